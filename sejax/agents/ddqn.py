@@ -1,0 +1,152 @@
+"""Double DQN with soft target updates and Adam.
+
+Source: van Hasselt et al., "Deep RL with Double Q-learning" (2016); the paper's hyperparameter
+tables; `reference_details.md` 4.1.
+"""
+
+import functools
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import optax
+from flax import struct
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Float
+
+from sejax.agents.agent import Agent
+from sejax.agents.replay import Transition
+from sejax.configs import DDQNConfig
+from sejax.networks import MLP
+
+
+class DDQNHparams(NamedTuple):
+    """The traced hyperparameters, scalars that a population of agents may vary."""
+
+    learning_rate: Array | float
+    target_update_rate: Array | float
+    discount: Array | float
+    epsilon_init: Array | float
+    epsilon_min: Array | float
+    epsilon_decay: Array | float
+
+
+@struct.dataclass
+class DDQNState:
+    """One agent. Parameters are flat vectors: Adam over one array costs a fifth of four."""
+
+    params: Float[Array, " num_params"]
+    target_params: Float[Array, " num_params"]
+    opt_state: optax.OptState
+    epsilon: Array
+    hparams: DDQNHparams
+
+
+@functools.cache
+def make_ddqn(config: DDQNConfig, obs_dim: int, num_actions: int) -> Agent:
+    """Builds the agent for observations `[obs_dim]` and actions `0..num_actions-1`.
+
+    Example:
+      >>> agent = make_ddqn(DDQNConfig(), obs_dim=4, num_actions=2)
+      >>> state = agent.init(jax.random.key(0), agent.hparams)
+      >>> int(agent.act(jax.random.key(1), state, jnp.zeros(4), explore=False)) in (0, 1)
+      True
+    """
+    network = MLP(
+        num_actions, config.hidden_size, config.num_layers, config.activation,
+        learn_prelu_slope=True,
+    )  # fmt: skip
+    template = jax.eval_shape(network.init, jax.random.key(0), jnp.zeros(obs_dim))
+    _, unravel = ravel_pytree(jax.tree.map(lambda x: jnp.zeros(x.shape), template))
+    adam = optax.scale_by_adam()
+
+    def init(key: Array, hparams: DDQNHparams) -> DDQNState:
+        params, _ = ravel_pytree(network.init(key, jnp.zeros(obs_dim)))
+        hparams = jax.tree.map(jnp.float32, hparams)
+        return DDQNState(
+            params=params,
+            target_params=params,
+            opt_state=adam.init(params),
+            epsilon=hparams.epsilon_init,
+            hparams=hparams,
+        )
+
+    def begin_episode(state: DDQNState, episode: Array) -> DDQNState:
+        """Epsilon starts at its initial value and decays by a factor down to its minimum."""
+        hp = state.hparams
+        epsilon = jnp.maximum(hp.epsilon_init * hp.epsilon_decay**episode, hp.epsilon_min)
+        return state.replace(epsilon=jnp.where(episode == 0, hp.epsilon_init, epsilon))
+
+    def act(key: Array, state: DDQNState, obs: Float[Array, " obs_dim"], explore: bool) -> Array:
+        greedy = jnp.argmax(network.apply(unravel(state.params), obs)).astype(jnp.int32)
+        if not explore:
+            return greedy
+        bits = jax.random.bits(key, (2,))
+        random_action = (bits[0] % jnp.uint32(num_actions)).astype(jnp.int32)
+        uniform = (bits[1] >> 8).astype(jnp.float32) * jnp.float32(2**-24)
+        return jnp.where(uniform < state.epsilon, random_action, greedy)
+
+    def loss_fn(params, target_params, discount, batch: Transition) -> Array:
+        q_values = network.apply(params, batch.obs)  # [actions, batch]
+        targets = double_q_targets(
+            network.apply(params, batch.next_obs),
+            network.apply(target_params, batch.next_obs),
+            batch.reward,
+            discount * batch.discount,
+        )
+        error = select_action(q_values, batch.action) - jax.lax.stop_gradient(targets)
+        return jnp.mean(error**2)
+
+    def update(key: Array, state: DDQNState, batch: Transition) -> DDQNState:
+        hp = state.hparams
+        gradient_fn = jax.grad(loss_fn)
+        gradient, _ = ravel_pytree(
+            gradient_fn(unravel(state.params), unravel(state.target_params), hp.discount, batch)
+        )
+        direction, opt_state = adam.update(gradient, state.opt_state)
+        params = state.params - hp.learning_rate * direction
+        tau = hp.target_update_rate
+        return state.replace(
+            params=params,
+            target_params=tau * params + (1 - tau) * state.target_params,
+            opt_state=opt_state,
+        )
+
+    return Agent(
+        init=init,
+        begin_episode=begin_episode,
+        act=act,
+        update=update,
+        hparams=DDQNHparams(**{f: getattr(config, f) for f in DDQNHparams._fields}),
+        init_episodes=config.init_episodes,
+        batch_size=config.batch_size,
+        buffer_size=config.buffer_size,
+    )
+
+
+def double_q_targets(
+    online_next_q: Float[Array, "actions batch"],
+    target_next_q: Float[Array, "actions batch"],
+    reward: Float[Array, " batch"],
+    discount: Float[Array, " batch"],
+) -> Float[Array, " batch"]:
+    r"""Targets :math:`r + \gamma\, Q'(s', \arg\max_a Q(s', a))`.
+
+    Args:
+      online_next_q: Q of the online network at the next states.
+      target_next_q: Q' of the target network at the next states.
+      reward: in the task's units.
+      discount: gamma times the transition's own discount.
+
+    Source: van Hasselt et al. (2016), eq. 4.
+    """
+    best = jnp.argmax(online_next_q, axis=0)
+    return reward + discount * select_action(target_next_q, best)
+
+
+def select_action(
+    q_values: Float[Array, "actions batch"], action: Array
+) -> Float[Array, " batch"]:
+    """Q of each column's action, by mask: gathers and their gradients are slow on CPU."""
+    mask = jnp.arange(q_values.shape[0])[:, None] == action
+    return jnp.sum(jnp.where(mask, q_values, 0.0), axis=0)

@@ -1,0 +1,108 @@
+"""Experience replay: a ring of packed rows, sampled uniformly with replacement.
+
+A transition is one float32 row, so that storing is a single write and sampling a single gather.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int, UInt32
+
+
+class Transition(NamedTuple):
+    """One step, or a feature-major batch of them (`[obs_dim, batch]`, `[batch]`).
+
+    `discount` is what the target bootstraps with before the agent's gamma: 0 where the episode
+    terminated, 1 elsewhere, anything in an SE with a soft done.
+    """
+
+    obs: Array
+    action: Array
+    reward: Array
+    discount: Array
+    next_obs: Array
+
+
+def row_width(obs_dim: int) -> int:
+    """Number of floats in a packed transition with one discrete action."""
+    return 2 * obs_dim + 3
+
+
+def init(capacity: int, obs_dim: int) -> Float[Array, "capacity width"]:
+    """An empty buffer."""
+    return jnp.zeros((capacity, row_width(obs_dim)), jnp.float32)
+
+
+def store(
+    rows: Float[Array, "capacity width"],
+    step: Int[Array, ""],
+    transition: Transition,
+    active: Array | bool = True,
+) -> Float[Array, "capacity width"]:
+    """Writes the transition of the agent's `step`-th step; the oldest row gives way when full.
+
+    The write is dropped where `active` is False: an index out of range costs nothing, where a
+    select would copy the buffer.
+    """
+    row = jnp.concatenate(
+        [
+            transition.obs,
+            transition.next_obs,
+            jnp.stack([transition.action, transition.reward, transition.discount]).astype(
+                jnp.float32
+            ),
+        ]
+    )
+    capacity = rows.shape[0]
+    if active is True:
+        return jax.lax.dynamic_update_slice(rows, row[None], (step % capacity, 0))
+    index = jnp.where(active, step % capacity, capacity)
+    return rows.at[index].set(row, mode="drop")
+
+
+def sample(
+    rows: Float[Array, "capacity width"],
+    seed: UInt32[Array, ""],
+    num_stored: Int[Array, ""],
+    batch_size: int,
+) -> Transition:
+    """Draws a feature-major batch, uniformly with replacement, from the first `num_stored` rows.
+
+    Args:
+      rows: the buffer.
+      seed: 32 random bits for this draw.
+      num_stored: rows written so far, at least 1; more than the capacity counts as the capacity.
+      batch_size: number of rows to draw (static).
+
+    Source: `reference_details.md` 3.5 (with replacement, from the first stored transition on).
+    """
+    size = jnp.minimum(num_stored, rows.shape[0])
+    batch = rows[sample_indices(seed, size, batch_size)].T  # [width, batch]
+    obs_dim = (rows.shape[1] - 3) // 2
+    return Transition(
+        obs=batch[:obs_dim],
+        next_obs=batch[obs_dim : 2 * obs_dim],
+        action=batch[-3].astype(jnp.int32),
+        reward=batch[-2],
+        discount=batch[-1],
+    )
+
+
+def sample_indices(
+    seed: UInt32[Array, ""], size: Int[Array, ""], batch_size: int
+) -> Int[Array, " batch"]:
+    """Uniform indices in [0, size), from a counter-based hash of `seed`.
+
+    threefry takes half as long as the learning step at these sizes. The hash is the finaliser
+    of MurmurHash3 on a Weyl sequence; 24 of its bits choose the index, so that the bias is below
+    size / 2**24.
+    """
+    counter = jnp.arange(batch_size, dtype=jnp.uint32)
+    x = seed + counter * jnp.uint32(0x9E3779B9)
+    x = (x ^ (x >> 16)) * jnp.uint32(0x85EBCA6B)
+    x = (x ^ (x >> 13)) * jnp.uint32(0xC2B2AE35)
+    x = x ^ (x >> 16)
+    fraction = (x >> 8).astype(jnp.float32) * jnp.float32(2**-24)  # [0, 1)
+    index = (fraction * size.astype(jnp.float32)).astype(jnp.int32)
+    return jnp.minimum(index, size - 1)  # rounding may reach size

@@ -1,0 +1,398 @@
+"""Everything that can be configured, validated before jax is imported or anything compiled.
+
+The dataclasses here and the YAML files in `conf/` have the same field names. `config` composes
+them as the commands do: `sejax.config(["env=acrobot", "generations=50"])`.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from typing import Any
+
+from hydra import compose, initialize_config_dir
+from hydra.core.config_store import ConfigStore
+from hydra.errors import HydraException
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from sejax.errors import ConfigError, require, unknown_name
+
+CONF_DIR = Path(__file__).parent / "conf"
+ACTIVATIONS = ("tanh", "relu", "leaky_relu", "prelu")
+DONE_MODES = ("soft", "threshold")
+STOP_RULES = ("plateau", "solved", "never")
+SOLVED_BY = ("test", "train")
+SCORE_TRANSFORMS = (
+    "linear", "rank", "nes", "nes_unnormalized",
+    "single_best", "single_better", "all_better_1", "all_better_2",
+)  # fmt: skip
+UPDATE_RULES = ("authors", "paper")
+AGGREGATES = ("mean", "min")
+OBJECTIVES = ("max_reward", "reward_threshold")
+
+# Name of the `es` choice -> evosax's class. Listed here because importing evosax takes seconds;
+# a test holds the list against evosax's own registry.
+EVOSAX_ALGORITHMS = {
+    "ars": "ARS",
+    "asebo": "ASEBO",
+    "cma_anchored_les": "CMAAnchoredLES",
+    "cma_es": "CMA_ES",
+    "cr_fm_nes": "CR_FM_NES",
+    "des": "DES",
+    "esmc": "ESMC",
+    "evotf_es": "EvoTF_ES",
+    "gradientless_descent": "GradientlessDescent",
+    "guided_es": "GuidedES",
+    "hill_climbing": "HillClimbing",
+    "iamalgam_full": "iAMaLGaM_Full",
+    "iamalgam_univariate": "iAMaLGaM_Univariate",
+    "les": "LES",
+    "lm_ma_es": "LM_MA_ES",
+    "ma_es": "MA_ES",
+    "noise_reuse_es": "NoiseReuseES",
+    "open_es": "Open_ES",
+    "persistent_es": "PersistentES",
+    "pgpe": "PGPE",
+    "random_search": "RandomSearch",
+    "rm_es": "Rm_ES",
+    "sep_cma_es": "Sep_CMA_ES",
+    "simple_es": "SimpleES",
+    "simulated_annealing": "SimulatedAnnealing",
+    "snes": "SNES",
+    "sv_cma_es": "SV_CMA_ES",
+    "sv_open_es": "SV_Open_ES",
+    "xnes": "xNES",
+}
+
+
+def _at_least(minimum: float, name: str, value: Any, reason: str, fix: Any) -> None:
+    require(value >= minimum, name, f"be at least {minimum}", reason, value, f"{name}={fix}")
+
+
+def _positive(name: str, value: float, reason: str, fix: Any) -> None:
+    require(value > 0 and math.isfinite(value), name, "be above 0 and finite", reason, value,
+            f"{name}={fix}")  # fmt: skip
+
+
+def _fraction(name: str, value: float, fix: Any) -> None:
+    require(0 <= value <= 1, name, "lie in [0, 1]", "it is a fraction", value, f"{name}={fix}")
+
+
+def _one_of(name: str, value: str, known: Sequence[str]) -> None:
+    if value not in known:
+        raise unknown_name(name, value, known)
+
+
+@dataclass(frozen=True, kw_only=True)
+class EnvConfig:
+    """Which real task; its limits are the paper's and live in `sejax.envs`."""
+
+    name: str = "cartpole"
+
+
+@dataclass(frozen=True, kw_only=True)
+class SyntheticConfig:
+    """Shape of the SE's three networks, and how their done output is used."""
+
+    name: str = "se"
+    hidden_size: int = 128
+    num_layers: int = 1
+    activation: str = "leaky_relu"
+    done: str = "soft"  # soft: bootstrap with 1 - d (authors); threshold: with 1 - [d > 0.5].
+
+    def __post_init__(self) -> None:
+        _at_least(1, "proxy.hidden_size", self.hidden_size, "a layer needs a unit", 128)
+        _at_least(1, "proxy.num_layers", self.num_layers, "the SE has a hidden layer", 1)
+        _one_of("proxy.activation", self.activation, ACTIVATIONS)
+        _one_of("proxy.done", self.done, DONE_MODES)
+
+
+@dataclass(frozen=True, kw_only=True)
+class DDQNConfig:
+    """DDQN's hyperparameters; the defaults are the paper's "default agent hyperparameters"."""
+
+    name: str = "ddqn"
+    init_episodes: int = 10  # episodes before learning starts
+    batch_size: int = 128
+    buffer_size: int = 100_000
+    hidden_size: int = 128
+    num_layers: int = 2
+    activation: str = "relu"
+    learning_rate: float = 1e-3
+    target_update_rate: float = 0.01  # tau: weight of the online network in the target's update.
+    discount: float = 0.99  # gamma
+    epsilon_init: float = 1.0
+    epsilon_min: float = 0.01
+    epsilon_decay: float = 0.9  # factor for each episode
+
+    def __post_init__(self) -> None:
+        for name in ("batch_size", "buffer_size", "hidden_size", "num_layers"):
+            _at_least(1, f"agent.{name}", getattr(self, name), "there is nothing to learn from or "
+                      "with otherwise", _default(DDQNConfig, name))  # fmt: skip
+        _at_least(0, "agent.init_episodes", self.init_episodes, "it counts episodes", 1)
+        _positive("agent.learning_rate", self.learning_rate, "Adam would not move", 0.001)
+        for name in ("target_update_rate", "discount", "epsilon_init", "epsilon_min",
+                     "epsilon_decay"):  # fmt: skip
+            _fraction(f"agent.{name}", getattr(self, name), _default(DDQNConfig, name))
+        _one_of("agent.activation", self.activation, ACTIVATIONS)
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainingConfig:
+    """How long an agent trains, and how it is tested."""
+
+    max_episodes: int = 1000  # n_e
+    stop_rule: str = "plateau"  # plateau (SEs), solved (real tasks), never
+    window: int = 10  # d: episodes in each of the two means that the plateau rule compares.
+    plateau_tolerance: float = 0.01  # C_diff: relative change between them that counts as flat.
+    solved_by: str = "test"  # whose last d returns must reach the solved reward: test or train.
+    test_episodes: int = 10  # n_te: episodes on the real task after training.
+    time_limit_is_terminal: bool = False  # a real episode cut by the limit does not bootstrap.
+
+    def __post_init__(self) -> None:
+        for name in ("max_episodes", "window", "test_episodes"):
+            _at_least(1, f"training.{name}", getattr(self, name), "it counts episodes",
+                      _default(TrainingConfig, name))  # fmt: skip
+        _at_least(0, "training.plateau_tolerance", self.plateau_tolerance,
+                  "it bounds a relative change", 0.01)  # fmt: skip
+        _one_of("training.stop_rule", self.stop_rule, STOP_RULES)
+        _one_of("training.solved_by", self.solved_by, SOLVED_BY)
+
+
+@dataclass(frozen=True, kw_only=True)
+class NESConfig:
+    """The paper's NES (Algorithm 1 and appendix "NES Score Transformation")."""
+
+    name: str = "nes"
+    population_size: int = 16  # n_p: members in a generation.
+    noise_std: float = 0.05  # sigma: std of the weight perturbation.
+    noise_std_decay: float = 1.0  # factor on sigma after each generation
+    step_size: float = 1.0  # alpha
+    step_size_decay: float = 1.0  # factor on alpha after each generation
+    mirrored: bool = True  # each member tries +eps and -eps and keeps the better sign.
+    score_transform: str = "all_better_2"
+    update_rule: str = "authors"  # authors: psi += alpha sum F eps; paper: divided by n_p sigma.
+    weight_decay: float = 0.0  # psi shrinks by this fraction before each update.
+    num_evals: int = 1  # agents trained on each perturbed proxy
+    eval_aggregate: str = "mean"  # what their scores make: mean or min
+    common_random_numbers: bool = False  # the same inner seeds for all members of a generation
+
+    def __post_init__(self) -> None:
+        _at_least(2, "es.population_size", self.population_size,
+                  "scores are compared within a generation", 16)  # fmt: skip
+        _positive("es.noise_std", self.noise_std, "members must differ", 0.05)
+        _positive("es.step_size", self.step_size, "the proxy would not move", 1)
+        for name in ("noise_std_decay", "step_size_decay"):
+            value = getattr(self, name)
+            require(0 < value <= 1, f"es.{name}", "lie in (0, 1]", "it shrinks each generation",
+                    value, f"es.{name}=1")  # fmt: skip
+        _fraction("es.weight_decay", self.weight_decay, 0)
+        _at_least(1, "es.num_evals", self.num_evals, "a member needs a score", 1)
+        _one_of("es.score_transform", self.score_transform, SCORE_TRANSFORMS)
+        _one_of("es.update_rule", self.update_rule, UPDATE_RULES)
+        _one_of("es.eval_aggregate", self.eval_aggregate, AGGREGATES)
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvosaxConfig:
+    """One of evosax's distribution-based algorithms in NES's place."""
+
+    name: str = "open_es"
+    population_size: int = 32  # candidates in a generation
+    num_incumbent_evals: int = 16  # agents trained on the distribution's mean
+    noise_std: float = 0.05  # initial std of the search distribution
+    noise_std_decay: float = 1.0  # factor for each generation, where the algorithm takes a schedule
+    step_size: float = 0.05  # learning rate of Adam on the mean, where the algorithm takes one
+    num_evals: int = 1
+    eval_aggregate: str = "mean"
+    common_random_numbers: bool = False
+
+    def __post_init__(self) -> None:
+        _at_least(2, "es.population_size", self.population_size,
+                  "scores are compared within a generation", 32)  # fmt: skip
+        require(self.population_size % 2 == 0, "es.population_size", "be even",
+                "evosax's algorithms pair opposite perturbations", self.population_size,
+                f"es.population_size={self.population_size + 1}")  # fmt: skip
+        _at_least(1, "es.num_incumbent_evals", self.num_incumbent_evals,
+                  "the incumbent's score selects the proxy", 16)  # fmt: skip
+        _positive("es.noise_std", self.noise_std, "candidates must differ", 0.05)
+        _positive("es.step_size", self.step_size, "the mean would not move", 0.05)
+        require(0 < self.noise_std_decay <= 1, "es.noise_std_decay", "lie in (0, 1]",
+                "it shrinks each generation", self.noise_std_decay, "es.noise_std_decay=1")  # fmt: skip
+        _at_least(1, "es.num_evals", self.num_evals, "a candidate needs a score", 1)
+        _one_of("es.eval_aggregate", self.eval_aggregate, AGGREGATES)
+        _one_of("es.name", self.name, tuple(EVOSAX_ALGORITHMS))
+
+
+@dataclass(frozen=True, kw_only=True)
+class ObjectiveConfig:
+    """What a training and its test on the real task are worth."""
+
+    name: str = "max_reward"
+    unsolved_weight: float = 100.0  # w_sol in the reward threshold objective
+
+    def __post_init__(self) -> None:
+        _one_of("objective.name", self.name, OBJECTIVES)
+        _at_least(0, "objective.unsolved_weight", self.unsolved_weight,
+                  "a shortfall must not be rewarded", 100)  # fmt: skip
+
+
+@dataclass(frozen=True, kw_only=True)
+class LearnConfig:
+    """A whole bilevel optimisation: what `sejax.run` and `sejax.make_learner` take."""
+
+    preset: str = "best"
+    env: EnvConfig = field(default_factory=EnvConfig)
+    proxy: SyntheticConfig = field(default_factory=SyntheticConfig)
+    agent: DDQNConfig = field(default_factory=DDQNConfig)
+    es: Any = field(default_factory=NESConfig)
+    objective: ObjectiveConfig = field(default_factory=ObjectiveConfig)
+    training: TrainingConfig = field(default_factory=TrainingConfig)
+    generations: int = 50  # n_o
+    seed: int = 0
+    num_seeds: int = 1  # independent runs in one program, with seeds seed, seed + 1, ...
+    stop_when_solved: bool = False  # a run ends at its first incumbent mean above the threshold.
+    lanes: int = 1  # agents that train in lockstep on one device
+    devices: int | None = None  # devices to spread the population over; null: all
+    checkpoint_every: int = 1  # generations
+    run_dir: str | None = None  # null: runs/<env>-<proxy>-<agent>-s<seed>
+
+    def __post_init__(self) -> None:
+        _at_least(1, "generations", self.generations, "there is nothing to do otherwise", 50)
+        require(0 <= self.seed < 2**31, "seed", "lie in [0, 2**31)", "it is a 32-bit number",
+                self.seed, "seed=0")  # fmt: skip
+        _at_least(1, "num_seeds", self.num_seeds, "it counts runs", 1)
+        _at_least(1, "lanes", self.lanes, "it counts agents", 1)
+        _at_least(1, "checkpoint_every", self.checkpoint_every, "it counts generations", 1)
+        if self.devices is not None:
+            _at_least(1, "devices", self.devices, "something must compute", "null")
+
+    @property
+    def resolved_run_dir(self) -> Path:
+        name = f"{self.env.name}-{self.proxy.name}-{self.agent.name}-s{self.seed}"
+        return Path(self.run_dir or f"runs/{name}")
+
+
+def register_evosax_choices() -> None:
+    """Makes `es=<name>` known to Hydra for each of evosax's algorithms."""
+    for name in EVOSAX_ALGORITHMS:
+        ConfigStore.instance().store(group="es", name=name, node=EvosaxConfig(name=name))
+
+
+def config(overrides: Sequence[str] = ()) -> LearnConfig:
+    """Composes and validates a configuration from command-line overrides.
+
+    Args:
+      overrides: Hydra overrides as typed after `python -m sejax.run`.
+
+    Raises:
+      ConfigError: for an unknown group, choice or field, or a value out of range.
+
+    Example:
+      >>> config(["env=acrobot", "generations=7"]).generations
+      7
+    """
+    register_evosax_choices()
+    try:
+        with initialize_config_dir(str(CONF_DIR), version_base="1.3"):
+            return from_hydra(compose("run", overrides=list(overrides)))
+    except HydraException as error:
+        raise translate_hydra_error(error) from error
+
+
+def from_hydra(cfg: DictConfig) -> LearnConfig:
+    """The typed and validated configuration of a composed Hydra one."""
+    es_schema = NESConfig if cfg.es.name == "nes" else EvosaxConfig
+    try:
+        groups = {
+            "env": _typed(EnvConfig, cfg, "env"),
+            "proxy": _typed(SyntheticConfig, cfg, "proxy"),
+            "agent": _typed(DDQNConfig, cfg, "agent"),
+            "es": _typed(es_schema, cfg, "es"),
+            "objective": _typed(ObjectiveConfig, cfg, "objective"),
+            "training": _typed(TrainingConfig, cfg, "training"),
+        }
+        plain = {f.name for f in fields(LearnConfig)} - groups.keys()
+        schema = OmegaConf.structured(_PlainFields)
+        values = OmegaConf.merge(schema, {k: cfg[k] for k in plain if k in cfg})
+    except OmegaConfBaseException as error:
+        where = f" in {error.full_key}" if getattr(error, "full_key", None) else ""
+        raise ConfigError(f"{str(error.msg or error).splitlines()[0]}{where}.") from error
+    return LearnConfig(**groups, **OmegaConf.to_container(values))  # type: ignore[arg-type]
+
+
+def to_dict(cfg: LearnConfig) -> dict[str, Any]:
+    """The configuration as nested plain values, as `config.yaml` and file metadata hold it."""
+    return {
+        f.name: (vars(value).copy() if hasattr(value, "__dataclass_fields__") else value)
+        for f in fields(cfg)
+        for value in [getattr(cfg, f.name)]
+    }
+
+
+def from_dict(values: dict[str, Any]) -> LearnConfig:
+    """Inverse of `to_dict`."""
+    return from_hydra(OmegaConf.create(values))
+
+
+@dataclass
+class _PlainFields:
+    """Types of `LearnConfig`'s own fields, for OmegaConf to check."""
+
+    preset: str = "best"
+    generations: int = 50
+    seed: int = 0
+    num_seeds: int = 1
+    stop_when_solved: bool = False
+    lanes: int = 1
+    devices: int | None = None
+    checkpoint_every: int = 1
+    run_dir: str | None = None
+
+
+def _typed(schema: type, cfg: DictConfig, group: str) -> Any:
+    target = OmegaConf.create({group: OmegaConf.structured(schema)})
+    OmegaConf.set_readonly(target[group], False)  # a frozen dataclass comes read-only
+    values = OmegaConf.merge(target, {group: cfg[group]})[group]
+    return schema(**OmegaConf.to_container(values))  # type: ignore[arg-type]
+
+
+def _default(schema: type, name: str) -> Any:
+    return schema.__dataclass_fields__[name].default
+
+
+def translate_hydra_error(error: Exception) -> ConfigError:
+    """One clear sentence for what Hydra refused; unknown choices get the nearest known ones."""
+    text = str(error)
+    missing = _between(text, "Could not find '", "'")
+    if missing and "Available options" in text:
+        group, _, got = missing.rpartition("/")
+        known = [line.strip() for line in text.split("Available options in")[1].splitlines()[1:]]
+        return unknown_name(group, got, [name for name in known if name])
+    if missing and missing.startswith("tuned/"):
+        preset, _, pair = missing.removeprefix("tuned/").partition("/")
+        return ConfigError(
+            f"preset must be one that the paper or a measurement defines for the task, because it "
+            f"holds that task's numbers; got preset={preset} for {pair}. Set preset=best."
+        )
+    key = _between(text, "Could not override '", "'")
+    if key:
+        return unknown_name("override", key, _known_fields())
+    return ConfigError(text.splitlines()[0])
+
+
+def _known_fields() -> list[str]:
+    groups = {"proxy": SyntheticConfig, "agent": DDQNConfig, "es": NESConfig,
+              "objective": ObjectiveConfig, "training": TrainingConfig}  # fmt: skip
+    names = [f.name for f in fields(_PlainFields)]
+    return names + [f"{g}.{f.name}" for g, schema in groups.items() for f in fields(schema)]
+
+
+def _between(text: str, start: str, end: str) -> str:
+    _, found, rest = text.partition(start)
+    return rest.partition(end)[0] if found else ""
+
+
+
+__all__ = ["ConfigError", "LearnConfig", "config"]

@@ -1,0 +1,5 @@
+"""The real tasks: gymnax environments with the paper's step limits and solved thresholds."""
+
+from sejax.envs.registry import Task, make, names
+
+__all__ = ["Task", "make", "names"]

@@ -1,0 +1,129 @@
+r"""The eight score transforms: from the members' scores K_i to their weights F_i.
+
+Scores are to be maximised. A score that is not finite ranks below every finite one and gets the
+weight of the worst. If no member is better than another (or than the incumbent, where the transform
+compares with it), all weights of a transform that needs a difference are 0 and the proxy stays.
+
+Source: paper, appendix "NES Score Transformation". `K_psi` is the incumbent's mean score.
+"""
+
+from collections.abc import Callable
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+Scores = Float[Array, " pop"]
+ScoreTransform = Callable[[Scores, Float[Array, ""]], Scores]
+
+
+def linear(scores: Scores, incumbent: Float[Array, ""]) -> Scores:
+    r"""Maps scores linearly to [0, 1]: :math:`F_i = (K_i - \min K) / (\max K - \min K)`.
+
+    Args:
+      scores: `[pop]` test return of each member, in reward units.
+      incumbent: not used.
+
+    Returns:
+      `[pop]` weights; all 0 if all scores are equal.
+    """
+    scores = _floor_nonfinite(scores)
+    return _safe_divide(scores - scores.min(), scores.max() - scores.min())
+
+
+def rank(scores: Scores, incumbent: Float[Array, ""]) -> Scores:
+    r"""Maps ranks linearly to [0, 1]: :math:`F_i = (R_i - \min R) / (\max R - \min R)`.
+
+    :math:`R_i` counts the members with a lower score, so that ties share a rank.
+    """
+    ranks = _num_lower(scores)
+    return _safe_divide(ranks - ranks.min(), ranks.max() - ranks.min())
+
+
+def nes(scores: Scores, incumbent: Float[Array, ""]) -> Scores:
+    r"""Utilities of Wierstra et al. (2008), scaled to a largest magnitude of 1.
+
+    .. math::
+        \hat F_i = \frac{\max(0, \log(n_p/2 + 1) - \log R_i)}{\sum_j \max(0, \ldots)} - 1/n_p,
+        \quad F_i = \hat F_i / \max_i |\hat F_i|
+
+    Here :math:`R_i` is 1 for the best, as in the source; the paper's text defines it with 0 for
+    the worst, for which the logarithm is not defined. Ties share the better rank.
+    """
+    utilities = _log_utilities(scores) - 1 / scores.shape[0]
+    return _safe_divide(utilities, jnp.abs(utilities).max())
+
+
+def nes_unnormalized(scores: Scores, incumbent: Float[Array, ""]) -> Scores:
+    """As `nes` without the subtraction of 1/n_p: the worse half weighs nothing, the best 1."""
+    utilities = _log_utilities(scores)
+    return _safe_divide(utilities, jnp.abs(utilities).max())
+
+
+def single_best(scores: Scores, incumbent: Float[Array, ""]) -> Scores:
+    """1 for the member of the best rank (for each, if several share it), 0 for the others."""
+    scores = _ranked_last(scores)
+    return jnp.where((scores == scores.max()) & jnp.isfinite(scores), 1.0, 0.0)
+
+
+def single_better(scores: Scores, incumbent: Float[Array, ""]) -> Scores:
+    """As `single_best`, but only if that member is better than the incumbent."""
+    return jnp.where(_ranked_last(scores) > incumbent, single_best(scores, incumbent), 0.0)
+
+
+def all_better_1(scores: Scores, incumbent: Float[Array, ""]) -> Scores:
+    r"""Weighs the members that beat the incumbent by how much, the best with 1.
+
+    .. math:: F_i \propto (K_i - K_\psi) / (\max K - K_\psi) \text{ if } K_i > K_\psi, \text{ else } 0
+    """
+    advantage = _advantage(scores, incumbent)
+    return _safe_divide(advantage, advantage.max())
+
+
+def all_better_2(scores: Scores, incumbent: Float[Array, ""]) -> Scores:
+    """As `all_better_1`, with weights that sum to 1."""
+    advantage = _advantage(scores, incumbent)
+    return _safe_divide(advantage, advantage.sum())
+
+
+TRANSFORMS: dict[str, ScoreTransform] = {
+    f.__name__: f
+    for f in (linear, rank, nes, nes_unnormalized, single_best, single_better,
+              all_better_1, all_better_2)
+}  # fmt: skip
+
+
+def _advantage(scores: Scores, incumbent: Float[Array, ""]) -> Scores:
+    """Advantage over the incumbent, 0 for members that are not better.
+
+    An incumbent without a finite score is below every member: the worst finite one stands in.
+    """
+    floor = jnp.where(jnp.isfinite(incumbent), incumbent, _floor_nonfinite(scores).min())
+    return jnp.where(jnp.isfinite(scores), jnp.maximum(scores - floor, 0.0), 0.0)
+
+
+def _log_utilities(scores: Scores) -> Scores:
+    num_members = scores.shape[0]
+    scores = _ranked_last(scores)
+    best_is_one = 1 + (scores[None, :] > scores[:, None]).sum(axis=1)
+    utilities = jnp.maximum(0.0, jnp.log(num_members / 2 + 1) - jnp.log(best_is_one))
+    return utilities / utilities.sum()
+
+
+def _num_lower(scores: Scores) -> Scores:
+    scores = _ranked_last(scores)
+    return (scores[None, :] < scores[:, None]).sum(axis=1).astype(jnp.float32)
+
+
+def _ranked_last(scores: Scores) -> Scores:
+    return jnp.where(jnp.isfinite(scores), scores, -jnp.inf)
+
+
+def _floor_nonfinite(scores: Scores) -> Scores:
+    """Non-finite scores replaced by the worst finite one (by 0 if there is none)."""
+    finite = jnp.isfinite(scores)
+    worst = jnp.min(jnp.where(finite, scores, jnp.inf))
+    return jnp.where(finite, scores, jnp.where(jnp.isfinite(worst), worst, 0.0))
+
+
+def _safe_divide(numerator: Array, denominator: Array) -> Array:
+    return jnp.where(denominator > 0, numerator / jnp.where(denominator > 0, denominator, 1.0), 0.0)

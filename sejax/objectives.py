@@ -1,0 +1,49 @@
+"""What the training of one agent on a proxy, and its test on the real task, are worth."""
+
+from collections.abc import Callable
+
+import jax.numpy as jnp
+from flax import struct
+from jaxtyping import Array, Bool, Float, Int
+
+from sejax.configs import ObjectiveConfig
+
+
+@struct.dataclass
+class Outcome:
+    """What came of one agent. All leaves are `[]`, or `[agent]` for many.
+
+    Attributes:
+      test_return: mean return over the test episodes on the real task, in reward units.
+      train_steps: steps in the training world.
+      train_episodes: episodes there.
+      nonfinite: whether a number that is not finite was met in training; the score is then nan.
+      real_steps: steps on the real task: tests, and training where its dynamics are real.
+    """
+
+    test_return: Float[Array, "*agent"]
+    train_steps: Int[Array, "*agent"]
+    train_episodes: Int[Array, "*agent"]
+    nonfinite: Bool[Array, "*agent"]
+    real_steps: Int[Array, "*agent"]
+
+
+def make_objective(
+    config: ObjectiveConfig, solved_reward: float
+) -> Callable[[Outcome], Float[Array, "*agent"]]:
+    r"""Builds `objective(outcome) -> score`, to be maximised; nan for a training that diverged.
+
+    - `max_reward`: the mean test return (SEs).
+    - `reward_threshold`: :math:`-(n_{tr} + w_{sol} \max(0, C_{sol} - C_{fin}))` (RNs).
+
+    Source: paper, Algorithm 1, EvaluateAgent, and section "Learning Reward Networks".
+    """
+
+    def objective(outcome: Outcome) -> Array:
+        score = outcome.test_return
+        if config.name == "reward_threshold":
+            shortfall = jnp.maximum(0.0, solved_reward - outcome.test_return)
+            score = -(outcome.train_steps + config.unsolved_weight * shortfall)
+        return jnp.where(outcome.nonfinite, jnp.nan, score)
+
+    return objective
