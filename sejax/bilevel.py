@@ -13,17 +13,16 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 from jax.flatten_util import ravel_pytree
-from jax.sharding import AxisType, PartitionSpec
 from jaxtyping import Array, Float
 
 from sejax import envs
 from sejax.agents.registry import make_agent
-from sejax.agents.trainer import make_tester, make_trainer
 from sejax.configs import LearnConfig
-from sejax.errors import require
-from sejax.es import Strategy, make_strategy
+from sejax.es import make_strategy
 from sejax.es.nes import finite_mean
+from sejax.evaluation import make_evaluator
 from sejax.objectives import Outcome, make_objective
+from sejax.parallel import spread_over_devices
 from sejax.proxies.synthetic import SyntheticEnv, make_synthetic
 
 
@@ -150,7 +149,9 @@ def make_program(config: LearnConfig) -> Program:
 
     def init(keys: Array) -> LearnState:
         num_seeds = keys.shape[0]
-        key_weights, key_es, key_run = (k for k in jax.vmap(lambda k: jax.random.split(k, 3))(keys).T)
+        key_weights, key_es, key_run = (
+            k for k in jax.vmap(lambda k: jax.random.split(k, 3))(keys).T
+        )
         mean = jax.vmap(lambda key: ravel_pytree(env.init_weights(key))[0])(key_weights)
         # Each field its own buffer, so that all of them can be donated.
         return LearnState(
@@ -169,7 +170,9 @@ def make_program(config: LearnConfig) -> Program:
     def generation(state: LearnState) -> tuple[LearnState, GenerationInfo]:
         """One pass of Algorithm 1's outer loop for every seed; a scan body."""
         keys = jax.vmap(jax.random.fold_in)(state.key, state.generation)
-        key_ask, key_inner, key_tell = (k for k in jax.vmap(lambda k: jax.random.split(k, 3))(keys).T)
+        key_ask, key_inner, key_tell = (
+            k for k in jax.vmap(lambda k: jax.random.split(k, 3))(keys).T
+        )
         candidates, asked = jax.vmap(strategy.ask)(key_ask, state.es_state)
         outcome = score_candidates(strategy.seed_ids, key_inner, candidates, ~state.finished)
         scores = objective(outcome)  # [seed, candidates]
@@ -240,24 +243,12 @@ def make_population_scorer(
     `Outcome` with leaves `[seed, n]`. The trainings are spread over the devices; on each device
     groups of `config.lanes` of them follow one another.
     """
-    agent = make_agent(config.agent, task)
-    train = make_trainer(agent, env, config.training, task.max_steps, task.solved_reward)
-    test = make_tester(agent, task, config.training.test_episodes)
+    evaluate = make_evaluator(make_agent(config.agent, task), env, task, config.training)
 
-    def evaluate(key: Array, candidate: Array, active: Array) -> Outcome:
-        """TrainAgent and EvaluateAgent of Algorithm 1 for one candidate."""
-        key_train, key_test = jax.random.split(key)
-        result = train(key_train, env.params(unravel(candidate)), agent.hparams, active)
-        returns, steps = test(key_test, result.agent_state, active)
-        return Outcome(
-            test_return=returns.mean(),
-            train_steps=result.train_steps,
-            train_episodes=result.episodes,
-            nonfinite=result.nonfinite | ~jnp.isfinite(returns.mean()),
-            real_steps=steps.sum() + result.test_steps,
-        )
+    def evaluate_candidate(key: Array, candidate: Array, active: Array) -> Outcome:
+        return evaluate(key, env.params(unravel(candidate)), active)
 
-    evaluate_many = spread_over_devices(evaluate, config.devices, config.lanes)
+    evaluate_many = spread_over_devices(evaluate_candidate, config.devices, config.lanes)
 
     def score(seed_ids: Array, keys: Array, candidates: Array, active: Array) -> Outcome:
         num_seeds, num_candidates, num_dims = candidates.shape
@@ -272,57 +263,9 @@ def make_population_scorer(
     return score
 
 
-def spread_over_devices(
-    fn: Callable[..., Any], num_devices: int | None, lanes: int
-) -> Callable[..., Any]:
-    """Maps `fn` over the leading axis of its arguments, over devices and in lanes.
-
-    Devices take the elements in turn (0, 1, 0, 1, ...), so that each gets its share of long and
-    short ones. The result does not depend on the number of devices.
-
-    Raises:
-      ConfigError: if there are fewer than `num_devices` devices.
-    """
-    available = jax.devices()
-    require(num_devices is None or num_devices <= len(available), "devices",
-            f"be at most {len(available)}", "that is how many there are", num_devices,
-            "devices=null")  # fmt: skip
-    count = num_devices or len(available)
-
-    def map_here(*args: Any) -> Any:
-        def one(args: Any) -> Any:
-            return fn(*args)
-
-        return jax.lax.map(one, args, batch_size=lanes if lanes > 1 else None)
-
-    if count == 1:
-        return map_here
-    mesh = jax.make_mesh(
-        (count,), ("device",), axis_types=(AxisType.Auto,), devices=available[:count]
-    )
-    axis = PartitionSpec("device")
-    mapped = jax.shard_map(map_here, mesh=mesh, in_specs=axis, out_specs=axis, check_vma=False)
-
-    def map_spread(*args: Any) -> Any:
-        size = jax.tree.leaves(args)[0].shape[0]
-        padded = -(-size // count) * count
-
-        def deal(x: Array) -> Array:
-            x = jnp.concatenate([x, x[: padded - size]]) if padded > size else x
-            return x.reshape(-1, count, *x.shape[1:]).swapaxes(0, 1).reshape(padded, *x.shape[1:])
-
-        def gather(x: Array) -> Array:
-            x = x.reshape(count, -1, *x.shape[1:]).swapaxes(0, 1).reshape(padded, *x.shape[1:])
-            return x[:size]
-
-        return jax.tree.map(gather, mapped(*jax.tree.map(deal, args)))
-
-    return map_spread
-
-
 def _where(mask: Array, a: Array, b: Array) -> Array:
     """Selects along the leading axis; keys too."""
     return jax.vmap(jnp.where)(mask, a, b)
 
 
-__all__ = ["LearnResult", "LearnState", "Program", "Strategy", "make_learner", "make_program"]
+__all__ = ["LearnResult", "LearnState", "Program", "make_learner", "make_program"]

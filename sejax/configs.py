@@ -16,7 +16,7 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from sejax.errors import ConfigError, require, unknown_name
+from sejax.errors import ConfigError, nearest, require, unknown_name
 
 CONF_DIR = Path(__file__).parent / "conf"
 ACTIVATIONS = ("tanh", "relu", "leaky_relu", "prelu")
@@ -138,6 +138,9 @@ class DDQNConfig:
         _one_of("agent.activation", self.activation, ACTIVATIONS)
 
 
+AgentConfig = DDQNConfig
+
+
 @dataclass(frozen=True, kw_only=True)
 class TrainingConfig:
     """How long an agent trains, and how it is tested."""
@@ -253,7 +256,7 @@ class LearnConfig:
     seed: int = 0
     num_seeds: int = 1  # independent runs in one program, with seeds seed, seed + 1, ...
     stop_when_solved: bool = False  # a run ends at its first incumbent mean above the threshold.
-    lanes: int = 1  # agents that train in lockstep on one device
+    lanes: int | None = None  # agents in lockstep on one device; null: 1 on CPU, all elsewhere
     devices: int | None = None  # devices to spread the population over; null: all
     checkpoint_every: int = 1  # generations
     run_dir: str | None = None  # null: runs/<env>-<proxy>-<agent>-s<seed>
@@ -263,10 +266,10 @@ class LearnConfig:
         require(0 <= self.seed < 2**31, "seed", "lie in [0, 2**31)", "it is a 32-bit number",
                 self.seed, "seed=0")  # fmt: skip
         _at_least(1, "num_seeds", self.num_seeds, "it counts runs", 1)
-        _at_least(1, "lanes", self.lanes, "it counts agents", 1)
         _at_least(1, "checkpoint_every", self.checkpoint_every, "it counts generations", 1)
-        if self.devices is not None:
-            _at_least(1, "devices", self.devices, "something must compute", "null")
+        for name in ("lanes", "devices"):
+            if getattr(self, name) is not None:
+                _at_least(1, name, getattr(self, name), "something must compute", "null")
 
     @property
     def resolved_run_dir(self) -> Path:
@@ -345,7 +348,7 @@ class _PlainFields:
     seed: int = 0
     num_seeds: int = 1
     stop_when_solved: bool = False
-    lanes: int = 1
+    lanes: int | None = None
     devices: int | None = None
     checkpoint_every: int = 1
     run_dir: str | None = None
@@ -368,7 +371,8 @@ def translate_hydra_error(error: Exception) -> ConfigError:
     missing = _between(text, "Could not find '", "'")
     if missing and "Available options" in text:
         group, _, got = missing.rpartition("/")
-        known = [line.strip() for line in text.split("Available options in")[1].splitlines()[1:]]
+        listed = text.split("Available options in")[1].split("Config search path")[0]
+        known = [line.strip() for line in listed.splitlines()[1:]]
         return unknown_name(group, got, [name for name in known if name])
     if missing and missing.startswith("tuned/"):
         preset, _, pair = missing.removeprefix("tuned/").partition("/")
@@ -378,7 +382,13 @@ def translate_hydra_error(error: Exception) -> ConfigError:
         )
     key = _between(text, "Could not override '", "'")
     if key:
-        return unknown_name("override", key, _known_fields())
+        group = key.rpartition(".")[0]
+        siblings = [name for name in _known_fields() if name.rpartition(".")[0] == group]
+        ranked = nearest(key, siblings or _known_fields())
+        return ConfigError(
+            f"override must name a field of the configuration, because nothing else is read; got "
+            f"{key}. Did you mean {ranked[0]}? Fields there: {', '.join(ranked)}."
+        )
     return ConfigError(text.splitlines()[0])
 
 
@@ -392,7 +402,6 @@ def _known_fields() -> list[str]:
 def _between(text: str, start: str, end: str) -> str:
     _, found, rest = text.partition(start)
     return rest.partition(end)[0] if found else ""
-
 
 
 __all__ = ["ConfigError", "LearnConfig", "config"]

@@ -10,11 +10,15 @@ class ConfigError(ValueError):
 
 def unknown_name(field: str, got: str, known: Iterable[str]) -> ConfigError:
     """Error for an unknown choice; lists the known ones, nearest first, and names the override."""
-    known = list(known)
-    ranked = sorted(known, key=lambda name: -difflib.SequenceMatcher(None, got, name).ratio())
+    ranked = nearest(got, known)
     return ConfigError(
         f"{field} must be one of {', '.join(ranked)}; got {got!r}. Did you mean {field}={ranked[0]}?"
     )
+
+
+def nearest(got: str, known: Iterable[str]) -> list[str]:
+    """The known names, the most similar first."""
+    return sorted(known, key=lambda name: -difflib.SequenceMatcher(None, got, name).ratio())
 
 
 def require(holds: bool, field: str, rule: str, reason: str, got: object, fix: str) -> None:

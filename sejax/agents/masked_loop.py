@@ -47,12 +47,12 @@ def _while_any_active(body: Body, depth: int) -> Callable[..., tuple[Any, Any]]:
             large, small = carry
             large, stepped = step(large, small, consts, depth > 0)
             if depth > 0:
-                stepped = jax.tree.map(
-                    functools.partial(_select, small.active), stepped, small
-                )
+                stepped = jax.tree.map(functools.partial(_select, small.active), stepped, small)
             return large, stepped
 
-        return jax.lax.while_loop(lambda carry: jnp.any(carry[1].active), masked_step, (large, small))
+        return jax.lax.while_loop(
+            lambda carry: jnp.any(carry[1].active), masked_step, (large, small)
+        )
 
     @loop.def_vmap
     def _(axis_size: int, in_batched: Any, large: Any, small: Any, consts: Any):

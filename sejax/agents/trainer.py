@@ -17,6 +17,7 @@ from sejax.agents.agent import Agent
 from sejax.agents.masked_loop import while_any_active
 from sejax.configs import TrainingConfig
 
+
 @struct.dataclass
 class TrainResult:
     """What came of one training.
@@ -73,7 +74,7 @@ def make_trainer(
     training: TrainingConfig,
     max_steps: int,
     solved_reward: float = jnp.inf,
-    test_fn: Callable[[Array, Any], tuple[Array, Array]] | None = None,
+    test_fn: Callable[[Array, Any, Array], tuple[Array, Array]] | None = None,
 ) -> Callable[..., TrainResult]:
     """Builds `train(key, env_params, hparams, active=True) -> TrainResult` for one agent.
 
@@ -87,8 +88,8 @@ def make_trainer(
       training: stopping rule and limits.
       max_steps: the world's step limit; no buffer needs more than `max_episodes * max_steps` rows.
       solved_reward: for `stop_rule="solved"`.
-      test_fn: `(key, agent_state) -> (mean return, steps)` on the real task, called after each
-        training episode if `stop_rule="solved"` and `solved_by="test"`.
+      test_fn: `(key, agent_state, active) -> (mean return, steps)` on the real task, called after
+        each training episode if `stop_rule="solved"` and `solved_by="test"`.
 
     Raises:
       ValueError: if tests are asked for and no `test_fn` is given.
@@ -154,16 +155,19 @@ def make_trainer(
         )
         ended = terminated | truncated | state.nonfinite
         state = jax.lax.cond(
-            ended, lambda s: end_episode(key_end, s, env_params), lambda s: s, state
+            ended, lambda s: end_episode(key_end, s, env_params, ended), lambda s: s, state
         )
         return rows, state
 
-    def end_episode(key: Array, state: _LoopState, env_params: Any) -> _LoopState:
-        """Records the episode, decides whether training goes on, and starts the next one."""
+    def end_episode(key: Array, state: _LoopState, env_params: Any, ended: Array) -> _LoopState:
+        """Records the episode, decides whether training goes on, and starts the next one.
+
+        In lanes this runs for all of them if it runs for one; `ended` spares the others the test.
+        """
         key_reset, key_test = jax.random.split(key)
         episode_return, test_steps = state.episode_return, state.test_steps
         if tests_each_episode:
-            episode_return, num_steps = test_fn(key_test, state.agent_state)
+            episode_return, num_steps = test_fn(key_test, state.agent_state, ended)
             test_steps = test_steps + num_steps
         recent = jnp.concatenate([state.recent[1:], episode_return[None]])
         num_episodes = state.episode + 1

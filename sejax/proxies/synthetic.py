@@ -3,6 +3,7 @@
 Source: paper, section "Learning Synthetic Environments"; `reference_details.md` 1.
 """
 
+import copy
 import functools
 from typing import Any
 
@@ -49,6 +50,7 @@ class SyntheticEnv(environment.Environment[SyntheticState, SyntheticParams]):
         super().__init__()
         self.task = task
         self.config = config
+        self._default_params: SyntheticParams | None = None
         outputs = {"state": task.obs_dim, "reward": 1, "done": 1}
         self._nets = {
             head: MLP(size, config.hidden_size, config.num_layers, config.activation)
@@ -70,7 +72,14 @@ class SyntheticEnv(environment.Environment[SyntheticState, SyntheticParams]):
 
     @property
     def default_params(self) -> SyntheticParams:
-        return self.params(self.init_weights(jax.random.key(0)))
+        """Random weights, or those given to `with_default_params`."""
+        return self._default_params or self.params(self.init_weights(jax.random.key(0)))
+
+    def with_default_params(self, params: SyntheticParams) -> "SyntheticEnv":
+        """A copy for callers that rely on `default_params`, such as `gymnax.make`."""
+        env = copy.copy(self)
+        env._default_params = params
+        return env
 
     def predict(
         self, weights: Any, obs: Float[Array, " obs_dim"], action: Array
