@@ -29,6 +29,7 @@ SCORE_TRANSFORMS = (
 )  # fmt: skip
 UPDATE_RULES = ("authors", "paper")
 AGGREGATES = ("mean", "min")
+AGENT_HPARAMS = ("default", "nes")
 OBJECTIVES = ("max_reward", "reward_threshold")
 
 # Name of the `es` choice -> evosax's class. Listed here because importing evosax takes seconds;
@@ -277,6 +278,31 @@ class LearnConfig:
         return Path(self.run_dir or f"runs/{name}")
 
 
+@dataclass(frozen=True, kw_only=True)
+class EvaluateConfig:
+    """What `sejax.evaluate` takes."""
+
+    proxy: str
+    env: str | None = None
+    agent: AgentConfig = field(default_factory=AgentConfig)
+    agent_hparams: str = "default"
+    training: TrainingConfig = field(default_factory=TrainingConfig)
+    real_training: TrainingConfig = field(default_factory=TrainingConfig)
+    num_agents: int = 10
+    baseline: bool = True
+    seed: int = 0
+    lanes: int | None = None
+    devices: int | None = None
+    out_dir: str | None = None
+
+    def __post_init__(self) -> None:
+        _at_least(1, "num_agents", self.num_agents, "there is nothing to average otherwise", 10)
+        _one_of("agent_hparams", self.agent_hparams, AGENT_HPARAMS)
+        for name in ("lanes", "devices"):
+            if getattr(self, name) is not None:
+                _at_least(1, name, getattr(self, name), "something must compute", "null")
+
+
 def register_evosax_choices() -> None:
     """Makes `es=<name>` known to Hydra for each of evosax's algorithms."""
     for name in EVOSAX_ALGORITHMS:
@@ -306,23 +332,42 @@ def config(overrides: Sequence[str] = ()) -> LearnConfig:
 
 def from_hydra(cfg: DictConfig) -> LearnConfig:
     """The typed and validated configuration of a composed Hydra one."""
-    es_schema = NESConfig if cfg.es.name == "nes" else EvosaxConfig
+    groups = {
+        "env": EnvConfig,
+        "proxy": SyntheticConfig,
+        "agent": DDQNConfig,
+        "es": NESConfig if cfg.es.name == "nes" else EvosaxConfig,
+        "objective": ObjectiveConfig,
+        "training": TrainingConfig,
+    }
+    return _build(LearnConfig, groups, _PlainFields, cfg)
+
+
+def evaluate_from_hydra(cfg: DictConfig) -> EvaluateConfig:
+    """As `from_hydra`, for `sejax.evaluate`.
+
+    Raises:
+      ConfigError: if no proxy is named, or a value is out of range.
+    """
+    if OmegaConf.is_missing(cfg, "proxy"):
+        raise ConfigError(
+            "proxy must be given, because agents are trained on it; got none. Set proxy=RUN_DIR, "
+            "proxy=FILE, proxy=cartpole (a shipped one) or proxy=real env=cartpole."
+        )
+    groups = {"agent": DDQNConfig, "training": TrainingConfig, "real_training": TrainingConfig}
+    return _build(EvaluateConfig, groups, _PlainEvaluateFields, cfg)
+
+
+def _build(schema: type, groups: dict[str, type], plain: type, cfg: DictConfig) -> Any:
+    """An instance of `schema` from a composed configuration; types are OmegaConf's to check."""
     try:
-        groups = {
-            "env": _typed(EnvConfig, cfg, "env"),
-            "proxy": _typed(SyntheticConfig, cfg, "proxy"),
-            "agent": _typed(DDQNConfig, cfg, "agent"),
-            "es": _typed(es_schema, cfg, "es"),
-            "objective": _typed(ObjectiveConfig, cfg, "objective"),
-            "training": _typed(TrainingConfig, cfg, "training"),
-        }
-        plain = {f.name for f in fields(LearnConfig)} - groups.keys()
-        schema = OmegaConf.structured(_PlainFields)
-        values = OmegaConf.merge(schema, {k: cfg[k] for k in plain if k in cfg})
+        typed = {name: _typed(group, cfg, name) for name, group in groups.items()}
+        names = [f.name for f in fields(plain) if f.name in cfg]
+        values = OmegaConf.merge(OmegaConf.structured(plain), {n: cfg[n] for n in names})
     except OmegaConfBaseException as error:
         where = f" in {error.full_key}" if getattr(error, "full_key", None) else ""
         raise ConfigError(f"{str(error.msg or error).splitlines()[0]}{where}.") from error
-    return LearnConfig(**groups, **OmegaConf.to_container(values))  # type: ignore[arg-type]
+    return schema(**typed, **OmegaConf.to_container(values))  # type: ignore[arg-type]
 
 
 def to_dict(cfg: LearnConfig) -> dict[str, Any]:
@@ -352,6 +397,21 @@ class _PlainFields:
     devices: int | None = None
     checkpoint_every: int = 1
     run_dir: str | None = None
+
+
+@dataclass
+class _PlainEvaluateFields:
+    """Types of `EvaluateConfig`'s own fields."""
+
+    proxy: str = ""
+    env: str | None = None
+    agent_hparams: str = "default"
+    num_agents: int = 10
+    baseline: bool = True
+    seed: int = 0
+    lanes: int | None = None
+    devices: int | None = None
+    out_dir: str | None = None
 
 
 def _typed(schema: type, cfg: DictConfig, group: str) -> Any:

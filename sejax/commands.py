@@ -1,0 +1,41 @@
+"""What the commands share: Hydra's start, exit codes, and messages."""
+
+import os
+import sys
+from collections.abc import Callable
+from typing import NoReturn
+
+from hydra.errors import HydraException
+
+from sejax.configs import register_evosax_choices, translate_hydra_error
+from sejax.errors import ConfigError
+
+BAD_INPUT, FAILED, INTERRUPTED = 2, 1, 130
+
+
+def start(main: Callable[[], object]) -> None:
+    """Runs a Hydra main function and turns bad input into one message and exit code 2."""
+    os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra then raises, and the message is ours.
+    register_evosax_choices()
+    try:
+        main()
+    except HydraException as error:
+        fail(str(translate_hydra_error(error)), BAD_INPUT)
+    except ConfigError as error:
+        fail(str(error), BAD_INPUT)
+    except OSError as error:
+        fail(f"A file could not be written or read: {error}. All that was written before is "
+             f"whole; run the same command again to go on from there.", FAILED)  # fmt: skip
+
+
+def fail(message: str, status: int) -> NoReturn:
+    """Prints the message and ends the process."""
+    print(f"error: {message}", file=sys.stderr)
+    sys.exit(status)
+
+
+def leave(status: int) -> NoReturn:
+    """Ends the process at once, even while a program is still running on the devices."""
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(status)

@@ -1,0 +1,133 @@
+"""`python -m sejax.evaluate`: train fresh agents on a stored proxy, test them on the real task."""
+
+import time
+from pathlib import Path
+from typing import Any
+
+import hydra
+from omegaconf import DictConfig
+
+from sejax import commands
+from sejax.configs import EvaluateConfig, evaluate_from_hydra
+from sejax.errors import ConfigError
+
+
+@hydra.main(config_path="conf", config_name="evaluate", version_base="1.3")
+def main(cfg: DictConfig) -> float:
+    """Evaluates as configured and returns the mean test return (for Hydra's sweepers)."""
+    config = evaluate_from_hydra(cfg)
+    from sejax.runtime import configure_xla, enable_compilation_cache
+
+    if "jax" not in __import__("sys").modules:  # a sweep's second job finds it running
+        configure_xla(config.devices)
+        enable_compilation_cache()
+    return evaluate(config)
+
+
+def evaluate(config: EvaluateConfig) -> float:
+    """Trains `num_agents` agents in each world, prints a table and writes CSV, JSON and PNG.
+
+    Returns:
+      The mean test return of the agents trained on the proxy (on the real task for `proxy=real`).
+
+    Raises:
+      ConfigError: for an unknown or damaged proxy, or a task that is not the proxy's.
+    """
+    import pandas as pd
+
+    from sejax import plots
+    from sejax.files import write_text
+
+    task, worlds, agent_config, out_dir = _prepare(config)
+    tables = {
+        name: _train_and_test(config, agent_config, task, *world) for name, world in worlds.items()
+    }
+    table = pd.concat([t.assign(world=name) for name, t in tables.items()])
+    out_dir.mkdir(parents=True, exist_ok=True)
+    write_text(out_dir / "evaluation.csv", table.to_csv(index=False))
+    plots.evaluation(tables, task.solved_reward, out_dir / "evaluation.png")
+    summary = summarise(table)
+    write_text(out_dir / "evaluation.json", summary.to_json(orient="index", indent=2))
+    _print_table(summary, task, config, out_dir)
+    return float(next(iter(tables.values()))["test_return"].mean())
+
+
+def summarise(table: Any) -> Any:
+    """Mean and standard deviation of each column for each world, as a data frame."""
+    columns = ["test_return", "train_steps", "train_episodes"]
+    summary = table.groupby("world", sort=False)[columns].agg(["mean", "std"])
+    summary.columns = [f"{name}_{statistic}" for name, statistic in summary.columns]
+    grouped = table.groupby("world", sort=False)
+    return summary.assign(num_agents=grouped.size(), num_nonfinite=grouped["nonfinite"].sum())
+
+
+def _prepare(config: EvaluateConfig) -> tuple[Any, dict[str, Any], Any, Path]:
+    """The task, the worlds to train in, the agent's configuration and the output folder."""
+    from sejax import envs
+    from sejax.proxies import io as proxy_io
+
+    if config.proxy == "real":
+        if config.env is None:
+            raise ConfigError("env must be given with proxy=real, because the task cannot be read "
+                              "from a proxy; got none. Set env=cartpole.")  # fmt: skip
+        task = envs.make(config.env)
+        worlds = {"the real task": (task.env, task.params, config.real_training)}
+        return task, worlds, config.agent, Path(config.out_dir or f"runs/evaluate-{task.name}")
+    proxy = proxy_io.load_proxy(config.proxy)
+    task = proxy.task
+    if config.env not in (None, task.name):
+        raise ConfigError(f"env must be the proxy's own task, because agents trained on it are "
+                          f"tested there; got {config.env} for a proxy of {task.name}. Set "
+                          f"env={task.name}.")  # fmt: skip
+    worlds = {"the proxy": (proxy.env, proxy.params, config.training)}
+    if config.baseline:
+        worlds["the real task"] = (task.env, task.params, config.real_training)
+    agent = proxy.config.agent if config.agent_hparams == "nes" else config.agent
+    shipped = proxy.path.parent == proxy_io.PRETRAINED_DIR
+    beside = Path(f"runs/evaluate-{proxy.path.stem}") if shipped else proxy.path.parent
+    return task, worlds, agent, Path(config.out_dir or beside)
+
+
+def _train_and_test(
+    config: EvaluateConfig, agent_config: Any, task: Any, env: Any, env_params: Any, training: Any
+) -> Any:
+    import jax
+    import pandas as pd
+
+    from sejax.evaluation import evaluate_agents
+
+    keys = jax.random.split(jax.random.key(config.seed), config.num_agents)
+    started = time.time()
+    outcome = evaluate_agents(
+        agent_config, env, env_params, task, training, keys, config.lanes, config.devices
+    )
+    outcome = jax.device_get(outcome)
+    print(f"{env.name}: {config.num_agents} agents in {time.time() - started:.1f} s", flush=True)
+    return pd.DataFrame({"agent": range(config.num_agents), **vars(outcome)})
+
+
+def _print_table(summary: Any, task: Any, config: EvaluateConfig, out_dir: Path) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(title=f"{config.num_agents} fresh {config.agent.name} agents, tested on "
+                        f"{task.name} (solved at {task.solved_reward:g})")  # fmt: skip
+    for column in ("trained on", "return", "training steps", "training episodes"):
+        table.add_column(column, justify="left" if column == "trained on" else "right")
+    for world, row in summary.iterrows():
+        table.add_row(
+            str(world),
+            f"{row.test_return_mean:.1f} ± {row.test_return_std:.1f}",
+            f"{row.train_steps_mean:,.0f} ± {row.train_steps_std:,.0f}",
+            f"{row.train_episodes_mean:,.1f} ± {row.train_episodes_std:,.1f}",
+        )
+    console = Console(highlight=False)
+    console.print(table)
+    diverged = int(summary["num_nonfinite"].sum())
+    if diverged:
+        console.print(f"{diverged} agents met a number that is not finite.")
+    console.print(f"{out_dir}/evaluation.csv, .json and .png hold every agent.", soft_wrap=True)
+
+
+if __name__ == "__main__":
+    commands.start(main)

@@ -1,0 +1,105 @@
+"""The live progress line of `sejax.run`, and its last words."""
+
+import time
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.panel import Panel
+from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeRemainingColumn
+
+from sejax.configs import LearnConfig
+
+DRAW_EVERY_S = 30.0
+
+
+class RunProgress:
+    """One live line on a terminal; one line for each generation elsewhere."""
+
+    def __init__(self, config: LearnConfig):
+        self._config = config
+        self._console = Console(highlight=False)
+        self._live = self._console.is_terminal
+        self._progress = Progress(
+            SpinnerColumn(),
+            TextColumn("generation {task.completed}/{task.total}"),
+            BarColumn(bar_width=16),
+            TextColumn("{task.description}"),
+            TextColumn("left"),
+            TimeRemainingColumn(elapsed_when_finished=False),
+            console=self._console,
+            disable=not self._live,
+        )
+        self._task = self._progress.add_task("", total=config.generations)
+        self._last = self._drawn = time.time()
+
+    def __enter__(self) -> "RunProgress":
+        self._progress.start()
+        return self
+
+    def __exit__(self, *_: Any) -> None:
+        self._progress.stop()
+
+    def stop(self) -> None:
+        self._progress.stop()
+
+    def say(self, text: str) -> None:
+        """Shows what is being done before the first generation."""
+        self._progress.update(self._task, description=text)
+
+    def print(self, text: str) -> None:
+        """Prints a line that stays."""
+        self._console.print(text, soft_wrap=True)
+
+    def compiled(self) -> None:
+        self.say("first generation")
+        self._last = time.time()
+
+    def update(self, generation: int, info: Any) -> None:
+        """Shows what the last generation of a chunk, leaves `[generation, seed]`, came to."""
+        now = time.time()
+        steps_per_s = np.sum(info.train_steps_total) / max(now - self._last, 1e-9)
+        self._last = now
+        text = (
+            f"incumbent {np.nanmean(info.incumbent_mean[-1]):.1f} ± "
+            f"{np.nanmean(info.incumbent_std[-1]):.1f}, best {np.max(info.best_so_far[-1]):.1f}, "
+            f"{np.mean(info.train_steps_mean[-1]):,.0f} steps an agent, {steps_per_s:,.0f} steps/s"
+        )
+        num_nonfinite = int(np.sum(info.num_nonfinite))
+        if num_nonfinite:
+            text += f", {num_nonfinite} diverged"
+        if self._config.num_seeds > 1:
+            text += f", {int(np.sum(info.active[-1]))} of {self._config.num_seeds} seeds running"
+        self._progress.update(self._task, completed=generation, description=text)
+        if not self._live:
+            self.print(f"generation {generation}/{self._config.generations}: {text}")
+
+    def time_to_draw(self) -> bool:
+        """Whether the picture is old enough to be drawn again."""
+        if time.time() - self._drawn < DRAW_EVERY_S:
+            return False
+        self._drawn = time.time()
+        return True
+
+    def finish(self, directory: Any, program: Any, best: float, ended: str) -> None:
+        """Says how it ended, where everything is, and what to do next."""
+        self.stop()
+        solved = best >= program.task.solved_reward
+        verdict = "solved" if solved else "not solved"
+        path = directory.path
+        self._console.print(
+            Panel(
+                f"{program.task.name}: {verdict}. Best incumbent mean {best:.1f} "
+                f"(solved at {program.task.solved_reward:g}).\n\n"
+                f"{path}/proxy.safetensors     the best proxy\n"
+                f"{path}/learning_curve.png    how it was learned\n"
+                f"{path}/metrics.csv           a row for each generation\n\n"
+                f"Train fresh agents on it, and on the real task beside them:\n"
+                f"  python -m sejax.evaluate proxy={path} num_agents=20\n"
+                f"Use it as a gymnax environment:\n"
+                f'  env, params = sejax.load("{path}")',
+                title="learned" if ended == "finished" else ended,
+                expand=False,
+            ),
+            soft_wrap=True,
+        )
