@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import orbax.checkpoint as ocp
 
 from sejax.files import write_text
@@ -102,6 +103,9 @@ def _without_keys(state: Any) -> Any:
 
 
 def _with_keys(restored: Any, template: Any) -> Any:
+    """Keys wrapped again; through NumPy, so that no leaf is tied to the device it was read on."""
     return jax.tree.map(
-        lambda x, like: jax.random.wrap_key_data(x) if _is_key(like) else x, restored, template
+        lambda x, like: jax.random.wrap_key_data(x) if _is_key(like) else jnp.asarray(x),
+        jax.device_get(restored),
+        template,
     )

@@ -1,11 +1,13 @@
 """What the commands share: Hydra's start, exit codes, and messages."""
 
+import functools
 import os
 import sys
 from collections.abc import Callable
 from typing import NoReturn
 
 from hydra.errors import HydraException
+from omegaconf import DictConfig
 
 from sejax.configs import register_evosax_choices, translate_hydra_error
 from sejax.errors import ConfigError
@@ -14,18 +16,35 @@ BAD_INPUT, FAILED, INTERRUPTED = 2, 1, 130
 
 
 def start(main: Callable[[], object]) -> None:
-    """Runs a Hydra main function and turns bad input into one message and exit code 2."""
+    """Runs a Hydra main function; what Hydra refuses becomes one message and exit code 2."""
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra then raises, and the message is ours.
     register_evosax_choices()
     try:
         main()
     except HydraException as error:
         fail(str(translate_hydra_error(error)), BAD_INPUT)
-    except ConfigError as error:
-        fail(str(error), BAD_INPUT)
-    except OSError as error:
-        fail(f"A file could not be written or read: {error}. All that was written before is "
-             f"whole; run the same command again to go on from there.", FAILED)  # fmt: skip
+
+
+def task(main: Callable[[DictConfig], float]) -> Callable[[DictConfig], float]:
+    """Decorates what Hydra calls: bad input and files that fail become a message and exit code.
+
+    Inside of Hydra's call, as Hydra prints lines of its own for an exception that leaves it.
+    """
+
+    @functools.wraps(main)
+    def guarded(cfg: DictConfig) -> float:
+        try:
+            return main(cfg)
+        except ConfigError as error:
+            fail(str(error), BAD_INPUT)
+        except OSError as error:
+            fail(
+                f"A file could not be written or read: {error}. All that was written before is "
+                f"whole; run the same command again to go on from there.",
+                FAILED,
+            )
+
+    return guarded
 
 
 def fail(message: str, status: int) -> NoReturn:

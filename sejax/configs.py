@@ -18,7 +18,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from sejax.errors import ConfigError, nearest, require, unknown_name
 
-CONF_DIR = Path(__file__).parent / "conf"
+CONF_DIR = Path(__file__).parent / "conf" / "run"
 ACTIVATIONS = ("tanh", "relu", "leaky_relu", "prelu")
 DONE_MODES = ("soft", "threshold")
 STOP_RULES = ("plateau", "solved", "never")
@@ -223,7 +223,7 @@ class EvosaxConfig:
         _positive("es.noise_std", self.noise_std, "candidates must differ", 0.05)
         _positive("es.step_size", self.step_size, "the mean would not move", 0.05)
         require(0 < self.noise_std_decay <= 1, "es.noise_std_decay", "lie in (0, 1]",
-                "it shrinks each generation", self.noise_std_decay, "es.noise_std_decay=1")  # fmt: skip
+                "it shrinks", self.noise_std_decay, "es.noise_std_decay=1")  # fmt: skip
         _at_least(1, "es.num_evals", self.num_evals, "a candidate needs a score", 1)
         _one_of("es.eval_aggregate", self.eval_aggregate, AGGREGATES)
         _one_of("es.name", self.name, tuple(EVOSAX_ALGORITHMS))

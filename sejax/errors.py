@@ -12,7 +12,8 @@ def unknown_name(field: str, got: str, known: Iterable[str]) -> ConfigError:
     """Error for an unknown choice; lists the known ones, nearest first, and names the override."""
     ranked = nearest(got, known)
     return ConfigError(
-        f"{field} must be one of {', '.join(ranked)}; got {got!r}. Did you mean {field}={ranked[0]}?"
+        f"{field} must be one of {', '.join(ranked)}; got {got!r}. "
+        f"Did you mean {field}={ranked[0]}?"
     )
 
 

@@ -1,5 +1,6 @@
 """`python -m sejax.evaluate`: train fresh agents on a stored proxy, test them on the real task."""
 
+import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -12,13 +13,14 @@ from sejax.configs import EvaluateConfig, evaluate_from_hydra
 from sejax.errors import ConfigError
 
 
-@hydra.main(config_path="conf", config_name="evaluate", version_base="1.3")
+@hydra.main(config_path="conf/evaluate", config_name="evaluate", version_base="1.3")
+@commands.task
 def main(cfg: DictConfig) -> float:
     """Evaluates as configured and returns the mean test return (for Hydra's sweepers)."""
     config = evaluate_from_hydra(cfg)
     from sejax.runtime import configure_xla, enable_compilation_cache
 
-    if "jax" not in __import__("sys").modules:  # a sweep's second job finds it running
+    if "jax" not in sys.modules:  # a sweep's second job finds it running
         configure_xla(config.devices)
         enable_compilation_cache()
     return evaluate(config)

@@ -43,8 +43,8 @@ class Dense(nn.Module):
 class MLP(nn.Module):
     """`num_layers` hidden layers of `hidden_size` units with an activation, then a linear head.
 
-    `activation` is one of `config.ACTIVATIONS`. PReLU has one slope for the whole network, as in the
-    authors' code. `learn_prelu_slope` makes it a parameter (agents); otherwise it stays at 0.25
+    `activation` is one of `configs.ACTIVATIONS`. PReLU has one slope for the whole network, as in
+    the authors' code. `learn_prelu_slope` makes it a parameter (agents); otherwise it stays at 0.25
     (proxies: the authors' NES perturbs the weights and biases of linear layers only).
 
     Source: paper, appendix "SE hyperparameters"; `reference_details.md` 1.10 and 1.11.

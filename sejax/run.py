@@ -4,6 +4,7 @@ Running the same command on an existing run directory goes on where it stopped.
 """
 
 import platform
+import sys
 import time
 from typing import Any
 
@@ -14,13 +15,14 @@ from sejax import commands
 from sejax.configs import LearnConfig, from_hydra
 
 
-@hydra.main(config_path="conf", config_name="run", version_base="1.3")
+@hydra.main(config_path="conf/run", config_name="run", version_base="1.3")
+@commands.task
 def main(cfg: DictConfig) -> float:
     """Learns a proxy as configured and returns the best incumbent mean (for Hydra's sweepers)."""
     config = from_hydra(cfg)
     from sejax.runtime import configure_xla
 
-    if "jax" not in __import__("sys").modules:  # a sweep's second job finds it running
+    if "jax" not in sys.modules:  # a sweep's second job finds it running
         configure_xla(config.devices)
     return learn(config)
 

@@ -240,7 +240,7 @@ def is_solved(
 
 
 def make_tester(agent: Agent, task: Any, num_episodes: int) -> Callable[..., Any]:
-    """Builds `test(key, agent_state, active=True) -> (returns [num_episodes], steps [num_episodes])`.
+    """Builds `test(key, agent_state, active=True) -> (returns, steps)`, both `[num_episodes]`.
 
     Episodes on the real task without exploration, each from a fresh initial state.
 

@@ -73,7 +73,7 @@ def single_better(scores: Scores, incumbent: Float[Array, ""]) -> Scores:
 def all_better_1(scores: Scores, incumbent: Float[Array, ""]) -> Scores:
     r"""Weighs the members that beat the incumbent by how much, the best with 1.
 
-    .. math:: F_i \propto (K_i - K_\psi) / (\max K - K_\psi) \text{ if } K_i > K_\psi, \text{ else } 0
+    .. math:: F_i = \max(0, K_i - K_\psi) / (\max K - K_\psi)
     """
     advantage = _advantage(scores, incumbent)
     return _safe_divide(advantage, advantage.max())

@@ -1,0 +1,1 @@
+"""Groups that more than one command takes."""

@@ -1,0 +1,54 @@
+"""How every test runs: two CPU devices, warnings as errors, compiled programs kept between runs."""
+
+import hashlib
+import os
+import platform
+from pathlib import Path
+
+_FLAGS = (
+    "--xla_force_host_platform_device_count=2",
+    "--xla_cpu_multi_thread_eigen=false",
+    "--xla_cpu_collective_call_warn_stuck_timeout_seconds=100000",
+    "--xla_cpu_collective_call_terminate_timeout_seconds=100000",
+)
+os.environ["XLA_FLAGS"] = " ".join([os.environ.get("XLA_FLAGS", ""), *_FLAGS]).strip()
+os.environ.setdefault("JAX_PLATFORMS", "cpu")
+
+import hypothesis  # noqa: E402
+import jax  # noqa: E402
+import pytest  # noqa: E402
+
+
+def _cpu_model() -> str:
+    """Model and instruction sets: a program compiled for one CPU may crash on another."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        return platform.processor()
+    wanted = ("model name", "flags", "Features", "CPU part")
+    return "\n".join(sorted({line for line in lines if line.startswith(wanted)}))
+
+
+def _compilation_cache() -> Path:
+    base = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache"))
+    return base / "sejax-tests" / hashlib.sha256(_cpu_model().encode()).hexdigest()[:16]
+
+
+jax.config.update("jax_compilation_cache_dir", str(_compilation_cache()))
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
+
+# Compilation happens inside examples, so that their duration says nothing.
+hypothesis.settings.register_profile(
+    "sejax", deadline=None, derandomize=True, max_examples=30, database=None
+)
+hypothesis.settings.load_profile("sejax")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    config.addinivalue_line("filterwarnings", "error")
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _two_cpu_devices():
+    if jax.device_count() < 2:
+        pytest.exit("jax was initialised before conftest.py could ask for two CPU devices", 3)
