@@ -5,7 +5,6 @@ from typing import Any
 
 import numpy as np
 from rich.console import Console
-from rich.panel import Panel
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeRemainingColumn
 
 from sejax.configs import LearnConfig
@@ -87,19 +86,16 @@ class RunProgress:
         solved = best >= program.task.solved_reward
         verdict = "solved" if solved else "not solved"
         path = directory.path
-        self._console.print(
-            Panel(
-                f"{program.task.name}: {verdict}. Best incumbent mean {best:.1f} "
-                f"(solved at {program.task.solved_reward:g}).\n\n"
-                f"{path}/proxy.safetensors     the best proxy\n"
-                f"{path}/learning_curve.png    how it was learned\n"
-                f"{path}/metrics.csv           a row for each generation\n\n"
-                f"Train fresh agents on it, and on the real task beside them:\n"
-                f"  python -m sejax.evaluate proxy={path} num_agents=20\n"
-                f"Use it as a gymnax environment:\n"
-                f'  env, params = sejax.load("{path}")',
-                title="learned" if ended == "finished" else ended,
-                expand=False,
-            ),
-            soft_wrap=True,
+        title = "learned" if ended == "finished" else ended
+        self._console.rule(f"{program.task.name}: {title}", align="left")
+        self.print(
+            f"{verdict}: best incumbent mean {best:.1f}, solved at "
+            f"{program.task.solved_reward:g}\n\n"
+            f"  {path}/proxy.safetensors    the best proxy\n"
+            f"  {path}/learning_curve.png   how it was learned\n"
+            f"  {path}/metrics.csv          a row for each generation\n\n"
+            f"Train fresh agents on it, and on the real task beside them:\n"
+            f"  python -m sejax.evaluate proxy={path} num_agents=20\n"
+            f"Use it as a gymnax environment:\n"
+            f'  env, params = sejax.load("{path}")'
         )

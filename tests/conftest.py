@@ -35,7 +35,8 @@ def _compilation_cache() -> Path:
 
 
 jax.config.update("jax_compilation_cache_dir", str(_compilation_cache()))
-jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.05)
+jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)
 
 # Compilation happens inside examples, so that their duration says nothing.
 hypothesis.settings.register_profile(
@@ -46,6 +47,8 @@ hypothesis.settings.load_profile("sejax")
 
 def pytest_configure(config: pytest.Config) -> None:
     config.addinivalue_line("filterwarnings", "error")
+    # A cache that cannot be read or written costs time and fails nothing.
+    config.addinivalue_line("filterwarnings", "ignore:.*persistent compilation cache:UserWarning")
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -4,37 +4,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from support import numpy_forward
 
 from sejax.configs import ACTIVATIONS
 from sejax.networks import MLP, PRELU_SLOPE
 
-NUMPY_ACTIVATIONS = {
-    "tanh": np.tanh,
-    "relu": lambda x: np.maximum(x, 0),
-    "leaky_relu": lambda x: np.where(x >= 0, x, 0.01 * x),
-    "prelu": lambda x: np.where(x >= 0, x, 0.25 * x),
-}
-
-
-def numpy_forward(params, x, activation, num_layers, prelu_slope=0.25):
-    """The MLP on a single input `[in]`, by plain loops over units."""
-    activate = NUMPY_ACTIVATIONS[activation]
-    if activation == "prelu":
-        activate = lambda x: np.where(x >= 0, x, prelu_slope * x)  # noqa: E731
-    for layer in range(num_layers + 1):
-        kernel = np.asarray(params[f"Dense_{layer}"]["kernel"], np.float64)
-        bias = np.asarray(params[f"Dense_{layer}"]["bias"], np.float64)
-        x = np.array(
-            [sum(w * v for w, v in zip(row, x, strict=True)) for row in kernel]
-        ) + bias
-        if layer < num_layers:
-            x = activate(x)
-    return x
-
 
 def test_initial_weights_and_biases_are_uniform_within_one_over_root_fan_in():
     net = MLP(num_outputs=50, hidden_size=200, num_layers=2, activation="relu")
-    params = net.init(jax.random.key(0), jnp.zeros(9))["params"]
+    params = jax.jit(net.init)(jax.random.key(0), jnp.zeros(9))["params"]
     # fan-in of each layer: the input, then the hidden size twice; for biases that of their layer.
     for layer, (fan_in, fan_out) in enumerate([(9, 200), (200, 200), (200, 50)]):
         bound = fan_in**-0.5
@@ -51,7 +29,7 @@ def test_initial_weights_and_biases_are_uniform_within_one_over_root_fan_in():
 
 def test_layers_are_initialised_independently():
     net = MLP(num_outputs=8, hidden_size=8, num_layers=2, activation="relu")
-    params = net.init(jax.random.key(0), jnp.zeros(8))["params"]
+    params = jax.jit(net.init)(jax.random.key(0), jnp.zeros(8))["params"]
     kernels = [np.asarray(params[f"Dense_{i}"]["kernel"]).ravel() for i in range(3)]
     correlations = np.corrcoef(kernels)[np.triu_indices(3, 1)]
     assert np.abs(correlations).max() < 5 / np.sqrt(64)
@@ -61,7 +39,7 @@ def test_layers_are_initialised_independently():
 @pytest.mark.parametrize("activation", ACTIVATIONS)
 def test_forward_equals_a_numpy_loop(activation, num_layers):
     net = MLP(num_outputs=3, hidden_size=5, num_layers=num_layers, activation=activation)
-    params = net.init(jax.random.key(1), jnp.zeros(4))["params"]
+    params = jax.jit(net.init)(jax.random.key(1), jnp.zeros(4))["params"]
     for x in np.random.default_rng(0).normal(size=(5, 4)) * 2:
         expected = numpy_forward(params, x, activation, num_layers)
         got = net.apply({"params": params}, jnp.float32(x))
@@ -70,7 +48,7 @@ def test_forward_equals_a_numpy_loop(activation, num_layers):
 
 def test_a_feature_major_batch_equals_single_inputs():
     net = MLP(num_outputs=3, hidden_size=5, num_layers=2, activation="tanh")
-    variables = net.init(jax.random.key(2), jnp.zeros(4))
+    variables = jax.jit(net.init)(jax.random.key(2), jnp.zeros(4))
     batch = jax.random.normal(jax.random.key(3), (4, 7))  # [feature, batch]
     together = net.apply(variables, batch)
     assert together.shape == (3, 7)
@@ -81,14 +59,14 @@ def test_a_feature_major_batch_equals_single_inputs():
 
 def test_the_prelu_slope_of_a_proxy_is_fixed_and_no_parameter():
     net = MLP(num_outputs=1, hidden_size=3, num_layers=2, activation="prelu")
-    params = net.init(jax.random.key(0), jnp.zeros(2))["params"]
+    params = jax.jit(net.init)(jax.random.key(0), jnp.zeros(2))["params"]
     assert set(params) == {"Dense_0", "Dense_1", "Dense_2"}
     assert PRELU_SLOPE == 0.25
 
 
 def test_a_learned_prelu_slope_is_one_parameter_of_the_whole_network():
     net = MLP(3, hidden_size=5, num_layers=2, activation="prelu", learn_prelu_slope=True)
-    params = net.init(jax.random.key(0), jnp.zeros(4))["params"]
+    params = jax.jit(net.init)(jax.random.key(0), jnp.zeros(4))["params"]
     assert params["prelu_slope"].shape == () and params["prelu_slope"] == 0.25
     params = {**params, "prelu_slope": jnp.float32(0.6)}
     x = np.array([0.3, -1.0, 2.0, -0.5])
@@ -101,5 +79,5 @@ def test_a_learned_prelu_slope_is_one_parameter_of_the_whole_network():
 
 def test_other_activations_have_no_slope_to_learn():
     net = MLP(3, hidden_size=5, num_layers=1, activation="tanh", learn_prelu_slope=True)
-    params = net.init(jax.random.key(0), jnp.zeros(4))["params"]
+    params = jax.jit(net.init)(jax.random.key(0), jnp.zeros(4))["params"]
     assert set(params) == {"Dense_0", "Dense_1"}

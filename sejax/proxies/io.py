@@ -21,7 +21,7 @@ from sejax.errors import ConfigError, require, unknown_name
 from sejax.files import atomic_path
 from sejax.proxies.synthetic import SyntheticEnv, SyntheticParams, make_synthetic
 
-FORMAT_VERSION = "1"
+FORMAT_VERSION = 1
 PRETRAINED_DIR = Path(__file__).parents[1] / "pretrained"
 
 
@@ -52,11 +52,12 @@ def save(path: str | Path, config: LearnConfig, weights: Any, **metadata: Any) -
     Raises:
       OSError: if it cannot be written; an older file stays as it was.
     """
-    header = {"format_version": FORMAT_VERSION, "config": json.dumps(to_dict(config)),
-              **{key: json.dumps(value) for key, value in metadata.items()}}  # fmt: skip
+    header = {"format_version": FORMAT_VERSION, **metadata}
+    header["config"] = to_dict(config) | {"run_dir": None}  # no path of the machine that made it
     tensors = {name: np.asarray(x) for name, x in flatten_dict(weights, sep="/").items()}
     with atomic_path(Path(path)) as temporary:
-        save_file(tensors, temporary, metadata=header)
+        # One entry: safetensors writes several in random order.
+        save_file(tensors, temporary, metadata={"sejax": json.dumps(header)})
 
 
 def load(source: str | Path) -> tuple[SyntheticEnv, SyntheticParams]:
@@ -84,13 +85,16 @@ def load_proxy(source: str | Path) -> Proxy:
     path = find(source)
     tensors, header = _read(path)
     try:
-        metadata = {key: json.loads(value) for key, value in header.items() if key != "config"}
-        config = from_dict(json.loads(header["config"]))
+        metadata = json.loads(header["sejax"])
+        config = from_dict(metadata.pop("config"))
     except (KeyError, ValueError) as error:
         raise ConfigError(
             f"proxy must be a file that sejax has written, because the network is rebuilt from its "
             f"metadata; {path} has none that is valid ({error}). Learn it again with sejax.run."
         ) from error
+    require(metadata["format_version"] == FORMAT_VERSION, "proxy",
+            f"be of format {FORMAT_VERSION}", "this version of sejax reads no other",
+            metadata["format_version"], "proxy to a file of this version")  # fmt: skip
     env = make_synthetic(envs.make(config.env.name), config.proxy)
     weights = unflatten_dict({tuple(name.split("/")): x for name, x in tensors.items()})
     _check_shapes(path, env, weights)

@@ -1,0 +1,163 @@
+"""What the benchmarks share: arguments, measuring subprocesses, tables and the RESULT line.
+
+Each benchmark is a parent that only asks and prints, and *sides*: subprocesses of the same script
+(`--side NAME`) that set up their own threads and devices, compile, and then measure on request.
+Settings of one side never reach another, and a side starts once, however often it measures.
+"""
+
+import argparse
+import json
+import os
+import platform
+import resource
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Sequence
+from importlib.metadata import version
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+Handler = Callable[[dict[str, Any]], dict[str, Any]]
+
+
+def parse_args(
+    description: str | None, add_options: Callable[[argparse.ArgumentParser], None]
+) -> argparse.Namespace:
+    """Arguments that every benchmark takes, and its own; `--side` is for its subprocesses."""
+    summary = (description or "").partition("\n")[0]
+    parser = argparse.ArgumentParser(description=summary)
+    parser.add_argument("--quick", action="store_true", help="a small version, in under 50 seconds")
+    parser.add_argument("--json", type=Path, metavar="PATH", help="write the result there as well")
+    parser.add_argument("--seed", type=int, default=0, help="of the first proxy and agents")
+    parser.add_argument("--side", help=argparse.SUPPRESS)
+    add_options(parser)
+    return parser.parse_args()
+
+
+class Side:
+    """A subprocess that answers requests, a JSON object on a line each way."""
+
+    def __init__(self, script: str, name: str, *options: object, env: dict[str, str] | None = None):
+        command = [sys.executable, script, "--side", name, *map(str, options)]
+        self.name = name
+        self._process = subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+            env=os.environ | (env or {}),
+        )  # fmt: skip
+        self.ready = self._read()
+
+    def ask(self, **request: Any) -> dict[str, Any]:
+        """The side's answer.
+
+        Raises:
+          RuntimeError: if the side has ended; its own error is on stderr.
+        """
+        assert self._process.stdin is not None
+        self._process.stdin.write(json.dumps(request) + "\n")
+        self._process.stdin.flush()
+        return self._read()
+
+    def close(self) -> None:
+        """Lets the side end and waits for it."""
+        assert self._process.stdin is not None
+        self._process.stdin.close()
+        self._process.wait()
+
+    def __enter__(self) -> "Side":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _read(self) -> dict[str, Any]:
+        assert self._process.stdout is not None
+        line = self._process.stdout.readline()
+        if not line:
+            status = self._process.wait()
+            raise RuntimeError(f"side {self.name!r} ended with status {status}; see its error above.")
+        return json.loads(line)
+
+
+def serve(ready: dict[str, Any], handle: Handler) -> None:
+    """A side's main loop: says that it is ready, then answers until its input ends."""
+    print(json.dumps(ready), flush=True)
+    for line in sys.stdin:
+        print(json.dumps(handle(json.loads(line))), flush=True)
+
+
+def measure(fn: Callable[[], Any]) -> tuple[Any, dict[str, float]]:
+    """What `fn` returns, and its wall-clock and CPU seconds (all threads of this process)."""
+    wall, cpu = time.perf_counter(), time.process_time()
+    out = fn()
+    return out, {"wall_s": time.perf_counter() - wall, "cpu_s": time.process_time() - cpu}
+
+
+def use_one_core(core: int) -> None:
+    """Keeps this process, and XLA's thread pool if it comes later, to one core."""
+    os.environ["NPROC"] = "1"  # XLA sizes its pool by it; a larger one spins and doubles CPU time
+    os.sched_setaffinity(0, {core})
+
+
+def available_cores() -> list[int]:
+    """Numbers of the cores that this process may use."""
+    return sorted(os.sched_getaffinity(0))
+
+
+def peak_memory_mib() -> float:
+    """The most memory that this process has held so far."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+
+
+def spread(values: Sequence[float]) -> dict[str, float]:
+    """Median, smallest and largest of repeated measurements."""
+    return {"median": median(values), "min": min(values), "max": max(values)}
+
+
+def show_spread(values: dict[str, float], digits: int = 1) -> str:
+    """`median (min to max)`."""
+    middle, low, high = (f"{values[k]:,.{digits}f}" for k in ("median", "min", "max"))
+    return f"{middle} ({low} to {high})"
+
+
+def machine() -> dict[str, Any]:
+    """Where this was measured; the load before the start says how busy the machine was."""
+    return {
+        "cpu": _cpu_model(),
+        "cores": len(available_cores()),
+        "load_before": round(os.getloadavg()[0], 2),
+        "python": platform.python_version(),
+        **{package: version(package) for package in ("jax", "torch", "sejax")},
+    }
+
+
+def _cpu_model() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        return platform.processor()
+    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.processor()
+
+
+def print_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[object]]) -> None:
+    """Prints rows; the first column is text, the others are numbers."""
+    table = Table(title=title, title_justify="left")
+    for i, column in enumerate(columns):
+        table.add_column(column, justify="right" if i else "left")
+    for row in rows:
+        table.add_row(*map(str, row))
+    Console().print(table)
+
+
+def finish(benchmark: str, args: argparse.Namespace, result: dict[str, Any]) -> None:
+    """Writes the JSON file, if asked for, and prints the RESULT line, which comes last."""
+    result = {"benchmark": benchmark, "quick": args.quick} | result
+    if args.json:
+        args.json.parent.mkdir(parents=True, exist_ok=True)
+        args.json.write_text(json.dumps(result, indent=2) + "\n")
+    print(f"RESULT {json.dumps(result)}")

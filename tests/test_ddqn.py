@@ -1,0 +1,310 @@
+"""sejax.agents.ddqn: targets by hand, updates against torch, exploration, and a probe MDP."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import torch
+from jax.flatten_util import ravel_pytree
+
+from sejax.agents.ddqn import DDQNHparams, double_q_targets, make_ddqn, select_action
+from sejax.agents.replay import Transition
+from sejax.configs import DDQNConfig
+from sejax.networks import MLP
+
+OBS_DIM, NUM_ACTIONS, BATCH = 3, 2, 7
+CONFIG = DDQNConfig(
+    hidden_size=5, num_layers=2, activation="tanh", batch_size=BATCH,
+    learning_rate=0.01, target_update_rate=0.1, discount=0.9,
+)  # fmt: skip
+
+
+def random_batch(seed, discount=None):
+    rng = np.random.default_rng(seed)
+    columns = {
+        "obs": rng.normal(size=(OBS_DIM, BATCH)),
+        "reward": rng.normal(size=BATCH),
+        "discount": rng.uniform(-0.2, 1.2, BATCH) if discount is None else np.full(BATCH, discount),
+        "next_obs": rng.normal(size=(OBS_DIM, BATCH)),
+    }
+    action = jnp.int32(rng.integers(0, NUM_ACTIONS, BATCH))
+    return Transition(action=action, **{k: jnp.float32(v) for k, v in columns.items()})
+
+
+@pytest.fixture(scope="module")
+def agent():
+    return make_ddqn(CONFIG, OBS_DIM, NUM_ACTIONS)
+
+
+@pytest.fixture(scope="module")
+def state(agent):
+    return jax.jit(agent.init)(jax.random.key(1), agent.hparams)
+
+
+def q_network(config):
+    """The agent's network and the function from its flat parameters to the nested ones."""
+    net = MLP(
+        NUM_ACTIONS, config.hidden_size, config.num_layers, config.activation,
+        learn_prelu_slope=True,
+    )  # fmt: skip
+    _, unravel = ravel_pytree(net.init(jax.random.key(0), jnp.zeros(OBS_DIM)))
+    return net, lambda flat: unravel(flat)["params"]
+
+
+# --- the targets, by hand ------------------------------------------------------------------------
+
+
+def test_targets_take_the_online_networks_action_and_the_target_networks_value():
+    # Columns are next states, rows actions.
+    online = jnp.array([[1.0, 5.0, 2.0], [3.0, 4.0, 2.0]])  # best actions: 1, 0, 0 (first of equals)
+    target = jnp.array([[10.0, 20.0, 30.0], [40.0, 50.0, 60.0]])  # values there: 40, 20, 30
+    reward = jnp.array([1.0, -1.0, 0.5])
+    discount = jnp.array([0.9, 0.5, 0.0])
+    # 1 + 0.9 * 40 = 37;  -1 + 0.5 * 20 = 9;  0.5 + 0 * 30 = 0.5.
+    # Taking the maximum of the target network instead would give 37, 24 and 0.5.
+    np.testing.assert_allclose(double_q_targets(online, target, reward, discount), [37.0, 9.0, 0.5])
+
+
+def test_select_action_picks_each_columns_entry():
+    q_values = jnp.array([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]])
+    np.testing.assert_array_equal(select_action(q_values, jnp.array([1, 0, 1])), [4.0, 2.0, 6.0])
+
+
+# --- updates against torch -----------------------------------------------------------------------
+
+
+class TorchDDQN:
+    """The same agent in torch, from the same parameters."""
+
+    def __init__(self, params, config):
+        self.config = config
+        self.online, self.slope = self._network(params)
+        self.target, self.target_slope = self._network(params)
+        parameters = [*self.online.parameters()] + ([self.slope] if self.slope is not None else [])
+        self.optimizer = torch.optim.Adam(parameters, lr=config.learning_rate)
+
+    def _network(self, params):
+        layers = []
+        for i in range(self.config.num_layers + 1):
+            kernel, bias = params[f"Dense_{i}"]["kernel"], params[f"Dense_{i}"]["bias"]
+            layer = torch.nn.Linear(kernel.shape[1], kernel.shape[0])
+            layer.weight.data = torch.tensor(np.array(kernel))
+            layer.bias.data = torch.tensor(np.array(bias))
+            layers.append(layer)
+        slope = params.get("prelu_slope")
+        slope = None if slope is None else torch.nn.Parameter(torch.tensor([float(slope)]))
+        return torch.nn.ModuleList(layers), slope
+
+    def q_values(self, layers, slope, x):
+        activate = {
+            "tanh": torch.tanh,
+            "relu": torch.relu,
+            "leaky_relu": torch.nn.functional.leaky_relu,
+            "prelu": lambda h: torch.nn.functional.prelu(h, slope),
+        }[self.config.activation]
+        for layer in layers[:-1]:
+            x = activate(layer(x))
+        return layers[-1](x)
+
+    def update(self, batch):
+        tensors = Transition(*(torch.tensor(np.array(x)) for x in batch))
+        obs, next_obs = tensors.obs.T, tensors.next_obs.T
+        q = self.q_values(self.online, self.slope, obs)
+        q = q.gather(1, tensors.action.long()[:, None])[:, 0]
+        with torch.no_grad():
+            best = self.q_values(self.online, self.slope, next_obs).argmax(1)
+            values = self.q_values(self.target, self.target_slope, next_obs)
+            value = values.gather(1, best[:, None])[:, 0]
+            goal = tensors.reward + self.config.discount * tensors.discount * value
+        loss = torch.nn.functional.mse_loss(q, goal)
+        self.optimizer.zero_grad()
+        loss.backward()
+        self.optimizer.step()
+        tau = self.config.target_update_rate
+        with torch.no_grad():
+            pairs = [*zip(self.target.parameters(), self.online.parameters(), strict=True)]
+            if self.slope is not None:
+                pairs.append((self.target_slope, self.slope))
+            for slow, fast in pairs:
+                slow.copy_(tau * fast + (1 - tau) * slow)
+
+    def arrays(self, layers, slope):
+        out = {
+            f"Dense_{i}": {"kernel": m.weight.detach().numpy(), "bias": m.bias.detach().numpy()}
+            for i, m in enumerate(layers)
+        }
+        return out if slope is None else {**out, "prelu_slope": slope.detach().numpy()[0]}
+
+
+@pytest.mark.parametrize("activation", ["tanh", "relu", "leaky_relu", "prelu"])
+def test_updates_equal_torchs_on_the_same_batches(activation):
+    config = DDQNConfig(**{**vars(CONFIG), "activation": activation})
+    agent = make_ddqn(config, OBS_DIM, NUM_ACTIONS)
+    _, nested = q_network(config)
+    state = jax.jit(agent.init)(jax.random.key(1), agent.hparams)
+    reference = TorchDDQN(nested(state.params), config)
+    update = jax.jit(agent.update)
+    for number in range(1, 6):
+        batch = random_batch(number)
+        state = update(jax.random.key(0), state, batch)
+        reference.update(batch)
+        if number in (1, 5):
+            for got, layers, slope in (
+                (state.params, reference.online, reference.slope),
+                (state.target_params, reference.target, reference.target_slope),
+            ):
+                expected, _ = ravel_pytree(reference.arrays(layers, slope))
+                flat, _ = ravel_pytree(nested(got))
+                np.testing.assert_allclose(flat, expected, rtol=1e-5, atol=2e-6)
+
+
+def test_the_first_adam_step_moves_each_weight_by_the_learning_rate(agent, state):
+    # Adam's first direction is g / (|g| + 1e-8): a sign, wherever the gradient is not tiny.
+    after = jax.jit(agent.update)(jax.random.key(0), state, random_batch(0))
+    np.testing.assert_allclose(np.abs(after.params - state.params), 0.01, rtol=1e-3)
+
+
+def test_the_target_network_starts_as_a_copy_and_follows_softly(agent, state):
+    np.testing.assert_array_equal(state.target_params, state.params)
+    after = jax.jit(agent.update)(jax.random.key(0), state, random_batch(0))
+    expected = 0.1 * after.params + 0.9 * state.target_params
+    np.testing.assert_allclose(after.target_params, expected, rtol=1e-6)
+
+
+def test_a_transition_with_discount_zero_ignores_its_next_state(agent, state):
+    update = jax.jit(agent.update)
+
+    def gradient(batch):
+        return update(jax.random.key(0), state, batch).opt_state.mu  # Adam's first mean: 0.1 g
+
+    batch = random_batch(0, discount=0.0)
+    elsewhere = batch._replace(next_obs=batch.next_obs + 3.0)
+    np.testing.assert_array_equal(gradient(batch), gradient(elsewhere))
+    bootstrapping = jnp.ones(BATCH)
+    a, b = (gradient(x._replace(discount=bootstrapping)) for x in (batch, elsewhere))
+    assert np.abs(a - b).max() > 1e-3
+
+
+def test_hyperparameters_are_traced_so_that_a_population_may_vary_them(agent):
+    key, batch = jax.random.key(1), random_batch(0)
+    rates = jnp.array([0.0, 0.01, 0.1])
+
+    def after(rate):
+        state = agent.init(key, agent.hparams._replace(learning_rate=rate))
+        return agent.update(key, state, batch).params - state.params
+
+    moved = jax.jit(jax.vmap(after))(rates)
+    np.testing.assert_array_equal(moved[0], 0.0)
+    np.testing.assert_allclose(moved[2], 10 * moved[1], rtol=1e-3, atol=1e-6)
+
+
+# --- exploration ---------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def epsilon_in(agent, state):
+    """Epsilon in each of these episodes, with these hyperparameters."""
+    begin = jax.jit(agent.begin_episode)
+
+    def epsilons(episodes, **hparams):
+        changed = state.replace(hparams=state.hparams._replace(**hparams))
+        return [float(begin(changed, jnp.int32(n)).epsilon) for n in episodes]
+
+    return epsilons
+
+
+def test_epsilon_decays_by_a_factor_each_episode_down_to_its_minimum(epsilon_in):
+    # 0.8, 0.4, 0.2, then max(0.1, 0.15) = 0.15.
+    got = epsilon_in(range(6), epsilon_init=0.8, epsilon_decay=0.5, epsilon_min=0.15)
+    np.testing.assert_allclose(got, [0.8, 0.4, 0.2, 0.15, 0.15, 0.15], rtol=1e-6)
+
+
+def test_epsilon_with_decay_zero_is_initial_once_and_minimal_ever_after(epsilon_in):
+    got = epsilon_in(range(4), epsilon_init=0.8, epsilon_decay=0.0, epsilon_min=0.1)
+    np.testing.assert_allclose(got, [0.8, 0.1, 0.1, 0.1], rtol=1e-6)
+
+
+def test_the_first_episode_uses_the_initial_epsilon_even_below_the_minimum(epsilon_in):
+    got = epsilon_in(range(3), epsilon_init=0.05, epsilon_decay=0.9, epsilon_min=0.1)
+    np.testing.assert_allclose(got, [0.05, 0.1, 0.1], rtol=1e-6)
+
+
+def test_epsilon_after_a_thousand_episodes_is_minimal(epsilon_in):
+    got = epsilon_in([1000], epsilon_init=1.0, epsilon_decay=0.9, epsilon_min=0.01)
+    np.testing.assert_allclose(got, [0.01], rtol=1e-6)
+
+
+@pytest.fixture(scope="module")
+def draw_actions():
+    """Exploring actions of 4000 keys and the greedy one, by epsilon; three actions."""
+    agent = make_ddqn(CONFIG, OBS_DIM, num_actions=3)
+    obs = jnp.array([0.3, -0.2, 0.5])
+    state = jax.jit(agent.init)(jax.random.key(0), agent.hparams)
+    keys = jax.random.split(jax.random.key(1), 4000)
+
+    @jax.jit
+    def draw(epsilon):
+        act = jax.vmap(agent.act, (0, None, None, None))
+        explorer = state.replace(epsilon=epsilon)
+        return act(keys, explorer, obs, True), act(keys, explorer, obs, False)
+
+    net = MLP(3, CONFIG.hidden_size, CONFIG.num_layers, CONFIG.activation)
+    _, unravel = ravel_pytree(net.init(jax.random.key(0), obs))
+    return draw, int(np.argmax(net.apply(unravel(state.params), obs)))
+
+
+@pytest.mark.parametrize("epsilon", [0.0, 0.3, 1.0])
+def test_actions_are_random_with_probability_epsilon_and_greedy_otherwise(draw_actions, epsilon):
+    draw, best = draw_actions
+    drawn, greedy = draw(jnp.float32(epsilon))
+    assert drawn.dtype == jnp.int32
+    np.testing.assert_array_equal(greedy, best)
+    # Random actions are uniform, the greedy one included.
+    expected = np.full(3, epsilon / 3)
+    expected[best] += 1 - epsilon
+    share = np.bincount(drawn, minlength=3) / drawn.size
+    deviation = np.sqrt(expected * (1 - expected) / drawn.size)
+    assert (np.abs(share - expected) <= 5 * deviation + 1e-7).all()
+
+
+# --- probe ---------------------------------------------------------------------------------------
+
+
+def test_a_two_step_probe_learns_gamma_and_one():
+    # A -> B with reward 0, B -> end with reward 1, whatever the action. Hence Q(B) = 1, as nothing
+    # follows, and Q(A) = 0 + gamma * Q(B) = gamma. The end looks like A: bootstrapping there
+    # would be seen.
+    gamma = 0.7
+    config = DDQNConfig(
+        hidden_size=8, num_layers=1, activation="tanh", learning_rate=0.02,
+        target_update_rate=0.1, discount=gamma,
+    )  # fmt: skip
+    agent = make_ddqn(config, obs_dim=2, num_actions=2)
+    a, b = [1.0, 0.0], [0.0, 1.0]
+    batch = Transition(
+        obs=jnp.array([a, a, b, b]).T,
+        action=jnp.array([0, 1, 0, 1]),
+        reward=jnp.array([0.0, 0.0, 1.0, 1.0]),
+        discount=jnp.array([1.0, 1.0, 0.0, 0.0]),
+        next_obs=jnp.array([b, b, a, a]).T,
+    )
+
+    def step(state, _):
+        return agent.update(jax.random.key(0), state, batch), None
+
+    def learn(key):
+        return jax.lax.scan(step, agent.init(key, agent.hparams), length=600)
+
+    state, _ = jax.jit(learn)(jax.random.key(0))
+    net = MLP(2, 8, 1, "tanh")
+    _, unravel = ravel_pytree(net.init(jax.random.key(0), jnp.zeros(2)))
+    q_values = net.apply(unravel(state.params), jnp.array([a, b]).T)  # [actions, (A, B)]
+    np.testing.assert_allclose(q_values, [[gamma, 1.0], [gamma, 1.0]], atol=0.02)
+
+
+def test_hparams_hold_the_configured_numbers(agent):
+    assert agent.hparams == DDQNHparams(
+        learning_rate=0.01, target_update_rate=0.1, discount=0.9,
+        epsilon_init=1.0, epsilon_min=0.01, epsilon_decay=0.9,
+    )  # fmt: skip
+    assert (agent.batch_size, agent.buffer_size, agent.init_episodes) == (BATCH, 100_000, 10)

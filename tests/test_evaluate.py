@@ -1,0 +1,125 @@
+"""`python -m sejax.evaluate`, and proxies as files."""
+
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pandas as pd
+import pytest
+from hydra import compose, initialize_config_dir
+
+import sejax
+from sejax.configs import CONF_DIR, evaluate_from_hydra
+from sejax.errors import ConfigError
+from sejax.evaluate import evaluate
+from sejax.proxies import io as proxy_io
+from sejax.proxies.synthetic import make_synthetic
+
+TINY = ["agent.hidden_size=4", "agent.batch_size=4", "agent.init_episodes=1", "num_agents=3",
+        "training.max_episodes=2", "real_training.max_episodes=2"]  # fmt: skip
+
+
+def evaluate_config(*overrides: str):
+    folder = CONF_DIR.parent / "evaluate"
+    with initialize_config_dir(str(folder), version_base="1.3"):
+        return evaluate_from_hydra(compose("evaluate", overrides=[*TINY, *overrides]))
+
+
+@pytest.fixture(scope="module")
+def stored(tmp_path_factory):
+    """A proxy file with random weights: its path, environment and weights."""
+    path = tmp_path_factory.mktemp("proxy") / "proxy.safetensors"
+    config = sejax.config(["proxy.hidden_size=4"])
+    from sejax import envs
+
+    env = make_synthetic(envs.make("cartpole"), config.proxy)
+    weights = env.init_weights(jax.random.key(3))
+    sejax.save(path, config, weights, score=12.5, generation=7, seed=0)
+    return path, env, weights
+
+
+def test_a_proxy_that_is_saved_and_loaded_is_the_same(stored):
+    path, env, weights = stored
+    loaded_env, params = sejax.load(path)
+    assert loaded_env is env, "the same configuration shares one environment, hence its programs"
+    for a, b in zip(jax.tree.leaves(weights), jax.tree.leaves(params.weights), strict=True):
+        np.testing.assert_array_equal(a, b)
+    metadata = proxy_io.load_proxy(path.parent).metadata
+    assert metadata["score"] == 12.5 and metadata["generation"] == 7
+    assert metadata["format_version"] == 1
+
+
+def test_a_loaded_proxy_steps_as_a_gymnax_environment(stored):
+    env, params = sejax.load(stored[0])
+    obs, state = env.reset(jax.random.key(0), params)
+    obs, state, reward, terminated, truncated, info = env.step(
+        jax.random.key(1), state, jnp.int32(1), params
+    )
+    assert obs.shape == (4,) and reward.shape == () and not truncated
+
+
+def test_a_damaged_file_is_refused(stored, tmp_path):
+    damaged = tmp_path / "proxy.safetensors"
+    damaged.write_bytes(stored[0].read_bytes()[:-20])
+    with pytest.raises(ConfigError, match=r"whole safetensors file.*which is damaged"):
+        sejax.load(damaged)
+
+
+def test_a_foreign_safetensors_file_is_refused(tmp_path):
+    from safetensors.numpy import save_file
+
+    save_file({"x": np.zeros(3)}, tmp_path / "x.safetensors")
+    with pytest.raises(ConfigError, match="a file that sejax has written"):
+        sejax.load(tmp_path / "x.safetensors")
+
+
+def test_tensors_of_another_shape_are_refused(stored, tmp_path):
+    _, env, weights = stored
+    config = sejax.config(["proxy.hidden_size=5"])
+    sejax.save(tmp_path / "p.safetensors", config, weights)
+    with pytest.raises(ConfigError, match="must hold the tensors of the network"):
+        sejax.load(tmp_path / "p.safetensors")
+
+
+def test_an_unknown_name_lists_the_shipped_ones():
+    with pytest.raises(ConfigError, match="proxy must be one of .*got 'carpole'"):
+        sejax.load("carpole")
+
+
+def test_evaluation_writes_a_row_for_each_agent_and_their_means(stored, tmp_path, capsys):
+    mean = evaluate(evaluate_config(f"proxy={stored[0]}", f"out_dir={tmp_path}"))
+    table = pd.read_csv(tmp_path / "evaluation.csv")
+    assert table.groupby("world").size().to_dict() == {"the proxy": 3, "the real task": 3}
+    assert mean == pytest.approx(table[table.world == "the proxy"].test_return.mean(), rel=1e-5)
+    summary = json.loads((tmp_path / "evaluation.json").read_text())
+    steps = table[table.world == "the real task"].train_steps.mean()
+    assert summary["the real task"]["train_steps_mean"] == pytest.approx(steps)
+    assert (tmp_path / "evaluation.png").stat().st_size > 10_000
+    assert "3 fresh ddqn agents" in capsys.readouterr().out
+
+
+def test_the_real_task_alone_can_be_evaluated(tmp_path):
+    evaluate(evaluate_config("proxy=real", "env=cartpole", f"out_dir={tmp_path}"))
+    assert set(pd.read_csv(tmp_path / "evaluation.csv").world) == {"the real task"}
+
+
+def test_a_proxy_of_another_task_is_refused(stored):
+    with pytest.raises(ConfigError, match="acrobot for a proxy of cartpole. Set env=cartpole"):
+        evaluate(evaluate_config(f"proxy={stored[0]}", "env=acrobot"))
+
+
+def test_a_missing_proxy_says_what_to_set():
+    with pytest.raises(ConfigError, match="proxy must be given"):
+        evaluate_config()
+
+
+def test_registering_with_gymnax_is_idempotent():
+    import gymnax
+
+    ids = sejax.register_gymnax()
+    assert sejax.register_gymnax() == ids
+    for env_id in ids:
+        env, params = gymnax.make(env_id)
+        shipped = sejax.load(env_id.removeprefix("sejax/"))[1]
+        assert jnp.array_equal(jax.tree.leaves(params)[0], jax.tree.leaves(shipped)[0])
