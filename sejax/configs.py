@@ -147,6 +147,8 @@ class TrainingConfig:
     """How long an agent trains, and how it is tested."""
 
     max_episodes: int = 1000  # n_e
+    min_steps: int = 0  # the stop rule waits for so many training steps.
+    max_steps: int | None = None  # training ends after so many steps, whatever the rule says.
     stop_rule: str = "plateau"  # plateau (SEs), solved (real tasks), never
     window: int = 10  # d: episodes in each of the two means that the plateau rule compares.
     plateau_tolerance: float = 0.01  # C_diff: relative change between them that counts as flat.
@@ -158,6 +160,9 @@ class TrainingConfig:
         for name in ("max_episodes", "window", "test_episodes"):
             _at_least(1, f"training.{name}", getattr(self, name), "it counts episodes",
                       _default(TrainingConfig, name))  # fmt: skip
+        _at_least(0, "training.min_steps", self.min_steps, "it counts steps", 0)
+        if self.max_steps is not None:
+            _at_least(1, "training.max_steps", self.max_steps, "an agent must train", "null")
         _at_least(0, "training.plateau_tolerance", self.plateau_tolerance,
                   "it bounds a relative change", 0.01)  # fmt: skip
         _one_of("training.stop_rule", self.stop_rule, STOP_RULES)

@@ -43,9 +43,7 @@ def make_evaluator(
         returns, steps = test_once(key, agent_state, active)
         return returns[0], steps[0]
 
-    train = make_trainer(
-        agent, env, training, task.max_steps, task.solved_reward, test_fn=test_between
-    )
+    train = make_trainer(agent, env, training, task.solved_reward, test_fn=test_between)
 
     def evaluate(key: Array, env_params: Any, active: Array | bool = True) -> Outcome:
         key_train, key_test = jax.random.split(key)

@@ -38,7 +38,7 @@ def agent():
 
 @pytest.fixture(scope="module")
 def state(agent):
-    return jax.jit(agent.init)(jax.random.key(1), agent.hparams)
+    return agent.init(jax.random.key(1), agent.hparams)
 
 
 def q_network(config):
@@ -141,7 +141,7 @@ def test_updates_equal_torchs_on_the_same_batches(activation):
     config = DDQNConfig(**{**vars(CONFIG), "activation": activation})
     agent = make_ddqn(config, OBS_DIM, NUM_ACTIONS)
     _, nested = q_network(config)
-    state = jax.jit(agent.init)(jax.random.key(1), agent.hparams)
+    state = agent.init(jax.random.key(1), agent.hparams)
     reference = TorchDDQN(nested(state.params), config)
     update = jax.jit(agent.update)
     for number in range(1, 6):
@@ -239,7 +239,7 @@ def draw_actions():
     """Exploring actions of 4000 keys and the greedy one, by epsilon; three actions."""
     agent = make_ddqn(CONFIG, OBS_DIM, num_actions=3)
     obs = jnp.array([0.3, -0.2, 0.5])
-    state = jax.jit(agent.init)(jax.random.key(0), agent.hparams)
+    state = agent.init(jax.random.key(0), agent.hparams)
     keys = jax.random.split(jax.random.key(1), 4000)
 
     @jax.jit
@@ -292,10 +292,8 @@ def test_a_two_step_probe_learns_gamma_and_one():
     def step(state, _):
         return agent.update(jax.random.key(0), state, batch), None
 
-    def learn(key):
-        return jax.lax.scan(step, agent.init(key, agent.hparams), length=600)
-
-    state, _ = jax.jit(learn)(jax.random.key(0))
+    state = agent.init(jax.random.key(0), agent.hparams)
+    state, _ = jax.lax.scan(step, state, length=600)
     net = MLP(2, 8, 1, "tanh")
     _, unravel = ravel_pytree(net.init(jax.random.key(0), jnp.zeros(2)))
     q_values = net.apply(unravel(state.params), jnp.array([a, b]).T)  # [actions, (A, B)]

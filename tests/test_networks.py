@@ -12,7 +12,7 @@ from sejax.networks import MLP, PRELU_SLOPE
 
 def test_initial_weights_and_biases_are_uniform_within_one_over_root_fan_in():
     net = MLP(num_outputs=50, hidden_size=200, num_layers=2, activation="relu")
-    params = jax.jit(net.init)(jax.random.key(0), jnp.zeros(9))["params"]
+    params = net.init(jax.random.key(0), jnp.zeros(9))["params"]
     # fan-in of each layer: the input, then the hidden size twice; for biases that of their layer.
     for layer, (fan_in, fan_out) in enumerate([(9, 200), (200, 200), (200, 50)]):
         bound = fan_in**-0.5
@@ -29,7 +29,7 @@ def test_initial_weights_and_biases_are_uniform_within_one_over_root_fan_in():
 
 def test_layers_are_initialised_independently():
     net = MLP(num_outputs=8, hidden_size=8, num_layers=2, activation="relu")
-    params = jax.jit(net.init)(jax.random.key(0), jnp.zeros(8))["params"]
+    params = net.init(jax.random.key(0), jnp.zeros(8))["params"]
     kernels = [np.asarray(params[f"Dense_{i}"]["kernel"]).ravel() for i in range(3)]
     correlations = np.corrcoef(kernels)[np.triu_indices(3, 1)]
     assert np.abs(correlations).max() < 5 / np.sqrt(64)
@@ -39,7 +39,7 @@ def test_layers_are_initialised_independently():
 @pytest.mark.parametrize("activation", ACTIVATIONS)
 def test_forward_equals_a_numpy_loop(activation, num_layers):
     net = MLP(num_outputs=3, hidden_size=5, num_layers=num_layers, activation=activation)
-    params = jax.jit(net.init)(jax.random.key(1), jnp.zeros(4))["params"]
+    params = net.init(jax.random.key(1), jnp.zeros(4))["params"]
     for x in np.random.default_rng(0).normal(size=(5, 4)) * 2:
         expected = numpy_forward(params, x, activation, num_layers)
         got = net.apply({"params": params}, jnp.float32(x))
@@ -48,7 +48,7 @@ def test_forward_equals_a_numpy_loop(activation, num_layers):
 
 def test_a_feature_major_batch_equals_single_inputs():
     net = MLP(num_outputs=3, hidden_size=5, num_layers=2, activation="tanh")
-    variables = jax.jit(net.init)(jax.random.key(2), jnp.zeros(4))
+    variables = net.init(jax.random.key(2), jnp.zeros(4))
     batch = jax.random.normal(jax.random.key(3), (4, 7))  # [feature, batch]
     together = net.apply(variables, batch)
     assert together.shape == (3, 7)
@@ -59,14 +59,14 @@ def test_a_feature_major_batch_equals_single_inputs():
 
 def test_the_prelu_slope_of_a_proxy_is_fixed_and_no_parameter():
     net = MLP(num_outputs=1, hidden_size=3, num_layers=2, activation="prelu")
-    params = jax.jit(net.init)(jax.random.key(0), jnp.zeros(2))["params"]
+    params = net.init(jax.random.key(0), jnp.zeros(2))["params"]
     assert set(params) == {"Dense_0", "Dense_1", "Dense_2"}
     assert PRELU_SLOPE == 0.25
 
 
 def test_a_learned_prelu_slope_is_one_parameter_of_the_whole_network():
     net = MLP(3, hidden_size=5, num_layers=2, activation="prelu", learn_prelu_slope=True)
-    params = jax.jit(net.init)(jax.random.key(0), jnp.zeros(4))["params"]
+    params = net.init(jax.random.key(0), jnp.zeros(4))["params"]
     assert params["prelu_slope"].shape == () and params["prelu_slope"] == 0.25
     params = {**params, "prelu_slope": jnp.float32(0.6)}
     x = np.array([0.3, -1.0, 2.0, -0.5])
@@ -79,5 +79,5 @@ def test_a_learned_prelu_slope_is_one_parameter_of_the_whole_network():
 
 def test_other_activations_have_no_slope_to_learn():
     net = MLP(3, hidden_size=5, num_layers=1, activation="tanh", learn_prelu_slope=True)
-    params = jax.jit(net.init)(jax.random.key(0), jnp.zeros(4))["params"]
+    params = net.init(jax.random.key(0), jnp.zeros(4))["params"]
     assert set(params) == {"Dense_0", "Dense_1"}

@@ -33,7 +33,8 @@ def step():
 
 def constant_weights(state, reward, done):
     """Weights with which the three outputs are these constants, whatever the input."""
-    weights = jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), jax.eval_shape(make_env().init_weights, jax.random.key(0)))
+    shapes = jax.eval_shape(make_env().init_weights, jax.random.key(0))
+    weights = jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), shapes)
     for head, value in {"state": state, "reward": reward, "done": done}.items():
         weights[head][f"Dense_{CONFIG.num_layers}"]["bias"][:] = value
     return weights
@@ -46,7 +47,7 @@ def constant_weights(state, reward, done):
 def test_predict_equals_three_separate_mlps_fed_the_one_hot_action_first(task):
     env = make_env(task)
     num_actions, obs_dim = env.task.num_actions, env.task.obs_dim
-    weights = jax.jit(env.init_weights)(jax.random.key(3))
+    weights = env.init_weights(jax.random.key(3))
     predict = jax.jit(env.predict)
     for action in range(num_actions):
         obs = np.random.default_rng(action).normal(size=obs_dim)
@@ -64,7 +65,7 @@ def test_predict_equals_three_separate_mlps_fed_the_one_hot_action_first(task):
 
 def test_the_networks_share_a_shape_and_no_weights():
     env = make_env()
-    weights = jax.jit(env.init_weights)(jax.random.key(0))
+    weights = env.init_weights(jax.random.key(0))
     for head, outputs in {"state": 4, "reward": 1, "done": 1}.items():
         shapes = [weights[head][f"Dense_{i}"]["kernel"].shape for i in range(3)]
         assert shapes == [(5, 6), (5, 5), (outputs, 5)]  # 2 actions + 4 numbers of state
@@ -76,12 +77,12 @@ def test_the_papers_se_for_cartpole_has_2247_parameters():
     # (6 * 83 + 83) * 3 for the hidden layers, (83 + 1) * (4 + 1 + 1) for the heads:
     # 1743 + 504 = 2247, as the authors' networks have.
     env = make_env(hidden_size=83, num_layers=1)
-    weights = jax.jit(env.init_weights)(jax.random.key(0))
+    weights = jax.eval_shape(env.init_weights, jax.random.key(0))
     assert sum(x.size for x in jax.tree.leaves(weights)) == 2247
 
 
 def test_a_step_moves_to_the_predicted_state_itself(step):
-    weights = jax.jit(make_env().init_weights)(jax.random.key(5))
+    weights = make_env().init_weights(jax.random.key(5))
     next_obs, reward, _ = make_env().predict(weights, OBS, jnp.int32(1))
     obs, state, got_reward, _, _ = step["soft"](weights)
     np.testing.assert_allclose(obs, next_obs, rtol=1e-6)
@@ -185,15 +186,15 @@ def test_termination_resets_too():
 def test_weights_are_traced_so_that_many_proxies_step_at_once():
     env = make_env()
     keys = jax.random.split(jax.random.key(0), 3)
-    weights = jax.jit(jax.vmap(env.init_weights))(keys)
+    each = [env.init_weights(key) for key in keys]
+    weights = jax.tree.map(lambda *x: jnp.stack(x), *each)
     _, state = env.reset(keys[0], env.default_params)
     step = jax.jit(jax.vmap(lambda w: env.step_env(keys[0], state, 1, env.params(w))[:3]))
     obs, _, reward = step(weights)
     assert obs.shape == (3, 4)
     predict = jax.jit(env.predict)
     for i in range(3):
-        own = jax.tree.map(lambda x, i=i: x[i], weights)
-        expected_obs, expected_reward, _ = predict(own, state.obs, jnp.int32(1))
+        expected_obs, expected_reward, _ = predict(each[i], state.obs, jnp.int32(1))
         np.testing.assert_allclose(obs[i], expected_obs, rtol=1e-5, atol=1e-6)
         np.testing.assert_allclose(reward[i], expected_reward, rtol=1e-5, atol=1e-6)
 

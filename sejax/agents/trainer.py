@@ -71,8 +71,7 @@ class _LoopState:
 def make_trainer(
     agent: Agent,
     env: Any,
-    training: TrainingConfig,
-    max_steps: int,
+    training: TrainingConfig = TrainingConfig(),  # noqa: B008 (frozen)
     solved_reward: float = jnp.inf,
     test_fn: Callable[[Array, Any, Array], tuple[Array, Array]] | None = None,
 ) -> Callable[..., TrainResult]:
@@ -86,7 +85,6 @@ def make_trainer(
       agent: from `sejax.agents`.
       env: gymnax environment to train in: real, synthetic or reward-shaped.
       training: stopping rule and limits.
-      max_steps: the world's step limit; no buffer needs more than `max_episodes * max_steps` rows.
       solved_reward: for `stop_rule="solved"`.
       test_fn: `(key, agent_state, active) -> (mean return, steps)` on the real task, called after
         each training episode if `stop_rule="solved"` and `solved_by="test"`.
@@ -100,7 +98,10 @@ def make_trainer(
     if tests_each_episode and test_fn is None:
         raise ValueError("stop_rule='solved' with solved_by='test' needs a test_fn; got None.")
     window = training.window
-    capacity = min(agent.buffer_size, training.max_episodes * max_steps)
+    step_limit = training.max_episodes * _episode_limit(env)
+    if training.max_steps is not None:
+        step_limit = min(step_limit, training.max_steps)
+    capacity = min(agent.buffer_size, step_limit)
 
     def begin(key: Array, env_params: Any, hparams: Any, active: Array) -> _LoopState:
         key_agent, key_reset = jax.random.split(key)
@@ -152,6 +153,7 @@ def make_trainer(
             env_state=env_state,
             agent_state=agent_state,
             nonfinite=state.nonfinite | info.get("nonfinite", False),
+            active=state.step + 1 < step_limit,
         )
         ended = terminated | truncated | state.nonfinite
         state = jax.lax.cond(
@@ -172,15 +174,15 @@ def make_trainer(
         recent = jnp.concatenate([state.recent[1:], episode_return[None]])
         num_episodes = state.episode + 1
         stop = (num_episodes >= training.max_episodes) | state.nonfinite
-        may_stop = state.episode >= agent.init_episodes
+        may_stop = (state.episode >= agent.init_episodes) & (state.step >= training.min_steps)
         if training.stop_rule == "plateau":
             flat = is_plateau(recent, num_episodes, training.plateau_tolerance)
-            stop = stop | (flat & (state.episode >= agent.init_episodes + window))
+            stop = stop | (may_stop & flat & (state.episode >= agent.init_episodes + window))
         elif training.stop_rule == "solved":
             stop = stop | (may_stop & is_solved(recent, num_episodes, solved_reward))
         obs, env_state = env.reset_env(key_reset, env_params)
         return state.replace(
-            active=~stop,
+            active=state.active & ~stop,
             episode=num_episodes,
             episode_return=jnp.float32(0),
             obs=obs,
@@ -282,6 +284,12 @@ def make_tester(agent: Agent, task: Any, num_episodes: int) -> Callable[..., Any
         return jax.vmap(episode, in_axes=(0, None, None))(keys, agent_state, active)
 
     return test
+
+
+def _episode_limit(env: Any) -> int:
+    """The world's step limit, for the size of the replay buffer."""
+    limit = getattr(env, "max_steps", None) or env.default_params.max_steps_in_episode
+    return int(limit)
 
 
 def _all_finite(tree: Any) -> Array:

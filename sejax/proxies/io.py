@@ -170,8 +170,8 @@ def _read(path: Path) -> tuple[dict[str, np.ndarray], dict[str, str]]:
     except (SafetensorError, OSError) as error:
         raise ConfigError(
             f"proxy must be a whole safetensors file, because weights are read from it; got "
-            f"{path}, which is damaged ({error}). Use proxy_last.safetensors of the same run, or run "
-            f"sejax.run on the directory again."
+            f"{path}, which is damaged ({error}). Use proxy_last.safetensors of the same run, "
+            f"or run sejax.run on the directory again."
         ) from error
 
 

@@ -1,0 +1,393 @@
+"""sejax.es: the paper's NES against NumPy, and the contract of every outer optimiser."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from sejax.configs import EVOSAX_ALGORITHMS, EvosaxConfig, NESConfig
+from sejax.es import make_strategy
+from sejax.es.nes import aggregate, finite_mean
+from sejax.es.strategy import finite_fitness
+
+NAN, INF = np.nan, np.inf
+DIMS = 6
+MEAN = np.array([0.3, -0.2, 0.1, 0.5, -0.4, 0.2], np.float32)
+
+
+@functools.cache
+def nes(**fields):
+    """Strategy with jitted `ask` and `tell`, by config fields; population 3 unless told."""
+    strategy = make_strategy(NESConfig(**{"population_size": 3, **fields}), DIMS)
+    return strategy, jax.jit(strategy.ask), jax.jit(strategy.tell)
+
+
+def asked(seed=1, **fields):
+    strategy, ask, tell = nes(**fields)
+    state = strategy.init(jax.random.key(0), jnp.array(MEAN))
+    candidates, state = ask(jax.random.key(seed), state)
+    return np.asarray(candidates), state, tell
+
+
+def told(scores, seed=1, **fields):
+    """State after one generation with these scores, and the candidates that had them."""
+    candidates, state, tell = asked(seed, **fields)
+    return tell(jax.random.key(2), candidates, jnp.array(scores, jnp.float32), state), candidates
+
+
+# --- candidates ----------------------------------------------------------------------------------
+
+
+def test_mirrored_members_use_opposite_noise():
+    candidates, _, _ = asked()
+    plus, minus = candidates[:3] - MEAN, candidates[3:6] - MEAN
+    np.testing.assert_allclose(plus, -minus, atol=1e-7)
+    assert np.abs(plus).min() > 0
+
+
+def test_candidates_are_plus_then_minus_then_the_incumbents():
+    candidates, _, _ = asked(num_evals=2)
+    strategy, _, _ = nes(num_evals=2)
+    # 3 members, each sign evaluated twice in a row, then one incumbent for each member.
+    assert candidates.shape == (3 * 2 + 3 * 2 + 3, DIMS)
+    assert (strategy.num_candidates, strategy.num_incumbent_evals) == (15, 3)
+    np.testing.assert_array_equal(candidates[:12:2], candidates[1:12:2])
+    np.testing.assert_allclose(candidates[:6] - MEAN, MEAN - candidates[6:12], atol=1e-7)
+    np.testing.assert_array_equal(candidates[12:], np.tile(MEAN, (3, 1)))
+    assert len(np.unique(candidates[:6:2], axis=0)) == 3
+
+
+def test_without_mirroring_there_is_no_minus_half():
+    candidates, _, _ = asked(mirrored=False)
+    assert candidates.shape == (3 + 3, DIMS)
+    np.testing.assert_array_equal(candidates[3:], np.tile(MEAN, (3, 1)))
+
+
+def test_a_generation_of_the_paper_trains_48_agents():
+    strategy = make_strategy(NESConfig(), DIMS)
+    assert (strategy.num_candidates, strategy.num_incumbent_evals) == (48, 16)
+
+
+def test_the_noise_is_normal_with_the_configured_std():
+    strategy = make_strategy(NESConfig(population_size=50, noise_std=0.05), 400)
+    state = strategy.init(jax.random.key(0), jnp.zeros(400))
+    candidates, _ = strategy.ask(jax.random.key(1), state)
+    noise = np.asarray(candidates[:50]) / 0.05
+    n = noise.size
+    assert abs(noise.mean()) < 5 / np.sqrt(n)
+    assert abs(noise.var() - 1) < 5 * np.sqrt(2 / n)
+    assert abs((noise**4).mean() - 3) < 5 * np.sqrt(96 / n)  # kurtosis of a normal
+
+
+def test_each_generation_draws_new_noise():
+    first, second = asked(seed=1)[0], asked(seed=2)[0]
+    assert np.abs(first[:3] - second[:3]).min() > 0
+
+
+# --- the sign ------------------------------------------------------------------------------------
+
+
+def test_each_member_moves_the_mean_by_its_better_sign():
+    # Members 0, 1, 2: plus 5, 1, 2; minus 3, 4, 2. Better: plus, minus, and plus for the tie.
+    state, candidates = told([5, 1, 2, 3, 4, 2, 0, 0, 0], score_transform="linear")
+    # linear on 5, 4, 2: 1, 2/3, 0.
+    noise = candidates[:3] - MEAN
+    expected = MEAN + 1.0 * noise[0] - 2 / 3 * noise[1]
+    np.testing.assert_allclose(state.mean, expected, rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("diverged", [NAN, INF, -INF])
+def test_a_sign_that_diverged_loses_to_one_that_did_not(diverged):
+    scores = [diverged, 1, 2, -9, diverged, 3, 0, 0, 0]
+    state, candidates = told(scores, score_transform="rank")
+    # Members: minus -9, plus 1, minus 3; ranks 0, 1, 2 over 2.
+    noise = candidates[:3] - MEAN
+    expected = MEAN + 0.5 * noise[1] - noise[2]
+    np.testing.assert_allclose(state.mean, expected, rtol=1e-5, atol=1e-6)
+
+
+# --- the update ----------------------------------------------------------------------------------
+
+
+def numpy_generation(mean, candidates, scores, config, noise_std, step_size):
+    """Algorithm 1 with mirrored sampling and All Better 2, in plain loops."""
+    n, repeats = config.population_size, config.num_evals
+    perturbed = scores[: 2 * n * repeats].reshape(2 * n, repeats)
+    values = perturbed.mean(axis=1) if config.eval_aggregate == "mean" else perturbed.min(axis=1)
+    incumbent = np.mean(scores[2 * n * repeats :])
+    noise, member_scores = [], []
+    for i in range(n):
+        plus, minus = values[i], values[n + i]
+        eps = candidates[i * repeats] - mean
+        noise.append(-eps if minus > plus else eps)
+        member_scores.append(max(plus, minus))
+    advantages = [max(0.0, k - incumbent) for k in member_scores]
+    weights = [a / sum(advantages) if sum(advantages) > 0 else 0.0 for a in advantages]
+    step = step_size * sum(f * eps for f, eps in zip(weights, noise, strict=True))
+    if config.update_rule == "paper":
+        step = step / (n * noise_std)
+    return (1 - config.weight_decay) * mean + step
+
+
+@pytest.mark.parametrize("update_rule", ["authors", "paper"])
+@pytest.mark.parametrize("aggregate_by", ["mean", "min"])
+def test_generations_equal_a_numpy_loop(update_rule, aggregate_by):
+    config = NESConfig(
+        population_size=4, num_evals=3, eval_aggregate=aggregate_by, update_rule=update_rule,
+        noise_std=0.2, noise_std_decay=0.9, step_size=0.5, step_size_decay=0.8, weight_decay=0.1,
+    )  # fmt: skip
+    strategy = make_strategy(config, DIMS)
+    state = strategy.init(jax.random.key(0), jnp.array(MEAN))
+    rng = np.random.default_rng(0)
+    mean = MEAN.astype(np.float64)
+    for number in range(3):
+        candidates, state = strategy.ask(jax.random.key(number), state)
+        scores = rng.normal(size=strategy.num_candidates)
+        scores[-4:] -= 0.5
+        state = strategy.tell(jax.random.key(0), candidates, jnp.float32(scores), state)
+        mean = numpy_generation(
+            mean, np.asarray(candidates, np.float64), scores, config,
+            noise_std=0.2 * 0.9**number, step_size=0.5 * 0.8**number,
+        )  # fmt: skip
+        np.testing.assert_allclose(strategy.incumbent(state), mean, rtol=1e-4, atol=1e-5)
+
+
+def test_noise_and_step_shrink_by_their_factors_after_each_generation():
+    fields = {"noise_std_decay": 0.9, "step_size_decay": 0.5, "noise_std": 0.2, "step_size": 3.0}
+    strategy, ask, tell = nes(**fields)
+    state = strategy.init(jax.random.key(0), jnp.array(MEAN))
+    noises = []
+    for _ in range(3):
+        candidates, state = ask(jax.random.key(5), state)
+        noises.append(candidates[:3] - state.mean)
+        state = tell(jax.random.key(0), candidates, jnp.zeros(9), state)
+    # The same key draws the same normals, times sigma: 0.2, 0.18, 0.162.
+    np.testing.assert_allclose(noises[1], 0.9 * noises[0], rtol=1e-4, atol=1e-6)
+    np.testing.assert_allclose(noises[2], 0.81 * noises[0], rtol=1e-4, atol=1e-6)
+    np.testing.assert_allclose(state.step_size, 3.0 * 0.5**3, rtol=1e-6)
+
+
+def test_weight_decay_shrinks_the_mean_before_the_step():
+    scores = [0, 0, 0, 0, 0, 0, 1, 1, 1]  # no member beats the incumbent: no step
+    state, _ = told(scores, weight_decay=0.25)
+    np.testing.assert_allclose(state.mean, 0.75 * MEAN, rtol=1e-6)
+
+
+def test_the_proxy_stays_if_no_member_beats_the_incumbents_mean():
+    # Incumbents 1, 2, 6: mean 3; the best member has 3, which is not better.
+    state, _ = told([3, 0, 1, 2, 3, 0, 1, 2, 6])
+    np.testing.assert_array_equal(state.mean, MEAN)
+
+
+def test_diverged_scores_never_reach_the_mean():
+    # Member 0 diverged with both signs, member 1 scores 5 by its plus, member 2 is worse than the
+    # incumbents' finite mean of 2.
+    scores = [NAN, 5, 0, INF, NAN, 1, 1, NAN, 3]
+    state, candidates = told(scores)
+    np.testing.assert_allclose(state.mean, candidates[1], rtol=1e-5, atol=1e-6)
+
+
+def test_a_generation_that_diverged_as_a_whole_leaves_the_proxy_as_it_was():
+    state, _ = told([NAN] * 9)
+    np.testing.assert_array_equal(state.mean, MEAN)
+
+
+def test_enormous_noise_that_diverged_leaves_no_trace():
+    # Weights are 0 where eps is 1e30: the product must be 0 and not nan.
+    state, candidates = told([NAN, 1, NAN, NAN, 0, NAN, 0, 0, 0], noise_std=1e30)
+    np.testing.assert_allclose(state.mean, candidates[1], rtol=1e-5)
+    state, _ = told([NAN] * 6 + [0, 0, 0], noise_std=1e30)
+    np.testing.assert_array_equal(state.mean, MEAN)
+
+
+def test_aggregates_are_not_finite_if_one_evaluation_is_not():
+    scores = jnp.array([[1.0, 3.0], [2.0, NAN], [INF, 0.0], [-4.0, -4.0]])
+    np.testing.assert_array_equal(aggregate(scores, "mean"), [2.0, NAN, NAN, -4.0])
+    np.testing.assert_array_equal(aggregate(scores, "min"), [1.0, NAN, NAN, -4.0])
+
+
+def test_the_finite_mean_leaves_out_what_diverged():
+    assert finite_mean(jnp.array([1.0, NAN, 5.0, -INF])) == 3.0
+    assert np.isnan(finite_mean(jnp.array([NAN, INF])))
+
+
+# --- statistics ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("mirrored", [True, False])
+@pytest.mark.parametrize("score_transform", ["linear", "all_better_2"])
+def test_the_mean_step_on_a_linear_score_points_along_its_gradient(score_transform, mirrored):
+    gradient = np.array([3.0, -1.0, 0.5, 0.0, 2.0, -0.2])
+    direction = gradient / np.linalg.norm(gradient)
+    config = NESConfig(
+        population_size=8, noise_std=0.1, score_transform=score_transform, mirrored=mirrored
+    )
+    strategy = make_strategy(config, DIMS)
+    start = strategy.init(jax.random.key(0), jnp.array(MEAN))
+
+    def step(key):
+        candidates, state = strategy.ask(key, start)
+        scores = candidates @ jnp.array(gradient, jnp.float32)
+        return strategy.tell(key, candidates, scores, state).mean - MEAN
+
+    steps = np.asarray(jax.jit(jax.vmap(step))(jax.random.split(jax.random.key(1), 2000)))
+    along = steps @ direction
+    across = steps - np.outer(along, direction)
+    # The noise is isotropic, so that the expected step is a multiple of the gradient.
+    error = across.std(axis=0) / np.sqrt(len(steps))
+    assert (np.abs(across.mean(axis=0)) <= 5 * error + 1e-7).all()
+    assert along.mean() > 20 * along.std() / np.sqrt(len(steps))
+
+
+# --- seeds ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("config", [NESConfig(population_size=3, num_evals=2),
+                                    EvosaxConfig(population_size=4, num_evals=2)])  # fmt: skip
+def test_every_candidate_trains_with_its_own_seed_unless_asked_otherwise(config):
+    strategy = make_strategy(config, DIMS)
+    assert len(set(strategy.seed_ids.tolist())) == strategy.num_candidates
+
+
+def test_common_random_numbers_give_each_evaluation_of_a_member_the_same_seeds():
+    # 3 members, 2 signs, 2 evaluations: seeds 0 and 1 for each; the incumbents 0, 1, 2.
+    config = NESConfig(population_size=3, num_evals=2, common_random_numbers=True)
+    seed_ids = make_strategy(config, DIMS).seed_ids
+    np.testing.assert_array_equal(seed_ids, [0, 1] * 6 + [0, 1, 2])
+    config = EvosaxConfig(population_size=4, num_incumbent_evals=3, common_random_numbers=True)
+    seed_ids = make_strategy(config, DIMS).seed_ids
+    np.testing.assert_array_equal(seed_ids, [0] * 4 + [0, 1, 2])
+
+
+# --- contract of every strategy ------------------------------------------------------------------
+
+UNBUILDABLE = {
+    "des": "evosax.algorithms has no attribute DES: the class is DiscoveredES, `DES` is its key",
+    "les": "evosax.algorithms has no attribute LES: the class is LearnedES, `LES` is its key",
+    "random_search": "needs sampling_fn, which make_strategy does not give",
+    "sv_cma_es": "needs num_populations, which make_strategy does not give",
+    "sv_open_es": "needs num_populations, which make_strategy does not give",
+}
+BUILDABLE = [
+    pytest.param(
+        name,
+        marks=pytest.mark.xfail(strict=True, reason=UNBUILDABLE[name])
+        if name in UNBUILDABLE
+        else (),
+    )
+    for name in EVOSAX_ALGORITHMS
+]
+USUAL = ("open_es", "snes", "sep_cma_es", "cma_es", "xnes", "pgpe", "simple_es")
+SLOW_CLIMBERS = {"lm_ma_es": "evosax 0.3.2: its mean becomes nan on a sphere of 6 dimensions"}
+OTHERS = [
+    pytest.param(
+        name,
+        marks=[pytest.mark.slow]
+        + (
+            [pytest.mark.xfail(strict=True, reason=SLOW_CLIMBERS[name])]
+            if name in SLOW_CLIMBERS
+            else []
+        ),
+    )
+    for name in EVOSAX_ALGORITHMS
+    if name not in USUAL and name not in UNBUILDABLE
+]
+
+
+def evosax_strategy(name, **fields):
+    config = EvosaxConfig(
+        name=name, population_size=16, num_incumbent_evals=2, noise_std=0.1, **fields
+    )
+    return make_strategy(config, DIMS)
+
+
+def test_the_names_are_evosaxs_own_distribution_based_algorithms():
+    from evosax.algorithms import distribution_based_algorithms
+
+    assert set(EVOSAX_ALGORITHMS.values()) == set(distribution_based_algorithms)
+    assert list(EVOSAX_ALGORITHMS) == sorted(EVOSAX_ALGORITHMS)
+
+
+@pytest.mark.parametrize("name", BUILDABLE)
+def test_every_algorithm_asks_for_its_population_and_the_incumbent(name):
+    strategy = evosax_strategy(name)
+    state = jax.eval_shape(strategy.init, jax.random.key(0), jnp.array(MEAN))
+    candidates, after_ask = jax.eval_shape(strategy.ask, jax.random.key(1), state)
+    assert candidates.shape == (strategy.num_candidates, DIMS) == (18, DIMS)
+    assert strategy.num_incumbent_evals == 2
+    after = jax.eval_shape(
+        strategy.tell, jax.random.key(2), candidates, jnp.zeros(18), after_ask
+    )
+    assert jax.eval_shape(strategy.incumbent, after).shape == (DIMS,)
+    # A scan carries the state: its structure, shapes and types must not change.
+    assert jax.tree.map(lambda x: (x.shape, x.dtype), after) == jax.tree.map(
+        lambda x: (x.shape, x.dtype), state
+    )
+
+
+TARGET = np.array([0.5, -0.4, 0.3, -0.2, 0.6, -0.5], np.float32)
+
+
+def climb(strategy, generations):
+    """Scores of the incumbent on a smooth concave function, one for each generation.
+
+    Two of the trainings always diverge, and in the tenth generation all do.
+    """
+    index = jnp.arange(strategy.num_candidates)
+
+    def generation(state, scan):
+        number, key = scan
+        key_ask, key_tell = jax.random.split(key)
+        candidates, state = strategy.ask(key_ask, state)
+        true_scores = -jnp.sum((candidates - TARGET) ** 2, axis=-1)
+        scores = jnp.where(index == 3, NAN, jnp.where(index == 8, INF, true_scores))
+        scores = jnp.where(number == 10, NAN, scores)
+        return strategy.tell(key_tell, candidates, scores, state), true_scores[-1]
+
+    state = strategy.init(jax.random.key(0), jnp.zeros(DIMS))
+    scan = jnp.arange(generations), jax.random.split(jax.random.key(1), generations)
+    state, scores = jax.jit(lambda state: jax.lax.scan(generation, state, scan))(state)
+    assert np.isfinite(strategy.incumbent(state)).all()
+    return np.asarray(scores)
+
+
+@pytest.mark.parametrize("name", [*USUAL, *OTHERS])
+def test_every_algorithm_maximises_scores_though_some_trainings_diverge(name):
+    # A wrong sign would run away from the target. Start: -|target|^2 = -1.15.
+    scores = climb(evosax_strategy(name), generations=80)
+    np.testing.assert_allclose(scores[0], -1.15, rtol=1e-5)
+    assert scores[-1] > -0.58  # half of the way, in score
+
+
+@pytest.mark.parametrize(
+    "fields",
+    [
+        {"noise_std": 0.1, "step_size": 1.0},
+        {"noise_std": 0.1, "step_size": 1.0, "mirrored": False},
+        # divided by n_p sigma = 1.6: the same step with alpha = 1.6
+        {"noise_std": 0.1, "step_size": 1.6, "update_rule": "paper"},
+        {"noise_std": 0.1, "step_size": 0.2, "score_transform": "nes_unnormalized"},
+    ],
+    ids=str,
+)
+def test_the_papers_nes_maximises_scores_though_some_trainings_diverge(fields):
+    scores = climb(make_strategy(NESConfig(population_size=16, **fields), DIMS), 40)
+    assert scores[0] < -1.1 and scores[-1] > -0.1
+
+
+def test_the_incumbent_of_evosax_is_the_mean_at_the_end_of_the_candidates():
+    strategy = evosax_strategy("open_es", num_evals=2)
+    state = strategy.init(jax.random.key(0), jnp.array(MEAN))
+    candidates, state = strategy.ask(jax.random.key(1), state)
+    assert candidates.shape == (2 * 16 + 2, DIMS)
+    np.testing.assert_array_equal(candidates[:32:2], candidates[1:32:2])
+    np.testing.assert_allclose(candidates[-2:], np.tile(MEAN, (2, 1)), rtol=1e-6)
+
+
+def test_nonfinite_fitness_is_just_worse_than_the_worst():
+    # evosax minimises. Worst 3, best 1: 3 + (3 - 1) = 5. One finite value 2: 2 + 1. None: 0.
+    np.testing.assert_array_equal(finite_fitness(jnp.array([1.0, NAN, 3.0, INF])), [1, 5, 3, 5])
+    np.testing.assert_array_equal(finite_fitness(jnp.array([2.0, -INF])), [2, 3])
+    np.testing.assert_array_equal(finite_fitness(jnp.array([NAN, INF])), [0, 0])

@@ -1,0 +1,194 @@
+"""sejax.es.score_transforms: each of the eight on numbers worked by hand, and their laws."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sejax.configs import SCORE_TRANSFORMS
+from sejax.es.score_transforms import TRANSFORMS
+
+NAN, INF = np.nan, np.inf
+SCORES = [3.0, NAN, 1.0, 2.0]
+JITTED = {name: jax.jit(transform) for name, transform in TRANSFORMS.items()}
+
+
+def transform(name, scores, incumbent):
+    return np.asarray(JITTED[name](jnp.array(scores, jnp.float32), jnp.float32(incumbent)))
+
+
+def test_the_eight_transforms_are_the_configured_ones():
+    assert tuple(TRANSFORMS) == SCORE_TRANSFORMS
+
+
+@pytest.mark.parametrize(
+    ("name", "expected"),
+    [
+        # nan counts as the worst finite score, 1: (3-1)/2, 0/2, 0/2, (2-1)/2.
+        ("linear", [1, 0, 0, 0.5]),
+        # Members with a lower score: 3, 0, 1, 2; divided by 3 - 0.
+        ("rank", [1, 0, 1 / 3, 2 / 3]),
+        # n = 4. Ranks from the best: 1, 4, 3, 2. max(0, ln 3 - ln R) = 1.098612, 0, 0, 0.405465.
+        # Their sum is 1.504077; shares 0.730423, 0, 0, 0.269577; less 1/4: 0.480423, -0.25,
+        # -0.25, 0.019577; divided by 0.480423.
+        ("nes", [1, -0.520375, -0.520375, 0.040750]),
+        # The same without the 1/4: 0.269577 / 0.730423 = 0.369070.
+        ("nes_unnormalized", [1, 0, 0, 0.369070]),
+        ("single_best", [1, 0, 0, 0]),
+        # 3 > 1.5, the incumbent.
+        ("single_better", [1, 0, 0, 0]),
+        # Advantages over 1.5: 1.5, 0, 0, 0.5; divided by the largest.
+        ("all_better_1", [1, 0, 0, 1 / 3]),
+        # The same divided by their sum, 2.
+        ("all_better_2", [0.75, 0, 0, 0.25]),
+    ],
+)
+def test_weights_worked_by_hand(name, expected):
+    np.testing.assert_allclose(transform(name, SCORES, 1.5), expected, rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("name", "expected"),
+    [
+        ("linear", [1, 0, 0, 0.5]),  # not asked
+        ("single_best", [1, 0, 0, 0]),  # not asked
+        ("single_better", [0, 0, 0, 0]),
+        ("all_better_1", [0, 0, 0, 0]),
+        ("all_better_2", [0, 0, 0, 0]),
+    ],
+)
+@pytest.mark.parametrize("incumbent", [3.0, 5.0])
+def test_the_better_transforms_weigh_nothing_if_none_beats_the_incumbent(
+    name, expected, incumbent
+):
+    np.testing.assert_allclose(transform(name, SCORES, incumbent), expected, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("name", "expected"),
+    [
+        # Scores 2, 5, 5, 1: (K - 1) / 4.
+        ("linear", [0.25, 1, 1, 0]),
+        # Lower scores: 1, 2, 2, 0; divided by 2.
+        ("rank", [0.5, 1, 1, 0]),
+        # Ranks from the best, ties sharing the better: 3, 1, 1, 4. Shares 0, 1/2, 1/2, 0; less
+        # 1/4: -0.25, 0.25, 0.25, -0.25; divided by 0.25.
+        ("nes", [-1, 1, 1, -1]),
+        ("nes_unnormalized", [0, 1, 1, 0]),
+        ("single_best", [0, 1, 1, 0]),
+        ("single_better", [0, 1, 1, 0]),
+        # Advantages over 1: 1, 4, 4, 0.
+        ("all_better_1", [0.25, 1, 1, 0]),
+        ("all_better_2", [1 / 9, 4 / 9, 4 / 9, 0]),
+    ],
+)
+def test_members_that_tie_weigh_the_same(name, expected):
+    np.testing.assert_allclose(transform(name, [2, 5, 5, 1], 1.0), expected, rtol=1e-5, atol=1e-6)
+
+
+NES_TIES = pytest.mark.xfail(
+    strict=True,
+    reason="nes divides rounding noise by its own magnitude when all utilities are 1/n: "
+    "weights are +1 or -1 for many population sizes (16 among them)",
+)
+
+
+@pytest.mark.parametrize("name", ["linear", "rank", pytest.param("nes", marks=NES_TIES)])
+def test_equal_scores_weigh_nothing_where_a_difference_is_needed(name):
+    for size in (2, 3, 4, 7, 16, 31):
+        np.testing.assert_array_equal(transform(name, [7.0] * size, 1.0), 0.0)
+
+
+@pytest.mark.parametrize(
+    ("name", "expected"),
+    [("single_best", 1), ("single_better", 1), ("all_better_1", 1), ("all_better_2", 0.25)],
+)
+def test_equal_scores_above_the_incumbent_share_the_weight(name, expected):
+    np.testing.assert_allclose(transform(name, [7.0] * 4, 1.0), expected)
+
+
+DIVERGED_ALL = {
+    "nes": NES_TIES,
+    "nes_unnormalized": pytest.mark.xfail(
+        strict=True,
+        reason="nes_unnormalized weighs every member 1 when all have diverged: the incumbent "
+        "then moves by the sum of the diverged perturbations",
+    ),
+}
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(n, marks=DIVERGED_ALL.get(n, ())) for n in SCORE_TRANSFORMS]
+)
+@pytest.mark.parametrize("incumbent", [1.0, NAN])
+def test_a_generation_that_diverged_as_a_whole_weighs_nothing(name, incumbent):
+    for size in (2, 3, 16):
+        for scores in ([NAN] * size, [NAN, INF] + [-INF] * (size - 2)):
+            np.testing.assert_array_equal(transform(name, scores, incumbent), 0.0)
+
+
+BETTER_THAN_DIVERGED = pytest.mark.xfail(
+    strict=True,
+    reason="single_better compares with a nan incumbent and never moves, where all_better_1 and "
+    "all_better_2 take an incumbent without a finite score as below every member",
+)
+
+
+@pytest.mark.parametrize(
+    ("name", "expected"),
+    [
+        pytest.param("single_better", [1, 0, 0, 0], marks=BETTER_THAN_DIVERGED),
+        # The worst finite score, 1, stands in: advantages 2, 0, 0, 1.
+        ("all_better_1", [1, 0, 0, 0.5]),
+        ("all_better_2", [2 / 3, 0, 0, 1 / 3]),
+    ],
+)
+def test_an_incumbent_without_a_finite_score_is_below_every_member(name, expected):
+    np.testing.assert_allclose(transform(name, SCORES, NAN), expected, rtol=1e-5, atol=1e-6)
+
+
+# --- laws ----------------------------------------------------------------------------------------
+
+# Sixteenths in [-64, 64], exact in float32, so that float comparisons are those of the reals.
+finite_scores = st.integers(-1024, 1024).map(lambda n: n / 16)
+scores_lists = st.lists(
+    st.one_of(finite_scores, st.sampled_from([NAN, INF, -INF])), min_size=6, max_size=6
+)
+
+
+@pytest.mark.parametrize("name", SCORE_TRANSFORMS)
+@given(scores=scores_lists, incumbent=finite_scores, order=st.permutations(range(6)))
+def test_permuting_the_members_permutes_their_weights(name, scores, incumbent, order):
+    weights = transform(name, scores, incumbent)
+    permuted = transform(name, [scores[i] for i in order], incumbent)
+    np.testing.assert_allclose(permuted, weights[list(order)], rtol=1e-4, atol=1e-6)
+
+
+@pytest.mark.parametrize("name", SCORE_TRANSFORMS)
+@given(scores=scores_lists, incumbent=st.one_of(finite_scores, st.just(NAN)))
+def test_weights_are_finite_bounded_and_never_fall_with_the_score(name, scores, incumbent):
+    weights = transform(name, scores, incumbent)
+    assert np.isfinite(weights).all() and np.abs(weights).max() <= 1 + 1e-6
+    ranked = np.where(np.isfinite(scores), scores, -INF)  # not finite: worst
+    ordered = weights[np.argsort(ranked, kind="stable")]
+    assert (np.diff(ordered) >= -1e-5).all()
+
+
+@pytest.mark.parametrize("name", ["linear", "rank", "nes", "nes_unnormalized", "single_best"])
+@given(scores=scores_lists, incumbents=st.tuples(finite_scores, finite_scores))
+def test_transforms_that_do_not_compare_ignore_the_incumbent(name, scores, incumbents):
+    a, b = (transform(name, scores, incumbent) for incumbent in incumbents)
+    np.testing.assert_array_equal(a, b)
+
+
+@pytest.mark.parametrize("name", ["single_better", "all_better_1", "all_better_2"])
+@given(scores=scores_lists, incumbent=finite_scores)
+def test_only_members_better_than_the_incumbent_weigh(name, scores, incumbent):
+    weights = transform(name, scores, incumbent)
+    better = np.isfinite(scores) & (np.array(scores) > incumbent)
+    assert (weights[~better] == 0).all()
+    assert weights.any() == better.any()
+    if name == "all_better_2" and better.any():
+        np.testing.assert_allclose(weights.sum(), 1, rtol=1e-5)
