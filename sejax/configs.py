@@ -311,7 +311,9 @@ class EvaluateConfig:
 def register_evosax_choices() -> None:
     """Makes `es=<name>` known to Hydra for each of evosax's algorithms."""
     for name in EVOSAX_ALGORITHMS:
-        ConfigStore.instance().store(group="es", name=name, node=EvosaxConfig(name=name))
+        ConfigStore.instance().store(
+            group="es", name=name, node=vars(EvosaxConfig(name=name)).copy()
+        )
 
 
 def config(overrides: Sequence[str] = ()) -> LearnConfig:

@@ -333,7 +333,7 @@ TARGET = np.array([0.5, -0.4, 0.3, -0.2, 0.6, -0.5], np.float32)
 def climb(strategy, generations):
     """Scores of the incumbent on a smooth concave function, one for each generation.
 
-    Two of the trainings always diverge, and in the tenth generation all do.
+    Two trainings of each generation diverge, others each time, and in the tenth all do.
     """
     index = jnp.arange(strategy.num_candidates)
 
@@ -342,7 +342,8 @@ def climb(strategy, generations):
         key_ask, key_tell = jax.random.split(key)
         candidates, state = strategy.ask(key_ask, state)
         true_scores = -jnp.sum((candidates - TARGET) ** 2, axis=-1)
-        scores = jnp.where(index == 3, NAN, jnp.where(index == 8, INF, true_scores))
+        diverged = (5 * number + jnp.array([[0], [1]])) % 16 == index  # [2, candidates]
+        scores = jnp.where(diverged[0], NAN, jnp.where(diverged[1], INF, true_scores))
         scores = jnp.where(number == 10, NAN, scores)
         return strategy.tell(key_tell, candidates, scores, state), true_scores[-1]
 
@@ -358,7 +359,7 @@ def test_every_algorithm_maximises_scores_though_some_trainings_diverge(name):
     # A wrong sign would run away from the target. Start: -|target|^2 = -1.15.
     scores = climb(evosax_strategy(name), generations=80)
     np.testing.assert_allclose(scores[0], -1.15, rtol=1e-5)
-    assert scores[-1] > -0.58  # half of the way, in score
+    assert scores[-1] > -0.75  # a third of the way, in score
 
 
 @pytest.mark.parametrize(
