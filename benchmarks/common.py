@@ -79,7 +79,9 @@ class Side:
         line = self._process.stdout.readline()
         if not line:
             status = self._process.wait()
-            raise RuntimeError(f"side {self.name!r} ended with status {status}; see its error above.")
+            raise RuntimeError(
+                f"side {self.name!r} ended with status {status}; see its error above."
+            )
         return json.loads(line)
 
 
@@ -95,12 +97,6 @@ def measure(fn: Callable[[], Any]) -> tuple[Any, dict[str, float]]:
     wall, cpu = time.perf_counter(), time.process_time()
     out = fn()
     return out, {"wall_s": time.perf_counter() - wall, "cpu_s": time.process_time() - cpu}
-
-
-def use_one_core(core: int) -> None:
-    """Keeps this process, and XLA's thread pool if it comes later, to one core."""
-    os.environ["NPROC"] = "1"  # XLA sizes its pool by it; a larger one spins and doubles CPU time
-    os.sched_setaffinity(0, {core})
 
 
 def available_cores() -> list[int]:
@@ -148,10 +144,11 @@ def print_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[obje
     """Prints rows; the first column is text, the others are numbers."""
     table = Table(title=title, title_justify="left")
     for i, column in enumerate(columns):
-        table.add_column(column, justify="right" if i else "left")
+        table.add_column(column, justify="right" if i else "left", no_wrap=True)
     for row in rows:
         table.add_row(*map(str, row))
-    Console().print(table)
+    console = Console()
+    Console(width=max(console.width, 110)).print(table)
 
 
 def finish(benchmark: str, args: argparse.Namespace, result: dict[str, Any]) -> None:

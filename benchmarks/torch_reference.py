@@ -1,30 +1,33 @@
-"""The inner loop and one NES generation of sejax once more, in eager PyTorch: the yardstick.
+"""The inner loop of sejax once more, in eager PyTorch: the yardstick.
 
 What a good PyTorch programmer would write for the paper's design, one small network call after the
 other: DDQN on an SE of three networks, then greedy test episodes on the real CartPole. It means
-the same as `sejax.agents.trainer` and `sejax.es.nes`, and takes its hyperparameters from the same
-`sejax.config([...])`. It imports neither jax nor the simulators.
+the same as `sejax.agents.trainer`, and takes its hyperparameters from the same
+`sejax.config([...])`. It imports neither jax nor gymnax. `torch_nes.py` has the generation.
 
-What was tried for speed (one thread, AVX-512, microseconds of the paper's CartPole learning step;
-first what is used here):
+What was tried for speed, in microseconds on one thread of an AVX-512 machine at the paper's
+CartPole settings; first what is used here, alone in a loop (in the whole step, where caches are
+cold, everything takes about 1.3 times as long):
 
-- loss and gradient by autograd 310; the same with torch.compile 8 % less, after 20 s of
-  compilation; a backward pass written by hand 200, which would give up what PyTorch is for; one
-  batched product for both networks at the next states no faster, feature-major no faster;
-- `torch._fused_adam_` on the list of parameters 4; `torch.optim.Adam(fused=True)` 39, plain 111,
-  `foreach` 107, over one flat parameter 41, by hand over one flat parameter 15;
-- `torch._foreach_lerp_` for the soft target update 3;
-- the SE's three networks joined in one with block-diagonal layers 10; as three modules 49;
-- a replay buffer that NumPy and PyTorch share, written through NumPy 1, through PyTorch 7.
+- loss and gradient: autograd on plain functions 310; with `nn.Sequential` 45 more;
+  feature-major, by masks in the place of `gather`, or with one batched product for both networks
+  at the next states: the same within 5 %;
+- optimiser: `torch._fused_adam_` 4; `torch.optim.adam.adam(fused=True)` 21;
+  `torch.optim.Adam(fused=True)` 39, over one flat parameter 29, plain 111, `foreach` 107;
+- soft target update: `torch._foreach_lerp_` 3;
+- SE step: the three networks joined in one with block-diagonal layers 10, as three modules 49;
+- acting: through PyTorch 8; through NumPy on the same memory 3, lost in the noise of the step;
+- storing a transition: through NumPy on the buffer's memory 1, through PyTorch 7.
+
+Beyond eager PyTorch, for the whole step with learning, of 460 here: a backward pass written by
+hand 350; `torch.compile` over loss, gradient, Adam and soft update in one 310, after 10 to 20 s.
 """
 
+import itertools
 import math
 import random
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass
-from multiprocessing import get_context
-from multiprocessing.pool import Pool
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -32,7 +35,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from sejax.configs import DDQNConfig, LearnConfig, NESConfig, SyntheticConfig, TrainingConfig
+from sejax.configs import DDQNConfig, LearnConfig, SyntheticConfig, TrainingConfig
 
 OBS_DIM, NUM_ACTIONS, MAX_STEPS = 4, 2, 200  # CartPole-v0
 HEADS = {"state": OBS_DIM, "reward": 1, "done": 1}
@@ -65,14 +68,12 @@ ACTIVATIONS: dict[str, Callable[[Tensor], Tensor]] = {
 }
 
 
-def init_mlp(
-    sizes: list[int], activation: str, generator: torch.Generator | None = None
-) -> list[Tensor]:
+def init_mlp(sizes: list[int], activation: str) -> list[Tensor]:
     """Parameters for `mlp`, uniform in +-1/sqrt(fan_in), for layers of these sizes."""
     params = []
-    for fan_in, fan_out in zip(sizes[:-1], sizes[1:], strict=True):
+    for fan_in, fan_out in itertools.pairwise(sizes):
         for shape in ((fan_out, fan_in), (fan_out,)):
-            uniform = torch.rand(shape, generator=generator)
+            uniform = torch.rand(shape)
             params.append((2 * uniform - 1) * fan_in**-0.5)
     return params + ([torch.full((1,), PRELU_SLOPE)] if activation == "prelu" else [])
 
@@ -82,7 +83,7 @@ def params_from_flax(tree: dict[str, Any]) -> list[Tensor]:
     layers = sorted((name for name in tree if name.startswith("Dense_")), key=_layer_number)
     arrays = [tree[name][leaf] for name in layers for leaf in ("kernel", "bias")]
     arrays += [np.reshape(tree["prelu_slope"], (1,))] if "prelu_slope" in tree else []
-    return [torch.tensor(np.asarray(array)) for array in arrays]
+    return [torch.tensor(np.asarray(array, np.float32)) for array in arrays]
 
 
 def params_to_flax(params: list[Tensor]) -> dict[str, Any]:
@@ -117,6 +118,7 @@ class SyntheticEnv:
         self._soft = config.done == "soft"
         self._one_hot = torch.eye(NUM_ACTIONS)
 
+    @torch.no_grad()
     def step(self, obs: Tensor, action: int) -> tuple[Tensor, float, float, bool, bool]:
         """Next observation, reward, discount for the target, terminated, and nonfinite."""
         out = mlp(self._params, torch.cat([self._one_hot[action], obs]), self._activation)
@@ -126,7 +128,8 @@ class SyntheticEnv:
             return obs, 0.0, 0.0, True, math.isnan(size)
         *_, reward, done = values
         terminated = done > 0.5
-        return out[:OBS_DIM], reward, 1 - done if self._soft else 1.0 - terminated, terminated, False
+        discount = 1 - done if self._soft else 1.0 - terminated
+        return out[:OBS_DIM], reward, discount, terminated, False
 
 
 class CartPole:
@@ -143,7 +146,7 @@ class CartPole:
     @classmethod
     def step(cls, state: np.ndarray, action: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Next states `[episode, 4]` and whether each has fallen `[episode]`."""
-        position, velocity, angle, spin = state.T
+        _, velocity, angle, spin = state.T
         cos, sin = np.cos(angle), np.sin(angle)
         pole_moment = cls.pole_mass * cls.half_length
         push = np.where(action == 1, cls.force, -cls.force)
@@ -169,6 +172,17 @@ class Batch(NamedTuple):
     action: Tensor  # [batch, 1], int64
     reward: Tensor  # [batch, 1]
     discount: Tensor  # [batch, 1]
+
+
+def batch_from_sejax(transition: Any) -> Batch:
+    """A batch from a feature-major `sejax.agents.replay.Transition`, to compare updates with."""
+
+    def rows(name: str) -> Tensor:
+        array = np.asarray(getattr(transition, name), np.float32)
+        return torch.tensor(np.atleast_2d(array).T.copy())
+
+    columns = {name: rows(name) for name in Batch._fields}
+    return Batch(**columns | {"action": columns["action"].long()})
 
 
 class ReplayBuffer:
@@ -207,7 +221,7 @@ class DDQNState:
     target: list[Tensor]
     exp_avgs: list[Tensor]  # Adam's moments
     exp_avg_sqs: list[Tensor]
-    steps: list[Tensor]
+    num_updates: Tensor
     values: list[Tensor]  # the same memory as `online`, without gradients
 
 
@@ -219,7 +233,7 @@ def ddqn_state(online: list[Tensor], target: list[Tensor] | None = None) -> DDQN
         target=[p.detach().clone() for p in target or online],
         exp_avgs=[torch.zeros_like(p) for p in values],
         exp_avg_sqs=[torch.zeros_like(p) for p in values],
-        steps=[torch.zeros(()) for _ in values],
+        num_updates=torch.zeros(()),
         values=values,
     )
 
@@ -247,9 +261,10 @@ def ddqn_update(state: DDQNState, batch: Batch, config: DDQNConfig) -> None:
     """One step of Adam on `ddqn_loss` and one soft update of the target network, in place."""
     gradient = torch.autograd.grad(ddqn_loss(state, batch, config), state.online)
     with torch.no_grad():
-        torch._foreach_add_(state.steps, 1)
+        state.num_updates += 1
         torch._fused_adam_(
-            state.values, gradient, state.exp_avgs, state.exp_avg_sqs, [], state.steps,
+            state.values, gradient, state.exp_avgs, state.exp_avg_sqs, [],
+            [state.num_updates] * len(state.values),
             lr=config.learning_rate, beta1=0.9, beta2=0.999, weight_decay=0.0, eps=1e-8,
             amsgrad=False, maximize=False,
         )  # fmt: skip
@@ -258,6 +273,7 @@ def ddqn_update(state: DDQNState, batch: Batch, config: DDQNConfig) -> None:
 
 @torch.no_grad()
 def greedy_action(state: DDQNState, obs: Tensor, activation: str) -> int:
+    """The action with the largest Q at one observation."""
     return int(mlp(state.values, obs, activation).argmax())
 
 
@@ -281,43 +297,76 @@ def train(env: SyntheticEnv, config: LearnConfig, seed: int) -> TrainResult:
     """
     _check(config)
     torch.manual_seed(seed)
-    rng, rng_actions = np.random.default_rng(seed), random.Random(seed)
-    hp, training = config.agent, config.training
-    agent = init_ddqn(hp)
-    buffer = ReplayBuffer(min(hp.buffer_size, training.max_episodes * MAX_STEPS), hp.batch_size)
+    random.seed(seed)
+    rng = np.random.default_rng(seed)
+    agent = init_ddqn(config.agent)
+    capacity = min(config.agent.buffer_size, config.training.max_episodes * MAX_STEPS)
+    buffer = ReplayBuffer(capacity, config.agent.batch_size)
     returns: list[float] = []
     train_steps = 0
-    nonfinite = stop = False
-    while not stop:
-        episode = len(returns)
-        epsilon = _epsilon(hp, episode)
+    while True:
         obs = torch.from_numpy(CartPole.reset(rng, 1)[0])
-        episode_return, ended, time = 0.0, False, 0
-        while not ended:
-            if rng_actions.random() < epsilon:
-                action = rng_actions.randrange(NUM_ACTIONS)
-            else:
-                action = greedy_action(agent, obs, hp.activation)
-            next_obs, reward, discount, terminated, nonfinite = env.step(obs, action)
-            time += 1
-            truncated = time >= MAX_STEPS
-            if truncated and training.time_limit_is_terminal:
-                discount = 0.0
-            buffer.store(obs, next_obs, action, reward, discount)
-            if episode >= hp.init_episodes:
-                ddqn_update(agent, buffer.sample(), hp)
-            obs = next_obs
-            episode_return += reward
-            ended = terminated or truncated or nonfinite
-        train_steps += time
-        returns.append(episode_return)
-        stop = nonfinite or len(returns) >= training.max_episodes or (
-            training.stop_rule == "plateau"
-            and episode >= hp.init_episodes + training.window
-            and is_plateau(returns, training)
-        )
-    nonfinite = nonfinite or not all(bool(p.isfinite().all()) for p in agent.values)
+        episode = play_episode(env, agent, buffer, obs, len(returns), config)
+        train_steps += episode.steps
+        returns.append(episode.total)
+        if episode.nonfinite or should_stop(returns, config):
+            break
+    nonfinite = episode.nonfinite or not all(bool(p.isfinite().all()) for p in agent.values)
     return TrainResult(agent=agent, train_steps=train_steps, returns=returns, nonfinite=nonfinite)
+
+
+class Episode(NamedTuple):
+    """What came of one training episode."""
+
+    steps: int
+    total: float
+    nonfinite: bool
+
+
+def play_episode(
+    env: SyntheticEnv,
+    agent: DDQNState,
+    buffer: ReplayBuffer,
+    obs: Tensor,
+    episode: int,
+    config: LearnConfig,
+) -> Episode:
+    """One training episode: each step acts, steps the SE, stores, and learns once."""
+    hp = config.agent
+    epsilon = epsilon_at(episode, hp)
+    total = 0.0
+    for step in range(1, MAX_STEPS + 1):
+        if random.random() < epsilon:
+            action = random.randrange(NUM_ACTIONS)
+        else:
+            action = greedy_action(agent, obs, hp.activation)
+        next_obs, reward, discount, terminated, nonfinite = env.step(obs, action)
+        if step == MAX_STEPS and config.training.time_limit_is_terminal:
+            discount = 0.0
+        buffer.store(obs, next_obs, action, reward, discount)
+        if episode >= hp.init_episodes:
+            ddqn_update(agent, buffer.sample(), hp)
+        obs = next_obs
+        total += reward
+        if terminated:
+            break
+    return Episode(step, total, nonfinite)
+
+
+def epsilon_at(episode: int, hp: DDQNConfig) -> float:
+    """Epsilon's initial value, decayed by a factor for each episode down to its minimum."""
+    if episode == 0:
+        return hp.epsilon_init
+    return max(hp.epsilon_init * hp.epsilon_decay**episode, hp.epsilon_min)
+
+
+def should_stop(returns: list[float], config: LearnConfig) -> bool:
+    """Whether training ends after the last of these episodes."""
+    training, episode = config.training, len(returns) - 1
+    if len(returns) >= training.max_episodes:
+        return True
+    may_stop = episode >= config.agent.init_episodes + training.window
+    return training.stop_rule == "plateau" and may_stop and is_plateau(returns, training)
 
 
 def is_plateau(returns: list[float], training: TrainingConfig) -> bool:
@@ -332,7 +381,7 @@ def is_plateau(returns: list[float], training: TrainingConfig) -> bool:
 
 
 @torch.no_grad()
-def test(agent: DDQNState, config: LearnConfig, seed: int) -> np.ndarray:
+def play_test_episodes(agent: DDQNState, config: LearnConfig, seed: int) -> np.ndarray:
     """Returns `[test_episodes]` of greedy episodes on the real task, all played side by side."""
     state = CartPole.reset(np.random.default_rng(seed), config.training.test_episodes)
     active = np.ones(len(state), dtype=bool)
@@ -347,12 +396,6 @@ def test(agent: DDQNState, config: LearnConfig, seed: int) -> np.ndarray:
     return returns
 
 
-def _epsilon(hp: DDQNConfig, episode: int) -> float:
-    if episode == 0:
-        return hp.epsilon_init
-    return max(hp.epsilon_init * hp.epsilon_decay**episode, hp.epsilon_min)
-
-
 def _check(config: LearnConfig) -> None:
     """Refuses what is not built here, rather than measuring something else."""
     supported = {
@@ -365,116 +408,3 @@ def _check(config: LearnConfig) -> None:
     for field, (got, known) in supported.items():
         if got not in known:
             raise ValueError(f"{field} must be one of {known} in the reference; got {got!r}.")
-
-
-# --- one generation ---------------------------------------------------------------------------
-
-
-@dataclass(kw_only=True)
-class Outcome:
-    """What came of one candidate: its score (nan if the training diverged) and its cost."""
-
-    score: float
-    train_steps: int
-    test_steps: int
-
-
-def evaluate(weights: Weights, config: LearnConfig, seed: int) -> Outcome:
-    """Trains a fresh agent on the SE with these weights and tests it on the real task.
-
-    Source: paper, Algorithm 1, TrainAgent and EvaluateAgent.
-    """
-    result = train(SyntheticEnv(weights, config.proxy), config, seed)
-    returns = test(result.agent, config, seed + 1)
-    score = math.nan if result.nonfinite else float(returns.mean())
-    return Outcome(score=score, train_steps=result.train_steps, test_steps=int(returns.sum()))
-
-
-@contextmanager
-def worker_pool(num_processes: int) -> Iterator[Pool]:
-    """A pool of processes with one torch thread each, started and warm."""
-    with get_context("spawn").Pool(num_processes, initializer=_start_worker) as pool:
-        pool.map(abs, range(num_processes))
-        yield pool
-
-
-def _start_worker() -> None:
-    torch.set_num_threads(1)
-
-
-def generation(
-    psi: np.ndarray, config: LearnConfig, pool: Pool, seed: int
-) -> tuple[np.ndarray, list[Outcome]]:
-    """One pass of Algorithm 1's outer loop; returns the next psi and the candidates' outcomes.
-
-    Each member tries psi + eps and psi - eps, and one agent trains on psi for each member. A free
-    process takes the next candidate, so that long and short trainings balance out.
-    """
-    es = config.es
-    rng = np.random.default_rng(seed)
-    noise = es.noise_std * rng.standard_normal((es.population_size, psi.size), dtype=np.float32)
-    candidates = [*(psi + noise), *(psi - noise), *[psi] * es.population_size]
-    seeds = rng.integers(2**31, size=len(candidates)).tolist()
-    jobs = [
-        (unravel(flat, config.proxy), config, job_seed)
-        for flat, job_seed in zip(candidates, seeds, strict=True)
-    ]
-    outcomes = pool.starmap(evaluate, jobs, chunksize=1)
-    scores = np.array([outcome.score for outcome in outcomes])
-    return nes_update(psi, noise, scores, es), outcomes
-
-
-def nes_update(
-    psi: np.ndarray, noise: np.ndarray, scores: np.ndarray, es: NESConfig
-) -> np.ndarray:
-    """The NES step from scores `[3 n]` of psi + eps, psi - eps and psi, with All Better 2.
-
-    Source: paper, Algorithm 1 and appendix "NES Score Transformation".
-    """
-    if not (es.mirrored and es.score_transform == "all_better_2" and es.num_evals == 1):
-        raise ValueError("the reference has mirrored sampling with all_better_2 alone; set these.")
-    plus, minus, incumbent = np.where(np.isfinite(scores), scores, -np.inf).reshape(3, -1)
-    noise = np.where(minus > plus, -1, 1)[:, None] * noise
-    finite = incumbent[np.isfinite(incumbent)]
-    best = np.maximum(plus, minus)
-    if not np.isfinite(best).any():
-        return (1 - es.weight_decay) * psi
-    floor = finite.mean() if finite.size else best[np.isfinite(best)].min()
-    advantage = np.maximum(best - floor, 0)
-    weights = advantage / advantage.sum() if advantage.sum() > 0 else advantage
-    step = es.step_size * weights @ noise
-    if es.update_rule == "paper":
-        step = step / (es.population_size * es.noise_std)
-    return ((1 - es.weight_decay) * psi + step).astype(np.float32)
-
-
-def random_weights(config: SyntheticConfig, seed: int) -> Weights:
-    """A fresh SE, as sejax's default initialisation draws it."""
-    generator = torch.Generator().manual_seed(seed)
-    return {
-        head: params_to_flax(init_mlp(_proxy_sizes(config, head), "", generator))
-        for head in HEADS
-    }
-
-
-def ravel(weights: Weights) -> np.ndarray:
-    """All of an SE's weights as one vector."""
-    arrays = [p.numpy().ravel() for head in HEADS for p in params_from_flax(weights[head])]
-    return np.concatenate(arrays)
-
-
-def unravel(flat: np.ndarray, config: SyntheticConfig) -> Weights:
-    """Inverse of `ravel`."""
-    weights, start = {}, 0
-    for head in HEADS:
-        params = init_mlp(_proxy_sizes(config, head), "")
-        for i, shape in enumerate(p.shape for p in params):
-            params[i] = torch.from_numpy(flat[start : start + shape.numel()].reshape(shape))
-            start += shape.numel()
-        weights[head] = params_to_flax(params)
-    return weights
-
-
-def _proxy_sizes(config: SyntheticConfig, head: str) -> list[int]:
-    hidden = [config.hidden_size] * config.num_layers
-    return [NUM_ACTIONS + OBS_DIM, *hidden, HEADS[head]]

@@ -175,6 +175,7 @@ class NESConfig:
 
     name: str = "nes"
     population_size: int = 16  # n_p: members in a generation.
+    num_incumbent_evals: int | None = None  # agents on the incumbent; null: one for each member
     noise_std: float = 0.05  # sigma: std of the weight perturbation.
     noise_std_decay: float = 1.0  # factor on sigma after each generation
     step_size: float = 1.0  # alpha
@@ -190,6 +191,9 @@ class NESConfig:
     def __post_init__(self) -> None:
         _at_least(2, "es.population_size", self.population_size,
                   "scores are compared within a generation", 16)  # fmt: skip
+        if self.num_incumbent_evals is not None:
+            _at_least(1, "es.num_incumbent_evals", self.num_incumbent_evals,
+                      "the incumbent's score selects the proxy", "null")  # fmt: skip
         _positive("es.noise_std", self.noise_std, "members must differ", 0.05)
         _positive("es.step_size", self.step_size, "the proxy would not move", 1)
         for name in ("noise_std_decay", "step_size_decay"):

@@ -1,4 +1,7 @@
-"""What several test modules share: plain references and tiny configurations."""
+"""What several test modules share: plain references, and a reader of compiled programs."""
+
+import math
+import re
 
 import numpy as np
 
@@ -20,3 +23,51 @@ def numpy_forward(params, x, activation, num_layers, prelu_slope=0.25):
         if layer < num_layers:
             x = activate(x)
     return x
+
+
+# Ops that pass a buffer on or write into it in place.
+IN_PLACE = {
+    "parameter", "get-tuple-element", "tuple", "while", "conditional", "call", "fusion", "bitcast",
+    "dynamic-update-slice", "scatter",
+}  # fmt: skip
+
+
+def large_ops_in_loops(hlo, num_elements):
+    """Ops in the loops of a compiled program that make a new array of at least this size.
+
+    Returns `(op, line)` for each op of a `while` body, or of what it calls, whose result has at
+    least `num_elements` elements and that is not one of `IN_PLACE`. What runs once before a loop
+    is not listed.
+    """
+    computations, name = {}, None
+    for line in hlo.splitlines():
+        header = re.match(r"(?:ENTRY )?%?([\w.\-]+) \(.*\) -> .*\{$", line)
+        if header:
+            name = header.group(1)
+            computations[name] = []
+        elif line.startswith("}"):
+            name = None
+        elif name:
+            computations[name].append(line.strip())
+    pending = {body for body in re.findall(r"body=%?([\w.\-]+)", hlo)}
+    assert pending, "the program has no loop"
+    reached = set()
+    while pending:
+        name = pending.pop()
+        reached.add(name)
+        called = re.findall(
+            r"(?:calls|to_apply|body|condition|true_computation|false_computation)=%?([\w.\-]+)",
+            "\n".join(computations[name]),
+        )
+        for branches in re.findall(
+            r"(?:branch_computations|called_computations)=\{(.*?)\}", "\n".join(computations[name])
+        ):
+            called += re.findall(r"%?([\w.\-]+)", branches)
+        pending |= set(called) - reached
+    found = []
+    for name in sorted(reached):
+        for line in computations[name]:
+            op = re.search(r"= \w+\[([\d,]*)\]\S* ([\w\-]+)\(", line)  # results that are no tuple
+            if op and math.prod(int(d) for d in op.group(1).split(",") if d) >= num_elements:
+                found.append((op.group(2), line))
+    return [(op, line) for op, line in found if op not in IN_PLACE]

@@ -38,8 +38,9 @@ class NES(base.DistributionBasedAlgorithm):
 
     `ask` returns the candidates to score, `[num_candidates, num_dims]`: psi + eps_i for each of the
     `config.population_size` members, then psi - eps_i if sampling is mirrored, each of these
-    `config.num_evals` times, and last the incumbent psi once for each member. `tell` takes the
-    fitness of all of them, which evosax minimises: the negative of the score.
+    `config.num_evals` times, and last the incumbent psi, once for each member unless
+    `config.num_incumbent_evals` says otherwise. `tell` takes the fitness of all of them, which
+    evosax minimises: the negative of the score.
 
     With mirrored sampling a member's score is that of its better sign, and its eps has that sign;
     a tie keeps the plus.
@@ -48,7 +49,8 @@ class NES(base.DistributionBasedAlgorithm):
     def __init__(self, config: NESConfig, solution: Any):
         num_signs = 2 if config.mirrored else 1
         self.num_perturbed = config.population_size * num_signs * config.num_evals
-        super().__init__(self.num_perturbed + config.population_size, solution)
+        self.num_incumbent_evals = config.num_incumbent_evals or config.population_size
+        super().__init__(self.num_perturbed + self.num_incumbent_evals, solution)
         self.config = config
         self.num_signs = num_signs
 
@@ -73,7 +75,7 @@ class NES(base.DistributionBasedAlgorithm):
         noise = state.noise_std * jax.random.normal(key, (num_members, self.num_dims))
         signed = jnp.concatenate([noise, -noise]) if self.config.mirrored else noise
         perturbed = jnp.repeat(state.mean + signed, self.config.num_evals, axis=0)
-        incumbents = jnp.broadcast_to(state.mean, (num_members, self.num_dims))
+        incumbents = jnp.broadcast_to(state.mean, (self.num_incumbent_evals, self.num_dims))
         return jnp.concatenate([perturbed, incumbents]), state
 
     def _tell(

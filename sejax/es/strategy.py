@@ -68,9 +68,9 @@ def _nes(config: NESConfig, num_dims: int) -> Strategy:
         ask=lambda key, state: algorithm.ask(key, state, params),
         tell=tell,
         incumbent=lambda state: state.mean,
-        seed_ids=_seed_ids(config, algorithm.num_perturbed, config.population_size),
+        seed_ids=_seed_ids(config, algorithm.num_perturbed, algorithm.num_incumbent_evals),
         num_candidates=algorithm.population_size,
-        num_incumbent_evals=config.population_size,
+        num_incumbent_evals=algorithm.num_incumbent_evals,
     )
 
 

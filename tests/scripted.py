@@ -1,0 +1,110 @@
+"""A world and an agent that follow a script, so that a training can be worked out by hand.
+
+The agent says which episode it is in and at what time it believes to be; the world pays each
+episode's scripted return at its end. Nothing depends on random numbers but a tag that marks an
+episode's observations.
+"""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+from gymnax.environments import environment
+
+from sejax.agents.agent import Agent
+from sejax.agents.replay import Transition
+
+MAX_EPISODES = 12
+MAX_STEPS = 4  # the world's step limit
+WHO = 100  # an action is WHO * episode + time
+
+
+@struct.dataclass
+class ScriptState(environment.EnvState):
+    tag: jax.Array  # drawn at reset
+
+
+@struct.dataclass
+class ScriptParams(environment.EnvParams):
+    returns: jax.Array = None  # [MAX_EPISODES]
+    lengths: jax.Array = None  # [MAX_EPISODES]: step at which each episode terminates
+    nonfinite_episode: Any = -1  # its second step is not a number
+    max_steps_in_episode: int = MAX_STEPS
+
+
+class ScriptedEnv(environment.Environment[ScriptState, ScriptParams]):
+    @property
+    def default_params(self):
+        return script([0.0] * MAX_EPISODES, [1] * MAX_EPISODES)
+
+    def reset_env(self, key, params):
+        state = ScriptState(time=jnp.int32(0), tag=jax.random.uniform(key))
+        return self.get_obs(state), state
+
+    def step_env(self, key, state, action, params):
+        episode, time = action // WHO, state.time + 1
+        terminated = time >= params.lengths[episode]
+        last = terminated | (time >= params.max_steps_in_episode)
+        state = state.replace(time=time)
+        info = {
+            "discount": 1.0 - terminated,
+            "nonfinite": (episode == params.nonfinite_episode) & (time == 2),
+        }
+        reward = jnp.where(last, params.returns[episode], 0.0)
+        return self.get_obs(state), state, reward, terminated, info
+
+    def get_obs(self, state, params=None, key=None):
+        return jnp.stack([state.time.astype(jnp.float32), state.tag])
+
+
+@struct.dataclass
+class ScriptedAgentState:
+    episode: jax.Array
+    num_updates: jax.Array
+    first_update_episode: jax.Array
+    batch: Transition  # of the last update
+    min_discount: jax.Array  # over all batches
+    weight: jax.Array  # what hparams says; a float, so that it may diverge
+
+
+def script(returns, lengths, **fields):
+    return ScriptParams(
+        returns=jnp.array(returns, jnp.float32), lengths=jnp.array(lengths, jnp.int32), **fields
+    )
+
+
+def scripted_agent(init_episodes=2, buffer_size=1000, batch_size=64):
+    empty = Transition(
+        obs=jnp.zeros((2, batch_size)),
+        action=jnp.zeros(batch_size, jnp.int32),
+        reward=jnp.zeros(batch_size),
+        discount=jnp.zeros(batch_size),
+        next_obs=jnp.zeros((2, batch_size)),
+    )
+
+    def init(key, hparams):
+        return ScriptedAgentState(
+            episode=jnp.int32(-1), num_updates=jnp.int32(0), first_update_episode=jnp.int32(-1),
+            batch=empty, min_discount=jnp.float32(jnp.inf), weight=jnp.float32(hparams),
+        )  # fmt: skip
+
+    def update(key, state, batch):
+        first = jnp.where(state.num_updates == 0, state.episode, state.first_update_episode)
+        return state.replace(
+            num_updates=state.num_updates + 1,
+            first_update_episode=first,
+            batch=batch,
+            min_discount=jnp.minimum(state.min_discount, batch.discount.min()),
+        )
+
+    return Agent(
+        init=init,
+        begin_episode=lambda state, episode: state.replace(episode=episode),
+        act=lambda key, state, obs, explore: WHO * state.episode + obs[0].astype(jnp.int32),
+        update=update,
+        hparams=0.0,
+        init_episodes=init_episodes,
+        batch_size=batch_size,
+        buffer_size=buffer_size,
+    )

@@ -1,0 +1,268 @@
+"""sejax.bilevel: the outer loop as one program, however it is cut, mapped and spread."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from support import large_ops_in_loops
+
+import sejax
+from sejax import bilevel, envs
+from sejax.bilevel import make_learner, make_program
+from sejax.configs import EVOSAX_ALGORITHMS
+from sejax.errors import ConfigError
+
+# 40 steps for each of 12 agents: short enough for rounding not to grow into other actions.
+TINY = [
+    "proxy.hidden_size=4", "agent.hidden_size=4", "agent.num_layers=1", "agent.batch_size=4",
+    "agent.init_episodes=0", "es.population_size=4", "es.noise_std=1.0", "training.max_episodes=3",
+    "training.max_steps=40", "training.window=2", "training.test_episodes=2", "generations=3",
+]  # fmt: skip
+KEYS = jax.random.split(jax.random.key(0), 2)
+
+
+def tiny(*overrides):
+    return sejax.config([*TINY, *overrides])
+
+
+def run(program, keys, generations, state=None, generation=None):
+    """States and infos of a run that Python drives, generation by generation."""
+    generation = generation or jax.jit(program.generation)
+    states, infos = [program.init(keys) if state is None else state], []
+    for _ in range(generations):
+        state, info = generation(states[-1])
+        states.append(state)
+        infos.append(info)
+    return states, infos
+
+
+@pytest.fixture(scope="module")
+def one_device():
+    """Program on one device, its jitted generation, and a run of three generations of each key."""
+    program = make_program(tiny("devices=1"))
+    generation = jax.jit(program.generation)
+    runs = [run(program, KEYS[i : i + 1], 3, generation=generation) for i in range(2)]
+    return program, generation, runs
+
+
+def leaves(tree):
+    """Leaves as NumPy arrays, keys included."""
+    plain = jax.tree.map(
+        lambda x: jax.random.key_data(x) if jnp.issubdtype(x.dtype, jax.dtypes.prng_key) else x,
+        tree,
+    )
+    return [np.asarray(x) for x in jax.tree.leaves(plain)]
+
+
+def assert_equal(a, b, **tolerance):
+    for x, y in zip(leaves(a), leaves(b), strict=True):
+        if tolerance:
+            np.testing.assert_allclose(x, y, **tolerance)
+        else:
+            np.testing.assert_array_equal(x, y)
+
+
+# --- what a generation does ----------------------------------------------------------------------
+
+
+def test_a_generation_measures_the_incumbent_and_then_moves_it(one_device):
+    _, _, ((states, infos), _) = one_device
+    for before, after, info in zip(states, states[1:], infos, strict=False):
+        np.testing.assert_array_equal(after.incumbent, before.es_state.mean)
+        np.testing.assert_array_equal(after.incumbent_score, info.incumbent_mean)
+        # All Better 2 moves the mean exactly if a member beats the incumbents' mean.
+        moved = bool((after.es_state.mean != before.es_state.mean).any())
+        assert moved == bool(info.population_max[0] > info.incumbent_mean[0])
+    assert any((a.es_state.mean != b.es_state.mean).any() for a, b in zip(states, states[1:]))  # noqa: B905
+
+
+def test_the_best_proxy_is_the_one_with_the_highest_incumbent_mean(one_device):
+    _, _, runs = one_device
+    for states, infos in runs:
+        means = [float(info.incumbent_mean[0]) for info in infos]
+        np.testing.assert_allclose(
+            [float(info.best_so_far[0]) for info in infos], np.maximum.accumulate(means)
+        )
+        best = int(np.argmax(means))
+        assert states[-1].best_generation == best and states[-1].best_score == means[best]
+        np.testing.assert_array_equal(states[-1].best, states[best + 1].incumbent)
+
+
+def test_infos_count_generations_and_steps(one_device):
+    program, _, ((states, infos), _) = one_device
+    assert program.num_candidates == 12  # 4 members with two signs, 4 incumbents
+    for number, info in enumerate(infos):
+        assert info.generation == number and info.active
+        assert info.train_steps_total == 12 * info.train_steps_mean
+        assert 0 < info.train_steps_max[0] <= 40
+        assert info.num_nonfinite == 0
+    real_steps = np.diff([0] + [int(info.env_steps_total[0]) for info in infos])
+    assert (real_steps >= 12 * 2 * 5).all()  # 12 agents, 2 tests of at least 5 steps each
+    assert states[-1].env_steps == infos[-1].env_steps_total
+
+
+def test_generations_of_one_seed_differ_and_so_do_seeds(one_device):
+    _, _, ((states, infos), (others, _)) = one_device
+    assert (states[0].incumbent != others[0].incumbent).any()
+    assert len({float(info.population_mean[0]) for info in infos}) == 3
+
+
+def test_all_generations_run_in_one_executable(one_device):
+    # A dtype or weak type that changed on the way would compile the program a second time.
+    _, generation, _ = one_device
+    assert generation._cache_size() == 1
+
+
+def test_the_programs_loops_neither_copy_nor_select_a_buffer(one_device):
+    program, generation, ((states, _), _) = one_device
+    hlo = generation.lower(states[0]).compile().as_text()
+    assert "f32[40,11]" in hlo  # the replay buffer: 40 rows of 2 * 4 + 3
+    copies = [
+        line
+        for op, line in large_ops_in_loops(hlo, num_elements=440)
+        if "f32[40,11]" in line.split("(")[0] and op in ("copy", "select")
+    ]
+    assert not copies, copies
+
+
+# --- the same numbers, however it is run ---------------------------------------------------------
+
+
+def assert_result_equals_run(result, program, states, infos, **tolerance):
+    assert_equal(result.weights, program.unravel(states[-1].best[0]), **tolerance)
+    assert_equal(result.last_weights, program.unravel(states[-1].incumbent[0]), **tolerance)
+    history = jax.tree.map(lambda *x: jnp.concatenate(x), *infos)
+    assert_equal(result.info, history, **tolerance)
+    assert result.generation == states[-1].best_generation[0]
+    assert_equal(result.score, states[-1].best_score[0], **tolerance)
+
+
+def test_a_jitted_learner_equals_driving_it_by_hand(one_device):
+    program, _, runs = one_device
+    learn = jax.jit(make_learner(tiny("devices=1")))
+    for key, (states, infos) in zip(KEYS, runs, strict=True):
+        assert_result_equals_run(learn(key), program, states, infos, rtol=1e-5, atol=1e-6)
+
+
+def test_a_learner_vmapped_over_keys_equals_separate_runs(one_device):
+    # On both devices at once: the program of the README.
+    program, _, runs = one_device
+    results = jax.jit(jax.vmap(make_learner(tiny())))(KEYS)
+    for i, (states, infos) in enumerate(runs):
+        result = jax.tree.map(lambda x, i=i: x[i], results)
+        assert_result_equals_run(result, program, states, infos, rtol=1e-4, atol=1e-5)
+
+
+def test_two_devices_give_the_same_bits_as_one(one_device):
+    _, _, ((states, infos), _) = one_device
+    program = make_program(tiny("devices=2"))
+    spread_states, spread_infos = run(program, KEYS[:1], 2)
+    assert_equal(spread_states[2], states[2])
+    assert_equal(spread_infos, infos[:2])
+
+
+def test_four_lanes_give_the_same_numbers_as_one(one_device):
+    _, _, ((states, infos), _) = one_device
+    program = make_program(tiny("devices=1", "lanes=4"))
+    lane_states, lane_infos = run(program, KEYS[:1], 2)
+    assert_equal(lane_states[2], states[2], rtol=1e-4, atol=1e-5)
+    assert_equal(lane_infos, infos[:2], rtol=1e-4, atol=1e-5)
+
+
+# --- several seeds, and stopping -----------------------------------------------------------------
+
+
+def test_seeds_of_one_program_equal_separate_runs_and_stop_when_solved(one_device, monkeypatch):
+    _, _, runs = one_device
+    first, second = (float(infos[0].incumbent_mean[0]) for _, infos in runs)
+    # A threshold that the better seed alone reaches in its first generation.
+    assert first != second
+    task = dataclasses.replace(envs.make("cartpole"), solved_reward=(first + second) / 2)
+    monkeypatch.setattr(bilevel.envs, "make", lambda name: task)
+    program = make_program(tiny("devices=1", "num_seeds=2", "stop_when_solved=true"))
+    states, infos = run(program, KEYS, 3)
+
+    solved = int(second > first)
+    alone, alone_infos = runs[solved]
+    np.testing.assert_array_equal(states[1].finished, [i == solved for i in range(2)])
+    # Up to its solution the seed runs as it does alone; then it stays as it is, at no cost.
+    seed_of = lambda tree, i: jax.tree.map(lambda x: x[i], tree)  # noqa: E731
+    assert_equal(states[1].best[solved], alone[1].best[0])
+    for state, info in zip(states[2:], infos[1:], strict=True):
+        assert_equal(seed_of(state, solved), seed_of(states[1], solved))
+        assert not info.active[solved] and info.train_steps_total[solved] == 0
+        assert info.env_steps_total[solved] == alone_infos[0].env_steps_total[0]
+
+    # The other seed goes on as it would alone, as long as it is not solved itself.
+    other = 1 - solved
+    alone, alone_infos = runs[other]
+    for number in range(3):
+        assert infos[number].active[other]
+        assert_equal(seed_of(infos[number], other), seed_of(alone_infos[number], 0))
+        if states[number + 1].finished[other]:
+            break
+        assert_equal(states[number + 1].best[other], alone[number + 1].best[0])
+
+
+def test_solved_runs_go_on_unless_asked_to_stop(one_device):
+    _, _, runs = one_device
+    assert not any(state.finished.any() for states, _ in runs for state in states)
+
+
+# --- trouble -------------------------------------------------------------------------------------
+
+
+def test_a_population_of_proxies_that_diverge_is_counted_and_leaves_no_trace(one_device):
+    _, generation, ((states, _), _) = one_device
+    wild = states[1].replace(
+        es_state=states[1].es_state.replace(noise_std=jnp.full(1, 1e30, jnp.float32))
+    )
+    after, info = generation(wild)
+    # All 8 perturbed proxies give numbers that are none; the 4 incumbents are as good as ever.
+    assert info.num_nonfinite == 8
+    assert np.isnan(info.population_mean) and np.isnan(info.population_max)
+    assert np.isfinite(info.incumbent_mean) and np.isfinite(info.incumbent_std)
+    np.testing.assert_array_equal(after.es_state.mean, wild.es_state.mean)
+    assert 0 < info.train_steps_max[0] <= 40
+
+
+def test_an_incumbent_that_diverges_is_never_the_best(one_device):
+    _, generation, ((states, _), _) = one_device
+    broken = states[0].replace(
+        es_state=states[0].es_state.replace(mean=jnp.full_like(states[0].es_state.mean, jnp.nan))
+    )
+    after, info = generation(broken)
+    assert info.num_nonfinite == 12
+    assert after.incumbent_score == -jnp.inf and after.best_generation == -1
+    np.testing.assert_array_equal(after.best, states[0].best)
+
+
+def test_more_devices_than_there_are_is_refused():
+    count = jax.device_count()
+    with pytest.raises(
+        ConfigError, match=rf"devices must be at most {count}, .* got {count + 1}\. Set devices="
+    ):
+        make_learner(tiny(f"devices={count + 1}"))
+
+
+@pytest.mark.parametrize(
+    "overrides",
+    [
+        ("es=open_es",), ("es=cma_es",), ("es=snes",), ("objective=reward_threshold",),
+        ("env=acrobot",), ("agent.activation=prelu", "proxy.activation=prelu"),
+        ("proxy.done=threshold",), ("es.mirrored=false", "es.num_evals=2"),
+        ("es.common_random_numbers=true",), ("es.update_rule=paper",),
+    ],
+    ids=" ".join,
+)  # fmt: skip
+def test_every_kind_of_configuration_makes_a_scan_body(overrides):
+    # Tracing only: the state that comes out has the types of the one that goes in.
+    assert {"open_es", "cma_es", "snes"} <= set(EVOSAX_ALGORITHMS)
+    program = make_program(tiny(*overrides))
+    state = jax.eval_shape(program.init, KEYS)
+    after, info = jax.eval_shape(program.generation, state)
+    kind = lambda tree: jax.tree.map(lambda x: (x.shape, x.dtype), tree)  # noqa: E731
+    assert kind(after) == kind(state)
+    assert {x.shape for x in jax.tree.leaves(info)} == {(2,)}

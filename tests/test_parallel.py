@@ -1,0 +1,77 @@
+"""sejax.parallel: the same results in the same order, however the work is spread."""
+
+import os
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from sejax.errors import ConfigError
+from sejax.parallel import spread_over_devices
+
+
+def work(key, x):
+    """Something that depends on both arguments and takes a different time for each element."""
+    steps = jnp.int32(jnp.abs(x[0])) + 1
+    walked = jax.lax.fori_loop(0, steps, lambda i, y: jnp.sin(y) + i, x)
+    return {"walked": walked, "noise": jax.random.normal(key), "steps": steps}
+
+
+@pytest.mark.parametrize("num_devices", [1, 2, None])
+@pytest.mark.parametrize("lanes", [1, 3, 100, None])
+def test_results_come_back_in_order_for_every_size(num_devices, lanes):
+    for size in (1, 2, 5):
+        keys = jax.random.split(jax.random.key(0), size)
+        xs = jnp.arange(2.0 * size).reshape(size, 2)
+        got = jax.jit(spread_over_devices(work, num_devices, lanes))(keys, xs)
+        assert got["walked"].shape == (size, 2) and got["steps"].shape == (size,)
+        for i in range(size):
+            expected = work(keys[i], xs[i])
+            for name, value in expected.items():
+                np.testing.assert_allclose(got[name][i], value, rtol=1e-6)
+
+
+def test_the_number_of_devices_changes_no_bit():
+    keys = jax.random.split(jax.random.key(0), 5)
+    xs = jnp.linspace(-3, 3, 10).reshape(5, 2)
+    one, two = (jax.jit(spread_over_devices(work, n))(keys, xs) for n in (1, 2))
+    for name in one:
+        np.testing.assert_array_equal(one[name], two[name])
+
+
+def test_two_devices_share_the_work():
+    hlo = jax.jit(spread_over_devices(work, 2)).lower(
+        jax.random.split(jax.random.key(0), 4), jnp.ones((4, 2))
+    )
+    assert "num_partitions=2" in hlo.compile().as_text().splitlines()[0]
+
+
+def test_more_devices_than_there_are_is_refused():
+    count = jax.device_count()
+    with pytest.raises(
+        ConfigError,
+        match=rf"^devices must be at most {count}, because that is how many there are; "
+        rf"got {count + 1}\. Set devices=null\.$",
+    ):
+        spread_over_devices(work, count + 1)
+
+
+@pytest.mark.xfail(
+    strict=True,
+    reason="the padding x[: padded - size] is too short when there are more than twice as many "
+    "devices as elements, and the reshape fails (48 trainings on more than 96 cores)",
+)
+def test_there_may_be_far_more_devices_than_elements():
+    program = (
+        "import jax.numpy as jnp\n"
+        "from sejax.parallel import spread_over_devices\n"
+        "print(spread_over_devices(lambda x: x + 1, 8)(jnp.arange(3.0)).tolist())\n"
+    )
+    environment = {**os.environ, "XLA_FLAGS": "--xla_force_host_platform_device_count=8"}
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, env=environment
+    )
+    assert done.stdout.strip() == "[1.0, 2.0, 3.0]", done.stderr

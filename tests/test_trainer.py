@@ -1,0 +1,401 @@
+"""sejax.agents.trainer: the inner loop against a plain Python one, alone and in lanes."""
+
+import gymnasium
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scripted import MAX_EPISODES, MAX_STEPS, WHO, ScriptedEnv, script, scripted_agent
+
+from sejax import envs
+from sejax.agents.ddqn import make_ddqn
+from sejax.agents.trainer import is_plateau, is_solved, make_tester, make_trainer
+from sejax.configs import DDQNConfig, SyntheticConfig, TrainingConfig
+from sejax.proxies.synthetic import make_synthetic
+
+WINDOW, TOLERANCE, SOLVED, INIT_EPISODES = 2, 0.25, 1.5, 2
+KEY = jax.random.key(0)
+ENV = ScriptedEnv()
+
+
+def training(**fields):
+    return TrainingConfig(
+        **{"max_episodes": MAX_EPISODES, "window": WINDOW, "plateau_tolerance": TOLERANCE, **fields}
+    )
+
+
+def scripted_test(key, agent_state, active):
+    """A test between episodes whose return is -1, 0, 1, 2, ... after episode 0, 1, 2, ..."""
+    return agent_state.episode - 1.0, jnp.int32(3)
+
+
+VARIANTS = {
+    "never": training(stop_rule="never"),
+    "plateau": training(stop_rule="plateau"),
+    "solved": training(stop_rule="solved", solved_by="train"),
+    "tested": training(stop_rule="solved", solved_by="test"),
+    "cut": training(stop_rule="never", time_limit_is_terminal=True, max_steps=17),
+    "patient": training(stop_rule="plateau", min_steps=14),
+}
+
+
+@pytest.fixture(scope="module")
+def trainers():
+    """Jitted scripted trainings by variant: `(key, env_params, weight=0, active=True)`."""
+
+    def build(name, config):
+        agent = scripted_agent(INIT_EPISODES, buffer_size=5 if name == "solved" else 1000)
+        train = jax.jit(
+            make_trainer(agent, ENV, config, solved_reward=SOLVED, test_fn=scripted_test)
+        )
+        return lambda key, params, weight=0.0, active=True: train(
+            key, params, jnp.float32(weight), jnp.bool_(active)
+        )
+
+    return {name: build(name, config) for name, config in VARIANTS.items()}
+
+
+def plain_training(returns, lengths, rule, min_steps=0):
+    """The paper's loop and stopping rules in plain Python: returns so far, steps, updates."""
+    history, steps, updates = [], 0, 0
+
+    def mean(values):
+        return sum(values) / len(values) if values else 0.0
+
+    for episode in range(MAX_EPISODES):
+        length = min(lengths[episode], MAX_STEPS)
+        steps += length
+        updates += length if episode >= INIT_EPISODES else 0
+        history.append(returns[episode])
+        if episode < INIT_EPISODES or steps < min_steps:
+            continue
+        newer = mean(history[-WINDOW:])
+        if rule == "solved" and newer >= SOLVED:
+            break
+        if rule == "plateau" and episode >= INIT_EPISODES + WINDOW:
+            older = mean(history[-2 * WINDOW : -WINDOW])
+            if abs(newer - older) <= TOLERANCE * (abs(older) + 1e-9):
+                break
+    return history, steps, updates
+
+
+scripts = st.tuples(
+    st.lists(st.integers(-3, 3), min_size=MAX_EPISODES, max_size=MAX_EPISODES),
+    st.lists(st.integers(1, 6), min_size=MAX_EPISODES, max_size=MAX_EPISODES),
+)
+
+
+# --- the loop ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("variant", ["never", "plateau", "solved", "patient"])
+@given(scripted=scripts)
+def test_training_equals_a_plain_python_loop(trainers, variant, scripted):
+    returns, lengths = scripted
+    rule = VARIANTS[variant].stop_rule
+    history, steps, updates = plain_training(returns, lengths, rule, VARIANTS[variant].min_steps)
+    result = trainers[variant](KEY, script(returns, lengths))
+    assert result.train_steps == steps
+    assert result.episodes == len(history)
+    expected = np.full(MAX_EPISODES, np.nan)
+    expected[: len(history)] = history
+    np.testing.assert_array_equal(result.returns, expected)
+    assert result.agent_state.num_updates == updates
+    assert not result.nonfinite
+    assert result.test_steps == 0
+
+
+def test_a_plateau_stops_at_the_first_episode_that_the_rule_allows(trainers):
+    # All returns equal: flat at once, but the rule waits for episode index 2 + 2 (the fifth).
+    result = trainers["plateau"](KEY, script([3] * 12, [2] * 12))
+    assert result.episodes == 5 and result.train_steps == 10
+
+
+def test_growing_returns_never_are_a_plateau(trainers):
+    result = trainers["plateau"](KEY, script([2.0**n for n in range(12)], [1] * 12))
+    assert result.episodes == 12
+
+
+def test_a_solved_task_stops_only_after_the_initial_episodes(trainers):
+    result = trainers["solved"](KEY, script([3] * 12, [1] * 12))
+    assert result.episodes == 3
+
+
+def test_tests_between_episodes_decide_and_are_recorded(trainers):
+    # Test returns -1, 0, 1, 2: the mean of the last two is 1.5 after the fourth episode.
+    result = trainers["tested"](KEY, script([3] * 12, [1] * 12))
+    assert result.episodes == 4
+    np.testing.assert_array_equal(result.returns, [-1, 0, 1, 2] + [np.nan] * 8)
+    assert result.test_steps == 4 * 3
+
+
+def test_learning_starts_with_the_first_episode_after_the_initial_ones(trainers):
+    result = trainers["never"](KEY, script([0] * 12, [3] * 12))
+    assert result.agent_state.first_update_episode == INIT_EPISODES
+    assert result.agent_state.num_updates == 3 * 10
+
+
+def test_a_step_budget_ends_training_within_an_episode(trainers):
+    result = trainers["cut"](KEY, script([7] * 12, [4] * 12))
+    assert result.train_steps == 17
+    assert result.episodes == 4  # the fifth is not finished and has no return
+    np.testing.assert_array_equal(result.returns, [7] * 4 + [np.nan] * 8)
+    assert result.agent_state.num_updates == 17 - 8
+
+
+def test_episodes_run_for_max_episodes_at_the_step_limit(trainers):
+    result = trainers["never"](KEY, script([1] * 12, [99] * 12))
+    assert result.episodes == 12 and result.train_steps == 12 * MAX_STEPS
+
+
+@pytest.mark.xfail(
+    strict=True,
+    reason="the step limit of env.default_params bounds the whole training: params with a higher "
+    "max_steps_in_episode end it silently after max_episodes * default limit steps",
+)
+def test_a_step_limit_above_the_default_still_trains_all_episodes(trainers):
+    params = script([1] * 12, [99] * 12, max_steps_in_episode=2 * MAX_STEPS)
+    result = trainers["never"](KEY, params)
+    assert result.episodes == 12 and result.train_steps == 12 * 2 * MAX_STEPS
+
+
+def test_tests_need_a_test_function():
+    with pytest.raises(ValueError, match=r"solved_by='test' needs a test_fn; got None\."):
+        make_trainer(scripted_agent(), ENV, VARIANTS["tested"])
+
+
+# --- what is stored ------------------------------------------------------------------------------
+
+
+def stored(result):
+    """Rows of the last batch as tuples (episode, time, reward, discount, next time)."""
+    batch = result.agent_state.batch
+    np.testing.assert_array_equal(batch.action % WHO, batch.obs[0])  # acted on what it saw
+    np.testing.assert_array_equal(batch.obs[1], batch.next_obs[1])  # the same episode's tag
+    columns = (batch.action // WHO, batch.obs[0], batch.reward, batch.discount, batch.next_obs[0])
+    return {tuple(float(c[i]) for c in columns) for i in range(batch.reward.size)}
+
+
+def test_the_replay_holds_what_happened_with_the_true_last_observations(trainers):
+    # Lengths 2 and 3 terminate, 6 is cut by the limit of 4 and bootstraps.
+    lengths = [2, 3, 6] * 4
+    result = trainers["never"](KEY, script(range(12), lengths))
+    expected = set()
+    for episode, length in enumerate(lengths):
+        for t in range(min(length, MAX_STEPS)):
+            last = t + 1 == min(length, MAX_STEPS)
+            discount = 0.0 if t + 1 >= length else 1.0
+            expected.add((float(episode), float(t), episode * last, discount, t + 1.0))
+    rows = stored(result)
+    assert rows <= expected
+    # 64 draws of 36 rows: half of them are met, ends of both kinds among them.
+    assert len(rows) > 18
+    assert {discount for _, t, _, discount, next_t in rows if next_t == 4} == {1.0}
+    assert 0.0 in {discount for *_, discount, _ in rows}
+
+
+def test_a_full_buffer_holds_the_last_transitions(trainers):
+    # Capacity 5, episodes of 2 steps, never solved: the last five of 24 transitions.
+    result = trainers["solved"](KEY, script([0] * 12, [2] * 12))
+    got = {(episode, t) for episode, t, *_ in stored(result)}
+    assert got == {(9, 1), (10, 0), (10, 1), (11, 0), (11, 1)}
+
+
+def test_each_episode_starts_from_a_fresh_reset(trainers):
+    result = trainers["never"](KEY, script([0] * 12, [1] * 12))
+    batch = result.agent_state.batch
+    tags = {int(a) // WHO: float(tag) for a, tag in zip(batch.action, batch.obs[1], strict=True)}
+    assert len(tags) > 8 and len(set(tags.values())) == len(tags)
+
+
+def test_a_time_limit_bootstraps_unless_it_is_asked_to_be_terminal(trainers):
+    params = script([0] * 12, [99] * 12)  # no episode terminates
+    assert trainers["never"](KEY, params).agent_state.min_discount == 1.0
+    assert trainers["cut"](KEY, params).agent_state.min_discount == 0.0
+    result = trainers["cut"](KEY, params)
+    assert {d for _, t, _, d, _ in stored(result) if t < MAX_STEPS - 1} == {1.0}
+
+
+# --- trainings that go wrong ---------------------------------------------------------------------
+
+
+def test_a_number_that_is_not_finite_stops_training_and_is_flagged(trainers):
+    result = trainers["never"](KEY, script([5] * 12, [3] * 12, nonfinite_episode=2))
+    assert result.nonfinite
+    assert result.train_steps == 3 + 3 + 2 and result.episodes == 3
+
+
+def test_weights_that_are_not_finite_are_flagged(trainers):
+    params = script([5] * 12, [3] * 12)
+    assert trainers["never"](KEY, params, jnp.nan).nonfinite
+    assert trainers["never"](KEY, params, jnp.inf).nonfinite
+    assert not trainers["never"](KEY, params, 1.0).nonfinite
+
+
+def test_an_inactive_training_does_nothing(trainers):
+    result = trainers["never"](KEY, script([5] * 12, [3] * 12), active=False)
+    assert result.train_steps == 0 and result.episodes == 0 and result.test_steps == 0
+    assert np.isnan(result.returns).all()
+    assert result.agent_state.num_updates == 0
+
+
+# --- the stopping rules by hand ------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("recent", "num_episodes", "flat"),
+    [
+        # Windows of 2, tolerance 1 %. Older mean 100: newer may be 99 to 101.
+        ([99, 101, 100, 100], 4, True),
+        ([100, 100, 100.5, 101.3], 4, True),  # newer 100.9
+        ([100, 100, 101, 101.4], 4, False),  # newer 101.2
+        ([-100, -100, -100.4, -101.2], 9, True),  # relative to the magnitude: 0.8 of 1
+        ([-100, -100, -101, -101.4], 9, False),
+        ([50, -50, 0, 0], 4, True),  # older 0, newer 0
+        ([50, -50, 0, 0.1], 4, False),  # older 0: nothing but 0 is close
+        # Three episodes 5, 5, 5: the older window holds one of them, whose mean is 5.
+        ([0, 5, 5, 5], 3, True),
+        ([0, 4, 5, 5], 3, False),
+        # Two episodes: the older window is empty and has mean 0.
+        ([0, 0, 5, 5], 2, False),
+        ([0, 0, 3, -3], 2, True),
+        # One episode: newer is its return, older 0.
+        ([0, 0, 0, 5], 1, False),
+        ([0, 0, 0, 0], 1, True),
+    ],
+)
+def test_a_plateau_compares_the_last_window_with_the_one_before(recent, num_episodes, flat):
+    recent = jnp.array(recent, jnp.float32)
+    assert bool(is_plateau(recent, jnp.int32(num_episodes), 0.01)) == flat
+
+
+def test_a_plateau_over_odd_windows_weighs_all_their_returns():
+    # Windows of 3: older (1 + 2 + 3) / 3 = 2, newer (3 + 2 + 1) / 3 = 2.
+    assert is_plateau(jnp.array([1.0, 2, 3, 3, 2, 1]), jnp.int32(6), 0.001)
+    # Five episodes: older (2 + 3) / 2 = 2.5, newer 2: apart by a fifth.
+    recent = jnp.array([0.0, 2, 3, 3, 2, 1])
+    assert is_plateau(recent, jnp.int32(5), 0.21)
+    assert not is_plateau(recent, jnp.int32(5), 0.19)
+
+
+def test_a_nonfinite_return_is_no_plateau():
+    assert not is_plateau(jnp.array([1.0, 1.0, 1.0, jnp.nan]), jnp.int32(4), 0.5)
+
+
+@pytest.mark.parametrize(
+    ("recent", "num_episodes", "solved"),
+    [
+        ([0, 0, 190, 200], 4, True),  # exactly 195
+        ([200, 200, 190, 199], 4, False),
+        ([0, 0, 0, 195], 1, True),  # the mean of all there are
+        ([0, 0, 0, 194], 1, False),
+    ],
+)
+def test_solved_means_that_the_last_window_reaches_the_threshold(recent, num_episodes, solved):
+    recent = jnp.array(recent, jnp.float32)
+    assert bool(is_solved(recent, jnp.int32(num_episodes), 195.0)) == solved
+
+
+# --- lanes ---------------------------------------------------------------------------------------
+
+
+def assert_same(many, index, alone):
+    """A lane's result and that of the training alone: counts equal, numbers up to rounding."""
+    lane = jax.tree.map(lambda x: x[index], many)
+    assert lane.train_steps == alone.train_steps
+    assert lane.episodes == alone.episodes
+    assert lane.test_steps == alone.test_steps
+    assert lane.nonfinite == alone.nonfinite
+    for a, b in zip(jax.tree.leaves(lane), jax.tree.leaves(alone), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-4)
+
+
+@pytest.mark.parametrize("variant", ["plateau", "tested"])
+def test_scripted_lanes_equal_single_trainings(trainers, variant):
+    keys = jax.random.split(KEY, 5)
+    rng = np.random.default_rng(0)
+    each = [script(rng.integers(-2, 3, 12), rng.integers(1, 7, 12)) for _ in range(4)]
+    each.append(script([1] * 12, [3] * 12, nonfinite_episode=1))
+    params = jax.tree.map(lambda *x: jnp.stack([jnp.asarray(v) for v in x]), *each)
+    active = jnp.array([True, True, False, True, True])
+    many = jax.jit(jax.vmap(trainers[variant]))(keys, params, jnp.arange(5.0), active)
+    assert len(set(np.asarray(many.train_steps).tolist())) > 2  # stopped at different times
+    for i in range(5):
+        assert_same(many, i, trainers[variant](keys[i], each[i], float(i), active[i]))
+
+
+@pytest.fixture(scope="module")
+def ddqn_in_se():
+    """Single and vmapped short trainings of a DDQN agent in SEs of different step limits."""
+    task = envs.make("cartpole")
+    env = make_synthetic(task, SyntheticConfig(hidden_size=4))
+    config = DDQNConfig(hidden_size=4, num_layers=1, batch_size=4, init_episodes=1)
+    train = make_trainer(
+        make_ddqn(config, 4, 2), env, training(max_episodes=8, plateau_tolerance=0.3)
+    )
+    keys = jax.random.split(jax.random.key(1), 4)
+    each = [
+        env.params(env.init_weights(key)).replace(max_steps_in_episode=jnp.int32(limit))
+        for key, limit in zip(keys, [7, 15, 4, 11], strict=True)
+    ]
+    params = jax.tree.map(lambda *x: jnp.stack(x), *each)
+    single = jax.jit(train)
+    return train, keys, params, [single(k, p) for k, p in zip(keys, each, strict=True)]
+
+
+def test_lanes_equal_single_trainings(ddqn_in_se):
+    train, keys, params, alone = ddqn_in_se
+    many = jax.jit(jax.vmap(train))(keys, params)
+    assert len({int(x.train_steps) for x in alone}) > 2  # lanes that stop at different times
+    for i in range(4):
+        assert_same(many, i, alone[i])
+
+
+def test_nested_lanes_equal_single_trainings(ddqn_in_se):
+    train, keys, params, alone = ddqn_in_se
+    square = jax.tree.map(lambda x: x.reshape(2, 2, *x.shape[1:]), params)
+    many = jax.jit(jax.vmap(jax.vmap(train)))(keys.reshape(2, 2), square)
+    for i in range(4):
+        assert_same(many, divmod(i, 2), alone[i])
+
+
+# --- the test on the real task -------------------------------------------------------------------
+
+
+def test_the_tester_equals_greedy_episodes_in_gymnasium():
+    task = envs.make("cartpole")
+    agent = make_ddqn(DDQNConfig(hidden_size=8, num_layers=1), 4, 2)
+    state = agent.init(jax.random.key(2), agent.hparams)
+    key = jax.random.key(3)
+    returns, steps = jax.jit(make_tester(agent, task, num_episodes=6))(key, state)
+    assert returns.shape == (6,) and steps.shape == (6,)
+    reference = gymnasium.make("CartPole-v1").unwrapped
+    greedy = jax.jit(lambda obs: agent.act(key, state, obs, explore=False))
+    for i, key_episode in enumerate(jax.random.split(key, 6)):
+        key_reset, _ = jax.random.split(key_episode)
+        obs, _ = task.env.reset_env(key_reset, task.params)
+        reference.reset(seed=0)
+        reference.state = np.array(obs, np.float64)
+        total, num_steps, ended = 0.0, 0, False
+        while not ended:
+            obs, reward, terminated, _, _ = reference.step(int(greedy(jnp.float32(obs))))
+            total, num_steps = total + reward, num_steps + 1
+            ended = terminated or num_steps == 200
+        assert (returns[i], steps[i]) == (total, num_steps)
+    assert len(set(np.asarray(steps).tolist())) > 1  # different initial states
+
+
+def test_test_episodes_end_at_the_step_limit_and_inactive_ones_do_not_begin():
+    params = script([2.5] * 12, [99] * 12)
+    task = envs.Task(name="script", env=ENV, params=params, solved_reward=0.0)
+    agent = scripted_agent()
+    state = agent.begin_episode(agent.init(KEY, 0.0), 0)
+    test = jax.jit(make_tester(agent, task, num_episodes=3))
+    returns, steps = test(KEY, state)
+    np.testing.assert_array_equal(returns, [2.5] * 3)
+    np.testing.assert_array_equal(steps, [MAX_STEPS] * 3)
+    returns, steps = test(KEY, state, jnp.bool_(False))
+    np.testing.assert_array_equal(returns, 0.0)
+    np.testing.assert_array_equal(steps, 0)
