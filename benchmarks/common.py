@@ -14,6 +14,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Sequence
+from functools import cached_property
 from importlib.metadata import version
 from pathlib import Path
 from statistics import median
@@ -49,7 +50,11 @@ class Side:
             command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
             env=os.environ | (env or {}),
         )  # fmt: skip
-        self.ready = self._read()
+
+    @cached_property
+    def ready(self) -> dict[str, Any]:
+        """What the side says once it has started; waits for that."""
+        return self._read()
 
     def ask(self, **request: Any) -> dict[str, Any]:
         """The side's answer.
@@ -57,7 +62,7 @@ class Side:
         Raises:
           RuntimeError: if the side has ended; its own error is on stderr.
         """
-        assert self._process.stdin is not None
+        assert self.ready is not None and self._process.stdin is not None
         self._process.stdin.write(json.dumps(request) + "\n")
         self._process.stdin.flush()
         return self._read()
@@ -152,7 +157,17 @@ def print_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[obje
 
 
 def finish(benchmark: str, args: argparse.Namespace, result: dict[str, Any]) -> None:
-    """Writes the JSON file, if asked for, and prints the RESULT line, which comes last."""
+    """Says where this was measured, writes the JSON file if asked for, and prints the RESULT line.
+
+    Args:
+      benchmark: its name.
+      args: from `parse_args`.
+      result: what was measured; `result["machine"]`, if there, is from `machine`.
+    """
+    if where := result.get("machine"):
+        print(
+            f"{where['cpu']}, {where['cores']} cores, load before the start {where['load_before']}"
+        )
     result = {"benchmark": benchmark, "quick": args.quick} | result
     if args.json:
         args.json.parent.mkdir(parents=True, exist_ok=True)

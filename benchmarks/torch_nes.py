@@ -58,14 +58,15 @@ def generation(
 ) -> tuple[Weights, list[Outcome]]:
     """One pass of Algorithm 1's outer loop; returns the next SE and the candidates' outcomes.
 
-    Each member tries psi + eps and psi - eps, and for each member one agent trains on psi. A free
-    process takes the next candidate, so that long and short trainings balance out.
+    Each member tries psi + eps and psi - eps; the last candidates are psi itself. A free process
+    takes the next candidate, so that long and short trainings balance out.
     """
     es = config.es
     psi, unravel = ravel(weights)
     rng = np.random.default_rng(seed)
     noise = es.noise_std * rng.standard_normal((es.population_size, psi.size), dtype=np.float32)
-    candidates = [*(psi + noise), *(psi - noise), *[psi] * es.population_size]
+    num_incumbents = es.num_incumbent_evals or es.population_size
+    candidates = [*(psi + noise), *(psi - noise), *[psi] * num_incumbents]
     seeds = rng.integers(2**31, size=len(candidates)).tolist()
     jobs = [(unravel(flat), config, s) for flat, s in zip(candidates, seeds, strict=True)]
     outcomes = pool.starmap(evaluate, jobs, chunksize=1)
@@ -74,12 +75,12 @@ def generation(
 
 
 def nes_update(psi: np.ndarray, noise: np.ndarray, scores: np.ndarray, es: NESConfig) -> np.ndarray:
-    """The next psi from the scores `[3 n]` of psi + eps, psi - eps and psi; with All Better 2.
+    """The next psi from the scores of psi + eps `[n]`, psi - eps `[n]` and psi `[any]`, in a row.
 
     Args:
       psi: `[dims]` the incumbent.
       noise: `[n, dims]` eps of each member, its std included.
-      scores: higher is better; those that are not finite rank worst.
+      scores: higher is better; those that are not finite rank worst. All Better 2 weighs them.
       es: the step and its rule.
 
     Raises:
@@ -89,7 +90,8 @@ def nes_update(psi: np.ndarray, noise: np.ndarray, scores: np.ndarray, es: NESCo
     """
     if not (es.mirrored and es.score_transform == "all_better_2" and es.num_evals == 1):
         raise ValueError("the reference knows mirrored sampling, one evaluation and all_better_2.")
-    plus, minus, incumbent = np.where(np.isfinite(scores), scores, -np.inf).reshape(3, -1)
+    scores = np.where(np.isfinite(scores), scores, -np.inf)
+    plus, minus, incumbent = np.split(scores, [len(noise), 2 * len(noise)])
     signed = np.where(minus > plus, -1, 1)[:, None] * noise
     weights = all_better_2(np.maximum(plus, minus), incumbent)
     step = es.step_size * weights @ signed

@@ -341,8 +341,6 @@ def play_episode(
         else:
             action = greedy_action(agent, obs, hp.activation)
         next_obs, reward, discount, terminated, nonfinite = env.step(obs, action)
-        if step == MAX_STEPS and config.training.time_limit_is_terminal:
-            discount = 0.0
         buffer.store(obs, next_obs, action, reward, discount)
         if episode >= hp.init_episodes:
             ddqn_update(agent, buffer.sample(), hp)

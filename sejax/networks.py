@@ -4,6 +4,7 @@ Activations are *feature-major*, `[feature, batch]`: `kernel @ x` with the batch
 1.7 times faster on CPU than rows-major for layers this small. A single input is `[feature]`.
 """
 
+import functools
 from collections.abc import Callable
 
 import jax
@@ -37,7 +38,47 @@ class Dense(nn.Module):
         fan_in = x.shape[0]
         kernel = self.param("kernel", uniform_fan_in(fan_in), (self.features, fan_in))
         bias = self.param("bias", uniform_fan_in(fan_in), (self.features,))
-        return kernel @ x + (bias if x.ndim == 1 else bias[:, None])
+        if x.ndim == 1:
+            return kernel @ x + bias
+        return affine(kernel, bias, x)
+
+
+# A product over at most this many terms is written out as a sum, which XLA fuses with what
+# surrounds it; calling the matrix library for it costs more than the arithmetic.
+_MAX_UNROLLED = 8
+
+
+@jax.custom_vjp
+def affine(
+    kernel: Float[Array, "out in"], bias: Float[Array, " out"], x: Float[Array, "in batch"]
+) -> Float[Array, "out batch"]:
+    """`kernel @ x + bias`, with products over few terms unrolled in both passes."""
+    return _product(kernel, x) + bias[:, None]
+
+
+def _affine_forward(kernel: Array, bias: Array, x: Array) -> tuple[Array, tuple[Array, Array]]:
+    return affine(kernel, bias, x), (kernel, x)
+
+
+def _affine_backward(residuals: tuple[Array, Array], gradient: Array) -> tuple[Array, ...]:
+    kernel, x = residuals
+    num_outputs = kernel.shape[0]
+    if num_outputs <= _MAX_UNROLLED:
+        # The result of a product is stored, whereas XLA would compute a gradient that comes out of
+        # a chain of cheap operations anew for each of the `in` rows that the last line makes.
+        gradient = jnp.eye(num_outputs) @ gradient
+    return gradient @ x.T, gradient.sum(axis=1), _product(kernel.T, gradient)
+
+
+affine.defvjp(_affine_forward, _affine_backward)
+
+
+def _product(a: Float[Array, "rows inner"], b: Float[Array, "inner batch"]) -> Array:
+    inner = a.shape[1]
+    if inner > _MAX_UNROLLED:
+        return a @ b
+    terms = [a[:, i : i + 1] * b[i : i + 1] for i in range(inner)]
+    return functools.reduce(jnp.add, terms)
 
 
 class MLP(nn.Module):

@@ -5,7 +5,10 @@ import os
 import platform
 from pathlib import Path
 
+# Compilation is most of the time here. LLVM's optimisation is off, which halves it; XLA's own
+# passes, whose result test_program.py reads, stay on. Command tests start processes without these.
 _FLAGS = (
+    "--xla_backend_optimization_level=0",
     "--xla_force_host_platform_device_count=2",
     "--xla_cpu_multi_thread_eigen=false",
     "--xla_cpu_collective_call_warn_stuck_timeout_seconds=100000",

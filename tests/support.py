@@ -17,9 +17,7 @@ def numpy_forward(params, x, activation, num_layers, prelu_slope=0.25):
     for layer in range(num_layers + 1):
         kernel = np.asarray(params[f"Dense_{layer}"]["kernel"], np.float64)
         bias = np.asarray(params[f"Dense_{layer}"]["bias"], np.float64)
-        x = np.array(
-            [sum(w * v for w, v in zip(row, x, strict=True)) for row in kernel]
-        ) + bias
+        x = np.array([sum(w * v for w, v in zip(row, x, strict=True)) for row in kernel]) + bias
         if layer < num_layers:
             x = activate(x)
     return x

@@ -4,7 +4,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import torch
 from jax.flatten_util import ravel_pytree
 
 from sejax.agents.ddqn import DDQNHparams, double_q_targets, make_ddqn, select_action
@@ -56,7 +55,9 @@ def q_network(config):
 
 def test_targets_take_the_online_networks_action_and_the_target_networks_value():
     # Columns are next states, rows actions.
-    online = jnp.array([[1.0, 5.0, 2.0], [3.0, 4.0, 2.0]])  # best actions: 1, 0, 0 (first of equals)
+    online = jnp.array(
+        [[1.0, 5.0, 2.0], [3.0, 4.0, 2.0]]
+    )  # best actions: 1, 0, 0 (first of equals)
     target = jnp.array([[10.0, 20.0, 30.0], [40.0, 50.0, 60.0]])  # values there: 40, 20, 30
     reward = jnp.array([1.0, -1.0, 0.5])
     discount = jnp.array([0.9, 0.5, 0.0])
@@ -73,76 +74,18 @@ def test_select_action_picks_each_columns_entry():
 # --- updates against torch -----------------------------------------------------------------------
 
 
-class TorchDDQN:
-    """The same agent in torch, from the same parameters."""
-
-    def __init__(self, params, config):
-        self.config = config
-        self.online, self.slope = self._network(params)
-        self.target, self.target_slope = self._network(params)
-        parameters = [*self.online.parameters()] + ([self.slope] if self.slope is not None else [])
-        self.optimizer = torch.optim.Adam(parameters, lr=config.learning_rate)
-
-    def _network(self, params):
-        layers = []
-        for i in range(self.config.num_layers + 1):
-            kernel, bias = params[f"Dense_{i}"]["kernel"], params[f"Dense_{i}"]["bias"]
-            layer = torch.nn.Linear(kernel.shape[1], kernel.shape[0])
-            layer.weight.data = torch.tensor(np.array(kernel))
-            layer.bias.data = torch.tensor(np.array(bias))
-            layers.append(layer)
-        slope = params.get("prelu_slope")
-        slope = None if slope is None else torch.nn.Parameter(torch.tensor([float(slope)]))
-        return torch.nn.ModuleList(layers), slope
-
-    def q_values(self, layers, slope, x):
-        activate = {
-            "tanh": torch.tanh,
-            "relu": torch.relu,
-            "leaky_relu": torch.nn.functional.leaky_relu,
-            "prelu": lambda h: torch.nn.functional.prelu(h, slope),
-        }[self.config.activation]
-        for layer in layers[:-1]:
-            x = activate(layer(x))
-        return layers[-1](x)
-
-    def update(self, batch):
-        tensors = Transition(*(torch.tensor(np.array(x)) for x in batch))
-        obs, next_obs = tensors.obs.T, tensors.next_obs.T
-        q = self.q_values(self.online, self.slope, obs)
-        q = q.gather(1, tensors.action.long()[:, None])[:, 0]
-        with torch.no_grad():
-            best = self.q_values(self.online, self.slope, next_obs).argmax(1)
-            values = self.q_values(self.target, self.target_slope, next_obs)
-            value = values.gather(1, best[:, None])[:, 0]
-            goal = tensors.reward + self.config.discount * tensors.discount * value
-        loss = torch.nn.functional.mse_loss(q, goal)
-        self.optimizer.zero_grad()
-        loss.backward()
-        self.optimizer.step()
-        tau = self.config.target_update_rate
-        with torch.no_grad():
-            pairs = [*zip(self.target.parameters(), self.online.parameters(), strict=True)]
-            if self.slope is not None:
-                pairs.append((self.target_slope, self.slope))
-            for slow, fast in pairs:
-                slow.copy_(tau * fast + (1 - tau) * slow)
-
-    def arrays(self, layers, slope):
-        out = {
-            f"Dense_{i}": {"kernel": m.weight.detach().numpy(), "bias": m.bias.detach().numpy()}
-            for i, m in enumerate(layers)
-        }
-        return out if slope is None else {**out, "prelu_slope": slope.detach().numpy()[0]}
-
-
 @pytest.mark.parametrize("activation", ["tanh", "relu", "leaky_relu", "prelu"])
 def test_updates_equal_torchs_on_the_same_batches(activation):
+    pytest.importorskip("torch")  # an extra of its own: it is large
+    from torch_ddqn import TorchDDQN
+
     config = DDQNConfig(**{**vars(CONFIG), "activation": activation})
     agent = make_ddqn(config, OBS_DIM, NUM_ACTIONS)
     _, nested = q_network(config)
     state = agent.init(jax.random.key(1), agent.hparams)
-    reference = TorchDDQN(nested(state.params), config)
+    # Target and online network apart from the start, so that it shows which one is used where.
+    state = state.replace(target_params=state.params[::-1])
+    reference = TorchDDQN(nested(state.params), nested(state.target_params), config)
     update = jax.jit(agent.update)
     for number in range(1, 6):
         batch = random_batch(number)
@@ -306,3 +249,16 @@ def test_hparams_hold_the_configured_numbers(agent):
         epsilon_init=1.0, epsilon_min=0.01, epsilon_decay=0.9,
     )  # fmt: skip
     assert (agent.batch_size, agent.buffer_size, agent.init_episodes) == (BATCH, 100_000, 10)
+
+
+def test_columns_of_no_weight_change_nothing(agent, state):
+    batch = random_batch(5)
+    other = random_batch(6)
+    joined = jax.tree.map(
+        lambda a, b: jnp.concatenate([a, b], axis=-1),
+        batch._replace(weight=jnp.ones(BATCH)),
+        other._replace(weight=jnp.zeros(BATCH)),
+    )
+    alone = agent.update(jax.random.key(0), state, batch)
+    padded = agent.update(jax.random.key(0), state, joined)
+    np.testing.assert_allclose(padded.params, alone.params, rtol=1e-5, atol=1e-7)

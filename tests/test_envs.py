@@ -87,7 +87,7 @@ def test_a_step_returns_what_the_trainer_relies_on(name, env_step):
 @pytest.mark.parametrize("name", envs.names())
 def test_only_the_step_limit_truncates_and_it_does_not_terminate(name):
     task = envs.make(name)
-    obs, state = task.env.reset_env(jax.random.key(0), task.params)
+    _, state = task.env.reset_env(jax.random.key(0), task.params)
     for steps_before, truncates in [
         (0, False), (task.max_steps - 2, False), (task.max_steps - 1, True),
     ]:  # fmt: skip
@@ -108,7 +108,7 @@ def test_vmapped_steps_equal_single_ones(name, env_step):
     step = jax.jit(jax.vmap(lambda k, s, a: task.env.step_env(k, s, a, task.params)))
     together = step(keys, states, actions)
     for i in range(6):
-        alone = env_step[name](keys[i], jax.tree.map(lambda x: x[i], states), actions[i])
+        alone = env_step[name](keys[i], jax.tree.map(lambda x, i=i: x[i], states), actions[i])
         for a, b in zip(jax.tree.leaves(together), jax.tree.leaves(alone), strict=True):
             np.testing.assert_allclose(a[i], b, rtol=1e-5, atol=1e-6)
 
@@ -167,7 +167,7 @@ def test_steps_from_states_all_over_the_box_equal_gymnasiums(name):
     np.testing.assert_allclose(obs, expected_obs, rtol=1e-6, atol=1e-6)
     np.testing.assert_array_equal(terminated, expected_terminated)
     np.testing.assert_allclose(reward, expected_reward, atol=1e-6)
-    # In float32, as we run them, Acrobot's fastest spins amplify rounding in one step of a thousand.
+    # In float32, as we run them, Acrobot's fastest spins amplify rounding in a step of a thousand.
     obs, _, _, terminated, _ = jax.jit(jax.vmap(step))(np.float32(states), actions)
     error = np.abs(obs - expected_obs) / (1 + np.abs(expected_obs))
     assert np.quantile(error.max(axis=1), 0.998) < 1e-4

@@ -182,11 +182,13 @@ def test_the_proxy_stays_if_no_member_beats_the_incumbents_mean():
 
 
 def test_diverged_scores_never_reach_the_mean():
-    # Member 0 diverged with both signs, member 1 scores 5 by its plus, member 2 is worse than the
-    # incumbents' finite mean of 2.
-    scores = [NAN, 5, 0, INF, NAN, 1, 1, NAN, 3]
+    # Member 0 diverged with both signs; members 1 and 2 score 5 and 3 by their plus. The
+    # incumbents' finite mean is 2: advantages 3 and 1, weights 3/4 and 1/4.
+    scores = [NAN, 5, 3, INF, NAN, 1, 1, NAN, 3]
     state, candidates = told(scores)
-    np.testing.assert_allclose(state.mean, candidates[1], rtol=1e-5, atol=1e-6)
+    noise = candidates[:3] - MEAN
+    expected = MEAN + 0.75 * noise[1] + 0.25 * noise[2]
+    np.testing.assert_allclose(state.mean, expected, rtol=1e-5, atol=1e-6)
 
 
 def test_a_generation_that_diverged_as_a_whole_leaves_the_proxy_as_it_was():
@@ -317,9 +319,7 @@ def test_every_algorithm_asks_for_its_population_and_the_incumbent(name):
     candidates, after_ask = jax.eval_shape(strategy.ask, jax.random.key(1), state)
     assert candidates.shape == (strategy.num_candidates, DIMS) == (18, DIMS)
     assert strategy.num_incumbent_evals == 2
-    after = jax.eval_shape(
-        strategy.tell, jax.random.key(2), candidates, jnp.zeros(18), after_ask
-    )
+    after = jax.eval_shape(strategy.tell, jax.random.key(2), candidates, jnp.zeros(18), after_ask)
     assert jax.eval_shape(strategy.incumbent, after).shape == (DIMS,)
     # A scan carries the state: its structure, shapes and types must not change.
     assert jax.tree.map(lambda x: (x.shape, x.dtype), after) == jax.tree.map(

@@ -7,7 +7,7 @@ import pytest
 from support import numpy_forward
 
 from sejax.configs import ACTIVATIONS
-from sejax.networks import MLP, PRELU_SLOPE
+from sejax.networks import MLP, PRELU_SLOPE, affine
 
 
 def test_initial_weights_and_biases_are_uniform_within_one_over_root_fan_in():
@@ -81,3 +81,23 @@ def test_other_activations_have_no_slope_to_learn():
     net = MLP(3, hidden_size=5, num_layers=1, activation="tanh", learn_prelu_slope=True)
     params = net.init(jax.random.key(0), jnp.zeros(4))["params"]
     assert set(params) == {"Dense_0", "Dense_1"}
+
+
+@pytest.mark.parametrize(("num_inputs", "num_outputs"), [(3, 2), (20, 2), (3, 20), (20, 20)])
+def test_affine_and_its_gradient_equal_the_plain_product(num_inputs, num_outputs):
+    keys = jax.random.split(jax.random.key(0), 4)
+    kernel = jax.random.normal(keys[0], (num_outputs, num_inputs))
+    bias = jax.random.normal(keys[1], (num_outputs,))
+    x = jax.random.normal(keys[2], (num_inputs, 7))
+    weight = jax.random.normal(keys[3], (num_outputs, 7))
+
+    def of(fn):
+        return jax.value_and_grad(lambda *args: jnp.sum(weight * fn(*args)), (0, 1, 2))(
+            kernel, bias, x
+        )
+
+    value, gradients = of(affine)
+    expected, expected_gradients = of(lambda k, b, x: k @ x + b[:, None])
+    np.testing.assert_allclose(value, expected, rtol=1e-5)
+    for got, wanted in zip(gradients, expected_gradients, strict=True):
+        np.testing.assert_allclose(got, wanted, rtol=1e-4, atol=1e-5)

@@ -36,8 +36,8 @@ def filled(num_steps):
 
 def test_what_is_stored_comes_back_unchanged():
     rows = filled(3)
-    batch = sample(rows, jnp.uint32(1), jnp.int32(3), 20)
-    assert batch.obs.shape == (OBS_DIM, 20) and batch.reward.shape == (20,)  # feature-major
+    batch = sample(rows, jnp.uint32(1), jnp.int32(3), 24)
+    assert batch.obs.shape == (OBS_DIM, 24) and batch.reward.shape == (24,)  # feature-major
     assert batch.action.dtype == jnp.int32
     assert set(np.asarray(batch.action).tolist()) == {0, 1, 2}
     for column, number in enumerate(np.asarray(batch.action)):
@@ -128,3 +128,9 @@ def test_buffers_of_several_lanes_are_independent():
     many = jax.jit(jax.vmap(replay.store, (0, 0, None, 0)))(rows, steps, transition(9), active)
     np.testing.assert_array_equal(many[0], store(rows[0], steps[0], transition(9)))
     np.testing.assert_array_equal(many[1], rows[1])
+
+
+def test_a_batch_is_filled_up_with_columns_of_no_weight():
+    batch = sample(filled(3), jnp.uint32(1), jnp.int32(3), 20)
+    assert batch.obs.shape == (OBS_DIM, 24)
+    np.testing.assert_array_equal(batch.weight, [1.0] * 20 + [0.0] * 4)

@@ -60,9 +60,7 @@ def test_weights_worked_by_hand(name, expected):
     ],
 )
 @pytest.mark.parametrize("incumbent", [3.0, 5.0])
-def test_the_better_transforms_weigh_nothing_if_none_beats_the_incumbent(
-    name, expected, incumbent
-):
+def test_the_better_transforms_weigh_nothing_if_none_beats_the_incumbent(name, expected, incumbent):
     np.testing.assert_allclose(transform(name, SCORES, incumbent), expected, atol=1e-6)
 
 

@@ -1,4 +1,4 @@
-"""sejax.proxies.synthetic: the SE's equations, its ends of episodes, and its use as a gymnax env."""
+"""sejax.proxies.synthetic: the SE's equations, its ends of episodes, and plain gymnax usage."""
 
 import jax
 import jax.numpy as jnp
@@ -94,9 +94,7 @@ def test_a_step_moves_to_the_predicted_state_itself(step):
     ("done", "terminates"), [(-3.0, False), (0.0, False), (0.5, False), (0.501, True), (7.0, True)]
 )
 @pytest.mark.parametrize("mode", ["soft", "threshold"])
-def test_an_episode_terminates_where_the_done_output_exceeds_one_half(
-    step, mode, done, terminates
-):
+def test_an_episode_terminates_where_the_done_output_exceeds_one_half(step, mode, done, terminates):
     _, _, reward, terminated, info = step[mode](constant_weights(1.0, 2.0, done))
     assert terminated == terminates
     assert reward == 2.0  # the reward of the last step counts

@@ -95,7 +95,7 @@ def make_ddqn(config: DDQNConfig, obs_dim: int, num_actions: int) -> Agent:
             discount * batch.discount,
         )
         error = select_action(q_values, batch.action) - jax.lax.stop_gradient(targets)
-        return jnp.mean(error**2)
+        return jnp.mean(batch.weight * error**2) / jnp.mean(batch.weight)
 
     def update(key: Array, state: DDQNState, batch: Transition) -> DDQNState:
         hp = state.hparams
