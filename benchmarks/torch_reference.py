@@ -335,7 +335,7 @@ def play_episode(
     hp = config.agent
     epsilon = epsilon_at(episode, hp)
     total = 0.0
-    for step in range(1, MAX_STEPS + 1):
+    for _ in range(1, MAX_STEPS + 1):
         if random.random() < epsilon:
             action = random.randrange(NUM_ACTIONS)
         else:

@@ -153,19 +153,19 @@ def make_program(config: LearnConfig) -> Program:
             k for k in jax.vmap(lambda k: jax.random.split(k, 3))(keys).T
         )
         mean = jax.vmap(lambda key: ravel_pytree(env.init_weights(key))[0])(key_weights)
-        # Each field its own buffer, so that all of them can be donated.
-        return LearnState(
+        state = LearnState(
             key=key_run,
             es_state=jax.vmap(strategy.init)(key_es, mean),
             generation=jnp.zeros(num_seeds, jnp.int32),
-            incumbent=mean + 0,
+            incumbent=mean,
             incumbent_score=jnp.full(num_seeds, -jnp.inf),
-            best=mean + 0,
+            best=mean,
             best_score=jnp.full(num_seeds, -jnp.inf),
             best_generation=jnp.full(num_seeds, -1, jnp.int32),
             env_steps=jnp.zeros(num_seeds, jnp.int32),
             finished=jnp.zeros(num_seeds, bool),
         )
+        return jax.tree.map(_strongly_typed, state)
 
     def generation(state: LearnState) -> tuple[LearnState, GenerationInfo]:
         """One pass of Algorithm 1's outer loop for every seed; a scan body."""
@@ -261,6 +261,12 @@ def make_population_scorer(
         return jax.tree.map(lambda x: x.reshape(num_seeds, num_candidates), outcome)
 
     return score
+
+
+def _strongly_typed(x: Array) -> Array:
+    """As a generation returns it: a weak type would be another signature and compile anew."""
+    is_key = jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
+    return x if is_key else jax.lax.convert_element_type(x, x.dtype)
 
 
 def _where(mask: Array, a: Array, b: Array) -> Array:

@@ -16,6 +16,7 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from sejax import envs
 from sejax.errors import ConfigError, nearest, require, unknown_name
 
 CONF_DIR = Path(__file__).parent / "conf" / "run"
@@ -33,7 +34,8 @@ AGENT_HPARAMS = ("default", "nes")
 OBJECTIVES = ("max_reward", "reward_threshold")
 
 # Name of the `es` choice -> evosax's class. Listed here because importing evosax takes seconds;
-# a test holds the list against evosax's own registry.
+# a test holds the list against evosax's own registry. Left out are RandomSearch and the two SV
+# algorithms, which have no single mean that could be the incumbent.
 EVOSAX_ALGORITHMS = {
     "ars": "ARS",
     "asebo": "ASEBO",
@@ -55,14 +57,11 @@ EVOSAX_ALGORITHMS = {
     "open_es": "Open_ES",
     "persistent_es": "PersistentES",
     "pgpe": "PGPE",
-    "random_search": "RandomSearch",
     "rm_es": "Rm_ES",
     "sep_cma_es": "Sep_CMA_ES",
     "simple_es": "SimpleES",
     "simulated_annealing": "SimulatedAnnealing",
     "snes": "SNES",
-    "sv_cma_es": "SV_CMA_ES",
-    "sv_open_es": "SV_Open_ES",
     "xnes": "xNES",
 }
 
@@ -91,6 +90,9 @@ class EnvConfig:
 
     name: str = "cartpole"
 
+    def __post_init__(self) -> None:
+        _one_of("env.name", self.name, envs.names())
+
 
 @dataclass(frozen=True, kw_only=True)
 class SyntheticConfig:
@@ -103,6 +105,7 @@ class SyntheticConfig:
     done: str = "soft"  # soft: bootstrap with 1 - d (authors); threshold: with 1 - [d > 0.5].
 
     def __post_init__(self) -> None:
+        _one_of("proxy.name", self.name, ("se",))
         _at_least(1, "proxy.hidden_size", self.hidden_size, "a layer needs a unit", 128)
         _at_least(1, "proxy.num_layers", self.num_layers, "the SE has a hidden layer", 1)
         _one_of("proxy.activation", self.activation, ACTIVATIONS)
@@ -128,6 +131,7 @@ class DDQNConfig:
     epsilon_decay: float = 0.9  # factor for each episode
 
     def __post_init__(self) -> None:
+        _one_of("agent.name", self.name, ("ddqn",))
         for name in ("batch_size", "buffer_size", "hidden_size", "num_layers"):
             _at_least(1, f"agent.{name}", getattr(self, name), "there is nothing to learn from or "
                       "with otherwise", _default(DDQNConfig, name))  # fmt: skip
@@ -455,6 +459,11 @@ def translate_hydra_error(error: Exception) -> ConfigError:
     if key:
         group = key.rpartition(".")[0]
         siblings = [name for name in _known_fields() if name.rpartition(".")[0] == group]
+        if key in siblings:
+            return ConfigError(
+                f"override must name a field of the chosen {group}, because nothing else is read; "
+                f"got {key}, which another choice of {group} has. See --cfg job for its fields."
+            )
         ranked = nearest(key, siblings or _known_fields())
         return ConfigError(
             f"override must name a field of the configuration, because nothing else is read; got "
@@ -464,10 +473,12 @@ def translate_hydra_error(error: Exception) -> ConfigError:
 
 
 def _known_fields() -> list[str]:
-    groups = {"proxy": SyntheticConfig, "agent": DDQNConfig, "es": NESConfig,
-              "objective": ObjectiveConfig, "training": TrainingConfig}  # fmt: skip
-    names = [f.name for f in fields(_PlainFields)]
-    return names + [f"{g}.{f.name}" for g, schema in groups.items() for f in fields(schema)]
+    groups = (("proxy", SyntheticConfig), ("agent", DDQNConfig), ("es", NESConfig),
+              ("es", EvosaxConfig), ("objective", ObjectiveConfig), ("training", TrainingConfig),
+              ("real_training", TrainingConfig))  # fmt: skip
+    names = [f.name for f in (*fields(_PlainFields), *fields(_PlainEvaluateFields))]
+    names += [f"{group}.{f.name}" for group, schema in groups for f in fields(schema)]
+    return list(dict.fromkeys(names))
 
 
 def _between(text: str, start: str, end: str) -> str:

@@ -57,7 +57,7 @@ def spread_over_devices(
         padded = -(-size // count) * count
 
         def deal(x: Array) -> Array:
-            x = jnp.concatenate([x, x[: padded - size]]) if padded > size else x
+            x = x[jnp.arange(padded) % size] if padded > size else x
             return x.reshape(-1, count, *x.shape[1:]).swapaxes(0, 1).reshape(padded, *x.shape[1:])
 
         def gather(x: Array) -> Array:

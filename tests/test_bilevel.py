@@ -116,11 +116,6 @@ def test_generations_of_one_seed_differ_and_so_do_seeds(one_device):
     assert len({float(info.population_mean[0]) for info in infos}) == 3
 
 
-@pytest.mark.xfail(
-    strict=True,
-    reason="init gives best_score, incumbent_score and evosax's fields weak types, which the first "
-    "generation makes strong: a jitted generation is traced and compiled a second time",
-)
 def test_all_generations_run_in_one_executable(one_device):
     program, _, ((states, _), _) = one_device
     weak = lambda tree: jax.tree.map(lambda x: x.weak_type, tree)  # noqa: E731

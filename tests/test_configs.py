@@ -181,11 +181,6 @@ def test_the_performance_preset_is_how_those_ses_were_made():
         assert (composed.agent.epsilon_init, composed.agent.epsilon_min) == (1.0, 0.01)
 
 
-@pytest.mark.xfail(
-    strict=True,
-    reason="stop_when_solved: true of tuned/paper_performance is overwritten by run.yaml's own "
-    "stop_when_solved: false, because _self_ comes after tuned",
-)
 def test_the_performance_preset_stops_when_solved():
     assert composed_with("env=cartpole", "preset=paper_performance").stop_when_solved
     assert composed_with("env=acrobot", "preset=paper_performance").stop_when_solved
@@ -251,22 +246,12 @@ def test_an_unknown_field_names_the_nearest_one(override, nearest):
     assert last.partition("=")[0] in said and f"Did you mean {nearest}?" in said
 
 
-@pytest.mark.xfail(
-    strict=True,
-    reason="fields are suggested from NESConfig whatever `es` is: 'got es.mirrored. Did you mean "
-    "es.mirrored?'",
-)
 def test_a_field_that_another_algorithm_has_is_not_suggested():
     assert "Did you mean es.mirrored?" not in message("es=open_es", "es.mirrored=true")
 
 
 @pytest.mark.parametrize(
     "overrides", [("proxy.name=rn",), ("env.name=no_such_task",), ("agent.name=dqn",)], ids=" ".join
-)
-@pytest.mark.xfail(
-    strict=True,
-    reason="a group's name field is not checked: an SE is learned under another proxy's name, and "
-    "an unknown task is found out only when the program is built",
 )
 def test_a_name_that_no_choice_has_is_refused(overrides):
     message(*overrides)

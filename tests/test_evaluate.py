@@ -53,7 +53,7 @@ def test_a_proxy_that_is_saved_and_loaded_is_the_same(stored):
 def test_a_loaded_proxy_steps_as_a_gymnax_environment(stored):
     env, params = sejax.load(stored[0])
     obs, state = env.reset(jax.random.key(0), params)
-    obs, state, reward, terminated, truncated, info = env.step(
+    obs, state, reward, _terminated, truncated, _info = env.step(
         jax.random.key(1), state, jnp.int32(1), params
     )
     assert obs.shape == (4,) and reward.shape == () and not truncated
@@ -75,7 +75,7 @@ def test_a_foreign_safetensors_file_is_refused(tmp_path):
 
 
 def test_tensors_of_another_shape_are_refused(stored, tmp_path):
-    _, env, weights = stored
+    _, _env, weights = stored
     config = sejax.config(["proxy.hidden_size=5"])
     sejax.save(tmp_path / "p.safetensors", config, weights)
     with pytest.raises(ConfigError, match="must hold the tensors of the network"):
@@ -83,7 +83,7 @@ def test_tensors_of_another_shape_are_refused(stored, tmp_path):
 
 
 def test_an_unknown_name_lists_the_shipped_ones():
-    with pytest.raises(ConfigError, match="proxy must be one of .*got 'carpole'"):
+    with pytest.raises(ConfigError, match=r"proxy must be one of .*got 'carpole'"):
         sejax.load("carpole")
 
 
@@ -105,7 +105,7 @@ def test_the_real_task_alone_can_be_evaluated(tmp_path):
 
 
 def test_a_proxy_of_another_task_is_refused(stored):
-    with pytest.raises(ConfigError, match="acrobot for a proxy of cartpole. Set env=cartpole"):
+    with pytest.raises(ConfigError, match=r"acrobot for a proxy of cartpole\. Set env=cartpole"):
         evaluate(evaluate_config(f"proxy={stored[0]}", "env=acrobot"))
 
 
@@ -120,6 +120,6 @@ def test_registering_with_gymnax_is_idempotent():
     ids = sejax.register_gymnax()
     assert sejax.register_gymnax() == ids
     for env_id in ids:
-        env, params = gymnax.make(env_id)
+        _env, params = gymnax.make(env_id)
         shipped = sejax.load(env_id.removeprefix("sejax/"))[1]
         assert jnp.array_equal(jax.tree.leaves(params)[0], jax.tree.leaves(shipped)[0])

@@ -60,11 +60,6 @@ def test_more_devices_than_there_are_is_refused():
         spread_over_devices(work, count + 1)
 
 
-@pytest.mark.xfail(
-    strict=True,
-    reason="the padding x[: padded - size] is too short when there are more than twice as many "
-    "devices as elements, and the reshape fails (48 trainings on more than 96 cores)",
-)
 def test_there_may_be_far_more_devices_than_elements():
     program = (
         "import jax.numpy as jnp\n"

@@ -86,14 +86,7 @@ def test_members_that_tie_weigh_the_same(name, expected):
     np.testing.assert_allclose(transform(name, [2, 5, 5, 1], 1.0), expected, rtol=1e-5, atol=1e-6)
 
 
-NES_TIES = pytest.mark.xfail(
-    strict=True,
-    reason="nes divides rounding noise by its own magnitude when all utilities are 1/n: "
-    "weights are +1 or -1 for many population sizes (16 among them)",
-)
-
-
-@pytest.mark.parametrize("name", ["linear", "rank", pytest.param("nes", marks=NES_TIES)])
+@pytest.mark.parametrize("name", ["linear", "rank", "nes", "nes_unnormalized"])
 def test_equal_scores_weigh_nothing_where_a_difference_is_needed(name):
     for size in (2, 3, 4, 7, 16, 31):
         np.testing.assert_array_equal(transform(name, [7.0] * size, 1.0), 0.0)
@@ -107,19 +100,7 @@ def test_equal_scores_above_the_incumbent_share_the_weight(name, expected):
     np.testing.assert_allclose(transform(name, [7.0] * 4, 1.0), expected)
 
 
-DIVERGED_ALL = {
-    "nes": NES_TIES,
-    "nes_unnormalized": pytest.mark.xfail(
-        strict=True,
-        reason="nes_unnormalized weighs every member 1 when all have diverged: the incumbent "
-        "then moves by the sum of the diverged perturbations",
-    ),
-}
-
-
-@pytest.mark.parametrize(
-    "name", [pytest.param(n, marks=DIVERGED_ALL.get(n, ())) for n in SCORE_TRANSFORMS]
-)
+@pytest.mark.parametrize("name", SCORE_TRANSFORMS)
 @pytest.mark.parametrize("incumbent", [1.0, NAN])
 def test_a_generation_that_diverged_as_a_whole_weighs_nothing(name, incumbent):
     for size in (2, 3, 16):
@@ -127,20 +108,13 @@ def test_a_generation_that_diverged_as_a_whole_weighs_nothing(name, incumbent):
             np.testing.assert_array_equal(transform(name, scores, incumbent), 0.0)
 
 
-BETTER_THAN_DIVERGED = pytest.mark.xfail(
-    strict=True,
-    reason="single_better compares with a nan incumbent and never moves, where all_better_1 and "
-    "all_better_2 take an incumbent without a finite score as below every member",
-)
-
-
 @pytest.mark.parametrize(
     ("name", "expected"),
     [
-        pytest.param("single_better", [1, 0, 0, 0], marks=BETTER_THAN_DIVERGED),
-        # The worst finite score, 1, stands in: advantages 2, 0, 0, 1.
-        ("all_better_1", [1, 0, 0, 0.5]),
-        ("all_better_2", [2 / 3, 0, 0, 1 / 3]),
+        ("single_better", [1, 0, 0, 0]),
+        # Below the worst finite score, 1, by their range, 2: advantages over -1 are 4, 0, 2, 3.
+        ("all_better_1", [1, 0, 0.5, 0.75]),
+        ("all_better_2", [4 / 9, 0, 2 / 9, 3 / 9]),
     ],
 )
 def test_an_incumbent_without_a_finite_score_is_below_every_member(name, expected):

@@ -150,11 +150,6 @@ def test_episodes_run_for_max_episodes_at_the_step_limit(trainers):
     assert result.episodes == 12 and result.train_steps == 12 * MAX_STEPS
 
 
-@pytest.mark.xfail(
-    strict=True,
-    reason="the step limit of env.default_params bounds the whole training: params with a higher "
-    "max_steps_in_episode end it silently after max_episodes * default limit steps",
-)
 def test_a_step_limit_above_the_default_still_trains_all_episodes(trainers):
     params = script([1] * 12, [99] * 12, max_steps_in_episode=2 * MAX_STEPS)
     result = trainers["never"](KEY, params)

@@ -146,5 +146,5 @@ def double_q_targets(
 
 def select_action(q_values: Float[Array, "actions batch"], action: Array) -> Float[Array, " batch"]:
     """Q of each column's action, by mask: gathers and their gradients are slow on CPU."""
-    mask = jnp.arange(q_values.shape[0])[:, None] == action
+    mask = jnp.arange(q_values.shape[0])[:, None] == action[None, :]
     return jnp.sum(jnp.where(mask, q_values, 0.0), axis=0)

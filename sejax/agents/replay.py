@@ -9,7 +9,6 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, UInt32
 
-
 _VECTOR = 8  # float32 lanes of AVX2
 
 

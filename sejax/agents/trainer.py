@@ -17,6 +17,8 @@ from sejax.agents.agent import Agent
 from sejax.agents.masked_loop import while_any_active
 from sejax.configs import TrainingConfig
 
+_NO_LIMIT = 2**31 - 1
+
 
 @struct.dataclass
 class TrainResult:
@@ -98,10 +100,8 @@ def make_trainer(
     if tests_each_episode and test_fn is None:
         raise ValueError("stop_rule='solved' with solved_by='test' needs a test_fn; got None.")
     window = training.window
-    step_limit = training.max_episodes * _episode_limit(env)
-    if training.max_steps is not None:
-        step_limit = min(step_limit, training.max_steps)
-    capacity = min(agent.buffer_size, step_limit)
+    max_steps = training.max_steps or _NO_LIMIT
+    capacity = min(agent.buffer_size, max_steps)
 
     def begin(key: Array, env_params: Any, hparams: Any, active: Array) -> _LoopState:
         key_agent, key_reset = jax.random.split(key)
@@ -153,7 +153,7 @@ def make_trainer(
             env_state=env_state,
             agent_state=agent_state,
             nonfinite=state.nonfinite | info.get("nonfinite", False),
-            active=state.step + 1 < step_limit,
+            active=state.step + 1 < max_steps,
         )
         ended = terminated | truncated | state.nonfinite
         state = jax.lax.cond(
@@ -284,12 +284,6 @@ def make_tester(agent: Agent, task: Any, num_episodes: int) -> Callable[..., Any
         return jax.vmap(episode, in_axes=(0, None, None))(keys, agent_state, active)
 
     return test
-
-
-def _episode_limit(env: Any) -> int:
-    """The world's step limit, for the size of the replay buffer."""
-    limit = getattr(env, "max_steps", None) or env.default_params.max_steps_in_episode
-    return int(limit)
 
 
 def _all_finite(tree: Any) -> Array:

@@ -50,12 +50,13 @@ def nes(scores: Scores, incumbent: Float[Array, ""]) -> Scores:
     the worst, for which the logarithm is not defined. Ties share the better rank.
     """
     utilities = _log_utilities(scores) - 1 / scores.shape[0]
+    utilities = jnp.where(_any_differ(scores), utilities, 0.0)
     return _safe_divide(utilities, jnp.abs(utilities).max())
 
 
 def nes_unnormalized(scores: Scores, incumbent: Float[Array, ""]) -> Scores:
     """As `nes` without the subtraction of 1/n_p: the worse half weighs nothing, the best 1."""
-    utilities = _log_utilities(scores)
+    utilities = jnp.where(_any_differ(scores), _log_utilities(scores), 0.0)
     return _safe_divide(utilities, jnp.abs(utilities).max())
 
 
@@ -67,7 +68,8 @@ def single_best(scores: Scores, incumbent: Float[Array, ""]) -> Scores:
 
 def single_better(scores: Scores, incumbent: Float[Array, ""]) -> Scores:
     """As `single_best`, but only if that member is better than the incumbent."""
-    return jnp.where(_ranked_last(scores) > incumbent, single_best(scores, incumbent), 0.0)
+    better = _advantage(scores, incumbent) > 0
+    return jnp.where(better, single_best(scores, incumbent), 0.0)
 
 
 def all_better_1(scores: Scores, incumbent: Float[Array, ""]) -> Scores:
@@ -95,18 +97,27 @@ TRANSFORMS: dict[str, ScoreTransform] = {
 def _advantage(scores: Scores, incumbent: Float[Array, ""]) -> Scores:
     """Advantage over the incumbent, 0 for members that are not better.
 
-    An incumbent without a finite score is below every member: the worst finite one stands in.
+    Every member with a finite score is better than an incumbent without one.
     """
-    floor = jnp.where(jnp.isfinite(incumbent), incumbent, _floor_nonfinite(scores).min())
+    finite = _floor_nonfinite(scores)
+    below_all = finite.min() - jnp.maximum(finite.max() - finite.min(), 1.0)
+    floor = jnp.where(jnp.isfinite(incumbent), incumbent, below_all)
     return jnp.where(jnp.isfinite(scores), jnp.maximum(scores - floor, 0.0), 0.0)
 
 
 def _log_utilities(scores: Scores) -> Scores:
+    """Utilities that sum to 1; 0 for a score that is not finite, whatever its rank."""
     num_members = scores.shape[0]
-    scores = _ranked_last(scores)
-    best_is_one = 1 + (scores[None, :] > scores[:, None]).sum(axis=1)
+    ranked = _ranked_last(scores)
+    best_is_one = 1 + (ranked[None, :] > ranked[:, None]).sum(axis=1)
     utilities = jnp.maximum(0.0, jnp.log(num_members / 2 + 1) - jnp.log(best_is_one))
-    return utilities / utilities.sum()
+    utilities = jnp.where(jnp.isfinite(scores), utilities, 0.0)
+    return _safe_divide(utilities, utilities.sum())
+
+
+def _any_differ(scores: Scores) -> Array:
+    ranked = _ranked_last(scores)
+    return ranked.max() > ranked.min()
 
 
 def _num_lower(scores: Scores) -> Scores:

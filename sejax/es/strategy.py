@@ -109,9 +109,9 @@ def _build_evosax(config: EvosaxConfig, num_dims: int) -> tuple[Any, Any]:
     Set explicitly because evosax's defaults (std 1, learning rate 1e-3) either destroy a small
     network or hardly move it.
     """
-    import evosax.algorithms as algorithms
+    from evosax.algorithms import distribution_based_algorithms
 
-    cls = getattr(algorithms, EVOSAX_ALGORITHMS[config.name])
+    cls = distribution_based_algorithms[EVOSAX_ALGORITHMS[config.name]]
     accepted = inspect.signature(cls.__init__).parameters
     options: dict[str, Any] = {}
     if "std_schedule" in accepted:

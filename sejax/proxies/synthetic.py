@@ -71,11 +71,6 @@ class SyntheticEnv(environment.Environment[SyntheticState, SyntheticParams]):
         return SyntheticParams(weights=weights, max_steps_in_episode=self.task.max_steps)
 
     @property
-    def max_steps(self) -> int:
-        """The real task's step limit."""
-        return self.task.max_steps
-
-    @property
     def default_params(self) -> SyntheticParams:
         """Random weights, or those given to `with_default_params`."""
         return self._default_params or self.params(self.init_weights(jax.random.key(0)))
