@@ -335,7 +335,9 @@ def play_episode(
     hp = config.agent
     epsilon = epsilon_at(episode, hp)
     total = 0.0
-    for _ in range(1, MAX_STEPS + 1):
+    num_steps = 0
+    for _ in range(MAX_STEPS):
+        num_steps += 1
         if random.random() < epsilon:
             action = random.randrange(NUM_ACTIONS)
         else:
@@ -348,7 +350,7 @@ def play_episode(
         total += reward
         if terminated:
             break
-    return Episode(step, total, nonfinite)
+    return Episode(num_steps, total, nonfinite)
 
 
 def epsilon_at(episode: int, hp: DDQNConfig) -> float:

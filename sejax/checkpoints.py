@@ -51,7 +51,7 @@ def restore_newest(folder: Path, template: Any) -> tuple[Any, int, list[str]]:
       The state (the template if there is no checkpoint), the generations it has finished, and a
       sentence for each damaged checkpoint that was passed over.
     """
-    problems = []
+    problems: list[str] = []
     for generation in _generations(folder):
         path = (folder / str(generation)).resolve()
         problem = _problem(path)

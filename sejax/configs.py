@@ -31,6 +31,7 @@ SCORE_TRANSFORMS = (
 UPDATE_RULES = ("authors", "paper")
 AGGREGATES = ("mean", "min")
 AGENT_HPARAMS = ("default", "nes")
+TRAINING_FROM = ("proxy", "config")
 OBJECTIVES = ("max_reward", "reward_threshold")
 
 # Name of the `es` choice -> evosax's class. Listed here because importing evosax takes seconds;
@@ -299,6 +300,7 @@ class EvaluateConfig:
     env: str | None = None
     agent: AgentConfig = field(default_factory=AgentConfig)
     agent_hparams: str = "default"
+    training_from: str = "proxy"  # how long agents train: as the proxy was learned, or `training`
     training: TrainingConfig = field(default_factory=TrainingConfig)
     real_training: TrainingConfig = field(default_factory=TrainingConfig)
     num_agents: int = 10
@@ -311,6 +313,7 @@ class EvaluateConfig:
     def __post_init__(self) -> None:
         _at_least(1, "num_agents", self.num_agents, "there is nothing to average otherwise", 10)
         _one_of("agent_hparams", self.agent_hparams, AGENT_HPARAMS)
+        _one_of("training_from", self.training_from, TRAINING_FROM)
         for name in ("lanes", "devices"):
             if getattr(self, name) is not None:
                 _at_least(1, name, getattr(self, name), "something must compute", "null")
@@ -421,6 +424,7 @@ class _PlainEvaluateFields:
     proxy: str = ""
     env: str | None = None
     agent_hparams: str = "default"
+    training_from: str = "proxy"
     num_agents: int = 10
     baseline: bool = True
     seed: int = 0
@@ -432,8 +436,8 @@ class _PlainEvaluateFields:
 def _typed(schema: type, cfg: DictConfig, group: str) -> Any:
     target = OmegaConf.create({group: OmegaConf.structured(schema)})
     OmegaConf.set_readonly(target[group], False)  # a frozen dataclass comes read-only
-    values = OmegaConf.merge(target, {group: cfg[group]})[group]
-    return schema(**OmegaConf.to_container(values))  # type: ignore[arg-type]
+    values: Any = OmegaConf.to_container(OmegaConf.merge(target, {group: cfg[group]}))
+    return schema(**values[group])
 
 
 def _default(schema: type, name: str) -> Any:

@@ -81,7 +81,8 @@ def _prepare(config: EvaluateConfig) -> tuple[Any, dict[str, Any], Any, Path]:
         raise ConfigError(f"env must be the proxy's own task, because agents trained on it are "
                           f"tested there; got {config.env} for a proxy of {task.name}. Set "
                           f"env={task.name}.")  # fmt: skip
-    worlds = {"the proxy": (proxy.env, proxy.params, config.training)}
+    training = proxy.config.training if config.training_from == "proxy" else config.training
+    worlds = {"the proxy": (proxy.env, proxy.params, training)}
     if config.baseline:
         worlds["the real task"] = (task.env, task.params, config.real_training)
     agent = proxy.config.agent if config.agent_hparams == "nes" else config.agent

@@ -43,7 +43,8 @@ def test_every_task_composes_with_every_preset(env, preset):
     composed = composed_with(f"env={env}", f"preset={preset}")
     assert isinstance(composed, LearnConfig)
     assert (composed.env.name, composed.preset) == (env, preset)
-    assert composed.training.stop_rule == "plateau"  # an SE gives no other sign of progress
+    # An SE gives no sign of the agent's progress: its own returns level off, or a budget ends.
+    assert composed.training.stop_rule == "plateau" or composed.training.max_steps is not None
 
 
 @pytest.mark.parametrize("name", EVOSAX_ALGORITHMS)
@@ -357,7 +358,7 @@ def test_a_configuration_survives_being_written_and_read(overrides):
 
 
 def test_plain_values_are_a_copy():
-    composed = config()
+    composed = config(["es.population_size=16"])
     to_dict(composed)["es"]["population_size"] = 99
     assert composed.es.population_size == 16
 

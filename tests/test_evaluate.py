@@ -30,7 +30,7 @@ def evaluate_config(*overrides: str):
 def stored(tmp_path_factory):
     """A proxy file with random weights: its path, environment and weights."""
     path = tmp_path_factory.mktemp("proxy") / "proxy.safetensors"
-    config = sejax.config(["proxy.hidden_size=4"])
+    config = sejax.config(["proxy.hidden_size=4", "training.max_steps=50"])
     from sejax import envs
 
     env = make_synthetic(envs.make("cartpole"), config.proxy)
@@ -97,6 +97,19 @@ def test_evaluation_writes_a_row_for_each_agent_and_their_means(stored, tmp_path
     assert summary["the real task"]["train_steps_mean"] == pytest.approx(steps)
     assert (tmp_path / "evaluation.png").stat().st_size > 10_000
     assert "3 fresh ddqn agents" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(("training_from", "steps"), [("proxy", 50), ("config", 90)])
+def test_agents_train_as_the_proxy_was_learned_or_as_configured(
+    training_from, steps, stored, tmp_path
+):
+    overrides = [
+        f"proxy={stored[0]}", f"out_dir={tmp_path}", f"training_from={training_from}",
+        "baseline=false", "training.max_steps=90", "training.max_episodes=1000",
+        "training.stop_rule=never",
+    ]  # fmt: skip
+    evaluate(evaluate_config(*overrides))
+    assert (pd.read_csv(tmp_path / "evaluation.csv").train_steps == steps).all()
 
 
 def test_the_real_task_alone_can_be_evaluated(tmp_path):

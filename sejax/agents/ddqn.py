@@ -67,7 +67,7 @@ def make_ddqn(config: DDQNConfig, obs_dim: int, num_actions: int) -> Agent:
             params=params,
             target_params=params,
             opt_state=adam.init(params),
-            epsilon=hparams.epsilon_init,
+            epsilon=jnp.float32(hparams.epsilon_init),
             hparams=hparams,
         )
 

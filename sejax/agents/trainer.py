@@ -103,7 +103,7 @@ def make_trainer(
     max_steps = training.max_steps or _NO_LIMIT
     capacity = min(agent.buffer_size, max_steps)
 
-    def begin(key: Array, env_params: Any, hparams: Any, active: Array) -> _LoopState:
+    def begin(key: Array, env_params: Any, hparams: Any, active: Array | bool) -> _LoopState:
         key_agent, key_reset = jax.random.split(key)
         obs, env_state = env.reset_env(key_reset, env_params)
         agent_state = agent.init(key_agent, hparams)
@@ -168,7 +168,7 @@ def make_trainer(
         """
         key_reset, key_test = jax.random.split(key)
         episode_return, test_steps = state.episode_return, state.test_steps
-        if tests_each_episode:
+        if tests_each_episode and test_fn is not None:
             episode_return, num_steps = test_fn(key_test, state.agent_state, ended)
             test_steps = test_steps + num_steps
         recent = jnp.concatenate([state.recent[1:], episode_return[None]])
@@ -266,7 +266,7 @@ def make_tester(agent: Agent, task: Any, num_episodes: int) -> Callable[..., Any
             env_state=env_state,
         )
 
-    def episode(key: Array, agent_state: Any, active: Array) -> tuple[Array, Array]:
+    def episode(key: Array, agent_state: Any, active: Array | bool) -> tuple[Array, Array]:
         key_reset, key_steps = jax.random.split(key)
         obs, env_state = env.reset_env(key_reset, params)
         state = _TestState(
