@@ -6,7 +6,7 @@ them as the commands do: `sejax.config(["env=acrobot", "generations=50"])`.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import MISSING, dataclass, field, fields, make_dataclass
 from pathlib import Path
 from typing import Any
 
@@ -296,7 +296,7 @@ class LearnConfig:
 class EvaluateConfig:
     """What `sejax.evaluate` takes."""
 
-    proxy: str
+    proxy: str = "???"  # OmegaConf's word for a value that must be given
     env: str | None = None
     agent: AgentConfig = field(default_factory=AgentConfig)
     agent_hparams: str = "default"
@@ -358,7 +358,7 @@ def from_hydra(cfg: DictConfig) -> LearnConfig:
         "objective": ObjectiveConfig,
         "training": TrainingConfig,
     }
-    return _build(LearnConfig, groups, _PlainFields, cfg)
+    return _build(LearnConfig, groups, cfg)
 
 
 def evaluate_from_hydra(cfg: DictConfig) -> EvaluateConfig:
@@ -373,19 +373,27 @@ def evaluate_from_hydra(cfg: DictConfig) -> EvaluateConfig:
             "proxy=FILE, proxy=cartpole (a shipped one) or proxy=real env=cartpole."
         )
     groups = {"agent": DDQNConfig, "training": TrainingConfig, "real_training": TrainingConfig}
-    return _build(EvaluateConfig, groups, _PlainEvaluateFields, cfg)
+    return _build(EvaluateConfig, groups, cfg)
 
 
-def _build(schema: type, groups: dict[str, type], plain: type, cfg: DictConfig) -> Any:
+def _build(schema: type, groups: dict[str, type], cfg: DictConfig) -> Any:
     """An instance of `schema` from a composed configuration; types are OmegaConf's to check."""
+    plain = make_dataclass(
+        "Plain", [(f.name, f.type, field(default=f.default)) for f in _plain_fields(schema)]
+    )
     try:
         typed = {name: _typed(group, cfg, name) for name, group in groups.items()}
-        names = [f.name for f in fields(plain) if f.name in cfg]
-        values = OmegaConf.merge(OmegaConf.structured(plain), {n: cfg[n] for n in names})
+        given = {f.name: cfg[f.name] for f in fields(plain) if f.name in cfg}
+        values: Any = OmegaConf.to_container(OmegaConf.merge(OmegaConf.structured(plain), given))
     except OmegaConfBaseException as error:
         where = f" in {error.full_key}" if getattr(error, "full_key", None) else ""
         raise ConfigError(f"{str(error.msg or error).splitlines()[0]}{where}.") from error
-    return schema(**typed, **OmegaConf.to_container(values))  # type: ignore[arg-type]
+    return schema(**typed, **values)
+
+
+def _plain_fields(schema: Any) -> list[Any]:
+    """Fields that are values rather than groups."""
+    return [f for f in fields(schema) if f.default_factory is MISSING]
 
 
 def to_dict(cfg: LearnConfig) -> dict[str, Any]:
@@ -400,37 +408,6 @@ def to_dict(cfg: LearnConfig) -> dict[str, Any]:
 def from_dict(values: dict[str, Any]) -> LearnConfig:
     """Inverse of `to_dict`."""
     return from_hydra(OmegaConf.create(values))
-
-
-@dataclass
-class _PlainFields:
-    """Types of `LearnConfig`'s own fields, for OmegaConf to check."""
-
-    preset: str = "best"
-    generations: int = 50
-    seed: int = 0
-    num_seeds: int = 1
-    stop_when_solved: bool = False
-    lanes: int | None = None
-    devices: int | None = None
-    checkpoint_every: int = 1
-    run_dir: str | None = None
-
-
-@dataclass
-class _PlainEvaluateFields:
-    """Types of `EvaluateConfig`'s own fields."""
-
-    proxy: str = ""
-    env: str | None = None
-    agent_hparams: str = "default"
-    training_from: str = "proxy"
-    num_agents: int = 10
-    baseline: bool = True
-    seed: int = 0
-    lanes: int | None = None
-    devices: int | None = None
-    out_dir: str | None = None
 
 
 def _typed(schema: type, cfg: DictConfig, group: str) -> Any:
@@ -480,7 +457,7 @@ def _known_fields() -> list[str]:
     groups = (("proxy", SyntheticConfig), ("agent", DDQNConfig), ("es", NESConfig),
               ("es", EvosaxConfig), ("objective", ObjectiveConfig), ("training", TrainingConfig),
               ("real_training", TrainingConfig))  # fmt: skip
-    names = [f.name for f in (*fields(_PlainFields), *fields(_PlainEvaluateFields))]
+    names = [f.name for f in (*_plain_fields(LearnConfig), *_plain_fields(EvaluateConfig))]
     names += [f"{group}.{f.name}" for group, schema in groups for f in fields(schema)]
     return list(dict.fromkeys(names))
 
