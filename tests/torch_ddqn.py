@@ -1,9 +1,19 @@
-"""The DDQN agent in torch, as an independent reference for one learning step."""
+"""The DDQN agent in torch: makes the golden numbers that `test_ddqn.py` holds sejax against.
 
+torch is large and not needed for the tests, so that what it computed is kept in the repository.
+Remake it with `python tests/torch_ddqn.py` where torch is installed.
+"""
+
+import jax
 import numpy as np
 import torch
+from test_ddqn import CONFIG, GOLDEN, NUM_ACTIONS, OBS_DIM, q_network, random_batch
 
+from sejax.agents.ddqn import make_ddqn
 from sejax.agents.replay import Transition
+from sejax.configs import ACTIVATIONS, DDQNConfig
+
+NUM_UPDATES = 5
 
 
 class TorchDDQN:
@@ -67,3 +77,31 @@ class TorchDDQN:
             for i, m in enumerate(layers)
         }
         return out if slope is None else {**out, "prelu_slope": slope.detach().numpy()[0]}
+
+
+def main():
+    """Writes the parameters before, after one, and after five updates on the test's batches."""
+    arrays = {}
+    for activation in ACTIVATIONS:
+        config = DDQNConfig(**{**vars(CONFIG), "activation": activation})
+        _, nested = q_network(config)
+        agent = make_ddqn(config, OBS_DIM, NUM_ACTIONS)
+        params = agent.init(jax.random.key(1), agent.hparams).params
+        # Target and online network apart from the start, so that it shows which is used where.
+        target_params = params[::-1]
+        reference = TorchDDQN(nested(params), nested(target_params), config)
+        arrays |= {f"{activation}/params/0": params, f"{activation}/target_params/0": target_params}
+        for number in range(1, NUM_UPDATES + 1):
+            reference.update(random_batch(number))
+            if number in (1, NUM_UPDATES):
+                for name, layers, slope in (
+                    ("params", reference.online, reference.slope),
+                    ("target_params", reference.target, reference.target_slope),
+                ):
+                    flat, _ = jax.flatten_util.ravel_pytree(reference.arrays(layers, slope))
+                    arrays[f"{activation}/{name}/{number}"] = flat
+    np.savez(GOLDEN, **{name: np.asarray(x) for name, x in arrays.items()})
+
+
+if __name__ == "__main__":
+    main()
