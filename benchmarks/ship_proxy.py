@@ -1,0 +1,45 @@
+"""Puts a learned proxy into the package, with the numbers of its evaluation in its metadata.
+
+    python benchmarks/ship_proxy.py runs/cartpole-se-ddqn-s1 cartpole
+
+Runs `python -m sejax.evaluate` on it (fresh agents with the paper's default hyperparameters, and as
+many on the real task) and writes `sejax/pretrained/NAME.safetensors`.
+"""
+
+import argparse
+import json
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import common
+
+from sejax.proxies import io
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("run", help="run directory or file of the proxy")
+    parser.add_argument("name", help="what sejax.load will call it")
+    parser.add_argument("--agents", type=int, default=100)
+    parser.add_argument("--quick", action="store_true", help="two agents; writes nothing")
+    parser.add_argument("--json", type=Path, metavar="PATH", help="write the result there as well")
+    args = parser.parse_args()
+    num_agents = 2 if args.quick else args.agents
+    with tempfile.TemporaryDirectory() as folder:
+        command = [sys.executable, "-m", "sejax.evaluate", f"proxy={args.run}",
+                   f"num_agents={num_agents}", f"out_dir={folder}"]  # fmt: skip
+        subprocess.run(command, check=True)
+        evaluation = json.loads((Path(folder) / "evaluation.json").read_text())
+    proxy = io.load_proxy(args.run)
+    metadata = {k: v for k, v in proxy.metadata.items() if k != "format_version"}
+    if not args.quick:
+        target = io.PRETRAINED_DIR / f"{args.name}.safetensors"
+        weights = proxy.params.weights
+        io.save(target, proxy.config, weights, **(metadata | {"evaluation": evaluation}))
+    common.finish("ship_proxy", args, {"name": args.name, "evaluation": evaluation})
+
+
+if __name__ == "__main__":
+    main()
