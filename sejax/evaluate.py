@@ -1,5 +1,6 @@
 """`python -m sejax.evaluate`: train fresh agents on a stored proxy, test them on the real task."""
 
+import dataclasses
 import sys
 import time
 from pathlib import Path
@@ -81,14 +82,30 @@ def _prepare(config: EvaluateConfig) -> tuple[Any, dict[str, Any], Any, Path]:
         raise ConfigError(f"env must be the proxy's own task, because agents trained on it are "
                           f"tested there; got {config.env} for a proxy of {task.name}. Set "
                           f"env={task.name}.")  # fmt: skip
-    training = proxy.config.training if config.training_from == "proxy" else config.training
+    agent = proxy.config.agent if config.agent_hparams == "nes" else config.agent
+    training = config.training
+    if config.training_from == "proxy":
+        training = _as_learned(proxy, agent)
     worlds = {"the proxy": (proxy.env, proxy.params, training)}
     if config.baseline:
         worlds["the real task"] = (task.env, task.params, config.real_training)
-    agent = proxy.config.agent if config.agent_hparams == "nes" else config.agent
     shipped = proxy.path.parent == proxy_io.PRETRAINED_DIR
     beside = Path(f"runs/evaluate-{proxy.path.stem}") if shipped else proxy.path.parent
     return task, worlds, agent, Path(config.out_dir or beside)
+
+
+def _as_learned(proxy: Any, agent: Any) -> Any:
+    """How long agents trained while the proxy was learned.
+
+    A step budget grows by the initial episodes that this agent has beyond those of the agent it was
+    learned with: nothing is learned in them, and ten long ones could use it up.
+    """
+    training = proxy.config.training
+    if training.max_steps is None:
+        return training
+    more_episodes = max(0, agent.init_episodes - proxy.config.agent.init_episodes)
+    max_steps = training.max_steps + more_episodes * proxy.task.max_steps
+    return dataclasses.replace(training, max_steps=max_steps)
 
 
 def _train_and_test(
