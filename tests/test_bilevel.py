@@ -18,6 +18,7 @@ from sejax.errors import ConfigError
 # 40 steps for each of 12 agents: short enough for rounding not to grow into other actions.
 TINY = [
     "proxy.hidden_size=4", "agent.hidden_size=4", "agent.num_layers=1", "agent.batch_size=4",
+    "preset=paper_performance", "stop_when_solved=false",
     "agent.init_episodes=0", "es.population_size=4", "es.noise_std=1.0", "training.max_episodes=3",
     "training.max_steps=40", "training.window=2", "training.test_episodes=2", "generations=3",
 ]  # fmt: skip

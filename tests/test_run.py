@@ -17,6 +17,7 @@ from sejax.errors import ConfigError
 from sejax.run_directory import COLUMNS, RunDirectory
 
 TINY = [
+    "preset=paper", "checkpoint_every=1",
     "es.population_size=2", "agent.hidden_size=4", "agent.batch_size=4", "agent.init_episodes=1",
     "proxy.hidden_size=4", "training.max_episodes=2", "training.test_episodes=1", "generations=3",
 ]  # fmt: skip
