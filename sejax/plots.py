@@ -44,7 +44,7 @@ def learning_curve(rows: Sequence[dict[str, Any]], solved_reward: float, path: P
         top.legend(frameon=False, fontsize=9, loc="best")
         bottom.set_ylabel("training steps\nof an agent")
         bottom.set_xlabel("NES generation")
-        bottom.set_ylim(bottom=0)
+        bottom.set_ylim(0, 1.1 * data["train_steps_mean"].max())
         bottom.xaxis.get_major_locator().set_params(integer=True)
         _write(figure, path)
 

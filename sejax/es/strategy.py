@@ -46,6 +46,7 @@ def make_strategy(config: NESConfig | EvosaxConfig, num_dims: int) -> Strategy:
     """The strategy that a configuration names, over vectors of `num_dims` numbers.
 
     Example:
+      >>> import jax
       >>> strategy = make_strategy(NESConfig(population_size=4), num_dims=3)
       >>> state = strategy.init(jax.random.key(0), jnp.zeros(3))
       >>> strategy.ask(jax.random.key(1), state)[0].shape  # +eps, -eps and the incumbent
