@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax.experimental.xla_metadata import set_xla_metadata
 from jaxtyping import Array, Float, Int, UInt32
 
 _VECTOR = 8  # float32 lanes of AVX2
@@ -89,7 +90,9 @@ def sample(
     padded_size = -(-batch_size // _VECTOR) * _VECTOR
     width = rows.shape[1]
     index = sample_indices(seed, size, padded_size)[None, :] * width + jnp.arange(width)[:, None]
-    batch = rows.reshape(-1)[index]  # [width, batch]
+    batch = jax.lax.platform_dependent(
+        rows.reshape(-1), index, cpu=_gather_outlined, default=_gather
+    )  # [width, batch]
     is_padding = jnp.arange(padded_size) >= batch_size
     obs_dim = (rows.shape[1] - 3) // 2
     return Transition(
@@ -100,6 +103,20 @@ def sample(
         discount=batch[-1],
         weight=1.0 if padded_size == batch_size else 1.0 - is_padding,
     )
+
+
+def _gather(flat: Float[Array, " n"], index: Int[Array, "width batch"]) -> Array:
+    return flat.at[index].get(mode="promise_in_bounds")
+
+
+def _gather_outlined(flat: Array, index: Array) -> Array:
+    """The gather as a computation of its own.
+
+    XLA would fuse it with what makes the indices and hash each row's index anew for each of its
+    numbers; with several devices in a process it would then also hand half of that to another core.
+    """
+    with set_xla_metadata(inlineable="false"):
+        return jax.jit(_gather)(flat, index)
 
 
 def sample_indices(
