@@ -13,6 +13,7 @@ from flax import struct
 from gymnax.environments import environment
 
 from sejax.agents.agent import Agent
+from sejax.agents.memory import replay_memory
 from sejax.agents.replay import Transition
 
 MAX_EPISODES = 12
@@ -104,7 +105,7 @@ def scripted_agent(init_episodes=2, buffer_size=1000, batch_size=64):
         act=lambda key, state, obs, explore: WHO * state.episode + obs[0].astype(jnp.int32),
         update=update,
         hparams=0.0,
+        memory=replay_memory(batch_size, buffer_size),
         init_episodes=init_episodes,
-        batch_size=batch_size,
-        buffer_size=buffer_size,
+        learns_from=init_episodes,
     )

@@ -243,7 +243,7 @@ def test_hparams_hold_the_configured_numbers(agent):
         learning_rate=0.01, target_update_rate=0.1, discount=0.9,
         epsilon_init=1.0, epsilon_min=0.01, epsilon_decay=0.9,
     )  # fmt: skip
-    assert (agent.batch_size, agent.buffer_size, agent.init_episodes) == (BATCH, 100_000, 10)
+    assert (agent.init_episodes, agent.learns_from) == (10, 10)
 
 
 def test_columns_of_no_weight_change_nothing(agent, state):

@@ -4,6 +4,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+from sejax.agents.memory import MemoryMaker
+
 
 @dataclass(frozen=True, kw_only=True)
 class Agent:
@@ -12,19 +14,24 @@ class Agent:
     Attributes:
       init: `(key, hparams) -> state`. `hparams` are the agent's traced numbers, kept in its state.
       begin_episode: `(state, episode) -> state`; applies schedules that move with episodes.
-      act: `(key, state, obs, explore) -> action`; `explore` is a Python bool.
-      update: `(key, state, batch) -> state`; one learning step on a `replay.Transition` batch.
+      act: `(key, state, obs, explore) -> action`, as the agent remembers it; `explore` is a Python
+        bool.
+      update: `(key, state, batch) -> state`; one learning step on what `memory` hands out.
+      memory: how steps are kept, from `sejax.agents.memory`.
       hparams: the default traced hyperparameters, a pytree of floats.
-      init_episodes: episodes at the start in which nothing is learned.
-      batch_size: transitions in a batch.
-      buffer_size: capacity of the replay buffer.
+      init_episodes: episodes at the start of which no stop rule may judge.
+      learns_from: first episode, counted from 0, in which the agent learns.
+      env_action: `action -> action` as the world takes it.
+      action_repeat: steps of the world for each decision.
     """
 
     init: Callable[..., Any]
     begin_episode: Callable[..., Any]
     act: Callable[..., Any]
     update: Callable[..., Any]
+    memory: MemoryMaker
     hparams: Any
     init_episodes: int
-    batch_size: int
-    buffer_size: int
+    learns_from: int
+    env_action: Callable[[Any], Any] = lambda action: action
+    action_repeat: int = 1

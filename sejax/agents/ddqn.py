@@ -15,6 +15,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from sejax.agents.agent import Agent
+from sejax.agents.memory import replay_memory
 from sejax.agents.replay import Transition
 from sejax.configs import DDQNConfig
 from sejax.networks import MLP
@@ -118,9 +119,9 @@ def make_ddqn(config: DDQNConfig, obs_dim: int, num_actions: int) -> Agent:
         act=act,
         update=update,
         hparams=DDQNHparams(**{f: getattr(config, f) for f in DDQNHparams._fields}),
+        memory=replay_memory(config.batch_size, config.buffer_size),
         init_episodes=config.init_episodes,
-        batch_size=config.batch_size,
-        buffer_size=config.buffer_size,
+        learns_from=config.init_episodes,
     )
 
 

@@ -16,6 +16,7 @@ _VECTOR = 8  # float32 lanes of AVX2
 class Transition(NamedTuple):
     """One step, or a feature-major batch of them (`[obs_dim, batch]`, `[batch]`).
 
+    `action` is an index or, where actions are vectors, `[action_dim]` or `[action_dim, batch]`.
     `discount` is what the target bootstraps with before the agent's gamma: 0 where the episode
     terminated, 1 elsewhere, anything in an SE with a soft done. `weight` is 0 in columns that only
     fill a batch up.
@@ -29,14 +30,23 @@ class Transition(NamedTuple):
     weight: Array | float = 1.0
 
 
-def row_width(obs_dim: int) -> int:
-    """Number of floats in a packed transition with one discrete action."""
-    return 2 * obs_dim + 3
+def row_width(obs_dim: int, action_dim: int | None = None) -> int:
+    """Number of floats in a packed transition; `action_dim` is None for an action's index."""
+    return 2 * obs_dim + (action_dim or 1) + 2
 
 
-def init(capacity: int, obs_dim: int) -> Float[Array, "capacity width"]:
+def init(
+    capacity: int, obs_dim: int, action_dim: int | None = None
+) -> Float[Array, "capacity width"]:
     """An empty buffer."""
-    return jnp.zeros((capacity, row_width(obs_dim)), jnp.float32)
+    return jnp.zeros((capacity, row_width(obs_dim, action_dim)), jnp.float32)
+
+
+def pack(transition: Transition) -> Float[Array, " width"]:
+    """One transition as a row."""
+    parts = (transition.obs, transition.next_obs, transition.action, transition.reward,
+             transition.discount)  # fmt: skip
+    return jnp.concatenate([jnp.atleast_1d(x).astype(jnp.float32) for x in parts])
 
 
 def store(
@@ -45,20 +55,21 @@ def store(
     transition: Transition,
     active: Array | bool = True,
 ) -> Float[Array, "capacity width"]:
-    """Writes the transition of the agent's `step`-th step; the oldest row gives way when full.
+    """Writes the transition of the agent's `step`-th step; the oldest row gives way when full."""
+    return write_row(rows, step, pack(transition), active)
+
+
+def write_row(
+    rows: Float[Array, "capacity width"],
+    step: Int[Array, ""],
+    row: Float[Array, " width"],
+    active: Array | bool = True,
+) -> Float[Array, "capacity width"]:
+    """Writes a row into the ring.
 
     The write is dropped where `active` is False: an index out of range costs nothing, where a
     select would copy the buffer.
     """
-    row = jnp.concatenate(
-        [
-            transition.obs,
-            transition.next_obs,
-            jnp.stack([transition.action, transition.reward, transition.discount]).astype(
-                jnp.float32
-            ),
-        ]
-    )
     capacity = rows.shape[0]
     if active is True:
         return jax.lax.dynamic_update_slice(rows, row[None], (step % capacity, 0))
@@ -71,6 +82,7 @@ def sample(
     seed: UInt32[Array, ""],
     num_stored: Int[Array, ""],
     batch_size: int,
+    action_dim: int | None = None,
 ) -> Transition:
     """Draws a feature-major batch, uniformly with replacement, from the first `num_stored` rows.
 
@@ -79,6 +91,7 @@ def sample(
       seed: 32 random bits for this draw.
       num_stored: rows written so far, at least 1; more than the capacity counts as the capacity.
       batch_size: number of rows to draw (static).
+      action_dim: length of an action, or None if it is an index.
 
     Returns:
       A batch whose width is `batch_size` rounded up to whole vectors of the CPU; the columns beyond
@@ -94,14 +107,20 @@ def sample(
         rows.reshape(-1), index, cpu=_gather_outlined, default=_gather
     )  # [width, batch]
     is_padding = jnp.arange(padded_size) >= batch_size
-    obs_dim = (rows.shape[1] - 3) // 2
+    weight = 1.0 if padded_size == batch_size else 1.0 - is_padding
+    return unpack(batch, action_dim)._replace(weight=weight)
+
+
+def unpack(rows: Float[Array, "width batch"], action_dim: int | None = None) -> Transition:
+    """Packed transitions, feature-major, as a batch."""
+    obs_dim = (rows.shape[0] - 2 - (action_dim or 1)) // 2
+    action = rows[2 * obs_dim : -2]
     return Transition(
-        obs=batch[:obs_dim],
-        next_obs=batch[obs_dim : 2 * obs_dim],
-        action=batch[-3].astype(jnp.int32),
-        reward=batch[-2],
-        discount=batch[-1],
-        weight=1.0 if padded_size == batch_size else 1.0 - is_padding,
+        obs=rows[:obs_dim],
+        next_obs=rows[obs_dim : 2 * obs_dim],
+        action=action[0].astype(jnp.int32) if action_dim is None else action,
+        reward=rows[-2],
+        discount=rows[-1],
     )
 
 

@@ -12,9 +12,10 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Float
 
-from sejax.agents import replay
 from sejax.agents.agent import Agent
 from sejax.agents.masked_loop import while_any_active
+from sejax.agents.memory import Memory
+from sejax.agents.replay import Transition
 from sejax.configs import TrainingConfig
 
 _NO_LIMIT = 2**31 - 1
@@ -55,7 +56,7 @@ class _TestState:
 
 @struct.dataclass
 class _LoopState:
-    """Carry of the step loop. Everything but `rows` is small."""
+    """Carry of the step loop. What the agent remembers is carried beside it."""
 
     active: Array
     step: Array
@@ -101,7 +102,6 @@ def make_trainer(
         raise ValueError("stop_rule='solved' with solved_by='test' needs a test_fn; got None.")
     window = training.window
     max_steps = training.max_steps or _NO_LIMIT
-    capacity = min(agent.buffer_size, max_steps)
 
     def begin(key: Array, env_params: Any, hparams: Any, active: Array | bool) -> _LoopState:
         key_agent, key_reset = jax.random.split(key)
@@ -121,30 +121,39 @@ def make_trainer(
             test_steps=jnp.int32(0),
         )
 
-    def step(rows: Array, state: _LoopState, consts: Any, masked: bool) -> tuple[Array, _LoopState]:
+    def make_memory(state: _LoopState) -> Memory:
+        def example() -> Transition:
+            action = agent.act(jax.random.key(0), state.agent_state, state.obs, explore=True)
+            return Transition(state.obs, action, jnp.float32(0), jnp.float32(0), state.obs)
+
+        return agent.memory(jax.eval_shape(example), max_steps)
+
+    def step(kept: Any, state: _LoopState, consts: Any, masked: bool) -> tuple[Any, _LoopState]:
         """One agent step: act, step the world, store, learn, and close the episode if it ended."""
         key, env_params = consts
+        memory = make_memory(state)
         key_act, key_env, key_sample, key_update, key_end = jax.random.split(
             jax.random.fold_in(key, state.step), 5
         )
         action = agent.act(key_act, state.agent_state, state.obs, explore=True)
         next_obs, env_state, reward, terminated, info = env.step_env(
-            key_env, state.env_state, action, env_params
+            key_env, state.env_state, agent.env_action(action), env_params
         )
         truncated = env.is_truncated(env_state, env_params)
+        nonfinite = state.nonfinite | info.get("nonfinite", False)
+        ended = terminated | truncated | nonfinite
         discount = jnp.float32(info["discount"])
         if training.time_limit_is_terminal:
             discount = jnp.where(truncated, 0.0, discount)
-        transition = replay.Transition(state.obs, action, reward, discount, next_obs)
-        rows = replay.store(rows, state.step, transition, state.active if masked else True)
+        transition = Transition(state.obs, action, reward, discount, next_obs)
+        kept = memory.store(kept, state.step, transition, ended, state.active if masked else True)
 
         def learn(agent_state):
-            seed = jax.random.bits(key_sample)
-            batch = replay.sample(rows, seed, state.step + 1, agent.batch_size)
+            batch = memory.batch(key_sample, kept, state.step + 1, transition)
             return agent.update(key_update, agent_state, batch)
 
         agent_state = jax.lax.cond(
-            state.episode >= agent.init_episodes, learn, lambda s: s, state.agent_state
+            state.episode >= agent.learns_from, learn, lambda s: s, state.agent_state
         )
         state = state.replace(
             step=state.step + 1,
@@ -152,14 +161,13 @@ def make_trainer(
             obs=next_obs,
             env_state=env_state,
             agent_state=agent_state,
-            nonfinite=state.nonfinite | info.get("nonfinite", False),
+            nonfinite=nonfinite,
             active=state.step + 1 < max_steps,
         )
-        ended = terminated | truncated | state.nonfinite
         state = jax.lax.cond(
             ended, lambda s: end_episode(key_end, s, env_params, ended), lambda s: s, state
         )
-        return rows, state
+        return kept, state
 
     def end_episode(key: Array, state: _LoopState, env_params: Any, ended: Array) -> _LoopState:
         """Records the episode, decides whether training goes on, and starts the next one.
@@ -198,8 +206,8 @@ def make_trainer(
     ) -> TrainResult:
         key_begin, key_steps = jax.random.split(key)
         state = begin(key_begin, env_params, hparams, active)
-        rows = replay.init(capacity, state.obs.shape[0])
-        _, state = while_any_active(step, rows, state, (key_steps, env_params))
+        kept = make_memory(state).init()
+        _, state = while_any_active(step, kept, state, (key_steps, env_params))
         return TrainResult(
             agent_state=state.agent_state,
             train_steps=state.step,
@@ -255,7 +263,7 @@ def make_tester(agent: Agent, task: Any, num_episodes: int) -> Callable[..., Any
         key_act, key_env = jax.random.split(jax.random.fold_in(key, state.num_steps))
         action = agent.act(key_act, agent_state, state.obs, explore=False)
         obs, env_state, reward, terminated, _ = env.step_env(
-            key_env, state.env_state, action, params
+            key_env, state.env_state, agent.env_action(action), params
         )
         ended = terminated | env.is_truncated(env_state, params)
         return nothing, _TestState(

@@ -1,0 +1,104 @@
+"""What an agent keeps of its steps, and what of it each learning step gets to see."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from sejax.agents import replay
+from sejax.agents.replay import Transition
+
+
+class Memory(NamedTuple):
+    """Pure functions over an agent's large arrays, which are updated in place.
+
+    Attributes:
+      init: `() -> arrays`.
+      store: `(arrays, step, transition, ended, active) -> arrays`; writes the `step`-th step, and
+        nothing if `active` is False. `ended` says whether the episode ended there.
+      batch: `(key, arrays, num_steps, transition) -> batch` for `Agent.update`, after `num_steps`
+        steps, the last of which was `transition`.
+    """
+
+    init: Callable[[], Any]
+    store: Callable[..., Any]
+    batch: Callable[..., Any]
+
+
+# `(example, max_steps) -> Memory`: for transitions like `example`, of which there are at most
+# `max_steps`.
+MemoryMaker = Callable[[Transition, int], Memory]
+
+
+class Rollout(NamedTuple):
+    """All steps since the last learning phase, in order.
+
+    Attributes:
+      rows: packed transitions with one more column, which is 1 where the episode ended.
+      is_full: whether as many steps as a phase takes are there.
+    """
+
+    rows: Float[Array, "steps width"]
+    is_full: Bool[Array, ""]
+
+
+def replay_memory(batch_size: int, buffer_size: int) -> MemoryMaker:
+    """A ring of the last `buffer_size` steps, from which batches are drawn uniformly."""
+
+    def make(example: Transition, max_steps: int) -> Memory:
+        obs_dim, action_dim = _dims(example)
+        capacity = min(buffer_size, max_steps)
+
+        def batch(key: Array, rows: Array, num_steps: Array, transition: Transition) -> Transition:
+            return replay.sample(rows, jax.random.bits(key), num_steps, batch_size, action_dim)
+
+        return Memory(
+            init=lambda: replay.init(capacity, obs_dim, action_dim),
+            store=lambda rows, step, transition, ended, active: replay.store(
+                rows, step, transition, active
+            ),
+            batch=batch,
+        )
+
+    return make
+
+
+def rollout_memory(length: int) -> MemoryMaker:
+    """The last `length` steps in order, overwritten when they have been learned from."""
+
+    def make(example: Transition, max_steps: int) -> Memory:
+        obs_dim, action_dim = _dims(example)
+
+        def store(
+            rows: Array, step: Array, transition: Transition, ended: Array, active: Array | bool
+        ) -> Array:
+            row = jnp.append(replay.pack(transition), jnp.float32(ended))
+            return replay.write_row(rows, step, row, active)
+
+        def batch(key: Array, rows: Array, num_steps: Array, transition: Transition) -> Rollout:
+            return Rollout(rows=rows, is_full=num_steps % length == 0)
+
+        width = replay.row_width(obs_dim, action_dim) + 1
+        return Memory(init=lambda: jnp.zeros((length, width)), store=store, batch=batch)
+
+    return make
+
+
+def no_memory() -> MemoryMaker:
+    """Keeps nothing: each learning step sees the step just made."""
+
+    def make(example: Transition, max_steps: int) -> Memory:
+        return Memory(
+            init=lambda: jnp.zeros(0),
+            store=lambda arrays, step, transition, ended, active: arrays,
+            batch=lambda key, arrays, num_steps, transition: transition,
+        )
+
+    return make
+
+
+def _dims(example: Transition) -> tuple[int, int | None]:
+    """Length of an observation, and of an action unless it is an index."""
+    return example.obs.shape[0], example.action.shape[0] if example.action.ndim else None
