@@ -28,7 +28,7 @@ import math
 import random
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 import torch
@@ -299,9 +299,10 @@ def train(env: SyntheticEnv, config: LearnConfig, seed: int) -> TrainResult:
     torch.manual_seed(seed)
     random.seed(seed)
     rng = np.random.default_rng(seed)
-    agent = init_ddqn(config.agent)
-    capacity = min(config.agent.buffer_size, config.training.max_episodes * MAX_STEPS)
-    buffer = ReplayBuffer(capacity, config.agent.batch_size)
+    hp = cast(DDQNConfig, config.agent)
+    agent = init_ddqn(hp)
+    capacity = min(hp.buffer_size, config.training.max_episodes * MAX_STEPS)
+    buffer = ReplayBuffer(capacity, hp.batch_size)
     returns: list[float] = []
     train_steps = 0
     while True:
@@ -332,7 +333,7 @@ def play_episode(
     config: LearnConfig,
 ) -> Episode:
     """One training episode: each step acts, steps the SE, stores, and learns once."""
-    hp = config.agent
+    hp = cast(DDQNConfig, config.agent)
     epsilon = epsilon_at(episode, hp)
     total = 0.0
     num_steps = 0
@@ -386,8 +387,9 @@ def play_test_episodes(agent: DDQNState, config: LearnConfig, seed: int) -> np.n
     state = CartPole.reset(np.random.default_rng(seed), config.training.test_episodes)
     active = np.ones(len(state), dtype=bool)
     returns = np.zeros(len(state))
+    activation = cast(DDQNConfig, config.agent).activation
     for _ in range(MAX_STEPS):
-        q_values = mlp(agent.values, torch.from_numpy(state), config.agent.activation)
+        q_values = mlp(agent.values, torch.from_numpy(state), activation)
         state, fallen = CartPole.step(state, q_values.argmax(1).numpy())
         returns += active  # 1 for each step, the one that falls included
         active &= ~fallen

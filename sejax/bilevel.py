@@ -16,11 +16,12 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from sejax import envs
+from sejax.agents.hparams import make_varied_agents
 from sejax.agents.registry import make_agent
 from sejax.configs import LearnConfig
 from sejax.es import make_strategy
 from sejax.es.nes import finite_mean
-from sejax.evaluation import make_evaluator
+from sejax.evaluation import evaluator_and_lanes
 from sejax.objectives import Outcome, make_objective
 from sejax.parallel import spread_over_devices
 from sejax.proxies.synthetic import SyntheticEnv, make_synthetic
@@ -243,12 +244,14 @@ def make_population_scorer(
     `Outcome` with leaves `[seed, n]`. The trainings are spread over the devices; on each device
     groups of `config.lanes` of them follow one another.
     """
-    evaluate = make_evaluator(make_agent(config.agent, task), env, task, config.training)
+    make = make_varied_agents if config.agent_hparams == "varied" else make_agent
+    agent = make(config.agent, task, config.exploration)
+    evaluate, cpu_lanes = evaluator_and_lanes(agent, env, task, config.training)
 
     def evaluate_candidate(key: Array, candidate: Array, active: Array) -> Outcome:
         return evaluate(key, env.params(unravel(candidate)), active)
 
-    evaluate_many = spread_over_devices(evaluate_candidate, config.devices, config.lanes)
+    evaluate_many = spread_over_devices(evaluate_candidate, config.devices, config.lanes, cpu_lanes)
 
     def score(seed_ids: Array, keys: Array, candidates: Array, active: Array) -> Outcome:
         num_seeds, num_candidates, num_dims = candidates.shape

@@ -4,7 +4,6 @@ The dataclasses here and the YAML files in `conf/` have the same field names. `c
 them as the commands do: `sejax.config(["env=acrobot", "generations=50"])`.
 """
 
-import math
 from collections.abc import Sequence
 from dataclasses import MISSING, dataclass, field, fields, make_dataclass
 from pathlib import Path
@@ -17,10 +16,18 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from sejax import envs
+from sejax.agents.configs import (
+    ACTIVATIONS,
+    AGENT_CONFIGS,
+    EXPLORATION_CONFIGS,
+    AgentConfig,
+    DDQNConfig,
+    ExplorationConfig,
+)
 from sejax.errors import ConfigError, nearest, require, unknown_name
+from sejax.validation import at_least, default, fraction, one_of, positive
 
 CONF_DIR = Path(__file__).parent / "conf" / "run"
-ACTIVATIONS = ("tanh", "relu", "leaky_relu", "prelu")
 DONE_MODES = ("soft", "threshold")
 STOP_RULES = ("plateau", "solved", "never")
 SOLVED_BY = ("test", "train")
@@ -30,7 +37,8 @@ SCORE_TRANSFORMS = (
 )  # fmt: skip
 UPDATE_RULES = ("authors", "paper")
 AGGREGATES = ("mean", "min")
-AGENT_HPARAMS = ("default", "nes")
+AGENT_HPARAMS = ("default", "varied")
+EVALUATION_HPARAMS = (*AGENT_HPARAMS, "nes")
 TRAINING_FROM = ("proxy", "config")
 OBJECTIVES = ("max_reward", "reward_threshold")
 
@@ -67,24 +75,6 @@ EVOSAX_ALGORITHMS = {
 }
 
 
-def _at_least(minimum: float, name: str, value: Any, reason: str, fix: Any) -> None:
-    require(value >= minimum, name, f"be at least {minimum}", reason, value, f"{name}={fix}")
-
-
-def _positive(name: str, value: float, reason: str, fix: Any) -> None:
-    require(value > 0 and math.isfinite(value), name, "be above 0 and finite", reason, value,
-            f"{name}={fix}")  # fmt: skip
-
-
-def _fraction(name: str, value: float, fix: Any) -> None:
-    require(0 <= value <= 1, name, "lie in [0, 1]", "it is a fraction", value, f"{name}={fix}")
-
-
-def _one_of(name: str, value: str, known: Sequence[str]) -> None:
-    if value not in known:
-        raise unknown_name(name, value, known)
-
-
 @dataclass(frozen=True, kw_only=True)
 class EnvConfig:
     """Which real task; its limits are the paper's and live in `sejax.envs`."""
@@ -92,7 +82,7 @@ class EnvConfig:
     name: str = "cartpole"
 
     def __post_init__(self) -> None:
-        _one_of("env.name", self.name, envs.names())
+        one_of("env.name", self.name, envs.names())
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -106,45 +96,11 @@ class SyntheticConfig:
     done: str = "soft"  # soft: bootstrap with 1 - d (authors); threshold: with 1 - [d > 0.5].
 
     def __post_init__(self) -> None:
-        _one_of("proxy.name", self.name, ("se",))
-        _at_least(1, "proxy.hidden_size", self.hidden_size, "a layer needs a unit", 128)
-        _at_least(1, "proxy.num_layers", self.num_layers, "the SE has a hidden layer", 1)
-        _one_of("proxy.activation", self.activation, ACTIVATIONS)
-        _one_of("proxy.done", self.done, DONE_MODES)
-
-
-@dataclass(frozen=True, kw_only=True)
-class DDQNConfig:
-    """DDQN's hyperparameters; the defaults are the paper's "default agent hyperparameters"."""
-
-    name: str = "ddqn"
-    init_episodes: int = 10  # episodes before learning starts
-    batch_size: int = 128
-    buffer_size: int = 100_000
-    hidden_size: int = 128
-    num_layers: int = 2
-    activation: str = "relu"
-    learning_rate: float = 1e-3
-    target_update_rate: float = 0.01  # tau: weight of the online network in the target's update.
-    discount: float = 0.99  # gamma
-    epsilon_init: float = 1.0
-    epsilon_min: float = 0.01
-    epsilon_decay: float = 0.9  # factor for each episode
-
-    def __post_init__(self) -> None:
-        _one_of("agent.name", self.name, ("ddqn",))
-        for name in ("batch_size", "buffer_size", "hidden_size", "num_layers"):
-            _at_least(1, f"agent.{name}", getattr(self, name), "there is nothing to learn from or "
-                      "with otherwise", _default(DDQNConfig, name))  # fmt: skip
-        _at_least(0, "agent.init_episodes", self.init_episodes, "it counts episodes", 1)
-        _positive("agent.learning_rate", self.learning_rate, "Adam would not move", 0.001)
-        for name in ("target_update_rate", "discount", "epsilon_init", "epsilon_min",
-                     "epsilon_decay"):  # fmt: skip
-            _fraction(f"agent.{name}", getattr(self, name), _default(DDQNConfig, name))
-        _one_of("agent.activation", self.activation, ACTIVATIONS)
-
-
-AgentConfig = DDQNConfig
+        one_of("proxy.name", self.name, ("se",))
+        at_least(1, "proxy.hidden_size", self.hidden_size, "a layer needs a unit", 128)
+        at_least(1, "proxy.num_layers", self.num_layers, "the SE has a hidden layer", 1)
+        one_of("proxy.activation", self.activation, ACTIVATIONS)
+        one_of("proxy.done", self.done, DONE_MODES)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -163,15 +119,15 @@ class TrainingConfig:
 
     def __post_init__(self) -> None:
         for name in ("max_episodes", "window", "test_episodes"):
-            _at_least(1, f"training.{name}", getattr(self, name), "it counts episodes",
-                      _default(TrainingConfig, name))  # fmt: skip
-        _at_least(0, "training.min_steps", self.min_steps, "it counts steps", 0)
+            at_least(1, f"training.{name}", getattr(self, name), "it counts episodes",
+                      default(TrainingConfig, name))  # fmt: skip
+        at_least(0, "training.min_steps", self.min_steps, "it counts steps", 0)
         if self.max_steps is not None:
-            _at_least(1, "training.max_steps", self.max_steps, "an agent must train", "null")
-        _at_least(0, "training.plateau_tolerance", self.plateau_tolerance,
+            at_least(1, "training.max_steps", self.max_steps, "an agent must train", "null")
+        at_least(0, "training.plateau_tolerance", self.plateau_tolerance,
                   "it bounds a relative change", 0.01)  # fmt: skip
-        _one_of("training.stop_rule", self.stop_rule, STOP_RULES)
-        _one_of("training.solved_by", self.solved_by, SOLVED_BY)
+        one_of("training.stop_rule", self.stop_rule, STOP_RULES)
+        one_of("training.solved_by", self.solved_by, SOLVED_BY)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -194,22 +150,22 @@ class NESConfig:
     common_random_numbers: bool = False  # the same inner seeds for all members of a generation
 
     def __post_init__(self) -> None:
-        _at_least(2, "es.population_size", self.population_size,
+        at_least(2, "es.population_size", self.population_size,
                   "scores are compared within a generation", 16)  # fmt: skip
         if self.num_incumbent_evals is not None:
-            _at_least(1, "es.num_incumbent_evals", self.num_incumbent_evals,
+            at_least(1, "es.num_incumbent_evals", self.num_incumbent_evals,
                       "the incumbent's score selects the proxy", "null")  # fmt: skip
-        _positive("es.noise_std", self.noise_std, "members must differ", 0.05)
-        _positive("es.step_size", self.step_size, "the proxy would not move", 1)
+        positive("es.noise_std", self.noise_std, "members must differ", 0.05)
+        positive("es.step_size", self.step_size, "the proxy would not move", 1)
         for name in ("noise_std_decay", "step_size_decay"):
             value = getattr(self, name)
             require(0 < value <= 1, f"es.{name}", "lie in (0, 1]", "it shrinks each generation",
                     value, f"es.{name}=1")  # fmt: skip
-        _fraction("es.weight_decay", self.weight_decay, 0)
-        _at_least(1, "es.num_evals", self.num_evals, "a member needs a score", 1)
-        _one_of("es.score_transform", self.score_transform, SCORE_TRANSFORMS)
-        _one_of("es.update_rule", self.update_rule, UPDATE_RULES)
-        _one_of("es.eval_aggregate", self.eval_aggregate, AGGREGATES)
+        fraction("es.weight_decay", self.weight_decay, 0)
+        at_least(1, "es.num_evals", self.num_evals, "a member needs a score", 1)
+        one_of("es.score_transform", self.score_transform, SCORE_TRANSFORMS)
+        one_of("es.update_rule", self.update_rule, UPDATE_RULES)
+        one_of("es.eval_aggregate", self.eval_aggregate, AGGREGATES)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -227,20 +183,20 @@ class EvosaxConfig:
     common_random_numbers: bool = False
 
     def __post_init__(self) -> None:
-        _at_least(2, "es.population_size", self.population_size,
+        at_least(2, "es.population_size", self.population_size,
                   "scores are compared within a generation", 32)  # fmt: skip
         require(self.population_size % 2 == 0, "es.population_size", "be even",
                 "evosax's algorithms pair opposite perturbations", self.population_size,
                 f"es.population_size={self.population_size + 1}")  # fmt: skip
-        _at_least(1, "es.num_incumbent_evals", self.num_incumbent_evals,
+        at_least(1, "es.num_incumbent_evals", self.num_incumbent_evals,
                   "the incumbent's score selects the proxy", 16)  # fmt: skip
-        _positive("es.noise_std", self.noise_std, "candidates must differ", 0.05)
-        _positive("es.step_size", self.step_size, "the mean would not move", 0.05)
+        positive("es.noise_std", self.noise_std, "candidates must differ", 0.05)
+        positive("es.step_size", self.step_size, "the mean would not move", 0.05)
         require(0 < self.noise_std_decay <= 1, "es.noise_std_decay", "lie in (0, 1]",
                 "it shrinks", self.noise_std_decay, "es.noise_std_decay=1")  # fmt: skip
-        _at_least(1, "es.num_evals", self.num_evals, "a candidate needs a score", 1)
-        _one_of("es.eval_aggregate", self.eval_aggregate, AGGREGATES)
-        _one_of("es.name", self.name, tuple(EVOSAX_ALGORITHMS))
+        at_least(1, "es.num_evals", self.num_evals, "a candidate needs a score", 1)
+        one_of("es.eval_aggregate", self.eval_aggregate, AGGREGATES)
+        one_of("es.name", self.name, tuple(EVOSAX_ALGORITHMS))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -251,8 +207,8 @@ class ObjectiveConfig:
     unsolved_weight: float = 100.0  # w_sol in the reward threshold objective
 
     def __post_init__(self) -> None:
-        _one_of("objective.name", self.name, OBJECTIVES)
-        _at_least(0, "objective.unsolved_weight", self.unsolved_weight,
+        one_of("objective.name", self.name, OBJECTIVES)
+        at_least(0, "objective.unsolved_weight", self.unsolved_weight,
                   "a shortfall must not be rewarded", 100)  # fmt: skip
 
 
@@ -263,33 +219,39 @@ class LearnConfig:
     preset: str = "best"
     env: EnvConfig = field(default_factory=EnvConfig)
     proxy: SyntheticConfig = field(default_factory=SyntheticConfig)
-    agent: DDQNConfig = field(default_factory=DDQNConfig)
+    agent: AgentConfig = field(default_factory=DDQNConfig)
+    exploration: ExplorationConfig = field(default_factory=ExplorationConfig)
     es: Any = field(default_factory=NESConfig)
     objective: ObjectiveConfig = field(default_factory=ObjectiveConfig)
     training: TrainingConfig = field(default_factory=TrainingConfig)
+    agent_hparams: str = "default"  # default: the agent's; varied: drawn anew for each training
     generations: int = 50  # n_o
     seed: int = 0
     num_seeds: int = 1  # independent runs in one program, with seeds seed, seed + 1, ...
     stop_when_solved: bool = False  # a run ends at its first incumbent mean above the threshold.
-    lanes: int | None = None  # agents in lockstep on one device; null: 1 on CPU, all elsewhere
+    lanes: int | None = None  # agents in lockstep on one device; null: what suits agent and device
     devices: int | None = None  # devices to spread the population over; null: all
     checkpoint_every: int = 1  # generations
     run_dir: str | None = None  # null: runs/<env>-<proxy>-<agent>-s<seed>
 
     def __post_init__(self) -> None:
-        _at_least(1, "generations", self.generations, "there is nothing to do otherwise", 50)
+        require_fit(self.agent, self.exploration, self.env.name)
+        one_of("agent_hparams", self.agent_hparams, AGENT_HPARAMS)
+        at_least(1, "generations", self.generations, "there is nothing to do otherwise", 50)
         require(0 <= self.seed < 2**31, "seed", "lie in [0, 2**31)", "it is a 32-bit number",
                 self.seed, "seed=0")  # fmt: skip
-        _at_least(1, "num_seeds", self.num_seeds, "it counts runs", 1)
-        _at_least(1, "checkpoint_every", self.checkpoint_every, "it counts generations", 1)
+        at_least(1, "num_seeds", self.num_seeds, "it counts runs", 1)
+        at_least(1, "checkpoint_every", self.checkpoint_every, "it counts generations", 1)
         for name in ("lanes", "devices"):
             if getattr(self, name) is not None:
-                _at_least(1, name, getattr(self, name), "something must compute", "null")
+                at_least(1, name, getattr(self, name), "something must compute", "null")
 
     @property
     def resolved_run_dir(self) -> Path:
-        name = f"{self.env.name}-{self.proxy.name}-{self.agent.name}-s{self.seed}"
-        return Path(self.run_dir or f"runs/{name}")
+        explored = "" if self.exploration.name == "none" else f"_{self.exploration.name}"
+        varied = "_varied" if self.agent_hparams == "varied" else ""
+        agent = f"{self.agent.name}{explored}{varied}"
+        return Path(self.run_dir or f"runs/{self.env.name}-{self.proxy.name}-{agent}-s{self.seed}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -298,7 +260,8 @@ class EvaluateConfig:
 
     proxy: str = "???"  # OmegaConf's word for a value that must be given
     env: str | None = None
-    agent: AgentConfig = field(default_factory=AgentConfig)
+    agent: AgentConfig = field(default_factory=DDQNConfig)
+    exploration: ExplorationConfig = field(default_factory=ExplorationConfig)
     agent_hparams: str = "default"
     training_from: str = "proxy"  # how long agents train: as the proxy was learned, or `training`
     training: TrainingConfig = field(default_factory=TrainingConfig)
@@ -311,12 +274,12 @@ class EvaluateConfig:
     out_dir: str | None = None
 
     def __post_init__(self) -> None:
-        _at_least(1, "num_agents", self.num_agents, "there is nothing to average otherwise", 10)
-        _one_of("agent_hparams", self.agent_hparams, AGENT_HPARAMS)
-        _one_of("training_from", self.training_from, TRAINING_FROM)
+        at_least(1, "num_agents", self.num_agents, "there is nothing to average otherwise", 10)
+        one_of("agent_hparams", self.agent_hparams, EVALUATION_HPARAMS)
+        one_of("training_from", self.training_from, TRAINING_FROM)
         for name in ("lanes", "devices"):
             if getattr(self, name) is not None:
-                _at_least(1, name, getattr(self, name), "something must compute", "null")
+                at_least(1, name, getattr(self, name), "something must compute", "null")
 
 
 def register_evosax_choices() -> None:
@@ -353,7 +316,7 @@ def from_hydra(cfg: DictConfig) -> LearnConfig:
     groups = {
         "env": EnvConfig,
         "proxy": SyntheticConfig,
-        "agent": DDQNConfig,
+        **_agent_groups(cfg),
         "es": NESConfig if cfg.es.name == "nes" else EvosaxConfig,
         "objective": ObjectiveConfig,
         "training": TrainingConfig,
@@ -372,8 +335,35 @@ def evaluate_from_hydra(cfg: DictConfig) -> EvaluateConfig:
             "proxy must be given, because agents are trained on it; got none. Set proxy=RUN_DIR, "
             "proxy=FILE, proxy=cartpole (a shipped one) or proxy=real env=cartpole."
         )
-    groups = {"agent": DDQNConfig, "training": TrainingConfig, "real_training": TrainingConfig}
+    groups = {**_agent_groups(cfg), "training": TrainingConfig, "real_training": TrainingConfig}
     return _build(EvaluateConfig, groups, cfg)
+
+
+def _agent_groups(cfg: DictConfig) -> dict[str, type]:
+    """The classes of the chosen agent and exploration; files of older versions lack the latter."""
+    one_of("agent.name", cfg.agent.name, tuple(AGENT_CONFIGS))
+    groups: dict[str, type] = {"agent": AGENT_CONFIGS[cfg.agent.name]}
+    if "exploration" in cfg:
+        one_of("exploration.name", cfg.exploration.name, tuple(EXPLORATION_CONFIGS))
+        groups["exploration"] = EXPLORATION_CONFIGS[cfg.exploration.name]
+    return groups
+
+
+def require_fit(agent: AgentConfig, exploration: ExplorationConfig, env_name: str) -> None:
+    """Checks that an agent can act in a task, and that it can be made to explore so.
+
+    Raises:
+      ConfigError: if it cannot.
+    """
+    kind = envs.kind(env_name)
+    fitting = [name for name, schema in AGENT_CONFIGS.items()
+               if schema.states == kind.states and kind.actions in schema.actions]  # fmt: skip
+    require(agent.name in fitting, "agent", f"be one of {', '.join(fitting)} in {env_name}",
+            f"its states are {kind.states} and its actions {kind.actions}", agent.name,
+            f"agent={fitting[0]}")  # fmt: skip
+    require(agent.name in exploration.agents, "exploration", f"suit {agent.name}",
+            f"{exploration.name} is made for {', '.join(exploration.agents)}", exploration.name,
+            "exploration=none")  # fmt: skip
 
 
 def _build(schema: type, groups: dict[str, type], cfg: DictConfig) -> Any:
@@ -417,10 +407,6 @@ def _typed(schema: type, cfg: DictConfig, group: str) -> Any:
     return schema(**values[group])
 
 
-def _default(schema: type, name: str) -> Any:
-    return schema.__dataclass_fields__[name].default
-
-
 def translate_hydra_error(error: Exception) -> ConfigError:
     """One clear sentence for what Hydra refused; unknown choices get the nearest known ones."""
     text = str(error)
@@ -454,7 +440,8 @@ def translate_hydra_error(error: Exception) -> ConfigError:
 
 
 def _known_fields() -> list[str]:
-    groups = (("proxy", SyntheticConfig), ("agent", DDQNConfig), ("es", NESConfig),
+    groups = (("proxy", SyntheticConfig), *(("agent", c) for c in AGENT_CONFIGS.values()),
+              *(("exploration", c) for c in EXPLORATION_CONFIGS.values()), ("es", NESConfig),
               ("es", EvosaxConfig), ("objective", ObjectiveConfig), ("training", TrainingConfig),
               ("real_training", TrainingConfig))  # fmt: skip
     names = [f.name for f in (*_plain_fields(LearnConfig), *_plain_fields(EvaluateConfig))]

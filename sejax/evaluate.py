@@ -10,7 +10,7 @@ import hydra
 from omegaconf import DictConfig
 
 from sejax import commands
-from sejax.configs import EvaluateConfig, evaluate_from_hydra
+from sejax.configs import EvaluateConfig, evaluate_from_hydra, require_fit
 from sejax.errors import ConfigError
 
 
@@ -73,6 +73,7 @@ def _prepare(config: EvaluateConfig) -> tuple[Any, dict[str, Any], Any, Path]:
         if config.env is None:
             raise ConfigError("env must be given with proxy=real, because the task cannot be read "
                               "from a proxy; got none. Set env=cartpole.")  # fmt: skip
+        require_fit(config.agent, config.exploration, config.env)
         task = envs.make(config.env)
         worlds = {"the real task": (task.env, task.params, config.real_training)}
         return task, worlds, config.agent, Path(config.out_dir or f"runs/evaluate-{task.name}")
@@ -83,6 +84,7 @@ def _prepare(config: EvaluateConfig) -> tuple[Any, dict[str, Any], Any, Path]:
                           f"tested there; got {config.env} for a proxy of {task.name}. Set "
                           f"env={task.name}.")  # fmt: skip
     agent = proxy.config.agent if config.agent_hparams == "nes" else config.agent
+    require_fit(agent, config.exploration, task.name)
     training = config.training
     if config.training_from == "proxy":
         training = _as_learned(proxy, agent)
@@ -114,12 +116,20 @@ def _train_and_test(
     import jax
     import pandas as pd
 
+    from sejax.agents.registry import make_agent
     from sejax.evaluation import evaluate_agents
 
     keys = jax.random.split(jax.random.key(config.seed), config.num_agents)
     started = time.time()
     outcome = evaluate_agents(
-        agent_config, env, env_params, task, training, keys, config.lanes, config.devices
+        make_agent(agent_config, task, config.exploration),
+        env,
+        env_params,
+        task,
+        training,
+        keys,
+        config.lanes,
+        config.devices,
     )
     outcome = jax.device_get(outcome)
     print(f"{env.name}: {config.num_agents} agents in {time.time() - started:.1f} s", flush=True)

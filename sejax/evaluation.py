@@ -4,7 +4,6 @@ Source: paper, Algorithm 1 (TrainAgent, EvaluateAgent) and section "Performance 
 Agents".
 """
 
-import dataclasses
 from collections.abc import Callable
 from typing import Any
 
@@ -13,9 +12,9 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from sejax.agents.agent import Agent
-from sejax.agents.registry import make_agent
+from sejax.agents.hparams import VariedAgents
 from sejax.agents.trainer import make_tester, make_trainer
-from sejax.configs import AgentConfig, TrainingConfig
+from sejax.configs import TrainingConfig
 from sejax.envs import Task
 from sejax.objectives import Outcome
 from sejax.parallel import spread_over_devices
@@ -25,17 +24,12 @@ from sejax.proxies.synthetic import SyntheticEnv
 def make_evaluator(
     agent: Agent, env: Any, task: Task, training: TrainingConfig
 ) -> Callable[..., Outcome]:
-    """Builds `evaluate(key, env_params, active=True) -> Outcome` for one fresh agent.
+    """Builds `evaluate(key, env_params, active=True, hparams=...) -> Outcome` for a fresh agent.
 
     The agent trains in `env`, which may be a proxy or the task itself, and is tested over
     `training.test_episodes` episodes on the task. With `active=False` nothing is computed.
-
-    `training.time_limit_is_terminal` speaks of real time limits and is ignored in an SE: there the
-    last step of an episode bootstraps with what the done network says, as in the authors' code.
     """
     synthetic = isinstance(env, SyntheticEnv)
-    if synthetic:
-        training = dataclasses.replace(training, time_limit_is_terminal=False)
     test_once = make_tester(agent, task, num_episodes=1)
     test = make_tester(agent, task, training.test_episodes)
 
@@ -45,9 +39,11 @@ def make_evaluator(
 
     train = make_trainer(agent, env, training, task.solved_reward, test_fn=test_between)
 
-    def evaluate(key: Array, env_params: Any, active: Array | bool = True) -> Outcome:
+    def evaluate(
+        key: Array, env_params: Any, active: Array | bool = True, hparams: Any = agent.hparams
+    ) -> Outcome:
         key_train, key_test = jax.random.split(key)
-        result = train(key_train, env_params, agent.hparams, active)
+        result = train(key_train, env_params, hparams, active)
         returns, steps = test(key_test, result.agent_state, active)
         test_return = returns.mean()
         real_steps = steps.sum() + result.test_steps
@@ -62,8 +58,39 @@ def make_evaluator(
     return evaluate
 
 
+def make_varied_evaluator(
+    varied: VariedAgents, env: Any, task: Task, training: TrainingConfig
+) -> Callable[..., Outcome]:
+    """As `make_evaluator`, for an agent whose hyperparameters are drawn first, from the same key.
+
+    Source: paper, section "Performance of SE-trained Agents" (HPs varied).
+    """
+    evaluators = [make_evaluator(agent, env, task, training) for agent in varied.agents]
+
+    def evaluate(key: Array, env_params: Any, active: Array | bool = True) -> Outcome:
+        values = varied.draw(drawing_key(key))
+        args = (key, env_params, active, varied.hparams(values))
+        return jax.lax.switch(varied.branch(values), evaluators, *args)
+
+    return evaluate
+
+
+def evaluator_and_lanes(
+    agent: Agent | VariedAgents, env: Any, task: Task, training: TrainingConfig
+) -> tuple[Callable[..., Outcome], int | None]:
+    """The evaluator of an agent, fixed or varied, and the lanes that suit it on a CPU."""
+    if isinstance(agent, VariedAgents):
+        return make_varied_evaluator(agent, env, task, training), agent.agents[0].cpu_lanes
+    return make_evaluator(agent, env, task, training), agent.cpu_lanes
+
+
+def drawing_key(key: Array) -> Array:
+    """The part of a training's key that its hyperparameters are drawn from."""
+    return jax.random.fold_in(key, 0x48_50)  # training and test keys are splits of the key
+
+
 def evaluate_agents(
-    agent_config: AgentConfig,
+    agent: Agent | VariedAgents,
     env: Any,
     env_params: Any,
     task: Task,
@@ -73,6 +100,6 @@ def evaluate_agents(
     devices: int | None = None,
 ) -> Outcome:
     """Trains and tests one fresh agent for each key, over all devices; leaves `[agent]`."""
-    evaluate = make_evaluator(make_agent(agent_config, task), env, task, training)
-    program = spread_over_devices(lambda key: evaluate(key, env_params), devices, lanes)
+    evaluate, cpu_lanes = evaluator_and_lanes(agent, env, task, training)
+    program = spread_over_devices(lambda key: evaluate(key, env_params), devices, lanes, cpu_lanes)
     return jax.jit(program)(keys)

@@ -6,6 +6,7 @@ Activations are *feature-major*, `[feature, batch]`: `kernel @ x` with the batch
 
 import functools
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -88,7 +89,10 @@ class MLP(nn.Module):
 
     `activation` is one of `configs.ACTIVATIONS`. PReLU has one slope for the whole network, as in
     the authors' code. `learn_prelu_slope` makes it a parameter (agents); otherwise it stays at 0.25
-    (proxies: the authors' NES perturbs the weights and biases of linear layers only).
+    (proxies: the authors' NES perturbs the weights and biases of linear layers only). `layer_norm`
+    normalises each column over the units of every hidden layer but the first, before the
+    activation; its scale and bias are learned and, as in the authors' code, the same in all layers.
+    With `may_narrow` it knows how many units `narrow` has left.
 
     Source: paper, appendix "SE hyperparameters"; `reference_details.md` 1.10 and 1.11.
     """
@@ -98,13 +102,37 @@ class MLP(nn.Module):
     num_layers: int
     activation: str
     learn_prelu_slope: bool = False
+    layer_norm: bool = False
+    may_narrow: bool = False
 
     @nn.compact
     def __call__(self, x: Float[Array, "in *batch"]) -> Float[Array, "out *batch"]:
         activate = self._activation_fn()
-        for _ in range(self.num_layers):
-            x = activate(Dense(self.hidden_size)(x))
+        normalize = self._layer_norm_fn()
+        for layer in range(self.num_layers):
+            x = Dense(self.hidden_size)(x)
+            if layer > 0:
+                x = normalize(x)
+            x = activate(x)
         return Dense(self.num_outputs)(x)
+
+    def _layer_norm_fn(self) -> Callable[[Array], Array]:
+        if not self.layer_norm:
+            return lambda x: x
+        normalize = nn.LayerNorm(
+            epsilon=1e-5, reduction_axes=0, feature_axes=0, use_fast_variance=False
+        )
+        if not self.may_narrow:
+            return normalize
+        # A parameter that never changes: rounded, as averaging it into a target network may not.
+        width = self.param("width", nn.initializers.constant(self.hidden_size), ())
+        in_use = jnp.arange(self.hidden_size) < jnp.round(jax.lax.stop_gradient(width))
+
+        def normalize_in_use(x: Array) -> Array:
+            mask = in_use if x.ndim == 1 else in_use[:, None]
+            return jnp.where(mask, normalize(x, mask=jnp.broadcast_to(mask, x.shape)), 0.0)
+
+        return normalize_in_use
 
     def _activation_fn(self) -> Callable[[Array], Array]:
         if self.activation == "prelu":
@@ -113,3 +141,74 @@ class MLP(nn.Module):
                 slope = self.param("prelu_slope", nn.initializers.constant(PRELU_SLOPE), ())
             return lambda x: jnp.where(x >= 0, x, slope * x)
         return {"tanh": jnp.tanh, "relu": nn.relu, "leaky_relu": nn.leaky_relu}[self.activation]
+
+
+def narrow(params: dict[str, Any], hidden_size: Array) -> dict[str, Any]:
+    """Freshly initialised parameters of an `MLP` in which only the first `hidden_size` units count.
+
+    All weights into and out of the other units are 0. They stay 0 in training, as every activation
+    maps 0 to 0 with a finite slope, so that the network is exactly one with `hidden_size` units,
+    and its weights are distributed as those of a network that was made so.
+
+    Args:
+      params: of an `MLP`, or of a `DuelingMLP`, whose shared part is narrowed.
+      hidden_size: `[]`, at most the network's.
+    """
+    if "features" in params:
+        return {**params, "features": narrow(params["features"], hidden_size)}
+    num_layers = sum(name.startswith("Dense_") for name in params)
+    full_size = params["Dense_0"]["bias"].shape[0]
+    in_use = jnp.arange(full_size) < hidden_size
+    widen = jnp.sqrt(full_size / hidden_size)  # weights are uniform in +-1/sqrt(fan_in)
+    narrowed = dict(params)
+    for layer in range(num_layers):
+        kernel, bias = params[f"Dense_{layer}"]["kernel"], params[f"Dense_{layer}"]["bias"]
+        if layer > 0:
+            kernel, bias = kernel * in_use[None, :] * widen, bias * widen
+        if layer < num_layers - 1:
+            kernel, bias = kernel * in_use[:, None], bias * in_use
+        narrowed[f"Dense_{layer}"] = {"kernel": kernel, "bias": bias}
+    if "width" in params:
+        narrowed["width"] = jnp.float32(hidden_size)
+    return narrowed
+
+
+class DuelingMLP(nn.Module):
+    r"""Dueling network: a value and an advantage stream on shared features.
+
+    .. math:: Q(s, a) = V(s) + A(s, a) - \frac{1}{|A|} \sum_{a'} A(s, a')
+
+    The shared part is an `MLP` whose linear head has `feature_dim` outputs and no activation, and
+    each stream is an `MLP` on those with `stream_num_layers` hidden layers of `stream_hidden_size`
+    units. PReLU has a learned slope for each of the three parts.
+
+    Differs: the mean is over the actions of each sample. The authors' is over those of the whole
+    batch, so that the Q values of a sample depend on what else is in its batch.
+
+    Source: Wang et al., "Dueling Network Architectures for Deep RL" (2016), eq. 9; paper, appendix,
+    tables of DDQN and Dueling DDQN; `reference_details.md` 4.2.
+    """
+
+    num_actions: int
+    feature_dim: int
+    hidden_size: int
+    num_layers: int
+    stream_hidden_size: int
+    stream_num_layers: int
+    activation: str
+
+    @nn.compact
+    def __call__(self, x: Float[Array, "in *batch"]) -> Float[Array, "actions *batch"]:
+        features = self._mlp("features", self.feature_dim, self.hidden_size, self.num_layers)(x)
+        value = self._stream("value", 1)(features)  # [1, *batch]
+        advantage = self._stream("advantage", self.num_actions)(features)
+        return value + advantage - jnp.mean(advantage, axis=0, keepdims=True)
+
+    def _stream(self, name: str, num_outputs: int) -> MLP:
+        return self._mlp(name, num_outputs, self.stream_hidden_size, self.stream_num_layers)
+
+    def _mlp(self, name: str, num_outputs: int, hidden_size: int, num_layers: int) -> MLP:
+        return MLP(
+            num_outputs, hidden_size, num_layers, self.activation,
+            learn_prelu_slope=True, name=name,
+        )  # fmt: skip

@@ -12,15 +12,19 @@ from sejax.errors import require
 
 
 def spread_over_devices(
-    fn: Callable[..., Any], num_devices: int | None = None, lanes: int | None = None
+    fn: Callable[..., Any],
+    num_devices: int | None = None,
+    lanes: int | None = None,
+    cpu_lanes: int | None = 1,
 ) -> Callable[..., Any]:
     """Maps `fn` over the leading axis of its arguments, over devices and in lanes.
 
     Args:
       fn: a function of one element.
       num_devices: None for all.
-      lanes: elements that run in lockstep on one device. None for 1 on a CPU, where a lane only
-        waits for the others, and for all elsewhere.
+      lanes: elements that run in lockstep on one device. None for `cpu_lanes` on a CPU and for all
+        elsewhere.
+      cpu_lanes: None for all; 1 where a lane would only wait for the others.
 
     Devices take the elements in turn (0, 1, 0, 1, ...), so that each gets its share of long and
     short ones. The result does not depend on the number of devices.
@@ -39,7 +43,7 @@ def spread_over_devices(
             return fn(*args)
 
         size = jax.tree.leaves(args)[0].shape[0]
-        batch_size = lanes or (1 if available[0].platform == "cpu" else size)
+        batch_size = lanes or (cpu_lanes if available[0].platform == "cpu" else None) or size
         if batch_size >= size:
             return jax.vmap(one)(args) if size > 1 else jax.lax.map(one, args)
         return jax.lax.map(one, args, batch_size=batch_size if batch_size > 1 else None)

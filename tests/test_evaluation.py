@@ -1,16 +1,13 @@
-"""sejax.evaluation: what is counted, and whose time limits are terminal."""
+"""sejax.evaluation: what is counted."""
 
 import dataclasses
 
 import jax
 import jax.numpy as jnp
-import pytest
 from scripted import MAX_EPISODES, MAX_STEPS, ScriptedEnv, script, scripted_agent
 
 from sejax import envs, evaluation
-from sejax.agents.ddqn import make_ddqn
-from sejax.configs import DDQNConfig, SyntheticConfig, TrainingConfig
-from sejax.proxies.synthetic import make_synthetic
+from sejax.configs import TrainingConfig
 
 ENV = ScriptedEnv()
 TRAINING = TrainingConfig(max_episodes=MAX_EPISODES, stop_rule="never", test_episodes=3)
@@ -38,23 +35,3 @@ def test_an_outcome_counts_training_and_tests():
     assert diverged.nonfinite and diverged.train_steps == 5
     nothing = evaluate(jax.random.key(0), script([5] * 12, [3] * 12), jnp.bool_(False))
     assert nothing.train_steps == 0 and nothing.real_steps == 0
-
-
-@pytest.mark.parametrize("asked", [True, False])
-@pytest.mark.parametrize("world", ["real", "synthetic"])
-def test_a_time_limit_is_terminal_on_the_real_task_if_asked_and_never_in_an_se(
-    monkeypatch, world, asked
-):
-    task = envs.make("cartpole")
-    env = task.env if world == "real" else make_synthetic(task, SyntheticConfig(hidden_size=4))
-    made = []
-
-    def make_trainer(agent, env, training, *args, **kwargs):
-        made.append(training)
-        return lambda *args: None
-
-    monkeypatch.setattr(evaluation, "make_trainer", make_trainer)
-    training = TrainingConfig(time_limit_is_terminal=asked)
-    evaluation.make_evaluator(make_ddqn(DDQNConfig(), 4, 2), env, task, training)
-    (training,) = made
-    assert training.time_limit_is_terminal == (asked and world == "real")

@@ -25,7 +25,7 @@ def step():
     def build(done):
         env = make_env(done=done)
         _, state = env.reset_env(jax.random.key(0), env.default_params)
-        state = state.replace(obs=OBS)
+        state = state.replace(vector=OBS)
         return jax.jit(lambda w: env.step_env(jax.random.key(1), state, 1, env.params(w)))
 
     return {done: build(done) for done in ("soft", "threshold")}
@@ -86,7 +86,7 @@ def test_a_step_moves_to_the_predicted_state_itself(step):
     next_obs, reward, _ = make_env().predict(weights, OBS, jnp.int32(1))
     obs, state, got_reward, _, _ = step["soft"](weights)
     np.testing.assert_allclose(obs, next_obs, rtol=1e-6)
-    np.testing.assert_array_equal(state.obs, obs)
+    np.testing.assert_array_equal(state.vector, obs)
     np.testing.assert_allclose(got_reward, reward, rtol=1e-6)
 
 
@@ -121,7 +121,7 @@ def test_an_absurd_or_nonfinite_output_ends_the_episode_where_it_was(step, mode,
     weights = constant_weights(**{"state": 1.0, "reward": 2.0, "done": 0.0, **outputs})
     obs, state, reward, terminated, info = step[mode](weights)
     np.testing.assert_array_equal(obs, OBS)
-    np.testing.assert_array_equal(state.obs, OBS)
+    np.testing.assert_array_equal(state.vector, OBS)
     assert terminated
     assert reward == 0.0
     assert info["discount"] == 0.0
@@ -147,7 +147,7 @@ def test_initial_states_are_the_real_tasks(task):
     obs, state = jax.vmap(env.reset_env, (0, None))(keys, env.default_params)
     real, _ = jax.vmap(env.task.env.reset_env, (0, None))(keys, env.task.params)
     np.testing.assert_array_equal(obs, real)
-    np.testing.assert_array_equal(state.obs, real)
+    np.testing.assert_array_equal(state.vector, real)
     np.testing.assert_array_equal(state.time, 0)
 
 
@@ -192,7 +192,7 @@ def test_weights_are_traced_so_that_many_proxies_step_at_once():
     assert obs.shape == (3, 4)
     predict = jax.jit(env.predict)
     for i in range(3):
-        expected_obs, expected_reward, _ = predict(each[i], state.obs, jnp.int32(1))
+        expected_obs, expected_reward, _ = predict(each[i], state.vector, jnp.int32(1))
         np.testing.assert_allclose(obs[i], expected_obs, rtol=1e-5, atol=1e-6)
         np.testing.assert_allclose(reward[i], expected_reward, rtol=1e-5, atol=1e-6)
 

@@ -348,6 +348,27 @@ def test_lanes_equal_single_trainings(ddqn_in_se):
         assert_same(many, i, alone[i])
 
 
+@pytest.mark.parametrize("world", ["real", "synthetic"])
+def test_a_time_limit_is_terminal_on_the_real_task_if_asked_and_never_in_an_se(world):
+    task = envs.make("cartpole")
+    synthetic = make_synthetic(task, SyntheticConfig(hidden_size=4))
+    env, params = {
+        "real": (task.env, task.params.replace(max_steps_in_episode=4)),
+        "synthetic": (synthetic, synthetic.default_params.replace(max_steps_in_episode=4)),
+    }[world]
+    config = DDQNConfig(hidden_size=4, num_layers=1, batch_size=4, init_episodes=1)
+    trained = [
+        jax.jit(
+            make_trainer(
+                make_ddqn(config, 4, 2), env,
+                training(max_episodes=6, stop_rule="never", time_limit_is_terminal=asked),
+            )
+        )(KEY, params).agent_state.params
+        for asked in (False, True)
+    ]  # fmt: skip
+    assert np.array_equal(*trained) == (world == "synthetic")
+
+
 def test_nested_lanes_equal_single_trainings(ddqn_in_se):
     train, keys, params, alone = ddqn_in_se
     square = jax.tree.map(lambda x: x.reshape(2, 2, *x.shape[1:]), params)

@@ -23,6 +23,9 @@ class Agent:
       learns_from: first episode, counted from 0, in which the agent learns.
       env_action: `action -> action` as the world takes it.
       action_repeat: steps of the world for each decision.
+      batch_size: `state -> []` or None: columns of a batch in use, where hyperparameters vary.
+      cpu_lanes: agents that best train in lockstep on a CPU core; None for as many as there are.
+        A network keeps a core busy alone, a table does not.
     """
 
     init: Callable[..., Any]
@@ -35,3 +38,12 @@ class Agent:
     learns_from: int
     env_action: Callable[[Any], Any] = lambda action: action
     action_repeat: int = 1
+    batch_size: Callable[[Any], Any] = lambda state: None
+    cpu_lanes: int | None = 1
+
+
+def hparams_of(hparams: type, config: Any) -> Any:
+    """The traced hyperparameters that have no default, with a configuration's values."""
+    fields: Any = hparams
+    names = [name for name in fields._fields if name not in fields._field_defaults]
+    return hparams(**{name: getattr(config, name) for name in names})

@@ -1,7 +1,7 @@
-"""Double DQN with soft target updates and Adam.
+"""Double DQN with soft target updates and Adam, with a plain or a dueling network.
 
 Source: van Hasselt et al., "Deep RL with Double Q-learning" (2016); the paper's hyperparameter
-tables; `reference_details.md` 4.1.
+tables; `reference_details.md` 4.1 and 4.2.
 """
 
 import functools
@@ -10,15 +10,18 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import optax
+from flax import linen as nn
 from flax import struct
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
-from sejax.agents.agent import Agent
+from sejax.agents.agent import Agent, hparams_of
+from sejax.agents.blocks import sum_over_batch
+from sejax.agents.configs import DDQNConfig, DuelingDDQNConfig
 from sejax.agents.memory import replay_memory
-from sejax.agents.replay import Transition
-from sejax.configs import DDQNConfig
-from sejax.networks import MLP
+from sejax.agents.replay import Transition, num_columns
+from sejax.agents.schedules import decayed_epsilon
+from sejax.networks import MLP, DuelingMLP, narrow
 
 
 class DDQNHparams(NamedTuple):
@@ -30,6 +33,8 @@ class DDQNHparams(NamedTuple):
     epsilon_init: Array | float
     epsilon_min: Array | float
     epsilon_decay: Array | float
+    hidden_size: Array | None = None  # units in use, if fewer than the network has
+    batch_size: Array | None = None  # columns in use, if fewer than a batch has
 
 
 @struct.dataclass
@@ -47,22 +52,24 @@ class DDQNState:
 def make_ddqn(config: DDQNConfig, obs_dim: int, num_actions: int) -> Agent:
     """Builds the agent for observations `[obs_dim]` and actions `0..num_actions-1`.
 
+    A `DuelingDDQNConfig` makes its network a dueling one.
+
     Example:
       >>> agent = make_ddqn(DDQNConfig(), obs_dim=4, num_actions=2)
       >>> state = agent.init(jax.random.key(0), agent.hparams)
       >>> int(agent.act(jax.random.key(1), state, jnp.zeros(4), explore=False)) in (0, 1)
       True
     """
-    network = MLP(
-        num_actions, config.hidden_size, config.num_layers, config.activation,
-        learn_prelu_slope=True,
-    )  # fmt: skip
+    network = q_network(config, num_actions)
     template = jax.eval_shape(network.init, jax.random.key(0), jnp.zeros(obs_dim))
     _, unravel = ravel_pytree(jax.tree.map(lambda x: jnp.zeros(x.shape), template))
     adam = optax.scale_by_adam()
 
     def init(key: Array, hparams: DDQNHparams) -> DDQNState:
-        params, _ = ravel_pytree(network.init(key, jnp.zeros(obs_dim)))
+        variables = network.init(key, jnp.zeros(obs_dim))
+        if hparams.hidden_size is not None:
+            variables = {"params": narrow(variables["params"], hparams.hidden_size)}
+        params, _ = ravel_pytree(variables)
         hparams = jax.tree.map(jnp.float32, hparams)
         return DDQNState(
             params=params,
@@ -73,10 +80,9 @@ def make_ddqn(config: DDQNConfig, obs_dim: int, num_actions: int) -> Agent:
         )
 
     def begin_episode(state: DDQNState, episode: Array) -> DDQNState:
-        """Epsilon starts at its initial value and decays by a factor down to its minimum."""
         hp = state.hparams
-        epsilon = jnp.maximum(hp.epsilon_init * hp.epsilon_decay**episode, hp.epsilon_min)
-        return state.replace(epsilon=jnp.where(episode == 0, hp.epsilon_init, epsilon))
+        epsilon = decayed_epsilon(hp.epsilon_init, hp.epsilon_min, hp.epsilon_decay, episode)
+        return state.replace(epsilon=epsilon)
 
     def act(key: Array, state: DDQNState, obs: Float[Array, " obs_dim"], explore: bool) -> Array:
         greedy = jnp.argmax(network.apply(unravel(state.params), obs)).astype(jnp.int32)
@@ -87,7 +93,7 @@ def make_ddqn(config: DDQNConfig, obs_dim: int, num_actions: int) -> Agent:
         uniform = (bits[1] >> 8).astype(jnp.float32) * jnp.float32(2**-24)
         return jnp.where(uniform < state.epsilon, random_action, greedy)
 
-    def loss_fn(params, target_params, discount, batch: Transition) -> Array:
+    def sum_of_losses(params, target_params, discount, batch: Transition) -> Array:
         q_values = network.apply(params, batch.obs)  # [actions, batch]
         targets = double_q_targets(
             network.apply(params, batch.next_obs),
@@ -96,14 +102,17 @@ def make_ddqn(config: DDQNConfig, obs_dim: int, num_actions: int) -> Agent:
             discount * batch.discount,
         )
         error = select_action(q_values, batch.action) - jax.lax.stop_gradient(targets)
-        return jnp.mean(batch.weight * error**2) / jnp.mean(batch.weight)
+        return jnp.sum(batch.weight * error**2)
 
     def update(key: Array, state: DDQNState, batch: Transition) -> DDQNState:
         hp = state.hparams
-        gradient_fn = jax.grad(loss_fn)
-        gradient, _ = ravel_pytree(
-            gradient_fn(unravel(state.params), unravel(state.target_params), hp.discount, batch)
-        )
+        params, target_params = unravel(state.params), unravel(state.target_params)
+
+        def sum_of_gradients(batch: Transition) -> Array:
+            gradient = jax.grad(sum_of_losses)(params, target_params, hp.discount, batch)
+            return ravel_pytree(gradient)[0]
+
+        gradient = sum_over_batch(sum_of_gradients, batch, hp.batch_size) / num_columns(batch)
         direction, opt_state = adam.update(gradient, state.opt_state)
         params = state.params - hp.learning_rate * direction
         tau = hp.target_update_rate
@@ -118,11 +127,25 @@ def make_ddqn(config: DDQNConfig, obs_dim: int, num_actions: int) -> Agent:
         begin_episode=begin_episode,
         act=act,
         update=update,
-        hparams=DDQNHparams(**{f: getattr(config, f) for f in DDQNHparams._fields}),
+        hparams=hparams_of(DDQNHparams, config),
         memory=replay_memory(config.batch_size, config.buffer_size),
         init_episodes=config.init_episodes,
         learns_from=config.init_episodes,
+        batch_size=lambda state: state.hparams.batch_size,
     )
+
+
+def q_network(config: DDQNConfig, num_actions: int) -> nn.Module:
+    """Maps observations `[obs_dim, *batch]` to Q values `[num_actions, *batch]`."""
+    if isinstance(config, DuelingDDQNConfig):
+        return DuelingMLP(
+            num_actions, config.feature_dim, config.hidden_size, config.num_layers,
+            config.stream_hidden_size, config.stream_num_layers, config.activation,
+        )  # fmt: skip
+    return MLP(
+        num_actions, config.hidden_size, config.num_layers, config.activation,
+        learn_prelu_slope=True,
+    )  # fmt: skip
 
 
 def double_q_targets(

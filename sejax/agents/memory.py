@@ -18,8 +18,9 @@ class Memory(NamedTuple):
       init: `() -> arrays`.
       store: `(arrays, step, transition, ended, active) -> arrays`; writes the `step`-th step, and
         nothing if `active` is False. `ended` says whether the episode ended there.
-      batch: `(key, arrays, num_steps, transition) -> batch` for `Agent.update`, after `num_steps`
-        steps, the last of which was `transition`.
+      batch: `(key, arrays, num_steps, transition, batch_size) -> batch` for `Agent.update`, after
+        `num_steps` steps, the last of which was `transition`. Columns from `batch_size` on, if that
+        is given, have weight 0.
     """
 
     init: Callable[[], Any]
@@ -51,8 +52,18 @@ def replay_memory(batch_size: int, buffer_size: int) -> MemoryMaker:
         obs_dim, action_dim = _dims(example)
         capacity = min(buffer_size, max_steps)
 
-        def batch(key: Array, rows: Array, num_steps: Array, transition: Transition) -> Transition:
-            return replay.sample(rows, jax.random.bits(key), num_steps, batch_size, action_dim)
+        def batch(
+            key: Array,
+            rows: Array,
+            num_steps: Array,
+            transition: Transition,
+            in_use: Array | None = None,
+        ) -> Transition:
+            drawn = replay.sample(rows, jax.random.bits(key), num_steps, batch_size, action_dim)
+            if in_use is None:
+                return drawn
+            columns = jnp.arange(drawn.reward.shape[0])
+            return drawn._replace(weight=jnp.float32(columns < in_use))
 
         return Memory(
             init=lambda: replay.init(capacity, obs_dim, action_dim),
@@ -77,7 +88,13 @@ def rollout_memory(length: int) -> MemoryMaker:
             row = jnp.append(replay.pack(transition), jnp.float32(ended))
             return replay.write_row(rows, step, row, active)
 
-        def batch(key: Array, rows: Array, num_steps: Array, transition: Transition) -> Rollout:
+        def batch(
+            key: Array,
+            rows: Array,
+            num_steps: Array,
+            transition: Transition,
+            in_use: Array | None = None,
+        ) -> Rollout:
             return Rollout(rows=rows, is_full=num_steps % length == 0)
 
         width = replay.row_width(obs_dim, action_dim) + 1
@@ -93,7 +110,7 @@ def no_memory() -> MemoryMaker:
         return Memory(
             init=lambda: jnp.zeros(0),
             store=lambda arrays, step, transition, ended, active: arrays,
-            batch=lambda key, arrays, num_steps, transition: transition,
+            batch=lambda key, arrays, num_steps, transition, in_use=None: transition,
         )
 
     return make

@@ -30,6 +30,11 @@ class Transition(NamedTuple):
     weight: Array | float = 1.0
 
 
+def num_columns(batch: Transition) -> Array | float:
+    """Columns of a batch that count, i.e. do not only fill it up."""
+    return jnp.sum(jnp.broadcast_to(batch.weight, batch.reward.shape))
+
+
 def row_width(obs_dim: int, action_dim: int | None = None) -> int:
     """Number of floats in a packed transition; `action_dim` is None for an action's index."""
     return 2 * obs_dim + (action_dim or 1) + 2

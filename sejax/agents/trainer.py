@@ -17,6 +17,8 @@ from sejax.agents.masked_loop import while_any_active
 from sejax.agents.memory import Memory
 from sejax.agents.replay import Transition
 from sejax.configs import TrainingConfig
+from sejax.envs.action_repeat import repeat_actions
+from sejax.proxies.synthetic import SyntheticEnv
 
 _NO_LIMIT = 2**31 - 1
 
@@ -59,7 +61,8 @@ class _LoopState:
     """Carry of the step loop. What the agent remembers is carried beside it."""
 
     active: Array
-    step: Array
+    step: Array  # decisions
+    train_steps: Array  # steps of the world
     episode: Array
     episode_return: Array
     obs: Array
@@ -87,7 +90,9 @@ def make_trainer(
     Args:
       agent: from `sejax.agents`.
       env: gymnax environment to train in: real, synthetic or reward-shaped.
-      training: stopping rule and limits.
+      training: stopping rule and limits. `time_limit_is_terminal` speaks of real time limits and is
+        ignored in an SE: there the last step of an episode bootstraps with what the done network
+        says, as in the authors' code.
       solved_reward: for `stop_rule="solved"`.
       test_fn: `(key, agent_state, active) -> (mean return, steps)` on the real task, called after
         each training episode if `stop_rule="solved"` and `solved_by="test"`.
@@ -100,6 +105,8 @@ def make_trainer(
     tests_each_episode = training.stop_rule == "solved" and training.solved_by == "test"
     if tests_each_episode and test_fn is None:
         raise ValueError("stop_rule='solved' with solved_by='test' needs a test_fn; got None.")
+    time_limit_is_terminal = training.time_limit_is_terminal and not isinstance(env, SyntheticEnv)
+    env = repeat_actions(env, agent.action_repeat)
     window = training.window
     max_steps = training.max_steps or _NO_LIMIT
 
@@ -110,6 +117,7 @@ def make_trainer(
         return _LoopState(
             active=jnp.asarray(active),
             step=jnp.int32(0),
+            train_steps=jnp.int32(0),
             episode=jnp.int32(0),
             episode_return=jnp.float32(0),
             obs=obs,
@@ -143,26 +151,29 @@ def make_trainer(
         nonfinite = state.nonfinite | info.get("nonfinite", False)
         ended = terminated | truncated | nonfinite
         discount = jnp.float32(info["discount"])
-        if training.time_limit_is_terminal:
+        if time_limit_is_terminal:
             discount = jnp.where(truncated, 0.0, discount)
         transition = Transition(state.obs, action, reward, discount, next_obs)
         kept = memory.store(kept, state.step, transition, ended, state.active if masked else True)
 
         def learn(agent_state):
-            batch = memory.batch(key_sample, kept, state.step + 1, transition)
+            size = agent.batch_size(agent_state)
+            batch = memory.batch(key_sample, kept, state.step + 1, transition, size)
             return agent.update(key_update, agent_state, batch)
 
         agent_state = jax.lax.cond(
             state.episode >= agent.learns_from, learn, lambda s: s, state.agent_state
         )
+        train_steps = state.train_steps + info.get("num_steps", 1)
         state = state.replace(
             step=state.step + 1,
+            train_steps=train_steps,
             episode_return=state.episode_return + reward,
             obs=next_obs,
             env_state=env_state,
             agent_state=agent_state,
             nonfinite=nonfinite,
-            active=state.step + 1 < max_steps,
+            active=train_steps < max_steps,
         )
         state = jax.lax.cond(
             ended, lambda s: end_episode(key_end, s, env_params, ended), lambda s: s, state
@@ -182,7 +193,9 @@ def make_trainer(
         recent = jnp.concatenate([state.recent[1:], episode_return[None]])
         num_episodes = state.episode + 1
         stop = (num_episodes >= training.max_episodes) | state.nonfinite
-        may_stop = (state.episode >= agent.init_episodes) & (state.step >= training.min_steps)
+        may_stop = (state.episode >= agent.init_episodes) & (
+            state.train_steps >= training.min_steps
+        )
         if training.stop_rule == "plateau":
             flat = is_plateau(recent, num_episodes, training.plateau_tolerance)
             stop = stop | (may_stop & flat & (state.episode >= agent.init_episodes + window))
@@ -210,7 +223,7 @@ def make_trainer(
         _, state = while_any_active(step, kept, state, (key_steps, env_params))
         return TrainResult(
             agent_state=state.agent_state,
-            train_steps=state.step,
+            train_steps=state.train_steps,
             episodes=state.episode,
             returns=state.returns,
             nonfinite=state.nonfinite | ~_all_finite(state.agent_state),
@@ -256,19 +269,19 @@ def make_tester(agent: Agent, task: Any, num_episodes: int) -> Callable[..., Any
 
     Source: paper, Algorithm 1, EvaluateAgent.
     """
-    env, params = task.env, task.params
+    env, params = repeat_actions(task.env, agent.action_repeat), task.params
 
     def step(nothing: Array, state: _TestState, consts: Any, masked: bool):
         key, agent_state = consts
         key_act, key_env = jax.random.split(jax.random.fold_in(key, state.num_steps))
         action = agent.act(key_act, agent_state, state.obs, explore=False)
-        obs, env_state, reward, terminated, _ = env.step_env(
+        obs, env_state, reward, terminated, info = env.step_env(
             key_env, state.env_state, agent.env_action(action), params
         )
         ended = terminated | env.is_truncated(env_state, params)
         return nothing, _TestState(
             active=~ended,
-            num_steps=state.num_steps + 1,
+            num_steps=state.num_steps + info.get("num_steps", 1),
             total=state.total + reward,
             obs=obs,
             env_state=env_state,

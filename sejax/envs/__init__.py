@@ -1,5 +1,6 @@
 """The real tasks: gymnax environments with the paper's step limits and solved thresholds."""
 
+from sejax.envs.kinds import kind
 from sejax.envs.registry import Task, make, names
 
-__all__ = ["Task", "make", "names"]
+__all__ = ["Task", "kind", "make", "names"]

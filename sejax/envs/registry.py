@@ -32,31 +32,98 @@ class Task:
         return int(self.params.max_steps_in_episode)
 
     @property
-    def obs_dim(self) -> int:
-        return int(self.env.observation_space(self.params).shape[0])
+    def num_states(self) -> int | None:
+        """Number of states of a task whose observation is an index; None for vectors."""
+        return _num_categories(self.env.observation_space(self.params))
 
     @property
-    def num_actions(self) -> int:
-        return int(self.env.num_actions)
+    def obs_dim(self) -> int:
+        """Length of the observation that networks see; an index is one-hot to them."""
+        return self.num_states or int(self.env.observation_space(self.params).shape[0])
+
+    @property
+    def num_actions(self) -> int | None:
+        """Number of discrete actions; None for continuous ones."""
+        return _num_categories(self.env.action_space(self.params))
+
+    @property
+    def action_dim(self) -> int:
+        """Length of the action that networks see; a discrete one is one-hot to them."""
+        return self.num_actions or int(self.env.action_space(self.params).shape[0])
+
+    @property
+    def max_action(self) -> float:
+        """Continuous actions lie in [-max_action, max_action]; 1 for discrete ones."""
+        if self.num_actions is not None:
+            return 1.0
+        import numpy as np
+
+        return float(np.max(self.env.action_space(self.params).high))
+
+
+def _num_categories(space: Any) -> int | None:
+    """Size of a gymnax `Discrete` space; None for a `Box`."""
+    from gymnax.environments import spaces
+
+    return int(space.n) if isinstance(space, spaces.Discrete) else None
 
 
 def _cartpole() -> Task:
-    from gymnax.environments.classic_control.cartpole import CartPole
+    from gymnax.environments.classic_control.cartpole import CartPole, EnvParams
 
-    env = CartPole()
-    params = env.default_params.replace(max_steps_in_episode=200)
-    return Task(name="cartpole", env=env, params=params, solved_reward=195.0)
+    params = EnvParams(max_steps_in_episode=200)
+    return Task(name="cartpole", env=CartPole(), params=params, solved_reward=195.0)
 
 
 def _acrobot() -> Task:
-    from gymnax.environments.classic_control.acrobot import Acrobot
+    from gymnax.environments.classic_control.acrobot import Acrobot, EnvParams
 
-    env = Acrobot()
-    params = env.default_params.replace(max_steps_in_episode=500)
-    return Task(name="acrobot", env=env, params=params, solved_reward=-100.0)
+    params = EnvParams(max_steps_in_episode=500)
+    return Task(name="acrobot", env=Acrobot(), params=params, solved_reward=-100.0)
 
 
-_TASKS: dict[str, Callable[[], Task]] = {"cartpole": _cartpole, "acrobot": _acrobot}
+def _cliff_walking() -> Task:
+    from sejax.envs.gridworld import CLIFF_WALKING, GridParams, GridWorld
+
+    params = GridParams(
+        step_reward=-1.0, goal_reward=0.0, hole_reward=-100.0, max_steps_in_episode=50
+    )
+    env = GridWorld(CLIFF_WALKING, params)
+    return Task(name="cliff_walking", env=env, params=params, solved_reward=-20.0)
+
+
+def _gridworld_2x2() -> Task:
+    from sejax.envs.gridworld import ROOM_2X2, GridParams, GridWorld
+
+    params = GridParams(max_steps_in_episode=10)
+    env = GridWorld(ROOM_2X2, params)
+    return Task(name="gridworld_2x2", env=env, params=params, solved_reward=0.8)
+
+
+def _mountain_car_continuous() -> Task:
+    from sejax.envs.mountain_car_continuous import EnvParams, MountainCarContinuous
+
+    env = MountainCarContinuous()
+    params = EnvParams(max_steps_in_episode=999)
+    return Task(name="mountain_car_continuous", env=env, params=params, solved_reward=90.0)
+
+
+def _pendulum() -> Task:
+    from gymnax.environments.classic_control.pendulum import EnvParams, Pendulum
+
+    params = EnvParams(max_steps_in_episode=200)
+    # Our choice of threshold: neither the paper nor Gymnasium defines one.
+    return Task(name="pendulum", env=Pendulum(), params=params, solved_reward=-250.0)
+
+
+_TASKS: dict[str, Callable[[], Task]] = {
+    "cartpole": _cartpole,
+    "acrobot": _acrobot,
+    "cliff_walking": _cliff_walking,
+    "gridworld_2x2": _gridworld_2x2,
+    "mountain_car_continuous": _mountain_car_continuous,
+    "pendulum": _pendulum,
+}
 
 
 def names() -> tuple[str, ...]:

@@ -1,0 +1,170 @@
+"""Tabular Q-learning and SARSA: one value for each pair of a state and an action.
+
+Source: Watkins, "Learning from Delayed Rewards" (1989); Rummery and Niranjan, "On-Line Q-Learning
+Using Connectionist Systems" (1994); paper, appendix, tables of Cliff Walking;
+`reference_details.md` 4.6.
+"""
+
+import functools
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+from jaxtyping import Array, Float, Int
+
+from sejax.agents.agent import Agent
+from sejax.agents.configs import QLearningConfig, SARSAConfig
+from sejax.agents.memory import no_memory
+from sejax.agents.replay import Transition
+from sejax.agents.schedules import decayed_epsilon
+
+# `(key, q_row [num_actions], epsilon) -> []`: what the next state is worth to the target.
+NextValue = Callable[[Array, Array, Array], Array]
+
+
+class TabularHparams(NamedTuple):
+    """The traced hyperparameters, scalars that a population of agents may vary."""
+
+    learning_rate: Array | float
+    discount: Array | float
+    epsilon_init: Array | float
+    epsilon_min: Array | float
+    epsilon_decay: Array | float
+
+
+@struct.dataclass
+class TabularState:
+    """One agent."""
+
+    q_values: Float[Array, "num_states num_actions"]
+    epsilon: Array
+    hparams: TabularHparams
+
+
+@functools.cache
+def make_q_learning(config: QLearningConfig, num_states: int, num_actions: int) -> Agent:
+    r"""Q-learning for observations `0..num_states-1` and actions `0..num_actions-1`.
+
+    .. math:: Q(s, a) \leftarrow Q(s, a) + \alpha (r + \gamma d \max_{a'} Q(s', a') - Q(s, a))
+
+    with the transition's own discount d, and from Q = 0 on. It learns from each step once, when it
+    has been made.
+
+    Differs: in an SE with `done="soft"` d is the learned 1 - done; the authors' tabular agents
+    bootstrap in full where done < 0.5 and not at all elsewhere, as `done="threshold"` does.
+
+    Example:
+      >>> agent = make_q_learning(QLearningConfig(), num_states=48, num_actions=4)
+      >>> state = agent.init(jax.random.key(0), agent.hparams)
+      >>> int(agent.act(jax.random.key(1), state, jnp.int32(36), explore=False))
+      0
+    """
+
+    def next_value(key: Array, q_row: Array, epsilon: Array) -> Array:
+        return jnp.max(q_row)
+
+    return _make_tabular(config, num_states, num_actions, next_value)
+
+
+@functools.cache
+def make_sarsa(config: SARSAConfig, num_states: int, num_actions: int) -> Agent:
+    r"""SARSA for observations `0..num_states-1` and actions `0..num_actions-1`.
+
+    .. math:: Q(s, a) \leftarrow Q(s, a) + \alpha (r + \gamma d \, Q(s', a') - Q(s, a))
+
+    As in the authors' code, a' is drawn by the learning step from the epsilon-greedy policy. It is
+    not the action executed next, which is drawn anew, and after this update.
+
+    Differs: in SEs as `make_q_learning`.
+
+    Example:
+      >>> agent = make_sarsa(SARSAConfig(), num_states=48, num_actions=4)
+      >>> state = agent.init(jax.random.key(0), agent.hparams)
+      >>> int(agent.act(jax.random.key(1), state, jnp.int32(36), explore=False))
+      0
+    """
+
+    def next_value(key: Array, q_row: Array, epsilon: Array) -> Array:
+        action = epsilon_greedy(key, q_row, epsilon)
+        return jnp.sum(jnp.where(jnp.arange(num_actions) == action, q_row, 0.0))
+
+    return _make_tabular(config, num_states, num_actions, next_value)
+
+
+def _make_tabular(
+    config: QLearningConfig, num_states: int, num_actions: int, next_value: NextValue
+) -> Agent:
+    """What both agents share: all but the value of the next state."""
+
+    def init(key: Array, hparams: TabularHparams) -> TabularState:
+        hparams = jax.tree.map(jnp.float32, hparams)
+        return TabularState(
+            q_values=jnp.zeros((num_states, num_actions), jnp.float32),
+            epsilon=jnp.float32(hparams.epsilon_init),
+            hparams=hparams,
+        )
+
+    def begin_episode(state: TabularState, episode: Array) -> TabularState:
+        hp = state.hparams
+        epsilon = decayed_epsilon(hp.epsilon_init, hp.epsilon_min, hp.epsilon_decay, episode)
+        return state.replace(epsilon=epsilon)
+
+    def act(key: Array, state: TabularState, obs: Int[Array, ""], explore: bool) -> Array:
+        q_row = row_of(state.q_values, obs)
+        if not explore:
+            return jnp.argmax(q_row).astype(jnp.int32)
+        return epsilon_greedy(key, q_row, state.epsilon)
+
+    def update(key: Array, state: TabularState, transition: Transition) -> TabularState:
+        hp, step = state.hparams, transition
+        value = next_value(key, row_of(state.q_values, step.next_obs), state.epsilon)
+        target = step.reward + hp.discount * step.discount * value
+        is_visited = mask_of(step.obs, step.action, (num_states, num_actions))
+        moved = state.q_values + hp.learning_rate * (target - state.q_values)
+        return state.replace(q_values=jnp.where(is_visited, moved, state.q_values))
+
+    return Agent(
+        init=init,
+        begin_episode=begin_episode,
+        act=act,
+        update=update,
+        hparams=TabularHparams(**{f: getattr(config, f) for f in TabularHparams._fields}),
+        memory=no_memory(),
+        init_episodes=config.init_episodes,
+        learns_from=config.init_episodes,
+        cpu_lanes=None,
+    )
+
+
+def epsilon_greedy(
+    key: Array, q_row: Float[Array, " num_actions"], epsilon: Array
+) -> Int[Array, ""]:
+    """A uniform action with probability epsilon, else the first of the best."""
+    bits = jax.random.bits(key, (2,))
+    random_action = (bits[0] % jnp.uint32(q_row.shape[0])).astype(jnp.int32)
+    uniform = (bits[1] >> 8).astype(jnp.float32) * jnp.float32(2**-24)
+    return jnp.where(uniform < epsilon, random_action, jnp.argmax(q_row).astype(jnp.int32))
+
+
+# Tables are read by index and written by mask. In lanes on a CPU, reading by a mask over the whole
+# table makes a training step three times as long; writing by one joins the trainer's own selects
+# over the table, where a scatter is an operation more.
+
+
+def row_of(table: Array, state: Int[Array, ""]) -> Array:
+    """A state's entries of a table `[num_states, num_actions]`, `[num_actions]`."""
+    return table.at[state].get(mode="promise_in_bounds")
+
+
+def entry_of(table: Array, state: Int[Array, ""], action: Int[Array, ""]) -> Array:
+    """One entry of a table `[num_states, num_actions]`, `[]`."""
+    return table.at[state, action].get(mode="promise_in_bounds")
+
+
+def mask_of(state: Int[Array, ""], action: Int[Array, ""], shape: tuple[int, int]) -> Array:
+    """True at one entry of a table of this shape, `[num_states, num_actions]` bool."""
+    num_states, num_actions = shape
+    entry = jnp.arange(num_states * num_actions, dtype=jnp.int32).reshape(shape)
+    return entry == state * num_actions + action

@@ -1,0 +1,435 @@
+"""TD3, and TD3 for discrete actions, whose policy is a Gumbel-Softmax.
+
+The two share everything but a `Policy`: what becomes of the actor's outputs.
+
+Source: Fujimoto et al., "Addressing Function Approximation Error in Actor-Critic Methods" (2018);
+Jang et al., "Categorical Reparameterization with Gumbel-Softmax" (2017); the paper's
+hyperparameter tables; `reference_details.md` 4.3 and 4.4.
+"""
+
+import functools
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import optax
+from flax import struct
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Bool, Float, Int
+
+from sejax.agents.agent import Agent
+from sejax.agents.configs import DiscreteTD3Config, TD3Config
+from sejax.agents.memory import replay_memory
+from sejax.agents.replay import Transition
+from sejax.networks import MLP
+
+_MIN_TEMPERATURE = 1e-6
+
+
+class TD3Hparams(NamedTuple):
+    """The traced hyperparameters, scalars that a population of agents may vary."""
+
+    learning_rate: Array | float
+    target_update_rate: Array | float
+    discount: Array | float
+    action_noise_std: Array | float
+    target_noise_std: Array | float
+    target_noise_clip: Array | float
+
+
+class DiscreteTD3Hparams(NamedTuple):
+    """Those of `TD3Hparams`, and the Gumbel-Softmax's temperatures."""
+
+    learning_rate: Array | float
+    target_update_rate: Array | float
+    discount: Array | float
+    action_noise_std: Array | float
+    target_noise_std: Array | float
+    target_noise_clip: Array | float
+    temperature: Array | float
+    final_temperature: Array | float
+
+
+class TD3State(struct.PyTreeNode):
+    """One agent. Parameters are flat; the two critics' are the rows of one array."""
+
+    actor: Float[Array, " num_actor_params"]
+    critics: Float[Array, "2 num_critic_params"]
+    target_actor: Float[Array, " num_actor_params"]
+    target_critics: Float[Array, "2 num_critic_params"]
+    actor_opt_state: optax.OptState
+    critic_opt_state: optax.OptState
+    num_updates: Int[Array, ""]
+    is_warming_up: Bool[Array, ""]
+    hparams: Any
+
+
+class LearningNoise(NamedTuple):
+    """The random numbers of one learning step, each `[action_dim, batch]`.
+
+    Attributes:
+      smoothing: standard normal; scaled and clipped, it is added to the target policy's actions.
+      target_policy: what the target policy draws for the next states; None for continuous actions.
+      policy: what the policy draws for the states; likewise.
+    """
+
+    smoothing: Array
+    target_policy: Array | None
+    policy: Array | None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Policy:
+    """What the two variants differ in. Actions and outputs are `[action_dim, *batch]`.
+
+    Attributes:
+      action_dim: length of an action.
+      max_action: the unit of all Gaussian noise.
+      draw: `(key, shape) -> noise`, the randomness of `action`.
+      action: `(outputs, noise, state) -> action` for an actor's outputs.
+      restrict: `action -> action` as it is allowed to be once Gaussian noise was added.
+      warm_up: `key -> action`, `[action_dim]`, uniformly random.
+      best: `outputs -> action` without any randomness.
+      env_action: `action -> action` as the world takes it.
+    """
+
+    action_dim: int
+    max_action: float
+    draw: Callable[[Array, tuple[int, ...]], Array | None]
+    action: Callable[[Array, Array | None, TD3State], Array]
+    restrict: Callable[[Array], Array]
+    warm_up: Callable[[Array], Array]
+    best: Callable[[Array], Array]
+    env_action: Callable[[Array], Array]
+
+
+@functools.cache
+def make_td3(config: TD3Config, obs_dim: int, action_dim: int, max_action: float) -> Agent:
+    """Builds the agent for observations `[obs_dim]` and actions `[action_dim]`.
+
+    Actions lie in [-max_action, max_action]; the stds of all noise are in units of `max_action`.
+
+    Differs: the authors do not scale the target policy's noise by the largest action. That is the
+    same wherever it is 1, as in all of the paper's tasks. Tests are without exploration noise
+    unless `config.noisy_tests` is set.
+
+    Example:
+      >>> agent = make_td3(TD3Config(), obs_dim=3, action_dim=1, max_action=2.0)
+      >>> state = agent.init(jax.random.key(0), agent.hparams)
+      >>> agent.act(jax.random.key(1), state, jnp.zeros(3), explore=True).shape
+      (1,)
+    """
+    hparams = TD3Hparams(**{f: getattr(config, f) for f in TD3Hparams._fields})
+    return _make_agent(config, obs_dim, tanh_policy(action_dim, max_action), hparams)
+
+
+@functools.cache
+def make_td3_discrete(config: DiscreteTD3Config, obs_dim: int, num_actions: int) -> Agent:
+    """Builds the agent for observations `[obs_dim]` and actions `0..num_actions-1`.
+
+    It remembers actions as vectors `[num_actions]`: what the Gumbel-Softmax gave, with exploration
+    noise. The world takes the index of the largest entry.
+
+    Differs: the temperature reaches its end after `config.temperature_steps` learning steps, in the
+    authors' code after one less. Tests take the likeliest action unless `config.noisy_tests` is
+    set.
+
+    Example:
+      >>> agent = make_td3_discrete(DiscreteTD3Config(), obs_dim=4, num_actions=2)
+      >>> state = agent.init(jax.random.key(0), agent.hparams)
+      >>> action = agent.act(jax.random.key(1), state, jnp.zeros(4), explore=True)
+      >>> action.shape, int(agent.env_action(action)) in (0, 1)
+      ((2,), True)
+    """
+    hparams = DiscreteTD3Hparams(**{f: getattr(config, f) for f in DiscreteTD3Hparams._fields})
+    policy = gumbel_softmax_policy(num_actions, config.temperature_steps, config.one_hot_actions)
+    return _make_agent(config, obs_dim, policy, hparams)
+
+
+def _make_agent(config: TD3Config, obs_dim: int, policy: Policy, hparams: Any) -> Agent:
+    networks = make_networks(config, obs_dim, policy.action_dim)
+    learn = make_learning_step(config, networks, policy)
+    adam = optax.scale_by_adam()
+
+    def init(key: Array, hparams: Any) -> TD3State:
+        actor, critics = networks.init(key)
+        return TD3State(
+            actor=actor,
+            critics=critics,
+            target_actor=actor,
+            target_critics=critics,
+            actor_opt_state=adam.init(actor),
+            critic_opt_state=adam.init(critics),
+            num_updates=jnp.int32(0),
+            is_warming_up=jnp.bool_(config.init_episodes > 0),
+            hparams=jax.tree.map(jnp.float32, hparams),
+        )
+
+    def begin_episode(state: TD3State, episode: Array) -> TD3State:
+        return state.replace(is_warming_up=jnp.asarray(episode < config.init_episodes))
+
+    def act(key: Array, state: TD3State, obs: Float[Array, " obs_dim"], explore: bool) -> Array:
+        outputs = networks.actor(state.actor, obs)
+        if not explore and not config.noisy_tests:
+            return policy.best(outputs)
+        key_policy, key_noise, key_warm_up = jax.random.split(key, 3)
+        action = policy.action(outputs, policy.draw(key_policy, outputs.shape), state)
+        noise = policy.max_action * jax.random.normal(key_noise, outputs.shape)
+        action = policy.restrict(action + state.hparams.action_noise_std * noise)
+        if not explore:
+            return action
+        return jnp.where(state.is_warming_up, policy.warm_up(key_warm_up), action)
+
+    def update(key: Array, state: TD3State, batch: Transition) -> TD3State:
+        return learn(state, batch, draw_learning_noise(key, policy, batch.action.shape))
+
+    return Agent(
+        init=init,
+        begin_episode=begin_episode,
+        act=act,
+        update=update,
+        memory=replay_memory(config.batch_size, config.buffer_size),
+        hparams=hparams,
+        init_episodes=config.init_episodes,
+        learns_from=config.init_episodes,
+        env_action=policy.env_action,
+        action_repeat=config.action_repeat,
+    )
+
+
+# --- networks ------------------------------------------------------------------------------------
+
+
+class Networks(NamedTuple):
+    """The actor and the critics as functions of flat parameters.
+
+    Attributes:
+      init: `key -> (actor, critics)`, parameters `[n]` and `[2, m]`.
+      actor: `(actor, obs) -> outputs`, `[action_dim, *batch]`, before the policy.
+      critic: `(critic, obs, action) -> q_values`, `[*batch]`, of one of the critics.
+    """
+
+    init: Callable[[Array], tuple[Array, Array]]
+    actor: Callable[[Array, Array], Array]
+    critic: Callable[[Array, Array, Array], Array]
+
+
+def make_networks(config: TD3Config, obs_dim: int, action_dim: int) -> Networks:
+    """An actor `s -> [action_dim]` and critics `[s, a] -> Q` of the same hidden layers."""
+    layer_norm = isinstance(config, DiscreteTD3Config) and config.layer_norm
+
+    def network(num_inputs: int, num_outputs: int) -> tuple[Callable, Callable]:
+        mlp = MLP(
+            num_outputs, config.hidden_size, config.num_layers, config.activation,
+            learn_prelu_slope=True, layer_norm=layer_norm,
+        )  # fmt: skip
+        template = jax.eval_shape(mlp.init, jax.random.key(0), jnp.zeros(num_inputs))
+        _, unravel = ravel_pytree(jax.tree.map(lambda x: jnp.zeros(x.shape), template))
+
+        def init(key: Array) -> Array:
+            return ravel_pytree(mlp.init(key, jnp.zeros(num_inputs)))[0]
+
+        return init, lambda params, x: mlp.apply(unravel(params), x)
+
+    init_actor, actor = network(obs_dim, action_dim)
+    init_critic, critic = network(obs_dim + action_dim, 1)
+
+    def init(key: Array) -> tuple[Array, Array]:
+        key_actor, key_critics = jax.random.split(key)
+        return init_actor(key_actor), jax.vmap(init_critic)(jax.random.split(key_critics))
+
+    return Networks(
+        init=init,
+        actor=actor,
+        critic=lambda params, obs, action: critic(params, jnp.concatenate([obs, action]))[0],
+    )
+
+
+# --- learning ------------------------------------------------------------------------------------
+
+
+def make_learning_step(
+    config: TD3Config, networks: Networks, policy: Policy
+) -> Callable[[TD3State, Transition, LearningNoise], TD3State]:
+    """Builds `learn(state, batch, noise) -> state`, one step of both variants.
+
+    The critics move in every step, the actor and all targets in every `config.policy_delay`-th.
+
+    Source: Fujimoto et al. (2018), algorithm 1; `reference_details.md` 4.3.
+    """
+    adam = optax.scale_by_adam()
+
+    def both_q(critics: Array, obs: Array, action: Array) -> Float[Array, "2 batch"]:
+        return jax.vmap(networks.critic, (0, None, None))(critics, obs, action)
+
+    def update_critics(state: TD3State, batch: Transition, noise: LearningNoise) -> TD3State:
+        hp = state.hparams
+        next_action = smoothed_target_action(
+            networks.actor(state.target_actor, batch.next_obs), noise, state, policy
+        )
+        next_q = jnp.min(both_q(state.target_critics, batch.next_obs, next_action), axis=0)
+        targets = batch.reward + hp.discount * batch.discount * next_q
+
+        def loss(critics: Array) -> Array:
+            errors = both_q(critics, batch.obs, batch.action) - targets[None]
+            return _mean(jnp.sum(errors**2, axis=0), batch.weight)
+
+        direction, opt_state = adam.update(jax.grad(loss)(state.critics), state.critic_opt_state)
+        return state.replace(
+            critics=state.critics - hp.learning_rate * direction, critic_opt_state=opt_state
+        )
+
+    def update_actor(state: TD3State, batch: Transition, noise: LearningNoise) -> TD3State:
+        hp = state.hparams
+
+        def loss(actor: Array) -> Array:
+            action = policy.action(networks.actor(actor, batch.obs), noise.policy, state)
+            return -_mean(networks.critic(state.critics[0], batch.obs, action), batch.weight)
+
+        direction, opt_state = adam.update(jax.grad(loss)(state.actor), state.actor_opt_state)
+        actor = state.actor - hp.learning_rate * direction
+        tau = hp.target_update_rate
+        return state.replace(
+            actor=actor,
+            actor_opt_state=opt_state,
+            target_actor=tau * actor + (1 - tau) * state.target_actor,
+            target_critics=tau * state.critics + (1 - tau) * state.target_critics,
+        )
+
+    def learn(state: TD3State, batch: Transition, noise: LearningNoise) -> TD3State:
+        state = state.replace(num_updates=state.num_updates + 1)
+        state = update_critics(state, batch, noise)
+        if config.policy_delay == 1:
+            return update_actor(state, batch, noise)
+        return jax.lax.cond(
+            state.num_updates % config.policy_delay == 0,
+            lambda state: update_actor(state, batch, noise),
+            lambda state: state,
+            state,
+        )
+
+    return learn
+
+
+def draw_learning_noise(key: Array, policy: Policy, shape: tuple[int, ...]) -> LearningNoise:
+    """The random numbers of a learning step on actions `[action_dim, batch]`."""
+    key_smoothing, key_target, key_policy = jax.random.split(key, 3)
+    return LearningNoise(
+        smoothing=jax.random.normal(key_smoothing, shape),
+        target_policy=policy.draw(key_target, shape),
+        policy=policy.draw(key_policy, shape),
+    )
+
+
+def smoothed_target_action(
+    outputs: Float[Array, "actions batch"], noise: LearningNoise, state: TD3State, policy: Policy
+) -> Float[Array, "actions batch"]:
+    r"""The target policy's action plus :math:`\mathrm{clip}(\epsilon, -c, c)`, as allowed.
+
+    Source: Fujimoto et al. (2018), eq. 14.
+    """
+    hp = state.hparams
+    smoothing = jnp.clip(
+        hp.target_noise_std * noise.smoothing, -hp.target_noise_clip, hp.target_noise_clip
+    )
+    action = policy.action(outputs, noise.target_policy, state)
+    return policy.restrict(action + policy.max_action * smoothing)
+
+
+def _mean(x: Float[Array, " batch"], weight: Array | float) -> Array:
+    """Mean over the columns that count."""
+    return jnp.mean(weight * x) / jnp.mean(weight)
+
+
+# --- policies ------------------------------------------------------------------------------------
+
+
+def tanh_policy(action_dim: int, max_action: float) -> Policy:
+    """Continuous actions `max_action * tanh(outputs)`; noise does not lead out of their range."""
+
+    def squash(outputs: Array) -> Array:
+        return max_action * jnp.tanh(outputs)
+
+    return Policy(
+        action_dim=action_dim,
+        max_action=max_action,
+        draw=lambda key, shape: None,
+        action=lambda outputs, noise, state: squash(outputs),
+        restrict=lambda action: jnp.clip(action, -max_action, max_action),
+        warm_up=lambda key: jax.random.uniform(
+            key, (action_dim,), minval=-max_action, maxval=max_action
+        ),
+        best=squash,
+        env_action=lambda action: action,
+    )
+
+
+def gumbel_softmax_policy(num_actions: int, temperature_steps: int, one_hot: bool) -> Policy:
+    """Discrete actions as relaxed one-hot vectors; noise may lead anywhere.
+
+    Args:
+      num_actions: length of the vector.
+      temperature_steps: learning steps until the final temperature.
+      one_hot: whether the vectors are exactly one-hot, with the relaxed ones' gradients.
+    """
+
+    def action(outputs: Array, noise: Array | None, state: TD3State) -> Array:
+        assert noise is not None
+        temperature = annealed_temperature(state.hparams, state.num_updates, temperature_steps)
+        return gumbel_softmax(outputs, noise, temperature, one_hot)
+
+    def warm_up(key: Array) -> Array:
+        return jax.nn.one_hot(jax.random.randint(key, (), 0, num_actions), num_actions)
+
+    return Policy(
+        action_dim=num_actions,
+        max_action=1.0,
+        draw=jax.random.gumbel,
+        action=action,
+        restrict=lambda action: action,
+        warm_up=warm_up,
+        best=_one_hot_of_largest,
+        env_action=lambda action: jnp.argmax(action, axis=0).astype(jnp.int32),
+    )
+
+
+def gumbel_softmax(
+    logits: Float[Array, "actions *batch"],
+    gumbel: Float[Array, "actions *batch"],
+    temperature: Array | float,
+    one_hot: bool,
+) -> Float[Array, "actions *batch"]:
+    """A relaxed sample of the categorical distribution, one in each column.
+
+    Args:
+      logits: unnormalised log-probabilities.
+      gumbel: standard Gumbel noise.
+      temperature: towards 0, samples become one-hot.
+      one_hot: round to one-hot, with the gradient of the relaxed sample ("straight-through").
+
+    Source: Jang et al. (2017), eq. 2.
+    """
+    perturbed = logits + gumbel
+    soft = jax.nn.softmax(perturbed / temperature, axis=0)
+    if not one_hot:
+        return soft
+    return _one_hot_of_largest(perturbed) + (soft - jax.lax.stop_gradient(soft))
+
+
+def annealed_temperature(hparams: DiscreteTD3Hparams, num_updates: Array, num_steps: int) -> Array:
+    """Temperature in the `num_updates`-th learning step and until the next one.
+
+    It falls linearly from `hparams.temperature` to its `hparams.final_temperature`-fold in
+    `num_steps` learning steps, and stays there.
+
+    Source: `reference_details.md` 4.4.
+    """
+    progress = jnp.minimum(num_updates / num_steps, 1.0)
+    factor = 1 + progress * (hparams.final_temperature - 1)
+    return jnp.maximum(hparams.temperature * factor, _MIN_TEMPERATURE)
+
+
+def _one_hot_of_largest(x: Float[Array, "actions *batch"]) -> Float[Array, "actions *batch"]:
+    return jax.nn.one_hot(jnp.argmax(x, axis=0), x.shape[0], axis=0)

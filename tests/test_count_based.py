@@ -1,0 +1,151 @@
+"""sejax.agents.count_based: the bonus by hand and by a plain loop, and in a training."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from sejax import envs
+from sejax.agents.configs import CountBasedConfig, QLearningConfig, SARSAConfig
+from sejax.agents.count_based import with_count_bonus
+from sejax.agents.replay import Transition
+from sejax.agents.tabular import make_q_learning, make_sarsa
+from sejax.agents.trainer import make_tester, make_trainer
+from sejax.configs import TrainingConfig
+
+NUM_STATES, NUM_ACTIONS, BETA = 3, 2, 0.5
+KEY = jax.random.key(0)
+PLAIN = make_q_learning(
+    QLearningConfig(learning_rate=0.5, discount=0.9, epsilon_init=0.8, epsilon_decay=0.5),
+    NUM_STATES, NUM_ACTIONS,
+)  # fmt: skip
+
+
+def counting(plain=PLAIN, beta=BETA, num_states=NUM_STATES, num_actions=NUM_ACTIONS):
+    return with_count_bonus(plain, CountBasedConfig(reward_scale=beta), num_states, num_actions)
+
+
+def step(obs, action, reward, discount=0.0, next_obs=0):
+    return Transition(
+        obs=jnp.int32(obs), action=jnp.int32(action), reward=jnp.float32(reward),
+        discount=jnp.float32(discount), next_obs=jnp.int32(next_obs),
+    )  # fmt: skip
+
+
+def test_the_bonus_falls_with_the_root_of_the_visits_of_a_pair():
+    # With learning rate 1 and nothing to follow, a value is the last reward with its bonus.
+    plain = make_q_learning(QLearningConfig(learning_rate=1.0), NUM_STATES, NUM_ACTIONS)
+    agent = counting(plain)
+    update = jax.jit(agent.update)
+    state = agent.init(KEY, agent.hparams)
+    np.testing.assert_array_equal(state.counts, np.zeros((3, 2)))
+    steps = [(1, 0, 2.0), (1, 0, 2.0), (1, 1, -1.0), (2, 0, 0.0), (1, 0, 2.0), (1, 0, 2.0)]
+    seen = []
+    for obs, action, reward in steps:
+        state = update(KEY, state, step(obs, action, reward))
+        seen.append(float(state.agent_state.q_values[obs, action]))
+    # Visits so far: 1, 2, 1 (the other action), 1 (another state), 3, 4.
+    expected = [2.5, 2 + 0.5 / 2**0.5, -0.5, 0.5, 2 + 0.5 / 3**0.5, 2.25]
+    np.testing.assert_allclose(seen, expected, rtol=1e-6)
+    np.testing.assert_array_equal(state.counts, [[0, 0], [4, 1], [1, 0]])
+
+
+@pytest.mark.parametrize("make", [make_q_learning, make_sarsa])
+def test_the_agent_inside_learns_as_if_the_bonus_were_paid(make):
+    config = QLearningConfig if make is make_q_learning else SARSAConfig
+    plain = make(config(learning_rate=0.3, epsilon_init=0.6), NUM_STATES, NUM_ACTIONS)
+    agent = counting(plain)
+    rng = np.random.default_rng(0)
+    state, expected = agent.init(KEY, agent.hparams), plain.init(KEY, plain.hparams)
+    update, plain_update = jax.jit(agent.update), jax.jit(plain.update)
+    counts = np.zeros((NUM_STATES, NUM_ACTIONS))
+    for key in jax.random.split(KEY, 60):
+        obs, next_obs = rng.integers(0, NUM_STATES, 2)
+        action, reward = rng.integers(0, NUM_ACTIONS), rng.normal()
+        discount = rng.choice([0.0, 1.0, 0.7])
+        counts[obs, action] += 1
+        paid = reward + BETA / np.sqrt(counts[obs, action])
+        state = update(key, state, step(obs, action, reward, discount, next_obs))
+        expected = plain_update(key, expected, step(obs, action, paid, discount, next_obs))
+    np.testing.assert_array_equal(state.counts, counts)
+    np.testing.assert_allclose(state.agent_state.q_values, expected.q_values, rtol=1e-5, atol=1e-6)
+
+
+def test_it_acts_and_begins_episodes_as_the_agent_inside():
+    agent = counting()
+    state = agent.begin_episode(agent.init(KEY, agent.hparams), jnp.int32(1))
+    plain = PLAIN.begin_episode(PLAIN.init(KEY, PLAIN.hparams), jnp.int32(1))
+    assert state.agent_state.epsilon == plain.epsilon == jnp.float32(0.4)  # 0.8 * 0.5
+    keys = jax.random.split(KEY, 50)
+    for explore in (True, False):
+        got, expected = (
+            jax.vmap(lambda key, a=a, s=s, e=explore: a.act(key, s, jnp.int32(2), e))(keys)
+            for a, s in ((agent, state), (PLAIN, plain))
+        )
+        np.testing.assert_array_equal(got, expected)
+        assert len(set(got.tolist())) == (2 if explore else 1)
+
+
+def test_beta_and_the_numbers_inside_are_traced():
+    agent = counting()
+    assert agent.hparams.agent == PLAIN.hparams and agent.hparams.reward_scale == BETA
+
+    def after(beta, rate):
+        inner = agent.hparams.agent._replace(learning_rate=rate)
+        state = agent.init(KEY, agent.hparams._replace(agent=inner, reward_scale=beta))
+        return agent.update(KEY, state, step(0, 0, 1.0)).agent_state.q_values[0, 0]
+
+    got = jax.jit(jax.vmap(after))(jnp.array([0.0, 0.2, 1.0]), jnp.array([1.0, 1.0, 0.5]))
+    np.testing.assert_allclose(got, [1.0, 1.2, 1.0], rtol=1e-6)
+
+
+def test_an_agent_is_made_once_and_keeps_the_rest_of_the_contract():
+    plain = make_q_learning(QLearningConfig(init_episodes=3), NUM_STATES, NUM_ACTIONS)
+    agent = counting(plain)
+    assert agent is counting(plain)
+    assert (agent.init_episodes, agent.learns_from) == (3, 3)
+    assert agent.memory is plain.memory
+
+
+# --- in a training -------------------------------------------------------------------------------
+
+
+def test_in_a_training_each_learning_step_counts_and_returns_stay_without_the_bonus():
+    task = envs.make("cliff_walking")
+    plain = make_q_learning(QLearningConfig(init_episodes=2), 48, 4)
+    agent = counting(plain, 0.1, 48, 4)
+    config = TrainingConfig(max_episodes=200, stop_rule="never")
+    train, test = make_trainer(agent, task.env, config), make_tester(agent, task, 1)
+
+    @jax.jit
+    @jax.vmap
+    def run(key):
+        result = train(key, task.params)
+        return result, test(key, result.agent_state)[0][0]
+
+    result, test_returns = run(jax.random.split(KEY, 4))
+    np.testing.assert_array_equal(test_returns, -12.0)
+    returns = np.asarray(result.returns)
+    np.testing.assert_array_equal(returns, np.round(returns))
+    # The first two episodes are not learned from. One that falls off takes -99 - return steps, one
+    # that arrives 1 - return, and one that runs out of time 50.
+    first = returns[:, :2]
+    lengths = np.where(first <= -100, -99 - first, np.minimum(1 - first, 50)).sum(axis=1)
+    counts = np.asarray(result.agent_state.counts)
+    np.testing.assert_array_equal(counts.sum(axis=(1, 2)), result.train_steps - lengths)
+    assert (counts[:, 37:] == 0).all()  # nothing is done in the cliff or at the goal
+
+
+def test_without_a_bonus_a_training_is_the_plain_agents():
+    task = envs.make("gridworld_2x2")
+    plain = make_sarsa(SARSAConfig(epsilon_init=0.5, epsilon_min=0.5), 4, 4)
+    config = TrainingConfig(max_episodes=30, stop_rule="never")
+
+    def final(agent):
+        return jax.jit(make_trainer(agent, task.env, config))(KEY, task.params)
+
+    got, expected = final(counting(plain, 0.0, 4, 4)), final(plain)
+    np.testing.assert_array_equal(got.agent_state.agent_state.q_values,
+                                  expected.agent_state.q_values)  # fmt: skip
+    np.testing.assert_array_equal(got.returns, expected.returns)
+    assert got.train_steps == expected.train_steps == got.agent_state.counts.sum()

@@ -1,0 +1,371 @@
+"""sejax.agents.icm: models and loss by hand, updates against torch, and what the agent sees."""
+
+import functools
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from flax import struct
+from support import numpy_forward
+
+from sejax.agents.agent import Agent
+from sejax.agents.configs import DDQNConfig, ICMConfig
+from sejax.agents.ddqn import make_ddqn
+from sejax.agents.icm import ICM, ICMOutputs, icm_loss, with_icm
+from sejax.agents.memory import Rollout, replay_memory
+from sejax.agents.replay import Transition, pack
+
+OBS_DIM, WIDTH, BATCH = 3, 2, 7  # WIDTH: actions to choose from, or length of an action
+GOLDEN = Path(__file__).parent / "golden" / "icm_updates.npz"
+KINDS = ("index", "vector")
+CONFIG = ICMConfig(
+    learning_rate=0.01, forward_weight=0.3, reward_scale=0.5, feature_dim=4, hidden_size=6,
+    num_layers=1, num_residual_blocks=1,
+)  # fmt: skip
+DDQN = DDQNConfig(hidden_size=5, num_layers=1, batch_size=BATCH, learning_rate=0.01)
+KEY = jax.random.key(0)
+
+
+def random_batch(seed, kind):
+    rng = np.random.default_rng(seed)
+    action = rng.integers(0, WIDTH, BATCH) if kind == "index" else rng.normal(size=(WIDTH, BATCH))
+    return Transition(
+        obs=jnp.float32(rng.normal(size=(OBS_DIM, BATCH))),
+        action=jnp.int32(action) if kind == "index" else jnp.float32(action),
+        reward=jnp.float32(rng.normal(size=BATCH)),
+        discount=jnp.float32(rng.uniform(0, 1, BATCH)),
+        next_obs=jnp.float32(rng.normal(size=(OBS_DIM, BATCH))),
+        weight=jnp.ones(BATCH),
+    )
+
+
+@struct.dataclass
+class Seen:
+    """State of an agent that learns nothing and keeps what it was shown."""
+
+    reward: jax.Array
+    rows: jax.Array  # of a rollout
+    updates: jax.Array
+
+
+def stub_agent(kind):
+    width = 2 * OBS_DIM + (1 if kind == "index" else WIDTH) + 3
+
+    def update(key, state, batch):
+        if isinstance(batch, Rollout):
+            state = state.replace(rows=batch.rows)
+        reward = batch.rows[:, -3] if isinstance(batch, Rollout) else batch.reward
+        return state.replace(reward=reward, updates=state.updates + 1)
+
+    return Agent(
+        init=lambda key, hparams: Seen(
+            reward=jnp.zeros(BATCH), rows=jnp.zeros((BATCH, width)), updates=jnp.int32(0)
+        ),
+        begin_episode=lambda state, episode: state,
+        act=lambda key, state, obs, explore: jnp.int32(0),
+        update=update,
+        memory=replay_memory(BATCH, 10),
+        hparams=(),
+        init_episodes=3,
+        learns_from=2,
+        env_action=jnp.negative,
+        action_repeat=2,
+    )
+
+
+STUBS = {kind: stub_agent(kind) for kind in KINDS}
+
+
+def curious(kind, agent=None):
+    """The wrapped agent; discrete actions are indices, vectors are continuous."""
+    num_actions, action_dim = (WIDTH, None) if kind == "index" else (None, WIDTH)
+    return with_icm(agent or STUBS[kind], CONFIG, OBS_DIM, num_actions, action_dim)
+
+
+def model_of(config):
+    model = ICM(
+        WIDTH, config.feature_dim, config.hidden_size, config.num_layers, config.num_residual_blocks
+    )
+    example = (jnp.zeros(OBS_DIM), jnp.zeros(WIDTH), jnp.zeros(OBS_DIM))
+    variables = jax.jit(model.init)(jax.random.key(1), *example)
+    _, unravel = jax.flatten_util.ravel_pytree(variables)
+    return model, variables, unravel
+
+
+@pytest.fixture(scope="module")
+def updates():
+    """Jitted updates of the wrapped stub by kind."""
+    return {kind: jax.jit(curious(kind).update) for kind in KINDS}
+
+
+@pytest.fixture(scope="module")
+def learn():
+    """`(state, batch, number) -> state` after so many updates on index actions."""
+    update = curious("index").update
+    return jax.jit(
+        lambda state, batch, number: jax.lax.fori_loop(
+            0, number, lambda _, s: update(KEY, s, batch), state
+        )
+    )
+
+
+@functools.cache
+def initial(kind):
+    agent = curious(kind)
+    return jax.jit(agent.init)(jax.random.key(1), agent.hparams)
+
+
+def fresh(kind, **hparams):
+    """A wrapped stub with these hyperparameters."""
+    state = initial(kind)
+    numbers = {name: jnp.float32(x) for name, x in hparams.items()}
+    return state.replace(hparams=state.hparams._replace(**numbers))
+
+
+def bonus(state, batch):
+    """The bonus that the wrapped stub's agent was shown."""
+    return np.asarray(state.agent_state.reward - batch.reward)
+
+
+# --- the models and the loss, by hand ------------------------------------------------------------
+
+
+def dense(params, x):
+    kernel, bias = np.asarray(params["kernel"], np.float64), np.asarray(params["bias"])
+    return np.array([sum(w * v for w, v in zip(row, x, strict=True)) for row in kernel]) + bias
+
+
+def numpy_icm(params, obs, action, next_obs, num_layers, num_blocks):
+    """Next features, predicted ones, and the inverse model's output for one transition."""
+    features, next_features = (
+        numpy_forward(params["features"], x, "leaky_relu", num_layers) for x in (obs, next_obs)
+    )
+    pair = np.concatenate([features, next_features])
+    inverse = numpy_forward(params["inverse"], pair, "relu", num_layers)
+    forward = params["forward"]
+    pair = np.concatenate([features, action])
+    x = numpy_forward(forward["MLP_0"], pair, "leaky_relu", num_layers)
+    for i in range(num_blocks):
+        hidden = dense(forward[f"Dense_{2 * i}"], np.concatenate([x, action]))
+        hidden = np.where(hidden >= 0, hidden, 0.01 * hidden)
+        x = x + dense(forward[f"Dense_{2 * i + 1}"], np.concatenate([hidden, action]))
+    return next_features, numpy_forward(forward["MLP_1"], x, "leaky_relu", 1), inverse
+
+
+def test_the_models_equal_numpy_loops():
+    config = ICMConfig(**{**vars(CONFIG), "num_layers": 2, "num_residual_blocks": 2})
+    model, variables, _ = model_of(config)
+    batch = random_batch(0, "vector")
+    got = model.apply(variables, batch.obs, batch.action, batch.next_obs)
+    for i in range(BATCH):
+        columns = (np.asarray(x)[:, i] for x in (batch.obs, batch.action, batch.next_obs))
+        expected = numpy_icm(variables["params"], *columns, num_layers=2, num_blocks=2)
+        for whole, column in zip(got, expected, strict=True):
+            np.testing.assert_allclose(whole[:, i], column, rtol=1e-4, atol=1e-6)
+
+
+# Two features, two columns. Squared errors: (1 + 9) / 2 = 5 and (0 + 4) / 2 = 2.
+OUTPUTS = ICMOutputs(
+    next_features=jnp.array([[1.0, 2.0], [3.0, 4.0]]),
+    predicted_next_features=jnp.array([[2.0, 2.0], [0.0, 6.0]]),
+    predicted_action=jnp.array([[0.0, 1.0], [0.0, 3.0], [jnp.log(2.0), 1.0]]),
+)
+
+
+def test_the_loss_of_index_actions_is_a_softmax_cross_entropy_and_a_squared_error():
+    # Softmax: (1/4, 1/4, 1/2) and (1, e^2, 1) / (2 + e^2). The actions taken: 2 and 1.
+    inverse = [np.log(2), np.log(2 + np.exp(2)) - 2]
+    expected = np.mean([0.8 * inverse[0] + 0.2 * 5, 0.8 * inverse[1] + 0.2 * 2])
+    got = icm_loss(OUTPUTS, jnp.array([2, 1]), forward_weight=0.2)
+    np.testing.assert_allclose(got, expected, rtol=1e-6)
+
+
+def test_the_loss_of_vector_actions_is_two_squared_errors():
+    action = jnp.array([[1.0, 1.0], [2.0, 3.0], [jnp.log(2.0), 4.0]])
+    # (1 + 4 + 0) / 3 and (0 + 0 + 9) / 3.
+    expected = np.mean([0.8 * 5 / 3 + 0.2 * 5, 0.8 * 3 + 0.2 * 2])
+    np.testing.assert_allclose(icm_loss(OUTPUTS, action, 0.2), expected, rtol=1e-6)
+    # The second column alone.
+    got = icm_loss(OUTPUTS, action, 0.2, weight=jnp.array([0.0, 1.0]))
+    np.testing.assert_allclose(got, 0.8 * 3 + 0.2 * 2, rtol=1e-6)
+
+
+def test_large_logits_make_a_large_and_finite_loss():
+    outputs = OUTPUTS._replace(predicted_action=jnp.array([[1e4, -1e4], [-1e4, 1e4]]))
+    np.testing.assert_allclose(icm_loss(outputs, jnp.array([0, 0]), 0.0), 1e4)  # mean of 0 and 2e4
+
+
+def test_the_forward_models_target_passes_a_gradient_on():
+    gradient = jax.grad(
+        lambda x: icm_loss(OUTPUTS._replace(next_features=x), jnp.array([0, 1]), 1.0)
+    )
+    # d/dt of (p - t)^2 / 4 is (t - p) / 2: mean over two features and two columns.
+    expected = (OUTPUTS.next_features - OUTPUTS.predicted_next_features) / 2
+    np.testing.assert_allclose(gradient(OUTPUTS.next_features), expected, rtol=1e-6)
+
+
+# --- updates against torch -----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_updates_and_bonuses_equal_torchs_on_the_same_batches(kind, updates):
+    golden = np.load(GOLDEN)  # made by torch_icm.py
+    state = fresh(kind).replace(params=jnp.asarray(golden[f"{kind}/params/0"]))
+    for number in range(1, 6):
+        batch = random_batch(number, kind)
+        state = updates[kind](KEY, state, batch)
+        if number in (1, 5):
+            expected = golden[f"{kind}/params/{number}"]
+            np.testing.assert_allclose(state.params, expected, rtol=1e-5, atol=2e-6)
+            expected = golden[f"{kind}/bonus/{number}"]  # by the models after this update
+            np.testing.assert_allclose(bonus(state, batch), expected, rtol=1e-4, atol=1e-6)
+
+
+# --- what the agent sees -------------------------------------------------------------------------
+
+
+def test_the_bonus_shrinks_for_what_is_seen_often_and_is_larger_for_the_unseen(updates, learn):
+    state, update = fresh("index", forward_weight=0.5), updates["index"]
+    seen, unseen = random_batch(1, "index"), random_batch(2, "index")
+    unseen = unseen._replace(obs=unseen.obs + 3.0, next_obs=unseen.next_obs - 3.0)
+    first = bonus(update(KEY, state, seen), seen)
+    state = learn(state, seen, 300)
+    last = bonus(state, seen)
+    frozen = state.replace(hparams=state.hparams._replace(learning_rate=jnp.float32(0)))
+    strange = bonus(update(KEY, frozen, unseen), unseen)
+    assert last.mean() < 0.1 * first.mean()
+    assert strange.mean() > 10 * last.mean()
+
+
+def test_the_inverse_model_learns_which_action_was_taken(learn):
+    # The state moves up with action 1 and down with action 0.
+    batch = random_batch(0, "index")
+    move = jnp.where(batch.action == 1, 1.0, -1.0)
+    batch = batch._replace(next_obs=batch.obs + move)
+    state = learn(fresh("index", forward_weight=0.0), batch, 200)
+    model, _, unravel = model_of(CONFIG)
+    one_hot = jax.nn.one_hot(batch.action, WIDTH, axis=0)
+    logits = model.apply(unravel(state.params), batch.obs, one_hot, batch.next_obs).predicted_action
+    np.testing.assert_array_equal(jnp.argmax(logits, axis=0), batch.action)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_columns_of_no_weight_change_nothing(kind, updates):
+    counts = np.arange(BATCH) < 4
+    batch, other = random_batch(5, kind), random_batch(6, kind)
+    mixed = jax.tree.map(lambda a, b: jnp.where(counts, a, b), batch, other)
+    states, weight = [fresh(kind)] * 2, jnp.float32(counts)
+    for _ in range(2):
+        states = [
+            updates[kind](KEY, state, x._replace(weight=weight))
+            for state, x in zip(states, (batch, mixed), strict=True)
+        ]
+    np.testing.assert_array_equal(*(state.params for state in states))
+    np.testing.assert_array_equal(*(state.agent_state.reward[:4] for state in states))
+    assert (states[0].agent_state.reward[4:] != states[1].agent_state.reward[4:]).all()
+
+
+def test_a_wrapped_ddqn_learns_as_a_plain_one_from_the_rewards_with_the_bonus(updates):
+    plain = make_ddqn(DDQN, OBS_DIM, WIDTH)
+    agent = curious("index", plain)
+    state, batch = agent.init(jax.random.key(2), agent.hparams), random_batch(3, "index")
+    after = jax.jit(agent.update)(KEY, state, batch)
+    stub_state = fresh("index").replace(params=state.params)
+    rewards = updates["index"](KEY, stub_state, batch).agent_state.reward
+    assert (rewards > batch.reward).all()
+    expected = jax.jit(plain.update)(KEY, state.agent_state, batch._replace(reward=rewards))
+    np.testing.assert_allclose(after.agent_state.params, expected.params, rtol=1e-5, atol=1e-7)
+    same = jax.tree.map(
+        lambda a, b: a.dtype == b.dtype and a.weak_type == b.weak_type, state, after
+    )
+    assert jax.tree.all(same)
+
+
+def test_indices_and_their_one_hot_vectors_have_the_same_bonus(updates):
+    # Discrete TD3 keeps vectors: they go to the forward model as they are.
+    batch = random_batch(4, "index")
+    state = fresh("index", learning_rate=0.0)
+    one_hot = batch._replace(action=jax.nn.one_hot(batch.action, WIDTH, axis=0))
+    expected = bonus(updates["index"](KEY, state, batch), batch)
+    got = bonus(updates["index"](KEY, state, one_hot), batch)
+    np.testing.assert_allclose(got, expected, rtol=1e-6, atol=1e-7)
+    flipped = batch._replace(action=1 - batch.action)
+    assert np.abs(bonus(updates["index"](KEY, state, flipped), batch) - expected).max() > 1e-4
+
+
+def test_hyperparameters_are_traced_so_that_a_population_may_vary_them():
+    agent, batch = curious("index"), random_batch(0, "index")
+
+    start = initial("index")
+
+    def shown(scale, rate):
+        hparams = start.hparams._replace(reward_scale=scale, learning_rate=rate)
+        after = agent.update(KEY, start.replace(hparams=hparams), batch)
+        return after.agent_state.reward - batch.reward, after.params - start.params
+
+    scales, rates = jnp.array([0.0, 1.0, 3.0]), jnp.array([0.1, 0.0, 0.0])
+    bonuses, moved = jax.jit(jax.vmap(shown))(scales, rates)
+    np.testing.assert_array_equal(bonuses[0], 0.0)
+    np.testing.assert_allclose(bonuses[2], 3 * bonuses[1], rtol=1e-4, atol=1e-6)
+    assert (np.abs(moved[0]) > 0.09).mean() > 0.5 and (moved[1:] == 0).all()
+
+
+# --- rollouts ------------------------------------------------------------------------------------
+
+
+def as_rollout(batch, is_full=True):
+    """The batch as a rollout's rows; the episode ended in the third step."""
+    ended = np.float32(np.arange(BATCH) == 2)
+    rows = jnp.concatenate([jax.vmap(pack, -1)(batch), ended[:, None]], axis=1)
+    return Rollout(rows=rows, is_full=jnp.bool_(is_full))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_full_rollout_gets_the_bonus_first_and_then_trains_the_models_once(kind, updates):
+    batch, state = random_batch(1, kind), fresh(kind)
+    rollout = as_rollout(batch)
+    before = updates[kind](
+        KEY, fresh(kind, learning_rate=0), batch
+    )  # the bonus by the models as they were
+    trained = updates[kind](KEY, state, batch)
+    after = updates[kind](KEY, state, rollout)
+    np.testing.assert_allclose(
+        after.agent_state.reward, before.agent_state.reward, rtol=1e-5, atol=1e-6
+    )
+    np.testing.assert_allclose(after.params, trained.params, rtol=1e-5, atol=1e-6)
+    assert np.abs(trained.agent_state.reward - before.agent_state.reward).max() > 1e-4
+    assert after.agent_state.updates == 1
+    changed = np.asarray(after.agent_state.rows != rollout.rows).any(axis=0)
+    assert list(np.flatnonzero(changed)) == [rollout.rows.shape[1] - 3]  # the rewards alone
+
+
+def test_a_rollout_that_is_not_full_changes_nothing_alone_and_in_lanes(updates):
+    state, batch = fresh("index"), random_batch(1, "index")
+    waiting = updates["index"](KEY, state, as_rollout(batch, is_full=False))
+    jax.tree.map(np.testing.assert_array_equal, waiting, state)
+    full = updates["index"](KEY, state, as_rollout(batch))
+    lanes = jax.tree.map(lambda *x: jnp.stack(x), as_rollout(batch, False), as_rollout(batch))
+    both = jax.jit(jax.vmap(curious("index").update, (None, None, 0)))(KEY, state, lanes)
+    jax.tree.map(lambda x, y: np.testing.assert_array_equal(x[0], y), both, state)
+    jax.tree.map(lambda x, y: np.testing.assert_allclose(x[1], y, rtol=1e-5, atol=1e-6), both, full)
+
+
+# --- the rest of the agent -----------------------------------------------------------------------
+
+
+def test_everything_else_is_the_wrapped_agents():
+    agent = curious("index")
+    for name in ("memory", "init_episodes", "learns_from", "env_action", "action_repeat"):
+        assert getattr(agent, name) is getattr(STUBS["index"], name)
+    assert agent.hparams == ((), (0.01, 0.3, 0.5))
+    ddqn = make_ddqn(DDQN, OBS_DIM, WIDTH)
+    agent = curious("index", ddqn)
+    state = agent.begin_episode(agent.init(KEY, agent.hparams), jnp.int32(3))
+    inner = ddqn.begin_episode(state.agent_state, jnp.int32(3))
+    assert state.agent_state.epsilon == inner.epsilon and 0 < inner.epsilon < 1
+    obs = jnp.array([0.3, -0.2, 0.5])
+    for seed in range(5):
+        key = jax.random.key(seed)
+        assert agent.act(key, state, obs, True) == ddqn.act(key, state.agent_state, obs, True)

@@ -1,0 +1,608 @@
+"""sejax.agents.td3: updates against torch, noise, exploration, Gumbel-Softmax, probe MDPs."""
+
+import functools
+from dataclasses import replace
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.flatten_util import ravel_pytree
+from support import numpy_forward
+
+from sejax import envs
+from sejax.agents.configs import DiscreteTD3Config, TD3Config
+from sejax.agents.replay import Transition
+from sejax.agents.td3 import (
+    DiscreteTD3Hparams,
+    LearningNoise,
+    TD3Hparams,
+    annealed_temperature,
+    draw_learning_noise,
+    gumbel_softmax,
+    gumbel_softmax_policy,
+    make_learning_step,
+    make_networks,
+    make_td3,
+    make_td3_discrete,
+    smoothed_target_action,
+    tanh_policy,
+)
+from sejax.agents.trainer import make_tester, make_trainer
+from sejax.configs import TrainingConfig
+from sejax.networks import MLP
+
+OBS_DIM, ACTION_DIM, BATCH, MAX_ACTION = 3, 2, 7, 2.0
+GOLDEN = Path(__file__).parent / "golden" / "td3_updates.npz"
+CONFIG = TD3Config(
+    hidden_size=5, num_layers=2, activation="relu", batch_size=BATCH, learning_rate=0.01,
+    target_update_rate=0.1, discount=0.9, init_episodes=3, target_noise_std=0.4,
+)  # fmt: skip
+DISCRETE = DiscreteTD3Config(
+    hidden_size=5, num_layers=3, activation="tanh", batch_size=BATCH, learning_rate=0.01,
+    target_update_rate=0.1, discount=0.9, init_episodes=3, target_noise_std=0.4, temperature=2.0,
+    final_temperature=0.25, temperature_steps=4,
+)  # fmt: skip
+CASES = {
+    "relu": CONFIG,
+    "prelu_every_step": replace(CONFIG, activation="prelu", policy_delay=1),
+    "layer_norm": DISCRETE,
+    "one_hot": replace(
+        DISCRETE, one_hot_actions=True, layer_norm=False, activation="leaky_relu", num_layers=1
+    ),
+}
+NAMES = ("actor", "critics", "target_actor", "target_critics")
+CHECKED_UPDATES = (1, 2, 5)
+
+
+def is_discrete(config):
+    return isinstance(config, DiscreteTD3Config)
+
+
+def policy_of(config):
+    if is_discrete(config):
+        return gumbel_softmax_policy(ACTION_DIM, config.temperature_steps, config.one_hot_actions)
+    return tanh_policy(ACTION_DIM, MAX_ACTION)
+
+
+@functools.cache
+def agent_of(config):
+    if is_discrete(config):
+        return make_td3_discrete(config, OBS_DIM, ACTION_DIM)
+    return make_td3(config, OBS_DIM, ACTION_DIM, MAX_ACTION)
+
+
+@functools.cache
+def state_of(config):
+    agent = agent_of(config)
+    return jax.jit(agent.init)(jax.random.key(1), agent.hparams)
+
+
+@functools.cache
+def update_of(config):
+    return jax.jit(agent_of(config).update)
+
+
+def case_batch(config, seed, **columns):
+    """A random batch whose last column does not count."""
+    rng = np.random.default_rng(seed)
+    action = rng.uniform(-MAX_ACTION, MAX_ACTION, (ACTION_DIM, BATCH))
+    if is_discrete(config):
+        action = np.eye(ACTION_DIM)[rng.integers(0, ACTION_DIM, BATCH)].T + 0.1 * action
+    arrays = {
+        "obs": rng.normal(size=(OBS_DIM, BATCH)),
+        "action": action,
+        "reward": rng.normal(size=BATCH),
+        "discount": rng.uniform(-0.2, 1.2, BATCH),
+        "next_obs": rng.normal(size=(OBS_DIM, BATCH)),
+        "weight": np.arange(BATCH) < BATCH - 1,
+    } | columns
+    return Transition(**{k: jnp.float32(v) for k, v in arrays.items()})
+
+
+def case_noise(config, seed):
+    rng = np.random.default_rng([seed, 1])
+    shape = (ACTION_DIM, BATCH)
+    # Some of the smoothing noise is beyond the clip, which is 0.5 / 0.4 = 1.25 standard deviations.
+    smoothing = jnp.float32(rng.normal(size=shape))
+    if not is_discrete(config):
+        return LearningNoise(smoothing, None, None)
+    return LearningNoise(smoothing, *(jnp.float32(rng.gumbel(size=shape)) for _ in range(2)))
+
+
+def mlp_of(config, num_outputs):
+    return MLP(
+        num_outputs, config.hidden_size, config.num_layers, config.activation,
+        learn_prelu_slope=True, layer_norm=is_discrete(config) and config.layer_norm,
+    )  # fmt: skip
+
+
+def initial_params(config):
+    """Random parameters, all networks' different, so that it shows which is used where."""
+    rng = np.random.default_rng(0)
+    state = state_of(config)
+    return [jnp.float32(0.5 * rng.normal(size=getattr(state, name).shape)) for name in NAMES]
+
+
+def nested_params(config, params):
+    """Flat parameters (as in `NAMES`) as dictionaries by layer; the critics' as lists of two."""
+
+    def nest(flat, num_inputs, num_outputs):
+        init = mlp_of(config, num_outputs).init
+        template = jax.eval_shape(init, jax.random.key(0), jnp.zeros(num_inputs))
+        _, unravel = ravel_pytree(jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), template))
+        return unravel(flat)["params"]
+
+    nest_actor = functools.partial(nest, num_inputs=OBS_DIM, num_outputs=ACTION_DIM)
+    nest_critic = functools.partial(nest, num_inputs=OBS_DIM + ACTION_DIM, num_outputs=1)
+    actor, critics, target_actor, target_critics = params
+    return (
+        nest_actor(actor),
+        [nest_critic(x) for x in critics],
+        nest_actor(target_actor),
+        [nest_critic(x) for x in target_critics],
+    )
+
+
+def actor_outputs(config, state, obs):
+    """The actor's outputs for one observation, by plain loops; networks without layer norm."""
+    params = nested_params(config, [getattr(state, name) for name in NAMES])[0]
+    return numpy_forward(params, obs, config.activation, config.num_layers)
+
+
+# --- updates against torch -----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_updates_equal_torchs_on_the_same_batches_and_noise(case):
+    golden = np.load(GOLDEN)  # made by torch_td3.py
+    config = CASES[case]
+    networks = make_networks(config, OBS_DIM, ACTION_DIM)
+    learn = jax.jit(make_learning_step(config, networks, policy_of(config)))
+    state = state_of(config).replace(**dict(zip(NAMES, initial_params(config), strict=True)))
+    for number in range(1, max(CHECKED_UPDATES) + 1):
+        state = learn(state, case_batch(config, number), case_noise(config, number))
+        if number in CHECKED_UPDATES:
+            for name in NAMES:
+                np.testing.assert_allclose(
+                    getattr(state, name), golden[f"{case}/{name}/{number}"], rtol=2e-5, atol=4e-6
+                )
+
+
+@pytest.mark.parametrize("config", [CONFIG, DISCRETE], ids=["continuous", "discrete"])
+def test_an_update_is_the_learning_step_on_noise_drawn_from_its_key(config):
+    policy = policy_of(config)
+    learn = jax.jit(make_learning_step(config, make_networks(config, OBS_DIM, ACTION_DIM), policy))
+    batch, key = case_batch(config, 0), jax.random.key(3)
+    state = state_of(config).replace(num_updates=jnp.int32(1))
+    got = update_of(config)(key, state, batch)
+    expected = learn(state, batch, draw_learning_noise(key, policy, batch.action.shape))
+    other = update_of(config)(jax.random.key(4), state, batch)
+    for name in NAMES:
+        np.testing.assert_allclose(getattr(got, name), getattr(expected, name), rtol=1e-6)
+    assert not np.allclose(got.critic_opt_state.mu, other.critic_opt_state.mu)
+
+
+def test_noise_is_normal_and_gumbel_and_drawn_independently():
+    n = 20_000
+    noise = draw_learning_noise(jax.random.key(0), policy_of(DISCRETE), (1, n))
+    x = np.concatenate(noise)  # [3, n]
+    # Standard Gumbel: mean 0.5772, variance pi^2 / 6.
+    variance = np.array([1.0, np.pi**2 / 6, np.pi**2 / 6])
+    assert (np.abs(x.mean(1) - [0.0, 0.57722, 0.57722]) < 5 * np.sqrt(variance / n)).all()
+    np.testing.assert_allclose(x.var(1), variance, rtol=0.1)
+    assert np.abs(np.corrcoef(x)[np.triu_indices(3, 1)]).max() < 5 / np.sqrt(n)
+    assert draw_learning_noise(jax.random.key(0), policy_of(CONFIG), (1, 2)).policy is None
+
+
+@pytest.mark.parametrize("config", [CONFIG, DISCRETE], ids=["continuous", "discrete"])
+def test_the_actor_and_all_targets_move_in_every_second_step_the_critics_in_all(config):
+    states = [state_of(config)]
+    for name in ("actor", "critics"):  # targets start as copies
+        np.testing.assert_array_equal(
+            getattr(states[0], f"target_{name}"), getattr(states[0], name)
+        )
+    assert not np.allclose(states[0].critics[0], states[0].critics[1])
+    for number in range(1, 5):
+        states.append(update_of(config)(jax.random.key(number), states[-1], case_batch(config, 0)))
+        before, after = states[-2:]
+        assert int(after.num_updates) == number
+        moved = {name: not np.array_equal(getattr(before, name), getattr(after, name))
+                 for name in NAMES}  # fmt: skip
+        is_policy_step = number % 2 == 0
+        assert moved == {name: name == "critics" or is_policy_step for name in NAMES}
+        if is_policy_step:
+            for name in ("actor", "critics"):
+                expected = 0.1 * getattr(after, name) + 0.9 * getattr(before, f"target_{name}")
+                np.testing.assert_allclose(
+                    getattr(after, f"target_{name}"), expected, rtol=1e-5, atol=1e-7
+                )
+
+
+@pytest.mark.parametrize("config", [CONFIG, DISCRETE], ids=["continuous", "discrete"])
+def test_columns_of_no_weight_change_nothing(config):
+    state = state_of(config).replace(num_updates=jnp.int32(1))  # the next step moves everything
+    batch = case_batch(config, 0)
+    is_padding = batch.weight == 0
+    other = jax.tree.map(lambda x: jnp.where(is_padding, x + 3.0, x), batch)
+    other = other._replace(weight=batch.weight)
+    a, b = (update_of(config)(jax.random.key(0), state, x) for x in (batch, other))
+    for name in NAMES:
+        np.testing.assert_allclose(getattr(a, name), getattr(b, name), rtol=1e-6, atol=1e-8)
+    counted = batch._replace(weight=jnp.ones(BATCH))
+    all_count = update_of(config)(jax.random.key(0), state, counted)
+    assert not np.allclose(a.critic_opt_state.mu, all_count.critic_opt_state.mu, rtol=1e-3)
+
+
+def test_a_transition_with_discount_zero_ignores_its_next_state():
+    def gradient(batch):  # Adam's first mean: 0.1 g
+        return update_of(CONFIG)(jax.random.key(0), state_of(CONFIG), batch).critic_opt_state.mu
+
+    batch = case_batch(CONFIG, 0, discount=np.zeros(BATCH))
+    elsewhere = batch._replace(next_obs=batch.next_obs + 3.0)
+    np.testing.assert_array_equal(gradient(batch), gradient(elsewhere))
+    a, b = (gradient(x._replace(discount=jnp.ones(BATCH))) for x in (batch, elsewhere))
+    assert np.abs(a - b).max() > 1e-3
+
+
+@pytest.mark.parametrize("config", [CONFIG, DISCRETE], ids=["continuous", "discrete"])
+def test_members_with_their_own_numbers_and_counters_update_under_vmap_as_alone(config):
+    # Lane 0 comes to an actor update, lane 1 does not.
+    base, batch = state_of(config), case_batch(config, 0)
+    lanes = [
+        base.replace(num_updates=jnp.int32(n),
+                     hparams=base.hparams._replace(learning_rate=jnp.float32(rate)))
+        for n, rate in ((1, 0.01), (2, 0.1))
+    ]  # fmt: skip
+    stacked = jax.tree.map(lambda *x: jnp.stack(x), *lanes)
+    key = jax.random.key(0)
+    together = jax.jit(jax.vmap(agent_of(config).update, (None, 0, None)))(key, stacked, batch)
+    for i, lane in enumerate(lanes):
+        alone = update_of(config)(key, lane, batch)
+        for name in NAMES:
+            np.testing.assert_allclose(
+                getattr(together, name)[i], getattr(alone, name), rtol=1e-5, atol=1e-6
+            )
+
+
+@pytest.mark.parametrize("config", [CONFIG, DISCRETE], ids=["continuous", "discrete"])
+def test_the_state_keeps_its_types(config):
+    agent, state = agent_of(config), state_of(config)
+
+    def types(fn, *args):
+        return jax.tree.map(lambda x: (x.shape, x.dtype, x.weak_type), jax.eval_shape(fn, *args))
+
+    kept = types(lambda x: x, state)
+    assert types(agent.begin_episode, state, jnp.int32(1)) == kept
+    assert types(agent.update, jax.random.key(0), state, case_batch(config, 0)) == kept
+    acting = [
+        types(functools.partial(agent.act, explore=explore), jax.random.key(0), state, jnp.zeros(3))
+        for explore in (True, False)
+    ]
+    assert acting == [((ACTION_DIM,), jnp.float32, False)] * 2
+
+
+# --- target policy, by hand ----------------------------------------------------------------------
+
+
+def test_smoothing_noise_is_scaled_clipped_and_the_action_clamped():
+    # One action in [-2, 2]; std 0.2 and clip 0.5, both times 2. Outputs 0: the target policy's
+    # action is 0. Noise of 1 std: 0.4; of -9 std: -1.8, clipped to -1. Output atanh(0.75): 1.5,
+    # and with 9 std 1.5 + 1 = 2.5, clamped to 2.
+    noise = LearningNoise(jnp.array([[1.0, -9.0, 9.0]]), None, None)
+    outputs = jnp.array([[0.0, 0.0, np.arctanh(0.75)]])
+    hparams = TD3Hparams(0.0, 0.0, 0.0, 0.0, target_noise_std=0.2, target_noise_clip=0.5)
+    state = state_of(CONFIG).replace(hparams=hparams)
+    got = smoothed_target_action(outputs, noise, state, tanh_policy(1, 2.0))
+    np.testing.assert_allclose(got, [[0.4, -1.0, 2.0]], rtol=1e-6)
+
+
+def test_discrete_smoothing_noise_is_clipped_but_the_vector_not_clamped():
+    # Perturbed logits 0 and ln 3 at temperature 1: shares 1/4 and 3/4. Noise of 9 and -9 std is
+    # clipped to 0.5 and -0.5.
+    noise = LearningNoise(
+        smoothing=jnp.array([[-9.0], [9.0]]), target_policy=jnp.array([[0.0], [np.log(3.0)]]),
+        policy=jnp.full((2, 1), jnp.nan),
+    )  # fmt: skip
+    hparams = state_of(DISCRETE).hparams._replace(
+        target_noise_std=0.2, target_noise_clip=0.5, temperature=1.0, final_temperature=1.0
+    )
+    state = state_of(DISCRETE).replace(hparams=hparams)
+    got = smoothed_target_action(jnp.zeros((2, 1)), noise, state, policy_of(DISCRETE))
+    np.testing.assert_allclose(got, [[-0.25], [1.25]], rtol=1e-6)
+
+
+# --- the Gumbel-Softmax --------------------------------------------------------------------------
+
+
+def test_gumbel_softmax_by_hand():
+    logits, gumbel = jnp.array([0.0, 1.0]), jnp.array([0.5, np.log(2.0) - 0.5])
+    # The sums differ by ln 2: shares 1 : 2 at temperature 1, 1 : 4 at temperature 1/2.
+    np.testing.assert_allclose(gumbel_softmax(logits, gumbel, 1.0, False), [1 / 3, 2 / 3], 1e-6)
+    np.testing.assert_allclose(gumbel_softmax(logits, gumbel, 0.5, False), [0.2, 0.8], 1e-6)
+
+
+def test_one_hot_samples_are_exact_and_have_the_relaxed_gradient():
+    rng = np.random.default_rng(0)
+    logits, gumbel = (jnp.float32(rng.normal(size=(4, 6))) for _ in range(2))
+    weights = jnp.float32(rng.normal(size=(4, 6)))
+
+    def value(logits, one_hot):
+        return jnp.sum(weights * gumbel_softmax(logits, gumbel, 0.7, one_hot))
+
+    hard = np.asarray(gumbel_softmax(logits, gumbel, 0.7, True))
+    np.testing.assert_array_equal(hard, np.eye(4)[np.argmax(logits + gumbel, axis=0)].T)
+    np.testing.assert_allclose(
+        jax.grad(value)(logits, True), jax.grad(value)(logits, False), rtol=1e-5, atol=1e-7
+    )
+
+
+def test_samples_follow_the_softmax_of_the_logits():
+    probabilities, n = np.array([0.1, 0.2, 0.7]), 4000
+    policy = gumbel_softmax_policy(3, 1, one_hot=True)
+    state = state_of(DISCRETE)
+    noise = policy.draw(jax.random.key(0), (3, n))
+    logits = jnp.broadcast_to(jnp.log(probabilities)[:, None] + 5.0, (3, n))
+    share = np.asarray(policy.action(logits, noise, state)).mean(axis=1)
+    deviation = np.sqrt(probabilities * (1 - probabilities) / n)
+    assert (np.abs(share - probabilities) < 5 * deviation).all()
+
+
+def test_the_temperature_falls_linearly_to_its_end_and_stays():
+    hparams = agent_of(DISCRETE).hparams._replace(temperature=2.0, final_temperature=0.25)
+    got = [float(annealed_temperature(hparams, jnp.int32(n), 4)) for n in (0, 1, 2, 3, 4, 5, 10**9)]
+    # From 2 to 0.5 in four steps of 0.375.
+    np.testing.assert_allclose(got, [2.0, 1.625, 1.25, 0.875, 0.5, 0.5, 0.5], rtol=1e-6)
+
+
+def test_a_final_temperature_of_zero_gives_finite_samples_and_gradients():
+    hparams = agent_of(DISCRETE).hparams._replace(final_temperature=0.0)
+    temperature = annealed_temperature(hparams, jnp.int32(9), 4)
+    logits, gumbel = jnp.array([30.0, -30.0, 1.0]), jnp.array([-2.0, 17.0, 0.0])
+    sample, pull = jax.vjp(lambda x: gumbel_softmax(x, gumbel, temperature, False), logits)
+    np.testing.assert_array_equal(sample, [1.0, 0.0, 0.0])
+    assert np.isfinite(pull(jnp.array([1.0, 2.0, 3.0]))[0]).all()
+
+
+# --- acting --------------------------------------------------------------------------------------
+
+PLAIN = replace(DISCRETE, layer_norm=False, num_layers=2)
+OBS = np.float32([0.3, -0.2, 0.5])
+
+
+@functools.cache
+def drawn_actions(config, explore, warming_up=False, action_noise_std=0.01):
+    """Actions of 4000 keys, `[4000, action_dim]`."""
+    state = state_of(config)
+    state = agent_of(config).begin_episode(
+        state.replace(hparams=state.hparams._replace(action_noise_std=action_noise_std)),
+        jnp.int32(2 if warming_up else 3),
+    )
+    keys = jax.random.split(jax.random.key(1), 4000)
+    act = functools.partial(agent_of(config).act, explore=explore)
+    return np.asarray(jax.jit(jax.vmap(act, (0, None, None)))(keys, state, OBS))
+
+
+@pytest.mark.parametrize("config", [CONFIG, DISCRETE], ids=["continuous", "discrete"])
+def test_the_first_episodes_are_for_warming_up(config):
+    begin = agent_of(config).begin_episode
+    got = [bool(begin(state_of(config), jnp.int32(n)).is_warming_up) for n in range(5)]
+    assert got == [True, True, True, False, False]
+    assert (agent_of(config).init_episodes, agent_of(config).learns_from) == (3, 3)
+
+
+def test_warm_up_actions_are_uniform_in_the_range():
+    drawn = drawn_actions(CONFIG, explore=True, warming_up=True)
+    assert np.abs(drawn).max() <= MAX_ACTION
+    # U(-2, 2) has variance 16 / 12, and a quarter of the draws lies in each quarter of the range.
+    assert (np.abs(drawn.mean(0)) < 5 * np.sqrt(16 / 12 / 4000)).all()
+    for dim in range(ACTION_DIM):
+        share = np.histogram(drawn[:, dim], bins=4, range=(-2, 2))[0] / 4000
+        assert np.abs(share - 0.25).max() < 5 * np.sqrt(0.25 * 0.75 / 4000)
+    assert abs(np.corrcoef(drawn.T)[0, 1]) < 5 / np.sqrt(4000)
+
+
+def test_discrete_warm_up_actions_are_exact_one_hots_drawn_uniformly():
+    drawn = drawn_actions(PLAIN, explore=True, warming_up=True)
+    assert ((drawn == 0) | (drawn == 1)).all() and (drawn.sum(1) == 1).all()
+    assert np.abs(drawn.mean(0) - 0.5).max() < 5 * 0.5 / np.sqrt(4000)
+
+
+def test_exploring_adds_noise_of_the_configured_size_to_the_policys_action():
+    drawn = drawn_actions(CONFIG, explore=True)
+    expected = MAX_ACTION * np.tanh(actor_outputs(CONFIG, state_of(CONFIG), OBS))
+    std = 0.01 * MAX_ACTION
+    assert (np.abs(drawn.mean(0) - expected) < 5 * std / np.sqrt(4000)).all()
+    np.testing.assert_allclose(drawn.std(0), std, rtol=0.06)  # 5 / sqrt(2 * 4000)
+
+
+def test_exploring_does_not_leave_the_range():
+    drawn = drawn_actions(CONFIG, explore=True, action_noise_std=1.0)
+    assert np.abs(drawn).max() == MAX_ACTION
+
+
+def test_discrete_exploring_adds_noise_to_a_gumbel_softmax_sample():
+    one_hot = replace(PLAIN, one_hot_actions=True)
+    drawn = drawn_actions(one_hot, explore=True)
+    sample = np.round(drawn)
+    assert (sample.sum(1) == 1).all()
+    np.testing.assert_allclose((drawn - sample).std(0), 0.01, rtol=0.06)
+    assert drawn.min() < 0 and drawn.max() > 1  # not clamped
+    probabilities = np.exp(actor_outputs(one_hot, state_of(one_hot), OBS))
+    probabilities /= probabilities.sum()
+    assert np.abs(sample.mean(0) - probabilities).max() < 5 * 0.5 / np.sqrt(4000)
+
+
+def test_relaxed_samples_have_the_temperature_of_the_last_learning_step():
+    drawn = drawn_actions(PLAIN, explore=True, action_noise_std=0.0)
+    # log(a_1 / a_0) = (difference of logits + logistic noise) / temperature, and the standard
+    # logistic distribution has variance pi^2 / 3. Before any learning step the temperature is 2.
+    log_ratio = np.log(drawn[:, 1] / drawn[:, 0])
+    logits = actor_outputs(PLAIN, state_of(PLAIN), OBS)
+    std = np.pi / np.sqrt(3) / 2.0
+    assert abs(log_ratio.mean() - (logits[1] - logits[0]) / 2.0) < 5 * std / np.sqrt(4000)
+    np.testing.assert_allclose(log_ratio.std(), std, rtol=0.1)
+
+
+def test_tests_are_without_noise():
+    outputs = actor_outputs(CONFIG, state_of(CONFIG), OBS)
+    drawn = drawn_actions(CONFIG, explore=False)
+    np.testing.assert_allclose(drawn, np.tile(MAX_ACTION * np.tanh(outputs), (4000, 1)), rtol=1e-5)
+    drawn = drawn_actions(PLAIN, explore=False)
+    best = int(np.argmax(actor_outputs(PLAIN, state_of(PLAIN), OBS)))
+    index = jax.vmap(agent_of(PLAIN).env_action)(drawn)
+    assert index.dtype == jnp.int32 and (np.asarray(index) == best).all()
+
+
+@pytest.mark.parametrize("config", [CONFIG, PLAIN], ids=["continuous", "discrete"])
+def test_noisy_tests_act_as_in_training_but_never_warm_up(config):
+    noisy = replace(config, noisy_tests=True)
+    np.testing.assert_allclose(
+        drawn_actions(noisy, explore=False, warming_up=True), drawn_actions(config, explore=True),
+        rtol=1e-5, atol=1e-6,
+    )  # fmt: skip
+
+
+# --- the agent as a whole ------------------------------------------------------------------------
+
+
+def test_the_agent_holds_the_configured_numbers():
+    agent = agent_of(replace(CONFIG, action_repeat=4, action_noise_std=0.3, init_episodes=6))
+    assert agent.hparams == TD3Hparams(
+        learning_rate=0.01, target_update_rate=0.1, discount=0.9,
+        action_noise_std=0.3, target_noise_std=0.4, target_noise_clip=0.5,
+    )  # fmt: skip
+    assert (agent.action_repeat, agent.init_episodes, agent.learns_from) == (4, 6, 6)
+    assert agent_of(DISCRETE).hparams == DiscreteTD3Hparams(
+        learning_rate=0.01, target_update_rate=0.1, discount=0.9,
+        action_noise_std=0.1, target_noise_std=0.4, target_noise_clip=0.5,
+        temperature=2.0, final_temperature=0.25,
+    )  # fmt: skip
+
+
+def test_the_memory_hands_out_action_vectors():
+    action = jnp.array([0.25, -1.5])
+    one = Transition(jnp.ones(3), action, jnp.float32(2.0), jnp.float32(0.5), jnp.zeros(3))
+    memory = agent_of(CONFIG).memory(jax.eval_shape(lambda: one), 10)
+    kept = memory.store(memory.init(), jnp.int32(0), one, False, True)
+    batch = memory.batch(jax.random.key(0), kept, jnp.int32(1), one)
+    np.testing.assert_array_equal(batch.action, np.tile(action[:, None], batch.obs.shape[1]))
+    assert float(jnp.sum(batch.weight)) == BATCH
+
+
+def test_layer_norm_comes_after_each_hidden_layer_but_the_first_and_is_shared():
+    net = MLP(2, hidden_size=5, num_layers=3, activation="tanh", layer_norm=True)
+    params = net.init(jax.random.key(0), jnp.zeros(4))["params"]
+    assert set(params) == {"Dense_0", "Dense_1", "Dense_2", "Dense_3", "LayerNorm_0"}
+    rng = np.random.default_rng(0)
+    params["LayerNorm_0"] = {k: jnp.float32(rng.normal(size=5)) for k in ("scale", "bias")}
+    norm = {k: np.asarray(v, np.float64) for k, v in params["LayerNorm_0"].items()}
+    batch = rng.normal(size=(4, 6))
+    got = net.apply({"params": params}, jnp.float32(batch))
+    for column in range(6):
+        x = batch[:, column]
+        for layer in range(4):
+            dense = params[f"Dense_{layer}"]
+            x = np.asarray(dense["kernel"], np.float64) @ x + np.asarray(dense["bias"])
+            if layer in (1, 2):
+                spread = np.sqrt(np.mean((x - x.mean()) ** 2) + 1e-5)
+                x = norm["scale"] * (x - x.mean()) / spread + norm["bias"]
+            if layer < 3:
+                x = np.tanh(x)
+        np.testing.assert_allclose(got[:, column], x, rtol=1e-4, atol=1e-5)
+        alone = net.apply({"params": params}, jnp.float32(batch[:, column]))
+        np.testing.assert_allclose(alone, x, rtol=1e-4, atol=1e-5)
+
+
+# --- probes --------------------------------------------------------------------------------------
+
+
+def train_on(agent, batch, num_updates):
+    def step(state, key):
+        return agent.update(key, state, batch), None
+
+    state = jax.jit(agent.init)(jax.random.key(0), agent.hparams)
+    return jax.lax.scan(step, state, jax.random.split(jax.random.key(1), num_updates))[0]
+
+
+def test_on_a_one_step_bandit_the_policy_finds_the_best_action():
+    # Reward -(a - 0.3)^2 for actions in [-2, 2], whatever the observation; nothing follows.
+    config = TD3Config(
+        hidden_size=16, num_layers=1, activation="tanh", learning_rate=0.01, target_update_rate=0.1
+    )
+    agent = make_td3(config, obs_dim=1, action_dim=1, max_action=2.0)
+    action = jnp.linspace(-2, 2, 32)[None]
+    batch = Transition(
+        obs=jnp.zeros((1, 32)), action=action, reward=-((action[0] - 0.3) ** 2),
+        discount=jnp.zeros(32), next_obs=jnp.zeros((1, 32)),
+    )  # fmt: skip
+    state = train_on(agent, batch, 700)
+    got = agent.act(jax.random.key(0), state, jnp.zeros(1), explore=False)
+    np.testing.assert_allclose(got, [0.3], atol=0.1)
+
+
+@pytest.mark.parametrize("one_hot", [False, True], ids=["relaxed", "one_hot"])
+def test_on_a_two_state_probe_the_discrete_policy_waits_for_the_larger_reward(one_hot):
+    # In A, action 0 ends the episode with 0.5 and action 1 leads to B with nothing. In B, action 0
+    # ends it with 1 and action 1 with 0. With gamma 0.8 waiting is worth 0.8: Q(A) = [0.5, 0.8],
+    # Q(B) = [1, 0], policy 1 in A and 0 in B. The end looks like A: bootstrapping there would show.
+    # The actions are such as the policy gives, as critics are wild where they have seen nothing.
+    config = DiscreteTD3Config(
+        hidden_size=16, num_layers=2, learning_rate=0.003, target_update_rate=0.1, discount=0.8,
+        target_noise_std=0.0, final_temperature=1.0, one_hot_actions=one_hot,
+    )  # fmt: skip
+    agent = make_td3_discrete(config, obs_dim=2, num_actions=2)
+    gumbel = jnp.float32(np.random.default_rng(0).gumbel(size=(2, 64)))
+    action = gumbel_softmax(jnp.zeros((2, 64)), gumbel, 0.3, one_hot)
+    taken, in_a = np.argmax(action, axis=0), np.arange(64) % 2 == 0
+    waits = in_a & (taken == 1)
+    states = np.float32([[1, 0], [0, 1]])  # columns: A and B
+    batch = Transition(
+        obs=jnp.array(np.where(in_a, states[:, :1], states[:, 1:])),
+        action=action,
+        reward=jnp.float32(np.where(taken == 0, np.where(in_a, 0.5, 1.0), 0.0)),
+        discount=jnp.float32(waits),
+        next_obs=jnp.array(np.where(waits, states[:, 1:], states[:, :1])),
+    )
+    state = train_on(agent, batch, 1000)
+    for obs, best in zip(states.T, (1, 0), strict=True):
+        action = agent.act(jax.random.key(0), state, obs, explore=False)
+        assert int(agent.env_action(action)) == best
+    networks = make_networks(config, 2, 2)
+    for critic in state.critics:
+        got = networks.critic(critic, np.repeat(states, 2, axis=1), np.tile(np.eye(2), 2))
+        np.testing.assert_allclose(got, [0.5, 0.8, 1.0, 0.0], atol=0.1)
+
+
+# --- real tasks ----------------------------------------------------------------------------------
+
+
+def mean_test_return(agent, task, training):
+    @jax.jit
+    def run(key):
+        key_train, key_test = jax.random.split(key)
+        result = make_trainer(agent, task.env, training, task.solved_reward)(key_train, task.params)
+        returns, _ = make_tester(agent, task, 10)(key_test, result.agent_state)
+        return returns, result.train_steps
+
+    returns, train_steps = run(jax.random.key(0))
+    print(f"{task.name}: mean {returns.mean()}, worst {returns.min()}, {train_steps} steps")
+    return float(returns.mean())
+
+
+@pytest.mark.slow
+def test_td3_solves_pendulum_in_20000_steps():
+    task = envs.make("pendulum")
+    config = TD3Config(init_episodes=5, batch_size=128, learning_rate=1e-3)
+    agent = make_td3(config, task.obs_dim, task.action_dim, task.max_action)
+    training = TrainingConfig(max_episodes=100, max_steps=20_000, stop_rule="never")
+    assert mean_test_return(agent, task, training) > -250
+
+
+@pytest.mark.slow
+def test_discrete_td3_solves_cartpole():
+    task = envs.make("cartpole")
+    agent = make_td3_discrete(DiscreteTD3Config(), task.obs_dim, task.num_actions)
+    training = TrainingConfig(max_steps=50_000, stop_rule="solved", solved_by="train")
+    assert mean_test_return(agent, task, training) >= task.solved_reward
