@@ -116,24 +116,23 @@ def _train_and_test(
     import jax
     import pandas as pd
 
+    from sejax.agents.hparams import make_varied_agents
     from sejax.agents.registry import make_agent
-    from sejax.evaluation import evaluate_agents
+    from sejax.evaluation import drawing_key, evaluate_agents
 
+    varied = config.agent_hparams == "varied"
+    make = make_varied_agents if varied else make_agent
+    agents: Any = make(agent_config, task, config.exploration)
     keys = jax.random.split(jax.random.key(config.seed), config.num_agents)
     started = time.time()
     outcome = evaluate_agents(
-        make_agent(agent_config, task, config.exploration),
-        env,
-        env_params,
-        task,
-        training,
-        keys,
-        config.lanes,
-        config.devices,
+        agents, env, env_params, task, training, keys, config.lanes, config.devices
     )
     outcome = jax.device_get(outcome)
+    drawn = jax.vmap(lambda key: agents.draw(drawing_key(key)))(keys) if varied else {}
     print(f"{env.name}: {config.num_agents} agents in {time.time() - started:.1f} s", flush=True)
-    return pd.DataFrame({"agent": range(config.num_agents), **vars(outcome)})
+    columns = {"agent": range(config.num_agents), **vars(outcome), **jax.device_get(drawn)}
+    return pd.DataFrame(columns)
 
 
 def _print_table(summary: Any, task: Any, config: EvaluateConfig, out_dir: Path) -> None:

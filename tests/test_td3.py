@@ -115,14 +115,26 @@ def mlp_of(config, num_outputs):
     return MLP(
         num_outputs, config.hidden_size, config.num_layers, config.activation,
         learn_prelu_slope=True, layer_norm=is_discrete(config) and config.layer_norm,
+        may_narrow=True,
     )  # fmt: skip
 
 
 def initial_params(config):
     """Random parameters, all networks' different, so that it shows which is used where."""
-    rng = np.random.default_rng(0)
+    # A seed with which no gradient is as small as Adam's epsilon: rounding would decide its step.
+    rng = np.random.default_rng(2)
     state = state_of(config)
-    return [jnp.float32(0.5 * rng.normal(size=getattr(state, name).shape)) for name in NAMES]
+    drawn = [jnp.float32(0.5 * rng.normal(size=getattr(state, name).shape)) for name in NAMES]
+
+    def flat(params):
+        if "width" in params:  # no weight: the number of units
+            params = {**params, "width": jnp.float32(config.hidden_size)}
+        return ravel_pytree(params)[0]
+
+    return [
+        jnp.stack([flat(x) for x in nested]) if isinstance(nested, list) else flat(nested)
+        for nested in nested_params(config, drawn)
+    ]
 
 
 def nested_params(config, params):
@@ -180,7 +192,9 @@ def test_an_update_is_the_learning_step_on_noise_drawn_from_its_key(config):
     expected = learn(state, batch, draw_learning_noise(key, policy, batch.action.shape))
     other = update_of(config)(jax.random.key(4), state, batch)
     for name in NAMES:
-        np.testing.assert_allclose(getattr(got, name), getattr(expected, name), rtol=1e-6)
+        np.testing.assert_allclose(
+            getattr(got, name), getattr(expected, name), rtol=1e-5, atol=1e-7
+        )
     assert not np.allclose(got.critic_opt_state.mu, other.critic_opt_state.mu)
 
 
@@ -244,6 +258,68 @@ def test_a_transition_with_discount_zero_ignores_its_next_state():
     np.testing.assert_array_equal(gradient(batch), gradient(elsewhere))
     a, b = (gradient(x._replace(discount=jnp.ones(BATCH))) for x in (batch, elsewhere))
     assert np.abs(a - b).max() > 1e-3
+
+
+def test_the_critics_losses_are_means_over_the_columns_and_added():
+    # With discount 0 the error of a column is Q - r, and the gradient for the bias of a critic's
+    # head is twice the mean error. Adam's first mean is a tenth of it.
+    config = replace(CONFIG, activation="tanh")
+    state, batch = state_of(config), case_batch(config, 0, discount=np.zeros(BATCH))
+    after = update_of(config)(jax.random.key(0), state, batch)
+    _, critics, _, _ = nested_params(config, [getattr(state, name) for name in NAMES])
+    _, means, _, _ = nested_params(
+        config, [state.actor, after.critic_opt_state.mu, state.actor, state.critics]
+    )
+    inputs = np.concatenate([batch.obs, batch.action]).T[:-1]  # the last column does not count
+    for params, mean in zip(critics, means, strict=True):
+        q_values = np.array([numpy_forward(params, x, "tanh", 2)[0] for x in inputs])
+        expected = 0.1 * 2 * np.mean(q_values - batch.reward[:-1])
+        np.testing.assert_allclose(mean["Dense_2"]["bias"], [expected], rtol=1e-4)
+
+
+def test_an_agent_with_units_and_columns_out_of_use_learns_as_a_smaller_one():
+    # Three of five units and four of seven columns.
+    small_config = replace(DISCRETE, hidden_size=3)
+    key = jax.random.key(2)
+    large, policy = agent_of(DISCRETE), policy_of(DISCRETE)
+    numbers = large.hparams._replace(hidden_size=jnp.float32(3), batch_size=jnp.float32(4))
+    state = jax.jit(large.init)(key, numbers)
+    assert float(large.batch_size(state)) == 4 and large.batch_size(state_of(DISCRETE)) is None
+
+    def cut(params):
+        """Parameters of the units in use, as those of the smaller network."""
+        out = {"width": jnp.float32(3)}
+        out["LayerNorm_0"] = {name: x[:3] for name, x in params["LayerNorm_0"].items()}
+        for i in range(4):
+            rows, columns = slice(3 if i < 3 else None), slice(3 if i > 0 else None)
+            layer = params[f"Dense_{i}"]
+            out[f"Dense_{i}"] = {
+                "kernel": layer["kernel"][rows, columns], "bias": layer["bias"][rows]
+            }  # fmt: skip
+        return ravel_pytree(out)[0]
+
+    def cut_all(state):
+        nested = nested_params(DISCRETE, [getattr(state, name) for name in NAMES])
+        flat = [jnp.stack([cut(x) for x in n]) if isinstance(n, list) else cut(n) for n in nested]
+        return dict(zip(NAMES, flat, strict=True))
+
+    small = state_of(small_config).replace(**cut_all(state))
+    learn = jax.jit(
+        make_learning_step(DISCRETE, make_networks(DISCRETE, OBS_DIM, ACTION_DIM), policy)
+    )
+    learn_small = jax.jit(
+        make_learning_step(small_config, make_networks(small_config, OBS_DIM, ACTION_DIM), policy)
+    )
+    for number in range(1, 5):
+        batch = case_batch(DISCRETE, number, weight=np.arange(BATCH) < 4)
+        noise = case_noise(DISCRETE, number)
+        state, small = learn(state, batch, noise), learn_small(small, batch, noise)
+    for name, got in cut_all(state).items():
+        np.testing.assert_allclose(got, getattr(small, name), rtol=1e-4, atol=1e-5)
+    # Nothing but the cut part is there, apart from the layer norms' idle scales of 1.
+    for name in NAMES:
+        num_idle = np.count_nonzero(getattr(state, name)) - np.count_nonzero(getattr(small, name))
+        assert num_idle == 2 * np.atleast_2d(getattr(state, name)).shape[0]
 
 
 @pytest.mark.parametrize("config", [CONFIG, DISCRETE], ids=["continuous", "discrete"])
@@ -486,7 +562,7 @@ def test_the_memory_hands_out_action_vectors():
     one = Transition(jnp.ones(3), action, jnp.float32(2.0), jnp.float32(0.5), jnp.zeros(3))
     memory = agent_of(CONFIG).memory(jax.eval_shape(lambda: one), 10)
     kept = memory.store(memory.init(), jnp.int32(0), one, False, True)
-    batch = memory.batch(jax.random.key(0), kept, jnp.int32(1), one)
+    batch = memory.batch(jax.random.key(0), kept, jnp.int32(1), one, None)
     np.testing.assert_array_equal(batch.action, np.tile(action[:, None], batch.obs.shape[1]))
     assert float(jnp.sum(batch.weight)) == BATCH
 

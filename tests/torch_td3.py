@@ -61,6 +61,7 @@ class TorchMLP(torch.nn.Module):
         if self.norm is not None:
             scale, bias = self.norm.weight.detach().numpy(), self.norm.bias.detach().numpy()
             out["LayerNorm_0"] = {"scale": scale, "bias": bias}
+            out["width"] = np.float32(len(scale))
         if isinstance(self.activate, torch.nn.PReLU):
             out["prelu_slope"] = self.activate.weight.detach().numpy()[0]
         return out

@@ -19,11 +19,12 @@ from flax import struct
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int
 
-from sejax.agents.agent import Agent
+from sejax.agents.agent import Agent, hparams_of
+from sejax.agents.blocks import sum_over_batch
 from sejax.agents.configs import DiscreteTD3Config, TD3Config
 from sejax.agents.memory import replay_memory
-from sejax.agents.replay import Transition
-from sejax.networks import MLP
+from sejax.agents.replay import Transition, num_columns
+from sejax.networks import MLP, narrow
 
 _MIN_TEMPERATURE = 1e-6
 
@@ -37,6 +38,8 @@ class TD3Hparams(NamedTuple):
     action_noise_std: Array | float
     target_noise_std: Array | float
     target_noise_clip: Array | float
+    hidden_size: Array | None = None  # units in use, if fewer than the networks have
+    batch_size: Array | None = None  # columns in use, if fewer than a batch has
 
 
 class DiscreteTD3Hparams(NamedTuple):
@@ -50,6 +53,8 @@ class DiscreteTD3Hparams(NamedTuple):
     target_noise_clip: Array | float
     temperature: Array | float
     final_temperature: Array | float
+    hidden_size: Array | None = None
+    batch_size: Array | None = None
 
 
 class TD3State(struct.PyTreeNode):
@@ -121,8 +126,8 @@ def make_td3(config: TD3Config, obs_dim: int, action_dim: int, max_action: float
       >>> agent.act(jax.random.key(1), state, jnp.zeros(3), explore=True).shape
       (1,)
     """
-    hparams = TD3Hparams(**{f: getattr(config, f) for f in TD3Hparams._fields})
-    return _make_agent(config, obs_dim, tanh_policy(action_dim, max_action), hparams)
+    policy = tanh_policy(action_dim, max_action)
+    return _make_agent(config, obs_dim, policy, hparams_of(TD3Hparams, config))
 
 
 @functools.cache
@@ -143,9 +148,8 @@ def make_td3_discrete(config: DiscreteTD3Config, obs_dim: int, num_actions: int)
       >>> action.shape, int(agent.env_action(action)) in (0, 1)
       ((2,), True)
     """
-    hparams = DiscreteTD3Hparams(**{f: getattr(config, f) for f in DiscreteTD3Hparams._fields})
     policy = gumbel_softmax_policy(num_actions, config.temperature_steps, config.one_hot_actions)
-    return _make_agent(config, obs_dim, policy, hparams)
+    return _make_agent(config, obs_dim, policy, hparams_of(DiscreteTD3Hparams, config))
 
 
 def _make_agent(config: TD3Config, obs_dim: int, policy: Policy, hparams: Any) -> Agent:
@@ -154,7 +158,7 @@ def _make_agent(config: TD3Config, obs_dim: int, policy: Policy, hparams: Any) -
     adam = optax.scale_by_adam()
 
     def init(key: Array, hparams: Any) -> TD3State:
-        actor, critics = networks.init(key)
+        actor, critics = networks.init(key, hparams.hidden_size)
         return TD3State(
             actor=actor,
             critics=critics,
@@ -196,6 +200,7 @@ def _make_agent(config: TD3Config, obs_dim: int, policy: Policy, hparams: Any) -
         learns_from=config.init_episodes,
         env_action=policy.env_action,
         action_repeat=config.action_repeat,
+        batch_size=lambda state: state.hparams.batch_size,
     )
 
 
@@ -206,12 +211,13 @@ class Networks(NamedTuple):
     """The actor and the critics as functions of flat parameters.
 
     Attributes:
-      init: `key -> (actor, critics)`, parameters `[n]` and `[2, m]`.
+      init: `(key, hidden_size) -> (actor, critics)`, parameters `[n]` and `[2, m]`. `hidden_size`
+        is the number of units in use, or None for all.
       actor: `(actor, obs) -> outputs`, `[action_dim, *batch]`, before the policy.
       critic: `(critic, obs, action) -> q_values`, `[*batch]`, of one of the critics.
     """
 
-    init: Callable[[Array], tuple[Array, Array]]
+    init: Callable[[Array, Array | None], tuple[Array, Array]]
     actor: Callable[[Array, Array], Array]
     critic: Callable[[Array, Array, Array], Array]
 
@@ -223,22 +229,27 @@ def make_networks(config: TD3Config, obs_dim: int, action_dim: int) -> Networks:
     def network(num_inputs: int, num_outputs: int) -> tuple[Callable, Callable]:
         mlp = MLP(
             num_outputs, config.hidden_size, config.num_layers, config.activation,
-            learn_prelu_slope=True, layer_norm=layer_norm,
+            learn_prelu_slope=True, layer_norm=layer_norm, may_narrow=True,
         )  # fmt: skip
         template = jax.eval_shape(mlp.init, jax.random.key(0), jnp.zeros(num_inputs))
         _, unravel = ravel_pytree(jax.tree.map(lambda x: jnp.zeros(x.shape), template))
 
-        def init(key: Array) -> Array:
-            return ravel_pytree(mlp.init(key, jnp.zeros(num_inputs)))[0]
+        def init(key: Array, hidden_size: Array | None) -> Array:
+            variables: Any = mlp.init(key, jnp.zeros(num_inputs))
+            if hidden_size is not None:
+                variables = {"params": narrow(variables["params"], hidden_size)}
+            return ravel_pytree(variables)[0]
 
         return init, lambda params, x: mlp.apply(unravel(params), x)
 
     init_actor, actor = network(obs_dim, action_dim)
     init_critic, critic = network(obs_dim + action_dim, 1)
 
-    def init(key: Array) -> tuple[Array, Array]:
+    def init(key: Array, hidden_size: Array | None = None) -> tuple[Array, Array]:
         key_actor, key_critics = jax.random.split(key)
-        return init_actor(key_actor), jax.vmap(init_critic)(jax.random.split(key_critics))
+        init_critics = jax.vmap(init_critic, (0, None))
+        critics = init_critics(jax.random.split(key_critics), hidden_size)
+        return init_actor(key_actor, hidden_size), critics
 
     return Networks(
         init=init,
@@ -266,17 +277,18 @@ def make_learning_step(
 
     def update_critics(state: TD3State, batch: Transition, noise: LearningNoise) -> TD3State:
         hp = state.hparams
-        next_action = smoothed_target_action(
-            networks.actor(state.target_actor, batch.next_obs), noise, state, policy
-        )
-        next_q = jnp.min(both_q(state.target_critics, batch.next_obs, next_action), axis=0)
-        targets = batch.reward + hp.discount * batch.discount * next_q
 
-        def loss(critics: Array) -> Array:
+        def sum_of_losses(critics: Array, batch: Transition, noise: LearningNoise) -> Array:
+            next_action = smoothed_target_action(
+                networks.actor(state.target_actor, batch.next_obs), noise, state, policy
+            )
+            next_q = jnp.min(both_q(state.target_critics, batch.next_obs, next_action), axis=0)
+            targets = batch.reward + hp.discount * batch.discount * next_q
             errors = both_q(critics, batch.obs, batch.action) - targets[None]
-            return _mean(jnp.sum(errors**2, axis=0), batch.weight)
+            return jnp.sum(batch.weight * jnp.sum(errors**2, axis=0))
 
-        direction, opt_state = adam.update(jax.grad(loss)(state.critics), state.critic_opt_state)
+        gradient = mean_gradient(sum_of_losses, state.critics, batch, noise, hp.batch_size)
+        direction, opt_state = adam.update(gradient, state.critic_opt_state)
         return state.replace(
             critics=state.critics - hp.learning_rate * direction, critic_opt_state=opt_state
         )
@@ -284,11 +296,12 @@ def make_learning_step(
     def update_actor(state: TD3State, batch: Transition, noise: LearningNoise) -> TD3State:
         hp = state.hparams
 
-        def loss(actor: Array) -> Array:
+        def sum_of_losses(actor: Array, batch: Transition, noise: LearningNoise) -> Array:
             action = policy.action(networks.actor(actor, batch.obs), noise.policy, state)
-            return -_mean(networks.critic(state.critics[0], batch.obs, action), batch.weight)
+            return -jnp.sum(batch.weight * networks.critic(state.critics[0], batch.obs, action))
 
-        direction, opt_state = adam.update(jax.grad(loss)(state.actor), state.actor_opt_state)
+        gradient = mean_gradient(sum_of_losses, state.actor, batch, noise, hp.batch_size)
+        direction, opt_state = adam.update(gradient, state.actor_opt_state)
         actor = state.actor - hp.learning_rate * direction
         tau = hp.target_update_rate
         return state.replace(
@@ -311,6 +324,21 @@ def make_learning_step(
         )
 
     return learn
+
+
+def mean_gradient(
+    sum_of_losses: Callable[[Array, Transition, LearningNoise], Array],
+    params: Array,
+    batch: Transition,
+    noise: LearningNoise,
+    batch_size: Array | None,
+) -> Array:
+    """Gradient of the mean loss over the columns that count, at the cost of those alone."""
+
+    def sum_of_gradients(columns: tuple[Transition, LearningNoise]) -> Array:
+        return jax.grad(sum_of_losses)(params, *columns)
+
+    return sum_over_batch(sum_of_gradients, (batch, noise), batch_size) / num_columns(batch)
 
 
 def draw_learning_noise(key: Array, policy: Policy, shape: tuple[int, ...]) -> LearningNoise:
@@ -336,11 +364,6 @@ def smoothed_target_action(
     )
     action = policy.action(outputs, noise.target_policy, state)
     return policy.restrict(action + policy.max_action * smoothing)
-
-
-def _mean(x: Float[Array, " batch"], weight: Array | float) -> Array:
-    """Mean over the columns that count."""
-    return jnp.mean(weight * x) / jnp.mean(weight)
 
 
 # --- policies ------------------------------------------------------------------------------------

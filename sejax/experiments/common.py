@@ -1,0 +1,101 @@
+"""What the experiments share: their options, pieces of work that are done once, and their tables.
+
+An experiment is cut into pieces that take minutes (one SE learned, the agents of one SE). Each is
+written as a CSV file under the output folder as soon as it is done, with the settings that it was
+made with beside it; running the same command again computes only what is missing.
+"""
+
+import argparse
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from sejax.errors import ConfigError
+from sejax.files import write_text
+
+
+def parse_args(
+    name: str, description: str | None, add_options: Callable[[argparse.ArgumentParser], None]
+) -> argparse.Namespace:
+    """Options that every experiment takes, and its own; starts XLA with a device for each core."""
+    summary = (description or "").partition("\n")[0]
+    parser = argparse.ArgumentParser(prog=f"python -m sejax.experiments.{name}",
+                                     description=summary)  # fmt: skip
+    parser.add_argument("--quick", action="store_true", help="a small version, in two minutes")
+    parser.add_argument("--out", type=Path, help=f"output folder; results/{name}[-quick]")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--devices", type=int, help="devices to use; all")
+    add_options(parser)
+    args = parser.parse_args()
+    args.out = args.out or Path("results") / (f"{name}-quick" if args.quick else name)
+    from sejax.runtime import configure_xla, enable_compilation_cache
+
+    configure_xla(args.devices)
+    enable_compilation_cache()
+    return args
+
+
+class Pieces:
+    """The finished pieces of an experiment, in a folder."""
+
+    def __init__(self, folder: Path):
+        self.folder = folder
+
+    def compute(
+        self, name: str, settings: dict[str, Any], compute: Callable[[], pd.DataFrame]
+    ) -> pd.DataFrame:
+        """A piece's table: read if it is there, else computed and written.
+
+        Args:
+          name: of the files, `<name>.csv` and `<name>.json`.
+          settings: what the piece depends on; plain values.
+          compute: makes the table.
+
+        Raises:
+          ConfigError: if a piece of that name was made with other settings.
+        """
+        table, made_with = self.folder / f"{name}.csv", self.folder / f"{name}.json"
+        settings = json.loads(json.dumps(settings, default=str))
+        if table.exists() and made_with.exists():
+            there = json.loads(made_with.read_text())
+            differing = sorted(key for key in {*there, *settings}
+                               if there.get(key) != settings.get(key))  # fmt: skip
+            if differing:
+                raise ConfigError(
+                    f"--out must be a new folder or that of the same experiment, because finished "
+                    f"pieces are used again; got {table} with another {', '.join(differing)}. "
+                    f"Set --out=DIR."
+                )
+            return pd.read_csv(table)
+        made = compute()
+        write_text(made_with, json.dumps(settings, indent=2))
+        write_text(table, made.to_csv(index=False))
+        return made
+
+
+def bootstrap_interval(
+    values: Any, level: float = 0.95, num_resamples: int = 2000, seed: int = 0
+) -> tuple[float, float]:
+    """Percentile bootstrap confidence interval of the mean of independent values `[n]`.
+
+    Average what belongs together (the agents of one proxy) before: only independent values may be
+    drawn one by one.
+    """
+    values = np.asarray(values, float)
+    draws = np.random.default_rng(seed).integers(0, values.size, (num_resamples, values.size))
+    means = values[draws].mean(axis=1)
+    low, high = np.quantile(means, [(1 - level) / 2, (1 + level) / 2])
+    return float(low), float(high)
+
+
+def write_markdown(path: Path, title: str, command: str, table: pd.DataFrame, note: str) -> None:
+    """Writes a table as Markdown, with the command that makes it and what to know about it."""
+    header = "| " + " | ".join(map(str, table.columns)) + " |"
+    rule = "|" + " --- |" * len(table.columns)
+    rows = ["| " + " | ".join(map(str, row)) + " |" for row in table.itertuples(index=False)]
+    body = "\n".join([header, rule, *rows])
+    write_text(path, f"# {title}\n\n`{command}`\n\n{body}\n\n{note}\n")
