@@ -66,12 +66,13 @@ def test_draws_fill_their_range_with_the_density_they_should_have(bounds):
     assert np.abs(np.sort(share) - np.linspace(0, 1, share.size)).max() < 0.02  # Kolmogorov-Smirnov
 
 
-def test_every_hidden_size_has_a_network_that_is_at_most_half_as_large_again():
-    sizes = np.array(hidden_sizes(Range(42, 384, True, True)))
+@pytest.mark.parametrize(("num_layers", "ratio"), [(1, 1.5), (2, 1.25), (3, 1.25)])
+def test_every_hidden_size_has_a_network_with_little_room_to_spare(num_layers, ratio):
+    sizes = np.array(hidden_sizes(Range(42, 384, True, True), num_layers))
     assert sizes[-1] == 384 and (np.diff(sizes) > 0).all()
     for size in range(42, 385):
         room = sizes[sizes >= size].min()
-        assert room <= max(1.5 * size, size + 16)
+        assert room <= max(ratio * size, size + 16)
 
 
 # --- narrow networks -----------------------------------------------------------------------------
@@ -191,16 +192,16 @@ def test_every_drawn_agent_finds_a_network_with_room():
     varied = make_varied_agents(config, task, ExplorationConfig())
     values = jax.vmap(varied.draw)(jax.random.split(jax.random.key(0), 200))
     branches = jax.vmap(varied.branch)(values)
-    sizes = hidden_sizes(varied.ranges["hidden_size"])
-    assert len(varied.agents) == 3 * len(sizes)
+    sizes = {depth: hidden_sizes(varied.ranges["hidden_size"], depth) for depth in (1, 2, 3)}
+    assert len(varied.agents) == sum(map(len, sizes.values()))
     for index, hidden, depth in zip(branches, values["hidden_size"], values["num_layers"],
                                     strict=True):  # fmt: skip
         agent = varied.agents[int(index)]
         state = jax.eval_shape(agent.init, jax.random.key(0), agent.hparams)
-        room = min(size for size in sizes if size >= hidden)
+        room = min(size for size in sizes[int(depth)] if size >= hidden)
         inner = (int(depth) - 1) * room * (room + 1)
         assert state.params.shape == (room * 5 + inner + 2 * (room + 1),)
-    assert len(set(branches.tolist())) > len(sizes)
+    assert len(set(branches.tolist())) == len(varied.agents)
 
 
 def test_trainings_with_drawn_hyperparameters_equal_those_with_the_same_given():

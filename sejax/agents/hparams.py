@@ -11,7 +11,6 @@ Source: paper, table "Agent hyperparameter ranges" and appendix "Varied Agent Hy
 
 import dataclasses
 import functools
-import itertools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -26,7 +25,9 @@ from sejax.agents.configs import AgentConfig, ExplorationConfig, QLearningConfig
 from sejax.agents.registry import make_agent
 from sejax.envs import Task
 
-_SIZE_RATIO = 1.5  # of neighbouring hidden sizes: a network has at most this much room to spare
+# Of neighbouring hidden sizes, i.e. how much room a network may have to spare: with one hidden layer
+# the cost grows with the size, with more of them with its square.
+_SIZE_RATIO, _SIZE_RATIO_DEEP = 1.5, 1.25
 _MULTIPLE = 8  # vector width of a CPU
 
 
@@ -89,12 +90,13 @@ def draw_value(key: Array, bounds: Range) -> Array:
     return jnp.clip(value, bounds.low, bounds.high)
 
 
-def hidden_sizes(bounds: Range) -> tuple[int, ...]:
+def hidden_sizes(bounds: Range, num_layers: int) -> tuple[int, ...]:
     """Sizes of networks, growing, the last of which has room for all in the range."""
+    ratio = _SIZE_RATIO if num_layers == 1 else _SIZE_RATIO_DEEP
     sizes, size = [], bounds.high
     while True:
         sizes.append(-(-math.ceil(size) // _MULTIPLE) * _MULTIPLE)
-        size = size / _SIZE_RATIO
+        size = size / ratio
         if size < bounds.low:
             return tuple(sorted(set(sizes)))
 
@@ -105,16 +107,15 @@ def make_varied_agents(
 ) -> VariedAgents:
     """Builds the agents for all sizes in the ranges around a configuration."""
     ranges = ranges_of(config)
-    sizes: tuple[int, ...] = ()
-    depths: tuple[int, ...] = ()
+    shapes: list[tuple[int, int]] = []  # (depth, room for hidden units) of each branch, ascending
     branches = [make_agent(config, task, exploration)]
     if "hidden_size" in ranges:
-        sizes = hidden_sizes(ranges["hidden_size"])
-        depths = tuple(range(int(ranges["num_layers"].low), int(ranges["num_layers"].high) + 1))
+        low, high = int(ranges["num_layers"].low), int(ranges["num_layers"].high)
+        shapes = [(depth, size) for depth in range(low, high + 1)
+                  for size in hidden_sizes(ranges["hidden_size"], depth)]  # fmt: skip
         changes: dict[str, Any] = {}
         if "batch_size" in ranges:
             changes["batch_size"] = int(ranges["batch_size"].high)
-        shapes = itertools.product(depths, sizes)
         branches = [
             make_agent(_replace(config, num_layers=depth, hidden_size=size, **changes), task,
                        exploration)
@@ -129,10 +130,13 @@ def make_varied_agents(
         }
 
     def branch(values: dict[str, Array]) -> Array:
-        if not sizes:
+        if not shapes:
             return jnp.int32(0)
-        size = jnp.sum(values["hidden_size"] > jnp.array(sizes))
-        return ((values["num_layers"] - depths[0]) * len(sizes) + size).astype(jnp.int32)
+        depths, rooms = jnp.array(shapes).T
+        too_small = (depths < values["num_layers"]) | (
+            (depths == values["num_layers"]) & (rooms < values["hidden_size"])
+        )
+        return jnp.sum(too_small).astype(jnp.int32)
 
     def hparams(values: dict[str, Array]) -> Any:
         traced = {name: x for name, x in values.items() if name != "num_layers"}

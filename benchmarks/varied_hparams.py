@@ -1,0 +1,119 @@
+"""What it costs that a program varies the hyperparameters, against the drawn agents one by one.
+
+Trains DDQN agents with drawn learning rate, batch size, hidden size and depth in a CartPole SE, on
+one core: once with the one program that can train all of them, and once each with a program that is
+compiled for exactly the drawn sizes. Compilation is not counted in the times. Quoted is the ratio
+of the summed CPU times; each draw's ratio is in the table.
+"""
+
+import argparse
+import os
+import time
+from typing import Any
+
+import common
+
+OVERRIDES = ["training.stop_rule=never", "agent.init_episodes=0"]
+
+
+def main() -> None:
+    """Runs the benchmark, or its side."""
+    args = common.parse_args(__doc__, add_options)
+    if args.side:
+        os.sched_setaffinity(0, {args.core})
+        serve(args)
+        return
+    draws = args.draws or (4 if args.quick else 16)
+    options = ("--steps", args.steps, "--core", args.core, "--seed", args.seed,
+               "--agent-size", args.agent_size or (32 if args.quick else 128))  # fmt: skip
+    with common.Side(__file__, "sejax", *options) as side:
+        compile_s = side.ready["compile_s"]
+        samples = [side.ask(number=number) for number in range(draws)]
+    ratio = sum(s["varied_s"] for s in samples) / sum(s["alone_s"] for s in samples)
+    show(samples, ratio, compile_s)
+    common.finish("varied_hparams", args,
+                  {"ratio": ratio, "compile_s": compile_s, "samples": samples})  # fmt: skip
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Options of this benchmark."""
+    parser.add_argument("--draws", type=int, help="agents (4 if --quick, else 16)")
+    parser.add_argument("--steps", type=int, default=2000, help="of each training")
+    parser.add_argument("--agent-size", type=int, help="hidden and batch size that ranges surround "
+                        "(32 if --quick, else 128)")  # fmt: skip
+    parser.add_argument("--core", type=int, default=common.available_cores()[-1])
+
+
+def serve(args: argparse.Namespace) -> None:
+    """Compiles the program that varies, then measures each draw both ways."""
+    from sejax.runtime import configure_xla
+
+    configure_xla(1)
+    import dataclasses
+
+    import jax
+
+    import sejax
+    from sejax import envs
+    from sejax.agents.hparams import make_varied_agents
+    from sejax.agents.trainer import make_trainer
+    from sejax.proxies.synthetic import make_synthetic
+
+    size = args.agent_size
+    config = sejax.config([*OVERRIDES, f"agent.hidden_size={size}", f"agent.batch_size={size}",
+                           "agent.num_layers=2", f"training.max_steps={args.steps}"])  # fmt: skip
+    task = envs.make("cartpole")
+    env = make_synthetic(task, config.proxy)
+    params = env.params(env.init_weights(jax.random.key(args.seed)))
+    varied = make_varied_agents(config.agent, task, config.exploration)
+    trainers = [make_trainer(agent, env, config.training) for agent in varied.agents]
+
+    def train_varied(key: Any, values: Any) -> Any:
+        hparams = varied.hparams(values)
+        return jax.lax.switch(
+            varied.branch(values),
+            [lambda key, hparams, t=t: t(key, params, hparams).train_steps for t in trainers],
+            key, hparams,
+        )  # fmt: skip
+
+    key = jax.random.key(args.seed)
+    started = time.time()
+    program = jax.jit(train_varied).lower(key, varied.draw(key)).compile()
+    compile_s = time.time() - started
+
+    def handle(request: dict[str, Any]) -> dict[str, Any]:
+        key = jax.random.fold_in(jax.random.key(args.seed), request["number"])
+        values = varied.draw(key)
+        plain = {name: float(x) for name, x in values.items()}
+        sizes = {name: round(x) for name, x in plain.items() if name != "learning_rate"}
+        changes: dict[str, Any] = {**sizes, "learning_rate": plain["learning_rate"]}
+        agent = sejax.make_agent(dataclasses.replace(config.agent, **changes), task)
+        train = make_trainer(agent, env, config.training)
+        alone = jax.jit(lambda key: train(key, params).train_steps).lower(key).compile()
+        jax.block_until_ready((program(key, values), alone(key)))
+        seconds = {}
+        for name, run in (
+            ("varied_s", lambda: program(key, values)),
+            ("alone_s", lambda: alone(key)),
+        ):
+            _, times = common.measure(lambda run=run: jax.block_until_ready(run()))
+            seconds[name] = times["cpu_s"]
+        return {**plain, **seconds}
+
+    common.serve({"compile_s": compile_s}, handle)
+
+
+def show(samples: list[dict[str, Any]], ratio: float, compile_s: float) -> None:
+    """Prints the table."""
+    rows = [
+        [f"{s['batch_size']:.0f}", f"{s['hidden_size']:.0f}", f"{s['num_layers']:.0f}",
+         f"{s['varied_s']:.2f}", f"{s['alone_s']:.2f}", f"{s['varied_s'] / s['alone_s']:.2f}"]
+        for s in samples
+    ]  # fmt: skip
+    columns = ["batch", "hidden", "layers", "varying program, CPU s", "alone, CPU s", "ratio"]
+    common.print_table("Trainings with drawn hyperparameters, one core", columns, rows)
+    print(f"Summed: {ratio:.2f}. The program that varies compiled in {compile_s:.0f} s.")
+
+
+if __name__ == "__main__":
+    main()
