@@ -25,7 +25,7 @@ from sejax.agents.configs import AgentConfig, ExplorationConfig, QLearningConfig
 from sejax.agents.registry import make_agent
 from sejax.envs import Task
 
-# Of neighbouring hidden sizes, i.e. how much room a network may have to spare: with one hidden layer
+# Of neighbouring hidden sizes: how much room a network may have to spare. With one hidden layer
 # the cost grows with the size, with more of them with its square.
 _SIZE_RATIO, _SIZE_RATIO_DEEP = 1.5, 1.25
 _MULTIPLE = 8  # vector width of a CPU
