@@ -7,6 +7,7 @@ of the summed CPU times; each draw's ratio is in the table.
 """
 
 import argparse
+import functools
 import os
 import time
 from typing import Any
@@ -23,9 +24,10 @@ def main() -> None:
         os.sched_setaffinity(0, {args.core})
         serve(args)
         return
-    draws = args.draws or (4 if args.quick else 16)
+    draws = args.draws or (3 if args.quick else 16)
     options = ("--steps", args.steps, "--core", args.core, "--seed", args.seed,
-               "--agent-size", args.agent_size or (32 if args.quick else 128))  # fmt: skip
+               "--agent-size", args.agent_size or (32 if args.quick else 128),
+               "--agent-layers", 1 if args.quick else 2)  # fmt: skip
     with common.Side(__file__, "sejax", *options) as side:
         compile_s = side.ready["compile_s"]
         samples = [side.ask(number=number) for number in range(draws)]
@@ -37,10 +39,11 @@ def main() -> None:
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Options of this benchmark."""
-    parser.add_argument("--draws", type=int, help="agents (4 if --quick, else 16)")
+    parser.add_argument("--draws", type=int, help="agents (3 if --quick, else 16)")
     parser.add_argument("--steps", type=int, default=2000, help="of each training")
     parser.add_argument("--agent-size", type=int, help="hidden and batch size that ranges surround "
                         "(32 if --quick, else 128)")  # fmt: skip
+    parser.add_argument("--agent-layers", type=int, default=2, help="that ranges surround")
     parser.add_argument("--core", type=int, default=common.available_cores()[-1])
 
 
@@ -60,8 +63,10 @@ def serve(args: argparse.Namespace) -> None:
     from sejax.proxies.synthetic import make_synthetic
 
     size = args.agent_size
-    config = sejax.config([*OVERRIDES, f"agent.hidden_size={size}", f"agent.batch_size={size}",
-                           "agent.num_layers=2", f"training.max_steps={args.steps}"])  # fmt: skip
+    config = sejax.config([
+        *OVERRIDES, f"agent.hidden_size={size}", f"agent.batch_size={size}",
+        f"agent.num_layers={args.agent_layers}", f"training.max_steps={args.steps}",
+    ])  # fmt: skip
     task = envs.make("cartpole")
     env = make_synthetic(task, config.proxy)
     params = env.params(env.init_weights(jax.random.key(args.seed)))
@@ -91,16 +96,19 @@ def serve(args: argparse.Namespace) -> None:
         train = make_trainer(agent, env, config.training)
         alone = jax.jit(lambda key: train(key, params).train_steps).lower(key).compile()
         jax.block_until_ready((program(key, values), alone(key)))
+        runs = {"varied_s": (program, key, values), "alone_s": (alone, key)}
         seconds = {}
-        for name, run in (
-            ("varied_s", lambda: program(key, values)),
-            ("alone_s", lambda: alone(key)),
-        ):
-            _, times = common.measure(lambda run=run: jax.block_until_ready(run()))
+        for name, (run, *inputs) in runs.items():
+            _, times = common.measure(functools.partial(wait_for, run, *inputs))
             seconds[name] = times["cpu_s"]
         return {**plain, **seconds}
 
     common.serve({"compile_s": compile_s}, handle)
+
+
+def wait_for(program: Any, *inputs: Any) -> None:
+    """Runs a compiled program to its end."""
+    program(*inputs).block_until_ready()
 
 
 def show(samples: list[dict[str, Any]], ratio: float, compile_s: float) -> None:

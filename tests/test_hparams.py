@@ -10,7 +10,7 @@ import pytest
 from jax.flatten_util import ravel_pytree
 
 from sejax import envs
-from sejax.agents.blocks import BLOCK_SIZE, sum_over_batch
+from sejax.agents.blocks import block_size, sum_over_batch
 from sejax.agents.configs import DDQNConfig, DuelingDDQNConfig, ExplorationConfig, QLearningConfig
 from sejax.agents.ddqn import make_ddqn, q_network
 from sejax.agents.hparams import (
@@ -169,7 +169,7 @@ def test_a_layer_norm_sees_only_the_units_in_use():
 # --- blocks of a batch ---------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("batch_size", [1, BLOCK_SIZE, BLOCK_SIZE + 1, 100])
+@pytest.mark.parametrize("batch_size", [1, block_size(100), block_size(100) + 1, 100])
 def test_a_sum_over_blocks_is_the_sum_over_the_columns_in_use(batch_size):
     values = jnp.arange(100.0)
     batch = {"x": jnp.stack([values, 2 * values]), "weight": values < batch_size, "scale": 3.0}

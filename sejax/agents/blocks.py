@@ -7,7 +7,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-BLOCK_SIZE = 64  # columns; small enough to waste little, large enough to be worth a loop iteration
+_NUM_BLOCKS, _MIN_SIZE = 6, 32  # enough to waste little, large enough to be worth an iteration
+_MULTIPLE = 8  # vector width of a CPU
+
+
+def block_size(width: int) -> int:
+    """Columns in a block of a batch that has room for `width`."""
+    return max(_MIN_SIZE, -(-width // (_NUM_BLOCKS * _MULTIPLE)) * _MULTIPLE)
 
 
 def sum_over_batch(fn: Callable[[Any], Array], batch: Any, batch_size: Array | None) -> Array:
@@ -25,7 +31,8 @@ def sum_over_batch(fn: Callable[[Any], Array], batch: Any, batch_size: Array | N
     if batch_size is None:
         return fn(batch)
     width = max(x.shape[-1] for x in jax.tree.leaves(batch) if jnp.ndim(x))
-    padded = -(-width // BLOCK_SIZE) * BLOCK_SIZE
+    size = block_size(width)
+    padded = -(-width // size) * size
 
     def pad(x: Array) -> Array:
         missing = [(0, 0)] * (jnp.ndim(x) - 1) + [(0, padded - width)]
@@ -37,10 +44,10 @@ def sum_over_batch(fn: Callable[[Any], Array], batch: Any, batch_size: Array | N
         def cut(x: Array) -> Array:
             if not jnp.ndim(x):
                 return x
-            return jax.lax.dynamic_slice_in_dim(x, index * BLOCK_SIZE, BLOCK_SIZE, axis=-1)
+            return jax.lax.dynamic_slice_in_dim(x, index * size, size, axis=-1)
 
         return fn(jax.tree.map(cut, batch))
 
-    num_blocks = jnp.ceil(batch_size / BLOCK_SIZE).astype(jnp.int32)
+    num_blocks = jnp.ceil(batch_size / size).astype(jnp.int32)
     zero = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(block, num_blocks))
     return jax.lax.fori_loop(0, num_blocks, lambda i, total: total + block(i), zero)
