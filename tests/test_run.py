@@ -149,7 +149,7 @@ def test_ctrl_c_saves_and_exits_130(tmp_path):
     process = start(*TINY, "generations=100000", f"run_dir={tmp_path}")
     wait_for_rows(tmp_path, 2, process)
     process.send_signal(signal.SIGINT)
-    out, err = process.communicate(timeout=30)
+    out, err = process.communicate(timeout=120)
     assert process.returncode == 130, err
     assert "are saved in" in out
     assert (tmp_path / "proxy.safetensors").exists()
