@@ -9,8 +9,8 @@ import pytest
 
 from sejax import envs
 from sejax.agents.configs import QLearningConfig, SARSAConfig
+from sejax.agents.epsilon_greedy import decayed_epsilon
 from sejax.agents.replay import Transition
-from sejax.agents.schedules import decayed_epsilon
 from sejax.agents.tabular import TabularHparams, entry_of, make_q_learning, make_sarsa, mask_of
 from sejax.agents.trainer import make_tester, make_trainer
 from sejax.configs import TrainingConfig

@@ -5,7 +5,7 @@ tables; `reference_details.md` 4.1 and 4.2.
 """
 
 import functools
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -18,9 +18,9 @@ from jaxtyping import Array, Float
 from sejax.agents.agent import Agent, hparams_of
 from sejax.agents.blocks import sum_over_batch
 from sejax.agents.configs import DDQNConfig, DuelingDDQNConfig
+from sejax.agents.epsilon_greedy import decayed_epsilon, epsilon_greedy
 from sejax.agents.memory import replay_memory
 from sejax.agents.replay import Transition, num_columns
-from sejax.agents.schedules import decayed_epsilon
 from sejax.networks import MLP, DuelingMLP, narrow
 
 
@@ -85,13 +85,10 @@ def make_ddqn(config: DDQNConfig, obs_dim: int, num_actions: int) -> Agent:
         return state.replace(epsilon=epsilon)
 
     def act(key: Array, state: DDQNState, obs: Float[Array, " obs_dim"], explore: bool) -> Array:
-        greedy = jnp.argmax(network.apply(unravel(state.params), obs)).astype(jnp.int32)
+        q_values: Any = network.apply(unravel(state.params), obs)
         if not explore:
-            return greedy
-        bits = jax.random.bits(key, (2,))
-        random_action = (bits[0] % jnp.uint32(num_actions)).astype(jnp.int32)
-        uniform = (bits[1] >> 8).astype(jnp.float32) * jnp.float32(2**-24)
-        return jnp.where(uniform < state.epsilon, random_action, greedy)
+            return jnp.argmax(q_values).astype(jnp.int32)
+        return epsilon_greedy(key, q_values, state.epsilon)
 
     def sum_of_losses(params, target_params, discount, batch: Transition) -> Array:
         q_values = network.apply(params, batch.obs)  # [actions, batch]

@@ -14,11 +14,11 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Float, Int
 
-from sejax.agents.agent import Agent
+from sejax.agents.agent import Agent, hparams_of
 from sejax.agents.configs import QLearningConfig, SARSAConfig
+from sejax.agents.epsilon_greedy import decayed_epsilon, epsilon_greedy
 from sejax.agents.memory import no_memory
 from sejax.agents.replay import Transition
-from sejax.agents.schedules import decayed_epsilon
 
 # `(key, q_row [num_actions], epsilon) -> []`: what the next state is worth to the target.
 NextValue = Callable[[Array, Array, Array], Array]
@@ -130,22 +130,12 @@ def _make_tabular(
         begin_episode=begin_episode,
         act=act,
         update=update,
-        hparams=TabularHparams(**{f: getattr(config, f) for f in TabularHparams._fields}),
+        hparams=hparams_of(TabularHparams, config),
         memory=no_memory(),
         init_episodes=config.init_episodes,
         learns_from=config.init_episodes,
         cpu_lanes=None,
     )
-
-
-def epsilon_greedy(
-    key: Array, q_row: Float[Array, " num_actions"], epsilon: Array
-) -> Int[Array, ""]:
-    """A uniform action with probability epsilon, else the first of the best."""
-    bits = jax.random.bits(key, (2,))
-    random_action = (bits[0] % jnp.uint32(q_row.shape[0])).astype(jnp.int32)
-    uniform = (bits[1] >> 8).astype(jnp.float32) * jnp.float32(2**-24)
-    return jnp.where(uniform < epsilon, random_action, jnp.argmax(q_row).astype(jnp.int32))
 
 
 # Tables are read by index and written by mask. In lanes on a CPU, reading by a mask over the whole

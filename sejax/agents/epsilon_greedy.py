@@ -1,0 +1,29 @@
+"""Random actions now and then, fewer from episode to episode."""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+
+def decayed_epsilon(
+    init: Array | float, minimum: Array | float, decay: Array | float, episode: Array
+) -> Array:
+    """Share of random actions in an episode, counted from 0, `[]` float32.
+
+    It is `init` in episode 0, even where that is less than `minimum`, and
+    `max(init * decay**episode, minimum)` afterwards.
+
+    Source: `reference_details.md` 3.4.
+    """
+    epsilon = jnp.maximum(init * decay**episode, minimum)
+    return jnp.where(episode == 0, init, epsilon)
+
+
+def epsilon_greedy(
+    key: Array, q_row: Float[Array, " num_actions"], epsilon: Array
+) -> Int[Array, ""]:
+    """A uniform action with probability epsilon, else the first of the best."""
+    bits = jax.random.bits(key, (2,))
+    random_action = (bits[0] % jnp.uint32(q_row.shape[0])).astype(jnp.int32)
+    uniform = (bits[1] >> 8).astype(jnp.float32) * jnp.float32(2**-24)
+    return jnp.where(uniform < epsilon, random_action, jnp.argmax(q_row).astype(jnp.int32))
