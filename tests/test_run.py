@@ -32,10 +32,16 @@ def command(*overrides: str, timeout: float = 120) -> subprocess.CompletedProces
     )  # fmt: skip
 
 
+def _hear_ctrl_c() -> None:
+    """A shell's background jobs, such as a test run may be, ignore it; what they start does too."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
 def start(*overrides: str) -> subprocess.Popen[str]:
     return subprocess.Popen(
         [sys.executable, "-m", "sejax.run", *overrides],
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=_environment(),
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        preexec_fn=_hear_ctrl_c, env=_environment(),
     )  # fmt: skip
 
 
@@ -149,7 +155,7 @@ def test_ctrl_c_saves_and_exits_130(tmp_path):
     process = start(*TINY, "generations=100000", f"run_dir={tmp_path}")
     wait_for_rows(tmp_path, 2, process)
     process.send_signal(signal.SIGINT)
-    out, err = process.communicate(timeout=120)
+    out, err = process.communicate(timeout=60)
     assert process.returncode == 130, err
     assert "are saved in" in out
     assert (tmp_path / "proxy.safetensors").exists()
