@@ -1,0 +1,188 @@
+"""Sets of learned SEs of one task in one file: what `--ses FILE` of the experiments reads.
+
+The tensors are those of one SE with a leading axis over the SEs, in safetensors. The metadata holds
+the format version, the configuration that all were learned with, and of each SE its score,
+generation and seed. Nothing in it is executed when it is read.
+"""
+
+import dataclasses
+import hashlib
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from flax.traverse_util import flatten_dict, unflatten_dict
+from safetensors import SafetensorError, safe_open
+from safetensors.numpy import save_file
+
+from sejax import envs
+from sejax.configs import LearnConfig, from_dict, to_dict
+from sejax.errors import ConfigError, require
+from sejax.files import atomic_path
+from sejax.proxies import io as proxy_io
+from sejax.proxies.synthetic import SyntheticEnv, SyntheticParams, make_synthetic
+
+FORMAT_VERSION = 1
+
+
+@dataclass(frozen=True, kw_only=True)
+class SESet:
+    """SEs that share a configuration, and hence every compiled program.
+
+    Attributes:
+      env: the SE; its weights are what differs.
+      weights: leaves `[num_ses, ...]`, NumPy float32.
+      scores: `[num_ses]` incumbent mean that each was chosen for.
+      generations: `[num_ses]` outer iteration that measured it.
+      seeds: `[num_ses]` seed of the run that it came from.
+      config: that the SEs were learned with; its seed is the first run's.
+      path: the file.
+    """
+
+    env: SyntheticEnv
+    weights: Any
+    scores: np.ndarray
+    generations: np.ndarray
+    seeds: np.ndarray
+    config: LearnConfig
+    path: Path
+
+    @property
+    def task(self) -> envs.Task:
+        return self.env.task
+
+    @property
+    def num_ses(self) -> int:
+        return len(self.scores)
+
+    @property
+    def params(self) -> SyntheticParams:
+        """All SEs as one `EnvParams`; only `weights` has the leading axis."""
+        return self.env.params(self.weights)
+
+    def one(self, index: int) -> SyntheticParams:
+        """`EnvParams` of one SE."""
+        return self.env.params(jax.tree.map(lambda x: x[index], self.weights))
+
+    def fingerprint(self, index: int) -> str:
+        """Eight letters that tell one SE's weights from another's."""
+        flat = flatten_dict(self.one(index).weights, sep="/")
+        content = b"".join(np.ascontiguousarray(flat[name]).tobytes() for name in sorted(flat))
+        return hashlib.sha256(content).hexdigest()[:8]
+
+    def first(self, count: int | None) -> "SESet":
+        """The first SEs of the set: those of the first runs, whatever their score."""
+        return dataclasses.replace(
+            self,
+            weights=jax.tree.map(lambda x: x[:count], self.weights),
+            scores=self.scores[:count],
+            generations=self.generations[:count],
+            seeds=self.seeds[:count],
+        )
+
+
+def save_set(
+    path: str | Path,
+    config: LearnConfig,
+    weights: Sequence[Any],
+    scores: Sequence[float],
+    generations: Sequence[int],
+    seeds: Sequence[int],
+) -> None:
+    """Writes a set atomically.
+
+    Args:
+      path: the file, `*.safetensors`.
+      config: the configuration that all were learned with.
+      weights: of each SE, as from `SyntheticEnv.init_weights`.
+      scores: of each SE, its incumbent mean.
+      generations: of each SE, the outer iteration that measured it.
+      seeds: of each SE, its run's seed.
+
+    Raises:
+      OSError: if it cannot be written; an older file stays as it was.
+    """
+    header = {
+        "format_version": FORMAT_VERSION,
+        "config": to_dict(config) | {"run_dir": None},  # no path of the machine that made it
+        "scores": [float(x) for x in scores],
+        "generations": [int(x) for x in generations],
+        "seeds": [int(x) for x in seeds],
+    }
+    flat = [flatten_dict(one, sep="/") for one in weights]
+    tensors = {name: np.stack([np.asarray(one[name], np.float32) for one in flat])
+               for name in flat[0]}  # fmt: skip
+    with atomic_path(Path(path)) as temporary:
+        save_file(tensors, temporary, metadata={"sejax_set": json.dumps(header)})
+
+
+def load_set(source: str | Path, option: str = "--ses") -> SESet:
+    """Loads a set of SEs; a single stored proxy is a set of one.
+
+    Args:
+      source: a file of `save_set`, or whatever `sejax.load` takes.
+      option: named in error messages.
+
+    Raises:
+      ConfigError: if there is no such file, or it is damaged or of another format.
+    """
+    if not Path(source).is_file():
+        return _set_of_one(source)
+    path = Path(source)
+    try:
+        with safe_open(path, framework="np") as file:
+            header = dict(file.metadata() or {})
+            if "sejax_set" not in header:
+                return _set_of_one(path)
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+        stored = json.loads(header["sejax_set"])
+        config = from_dict(stored["config"])
+        columns = [np.asarray(stored[name]) for name in ("scores", "generations", "seeds")]
+    except (SafetensorError, OSError, KeyError, ValueError) as error:
+        raise ConfigError(
+            f"{option} must be a whole file of SEs that sejax has written, because weights are "
+            f"read from it; got {path}, which is damaged ({error}). Run sejax.experiments."
+            f"se_feasibility again, which writes it."
+        ) from error
+    require(stored.get("format_version") == FORMAT_VERSION, option,
+            f"be of format {FORMAT_VERSION}", "this version of sejax reads no other",
+            stored.get("format_version"), f"{option} to a file of this version")  # fmt: skip
+    env = make_synthetic(envs.make(config.env.name), config.proxy)
+    _check_shapes(path, option, env, tensors, [len(column) for column in columns])
+    weights = unflatten_dict({tuple(name.split("/")): x for name, x in tensors.items()})
+    scores, generations, seeds = columns
+    return SESet(env=env, weights=weights, scores=scores, generations=generations, seeds=seeds,
+                 config=config, path=path)  # fmt: skip
+
+
+def _set_of_one(source: str | Path) -> SESet:
+    proxy = proxy_io.load_proxy(source)
+    stored = proxy.metadata
+    return SESet(
+        env=proxy.env,
+        weights=jax.tree.map(lambda x: np.asarray(x)[None], proxy.params.weights),
+        scores=np.array([stored.get("score", np.nan)]),
+        generations=np.array([stored.get("generation", -1)]),
+        seeds=np.array([stored.get("seed", -1)]),
+        config=proxy.config,
+        path=proxy.path,
+    )
+
+
+def _check_shapes(
+    path: Path, option: str, env: SyntheticEnv, tensors: dict[str, np.ndarray], counts: list[int]
+) -> None:
+    expected = flatten_dict(jax.eval_shape(env.init_weights, jax.random.key(0)), sep="/")
+    wanted = {name: (counts[0], *x.shape) for name, x in expected.items()}
+    shapes = {name: x.shape for name, x in tensors.items()}
+    if shapes != wanted or len(set(counts)) > 1 or counts[0] < 1:
+        raise ConfigError(
+            f"{option} must hold the tensors of the network in its metadata for each SE, because "
+            f"they are its weights; {path} has {shapes} in place of {wanted}, and {counts} "
+            f"scores, generations and seeds. Learn the SEs again with sejax.experiments."
+            f"se_feasibility."
+        )
