@@ -91,9 +91,10 @@ def _learn_in(directory: Any, progress: Any) -> float:
         generation += length
         host_state, info = jax.device_get((state, info))
         wall_s = wall_before + time.time() - started
-        directory.add_rows(info, wall_s)
-        directory.save_proxies(program, host_state)
-        checkpoints.save(directory.checkpoints, generation, state)
+        with commands.interrupts_held():
+            directory.add_rows(info, wall_s)
+            directory.save_proxies(program, host_state)
+            checkpoints.save(directory.checkpoints, generation, state)
         progress.update(generation, info)
         if progress.time_to_draw():
             _draw(directory, program)

@@ -12,7 +12,7 @@ import pytest
 import yaml
 
 import sejax
-from sejax import checkpoints, run
+from sejax import checkpoints, commands, run
 from sejax.errors import ConfigError
 from sejax.run_directory import COLUMNS, RunDirectory
 
@@ -32,16 +32,17 @@ def command(*overrides: str, timeout: float = 120) -> subprocess.CompletedProces
     )  # fmt: skip
 
 
-def _hear_ctrl_c() -> None:
-    """A shell's background jobs, such as a test run may be, ignore it; what they start does too."""
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
+# A shell's background jobs, such as a test run may be, ignore Ctrl-C, and what they start does too.
+HEARS_CTRL_C = (
+    "import runpy, signal; signal.signal(signal.SIGINT, signal.default_int_handler); "
+    "runpy.run_module('sejax.run', run_name='__main__', alter_sys=True)"
+)
 
 
 def start(*overrides: str) -> subprocess.Popen[str]:
     return subprocess.Popen(
-        [sys.executable, "-m", "sejax.run", *overrides],
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-        preexec_fn=_hear_ctrl_c, env=_environment(),
+        [sys.executable, "-c", HEARS_CTRL_C, *overrides],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=_environment(),
     )  # fmt: skip
 
 
@@ -159,6 +160,15 @@ def test_ctrl_c_saves_and_exits_130(tmp_path):
     assert process.returncode == 130, err
     assert "are saved in" in out
     assert (tmp_path / "proxy.safetensors").exists()
+
+
+def test_an_interrupt_waits_until_files_are_written():
+    written = []
+    with pytest.raises(KeyboardInterrupt), commands.interrupts_held():
+        signal.raise_signal(signal.SIGINT)
+        written.append("all")
+    assert written == ["all"]
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
 def test_another_configuration_in_the_same_directory_is_refused(uninterrupted):
