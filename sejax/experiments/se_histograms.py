@@ -17,6 +17,7 @@ not what the agents do in it.
 
 import argparse
 import dataclasses
+import functools
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -107,13 +108,14 @@ def run(args: argparse.Namespace) -> pd.DataFrame:
     pieces = common.Pieces(args.out / "pieces")
     tables = []
     for kind in args.agents:
-        agent = AGENT_CONFIGS[kind](**(QUICK_AGENT if args.quick else {}))
+        changes: dict[str, Any] = QUICK_AGENT if args.quick else {}
+        agent = AGENT_CONFIGS[kind](**changes)
         require_fit(agent, ses.config.exploration, ses.task.name)
         training = training_of(args, ses, agent)
         settings = {"proxy": ses.fingerprint(0), "num_agents": args.num_agents,
                     "max_rows": args.max_rows, "agent": vars(agent), "training": vars(training),
                     "seed": args.seed}  # fmt: skip
-        rows = pieces.compute(kind, settings, lambda a=agent, t=training: record(args, ses, a, t))
+        rows = pieces.compute(kind, settings, functools.partial(record, args, ses, agent, training))
         print(f"{kind}: mean return {test_returns(rows).mean():.1f}, {len(rows):,} transitions",
               flush=True)  # fmt: skip
         tables.append(rows.assign(kind=kind))

@@ -1,0 +1,654 @@
+"""Do models fitted to real transitions train agents as SEs do: the supervised baseline.
+
+Source: paper, appendix "Supervised Learning and Synthetic Environments", subsection "Comparing
+Supervised Learning with Synthetic Environments on CartPole"; `reference_details.md` 7.5.
+
+1. `--models` NES runs, with the settings that the SE was learned with and `--population` members.
+   All real test episodes of their agents, those of members and of incumbents, are recorded, and
+   `--max-rows` transitions of each run are drawn from them.
+2. A model with the SE's architecture is fitted to each run's transitions: Adam on the mean squared
+   error of [s', r]. In the authors' code nobody fitted the network for the end of an episode; it
+   kept its random weights. Here it is fitted too (mean squared error, 1 where the episode
+   terminated, else 0). The three networks share nothing, so that one fit gives both models:
+   `as the authors` has the random weights of that network, `fair` the fitted ones and ends an
+   episode, and its return, where they say so.
+3. On each model, and on the SE, agents are trained and tested on the real task.
+
+Differs: the paper fits to all transitions of a run and not to a part of them. Its agents stop by
+the plateau rule; here they train as long as those that the SE was learned with. That may be too
+short for any agent on the real task itself: `--max-steps` gives those on the models more time.
+"""
+
+import argparse
+import dataclasses
+import functools
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from sejax import commands
+from sejax.errors import ConfigError, require, unknown_name
+from sejax.experiments import common
+
+NAME = "supervised_baseline"
+AGENTS = ("ddqn", "dueling_ddqn", "td3_discrete")
+HPARAMS = ("varied", "default")
+LEARNING_RATE, BATCH_SIZE = 1e-4, 1024  # paper and reference_details.md 7.5
+BEST = 2  # models in the paper's second figure
+
+QUICK_AGENT = {"hidden_size": 8, "num_layers": 1, "batch_size": 8, "init_episodes": 1}
+QUICK_STEPS = 1500
+# Of each option: in full, quick.
+DEFAULTS = {"models": (5, 2), "generations": (25, 3), "population": (16, 3),
+            "max_rows": (100_000, 3000), "epochs": (100, 20), "num_agents": (20, 2)}  # fmt: skip
+
+LABELS = {"authors": "model, as the authors", "authors_best": f"model, as the authors, best {BEST}",
+          "fair": "model, fair", "se": "SE"}  # fmt: skip
+# Paper, the same subsection, "Result": mean test returns of DDQN agents with drawn hyperparameters.
+PAPER = {
+    ("authors", "ddqn", "varied"): "15.01",
+    ("authors_best", "ddqn", "varied"): "17.73",
+    ("se", "ddqn", "varied"): "190.7",
+}
+
+
+def main() -> None:
+    """Runs the experiment as the command line says."""
+    args = common.parse_args(NAME, __doc__, add_options)
+    try:
+        run(args)
+    except ConfigError as error:
+        commands.fail(str(error), commands.BAD_INPUT)
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Options of this experiment."""
+    parser.add_argument("--proxy", default="cartpole", help="SE to compare with; the NES runs "
+                        "have its settings; run directory, file or name; cartpole")  # fmt: skip
+    parser.add_argument("--models", type=int, help="NES runs, and a model for each; 5, quick 2")
+    parser.add_argument("--generations", type=int, help="of an NES run; 25, quick 3")
+    parser.add_argument("--population", type=int, help="members of a generation; 16, quick 3")
+    parser.add_argument("--max-rows", type=int, help="transitions for a model; 100000, quick 3000")
+    parser.add_argument("--epochs", type=int, help="of a fit; 100, quick 20")
+    parser.add_argument("--agents", nargs="+", default=["ddqn"], metavar="AGENT",
+                        help=f"{', '.join(AGENTS)}; ddqn")  # fmt: skip
+    parser.add_argument("--num-agents", type=int, help="for each model; 20, quick 2")
+    parser.add_argument("--test-episodes", type=int, default=10, help="of each agent; 10")
+    parser.add_argument("--max-steps", type=int, help="training steps of an agent on a model; as "
+                        "on the SE")  # fmt: skip
+
+
+def fill_in(args: argparse.Namespace) -> None:
+    """Sets the options that were not given.
+
+    Raises:
+      ConfigError: for an unknown agent or a number out of range.
+    """
+    for name, values in DEFAULTS.items():
+        if getattr(args, name) is None:
+            setattr(args, name, values[args.quick])
+        option = f"--{name.replace('_', '-')}"
+        least = 2 if name == "population" else 1
+        require(getattr(args, name) >= least, option, f"be at least {least}", "it counts",
+                getattr(args, name), f"{option}={values[0]}")  # fmt: skip
+    for name in ("test_episodes", "max_steps"):
+        option, value = f"--{name.replace('_', '-')}", getattr(args, name)
+        require(value is None or value >= 1, option, "be at least 1", "it counts", value,
+                f"{option}=10")  # fmt: skip
+    for kind in args.agents:
+        if kind not in AGENTS:
+            raise unknown_name("--agents", kind, AGENTS)
+
+
+def run(args: argparse.Namespace) -> pd.DataFrame:
+    """Computes what is missing, writes everything and returns the table.
+
+    Raises:
+      ConfigError: for a proxy or settings that cannot work.
+    """
+    fill_in(args)
+    from sejax.experiments.se_sets import load_set
+
+    ses = load_set(args.proxy, "--proxy").first(1)
+    require(ses.task.num_states is None and ses.task.num_actions is not None, "--proxy",
+            "be an SE with vector states and discrete actions", "the agents are made for these",
+            f"one of {ses.task.name}", "--proxy=cartpole")  # fmt: skip
+    pieces = common.Pieces(args.out / "pieces")
+    data = [collect_piece(args, ses, index, pieces) for index in range(args.models)]
+    fits = fit_piece(args, ses, data, pieces)
+    worlds = make_worlds(args, ses)
+    tables = [
+        train_all(args, world, kind, hparams, pieces).assign(world=name, kind=kind, hparams=hparams)
+        for kind in args.agents
+        for hparams in HPARAMS
+        for name, world in worlds.items()
+    ]
+    agents = with_best(pd.concat(tables, ignore_index=True), quality(data))
+    return report(args, ses.task, data, fits, agents)
+
+
+# The transitions.
+
+
+def learning_config(args: argparse.Namespace, ses: Any) -> Any:
+    """Settings of the NES runs that the transitions come from."""
+    config = ses.config
+    agent = config.agent
+    training = dataclasses.replace(config.training, test_episodes=args.test_episodes)
+    if args.quick:
+        agent = dataclasses.replace(agent, **QUICK_AGENT)
+        training = dataclasses.replace(training, max_steps=QUICK_STEPS)
+    es = dataclasses.replace(config.es, population_size=args.population,
+                             num_incumbent_evals=args.population)  # fmt: skip
+    return dataclasses.replace(config, agent=agent, training=training, es=es, devices=args.devices)
+
+
+def collect_piece(
+    args: argparse.Namespace, ses: Any, index: int, pieces: common.Pieces
+) -> pd.DataFrame:
+    """The transitions of one NES run."""
+    from sejax.configs import to_dict
+
+    config = learning_config(args, ses)
+    settings = to_dict(config) | {"generations": args.generations, "max_rows": args.max_rows,
+                                  "seed": args.seed + index, "devices": None}  # fmt: skip
+    rows = pieces.compute(
+        f"transitions-{index}", settings,
+        lambda: collect(config, args.seed + index, args.generations, args.max_rows),
+    )  # fmt: skip
+    print(f"NES run {index}: {len(rows):,} transitions of episodes with mean return "
+          f"{rows['return'].mean():.1f}", flush=True)  # fmt: skip
+    return rows
+
+
+def collect(config: Any, seed: int, generations: int, max_rows: int) -> pd.DataFrame:
+    """Runs NES and draws transitions, all equally likely, from its agents' real test episodes."""
+    import jax
+
+    from sejax.es import make_strategy
+    from sejax.objectives import make_objective
+
+    env, unravel, mean = make_proxy(config, seed)
+    strategy = make_strategy(config.es, mean.size)
+    evaluate = make_recorded_evaluation(config, env, unravel)
+    objective = make_objective(config.objective, env.task.solved_reward)
+    key_es, key_run = jax.random.split(jax.random.key(seed))
+    state = jax.jit(strategy.init)(key_es, mean)
+    ask, tell = jax.jit(strategy.ask), jax.jit(strategy.tell)
+    rng = np.random.default_rng(seed)
+    sample = Sample(max_rows, rng)
+    for generation in range(generations):
+        key_ask, key_tell, key_inner = jax.random.split(jax.random.fold_in(key_run, generation), 3)
+        candidates, asked = ask(key_ask, state)
+        keys = jax.random.split(key_inner, strategy.num_candidates)
+        outcome, steps = evaluate(keys, candidates)
+        state = tell(key_tell, candidates, objective(outcome), asked)
+        sample.add(table_of(jax.device_get(steps), generation))
+    return sample.table
+
+
+def make_proxy(config: Any, seed: int) -> tuple[Any, Callable[[Any], Any], Any]:
+    """The SE of a configuration, its weights' form, and random ones to begin with, `[dims]`."""
+    import jax
+    from jax.flatten_util import ravel_pytree
+
+    from sejax import envs
+    from sejax.proxies.synthetic import make_synthetic
+
+    env = make_synthetic(envs.make(config.env.name), config.proxy)
+    mean, unravel = ravel_pytree(env.init_weights(jax.random.key(seed)))
+    return env, unravel, mean
+
+
+def make_recorded_evaluation(
+    config: Any, env: Any, unravel: Callable[[Any], Any]
+) -> Callable[..., Any]:
+    """Builds `evaluate(keys [n], candidates [n, dims]) -> (Outcome, transitions)`, leaves `[n]`."""
+    import jax
+    import jax.numpy as jnp
+
+    from sejax.agents.registry import make_agent
+    from sejax.agents.trainer import make_trainer
+    from sejax.experiments.se_histograms import make_test_recorder
+    from sejax.objectives import Outcome
+    from sejax.parallel import spread_over_devices
+
+    agent = make_agent(config.agent, env.task, config.exploration)
+    train = make_trainer(agent, env, config.training, env.task.solved_reward)
+    num_episodes = config.training.test_episodes
+    test = make_test_recorder(agent, env.task, num_episodes)
+
+    def one(key: Any, candidate: Any) -> Any:
+        key_train, key_test = jax.random.split(key)
+        result = train(key_train, env.params(unravel(candidate)))
+        steps = test(key_test, result.agent_state)
+        rewards = jnp.where(steps.valid, steps.reward, 0.0)
+        returns = rewards.reshape(num_episodes, -1).sum(axis=1)
+        outcome = Outcome(test_return=returns.mean(), train_steps=result.train_steps,
+                          train_episodes=result.episodes, nonfinite=result.nonfinite,
+                          real_steps=steps.valid.sum())  # fmt: skip
+        return outcome, (steps, jnp.repeat(returns, env.task.max_steps))
+
+    return jax.jit(spread_over_devices(one, config.devices, config.lanes, agent.cpu_lanes))
+
+
+def table_of(steps_and_returns: Any, generation: int) -> pd.DataFrame:
+    """The transitions that were made, a row each, with the return of their episode."""
+    steps, returns = steps_and_returns
+    valid = steps.valid
+    obs, next_obs = steps.obs[valid], steps.next_obs[valid]
+    columns = {f"state_{i}": obs[:, i] for i in range(obs.shape[1])}
+    columns |= {"action": steps.action[valid]}
+    columns |= {f"next_state_{i}": next_obs[:, i] for i in range(obs.shape[1])}
+    return pd.DataFrame(columns | {
+        "reward": steps.reward[valid], "terminated": steps.terminated[valid].astype(int),
+        "return": returns[valid], "generation": generation,
+    })  # fmt: skip
+
+
+class Sample:
+    """A uniform sample without replacement of all rows that were ever added."""
+
+    def __init__(self, size: int, rng: np.random.Generator):
+        self.size = size
+        self._rng = rng
+        self._rows: pd.DataFrame | None = None
+
+    def add(self, rows: pd.DataFrame) -> None:
+        """Every row draws a number, and those with the lowest numbers stay."""
+        rows = rows.assign(_drawn=self._rng.uniform(size=len(rows)))
+        rows = rows if self._rows is None else pd.concat([self._rows, rows], ignore_index=True)
+        self._rows = rows.nsmallest(self.size, "_drawn").reset_index(drop=True)
+
+    @property
+    def table(self) -> pd.DataFrame:
+        """The sample, in random order."""
+        return pd.DataFrame() if self._rows is None else self._rows.drop(columns="_drawn")
+
+
+def quality(data: list[pd.DataFrame]) -> list[float]:
+    """Mean return of the episodes that each model's transitions come from."""
+    return [float(rows["return"].mean()) for rows in data]
+
+
+# The models.
+
+
+def model_file(args: argparse.Namespace, variant: str) -> Path:
+    """Where the models of a variant are stored."""
+    return Path(args.out) / f"models-{variant}.safetensors"
+
+
+def fit_piece(
+    args: argparse.Namespace, ses: Any, data: list[pd.DataFrame], pieces: common.Pieces
+) -> pd.DataFrame:
+    """Fits all models, stores both variants of them, and returns the errors of each epoch."""
+    num_rows = min(len(rows) for rows in data)
+    settings = {"proxy": vars(ses.config.proxy), "models": args.models, "num_rows": num_rows,
+                "epochs": args.epochs, "learning_rate": LEARNING_RATE, "batch_size": BATCH_SIZE,
+                "generations": args.generations, "population": args.population,
+                "seed": args.seed}  # fmt: skip
+    fits = pieces.compute("fit", settings, lambda: fit_all(args, ses, data, num_rows))
+    last = fits[fits["epoch"] == args.epochs - 1].mean()
+    print(f"Models: mean squared error {last['error']:.2g} of [s', r], "
+          f"{last['done_error']:.2g} of the end", flush=True)  # fmt: skip
+    return fits
+
+
+def fit_all(
+    args: argparse.Namespace, ses: Any, data: list[pd.DataFrame], num_rows: int
+) -> pd.DataFrame:
+    """Fits a model to each run's transitions and writes the models; a row for each epoch."""
+    import jax
+
+    from sejax.parallel import spread_over_devices
+
+    arrays = [arrays_of(rows.iloc[:num_rows]) for rows in data]
+    stacked = tuple(np.stack(parts) for parts in zip(*arrays, strict=True))
+    keys = jax.random.split(jax.random.key(args.seed), args.models)
+    fit = make_fit(ses.env, num_rows, args.epochs)
+    program = jax.jit(spread_over_devices(fit, args.devices))
+    initial, fitted, errors = jax.device_get(program(keys, *stacked))
+    save_models(args, ses, {**fitted, "done": initial["done"]}, "authors", "soft")
+    save_models(args, ses, fitted, "fair", "threshold")
+    return pd.concat([
+        pd.DataFrame({"model": i, "epoch": range(args.epochs), "error": errors[i, :, 0],
+                      "done_error": errors[i, :, 1]})
+        for i in range(args.models)
+    ])  # fmt: skip
+
+
+def arrays_of(rows: pd.DataFrame) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """States `[n, obs_dim]`, actions `[n]`, targets [s', r] and ends `[n]`."""
+    states = [name for name in rows if name.startswith("state_")]
+    targets = [name for name in rows if name.startswith("next_state_")] + ["reward"]
+    return (
+        rows[states].to_numpy(np.float32),
+        rows["action"].to_numpy(np.int32),
+        rows[targets].to_numpy(np.float32),
+        rows["terminated"].to_numpy(np.float32),
+    )
+
+
+def make_fit(env: Any, num_rows: int, epochs: int) -> Callable[..., Any]:
+    """Builds `fit(key, states, actions, targets, ends) -> (initial, fitted, errors [epochs, 2])`.
+
+    The errors are means over an epoch, of [s', r] and of the end. What does not fill the last batch
+    of an epoch is left out of it; the order is drawn anew for each.
+    """
+    import jax
+    import jax.numpy as jnp
+    import optax
+
+    batch_size = min(BATCH_SIZE, num_rows)
+    num_batches = num_rows // batch_size
+    optimizer = optax.adam(LEARNING_RATE)
+
+    def errors_of(weights: Any, states: Any, actions: Any, targets: Any, ends: Any) -> Any:
+        state, reward, done = jax.vmap(env.predict, (None, 0, 0))(weights, states, actions)
+        predicted = jnp.concatenate([state, reward[:, None]], axis=1)
+        return jnp.stack([jnp.mean((predicted - targets) ** 2), jnp.mean((done - ends) ** 2)])
+
+    def loss(weights: Any, batch: Any) -> Any:
+        errors = errors_of(weights, *batch)
+        return errors.sum(), errors
+
+    def fit(key: Any, *data: Any) -> Any:
+        key_init, key_order = jax.random.split(key)
+        initial = env.init_weights(key_init)
+
+        def update(carry: Any, rows: Any) -> Any:
+            weights, opt_state = carry
+            batch = tuple(x[rows] for x in data)
+            gradient, errors = jax.grad(loss, has_aux=True)(weights, batch)
+            step, opt_state = optimizer.update(gradient, opt_state)
+            return (optax.apply_updates(weights, step), opt_state), errors
+
+        def epoch(carry: Any, key_epoch: Any) -> Any:
+            order = jax.random.permutation(key_epoch, num_rows)[: num_batches * batch_size]
+            carry, errors = jax.lax.scan(update, carry, order.reshape(num_batches, batch_size))
+            return carry, errors.mean(axis=0)
+
+        keys = jax.random.split(key_order, epochs)
+        (fitted, _), errors = jax.lax.scan(epoch, (initial, optimizer.init(initial)), keys)
+        return initial, fitted, errors
+
+    return fit
+
+
+def save_models(args: argparse.Namespace, ses: Any, weights: Any, variant: str, done: str) -> None:
+    """Stores the models of a variant, as SEs with their use of the done output."""
+    import jax
+
+    from sejax.experiments.se_sets import save_set
+
+    config = dataclasses.replace(ses.config, proxy=dataclasses.replace(ses.config.proxy, done=done))
+    each = [jax.tree.map(lambda x, i=i: x[i], weights) for i in range(args.models)]
+    seeds = [args.seed + i for i in range(args.models)]
+    save_set(model_file(args, variant), config, each, [float("nan")] * args.models,
+             [args.generations] * args.models, seeds)  # fmt: skip
+
+
+# The agents.
+
+
+@dataclass(frozen=True, kw_only=True)
+class World:
+    """What agents are trained in.
+
+    Attributes:
+      sets: the models, or the SE, as an `SESet`.
+      groups: groups of agents; the i-th trains on the i-th model, or on the SE.
+      is_model: whether these are models.
+    """
+
+    sets: Any
+    groups: int
+    is_model: bool
+
+    def one(self, group: int) -> tuple[Any, str]:
+        """`EnvParams` of a group's world, and the fingerprint of its weights."""
+        index = group % self.sets.num_ses
+        return self.sets.one(index), self.sets.fingerprint(index)
+
+
+def make_worlds(args: argparse.Namespace, ses: Any) -> dict[str, World]:
+    """The models of both variants and the SE, with as many agents on the SE as on all models."""
+    from sejax.experiments.se_sets import load_set
+
+    sets = {name: load_set(model_file(args, name), "--out") for name in ("authors", "fair")}
+    return {
+        name: World(sets=each, groups=args.models, is_model=each is not ses)
+        for name, each in (sets | {"se": ses}).items()
+    }
+
+
+def train_all(
+    args: argparse.Namespace, world: World, kind: str, hparams: str, pieces: common.Pieces
+) -> pd.DataFrame:
+    """Agents of one kind in a world, a row each; every group is a piece."""
+    from sejax.agents.configs import AGENT_CONFIGS
+    from sejax.evaluate import _as_learned
+
+    changes: dict[str, Any] = QUICK_AGENT if args.quick else {}
+    config = AGENT_CONFIGS[kind](**changes)
+    training = _as_learned(world.sets, config)
+    max_steps = QUICK_STEPS if args.quick else training.max_steps
+    if args.max_steps and world.is_model:
+        max_steps = args.max_steps
+    training = dataclasses.replace(training, test_episodes=args.test_episodes, max_steps=max_steps)
+    tables = []
+    for group in range(world.groups):
+        params, fingerprint = world.one(group)
+        settings = {"weights": fingerprint, "proxy": vars(world.sets.config.proxy),
+                    "agent": vars(config), "training": vars(training), "hparams": hparams,
+                    "num_agents": args.num_agents, "group": group, "seed": args.seed}  # fmt: skip
+        table = pieces.compute(
+            f"{kind}-{hparams}-{world.sets.path.stem}-{group}", settings,
+            functools.partial(train_group, args, world, config, training, hparams, params, group),
+        )  # fmt: skip
+        tables.append(table.assign(group=group))
+    agents = pd.concat(tables, ignore_index=True)
+    print(f"{kind}, {hparams} hyperparameters, {world.sets.path.stem}: mean return "
+          f"{agents['test_return'].mean():.1f}", flush=True)  # fmt: skip
+    return agents
+
+
+def train_group(
+    args: argparse.Namespace,
+    world: World,
+    config: Any,
+    training: Any,
+    hparams: str,
+    params: Any,
+    group: int,
+) -> pd.DataFrame:
+    """Trains and tests a group of agents; a row each. Groups draw the same in every world."""
+    import jax
+
+    program = make_program(config, world.sets.env, training, hparams, args.devices)
+    key = jax.random.fold_in(jax.random.key(args.seed), group)
+    outcome = jax.device_get(program(jax.random.split(key, args.num_agents), params))
+    returns = outcome.pop("returns").astype(float)
+    columns = {"agent": range(args.num_agents), "test_return": returns.mean(axis=1), **outcome}
+    columns |= {f"return_{i}": returns[:, i] for i in range(returns.shape[1])}
+    return pd.DataFrame(columns)
+
+
+@functools.cache
+def make_program(
+    config: Any, env: Any, training: Any, hparams: str, devices: int | None
+) -> Callable[..., Any]:
+    """Builds `program(keys [agent], env_params) -> outcome`, leaves `[agent, ...]`."""
+    import jax
+
+    from sejax.agents.configs import ExplorationConfig
+    from sejax.agents.registry import make_agent
+    from sejax.experiments import se_performance
+    from sejax.parallel import spread_over_devices
+
+    if hparams == "varied":
+        varied = se_performance.make_program(config, env, env.task, training, devices)
+        return lambda keys, params: varied(keys, params)[0]
+    agent = make_agent(config, env.task, ExplorationConfig())
+    evaluate = se_performance.make_branch(agent, env, env.task, training)
+
+    def program(keys: Any, params: Any) -> Any:
+        return spread_over_devices(lambda key: evaluate(key, params, agent.hparams), devices,
+                                   cpu_lanes=agent.cpu_lanes)(keys)  # fmt: skip
+
+    return jax.jit(program)
+
+
+# The results.
+
+
+def with_best(agents: pd.DataFrame, quality_of_models: list[float]) -> pd.DataFrame:
+    """Adds the models whose transitions come from the best episodes as a world of its own.
+
+    Differs: the paper takes two models most of whose samples come from episodes with a return of
+    190 at least; here it is the mean return, which ranks models of any task.
+    """
+    if len(quality_of_models) <= BEST:
+        return agents
+    best = np.argsort(quality_of_models)[-BEST:]
+    chosen = agents[(agents["world"] == "authors") & agents["group"].isin(best)]
+    return pd.concat([agents, chosen.assign(world="authors_best")], ignore_index=True)
+
+
+def return_columns(agents: pd.DataFrame) -> list[str]:
+    """Names of the columns that hold the return of one test episode."""
+    return [name for name in agents if name.startswith("return_")]
+
+
+def summarise(agents: pd.DataFrame, solved_reward: float) -> pd.DataFrame:
+    """Means over test episodes for each kind of agent, hyperparameters and world.
+
+    Intervals come from drawing models again, as agents of one model have much in common. All groups
+    of the SE share it: their intervals are those of drawing agents.
+    """
+    rows = []
+    for (kind, hparams, name), mine in agents.groupby(["kind", "hparams", "world"], sort=False):
+        independent = mine["test_return"]
+        if name != "se":
+            independent = mine.groupby("group")["test_return"].mean()
+        low, high = common.bootstrap_interval(independent)
+        rows.append({
+            "kind": kind, "hparams": hparams, "world": name, "num_agents": len(mine),
+            "return_mean": mine["test_return"].mean(),
+            "return_std": mine[return_columns(mine)].to_numpy().std(),
+            "return_low": low, "return_high": high,
+            "solved": (mine["test_return"] >= solved_reward).mean(),
+            "train_steps": mine["train_steps"].mean(),
+            "train_episodes": mine["train_episodes"].mean(),
+            "num_nonfinite": int(mine["nonfinite"].sum()),
+        })  # fmt: skip
+    return pd.DataFrame(rows)
+
+
+def make_table(summary: pd.DataFrame) -> pd.DataFrame:
+    """The summary as texts, with the paper's numbers."""
+    return pd.DataFrame([
+        {
+            "agent": row.kind,
+            "hyperparameters": {"varied": "drawn"}.get(row.hparams, row.hparams),
+            "trained on": LABELS[row.world],
+            "agents": row.num_agents,
+            "return": f"{row.return_mean:.1f} ± {row.return_std:.1f} "
+                      f"[{row.return_low:.1f}, {row.return_high:.1f}]",
+            "paper's": PAPER.get((row.world, row.kind, row.hparams), ""),
+            "solved": f"{row.solved:.0%}",
+            "training steps": f"{row.train_steps:,.0f}",
+            "episodes": f"{row.train_episodes:.1f}",
+        }
+        for row in summary.itertuples()
+    ])  # fmt: skip
+
+
+def report(
+    args: argparse.Namespace,
+    task: Any,
+    data: list[pd.DataFrame],
+    fits: pd.DataFrame,
+    agents: pd.DataFrame,
+) -> pd.DataFrame:
+    """Writes the CSV, the picture and the table, prints the table and returns it."""
+    from sejax.experiments import figures
+    from sejax.files import write_text
+
+    summary = summarise(agents, task.solved_reward)
+    table = make_table(summary)
+    write_text(args.out / "agents.csv", agents.to_csv(index=False))
+    write_text(args.out / "summary.csv", summary.to_csv(index=False))
+    write_text(args.out / "fits.csv", fits.to_csv(index=False))
+    draw(task, agents, summary, args.out / "supervised_baseline.png")
+    last = fits[fits["epoch"] == args.epochs - 1].mean()
+    ended = np.mean([rows["terminated"].mean() for rows in data])
+    title = f"Agents trained on supervised models of {task.name} and on an SE"
+    note = (
+        f"Mean ± std over test episodes and a bootstrap 95% interval that draws models, for the SE "
+        f"agents; solved: agents with a mean return of {task.solved_reward:g} at least. "
+        f"{args.models} models, each fitted for {args.epochs} epochs to "
+        f"{min(map(len, data)):,} transitions of one NES run, from episodes with a mean return of "
+        f"{np.mean(quality(data)):.1f}; {ended:.2%} of the transitions end an episode. Mean "
+        f"squared error {last['error']:.2g} of [s', r] (paper: 5e-07), {last['done_error']:.2g} "
+        "of the end. As the authors: the network for the end keeps its random weights. Fair: it is "
+        "fitted too, and used. The best models are those of the runs with the best episodes. "
+        f"Agents that met a number that is not finite: {int(summary['num_nonfinite'].sum())}."
+    )
+    command = figures.command(NAME, args, "proxy", "models", "generations", "population",
+                              "max_rows", "epochs", "agents", "num_agents",
+                              "test_episodes", "max_steps")  # fmt: skip
+    common.write_markdown(args.out / "table.md", title, command, table, note)
+    figures.print_table(title, table)
+    print(f"{args.out}: agents.csv (every test return), summary.csv, fits.csv, "
+          "supervised_baseline.png and table.md.")  # fmt: skip
+    return table
+
+
+def draw(task: Any, agents: pd.DataFrame, summary: pd.DataFrame, path: Path) -> None:
+    """Draws histograms of the test returns, a panel for each agent and choice of hyperparameters.
+
+    Source: paper, figure "Comparing the cumulative test reward densities", top.
+    """
+    import matplotlib.pyplot as plt
+
+    from sejax.experiments import figures
+
+    colors = {"authors": figures.SOLVED, "fair": figures.VARIED, "se": figures.REAL}
+    returns = agents[return_columns(agents)].to_numpy()
+    edges = np.linspace(returns.min(), max(returns.max(), returns.min() + 1), 41)
+    panels = list(agents.groupby(["kind", "hparams"], sort=False))
+    num_episodes = max((mine["world"] == "se").sum() for _, mine in panels) * returns.shape[1]
+    with plt.rc_context(figures.STYLE):
+        figure, axes = plt.subplots(1, len(panels), figsize=(1 + 4 * len(panels), 3.6),
+                                    squeeze=False, sharey=True, layout="constrained")  # fmt: skip
+        for axis, ((kind, hparams), mine) in zip(axes[0], panels, strict=True):
+            for name, color in colors.items():
+                _histogram(axis, mine[mine["world"] == name], edges, color, LABELS[name])
+            given = "drawn" if hparams == "varied" else hparams
+            axis.set_title(f"{figures.AGENT_NAMES.get(kind, kind)}, {given} hyperparameters")
+            axis.set_xlabel(f"return of a test episode on {task.name}")
+            axis.set_yscale("log")
+            axis.set_ylim(0.5 / num_episodes, 1.1)
+        axes[0, 0].set_ylabel("share of test episodes")
+        handles, labels = axes[0, 0].get_legend_handles_labels()
+        figure.legend(handles, labels, ncols=3, loc="outside upper center")
+        figures.write(figure, path)
+
+
+def _histogram(axis: Any, agents: pd.DataFrame, edges: np.ndarray, color: str, label: str) -> None:
+    returns = agents[return_columns(agents)].to_numpy().ravel()
+    share = np.full(returns.size, 1 / returns.size)
+    options: dict[str, Any] = {"bins": edges, "weights": share, "color": color}
+    axis.hist(returns, histtype="stepfilled", alpha=0.2, **options)
+    axis.hist(returns, histtype="step", lw=1.4, label=f"{label} (dashed: mean)", **options)
+    axis.axvline(returns.mean(), color=color, ls="--", lw=1.2)
+
+
+if __name__ == "__main__":
+    main()
