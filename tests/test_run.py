@@ -163,12 +163,16 @@ def test_ctrl_c_saves_and_exits_130(tmp_path):
 
 
 def test_an_interrupt_waits_until_files_are_written():
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
     written = []
-    with pytest.raises(KeyboardInterrupt), commands.interrupts_held():
-        signal.raise_signal(signal.SIGINT)
-        written.append("all")
-    assert written == ["all"]
-    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    try:
+        with pytest.raises(KeyboardInterrupt), commands.interrupts_held():
+            signal.raise_signal(signal.SIGINT)
+            written.append("all")
+        assert written == ["all"]
+        assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def test_another_configuration_in_the_same_directory_is_refused(uninterrupted):
