@@ -1,0 +1,420 @@
+"""The experiments on score transforms, on histograms of SEs and on supervised models."""
+
+import argparse
+import dataclasses
+import re
+from types import SimpleNamespace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pandas as pd
+import pytest
+import scipy.stats
+from support import numpy_forward
+
+import sejax
+from sejax import envs
+from sejax.agents.registry import make_agent
+from sejax.agents.trainer import make_tester, make_trainer
+from sejax.bilevel import make_program
+from sejax.errors import ConfigError
+from sejax.experiments import common, score_transforms, se_histograms, supervised_baseline
+from sejax.experiments.se_sets import load_set, save_set
+from sejax.proxies.synthetic import make_synthetic
+
+TINY_AGENT = {"hidden_size": 4, "num_layers": 1, "batch_size": 4, "init_episodes": 2}
+TINY_TRANSFORMS = ["--runs", "3", "--generations", "2", "--population", "2", "--slots", "2"]
+TINY_MODELS = ["--models", "3", "--generations", "2", "--population", "2", "--max-rows", "30",
+               "--epochs", "2", "--num-agents", "2", "--test-episodes", "2"]  # fmt: skip
+
+
+def options(experiment, out, *argv):
+    """What the experiment's command line would parse to."""
+    parser = argparse.ArgumentParser()
+    experiment.add_options(parser)
+    args = parser.parse_args(argv)
+    return argparse.Namespace(**vars(args), quick=True, out=out, seed=3, devices=None)
+
+
+def refuse(*_, **__):
+    raise AssertionError("computed again")
+
+
+@pytest.fixture(scope="module")
+def se_file(tmp_path_factory):
+    """A file with an SE of random weights."""
+    path = tmp_path_factory.mktemp("se") / "se.safetensors"
+    config = sejax.config(["proxy.hidden_size=4", "training.max_steps=60", "agent.init_episodes=1"])
+    env = make_synthetic(envs.make("cartpole"), config.proxy)
+    save_set(path, config, [env.init_weights(jax.random.key(5))], [1.0], [0], [0])
+    return str(path)
+
+
+@pytest.fixture
+def small(monkeypatch):
+    """Agents and budgets that cost nothing."""
+    for experiment in (se_histograms, supervised_baseline):
+        monkeypatch.setattr(experiment, "QUICK_AGENT", TINY_AGENT)
+    monkeypatch.setattr(supervised_baseline, "QUICK_STEPS", 60)
+
+
+# Score transforms.
+
+
+def test_step_sizes_are_spread_evenly_over_the_logarithm():
+    sizes = score_transforms.draw_step_sizes(12, seed=1)
+    places = np.log10(sizes) + 2  # 0.01 -> 0, 10 -> 3
+    np.testing.assert_array_equal(np.sort(np.floor(places * 4)), np.arange(12))
+    assert (np.diff(sizes) < 0).any(), "the order is random"
+    np.testing.assert_array_equal(sizes, score_transforms.draw_step_sizes(12, seed=1))
+
+
+class ScriptedSearch:
+    """Runs that solve the task at a known generation, in place of compiled ones."""
+
+    def __init__(self, solved_at):
+        self.solved_at = np.asarray(solved_at)
+        self.trained = 0  # generations of runs, the measure of the work done
+
+    def init(self, keys, sizes):
+        assert np.allclose(sizes, keys / 10), "a run keeps its step size"
+        zeros = np.zeros(len(keys), int)
+        return State(run=keys, generation=zeros, finished=zeros > 0, incumbent_score=zeros)
+
+    def advance(self, state, transform):
+        assert transform == 2
+        self.trained += int((~state.finished).sum())
+        made = state.generation + 1
+        finished = state.finished | (made > self.solved_at[state.run])
+        return state.replace(generation=made, finished=finished, incumbent_score=state.run * 100)
+
+    def merge(self, where, a, b):
+        return State(**{k: np.where(where, x, getattr(b, k)) for k, x in vars(a).items()})
+
+
+class State(SimpleNamespace):
+    def replace(self, **changes):
+        return State(**(vars(self) | changes))
+
+
+@pytest.mark.parametrize("slots", [1, 2, 5])
+def test_runs_follow_one_another_in_slots(slots):
+    solved_at = [3, 0, 9, 1, 4]  # updates before the incumbent solves the task
+    search = ScriptedSearch(solved_at)
+    updates, solved, scores = score_transforms.solve_all(
+        search, np.arange(5), "nes", np.arange(5) / 10, generations=5, slots=slots
+    )
+    np.testing.assert_array_equal(updates, [3, 0, 5, 1, 4])
+    np.testing.assert_array_equal(solved, [True, True, False, True, True])
+    np.testing.assert_array_equal(scores, [0, 100, 200, 300, 400])
+    assert search.trained == 4 + 1 + 5 + 2 + 5, "an empty slot costs nothing"
+
+
+def test_the_search_is_the_bilevel_loop():
+    search = score_transforms.make_search(True, 2, None)
+    keys, sizes = jax.random.split(jax.random.key(0), 3), np.array([0.1, 1.0, 5.0], np.float32)
+    state = search.init(keys, sizes)
+    config = sejax.config([*score_transforms.SETTINGS, "es.score_transform=single_best",
+                           "es.mirrored=true", "es.population_size=2"])  # fmt: skip
+    program = make_program(config)
+    expected = program.init(keys)
+    expected = expected.replace(es_state=expected.es_state.replace(step_size=jnp.asarray(sizes)))
+    generation = jax.jit(program.generation)
+    for _ in range(2):
+        state = search.advance(state, score_transforms.SCORE_TRANSFORMS.index("single_best"))
+        expected, _ = generation(expected)
+    np.testing.assert_allclose(state.incumbent_score, expected.incumbent_score, rtol=1e-5)
+    np.testing.assert_allclose(state.es_state.mean, expected.es_state.mean, rtol=1e-4, atol=1e-6)
+
+
+def test_the_best_bin_and_the_ranks_are_those_of_the_means():
+    runs = pd.DataFrame({
+        "transform": ["rank"] * 4 + ["nes"] * 4, "mirrored": True, "run": [0, 1, 2, 3] * 2,
+        "step_size": [0.02, 0.05, 0.5, 5.0] * 2,
+        "updates": [10, 20, 4, 30, 5, 5, 5, 9], "solved": [1, 1, 1, 0, 1, 1, 1, 1],
+    })  # fmt: skip
+    summary = score_transforms.summarise(runs, bins=3)  # edges 0.01, 0.1, 1, 10
+    first, second = summary.itertuples()
+    assert (first.transform, first.updates, first.solved) == ("nes", 6.0, 1.0)
+    assert (second.transform, second.updates, second.solved) == ("rank", 16.0, 0.75)
+    assert second.best_updates == 4 and second.best_low == pytest.approx(0.1)
+    cells = score_transforms.binned(runs, bins=3).set_index(["transform", "bin"])
+    assert cells.loc[("rank", 0), "updates"] == 15 and cells.loc[("rank", 0), "runs"] == 2
+    table = score_transforms.make_table(summary)
+    assert list(table["rank"]) == ["1", "2"] and list(table["rank there"]) == ["2", "1"]
+
+
+def test_score_transforms_run_and_go_on_where_they_stopped(tmp_path, monkeypatch):
+    table = score_transforms.run(options(score_transforms, tmp_path, *TINY_TRANSFORMS))
+    assert len(table) == 16 and (tmp_path / "score_transforms.png").stat().st_size > 10_000
+    runs = pd.read_csv(tmp_path / "runs.csv")
+    assert len(runs) == 16 * 3 and runs["updates"].between(0, 2).all()
+    assert (runs["solved"] == (runs["last_score"] > 0.8)).all()
+    sizes = runs.pivot(index=["transform", "mirrored"], columns="run", values="step_size")
+    assert (sizes.nunique() == 1).all(), "all cells have the same step sizes"
+    (tmp_path / "pieces" / "rank-plain.csv").unlink()
+    compute = score_transforms.compute_cell
+    made = []
+    monkeypatch.setattr(score_transforms, "compute_cell",
+                        lambda *args: made.append(args[1:]) or compute(*args))  # fmt: skip
+    again = score_transforms.run(options(score_transforms, tmp_path, *TINY_TRANSFORMS))
+    assert made == [("rank", False)] and again.equals(table)
+    with pytest.raises(ConfigError, match="another generations"):
+        score_transforms.run(
+            options(score_transforms, tmp_path, *TINY_TRANSFORMS, "--generations", "3")
+        )
+
+
+# Histograms.
+
+
+@pytest.mark.parametrize("capacity", [200, 25])
+def test_a_recorded_training_is_the_training(se_file, capacity):
+    ses = load_set(se_file)
+    agent_config = dataclasses.replace(ses.config.agent, **TINY_AGENT)
+    agent = make_agent(agent_config, ses.task, ses.config.exploration)
+    training = dataclasses.replace(ses.config.training, max_steps=90, max_episodes=12)
+    recording = se_histograms.recording_agent(agent, capacity, 4)
+    key, params = jax.random.key(1), ses.one(0)
+    short = params.replace(max_steps_in_episode=9)
+    plain = jax.jit(make_trainer(agent, ses.env, training))(key, short)
+    result = jax.jit(make_trainer(recording, ses.env, training))(key, short)
+    for a, b in zip(jax.tree.leaves(plain.agent_state), jax.tree.leaves(result.agent_state.agent),
+                    strict=True):  # fmt: skip
+        np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-7)
+    steps = int(plain.train_steps)
+    assert result.agent_state.num_rows == steps == 90
+    rows = np.asarray(result.agent_state.rows)
+    if capacity < steps:  # the last ones: the whole of the last episode among them
+        last = int(plain.episodes) - 1
+        assert rows[:, 0].min() == (steps - capacity) // 9 and rows[:, 0].max() == last
+    rows = rows[: min(steps, capacity)]
+    for episode in np.unique(rows[:, 0])[1:]:
+        rewards = rows[rows[:, 0] == episode, 1]
+        np.testing.assert_allclose(rewards.sum(), plain.returns[int(episode)], rtol=1e-4)
+
+
+def test_recorded_tests_are_the_tests(se_file):
+    ses = load_set(se_file)
+    agent = make_agent(ses.config.agent, ses.task, ses.config.exploration)
+    state = agent.init(jax.random.key(0), agent.hparams)
+    key = jax.random.key(4)
+    returns, lengths = jax.jit(make_tester(agent, ses.task, 3))(key, state)
+    steps = jax.jit(se_histograms.make_test_recorder(agent, ses.task, 3))(key, state)
+    valid = np.asarray(steps.valid).reshape(3, -1)
+    np.testing.assert_array_equal(valid.sum(axis=1), lengths)
+    rewards = np.where(valid, np.asarray(steps.reward).reshape(3, -1), 0)
+    np.testing.assert_allclose(rewards.sum(axis=1), returns)
+    terminated = np.asarray(steps.terminated).reshape(3, -1)
+    assert all(row[length - 1] for row, length in zip(terminated, lengths, strict=True))
+    obs, next_obs = np.asarray(steps.obs), np.asarray(steps.next_obs)
+    within = valid[0, 1:]
+    np.testing.assert_array_equal(obs[1 : valid.shape[1]][within], next_obs[: within.size][within])
+
+
+def test_the_distance_is_wassersteins():
+    rng = np.random.default_rng(0)
+    for a, b in ((rng.normal(size=50), rng.normal(1, 3, size=31)), (np.ones(3), np.zeros(2))):
+        expected = scipy.stats.wasserstein_distance(a, b)
+        np.testing.assert_allclose(se_histograms.distance(a, b), expected, rtol=1e-10)
+    assert se_histograms.distance([1.0, 2.0], [2.0, 1.0]) == 0
+
+
+def test_the_table_says_which_distribution_the_response_is_closer_to():
+    states = {"train": [0.0, 0.2], "test": [3.0, 4.0], "response": [0.1, 0.5]}
+    rows = pd.DataFrame([
+        {"kind": "ddqn", "source": source, "agent": 0, "episode": i % 2, "reward": 1.0 + i,
+         "state_0": x}
+        for source, values in states.items() for i, x in enumerate(values)
+    ])  # fmt: skip
+    summary = se_histograms.summarise(rows)
+    state = summary.iloc[0]
+    assert state["response_to_train"] == pytest.approx(0.2)
+    assert state["response_to_test"] == pytest.approx(3.2)
+    table = se_histograms.make_table(SimpleNamespace(name="other"), rows, summary)
+    assert table["response is closer to"][0] == "train" and list(table["next"]) == [
+        "state 0", "reward",
+    ]  # fmt: skip
+    assert table["return"][0] == "1.50 ± 0.71", "of the two test episodes"
+
+
+def test_histograms_run_and_go_on_where_they_stopped(se_file, tmp_path, monkeypatch, small):
+    argv = ["--proxy", se_file, "--agents", "ddqn", "--num-agents", "2", "--test-episodes", "2",
+            "--max-rows", "50"]  # fmt: skip
+    table = se_histograms.run(options(se_histograms, tmp_path, *argv))
+    assert len(table) == 5 and (tmp_path / "histograms.png").stat().st_size > 10_000
+    rows = pd.read_csv(tmp_path / "pieces" / "ddqn.csv")
+    by_source = rows.groupby("source").size()
+    assert by_source["train"] == 2 * 50 and by_source["test"] == by_source["response"]
+    test, response = (rows[rows["source"] == name] for name in ("test", "response"))
+    assert (test["reward"] == 1).all() and (test.groupby(["agent", "episode"]).size() > 5).all()
+    # The first real state is not in the file; from the second on, it is the one before.
+    ses = load_set(se_file)
+    states = [f"state_{i}" for i in range(4)]
+    predicted = [
+        [
+            ses.env.predict(ses.one(0).weights, jnp.float32(test[states].iloc[0]), a)[0]
+            for a in (0, 1)
+        ]
+    ]
+    assert min(np.abs(np.asarray(x) - response[states].iloc[1].to_numpy()).max()
+               for x in predicted[0]) < 1e-4  # fmt: skip
+    monkeypatch.setattr(se_histograms, "record", refuse)
+    assert se_histograms.run(options(se_histograms, tmp_path, *argv)).equals(table)
+    with pytest.raises(ConfigError, match="another max_rows"):
+        se_histograms.run(options(se_histograms, tmp_path, *argv[:-1], "40"))
+
+
+# Supervised models.
+
+
+def test_a_sample_is_uniform_over_all_that_was_added():
+    counts = np.zeros(20)
+    for seed in range(400):
+        sample = supervised_baseline.Sample(5, np.random.default_rng(seed))
+        for start, stop in ((0, 3), (3, 4), (4, 20)):
+            sample.add(pd.DataFrame({"row": range(start, stop)}))
+        drawn = sample.table["row"]
+        assert drawn.nunique() == 5
+        counts[drawn] += 1
+    error = np.sqrt(400 * 0.25 * 0.75)  # each row is drawn with probability 5 / 20
+    assert np.abs(counts - 100).max() < 5 * error
+    small = supervised_baseline.Sample(5, np.random.default_rng(0))
+    small.add(pd.DataFrame({"row": [7, 8]}))
+    assert sorted(small.table["row"]) == [7, 8] and list(small.table) == ["row"]
+
+
+def random_data(num_rows):
+    rng = np.random.default_rng(0)
+    states, targets = rng.normal(size=(num_rows, 4)), rng.normal(size=(num_rows, 5))
+    return (states.astype(np.float32), rng.integers(0, 2, num_rows), targets.astype(np.float32),
+            rng.integers(0, 2, num_rows).astype(np.float32))  # fmt: skip
+
+
+def test_the_first_step_of_a_fit_is_adams_on_the_mean_squared_error(se_file):
+    env = load_set(se_file).env
+    data = random_data(6)
+    states, actions, targets, ends = data
+    initial, fitted, errors = supervised_baseline.make_fit(env, 6, 1)(jax.random.key(2), *data)
+    squares, end_squares = [], []
+    for state, action, target, end in zip(states, actions, targets, ends, strict=True):
+        x = np.concatenate([np.eye(2)[action], state])
+        out = {head: numpy_forward(initial[head], x, "leaky_relu", 1) for head in initial}
+        squares.append((np.concatenate([out["state"], out["reward"]]) - target) ** 2)
+        end_squares.append((out["done"] - end) ** 2)
+    np.testing.assert_allclose(errors[0], [np.mean(squares), np.mean(end_squares)], rtol=1e-4)
+    # Adam's first step is the learning rate against the gradient's sign; that of the reward's bias
+    # is that of the mean error.
+    step = fitted["reward"]["Dense_1"]["bias"] - initial["reward"]["Dense_1"]["bias"]
+    mean_error = np.mean([
+        numpy_forward(initial["reward"], np.concatenate([np.eye(2)[a], s]), "leaky_relu", 1) - t[-1]
+        for s, a, t in zip(states, actions, targets, strict=True)
+    ])  # fmt: skip
+    np.testing.assert_allclose(step, -1e-4 * np.sign(mean_error), rtol=1e-2)
+
+
+def test_one_fit_serves_both_models_as_the_networks_share_nothing(se_file):
+    env = load_set(se_file).env
+    states, actions, targets, ends = random_data(8)
+    fit = jax.jit(supervised_baseline.make_fit(env, 8, 5))
+    _, a, _ = fit(jax.random.key(2), states, actions, targets, ends)
+    _, b, errors = fit(jax.random.key(2), states, actions, targets, 1 - ends)
+    for head in ("state", "reward"):
+        for x, y in zip(jax.tree.leaves(a[head]), jax.tree.leaves(b[head]), strict=True):
+            np.testing.assert_allclose(x, y, rtol=1e-5)
+    assert any((x != y).any() for x, y in zip(jax.tree.leaves(a["done"]),
+                                              jax.tree.leaves(b["done"]), strict=True))  # fmt: skip
+    assert (errors[-1] < errors[0]).all()
+
+
+def test_intervals_draw_models_and_the_best_ones_are_those_of_the_best_episodes():
+    agents = pd.DataFrame({
+        "kind": "ddqn", "hparams": "varied", "world": ["authors"] * 6 + ["se"] * 6,
+        "group": [0, 0, 1, 1, 2, 2] * 2, "nonfinite": False, "train_steps": 10,
+        "train_episodes": 1, "return_0": [0, 2, 10, 10, 30, 30] + [200] * 6,
+        "return_1": [2, 4, 10, 10, 30, 30] + [200] * 6,
+    })  # fmt: skip
+    agents["test_return"] = agents[["return_0", "return_1"]].mean(axis=1)
+    agents = supervised_baseline.with_best(agents, [50.0, 10.0, 90.0])
+    summary = supervised_baseline.summarise(agents, 195.0).set_index("world")
+    assert summary.loc["authors", "return_mean"] == pytest.approx(14)
+    low, high = common.bootstrap_interval([2, 10, 30])
+    assert tuple(summary.loc["authors", ["return_low", "return_high"]]) == (low, high)
+    assert summary.loc["authors_best", "return_mean"] == pytest.approx(16), "models 0 and 2"
+    assert summary.loc["se", "solved"] == 1 and summary.loc["authors", "solved"] == 0
+    table = supervised_baseline.make_table(summary.reset_index())
+    assert list(table["paper's"]) == ["15.01", "190.7", "17.73"]
+    few = agents[agents["group"] < 2]
+    assert supervised_baseline.with_best(few, [1.0, 2.0]) is few
+
+
+def test_the_supervised_baseline_runs_and_goes_on(se_file, tmp_path, monkeypatch, small):
+    argv = ["--proxy", se_file, *TINY_MODELS]
+    table = supervised_baseline.run(options(supervised_baseline, tmp_path, *argv))
+    assert list(table["trained on"]) == [
+        supervised_baseline.LABELS[name] for _ in range(2) for name in ("authors", "fair", "se",
+                                                                        "authors_best")
+    ]  # fmt: skip
+    assert (tmp_path / "supervised_baseline.png").stat().st_size > 10_000
+    rows = pd.read_csv(tmp_path / "pieces" / "transitions-0.csv")
+    check_real_transitions(rows)
+    check_models(tmp_path)
+    for name in ("collect", "fit_all", "train_group"):
+        monkeypatch.setattr(supervised_baseline, name, refuse)
+    again = supervised_baseline.run(options(supervised_baseline, tmp_path, *argv))
+    assert again.equals(table)
+    with pytest.raises(ConfigError, match="another num_agents"):
+        args = options(supervised_baseline, tmp_path, *argv, "--num-agents", "3")
+        supervised_baseline.run(args)
+
+
+def check_real_transitions(rows):
+    """Each row is one step of the real task."""
+    assert len(rows) == 30 and set(rows["generation"]) == {0, 1} and (rows["reward"] == 1).all()
+    task = envs.make("cartpole")
+    names = ("x", "x_dot", "theta", "theta_dot")
+    _, start = task.env.reset_env(jax.random.key(0), task.params)
+    for _, row in rows.iterrows():
+        state = start.replace(**{x: jnp.float32(row[f"state_{i}"]) for i, x in enumerate(names)})
+        obs, _, _, terminated, _ = task.env.step_env(
+            jax.random.key(0), state, jnp.int32(row["action"]), task.params
+        )
+        np.testing.assert_allclose(obs, [row[f"next_state_{i}"] for i in range(4)], atol=1e-5)
+        assert bool(terminated) == bool(row["terminated"])
+
+
+def check_models(folder):
+    """The variants differ in the network for the end and in what is made of it only."""
+    authors, fair = (
+        load_set(folder / f"models-{name}.safetensors") for name in ("authors", "fair")
+    )
+    assert authors.num_ses == fair.num_ses == 3
+    assert (authors.config.proxy.done, fair.config.proxy.done) == ("soft", "threshold")
+    for head, same in (("state", True), ("reward", True), ("done", False)):
+        pairs = zip(jax.tree.leaves(authors.weights[head]), jax.tree.leaves(fair.weights[head]),
+                    strict=True)  # fmt: skip
+        assert all(np.array_equal(a, b) for a, b in pairs) == same, head
+
+
+@pytest.mark.parametrize(
+    ("experiment", "argv", "message"),
+    [
+        (score_transforms, ["--runs", "0"], "--runs must be at least 1.*got 0.*--runs="),
+        (score_transforms, ["--population", "1"], "es.population_size must be at least 2"),
+        (se_histograms, ["--agents", "ddqm"], "--agents must be one of ddqn.*got .ddqm"),
+        (se_histograms, ["--proxy", "nowhere"], "cartpole.*got .nowhere"),
+        (supervised_baseline, ["--epochs", "0"], "--epochs must be at least 1.*--epochs=100"),
+        (supervised_baseline, ["--agents", "ppo"], "--agents must be one of.*got .ppo"),
+    ],
+)
+def test_bad_input_ends_with_one_message_and_status_2(
+    experiment, argv, message, tmp_path, monkeypatch, capsys
+):
+    args = options(experiment, tmp_path, *argv)
+    monkeypatch.setattr(common, "parse_args", lambda *_: args)
+    with pytest.raises(SystemExit) as ended:
+        experiment.main()
+    assert ended.value.code == 2
+    error = capsys.readouterr().err
+    assert re.search(message, error) and error.count("error:") == 1
