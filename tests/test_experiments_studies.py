@@ -249,21 +249,24 @@ def test_histograms_run_and_go_on_where_they_stopped(se_file, tmp_path, monkeypa
     assert by_source["train"] == 2 * 50 and by_source["test"] == by_source["response"]
     test, response = (rows[rows["source"] == name] for name in ("test", "response"))
     assert (test["reward"] == 1).all() and (test.groupby(["agent", "episode"]).size() > 5).all()
-    # The first real state is not in the file; from the second on, it is the one before.
-    ses = load_set(se_file)
-    states = [f"state_{i}" for i in range(4)]
-    predicted = [
-        [
-            ses.env.predict(ses.one(0).weights, jnp.float32(test[states].iloc[0]), a)[0]
-            for a in (0, 1)
-        ]
-    ]
-    assert min(np.abs(np.asarray(x) - response[states].iloc[1].to_numpy()).max()
-               for x in predicted[0]) < 1e-4  # fmt: skip
+    check_responses(load_set(se_file), test, response)
     monkeypatch.setattr(se_histograms, "record", refuse)
     assert se_histograms.run(options(se_histograms, tmp_path, *argv)).equals(table)
     with pytest.raises(ConfigError, match="another max_rows"):
         se_histograms.run(options(se_histograms, tmp_path, *argv[:-1], "40"))
+
+
+def check_responses(ses, test, response):
+    """What the SE says to a real state, which is the next one of the row before."""
+    states = [f"state_{i}" for i in range(4)]
+    for row in (1, 2, 3):
+        state = jnp.float32(test[states].iloc[row - 1])
+        said = response[[*states, "reward"]].iloc[row].to_numpy(float)
+        errors = []
+        for action in (0, 1):
+            vector, reward, _ = ses.env.predict(ses.one(0).weights, state, action)
+            errors.append(np.abs(np.append(vector, reward) - said).max())
+        assert min(errors) < 1e-4
 
 
 # Supervised models.
@@ -344,7 +347,7 @@ def test_intervals_draw_models_and_the_best_ones_are_those_of_the_best_episodes(
     assert summary.loc["authors_best", "return_mean"] == pytest.approx(16), "models 0 and 2"
     assert summary.loc["se", "solved"] == 1 and summary.loc["authors", "solved"] == 0
     table = supervised_baseline.make_table(summary.reset_index())
-    assert list(table["paper's"]) == ["15.01", "190.7", "17.73"]
+    assert list(table["paper's"]) == ["15.01", "17.73", "190.7"]
     few = agents[agents["group"] < 2]
     assert supervised_baseline.with_best(few, [1.0, 2.0]) is few
 
@@ -353,8 +356,7 @@ def test_the_supervised_baseline_runs_and_goes_on(se_file, tmp_path, monkeypatch
     argv = ["--proxy", se_file, *TINY_MODELS]
     table = supervised_baseline.run(options(supervised_baseline, tmp_path, *argv))
     assert list(table["trained on"]) == [
-        supervised_baseline.LABELS[name] for _ in range(2) for name in ("authors", "fair", "se",
-                                                                        "authors_best")
+        text for _ in range(2) for text in supervised_baseline.LABELS.values()
     ]  # fmt: skip
     assert (tmp_path / "supervised_baseline.png").stat().st_size > 10_000
     rows = pd.read_csv(tmp_path / "pieces" / "transitions-0.csv")

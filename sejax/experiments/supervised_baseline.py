@@ -360,6 +360,7 @@ def make_fit(env: Any, num_rows: int, epochs: int) -> Callable[..., Any]:
     def fit(key: Any, *data: Any) -> Any:
         key_init, key_order = jax.random.split(key)
         initial = env.init_weights(key_init)
+        data = tuple(map(jnp.asarray, data))
 
         def update(carry: Any, rows: Any) -> Any:
             weights, opt_state = carry
@@ -532,7 +533,7 @@ def summarise(agents: pd.DataFrame, solved_reward: float) -> pd.DataFrame:
     of the SE share it: their intervals are those of drawing agents.
     """
     rows = []
-    for (kind, hparams, name), mine in agents.groupby(["kind", "hparams", "world"], sort=False):
+    for (kind, hparams, name), mine in agents.groupby(["kind", "hparams", "world"]):
         independent = mine["test_return"]
         if name != "se":
             independent = mine.groupby("group")["test_return"].mean()
@@ -547,7 +548,10 @@ def summarise(agents: pd.DataFrame, solved_reward: float) -> pd.DataFrame:
             "train_episodes": mine["train_episodes"].mean(),
             "num_nonfinite": int(mine["nonfinite"].sum()),
         })  # fmt: skip
-    return pd.DataFrame(rows)
+    order = [*AGENTS, *HPARAMS, *LABELS]
+    return pd.DataFrame(rows).sort_values(
+        ["kind", "hparams", "world"], key=lambda names: names.map(order.index), ignore_index=True
+    )
 
 
 def make_table(summary: pd.DataFrame) -> pd.DataFrame:
