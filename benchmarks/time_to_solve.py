@@ -1,9 +1,10 @@
 """How long `python -m sejax.run` takes to find a proxy that solves the task, over many seeds.
 
 Each seed is a run of the command itself, one after another on all cores, in a directory of its
-own under `--runs`: an interrupted benchmark goes on where it stopped. A run counts as solved at the
-first generation whose incumbent mean (fresh agents, none of which trained before) reaches the
-task's threshold, and goes on to the end, to show whether the incumbent stays solved.
+own under `--runs`: an interrupted benchmark goes on where it stopped. The curves of finished seeds
+are kept in `--curves`, and no seed is run again that it has with as many generations. A run counts
+as solved at the first generation whose incumbent mean (fresh agents, none of which trained before)
+reaches the task's threshold, and goes on to the end, to show whether the incumbent stays solved.
 
 Reported for each setting: in how many seeds it solved, and the generations, wall-clock minutes
 (start, compilation and all files included), CPU minutes and real environment steps to that point;
@@ -22,12 +23,22 @@ import numpy as np
 import pandas as pd
 
 from sejax import envs
+from sejax.files import write_text
 
 SETTINGS = {
     "best": ["preset=best"],
     "paper": ["preset=paper"],
     "paper_performance": ["preset=paper_performance", "stop_when_solved=false"],
+    # The default with one thing changed; 128 trainings in a generation as there.
+    "threshold": ["proxy.done=threshold"],
+    "unmirrored": ["es.mirrored=false", "es.population_size=128"],
+    "rank": ["es.score_transform=rank", "es.step_size=0.03"],
+    "nes_unnormalized": ["es.score_transform=nes_unnormalized", "es.step_size=0.06"],
+    "snes": ["es=snes", "es.population_size=128", "es.noise_std=0.06"],
+    "open_es": ["es=open_es", "es.population_size=128", "es.noise_std=0.06"],
+    "sep_cma_es": ["es=sep_cma_es", "es.population_size=128", "es.noise_std=0.06"],
 }
+COLUMNS = ["preset", "seed", "generation", "incumbent_mean", "env_steps_total", "wall_s", "cpu_s"]
 QUICK = ["es.population_size=4", "training.max_steps=200", "training.max_episodes=20"]
 
 
@@ -36,13 +47,14 @@ def main() -> None:
     settings = [setting.partition(":") for setting in args.settings]
     if args.quick:
         settings, args.runs = [("best", ":", "2x2")], args.runs / "quick"
+        args.curves = args.runs / "curves.csv"
+    args.curves = args.curves or Path(f"results/time_to_solve/{args.env}.csv")
     tables, rows = {}, []
     for name, _, size in settings:
         num_seeds, generations = (int(x) for x in size.split("x"))
-        extra = QUICK if args.quick else []
-        runs = [run_seed(args, name, args.seed + i, generations, extra) for i in range(num_seeds)]
-        tables[name] = runs
-        rows.append(summarise(name, runs, envs.make(args.env).solved_reward))
+        seeds = range(args.seed, args.seed + num_seeds)
+        tables[name] = [curve_of(args, name, seed, generations) for seed in seeds]
+        rows.append(summarise(name, tables[name], envs.make(args.env).solved_reward))
     columns = list(rows[0])
     common.print_table(f"{args.env}: time to a solved proxy", columns,
                        [[str(row[c]) for c in columns] for row in rows])  # fmt: skip
@@ -56,53 +68,67 @@ def main() -> None:
 def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--env", default="cartpole")
     parser.add_argument("--settings", nargs="+", default=["best:10x30"],
-                        metavar="PRESET:SEEDSxGENERATIONS")  # fmt: skip
+                        metavar="NAME:SEEDSxGENERATIONS", help=", ".join(SETTINGS))  # fmt: skip
     parser.add_argument("--runs", type=Path, default=Path("runs/time_to_solve"))
+    parser.add_argument("--curves", type=Path, metavar="CSV", help="curves of all finished seeds; "
+                        "results/time_to_solve/ENV.csv")  # fmt: skip
     parser.add_argument("--figure", type=Path, help="draw the curves of all seeds there")
     parser.add_argument("--markdown", type=Path, help="write the table there")
 
 
-def run_seed(
-    args: argparse.Namespace, setting: str, seed: int, generations: int, extra: list[str]
-) -> dict[str, Any]:
-    """Runs or resumes one seed and reads its files."""
+def curve_of(args: argparse.Namespace, setting: str, seed: int, generations: int) -> pd.DataFrame:
+    """One seed's curve, a row for each generation: read if it is there, else run and kept."""
+    kept = pd.read_csv(args.curves) if args.curves.exists() else pd.DataFrame(columns=COLUMNS)
+    mine = (kept["preset"] == setting) & (kept["seed"] == seed)
+    if mine.sum() < generations:
+        curve = run_seed(args, setting, seed, generations)
+        parts = [part for part in (kept[~mine], curve) if len(part)]
+        write_text(args.curves, pd.concat(parts).to_csv(index=False, float_format="%.6g"))
+        return curve
+    return kept[mine].head(generations)
+
+
+def run_seed(args: argparse.Namespace, setting: str, seed: int, generations: int) -> pd.DataFrame:
+    """Runs or resumes one seed and returns its curve, with the columns of `COLUMNS`."""
     path = args.runs / f"{args.env}-{setting}-s{seed}"
     command = [sys.executable, "-m", "sejax.run", f"env={args.env}", *SETTINGS[setting],
-               f"seed={seed}", f"run_dir={path}", f"generations={generations}", *extra]  # fmt: skip
-    metrics = path / "metrics.csv"
-    if not metrics.exists() or len(pd.read_csv(metrics)) < generations:
-        subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
-    summary = json.loads((path / "run.json").read_text())
-    return {"metrics": pd.read_csv(metrics), **summary}
+               f"seed={seed}", f"run_dir={path}", f"generations={generations}",
+               *(QUICK if args.quick else [])]  # fmt: skip
+    subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
+    metrics = pd.read_csv(path / "metrics.csv")
+    cpu_s = json.loads((path / "run.json").read_text())["cpu_s_of_last_session"]
+    # All of a run's generations are alike enough to share out the CPU time by wall-clock.
+    cpu_per_wall = cpu_s / metrics["wall_s"].iloc[-1]
+    return metrics.assign(preset=setting, cpu_s=metrics["wall_s"] * cpu_per_wall)[COLUMNS]
 
 
-def summarise(name: str, runs: list[dict[str, Any]], solved_reward: float) -> dict[str, Any]:
+def summarise(name: str, curves: list[pd.DataFrame], solved_reward: float) -> dict[str, Any]:
     """One row of the table; medians and ranges over the seeds that solved the task."""
     reached = []
-    for run in runs:
-        metrics = run["metrics"]
-        solved = np.flatnonzero(metrics["incumbent_mean"] >= solved_reward)
-        if len(solved):
-            first = metrics.iloc[solved[0]]
-            cpu_per_wall = run["cpu_s_of_last_session"] / metrics["wall_s"].iloc[-1]
+    for curve in curves:
+        is_solved = curve["incumbent_mean"].to_numpy() >= solved_reward
+        if is_solved.any():
+            first = int(np.argmax(is_solved))
+            row = curve.iloc[first]
             reached.append(
                 {
-                    "generations": solved[0] + 1,
-                    "wall minutes": first["wall_s"] / 60,
-                    "CPU minutes": first["wall_s"] / 60 * cpu_per_wall,
-                    "real steps": first["env_steps_total"],
-                    "solved afterwards": (
-                        metrics["incumbent_mean"].iloc[solved[0] :] >= solved_reward
-                    ).mean(),
+                    "generations": first + 1,
+                    "wall minutes": row["wall_s"] / 60,
+                    "CPU minutes": row["cpu_s"] / 60,
+                    "real steps": row["env_steps_total"],
+                    "solved afterwards": is_solved[first:].mean(),
                 }
             )
-    last = pd.concat([run["metrics"].tail(5) for run in runs])["incumbent_mean"]
+    last = pd.concat([curve.tail(5) for curve in curves])["incumbent_mean"]
+    best = np.mean([curve["incumbent_mean"].max() for curve in curves])
+    cpu_s = np.mean([curve["cpu_s"].iloc[-1] / len(curve) for curve in curves])
     row = {
         "preset": name,
-        "generations run": len(runs[0]["metrics"]),
-        "solved": f"{len(reached)} of {len(runs)}",
-        "best incumbent": f"{np.mean([r['metrics']['best_so_far'].iloc[-1] for r in runs]):.1f}",
+        "generations run": len(curves[0]),
+        "solved": f"{len(reached)} of {len(curves)}",
+        "best incumbent": f"{best:.1f}",
         "last five incumbents": f"{last.mean():.1f}",
+        "CPU seconds of a generation": f"{cpu_s:.0f}",
     }
     table = pd.DataFrame(reached)
     for column, form in (("generations", ",.0f"), ("wall minutes", ".1f"), ("CPU minutes", ".1f"),
@@ -120,7 +146,7 @@ def to_markdown(columns: list[str], rows: list[dict[str, Any]]) -> str:
     return "".join(f"| {' | '.join(line)} |\n" for line in lines)
 
 
-def draw(tables: dict[str, list[dict[str, Any]]], solved_reward: float, path: Path) -> None:
+def draw(tables: dict[str, list[pd.DataFrame]], solved_reward: float, path: Path) -> None:
     """A panel for each setting: each seed's incumbent mean, and their mean."""
     import matplotlib as mpl
 
@@ -132,12 +158,12 @@ def draw(tables: dict[str, list[dict[str, Any]]], solved_reward: float, path: Pa
             1, len(tables), figsize=(1 + 3.6 * len(tables), 3.4), sharey=True,
             layout="constrained", squeeze=False,
         )  # fmt: skip
-        for axis, (name, runs) in zip(axes[0], tables.items(), strict=True):
-            curves = pd.concat([run["metrics"]["incumbent_mean"] for run in runs], axis=1)
-            axis.plot(curves.to_numpy(), color="#1f5fa8", lw=0.8, alpha=0.6)
-            axis.plot(curves.mean(axis=1), color="black", lw=2.2)
+        for axis, (name, seeds) in zip(axes[0], tables.items(), strict=True):
+            curves = pd.concat([c.set_index("generation")["incumbent_mean"] for c in seeds], axis=1)
+            axis.plot(curves.index + 1, curves.to_numpy(), color="#1f5fa8", lw=0.8, alpha=0.6)
+            axis.plot(curves.index + 1, curves.mean(axis=1), color="black", lw=2.2)
             axis.axhline(solved_reward, color="#3c8d40", ls="--", lw=1.2)
-            axis.set_title(f"preset={name}, {len(runs)} seeds", fontsize=10)
+            axis.set_title(f"preset={name}, {len(seeds)} seeds", fontsize=10)
             axis.set_xlabel("NES generation")
         axes[0][0].set_ylabel("incumbent: mean return\non the real task")
         path.parent.mkdir(parents=True, exist_ok=True)
