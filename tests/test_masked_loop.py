@@ -56,3 +56,20 @@ def test_arguments_that_all_lanes_share_need_no_axis():
     assert_counted(log[0], state.number[0], 3)
     assert_counted(log[1], state.number[1], 0)  # was never active
     assert_counted(log[2], state.number[2], 3)
+
+
+def test_lanes_in_a_cond_may_read_arrays_that_the_body_closes_over():
+    squares = jnp.arange(7) ** 2
+
+    def squaring(log, state, limit, masked):
+        log, state = body(log, state, limit, masked)
+        return log, state.replace(number=jnp.sqrt(squares[state.number]).astype(jnp.int32))
+
+    def count_if(wanted, limit):
+        state = Count(active=jnp.bool_(True), number=jnp.int32(0))
+        none = (jnp.zeros(6, jnp.int32), state)
+        return jax.lax.cond(wanted, lambda: while_any_active(squaring, *none, limit), lambda: none)
+
+    log, state = jax.vmap(count_if)(jnp.array([True, False]), jnp.array([4, 5]))
+    assert_counted(log[0], state.number[0], 4)
+    assert not log[1].any()

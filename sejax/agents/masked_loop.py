@@ -13,6 +13,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from jax.custom_batching import custom_vmap
+from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 
 Body = Callable[..., tuple[Any, Any]]
 
@@ -30,40 +31,50 @@ def while_any_active(body: Body, large: Any, small: Any, consts: Any) -> tuple[A
     Returns:
       The last `large` and `small`. Any nesting of `vmap` gives each lane what it would get alone.
     """
-    return _while_any_active(body, 0)(large, small, consts)
+    return _while_any_active(body, 0, large, small, consts)
 
 
-@functools.cache
-def _while_any_active(body: Body, depth: int) -> Callable[..., tuple[Any, Any]]:
+def _while_any_active(
+    body: Body, depth: int, large: Any, small: Any, consts: Any
+) -> tuple[Any, Any]:
     """The loop under `depth` vmaps, which makes itself one deeper when it is vmapped."""
 
-    @custom_vmap
-    def loop(large: Any, small: Any, consts: Any) -> tuple[Any, Any]:
-        step = body
+    def masked_step(large: Any, small: Any, consts: Any) -> tuple[Any, Any]:
+        def step(large: Any, small: Any, consts: Any) -> tuple[Any, Any]:
+            return body(large, small, consts, depth > 0)
+
         for _ in range(depth):
-            step = jax.vmap(step, in_axes=(0, 0, 0, None))
+            step = jax.vmap(step)
+        large, stepped = step(large, small, consts)
+        if depth > 0:
+            stepped = jax.tree.map(functools.partial(_select, small.active), stepped, small)
+        return large, stepped
 
-        def masked_step(carry: tuple[Any, Any]) -> tuple[Any, Any]:
-            large, small = carry
-            large, stepped = step(large, small, consts, depth > 0)
-            if depth > 0:
-                stepped = jax.tree.map(functools.partial(_select, small.active), stepped, small)
-            return large, stepped
+    # Arrays that the body closes over (a map of a grid world) become arguments of the loop: within
+    # a `cond` whose predicate is vmapped they are batched, which custom_vmap refuses for closures.
+    jaxpr, shapes = jax.make_jaxpr(masked_step, return_shape=True)(large, small, consts)
+    out_tree = jax.tree.structure(shapes)
 
-        return jax.lax.while_loop(
-            lambda carry: jnp.any(carry[1].active), masked_step, (large, small)
-        )
+    @custom_vmap
+    def loop(large: Any, small: Any, consts: Any, captured: Any) -> tuple[Any, Any]:
+        masked = jaxpr_as_fun(ClosedJaxpr(jaxpr.jaxpr, captured))
+
+        def step(carry: tuple[Any, Any]) -> tuple[Any, Any]:
+            return jax.tree.unflatten(out_tree, masked(*jax.tree.leaves((*carry, consts))))
+
+        return jax.lax.while_loop(lambda carry: jnp.any(carry[1].active), step, (large, small))
 
     @loop.def_vmap
-    def _(axis_size: int, in_batched: Any, large: Any, small: Any, consts: Any):
+    def _(axis_size: int, in_batched: Any, large: Any, small: Any, consts: Any, captured: Any):
         def broadcast(batched: bool, x: Any) -> Any:
             return x if batched else jnp.broadcast_to(x, (axis_size, *jnp.shape(x)))
 
-        args = jax.tree.map(broadcast, in_batched, [large, small, consts])
-        out = _while_any_active(body, depth + 1)(*args)
+        # The deeper loop captures for itself what is the same for all lanes.
+        args = jax.tree.map(broadcast, in_batched[:3], [large, small, consts])
+        out = _while_any_active(body, depth + 1, *args)
         return out, jax.tree.map(lambda _: True, out)
 
-    return loop
+    return loop(large, small, consts, jaxpr.consts)
 
 
 def _select(active: jax.Array, new: jax.Array, old: jax.Array) -> jax.Array:

@@ -10,7 +10,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from flax import struct
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from sejax.agents.agent import Agent
 from sejax.agents.masked_loop import while_any_active
@@ -33,6 +33,8 @@ class TrainResult:
       episodes: finished training episodes, `[]` int32.
       returns: return of each training episode in the training world, `[max_episodes]`; nan after
         the last. With tests between episodes (`solved_by="test"`) the test returns.
+      episode_ends: training steps at the end of each training episode, `[max_episodes]` int32; 0
+        after the last.
       nonfinite: whether a number that is not finite was met: an output of the world or a weight.
       test_steps: real steps spent on tests between training episodes, `[]` int32.
     """
@@ -41,6 +43,7 @@ class TrainResult:
     train_steps: Array
     episodes: Array
     returns: Float[Array, " max_episodes"]
+    episode_ends: Int[Array, " max_episodes"]
     nonfinite: Array
     test_steps: Array
 
@@ -70,6 +73,7 @@ class _LoopState:
     agent_state: Any
     recent: Array  # [2 * window]: the last returns, newest last
     returns: Array  # [max_episodes]
+    episode_ends: Array  # [max_episodes]
     nonfinite: Array
     test_steps: Array
 
@@ -125,6 +129,7 @@ def make_trainer(
             agent_state=agent.begin_episode(agent_state, jnp.int32(0)),
             recent=jnp.zeros(2 * window),
             returns=jnp.full(training.max_episodes, jnp.nan),
+            episode_ends=jnp.zeros(training.max_episodes, jnp.int32),
             nonfinite=jnp.bool_(False),
             test_steps=jnp.int32(0),
         )
@@ -211,6 +216,7 @@ def make_trainer(
             agent_state=agent.begin_episode(state.agent_state, num_episodes),
             recent=recent,
             returns=state.returns.at[state.episode].set(episode_return),
+            episode_ends=state.episode_ends.at[state.episode].set(state.train_steps),
             test_steps=test_steps,
         )
 
@@ -226,6 +232,7 @@ def make_trainer(
             train_steps=state.train_steps,
             episodes=state.episode,
             returns=state.returns,
+            episode_ends=state.episode_ends,
             nonfinite=state.nonfinite | ~_all_finite(state.agent_state),
             test_steps=state.test_steps,
         )

@@ -1,0 +1,333 @@
+"""How every agent learns its task: test returns against training steps, over many seeds.
+
+Source: paper, Algorithm 1, TrainAgent and EvaluateAgent, with the real task in the SE's place.
+
+After each training episode an agent plays `--test-episodes` greedy ones on the task, and nothing
+ends its training but the step limit. A study is an agent on a task; its hyperparameters are the
+paper's where `STUDIES` names no others, and its peers are what others report for the same task.
+"""
+
+import argparse
+import functools
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from sejax import commands
+from sejax.agents.configs import AGENT_CONFIGS
+from sejax.errors import ConfigError, require, unknown_name
+from sejax.experiments import common
+
+NAME = "agent_learning"
+WINDOW = 10  # test episodes that a point of a curve is the mean of
+QUICK_STEPS, QUICK_AGENTS = 2000, 2
+
+# RL Baselines3 Zoo, benchmark.md: the final return of one agent, with the steps it was trained for.
+ZOO = "RL Baselines3 Zoo"
+PAPER_DDQN = "16,888 steps to solve, agents with drawn hyperparameters (the paper)"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Study:
+    """An agent on a task.
+
+    Attributes:
+      env: name of the task.
+      agent: name of the agent.
+      max_steps: training steps.
+      hparams: hyperparameters other than the agent's defaults, which are the paper's.
+      peers: what others report.
+    """
+
+    env: str
+    agent: str
+    max_steps: int
+    hparams: dict[str, Any] = field(default_factory=dict)
+    peers: str = ""
+
+    @property
+    def name(self) -> str:
+        return f"{self.env}-{self.agent}"
+
+
+STUDIES = (
+    Study(env="cartpole", agent="ddqn", max_steps=20_000, peers=PAPER_DDQN),
+    Study(env="cartpole", agent="dueling_ddqn", max_steps=20_000, peers="12,745 steps to solve, "
+          "likewise"),
+    Study(env="cartpole", agent="td3_discrete", max_steps=20_000, peers="17,875 steps and a return "
+          "of 152, likewise"),
+    Study(env="cartpole", agent="ppo", max_steps=100_000,
+          hparams={"activation": "tanh", "learning_rate": 1e-3, "discount": 0.98,
+                   "update_episodes": 4, "epochs": 20},
+          peers=f"500.0 of 500 on CartPole-v1 after 100,000 steps ({ZOO})"),
+    Study(env="pendulum", agent="td3", max_steps=20_000,
+          hparams={"learning_rate": 1e-3, "discount": 0.98, "init_episodes": 10},
+          peers=f"-151.9 after 20,000 steps ({ZOO})"),
+    Study(env="pendulum", agent="ppo", max_steps=200_000,
+          hparams={"activation": "tanh", "learning_rate": 5e-4, "discount": 0.95,
+                   "entropy_weight": 0.0, "init_action_std": 1.0},
+          peers=f"-172.2 after 100,000 steps ({ZOO})"),
+    Study(env="cliff_walking", agent="q_learning", max_steps=2_000, peers="optimal: -12"),
+    Study(env="cliff_walking", agent="sarsa", max_steps=2_000, peers="optimal: -12"),
+    Study(env="cliff_walking", agent="sarsa", max_steps=5_000,
+          hparams={"discount": 1.0, "epsilon_init": 0.01, "epsilon_min": 0.0,
+                   "epsilon_decay": 0.9}, peers="optimal: -12"),
+)  # fmt: skip
+
+
+def main() -> None:
+    """Runs the experiment as the command line says."""
+    args = common.parse_args(NAME, __doc__, add_options)
+    try:
+        run(args)
+    except ConfigError as error:
+        commands.fail(str(error), commands.BAD_INPUT)
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Options of this experiment."""
+    parser.add_argument("--envs", nargs="+", default=list(dict.fromkeys(s.env for s in STUDIES)),
+                        metavar="TASK", help="tasks whose agents are trained; all")  # fmt: skip
+    parser.add_argument("--num-agents", type=int, help="seeds of each agent; 10, quick 2")
+    parser.add_argument("--test-episodes", type=int, default=1, help="after each training episode")
+
+
+def run(args: argparse.Namespace) -> pd.DataFrame:
+    """Trains what is missing, writes everything and returns the table.
+
+    Raises:
+      ConfigError: for an unknown task or numbers that cannot work.
+    """
+    if args.num_agents is None:
+        args.num_agents = QUICK_AGENTS if args.quick else 10
+    for name in ("num_agents", "test_episodes"):
+        option = f"--{name.replace('_', '-')}"
+        require(getattr(args, name) >= 1, option, "be at least 1", "it counts",
+                getattr(args, name), f"{option}=10")  # fmt: skip
+    known = tuple(dict.fromkeys(study.env for study in STUDIES))
+    for env in args.envs:
+        if env not in known:
+            raise unknown_name("--envs", env, known)
+    pieces = common.Pieces(args.out / "pieces")
+    tables = []
+    for number, study in enumerate(STUDIES):
+        if study.env not in args.envs:
+            continue
+        max_steps = min(study.max_steps, QUICK_STEPS) if args.quick else study.max_steps
+        config = AGENT_CONFIGS[study.agent](**study.hparams)
+        settings = {"agent": vars(config), "env": study.env, "max_steps": max_steps,
+                    "num_agents": args.num_agents, "test_episodes": args.test_episodes,
+                    "seed": args.seed}  # fmt: skip
+        curves = pieces.compute(
+            f"{number:02d}-{study.name}", settings,
+            functools.partial(train, config, study.env, max_steps, args),
+        )  # fmt: skip
+        print(f"{study.name}: last {WINDOW} test returns {last_returns(curves).mean():.1f}",
+              flush=True)  # fmt: skip
+        tables.append(curves.assign(study=number, max_steps=max_steps))
+    return report(args, pd.concat(tables, ignore_index=True))
+
+
+def train(config: Any, env: str, max_steps: int, args: argparse.Namespace) -> pd.DataFrame:
+    """Trains the agents of a study; a row for each training episode of each."""
+    import jax
+
+    from sejax.parallel import spread_over_devices
+
+    program, cpu_lanes = make_program(config, env, max_steps, args.test_episodes)
+    keys = jax.random.split(jax.random.key(args.seed), args.num_agents)
+    spread = spread_over_devices(program, args.devices, cpu_lanes=cpu_lanes)
+    returns, steps = jax.device_get(jax.jit(spread)(keys))
+    rows = []
+    for agent in range(args.num_agents):
+        count = int((steps[agent] > 0).sum())
+        curve = {"steps": steps[agent, :count], "test_return": returns[agent, :count].astype(float)}
+        rows.append(pd.DataFrame({"agent": agent} | curve))
+    return pd.concat(rows, ignore_index=True)
+
+
+def make_program(
+    config: Any, env: str, max_steps: int, test_episodes: int
+) -> tuple[Callable[[Any], Any], int | None]:
+    """Builds `program(key) -> (test returns, training steps)`, `[episodes]`, and its CPU lanes."""
+    import jax.numpy as jnp
+
+    from sejax import envs
+    from sejax.agents.configs import ExplorationConfig
+    from sejax.agents.registry import make_agent
+    from sejax.agents.trainer import make_tester, make_trainer
+    from sejax.configs import TrainingConfig
+
+    task = envs.make(env)
+    agent = make_agent(config, task, ExplorationConfig())
+    training = TrainingConfig(
+        max_episodes=max_steps // SHORTEST_EPISODE,
+        max_steps=max_steps,
+        stop_rule="solved",  # with a threshold that nobody reaches: tested, but never stopped
+        solved_by="test",
+        time_limit_is_terminal=False,
+    )
+    test = make_tester(agent, task, test_episodes)
+
+    def test_between(key: Any, agent_state: Any, active: Any) -> Any:
+        returns, steps = test(key, agent_state, active)
+        return returns.mean(), steps.sum()
+
+    train_one = make_trainer(agent, task.env, training, jnp.inf, test_between)
+
+    def program(key: Any) -> Any:
+        result = train_one(key, task.params)
+        return result.returns, result.episode_ends
+
+    return program, agent.cpu_lanes
+
+
+SHORTEST_EPISODE = 8  # CartPole cannot be lost sooner
+
+
+def last_returns(curves: pd.DataFrame) -> pd.Series:
+    """Mean of each agent's last `WINDOW` test returns, by agent."""
+    return curves.groupby("agent")["test_return"].apply(lambda x: x.tail(WINDOW).mean())
+
+
+def smoothed(curve: pd.DataFrame) -> np.ndarray:
+    """Mean of the last `WINDOW` test returns (of all, if fewer) after each episode of an agent."""
+    return curve["test_return"].rolling(WINDOW, min_periods=1).mean().to_numpy()
+
+
+def steps_to_solve(curve: pd.DataFrame, solved_reward: float) -> float:
+    """Training steps until the mean of the last `WINDOW` tests is high enough; inf if it never is.
+
+    Args:
+      curve: of one agent, in order.
+      solved_reward: the task's threshold.
+    """
+    full = curve["test_return"].rolling(WINDOW).mean().to_numpy()
+    solved = np.flatnonzero(full >= solved_reward)
+    return float(curve["steps"].iloc[solved[0]]) if len(solved) else np.inf
+
+
+def on_grid(curves: pd.DataFrame, grid: np.ndarray) -> np.ndarray:
+    """Each agent's smoothed test return at given training steps, `[agent, points]`.
+
+    The value at a step is that of the last finished episode; nan before the first.
+    """
+    rows = []
+    for _, curve in curves.groupby("agent"):
+        place = np.searchsorted(curve["steps"], grid, side="right") - 1
+        rows.append(np.where(place >= 0, smoothed(curve)[place], np.nan))
+    return np.stack(rows)
+
+
+def summarise(curves: pd.DataFrame) -> pd.DataFrame:
+    """One row for each study."""
+    from sejax import envs
+
+    rows = []
+    for number, mine in curves.groupby("study"):
+        study = STUDIES[int(number)]
+        threshold = envs.make(study.env).solved_reward
+        to_solve = mine.groupby("agent")[["steps", "test_return"]].apply(
+            steps_to_solve, solved_reward=threshold
+        )
+        last = last_returns(mine)
+        low, high = common.bootstrap_interval(last)
+        rows.append({
+            "study": number, "env": study.env, "agent": study.agent,
+            "num_agents": len(last), "max_steps": mine["max_steps"].iloc[0], "threshold": threshold,
+            "num_solved": int(np.isfinite(to_solve).sum()),
+            "median_steps_to_solve": float(np.sort(to_solve)[(len(to_solve) - 1) // 2]),
+            "last_return": last.mean(), "last_low": low, "last_high": high,
+        })  # fmt: skip
+    return pd.DataFrame(rows)
+
+
+def make_table(summary: pd.DataFrame) -> pd.DataFrame:
+    """The summary as texts, with what others report."""
+    rows = []
+    for row in summary.itertuples():
+        study = STUDIES[row.study]
+        changed = ", ".join(f"{name} {value}" for name, value in study.hparams.items())
+        median = row.median_steps_to_solve
+        rows.append({
+            "task": row.env,
+            "agent": row.agent,
+            "other than the paper's": changed,
+            "solved": f"{row.num_solved} of {row.num_agents} at {row.threshold:g}",
+            "median steps to solve": f"{median:,.0f}" if np.isfinite(median) else "-",
+            "steps": f"{row.max_steps:,}",
+            f"last {WINDOW} tests": f"{row.last_return:.1f} "
+                                    f"[{row.last_low:.1f}, {row.last_high:.1f}]",
+            "others": study.peers,
+        })  # fmt: skip
+    return pd.DataFrame(rows)
+
+
+def report(args: argparse.Namespace, curves: pd.DataFrame) -> pd.DataFrame:
+    """Writes the CSV, the picture and the table, prints the table and returns it."""
+    from sejax.experiments import figures
+    from sejax.files import write_text
+
+    summary = summarise(curves)
+    table = make_table(summary)
+    write_text(args.out / "summary.csv", summary.to_csv(index=False))
+    draw(curves, args.out / "learning_curves.png")
+    title = "Agents that learn the real tasks"
+    note = (
+        f"{args.num_agents} seeds of each; after each training episode {args.test_episodes} "
+        f"greedy test episode. Solved: the mean of {WINDOW} tests in a row reaches the threshold "
+        f"at some time. The last {WINDOW} tests: mean over seeds, bootstrap 95% interval. "
+        "CartPole here is v0, of 200 steps."
+    )
+    command = figures.command(NAME, args, "envs", "num_agents", "test_episodes")
+    common.write_markdown(args.out / "table.md", title, command, table, note)
+    figures.print_table(title, table)
+    print(f"{args.out}: learning_curves.png, summary.csv and table.md.")
+    return table
+
+
+def draw(curves: pd.DataFrame, path: Path, points: int = 100) -> None:
+    """Draws a panel for each task: mean and 95% interval of each agent."""
+    import matplotlib.pyplot as plt
+
+    from sejax import envs
+    from sejax.experiments import figures
+
+    panels = list(curves.groupby(curves["study"].map(lambda i: STUDIES[i].env), sort=False))
+    palette = (figures.REAL, figures.VARIED, figures.FIXED, figures.SOLVED)
+    with plt.rc_context(figures.STYLE):
+        columns = min(2, len(panels))
+        lines = -(-len(panels) // columns)
+        figure, axes = plt.subplots(lines, columns, figsize=(5.2 * columns, 3.4 * lines),
+                                    squeeze=False, layout="constrained")  # fmt: skip
+        for axis in axes.ravel()[len(panels) :]:
+            axis.set_visible(False)
+        for axis, (env, mine) in zip(axes.ravel(), panels, strict=False):
+            for color, (number, study_curves) in zip(palette, mine.groupby("study"), strict=False):
+                study = STUDIES[int(number)]
+                last_step = study_curves["steps"].max()
+                grid = np.geomspace(last_step / 200, last_step, points)
+                values = on_grid(study_curves, grid)
+                known = ~np.isnan(values).any(axis=0)
+                bounds = [common.bootstrap_interval(v) for v in values[:, known].T]
+                low, high = np.transpose(bounds)
+                label = figures.AGENT_NAMES.get(study.agent, study.agent)
+                axis.plot(grid[known], values[:, known].mean(axis=0), color=color, lw=1.8,
+                          label=f"{label}*" if study.hparams else label)  # fmt: skip
+                axis.fill_between(grid[known], low, high, color=color, alpha=0.18, lw=0)
+            axis.axhline(envs.make(env).solved_reward, color="#7a7a7a", ls="--", lw=1)
+            axis.set_title(str(env), fontsize=10)
+            axis.set_xscale("log")
+            axis.set_xlabel("training steps (log scale); *: see the table's hyperparameters")
+            axis.legend(fontsize=8, loc="best")
+        for axis in axes[:, 0]:
+            axis.set_ylabel(f"test return, mean of {WINDOW}")
+        figures.write(figure, path)
+
+
+if __name__ == "__main__":
+    main()

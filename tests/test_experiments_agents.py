@@ -1,0 +1,68 @@
+"""The experiment on how agents learn the real tasks."""
+
+import argparse
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from sejax.errors import ConfigError
+from sejax.experiments import agent_learning
+
+
+def options(out, *argv):
+    parser = argparse.ArgumentParser()
+    agent_learning.add_options(parser)
+    args = parser.parse_args(argv)
+    return argparse.Namespace(**vars(args), quick=True, out=out, seed=3, devices=1)
+
+
+def refuse(*_, **__):
+    raise AssertionError("computed again")
+
+
+def curve(steps, returns):
+    return pd.DataFrame({"agent": 0, "steps": steps, "test_return": np.array(returns, float)})
+
+
+def test_a_task_is_solved_when_ten_tests_in_a_row_are_good_on_average():
+    good_late = curve(range(10, 310, 10), [0] * 10 + [10] * 20)
+    # Ten in a row have mean 9 once nine of them are 10: the window ends at the 19th episode.
+    assert agent_learning.steps_to_solve(good_late, 9.0) == 190
+    assert agent_learning.steps_to_solve(good_late, 10.1) == np.inf
+    assert agent_learning.steps_to_solve(good_late.head(9), 0.0) == np.inf  # too few tests
+
+
+def test_curves_hold_the_value_of_the_last_finished_episode():
+    two = pd.concat([curve([10, 20], [1, 3]), curve([15], [5]).assign(agent=1)])
+    values = agent_learning.on_grid(two, np.array([5, 10, 19, 20]))
+    np.testing.assert_array_equal(values, [[np.nan, 1, 1, 2], [np.nan, np.nan, 5, 5]])
+
+
+def test_every_agent_learns_and_nothing_is_computed_twice(tmp_path, monkeypatch):
+    monkeypatch.setattr(agent_learning, "QUICK_STEPS", 400)
+    args = options(tmp_path, "--envs", "cliff_walking")
+    table = agent_learning.run(args)
+    assert list(table["agent"]) == ["q_learning", "sarsa", "sarsa"]
+    assert (tmp_path / "learning_curves.png").stat().st_size > 10_000
+    assert "python -m sejax.experiments.agent_learning --quick" in (
+        tmp_path / "table.md"
+    ).read_text()
+    curves = pd.read_csv(next((tmp_path / "pieces").glob("*q_learning.csv")))
+    assert set(curves["agent"]) == {0, 1}
+    for _, mine in curves.groupby("agent"):
+        assert (np.diff(mine["steps"], prepend=0) >= 1).all()
+        assert (np.diff(mine["steps"], prepend=0) <= 50).all()
+        assert mine["steps"].iloc[-1] <= 400
+        assert mine["test_return"].between(-150, -12).all()
+
+    monkeypatch.setattr(agent_learning, "train", refuse)
+    pd.testing.assert_frame_equal(agent_learning.run(args), table)
+
+
+@pytest.mark.parametrize(
+    ("given", "named"), [(["--envs", "cartpol"], "cartpole"), (["--num-agents", "0"], "at least 1")]
+)
+def test_what_cannot_work_is_refused(tmp_path, given, named):
+    with pytest.raises(ConfigError, match=named):
+        agent_learning.run(options(tmp_path, *given))
