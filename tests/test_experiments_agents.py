@@ -45,9 +45,9 @@ def test_every_agent_learns_and_nothing_is_computed_twice(tmp_path, monkeypatch)
     table = agent_learning.run(args)
     assert list(table["agent"]) == ["q_learning", "sarsa", "sarsa"]
     assert (tmp_path / "learning_curves.png").stat().st_size > 10_000
-    assert "python -m sejax.experiments.agent_learning --quick" in (
-        tmp_path / "table.md"
-    ).read_text()
+    assert (
+        "python -m sejax.experiments.agent_learning --quick" in (tmp_path / "table.md").read_text()
+    )
     curves = pd.read_csv(next((tmp_path / "pieces").glob("*q_learning.csv")))
     assert set(curves["agent"]) == {0, 1}
     for _, mine in curves.groupby("agent"):

@@ -68,8 +68,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     """Options of this experiment."""
     parser.add_argument("--proxy", default="cartpole", help="SE: a run directory, a file or a "
                         "shipped name; cartpole")  # fmt: skip
-    parser.add_argument("--agents", nargs="+", default=list(AGENTS[:2]), metavar="AGENT",
-                        help=f"a row each, of {', '.join(AGENTS)}; ddqn dueling_ddqn")  # fmt: skip
+    parser.add_argument("--agents", nargs="+", default=list(AGENTS), metavar="AGENT",
+                        help=f"a row each; {', '.join(AGENTS)}")  # fmt: skip
     parser.add_argument("--num-agents", type=int, help="of each kind; 10, quick 3")
     parser.add_argument("--test-episodes", type=int, default=10, help="of each agent; 10")
     parser.add_argument("--max-rows", type=int, default=10_000, help="training transitions of an "

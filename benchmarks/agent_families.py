@@ -1,0 +1,286 @@
+"""CPU time of one agent step for each family of agents on one core: sejax against eager PyTorch.
+
+Each family trains `--agents` agents for `--steps` steps on a fresh SE. Hyperparameters are the
+paper's: for DDQN those of CartPole, for the others the defaults. Families with a PyTorch reference
+are measured at those of `preset=best` as well, where networks and batches are small. Agents learn
+from the first step on; training never stops early, and a fresh SE hardly ever ends an episode. PPO
+learns when its rollout is full: it trains for a multiple of that many steps, at least two, so that
+acting and learning have their usual shares.
+
+sejax trains the agents as the commands do, through `spread_over_devices` and with the agent's own
+number of lanes, but on one device. PyTorch trains `--torch-agents` of them one after the other, for
+as many steps each: what a step costs there does not depend on how many agents there are.
+
+Both sides are kept to the same core and take turns, so that a disturbance meets both. Compilation
+is not counted, nor is a short training by PyTorch before the first. CPU time, unlike wall-clock,
+excludes what other processes take. The ratio of a pair is what to quote: PyTorch's time over
+sejax's.
+"""
+
+import argparse
+import functools
+import importlib
+import os
+from dataclasses import dataclass, replace
+from statistics import median
+from typing import Any
+
+import common
+from rich.progress import track
+
+from sejax.agents.configs import AGENT_CONFIGS, AgentConfig, PPOConfig
+from sejax.configs import EnvConfig, LearnConfig, TrainingConfig, config
+
+WARM_UP_STEPS = 300
+
+
+@dataclass(frozen=True, kw_only=True)
+class Family:
+    """A row of the table.
+
+    Attributes:
+      agent: name of the agent.
+      env: name of the task that the SE stands in for.
+      reference: the PyTorch module with `train(env, config, seed)`, if there is one.
+      settings: "paper" or "best": whose hyperparameters.
+    """
+
+    agent: str
+    env: str
+    reference: str | None = None
+    settings: str = "paper"
+
+    def learn_config(self, steps: int) -> LearnConfig:
+        """Training for so many steps, or PPO's next multiple, in all of which the agent learns."""
+        chosen = self._learn_config()
+        agent = replace(chosen.agent, init_episodes=0)
+        steps = whole_phases(steps, agent)
+        training = TrainingConfig(stop_rule="never", max_steps=steps, max_episodes=steps)
+        return replace(chosen, agent=agent, training=training)
+
+    def _learn_config(self) -> LearnConfig:
+        if self.settings == "best":
+            return config([f"env={self.env}", f"agent={self.agent}", "preset=best"])
+        if self.agent == "ddqn":
+            return config([f"env={self.env}", "preset=paper"])
+        agent = AGENT_CONFIGS[self.agent](name=self.agent)
+        return LearnConfig(env=EnvConfig(name=self.env), agent=agent)
+
+
+WITH_REFERENCE = [
+    Family(agent="ddqn", env="cartpole", reference="torch_reference"),
+    Family(agent="td3", env="pendulum", reference="torch_reference_td3"),
+    Family(agent="ppo", env="cartpole", reference="torch_reference_ppo"),
+]
+OTHERS = [
+    Family(agent="dueling_ddqn", env="cartpole"),
+    Family(agent="td3_discrete", env="cartpole"),
+    Family(agent="q_learning", env="cliff_walking"),
+    Family(agent="sarsa", env="cliff_walking"),
+]
+FAMILIES = {
+    f"{family.agent}, {family.settings}": family
+    for family in [
+        *WITH_REFERENCE,
+        *(replace(family, settings="best") for family in WITH_REFERENCE),
+        *OTHERS,
+    ]
+}
+
+
+def whole_phases(steps: int, agent: AgentConfig) -> int:
+    """The number of steps, for PPO rounded up to whole learning phases, of which at least two."""
+    if not isinstance(agent, PPOConfig):
+        return steps
+    length = agent.update_episodes * 200 + 1  # sejax.agents.ppo.rollout_length in CartPole
+    return max(2, -(-steps // length)) * length
+
+
+def main() -> None:
+    """Runs the benchmark, or one of its sides."""
+    args = common.parse_args(__doc__, add_options)
+    set_defaults(args)
+    if args.side:
+        os.sched_setaffinity(0, {args.core})
+        SIDES[args.side](args)
+        return
+    machine = common.machine()
+    samples = measure_pairs(args)
+    result = summarise(samples)
+    show(result, args)
+    settings = {name: getattr(args, name) for name in SIZES} | {"core": args.core}
+    common.finish("agent_families", args, {"machine": machine, "settings": settings, **result})
+
+
+# Name of an option -> value if --quick, value otherwise.
+SIZES = {"agents": (3, 40), "torch_agents": (1, 3), "steps": (300, 2000), "pairs": (3, 3)}
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Options of this benchmark."""
+    described = {
+        "agents": "that sejax trains in each family",
+        "torch_agents": "that PyTorch trains",
+        "steps": "of each agent",
+        "pairs": "repetitions",
+    }
+    for name, text in described.items():
+        quick, full = SIZES[name]
+        values = f"{quick} if --quick, else {full}" if quick != full else f"{full}"
+        parser.add_argument(f"--{name.replace('_', '-')}", type=int, help=f"{text} ({values})")
+    parser.add_argument(
+        "--families", nargs="+", choices=FAMILIES, metavar="FAMILY",
+        help="rows of the table, such as 'td3, paper' (the first three if --quick, else all)",
+    )  # fmt: skip
+    parser.add_argument("--core", type=int, default=common.available_cores()[-1])
+
+
+def set_defaults(args: argparse.Namespace) -> None:
+    """Fills in the sizes and families that were not given."""
+    for name, (quick, full) in SIZES.items():
+        if getattr(args, name) is None:
+            setattr(args, name, quick if args.quick else full)
+    args.families = args.families or list(FAMILIES)[: 3 if args.quick else None]
+
+
+def measure_pairs(args: argparse.Namespace) -> list[dict[str, Any]]:
+    """One sample for each family and pair: CPU seconds and steps of both sides."""
+    names = ("agents", "torch_agents", "steps", "core", "seed")
+    options = [x for name in names for x in (f"--{name.replace('_', '-')}", getattr(args, name))]
+    samples = []
+    with (
+        common.Side(__file__, "sejax", *options) as sejax_side,
+        common.Side(__file__, "torch", *options) as torch_side,
+    ):
+        for family in track(args.families, "Measuring", transient=True):
+            sides = [sejax_side, torch_side] if FAMILIES[family].reference else [sejax_side]
+            prepared = sejax_side.ask(family=family)
+            if torch_side in sides:
+                torch_side.ask(family=family, weights=prepared["weights"])
+            for pair in range(args.pairs):
+                seed = args.seed + pair
+                times = {side.name: side.ask(family=family, seed=seed) for side in sides}
+                samples.append({"family": family, **times})
+    return samples
+
+
+def summarise(samples: list[dict[str, Any]]) -> dict[str, Any]:
+    """Medians and ranges of both sides' times and of the ratios within the pairs."""
+    result: dict[str, Any] = {"families": {}}
+    for family in dict.fromkeys(sample["family"] for sample in samples):
+        chosen = [sample for sample in samples if sample["family"] == family]
+        times = {
+            side: [1e6 * sample[side]["cpu_s"] / sample[side]["steps"] for sample in chosen]
+            for side in SIDES
+            if side in chosen[0]
+        }
+        row = {f"{side}_us": common.spread(values) for side, values in times.items()}
+        if "torch" in times:
+            ratios = [b / a for a, b in zip(times["sejax"], times["torch"], strict=True)]
+            row["ratio"] = common.spread(ratios)
+        result["families"][family] = row | {"steps": chosen[0]["sejax"]["steps"]}
+    result["share_of_core"] = median(
+        sample[side]["cpu_s"] / sample[side]["wall_s"]
+        for sample in samples for side in SIDES if side in sample
+    )  # fmt: skip
+    return result
+
+
+def show(result: dict[str, Any], args: argparse.Namespace) -> None:
+    """Prints the table."""
+    rows = [
+        [family, *(common.show_spread(row[column]) if column in row else "-"
+                   for column in ("sejax_us", "torch_us", "ratio"))]
+        for family, row in result["families"].items()
+    ]  # fmt: skip
+    common.print_table(
+        f"CPU microseconds per agent step on one core, {args.agents} agents, median (min to max)",
+        ["agent, hyperparameters", "sejax", "PyTorch", "PyTorch / sejax"],
+        rows,
+    )
+    print(f"Share of the core that these processes got: {result['share_of_core']:.0%}")
+
+
+def sejax_side(args: argparse.Namespace) -> None:
+    """Trains all agents of a family in one program for one device.
+
+    A request without a seed compiles that, and answers with the SE's weights.
+    """
+    from sejax.runtime import configure_xla, enable_compilation_cache
+
+    configure_xla(1)
+    enable_compilation_cache()
+    import jax
+    import numpy as np
+
+    import sejax
+    from sejax import envs
+    from sejax.agents.trainer import make_trainer
+    from sejax.parallel import spread_over_devices
+    from sejax.proxies.synthetic import make_synthetic
+
+    programs = {}
+
+    def keys(seed: int) -> jax.Array:
+        return jax.random.split(jax.random.key(seed), args.agents)
+
+    def prepare(family: str) -> dict[str, Any]:
+        config = FAMILIES[family].learn_config(args.steps)
+        task = envs.make(config.env.name)
+        env, agent = make_synthetic(task, config.proxy), sejax.make_agent(config.agent, task)
+        train = make_trainer(agent, env, config.training, task.solved_reward)
+        weights = env.init_weights(jax.random.key(args.seed))
+
+        def train_all(keys: jax.Array, params: Any) -> Any:
+            one = functools.partial(train, env_params=params)
+            return spread_over_devices(one, cpu_lanes=agent.cpu_lanes)(keys)
+
+        params = env.params(weights)
+        programs[family] = jax.jit(train_all).lower(keys(0), params).compile(), params
+        return {"weights": jax.tree.map(lambda x: np.asarray(x).tolist(), weights)}
+
+    def handle(request: dict[str, Any]) -> dict[str, Any]:
+        if "seed" not in request:
+            return prepare(request["family"])
+        program, params = programs[request["family"]]
+        chosen = keys(request["seed"])
+        result, times = common.measure(lambda: jax.block_until_ready(program(chosen, params)))
+        return {"steps": int(result.train_steps.sum()), **times}
+
+    common.serve({}, handle)
+
+
+def torch_side(args: argparse.Namespace) -> None:
+    """Trains some agents of a family one after the other with one thread.
+
+    A request with weights makes the SE of them and trains an agent for a few steps.
+    """
+    import torch
+    from torch_reference import SyntheticEnv
+
+    torch.set_num_threads(1)
+    prepared = {}
+
+    def prepare(family: str, weights: Any) -> dict[str, Any]:
+        config = FAMILIES[family].learn_config(args.steps)
+        env = SyntheticEnv(weights, config.proxy)
+        reference = importlib.import_module(FAMILIES[family].reference or "")
+        prepared[family] = functools.partial(reference.train, env, config)
+        reference.train(env, FAMILIES[family].learn_config(WARM_UP_STEPS), 0)
+        return {}
+
+    def handle(request: dict[str, Any]) -> dict[str, Any]:
+        if "weights" in request:
+            return prepare(request["family"], request["weights"])
+        train, first = prepared[request["family"]], request["seed"] * args.torch_agents
+        seeds = range(first, first + args.torch_agents)
+        results, times = common.measure(lambda: [train(seed) for seed in seeds])
+        return {"steps": sum(result.train_steps for result in results), **times}
+
+    common.serve({}, handle)
+
+
+SIDES = {"sejax": sejax_side, "torch": torch_side}
+
+if __name__ == "__main__":
+    main()

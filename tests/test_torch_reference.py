@@ -1,0 +1,64 @@
+"""benchmarks/torch_reference.py, the yardstick of the benchmarks: its updates are sejax's."""
+
+import sys
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.flatten_util import ravel_pytree
+
+from sejax.agents.configs import DDQNConfig
+from sejax.agents.ddqn import make_ddqn
+from sejax.agents.replay import Transition
+from sejax.configs import LearnConfig, SyntheticConfig, TrainingConfig
+from sejax.networks import MLP
+
+torch = pytest.importorskip("torch")
+sys.path.append(str(Path(__file__).parents[1] / "benchmarks"))
+
+import torch_reference as reference  # noqa: E402
+
+OBS_DIM, NUM_ACTIONS, BATCH = reference.OBS_DIM, reference.NUM_ACTIONS, 8
+CONFIG = DDQNConfig(hidden_size=9, num_layers=2, batch_size=BATCH, learning_rate=0.01)
+
+
+def torch_network(params):
+    """sejax's flat parameters as the reference keeps them."""
+    mlp = MLP(NUM_ACTIONS, CONFIG.hidden_size, CONFIG.num_layers, CONFIG.activation)
+    template = mlp.init(jax.random.key(0), jnp.zeros(OBS_DIM))["params"]
+    return reference.params_from_flax(ravel_pytree(template)[1](params))
+
+
+def test_updates_equal_sejaxs_on_the_same_batches():
+    agent = make_ddqn(CONFIG, OBS_DIM, NUM_ACTIONS)
+    state = jax.jit(agent.init)(jax.random.key(1), agent.hparams)
+    update = jax.jit(agent.update)
+    torch_state = reference.ddqn_state(torch_network(state.params))
+    rng = np.random.default_rng(0)
+    for _ in range(2):
+        batch = Transition(
+            obs=jnp.float32(rng.normal(size=(OBS_DIM, BATCH))),
+            action=jnp.int32(rng.integers(0, NUM_ACTIONS, BATCH)),
+            reward=jnp.float32(rng.normal(size=BATCH)),
+            discount=jnp.float32(rng.uniform(-0.2, 1.2, BATCH)),
+            next_obs=jnp.float32(rng.normal(size=(OBS_DIM, BATCH))),
+        )
+        state = update(jax.random.key(0), state, batch)
+        reference.ddqn_update(torch_state, reference.batch_from_sejax(batch), CONFIG)
+    networks = (state.params, torch_state.online.values), (state.target_params, torch_state.target)
+    for ours, theirs in networks:
+        torch.testing.assert_close(theirs, torch_network(ours), rtol=1e-4, atol=1e-6)
+
+
+@pytest.mark.parametrize(("max_steps", "steps"), [(None, 400), (250, 250)])
+def test_training_ends_after_the_episodes_or_the_steps(max_steps, steps):
+    heads = {name: reference.params_to_flax(reference.init_mlp([6, 5, size], "leaky_relu"))
+             for name, size in reference.HEADS.items()}  # fmt: skip
+    heads["done"]["Dense_1"]["bias"] -= 10  # never
+    env = reference.SyntheticEnv(heads, SyntheticConfig(hidden_size=5))
+    training = TrainingConfig(stop_rule="never", max_episodes=2, max_steps=max_steps)
+    result = reference.train(env, LearnConfig(agent=CONFIG, training=training), seed=0)
+    assert result.train_steps == steps
+    assert len(result.returns) == 2
