@@ -23,13 +23,13 @@ import importlib
 import os
 from dataclasses import dataclass, replace
 from statistics import median
-from typing import Any
+from typing import Any, cast
 
 import common
 from rich.progress import track
 
 from sejax.agents.configs import AGENT_CONFIGS, AgentConfig, PPOConfig
-from sejax.configs import EnvConfig, LearnConfig, TrainingConfig, config
+from sejax.configs import EnvConfig, LearnConfig, SyntheticConfig, TrainingConfig, config
 
 WARM_UP_STEPS = 300
 
@@ -263,7 +263,7 @@ def torch_side(args: argparse.Namespace) -> None:
 
     def prepare(family: str, weights: Any) -> dict[str, Any]:
         config = FAMILIES[family].learn_config(args.steps)
-        env = SyntheticEnv(weights, config.proxy)
+        env = SyntheticEnv(weights, cast(SyntheticConfig, config.proxy))
         reference = importlib.import_module(FAMILIES[family].reference or "")
         prepared[family] = functools.partial(reference.train, env, config)
         reference.train(env, FAMILIES[family].learn_config(WARM_UP_STEPS), 0)

@@ -11,12 +11,13 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from multiprocessing import get_context
 from multiprocessing.pool import Pool
+from typing import cast
 
 import numpy as np
 import torch
 from torch_reference import SyntheticEnv, Weights, play_test_episodes, train
 
-from sejax.configs import LearnConfig, NESConfig
+from sejax.configs import LearnConfig, NESConfig, SyntheticConfig
 
 
 @dataclass(kw_only=True)
@@ -34,7 +35,7 @@ def evaluate(weights: Weights, config: LearnConfig, seed: int) -> Outcome:
     Source: paper, Algorithm 1, TrainAgent and EvaluateAgent.
     """
     start = time.process_time()
-    result = train(SyntheticEnv(weights, config.proxy), config, seed)
+    result = train(SyntheticEnv(weights, cast(SyntheticConfig, config.proxy)), config, seed)
     returns = play_test_episodes(result.agent, config, seed + 1)
     return Outcome(
         score=math.nan if result.nonfinite else float(returns.mean()),

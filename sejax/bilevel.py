@@ -24,7 +24,7 @@ from sejax.es.nes import finite_mean
 from sejax.evaluation import evaluator_and_lanes
 from sejax.objectives import Outcome, make_objective
 from sejax.parallel import spread_over_devices
-from sejax.proxies.synthetic import SyntheticEnv, make_synthetic
+from sejax.proxies.registry import ProxyEnv, make_proxy
 
 
 @struct.dataclass
@@ -91,6 +91,8 @@ class Program:
       unravel: flat parameters `[dims]` to the proxy's weights.
       env: the proxy.
       task: the real task.
+      solved_score: incumbent mean at which the task counts as solved; None if the objective's
+        scores are not returns.
       num_dims: length of a parameter vector.
       num_candidates: trainings in a generation of one seed.
     """
@@ -98,8 +100,9 @@ class Program:
     init: Callable[[Array], LearnState]
     generation: Callable[[LearnState], tuple[LearnState, GenerationInfo]]
     unravel: Callable[[Array], Any]
-    env: SyntheticEnv
+    env: ProxyEnv
     task: envs.Task
+    solved_score: float | None
     num_dims: int
     num_candidates: int
 
@@ -142,11 +145,12 @@ def make_learner(config: LearnConfig) -> Callable[[Array], LearnResult]:
 def make_program(config: LearnConfig) -> Program:
     """Assembles the bilevel loop for `[seed]` independent runs. See `Program`."""
     task = envs.make(config.env.name)
-    env = make_synthetic(task, config.proxy)
+    env = make_proxy(task, config.proxy)
     flat, unravel = ravel_pytree(env.init_weights(jax.random.key(0)))
     strategy = make_strategy(config.es, flat.size)
     score_candidates = make_population_scorer(config, task, env, unravel)
     objective = make_objective(config.objective, task.solved_reward)
+    solved_score = task.solved_reward if config.objective.name == "max_reward" else None
 
     def init(keys: Array) -> LearnState:
         num_seeds = keys.shape[0]
@@ -189,7 +193,9 @@ def make_program(config: LearnConfig) -> Program:
         score = jax.vmap(finite_mean)(scores[:, -strategy.num_incumbent_evals :])
         score = jnp.where(jnp.isfinite(score), score, -jnp.inf)
         better = score > state.best_score
-        solved = score >= task.solved_reward
+        finished = state.finished
+        if config.stop_when_solved and solved_score is not None:
+            finished = score >= solved_score
         return LearnState(
             key=state.key,
             es_state=told,
@@ -200,7 +206,7 @@ def make_program(config: LearnConfig) -> Program:
             best_score=jnp.where(better, score, state.best_score),
             best_generation=jnp.where(better, state.generation, state.best_generation),
             env_steps=state.env_steps + outcome.real_steps.sum(axis=1),
-            finished=solved if config.stop_when_solved else state.finished,
+            finished=finished,
         )
 
     def _summarise(
@@ -230,13 +236,14 @@ def make_program(config: LearnConfig) -> Program:
         unravel=unravel,
         env=env,
         task=task,
+        solved_score=solved_score,
         num_dims=flat.size,
         num_candidates=strategy.num_candidates,
     )
 
 
 def make_population_scorer(
-    config: LearnConfig, task: envs.Task, env: SyntheticEnv, unravel: Callable[[Array], Any]
+    config: LearnConfig, task: envs.Task, env: ProxyEnv, unravel: Callable[[Array], Any]
 ) -> Callable[..., Outcome]:
     """Builds `score(seed_ids [n], keys [seed], candidates [seed, n, dims], active [seed])`.
 
@@ -246,7 +253,9 @@ def make_population_scorer(
     """
     make = make_varied_agents if config.agent_hparams == "varied" else make_agent
     agent = make(config.agent, task, config.exploration)
-    evaluate, cpu_lanes = evaluator_and_lanes(agent, env, task, config.training)
+    # The area under a learning curve that ends when the task is solved would reward learning late.
+    stop_reward = jnp.inf if config.objective.name == "auc" else None
+    evaluate, cpu_lanes = evaluator_and_lanes(agent, env, task, config.training, stop_reward)
 
     def evaluate_candidate(key: Array, candidate: Array, active: Array) -> Outcome:
         return evaluate(key, env.params(unravel(candidate)), active)

@@ -29,6 +29,10 @@ from sejax.validation import at_least, default, fraction, one_of, positive
 
 CONF_DIR = Path(__file__).parent / "conf" / "run"
 DONE_MODES = ("soft", "threshold")
+RN_VARIANTS = (
+    "additive_potential", "exclusive_potential", "additive_non_potential",
+    "exclusive_non_potential",
+)  # fmt: skip
 STOP_RULES = ("plateau", "solved", "never")
 SOLVED_BY = ("test", "train")
 SCORE_TRANSFORMS = (
@@ -40,7 +44,7 @@ AGGREGATES = ("mean", "min")
 AGENT_HPARAMS = ("default", "varied")
 EVALUATION_HPARAMS = (*AGENT_HPARAMS, "nes")
 TRAINING_FROM = ("proxy", "config")
-OBJECTIVES = ("max_reward", "reward_threshold")
+OBJECTIVES = ("max_reward", "reward_threshold", "auc")
 
 # Name of the `es` choice -> evosax's class. Listed here because importing evosax takes seconds;
 # a test holds the list against evosax's own registry. Left out are RandomSearch and the two SV
@@ -86,21 +90,48 @@ class EnvConfig:
 
 
 @dataclass(frozen=True, kw_only=True)
-class SyntheticConfig:
-    """Shape of the SE's three networks, and how their done output is used."""
+class ProxyConfig:
+    """What all proxies share: the shape of their networks."""
 
-    name: str = "se"
+    name: str
     hidden_size: int = 128
     num_layers: int = 1
     activation: str = "leaky_relu"
+
+    def __post_init__(self) -> None:
+        one_of("proxy.name", self.name, tuple(PROXY_CONFIGS))
+        at_least(1, "proxy.hidden_size", self.hidden_size, "a layer needs a unit", 128)
+        at_least(1, "proxy.num_layers", self.num_layers, "there is a hidden layer", 1)
+        one_of("proxy.activation", self.activation, ACTIVATIONS)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SyntheticConfig(ProxyConfig):
+    """The SE's three networks, and how their done output is used."""
+
+    name: str = "se"
     done: str = "soft"  # soft: bootstrap with 1 - d (authors); threshold: with 1 - [d > 0.5].
 
     def __post_init__(self) -> None:
-        one_of("proxy.name", self.name, ("se",))
-        at_least(1, "proxy.hidden_size", self.hidden_size, "a layer needs a unit", 128)
-        at_least(1, "proxy.num_layers", self.num_layers, "the SE has a hidden layer", 1)
-        one_of("proxy.activation", self.activation, ACTIVATIONS)
+        super().__post_init__()
         one_of("proxy.done", self.done, DONE_MODES)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RewardConfig(ProxyConfig):
+    """The RN's network, and how its output makes a reward."""
+
+    name: str = "rn"
+    activation: str = "prelu"
+    variant: str = "additive_potential"
+    zero_at_terminal: bool = False  # Phi is 0 where the episode terminates: policy invariance
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        one_of("proxy.variant", self.variant, RN_VARIANTS)
+
+
+PROXY_CONFIGS: dict[str, type[ProxyConfig]] = {"se": SyntheticConfig, "rn": RewardConfig}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -218,7 +249,7 @@ class LearnConfig:
 
     preset: str = "best"
     env: EnvConfig = field(default_factory=EnvConfig)
-    proxy: SyntheticConfig = field(default_factory=SyntheticConfig)
+    proxy: ProxyConfig = field(default_factory=SyntheticConfig)
     agent: AgentConfig = field(default_factory=DDQNConfig)
     exploration: ExplorationConfig = field(default_factory=ExplorationConfig)
     es: Any = field(default_factory=NESConfig)
@@ -236,6 +267,11 @@ class LearnConfig:
 
     def __post_init__(self) -> None:
         require_fit(self.agent, self.exploration, self.env.name)
+        self._require_tests_for_auc()
+        require(not self.stop_when_solved or self.objective.name == "max_reward",
+                "stop_when_solved", "be false with this objective", "its scores are not returns, "
+                "so that none says solved", f"true with objective={self.objective.name}",
+                "stop_when_solved=false")  # fmt: skip
         one_of("agent_hparams", self.agent_hparams, AGENT_HPARAMS)
         at_least(1, "generations", self.generations, "there is nothing to do otherwise", 50)
         require(0 <= self.seed < 2**31, "seed", "lie in [0, 2**31)", "it is a 32-bit number",
@@ -245,6 +281,13 @@ class LearnConfig:
         for name in ("lanes", "devices"):
             if getattr(self, name) is not None:
                 at_least(1, name, getattr(self, name), "something must compute", "null")
+
+    def _require_tests_for_auc(self) -> None:
+        rule = f"{self.training.stop_rule} by {self.training.solved_by} returns"
+        require(self.objective.name != "auc" or rule == "solved by test returns", "objective",
+                "be reward_threshold or max_reward where agents are not tested after each episode",
+                "the area is that under the curve of those tests", f"auc with stop_rule {rule}",
+                "training.stop_rule=solved training.solved_by=test")  # fmt: skip
 
     @property
     def resolved_run_dir(self) -> Path:
@@ -313,9 +356,10 @@ def config(overrides: Sequence[str] = ()) -> LearnConfig:
 
 def from_hydra(cfg: DictConfig) -> LearnConfig:
     """The typed and validated configuration of a composed Hydra one."""
+    one_of("proxy.name", cfg.proxy.name, tuple(PROXY_CONFIGS))
     groups = {
         "env": EnvConfig,
-        "proxy": SyntheticConfig,
+        "proxy": PROXY_CONFIGS[cfg.proxy.name],
         **_agent_groups(cfg),
         "es": NESConfig if cfg.es.name == "nes" else EvosaxConfig,
         "objective": ObjectiveConfig,
@@ -418,6 +462,14 @@ def translate_hydra_error(error: Exception) -> ConfigError:
         return unknown_name(group, got, [name for name in known if name])
     if missing and missing.startswith("tuned/"):
         preset, _, pair = missing.removeprefix("tuned/").partition("/")
+        env, _, proxy = pair.rpartition("-")
+        if preset == "best":
+            files = (CONF_DIR / "tuned" / "best").glob(f"*-{proxy}.yaml")
+            known = sorted(path.stem.removesuffix(f"-{proxy}") for path in files)
+            return ConfigError(
+                f"env must be one of {', '.join(known)} with proxy={proxy}, because there are "
+                f"settings for these; got {env}. Set env={known[0]}."
+            )
         return ConfigError(
             f"preset must be one that the paper or a measurement defines for the task, because it "
             f"holds that task's numbers; got preset={preset} for {pair}. Set preset=best."
@@ -440,12 +492,15 @@ def translate_hydra_error(error: Exception) -> ConfigError:
 
 
 def _known_fields() -> list[str]:
-    groups = (("proxy", SyntheticConfig), *(("agent", c) for c in AGENT_CONFIGS.values()),
+    groups = (*(("proxy", c) for c in PROXY_CONFIGS.values()),
+              *(("agent", c) for c in AGENT_CONFIGS.values()),
               *(("exploration", c) for c in EXPLORATION_CONFIGS.values()), ("es", NESConfig),
               ("es", EvosaxConfig), ("objective", ObjectiveConfig), ("training", TrainingConfig),
               ("real_training", TrainingConfig))  # fmt: skip
     names = [f.name for f in (*_plain_fields(LearnConfig), *_plain_fields(EvaluateConfig))]
-    names += [f"{group}.{f.name}" for group, schema in groups for f in fields(schema)]
+    schema: Any
+    for group, schema in groups:
+        names += [f"{group}.{f.name}" for f in fields(schema)]
     return list(dict.fromkeys(names))
 
 

@@ -13,7 +13,7 @@ from jaxtyping import Array
 
 from sejax.agents.agent import Agent
 from sejax.agents.hparams import VariedAgents
-from sejax.agents.trainer import make_tester, make_trainer
+from sejax.agents.trainer import TrainResult, make_tester, make_trainer
 from sejax.configs import TrainingConfig
 from sejax.envs import Task
 from sejax.objectives import Outcome
@@ -22,12 +22,17 @@ from sejax.proxies.synthetic import SyntheticEnv
 
 
 def make_evaluator(
-    agent: Agent, env: Any, task: Task, training: TrainingConfig
+    agent: Agent,
+    env: Any,
+    task: Task,
+    training: TrainingConfig,
+    stop_reward: float | None = None,
 ) -> Callable[..., Outcome]:
     """Builds `evaluate(key, env_params, active=True, hparams=...) -> Outcome` for a fresh agent.
 
     The agent trains in `env`, which may be a proxy or the task itself, and is tested over
-    `training.test_episodes` episodes on the task. With `active=False` nothing is computed.
+    `training.test_episodes` episodes on the task. With `active=False` nothing is computed. What the
+    solved rule asks for is `stop_reward`, or the task's threshold.
     """
     synthetic = isinstance(env, SyntheticEnv)
     test_once = make_tester(agent, task, num_episodes=1)
@@ -37,7 +42,8 @@ def make_evaluator(
         returns, steps = test_once(key, agent_state, active)
         return returns[0], steps[0]
 
-    train = make_trainer(agent, env, training, task.solved_reward, test_fn=test_between)
+    stop_reward = task.solved_reward if stop_reward is None else stop_reward
+    train = make_trainer(agent, env, training, stop_reward, test_fn=test_between)
 
     def evaluate(
         key: Array, env_params: Any, active: Array | bool = True, hparams: Any = agent.hparams
@@ -51,6 +57,7 @@ def make_evaluator(
             test_return=test_return,
             train_steps=result.train_steps,
             train_episodes=result.episodes,
+            return_area=return_area(result),
             nonfinite=result.nonfinite | ~jnp.isfinite(test_return),
             real_steps=real_steps if synthetic else real_steps + result.train_steps,
         )
@@ -58,14 +65,31 @@ def make_evaluator(
     return evaluate
 
 
+def return_area(result: TrainResult) -> Array:
+    """Sum over training episodes of return times length: the area under the learning curve.
+
+    Source: paper, appendix "Studying the Influence of Different Reward Network Optimization
+    Objectives" (AUC); `reference_details.md` 5.5.
+    """
+    lengths = jnp.diff(result.episode_ends, prepend=0)
+    finished = jnp.arange(lengths.size) < result.episodes
+    return jnp.sum(jnp.where(finished, result.returns * lengths, 0.0))
+
+
 def make_varied_evaluator(
-    varied: VariedAgents, env: Any, task: Task, training: TrainingConfig
+    varied: VariedAgents,
+    env: Any,
+    task: Task,
+    training: TrainingConfig,
+    stop_reward: float | None = None,
 ) -> Callable[..., Outcome]:
     """As `make_evaluator`, for an agent whose hyperparameters are drawn first, from the same key.
 
     Source: paper, section "Performance of SE-trained Agents" (HPs varied).
     """
-    evaluators = [make_evaluator(agent, env, task, training) for agent in varied.agents]
+    evaluators = [
+        make_evaluator(agent, env, task, training, stop_reward) for agent in varied.agents
+    ]
 
     def evaluate(key: Array, env_params: Any, active: Array | bool = True) -> Outcome:
         values = varied.draw(drawing_key(key))
@@ -76,12 +100,17 @@ def make_varied_evaluator(
 
 
 def evaluator_and_lanes(
-    agent: Agent | VariedAgents, env: Any, task: Task, training: TrainingConfig
+    agent: Agent | VariedAgents,
+    env: Any,
+    task: Task,
+    training: TrainingConfig,
+    stop_reward: float | None = None,
 ) -> tuple[Callable[..., Outcome], int | None]:
     """The evaluator of an agent, fixed or varied, and the lanes that suit it on a CPU."""
     if isinstance(agent, VariedAgents):
-        return make_varied_evaluator(agent, env, task, training), agent.agents[0].cpu_lanes
-    return make_evaluator(agent, env, task, training), agent.cpu_lanes
+        evaluator = make_varied_evaluator(agent, env, task, training, stop_reward)
+        return evaluator, agent.agents[0].cpu_lanes
+    return make_evaluator(agent, env, task, training, stop_reward), agent.cpu_lanes
 
 
 def drawing_key(key: Array) -> Array:

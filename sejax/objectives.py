@@ -17,6 +17,8 @@ class Outcome:
       test_return: mean return over the test episodes on the real task, in reward units.
       train_steps: steps in the training world.
       train_episodes: episodes there.
+      return_area: sum over those episodes of their return times their length; the returns are those
+        of the tests after each, where there are such tests.
       nonfinite: whether a number that is not finite was met in training; the score is then nan.
       real_steps: steps on the real task: tests, and training where its dynamics are real.
     """
@@ -24,6 +26,7 @@ class Outcome:
     test_return: Float[Array, "*agent"]
     train_steps: Int[Array, "*agent"]
     train_episodes: Int[Array, "*agent"]
+    return_area: Float[Array, "*agent"]
     nonfinite: Bool[Array, "*agent"]
     real_steps: Int[Array, "*agent"]
 
@@ -35,8 +38,10 @@ def make_objective(
 
     - `max_reward`: the mean test return (SEs).
     - `reward_threshold`: :math:`-(n_{tr} + w_{sol} \max(0, C_{sol} - C_{fin}))` (RNs).
+    - `auc`: the area under the curve of test returns over training steps (RNs).
 
-    Source: paper, Algorithm 1, EvaluateAgent, and section "Learning Reward Networks".
+    Source: paper, Algorithm 1, EvaluateAgent, section "Learning Reward Networks", and appendix
+    "Studying the Influence of Different Reward Network Optimization Objectives".
     """
 
     def objective(outcome: Outcome) -> Array:
@@ -44,6 +49,8 @@ def make_objective(
         if config.name == "reward_threshold":
             shortfall = jnp.maximum(0.0, solved_reward - outcome.test_return)
             score = -(outcome.train_steps + config.unsolved_weight * shortfall)
+        elif config.name == "auc":
+            score = outcome.return_area
         return jnp.where(outcome.nonfinite, jnp.nan, score)
 
     return objective

@@ -16,12 +16,12 @@ from sejax.files import atomic_path
 INCUMBENT, POPULATION, SOLVED, STEPS = "#1f5fa8", "#d9822b", "#3c8d40", "#6b4c9a"
 
 
-def learning_curve(rows: Sequence[dict[str, Any]], solved_reward: float, path: Path) -> None:
+def learning_curve(rows: Sequence[dict[str, Any]], solved_score: float | None, path: Path) -> None:
     """Draws `learning_curve.png`: scores above, agents' training steps below.
 
     Args:
       rows: rows of `metrics.csv`.
-      solved_reward: the task's threshold, drawn as a line.
+      solved_score: the task's threshold, drawn as a line; None if scores are not returns.
       path: the picture.
     """
     data = pd.DataFrame(rows).astype(float)
@@ -37,10 +37,10 @@ def learning_curve(rows: Sequence[dict[str, Any]], solved_reward: float, path: P
             top.plot(
                 mean.index, mean, color="black", lw=2.2, label="mean of the seeds still running"
             )
-        top.axhline(
-            solved_reward, color=SOLVED, ls="--", lw=1.2, label=f"solved ({solved_reward:g})"
-        )
-        top.set_ylabel("return on the real task")
+        if solved_score is not None:
+            label = f"solved ({solved_score:g})"
+            top.axhline(solved_score, color=SOLVED, ls="--", lw=1.2, label=label)
+        top.set_ylabel("score" if solved_score is None else "return on the real task")
         top.legend(frameon=False, fontsize=9, loc="best")
         bottom.set_ylabel("training steps\nof an agent")
         bottom.set_xlabel("NES generation")

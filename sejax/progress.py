@@ -83,14 +83,17 @@ class RunProgress:
     def finish(self, directory: Any, program: Any, best: float, ended: str) -> None:
         """Says how it ended, where everything is, and what to do next."""
         self.stop()
-        solved = best >= program.task.solved_reward
-        verdict = "solved" if solved else "not solved"
+        verdict = f"best incumbent score {best:.1f}"
+        if program.solved_score is not None:
+            solved = "solved" if best >= program.solved_score else "not solved"
+            verdict = (
+                f"{solved}: best incumbent mean {best:.1f}, solved at {program.solved_score:g}"
+            )
         path = directory.path
         title = "learned" if ended == "finished" else ended
         self._console.rule(f"{program.task.name}: {title}", align="left")
         self.print(
-            f"{verdict}: best incumbent mean {best:.1f}, solved at "
-            f"{program.task.solved_reward:g}\n\n"
+            f"{verdict}\n\n"
             f"  {path}/proxy.safetensors    the best proxy\n"
             f"  {path}/learning_curve.png   how it was learned\n"
             f"  {path}/metrics.csv          a row for each generation\n\n"

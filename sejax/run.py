@@ -135,7 +135,7 @@ def _draw(directory: Any, program: Any) -> None:
 
     if directory.rows:
         plots.learning_curve(
-            directory.rows, program.task.solved_reward, directory.path / "learning_curve.png"
+            directory.rows, program.solved_score, directory.path / "learning_curve.png"
         )
 
 

@@ -14,6 +14,7 @@ def outcome(test_return, train_steps, nonfinite):
         test_return=jnp.array(test_return, jnp.float32),
         train_steps=jnp.array(train_steps, jnp.int32),
         train_episodes=jnp.ones(count, jnp.int32),
+        return_area=jnp.arange(count, dtype=jnp.float32),
         nonfinite=jnp.array(nonfinite),
         real_steps=jnp.ones(count, jnp.int32),
     )

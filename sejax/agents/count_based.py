@@ -95,4 +95,5 @@ def with_count_bonus(
         act=act,
         update=update,
         hparams=CountingHparams(agent=agent.hparams, reward_scale=config.reward_scale),
+        discount=lambda hparams: agent.discount(hparams.agent),
     )

@@ -233,6 +233,7 @@ def with_icm(
         act=act,
         update=update,
         hparams=CuriousHparams(agent=agent.hparams, icm=hparams),
+        discount=lambda hparams: agent.discount(hparams.agent),
         batch_size=lambda state: agent.batch_size(state.agent_state),
     )
 

@@ -18,6 +18,7 @@ from sejax.agents.memory import Memory
 from sejax.agents.replay import Transition
 from sejax.configs import TrainingConfig
 from sejax.envs.action_repeat import repeat_actions
+from sejax.proxies.reward import RewardEnv
 from sejax.proxies.synthetic import SyntheticEnv
 
 _NO_LIMIT = 2**31 - 1
@@ -93,7 +94,8 @@ def make_trainer(
 
     Args:
       agent: from `sejax.agents`.
-      env: gymnax environment to train in: real, synthetic or reward-shaped.
+      env: gymnax environment to train in: real, synthetic or reward-shaped. A potential-based
+        reward has the agent's discount, whatever its params say.
       training: stopping rule and limits. `time_limit_is_terminal` speaks of real time limits and is
         ignored in an SE: there the last step of an episode bootstraps with what the done network
         says, as in the authors' code.
@@ -110,6 +112,7 @@ def make_trainer(
     if tests_each_episode and test_fn is None:
         raise ValueError("stop_rule='solved' with solved_by='test' needs a test_fn; got None.")
     time_limit_is_terminal = training.time_limit_is_terminal and not isinstance(env, SyntheticEnv)
+    is_shaped = isinstance(env, RewardEnv)
     env = repeat_actions(env, agent.action_repeat)
     window = training.window
     max_steps = training.max_steps or _NO_LIMIT
@@ -223,6 +226,8 @@ def make_trainer(
     def train(
         key: Array, env_params: Any, hparams: Any = agent.hparams, active: Array | bool = True
     ) -> TrainResult:
+        if is_shaped:
+            env_params = env_params.replace(discount=jnp.float32(agent.discount(hparams)))
         key_begin, key_steps = jax.random.split(key)
         state = begin(key_begin, env_params, hparams, active)
         kept = make_memory(state).init()

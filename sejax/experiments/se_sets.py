@@ -11,7 +11,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import jax
 import numpy as np
@@ -20,7 +20,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
 
 from sejax import envs
-from sejax.configs import LearnConfig, from_dict, to_dict
+from sejax.configs import LearnConfig, SyntheticConfig, from_dict, to_dict
 from sejax.errors import ConfigError, require
 from sejax.files import atomic_path
 from sejax.proxies import io as proxy_io
@@ -131,13 +131,13 @@ def load_set(source: str | Path, option: str = "--ses") -> SESet:
       ConfigError: if there is no such file, or it is damaged or of another format.
     """
     if not Path(source).is_file():
-        return _set_of_one(source)
+        return _set_of_one(source, option)
     path = Path(source)
     try:
         with safe_open(path, framework="np") as file:
             header = dict(file.metadata() or {})
             if "sejax_set" not in header:
-                return _set_of_one(path)
+                return _set_of_one(path, option)
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
         stored = json.loads(header["sejax_set"])
         config = from_dict(stored["config"])
@@ -151,7 +151,7 @@ def load_set(source: str | Path, option: str = "--ses") -> SESet:
     require(stored.get("format_version") == FORMAT_VERSION, option,
             f"be of format {FORMAT_VERSION}", "this version of sejax reads no other",
             stored.get("format_version"), f"{option} to a file of this version")  # fmt: skip
-    env = make_synthetic(envs.make(config.env.name), config.proxy)
+    env = _se_of(config, option)
     _check_shapes(path, option, env, tensors, [len(column) for column in columns])
     weights = unflatten_dict({tuple(name.split("/")): x for name, x in tensors.items()})
     scores, generations, seeds = columns
@@ -159,11 +159,18 @@ def load_set(source: str | Path, option: str = "--ses") -> SESet:
                  config=config, path=path)  # fmt: skip
 
 
-def _set_of_one(source: str | Path) -> SESet:
+def _se_of(config: LearnConfig, option: str) -> SyntheticEnv:
+    require(isinstance(config.proxy, SyntheticConfig), option, "hold synthetic environments",
+            "their networks are what is studied", f"proxy={config.proxy.name}",
+            f"{option} to a proxy learned with proxy=se")  # fmt: skip
+    return make_synthetic(envs.make(config.env.name), cast(SyntheticConfig, config.proxy))
+
+
+def _set_of_one(source: str | Path, option: str) -> SESet:
     proxy = proxy_io.load_proxy(source)
     stored = proxy.metadata
     return SESet(
-        env=proxy.env,
+        env=_se_of(proxy.config, option),
         weights=jax.tree.map(lambda x: np.asarray(x)[None], proxy.params.weights),
         scores=np.array([stored.get("score", np.nan)]),
         generations=np.array([stored.get("generation", -1)]),

@@ -197,9 +197,9 @@ def make_proxy(config: Any, seed: int) -> tuple[Any, Callable[[Any], Any], Any]:
     from jax.flatten_util import ravel_pytree
 
     from sejax import envs
-    from sejax.proxies.synthetic import make_synthetic
+    from sejax.proxies.registry import make_proxy
 
-    env = make_synthetic(envs.make(config.env.name), config.proxy)
+    env = make_proxy(envs.make(config.env.name), config.proxy)
     mean, unravel = ravel_pytree(env.init_weights(jax.random.key(seed)))
     return env, unravel, mean
 
@@ -213,6 +213,7 @@ def make_recorded_evaluation(
 
     from sejax.agents.registry import make_agent
     from sejax.agents.trainer import make_trainer
+    from sejax.evaluation import return_area
     from sejax.experiments.se_histograms import make_test_recorder
     from sejax.objectives import Outcome
     from sejax.parallel import spread_over_devices
@@ -229,7 +230,8 @@ def make_recorded_evaluation(
         rewards = jnp.where(steps.valid, steps.reward, 0.0)
         returns = rewards.reshape(num_episodes, -1).sum(axis=1)
         outcome = Outcome(test_return=returns.mean(), train_steps=result.train_steps,
-                          train_episodes=result.episodes, nonfinite=result.nonfinite,
+                          train_episodes=result.episodes, return_area=return_area(result),
+                          nonfinite=result.nonfinite,
                           real_steps=steps.valid.sum())  # fmt: skip
         return outcome, (steps, jnp.repeat(returns, env.task.max_steps))
 

@@ -19,7 +19,7 @@ from sejax import envs
 from sejax.configs import LearnConfig, from_dict, to_dict
 from sejax.errors import ConfigError, require, unknown_name
 from sejax.files import atomic_path
-from sejax.proxies.synthetic import SyntheticEnv, SyntheticParams, make_synthetic
+from sejax.proxies.registry import ProxyEnv, ProxyParams, make_proxy
 
 FORMAT_VERSION = 1
 PRETRAINED_DIR = Path(__file__).parents[1] / "pretrained"
@@ -29,8 +29,8 @@ PRETRAINED_DIR = Path(__file__).parents[1] / "pretrained"
 class Proxy:
     """A stored proxy: its environment, its weights as `EnvParams`, and where it came from."""
 
-    env: SyntheticEnv
-    params: SyntheticParams
+    env: ProxyEnv
+    params: ProxyParams
     config: LearnConfig
     metadata: dict[str, Any]
     path: Path
@@ -46,7 +46,7 @@ def save(path: str | Path, config: LearnConfig, weights: Any, **metadata: Any) -
     Args:
       path: the file, `*.safetensors`.
       config: the configuration it was learned with.
-      weights: as from `SyntheticEnv.init_weights`.
+      weights: as from `init_weights` of the proxy.
       **metadata: plain values to keep with it, such as score, generation and seed.
 
     Raises:
@@ -60,7 +60,7 @@ def save(path: str | Path, config: LearnConfig, weights: Any, **metadata: Any) -
         save_file(tensors, temporary, metadata={"sejax": json.dumps(header)})
 
 
-def load(source: str | Path) -> tuple[SyntheticEnv, SyntheticParams]:
+def load(source: str | Path) -> tuple[ProxyEnv, ProxyParams]:
     """Loads a proxy as a gymnax environment and its params (the weights).
 
     Args:
@@ -95,7 +95,7 @@ def load_proxy(source: str | Path) -> Proxy:
     require(metadata["format_version"] == FORMAT_VERSION, "proxy",
             f"be of format {FORMAT_VERSION}", "this version of sejax reads no other",
             metadata["format_version"], "proxy to a file of this version")  # fmt: skip
-    env = make_synthetic(envs.make(config.env.name), config.proxy)
+    env = make_proxy(envs.make(config.env.name), config.proxy)
     weights = unflatten_dict({tuple(name.split("/")): x for name, x in tensors.items()})
     _check_shapes(path, env, weights)
     return Proxy(
@@ -157,7 +157,7 @@ class _Factory:
 
     name: str
 
-    def __call__(self) -> SyntheticEnv:
+    def __call__(self) -> ProxyEnv:
         env, params = load(self.name)
         return env.with_default_params(params)
 
@@ -175,7 +175,7 @@ def _read(path: Path) -> tuple[dict[str, np.ndarray], dict[str, str]]:
         ) from error
 
 
-def _check_shapes(path: Path, env: SyntheticEnv, weights: Any) -> None:
+def _check_shapes(path: Path, env: ProxyEnv, weights: Any) -> None:
     expected = jax.eval_shape(env.init_weights, jax.random.key(0))
     shapes = {k: x.shape for k, x in flatten_dict(weights, sep="/").items()}
     wanted = {k: x.shape for k, x in flatten_dict(expected, sep="/").items()}

@@ -1,0 +1,246 @@
+"""sejax.proxies.reward: the four rewards, what they leave unchanged, and RNs as proxies."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from support import numpy_forward
+
+import sejax
+from sejax import envs
+from sejax.agents.configs import QLearningConfig
+from sejax.agents.registry import make_agent
+from sejax.agents.trainer import make_trainer
+from sejax.bilevel import make_learner
+from sejax.configs import RN_VARIANTS, ExplorationConfig, RewardConfig, TrainingConfig
+from sejax.errors import ConfigError
+from sejax.evaluation import return_area
+from sejax.proxies.reward import make_reward
+from sejax.proxies.synthetic import ABSURD
+
+GAMMA = 0.9
+VARIANTS = {  # table "Overview of Reward Network variants"
+    "additive_potential": lambda r, before, after: r + GAMMA * after - before,
+    "exclusive_potential": lambda r, before, after: GAMMA * after - before,
+    "additive_non_potential": lambda r, before, after: r + after,
+    "exclusive_non_potential": lambda r, before, after: after,
+}
+
+
+def make_env(task, variant="additive_potential", **changes):
+    return make_reward(envs.make(task), RewardConfig(variant=variant, hidden_size=5, **changes))
+
+
+def phi(env, weights, obs):
+    """The potential in NumPy; a discrete state is one-hot."""
+    one_hot = env.task.num_states is not None
+    x = np.eye(env.task.num_states)[int(obs)] if one_hot else np.asarray(obs, np.float64)
+    return numpy_forward(weights["potential"], x, "prelu", 1)[0]
+
+
+def trajectory(env, weights, actions, seed=0):
+    """Transitions `(s, a, r shaped, s', terminated, real reward)` with the given actions."""
+    params = env.params(weights, GAMMA)
+    step = jax.jit(env.step_env)
+    obs, state = env.reset_env(jax.random.key(seed), params)
+    rows = []
+    for action in actions:
+        next_obs, state, reward, terminated, info = step(
+            jax.random.key(1), state, jnp.int32(action), params
+        )
+        rows.append((np.asarray(obs), action, float(reward), np.asarray(next_obs),
+                     bool(terminated), float(info["real_reward"])))  # fmt: skip
+        obs = next_obs
+        if terminated:
+            break
+    return rows
+
+
+# --- the rewards ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("variant", RN_VARIANTS)
+@pytest.mark.parametrize("task", ["cartpole", "cliff_walking"])
+def test_rewards_are_those_of_the_table(task, variant):
+    env = make_env(task, variant)
+    weights = env.init_weights(jax.random.key(1))
+    rows = trajectory(env, weights, [1, 0, 1, 0] if task == "cartpole" else [3, 0, 1, 2])
+    assert len(rows) == 4
+    for obs, _, reward, next_obs, _, real in rows:
+        expected = VARIANTS[variant](real, phi(env, weights, obs), phi(env, weights, next_obs))
+        np.testing.assert_allclose(reward, expected, rtol=1e-5, atol=1e-6)
+
+
+def test_everything_but_the_reward_is_the_real_tasks():
+    env = make_env("cartpole")
+    task, params = env.task, env.default_params
+    key, actions = jax.random.key(4), [1] * 12
+    obs, state = env.reset_env(key, params)
+    real_obs, real_state = task.env.reset_env(key, task.params)
+    for action in actions:
+        np.testing.assert_array_equal(obs, real_obs)
+        np.testing.assert_array_equal(env.get_obs(state), real_obs)
+        obs, state, _, terminated, info = env.step_env(key, state, action, params)
+        real_obs, real_state, reward, real_terminated, real_info = task.env.step_env(
+            key, real_state, action, task.params
+        )
+        assert terminated == real_terminated
+        assert info["discount"] == real_info["discount"] and info["real_reward"] == reward
+        if terminated:
+            break
+    assert terminated  # pushed to one side the pole falls
+    late = state.replace(time=task.max_steps)
+    assert env.is_truncated(late, params) and not env.is_truncated(state, params)
+
+
+def test_the_exclusive_ones_ignore_the_real_reward():
+    for variant in ("exclusive_potential", "exclusive_non_potential"):
+        env = make_env("cliff_walking", variant)
+        params = env.params(env.init_weights(jax.random.key(0)), GAMMA)
+        shaped = [float(env.shape(params, jnp.int32(36), jnp.int32(24), r, False)) for r in (0, -1)]
+        assert shaped[0] == shaped[1]
+
+
+def test_potentials_telescope_along_any_trajectory():
+    env = make_env("cartpole", "exclusive_potential")
+    weights = env.init_weights(jax.random.key(2))
+    rows = trajectory(env, weights, np.random.default_rng(0).integers(0, 2, 9))
+    total = sum(GAMMA**t * reward for t, (_, _, reward, *_) in enumerate(rows))
+    first, last = phi(env, weights, rows[0][0]), phi(env, weights, rows[-1][3])
+    np.testing.assert_allclose(total, GAMMA ** len(rows) * last - first, rtol=1e-4)
+
+
+def test_zero_at_terminal_drops_the_potential_there_and_nowhere_else():
+    # From S, RIGHT falls off the cliff and terminates; UP does not.
+    env = make_env("cliff_walking", zero_at_terminal=True)
+    weights = env.init_weights(jax.random.key(5))
+    start = phi(env, weights, 36)
+    fall, up = (trajectory(env, weights, [action])[0] for action in (0, 3))
+    np.testing.assert_allclose(fall[2], -100 - start, rtol=1e-5)
+    np.testing.assert_allclose(up[2], -1 + GAMMA * phi(env, weights, 24) - start, rtol=1e-5)
+
+
+def q_values(env, weights):
+    """Optimal action values of a grid world with the shaped rewards, by value iteration."""
+    task = env.task
+    num_states, num_actions = task.num_states, task.num_actions
+    params = env.params(weights, GAMMA)
+    _, template = env.reset_env(None, params)
+
+    def one(state, action):
+        world = template.world.replace(index=state)
+        step = env.step_env(None, template.replace(world=world, obs=state), action, params)
+        return step[0], step[2], step[3]
+
+    states, actions = jnp.divmod(jnp.arange(num_states * num_actions), num_actions)
+    next_state, reward, terminated = (
+        np.asarray(x) for x in jax.jit(jax.vmap(one))(states, actions)
+    )
+    values = np.zeros(num_states)
+    for _ in range(300):
+        q = (reward + GAMMA * np.where(terminated, 0, values[next_state])).reshape(-1, num_actions)
+        values = q.max(axis=1)
+    return q
+
+
+def test_a_potential_that_ends_at_zero_leaves_the_optimal_policy_unchanged():
+    env = make_env("cliff_walking", zero_at_terminal=True)
+    weights = jax.tree.map(lambda x: 4 * x, env.init_weights(jax.random.key(6)))
+    nothing = jax.tree.map(jnp.zeros_like, weights)
+    plain, shaped = q_values(env, nothing), q_values(env, weights)
+    potentials = np.array([phi(env, weights, state) for state in range(48)])
+    inside = np.ones(48, bool)
+    inside[37:] = False  # the cliff and the goal are terminal
+    np.testing.assert_allclose(shaped[inside], (plain - potentials[:, None])[inside], atol=1e-3)
+    assert np.ptp(potentials) > 1  # of no small potential
+    best = plain >= plain.max(axis=1, keepdims=True) - 1e-3
+    kept = shaped >= shaped.max(axis=1, keepdims=True) - 1e-3
+    np.testing.assert_array_equal(best[inside], kept[inside])
+    other = q_values(make_env("cliff_walking", "additive_non_potential"), weights)
+    changed = other >= other.max(axis=1, keepdims=True) - 1e-3
+    assert (best[inside] != changed[inside]).any()
+
+
+@pytest.mark.parametrize(("value", "is_number"), [(np.nan, False), (np.inf, False), (1e30, True)])
+def test_an_absurd_reward_ends_the_episode_instead_of_poisoning_the_agent(value, is_number):
+    env = make_env("cartpole", "additive_non_potential")
+    weights = jax.tree.map(jnp.zeros_like, env.init_weights(jax.random.key(0)))
+    weights["potential"]["Dense_1"]["bias"] = jnp.full(1, value)
+    assert abs(value) > ABSURD or np.isnan(value)
+    params = env.params(weights)
+    _, state = env.reset_env(jax.random.key(0), params)
+    _, _, reward, terminated, info = env.step_env(jax.random.key(1), state, 0, params)
+    assert reward == 0 and terminated and info["nonfinite"] == (not is_number)
+
+
+# --- agents on it --------------------------------------------------------------------------------
+
+
+def test_the_discount_is_the_agents():
+    """The table of a Q-learning agent with alpha 1 after one step is the shaped reward itself."""
+    env = make_env("cliff_walking")
+    weights = env.init_weights(jax.random.key(1))
+    training = TrainingConfig(max_episodes=1, max_steps=1, stop_rule="never")
+    agent = make_agent(QLearningConfig(discount=GAMMA), env.task, ExplorationConfig())
+    result = make_trainer(agent, env, training)(jax.random.key(0), env.params(weights, 0.123))
+    table = np.asarray(result.agent_state.q_values)
+    ((state, action),) = np.argwhere(table != 0)
+    (row,) = trajectory(env, weights, [action])
+    assert state == 36
+    np.testing.assert_allclose(table[state, action], row[2], rtol=1e-6)
+
+
+LEARN = ["env=cliff_walking", "proxy=rn", "generations=1", "es.population_size=2",
+         "training.max_episodes=12"]  # fmt: skip
+
+
+def test_steps_on_a_reward_network_are_real_and_stop_when_the_task_is_solved():
+    config = sejax.config([*LEARN, "es.num_incumbent_evals=2"])
+    result = jax.jit(make_learner(config))(jax.random.key(0))
+    steps, real = result.info.train_steps_total[0], result.info.env_steps_total[0]
+    assert real > steps  # those of the tests between and after the training episodes as well
+    # -(n_tr + 100 max(0, C_sol - C_fin)), at most 12 episodes of 50 steps, a return of at least
+    # -149 where the task is solved at -20.
+    assert -(600 + 100 * 129) <= result.score < 0
+
+
+def test_the_area_under_the_curve_is_that_of_tests_over_training_steps():
+    env = make_env("cliff_walking")
+    agent = make_agent(QLearningConfig(), env.task, ExplorationConfig())
+    training = TrainingConfig(max_episodes=3, stop_rule="solved", solved_by="test")
+
+    def test_fn(key, agent_state, active):
+        return jnp.float32(2.0) + agent_state.epsilon, jnp.int32(7)
+
+    result = make_trainer(agent, env, training, jnp.inf, test_fn)(
+        jax.random.key(3), env.default_params
+    )
+    ends = np.asarray(result.episode_ends)
+    assert result.test_steps == 21
+    np.testing.assert_allclose(return_area(result), np.diff(ends, prepend=0) @ result.returns)
+    np.testing.assert_allclose(return_area(result), (2.0 + 0.1) * ends[-1], rtol=1e-6)
+
+
+def test_a_stored_reward_network_comes_back(tmp_path):
+    config = sejax.config([*LEARN, "proxy.variant=exclusive_non_potential"])
+    env = make_reward(envs.make("cliff_walking"), config.proxy)
+    weights = env.init_weights(jax.random.key(9))
+    sejax.save(tmp_path / "rn.safetensors", config, weights)
+    loaded, params = sejax.load(tmp_path / "rn.safetensors")
+    assert loaded is env
+    jax.tree.map(np.testing.assert_array_equal, params.weights, weights)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "said"),
+    [
+        (["env=pendulum", "proxy=rn"], "cliff_walking"),
+        (["proxy=rn", "proxy.variant=additive"], "additive_potential"),
+        (["proxy=rn", "stop_when_solved=true"], "stop_when_solved=false"),
+        (["objective=auc"], "training.stop_rule=solved"),
+        (["proxy=rn", "proxy.done=soft"], "proxy"),
+    ],
+)
+def test_what_makes_no_sense_is_refused(overrides, said):
+    with pytest.raises(ConfigError, match=said):
+        sejax.config(overrides)
