@@ -406,7 +406,7 @@ def check_models(folder):
         (score_transforms, ["--population", "1"], "es.population_size must be at least 2"),
         (se_histograms, ["--agents", "ddqm"], "--agents must be one of ddqn.*got .ddqm"),
         (se_histograms, ["--proxy", "nowhere"], "cartpole.*got .nowhere"),
-        (supervised_baseline, ["--epochs", "0"], "--epochs must be at least 1.*--epochs=100"),
+        (supervised_baseline, ["--epochs", "0"], "--epochs must be at least 1.*--epochs=10"),
         (supervised_baseline, ["--agents", "ppo"], "--agents must be one of.*got .ppo"),
     ],
 )

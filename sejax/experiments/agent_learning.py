@@ -17,9 +17,8 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from sejax import commands
 from sejax.agents.configs import AGENT_CONFIGS
-from sejax.errors import ConfigError, require, unknown_name
+from sejax.errors import unknown_name
 from sejax.experiments import common
 
 NAME = "agent_learning"
@@ -81,11 +80,7 @@ STUDIES = (
 
 def main() -> None:
     """Runs the experiment as the command line says."""
-    args = common.parse_args(NAME, __doc__, add_options)
-    try:
-        run(args)
-    except ConfigError as error:
-        commands.fail(str(error), commands.BAD_INPUT)
+    common.run_command(NAME, __doc__, add_options, run)
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -104,10 +99,7 @@ def run(args: argparse.Namespace) -> pd.DataFrame:
     """
     if args.num_agents is None:
         args.num_agents = QUICK_AGENTS if args.quick else 10
-    for name in ("num_agents", "test_episodes"):
-        option = f"--{name.replace('_', '-')}"
-        require(getattr(args, name) >= 1, option, "be at least 1", "it counts",
-                getattr(args, name), f"{option}=10")  # fmt: skip
+    common.require_counts(args, "num_agents", "test_episodes")
     known = tuple(dict.fromkeys(study.env for study in STUDIES))
     for env in args.envs:
         if env not in known:

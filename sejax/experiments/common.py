@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from sejax.errors import ConfigError
+from sejax import commands
+from sejax.errors import ConfigError, require
 from sejax.files import write_text
 
 
@@ -37,6 +38,32 @@ def parse_args(
     configure_xla(args.devices)
     enable_compilation_cache()
     return args
+
+
+def run_command(
+    name: str,
+    description: str | None,
+    add_options: Callable[[argparse.ArgumentParser], None],
+    run: Callable[[argparse.Namespace], Any],
+) -> None:
+    """Runs an experiment as the command line says; bad input ends it with one message."""
+    args = parse_args(name, description, add_options)
+    try:
+        run(args)
+    except ConfigError as error:
+        commands.fail(str(error), commands.BAD_INPUT)
+
+
+def require_counts(args: argparse.Namespace, *names: str, least: int = 1) -> None:
+    """Checks options that count something; those that were not given, or that are unknown, pass.
+
+    Raises:
+      ConfigError: for a number that is too small.
+    """
+    for name in names:
+        option, value = f"--{name.replace('_', '-')}", getattr(args, name, None)
+        require(value is None or value >= least, option, f"be at least {least}", "it counts",
+                value, f"{option}=10")  # fmt: skip
 
 
 class Pieces:

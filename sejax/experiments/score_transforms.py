@@ -26,9 +26,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from sejax import commands
 from sejax.configs import SCORE_TRANSFORMS
-from sejax.errors import ConfigError, require
 from sejax.experiments import common
 
 NAME = "score_transforms"
@@ -53,11 +51,7 @@ PAPER = {"all_better_1": "among the best", "all_better_2": "among the best"}
 
 def main() -> None:
     """Runs the experiment as the command line says."""
-    args = common.parse_args(NAME, __doc__, add_options)
-    try:
-        run(args)
-    except ConfigError as error:
-        commands.fail(str(error), commands.BAD_INPUT)
+    common.run_command(NAME, __doc__, add_options, run)
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -80,9 +74,7 @@ def fill_in(args: argparse.Namespace) -> None:
     for name, (full, quick) in defaults.items():
         if getattr(args, name) is None:
             setattr(args, name, quick if args.quick else full)
-    for name in ("runs", "generations", "slots", "bins"):
-        require(getattr(args, name) >= 1, f"--{name}", "be at least 1", "it counts",
-                getattr(args, name), f"--{name}=10")  # fmt: skip
+    common.require_counts(args, "runs", "generations", "slots", "bins")
 
 
 def run(args: argparse.Namespace) -> pd.DataFrame:

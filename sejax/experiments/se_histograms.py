@@ -25,8 +25,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 
-from sejax import commands
-from sejax.errors import ConfigError, require, unknown_name
+from sejax.errors import unknown_name
 from sejax.experiments import common
 
 NAME = "se_histograms"
@@ -57,11 +56,7 @@ PAPER_RETURNS = {
 
 def main() -> None:
     """Runs the experiment as the command line says."""
-    args = common.parse_args(NAME, __doc__, add_options)
-    try:
-        run(args)
-    except ConfigError as error:
-        commands.fail(str(error), commands.BAD_INPUT)
+    common.run_command(NAME, __doc__, add_options, run)
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -87,10 +82,7 @@ def fill_in(args: argparse.Namespace) -> None:
     for kind in args.agents:
         if kind not in AGENTS:
             raise unknown_name("--agents", kind, AGENTS)
-    for name in ("num_agents", "test_episodes", "max_rows"):
-        option = f"--{name.replace('_', '-')}"
-        require(getattr(args, name) >= 1, option, "be at least 1", "it counts",
-                getattr(args, name), f"{option}=10")  # fmt: skip
+    common.require_counts(args, "num_agents", "test_episodes", "max_rows")
 
 
 def run(args: argparse.Namespace) -> pd.DataFrame:

@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from sejax import commands
 from sejax.errors import ConfigError
 from sejax.experiments import common
 from sejax.experiments.se_performance import (
@@ -29,11 +28,7 @@ NAME = "se_models"
 
 def main() -> None:
     """Runs the experiment as the command line says."""
-    args = common.parse_args(NAME, __doc__, add_options)
-    try:
-        run(args)
-    except ConfigError as error:
-        commands.fail(str(error), commands.BAD_INPUT)
+    common.run_command(NAME, __doc__, add_options, run)
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:

@@ -19,9 +19,8 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from sejax import commands
 from sejax.configs import TrainingConfig
-from sejax.errors import ConfigError, require, unknown_name
+from sejax.errors import require, unknown_name
 from sejax.experiments import common
 
 NAME = "se_performance"
@@ -91,11 +90,7 @@ class World:
 
 def main() -> None:
     """Runs the experiment as the command line says."""
-    args = common.parse_args(NAME, __doc__, add_options)
-    try:
-        run(args)
-    except ConfigError as error:
-        commands.fail(str(error), commands.BAD_INPUT)
+    common.run_command(NAME, __doc__, add_options, run)
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -136,11 +131,8 @@ def fill_in(args: argparse.Namespace) -> None:
     for kind in args.agents:
         if kind not in AGENTS:
             raise unknown_name("--agents", kind, AGENTS)
-    for name in ("num_agents", "num_ses", "test_episodes", "max_steps", "real_episodes"):
-        value = getattr(args, name, None)
-        if value is not None:
-            option = f"--{name.replace('_', '-')}"
-            require(value >= 1, option, "be at least 1", "it counts", value, f"{option}=10")
+    common.require_counts(args, "num_agents", "num_ses", "test_episodes", "max_steps",
+                          "real_episodes")  # fmt: skip
 
 
 def run(args: argparse.Namespace) -> pd.DataFrame:

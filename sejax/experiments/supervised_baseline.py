@@ -30,8 +30,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from sejax import commands
-from sejax.errors import ConfigError, require, unknown_name
+from sejax.errors import require, unknown_name
 from sejax.experiments import common
 
 NAME = "supervised_baseline"
@@ -58,11 +57,7 @@ PAPER = {
 
 def main() -> None:
     """Runs the experiment as the command line says."""
-    args = common.parse_args(NAME, __doc__, add_options)
-    try:
-        run(args)
-    except ConfigError as error:
-        commands.fail(str(error), commands.BAD_INPUT)
+    common.run_command(NAME, __doc__, add_options, run)
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -91,14 +86,8 @@ def fill_in(args: argparse.Namespace) -> None:
     for name, values in DEFAULTS.items():
         if getattr(args, name) is None:
             setattr(args, name, values[args.quick])
-        option = f"--{name.replace('_', '-')}"
-        least = 2 if name == "population" else 1
-        require(getattr(args, name) >= least, option, f"be at least {least}", "it counts",
-                getattr(args, name), f"{option}={values[0]}")  # fmt: skip
-    for name in ("test_episodes", "max_steps"):
-        option, value = f"--{name.replace('_', '-')}", getattr(args, name)
-        require(value is None or value >= 1, option, "be at least 1", "it counts", value,
-                f"{option}=10")  # fmt: skip
+    common.require_counts(args, *DEFAULTS, "test_episodes", "max_steps")
+    common.require_counts(args, "population", least=2)
     for kind in args.agents:
         if kind not in AGENTS:
             raise unknown_name("--agents", kind, AGENTS)
