@@ -21,8 +21,9 @@ PLAIN = make_q_learning(
 )  # fmt: skip
 
 
-def counting(plain=PLAIN, beta=BETA, num_states=NUM_STATES, num_actions=NUM_ACTIONS):
-    return with_count_bonus(plain, CountBasedConfig(reward_scale=beta), num_states, num_actions)
+def counting(plain=PLAIN, beta=BETA, num_states=NUM_STATES, num_actions=NUM_ACTIONS, power=1.0):
+    config = CountBasedConfig(reward_scale=beta, count_power=power)
+    return with_count_bonus(plain, config, num_states, num_actions)
 
 
 def step(obs, action, reward, discount=0.0, next_obs=0):
@@ -32,10 +33,11 @@ def step(obs, action, reward, discount=0.0, next_obs=0):
     )  # fmt: skip
 
 
-def test_the_bonus_falls_with_the_root_of_the_visits_of_a_pair():
+@pytest.mark.parametrize("power", [1.0, 0.5])
+def test_the_bonus_falls_with_the_visits_of_a_pair_or_their_root(power):
     # With learning rate 1 and nothing to follow, a value is the last reward with its bonus.
     plain = make_q_learning(QLearningConfig(learning_rate=1.0), NUM_STATES, NUM_ACTIONS)
-    agent = counting(plain)
+    agent = counting(plain, power=power)
     update = jax.jit(agent.update)
     state = agent.init(KEY, agent.hparams)
     np.testing.assert_array_equal(state.counts, np.zeros((3, 2)))
@@ -45,7 +47,7 @@ def test_the_bonus_falls_with_the_root_of_the_visits_of_a_pair():
         state = update(KEY, state, step(obs, action, reward))
         seen.append(float(state.agent_state.q_values[obs, action]))
     # Visits so far: 1, 2, 1 (the other action), 1 (another state), 3, 4.
-    expected = [2.5, 2 + 0.5 / 2**0.5, -0.5, 0.5, 2 + 0.5 / 3**0.5, 2.25]
+    expected = [2.5, 2 + 0.5 / 2**power, -0.5, 0.5, 2 + 0.5 / 3**power, 2 + 0.5 / 4**power]
     np.testing.assert_allclose(seen, expected, rtol=1e-6)
     np.testing.assert_array_equal(state.counts, [[0, 0], [4, 1], [1, 0]])
 
@@ -64,7 +66,7 @@ def test_the_agent_inside_learns_as_if_the_bonus_were_paid(make):
         action, reward = rng.integers(0, NUM_ACTIONS), rng.normal()
         discount = rng.choice([0.0, 1.0, 0.7])
         counts[obs, action] += 1
-        paid = reward + BETA / np.sqrt(counts[obs, action])
+        paid = reward + BETA / counts[obs, action]
         state = update(key, state, step(obs, action, reward, discount, next_obs))
         expected = plain_update(key, expected, step(obs, action, paid, discount, next_obs))
     np.testing.assert_array_equal(state.counts, counts)

@@ -212,15 +212,17 @@ class ICMConfig(ExplorationConfig):
 
 @dataclass(frozen=True, kw_only=True)
 class CountBasedConfig(ExplorationConfig):
-    r"""A bonus :math:`\beta / \sqrt{n(s, a)}` for rarely taken actions."""
+    r"""A bonus :math:`\beta / n(s, a)^p` for rarely taken actions."""
 
     agents: ClassVar[tuple[str, ...]] = ("q_learning", "sarsa")
 
     name: str = "count_based"
     reward_scale: float = 0.1  # beta
+    count_power: float = 1.0  # p: 1 in the paper's text, 0.5 in the authors' code
 
     def __post_init__(self) -> None:
         at_least(0, "exploration.reward_scale", self.reward_scale, "it scales a bonus", 0.1)
+        positive("exploration.count_power", self.count_power, "the bonus would not fade", 1)
 
 
 EXPLORATION_CONFIGS: dict[str, type[ExplorationConfig]] = {

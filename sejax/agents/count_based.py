@@ -1,7 +1,8 @@
 """Count-based exploration: a bonus for actions that a tabular agent has rarely learned from.
 
 Source: Strehl and Littman, "An Analysis of Model-Based Interval Estimation for Markov Decision
-Processes" (2008); paper, appendix, table of count-based Q-learning; `reference_details.md` 4.7.
+Processes" (2008); paper, section "Experiments with Reward Networks", paragraph "Baselines", and
+appendix, table of count-based Q-learning; `reference_details.md` 4.7.
 """
 
 import dataclasses
@@ -40,18 +41,17 @@ def with_count_bonus(
 ) -> Agent:
     r"""The same agent, learning from rewards with a bonus for rare pairs of state and action.
 
-    .. math:: n(s, a) \leftarrow n(s, a) + 1, \quad r \leftarrow r + \beta / \sqrt{n(s, a)}
+    .. math:: n(s, a) \leftarrow n(s, a) + 1, \quad r \leftarrow r + \beta / n(s, a)^p
 
-    for the step at hand, before the learning step of the agent inside.
+    for the step at hand, before the learning step of the agent inside. The power p is 1 in the
+    paper's text and 1/2 in the authors' code.
 
     Args:
       agent: one that learns from single steps with indices as observations and actions, from
         `sejax.agents.tabular`.
-      config: beta, in reward units.
+      config: beta, in reward units, and the power.
       num_states: number of different observations.
       num_actions: number of different actions.
-
-    Differs: the authors add 1e-9 to the root, which is never less than 1.
 
     Example:
       >>> import jax
@@ -81,7 +81,7 @@ def with_count_bonus(
         obs, action = transition.obs, transition.action
         count = entry_of(state.counts, obs, action) + 1
         is_visited = mask_of(obs, action, (num_states, num_actions))
-        bonus = state.reward_scale / jnp.sqrt(count.astype(jnp.float32))
+        bonus = state.reward_scale * count.astype(jnp.float32) ** -config.count_power
         transition = transition._replace(reward=transition.reward + bonus)
         return state.replace(
             agent_state=agent.update(key, state.agent_state, transition),
