@@ -106,9 +106,8 @@ def learn_all(configs: list[Any], pieces: common.Pieces) -> tuple[pd.DataFrame, 
             name, piece_settings(config), functools.partial(learn_one, config, program, step)
         )
         solved = generations_to_solve(curve, program.task.solved_reward)
-        print(f"{name}: best {curve['best_so_far'].max():.1f}, "
-              f"{f'solved in {solved:.0f}' if np.isfinite(solved) else 'not solved in'} of "
-              f"{len(curve)} generations", flush=True)  # fmt: skip
+        when = f"solved in generation {solved:.0f}" if np.isfinite(solved) else "not solved"
+        print(f"{name}: best {curve['best_so_far'].max():.1f}, {when} of {len(curve)}", flush=True)
         curves.append(curve)
     return pd.concat(curves, ignore_index=True), envs.make(configs[0].env.name).solved_reward
 
