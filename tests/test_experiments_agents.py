@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 
 from sejax.errors import ConfigError
-from sejax.experiments import agent_learning
+from sejax.experiments import agent_learning, return_curves
 
 
 def options(out, *argv):
@@ -28,14 +28,14 @@ def curve(steps, returns):
 def test_a_task_is_solved_when_ten_tests_in_a_row_are_good_on_average():
     good_late = curve(range(10, 310, 10), [0] * 10 + [10] * 20)
     # Ten in a row have mean 9 once nine of them are 10: the window ends at the 19th episode.
-    assert agent_learning.steps_to_solve(good_late, 9.0) == 190
-    assert agent_learning.steps_to_solve(good_late, 10.1) == np.inf
-    assert agent_learning.steps_to_solve(good_late.head(9), 0.0) == np.inf  # too few tests
+    assert return_curves.steps_to_solve(good_late, 9.0) == 190
+    assert return_curves.steps_to_solve(good_late, 10.1) == np.inf
+    assert return_curves.steps_to_solve(good_late.head(9), 0.0) == np.inf  # too few tests
 
 
 def test_curves_hold_the_value_of_the_last_finished_episode():
     two = pd.concat([curve([10, 20], [1, 3]), curve([15], [5]).assign(agent=1)])
-    values = agent_learning.on_grid(two, np.array([5, 10, 19, 20]))
+    values = return_curves.on_grid(two, np.array([5, 10, 19, 20]))
     np.testing.assert_array_equal(values, [[np.nan, 1, 1, 2], [np.nan, np.nan, 5, 5]])
 
 

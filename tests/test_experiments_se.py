@@ -14,8 +14,15 @@ import pytest
 import sejax
 from sejax import envs
 from sejax.errors import ConfigError
-from sejax.experiments import common, figures, se_feasibility, se_models, se_performance
-from sejax.experiments.se_sets import load_set, save_set
+from sejax.experiments import (
+    common,
+    figures,
+    proxy_runs,
+    se_feasibility,
+    se_models,
+    se_performance,
+)  # fmt: skip
+from sejax.experiments.proxy_sets import load_set, save_set
 from sejax.proxies.synthetic import make_synthetic
 
 TINY_RUN = ["generations=3", "es.population_size=2", "es.num_incumbent_evals=2",
@@ -60,7 +67,7 @@ def assert_equal_trees(a, b):
 def test_a_set_that_is_saved_and_loaded_is_the_same(ses):
     path, weights = ses
     loaded = load_set(path)
-    assert loaded.num_ses == 3 and loaded.task.name == "cartpole"
+    assert loaded.size == 3 and loaded.task.name == "cartpole"
     for i in range(3):
         assert_equal_trees(loaded.one(i).weights, weights[i])
     np.testing.assert_array_equal(loaded.scores, [1, 2, 3])
@@ -68,7 +75,7 @@ def test_a_set_that_is_saved_and_loaded_is_the_same(ses):
     np.testing.assert_array_equal(loaded.seeds, [7, 8, 9])
     assert len({loaded.fingerprint(i) for i in range(3)}) == 3
     assert_equal_trees(loaded.first(2).weights, jax.tree.map(lambda x: x[:2], loaded.weights))
-    assert loaded.first(None).num_ses == 3
+    assert loaded.first(None).size == 3
 
 
 def test_all_ses_of_a_set_step_at_once(ses):
@@ -90,7 +97,7 @@ def test_a_single_proxy_is_a_set_of_one(ses, tmp_path):
     config, weights = load_set(ses[0]).config, ses[1][0]
     sejax.save(tmp_path / "p.safetensors", config, weights, score=12.5, generation=7, seed=2)
     loaded = load_set(tmp_path / "p.safetensors")
-    assert (loaded.num_ses, loaded.scores[0], loaded.seeds[0]) == (1, 12.5, 2)
+    assert (loaded.size, loaded.scores[0], loaded.seeds[0]) == (1, 12.5, 2)
     assert_equal_trees(loaded.one(0).weights, weights)
     assert loaded.fingerprint(0) == load_set(ses[0]).fingerprint(0)
 
@@ -149,7 +156,7 @@ def test_feasibility_learns_as_sejax_run_does_and_goes_on_where_it_stopped(tmp_p
     assert_equal_trees(stored.one(1).weights, result.weights)
     assert stored.scores[1] == pytest.approx(float(result.score))
 
-    monkeypatch.setattr(se_feasibility, "learn_one", refuse)
+    monkeypatch.setattr(proxy_runs, "learn_one", refuse)
     pd.testing.assert_frame_equal(learned(tmp_path), table)
     with pytest.raises(ConfigError, match="with another agent_hparams"):
         learned(tmp_path, "--agent-hparams", "varied")

@@ -20,7 +20,7 @@ from sejax.agents.trainer import make_tester, make_trainer
 from sejax.bilevel import make_program
 from sejax.errors import ConfigError
 from sejax.experiments import common, score_transforms, se_histograms, supervised_baseline
-from sejax.experiments.se_sets import load_set, save_set
+from sejax.experiments.proxy_sets import load_set, save_set
 from sejax.proxies.synthetic import make_synthetic
 
 TINY_AGENT = {"hidden_size": 4, "num_layers": 1, "batch_size": 4, "init_episodes": 2}
@@ -391,7 +391,7 @@ def check_models(folder):
     authors, fair = (
         load_set(folder / f"models-{name}.safetensors") for name in ("authors", "fair")
     )
-    assert authors.num_ses == fair.num_ses == 3
+    assert authors.size == fair.size == 3
     assert (authors.config.proxy.done, fair.config.proxy.done) == ("soft", "threshold")
     for head, same in (("state", True), ("reward", True), ("done", False)):
         pairs = zip(jax.tree.leaves(authors.weights[head]), jax.tree.leaves(fair.weights[head]),

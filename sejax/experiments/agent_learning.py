@@ -9,7 +9,6 @@ paper's where `STUDIES` names no others, and its peers are what others report fo
 
 import argparse
 import functools
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -19,11 +18,12 @@ import pandas as pd
 
 from sejax.agents.configs import AGENT_CONFIGS
 from sejax.errors import unknown_name
-from sejax.experiments import common
+from sejax.experiments import common, return_curves
+from sejax.experiments.return_curves import WINDOW
 
 NAME = "agent_learning"
-WINDOW = 10  # test episodes that a point of a curve is the mean of
 QUICK_STEPS, QUICK_AGENTS = 2000, 2
+SHORTEST_EPISODE = 8  # CartPole cannot be lost sooner
 
 # RL Baselines3 Zoo, benchmark.md: the final return of one agent, with the steps it was trained for.
 ZOO = "RL Baselines3 Zoo"
@@ -118,8 +118,8 @@ def run(args: argparse.Namespace) -> pd.DataFrame:
             f"{number:02d}-{study.name}", settings,
             functools.partial(train, config, study.env, max_steps, args),
         )  # fmt: skip
-        print(f"{study.name}: last {WINDOW} test returns {last_returns(curves).mean():.1f}",
-              flush=True)  # fmt: skip
+        last = return_curves.last_returns(curves).mean()
+        print(f"{study.name}: last {WINDOW} test returns {last:.1f}", flush=True)
         tables.append(curves.assign(study=number, max_steps=max_steps))
     return report(args, pd.concat(tables, ignore_index=True))
 
@@ -128,91 +128,20 @@ def train(config: Any, env: str, max_steps: int, args: argparse.Namespace) -> pd
     """Trains the agents of a study; a row for each training episode of each."""
     import jax
 
-    from sejax.parallel import spread_over_devices
-
-    program, cpu_lanes = make_program(config, env, max_steps, args.test_episodes)
-    keys = jax.random.split(jax.random.key(args.seed), args.num_agents)
-    spread = spread_over_devices(program, args.devices, cpu_lanes=cpu_lanes)
-    returns, steps = jax.device_get(jax.jit(spread)(keys))
-    rows = []
-    for agent in range(args.num_agents):
-        count = int((steps[agent] > 0).sum())
-        curve = {"steps": steps[agent, :count], "test_return": returns[agent, :count].astype(float)}
-        rows.append(pd.DataFrame({"agent": agent} | curve))
-    return pd.concat(rows, ignore_index=True)
-
-
-def make_program(
-    config: Any, env: str, max_steps: int, test_episodes: int
-) -> tuple[Callable[[Any], Any], int | None]:
-    """Builds `program(key) -> (test returns, training steps)`, `[episodes]`, and its CPU lanes."""
-    import jax.numpy as jnp
-
     from sejax import envs
     from sejax.agents.configs import ExplorationConfig
-    from sejax.agents.registry import make_agent
-    from sejax.agents.trainer import make_tester, make_trainer
     from sejax.configs import TrainingConfig
 
     task = envs.make(env)
-    agent = make_agent(config, task, ExplorationConfig())
     training = TrainingConfig(
         max_episodes=max_steps // SHORTEST_EPISODE,
         max_steps=max_steps,
-        stop_rule="solved",  # with a threshold that nobody reaches: tested, but never stopped
-        solved_by="test",
-        time_limit_is_terminal=False,
+        test_episodes=args.test_episodes,
     )
-    test = make_tester(agent, task, test_episodes)
-
-    def test_between(key: Any, agent_state: Any, active: Any) -> Any:
-        returns, steps = test(key, agent_state, active)
-        return returns.mean(), steps.sum()
-
-    train_one = make_trainer(agent, task.env, training, jnp.inf, test_between)
-
-    def program(key: Any) -> Any:
-        result = train_one(key, task.params)
-        return result.returns, result.episode_ends
-
-    return program, agent.cpu_lanes
-
-
-SHORTEST_EPISODE = 8  # CartPole cannot be lost sooner
-
-
-def last_returns(curves: pd.DataFrame) -> pd.Series:
-    """Mean of each agent's last `WINDOW` test returns, by agent."""
-    return curves.groupby("agent")["test_return"].apply(lambda x: x.tail(WINDOW).mean())
-
-
-def smoothed(curve: pd.DataFrame) -> np.ndarray:
-    """Mean of the last `WINDOW` test returns (of all, if fewer) after each episode of an agent."""
-    return curve["test_return"].rolling(WINDOW, min_periods=1).mean().to_numpy()
-
-
-def steps_to_solve(curve: pd.DataFrame, solved_reward: float) -> float:
-    """Training steps until the mean of the last `WINDOW` tests is high enough; inf if it never is.
-
-    Args:
-      curve: of one agent, in order.
-      solved_reward: the task's threshold.
-    """
-    full = curve["test_return"].rolling(WINDOW).mean().to_numpy()
-    solved = np.flatnonzero(full >= solved_reward)
-    return float(curve["steps"].iloc[solved[0]]) if len(solved) else np.inf
-
-
-def on_grid(curves: pd.DataFrame, grid: np.ndarray) -> np.ndarray:
-    """Each agent's smoothed test return at given training steps, `[agent, points]`.
-
-    The value at a step is that of the last finished episode; nan before the first.
-    """
-    rows = []
-    for _, curve in curves.groupby("agent"):
-        place = np.searchsorted(curve["steps"], grid, side="right") - 1
-        rows.append(np.where(place >= 0, smoothed(curve)[place], np.nan))
-    return np.stack(rows)
+    program = return_curves.make_program(config, ExplorationConfig(), task.env, task, training,
+                                         devices=args.devices)  # fmt: skip
+    keys = jax.random.split(jax.random.key(args.seed), args.num_agents)
+    return return_curves.to_table(*jax.device_get(program(keys, task.params)))
 
 
 def summarise(curves: pd.DataFrame) -> pd.DataFrame:
@@ -224,9 +153,9 @@ def summarise(curves: pd.DataFrame) -> pd.DataFrame:
         study = STUDIES[int(number)]
         threshold = envs.make(study.env).solved_reward
         to_solve = mine.groupby("agent")[["steps", "test_return"]].apply(
-            steps_to_solve, solved_reward=threshold
+            return_curves.steps_to_solve, solved_reward=threshold
         )
-        last = last_returns(mine)
+        last = return_curves.last_returns(mine)
         low, high = common.bootstrap_interval(last)
         rows.append({
             "study": number, "env": study.env, "agent": study.agent,
@@ -303,7 +232,7 @@ def draw(curves: pd.DataFrame, path: Path, points: int = 100) -> None:
                 study = STUDIES[int(number)]
                 last_step = study_curves["steps"].max()
                 grid = np.geomspace(last_step / 200, last_step, points)
-                values = on_grid(study_curves, grid)
+                values = return_curves.on_grid(study_curves, grid)
                 known = ~np.isnan(values).any(axis=0)
                 bounds = [common.bootstrap_interval(v) for v in values[:, known].T]
                 low, high = np.transpose(bounds)

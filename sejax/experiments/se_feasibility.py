@@ -10,16 +10,12 @@ the other experiments read (`--ses`, `--varied`, `--fixed`).
 
 import argparse
 import dataclasses
-import functools
-import time
-from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
-from sejax.experiments import common
+from sejax.experiments import common, proxy_runs
 
 NAME = "se_feasibility"
 NUM_RUNS = {"cartpole": 10, "acrobot": 5}
@@ -61,6 +57,7 @@ def run(args: argparse.Namespace) -> pd.DataFrame:
       ConfigError: for settings that cannot work, or an output folder of other settings.
     """
     import sejax
+    from sejax import envs
     from sejax.errors import require
 
     config = sejax.config(overrides(args))
@@ -68,18 +65,11 @@ def run(args: argparse.Namespace) -> pd.DataFrame:
     if count is None:
         count = QUICK_RUNS if args.quick else NUM_RUNS.get(config.env.name, 5)
     require(count >= 1, "--runs", "be at least 1", "it counts runs", count, "--runs=5")
-    configs = [
-        dataclasses.replace(
-            config,
-            seed=args.seed + i,
-            devices=args.devices,
-            run_dir=str(args.out / "runs" / f"seed{args.seed + i}"),
-        )
-        for i in range(count)
-    ]
-    curves, solved_reward = learn_all(configs, common.Pieces(args.out / "pieces"))
-    collect(configs, args.out / "ses.safetensors")
-    return report(args, config, curves, solved_reward)
+    config = dataclasses.replace(config, devices=args.devices)
+    configs = proxy_runs.configs_of_runs(config, args.seed, count, args.out / "runs")
+    curves = proxy_runs.learn_all(configs, common.Pieces(args.out / "pieces"))
+    proxy_runs.collect(configs, args.out / "ses.safetensors")
+    return report(args, config, curves, envs.make(config.env.name).solved_reward)
 
 
 def overrides(args: argparse.Namespace) -> list[str]:
@@ -92,110 +82,6 @@ def overrides(args: argparse.Namespace) -> list[str]:
     return chosen + args.overrides
 
 
-def learn_all(configs: list[Any], pieces: common.Pieces) -> tuple[pd.DataFrame, float]:
-    """Curves of all runs, in rows with the columns of `metrics.csv`, and the solved threshold."""
-    from sejax import envs
-    from sejax.bilevel import make_program
-
-    program = make_program(configs[0])
-    step = make_step(program)
-    curves = []
-    for config in configs:
-        name = f"seed{config.seed}"
-        curve = pieces.compute(
-            name, piece_settings(config), functools.partial(learn_one, config, program, step)
-        )
-        solved = generations_to_solve(curve, program.task.solved_reward)
-        when = f"solved in generation {solved:.0f}" if np.isfinite(solved) else "not solved"
-        print(f"{name}: best {curve['best_so_far'].max():.1f}, {when} of {len(curve)}", flush=True)
-        curves.append(curve)
-    return pd.concat(curves, ignore_index=True), envs.make(configs[0].env.name).solved_reward
-
-
-def piece_settings(config: Any) -> dict[str, Any]:
-    """What a run depends on, as `group.field`; not how it is computed or where it is written."""
-    from sejax.configs import to_dict
-
-    flat = pd.json_normalize(to_dict(config)).iloc[0].to_dict()
-    return {name: value for name, value in flat.items()
-            if name not in ("run_dir", "devices", "lanes", "checkpoint_every")}  # fmt: skip
-
-
-def make_step(program: Any) -> Callable[[Any], Any]:
-    """Builds `step(state) -> (state, info)`: a generation, compiled at the first call, only once.
-
-    Left to `jax.jit` it would be compiled anew for the state's every placement on the devices: new,
-    restored, or as the generation before returned it.
-    """
-    import jax
-
-    @functools.cache
-    def compiled() -> Any:
-        state = jax.eval_shape(program.init, jax.random.key(0)[None])
-        return jax.jit(program.generation, donate_argnums=0).lower(state).compile()
-
-    return lambda state: compiled()(state)
-
-
-def learn_one(config: Any, program: Any, step: Callable[..., Any]) -> pd.DataFrame:
-    """One run of Algorithm 1, saved after each generation; goes on where it was stopped.
-
-    Args:
-      config: with the run's seed and folder.
-      program: from `bilevel.make_program`.
-      step: from `make_step`; it uses up the state's buffers.
-
-    Returns:
-      The rows of the run's `metrics.csv`.
-    """
-    import jax
-
-    from sejax import checkpoints
-    from sejax.run_directory import RunDirectory
-
-    directory = RunDirectory.open(config)
-    state = jax.jit(program.init)(jax.random.key(config.seed)[None])
-    state, generation, _ = checkpoints.restore_newest(directory.checkpoints, state)
-    directory.drop_rows_from(generation)
-    state = jax.tree.map(lambda x: x.copy(), state)  # own buffers, so that they can be donated
-    started = time.time() - (float(directory.rows[-1]["wall_s"]) if directory.rows else 0.0)
-    while generation < config.generations and not bool(state.finished.all()):
-        state, info = step(state)
-        generation += 1
-        host_state, info = jax.device_get((state, info))
-        directory.add_rows(jax.tree.map(lambda x: x[None], info), time.time() - started)
-        directory.save_proxies(program, host_state)
-        checkpoints.save(directory.checkpoints, generation, state)
-    return pd.read_csv(directory.metrics)
-
-
-def collect(configs: list[Any], path: Path) -> None:
-    """Writes the best SE of each run into one file."""
-    from sejax.experiments.se_sets import save_set
-    from sejax.proxies import io as proxy_io
-
-    best = [proxy_io.load_proxy(config.run_dir) for config in configs]
-    save_set(
-        path,
-        configs[0],
-        [proxy.params.weights for proxy in best],
-        [proxy.metadata["score"] for proxy in best],
-        [proxy.metadata["generation"] for proxy in best],
-        [config.seed for config in configs],
-    )
-
-
-def generations_to_solve(curve: pd.DataFrame, solved_reward: float) -> float:
-    """Generations until the first whose incumbent mean reaches the threshold; inf if none does.
-
-    Args:
-      curve: one run, in the order of its generations.
-      solved_reward: the threshold.
-    """
-    solved = curve["generation"][curve["incumbent_mean"] >= solved_reward]
-    return float(solved.iloc[0]) + 1 if len(solved) else np.inf
-
-
 def summarise(curves: pd.DataFrame, solved_reward: float) -> pd.DataFrame:
     """One row for each run: what it took to solve the task and how far it came.
 
@@ -205,7 +91,7 @@ def summarise(curves: pd.DataFrame, solved_reward: float) -> pd.DataFrame:
     """
     rows = []
     for seed, curve in curves.groupby("seed"):
-        to_solve = generations_to_solve(curve, solved_reward)
+        to_solve = proxy_runs.generations_to_solve(curve, solved_reward)
         at_solving = curve[curve["generation"] + 1 == to_solve]
         rows.append({
             "seed": seed,

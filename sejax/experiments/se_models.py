@@ -44,7 +44,7 @@ def run(args: argparse.Namespace) -> pd.DataFrame:
     Raises:
       ConfigError: for a file or settings that cannot work.
     """
-    from sejax.experiments.se_sets import load_set
+    from sejax.experiments.proxy_sets import load_set
 
     fill_in(args)
     source = args.ses or ("cartpole" if args.quick else None)

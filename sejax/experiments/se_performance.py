@@ -160,7 +160,7 @@ def make_worlds(args: argparse.Namespace) -> dict[str, World]:
       ConfigError: if the SEs are of different tasks.
     """
     from sejax import envs
-    from sejax.experiments.se_sets import load_set
+    from sejax.experiments.proxy_sets import load_set
 
     files = {"varied": args.varied, "fixed": args.fixed}
     if args.quick and not any(files.values()):
@@ -175,7 +175,7 @@ def make_worlds(args: argparse.Namespace) -> dict[str, World]:
     names = sorted({ses.task.name for ses in sets.values()} | ({args.env} if args.env else set()))
     require(len(names) <= 1, "--varied, --fixed and --env", "be of one task",
             "agents are tested on it", ", ".join(names), "files of the same task")  # fmt: skip
-    count = max((ses.num_ses for ses in sets.values()), default=args.num_ses)
+    count = max((ses.size for ses in sets.values()), default=args.num_ses)
     task = envs.make(names[0] if names else "cartpole")
     return {"real": real_world(args, task, count)} | {
         name: se_world(args, ses) for name, ses in sets.items()
@@ -213,9 +213,9 @@ def se_world(args: argparse.Namespace, ses: Any) -> World:
                                    test_episodes=args.test_episodes)  # fmt: skip
 
     # The name has the weights' hash, so that sets can share a folder: se_models then finds these.
-    names = tuple(f"se-{i:02d}-{ses.fingerprint(i)}" for i in range(ses.num_ses))
+    names = tuple(f"se-{i:02d}-{ses.fingerprint(i)}" for i in range(ses.size))
     proxy = {f"proxy.{name}": value for name, value in vars(ses.config.proxy).items()}
-    params = tuple(ses.one(i) for i in range(ses.num_ses))
+    params = tuple(ses.one(i) for i in range(ses.size))
     return World(env=ses.env, task=ses.task, params=params, names=names, training=training,
                  settings={"world": f"SE of {ses.task.name}", **proxy})  # fmt: skip
 

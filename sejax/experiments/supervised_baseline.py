@@ -100,7 +100,7 @@ def run(args: argparse.Namespace) -> pd.DataFrame:
       ConfigError: for a proxy or settings that cannot work.
     """
     fill_in(args)
-    from sejax.experiments.se_sets import load_set
+    from sejax.experiments.proxy_sets import load_set
 
     ses = load_set(args.proxy, "--proxy").first(1)
     require(ses.task.num_states is None and ses.task.num_actions is not None, "--proxy",
@@ -376,7 +376,7 @@ def save_models(args: argparse.Namespace, ses: Any, weights: Any, variant: str, 
     """Stores the models of a variant, as SEs with their use of the done output."""
     import jax
 
-    from sejax.experiments.se_sets import save_set
+    from sejax.experiments.proxy_sets import save_set
 
     config = dataclasses.replace(ses.config, proxy=dataclasses.replace(ses.config.proxy, done=done))
     each = [jax.tree.map(lambda x, i=i: x[i], weights) for i in range(args.models)]
@@ -393,7 +393,7 @@ class World:
     """What agents are trained in.
 
     Attributes:
-      sets: the models, or the SE, as an `SESet`.
+      sets: the models, or the SE, as an `ProxySet`.
       groups: groups of agents; the i-th trains on the i-th model, or on the SE.
       is_model: whether these are models.
     """
@@ -404,13 +404,13 @@ class World:
 
     def one(self, group: int) -> tuple[Any, str]:
         """`EnvParams` of a group's world, and the fingerprint of its weights."""
-        index = group % self.sets.num_ses
+        index = group % self.sets.size
         return self.sets.one(index), self.sets.fingerprint(index)
 
 
 def make_worlds(args: argparse.Namespace, ses: Any) -> dict[str, World]:
     """The models of both variants and the SE, with as many agents on the SE as on all models."""
-    from sejax.experiments.se_sets import load_set
+    from sejax.experiments.proxy_sets import load_set
 
     sets = {name: load_set(model_file(args, name), "--out") for name in ("authors", "fair")}
     return {

@@ -1,8 +1,8 @@
-"""Sets of learned SEs of one task in one file: what `--ses FILE` of the experiments reads.
+"""Sets of learned proxies of one task in one file: what the experiments read.
 
-The tensors are those of one SE with a leading axis over the SEs, in safetensors. The metadata holds
-the format version, the configuration that all were learned with, and of each SE its score,
-generation and seed. Nothing in it is executed when it is read.
+The tensors are those of one proxy with a leading axis over the proxies, in safetensors. The
+metadata holds the format version, the configuration that all were learned with, and of each proxy
+its score, generation and seed. Nothing in it is executed when it is read.
 """
 
 import dataclasses
@@ -11,7 +11,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import jax
 import numpy as np
@@ -20,30 +20,30 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
 
 from sejax import envs
-from sejax.configs import LearnConfig, SyntheticConfig, from_dict, to_dict
+from sejax.configs import LearnConfig, from_dict, to_dict
 from sejax.errors import ConfigError, require
 from sejax.files import atomic_path
 from sejax.proxies import io as proxy_io
-from sejax.proxies.synthetic import SyntheticEnv, SyntheticParams, make_synthetic
+from sejax.proxies.registry import ProxyEnv, ProxyParams, make_proxy
 
 FORMAT_VERSION = 1
 
 
 @dataclass(frozen=True, kw_only=True)
-class SESet:
-    """SEs that share a configuration, and hence every compiled program.
+class ProxySet:
+    """Proxies that share a configuration, and hence every compiled program.
 
     Attributes:
-      env: the SE; its weights are what differs.
-      weights: leaves `[num_ses, ...]`, NumPy float32.
-      scores: `[num_ses]` incumbent mean that each was chosen for.
-      generations: `[num_ses]` outer iteration that measured it.
-      seeds: `[num_ses]` seed of the run that it came from.
+      env: the SE or RN; its weights are what differs.
+      weights: leaves `[size, ...]`, NumPy float32.
+      scores: `[size]` incumbent mean that each was chosen for.
+      generations: `[size]` outer iteration that measured it.
+      seeds: `[size]` seed of the run that it came from.
       config: that the SEs were learned with; its seed is the first run's.
       path: the file.
     """
 
-    env: SyntheticEnv
+    env: ProxyEnv
     weights: Any
     scores: np.ndarray
     generations: np.ndarray
@@ -56,26 +56,26 @@ class SESet:
         return self.env.task
 
     @property
-    def num_ses(self) -> int:
+    def size(self) -> int:
         return len(self.scores)
 
     @property
-    def params(self) -> SyntheticParams:
-        """All SEs as one `EnvParams`; only `weights` has the leading axis."""
+    def params(self) -> ProxyParams:
+        """All proxies as one `EnvParams`; only `weights` has the leading axis."""
         return self.env.params(self.weights)
 
-    def one(self, index: int) -> SyntheticParams:
-        """`EnvParams` of one SE."""
+    def one(self, index: int) -> ProxyParams:
+        """`EnvParams` of one of them."""
         return self.env.params(jax.tree.map(lambda x: x[index], self.weights))
 
     def fingerprint(self, index: int) -> str:
-        """Eight letters that tell one SE's weights from another's."""
+        """Eight letters that tell one's weights from another's."""
         flat = flatten_dict(self.one(index).weights, sep="/")
         content = b"".join(np.ascontiguousarray(flat[name]).tobytes() for name in sorted(flat))
         return hashlib.sha256(content).hexdigest()[:8]
 
-    def first(self, count: int | None) -> "SESet":
-        """The first SEs of the set: those of the first runs, whatever their score."""
+    def first(self, count: int | None) -> "ProxySet":
+        """The first ones of the set: those of the first runs, whatever their score."""
         return dataclasses.replace(
             self,
             weights=jax.tree.map(lambda x: x[:count], self.weights),
@@ -98,10 +98,10 @@ def save_set(
     Args:
       path: the file, `*.safetensors`.
       config: the configuration that all were learned with.
-      weights: of each SE, as from `SyntheticEnv.init_weights`.
-      scores: of each SE, its incumbent mean.
-      generations: of each SE, the outer iteration that measured it.
-      seeds: of each SE, its run's seed.
+      weights: of each proxy, as from its `init_weights`.
+      scores: of each, its incumbent mean.
+      generations: of each, the outer iteration that measured it.
+      seeds: of each, its run's seed.
 
     Raises:
       OSError: if it cannot be written; an older file stays as it was.
@@ -120,57 +120,59 @@ def save_set(
         save_file(tensors, temporary, metadata={"sejax_set": json.dumps(header)})
 
 
-def load_set(source: str | Path, option: str = "--ses") -> SESet:
-    """Loads a set of SEs; a single stored proxy is a set of one.
+def load_set(source: str | Path, option: str = "--ses", kind: str = "se") -> ProxySet:
+    """Loads a set of proxies; a single stored one is a set of one.
 
     Args:
       source: a file of `save_set`, or whatever `sejax.load` takes.
       option: named in error messages.
+      kind: "se" or "rn", which the proxies must be.
 
     Raises:
-      ConfigError: if there is no such file, or it is damaged or of another format.
+      ConfigError: if there is no such file, it is damaged or of another format, or its proxies are
+        of another kind.
     """
     if not Path(source).is_file():
-        return _set_of_one(source, option)
+        return _set_of_one(source, option, kind)
     path = Path(source)
     try:
         with safe_open(path, framework="np") as file:
             header = dict(file.metadata() or {})
             if "sejax_set" not in header:
-                return _set_of_one(path, option)
+                return _set_of_one(path, option, kind)
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
         stored = json.loads(header["sejax_set"])
         config = from_dict(stored["config"])
         columns = [np.asarray(stored[name]) for name in ("scores", "generations", "seeds")]
     except (SafetensorError, OSError, KeyError, ValueError) as error:
         raise ConfigError(
-            f"{option} must be a whole file of SEs that sejax has written, because weights are "
-            f"read from it; got {path}, which is damaged ({error}). Run sejax.experiments."
-            f"se_feasibility again, which writes it."
+            f"{option} must be a whole file of proxies that sejax has written, because weights are "
+            f"read from it; got {path}, which is damaged ({error}). Run the experiment again that "
+            f"wrote it."
         ) from error
     require(stored.get("format_version") == FORMAT_VERSION, option,
             f"be of format {FORMAT_VERSION}", "this version of sejax reads no other",
             stored.get("format_version"), f"{option} to a file of this version")  # fmt: skip
-    env = _se_of(config, option)
+    env = _proxy_of(config, option, kind)
     _check_shapes(path, option, env, tensors, [len(column) for column in columns])
     weights = unflatten_dict({tuple(name.split("/")): x for name, x in tensors.items()})
     scores, generations, seeds = columns
-    return SESet(env=env, weights=weights, scores=scores, generations=generations, seeds=seeds,
+    return ProxySet(env=env, weights=weights, scores=scores, generations=generations, seeds=seeds,
                  config=config, path=path)  # fmt: skip
 
 
-def _se_of(config: LearnConfig, option: str) -> SyntheticEnv:
-    require(isinstance(config.proxy, SyntheticConfig), option, "hold synthetic environments",
-            "their networks are what is studied", f"proxy={config.proxy.name}",
-            f"{option} to a proxy learned with proxy=se")  # fmt: skip
-    return make_synthetic(envs.make(config.env.name), cast(SyntheticConfig, config.proxy))
+def _proxy_of(config: LearnConfig, option: str, kind: str) -> ProxyEnv:
+    require(config.proxy.name == kind, option, f"hold proxies learned with proxy={kind}",
+            "these are what is studied", f"proxy={config.proxy.name}",
+            f"{option} to a file of those")  # fmt: skip
+    return make_proxy(envs.make(config.env.name), config.proxy)
 
 
-def _set_of_one(source: str | Path, option: str) -> SESet:
+def _set_of_one(source: str | Path, option: str, kind: str) -> ProxySet:
     proxy = proxy_io.load_proxy(source)
     stored = proxy.metadata
-    return SESet(
-        env=_se_of(proxy.config, option),
+    return ProxySet(
+        env=_proxy_of(proxy.config, option, kind),
         weights=jax.tree.map(lambda x: np.asarray(x)[None], proxy.params.weights),
         scores=np.array([stored.get("score", np.nan)]),
         generations=np.array([stored.get("generation", -1)]),
@@ -181,15 +183,14 @@ def _set_of_one(source: str | Path, option: str) -> SESet:
 
 
 def _check_shapes(
-    path: Path, option: str, env: SyntheticEnv, tensors: dict[str, np.ndarray], counts: list[int]
+    path: Path, option: str, env: ProxyEnv, tensors: dict[str, np.ndarray], counts: list[int]
 ) -> None:
     expected = flatten_dict(jax.eval_shape(env.init_weights, jax.random.key(0)), sep="/")
     wanted = {name: (counts[0], *x.shape) for name, x in expected.items()}
     shapes = {name: x.shape for name, x in tensors.items()}
     if shapes != wanted or len(set(counts)) > 1 or counts[0] < 1:
         raise ConfigError(
-            f"{option} must hold the tensors of the network in its metadata for each SE, because "
+            f"{option} must hold the tensors of the network in its metadata for each proxy, as "
             f"they are its weights; {path} has {shapes} in place of {wanted}, and {counts} "
-            f"scores, generations and seeds. Learn the SEs again with sejax.experiments."
-            f"se_feasibility."
+            f"scores, generations and seeds. Run the experiment again that wrote it."
         )
