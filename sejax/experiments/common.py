@@ -6,8 +6,10 @@ made with beside it; running the same command again computes only what is missin
 """
 
 import argparse
+import itertools
 import json
-from collections.abc import Callable
+import sys
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +24,10 @@ from sejax.files import write_text
 def parse_args(
     name: str, description: str | None, add_options: Callable[[argparse.ArgumentParser], None]
 ) -> argparse.Namespace:
-    """Options that every experiment takes, and its own; starts XLA with a device for each core."""
+    """Options that every experiment takes, and its own; starts XLA with a device for each core.
+
+    Words `name=value` before the first option mean `--name value`, as in sejax.run.
+    """
     summary = (description or "").partition("\n")[0]
     parser = argparse.ArgumentParser(prog=f"python -m sejax.experiments.{name}",
                                      description=summary)  # fmt: skip
@@ -31,13 +36,21 @@ def parse_args(
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--devices", type=int, help="devices to use; all")
     add_options(parser)
-    args = parser.parse_args()
+    args = parser.parse_args(as_options(sys.argv[1:]))
     args.out = args.out or Path("results") / (f"{name}-quick" if args.quick else name)
     from sejax.runtime import configure_xla, enable_compilation_cache
 
     configure_xla(args.devices)
     enable_compilation_cache()
     return args
+
+
+def as_options(words: Sequence[str]) -> list[str]:
+    """Turns leading words `name=value` into `--name value`."""
+    leading = list(itertools.takewhile(lambda word: "=" in word and word[0] != "-", words))
+    split = [(f"--{name.replace('_', '-')}", value) for name, _, value in
+             (word.partition("=") for word in leading)]  # fmt: skip
+    return [*itertools.chain(*split), *words[len(leading) :]]
 
 
 def run_command(
