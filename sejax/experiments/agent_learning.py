@@ -221,9 +221,9 @@ def draw(curves: pd.DataFrame, path: Path, points: int = 100) -> None:
     panels = list(curves.groupby(curves["study"].map(lambda i: STUDIES[i].env), sort=False))
     palette = (figures.REAL, figures.VARIED, figures.FIXED, figures.SOLVED)
     with plt.rc_context(figures.STYLE):
-        columns = min(2, len(panels))
+        columns = min(3, len(panels))
         lines = -(-len(panels) // columns)
-        figure, axes = plt.subplots(lines, columns, figsize=(5.2 * columns, 3.4 * lines),
+        figure, axes = plt.subplots(lines, columns, figsize=(4.6 * columns, 3.6 * lines),
                                     squeeze=False, layout="constrained")  # fmt: skip
         for axis in axes.ravel()[len(panels) :]:
             axis.set_visible(False)
@@ -243,7 +243,7 @@ def draw(curves: pd.DataFrame, path: Path, points: int = 100) -> None:
             axis.axhline(envs.make(env).solved_reward, color="#7a7a7a", ls="--", lw=1)
             axis.set_title(str(env), fontsize=10)
             axis.set_xscale("log")
-            axis.set_xlabel("training steps (log scale); *: see the table's hyperparameters")
+            axis.set_xlabel("training steps (*: hyperparameters in the table)")
             axis.legend(fontsize=8, loc="best")
         for axis in axes[:, 0]:
             axis.set_ylabel(f"test return, mean of {WINDOW}")

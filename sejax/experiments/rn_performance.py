@@ -380,7 +380,8 @@ def draw(curves: pd.DataFrame, args: argparse.Namespace, solved_reward: float, p
             axis.axhline(solved_reward, color="#7a7a7a", ls=":", lw=1)
             study = STUDIES[args.env]
             agent = study.transfer_agent if row == "transfer" else study.agent
-            axis.set_title(f"{agent.name}, {ROWS[row]}", fontsize=10)
+            name = figures.AGENT_NAMES[agent.name]
+            axis.set_title(f"{name}, {ROWS[row]}", fontsize=10)
             axis.set_xlabel("training steps")
         axes[0, 0].set_ylabel(f"test return on {args.env}")
         handles, labels = axes[0, 0].get_legend_handles_labels()
