@@ -268,7 +268,7 @@ def test_performance_trains_as_evaluation_does_and_goes_on(ses, tmp_path, monkey
     assert (tmp_path / "performance.png").stat().st_size > 10_000
     assert "16887.7" in (tmp_path / "table.md").read_text()
 
-    monkeypatch.setattr(se_performance, "train_group", refuse)
+    monkeypatch.setattr(se_performance, "train_groups", refuse)
     pd.testing.assert_frame_equal(performance(ses, tmp_path), table)
     with pytest.raises(ConfigError, match=r"with another training\.test_episodes"):
         performance(ses, tmp_path, "--test-episodes", "4")

@@ -98,23 +98,43 @@ class Pieces:
         Raises:
           ConfigError: if a piece of that name was made with other settings.
         """
-        table, made_with = self.folder / f"{name}.csv", self.folder / f"{name}.json"
+        (table,) = self.compute_all({name: settings}, lambda _: [compute()])
+        return table
+
+    def compute_all(
+        self,
+        settings: dict[str, dict[str, Any]],
+        compute: Callable[[list[str]], list[pd.DataFrame]],
+    ) -> list[pd.DataFrame]:
+        """As `compute` for several pieces, of which those that are missing are made at once.
+
+        Args:
+          settings: of each piece, by its name.
+          compute: makes the tables of the pieces with the given names.
+        """
         settings = json.loads(json.dumps(settings, default=str))
-        if table.exists() and made_with.exists():
-            there = json.loads(made_with.read_text())
-            differing = sorted(key for key in {*there, *settings}
-                               if there.get(key) != settings.get(key))  # fmt: skip
-            if differing:
-                raise ConfigError(
-                    f"--out must be a new folder or that of the same experiment, because finished "
-                    f"pieces are used again; got {table} with another {', '.join(differing)}. "
-                    f"Set --out=DIR."
-                )
-            return pd.read_csv(table)
-        made = compute()
-        write_text(made_with, json.dumps(settings, indent=2))
-        write_text(table, made.to_csv(index=False))
-        return made
+        tables = {name: self._stored(name, mine) for name, mine in settings.items()}
+        missing = [name for name, table in tables.items() if table is None]
+        for name, table in zip(missing, compute(missing) if missing else [], strict=True):
+            write_text(self.folder / f"{name}.json", json.dumps(settings[name], indent=2))
+            write_text(self.folder / f"{name}.csv", table.to_csv(index=False))
+            tables[name] = table
+        return [table for table in tables.values() if table is not None]
+
+    def _stored(self, name: str, settings: dict[str, Any]) -> pd.DataFrame | None:
+        table, made_with = self.folder / f"{name}.csv", self.folder / f"{name}.json"
+        if not (table.exists() and made_with.exists()):
+            return None
+        there = json.loads(made_with.read_text())
+        differing = sorted(key for key in {*there, *settings}
+                           if there.get(key) != settings.get(key))  # fmt: skip
+        if differing:
+            raise ConfigError(
+                f"--out must be a new folder or that of the same experiment, because finished "
+                f"pieces are used again; got {table} with another {', '.join(differing)}. "
+                f"Set --out=DIR."
+            )
+        return pd.read_csv(table)
 
 
 def bootstrap_interval(

@@ -28,6 +28,7 @@ AGENTS = ("ddqn", "dueling_ddqn", "td3_discrete")
 NUM_SES = 40
 NUM_BEST = 5
 BEST_FOR = "td3_discrete"
+GROUPS_AT_ONCE = 5  # groups of agents in one program
 LABELS = {"real": "real", "varied": "synth., HPs varied", "fixed": "synth., HPs fixed",
           "best": "synth., best SEs"}  # fmt: skip
 
@@ -236,54 +237,77 @@ def train_all(
         "seed": args.seed,
     }
     tables = []
-    for index, (name, params) in enumerate(zip(world.names, world.params, strict=True)):
-        table = pieces.compute(
-            f"{kind}-{name}", settings | {"group": name},
-            functools.partial(train_group, args, config, world, training, index, params),
-        )  # fmt: skip
-        print(f"{kind} {name}: mean return {table['test_return'].mean():.1f} after "
-              f"{table['train_steps'].mean():,.0f} steps", flush=True)  # fmt: skip
-        tables.append(table.assign(kind=kind, group=name))
+    for first in range(0, len(world.names), GROUPS_AT_ONCE):
+        indices = {f"{kind}-{name}": index for index, name in enumerate(world.names)
+                   if first <= index < first + GROUPS_AT_ONCE}  # fmt: skip
+
+        def compute(missing: list[str], indices: dict[str, int] = indices) -> list[pd.DataFrame]:
+            chosen = [indices[piece] for piece in missing]
+            return train_groups(args, config, world, training, chosen)
+
+        named = {piece: settings | {"group": world.names[i]} for piece, i in indices.items()}
+        computed = pieces.compute_all(named, compute)
+        for index, table in zip(indices.values(), computed, strict=True):
+            name = world.names[index]
+            print(f"{kind} {name}: mean return {table['test_return'].mean():.1f} after "
+                  f"{table['train_steps'].mean():,.0f} steps", flush=True)  # fmt: skip
+            tables.append(table.assign(kind=kind, group=name))
     return pd.concat(tables, ignore_index=True)
 
 
-def train_group(
+def train_groups(
     args: argparse.Namespace,
     config: Any,
     world: World,
     training: TrainingConfig,
-    index: int,
-    params: Any,
-) -> pd.DataFrame:
-    """Trains and tests the agents of one SE, or of one group on the real task; a row each.
+    indices: list[int],
+) -> list[pd.DataFrame]:
+    """Trains and tests the agents of some SEs, or groups on the real task; a row for each agent.
 
+    Some agents train a hundred times as long as others: several groups in one program keep all
+    devices busy, and there are always as many as `GROUPS_AT_ONCE`, so that it is compiled once.
     Agents of the same numbers draw the same hyperparameters in every setting, so that settings are
     compared on equal draws.
     """
     import jax
 
     program = make_program(config, world.env, world.task, training, args.devices)
-    key_group = jax.random.fold_in(jax.random.key(args.seed), index)
-    keys = jax.vmap(functools.partial(jax.random.fold_in, key_group))(np.arange(args.num_agents))
-    outcome, drawn = jax.device_get(program(keys, params))
-    returns = outcome.pop("returns").astype(float)
-    columns = {"agent": range(args.num_agents), "test_return": returns.mean(axis=1)}
-    for name, values in {**outcome, **drawn}.items():
-        columns[name] = values if values.dtype == bool else values.astype(float)
-    columns |= {f"return_{i}": returns[:, i] for i in range(returns.shape[1])}
-    return pd.DataFrame(columns)
+    num_agents = args.num_agents
+    padded = [*indices, *[indices[-1]] * (GROUPS_AT_ONCE - len(indices))]
+    groups = np.repeat(padded, num_agents)
+    numbers = np.tile(np.arange(num_agents), len(padded))
+    key = jax.random.key(args.seed)
+    keys = jax.vmap(lambda g, n: jax.random.fold_in(jax.random.fold_in(key, g), n))(groups, numbers)
+    params = jax.tree.map(
+        lambda *each: np.repeat(np.stack(each), num_agents, axis=0),
+        *[world.params[index] for index in padded],
+    )
+    active = np.arange(len(groups)) < len(indices) * num_agents
+    outcome, drawn = jax.device_get(program(keys, params, active))
+    tables = []
+    for place in range(len(indices)):
+        mine = slice(place * num_agents, (place + 1) * num_agents)
+        returns = outcome["returns"][mine].astype(float)
+        columns = {"agent": range(num_agents), "test_return": returns.mean(axis=1)}
+        for name, values in {**outcome, **drawn}.items():
+            if name != "returns":
+                kept = values[mine]
+                columns[name] = kept if kept.dtype == bool else kept.astype(float)
+        columns |= {f"return_{i}": returns[:, i] for i in range(returns.shape[1])}
+        tables.append(pd.DataFrame(columns))
+    return tables
 
 
 @functools.cache
 def make_program(
     config: Any, env: Any, task: Any, training: TrainingConfig, devices: int | None
 ) -> Callable[..., Any]:
-    """Builds `program(keys [agent], env_params) -> (outcome, hparams)`, compiled once for all SEs.
+    """Builds `program(keys, env_params, active) -> (outcome, hparams)`, compiled once for all SEs.
 
-    The outcome's leaves are `[agent]` or, for the returns, `[agent, episode]`.
+    All leaves are `[agent, ...]`; the outcome's are `[agent]` or, for the returns,
+    `[agent, episode]`. Nothing is computed for an agent that is not active.
     """
     import jax
-    import jax.numpy as jnp
 
     from sejax.agents.configs import ExplorationConfig
     from sejax.agents.hparams import make_varied_agents
@@ -293,19 +317,13 @@ def make_program(
     varied = make_varied_agents(config, task, ExplorationConfig())
     branches = [make_branch(agent, env, task, training) for agent in varied.agents]
 
-    def train_one(key: Any, env_params: Any) -> Any:
+    def train_one(key: Any, env_params: Any, active: Any) -> Any:
         values = varied.draw(drawing_key(key))
-        args = (key, env_params, varied.hparams(values))
+        args = (key, env_params, varied.hparams(values), active)
         return jax.lax.switch(varied.branch(values), branches, *args), values
 
     spread = spread_over_devices(train_one, devices, cpu_lanes=varied.agents[0].cpu_lanes)
-
-    def program(keys: Any, env_params: Any) -> Any:
-        count = keys.shape[0]
-        each = jax.tree.map(lambda x: jnp.broadcast_to(x, (count, *jnp.shape(x))), env_params)
-        return spread(keys, each)
-
-    return jax.jit(program)
+    return jax.jit(spread)
 
 
 def make_branch(agent: Any, env: Any, task: Any, training: TrainingConfig) -> Callable[..., Any]:
@@ -323,10 +341,10 @@ def make_branch(agent: Any, env: Any, task: Any, training: TrainingConfig) -> Ca
 
     train = make_trainer(agent, env, training, task.solved_reward, test_fn=test_between)
 
-    def evaluate(key: Any, env_params: Any, hparams: Any) -> dict[str, Any]:
+    def evaluate(key: Any, env_params: Any, hparams: Any, active: Any = True) -> dict[str, Any]:
         key_train, key_test = jax.random.split(key)
-        result = train(key_train, env_params, hparams)
-        returns, _ = test(key_test, result.agent_state)
+        result = train(key_train, env_params, hparams, active)
+        returns, _ = test(key_test, result.agent_state, active)
         return {
             "returns": returns,
             "train_steps": result.train_steps,

@@ -485,7 +485,13 @@ def make_program(
 
     if hparams == "varied":
         varied = se_performance.make_program(config, env, env.task, training, devices)
-        return lambda keys, params: varied(keys, params)[0]
+
+        def draw_and_train(keys: Any, params: Any) -> Any:
+            count = len(keys)
+            each = jax.tree.map(lambda x: np.repeat(np.asarray(x)[None], count, axis=0), params)
+            return varied(keys, each, np.ones(count, bool))[0]
+
+        return draw_and_train
     agent = make_agent(config, env.task, ExplorationConfig())
     evaluate = se_performance.make_branch(agent, env, env.task, training)
 
