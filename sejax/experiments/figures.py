@@ -156,7 +156,9 @@ def performance(
             axis.set_ylabel(label)
         longest = max(columns.values(), key=len)
         handles = [plt.Line2D([], [], color=color, lw=3) for color, _ in longest.values()]
-        figure.legend(handles, [f"train: {label}" for label in longest], ncols=len(longest),
+        # Side by side the labels are as wide as two columns.
+        figure.legend(handles, [f"train: {label}" for label in longest],
+                      ncols=len(longest) if len(columns) > 1 else 1,
                       loc="outside upper center")  # fmt: skip
         write(figure, path)
 
