@@ -9,7 +9,7 @@ For each variant `--rns` RNs are learned, in `<out>/runs/<variant>/seed<N>`, and
 and as many on the real task alone and with an exploration bonus. Episodes of training and of greedy
 testing on the real task alternate, and nothing stops an agent early.
 
-Differs: agents train for the steps that the paper's figure shows, not for a number of episodes.
+Differs: agents stop after the steps that the paper's figure shows, or its number of episodes.
 """
 
 import argparse
@@ -55,7 +55,8 @@ class Study:
       agent: of the rows with default and varied hyperparameters.
       transfer_agent: of the row with an unseen agent.
       bonuses: exploration bonuses that are compared on the real task.
-      max_steps: training steps that the paper's figure shows.
+      max_episodes: that the paper trains.
+      max_steps: training steps that its figure shows.
       rns: number of RNs of each variant.
       num_agents: on each of them.
     """
@@ -63,6 +64,7 @@ class Study:
     agent: AgentConfig
     transfer_agent: AgentConfig
     bonuses: tuple[str, ...] = ()
+    max_episodes: int
     max_steps: int
     rns: int = 10
     num_agents: int = 10
@@ -76,15 +78,16 @@ _CARTPOLE: dict[str, Any] = {
 STUDIES = {
     "cliff_walking": Study(
         agent=QLearningConfig(), transfer_agent=SARSAConfig(), bonuses=("count_based",),
-        max_steps=5000,
+        max_episodes=500, max_steps=5000,
     ),
     "cartpole": Study(
         agent=DDQNConfig(**_CARTPOLE), transfer_agent=DuelingDDQNConfig(**_CARTPOLE),
-        bonuses=("icm",), max_steps=50_000,
+        bonuses=("icm",), max_episodes=1000, max_steps=50_000,
     ),
     "mountain_car_continuous": Study(
         agent=TD3Config(init_episodes=50, action_repeat=2),
-        transfer_agent=PPOConfig(action_repeat=5), bonuses=("icm",), max_steps=250_000,
+        transfer_agent=PPOConfig(action_repeat=5), bonuses=("icm",),
+        max_episodes=3000, max_steps=250_000,
     ),
 }  # fmt: skip
 LABELS = {
@@ -254,7 +257,7 @@ def train_group(
 
     task = envs.make(args.env)
     training = TrainingConfig(
-        max_episodes=args.max_steps, max_steps=args.max_steps, test_episodes=1,
+        max_episodes=STUDIES[args.env].max_episodes, max_steps=args.max_steps, test_episodes=1,
         time_limit_is_terminal=True,
     )  # fmt: skip
     program = return_curves.make_program(

@@ -113,7 +113,7 @@ def add_agent_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--agents", nargs="+", default=list(AGENTS), metavar="AGENT",
                         help=", ".join(AGENTS))  # fmt: skip
     parser.add_argument("--num-agents", type=int, help="agents for each SE; 10, quick 4")
-    parser.add_argument("--num-ses", type=int, help="SEs of a set at most; 40, quick 2")
+    parser.add_argument("--num-ses", type=int, help="SEs of a set at most; 40, quick 3")
     parser.add_argument("--test-episodes", type=int, default=10, help="of each agent; 10")
     parser.add_argument("--max-steps", type=int, help="training steps at most; no other limit "
                         "than that of the SEs' own configuration")  # fmt: skip
