@@ -1,24 +1,12 @@
 """The experiment on how agents learn the real tasks."""
 
-import argparse
-
 import numpy as np
 import pandas as pd
 import pytest
+from support import experiment_options, refuse
 
 from sejax.errors import ConfigError
 from sejax.experiments import agent_learning, return_curves
-
-
-def options(out, *argv):
-    parser = argparse.ArgumentParser()
-    agent_learning.add_options(parser)
-    args = parser.parse_args(argv)
-    return argparse.Namespace(**vars(args), quick=True, out=out, seed=3, devices=1)
-
-
-def refuse(*_, **__):
-    raise AssertionError("computed again")
 
 
 def curve(steps, returns):
@@ -41,7 +29,7 @@ def test_curves_hold_the_value_of_the_last_finished_episode():
 
 def test_every_agent_learns_and_nothing_is_computed_twice(tmp_path, monkeypatch):
     monkeypatch.setattr(agent_learning, "QUICK_STEPS", 400)
-    args = options(tmp_path, "--envs", "cliff_walking")
+    args = experiment_options(agent_learning, tmp_path, "--envs", "cliff_walking")
     table = agent_learning.run(args)
     assert list(table["agent"]) == ["q_learning", "sarsa", "sarsa"]
     assert (tmp_path / "learning_curves.png").stat().st_size > 10_000
@@ -65,4 +53,4 @@ def test_every_agent_learns_and_nothing_is_computed_twice(tmp_path, monkeypatch)
 )
 def test_what_cannot_work_is_refused(tmp_path, given, named):
     with pytest.raises(ConfigError, match=named):
-        agent_learning.run(options(tmp_path, *given))
+        agent_learning.run(experiment_options(agent_learning, tmp_path, *given))

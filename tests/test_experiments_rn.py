@@ -1,26 +1,13 @@
 """The experiment on what agents reach with reward networks."""
 
-import argparse
-
 import numpy as np
 import pandas as pd
 import pytest
+from support import experiment_options, refuse
 
 from sejax.errors import ConfigError
 from sejax.experiments import common, proxy_runs, rn_performance
 from sejax.experiments.proxy_sets import load_set
-
-
-def options(out, *argv):
-    parser = argparse.ArgumentParser()
-    rn_performance.add_options(parser)
-    args = parser.parse_args(argv)
-    return argparse.Namespace(**vars(args), quick=True, out=out, seed=3, devices=1)
-
-
-def refuse(*_, **__):
-    raise AssertionError("computed again")
-
 
 TINY = ["--variants", "additive_potential", "--rns", "2", "--num-agents", "2", "--generations", "1",
         "--max-steps", "150", "--rows", "default"]  # fmt: skip
@@ -28,7 +15,7 @@ TINY = ["--variants", "additive_potential", "--rns", "2", "--num-agents", "2", "
 
 def test_rns_are_learned_stored_and_used_once(tmp_path, monkeypatch):
     monkeypatch.setattr(rn_performance, "QUICK_POPULATION", 2)
-    args = options(tmp_path, *TINY)
+    args = experiment_options(rn_performance, tmp_path, *TINY)
     table = rn_performance.run(args)
     assert list(table["trained with"]) == ["real", "count_based", "additive_potential"]
     assert set(table["groups, agents"]) == {"2, 4"}
@@ -78,7 +65,7 @@ def test_the_summary_is_over_agents_and_its_intervals_over_groups():
 )
 def test_what_cannot_work_is_refused(tmp_path, given, said):
     with pytest.raises(ConfigError, match=said):
-        rn_performance.run(options(tmp_path, *given))
+        rn_performance.run(experiment_options(rn_performance, tmp_path, *given))
 
 
 def test_leading_words_are_options_too():

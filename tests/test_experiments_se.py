@@ -1,6 +1,5 @@
 """The experiments with SEs: sets of SEs, feasibility, performance, single SEs."""
 
-import argparse
 import json
 import os
 import subprocess
@@ -10,6 +9,7 @@ import jax
 import numpy as np
 import pandas as pd
 import pytest
+from support import experiment_options, refuse
 
 import sejax
 from sejax import envs
@@ -31,21 +31,9 @@ TINY_RUN = ["generations=3", "es.population_size=2", "es.num_incumbent_evals=2",
 TINY_AGENT = {"hidden_size": 2, "batch_size": 4, "num_layers": 1, "init_episodes": 1}
 
 
-def options(experiment, out, *argv):
-    """What the experiment's command line would parse to."""
-    parser = argparse.ArgumentParser()
-    experiment.add_options(parser)
-    args = parser.parse_args(argv)
-    return argparse.Namespace(**vars(args), quick=True, out=out, seed=3, devices=None)
-
-
 def learned(out, *argv):
-    args = options(se_feasibility, out, "--runs", "2", *argv, "--set", *TINY_RUN)
+    args = experiment_options(se_feasibility, out, "--runs", "2", *argv, "--set", *TINY_RUN)
     return se_feasibility.run(args)
-
-
-def refuse(*_, **__):
-    raise AssertionError("computed again")
 
 
 @pytest.fixture(scope="module")
@@ -146,8 +134,8 @@ def test_feasibility_learns_as_sejax_run_does_and_goes_on_where_it_stopped(tmp_p
     table = learned(tmp_path)
     made = pd.read_csv(tmp_path / "learning_curves.csv")
     assert made.groupby("seed").size().to_dict() == {3: 3, 4: 3}
-    config = sejax.config(se_feasibility.overrides(options(se_feasibility, tmp_path, "--set",
-                                                           *TINY_RUN)))  # fmt: skip
+    args = experiment_options(se_feasibility, tmp_path, "--set", *TINY_RUN)
+    config = sejax.config(se_feasibility.overrides(args))
     result = jax.jit(sejax.make_learner(config))(jax.random.key(4))
     mine = made[made["seed"] == 4]
     np.testing.assert_allclose(mine["incumbent_mean"], result.info.incumbent_mean, rtol=1e-6)
@@ -167,7 +155,7 @@ def test_a_run_that_was_stopped_goes_on_at_its_last_generation(tmp_path):
     for out, counts in ((tmp_path / "a", (2, 5)), (tmp_path / "b", (5,))):
         for count in counts:
             (out / "pieces" / "seed3.json").unlink(missing_ok=True)
-            args = options(se_feasibility, out, "--runs", "1", "--set", *TINY_RUN)
+            args = experiment_options(se_feasibility, out, "--runs", "1", "--set", *TINY_RUN)
             args.overrides = [*args.overrides, f"generations={count}"]
             se_feasibility.run(args)
     a, b = (pd.read_csv(tmp_path / x / "learning_curves.csv") for x in "ab")
@@ -237,7 +225,7 @@ def test_single_ses_are_sorted_and_their_ranks_correlated():
 
 
 def performance(ses, out, *argv):
-    args = options(se_performance, out, "--fixed", str(ses[0]), "--agents", "ddqn",
+    args = experiment_options(se_performance, out, "--fixed", str(ses[0]), "--agents", "ddqn",
                    "--num-agents", "3", "--num-ses", "2", "--test-episodes", "2",
                    "--real-episodes", "3", *argv)  # fmt: skip
     return se_performance.run(args)
@@ -273,8 +261,10 @@ def test_performance_trains_as_evaluation_does_and_goes_on(ses, tmp_path, monkey
     with pytest.raises(ConfigError, match=r"with another training\.test_episodes"):
         performance(ses, tmp_path, "--test-episodes", "4")
 
-    args = options(se_models, tmp_path, "--ses", str(ses[0]), "--agents", "ddqn", "--num-agents",
-                   "3", "--num-ses", "2", "--test-episodes", "2")  # fmt: skip
+    args = experiment_options(
+        se_models, tmp_path, "--ses", str(ses[0]), "--agents", "ddqn", "--num-agents", "3",
+        "--num-ses", "2", "--test-episodes", "2",
+    )  # fmt: skip
     single = se_models.run(args)  # finds what se_performance has trained
     assert set(single["SE"]) == {0, 1} and set(single["run's seed"]) == {7, 8}
     assert (tmp_path / "models.png").stat().st_size > 10_000
@@ -293,7 +283,7 @@ def test_agents_of_equal_number_draw_equal_hyperparameters_in_all_settings(
 
 
 def test_ses_learned_otherwise_than_the_option_says_are_refused(ses, tmp_path):
-    args = options(se_performance, tmp_path, "--varied", str(ses[0]))
+    args = experiment_options(se_performance, tmp_path, "--varied", str(ses[0]))
     with pytest.raises(ConfigError, match=r"--varied must be SEs learned with varied.*--fixed="):
         se_performance.run(args)
 
@@ -305,7 +295,7 @@ def test_ses_learned_otherwise_than_the_option_says_are_refused(ses, tmp_path):
      (["--env", "acrobot"], "must be of one task")],
 )  # fmt: skip
 def test_bad_options_are_refused(argv, message, ses, tmp_path):
-    args = options(se_performance, tmp_path, "--fixed", str(ses[0]), *argv)
+    args = experiment_options(se_performance, tmp_path, "--fixed", str(ses[0]), *argv)
     with pytest.raises(ConfigError, match=message):
         se_performance.run(args)
 

@@ -1,6 +1,5 @@
 """The experiments on score transforms, on histograms of SEs and on supervised models."""
 
-import argparse
 import dataclasses
 import re
 from types import SimpleNamespace
@@ -11,7 +10,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import scipy.stats
-from support import numpy_forward
+from support import experiment_options, numpy_forward, refuse
 
 import sejax
 from sejax import envs
@@ -27,18 +26,6 @@ TINY_AGENT = {"hidden_size": 4, "num_layers": 1, "batch_size": 4, "init_episodes
 TINY_TRANSFORMS = ["--runs", "3", "--generations", "2", "--population", "2", "--slots", "2"]
 TINY_MODELS = ["--models", "3", "--generations", "2", "--population", "2", "--max-rows", "30",
                "--epochs", "2", "--num-agents", "2", "--test-episodes", "2"]  # fmt: skip
-
-
-def options(experiment, out, *argv):
-    """What the experiment's command line would parse to."""
-    parser = argparse.ArgumentParser()
-    experiment.add_options(parser)
-    args = parser.parse_args(argv)
-    return argparse.Namespace(**vars(args), quick=True, out=out, seed=3, devices=None)
-
-
-def refuse(*_, **__):
-    raise AssertionError("computed again")
 
 
 @pytest.fixture(scope="module")
@@ -146,7 +133,7 @@ def test_the_best_bin_and_the_ranks_are_those_of_the_means():
 
 
 def test_score_transforms_run_and_go_on_where_they_stopped(tmp_path, monkeypatch):
-    table = score_transforms.run(options(score_transforms, tmp_path, *TINY_TRANSFORMS))
+    table = score_transforms.run(experiment_options(score_transforms, tmp_path, *TINY_TRANSFORMS))
     assert len(table) == 16 and (tmp_path / "score_transforms.png").stat().st_size > 10_000
     runs = pd.read_csv(tmp_path / "runs.csv")
     assert len(runs) == 16 * 3 and runs["updates"].between(0, 2).all()
@@ -158,11 +145,11 @@ def test_score_transforms_run_and_go_on_where_they_stopped(tmp_path, monkeypatch
     made = []
     monkeypatch.setattr(score_transforms, "compute_cell",
                         lambda *args: made.append(args[1:]) or compute(*args))  # fmt: skip
-    again = score_transforms.run(options(score_transforms, tmp_path, *TINY_TRANSFORMS))
+    again = score_transforms.run(experiment_options(score_transforms, tmp_path, *TINY_TRANSFORMS))
     assert made == [("rank", False)] and again.equals(table)
     with pytest.raises(ConfigError, match="another generations"):
         score_transforms.run(
-            options(score_transforms, tmp_path, *TINY_TRANSFORMS, "--generations", "3")
+            experiment_options(score_transforms, tmp_path, *TINY_TRANSFORMS, "--generations", "3")
         )
 
 
@@ -242,7 +229,7 @@ def test_the_table_says_which_distribution_the_response_is_closer_to():
 def test_histograms_run_and_go_on_where_they_stopped(se_file, tmp_path, monkeypatch, small):
     argv = ["--proxy", se_file, "--agents", "ddqn", "--num-agents", "2", "--test-episodes", "2",
             "--max-rows", "50"]  # fmt: skip
-    table = se_histograms.run(options(se_histograms, tmp_path, *argv))
+    table = se_histograms.run(experiment_options(se_histograms, tmp_path, *argv))
     assert len(table) == 5 and (tmp_path / "histograms.png").stat().st_size > 10_000
     rows = pd.read_csv(tmp_path / "pieces" / "ddqn.csv")
     by_source = rows.groupby("source").size()
@@ -251,9 +238,9 @@ def test_histograms_run_and_go_on_where_they_stopped(se_file, tmp_path, monkeypa
     assert (test["reward"] == 1).all() and (test.groupby(["agent", "episode"]).size() > 5).all()
     check_responses(load_set(se_file), test, response)
     monkeypatch.setattr(se_histograms, "record", refuse)
-    assert se_histograms.run(options(se_histograms, tmp_path, *argv)).equals(table)
+    assert se_histograms.run(experiment_options(se_histograms, tmp_path, *argv)).equals(table)
     with pytest.raises(ConfigError, match="another max_rows"):
-        se_histograms.run(options(se_histograms, tmp_path, *argv[:-1], "40"))
+        se_histograms.run(experiment_options(se_histograms, tmp_path, *argv[:-1], "40"))
 
 
 def check_responses(ses, test, response):
@@ -354,7 +341,7 @@ def test_intervals_draw_models_and_the_best_ones_are_those_of_the_best_episodes(
 
 def test_the_supervised_baseline_runs_and_goes_on(se_file, tmp_path, monkeypatch, small):
     argv = ["--proxy", se_file, *TINY_MODELS]
-    table = supervised_baseline.run(options(supervised_baseline, tmp_path, *argv))
+    table = supervised_baseline.run(experiment_options(supervised_baseline, tmp_path, *argv))
     assert list(table["trained on"]) == [
         text for _ in range(2) for text in supervised_baseline.LABELS.values()
     ]  # fmt: skip
@@ -364,10 +351,10 @@ def test_the_supervised_baseline_runs_and_goes_on(se_file, tmp_path, monkeypatch
     check_models(tmp_path)
     for name in ("collect", "fit_all", "train_group"):
         monkeypatch.setattr(supervised_baseline, name, refuse)
-    again = supervised_baseline.run(options(supervised_baseline, tmp_path, *argv))
+    again = supervised_baseline.run(experiment_options(supervised_baseline, tmp_path, *argv))
     assert again.equals(table)
     with pytest.raises(ConfigError, match="another num_agents"):
-        args = options(supervised_baseline, tmp_path, *argv, "--num-agents", "3")
+        args = experiment_options(supervised_baseline, tmp_path, *argv, "--num-agents", "3")
         supervised_baseline.run(args)
 
 
@@ -413,7 +400,7 @@ def check_models(folder):
 def test_bad_input_ends_with_one_message_and_status_2(
     experiment, argv, message, tmp_path, monkeypatch, capsys
 ):
-    args = options(experiment, tmp_path, *argv)
+    args = experiment_options(experiment, tmp_path, *argv)
     monkeypatch.setattr(common, "parse_args", lambda *_: args)
     with pytest.raises(SystemExit) as ended:
         experiment.main()

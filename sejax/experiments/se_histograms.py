@@ -25,11 +25,10 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 
-from sejax.errors import unknown_name
 from sejax.experiments import common
+from sejax.experiments.se_performance import AGENTS, check_agents
 
 NAME = "se_histograms"
-AGENTS = ("ddqn", "dueling_ddqn", "td3_discrete")
 QUICK_AGENT = {"hidden_size": 16, "num_layers": 1, "batch_size": 16, "init_episodes": 1}
 SOURCES = ("train", "test", "response")
 LABELS = {"train": "SE, in training", "test": "real task, in tests",
@@ -79,9 +78,7 @@ def fill_in(args: argparse.Namespace) -> None:
     """
     if args.num_agents is None:
         args.num_agents = 3 if args.quick else 10
-    for kind in args.agents:
-        if kind not in AGENTS:
-            raise unknown_name("--agents", kind, AGENTS)
+    check_agents(args)
     common.require_counts(args, "num_agents", "test_episodes", "max_rows")
 
 

@@ -129,11 +129,20 @@ def fill_in(args: argparse.Namespace) -> None:
     for name, value in (QUICK if args.quick else defaults).items():
         if getattr(args, name, 0) is None:
             setattr(args, name, value)
+    check_agents(args)
+    common.require_counts(args, "num_agents", "num_ses", "test_episodes", "max_steps",
+                          "real_episodes")  # fmt: skip
+
+
+def check_agents(args: argparse.Namespace) -> None:
+    """Checks `--agents`, which the experiments with SEs share.
+
+    Raises:
+      ConfigError: for an agent that is not one of `AGENTS`.
+    """
     for kind in args.agents:
         if kind not in AGENTS:
             raise unknown_name("--agents", kind, AGENTS)
-    common.require_counts(args, "num_agents", "num_ses", "test_episodes", "max_steps",
-                          "real_episodes")  # fmt: skip
 
 
 def run(args: argparse.Namespace) -> pd.DataFrame:

@@ -30,11 +30,11 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from sejax.errors import require, unknown_name
+from sejax.errors import require
 from sejax.experiments import common
+from sejax.experiments.se_performance import AGENTS, check_agents, return_columns
 
 NAME = "supervised_baseline"
-AGENTS = ("ddqn", "dueling_ddqn", "td3_discrete")
 HPARAMS = ("varied", "default")
 LEARNING_RATE, BATCH_SIZE = 1e-4, 1024  # paper and reference_details.md 7.5
 BEST = 2  # models in the paper's second figure
@@ -88,9 +88,7 @@ def fill_in(args: argparse.Namespace) -> None:
             setattr(args, name, values[args.quick])
     common.require_counts(args, *DEFAULTS, "test_episodes", "max_steps")
     common.require_counts(args, "population", least=2)
-    for kind in args.agents:
-        if kind not in AGENTS:
-            raise unknown_name("--agents", kind, AGENTS)
+    check_agents(args)
 
 
 def run(args: argparse.Namespace) -> pd.DataFrame:
@@ -516,11 +514,6 @@ def with_best(agents: pd.DataFrame, quality_of_models: list[float]) -> pd.DataFr
     best = np.argsort(quality_of_models)[-BEST:]
     chosen = agents[(agents["world"] == "authors") & agents["group"].isin(best)]
     return pd.concat([agents, chosen.assign(world="authors_best")], ignore_index=True)
-
-
-def return_columns(agents: pd.DataFrame) -> list[str]:
-    """Names of the columns that hold the return of one test episode."""
-    return [name for name in agents if name.startswith("return_")]
 
 
 def summarise(agents: pd.DataFrame, solved_reward: float) -> pd.DataFrame:
