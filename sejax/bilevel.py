@@ -144,7 +144,7 @@ def make_learner(config: LearnConfig) -> Callable[[Array], LearnResult]:
 
 def make_program(config: LearnConfig) -> Program:
     """Assembles the bilevel loop for `[seed]` independent runs. See `Program`."""
-    task = envs.make(config.env.name)
+    task = config.env.make()
     env = make_proxy(task, config.proxy)
     flat, unravel = ravel_pytree(env.init_weights(jax.random.key(0)))
     strategy = make_strategy(config.es, flat.size)

@@ -31,7 +31,7 @@ CONF_DIR = Path(__file__).parent / "conf" / "run"
 DONE_MODES = ("soft", "threshold")
 RN_VARIANTS = (
     "additive_potential", "exclusive_potential", "additive_non_potential",
-    "exclusive_non_potential",
+    "exclusive_non_potential", "additive_weighted_info", "exclusive_weighted_info",
 )  # fmt: skip
 STOP_RULES = ("plateau", "solved", "never")
 SOLVED_BY = ("test", "train")
@@ -84,9 +84,15 @@ class EnvConfig:
     """Which real task; its limits are the paper's and live in `sejax.envs`."""
 
     name: str = "cartpole"
+    backend: str | None = None  # physics of a brax task
 
     def __post_init__(self) -> None:
         one_of("env.name", self.name, envs.names())
+        envs.check_backend(self.name, self.backend)
+
+    def make(self) -> envs.Task:
+        """The task; it is built once."""
+        return envs.make(self.name, self.backend)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -124,11 +130,28 @@ class RewardConfig(ProxyConfig):
     name: str = "rn"
     activation: str = "prelu"
     variant: str = "additive_potential"
+    augmented: bool = False  # the network sees the task's observation vector v as well
     zero_at_terminal: bool = False  # Phi is 0 where the episode terminates: policy invariance
 
     def __post_init__(self) -> None:
         super().__post_init__()
         one_of("proxy.variant", self.variant, RN_VARIANTS)
+        for name in ("augmented", "zero_at_terminal"):
+            require(not (self.weighs_info and getattr(self, name)), f"proxy.{name}",
+                    "be false with weighted info", f"{self.variant} has no network",
+                    "true", f"proxy.{name}=false")  # fmt: skip
+
+    @property
+    def weighs_info(self) -> bool:
+        return self.variant.endswith("weighted_info")
+
+    @property
+    def is_additive(self) -> bool:
+        return self.variant.startswith("additive")
+
+    @property
+    def is_potential_based(self) -> bool:
+        return self.variant in ("additive_potential", "exclusive_potential")
 
 
 PROXY_CONFIGS: dict[str, type[ProxyConfig]] = {"se": SyntheticConfig, "rn": RewardConfig}
@@ -267,6 +290,7 @@ class LearnConfig:
 
     def __post_init__(self) -> None:
         require_fit(self.agent, self.exploration, self.env.name)
+        self._require_info()
         self._require_tests_for_auc()
         require(not self.stop_when_solved or self.objective.name == "max_reward",
                 "stop_when_solved", "be false with this objective", "its scores are not returns, "
@@ -281,6 +305,15 @@ class LearnConfig:
         for name in ("lanes", "devices"):
             if getattr(self, name) is not None:
                 at_least(1, name, getattr(self, name), "something must compute", "null")
+
+    def _require_info(self) -> None:
+        proxy = self.proxy
+        if isinstance(proxy, RewardConfig) and not envs.kind(self.env.name).has_info:
+            because = f"a step of {self.env.name} tells nothing beyond its observation"
+            require(not proxy.weighs_info, "proxy.variant", "be one with a potential", because,
+                    proxy.variant, "proxy.variant=additive_potential")  # fmt: skip
+            require(not proxy.augmented, "proxy.augmented", "be false", because, "true",
+                    "proxy.augmented=false")  # fmt: skip
 
     def _require_tests_for_auc(self) -> None:
         rule = f"{self.training.stop_rule} by {self.training.solved_by} returns"

@@ -43,7 +43,8 @@ def evaluate(config: EvaluateConfig) -> float:
 
     task, worlds, agent_config, out_dir = _prepare(config)
     tables = {
-        name: _train_and_test(config, agent_config, task, *world) for name, world in worlds.items()
+        name: _train_and_test(config, agent_config, task, name, *world)
+        for name, world in worlds.items()
     }
     table = pd.concat([t.assign(world=name) for name, t in tables.items()])
     out_dir.mkdir(parents=True, exist_ok=True)
@@ -111,8 +112,9 @@ def _as_learned(proxy: Any, agent: Any) -> Any:
 
 
 def _train_and_test(
-    config: EvaluateConfig, agent_config: Any, task: Any, env: Any, env_params: Any, training: Any
-) -> Any:
+    config: EvaluateConfig, agent_config: Any, task: Any, world: str, env: Any, env_params: Any,
+    training: Any,
+) -> Any:  # fmt: skip
     import jax
     import pandas as pd
 
@@ -130,7 +132,7 @@ def _train_and_test(
     )
     outcome = jax.device_get(outcome)
     drawn = jax.vmap(lambda key: agents.draw(drawing_key(key)))(keys) if varied else {}
-    print(f"{env.name}: {config.num_agents} agents in {time.time() - started:.1f} s", flush=True)
+    print(f"{world}: {config.num_agents} agents in {time.time() - started:.1f} s", flush=True)
     columns = {"agent": range(config.num_agents), **vars(outcome), **jax.device_get(drawn)}
     return pd.DataFrame(columns)
 

@@ -1,4 +1,4 @@
-"""The experiment on what agents reach with reward networks."""
+"""The experiments on reward networks: what agents reach with them, and what they have learned."""
 
 import numpy as np
 import pandas as pd
@@ -6,29 +6,153 @@ import pytest
 from support import experiment_options, refuse
 
 from sejax.errors import ConfigError
-from sejax.experiments import common, proxy_runs, rn_performance
+from sejax.experiments import (
+    common,
+    proxy_runs,
+    rn_curves,
+    rn_heatmap,
+    rn_objectives,
+    rn_performance,
+    rn_studies,
+    timings,
+)
 from sejax.experiments.proxy_sets import load_set
 
-TINY = ["--variants", "additive_potential", "--rns", "2", "--num-agents", "2", "--generations", "1",
-        "--max-steps", "150", "--rows", "default"]  # fmt: skip
+LEARN = ["--variants", "additive_potential", "exclusive_non_potential", "--learned", "3",
+         "--generations", "1", "--set", "training.max_episodes=5"]  # fmt: skip
+TRAIN = ["--rns", "2", "--num-agents", "2", "--max-steps", "150", "--rows", "default"]
 
 
-def test_rns_are_learned_stored_and_used_once(tmp_path, monkeypatch):
-    monkeypatch.setattr(rn_performance, "QUICK_POPULATION", 2)
-    args = experiment_options(rn_performance, tmp_path, *TINY)
+@pytest.fixture(scope="module")
+def rns_dir(tmp_path_factory):
+    """Reward networks that all experiments here use."""
+    return tmp_path_factory.mktemp("rns")
+
+
+@pytest.fixture
+def options(rns_dir, tmp_path, monkeypatch):
+    """`options(module, *given)`: the options of an experiment that uses those."""
+    monkeypatch.setattr(rn_studies, "QUICK_POPULATION", 2)
+    rest = [*LEARN, "--rns-dir", str(rns_dir)]
+    return lambda module, *given: experiment_options(module, tmp_path, *rest, *given)
+
+
+def test_rns_are_learned_stored_and_used_once(options, rns_dir, tmp_path, monkeypatch):
+    args = options(rn_performance, *TRAIN)
     table = rn_performance.run(args)
-    assert list(table["trained with"]) == ["real", "count_based", "additive_potential"]
+    assert list(table["trained with"]) == ["real", "count_based", *args.variants]
     assert set(table["groups, agents"]) == {"2, 4"}
     assert (tmp_path / "performance.png").stat().st_size > 10_000
-    rns = load_set(tmp_path / "rns-additive_potential.safetensors", kind="rn")
-    assert rns.size == 2 and rns.config.objective.name == "reward_threshold"
-    assert rns.fingerprint(0) != rns.fingerprint(1)
+    folder = rns_dir / "cliff_walking" / "reward_threshold"
+    rns = load_set(folder / "additive_potential.safetensors", kind="rn")
+    assert rns.size == 3 and rns.config.objective.name == "reward_threshold"
+    assert len({rns.fingerprint(i) for i in range(3)}) == 3
+    assert list(rns.seeds) == [3, 4, 5]
     with pytest.raises(ConfigError, match="proxy=se"):
-        load_set(tmp_path / "rns-additive_potential.safetensors")
+        load_set(folder / "additive_potential.safetensors")
 
-    monkeypatch.setattr(rn_performance, "train_group", refuse)
+    # The best two of three, and the worst two, by the scores of the runs' incumbents.
+    curve = pd.read_csv(folder / "curves" / "additive_potential-seeds3-5.csv")
+    np.testing.assert_allclose(rns.scores, curve["incumbent_mean"], rtol=1e-6)
+    best, worst = rns.ranked(2), rns.ranked(2, worst=True)
+    assert list(best.scores) == sorted(rns.scores)[:0:-1]
+    assert list(worst.scores) == sorted(rns.scores)[:2]
+    used = {one["weights"] for one in pieces_of(tmp_path, "default-additive_potential")}
+    assert used == {best.fingerprint(0), best.fingerprint(1)}
+
+    monkeypatch.setattr(rn_curves, "train_group", refuse)
     monkeypatch.setattr(proxy_runs, "learn_one", refuse)
     pd.testing.assert_frame_equal(rn_performance.run(args), table)
+
+
+def pieces_of(folder, prefix):
+    """Settings of the pieces of that name."""
+    return [pd.read_json(path, typ="series")
+            for path in sorted((folder / "pieces").glob(f"{prefix}-*.json"))]  # fmt: skip
+
+
+def test_several_runs_in_one_program_are_those_runs(rns_dir, options, tmp_path):
+    """Seeds that are learned together get the weights that each gets alone."""
+    args = options(rn_performance, *TRAIN)
+    rns = rn_studies.learn(args, "additive_potential", "reward_threshold")
+    (together,) = proxy_runs.configs_of_runs(rns.config, 3, tmp_path, at_once=3)
+    assert together.num_seeds == 3 and together.run_dir.endswith("seeds3-5")
+    alone = proxy_runs.configs_of_runs(rns.config, 3, tmp_path)
+    assert [config.seed for config in alone] == [3, 4, 5]
+    proxy_runs.learn_all(alone[1:2], common.Pieces(tmp_path / "curves"))
+    proxy_runs.collect(alone[1:2], tmp_path / "alone.safetensors")
+    one = load_set(tmp_path / "alone.safetensors", kind="rn")
+    assert one.seeds[0] == 4 and one.scores[0] == rns.scores[1]
+    assert one.fingerprint(0) == rns.fingerprint(1)
+
+
+def test_objectives_are_compared_with_the_best_and_the_worst(options, tmp_path):
+    args = options(rn_objectives, *TRAIN, "--objectives", "reward_threshold", "auc")
+    table = rn_objectives.run(args)
+    # For each objective and choice: the real task twice and two variants.
+    assert len(table) == 2 * 2 * 4
+    for name in ("best", "worst"):
+        assert (tmp_path / f"{name}.png").stat().st_size > 10_000
+    summary = pd.read_csv(tmp_path / "summary.csv")
+    real = summary[summary["world"] == "real"]
+    assert real["steps_to_solve"].nunique() == 1  # the same agents beside each objective
+    prefix = "reward_threshold-{}-default-additive_potential"
+    best, worst = (
+        [piece["weights"] for piece in pieces_of(tmp_path, prefix.format(pick))]
+        for pick in ("best", "worst")
+    )
+    assert best[0] != worst[0] and best[1] == worst[1]  # two of three each: the middle one twice
+
+
+def test_the_heat_map_shows_what_the_rns_pay(options, tmp_path):
+    args = options(rn_heatmap)
+    table = rn_heatmap.run(args)
+    assert list(table["variant"]) == args.variants
+    assert (tmp_path / "heatmap.png").stat().st_size > 10_000
+    summary = pd.read_csv(tmp_path / "summary.csv").set_index(["variant", "move"])
+    # 11 moves into the cliff cost 100 and only the additive RNs pay the real reward as well.
+    assert summary.loc[("additive_potential", "into the cliff"), "mean"] < -90
+    assert summary.loc[("exclusive_non_potential", "into the cliff"), "mean"] > -10
+
+    rns = rn_studies.learn(args, "exclusive_non_potential", "reward_threshold")
+    rewards = rn_heatmap.rewards_of_moves(rns)
+    assert rewards.shape == (3, 48, 4) and np.isnan(rewards[:, 37:]).all()
+    potential = [float(rns.env.potential(rns.one(1).weights, np.int32(s))) for s in (24, 0)]
+    # From the start (row 3) UP leads to state 24, and UP from state 0 stays there.
+    np.testing.assert_allclose(rewards[1, [36, 0], 3], potential, rtol=1e-5)
+
+
+def test_moves_are_those_of_the_map():
+    moves = {kind: mask.sum() for kind, mask in rn_heatmap.kinds_of_moves().items()}
+    assert moves == {
+        "into the cliff": 11, "from the start up": 1, "right along the cliff": 11,
+        "left along the cliff": 11, "down to the cliff's edge": 12, "up from the cliff's edge": 12,
+        "into the goal": 1,
+    }  # fmt: skip
+
+
+def test_ignored_rewards_do_not_stretch_the_colours():
+    rewards = np.array([[[-101.0, 1.0]], [[-99.0, 3.0]], [[-20.0, 2.0]]])  # [rn, state, action]
+    np.testing.assert_allclose(rn_heatmap.mean_rewards(rewards, ignore=False), [[0, 1]])
+    rewards = np.concatenate([rewards, [[[-60.0, 0.0]], [[-70.0, 0.0]], [[-51.0, 1.0]]]])[
+        :, :, ::-1
+    ]
+    flat = rn_heatmap.mean_rewards(np.dstack([rewards, np.full((6, 1), 41.0)]), ignore=True)
+    # Means 7/6, -20 (all others ignored) and 41, from 0 to 1.
+    np.testing.assert_allclose(flat, [[(7 / 6 + 20) / 61, 0.0, 1.0]])
+    nothing = rn_heatmap.mean_rewards(np.array([[[-60.0, 1.0, 2.0]]]), ignore=True)
+    np.testing.assert_allclose(nothing, [[np.nan, 0.0, 1.0]])
+
+
+def test_timings_are_of_the_papers_rows(tmp_path):
+    args = experiment_options(timings, tmp_path, "--rows", "cliff_walking-rn",
+                              "--generations", "1")  # fmt: skip
+    table = timings.run(args)
+    assert table["paper, 16 cores"].iloc[0] == "10 s"
+    timed = pd.read_csv(tmp_path / "summary.csv").iloc[0]
+    # Two members with two signs and two incumbents, at most 4 episodes of 50 steps each.
+    assert timed["agents"] == 6 and 0 < timed["train_steps"] <= 6 * 4 * 50
+    assert timed["seconds"] > 0 and (tmp_path / "timings.png").stat().st_size > 10_000
 
 
 def test_the_summary_is_over_agents_and_its_intervals_over_groups():
@@ -41,7 +165,7 @@ def test_the_summary_is_over_agents_and_its_intervals_over_groups():
         })
         for g in range(2) for i in range(2)
     ]  # fmt: skip
-    summary = rn_performance.summarise(pd.concat(frames), -12.0, max_steps=300)
+    summary = rn_curves.summarise(pd.concat(frames), -12.0, max_steps=300)
     (row,) = summary.itertuples()
     # Ten tests in a row: solved at episodes 14, 15, 16 and 17.
     assert row.steps_to_solve == np.mean([140, 150, 160, 170]) and row.solved == 1.0
@@ -49,23 +173,40 @@ def test_the_summary_is_over_agents_and_its_intervals_over_groups():
     assert row.last_return == -12.0
     # Returns held over the next episode's steps, on a grid that begins before the first one ends.
     assert -50 < row.return_low < row.mean_return < row.return_high < -12
-    never = rn_performance.summarise(pd.concat(frames), 0.0, max_steps=300).iloc[0]
+    never = rn_curves.summarise(pd.concat(frames), 0.0, max_steps=300).iloc[0]
     assert never["steps_to_solve"] == 300 and never["solved"] == 0.0
 
 
+def test_augmented_variants_are_named_in_pictures():
+    assert rn_studies.label("exclusive_potential+augm") == r"$\gamma\Phi(s', v') - \Phi(s, v)$"
+    assert rn_studies.label("exclusive_potential") == r"$\gamma\Phi(s') - \Phi(s)$"
+
+
 @pytest.mark.parametrize(
-    ("given", "said"),
+    ("module", "given", "said"),
     [
-        (["--env", "acrobot"], "cartpole"),
-        (["--variants", "additive"], "additive_potential"),
-        (["--rows", "varied", "transfers"], "transfer"),
-        (["--rns", "0"], "at least 1"),
-        (["--objective", "steps"], "reward_threshold"),
+        (rn_performance, ["--env", "acrobot"], "cartpole"),
+        (rn_performance, ["--variants", "additive"], "additive_potential"),
+        (
+            rn_performance,
+            ["--env", "cartpole", "--variants", "additive_potential+augm"],
+            "additive",
+        ),
+        (rn_performance, ["--rows", "varied", "transfers"], "transfer"),
+        (rn_performance, ["--rns", "0"], "at least 1"),
+        (rn_performance, ["--learned", "0"], "at least 1"),
+        (rn_performance, ["--objective", "steps"], "reward_threshold"),
+        (rn_objectives, ["--picks", "top"], "worst"),
+        (rn_objectives, ["--objectives", "max"], "max_reward"),
+        (rn_heatmap, ["--env", "cartpole"], "cliff_walking"),
+        (rn_heatmap, ["--objective", "steps"], "reward_threshold"),
+        (timings, ["--rows", "pendulum-rn"], "halfcheetah-rn"),
+        (timings, ["--generations", "0"], "at least 1"),
     ],
 )
-def test_what_cannot_work_is_refused(tmp_path, given, said):
+def test_what_cannot_work_is_refused(tmp_path, module, given, said):
     with pytest.raises(ConfigError, match=said):
-        rn_performance.run(experiment_options(rn_performance, tmp_path, *given))
+        module.run(experiment_options(module, tmp_path, *given))
 
 
 def test_leading_words_are_options_too():

@@ -1,5 +1,7 @@
 """sejax.proxies.reward: the four rewards, what they leave unchanged, and RNs as proxies."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -12,10 +14,10 @@ from sejax.agents.configs import QLearningConfig
 from sejax.agents.registry import make_agent
 from sejax.agents.trainer import make_trainer
 from sejax.bilevel import make_learner
-from sejax.configs import RN_VARIANTS, ExplorationConfig, RewardConfig, TrainingConfig
+from sejax.configs import ExplorationConfig, RewardConfig, TrainingConfig
 from sejax.errors import ConfigError
 from sejax.evaluation import return_area
-from sejax.proxies.reward import make_reward
+from sejax.proxies.reward import RewardEnv, make_reward
 from sejax.proxies.synthetic import ABSURD
 
 GAMMA = 0.9
@@ -59,7 +61,7 @@ def trajectory(env, weights, actions, seed=0):
 # --- the rewards ---------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("variant", RN_VARIANTS)
+@pytest.mark.parametrize("variant", list(VARIANTS))
 @pytest.mark.parametrize("task", ["cartpole", "cliff_walking"])
 def test_rewards_are_those_of_the_table(task, variant):
     env = make_env(task, variant)
@@ -94,11 +96,17 @@ def test_everything_but_the_reward_is_the_real_tasks():
 
 
 def test_the_exclusive_ones_ignore_the_real_reward():
-    for variant in ("exclusive_potential", "exclusive_non_potential"):
-        env = make_env("cliff_walking", variant)
-        params = env.params(env.init_weights(jax.random.key(0)), GAMMA)
-        shaped = [float(env.shape(params, jnp.int32(36), jnp.int32(24), r, False)) for r in (0, -1)]
-        assert shaped[0] == shaped[1]
+    task = envs.make("cliff_walking")
+    costly = dataclasses.replace(task, params=task.params.replace(step_reward=-7.0))
+    for variant in VARIANTS:
+        config = RewardConfig(variant=variant, hidden_size=5)
+        rewards = []
+        for its_task in (task, costly):
+            env = RewardEnv(its_task, config)
+            (row,) = trajectory(env, env.init_weights(jax.random.key(0)), [3])
+            rewards.append(row[2])
+        difference = 6.0 if variant.startswith("additive") else 0.0
+        np.testing.assert_allclose(rewards[0] - rewards[1], difference, atol=1e-5)
 
 
 def test_potentials_telescope_along_any_trajectory():

@@ -4,11 +4,15 @@ gymnax is imported only when a task is made: it costs seconds, and `names()` mus
 """
 
 import functools
+import io
+import warnings
 from collections.abc import Callable
+from contextlib import redirect_stdout
 from dataclasses import dataclass
 from typing import Any
 
-from sejax.errors import unknown_name
+from sejax.envs.kinds import KINDS, PHYSICS_BACKENDS, check_backend, kind
+from sejax.errors import ConfigError
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -20,12 +24,17 @@ class Task:
       env: gymnax `Environment`; one instance for each name, so that `jit` caches hold.
       params: its `EnvParams`, with the paper's step limit in `max_steps_in_episode`.
       solved_reward: mean return per episode at which the task counts as solved.
+      info_keys: entries of a step's `info` that say more of the state than the observation, each
+        `[]`; what reward networks can weigh.
+      augmented_keys: those that describe the state alone, as input for reward networks.
     """
 
     name: str
     env: Any
     params: Any
     solved_reward: float
+    info_keys: tuple[str, ...] = ()
+    augmented_keys: tuple[str, ...] = ()
 
     @property
     def max_steps(self) -> int:
@@ -116,6 +125,25 @@ def _pendulum() -> Task:
     return Task(name="pendulum", env=Pendulum(), params=params, solved_reward=-250.0)
 
 
+def _halfcheetah(backend: str) -> Task:
+    try:
+        # On import brax tells at length of other physics, and that its envs are not maintained.
+        with warnings.catch_warnings(action="ignore"), redirect_stdout(io.StringIO()):
+            from sejax.envs.halfcheetah import INFO_KEYS, CheetahParams, HalfCheetah
+
+            env = HalfCheetah(backend)
+    except ImportError as error:
+        raise ConfigError(
+            "env=halfcheetah needs brax, because its physics are brax's; it is not installed "
+            f"({error}). Install it with pip install 'sejax[brax]'."
+        ) from error
+
+    return Task(
+        name="halfcheetah", env=env, params=CheetahParams(), solved_reward=3000.0,
+        info_keys=INFO_KEYS, augmented_keys=("x_position", "x_velocity"),
+    )  # fmt: skip
+
+
 _TASKS: dict[str, Callable[[], Task]] = {
     "cartpole": _cartpole,
     "acrobot": _acrobot,
@@ -123,23 +151,37 @@ _TASKS: dict[str, Callable[[], Task]] = {
     "gridworld_2x2": _gridworld_2x2,
     "mountain_car_continuous": _mountain_car_continuous,
     "pendulum": _pendulum,
+    **{
+        f"halfcheetah-{backend}": functools.partial(_halfcheetah, backend)
+        for backend in PHYSICS_BACKENDS
+    },
 }
 
 
 def names() -> tuple[str, ...]:
     """Names that `make` takes."""
-    return tuple(_TASKS)
+    return tuple(KINDS)
 
 
-@functools.cache
-def make(name: str) -> Task:
+def make(name: str, backend: str | None = None) -> Task:
     """Builds a task once and returns the same object ever after.
 
+    Args:
+      name: one of `names()`.
+      backend: physics of a brax task, one of `PHYSICS_BACKENDS`; None is the first.
+
     Raises:
-      ConfigError: if the name is unknown; the message lists the known ones, nearest first.
+      ConfigError: if a name is unknown; the message lists the known ones, nearest first. Also if
+        the task has no choice of physics, or needs a package that is not installed.
 
     Source: paper, appendix, fixed hyperparameters (episode length and solved reward).
     """
-    if name not in _TASKS:
-        raise unknown_name("env", name, names())
-    return _TASKS[name]()
+    check_backend(name, backend)
+    if kind(name).has_physics:
+        return _make(f"{name}-{backend or PHYSICS_BACKENDS[0]}")
+    return _make(name)
+
+
+@functools.cache
+def _make(key: str) -> Task:
+    return _TASKS[key]()

@@ -1,7 +1,7 @@
-"""Learning many proxies, one NES run after the other, each saved as it goes.
+"""Learning many proxies, one NES run after the other or several at once, saved as they go.
 
-Each run is that of `python -m sejax.run` with the same settings and seed, in a run directory of its
-own; a run that was stopped goes on, and a finished one is kept.
+Each run is that of `python -m sejax.run` with the same settings and seeds, in a run directory of
+its own; a run that was stopped goes on, and a finished one is kept.
 """
 
 import dataclasses
@@ -17,12 +17,23 @@ import pandas as pd
 from sejax.experiments import common
 
 
-def configs_of_runs(config: Any, seed: int, count: int, folder: Path) -> list[Any]:
-    """Configurations of runs with seeds `seed`, `seed + 1`, ... in folders of their own."""
-    return [
-        dataclasses.replace(config, seed=seed + i, run_dir=str(folder / f"seed{seed + i}"))
-        for i in range(count)
-    ]
+def configs_of_runs(config: Any, count: int, folder: Path, at_once: int = 1) -> list[Any]:
+    """Configurations of runs with `count` seeds from `config.seed` on, in folders of their own.
+
+    Args:
+      config: of all.
+      count: seeds in all.
+      folder: where the runs' folders go.
+      at_once: seeds that one program learns.
+    """
+    configs = []
+    for seed in range(config.seed, config.seed + count, at_once):
+        num_seeds = min(at_once, config.seed + count - seed)
+        name = f"seed{seed}" if num_seeds == 1 else f"seeds{seed}-{seed + num_seeds - 1}"
+        configs.append(dataclasses.replace(
+            config, seed=seed, num_seeds=num_seeds, run_dir=str(folder / name)
+        ))  # fmt: skip
+    return configs
 
 
 def learn_all(configs: list[Any], pieces: common.Pieces, prefix: str = "") -> pd.DataFrame:
@@ -30,7 +41,7 @@ def learn_all(configs: list[Any], pieces: common.Pieces, prefix: str = "") -> pd
 
     Args:
       configs: from `configs_of_runs`; a run that is finished is not made again.
-      pieces: where the curves are kept, as `<prefix>seed<N>`.
+      pieces: where the curves are kept, as `<prefix>` and the name of the run's folder.
       prefix: for runs of different settings in one folder.
     """
     from sejax.bilevel import make_program
@@ -39,16 +50,17 @@ def learn_all(configs: list[Any], pieces: common.Pieces, prefix: str = "") -> pd
     step = make_step(program)
     curves = []
     for config in configs:
-        name = f"{prefix}seed{config.seed}"
+        name = prefix + Path(config.run_dir).name
         curve = pieces.compute(
             name, piece_settings(config), functools.partial(learn_one, config, program, step)
         )
+        best = curve.groupby("seed")["best_so_far"].max().mean()
         when = ""
-        if program.solved_score is not None:
+        if program.solved_score is not None and config.num_seeds == 1:
             solved = generations_to_solve(curve, program.solved_score)
             when = f"solved in generation {solved:.0f}" if np.isfinite(solved) else "not solved"
             when = f", {when} of {len(curve)}"
-        print(f"{name}: best {curve['best_so_far'].max():.1f}{when}", flush=True)
+        print(f"{name}: best {best:.1f}{when}", flush=True)
         curves.append(curve)
     return pd.concat(curves, ignore_index=True)
 
@@ -63,7 +75,7 @@ def piece_settings(config: Any) -> dict[str, Any]:
 
 
 def make_step(program: Any) -> Callable[[Any], Any]:
-    """Builds `step(state) -> (state, info)`: a generation, compiled at the first call, only once.
+    """Builds `step(state) -> (state, info)`: a generation, compiled once for a number of seeds.
 
     Left to `jax.jit` it would be compiled anew for the state's every placement on the devices: new,
     restored, or as the generation before returned it.
@@ -71,18 +83,18 @@ def make_step(program: Any) -> Callable[[Any], Any]:
     import jax
 
     @functools.cache
-    def compiled() -> Any:
-        state = jax.eval_shape(program.init, jax.random.key(0)[None])
+    def compiled(num_seeds: int) -> Any:
+        state = jax.eval_shape(program.init, jax.random.split(jax.random.key(0), num_seeds))
         return jax.jit(program.generation, donate_argnums=0).lower(state).compile()
 
-    return lambda state: compiled()(state)
+    return lambda state: compiled(state.generation.shape[0])(state)
 
 
 def learn_one(config: Any, program: Any, step: Callable[..., Any]) -> pd.DataFrame:
     """One run of Algorithm 1, saved after each generation; goes on where it was stopped.
 
     Args:
-      config: with the run's seed and folder.
+      config: with the run's seeds and folder.
       program: from `bilevel.make_program`.
       step: from `make_step`; it uses up the state's buffers.
 
@@ -95,7 +107,8 @@ def learn_one(config: Any, program: Any, step: Callable[..., Any]) -> pd.DataFra
     from sejax.run_directory import RunDirectory
 
     directory = RunDirectory.open(config)
-    state = jax.jit(program.init)(jax.random.key(config.seed)[None])
+    seeds = config.seed + jax.numpy.arange(config.num_seeds)
+    state = jax.jit(program.init)(jax.vmap(jax.random.key)(seeds))
     state, generation, _ = checkpoints.restore_newest(directory.checkpoints, state)
     directory.drop_rows_from(generation)
     state = jax.tree.map(lambda x: x.copy(), state)  # own buffers, so that they can be donated
@@ -111,18 +124,24 @@ def learn_one(config: Any, program: Any, step: Callable[..., Any]) -> pd.DataFra
 
 
 def collect(configs: list[Any], path: Path) -> None:
-    """Writes the best SE of each run into one file."""
+    """Writes the best proxy of each seed into one file."""
     from sejax.experiments.proxy_sets import save_set
     from sejax.proxies import io as proxy_io
 
-    best = [proxy_io.load_proxy(config.run_dir) for config in configs]
+    files = []
+    for config in configs:
+        folder = Path(config.run_dir)
+        seeds = range(config.seed, config.seed + config.num_seeds)
+        several = [folder / "proxies" / f"seed{seed}.safetensors" for seed in seeds]
+        files += several if config.num_seeds > 1 else [folder]
+    best = [proxy_io.load_proxy(file) for file in files]
     save_set(
         path,
         configs[0],
         [proxy.params.weights for proxy in best],
         [proxy.metadata["score"] for proxy in best],
         [proxy.metadata["generation"] for proxy in best],
-        [config.seed for config in configs],
+        [proxy.metadata["seed"] for proxy in best],
     )
 
 

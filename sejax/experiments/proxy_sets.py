@@ -76,12 +76,22 @@ class ProxySet:
 
     def first(self, count: int | None) -> "ProxySet":
         """The first ones of the set: those of the first runs, whatever their score."""
+        return self.select(range(self.size)[:count])
+
+    def ranked(self, count: int, worst: bool = False) -> "ProxySet":
+        """Those with the highest scores, the best first; or the lowest, the worst first."""
+        order = np.argsort(self.scores, kind="stable")
+        return self.select((order if worst else order[::-1])[:count])
+
+    def select(self, indices: Sequence[int] | np.ndarray) -> "ProxySet":
+        """Those at these places, in this order."""
+        places = np.asarray(indices, int)
         return dataclasses.replace(
             self,
-            weights=jax.tree.map(lambda x: x[:count], self.weights),
-            scores=self.scores[:count],
-            generations=self.generations[:count],
-            seeds=self.seeds[:count],
+            weights=jax.tree.map(lambda x: x[places], self.weights),
+            scores=self.scores[places],
+            generations=self.generations[places],
+            seeds=self.seeds[places],
         )
 
 
@@ -165,7 +175,7 @@ def _proxy_of(config: LearnConfig, option: str, kind: str) -> ProxyEnv:
     require(config.proxy.name == kind, option, f"hold proxies learned with proxy={kind}",
             "these are what is studied", f"proxy={config.proxy.name}",
             f"{option} to a file of those")  # fmt: skip
-    return make_proxy(envs.make(config.env.name), config.proxy)
+    return make_proxy(config.env.make(), config.proxy)
 
 
 def _set_of_one(source: str | Path, option: str, kind: str) -> ProxySet:

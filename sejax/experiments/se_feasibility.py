@@ -57,7 +57,6 @@ def run(args: argparse.Namespace) -> pd.DataFrame:
       ConfigError: for settings that cannot work, or an output folder of other settings.
     """
     import sejax
-    from sejax import envs
     from sejax.errors import require
 
     config = sejax.config(overrides(args))
@@ -65,11 +64,11 @@ def run(args: argparse.Namespace) -> pd.DataFrame:
     if count is None:
         count = QUICK_RUNS if args.quick else NUM_RUNS.get(config.env.name, 5)
     require(count >= 1, "--runs", "be at least 1", "it counts runs", count, "--runs=5")
-    config = dataclasses.replace(config, devices=args.devices)
-    configs = proxy_runs.configs_of_runs(config, args.seed, count, args.out / "runs")
+    config = dataclasses.replace(config, devices=args.devices, seed=args.seed)
+    configs = proxy_runs.configs_of_runs(config, count, args.out / "runs")
     curves = proxy_runs.learn_all(configs, common.Pieces(args.out / "pieces"))
     proxy_runs.collect(configs, args.out / "ses.safetensors")
-    return report(args, config, curves, envs.make(config.env.name).solved_reward)
+    return report(args, config, curves, config.env.make().solved_reward)
 
 
 def overrides(args: argparse.Namespace) -> list[str]:

@@ -183,10 +183,9 @@ def make_proxy(config: Any, seed: int) -> tuple[Any, Callable[[Any], Any], Any]:
     import jax
     from jax.flatten_util import ravel_pytree
 
-    from sejax import envs
     from sejax.proxies.registry import make_proxy
 
-    env = make_proxy(envs.make(config.env.name), config.proxy)
+    env = make_proxy(config.env.make(), config.proxy)
     mean, unravel = ravel_pytree(env.init_weights(jax.random.key(seed)))
     return env, unravel, mean
 

@@ -95,7 +95,7 @@ def load_proxy(source: str | Path) -> Proxy:
     require(metadata["format_version"] == FORMAT_VERSION, "proxy",
             f"be of format {FORMAT_VERSION}", "this version of sejax reads no other",
             metadata["format_version"], "proxy to a file of this version")  # fmt: skip
-    env = make_proxy(envs.make(config.env.name), config.proxy)
+    env = make_proxy(config.env.make(), config.proxy)
     weights = unflatten_dict({tuple(name.split("/")): x for name, x in tensors.items()})
     _check_shapes(path, env, weights)
     return Proxy(

@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 
 from sejax import envs
 from sejax.configs import RewardConfig
-from sejax.networks import MLP
+from sejax.networks import MLP, uniform_fan_in
 from sejax.proxies.synthetic import ABSURD
 
 
@@ -24,12 +24,13 @@ from sejax.proxies.synthetic import ABSURD
 class RewardState(environment.EnvState):
     world: Any  # the real task's state
     obs: Array  # what the agent saw last
+    augmentation: Float[Array, " keys"]  # v of that state; zeros before the first step
     time: Array | int
 
 
 @struct.dataclass
 class RewardParams(environment.EnvParams):
-    weights: Any = None  # {"potential": variables of an MLP}
+    weights: Any = None  # as from `init_weights`
     discount: Array | float = 1.0  # gamma; a trainer puts that of the agent here
     max_steps_in_episode: int = 1
 
@@ -40,18 +41,25 @@ class RewardEnv(environment.Environment[RewardState, RewardParams]):
     Dynamics, termination and observations are the real task's. With r the real reward, the agent
     gets
 
-    ========================= =====================================
-    `variant`                 reward
-    ========================= =====================================
-    `additive_potential`      :math:`r + \gamma \Phi(s') - \Phi(s)`
-    `exclusive_potential`     :math:`\gamma \Phi(s') - \Phi(s)`
-    `additive_non_potential`  :math:`r + \Phi(s')`
-    `exclusive_non_potential` :math:`\Phi(s')`
-    ========================= =====================================
+    ========================== =====================================
+    `variant`                  reward
+    ========================== =====================================
+    `additive_potential`       :math:`r + \gamma \Phi(s') - \Phi(s)`
+    `exclusive_potential`      :math:`\gamma \Phi(s') - \Phi(s)`
+    `additive_non_potential`   :math:`r + \Phi(s')`
+    `exclusive_non_potential`  :math:`\Phi(s')`
+    `additive_weighted_info`   :math:`r + w^\top i'`
+    `exclusive_weighted_info`  :math:`w^\top i'`
+    ========================== =====================================
 
     where gamma is the agent's discount. A discrete state is one-hot to the network. With
     `zero_at_terminal` :math:`\Phi` is 0 where the episode terminates, which is what leaves the
     optimal policy as it is (Ng et al., 1999); the authors' code keeps the network's value.
+
+    `augmented` networks see the task's observation vector v as well (`Task.augmented_keys`):
+    :math:`\Phi(s, v)` and :math:`\Phi(s', v')`. The authors' code has v' in both. The last two
+    variants, baselines of the authors' code, weigh the numbers i' in the step's `info`
+    (`Task.info_keys`) and have no network.
 
     `info["real_reward"]` is r. A reward that is not finite, or absurd, is 0 and ends the episode;
     `info["nonfinite"]` says whether it was not even a number.
@@ -62,11 +70,16 @@ class RewardEnv(environment.Environment[RewardState, RewardParams]):
         self.task = task
         self.config = config
         self._default_params: RewardParams | None = None
+        self._augmented_keys = task.augmented_keys if config.augmented else ()
         self._net = MLP(1, config.hidden_size, config.num_layers, config.activation)
 
     def init_weights(self, key: Array) -> Any:
-        """Random weights of the network, `{"potential"}`."""
-        return {"potential": self._net.init(key, jnp.zeros(self.task.obs_dim))["params"]}
+        """Random weights: `{"potential"}` of the network, or `{"info_weights": [info_keys]}`."""
+        if self.config.weighs_info:
+            num_keys = len(self.task.info_keys)
+            return {"info_weights": uniform_fan_in(num_keys)(key, (num_keys,))}
+        num_inputs = self.task.obs_dim + len(self._augmented_keys)
+        return {"potential": self._net.init(key, jnp.zeros(num_inputs))["params"]}
 
     def params(self, weights: Any, discount: Array | float = 1.0) -> RewardParams:
         """`EnvParams` of the RN with these weights and the real task's step limit."""
@@ -85,27 +98,42 @@ class RewardEnv(environment.Environment[RewardState, RewardParams]):
         env._default_params = params
         return env
 
-    def potential(self, weights: Any, obs: Array) -> Float[Array, ""]:
-        """The network's output for an observation of the task."""
+    def potential(
+        self, weights: Any, obs: Array, augmentation: Array | tuple[()] = ()
+    ) -> Float[Array, ""]:
+        """The network's output for an observation of the task, and v of it if augmented."""
         if self.task.num_states is not None:
             obs = jax.nn.one_hot(obs, self.task.num_states)
-        return self._net.apply({"params": weights["potential"]}, obs)[0]
+        inputs = jnp.concatenate([obs, jnp.asarray(augmentation, jnp.float32)])
+        return self._net.apply({"params": weights["potential"]}, inputs)[0]
 
-    def shape(
-        self, params: RewardParams, obs: Array, next_obs: Array, reward: Any, terminated: Any
-    ) -> Float[Array, ""]:
-        """What the agent gets for a transition with real reward `reward`."""
-        after = self.potential(params.weights, next_obs)
+    def bonus(
+        self, params: RewardParams, state: RewardState, next_state: RewardState, info: Any,
+        terminated: Any,
+    ) -> Float[Array, ""]:  # fmt: skip
+        """What a transition is worth beside the real reward.
+
+        Args:
+          params: weights and discount.
+          state: of the RN before the step.
+          next_state: of the RN after it.
+          info: of the real task's step.
+          terminated: whether the task ended by it.
+        """
+        if self.config.weighs_info:
+            return params.weights["info_weights"] @ _select(info, self.task.info_keys)
+        after = self.potential(params.weights, next_state.obs, next_state.augmentation)
         if self.config.zero_at_terminal:
             after = jnp.where(terminated, 0.0, after)
-        bonus = after
-        if not self.config.variant.endswith("non_potential"):
-            bonus = params.discount * after - self.potential(params.weights, obs)
-        return reward + bonus if self.config.variant.startswith("additive") else bonus
+        if not self.config.is_potential_based:
+            return after
+        before = self.potential(params.weights, state.obs, state.augmentation)
+        return params.discount * after - before
 
     def reset_env(self, key: Array, params: RewardParams) -> tuple[Array, RewardState]:
         obs, world = self.task.env.reset_env(key, self.task.params)
-        return obs, RewardState(world=world, obs=obs, time=jnp.int32(0))
+        nothing = jnp.zeros(len(self._augmented_keys))
+        return obs, RewardState(world=world, obs=obs, augmentation=nothing, time=jnp.int32(0))
 
     def step_env(
         self, key: Array, state: RewardState, action: Any, params: RewardParams
@@ -113,15 +141,22 @@ class RewardEnv(environment.Environment[RewardState, RewardParams]):
         obs, world, real_reward, terminated, info = self.task.env.step_env(
             key, state.world, action, self.task.params
         )
-        reward = self.shape(params, state.obs, obs, real_reward, terminated)
+        next_state = RewardState(
+            world=world,
+            obs=obs,
+            augmentation=_select(info, self._augmented_keys),
+            time=state.time + 1,
+        )
+        reward = self.bonus(params, state, next_state, info, terminated)
+        if self.config.is_additive:
+            reward = real_reward + reward
         sane = jnp.abs(reward) < ABSURD  # False for nan
         info = {
             **info,
             "real_reward": jnp.float32(real_reward),
             "nonfinite": ~jnp.isfinite(reward),
         }
-        state = RewardState(world=world, obs=obs, time=state.time + 1)
-        return obs, state, jnp.where(sane, reward, 0.0), terminated | ~sane, info
+        return obs, next_state, jnp.where(sane, reward, 0.0), terminated | ~sane, info
 
     def get_obs(self, state: RewardState, params: Any = None, key: Any = None) -> Array:
         return state.obs
@@ -139,6 +174,11 @@ class RewardEnv(environment.Environment[RewardState, RewardParams]):
 
     def observation_space(self, params: RewardParams | None = None) -> Any:
         return self.task.env.observation_space(self.task.params)
+
+
+def _select(info: Any, keys: tuple[str, ...]) -> Float[Array, " keys"]:
+    """The numbers under these keys."""
+    return jnp.array([info[key] for key in keys], jnp.float32)
 
 
 @functools.cache

@@ -1,0 +1,209 @@
+"""The rewards that RNs have learned for each move on the Cliff Walking map, as a picture of it.
+
+Source: paper, appendix "Qualitative Study of Reward Networks on the Cliff Walking Task" (figure
+"Learned Cliff Walking reward for different reward network types"); `reference_details.md` 7.7.
+
+Differs: moves out of the goal and the cliff, which end an episode and which no agent ever makes,
+are left out.
+"""
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from sejax.configs import OBJECTIVES
+from sejax.errors import require
+from sejax.experiments import common, rn_studies
+
+NAME = "rn_heatmap"
+IGNORED_BELOW = -50.0  # the right column leaves out rewards of at most this
+# Corners of the triangle of each action in a cell whose middle is (0, 0), y downwards: the middle
+# and two corners of the cell. Actions as in `sejax.envs.gridworld`: RIGHT, LEFT, DOWN, UP.
+_CORNERS = {0: ((0.5, -0.5), (0.5, 0.5)), 1: ((-0.5, -0.5), (-0.5, 0.5)),
+            2: ((-0.5, 0.5), (0.5, 0.5)), 3: ((-0.5, -0.5), (0.5, -0.5))}  # fmt: skip
+
+
+def main() -> None:
+    """Runs the experiment as the command line says."""
+    common.run_command(NAME, __doc__, add_options, run)
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Options of this experiment."""
+    rn_studies.add_options(parser)
+    parser.add_argument("--objective", default="reward_threshold", help=", ".join(OBJECTIVES))
+
+
+def run(args: argparse.Namespace) -> pd.DataFrame:
+    """Learns what is missing, writes everything and returns the table.
+
+    Raises:
+      ConfigError: for settings that cannot work, or a task that is no map.
+    """
+    require(args.env == "cliff_walking", "--env", "be cliff_walking", "the picture is its map",
+            args.env, "--env=cliff_walking")  # fmt: skip
+    rn_studies.fill_in(args)
+    require(args.objective in OBJECTIVES, "--objective", f"be one of {', '.join(OBJECTIVES)}",
+            "RNs are learned by it", args.objective, "--objective=reward_threshold")  # fmt: skip
+    rewards = {
+        variant: rewards_of_moves(rn_studies.learn(args, variant, args.objective))
+        for variant in args.variants
+    }
+    return report(args, rewards)
+
+
+def rewards_of_moves(rns: Any) -> np.ndarray:
+    """What each RN pays for each move, `[rn, state, action]`; nan out of terminal states."""
+    import jax
+    import jax.numpy as jnp
+
+    env, task = rns.env, rns.task
+    grid = task.env
+
+    def reward(weights: Any, index: Any, action: Any) -> Any:
+        params = env.params(weights, rns.config.agent.discount)
+        _, state = env.reset_env(None, params)
+        state = state.replace(world=state.world.replace(index=index), obs=index)
+        _, _, reward, _, _ = env.step_env(None, state, action, params)
+        terminal = grid.is_terminated(state.world, task.params)
+        return jnp.where(terminal, jnp.nan, reward)
+
+    over_actions = jax.vmap(reward, (None, None, 0))
+    over_states = jax.vmap(over_actions, (None, 0, None))
+    over_rns = jax.vmap(over_states, (0, None, None))
+    states, actions = jnp.arange(task.num_states), jnp.arange(grid.num_actions)
+    return np.asarray(jax.jit(over_rns)(rns.weights, states, actions))
+
+
+def kinds_of_moves() -> dict[str, np.ndarray]:
+    """The moves that the paper speaks of, as masks `[state, action]`."""
+    rows, columns = 4, 12
+    row, column = np.divmod(np.arange(rows * columns), columns)
+    right, left, down, up = range(4)
+    start, goal = (row == 3) & (column == 0), (column == 11) & (row == 2)
+    above_cliff = (row == 2) & (column > 0) & (column < 11)
+
+    def moves(states: np.ndarray, action: int) -> np.ndarray:
+        return states[:, None] & (np.arange(4) == action)
+
+    return {
+        "into the cliff": moves(above_cliff, down) | moves(start, right),
+        "from the start up": moves(start, up),
+        "right along the cliff": moves((row == 2) & (column < 11), right),
+        "left along the cliff": moves((row == 2) & (column > 0), left),
+        "down to the cliff's edge": moves(row == 1, down),
+        "up from the cliff's edge": moves(row == 2, up),
+        "into the goal": moves(goal, down),
+    }
+
+
+def mean_rewards(rewards: np.ndarray, ignore: bool) -> np.ndarray:
+    """Mean over RNs, `[state, action]`, in [0, 1] from the lowest to the highest; nan where none.
+
+    Args:
+      rewards: `[rn, state, action]`.
+      ignore: leave out rewards of at most `IGNORED_BELOW`.
+    """
+    kept = np.where(rewards <= IGNORED_BELOW, np.nan, rewards) if ignore else rewards
+    count = np.isfinite(kept).sum(axis=0)
+    mean = np.where(count > 0, np.nansum(kept, axis=0) / np.maximum(count, 1), np.nan)
+    low, high = np.nanmin(mean), np.nanmax(mean)
+    return (mean - low) / max(high - low, 1e-9)
+
+
+def summarise(rewards: dict[str, np.ndarray]) -> pd.DataFrame:
+    """Mean and std over RNs of the mean reward of each kind of move."""
+    out = []
+    for variant, mine in rewards.items():
+        for kind, mask in kinds_of_moves().items():
+            of_rns = mine[:, mask].mean(axis=1)
+            out.append({"variant": variant, "move": kind, "rns": len(mine),
+                        "mean": of_rns.mean(), "std": of_rns.std()})  # fmt: skip
+    return pd.DataFrame(out)
+
+
+def report(args: argparse.Namespace, rewards: dict[str, np.ndarray]) -> pd.DataFrame:
+    """Writes the CSV, the picture and the table, prints the table and returns it."""
+    from sejax.experiments import figures
+    from sejax.files import write_text
+
+    summary = summarise(rewards)
+    write_text(args.out / "summary.csv", summary.to_csv(index=False, float_format="%.6g"))
+    draw(rewards, args.out / "heatmap.png")
+    texts = summary.assign(text=[f"{row.mean:.1f} ± {row.std:.1f}" for row in summary.itertuples()])
+    table = texts.pivot(index="variant", columns="move", values="text")
+    table = table.loc[list(rewards), list(kinds_of_moves())].reset_index()
+    title = "Rewards that RNs have learned for the moves on Cliff Walking"
+    note = (
+        f"Mean and standard deviation over {args.learned} RNs of each variant, learned by "
+        f"{args.objective}. The edge is the row above the cliff. The paper describes its picture: "
+        "the additive potential RNs pay little for entering the cliff and for going up from the "
+        "edge, and much for going down to it; the additive non-potential ones pay for the shortest "
+        "path; the exclusive non-potential ones only help around the start and the goal; the "
+        "exclusive potential ones look random."
+    )
+    command = figures.command(NAME, args, "env", "variants", "objective", "learned", "generations",
+                              "preset", "set")  # fmt: skip
+    common.write_markdown(args.out / "table.md", title, command, table, note)
+    figures.print_table(title, table)
+    print(f"{args.out}: summary.csv, heatmap.png and table.md; the RNs are in {args.rns_dir}.")
+    return table
+
+
+def draw(rewards: dict[str, np.ndarray], path: Path) -> None:
+    """Draws a map for each variant, with all rewards and without the lowest."""
+    import matplotlib.pyplot as plt
+
+    from sejax.experiments import figures
+
+    titles = ("all rewards", f"rewards ≤ {IGNORED_BELOW:g} left out")
+    with plt.rc_context(figures.STYLE):
+        figure, axes = plt.subplots(
+            len(rewards), 2, figsize=(11, 0.7 + 2.05 * len(rewards)), squeeze=False,
+            layout="constrained",
+        )  # fmt: skip
+        for line, (variant, mine) in zip(axes, rewards.items(), strict=True):
+            for axis, title, ignore in zip(line, titles, (False, True), strict=True):
+                shown = draw_map(axis, mean_rewards(mine, ignore))
+                axis.set_title(f"{rn_studies.label(variant)}: {title}", fontsize=10)
+        bar = figure.colorbar(shown, ax=axes, shrink=0.5, pad=0.02)
+        bar.set_label("mean reward, from the lowest to the highest")
+        figures.write(figure, path)
+
+
+def draw_map(axis: Any, values: np.ndarray) -> Any:
+    """Draws the map with a triangle for each move, coloured by `values [state, action]`."""
+    from matplotlib.collections import PolyCollection
+
+    from sejax.envs.gridworld import CLIFF_WALKING
+
+    triangles, colors = [], []
+    for row, cells in enumerate(CLIFF_WALKING):
+        for column, cell in enumerate(cells):
+            state = row * len(cells) + column
+            middle = np.array([column, row])
+            for action, corners in _CORNERS.items():
+                if cell not in "GO" and np.isfinite(values[state, action]):
+                    triangles.append([middle, *(middle + corner for corner in corners)])
+                    colors.append(values[state, action])
+            if cell in "GO":
+                color = "#d9d9d9" if cell == "O" else "#ffffff"
+                axis.fill(*(middle[:, None] + [[-0.5, 0.5, 0.5, -0.5], [-0.5, -0.5, 0.5, 0.5]]),
+                          color=color, lw=0)  # fmt: skip
+            if cell != " ":
+                axis.text(*middle, {"O": "cliff"}.get(cell, cell), ha="center", va="center",
+                          fontsize=6 if cell == "O" else 10, weight="bold")  # fmt: skip
+    shown = axis.add_collection(
+        PolyCollection(triangles, array=colors, cmap="RdYlGn", edgecolors="#555555", lw=0.25,
+                       clim=(0, 1))
+    )  # fmt: skip
+    axis.set(xlim=(-0.5, 11.5), ylim=(3.5, -0.5), aspect="equal", xticks=[], yticks=[])
+    axis.spines[:].set_visible(True)
+    return shown
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,206 @@
+"""What the paper studies about reward networks, task by task, and the sets of RNs it needs.
+
+RNs are learned once and shared by all experiments: those of a task, variant and objective are one
+file, `<rns>/<env>/<objective>/<variant>.safetensors`, and the curves of their NES runs lie beside
+it. Runs that were interrupted go on.
+"""
+
+import argparse
+import dataclasses
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from sejax.agents.configs import (
+    AgentConfig,
+    CountBasedConfig,
+    DDQNConfig,
+    DuelingDDQNConfig,
+    ExplorationConfig,
+    ICMConfig,
+    PPOConfig,
+    QLearningConfig,
+    SARSAConfig,
+    TD3Config,
+)
+from sejax.errors import unknown_name
+from sejax.experiments import common, proxy_runs
+
+# Paper, table "Overview of Reward Network variants".
+VARIANTS = (
+    "additive_potential", "exclusive_potential", "additive_non_potential",
+    "exclusive_non_potential",
+)  # fmt: skip
+AUGMENTED = "+augm"  # of a variant's name: the network sees the task's observation vector as well
+WEIGHTED_INFO = ("additive_weighted_info", "exclusive_weighted_info")
+QUICK = {"learned": 2, "generations": 4}
+QUICK_POPULATION = 8
+
+
+@dataclass(frozen=True, kw_only=True)
+class Study:
+    """What the paper trains on the RNs of a task.
+
+    Attributes:
+      agent: of the rows with default and varied hyperparameters.
+      transfer_agent: of the row with an unseen agent.
+      bonuses: exploration bonuses that are compared on the real task.
+      variants: of the RNs.
+      max_episodes: that the paper trains.
+      max_steps: training steps that its figure shows.
+      learned: RNs of each variant that are learned.
+      runs_at_once: of them in one program; a run is saved after each generation of all.
+      rns: number of them, the best ones, that agents are trained on.
+      num_agents: on each of these.
+    """
+
+    agent: AgentConfig
+    transfer_agent: AgentConfig
+    bonuses: dict[str, ExplorationConfig]
+    variants: tuple[str, ...] = VARIANTS
+    max_episodes: int
+    max_steps: int
+    learned: int = 10
+    runs_at_once: int = 1
+    rns: int = 10
+    num_agents: int = 10
+
+
+# Paper, appendix "Reward Network Hyperparameters": the tables of default hyperparameters.
+_CARTPOLE: dict[str, Any] = {
+    "init_episodes": 1, "batch_size": 32, "learning_rate": 2.5e-4, "target_update_rate": 0.01,
+    "epsilon_min": 0.1, "hidden_size": 64, "num_layers": 1, "buffer_size": 1_000_000,
+}  # fmt: skip
+STUDIES = {
+    "cliff_walking": Study(
+        agent=QLearningConfig(), transfer_agent=SARSAConfig(),
+        bonuses={"count_based": CountBasedConfig()},
+        max_episodes=500, max_steps=5000, learned=50, runs_at_once=50,
+    ),
+    "cartpole": Study(
+        agent=DDQNConfig(**_CARTPOLE), transfer_agent=DuelingDDQNConfig(**_CARTPOLE),
+        bonuses={"icm": ICMConfig()},
+        max_episodes=1000, max_steps=50_000,
+    ),
+    "mountain_car_continuous": Study(
+        agent=TD3Config(init_episodes=50, action_repeat=2),
+        transfer_agent=PPOConfig(action_repeat=5),
+        bonuses={"icm": ICMConfig(forward_weight=0.1, reward_scale=0.01, learning_rate=5e-4)},
+        max_episodes=3000, max_steps=250_000,
+    ),
+    "halfcheetah": Study(
+        agent=TD3Config(),
+        transfer_agent=PPOConfig(
+            hidden_size=128, activation="tanh", learning_rate=1e-5, update_episodes=1, epochs=10,
+            entropy_weight=0.001, init_action_std=0.1,
+        ),
+        bonuses={"icm": ICMConfig(forward_weight=0.001, reward_scale=0.1, learning_rate=1e-5)},
+        variants=(*VARIANTS, *(v + AUGMENTED for v in VARIANTS), *WEIGHTED_INFO),
+        max_episodes=1000, max_steps=500_000, learned=5, rns=5, num_agents=5,
+    ),
+}  # fmt: skip
+LABELS = {
+    "real": "real reward",
+    "icm": "real reward + ICM",
+    "count_based": "real reward + count-based",
+    "additive_potential": r"$r + \gamma\Phi(s') - \Phi(s)$",
+    "exclusive_potential": r"$\gamma\Phi(s') - \Phi(s)$",
+    "additive_non_potential": r"$r + \Phi(s')$",
+    "exclusive_non_potential": r"$\Phi(s')$",
+    "additive_weighted_info": r"$r + w^\top i'$",
+    "exclusive_weighted_info": r"$w^\top i'$",
+}
+
+
+def label(name: str) -> str:
+    """Name of a world in pictures: the reward that agents get there."""
+    plain = LABELS[name.removesuffix(AUGMENTED)]
+    return (
+        plain.replace("(s')", "(s', v')").replace("(s)", "(s, v)") if AUGMENTED in name else plain
+    )
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Options about the task and the RNs that are learned."""
+    parser.add_argument("--env", default="cliff_walking", help=f"task: {', '.join(STUDIES)}")
+    parser.add_argument("--variants", nargs="+", metavar="VARIANT",
+                        help=f"{', '.join(VARIANTS)}, these with {AUGMENTED}, "
+                             f"{', '.join(WEIGHTED_INFO)}; all of the paper's")  # fmt: skip
+    parser.add_argument("--learned", type=int, help="RNs to learn of each variant; 50, 10 or 5")
+    parser.add_argument("--generations", type=int, help="outer iterations; the preset's")
+    parser.add_argument("--preset", default="best", help="of the NES runs: best, paper")
+    parser.add_argument("--set", nargs="+", default=[], metavar="KEY=VALUE",
+                        help="overrides of the NES runs, as in sejax.run")  # fmt: skip
+    parser.add_argument("--rns-dir", type=Path,
+                        help="where RNs are kept; results/reward_networks")  # fmt: skip
+
+
+def fill_in(args: argparse.Namespace) -> Study:
+    """Sets those options that were not given, checks all of them, and returns the task's study.
+
+    Raises:
+      ConfigError: for an unknown name or a number out of range.
+    """
+    if args.env not in STUDIES:
+        raise unknown_name("--env", args.env, STUDIES)
+    study = STUDIES[args.env]
+    if args.variants is None:
+        args.variants = list(study.variants)
+    for name in args.variants:
+        if name not in study.variants:
+            raise unknown_name("--variants", name, study.variants)
+    common.require_counts(args, "learned", "generations")
+    for name in ("learned", "generations"):
+        if getattr(args, name) is None:
+            setattr(args, name, QUICK[name] if args.quick else getattr(study, name, None))
+    if args.rns_dir is None:
+        args.rns_dir = args.out / "rns" if args.quick else Path("results/reward_networks")
+    return study
+
+
+def learn(args: argparse.Namespace, variant: str, objective: str) -> Any:
+    """The RNs of a variant, learned by an objective, in the order of their seeds.
+
+    Args:
+      args: with the options of `add_options`, filled in.
+      variant: one of the study's.
+      objective: one of `configs.OBJECTIVES`.
+
+    Returns:
+      A `ProxySet` of `args.learned` RNs.
+
+    Raises:
+      ConfigError: for settings that cannot work, or a folder with RNs of other settings.
+    """
+    import sejax
+    from sejax.experiments.proxy_sets import load_set
+
+    plain = variant.removesuffix(AUGMENTED)
+    overrides = [f"env={args.env}", "proxy=rn", f"preset={args.preset}", f"proxy.variant={plain}",
+                 f"proxy.augmented={str(plain != variant).lower()}",
+                 f"objective={objective}"]  # fmt: skip
+    if args.generations is not None:
+        overrides.append(f"generations={args.generations}")
+    if args.quick:
+        overrides.append(f"es.population_size={QUICK_POPULATION}")
+    config = dataclasses.replace(
+        sejax.config([*overrides, *args.set]), devices=args.devices, seed=args.seed
+    )
+    folder = args.rns_dir / args.env / objective
+    path = folder / f"{variant}.safetensors"
+    if path.exists():
+        stored = load_set(path, "--rns-dir", "rn")
+        if is_of(stored, config, args.learned):
+            return stored.first(args.learned)
+    at_once = STUDIES[args.env].runs_at_once
+    configs = proxy_runs.configs_of_runs(config, args.learned, folder / "runs" / variant, at_once)
+    proxy_runs.learn_all(configs, common.Pieces(folder / "curves"), f"{variant}-")
+    proxy_runs.collect(configs, path)
+    return load_set(path, "--rns-dir", "rn")
+
+
+def is_of(stored: Any, config: Any, count: int) -> bool:
+    """Whether a set holds at least `count` proxies learned as the configuration says."""
+    settings, wanted = map(proxy_runs.piece_settings, (stored.config, config))
+    same = {**settings, "num_seeds": 1} == {**wanted, "num_seeds": 1}
+    return same and stored.size >= count
