@@ -1,0 +1,46 @@
+"""Reward networks learned end to end: every task, variant and objective, and what they are for."""
+
+import jax
+import numpy as np
+import pytest
+
+import sejax
+from sejax.bilevel import make_learner
+from sejax.configs import OBJECTIVES, RN_VARIANTS
+from sejax.envs import kind
+
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore:Brax System:UserWarning"),
+]
+TASKS = ("cliff_walking", "cartpole", "mountain_car_continuous", "halfcheetah")
+# Trainings of seconds, in which something is learned nevertheless.
+SHORT = ["generations=2", "es.population_size=4", "es.num_incumbent_evals=2",
+         "training.max_episodes=3"]  # fmt: skip
+
+
+@pytest.mark.parametrize("objective", OBJECTIVES)
+@pytest.mark.parametrize("variant", RN_VARIANTS)
+@pytest.mark.parametrize("task", TASKS)
+def test_every_task_variant_and_objective_learns(task, variant, objective):
+    if variant.endswith("info") and not kind(task).has_info:
+        pytest.skip("refused: the task tells nothing beyond its observation")
+    overrides = [f"env={task}", "proxy=rn", f"proxy.variant={variant}", f"objective={objective}"]
+    if task != "cliff_walking":
+        overrides += ["agent.init_episodes=1", "training.max_steps=1200"]
+    config = sejax.config([*overrides, *SHORT])
+    result = jax.jit(make_learner(config))(jax.random.key(0))
+    info = jax.device_get(result.info)
+    assert np.isfinite(info.incumbent_mean).all() and not info.num_nonfinite.any()
+    assert (info.train_steps_mean > 0).all()
+    if objective == "reward_threshold":
+        assert (info.incumbent_mean < 0).all()  # steps are a cost
+
+
+def test_cliff_walking_rns_teach_faster_than_the_real_reward():
+    """Ten generations already find a reward with which Q-learning needs fewer steps."""
+    config = sejax.config(["env=cliff_walking", "proxy=rn", "generations=10",
+                           "proxy.variant=additive_non_potential"])  # fmt: skip
+    info = jax.device_get(jax.jit(make_learner(config))(jax.random.key(0)).info)
+    # Scores are minus the steps to solve, where all agents solve the task.
+    assert info.best_so_far[-1] > 0.8 * info.incumbent_mean[0]
