@@ -35,6 +35,8 @@ class RunDirectory:
     path: Path
     config: LearnConfig
     rows: list[dict[str, Any]] = field(default_factory=list)
+    # Generation of the best proxy of each seed that this process has written: few are new.
+    _stored: dict[int, int] = field(default_factory=dict)
 
     @classmethod
     def open(cls, config: LearnConfig) -> "RunDirectory":
@@ -102,10 +104,13 @@ class RunDirectory:
             state.incumbent_score, state.generation - 1, last,
         )  # fmt: skip
         for seed in range(self.config.num_seeds) if self.config.num_seeds > 1 else ():
-            self._save(
-                self.path / "proxies" / f"seed{self.config.seed + seed}.safetensors", program,
-                state.best, state.best_score, state.best_generation, seed,
-            )  # fmt: skip
+            path = self.path / "proxies" / f"seed{self.config.seed + seed}.safetensors"
+            generation = int(state.best_generation[seed])
+            if self._stored.get(seed) != generation:
+                self._stored[seed] = generation
+                self._save(
+                    path, program, state.best, state.best_score, state.best_generation, seed
+                )  # fmt: skip
 
     def write_summary(self, **values: Any) -> None:
         """Writes `run.json`."""

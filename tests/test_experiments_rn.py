@@ -117,7 +117,7 @@ def test_the_heat_map_shows_what_the_rns_pay(options, tmp_path):
     rns = rn_studies.learn(args, "exclusive_non_potential", "reward_threshold")
     rewards = rn_heatmap.rewards_of_moves(rns)
     assert rewards.shape == (3, 48, 4) and np.isnan(rewards[:, 37:]).all()
-    potential = [float(rns.env.potential(rns.one(1).weights, np.int32(s))) for s in (24, 0)]
+    potential = [float(rns.env.potential(rns.one(1), np.int32(s))) for s in (24, 0)]
     # From the start (row 3) UP leads to state 24, and UP from state 0 stays there.
     np.testing.assert_allclose(rewards[1, [36, 0], 3], potential, rtol=1e-5)
 

@@ -31,6 +31,7 @@ class RewardState(environment.EnvState):
 @struct.dataclass
 class RewardParams(environment.EnvParams):
     weights: Any = None  # as from `init_weights`
+    potentials: Array | None = None  # of every state, where states are counted
     discount: Array | float = 1.0  # gamma; a trainer puts that of the agent here
     max_steps_in_episode: int = 1
 
@@ -82,10 +83,19 @@ class RewardEnv(environment.Environment[RewardState, RewardParams]):
         return {"potential": self._net.init(key, jnp.zeros(num_inputs))["params"]}
 
     def params(self, weights: Any, discount: Array | float = 1.0) -> RewardParams:
-        """`EnvParams` of the RN with these weights and the real task's step limit."""
+        """`EnvParams` of the RN with these weights and the real task's step limit.
+
+        Where states are counted, all potentials are computed here, once for a training, and a step
+        looks its two up.
+        """
+        potentials = None
+        if self.task.num_states is not None and "potential" in weights:
+            one_hot = jnp.eye(self.task.num_states)
+            potentials = self._net.apply({"params": weights["potential"]}, one_hot)[0]
         return RewardParams(
-            weights=weights, discount=discount, max_steps_in_episode=self.task.max_steps
-        )
+            weights=weights, potentials=potentials, discount=discount,
+            max_steps_in_episode=self.task.max_steps,
+        )  # fmt: skip
 
     @property
     def default_params(self) -> RewardParams:
@@ -99,13 +109,13 @@ class RewardEnv(environment.Environment[RewardState, RewardParams]):
         return env
 
     def potential(
-        self, weights: Any, obs: Array, augmentation: Array | tuple[()] = ()
+        self, params: RewardParams, obs: Array, augmentation: Array | tuple[()] = ()
     ) -> Float[Array, ""]:
         """The network's output for an observation of the task, and v of it if augmented."""
-        if self.task.num_states is not None:
-            obs = jax.nn.one_hot(obs, self.task.num_states)
+        if params.potentials is not None:
+            return params.potentials[obs]
         inputs = jnp.concatenate([obs, jnp.asarray(augmentation, jnp.float32)])
-        return self._net.apply({"params": weights["potential"]}, inputs)[0]
+        return self._net.apply({"params": params.weights["potential"]}, inputs)[0]
 
     def bonus(
         self, params: RewardParams, state: RewardState, next_state: RewardState, info: Any,
@@ -122,12 +132,12 @@ class RewardEnv(environment.Environment[RewardState, RewardParams]):
         """
         if self.config.weighs_info:
             return params.weights["info_weights"] @ _select(info, self.task.info_keys)
-        after = self.potential(params.weights, next_state.obs, next_state.augmentation)
+        after = self.potential(params, next_state.obs, next_state.augmentation)
         if self.config.zero_at_terminal:
             after = jnp.where(terminated, 0.0, after)
         if not self.config.is_potential_based:
             return after
-        before = self.potential(params.weights, state.obs, state.augmentation)
+        before = self.potential(params, state.obs, state.augmentation)
         return params.discount * after - before
 
     def reset_env(self, key: Array, params: RewardParams) -> tuple[Array, RewardState]:
