@@ -248,8 +248,8 @@ def make_population_scorer(
     """Builds `score(seed_ids [n], keys [seed], candidates [seed, n, dims], active [seed])`.
 
     It trains one fresh agent on each candidate, tests it on the real task, and returns an
-    `Outcome` with leaves `[seed, n]`. The trainings are spread over the devices; on each device
-    groups of `config.lanes` of them follow one another.
+    `Outcome` with leaves `[seed, n, ...]`. The trainings are spread over the devices; on each
+    device groups of `config.lanes` of them follow one another.
     """
     make = make_varied_agents if config.agent_hparams == "varied" else make_agent
     agent = make(config.agent, task, config.exploration)
@@ -270,7 +270,7 @@ def make_population_scorer(
             candidates.reshape(-1, num_dims),
             jnp.repeat(active, num_candidates),
         )
-        return jax.tree.map(lambda x: x.reshape(num_seeds, num_candidates), outcome)
+        return jax.tree.map(lambda x: x.reshape(num_seeds, num_candidates, *x.shape[1:]), outcome)
 
     return score
 

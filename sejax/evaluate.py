@@ -118,9 +118,9 @@ def _train_and_test(
     import jax
     import pandas as pd
 
-    from sejax.agents.hparams import make_varied_agents
+    from sejax.agents.hparams import drawing_key, make_varied_agents
     from sejax.agents.registry import make_agent
-    from sejax.evaluation import drawing_key, evaluate_agents
+    from sejax.evaluation import evaluate_agents
 
     varied = config.agent_hparams == "varied"
     make = make_varied_agents if varied else make_agent
@@ -133,7 +133,9 @@ def _train_and_test(
     outcome = jax.device_get(outcome)
     drawn = jax.vmap(lambda key: agents.draw(drawing_key(key)))(keys) if varied else {}
     print(f"{world}: {config.num_agents} agents in {time.time() - started:.1f} s", flush=True)
-    columns = {"agent": range(config.num_agents), **vars(outcome), **jax.device_get(drawn)}
+    columns = {"agent": range(config.num_agents), "test_return": outcome.test_return,
+               **vars(outcome), **jax.device_get(drawn)}  # fmt: skip
+    del columns["test_returns"]
     return pd.DataFrame(columns)
 
 

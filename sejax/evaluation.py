@@ -51,14 +51,13 @@ def make_evaluator(
         key_train, key_test = jax.random.split(key)
         result = train(key_train, env_params, hparams, active)
         returns, steps = test(key_test, result.agent_state, active)
-        test_return = returns.mean()
         real_steps = steps.sum() + result.test_steps
         return Outcome(
-            test_return=test_return,
+            test_returns=returns,
             train_steps=result.train_steps,
             train_episodes=result.episodes,
             return_area=return_area(result),
-            nonfinite=result.nonfinite | ~jnp.isfinite(test_return),
+            nonfinite=result.nonfinite | ~jnp.isfinite(returns).all(),
             real_steps=real_steps if synthetic else real_steps + result.train_steps,
         )
 
@@ -87,16 +86,10 @@ def make_varied_evaluator(
 
     Source: paper, section "Performance of SE-trained Agents" (HPs varied).
     """
-    evaluators = [
-        make_evaluator(agent, env, task, training, stop_reward) for agent in varied.agents
-    ]
-
-    def evaluate(key: Array, env_params: Any, active: Array | bool = True) -> Outcome:
-        values = varied.draw(drawing_key(key))
-        args = (key, env_params, active, varied.hparams(values))
-        return jax.lax.switch(varied.branch(values), evaluators, *args)
-
-    return evaluate
+    evaluate = varied.over_draws(
+        lambda agent: make_evaluator(agent, env, task, training, stop_reward)
+    )
+    return lambda key, env_params, active=True: evaluate(key, env_params, active)
 
 
 def evaluator_and_lanes(
@@ -111,11 +104,6 @@ def evaluator_and_lanes(
         evaluator = make_varied_evaluator(agent, env, task, training, stop_reward)
         return evaluator, agent.agents[0].cpu_lanes
     return make_evaluator(agent, env, task, training, stop_reward), agent.cpu_lanes
-
-
-def drawing_key(key: Array) -> Array:
-    """The part of a training's key that its hyperparameters are drawn from."""
-    return jax.random.fold_in(key, 0x48_50)  # training and test keys are splits of the key
 
 
 def evaluate_agents(

@@ -11,10 +11,10 @@ from sejax.configs import ObjectiveConfig
 
 @struct.dataclass
 class Outcome:
-    """What came of one agent. All leaves are `[]`, or `[agent]` for many.
+    """What came of one agent. Leaves are `[]` but for the first, and `[agent, ...]` for many.
 
     Attributes:
-      test_return: mean return over the test episodes on the real task, in reward units.
+      test_returns: return of each test episode on the real task, in reward units.
       train_steps: steps in the training world.
       train_episodes: episodes there.
       return_area: sum over those episodes of their return times their length; the returns are those
@@ -23,12 +23,17 @@ class Outcome:
       real_steps: steps on the real task: tests, and training where its dynamics are real.
     """
 
-    test_return: Float[Array, "*agent"]
+    test_returns: Float[Array, "*agent episode"]
     train_steps: Int[Array, "*agent"]
     train_episodes: Int[Array, "*agent"]
     return_area: Float[Array, "*agent"]
     nonfinite: Bool[Array, "*agent"]
     real_steps: Int[Array, "*agent"]
+
+    @property
+    def test_return(self) -> Float[Array, "*agent"]:
+        """Mean over the test episodes."""
+        return self.test_returns.mean(axis=-1)
 
 
 def make_objective(

@@ -180,7 +180,7 @@ def test_seeds_of_one_program_equal_separate_runs_and_stop_when_solved(one_devic
     # A threshold that the better seed alone reaches in its first generation.
     assert first != second
     task = dataclasses.replace(envs.make("cartpole"), solved_reward=(first + second) / 2)
-    monkeypatch.setattr(bilevel.envs, "make", lambda name: task)
+    monkeypatch.setattr(bilevel.envs, "make", lambda name, backend: task)
     program = make_program(tiny("devices=1", "num_seeds=2", "stop_when_solved=true"))
     states, infos = run(*compiled(program, KEYS), 3)
 

@@ -16,13 +16,14 @@ from sejax.agents.ddqn import make_ddqn, q_network
 from sejax.agents.hparams import (
     Range,
     draw_value,
+    drawing_key,
     hidden_sizes,
     make_varied_agents,
     ranges_of,
 )
 from sejax.agents.replay import Transition
 from sejax.configs import SyntheticConfig, TrainingConfig
-from sejax.evaluation import drawing_key, evaluate_agents
+from sejax.evaluation import evaluate_agents
 from sejax.networks import MLP, narrow
 from sejax.proxies.synthetic import make_synthetic
 

@@ -58,6 +58,26 @@ class VariedAgents:
     hparams: Callable[[dict[str, Array]], Any]
     ranges: dict[str, Range]
 
+    def over_draws(self, make_branch: Callable[[Agent], Callable[..., Any]]) -> Callable[..., Any]:
+        """Builds `run(key, *args)` for an agent whose hyperparameters are drawn first, from `key`.
+
+        Args:
+          make_branch: builds `branch(key, *args, hparams)` for an agent.
+        """
+        branches = [make_branch(agent) for agent in self.agents]
+
+        def run(key: Array, *args: Any) -> Any:
+            values = self.draw(drawing_key(key))
+            hparams = self.hparams(values)
+            return jax.lax.switch(self.branch(values), branches, key, *args, hparams)
+
+        return run
+
+
+def drawing_key(key: Array) -> Array:
+    """The part of a training's key that its hyperparameters are drawn from."""
+    return jax.random.fold_in(key, 0x48_50)  # training and test keys are splits of the key
+
 
 def ranges_of(config: AgentConfig) -> dict[str, Range]:
     """The paper's ranges around an agent's configuration.

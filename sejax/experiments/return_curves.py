@@ -47,7 +47,6 @@ def make_program(
     from sejax.agents.hparams import make_varied_agents
     from sejax.agents.registry import make_agent
     from sejax.agents.trainer import make_tester, make_trainer
-    from sejax.evaluation import drawing_key
     from sejax.parallel import spread_over_devices
 
     # A threshold that nobody reaches: tested after each episode, but never stopped.
@@ -70,12 +69,7 @@ def make_program(
 
     if agent_hparams == "varied":
         varied = make_varied_agents(config, task, exploration)
-        branches, cpu_lanes = [branch(agent) for agent in varied.agents], varied.agents[0].cpu_lanes
-
-        def one(key: Any, env_params: Any) -> Any:
-            values = varied.draw(drawing_key(key))
-            args = (key, env_params, varied.hparams(values))
-            return jax.lax.switch(varied.branch(values), branches, *args)
+        one, cpu_lanes = varied.over_draws(branch), varied.agents[0].cpu_lanes
     else:
         agent = make_agent(config, task, exploration)
         only, cpu_lanes = branch(agent), agent.cpu_lanes

@@ -296,72 +296,47 @@ def train_groups(
     tables = []
     for place in range(len(indices)):
         mine = slice(place * num_agents, (place + 1) * num_agents)
-        returns = outcome["returns"][mine].astype(float)
-        columns = {"agent": range(num_agents), "test_return": returns.mean(axis=1)}
-        for name, values in {**outcome, **drawn}.items():
-            if name != "returns":
-                kept = values[mine]
-                columns[name] = kept if kept.dtype == bool else kept.astype(float)
-        columns |= {f"return_{i}": returns[:, i] for i in range(returns.shape[1])}
-        tables.append(pd.DataFrame(columns))
+        table = to_table(jax.tree.map(lambda x, mine=mine: x[mine], outcome))
+        tables.append(table.assign(**{name: x[mine].astype(float) for name, x in drawn.items()}))
     return tables
+
+
+def to_table(outcome: Any) -> pd.DataFrame:
+    """The outcomes of some agents, a row each, with a column for each test episode's return."""
+    returns = outcome.test_returns.astype(float)
+    columns = {
+        "agent": range(len(returns)),
+        "test_return": returns.mean(axis=1),
+        "nonfinite": outcome.nonfinite,
+        "train_episodes": outcome.train_episodes.astype(float),
+        "train_steps": outcome.train_steps.astype(float),
+    }
+    return pd.DataFrame(columns | {f"return_{i}": x for i, x in enumerate(returns.T)})
 
 
 @functools.cache
 def make_program(
     config: Any, env: Any, task: Any, training: TrainingConfig, devices: int | None
 ) -> Callable[..., Any]:
-    """Builds `program(keys, env_params, active) -> (outcome, hparams)`, compiled once for all SEs.
+    """Builds `program(keys, env_params, active) -> (Outcome, hparams)`, compiled once for all SEs.
 
-    All leaves are `[agent, ...]`; the outcome's are `[agent]` or, for the returns,
-    `[agent, episode]`. Nothing is computed for an agent that is not active.
+    All leaves are `[agent, ...]`. Nothing is computed for an agent that is not active.
     """
     import jax
 
     from sejax.agents.configs import ExplorationConfig
-    from sejax.agents.hparams import make_varied_agents
-    from sejax.evaluation import drawing_key
+    from sejax.agents.hparams import drawing_key, make_varied_agents
+    from sejax.evaluation import make_varied_evaluator
     from sejax.parallel import spread_over_devices
 
     varied = make_varied_agents(config, task, ExplorationConfig())
-    branches = [make_branch(agent, env, task, training) for agent in varied.agents]
+    evaluate = make_varied_evaluator(varied, env, task, training)
 
     def train_one(key: Any, env_params: Any, active: Any) -> Any:
-        values = varied.draw(drawing_key(key))
-        args = (key, env_params, varied.hparams(values), active)
-        return jax.lax.switch(varied.branch(values), branches, *args), values
+        return evaluate(key, env_params, active), varied.draw(drawing_key(key))
 
     spread = spread_over_devices(train_one, devices, cpu_lanes=varied.agents[0].cpu_lanes)
     return jax.jit(spread)
-
-
-def make_branch(agent: Any, env: Any, task: Any, training: TrainingConfig) -> Callable[..., Any]:
-    """As `evaluation.make_evaluator`, but it returns each test episode's return."""
-    import jax
-
-    from sejax.agents.trainer import make_tester, make_trainer
-
-    test_once = make_tester(agent, task, num_episodes=1)
-    test = make_tester(agent, task, training.test_episodes)
-
-    def test_between(key: Any, agent_state: Any, active: Any) -> Any:
-        returns, steps = test_once(key, agent_state, active)
-        return returns[0], steps[0]
-
-    train = make_trainer(agent, env, training, task.solved_reward, test_fn=test_between)
-
-    def evaluate(key: Any, env_params: Any, hparams: Any, active: Any = True) -> dict[str, Any]:
-        key_train, key_test = jax.random.split(key)
-        result = train(key_train, env_params, hparams, active)
-        returns, _ = test(key_test, result.agent_state, active)
-        return {
-            "returns": returns,
-            "train_steps": result.train_steps,
-            "train_episodes": result.episodes,
-            "nonfinite": result.nonfinite,
-        }
-
-    return evaluate
 
 
 def return_columns(agents: pd.DataFrame) -> list[str]:

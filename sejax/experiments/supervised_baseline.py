@@ -32,7 +32,7 @@ import pandas as pd
 
 from sejax.errors import require
 from sejax.experiments import common
-from sejax.experiments.se_performance import AGENTS, check_agents, return_columns
+from sejax.experiments.se_performance import AGENTS, check_agents, return_columns, to_table
 
 NAME = "supervised_baseline"
 HPARAMS = ("varied", "default")
@@ -215,7 +215,7 @@ def make_recorded_evaluation(
         steps = test(key_test, result.agent_state)
         rewards = jnp.where(steps.valid, steps.reward, 0.0)
         returns = rewards.reshape(num_episodes, -1).sum(axis=1)
-        outcome = Outcome(test_return=returns.mean(), train_steps=result.train_steps,
+        outcome = Outcome(test_returns=returns, train_steps=result.train_steps,
                           train_episodes=result.episodes, return_area=return_area(result),
                           nonfinite=result.nonfinite,
                           real_steps=steps.valid.sum())  # fmt: skip
@@ -462,39 +462,29 @@ def train_group(
     program = make_program(config, world.sets.env, training, hparams, args.devices)
     key = jax.random.fold_in(jax.random.key(args.seed), group)
     outcome = jax.device_get(program(jax.random.split(key, args.num_agents), params))
-    returns = outcome.pop("returns").astype(float)
-    columns = {"agent": range(args.num_agents), "test_return": returns.mean(axis=1), **outcome}
-    columns |= {f"return_{i}": returns[:, i] for i in range(returns.shape[1])}
-    return pd.DataFrame(columns)
+    return to_table(outcome)
 
 
 @functools.cache
 def make_program(
     config: Any, env: Any, training: Any, hparams: str, devices: int | None
 ) -> Callable[..., Any]:
-    """Builds `program(keys [agent], env_params) -> outcome`, leaves `[agent, ...]`."""
+    """Builds `program(keys [agent], env_params) -> Outcome`, leaves `[agent, ...]`."""
     import jax
 
     from sejax.agents.configs import ExplorationConfig
+    from sejax.agents.hparams import make_varied_agents
     from sejax.agents.registry import make_agent
-    from sejax.experiments import se_performance
+    from sejax.evaluation import evaluator_and_lanes
     from sejax.parallel import spread_over_devices
 
-    if hparams == "varied":
-        varied = se_performance.make_program(config, env, env.task, training, devices)
-
-        def draw_and_train(keys: Any, params: Any) -> Any:
-            count = len(keys)
-            each = jax.tree.map(lambda x: np.repeat(np.asarray(x)[None], count, axis=0), params)
-            return varied(keys, each, np.ones(count, bool))[0]
-
-        return draw_and_train
-    agent = make_agent(config, env.task, ExplorationConfig())
-    evaluate = se_performance.make_branch(agent, env, env.task, training)
+    make: Any = make_varied_agents if hparams == "varied" else make_agent
+    agent = make(config, env.task, ExplorationConfig())
+    evaluate, cpu_lanes = evaluator_and_lanes(agent, env, env.task, training)
 
     def program(keys: Any, params: Any) -> Any:
-        return spread_over_devices(lambda key: evaluate(key, params, agent.hparams), devices,
-                                   cpu_lanes=agent.cpu_lanes)(keys)  # fmt: skip
+        return spread_over_devices(lambda key: evaluate(key, params), devices,
+                                   cpu_lanes=cpu_lanes)(keys)  # fmt: skip
 
     return jax.jit(program)
 
