@@ -1,6 +1,8 @@
 """Puts a learned proxy into the package, with the numbers of its evaluation in its metadata.
 
     python benchmarks/ship_proxy.py runs/cartpole-se-ddqn-s1 cartpole
+    python benchmarks/ship_proxy.py runs/cliff_walking-rn-q_learning-s0 cliff_walking-rn \\
+        agent=q_learning
 
 Runs `python -m sejax.evaluate` on it (fresh agents with the paper's default hyperparameters, and as
 many on the real task) and writes `sejax/pretrained/NAME.safetensors`.
@@ -22,6 +24,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("run", help="run directory or file of the proxy")
     parser.add_argument("name", help="what sejax.load will call it")
+    parser.add_argument("overrides", nargs="*", help="of sejax.evaluate, such as agent=q_learning")
     parser.add_argument("--agents", type=int, default=100)
     parser.add_argument("--quick", action="store_true", help="two agents; writes nothing")
     parser.add_argument("--json", type=Path, metavar="PATH", help="write the result there as well")
@@ -29,7 +32,8 @@ def main() -> None:
     num_agents = 2 if args.quick else args.agents
     with tempfile.TemporaryDirectory() as folder:
         command = [sys.executable, "-m", "sejax.evaluate", f"proxy={args.run}",
-                   f"num_agents={num_agents}", f"out_dir={folder}"]  # fmt: skip
+                   f"num_agents={num_agents}", f"out_dir={folder}",
+                   *args.overrides]  # fmt: skip
         subprocess.run(command, check=True)
         evaluation = json.loads((Path(folder) / "evaluation.json").read_text())
     proxy = io.load_proxy(args.run)

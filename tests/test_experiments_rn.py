@@ -19,7 +19,8 @@ from sejax.experiments import (
 from sejax.experiments.proxy_sets import load_set
 
 LEARN = ["--variants", "additive_potential", "exclusive_non_potential", "--learned", "3",
-         "--generations", "1", "--set", "training.max_episodes=5"]  # fmt: skip
+         "--generations", "1", "--set", "training.max_episodes=5",
+         "es.population_size=2"]  # fmt: skip
 TRAIN = ["--rns", "2", "--num-agents", "2", "--max-steps", "150", "--rows", "default"]
 
 
@@ -30,9 +31,8 @@ def rns_dir(tmp_path_factory):
 
 
 @pytest.fixture
-def options(rns_dir, tmp_path, monkeypatch):
+def options(rns_dir, tmp_path):
     """`options(module, *given)`: the options of an experiment that uses those."""
-    monkeypatch.setattr(rn_studies, "QUICK_POPULATION", 2)
     rest = [*LEARN, "--rns-dir", str(rns_dir)]
     return lambda module, *given: experiment_options(module, tmp_path, *rest, *given)
 

@@ -22,7 +22,6 @@ ROWS = {
     "varied": "varied hyperparameters",
     "transfer": "unseen agent",
 }
-QUICK = {"rns": 2, "num_agents": 4, "max_steps": 1500}
 GRID_POINTS = 200
 
 
@@ -48,8 +47,7 @@ class World:
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Options about the agents; with those of `rn_studies`."""
     rn_studies.add_options(parser)
-    parser.add_argument("--rows", nargs="+", default=list(ROWS), metavar="ROW",
-                        help=", ".join(ROWS))  # fmt: skip
+    parser.add_argument("--rows", nargs="+", metavar="ROW", help=", ".join(ROWS))
     parser.add_argument("--rns", type=int, help="RNs of each variant to use, the best; 10")
     parser.add_argument("--num-agents", type=int, help="on each RN, in each row; 10")
     parser.add_argument("--max-steps", type=int, help="training steps; as the paper's figure")
@@ -61,14 +59,12 @@ def fill_in(args: argparse.Namespace) -> None:
     Raises:
       ConfigError: for an unknown name or a number out of range.
     """
-    study = rn_studies.fill_in(args)
+    rn_studies.fill_in(args)
+    args.rows = args.rows or list(ROWS)
     for name in args.rows:
         if name not in ROWS:
             raise unknown_name("--rows", name, ROWS)
-    common.require_counts(args, *QUICK)
-    for name, quick in QUICK.items():
-        if getattr(args, name) is None:
-            setattr(args, name, quick if args.quick else getattr(study, name))
+    common.require_counts(args, "rns", "num_agents", "max_steps")
     args.rns = min(args.rns, args.learned)
 
 

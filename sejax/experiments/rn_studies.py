@@ -7,7 +7,7 @@ it. Runs that were interrupted go on.
 
 import argparse
 import dataclasses
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -33,8 +33,11 @@ VARIANTS = (
 )  # fmt: skip
 AUGMENTED = "+augm"  # of a variant's name: the network sees the task's observation vector as well
 WEIGHTED_INFO = ("additive_weighted_info", "exclusive_weighted_info")
-QUICK = {"learned": 2, "generations": 4}
-QUICK_POPULATION = 8
+# With --quick; a task's own come on top.
+QUICK: dict[str, Any] = {
+    "learned": 2, "generations": 4, "rns": 2, "num_agents": 4, "max_steps": 1500,
+    "set": ["es.population_size=8"],
+}  # fmt: skip
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,6 +55,7 @@ class Study:
       runs_at_once: of them in one program; a run is saved after each generation of all.
       rns: number of them, the best ones, that agents are trained on.
       num_agents: on each of these.
+      quick: options with --quick, where trainings of this task would take too long otherwise.
     """
 
     agent: AgentConfig
@@ -64,6 +68,7 @@ class Study:
     runs_at_once: int = 1
     rns: int = 10
     num_agents: int = 10
+    quick: dict[str, Any] = field(default_factory=dict)
 
 
 # Paper, appendix "Reward Network Hyperparameters": the tables of default hyperparameters.
@@ -81,12 +86,17 @@ STUDIES = {
         agent=DDQNConfig(**_CARTPOLE), transfer_agent=DuelingDDQNConfig(**_CARTPOLE),
         bonuses={"icm": ICMConfig()},
         max_episodes=1000, max_steps=50_000,
+        quick={"variants": ["additive_potential", "additive_non_potential"],
+               "rows": ["default", "transfer"]},
     ),
     "mountain_car_continuous": Study(
         agent=TD3Config(init_episodes=50, action_repeat=2),
         transfer_agent=PPOConfig(action_repeat=5),
         bonuses={"icm": ICMConfig(forward_weight=0.1, reward_scale=0.01, learning_rate=5e-4)},
         max_episodes=3000, max_steps=250_000,
+        quick={"variants": ["additive_potential"], "rows": ["default"], "generations": 2,
+               "set": ["es.population_size=4", "es.num_incumbent_evals=4",
+                       "training.max_episodes=4", "agent.init_episodes=1"]},
     ),
     "halfcheetah": Study(
         agent=TD3Config(),
@@ -97,6 +107,10 @@ STUDIES = {
         bonuses={"icm": ICMConfig(forward_weight=0.001, reward_scale=0.1, learning_rate=1e-5)},
         variants=(*VARIANTS, *(v + AUGMENTED for v in VARIANTS), *WEIGHTED_INFO),
         max_episodes=1000, max_steps=500_000, learned=5, rns=5, num_agents=5,
+        quick={"variants": ["additive_potential"], "rows": ["default"], "generations": 1,
+               "learned": 1, "num_agents": 2,
+               "set": ["es.population_size=2", "es.num_incumbent_evals=2",
+                       "training.max_episodes=2", "agent.init_episodes=1"]},
     ),
 }  # fmt: skip
 LABELS = {
@@ -129,14 +143,14 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--learned", type=int, help="RNs to learn of each variant; 50, 10 or 5")
     parser.add_argument("--generations", type=int, help="outer iterations; the preset's")
     parser.add_argument("--preset", default="best", help="of the NES runs: best, paper")
-    parser.add_argument("--set", nargs="+", default=[], metavar="KEY=VALUE",
+    parser.add_argument("--set", nargs="+", metavar="KEY=VALUE",
                         help="overrides of the NES runs, as in sejax.run")  # fmt: skip
     parser.add_argument("--rns-dir", type=Path,
                         help="where RNs are kept; results/reward_networks")  # fmt: skip
 
 
-def fill_in(args: argparse.Namespace) -> Study:
-    """Sets those options that were not given, checks all of them, and returns the task's study.
+def fill_in(args: argparse.Namespace) -> None:
+    """Sets the options that were not given, and checks those of `add_options`.
 
     Raises:
       ConfigError: for an unknown name or a number out of range.
@@ -144,18 +158,24 @@ def fill_in(args: argparse.Namespace) -> Study:
     if args.env not in STUDIES:
         raise unknown_name("--env", args.env, STUDIES)
     study = STUDIES[args.env]
-    if args.variants is None:
-        args.variants = list(study.variants)
+    for name, value in default_options(args).items():
+        if getattr(args, name, value) is None:
+            setattr(args, name, value)
     for name in args.variants:
         if name not in study.variants:
             raise unknown_name("--variants", name, study.variants)
     common.require_counts(args, "learned", "generations")
-    for name in ("learned", "generations"):
-        if getattr(args, name) is None:
-            setattr(args, name, QUICK[name] if args.quick else getattr(study, name, None))
     if args.rns_dir is None:
         args.rns_dir = args.out / "rns" if args.quick else Path("results/reward_networks")
-    return study
+
+
+def default_options(args: argparse.Namespace) -> dict[str, Any]:
+    """Options of this module and of those that use it, where they are not given."""
+    study = STUDIES[args.env]
+    defaults = {"variants": list(study.variants), "set": [], "learned": study.learned,
+                "rns": study.rns, "num_agents": study.num_agents,
+                "max_steps": study.max_steps}  # fmt: skip
+    return defaults | (QUICK | study.quick if args.quick else {})
 
 
 def learn(args: argparse.Namespace, variant: str, objective: str) -> Any:
@@ -181,8 +201,6 @@ def learn(args: argparse.Namespace, variant: str, objective: str) -> Any:
                  f"objective={objective}"]  # fmt: skip
     if args.generations is not None:
         overrides.append(f"generations={args.generations}")
-    if args.quick:
-        overrides.append(f"es.population_size={QUICK_POPULATION}")
     config = dataclasses.replace(
         sejax.config([*overrides, *args.set]), devices=args.devices, seed=args.seed
     )
