@@ -195,7 +195,20 @@ def test_the_discount_is_the_agents():
     ((state, action),) = np.argwhere(table != 0)
     (row,) = trajectory(env, weights, [action])
     assert state == 36
-    np.testing.assert_allclose(table[state, action], row[2], rtol=1e-6)
+    np.testing.assert_allclose(table[state, action], row[2], rtol=1e-5)
+
+
+def test_prepared_params_look_up_what_the_network_says():
+    env = make_env("cliff_walking", "exclusive_potential")
+    params = env.params(env.init_weights(jax.random.key(1)))
+    prepared = env.prepared(params, GAMMA)
+    assert params.potentials is None and prepared.potentials.shape == (48,)
+    for state in (0, 36, 47):
+        expected = phi(env, params.weights, state)
+        for one in (params, prepared):
+            np.testing.assert_allclose(env.potential(one, jnp.int32(state)), expected, rtol=1e-5)
+    assert prepared.discount == np.float32(GAMMA)
+    assert make_env("cartpole").prepared(params, GAMMA).potentials is None
 
 
 LEARN = ["env=cliff_walking", "proxy=rn", "generations=1", "es.population_size=2",

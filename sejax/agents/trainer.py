@@ -112,7 +112,7 @@ def make_trainer(
     if tests_each_episode and test_fn is None:
         raise ValueError("stop_rule='solved' with solved_by='test' needs a test_fn; got None.")
     time_limit_is_terminal = training.time_limit_is_terminal and not isinstance(env, SyntheticEnv)
-    is_shaped = isinstance(env, RewardEnv)
+    shaped = env if isinstance(env, RewardEnv) else None
     env = repeat_actions(env, agent.action_repeat)
     window = training.window
     max_steps = training.max_steps or _NO_LIMIT
@@ -226,8 +226,8 @@ def make_trainer(
     def train(
         key: Array, env_params: Any, hparams: Any = agent.hparams, active: Array | bool = True
     ) -> TrainResult:
-        if is_shaped:
-            env_params = env_params.replace(discount=jnp.float32(agent.discount(hparams)))
+        if shaped is not None:
+            env_params = shaped.prepared(env_params, agent.discount(hparams))
         key_begin, key_steps = jax.random.split(key)
         state = begin(key_begin, env_params, hparams, active)
         kept = make_memory(state).init()

@@ -31,8 +31,8 @@ class RewardState(environment.EnvState):
 @struct.dataclass
 class RewardParams(environment.EnvParams):
     weights: Any = None  # as from `init_weights`
-    potentials: Array | None = None  # of every state, where states are counted
-    discount: Array | float = 1.0  # gamma; a trainer puts that of the agent here
+    potentials: Array | None = None  # of every state, if `prepared` for one where they are counted
+    discount: Array | float = 1.0  # gamma; `prepared` puts the agent's here
     max_steps_in_episode: int = 1
 
 
@@ -83,19 +83,21 @@ class RewardEnv(environment.Environment[RewardState, RewardParams]):
         return {"potential": self._net.init(key, jnp.zeros(num_inputs))["params"]}
 
     def params(self, weights: Any, discount: Array | float = 1.0) -> RewardParams:
-        """`EnvParams` of the RN with these weights and the real task's step limit.
+        """`EnvParams` of the RN with these weights and the real task's step limit."""
+        return RewardParams(
+            weights=weights, discount=discount, max_steps_in_episode=self.task.max_steps
+        )
 
-        Where states are counted, all potentials are computed here, once for a training, and a step
-        looks its two up.
+    def prepared(self, params: RewardParams, discount: Array | float) -> RewardParams:
+        """The same for a whole training of an agent with this discount.
+
+        Where states are counted, all potentials are computed at once: a step then looks its two up.
         """
         potentials = None
-        if self.task.num_states is not None and "potential" in weights:
-            one_hot = jnp.eye(self.task.num_states)
-            potentials = self._net.apply({"params": weights["potential"]}, one_hot)[0]
-        return RewardParams(
-            weights=weights, potentials=potentials, discount=discount,
-            max_steps_in_episode=self.task.max_steps,
-        )  # fmt: skip
+        if self.task.num_states is not None and not self.config.weighs_info:
+            states = jnp.arange(self.task.num_states)
+            potentials = self._apply(params.weights, jax.nn.one_hot(states, states.size))
+        return params.replace(discount=jnp.float32(discount), potentials=potentials)
 
     @property
     def default_params(self) -> RewardParams:
@@ -114,8 +116,13 @@ class RewardEnv(environment.Environment[RewardState, RewardParams]):
         """The network's output for an observation of the task, and v of it if augmented."""
         if params.potentials is not None:
             return params.potentials[obs]
+        if self.task.num_states is not None:
+            obs = jax.nn.one_hot(obs, self.task.num_states)
         inputs = jnp.concatenate([obs, jnp.asarray(augmentation, jnp.float32)])
-        return self._net.apply({"params": params.weights["potential"]}, inputs)[0]
+        return self._apply(params.weights, inputs)
+
+    def _apply(self, weights: Any, inputs: Float[Array, "in *batch"]) -> Float[Array, "*batch"]:
+        return self._net.apply({"params": weights["potential"]}, inputs)[0]
 
     def bonus(
         self, params: RewardParams, state: RewardState, next_state: RewardState, info: Any,
