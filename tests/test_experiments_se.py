@@ -1,5 +1,6 @@
 """The experiments with SEs: sets of SEs, feasibility, performance, single SEs."""
 
+import dataclasses
 import json
 import os
 import subprocess
@@ -64,6 +65,9 @@ def test_a_set_that_is_saved_and_loaded_is_the_same(ses):
     assert len({loaded.fingerprint(i) for i in range(3)}) == 3
     assert_equal_trees(loaded.first(2).weights, jax.tree.map(lambda x: x[:2], loaded.weights))
     assert loaded.first(None).size == 3
+    some = dataclasses.replace(loaded, scores=np.array([195.0, 194.9, 200.0]))
+    assert list(some.solved().seeds) == [loaded.seeds[0], loaded.seeds[2]]
+    assert dataclasses.replace(loaded, scores=np.zeros(3)).solved().size == 3  # rather than none
 
 
 def test_all_ses_of_a_set_step_at_once(ses):
@@ -240,7 +244,8 @@ def test_performance_trains_as_evaluation_does_and_goes_on(ses, tmp_path, monkey
     table = performance(ses, tmp_path)
     agents = pd.read_csv(tmp_path / "agents.csv")
     assert agents.groupby("setting").size().to_dict() == {"real": 6, "fixed": 6}
-    mine = agents[agents["group"] == f"se-01-{load_set(ses[0]).fingerprint(1)}"]
+    stored = load_set(ses[0])
+    mine = agents[agents["group"] == f"se-{stored.seeds[1]:02d}-{stored.fingerprint(1)}"]
     loaded, task = load_set(ses[0]), envs.make("cartpole")
     key = jax.random.fold_in(jax.random.key(3), 1)
     keys = jax.numpy.stack([jax.random.fold_in(key, i) for i in range(3)])

@@ -78,6 +78,11 @@ class ProxySet:
         """The first ones of the set: those of the first runs, whatever their score."""
         return self.select(range(self.size)[:count])
 
+    def solved(self) -> "ProxySet":
+        """Those whose score, a mean return, reached the task's threshold; all if none did."""
+        reached = np.flatnonzero(self.scores >= self.task.solved_reward)
+        return self.select(reached) if reached.size else self
+
     def ranked(self, count: int, worst: bool = False) -> "ProxySet":
         """Those with the highest scores, the best first; or the lowest, the worst first."""
         order = np.argsort(self.scores, kind="stable")

@@ -6,7 +6,9 @@ the Acrobot Task"; `reference_details.md` 7.1.
 
 On each SE of a set `--num-agents` agents are trained whose hyperparameters are drawn anew for each,
 whatever the SEs were learned with; `--varied` and `--fixed` are sets from se_feasibility, learned
-with `--agent-hparams varied` and without. As many groups of agents are trained on the real task.
+with `--agent-hparams varied` and without. SEs that did not reach the task's threshold are left out,
+as in the authors' code, which stores no others. As many groups of agents are trained on the real
+task.
 """
 
 import argparse
@@ -175,8 +177,10 @@ def make_worlds(args: argparse.Namespace) -> dict[str, World]:
     files = {"varied": args.varied, "fixed": args.fixed}
     if args.quick and not any(files.values()):
         files["fixed"] = args.env or "cartpole"
-    sets = {name: load_set(file, f"--{name}").first(args.num_ses)
-            for name, file in files.items() if file}  # fmt: skip
+    sets = {name: load_set(file, f"--{name}") for name, file in files.items() if file}
+    for name, ses in sets.items():
+        sets[name] = ses.solved().first(args.num_ses)
+        print(f"{name}: {ses.solved().size} of {ses.size} SEs reached the threshold", flush=True)
     for name, ses in sets.items():
         learned_with = "varied" if ses.config.agent_hparams == "varied" else "fixed"
         require(learned_with == name, f"--{name}", f"be SEs learned with {name} hyperparameters",
@@ -223,7 +227,7 @@ def se_world(args: argparse.Namespace, ses: Any) -> World:
                                    test_episodes=args.test_episodes)  # fmt: skip
 
     # The name has the weights' hash, so that sets can share a folder: se_models then finds these.
-    names = tuple(f"se-{i:02d}-{ses.fingerprint(i)}" for i in range(ses.size))
+    names = tuple(f"se-{seed:02d}-{ses.fingerprint(i)}" for i, seed in enumerate(ses.seeds))
     proxy = {f"proxy.{name}": value for name, value in vars(ses.config.proxy).items()}
     params = tuple(ses.one(i) for i in range(ses.size))
     return World(env=ses.env, task=ses.task, params=params, names=names, training=training,
@@ -441,9 +445,9 @@ def report(args: argparse.Namespace, task: Any, agents: pd.DataFrame) -> pd.Data
         'each; in brackets a bootstrap 95% interval that draws SEs, not agents. "Fewer" are '
         "training steps saved against the real task, for which a group of agents takes the place "
         f"of an SE. The best SEs, {NUM_BEST} at most, are chosen by half of their agents and shown "
-        "by the other half. The paper has 40 SEs with 10 agents each; where a field is empty it "
-        f"gives no number. Agents that met a number that is not finite: "
-        f"{int(agents['nonfinite'].sum())}."
+        "by the other half. SEs are those of a set that reached the threshold. The paper has 40 "
+        "SEs with 10 agents each; where a field is empty it gives no number. Agents that met a "
+        f"number that is not finite: {int(agents['nonfinite'].sum())}."
     )
     command = figures.command(NAME, args, "varied", "fixed", "env", "agents", "num_agents",
                               "num_ses", "test_episodes", "solved_by", "real_episodes",
