@@ -215,7 +215,7 @@ def report(args: argparse.Namespace, timed: pd.DataFrame) -> pd.DataFrame:
             "proxy": ROWS[row.row].proxy.upper(),
             "settings": SETTINGS[row.preset],
             f"paper, {PAPER_CORES} cores": f"{ROWS[row.row].seconds:g} s",
-            f"sejax, {cores} cores": f"{row.seconds:,.1f} s ({row.how})",
+            f"sejax, {cores} cores": f"{show(row.seconds)} s ({row.how})",
             "agents": row.agents,
             "training steps": f"{row.train_steps:,.0f}",
             "CPU µs for a training step": f"{row.cpu_seconds / row.train_steps * 1e6:,.1f}",
@@ -240,6 +240,11 @@ def report(args: argparse.Namespace, timed: pd.DataFrame) -> pd.DataFrame:
     figures.print_table(title, table)
     print(f"{args.out}: summary.csv, timings.png and table.md.")
     return table
+
+
+def show(seconds: float) -> str:
+    """Two digits of a short time, whole seconds of a long one."""
+    return f"{seconds:,.0f}" if seconds >= 10 else f"{seconds:.2g}"
 
 
 def draw(timed: pd.DataFrame, args: argparse.Namespace) -> None:
