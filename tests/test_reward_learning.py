@@ -25,6 +25,8 @@ SHORT = ["generations=2", "es.population_size=4", "es.num_incumbent_evals=2",
 def test_every_task_variant_and_objective_learns(task, variant, objective):
     if variant.endswith("info") and not kind(task).has_info:
         pytest.skip("refused: the task tells nothing beyond its observation")
+    if task == "halfcheetah" and objective != OBJECTIVES[0] and variant != RN_VARIANTS[0]:
+        pytest.skip("compiling its physics takes a minute")
     overrides = [f"env={task}", "proxy=rn", f"proxy.variant={variant}", f"objective={objective}"]
     if task != "cliff_walking":
         overrides += ["agent.init_episodes=1", "training.max_steps=1200"]
