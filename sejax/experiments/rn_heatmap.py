@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from sejax.configs import OBJECTIVES
 from sejax.errors import require
 from sejax.experiments import common, rn_studies
 
@@ -34,7 +33,7 @@ def main() -> None:
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Options of this experiment."""
     rn_studies.add_options(parser)
-    parser.add_argument("--objective", default="reward_threshold", help=", ".join(OBJECTIVES))
+    rn_studies.add_objective(parser)
 
 
 def run(args: argparse.Namespace) -> pd.DataFrame:
@@ -46,8 +45,6 @@ def run(args: argparse.Namespace) -> pd.DataFrame:
     require(args.env == "cliff_walking", "--env", "be cliff_walking", "the picture is its map",
             args.env, "--env=cliff_walking")  # fmt: skip
     rn_studies.fill_in(args)
-    require(args.objective in OBJECTIVES, "--objective", f"be one of {', '.join(OBJECTIVES)}",
-            "RNs are learned by it", args.objective, "--objective=reward_threshold")  # fmt: skip
     rewards = {
         variant: rewards_of_moves(rn_studies.learn(args, variant, args.objective))
         for variant in args.variants

@@ -17,8 +17,6 @@ from pathlib import Path
 
 import pandas as pd
 
-from sejax.configs import OBJECTIVES
-from sejax.errors import require
 from sejax.experiments import common, return_curves, rn_curves, rn_studies
 
 NAME = "rn_performance"
@@ -32,7 +30,7 @@ def main() -> None:
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Options of this experiment."""
     rn_curves.add_options(parser)
-    parser.add_argument("--objective", default="reward_threshold", help=", ".join(OBJECTIVES))
+    rn_studies.add_objective(parser)
 
 
 def run(args: argparse.Namespace) -> pd.DataFrame:
@@ -42,8 +40,6 @@ def run(args: argparse.Namespace) -> pd.DataFrame:
       ConfigError: for settings that cannot work, or an output folder of other settings.
     """
     rn_curves.fill_in(args)
-    require(args.objective in OBJECTIVES, "--objective", f"be one of {', '.join(OBJECTIVES)}",
-            "RNs are learned by it", args.objective, "--objective=reward_threshold")  # fmt: skip
     pieces = common.Pieces(args.out / "pieces")
     worlds = rn_curves.real_worlds(args)
     for variant in args.variants:

@@ -23,6 +23,7 @@ from sejax.agents.configs import (
     SARSAConfig,
     TD3Config,
 )
+from sejax.configs import OBJECTIVES
 from sejax.errors import unknown_name
 from sejax.experiments import common, proxy_runs
 
@@ -151,8 +152,13 @@ def add_options(parser: argparse.ArgumentParser) -> None:
                         help="where RNs are kept; results/reward_networks")  # fmt: skip
 
 
+def add_objective(parser: argparse.ArgumentParser) -> None:
+    """The option of experiments that use the RNs of one objective."""
+    parser.add_argument("--objective", default="reward_threshold", help=", ".join(OBJECTIVES))
+
+
 def fill_in(args: argparse.Namespace) -> None:
-    """Sets the options that were not given, and checks those of `add_options`.
+    """Sets the options that were not given, and checks those of this module.
 
     Raises:
       ConfigError: for an unknown name or a number out of range.
@@ -166,6 +172,8 @@ def fill_in(args: argparse.Namespace) -> None:
     for name in args.variants:
         if name not in study.variants:
             raise unknown_name("--variants", name, study.variants)
+    if getattr(args, "objective", OBJECTIVES[0]) not in OBJECTIVES:
+        raise unknown_name("--objective", args.objective, OBJECTIVES)
     common.require_counts(args, "learned", "generations")
     if args.rns_dir is None:
         args.rns_dir = args.out / "rns" if args.quick else Path("results/reward_networks")
