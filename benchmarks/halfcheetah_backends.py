@@ -14,6 +14,8 @@ from typing import Any
 import common
 import numpy as np
 
+from sejax.envs.kinds import PHYSICS_BACKENDS
+
 GAIT_STEPS = 200
 DT = 0.05  # seconds of a control step: five physics steps of 0.01
 MUJOCO_FRAMES = 5
@@ -50,8 +52,7 @@ def main() -> None:
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--backends", nargs="+",
-                        default=["mjx", "spring", "positional", "generalized"])  # fmt: skip
+    parser.add_argument("--backends", nargs="+", default=list(PHYSICS_BACKENDS))
     parser.add_argument("--gaits", type=int, default=24)
 
 
