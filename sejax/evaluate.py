@@ -1,6 +1,5 @@
 """`python -m sejax.evaluate`: train fresh agents on a stored proxy, test them on the real task."""
 
-import dataclasses
 import sys
 import time
 from pathlib import Path
@@ -68,6 +67,7 @@ def summarise(table: Any) -> Any:
 def _prepare(config: EvaluateConfig) -> tuple[Any, dict[str, Any], Any, Path]:
     """The task, the worlds to train in, the agent's configuration and the output folder."""
     from sejax import envs
+    from sejax.evaluation import training_as_learned
     from sejax.proxies import io as proxy_io
 
     if config.proxy == "real":
@@ -88,27 +88,13 @@ def _prepare(config: EvaluateConfig) -> tuple[Any, dict[str, Any], Any, Path]:
     require_fit(agent, config.exploration, task.name)
     training = config.training
     if config.training_from == "proxy":
-        training = _as_learned(proxy, agent)
+        training = training_as_learned(proxy, agent)
     worlds = {"the proxy": (proxy.env, proxy.params, training)}
     if config.baseline:
         worlds["the real task"] = (task.env, task.params, config.real_training)
     shipped = proxy.path.parent == proxy_io.PRETRAINED_DIR
     beside = Path(f"runs/evaluate-{proxy.path.stem}") if shipped else proxy.path.parent
     return task, worlds, agent, Path(config.out_dir or beside)
-
-
-def _as_learned(proxy: Any, agent: Any) -> Any:
-    """How long agents trained while the proxy was learned.
-
-    A step budget grows by the initial episodes that this agent has beyond those of the agent it was
-    learned with: nothing is learned in them, and ten long ones could use it up.
-    """
-    training = proxy.config.training
-    if training.max_steps is None:
-        return training
-    more_episodes = max(0, agent.init_episodes - proxy.config.agent.init_episodes)
-    max_steps = training.max_steps + more_episodes * proxy.task.max_steps
-    return dataclasses.replace(training, max_steps=max_steps)
 
 
 def _train_and_test(

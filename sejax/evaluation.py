@@ -4,6 +4,7 @@ Source: paper, Algorithm 1 (TrainAgent, EvaluateAgent) and section "Performance 
 Agents".
 """
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any
 
@@ -12,6 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from sejax.agents.agent import Agent
+from sejax.agents.configs import AgentConfig
 from sejax.agents.hparams import VariedAgents
 from sejax.agents.trainer import TrainResult, make_tester, make_trainer
 from sejax.configs import TrainingConfig
@@ -104,6 +106,20 @@ def evaluator_and_lanes(
         evaluator = make_varied_evaluator(agent, env, task, training, stop_reward)
         return evaluator, agent.agents[0].cpu_lanes
     return make_evaluator(agent, env, task, training, stop_reward), agent.cpu_lanes
+
+
+def training_as_learned(proxy: Any, agent: AgentConfig) -> TrainingConfig:
+    """How long agents trained while a proxy, or a set of them, was learned.
+
+    A step budget grows by the initial episodes that this agent has beyond those of the agent it was
+    learned with: nothing is learned in them, and ten long ones could use it up.
+    """
+    training = proxy.config.training
+    if training.max_steps is None:
+        return training
+    more_episodes = max(0, agent.init_episodes - proxy.config.agent.init_episodes)
+    max_steps = training.max_steps + more_episodes * proxy.task.max_steps
+    return dataclasses.replace(training, max_steps=max_steps)
 
 
 def evaluate_agents(

@@ -114,12 +114,12 @@ def test_agents_train_as_the_proxy_was_learned_or_as_configured(
 
 
 def test_initial_episodes_beyond_the_proxys_own_extend_its_step_budget(stored):
-    from sejax.evaluate import _as_learned
+    from sejax.evaluation import training_as_learned
 
     proxy = proxy_io.load_proxy(stored[0])  # learned with 1 initial episode and 50 steps
     agent = dataclasses.replace(proxy.config.agent, init_episodes=4)
-    assert _as_learned(proxy, agent).max_steps == 50 + 3 * 200
-    assert _as_learned(proxy, proxy.config.agent).max_steps == 50
+    assert training_as_learned(proxy, agent).max_steps == 50 + 3 * 200
+    assert training_as_learned(proxy, proxy.config.agent).max_steps == 50
 
 
 def test_the_real_task_alone_can_be_evaluated(tmp_path):

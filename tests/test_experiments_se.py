@@ -158,7 +158,6 @@ def test_a_run_that_was_stopped_goes_on_at_its_last_generation(tmp_path):
     """Learns two generations, then five: the same as five at once."""
     for out, counts in ((tmp_path / "a", (2, 5)), (tmp_path / "b", (5,))):
         for count in counts:
-            (out / "pieces" / "seed3.json").unlink(missing_ok=True)
             args = experiment_options(se_feasibility, out, "--runs", "1", "--set", *TINY_RUN)
             args.overrides = [*args.overrides, f"generations={count}"]
             se_feasibility.run(args)

@@ -18,7 +18,13 @@ from sejax.agents.registry import make_agent
 from sejax.agents.trainer import make_tester, make_trainer
 from sejax.bilevel import make_program
 from sejax.errors import ConfigError
-from sejax.experiments import common, score_transforms, se_histograms, supervised_baseline
+from sejax.experiments import (
+    common,
+    score_transforms,
+    se_histograms,
+    supervised_baseline,
+    supervised_models,
+)
 from sejax.experiments.proxy_sets import load_set, save_set
 from sejax.proxies.synthetic import make_synthetic
 
@@ -41,9 +47,9 @@ def se_file(tmp_path_factory):
 @pytest.fixture
 def small(monkeypatch):
     """Agents and budgets that cost nothing."""
-    for experiment in (se_histograms, supervised_baseline):
+    for experiment in (se_histograms, supervised_models):
         monkeypatch.setattr(experiment, "QUICK_AGENT", TINY_AGENT)
-    monkeypatch.setattr(supervised_baseline, "QUICK_STEPS", 60)
+    monkeypatch.setattr(supervised_models, "QUICK_STEPS", 60)
 
 
 # Score transforms.
@@ -262,7 +268,7 @@ def check_responses(ses, test, response):
 def test_a_sample_is_uniform_over_all_that_was_added():
     counts = np.zeros(20)
     for seed in range(400):
-        sample = supervised_baseline.Sample(5, np.random.default_rng(seed))
+        sample = supervised_models.Sample(5, np.random.default_rng(seed))
         for start, stop in ((0, 3), (3, 4), (4, 20)):
             sample.add(pd.DataFrame({"row": range(start, stop)}))
         drawn = sample.table["row"]
@@ -270,7 +276,7 @@ def test_a_sample_is_uniform_over_all_that_was_added():
         counts[drawn] += 1
     error = np.sqrt(400 * 0.25 * 0.75)  # each row is drawn with probability 5 / 20
     assert np.abs(counts - 100).max() < 5 * error
-    small = supervised_baseline.Sample(5, np.random.default_rng(0))
+    small = supervised_models.Sample(5, np.random.default_rng(0))
     small.add(pd.DataFrame({"row": [7, 8]}))
     assert sorted(small.table["row"]) == [7, 8] and list(small.table) == ["row"]
 
@@ -286,7 +292,7 @@ def test_the_first_step_of_a_fit_is_adams_on_the_mean_squared_error(se_file):
     env = load_set(se_file).env
     data = random_data(6)
     states, actions, targets, ends = data
-    initial, fitted, errors = supervised_baseline.make_fit(env, 6, 1)(jax.random.key(2), *data)
+    initial, fitted, errors = supervised_models.make_fit(env, 6, 1)(jax.random.key(2), *data)
     squares, end_squares = [], []
     for state, action, target, end in zip(states, actions, targets, ends, strict=True):
         x = np.concatenate([np.eye(2)[action], state])
@@ -307,7 +313,7 @@ def test_the_first_step_of_a_fit_is_adams_on_the_mean_squared_error(se_file):
 def test_one_fit_serves_both_models_as_the_networks_share_nothing(se_file):
     env = load_set(se_file).env
     states, actions, targets, ends = random_data(8)
-    fit = jax.jit(supervised_baseline.make_fit(env, 8, 5))
+    fit = jax.jit(supervised_models.make_fit(env, 8, 5))
     _, a, _ = fit(jax.random.key(2), states, actions, targets, ends)
     _, b, errors = fit(jax.random.key(2), states, actions, targets, 1 - ends)
     for head in ("state", "reward"):
@@ -349,8 +355,9 @@ def test_the_supervised_baseline_runs_and_goes_on(se_file, tmp_path, monkeypatch
     rows = pd.read_csv(tmp_path / "pieces" / "transitions-0.csv")
     check_real_transitions(rows)
     check_models(tmp_path)
-    for name in ("collect", "fit_all", "train_group"):
-        monkeypatch.setattr(supervised_baseline, name, refuse)
+    monkeypatch.setattr(supervised_models, "collect", refuse)
+    monkeypatch.setattr(supervised_models, "fit_all", refuse)
+    monkeypatch.setattr(supervised_baseline, "train_group", refuse)
     again = supervised_baseline.run(experiment_options(supervised_baseline, tmp_path, *argv))
     assert again.equals(table)
     with pytest.raises(ConfigError, match="another num_agents"):

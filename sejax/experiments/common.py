@@ -86,7 +86,11 @@ class Pieces:
         self.folder = folder
 
     def compute(
-        self, name: str, settings: dict[str, Any], compute: Callable[[], pd.DataFrame]
+        self,
+        name: str,
+        settings: dict[str, Any],
+        compute: Callable[[], pd.DataFrame],
+        length: str | None = None,
     ) -> pd.DataFrame:
         """A piece's table: read if it is there, else computed and written.
 
@@ -94,26 +98,30 @@ class Pieces:
           name: of the files, `<name>.csv` and `<name>.json`.
           settings: what the piece depends on; plain values.
           compute: makes the table.
+          length: name of the setting that says how long the work goes on, if there is one: a piece
+            that was made with a smaller value is made anew.
 
         Raises:
           ConfigError: if a piece of that name was made with other settings.
         """
-        (table,) = self.compute_all({name: settings}, lambda _: [compute()])
+        (table,) = self.compute_all({name: settings}, lambda _: [compute()], length)
         return table
 
     def compute_all(
         self,
         settings: dict[str, dict[str, Any]],
         compute: Callable[[list[str]], list[pd.DataFrame]],
+        length: str | None = None,
     ) -> list[pd.DataFrame]:
         """As `compute` for several pieces, of which those that are missing are made at once.
 
         Args:
           settings: of each piece, by its name.
           compute: makes the tables of the pieces with the given names.
+          length: as for `compute`.
         """
         settings = json.loads(json.dumps(settings, default=str))
-        tables = {name: self._stored(name, mine) for name, mine in settings.items()}
+        tables = {name: self._stored(name, mine, length) for name, mine in settings.items()}
         missing = [name for name, table in tables.items() if table is None]
         for name, table in zip(missing, compute(missing) if missing else [], strict=True):
             write_text(self.folder / f"{name}.json", json.dumps(settings[name], indent=2))
@@ -121,13 +129,17 @@ class Pieces:
             tables[name] = table
         return [table for table in tables.values() if table is not None]
 
-    def _stored(self, name: str, settings: dict[str, Any]) -> pd.DataFrame | None:
+    def _stored(
+        self, name: str, settings: dict[str, Any], length: str | None
+    ) -> pd.DataFrame | None:
         table, made_with = self.folder / f"{name}.csv", self.folder / f"{name}.json"
         if not (table.exists() and made_with.exists()):
             return None
         there = json.loads(made_with.read_text())
         differing = sorted(key for key in {*there, *settings}
                            if there.get(key) != settings.get(key))  # fmt: skip
+        if length and differing == [length] and there.get(length, 0) < settings[length]:
+            return None
         if differing:
             raise ConfigError(
                 f"--out must be a new folder or that of the same experiment, because finished "

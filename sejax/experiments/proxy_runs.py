@@ -40,7 +40,8 @@ def learn_all(configs: list[Any], pieces: common.Pieces, prefix: str = "") -> pd
     """Curves of all runs, in rows with the columns of `metrics.csv`.
 
     Args:
-      configs: from `configs_of_runs`; a run that is finished is not made again.
+      configs: from `configs_of_runs`; a run that is finished is not made again, one of fewer
+        generations goes on if its folder is still there.
       pieces: where the curves are kept, as `<prefix>` and the name of the run's folder.
       prefix: for runs of different settings in one folder.
     """
@@ -51,9 +52,8 @@ def learn_all(configs: list[Any], pieces: common.Pieces, prefix: str = "") -> pd
     curves = []
     for config in configs:
         name = prefix + Path(config.run_dir).name
-        curve = pieces.compute(
-            name, piece_settings(config), functools.partial(learn_one, config, program, step)
-        )
+        learn = functools.partial(learn_one, config, program, step)
+        curve = pieces.compute(name, piece_settings(config), learn, length="generations")
         best = curve.groupby("seed")["best_so_far"].max().mean()
         when = ""
         if program.solved_score is not None and config.num_seeds == 1:

@@ -113,9 +113,11 @@ def run(args: argparse.Namespace) -> pd.DataFrame:
 
 def training_of(args: argparse.Namespace, ses: Any, agent: Any) -> Any:
     """How long an agent trains: as those that the SE was learned with."""
-    from sejax.evaluate import _as_learned
+    from sejax.evaluation import training_as_learned
 
-    training = dataclasses.replace(_as_learned(ses, agent), test_episodes=args.test_episodes)
+    training = dataclasses.replace(
+        training_as_learned(ses, agent), test_episodes=args.test_episodes
+    )
     if args.quick:
         training = dataclasses.replace(training, max_steps=min(training.max_steps or 2000, 2000))
     return training

@@ -30,7 +30,7 @@ AGENTS = ("ddqn", "dueling_ddqn", "td3_discrete")
 NUM_SES = 40
 NUM_BEST = 5
 BEST_FOR = "td3_discrete"
-GROUPS_AT_ONCE = 5  # groups of agents in one program
+GROUPS_AT_ONCE = 5  # groups of agents in one program, on more than one device
 LABELS = {"real": "real", "varied": "synth., HPs varied", "fixed": "synth., HPs fixed",
           "best": "synth., best SEs"}  # fmt: skip
 
@@ -218,10 +218,10 @@ def real_world(args: argparse.Namespace, task: Any, count: int) -> World:
 
 def se_world(args: argparse.Namespace, ses: Any) -> World:
     """The SEs of a set; agents train as long as those that the SEs were learned with."""
-    from sejax.evaluate import _as_learned
+    from sejax.evaluation import training_as_learned
 
     def training(agent: Any) -> TrainingConfig:
-        learned = _as_learned(ses, agent)
+        learned = training_as_learned(ses, agent)
         limits = [x for x in (learned.max_steps, args.max_steps) if x is not None]
         return dataclasses.replace(learned, max_steps=min(limits, default=None),
                                    test_episodes=args.test_episodes)  # fmt: skip
@@ -250,9 +250,10 @@ def train_all(
         "seed": args.seed,
     }
     tables = []
-    for first in range(0, len(world.names), GROUPS_AT_ONCE):
+    at_once = groups_at_once(args.devices)
+    for first in range(0, len(world.names), at_once):
         indices = {f"{kind}-{name}": index for index, name in enumerate(world.names)
-                   if first <= index < first + GROUPS_AT_ONCE}  # fmt: skip
+                   if first <= index < first + at_once}  # fmt: skip
 
         def compute(missing: list[str], indices: dict[str, int] = indices) -> list[pd.DataFrame]:
             chosen = [indices[piece] for piece in missing]
@@ -268,6 +269,16 @@ def train_all(
     return pd.concat(tables, ignore_index=True)
 
 
+def groups_at_once(devices: int | None) -> int:
+    """Groups in one program: some agents train a hundred times as long as others.
+
+    Several groups keep all devices busy; with one device, a group is saved as soon as it is done.
+    """
+    import jax
+
+    return 1 if (devices or jax.device_count()) == 1 else GROUPS_AT_ONCE
+
+
 def train_groups(
     args: argparse.Namespace,
     config: Any,
@@ -277,16 +288,15 @@ def train_groups(
 ) -> list[pd.DataFrame]:
     """Trains and tests the agents of some SEs, or groups on the real task; a row for each agent.
 
-    Some agents train a hundred times as long as others: several groups in one program keep all
-    devices busy, and there are always as many as `GROUPS_AT_ONCE`, so that it is compiled once.
-    Agents of the same numbers draw the same hyperparameters in every setting, so that settings are
-    compared on equal draws.
+    There are always as many as `groups_at_once`, so that the program is compiled once. Agents of
+    the same numbers draw the same hyperparameters in every setting, so that settings are compared
+    on equal draws.
     """
     import jax
 
     program = make_program(config, world.env, world.task, training, args.devices)
     num_agents = args.num_agents
-    padded = [*indices, *[indices[-1]] * (GROUPS_AT_ONCE - len(indices))]
+    padded = [*indices, *[indices[-1]] * (groups_at_once(args.devices) - len(indices))]
     groups = np.repeat(padded, num_agents)
     numbers = np.tile(np.arange(num_agents), len(padded))
     key = jax.random.key(args.seed)
