@@ -215,9 +215,9 @@ def sejax_side(args: argparse.Namespace) -> None:
 
     import sejax
     from sejax import envs
-    from sejax.agents.trainer import make_trainer
     from sejax.parallel import spread_over_devices
     from sejax.proxies.synthetic import make_synthetic
+    from sejax.trainer import make_trainer
 
     programs = {}
 

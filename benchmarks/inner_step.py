@@ -112,8 +112,8 @@ def sejax_side(args: argparse.Namespace) -> None:
 
     import sejax
     from sejax import envs
-    from sejax.agents.trainer import make_trainer
     from sejax.proxies.synthetic import make_synthetic
+    from sejax.trainer import make_trainer
 
     task = envs.make("cartpole")
     trainings = {}

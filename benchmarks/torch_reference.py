@@ -2,7 +2,7 @@
 
 What a good PyTorch programmer would write for the paper's design, one small network call after the
 other: DDQN on an SE of three networks, then greedy test episodes on the real CartPole. It means
-the same as `sejax.agents.trainer`, and takes its hyperparameters from the same
+the same as `sejax.trainer`, and takes its hyperparameters from the same
 `sejax.config([...])`. It imports neither jax nor gymnax. `torch_nes.py` has the generation,
 `torch_reference_td3.py` and `torch_reference_ppo.py` have other agents.
 
@@ -329,7 +329,7 @@ def greedy_action(state: DDQNState, obs: Tensor, activation: str) -> int:
 
 @dataclass(kw_only=True)
 class TrainResult:
-    """What came of one training: as `sejax.agents.trainer.TrainResult`."""
+    """What came of one training: as `sejax.trainer.TrainResult`."""
 
     agent: Any
     train_steps: int

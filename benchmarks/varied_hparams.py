@@ -59,8 +59,8 @@ def serve(args: argparse.Namespace) -> None:
     import sejax
     from sejax import envs
     from sejax.agents.hparams import make_varied_agents
-    from sejax.agents.trainer import make_trainer
     from sejax.proxies.synthetic import make_synthetic
+    from sejax.trainer import make_trainer
 
     size = args.agent_size
     config = sejax.config([

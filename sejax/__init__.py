@@ -17,7 +17,7 @@ _EXPORTS = {
     "save": "sejax.proxies.io",
     "make_agent": "sejax.agents.registry",
     "make_learner": "sejax.bilevel",
-    "make_trainer": "sejax.agents.trainer",
+    "make_trainer": "sejax.trainer",
     "register_gymnax": "sejax.proxies.io",
 }
 __all__ = ["ConfigError", "config", "load", "make_agent", "make_learner", "make_trainer",

@@ -15,12 +15,12 @@ from jaxtyping import Array
 from sejax.agents.agent import Agent
 from sejax.agents.configs import AgentConfig
 from sejax.agents.hparams import VariedAgents
-from sejax.agents.trainer import TrainResult, make_tester, make_trainer
 from sejax.configs import TrainingConfig
 from sejax.envs import Task
 from sejax.objectives import Outcome
 from sejax.parallel import spread_over_devices
 from sejax.proxies.synthetic import SyntheticEnv
+from sejax.trainer import TrainResult, make_tester, make_trainer
 
 
 def make_evaluator(

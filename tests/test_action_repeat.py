@@ -9,9 +9,9 @@ import pytest
 from scripted import MAX_EPISODES, MAX_STEPS, ScriptedEnv, script, scripted_agent
 
 from sejax import envs
-from sejax.agents.trainer import make_trainer
 from sejax.configs import TrainingConfig
 from sejax.envs.action_repeat import repeat_actions
+from sejax.trainer import make_trainer
 
 KEY = jax.random.key(0)
 

@@ -13,9 +13,9 @@ from test_ddqn import BATCH, OBS_DIM, random_batch
 from sejax import envs
 from sejax.agents.configs import DuelingDDQNConfig
 from sejax.agents.ddqn import make_ddqn, q_network
-from sejax.agents.trainer import make_trainer
 from sejax.configs import TrainingConfig
 from sejax.networks import DuelingMLP
+from sejax.trainer import make_trainer
 
 NUM_ACTIONS = 2  # as in the batches of test_ddqn
 GOLDEN = Path(__file__).parent / "golden" / "dueling_updates.npz"

@@ -15,7 +15,6 @@ from support import experiment_options, numpy_forward, refuse
 import sejax
 from sejax import envs
 from sejax.agents.registry import make_agent
-from sejax.agents.trainer import make_tester, make_trainer
 from sejax.bilevel import make_program
 from sejax.errors import ConfigError
 from sejax.experiments import (
@@ -27,6 +26,7 @@ from sejax.experiments import (
 )
 from sejax.experiments.proxy_sets import load_set, save_set
 from sejax.proxies.synthetic import make_synthetic
+from sejax.trainer import make_tester, make_trainer
 
 TINY_AGENT = {"hidden_size": 4, "num_layers": 1, "batch_size": 4, "init_episodes": 2}
 TINY_TRANSFORMS = ["--runs", "3", "--generations", "2", "--population", "2", "--slots", "2"]

@@ -25,9 +25,9 @@ from sejax.agents.ppo import (
     rollout_length,
 )
 from sejax.agents.replay import Transition
-from sejax.agents.trainer import make_tester, make_trainer
 from sejax.configs import TrainingConfig
 from sejax.networks import MLP
+from sejax.trainer import make_tester, make_trainer
 
 OBS_DIM, NUM_ACTIONS, ACTION_DIM, MAX_ACTION, MAX_STEPS = 3, 4, 2, 2.0, 6
 STEPS = 13  # two episodes of full length, and one step

@@ -8,9 +8,9 @@ from support import large_ops_in_loops
 
 from sejax import envs
 from sejax.agents.ddqn import make_ddqn
-from sejax.agents.trainer import make_trainer
 from sejax.configs import DDQNConfig, SyntheticConfig, TrainingConfig
 from sejax.proxies.synthetic import make_synthetic
+from sejax.trainer import make_trainer
 
 CAPACITY = 7919  # rows; nothing else in the program is nearly as long
 

@@ -12,13 +12,13 @@ import sejax
 from sejax import envs
 from sejax.agents.configs import QLearningConfig
 from sejax.agents.registry import make_agent
-from sejax.agents.trainer import make_trainer
 from sejax.bilevel import make_learner
 from sejax.configs import ExplorationConfig, RewardConfig, TrainingConfig
 from sejax.errors import ConfigError
 from sejax.evaluation import return_area
 from sejax.proxies.reward import RewardEnv, make_reward
 from sejax.proxies.synthetic import ABSURD
+from sejax.trainer import make_trainer
 
 GAMMA = 0.9
 VARIANTS = {  # table "Overview of Reward Network variants"

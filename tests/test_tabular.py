@@ -12,8 +12,8 @@ from sejax.agents.configs import QLearningConfig, SARSAConfig
 from sejax.agents.epsilon_greedy import decayed_epsilon
 from sejax.agents.replay import Transition
 from sejax.agents.tabular import TabularHparams, entry_of, make_q_learning, make_sarsa, mask_of
-from sejax.agents.trainer import make_tester, make_trainer
 from sejax.configs import TrainingConfig
+from sejax.trainer import make_tester, make_trainer
 
 NUM_STATES, NUM_ACTIONS = 5, 3
 KEY = jax.random.key(0)

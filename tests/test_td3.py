@@ -29,9 +29,9 @@ from sejax.agents.td3 import (
     smoothed_target_action,
     tanh_policy,
 )
-from sejax.agents.trainer import make_tester, make_trainer
 from sejax.configs import TrainingConfig
 from sejax.networks import MLP
+from sejax.trainer import make_tester, make_trainer
 
 OBS_DIM, ACTION_DIM, BATCH, MAX_ACTION = 3, 2, 7, 2.0
 GOLDEN = Path(__file__).parent / "golden" / "td3_updates.npz"

@@ -1,4 +1,4 @@
-"""sejax.agents.trainer: the inner loop against a plain Python one, alone and in lanes."""
+"""sejax.trainer: the inner loop against a plain Python one, alone and in lanes."""
 
 import gymnasium
 import jax
@@ -11,9 +11,9 @@ from scripted import MAX_EPISODES, MAX_STEPS, WHO, ScriptedEnv, script, scripted
 
 from sejax import envs
 from sejax.agents.ddqn import make_ddqn
-from sejax.agents.trainer import is_plateau, is_solved, make_tester, make_trainer
 from sejax.configs import DDQNConfig, SyntheticConfig, TrainingConfig
 from sejax.proxies.synthetic import make_synthetic
+from sejax.trainer import is_plateau, is_solved, make_tester, make_trainer
 
 WINDOW, TOLERANCE, SOLVED, INIT_EPISODES = 2, 0.25, 1.5, 2
 KEY = jax.random.key(0)

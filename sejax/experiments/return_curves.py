@@ -46,8 +46,8 @@ def make_program(
 
     from sejax.agents.hparams import make_varied_agents
     from sejax.agents.registry import make_agent
-    from sejax.agents.trainer import make_tester, make_trainer
     from sejax.parallel import spread_over_devices
+    from sejax.trainer import make_tester, make_trainer
 
     # A threshold that nobody reaches: tested after each episode, but never stopped.
     training = dataclasses.replace(training, stop_rule="solved", solved_by="test")

@@ -177,7 +177,7 @@ def make_recorder(
     import jax.numpy as jnp
 
     from sejax.agents.registry import make_agent
-    from sejax.agents.trainer import make_trainer
+    from sejax.trainer import make_trainer
 
     agent = make_agent(config, ses.task, ses.config.exploration)
     capacity = min(max_rows, training.max_steps or max_rows)

@@ -13,11 +13,11 @@ from flax import struct
 from jaxtyping import Array, Float, Int
 
 from sejax.agents.agent import Agent
-from sejax.agents.masked_loop import while_any_active
 from sejax.agents.memory import Memory
 from sejax.agents.replay import Transition
 from sejax.configs import TrainingConfig
 from sejax.envs.action_repeat import repeat_actions
+from sejax.masked_loop import while_any_active
 from sejax.proxies.reward import RewardEnv
 from sejax.proxies.synthetic import SyntheticEnv
 
