@@ -30,6 +30,7 @@ from rich.progress import track
 
 from sejax.agents.configs import AGENT_CONFIGS, AgentConfig, PPOConfig
 from sejax.configs import EnvConfig, LearnConfig, SyntheticConfig, TrainingConfig, config
+from sejax.envs.kinds import kind
 
 WARM_UP_STEPS = 300
 
@@ -92,7 +93,7 @@ def whole_phases(steps: int, agent: AgentConfig) -> int:
     """The number of steps, for PPO rounded up to whole learning phases, of which at least two."""
     if not isinstance(agent, PPOConfig):
         return steps
-    length = agent.update_episodes * 200 + 1  # sejax.agents.ppo.rollout_length in CartPole
+    length = agent.rollout_length(kind("cartpole").max_steps)
     return max(2, -(-steps // length)) * length
 
 

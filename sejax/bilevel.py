@@ -181,10 +181,14 @@ def make_program(config: LearnConfig) -> Program:
         candidates, asked = jax.vmap(strategy.ask)(key_ask, state.es_state)
         outcome = score_candidates(strategy.seed_ids, key_inner, candidates, ~state.finished)
         scores = objective(outcome)  # [seed, candidates]
+        num_nonfinite = (~jnp.isfinite(scores)).sum(axis=1)
+        scores = jax.vmap(_rank_diverged_incumbents_last, (0, None))(
+            scores, strategy.num_incumbent_evals
+        )
         told = jax.vmap(strategy.tell)(key_tell, candidates, scores, asked)
         stepped = _advance(state, told, jax.vmap(strategy.incumbent)(asked), scores, outcome)
         stepped = jax.tree.map(lambda new, old: _where(state.finished, old, new), stepped, state)
-        return stepped, _summarise(state, stepped, scores, outcome)
+        return stepped, _summarise(state, stepped, scores, outcome, num_nonfinite)
 
     def _advance(
         state: LearnState, told: Any, incumbent: Array, scores: Array, outcome: Outcome
@@ -210,7 +214,11 @@ def make_program(config: LearnConfig) -> Program:
         )
 
     def _summarise(
-        before: LearnState, after: LearnState, scores: Array, outcome: Outcome
+        before: LearnState,
+        after: LearnState,
+        scores: Array,
+        outcome: Outcome,
+        num_nonfinite: Array,
     ) -> GenerationInfo:
         num_perturbed = strategy.num_candidates - strategy.num_incumbent_evals
         perturbed, incumbent = scores[:, :num_perturbed], scores[:, num_perturbed:]
@@ -224,7 +232,7 @@ def make_program(config: LearnConfig) -> Program:
             train_steps_mean=outcome.train_steps.mean(axis=1),
             train_steps_max=outcome.train_steps.max(axis=1),
             train_episodes_mean=outcome.train_episodes.mean(axis=1),
-            num_nonfinite=(~jnp.isfinite(scores)).sum(axis=1),
+            num_nonfinite=num_nonfinite,
             env_steps_total=after.env_steps,
             train_steps_total=outcome.train_steps.sum(axis=1),
             active=~before.finished,
@@ -254,7 +262,7 @@ def make_population_scorer(
     make = make_varied_agents if config.agent_hparams == "varied" else make_agent
     agent = make(config.agent, task, config.exploration)
     # The area under a learning curve that ends when the task is solved would reward learning late.
-    stop_reward = jnp.inf if config.objective.name == "auc" else None
+    stop_reward = jnp.inf if config.objective.needs_curve else None
     evaluate, cpu_lanes = evaluator_and_lanes(agent, env, task, config.training, stop_reward)
 
     def evaluate_candidate(key: Array, candidate: Array, active: Array) -> Outcome:
@@ -273,6 +281,19 @@ def make_population_scorer(
         return jax.tree.map(lambda x: x.reshape(num_seeds, num_candidates, *x.shape[1:]), outcome)
 
     return score
+
+
+def _rank_diverged_incumbents_last(
+    scores: Float[Array, " candidates"], num_incumbent_evals: int
+) -> Float[Array, " candidates"]:
+    """Gives the incumbent's agents that diverged the lowest finite score of the generation.
+
+    A mean without them would rank an incumbent by the agents that survived it. Members keep nan:
+    the strategy ranks these last itself.
+    """
+    lowest = jnp.nanmin(jnp.where(jnp.isfinite(scores), scores, jnp.nan))
+    is_incumbent = jnp.arange(scores.size) >= scores.size - num_incumbent_evals
+    return jnp.where(is_incumbent & ~jnp.isfinite(scores), lowest, scores)
 
 
 def _strongly_typed(x: Array) -> Array:

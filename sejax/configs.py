@@ -23,6 +23,7 @@ from sejax.agents.configs import (
     AgentConfig,
     DDQNConfig,
     ExplorationConfig,
+    PPOConfig,
 )
 from sejax.errors import ConfigError, nearest, require, unknown_name
 from sejax.validation import at_least, default, fraction, one_of, positive
@@ -44,7 +45,7 @@ AGGREGATES = ("mean", "min")
 AGENT_HPARAMS = ("default", "varied")
 EVALUATION_HPARAMS = (*AGENT_HPARAMS, "nes")
 TRAINING_FROM = ("proxy", "config")
-OBJECTIVES = ("max_reward", "reward_threshold", "auc")
+OBJECTIVES = ("max_reward", "reward_threshold", "auc", "auc_sum")
 
 # Name of the `es` choice -> evosax's class. Listed here because importing evosax takes seconds;
 # a test holds the list against evosax's own registry. Left out are RandomSearch and the two SV
@@ -169,7 +170,7 @@ class TrainingConfig:
     plateau_tolerance: float = 0.01  # C_diff: relative change between them that counts as flat.
     solved_by: str = "test"  # whose last d returns must reach the solved reward: test or train.
     test_episodes: int = 10  # n_te: episodes on the real task after training.
-    time_limit_is_terminal: bool = False  # a real episode cut by the limit does not bootstrap.
+    time_limit_is_terminal: bool = True  # a real episode cut by the limit does not bootstrap.
 
     def __post_init__(self) -> None:
         for name in ("max_episodes", "window", "test_episodes"):
@@ -265,6 +266,11 @@ class ObjectiveConfig:
         at_least(0, "objective.unsolved_weight", self.unsolved_weight,
                   "a shortfall must not be rewarded", 100)  # fmt: skip
 
+    @property
+    def needs_curve(self) -> bool:
+        """Whether it looks at the tests between training episodes, however many there are."""
+        return self.name.startswith("auc")
+
 
 @dataclass(frozen=True, kw_only=True)
 class LearnConfig:
@@ -292,6 +298,8 @@ class LearnConfig:
         require_fit(self.agent, self.exploration, self.env.name)
         self._require_info()
         self._require_tests_for_auc()
+        self._require_real_returns()
+        self._require_learning()
         require(not self.stop_when_solved or self.objective.name == "max_reward",
                 "stop_when_solved", "be false with this objective", "its scores are not returns, "
                 "so that none says solved", f"true with objective={self.objective.name}",
@@ -317,10 +325,29 @@ class LearnConfig:
 
     def _require_tests_for_auc(self) -> None:
         rule = f"{self.training.stop_rule} by {self.training.solved_by} returns"
-        require(self.objective.name != "auc" or rule == "solved by test returns", "objective",
+        require(not self.objective.needs_curve or rule == "solved by test returns", "objective",
                 "be reward_threshold or max_reward where agents are not tested after each episode",
-                "the area is that under the curve of those tests", f"auc with stop_rule {rule}",
+                "the area is that under the curve of those tests",
+                f"{self.objective.name} with stop_rule {rule}",
                 "training.stop_rule=solved training.solved_by=test")  # fmt: skip
+
+    def _require_real_returns(self) -> None:
+        training = self.training
+        require(training.stop_rule != "solved" or training.solved_by == "test",
+                "training.solved_by", "be test with stop_rule=solved", "returns on a proxy say "
+                "nothing about the real task's threshold", training.solved_by,
+                "training.solved_by=test")  # fmt: skip
+
+    def _require_learning(self) -> None:
+        """Episodes on an SE with soft ends last as long as they may: their number is known."""
+        budget = self.training.max_steps
+        if budget is None or getattr(self.proxy, "done", None) != "soft":
+            return
+        before = self.agent.steps_before_learning(envs.kind(self.env.name).max_steps)
+        name = "update_episodes" if isinstance(self.agent, PPOConfig) else "init_episodes"
+        require(budget > before, "training.max_steps", f"exceed {before}", f"{self.agent.name} "
+                f"learns nothing before with agent.{name}={getattr(self.agent, name)}", budget,
+                f"training.max_steps={4 * before}, or agent.{name} lower")  # fmt: skip
 
     @property
     def resolved_run_dir(self) -> Path:
@@ -353,9 +380,23 @@ class EvaluateConfig:
         at_least(1, "num_agents", self.num_agents, "there is nothing to average otherwise", 10)
         one_of("agent_hparams", self.agent_hparams, EVALUATION_HPARAMS)
         one_of("training_from", self.training_from, TRAINING_FROM)
+        self._require_use()
         for name in ("lanes", "devices"):
             if getattr(self, name) is not None:
                 at_least(1, name, getattr(self, name), "something must compute", "null")
+
+    def _require_use(self) -> None:
+        """Refuses settings that would have no effect."""
+        require(self.agent_hparams != "nes" or (self.agent, self.exploration)
+                == (DDQNConfig(), ExplorationConfig()), "agent and exploration", "be left out with "
+                "agent_hparams=nes", "the proxy says which they are",
+                f"{self.agent.name} and {self.exploration.name}, or other values of them",
+                "agent_hparams=default")  # fmt: skip
+        used = self.training_from == "config" and self.proxy != "real"
+        require(used or self.training == TrainingConfig(), "training", "be left as it is",
+                "agents train on a proxy as it was learned with, and on the real task as "
+                "real_training says", "other values", "training_from=config, or real_training.*"
+                )  # fmt: skip
 
 
 def register_evosax_choices() -> None:

@@ -111,14 +111,16 @@ def evaluator_and_lanes(
 def training_as_learned(proxy: Any, agent: AgentConfig) -> TrainingConfig:
     """How long agents trained while a proxy, or a set of them, was learned.
 
-    A step budget grows by the initial episodes that this agent has beyond those of the agent it was
-    learned with: nothing is learned in them, and ten long ones could use it up.
+    A step budget grows by the steps for which this agent waits longer with learning than the one it
+    was learned with: ten long initial episodes, or a rollout of PPO, could use it up.
     """
     training = proxy.config.training
     if training.max_steps is None:
         return training
-    more_episodes = max(0, agent.init_episodes - proxy.config.agent.init_episodes)
-    max_steps = training.max_steps + more_episodes * proxy.task.max_steps
+    before, before_then = (
+        each.steps_before_learning(proxy.task.max_steps) for each in (agent, proxy.config.agent)
+    )
+    max_steps = training.max_steps + max(0, before - before_then)
     return dataclasses.replace(training, max_steps=max_steps)
 
 

@@ -43,7 +43,10 @@ def make_objective(
 
     - `max_reward`: the mean test return (SEs).
     - `reward_threshold`: :math:`-(n_{tr} + w_{sol} \max(0, C_{sol} - C_{fin}))` (RNs).
-    - `auc`: the area under the curve of test returns over training steps (RNs).
+    - `auc`: the area under the curve of test returns over training steps, by the number of these
+      steps (RNs).
+    - `auc_sum`: the area itself, as in the authors' code. Agents train a number of episodes, so
+      that it rewards short ones where returns are negative, and long ones where they are positive.
 
     Source: paper, Algorithm 1, EvaluateAgent, section "Learning Reward Networks", and appendix
     "Studying the Influence of Different Reward Network Optimization Objectives".
@@ -55,6 +58,8 @@ def make_objective(
             shortfall = jnp.maximum(0.0, solved_reward - outcome.test_return)
             score = -(outcome.train_steps + config.unsolved_weight * shortfall)
         elif config.name == "auc":
+            score = outcome.return_area / jnp.maximum(outcome.train_steps, 1)
+        elif config.name == "auc_sum":
             score = outcome.return_area
         return jnp.where(outcome.nonfinite, jnp.nan, score)
 

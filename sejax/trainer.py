@@ -227,7 +227,8 @@ def make_trainer(
         key: Array, env_params: Any, hparams: Any = agent.hparams, active: Array | bool = True
     ) -> TrainResult:
         if shaped is not None:
-            env_params = shaped.prepared(env_params, agent.discount(hparams))
+            discount = agent.discount(hparams)
+            env_params = shaped.prepared(env_params, discount, time_limit_is_terminal)
         key_begin, key_steps = jax.random.split(key)
         state = begin(key_begin, env_params, hparams, active)
         kept = make_memory(state).init()

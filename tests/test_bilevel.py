@@ -11,7 +11,7 @@ from support import large_ops_in_loops
 
 import sejax
 from sejax import bilevel, envs
-from sejax.bilevel import make_learner, make_program
+from sejax.bilevel import _rank_diverged_incumbents_last, make_learner, make_program
 from sejax.configs import EVOSAX_ALGORITHMS
 from sejax.errors import ConfigError
 
@@ -237,6 +237,14 @@ def test_an_incumbent_that_diverges_is_never_the_best(one_device):
     assert info.num_nonfinite == 12
     assert after.incumbent_score == -jnp.inf and after.best_generation == -1
     np.testing.assert_array_equal(after.best, states[0].best)
+
+
+def test_incumbent_agents_that_diverge_count_as_the_worst_of_the_generation():
+    nan, inf = jnp.nan, jnp.inf
+    scores = jnp.array([-9.0, nan, 3.0, 5.0, nan, 7.0, inf])  # the last four are the incumbent's
+    got = _rank_diverged_incumbents_last(scores, 4)
+    np.testing.assert_array_equal(got, [-9.0, nan, 3.0, 5.0, -9.0, 7.0, -9.0])
+    assert np.isnan(_rank_diverged_incumbents_last(jnp.full(3, nan), 2)).all()
 
 
 def test_more_devices_than_there_are_is_refused():

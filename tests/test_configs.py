@@ -9,7 +9,10 @@ import pytest
 import yaml
 
 import sejax
+from sejax import envs
+from sejax.agents.configs import AGENT_CONFIGS
 from sejax.configs import (
+    CONF_DIR,
     EVOSAX_ALGORITHMS,
     DDQNConfig,
     EvosaxConfig,
@@ -24,6 +27,7 @@ from sejax.errors import ConfigError, require, unknown_name
 
 composed_with = functools.cache(lambda *overrides: config(overrides))
 ENVS = ("cartpole", "acrobot")
+BEST_SES = sorted((CONF_DIR / "tuned" / "best").glob("*-se.yaml"))
 PRESETS = ("best", "paper", "paper_performance")
 
 
@@ -204,6 +208,40 @@ def test_a_population_of_one_is_refused_with_the_whole_message():
     )
 
 
+@pytest.mark.parametrize("env", [path.stem.removesuffix("-se") for path in BEST_SES])
+def test_agents_learn_within_the_default_budget_of_an_se(env):
+    kind = envs.kind(env)
+    for name, agent in AGENT_CONFIGS.items():
+        if agent.states == kind.states and kind.actions in agent.actions:
+            config = sejax.config([f"env={env}", f"agent={name}"])
+            before = config.agent.steps_before_learning(kind.max_steps)
+            budget = config.training.max_steps or config.training.max_episodes * kind.max_steps
+            assert budget >= 2 * before, name
+
+
+@pytest.mark.parametrize(
+    ("overrides", "said"),
+    [
+        (("env=acrobot", "agent=dueling_ddqn", "agent.init_episodes=10"),
+         "training.max_steps must exceed 5000, because dueling_ddqn learns nothing before with "
+         "agent.init_episodes=10; got 4000."),
+        (("agent=ppo", "agent.update_episodes=20"),
+         "training.max_steps must exceed 4001, because ppo learns nothing before"),
+        (("training.stop_rule=solved", "training.solved_by=train"),
+         "training.solved_by must be test with stop_rule=solved"),
+        (("env=cliff_walking", "proxy=rn", "training.solved_by=train"),
+         "training.solved_by must be test with stop_rule=solved"),
+    ],
+)  # fmt: skip
+def test_trainings_that_cannot_teach_or_judge_are_refused(overrides, said):
+    assert message(*overrides).startswith(said)
+
+
+def test_episodes_that_may_end_early_need_no_long_budget():
+    sejax.config(["proxy.done=threshold", "training.max_steps=100"])
+    sejax.config(["proxy=rn", "training.max_steps=100"])
+
+
 def test_a_value_that_is_no_number_is_refused_with_the_whole_message():
     assert message("es.noise_std=nan") == (
         "es.noise_std must be above 0 and finite, because members must differ; got nan. "
@@ -346,7 +384,7 @@ def test_a_config_error_is_a_value_error_with_the_projects_form():
     [
         (),
         ("env=acrobot", "preset=paper", "seed=3", "run_dir=some/where"),
-        ("es=cma_es", "devices=2", "lanes=4", "training.max_steps=100"),
+        ("es=cma_es", "devices=2", "lanes=4", "training.max_steps=1000"),
     ],
     ids=" ".join,
 )

@@ -11,14 +11,16 @@ import pytest
 from hydra import compose, initialize_config_dir
 
 import sejax
+from sejax.agents.configs import PPOConfig
 from sejax.configs import CONF_DIR, evaluate_from_hydra
 from sejax.errors import ConfigError
-from sejax.evaluate import evaluate
+from sejax.evaluate import _prepare, evaluate
 from sejax.proxies import io as proxy_io
+from sejax.proxies.reward import make_reward
 from sejax.proxies.synthetic import make_synthetic
 
-TINY = ["agent.hidden_size=4", "agent.batch_size=4", "agent.init_episodes=1", "num_agents=3",
-        "training.max_episodes=2", "real_training.max_episodes=2"]  # fmt: skip
+TINY = ["agent.hidden_size=4", "agent.batch_size=4", "agent.init_episodes=0", "num_agents=3",
+        "real_training.max_episodes=2"]  # fmt: skip
 
 
 def evaluate_config(*overrides: str):
@@ -31,7 +33,7 @@ def evaluate_config(*overrides: str):
 def stored(tmp_path_factory):
     """A proxy file with random weights: its path, environment and weights."""
     path = tmp_path_factory.mktemp("proxy") / "proxy.safetensors"
-    config = sejax.config(["proxy.hidden_size=4", "training.max_steps=50"])
+    config = sejax.config(["proxy.hidden_size=4", "training.max_steps=50", "agent.init_episodes=0"])
     from sejax import envs
 
     env = make_synthetic(envs.make("cartpole"), config.proxy)
@@ -100,15 +102,12 @@ def test_evaluation_writes_a_row_for_each_agent_and_their_means(stored, tmp_path
     assert "3 fresh ddqn agents" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize(("training_from", "steps"), [("proxy", 50), ("config", 90)])
-def test_agents_train_as_the_proxy_was_learned_or_as_configured(
-    training_from, steps, stored, tmp_path
-):
-    overrides = [
-        f"proxy={stored[0]}", f"out_dir={tmp_path}", f"training_from={training_from}",
-        "baseline=false", "training.max_steps=90", "training.max_episodes=1000",
-        "training.stop_rule=never",
-    ]  # fmt: skip
+@pytest.mark.parametrize(
+    ("given", "steps"),
+    [([], 50), (["training_from=config", "training.max_steps=90", "training.stop_rule=never"], 90)],
+)
+def test_agents_train_as_the_proxy_was_learned_or_as_configured(given, steps, stored, tmp_path):
+    overrides = [f"proxy={stored[0]}", f"out_dir={tmp_path}", "baseline=false", *given]
     evaluate(evaluate_config(*overrides))
     assert (pd.read_csv(tmp_path / "evaluation.csv").train_steps == steps).all()
 
@@ -116,10 +115,43 @@ def test_agents_train_as_the_proxy_was_learned_or_as_configured(
 def test_initial_episodes_beyond_the_proxys_own_extend_its_step_budget(stored):
     from sejax.evaluation import training_as_learned
 
-    proxy = proxy_io.load_proxy(stored[0])  # learned with 1 initial episode and 50 steps
-    agent = dataclasses.replace(proxy.config.agent, init_episodes=4)
+    proxy = proxy_io.load_proxy(stored[0])  # learned with no initial episode and 50 steps
+    agent = dataclasses.replace(proxy.config.agent, init_episodes=3)
     assert training_as_learned(proxy, agent).max_steps == 50 + 3 * 200
+    assert training_as_learned(proxy, PPOConfig(update_episodes=2)).max_steps == 50 + 401
     assert training_as_learned(proxy, proxy.config.agent).max_steps == 50
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        (["training.max_steps=90"], "training must be left as it is.*training_from=config"),
+        (["proxy=real", "env=cartpole", "training_from=config", "training.max_steps=90"],
+         "training must be left as it is.*real_training"),
+        (["agent_hparams=nes"], "agent and exploration must be left out with agent_hparams=nes"),
+    ],
+)  # fmt: skip
+def test_settings_without_effect_are_refused(given, message, stored):
+    with pytest.raises(ConfigError, match=message):
+        evaluate_config(f"proxy={stored[0]}", *given)
+
+
+def test_agents_of_the_nes_run_bring_their_exploration(tmp_path, capsys):
+    """An RN learned with Q-learning agents and a count-based bonus."""
+    config = sejax.config(["env=cliff_walking", "proxy=rn", "exploration=count_based"])
+    env = make_reward(config.env.make(), config.proxy)
+    path = tmp_path / "proxy.safetensors"
+    sejax.save(path, config, env.init_weights(jax.random.key(0)))
+    folder = CONF_DIR.parent / "evaluate"
+    overrides = [f"proxy={path}", "agent_hparams=nes", "num_agents=2", "baseline=false",
+                 "real_training.max_episodes=2"]  # fmt: skip
+    with initialize_config_dir(str(folder), version_base="1.3"):
+        composed = evaluate_from_hydra(compose("evaluate", overrides=overrides))
+    _task, worlds, (agent, exploration), _ = _prepare(composed)
+    assert (agent, exploration) == (config.agent, config.exploration)
+    assert worlds["the proxy"][2] == composed.real_training  # its dynamics are real
+    evaluate(composed)
+    assert "2 fresh q_learning agents" in capsys.readouterr().out
 
 
 def test_the_real_task_alone_can_be_evaluated(tmp_path):

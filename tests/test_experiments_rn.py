@@ -88,6 +88,9 @@ def test_several_runs_in_one_program_are_those_runs(rns_dir, options, tmp_path):
 
 def test_objectives_are_compared_with_the_best_and_the_worst(options, tmp_path):
     args = options(rn_objectives, *TRAIN, "--objectives", "reward_threshold", "auc")
+    with pytest.raises(ConfigError, match=r"--learned must be at least 4.*got 3"):
+        rn_objectives.run(args)
+    args = options(rn_objectives, *TRAIN[2:], "--objectives", "reward_threshold", "auc")
     table = rn_objectives.run(args)
     # For each objective and choice: the real task twice and two variants.
     assert len(table) == 2 * 2 * 4
@@ -101,7 +104,7 @@ def test_objectives_are_compared_with_the_best_and_the_worst(options, tmp_path):
         [piece["weights"] for piece in pieces_of(tmp_path, prefix.format(pick))]
         for pick in ("best", "worst")
     )
-    assert best[0] != worst[0] and best[1] == worst[1]  # two of three each: the middle one twice
+    assert len(best) == len(worst) == 1 and best != worst
 
 
 def test_the_heat_map_shows_what_the_rns_pay(options, tmp_path):

@@ -28,7 +28,7 @@ from sejax.experiments.proxy_sets import load_set, save_set
 from sejax.proxies.synthetic import make_synthetic
 from sejax.trainer import make_tester, make_trainer
 
-TINY_AGENT = {"hidden_size": 4, "num_layers": 1, "batch_size": 4, "init_episodes": 2}
+TINY_AGENT = {"hidden_size": 4, "num_layers": 1, "batch_size": 4, "init_episodes": 0}
 TINY_TRANSFORMS = ["--runs", "3", "--generations", "2", "--population", "2", "--slots", "2"]
 TINY_MODELS = ["--models", "3", "--generations", "2", "--population", "2", "--max-rows", "30",
                "--epochs", "2", "--num-agents", "2", "--test-episodes", "2"]  # fmt: skip
@@ -38,7 +38,7 @@ TINY_MODELS = ["--models", "3", "--generations", "2", "--population", "2", "--ma
 def se_file(tmp_path_factory):
     """A file with an SE of random weights."""
     path = tmp_path_factory.mktemp("se") / "se.safetensors"
-    config = sejax.config(["proxy.hidden_size=4", "training.max_steps=60", "agent.init_episodes=1"])
+    config = sejax.config(["proxy.hidden_size=4", "training.max_steps=60", "agent.init_episodes=0"])
     env = make_synthetic(envs.make("cartpole"), config.proxy)
     save_set(path, config, [env.init_weights(jax.random.key(5))], [1.0], [0], [0])
     return str(path)

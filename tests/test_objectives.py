@@ -43,6 +43,13 @@ def test_reward_threshold_prefers_fewer_steps_among_the_solved():
     np.testing.assert_array_equal(got, [-300.0, -200.0, -3100.0])
 
 
+@pytest.mark.parametrize(("name", "scores"), [("auc", [0, 0.5, 0.5]), ("auc_sum", [0, 1, 2])])
+def test_auc_is_the_mean_under_the_curve_or_the_area(name, scores):
+    objective = make_objective(ObjectiveConfig(name=name), solved_reward=195.0)
+    got = objective(outcome([1.0, 1.0, 1.0], [1, 2, 4], [False] * 3))  # areas 0, 1, 2
+    np.testing.assert_array_equal(got, scores)
+
+
 @pytest.mark.parametrize("name", OBJECTIVES)
 def test_a_training_that_diverged_has_no_score(name):
     objective = make_objective(ObjectiveConfig(name=name), solved_reward=195.0)

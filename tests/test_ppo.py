@@ -22,7 +22,6 @@ from sejax.agents.ppo import (
     make_ppo,
     normalized,
     ppo_loss,
-    rollout_length,
 )
 from sejax.agents.replay import Transition
 from sejax.configs import TrainingConfig
@@ -297,7 +296,7 @@ def test_a_rollout_is_as_long_as_the_authors(update_episodes, action_repeat):
     while not time_step / max_steps > update_episodes:
         decisions, time_step = decisions + 1, time_step + action_repeat
     config = PPOConfig(update_episodes=update_episodes, action_repeat=action_repeat)
-    assert rollout_length(config, max_steps) == decisions
+    assert config.rollout_length(max_steps) == decisions
 
 
 # --- policies ------------------------------------------------------------------------------------

@@ -128,6 +128,21 @@ def test_zero_at_terminal_drops_the_potential_there_and_nowhere_else():
     np.testing.assert_allclose(up[2], -1 + GAMMA * phi(env, weights, 24) - start, rtol=1e-5)
 
 
+@pytest.mark.parametrize("limit_is_terminal", [True, False])
+def test_zero_at_terminal_counts_the_step_limit_if_agents_do(limit_is_terminal):
+    env = make_env("cartpole", "exclusive_potential", zero_at_terminal=True)
+    weights = env.init_weights(jax.random.key(7))
+    params = env.prepared(env.params(weights), GAMMA, limit_is_terminal)
+    obs, state = env.reset_env(jax.random.key(8), params)
+    for time, ends in ((198, False), (199, True)):  # the next step is the 199th or the 200th
+        after, _, reward, terminated, _ = env.step_env(
+            jax.random.key(9), state.replace(time=jnp.int32(time)), 0, params
+        )
+        assert not terminated
+        kept = 0.0 if ends and limit_is_terminal else GAMMA * phi(env, weights, after)
+        np.testing.assert_allclose(reward, kept - phi(env, weights, obs), rtol=1e-5)
+
+
 def q_values(env, weights):
     """Optimal action values of a grid world with the shaped rewards, by value iteration."""
     task = env.task

@@ -1,5 +1,6 @@
 """benchmarks/torch_reference.py, the yardstick of the benchmarks: its updates are sejax's."""
 
+import dataclasses
 import sys
 from pathlib import Path
 
@@ -59,6 +60,7 @@ def test_training_ends_after_the_episodes_or_the_steps(max_steps, steps):
     heads["done"]["Dense_1"]["bias"] -= 10  # never
     env = reference.SyntheticEnv(heads, SyntheticConfig(hidden_size=5))
     training = TrainingConfig(stop_rule="never", max_episodes=2, max_steps=max_steps)
-    result = reference.train(env, LearnConfig(agent=CONFIG, training=training), seed=0)
+    agent = dataclasses.replace(CONFIG, init_episodes=1)
+    result = reference.train(env, LearnConfig(agent=agent, training=training), seed=0)
     assert result.train_steps == steps
     assert len(result.returns) == 2

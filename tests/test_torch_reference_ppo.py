@@ -13,7 +13,7 @@ from jax.flatten_util import ravel_pytree
 from sejax.agents import replay
 from sejax.agents.configs import PPOConfig
 from sejax.agents.memory import Rollout
-from sejax.agents.ppo import make_ppo, rollout_length
+from sejax.agents.ppo import make_ppo
 from sejax.agents.replay import Transition
 from sejax.configs import LearnConfig, SyntheticConfig, TrainingConfig
 from sejax.networks import MLP
@@ -76,11 +76,12 @@ def test_a_learning_phase_equals_sejaxs_on_the_same_rollout():
 
 def test_it_learns_when_the_rollout_is_full():
     length = torch_ppo.rollout_length(CONFIG)
-    assert length == rollout_length(CONFIG, reference.MAX_STEPS)
+    assert length == CONFIG.rollout_length(reference.MAX_STEPS)
     heads = {name: reference.params_to_flax(reference.init_mlp([6, 5, size], "leaky_relu"))
              for name, size in reference.HEADS.items()}  # fmt: skip
     env = reference.SyntheticEnv(heads, SyntheticConfig(hidden_size=5))
-    config = LearnConfig(agent=CONFIG, training=TrainingConfig(stop_rule="never", max_steps=1))
+    config = LearnConfig(agent=CONFIG, training=TrainingConfig(stop_rule="never", max_steps=1),
+                         proxy=SyntheticConfig(done="threshold"))  # fmt: skip
 
     def actor_after(num_steps):
         training = replace(config.training, max_steps=num_steps)

@@ -22,7 +22,13 @@ ENV = ScriptedEnv()
 
 def training(**fields):
     return TrainingConfig(
-        **{"max_episodes": MAX_EPISODES, "window": WINDOW, "plateau_tolerance": TOLERANCE, **fields}
+        **{
+            "max_episodes": MAX_EPISODES,
+            "window": WINDOW,
+            "plateau_tolerance": TOLERANCE,
+            "time_limit_is_terminal": False,
+            **fields,
+        }
     )
 
 

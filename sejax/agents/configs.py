@@ -49,6 +49,10 @@ class AgentConfig:
         if hasattr(self, "activation"):
             one_of("agent.activation", self.activation, ACTIVATIONS)
 
+    def steps_before_learning(self, max_episode_steps: int) -> int:
+        """Training steps before the agent first learns, where episodes have this length."""
+        return self.init_episodes * max_episode_steps
+
 
 @dataclass(frozen=True, kw_only=True)
 class DDQNConfig(AgentConfig):
@@ -141,6 +145,21 @@ class PPOConfig(AgentConfig):
     entropy_weight: float = 0.01
     init_action_std: float = 0.5  # of the Gaussian policy; learned
     action_repeat: int = 1
+
+    def rollout_length(self, max_episode_steps: int) -> int:
+        """Decisions between two learning phases.
+
+        The authors learn as soon as (decisions x `action_repeat`) / `max_episode_steps` exceeds
+        `update_episodes`, also in the middle of an episode; this is the first whole number that
+        does.
+
+        Source: `reference_details.md` 4.5.
+        """
+        return self.update_episodes * max_episode_steps // self.action_repeat + 1
+
+    def steps_before_learning(self, max_episode_steps: int) -> int:
+        """As of any agent; PPO learns once a rollout is full."""
+        return self.rollout_length(max_episode_steps) * self.action_repeat
 
 
 @dataclass(frozen=True, kw_only=True)

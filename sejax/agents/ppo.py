@@ -193,24 +193,13 @@ def make_ppo(
         begin_episode=lambda state, episode: state,
         act=act,
         update=update,
-        memory=rollout_memory(rollout_length(config, max_steps)),
+        memory=rollout_memory(config.rollout_length(max_steps)),
         hparams=hparams_of(PPOHparams, config),
         init_episodes=config.init_episodes,
         learns_from=0,
         env_action=policy.env_action,
         action_repeat=config.action_repeat,
     )
-
-
-def rollout_length(config: PPOConfig, max_steps: int) -> int:
-    """Decisions between two learning phases.
-
-    The authors learn as soon as (decisions x `action_repeat`) / `max_steps` exceeds
-    `update_episodes`, also in the middle of an episode; this is the first whole number that does.
-
-    Source: `reference_details.md` 4.5.
-    """
-    return config.update_episodes * max_steps // config.action_repeat + 1
 
 
 def discounted_returns(

@@ -1,4 +1,4 @@
-"""What sort of states and actions each task has, known without importing any task.
+"""What sort of states, actions and episodes each task has, known without importing any task.
 
 Configurations are checked before gymnax is imported, which takes seconds; a test holds this table
 against the tasks.
@@ -15,24 +15,26 @@ class TaskKind(NamedTuple):
     Attributes:
       states: "vector" or "discrete".
       actions: "discrete" or "continuous".
+      max_steps: the paper's step limit of an episode.
       has_physics: whether the physics backend can be chosen.
       has_info: whether its steps tell more than the observation; see `Task.info_keys`.
     """
 
     states: str
     actions: str
+    max_steps: int
     has_physics: bool = False
     has_info: bool = False
 
 
 KINDS = {
-    "cartpole": TaskKind("vector", "discrete"),
-    "acrobot": TaskKind("vector", "discrete"),
-    "cliff_walking": TaskKind("discrete", "discrete"),
-    "gridworld_2x2": TaskKind("discrete", "discrete"),
-    "mountain_car_continuous": TaskKind("vector", "continuous"),
-    "pendulum": TaskKind("vector", "continuous"),
-    "halfcheetah": TaskKind("vector", "continuous", has_physics=True, has_info=True),
+    "cartpole": TaskKind("vector", "discrete", 200),
+    "acrobot": TaskKind("vector", "discrete", 500),
+    "cliff_walking": TaskKind("discrete", "discrete", 50),
+    "gridworld_2x2": TaskKind("discrete", "discrete", 10),
+    "mountain_car_continuous": TaskKind("vector", "continuous", 999),
+    "pendulum": TaskKind("vector", "continuous", 200),
+    "halfcheetah": TaskKind("vector", "continuous", 1000, has_physics=True, has_info=True),
 }
 # brax's; the first is the default: nearly MuJoCo at less than twice the cost of the cheapest, where
 # no other one moves like MuJoCo at all (docs/halfcheetah.md).

@@ -80,14 +80,14 @@ def _num_categories(space: Any) -> int | None:
 def _cartpole() -> Task:
     from gymnax.environments.classic_control.cartpole import CartPole, EnvParams
 
-    params = EnvParams(max_steps_in_episode=200)
+    params = EnvParams(max_steps_in_episode=kind("cartpole").max_steps)
     return Task(name="cartpole", env=CartPole(), params=params, solved_reward=195.0)
 
 
 def _acrobot() -> Task:
     from gymnax.environments.classic_control.acrobot import Acrobot, EnvParams
 
-    params = EnvParams(max_steps_in_episode=500)
+    params = EnvParams(max_steps_in_episode=kind("acrobot").max_steps)
     return Task(name="acrobot", env=Acrobot(), params=params, solved_reward=-100.0)
 
 
@@ -95,7 +95,10 @@ def _cliff_walking() -> Task:
     from sejax.envs.gridworld import CLIFF_WALKING, GridParams, GridWorld
 
     params = GridParams(
-        step_reward=-1.0, goal_reward=0.0, hole_reward=-100.0, max_steps_in_episode=50
+        step_reward=-1.0,
+        goal_reward=0.0,
+        hole_reward=-100.0,
+        max_steps_in_episode=kind("cliff_walking").max_steps,
     )
     env = GridWorld(CLIFF_WALKING, params)
     return Task(name="cliff_walking", env=env, params=params, solved_reward=-20.0)
@@ -104,7 +107,7 @@ def _cliff_walking() -> Task:
 def _gridworld_2x2() -> Task:
     from sejax.envs.gridworld import ROOM_2X2, GridParams, GridWorld
 
-    params = GridParams(max_steps_in_episode=10)
+    params = GridParams(max_steps_in_episode=kind("gridworld_2x2").max_steps)
     env = GridWorld(ROOM_2X2, params)
     return Task(name="gridworld_2x2", env=env, params=params, solved_reward=0.8)
 
@@ -113,14 +116,14 @@ def _mountain_car_continuous() -> Task:
     from sejax.envs.mountain_car_continuous import EnvParams, MountainCarContinuous
 
     env = MountainCarContinuous()
-    params = EnvParams(max_steps_in_episode=999)
+    params = EnvParams(max_steps_in_episode=kind("mountain_car_continuous").max_steps)
     return Task(name="mountain_car_continuous", env=env, params=params, solved_reward=90.0)
 
 
 def _pendulum() -> Task:
     from gymnax.environments.classic_control.pendulum import EnvParams, Pendulum
 
-    params = EnvParams(max_steps_in_episode=200)
+    params = EnvParams(max_steps_in_episode=kind("pendulum").max_steps)
     # Our choice of threshold: neither the paper nor Gymnasium defines one.
     return Task(name="pendulum", env=Pendulum(), params=params, solved_reward=-250.0)
 
@@ -138,8 +141,9 @@ def _halfcheetah(backend: str) -> Task:
             f"({error}). Install it with pip install 'sejax[brax]'."
         ) from error
 
+    params = CheetahParams(max_steps_in_episode=kind("halfcheetah").max_steps)
     return Task(
-        name="halfcheetah", env=env, params=CheetahParams(), solved_reward=3000.0,
+        name="halfcheetah", env=env, params=params, solved_reward=3000.0,
         info_keys=INFO_KEYS, augmented_keys=("x_position", "x_velocity"),
     )  # fmt: skip
 

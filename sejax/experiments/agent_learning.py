@@ -137,6 +137,7 @@ def train(config: Any, env: str, max_steps: int, args: argparse.Namespace) -> pd
         max_episodes=max_steps // SHORTEST_EPISODE,
         max_steps=max_steps,
         test_episodes=args.test_episodes,
+        time_limit_is_terminal=False,  # as in the literature; the paper's code ends episodes there
     )
     program = return_curves.make_program(config, ExplorationConfig(), task.env, task, training,
                                          devices=args.devices)  # fmt: skip
@@ -161,7 +162,7 @@ def summarise(curves: pd.DataFrame) -> pd.DataFrame:
             "study": number, "env": study.env, "agent": study.agent,
             "num_agents": len(last), "max_steps": mine["max_steps"].iloc[0], "threshold": threshold,
             "num_solved": int(np.isfinite(to_solve).sum()),
-            "median_steps_to_solve": float(np.sort(to_solve)[(len(to_solve) - 1) // 2]),
+            "median_steps_to_solve": common.median(to_solve),
             "last_return": last.mean(), "last_low": low, "last_high": high,
         })  # fmt: skip
     return pd.DataFrame(rows)

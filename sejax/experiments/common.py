@@ -149,6 +149,12 @@ class Pieces:
         return pd.read_csv(table)
 
 
+def median(values: Any) -> float:
+    """The median of numbers that may be inf."""
+    values = np.sort(np.asarray(values, float))
+    return float((values[(values.size - 1) // 2] + values[values.size // 2]) / 2)
+
+
 def bootstrap_interval(
     values: Any, level: float = 0.95, num_resamples: int = 2000, seed: int = 0
 ) -> tuple[float, float]:

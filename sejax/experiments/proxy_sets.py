@@ -79,9 +79,8 @@ class ProxySet:
         return self.select(range(self.size)[:count])
 
     def solved(self) -> "ProxySet":
-        """Those whose score, a mean return, reached the task's threshold; all if none did."""
-        reached = np.flatnonzero(self.scores >= self.task.solved_reward)
-        return self.select(reached) if reached.size else self
+        """Those whose score, a mean return, reached the task's threshold."""
+        return self.select(np.flatnonzero(self.scores >= self.task.solved_reward))
 
     def ranked(self, count: int, worst: bool = False) -> "ProxySet":
         """Those with the highest scores, the best first; or the lowest, the worst first."""

@@ -14,6 +14,7 @@ import numpy as np
 import pandas as pd
 
 from sejax.agents.configs import AgentConfig, ExplorationConfig
+from sejax.configs import TrainingConfig
 from sejax.errors import unknown_name
 from sejax.experiments import common, return_curves, rn_studies
 
@@ -32,16 +33,20 @@ class World:
     Attributes:
       name: as in `rn_studies.LABELS`.
       env: gymnax environment.
+      task: the real task that agents are tested on.
       params: `EnvParams` of each group of agents.
       fingerprints: what tells the groups' worlds apart.
       exploration: bonus of the agents.
+      settings: of the RNs; plain values.
     """
 
     name: str
     env: Any
+    task: Any
     params: tuple[Any, ...]
     fingerprints: tuple[str, ...]
     exploration: ExplorationConfig = field(default_factory=ExplorationConfig)
+    settings: dict[str, Any] = field(default_factory=dict)
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -76,12 +81,10 @@ def agent_of(args: argparse.Namespace, row: str) -> AgentConfig:
 
 def real_worlds(args: argparse.Namespace) -> list[World]:
     """The real task, without and with the study's bonuses."""
-    from sejax import envs
-
-    task = envs.make(args.env)
+    task = rn_studies.make_task(args)
     bonuses = {"real": ExplorationConfig(), **rn_studies.STUDIES[args.env].bonuses}
     return [
-        World(name=name, env=task.env, params=(task.params,) * args.rns,
+        World(name=name, env=task.env, task=task, params=(task.params,) * args.rns,
               fingerprints=("",) * args.rns, exploration=bonus)
         for name, bonus in bonuses.items()
     ]  # fmt: skip
@@ -90,8 +93,9 @@ def real_worlds(args: argparse.Namespace) -> list[World]:
 def rn_world(variant: str, rns: Any) -> World:
     """The RNs of a set, one for each group of agents."""
     indices = range(rns.size)
-    return World(name=variant, env=rns.env, params=tuple(map(rns.one, indices)),
-                 fingerprints=tuple(map(rns.fingerprint, indices)))  # fmt: skip
+    return World(name=variant, env=rns.env, task=rns.task, params=tuple(map(rns.one, indices)),
+                 fingerprints=tuple(map(rns.fingerprint, indices)),
+                 settings=vars(rns.config.proxy))  # fmt: skip
 
 
 def train_all(
@@ -107,15 +111,21 @@ def train_all(
       prefix: of the pieces' names, to tell worlds of one name apart.
     """
     agent = agent_of(args, row)
+    training = TrainingConfig(
+        max_episodes=rn_studies.STUDIES[args.env].max_episodes,
+        max_steps=args.max_steps,
+        test_episodes=1,
+    )
     tables = []
     for group in range(len(world.params)):
-        settings = {"env": args.env, "agent": vars(agent), "row": row, "world": world.name,
+        settings = {"env": world.task.name, "simulator": world.task.env.name,
+                    "agent": vars(agent), "row": row, "world": world.name, "proxy": world.settings,
                     "weights": world.fingerprints[group], "exploration": vars(world.exploration),
-                    "num_agents": args.num_agents, "max_steps": args.max_steps,
-                    "group": group, "seed": args.seed}  # fmt: skip
+                    "training": vars(training), "num_agents": args.num_agents, "group": group,
+                    "seed": args.seed}  # fmt: skip
         curves = pieces.compute(
             f"{prefix}{row}-{world.name}-{group:02d}", settings,
-            functools.partial(train_group, args, agent, row, world, group),
+            functools.partial(train_group, args, agent, row, world, training, group),
         )  # fmt: skip
         tables.append(curves.assign(agent=curves["agent"] + group * args.num_agents, group=group))
     curves = pd.concat(tables, ignore_index=True)
@@ -125,21 +135,18 @@ def train_all(
 
 
 def train_group(
-    args: argparse.Namespace, agent: AgentConfig, row: str, world: World, group: int
+    args: argparse.Namespace,
+    agent: AgentConfig,
+    row: str,
+    world: World,
+    training: TrainingConfig,
+    group: int,
 ) -> pd.DataFrame:
     """Curves of the agents on one RN, or of a group on the real task."""
     import jax
 
-    from sejax import envs
-    from sejax.configs import TrainingConfig
-
-    task = envs.make(args.env)
-    training = TrainingConfig(
-        max_episodes=rn_studies.STUDIES[args.env].max_episodes, max_steps=args.max_steps,
-        test_episodes=1, time_limit_is_terminal=True,
-    )  # fmt: skip
     program = return_curves.make_program(
-        agent, world.exploration, world.env, task, training,
+        agent, world.exploration, world.env, world.task, training,
         "varied" if row == "varied" else "default", args.devices,
     )  # fmt: skip
     key = jax.random.fold_in(jax.random.key(args.seed), group)

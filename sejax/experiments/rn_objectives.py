@@ -13,16 +13,19 @@ from pathlib import Path
 import pandas as pd
 
 from sejax.configs import OBJECTIVES
-from sejax.errors import unknown_name
+from sejax.errors import require, unknown_name
 from sejax.experiments import common, return_curves, rn_curves, rn_studies
 
 NAME = "rn_objectives"
 PICKS = ("best", "worst")
+QUICK_LEARNED = 4
 OBJECTIVE_NAMES = {
     "reward_threshold": "reward threshold",
     "auc": "area under the curve",
     "max_reward": "final return",
+    "auc_sum": "area, not by steps",
 }
+PAPERS = ("reward_threshold", "auc", "max_reward")
 
 
 def main() -> None:
@@ -33,10 +36,27 @@ def main() -> None:
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Options of this experiment."""
     rn_curves.add_options(parser)
-    parser.add_argument("--objectives", nargs="+", default=list(OBJECTIVE_NAMES),
+    parser.add_argument("--objectives", nargs="+", default=list(PAPERS),
                         metavar="OBJECTIVE", help=", ".join(OBJECTIVE_NAMES))  # fmt: skip
     parser.add_argument("--picks", nargs="+", default=list(PICKS), metavar="PICK",
                         help=", ".join(PICKS))  # fmt: skip
+
+
+def fill_in(args: argparse.Namespace) -> None:
+    """As `rn_curves.fill_in`; unless they are given, as few RNs are picked as leave picks apart.
+
+    Raises:
+      ConfigError: for options that cannot work, or if the best would be among the worst.
+    """
+    picked = args.rns
+    if args.quick and args.learned is None:
+        args.learned = QUICK_LEARNED
+    rn_curves.fill_in(args)
+    if len(args.picks) > 1 and picked is None:
+        args.rns = max(1, min(args.rns, args.learned // 2))
+    require(len(args.picks) == 1 or 2 * args.rns <= args.learned, "--learned",
+            f"be at least {2 * args.rns}", "the best and the worst are picked from them",
+            args.learned, f"--learned={2 * args.rns} or --picks best")  # fmt: skip
 
 
 def run(args: argparse.Namespace) -> pd.DataFrame:
@@ -45,7 +65,7 @@ def run(args: argparse.Namespace) -> pd.DataFrame:
     Raises:
       ConfigError: for settings that cannot work, or an output folder of other settings.
     """
-    rn_curves.fill_in(args)
+    fill_in(args)
     for option, names, known in (("--objectives", args.objectives, OBJECTIVES),
                                  ("--picks", args.picks, PICKS)):  # fmt: skip
         for name in names:
@@ -75,11 +95,10 @@ def run(args: argparse.Namespace) -> pd.DataFrame:
 
 def report(args: argparse.Namespace, curves: pd.DataFrame) -> pd.DataFrame:
     """Writes the CSV, the pictures and the table, prints the table and returns it."""
-    from sejax import envs
     from sejax.experiments import figures
     from sejax.files import write_text
 
-    task = envs.make(args.env)
+    task = rn_studies.make_task(args)
     summaries, tables = [], []
     for (objective, pick), mine in curves.groupby(["objective", "pick"], sort=False):
         summary = rn_curves.summarise(mine, task.solved_reward, args.max_steps)

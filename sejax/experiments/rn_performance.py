@@ -53,11 +53,10 @@ def run(args: argparse.Namespace) -> pd.DataFrame:
 
 def report(args: argparse.Namespace, curves: pd.DataFrame) -> pd.DataFrame:
     """Writes the CSV, the picture and the table, prints the table and returns it."""
-    from sejax import envs
     from sejax.experiments import figures
     from sejax.files import write_text
 
-    task = envs.make(args.env)
+    task = rn_studies.make_task(args)
     summary = rn_curves.summarise(curves, task.solved_reward, args.max_steps)
     table = rn_curves.make_table(summary)
     write_text(args.out / "summary.csv", summary.to_csv(index=False))

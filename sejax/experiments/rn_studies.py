@@ -202,18 +202,9 @@ def learn(args: argparse.Namespace, variant: str, objective: str) -> Any:
     Raises:
       ConfigError: for settings that cannot work, or a folder with RNs of other settings.
     """
-    import sejax
     from sejax.experiments.proxy_sets import load_set
 
-    plain = variant.removesuffix(AUGMENTED)
-    overrides = [f"env={args.env}", "proxy=rn", f"preset={args.preset}", f"proxy.variant={plain}",
-                 f"proxy.augmented={str(plain != variant).lower()}",
-                 f"objective={objective}"]  # fmt: skip
-    if args.generations is not None:
-        overrides.append(f"generations={args.generations}")
-    config = dataclasses.replace(
-        sejax.config([*overrides, *args.set]), devices=args.devices, seed=args.seed
-    )
+    config = learning_config(args, variant, objective)
     folder = args.rns_dir / args.env / objective
     path = folder / f"{variant}.safetensors"
     if path.exists():
@@ -225,6 +216,29 @@ def learn(args: argparse.Namespace, variant: str, objective: str) -> Any:
     proxy_runs.learn_all(configs, common.Pieces(folder / "curves"), f"{variant}-")
     proxy_runs.collect(configs, path)
     return load_set(path, "--rns-dir", "rn")
+
+
+def learning_config(args: argparse.Namespace, variant: str, objective: str) -> Any:
+    """Settings of the NES runs for a variant and objective.
+
+    Raises:
+      ConfigError: for settings that cannot work.
+    """
+    import sejax
+
+    plain = variant.removesuffix(AUGMENTED)
+    overrides = [f"env={args.env}", "proxy=rn", f"preset={args.preset}", f"proxy.variant={plain}",
+                 f"proxy.augmented={str(plain != variant).lower()}",
+                 f"objective={objective}"]  # fmt: skip
+    if args.generations is not None:
+        overrides.append(f"generations={args.generations}")
+    config = sejax.config([*overrides, *args.set])
+    return dataclasses.replace(config, devices=args.devices, seed=args.seed)
+
+
+def make_task(args: argparse.Namespace) -> Any:
+    """The real task, with the physics that the RNs are learned with."""
+    return learning_config(args, args.variants[0], OBJECTIVES[0]).env.make()
 
 
 def is_of(stored: Any, config: Any, count: int) -> bool:

@@ -108,8 +108,7 @@ def summarise(curves: pd.DataFrame, solved_reward: float) -> pd.DataFrame:
 def median_and_range(values: Any, limit: int) -> str:
     """`median (lowest to highest)` of counts, where inf is "more than the limit"."""
     values = np.sort(np.asarray(values, float))
-    # The middle one of an even number lies between two, one of which may be inf.
-    middle = (values[(values.size - 1) // 2] + values[values.size // 2]) / 2
+    middle = common.median(values)
 
     def text(x: float) -> str:
         return f"{x:g}" if np.isfinite(x) else f"> {limit}"

@@ -179,8 +179,10 @@ def make_worlds(args: argparse.Namespace) -> dict[str, World]:
         files["fixed"] = args.env or "cartpole"
     sets = {name: load_set(file, f"--{name}") for name, file in files.items() if file}
     for name, ses in sets.items():
-        sets[name] = ses.solved().first(args.num_ses)
-        print(f"{name}: {ses.solved().size} of {ses.size} SEs reached the threshold", flush=True)
+        solved = ses.solved()
+        sets[name] = (solved if solved.size else ses).first(args.num_ses)
+        print(f"{name}: {solved.size} of {ses.size} SEs reached the threshold"
+              f"{'' if solved.size else ', all are used'}", flush=True)  # fmt: skip
     for name, ses in sets.items():
         learned_with = "varied" if ses.config.agent_hparams == "varied" else "fixed"
         require(learned_with == name, f"--{name}", f"be SEs learned with {name} hyperparameters",
@@ -455,9 +457,9 @@ def report(args: argparse.Namespace, task: Any, agents: pd.DataFrame) -> pd.Data
         'each; in brackets a bootstrap 95% interval that draws SEs, not agents. "Fewer" are '
         "training steps saved against the real task, for which a group of agents takes the place "
         f"of an SE. The best SEs, {NUM_BEST} at most, are chosen by half of their agents and shown "
-        "by the other half. SEs are those of a set that reached the threshold. The paper has 40 "
-        "SEs with 10 agents each; where a field is empty it gives no number. Agents that met a "
-        f"number that is not finite: {int(agents['nonfinite'].sum())}."
+        "by the other half. SEs are those of a set that reached the threshold, all where none did. "
+        "The paper has 40 SEs with 10 agents each; where a field is empty it gives no number. "
+        f"Agents that met a number that is not finite: {int(agents['nonfinite'].sum())}."
     )
     command = figures.command(NAME, args, "varied", "fixed", "env", "agents", "num_agents",
                               "num_ses", "test_episodes", "solved_by", "real_episodes",

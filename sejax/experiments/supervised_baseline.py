@@ -100,6 +100,10 @@ def run(args: argparse.Namespace) -> pd.DataFrame:
     require(ses.task.num_states is None and ses.task.num_actions is not None, "--proxy",
             "be an SE with vector states and discrete actions", "the agents are made for these",
             f"one of {ses.task.name}", "--proxy=cartpole")  # fmt: skip
+    require(ses.config.agent_hparams == "default" and not ses.config.es.common_random_numbers,
+            "--proxy", "be an SE learned with fixed hyperparameters and a seed for each agent",
+            "the recorded NES runs have these", "one learned otherwise",
+            "--proxy=cartpole")  # fmt: skip
     pieces = common.Pieces(args.out / "pieces")
     data = [
         supervised_models.collect_piece(args, ses, index, pieces) for index in range(args.models)

@@ -33,6 +33,7 @@ class RewardParams(environment.EnvParams):
     weights: Any = None  # as from `init_weights`
     potentials: Array | None = None  # of every state, if `prepared` for one where they are counted
     discount: Array | float = 1.0  # gamma; `prepared` puts the agent's here
+    limit_is_terminal: Array | bool = False  # whether episodes end for the agent at the step limit
     max_steps_in_episode: int = 1
 
 
@@ -54,8 +55,11 @@ class RewardEnv(environment.Environment[RewardState, RewardParams]):
     ========================== =====================================
 
     where gamma is the agent's discount. A discrete state is one-hot to the network. With
-    `zero_at_terminal` :math:`\Phi` is 0 where the episode terminates, which is what leaves the
-    optimal policy as it is (Ng et al., 1999); the authors' code keeps the network's value.
+    `zero_at_terminal` :math:`\Phi` is 0 where the episode ends for the agent: where it terminates,
+    and at the step limit if agents do not bootstrap there. That is what makes `additive_potential`
+    leave the optimal policy as it is (Ng et al., 1999); the authors' code keeps the network's
+    value. An agent that repeats its actions gets the sum of the rewards of all steps, shaped each
+    with the discount of a whole decision, as in the authors' code.
 
     `augmented` networks see the task's observation vector v as well (`Task.augmented_keys`):
     :math:`\Phi(s, v)` and :math:`\Phi(s', v')`. The authors' code has v' in both. The last two
@@ -88,16 +92,27 @@ class RewardEnv(environment.Environment[RewardState, RewardParams]):
             weights=weights, discount=discount, max_steps_in_episode=self.task.max_steps
         )
 
-    def prepared(self, params: RewardParams, discount: Array | float) -> RewardParams:
-        """The same for a whole training of an agent with this discount.
+    def prepared(
+        self, params: RewardParams, discount: Array | float, limit_is_terminal: bool = False
+    ) -> RewardParams:
+        """The same for a whole training of an agent.
 
         Where states are counted, all potentials are computed at once: a step then looks its two up.
+
+        Args:
+          params: of the RN.
+          discount: the agent's.
+          limit_is_terminal: whether the agent does not bootstrap at the step limit.
         """
         potentials = None
         if self.task.num_states is not None and not self.config.weighs_info:
             states = jnp.arange(self.task.num_states)
             potentials = self._apply(params.weights, jax.nn.one_hot(states, states.size))
-        return params.replace(discount=jnp.float32(discount), potentials=potentials)
+        return params.replace(
+            discount=jnp.float32(discount),
+            limit_is_terminal=jnp.bool_(limit_is_terminal),
+            potentials=potentials,
+        )
 
     @property
     def default_params(self) -> RewardParams:
@@ -141,7 +156,8 @@ class RewardEnv(environment.Environment[RewardState, RewardParams]):
             return params.weights["info_weights"] @ _select(info, self.task.info_keys)
         after = self.potential(params, next_state.obs, next_state.augmentation)
         if self.config.zero_at_terminal:
-            after = jnp.where(terminated, 0.0, after)
+            at_limit = next_state.time >= params.max_steps_in_episode
+            after = jnp.where(terminated | (params.limit_is_terminal & at_limit), 0.0, after)
         if not self.config.is_potential_based:
             return after
         before = self.potential(params, state.obs, state.augmentation)
