@@ -86,14 +86,15 @@ class EnvConfig:
 
     name: str = "cartpole"
     backend: str | None = None  # physics of a brax task
+    goal_reward: float | None = None  # of the move into the goal, in Cliff Walking; null: 0
 
     def __post_init__(self) -> None:
         one_of("env.name", self.name, envs.names())
-        envs.check_backend(self.name, self.backend)
+        envs.check_choices(self.name, self.backend, self.goal_reward)
 
     def make(self) -> envs.Task:
         """The task; it is built once."""
-        return envs.make(self.name, self.backend)
+        return envs.make(self.name, self.backend, self.goal_reward)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -15,6 +15,7 @@ from sejax.configs import (
     CONF_DIR,
     EVOSAX_ALGORITHMS,
     DDQNConfig,
+    EnvConfig,
     EvosaxConfig,
     LearnConfig,
     NESConfig,
@@ -235,6 +236,13 @@ def test_agents_learn_within_the_default_budget_of_an_se(env):
 )  # fmt: skip
 def test_trainings_that_cannot_teach_or_judge_are_refused(overrides, said):
     assert message(*overrides).startswith(said)
+
+
+def test_only_cliff_walking_has_a_choice_of_goal_reward():
+    assert config(["env=cliff_walking", "env.goal_reward=-1"]).env.make().params.goal_reward == -1
+    assert message("env=cliff_walking", "env.goal_reward=nan").startswith("env.goal_reward must be")
+    with pytest.raises(ConfigError, match="goal_reward must be null in gridworld_2x2"):
+        EnvConfig(name="gridworld_2x2", goal_reward=1.0)
 
 
 def test_episodes_that_may_end_early_need_no_long_budget():

@@ -418,6 +418,21 @@ def test_the_best_return_of_the_2x2_room_is_two_moves():
     np.testing.assert_allclose(values[0], 0.99, rtol=1e-6)
 
 
+def test_the_move_into_the_goal_can_be_paid():
+    task = envs.make("cliff_walking", goal_reward=-1.0)
+    assert envs.make("cliff_walking", goal_reward=-1) is task is not envs.make("cliff_walking")
+    _, state = task.env.reset_env(jax.random.key(0), task.params)
+    above = state.replace(index=jnp.int32(35))
+    for index, action, expected in ((35, DOWN, -1.0), (24, RIGHT, -1.0)):
+        got = task.env.step_env(
+            jax.random.key(0), above.replace(index=jnp.int32(index)), action, task.params
+        )
+        assert got[2] == expected
+    assert envs.make("cliff_walking").env.step_env(
+        jax.random.key(0), above, DOWN, envs.make("cliff_walking").params
+    )[2] == 0  # fmt: skip
+
+
 def test_moves_of_cliff_walking_equal_gymnasiums(cliff_table):
     next_index, reward, terminated = cliff_table
     table = gymnasium.make("CliffWalking-v1").unwrapped.P

@@ -14,6 +14,7 @@ from support import experiment_options, refuse
 
 import sejax
 from sejax import envs
+from sejax.configs import TrainingConfig
 from sejax.errors import ConfigError
 from sejax.experiments import (
     common,
@@ -255,7 +256,12 @@ def test_performance_trains_as_evaluation_does_and_goes_on(ses, tmp_path, monkey
     np.testing.assert_allclose(mine["return_0"] + mine["return_1"], 2 * mine["test_return"])
     assert (mine["train_steps"] == 40).all() and mine["hidden_size"].between(1, 6).all()
     real = agents[agents["setting"] == "real"]
-    assert (real["train_episodes"] <= 3).all()
+    real_training = TrainingConfig(max_episodes=3, stop_rule="solved",
+                                   solved_by="train", test_episodes=2)  # fmt: skip
+    expected = evaluate_agents(varied, task.env, task.params, task, real_training, keys)
+    mine = real[real["group"] == "real-01"]
+    np.testing.assert_allclose(mine["test_return"], expected.test_return, rtol=1e-6)
+    np.testing.assert_array_equal(mine["train_steps"], expected.train_steps)
     assert table["trained on"].tolist() == ["real", "synth., HPs fixed"]
     assert (tmp_path / "performance.png").stat().st_size > 10_000
     assert "16887.7" in (tmp_path / "table.md").read_text()

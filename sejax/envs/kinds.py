@@ -4,6 +4,7 @@ Configurations are checked before gymnax is imported, which takes seconds; a tes
 against the tasks.
 """
 
+import math
 from typing import NamedTuple
 
 from sejax.errors import require, unknown_name
@@ -17,6 +18,7 @@ class TaskKind(NamedTuple):
       actions: "discrete" or "continuous".
       max_steps: the paper's step limit of an episode.
       has_physics: whether the physics backend can be chosen.
+      has_goal_reward: whether the reward for the move into the goal can be chosen.
       has_info: whether its steps tell more than the observation; see `Task.info_keys`.
     """
 
@@ -24,13 +26,14 @@ class TaskKind(NamedTuple):
     actions: str
     max_steps: int
     has_physics: bool = False
+    has_goal_reward: bool = False
     has_info: bool = False
 
 
 KINDS = {
     "cartpole": TaskKind("vector", "discrete", 200),
     "acrobot": TaskKind("vector", "discrete", 500),
-    "cliff_walking": TaskKind("discrete", "discrete", 50),
+    "cliff_walking": TaskKind("discrete", "discrete", 50, has_goal_reward=True),
     "gridworld_2x2": TaskKind("discrete", "discrete", 10),
     "mountain_car_continuous": TaskKind("vector", "continuous", 999),
     "pendulum": TaskKind("vector", "continuous", 200),
@@ -52,11 +55,11 @@ def kind(name: str) -> TaskKind:
     return KINDS[name]
 
 
-def check_backend(name: str, backend: str | None) -> None:
-    """Checks a choice of physics.
+def check_choices(name: str, backend: str | None, goal_reward: float | None) -> None:
+    """Checks what of a task can be chosen.
 
     Raises:
-      ConfigError: if the task is unknown, it has no choice of physics, or has not this one.
+      ConfigError: if the task is unknown, leaves no such choice, or has not these physics.
     """
     physical = [task for task, its_kind in KINDS.items() if its_kind.has_physics]
     require(backend is None or kind(name).has_physics, "env.backend", f"be null in {name}",
@@ -64,3 +67,9 @@ def check_backend(name: str, backend: str | None) -> None:
             "env.backend=null")  # fmt: skip
     if backend is not None and backend not in PHYSICS_BACKENDS:
         raise unknown_name("env.backend", backend, PHYSICS_BACKENDS)
+    rewarding = [task for task, its_kind in KINDS.items() if its_kind.has_goal_reward]
+    require(goal_reward is None or kind(name).has_goal_reward, "env.goal_reward",
+            f"be null in {name}", f"only {', '.join(rewarding)} can choose it", goal_reward,
+            "env.goal_reward=null")  # fmt: skip
+    require(goal_reward is None or math.isfinite(goal_reward), "env.goal_reward", "be finite",
+            "it is a reward", goal_reward, "env.goal_reward=-1")  # fmt: skip

@@ -11,7 +11,7 @@ from contextlib import redirect_stdout
 from dataclasses import dataclass
 from typing import Any
 
-from sejax.envs.kinds import KINDS, PHYSICS_BACKENDS, check_backend, kind
+from sejax.envs.kinds import KINDS, PHYSICS_BACKENDS, check_choices, kind
 from sejax.errors import ConfigError
 
 
@@ -91,12 +91,12 @@ def _acrobot() -> Task:
     return Task(name="acrobot", env=Acrobot(), params=params, solved_reward=-100.0)
 
 
-def _cliff_walking() -> Task:
+def _cliff_walking(goal_reward: float = 0.0) -> Task:
     from sejax.envs.gridworld import CLIFF_WALKING, GridParams, GridWorld
 
     params = GridParams(
         step_reward=-1.0,
-        goal_reward=0.0,
+        goal_reward=goal_reward,
         hole_reward=-100.0,
         max_steps_in_episode=kind("cliff_walking").max_steps,
     )
@@ -148,7 +148,7 @@ def _halfcheetah(backend: str) -> Task:
     )  # fmt: skip
 
 
-_TASKS: dict[str, Callable[[], Task]] = {
+_TASKS: dict[str, Callable[..., Task]] = {
     "cartpole": _cartpole,
     "acrobot": _acrobot,
     "cliff_walking": _cliff_walking,
@@ -167,25 +167,26 @@ def names() -> tuple[str, ...]:
     return tuple(KINDS)
 
 
-def make(name: str, backend: str | None = None) -> Task:
+def make(name: str, backend: str | None = None, goal_reward: float | None = None) -> Task:
     """Builds a task once and returns the same object ever after.
 
     Args:
       name: one of `names()`.
       backend: physics of a brax task, one of `PHYSICS_BACKENDS`; None is the first.
+      goal_reward: reward for the move into the goal in Cliff Walking; None is 0.
 
     Raises:
       ConfigError: if a name is unknown; the message lists the known ones, nearest first. Also if
-        the task has no choice of physics, or needs a package that is not installed.
+        the task leaves no such choice, or needs a package that is not installed.
 
     Source: paper, appendix, fixed hyperparameters (episode length and solved reward).
     """
-    check_backend(name, backend)
+    check_choices(name, backend, goal_reward)
     if kind(name).has_physics:
         return _make(f"{name}-{backend or PHYSICS_BACKENDS[0]}")
-    return _make(name)
+    return _make(name) if goal_reward is None else _make(name, float(goal_reward))
 
 
 @functools.cache
-def _make(key: str) -> Task:
-    return _TASKS[key]()
+def _make(key: str, *choices: float) -> Task:
+    return _TASKS[key](*choices)

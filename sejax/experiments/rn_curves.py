@@ -81,7 +81,7 @@ def agent_of(args: argparse.Namespace, row: str) -> AgentConfig:
 
 def real_worlds(args: argparse.Namespace) -> list[World]:
     """The real task, without and with the study's bonuses."""
-    task = rn_studies.make_task(args)
+    task = rn_studies.env_config(args).make()
     bonuses = {"real": ExplorationConfig(), **rn_studies.STUDIES[args.env].bonuses}
     return [
         World(name=name, env=task.env, task=task, params=(task.params,) * args.rns,
@@ -118,8 +118,8 @@ def train_all(
     )
     tables = []
     for group in range(len(world.params)):
-        settings = {"env": world.task.name, "simulator": world.task.env.name,
-                    "agent": vars(agent), "row": row, "world": world.name, "proxy": world.settings,
+        settings = {"env": vars(rn_studies.env_config(args)), "agent": vars(agent), "row": row,
+                    "world": world.name, "proxy": world.settings,
                     "weights": world.fingerprints[group], "exploration": vars(world.exploration),
                     "training": vars(training), "num_agents": args.num_agents, "group": group,
                     "seed": args.seed}  # fmt: skip

@@ -98,7 +98,7 @@ def report(args: argparse.Namespace, curves: pd.DataFrame) -> pd.DataFrame:
     from sejax.experiments import figures
     from sejax.files import write_text
 
-    task = rn_studies.make_task(args)
+    task = rn_studies.env_config(args).make()
     summaries, tables = [], []
     for (objective, pick), mine in curves.groupby(["objective", "pick"], sort=False):
         summary = rn_curves.summarise(mine, task.solved_reward, args.max_steps)

@@ -56,7 +56,7 @@ def report(args: argparse.Namespace, curves: pd.DataFrame) -> pd.DataFrame:
     from sejax.experiments import figures
     from sejax.files import write_text
 
-    task = rn_studies.make_task(args)
+    task = rn_studies.env_config(args).make()
     summary = rn_curves.summarise(curves, task.solved_reward, args.max_steps)
     table = rn_curves.make_table(summary)
     write_text(args.out / "summary.csv", summary.to_csv(index=False))

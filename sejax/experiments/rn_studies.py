@@ -23,7 +23,7 @@ from sejax.agents.configs import (
     SARSAConfig,
     TD3Config,
 )
-from sejax.configs import OBJECTIVES
+from sejax.configs import OBJECTIVES, EnvConfig
 from sejax.errors import unknown_name
 from sejax.experiments import common, proxy_runs
 
@@ -236,9 +236,9 @@ def learning_config(args: argparse.Namespace, variant: str, objective: str) -> A
     return dataclasses.replace(config, devices=args.devices, seed=args.seed)
 
 
-def make_task(args: argparse.Namespace) -> Any:
-    """The real task, with the physics that the RNs are learned with."""
-    return learning_config(args, args.variants[0], OBJECTIVES[0]).env.make()
+def env_config(args: argparse.Namespace) -> EnvConfig:
+    """Which real task it is, with the physics and rewards that the RNs are learned with."""
+    return learning_config(args, args.variants[0], OBJECTIVES[0]).env
 
 
 def is_of(stored: Any, config: Any, count: int) -> bool:
