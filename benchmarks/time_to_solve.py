@@ -39,7 +39,7 @@ SETTINGS = {
     "sep_cma_es": ["es=sep_cma_es", "es.population_size=128", "es.noise_std=0.06"],
 }
 COLUMNS = ["preset", "seed", "generation", "incumbent_mean", "env_steps_total", "wall_s", "cpu_s"]
-QUICK = ["es.population_size=4", "training.max_steps=200", "training.max_episodes=20"]
+QUICK = ["es.population_size=4", "agent.init_episodes=1", "training.max_steps=1000"]
 
 
 def main() -> None:

@@ -288,12 +288,13 @@ def _rank_diverged_incumbents_last(
 ) -> Float[Array, " candidates"]:
     """Gives the incumbent's agents that diverged the lowest finite score of the generation.
 
-    A mean without them would rank an incumbent by the agents that survived it. Members keep nan:
-    the strategy ranks these last itself.
+    A mean without them would rank an incumbent by the agents that survived it. One that none
+    survived has no score. Members keep nan: the strategy ranks these last itself.
     """
-    lowest = jnp.nanmin(jnp.where(jnp.isfinite(scores), scores, jnp.nan))
+    finite = jnp.isfinite(scores)
+    lowest = jnp.nanmin(jnp.where(finite, scores, jnp.nan))
     is_incumbent = jnp.arange(scores.size) >= scores.size - num_incumbent_evals
-    return jnp.where(is_incumbent & ~jnp.isfinite(scores), lowest, scores)
+    return jnp.where(is_incumbent & ~finite & (is_incumbent & finite).any(), lowest, scores)
 
 
 def _strongly_typed(x: Array) -> Array:

@@ -133,7 +133,7 @@ class RewardConfig(ProxyConfig):
     activation: str = "prelu"
     variant: str = "additive_potential"
     augmented: bool = False  # the network sees the task's observation vector v as well
-    zero_at_terminal: bool = False  # Phi is 0 where the episode terminates: policy invariance
+    zero_at_terminal: bool = False  # Phi is 0 where episodes end for the agent; see RewardEnv
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -298,8 +298,8 @@ class LearnConfig:
     def __post_init__(self) -> None:
         require_fit(self.agent, self.exploration, self.env.name)
         self._require_info()
-        self._require_tests_for_auc()
         self._require_real_returns()
+        self._require_tests_for_auc()
         self._require_learning()
         require(not self.stop_when_solved or self.objective.name == "max_reward",
                 "stop_when_solved", "be false with this objective", "its scores are not returns, "
@@ -325,12 +325,12 @@ class LearnConfig:
                     "proxy.augmented=false")  # fmt: skip
 
     def _require_tests_for_auc(self) -> None:
-        rule = f"{self.training.stop_rule} by {self.training.solved_by} returns"
-        require(not self.objective.needs_curve or rule == "solved by test returns", "objective",
+        rule = self.training.stop_rule
+        require(not self.objective.needs_curve or rule == "solved", "objective",
                 "be reward_threshold or max_reward where agents are not tested after each episode",
                 "the area is that under the curve of those tests",
                 f"{self.objective.name} with stop_rule {rule}",
-                "training.stop_rule=solved training.solved_by=test")  # fmt: skip
+                "training.stop_rule=solved")  # fmt: skip
 
     def _require_real_returns(self) -> None:
         training = self.training
@@ -388,16 +388,30 @@ class EvaluateConfig:
 
     def _require_use(self) -> None:
         """Refuses settings that would have no effect."""
-        require(self.agent_hparams != "nes" or (self.agent, self.exploration)
-                == (DDQNConfig(), ExplorationConfig()), "agent and exploration", "be left out with "
-                "agent_hparams=nes", "the proxy says which they are",
-                f"{self.agent.name} and {self.exploration.name}, or other values of them",
-                "agent_hparams=default")  # fmt: skip
-        used = self.training_from == "config" and self.proxy != "real"
-        require(used or self.training == TrainingConfig(), "training", "be left as it is",
-                "agents train on a proxy as it was learned with, and on the real task as "
-                "real_training says", "other values", "training_from=config, or real_training.*"
-                )  # fmt: skip
+        for name, idle in (("agent_hparams", "nes"), ("training_from", "config")):
+            usual_value = default(EvaluateConfig, name)
+            require(self.proxy != "real" or getattr(self, name) != idle, name,
+                    f"be {usual_value} with proxy=real", "there is no proxy", idle,
+                    f"{name}={usual_value}")  # fmt: skip
+        if self.agent_hparams == "nes":
+            for group, usual in (("agent", DDQNConfig()), ("exploration", ExplorationConfig())):
+                given = getattr(self, group)
+                require(given == usual, group, "be left out with agent_hparams=nes",
+                        "the proxy says which it was learned with", _differences(given, usual),
+                        "agent_hparams=default")  # fmt: skip
+        usual_training = TrainingConfig()
+        require(self.training_from == "config" or self.training == usual_training, "training",
+                "be left as it is", "agents train on an SE as it was learned with, and else as "
+                "real_training says", _differences(self.training, usual_training),
+                "training_from=config, or real_training.*")  # fmt: skip
+
+
+def _differences(given: Any, usual: Any) -> str:
+    """Fields of a group that are not as usual, for messages."""
+    if type(given) is not type(usual):
+        return str(given.name)
+    return ", ".join(f"{name}={value}" for name, value in vars(given).items()
+                     if value != getattr(usual, name))  # fmt: skip
 
 
 def register_evosax_choices() -> None:
@@ -567,7 +581,7 @@ def translate_hydra_error(error: Exception) -> ConfigError:
 
 
 def _known_fields() -> list[str]:
-    groups = (*(("proxy", c) for c in PROXY_CONFIGS.values()),
+    groups = (("env", EnvConfig), *(("proxy", c) for c in PROXY_CONFIGS.values()),
               *(("agent", c) for c in AGENT_CONFIGS.values()),
               *(("exploration", c) for c in EXPLORATION_CONFIGS.values()), ("es", NESConfig),
               ("es", EvosaxConfig), ("objective", ObjectiveConfig), ("training", TrainingConfig),

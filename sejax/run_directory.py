@@ -143,7 +143,7 @@ def _format(value: Any) -> str:
 
 
 def _refuse_other_config(path: Path, stored: dict[str, Any], new: dict[str, Any]) -> None:
-    old, asked = _flatten(stored), _flatten(new)
+    old, asked = flatten(stored), flatten(new)
     differing = [
         f"{name} ({old.get(name)} there, {asked.get(name)} here)"
         for name in sorted(old.keys() | asked.keys())
@@ -157,11 +157,12 @@ def _refuse_other_config(path: Path, stored: dict[str, Any], new: dict[str, Any]
         )
 
 
-def _flatten(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+def flatten(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Nested settings as `{"group.field": value}`."""
     flat: dict[str, Any] = {}
     for key, value in values.items():
         if isinstance(value, dict):
-            flat |= _flatten(value, f"{prefix}{key}.")
+            flat |= flatten(value, f"{prefix}{key}.")
         else:
             flat[f"{prefix}{key}"] = value
     return flat

@@ -243,6 +243,8 @@ def test_only_cliff_walking_has_a_choice_of_goal_reward():
     assert message("env=cliff_walking", "env.goal_reward=nan").startswith("env.goal_reward must be")
     with pytest.raises(ConfigError, match="goal_reward must be null in gridworld_2x2"):
         EnvConfig(name="gridworld_2x2", goal_reward=1.0)
+    said = message("env=cartpole", "env.goal_reward=-1")
+    assert "env.goal_reward, which another choice of env has" in said
 
 
 def test_episodes_that_may_end_early_need_no_long_budget():

@@ -126,9 +126,9 @@ def test_initial_episodes_beyond_the_proxys_own_extend_its_step_budget(stored):
     ("given", "message"),
     [
         (["training.max_steps=90"], "training must be left as it is.*training_from=config"),
-        (["proxy=real", "env=cartpole", "training_from=config", "training.max_steps=90"],
-         "training must be left as it is.*real_training"),
-        (["agent_hparams=nes"], "agent and exploration must be left out with agent_hparams=nes"),
+        (["proxy=real", "env=cartpole", "training_from=config"], "training_from must be proxy"),
+        (["proxy=real", "env=cartpole", "agent_hparams=nes"], "agent_hparams must be default"),
+        (["agent_hparams=nes"], "agent must be left out with agent_hparams=nes.*batch_size=4"),
     ],
 )  # fmt: skip
 def test_settings_without_effect_are_refused(given, message, stored):

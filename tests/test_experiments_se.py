@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import os
+import shutil
 import subprocess
 import sys
 
@@ -164,6 +165,52 @@ def test_a_run_that_was_stopped_goes_on_at_its_last_generation(tmp_path):
             se_feasibility.run(args)
     a, b = (pd.read_csv(tmp_path / x / "learning_curves.csv") for x in "ab")
     pd.testing.assert_frame_equal(a.drop(columns="wall_s"), b.drop(columns="wall_s"))
+
+
+def test_a_run_without_its_checkpoint_is_not_replaced(tmp_path):
+    learned(tmp_path)
+    for folder in (tmp_path / "runs").glob("*/checkpoint"):
+        shutil.rmtree(folder)
+    before = (tmp_path / "runs" / "seed3" / "metrics.csv").read_text()
+    args = experiment_options(se_feasibility, tmp_path, "--set", *TINY_RUN)
+    args.overrides = [*args.overrides, "generations=4"]
+    with pytest.raises(ConfigError, match=r"keep the checkpoints of runs.*with 3 generations and"):
+        se_feasibility.run(args)
+    assert (tmp_path / "runs" / "seed3" / "metrics.csv").read_text() == before
+
+
+def test_a_kill_while_a_piece_is_made_longer_loses_nothing(tmp_path, monkeypatch):
+    pieces, rows = common.Pieces(tmp_path), []
+
+    def make(count):
+        rows.append(count)
+        return pd.DataFrame({"row": range(count)})
+
+    def compute(count):
+        return pieces.compute("p", {"count": count}, lambda: make(count), length="count")
+
+    assert len(compute(2)) == len(compute(2)) == 2 and rows == [2]
+    written = common.write_text
+
+    def killed(path, text):
+        if path.suffix == ".json":
+            raise KeyboardInterrupt
+        written(path, text)
+
+    monkeypatch.setattr(common, "write_text", killed)
+    with pytest.raises(KeyboardInterrupt):
+        compute(5)
+    monkeypatch.setattr(common, "write_text", written)
+    assert len(compute(5)) == len(compute(5)) == 5 and rows == [2, 5, 5]
+    with pytest.raises(ConfigError, match="with another count"):
+        compute(3)
+
+
+@pytest.mark.parametrize("preset", ["best", "paper", "paper_performance"])
+@pytest.mark.parametrize("env", ["cartpole", "acrobot"])
+def test_quick_runs_are_long_enough_to_learn(env, preset):
+    config = sejax.config([f"env={env}", f"preset={preset}", *se_feasibility.QUICK])
+    assert config.agent.init_episodes == 1
 
 
 def made_up_agents(num_ses=4, num_agents=6):

@@ -143,6 +143,23 @@ def test_zero_at_terminal_counts_the_step_limit_if_agents_do(limit_is_terminal):
         np.testing.assert_allclose(reward, kept - phi(env, weights, obs), rtol=1e-5)
 
 
+@pytest.mark.parametrize("limit_is_terminal", [True, False])
+def test_a_training_says_whether_the_limit_is_terminal(limit_is_terminal, monkeypatch):
+    seen = []
+    monkeypatch.setattr(
+        RewardEnv, "prepared", lambda self, params, discount, limit: seen.append(limit) or params
+    )
+    env = make_env("cliff_walking", zero_at_terminal=True)
+    training = TrainingConfig(
+        max_episodes=1, max_steps=1, stop_rule="never", time_limit_is_terminal=limit_is_terminal
+    )
+    train = make_trainer(
+        make_agent(QLearningConfig(), env.task, ExplorationConfig()), env, training
+    )
+    train(jax.random.key(0), env.params(env.init_weights(jax.random.key(0))))
+    assert seen == [limit_is_terminal]
+
+
 def q_values(env, weights):
     """Optimal action values of a grid world with the shaped rewards, by value iteration."""
     task = env.task

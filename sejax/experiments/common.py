@@ -19,6 +19,7 @@ import pandas as pd
 from sejax import commands
 from sejax.errors import ConfigError, require
 from sejax.files import write_text
+from sejax.run_directory import flatten
 
 
 def parse_args(
@@ -124,8 +125,9 @@ class Pieces:
         tables = {name: self._stored(name, mine, length) for name, mine in settings.items()}
         missing = [name for name, table in tables.items() if table is None]
         for name, table in zip(missing, compute(missing) if missing else [], strict=True):
-            write_text(self.folder / f"{name}.json", json.dumps(settings[name], indent=2))
+            # In this order: a longer table with the settings of the shorter one is made again.
             write_text(self.folder / f"{name}.csv", table.to_csv(index=False))
+            write_text(self.folder / f"{name}.json", json.dumps(settings[name], indent=2))
             tables[name] = table
         return [table for table in tables.values() if table is not None]
 
@@ -135,10 +137,9 @@ class Pieces:
         table, made_with = self.folder / f"{name}.csv", self.folder / f"{name}.json"
         if not (table.exists() and made_with.exists()):
             return None
-        there = json.loads(made_with.read_text())
-        differing = sorted(key for key in {*there, *settings}
-                           if there.get(key) != settings.get(key))  # fmt: skip
-        if length and differing == [length] and there.get(length, 0) < settings[length]:
+        there, asked = flatten(json.loads(made_with.read_text())), flatten(settings)
+        differing = sorted(key for key in {*there, *asked} if there.get(key) != asked.get(key))
+        if length and differing == [length] and there[length] < asked[length]:
             return None
         if differing:
             raise ConfigError(

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from sejax.errors import require
 from sejax.experiments import common
 
 
@@ -41,7 +42,7 @@ def learn_all(configs: list[Any], pieces: common.Pieces, prefix: str = "") -> pd
 
     Args:
       configs: from `configs_of_runs`; a run that is finished is not made again, one of fewer
-        generations goes on if its folder is still there.
+        generations goes on if its checkpoint is still there.
       pieces: where the curves are kept, as `<prefix>` and the name of the run's folder.
       prefix: for runs of different settings in one folder.
     """
@@ -68,9 +69,9 @@ def learn_all(configs: list[Any], pieces: common.Pieces, prefix: str = "") -> pd
 def piece_settings(config: Any) -> dict[str, Any]:
     """What a run depends on, as `group.field`; not how it is computed or where it is written."""
     from sejax.configs import to_dict
+    from sejax.run_directory import flatten
 
-    flat = pd.json_normalize(to_dict(config)).iloc[0].to_dict()
-    return {name: value for name, value in flat.items()
+    return {name: value for name, value in flatten(to_dict(config)).items()
             if name not in ("run_dir", "devices", "lanes", "checkpoint_every")}  # fmt: skip
 
 
@@ -100,6 +101,9 @@ def learn_one(config: Any, program: Any, step: Callable[..., Any]) -> pd.DataFra
 
     Returns:
       The rows of the run's `metrics.csv`.
+
+    Raises:
+      ConfigError: for a run whose files are there without its checkpoint, as in a clone.
     """
     import jax
 
@@ -110,6 +114,10 @@ def learn_one(config: Any, program: Any, step: Callable[..., Any]) -> pd.DataFra
     seeds = config.seed + jax.numpy.arange(config.num_seeds)
     state = jax.jit(program.init)(jax.vmap(jax.random.key)(seeds))
     state, generation, _ = checkpoints.restore_newest(directory.checkpoints, state)
+    rows = len(directory.rows)
+    require(generation > 0 or rows <= config.num_seeds, "--out", "keep the checkpoints of runs that"
+            " are to go on", "they would start anew and replace what is there",
+            f"{directory.path} with {rows} generations and no checkpoint", "--out=DIR")  # fmt: skip
     directory.drop_rows_from(generation)
     state = jax.tree.map(lambda x: x.copy(), state)  # own buffers, so that they can be donated
     started = time.time() - (float(directory.rows[-1]["wall_s"]) if directory.rows else 0.0)

@@ -14,7 +14,7 @@ import numpy as np
 import pandas as pd
 
 from sejax.agents.configs import AgentConfig, ExplorationConfig
-from sejax.configs import TrainingConfig
+from sejax.configs import EnvConfig, TrainingConfig
 from sejax.errors import unknown_name
 from sejax.experiments import common, return_curves, rn_studies
 
@@ -33,7 +33,7 @@ class World:
     Attributes:
       name: as in `rn_studies.LABELS`.
       env: gymnax environment.
-      task: the real task that agents are tested on.
+      env_config: of the real task that agents are tested on.
       params: `EnvParams` of each group of agents.
       fingerprints: what tells the groups' worlds apart.
       exploration: bonus of the agents.
@@ -42,7 +42,7 @@ class World:
 
     name: str
     env: Any
-    task: Any
+    env_config: EnvConfig
     params: tuple[Any, ...]
     fingerprints: tuple[str, ...]
     exploration: ExplorationConfig = field(default_factory=ExplorationConfig)
@@ -53,7 +53,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     """Options about the agents; with those of `rn_studies`."""
     rn_studies.add_options(parser)
     parser.add_argument("--rows", nargs="+", metavar="ROW", help=", ".join(ROWS))
-    parser.add_argument("--rns", type=int, help="RNs of each variant to use, the best; 10")
+    parser.add_argument("--rns", type=int, help="RNs of each variant to use, the best; 10 or 5")
     parser.add_argument("--num-agents", type=int, help="on each RN, in each row; 10")
     parser.add_argument("--max-steps", type=int, help="training steps; as the paper's figure")
 
@@ -81,10 +81,11 @@ def agent_of(args: argparse.Namespace, row: str) -> AgentConfig:
 
 def real_worlds(args: argparse.Namespace) -> list[World]:
     """The real task, without and with the study's bonuses."""
-    task = rn_studies.env_config(args).make()
+    env_config = rn_studies.env_config(args)
+    task = env_config.make()
     bonuses = {"real": ExplorationConfig(), **rn_studies.STUDIES[args.env].bonuses}
     return [
-        World(name=name, env=task.env, task=task, params=(task.params,) * args.rns,
+        World(name=name, env=task.env, env_config=env_config, params=(task.params,) * args.rns,
               fingerprints=("",) * args.rns, exploration=bonus)
         for name, bonus in bonuses.items()
     ]  # fmt: skip
@@ -93,7 +94,8 @@ def real_worlds(args: argparse.Namespace) -> list[World]:
 def rn_world(variant: str, rns: Any) -> World:
     """The RNs of a set, one for each group of agents."""
     indices = range(rns.size)
-    return World(name=variant, env=rns.env, task=rns.task, params=tuple(map(rns.one, indices)),
+    return World(name=variant, env=rns.env, env_config=rns.config.env,
+                 params=tuple(map(rns.one, indices)),
                  fingerprints=tuple(map(rns.fingerprint, indices)),
                  settings=vars(rns.config.proxy))  # fmt: skip
 
@@ -118,7 +120,7 @@ def train_all(
     )
     tables = []
     for group in range(len(world.params)):
-        settings = {"env": vars(rn_studies.env_config(args)), "agent": vars(agent), "row": row,
+        settings = {"env": vars(world.env_config), "agent": vars(agent), "row": row,
                     "world": world.name, "proxy": world.settings,
                     "weights": world.fingerprints[group], "exploration": vars(world.exploration),
                     "training": vars(training), "num_agents": args.num_agents, "group": group,
@@ -146,7 +148,7 @@ def train_group(
     import jax
 
     program = return_curves.make_program(
-        agent, world.exploration, world.env, world.task, training,
+        agent, world.exploration, world.env, world.env_config.make(), training,
         "varied" if row == "varied" else "default", args.devices,
     )  # fmt: skip
     key = jax.random.fold_in(jax.random.key(args.seed), group)

@@ -22,8 +22,8 @@ NUM_RUNS = {"cartpole": 10, "acrobot": 5}
 
 # A little world and agents that learn enough to be seen moving.
 QUICK = ["generations=8", "es.population_size=12", "es.num_incumbent_evals=8",
-         "agent.hidden_size=32", "agent.batch_size=32", "training.max_steps=1500",
-         "proxy.hidden_size=32"]  # fmt: skip
+         "agent.hidden_size=32", "agent.batch_size=32", "agent.init_episodes=1",
+         "training.max_steps=1500", "proxy.hidden_size=32"]  # fmt: skip
 QUICK_RUNS = 3
 
 # Paper, paragraph "Feasibility": "50 NES iterations are often sufficient to find SEs that teach

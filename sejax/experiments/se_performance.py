@@ -30,7 +30,7 @@ AGENTS = ("ddqn", "dueling_ddqn", "td3_discrete")
 NUM_SES = 40
 NUM_BEST = 5
 BEST_FOR = "td3_discrete"
-GROUPS_AT_ONCE = 5  # groups of agents in one program, on more than one device
+GROUPS_AT_ONCE = 5  # groups of agents in one program, but for one CPU device
 LABELS = {"real": "real", "varied": "synth., HPs varied", "fixed": "synth., HPs fixed",
           "best": "synth., best SEs"}  # fmt: skip
 
@@ -274,11 +274,13 @@ def train_all(
 def groups_at_once(devices: int | None) -> int:
     """Groups in one program: some agents train a hundred times as long as others.
 
-    Several groups keep all devices busy; with one device, a group is saved as soon as it is done.
+    Several groups keep all devices, or an accelerator's lanes, busy; with one CPU device, a group
+    is saved as soon as it is done.
     """
     import jax
 
-    return 1 if (devices or jax.device_count()) == 1 else GROUPS_AT_ONCE
+    alone = (devices or jax.device_count()) == 1 and jax.default_backend() == "cpu"
+    return 1 if alone else GROUPS_AT_ONCE
 
 
 def train_groups(
