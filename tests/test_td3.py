@@ -672,7 +672,9 @@ def test_td3_solves_pendulum_in_20000_steps():
     task = envs.make("pendulum")
     config = TD3Config(init_episodes=5, batch_size=128, learning_rate=1e-3)
     agent = make_td3(config, task.obs_dim, task.action_dim, task.max_action)
-    training = TrainingConfig(max_episodes=100, max_steps=20_000, stop_rule="never")
+    training = TrainingConfig(
+        max_episodes=100, max_steps=20_000, stop_rule="never", time_limit_is_terminal=False
+    )
     assert mean_test_return(agent, task, training) > -250
 
 
