@@ -41,9 +41,10 @@ def evaluate(config: EvaluateConfig) -> float:
     from sejax import plots
     from sejax.files import write_text
 
-    task, worlds, agents, out_dir = _prepare(config)
+    task, worlds, agent, exploration, out_dir = _prepare(config)
     tables = {
-        name: _train_and_test(config, agents, task, name, *world) for name, world in worlds.items()
+        name: _train_and_test(config, agent, exploration, task, name, *world)
+        for name, world in worlds.items()
     }
     table = pd.concat([t.assign(world=name) for name, t in tables.items()])
     out_dir.mkdir(parents=True, exist_ok=True)
@@ -51,7 +52,7 @@ def evaluate(config: EvaluateConfig) -> float:
     plots.evaluation(tables, task.solved_reward, out_dir / "evaluation.png")
     summary = summarise(table)
     write_text(out_dir / "evaluation.json", summary.to_json(orient="index", indent=2))
-    _print_table(summary, task, config, agents[0].name, out_dir)
+    _print_table(summary, task, config, agent.name, out_dir)
     return float(next(iter(tables.values()))["test_return"].mean())
 
 
@@ -64,8 +65,8 @@ def summarise(table: Any) -> Any:
     return summary.assign(num_agents=grouped.size(), num_nonfinite=grouped["nonfinite"].sum())
 
 
-def _prepare(config: EvaluateConfig) -> tuple[Any, dict[str, Any], tuple[Any, Any], Path]:
-    """The task, the worlds to train in, the agents and their exploration, and the output folder."""
+def _prepare(config: EvaluateConfig) -> tuple[Any, dict[str, Any], Any, Any, Path]:
+    """The task, the worlds to train in, the agent, its exploration, and the output folder."""
     from sejax import envs
     from sejax.evaluation import training_as_learned
     from sejax.proxies import io as proxy_io
@@ -77,36 +78,36 @@ def _prepare(config: EvaluateConfig) -> tuple[Any, dict[str, Any], tuple[Any, An
         require_fit(config.agent, config.exploration, config.env)
         task = envs.make(config.env)
         worlds = {"the real task": (task.env, task.params, config.real_training)}
-        agents = config.agent, config.exploration
-        return task, worlds, agents, Path(config.out_dir or f"runs/evaluate-{task.name}")
+        out_dir = Path(config.out_dir or f"runs/evaluate-{task.name}")
+        return task, worlds, config.agent, config.exploration, out_dir
     proxy = proxy_io.load_proxy(config.proxy)
     task = proxy.task
     if config.env not in (None, task.name):
         raise ConfigError(f"env must be the proxy's own task, because agents trained on it are "
                           f"tested there; got {config.env} for a proxy of {task.name}. Set "
                           f"env={task.name}.")  # fmt: skip
-    agents = config.agent, config.exploration
+    agent, exploration = config.agent, config.exploration
     if config.agent_hparams == "nes":
-        agents = proxy.config.agent, proxy.config.exploration
-    require_fit(*agents, task.name)
+        agent, exploration = proxy.config.agent, proxy.config.exploration
+    require_fit(agent, exploration, task.name)
     training = config.training
     if config.training_from == "proxy":
         # An RN's dynamics are real: its agents train and stop as on the real task.
         training = config.real_training
         if proxy.config.proxy.name == "se":
-            training = dataclasses.replace(training_as_learned(proxy, agents[0]),
+            training = dataclasses.replace(training_as_learned(proxy, agent),
                                            test_episodes=training.test_episodes)  # fmt: skip
     worlds = {"the proxy": (proxy.env, proxy.params, training)}
     if config.baseline:
         worlds["the real task"] = (task.env, task.params, config.real_training)
     shipped = proxy.path.parent == proxy_io.PRETRAINED_DIR
     beside = Path(f"runs/evaluate-{proxy.path.stem}") if shipped else proxy.path.parent
-    return task, worlds, agents, Path(config.out_dir or beside)
+    return task, worlds, agent, exploration, Path(config.out_dir or beside)
 
 
 def _train_and_test(
-    config: EvaluateConfig, agents_and_exploration: tuple[Any, Any], task: Any, world: str,
-    env: Any, env_params: Any, training: Any,
+    config: EvaluateConfig, agent: Any, exploration: Any, task: Any, world: str, env: Any,
+    env_params: Any, training: Any,
 ) -> Any:  # fmt: skip
     import jax
     import pandas as pd
@@ -117,7 +118,6 @@ def _train_and_test(
 
     varied = config.agent_hparams == "varied"
     make = make_varied_agents if varied else make_agent
-    agent, exploration = agents_and_exploration
     agents: Any = make(agent, task, exploration)
     keys = jax.random.split(jax.random.key(config.seed), config.num_agents)
     started = time.time()

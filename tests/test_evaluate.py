@@ -147,7 +147,7 @@ def test_agents_of_the_nes_run_bring_their_exploration(tmp_path, capsys):
                  "real_training.max_episodes=2"]  # fmt: skip
     with initialize_config_dir(str(folder), version_base="1.3"):
         composed = evaluate_from_hydra(compose("evaluate", overrides=overrides))
-    _task, worlds, (agent, exploration), _ = _prepare(composed)
+    _task, worlds, agent, exploration, _ = _prepare(composed)
     assert (agent, exploration) == (config.agent, config.exploration)
     assert worlds["the proxy"][2] == composed.real_training  # its dynamics are real
     evaluate(composed)
