@@ -229,6 +229,8 @@ def report(args: argparse.Namespace, timed: pd.DataFrame) -> pd.DataFrame:
         f"The first {args.generations} iterations of a run, compiled before. All tests on the "
         "real task are in them. For RNs our default has the paper's agents and sizes. "
     )
+    if args.quick:
+        note += "--quick: a few agents with short trainings, not to be compared with the paper's. "
     parts = timed[timed["how"] == "projected"]
     for row in parts.itertuples():
         note += (
@@ -261,8 +263,9 @@ def draw(timed: pd.DataFrame, args: argparse.Namespace) -> None:
     with plt.rc_context(figures.STYLE):
         figure, axis = plt.subplots(figsize=(7, 0.9 + 0.55 * len(names)), layout="constrained")
         paper = [ROWS[row.row].seconds for row in timed.itertuples()]
-        axis.barh(places - 0.19, paper, 0.36, color=figures.VARIED,
-                  label=f"paper, {PAPER_CORES} cores")  # fmt: skip
+        if not args.quick:  # whose trainings are much shorter
+            axis.barh(places - 0.19, paper, 0.36, color=figures.VARIED,
+                      label=f"paper, {PAPER_CORES} cores")  # fmt: skip
         projected = timed["how"].to_numpy() == "projected"
         bars = axis.barh(places + 0.19, timed["seconds"], 0.36, color=figures.REAL,
                          label=f"sejax, {cores} cores (hatched: projected)")  # fmt: skip
