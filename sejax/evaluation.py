@@ -113,6 +113,10 @@ def training_as_learned(proxy: Any, agent: AgentConfig) -> TrainingConfig:
 
     A step budget grows by the steps for which this agent waits longer with learning than the one it
     was learned with: ten long initial episodes, or a rollout of PPO, could use it up.
+
+    Args:
+      proxy: a `Proxy` or `ProxySet`, whose `config` and `task` are used.
+      agent: that is to train.
     """
     training = proxy.config.training
     if training.max_steps is None:

@@ -15,7 +15,7 @@ import numpy as np
 import yaml
 
 from sejax.configs import LearnConfig, to_dict
-from sejax.errors import ConfigError
+from sejax.errors import ConfigError, require
 from sejax.files import write_text
 
 COLUMNS = (
@@ -74,7 +74,17 @@ class RunDirectory:
         return self.path / "proxy.safetensors"
 
     def drop_rows_from(self, generation: int) -> None:
-        """Forgets metrics of generations that the checkpoint does not include."""
+        """Forgets metrics of generations that the checkpoint does not include.
+
+        Raises:
+          ConfigError: if there is no checkpoint of a run that had one, as in a clone: it would
+            start anew and replace its metrics and proxies.
+        """
+        made = int(self.rows[-1]["generation"]) + 1 if self.rows else 0
+        require(generation > 0 or made <= self.config.checkpoint_every, "run_dir", "keep the "
+                "checkpoints of a run that is to go on", "it would start anew and replace what is "
+                "there", f"{self.path} with {made} generations and no whole checkpoint",
+                "run_dir=FOLDER (--out=FOLDER in an experiment)")  # fmt: skip
         self.rows = [row for row in self.rows if int(row["generation"]) < generation]
 
     def add_rows(self, info: Any, wall_s: float) -> None:

@@ -174,7 +174,7 @@ def test_a_run_without_its_checkpoint_is_not_replaced(tmp_path):
     before = (tmp_path / "runs" / "seed3" / "metrics.csv").read_text()
     args = experiment_options(se_feasibility, tmp_path, "--set", *TINY_RUN)
     args.overrides = [*args.overrides, "generations=4"]
-    with pytest.raises(ConfigError, match=r"keep the checkpoints of runs.*with 3 generations and"):
+    with pytest.raises(ConfigError, match=r"keep the checkpoints of a run.*with 3 generations"):
         se_feasibility.run(args)
     assert (tmp_path / "runs" / "seed3" / "metrics.csv").read_text() == before
 

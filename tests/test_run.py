@@ -2,6 +2,7 @@
 
 import csv
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -125,6 +126,15 @@ def test_a_damaged_checkpoint_is_named_and_the_one_before_is_used(uninterrupted,
     said = capsys.readouterr().out
     assert f"{newest} is damaged" in said and "Going on at generation 3" in said
     assert rows(tmp_path) == rows(uninterrupted)
+
+
+def test_a_run_that_lost_its_checkpoints_is_not_replaced(uninterrupted, tmp_path):
+    shutil.copytree(uninterrupted, tmp_path, dirs_exist_ok=True)
+    shutil.rmtree(tmp_path / "checkpoint")
+    before = (tmp_path / "metrics.csv").read_text()
+    with pytest.raises(ConfigError, match=r"keep the checkpoints of a run.*run_dir=FOLDER"):
+        learn(tmp_path)
+    assert (tmp_path / "metrics.csv").read_text() == before
 
 
 def test_a_checkpoint_without_manifest_does_not_count(tmp_path):

@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from sejax.errors import require
 from sejax.experiments import common
 
 
@@ -103,7 +102,7 @@ def learn_one(config: Any, program: Any, step: Callable[..., Any]) -> pd.DataFra
       The rows of the run's `metrics.csv`.
 
     Raises:
-      ConfigError: for a run whose files are there without its checkpoint, as in a clone.
+      ConfigError: for a folder with another run, or one that has lost its checkpoint.
     """
     import jax
 
@@ -114,10 +113,6 @@ def learn_one(config: Any, program: Any, step: Callable[..., Any]) -> pd.DataFra
     seeds = config.seed + jax.numpy.arange(config.num_seeds)
     state = jax.jit(program.init)(jax.vmap(jax.random.key)(seeds))
     state, generation, _ = checkpoints.restore_newest(directory.checkpoints, state)
-    rows = len(directory.rows)
-    require(generation > 0 or rows <= config.num_seeds, "--out", "keep the checkpoints of runs that"
-            " are to go on", "they would start anew and replace what is there",
-            f"{directory.path} with {rows} generations and no checkpoint", "--out=DIR")  # fmt: skip
     directory.drop_rows_from(generation)
     state = jax.tree.map(lambda x: x.copy(), state)  # own buffers, so that they can be donated
     started = time.time() - (float(directory.rows[-1]["wall_s"]) if directory.rows else 0.0)

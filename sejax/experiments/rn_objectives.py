@@ -56,6 +56,11 @@ def fill_in(args: argparse.Namespace) -> None:
     if args.quick and args.learned is None:
         args.learned = QUICK_LEARNED
     rn_curves.fill_in(args)
+    for option, names, known in (("--objectives", args.objectives, OBJECTIVES),
+                                 ("--picks", args.picks, PICKS)):  # fmt: skip
+        for name in names:
+            if name not in known:
+                raise unknown_name(option, name, known)
     if len(args.picks) > 1 and picked is None:
         args.rns = max(1, min(args.rns, args.learned // 2))
     require(len(args.picks) == 1 or 2 * args.rns <= args.learned, "--learned",
@@ -70,11 +75,6 @@ def run(args: argparse.Namespace) -> pd.DataFrame:
       ConfigError: for settings that cannot work, or an output folder of other settings.
     """
     fill_in(args)
-    for option, names, known in (("--objectives", args.objectives, OBJECTIVES),
-                                 ("--picks", args.picks, PICKS)):  # fmt: skip
-        for name in names:
-            if name not in known:
-                raise unknown_name(option, name, known)
     pieces = common.Pieces(args.out / "pieces")
     without = pd.concat(
         [
