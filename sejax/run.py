@@ -74,7 +74,7 @@ def _learn_in(directory: Any, progress: Any) -> float:
         progress.print(problem)
     if generation:
         progress.print(f"Going on at generation {generation} of {directory.path}.")
-    directory.drop_rows_from(generation)
+    directory.go_on_from(generation)
 
     wall_before = float(directory.rows[-1]["wall_s"]) if directory.rows else 0.0
     progress.say("compiling")

@@ -50,8 +50,9 @@ class RunDirectory:
         try:
             if existing.exists():
                 _refuse_other_config(path, yaml.safe_load(existing.read_text()), to_dict(config))
-            path.mkdir(parents=True, exist_ok=True)
-            write_text(existing, yaml.safe_dump(to_dict(config), sort_keys=False))
+            else:
+                path.mkdir(parents=True, exist_ok=True)
+                write_text(existing, _yaml(config))
         except (OSError, yaml.YAMLError) as error:
             raise ConfigError(
                 f"run_dir must be a folder that can be written, because the run's files go there; "
@@ -73,8 +74,11 @@ class RunDirectory:
     def proxy(self) -> Path:
         return self.path / "proxy.safetensors"
 
-    def drop_rows_from(self, generation: int) -> None:
+    def go_on_from(self, generation: int) -> None:
         """Forgets metrics of generations that the checkpoint does not include.
+
+        Free fields of the configuration, which may differ from those stored, are written here: a
+        run that is refused keeps its files as they are.
 
         Raises:
           ConfigError: if there is no checkpoint of a run that had one, as in a clone: it would
@@ -86,6 +90,7 @@ class RunDirectory:
                 "there", f"{self.path} with {made} generations and no whole checkpoint",
                 "run_dir=FOLDER (--out=FOLDER in an experiment)")  # fmt: skip
         self.rows = [row for row in self.rows if int(row["generation"]) < generation]
+        write_text(self.path / "config.yaml", _yaml(self.config))
 
     def add_rows(self, info: Any, wall_s: float) -> None:
         """Appends the rows of a chunk, `info` leaves `[generation, seed]`, and writes the file."""
@@ -150,6 +155,10 @@ class RunDirectory:
 def _format(value: Any) -> str:
     """Shortest text that reads back as the same float32 or integer."""
     return str(int(value)) if np.issubdtype(np.asarray(value).dtype, np.integer) else f"{value:.9g}"
+
+
+def _yaml(config: LearnConfig) -> str:
+    return yaml.safe_dump(to_dict(config), sort_keys=False)
 
 
 def _refuse_other_config(path: Path, stored: dict[str, Any], new: dict[str, Any]) -> None:

@@ -113,7 +113,7 @@ def learn_one(config: Any, program: Any, step: Callable[..., Any]) -> pd.DataFra
     seeds = config.seed + jax.numpy.arange(config.num_seeds)
     state = jax.jit(program.init)(jax.vmap(jax.random.key)(seeds))
     state, generation, _ = checkpoints.restore_newest(directory.checkpoints, state)
-    directory.drop_rows_from(generation)
+    directory.go_on_from(generation)
     state = jax.tree.map(lambda x: x.copy(), state)  # own buffers, so that they can be donated
     started = time.time() - (float(directory.rows[-1]["wall_s"]) if directory.rows else 0.0)
     while generation < config.generations and not bool(state.finished.all()):
