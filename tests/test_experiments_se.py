@@ -21,6 +21,7 @@ from sejax.experiments import (
     common,
     figures,
     proxy_runs,
+    se_agents,
     se_feasibility,
     se_models,
     se_performance,
@@ -287,7 +288,7 @@ def test_performance_trains_as_evaluation_does_and_goes_on(ses, tmp_path, monkey
     from sejax.agents.hparams import make_varied_agents
     from sejax.evaluation import evaluate_agents
 
-    monkeypatch.setattr(se_performance, "QUICK_AGENT", TINY_AGENT)
+    monkeypatch.setattr(se_agents, "QUICK_AGENT", TINY_AGENT)
     table = performance(ses, tmp_path)
     agents = pd.read_csv(tmp_path / "agents.csv")
     assert agents.groupby("setting").size().to_dict() == {"real": 6, "fixed": 6}
@@ -313,7 +314,7 @@ def test_performance_trains_as_evaluation_does_and_goes_on(ses, tmp_path, monkey
     assert (tmp_path / "performance.png").stat().st_size > 10_000
     assert "16887.7" in (tmp_path / "table.md").read_text()
 
-    monkeypatch.setattr(se_performance, "train_groups", refuse)
+    monkeypatch.setattr(se_agents, "train_groups", refuse)
     pd.testing.assert_frame_equal(performance(ses, tmp_path), table)
     with pytest.raises(ConfigError, match=r"with another training\.test_episodes"):
         performance(ses, tmp_path, "--test-episodes", "4")
@@ -330,7 +331,7 @@ def test_performance_trains_as_evaluation_does_and_goes_on(ses, tmp_path, monkey
 def test_agents_of_equal_number_draw_equal_hyperparameters_in_all_settings(
     ses, tmp_path, monkeypatch
 ):
-    monkeypatch.setattr(se_performance, "QUICK_AGENT", TINY_AGENT)
+    monkeypatch.setattr(se_agents, "QUICK_AGENT", TINY_AGENT)
     performance(ses, tmp_path)
     agents = pd.read_csv(tmp_path / "agents.csv")
     real, fixed = (agents[agents["setting"] == name] for name in ("real", "fixed"))

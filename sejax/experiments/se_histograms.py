@@ -26,7 +26,7 @@ import numpy as np
 import pandas as pd
 
 from sejax.experiments import common
-from sejax.experiments.se_performance import AGENTS, check_agents
+from sejax.experiments.se_agents import AGENTS, check_agents
 
 NAME = "se_histograms"
 QUICK_AGENT = {"hidden_size": 16, "num_layers": 1, "batch_size": 16, "init_episodes": 1}

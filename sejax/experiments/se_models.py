@@ -14,14 +14,7 @@ import numpy as np
 import pandas as pd
 
 from sejax.errors import ConfigError
-from sejax.experiments import common
-from sejax.experiments.se_performance import (
-    add_agent_options,
-    fill_in,
-    return_columns,
-    se_world,
-    train_all,
-)
+from sejax.experiments import common, se_agents
 
 NAME = "se_models"
 
@@ -35,7 +28,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     """Options of this experiment."""
     parser.add_argument("--ses", metavar="FILE", help="SEs, from se_feasibility; with --quick, "
                         "the shipped cartpole SE")  # fmt: skip
-    add_agent_options(parser)
+    se_agents.add_options(parser)
 
 
 def run(args: argparse.Namespace) -> pd.DataFrame:
@@ -46,15 +39,15 @@ def run(args: argparse.Namespace) -> pd.DataFrame:
     """
     from sejax.experiments.proxy_sets import load_set
 
-    fill_in(args)
+    se_agents.fill_in(args)
     source = args.ses or ("cartpole" if args.quick else None)
     if source is None:
         raise ConfigError("--ses must be given, because agents are trained on its SEs; got none. "
                           "Set --ses=results/se_feasibility/ses.safetensors.")  # fmt: skip
     ses = load_set(source).first(args.num_ses)
-    world = se_world(args, ses)
+    world = se_agents.se_world(args, ses)
     pieces = common.Pieces(args.out / "pieces")
-    agents = pd.concat([train_all(args, kind, world, pieces) for kind in args.agents])
+    agents = pd.concat([se_agents.train_all(args, kind, world, pieces) for kind in args.agents])
     agents["se"] = agents["group"].map({name: i for i, name in enumerate(world.names)})
     return report(args, ses, agents)
 
@@ -110,7 +103,7 @@ def report(args: argparse.Namespace, ses: Any, agents: pd.DataFrame) -> pd.DataF
     write_text(args.out / "models_agents.csv", agents.to_csv(index=False))
     write_text(args.out / "models_summary.csv", summary.to_csv(index=False))
     kinds = {kind: agents[agents["kind"] == kind] for kind in args.agents}
-    figures.violins(kinds, return_columns(agents), task.name, task.solved_reward,
+    figures.violins(kinds, se_agents.return_columns(agents), task.name, task.solved_reward,
                     args.out / "models.png")  # fmt: skip
     title = f"Single SEs of {task.name} (solved at {task.solved_reward:g})"
     note = (

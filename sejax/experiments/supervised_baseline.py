@@ -32,7 +32,7 @@ import pandas as pd
 
 from sejax.errors import require
 from sejax.experiments import common, supervised_models
-from sejax.experiments.se_performance import AGENTS, check_agents, return_columns, to_table
+from sejax.experiments.se_agents import AGENTS, check_agents, return_columns, to_table
 
 NAME = "supervised_baseline"
 HPARAMS = ("varied", "default")
