@@ -298,17 +298,17 @@ class LearnConfig:
     def __post_init__(self) -> None:
         require_fit(self.agent, self.exploration, self.env.name)
         self._require_info()
-        self._require_real_returns()
+        require_real_returns("training", self.training)
         self._require_tests_for_auc()
-        self._require_learning()
+        if getattr(self.proxy, "done", None) == "soft":
+            require_learning("training", self.training, self.agent, self.env.name)
         require(not self.stop_when_solved or self.objective.name == "max_reward",
                 "stop_when_solved", "be false with this objective", "its scores are not returns, "
                 "so that none says solved", f"true with objective={self.objective.name}",
                 "stop_when_solved=false")  # fmt: skip
         one_of("agent_hparams", self.agent_hparams, AGENT_HPARAMS)
         at_least(1, "generations", self.generations, "there is nothing to do otherwise", 50)
-        require(0 <= self.seed < 2**31, "seed", "lie in [0, 2**31)", "it is a 32-bit number",
-                self.seed, "seed=0")  # fmt: skip
+        require_seed("seed", self.seed)
         at_least(1, "num_seeds", self.num_seeds, "it counts runs", 1)
         at_least(1, "checkpoint_every", self.checkpoint_every, "it counts generations", 1)
         for name in ("lanes", "devices"):
@@ -331,24 +331,6 @@ class LearnConfig:
                 "the area is that under the curve of those tests",
                 f"{self.objective.name} with stop_rule {rule}",
                 "training.stop_rule=solved")  # fmt: skip
-
-    def _require_real_returns(self) -> None:
-        training = self.training
-        require(training.stop_rule != "solved" or training.solved_by == "test",
-                "training.solved_by", "be test with stop_rule=solved", "returns on a proxy say "
-                "nothing about the real task's threshold", training.solved_by,
-                "training.solved_by=test")  # fmt: skip
-
-    def _require_learning(self) -> None:
-        """Episodes on an SE with soft ends last as long as they may: their number is known."""
-        budget = self.training.max_steps
-        if budget is None or getattr(self.proxy, "done", None) != "soft":
-            return
-        before = self.agent.steps_before_learning(envs.kind(self.env.name).max_steps)
-        name = "update_episodes" if isinstance(self.agent, PPOConfig) else "init_episodes"
-        require(budget > before, "training.max_steps", f"exceed {before}", f"{self.agent.name} "
-                f"learns nothing before with agent.{name}={getattr(self.agent, name)}", budget,
-                f"training.max_steps={4 * before}, or agent.{name} lower")  # fmt: skip
 
     @property
     def resolved_run_dir(self) -> Path:
@@ -381,6 +363,7 @@ class EvaluateConfig:
         at_least(1, "num_agents", self.num_agents, "there is nothing to average otherwise", 10)
         one_of("agent_hparams", self.agent_hparams, EVALUATION_HPARAMS)
         one_of("training_from", self.training_from, TRAINING_FROM)
+        require_seed("seed", self.seed)
         self._require_use()
         for name in ("lanes", "devices"):
             if getattr(self, name) is not None:
@@ -400,10 +383,41 @@ class EvaluateConfig:
                         "the proxy says which it was learned with", _differences(given, usual),
                         "agent_hparams=default")  # fmt: skip
         usual_training = TrainingConfig()
+        instead = "real_training.*"
         require(self.training_from == "config" or self.training == usual_training, "training",
                 "be left as it is", "agents train on an SE as it was learned with, and else as "
                 "real_training says", _differences(self.training, usual_training),
-                "training_from=config, or real_training.*")  # fmt: skip
+                instead if self.proxy == "real" else f"training_from=config, or {instead}",
+                )  # fmt: skip
+
+
+def require_seed(name: str, seed: int) -> None:
+    """Checks that a seed is one that `jax.random.key` takes as it is."""
+    require(0 <= seed < 2**31, name, "lie in [0, 2**31)", "it is a 32-bit number", seed,
+            f"{name}=0")  # fmt: skip
+
+
+def require_real_returns(name: str, training: TrainingConfig) -> None:
+    """Checks that the rule by which agents stop on a proxy does not read the proxy's returns."""
+    require(training.stop_rule != "solved" or training.solved_by == "test",
+            f"{name}.solved_by", "be test with stop_rule=solved", "returns on a proxy say "
+            "nothing about the real task's threshold", training.solved_by,
+            f"{name}.solved_by=test")  # fmt: skip
+
+
+def require_learning(
+    name: str, training: TrainingConfig, agent: AgentConfig, env_name: str
+) -> None:
+    """Checks that a step budget lets an agent learn on an SE with soft ends.
+
+    Episodes there last as long as they may, so that the agent's first learning step is known.
+    """
+    before = agent.steps_before_learning(envs.kind(env_name).max_steps)
+    waits = "update_episodes" if isinstance(agent, PPOConfig) else "init_episodes"
+    require(training.max_steps is None or training.max_steps > before, f"{name}.max_steps",
+            f"exceed {before}", f"{agent.name} learns nothing before with "
+            f"agent.{waits}={getattr(agent, waits, None)}", training.max_steps,
+            f"{name}.max_steps={4 * before}, or agent.{waits} lower")  # fmt: skip
 
 
 def _differences(given: Any, usual: Any) -> str:

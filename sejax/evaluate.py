@@ -1,6 +1,7 @@
 """`python -m sejax.evaluate`: train fresh agents on a stored proxy, test them on the real task."""
 
 import dataclasses
+import math
 import sys
 import time
 from pathlib import Path
@@ -10,7 +11,13 @@ import hydra
 from omegaconf import DictConfig
 
 from sejax import commands
-from sejax.configs import EvaluateConfig, evaluate_from_hydra, require_fit
+from sejax.configs import (
+    EvaluateConfig,
+    evaluate_from_hydra,
+    require_fit,
+    require_learning,
+    require_real_returns,
+)
 from sejax.errors import ConfigError
 
 
@@ -90,13 +97,18 @@ def _prepare(config: EvaluateConfig) -> tuple[Any, dict[str, Any], Any, Any, Pat
     if config.agent_hparams == "nes":
         agent, exploration = proxy.config.agent, proxy.config.exploration
     require_fit(agent, exploration, task.name)
-    training = config.training
-    if config.training_from == "proxy":
+    is_se = proxy.config.proxy.name == "se"
+    if config.training_from == "config":
+        training, group = config.training, "training"
+    else:
         # An RN's dynamics are real: its agents train and stop as on the real task.
-        training = config.real_training
-        if proxy.config.proxy.name == "se":
+        training, group = config.real_training, "real_training"
+        if is_se:
             training = dataclasses.replace(training_as_learned(proxy, agent),
                                            test_episodes=training.test_episodes)  # fmt: skip
+    require_real_returns(group, training)
+    if is_se and proxy.config.proxy.done == "soft":
+        require_learning(group, training, agent, task.name)
     worlds = {"the proxy": (proxy.env, proxy.params, training)}
     if config.baseline:
         worlds["the real task"] = (task.env, task.params, config.real_training)
@@ -146,9 +158,9 @@ def _print_table(
     for world, row in summary.iterrows():
         table.add_row(
             str(world),
-            f"{row.test_return_mean:.1f} ± {row.test_return_std:.1f}",
-            f"{row.train_steps_mean:,.0f} ± {row.train_steps_std:,.0f}",
-            f"{row.train_episodes_mean:,.1f} ± {row.train_episodes_std:,.1f}",
+            _spread(row.test_return_mean, row.test_return_std, 1),
+            _spread(row.train_steps_mean, row.train_steps_std, 0),
+            _spread(row.train_episodes_mean, row.train_episodes_std, 1),
         )
     console = Console(highlight=False)
     console.print(table)
@@ -156,6 +168,11 @@ def _print_table(
     if diverged:
         console.print(f"{diverged} agents met a number that is not finite.")
     console.print(f"{out_dir}/evaluation.csv, .json and .png hold every agent.", soft_wrap=True)
+
+
+def _spread(mean: float, std: float, digits: int) -> str:
+    """Mean and deviation; one agent has none."""
+    return f"{mean:,.{digits}f}" + (f" ± {std:,.{digits}f}" if math.isfinite(std) else "")
 
 
 if __name__ == "__main__":

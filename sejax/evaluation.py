@@ -37,15 +37,8 @@ def make_evaluator(
     solved rule asks for is `stop_reward`, or the task's threshold.
     """
     synthetic = isinstance(env, SyntheticEnv)
-    test_once = make_tester(agent, task, num_episodes=1)
     test = make_tester(agent, task, training.test_episodes)
-
-    def test_between(key: Array, agent_state: Any, active: Array) -> tuple[Array, Array]:
-        returns, steps = test_once(key, agent_state, active)
-        return returns[0], steps[0]
-
-    stop_reward = task.solved_reward if stop_reward is None else stop_reward
-    train = make_trainer(agent, env, training, stop_reward, test_fn=test_between)
+    train = make_tested_trainer(agent, env, task, training, stop_reward)
 
     def evaluate(
         key: Array, env_params: Any, active: Array | bool = True, hparams: Any = agent.hparams
@@ -64,6 +57,24 @@ def make_evaluator(
         )
 
     return evaluate
+
+
+def make_tested_trainer(
+    agent: Agent,
+    env: Any,
+    task: Task,
+    training: TrainingConfig,
+    stop_reward: float | None = None,
+) -> Callable[..., TrainResult]:
+    """A trainer that tests on the task between episodes where the solved rule asks for it."""
+    test_once = make_tester(agent, task, num_episodes=1)
+
+    def test_between(key: Array, agent_state: Any, active: Array) -> tuple[Array, Array]:
+        returns, steps = test_once(key, agent_state, active)
+        return returns[0], steps[0]
+
+    stop_reward = task.solved_reward if stop_reward is None else stop_reward
+    return make_trainer(agent, env, training, stop_reward, test_fn=test_between)
 
 
 def return_area(result: TrainResult) -> Array:

@@ -129,11 +129,41 @@ def test_initial_episodes_beyond_the_proxys_own_extend_its_step_budget(stored):
         (["proxy=real", "env=cartpole", "training_from=config"], "training_from must be proxy"),
         (["proxy=real", "env=cartpole", "agent_hparams=nes"], "agent_hparams must be default"),
         (["agent_hparams=nes"], "agent must be left out with agent_hparams=nes.*batch_size=4"),
+        (["proxy=real", "env=cartpole", "training.max_steps=9"], r"training must.*Set real_train"),
+        (["seed=-1"], r"seed must lie in \[0, 2\*\*31\)"),
     ],
 )  # fmt: skip
-def test_settings_without_effect_are_refused(given, message, stored):
+def test_settings_that_cannot_be_or_have_no_effect_are_refused(given, message, stored):
     with pytest.raises(ConfigError, match=message):
         evaluate_config(f"proxy={stored[0]}", *given)
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        (["training.solved_by=train", "training.stop_rule=solved"], "training.solved_by must be"),
+        (["training.max_steps=300", "agent.init_episodes=2"], "max_steps must exceed 400"),
+    ],
+)
+def test_trainings_that_sejax_run_refuses_are_refused(given, message, stored):
+    config = evaluate_config(f"proxy={stored[0]}", "training_from=config", *given)
+    with pytest.raises(ConfigError, match=message):
+        evaluate(config)
+
+
+def test_agents_on_rewards_of_a_network_do_not_stop_by_these(tmp_path):
+    config = sejax.config(["proxy=rn"])
+    env = make_reward(config.env.make(), config.proxy)
+    sejax.save(tmp_path / "proxy.safetensors", config, env.init_weights(jax.random.key(0)))
+    overrides = [f"proxy={tmp_path}", "real_training.solved_by=train"]
+    with pytest.raises(ConfigError, match=r"real_training\.solved_by must be test"):
+        evaluate(evaluate_config(*overrides))
+
+
+def test_one_agent_has_no_deviation(tmp_path, capsys):
+    overrides = ["proxy=real", "env=cartpole", "num_agents=1", f"out_dir={tmp_path}"]
+    evaluate(evaluate_config(*overrides))
+    assert "nan" not in capsys.readouterr().out
 
 
 def test_agents_of_the_nes_run_bring_their_exploration(tmp_path, capsys):

@@ -362,7 +362,9 @@ def test_bad_options_are_refused(argv, message, ses, tmp_path):
     ("name", "argv", "message"),
     [("se_feasibility", ["--env", "cartpol"], "Did you mean env=cartpole"),
      ("se_performance", ["--fixed", "none.safetensors"], "does not exist"),
-     ("se_models", [], "--ses must be given")],
+     ("se_models", [], "--ses must be given"),
+     ("se_models", ["--seed", "-1"], "--seed must lie in"),
+     ("se_models", ["--devices", "0"], "--devices must be at least 1")],
 )  # fmt: skip
 def test_commands_end_bad_input_with_one_message_and_status_2(name, argv, message, tmp_path):
     environment = {key: value for key, value in os.environ.items() if key != "XLA_FLAGS"}

@@ -351,6 +351,10 @@ def test_intervals_draw_models_and_the_best_ones_are_those_of_the_best_episodes(
     assert summary.loc["se", "solved"] == 1 and summary.loc["authors", "solved"] == 0
     table = supervised_baseline.make_table(summary.reset_index())
     assert list(table["paper's"]) == ["15.01", "17.73", "190.7"]
+    agents.loc[agents["group"] == 2, "nonfinite"] = True  # also those of the best models' copies
+    assert supervised_baseline.diverged_text(agents[agents["world"] != "se"]) == (
+        "2 of 6 (model, as the authors)"
+    )
     few = agents[agents["group"] < 2]
     assert supervised_baseline.with_best(few, [1.0, 2.0]) is few
 
@@ -373,6 +377,19 @@ def test_the_supervised_baseline_runs_and_goes_on(se_file, tmp_path, monkeypatch
     with pytest.raises(ConfigError, match="another num_agents"):
         args = experiment_options(supervised_baseline, tmp_path, *argv, "--num-agents", "3")
         supervised_baseline.run(args)
+
+
+@pytest.mark.parametrize("overrides", [["agent=ppo"], ["agent=td3_discrete",
+                                                        "agent.action_repeat=2"]])  # fmt: skip
+def test_ses_whose_tests_cannot_be_recorded_are_refused(overrides, tmp_path):
+    config = sejax.config(["proxy.hidden_size=4", "training.max_steps=9000", *overrides])
+    env = make_synthetic(envs.make("cartpole"), config.proxy)
+    path = tmp_path / "se.safetensors"
+    save_set(path, config, [env.init_weights(jax.random.key(5))], [1.0], [0], [0])
+    with pytest.raises(ConfigError, match="without action repeat"):
+        supervised_baseline.run(
+            experiment_options(supervised_baseline, tmp_path, "--proxy", str(path))
+        )
 
 
 def check_real_transitions(rows):

@@ -17,6 +17,7 @@ import numpy as np
 import pandas as pd
 
 from sejax import commands
+from sejax.configs import require_seed
 from sejax.errors import ConfigError, require
 from sejax.files import write_text
 from sejax.run_directory import flatten
@@ -28,6 +29,9 @@ def parse_args(
     """Options that every experiment takes, and its own; starts XLA with a device for each core.
 
     Words `name=value` before the first option mean `--name value`, as in sejax.run.
+
+    Raises:
+      ConfigError: for a seed or a number of devices that cannot be.
     """
     summary = (description or "").partition("\n")[0]
     parser = argparse.ArgumentParser(prog=f"python -m sejax.experiments.{name}",
@@ -38,6 +42,8 @@ def parse_args(
     parser.add_argument("--devices", type=int, help="devices to use; all")
     add_options(parser)
     args = parser.parse_args(as_options(sys.argv[1:]))
+    require_seed("--seed", args.seed)
+    require_counts(args, "devices")
     args.out = args.out or Path("results") / (f"{name}-quick" if args.quick else name)
     from sejax.runtime import configure_xla, enable_compilation_cache
 
@@ -61,9 +67,8 @@ def run_command(
     run: Callable[[argparse.Namespace], Any],
 ) -> None:
     """Runs an experiment as the command line says; bad input ends it with one message."""
-    args = parse_args(name, description, add_options)
     try:
-        run(args)
+        run(parse_args(name, description, add_options))
     except ConfigError as error:
         commands.fail(str(error), commands.BAD_INPUT)
 

@@ -177,12 +177,12 @@ def make_recorder(
     import jax.numpy as jnp
 
     from sejax.agents.registry import make_agent
-    from sejax.trainer import make_trainer
+    from sejax.evaluation import make_tested_trainer
 
     agent = make_agent(config, ses.task, ses.config.exploration)
     capacity = min(max_rows, training.max_steps or max_rows)
     recording = recording_agent(agent, capacity, ses.task.obs_dim)
-    train = make_trainer(recording, ses.env, training, ses.task.solved_reward)
+    train = make_tested_trainer(recording, ses.env, ses.task, training)
     test = make_test_recorder(agent, ses.task, training.test_episodes)
 
     def one(key: Any, env_params: Any) -> dict[str, dict[str, Any]]:
@@ -274,7 +274,8 @@ def make_test_recorder(agent: Any, task: Any, num_episodes: int) -> Callable[...
     """Builds `test(key, agent_state) -> Steps` of greedy episodes on the real task.
 
     The leaves are `[num_episodes * max_steps, ...]`, episode by episode; `action` is what the world
-    was given. The episodes are those of `make_tester` with the same key.
+    was given. The episodes are those of `make_tester` with the same key, for an agent that does not
+    repeat its actions.
     """
     import jax
     import jax.numpy as jnp

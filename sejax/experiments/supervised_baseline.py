@@ -104,6 +104,11 @@ def run(args: argparse.Namespace) -> pd.DataFrame:
             "--proxy", "be an SE learned with fixed hyperparameters and a seed for each agent",
             "the recorded NES runs have these", "one learned otherwise",
             "--proxy=cartpole")  # fmt: skip
+    learned_with: Any = ses.config.agent
+    require(learned_with.name in AGENTS and getattr(learned_with, "action_repeat", 1) == 1,
+            "--proxy", f"be an SE learned with {', '.join(AGENTS)}, without action repeat", "the "
+            "recorded NES runs have its agent, and their every step is a row",
+            f"one learned with {learned_with.name}", "--proxy=cartpole")  # fmt: skip
     pieces = common.Pieces(args.out / "pieces")
     data = [
         supervised_models.collect_piece(args, ses, index, pieces) for index in range(args.models)
@@ -317,7 +322,7 @@ def report(
         f"{last['error']:.2g} of [s', r] (paper: 5e-07), {last['done_error']:.2g} "
         "of the end. As the authors: the network for the end keeps its random weights. Fair: it is "
         "fitted too, and used. The best models are those of the runs with the best episodes. "
-        f"Agents that met a number that is not finite: {int(summary['num_nonfinite'].sum())}."
+        f"Agents that met a number that is not finite: {diverged_text(agents)}."
     )
     command = figures.command(NAME, args, "proxy", "models", "generations", "population",
                               "max_rows", "epochs", "agents", "num_agents",
@@ -327,6 +332,15 @@ def report(
     print(f"{args.out}: agents.csv (every test return), summary.csv, fits.csv, "
           "supervised_baseline.png and table.md.")  # fmt: skip
     return table
+
+
+def diverged_text(agents: pd.DataFrame) -> str:
+    """How many agents diverged, world by world; the best models' are among the authors'."""
+    own = agents[agents["world"] != "authors_best"]
+    counts = own.groupby("world", sort=False)["nonfinite"].sum()
+    texts = [f"{int(count)} of {(own['world'] == world).sum()} ({LABELS[str(world)]})"
+             for world, count in counts.items() if count]  # fmt: skip
+    return ", ".join(texts) or "none"
 
 
 def draw(task: Any, agents: pd.DataFrame, summary: pd.DataFrame, path: Path) -> None:

@@ -97,14 +97,13 @@ def make_recorded_evaluation(
     import jax.numpy as jnp
 
     from sejax.agents.registry import make_agent
-    from sejax.evaluation import return_area
+    from sejax.evaluation import make_tested_trainer, return_area
     from sejax.experiments.se_histograms import make_test_recorder
     from sejax.objectives import Outcome
     from sejax.parallel import spread_over_devices
-    from sejax.trainer import make_trainer
 
     agent = make_agent(config.agent, env.task, config.exploration)
-    train = make_trainer(agent, env, config.training, env.task.solved_reward)
+    train = make_tested_trainer(agent, env, env.task, config.training)
     num_episodes = config.training.test_episodes
     test = make_test_recorder(agent, env.task, num_episodes)
 
