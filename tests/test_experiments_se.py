@@ -319,6 +319,9 @@ def test_performance_trains_as_evaluation_does_and_goes_on(ses, tmp_path, monkey
     with pytest.raises(ConfigError, match=r"with another training\.test_episodes"):
         performance(ses, tmp_path, "--test-episodes", "4")
 
+    fewer = performance(ses, tmp_path, "--real-groups", "1")
+    assert fewer["SEs, agents"].tolist() == ["1, 3", "2, 6"]
+
     args = experiment_options(
         se_models, tmp_path, "--ses", str(ses[0]), "--agents", "ddqn", "--num-agents", "3",
         "--num-ses", "2", "--test-episodes", "2",

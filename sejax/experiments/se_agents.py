@@ -76,7 +76,7 @@ def fill_in(args: argparse.Namespace) -> None:
             setattr(args, name, value)
     check_agents(args)
     common.require_counts(args, "num_agents", "num_ses", "test_episodes", "max_steps",
-                          "real_episodes")  # fmt: skip
+                          "real_episodes", "real_groups")  # fmt: skip
 
 
 def check_agents(args: argparse.Namespace) -> None:

@@ -8,7 +8,7 @@ On each SE of a set `--num-agents` agents are trained whose hyperparameters are 
 whatever the SEs were learned with; `--varied` and `--fixed` are sets from se_feasibility, learned
 with `--agent-hparams varied` and without. SEs that did not reach the task's threshold are left out,
 as in the authors' code, which stores no others. As many groups of agents are trained on the real
-task.
+task, or `--real-groups`.
 """
 
 import argparse
@@ -64,6 +64,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--fixed", metavar="FILE", help="SEs learned with one agent's; with "
                         "--quick and no file, the shipped cartpole SE")  # fmt: skip
     parser.add_argument("--env", help="task, where no file is given; cartpole")
+    parser.add_argument("--real-groups", type=int, help="groups of agents on the real task, which "
+                        "takes longest; as many as SEs")  # fmt: skip
     parser.add_argument("--solved-by", choices=("train", "test"), default="train", help="whose "
                         "last returns end training on the real task; train, as in the paper's "
                         "code")  # fmt: skip
@@ -116,7 +118,8 @@ def make_worlds(args: argparse.Namespace) -> dict[str, se_agents.World]:
     names = sorted({ses.task.name for ses in sets.values()} | ({args.env} if args.env else set()))
     require(len(names) <= 1, "--varied, --fixed and --env", "be of one task",
             "agents are tested on it", ", ".join(names), "files of the same task")  # fmt: skip
-    count = max((ses.size for ses in sets.values()), default=args.num_ses)
+    as_ses = max((ses.size for ses in sets.values()), default=args.num_ses)
+    count = args.real_groups or as_ses
     task = envs.make(names[0] if names else "cartpole")
     return {"real": se_agents.real_world(args, task, count)} | {
         name: se_agents.se_world(args, ses) for name, ses in sets.items()
@@ -226,8 +229,8 @@ def report(args: argparse.Namespace, task: Any, agents: pd.DataFrame) -> pd.Data
         f"Agents that met a number that is not finite: {int(agents['nonfinite'].sum())}."
     )
     command = figures.command(NAME, args, "varied", "fixed", "env", "agents", "num_agents",
-                              "num_ses", "test_episodes", "solved_by", "real_episodes",
-                              "max_steps")  # fmt: skip
+                              "num_ses", "real_groups", "test_episodes", "solved_by",
+                              "real_episodes", "max_steps")  # fmt: skip
     common.write_markdown(args.out / "table.md", title, command, table, note)
     figures.print_table(title, table)
     print(f"{args.out}: agents.csv (every test return), summary.csv, performance.png and table.md.")
