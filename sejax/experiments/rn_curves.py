@@ -53,6 +53,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     """Options about the agents; with those of `rn_studies`."""
     rn_studies.add_options(parser)
     parser.add_argument("--rows", nargs="+", metavar="ROW", help=", ".join(ROWS))
+    parser.add_argument("--bonuses", nargs="+", metavar="BONUS", help="exploration bonuses on the "
+                        "real task to compare with; the paper's, or none")  # fmt: skip
     parser.add_argument("--rns", type=int, help="RNs of each variant to use, the best; 10 or 5")
     parser.add_argument("--num-agents", type=int, help="on each RN, in each row; 10")
     parser.add_argument("--max-steps", type=int, help="training steps; as the paper's figure")
@@ -69,6 +71,11 @@ def fill_in(args: argparse.Namespace) -> None:
     for name in args.rows:
         if name not in ROWS:
             raise unknown_name("--rows", name, ROWS)
+    bonuses = rn_studies.STUDIES[args.env].bonuses
+    args.bonuses = list(bonuses) if args.bonuses is None else args.bonuses
+    for name in args.bonuses:
+        if name not in (*bonuses, "none"):
+            raise unknown_name("--bonuses", name, (*bonuses, "none"))
     common.require_counts(args, "rns", "num_agents", "max_steps")
     args.rns = min(args.rns, args.learned)
 
@@ -80,10 +87,14 @@ def agent_of(args: argparse.Namespace, row: str) -> AgentConfig:
 
 
 def real_worlds(args: argparse.Namespace) -> list[World]:
-    """The real task, without and with the study's bonuses."""
+    """The real task, without and with the bonuses that are compared."""
     env_config = rn_studies.env_config(args)
     task = env_config.make()
-    bonuses = {"real": ExplorationConfig(), **rn_studies.STUDIES[args.env].bonuses}
+    studied = rn_studies.STUDIES[args.env].bonuses
+    bonuses = {
+        "real": ExplorationConfig(),
+        **{name: bonus for name, bonus in studied.items() if name in args.bonuses},
+    }
     return [
         World(name=name, env=task.env, env_config=env_config, params=(task.params,) * args.rns,
               fingerprints=("",) * args.rns, exploration=bonus)

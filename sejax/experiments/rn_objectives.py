@@ -127,9 +127,9 @@ def report(args: argparse.Namespace, curves: pd.DataFrame) -> pd.DataFrame:
         "concludes that the area does about as well as the threshold, and that the final return "
         "makes learning faster on CartPole but not on Cliff Walking."
     )
-    command = figures.command(NAME, args, "env", "objectives", "picks", "variants", "rows",
-                              "learned", "rns", "generations", "num_agents", "max_steps", "preset",
-                              "set")  # fmt: skip
+    command = figures.command(NAME, args, "env", "objectives", "picks", "variants", "bonuses",
+                              "rows", "learned", "rns", "generations", "num_agents", "max_steps",
+                              "preset", "set")  # fmt: skip
     common.write_markdown(args.out / "table.md", title, command, table, note)
     figures.print_table(title, table)
     pictures = ", ".join(f"{pick}.png" for pick in args.picks)

@@ -72,8 +72,8 @@ def report(args: argparse.Namespace, curves: pd.DataFrame) -> pd.DataFrame:
         "these tasks some variant learns faster than all agents without an RN, the additive ones "
         "most reliably."
     )
-    command = figures.command(NAME, args, "env", "variants", "rows", "objective", "learned",
-                              "rns", "generations", "num_agents", "max_steps", "preset",
+    command = figures.command(NAME, args, "env", "variants", "bonuses", "rows", "objective",
+                              "learned", "rns", "generations", "num_agents", "max_steps", "preset",
                               "set")  # fmt: skip
     common.write_markdown(args.out / "table.md", title, command, table, note)
     figures.print_table(title, table)
