@@ -410,7 +410,7 @@ def require_learning(
 ) -> None:
     """Checks that a step budget lets an agent learn on an SE with soft ends.
 
-    Episodes there last as long as they may, so that the agent's first learning step is known.
+    Most such SEs never end an episode, so that initial episodes take all steps that they may.
     """
     before = agent.steps_before_learning(envs.kind(env_name).max_steps)
     waits = "update_episodes" if isinstance(agent, PPOConfig) else "init_episodes"
