@@ -383,22 +383,29 @@ class EvaluateConfig:
                         "the proxy says which it was learned with", _differences(given, usual),
                         "agent_hparams=default")  # fmt: skip
         usual_training = TrainingConfig()
-        instead = "real_training.*"
+        instead = "" if self.proxy == "real" else "training_from=config, or "
         require(self.training_from == "config" or self.training == usual_training, "training",
                 "be left as it is", "agents train on an SE as it was learned with, and else as "
                 "real_training says", _differences(self.training, usual_training),
-                instead if self.proxy == "real" else f"training_from=config, or {instead}",
-                )  # fmt: skip
+                f"{instead}real_training.*")  # fmt: skip
 
 
 def require_seed(name: str, seed: int) -> None:
-    """Checks that a seed is one that `jax.random.key` takes as it is."""
+    """Checks that a seed is one that `jax.random.key` takes as it is.
+
+    Raises:
+      ConfigError: if it is not.
+    """
     require(0 <= seed < 2**31, name, "lie in [0, 2**31)", "it is a 32-bit number", seed,
             f"{name}=0")  # fmt: skip
 
 
 def require_real_returns(name: str, training: TrainingConfig) -> None:
-    """Checks that the rule by which agents stop on a proxy does not read the proxy's returns."""
+    """Checks that the rule by which agents stop on a proxy does not read the proxy's returns.
+
+    Raises:
+      ConfigError: if it does.
+    """
     require(training.stop_rule != "solved" or training.solved_by == "test",
             f"{name}.solved_by", "be test with stop_rule=solved", "returns on a proxy say "
             "nothing about the real task's threshold", training.solved_by,
@@ -411,6 +418,9 @@ def require_learning(
     """Checks that a step budget lets an agent learn on an SE with soft ends.
 
     Most such SEs never end an episode, so that initial episodes take all steps that they may.
+
+    Raises:
+      ConfigError: if it does not.
     """
     before = agent.steps_before_learning(envs.kind(env_name).max_steps)
     waits = "update_episodes" if isinstance(agent, PPOConfig) else "init_episodes"

@@ -65,13 +65,25 @@ def make_tested_trainer(
     task: Task,
     training: TrainingConfig,
     stop_reward: float | None = None,
+    tests_between: int = 1,
 ) -> Callable[..., TrainResult]:
-    """A trainer that tests on the task between episodes where the solved rule asks for it."""
-    test_once = make_tester(agent, task, num_episodes=1)
+    """Builds a `make_trainer` that tests on the task after each episode if the solved rule asks so.
+
+    Args:
+      agent: from `sejax.agents`.
+      env: gymnax environment to train in.
+      task: the real task.
+      training: stopping rule and limits.
+      stop_reward: what the solved rule asks for; None for the task's threshold.
+      tests_between: greedy test episodes after each training episode, of which the mean counts.
+
+    Source: paper, section "Experiments with Reward Networks" (training and testing alternate).
+    """
+    test = make_tester(agent, task, tests_between)
 
     def test_between(key: Array, agent_state: Any, active: Array) -> tuple[Array, Array]:
-        returns, steps = test_once(key, agent_state, active)
-        return returns[0], steps[0]
+        returns, steps = test(key, agent_state, active)
+        return returns.mean(), steps.sum()
 
     stop_reward = task.solved_reward if stop_reward is None else stop_reward
     return make_trainer(agent, env, training, stop_reward, test_fn=test_between)

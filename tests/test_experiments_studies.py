@@ -379,6 +379,19 @@ def test_the_supervised_baseline_runs_and_goes_on(se_file, tmp_path, monkeypatch
         supervised_baseline.run(args)
 
 
+def test_trainings_that_end_by_tests_can_be_recorded(tmp_path):
+    """An SE learned with the solved rule, whose agents are tested between episodes."""
+    config = sejax.config(["proxy.hidden_size=4", "training.stop_rule=solved",
+                           "training.max_episodes=3", "training.max_steps=450",
+                           "training.test_episodes=1", "agent.init_episodes=0",
+                           "agent.hidden_size=4", "agent.batch_size=4", "devices=1"])  # fmt: skip
+    env, unravel, mean = supervised_models.make_proxy(config, seed=0)
+    evaluate = supervised_models.make_recorded_evaluation(config, env, unravel)
+    outcome, (steps, _) = evaluate(jax.random.split(jax.random.key(0), 1), mean[None])
+    assert 0 < outcome.train_steps[0] <= 450
+    assert outcome.real_steps[0] > steps.valid.sum()  # those between episodes count as well
+
+
 @pytest.mark.parametrize("overrides", [["agent=ppo"], ["agent=td3_discrete",
                                                         "agent.action_repeat=2"]])  # fmt: skip
 def test_ses_whose_tests_cannot_be_recorded_are_refused(overrides, tmp_path):

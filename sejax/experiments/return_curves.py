@@ -46,20 +46,14 @@ def make_program(
 
     from sejax.agents.hparams import make_varied_agents
     from sejax.agents.registry import make_agent
+    from sejax.evaluation import make_tested_trainer
     from sejax.parallel import spread_over_devices
-    from sejax.trainer import make_tester, make_trainer
 
     # A threshold that nobody reaches: tested after each episode, but never stopped.
     training = dataclasses.replace(training, stop_rule="solved", solved_by="test")
 
     def branch(agent: Any) -> Callable[..., Any]:
-        test = make_tester(agent, task, training.test_episodes)
-
-        def test_between(key: Any, agent_state: Any, active: Any) -> Any:
-            returns, steps = test(key, agent_state, active)
-            return returns.mean(), steps.sum()
-
-        train = make_trainer(agent, env, training, jnp.inf, test_between)
+        train = make_tested_trainer(agent, env, task, training, jnp.inf, training.test_episodes)
 
         def curve(key: Any, env_params: Any, hparams: Any) -> Any:
             result = train(key, env_params, hparams)

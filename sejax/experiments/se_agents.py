@@ -91,7 +91,7 @@ def check_agents(args: argparse.Namespace) -> None:
 
 
 def real_world(args: argparse.Namespace, task: Any, count: int) -> World:
-    """The real task as often as there are SEs; training ends by the solved rule."""
+    """The real task for `count` groups of agents; training ends by the solved rule."""
 
     def training(agent: Any) -> TrainingConfig:
         # reference_details.md 7.1: discrete TD3 trains 500 episodes on Acrobot, all others 1000.
@@ -131,7 +131,11 @@ def se_world(args: argparse.Namespace, ses: Any) -> World:
 def train_all(
     args: argparse.Namespace, kind: str, world: World, pieces: common.Pieces
 ) -> pd.DataFrame:
-    """Agents of one kind in a world, a row each; every group is a piece."""
+    """Agents of one kind in a world, a row each; every group is a piece.
+
+    Raises:
+      ConfigError: for stored pieces of other settings.
+    """
     from sejax.agents.configs import AGENT_CONFIGS
 
     config = AGENT_CONFIGS[kind](**(QUICK_AGENT if args.quick else {}))

@@ -116,7 +116,7 @@ def make_recorded_evaluation(
         outcome = Outcome(test_returns=returns, train_steps=result.train_steps,
                           train_episodes=result.episodes, return_area=return_area(result),
                           nonfinite=result.nonfinite,
-                          real_steps=steps.valid.sum())  # fmt: skip
+                          real_steps=steps.valid.sum() + result.test_steps)  # fmt: skip
         return outcome, (steps, jnp.repeat(returns, env.task.max_steps))
 
     return jax.jit(spread_over_devices(one, config.devices, config.lanes, agent.cpu_lanes))
