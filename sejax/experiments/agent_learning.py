@@ -17,6 +17,7 @@ import numpy as np
 import pandas as pd
 
 from sejax.agents.configs import AGENT_CONFIGS
+from sejax.configs import TrainingConfig
 from sejax.errors import unknown_name
 from sejax.experiments import common, return_curves
 from sejax.experiments.return_curves import WINDOW
@@ -111,12 +112,17 @@ def run(args: argparse.Namespace) -> pd.DataFrame:
             continue
         max_steps = min(study.max_steps, QUICK_STEPS) if args.quick else study.max_steps
         config = AGENT_CONFIGS[study.agent](**study.hparams)
-        settings = {"agent": vars(config), "env": study.env, "max_steps": max_steps,
-                    "num_agents": args.num_agents, "test_episodes": args.test_episodes,
-                    "seed": args.seed}  # fmt: skip
+        training = TrainingConfig(
+            max_episodes=max_steps // SHORTEST_EPISODE,
+            max_steps=max_steps,
+            test_episodes=args.test_episodes,
+            time_limit_is_terminal=False,  # as in the literature; the paper's code ends there
+        )
+        settings = {"agent": vars(config), "env": study.env, "training": vars(training),
+                    "num_agents": args.num_agents, "seed": args.seed}  # fmt: skip
         curves = pieces.compute(
             f"{number:02d}-{study.name}", settings,
-            functools.partial(train, config, study.env, max_steps, args),
+            functools.partial(train, config, study.env, training, args),
         )  # fmt: skip
         last = return_curves.last_returns(curves).mean()
         print(f"{study.name}: last {WINDOW} test returns {last:.1f}", flush=True)
@@ -124,21 +130,16 @@ def run(args: argparse.Namespace) -> pd.DataFrame:
     return report(args, pd.concat(tables, ignore_index=True))
 
 
-def train(config: Any, env: str, max_steps: int, args: argparse.Namespace) -> pd.DataFrame:
+def train(
+    config: Any, env: str, training: TrainingConfig, args: argparse.Namespace
+) -> pd.DataFrame:
     """Trains the agents of a study; a row for each training episode of each."""
     import jax
 
     from sejax import envs
     from sejax.agents.configs import ExplorationConfig
-    from sejax.configs import TrainingConfig
 
     task = envs.make(env)
-    training = TrainingConfig(
-        max_episodes=max_steps // SHORTEST_EPISODE,
-        max_steps=max_steps,
-        test_episodes=args.test_episodes,
-        time_limit_is_terminal=False,  # as in the literature; the paper's code ends episodes there
-    )
     program = return_curves.make_program(config, ExplorationConfig(), task.env, task, training,
                                          devices=args.devices)  # fmt: skip
     keys = jax.random.split(jax.random.key(args.seed), args.num_agents)
