@@ -145,13 +145,10 @@ def select_best(agents: pd.DataFrame, count: int = NUM_BEST) -> pd.DataFrame:
 
 
 def with_best(agents: pd.DataFrame) -> pd.DataFrame:
-    """Adds the best SEs for discrete TD3 as a setting of its own, where there are several SEs."""
-    for setting in ("varied", "fixed"):
-        mine = agents[(agents["kind"] == BEST_FOR) & (agents["setting"] == setting)]
-        best = select_best(mine) if len(mine) else mine
-        if len(best):
-            return pd.concat([agents, best.assign(setting="best")], ignore_index=True)
-    return agents
+    """Adds the best SEs of all sets for discrete TD3 as a setting, where there are several SEs."""
+    on_ses = agents[(agents["kind"] == BEST_FOR) & (agents["setting"] != "real")]
+    best = select_best(on_ses) if len(on_ses) else on_ses
+    return pd.concat([agents, best.assign(setting="best")], ignore_index=True)
 
 
 def summarise(agents: pd.DataFrame) -> pd.DataFrame:
