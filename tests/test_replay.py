@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -46,6 +47,20 @@ def test_what_is_stored_comes_back_unchanged():
         np.testing.assert_array_equal(batch.next_obs[:, column], expected.next_obs)
         assert batch.reward[column] == expected.reward
         assert batch.discount[column] == expected.discount
+
+
+@pytest.mark.parametrize("in_use", [1, 31, 32, 33, 100])
+def test_a_batch_in_use_is_the_beginning_of_the_whole_one(in_use):
+    rows, seed, num_steps = filled(5), jnp.uint32(7), jnp.int32(5)
+    whole = sample(rows, seed, num_steps, 104)
+    some = jax.jit(lambda n: replay.sample(rows, seed, num_steps, 100, None, n))(
+        jnp.float32(in_use)
+    )
+    for name in ("obs", "action", "reward", "discount", "next_obs"):
+        got, expected = getattr(some, name), getattr(whole, name)
+        np.testing.assert_array_equal(got[..., :in_use], expected[..., :in_use])
+        assert jnp.isfinite(got).all()
+    np.testing.assert_array_equal(some.weight, np.arange(some.reward.shape[0]) < in_use)
 
 
 def test_a_full_buffer_overwrites_its_oldest_rows():

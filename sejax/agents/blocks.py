@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-_NUM_BLOCKS, _MIN_SIZE = 6, 32  # enough to waste little, large enough to be worth an iteration
+_NUM_BLOCKS, _MIN_SIZE = 4, 32  # enough to waste little, large enough for efficient products
 _MULTIPLE = 8  # vector width of a CPU
 
 

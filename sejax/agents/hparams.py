@@ -25,9 +25,9 @@ from sejax.agents.configs import AgentConfig, ExplorationConfig, QLearningConfig
 from sejax.agents.registry import make_agent
 from sejax.envs import Task
 
-# Of neighbouring hidden sizes: how much room a network may have to spare. With one hidden layer
-# the cost grows with the size, with more of them with its square.
-_SIZE_RATIO, _SIZE_RATIO_DEEP = 1.5, 1.25
+# Networks of a depth: evenly spaced sizes, since what room to spare costs matters for large ones.
+# With one hidden layer the cost grows with the size, with more of them with its square.
+_NUM_SIZES, _NUM_SIZES_DEEP = 6, 12
 _MULTIPLE = 8  # vector width of a CPU
 
 
@@ -112,13 +112,10 @@ def draw_value(key: Array, bounds: Range) -> Array:
 
 def hidden_sizes(bounds: Range, num_layers: int) -> tuple[int, ...]:
     """Sizes of networks, growing, the last of which has room for all in the range."""
-    ratio = _SIZE_RATIO if num_layers == 1 else _SIZE_RATIO_DEEP
-    sizes, size = [], bounds.high
-    while True:
-        sizes.append(-(-math.ceil(size) // _MULTIPLE) * _MULTIPLE)
-        size = size / ratio
-        if size < bounds.low:
-            return tuple(sorted(set(sizes)))
+    parts = _NUM_SIZES if num_layers == 1 else _NUM_SIZES_DEEP
+    step = -(-math.ceil(bounds.high) // (parts * _MULTIPLE)) * _MULTIPLE
+    smallest = math.ceil(bounds.low / step) * step
+    return tuple(range(smallest, math.ceil(bounds.high) + step, step))
 
 
 @functools.cache

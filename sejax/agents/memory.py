@@ -59,11 +59,8 @@ def replay_memory(batch_size: int, buffer_size: int) -> MemoryMaker:
             transition: Transition,
             in_use: Array | None = None,
         ) -> Transition:
-            drawn = replay.sample(rows, jax.random.bits(key), num_steps, batch_size, action_dim)
-            if in_use is None:
-                return drawn
-            columns = jnp.arange(drawn.reward.shape[0])
-            return drawn._replace(weight=jnp.float32(columns < in_use))
+            seed = jax.random.bits(key)
+            return replay.sample(rows, seed, num_steps, batch_size, action_dim, in_use)
 
         return Memory(
             init=lambda: replay.init(capacity, obs_dim, action_dim),

@@ -10,6 +10,8 @@ import jax.numpy as jnp
 from jax.experimental.xla_metadata import set_xla_metadata
 from jaxtyping import Array, Float, Int, UInt32
 
+from sejax.agents.blocks import block_size
+
 _VECTOR = 8  # float32 lanes of AVX2
 
 
@@ -88,6 +90,7 @@ def sample(
     num_stored: Int[Array, ""],
     batch_size: int,
     action_dim: int | None = None,
+    in_use: Array | None = None,
 ) -> Transition:
     """Draws a feature-major batch, uniformly with replacement, from the first `num_stored` rows.
 
@@ -97,22 +100,40 @@ def sample(
       num_stored: rows written so far, at least 1; more than the capacity counts as the capacity.
       batch_size: number of rows to draw (static).
       action_dim: length of an action, or None if it is an index.
+      in_use: draw only the first so many of the columns, `[]`; None for all of them.
 
     Returns:
-      A batch whose width is `batch_size` rounded up to whole vectors of the CPU; the columns beyond
-      it have weight 0. A remainder costs more than the arithmetic on up to seven more columns.
+      A batch whose width is `batch_size` rounded up to whole vectors of the CPU, or with `in_use`
+      to whole blocks of a batch; the columns beyond what was asked for have weight 0. A remainder
+      costs more than the arithmetic on up to seven more columns.
 
     Source: `reference_details.md` 3.5 (with replacement, from the first stored transition on).
     """
     size = jnp.minimum(num_stored, rows.shape[0])
-    padded_size = -(-batch_size // _VECTOR) * _VECTOR
     width = rows.shape[1]
-    index = sample_indices(seed, size, padded_size)[None, :] * width + jnp.arange(width)[:, None]
-    batch = jax.lax.platform_dependent(
-        rows.reshape(-1), index, cpu=_gather_outlined, default=_gather
-    )  # [width, batch]
-    is_padding = jnp.arange(padded_size) >= batch_size
-    weight = 1.0 if padded_size == batch_size else 1.0 - is_padding
+
+    def columns(first: Array | int, count: int) -> Float[Array, "width count"]:
+        index = sample_indices(seed, size, count, first)[None, :] * width
+        return jax.lax.platform_dependent(
+            rows.reshape(-1), index + jnp.arange(width)[:, None], cpu=_gather_outlined,
+            default=_gather,
+        )  # fmt: skip
+
+    step = _VECTOR if in_use is None else block_size(batch_size)
+    padded_size = -(-batch_size // step) * step
+    if in_use is None:
+        batch = columns(0, padded_size)
+        is_padding = jnp.arange(padded_size) >= batch_size
+        weight = 1.0 if padded_size == batch_size else 1.0 - is_padding
+    else:
+
+        def draw_block(i: Array, batch: Array) -> Array:
+            return jax.lax.dynamic_update_slice(batch, columns(i * step, step), (0, i * step))
+
+        num_blocks = jnp.ceil(in_use / step).astype(jnp.int32)
+        empty = jnp.zeros((width, padded_size), rows.dtype)
+        batch = jax.lax.fori_loop(0, num_blocks, draw_block, empty)
+        weight = jnp.float32(jnp.arange(padded_size) < in_use)
     return unpack(batch, action_dim)._replace(weight=weight)
 
 
@@ -144,15 +165,15 @@ def _gather_outlined(flat: Array, index: Array) -> Array:
 
 
 def sample_indices(
-    seed: UInt32[Array, ""], size: Int[Array, ""], batch_size: int
+    seed: UInt32[Array, ""], size: Int[Array, ""], batch_size: int, first: Array | int = 0
 ) -> Int[Array, " batch"]:
-    """Uniform indices in [0, size), from a counter-based hash of `seed`.
+    """Uniform indices in [0, size) of the columns from `first` on: a hash of `seed` and column.
 
     threefry takes half as long as the learning step at these sizes. The hash is the finaliser
     of MurmurHash3 on a Weyl sequence; 24 of its bits choose the index, so that the bias is below
     size / 2**24.
     """
-    counter = jnp.arange(batch_size, dtype=jnp.uint32)
+    counter = jnp.uint32(first) + jnp.arange(batch_size, dtype=jnp.uint32)
     x = seed + counter * jnp.uint32(0x9E3779B9)
     x = (x ^ (x >> 16)) * jnp.uint32(0x85EBCA6B)
     x = (x ^ (x >> 13)) * jnp.uint32(0xC2B2AE35)
