@@ -219,10 +219,11 @@ def report(args: argparse.Namespace, task: Any, agents: pd.DataFrame) -> pd.Data
         f"Mean ± std over agents with drawn hyperparameters, {args.test_episodes} test episodes "
         'each; in brackets a bootstrap 95% interval that draws SEs, not agents. "Fewer" are '
         "training steps saved against the real task, for which a group of agents takes the place "
-        f"of an SE. The best SEs, {NUM_BEST} at most, are chosen by half of their agents and shown "
-        "by the other half. SEs are those of a set that reached the threshold, all where none did. "
-        "The paper has 40 SEs with 10 agents each; where a field is empty it gives no number here, "
-        "but for DDQN in CartPole a mean return on SEs of 190.7, in another section. "
+        f"of an SE. The best SEs of all sets, {NUM_BEST} at most, are chosen by half of their "
+        "agents and shown by the other half. SEs are those of a set that reached the threshold, "
+        "all where none did. The paper has 40 SEs with 10 agents each; where a field is empty it "
+        "gives no number here, but for DDQN in CartPole a mean return on SEs of 190.7, in another "
+        "section. "
         f"Agents that met a number that is not finite: {int(agents['nonfinite'].sum())}."
     )
     command = figures.command(NAME, args, "varied", "fixed", "env", "agents", "num_agents",
