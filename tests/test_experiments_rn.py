@@ -63,6 +63,9 @@ def test_rns_are_learned_stored_and_used_once(options, rns_dir, tmp_path, monkey
     monkeypatch.setattr(rn_curves, "train_group", refuse)
     monkeypatch.setattr(proxy_runs, "learn_one", refuse)
     pd.testing.assert_frame_equal(rn_performance.run(args), table)
+    args.bonus_groups = 1
+    fewer = rn_performance.run(args).set_index("trained with")["groups, agents"]
+    assert fewer["count_based"] == "1, 2" and set(fewer.drop("count_based")) == {"2, 4"}
     args.bonuses = ["none"]
     expected = table[table["trained with"] != "count_based"].reset_index(drop=True)
     pd.testing.assert_frame_equal(rn_performance.run(args), expected)
@@ -201,6 +204,7 @@ def test_augmented_variants_are_named_in_pictures():
         (rn_performance, ["--rows", "varied", "transfers"], "transfer"),
         (rn_performance, ["--bonuses", "icm"], "--bonuses must be one of count_based, none.*icm"),
         (rn_performance, ["--rns", "0"], "at least 1"),
+        (rn_performance, ["--bonus-groups", "0"], "--bonus-groups must be at least 1"),
         (rn_performance, ["--learned", "0"], "at least 1"),
         (rn_performance, ["--objective", "steps"], "reward_threshold"),
         (rn_objectives, ["--picks", "top"], "worst"),

@@ -55,6 +55,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--rows", nargs="+", metavar="ROW", help=", ".join(ROWS))
     parser.add_argument("--bonuses", nargs="+", metavar="BONUS", help="exploration bonuses on the "
                         "real task to compare with; the paper's, or none")  # fmt: skip
+    parser.add_argument("--bonus-groups", type=int, help="groups of agents with a bonus, which are "
+                        "dear; as many as RNs are used")  # fmt: skip
     parser.add_argument("--rns", type=int, help="RNs of each variant to use, the best; 10 or 5")
     parser.add_argument("--num-agents", type=int, help="on each RN, in each row; 10")
     parser.add_argument("--max-steps", type=int, help="training steps; as the paper's figure")
@@ -76,8 +78,9 @@ def fill_in(args: argparse.Namespace) -> None:
     for name in args.bonuses:
         if name not in (*bonuses, "none"):
             raise unknown_name("--bonuses", name, (*bonuses, "none"))
-    common.require_counts(args, "rns", "num_agents", "max_steps")
+    common.require_counts(args, "rns", "num_agents", "max_steps", "bonus_groups")
     args.rns = min(args.rns, args.learned)
+    args.bonus_groups = args.bonus_groups or args.rns
 
 
 def agent_of(args: argparse.Namespace, row: str) -> AgentConfig:
@@ -91,14 +94,14 @@ def real_worlds(args: argparse.Namespace) -> list[World]:
     env_config = rn_studies.env_config(args)
     task = env_config.make()
     studied = rn_studies.STUDIES[args.env].bonuses
-    bonuses = {
-        "real": ExplorationConfig(),
-        **{name: bonus for name, bonus in studied.items() if name in args.bonuses},
+    worlds = {
+        "real": (ExplorationConfig(), args.rns),
+        **{name: (studied[name], args.bonus_groups) for name in studied if name in args.bonuses},
     }
     return [
-        World(name=name, env=task.env, env_config=env_config, params=(task.params,) * args.rns,
-              fingerprints=("",) * args.rns, exploration=bonus)
-        for name, bonus in bonuses.items()
+        World(name=name, env=task.env, env_config=env_config, params=(task.params,) * groups,
+              fingerprints=("",) * groups, exploration=bonus)
+        for name, (bonus, groups) in worlds.items()
     ]  # fmt: skip
 
 

@@ -128,8 +128,8 @@ def report(args: argparse.Namespace, curves: pd.DataFrame) -> pd.DataFrame:
         "makes learning faster on CartPole but not on Cliff Walking."
     )
     command = figures.command(NAME, args, "env", "objectives", "picks", "variants", "bonuses",
-                              "rows", "learned", "rns", "generations", "num_agents", "max_steps",
-                              "preset", "set")  # fmt: skip
+                              "bonus_groups", "rows", "learned", "rns", "generations",
+                              "num_agents", "max_steps", "preset", "set")  # fmt: skip
     common.write_markdown(args.out / "table.md", title, command, table, note)
     figures.print_table(title, table)
     pictures = ", ".join(f"{pick}.png" for pick in args.picks)

@@ -64,7 +64,8 @@ def report(args: argparse.Namespace, curves: pd.DataFrame) -> pd.DataFrame:
     title = f"Agents trained with reward networks and tested on {args.env}"
     note = (
         f"The best {args.rns} of {args.learned} RNs of each variant, learned by {args.objective}, "
-        f"with {args.num_agents} agents each, and as many groups on the real task; up to "
+        f"with {args.num_agents} agents each, and as many groups on the real task (with a bonus: "
+        f"{args.bonus_groups}); up to "
         f"{args.max_steps:,} training steps, one greedy test episode after each training episode. "
         f"Steps to solve: until the mean of {return_curves.WINDOW} tests in a row reaches "
         f"{task.solved_reward:g}; an agent that never does counts all steps. In brackets bootstrap "
@@ -72,9 +73,9 @@ def report(args: argparse.Namespace, curves: pd.DataFrame) -> pd.DataFrame:
         "these tasks some variant learns faster than all agents without an RN, the additive ones "
         "most reliably."
     )
-    command = figures.command(NAME, args, "env", "variants", "bonuses", "rows", "objective",
-                              "learned", "rns", "generations", "num_agents", "max_steps", "preset",
-                              "set")  # fmt: skip
+    command = figures.command(NAME, args, "env", "variants", "bonuses", "bonus_groups", "rows",
+                              "objective", "learned", "rns", "generations", "num_agents",
+                              "max_steps", "preset", "set")  # fmt: skip
     common.write_markdown(args.out / "table.md", title, command, table, note)
     figures.print_table(title, table)
     print(f"{args.out}: summary.csv, performance.png and table.md; the RNs are in {args.rns_dir}.")
