@@ -101,6 +101,8 @@ def test_files_that_are_no_set_are_refused(ses, tmp_path):
     path, weights = ses
     damaged = tmp_path / "damaged.safetensors"
     damaged.write_bytes(path.read_bytes()[:-20])
+    with pytest.raises(ConfigError, match=r"proxy must be a single proxy.*load_set reads sets"):
+        sejax.load(path)
     with pytest.raises(ConfigError, match=r"--fixed must be a whole file.*which is damaged"):
         load_set(damaged, "--fixed")
     other = sejax.config(["proxy.hidden_size=5"])

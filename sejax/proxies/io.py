@@ -84,6 +84,9 @@ def load_proxy(source: str | Path) -> Proxy:
     """As `load`, with the configuration and the metadata."""
     path = find(source)
     tensors, header = _read(path)
+    require("sejax_set" not in header, "proxy", "be a single proxy", "an agent trains in one world",
+            f"{path}, a set of several", "proxy to a run directory; in Python "
+            "sejax.experiments.proxy_sets.load_set reads sets")  # fmt: skip
     try:
         metadata = json.loads(header["sejax"])
         config = from_dict(metadata.pop("config"))
