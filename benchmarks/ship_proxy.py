@@ -19,8 +19,8 @@ from pathlib import Path
 
 import common
 
-from sejax.experiments.proxy_sets import load_set
 from sejax.proxies import io
+from sejax.proxies.sets import load_set
 
 
 def main() -> None:

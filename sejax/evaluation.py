@@ -51,7 +51,7 @@ def make_evaluator(
             test_returns=returns,
             train_steps=result.train_steps,
             train_episodes=result.episodes,
-            return_area=return_area(result),
+            return_area=return_area(result, returns.mean()),
             nonfinite=result.nonfinite | ~jnp.isfinite(returns).all(),
             real_steps=real_steps if synthetic else real_steps + result.train_steps,
         )
@@ -89,15 +89,20 @@ def make_tested_trainer(
     return make_trainer(agent, env, training, stop_reward, test_fn=test_between)
 
 
-def return_area(result: TrainResult) -> Array:
+def return_area(result: TrainResult, final_return: Array) -> Array:
     """Sum over training episodes of return times length: the area under the learning curve.
+
+    Args:
+      result: of a training.
+      final_return: of the test after it, for the steps of an episode that the step limit cut off.
 
     Source: paper, appendix "Studying the Influence of Different Reward Network Optimization
     Objectives" (AUC); `reference_details.md` 5.5.
     """
     lengths = jnp.diff(result.episode_ends, prepend=0)
     finished = jnp.arange(lengths.size) < result.episodes
-    return jnp.sum(jnp.where(finished, result.returns * lengths, 0.0))
+    rest = result.train_steps - result.episode_ends.max()
+    return jnp.sum(jnp.where(finished, result.returns * lengths, 0.0)) + final_return * rest
 
 
 def make_varied_evaluator(

@@ -18,7 +18,8 @@ class Outcome:
       train_steps: steps in the training world.
       train_episodes: episodes there.
       return_area: sum over those episodes of their return times their length; the returns are those
-        of the tests after each, where there are such tests.
+        of the tests after each, where there are such tests. An episode that the step limit cut off
+        counts with the test return.
       nonfinite: whether a number that is not finite was met in training; the score is then nan.
       real_steps: steps on the real task: tests, and training where its dynamics are real.
     """

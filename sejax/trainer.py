@@ -113,9 +113,11 @@ def make_trainer(
         raise ValueError("stop_rule='solved' with solved_by='test' needs a test_fn; got None.")
     time_limit_is_terminal = training.time_limit_is_terminal and not isinstance(env, SyntheticEnv)
     shaped = env if isinstance(env, RewardEnv) else None
+    max_steps = memory_steps = training.max_steps or _NO_LIMIT
+    if isinstance(env, RewardEnv | SyntheticEnv):  # whose episodes are no longer than the task's
+        memory_steps = min(max_steps, training.max_episodes * env.task.max_steps)
     env = repeat_actions(env, agent.action_repeat)
     window = training.window
-    max_steps = training.max_steps or _NO_LIMIT
 
     def begin(key: Array, env_params: Any, hparams: Any, active: Array | bool) -> _LoopState:
         key_agent, key_reset = jax.random.split(key)
@@ -142,7 +144,7 @@ def make_trainer(
             action = agent.act(jax.random.key(0), state.agent_state, state.obs, explore=True)
             return Transition(state.obs, action, jnp.float32(0), jnp.float32(0), state.obs)
 
-        return agent.memory(jax.eval_shape(example), max_steps)
+        return agent.memory(jax.eval_shape(example), memory_steps)
 
     def step(kept: Any, state: _LoopState, consts: Any, masked: bool) -> tuple[Any, _LoopState]:
         """One agent step: act, step the world, store, learn, and close the episode if it ended."""

@@ -16,7 +16,7 @@ from sejax.experiments import (
     rn_studies,
     timings,
 )
-from sejax.experiments.proxy_sets import load_set
+from sejax.proxies.sets import load_set
 
 LEARN = ["--variants", "additive_potential", "exclusive_non_potential", "--learned", "3",
          "--generations", "1", "--set", "training.max_episodes=5",

@@ -26,7 +26,7 @@ from sejax.experiments import (
     se_models,
     se_performance,
 )  # fmt: skip
-from sejax.experiments.proxy_sets import load_set, save_set
+from sejax.proxies.sets import load_set, save_set
 from sejax.proxies.synthetic import make_synthetic
 
 TINY_RUN = ["generations=3", "es.population_size=2", "es.num_incumbent_evals=2",

@@ -24,7 +24,7 @@ from sejax.experiments import (
     supervised_baseline,
     supervised_models,
 )
-from sejax.experiments.proxy_sets import load_set, save_set
+from sejax.proxies.sets import load_set, save_set
 from sejax.proxies.synthetic import make_synthetic
 from sejax.trainer import make_tester, make_trainer
 

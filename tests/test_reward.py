@@ -15,10 +15,10 @@ from sejax.agents.registry import make_agent
 from sejax.bilevel import make_learner
 from sejax.configs import ExplorationConfig, RewardConfig, TrainingConfig
 from sejax.errors import ConfigError
-from sejax.evaluation import return_area
+from sejax.evaluation import make_evaluator, return_area
 from sejax.proxies.reward import RewardEnv, make_reward
 from sejax.proxies.synthetic import ABSURD
-from sejax.trainer import make_trainer
+from sejax.trainer import TrainResult, make_trainer
 
 GAMMA = 0.9
 VARIANTS = {  # table "Overview of Reward Network variants"
@@ -211,6 +211,7 @@ def test_an_absurd_reward_ends_the_episode_instead_of_poisoning_the_agent(value,
     _, state = env.reset_env(jax.random.key(0), params)
     _, _, reward, terminated, info = env.step_env(jax.random.key(1), state, 0, params)
     assert reward == 0 and terminated and info["nonfinite"] == (not is_number)
+    assert info["discount"] == 0  # nothing is learned from what would come after
 
 
 # --- agents on it --------------------------------------------------------------------------------
@@ -247,7 +248,7 @@ LEARN = ["env=cliff_walking", "proxy=rn", "generations=1", "es.population_size=2
          "training.max_episodes=12"]  # fmt: skip
 
 
-def test_steps_on_a_reward_network_are_real_and_stop_when_the_task_is_solved():
+def test_steps_on_a_reward_network_are_real_and_scored():
     config = sejax.config([*LEARN, "es.num_incumbent_evals=2"])
     result = jax.jit(make_learner(config))(jax.random.key(0))
     steps, real = result.info.train_steps_total[0], result.info.env_steps_total[0]
@@ -255,6 +256,21 @@ def test_steps_on_a_reward_network_are_real_and_stop_when_the_task_is_solved():
     # -(n_tr + 100 max(0, C_sol - C_fin)), at most 12 episodes of 50 steps, a return of at least
     # -149 where the task is solved at -20.
     assert -(600 + 100 * 129) <= result.score < 0
+
+
+def test_training_on_a_reward_network_stops_when_tests_on_the_real_task_solve_it():
+    config = sejax.config(LEARN)
+    env = make_env("cliff_walking")
+    agent = make_agent(config.agent, env.task, config.exploration)
+    params = env.params(env.init_weights(jax.random.key(1)))
+
+    def episodes(stop_reward):
+        evaluate = make_evaluator(agent, env, env.task, config.training, stop_reward)
+        return int(evaluate(jax.random.key(0), params).train_episodes)
+
+    first_that_counts = agent.init_episodes + 1
+    assert episodes(-1000.0) == first_that_counts
+    assert episodes(0.0) == config.training.max_episodes == 12
 
 
 def test_the_area_under_the_curve_is_that_of_tests_over_training_steps():
@@ -270,8 +286,20 @@ def test_the_area_under_the_curve_is_that_of_tests_over_training_steps():
     )
     ends = np.asarray(result.episode_ends)
     assert result.test_steps == 21
-    np.testing.assert_allclose(return_area(result), np.diff(ends, prepend=0) @ result.returns)
-    np.testing.assert_allclose(return_area(result), (2.0 + 0.1) * ends[-1], rtol=1e-6)
+    area = return_area(result, jnp.float32(99.0))
+    np.testing.assert_allclose(area, np.diff(ends, prepend=0) @ result.returns)
+    np.testing.assert_allclose(area, (2.0 + 0.1) * ends[-1], rtol=1e-6)
+
+
+def test_the_area_counts_an_episode_that_the_budget_cut_off_with_the_test_after_it():
+    result = TrainResult(
+        agent_state=None, train_steps=jnp.int32(17), episodes=jnp.int32(2),
+        returns=jnp.array([-5.0, -3.0, jnp.nan]), episode_ends=jnp.array([4, 10, 0]),
+        nonfinite=jnp.bool_(False), test_steps=jnp.int32(0),
+    )  # fmt: skip
+    assert return_area(result, jnp.float32(-2.0)) == -5 * 4 - 3 * 6 - 2 * 7
+    nothing = result.replace(episodes=jnp.int32(0), episode_ends=jnp.zeros(3, jnp.int32))
+    assert return_area(nothing, jnp.float32(-2.0)) == -2 * 17
 
 
 def test_a_stored_reward_network_comes_back(tmp_path):
@@ -282,6 +310,19 @@ def test_a_stored_reward_network_comes_back(tmp_path):
     loaded, params = sejax.load(tmp_path / "rn.safetensors")
     assert loaded is env
     jax.tree.map(np.testing.assert_array_equal, params.weights, weights)
+
+
+def test_a_loaded_potential_pays_with_the_discount_of_its_agent(tmp_path):
+    config = sejax.config([*LEARN, "proxy.variant=exclusive_potential", "agent.discount=0.7"])
+    env = make_reward(envs.make("cliff_walking"), config.proxy)
+    weights = env.init_weights(jax.random.key(9))
+    sejax.save(tmp_path / "rn.safetensors", config, weights)
+    for params in (sejax.load(tmp_path / "rn.safetensors")[1],
+                   sejax.load_set(tmp_path / "rn.safetensors").one(0)):  # fmt: skip
+        _, state = env.reset(jax.random.key(0), params)
+        _, _, reward, *_ = env.step(jax.random.key(1), state, 3, params)  # up, from 36 to 24
+        expected = 0.7 * phi(env, weights, 24) - phi(env, weights, 36)
+        np.testing.assert_allclose(reward, expected, rtol=1e-5)
 
 
 @pytest.mark.parametrize(

@@ -78,7 +78,8 @@ def make_ppo(
 
     Without exploration the agent takes its most probable action. Differs: the authors also test
     with sampled actions (`reference_details.md` 3.7). The policy delay in the paper's table for PPO
-    has no counterpart in their code, nor here.
+    has no counterpart in their code, nor here. They do not clip actions, so that MountainCarContinuous
+    charges for what was drawn.
 
     Args:
       config: hyperparameters.

@@ -128,8 +128,8 @@ def learn_one(config: Any, program: Any, step: Callable[..., Any]) -> pd.DataFra
 
 def collect(configs: list[Any], path: Path) -> None:
     """Writes the best proxy of each seed into one file."""
-    from sejax.experiments.proxy_sets import save_set
     from sejax.proxies import io as proxy_io
+    from sejax.proxies.sets import save_set
 
     files = []
     for config in configs:

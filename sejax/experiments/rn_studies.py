@@ -202,7 +202,7 @@ def learn(args: argparse.Namespace, variant: str, objective: str) -> Any:
     Raises:
       ConfigError: for settings that cannot work, or a folder with RNs of other settings.
     """
-    from sejax.experiments.proxy_sets import load_set
+    from sejax.proxies.sets import load_set
 
     config = learning_config(args, variant, objective)
     folder = args.rns_dir / args.env / objective

@@ -91,7 +91,7 @@ def run(args: argparse.Namespace) -> pd.DataFrame:
     fill_in(args)
     from sejax.agents.configs import AGENT_CONFIGS
     from sejax.configs import require_fit
-    from sejax.experiments.proxy_sets import load_set
+    from sejax.proxies.sets import load_set
 
     ses = load_set(args.proxy, "--proxy").first(1)
     pieces = common.Pieces(args.out / "pieces")

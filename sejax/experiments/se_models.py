@@ -37,7 +37,7 @@ def run(args: argparse.Namespace) -> pd.DataFrame:
     Raises:
       ConfigError: for a file or settings that cannot work.
     """
-    from sejax.experiments.proxy_sets import load_set
+    from sejax.proxies.sets import load_set
 
     se_agents.fill_in(args)
     source = args.ses or ("cartpole" if args.quick else None)

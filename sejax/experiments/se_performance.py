@@ -99,7 +99,7 @@ def make_worlds(args: argparse.Namespace) -> dict[str, se_agents.World]:
       ConfigError: if the SEs are of different tasks.
     """
     from sejax import envs
-    from sejax.experiments.proxy_sets import load_set
+    from sejax.proxies.sets import load_set
 
     files = {"varied": args.varied, "fixed": args.fixed}
     if args.quick and not any(files.values()):

@@ -94,7 +94,7 @@ def run(args: argparse.Namespace) -> pd.DataFrame:
       ConfigError: for a proxy or settings that cannot work.
     """
     fill_in(args)
-    from sejax.experiments.proxy_sets import load_set
+    from sejax.proxies.sets import load_set
 
     ses = load_set(args.proxy, "--proxy").first(1)
     require(ses.task.num_states is None and ses.task.num_actions is not None, "--proxy",
@@ -147,7 +147,7 @@ class World:
 
 def make_worlds(args: argparse.Namespace, ses: Any) -> dict[str, World]:
     """The models of both variants and the SE, with as many agents on the SE as on all models."""
-    from sejax.experiments.proxy_sets import load_set
+    from sejax.proxies.sets import load_set
 
     sets = {
         name: load_set(supervised_models.model_file(args, name), "--out")

@@ -114,7 +114,8 @@ def make_recorded_evaluation(
         rewards = jnp.where(steps.valid, steps.reward, 0.0)
         returns = rewards.reshape(num_episodes, -1).sum(axis=1)
         outcome = Outcome(test_returns=returns, train_steps=result.train_steps,
-                          train_episodes=result.episodes, return_area=return_area(result),
+                          train_episodes=result.episodes,
+                          return_area=return_area(result, returns.mean()),
                           nonfinite=result.nonfinite,
                           real_steps=steps.valid.sum() + result.test_steps)  # fmt: skip
         return outcome, (steps, jnp.repeat(returns, env.task.max_steps))
@@ -268,7 +269,7 @@ def save_models(args: argparse.Namespace, ses: Any, weights: Any, variant: str, 
     """Stores the models of a variant, as SEs with their use of the done output."""
     import jax
 
-    from sejax.experiments.proxy_sets import save_set
+    from sejax.proxies.sets import save_set
 
     config = dataclasses.replace(ses.config, proxy=dataclasses.replace(ses.config.proxy, done=done))
     each = [jax.tree.map(lambda x, i=i: x[i], weights) for i in range(args.models)]

@@ -19,7 +19,7 @@ from sejax import envs
 from sejax.configs import LearnConfig, from_dict, to_dict
 from sejax.errors import ConfigError, require, unknown_name
 from sejax.files import atomic_path
-from sejax.proxies.registry import ProxyEnv, ProxyParams, make_proxy
+from sejax.proxies.registry import ProxyEnv, ProxyParams, make_proxy, params_as_learned
 
 FORMAT_VERSION = 1
 PRETRAINED_DIR = Path(__file__).parents[1] / "pretrained"
@@ -63,6 +63,9 @@ def save(path: str | Path, config: LearnConfig, weights: Any, **metadata: Any) -
 def load(source: str | Path) -> tuple[ProxyEnv, ProxyParams]:
     """Loads a proxy as a gymnax environment and its params (the weights).
 
+    The discount of a potential-based RN is that of the agent it was learned with. For another one
+    take `params.replace(discount=...)`; `make_trainer` does so by itself.
+
     Args:
       source: a run directory, a safetensors file, or the name of a proxy that ships with the
         package (`pretrained_names()`).
@@ -81,12 +84,12 @@ def load(source: str | Path) -> tuple[ProxyEnv, ProxyParams]:
 
 
 def load_proxy(source: str | Path) -> Proxy:
-    """As `load`, with the configuration and the metadata."""
+    """As `load`, with the real task, the configuration and the metadata."""
     path = find(source)
     tensors, header = _read(path)
     require("sejax_set" not in header, "proxy", "be a single proxy", "an agent trains in one world",
             f"{path}, a set of several", "proxy to a run directory; in Python "
-            "sejax.experiments.proxy_sets.load_set reads sets")  # fmt: skip
+            "sejax.load_set reads sets")  # fmt: skip
     try:
         metadata = json.loads(header["sejax"])
         config = from_dict(metadata.pop("config"))
@@ -103,7 +106,7 @@ def load_proxy(source: str | Path) -> Proxy:
     _check_shapes(path, env, weights)
     return Proxy(
         env=env,
-        params=env.params(jax.tree.map(jax.numpy.asarray, weights)),
+        params=params_as_learned(env, jax.tree.map(jax.numpy.asarray, weights), config),
         config=config,
         metadata=metadata,
         path=path,

@@ -59,10 +59,12 @@ class RewardEnv(environment.Environment[RewardState, RewardParams]):
     and at the step limit if agents do not bootstrap there. That is what makes `additive_potential`
     leave the optimal policy as it is (Ng et al., 1999); the authors' code keeps the network's
     value. An agent that repeats its actions gets the sum of the rewards of all steps, shaped each
-    with the discount of a whole decision, as in the authors' code.
+    with the discount of a whole decision, as in the authors' code; for it the potentials of the
+    steps between do not cancel.
 
     `augmented` networks see the task's observation vector v as well (`Task.augmented_keys`):
-    :math:`\Phi(s, v)` and :math:`\Phi(s', v')`. The authors' code has v' in both. The last two
+    :math:`\Phi(s, v)` and :math:`\Phi(s', v')`. The authors' code has v' in both, and on
+    HalfCheetah the two parts of the reward beside position and velocity. The last two
     variants, baselines of the authors' code, weigh the numbers i' in the step's `info`
     (`Task.info_keys`) and have no network.
 
@@ -186,6 +188,7 @@ class RewardEnv(environment.Environment[RewardState, RewardParams]):
         sane = jnp.abs(reward) < ABSURD  # False for nan
         info = {
             **info,
+            "discount": jnp.where(sane, info["discount"], 0.0),
             "real_reward": jnp.float32(real_reward),
             "nonfinite": ~jnp.isfinite(reward),
         }

@@ -1,4 +1,4 @@
-"""Sets of learned proxies of one task in one file: what the experiments read.
+"""Sets of learned proxies of one task in one file: what the experiments write and read.
 
 The tensors are those of one proxy with a leading axis over the proxies, in safetensors. The
 metadata holds the format version, the configuration that all were learned with, and of each proxy
@@ -24,7 +24,7 @@ from sejax.configs import LearnConfig, from_dict, to_dict
 from sejax.errors import ConfigError, require
 from sejax.files import atomic_path
 from sejax.proxies import io as proxy_io
-from sejax.proxies.registry import ProxyEnv, ProxyParams, make_proxy
+from sejax.proxies.registry import ProxyEnv, ProxyParams, make_proxy, params_as_learned
 
 FORMAT_VERSION = 1
 
@@ -39,7 +39,7 @@ class ProxySet:
       scores: `[size]` incumbent mean that each was chosen for.
       generations: `[size]` outer iteration that measured it.
       seeds: `[size]` seed of the run that it came from.
-      config: that the SEs were learned with; its seed is the first run's.
+      config: that they were learned with; its seed is the first run's.
       path: the file.
     """
 
@@ -62,11 +62,12 @@ class ProxySet:
     @property
     def params(self) -> ProxyParams:
         """All proxies as one `EnvParams`; only `weights` has the leading axis."""
-        return self.env.params(self.weights)
+        return params_as_learned(self.env, self.weights, self.config)
 
     def one(self, index: int) -> ProxyParams:
-        """`EnvParams` of one of them."""
-        return self.env.params(jax.tree.map(lambda x: x[index], self.weights))
+        """`EnvParams` of one of them, as `sejax.load` gives them."""
+        weights = jax.tree.map(lambda x: x[index], self.weights)
+        return params_as_learned(self.env, weights, self.config)
 
     def fingerprint(self, index: int) -> str:
         """Eight letters that tell one's weights from another's."""
@@ -134,17 +135,23 @@ def save_set(
         save_file(tensors, temporary, metadata={"sejax_set": json.dumps(header)})
 
 
-def load_set(source: str | Path, option: str = "--ses", kind: str = "se") -> ProxySet:
+def load_set(source: str | Path, option: str = "source", kind: str | None = None) -> ProxySet:
     """Loads a set of proxies; a single stored one is a set of one.
 
     Args:
       source: a file of `save_set`, or whatever `sejax.load` takes.
       option: named in error messages.
-      kind: "se" or "rn", which the proxies must be.
+      kind: "se" or "rn", which the proxies must be; None for either.
 
     Raises:
       ConfigError: if there is no such file, it is damaged or of another format, or its proxies are
         of another kind.
+
+    Example:
+      >>> rns = load_set("cliff_walking-rn")  # or a file in results/reward_networks
+      >>> env, params = rns.env, rns.one(0)
+      >>> rns.size, params.discount
+      (1, 0.8)
     """
     if not Path(source).is_file():
         return _set_of_one(source, option, kind)
@@ -175,14 +182,14 @@ def load_set(source: str | Path, option: str = "--ses", kind: str = "se") -> Pro
                  config=config, path=path)  # fmt: skip
 
 
-def _proxy_of(config: LearnConfig, option: str, kind: str) -> ProxyEnv:
-    require(config.proxy.name == kind, option, f"hold proxies learned with proxy={kind}",
+def _proxy_of(config: LearnConfig, option: str, kind: str | None) -> ProxyEnv:
+    require(kind in (None, config.proxy.name), option, f"hold proxies learned with proxy={kind}",
             "these are what is studied", f"proxy={config.proxy.name}",
             f"{option} to a file of those")  # fmt: skip
     return make_proxy(config.env.make(), config.proxy)
 
 
-def _set_of_one(source: str | Path, option: str, kind: str) -> ProxySet:
+def _set_of_one(source: str | Path, option: str, kind: str | None) -> ProxySet:
     proxy = proxy_io.load_proxy(source)
     stored = proxy.metadata
     return ProxySet(
