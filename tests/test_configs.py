@@ -25,6 +25,7 @@ from sejax.configs import (
     to_dict,
 )
 from sejax.errors import ConfigError, require, unknown_name
+from sejax.experiments.rn_studies import STUDIES
 
 composed_with = functools.cache(lambda *overrides: config(overrides))
 ENVS = ("cartpole", "acrobot")
@@ -197,6 +198,118 @@ def test_the_dataclass_defaults_are_the_papers_default_agent():
         group, name = path.split(".")
         schema = {"agent": DDQNConfig, "training": TrainingConfig}[group]
         assert getattr(schema(), name) == expected
+
+
+# Appendix "Reward Network Hyperparameters": the tables for learning RNs, a column for each task.
+RN_TASKS = ("cliff_walking", "cartpole", "mountain_car_continuous", "halfcheetah")
+LEARNING_RNS = {
+    "generations": (50,) * 4,
+    "es.population_size": (16,) * 4,
+    "es.step_size": (0.5,) * 4,
+    "es.noise_std": (0.1,) * 4,
+    "es.mirrored": (True,) * 4,
+    "es.score_transform": ("all_better_2",) * 4,
+    "objective.unsolved_weight": (100,) * 4,
+    "training.test_episodes": (1,) * 4,
+    "training.max_episodes": (100,) * 4,
+    "proxy.num_layers": (1,) * 4,
+    "proxy.hidden_size": (32, 64, 128, 128),
+    "proxy.activation": ("prelu",) * 4,
+    "agent.name": ("q_learning", "ddqn", "td3", "td3"),
+    "agent.learning_rate": (1.0, 0.003, 0.003, 0.003),
+    "agent.discount": (0.8, 0.99, 0.99, 0.98),
+    "agent.init_episodes": (None, 1, 50, 20),
+    "agent.batch_size": (None, 192, 192, 192),
+    "agent.target_update_rate": (None, 0.01, 0.01, 0.01),
+    "agent.num_layers": (None, 1, 2, 2),
+    "agent.hidden_size": (None, 64, 128, 128),
+    "agent.activation": (None, "leaky_relu", "leaky_relu", "relu"),
+    "agent.buffer_size": (None, 1_000_000, 100_000, 100_000),
+    "agent.epsilon_init": (0.01, 0.8, None, None),
+    "agent.epsilon_min": (0.01, 0.03, None, None),
+    "agent.epsilon_decay": (0.0, 0.95, None, None),
+    "agent.policy_delay": (None, None, 1, 1),
+    "agent.action_repeat": (None, None, 2, 1),
+    "agent.action_noise_std": (None, None, 0.05, 0.05),
+    "agent.target_noise_std": (None, None, 0.2, 0.2),
+    "agent.target_noise_clip": (None, None, 0.5, 0.5),
+}
+# The tables of default hyperparameters, for agents that are trained on learned RNs. SARSA's are not
+# here: see `STUDIES`.
+AFTER_LEARNING = {
+    ("cliff_walking", "agent"): {"learning_rate": 1.0, "discount": 0.8, "epsilon_init": 0.1,
+                                 "epsilon_min": 0.1, "epsilon_decay": 0.0},
+    ("cartpole", "agent"): {
+        "init_episodes": 1, "batch_size": 32, "learning_rate": 0.00025, "target_update_rate": 0.01,
+        "discount": 0.99, "epsilon_init": 1.0, "epsilon_min": 0.1, "epsilon_decay": 0.9,
+        "num_layers": 1, "hidden_size": 64, "activation": "relu", "buffer_size": 1_000_000,
+    },
+    ("cartpole", "transfer_agent"): {
+        "init_episodes": 1, "batch_size": 32, "learning_rate": 0.00025, "target_update_rate": 0.01,
+        "discount": 0.99, "epsilon_init": 1.0, "epsilon_min": 0.1, "epsilon_decay": 0.9,
+        "num_layers": 1, "hidden_size": 64, "activation": "relu", "buffer_size": 1_000_000,
+        "feature_dim": 128, "stream_num_layers": 1, "stream_hidden_size": 128,
+    },
+    ("mountain_car_continuous", "agent"): {
+        "init_episodes": 50, "batch_size": 256, "learning_rate": 0.0003, "discount": 0.99,
+        "target_update_rate": 0.005, "policy_delay": 2, "action_repeat": 2,
+        "action_noise_std": 0.1, "target_noise_std": 0.2, "target_noise_clip": 0.5,
+        "num_layers": 2, "hidden_size": 128, "activation": "relu", "buffer_size": 100_000,
+    },
+    ("halfcheetah", "agent"): {
+        "init_episodes": 20, "batch_size": 256, "learning_rate": 0.0003, "discount": 0.99,
+        "target_update_rate": 0.005, "policy_delay": 2, "action_repeat": 1,
+        "action_noise_std": 0.1, "target_noise_std": 0.2, "target_noise_clip": 0.5,
+        "num_layers": 2, "hidden_size": 128, "activation": "relu", "buffer_size": 100_000,
+    },
+    ("mountain_car_continuous", "transfer_agent"): {
+        "epochs": 80, "learning_rate": 0.0003, "update_episodes": 10, "discount": 0.99,
+        "action_repeat": 5, "value_weight": 1, "entropy_weight": 0.01, "clip_ratio": 0.2,
+        "num_layers": 2, "hidden_size": 64, "activation": "relu",
+    },
+    ("halfcheetah", "transfer_agent"): {
+        "epochs": 10, "learning_rate": 0.00001, "update_episodes": 1, "discount": 0.99,
+        "action_repeat": 1, "value_weight": 1, "entropy_weight": 0.001, "clip_ratio": 0.2,
+        "num_layers": 2, "hidden_size": 128, "activation": "tanh",
+    },
+}  # fmt: skip
+# "Optimized value" of the tables of the ICM, and of the count-based agents.
+BONUSES = {
+    "cliff_walking": {"reward_scale": 0.1},
+    "cartpole": {"learning_rate": 0.00001, "forward_weight": 0.05, "reward_scale": 0.03},
+    "mountain_car_continuous": {"learning_rate": 0.0005, "forward_weight": 0.1,
+                                "reward_scale": 0.01},
+    "halfcheetah": {"learning_rate": 0.00001, "forward_weight": 0.001, "reward_scale": 0.1},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("path", LEARNING_RNS)
+def test_the_papers_preset_holds_the_numbers_of_its_tables_for_rns(path):
+    for env, expected in zip(RN_TASKS, LEARNING_RNS[path], strict=True):
+        composed = composed_with(f"env={env}", "proxy=rn", "preset=paper")
+        if expected is not None:
+            assert value_at(composed, path) == expected
+
+
+@pytest.mark.parametrize("env", ["mountain_car_continuous", "halfcheetah"])
+def test_ppo_trains_for_more_episodes_on_rns(env):
+    composed = composed_with(f"env={env}", "proxy=rn", "preset=paper", "agent=ppo")
+    assert composed.training.max_episodes == 1000
+
+
+@pytest.mark.parametrize(("env", "which"), AFTER_LEARNING)
+def test_agents_after_learning_rns_are_those_of_the_papers_tables(env, which):
+    agent = getattr(STUDIES[env], which)
+    expected = AFTER_LEARNING[env, which]
+    assert {name: getattr(agent, name) for name in expected} == expected
+
+
+@pytest.mark.parametrize("env", BONUSES)
+def test_bonuses_beside_rns_are_those_of_the_papers_tables(env):
+    (bonus,) = STUDIES[env].bonuses.values()
+    assert {name: getattr(bonus, name) for name in BONUSES[env]} == BONUSES[env]
+    if bonus.name == "icm":
+        assert (bonus.feature_dim, bonus.hidden_size) == (32, 128)
 
 
 # --- bad input -----------------------------------------------------------------------------------

@@ -77,9 +77,9 @@ def make_ppo(
     `update` learns once the rollout is full and costs next to nothing before, in lanes too.
 
     Without exploration the agent takes its most probable action. Differs: the authors also test
-    with sampled actions (`reference_details.md` 3.7). The policy delay in the paper's table for PPO
-    has no counterpart in their code, nor here. They do not clip actions, so that MountainCarContinuous
-    charges for what was drawn.
+    with sampled actions (`reference_details.md` 3.7), and they do not clip actions, so that
+    MountainCarContinuous charges for what was drawn. The policy delay in the paper's table for PPO
+    has no counterpart in their code, nor here.
 
     Args:
       config: hyperparameters.
