@@ -49,7 +49,7 @@ def test_rns_are_learned_stored_and_used_once(options, rns_dir, tmp_path, monkey
     assert len({rns.fingerprint(i) for i in range(3)}) == 3
     assert list(rns.seeds) == [3, 4, 5]
     with pytest.raises(ConfigError, match="proxy=se"):
-        load_set(folder / "additive_potential.safetensors")
+        load_set(folder / "additive_potential.safetensors", kind="se")
 
     # The best two of three, and the worst two, by the scores of the runs' incumbents.
     curve = pd.read_csv(folder / "curves" / "additive_potential-seeds3-5.csv")
@@ -75,6 +75,37 @@ def pieces_of(folder, prefix):
     """Settings of the pieces of that name."""
     return [pd.read_json(path, typ="series")
             for path in sorted((folder / "pieces").glob(f"{prefix}-*.json"))]  # fmt: skip
+
+
+def test_a_set_grows_by_the_rns_that_it_lacks(rns_dir, options, monkeypatch):
+    args = options(rn_performance, *TRAIN)
+    rn_studies.fill_in(args)
+    three = rn_studies.learn(args, "additive_potential", "reward_threshold")
+    learned = []
+    learn_one = proxy_runs.learn_one
+
+    def learn_and_count(config, *rest):
+        learned.append(config.seed)
+        return learn_one(config, *rest)
+
+    monkeypatch.setattr(proxy_runs, "learn_one", learn_and_count)
+    args.learned = 4
+    four = rn_studies.learn(args, "additive_potential", "reward_threshold")
+    assert learned == [6] and list(four.seeds) == [3, 4, 5, 6]
+    assert list(four.scores[:3]) == list(three.scores)
+    assert [four.fingerprint(i) for i in range(3)] == [three.fingerprint(i) for i in range(3)]
+    assert four.fingerprint(3) not in [three.fingerprint(i) for i in range(3)]
+
+
+def test_rns_of_other_settings_are_refused_before_any_are_learned(options, monkeypatch):
+    args = options(rn_performance, *TRAIN)
+    rn_performance.run(args)
+    monkeypatch.setattr(proxy_runs, "learn_one", refuse)
+    monkeypatch.setattr(rn_curves, "train_group", refuse)
+    args.set = [*args.set, "proxy.hidden_size=7"]
+    args.variants = ["exclusive_potential", *args.variants]  # the first is yet to be learned
+    with pytest.raises(ConfigError, match=r"--rns-dir must be .* another proxy\.hidden_size"):
+        rn_performance.run(args)
 
 
 def test_several_runs_in_one_program_are_those_runs(rns_dir, options, tmp_path):
@@ -164,26 +195,40 @@ def test_timings_are_of_the_papers_rows(tmp_path):
     assert timed["seconds"] > 0 and (tmp_path / "timings.png").stat().st_size > 10_000
 
 
-def test_the_summary_is_over_agents_and_its_intervals_over_groups():
-    # Episodes of 10 steps; agent i of group g is good from its episode 5 + 2 g + i on.
-    frames = [
+def curves_of(world, num_groups):
+    """Episodes of 10 steps; agent i of group g is good from its episode 5 + 2 g + i on."""
+    return pd.concat([
         pd.DataFrame({
-            "row": "default", "world": "real", "group": g, "agent": 2 * g + i,
+            "row": "default", "world": world, "group": g, "agent": 2 * g + i,
             "steps": np.arange(10, 310, 10),
             "test_return": ([-50.0] * (4 + 2 * g + i) + [-12.0] * 30)[:30],
         })
-        for g in range(2) for i in range(2)
-    ]  # fmt: skip
-    summary = rn_curves.summarise(pd.concat(frames), -12.0, max_steps=300)
-    (row,) = summary.itertuples()
+        for g in range(num_groups) for i in range(2)
+    ])  # fmt: skip
+
+
+def test_the_summary_is_over_agents():
+    curves = curves_of("real", 2)
+    (row,) = rn_curves.summarise(curves, -12.0, max_steps=300).itertuples()
     # Ten tests in a row: solved at episodes 14, 15, 16 and 17.
     assert row.steps_to_solve == np.mean([140, 150, 160, 170]) and row.solved == 1.0
-    assert row.steps_low == 145 and row.steps_high == 165  # the groups' means
-    assert row.last_return == -12.0
-    # Returns held over the next episode's steps, on a grid that begins before the first one ends.
-    assert -50 < row.return_low < row.mean_return < row.return_high < -12
-    never = rn_curves.summarise(pd.concat(frames), 0.0, max_steps=300).iloc[0]
+    assert row.last_return == -12.0 and -50 < row.mean_return < -12
+    never = rn_curves.summarise(curves, 0.0, max_steps=300).iloc[0]
     assert never["steps_to_solve"] == 300 and never["solved"] == 0.0
+
+
+def test_intervals_draw_rns_or_agents_and_need_five_of_them():
+    for world, independent in (
+        ("additive_potential", 145 + 20 * np.arange(5)),  # the groups' means
+        ("real", 140 + 10 * np.arange(10)),
+    ):
+        (row,) = rn_curves.summarise(curves_of(world, 5), -12.0, max_steps=300).itertuples()
+        assert (row.steps_low, row.steps_high) == common.bootstrap_interval(independent)
+        assert row.return_low < row.mean_return < row.return_high
+    few = rn_curves.summarise(curves_of("additive_potential", 4), -12.0, max_steps=300)
+    assert few[["steps_low", "return_high"]].isna().all(axis=None)
+    shown = rn_curves.make_table(few).iloc[0]
+    assert shown["steps to solve"] == "175" and "[" not in shown["mean return over training"]
 
 
 def test_augmented_variants_are_named_in_pictures():

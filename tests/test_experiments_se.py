@@ -107,7 +107,7 @@ def test_files_that_are_no_set_are_refused(ses, tmp_path):
         load_set(damaged, "--fixed")
     other = sejax.config(["proxy.hidden_size=5"])
     save_set(tmp_path / "other.safetensors", other, weights, [1] * 3, [1] * 3, [1] * 3)
-    with pytest.raises(ConfigError, match="--ses must hold the tensors of the network"):
+    with pytest.raises(ConfigError, match="source must hold the tensors of the network"):
         load_set(tmp_path / "other.safetensors")
     with pytest.raises(ConfigError, match="does not exist"):
         load_set(tmp_path / "none.safetensors")

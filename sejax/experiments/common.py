@@ -37,14 +37,17 @@ def parse_args(
     parser = argparse.ArgumentParser(prog=f"python -m sejax.experiments.{name}",
                                      description=summary)  # fmt: skip
     parser.add_argument("--quick", action="store_true", help="a small version, in two minutes")
-    parser.add_argument("--out", type=Path, help=f"output folder; results/{name}[-quick]")
+    parser.add_argument("--out", type=Path, help=f"output folder; results/{name}[-quick], where "
+                        "there is a choice of tasks a folder there")  # fmt: skip
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--devices", type=int, help="devices to use; all")
     add_options(parser)
     args = parser.parse_args(as_options(sys.argv[1:]))
     require_seed("--seed", args.seed)
     require_counts(args, "devices")
-    args.out = args.out or Path("results") / (f"{name}-quick" if args.quick else name)
+    # Pieces of several tasks in one folder would be taken for each other.
+    of_task = [args.env] if getattr(args, "env", None) else []
+    args.out = args.out or Path("results", f"{name}-quick" if args.quick else name, *of_task)
     from sejax.runtime import configure_xla, enable_compilation_cache
 
     configure_xla(args.devices)
@@ -86,10 +89,11 @@ def require_counts(args: argparse.Namespace, *names: str, least: int = 1) -> Non
 
 
 class Pieces:
-    """The finished pieces of an experiment, in a folder."""
+    """The finished pieces of an experiment, in a folder that is below what `option` names."""
 
-    def __init__(self, folder: Path):
+    def __init__(self, folder: Path, option: str = "--out"):
         self.folder = folder
+        self.option = option
 
     def compute(
         self,
@@ -148,9 +152,9 @@ class Pieces:
             return None
         if differing:
             raise ConfigError(
-                f"--out must be a new folder or that of the same experiment, because finished "
-                f"pieces are used again; got {table} with another {', '.join(differing)}. "
-                f"Set --out=DIR."
+                f"{self.option} must be a new folder or that of the same experiment, because "
+                f"finished pieces are used again; got {table} with another "
+                f"{', '.join(differing)}. Set {self.option}=DIR."
             )
         return pd.read_csv(table)
 

@@ -126,8 +126,14 @@ def learn_one(config: Any, program: Any, step: Callable[..., Any]) -> pd.DataFra
     return pd.read_csv(directory.metrics)
 
 
-def collect(configs: list[Any], path: Path) -> None:
-    """Writes the best proxy of each seed into one file."""
+def collect(configs: list[Any], path: Path, before: Any = None) -> None:
+    """Writes the best proxy of each seed into one file.
+
+    Args:
+      configs: of the runs.
+      path: the file.
+      before: a `ProxySet` of the same settings and earlier seeds, which comes first.
+    """
     from sejax.proxies import io as proxy_io
     from sejax.proxies.sets import save_set
 
@@ -138,13 +144,14 @@ def collect(configs: list[Any], path: Path) -> None:
         several = [folder / "proxies" / f"seed{seed}.safetensors" for seed in seeds]
         files += several if config.num_seeds > 1 else [folder]
     best = [proxy_io.load_proxy(file) for file in files]
+    known = range(before.size) if before else ()
     save_set(
         path,
-        configs[0],
-        [proxy.params.weights for proxy in best],
-        [proxy.metadata["score"] for proxy in best],
-        [proxy.metadata["generation"] for proxy in best],
-        [proxy.metadata["seed"] for proxy in best],
+        before.config if before else configs[0],
+        [before.one(i).weights for i in known] + [proxy.params.weights for proxy in best],
+        [before.scores[i] for i in known] + [proxy.metadata["score"] for proxy in best],
+        [before.generations[i] for i in known] + [proxy.metadata["generation"] for proxy in best],
+        [before.seeds[i] for i in known] + [proxy.metadata["seed"] for proxy in best],
     )
 
 

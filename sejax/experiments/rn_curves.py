@@ -15,8 +15,8 @@ import pandas as pd
 
 from sejax.agents.configs import AgentConfig, ExplorationConfig
 from sejax.configs import EnvConfig, TrainingConfig
-from sejax.errors import unknown_name
 from sejax.experiments import common, return_curves, rn_studies
+from sejax.validation import one_of
 
 ROWS = {
     "default": "default hyperparameters",
@@ -24,6 +24,8 @@ ROWS = {
     "transfer": "unseen agent",
 }
 GRID_POINTS = 200
+WITHOUT_RN = ("real", "count_based", "icm")  # worlds whose groups of agents have nothing in common
+LEAST_FOR_INTERVAL = 5  # independent values
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,13 +54,27 @@ class World:
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Options about the agents; with those of `rn_studies`."""
     rn_studies.add_options(parser)
-    parser.add_argument("--rows", nargs="+", metavar="ROW", help=", ".join(ROWS))
-    parser.add_argument("--bonuses", nargs="+", metavar="BONUS", help="exploration bonuses on the "
-                        "real task to compare with; the paper's, or none")  # fmt: skip
+    parser.add_argument(
+        "--rows",
+        nargs="+",
+        metavar="ROW",
+        help="agents to train: default (the paper's hyperparameters), varied "
+        "(drawn for each agent), transfer (one that the RNs never saw); all",
+    )
+    parser.add_argument(
+        "--bonuses",
+        nargs="+",
+        metavar="BONUS",
+        help="exploration bonuses on the real task to compare with: count_based on "
+        "cliff_walking, elsewhere icm; or none",
+    )
     parser.add_argument("--bonus-groups", type=int, help="groups of agents with a bonus, which are "
                         "dear; as many as RNs are used")  # fmt: skip
-    parser.add_argument("--rns", type=int, help="RNs of each variant to use, the best; 10 or 5")
-    parser.add_argument("--num-agents", type=int, help="on each RN, in each row; 10")
+    parser.add_argument("--rns", type=int, help="RNs of each variant that agents are trained on, "
+                        "the best; 10, on halfcheetah 5")  # fmt: skip
+    parser.add_argument(
+        "--num-agents", type=int, help="on each RN, in each row; 10, on halfcheetah 5"
+    )
     parser.add_argument("--max-steps", type=int, help="training steps; as the paper's figure")
 
 
@@ -71,16 +87,14 @@ def fill_in(args: argparse.Namespace) -> None:
     rn_studies.fill_in(args)
     args.rows = args.rows or list(ROWS)
     for name in args.rows:
-        if name not in ROWS:
-            raise unknown_name("--rows", name, ROWS)
+        one_of("--rows", name, tuple(ROWS))
     bonuses = rn_studies.STUDIES[args.env].bonuses
     args.bonuses = list(bonuses) if args.bonuses is None else args.bonuses
     for name in args.bonuses:
-        if name not in (*bonuses, "none"):
-            raise unknown_name("--bonuses", name, (*bonuses, "none"))
+        one_of("--bonuses", name, (*bonuses, "none"))
     common.require_counts(args, "rns", "num_agents", "max_steps", "bonus_groups")
     args.rns = min(args.rns, args.learned)
-    args.bonus_groups = args.bonus_groups or args.rns
+    args.bonus_groups = None if args.bonuses == ["none"] else args.bonus_groups or args.rns
 
 
 def agent_of(args: argparse.Namespace, row: str) -> AgentConfig:
@@ -173,8 +187,9 @@ def train_group(
 def summarise(curves: pd.DataFrame, solved_reward: float, max_steps: int) -> pd.DataFrame:
     """One row for each row of the figure and world.
 
-    An agent that did not solve the task counts `max_steps`. Intervals come from drawing groups
-    (RNs) again, since agents of one RN have much in common.
+    An agent that did not solve the task counts `max_steps`. Intervals come from drawing RNs again,
+    since agents of one RN have much in common, and agents where there are no RNs; of fewer than
+    `LEAST_FOR_INTERVAL` there is none (nan).
     """
     out = []
     grid = step_grid(max_steps)
@@ -184,8 +199,8 @@ def summarise(curves: pd.DataFrame, solved_reward: float, max_steps: int) -> pd.
         held = return_curves.on_grid(mine, grid, window=1)
         mean_return = pd.Series(np.nanmean(held, axis=1), index=steps.index)
         counted = steps.clip(upper=max_steps)
-        low, high = common.bootstrap_interval(counted.groupby("group").mean())
-        area_low, area_high = common.bootstrap_interval(mean_return.groupby("group").mean())
+        low, high = interval(counted, str(world))
+        area_low, area_high = interval(mean_return, str(world))
         out.append({
             "row": row, "world": world, "groups": mine["group"].nunique(), "agents": len(steps),
             "solved": float(np.isfinite(steps).mean()), "steps_to_solve": counted.mean(),
@@ -194,6 +209,14 @@ def summarise(curves: pd.DataFrame, solved_reward: float, max_steps: int) -> pd.
             "last_return": return_curves.last_returns(mine).mean(),
         })  # fmt: skip
     return pd.DataFrame(out)
+
+
+def interval(values: pd.Series, world: str) -> tuple[float, float]:
+    """95% bootstrap interval of the mean over agents, indexed by their group."""
+    independent = values if world in WITHOUT_RN else values.groupby("group").mean()
+    if len(independent) < LEAST_FOR_INTERVAL:
+        return np.nan, np.nan
+    return common.bootstrap_interval(independent)
 
 
 def step_grid(max_steps: int) -> np.ndarray:
@@ -209,21 +232,26 @@ def make_table(summary: pd.DataFrame) -> pd.DataFrame:
             "agents": ROWS[row.row],
             "trained with": row.world,
             "groups, agents": f"{row.groups}, {row.agents}",
-            "steps to solve": f"{row.steps_to_solve:,.0f} "
-                              f"[{row.steps_low:,.0f}, {row.steps_high:,.0f}]",
+            "steps to solve": with_interval(row.steps_to_solve, row.steps_low, row.steps_high, 0),
             "of the bare agent's": f"{row.steps_to_solve / bare[row.row]:.0%}"
             if row.row in bare else "",
             "solved": f"{row.solved:.0%}",
-            "mean return over training": f"{row.mean_return:.1f} "
-                                         f"[{row.return_low:.1f}, {row.return_high:.1f}]",
+            "mean return over training":
+                with_interval(row.mean_return, row.return_low, row.return_high, 1),
             "last tests": f"{row.last_return:.1f}",
         }
         for row in summary.itertuples()
     ])  # fmt: skip
 
 
+def with_interval(mean: float, low: float, high: float, digits: int) -> str:
+    """A mean and its interval, if it has one."""
+    brackets = f" [{low:,.{digits}f}, {high:,.{digits}f}]" if np.isfinite(low) else ""
+    return f"{mean:,.{digits}f}{brackets}"
+
+
 def panel(axis: Any, curves: pd.DataFrame, args: argparse.Namespace, solved_reward: float) -> None:
-    """Draws one row's mean test return of each world with its standard error.
+    """Draws one row's mean test return of each world with its standard error over all agents.
 
     Source: paper, figure "The average cumulative test rewards of agents when trained on different
     RN variants".
@@ -244,7 +272,7 @@ def panel(axis: Any, curves: pd.DataFrame, args: argparse.Namespace, solved_rewa
         mean = values[:, known].mean(axis=0)
         error = values[:, known].std(axis=0) / np.sqrt(len(values))
         color = colors[name.removesuffix(rn_studies.AUGMENTED)]
-        dashed = name in ("icm", "count_based")
+        dashed = name in WITHOUT_RN[1:]
         style = "--" if dashed else ":" if rn_studies.AUGMENTED in name else "-"
         axis.plot(grid[known], mean, color=color, ls=style, lw=1.6, label=rn_studies.label(name))
         axis.fill_between(grid[known], mean - error, mean + error, color=color, alpha=0.2, lw=0)

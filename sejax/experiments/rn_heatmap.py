@@ -45,6 +45,7 @@ def run(args: argparse.Namespace) -> pd.DataFrame:
     require(args.env == "cliff_walking", "--env", "be cliff_walking", "the picture is its map",
             args.env, "--env=cliff_walking")  # fmt: skip
     rn_studies.fill_in(args)
+    rn_studies.check_stored(args, [args.objective])
     rewards = {
         variant: rewards_of_moves(rn_studies.learn(args, variant, args.objective))
         for variant in args.variants
@@ -61,7 +62,7 @@ def rewards_of_moves(rns: Any) -> np.ndarray:
     grid = task.env
 
     def reward(weights: Any, index: Any, action: Any) -> Any:
-        params = env.params(weights, rns.config.agent.discount)
+        params = rns.params.replace(weights=weights)
         _, state = env.reset_env(None, params)
         state = state.replace(world=state.world.replace(index=index), obs=index)
         _, _, reward, _, _ = env.step_env(None, state, action, params)

@@ -17,8 +17,9 @@ from pathlib import Path
 import pandas as pd
 
 from sejax.configs import OBJECTIVES
-from sejax.errors import require, unknown_name
+from sejax.errors import require
 from sejax.experiments import common, return_curves, rn_curves, rn_studies
+from sejax.validation import one_of
 
 NAME = "rn_objectives"
 PICKS = ("best", "worst")
@@ -43,7 +44,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--objectives", nargs="+", default=list(DEFAULT_OBJECTIVES),
                         metavar="OBJECTIVE", help=", ".join(OBJECTIVE_NAMES))  # fmt: skip
     parser.add_argument("--picks", nargs="+", default=list(PICKS), metavar="PICK",
-                        help=", ".join(PICKS))  # fmt: skip
+                        help="RNs that train agents: best, worst (as the authors' scripts picked "
+                             "for two objectives); both")  # fmt: skip
 
 
 def fill_in(args: argparse.Namespace) -> None:
@@ -59,8 +61,7 @@ def fill_in(args: argparse.Namespace) -> None:
     for option, names, known in (("--objectives", args.objectives, OBJECTIVES),
                                  ("--picks", args.picks, PICKS)):  # fmt: skip
         for name in names:
-            if name not in known:
-                raise unknown_name(option, name, known)
+            one_of(option, name, known)
     if len(args.picks) > 1 and picked is None:
         args.rns = max(1, min(args.rns, args.learned // 2))
     require(len(args.picks) == 1 or 2 * args.rns <= args.learned, "--learned",
@@ -75,6 +76,7 @@ def run(args: argparse.Namespace) -> pd.DataFrame:
       ConfigError: for settings that cannot work, or an output folder of other settings.
     """
     fill_in(args)
+    rn_studies.check_stored(args, args.objectives)
     pieces = common.Pieces(args.out / "pieces")
     without = pd.concat(
         [
@@ -115,17 +117,19 @@ def report(args: argparse.Namespace, curves: pd.DataFrame) -> pd.DataFrame:
     for pick in args.picks:
         draw(curves[curves["pick"] == pick], args, task.solved_reward, args.out / f"{pick}.png")
     title = f"Objectives of reward networks on {args.env}"
+    episodes = rn_studies.STUDIES[args.env].max_episodes
     note = (
         f"{args.learned} RNs of each variant were learned by each objective. Of these the "
         f"{args.rns} with the highest and with the lowest scores (best, worst) train "
-        f"{args.num_agents} agents each, for up to {args.max_steps:,} training steps. Steps to "
-        f"solve: until the mean of {return_curves.WINDOW} tests in a row reaches "
-        f"{task.solved_reward:g}; an agent that never does counts all steps. In brackets bootstrap "
-        "95% intervals that draw RNs. The area is by training steps, where the authors' code has "
-        "the sum. The paper shows curves and gives no numbers; those for the area and the final "
-        "return are, by a slip in the authors' scripts, of the worst ten. It "
-        "concludes that the area does about as well as the threshold, and that the final return "
-        "makes learning faster on CartPole but not on Cliff Walking."
+        f"{args.num_agents} agents each, for up to {args.max_steps:,} training steps or "
+        f"{episodes:,} episodes. Steps to solve: until the mean of {return_curves.WINDOW} tests in "
+        f"a row reaches {task.solved_reward:g}; an agent that never does counts "
+        f"{args.max_steps:,}. In brackets bootstrap 95% intervals, for at least five RNs: they "
+        "draw RNs, and agents on the real task. The area is by training steps, where the authors' "
+        "code has the sum. The paper shows curves and gives no numbers; those for the area and the "
+        "final return are, by a slip in the authors' scripts, of the worst ten. It concludes that "
+        "the area does about as well as the threshold, and that the final return makes learning "
+        "faster on CartPole but not on Cliff Walking."
     )
     command = figures.command(NAME, args, "env", "objectives", "picks", "variants", "bonuses",
                               "bonus_groups", "rows", "learned", "rns", "generations",

@@ -13,8 +13,10 @@ Differs: agents stop after the steps that the paper's figure shows, or its numbe
 """
 
 import argparse
+from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
 
 from sejax.experiments import common, return_curves, rn_curves, rn_studies
@@ -40,15 +42,22 @@ def run(args: argparse.Namespace) -> pd.DataFrame:
       ConfigError: for settings that cannot work, or an output folder of other settings.
     """
     rn_curves.fill_in(args)
+    rn_studies.check_stored(args, [args.objective])
     pieces = common.Pieces(args.out / "pieces")
-    worlds = rn_curves.real_worlds(args)
+    tables = [
+        rn_curves.train_all(args, row, world, pieces) for world in worlds(args) for row in args.rows
+    ]
+    curves = pd.concat(tables, ignore_index=True)
+    by_row = curves["row"].map({row: place for place, row in enumerate(args.rows)})
+    return report(args, curves.iloc[np.argsort(by_row, kind="stable")])
+
+
+def worlds(args: argparse.Namespace) -> Iterator[rn_curves.World]:
+    """All worlds that agents are trained in; RNs are learned when they are needed."""
+    yield from rn_curves.real_worlds(args)
     for variant in args.variants:
         rns = rn_studies.learn(args, variant, args.objective).ranked(args.rns)
-        worlds.append(rn_curves.rn_world(variant, rns))
-    tables = [
-        rn_curves.train_all(args, row, world, pieces) for row in args.rows for world in worlds
-    ]
-    return report(args, pd.concat(tables, ignore_index=True))
+        yield rn_curves.rn_world(variant, rns)
 
 
 def report(args: argparse.Namespace, curves: pd.DataFrame) -> pd.DataFrame:
@@ -62,16 +71,17 @@ def report(args: argparse.Namespace, curves: pd.DataFrame) -> pd.DataFrame:
     write_text(args.out / "summary.csv", summary.to_csv(index=False))
     draw(curves, args, task.solved_reward, args.out / "performance.png")
     title = f"Agents trained with reward networks and tested on {args.env}"
+    episodes = rn_studies.STUDIES[args.env].max_episodes
+    with_bonus = f" (with a bonus: {args.bonus_groups})" if args.bonus_groups else ""
     note = (
         f"The best {args.rns} of {args.learned} RNs of each variant, learned by {args.objective}, "
-        f"with {args.num_agents} agents each, and as many groups on the real task (with a bonus: "
-        f"{args.bonus_groups}); up to "
-        f"{args.max_steps:,} training steps, one greedy test episode after each training episode. "
-        f"Steps to solve: until the mean of {return_curves.WINDOW} tests in a row reaches "
-        f"{task.solved_reward:g}; an agent that never does counts all steps. In brackets bootstrap "
-        "95% intervals that draw groups. The paper shows curves and gives no numbers: on each of "
-        "these tasks some variant learns faster than all agents without an RN, the additive ones "
-        "most reliably."
+        f"with {args.num_agents} agents each, and as many groups on the real task{with_bonus}; up "
+        f"to {args.max_steps:,} training steps or {episodes:,} episodes, one greedy test episode "
+        f"after each. Steps to solve: until the mean of {return_curves.WINDOW} tests in a row "
+        f"reaches {task.solved_reward:g}; an agent that never does counts {args.max_steps:,}. In "
+        "brackets bootstrap 95% intervals, for at least five RNs: they draw RNs, and agents on the "
+        "real task. The paper shows curves and gives no numbers: on each of these tasks some "
+        "variant learns faster than all agents without an RN, the additive ones most reliably."
     )
     command = figures.command(NAME, args, "env", "variants", "bonuses", "bonus_groups", "rows",
                               "objective", "learned", "rns", "generations", "num_agents",

@@ -2,11 +2,16 @@
 
 RNs are learned once and shared by all experiments: those of a task, variant and objective are one
 file, `<rns>/<env>/<objective>/<variant>.safetensors`, and the curves of their NES runs lie beside
-it. Runs that were interrupted go on.
+it. Runs that were interrupted go on, and where more RNs are asked for than a file holds only the
+further ones are learned.
+
+Differs: on HalfCheetah the unseen agent, PPO, has the ICM and the number of episodes of TD3; the
+authors' scripts have others for it (`reference_details.md` 4.8 and 7.3).
 """
 
 import argparse
 import dataclasses
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -24,8 +29,9 @@ from sejax.agents.configs import (
     TD3Config,
 )
 from sejax.configs import OBJECTIVES, EnvConfig
-from sejax.errors import unknown_name
+from sejax.errors import ConfigError
 from sejax.experiments import common, proxy_runs
+from sejax.validation import one_of
 
 # Paper, table "Overview of Reward Network variants".
 VARIANTS = (
@@ -139,11 +145,16 @@ def label(name: str) -> str:
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Options about the task and the RNs that are learned."""
-    parser.add_argument("--env", default="cliff_walking", help=f"task: {', '.join(STUDIES)}")
+    parser.add_argument(
+        "--env",
+        default="cliff_walking",
+        help=f"task, cliff_walking or {', '.join(list(STUDIES)[1:])}",
+    )
     parser.add_argument("--variants", nargs="+", metavar="VARIANT",
                         help=f"{', '.join(VARIANTS)}, these with {AUGMENTED}, "
                              f"{', '.join(WEIGHTED_INFO)}; all of the paper's")  # fmt: skip
-    parser.add_argument("--learned", type=int, help="RNs to learn of each variant; 50, 10 or 5")
+    parser.add_argument("--learned", type=int, help="RNs to learn of each variant; 50 on "
+                        "cliff_walking, 5 on halfcheetah, else 10")  # fmt: skip
     parser.add_argument("--generations", type=int, help="outer iterations; the preset's")
     parser.add_argument("--preset", default="best", help="of the NES runs: best, paper")
     parser.add_argument("--set", nargs="+", metavar="KEY=VALUE",
@@ -163,17 +174,14 @@ def fill_in(args: argparse.Namespace) -> None:
     Raises:
       ConfigError: for an unknown name or a number out of range.
     """
-    if args.env not in STUDIES:
-        raise unknown_name("--env", args.env, STUDIES)
+    one_of("--env", args.env, tuple(STUDIES))
     study = STUDIES[args.env]
     for name, value in default_options(args).items():
         if getattr(args, name, value) is None:
             setattr(args, name, value)
     for name in args.variants:
-        if name not in study.variants:
-            raise unknown_name("--variants", name, study.variants)
-    if getattr(args, "objective", OBJECTIVES[0]) not in OBJECTIVES:
-        raise unknown_name("--objective", args.objective, OBJECTIVES)
+        one_of("--variants", name, study.variants)
+    one_of("--objective", getattr(args, "objective", OBJECTIVES[0]), OBJECTIVES)
     common.require_counts(args, "learned", "generations")
     if args.rns_dir is None:
         args.rns_dir = args.out / "rns" if args.quick else Path("results/reward_networks")
@@ -204,18 +212,68 @@ def learn(args: argparse.Namespace, variant: str, objective: str) -> Any:
     """
     from sejax.proxies.sets import load_set
 
-    config = learning_config(args, variant, objective)
-    folder = args.rns_dir / args.env / objective
-    path = folder / f"{variant}.safetensors"
-    if path.exists():
-        stored = load_set(path, "--rns-dir", "rn")
-        if is_of(stored, config, args.learned):
-            return stored.first(args.learned)
-    at_once = STUDIES[args.env].runs_at_once
-    configs = proxy_runs.configs_of_runs(config, args.learned, folder / "runs" / variant, at_once)
-    proxy_runs.learn_all(configs, common.Pieces(folder / "curves"), f"{variant}-")
-    proxy_runs.collect(configs, path)
-    return load_set(path, "--rns-dir", "rn")
+    there = stored(args, variant, objective)
+    known = there.size if there else 0
+    if known < args.learned:
+        config = learning_config(args, variant, objective)
+        config = dataclasses.replace(config, seed=args.seed + known)
+        path = set_file(args, variant, objective)
+        at_once = STUDIES[args.env].runs_at_once
+        configs = proxy_runs.configs_of_runs(
+            config, args.learned - known, path.parent / "runs" / variant, at_once
+        )
+        print(f"{variant}: learns {args.learned - known} RNs, {config.generations} generations "
+              "each; may be stopped and started again", flush=True)  # fmt: skip
+        curves = common.Pieces(path.parent / "curves", "--rns-dir")
+        proxy_runs.learn_all(configs, curves, f"{variant}-")
+        proxy_runs.collect(configs, path, there)
+        there = load_set(path, "--rns-dir", "rn")
+    return there.first(args.learned)
+
+
+def set_file(args: argparse.Namespace, variant: str, objective: str) -> Path:
+    """Where the RNs of a variant and objective are kept."""
+    return Path(args.rns_dir, args.env, objective, f"{variant}.safetensors")
+
+
+def stored(args: argparse.Namespace, variant: str, objective: str) -> Any:
+    """The RNs that are there already, a `ProxySet`; None if they are to be learned.
+
+    Raises:
+      ConfigError: if they were learned with other settings. Fewer generations are no such settings:
+        their runs go on.
+    """
+    from sejax.proxies.sets import load_set
+
+    path = set_file(args, variant, objective)
+    if not path.exists():
+        return None
+    there = load_set(path, "--rns-dir", "rn")
+    made_with, asked = map(
+        proxy_runs.piece_settings, (there.config, learning_config(args, variant, objective))
+    )
+    differing = [name for name in sorted({*made_with, *asked})
+                 if name != "num_seeds" and made_with.get(name) != asked.get(name)]  # fmt: skip
+    if differing == ["generations"] and made_with["generations"] < asked["generations"]:
+        return None
+    if differing:
+        raise ConfigError(
+            f"--rns-dir must be a new folder or hold RNs of the same settings, because they are "
+            f"learned once for all experiments; got {path} with another {', '.join(differing)}. "
+            f"Set --rns-dir=DIR, or the options that they were learned with."
+        )
+    return there
+
+
+def check_stored(args: argparse.Namespace, objectives: Sequence[str]) -> None:
+    """Checks all RNs that are there before any are learned, which may take days.
+
+    Raises:
+      ConfigError: if some were learned with other settings.
+    """
+    for objective in objectives:
+        for variant in args.variants:
+            stored(args, variant, objective)
 
 
 def learning_config(args: argparse.Namespace, variant: str, objective: str) -> Any:
@@ -239,10 +297,3 @@ def learning_config(args: argparse.Namespace, variant: str, objective: str) -> A
 def env_config(args: argparse.Namespace) -> EnvConfig:
     """Which real task it is, with the physics and rewards that the RNs are learned with."""
     return learning_config(args, args.variants[0], OBJECTIVES[0]).env
-
-
-def is_of(stored: Any, config: Any, count: int) -> bool:
-    """Whether a set holds at least `count` proxies learned as the configuration says."""
-    settings, wanted = map(proxy_runs.piece_settings, (stored.config, config))
-    same = {**settings, "num_seeds": 1} == {**wanted, "num_seeds": 1}
-    return same and stored.size >= count

@@ -93,7 +93,7 @@ def run(args: argparse.Namespace) -> pd.DataFrame:
     from sejax.configs import require_fit
     from sejax.proxies.sets import load_set
 
-    ses = load_set(args.proxy, "--proxy").first(1)
+    ses = load_set(args.proxy, "--proxy", "se").first(1)
     pieces = common.Pieces(args.out / "pieces")
     tables = []
     for kind in args.agents:

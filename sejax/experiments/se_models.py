@@ -44,7 +44,7 @@ def run(args: argparse.Namespace) -> pd.DataFrame:
     if source is None:
         raise ConfigError("--ses must be given, because agents are trained on its SEs; got none. "
                           "Set --ses=results/se_feasibility/ses.safetensors.")  # fmt: skip
-    ses = load_set(source).first(args.num_ses)
+    ses = load_set(source, "--ses", "se").first(args.num_ses)
     world = se_agents.se_world(args, ses)
     pieces = common.Pieces(args.out / "pieces")
     agents = pd.concat([se_agents.train_all(args, kind, world, pieces) for kind in args.agents])

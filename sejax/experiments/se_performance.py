@@ -104,7 +104,7 @@ def make_worlds(args: argparse.Namespace) -> dict[str, se_agents.World]:
     files = {"varied": args.varied, "fixed": args.fixed}
     if args.quick and not any(files.values()):
         files["fixed"] = args.env or "cartpole"
-    sets = {name: load_set(file, f"--{name}") for name, file in files.items() if file}
+    sets = {name: load_set(file, f"--{name}", "se") for name, file in files.items() if file}
     for name, ses in sets.items():
         solved = ses.solved()
         sets[name] = (solved if solved.size else ses).first(args.num_ses)

@@ -96,7 +96,7 @@ def run(args: argparse.Namespace) -> pd.DataFrame:
     fill_in(args)
     from sejax.proxies.sets import load_set
 
-    ses = load_set(args.proxy, "--proxy").first(1)
+    ses = load_set(args.proxy, "--proxy", "se").first(1)
     require(ses.task.num_states is None and ses.task.num_actions is not None, "--proxy",
             "be an SE with vector states and discrete actions", "the agents are made for these",
             f"one of {ses.task.name}", "--proxy=cartpole")  # fmt: skip
@@ -150,7 +150,7 @@ def make_worlds(args: argparse.Namespace, ses: Any) -> dict[str, World]:
     from sejax.proxies.sets import load_set
 
     sets = {
-        name: load_set(supervised_models.model_file(args, name), "--out")
+        name: load_set(supervised_models.model_file(args, name), "--out", "se")
         for name in ("authors", "fair")
     }
     return {
