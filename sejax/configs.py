@@ -596,7 +596,8 @@ def translate_hydra_error(error: Exception) -> ConfigError:
                 f"override must name a field of the chosen {group}, because nothing else is read; "
                 f"got {key}, which another choice of {group} has. See --cfg job for its fields."
             )
-        ranked = nearest(key, siblings or _known_fields())
+        in_groups = [name for name in _known_fields() if name.rpartition(".")[2] == key]
+        ranked = in_groups or nearest(key, siblings or _known_fields())
         return ConfigError(
             f"override must name a field of the configuration, because nothing else is read; got "
             f"{key}. Did you mean {ranked[0]}? Fields there: {', '.join(ranked)}."

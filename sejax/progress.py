@@ -83,13 +83,22 @@ class RunProgress:
     def finish(self, directory: Any, program: Any, best: float, ended: str) -> None:
         """Says how it ended, where everything is, and what to do next."""
         self.stop()
+        config = self._config
         verdict = f"best incumbent score {best:.1f}"
+        if config.objective.name == "reward_threshold":
+            verdict += (
+                f": minus the training steps of its agents, and {config.objective.unsolved_weight:g} "
+                f"for each unit of return below {program.task.solved_reward:g}"
+            )
         if program.solved_score is not None:
             solved = "solved" if best >= program.solved_score else "not solved"
             verdict = (
                 f"{solved}: best incumbent mean {best:.1f}, solved at {program.solved_score:g}"
             )
         path = directory.path
+        # Those that an RN was learned with; an SE is meant for the paper's default ones.
+        agent = "" if config.agent.name == "ddqn" else f" agent={config.agent.name}"
+        agent = " agent_hparams=nes" if config.proxy.name == "rn" else agent
         title = "learned" if ended == "finished" else ended
         self._console.rule(f"{program.task.name}: {title}", align="left")
         self.print(
@@ -98,7 +107,7 @@ class RunProgress:
             f"  {path}/learning_curve.png   how it was learned\n"
             f"  {path}/metrics.csv          a row for each generation\n\n"
             f"Train fresh agents on it, and on the real task beside them:\n"
-            f"  python -m sejax.evaluate proxy={path} num_agents=20\n"
+            f"  python -m sejax.evaluate proxy={path}{agent} num_agents=20\n"
             f"Use it as a gymnax environment:\n"
             f'  env, params = sejax.load("{path}")'
         )

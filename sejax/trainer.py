@@ -95,7 +95,9 @@ def make_trainer(
     Args:
       agent: from `sejax.agents`.
       env: gymnax environment to train in: real, synthetic or reward-shaped. A potential-based
-        reward has the agent's discount, whatever its params say.
+        reward has the agent's discount, whatever its params say. The plateau rule, the default,
+        reads the returns of this world; for tests on the real task see
+        `evaluation.make_evaluator`.
       training: stopping rule and limits. `time_limit_is_terminal` speaks of real time limits and is
         ignored in an SE: there the last step of an episode bootstraps with what the done network
         says, as in the authors' code.

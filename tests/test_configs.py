@@ -400,6 +400,7 @@ def test_an_unknown_choice_lists_the_known_ones_nearest_first(override, field, n
         ("generation=3", "generations"),
         ("agent.learningrate=0.1", "agent.learning_rate"),
         ("es=open_es es.populationsize=4", "es.population_size"),
+        ("proxy=rn variant=additive_potential", "proxy.variant"),  # the right field, without group
     ],
 )
 def test_an_unknown_field_names_the_nearest_one(override, nearest):
