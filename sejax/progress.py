@@ -83,11 +83,11 @@ class RunProgress:
     def finish(self, directory: Any, program: Any, best: float, ended: str) -> None:
         """Says how it ended, where everything is, and what to do next."""
         self.stop()
-        config = self._config
+        config, objective = self._config, self._config.objective
         verdict = f"best incumbent score {best:.1f}"
-        if config.objective.name == "reward_threshold":
+        if objective.name == "reward_threshold":
             verdict += (
-                f": minus the training steps of its agents, and {config.objective.unsolved_weight:g} "
+                f": minus the training steps of its agents, and {objective.unsolved_weight:g} "
                 f"for each unit of return below {program.task.solved_reward:g}"
             )
         if program.solved_score is not None:

@@ -1,7 +1,7 @@
 """Checks that several configurations share; each raises one clear `ConfigError`."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Iterable
 from typing import Any
 
 from sejax.errors import require, unknown_name
@@ -20,9 +20,14 @@ def fraction(name: str, value: float, fix: Any) -> None:
     require(0 <= value <= 1, name, "lie in [0, 1]", "it is a fraction", value, f"{name}={fix}")
 
 
-def one_of(name: str, value: str, known: Sequence[str]) -> None:
+def one_of(name: str, value: str, known: Collection[str]) -> None:
     if value not in known:
         raise unknown_name(name, value, known)
+
+
+def each_of(name: str, values: Iterable[str], known: Collection[str]) -> None:
+    for value in values:
+        one_of(name, value, known)
 
 
 def default(schema: type, name: str) -> Any:

@@ -18,9 +18,9 @@ import pandas as pd
 
 from sejax.agents.configs import AGENT_CONFIGS
 from sejax.configs import TrainingConfig
-from sejax.errors import unknown_name
 from sejax.experiments import common, return_curves
 from sejax.experiments.return_curves import WINDOW
+from sejax.validation import each_of
 
 NAME = "agent_learning"
 QUICK_STEPS, QUICK_AGENTS = 2000, 2
@@ -102,9 +102,7 @@ def run(args: argparse.Namespace) -> pd.DataFrame:
         args.num_agents = QUICK_AGENTS if args.quick else 10
     common.require_counts(args, "num_agents", "test_episodes")
     known = tuple(dict.fromkeys(study.env for study in STUDIES))
-    for env in args.envs:
-        if env not in known:
-            raise unknown_name("--envs", env, known)
+    each_of("--envs", args.envs, known)
     pieces = common.Pieces(args.out / "pieces")
     tables = []
     for number, study in enumerate(STUDIES):

@@ -16,7 +16,7 @@ import pandas as pd
 from sejax.agents.configs import AgentConfig, ExplorationConfig
 from sejax.configs import EnvConfig, TrainingConfig
 from sejax.experiments import common, return_curves, rn_studies
-from sejax.validation import one_of
+from sejax.validation import each_of
 
 ROWS = {
     "default": "default hyperparameters",
@@ -86,12 +86,10 @@ def fill_in(args: argparse.Namespace) -> None:
     """
     rn_studies.fill_in(args)
     args.rows = args.rows or list(ROWS)
-    for name in args.rows:
-        one_of("--rows", name, tuple(ROWS))
+    each_of("--rows", args.rows, ROWS)
     bonuses = rn_studies.STUDIES[args.env].bonuses
     args.bonuses = list(bonuses) if args.bonuses is None else args.bonuses
-    for name in args.bonuses:
-        one_of("--bonuses", name, (*bonuses, "none"))
+    each_of("--bonuses", args.bonuses, (*bonuses, "none"))
     common.require_counts(args, "rns", "num_agents", "max_steps", "bonus_groups")
     args.rns = min(args.rns, args.learned)
     args.bonus_groups = None if args.bonuses == ["none"] else args.bonus_groups or args.rns

@@ -19,7 +19,7 @@ import pandas as pd
 from sejax.configs import OBJECTIVES
 from sejax.errors import require
 from sejax.experiments import common, return_curves, rn_curves, rn_studies
-from sejax.validation import one_of
+from sejax.validation import each_of
 
 NAME = "rn_objectives"
 PICKS = ("best", "worst")
@@ -58,10 +58,8 @@ def fill_in(args: argparse.Namespace) -> None:
     if args.quick and args.learned is None:
         args.learned = QUICK_LEARNED
     rn_curves.fill_in(args)
-    for option, names, known in (("--objectives", args.objectives, OBJECTIVES),
-                                 ("--picks", args.picks, PICKS)):  # fmt: skip
-        for name in names:
-            one_of(option, name, known)
+    each_of("--objectives", args.objectives, OBJECTIVES)
+    each_of("--picks", args.picks, PICKS)
     if len(args.picks) > 1 and picked is None:
         args.rns = max(1, min(args.rns, args.learned // 2))
     require(len(args.picks) == 1 or 2 * args.rns <= args.learned, "--learned",

@@ -31,7 +31,7 @@ from sejax.agents.configs import (
 from sejax.configs import OBJECTIVES, EnvConfig
 from sejax.errors import ConfigError
 from sejax.experiments import common, proxy_runs
-from sejax.validation import one_of
+from sejax.validation import each_of, one_of
 
 # Paper, table "Overview of Reward Network variants".
 VARIANTS = (
@@ -174,13 +174,12 @@ def fill_in(args: argparse.Namespace) -> None:
     Raises:
       ConfigError: for an unknown name or a number out of range.
     """
-    one_of("--env", args.env, tuple(STUDIES))
+    one_of("--env", args.env, STUDIES)
     study = STUDIES[args.env]
     for name, value in default_options(args).items():
         if getattr(args, name, value) is None:
             setattr(args, name, value)
-    for name in args.variants:
-        one_of("--variants", name, study.variants)
+    each_of("--variants", args.variants, study.variants)
     one_of("--objective", getattr(args, "objective", OBJECTIVES[0]), OBJECTIVES)
     common.require_counts(args, "learned", "generations")
     if args.rns_dir is None:

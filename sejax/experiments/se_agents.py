@@ -15,8 +15,8 @@ import numpy as np
 import pandas as pd
 
 from sejax.configs import TrainingConfig
-from sejax.errors import unknown_name
 from sejax.experiments import common
+from sejax.validation import each_of
 
 AGENTS = ("ddqn", "dueling_ddqn", "td3_discrete")
 NUM_SES = 40
@@ -85,9 +85,7 @@ def check_agents(args: argparse.Namespace) -> None:
     Raises:
       ConfigError: for an agent that is not one of `AGENTS`.
     """
-    for kind in args.agents:
-        if kind not in AGENTS:
-            raise unknown_name("--agents", kind, AGENTS)
+    each_of("--agents", args.agents, AGENTS)
 
 
 def real_world(args: argparse.Namespace, task: Any, count: int) -> World:

@@ -20,9 +20,9 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 
-from sejax.errors import unknown_name
 from sejax.experiments import common
 from sejax.runtime import available_cores
+from sejax.validation import each_of
 
 NAME = "timings"
 PAPER_CORES = 16
@@ -68,9 +68,7 @@ def run(args: argparse.Namespace) -> pd.DataFrame:
     Raises:
       ConfigError: for an unknown row, or an output folder of other settings.
     """
-    for name in args.rows:
-        if name not in ROWS:
-            raise unknown_name("--rows", name, ROWS)
+    each_of("--rows", args.rows, ROWS)
     common.require_counts(args, "generations")
     pieces = common.Pieces(args.out / "pieces")
     cores = args.devices or available_cores()
