@@ -100,6 +100,7 @@ class RewardEnv(environment.Environment[RewardState, RewardParams]):
         """The same for a whole training of an agent.
 
         Where states are counted, all potentials are computed at once: a step then looks its two up.
+        They are these weights': with other weights prepare again.
 
         Args:
           params: of the RN.
