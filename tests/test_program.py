@@ -8,7 +8,8 @@ from support import large_ops_in_loops
 
 from sejax import envs
 from sejax.agents.ddqn import make_ddqn
-from sejax.configs import DDQNConfig, SyntheticConfig, TrainingConfig
+from sejax.configs import DDQNConfig, RewardConfig, SyntheticConfig, TrainingConfig
+from sejax.proxies.reward import make_reward
 from sejax.proxies.synthetic import make_synthetic
 from sejax.trainer import make_trainer
 
@@ -92,3 +93,14 @@ def test_a_training_is_traced_once_for_all_values_of_its_arguments(case):
         )
         steps.add(int(result.train_steps))
     assert len(steps) == 3 and 0 in steps
+
+
+def test_a_buffer_holds_no_more_steps_than_a_training_on_a_proxy_can_have():
+    # An RN's agent of the paper has room for a million, of which its training can fill 20,000.
+    task = envs.make("cartpole")
+    env = make_reward(task, RewardConfig())
+    agent = make_ddqn(DDQNConfig(buffer_size=1_000_000), task.obs_dim, task.num_actions)
+    training = TrainingConfig(max_episodes=100, stop_rule="never")
+    key = jax.random.key(0)
+    program = str(jax.make_jaxpr(make_trainer(agent, env, training))(key, env.default_params))
+    assert "f32[20000," in program and "f32[1000000," not in program
