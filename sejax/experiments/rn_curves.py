@@ -182,6 +182,11 @@ def train_group(
     return return_curves.to_table(*jax.device_get(program(keys, world.params[group])))
 
 
+def by_row(args: argparse.Namespace, curves: pd.DataFrame) -> pd.DataFrame:
+    """The curves, those of the figure's first row of agents first, else in the order they have."""
+    return pd.concat([curves[curves["row"] == row] for row in args.rows], ignore_index=True)
+
+
 def summarise(curves: pd.DataFrame, solved_reward: float, max_steps: int) -> pd.DataFrame:
     """One row for each row of the figure and world.
 

@@ -93,7 +93,8 @@ def run(args: argparse.Namespace) -> pd.DataFrame:
                 prefix = f"{objective}-{pick}-"
                 curves += [rn_curves.train_all(args, row, world, pieces, prefix)
                            for row in args.rows]  # fmt: skip
-            tables.append(pd.concat(curves).assign(objective=objective, pick=pick))
+            curves_by_row = rn_curves.by_row(args, pd.concat(curves))
+            tables.append(curves_by_row.assign(objective=objective, pick=pick))
     return report(args, pd.concat(tables, ignore_index=True))
 
 
@@ -103,14 +104,19 @@ def report(args: argparse.Namespace, curves: pd.DataFrame) -> pd.DataFrame:
     from sejax.files import write_text
 
     task = rn_studies.env_config(args).make()
-    summaries, tables = [], []
+    summaries: list[pd.DataFrame] = []
+    tables: list[pd.DataFrame] = []
     for (objective, pick), mine in curves.groupby(["objective", "pick"], sort=False):
         summary = rn_curves.summarise(mine, task.solved_reward, args.max_steps)
         table = rn_curves.make_table(summary)
+        with_rn = ~table["trained with"].isin(rn_curves.WITHOUT_RN)
+        if not tables:  # the agents without an RN are the same beside each objective
+            tables.append(table[~with_rn].assign(objective="", RNs=""))
         chosen = {"objective": OBJECTIVE_NAMES[str(objective)], "RNs": pick}
+        tables.append(table[with_rn].assign(**chosen))
         summaries.append(summary.assign(objective=objective, pick=pick))
-        tables.append(table.assign(**chosen)[[*chosen, *table.columns]])
     table = pd.concat(tables, ignore_index=True)
+    table = table[["objective", "RNs", *table.columns.drop(["objective", "RNs"])]]
     write_text(args.out / "summary.csv", pd.concat(summaries).to_csv(index=False))
     for pick in args.picks:
         draw(curves[curves["pick"] == pick], args, task.solved_reward, args.out / f"{pick}.png")

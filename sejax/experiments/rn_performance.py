@@ -16,7 +16,6 @@ import argparse
 from collections.abc import Iterator
 from pathlib import Path
 
-import numpy as np
 import pandas as pd
 
 from sejax.experiments import common, return_curves, rn_curves, rn_studies
@@ -47,9 +46,7 @@ def run(args: argparse.Namespace) -> pd.DataFrame:
     tables = [
         rn_curves.train_all(args, row, world, pieces) for world in worlds(args) for row in args.rows
     ]
-    curves = pd.concat(tables, ignore_index=True)
-    by_row = curves["row"].map({row: place for place, row in enumerate(args.rows)})
-    return report(args, curves.iloc[np.argsort(by_row, kind="stable")])
+    return report(args, rn_curves.by_row(args, pd.concat(tables)))
 
 
 def worlds(args: argparse.Namespace) -> Iterator[rn_curves.World]:
