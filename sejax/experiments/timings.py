@@ -94,6 +94,8 @@ def config_of(args: argparse.Namespace, row: Row, preset: str) -> Any:
     import sejax
 
     overrides = [f"env={row.env}", f"proxy={row.proxy}", f"preset={preset}"]
+    if row.proxy == "rn":  # the paper does not say which variant; this one needs two potentials
+        overrides.append("proxy.variant=additive_potential")
     if args.quick:
         overrides += [word for word in QUICK
                       if row.env != "cliff_walking" or "init_episodes" not in word]  # fmt: skip
