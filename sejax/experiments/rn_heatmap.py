@@ -144,10 +144,11 @@ def report(args: argparse.Namespace, rewards: dict[str, np.ndarray]) -> pd.DataF
         "exclusive potential ones look random."
     )
     command = figures.command(NAME, args, "env", "variants", "objective", "learned", "generations",
-                              "preset", "set")  # fmt: skip
+                              "preset", "set", "rns_dir")  # fmt: skip
     common.write_markdown(args.out / "table.md", title, command, table, note)
     figures.print_table(title, table)
-    print(f"{args.out}: summary.csv, heatmap.png and table.md; the RNs are in {args.rns_dir}.")
+    rns_dir = rn_studies.rns_dir(args)
+    print(f"{args.out}: summary.csv, heatmap.png and table.md; the RNs are in {rns_dir}.")
     return table
 
 

@@ -137,11 +137,12 @@ def report(args: argparse.Namespace, curves: pd.DataFrame) -> pd.DataFrame:
     )
     command = figures.command(NAME, args, "env", "objectives", "picks", "variants", "bonuses",
                               "bonus_groups", "rows", "learned", "rns", "generations",
-                              "num_agents", "max_steps", "preset", "set")  # fmt: skip
+                              "num_agents", "max_steps", "preset", "set", "rns_dir")  # fmt: skip
     common.write_markdown(args.out / "table.md", title, command, table, note)
     figures.print_table(title, table)
     pictures = ", ".join(f"{pick}.png" for pick in args.picks)
-    print(f"{args.out}: summary.csv, {pictures} and table.md; the RNs are in {args.rns_dir}.")
+    rns_dir = rn_studies.rns_dir(args)
+    print(f"{args.out}: summary.csv, {pictures} and table.md; the RNs are in {rns_dir}.")
     return table
 
 

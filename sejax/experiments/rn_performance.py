@@ -82,10 +82,11 @@ def report(args: argparse.Namespace, curves: pd.DataFrame) -> pd.DataFrame:
     )
     command = figures.command(NAME, args, "env", "variants", "bonuses", "bonus_groups", "rows",
                               "objective", "learned", "rns", "generations", "num_agents",
-                              "max_steps", "preset", "set")  # fmt: skip
+                              "max_steps", "preset", "set", "rns_dir")  # fmt: skip
     common.write_markdown(args.out / "table.md", title, command, table, note)
     figures.print_table(title, table)
-    print(f"{args.out}: summary.csv, performance.png and table.md; the RNs are in {args.rns_dir}.")
+    rns_dir = rn_studies.rns_dir(args)
+    print(f"{args.out}: summary.csv, performance.png and table.md; the RNs are in {rns_dir}.")
     return table
 
 

@@ -182,8 +182,6 @@ def fill_in(args: argparse.Namespace) -> None:
     each_of("--variants", args.variants, study.variants)
     one_of("--objective", getattr(args, "objective", OBJECTIVES[0]), OBJECTIVES)
     common.require_counts(args, "learned", "generations")
-    if args.rns_dir is None:
-        args.rns_dir = args.out / "rns" if args.quick else Path("results/reward_networks")
 
 
 def default_options(args: argparse.Namespace) -> dict[str, Any]:
@@ -230,9 +228,15 @@ def learn(args: argparse.Namespace, variant: str, objective: str) -> Any:
     return there.first(args.learned)
 
 
+def rns_dir(args: argparse.Namespace) -> Path:
+    """Where all RNs are kept."""
+    default = args.out / "rns" if args.quick else Path("results/reward_networks")
+    return args.rns_dir or default
+
+
 def set_file(args: argparse.Namespace, variant: str, objective: str) -> Path:
     """Where the RNs of a variant and objective are kept."""
-    return Path(args.rns_dir, args.env, objective, f"{variant}.safetensors")
+    return rns_dir(args) / args.env / objective / f"{variant}.safetensors"
 
 
 def stored(args: argparse.Namespace, variant: str, objective: str) -> Any:
