@@ -62,7 +62,8 @@ class Study:
       runs_at_once: of them in one program; a run is saved after each generation of all.
       rns: number of them, the best ones, that agents are trained on.
       num_agents: on each of these.
-      quick: options with --quick, where trainings of this task would take too long otherwise.
+      quick: options with --quick, where trainings of this task, or the compilation of HalfCheetah's
+        physics, would take too long otherwise.
     """
 
     agent: AgentConfig
@@ -117,7 +118,7 @@ STUDIES = {
         variants=(*VARIANTS, *(v + AUGMENTED for v in VARIANTS), *WEIGHTED_INFO),
         max_episodes=1000, max_steps=500_000, learned=5, rns=5, num_agents=5,
         quick={"variants": ["additive_potential"], "rows": ["default"], "generations": 1,
-               "learned": 1, "num_agents": 2,
+               "learned": 1, "num_agents": 2, "bonuses": ["none"],
                "set": ["es.population_size=2", "es.num_incumbent_evals=2",
                        "training.max_episodes=2", "agent.init_episodes=1"]},
     ),
