@@ -36,7 +36,7 @@ def parse_args(
     summary = (description or "").partition("\n")[0]
     parser = argparse.ArgumentParser(prog=f"python -m sejax.experiments.{name}",
                                      description=summary)  # fmt: skip
-    parser.add_argument("--quick", action="store_true", help="a small version, in two minutes")
+    parser.add_argument("--quick", action="store_true", help="a small version, in minutes")
     parser.add_argument("--out", type=Path, help=f"output folder; results/{name}[-quick], where "
                         "there is a choice of tasks a folder there")  # fmt: skip
     parser.add_argument("--seed", type=int, default=0)
