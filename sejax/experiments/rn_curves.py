@@ -54,27 +54,18 @@ class World:
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Options about the agents; with those of `rn_studies`."""
     rn_studies.add_options(parser)
-    parser.add_argument(
-        "--rows",
-        nargs="+",
-        metavar="ROW",
-        help="agents to train: default (the paper's hyperparameters), varied "
-        "(drawn for each agent), transfer (one that the RNs never saw); all",
-    )
-    parser.add_argument(
-        "--bonuses",
-        nargs="+",
-        metavar="BONUS",
-        help="exploration bonuses on the real task to compare with: count_based on "
-        "cliff_walking, elsewhere icm; or none",
-    )
+    parser.add_argument("--rows", nargs="+", metavar="ROW", help="agents to train: default (the "
+                        "paper's hyperparameters), varied (drawn for each agent), transfer (one "
+                        "that the RNs never saw); all")  # fmt: skip
+    parser.add_argument("--bonuses", nargs="+", metavar="BONUS", help="exploration bonuses on the "
+                        "real task to compare with: count_based on cliff_walking, elsewhere icm; "
+                        "or none")  # fmt: skip
     parser.add_argument("--bonus-groups", type=int, help="groups of agents with a bonus, which are "
                         "dear; as many as RNs are used")  # fmt: skip
     parser.add_argument("--rns", type=int, help="RNs of each variant that agents are trained on, "
                         "the best; 10, on halfcheetah 5")  # fmt: skip
-    parser.add_argument(
-        "--num-agents", type=int, help="on each RN, in each row; 10, on halfcheetah 5"
-    )
+    parser.add_argument("--num-agents", type=int, help="on each RN, in each row; 10, on "
+                        "halfcheetah 5")  # fmt: skip
     parser.add_argument("--max-steps", type=int, help="training steps; as the paper's figure")
 
 

@@ -146,11 +146,7 @@ def label(name: str) -> str:
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Options about the task and the RNs that are learned."""
-    parser.add_argument(
-        "--env",
-        default="cliff_walking",
-        help=f"task, cliff_walking or {', '.join(list(STUDIES)[1:])}",
-    )
+    parser.add_argument("--env", default="cliff_walking", help=f"task: {', '.join(STUDIES)}")
     parser.add_argument("--variants", nargs="+", metavar="VARIANT",
                         help=f"{', '.join(VARIANTS)}, these with {AUGMENTED}, "
                              f"{', '.join(WEIGHTED_INFO)}; all of the paper's")  # fmt: skip
