@@ -34,7 +34,7 @@ def main() -> None:
     args = parser.parse_args()
     num_agents = 2 if args.quick else args.agents
     with tempfile.TemporaryDirectory() as folder:
-        proxy = io.load_proxy(one_of_set(args.run, args.name, Path(folder)))
+        proxy = io.load_proxy(one_of_set(args.run, Path(folder)))
         command = [sys.executable, "-m", "sejax.evaluate", f"proxy={proxy.path}",
                    f"num_agents={num_agents}", f"out_dir={folder}",
                    *args.overrides]  # fmt: skip
@@ -48,13 +48,13 @@ def main() -> None:
     common.finish("ship_proxy", args, {"name": args.name, "evaluation": evaluation})
 
 
-def one_of_set(run: str, name: str, folder: Path) -> str | Path:
+def one_of_set(run: str, folder: Path) -> str | Path:
     """What to load: a run or a file as it is; one of a set as a file of its own."""
     path, _, place = run.partition("#")
     if not place:
         return run
     index = int(place)
-    proxies = load_set(path, "run", "rn" if name.endswith("-rn") else "se")
+    proxies = load_set(path, "run")
     seed = int(proxies.seeds[index])
     target = folder / "proxy.safetensors"
     io.save(target, dataclasses.replace(proxies.config, seed=seed, num_seeds=1),

@@ -97,7 +97,8 @@ def make_trainer(
       env: gymnax environment to train in: real, synthetic or reward-shaped. A potential-based
         reward has the agent's discount, whatever its params say. The plateau rule, the default,
         reads the returns of this world; for tests on the real task see
-        `evaluation.make_evaluator`.
+        `evaluation.make_evaluator`. In a proxy whose params allow longer episodes than its task the
+        buffer may hold fewer steps than the agent asks for.
       training: stopping rule and limits. `time_limit_is_terminal` speaks of real time limits and is
         ignored in an SE: there the last step of an episode bootstraps with what the done network
         says, as in the authors' code.

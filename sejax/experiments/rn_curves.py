@@ -266,7 +266,7 @@ def panel(axis: Any, curves: pd.DataFrame, args: argparse.Namespace, solved_rewa
         mean = values[:, known].mean(axis=0)
         error = values[:, known].std(axis=0) / np.sqrt(len(values))
         color = colors[name.removesuffix(rn_studies.AUGMENTED)]
-        dashed = name in WITHOUT_RN[1:]
+        dashed = name in WITHOUT_RN and name != "real"
         style = "--" if dashed else ":" if rn_studies.AUGMENTED in name else "-"
         axis.plot(grid[known], mean, color=color, ls=style, lw=1.6, label=rn_studies.label(name))
         axis.fill_between(grid[known], mean - error, mean + error, color=color, alpha=0.2, lw=0)
