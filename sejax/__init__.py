@@ -2,35 +2,112 @@
 
 Learn a small network that stands in for a task (`make_learner`), load one that was learned
 (`load`), and train agents on it (`make_trainer`; `make_evaluator` tests them on the real task too).
+Everything takes objects: tasks (`Task`, `sejax.envs.make`), agents (`make_agent`), proxies,
+objectives and strategies of your own serve as well as those that come with sejax.
+
 Names are imported on first use: importing `sejax` costs nothing, sets no environment variable and
 touches no flag.
 """
 
 import importlib
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 __version__ = "0.1.0"
 
 _EXPORTS = {
+    "AUC": "sejax.objectives",
+    "AUCSum": "sejax.objectives",
+    "Agent": "sejax.agents.agent",
     "ConfigError": "sejax.errors",
-    "config": "sejax.configs",
-    "load": "sejax.proxies.io",
-    "load_proxy": "sejax.proxies.io",
-    "load_set": "sejax.proxies.sets",
-    "save": "sejax.proxies.io",
-    "make_agent": "sejax.agents.registry",
+    "CountBasedConfig": "sejax.agents.count_based",
+    "DDQNConfig": "sejax.agents.ddqn",
+    "DiscreteTD3Config": "sejax.agents.td3",
+    "DuelingDDQNConfig": "sejax.agents.ddqn",
+    "EvosaxConfig": "sejax.es.evosax",
+    "ICMConfig": "sejax.agents.icm",
+    "LearnResult": "sejax.bilevel",
+    "MaxReward": "sejax.objectives",
+    "NESConfig": "sejax.es.nes",
+    "Objective": "sejax.objectives",
+    "Outcome": "sejax.objectives",
+    "PPOConfig": "sejax.agents.ppo",
+    "Proxy": "sejax.proxies.files",
+    "ProxyEnv": "sejax.proxies.proxy",
+    "ProxySet": "sejax.proxies.files",
+    "QLearningConfig": "sejax.agents.tabular",
+    "RewardConfig": "sejax.proxies.configs",
+    "RewardThreshold": "sejax.objectives",
+    "SARSAConfig": "sejax.agents.tabular",
+    "Strategy": "sejax.es.strategy",
+    "SyntheticConfig": "sejax.proxies.configs",
+    "TD3Config": "sejax.agents.td3",
+    "Task": "sejax.envs.task",
+    "TrainResult": "sejax.trainer",
+    "TrainingConfig": "sejax.trainer",
+    "Trials": "sejax.es.strategy",
+    "config": "sejax.app.compose",
+    "load": "sejax.proxies.files",
+    "load_proxy": "sejax.proxies.files",
+    "load_set": "sejax.proxies.files",
+    "make_agent": "sejax.agents",
     "make_evaluator": "sejax.evaluation",
     "make_learner": "sejax.bilevel",
     "make_trainer": "sejax.trainer",
-    "register_gymnax": "sejax.proxies.io",
+    "register_gymnax": "sejax.proxies.files",
+    "save": "sejax.proxies.files",
+    "save_set": "sejax.proxies.files",
 }
-__all__ = ["ConfigError", "config", "load", "load_proxy", "load_set", "make_agent",
-           "make_evaluator", "make_learner", "make_trainer", "register_gymnax", "save"]  # fmt: skip
+_MODULES = ("agents", "envs", "es", "proxies")
+
+if TYPE_CHECKING:  # what a type checker and an editor see
+    from sejax import agents, envs, es, proxies
+    from sejax.agents import make_agent
+    from sejax.agents.agent import Agent
+    from sejax.agents.count_based import CountBasedConfig
+    from sejax.agents.ddqn import DDQNConfig, DuelingDDQNConfig
+    from sejax.agents.icm import ICMConfig
+    from sejax.agents.ppo import PPOConfig
+    from sejax.agents.tabular import QLearningConfig, SARSAConfig
+    from sejax.agents.td3 import DiscreteTD3Config, TD3Config
+    from sejax.app.compose import config
+    from sejax.bilevel import LearnResult, make_learner
+    from sejax.envs.task import Task
+    from sejax.errors import ConfigError
+    from sejax.es.evosax import EvosaxConfig
+    from sejax.es.nes import NESConfig
+    from sejax.es.strategy import Strategy, Trials
+    from sejax.evaluation import make_evaluator
+    from sejax.objectives import AUC, AUCSum, MaxReward, Objective, Outcome, RewardThreshold
+    from sejax.proxies.configs import RewardConfig, SyntheticConfig
+    from sejax.proxies.files import (
+        Proxy,
+        ProxySet,
+        load,
+        load_proxy,
+        load_set,
+        register_gymnax,
+        save,
+        save_set,
+    )
+    from sejax.proxies.proxy import ProxyEnv
+    from sejax.trainer import TrainingConfig, TrainResult, make_trainer
+
+__all__ = [  # noqa: RUF022 (as the table above)
+    "AUC", "AUCSum", "Agent", "ConfigError", "CountBasedConfig", "DDQNConfig", "DiscreteTD3Config",
+    "DuelingDDQNConfig", "EvosaxConfig", "ICMConfig", "LearnResult", "MaxReward", "NESConfig",
+    "Objective", "Outcome", "PPOConfig", "Proxy", "ProxyEnv", "ProxySet", "QLearningConfig",
+    "RewardConfig", "RewardThreshold", "SARSAConfig", "Strategy", "SyntheticConfig", "TD3Config",
+    "Task", "TrainResult", "TrainingConfig", "Trials", "agents", "config", "envs", "es", "load",
+    "load_proxy", "load_set", "make_agent", "make_evaluator", "make_learner", "make_trainer",
+    "proxies", "register_gymnax", "save", "save_set",
+]  # fmt: skip
 
 
 def __getattr__(name: str) -> Any:
     if name in _EXPORTS:
         return getattr(importlib.import_module(_EXPORTS[name]), name)
+    if name in _MODULES:
+        return importlib.import_module(f"sejax.{name}")
     raise AttributeError(f"module 'sejax' has no attribute {name!r}")
 
 

@@ -1,6 +1,6 @@
 """The bilevel loop: NES outside, whole agent trainings inside, in one compiled program.
 
-Assembles proxies, agents and strategies; owns no maths of its own.
+Assembles a proxy, an agent, a strategy and an objective; owns no maths of its own.
 
 Source: paper, Algorithm 1.
 """
@@ -15,16 +15,16 @@ from flax import struct
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
-from sejax import envs
-from sejax.agents.hparams import make_varied_agents
-from sejax.agents.registry import make_agent
-from sejax.configs import LearnConfig
-from sejax.es import make_strategy
-from sejax.es.nes import finite_mean
-from sejax.evaluation import evaluator_and_lanes
-from sejax.objectives import Outcome, make_objective
+from sejax import plugins
+from sejax.agents.agent import Agent
+from sejax.counters import exact, wide_add, wide_sum, wide_zeros
+from sejax.envs.task import Task
+from sejax.es.strategy import Strategy, finite_mean
+from sejax.evaluation import make_evaluator, tested_throughout
+from sejax.objectives import MaxReward, Objective, Outcome
 from sejax.parallel import spread_over_devices
-from sejax.proxies.registry import ProxyEnv, make_proxy
+from sejax.proxies.proxy import ProxyEnv
+from sejax.trainer import TrainingConfig
 
 
 @struct.dataclass
@@ -39,7 +39,7 @@ class LearnState:
     best: Float[Array, "seed dims"]
     best_score: Array
     best_generation: Array
-    env_steps: Array
+    env_steps: Array  # a wide count, see `sejax.counters`
     finished: Array  # stop_when_solved: the run is over and its generations cost nothing
 
 
@@ -57,9 +57,19 @@ class GenerationInfo:
     train_steps_max: Array
     train_episodes_mean: Array
     num_nonfinite: Array
-    env_steps_total: Array
-    train_steps_total: Array
+    env_steps_wide: Array  # `[seed, 2]`; see `env_steps_total`
+    train_steps_wide: Array  # `[seed, 2]`; see `train_steps_total`
     active: Array
+
+    @property
+    def env_steps_total(self) -> Any:
+        """Steps on the real task so far, NumPy int64; for an info on the host."""
+        return exact(self.env_steps_wide)
+
+    @property
+    def train_steps_total(self) -> Any:
+        """Steps of all agents in this generation, NumPy int64; for an info on the host."""
+        return exact(self.train_steps_wide)
 
 
 @struct.dataclass
@@ -67,9 +77,9 @@ class LearnResult:
     """Result of a whole run.
 
     Attributes:
-      weights: the best proxy's weights.
-      score: its incumbent mean.
-      generation: the generation that measured it.
+      weights: the best proxy's weights, as from its `init_weights`.
+      score: its incumbent mean, `[]`.
+      generation: the generation that measured it, `[]` int32.
       last_weights: the last proxy that was measured.
       info: history, leaves `[generation]`.
     """
@@ -83,52 +93,102 @@ class LearnResult:
 
 @dataclass(frozen=True, kw_only=True)
 class Program:
-    """The pure functions of a configured bilevel loop.
+    """The pure functions of a bilevel loop over `[seed]` independent runs.
 
     Attributes:
       init: `(keys [seed]) -> LearnState`.
       generation: `(LearnState) -> (LearnState, GenerationInfo)`, a scan body over all seeds.
       unravel: flat parameters `[dims]` to the proxy's weights.
-      env: the proxy.
-      task: the real task.
-      solved_score: incumbent mean at which the task counts as solved; None if the objective's
-        scores are not returns.
+      proxy: what is learned.
+      strategy: that learns it.
+      objective: that it is learned by.
       num_dims: length of a parameter vector.
-      num_candidates: trainings in a generation of one seed.
     """
 
     init: Callable[[Array], LearnState]
     generation: Callable[[LearnState], tuple[LearnState, GenerationInfo]]
     unravel: Callable[[Array], Any]
-    env: ProxyEnv
-    task: envs.Task
-    solved_score: float | None
+    proxy: ProxyEnv
+    strategy: Strategy
+    objective: Objective
     num_dims: int
-    num_candidates: int
+
+    @property
+    def task(self) -> Task:
+        return self.proxy.task
+
+    @property
+    def solved_score(self) -> float | None:
+        """Incumbent mean at which the task counts as solved; None if no score says so."""
+        if not (self.objective.scores_are_returns and self.task.is_solvable):
+            return None
+        return self.task.solved_reward
 
 
-def make_learner(config: LearnConfig) -> Callable[[Array], LearnResult]:
+def make_learner(
+    config: Any = None,
+    *,
+    task: Task | None = None,
+    agent: Agent | None = None,
+    proxy: Any = None,
+    es: Any = None,
+    objective: Any = None,
+    training: TrainingConfig | None = None,
+    generations: int = 50,
+    stop_when_solved: bool = False,
+    devices: int | None = None,
+    lanes: int | None = None,
+) -> Callable[[Array], LearnResult]:
     """Builds `learn(key) -> LearnResult`: all of Algorithm 1 as one pure function.
 
     Jitted it is a single executable with the scan over generations inside; `vmap` it over keys for
-    several runs at once. `config.seed`, `num_seeds`, `run_dir` and `checkpoint_every` are the
-    command's and play no part here.
+    several runs at once.
 
     Args:
-      config: from `sejax.config`.
+      config: from `sejax.config`, in the place of all others. Its `seed`, `num_seeds`, `run_dir`
+        and `checkpoint_every` are the command's and play no part here.
+      task: the real task.
+      agent: that learns on the proxies, from `sejax.make_agent` or one of your own.
+      proxy: a `ProxyEnv` of the task, or a configuration that makes one; an SE if not given.
+      es: a configuration with `make(num_dims) -> Strategy`; the paper's NES if not given.
+      objective: an `Objective`, or a configuration that makes one; the mean test return if not
+        given.
+      training: how long each agent trains, and how it is tested.
+      generations: n_o of Algorithm 1.
+      stop_when_solved: whether a run ends at its first incumbent mean above the threshold.
+      devices: to spread the population over; None for all.
+      lanes: agents in lockstep on one device; None for what suits agent and device.
 
     Raises:
-      ConfigError: if the configuration asks for more devices than there are.
+      ConfigError: if the parts do not fit each other, or there are not so many devices.
+      TypeError: if neither a configuration nor a task and an agent are given.
 
     Source: paper, Algorithm 1.
+
+    Example:
+      >>> import sejax
+      >>> task = sejax.envs.make("gridworld_2x2")
+      >>> learn = make_learner(
+      ...     task=task, agent=sejax.make_agent(sejax.QLearningConfig(), task),
+      ...     proxy=sejax.SyntheticConfig(hidden_size=8), es=sejax.NESConfig(population_size=4),
+      ...     training=sejax.TrainingConfig(max_steps=100), generations=2, devices=1)
+      >>> jax.eval_shape(learn, jax.random.key(0)).info.incumbent_mean.shape
+      (2,)
     """
-    program = make_program(config)
+    if config is not None:
+        return make_learner(**config.parts(), generations=config.generations)
+    if task is None or agent is None:
+        raise TypeError("make_learner needs a configuration, or a task and an agent.")
+    program = make_program(
+        task=task, agent=agent, proxy=proxy, es=es, objective=objective, training=training,
+        stop_when_solved=stop_when_solved, devices=devices, lanes=lanes,
+    )  # fmt: skip
 
     def learn(key: Array) -> LearnResult:
         state, info = jax.lax.scan(
             lambda state, _: program.generation(state),
             program.init(key[None]),
-            length=config.generations,
+            length=generations,
         )
         state, info = jax.tree.map(lambda x: x[0], state), jax.tree.map(lambda x: x[:, 0], info)
         return LearnResult(
@@ -142,22 +202,36 @@ def make_learner(config: LearnConfig) -> Callable[[Array], LearnResult]:
     return learn
 
 
-def make_program(config: LearnConfig) -> Program:
-    """Assembles the bilevel loop for `[seed]` independent runs. See `Program`."""
-    task = config.env.make()
-    env = make_proxy(task, config.proxy)
-    flat, unravel = ravel_pytree(env.init_weights(jax.random.key(0)))
-    strategy = make_strategy(config.es, flat.size)
-    score_candidates = make_population_scorer(config, task, env, unravel)
-    objective = make_objective(config.objective, task.solved_reward)
-    solved_score = task.solved_reward if config.objective.name == "max_reward" else None
+def make_program(
+    *,
+    task: Task,
+    agent: Agent,
+    proxy: Any = None,
+    es: Any = None,
+    objective: Any = None,
+    training: TrainingConfig | None = None,
+    stop_when_solved: bool = False,
+    devices: int | None = None,
+    lanes: int | None = None,
+) -> Program:
+    """Assembles the bilevel loop for `[seed]` independent runs; arguments as of `make_learner`."""
+    proxy, objective = _proxy_of(proxy, task), _objective_of(objective, task)
+    training = training or TrainingConfig()
+    flat, unravel = ravel_pytree(proxy.init_weights(jax.random.key(0)))
+    strategy = _strategy_of(es, flat.size)
+    score_candidates = make_population_scorer(
+        agent, proxy, tested_throughout(training) if objective.needs_tests else training,
+        unravel, devices, lanes,
+    )  # fmt: skip
+    trials = strategy.trials
+    seed_ids = trials.seed_ids(strategy.num_members)
 
     def init(keys: Array) -> LearnState:
         num_seeds = keys.shape[0]
         key_weights, key_es, key_run = (
             k for k in jax.vmap(lambda k: jax.random.split(k, 3))(keys).T
         )
-        mean = jax.vmap(lambda key: ravel_pytree(env.init_weights(key))[0])(key_weights)
+        mean = jax.vmap(lambda key: ravel_pytree(proxy.init_weights(key))[0])(key_weights)
         state = LearnState(
             key=key_run,
             es_state=jax.vmap(strategy.init)(key_es, mean),
@@ -167,7 +241,7 @@ def make_program(config: LearnConfig) -> Program:
             best=mean,
             best_score=jnp.full(num_seeds, -jnp.inf),
             best_generation=jnp.full(num_seeds, -1, jnp.int32),
-            env_steps=jnp.zeros(num_seeds, jnp.int32),
+            env_steps=wide_zeros(num_seeds),
             finished=jnp.zeros(num_seeds, bool),
         )
         return jax.tree.map(_strongly_typed, state)
@@ -178,97 +252,110 @@ def make_program(config: LearnConfig) -> Program:
         key_ask, key_inner, key_tell = (
             k for k in jax.vmap(lambda k: jax.random.split(k, 3))(keys).T
         )
-        candidates, asked = jax.vmap(strategy.ask)(key_ask, state.es_state)
-        outcome = score_candidates(strategy.seed_ids, key_inner, candidates, ~state.finished)
-        scores = objective(outcome)  # [seed, candidates]
-        num_nonfinite = (~jnp.isfinite(scores)).sum(axis=1)
-        scores = jax.vmap(_rank_diverged_incumbents_last, (0, None))(
-            scores, strategy.num_incumbent_evals
-        )
-        told = jax.vmap(strategy.tell)(key_tell, candidates, scores, asked)
-        stepped = _advance(state, told, jax.vmap(strategy.incumbent)(asked), scores, outcome)
+        members, asked = jax.vmap(strategy.ask)(key_ask, state.es_state)
+        incumbent = jax.vmap(strategy.incumbent)(asked)
+        candidates = jax.vmap(trials.candidates)(members, incumbent)
+        outcome = score_candidates(seed_ids, key_inner, candidates, ~state.finished)
+        scores = Scores.of(objective(outcome), trials)
+        told = jax.vmap(strategy.tell)(
+            key_tell, members, jax.vmap(trials.of_members)(scores.tried), scores.incumbent_mean,
+            asked,
+        )  # fmt: skip
+        stepped = _advance(state, told, incumbent, scores, outcome)
+        if stop_when_solved and program.solved_score is not None:
+            stepped = stepped.replace(finished=stepped.incumbent_score >= program.solved_score)
         stepped = jax.tree.map(lambda new, old: _where(state.finished, old, new), stepped, state)
-        return stepped, _summarise(state, stepped, scores, outcome, num_nonfinite)
+        return stepped, _summarise(state, stepped, scores, outcome)
 
-    def _advance(
-        state: LearnState, told: Any, incumbent: Array, scores: Array, outcome: Outcome
-    ) -> LearnState:
-        """Records what this generation measured of its incumbent and keeps the best one."""
-        score = jax.vmap(finite_mean)(scores[:, -strategy.num_incumbent_evals :])
-        score = jnp.where(jnp.isfinite(score), score, -jnp.inf)
-        better = score > state.best_score
-        finished = state.finished
-        if config.stop_when_solved and solved_score is not None:
-            finished = score >= solved_score
-        return LearnState(
-            key=state.key,
-            es_state=told,
-            generation=state.generation + 1,
-            incumbent=incumbent,
-            incumbent_score=score,
-            best=_where(better, incumbent, state.best),
-            best_score=jnp.where(better, score, state.best_score),
-            best_generation=jnp.where(better, state.generation, state.best_generation),
-            env_steps=state.env_steps + outcome.real_steps.sum(axis=1),
-            finished=finished,
-        )
+    program = Program(init=init, generation=generation, unravel=unravel, proxy=proxy,
+                      strategy=strategy, objective=objective, num_dims=flat.size)  # fmt: skip
+    return program
 
-    def _summarise(
-        before: LearnState,
-        after: LearnState,
-        scores: Array,
-        outcome: Outcome,
-        num_nonfinite: Array,
-    ) -> GenerationInfo:
-        num_perturbed = strategy.num_candidates - strategy.num_incumbent_evals
-        perturbed, incumbent = scores[:, :num_perturbed], scores[:, num_perturbed:]
-        return GenerationInfo(
-            generation=before.generation,
-            incumbent_mean=jax.vmap(finite_mean)(incumbent),
-            incumbent_std=jnp.nanstd(incumbent, axis=1),
-            population_mean=jax.vmap(finite_mean)(perturbed),
-            population_max=jnp.nanmax(perturbed, axis=1),
-            best_so_far=after.best_score,
-            train_steps_mean=outcome.train_steps.mean(axis=1),
-            train_steps_max=outcome.train_steps.max(axis=1),
-            train_episodes_mean=outcome.train_episodes.mean(axis=1),
-            num_nonfinite=num_nonfinite,
-            env_steps_total=after.env_steps,
-            train_steps_total=outcome.train_steps.sum(axis=1),
-            active=~before.finished,
-        )
 
-    return Program(
-        init=init,
-        generation=generation,
-        unravel=unravel,
-        env=env,
-        task=task,
-        solved_score=solved_score,
-        num_dims=flat.size,
-        num_candidates=strategy.num_candidates,
+@struct.dataclass
+class Scores:
+    """What a generation's trainings are worth, leaves `[seed, ...]`.
+
+    Attributes:
+      tried: of the members' trials, `[seed, trials]`; not finite for agents that diverged.
+      incumbent: of the incumbent's, with agents that diverged ranked last.
+      incumbent_mean: of these, `[seed]`; nan if none survived.
+      num_nonfinite: trainings that diverged, `[seed]`.
+    """
+
+    tried: Array
+    incumbent: Array
+    incumbent_mean: Array
+    num_nonfinite: Array
+
+    @classmethod
+    def of(cls, scores: Float[Array, "seed trials"], trials: Any) -> "Scores":
+        tried, incumbent = jax.vmap(trials.split)(scores)
+        repaired, mean = jax.vmap(trials.of_incumbent)(incumbent, tried)
+        num_nonfinite = (~jnp.isfinite(scores)).sum(axis=1)
+        return cls(tried=tried, incumbent=repaired, incumbent_mean=mean,
+                   num_nonfinite=num_nonfinite)  # fmt: skip
+
+
+def _advance(
+    state: LearnState, told: Any, incumbent: Array, scores: Scores, outcome: Outcome
+) -> LearnState:
+    """Records what this generation measured of its incumbent and keeps the best one."""
+    score = scores.incumbent_mean
+    score = jnp.where(jnp.isfinite(score), score, -jnp.inf)
+    better = score > state.best_score
+    return state.replace(
+        es_state=told,
+        generation=state.generation + 1,
+        incumbent=incumbent,
+        incumbent_score=score,
+        best=_where(better, incumbent, state.best),
+        best_score=jnp.where(better, score, state.best_score),
+        best_generation=jnp.where(better, state.generation, state.best_generation),
+        env_steps=wide_add(state.env_steps, wide_sum(outcome.real_steps)),
+    )
+
+
+def _summarise(
+    before: LearnState, after: LearnState, scores: Scores, outcome: Outcome
+) -> GenerationInfo:
+    return GenerationInfo(
+        generation=before.generation,
+        incumbent_mean=scores.incumbent_mean,
+        incumbent_std=jnp.nanstd(scores.incumbent, axis=1),
+        population_mean=jax.vmap(finite_mean)(scores.tried),
+        population_max=jnp.nanmax(scores.tried, axis=1),
+        best_so_far=after.best_score,
+        train_steps_mean=outcome.train_steps.mean(axis=1),
+        train_steps_max=outcome.train_steps.max(axis=1),
+        train_episodes_mean=outcome.train_episodes.mean(axis=1),
+        num_nonfinite=scores.num_nonfinite,
+        env_steps_wide=after.env_steps,
+        train_steps_wide=wide_sum(outcome.train_steps),
+        active=~before.finished,
     )
 
 
 def make_population_scorer(
-    config: LearnConfig, task: envs.Task, env: ProxyEnv, unravel: Callable[[Array], Any]
+    agent: Agent,
+    proxy: ProxyEnv,
+    training: TrainingConfig,
+    unravel: Callable[[Array], Any],
+    devices: int | None = None,
+    lanes: int | None = None,
 ) -> Callable[..., Outcome]:
     """Builds `score(seed_ids [n], keys [seed], candidates [seed, n, dims], active [seed])`.
 
     It trains one fresh agent on each candidate, tests it on the real task, and returns an
     `Outcome` with leaves `[seed, n, ...]`. The trainings are spread over the devices; on each
-    device groups of `config.lanes` of them follow one another.
+    device groups of `lanes` of them follow one another.
     """
-    make = make_varied_agents if config.agent_hparams == "varied" else make_agent
-    agent = make(config.agent, task, config.exploration)
-    # The area under a learning curve that ends when the task is solved would reward learning late.
-    stop_reward = jnp.inf if config.objective.needs_curve else None
-    evaluate, cpu_lanes = evaluator_and_lanes(agent, env, task, config.training, stop_reward)
+    evaluate = make_evaluator(agent, proxy, proxy.task, training)
 
     def evaluate_candidate(key: Array, candidate: Array, active: Array) -> Outcome:
-        return evaluate(key, env.params(unravel(candidate)), active)
+        return evaluate(key, proxy.params(unravel(candidate)), active)
 
-    evaluate_many = spread_over_devices(evaluate_candidate, config.devices, config.lanes, cpu_lanes)
+    evaluate_many = spread_over_devices(evaluate_candidate, devices, lanes, agent.cpu_lanes)
 
     def score(seed_ids: Array, keys: Array, candidates: Array, active: Array) -> Outcome:
         num_seeds, num_candidates, num_dims = candidates.shape
@@ -283,18 +370,25 @@ def make_population_scorer(
     return score
 
 
-def _rank_diverged_incumbents_last(
-    scores: Float[Array, " candidates"], num_incumbent_evals: int
-) -> Float[Array, " candidates"]:
-    """Gives the incumbent's agents that diverged the lowest finite score of the generation.
+def _proxy_of(proxy: Any, task: Task) -> ProxyEnv:
+    if proxy is None:
+        from sejax.proxies.configs import SyntheticConfig
 
-    A mean without them would rank an incumbent by the agents that survived it. One that none
-    survived has no score. Members keep nan: the strategy ranks these last itself.
-    """
-    finite = jnp.isfinite(scores)
-    lowest = jnp.nanmin(jnp.where(finite, scores, jnp.nan))
-    is_incumbent = jnp.arange(scores.size) >= scores.size - num_incumbent_evals
-    return jnp.where(is_incumbent & ~finite & (is_incumbent & finite).any(), lowest, scores)
+        proxy = SyntheticConfig()
+    return plugins.make("proxy", proxy, task) if hasattr(proxy, "make") else proxy
+
+
+def _objective_of(objective: Any, task: Task) -> Objective:
+    objective = MaxReward() if objective is None else objective
+    return plugins.make("objective", objective, task) if hasattr(objective, "make") else objective
+
+
+def _strategy_of(es: Any, num_dims: int) -> Strategy:
+    if es is None:
+        from sejax.es.nes import NESConfig
+
+        es = NESConfig()
+    return plugins.make("es", es, num_dims)
 
 
 def _strongly_typed(x: Array) -> Array:
@@ -306,6 +400,3 @@ def _strongly_typed(x: Array) -> Array:
 def _where(mask: Array, a: Array, b: Array) -> Array:
     """Selects along the leading axis; keys too."""
     return jax.vmap(jnp.where)(mask, a, b)
-
-
-__all__ = ["LearnResult", "LearnState", "Program", "make_learner", "make_program"]

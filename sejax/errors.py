@@ -1,7 +1,14 @@
-"""The one error that bad input raises, and the message for an unknown name."""
+"""The one error that bad input raises, and the checks that raise it.
+
+Every message has one form: what must hold, why, what came, and how to mend it.
+"""
 
 import difflib
-from collections.abc import Iterable
+import math
+from collections.abc import Collection, Iterable
+from typing import Any
+
+LARGEST = 2**31 - 1  # steps, episodes and sizes are counted in 32 bits
 
 
 class ConfigError(ValueError):
@@ -12,17 +19,74 @@ def unknown_name(field: str, got: str, known: Iterable[str]) -> ConfigError:
     """Error for an unknown choice; lists the known ones, nearest first, and names the override."""
     ranked = nearest(got, known)
     return ConfigError(
-        f"{field} must be one of {', '.join(ranked)}; got {got!r}. "
+        f"{field} must be one of {', '.join(ranked)}; got {shortened(got)!r}. "
         f"Did you mean {field}={ranked[0]}?"
     )
 
 
 def nearest(got: str, known: Iterable[str]) -> list[str]:
     """The known names, the most similar first."""
-    return sorted(known, key=lambda name: -difflib.SequenceMatcher(None, got, name).ratio())
+    start = str(got)[:200]  # comparing takes time that grows with the square of the length
+    return sorted(known, key=lambda name: -difflib.SequenceMatcher(None, start, name).ratio())
 
 
-def require(holds: bool, field: str, rule: str, reason: str, got: object, fix: str) -> None:
+def shortened(value: object, length: int = 200) -> str:
+    """A value as text that leaves room for the rest of a message."""
+    text = str(value)
+    return text if len(text) <= length else f"{text[:length]}... ({len(text)} characters)"
+
+
+def require(holds: Any, field: str, rule: str, reason: str, got: object, fix: str) -> None:
     """Raises `ConfigError` in the project's one form of message unless `holds`."""
     if not holds:
-        raise ConfigError(f"{field} must {rule}, because {reason}; got {got}. Set {fix}.")
+        raise ConfigError(
+            f"{field} must {rule}, because {reason}; got {shortened(got)}. Set {fix}."
+        )
+
+
+def at_least(minimum: float, name: str, value: Any, reason: str, fix: Any) -> None:
+    require(is_number(value) and value >= minimum, name, f"be at least {minimum}", reason, value,
+            f"{name}={fix}")  # fmt: skip
+
+
+def whole(minimum: int, name: str, value: Any, reason: str, fix: Any) -> None:
+    """Checks a count: at least `minimum`, and not more than can be counted."""
+    at_least(minimum, name, value, reason, fix)
+    require(value <= LARGEST, name, f"be at most {LARGEST}", "it is counted in 32 bits", value,
+            f"{name}={fix}")  # fmt: skip
+
+
+def positive(name: str, value: Any, reason: str, fix: Any, at_most: float = math.inf) -> None:
+    require(is_number(value) and value > 0 and math.isfinite(value), name, "be above 0 and finite",
+            reason, value, f"{name}={fix}")  # fmt: skip
+    require(value <= at_most, name, f"be at most {at_most:g}", "the numbers that come of it would "
+            "not be finite", value, f"{name}={fix}")  # fmt: skip
+
+
+def fraction(name: str, value: Any, fix: Any) -> None:
+    require(is_number(value) and 0 <= value <= 1, name, "lie in [0, 1]", "it is a fraction", value,
+            f"{name}={fix}")  # fmt: skip
+
+
+def one_of(name: str, value: str, known: Collection[str]) -> None:
+    if value not in known:
+        raise unknown_name(name, value, known)
+
+
+def each_of(name: str, values: Iterable[str], known: Collection[str]) -> None:
+    for value in values:
+        one_of(name, value, known)
+
+
+def require_seed(name: str, seed: Any) -> None:
+    """Checks that a seed is one that `jax.random.key` takes as it is.
+
+    Raises:
+      ConfigError: if it is not.
+    """
+    require(is_number(seed) and 0 <= seed < 2**31, name, "lie in [0, 2**31)",
+            "it is a 32-bit number", seed, f"{name}=0")  # fmt: skip
+
+
+def is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from flax import linen as nn
 from jaxtyping import Array, Float
 
+ACTIVATIONS = ("tanh", "relu", "leaky_relu", "prelu")
 PRELU_SLOPE = 0.25
 
 
@@ -87,7 +88,7 @@ def _product(a: Float[Array, "rows inner"], b: Float[Array, "inner batch"]) -> A
 class MLP(nn.Module):
     """`num_layers` hidden layers of `hidden_size` units with an activation, then a linear head.
 
-    `activation` is one of `configs.ACTIVATIONS`. PReLU has one slope for the whole network, as in
+    `activation` is one of `ACTIVATIONS`. PReLU has one slope for the whole network, as in
     the authors' code. `learn_prelu_slope` makes it a parameter (agents); otherwise it stays at 0.25
     (proxies: the authors' NES perturbs the weights and biases of linear layers only). `layer_norm`
     normalises each column over the units of every hidden layer but the first, before the

@@ -1,12 +1,15 @@
 """What the training of one agent on a proxy, and its test on the real task, are worth."""
 
 from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, ClassVar
 
 import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
-from sejax.configs import ObjectiveConfig
+from sejax.errors import require
+from sejax.options import Options, not_negative, option
 
 
 @struct.dataclass
@@ -37,31 +40,112 @@ class Outcome:
         return self.test_returns.mean(axis=-1)
 
 
-def make_objective(
-    config: ObjectiveConfig, solved_reward: float
-) -> Callable[[Outcome], Float[Array, "*agent"]]:
-    r"""Builds `objective(outcome) -> score`, to be maximised; nan for a training that diverged.
+@dataclass(frozen=True, kw_only=True)
+class Objective:
+    """What the outer loop maximises.
 
-    - `max_reward`: the mean test return (SEs).
-    - `reward_threshold`: :math:`-(n_{tr} + w_{sol} \max(0, C_{sol} - C_{fin}))` (RNs).
-    - `auc`: the area under the curve of test returns over training steps, by the number of these
-      steps (RNs).
-    - `auc_sum`: the area itself, as in the authors' code. Agents train a number of episodes, so
-      that it rewards short ones where returns are negative, and long ones where they are positive.
-
-    Source: paper, Algorithm 1, EvaluateAgent, section "Learning Reward Networks", and appendix
-    "Studying the Influence of Different Reward Network Optimization Objectives".
+    Attributes:
+      score: `outcome -> [agent]` float32, leaves of the outcome `[agent, ...]`. A training that
+        diverged is worth nothing, whatever this says of it.
+      needs_tests: whether it looks at tests between training episodes: then agents are tested after
+        each of them, and none stops because it has solved the task.
+      scores_are_returns: whether scores are mean returns, which the task's threshold can be held
+        against.
+      meaning: of a score, for people.
     """
 
-    def objective(outcome: Outcome) -> Array:
-        score = outcome.test_return
-        if config.name == "reward_threshold":
-            shortfall = jnp.maximum(0.0, solved_reward - outcome.test_return)
-            score = -(outcome.train_steps + config.unsolved_weight * shortfall)
-        elif config.name == "auc":
-            score = outcome.return_area / jnp.maximum(outcome.train_steps, 1)
-        elif config.name == "auc_sum":
-            score = outcome.return_area
-        return jnp.where(outcome.nonfinite, jnp.nan, score)
+    score: Callable[[Outcome], Float[Array, "*agent"]]
+    needs_tests: bool = False
+    scores_are_returns: bool = False
+    meaning: str = ""
 
-    return objective
+    def __call__(self, outcome: Outcome) -> Float[Array, "*agent"]:
+        """Scores; nan for trainings that diverged."""
+        return jnp.where(outcome.nonfinite, jnp.nan, self.score(outcome))
+
+
+@dataclass(frozen=True, kw_only=True)
+class MaxReward(Options):
+    """The mean test return (SEs).
+
+    Source: paper, Algorithm 1, EvaluateAgent.
+    """
+
+    group: ClassVar[str] = "objective"
+    scores_are_returns: ClassVar[bool] = True
+
+    def make(self, task: Any) -> Objective:
+        return Objective(score=lambda outcome: outcome.test_return, scores_are_returns=True)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RewardThreshold(Options):
+    r"""How soon an agent solves the task (RNs).
+
+    .. math:: -(n_{tr} + w_{sol} \max(0, C_{sol} - C_{fin}))
+
+    Source: paper, section "Learning Reward Networks".
+    """
+
+    group: ClassVar[str] = "objective"
+    scores_are_returns: ClassVar[bool] = False
+
+    unsolved_weight: float = option(100.0, not_negative("a shortfall must not be rewarded"))  # w_sol
+
+    def make(self, task: Any) -> Objective:
+        """The objective on a task.
+
+        Raises:
+          ConfigError: if nobody says when the task is solved.
+        """
+        require(task.is_solvable, "objective", "be one that needs no threshold in this task",
+                "nobody says which return solves it", "reward_threshold",
+                "env.solved_reward, or objective=max_reward")  # fmt: skip
+
+        def score(outcome: Outcome) -> Array:
+            shortfall = jnp.maximum(0.0, task.solved_reward - outcome.test_return)
+            return -(outcome.train_steps + self.unsolved_weight * shortfall)
+
+        meaning = (f"minus the training steps of its agents, and {self.unsolved_weight:g} for each "
+                   f"unit of return below {task.solved_reward:g}")  # fmt: skip
+        return Objective(score=score, meaning=meaning)
+
+
+@dataclass(frozen=True, kw_only=True)
+class AUC(Options):
+    """The area under the curve of test returns over training steps, by the number of these (RNs).
+
+    Source: paper, appendix "Studying the Influence of Different Reward Network Optimization
+    Objectives".
+    """
+
+    group: ClassVar[str] = "objective"
+    scores_are_returns: ClassVar[bool] = False
+
+    def make(self, task: Any) -> Objective:
+        return Objective(
+            score=lambda outcome: outcome.return_area / jnp.maximum(outcome.train_steps, 1),
+            needs_tests=True,
+            meaning="the mean of its agents' test returns over their training",
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class AUCSum(Options):
+    """That area itself, as in the authors' code.
+
+    Agents train a number of episodes, so that it rewards short ones where returns are negative, and
+    long ones where they are positive.
+
+    Source: `reference_details.md` 5.5.
+    """
+
+    group: ClassVar[str] = "objective"
+    scores_are_returns: ClassVar[bool] = False
+
+    def make(self, task: Any) -> Objective:
+        return Objective(
+            score=lambda outcome: outcome.return_area,
+            needs_tests=True,
+            meaning="the sum of its agents' test returns times the steps between them",
+        )

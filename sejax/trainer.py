@@ -1,11 +1,13 @@
-"""The inner loop: one agent's whole training in one world, then its test on the real task.
+"""The inner loop: one agent's whole training in one world.
 
-Source: paper, Algorithm 1 (TrainAgent, EvaluateAgent) and appendix "Heuristics for Agent Training
-and Evaluation"; `reference_details.md` 3.
+Source: paper, Algorithm 1 (TrainAgent) and appendix "Heuristics for Agent Training and Evaluation";
+`reference_details.md` 3.
 """
 
+import dataclasses
 from collections.abc import Callable
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -13,15 +15,46 @@ from flax import struct
 from jaxtyping import Array, Float, Int
 
 from sejax.agents.agent import Agent
-from sejax.agents.memory import Memory
+from sejax.agents.memory import Memory, MemoryMaker
 from sejax.agents.replay import Transition
-from sejax.configs import TrainingConfig
-from sejax.envs.action_repeat import repeat_actions
-from sejax.masked_loop import while_any_active
-from sejax.proxies.reward import RewardEnv
-from sejax.proxies.synthetic import SyntheticEnv
+from sejax.loops import while_any_active
+from sejax.options import Options, counts, not_negative, one_of, option
 
+STOP_RULES = ("plateau", "solved", "never")
+SOLVED_BY = ("test", "train")
 _NO_LIMIT = 2**31 - 1
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainingConfig(Options):
+    """How long an agent trains, and how it is tested."""
+
+    group: ClassVar[str] = "training"
+
+    max_episodes: int = option(1000, counts("it counts episodes"))  # n_e
+    # The stop rule waits for so many training steps.
+    min_steps: int = option(0, counts("it counts steps", least=0))
+    # Training ends after so many steps, whatever the rule says.
+    max_steps: int | None = option(None, counts("an agent must train"))
+    stop_rule: str = option("plateau", one_of(STOP_RULES))  # plateau (SEs), solved (real tasks)
+    # d: episodes in each of the two means that the plateau rule compares
+    window: int = option(10, counts("it counts episodes"))
+    # C_diff: relative change between them that counts as flat
+    plateau_tolerance: float = option(0.01, not_negative("it bounds a relative change"))
+    # Whose last d returns must reach the solved reward.
+    solved_by: str = option("test", one_of(SOLVED_BY))
+    # n_te: greedy episodes on the real task after training
+    test_episodes: int = option(10, counts("it counts episodes"))
+    # Greedy episodes on the real task after each training episode; the solved rule by tests has at
+    # least one.
+    tests_between: int = option(0, counts("it counts episodes", least=0))
+    time_limit_is_terminal: bool = True  # a real episode cut by the limit does not bootstrap
+
+    @property
+    def num_tests_between(self) -> int:
+        """Test episodes after each training episode."""
+        by_tests = self.stop_rule == "solved" and self.solved_by == "test"
+        return max(self.tests_between, int(by_tests))
 
 
 @struct.dataclass
@@ -33,31 +66,25 @@ class TrainResult:
       train_steps: steps in the training world, `[]` int32.
       episodes: finished training episodes, `[]` int32.
       returns: return of each training episode in the training world, `[max_episodes]`; nan after
-        the last. With tests between episodes (`solved_by="test"`) the test returns.
+        the last.
+      test_returns: mean return of the tests on the real task after each training episode, likewise;
+        None if there are no such tests.
       episode_ends: training steps at the end of each training episode, `[max_episodes]` int32; 0
         after the last.
       nonfinite: whether a number that is not finite was met: an output of the world or a weight.
       test_steps: real steps spent on tests between training episodes, `[]` int32.
+      recorded: what the recorder has kept of the training's steps, if there was one.
     """
 
     agent_state: Any
     train_steps: Array
     episodes: Array
     returns: Float[Array, " max_episodes"]
+    test_returns: Float[Array, " max_episodes"] | None
     episode_ends: Int[Array, " max_episodes"]
     nonfinite: Array
     test_steps: Array
-
-
-@struct.dataclass
-class _TestState:
-    """Carry of a test episode."""
-
-    active: Array
-    num_steps: Array
-    total: Array
-    obs: Array
-    env_state: Any
+    recorded: Any
 
 
 @struct.dataclass
@@ -72,11 +99,16 @@ class _LoopState:
     obs: Array
     env_state: Any
     agent_state: Any
-    recent: Array  # [2 * window]: the last returns, newest last
+    recent: Array  # [2 * window]: the last returns that the stop rule judges, newest last
     returns: Array  # [max_episodes]
+    test_returns: Array | None  # [max_episodes]
     episode_ends: Array  # [max_episodes]
     nonfinite: Array
     test_steps: Array
+
+
+# `(key, agent_state, active) -> (mean return, steps)`, on the real task.
+TestFn = Callable[[Array, Any, Array], tuple[Array, Array]]
 
 
 def make_trainer(
@@ -84,48 +116,112 @@ def make_trainer(
     env: Any,
     training: TrainingConfig = TrainingConfig(),  # noqa: B008 (frozen)
     solved_reward: float = jnp.inf,
-    test_fn: Callable[[Array, Any, Array], tuple[Array, Array]] | None = None,
+    test_fn: TestFn | None = None,
+    recorder: MemoryMaker | None = None,
 ) -> Callable[..., TrainResult]:
     """Builds `train(key, env_params, hparams, active=True) -> TrainResult` for one agent.
 
     The result is pure; `vmap` it over keys, parameters and hyperparameters. Under `vmap` the lanes
-    step together until the last one stops, and a lane that has stopped writes nothing; alone, it
-    is a plain `while_loop` that stops early.
+    run in lockstep until the last one has stopped, without copies of replay buffers. With
+    `active=False` nothing is computed.
 
     Args:
-      agent: from `sejax.agents`.
+      agent: from `sejax.make_agent`, or one of your own.
       env: gymnax environment to train in: real, synthetic or reward-shaped. A potential-based
         reward has the agent's discount, whatever its params say. The plateau rule, the default,
-        reads the returns of this world; for tests on the real task see
-        `evaluation.make_evaluator`. In a proxy whose params allow longer episodes than its task the
-        buffer may hold fewer steps than the agent asks for.
+        reads the returns of this world; for tests on the real task see `sejax.make_evaluator`. In a
+        proxy whose params allow longer episodes than its task the buffer may hold fewer steps than
+        the agent asks for.
       training: stopping rule and limits. `time_limit_is_terminal` speaks of real time limits and is
         ignored in an SE: there the last step of an episode bootstraps with what the done network
         says, as in the authors' code.
       solved_reward: for `stop_rule="solved"`.
-      test_fn: `(key, agent_state, active) -> (mean return, steps)` on the real task, called after
-        each training episode if `stop_rule="solved"` and `solved_by="test"`.
+      test_fn: plays tests on the real task; called after each training episode if
+        `training.num_tests_between` is not 0.
+      recorder: keeps steps for whoever looks at the training, as an agent's `memory` does for the
+        agent; what it kept is `TrainResult.recorded`.
 
     Raises:
       ValueError: if tests are asked for and no `test_fn` is given.
 
     Source: paper, Algorithm 1, TrainAgent.
-    """
-    tests_each_episode = training.stop_rule == "solved" and training.solved_by == "test"
-    if tests_each_episode and test_fn is None:
-        raise ValueError("stop_rule='solved' with solved_by='test' needs a test_fn; got None.")
-    time_limit_is_terminal = training.time_limit_is_terminal and not isinstance(env, SyntheticEnv)
-    shaped = env if isinstance(env, RewardEnv) else None
-    max_steps = memory_steps = training.max_steps or _NO_LIMIT
-    if isinstance(env, RewardEnv | SyntheticEnv):  # whose episodes are no longer than the task's
-        memory_steps = min(max_steps, training.max_episodes * env.task.max_steps)
-    env = repeat_actions(env, agent.action_repeat)
-    window = training.window
 
-    def begin(key: Array, env_params: Any, hparams: Any, active: Array | bool) -> _LoopState:
+    Example:
+      >>> import sejax
+      >>> task = sejax.envs.make("cliff_walking")
+      >>> agent = sejax.make_agent(sejax.QLearningConfig(), task)
+      >>> train = make_trainer(agent, task.env, TrainingConfig(max_episodes=20))
+      >>> result = jax.jit(jax.vmap(train, (0, None)))(
+      ...     jax.random.split(jax.random.key(0), 8), task.params)
+      >>> result.returns.shape
+      (8, 20)
+    """
+    if training.num_tests_between and test_fn is None:
+        raise ValueError(
+            f"tests after each episode (training.num_tests_between is "
+            f"{training.num_tests_between}) need a test_fn; got None."
+        )
+    loop = _Loop(agent, env, training, solved_reward, test_fn, recorder)
+
+    def train(
+        key: Array, env_params: Any, hparams: Any = agent.hparams, active: Array | bool = True
+    ) -> TrainResult:
+        env_params = loop.prepare(env_params, hparams)
+        key_begin, key_steps = jax.random.split(key)
+        state = loop.begin(key_begin, env_params, hparams, active)
+        kept = tuple(memory.init() for memory in loop.memories(state))
+        kept, state = while_any_active(loop.step, kept, state, (key_steps, env_params))
+        return TrainResult(
+            agent_state=state.agent_state,
+            train_steps=state.train_steps,
+            episodes=state.episode,
+            returns=state.returns,
+            test_returns=state.test_returns,
+            episode_ends=state.episode_ends,
+            nonfinite=state.nonfinite | ~_all_finite(state.agent_state),
+            test_steps=state.test_steps,
+            recorded=kept[1] if recorder is not None else None,
+        )
+
+    return train
+
+
+class _Loop:
+    """The step loop of one agent in one world; pure functions of its carry."""
+
+    def __init__(
+        self,
+        agent: Agent,
+        env: Any,
+        training: TrainingConfig,
+        solved_reward: float,
+        test_fn: TestFn | None,
+        recorder: MemoryMaker | None,
+    ):
+        from sejax.envs.wrappers import repeat_actions
+        from sejax.proxies.proxy import prepare, world_of
+
+        world = world_of(env)
+        limit_is_terminal = training.time_limit_is_terminal and world.is_real
+        self.agent, self.training, self.solved_reward = agent, training, solved_reward
+        self.limit_is_terminal = limit_is_terminal
+        self.test_fn = test_fn if training.num_tests_between else None
+        self.env = repeat_actions(env, agent.action_repeat)
+        self.max_steps = self.memory_steps = training.max_steps or _NO_LIMIT
+        if world.max_steps is not None:
+            self.memory_steps = min(self.max_steps, training.max_episodes * world.max_steps)
+        self.memory_makers = (agent.memory, *([] if recorder is None else [recorder]))
+        self.prepare = lambda params, hparams: prepare(
+            env, params, agent.discount(hparams), limit_is_terminal
+        )
+
+    def begin(
+        self, key: Array, env_params: Any, hparams: Any, active: Array | bool
+    ) -> _LoopState:
         key_agent, key_reset = jax.random.split(key)
-        obs, env_state = env.reset_env(key_reset, env_params)
-        agent_state = agent.init(key_agent, hparams)
+        obs, env_state = self.env.reset_env(key_reset, env_params)
+        agent_state = self.agent.init(key_agent, hparams)
+        no_returns = jnp.full(self.training.max_episodes, jnp.nan)
         return _LoopState(
             active=jnp.asarray(active),
             step=jnp.int32(0),
@@ -134,48 +230,58 @@ def make_trainer(
             episode_return=jnp.float32(0),
             obs=obs,
             env_state=env_state,
-            agent_state=agent.begin_episode(agent_state, jnp.int32(0)),
-            recent=jnp.zeros(2 * window),
-            returns=jnp.full(training.max_episodes, jnp.nan),
-            episode_ends=jnp.zeros(training.max_episodes, jnp.int32),
+            agent_state=self.agent.begin_episode(agent_state, jnp.int32(0)),
+            recent=jnp.zeros(2 * self.training.window),
+            returns=no_returns,
+            test_returns=None if self.test_fn is None else no_returns,
+            episode_ends=jnp.zeros(self.training.max_episodes, jnp.int32),
             nonfinite=jnp.bool_(False),
             test_steps=jnp.int32(0),
         )
 
-    def make_memory(state: _LoopState) -> Memory:
+    def memories(self, state: _LoopState) -> list[Memory]:
+        """What the agent keeps of its steps, and what the recorder does."""
+
         def example() -> Transition:
-            action = agent.act(jax.random.key(0), state.agent_state, state.obs, explore=True)
+            act = self.agent.act
+            action = act(jax.random.key(0), state.agent_state, state.obs, explore=True)
             return Transition(state.obs, action, jnp.float32(0), jnp.float32(0), state.obs)
 
-        return agent.memory(jax.eval_shape(example), memory_steps)
+        shapes = jax.eval_shape(example)
+        return [make(shapes, self.memory_steps) for make in self.memory_makers]
 
-    def step(kept: Any, state: _LoopState, consts: Any, masked: bool) -> tuple[Any, _LoopState]:
+    def step(
+        self, kept: Any, state: _LoopState, consts: Any, masked: bool
+    ) -> tuple[Any, _LoopState]:
         """One agent step: act, step the world, store, learn, and close the episode if it ended."""
         key, env_params = consts
-        memory = make_memory(state)
+        memories = self.memories(state)
         key_act, key_env, key_sample, key_update, key_end = jax.random.split(
             jax.random.fold_in(key, state.step), 5
         )
-        action = agent.act(key_act, state.agent_state, state.obs, explore=True)
-        next_obs, env_state, reward, terminated, info = env.step_env(
-            key_env, state.env_state, agent.env_action(action), env_params
+        action = self.agent.act(key_act, state.agent_state, state.obs, explore=True)
+        next_obs, env_state, reward, terminated, info = self.env.step_env(
+            key_env, state.env_state, self.agent.env_action(action), env_params
         )
-        truncated = env.is_truncated(env_state, env_params)
+        truncated = self.env.is_truncated(env_state, env_params)
         nonfinite = state.nonfinite | info.get("nonfinite", False)
         ended = terminated | truncated | nonfinite
-        discount = jnp.float32(info["discount"])
-        if time_limit_is_terminal:
-            discount = jnp.where(truncated, 0.0, discount)
-        transition = Transition(state.obs, action, reward, discount, next_obs)
-        kept = memory.store(kept, state.step, transition, ended, state.active if masked else True)
+        transition = Transition(
+            state.obs, action, reward, self.discount(terminated, truncated, info), next_obs
+        )
+        active = state.active if masked else True
+        kept = tuple(
+            memory.store(arrays, state.step, transition, ended, active)
+            for memory, arrays in zip(memories, kept, strict=True)
+        )
 
-        def learn(agent_state):
-            size = agent.batch_size(agent_state)
-            batch = memory.batch(key_sample, kept, state.step + 1, transition, size)
-            return agent.update(key_update, agent_state, batch)
+        def learn(agent_state: Any) -> Any:
+            size = self.agent.batch_size(agent_state)
+            batch = memories[0].batch(key_sample, kept[0], state.step + 1, transition, size)
+            return self.agent.update(key_update, agent_state, batch)
 
         agent_state = jax.lax.cond(
-            state.episode >= agent.learns_from, learn, lambda s: s, state.agent_state
+            state.episode >= self.agent.learns_from, learn, lambda s: s, state.agent_state
         )
         train_steps = state.train_steps + info.get("num_steps", 1)
         state = state.replace(
@@ -186,69 +292,64 @@ def make_trainer(
             env_state=env_state,
             agent_state=agent_state,
             nonfinite=nonfinite,
-            active=train_steps < max_steps,
+            active=train_steps < self.max_steps,
         )
         state = jax.lax.cond(
-            ended, lambda s: end_episode(key_end, s, env_params, ended), lambda s: s, state
+            ended, lambda s: self.end_episode(key_end, s, env_params, ended), lambda s: s, state
         )
         return kept, state
 
-    def end_episode(key: Array, state: _LoopState, env_params: Any, ended: Array) -> _LoopState:
+    def discount(self, terminated: Array, truncated: Array, info: Any) -> Array:
+        """What a target bootstraps with, before gamma."""
+        discount = jnp.float32(info["discount"] if "discount" in info else ~terminated)
+        return jnp.where(truncated, 0.0, discount) if self.limit_is_terminal else discount
+
+    def end_episode(
+        self, key: Array, state: _LoopState, env_params: Any, ended: Array
+    ) -> _LoopState:
         """Records the episode, decides whether training goes on, and starts the next one.
 
         In lanes this runs for all of them if it runs for one; `ended` spares the others the test.
         """
         key_reset, key_test = jax.random.split(key)
-        episode_return, test_steps = state.episode_return, state.test_steps
-        if tests_each_episode and test_fn is not None:
-            episode_return, num_steps = test_fn(key_test, state.agent_state, ended)
-            test_steps = test_steps + num_steps
-        recent = jnp.concatenate([state.recent[1:], episode_return[None]])
+        judged = state.episode_return
+        if self.test_fn is not None:
+            tested, num_steps = self.test_fn(key_test, state.agent_state, ended)
+            state = state.replace(
+                test_returns=state.test_returns.at[state.episode].set(tested),
+                test_steps=state.test_steps + num_steps,
+            )
+            judged = tested if self.training.solved_by == "test" else judged
+        if self.training.stop_rule == "plateau":
+            judged = state.episode_return
+        recent = jnp.concatenate([state.recent[1:], judged[None]])
+        stop = self.stops(state, recent)
+        obs, env_state = self.env.reset_env(key_reset, env_params)
         num_episodes = state.episode + 1
-        stop = (num_episodes >= training.max_episodes) | state.nonfinite
-        may_stop = (state.episode >= agent.init_episodes) & (
-            state.train_steps >= training.min_steps
-        )
-        if training.stop_rule == "plateau":
-            flat = is_plateau(recent, num_episodes, training.plateau_tolerance)
-            stop = stop | (may_stop & flat & (state.episode >= agent.init_episodes + window))
-        elif training.stop_rule == "solved":
-            stop = stop | (may_stop & is_solved(recent, num_episodes, solved_reward))
-        obs, env_state = env.reset_env(key_reset, env_params)
         return state.replace(
             active=state.active & ~stop,
             episode=num_episodes,
             episode_return=jnp.float32(0),
             obs=obs,
             env_state=env_state,
-            agent_state=agent.begin_episode(state.agent_state, num_episodes),
+            agent_state=self.agent.begin_episode(state.agent_state, num_episodes),
             recent=recent,
-            returns=state.returns.at[state.episode].set(episode_return),
+            returns=state.returns.at[state.episode].set(state.episode_return),
             episode_ends=state.episode_ends.at[state.episode].set(state.train_steps),
-            test_steps=test_steps,
         )
 
-    def train(
-        key: Array, env_params: Any, hparams: Any = agent.hparams, active: Array | bool = True
-    ) -> TrainResult:
-        if shaped is not None:
-            discount = agent.discount(hparams)
-            env_params = shaped.prepared(env_params, discount, time_limit_is_terminal)
-        key_begin, key_steps = jax.random.split(key)
-        state = begin(key_begin, env_params, hparams, active)
-        kept = make_memory(state).init()
-        _, state = while_any_active(step, kept, state, (key_steps, env_params))
-        return TrainResult(
-            agent_state=state.agent_state,
-            train_steps=state.train_steps,
-            episodes=state.episode,
-            returns=state.returns,
-            episode_ends=state.episode_ends,
-            nonfinite=state.nonfinite | ~_all_finite(state.agent_state),
-            test_steps=state.test_steps,
-        )
-
-    return train
+    def stops(self, state: _LoopState, recent: Array) -> Array:
+        """Whether training ends with the episode that has just ended."""
+        training, first = self.training, self.agent.init_episodes
+        num_episodes = state.episode + 1
+        stop = (num_episodes >= training.max_episodes) | state.nonfinite
+        may_stop = (state.episode >= first) & (state.train_steps >= training.min_steps)
+        if training.stop_rule == "plateau":
+            flat = is_plateau(recent, num_episodes, training.plateau_tolerance)
+            return stop | (may_stop & flat & (state.episode >= first + training.window))
+        if training.stop_rule == "solved":
+            return stop | (may_stop & is_solved(recent, num_episodes, self.solved_reward))
+        return stop
 
 
 def is_plateau(
@@ -280,49 +381,31 @@ def is_solved(
     return recent[window:].sum() / jnp.clip(num_episodes, 1, window) >= solved_reward
 
 
-def make_tester(agent: Agent, task: Any, num_episodes: int) -> Callable[..., Any]:
-    """Builds `test(key, agent_state, active=True) -> (returns, steps)`, both `[num_episodes]`.
+def budget_for(
+    training: TrainingConfig, agent: Any, learned_with: Any, max_episode_steps: int
+) -> TrainingConfig:
+    """How long an agent trains on a proxy that was learned with another one.
 
-    Episodes on the real task without exploration, each from a fresh initial state.
+    A step budget grows by the steps for which this agent waits longer with learning than that one:
+    ten long initial episodes, or a rollout of PPO, could use it up.
 
-    Source: paper, Algorithm 1, EvaluateAgent.
+    Args:
+      training: that the proxy was learned with.
+      agent: configuration of the agent that is to train.
+      learned_with: of the one that the proxy was learned with.
+      max_episode_steps: the task's step limit.
     """
-    env, params = repeat_actions(task.env, agent.action_repeat), task.params
+    if training.max_steps is None:
+        return training
+    waits, waited = (steps_before_learning(each, max_episode_steps)
+                     for each in (agent, learned_with))  # fmt: skip
+    return dataclasses.replace(training, max_steps=training.max_steps + max(0, waits - waited))
 
-    def step(nothing: Array, state: _TestState, consts: Any, masked: bool):
-        key, agent_state = consts
-        key_act, key_env = jax.random.split(jax.random.fold_in(key, state.num_steps))
-        action = agent.act(key_act, agent_state, state.obs, explore=False)
-        obs, env_state, reward, terminated, info = env.step_env(
-            key_env, state.env_state, agent.env_action(action), params
-        )
-        ended = terminated | env.is_truncated(env_state, params)
-        return nothing, _TestState(
-            active=~ended,
-            num_steps=state.num_steps + info.get("num_steps", 1),
-            total=state.total + reward,
-            obs=obs,
-            env_state=env_state,
-        )
 
-    def episode(key: Array, agent_state: Any, active: Array | bool) -> tuple[Array, Array]:
-        key_reset, key_steps = jax.random.split(key)
-        obs, env_state = env.reset_env(key_reset, params)
-        state = _TestState(
-            active=jnp.asarray(active),
-            num_steps=jnp.int32(0),
-            total=jnp.float32(0),
-            obs=obs,
-            env_state=env_state,
-        )
-        _, state = while_any_active(step, jnp.zeros(0), state, (key_steps, agent_state))
-        return state.total, state.num_steps
-
-    def test(key: Array, agent_state: Any, active: Array | bool = True) -> tuple[Array, Array]:
-        keys = jax.random.split(key, num_episodes)
-        return jax.vmap(episode, in_axes=(0, None, None))(keys, agent_state, active)
-
-    return test
+def steps_before_learning(agent: Any, max_episode_steps: int) -> int:
+    """Training steps before an agent first learns, as its configuration says; 0 if it does not."""
+    steps = getattr(agent, "steps_before_learning", None)
+    return 0 if steps is None else steps(max_episode_steps)
 
 
 def _all_finite(tree: Any) -> Array:

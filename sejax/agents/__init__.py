@@ -1,1 +1,109 @@
-"""RL agents as bundles of pure functions, and the inner loop that trains any of them."""
+"""Agents: bundles of pure functions, a file each with configuration, hyperparameters and learning."""
+
+import functools
+from typing import Any
+
+from sejax import plugins
+from sejax.agents.agent import Agent, AgentOptions, NoExploration, traced
+from sejax.errors import require
+
+__all__ = ["Agent", "AgentOptions", "NoExploration", "make_agent", "names", "require_fit", "traced"]
+
+
+def names() -> list[str]:
+    """Names of the agents that come with sejax or with installed packages."""
+    return plugins.names("agent")
+
+
+def make_agent(
+    config: Any,
+    task: Any,
+    exploration: Any = NoExploration(),  # noqa: B008 (frozen)
+    varied: bool = False,
+) -> Agent:
+    """The agent for a task's observations and actions; the same object for the same arguments.
+
+    Args:
+      config: of the agent, such as `DDQNConfig()`; anything with `make(task) -> Agent`.
+      task: the real task.
+      exploration: intrinsic reward, such as `ICMConfig()`.
+      varied: whether hyperparameters are drawn anew for each training (paper, appendix "Varied
+        Agent Hyperparameters").
+
+    Raises:
+      ConfigError: if the agent does not suit the task's states or actions, or the exploration the
+        agent; or if none of a varied agent's options says how it is drawn.
+
+    Example:
+      >>> import sejax
+      >>> agent = make_agent(sejax.DDQNConfig(hidden_size=64), sejax.envs.make("cartpole"))
+      >>> agent.init_episodes
+      10
+    """
+    require_fit(config, exploration, task.facts, task.name)
+    return _make_agent(_Same((config, exploration)), task, varied)
+
+
+class _Same:
+    """Configurations that are equal if all their fields are, hashable or not."""
+
+    def __init__(self, configs: tuple[Any, ...]):
+        self.configs = configs
+        self.key = tuple((type(config), repr(vars(config))) for config in configs)
+
+    def __hash__(self) -> int:
+        return hash(self.key)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Same) and self.key == other.key
+
+
+@functools.cache
+def _make_agent(configs: _Same, task: Any, varied: bool) -> Agent:
+    config, exploration = configs.configs
+
+    def make(config: Any) -> Agent:
+        agent = plugins.make("agent", config, task)
+        return plugins.make("exploration", exploration, agent, task)
+
+    if not varied:
+        return make(config)
+    from sejax.agents.varied import make_varied
+
+    return make_varied(config, make)
+
+
+def require_fit(agent: Any, exploration: Any, facts: Any, task_name: str) -> None:
+    """Checks that an agent can act in a task, and that it can be made to explore so.
+
+    Args:
+      agent: its configuration; one without `states` and `actions` suits every task.
+      exploration: that of its intrinsic reward.
+      facts: of the task (`sejax.envs.Facts`).
+      task_name: for messages.
+
+    Raises:
+      ConfigError: if it cannot.
+    """
+    if not _suits(agent, facts):
+        fitting = [name for name in names() if _suits(plugins.find("agent", name), facts)]
+        require(False, "agent", f"be one of {', '.join(fitting)} in {task_name}",
+                f"its states are {facts.states} and its actions {facts.actions}",
+                plugins.name_of("agent", agent), f"agent={fitting[0]}")  # fmt: skip
+    wanted = getattr(exploration, "states", None)
+    name = plugins.name_of("agent", agent)
+    require(wanted in (None, getattr(agent, "states", wanted)), "exploration", f"suit {name}",
+            f"{plugins.name_of('exploration', exploration)} is made for agents with {wanted} "
+            "states", plugins.name_of("exploration", exploration),
+            "exploration=none")  # fmt: skip
+
+
+def default_for(facts: Any) -> str:
+    """The agent that is chosen for a task where none is asked for: the first that suits it."""
+    return next(name for name in ("ddqn", "td3", "q_learning")
+                if _suits(plugins.find("agent", name), facts))  # fmt: skip
+
+
+def _suits(agent: Any, facts: Any) -> bool:
+    states, actions = getattr(agent, "states", None), getattr(agent, "actions", None)
+    return states in (None, facts.states) and (actions is None or facts.actions in actions)

@@ -7,16 +7,33 @@ appendix, table of count-based Q-learning; `reference_details.md` 4.7.
 
 import dataclasses
 import functools
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from typing import Any, ClassVar, NamedTuple
 
 import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Int
 
 from sejax.agents.agent import Agent
-from sejax.agents.configs import CountBasedConfig
 from sejax.agents.replay import Transition
 from sejax.agents.tabular import entry_of, mask_of
+from sejax.options import Options, not_negative, option, positive
+
+
+@dataclass(frozen=True, kw_only=True)
+class CountBasedConfig(Options):
+    r"""A bonus :math:`\beta / n(s, a)^p` for rarely taken actions."""
+
+    group: ClassVar[str] = "exploration"
+    states: ClassVar[str] = "discrete"  # of the agents that it is made for
+
+    reward_scale: float = option(0.1, not_negative("it scales a bonus"))  # beta
+    # p: 1 in the paper's text, 0.5 in the authors' code
+    count_power: float = option(1.0, positive("the bonus would not fade"))
+
+    def make(self, agent: Agent, task: Any) -> Agent:
+        """The agent with the bonus."""
+        return with_count_bonus(agent, self, task.num_states, task.num_actions)
 
 
 class CountingHparams(NamedTuple):
@@ -55,8 +72,7 @@ def with_count_bonus(
 
     Example:
       >>> import jax
-      >>> from sejax.agents.configs import QLearningConfig
-      >>> from sejax.agents.tabular import make_q_learning
+      >>> from sejax.agents.tabular import QLearningConfig, make_q_learning
       >>> plain = make_q_learning(QLearningConfig(), num_states=48, num_actions=4)
       >>> agent = with_count_bonus(plain, CountBasedConfig(), num_states=48, num_actions=4)
       >>> state = agent.init(jax.random.key(0), agent.hparams)

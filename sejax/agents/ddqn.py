@@ -5,47 +5,83 @@ tables; `reference_details.md` 4.1 and 4.2.
 """
 
 import functools
-from typing import Any, NamedTuple
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import optax
 from flax import linen as nn
 from flax import struct
-from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
-from sejax.agents.agent import Agent, hparams_of
+from sejax.agents import flat
+from sejax.agents.agent import Agent, AgentOptions, traced
 from sejax.agents.blocks import sum_over_batch
-from sejax.agents.configs import DDQNConfig, DuelingDDQNConfig
 from sejax.agents.epsilon_greedy import decayed_epsilon, epsilon_greedy
 from sejax.agents.memory import replay_memory
 from sejax.agents.replay import Transition, num_columns
-from sejax.networks import MLP, DuelingMLP, narrow
+from sejax.networks import ACTIVATIONS, MLP, DuelingMLP, narrow
+from sejax.options import counts, fraction, one_of, option, positive
+
+MOVES = "the agent would not move"
 
 
-class DDQNHparams(NamedTuple):
-    """The traced hyperparameters, scalars that a population of agents may vary."""
+@dataclass(frozen=True, kw_only=True)
+class DDQNConfig(AgentOptions):
+    """DDQN's hyperparameters; the defaults are the paper's "default agent hyperparameters"."""
 
-    learning_rate: Array | float
-    target_update_rate: Array | float
-    discount: Array | float
-    epsilon_init: Array | float
-    epsilon_min: Array | float
-    epsilon_decay: Array | float
-    hidden_size: Array | None = None  # units in use, if fewer than the network has
-    batch_size: Array | None = None  # columns in use, if fewer than a batch has
+    batch_size: int = option(128, counts(), varied="triple")
+    buffer_size: int = option(100_000, counts())
+    hidden_size: int = option(128, counts(), varied="triple")
+    num_layers: int = option(2, counts(), varied="one_more_or_less")
+    activation: str = option("relu", one_of(ACTIVATIONS))
+    learning_rate: float = option(1e-3, positive(MOVES), traced=True, varied="triple")
+    # tau: weight of the online network in the target's update
+    target_update_rate: float = option(0.01, fraction(), traced=True)
+    discount: float = option(0.99, fraction(), traced=True)  # gamma
+    epsilon_init: float = option(1.0, fraction(), traced=True)
+    epsilon_min: float = option(0.01, fraction(), traced=True)
+    epsilon_decay: float = option(0.9, fraction(), traced=True)  # factor for each episode
+
+    def make(self, task: Any) -> Agent:
+        """The agent for a task's observations and actions."""
+        return make_ddqn(self, task.obs_dim, task.num_actions)
+
+    def network(self, num_actions: int) -> nn.Module:
+        """Maps observations `[obs_dim, *batch]` to Q values `[num_actions, *batch]`."""
+        return MLP(
+            num_actions, self.hidden_size, self.num_layers, self.activation,
+            learn_prelu_slope=True,
+        )  # fmt: skip
+
+
+@dataclass(frozen=True, kw_only=True)
+class DuelingDDQNConfig(DDQNConfig):
+    """DDQN with a dueling network (paper, appendix, tables of DDQN and Dueling DDQN)."""
+
+    feature_dim: int = option(128, counts())  # outputs of the part that both streams share
+    # Hidden layers of the value and of the advantage stream.
+    stream_num_layers: int = option(1, counts("it counts layers", least=0))
+    stream_hidden_size: int = option(128, counts())
+
+    def network(self, num_actions: int) -> nn.Module:
+        return DuelingMLP(
+            num_actions, self.feature_dim, self.hidden_size, self.num_layers,
+            self.stream_hidden_size, self.stream_num_layers, self.activation,
+        )  # fmt: skip
 
 
 @struct.dataclass
 class DDQNState:
-    """One agent. Parameters are flat vectors: Adam over one array costs a fifth of four."""
+    """One agent."""
 
     params: Float[Array, " num_params"]
     target_params: Float[Array, " num_params"]
     opt_state: optax.OptState
     epsilon: Array
-    hparams: DDQNHparams
+    hparams: Any  # traced options, and hidden_size and batch_size in use or None
 
 
 @functools.cache
@@ -60,35 +96,56 @@ def make_ddqn(config: DDQNConfig, obs_dim: int, num_actions: int) -> Agent:
       >>> int(agent.act(jax.random.key(1), state, jnp.zeros(4), explore=False)) in (0, 1)
       True
     """
-    network = q_network(config, num_actions)
-    template = jax.eval_shape(network.init, jax.random.key(0), jnp.zeros(obs_dim))
-    _, unravel = ravel_pytree(jax.tree.map(lambda x: jnp.zeros(x.shape), template))
-    adam = optax.scale_by_adam()
+    network = config.network(num_actions)
+    unflatten = flat.unflattener(network.init, jnp.zeros(obs_dim))
 
-    def init(key: Array, hparams: DDQNHparams) -> DDQNState:
+    def init(key: Array, hparams: Any) -> DDQNState:
         variables = network.init(key, jnp.zeros(obs_dim))
         if hparams.hidden_size is not None:
             variables = {"params": narrow(variables["params"], hparams.hidden_size)}
-        params, _ = ravel_pytree(variables)
+        params = flat.flatten(variables)
         hparams = jax.tree.map(jnp.float32, hparams)
         return DDQNState(
             params=params,
             target_params=params,
-            opt_state=adam.init(params),
+            opt_state=flat.ADAM.init(params),
             epsilon=jnp.float32(hparams.epsilon_init),
             hparams=hparams,
         )
 
-    def begin_episode(state: DDQNState, episode: Array) -> DDQNState:
-        hp = state.hparams
-        epsilon = decayed_epsilon(hp.epsilon_init, hp.epsilon_min, hp.epsilon_decay, episode)
-        return state.replace(epsilon=epsilon)
-
     def act(key: Array, state: DDQNState, obs: Float[Array, " obs_dim"], explore: bool) -> Array:
-        q_values: Any = network.apply(unravel(state.params), obs)
+        q_values: Any = network.apply(unflatten(state.params), obs)
         if not explore:
             return jnp.argmax(q_values).astype(jnp.int32)
         return epsilon_greedy(key, q_values, state.epsilon)
+
+    return Agent(
+        init=init,
+        begin_episode=begin_episode,
+        act=act,
+        update=make_learning_step(network, unflatten),
+        hparams=traced(config, hidden_size=None, batch_size=None),
+        memory=replay_memory(config.batch_size, config.buffer_size),
+        init_episodes=config.init_episodes,
+        learns_from=config.init_episodes,
+        batch_size=lambda state: state.hparams.batch_size,
+    )
+
+
+def begin_episode(state: DDQNState, episode: Array) -> DDQNState:
+    """The share of random actions in the episode."""
+    hp = state.hparams
+    epsilon = decayed_epsilon(hp.epsilon_init, hp.epsilon_min, hp.epsilon_decay, episode)
+    return state.replace(epsilon=epsilon)
+
+
+def make_learning_step(
+    network: nn.Module, unflatten: Callable[[Array], Any]
+) -> Callable[[Array, DDQNState, Transition], DDQNState]:
+    """Builds `update(key, state, batch) -> state`: Adam on the squared error to double-Q targets.
+
+    Source: van Hasselt et al. (2016), eq. 4; `reference_details.md` 4.1.
+    """
 
     def sum_of_losses(params, target_params, discount, batch: Transition) -> Array:
         q_values = network.apply(params, batch.obs)  # [actions, batch]
@@ -103,46 +160,23 @@ def make_ddqn(config: DDQNConfig, obs_dim: int, num_actions: int) -> Agent:
 
     def update(key: Array, state: DDQNState, batch: Transition) -> DDQNState:
         hp = state.hparams
-        params, target_params = unravel(state.params), unravel(state.target_params)
+        params, target_params = unflatten(state.params), unflatten(state.target_params)
 
         def sum_of_gradients(batch: Transition) -> Array:
-            gradient = jax.grad(sum_of_losses)(params, target_params, hp.discount, batch)
-            return ravel_pytree(gradient)[0]
+            return flat.flatten(jax.grad(sum_of_losses)(params, target_params, hp.discount, batch))
 
         gradient = sum_over_batch(sum_of_gradients, batch, hp.batch_size) / num_columns(batch)
-        direction, opt_state = adam.update(gradient, state.opt_state)
-        params = state.params - hp.learning_rate * direction
+        moved, opt_state = flat.adam_step(
+            state.params, state.opt_state, gradient, hp.learning_rate
+        )
         tau = hp.target_update_rate
         return state.replace(
-            params=params,
-            target_params=tau * params + (1 - tau) * state.target_params,
+            params=moved,
+            target_params=tau * moved + (1 - tau) * state.target_params,
             opt_state=opt_state,
         )
 
-    return Agent(
-        init=init,
-        begin_episode=begin_episode,
-        act=act,
-        update=update,
-        hparams=hparams_of(DDQNHparams, config),
-        memory=replay_memory(config.batch_size, config.buffer_size),
-        init_episodes=config.init_episodes,
-        learns_from=config.init_episodes,
-        batch_size=lambda state: state.hparams.batch_size,
-    )
-
-
-def q_network(config: DDQNConfig, num_actions: int) -> nn.Module:
-    """Maps observations `[obs_dim, *batch]` to Q values `[num_actions, *batch]`."""
-    if isinstance(config, DuelingDDQNConfig):
-        return DuelingMLP(
-            num_actions, config.feature_dim, config.hidden_size, config.num_layers,
-            config.stream_hidden_size, config.stream_num_layers, config.activation,
-        )  # fmt: skip
-    return MLP(
-        num_actions, config.hidden_size, config.num_layers, config.activation,
-        learn_prelu_slope=True,
-    )  # fmt: skip
+    return update
 
 
 def double_q_targets(

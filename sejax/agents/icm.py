@@ -7,38 +7,55 @@ of Burda et al., "Large-Scale Study of Curiosity-Driven Learning" (2019).
 
 import dataclasses
 import functools
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from typing import Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import optax
 from flax import linen as nn
 from flax import struct
-from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
-from sejax.agents.agent import Agent
-from sejax.agents.configs import ICMConfig
+from sejax.agents import flat
+from sejax.agents.agent import Agent, traced
 from sejax.agents.memory import Rollout
-from sejax.agents.replay import Transition, unpack
+from sejax.agents.replay import Transition
 from sejax.networks import MLP, Dense
+from sejax.options import Options, counts, fraction, not_negative, option, positive
 
-_REWARD = -3  # column of a rollout's rows; the discount and `ended` follow
 
+@dataclass(frozen=True, kw_only=True)
+class ICMConfig(Options):
+    """Intrinsic curiosity module (paper, appendix, tables of ICM).
 
-class ICMHparams(NamedTuple):
-    """The module's traced hyperparameters."""
+    The defaults are the paper's values optimized for CartPole, as in the authors' scripts. Its text
+    says that all experiments have its defaults: 1e-4, 0.2, 0.5 and 64 features.
+    """
 
-    learning_rate: Array | float
-    forward_weight: Array | float  # beta
-    reward_scale: Array | float  # eta
+    group: ClassVar[str] = "exploration"
+    states: ClassVar[str] = "vector"  # of the agents that it is made for
+
+    learning_rate: float = option(1e-5, positive("Adam would not move"), traced=True)
+    # beta: the forward model's share of the loss
+    forward_weight: float = option(0.05, fraction(), traced=True)
+    # eta: intrinsic reward for each unit of prediction error
+    reward_scale: float = option(0.03, not_negative("it scales a bonus"), traced=True)
+    feature_dim: int = option(32, counts("the models need units"))
+    hidden_size: int = option(128, counts("the models need units"))
+    num_layers: int = option(2, counts("the models need units"))
+    num_residual_blocks: int = option(4, counts("it counts", least=0))
+
+    def make(self, agent: Agent, task: Any) -> Agent:
+        """The agent with the bonus."""
+        return with_icm(agent, self, task.obs_dim, task.num_actions, task.action_dim)
 
 
 class CuriousHparams(NamedTuple):
     """Traced hyperparameters of a curious agent: those of the agent inside, and the module's."""
 
     agent: Any
-    icm: ICMHparams
+    icm: Any
 
 
 class CuriousState(struct.PyTreeNode):
@@ -47,7 +64,7 @@ class CuriousState(struct.PyTreeNode):
     agent_state: Any
     params: Float[Array, " num_params"]
     opt_state: optax.OptState
-    hparams: ICMHparams
+    hparams: Any  # the module's traced options
 
 
 class ICMOutputs(NamedTuple):
@@ -145,8 +162,7 @@ def with_icm(
     Source: `reference_details.md` 4.8.
 
     Example:
-      >>> from sejax.agents.configs import DDQNConfig
-      >>> from sejax.agents.ddqn import make_ddqn
+      >>> from sejax.agents.ddqn import DDQNConfig, make_ddqn
       >>> plain = make_ddqn(DDQNConfig(), obs_dim=4, num_actions=2)
       >>> agent = with_icm(plain, ICMConfig(), obs_dim=4, num_actions=2, action_dim=None)
       >>> state = agent.init(jax.random.key(0), agent.hparams)
@@ -160,17 +176,15 @@ def with_icm(
         config.num_residual_blocks,
     )  # fmt: skip
     example = (jnp.zeros(obs_dim), jnp.zeros(action_width), jnp.zeros(obs_dim))
-    template = jax.eval_shape(model.init, jax.random.key(0), *example)
-    _, unravel = ravel_pytree(jax.tree.map(lambda x: jnp.zeros(x.shape), template))
-    adam = optax.scale_by_adam()
+    unflatten = flat.unflattener(model.init, *example)
 
     def init(key: Array, hparams: CuriousHparams) -> CuriousState:
         key_agent, key_icm = jax.random.split(key)
-        params, _ = ravel_pytree(model.init(key_icm, *example))
+        params = flat.flatten(model.init(key_icm, *example))
         return CuriousState(
             agent_state=agent.init(key_agent, hparams.agent),
             params=params,
-            opt_state=adam.init(params),
+            opt_state=flat.ADAM.init(params),
             hparams=jax.tree.map(jnp.float32, hparams.icm),
         )
 
@@ -190,14 +204,14 @@ def with_icm(
             beta = state.hparams.forward_weight
             return icm_loss(outputs(params, batch), batch.action, beta, batch.weight)
 
-        gradient, _ = ravel_pytree(jax.grad(loss_fn)(unravel(state.params)))
-        direction: Any
-        direction, opt_state = adam.update(gradient, state.opt_state)
-        params = state.params - state.hparams.learning_rate * direction
+        gradient = flat.flatten(jax.grad(loss_fn)(unflatten(state.params)))
+        params, opt_state = flat.adam_step(
+            state.params, state.opt_state, gradient, state.hparams.learning_rate
+        )
         return state.replace(params=params, opt_state=opt_state)
 
     def bonus(state: CuriousState, batch: Transition) -> Float[Array, " batch"]:
-        error = prediction_error(outputs(unravel(state.params), batch))
+        error = prediction_error(outputs(unflatten(state.params), batch))
         return state.hparams.reward_scale * jax.lax.stop_gradient(error)
 
     def update(key: Array, state: CuriousState, batch: Transition | Rollout) -> CuriousState:
@@ -215,24 +229,22 @@ def with_icm(
 
         def learn(carry: tuple[Array, CuriousState]) -> tuple[Array, CuriousState]:
             _, state = carry
-            batch = _transitions(rollout, obs_dim, num_actions)
-            rows = rollout.rows.at[:, _REWARD].add(bonus(state, batch))
+            batch = rollout.transitions(obs_dim, num_actions is not None)
+            augmented = rollout.with_bonus(bonus(state, batch))
             state = train_models(state, batch)
-            augmented = rollout._replace(rows=rows)
             state = state.replace(agent_state=agent.update(key, state.agent_state, augmented))
             return jnp.bool_(False), state
 
         _, state = jax.lax.while_loop(lambda carry: carry[0], learn, (rollout.is_full, state))
         return state
 
-    hparams = ICMHparams(**{name: getattr(config, name) for name in ICMHparams._fields})
     return dataclasses.replace(
         agent,
         init=init,
         begin_episode=begin_episode,
         act=act,
         update=update,
-        hparams=CuriousHparams(agent=agent.hparams, icm=hparams),
+        hparams=CuriousHparams(agent=agent.hparams, icm=traced(config)),
         discount=lambda hparams: agent.discount(hparams.agent),
         batch_size=lambda state: agent.batch_size(state.agent_state),
     )
@@ -289,11 +301,3 @@ def as_vectors(action: Array, width: int) -> Float[Array, "width batch"]:
 def _is_index(action: Array) -> bool:
     """Whether a feature-major batch of actions holds indices."""
     return action.ndim == 1
-
-
-def _transitions(rollout: Rollout, obs_dim: int, num_actions: int | None) -> Transition:
-    """The steps of a rollout, feature-major. Discrete actions in one column are indices."""
-    steps = rollout.rows[:, :-1].T  # without `ended`
-    action_dim = steps.shape[0] - 2 * obs_dim - 2
-    is_index = num_actions is not None and action_dim == 1
-    return unpack(steps, None if is_index else action_dim)

@@ -33,6 +33,9 @@ class Memory(NamedTuple):
 MemoryMaker = Callable[[Transition, int], Memory]
 
 
+_REWARD = -3  # column of a rollout's rows; the discount and `ended` follow
+
+
 class Rollout(NamedTuple):
     """All steps since the last learning phase, in order.
 
@@ -43,6 +46,22 @@ class Rollout(NamedTuple):
 
     rows: Float[Array, "steps width"]
     is_full: Bool[Array, ""]
+
+    @property
+    def ended(self) -> Float[Array, " steps"]:
+        """1 at the last step of an episode, else 0."""
+        return self.rows[:, -1]
+
+    def transitions(self, obs_dim: int, is_discrete: bool) -> Transition:
+        """The steps, feature-major. Discrete actions in one column are indices."""
+        steps = self.rows[:, :-1].T  # without `ended`
+        action_dim = steps.shape[0] - 2 * obs_dim - 2
+        is_index = is_discrete and action_dim == 1
+        return replay.unpack(steps, None if is_index else action_dim)
+
+    def with_bonus(self, bonus: Float[Array, " steps"]) -> "Rollout":
+        """The same steps with a bonus on each one's reward."""
+        return self._replace(rows=self.rows.at[:, _REWARD].add(bonus))
 
 
 def replay_memory(batch_size: int, buffer_size: int) -> MemoryMaker:

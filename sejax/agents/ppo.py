@@ -7,35 +7,73 @@ table of PPO; `reference_details.md` 4.5.
 import functools
 import math
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from typing import Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import optax
 from flax import struct
-from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int
 
-from sejax.agents import replay
-from sejax.agents.agent import Agent, hparams_of
-from sejax.agents.configs import PPOConfig
+from sejax.agents import flat
+from sejax.agents.agent import Agent, AgentOptions, traced
 from sejax.agents.ddqn import select_action
 from sejax.agents.memory import Rollout, rollout_memory
-from sejax.networks import MLP, narrow
+from sejax.networks import ACTIVATIONS, MLP, narrow
+from sejax.options import counts, fraction, not_negative, one_of, option, positive
 
 MIN_STD = 0.01  # of the Gaussian policy, in units of the action
 _MAX_LOG_RATIO = 20.0  # exp(20) is beyond any clip, and finite
 
 
-class PPOHparams(NamedTuple):
-    """The traced hyperparameters, scalars that a population of agents may vary."""
+@dataclass(frozen=True, kw_only=True)
+class PPOConfig(AgentOptions):
+    """PPO (clip) for discrete and continuous actions (paper, appendix, table of PPO).
 
-    learning_rate: Array | float
-    discount: Array | float
-    clip_ratio: Array | float
-    value_weight: Array | float
-    entropy_weight: Array | float
-    hidden_size: Array | None = None  # units in use, if fewer than the networks have
+    The defaults are the paper's for MountainCarContinuous, whose RNs add `action_repeat=5`.
+    """
+
+    actions: ClassVar[tuple[str, ...]] = ("discrete", "continuous")
+
+    # PPO learns from the start; this only holds back the stop rule.
+    init_episodes: int = option(1, counts("it counts episodes", least=0))
+    hidden_size: int = option(64, counts(), varied="triple")
+    num_layers: int = option(2, counts(), varied="one_more_or_less")
+    activation: str = option("relu", one_of(ACTIVATIONS))
+    learning_rate: float = option(
+        3e-4, positive("the agent would not move"), traced=True, varied="triple"
+    )
+    discount: float = option(0.99, fraction(), traced=True)
+    update_episodes: int = option(10, counts())  # of full length, between two learning phases
+    epochs: int = option(80, counts())  # Adam steps on all of the rollout in a learning phase
+    clip_ratio: float = option(0.2, positive("the agent would not move"), traced=True)
+    value_weight: float = option(1.0, not_negative(), traced=True)
+    entropy_weight: float = option(0.01, not_negative(), traced=True)
+    # Of the Gaussian policy; learned.
+    init_action_std: float = option(0.5, positive("the agent would not move"))
+    action_repeat: int = option(1, counts())
+
+    def make(self, task: Any) -> Agent:
+        """The agent for a task's observations and actions."""
+        action_dim = task.action_dim if task.num_actions is None else None
+        return make_ppo(self, task.obs_dim, task.num_actions, action_dim, task.max_action,
+                        task.max_steps)  # fmt: skip
+
+    def rollout_length(self, max_episode_steps: int) -> int:
+        """Decisions between two learning phases.
+
+        The authors learn as soon as (decisions x `action_repeat`) / `max_episode_steps` exceeds
+        `update_episodes`, also in the middle of an episode; this is the first whole number that
+        does.
+
+        Source: `reference_details.md` 4.5.
+        """
+        return self.update_episodes * max_episode_steps // self.action_repeat + 1
+
+    def steps_before_learning(self, max_episode_steps: int) -> int:
+        """As of any agent; PPO learns once a rollout is full."""
+        return self.rollout_length(max_episode_steps) * self.action_repeat
 
 
 class PPOState(struct.PyTreeNode):
@@ -43,7 +81,7 @@ class PPOState(struct.PyTreeNode):
 
     params: Float[Array, " num_params"]
     opt_state: optax.OptState
-    hparams: PPOHparams
+    hparams: Any  # traced options, and hidden_size in use or None
 
 
 class Policy(NamedTuple):
@@ -112,65 +150,46 @@ def make_ppo(
         for size in (num_actions or std_dim, 1)
     )
 
+    networks = {"actor": actor, "critic": critic}
+
     def init_params(key: Array) -> dict[str, Any]:
-        key_actor, key_critic = jax.random.split(key)
-        return {
-            "actor": actor.init(key_actor, jnp.zeros(obs_dim)),
-            "critic": critic.init(key_critic, jnp.zeros(obs_dim)),
-            "std": jnp.full(std_dim, config.init_action_std, jnp.float32),
-        }
+        keys = dict(zip(networks, jax.random.split(key), strict=True))
+        weights = {name: net.init(keys[name], jnp.zeros(obs_dim)) for name, net in networks.items()}
+        return {**weights, "std": jnp.full(std_dim, config.init_action_std, jnp.float32)}
 
-    template = jax.eval_shape(init_params, jax.random.key(0))
-    _, unravel = ravel_pytree(jax.tree.map(lambda x: jnp.zeros(x.shape), template))
-    adam = optax.scale_by_adam()
+    unflatten = flat.unflattener(init_params)
 
-    def init(key: Array, hparams: PPOHparams) -> PPOState:
+    def init(key: Array, hparams: Any) -> PPOState:
         tree = init_params(key)
         if hparams.hidden_size is not None:
-            for name in ("actor", "critic"):
+            for name in networks:
                 tree[name] = {"params": narrow(tree[name]["params"], hparams.hidden_size)}
-        params, _ = ravel_pytree(tree)
+        params = flat.flatten(tree)
         return PPOState(
             params=params,
-            opt_state=adam.init(params),
+            opt_state=flat.ADAM.init(params),
             hparams=jax.tree.map(jnp.float32, hparams),
         )
 
     def act(key: Array, state: PPOState, obs: Float[Array, " obs_dim"], explore: bool) -> Array:
-        params = unravel(state.params)
+        params = unflatten(state.params)
         outputs: Any = actor.apply(params["actor"], obs)
         return policy.sample(key, outputs, params["std"]) if explore else policy.mode(outputs)
 
-    def evaluate(params: dict[str, Any], obs: Array, action: Array) -> tuple[Array, Array]:
+    def evaluate(params: dict[str, Any], obs: Array, action: Array) -> tuple[Array, Array, Array]:
+        """Log-probabilities and entropies of actions, and the critic's values, `[steps]` each."""
         outputs: Any = actor.apply(params["actor"], obs)
-        return policy.evaluate(outputs, params["std"], action)
+        log_prob, entropy = policy.evaluate(outputs, params["std"], action)
+        value: Any = critic.apply(params["critic"], obs)
+        return log_prob, entropy, value[0]
 
-    def least_params() -> Float[Array, " num_params"]:
-        """Lower bounds of the parameters: only the std has one."""
-        unbounded = jax.tree.map(lambda x: jnp.full(x.shape, -jnp.inf), template)
-        return ravel_pytree({**unbounded, "std": jnp.full(std_dim, MIN_STD)})[0]
-
-    def learn(params: Array, opt_state: Any, rows: Array, hp: Any) -> tuple[Array, Any]:
-        """A learning phase: `epochs` Adam steps on the whole rollout."""
-        steps = replay.unpack(rows[:, :-1].T, action_dim)
-        returns = normalized(discounted_returns(steps.reward, rows[:, -1], hp.discount))
-        # These parameters have made the whole rollout.
-        old_log_prob, _ = evaluate(unravel(params), steps.obs, steps.action)
-        bounds = least_params()
-
-        def loss_fn(params: dict[str, Any]) -> Array:
-            log_prob, entropy = evaluate(params, steps.obs, steps.action)
-            value = critic.apply(params["critic"], steps.obs)[0]
-            return ppo_loss(log_prob, entropy, value, old_log_prob, returns, hp)
-
-        def epoch(number: Array, carry: tuple[Array, Any]) -> tuple[Array, Any]:
-            params, opt_state = carry
-            gradient, _ = ravel_pytree(jax.grad(loss_fn)(unravel(params)))
-            direction, opt_state = adam.update(gradient, opt_state)
-            params = jnp.maximum(params - hp.learning_rate * direction, bounds)
-            return params, opt_state
-
-        return jax.lax.fori_loop(0, config.epochs, epoch, (params, opt_state))
+    least_std = {"std": jnp.full(std_dim, MIN_STD)}
+    template = jax.eval_shape(init_params, jax.random.key(0))
+    unbounded = jax.tree.map(lambda x: jnp.full(x.shape, -jnp.inf), template)
+    learn = make_learning_phase(
+        config, evaluate, unflatten, flat.flatten({**unbounded, **least_std}),
+        lambda rollout: rollout.transitions(obs_dim, num_actions is not None),
+    )  # fmt: skip
 
     def update(key: Array, state: PPOState, rollout: Rollout) -> PPOState:
         """Learns if the rollout is full.
@@ -183,7 +202,8 @@ def make_ppo(
             _, params, opt_state = carry
             # XLA would move what depends on the rows alone out of the loop, into every step.
             rows, params = jax.lax.optimization_barrier((rollout.rows, params))
-            return jnp.bool_(False), *learn(params, opt_state, rows, state.hparams)
+            full = rollout._replace(rows=rows)
+            return jnp.bool_(False), *learn(params, opt_state, full, state.hparams)
 
         _, params, opt_state = jax.lax.while_loop(
             lambda carry: carry[0], phase, (rollout.is_full, state.params, state.opt_state)
@@ -192,16 +212,55 @@ def make_ppo(
 
     return Agent(
         init=init,
-        begin_episode=lambda state, episode: state,
         act=act,
         update=update,
         memory=rollout_memory(config.rollout_length(max_steps)),
-        hparams=hparams_of(PPOHparams, config),
+        hparams=traced(config, hidden_size=None),
         init_episodes=config.init_episodes,
         learns_from=0,
         env_action=policy.env_action,
         action_repeat=config.action_repeat,
     )
+
+
+def make_learning_phase(
+    config: PPOConfig,
+    evaluate: Callable[[Any, Array, Array], tuple[Array, Array, Array]],
+    unflatten: Callable[[Array], Any],
+    least_params: Float[Array, " num_params"],
+    transitions: Callable[[Rollout], Any],
+) -> Callable[[Array, Any, Rollout, Any], tuple[Array, Any]]:
+    """Builds `learn(params, opt_state, rollout, hparams) -> (params, opt_state)`.
+
+    A learning phase: `config.epochs` Adam steps on the whole rollout.
+
+    Args:
+      config: the number of epochs.
+      evaluate: `(params, obs, action) -> (log_prob, entropy, value)`.
+      unflatten: of flat parameters.
+      least_params: lower bounds of the parameters: only the std has one.
+      transitions: what a rollout holds.
+    """
+
+    def learn(params: Array, opt_state: Any, rollout: Rollout, hp: Any) -> tuple[Array, Any]:
+        steps = transitions(rollout)
+        returns = normalized(discounted_returns(steps.reward, rollout.ended, hp.discount))
+        # These parameters have made the whole rollout.
+        old_log_prob, _, _ = evaluate(unflatten(params), steps.obs, steps.action)
+
+        def loss_fn(params: Any) -> Array:
+            log_prob, entropy, value = evaluate(params, steps.obs, steps.action)
+            return ppo_loss(log_prob, entropy, value, old_log_prob, returns, hp)
+
+        def epoch(number: Array, carry: tuple[Array, Any]) -> tuple[Array, Any]:
+            params, opt_state = carry
+            gradient = flat.flatten(jax.grad(loss_fn)(unflatten(params)))
+            moved, opt_state = flat.adam_step(params, opt_state, gradient, hp.learning_rate)
+            return jnp.maximum(moved, least_params), opt_state
+
+        return jax.lax.fori_loop(0, config.epochs, epoch, (params, opt_state))
+
+    return learn
 
 
 def discounted_returns(
@@ -241,7 +300,7 @@ def ppo_loss(
     value: Float[Array, " steps"],
     old_log_prob: Float[Array, " steps"],
     returns: Float[Array, " steps"],
-    hp: PPOHparams,
+    hp: Any,
 ) -> Float[Array, ""]:
     r"""What a learning phase minimises.
 

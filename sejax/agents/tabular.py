@@ -7,31 +7,50 @@ Using Connectionist Systems" (1994); paper, appendix, tables of Cliff Walking;
 
 import functools
 from collections.abc import Callable
-from typing import NamedTuple
+from dataclasses import dataclass
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Float, Int
 
-from sejax.agents.agent import Agent, hparams_of
-from sejax.agents.configs import QLearningConfig, SARSAConfig
+from sejax.agents.agent import Agent, AgentOptions, traced
 from sejax.agents.epsilon_greedy import decayed_epsilon, epsilon_greedy
 from sejax.agents.memory import no_memory
 from sejax.agents.replay import Transition
+from sejax.options import counts, fraction, option, positive
 
 # `(key, q_row [num_actions], epsilon) -> []`: what the next state is worth to the target.
 NextValue = Callable[[Array, Array, Array], Array]
 
 
-class TabularHparams(NamedTuple):
-    """The traced hyperparameters, scalars that a population of agents may vary."""
+@dataclass(frozen=True, kw_only=True)
+class QLearningConfig(AgentOptions):
+    """Tabular Q-learning (paper, appendix "Cliff Walking")."""
 
-    learning_rate: Array | float
-    discount: Array | float
-    epsilon_init: Array | float
-    epsilon_min: Array | float
-    epsilon_decay: Array | float
+    states: ClassVar[str] = "discrete"
+
+    init_episodes: int = option(0, counts("it counts episodes", least=0))
+    learning_rate: float = option(
+        1.0, positive("the agent would not move"), traced=True, varied="tenth_to_one"
+    )
+    discount: float = option(0.8, fraction(), traced=True, varied="tenth_to_one")
+    epsilon_init: float = option(0.1, fraction(), traced=True)
+    epsilon_min: float = option(0.1, fraction(), traced=True)
+    epsilon_decay: float = option(0.0, fraction(), traced=True)
+
+    def make(self, task: Any) -> Agent:
+        """The agent for a task's numbers of states and actions."""
+        return make_q_learning(self, task.num_states, task.num_actions)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SARSAConfig(QLearningConfig):
+    """Tabular SARSA; the same hyperparameters."""
+
+    def make(self, task: Any) -> Agent:
+        return make_sarsa(self, task.num_states, task.num_actions)
 
 
 @struct.dataclass
@@ -40,7 +59,7 @@ class TabularState:
 
     q_values: Float[Array, "num_states num_actions"]
     epsilon: Array
-    hparams: TabularHparams
+    hparams: Any  # traced options
 
 
 @functools.cache
@@ -98,7 +117,7 @@ def _make_tabular(
 ) -> Agent:
     """What both agents share: all but the value of the next state."""
 
-    def init(key: Array, hparams: TabularHparams) -> TabularState:
+    def init(key: Array, hparams: Any) -> TabularState:
         hparams = jax.tree.map(jnp.float32, hparams)
         return TabularState(
             q_values=jnp.zeros((num_states, num_actions), jnp.float32),
@@ -130,7 +149,7 @@ def _make_tabular(
         begin_episode=begin_episode,
         act=act,
         update=update,
-        hparams=hparams_of(TabularHparams, config),
+        hparams=traced(config),
         memory=no_memory(),
         init_episodes=config.init_episodes,
         learns_from=config.init_episodes,

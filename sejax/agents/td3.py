@@ -10,51 +10,84 @@ hyperparameter tables; `reference_details.md` 4.3 and 4.4.
 import functools
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import optax
 from flax import struct
-from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int
 
-from sejax.agents.agent import Agent, hparams_of
+from sejax.agents import flat
+from sejax.agents.agent import Agent, AgentOptions, traced
 from sejax.agents.blocks import sum_over_batch
-from sejax.agents.configs import DiscreteTD3Config, TD3Config
 from sejax.agents.memory import replay_memory
 from sejax.agents.replay import Transition, num_columns
-from sejax.networks import MLP, narrow
+from sejax.networks import ACTIVATIONS, MLP, narrow
+from sejax.options import counts, fraction, not_negative, one_of, option, positive
 
 _MIN_TEMPERATURE = 1e-6
 
 
-class TD3Hparams(NamedTuple):
-    """The traced hyperparameters, scalars that a population of agents may vary."""
+@dataclass(frozen=True, kw_only=True)
+class TD3Config(AgentOptions):
+    """TD3's hyperparameters (paper, appendix "MountainCarContinuous-v0 and HalfCheetah-v3").
 
-    learning_rate: Array | float
-    target_update_rate: Array | float
-    discount: Array | float
-    action_noise_std: Array | float
-    target_noise_std: Array | float
-    target_noise_clip: Array | float
-    hidden_size: Array | None = None  # units in use, if fewer than the networks have
-    batch_size: Array | None = None  # columns in use, if fewer than a batch has
+    The defaults are the paper's for HalfCheetah; for MountainCarContinuous it has
+    `init_episodes=50 action_repeat=2`.
+    """
+
+    actions: ClassVar[tuple[str, ...]] = ("continuous",)
+
+    # With uniformly random actions.
+    init_episodes: int = option(20, counts("it counts episodes", least=0))
+    batch_size: int = option(256, counts(), varied="triple")
+    buffer_size: int = option(100_000, counts())
+    hidden_size: int = option(128, counts(), varied="triple")
+    num_layers: int = option(2, counts(), varied="one_more_or_less")
+    activation: str = option("relu", one_of(ACTIVATIONS))
+    # Of the actor and the critics.
+    learning_rate: float = option(
+        3e-4, positive("the agent would not move"), traced=True, varied="triple"
+    )
+    target_update_rate: float = option(0.005, fraction(), traced=True)
+    discount: float = option(0.99, fraction(), traced=True)
+    policy_delay: int = option(2, counts())  # learning steps for each one of actor and targets
+    action_repeat: int = option(1, counts())  # steps of the world for each decision
+    # Exploration, in units of the largest action.
+    action_noise_std: float = option(0.1, not_negative(), traced=True)
+    # Smoothing of the target policy, likewise.
+    target_noise_std: float = option(0.2, not_negative(), traced=True)
+    target_noise_clip: float = option(0.5, not_negative(), traced=True)
+    noisy_tests: bool = False  # exploration noise in tests too, as in the authors' code
+
+    def make(self, task: Any) -> Agent:
+        """The agent for a task's observations and actions."""
+        return make_td3(self, task.obs_dim, task.action_dim, task.max_action)
 
 
-class DiscreteTD3Hparams(NamedTuple):
-    """Those of `TD3Hparams`, and the Gumbel-Softmax's temperatures."""
+@dataclass(frozen=True, kw_only=True)
+class DiscreteTD3Config(TD3Config):
+    """TD3 for discrete actions: the policy is a Gumbel-Softmax (paper, default agent table)."""
 
-    learning_rate: Array | float
-    target_update_rate: Array | float
-    discount: Array | float
-    action_noise_std: Array | float
-    target_noise_std: Array | float
-    target_noise_clip: Array | float
-    temperature: Array | float
-    final_temperature: Array | float
-    hidden_size: Array | None = None
-    batch_size: Array | None = None
+    actions: ClassVar[tuple[str, ...]] = ("discrete",)
+
+    init_episodes: int = option(10, counts("it counts episodes", least=0))
+    batch_size: int = option(128, counts(), varied="triple")
+    activation: str = option("tanh", one_of(ACTIVATIONS))
+    learning_rate: float = option(
+        5e-4, positive("the agent would not move"), traced=True, varied="triple"
+    )
+    target_update_rate: float = option(0.01, fraction(), traced=True)
+    layer_norm: bool = True  # after each hidden layer but the first, as in the authors' code
+    # Of the Gumbel-Softmax at the start.
+    temperature: float = option(1.0, positive("the agent would not move"), traced=True)
+    final_temperature: float = option(0.05, fraction(), traced=True)  # as a fraction of it, ...
+    temperature_steps: int = option(2000, counts())  # ... reached linearly after so many updates
+    one_hot_actions: bool = False  # straight-through one-hot actions in place of soft ones
+
+    def make(self, task: Any) -> Agent:
+        return make_td3_discrete(self, task.obs_dim, task.num_actions)
 
 
 class TD3State(struct.PyTreeNode):
@@ -68,7 +101,7 @@ class TD3State(struct.PyTreeNode):
     critic_opt_state: optax.OptState
     num_updates: Int[Array, ""]
     is_warming_up: Bool[Array, ""]
-    hparams: Any
+    hparams: Any  # traced options, and hidden_size and batch_size in use or None
 
 
 class LearningNoise(NamedTuple):
@@ -127,7 +160,7 @@ def make_td3(config: TD3Config, obs_dim: int, action_dim: int, max_action: float
       (1,)
     """
     policy = tanh_policy(action_dim, max_action)
-    return _make_agent(config, obs_dim, policy, hparams_of(TD3Hparams, config))
+    return _make_agent(config, obs_dim, policy)
 
 
 @functools.cache
@@ -149,13 +182,12 @@ def make_td3_discrete(config: DiscreteTD3Config, obs_dim: int, num_actions: int)
       ((2,), True)
     """
     policy = gumbel_softmax_policy(num_actions, config.temperature_steps, config.one_hot_actions)
-    return _make_agent(config, obs_dim, policy, hparams_of(DiscreteTD3Hparams, config))
+    return _make_agent(config, obs_dim, policy)
 
 
-def _make_agent(config: TD3Config, obs_dim: int, policy: Policy, hparams: Any) -> Agent:
+def _make_agent(config: TD3Config, obs_dim: int, policy: Policy) -> Agent:
     networks = make_networks(config, obs_dim, policy.action_dim)
     learn = make_learning_step(config, networks, policy)
-    adam = optax.scale_by_adam()
 
     def init(key: Array, hparams: Any) -> TD3State:
         actor, critics = networks.init(key, hparams.hidden_size)
@@ -164,8 +196,8 @@ def _make_agent(config: TD3Config, obs_dim: int, policy: Policy, hparams: Any) -
             critics=critics,
             target_actor=actor,
             target_critics=critics,
-            actor_opt_state=adam.init(actor),
-            critic_opt_state=adam.init(critics),
+            actor_opt_state=flat.ADAM.init(actor),
+            critic_opt_state=flat.ADAM.init(critics),
             num_updates=jnp.int32(0),
             is_warming_up=jnp.bool_(config.init_episodes > 0),
             hparams=jax.tree.map(jnp.float32, hparams),
@@ -195,7 +227,7 @@ def _make_agent(config: TD3Config, obs_dim: int, policy: Policy, hparams: Any) -
         act=act,
         update=update,
         memory=replay_memory(config.batch_size, config.buffer_size),
-        hparams=hparams,
+        hparams=traced(config, hidden_size=None, batch_size=None),
         init_episodes=config.init_episodes,
         learns_from=config.init_episodes,
         env_action=policy.env_action,
@@ -231,16 +263,15 @@ def make_networks(config: TD3Config, obs_dim: int, action_dim: int) -> Networks:
             num_outputs, config.hidden_size, config.num_layers, config.activation,
             learn_prelu_slope=True, layer_norm=layer_norm, may_narrow=True,
         )  # fmt: skip
-        template = jax.eval_shape(mlp.init, jax.random.key(0), jnp.zeros(num_inputs))
-        _, unravel = ravel_pytree(jax.tree.map(lambda x: jnp.zeros(x.shape), template))
+        unflatten = flat.unflattener(mlp.init, jnp.zeros(num_inputs))
 
         def init(key: Array, hidden_size: Array | None) -> Array:
             variables: Any = mlp.init(key, jnp.zeros(num_inputs))
             if hidden_size is not None:
                 variables = {"params": narrow(variables["params"], hidden_size)}
-            return ravel_pytree(variables)[0]
+            return flat.flatten(variables)
 
-        return init, lambda params, x: mlp.apply(unravel(params), x)
+        return init, lambda params, x: mlp.apply(unflatten(params), x)
 
     init_actor, actor = network(obs_dim, action_dim)
     init_critic, critic = network(obs_dim + action_dim, 1)
@@ -270,7 +301,6 @@ def make_learning_step(
 
     Source: Fujimoto et al. (2018), algorithm 1; `reference_details.md` 4.3.
     """
-    adam = optax.scale_by_adam()
 
     def both_q(critics: Array, obs: Array, action: Array) -> Float[Array, "2 batch"]:
         return jax.vmap(networks.critic, (0, None, None))(critics, obs, action)
@@ -288,10 +318,10 @@ def make_learning_step(
             return jnp.sum(batch.weight * jnp.sum(errors**2, axis=0))
 
         gradient = mean_gradient(sum_of_losses, state.critics, batch, noise, hp.batch_size)
-        direction, opt_state = adam.update(gradient, state.critic_opt_state)
-        return state.replace(
-            critics=state.critics - hp.learning_rate * direction, critic_opt_state=opt_state
+        critics, opt_state = flat.adam_step(
+            state.critics, state.critic_opt_state, gradient, hp.learning_rate
         )
+        return state.replace(critics=critics, critic_opt_state=opt_state)
 
     def update_actor(state: TD3State, batch: Transition, noise: LearningNoise) -> TD3State:
         hp = state.hparams
@@ -301,8 +331,9 @@ def make_learning_step(
             return -jnp.sum(batch.weight * networks.critic(state.critics[0], batch.obs, action))
 
         gradient = mean_gradient(sum_of_losses, state.actor, batch, noise, hp.batch_size)
-        direction, opt_state = adam.update(gradient, state.actor_opt_state)
-        actor = state.actor - hp.learning_rate * direction
+        actor, opt_state = flat.adam_step(
+            state.actor, state.actor_opt_state, gradient, hp.learning_rate
+        )
         tau = hp.target_update_rate
         return state.replace(
             actor=actor,
@@ -441,7 +472,7 @@ def gumbel_softmax(
     return _one_hot_of_largest(perturbed) + (soft - jax.lax.stop_gradient(soft))
 
 
-def annealed_temperature(hparams: DiscreteTD3Hparams, num_updates: Array, num_steps: int) -> Array:
+def annealed_temperature(hparams: Any, num_updates: Array, num_steps: int) -> Array:
     """Temperature in the `num_updates`-th learning step and until the next one.
 
     It falls linearly from `hparams.temperature` to its `hparams.final_temperature`-fold in

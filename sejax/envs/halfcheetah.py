@@ -1,87 +1,46 @@
-"""HalfCheetah on brax, as a gymnax environment."""
+"""HalfCheetah with brax's physics, 1000 steps; needs the extra `brax`."""
 
-import functools
-from typing import Any
+import io
+import warnings
+from contextlib import redirect_stdout
+from dataclasses import dataclass
+from typing import ClassVar
 
-import jax
-import jax.numpy as jnp
-import numpy as np
-from brax.envs.base import State
-from brax.envs.half_cheetah import Halfcheetah
-from flax import struct
-from gymnax.environments import environment, spaces
-from jaxtyping import Array, Float
+from sejax.envs.task import Facts, Task
+from sejax.errors import ConfigError
+from sejax.options import Options, one_of, option
 
-INFO_KEYS = ("x_position", "x_velocity", "reward_run", "reward_ctrl")
-
-
-@struct.dataclass
-class CheetahState(environment.EnvState):
-    physics: Any  # brax's pipeline state
-    time: Array | int
+# The first is the default: nearly MuJoCo at less than twice the cost of the cheapest, where no
+# other one moves like MuJoCo at all (docs/halfcheetah.md).
+BACKENDS = ("mjx", "spring", "positional", "generalized")
 
 
-@struct.dataclass
-class CheetahParams(environment.EnvParams):
-    max_steps_in_episode: int = 1000
+@dataclass(frozen=True, kw_only=True)
+class HalfCheetah(Options):
+    """A planar cheetah that is paid for running and charged for torque.
 
-
-class HalfCheetah(environment.Environment[CheetahState, CheetahParams]):
-    r"""A planar cheetah with six joints that is paid for running forward.
-
-    .. math:: r = v_x - 0.1 \lVert a \rVert^2
-
-    Observations are the positions without the torso's x and all velocities, `[17]`; actions are
-    torques, `[6]` in [-1, 1]. An episode never terminates. `info` has the torso's `x_position` (m),
-    its `x_velocity` over the step (m/s), and the reward's parts `reward_run` and `reward_ctrl`.
-
-    Each reset draws an initial state of its own from the key: brax's wrappers, which go back to one
-    cached state, are not used.
-
-    Source: brax 0.14, `brax.envs.half_cheetah`; Gymnasium's HalfCheetah.
+    Source: paper, appendix, fixed hyperparameters (episode length and solved reward).
     """
 
-    def __init__(self, backend: str):
-        super().__init__()
-        self.backend = backend
-        self._brax = Halfcheetah(backend=backend)
+    group: ClassVar[str] = "env"
+    facts: ClassVar[Facts] = Facts("vector", "continuous", max_steps=1000, has_info=True)
 
-    @property
-    def default_params(self) -> CheetahParams:
-        return CheetahParams()
+    backend: str = option(BACKENDS[0], one_of(BACKENDS))  # physics
 
-    def reset_env(
-        self, key: Array, params: CheetahParams
-    ) -> tuple[Float[Array, "17"], CheetahState]:
-        state = self._brax.reset(key)
-        return state.obs, CheetahState(physics=state.pipeline_state, time=jnp.int32(0))
+    def make(self) -> Task:
+        try:
+            # On import brax tells at length of other physics, and that its envs lack maintainers.
+            with warnings.catch_warnings(action="ignore"), redirect_stdout(io.StringIO()):
+                from sejax.envs.dynamics.halfcheetah import INFO_KEYS, CheetahParams, HalfCheetahEnv
 
-    def step_env(
-        self, key: Array | None, state: CheetahState, action: Array, params: CheetahParams
-    ) -> tuple[Float[Array, "17"], CheetahState, Array, Array, dict[Any, Any]]:
-        """One control step of 0.05 s; the key has no effect."""
-        nothing = jnp.float32(0)
-        before = State(state.physics, None, nothing, nothing, dict.fromkeys(INFO_KEYS, nothing))
-        after = self._brax.step(before, action)
-        info = {**after.metrics, "discount": jnp.float32(1)}
-        state = CheetahState(physics=after.pipeline_state, time=state.time + 1)
-        return after.obs, state, after.reward, jnp.bool_(False), info
-
-    def is_terminated(self, state: CheetahState, params: CheetahParams) -> Array:
-        return jnp.bool_(False)
-
-    @property
-    def name(self) -> str:
-        return f"HalfCheetah-{self.backend}"
-
-    def action_space(self, params: CheetahParams | None = None) -> spaces.Box:
-        limits = np.ones(self._brax.action_size, np.float32)
-        return spaces.Box(-limits, limits, limits.shape)
-
-    @functools.cached_property
-    def _obs_shape(self) -> tuple[int, ...]:
-        # brax's `observation_size` plays a reset, op by op.
-        return jax.eval_shape(self._brax.reset, jax.random.key(0)).obs.shape
-
-    def observation_space(self, params: CheetahParams | None = None) -> spaces.Box:
-        return spaces.Box(-jnp.inf, jnp.inf, self._obs_shape)
+                env = HalfCheetahEnv(self.backend)
+        except ImportError as error:
+            raise ConfigError(
+                "env=halfcheetah needs brax, because its physics are brax's; it is not installed "
+                f"({error}). Install it with pip install 'sejax[brax]'."
+            ) from error
+        return Task(
+            name="halfcheetah", env=env, params=CheetahParams(), max_steps=self.facts.max_steps,
+            solved_reward=3000.0, info_keys=INFO_KEYS,
+            augmented_keys=("x_position", "x_velocity"),
+        )  # fmt: skip

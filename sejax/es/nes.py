@@ -1,120 +1,140 @@
-"""The paper's natural evolution strategy as an evosax algorithm.
+"""The paper's natural evolution strategy.
 
 Source: paper, Algorithm 1 and appendix "NES Score Transformation"; `reference_details.md` 2.
 """
 
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
-from evosax.algorithms.distribution_based import base
 from flax import struct
 from jaxtyping import Array, Float
 
-from sejax.configs import NESConfig
 from sejax.es.score_transforms import TRANSFORMS
+from sejax.es.strategy import AGGREGATES, Strategy, Trials
+from sejax.options import Options, counts, fraction, one_of, option, positive, shrinks
+
+UPDATE_RULES = ("authors", "paper")
+_LARGEST = 1e6  # larger steps or noise lead to weights whose products are not finite
+
+
+@dataclass(frozen=True, kw_only=True)
+class NESConfig(Options):
+    """NES with mirrored sampling and evaluation of the incumbent (Algorithm 1)."""
+
+    group: ClassVar[str] = "es"
+
+    # n_p: members in a generation
+    population_size: int = option(16, counts("scores are compared within a generation", least=2))
+    # Agents on the incumbent; null: one for each member, as in the paper.
+    num_incumbent_evals: int | None = option(
+        None, counts("the incumbent's score selects the proxy")
+    )
+    # sigma: std of the weight perturbation
+    noise_std: float = option(0.05, positive("members must differ", _LARGEST))
+    noise_std_decay: float = option(1.0, shrinks())  # factor on sigma after each generation
+    step_size: float = option(1.0, positive("the proxy would not move", _LARGEST))  # alpha
+    step_size_decay: float = option(1.0, shrinks())  # factor on alpha after each generation
+    mirrored: bool = True  # each member tries +eps and -eps and keeps the better sign
+    score_transform: str = option("all_better_2", one_of(TRANSFORMS))
+    # authors: psi += alpha sum F eps; paper: that divided by n_p sigma
+    update_rule: str = option("authors", one_of(UPDATE_RULES))
+    weight_decay: float = option(0.0, fraction())  # psi shrinks by this before each update
+    num_evals: int = option(1, counts("a member needs a score"))  # agents on each perturbed proxy
+    eval_aggregate: str = option("mean", one_of(AGGREGATES))  # what their scores make
+    common_random_numbers: bool = False  # the same inner seeds for all members of a generation
+
+    def make(self, num_dims: int) -> Strategy:
+        """NES over vectors of `num_dims` numbers."""
+        return make_nes(self, num_dims)
 
 
 @struct.dataclass
-class State(base.State):
-    mean: Array  # psi
-    noise_std: Array
-    step_size: Array
+class NESState:
+    mean: Float[Array, " dims"]  # psi
+    noise_std: Array  # sigma
+    step_size: Array  # alpha
 
 
-@struct.dataclass
-class Params(base.Params):
-    """The traced numbers of Algorithm 1, which a population of runs may vary."""
+def make_nes(config: NESConfig, num_dims: int) -> Strategy:
+    r"""Builds NES over vectors `[num_dims]`.
 
-    noise_std: Array | float  # sigma
-    noise_std_decay: Array | float
-    step_size: Array | float  # alpha
-    step_size_decay: Array | float
-    weight_decay: Array | float
+    Members are psi + eps_i for each of `config.population_size`, then psi - eps_i if sampling is
+    mirrored. A mirrored pair's score is that of its better sign, and its eps has that sign; a tie
+    keeps the plus.
 
+    .. math:: \psi \leftarrow (1 - \lambda) \psi + \alpha \sum_i F_i \epsilon_i
 
-class NES(base.DistributionBasedAlgorithm):
-    """NES with mirrored sampling and evaluation of the incumbent.
+    with the weights F of the score transform, divided by :math:`n_p \sigma` with
+    `update_rule="paper"`.
 
-    `ask` returns the candidates to score, `[num_candidates, num_dims]`: psi + eps_i for each of the
-    `config.population_size` members, then psi - eps_i if sampling is mirrored, each of these
-    `config.num_evals` times, and last the incumbent psi, once for each member unless
-    `config.num_incumbent_evals` says otherwise. `tell` takes the fitness of all of them, which
-    evosax minimises: the negative of the score.
+    Source: paper, Algorithm 1; `reference_details.md` 2.
 
-    With mirrored sampling a member's score is that of its better sign, and its eps has that sign;
-    a tie keeps the plus.
+    Example:
+      >>> strategy = make_nes(NESConfig(population_size=4), num_dims=3)
+      >>> state = strategy.init(jax.random.key(0), jnp.zeros(3))
+      >>> strategy.ask(jax.random.key(1), state)[0].shape  # +eps and -eps
+      (8, 3)
     """
+    num_pairs = config.population_size
+    transform = TRANSFORMS[config.score_transform]
 
-    def __init__(self, config: NESConfig, solution: Any):
-        num_signs = 2 if config.mirrored else 1
-        self.num_perturbed = config.population_size * num_signs * config.num_evals
-        self.num_incumbent_evals = config.num_incumbent_evals or config.population_size
-        super().__init__(self.num_perturbed + self.num_incumbent_evals, solution)
-        self.config = config
-        self.num_signs = num_signs
-
-    @property
-    def _default_params(self) -> Params:  # type: ignore[override]
-        return Params(**{name: getattr(self.config, name) for name in Params.__annotations__})
-
-    def _init(self, key: Array, params: Params) -> State:
-        return State(
-            mean=jnp.full((self.num_dims,), jnp.nan),
-            noise_std=jnp.float32(params.noise_std),
-            step_size=jnp.float32(params.step_size),
-            best_solution=jnp.full((self.num_dims,), jnp.nan),
-            best_fitness=jnp.inf,
-            generation_counter=0,
+    def init(key: Array, mean: Float[Array, " dims"]) -> NESState:
+        return NESState(
+            mean=mean,
+            noise_std=jnp.float32(config.noise_std),
+            step_size=jnp.float32(config.step_size),
         )
 
-    def _ask(
-        self, key: Array, state: State, params: Params
-    ) -> tuple[Float[Array, "candidates dims"], State]:
-        num_members = self.config.population_size
-        noise = state.noise_std * jax.random.normal(key, (num_members, self.num_dims))
-        signed = jnp.concatenate([noise, -noise]) if self.config.mirrored else noise
-        perturbed = jnp.repeat(state.mean + signed, self.config.num_evals, axis=0)
-        incumbents = jnp.broadcast_to(state.mean, (self.num_incumbent_evals, self.num_dims))
-        return jnp.concatenate([perturbed, incumbents]), state
+    def ask(key: Array, state: NESState) -> tuple[Float[Array, "members dims"], NESState]:
+        noise = state.noise_std * jax.random.normal(key, (num_pairs, num_dims))
+        signed = jnp.concatenate([noise, -noise]) if config.mirrored else noise
+        return state.mean + signed, state
 
-    def _tell(
-        self, key: Array, population: Array, fitness: Array, state: State, params: Params
-    ) -> State:
-        scores, incumbent_scores = -fitness[: self.num_perturbed], -fitness[self.num_perturbed :]
-        num_evals = self.config.num_evals
-        scores = aggregate(scores.reshape(-1, num_evals), self.config.eval_aggregate)
-        noise = population[: self.num_perturbed : num_evals] - state.mean
-        scores, noise = self._choose_sign(scores, noise)
-        weights = TRANSFORMS[self.config.score_transform](scores, finite_mean(incumbent_scores))
+    def tell(
+        key: Array, members: Array, scores: Array, incumbent_score: Array, state: NESState
+    ) -> NESState:
+        noise = members - state.mean
+        if config.mirrored:
+            scores, noise = better_signs(scores, noise)
+        weights = transform(scores, incumbent_score)
         step = state.step_size * weights @ noise
-        if self.config.update_rule == "paper":
-            step = step / (self.config.population_size * state.noise_std)
+        if config.update_rule == "paper":
+            step = step / (num_pairs * state.noise_std)
         return state.replace(
-            mean=(1 - params.weight_decay) * state.mean + step,
-            noise_std=state.noise_std * params.noise_std_decay,
-            step_size=state.step_size * params.step_size_decay,
+            mean=(1 - config.weight_decay) * state.mean + step,
+            noise_std=state.noise_std * config.noise_std_decay,
+            step_size=state.step_size * config.step_size_decay,
         )
 
-    def _choose_sign(self, scores: Array, noise: Array) -> tuple[Array, Array]:
-        """Scores `[pop]` and signed noise `[pop, dims]` of each member's better sign."""
-        if not self.config.mirrored:
-            return scores, noise
-        plus, minus = scores.reshape(2, -1)
-        use_minus = jnp.where(jnp.isfinite(minus), minus, -jnp.inf) > jnp.where(
-            jnp.isfinite(plus), plus, -jnp.inf
-        )
-        sign = jnp.where(use_minus, -1.0, 1.0)
-        return jnp.where(use_minus, minus, plus), sign[:, None] * noise[: plus.shape[0]]
+    return Strategy(
+        init=init,
+        ask=ask,
+        tell=tell,
+        incumbent=lambda state: state.mean,
+        num_members=num_pairs * (2 if config.mirrored else 1),
+        trials=trials_of(config, config.num_incumbent_evals or num_pairs),
+    )
 
 
-def aggregate(scores: Float[Array, "pop evals"], how: str) -> Float[Array, " pop"]:
-    """Mean or minimum of each member's scores; not finite if one of them is not."""
-    scores = jnp.where(jnp.isfinite(scores), scores, jnp.nan)
-    return scores.mean(axis=1) if how == "mean" else scores.min(axis=1)
+def trials_of(config: Any, num_incumbent_evals: int) -> Trials:
+    """How often the proxies of a generation are tried, as a strategy's configuration says."""
+    return Trials(
+        num_evals=config.num_evals,
+        aggregate=config.eval_aggregate,
+        num_incumbent_evals=num_incumbent_evals,
+        common_random_numbers=config.common_random_numbers,
+    )
 
 
-def finite_mean(scores: Float[Array, " n"]) -> Float[Array, ""]:
-    """Mean of the finite scores; nan if there is none."""
-    finite = jnp.isfinite(scores)
-    return jnp.where(finite, scores, 0.0).sum() / finite.sum()
+def better_signs(
+    scores: Float[Array, " signed"], noise: Float[Array, "signed dims"]
+) -> tuple[Float[Array, " pop"], Float[Array, "pop dims"]]:
+    """Score and signed noise of each member's better sign; the plus signs are the first half."""
+    plus, minus = scores.reshape(2, -1)
+    use_minus = jnp.where(jnp.isfinite(minus), minus, -jnp.inf) > jnp.where(
+        jnp.isfinite(plus), plus, -jnp.inf
+    )
+    sign = jnp.where(use_minus, -1.0, 1.0)
+    return jnp.where(use_minus, minus, plus), sign[:, None] * noise[: plus.shape[0]]

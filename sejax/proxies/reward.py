@@ -4,8 +4,6 @@ Source: paper, section "Learning Reward Networks" (table "Overview of Reward Net
 `reference_details.md` 5.
 """
 
-import copy
-import functools
 from typing import Any
 
 import jax
@@ -14,10 +12,10 @@ from flax import struct
 from gymnax.environments import environment
 from jaxtyping import Array, Float
 
-from sejax import envs
-from sejax.configs import RewardConfig
+from sejax.envs.task import Task
 from sejax.networks import MLP, uniform_fan_in
-from sejax.proxies.synthetic import ABSURD
+from sejax.proxies.configs import RewardConfig
+from sejax.proxies.proxy import ABSURD, ProxyEnv
 
 
 @struct.dataclass
@@ -37,7 +35,7 @@ class RewardParams(environment.EnvParams):
     max_steps_in_episode: int = 1
 
 
-class RewardEnv(environment.Environment[RewardState, RewardParams]):
+class RewardEnv(ProxyEnv):
     r"""A task whose reward is shaped by a network :math:`\Phi`; a gymnax 1.x `Environment`.
 
     Dynamics, termination and observations are the real task's. With r the real reward, the agent
@@ -72,11 +70,10 @@ class RewardEnv(environment.Environment[RewardState, RewardParams]):
     `info["nonfinite"]` says whether it was not even a number.
     """
 
-    def __init__(self, task: envs.Task, config: RewardConfig):
-        super().__init__()
-        self.task = task
-        self.config = config
-        self._default_params: RewardParams | None = None
+    is_real = True
+
+    def __init__(self, task: Task, config: RewardConfig):
+        super().__init__(task, config)
         self._augmented_keys = task.augmented_keys if config.augmented else ()
         self._net = MLP(1, config.hidden_size, config.num_layers, config.activation)
 
@@ -89,23 +86,20 @@ class RewardEnv(environment.Environment[RewardState, RewardParams]):
         return {"potential": self._net.init(key, jnp.zeros(num_inputs))["params"]}
 
     def params(self, weights: Any, discount: Array | float = 1.0) -> RewardParams:
-        """`EnvParams` of the RN with these weights and the real task's step limit."""
         return RewardParams(
             weights=weights, discount=discount, max_steps_in_episode=self.task.max_steps
         )
 
     def prepared(
-        self, params: RewardParams, discount: Array | float, limit_is_terminal: bool = False
+        self,
+        params: RewardParams,
+        discount: Array | float,
+        limit_is_terminal: Array | bool = False,
     ) -> RewardParams:
         """The same for a whole training of an agent.
 
         Where states are counted, all potentials are computed at once: a step then looks its two up.
         They are these weights': with other weights prepare again.
-
-        Args:
-          params: of the RN.
-          discount: the agent's.
-          limit_is_terminal: whether the agent does not bootstrap at the step limit.
         """
         potentials = None
         if self.task.num_states is not None and not self.config.weighs_info:
@@ -116,17 +110,6 @@ class RewardEnv(environment.Environment[RewardState, RewardParams]):
             limit_is_terminal=jnp.bool_(limit_is_terminal),
             potentials=potentials,
         )
-
-    @property
-    def default_params(self) -> RewardParams:
-        """Random weights, or those given to `with_default_params`."""
-        return self._default_params or self.params(self.init_weights(jax.random.key(0)))
-
-    def with_default_params(self, params: RewardParams) -> "RewardEnv":
-        """A copy for callers that rely on `default_params`, such as `gymnax.make`."""
-        env = copy.copy(self)
-        env._default_params = params
-        return env
 
     def potential(
         self, params: RewardParams, obs: Array, augmentation: Array | tuple[()] = ()
@@ -198,27 +181,7 @@ class RewardEnv(environment.Environment[RewardState, RewardParams]):
     def get_obs(self, state: RewardState, params: Any = None, key: Any = None) -> Array:
         return state.obs
 
-    @property
-    def name(self) -> str:
-        return f"Reward-{self.task.name}"
-
-    @property
-    def num_actions(self) -> int:
-        return self.task.env.num_actions
-
-    def action_space(self, params: RewardParams | None = None) -> Any:
-        return self.task.env.action_space(self.task.params)
-
-    def observation_space(self, params: RewardParams | None = None) -> Any:
-        return self.task.env.observation_space(self.task.params)
-
 
 def _select(info: Any, keys: tuple[str, ...]) -> Float[Array, " keys"]:
     """The numbers under these keys."""
     return jnp.array([info[key] for key in keys], jnp.float32)
-
-
-@functools.cache
-def make_reward(task: envs.Task, config: RewardConfig) -> RewardEnv:
-    """The RN for a task, built once for each configuration (a new instance would recompile)."""
-    return RewardEnv(task, config)

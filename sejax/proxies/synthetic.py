@@ -3,8 +3,6 @@
 Source: paper, section "Learning Synthetic Environments"; `reference_details.md` 1.
 """
 
-import copy
-import functools
 from typing import Any
 
 import jax
@@ -13,13 +11,10 @@ from flax import struct
 from gymnax.environments import environment
 from jaxtyping import Array, Float
 
-from sejax import envs
-from sejax.configs import SyntheticConfig
+from sejax.envs.task import Task
 from sejax.networks import MLP
-
-# A state or reward beyond this is no world that an agent could learn from: the episode ends. It is
-# far outside every task's range and small enough for its square to stay finite in float32.
-ABSURD = 1e6
+from sejax.proxies.configs import SyntheticConfig
+from sejax.proxies.proxy import ABSURD, ProxyEnv
 
 
 @struct.dataclass
@@ -34,7 +29,7 @@ class SyntheticParams(environment.EnvParams):
     max_steps_in_episode: int = 1
 
 
-class SyntheticEnv(environment.Environment[SyntheticState, SyntheticParams]):
+class SyntheticEnv(ProxyEnv):
     """A task whose dynamics, reward and termination are networks; a gymnax 1.x `Environment`.
 
     Each network maps the action (one-hot if discrete) and the state to the next state, the reward
@@ -49,11 +44,8 @@ class SyntheticEnv(environment.Environment[SyntheticState, SyntheticParams]):
     reward is 0, and `info["nonfinite"]` says whether it was not even a number.
     """
 
-    def __init__(self, task: envs.Task, config: SyntheticConfig):
-        super().__init__()
-        self.task = task
-        self.config = config
-        self._default_params: SyntheticParams | None = None
+    def __init__(self, task: Task, config: SyntheticConfig):
+        super().__init__(task, config)
         outputs = {"state": task.obs_dim, "reward": 1, "done": 1}
         self._nets = {
             head: MLP(size, config.hidden_size, config.num_layers, config.activation)
@@ -69,20 +61,8 @@ class SyntheticEnv(environment.Environment[SyntheticState, SyntheticParams]):
             for k, (head, net) in zip(keys, self._nets.items(), strict=True)
         }
 
-    def params(self, weights: Any) -> SyntheticParams:
-        """`EnvParams` of the SE with these weights and the real task's step limit."""
+    def params(self, weights: Any, discount: Array | float = 1.0) -> SyntheticParams:
         return SyntheticParams(weights=weights, max_steps_in_episode=self.task.max_steps)
-
-    @property
-    def default_params(self) -> SyntheticParams:
-        """Random weights, or those given to `with_default_params`."""
-        return self._default_params or self.params(self.init_weights(jax.random.key(0)))
-
-    def with_default_params(self, params: SyntheticParams) -> "SyntheticEnv":
-        """A copy for callers that rely on `default_params`, such as `gymnax.make`."""
-        env = copy.copy(self)
-        env._default_params = params
-        return env
 
     def predict(
         self, weights: Any, vector: Float[Array, " obs_dim"], action: Array
@@ -123,17 +103,6 @@ class SyntheticEnv(environment.Environment[SyntheticState, SyntheticParams]):
             return jnp.argmax(state.vector).astype(jnp.int32)
         return state.vector
 
-    @property
-    def name(self) -> str:
-        return f"Synthetic-{self.task.name}"
-
-    @property
-    def num_actions(self) -> int:
-        return self.task.env.num_actions
-
-    def action_space(self, params: SyntheticParams | None = None) -> Any:
-        return self.task.env.action_space(self.task.params)
-
     def observation_space(self, params: SyntheticParams | None = None) -> Any:
         """The real task's, a box without its bounds: a learned world need not respect them."""
         from gymnax.environments import spaces
@@ -141,9 +110,3 @@ class SyntheticEnv(environment.Environment[SyntheticState, SyntheticParams]):
         if self.task.num_states is not None:
             return spaces.Discrete(self.task.num_states)
         return spaces.Box(-ABSURD, ABSURD, (self.task.obs_dim,), jnp.float32)
-
-
-@functools.cache
-def make_synthetic(task: envs.Task, config: SyntheticConfig) -> SyntheticEnv:
-    """The SE for a task, built once for each configuration (a new instance would recompile)."""
-    return SyntheticEnv(task, config)

@@ -1,0 +1,151 @@
+"""Agents whose learning rate, batch size, hidden size and depth are drawn anew for each training.
+
+All of them are one program. Learning rate and batch size are traced numbers; a hidden size is that
+of a network in which the other units are switched off (`networks.narrow`), in the smallest of a few
+networks that has room; for each of these, and for each depth, there is a branch. A branch is a real
+one where agents train one after another (`lanes=1`); in lanes all of them would run.
+
+Source: paper, table "Agent hyperparameter ranges" and appendix "Varied Agent Hyperparameters";
+`reference_details.md` 4.9.
+"""
+
+import dataclasses
+import math
+from collections.abc import Callable
+from typing import Any, NamedTuple, get_type_hints
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from sejax.agents.agent import Agent, Draw, with_hparams
+from sejax.errors import require
+
+# Networks of a depth: evenly spaced sizes, since what room to spare costs matters for large ones.
+# With one hidden layer the cost grows with the size, with more of them with its square.
+_NUM_SIZES, _NUM_SIZES_DEEP = 6, 12
+_MULTIPLE = 8  # vector width of a CPU
+
+
+class Range(NamedTuple):
+    """Bounds of a hyperparameter, both included."""
+
+    low: float
+    high: float
+    log: bool
+    integer: bool
+
+
+def ranges_of(config: Any) -> dict[str, Range]:
+    """The ranges around an agent's configuration, of the options that say how they are drawn.
+
+    Those of `option(..., varied=how)`:
+
+    - `triple`: a third to three times the value, log-uniformly.
+    - `one_more_or_less`: from one less, at least 1, to one more.
+    - `tenth_to_one`: in [0.1, 1].
+
+    Raises:
+      ConfigError: if no option says so.
+
+    Source: paper, table "Agent hyperparameter ranges"; tabular agents: `reference_details.md` 4.9.
+    """
+    hints = get_type_hints(type(config))
+    fields = [field for field in dataclasses.fields(config) if field.metadata.get("varied")]
+    require(fields, "agent_hparams", "be default with this agent", "none of its options says how "
+            "it is drawn (sejax.options.option(..., varied=...))", type(config).__name__,
+            "agent_hparams=default")  # fmt: skip
+    # Traced ones first: which key draws what.
+    ordered = sorted(fields, key=lambda field: not field.metadata["traced"])
+    return {
+        field.name: _range(field.metadata["varied"], getattr(config, field.name),
+                           hints[field.name] is int)
+        for field in ordered
+    }  # fmt: skip
+
+
+def _range(how: str, value: Any, integer: bool) -> Range:
+    match how:
+        case "triple" if integer:
+            return Range(max(1, value // 3), 3 * value, True, True)
+        case "triple":
+            return Range(value / 3, 3 * value, True, False)
+        case "one_more_or_less":
+            return Range(max(1, value - 1), value + 1, False, True)
+        case "tenth_to_one":
+            return Range(0.1, 1.0, False, False)
+    raise ValueError(f"varied must be triple, one_more_or_less or tenth_to_one; got {how!r}.")
+
+
+def draw_value(key: Array, bounds: Range) -> Array:
+    """One value, `[]` float32; integers are uniform over themselves, or log-uniform and rounded."""
+    low, high = (bounds.low - 0.5, bounds.high + 0.5) if bounds.integer else bounds[:2]
+    if bounds.log:
+        value = jnp.exp(jax.random.uniform(key, minval=math.log(low), maxval=math.log(high)))
+    else:
+        value = jax.random.uniform(key, minval=low, maxval=high)
+    if bounds.integer:
+        value = jnp.round(value)
+    return jnp.clip(value, bounds.low, bounds.high)
+
+
+def hidden_sizes(bounds: Range, num_layers: int) -> tuple[int, ...]:
+    """Sizes of networks, growing, the last of which has room for all in the range."""
+    parts = _NUM_SIZES if num_layers == 1 else _NUM_SIZES_DEEP
+    step = -(-math.ceil(bounds.high) // (parts * _MULTIPLE)) * _MULTIPLE
+    smallest = math.ceil(bounds.low / step) * step
+    return tuple(range(smallest, math.ceil(bounds.high) + step, step))
+
+
+def make_varied(config: Any, make: Callable[[Any], Agent]) -> Agent:
+    """An agent whose options are drawn anew for each training; see `Agent.fresh`.
+
+    Args:
+      config: of the agent around which they are drawn.
+      make: builds the agent that a configuration like it describes.
+
+    Returns:
+      The agent that `config` describes, with variants that have room for all that may be drawn.
+
+    Raises:
+      ConfigError: if none of its options says how it is drawn.
+    """
+    ranges = ranges_of(config)
+    shapes: list[tuple[int, int]] = []  # (depth, room for hidden units) of each variant, ascending
+    agent = make(config)
+    variants = [agent]
+    if "hidden_size" in ranges:
+        low, high = int(ranges["num_layers"].low), int(ranges["num_layers"].high)
+        shapes = [(depth, size) for depth in range(low, high + 1)
+                  for size in hidden_sizes(ranges["hidden_size"], depth)]  # fmt: skip
+        room = {"batch_size": int(ranges["batch_size"].high)} if "batch_size" in ranges else {}
+        variants = [
+            make(dataclasses.replace(config, num_layers=depth, hidden_size=size, **room))
+            for depth, size in shapes
+        ]
+
+    def draw(key: Array) -> Draw:
+        keys = jax.random.split(key, len(ranges))
+        values = {
+            name: draw_value(k, bounds)
+            for k, (name, bounds) in zip(keys, ranges.items(), strict=True)
+        }
+        traced = {name: x for name, x in values.items() if name != "num_layers"}
+        return Draw(
+            variant=smallest_with_room(shapes, values),
+            hparams=with_hparams(variants[0].hparams, traced),
+            values=values,
+        )
+
+    return dataclasses.replace(agent, variants=tuple(variants), draw=draw)
+
+
+def smallest_with_room(shapes: list[tuple[int, int]], values: dict[str, Array]) -> Array:
+    """Index of the first shape, (depth, hidden units), that has room for what was drawn."""
+    if not shapes:
+        return jnp.int32(0)
+    depths, rooms = jnp.array(shapes).T
+    too_small = (depths < values["num_layers"]) | (
+        (depths == values["num_layers"]) & (rooms < values["hidden_size"])
+    )
+    return jnp.sum(too_small).astype(jnp.int32)

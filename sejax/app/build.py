@@ -1,0 +1,241 @@
+"""A command's configuration: typed, validated, and able to make the objects that it describes."""
+
+import dataclasses
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from sejax import agents, envs, plugins, serialize
+from sejax.errors import ConfigError, one_of, require, require_seed, shortened, whole
+from sejax.trainer import TrainingConfig, steps_before_learning
+
+AGENT_HPARAMS = ("default", "varied")
+EVALUATION_HPARAMS = (*AGENT_HPARAMS, "nes")
+TRAINING_FROM = ("proxy", "config")
+LEARN_GROUPS = ("env", "proxy", "agent", "exploration", "es", "objective")
+EVALUATE_GROUPS = ("agent", "exploration")
+TRAININGS = ("training", "real_training")
+
+
+@dataclass(frozen=True, kw_only=True)
+class LearnConfig:
+    """A whole bilevel optimisation: what `sejax.run` and `sejax.make_learner` take.
+
+    It has no defaults: those are the command's (`sejax.config()`), so that there is one set.
+
+    Raises:
+      ConfigError: for parts that cannot work together.
+    """
+
+    preset: str
+    env: Any
+    proxy: Any
+    agent: Any
+    exploration: Any
+    es: Any
+    objective: Any
+    training: TrainingConfig
+    agent_hparams: str  # default: the agent's; varied: drawn anew for each training
+    generations: int  # n_o
+    seed: int
+    num_seeds: int  # independent runs in one program, with seeds seed, seed + 1, ...
+    stop_when_solved: bool  # a run ends at its first incumbent mean above the threshold
+    lanes: int | None  # agents in lockstep on one device; null: what suits agent and device
+    devices: int | None  # devices to spread the population over; null: all
+    checkpoint_every: int  # generations
+    run_dir: str | None  # null: runs/<env>-<proxy>-<agent>-s<seed>
+
+    def __post_init__(self) -> None:
+        one_of("agent_hparams", self.agent_hparams, AGENT_HPARAMS)
+        whole(1, "generations", self.generations, "there is nothing to do otherwise", 50)
+        require_seed("seed", self.seed)
+        whole(1, "num_seeds", self.num_seeds, "it counts runs", 1)
+        require_seed("seed + num_seeds - 1", self.seed + self.num_seeds - 1)
+        whole(1, "checkpoint_every", self.checkpoint_every, "it counts generations", 1)
+        _require_computing(self)
+        require_real_returns("training", self.training)
+        returns = getattr(self.objective, "scores_are_returns", None)
+        require(not self.stop_when_solved or returns is not False, "stop_when_solved",
+                "be false with this objective", "its scores are not returns, so that none says "
+                "solved", f"true with objective={self.name('objective')}",
+                "stop_when_solved=false")  # fmt: skip
+        facts, task_name = envs.facts_of(self.env), self.name("env")
+        agents.require_fit(self.agent, self.exploration, facts, task_name)
+        if hasattr(self.proxy, "require_task"):
+            self.proxy.require_task(facts, task_name)
+        if getattr(self.proxy, "may_never_end", False):
+            require_learning("training", self.training, self.agent, facts.max_steps)
+
+    def name(self, group: str) -> str:
+        """The name by which a group's choice was made."""
+        return plugins.name_of(group, getattr(self, group))
+
+    def task(self) -> envs.Task:
+        """The real task; it is built once."""
+        return envs.make_from(self.env)
+
+    def parts(self) -> dict[str, Any]:
+        """The objects that it describes, as `sejax.make_learner` takes them."""
+        task = self.task()
+        varied = self.agent_hparams == "varied"
+        return {
+            "task": task,
+            "agent": agents.make_agent(self.agent, task, self.exploration, varied),
+            "proxy": plugins.make("proxy", self.proxy, task),
+            "es": self.es,
+            "objective": plugins.make("objective", self.objective, task),
+            "training": self.training,
+            "stop_when_solved": self.stop_when_solved,
+            "devices": self.devices,
+            "lanes": self.lanes,
+        }
+
+    @property
+    def resolved_run_dir(self) -> Path:
+        explored = self.name("exploration")
+        explored = "" if explored == "none" else f"_{explored}"
+        varied = "_varied" if self.agent_hparams == "varied" else ""
+        agent = f"{self.name('agent')}{explored}{varied}"
+        name = f"{self.name('env')}-{self.name('proxy')}-{agent}-s{self.seed}"
+        return Path(self.run_dir or Path("runs", re.sub(r"[^\w.-]+", "_", name)))
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvaluateConfig:
+    """What `sejax.evaluate` takes. It has no defaults either: see `LearnConfig`."""
+
+    proxy: str
+    env: str | None
+    agent: Any
+    exploration: Any
+    agent_hparams: str
+    training_from: str  # how long agents train: as the proxy was learned, or `training`
+    training: TrainingConfig
+    real_training: TrainingConfig
+    num_agents: int
+    baseline: bool
+    seed: int
+    lanes: int | None
+    devices: int | None
+    out_dir: str | None
+
+    def __post_init__(self) -> None:
+        whole(1, "num_agents", self.num_agents, "there is nothing to average otherwise", 10)
+        one_of("agent_hparams", self.agent_hparams, EVALUATION_HPARAMS)
+        one_of("training_from", self.training_from, TRAINING_FROM)
+        require_seed("seed", self.seed)
+        _require_computing(self)
+        for name, idle, usual in (("agent_hparams", "nes", "default"),
+                                  ("training_from", "config", "proxy")):  # fmt: skip
+            require(self.proxy != "real" or getattr(self, name) != idle, name,
+                    f"be {usual} with proxy=real", "there is no proxy", idle,
+                    f"{name}={usual}")  # fmt: skip
+        self._require_use()
+
+    def _require_use(self) -> None:
+        """Refuses settings that would have no effect."""
+        if self.agent_hparams == "nes":
+            for group, usual in (("agent", "ddqn"), ("exploration", "none")):
+                changed = _differences(group, getattr(self, group), {"name": usual})
+                require(not changed, group, "be left out with agent_hparams=nes", "the proxy says "
+                        "which it was learned with", changed,
+                        "agent_hparams=default")  # fmt: skip
+        instead = "" if self.proxy == "real" else "training_from=config, or "
+        changed = _changes(serialize.to_plain(self.training), serialize.to_plain(TrainingConfig()))
+        require(self.training_from == "config" or not changed, "training", "be left as it is",
+                "agents train on an SE as it was learned with, and else as real_training says",
+                changed, f"{instead}real_training.*")  # fmt: skip
+
+
+def learn_config(values: Mapping[str, Any]) -> LearnConfig:
+    """The configuration of a run from plain values, as `config.yaml` and proxy files hold them.
+
+    Raises:
+      ConfigError: for an unknown, missing or bad field, or parts that cannot work together.
+    """
+    return _from_plain(LearnConfig, LEARN_GROUPS, values)
+
+
+def evaluate_config(values: Mapping[str, Any]) -> EvaluateConfig:
+    """As `learn_config`, for `sejax.evaluate`."""
+    require(values.get("proxy") not in (None, "???"), "proxy", "be given",
+            "agents are trained on it", "none", "proxy=RUN_DIR, proxy=FILE, proxy=cartpole (a "
+            "shipped one) or proxy=real env=cartpole")  # fmt: skip
+    return _from_plain(EvaluateConfig, EVALUATE_GROUPS, values)
+
+
+def to_plain(config: LearnConfig | EvaluateConfig) -> dict[str, Any]:
+    """Inverse of `learn_config` and `evaluate_config`."""
+    groups = LEARN_GROUPS if isinstance(config, LearnConfig) else EVALUATE_GROUPS
+    return {
+        field.name: plugins.describe(field.name, value) if field.name in groups
+        else serialize.to_plain(value) if field.name in TRAININGS else value
+        for field in dataclasses.fields(config)
+        for value in [getattr(config, field.name)]
+    }  # fmt: skip
+
+
+def _from_plain(schema: Any, groups: tuple[str, ...], values: Mapping[str, Any]) -> Any:
+    typed: dict[str, Any] = dict(values)
+    for group in groups:
+        require(group in values, group, "be chosen", "nothing works without", "none",
+                f"{group}=NAME")  # fmt: skip
+        typed[group] = plugins.configure(group, values[group])
+    for name in TRAININGS:
+        if name in values:
+            require(isinstance(values[name], Mapping), name, "have fields", "they say how long "
+                    "agents train", shortened(values[name]), f"{name}.max_episodes=1000")  # fmt: skip
+            typed[name] = serialize.from_plain(TrainingConfig, values[name], name)
+    return serialize.from_plain(schema, typed, "")
+
+
+def require_real_returns(name: str, training: TrainingConfig) -> None:
+    """Checks that the rule by which agents stop on a proxy does not read the proxy's returns.
+
+    Raises:
+      ConfigError: if it does.
+    """
+    require(training.stop_rule != "solved" or training.solved_by == "test",
+            f"{name}.solved_by", "be test with stop_rule=solved", "returns on a proxy say "
+            "nothing about the real task's threshold", training.solved_by,
+            f"{name}.solved_by=test")  # fmt: skip
+
+
+def require_learning(
+    name: str, training: TrainingConfig, agent: Any, max_episode_steps: int
+) -> None:
+    """Checks that a step budget lets an agent learn in a world whose episodes may never end.
+
+    Most SEs with soft ends are such, so that initial episodes take all steps that they may.
+
+    Raises:
+      ConfigError: if it does not.
+    """
+    before = steps_before_learning(agent, max_episode_steps)
+    waits = "update_episodes" if hasattr(agent, "update_episodes") else "init_episodes"
+    require(training.max_steps is None or training.max_steps > before, f"{name}.max_steps",
+            f"exceed {before}", f"{plugins.name_of('agent', agent)} learns nothing before with "
+            f"agent.{waits}={getattr(agent, waits, None)}", training.max_steps,
+            f"{name}.max_steps={4 * before}, or agent.{waits} lower")  # fmt: skip
+
+
+def _require_computing(config: Any) -> None:
+    for name in ("lanes", "devices"):
+        if getattr(config, name) is not None:
+            whole(1, name, getattr(config, name), "something must compute", "null")
+
+
+def _differences(group: str, config: Any, usual: dict[str, Any]) -> str:
+    """Fields of a group that are not as usual, for messages; its name if that differs."""
+    given, expected = plugins.describe(group, config), plugins.defaults(group, usual["name"])
+    return str(given["name"]) if given["name"] != usual["name"] else _changes(given, expected)
+
+
+def _changes(given: dict[str, Any], usual: dict[str, Any]) -> str:
+    return ", ".join(f"{k}={v}" for k, v in given.items() if v != usual.get(k))
+
+
+__all__ = ["ConfigError", "EvaluateConfig", "LearnConfig", "evaluate_config", "learn_config",
+           "to_plain"]  # fmt: skip

@@ -1,0 +1,279 @@
+"""The command line's words to a configuration, by Hydra.
+
+What can be chosen is not written in YAML: the nodes of a group are made from the dataclasses that
+its names stand for (`sejax.plugins`), those of a task's tuned settings from one file for each task
+and proxy (`sejax.app.presets`).
+"""
+
+import re
+import sys
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+from hydra import compose, initialize_config_dir
+from hydra.core.config_store import ConfigStore
+from hydra.core.global_hydra import GlobalHydra
+from hydra.errors import HydraException
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from sejax import agents, envs, plugins, serialize
+from sejax.app import build, presets
+from sejax.errors import ConfigError, nearest, shortened, unknown_name
+from sejax.trainer import TrainingConfig
+
+CONF_DIR = Path(__file__).parents[1] / "conf"
+_DEFAULT_AGENT, _DEFAULT_OBJECTIVE = "ddqn", "max_reward"
+_GROUPS = tuple(plugins.GROUPS)
+_CHOICE = re.compile(rf"(?:\+\+?)?({'|'.join(_GROUPS)}|preset)=(.*)", re.DOTALL)
+
+
+def config(overrides: Sequence[str] = ()) -> build.LearnConfig:
+    """Composes and validates a configuration from command-line overrides.
+
+    Args:
+      overrides: Hydra overrides as typed after `python -m sejax.run`.
+
+    Raises:
+      ConfigError: for an unknown group, choice or field, or a value out of range.
+
+    Example:
+      >>> config(["env=acrobot", "generations=7"]).generations
+      7
+    """
+    return learn_config(_compose("run", overrides))
+
+
+def evaluate_config(overrides: Sequence[str] = ()) -> build.EvaluateConfig:
+    """As `config`, for the words after `python -m sejax.evaluate`."""
+    return evaluate_config_of(_compose("evaluate", overrides))
+
+
+def learn_config(cfg: DictConfig) -> build.LearnConfig:
+    """The typed and validated configuration of a composed Hydra one."""
+    return build.learn_config(to_plain(cfg))
+
+
+def evaluate_config_of(cfg: DictConfig) -> build.EvaluateConfig:
+    """As `learn_config`, for `sejax.evaluate`."""
+    return build.evaluate_config(to_plain(cfg))
+
+
+def to_plain(cfg: DictConfig) -> dict[str, Any]:
+    """A composed configuration as plain values, with every interpolation resolved.
+
+    Raises:
+      ConfigError: for an interpolation of what is not there.
+    """
+    try:
+        plain: Any = OmegaConf.to_container(cfg, resolve=True)
+    except OmegaConfBaseException as error:
+        raise ConfigError(_first_line(error)) from error
+    plain.pop("hydra", None)
+    return plain
+
+
+def _compose(name: str, overrides: Sequence[str]) -> DictConfig:
+    register(name, overrides)
+    try:
+        if GlobalHydra.instance().is_initialized():  # within a command: Hydra knows the folder
+            return compose(name, overrides=list(overrides))
+        with initialize_config_dir(str(CONF_DIR), version_base="1.3"):
+            return compose(name, overrides=list(overrides))
+    except (HydraException, OmegaConfBaseException) as error:
+        raise translate_hydra_error(error, overrides) from error
+
+
+# --- what can be chosen --------------------------------------------------------------------------
+
+
+def register(name: str, overrides: Sequence[str]) -> None:
+    """Makes all choices known to Hydra, those in these words that are somebody's own too.
+
+    Args:
+      name: of the command: run or evaluate.
+      overrides: the words after it.
+
+    Raises:
+      ConfigError: for a choice of somebody's own that cannot be imported.
+    """
+    store = ConfigStore.instance()
+    training = serialize.to_plain(TrainingConfig())
+    base = {"training": training}
+    if name == "evaluate":
+        base["real_training"] = training
+    store.store(name="base", node=base)
+    chosen = _choices(overrides)
+    groups = _GROUPS if name == "run" else build.EVALUATE_GROUPS
+    for group in groups:
+        for choice in dict.fromkeys([*plugins.names(group), *chosen.get(group, ())]):
+            _register_choice(group, choice, choice in chosen.get(group, ()), overrides)
+    if name == "run":
+        _register_presets(chosen)
+
+
+def _choices(overrides: Iterable[str]) -> dict[str, list[str]]:
+    """The choices in the words of a command line, also of sweeps: `env=a,b`."""
+    found: dict[str, list[str]] = {}
+    for match in filter(None, map(_CHOICE.fullmatch, overrides)):
+        values = match[2].removeprefix("choice(").removesuffix(")")
+        choices = [value.strip(" '\"") for value in values.split(",")]
+        found.setdefault(match[1], []).extend(value for value in choices if value)
+    return found
+
+
+def _register_choice(group: str, choice: str, is_chosen: bool, overrides: Sequence[str]) -> None:
+    """A choice with its fields; of those that packages offer, only if it is chosen."""
+    is_own = choice not in plugins.GROUPS[group].built_in
+    known = plugins.is_registered(group, choice) or ":" in choice
+    if not known or (is_own and not is_chosen):
+        if choice in plugins.names(group):
+            _store(group, choice, {"name": choice})
+        return  # Hydra will say that it does not know it
+    node = plugins.defaults(group, choice)
+    changes: dict[str, str] = {}
+    if group == "env":
+        agent = _agent_for(choice, is_own, node, overrides)
+        changes = {"agent": agent} if agent != _DEFAULT_AGENT else {}
+    elif group == "proxy":
+        wanted = getattr(plugins.find(group, choice), "default_objective", _DEFAULT_OBJECTIVE)
+        changes = {"objective": wanted} if wanted != _DEFAULT_OBJECTIVE else {}
+    if changes:  # chooses of another group too, where that is left open
+        defaults = [{f"override /{other}": value} for other, value in changes.items()]
+        _store(group, choice, {"defaults": defaults, group: node}, package="_global_")
+    else:
+        _store(group, choice, node)
+
+
+def _agent_for(choice: str, is_own: bool, node: dict[str, Any], overrides: Sequence[str]) -> str:
+    """The agent that learns in a task where the command line names none."""
+    facts = getattr(plugins.find("env", choice), "facts", None)
+    if facts is None and (not is_own or "agent" in _choices(overrides)):
+        return _DEFAULT_AGENT
+    if facts is None:  # the task must be made to know: with the fields that are asked for
+        from sejax.app.runtime import configure_xla
+
+        given = {word.partition("=")[0]: word.partition("=")[2] for word in overrides}
+        devices = given.get("devices", "")
+        configure_xla(int(devices) if devices.isdigit() and 0 < int(devices) < 2**16 else None)
+        fields = {name.removeprefix("env."): OmegaConf.create({"x": value}).x
+                  for name, value in ((n, _parsed(v)) for n, v in given.items())
+                  if name.startswith("env.")}  # fmt: skip
+        if "???" in {**node, **fields}.values():
+            return _DEFAULT_AGENT  # what is missing is said later
+        facts = envs.facts_of(plugins.configure("env", {**node, **fields}))
+    return agents.default_for(facts)
+
+
+def _parsed(text: str) -> Any:
+    import yaml
+
+    try:
+        return yaml.safe_load(text)
+    except yaml.YAMLError:
+        return text
+
+
+def _register_presets(chosen: dict[str, list[str]]) -> None:
+    """The tuned settings of every pair of a task and a proxy that is known or chosen."""
+    for preset in presets.names():
+        _store("preset", preset, {"preset": preset}, package="_global_")
+    every = {group: dict.fromkeys([*plugins.names(group), *chosen.get(group, ())])
+             for group in ("env", "proxy")}  # fmt: skip
+    for env in every["env"]:
+        for proxy in every["proxy"]:
+            for preset, kind, choice, values in presets.settings(env, proxy):
+                name = f"{env}-{proxy}" + (f"-{choice}" if choice else "")
+                _store(f"{kind}/{preset}", name, dict(values), package="_global_")
+
+
+def _store(group: str, name: str, node: dict[str, Any], package: str | None = None) -> None:
+    """A node for Hydra; a name with slashes is a path in its group."""
+    folder, _, leaf = f"{group}/{name}".rpartition("/")
+    ConfigStore.instance().store(group=folder, name=leaf, node=node, package=package or group)
+
+
+# --- messages ------------------------------------------------------------------------------------
+
+
+def translate_hydra_error(error: Exception, overrides: Iterable[str] = ()) -> ConfigError:
+    """One clear sentence for what Hydra refused; unknown choices get the nearest known ones."""
+    text = str(error)
+    missing = _between(text, "Could not find '", "'")
+    if missing and missing.startswith("tuned/"):
+        return _no_preset(missing.removeprefix("tuned/"))
+    if missing and "Available options" in text:
+        group, _, got = missing.partition("/")
+        if group in plugins.GROUPS:
+            return unknown_name(group, got, plugins.names(group))
+        if group == "preset":
+            return unknown_name(group, got, presets.names())
+    key = _between(text, "Could not override '", "'")
+    if key:
+        return _unknown_field(key, overrides)
+    return ConfigError(_first_line(error))
+
+
+def _no_preset(name: str) -> ConfigError:
+    preset, _, pair = name.partition("/")
+    env, _, proxy = pair.rpartition("-")
+    known = presets.tuned(proxy, preset)
+    fix = f"Set preset=best, or env={known[0]}." if known else "Set preset=best."
+    tasks = f" ({', '.join(known)} with proxy={proxy})" if known else ""
+    return ConfigError(
+        f"preset must be one that the paper or a measurement defines for the task{tasks}, because "
+        f"it holds that task's numbers; got preset={preset} for {env} with proxy={proxy}. {fix}"
+    )
+
+
+def _unknown_field(key: str, overrides: Iterable[str]) -> ConfigError:
+    group, known = key.rpartition(".")[0], _known_fields(_choices(overrides))
+    siblings = [name for name in known if name.rpartition(".")[0] == group]
+    if key in siblings:
+        return ConfigError(
+            f"override must name a field of the chosen {group}, because nothing else is read; "
+            f"got {key}, which another choice of {group} has. See --cfg job for its fields."
+        )
+    in_groups = [name for name in known if name.rpartition(".")[2] == key]
+    ranked = in_groups or nearest(key, siblings or known)
+    return ConfigError(
+        f"override must name a field of the configuration, because nothing else is read; got "
+        f"{shortened(key)}. Did you mean {ranked[0]}? Fields there: {', '.join(ranked)}."
+    )
+
+
+def _known_fields(chosen: dict[str, list[str]]) -> list[str]:
+    """Every field of every choice, and the plain ones."""
+    import dataclasses
+
+    schemas = (build.LearnConfig, build.EvaluateConfig)
+    typed = {*plugins.GROUPS, *build.TRAININGS}
+    known = [f.name for schema in schemas for f in dataclasses.fields(schema)
+             if f.name not in typed]  # fmt: skip
+    for group in plugins.GROUPS:
+        for choice in dict.fromkeys([*plugins.names(group), *chosen.get(group, ())]):
+            try:
+                known += [f"{group}.{name}" for name in plugins.defaults(group, choice)]
+            except ConfigError:
+                continue
+    for training in build.TRAININGS:
+        known += [f"{training}.{f.name}" for f in dataclasses.fields(TrainingConfig)]
+    return list(dict.fromkeys(known))
+
+
+def _between(text: str, start: str, end: str) -> str:
+    _, found, rest = text.partition(start)
+    return rest.partition(end)[0] if found else ""
+
+
+def _first_line(error: Exception) -> str:
+    message = getattr(error, "msg", None) or str(error)
+    key = getattr(error, "full_key", None)
+    line = shortened((str(message).strip().splitlines() or [type(error).__name__])[0], 400)
+    return f"{line.rstrip('.')}{f' in {key}' if key and key not in line else ''}."
+
+
+def main_words() -> list[str]:
+    """The words after a command, without Hydra's own options."""
+    return [word for word in sys.argv[1:] if not word.startswith("--")]

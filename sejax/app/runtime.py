@@ -1,0 +1,80 @@
+"""How the commands start XLA. Libraries that import sejax keep their own settings."""
+
+import hashlib
+import os
+import platform
+import sys
+from pathlib import Path
+
+_NEVER_SECONDS = 1_000_000
+
+
+def available_cores() -> int:
+    """CPU cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def is_started() -> bool:
+    """Whether jax has its devices already."""
+    if "jax" not in sys.modules:
+        return False
+    from jax._src import xla_bridge
+
+    return bool(xla_bridge.backends_are_initialized())
+
+
+def configure_xla(num_devices: int | None = None) -> None:
+    """Sets XLA up for one CPU device per core; must run before jax first computes.
+
+    A flag that the user has set in `XLA_FLAGS` stays. The time limits of collectives are lifted:
+    devices reach the gather at the end of a generation at very different times, and XLA would
+    abort the process after a minute of waiting.
+
+    Args:
+      num_devices: CPU devices; None for one per core.
+
+    Once jax has computed, the flags would have no effect: then nothing is done (a sweep's second
+    job; Python code of a user's).
+    """
+    if is_started():
+        return
+    count = num_devices or available_cores()
+    flags = {
+        "--xla_force_host_platform_device_count": count,
+        "--xla_cpu_multi_thread_eigen": "false",
+        "--xla_cpu_collective_call_warn_stuck_timeout_seconds": _NEVER_SECONDS,
+        "--xla_cpu_collective_call_terminate_timeout_seconds": _NEVER_SECONDS,
+    }
+    given = os.environ.get("XLA_FLAGS", "")
+    added = [f"{flag}={value}" for flag, value in flags.items() if flag not in given]
+    os.environ["XLA_FLAGS"] = " ".join([given, *added]).strip()
+    if count == 1:
+        # With one device XLA would hand pieces of the step to a second thread, which doubles the
+        # CPU time for no gain: the pieces are smaller than the handing over.
+        os.environ.setdefault("NPROC", "1")
+
+
+def enable_compilation_cache() -> None:
+    """Keeps compiled programs between runs, in a folder for this kind of CPU.
+
+    Code compiled for another CPU is rejected or unsafe, so that the folder's name depends on the
+    CPU's model and features. `SEJAX_CACHE_DIR` moves it; set to nothing it switches the cache off.
+    """
+    import jax
+
+    root = os.environ.get("SEJAX_CACHE_DIR", str(Path.home() / ".cache" / "sejax"))
+    if not root or jax.config.jax_compilation_cache_dir:
+        return
+    jax.config.update("jax_compilation_cache_dir", str(Path(root) / cpu_fingerprint()))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
+
+
+def cpu_fingerprint() -> str:
+    """Short name of the host's kind of CPU: its architecture and a hash of model and features."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        described = sorted({x for x in lines if x.startswith(("model name", "flags", "Features"))})
+    except OSError:
+        described = [platform.processor()]
+    digest = hashlib.sha256("\n".join(described).encode()).hexdigest()[:12]
+    return f"{platform.machine()}-{digest}"

@@ -1,1 +1,0 @@
-"""Groups that more than one command takes."""

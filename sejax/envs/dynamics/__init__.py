@@ -1,0 +1,1 @@
+"""Environments that are our own; what gymnax has is taken from there."""

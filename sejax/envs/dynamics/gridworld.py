@@ -1,0 +1,141 @@
+"""Grid worlds drawn as maps of characters.
+
+Source: `docs/reference.md` 6.1 and 6.2.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from gymnax.environments import environment, spaces
+from jaxtyping import Array, Int
+
+CELLS = "S GO#"  # start, floor, goal, hole, wall
+MOVES = ((0, 1), (0, -1), (1, 0), (-1, 0))  # actions RIGHT, LEFT, DOWN, UP: (rows, columns)
+
+
+@struct.dataclass
+class GridState(environment.EnvState):
+    """Where the agent is: `index` = row * number of columns + column, `[]` int32."""
+
+    index: Array
+
+
+@struct.dataclass
+class GridParams(environment.EnvParams):
+    """Reward of a step, by the cell in which it ends; the defaults are the 2x2 room's."""
+
+    step_reward: float = -0.01
+    goal_reward: float = 1.0
+    hole_reward: float = -1.0
+    max_steps_in_episode: int = 10
+
+
+class GridWorld(environment.Environment[GridState, GridParams]):
+    """A deterministic world of cells; a gymnax 1.x `Environment`.
+
+    A move into a wall or off the map stays in place and is paid like the cell it stays in.
+    Entering the goal or a hole terminates. Observations are the cell's index, `[]` int32.
+
+    Example:
+      >>> env = GridWorld(["S ", " G"])
+      >>> obs, state = env.reset_env(None, env.default_params)
+      >>> obs, state, reward, terminated, info = env.step_env(None, state, 2, env.default_params)
+      >>> int(obs), round(float(reward), 2), bool(terminated)
+      (2, -0.01, False)
+    """
+
+    def __init__(self, rows: Sequence[str], params: GridParams | None = None):
+        """Reads a map.
+
+        Args:
+          rows: strings of equal length, of the characters `CELLS`: one S where episodes start,
+            G for goals, O for holes, # for walls and a space for floor.
+          params: `default_params`; those of `GridParams` if not given.
+
+        Raises:
+          ValueError: if the map is no rectangle of these characters with one S.
+        """
+        super().__init__()
+        _check(rows)
+        cells = np.array([list(row) for row in rows])
+        self.rows = tuple(rows)
+        self.num_states = cells.size
+        self._params = params
+        self._start = int(np.flatnonzero(cells == "S")[0])
+        self._goal = (cells == "G").ravel()  # [num_states]
+        self._hole = (cells == "O").ravel()  # [num_states]
+        self._next = _next_indices(cells)  # [num_states, 4]
+
+    @property
+    def default_params(self) -> GridParams:
+        return self._params or GridParams()
+
+    def reset_env(self, key: Array | None, params: GridParams) -> tuple[Array, GridState]:
+        """Puts the agent on the map's S; the key has no effect."""
+        state = GridState(index=jnp.int32(self._start), time=0)
+        return state.index, state
+
+    def step_env(
+        self, key: Array | None, state: GridState, action: Any, params: GridParams
+    ) -> tuple[Int[Array, ""], GridState, Array, Array, dict[Any, Any]]:
+        """Moves by one cell: action 0 RIGHT, 1 LEFT, 2 DOWN, 3 UP, `[]` int32."""
+        index = jnp.asarray(self._next)[state.index, action]
+        state = GridState(index=index, time=state.time + 1)
+        reward = jnp.where(
+            jnp.asarray(self._goal)[index],
+            params.goal_reward,
+            jnp.where(jnp.asarray(self._hole)[index], params.hole_reward, params.step_reward),
+        )
+        info = {"discount": self.discount(state, params)}
+        return index, state, reward, self.is_terminated(state, params), info
+
+    def get_obs(self, state: GridState, params: Any = None, key: Any = None) -> Array:
+        return state.index
+
+    def is_terminated(self, state: GridState, params: GridParams) -> Array:
+        return jnp.asarray(self._goal | self._hole)[state.index]
+
+    @property
+    def num_actions(self) -> int:
+        return len(MOVES)
+
+    def action_space(self, params: GridParams | None = None) -> spaces.Discrete:
+        return spaces.Discrete(len(MOVES))
+
+    def observation_space(self, params: GridParams | None = None) -> spaces.Discrete:
+        return spaces.Discrete(self.num_states)
+
+
+def _check(rows: Sequence[str]) -> None:
+    characters = "".join(rows)
+    if len({len(row) for row in rows}) != 1:
+        raise ValueError(
+            "rows must have one length, because a grid is a rectangle; got lengths "
+            f"{[len(row) for row in rows]}. Fill short rows with spaces."
+        )
+    unknown = sorted(set(characters) - set(CELLS))
+    if unknown:
+        raise ValueError(
+            f"rows must consist of {list(CELLS)}, because nothing else has a meaning; "
+            f"got {unknown}. Use a space for floor."
+        )
+    if characters.count("S") != 1:
+        raise ValueError(
+            "rows must have one S, because each episode starts there; "
+            f"got {characters.count('S')}. Mark one cell with S."
+        )
+
+
+def _next_indices(cells: np.ndarray) -> np.ndarray:
+    """Index reached from each cell by each action, `[num_states, 4]` int32."""
+    padded = np.pad(cells, 1, constant_values="#")
+    index = np.arange(cells.size).reshape(cells.shape)
+    columns = []
+    for down, right in MOVES:
+        target = np.roll(padded, (-down, -right), (0, 1))[1:-1, 1:-1]
+        moved = index + down * cells.shape[1] + right
+        columns.append(np.where(target == "#", index, moved).ravel())
+    return np.stack(columns, axis=1).astype(np.int32)

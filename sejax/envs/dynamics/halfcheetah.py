@@ -1,0 +1,87 @@
+"""HalfCheetah on brax, as a gymnax environment."""
+
+import functools
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from brax.envs.base import State
+from brax.envs.half_cheetah import Halfcheetah
+from flax import struct
+from gymnax.environments import environment, spaces
+from jaxtyping import Array, Float
+
+INFO_KEYS = ("x_position", "x_velocity", "reward_run", "reward_ctrl")
+
+
+@struct.dataclass
+class CheetahState(environment.EnvState):
+    physics: Any  # brax's pipeline state
+    time: Array | int
+
+
+@struct.dataclass
+class CheetahParams(environment.EnvParams):
+    max_steps_in_episode: int = 1000
+
+
+class HalfCheetahEnv(environment.Environment[CheetahState, CheetahParams]):
+    r"""A planar cheetah with six joints that is paid for running forward.
+
+    .. math:: r = v_x - 0.1 \lVert a \rVert^2
+
+    Observations are the positions without the torso's x and all velocities, `[17]`; actions are
+    torques, `[6]` in [-1, 1]. An episode never terminates. `info` has the torso's `x_position` (m),
+    its `x_velocity` over the step (m/s), and the reward's parts `reward_run` and `reward_ctrl`.
+
+    Each reset draws an initial state of its own from the key: brax's wrappers, which go back to one
+    cached state, are not used.
+
+    Source: brax 0.14, `brax.envs.half_cheetah`; Gymnasium's HalfCheetah.
+    """
+
+    def __init__(self, backend: str):
+        super().__init__()
+        self.backend = backend
+        self._brax = Halfcheetah(backend=backend)
+
+    @property
+    def default_params(self) -> CheetahParams:
+        return CheetahParams()
+
+    def reset_env(
+        self, key: Array, params: CheetahParams
+    ) -> tuple[Float[Array, "17"], CheetahState]:
+        state = self._brax.reset(key)
+        return state.obs, CheetahState(physics=state.pipeline_state, time=jnp.int32(0))
+
+    def step_env(
+        self, key: Array | None, state: CheetahState, action: Array, params: CheetahParams
+    ) -> tuple[Float[Array, "17"], CheetahState, Array, Array, dict[Any, Any]]:
+        """One control step of 0.05 s; the key has no effect."""
+        nothing = jnp.float32(0)
+        before = State(state.physics, None, nothing, nothing, dict.fromkeys(INFO_KEYS, nothing))
+        after = self._brax.step(before, action)
+        info = {**after.metrics, "discount": jnp.float32(1)}
+        state = CheetahState(physics=after.pipeline_state, time=state.time + 1)
+        return after.obs, state, after.reward, jnp.bool_(False), info
+
+    def is_terminated(self, state: CheetahState, params: CheetahParams) -> Array:
+        return jnp.bool_(False)
+
+    @property
+    def name(self) -> str:
+        return f"HalfCheetah-{self.backend}"
+
+    def action_space(self, params: CheetahParams | None = None) -> spaces.Box:
+        limits = np.ones(self._brax.action_size, np.float32)
+        return spaces.Box(-limits, limits, limits.shape)
+
+    @functools.cached_property
+    def _obs_shape(self) -> tuple[int, ...]:
+        # brax's `observation_size` plays a reset, op by op.
+        return jax.eval_shape(self._brax.reset, jax.random.key(0)).obs.shape
+
+    def observation_space(self, params: CheetahParams | None = None) -> spaces.Box:
+        return spaces.Box(-jnp.inf, jnp.inf, self._obs_shape)

@@ -1,0 +1,54 @@
+"""Any environment that gymnax knows, by its id: `env=gymnax/MountainCar-v0`."""
+
+import math
+from dataclasses import dataclass
+from typing import ClassVar
+
+from sejax import errors
+from sejax.envs.task import Task
+from sejax.options import Options, counts, option
+
+PREFIX = "gymnax/"
+# Gymnasium's registry defines when these count as solved; nobody does for the others.
+SOLVED_REWARD = {
+    "CartPole-v1": 475.0,
+    "Acrobot-v1": -100.0,
+    "MountainCar-v0": -110.0,
+    "MountainCarContinuous-v0": 90.0,
+    "FrozenLake-misc": 0.7,
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class GymnaxTask(Options):
+    """One of gymnax's environments as it is, or as another package has registered it there.
+
+    Raises:
+      ConfigError: when it is made, for an id that gymnax does not know or cannot make.
+    """
+
+    group: ClassVar[str] = "env"
+
+    name: str = f"{PREFIX}CartPole-v1"
+    solved_reward: float | None = None  # mean return that counts as solved; null: Gymnasium's
+    max_steps: int | None = option(None, counts("an episode has steps"))  # null: gymnax's
+
+    def make(self) -> Task:
+        import gymnax
+        from gymnax.registration import registered_envs
+
+        gymnax_id = self.name.removeprefix(PREFIX)
+        if gymnax_id not in registered_envs:
+            raise errors.unknown_name("env", self.name, [PREFIX + x for x in registered_envs])
+        try:
+            env, params = gymnax.make(gymnax_id)
+        except Exception as error:  # such as a data set that cannot be fetched
+            raise errors.ConfigError(
+                f"env must be an environment that gymnax can make here; {gymnax_id} raised "
+                f"{type(error).__name__}: {error}."
+            ) from error
+        solved = self.solved_reward
+        if solved is None:
+            solved = SOLVED_REWARD.get(gymnax_id, math.inf)
+        return Task(name=self.name, env=env, params=params, solved_reward=solved,
+                    max_steps=self.max_steps)  # fmt: skip

@@ -1,0 +1,130 @@
+"""The contract of a task: a real environment that agents are tested on, and what is known of it."""
+
+import math
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+from sejax import errors
+
+
+class Facts(NamedTuple):
+    """What must be known of a task to tell whether settings can work.
+
+    A task's configuration may state them as its class attribute `facts`: then bad settings are
+    refused before gymnax is imported, which takes seconds. A test holds them against the tasks.
+
+    Attributes:
+      states: "vector" or "discrete".
+      actions: "discrete" or "continuous".
+      max_steps: step limit of an episode.
+      has_info: whether its steps tell more than the observation; see `Task.info_keys`.
+    """
+
+    states: str
+    actions: str
+    max_steps: int
+    has_info: bool = False
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Task:
+    """A real task: what an agent is tested on, and what counts as solved.
+
+    Agents and networks see vectors: an observation that is no `[obs_dim]` float32 vector is
+    flattened, and continuous actions that do not lie in [-x, x] in each dimension are scaled to
+    [-1, 1] (`sejax.envs.wrappers`).
+
+    Attributes:
+      name: what it is called, in files too.
+      env: gymnax 1.x `Environment`. Build a task once: what is compiled for it is kept by identity.
+      params: its `EnvParams`; the environment's `default_params` if not given.
+      solved_reward: mean return per episode at which the task counts as solved; inf if nobody says.
+      max_steps: step limit of an episode; put into `params`, or taken from there if not given.
+      info_keys: entries of a step's `info` that say more of the state than the observation, each
+        `[]`; what reward networks can weigh.
+      augmented_keys: those that describe the state alone, as input for reward networks.
+      origin: plain values that `sejax.envs.make` makes it from again; None for one made by hand,
+        which whoever loads a proxy of it must give.
+
+    Raises:
+      ConfigError: for an observation or action space that is neither discrete nor a bounded box.
+
+    Example:
+      >>> import gymnax
+      >>> env, _ = gymnax.make("MountainCar-v0")
+      >>> task = Task(name="my_car", env=env, solved_reward=-110.0, max_steps=300)
+      >>> task.obs_dim, task.num_actions, task.max_steps
+      (2, 3, 300)
+    """
+
+    name: str
+    env: Any
+    params: Any = None
+    solved_reward: float = math.inf
+    max_steps: int = None  # type: ignore[assignment]  # an int once it is made
+    info_keys: tuple[str, ...] = ()
+    augmented_keys: tuple[str, ...] = ()
+    origin: dict[str, Any] | None = None
+
+    def __post_init__(self) -> None:
+        from sejax.envs.wrappers import as_vectors
+
+        params = self.env.default_params if self.params is None else self.params
+        limit = params.max_steps_in_episode if self.max_steps is None else self.max_steps
+        errors.whole(1, "env.max_steps", limit, "an episode has steps", 200)
+        if self.max_steps is not None and params.max_steps_in_episode != limit:
+            params = params.replace(max_steps_in_episode=limit)
+        object.__setattr__(self, "max_steps", int(limit))
+        object.__setattr__(self, "params", params)
+        object.__setattr__(self, "env", as_vectors(self.env, params, self.name))
+
+    @property
+    def facts(self) -> Facts:
+        """The same facts, from the spaces."""
+        return Facts(
+            states="vector" if self.num_states is None else "discrete",
+            actions="continuous" if self.num_actions is None else "discrete",
+            max_steps=self.max_steps,
+            has_info=bool(self.info_keys),
+        )
+
+    @property
+    def is_solvable(self) -> bool:
+        """Whether it is known what counts as solved."""
+        return math.isfinite(self.solved_reward)
+
+    @property
+    def num_states(self) -> int | None:
+        """Number of states of a task whose observation is an index; None for vectors."""
+        return _num_categories(self.env.observation_space(self.params))
+
+    @property
+    def obs_dim(self) -> int:
+        """Length of the observation that networks see; an index is one-hot to them."""
+        return self.num_states or int(self.env.observation_space(self.params).shape[0])
+
+    @property
+    def num_actions(self) -> int | None:
+        """Number of discrete actions; None for continuous ones."""
+        return _num_categories(self.env.action_space(self.params))
+
+    @property
+    def action_dim(self) -> int:
+        """Length of the action that networks see; a discrete one is one-hot to them."""
+        return self.num_actions or int(self.env.action_space(self.params).shape[0])
+
+    @property
+    def max_action(self) -> float:
+        """Continuous actions lie in [-max_action, max_action]; 1 for discrete ones."""
+        if self.num_actions is not None:
+            return 1.0
+        import numpy as np
+
+        return float(np.max(self.env.action_space(self.params).high))
+
+
+def _num_categories(space: Any) -> int | None:
+    """Size of a gymnax `Discrete` space; None for a `Box`."""
+    from gymnax.environments import spaces
+
+    return int(space.n) if isinstance(space, spaces.Discrete) else None

@@ -1,0 +1,139 @@
+"""evosax's distribution-based algorithms in the place of NES.
+
+This is the one place where a sign is turned: evosax minimises a fitness, scores are maximised.
+"""
+
+import inspect
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import jax.numpy as jnp
+import optax
+from jaxtyping import Array, Float
+
+from sejax.errors import require
+from sejax.es.nes import trials_of
+from sejax.es.strategy import AGGREGATES, Strategy
+from sejax.options import Options, counts, one_of, option, positive, shrinks
+
+# Name -> evosax's class. Listed here because importing evosax takes a second; a test holds the list
+# against evosax's own. Left out are RandomSearch and the two SV algorithms, which have no single
+# mean that could be the incumbent.
+ALGORITHMS = {
+    "ars": "ARS",
+    "asebo": "ASEBO",
+    "cma_anchored_les": "CMAAnchoredLES",
+    "cma_es": "CMA_ES",
+    "cr_fm_nes": "CR_FM_NES",
+    "des": "DES",
+    "esmc": "ESMC",
+    "evotf_es": "EvoTF_ES",
+    "gradientless_descent": "GradientlessDescent",
+    "guided_es": "GuidedES",
+    "hill_climbing": "HillClimbing",
+    "iamalgam_full": "iAMaLGaM_Full",
+    "iamalgam_univariate": "iAMaLGaM_Univariate",
+    "les": "LES",
+    "lm_ma_es": "LM_MA_ES",
+    "ma_es": "MA_ES",
+    "noise_reuse_es": "NoiseReuseES",
+    "open_es": "Open_ES",
+    "persistent_es": "PersistentES",
+    "pgpe": "PGPE",
+    "rm_es": "Rm_ES",
+    "sep_cma_es": "Sep_CMA_ES",
+    "simple_es": "SimpleES",
+    "simulated_annealing": "SimulatedAnnealing",
+    "snes": "SNES",
+    "xnes": "xNES",
+}
+_LARGEST = 1e6
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvosaxConfig(Options):
+    """One of evosax's distribution-based algorithms, with our std and step size.
+
+    Set explicitly because evosax's defaults (std 1, learning rate 1e-3) either destroy a small
+    network or hardly move it.
+    """
+
+    group: ClassVar[str] = "es"
+
+    name: str = option("open_es", one_of(ALGORITHMS))
+    # Candidates in a generation.
+    population_size: int = option(32, counts("scores are compared within a generation", least=2))
+    # Agents trained on the distribution's mean.
+    num_incumbent_evals: int = option(16, counts("the incumbent's score selects the proxy"))
+    # Initial std of the search distribution.
+    noise_std: float = option(0.05, positive("candidates must differ", _LARGEST))
+    # Factor for each generation, where the algorithm takes a schedule.
+    noise_std_decay: float = option(1.0, shrinks())
+    # Learning rate of Adam on the mean, where the algorithm takes one.
+    step_size: float = option(0.05, positive("the mean would not move", _LARGEST))
+    num_evals: int = option(1, counts("a candidate needs a score"))
+    eval_aggregate: str = option("mean", one_of(AGGREGATES))
+    common_random_numbers: bool = False
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require(self.population_size % 2 == 0, "es.population_size", "be even",
+                "evosax's algorithms pair opposite perturbations", self.population_size,
+                f"es.population_size={self.population_size + 1}")  # fmt: skip
+
+    def make(self, num_dims: int) -> Strategy:
+        """The algorithm over vectors of `num_dims` numbers."""
+        return make_evosax(self, num_dims)
+
+
+def make_evosax(config: EvosaxConfig, num_dims: int) -> Strategy:
+    """Builds one of evosax's algorithms, whose mean is the incumbent, over vectors `[num_dims]`."""
+    algorithm, params = _build(config, num_dims)
+
+    def tell(
+        key: Array, members: Array, scores: Array, incumbent_score: Array, state: Any
+    ) -> Any:
+        return algorithm.tell(key, members, finite_fitness(-scores), state, params)[0]
+
+    return Strategy(
+        init=lambda key, mean: algorithm.init(key, mean, params),
+        ask=lambda key, state: algorithm.ask(key, state, params),
+        tell=tell,
+        incumbent=algorithm.get_mean,
+        num_members=config.population_size,
+        trials=trials_of(config, config.num_incumbent_evals),
+    )
+
+
+def _build(config: EvosaxConfig, num_dims: int) -> tuple[Any, Any]:
+    """The algorithm and its params, with our std and step size wherever it takes one."""
+    from evosax.algorithms import distribution_based_algorithms
+
+    cls = distribution_based_algorithms[ALGORITHMS[config.name]]
+    accepted = inspect.signature(cls.__init__).parameters
+    options: dict[str, Any] = {}
+    if "std_schedule" in accepted:
+        options["std_schedule"] = optax.exponential_decay(
+            config.noise_std, transition_steps=1, decay_rate=config.noise_std_decay
+        )
+    if "optimizer" in accepted:
+        natural = config.name in ("snes", "xnes", "des")  # their mean update has a natural scale
+        options["optimizer"] = optax.sgd(1.0) if natural else optax.adam(config.step_size)
+    algorithm = cls(population_size=config.population_size, solution=jnp.zeros(num_dims), **options)
+    params = algorithm.default_params
+    if hasattr(params, "std_init"):
+        params = params.replace(std_init=config.noise_std)
+    return algorithm, params
+
+
+def finite_fitness(fitness: Float[Array, " pop"]) -> Float[Array, " pop"]:
+    """Fitness (minimised) with entries that are not finite just worse than the worst finite one.
+
+    An infinity would poison the algorithms that standardise, so the gap is that between best and
+    worst, or 1.
+    """
+    finite = jnp.isfinite(fitness)
+    worst = jnp.max(jnp.where(finite, fitness, -jnp.inf))
+    best = jnp.min(jnp.where(finite, fitness, jnp.inf))
+    replacement = worst + jnp.maximum(worst - best, 1.0)
+    return jnp.where(finite, fitness, jnp.where(finite.any(), replacement, 0.0))

@@ -1,0 +1,105 @@
+"""Options: the fields of a dataclass that say for themselves what they may be.
+
+A configuration is a frozen dataclass that knows how to make what it configures. Each of its fields
+is written once: name, type, default, and what must hold.
+
+Example:
+  >>> @dataclasses.dataclass(frozen=True, kw_only=True)
+  ... class Config(Options):
+  ...     group: ClassVar[str] = "agent"
+  ...     batch_size: int = option(128, counts())
+  >>> Config(batch_size=0)
+  Traceback (most recent call last):
+  sejax.errors.ConfigError: agent.batch_size must be at least 1, because there is nothing to \
+learn from or with otherwise; got 0. Set agent.batch_size=128.
+"""
+
+import dataclasses
+from collections.abc import Callable, Collection
+from typing import Any, ClassVar
+
+from sejax import errors
+
+Rule = Callable[[str, Any, Any], None]  # (name, value, default) -> None, or raises ConfigError
+
+
+def option(
+    default: Any, rule: Rule | None = None, *, traced: bool = False, varied: str | None = None
+) -> Any:
+    """A dataclass field.
+
+    Args:
+      default: its default; None where it may be left open, which passes any rule.
+      rule: what must hold.
+      traced: whether it is a number that the compiled program takes as an argument, so that a
+        population may vary it without compiling anew. See `traced_options`.
+      varied: how `agent_hparams=varied` draws it; see `sejax.agents.varied`.
+    """
+    metadata = {"rule": rule, "traced": traced, "varied": varied}
+    return dataclasses.field(default=default, metadata=metadata)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Options:
+    """A dataclass whose fields check themselves. `group` is where the command line has them."""
+
+    group: ClassVar[str] = ""
+
+    def __post_init__(self) -> None:
+        check(self, self.group)
+
+
+def check(config: Any, group: str) -> None:
+    """Checks all fields of a dataclass that have a rule.
+
+    Raises:
+      ConfigError: for the first one that does not hold.
+    """
+    for field in dataclasses.fields(config):
+        rule, value = field.metadata.get("rule"), getattr(config, field.name)
+        if rule is not None and not (value is None and field.default is None):
+            rule(f"{group}.{field.name}" if group else field.name, value, field.default)
+
+
+def traced_options(config: Any) -> dict[str, Any]:
+    """Values of the fields that are traced, in the order of the dataclass."""
+    return {
+        field.name: getattr(config, field.name)
+        for field in dataclasses.fields(config)
+        if field.metadata.get("traced")
+    }
+
+
+def counts(reason: str = "there is nothing to learn from or with otherwise", least: int = 1) -> Rule:
+    """A whole number from `least` on."""
+    return lambda name, value, default: errors.whole(
+        least, name, value, reason, "null" if default is None else default
+    )
+
+
+def not_negative(reason: str = "it is a size") -> Rule:
+    """A number from 0 on."""
+    return lambda name, value, default: errors.at_least(0, name, value, reason, default)
+
+
+def positive(reason: str, at_most: float = float("inf")) -> Rule:
+    """A number above 0."""
+    return lambda name, value, default: errors.positive(name, value, reason, default, at_most)
+
+
+def fraction() -> Rule:
+    """A number in [0, 1]."""
+    return lambda name, value, default: errors.fraction(name, value, default)
+
+
+def shrinks() -> Rule:
+    """A factor in (0, 1]."""
+    return lambda name, value, default: errors.require(
+        errors.is_number(value) and 0 < value <= 1, name, "lie in (0, 1]",
+        "it shrinks each generation", value, f"{name}={default:g}",
+    )  # fmt: skip
+
+
+def one_of(known: Collection[str]) -> Rule:
+    """One of these names."""
+    return lambda name, value, default: errors.one_of(name, value, known)

@@ -1,0 +1,511 @@
+"""Proxies as files: safetensors with all that is needed to rebuild the network.
+
+A file holds one proxy or a set of proxies that share a configuration; a set's tensors have a
+leading axis over its proxies. The metadata is plain data under one key: the format version, the
+configuration, the agents' discount, of each proxy its score, generation and seed, and a digest of
+all of it. Nothing in a file is executed, resolved or imported when it is read.
+"""
+
+import dataclasses
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from flax.traverse_util import flatten_dict, unflatten_dict
+from safetensors import SafetensorError, safe_open
+from safetensors.numpy import save_file
+
+from sejax import envs, plugins
+from sejax.envs.task import Task
+from sejax.errors import ConfigError, require, shortened, unknown_name
+from sejax.files import atomic_path
+from sejax.proxies.proxy import ProxyEnv
+
+FORMAT_VERSION = 2
+PRETRAINED_DIR = Path(__file__).parents[1] / "pretrained"
+_KEY = "sejax"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Proxy:
+    """A stored proxy.
+
+    Attributes:
+      env: the SE or RN, a gymnax environment.
+      params: its `EnvParams`: the weights, and the discount of the agent it was learned with.
+      record: what is known of it: `score`, `generation` and `seed`, where they are.
+      config: what it was learned with, nested plain values.
+      path: the file.
+    """
+
+    env: ProxyEnv
+    params: Any
+    record: dict[str, Any]
+    config: dict[str, Any]
+    path: Path
+
+    @property
+    def task(self) -> Task:
+        return self.env.task
+
+
+@dataclass(frozen=True, kw_only=True)
+class ProxySet:
+    """Proxies that share a configuration, and hence every compiled program.
+
+    Attributes:
+      env: the SE or RN; its weights are what differs.
+      weights: leaves `[size, ...]`, NumPy float32.
+      records: of each what is known of it: `score` (incumbent mean that it was chosen for),
+        `generation` (that measured it) and `seed` (of its run).
+      config: that they were learned with, nested plain values; its seed is the first run's.
+      discount: of the agent that they were learned with.
+      path: the file.
+    """
+
+    env: ProxyEnv
+    weights: Any
+    records: tuple[dict[str, Any], ...]
+    config: dict[str, Any]
+    discount: float
+    path: Path
+
+    @property
+    def task(self) -> Task:
+        return self.env.task
+
+    @property
+    def size(self) -> int:
+        return len(self.records)
+
+    @property
+    def scores(self) -> np.ndarray:
+        """`[size]` float64; nan where there is none."""
+        return np.array([record.get("score") for record in self.records], float)
+
+    @property
+    def seeds(self) -> np.ndarray:
+        """`[size]`; -1 where there is none."""
+        return np.array([record.get("seed", -1) for record in self.records])
+
+    @property
+    def params(self) -> Any:
+        """All proxies as one `EnvParams`; only `weights` has the leading axis."""
+        return self.env.params(self.weights, self.discount)
+
+    def one(self, index: int) -> Any:
+        """`EnvParams` of one of them, as `sejax.load` gives them."""
+        weights = jax.tree.map(lambda x: jax.numpy.asarray(x[index]), self.weights)
+        return self.env.params(weights, self.discount)
+
+    def proxy(self, index: int) -> Proxy:
+        """One of them."""
+        return Proxy(env=self.env, params=self.one(index), record=self.records[index],
+                     config=self.config, path=self.path)  # fmt: skip
+
+    def fingerprint(self, index: int) -> str:
+        """Eight letters that tell one's weights from another's."""
+        flat = flatten_dict(self.weights, sep="/")
+        content = b"".join(np.ascontiguousarray(flat[name][index]).tobytes()
+                           for name in sorted(flat))  # fmt: skip
+        return hashlib.sha256(content).hexdigest()[:8]
+
+    def first(self, count: int | None) -> "ProxySet":
+        """The first ones of the set: those of the first runs, whatever their score."""
+        return self.select(range(self.size)[:count])
+
+    def solved(self) -> "ProxySet":
+        """Those whose score, a mean return, reached the task's threshold."""
+        return self.select(np.flatnonzero(self.scores >= self.task.solved_reward))
+
+    def ranked(self, count: int, worst: bool = False) -> "ProxySet":
+        """Those with the highest scores, the best first; or the lowest, the worst first."""
+        order = np.argsort(self.scores, kind="stable")
+        return self.select((order if worst else order[::-1])[:count])
+
+    def select(self, indices: Sequence[int] | np.ndarray) -> "ProxySet":
+        """Those at these places, in this order."""
+        places = np.asarray(indices, int)
+        return dataclasses.replace(
+            self,
+            weights=jax.tree.map(lambda x: x[places], self.weights),
+            records=tuple(self.records[i] for i in places),
+        )
+
+
+# --- writing -------------------------------------------------------------------------------------
+
+
+def save(
+    path: str | Path,
+    env: ProxyEnv,
+    weights: Any,
+    config: Mapping[str, Any] | None = None,
+    discount: float = 1.0,
+    **record: Any,
+) -> None:
+    """Writes a proxy atomically.
+
+    Args:
+      path: the file, `*.safetensors`.
+      env: the proxy.
+      weights: as from its `init_weights`.
+      config: what it was learned with, nested plain values; task and kind of proxy are added.
+      discount: of the agent that it was learned with, which a potential-based RN pays with.
+      **record: plain values to keep with it, such as `score`, `generation` and `seed`.
+
+    Raises:
+      OSError: if it cannot be written; an older file stays as it was.
+
+    Example:
+      >>> import tempfile
+      >>> env, params = load("cartpole")
+      >>> path = Path(tempfile.mkdtemp(), "mine.safetensors")
+      >>> save(path, env, params.weights, score=195.0)
+      >>> load_proxy(path).record
+      {'score': 195.0}
+    """
+    tensors = {name: np.asarray(x) for name, x in flatten_dict(weights, sep="/").items()}
+    _write(Path(path), env, tensors, config, discount, [record], is_set=False)
+
+
+def save_set(
+    path: str | Path,
+    env: ProxyEnv,
+    weights: Sequence[Any],
+    records: Sequence[Mapping[str, Any]],
+    config: Mapping[str, Any] | None = None,
+    discount: float = 1.0,
+) -> None:
+    """Writes a set of proxies atomically; arguments as of `save`, with a record for each.
+
+    Raises:
+      OSError: if it cannot be written; an older file stays as it was.
+    """
+    flat = [flatten_dict(one, sep="/") for one in weights]
+    tensors = {name: np.stack([np.asarray(one[name], np.float32) for one in flat])
+               for name in flat[0]}  # fmt: skip
+    _write(Path(path), env, tensors, config, discount, records, is_set=True)
+
+
+def _write(
+    path: Path, env: ProxyEnv, tensors: dict[str, np.ndarray], config: Mapping[str, Any] | None,
+    discount: float, records: Sequence[Mapping[str, Any]], is_set: bool,
+) -> None:  # fmt: skip
+    known = {
+        "env": env.task.origin or {"name": env.task.name},
+        "proxy": plugins.describe("proxy", env.config),
+    }
+    header: dict[str, Any] = {
+        "format_version": FORMAT_VERSION,
+        "task": env.task.name,
+        "config": known | dict(config or {}) | {"run_dir": None},  # no path of a machine
+        "discount": float(discount),
+        "is_set": is_set,
+        "proxies": [dict(record) for record in records],
+    }
+    header["digest"] = _digest(tensors, header)
+    try:
+        with atomic_path(path) as temporary:
+            # One entry: safetensors writes several in random order.
+            save_file(tensors, temporary, metadata={_KEY: json.dumps(header)})
+    except SafetensorError as error:
+        raise OSError(f"{path} could not be written ({error})") from error
+
+
+def _digest(tensors: Mapping[str, np.ndarray], header: Mapping[str, Any]) -> str:
+    """Of all that a file says."""
+    content = hashlib.sha256()
+    for name in sorted(tensors):
+        x = np.ascontiguousarray(tensors[name])
+        content.update(f"{name} {x.dtype} {x.shape}".encode() + x.tobytes())
+    content.update(json.dumps({k: v for k, v in header.items() if k != "digest"}).encode())
+    return content.hexdigest()
+
+
+# --- reading -------------------------------------------------------------------------------------
+
+
+def load(
+    source: str | Path, task: Task | None = None, proxy: Any = None
+) -> tuple[ProxyEnv, Any]:
+    """Loads a proxy as a gymnax environment and its params (the weights).
+
+    The discount of a potential-based RN is that of the agent it was learned with. For another one
+    take `params.replace(discount=...)`; `make_trainer` does so by itself.
+
+    Args:
+      source: a run directory, a safetensors file, or the name of a proxy that ships with the
+        package (`pretrained_names()`).
+      task: of the proxy; needed if it is none that a registered name makes, as a file's names are
+        never imported.
+      proxy: its configuration; needed likewise for a kind of proxy of your own.
+
+    Raises:
+      ConfigError: if there is no such proxy, the file is damaged or of another format, it holds
+        several, or its task or kind is not known.
+
+    Example:
+      >>> env, params = load("cartpole")
+      >>> obs, state = env.reset(jax.random.key(0), params)
+      >>> obs.shape
+      (4,)
+    """
+    loaded = load_proxy(source, task, proxy)
+    return loaded.env, loaded.params
+
+
+def load_proxy(
+    source: str | Path, task: Task | None = None, proxy: Any = None, option: str = "source"
+) -> Proxy:
+    """As `load`, with the real task, the configuration and the record.
+
+    Args:
+      source: as of `load`.
+      task: likewise.
+      proxy: likewise.
+      option: what messages call `source`.
+    """
+    proxies = load_set(source, task, proxy, option)
+    require(proxies.size == 1, option, "be a single proxy", "an agent trains in one world",
+            f"{proxies.path}, a set of {proxies.size}", f"{option} to a run directory; "
+            "sejax.load_set reads sets")  # fmt: skip
+    return proxies.proxy(0)
+
+
+def load_set(
+    source: str | Path,
+    task: Task | None = None,
+    proxy: Any = None,
+    option: str = "source",
+    kind: str | None = None,
+) -> ProxySet:
+    """Loads a set of proxies; a single stored one is a set of one.
+
+    Args:
+      source: a file of `save_set`, or whatever `load` takes.
+      task: as of `load`.
+      proxy: likewise.
+      option: what messages call `source`.
+      kind: "se" or "rn", which the proxies must be; None for any.
+
+    Raises:
+      ConfigError: as `load`, or if its proxies are of another kind.
+
+    Example:
+      >>> rns = load_set("cliff_walking-rn")  # or a file in results/reward_networks
+      >>> env, params = rns.env, rns.one(0)
+      >>> rns.size, params.discount
+      (1, 0.8)
+    """
+    path = find(source, option)
+    tensors, header = _read(path, option)
+    config = header["config"]
+    name = config["proxy"].get("name")
+    require(kind in (None, name), option, f"hold proxies learned with proxy={kind}",
+            "these are what is studied", f"proxy={name}",
+            f"{option} to a file of those")  # fmt: skip
+    env = _env_of(path, header, task, proxy, option)
+    if not header["is_set"]:
+        tensors = {name: x[None] for name, x in tensors.items()}
+    _check_tensors(path, option, env, tensors, len(header["proxies"]))
+    weights = unflatten_dict({tuple(name.split("/")): x for name, x in tensors.items()})
+    return ProxySet(env=env, weights=weights, records=tuple(header["proxies"]), config=config,
+                    discount=header["discount"], path=path)  # fmt: skip
+
+
+def find(source: str | Path, option: str = "source") -> Path:
+    """The file that a run directory, a path or a shipped name stands for."""
+    path, text = Path(source), shortened(source)
+    try:
+        is_dir, is_file = path.is_dir(), path.is_file()
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"{option} must be a path; got {text} ({type(error).__name__}).") from None
+    if is_dir:
+        path = path / "proxy.safetensors"
+        is_run = (path.parent / "config.yaml").exists()
+        require(path.exists(), option, "be a run directory with a proxy.safetensors", "the run has "
+                "not finished a generation yet" if is_run else "this is a folder of another sort",
+                str(path.parent), f"{option} to a file, or finish the run first" if is_run else
+                f"{option} to a run directory or a file")  # fmt: skip
+        return path
+    if is_file:
+        return path
+    if path.suffix or len(path.parts) != 1:
+        raise ConfigError(
+            f"{option} must be a run directory, a safetensors file or a shipped name, because "
+            f"weights are read from it; got {text}, which does not exist. Shipped names: "
+            f"{', '.join(pretrained_names())}."
+        )
+    shipped = PRETRAINED_DIR / f"{source}.safetensors"
+    if shipped.is_file():
+        return shipped
+    raise unknown_name(option, str(source), pretrained_names())
+
+
+def pretrained_names() -> list[str]:
+    """Names of the proxies that ship with the package."""
+    return sorted(path.stem for path in PRETRAINED_DIR.glob("*.safetensors"))
+
+
+def _read(path: Path, option: str) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """Tensors and header of a file, checked against its digest and brought to this format."""
+    try:
+        with safe_open(path, framework="np") as file:
+            metadata = dict(file.metadata() or {})
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    except (SafetensorError, OSError, ValueError, TypeError) as error:
+        raise _damaged(path, option, str(error)) from error
+    try:
+        stored = json.loads(metadata.get(_KEY) or metadata["sejax_set"])
+        header = _as_current(stored, is_set=_KEY not in metadata)
+        if header is not None:
+            _check_header(header)
+    except (KeyError, ValueError, TypeError, AttributeError, RecursionError) as error:
+        raise ConfigError(
+            f"{option} must be a file that sejax has written, because the network is rebuilt from "
+            f"its metadata; {path} has none that is valid ({type(error).__name__}: "
+            f"{shortened(error)}). Learn it again."
+        ) from error
+    if header is None:
+        raise ConfigError(
+            f"{option} must be of format {FORMAT_VERSION} or older, because this version of sejax "
+            f"reads no other; {path} has {shortened(stored.get('format_version'))}. Update sejax."
+        )
+    if "digest" in header and header["digest"] != _digest(tensors, header):
+        raise _damaged(path, option, "its contents do not match its digest")
+    return tensors, header
+
+
+def _damaged(path: Path, option: str, how: str) -> ConfigError:
+    return ConfigError(
+        f"{option} must be a whole safetensors file, because weights are read from it; got {path}, "
+        f"which is damaged ({shortened(how)}). The command that wrote it writes it anew from its "
+        f"checkpoint."
+    )
+
+
+def _check_header(header: dict[str, Any]) -> None:
+    """Raises ValueError for metadata of another shape."""
+    config = header["config"]
+    if not all(isinstance(config[group], Mapping) for group in ("env", "proxy")):
+        raise ValueError("no task or proxy")
+    records = header["proxies"]
+    if not records or not all(isinstance(record, Mapping) for record in records):
+        raise ValueError("no records")
+    for record in records:
+        float(record.get("score", 0)), int(record.get("seed", 0))
+    header["discount"] = float(header["discount"])
+
+
+def _as_current(stored: Any, is_set: bool) -> dict[str, Any] | None:
+    """A header as this version has it; None for one of a later version."""
+    version = stored["format_version"]
+    if not isinstance(version, int) or not 1 <= version <= FORMAT_VERSION:
+        return None
+    if version == FORMAT_VERSION:
+        return dict(stored)
+    # Version 1 had two kinds of files, and no digest; see CHANGELOG.
+    config = _upgraded(stored["config"])
+    names = ("score", "generation", "seed")
+    if is_set:
+        columns = [stored[f"{name}s"] for name in names]
+        records = [dict(zip(names, row, strict=True)) for row in zip(*columns, strict=True)]
+    else:
+        records = [{k: v for k, v in stored.items() if k not in ("format_version", "config")}]
+    agent = config.get("agent") or {}
+    return {"format_version": FORMAT_VERSION, "task": config["env"]["name"], "config": config,
+            "discount": agent.get("discount", 1.0), "is_set": is_set,
+            "proxies": records}  # fmt: skip
+
+
+def _upgraded(config: Any) -> dict[str, Any]:
+    """A configuration of version 1, in which choices had the fields of all of their kind."""
+    config = dict(config)
+    config["env"] = {k: v for k, v in config["env"].items() if v is not None}
+    config.setdefault("exploration", {"name": "none"})
+    objective = dict(config.get("objective") or {"name": "max_reward"})
+    if objective["name"] != "reward_threshold":
+        objective.pop("unsolved_weight", None)
+    return config | {"objective": objective}
+
+
+def _env_of(
+    path: Path, header: dict[str, Any], task: Task | None, proxy: Any, option: str
+) -> ProxyEnv:
+    """The environment that a file's metadata describes."""
+    config = header["config"]
+    if task is None:
+        name = config["env"].get("name")
+        if not plugins.is_registered("env", str(name)):
+            raise ConfigError(
+                f"{option} must be a proxy of a registered task if no task is given, because what "
+                f"a file names is never imported; {path} is one of {shortened(name)!r}. Give the "
+                f"task: sejax.load(path, task=my_task), or env={shortened(name)} on the command "
+                f"line."
+            )
+        task = envs.make_from(plugins.configure("env", config["env"]))
+    require(header["task"] == task.name, option, f"be a proxy of {task.name}", "that is the task "
+            "given", f"one of {shortened(header['task'])} in {path}",
+            f"{option} to a proxy of {task.name}, or another task")  # fmt: skip
+    if proxy is None:
+        name = config["proxy"].get("name")
+        if not plugins.is_registered("proxy", str(name)):
+            raise ConfigError(
+                f"{option} must be of a registered kind if no proxy is given, because what a file "
+                f"names is never imported; {path} is a {shortened(name)!r}. Give its configuration:"
+                f" sejax.load(path, proxy=MyProxy()), or proxy_kind={shortened(name)} on the "
+                f"command line."
+            )
+        proxy = plugins.configure("proxy", config["proxy"])
+    return plugins.make("proxy", proxy, task)
+
+
+def _check_tensors(
+    path: Path, option: str, env: ProxyEnv, tensors: dict[str, np.ndarray], count: int
+) -> None:
+    expected = flatten_dict(jax.eval_shape(env.init_weights, jax.random.key(0)), sep="/")
+    wanted = {name: ("float32", (count, *x.shape)) for name, x in expected.items()}
+    there = {name: (str(x.dtype), x.shape) for name, x in tensors.items()}
+    finite = there == wanted and all(np.isfinite(x).all() for x in tensors.values())
+    if not finite:
+        what = "numbers that are not finite" if there == wanted else shortened(there)
+        raise ConfigError(
+            f"{option} must hold the tensors of the network in its metadata, because they are its "
+            f"weights; {path} has {what} in place of {shortened(wanted)}. Learn it again."
+        )
+
+
+# --- gymnax --------------------------------------------------------------------------------------
+
+
+def register_gymnax() -> list[str]:
+    """Registers the shipped proxies with gymnax as `sejax/<name>`; may be called repeatedly.
+
+    Returns:
+      The ids, for `gymnax.make`. The environment's `default_params` are the learned weights.
+    """
+    import gymnax
+    from gymnax.registration import registered_envs
+
+    ids = [f"sejax/{name}" for name in pretrained_names()]
+    for env_id in ids:
+        if env_id not in registered_envs:
+            gymnax.register(env_id, _Factory(env_id.removeprefix("sejax/")))
+    return ids
+
+
+@dataclass(frozen=True)
+class _Factory:
+    """Makes a shipped proxy whose default params are its weights."""
+
+    name: str
+
+    def __call__(self) -> Any:
+        env, params = load(self.name)
+        return env.with_default_params(params)

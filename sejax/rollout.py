@@ -1,0 +1,129 @@
+"""Greedy episodes of an agent on the real task: their returns, or every step of them.
+
+Source: paper, Algorithm 1, EvaluateAgent.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+from jaxtyping import Array, Bool, Float
+
+from sejax.agents.agent import Agent
+from sejax.loops import while_any_active
+
+
+class Steps(NamedTuple):
+    """Steps of greedy episodes, leaves `[step, ...]`; rows after an episode's end are not valid."""
+
+    obs: Array
+    action: Array
+    next_obs: Array
+    reward: Float[Array, " step"]
+    terminated: Bool[Array, " step"]
+    valid: Bool[Array, " step"]
+
+
+@struct.dataclass
+class _Episode:
+    """Carry of an episode."""
+
+    active: Array
+    num_steps: Array  # of the task
+    total: Array
+    obs: Array
+    env_state: Any
+
+
+class _Greedy:
+    """One greedy episode of an agent on a task: how it begins, and its every step."""
+
+    def __init__(self, agent: Agent, task: Any):
+        from sejax.envs.wrappers import repeat_actions
+
+        self.agent, self.params = agent, task.params
+        self.env = repeat_actions(task.env, agent.action_repeat)
+
+    def begin(self, key: Array, active: Array | bool) -> _Episode:
+        obs, env_state = self.env.reset_env(key, self.params)
+        return _Episode(
+            active=jnp.asarray(active),
+            num_steps=jnp.int32(0),
+            total=jnp.float32(0),
+            obs=obs,
+            env_state=env_state,
+        )
+
+    def step(self, key: Array, agent_state: Any, before: _Episode) -> tuple[_Episode, Steps]:
+        """The episode after a decision, and the decision."""
+        key_act, key_env = jax.random.split(key)
+        action = self.agent.act(key_act, agent_state, before.obs, explore=False)
+        action = self.agent.env_action(action)
+        obs, env_state, reward, terminated, info = self.env.step_env(
+            key_env, before.env_state, action, self.params
+        )
+        ended = terminated | self.env.is_truncated(env_state, self.params)
+        after = _Episode(
+            active=~ended,
+            num_steps=before.num_steps + info.get("num_steps", 1),
+            total=before.total + reward,
+            obs=obs,
+            env_state=env_state,
+        )
+        made = Steps(before.obs, action, obs, jnp.float32(reward), terminated, before.active)
+        return after, made
+
+
+def make_tester(agent: Agent, task: Any, num_episodes: int) -> Callable[..., Any]:
+    """Builds `test(key, agent_state, active=True) -> (returns, steps)`, both `[num_episodes]`.
+
+    Episodes on the real task without exploration, each from a fresh initial state. With
+    `active=False` nothing is played and all are 0.
+    """
+    greedy = _Greedy(agent, task)
+
+    def step(nothing: Array, state: _Episode, consts: Any, masked: bool) -> tuple[Array, _Episode]:
+        key, agent_state = consts
+        after, _ = greedy.step(jax.random.fold_in(key, state.num_steps), agent_state, state)
+        return nothing, after
+
+    def episode(key: Array, agent_state: Any, active: Array | bool) -> tuple[Array, Array]:
+        key_reset, key_steps = jax.random.split(key)
+        state = greedy.begin(key_reset, active)
+        _, state = while_any_active(step, jnp.zeros(0), state, (key_steps, agent_state))
+        return state.total, state.num_steps
+
+    def test(key: Array, agent_state: Any, active: Array | bool = True) -> tuple[Array, Array]:
+        keys = jax.random.split(key, num_episodes)
+        return jax.vmap(episode, in_axes=(0, None, None))(keys, agent_state, active)
+
+    return test
+
+
+def make_recorder(agent: Agent, task: Any, num_episodes: int) -> Callable[[Array, Any], Steps]:
+    """Builds `record(key, agent_state) -> Steps`, leaves `[num_episodes * max_steps, ...]`.
+
+    The episodes are those of `make_tester` with the same key. A decision that an agent repeats is
+    one step here.
+    """
+    greedy = _Greedy(agent, task)
+
+    def episode(key: Array, agent_state: Any) -> Steps:
+        key_reset, key_steps = jax.random.split(key)
+
+        def step(state: _Episode, _: None) -> tuple[_Episode, Steps]:
+            key_step = jax.random.fold_in(key_steps, state.num_steps)
+            after, made = greedy.step(key_step, agent_state, state)
+            return after.replace(active=state.active & after.active), made
+
+        start = greedy.begin(key_reset, True)
+        return jax.lax.scan(step, start, length=-(-task.max_steps // agent.action_repeat))[1]
+
+    def record(key: Array, agent_state: Any) -> Steps:
+        keys = jax.random.split(key, num_episodes)
+        steps = jax.vmap(episode, in_axes=(0, None))(keys, agent_state)
+        return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), steps)
+
+    return record

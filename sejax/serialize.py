@@ -1,0 +1,122 @@
+"""Dataclasses as plain values and back: what files, the command line and messages hold.
+
+Values are taken as they are meant (`1` for a float, a list for a tuple) and never guessed: nothing
+in them is resolved, imported or executed.
+"""
+
+import dataclasses
+import types
+import typing
+from collections.abc import Mapping
+from typing import Any
+
+from sejax.errors import ConfigError, nearest, require, shortened
+
+_WORDS = {bool: "true or false", int: "a whole number", float: "a number", str: "a word"}
+
+
+def to_plain(config: Any) -> dict[str, Any]:
+    """The fields of a dataclass as plain values: numbers, words, None, lists and dictionaries."""
+    return {field.name: _plain(getattr(config, field.name)) for field in dataclasses.fields(config)}
+
+
+def from_plain(cls: Any, values: Mapping[str, Any], where: str) -> Any:
+    """Inverse of `to_plain`.
+
+    Args:
+      cls: a dataclass.
+      values: by the names of its fields; those left out have their defaults.
+      where: what messages call it, as `agent` in `agent.batch_size`; may be empty.
+
+    Raises:
+      ConfigError: for a field that is not there, is missing, or has a value of another type.
+    """
+    fields = {field.name: field for field in dataclasses.fields(cls) if field.init}
+    hints = typing.get_type_hints(cls)
+    given = {}
+    for name, value in values.items():
+        if name not in fields:
+            known = nearest(str(name), fields)
+            raise ConfigError(
+                f"{_join(where, name)} must be a field of {cls.__name__}, because nothing else is "
+                f"read; got {shortened(value)}. Fields there: {', '.join(known) or 'none'}."
+            )
+        given[name] = _convert(value, hints[name], _join(where, name), fields[name])
+    for name, field in fields.items():
+        has_default = field.default is not dataclasses.MISSING
+        if name not in given and not has_default and field.default_factory is dataclasses.MISSING:
+            raise ConfigError(
+                f"{_join(where, name)} must be given, because it has no default; got none. "
+                f"Set {_join(where, name)}=VALUE."
+            )
+    return cls(**given)
+
+
+def flatten(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Nested settings as `{"group.field": value}`."""
+    flat: dict[str, Any] = {}
+    for key, value in values.items():
+        if isinstance(value, Mapping):
+            flat |= flatten(value, f"{prefix}{key}.")
+        else:
+            flat[f"{prefix}{key}"] = value
+    return flat
+
+
+def _join(where: str, name: str) -> str:
+    return f"{where}.{shortened(name)}" if where else shortened(name)
+
+
+def _plain(value: Any) -> Any:
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return to_plain(value)
+    if isinstance(value, tuple | list):
+        return [_plain(x) for x in value]
+    if isinstance(value, Mapping):
+        return {str(key): _plain(x) for key, x in value.items()}
+    return value
+
+
+def _convert(value: Any, hint: Any, name: str, field: Any) -> Any:
+    """A value as its field's type, or an error that says which that is."""
+    if hint is Any:
+        return value
+    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
+    if origin in (types.UnionType, typing.Union):
+        if value is None and type(None) in arguments:
+            return None
+        hint = next(kind for kind in arguments if kind is not type(None))
+        return _convert(value, hint, name, field)
+    if origin is typing.Literal:
+        require(value in arguments, name, f"be one of {', '.join(map(str, arguments))}",
+                "nothing else is known", value, f"{name}={arguments[0]}")  # fmt: skip
+        return value
+    if origin in (tuple, list) or hint in (tuple, list):
+        require(isinstance(value, list | tuple), name, "be a list", "it holds several values",
+                repr(value), f"{name}=[...]")  # fmt: skip
+        kind = arguments[0] if arguments else Any
+        return (origin or hint)(_convert(x, kind, name, field) for x in value)
+    if dataclasses.is_dataclass(hint) and isinstance(value, Mapping):
+        return from_plain(hint, value, name)
+    if hint in _WORDS:
+        return _scalar(value, hint, name, field)
+    return value
+
+
+def _scalar(value: Any, kind: type, name: str, field: Any) -> Any:
+    fits = type(value) is kind
+    if kind is float and type(value) is int and abs(value) < 2**1000:
+        return float(value)
+    if kind is int and type(value) is float and value.is_integer() and abs(value) < 2**53:
+        return int(value)
+    if kind is str and type(value) in (int, float):  # a name of digits, as of a folder
+        return str(value)
+    usual = "VALUE" if field.default is dataclasses.MISSING else _text(field.default)
+    require(fits, name, f"be {_WORDS[kind]}", "that is its type", repr(value), f"{name}={usual}")
+    return value
+
+
+def _text(value: Any) -> str:
+    """A value as the command line takes it."""
+    return {None: "null", True: "true", False: "false"}.get(value, str(value)) \
+        if isinstance(value, bool | None) else str(value)  # fmt: skip
