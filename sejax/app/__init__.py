@@ -1,0 +1,1 @@
+"""What the commands are made of; the library below does not know of it."""
