@@ -6,6 +6,7 @@ after a power cut at least the one before is there; damage is noticed by the fil
 """
 
 import contextlib
+import os
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -90,10 +91,11 @@ def newest_record(folder: Path) -> tuple[int, Any] | None:
 def generations(folder: Path) -> list[int]:
     """Generations for which there is a checkpoint by its name, whole or not, newest first."""
     try:
-        names = [path.name for path in folder.iterdir() if path.is_file()]
+        names = os.listdir(folder)
     except OSError:
         return []
-    return sorted((int(found[1]) for found in map(_NAME.fullmatch, names) if found), reverse=True)
+    found = (int(name[1]) for name in map(_NAME.fullmatch, names) if name)
+    return sorted((n for n in found if path_of(folder, n).is_file()), reverse=True)
 
 
 def path_of(folder: Path, generation: int) -> Path:
@@ -215,12 +217,21 @@ def _difference(found: Any, expected: list[list[str]]) -> str | None:
     return "its leaves have another order"
 
 
+def _key_impl(like: Any) -> Any:
+    """The implementation of a key, also where there is only its shape and dtype."""
+    import jax
+
+    found: list[Any] = []
+    jax.eval_shape(lambda key: found.append(jax.random.key_impl(key)), like)
+    return found[0]
+
+
 def _from_numpy(stored: np.ndarray, like: Any) -> Any:
     """A leaf of its own memory, tied to no device, of the kind of `like`."""
     import jax
 
     if _is_key(like):
-        return jax.random.wrap_key_data(jax.numpy.array(stored), impl=jax.random.key_impl(like))
+        return jax.random.wrap_key_data(jax.numpy.array(stored), impl=_key_impl(like))
     array = stored.view(_dtype(like)).reshape(np.shape(like)).copy()
     if isinstance(like, np.ndarray | np.generic):
         return array if isinstance(like, np.ndarray) else array[()]

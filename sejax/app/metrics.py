@@ -7,6 +7,7 @@ generations that the checkpoint does not have, and are dropped when the run goes
 
 import hashlib
 import os
+import re
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ COLUMNS = (
     "env_steps_total", "wall_s",
 )  # fmt: skip
 HEADER = ",".join(COLUMNS).encode() + b"\n"
+_INTEGER = re.compile(rb"-?[0-9]{1,20}")
 
 
 class MetricsError(ValueError):
@@ -59,6 +61,10 @@ class Metrics:
             "generations": dict(zip(map(str, self._seeds), self.generations, strict=True)),
         }
 
+    def fits(self, vouched: dict[str, Any]) -> bool:
+        """Whether that is of the same seeds."""
+        return list(vouched["generations"]) == [str(seed) for seed in self._seeds]
+
     def check(self, vouched: dict[str, Any]) -> None:
         """Sees whether the file begins with the rows vouched for; changes nothing.
 
@@ -94,7 +100,7 @@ class Metrics:
         """
         data = self._read()
         counts = self._count(data, 0, [0] * len(self._seeds))
-        torn = 0 < len(data) and not data.endswith(b"\n")
+        torn = bool(data) and not data.endswith(b"\n")
         return max(max(counts), min(counts) + torn)
 
     def append(self, info: Any, wall_s: float) -> None:
@@ -184,9 +190,9 @@ class Metrics:
 def _key(line: bytes, number: int) -> tuple[int, int]:
     """Generation and seed of a row."""
     cells = line.split(b",")
-    if len(cells) != len(COLUMNS) or not (cells[0].isdigit() and cells[1].isdigit()):
+    if len(cells) != len(COLUMNS) or not all(map(_INTEGER.fullmatch, cells[:2])):
         raise MetricsError(f"line {number} is not a row")
-    return int(cells[0][:18]), int(cells[1][:18])
+    return int(cells[0]), int(cells[1])
 
 
 def _format(value: Any) -> str:

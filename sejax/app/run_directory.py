@@ -8,7 +8,7 @@ files as they are. Nothing here imports jax before a state is restored: a refusa
 import json
 from pathlib import Path
 from types import TracebackType
-from typing import Any
+from typing import Any, TypeGuard
 
 import yaml
 
@@ -24,7 +24,6 @@ __all__ = ["COLUMNS", "FREE_FIELDS", "RunDirectory", "flatten"]
 FREE_FIELDS = {"generations", "devices", "checkpoint_every", "run_dir"}
 HINT = "Set run_dir=FOLDER."
 _SHOWN = 10  # differing fields that a message names
-_RECORD = {"config", "seeds", "metrics"}
 
 
 class RunDirectory:
@@ -37,13 +36,14 @@ class RunDirectory:
         self, path: Path, config: dict[str, Any], seeds: list[int], hint: str, lock: RunLock
     ):
         self.path = path
-        self.config = config
+        self.config = json.loads(json.dumps(config))  # as it reads back: tuples are lists
         self.seeds = seeds
         self._hint = hint
         self._lock = lock
         self._table = Metrics(self.metrics, seeds)
         self._stored = self._stored_config()
-        self._newest = checkpoints.newest_record(self.checkpoints)
+        newest = checkpoints.newest_record(self.checkpoints)
+        self._record = newest[1] if newest else None
 
     @classmethod
     def open(
@@ -64,7 +64,7 @@ class RunDirectory:
         path = Path(path)
         try:
             path.mkdir(parents=True, exist_ok=True)
-            lock = acquire(path / "run.lock", hint)
+            lock = acquire(path / "sejax.lock", hint)
         except OSError as error:
             raise ConfigError(
                 f"run_dir must be a folder that can be written, because the run's files go there; "
@@ -115,8 +115,8 @@ class RunDirectory:
     @property
     def finished_generations(self) -> int:
         """Generations with rows that the newest checkpoint has: what a kill would leave."""
-        record = self._newest[1] if self._newest else None
-        return max(record["metrics"]["generations"].values()) if _is_record(record) else 0
+        metrics = self._record["metrics"] if _is_record(self._record) else {"generations": {}}
+        return max(metrics["generations"].values(), default=0)
 
     def resume(self, template: Any) -> tuple[Any, int, list[str]]:
         """Restores the newest whole checkpoint and drops metrics that it does not include.
@@ -140,12 +140,12 @@ class RunDirectory:
         vouched = None
         if generation or record is not None:
             vouched = self._vouched(generation, record)
-            self._newest = generation, record
+            self._record = record
         else:
             self._refuse_to_start_anew(problems)
-        text = yaml.safe_dump(self.config, sort_keys=False)
-        if self._stored != yaml.safe_load(text):
-            write_text(self.path / "config.yaml", text)
+        if self._stored != self.config:
+            write_text(self.path / "config.yaml", yaml.safe_dump(self.config, sort_keys=False))
+            self._stored = self.config
         self._table.go_on_from(vouched)
         return state, generation, problems
 
@@ -172,9 +172,9 @@ class RunDirectory:
         Raises:
           OSError: if it cannot be written; the run goes on from the checkpoint before.
         """
-        record = {"config": self.config, "seeds": self.seeds, "metrics": self._table.vouch()}
+        record = {"config": self.config, "metrics": self._table.vouch()}
         checkpoints.save(self.checkpoints, generation, state, record)
-        self._newest = generation, record
+        self._record = record
 
     def write_summary(self, **values: Any) -> None:
         """Writes `run.json`."""
@@ -214,12 +214,12 @@ class RunDirectory:
         Raises:
           ConfigError: if one differs, or files of a run are there and no configuration.
         """
-        record = self._newest[1] if self._newest else None
         known = [self._stored] if self._stored is not None else []
-        known += [record["config"]] if _is_record(record) else []
+        known += [self._record["config"]] if _is_record(self._record) else []
         for stored in known:
             self._refuse_other_config(stored)
-        lost = [file.name for file in (self.metrics, self.proxy, self.checkpoints) if file.exists()]
+        lost = [file.name for file in (self.metrics, self.proxy) if file.exists()]
+        lost += ["checkpoints"] if checkpoints.generations(self.checkpoints) else []
         if lost and not known:
             raise ConfigError(
                 f"run_dir must be new or hold a run with its configuration, because what is there "
@@ -228,7 +228,7 @@ class RunDirectory:
             )
 
     def _refuse_other_config(self, stored: dict[str, Any]) -> None:
-        old, asked = flatten(stored), flatten(yaml.safe_load(yaml.safe_dump(self.config)))
+        old, asked = flatten(stored), flatten(self.config)
         differing = [
             f"{name} ({_short(old.get(name))} there, {_short(asked.get(name))} here)"
             for name in sorted(old.keys() | asked.keys())
@@ -248,7 +248,7 @@ class RunDirectory:
         Raises:
           ConfigError: if they differ.
         """
-        if not _is_record(record) or record["seeds"] != self.seeds:
+        if not _is_record(record) or not self._table.fits(record["metrics"]):
             raise ConfigError(
                 f"run_dir must hold checkpoints of its own run, because a run goes on from them; "
                 f"got {checkpoints.path_of(self.checkpoints, generation)}, which is of another. "
@@ -309,6 +309,12 @@ def _short(value: Any) -> str:
     return text if len(text) <= 60 else f"{text[:57]}..."
 
 
-def _is_record(record: Any) -> bool:
+def _is_record(record: Any) -> TypeGuard[dict[str, Any]]:
     """Whether a checkpoint's record is one of `commit`."""
-    return isinstance(record, dict) and record.keys() == _RECORD
+    match record:
+        case {
+            "config": dict(),
+            "metrics": {"bytes": int(), "sha256": str(), "generations": dict(generations)},
+        }:
+            return all(type(count) is int for count in generations.values())
+    return False

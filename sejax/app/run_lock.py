@@ -1,13 +1,14 @@
 """A run directory is used by one process at a time.
 
-The lock is the kernel's, on the file `run.lock`, and ends with the process, however that ends. The
-file says who holds it. Where the file system has no locks (some Lustre and FUSE mounts), the file
-itself is the lock: it counts unless its process is dead and was one of this machine.
+The lock is the kernel's, on the file `sejax.lock`, and ends with the process, however that ends.
+The file says who holds it. Where the file system has no locks (some Lustre and FUSE mounts), the
+file itself is the lock: it counts unless its process is dead and was one of this machine.
 """
 
 import contextlib
 import json
 import os
+import platform
 import weakref
 from pathlib import Path
 from typing import Any
@@ -60,7 +61,7 @@ def _open(path: Path) -> tuple[int, bool]:
     """The file's handle, and whether it was made here."""
     with contextlib.suppress(FileExistsError):
         return os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o666), True
-    return os.open(path, os.O_RDWR | os.O_CREAT, 0o666), False
+    return os.open(path, os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0), 0o666), False
 
 
 def _sign(handle: int) -> None:
@@ -93,8 +94,6 @@ def _is_dead(owner: dict[str, Any]) -> bool:
 
 
 def _host() -> str:
-    import platform
-
     return platform.node()
 
 
@@ -108,7 +107,9 @@ def _message(path: Path, owner: dict[str, Any], hint: str, locked: bool | None) 
 
 
 def _release(path: Path, handle: int, pid: int) -> None:
-    with contextlib.suppress(OSError):
-        if os.getpid() == pid and is_at(handle, path):  # a forked child only closes its copy
-            path.unlink()
-    os.close(handle)
+    try:
+        with contextlib.suppress(OSError):
+            if os.getpid() == pid and is_at(handle, path):  # a forked child only closes its copy
+                path.unlink()
+    finally:
+        os.close(handle)
