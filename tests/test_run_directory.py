@@ -570,6 +570,26 @@ def test_a_second_session_killed_at_any_file_operation_does_too(whole, tmp_path,
     assert count > 20
 
 
+def test_a_first_chunk_that_was_cut_may_be_cut_again_with_other_chunks(
+    whole, tmp_path, monkeypatch
+):
+    count = 0
+    first = tmp_path / "first"
+    with open_run(first, checkpoint_every=3) as directory:
+        directory.resume(TEMPLATE)
+        directory.append(info_of(0, 3), 1.0)
+        directory.proxy.write_text("proxy of 2")
+    while True:
+        path = Path(shutil.copytree(first, tmp_path / str(count)))
+        if not killed(monkeypatch, count, path, 5, chunk=1):
+            break
+        committed = saved(path)
+        assert go(path, 5) == committed
+        assert (path / "metrics.csv").read_bytes() == (whole / "metrics.csv").read_bytes()
+        count += 1
+    assert count > 40
+
+
 def test_rows_are_on_the_disk_before_the_checkpoint_that_vouches_for_them(run, monkeypatch):
     done = []
     fsync, replace = os.fsync, os.replace

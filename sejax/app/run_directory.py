@@ -143,10 +143,10 @@ class RunDirectory:
             self._record = record
         else:
             self._refuse_to_start_anew(problems)
-        if self._stored != self.config:
+        self._table.go_on_from(vouched)  # first: what may be there without a checkpoint goes by the
+        if self._stored != self.config:  # `checkpoint_every` that is stored
             write_text(self.path / "config.yaml", yaml.safe_dump(self.config, sort_keys=False))
             self._stored = self.config
-        self._table.go_on_from(vouched)
         return state, generation, problems
 
     def append(self, info: Any, wall_s: float) -> None:
