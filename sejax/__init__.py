@@ -92,7 +92,7 @@ if TYPE_CHECKING:  # what a type checker and an editor see
     from sejax.proxies.proxy import ProxyEnv
     from sejax.trainer import TrainingConfig, TrainResult, make_trainer
 
-__all__ = [  # noqa: RUF022 (as the table above)
+__all__ = [
     "AUC", "AUCSum", "Agent", "ConfigError", "CountBasedConfig", "DDQNConfig", "DiscreteTD3Config",
     "DuelingDDQNConfig", "EvosaxConfig", "ICMConfig", "LearnResult", "MaxReward", "NESConfig",
     "Objective", "Outcome", "PPOConfig", "Proxy", "ProxyEnv", "ProxySet", "QLearningConfig",

@@ -19,6 +19,7 @@ from sejax import plugins
 from sejax.agents.agent import Agent
 from sejax.counters import exact, wide_add, wide_sum, wide_zeros
 from sejax.envs.task import Task
+from sejax.errors import require
 from sejax.es.strategy import Strategy, finite_mean
 from sejax.evaluation import make_evaluator, tested_throughout
 from sejax.objectives import MaxReward, Objective, Outcome
@@ -100,6 +101,7 @@ class Program:
       generation: `(LearnState) -> (LearnState, GenerationInfo)`, a scan body over all seeds.
       unravel: flat parameters `[dims]` to the proxy's weights.
       proxy: what is learned.
+      agent: that learns on it.
       strategy: that learns it.
       objective: that it is learned by.
       num_dims: length of a parameter vector.
@@ -109,6 +111,7 @@ class Program:
     generation: Callable[[LearnState], tuple[LearnState, GenerationInfo]]
     unravel: Callable[[Array], Any]
     proxy: ProxyEnv
+    agent: Agent
     strategy: Strategy
     objective: Objective
     num_dims: int
@@ -226,6 +229,10 @@ def make_program(
     trials = strategy.trials
     seed_ids = trials.seed_ids(strategy.num_members)
 
+    require(not stop_when_solved or (objective.scores_are_returns and task.is_solvable),
+            "stop_when_solved", "be false with this objective and task", "nobody says which score "
+            "solves it", "true", "stop_when_solved=false")  # fmt: skip
+
     def init(keys: Array) -> LearnState:
         num_seeds = keys.shape[0]
         key_weights, key_es, key_run = (
@@ -262,14 +269,14 @@ def make_program(
             asked,
         )  # fmt: skip
         stepped = _advance(state, told, incumbent, scores, outcome)
-        if stop_when_solved and program.solved_score is not None:
-            stepped = stepped.replace(finished=stepped.incumbent_score >= program.solved_score)
+        if stop_when_solved:
+            stepped = stepped.replace(finished=stepped.incumbent_score >= task.solved_reward)
         stepped = jax.tree.map(lambda new, old: _where(state.finished, old, new), stepped, state)
         return stepped, _summarise(state, stepped, scores, outcome)
 
-    program = Program(init=init, generation=generation, unravel=unravel, proxy=proxy,
-                      strategy=strategy, objective=objective, num_dims=flat.size)  # fmt: skip
-    return program
+    return Program(init=init, generation=generation, unravel=unravel, proxy=proxy,
+                   agent=agent, strategy=strategy, objective=objective,
+                   num_dims=flat.size)  # fmt: skip
 
 
 @struct.dataclass

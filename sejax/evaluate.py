@@ -2,35 +2,27 @@
 
 import dataclasses
 import math
-import sys
 import time
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import hydra
 from omegaconf import DictConfig
 
-from sejax import commands
-from sejax.configs import (
-    EvaluateConfig,
-    evaluate_from_hydra,
-    require_fit,
-    require_learning,
-    require_real_returns,
-)
-from sejax.errors import ConfigError
+from sejax import plugins
+from sejax.app import build, commands, compose, runtime
+from sejax.app.build import EvaluateConfig
+from sejax.errors import ConfigError, require
 
 
-@hydra.main(config_path="conf/evaluate", config_name="evaluate", version_base="1.3")
+@hydra.main(config_path="conf", config_name="evaluate", version_base="1.3")
 @commands.task
 def main(cfg: DictConfig) -> float:
     """Evaluates as configured and returns the mean test return (for Hydra's sweepers)."""
-    config = evaluate_from_hydra(cfg)
-    from sejax.runtime import configure_xla, enable_compilation_cache
-
-    if "jax" not in sys.modules:  # a sweep's second job finds it running
-        configure_xla(config.devices)
-        enable_compilation_cache()
+    config = compose.evaluate_config_of(cfg)
+    runtime.configure_xla(config.devices)
+    runtime.enable_compilation_cache()
     return evaluate(config)
 
 
@@ -45,21 +37,19 @@ def evaluate(config: EvaluateConfig) -> float:
     """
     import pandas as pd
 
-    from sejax import plots
+    from sejax.app import plots
     from sejax.files import write_text
 
-    task, worlds, agent, exploration, out_dir = _prepare(config)
-    tables = {
-        name: _train_and_test(config, agent, exploration, task, name, *world)
-        for name, world in worlds.items()
-    }
+    study = _real_study(config) if config.proxy == "real" else _proxy_study(config)
+    tables = {name: _train_and_test(config, study, name) for name in study.worlds}
     table = pd.concat([t.assign(world=name) for name, t in tables.items()])
+    out_dir, solved_reward = study.out_dir, study.task.solved_reward
     out_dir.mkdir(parents=True, exist_ok=True)
     write_text(out_dir / "evaluation.csv", table.to_csv(index=False))
-    plots.evaluation(tables, task.solved_reward, out_dir / "evaluation.png")
+    plots.evaluation(tables, solved_reward, out_dir / "evaluation.png")
     summary = summarise(table)
     write_text(out_dir / "evaluation.json", summary.to_json(orient="index", indent=2))
-    _print_table(summary, task, config, agent.name, out_dir)
+    _print_table(summary, study, config)
     return float(next(iter(tables.values()))["test_return"].mean())
 
 
@@ -72,87 +62,151 @@ def summarise(table: Any) -> Any:
     return summary.assign(num_agents=grouped.size(), num_nonfinite=grouped["nonfinite"].sum())
 
 
-def _prepare(config: EvaluateConfig) -> tuple[Any, dict[str, Any], Any, Any, Path]:
-    """The task, the worlds to train in, the agent, its exploration, and the output folder."""
-    from sejax import envs
-    from sejax.evaluation import training_as_learned
-    from sejax.proxies import io as proxy_io
+@dataclass(frozen=True, kw_only=True)
+class Study:
+    """Which agents train where.
 
-    if config.proxy == "real":
-        if config.env is None:
-            raise ConfigError("env must be given with proxy=real, because the task cannot be read "
-                              "from a proxy; got none. Set env=cartpole.")  # fmt: skip
-        require_fit(config.agent, config.exploration, config.env)
-        task = envs.make(config.env)
-        worlds = {"the real task": (task.env, task.params, config.real_training)}
-        out_dir = Path(config.out_dir or f"runs/evaluate-{task.name}")
-        return task, worlds, config.agent, config.exploration, out_dir
-    proxy = proxy_io.load_proxy(config.proxy)
+    Attributes:
+      task: the real task, on which all are tested.
+      worlds: name to `(env, env_params, training)`.
+      agent: configuration of the agents.
+      exploration: likewise.
+      out_dir: where the files go.
+    """
+
+    task: Any
+    worlds: dict[str, tuple[Any, Any, Any]]
+    agent: Any
+    exploration: Any
+    out_dir: Path
+
+
+def _real_study(config: EvaluateConfig) -> Study:
+    """Agents on the real task alone."""
+    from sejax import agents, envs
+
+    if config.env is None:
+        raise ConfigError("env must be given with proxy=real, because the task cannot be read "
+                          "from a proxy; got none. Set env=cartpole.")  # fmt: skip
+    spec = plugins.configure("env", {"name": config.env})
+    agents.require_fit(config.agent, config.exploration, envs.facts_of(spec), config.env)
+    task = envs.make_from(spec)
+    worlds = {"the real task": (task.env, task.params, config.real_training)}
+    out_dir = Path(config.out_dir or Path("runs", f"evaluate-{_as_file_name(task.name)}"))
+    return Study(task=task, worlds=worlds, agent=config.agent, exploration=config.exploration,
+                 out_dir=out_dir)  # fmt: skip
+
+
+def _proxy_study(config: EvaluateConfig) -> Study:
+    """Agents on a proxy, and on its real task beside them."""
+    from sejax import agents
+    from sejax.proxies import files
+
+    proxy = _load(config)
     task = proxy.task
-    if config.env not in (None, task.name):
+    if config.env not in (None, task.name, proxy.config["env"].get("name")):
         raise ConfigError(f"env must be the proxy's own task, because agents trained on it are "
                           f"tested there; got {config.env} for a proxy of {task.name}. Set "
                           f"env={task.name}.")  # fmt: skip
     agent, exploration = config.agent, config.exploration
     if config.agent_hparams == "nes":
-        agent, exploration = proxy.config.agent, proxy.config.exploration
-    require_fit(agent, exploration, task.name)
-    is_se = proxy.config.proxy.name == "se"
-    if config.training_from == "config":
-        training, group = config.training, "training"
-    else:
-        # An RN's dynamics are real: its agents train and stop as on the real task.
-        training, group = config.real_training, "real_training"
-        if is_se:
-            training = dataclasses.replace(training_as_learned(proxy, agent),
-                                           test_episodes=training.test_episodes)  # fmt: skip
-    require_real_returns(group, training)
-    if is_se and proxy.config.proxy.done == "soft":
-        require_learning(group, training, agent, task.name)
+        agent, exploration = (_learned_with(proxy, group) for group in ("agent", "exploration"))
+    agents.require_fit(agent, exploration, task.facts, task.name)
+    group, training = _training_on(proxy, config, agent)
+    build.require_real_returns(group, training)
+    if getattr(proxy.env.config, "may_never_end", False):
+        build.require_learning(group, training, agent, task.max_steps)
     worlds = {"the proxy": (proxy.env, proxy.params, training)}
     if config.baseline:
         worlds["the real task"] = (task.env, task.params, config.real_training)
-    shipped = proxy.path.parent == proxy_io.PRETRAINED_DIR
-    beside = Path(f"runs/evaluate-{proxy.path.stem}") if shipped else proxy.path.parent
-    return task, worlds, agent, exploration, Path(config.out_dir or beside)
+    shipped = proxy.path.parent == files.PRETRAINED_DIR
+    beside = Path("runs", f"evaluate-{proxy.path.stem}") if shipped else proxy.path.parent
+    return Study(task=task, worlds=worlds, agent=agent, exploration=exploration,
+                 out_dir=Path(config.out_dir or beside))  # fmt: skip
 
 
-def _train_and_test(
-    config: EvaluateConfig, agent: Any, exploration: Any, task: Any, world: str, env: Any,
-    env_params: Any, training: Any,
-) -> Any:  # fmt: skip
+def _load(config: EvaluateConfig) -> Any:
+    """The proxy; modules are imported if the command line names them, never because a file does."""
+    from sejax import envs
+    from sejax.errors import unknown_name
+    from sejax.proxies import files
+
+    if config.proxy not in (*files.pretrained_names(), "real") and not any(
+        character in config.proxy for character in "/."
+    ) and not Path(config.proxy).exists():  # fmt: skip
+        raise unknown_name("proxy", config.proxy, [*files.pretrained_names(), "real"])
+    stored = files.read_config(config.proxy, "proxy")
+    task = proxy = None
+    if config.env is not None and not plugins.is_registered("env", config.env):
+        fields = stored["env"] if stored["env"].get("name") == config.env else {}
+        task = envs.make_from(plugins.configure("env", {**fields, "name": config.env}))
+    if config.proxy_kind is not None:
+        fields = {**stored["proxy"], "name": config.proxy_kind}
+        proxy = plugins.configure("proxy", fields)
+    return files.load_proxy(config.proxy, task, proxy, "proxy")
+
+
+def _learned_with(proxy: Any, group: str) -> Any:
+    """The agent, or its exploration, that a proxy was learned with."""
+    stored = proxy.config.get(group) or {"name": "none"}
+    require(plugins.is_registered(group, stored["name"]), "agent_hparams",
+            f"be default for a proxy learned with a foreign {group}", "what a file names is never "
+            "imported", f"nes for {stored['name']}",
+            f"agent_hparams=default {group}={stored['name']}")  # fmt: skip
+    return plugins.configure(group, stored)
+
+
+def _training_on(proxy: Any, config: EvaluateConfig, agent: Any) -> tuple[str, Any]:
+    """How long agents train on the proxy, and the group of fields that says so."""
+    from sejax.serialize import from_plain
+    from sejax.trainer import TrainingConfig, budget_for
+
+    if config.training_from == "config":
+        return "training", config.training
+    if proxy.env.is_real or "training" not in proxy.config:
+        # The dynamics are real: agents train and stop as on the real task.
+        return "real_training", config.real_training
+    learned = from_plain(TrainingConfig, proxy.config["training"], "training")
+    stored = proxy.config["agent"]
+    then = plugins.configure("agent", stored) if plugins.is_registered("agent", stored["name"]) \
+        else None  # fmt: skip
+    training = budget_for(learned, agent, then, proxy.task.max_steps)
+    test_episodes = config.real_training.test_episodes
+    return "real_training", dataclasses.replace(training, test_episodes=test_episodes)
+
+
+def _train_and_test(config: EvaluateConfig, study: Study, world: str) -> Any:
     import jax
     import pandas as pd
 
-    from sejax.agents.hparams import drawing_key, make_varied_agents
-    from sejax.agents.registry import make_agent
+    from sejax.agents import make_agent
     from sejax.evaluation import evaluate_agents
 
+    env, env_params, training = study.worlds[world]
     varied = config.agent_hparams == "varied"
-    make = make_varied_agents if varied else make_agent
-    agents: Any = make(agent, task, exploration)
+    agent = make_agent(study.agent, study.task, study.exploration, varied)
     keys = jax.random.split(jax.random.key(config.seed), config.num_agents)
     started = time.time()
     outcome = evaluate_agents(
-        agents, env, env_params, task, training, keys, config.lanes, config.devices
+        agent, env, env_params, study.task, training, keys, config.lanes, config.devices
     )
     outcome = jax.device_get(outcome)
-    drawn = jax.vmap(lambda key: agents.draw(drawing_key(key)))(keys) if varied else {}
+    drawn = jax.device_get(jax.vmap(agent.drawn_values)(keys))
     print(f"{world}: {config.num_agents} agents in {time.time() - started:.1f} s", flush=True)
     columns = {"agent": range(config.num_agents), "test_return": outcome.test_return,
-               **vars(outcome), **jax.device_get(drawn)}  # fmt: skip
+               **vars(outcome), **drawn}  # fmt: skip
     del columns["test_returns"]
     return pd.DataFrame(columns)
 
 
-def _print_table(
-    summary: Any, task: Any, config: EvaluateConfig, agent_name: str, out_dir: Path
-) -> None:
+def _print_table(summary: Any, study: Study, config: EvaluateConfig) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    table = Table(title=f"{config.num_agents} fresh {agent_name} agents, tested on "
-                        f"{task.name} (solved at {task.solved_reward:g})")  # fmt: skip
+    name, solved_at = plugins.name_of("agent", study.agent), study.task.solved_reward
+    solved = f" (solved at {solved_at:g})" if study.task.is_solvable else ""
+    table = Table(title=f"{config.num_agents} fresh {name} agents, tested on "
+                        f"{study.task.name}{solved}")  # fmt: skip
     for column in ("trained on", "return", "training steps", "training episodes"):
         table.add_column(column, justify="left" if column == "trained on" else "right")
     for world, row in summary.iterrows():
@@ -167,7 +221,8 @@ def _print_table(
     diverged = int(summary["num_nonfinite"].sum())
     if diverged:
         console.print(f"{diverged} agents met a number that is not finite.")
-    console.print(f"{out_dir}/evaluation.csv, .json and .png hold every agent.", soft_wrap=True)
+    console.print(f"{study.out_dir}/evaluation.csv, .json and .png hold every agent.",
+                  soft_wrap=True)  # fmt: skip
 
 
 def _spread(mean: float, std: float, digits: int) -> str:
@@ -175,5 +230,9 @@ def _spread(mean: float, std: float, digits: int) -> str:
     return f"{mean:,.{digits}f}" + (f" ± {std:,.{digits}f}" if math.isfinite(std) else "")
 
 
+def _as_file_name(name: str) -> str:
+    return name.replace("/", "_").replace(":", "_")
+
+
 if __name__ == "__main__":
-    commands.start(main)
+    commands.start("evaluate", main)

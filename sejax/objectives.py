@@ -90,7 +90,9 @@ class RewardThreshold(Options):
     group: ClassVar[str] = "objective"
     scores_are_returns: ClassVar[bool] = False
 
-    unsolved_weight: float = option(100.0, not_negative("a shortfall must not be rewarded"))  # w_sol
+    unsolved_weight: float = option(
+        100.0, not_negative("a shortfall must not be rewarded")
+    )  # w_sol
 
     def make(self, task: Any) -> Objective:
         """The objective on a task.

@@ -70,7 +70,9 @@ def traced_options(config: Any) -> dict[str, Any]:
     }
 
 
-def counts(reason: str = "there is nothing to learn from or with otherwise", least: int = 1) -> Rule:
+def counts(
+    reason: str = "there is nothing to learn from or with otherwise", least: int = 1
+) -> Rule:
     """A whole number from `least` on."""
     return lambda name, value, default: errors.whole(
         least, name, value, reason, "null" if default is None else default

@@ -297,7 +297,7 @@ def _as_dataclass(group: str, name: str, found: Any) -> Any:
         raise ConfigError(
             f"{group} must name a dataclass with make({', '.join(arguments)}), or a function that "
             f"takes ({', '.join((*arguments, '**options'))}), because its fields are the options; "
-            f"{name} is {shortened(found)}. See the README, \"Adding to it\"."
+            f'{name} is {shortened(found)}. See the README, "Adding to it".'
         )
     if f"{cls.__module__}:{cls.__qualname__}" != name:
         _NAMES[cls] = name

@@ -114,7 +114,7 @@ TestFn = Callable[[Array, Any, Array], tuple[Array, Array]]
 def make_trainer(
     agent: Agent,
     env: Any,
-    training: TrainingConfig = TrainingConfig(),  # noqa: B008 (frozen)
+    training: TrainingConfig = TrainingConfig(),
     solved_reward: float = jnp.inf,
     test_fn: TestFn | None = None,
     recorder: MemoryMaker | None = None,
@@ -215,9 +215,7 @@ class _Loop:
             env, params, agent.discount(hparams), limit_is_terminal
         )
 
-    def begin(
-        self, key: Array, env_params: Any, hparams: Any, active: Array | bool
-    ) -> _LoopState:
+    def begin(self, key: Array, env_params: Any, hparams: Any, active: Array | bool) -> _LoopState:
         key_agent, key_reset = jax.random.split(key)
         obs, env_state = self.env.reset_env(key_reset, env_params)
         agent_state = self.agent.init(key_agent, hparams)
@@ -301,7 +299,7 @@ class _Loop:
 
     def discount(self, terminated: Array, truncated: Array, info: Any) -> Array:
         """What a target bootstraps with, before gamma."""
-        discount = jnp.float32(info["discount"] if "discount" in info else ~terminated)
+        discount = jnp.float32(info.get("discount", ~terminated))
         return jnp.where(truncated, 0.0, discount) if self.limit_is_terminal else discount
 
     def end_episode(
@@ -313,7 +311,7 @@ class _Loop:
         """
         key_reset, key_test = jax.random.split(key)
         judged = state.episode_return
-        if self.test_fn is not None:
+        if self.test_fn is not None and state.test_returns is not None:
             tested, num_steps = self.test_fn(key_test, state.agent_state, ended)
             state = state.replace(
                 test_returns=state.test_returns.at[state.episode].set(tested),
@@ -392,7 +390,7 @@ def budget_for(
     Args:
       training: that the proxy was learned with.
       agent: configuration of the agent that is to train.
-      learned_with: of the one that the proxy was learned with.
+      learned_with: of the one that the proxy was learned with; None if that is not known.
       max_episode_steps: the task's step limit.
     """
     if training.max_steps is None:

@@ -1,4 +1,4 @@
-"""Agents: bundles of pure functions, a file each with configuration, hyperparameters and learning."""
+"""Agents: bundles of pure functions, a file each with configuration and learning."""
 
 import functools
 from typing import Any

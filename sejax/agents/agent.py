@@ -140,7 +140,7 @@ def traced(config: Any, **more: Any) -> Any:
 
 @functools.cache
 def _hparams_type(name: str, fields: tuple[str, ...]) -> Any:
-    return collections.namedtuple(name, fields)  # noqa: PYI024 (the fields are the config's)
+    return collections.namedtuple(name, fields)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -158,5 +158,3 @@ def with_hparams(hparams: Any, values: dict[str, Array]) -> Any:
     if "agent" in hparams._fields:
         return hparams._replace(agent=with_hparams(hparams.agent, values))
     return hparams._replace(**values)
-
-

@@ -166,9 +166,7 @@ def make_learning_step(
             return flat.flatten(jax.grad(sum_of_losses)(params, target_params, hp.discount, batch))
 
         gradient = sum_over_batch(sum_of_gradients, batch, hp.batch_size) / num_columns(batch)
-        moved, opt_state = flat.adam_step(
-            state.params, state.opt_state, gradient, hp.learning_rate
-        )
+        moved, opt_state = flat.adam_step(state.params, state.opt_state, gradient, hp.learning_rate)
         tau = hp.target_update_rate
         return state.replace(
             params=moved,

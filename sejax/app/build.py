@@ -107,6 +107,7 @@ class EvaluateConfig:
     """What `sejax.evaluate` takes. It has no defaults either: see `LearnConfig`."""
 
     proxy: str
+    proxy_kind: str | None  # a kind of proxy of somebody's own, which its file's name never imports
     env: str | None
     agent: Any
     exploration: Any
@@ -186,7 +187,8 @@ def _from_plain(schema: Any, groups: tuple[str, ...], values: Mapping[str, Any])
     for name in TRAININGS:
         if name in values:
             require(isinstance(values[name], Mapping), name, "have fields", "they say how long "
-                    "agents train", shortened(values[name]), f"{name}.max_episodes=1000")  # fmt: skip
+                    "agents train", shortened(values[name]),
+                    f"{name}.max_episodes=1000")  # fmt: skip
             typed[name] = serialize.from_plain(TrainingConfig, values[name], name)
     return serialize.from_plain(schema, typed, "")
 

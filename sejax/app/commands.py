@@ -7,25 +7,40 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import NoReturn
 
 from hydra.errors import HydraException
 from omegaconf import DictConfig
+from omegaconf.errors import OmegaConfBaseException
 
-from sejax.configs import register_evosax_choices, translate_hydra_error
+from sejax.app import compose
 from sejax.errors import ConfigError
 
 BAD_INPUT, FAILED, INTERRUPTED = 2, 1, 130
 
 
-def start(main: Callable[[], object]) -> None:
-    """Runs a Hydra main function; what Hydra refuses becomes one message and exit code 2."""
+def start(name: str, main: Callable[[], object]) -> None:
+    """Runs a Hydra main function; what Hydra refuses becomes one message and exit code 2.
+
+    Args:
+      name: of the command: run or evaluate.
+      main: decorated by `hydra.main`.
+    """
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra then raises, and the message is ours.
-    register_evosax_choices()
+    words = compose.main_words()
     try:
+        if sys.path[0] != "":  # `python -m` has put the current folder there, if it still exists
+            sys.path.insert(0, "")
+        Path.cwd()
+        compose.register(name, words)
         main()
-    except HydraException as error:
-        fail(str(translate_hydra_error(error)), BAD_INPUT)
+    except (HydraException, OmegaConfBaseException) as error:
+        fail(str(compose.translate_hydra_error(error, words)), BAD_INPUT)
+    except ConfigError as error:
+        fail(str(error), BAD_INPUT)
+    except FileNotFoundError as error:
+        fail(f"The current folder is gone ({error}). Change to one that exists.", FAILED)
 
 
 def task(main: Callable[[DictConfig], float]) -> Callable[[DictConfig], float]:
@@ -46,13 +61,18 @@ def task(main: Callable[[DictConfig], float]) -> Callable[[DictConfig], float]:
                 f"whole; run the same command again to go on from there.",
                 FAILED,
             )
+        except RuntimeError as error:
+            if "RESOURCE_EXHAUSTED" not in str(error) and "Out of memory" not in str(error):
+                raise
+            fail(f"There is not enough memory: {str(error).splitlines()[0]} Smaller networks, "
+                 f"buffers or populations need less.", FAILED)  # fmt: skip
 
     return guarded
 
 
 def fail(message: str, status: int) -> NoReturn:
     """Prints the message and ends the process."""
-    print(f"error: {message}", file=sys.stderr)
+    print(f"error: {message}".encode("utf-8", "replace").decode(), file=sys.stderr)
     sys.exit(status)
 
 

@@ -7,7 +7,8 @@ import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeRemainingColumn
 
-from sejax.configs import LearnConfig
+from sejax.app import presets
+from sejax.app.build import LearnConfig
 
 DRAW_EVERY_S = 30.0
 
@@ -34,6 +35,12 @@ class RunProgress:
 
     def __enter__(self) -> "RunProgress":
         self._progress.start()
+        pair = self._config.name("env"), self._config.name("proxy")
+        if not presets.is_tuned(*pair):
+            self.print(
+                f"There are no tuned settings for env={pair[0]} with proxy={pair[1]}: these are "
+                f"general ones, not tuned (docs/defaults.md)."
+            )
         return self
 
     def __exit__(self, *_: Any) -> None:
@@ -83,22 +90,15 @@ class RunProgress:
     def finish(self, directory: Any, program: Any, best: float, ended: str) -> None:
         """Says how it ended, where everything is, and what to do next."""
         self.stop()
-        config, objective = self._config, self._config.objective
         verdict = f"best incumbent score {best:.1f}"
-        if objective.name == "reward_threshold":
-            verdict += (
-                f": minus the training steps of its agents, and {objective.unsolved_weight:g} "
-                f"for each unit of return below {program.task.solved_reward:g}"
-            )
+        if program.objective.meaning:
+            verdict += f": {program.objective.meaning}"
         if program.solved_score is not None:
             solved = "solved" if best >= program.solved_score else "not solved"
             verdict = (
                 f"{solved}: best incumbent mean {best:.1f}, solved at {program.solved_score:g}"
             )
         path = directory.path
-        # Those that an RN was learned with; an SE is meant for the paper's default ones.
-        agent = "" if config.agent.name == "ddqn" else f" agent={config.agent.name}"
-        agent = " agent_hparams=nes" if config.proxy.name == "rn" else agent
         title = "learned" if ended == "finished" else ended
         self._console.rule(f"{program.task.name}: {title}", align="left")
         self.print(
@@ -107,7 +107,26 @@ class RunProgress:
             f"  {path}/learning_curve.png   how it was learned\n"
             f"  {path}/metrics.csv          a row for each generation\n\n"
             f"Train fresh agents on it, and on the real task beside them:\n"
-            f"  python -m sejax.evaluate proxy={path}{agent} num_agents=20\n"
+            f"  python -m sejax.evaluate proxy={path}{self._own_words(program)} num_agents=20\n"
             f"Use it as a gymnax environment:\n"
-            f'  env, params = sejax.load("{path}")'
+            f'  env, params = sejax.load("{path}"{self._own_arguments()})'
         )
+
+    def _own_words(self, program: Any) -> str:
+        """What `sejax.evaluate` must be told beside the proxy."""
+        config = self._config
+        words = ""
+        if ":" in config.name("env"):
+            words += f" env={config.name('env')}"
+        if ":" in config.name("proxy"):
+            words += f" proxy_kind={config.name('proxy')}"
+        agent = config.name("agent")
+        # An RN is judged with the agent that it was learned with; an SE is meant for the paper's.
+        if program.proxy.is_real and ":" not in agent:
+            return f"{words} agent_hparams=nes"
+        return words if agent == "ddqn" else f"{words} agent={agent}"
+
+    def _own_arguments(self) -> str:
+        """What `sejax.load` must be given beside the proxy."""
+        task = ", task=my_task" if ":" in self._config.name("env") else ""
+        return task + (", proxy=my_proxy_config" if ":" in self._config.name("proxy") else "")

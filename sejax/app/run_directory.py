@@ -12,13 +12,14 @@ from typing import Any, TypeGuard
 
 import yaml
 
-from sejax.app import checkpoints
+from sejax.app import build, checkpoints
 from sejax.app.metrics import COLUMNS, Metrics, MetricsError
 from sejax.app.run_lock import RunLock, acquire
 from sejax.errors import ConfigError
 from sejax.files import remove_leftovers, write_text
+from sejax.serialize import flatten
 
-__all__ = ["COLUMNS", "FREE_FIELDS", "RunDirectory", "flatten"]
+__all__ = ["COLUMNS", "FREE_FIELDS", "RunDirectory", "open_for"]
 
 # Fields that say how or how long to compute, not what: they may change between two sessions.
 FREE_FIELDS = {"generations", "devices", "checkpoint_every", "run_dir"}
@@ -289,15 +290,18 @@ class RunDirectory:
         )
 
 
-def flatten(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Nested settings as `{"group.field": value}`."""
-    flat: dict[str, Any] = {}
-    for key, value in values.items():
-        if isinstance(value, dict):
-            flat |= flatten(value, f"{prefix}{key}.")
-        else:
-            flat[f"{prefix}{key}"] = value
-    return flat
+def open_for(config: Any, hint: str = HINT) -> RunDirectory:
+    """The folder of a run; made, or opened to go on.
+
+    Args:
+      config: a `LearnConfig`.
+      hint: last sentence of a refusal: how to choose another folder.
+
+    Raises:
+      ConfigError: if it holds another run, is in use, or cannot be written.
+    """
+    seeds = [config.seed + i for i in range(config.num_seeds)]
+    return RunDirectory.open(config.resolved_run_dir, build.to_plain(config), seeds, hint)
 
 
 def _same(a: Any, b: Any) -> bool:

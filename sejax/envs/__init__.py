@@ -46,4 +46,3 @@ def facts_of(config: Any) -> Facts:
     """What a task's configuration says of it, or else the task itself."""
     stated = getattr(config, "facts", None)
     return stated if isinstance(stated, Facts) else make_from(config).facts
-

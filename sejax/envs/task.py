@@ -61,7 +61,7 @@ class Task:
     env: Any
     params: Any = None
     solved_reward: float = math.inf
-    max_steps: int = None  # type: ignore[assignment]  # an int once it is made
+    max_steps: Any = None  # an int once it is made
     info_keys: tuple[str, ...] = ()
     augmented_keys: tuple[str, ...] = ()
     origin: dict[str, Any] | None = None

@@ -90,9 +90,7 @@ def make_evosax(config: EvosaxConfig, num_dims: int) -> Strategy:
     """Builds one of evosax's algorithms, whose mean is the incumbent, over vectors `[num_dims]`."""
     algorithm, params = _build(config, num_dims)
 
-    def tell(
-        key: Array, members: Array, scores: Array, incumbent_score: Array, state: Any
-    ) -> Any:
+    def tell(key: Array, members: Array, scores: Array, incumbent_score: Array, state: Any) -> Any:
         return algorithm.tell(key, members, finite_fitness(-scores), state, params)[0]
 
     return Strategy(

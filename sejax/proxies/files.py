@@ -18,13 +18,13 @@ import jax
 import numpy as np
 from flax.traverse_util import flatten_dict, unflatten_dict
 from safetensors import SafetensorError, safe_open
-from safetensors.numpy import save_file
 
 from sejax import envs, plugins
 from sejax.envs.task import Task
 from sejax.errors import ConfigError, require, shortened, unknown_name
-from sejax.files import atomic_path
+from sejax.files import write_bytes
 from sejax.proxies.proxy import ProxyEnv
+from sejax.sealed import DamagedError, seal, unseal
 
 FORMAT_VERSION = 2
 PRETRAINED_DIR = Path(__file__).parents[1] / "pretrained"
@@ -209,31 +209,13 @@ def _write(
         "is_set": is_set,
         "proxies": [dict(record) for record in records],
     }
-    header["digest"] = _digest(tensors, header)
-    try:
-        with atomic_path(path) as temporary:
-            # One entry: safetensors writes several in random order.
-            save_file(tensors, temporary, metadata={_KEY: json.dumps(header)})
-    except SafetensorError as error:
-        raise OSError(f"{path} could not be written ({error})") from error
-
-
-def _digest(tensors: Mapping[str, np.ndarray], header: Mapping[str, Any]) -> str:
-    """Of all that a file says."""
-    content = hashlib.sha256()
-    for name in sorted(tensors):
-        x = np.ascontiguousarray(tensors[name])
-        content.update(f"{name} {x.dtype} {x.shape}".encode() + x.tobytes())
-    content.update(json.dumps({k: v for k, v in header.items() if k != "digest"}).encode())
-    return content.hexdigest()
+    write_bytes(path, seal(tensors, _KEY, header))
 
 
 # --- reading -------------------------------------------------------------------------------------
 
 
-def load(
-    source: str | Path, task: Task | None = None, proxy: Any = None
-) -> tuple[ProxyEnv, Any]:
+def load(source: str | Path, task: Task | None = None, proxy: Any = None) -> tuple[ProxyEnv, Any]:
     """Loads a proxy as a gymnax environment and its params (the weights).
 
     The discount of a potential-based RN is that of the agent it was learned with. For another one
@@ -319,13 +301,24 @@ def load_set(
                     discount=header["discount"], path=path)  # fmt: skip
 
 
+def read_config(source: str | Path, option: str = "source") -> dict[str, Any]:
+    """What the proxies of a file were learned with, nested plain values.
+
+    Raises:
+      ConfigError: if there is no such file, or it is damaged or of another format.
+    """
+    return _read(find(source, option), option)[1]["config"]
+
+
 def find(source: str | Path, option: str = "source") -> Path:
     """The file that a run directory, a path or a shipped name stands for."""
     path, text = Path(source), shortened(source)
     try:
         is_dir, is_file = path.is_dir(), path.is_file()
     except (OSError, ValueError) as error:
-        raise ConfigError(f"{option} must be a path; got {text} ({type(error).__name__}).") from None
+        raise ConfigError(
+            f"{option} must be a path; got {text} ({type(error).__name__})."
+        ) from None
     if is_dir:
         path = path / "proxy.safetensors"
         is_run = (path.parent / "config.yaml").exists()
@@ -363,23 +356,26 @@ def _read(path: Path, option: str) -> tuple[dict[str, np.ndarray], dict[str, Any
         raise _damaged(path, option, str(error)) from error
     try:
         stored = json.loads(metadata.get(_KEY) or metadata["sejax_set"])
-        header = _as_current(stored, is_set=_KEY not in metadata)
-        if header is not None:
-            _check_header(header)
+        version = stored["format_version"]
+        if version == 1:
+            stored = _from_version_1(stored, is_set=_KEY not in metadata)
+        if type(version) is int and version <= FORMAT_VERSION:
+            _check_header(stored)
     except (KeyError, ValueError, TypeError, AttributeError, RecursionError) as error:
         raise ConfigError(
             f"{option} must be a file that sejax has written, because the network is rebuilt from "
             f"its metadata; {path} has none that is valid ({type(error).__name__}: "
             f"{shortened(error)}). Learn it again."
         ) from error
-    if header is None:
-        raise ConfigError(
-            f"{option} must be of format {FORMAT_VERSION} or older, because this version of sejax "
-            f"reads no other; {path} has {shortened(stored.get('format_version'))}. Update sejax."
-        )
-    if "digest" in header and header["digest"] != _digest(tensors, header):
-        raise _damaged(path, option, "its contents do not match its digest")
-    return tensors, header
+    require(version in (1, FORMAT_VERSION), option, f"be of format {FORMAT_VERSION} or 1",
+            "this version of sejax reads no other", f"{shortened(version)} in {path}",
+            f"{option} to a file of this version")  # fmt: skip
+    if version == FORMAT_VERSION:
+        try:
+            tensors, _ = unseal(path.read_bytes(), _KEY)
+        except DamagedError as error:
+            raise _damaged(path, option, str(error)) from error
+    return tensors, stored
 
 
 def _damaged(path: Path, option: str, how: str) -> ConfigError:
@@ -403,14 +399,8 @@ def _check_header(header: dict[str, Any]) -> None:
     header["discount"] = float(header["discount"])
 
 
-def _as_current(stored: Any, is_set: bool) -> dict[str, Any] | None:
-    """A header as this version has it; None for one of a later version."""
-    version = stored["format_version"]
-    if not isinstance(version, int) or not 1 <= version <= FORMAT_VERSION:
-        return None
-    if version == FORMAT_VERSION:
-        return dict(stored)
-    # Version 1 had two kinds of files, and no digest; see CHANGELOG.
+def _from_version_1(stored: Any, is_set: bool) -> dict[str, Any]:
+    """A header of version 1, which had two kinds of files and no digest, as this one has it."""
     config = _upgraded(stored["config"])
     names = ("score", "generation", "seed")
     if is_set:

@@ -1,0 +1,216 @@
+"""The one driver of a run: chunks of generations, each saved before the next one starts."""
+
+import platform
+import time
+from pathlib import Path
+from typing import Any, Protocol
+
+import jax
+import numpy as np
+
+from sejax.app import build, commands
+from sejax.app.run_directory import RunDirectory
+from sejax.bilevel import Program, make_program
+from sejax.proxies import files
+
+
+class Reporter(Protocol):
+    """What a run tells while it goes on; see `sejax.app.progress`."""
+
+    def say(self, text: str) -> None: ...
+    def print(self, text: str) -> None: ...
+    def compiled(self) -> None: ...
+    def update(self, generation: int, info: Any) -> None: ...
+    def time_to_draw(self) -> bool: ...
+
+
+class Quiet:
+    """Tells nothing and draws nothing."""
+
+    def say(self, text: str) -> None:
+        pass
+
+    print = say
+
+    def compiled(self) -> None:
+        pass
+
+    def update(self, generation: int, info: Any) -> None:
+        pass
+
+    def time_to_draw(self) -> bool:
+        return False
+
+
+class Chunks:
+    """A program's generations in chunks of one length, compiled once for a number of seeds.
+
+    Left to `jax.jit` a chunk would be compiled anew for the state's every placement on the devices:
+    new, restored, or as the chunk before returned it.
+    """
+
+    def __init__(self, program: Program):
+        self.program = program
+        self._compiled: dict[tuple[int, int], Any] = {}
+
+    def is_ready(self, num_seeds: int, length: int) -> bool:
+        """Whether such a chunk has been compiled."""
+        return (num_seeds, length) in self._compiled
+
+    def advance(self, state: Any, length: int) -> tuple[Any, Any]:
+        """Runs `length` generations; the state's buffers are used up.
+
+        Returns:
+          The state, and an info with leaves `[length, seed]`.
+        """
+        num_seeds = state.generation.shape[0]
+        if not self.is_ready(num_seeds, length):
+            self.compile(num_seeds, length)
+        return self._compiled[num_seeds, length](state)
+
+    def compile(self, num_seeds: int, length: int) -> None:
+        """Compiles a chunk."""
+
+        def chunk(state: Any) -> Any:
+            return jax.lax.scan(
+                lambda state, _: self.program.generation(state), state, length=length
+            )
+
+        keys = jax.random.split(jax.random.key(0), num_seeds)
+        state = jax.eval_shape(self.program.init, keys)
+        self._compiled[num_seeds, length] = jax.jit(chunk, donate_argnums=0).lower(state).compile()
+
+
+def make_chunks(config: build.LearnConfig) -> Chunks:
+    """The compiled program of a configuration, which runs that differ in their seeds share."""
+    return Chunks(make_program(**config.parts()))
+
+
+def run(
+    config: build.LearnConfig,
+    directory: RunDirectory,
+    chunks: Chunks,
+    report: Reporter | None = None,
+) -> str:
+    """Runs the bilevel loop, or what is left of it, in chunks of `checkpoint_every` generations.
+
+    Every chunk is the same executable. After each, the metrics, the proxies and a checkpoint are
+    written.
+
+    Args:
+      config: of the run.
+      directory: its folder.
+      chunks: of a program of this configuration.
+      report: told how it goes; nobody is if not given.
+
+    Returns:
+      How it ended: finished or solved.
+
+    Raises:
+      ConfigError: if the folder's files do not fit each other.
+      OSError: if a file cannot be written; everything saved before is whole.
+    """
+    report = report or Quiet()
+    program = chunks.program
+    started, cpu_started = time.time(), time.process_time()
+    seeds = config.seed + jax.numpy.arange(config.num_seeds)
+    state = jax.jit(program.init)(jax.vmap(jax.random.key)(seeds))
+    state, generation, problems = directory.resume(state)
+    for problem in problems:
+        report.print(problem)
+    proxies = Proxies(config, directory.path, program)
+    if generation:
+        report.print(f"Going on at generation {generation} of {directory.path}.")
+        proxies.save(jax.device_get(state))  # again, as somebody may have damaged them
+    wall_before = float(directory.rows[-1]["wall_s"]) if directory.rows else 0.0
+    state = jax.tree.map(lambda x: x.copy(), state)  # own buffers, so that they can be donated
+    while generation < config.generations and not bool(state.finished.all()):
+        length = min(config.checkpoint_every, config.generations - generation)
+        if not chunks.is_ready(config.num_seeds, length):
+            report.say("compiling")
+            chunks.compile(config.num_seeds, length)
+            report.compiled()
+        state, info = chunks.advance(state, length)
+        _wait(state)
+        generation += length
+        host_state, info = jax.device_get((state, info))
+        with commands.interrupts_held():
+            directory.append(info, wall_before + time.time() - started)
+            proxies.save(host_state)
+            directory.commit(generation, state)
+        report.update(generation, info)
+        if report.time_to_draw():
+            draw(directory, program)
+    ended = "solved" if bool(state.finished.all()) else "finished"
+    draw(directory, program)
+    directory.write_summary(
+        ended=ended,
+        best_score=float(state.best_score.max()),
+        generations=generation,
+        wall_s=round(wall_before + time.time() - started, 1),
+        cpu_s_of_last_session=round(time.process_time() - cpu_started, 1),
+        devices=[str(device) for device in jax.devices()],
+        versions=_versions(),
+    )
+    return ended
+
+
+class Proxies:
+    """The proxy files of a run."""
+
+    def __init__(self, config: build.LearnConfig, folder: Path, program: Program):
+        self.config, self.folder, self.program = config, folder, program
+        self._plain = build.to_plain(config)
+        self._discount = float(program.agent.discount(program.agent.hparams))
+        self._stored: dict[int, int] = {}  # generation of each seed's best one that is on the disk
+
+    def save(self, state: Any) -> None:
+        """Writes the best proxy and the last one; with several seeds also the best of each.
+
+        Raises:
+          OSError: if a file cannot be written.
+        """
+        best, last = int(np.argmax(state.best_score)), int(np.argmax(state.incumbent_score))
+        self._save("proxy", best, state.best, state.best_score, state.best_generation)
+        self._save("proxy_last", last, state.incumbent, state.incumbent_score,
+                   state.generation - 1)  # fmt: skip
+        for i in range(self.config.num_seeds) if self.config.num_seeds > 1 else ():
+            generation = int(state.best_generation[i])
+            if self._stored.get(i) != generation:  # few are new
+                name = f"proxies/seed{self.config.seed + i}"
+                self._save(name, i, state.best, state.best_score, state.best_generation)
+                self._stored[i] = generation
+
+    def _save(self, name: str, index: int, flat: Any, score: Any, generation: Any) -> None:
+        files.save(
+            self.folder / f"{name}.safetensors",
+            self.program.proxy,
+            self.program.unravel(flat[index]),
+            self._plain,
+            self._discount,
+            score=float(score[index]),
+            generation=int(generation[index]),
+            seed=self.config.seed + index,
+        )
+
+
+def draw(directory: RunDirectory, program: Program) -> None:
+    """Draws the learning curve of what there is."""
+    from sejax.app import plots
+
+    if directory.rows:
+        path = directory.path / "learning_curve.png"
+        plots.learning_curve(directory.rows, program.solved_score, path)
+
+
+def _wait(state: Any) -> None:
+    """Waits for the devices in Python, so that Ctrl-C is heard while they work."""
+    while not state.generation.is_ready():
+        time.sleep(0.02)
+
+
+def _versions() -> dict[str, str]:
+    from importlib.metadata import version
+
+    packages = ("sejax", "jax", "jaxlib", "flax", "optax", "evosax", "gymnax", "numpy")
+    return {"python": platform.python_version(), **{name: version(name) for name in packages}}
