@@ -21,7 +21,6 @@ from sejax.errors import ConfigError, require
 def main(cfg: DictConfig) -> float:
     """Evaluates as configured and returns the mean test return (for Hydra's sweepers)."""
     config = compose.evaluate_config_of(cfg)
-    runtime.configure_xla(config.devices)
     runtime.enable_compilation_cache()
     return evaluate(config)
 

@@ -29,7 +29,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from sejax import serialize
-from sejax.errors import ConfigError, require, shortened, unknown_name
+from sejax.errors import ConfigError, nearest, require, shortened, unknown_name
 
 
 @dataclass(frozen=True)
@@ -279,9 +279,16 @@ def _import(group: str, path: str) -> Any:
             f"folder to PYTHONPATH."
         ) from error
     for part in attribute.split("."):
-        known = [name for name in dir(found) if not name.startswith("_")]
         if not hasattr(found, part):
-            raise unknown_name(f"{group}={module}", part, known or [module])
+            known = [name for name, value in vars(found).items()
+                     if callable(value) and getattr(value, "__module__", None) == module]  # fmt: skip
+            near = nearest(part, known)
+            raise ConfigError(
+                f"{group} must name a class or function of {module}, because that is what makes "
+                f"it; got {shortened(part)}, which is not there. There are: "
+                f"{', '.join(near) or 'none'}."
+                + (f" Did you mean {group}={module}:{near[0]}?" if near else "")
+            )
         found = getattr(found, part)
     return found
 

@@ -29,7 +29,6 @@ def learn(config: LearnConfig) -> float:
       ConfigError: if the run directory cannot be used.
       OSError: if a file cannot be written; everything saved before is whole.
     """
-    runtime.configure_xla(config.devices)
     from sejax.app.progress import RunProgress
 
     # Before the task is imported: a refusal must be quick.

@@ -3,10 +3,11 @@
 import contextlib
 import functools
 import os
+import re
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import NoReturn
 
@@ -14,7 +15,7 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
-from sejax.app import compose
+from sejax.app import compose, runtime
 from sejax.errors import ConfigError
 
 BAD_INPUT, FAILED, INTERRUPTED = 2, 1, 130
@@ -33,14 +34,26 @@ def start(name: str, main: Callable[[], object]) -> None:
         if sys.path[0] != "":  # `python -m` has put the current folder there, if it still exists
             sys.path.insert(0, "")
         Path.cwd()
+        runtime.configure_xla(_devices(words))  # before a plugin imports what starts jax's devices
+        if {"--help", "-h"} & set(sys.argv[1:]):
+            print(compose.help_text(name, words))
+            return
         compose.register(name, words)
         main()
     except (HydraException, OmegaConfBaseException) as error:
         fail(str(compose.translate_hydra_error(error, words)), BAD_INPUT)
     except ConfigError as error:
         fail(str(error), BAD_INPUT)
+    except BrokenPipeError:  # whoever reads has seen enough
+        leave(0)
     except FileNotFoundError as error:
         fail(f"The current folder is gone ({error}). Change to one that exists.", FAILED)
+
+
+def _devices(words: Sequence[str]) -> int | None:
+    """The number of devices that is asked for, if it is one; what is not is refused later."""
+    values = [word.removeprefix("devices=") for word in words if word.startswith("devices=")]
+    return int(values[-1]) if values and re.fullmatch(r"[1-9]\d{0,3}", values[-1]) else None
 
 
 def task(main: Callable[[DictConfig], float]) -> Callable[[DictConfig], float]:
@@ -95,6 +108,7 @@ def interrupts_held() -> Iterator[None]:
 
 def leave(status: int) -> NoReturn:
     """Ends the process at once, even while a program is still running on the devices."""
-    sys.stdout.flush()
-    sys.stderr.flush()
+    for stream in (sys.stdout, sys.stderr):
+        with contextlib.suppress(BrokenPipeError):
+            stream.flush()
     os._exit(status)

@@ -33,8 +33,7 @@ def configure_xla(num_devices: int | None = None) -> None:
     Args:
       num_devices: CPU devices; None for one per core.
 
-    Once jax has computed, the flags would have no effect: then nothing is done (a sweep's second
-    job; Python code of a user's).
+    Once jax has computed, the flags would have no effect: then nothing is done.
     """
     if is_started():
         return
