@@ -9,7 +9,7 @@ from typing import Any
 
 from sejax import agents, envs, plugins, serialize
 from sejax.errors import ConfigError, one_of, require, require_seed, shortened, whole
-from sejax.trainer import TrainingConfig, steps_before_learning
+from sejax.training import TrainingConfig, steps_before_learning
 
 AGENT_HPARAMS = ("default", "varied")
 EVALUATION_HPARAMS = (*AGENT_HPARAMS, "nes")

@@ -22,7 +22,7 @@ from omegaconf.errors import OmegaConfBaseException
 from sejax import agents, envs, plugins, serialize
 from sejax.app import build, presets
 from sejax.errors import ConfigError, nearest, shortened, unknown_name
-from sejax.trainer import TrainingConfig
+from sejax.training import TrainingConfig
 
 CONF_DIR = Path(__file__).parents[1] / "conf"
 # As in conf/run.yaml.

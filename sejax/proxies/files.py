@@ -25,6 +25,8 @@ from sejax.errors import ConfigError, require, shortened, unknown_name
 from sejax.files import write_bytes
 from sejax.proxies.proxy import ProxyEnv
 from sejax.sealed import DamagedError, seal, unseal
+from sejax.serialize import from_plain
+from sejax.training import TrainingConfig
 
 FORMAT_VERSION = 2
 PRETRAINED_DIR = Path(__file__).parents[1] / "pretrained"
@@ -52,6 +54,29 @@ class Proxy:
     @property
     def task(self) -> Task:
         return self.env.task
+
+    def learned_with(self, group: str) -> Any:
+        """A part of the configuration that it was learned with, such as `agent` or `training`.
+
+        Raises:
+          ConfigError: if nobody knows, or it is of somebody's own: a file's names are not imported.
+
+        Example:
+          >>> load_proxy("cliff_walking-rn").learned_with("agent").discount
+          0.8
+        """
+        stored = self.config.get(group)
+        where = f"{group} that {self.path.name} was learned with"
+        if group == "training" and isinstance(stored, Mapping):
+            return from_plain(TrainingConfig, stored, group)
+        if not isinstance(stored, Mapping):
+            raise ConfigError(f"The {where} must be in the file; it is not. Give one of your own.")
+        if not plugins.is_registered(group, str(stored.get("name"))):
+            raise ConfigError(
+                f"The {where} must be a registered one, because what a file names is never "
+                f"imported; it is {shortened(stored.get('name'))!r}. Give {group}= yourself."
+            )
+        return plugins.configure(group, stored)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -102,6 +127,10 @@ class ProxySet:
         """`EnvParams` of one of them, as `sejax.load` gives them."""
         weights = jax.tree.map(lambda x: jax.numpy.asarray(x[index]), self.weights)
         return self.env.params(weights, self.discount)
+
+    def learned_with(self, group: str) -> Any:
+        """As `Proxy.learned_with`, for all of them."""
+        return self.proxy(0).learned_with(group)
 
     def proxy(self, index: int) -> Proxy:
         """One of them."""
