@@ -17,7 +17,7 @@ from sejax.errors import ConfigError
 
 
 @hydra.main(config_path="conf", config_name="evaluate", version_base="1.3")
-@commands.task
+@commands.guarded
 def main(cfg: DictConfig) -> float:
     """Evaluates as configured and returns the mean test return (for Hydra's sweepers)."""
     config = compose.evaluate_config_of(cfg)

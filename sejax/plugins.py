@@ -280,9 +280,9 @@ def _import(group: str, path: str) -> Any:
         ) from error
     for part in attribute.split("."):
         if not hasattr(found, part):
-            known = [name for name, value in vars(found).items()
-                     if callable(value) and getattr(value, "__module__", None) == module]  # fmt: skip
-            near = nearest(part, known)
+            own = {name for name, value in vars(found).items()
+                   if callable(value) and getattr(value, "__module__", None) == module}  # fmt: skip
+            near = nearest(part, sorted(own))
             raise ConfigError(
                 f"{group} must name a class or function of {module}, because that is what makes "
                 f"it; got {shortened(part)}, which is not there. There are: "

@@ -78,7 +78,7 @@ TestFn = Callable[[Array, Any, Array], tuple[Array, Array]]
 def make_trainer(
     agent: Agent,
     env: Any,
-    training: TrainingConfig = TrainingConfig(),
+    training: TrainingConfig = TrainingConfig(),  # noqa: B008 (frozen)
     solved_reward: float = jnp.inf,
     test_fn: TestFn | None = None,
     recorder: MemoryMaker | None = None,
@@ -133,8 +133,8 @@ def make_trainer(
         env_params = loop.prepare(env_params, hparams)
         key_begin, key_steps = jax.random.split(key)
         state = loop.begin(key_begin, env_params, hparams, active)
-        kept = tuple(memory.init() for memory in loop.memories(state))
-        kept, state = while_any_active(loop.step, kept, state, (key_steps, env_params))
+        remembered = tuple(memory.init() for memory in loop.memories(state))
+        remembered, state = while_any_active(loop.step, remembered, state, (key_steps, env_params))
         return TrainResult(
             agent_state=state.agent_state,
             train_steps=state.train_steps,
@@ -144,7 +144,7 @@ def make_trainer(
             episode_ends=state.episode_ends,
             nonfinite=state.nonfinite | ~_all_finite(state.agent_state),
             test_steps=state.test_steps,
-            recorded=kept[1] if recorder is not None else None,
+            recorded=remembered[1] if recorder is not None else None,
         )
 
     return train
@@ -213,7 +213,7 @@ class _Loop:
         return [make(shapes, self.memory_steps) for make in self.memory_makers]
 
     def step(
-        self, kept: Any, state: _LoopState, consts: Any, masked: bool
+        self, remembered: Any, state: _LoopState, consts: Any, masked: bool
     ) -> tuple[Any, _LoopState]:
         """One agent step: act, step the world, store, learn, and close the episode if it ended."""
         key, env_params = consts
@@ -232,14 +232,14 @@ class _Loop:
             state.obs, action, reward, self.discount(terminated, truncated, info), next_obs
         )
         active = state.active if masked else True
-        kept = tuple(
+        remembered = tuple(
             memory.store(arrays, state.step, transition, ended, active)
-            for memory, arrays in zip(memories, kept, strict=True)
+            for memory, arrays in zip(memories, remembered, strict=True)
         )
 
         def learn(agent_state: Any) -> Any:
             size = self.agent.batch_size(agent_state)
-            batch = memories[0].batch(key_sample, kept[0], state.step + 1, transition, size)
+            batch = memories[0].batch(key_sample, remembered[0], state.step + 1, transition, size)
             return self.agent.update(key_update, agent_state, batch)
 
         agent_state = jax.lax.cond(
@@ -259,7 +259,7 @@ class _Loop:
         state = jax.lax.cond(
             ended, lambda s: self.end_episode(key_end, s, env_params, ended), lambda s: s, state
         )
-        return kept, state
+        return remembered, state
 
     def discount(self, terminated: Array, truncated: Array, info: Any) -> Array:
         """What a target bootstraps with, before gamma."""

@@ -56,14 +56,14 @@ def _devices(words: Sequence[str]) -> int | None:
     return int(values[-1]) if values and re.fullmatch(r"[1-9]\d{0,3}", values[-1]) else None
 
 
-def task(main: Callable[[DictConfig], float]) -> Callable[[DictConfig], float]:
+def guarded(main: Callable[[DictConfig], float]) -> Callable[[DictConfig], float]:
     """Decorates what Hydra calls: bad input and files that fail become a message and exit code.
 
     Inside of Hydra's call, as Hydra prints lines of its own for an exception that leaves it.
     """
 
     @functools.wraps(main)
-    def guarded(cfg: DictConfig) -> float:
+    def run(cfg: DictConfig) -> float:
         try:
             return main(cfg)
         except ConfigError as error:
@@ -80,7 +80,7 @@ def task(main: Callable[[DictConfig], float]) -> Callable[[DictConfig], float]:
             fail(f"There is not enough memory: {str(error).splitlines()[0]} Smaller networks, "
                  f"buffers or populations need less.", FAILED)  # fmt: skip
 
-    return guarded
+    return run
 
 
 def fail(message: str, status: int) -> NoReturn:
