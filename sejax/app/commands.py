@@ -2,6 +2,7 @@
 
 import contextlib
 import functools
+import io
 import os
 import re
 import signal
@@ -29,7 +30,11 @@ def start(name: str, main: Callable[[], object]) -> None:
       main: decorated by `hydra.main`.
     """
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra then raises, and the message is ours.
-    words = compose.main_words()
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")  # a terminal of few letters
+    sys.argv[1:] = [_quoted(word) for word in sys.argv[1:]]
+    words = [word for word in sys.argv[1:] if not word.startswith("-")]
     try:
         if sys.path[0] != "":  # `python -m` has put the current folder there, if it still exists
             sys.path.insert(0, "")
@@ -48,6 +53,15 @@ def start(name: str, main: Callable[[], object]) -> None:
         leave(0)
     except FileNotFoundError as error:
         fail(f"The current folder is gone ({error}). Change to one that exists.", FAILED)
+
+
+def _quoted(word: str) -> str:
+    """A word whose value Hydra's grammar reads: it knows letters outside of ASCII in quotes alone."""
+    name, equals, value = word.partition("=")
+    if not equals or value.isascii() or value[:1] in "'\"[{":
+        return word
+    escaped = value.replace("\\", "\\\\").replace("'", "\\'")
+    return f"{name}='{escaped}'"
 
 
 def _devices(words: Sequence[str]) -> int | None:
@@ -85,7 +99,7 @@ def guarded(main: Callable[[DictConfig], float]) -> Callable[[DictConfig], float
 
 def fail(message: str, status: int) -> NoReturn:
     """Prints the message and ends the process."""
-    print(f"error: {message}".encode("utf-8", "replace").decode(), file=sys.stderr)
+    print(f"error: {message}", file=sys.stderr)
     sys.exit(status)
 
 

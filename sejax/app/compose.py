@@ -6,7 +6,6 @@ and proxy (`sejax.app.presets`).
 """
 
 import re
-import sys
 import textwrap
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -302,8 +301,3 @@ def _first_line(error: Exception) -> str:
     key = getattr(error, "full_key", None)
     line = shortened((str(message).strip().splitlines() or [type(error).__name__])[0], 400)
     return f"{line.rstrip('.')}{f' in {key}' if key and key not in line else ''}."
-
-
-def main_words() -> list[str]:
-    """The words after a command, without Hydra's own options."""
-    return [word for word in sys.argv[1:] if not word.startswith("-")]

@@ -61,7 +61,12 @@ def enable_compilation_cache() -> None:
     """
     import jax
 
-    root = os.environ.get("SEJAX_CACHE_DIR", str(Path.home() / ".cache" / "sejax"))
+    root = os.environ.get("SEJAX_CACHE_DIR")
+    if root is None:
+        try:
+            root = str(Path.home() / ".cache" / "sejax")
+        except RuntimeError:  # nobody's home
+            return
     if not root or jax.config.jax_compilation_cache_dir:
         return
     jax.config.update("jax_compilation_cache_dir", str(Path(root) / cpu_fingerprint()))
