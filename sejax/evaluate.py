@@ -108,7 +108,7 @@ def _proxy_study(config: EvaluateConfig) -> Study:
                           f"tested there; got {config.env} for a proxy of {task.name}. Set "
                           f"env={task.name}.")  # fmt: skip
     agent, exploration = config.agent, config.exploration
-    if config.agent_hparams == "nes":
+    if config.agent_hparams == "as_learned":
         agent, exploration = proxy.learned_with("agent"), proxy.learned_with("exploration")
     agents.require_fit(agent, exploration, task.facts, task.name)
     group, training = _training_on(proxy, config, agent)

@@ -12,7 +12,7 @@ from sejax.errors import ConfigError, one_of, require, require_seed, shortened, 
 from sejax.training import TrainingConfig, steps_before_learning
 
 AGENT_HPARAMS = ("default", "varied")
-EVALUATION_HPARAMS = (*AGENT_HPARAMS, "nes")
+EVALUATION_HPARAMS = (*AGENT_HPARAMS, "as_learned")
 TRAINING_FROM = ("proxy", "config")
 LEARN_GROUPS = ("env", "proxy", "agent", "exploration", "es", "objective")
 EVALUATE_GROUPS = ("agent", "exploration")
@@ -128,7 +128,7 @@ class EvaluateConfig:
         one_of("training_from", self.training_from, TRAINING_FROM)
         require_seed("seed", self.seed)
         _require_computing(self)
-        for name, idle, usual in (("agent_hparams", "nes", "default"),
+        for name, idle, usual in (("agent_hparams", "as_learned", "default"),
                                   ("training_from", "config", "proxy")):  # fmt: skip
             require(self.proxy != "real" or getattr(self, name) != idle, name,
                     f"be {usual} with proxy=real", "there is no proxy", idle,
@@ -137,10 +137,10 @@ class EvaluateConfig:
 
     def _require_use(self) -> None:
         """Refuses settings that would have no effect."""
-        if self.agent_hparams == "nes":
+        if self.agent_hparams == "as_learned":
             for group, usual in (("agent", "ddqn"), ("exploration", "none")):
                 changed = _differences(group, getattr(self, group), {"name": usual})
-                require(not changed, group, "be left out with agent_hparams=nes", "the proxy says "
+                require(not changed, group, "be left out with agent_hparams=as_learned", "the proxy says "
                         "which it was learned with", changed,
                         "agent_hparams=default")  # fmt: skip
         instead = "" if self.proxy == "real" else "training_from=config, or "

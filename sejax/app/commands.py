@@ -56,7 +56,7 @@ def start(name: str, main: Callable[[], object]) -> None:
 
 
 def _quoted(word: str) -> str:
-    """A word whose value Hydra's grammar reads: it knows letters outside of ASCII in quotes alone."""
+    """A word as Hydra's grammar reads it, which knows letters outside of ASCII in quotes alone."""
     name, equals, value = word.partition("=")
     if not equals or value.isascii() or value[:1] in "'\"[{":
         return word
