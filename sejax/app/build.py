@@ -140,8 +140,8 @@ class EvaluateConfig:
         if self.agent_hparams == "as_learned":
             for group, usual in (("agent", "ddqn"), ("exploration", "none")):
                 changed = _differences(group, getattr(self, group), {"name": usual})
-                require(not changed, group, "be left out with agent_hparams=as_learned", "the proxy says "
-                        "which it was learned with", changed,
+                require(not changed, group, "be left out with agent_hparams=as_learned", "the "
+                        "proxy says which it was learned with", changed,
                         "agent_hparams=default")  # fmt: skip
         instead = "" if self.proxy == "real" else "training_from=config, or "
         changed = _changes(serialize.to_plain(self.training), serialize.to_plain(TrainingConfig()))

@@ -460,29 +460,27 @@ def _env_of(
     """The environment that a file's metadata describes."""
     config = header["config"]
     if task is None:
-        name = config["env"].get("name")
-        if not plugins.is_registered("env", str(name)):
-            raise ConfigError(
-                f"{option} must be a proxy of a registered task if no task is given, because what "
-                f"a file names is never imported; {path} is one of {shortened(name)!r}. Give the "
-                f"task: sejax.load(path, task=my_task), or env={shortened(name)} on the command "
-                f"line."
-            )
-        task = envs.make_from(plugins.configure("env", config["env"]))
+        task = envs.make_from(_registered("env", "task", "env", path, config, option))
     require(header["task"] == task.name, option, f"be a proxy of {task.name}", "that is the task "
             "given", f"one of {shortened(header['task'])} in {path}",
             f"{option} to a proxy of {task.name}, or another task")  # fmt: skip
     if proxy is None:
-        name = config["proxy"].get("name")
-        if not plugins.is_registered("proxy", str(name)):
-            raise ConfigError(
-                f"{option} must be of a registered kind if no proxy is given, because what a file "
-                f"names is never imported; {path} is a {shortened(name)!r}. Give its configuration:"
-                f" sejax.load(path, proxy=MyProxy()), or proxy_kind={shortened(name)} on the "
-                f"command line."
-            )
-        proxy = plugins.configure("proxy", config["proxy"])
+        proxy = _registered("proxy", "proxy", "proxy_kind", path, config, option)
     return plugins.make("proxy", proxy, task)
+
+
+def _registered(
+    group: str, argument: str, word: str, path: Path, config: Mapping[str, Any], option: str
+) -> Any:
+    """The configuration of a group, if its name is one that sejax or a package has registered."""
+    name = shortened(config[group].get("name"))
+    if not plugins.is_registered(group, str(config[group].get("name"))):
+        raise ConfigError(
+            f"{option} must be a proxy of a registered {group} if no {argument} is given, because "
+            f"what a file names is never imported; {path} is one of {name!r}. Give it: "
+            f"sejax.load(path, {argument}=...), or {word}={name} on the command line."
+        )
+    return plugins.configure(group, config[group])
 
 
 def _check_tensors(
