@@ -43,7 +43,7 @@ _EXPORTS = {
     "TD3Config": "sejax.agents.td3",
     "Task": "sejax.envs.task",
     "TrainResult": "sejax.trainer",
-    "TrainingConfig": "sejax.trainer",
+    "TrainingConfig": "sejax.training",
     "Trials": "sejax.es.strategy",
     "config": "sejax.app.compose",
     "load": "sejax.proxies.files",
@@ -90,7 +90,8 @@ if TYPE_CHECKING:  # what a type checker and an editor see
         save_set,
     )
     from sejax.proxies.proxy import ProxyEnv
-    from sejax.trainer import TrainingConfig, TrainResult, make_trainer
+    from sejax.trainer import TrainResult, make_trainer
+    from sejax.training import TrainingConfig
 
 __all__ = [
     "AUC", "AUCSum", "Agent", "ConfigError", "CountBasedConfig", "DDQNConfig", "DiscreteTD3Config",

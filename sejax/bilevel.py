@@ -25,7 +25,7 @@ from sejax.evaluation import make_evaluator, tested_throughout
 from sejax.objectives import MaxReward, Objective, Outcome
 from sejax.parallel import spread_over_devices
 from sejax.proxies.proxy import ProxyEnv
-from sejax.trainer import TrainingConfig
+from sejax.training import TrainingConfig
 
 
 @struct.dataclass

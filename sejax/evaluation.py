@@ -17,7 +17,8 @@ from sejax.objectives import Outcome
 from sejax.parallel import spread_over_devices
 from sejax.proxies.proxy import world_of
 from sejax.rollout import make_tester
-from sejax.trainer import TrainingConfig, TrainResult, make_trainer
+from sejax.trainer import TrainResult, make_trainer
+from sejax.training import TrainingConfig
 
 
 def make_evaluator(

@@ -29,7 +29,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from sejax import serialize
-from sejax.errors import ConfigError, require, shortened, unknown_name
+from sejax.errors import ConfigError, nearest, require, shortened, unknown_name
 
 
 @dataclass(frozen=True)
@@ -195,33 +195,36 @@ def make(group: str, config: Any, *arguments: Any) -> Any:
 
     Compiled programs are kept by the identity of what they were built from, so that a new instance
     would compile anew.
+
+    Raises:
+      ConfigError: if it makes something of another kind, or cannot be made.
     """
-    plain = tuple(serialize.to_plain(config).items())
     try:
-        return _make(_Made(type(config), repr(plain), arguments, config, group))
+        return _make(group, Same(config), *arguments)
     except TypeError as error:
         if "unhashable" not in str(error):
             raise
         return _checked(group, config, config.make(*arguments))
 
 
-class _Made:
-    """A key that is equal for equal configurations, hashable or not."""
+class Same:
+    """Configurations as a key that is equal if all their fields are, hashable or not."""
 
-    def __init__(self, cls: type, plain: str, arguments: tuple, config: Any, group: str):
-        self.key = (cls, plain, arguments)
-        self.config, self.group = config, group
+    def __init__(self, *configs: Any):
+        self.configs = configs
+        self._key = tuple((type(c), repr(serialize.to_plain(c))) for c in configs)
 
     def __hash__(self) -> int:
-        return hash(self.key)
+        return hash(self._key)
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Made) and self.key == other.key
+        return isinstance(other, Same) and self._key == other._key
 
 
 @functools.cache
-def _make(made: _Made) -> Any:
-    return _checked(made.group, made.config, made.config.make(*made.key[2]))
+def _make(group: str, key: Same, *arguments: Any) -> Any:
+    (config,) = key.configs
+    return _checked(group, config, config.make(*arguments))
 
 
 def _checked(group: str, config: Any, made: Any) -> Any:
@@ -279,9 +282,16 @@ def _import(group: str, path: str) -> Any:
             f"folder to PYTHONPATH."
         ) from error
     for part in attribute.split("."):
-        known = [name for name in dir(found) if not name.startswith("_")]
         if not hasattr(found, part):
-            raise unknown_name(f"{group}={module}", part, known or [module])
+            own = {name for name, value in vars(found).items()
+                   if callable(value) and getattr(value, "__module__", None) == module}  # fmt: skip
+            near = nearest(part, sorted(own))
+            raise ConfigError(
+                f"{group} must name a class or function of {module}, because that is what makes "
+                f"it; got {shortened(part)}, which is not there. There are: "
+                f"{', '.join(near) or 'none'}."
+                + (f" Did you mean {group}={module}:{near[0]}?" if near else "")
+            )
         found = getattr(found, part)
     return found
 

@@ -10,7 +10,7 @@ import pytest
 from jax.flatten_util import ravel_pytree
 
 from sejax import envs
-from sejax.agents.blocks import block_size, sum_over_batch
+from sejax.agents.partial_batch import block_size, sum_over_batch
 from sejax.agents.configs import DDQNConfig, DuelingDDQNConfig, ExplorationConfig, QLearningConfig
 from sejax.agents.ddqn import make_ddqn, q_network
 from sejax.agents.hparams import (

@@ -18,9 +18,9 @@ from jaxtyping import Array, Float
 
 from sejax.agents import flat
 from sejax.agents.agent import Agent, AgentOptions, traced
-from sejax.agents.blocks import sum_over_batch
 from sejax.agents.epsilon_greedy import decayed_epsilon, epsilon_greedy
 from sejax.agents.memory import replay_memory
+from sejax.agents.partial_batch import sum_over_batch
 from sejax.agents.replay import Transition, num_columns
 from sejax.networks import ACTIVATIONS, MLP, DuelingMLP, narrow
 from sejax.options import counts, fraction, one_of, option, positive

@@ -84,7 +84,7 @@ class PPOState(struct.PyTreeNode):
     hparams: Any  # traced options, and hidden_size in use or None
 
 
-class Policy(NamedTuple):
+class Distribution(NamedTuple):
     """A distribution of actions, given the actor's outputs and the Gaussian's std.
 
     Attributes:
@@ -344,7 +344,7 @@ def _evaluate_softmax(
     return select_action(log_probs, action), entropy
 
 
-SOFTMAX = Policy(
+SOFTMAX = Distribution(
     sample=_sample_softmax,
     mode=_softmax_mode,
     evaluate=_evaluate_softmax,
@@ -352,7 +352,7 @@ SOFTMAX = Policy(
 )
 
 
-def gaussian(max_action: float) -> Policy:
+def gaussian(max_action: float) -> Distribution:
     """Independent normal actions with mean `max_action * tanh(outputs)` and a given std.
 
     Differs: the authors' mean is `tanh(outputs)`, which cannot reach the whole range of a task
@@ -378,4 +378,4 @@ def gaussian(max_action: float) -> Policy:
     def env_action(action: Float[Array, " action_dim"]) -> Float[Array, " action_dim"]:
         return jnp.clip(action, -max_action, max_action)
 
-    return Policy(sample=sample, mode=mode, evaluate=evaluate, env_action=env_action)
+    return Distribution(sample=sample, mode=mode, evaluate=evaluate, env_action=env_action)

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jax.experimental.xla_metadata import set_xla_metadata
 from jaxtyping import Array, Float, Int, UInt32
 
-from sejax.agents.blocks import block_size
+from sejax.agents.partial_batch import block_size
 
 _VECTOR = 8  # float32 lanes of AVX2
 

@@ -20,8 +20,8 @@ from jaxtyping import Array, Bool, Float, Int
 
 from sejax.agents import flat
 from sejax.agents.agent import Agent, AgentOptions, traced
-from sejax.agents.blocks import sum_over_batch
 from sejax.agents.memory import replay_memory
+from sejax.agents.partial_batch import sum_over_batch
 from sejax.agents.replay import Transition, num_columns
 from sejax.networks import ACTIVATIONS, MLP, narrow
 from sejax.options import counts, fraction, not_negative, one_of, option, positive

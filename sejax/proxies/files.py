@@ -25,6 +25,8 @@ from sejax.errors import ConfigError, require, shortened, unknown_name
 from sejax.files import write_bytes
 from sejax.proxies.proxy import ProxyEnv
 from sejax.sealed import DamagedError, seal, unseal
+from sejax.serialize import from_plain
+from sejax.training import TrainingConfig
 
 FORMAT_VERSION = 2
 PRETRAINED_DIR = Path(__file__).parents[1] / "pretrained"
@@ -52,6 +54,29 @@ class Proxy:
     @property
     def task(self) -> Task:
         return self.env.task
+
+    def learned_with(self, group: str) -> Any:
+        """A part of the configuration that it was learned with, such as `agent` or `training`.
+
+        Raises:
+          ConfigError: if nobody knows, or it is of somebody's own: a file's names are not imported.
+
+        Example:
+          >>> load_proxy("cliff_walking-rn").learned_with("agent").discount
+          0.8
+        """
+        stored = self.config.get(group)
+        where = f"{group} that {self.path.name} was learned with"
+        if group == "training" and isinstance(stored, Mapping):
+            return from_plain(TrainingConfig, stored, group)
+        if not isinstance(stored, Mapping):
+            raise ConfigError(f"The {where} must be in the file; it is not. Give one of your own.")
+        if not plugins.is_registered(group, str(stored.get("name"))):
+            raise ConfigError(
+                f"The {where} must be a registered one, because what a file names is never "
+                f"imported; it is {shortened(stored.get('name'))!r}. Give {group}= yourself."
+            )
+        return plugins.configure(group, stored)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -102,6 +127,10 @@ class ProxySet:
         """`EnvParams` of one of them, as `sejax.load` gives them."""
         weights = jax.tree.map(lambda x: jax.numpy.asarray(x[index]), self.weights)
         return self.env.params(weights, self.discount)
+
+    def learned_with(self, group: str) -> Any:
+        """As `Proxy.learned_with`, for all of them."""
+        return self.proxy(0).learned_with(group)
 
     def proxy(self, index: int) -> Proxy:
         """One of them."""
@@ -431,29 +460,27 @@ def _env_of(
     """The environment that a file's metadata describes."""
     config = header["config"]
     if task is None:
-        name = config["env"].get("name")
-        if not plugins.is_registered("env", str(name)):
-            raise ConfigError(
-                f"{option} must be a proxy of a registered task if no task is given, because what "
-                f"a file names is never imported; {path} is one of {shortened(name)!r}. Give the "
-                f"task: sejax.load(path, task=my_task), or env={shortened(name)} on the command "
-                f"line."
-            )
-        task = envs.make_from(plugins.configure("env", config["env"]))
+        task = envs.make_from(_registered("env", "task", "env", path, config, option))
     require(header["task"] == task.name, option, f"be a proxy of {task.name}", "that is the task "
             "given", f"one of {shortened(header['task'])} in {path}",
             f"{option} to a proxy of {task.name}, or another task")  # fmt: skip
     if proxy is None:
-        name = config["proxy"].get("name")
-        if not plugins.is_registered("proxy", str(name)):
-            raise ConfigError(
-                f"{option} must be of a registered kind if no proxy is given, because what a file "
-                f"names is never imported; {path} is a {shortened(name)!r}. Give its configuration:"
-                f" sejax.load(path, proxy=MyProxy()), or proxy_kind={shortened(name)} on the "
-                f"command line."
-            )
-        proxy = plugins.configure("proxy", config["proxy"])
+        proxy = _registered("proxy", "proxy", "proxy_kind", path, config, option)
     return plugins.make("proxy", proxy, task)
+
+
+def _registered(
+    group: str, argument: str, word: str, path: Path, config: Mapping[str, Any], option: str
+) -> Any:
+    """The configuration of a group, if its name is one that sejax or a package has registered."""
+    name = shortened(config[group].get("name"))
+    if not plugins.is_registered(group, str(config[group].get("name"))):
+        raise ConfigError(
+            f"{option} must be a proxy of a registered {group} if no {argument} is given, because "
+            f"what a file names is never imported; {path} is one of {name!r}. Give it: "
+            f"sejax.load(path, {argument}=...), or {word}={name} on the command line."
+        )
+    return plugins.configure(group, config[group])
 
 
 def _check_tensors(
