@@ -275,10 +275,10 @@ def _import(group: str, path: str) -> Any:
     try:
         found: Any = importlib.import_module(module)
     except Exception as error:
-        reason = f"{type(error).__name__}: {error}"
+        reason = f"{type(error).__name__}: {shortened(error)}"
         raise ConfigError(
-            f"{group} must name a module that can be imported; importing {module!r} for "
-            f"{group}={path} raised {reason}. Run the command in the module's folder, or add that "
+            f"{group} must name a module that can be imported; importing {shortened(module)!r} for "
+            f"{group}={shortened(path)} raised {reason}. Run the command in the module's folder, or add that "
             f"folder to PYTHONPATH."
         ) from error
     for part in attribute.split("."):
