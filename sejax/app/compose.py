@@ -139,6 +139,8 @@ def register(name: str, overrides: Sequence[str]) -> None:
     groups = _GROUPS if name == "run" else build.EVALUATE_GROUPS
     _require_choices((*groups, "preset") if name == "run" else groups, overrides)
     store = ConfigStore.instance()
+    for group in (*_GROUPS, "preset", *_INTERNAL):  # `proxy` is a group of run, a field of evaluate
+        store.repo.pop(group, None)
     training = serialize.to_plain(TrainingConfig())
     base = {"training": training}
     if name == "evaluate":

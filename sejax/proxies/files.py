@@ -339,8 +339,17 @@ def read_config(source: str | Path, option: str = "source") -> dict[str, Any]:
     return _read(find(source, option), option)[1]["config"]
 
 
-def find(source: str | Path, option: str = "source") -> Path:
-    """The file that a run directory, a path or a shipped name stands for."""
+def find(source: str | Path, option: str = "source", also: Sequence[str] = ()) -> Path:
+    """The file that a run directory, a path or a shipped name stands for.
+
+    Args:
+      source: as of `load`.
+      option: what messages call it.
+      also: names beside the shipped ones, for messages.
+
+    Raises:
+      ConfigError: if there is none.
+    """
     path, text = Path(source), shortened(source)
     try:
         is_dir, is_file = path.is_dir(), path.is_file()
@@ -367,7 +376,7 @@ def find(source: str | Path, option: str = "source") -> Path:
     shipped = PRETRAINED_DIR / f"{source}.safetensors"
     if shipped.is_file():
         return shipped
-    raise unknown_name(option, str(source), pretrained_names())
+    raise unknown_name(option, str(source), [*pretrained_names(), *also])
 
 
 def pretrained_names() -> list[str]:
