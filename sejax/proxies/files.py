@@ -395,9 +395,10 @@ def _read(path: Path, option: str) -> tuple[dict[str, np.ndarray], dict[str, Any
     try:
         stored = json.loads(metadata.get(_KEY) or metadata["sejax_set"])
         version = stored["format_version"]
-        if version == 1:
+        is_known = type(version) is int and version in (1, FORMAT_VERSION)
+        if is_known and version == 1:
             stored = _from_version_1(stored, is_set=_KEY not in metadata)
-        if type(version) is int and version <= FORMAT_VERSION:
+        if is_known:
             _check_header(stored)
     except (KeyError, ValueError, TypeError, AttributeError, RecursionError) as error:
         raise ConfigError(
@@ -405,7 +406,7 @@ def _read(path: Path, option: str) -> tuple[dict[str, np.ndarray], dict[str, Any
             f"its metadata; {path} has none that is valid ({type(error).__name__}: "
             f"{shortened(error)}). Learn it again."
         ) from error
-    require(version in (1, FORMAT_VERSION), option, f"be of format {FORMAT_VERSION} or 1",
+    require(is_known, option, f"be of format {FORMAT_VERSION} or 1",
             "this version of sejax reads no other", f"{shortened(version)} in {path}",
             f"{option} to a file of this version")  # fmt: skip
     if version == FORMAT_VERSION:
@@ -429,11 +430,13 @@ def _check_header(header: dict[str, Any]) -> None:
     config = header["config"]
     if not all(isinstance(config[group], Mapping) for group in ("env", "proxy")):
         raise ValueError("no task or proxy")
+    if not isinstance(header["task"], str) or not isinstance(header["is_set"], bool):
+        raise ValueError("no name of a task, or nothing that says whether it is a set")
     records = header["proxies"]
     if not records or not all(isinstance(record, Mapping) for record in records):
         raise ValueError("no records")
     for record in records:
-        float(record.get("score", 0)), int(record.get("seed", 0))
+        float(record.get("score", 0)), int(record.get("seed", 0)), int(record.get("generation", 0))
     header["discount"] = float(header["discount"])
 
 
