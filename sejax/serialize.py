@@ -4,6 +4,7 @@ Values are taken as they are meant (`1` for a float, a list for a tuple) and nev
 in them is resolved, imported or executed.
 """
 
+import contextlib
 import dataclasses
 import types
 import typing
@@ -17,7 +18,8 @@ _WORDS = {bool: "true or false", int: "a whole number", float: "a number", str: 
 
 def to_plain(config: Any) -> dict[str, Any]:
     """The fields of a dataclass as plain values: numbers, words, None, lists and dictionaries."""
-    return {field.name: _plain(getattr(config, field.name)) for field in dataclasses.fields(config)}
+    fields = [field.name for field in dataclasses.fields(config) if field.init]
+    return {name: _plain(getattr(config, name)) for name in fields}
 
 
 def from_plain(cls: Any, values: Mapping[str, Any], where: str) -> Any:
@@ -83,10 +85,13 @@ def _convert(value: Any, hint: Any, name: str, field: Any) -> Any:
         return value
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
     if origin in (types.UnionType, typing.Union):
-        if value is None and type(None) in arguments:
-            return None
-        hint = next(kind for kind in arguments if kind is not type(None))
-        return _convert(value, hint, name, field)
+        if type(value) in arguments:  # None too
+            return value
+        *others, last = (kind for kind in arguments if kind is not type(None))
+        for kind in others:
+            with contextlib.suppress(ConfigError):
+                return _convert(value, kind, name, field)
+        return _convert(value, last, name, field)
     if origin is typing.Literal:
         require(value in arguments, name, f"be one of {', '.join(map(str, arguments))}",
                 "nothing else is known", value, f"{name}={arguments[0]}")  # fmt: skip
@@ -96,7 +101,10 @@ def _convert(value: Any, hint: Any, name: str, field: Any) -> Any:
                 repr(value), f"{name}=[...]")  # fmt: skip
         kind = arguments[0] if arguments else Any
         return (origin or hint)(_convert(x, kind, name, field) for x in value)
-    if dataclasses.is_dataclass(hint) and isinstance(value, Mapping):
+    if dataclasses.is_dataclass(hint) and not isinstance(value, hint):
+        known = ", ".join(x.name for x in dataclasses.fields(hint))
+        require(isinstance(value, Mapping), name, f"have the fields {known}", "it is more than one "
+                "value", repr(value), f"{name}.{known.partition(',')[0]}=VALUE")  # fmt: skip
         return from_plain(hint, value, name)
     if hint in _WORDS:
         return _scalar(value, hint, name, field)
