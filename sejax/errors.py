@@ -36,6 +36,11 @@ def shortened(value: object, length: int = 200) -> str:
     return text if len(text) <= length else f"{text[:length]}... ({len(text)} characters)"
 
 
+def told(error: BaseException) -> str:
+    """Kind and message of somebody else's error, on one line."""
+    return f"{type(error).__name__}: {shortened(' '.join(str(error).split()))}"
+
+
 def require(holds: Any, field: str, rule: str, reason: str, got: object, fix: str) -> None:
     """Raises `ConfigError` in the project's one form of message unless `holds`."""
     if not holds:

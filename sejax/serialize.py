@@ -19,7 +19,7 @@ _WORDS = {bool: "true or false", int: "a whole number", float: "a number", str: 
 def to_plain(config: Any) -> dict[str, Any]:
     """The fields of a dataclass as plain values: numbers, words, None, lists and dictionaries."""
     fields = [field.name for field in dataclasses.fields(config) if field.init]
-    return {name: _plain(getattr(config, name)) for name in fields}
+    return {name: plain(getattr(config, name)) for name in fields}
 
 
 def from_plain(cls: Any, values: Mapping[str, Any], where: str) -> Any:
@@ -34,7 +34,13 @@ def from_plain(cls: Any, values: Mapping[str, Any], where: str) -> Any:
       ConfigError: for a field that is not there, is missing, or has a value of another type.
     """
     fields = {field.name: field for field in dataclasses.fields(cls) if field.init}
-    hints = typing.get_type_hints(cls)
+    try:
+        hints = typing.get_type_hints(cls)
+    except NameError as error:
+        raise ConfigError(
+            f"{where or cls.__name__} must have fields of known types, because values are read by "
+            f"them; got {cls.__name__}, where {error}. Import it where the class is defined."
+        ) from error
     given = {}
     for name, value in values.items():
         if name not in fields:
@@ -69,13 +75,16 @@ def _join(where: str, name: str) -> str:
     return f"{where}.{shortened(name)}" if where else shortened(name)
 
 
-def _plain(value: Any) -> Any:
+def plain(value: Any) -> Any:
+    """One value as `to_plain` has it."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return to_plain(value)
     if isinstance(value, tuple | list):
-        return [_plain(x) for x in value]
+        return [plain(x) for x in value]
     if isinstance(value, Mapping):
-        return {str(key): _plain(x) for key, x in value.items()}
+        return {str(key): plain(x) for key, x in value.items()}
+    if hasattr(value, "tolist"):  # NumPy's and jax's numbers and arrays
+        return value.tolist()
     return value
 
 

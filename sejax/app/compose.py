@@ -113,8 +113,8 @@ def help_text(name: str, overrides: Sequence[str]) -> str:
 
 
 def _compose(name: str, overrides: Sequence[str], **options: Any) -> DictConfig:
-    register(name, overrides)
     try:
+        register(name, overrides)
         if GlobalHydra.instance().is_initialized():  # within a command: Hydra knows the folder
             return compose(name, overrides=list(overrides), **options)
         with initialize_config_dir(str(CONF_DIR), version_base="1.3"):
