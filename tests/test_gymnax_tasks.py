@@ -118,7 +118,9 @@ def test_the_threshold_is_gymnasiums_or_the_one_asked_for():
 
 
 def test_an_unknown_id_lists_those_of_gymnax_nearest_first():
-    with pytest.raises(ConfigError, match=r"^env must be one of gymnax/CartPole-v1, .*got 'gymnax/"):
+    with pytest.raises(
+        ConfigError, match=r"^env must be one of gymnax/CartPole-v1, .*got 'gymnax/"
+    ):
         task_of("CartPole-v7")
 
 
@@ -202,16 +204,21 @@ def test_worlds_that_agents_can_take_as_they_are_are_left_alone():
 @pytest.mark.parametrize("space", [spaces.Dict({"x": spaces.Discrete(2)}),
                                    spaces.Tuple([spaces.Discrete(2)])])  # fmt: skip
 def test_spaces_of_several_arrays_are_refused(space):
-    with pytest.raises(ConfigError, match=r"^env must have actions in a gymnax Box or Discrete space, "
-                                          r"because .* in odd\. Wrap the environment so that its "
+    with pytest.raises(ConfigError, match=r"^env must have actions in a gymnax Box or Discrete "
+                                          r"space, because .* in odd\. Wrap the environment so that its "
                                           r"actions are one array\.$"):  # fmt: skip
         odd_task(space)
-    with pytest.raises(ConfigError, match=r"^env must have observations in a gymnax Box or Discrete"):
+    with pytest.raises(
+        ConfigError, match=r"^env must have observations in a gymnax Box or Discrete"
+    ):
         odd_task(spaces.Discrete(2), space)
 
 
 @pytest.mark.parametrize(("low", "high"), [(-jnp.inf, 1.0), (-1.0, jnp.inf), (1.0, 1.0)])
 def test_actions_without_bounds_are_refused(low, high):
-    with pytest.raises(ConfigError, match=r"^env must have bounded actions, because agents draw and "
-                                          r"squash them within bounds; got Box.* in odd\. Give"):
+    with pytest.raises(
+        ConfigError,
+        match=r"^env must have bounded actions, because agents draw and "
+        r"squash them within bounds; got Box.* in odd\. Give",
+    ):
         odd_task(spaces.Box(low, high, (1,)))  # fmt: skip
