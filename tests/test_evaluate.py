@@ -22,7 +22,12 @@ from sejax.training import TrainingConfig, budget_for
 
 TINY = ["agent.hidden_size=4", "agent.batch_size=4", "agent.init_episodes=0", "num_agents=3",
         "real_training.max_episodes=2"]  # fmt: skip
-ROOM = ["agent=q_learning", "num_agents=2", "real_training.max_episodes=2"]  # tables compile fast
+ROOM = [
+    "agent=q_learning",
+    "num_agents=2",
+    "real_training.max_episodes=2",
+    "devices=1",
+]  # tables compile fast
 
 
 def evaluate_config(*overrides, words=TINY):
@@ -169,7 +174,7 @@ def test_agents_like_those_of_the_run_bring_their_exploration(tmp_path, capsys):
     path = save(tmp_path / "proxy.safetensors", *words)
     config = learned(*words)[0]
     overrides = [f"proxy={path}", "agent_hparams=as_learned", "num_agents=2", "baseline=false",
-                 "real_training.max_episodes=2"]  # fmt: skip
+                 "devices=1", "real_training.max_episodes=2"]  # fmt: skip
     composed = evaluate_config(*overrides, words=[])
     study = _proxy_study(composed)
     assert (study.agent, study.exploration) == (config.agent, config.exploration)

@@ -133,13 +133,12 @@ def test_each_reset_draws_another_state_and_the_limit_truncates(task, real_walk)
 
 
 def test_reward_networks_keep_what_the_physics_carry(task):
-    for variant in ("additive_potential", "exclusive_weighted_info"):
-        env = RewardConfig(variant=variant, hidden_size=4).make(task)
-        obs, state = jax.eval_shape(env.reset_env, jax.random.key(0), env.default_params)
-        after, next_state, reward, *_ = jax.eval_shape(
-            env.step_env, jax.random.key(0), state, jnp.zeros(6), env.default_params
-        )
-        assert (after, next_state) == (obs, state) and reward.shape == ()
+    env = RewardConfig(augmented=True, hidden_size=4).make(task)
+    obs, state = jax.eval_shape(env.reset_env, jax.random.key(0), env.default_params)
+    after, next_state, reward, *_ = jax.eval_shape(
+        env.step_env, jax.random.key(0), state, jnp.zeros(6), env.default_params
+    )
+    assert (after, next_state) == (obs, state) and reward.shape == ()
 
 
 def test_augmented_potentials_see_position_and_velocity_of_either_state(replayed, walk, real):

@@ -253,7 +253,7 @@ LEARN = ["env=cliff_walking", "proxy=rn", "generations=1", "es.population_size=2
 
 
 def test_steps_on_a_reward_network_are_real_and_scored():
-    config = sejax.config([*LEARN, "es.num_incumbent_evals=2"])
+    config = sejax.config([*LEARN, "es.num_incumbent_evals=2", "devices=1"])
     result = jax.jit(sejax.make_learner(config))(jax.random.key(0))
     info = jax.device_get(result.info)
     steps, real = info.train_steps_total[0], info.env_steps_total[0]
