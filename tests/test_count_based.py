@@ -6,12 +6,11 @@ import numpy as np
 import pytest
 
 from sejax import envs
-from sejax.agents.configs import CountBasedConfig, QLearningConfig, SARSAConfig
-from sejax.agents.count_based import with_count_bonus
+from sejax.agents.count_based import CountBasedConfig, with_count_bonus
 from sejax.agents.replay import Transition
-from sejax.agents.tabular import make_q_learning, make_sarsa
-from sejax.configs import TrainingConfig
-from sejax.trainer import make_tester, make_trainer
+from sejax.agents.tabular import QLearningConfig, SARSAConfig, make_q_learning, make_sarsa
+from sejax.rollout import make_tester
+from sejax.trainer import TrainingConfig, make_trainer
 
 NUM_STATES, NUM_ACTIONS, BETA = 3, 2, 0.5
 KEY = jax.random.key(0)

@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 from jax.flatten_util import ravel_pytree
 
-from sejax.agents.ddqn import DDQNHparams, double_q_targets, make_ddqn, select_action
+from sejax.agents.ddqn import DDQNConfig, double_q_targets, make_ddqn, select_action
 from sejax.agents.replay import Transition
-from sejax.configs import DDQNConfig
 from sejax.networks import MLP
 
 OBS_DIM, NUM_ACTIONS, BATCH = 3, 2, 7
@@ -239,10 +238,11 @@ def test_a_two_step_probe_learns_gamma_and_one():
 
 
 def test_hparams_hold_the_configured_numbers(agent):
-    assert agent.hparams == DDQNHparams(
-        learning_rate=0.01, target_update_rate=0.1, discount=0.9,
-        epsilon_init=1.0, epsilon_min=0.01, epsilon_decay=0.9,
-    )  # fmt: skip
+    assert agent.hparams._asdict() == {
+        "learning_rate": 0.01, "target_update_rate": 0.1, "discount": 0.9,
+        "epsilon_init": 1.0, "epsilon_min": 0.01, "epsilon_decay": 0.9,
+        "hidden_size": None, "batch_size": None,  # all of them
+    }  # fmt: skip
     assert (agent.init_episodes, agent.learns_from) == (10, 10)
 
 

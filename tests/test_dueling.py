@@ -11,11 +11,9 @@ from support import numpy_forward
 from test_ddqn import BATCH, OBS_DIM, random_batch
 
 from sejax import envs
-from sejax.agents.configs import DuelingDDQNConfig
-from sejax.agents.ddqn import make_ddqn, q_network
-from sejax.configs import TrainingConfig
+from sejax.agents.ddqn import DuelingDDQNConfig, make_ddqn
 from sejax.networks import DuelingMLP
-from sejax.trainer import make_trainer
+from sejax.trainer import TrainingConfig, make_trainer
 
 NUM_ACTIONS = 2  # as in the batches of test_ddqn
 GOLDEN = Path(__file__).parent / "golden" / "dueling_updates.npz"
@@ -32,7 +30,7 @@ def config_with(activation):
 
 def nested_params(config):
     """Turns the agent's flat parameters into the network's nested ones."""
-    network = q_network(config, NUM_ACTIONS)
+    network = config.network(NUM_ACTIONS)
     _, unravel = ravel_pytree(network.init(jax.random.key(0), jnp.zeros(OBS_DIM)))
     return lambda flat: unravel(flat)["params"]
 

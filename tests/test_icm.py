@@ -11,9 +11,8 @@ from flax import struct
 from support import numpy_forward
 
 from sejax.agents.agent import Agent
-from sejax.agents.configs import DDQNConfig, ICMConfig
-from sejax.agents.ddqn import make_ddqn
-from sejax.agents.icm import ICM, ICMOutputs, icm_loss, with_icm
+from sejax.agents.ddqn import DDQNConfig, make_ddqn
+from sejax.agents.icm import ICM, ICMConfig, ICMOutputs, icm_loss, with_icm
 from sejax.agents.memory import Rollout, replay_memory
 from sejax.agents.replay import Transition, pack
 

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from support import numpy_forward
 
-from sejax.configs import ACTIVATIONS
-from sejax.networks import MLP, PRELU_SLOPE, affine
+from sejax.networks import ACTIVATIONS, MLP, PRELU_SLOPE, affine
 
 
 def test_initial_weights_and_biases_are_uniform_within_one_over_root_fan_in():

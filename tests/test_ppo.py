@@ -11,12 +11,12 @@ from jax.flatten_util import ravel_pytree
 
 from sejax import envs
 from sejax.agents import replay
-from sejax.agents.configs import PPOConfig
+from sejax.agents.agent import traced
 from sejax.agents.memory import Rollout
 from sejax.agents.ppo import (
     MIN_STD,
     SOFTMAX,
-    PPOHparams,
+    PPOConfig,
     discounted_returns,
     gaussian,
     make_ppo,
@@ -24,9 +24,9 @@ from sejax.agents.ppo import (
     ppo_loss,
 )
 from sejax.agents.replay import Transition
-from sejax.configs import TrainingConfig
 from sejax.networks import MLP
-from sejax.trainer import make_tester, make_trainer
+from sejax.rollout import make_tester
+from sejax.trainer import TrainingConfig, make_trainer
 
 OBS_DIM, NUM_ACTIONS, ACTION_DIM, MAX_ACTION, MAX_STEPS = 3, 4, 2, 2.0, 6
 STEPS = 13  # two episodes of full length, and one step
@@ -36,9 +36,7 @@ CONFIG = PPOConfig(
     hidden_size=5, num_layers=2, activation="tanh", learning_rate=0.01, discount=0.9,
     update_episodes=2, epochs=3, clip_ratio=0.05, value_weight=0.7, entropy_weight=0.05,
 )  # fmt: skip
-HPARAMS = PPOHparams(
-    learning_rate=0.01, discount=0.9, clip_ratio=0.05, value_weight=0.7, entropy_weight=0.05
-)
+HPARAMS = traced(CONFIG)
 KINDS = ("discrete", "continuous")
 KEY = jax.random.key(0)
 
@@ -161,9 +159,7 @@ def loss_inputs():
 
 
 def test_loss_by_hand():
-    hp = PPOHparams(
-        learning_rate=0.0, discount=0.0, clip_ratio=0.2, value_weight=0.5, entropy_weight=0.1
-    )
+    hp = HPARAMS._replace(clip_ratio=0.2, value_weight=0.5, entropy_weight=0.1)
     # Ratios 2, 2, 0.5, 0.5 and advantages 1, -1, 1, -1. The smaller of the ratio's and of the
     # clipped ratio's product: min(2, 1.2), min(-2, -1.2), min(0.5, 0.8), min(-0.5, -0.8); mean
     # (1.2 - 2 + 0.5 - 0.8) / 4 = -0.275. Value error 1, entropy 3: 0.275 + 0.5 - 0.3 = 0.475.
@@ -381,7 +377,10 @@ def test_an_agent_has_either_discrete_or_continuous_actions():
 
 
 def test_the_agent_says_what_was_configured(agent):
-    assert agent.hparams == HPARAMS
+    assert agent.hparams._asdict() == {
+        "learning_rate": 0.01, "discount": 0.9, "clip_ratio": 0.05, "value_weight": 0.7,
+        "entropy_weight": 0.05, "hidden_size": None,  # all of it
+    }  # fmt: skip
     assert (agent.init_episodes, agent.learns_from, agent.action_repeat) == (1, 0, 1)
 
 

@@ -8,12 +8,18 @@ import numpy as np
 import pytest
 
 from sejax import envs
-from sejax.agents.configs import QLearningConfig, SARSAConfig
 from sejax.agents.epsilon_greedy import decayed_epsilon
 from sejax.agents.replay import Transition
-from sejax.agents.tabular import TabularHparams, entry_of, make_q_learning, make_sarsa, mask_of
-from sejax.configs import TrainingConfig
-from sejax.trainer import make_tester, make_trainer
+from sejax.agents.tabular import (
+    QLearningConfig,
+    SARSAConfig,
+    entry_of,
+    make_q_learning,
+    make_sarsa,
+    mask_of,
+)
+from sejax.rollout import make_tester
+from sejax.trainer import TrainingConfig, make_trainer
 
 NUM_STATES, NUM_ACTIONS = 5, 3
 KEY = jax.random.key(0)
@@ -192,9 +198,10 @@ def test_the_defaults_are_the_papers_and_an_agent_is_made_once(make):
     config = QLearningConfig() if make is make_q_learning else SARSAConfig()
     agent = make(config, 48, 4)
     assert agent is make(config, 48, 4)
-    assert agent.hparams == TabularHparams(
-        learning_rate=1.0, discount=0.8, epsilon_init=0.1, epsilon_min=0.1, epsilon_decay=0.0
-    )
+    assert agent.hparams._asdict() == {
+        "learning_rate": 1.0, "discount": 0.8,
+        "epsilon_init": 0.1, "epsilon_min": 0.1, "epsilon_decay": 0.0,
+    }  # fmt: skip
     assert (agent.init_episodes, agent.learns_from) == (0, 0)
 
 

@@ -12,12 +12,11 @@ from jax.flatten_util import ravel_pytree
 from support import numpy_forward
 
 from sejax import envs
-from sejax.agents.configs import DiscreteTD3Config, TD3Config
 from sejax.agents.replay import Transition
 from sejax.agents.td3 import (
-    DiscreteTD3Hparams,
+    DiscreteTD3Config,
     LearningNoise,
-    TD3Hparams,
+    TD3Config,
     annealed_temperature,
     draw_learning_noise,
     gumbel_softmax,
@@ -29,9 +28,9 @@ from sejax.agents.td3 import (
     smoothed_target_action,
     tanh_policy,
 )
-from sejax.configs import TrainingConfig
 from sejax.networks import MLP
-from sejax.trainer import make_tester, make_trainer
+from sejax.rollout import make_tester
+from sejax.trainer import TrainingConfig, make_trainer
 
 OBS_DIM, ACTION_DIM, BATCH, MAX_ACTION = 3, 2, 7, 2.0
 GOLDEN = Path(__file__).parent / "golden" / "td3_updates.npz"
@@ -368,7 +367,7 @@ def test_smoothing_noise_is_scaled_clipped_and_the_action_clamped():
     # and with 9 std 1.5 + 1 = 2.5, clamped to 2.
     noise = LearningNoise(jnp.array([[1.0, -9.0, 9.0]]), None, None)
     outputs = jnp.array([[0.0, 0.0, np.arctanh(0.75)]])
-    hparams = TD3Hparams(0.0, 0.0, 0.0, 0.0, target_noise_std=0.2, target_noise_clip=0.5)
+    hparams = state_of(CONFIG).hparams._replace(target_noise_std=0.2, target_noise_clip=0.5)
     state = state_of(CONFIG).replace(hparams=hparams)
     got = smoothed_target_action(outputs, noise, state, tanh_policy(1, 2.0))
     np.testing.assert_allclose(got, [[0.4, -1.0, 2.0]], rtol=1e-6)
@@ -545,16 +544,18 @@ def test_noisy_tests_act_as_in_training_but_never_warm_up(config):
 
 def test_the_agent_holds_the_configured_numbers():
     agent = agent_of(replace(CONFIG, action_repeat=4, action_noise_std=0.3, init_episodes=6))
-    assert agent.hparams == TD3Hparams(
-        learning_rate=0.01, target_update_rate=0.1, discount=0.9,
-        action_noise_std=0.3, target_noise_std=0.4, target_noise_clip=0.5,
-    )  # fmt: skip
+    assert agent.hparams._asdict() == {
+        "learning_rate": 0.01, "target_update_rate": 0.1, "discount": 0.9,
+        "action_noise_std": 0.3, "target_noise_std": 0.4, "target_noise_clip": 0.5,
+        "hidden_size": None, "batch_size": None,  # all of them
+    }  # fmt: skip
     assert (agent.action_repeat, agent.init_episodes, agent.learns_from) == (4, 6, 6)
-    assert agent_of(DISCRETE).hparams == DiscreteTD3Hparams(
-        learning_rate=0.01, target_update_rate=0.1, discount=0.9,
-        action_noise_std=0.1, target_noise_std=0.4, target_noise_clip=0.5,
-        temperature=2.0, final_temperature=0.25,
-    )  # fmt: skip
+    assert agent_of(DISCRETE).hparams._asdict() == {
+        "learning_rate": 0.01, "target_update_rate": 0.1, "discount": 0.9,
+        "action_noise_std": 0.1, "target_noise_std": 0.4, "target_noise_clip": 0.5,
+        "temperature": 2.0, "final_temperature": 0.25,
+        "hidden_size": None, "batch_size": None,
+    }  # fmt: skip
 
 
 def test_the_memory_hands_out_action_vectors():

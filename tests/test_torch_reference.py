@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 from jax.flatten_util import ravel_pytree
 
-from sejax.agents.configs import DDQNConfig
-from sejax.agents.ddqn import make_ddqn
+from sejax.agents.ddqn import DDQNConfig, make_ddqn
 from sejax.agents.replay import Transition
 from sejax.configs import LearnConfig, SyntheticConfig, TrainingConfig
 from sejax.networks import MLP
