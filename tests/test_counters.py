@@ -15,7 +15,7 @@ jit_sum, jit_add = jax.jit(wide_sum), jax.jit(wide_add)
 
 
 def is_normal(count):
-    return count.dtype == np.int32 and (0 <= count[..., 1]).all() and (count[..., 1] < 2**16).all()
+    return count.dtype == np.int32 and (count[..., 1] >= 0).all() and (count[..., 1] < 2**16).all()
 
 
 @given(rows)

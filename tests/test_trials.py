@@ -1,4 +1,4 @@
-"""sejax.es.strategy: how often the proxies of a generation are tried, and what that makes, by hand."""
+"""sejax.es.strategy: how often the proxies of a generation are tried, and what comes of it."""
 
 import jax.numpy as jnp
 import numpy as np

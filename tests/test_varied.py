@@ -1,7 +1,9 @@
-"""sejax.agents.hparams: what is drawn, and that a narrowed network is exactly a small one."""
+"""sejax.agents.varied: what is drawn, and that a narrowed network is exactly a small one."""
 
 import dataclasses
 import functools
+import re
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -10,22 +12,20 @@ import pytest
 from jax.flatten_util import ravel_pytree
 
 from sejax import envs
+from sejax.agents import make_agent
+from sejax.agents.agent import Agent, Draw, NoExploration, drawing_key
 from sejax.agents.blocks import block_size, sum_over_batch
-from sejax.agents.configs import DDQNConfig, DuelingDDQNConfig, ExplorationConfig, QLearningConfig
-from sejax.agents.ddqn import make_ddqn, q_network
-from sejax.agents.hparams import (
-    Range,
-    draw_value,
-    drawing_key,
-    hidden_sizes,
-    make_varied_agents,
-    ranges_of,
-)
+from sejax.agents.count_based import CountBasedConfig
+from sejax.agents.ddqn import DDQNConfig, DuelingDDQNConfig, make_ddqn
+from sejax.agents.memory import no_memory
 from sejax.agents.replay import Transition
-from sejax.configs import SyntheticConfig, TrainingConfig
-from sejax.evaluation import evaluate_agents
+from sejax.agents.tabular import QLearningConfig
+from sejax.agents.varied import Range, draw_value, hidden_sizes, ranges_of
+from sejax.errors import ConfigError
+from sejax.evaluation import evaluate_agents, make_evaluator
 from sejax.networks import MLP, narrow
-from sejax.proxies.synthetic import make_synthetic
+from sejax.proxies.configs import SyntheticConfig
+from sejax.trainer import TrainingConfig
 
 OBS_DIM, NUM_ACTIONS = 3, 2
 SMALL, LARGE = 5, 8
@@ -99,6 +99,12 @@ def configured(kind, hidden_size, batch_size):
     )  # fmt: skip
 
 
+def zeros_of(init):
+    """Parameters of the right shapes, without drawing any."""
+    shapes = jax.eval_shape(init, jax.random.key(0), jnp.zeros(OBS_DIM))
+    return jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), shapes)
+
+
 def embed(small, large):
     """The small network's parameters in a large one's, whose other entries are 0."""
 
@@ -111,11 +117,11 @@ def embed(small, large):
 def random_batch(num_columns, seed=0):
     rng = np.random.default_rng(seed)
     return Transition(
-        obs=jnp.float32(rng.normal(size=(OBS_DIM, num_columns))),
-        action=jnp.int32(rng.integers(0, NUM_ACTIONS, num_columns)),
-        reward=jnp.float32(rng.normal(size=num_columns)),
-        discount=jnp.float32(rng.uniform(0, 1, num_columns)),
-        next_obs=jnp.float32(rng.normal(size=(OBS_DIM, num_columns))),
+        obs=np.float32(rng.normal(size=(OBS_DIM, num_columns))),
+        action=np.int32(rng.integers(0, NUM_ACTIONS, num_columns)),
+        reward=np.float32(rng.normal(size=num_columns)),
+        discount=np.float32(rng.uniform(0, 1, num_columns)),
+        next_obs=np.float32(rng.normal(size=(OBS_DIM, num_columns))),
     )
 
 
@@ -123,112 +129,252 @@ def random_batch(num_columns, seed=0):
 def test_a_narrowed_agent_learns_exactly_as_a_small_one_on_the_columns_in_use(kind):
     configs = [configured(kind, SMALL, NUM_COLUMNS), configured(kind, LARGE, BATCH)]
     small, large = (make_ddqn(config, OBS_DIM, NUM_ACTIONS) for config in configs)
-    networks = [q_network(config, NUM_ACTIONS) for config in configs]
-    trees = [net.init(jax.random.key(1), jnp.zeros(OBS_DIM)) for net in networks]
-    unravels = [ravel_pytree(tree)[1] for tree in trees]
-    state = small.init(jax.random.key(0), small.hparams)
+    templates = [zeros_of(config.network(NUM_ACTIONS).init) for config in configs]
+
+    @jax.jit
+    def widened(params):
+        """The small agent's parameters in the large one."""
+        _, unravel_small = ravel_pytree(templates[0])
+        return ravel_pytree(embed(unravel_small(params), templates[1]))[0]
+
+    state = jax.jit(small.init)(jax.random.key(0), small.hparams)
     hparams = large.hparams._replace(hidden_size=jnp.float32(SMALL),
                                      batch_size=jnp.float32(NUM_COLUMNS))  # fmt: skip
-    wide = large.init(jax.random.key(0), hparams)
-    params = ravel_pytree(embed(unravels[0](state.params), trees[1]))[0]
+    wide = jax.jit(large.init)(jax.random.key(0), hparams)
+    params = widened(state.params)
     wide = wide.replace(params=params, target_params=params)
     update, update_wide = jax.jit(small.update), jax.jit(large.update)
+    weight = np.float32(np.arange(BATCH) < NUM_COLUMNS)
     for step in range(4):
         batch = random_batch(BATCH, seed=step)
-        cut = jax.tree.map(lambda x: x[..., :NUM_COLUMNS] if jnp.ndim(x) else x, batch)
-        weight = jnp.float32(jnp.arange(BATCH) < NUM_COLUMNS)
+        cut = jax.tree.map(lambda x: x[..., :NUM_COLUMNS] if np.ndim(x) else x, batch)
         state = update(jax.random.key(step), state, cut)
         wide = update_wide(jax.random.key(step), wide, batch._replace(weight=weight))
-    expected = ravel_pytree(embed(unravels[0](state.params), trees[1]))[0]
-    np.testing.assert_allclose(wide.params, expected, rtol=2e-5, atol=2e-6)
-    in_use = ravel_pytree(embed(jax.tree.map(jnp.ones_like, trees[0]), trees[1]))[0]
-    np.testing.assert_array_equal(wide.params[in_use == 0], 0.0)
+    np.testing.assert_allclose(wide.params, widened(state.params), rtol=2e-5, atol=2e-6)
+    in_use = np.asarray(widened(np.ones_like(state.params)))
+    np.testing.assert_array_equal(np.asarray(wide.params)[in_use == 0], 0.0)
 
 
 def test_narrowed_weights_are_distributed_as_those_of_a_small_network():
     net, small = (MLP(2, size, 3, "tanh") for size in (96, 40))
-    keys = jax.random.split(jax.random.key(3), 30)
     zeros = jnp.zeros(OBS_DIM)
-    wide = jax.vmap(lambda k: narrow(net.init(k, zeros)["params"], jnp.float32(40)))(keys)
-    plain = jax.vmap(lambda k: small.init(k, zeros)["params"])(keys)
+
+    @jax.jit
+    @jax.vmap
+    def draw(key):
+        wide = narrow(net.init(key, zeros)["params"], jnp.float32(40))
+        return wide, small.init(key, zeros)["params"]
+
+    wide, plain = draw(jax.random.split(jax.random.key(3), 30))
     for layer in plain:
         for name, expected in plain[layer].items():
             cut = (slice(None), *(slice(n) for n in expected.shape[1:]))
-            got = np.asarray(wide[layer][name][cut])
+            got, expected = np.asarray(wide[layer][name])[cut], np.asarray(expected)
             assert (got != 0).all()
             assert np.abs(got).max() <= np.abs(expected).max() * 1.1
-            assert got.std() == pytest.approx(np.asarray(expected).std(), rel=0.05)
+            assert got.std() == pytest.approx(expected.std(), rel=0.05)
 
 
 def test_a_layer_norm_sees_only_the_units_in_use():
     small, large = (
         MLP(2, size, 3, "tanh", layer_norm=True, may_narrow=True) for size in (SMALL, LARGE)
     )
-    x = jnp.float32(np.random.default_rng(0).normal(size=(OBS_DIM, 6)))
-    params = small.init(jax.random.key(0), x)["params"]
-    template = narrow(large.init(jax.random.key(1), x)["params"], jnp.float32(SMALL))
-    embedded = embed(params, template)
-    embedded["width"] = template["width"]
-    np.testing.assert_allclose(
-        large.apply({"params": embedded}, x), small.apply({"params": params}, x),
-        rtol=1e-5, atol=1e-6,
-    )  # fmt: skip
-    gradient = jax.grad(lambda p: jnp.sum(large.apply({"params": p}, x) ** 2))(embedded)
+    x = np.float32(np.random.default_rng(0).normal(size=(OBS_DIM, 6)))
+
+    @jax.jit
+    def run(key):
+        params = small.init(key, x)["params"]
+        template = narrow(large.init(key, x)["params"], jnp.float32(SMALL))
+        embedded = embed(params, template) | {"width": template["width"]}
+
+        def loss(params):
+            out = large.apply({"params": params}, x)
+            return jnp.sum(out**2), out
+
+        gradient, got = jax.grad(loss, has_aux=True)(embedded)
+        return got, small.apply({"params": params}, x), gradient
+
+    got, expected, gradient = run(jax.random.key(0))
+    np.testing.assert_allclose(got, expected, rtol=1e-5, atol=1e-6)
     assert gradient["width"] == 0
-    np.testing.assert_array_equal(gradient["Dense_3"]["kernel"][:, SMALL:], 0.0)
+    np.testing.assert_array_equal(np.asarray(gradient["Dense_3"]["kernel"])[:, SMALL:], 0.0)
 
 
 # --- blocks of a batch ---------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("batch_size", [1, block_size(100), block_size(100) + 1, 100])
-def test_a_sum_over_blocks_is_the_sum_over_the_columns_in_use(batch_size):
-    values = jnp.arange(100.0)
-    batch = {"x": jnp.stack([values, 2 * values]), "weight": values < batch_size, "scale": 3.0}
-
+@jax.jit
+def sums_of_columns(batch, batch_size):
     def total(batch):
         return jnp.sum(batch["scale"] * batch["weight"] * batch["x"], axis=1)
 
+    return sum_over_batch(total, batch, batch_size), sum_over_batch(total, batch, None)
+
+
+@pytest.mark.parametrize("batch_size", [1, block_size(100), block_size(100) + 1, 100])
+def test_a_sum_over_blocks_is_the_sum_over_the_columns_in_use(batch_size):
+    values = np.arange(100.0, dtype=np.float32)
+    batch = {"x": np.stack([values, 2 * values]), "weight": values < batch_size, "scale": 3.0}
     expected = 3 * np.arange(batch_size).sum() * np.array([1.0, 2.0])
-    got = jax.jit(lambda n: sum_over_batch(total, batch, n))(jnp.float32(batch_size))
-    np.testing.assert_allclose(got, expected)
-    np.testing.assert_allclose(sum_over_batch(total, batch, None), expected)
+    blockwise, at_once = sums_of_columns(batch, np.float32(batch_size))
+    np.testing.assert_allclose(blockwise, expected)
+    np.testing.assert_allclose(at_once, expected)
 
 
-# --- whole programs ------------------------------------------------------------------------------
+# --- varied agents -------------------------------------------------------------------------------
 
 
 def test_every_drawn_agent_finds_a_network_with_room():
     task = envs.make("cartpole")
     config = DDQNConfig(hidden_size=24, num_layers=2, batch_size=16)
-    varied = make_varied_agents(config, task, ExplorationConfig())
-    values = jax.vmap(varied.draw)(jax.random.split(jax.random.key(0), 200))
-    branches = jax.vmap(varied.branch)(values)
-    sizes = {depth: hidden_sizes(varied.ranges["hidden_size"], depth) for depth in (1, 2, 3)}
-    assert len(varied.agents) == sum(map(len, sizes.values()))
-    for index, hidden, depth in zip(branches, values["hidden_size"], values["num_layers"],
-                                    strict=True):  # fmt: skip
-        agent = varied.agents[int(index)]
-        state = jax.eval_shape(agent.init, jax.random.key(0), agent.hparams)
+    varied = make_agent(config, task, varied=True)
+    draws = jax.jit(jax.vmap(varied.draw))(jax.random.split(jax.random.key(0), 200))
+    values = {name: np.asarray(x) for name, x in draws.values.items()}
+    bounds = ranges_of(config)
+    assert set(values) == set(bounds)
+    sizes = {depth: hidden_sizes(bounds["hidden_size"], depth) for depth in (1, 2, 3)}
+    assert len(varied.variants) == sum(map(len, sizes.values()))
+
+    @functools.cache
+    def num_params(index):
+        agent = varied.variants[index]
+        return jax.eval_shape(agent.init, jax.random.key(0), agent.hparams).params.shape[0]
+
+    for index, hidden, depth in zip(draws.variant.tolist(), values["hidden_size"],
+                                    values["num_layers"], strict=True):  # fmt: skip
         room = min(size for size in sizes[int(depth)] if size >= hidden)
         inner = (int(depth) - 1) * room * (room + 1)
-        assert state.params.shape == (room * 5 + inner + 2 * (room + 1),)
-    assert len(set(branches.tolist())) == len(varied.agents)
+        assert num_params(index) == room * 5 + inner + 2 * (room + 1)
+    assert len(set(draws.variant.tolist())) == len(varied.variants)
+
+
+def test_what_is_drawn_is_what_the_agent_learns_with_and_comes_from_the_trainings_key():
+    config = DDQNConfig(hidden_size=24, num_layers=2, batch_size=16, discount=0.9)
+    varied = make_agent(config, envs.make("cartpole"), varied=True)
+    key = jax.random.key(3)
+    drawn, values = jax.jit(lambda key: (varied.draw(drawing_key(key)), varied.drawn_values(key)))(
+        key
+    )
+    assert drawn.values == values
+    hparams = drawn.hparams._asdict()
+    for name in ("learning_rate", "batch_size", "hidden_size"):
+        assert hparams.pop(name) == values[name]
+    assert hparams.pop("discount") == 0.9  # what is not varied stays as it was configured
+    # Room for the largest batch is in all variants; the agent itself is the configured one.
+    plain = make_agent(config, envs.make("cartpole"))
+    assert varied.hparams == plain.hparams and plain.drawn_values(key) == {}
+    assert plain.variants == () and plain.draw is None
+
+
+def test_the_agent_inside_an_exploring_one_is_varied():
+    varied = make_agent(QLearningConfig(), envs.make("gridworld_2x2"), CountBasedConfig(), True)
+    (variant,) = varied.variants
+    drawn = jax.jit(varied.draw)(jax.random.key(0))
+    assert drawn.variant == 0
+    expected = variant.hparams.agent._replace(**drawn.values)
+    assert drawn.hparams == variant.hparams._replace(agent=expected)
+    assert drawn.values["discount"] != variant.hparams.agent.discount
+
+
+def test_a_varied_agent_is_made_once():
+    task, config = envs.make("gridworld_2x2"), QLearningConfig()
+    assert make_agent(config, task, varied=True) is make_agent(config, task, NoExploration(), True)
+    assert make_agent(config, task, varied=True) is not make_agent(config, task)
+
+
+@dataclasses.dataclass(frozen=True)
+class ForeignConfig:
+    """Of an agent that knows nothing of sejax's options."""
+
+    learning_rate: float = 0.5
+
+    def make(self, task):
+        return agent_that("is foreign")
+
+
+class Numbers(NamedTuple):
+    rate: float
+
+
+def agent_that(name, **fields):
+    """An agent of which nothing but its identity matters."""
+    return Agent(
+        init=lambda key, hparams: name, act=None, update=None, memory=no_memory(),
+        hparams=Numbers(rate=1.0), **fields,
+    )  # fmt: skip
+
+
+def test_an_agent_none_of_whose_options_is_varied_is_refused_with_the_whole_message():
+    task = envs.make("gridworld_2x2")
+    assert isinstance(make_agent(ForeignConfig(), task), Agent)
+    message = (
+        "agent_hparams must be default with this agent, because none of its options says how it "
+        "is drawn (sejax.options.option(..., varied=...)); got ForeignConfig. "
+        "Set agent_hparams=default."
+    )
+    with pytest.raises(ConfigError, match=f"^{re.escape(message)}$"):
+        make_agent(ForeignConfig(), task, varied=True)
+
+
+# --- whole programs ------------------------------------------------------------------------------
+
+
+def test_a_fresh_agent_is_the_variant_that_was_drawn_with_what_was_drawn_for_it():
+    plain = agent_that("has its own numbers")
+    variants = (agent_that("is the first"), agent_that("is the second"))
+    values = {"rate": jnp.array([0.25, 4.0])}
+
+    def draw(key):
+        index = jax.random.randint(key, (), 0, 2)
+        rate = values["rate"][index]
+        return Draw(variant=index, hparams=Numbers(rate), values={"rate": rate})
+
+    varied = dataclasses.replace(plain, variants=variants, draw=draw)
+    built = []
+
+    def make_run(agent):
+        built.append(agent)
+        which = jnp.int32([plain, *variants].index(agent))
+        return lambda key, x, hparams: (which, hparams.rate * x, jax.random.bits(key))
+
+    keys = jax.random.split(jax.random.key(0), 12)
+    run = jax.jit(varied.fresh(make_run))
+    seen = set()
+    for key in keys:
+        which, scaled, bits = run(key, jnp.float32(3.0))
+        drawn = draw(drawing_key(key))
+        assert (which, scaled) == (drawn.variant + 1, 3.0 * drawn.hparams.rate)
+        assert bits == jax.random.bits(key)  # the training's own key
+        assert varied.drawn_values(key) == drawn.values
+        seen.add(int(which))
+    assert seen == {1, 2} and built == list(variants)
+    # An agent that nothing is drawn for runs with its own.
+    which, scaled, _ = plain.fresh(make_run)(keys[0], 3.0)
+    assert (which, scaled) == (0, 3.0)
 
 
 def test_trainings_with_drawn_hyperparameters_equal_those_with_the_same_given():
     task = envs.make("cartpole")
-    env = make_synthetic(task, SyntheticConfig(hidden_size=4))
+    env = SyntheticConfig(hidden_size=4).make(task)
     training = TrainingConfig(stop_rule="never", max_steps=60, test_episodes=2)
-    config = DDQNConfig(hidden_size=3, num_layers=1, batch_size=4, init_episodes=0)
-    varied = make_varied_agents(config, task, ExplorationConfig())
+    # Two networks, of one and of two layers; hidden sizes from 1 to 6, batches from 1 to 12.
+    config = DDQNConfig(hidden_size=2, num_layers=1, batch_size=4, init_episodes=0)
+    varied = make_agent(config, task, varied=True)
+    assert len(varied.variants) == 2
     keys = jax.random.split(jax.random.key(5), 3)
     outcome = evaluate_agents(varied, env, env.default_params, task, training, keys)
-    values = jax.vmap(lambda key: varied.draw(drawing_key(key)))(keys)
-    for i, key in enumerate(keys):
-        given = {name: x[i] for name, x in values.items()}
-        agent = varied.agents[int(varied.branch(given))]
-        agent = dataclasses.replace(agent, hparams=varied.hparams(given))
-        alone = evaluate_agents(agent, env, env.default_params, task, training, key[None])
-        assert outcome.test_return[i] == alone.test_return[0]
-        assert outcome.train_steps[i] == alone.train_steps[0] == 60
+
+    @functools.cache
+    def alone(variant):
+        def train(key, hparams):
+            agent = dataclasses.replace(varied.variants[variant], hparams=hparams)
+            return make_evaluator(agent, env, task, training)(key, env.default_params)
+
+        return jax.jit(train)
+
+    draws = [varied.draw(drawing_key(key)) for key in keys]
+    assert {int(drawn.variant) for drawn in draws} == {0, 1}
+    for i, (key, drawn) in enumerate(zip(keys, draws, strict=True)):
+        expected = alone(int(drawn.variant))(key, drawn.hparams)
+        np.testing.assert_array_equal(outcome.test_returns[i], expected.test_returns)
+        assert outcome.train_steps[i] == expected.train_steps == 60
