@@ -13,6 +13,12 @@ def shapes_of(fn, *args):
     return jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), jax.eval_shape(fn, *args))
 
 
+def random_like(tree, seed=0, scale=0.5):
+    """Normal numbers in the place of a pytree's; nothing is compiled."""
+    rng = np.random.default_rng(seed)
+    return jax.tree.map(lambda x: np.float32(scale * rng.normal(size=x.shape)), tree)
+
+
 def raveled(tree):
     """A pytree of arrays as one vector, as `ravel_pytree`, in NumPy."""
     return np.concatenate([np.ravel(x) for x in jax.tree.leaves(tree)])

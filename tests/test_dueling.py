@@ -6,7 +6,7 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
-from support import numpy_forward, shapes_of, unraveled
+from support import numpy_forward, random_like, shapes_of, unraveled
 from test_ddqn import BATCH, OBS_DIM, assert_updates_equal_torchs
 
 from sejax import envs
@@ -36,13 +36,13 @@ def nested_params(config):
 
 @functools.cache
 def dueling(activation="tanh", num_actions=3, stream_num_layers=2):
-    """The jitted network, and its parameters."""
+    """The jitted network, and random parameters for it."""
     net = DuelingMLP(
         num_actions, feature_dim=4, hidden_size=5, num_layers=1, stream_hidden_size=6,
         stream_num_layers=stream_num_layers, activation=activation,
     )  # fmt: skip
-    variables = jax.jit(net.init)(jax.random.key(1), np.zeros(OBS_DIM, np.float32))
-    return jax.jit(net.apply), jax.tree.map(np.asarray, variables)
+    variables = shapes_of(net.init, jax.random.key(1), np.zeros(OBS_DIM))
+    return jax.jit(net.apply), random_like(variables)
 
 
 # --- the network ---------------------------------------------------------------------------------
