@@ -388,6 +388,12 @@ def test_everything_else_is_the_wrapped_agents():
     for name in ("memory", "init_episodes", "learns_from", "env_action", "action_repeat"):
         assert getattr(agent, name) is getattr(STUBS["index"], name)
     assert agent.hparams == ((), (0.01, 0.3, 0.5))
+    assert agent.hparams.icm._fields == ("learning_rate", "forward_weight", "reward_scale")
+    state = jax.jit(agent.init)(jax.random.key(1), agent.hparams)
+    expected = initial("index")
+    np.testing.assert_allclose(state.params, expected.params, rtol=1e-5, atol=1e-7)
+    rest = [x.replace(params=None) for x in (state, expected)]
+    jax.tree.map(np.testing.assert_array_equal, *rest)
     ddqn = make_ddqn(DDQN, OBS_DIM, WIDTH)
     agent = curious("index", ddqn)
     obs = np.float32([0.3, -0.2, 0.5])

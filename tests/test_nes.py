@@ -47,13 +47,13 @@ def asked(seed=1, **fields):
     strategy, ask, tell = nes(**fields)
     state = strategy.init(jax.random.key(0), jnp.array(MEAN))
     candidates, state = ask(jax.random.key(seed), state)
-    return np.asarray(candidates), state, tell
+    return np.asarray(candidates), jax.tree.map(np.asarray, state), tell
 
 
 def told(scores, seed=1, **fields):
     """State after one generation with these scores, and the candidates that had them."""
     candidates, state, tell = asked(seed, **fields)
-    return tell(jax.random.key(2), candidates, jnp.array(scores, jnp.float32), state), candidates
+    return tell(jax.random.key(2), candidates, np.array(scores, np.float32), state), candidates
 
 
 # --- candidates ----------------------------------------------------------------------------------

@@ -1,7 +1,6 @@
 """sejax.es.score_transforms: each of the eight on numbers worked by hand, and their laws."""
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from hypothesis import given
@@ -12,11 +11,16 @@ from sejax.es.score_transforms import TRANSFORMS
 
 NAN, INF = np.nan, np.inf
 SCORES = [3.0, NAN, 1.0, 2.0]
-JITTED = {name: jax.jit(transform) for name, transform in TRANSFORMS.items()}
+
+
+@jax.jit
+def all_of_them(scores, incumbent):
+    """Weights by name: one program for each number of members."""
+    return {name: transform(scores, incumbent) for name, transform in TRANSFORMS.items()}
 
 
 def transform(name, scores, incumbent):
-    return np.asarray(JITTED[name](jnp.array(scores, jnp.float32), jnp.float32(incumbent)))
+    return np.asarray(all_of_them(np.array(scores, np.float32), np.float32(incumbent))[name])
 
 
 def test_the_eight_transforms_are_the_configured_ones():

@@ -226,7 +226,7 @@ def test_a_sum_over_blocks_is_the_sum_over_the_columns_in_use(batch_size):
 
 def test_every_drawn_agent_finds_a_network_with_room():
     task = envs.make("cartpole")
-    config = DDQNConfig(hidden_size=24, num_layers=2, batch_size=16)
+    config = DDQNConfig(hidden_size=8, num_layers=2, batch_size=16)
     varied = make_agent(config, task, varied=True)
     draws = jax.jit(jax.vmap(varied.draw))(jax.random.split(jax.random.key(0), 200))
     values = {name: np.asarray(x) for name, x in draws.values.items()}
@@ -249,7 +249,7 @@ def test_every_drawn_agent_finds_a_network_with_room():
 
 
 def test_what_is_drawn_is_what_the_agent_learns_with_and_comes_from_the_trainings_key():
-    config = DDQNConfig(hidden_size=24, num_layers=2, batch_size=16, discount=0.9)
+    config = DDQNConfig(hidden_size=2, num_layers=1, batch_size=16, discount=0.9)
     varied = make_agent(config, envs.make("cartpole"), varied=True)
     key = jax.random.key(3)
     drawn, values = jax.jit(lambda key: (varied.draw(drawing_key(key)), varied.drawn_values(key)))(
@@ -340,12 +340,16 @@ def test_a_fresh_agent_is_the_variant_that_was_drawn_with_what_was_drawn_for_it(
     keys = jax.random.split(jax.random.key(0), 12)
     run = jax.jit(varied.fresh(make_run))
     seen = set()
+
+    @jax.jit
+    def expected(key):  # the run has the training's own key
+        return draw(drawing_key(key)), varied.drawn_values(key), jax.random.bits(key)
+
     for key in keys:
-        which, scaled, bits = run(key, jnp.float32(3.0))
-        drawn = draw(drawing_key(key))
+        which, scaled, bits = run(key, np.float32(3.0))
+        drawn, values_of_key, expected_bits = expected(key)
         assert (which, scaled) == (drawn.variant + 1, 3.0 * drawn.hparams.rate)
-        assert bits == jax.random.bits(key)  # the training's own key
-        assert varied.drawn_values(key) == drawn.values
+        assert bits == expected_bits and values_of_key == drawn.values
         seen.add(int(which))
     assert seen == {1, 2} and built == list(variants)
     # An agent that nothing is drawn for runs with its own.
@@ -362,7 +366,7 @@ def test_trainings_with_drawn_hyperparameters_equal_those_with_the_same_given():
     varied = make_agent(config, task, varied=True)
     assert len(varied.variants) == 2
     keys = jax.random.split(jax.random.key(5), 3)
-    outcome = evaluate_agents(varied, env, env.default_params, task, training, keys)
+    outcome = evaluate_agents(varied, env, env.default_params, task, training, keys, devices=1)
 
     @functools.cache
     def alone(variant):
@@ -372,7 +376,8 @@ def test_trainings_with_drawn_hyperparameters_equal_those_with_the_same_given():
 
         return jax.jit(train)
 
-    draws = [varied.draw(drawing_key(key)) for key in keys]
+    draw = jax.jit(lambda key: varied.draw(drawing_key(key)))
+    draws = [draw(key) for key in keys]
     assert {int(drawn.variant) for drawn in draws} == {0, 1}
     for i, (key, drawn) in enumerate(zip(keys, draws, strict=True)):
         expected = alone(int(drawn.variant))(key, drawn.hparams)
