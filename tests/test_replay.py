@@ -128,9 +128,7 @@ def test_indices_are_uniform_within_a_batch_and_over_batches():
 
 def test_consecutive_seeds_draw_unrelated_batches():
     # Seeds are 32 random bits, but even counters must not give shifted copies of one batch.
-    draws = [
-        np.asarray(sample_indices(np.uint32(seed), np.int32(1000), 100)) for seed in range(20)
-    ]
+    draws = [np.asarray(sample_indices(np.uint32(seed), np.int32(1000), 100)) for seed in range(20)]
     equal = [np.mean(a == b) for i, a in enumerate(draws) for b in draws[:i]]
     assert np.mean(equal) < 0.01  # 1 in 1000 by chance
 
