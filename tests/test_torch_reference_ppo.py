@@ -10,13 +10,14 @@ import numpy as np
 import pytest
 from jax.flatten_util import ravel_pytree
 
+import sejax
 from sejax.agents import replay
-from sejax.agents.configs import PPOConfig
 from sejax.agents.memory import Rollout
-from sejax.agents.ppo import make_ppo
+from sejax.agents.ppo import PPOConfig, make_ppo
 from sejax.agents.replay import Transition
-from sejax.configs import LearnConfig, SyntheticConfig, TrainingConfig
 from sejax.networks import MLP
+from sejax.proxies.configs import SyntheticConfig
+from sejax.trainer import TrainingConfig
 
 torch = pytest.importorskip("torch")
 sys.path.append(str(Path(__file__).parents[1] / "benchmarks"))
@@ -80,8 +81,10 @@ def test_it_learns_when_the_rollout_is_full():
     heads = {name: reference.params_to_flax(reference.init_mlp([6, 5, size], "leaky_relu"))
              for name, size in reference.HEADS.items()}  # fmt: skip
     env = reference.SyntheticEnv(heads, SyntheticConfig(hidden_size=5))
-    config = LearnConfig(agent=CONFIG, training=TrainingConfig(stop_rule="never", max_steps=1),
-                         proxy=SyntheticConfig(done="threshold"))  # fmt: skip
+    config = replace(
+        sejax.config(["env=cartpole"]), agent=CONFIG, proxy=SyntheticConfig(done="threshold"),
+        training=TrainingConfig(stop_rule="never", max_steps=1),
+    )  # fmt: skip
 
     def actor_after(num_steps):
         training = replace(config.training, max_steps=num_steps)

@@ -1,4 +1,4 @@
-"""sejax.masked_loop: every lane gets what it would get alone, at any depth of vmap."""
+"""sejax.loops: every lane gets what it would get alone, at any depth of vmap."""
 
 import jax
 import jax.numpy as jnp
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from flax import struct
 
-from sejax.masked_loop import while_any_active
+from sejax.loops import while_any_active
 
 
 @struct.dataclass
@@ -44,15 +44,17 @@ def test_lanes_that_stop_at_different_times_equal_single_loops(shape):
     loop = count_to
     for _ in shape:
         loop = jax.vmap(loop)
-    limits = jnp.array([3, 1, 6, 2])
+    limits = np.int32([3, 1, 6, 2])
     log, state = jax.jit(loop)(limits.reshape(shape))
+    log, state = jax.tree.map(np.asarray, (log, state))
     for lane, limit in enumerate([3, 1, 6, 2]):
         index = np.unravel_index(lane, shape)
         assert_counted(log[index], state.number[index], limit)
 
 
 def test_arguments_that_all_lanes_share_need_no_axis():
-    log, state = jax.vmap(count_to, in_axes=(None, 0))(3, jnp.array([True, False, True]))
+    loop = jax.jit(jax.vmap(count_to, in_axes=(None, 0)))
+    log, state = jax.tree.map(np.asarray, loop(3, np.array([True, False, True])))
     assert_counted(log[0], state.number[0], 3)
     assert_counted(log[1], state.number[1], 0)  # was never active
     assert_counted(log[2], state.number[2], 3)
@@ -70,6 +72,7 @@ def test_lanes_in_a_cond_may_read_arrays_that_the_body_closes_over():
         none = (jnp.zeros(6, jnp.int32), state)
         return jax.lax.cond(wanted, lambda: while_any_active(squaring, *none, limit), lambda: none)
 
-    log, state = jax.vmap(count_if)(jnp.array([True, False]), jnp.array([4, 5]))
+    counted = jax.jit(jax.vmap(count_if))(np.array([True, False]), np.int32([4, 5]))
+    log, state = jax.tree.map(np.asarray, counted)
     assert_counted(log[0], state.number[0], 4)
     assert not log[1].any()
