@@ -382,7 +382,11 @@ def _proxy_of(proxy: Any, task: Task) -> ProxyEnv:
         from sejax.proxies.configs import SyntheticConfig
 
         proxy = SyntheticConfig()
-    return plugins.make("proxy", proxy, task) if hasattr(proxy, "make") else proxy
+    made = plugins.make("proxy", proxy, task) if hasattr(proxy, "make") else proxy
+    require(made.task is task, "proxy", "be one of the task given", "agents are tested there",
+            f"one of another ({made.task.name})",
+            "proxy to a configuration, or task to the proxy's")  # fmt: skip
+    return made
 
 
 def _objective_of(objective: Any, task: Task) -> Objective:

@@ -127,14 +127,10 @@ def _proxy_study(config: EvaluateConfig) -> Study:
 def _load(config: EvaluateConfig) -> Any:
     """The proxy; modules are imported if the command line names them, never because a file does."""
     from sejax import envs
-    from sejax.errors import unknown_name
     from sejax.proxies import files
 
-    if config.proxy not in (*files.pretrained_names(), "real") and not any(
-        character in config.proxy for character in "/."
-    ) and not Path(config.proxy).exists():  # fmt: skip
-        raise unknown_name("proxy", config.proxy, [*files.pretrained_names(), "real"])
-    stored = files.read_config(config.proxy, "proxy")
+    path = files.find(config.proxy, "proxy", also=("real",))
+    stored = files.read_config(path, "proxy")
     task = proxy = None
     if config.env is not None and not plugins.is_registered("env", config.env):
         fields = stored["env"] if stored["env"].get("name") == config.env else {}
@@ -142,7 +138,7 @@ def _load(config: EvaluateConfig) -> Any:
     if config.proxy_kind is not None:
         fields = {**stored["proxy"], "name": config.proxy_kind}
         proxy = plugins.configure("proxy", fields)
-    return files.load_proxy(config.proxy, task, proxy, "proxy")
+    return files.load_proxy(path, task, proxy, "proxy")
 
 
 def _training_on(proxy: Any, config: EvaluateConfig, agent: Any) -> tuple[str, Any]:

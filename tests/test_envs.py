@@ -367,7 +367,7 @@ def cliff_table():
     ids=["cliff_walking", "gridworld_2x2", "maze"],
 )
 def test_every_step_in_a_grid_follows_its_map(rows, rewards, request):
-    from sejax.envs.gridworld import GridParams, GridWorld
+    from sejax.envs.dynamics.gridworld import GridParams, GridWorld
 
     name = request.node.callspec.id
     if name in GRIDS:
@@ -478,7 +478,7 @@ def test_a_grid_episode_runs_to_its_step_limit_if_nothing_ends_it():
     ],
 )
 def test_a_map_that_is_no_grid_world_is_refused(rows, message):
-    from sejax.envs.gridworld import GridWorld
+    from sejax.envs.dynamics.gridworld import GridWorld
 
     with pytest.raises(ValueError, match=message):
         GridWorld(rows)

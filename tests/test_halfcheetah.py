@@ -8,9 +8,9 @@ from support import numpy_forward
 
 import sejax
 from sejax import envs
-from sejax.configs import RewardConfig
+from sejax.envs.halfcheetah import HalfCheetah
 from sejax.errors import ConfigError
-from sejax.proxies.reward import make_reward
+from sejax.proxies.configs import RewardConfig
 
 # brax calls parts of MuJoCo XLA that have been given other names.
 pytestmark = pytest.mark.filterwarnings(
@@ -83,6 +83,7 @@ def test_limits_and_sizes_are_the_papers(task):
     assert (task.max_steps, task.solved_reward) == (1000, 3000.0)
     assert (task.obs_dim, task.action_dim, task.max_action) == (17, 6, 1.0)
     assert task.num_states is None and task.num_actions is None
+    assert task.facts == HalfCheetah.facts  # what is said of it before brax is imported
 
 
 def test_each_reset_draws_another_state_and_the_limit_truncates(task):
@@ -95,7 +96,7 @@ def test_each_reset_draws_another_state_and_the_limit_truncates(task):
 
 def test_augmented_potentials_see_position_and_velocity_of_either_state(task, walk, real):
     config = RewardConfig(variant="exclusive_potential", augmented=True, hidden_size=4)
-    env = make_reward(task, config)
+    env = config.make(task)
     weights = env.init_weights(jax.random.key(1))
     _, first, *_ = real
     _, rn_first, obs, reward, _, _, info = walk(env, env.params(weights, GAMMA))
@@ -109,7 +110,7 @@ def test_augmented_potentials_see_position_and_velocity_of_either_state(task, wa
 
 
 def test_weighted_info_is_a_linear_reward(task, walk):
-    env = make_reward(task, RewardConfig(variant="additive_weighted_info"))
+    env = RewardConfig(variant="additive_weighted_info").make(task)
     weights = env.init_weights(jax.random.key(2))
     assert weights["info_weights"].shape == (4,) and np.abs(weights["info_weights"]).max() <= 0.5
     _, _, _, reward, _, _, info = walk(env, env.params(weights))
@@ -121,19 +122,19 @@ def test_weighted_info_is_a_linear_reward(task, walk):
 def test_the_papers_settings_are_its_own():
     config = sejax.config(["env=halfcheetah", "proxy=rn", "proxy.augmented=true"])
     agent = config.agent
-    assert (agent.name, agent.init_episodes, agent.discount, agent.activation) == (
+    assert (config.name("agent"), agent.init_episodes, agent.discount, agent.activation) == (
         "td3", 20, 0.98, "relu",
     )  # fmt: skip
     assert (config.proxy.hidden_size, config.proxy.activation) == (128, "prelu")
-    assert config.objective.name == "reward_threshold" and config.generations == 50
+    assert config.name("objective") == "reward_threshold" and config.generations == 50
 
 
 @pytest.mark.parametrize(
     ("overrides", "said"),
     [
         (["env=halfcheetah", "proxy=rn", "env.backend=sprung"], "spring"),
-        (["env=cartpole", "+env.backend=mjx"], "only halfcheetah"),
-        (["env=halfcheetah"], "proxy=se"),
+        (["env=cartpole", "+env.backend=mjx"], r"env\.backend must be a field of CartPole"),
+        (["env=halfcheetah", "preset=paper"], "preset=paper for halfcheetah with proxy=se"),
         (["env=cartpole", "proxy=rn", "proxy.augmented=true"], "proxy.augmented=false"),
         (["env=cartpole", "proxy=rn", "proxy.variant=additive_weighted_info"], "potential"),
         (["env=halfcheetah", "proxy=rn", "proxy.variant=exclusive_weighted_info",

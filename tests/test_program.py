@@ -6,12 +6,10 @@ import jax.numpy as jnp
 import pytest
 from support import large_ops_in_loops
 
-from sejax import envs
-from sejax.agents.ddqn import make_ddqn
-from sejax.configs import DDQNConfig, RewardConfig, SyntheticConfig, TrainingConfig
-from sejax.proxies.reward import make_reward
-from sejax.proxies.synthetic import make_synthetic
-from sejax.trainer import make_trainer
+from sejax import envs, plugins
+from sejax.agents.ddqn import DDQNConfig, make_ddqn
+from sejax.proxies.configs import RewardConfig, SyntheticConfig
+from sejax.trainer import TrainingConfig, make_trainer
 
 CAPACITY = 7919  # rows; nothing else in the program is nearly as long
 
@@ -19,7 +17,7 @@ CAPACITY = 7919  # rows; nothing else in the program is nearly as long
 @pytest.fixture(scope="module")
 def case():
     """The traced-at-most-once training of a tiny agent in a tiny SE, and how to call it."""
-    env = make_synthetic(envs.make("cartpole"), SyntheticConfig(hidden_size=4))
+    env = plugins.make("proxy", SyntheticConfig(hidden_size=4), envs.make("cartpole"))
     config = DDQNConfig(
         hidden_size=4, num_layers=1, batch_size=4, init_episodes=1, buffer_size=CAPACITY
     )
@@ -98,7 +96,7 @@ def test_a_training_is_traced_once_for_all_values_of_its_arguments(case):
 def test_a_buffer_holds_no_more_steps_than_a_training_on_a_proxy_can_have():
     # An RN's agent of the paper has room for a million, of which its training can fill 20,000.
     task = envs.make("cartpole")
-    env = make_reward(task, RewardConfig())
+    env = RewardConfig().make(task)
     agent = make_ddqn(DDQNConfig(buffer_size=1_000_000), task.obs_dim, task.num_actions)
     training = TrainingConfig(max_episodes=100, stop_rule="never")
     key = jax.random.key(0)

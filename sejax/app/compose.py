@@ -14,13 +14,15 @@ from typing import Any
 from hydra import compose, initialize_config_dir
 from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import ChoiceSweep, Override, QuotedString
 from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from sejax import agents, envs, plugins, serialize
 from sejax.app import build, presets
-from sejax.errors import ConfigError, nearest, shortened, unknown_name
+from sejax.errors import ConfigError, nearest, require, shortened, unknown_name
 from sejax.training import TrainingConfig
 
 CONF_DIR = Path(__file__).parents[1] / "conf"
@@ -28,6 +30,7 @@ CONF_DIR = Path(__file__).parents[1] / "conf"
 _DEFAULT_ENV, _DEFAULT_PROXY, _DEFAULT_AGENT = "cartpole", "se", "ddqn"
 _DEFAULT_OBJECTIVE = "max_reward"
 _GROUPS = tuple(plugins.GROUPS)
+_INTERNAL = ("base", "tuned", "tuned_agent", "tuned_es")  # groups that no word may choose
 _CHOICE = re.compile(rf"(?:\+\+?)?({'|'.join(_GROUPS)}|preset)=(.*)", re.DOTALL)
 
 
@@ -110,8 +113,8 @@ def help_text(name: str, overrides: Sequence[str]) -> str:
 
 
 def _compose(name: str, overrides: Sequence[str], **options: Any) -> DictConfig:
-    register(name, overrides)
     try:
+        register(name, overrides)
         if GlobalHydra.instance().is_initialized():  # within a command: Hydra knows the folder
             return compose(name, overrides=list(overrides), **options)
         with initialize_config_dir(str(CONF_DIR), version_base="1.3"):
@@ -131,21 +134,63 @@ def register(name: str, overrides: Sequence[str]) -> None:
       overrides: the words after it.
 
     Raises:
-      ConfigError: for a choice of somebody's own that cannot be imported.
+      ConfigError: for a choice that is none, or one of somebody's own that cannot be imported.
     """
+    groups = _GROUPS if name == "run" else build.EVALUATE_GROUPS
+    _require_choices((*groups, "preset") if name == "run" else groups, overrides)
     store = ConfigStore.instance()
+    for group in (*_GROUPS, "preset", *_INTERNAL):  # `proxy` is a group of run, a field of evaluate
+        store.repo.pop(group, None)
     training = serialize.to_plain(TrainingConfig())
     base = {"training": training}
     if name == "evaluate":
         base["real_training"] = training
     store.store(name="base", node=base)
     chosen = _choices(overrides)
-    groups = _GROUPS if name == "run" else build.EVALUATE_GROUPS
     for group in groups:
         for choice in dict.fromkeys([*plugins.names(group), *chosen.get(group, ())]):
             _register_choice(group, choice, choice in chosen.get(group, ()), overrides)
     if name == "run":
         _register_presets(chosen)
+
+
+def _require_choices(groups: tuple[str, ...], overrides: Sequence[str]) -> None:
+    """Checks the words that choose: Hydra takes none but a name, and looks for it as a file.
+
+    Raises:
+      ConfigError: for a choice that is not known, or is taken away.
+    """
+    parser = OverridesParser.create()
+    for word in overrides:
+        try:
+            override = parser.parse_override(word)
+        except HydraException:
+            continue  # Hydra will say what it cannot read
+        group = override.key_or_group
+        if not group or group in _INTERNAL:
+            raise _unknown_field(group, overrides)
+        if group in groups:
+            require(not override.is_delete(), group, "be chosen", "nothing works without it", word,
+                    f"{group}=NAME")  # fmt: skip
+            for choice in _values(override):
+                _require_choice(group, choice)
+
+
+def _values(override: Override) -> list[Any]:
+    """What a word sets, or each value of a sweep that lists them."""
+    value = override.value()
+    if isinstance(value, ChoiceSweep):
+        return [x.text if isinstance(x, QuotedString) else x for x in value.list]
+    return [] if override.is_sweep_override() else [value]
+
+
+def _require_choice(group: str, choice: Any) -> None:
+    known = presets.names() if group == "preset" else plugins.names(group)
+    is_own = group != "preset" and isinstance(choice, str) and (
+        plugins.is_registered(group, choice) or ":" in choice
+    )  # fmt: skip
+    if choice not in known and not is_own:
+        raise unknown_name(group, choice, known)
 
 
 def _choices(overrides: Iterable[str]) -> dict[str, list[str]]:

@@ -339,8 +339,17 @@ def read_config(source: str | Path, option: str = "source") -> dict[str, Any]:
     return _read(find(source, option), option)[1]["config"]
 
 
-def find(source: str | Path, option: str = "source") -> Path:
-    """The file that a run directory, a path or a shipped name stands for."""
+def find(source: str | Path, option: str = "source", also: Sequence[str] = ()) -> Path:
+    """The file that a run directory, a path or a shipped name stands for.
+
+    Args:
+      source: as of `load`.
+      option: what messages call it.
+      also: names beside the shipped ones, for messages.
+
+    Raises:
+      ConfigError: if there is none.
+    """
     path, text = Path(source), shortened(source)
     try:
         is_dir, is_file = path.is_dir(), path.is_file()
@@ -367,7 +376,7 @@ def find(source: str | Path, option: str = "source") -> Path:
     shipped = PRETRAINED_DIR / f"{source}.safetensors"
     if shipped.is_file():
         return shipped
-    raise unknown_name(option, str(source), pretrained_names())
+    raise unknown_name(option, str(source), [*pretrained_names(), *also])
 
 
 def pretrained_names() -> list[str]:
@@ -386,9 +395,10 @@ def _read(path: Path, option: str) -> tuple[dict[str, np.ndarray], dict[str, Any
     try:
         stored = json.loads(metadata.get(_KEY) or metadata["sejax_set"])
         version = stored["format_version"]
-        if version == 1:
+        is_known = type(version) is int and version in (1, FORMAT_VERSION)
+        if is_known and version == 1:
             stored = _from_version_1(stored, is_set=_KEY not in metadata)
-        if type(version) is int and version <= FORMAT_VERSION:
+        if is_known:
             _check_header(stored)
     except (KeyError, ValueError, TypeError, AttributeError, RecursionError) as error:
         raise ConfigError(
@@ -396,7 +406,7 @@ def _read(path: Path, option: str) -> tuple[dict[str, np.ndarray], dict[str, Any
             f"its metadata; {path} has none that is valid ({type(error).__name__}: "
             f"{shortened(error)}). Learn it again."
         ) from error
-    require(version in (1, FORMAT_VERSION), option, f"be of format {FORMAT_VERSION} or 1",
+    require(is_known, option, f"be of format {FORMAT_VERSION} or 1",
             "this version of sejax reads no other", f"{shortened(version)} in {path}",
             f"{option} to a file of this version")  # fmt: skip
     if version == FORMAT_VERSION:
@@ -420,11 +430,13 @@ def _check_header(header: dict[str, Any]) -> None:
     config = header["config"]
     if not all(isinstance(config[group], Mapping) for group in ("env", "proxy")):
         raise ValueError("no task or proxy")
+    if not isinstance(header["task"], str) or not isinstance(header["is_set"], bool):
+        raise ValueError("no name of a task, or nothing that says whether it is a set")
     records = header["proxies"]
     if not records or not all(isinstance(record, Mapping) for record in records):
         raise ValueError("no records")
     for record in records:
-        float(record.get("score", 0)), int(record.get("seed", 0))
+        float(record.get("score", 0)), int(record.get("seed", 0)), int(record.get("generation", 0))
     header["discount"] = float(header["discount"])
 
 

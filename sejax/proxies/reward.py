@@ -16,7 +16,7 @@ from sejax.envs.task import Task
 from sejax.networks import MLP, uniform_fan_in
 from sejax.proxies.proxy import ABSURD, ProxyEnv
 
-if TYPE_CHECKING:
+if TYPE_CHECKING:  # which makes it
     from sejax.proxies.configs import RewardConfig
 
 
@@ -174,7 +174,7 @@ class RewardEnv(ProxyEnv):
         sane = jnp.abs(reward) < ABSURD  # False for nan
         info = {
             **info,
-            "discount": jnp.where(sane, info["discount"], 0.0),
+            "discount": jnp.where(sane, info.get("discount", 1.0 - terminated), 0.0),
             "real_reward": jnp.float32(real_reward),
             "nonfinite": ~jnp.isfinite(reward),
         }

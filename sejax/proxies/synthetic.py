@@ -15,7 +15,7 @@ from sejax.envs.task import Task
 from sejax.networks import MLP
 from sejax.proxies.proxy import ABSURD, ProxyEnv
 
-if TYPE_CHECKING:
+if TYPE_CHECKING:  # which makes it
     from sejax.proxies.configs import SyntheticConfig
 
 

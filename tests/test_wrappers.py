@@ -1,4 +1,4 @@
-"""sejax.envs.action_repeat: decisions that last, against stepping by hand."""
+"""sejax.envs.wrappers: decisions that last, against stepping by hand, and worlds as vectors."""
 
 import dataclasses
 
@@ -9,9 +9,8 @@ import pytest
 from scripted import MAX_EPISODES, MAX_STEPS, ScriptedEnv, script, scripted_agent
 
 from sejax import envs
-from sejax.configs import TrainingConfig
-from sejax.envs.action_repeat import repeat_actions
-from sejax.trainer import make_trainer
+from sejax.envs.wrappers import repeat_actions
+from sejax.trainer import TrainingConfig, make_trainer
 
 KEY = jax.random.key(0)
 
