@@ -71,22 +71,28 @@ def serve(args: argparse.Namespace) -> None:
         train = sejax.make_trainer(agent, env, config.training)
         return lambda key, hparams: train(key, params, hparams).train_steps
 
+    def train_varied(key: Any, drawn: Any) -> Any:
+        runs = [make_run(agent) for agent in varied.variants]
+        return jax.lax.switch(drawn.variant, runs, key, drawn.hparams)
+
     key = jax.random.key(args.seed)
     started = time.time()
-    program = jax.jit(varied.fresh(make_run)).lower(key).compile()
+    program = jax.jit(train_varied).lower(key, varied.draw(key)).compile()
     compile_s = time.time() - started
 
     def handle(request: dict[str, Any]) -> dict[str, Any]:
         key = jax.random.fold_in(jax.random.key(args.seed), request["number"])
-        plain = {name: float(x) for name, x in varied.drawn_values(key).items()}
+        drawn = varied.draw(key)
+        plain = {name: float(x) for name, x in drawn.values.items()}
         sizes = {name: round(x) for name, x in plain.items() if name != "learning_rate"}
         changes: dict[str, Any] = {**sizes, "learning_rate": plain["learning_rate"]}
         agent = sejax.make_agent(dataclasses.replace(config.agent, **changes), task)
         alone = jax.jit(agent.fresh(make_run)).lower(key).compile()
-        jax.block_until_ready((program(key), alone(key)))
+        jax.block_until_ready((program(key, drawn), alone(key)))
+        runs = {"varied_s": (program, key, drawn), "alone_s": (alone, key)}
         seconds = {}
-        for name, run in {"varied_s": program, "alone_s": alone}.items():
-            _, times = common.measure(functools.partial(wait_for, run, key))
+        for name, (run, *inputs) in runs.items():
+            _, times = common.measure(functools.partial(wait_for, run, *inputs))
             seconds[name] = times["cpu_s"]
         return {**plain, **seconds}
 
