@@ -36,13 +36,10 @@ class SAC(AgentOptions):
 
     actions: ClassVar[tuple[str, ...]] = ("continuous",)
 
-    init_episodes: int = option(5, counts("it counts episodes", least=0))  # of random actions
     batch_size: int = option(128, counts())
     buffer_size: int = option(100_000, counts())
     hidden_size: int = option(64, counts())
-    learning_rate: float = option(
-        1e-3, positive("it would not learn"), traced=True, varied="triple"
-    )
+    learning_rate: float = option(1e-3, positive("it must learn"), traced=True, varied="triple")
     target_update_rate: float = option(0.005, fraction(), traced=True)  # tau
     discount: float = option(0.99, fraction(), traced=True)  # gamma
 
@@ -60,13 +57,11 @@ class SAC(AgentOptions):
             return state.replace(is_warming_up=episode < self.init_episodes)
 
         def act(key: Array, state: SACState, obs: Array, explore: bool) -> Array:
-            mean, std = networks.actor.apply(state.params["actor"], obs)
-            if not explore:
-                return jnp.tanh(mean)
             key_warm_up, key_noise = jax.random.split(key)
-            random = jax.random.uniform(key_warm_up, mean.shape, minval=-1.0)
-            action, _ = squashed(mean, std, jax.random.normal(key_noise, mean.shape))
-            return jnp.where(state.is_warming_up, random, action)
+            random = jax.random.uniform(key_warm_up, [task.action_dim], minval=-1.0)
+            noise = jax.random.normal(key_noise, [task.action_dim]) if explore else 0.0
+            action, _ = networks.action(state.params["actor"], obs, noise)
+            return jnp.where(explore & state.is_warming_up, random, action)
 
         def update(key: Array, state: SACState, batch: Transition) -> SACState:
             shape = (2, *batch.action.shape[::-1])  # [now or next, batch, action_dim]
@@ -92,7 +87,7 @@ class SACState(struct.PyTreeNode):
 
 
 class Actor(nn.Module):
-    """Mean and std of a Gaussian, `[action_dim]` each, before it is squashed."""
+    """Mean and std of a Gaussian, `[action_dim]` each."""
 
     action_dim: int
     hidden_size: int
@@ -116,6 +111,8 @@ class Critic(nn.Module):
 
 
 class Networks(NamedTuple):
+    """Pure functions of the parameters of an actor and two critics."""
+
     actor: Actor
     critic: Critic
 
@@ -130,13 +127,13 @@ class Networks(NamedTuple):
         """Both critics', `[2]`."""
         return jax.vmap(self.critic.apply, (0, None, None))(critics, obs, action)
 
-
-def squashed(mean: Array, std: Array, noise: Array) -> tuple[Array, Array]:
-    """An action `[action_dim]` in [-1, 1], and the logarithm of its density; appendix C."""
-    u = mean + std * noise
-    log_normal = -0.5 * noise**2 - jnp.log(std) - 0.5 * jnp.log(2 * jnp.pi)
-    log_slope = 2 * (jnp.log(2.0) - u - nn.softplus(-2 * u))  # log(1 - tanh(u)^2), stably
-    return jnp.tanh(u), jnp.sum(log_normal - log_slope)
+    def action(self, actor: Any, obs: Array, noise: Array | float) -> tuple[Array, Array]:
+        """An action `[action_dim]` in [-1, 1], and the logarithm of its density; appendix C."""
+        mean, std = self.actor.apply(actor, obs)
+        u = mean + std * noise
+        log_normal = -0.5 * noise**2 - jnp.log(std) - 0.5 * jnp.log(2 * jnp.pi)
+        log_slope = 2 * (jnp.log(2.0) - u - nn.softplus(-2 * u))  # log(1 - tanh(u)^2), stably
+        return jnp.tanh(u), jnp.sum(log_normal - log_slope)
 
 
 def losses(
@@ -153,19 +150,15 @@ def losses(
     """
     fixed = jax.lax.stop_gradient(params)
     alpha = jnp.exp(fixed["log_alpha"])
-    next_action, next_log_p = squashed(
-        *networks.actor.apply(fixed["actor"], step.next_obs), noise[1]
-    )
+    next_action, next_log_p = networks.action(fixed["actor"], step.next_obs, noise[1])
     next_q = jnp.min(networks.q_values(state.target_critics, step.next_obs, next_action))
     target = step.reward + state.hparams.discount * step.discount * (next_q - alpha * next_log_p)
     q_values = networks.q_values(params["critics"], step.obs, step.action)
-    action, log_p = squashed(*networks.actor.apply(params["actor"], step.obs), noise[0])
+    action, log_p = networks.action(params["actor"], step.obs, noise[0])
     q = jnp.min(networks.q_values(fixed["critics"], step.obs, action))
     entropy_gap = jax.lax.stop_gradient(-log_p) + action.size  # above the target entropy
-    return jnp.array([
-        0.5 * jnp.sum((q_values - target) ** 2), alpha * log_p - q,
-        jnp.exp(params["log_alpha"]) * entropy_gap,
-    ])  # fmt: skip
+    temperature_loss = jnp.exp(params["log_alpha"]) * entropy_gap
+    return jnp.array([0.5 * jnp.sum((q_values - target) ** 2), alpha * log_p - q, temperature_loss])
 
 
 def learn(networks: Networks, state: SACState, batch: Transition, noise: Array) -> SACState:
