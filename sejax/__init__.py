@@ -46,6 +46,8 @@ _EXPORTS = {
     "TrainingConfig": "sejax.training",
     "Trials": "sejax.es.strategy",
     "config": "sejax.app.compose",
+    "configure_xla": "sejax.app.runtime",
+    "evaluate_agents": "sejax.evaluation",
     "load": "sejax.proxies.files",
     "load_proxy": "sejax.proxies.files",
     "load_set": "sejax.proxies.files",
@@ -56,11 +58,12 @@ _EXPORTS = {
     "register_gymnax": "sejax.proxies.files",
     "save": "sejax.proxies.files",
     "save_set": "sejax.proxies.files",
+    "spread_over_devices": "sejax.parallel",
 }
-_MODULES = ("agents", "envs", "es", "proxies")
+_MODULES = ("agents", "envs", "es", "options", "proxies")
 
 if TYPE_CHECKING:  # what a type checker and an editor see
-    from sejax import agents, envs, es, proxies
+    from sejax import agents, envs, es, options, proxies
     from sejax.agents import make_agent
     from sejax.agents.agent import Agent
     from sejax.agents.count_based import CountBasedConfig
@@ -70,14 +73,16 @@ if TYPE_CHECKING:  # what a type checker and an editor see
     from sejax.agents.tabular import QLearningConfig, SARSAConfig
     from sejax.agents.td3 import DiscreteTD3Config, TD3Config
     from sejax.app.compose import config
+    from sejax.app.runtime import configure_xla
     from sejax.bilevel import LearnResult, make_learner
     from sejax.envs.task import Task
     from sejax.errors import ConfigError
     from sejax.es.evosax import EvosaxConfig
     from sejax.es.nes import NESConfig
     from sejax.es.strategy import Strategy, Trials
-    from sejax.evaluation import make_evaluator
+    from sejax.evaluation import evaluate_agents, make_evaluator
     from sejax.objectives import AUC, AUCSum, MaxReward, Objective, Outcome, RewardThreshold
+    from sejax.parallel import spread_over_devices
     from sejax.proxies.configs import RewardConfig, SyntheticConfig
     from sejax.proxies.files import (
         Proxy,
@@ -98,9 +103,10 @@ __all__ = [
     "DuelingDDQNConfig", "EvosaxConfig", "ICMConfig", "LearnResult", "MaxReward", "NESConfig",
     "Objective", "Outcome", "PPOConfig", "Proxy", "ProxyEnv", "ProxySet", "QLearningConfig",
     "RewardConfig", "RewardThreshold", "SARSAConfig", "Strategy", "SyntheticConfig", "TD3Config",
-    "Task", "TrainResult", "TrainingConfig", "Trials", "agents", "config", "envs", "es", "load",
-    "load_proxy", "load_set", "make_agent", "make_evaluator", "make_learner", "make_trainer",
-    "proxies", "register_gymnax", "save", "save_set",
+    "Task", "TrainResult", "TrainingConfig", "Trials", "agents", "config", "configure_xla", "envs",
+    "es", "evaluate_agents", "load", "load_proxy", "load_set", "make_agent", "make_evaluator",
+    "make_learner", "make_trainer", "options", "proxies", "register_gymnax", "save", "save_set",
+    "spread_over_devices",
 ]  # fmt: skip
 
 

@@ -108,9 +108,9 @@ def test_initial_episodes_beyond_the_proxys_own_extend_its_step_budget(stored):
     unlimited = TrainingConfig()
     assert budget_for(unlimited, PPOConfig(), then, 200) is unlimited
     # That is what an evaluation trains with.
-    _, _, used = _proxy_study(
-        evaluate_config(f"proxy={stored}", "agent.init_episodes=3")
-    ).worlds["the proxy"]
+    _, _, used = _proxy_study(evaluate_config(f"proxy={stored}", "agent.init_episodes=3")).worlds[
+        "the proxy"
+    ]
     assert used.max_steps == 650 and used.stop_rule == training.stop_rule
 
 
@@ -224,9 +224,7 @@ def test_a_missing_proxy_or_task_says_what_to_set():
         (["proxy=" + "d" * 10_000], "proxy must be "),
     ],
 )
-def test_the_command_ends_bad_input_with_one_message_and_status_2(
-    words, said, monkeypatch, capsys
-):
+def test_the_command_ends_bad_input_with_one_message_and_status_2(words, said, monkeypatch, capsys):
     from sejax import evaluate as command
 
     monkeypatch.setattr(sys, "argv", ["sejax.evaluate", *words])

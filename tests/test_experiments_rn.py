@@ -3,6 +3,7 @@
 import numpy as np
 import pandas as pd
 import pytest
+from sejax.proxies.sets import load_set
 from support import experiment_options, refuse
 
 from sejax.errors import ConfigError
@@ -16,7 +17,6 @@ from sejax.experiments import (
     rn_studies,
     timings,
 )
-from sejax.proxies.sets import load_set
 
 LEARN = ["--variants", "additive_potential", "exclusive_non_potential", "--learned", "3",
          "--generations", "1", "--set", "training.max_episodes=5",

@@ -11,11 +11,12 @@ import jax
 import numpy as np
 import pandas as pd
 import pytest
+from sejax.configs import TrainingConfig
+from sejax.proxies.sets import load_set, save_set
 from support import experiment_options, refuse
 
 import sejax
 from sejax import envs
-from sejax.configs import TrainingConfig
 from sejax.errors import ConfigError
 from sejax.experiments import (
     common,
@@ -26,7 +27,6 @@ from sejax.experiments import (
     se_models,
     se_performance,
 )  # fmt: skip
-from sejax.proxies.sets import load_set, save_set
 from sejax.proxies.synthetic import make_synthetic
 
 TINY_RUN = ["generations=3", "es.population_size=2", "es.num_incumbent_evals=2",
@@ -288,6 +288,7 @@ def performance(ses, out, *argv):
 def test_performance_trains_as_evaluation_does_and_goes_on(ses, tmp_path, monkeypatch, capsys):
     from sejax.agents.configs import DDQNConfig, ExplorationConfig
     from sejax.agents.hparams import make_varied_agents
+
     from sejax.evaluation import evaluate_agents
 
     monkeypatch.setattr(se_agents, "QUICK_AGENT", TINY_AGENT)

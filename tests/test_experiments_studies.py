@@ -10,11 +10,12 @@ import numpy as np
 import pandas as pd
 import pytest
 import scipy.stats
+from sejax.agents.registry import make_agent
+from sejax.proxies.sets import load_set, save_set
 from support import experiment_options, numpy_forward, refuse
 
 import sejax
 from sejax import envs
-from sejax.agents.registry import make_agent
 from sejax.bilevel import make_program
 from sejax.errors import ConfigError
 from sejax.experiments import (
@@ -24,7 +25,6 @@ from sejax.experiments import (
     supervised_baseline,
     supervised_models,
 )
-from sejax.proxies.sets import load_set, save_set
 from sejax.proxies.synthetic import make_synthetic
 from sejax.trainer import make_tester, make_trainer
 

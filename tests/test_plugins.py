@@ -138,7 +138,7 @@ def test_a_packages_plugin_is_known_by_its_name_and_imported_when_it_is_chosen(o
     assert (config.agent.extra, config.agent.discount) == (3, 0.5)
     assert config.name("agent") == "mine"
     assert build.learn_config(build.to_plain(config)) == config
-    assert "runs/gridworld_2x2-se-mine-s0" == str(config.resolved_run_dir)
+    assert str(config.resolved_run_dir) == "runs/gridworld_2x2-se-mine-s0"
 
 
 def test_a_name_of_sejaxs_own_cannot_be_taken_over(offered):
@@ -268,8 +268,11 @@ def test_fields_of_unknown_types_are_one_message(module):
 
 def test_a_plugin_must_make_what_its_group_is_of(module):
     config = plugins.configure("objective", {"name": f"{module(SEVERAL)}:wrong"})
-    with pytest.raises(ConfigError, match=r"^objective must make a sejax\.Objective, because that "
-                                          r"is what is used; got int from mine_.*:wrong\. Set obj"):
+    with pytest.raises(
+        ConfigError,
+        match=r"^objective must make a sejax\.Objective, because that "
+        r"is what is used; got int from mine_.*:wrong\. Set obj",
+    ):
         plugins.make("objective", config, envs.make("cartpole"))  # fmt: skip
 
 
@@ -523,7 +526,9 @@ def test_an_agent_of_ones_own_that_cannot_be_varied_says_so(own):
 
 
 def test_options_that_words_cannot_say_are_one_message(module):
-    name = module("import sejax\ndef f(task, score=print):\n    return sejax.Objective(score=score)\n")
+    name = module(
+        "import sejax\ndef f(task, score=print):\n    return sejax.Objective(score=score)\n"
+    )
     with pytest.raises(ConfigError) as error:
         sejax.config([f"objective={name}:f"])
     assert "\n" not in str(error.value)

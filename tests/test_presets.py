@@ -152,6 +152,7 @@ LEARNING_RNS = {
     "agent.target_noise_clip": (None, None, 0.5, 0.5),
 }
 
+
 @pytest.mark.parametrize("path", LEARNING_RNS)
 def test_the_papers_preset_holds_the_numbers_of_its_tables_for_rns(path):
     for env, expected in zip(RN_TASKS, LEARNING_RNS[path], strict=True):
@@ -190,7 +191,9 @@ def test_every_file_is_of_a_task_and_proxy_and_has_settings_of_known_choices():
 
 
 def test_a_section_has_the_settings_of_the_one_it_is_like_where_it_says_nothing():
-    paper, best = (composed_with("env=cartpole", "proxy=rn", f"preset={p}") for p in ("paper", "best"))
+    paper, best = (
+        composed_with("env=cartpole", "proxy=rn", f"preset={p}") for p in ("paper", "best")
+    )
     assert paper.proxy.variant == "additive_potential"
     assert best.proxy.variant == "exclusive_potential"
     assert paper.agent == best.agent and paper.training == best.training

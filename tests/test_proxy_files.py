@@ -117,7 +117,9 @@ def test_a_set_that_is_saved_and_loaded_is_the_same(tmp_path, env, weights):
 
 def test_parts_of_a_set_are_chosen_by_score_and_place(tmp_path, env, weights):
     path = tmp_path / "set.safetensors"
-    sejax.save_set(path, env, weights, [{"score": s, "seed": i} for i, s in enumerate((0.5, 0.9, 0.8))])
+    sejax.save_set(
+        path, env, weights, [{"score": s, "seed": i} for i, s in enumerate((0.5, 0.9, 0.8))]
+    )
     proxies = sejax.load_set(path)
     assert proxies.ranked(2).seeds.tolist() == [1, 2]
     assert proxies.ranked(2, worst=True).seeds.tolist() == [0, 2]
@@ -401,9 +403,13 @@ def test_a_foreign_task_or_kind_is_never_imported_and_loads_if_it_is_given(mine)
     assert stored["env"] == {"name": "my_file_worlds:Room", "size": 3}
     assert stored["proxy"]["name"] == "my_file_worlds:Mine"
     before = set(sys.modules)
-    with pytest.raises(ConfigError, match=r"registered env if no task is given.*env=my_file_worlds:R"):
+    with pytest.raises(
+        ConfigError, match=r"registered env if no task is given.*env=my_file_worlds:R"
+    ):
         sejax.load(path)
-    with pytest.raises(ConfigError, match=r"registered proxy if no proxy is given.*proxy_kind=my_fi"):
+    with pytest.raises(
+        ConfigError, match=r"registered proxy if no proxy is given.*proxy_kind=my_fi"
+    ):
         sejax.load(path, task=task)
     with pytest.raises(ConfigError, match=r"registered env if no task is given"):
         sejax.load(path, proxy=config)
@@ -449,11 +455,15 @@ def test_real_is_no_proxy_that_python_could_load():
 
 def test_a_folder_without_a_proxy_says_what_it_is(tmp_path):
     for load in (sejax.load, sejax.load_set):
-        with pytest.raises(ConfigError, match=r"this is a folder of another sort; got .*Set source"):
+        with pytest.raises(
+            ConfigError, match=r"this is a folder of another sort; got .*Set source"
+        ):
             load(tmp_path)
     (tmp_path / "config.yaml").write_text("{}")
     for load in (sejax.load, sejax.load_set):
-        with pytest.raises(ConfigError, match=r"run has not finished a generation yet; got .*finis"):
+        with pytest.raises(
+            ConfigError, match=r"run has not finished a generation yet; got .*finis"
+        ):
             load(tmp_path)
 
 

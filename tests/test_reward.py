@@ -240,8 +240,10 @@ def test_prepared_params_look_up_what_the_network_says():
         for one in (params, prepared):
             np.testing.assert_allclose(env.potential(one, jnp.int32(state)), expected, rtol=1e-5)
     assert prepared.discount == np.float32(GAMMA)
-    assert world_of(env) == World(is_real=True, max_steps=50) == world_of(env.task.env)._replace(
-        max_steps=50
+    assert (
+        world_of(env)
+        == World(is_real=True, max_steps=50)
+        == world_of(env.task.env)._replace(max_steps=50)
     )
     assert make_env("cartpole").prepared(params, GAMMA).potentials is None
 

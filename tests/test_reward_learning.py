@@ -3,10 +3,10 @@
 import jax
 import numpy as np
 import pytest
+from sejax.configs import OBJECTIVES, RN_VARIANTS
 
 import sejax
 from sejax.bilevel import make_learner
-from sejax.configs import OBJECTIVES, RN_VARIANTS
 from sejax.envs import kind
 
 pytestmark = [

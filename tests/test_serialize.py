@@ -34,7 +34,7 @@ class Outer:
     sizes: tuple[int, ...] = (1, 2)
     steps: list[float] = dataclasses.field(default_factory=list)
     anything: Any = None
-    inner: Inner = Inner()  # noqa: RUF009 (frozen)
+    inner: Inner = Inner()
     maybe: Inner | None = None
 
 
@@ -85,7 +85,9 @@ def test_what_is_written_as_json_reads_back_the_same(config):
     assert from_plain(Outer, json.loads(json.dumps(to_plain(config))), "") == config
 
 
-@given(st.dictionaries(words, st.none() | counts | words | st.lists(counts, max_size=2), max_size=3))
+@given(
+    st.dictionaries(words, st.none() | counts | words | st.lists(counts, max_size=2), max_size=3)
+)
 def test_values_of_any_kind_are_read_or_refused_with_one_message(values):
     try:
         config = from_plain(Outer, values, "")
@@ -191,7 +193,9 @@ def test_a_field_without_a_default_must_be_given():
         from_plain(needy, {}, "agent")
     assert from_plain(needy, {"size": 2.0}, "agent").size == 2
     nothing = dataclasses.make_dataclass("Nothing", [])
-    with pytest.raises(ConfigError, match=r"^x must be a field of Nothing, .* Fields there: none\."):
+    with pytest.raises(
+        ConfigError, match=r"^x must be a field of Nothing, .* Fields there: none\."
+    ):
         from_plain(nothing, {"x": 1}, "")
 
 

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from jax.flatten_util import ravel_pytree
 
-import sejax
 from sejax.agents.ddqn import DDQNConfig, make_ddqn
 from sejax.agents.replay import Transition
 from sejax.networks import MLP
@@ -62,7 +61,6 @@ def test_training_ends_after_the_episodes_or_the_steps(max_steps, steps):
     env = reference.SyntheticEnv(heads, SyntheticConfig(hidden_size=5))
     training = TrainingConfig(stop_rule="never", max_episodes=2, max_steps=max_steps)
     agent = dataclasses.replace(CONFIG, init_episodes=1)
-    config = dataclasses.replace(sejax.config(["env=cartpole"]), agent=agent, training=training)
-    result = reference.train(env, config, seed=0)
+    result = reference.train(env, agent, training, seed=0)
     assert result.train_steps == steps
     assert len(result.returns) == 2

@@ -1,7 +1,6 @@
 """benchmarks/torch_reference_ppo.py, the yardstick: its learning phase is sejax's."""
 
 import sys
-from dataclasses import replace
 from pathlib import Path
 
 import jax
@@ -10,7 +9,6 @@ import numpy as np
 import pytest
 from jax.flatten_util import ravel_pytree
 
-import sejax
 from sejax.agents import replay
 from sejax.agents.memory import Rollout
 from sejax.agents.ppo import PPOConfig, make_ppo
@@ -81,14 +79,10 @@ def test_it_learns_when_the_rollout_is_full():
     heads = {name: reference.params_to_flax(reference.init_mlp([6, 5, size], "leaky_relu"))
              for name, size in reference.HEADS.items()}  # fmt: skip
     env = reference.SyntheticEnv(heads, SyntheticConfig(hidden_size=5))
-    config = replace(
-        sejax.config(["env=cartpole"]), agent=CONFIG, proxy=SyntheticConfig(done="threshold"),
-        training=TrainingConfig(stop_rule="never", max_steps=1),
-    )  # fmt: skip
 
     def actor_after(num_steps):
-        training = replace(config.training, max_steps=num_steps)
-        result = torch_ppo.train(env, replace(config, training=training), seed=0)
+        training = TrainingConfig(stop_rule="never", max_steps=num_steps)
+        result = torch_ppo.train(env, CONFIG, training, seed=0)
         assert result.train_steps == num_steps
         return result.agent.state.networks.values
 

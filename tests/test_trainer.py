@@ -186,7 +186,9 @@ def test_a_step_limit_above_the_default_still_trains_all_episodes(trainers):
 
 def test_tests_need_a_test_function():
     for name in ("tested", "watched"):
-        with pytest.raises(ValueError, match=r"num_tests_between is 1\) need a test_fn; got None\."):
+        with pytest.raises(
+            ValueError, match=r"num_tests_between is 1\) need a test_fn; got None\."
+        ):
             make_trainer(scripted_agent(), ENV, VARIANTS[name])
 
 

@@ -10,11 +10,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax.flatten_util import ravel_pytree
+from sejax.agents.blocks import block_size, sum_over_batch
 
 from sejax import envs
 from sejax.agents import make_agent
 from sejax.agents.agent import Agent, Draw, NoExploration, drawing_key
-from sejax.agents.blocks import block_size, sum_over_batch
 from sejax.agents.count_based import CountBasedConfig
 from sejax.agents.ddqn import DDQNConfig, DuelingDDQNConfig, make_ddqn
 from sejax.agents.memory import no_memory

@@ -35,9 +35,10 @@ class World(NamedTuple):
 class ProxyEnv(environment.Environment[Any, Any]):
     """A proxy of a task; subclasses add the dynamics (`reset_env`, `step_env`).
 
-    A subclass must give `init_weights` and `params`. `step_env` must put into its `info` under
-    "discount" what a target bootstraps with before the agent's gamma, and may put under "nonfinite"
-    whether a number was met that is not finite, which ends the training.
+    A subclass must give `init_weights`, `params`, `reset_env` and `step_env`. The latter may put
+    into its `info` under "discount" what a target bootstraps with before the agent's gamma (1 minus
+    terminated if it is not there), and under "nonfinite" whether a number was met that is not
+    finite, which ends the training.
 
     Attributes:
       task: the real task.
