@@ -1,7 +1,5 @@
-"""Pictures and tables that the experiments with SEs share."""
+"""Pictures that the experiments share."""
 
-import argparse
-import shlex
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -207,38 +205,3 @@ def write(figure: Any, path: Path) -> None:
     with atomic_path(path) as temporary:
         figure.savefig(temporary, dpi=200)
     plt.close(figure)
-
-
-def print_table(title: str, table: pd.DataFrame) -> None:
-    """Prints a table of texts."""
-    from rich.console import Console
-    from rich.table import Table
-
-    printed = Table(title=title)
-    for column in table.columns:
-        printed.add_column(str(column))
-    for row in table.itertuples(index=False):
-        printed.add_row(*map(str, row))
-    console = Console(highlight=False)
-    if not console.is_terminal:
-        console.width = 220  # a file has room for whole rows
-    console.print(printed)
-
-
-def command(name: str, args: argparse.Namespace, *options: str | tuple[str, str]) -> str:
-    """The command line of an experiment, with the options that were given.
-
-    Args:
-      name: of the experiment.
-      args: its options, parsed.
-      *options: names of its own options in `args`, or (name there, name on the command line).
-    """
-    words = ["python", "-m", f"sejax.experiments.{name}"]
-    words += ["--quick"] if args.quick else []
-    for option in (*options, "seed"):
-        attribute, flag = (option, option) if isinstance(option, str) else option
-        value = getattr(args, attribute)
-        if value not in (None, []):
-            values = value if isinstance(value, list) else [value]
-            words += [f"--{flag.replace('_', '-')}", *map(str, values)]
-    return shlex.join(words)
