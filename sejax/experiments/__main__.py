@@ -12,7 +12,7 @@ def main() -> None:
     print("python -m sejax.experiments.NAME [quick=true] [FIELD=VALUE ...] [--help]\n")
     for module in sorted(pkgutil.iter_modules(experiments.__path__), key=lambda m: m.name):
         source = Path(experiments.__path__[0], f"{module.name}.py").read_text()
-        if "EXPERIMENT = " in source:
+        if "\nEXPERIMENT = " in source:
             about = ast.get_docstring(ast.parse(source)) or ""
             print(f"  {module.name:20} {about.partition(chr(10))[0]}")
 

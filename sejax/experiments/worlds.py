@@ -53,6 +53,7 @@ class World:
       exploration: their bonus.
       hparams: "default", or "varied" if hyperparameters are drawn for each agent.
       settings: what else the results depend on, such as the proxies' configuration; plain values.
+      is_single: whether its one group takes its keys from the seed itself.
     """
 
     name: str
@@ -61,9 +62,10 @@ class World:
     groups: tuple[Group, ...]
     agent: Any
     training: TrainingConfig
-    exploration: Any = NoExploration()
+    exploration: Any = field(default_factory=NoExploration)
     hparams: str = "default"
     settings: dict[str, Any] = field(default_factory=dict)
+    is_single: bool = False
 
     def settings_of(self, group: Group) -> dict[str, Any]:
         """What a group's results depend on, beside the random numbers."""
@@ -148,19 +150,22 @@ def train(
     program = make_program(measure, world.agent, world.exploration, world.hparams, world.env,
                            world.task, world.training, settings.devices)  # fmt: skip
     padded = [*places, *[places[-1]] * (at_once - len(places))]
-    keys = jax.vmap(lambda group: agent_keys(settings.seed, group, num_agents))(np.array(padded))
+    keys = jax.numpy.concatenate([
+        agent_keys(settings.seed, None if world.is_single else i, num_agents) for i in padded
+    ])  # fmt: skip
     params = jax.tree.map(lambda *each: np.stack(each), *[world.groups[i].params for i in padded])
     active = np.repeat(np.arange(at_once) < len(places), num_agents)
-    result = jax.device_get(program(keys.reshape(-1), params, active))
+    result = jax.device_get(program(keys, params, active))
     return [
         measure.to_table(*jax.tree.map(lambda x, i=i: x[i : i + num_agents], result))
         for i in range(0, len(places) * num_agents, num_agents)
     ]
 
 
-def agent_keys(seed: int, group: Any, num_agents: int) -> Any:
+def agent_keys(seed: int, group: int | None, num_agents: int) -> Any:
     """A key for each agent of a group, `[agent]`; the first ones are the same for any number."""
-    return jax.random.split(jax.random.fold_in(jax.random.key(seed), group), num_agents)
+    key = jax.random.key(seed)
+    return jax.random.split(key if group is None else jax.random.fold_in(key, group), num_agents)
 
 
 @functools.cache
