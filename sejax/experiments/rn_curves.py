@@ -113,7 +113,14 @@ def rn_curves(settings: CurveSettings, variant: str, rns: Any, prefix: str = "")
 
 
 def _curves(
-    settings: CurveSettings, prefix: str, name: str, env: Any, task: Any, groups: Any, **more: Any
+    settings: CurveSettings,
+    prefix: str,
+    name: str,
+    env: Any,
+    task: Any,
+    groups: Any,
+    /,
+    **more: Any,
 ) -> Iterator[pd.DataFrame]:
     """Those of each row, with the columns `group`, `row` and `world`."""
     for row in settings.rows:
