@@ -207,10 +207,10 @@ def draw(settings: AgentLearning, curves: pd.DataFrame, points: int = 100) -> No
                 grid = np.geomspace(last_step / 200, last_step, points)
                 values = return_curves.on_grid(study_curves, grid)
                 known = ~np.isnan(values).any(axis=0)
-                bounds = [bootstrap_interval(v) for v in values[:, known].T]
+                low, high = np.transpose([bootstrap_interval(v) for v in values[:, known].T])
                 label = figures.AGENT_NAMES[study.agent] + "*" * bool(study.hparams)
-                figures.band(axis, grid[known], values[:, known].mean(axis=0),
-                             *np.transpose(bounds), color, lw=1.8, label=label)  # fmt: skip
+                figures.band(axis, grid[known], values[:, known].mean(axis=0), low, high, color,
+                             lw=1.8, label=label)  # fmt: skip
             axis.axhline(sejax.envs.make(env).solved_reward, color="#7a7a7a", ls="--", lw=1)
             axis.set_title(env, fontsize=10)
             axis.set(xscale="log", xlabel="training steps (*: hyperparameters in the table)")

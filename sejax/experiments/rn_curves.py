@@ -87,7 +87,7 @@ class CurveSettings(RnSettings):
 def real_curves(settings: CurveSettings) -> pd.DataFrame:
     """Curves of all agents on the real task, without and with the bonuses that are compared."""
     task = settings.task
-    tables = []
+    tables: list[pd.DataFrame] = []
     bonuses = {name: bonus for name, bonus in settings.study.bonuses.items()
                if name in settings.bonuses}  # fmt: skip
     for name, bonus in {"real": NoExploration(), **bonuses}.items():

@@ -86,7 +86,8 @@ def report(settings: RnObjectives, rows: pd.DataFrame) -> pd.DataFrame:
     """Writes the summary, the pictures and the table, and returns the table."""
     solved_reward = settings.task.solved_reward
     without = rows[rows["world"].isin(rn_curves.WITHOUT_RN)]
-    summaries, tables = [], []
+    summaries: list[pd.DataFrame] = []
+    tables: list[pd.DataFrame] = []
     for objective in settings.objectives:
         for pick in settings.picks:
             mine = beside(settings, rows, without, objective, pick)
