@@ -104,12 +104,14 @@ def parse(settings: type[Settings], words: Sequence[str]) -> dict[str, Any]:
     runs = [word for word in words if has_runs and word.startswith(RUN_PREFIX)]
     own = [word for word in words if word not in runs]
     _require_words(settings, own, fields)
-    # Null stands for "not given": what a default is may depend on what is given.
-    node: Any = dict.fromkeys(fields)
+    # Null stands for "not given": what a default is may depend on what is given. The fields are in
+    # a node of their own, as Hydra would take some for the groups of `sejax.run`.
+    node: Any = {"settings": dict.fromkeys(fields)}
     ConfigStore.instance().store(name=settings.name, node=node)
     try:
         with initialize(config_path=None, version_base="1.3"):
-            given = to_plain(compose(settings.name, overrides=own))
+            words = [f"settings.{word}" for word in own]
+            given = to_plain(compose(settings.name, overrides=words))["settings"]
     except (HydraException, OmegaConfBaseException) as error:
         raise translate_hydra_error(error, own) from error
     if runs:

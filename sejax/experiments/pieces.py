@@ -61,7 +61,7 @@ class Pieces:
         for name, table in zip(missing, compute(missing) if missing else [], strict=True):
             write_text(self._file(name, "csv"), table.to_csv(index=False))
             write_text(self._file(name, "json"), json.dumps(settings[name], indent=2))
-        return [_read(self._file(name, "csv")) for name in settings]
+        return [pd.read_csv(self._file(name, "csv")) for name in settings]
 
     def _file(self, name: str, kind: str) -> Path:
         return self.folder / f"{name}.{kind}"
@@ -98,7 +98,7 @@ def read_rows(path: Path) -> pd.DataFrame:
             f"from_rows must be false where no rows are kept, because tables are made from them; "
             f"got true and no {path}. Set from_rows=false, or out=DIR."
         )
-    return _read(path, "xz")
+    return pd.read_csv(path)
 
 
 def stack(tables: dict[str, pd.DataFrame]) -> pd.DataFrame:
@@ -111,8 +111,3 @@ def unstack(rows: pd.DataFrame, name: str) -> pd.DataFrame:
     """A table of `stack`, without the columns of the others."""
     mine = rows[rows["table"] == name].drop(columns="table")
     return mine.dropna(axis=1, how="all").infer_objects().reset_index(drop=True)
-
-
-def _read(path: Path, compression: Any = None) -> pd.DataFrame:
-    # Every digit as it was written: tables from rows that were read are those of the first time.
-    return pd.read_csv(path, compression=compression, float_precision="round_trip")

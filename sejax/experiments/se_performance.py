@@ -128,7 +128,8 @@ def task_name(settings: SePerformance, sets: dict[str, Any]) -> str:
     Raises:
       ConfigError: if there are several.
     """
-    names = sorted({ses.task.name for ses in sets.values()} | {settings.env} - {None})
+    asked = {settings.env} if settings.env else set()
+    names = sorted({str(ses.task.name) for ses in sets.values()} | asked)
     require(len(names) <= 1, "varied, fixed and env", "be of one task",
             "agents are tested on it", ", ".join(names), "files of the same task")  # fmt: skip
     return names[0] if names else "cartpole"

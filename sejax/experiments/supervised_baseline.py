@@ -62,7 +62,7 @@ def compute(settings: SupervisedBaseline) -> pd.DataFrame:
       ConfigError: for a proxy or settings that cannot work.
     """
     ses = load(settings)
-    data = [supervised_models.collect_piece(settings, ses, i) for i in range(settings.models)]
+    data = supervised_models.collect_all(settings, ses)
     fits = supervised_models.fit_piece(settings, ses, data)
     tables = []
     for kind in settings.agents:

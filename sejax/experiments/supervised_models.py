@@ -5,10 +5,11 @@ Supervised Learning with Synthetic Environments on CartPole"; `reference_details
 """
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -54,8 +55,8 @@ class SupervisedBaseline(Settings):
 # --- transitions ---------------------------------------------------------------------------------
 
 
-def learning_config(settings: SupervisedBaseline, ses: Any, index: int) -> Any:
-    """Settings of the NES run that a model's transitions come from."""
+def learning_config(settings: SupervisedBaseline, ses: Any) -> Any:
+    """Settings of the NES runs that the transitions come from."""
     config = build.learn_config(ses.config)
     agent, training = config.agent, config.training
     training = dataclasses.replace(training, test_episodes=settings.test_episodes)
@@ -65,59 +66,76 @@ def learning_config(settings: SupervisedBaseline, ses: Any, index: int) -> Any:
     es = dataclasses.replace(config.es, population_size=settings.population,
                              num_incumbent_evals=settings.population)  # fmt: skip
     return dataclasses.replace(
-        config, agent=agent, training=training, es=es, seed=settings.seed + index, num_seeds=1,
-        generations=settings.generations, devices=settings.devices, run_dir=None,
+        config, agent=agent, training=training, es=es, generations=settings.generations,
+        seed=settings.seed, num_seeds=1, devices=settings.devices, run_dir=None,
     )  # fmt: skip
 
 
-def collect_piece(settings: SupervisedBaseline, ses: Any, index: int) -> pd.DataFrame:
-    """The transitions of one NES run."""
-    config = learning_config(settings, ses, index)
+def collect_all(settings: SupervisedBaseline, ses: Any) -> list[pd.DataFrame]:
+    """The transitions of each NES run; every run is a piece."""
+    config = learning_config(settings, ses)
     made_with = build.to_plain(config) | {"max_rows": settings.max_rows, "devices": None}
-    rows = settings.pieces.compute(
-        f"transitions-{index}", made_with, lambda: collect(config, settings.max_rows)
-    )
-    print(f"NES run {index}: {len(rows):,} transitions of episodes with mean return "
-          f"{rows['return'].mean():.1f}", flush=True)  # fmt: skip
-    return rows
+    tables = []
+    for index in range(settings.models):
+        seed = settings.seed + index
+        make = functools.partial(collect, config, seed, settings.max_rows)
+        rows = settings.pieces.compute(f"transitions-{index}", made_with | {"seed": seed}, make)
+        print(f"NES run {index}: {len(rows):,} transitions of episodes with mean return "
+              f"{rows['return'].mean():.1f}", flush=True)  # fmt: skip
+        tables.append(rows)
+    return tables
 
 
-def collect(config: Any, max_rows: int) -> pd.DataFrame:
+def collect(config: Any, seed: int, max_rows: int) -> pd.DataFrame:
     """Runs NES and draws transitions, all equally likely, from its agents' real test episodes."""
-    state, generation = make_recorded_run(config)
-    sample = Sample(max_rows, np.random.default_rng(config.seed))
+    run = make_recorded_run(config)
+    state = run.init(jax.random.key(seed))
+    sample = Sample(max_rows, np.random.default_rng(seed))
     for number in range(config.generations):
-        state, steps = generation(state, number)
+        state, steps = run.generation(state)
         sample.add(table_of(jax.device_get(steps), number))
     return sample.table
 
 
-def make_recorded_run(config: Any) -> tuple[Any, Callable[..., Any]]:
-    """The NES run of a configuration, with its tests recorded.
+class RecordedRun(NamedTuple):
+    """An NES run whose agents' tests are recorded; compiled functions.
 
-    Returns:
-      The strategy's state before the first generation, and `generation(state, number) ->
-      (state, transitions)`: that of `Program.generation` with the same seed.
+    Attributes:
+      init: `key -> LearnState`, leaves without their axis of seeds.
+      generation: `state -> (state, (steps, returns))`, leaves `[agent, step, ...]`: that of
+        `Program.generation`, but for what the state says of the best proxy.
     """
+
+    init: Callable[[Any], Any]
+    generation: Callable[[Any], Any]
+
+
+@functools.cache
+def make_recorded_run(config: Any) -> RecordedRun:
+    """The NES run of a configuration, from any seed: compiled once for all of them."""
     from sejax.bilevel import Scores, make_program
 
     program = make_program(**config.parts())
     strategy, trials = program.strategy, program.strategy.trials
-    start = jax.tree.map(lambda x: x[0], program.init(jax.random.key(config.seed)[None]))
+    seed_ids = jnp.asarray(trials.seed_ids(strategy.num_members))
     evaluate = make_recorded_evaluation(config)
 
-    def generation(state: Any, number: Any) -> Any:
-        key_ask, key_inner, key_tell = jax.random.split(jax.random.fold_in(start.key, number), 3)
-        members, asked = strategy.ask(key_ask, state)
+    def init(key: Any) -> Any:
+        return jax.tree.map(lambda x: x[0], program.init(key[None]))
+
+    def generation(state: Any) -> Any:
+        key = jax.random.fold_in(state.key, state.generation)
+        key_ask, key_inner, key_tell = jax.random.split(key, 3)
+        members, asked = strategy.ask(key_ask, state.es_state)
         candidates = trials.candidates(members, strategy.incumbent(asked))
-        seed_ids = jnp.asarray(trials.seed_ids(strategy.num_members))
         keys = jax.vmap(jax.random.fold_in, (None, 0))(key_inner, seed_ids)
         outcome, steps = evaluate(keys, jax.vmap(program.unravel)(candidates))
         scores = Scores.of(program.objective(outcome)[None], trials)
         tried, mean = trials.of_members(scores.tried[0]), scores.incumbent_mean[0]
-        return strategy.tell(key_tell, members, tried, mean, asked), steps
+        told = strategy.tell(key_tell, members, tried, mean, asked)
+        return state.replace(es_state=told, generation=state.generation + 1), steps
 
-    return start.es_state, jax.jit(generation)
+    return RecordedRun(init=jax.jit(init), generation=jax.jit(generation))
 
 
 def make_recorded_evaluation(config: Any) -> Callable[..., Any]:
