@@ -98,7 +98,7 @@ def read_rows(path: Path) -> pd.DataFrame:
             f"from_rows must be false where no rows are kept, because tables are made from them; "
             f"got true and no {path}. Set from_rows=false, or out=DIR."
         )
-    return pd.read_csv(path)
+    return pd.read_csv(path, low_memory=False)  # a column has one type throughout
 
 
 def stack(tables: dict[str, pd.DataFrame]) -> pd.DataFrame:
