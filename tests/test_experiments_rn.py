@@ -1,6 +1,10 @@
 """The experiments on reward networks: what agents reach with them, and what they have learned."""
 
 import dataclasses
+import importlib
+import re
+import shlex
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -309,3 +313,13 @@ def test_words_of_the_command_line_are_settings():
     assert given == {"env": "cartpole", "max_steps": 7, "quick": True, "variants": ["a", "b"],
                      "run": ["es.x=1"]}  # fmt: skip
     assert not any(parse(RnPerformance, []).values())
+
+
+def test_commands_in_the_docs_are_accepted():
+    text = (Path(__file__).parents[1] / "docs" / "results.md").read_text()
+    commands = re.findall(r"^python -m sejax\.experiments\.(\w+)(.*)$", text, re.MULTILINE)
+    assert len(commands) > 15
+    for name, words in commands:
+        settings = importlib.import_module(f"sejax.experiments.{name}").EXPERIMENT.settings
+        made = settings.of(**parse(settings, shlex.split(words)))
+        assert made.command().startswith(f"python -m sejax.experiments.{name}")
