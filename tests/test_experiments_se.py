@@ -1,5 +1,6 @@
 """The experiments with SEs: the framework, sets of SEs, feasibility, performance, single SEs."""
 
+import dataclasses
 import os
 import shutil
 import subprocess
@@ -15,6 +16,7 @@ from support import refuse
 
 import sejax
 from sejax import envs
+from sejax.agents.agent import drawing_key
 from sejax.app import session
 from sejax.errors import ConfigError
 from sejax.experiments import (
@@ -422,25 +424,41 @@ def test_performance_trains_as_evaluation_does_and_goes_on(ses, tmp_path, monkey
 
 
 def check_as_evaluation(ses, agents):
-    """The second groups are those of `evaluate_agents` with the same keys."""
-    from sejax.evaluation import evaluate_agents
-
+    """Agents of the second groups are those of `make_evaluator` with the same keys and draws."""
     loaded, task = sejax.load_set(ses[0]), envs.make("cartpole")
-    mine = agents[agents["group"] == f"se-{loaded.seeds[1]:02d}-{loaded.fingerprint(1)}"]
     key = jax.random.fold_in(jax.random.key(3), 1)
     keys = jax.numpy.stack([jax.random.fold_in(key, i) for i in range(3)])
-    varied = sejax.make_agent(sejax.DDQNConfig(**TINY_AGENT), task, varied=True)
+    mine = agents[agents["group"] == f"se-{loaded.seeds[1]:02d}-{loaded.fingerprint(1)}"]
     training = sejax.TrainingConfig(max_steps=40, stop_rule="never", test_episodes=2)
-    expected = evaluate_agents(varied, loaded.env, loaded.one(1), task, training, keys)
-    np.testing.assert_allclose(mine["test_return"], expected.test_return, rtol=1e-6)
+    chosen, expected = evaluated(loaded.env, loaded.one(1), task, training, keys)
+    np.testing.assert_allclose(mine["test_return"].iloc[chosen], expected.test_return, rtol=1e-6)
     np.testing.assert_allclose(mine["return_0"] + mine["return_1"], 2 * mine["test_return"])
     assert (mine["train_steps"] == 40).all() and mine["hidden_size"].between(1, 6).all()
     mine = agents[agents["group"] == "real-01"]
     training = sejax.TrainingConfig(max_episodes=3, max_steps=4000, stop_rule="solved",
                                     solved_by="train", test_episodes=2)  # fmt: skip
-    expected = evaluate_agents(varied, task.env, task.params, task, training, keys)
-    np.testing.assert_allclose(mine["test_return"], expected.test_return, rtol=1e-6)
-    np.testing.assert_array_equal(mine["train_steps"], expected.train_steps)
+    chosen, expected = evaluated(task.env, task.params, task, training, keys)
+    np.testing.assert_allclose(mine["test_return"].iloc[chosen], expected.test_return, rtol=1e-6)
+    np.testing.assert_array_equal(mine["train_steps"].iloc[chosen], expected.train_steps)
+
+
+def evaluated(env, params, task, training, keys):
+    """Outcomes of the agents that draw networks as deep as the first one does, and which they are.
+
+    All depths would be compiled otherwise.
+    """
+    varied = sejax.make_agent(sejax.DDQNConfig(**TINY_AGENT), task, varied=True)
+    draws = jax.vmap(lambda key: varied.draw(drawing_key(key)))(keys)
+    chosen = np.flatnonzero(draws.variant == draws.variant[0])
+    agent = varied.variants[int(draws.variant[0])]
+
+    @jax.jit
+    def evaluate(key, hparams):
+        fixed = dataclasses.replace(agent, hparams=hparams)
+        return sejax.make_evaluator(fixed, env, task, training)(key, params)
+
+    each = [evaluate(keys[i], jax.tree.map(lambda x, i=i: x[i], draws.hparams)) for i in chosen]
+    return chosen, jax.tree.map(lambda *x: np.stack(x), *each)
 
 
 def test_ses_learned_otherwise_than_the_option_says_are_refused(ses, tmp_path):

@@ -28,7 +28,7 @@ from sejax.experiments import (
 from sejax.rollout import make_recorder, make_tester
 from sejax.trainer import make_trainer
 
-TINY_AGENT = {"hidden_size": 4, "num_layers": 1, "batch_size": 4, "init_episodes": 0}
+TINY_AGENT = {"hidden_size": 2, "num_layers": 1, "batch_size": 4, "init_episodes": 0}
 TINY_TRANSFORMS = {"runs": 3, "generations": 2, "population": 2, "slots": 2}
 TINY_HISTOGRAMS = {"agents": "ddqn", "num_agents": 2, "test_episodes": 2, "max_rows": 50}
 TINY_MODELS = {"models": 3, "generations": 2, "population": 2, "max_rows": 30, "epochs": 2,
@@ -115,12 +115,11 @@ def test_runs_follow_one_another_in_slots(slots):
     assert search.trained == 4 + 1 + 5 + 2 + 5, "an empty slot costs nothing"
 
 
-@pytest.mark.parametrize("transform", ["single_best", "nes"])
-def test_the_search_is_the_bilevel_loop(transform):
+def test_the_search_is_the_bilevel_loop():
     search = score_transforms.make_search(True, 2, None)
     keys, sizes = jax.random.split(jax.random.key(0), 2), np.array([0.1, 5.0], np.float32)
-    state = search.init(keys, sizes, score_transforms.SCORE_TRANSFORMS.index(transform))
-    config = sejax.config([*score_transforms.SETTINGS, f"es.score_transform={transform}",
+    state = search.init(keys, sizes, score_transforms.SCORE_TRANSFORMS.index("single_best"))
+    config = sejax.config([*score_transforms.SETTINGS, "es.score_transform=single_best",
                            "es.mirrored=true", "es.population_size=2"])  # fmt: skip
     program = make_program(**config.parts())
     expected = program.init(keys)
@@ -361,21 +360,27 @@ def test_intervals_draw_models_and_the_best_ones_are_those_of_the_best_episodes(
 
 
 def test_the_supervised_baseline_runs_and_goes_on(se_file, tmp_path, monkeypatch, small):
-    options = TINY_MODELS | {"proxy": se_file}
+    options = TINY_MODELS | {"proxy": se_file, "hparams": "default"}
     table = run(supervised_baseline, tmp_path, **options)
-    assert list(table["trained on"]) == [
-        text for _ in range(2) for text in supervised_baseline.LABELS.values()
-    ]  # fmt: skip
+    labels = list(supervised_baseline.LABELS.values())
+    assert list(table["trained on"]) == labels
     assert (tmp_path / "supervised_baseline.png").stat().st_size > 10_000
     check_real_transitions(pd.read_csv(tmp_path / "work" / "pieces" / "transitions-0.csv"))
     check_models(tmp_path)
     monkeypatch.setattr(supervised_models, "collect", refuse)
+    monkeypatch.setattr(supervised_baseline, "draw", lambda *_: None)
     monkeypatch.setattr(supervised_models, "fit_all", refuse)
     monkeypatch.setattr(worlds, "train", refuse)
     assert run(supervised_baseline, tmp_path, **options).equals(table)
-    assert run(supervised_baseline, tmp_path, **options, from_rows=True).equals(table)
     with pytest.raises(ConfigError, match="another num_agents"):
         run(supervised_baseline, tmp_path, **options | {"num_agents": 3})
+    # Agents with drawn hyperparameters are rows of the same table.
+    rows = pieces.read_rows(tmp_path / "rows.csv.xz")
+    drawn = rows[rows["table"] == "agents"].assign(hparams="varied")
+    pieces.write_rows(tmp_path / "rows.csv.xz", pd.concat([rows, drawn]))
+    both = run(supervised_baseline, tmp_path, **options, from_rows=True)
+    assert list(both["trained on"]) == labels * 2
+    pd.testing.assert_frame_equal(both[4:].reset_index(drop=True), table)
 
 
 def test_a_recorded_run_is_the_bilevel_loop():

@@ -66,7 +66,7 @@ def compute(settings: SupervisedBaseline) -> pd.DataFrame:
     fits = supervised_models.fit_piece(settings, ses, data)
     tables = []
     for kind in settings.agents:
-        for hparams in HPARAMS:
+        for hparams in settings.hparams:
             for name, world in make_worlds(settings, ses, kind, hparams).items():
                 rows = train_groups(world, settings, settings.num_agents)
                 tables.append(rows.assign(world=name, kind=kind, hparams=hparams))

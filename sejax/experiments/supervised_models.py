@@ -23,6 +23,7 @@ from sejax.app import build
 from sejax.experiments import se_agents
 from sejax.experiments.se_agents import AGENTS
 from sejax.experiments.settings import Settings, each_of, setting
+from sejax.experiments.worlds import HPARAMS
 from sejax.options import counts
 from sejax.parallel import spread_over_devices
 
@@ -46,6 +47,8 @@ class SupervisedBaseline(Settings):
                             about="transitions for a model")  # fmt: skip
     epochs: int = setting(100, counts("it counts epochs"), quick=20, about="of a fit")
     agents: tuple[str, ...] = setting(("ddqn",), each_of(AGENTS), about=f"of {', '.join(AGENTS)}")
+    hparams: tuple[str, ...] = setting(HPARAMS, each_of(HPARAMS), about="of the agents; varied: "
+                                       "drawn for each")  # fmt: skip
     num_agents: int = setting(20, counts("it counts agents"), quick=2, about="for each model")
     test_episodes: int = setting(10, counts("it counts episodes"), about="of each agent")
     max_steps: int | None = setting(None, counts("an agent must train"), about="training steps of "
