@@ -35,21 +35,13 @@ PAPER_DDQN = "16,888 steps to solve, agents with drawn hyperparameters (the pape
 
 @dataclass(frozen=True, kw_only=True)
 class Study:
-    """An agent on a task.
-
-    Attributes:
-      env: name of the task.
-      agent: name of the agent.
-      max_steps: training steps.
-      hparams: hyperparameters other than the agent's defaults, which are the paper's.
-      peers: what others report.
-    """
+    """An agent on a task."""
 
     env: str
     agent: str
-    max_steps: int
-    hparams: dict[str, Any] = field(default_factory=dict)
-    peers: str = ""
+    max_steps: int  # of training
+    hparams: dict[str, Any] = field(default_factory=dict)  # others than the paper's, the defaults
+    peers: str = ""  # what others report
 
     def training(self, quick: bool, test_episodes: int) -> TrainingConfig:
         """Episodes of training and of tests alternate until the step limit."""

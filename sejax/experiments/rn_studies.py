@@ -18,19 +18,7 @@ from typing import Any
 import pandas as pd
 
 import sejax
-from sejax import (
-    CountBasedConfig,
-    DDQNConfig,
-    DuelingDDQNConfig,
-    ICMConfig,
-    PPOConfig,
-    QLearningConfig,
-    SARSAConfig,
-    TD3Config,
-    errors,
-    plugins,
-    serialize,
-)
+from sejax import ICMConfig, errors, plugins, serialize
 from sejax.app import build, run_directory
 from sejax.errors import ConfigError
 from sejax.experiments import pieces, proxy_runs
@@ -54,33 +42,19 @@ QUICK: dict[str, Any] = {
 
 @dataclass(frozen=True, kw_only=True)
 class Study:
-    """What the paper trains on the RNs of a task.
+    """What the paper trains on the RNs of a task."""
 
-    Attributes:
-      agent: of the rows with default and varied hyperparameters.
-      transfer_agent: of the row with an unseen agent.
-      bonuses: exploration bonuses that are compared on the real task.
-      variants: of the RNs.
-      max_episodes: that the paper trains.
-      max_steps: training steps that its figure shows.
-      learned: RNs of each variant that are learned.
-      runs_at_once: of them in one program; a run is saved after each generation of all.
-      rns: number of them, the best ones, that agents are trained on.
-      num_agents: on each of these.
-      when_quick: settings with quick=true, where trainings of this task, or the compilation of
-        HalfCheetah's physics, would take too long otherwise.
-    """
-
-    agent: Any
-    transfer_agent: Any
-    bonuses: dict[str, Any]
+    agent: Any  # of the rows with default and varied hyperparameters
+    transfer_agent: Any  # of the row with an unseen agent
+    bonuses: dict[str, Any]  # exploration bonuses that are compared on the real task
     variants: tuple[str, ...] = VARIANTS
-    max_episodes: int
-    max_steps: int
-    learned: int = 10
-    runs_at_once: int = 1
-    rns: int = 10
-    num_agents: int = 10
+    max_episodes: int  # that the paper trains
+    max_steps: int  # training steps that its figure shows
+    learned: int = 10  # RNs of each variant
+    runs_at_once: int = 1  # of them in one program; a run is saved after each generation of all
+    rns: int = 10  # the best ones of them, that agents are trained on
+    num_agents: int = 10  # on each of these
+    # Where trainings of the task, or compiling its physics, would take too long with quick=true.
     when_quick: dict[str, Any] = field(default_factory=dict)
 
 
@@ -93,29 +67,30 @@ STUDIES = {
     "cliff_walking": Study(
         # SARSA explores less than the paper's table says, as in the authors' scripts: with an
         # epsilon of 0.1 and a learning rate of 1 it does not learn the task.
-        agent=QLearningConfig(), transfer_agent=SARSAConfig(epsilon_init=0.01, epsilon_min=0.01),
-        bonuses={"count_based": CountBasedConfig()},
+        agent=sejax.QLearningConfig(),
+        transfer_agent=sejax.SARSAConfig(epsilon_init=0.01, epsilon_min=0.01),
+        bonuses={"count_based": sejax.CountBasedConfig()},
         max_episodes=500, max_steps=5000, learned=50, runs_at_once=50,
     ),
     "cartpole": Study(
-        agent=DDQNConfig(**_CARTPOLE), transfer_agent=DuelingDDQNConfig(**_CARTPOLE),
+        agent=sejax.DDQNConfig(**_CARTPOLE), transfer_agent=sejax.DuelingDDQNConfig(**_CARTPOLE),
         bonuses={"icm": ICMConfig()},
         max_episodes=1000, max_steps=50_000,
         when_quick={"variants": ("additive_potential",), "rows": ("default", "transfer"),
-               "generations": 2},
+                    "generations": 2},
     ),
     "mountain_car_continuous": Study(
-        agent=TD3Config(init_episodes=50, action_repeat=2),
-        transfer_agent=PPOConfig(action_repeat=5),
+        agent=sejax.TD3Config(init_episodes=50, action_repeat=2),
+        transfer_agent=sejax.PPOConfig(action_repeat=5),
         bonuses={"icm": ICMConfig(forward_weight=0.1, reward_scale=0.01, learning_rate=5e-4)},
         max_episodes=3000, max_steps=250_000,
         when_quick={"variants": ("additive_potential",), "rows": ("default",), "generations": 2,
-               "run": ("es.population_size=4", "es.num_incumbent_evals=4",
-                       "training.max_episodes=4", "agent.init_episodes=1")},
+                    "run": ("es.population_size=4", "es.num_incumbent_evals=4",
+                            "training.max_episodes=4", "agent.init_episodes=1")},
     ),
     "halfcheetah": Study(
-        agent=TD3Config(),
-        transfer_agent=PPOConfig(
+        agent=sejax.TD3Config(),
+        transfer_agent=sejax.PPOConfig(
             hidden_size=128, activation="tanh", learning_rate=1e-5, update_episodes=1, epochs=10,
             entropy_weight=0.001, init_action_std=0.1,
         ),
@@ -123,9 +98,9 @@ STUDIES = {
         variants=(*VARIANTS, *(v + AUGMENTED for v in VARIANTS), *WEIGHTED_INFO),
         max_episodes=1000, max_steps=500_000, learned=5, rns=5, num_agents=5,
         when_quick={"variants": ("additive_potential",), "rows": ("default",), "generations": 1,
-               "learned": 1, "num_agents": 2, "bonuses": (),
-               "run": ("es.population_size=2", "es.num_incumbent_evals=2",
-                       "training.max_episodes=2", "agent.init_episodes=1")},
+                    "learned": 1, "num_agents": 2, "bonuses": (),
+                    "run": ("es.population_size=2", "es.num_incumbent_evals=2",
+                            "training.max_episodes=2", "agent.init_episodes=1")},
     ),
 }  # fmt: skip
 LABELS = {
@@ -143,10 +118,9 @@ LABELS = {
 
 def label(name: str) -> str:
     """Name of a world in pictures: the reward that agents get there."""
-    plain = LABELS[name.removesuffix(AUGMENTED)]
-    return (
-        plain.replace("(s')", "(s', v')").replace("(s)", "(s, v)") if AUGMENTED in name else plain
-    )
+    text = LABELS[name.removesuffix(AUGMENTED)]
+    is_plain = AUGMENTED not in name
+    return text if is_plain else text.replace("(s')", "(s', v')").replace("(s)", "(s, v)")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -202,15 +176,7 @@ def objective_setting() -> Any:
 
 
 def learn(settings: RnSettings, variant: str, objective: str) -> Any:
-    """The RNs of a variant, learned by an objective, in the order of their seeds.
-
-    Args:
-      settings: of the experiment.
-      variant: one of the study's.
-      objective: one of `OBJECTIVES`.
-
-    Returns:
-      A `ProxySet` of `settings.learned` RNs.
+    """The RNs of a variant, learned by an objective: a `ProxySet` in the order of their seeds.
 
     Raises:
       ConfigError: for settings that cannot work, or a folder with RNs of other settings.
