@@ -1,12 +1,14 @@
 """sejax.envs: the contract of every real task, and parity with Gymnasium."""
 
+import dataclasses
+
 import gymnasium
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sejax import envs
+from sejax import envs, plugins
 from sejax.errors import ConfigError
 
 GYMNASIUM_IDS = {
@@ -147,6 +149,32 @@ def test_vmapped_steps_equal_single_ones(name, env_step):
         alone = env_step[name](keys[i], jax.tree.map(lambda x, i=i: x[i], states), actions[i])
         for a, b in zip(jax.tree.leaves(together), jax.tree.leaves(alone), strict=True):
             np.testing.assert_allclose(a[i], b, rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_what_is_said_of_a_task_before_it_is_made_is_so(name):
+    config = plugins.configure("env", {"name": name})
+    assert config.facts == envs.facts_of(config) == envs.make(name).facts
+
+
+def test_a_task_says_what_it_was_made_from():
+    for options in ({}, {"goal_reward": -1.0}):
+        task = envs.make("cliff_walking", **options)
+        assert task.origin == {"name": "cliff_walking", "goal_reward": 0.0} | options
+        assert envs.make(**task.origin) is task
+    assert dataclasses.replace(task, origin=None).origin is None
+
+
+def test_a_task_made_by_hand_has_the_limit_that_it_is_given():
+    world = envs.make("gridworld_2x2").env
+    task = envs.Task(name="mine", env=world)
+    assert task.params == world.default_params and task.max_steps == 10
+    assert task.solved_reward == np.inf and not task.is_solvable
+    shorter = envs.Task(name="mine", env=world, max_steps=3)
+    assert shorter.max_steps == shorter.params.max_steps_in_episode == 3
+    assert dataclasses.replace(shorter, max_steps=4).params.max_steps_in_episode == 4
+    with pytest.raises(ConfigError, match=r"^env\.max_steps must be at least 1"):
+        envs.Task(name="mine", env=world, max_steps=0)
 
 
 # --- the paper's numbers -------------------------------------------------------------------------
