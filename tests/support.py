@@ -1,6 +1,5 @@
 """What several test modules share: plain references, and a reader of compiled programs."""
 
-import argparse
 import math
 import re
 
@@ -96,14 +95,6 @@ def large_ops_in_loops(hlo, num_elements):
             if op and math.prod(int(d) for d in op.group(1).split(",") if d) >= num_elements:
                 found.append((op.group(2), line))
     return [(op, line) for op, line in found if op not in IN_PLACE]
-
-
-def experiment_options(experiment, out, *argv):
-    """What the command line of a module of `sejax.experiments` would parse to, with `--quick`."""
-    parser = argparse.ArgumentParser()
-    experiment.add_options(parser)
-    args = parser.parse_args(argv)
-    return argparse.Namespace(**vars(args), quick=True, out=out, seed=3, devices=None)
 
 
 def refuse(*_, **__):

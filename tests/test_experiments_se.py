@@ -306,7 +306,7 @@ def test_a_run_without_its_checkpoint_is_not_replaced(two_runs, tmp_path):
     metrics = tmp_path / "work/runs/seed3/metrics.csv"
     before = metrics.read_text()
     with pytest.raises(ConfigError, match=r"checkpoints of a run.*with 3 generations"):
-        learned(tmp_path, f"run_dir={tmp_path}", generations=4)
+        learned(tmp_path, generations=4)
     assert metrics.read_text() == before
 
 

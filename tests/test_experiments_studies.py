@@ -29,7 +29,7 @@ from sejax.rollout import make_recorder, make_tester
 from sejax.trainer import make_trainer
 
 TINY_AGENT = {"hidden_size": 2, "num_layers": 1, "batch_size": 4, "init_episodes": 0}
-TINY_TRANSFORMS = {"runs": 3, "generations": 2, "population": 2, "slots": 2}
+TINY_TRANSFORMS = {"runs": 3, "generations": 2, "population": 2}
 TINY_HISTOGRAMS = {"agents": "ddqn", "num_agents": 2, "test_episodes": 2, "max_rows": 50}
 TINY_MODELS = {"models": 3, "generations": 2, "population": 2, "max_rows": 30, "epochs": 2,
                "num_agents": 2, "test_episodes": 2}  # fmt: skip
@@ -79,40 +79,37 @@ class ScriptedSearch:
 
     def __init__(self, solved_at):
         self.solved_at = np.asarray(solved_at)
-        self.trained = 0  # generations of runs, the measure of the work done
+        self.advanced = 0
 
     def init(self, keys, sizes, transform):
-        assert transform == 2
-        assert np.allclose(sizes, keys / 10), "a run keeps its step size"
-        zeros = np.zeros(len(keys), int)
-        return State(run=keys, generation=zeros, finished=zeros > 0, incumbent_score=zeros)
+        assert transform == score_transforms.SCORE_TRANSFORMS.index("nes")
+        np.testing.assert_allclose(sizes, score_transforms.draw_step_sizes(len(keys), 3), rtol=1e-6)
+        none = np.zeros(len(keys), int)
+        return SimpleNamespace(generation=none, finished=none > 0, incumbent_score=none)
 
     def advance(self, state):
-        self.trained += int((~state.finished).sum())
-        made = state.generation + 1
-        finished = state.finished | (made > self.solved_at[state.run])
-        return state.replace(generation=made, finished=finished, incumbent_score=state.run * 100)
-
-    def merge(self, where, a, b):
-        return State(**{k: np.where(where, x, getattr(b, k)) for k, x in vars(a).items()})
+        self.advanced += 1
+        made = np.where(state.finished, state.generation, state.generation + 1)
+        score = np.arange(len(made)) * 100
+        return SimpleNamespace(generation=made, finished=made > self.solved_at,
+                               incumbent_score=score)  # fmt: skip
 
 
-class State(SimpleNamespace):
-    def replace(self, **changes):
-        return State(**(vars(self) | changes))
-
-
-@pytest.mark.parametrize("slots", [1, 2, 5])
-def test_runs_follow_one_another_in_slots(slots):
-    solved_at = [3, 0, 9, 1, 4]  # updates before the incumbent solves the task
+@pytest.mark.parametrize(
+    ("solved_at", "updates", "solved", "advanced"),
+    [([3, 0, 9, 1, 4], [3, 0, 5, 1, 4], [True, True, False, True, True], 5),
+     ([1, 0], [1, 0], [True, True], 2)],
+)  # fmt: skip
+def test_a_run_counts_the_updates_before_the_incumbent_that_solves_the_task(
+    solved_at, updates, solved, advanced, monkeypatch
+):
     search = ScriptedSearch(solved_at)
-    updates, solved, scores = score_transforms.solve_all(
-        search, np.arange(5), "nes", np.arange(5) / 10, generations=5, slots=slots
-    )
-    np.testing.assert_array_equal(updates, [3, 0, 5, 1, 4])
-    np.testing.assert_array_equal(solved, [True, True, False, True, True])
-    np.testing.assert_array_equal(scores, [0, 100, 200, 300, 400])
-    assert search.trained == 4 + 1 + 5 + 2 + 5, "an empty slot costs nothing"
+    monkeypatch.setattr(score_transforms, "make_search", lambda *_: search)
+    asked = score_transforms.ScoreTransforms.of(runs=len(updates), generations=5, seed=3)
+    cell = score_transforms.compute_cell(asked, "nes", True)
+    assert list(cell["updates"]) == updates and list(cell["solved"]) == solved
+    assert list(cell["last_score"]) == [100 * run for run in range(len(updates))]
+    assert search.advanced == advanced, "nothing is computed when all runs are over"
 
 
 def test_the_search_is_the_bilevel_loop():

@@ -81,22 +81,16 @@ def collect(configs: list[Any], path: Path, before: Any = None) -> None:
         seeds = range(config.seed, config.seed + config.num_seeds)
         several = [folder / "proxies" / f"seed{seed}.safetensors" for seed in seeds]
         sources += several if config.num_seeds > 1 else [folder]
-    proxies = [before.proxy(i) for i in range(before.size)] if before else []
-    proxies += [sejax.load_proxy(source) for source in sources]
+    sets = [*([before] if before else []), *map(sejax.load_set, sources)]
+    places = [(each, i) for each in sets for i in range(each.size)]
     sejax.save_set(
         path,
-        proxies[0].env,
-        [proxy.params.weights for proxy in proxies],
-        [proxy.record for proxy in proxies],
+        sets[0].env,
+        [each.one(i).weights for each, i in places],
+        [each.records[i] for each, i in places],
         before.config if before else build.to_plain(configs[0]),
-        discount_of(configs[0]),
+        sets[0].discount,
     )
-
-
-def discount_of(config: Any) -> float:
-    """Of the agent that proxies are learned with."""
-    agent = config.parts()["agent"]
-    return float(agent.discount(agent.hparams))
 
 
 def generations_to_solve(curve: pd.DataFrame, solved_reward: float) -> float:

@@ -6,8 +6,7 @@ different score transformation schemes"); `reference_details.md` 2.5 and 6.2.
 Each run learns an SE with a score transform, with mirrored sampling or without, and a step size
 that is drawn log-uniformly; what counts is how often NES has to update the SE until the agents
 trained on it solve the task. Runs of a cell, i.e. of a score transform with or without mirrored
-sampling, differ in the step size and the seed only and advance together in slots: where a run
-ends, the next one begins.
+sampling, differ in the step size and the seed only and are one program.
 
 Differs: the paper drew all settings of a run at random; here every cell has as many runs, with the
 same step sizes and seeds. Its own runs were made with an older agent that learned from one random
@@ -20,7 +19,7 @@ import itertools
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -71,7 +70,6 @@ class ScoreTransforms(Settings):
                                "most")  # fmt: skip
     population: int = setting(16, counts("scores are compared within a generation", least=2),
                               quick=8, about="members of a generation")  # fmt: skip
-    slots: int = setting(64, counts("it counts runs"), about="runs that advance together")
     bins: int = setting(9, counts("it counts bins"), quick=3, about="of step sizes")
 
 
@@ -100,13 +98,18 @@ def compute_cell(settings: ScoreTransforms, transform: str, mirrored: bool) -> p
     """Runs of one score transform, a row each."""
     keys = jax.random.split(jax.random.key(settings.seed), settings.runs)
     step_sizes = draw_step_sizes(settings.runs, settings.seed)
-    updates, solved, scores = solve_all(
-        make_search(mirrored, settings.population, settings.devices), keys, transform, step_sizes,
-        settings.generations, min(settings.slots, settings.runs),
-    )  # fmt: skip
+    search = make_search(mirrored, settings.population, settings.devices)
+    state = search.init(keys, np.float32(step_sizes), SCORE_TRANSFORMS.index(transform))
+    for _ in range(settings.generations):
+        state = search.advance(state)  # runs that have solved the task stay as they are
+        if state.finished.all():
+            break
+    solved = np.asarray(state.finished)
+    updates = np.where(solved, np.asarray(state.generation) - 1, settings.generations)
     return pd.DataFrame({"transform": transform, "mirrored": mirrored,
                          "run": range(settings.runs), "step_size": step_sizes,
-                         "updates": updates, "solved": solved, "last_score": scores})  # fmt: skip
+                         "updates": updates, "solved": solved,
+                         "last_score": np.asarray(state.incumbent_score)})  # fmt: skip
 
 
 def draw_step_sizes(count: int, seed: int) -> np.ndarray:
@@ -118,54 +121,6 @@ def draw_step_sizes(count: int, seed: int) -> np.ndarray:
     places = (rng.permutation(count) + rng.uniform(size=count)) / count
     low, high = np.log(STEP_SIZES)
     return np.exp(low + places * (high - low))
-
-
-def solve_all(
-    search: "Search",
-    keys: Any,
-    transform: str,
-    step_sizes: np.ndarray,
-    generations: int,
-    slots: int,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Runs NES for every key until the incumbent solves the task or `generations` are over.
-
-    Args:
-      search: from `make_search`.
-      keys: `[run]`.
-      transform: name of the score transform of all runs.
-      step_sizes: `[run]`.
-      generations: of a run at most.
-      slots: runs that advance together. The results do not depend on it.
-
-    Returns:
-      Updates before the incumbent that solved the task (`generations`, if none did), whether one
-      did, and the last incumbent mean; `[run]` each.
-    """
-    count = len(keys)
-    updates, solved = np.full(count, generations), np.zeros(count, bool)
-    scores = np.full(count, np.nan)
-    index, sizes = SCORE_TRANSFORMS.index(transform), np.asarray(step_sizes, np.float32)
-    in_slot, waiting = np.arange(slots), slots  # the run in each slot, -1: none; the next run
-    state = search.init(keys[:slots], sizes[:slots], index)
-    while (in_slot >= 0).any():
-        state = search.advance(state)
-        made, is_solved, score = map(
-            np.asarray, (state.generation, state.finished, state.incumbent_score)
-        )
-        ended = (is_solved | (made >= generations)) & (in_slot >= 0)
-        if not ended.any():
-            continue
-        runs = in_slot[ended]
-        updates[runs] = np.where(is_solved[ended], made[ended] - 1, generations)
-        solved[runs], scores[runs] = is_solved[ended], score[ended]
-        in_slot[ended] = -1
-        fresh = np.flatnonzero(ended)[: count - waiting]
-        in_slot[fresh] = np.arange(waiting, waiting + len(fresh))
-        waiting += len(fresh)
-        state = search.merge(ended, search.init(keys[in_slot], sizes[in_slot], index), state)
-        state = state.replace(finished=in_slot < 0)  # an empty slot costs nothing
-    return updates, solved, scores
 
 
 # --- NES whose step size and score transform are part of its state ------------------------------
@@ -206,19 +161,16 @@ class AnyNES(Options):
         )
 
 
-@dataclass(frozen=True, kw_only=True)
-class Search:
-    """Compiled functions over NES runs that advance together, one in each slot.
+class Search(NamedTuple):
+    """Compiled functions over NES runs.
 
     Attributes:
-      init: `(keys [slot], step_sizes [slot], transform) -> state`; the number of a transform.
-      advance: `state -> state`, a generation.
-      merge: `(where [slot], a, b) -> state`, of both.
+      init: `(keys [run], step_sizes [run], transform) -> state`; the number of a transform.
+      advance: `state -> state`, a generation of every run that has not solved the task.
     """
 
     init: Callable[..., Any]
     advance: Callable[[Any], Any]
-    merge: Callable[..., Any]
 
 
 @functools.cache
@@ -239,11 +191,7 @@ def make_search(mirrored: bool, population: int, devices: int | None) -> Search:
         )
         return state.replace(es_state=es_state)
 
-    def merge(where: Any, a: Any, b: Any) -> Any:
-        return jax.tree.map(lambda x, y: jax.vmap(jnp.where)(where, x, y), a, b)
-
-    return Search(init=jax.jit(init), advance=jax.jit(lambda state: program.generation(state)[0]),
-                  merge=jax.jit(merge))  # fmt: skip
+    return Search(init=jax.jit(init), advance=jax.jit(lambda state: program.generation(state)[0]))
 
 
 # --- what is made of it --------------------------------------------------------------------------
