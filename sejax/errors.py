@@ -24,7 +24,7 @@ def unknown_name(field: str, got: object, known: Iterable[str]) -> ConfigError:
     )
 
 
-def nearest(got: str, known: Iterable[str]) -> list[str]:
+def nearest(got: object, known: Iterable[str]) -> list[str]:
     """The known names, the most similar first."""
     start = str(got)[:200]  # comparing takes time that grows with the square of the length
     return sorted(known, key=lambda name: -difflib.SequenceMatcher(None, start, name).ratio())

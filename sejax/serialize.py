@@ -110,7 +110,7 @@ def _convert(value: Any, hint: Any, name: str, field: Any) -> Any:
                 repr(value), f"{name}=[...]")  # fmt: skip
         kind = arguments[0] if arguments else Any
         return (origin or hint)(_convert(x, kind, name, field) for x in value)
-    if dataclasses.is_dataclass(hint) and not isinstance(value, hint):
+    if isinstance(hint, type) and dataclasses.is_dataclass(hint) and not isinstance(value, hint):
         known = ", ".join(x.name for x in dataclasses.fields(hint))
         require(isinstance(value, Mapping), name, f"have the fields {known}", "it is more than one "
                 "value", repr(value), f"{name}.{known.partition(',')[0]}=VALUE")  # fmt: skip

@@ -12,7 +12,8 @@ from sejax.agents.count_based import CountBasedConfig, with_count_bonus
 from sejax.agents.replay import Transition
 from sejax.agents.tabular import QLearningConfig, SARSAConfig, make_q_learning, make_sarsa
 from sejax.rollout import make_tester
-from sejax.trainer import TrainingConfig, make_trainer
+from sejax.trainer import make_trainer
+from sejax.training import TrainingConfig
 
 NUM_STATES, NUM_ACTIONS, BETA = 3, 2, 0.5
 KEY = jax.random.key(0)

@@ -12,7 +12,8 @@ from test_ddqn import BATCH, OBS_DIM, assert_updates_equal_torchs
 from sejax import envs
 from sejax.agents.ddqn import DuelingDDQNConfig, make_ddqn
 from sejax.networks import DuelingMLP
-from sejax.trainer import TrainingConfig, make_trainer
+from sejax.trainer import make_trainer
+from sejax.training import TrainingConfig
 
 NUM_ACTIONS = 2  # as in the batches of test_ddqn
 GOLDEN = Path(__file__).parent / "golden" / "dueling_updates.npz"

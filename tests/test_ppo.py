@@ -27,7 +27,8 @@ from sejax.agents.ppo import (
 from sejax.agents.replay import Transition
 from sejax.networks import MLP
 from sejax.rollout import make_tester
-from sejax.trainer import TrainingConfig, make_trainer
+from sejax.trainer import make_trainer
+from sejax.training import TrainingConfig
 
 OBS_DIM, NUM_ACTIONS, ACTION_DIM, MAX_ACTION, MAX_STEPS = 3, 4, 2, 2.0, 6
 STEPS = 13  # two episodes of full length, and one step

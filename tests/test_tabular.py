@@ -19,7 +19,8 @@ from sejax.agents.tabular import (
     mask_of,
 )
 from sejax.rollout import make_tester
-from sejax.trainer import TrainingConfig, make_trainer
+from sejax.trainer import make_trainer
+from sejax.training import TrainingConfig
 
 NUM_STATES, NUM_ACTIONS = 5, 3
 KEY = jax.random.key(0)

@@ -29,7 +29,8 @@ from sejax.agents.td3 import (
 )
 from sejax.networks import MLP
 from sejax.rollout import make_tester
-from sejax.trainer import TrainingConfig, make_trainer
+from sejax.trainer import make_trainer
+from sejax.training import TrainingConfig
 
 OBS_DIM, ACTION_DIM, BATCH, MAX_ACTION = 3, 2, 7, 2.0
 GOLDEN = Path(__file__).parent / "golden" / "td3_updates.npz"

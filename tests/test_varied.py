@@ -10,7 +10,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax.flatten_util import ravel_pytree
-from sejax.agents.blocks import block_size, sum_over_batch
 
 from sejax import envs
 from sejax.agents import make_agent
@@ -18,6 +17,7 @@ from sejax.agents.agent import Agent, Draw, NoExploration, drawing_key
 from sejax.agents.count_based import CountBasedConfig
 from sejax.agents.ddqn import DDQNConfig, DuelingDDQNConfig, make_ddqn
 from sejax.agents.memory import no_memory
+from sejax.agents.partial_batch import block_size, sum_over_batch
 from sejax.agents.replay import Transition
 from sejax.agents.tabular import QLearningConfig
 from sejax.agents.varied import Range, draw_value, hidden_sizes, ranges_of
@@ -25,7 +25,7 @@ from sejax.errors import ConfigError
 from sejax.evaluation import evaluate_agents, make_evaluator
 from sejax.networks import MLP, narrow
 from sejax.proxies.configs import SyntheticConfig
-from sejax.trainer import TrainingConfig
+from sejax.training import TrainingConfig
 
 OBS_DIM, NUM_ACTIONS = 3, 2
 SMALL, LARGE = 5, 8

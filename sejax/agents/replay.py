@@ -37,8 +37,8 @@ class Transition(NamedTuple):
 
         Under `jax.vmap` a function of one transition then takes a batch.
         """
-        turned = jax.tree.map(jnp.transpose, self._replace(weight=None))
-        return turned._replace(weight=jnp.broadcast_to(self.weight, self.reward.shape))
+        weight = jnp.broadcast_to(self.weight, self.reward.shape)
+        return jax.tree.map(jnp.transpose, self._replace(weight=weight))
 
 
 def num_columns(batch: Transition) -> Array | float:

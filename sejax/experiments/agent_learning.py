@@ -23,7 +23,7 @@ from sejax.experiments.return_curves import WINDOW
 from sejax.experiments.settings import Settings, each_of, setting
 from sejax.experiments.tables import bootstrap_interval, publish
 from sejax.options import counts
-from sejax.trainer import TrainingConfig
+from sejax.training import TrainingConfig
 
 QUICK_STEPS = 2000
 SHORTEST_EPISODE = 8  # CartPole cannot be lost sooner

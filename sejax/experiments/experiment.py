@@ -59,7 +59,7 @@ class Experiment:
         runtime.configure_xla(settings.devices)
         runtime.enable_compilation_cache()
         try:
-            guarded: Any = commands.task(lambda _: float(len(self.run(settings))))
+            guarded: Any = commands.guarded(lambda _: float(len(self.run(settings))))
             guarded(settings)
         except KeyboardInterrupt:
             print(f"Interrupted. What is finished is kept in {settings.work_folder}; the same "

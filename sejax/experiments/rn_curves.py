@@ -21,7 +21,7 @@ from sejax.experiments.tables import bootstrap_interval
 from sejax.experiments.worlds import Group, World
 from sejax.options import counts
 from sejax.plugins import name_of
-from sejax.trainer import TrainingConfig
+from sejax.training import TrainingConfig
 
 ROWS = {
     "default": "default hyperparameters",

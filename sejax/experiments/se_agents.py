@@ -10,7 +10,7 @@ from sejax import plugins
 from sejax.experiments.settings import Settings, each_of, setting
 from sejax.experiments.worlds import Group, World, groups_at_once, train_groups, training_as_learned
 from sejax.options import counts
-from sejax.trainer import TrainingConfig
+from sejax.training import TrainingConfig
 
 AGENTS = ("ddqn", "dueling_ddqn", "td3_discrete")
 

@@ -40,7 +40,7 @@ from sejax.experiments.settings import Settings, each_of, setting
 from sejax.experiments.tables import publish
 from sejax.experiments.worlds import Group, Measure, World, train_groups, training_as_learned
 from sejax.options import counts
-from sejax.trainer import TrainingConfig
+from sejax.training import TrainingConfig
 
 SOURCES = ("train", "test", "response")
 LABELS = {"train": "SE, in training", "test": "real task, in tests",

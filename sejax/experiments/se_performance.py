@@ -26,7 +26,7 @@ from sejax.experiments.settings import setting
 from sejax.experiments.tables import bootstrap_interval, publish
 from sejax.experiments.worlds import Group, World, return_columns
 from sejax.options import counts, one_of
-from sejax.trainer import SOLVED_BY
+from sejax.training import SOLVED_BY
 
 NUM_BEST = 5
 BEST_FOR = "td3_discrete"

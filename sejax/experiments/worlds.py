@@ -19,7 +19,7 @@ from sejax import plugins, serialize
 from sejax.agents import NoExploration
 from sejax.experiments.settings import Settings
 from sejax.parallel import spread_over_devices
-from sejax.trainer import TrainingConfig, budget_for
+from sejax.training import TrainingConfig, budget_for
 
 HPARAMS = ("varied", "default")
 GROUPS_AT_ONCE = 5  # groups of agents in one program, but for one CPU device

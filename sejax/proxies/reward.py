@@ -172,7 +172,7 @@ class RewardEnv(ProxyEnv):
         if self.config.is_additive:
             reward = real_reward + reward
         sane = jnp.abs(reward) < ABSURD  # False for nan
-        discount = info.get("discount", jnp.float32(~terminated))
+        discount = info.get("discount", jnp.where(terminated, 0.0, 1.0))
         info = {
             **info,
             "discount": jnp.where(sane, discount, 0.0),
