@@ -410,6 +410,7 @@ def test_performance_trains_as_evaluation_does_and_goes_on(ses, tmp_path, monkey
         assert real[name].nunique() > 1
 
     monkeypatch.setattr(worlds, "train", refuse)
+    monkeypatch.setattr(se_performance, "draw", lambda *_: None)
     pd.testing.assert_frame_equal(performance(ses, tmp_path), table)
     pd.testing.assert_frame_equal(performance(ses, tmp_path, from_rows=True), table)
     with pytest.raises(ConfigError, match=r"with another training\.test_episodes"):
