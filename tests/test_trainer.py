@@ -1,5 +1,7 @@
 """sejax.trainer: the inner loop against a plain Python one, alone and in lanes."""
 
+import re
+
 import gymnasium
 import jax
 import jax.numpy as jnp
@@ -339,18 +341,35 @@ def assert_same(many, index, alone):
         np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-4)
 
 
-@pytest.mark.parametrize("variant", ["plateau", "tested"])
-def test_scripted_lanes_equal_single_trainings(trainers, variant):
-    keys = jax.random.split(KEY, 5)
+def scripted_lanes():
+    """Keys, params, weights and whether they run, of six trainings: `[lane, ...]`."""
     rng = np.random.default_rng(0)
-    each = [script(rng.integers(-2, 3, 12), rng.integers(1, 7, 12)) for _ in range(4)]
+    each = [script(rng.integers(-2, 3, 12), rng.integers(1, 7, 12)) for _ in range(5)]
     each.append(script([1] * 12, [3] * 12, nonfinite_episode=1))
     params = jax.tree.map(lambda *x: jnp.stack([jnp.asarray(v) for v in x]), *each)
-    active = jnp.array([True, True, False, True, True])
-    many = jax.jit(jax.vmap(trainers[variant]))(keys, params, jnp.arange(5.0), active)
+    active = jnp.array([True, True, False, True, True, True])
+    return jax.random.split(KEY, 6), params, jnp.arange(6.0), active
+
+
+def assert_lanes_are_single_trainings(train, lanes, many):
     assert len(set(np.asarray(many.train_steps).tolist())) > 2  # stopped at different times
-    for i in range(5):
-        assert_same(many, i, trainers[variant](keys[i], each[i], float(i), active[i]))
+    for i in range(6):
+        alone = jax.tree.map(lambda x, i=i: x[i], lanes)
+        assert_same(many, i, train(*alone))
+
+
+def test_scripted_lanes_equal_single_trainings(trainers):
+    lanes = scripted_lanes()
+    many = jax.jit(jax.vmap(trainers["plateau"]))(*lanes)
+    assert_lanes_are_single_trainings(trainers["plateau"], lanes, many)
+
+
+def test_nested_lanes_equal_single_trainings(trainers):
+    lanes = scripted_lanes()
+    nested = jax.tree.map(lambda x: x.reshape(2, 3, *x.shape[1:]), lanes)
+    many = jax.jit(jax.vmap(jax.vmap(trainers["tested"])))(*nested)
+    many = jax.tree.map(lambda x: x.reshape(6, *x.shape[2:]), many)
+    assert_lanes_are_single_trainings(trainers["tested"], lanes, many)
 
 
 @pytest.fixture(scope="module")
@@ -382,31 +401,22 @@ def test_lanes_equal_single_trainings(ddqn_in_se):
 
 @pytest.mark.parametrize("world", ["real", "synthetic"])
 def test_a_time_limit_is_terminal_on_the_real_task_if_asked_and_never_in_an_se(world):
+    """As programs; what they then do is above."""
     task = envs.make("cartpole")
     synthetic = plugins.make("proxy", SyntheticConfig(hidden_size=4), task)
     env, params = {
-        "real": (task.env, task.params.replace(max_steps_in_episode=4)),
-        "synthetic": (synthetic, synthetic.default_params.replace(max_steps_in_episode=4)),
+        "real": (task.env, task.params),
+        "synthetic": (synthetic, synthetic.default_params),
     }[world]
-    config = DDQNConfig(hidden_size=4, num_layers=1, batch_size=4, init_episodes=1)
-    trained = [
-        jax.jit(
-            make_trainer(
-                make_ddqn(config, 4, 2), env,
-                training(max_episodes=6, stop_rule="never", time_limit_is_terminal=asked),
-            )
-        )(KEY, params).agent_state.params
+    agent = make_ddqn(DDQNConfig(hidden_size=4, num_layers=1, batch_size=4, init_episodes=1), 4, 2)
+    programs = [
+        str(jax.make_jaxpr(make_trainer(
+            agent, env, training(max_episodes=6, stop_rule="never", time_limit_is_terminal=asked)
+        ))(KEY, params))
         for asked in (False, True)
     ]  # fmt: skip
-    assert np.array_equal(*trained) == (world == "synthetic")
-
-
-def test_nested_lanes_equal_single_trainings(ddqn_in_se):
-    train, keys, params, alone = ddqn_in_se
-    square = jax.tree.map(lambda x: x.reshape(2, 2, *x.shape[1:]), params)
-    many = jax.jit(jax.vmap(jax.vmap(train)))(keys.reshape(2, 2), square)
-    for i in range(4):
-        assert_same(many, divmod(i, 2), alone[i])
+    without, asked = (re.sub("0x[0-9a-f]+", "", program) for program in programs)
+    assert (without == asked) == (world == "synthetic")
 
 
 # --- the test on the real task -------------------------------------------------------------------
@@ -502,8 +512,8 @@ def test_recorded_tests_are_the_tests():
     task = envs.Task(name="script", env=ENV, params=script([2.5] * 12, [3] * 12))
     agent = scripted_agent()
     state = agent.begin_episode(agent.init(KEY, 0.0), 0)
-    returns, num_steps = jax.jit(make_tester(agent, task, 3))(KEY, state)
-    steps = jax.jit(make_recorder(agent, task, 3))(KEY, state)
+    both = make_tester(agent, task, 3), make_recorder(agent, task, 3)
+    (returns, num_steps), steps = jax.jit(lambda *args: [f(*args) for f in both])(KEY, state)
     valid = np.array(steps.valid).reshape(3, MAX_STEPS)
     np.testing.assert_array_equal(valid, [[True] * 3 + [False]] * 3)
     np.testing.assert_array_equal(valid.sum(axis=1), num_steps)
