@@ -86,6 +86,12 @@ class SACState(struct.PyTreeNode):
     hparams: Any
 
 
+def hidden_layers(x: Array, size: int) -> Array:
+    for _ in range(2):
+        x = nn.relu(nn.Dense(size)(x))
+    return x
+
+
 class Actor(nn.Module):
     """Mean and std of a Gaussian, `[action_dim]` each."""
 
@@ -94,7 +100,7 @@ class Actor(nn.Module):
 
     @nn.compact
     def __call__(self, obs: Array) -> tuple[Array, Array]:
-        x = nn.relu(nn.Dense(self.hidden_size)(nn.relu(nn.Dense(self.hidden_size)(obs))))
+        x = hidden_layers(obs, self.hidden_size)
         mean, log_std = jnp.split(nn.Dense(2 * self.action_dim)(x), 2)
         return mean, jnp.exp(jnp.clip(log_std, MIN_LOG_STD, MAX_LOG_STD))
 
@@ -106,8 +112,8 @@ class Critic(nn.Module):
 
     @nn.compact
     def __call__(self, obs: Array, action: Array) -> Array:
-        x = nn.relu(nn.Dense(self.hidden_size)(jnp.concatenate([obs, action])))
-        return nn.Dense(1)(nn.relu(nn.Dense(self.hidden_size)(x)))[0]
+        x = hidden_layers(jnp.concatenate([obs, action]), self.hidden_size)
+        return nn.Dense(1)(x)[0]
 
 
 class Networks(NamedTuple):

@@ -68,6 +68,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="Learns a synthetic reacher.")
     parser.add_argument("--generations", type=int, default=40)
     parser.add_argument("--population", type=int, default=16)
+    parser.add_argument("--steps", type=int, default=600, help="of each training")
     args = parser.parse_args()
     sejax.configure_xla()  # a device for each core
     task = make_reacher(size=3)
@@ -77,7 +78,7 @@ def main() -> None:
     learn = sejax.make_learner(
         task=task, agent=agent, proxy=sejax.SyntheticConfig(hidden_size=32, done="threshold"),
         es=sejax.NESConfig(population_size=args.population, noise_std=0.1),
-        training=sejax.TrainingConfig(max_steps=600, stop_rule="never"),
+        training=sejax.TrainingConfig(max_steps=args.steps, stop_rule="never"),
         generations=args.generations,
     )  # fmt: skip
     result = jax.jit(learn)(jax.random.key(0))

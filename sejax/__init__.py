@@ -33,6 +33,7 @@ _EXPORTS = {
     "PPOConfig": "sejax.agents.ppo",
     "Proxy": "sejax.proxies.files",
     "ProxyEnv": "sejax.proxies.proxy",
+    "ProxyParams": "sejax.proxies.proxy",
     "ProxySet": "sejax.proxies.files",
     "QLearningConfig": "sejax.agents.tabular",
     "RewardConfig": "sejax.proxies.configs",
@@ -94,19 +95,19 @@ if TYPE_CHECKING:  # what a type checker and an editor see
         save,
         save_set,
     )
-    from sejax.proxies.proxy import ProxyEnv
+    from sejax.proxies.proxy import ProxyEnv, ProxyParams
     from sejax.trainer import TrainResult, make_trainer
     from sejax.training import TrainingConfig
 
 __all__ = [
     "AUC", "AUCSum", "Agent", "ConfigError", "CountBasedConfig", "DDQNConfig", "DiscreteTD3Config",
     "DuelingDDQNConfig", "EvosaxConfig", "ICMConfig", "LearnResult", "MaxReward", "NESConfig",
-    "Objective", "Outcome", "PPOConfig", "Proxy", "ProxyEnv", "ProxySet", "QLearningConfig",
-    "RewardConfig", "RewardThreshold", "SARSAConfig", "Strategy", "SyntheticConfig", "TD3Config",
-    "Task", "TrainResult", "TrainingConfig", "Trials", "agents", "config", "configure_xla", "envs",
-    "es", "evaluate_agents", "load", "load_proxy", "load_set", "make_agent", "make_evaluator",
-    "make_learner", "make_trainer", "options", "proxies", "register_gymnax", "save", "save_set",
-    "spread_over_devices",
+    "Objective", "Outcome", "PPOConfig", "Proxy", "ProxyEnv", "ProxyParams", "ProxySet",
+    "QLearningConfig", "RewardConfig", "RewardThreshold", "SARSAConfig", "Strategy",
+    "SyntheticConfig", "TD3Config", "Task", "TrainResult", "TrainingConfig", "Trials", "agents",
+    "config", "configure_xla", "envs", "es", "evaluate_agents", "load", "load_proxy", "load_set",
+    "make_agent", "make_evaluator", "make_learner", "make_trainer", "options", "proxies",
+    "register_gymnax", "save", "save_set", "spread_over_devices",
 ]  # fmt: skip
 
 
