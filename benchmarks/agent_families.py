@@ -23,14 +23,15 @@ import importlib
 import os
 from dataclasses import dataclass, replace
 from statistics import median
-from typing import Any, cast
+from typing import Any
 
 import common
 from rich.progress import track
 
-from sejax.agents.configs import AGENT_CONFIGS, AgentConfig, PPOConfig
-from sejax.configs import EnvConfig, LearnConfig, SyntheticConfig, TrainingConfig, config
-from sejax.envs.kinds import kind
+import sejax
+from sejax import plugins
+from sejax.proxies.configs import SyntheticConfig
+from sejax.training import TrainingConfig
 
 WARM_UP_STEPS = 300
 
@@ -51,21 +52,23 @@ class Family:
     reference: str | None = None
     settings: str = "paper"
 
-    def learn_config(self, steps: int) -> LearnConfig:
-        """Training for so many steps, or PPO's next multiple, in all of which the agent learns."""
-        chosen = self._learn_config()
-        agent = replace(chosen.agent, init_episodes=0)
-        steps = whole_phases(steps, agent)
-        training = TrainingConfig(stop_rule="never", max_steps=steps, max_episodes=steps)
-        return replace(chosen, agent=agent, training=training)
+    def parts(self, steps: int) -> tuple[Any, SyntheticConfig, TrainingConfig]:
+        """Configurations of agent and SE, and a training of `steps` in which the agent learns.
 
-    def _learn_config(self) -> LearnConfig:
-        if self.settings == "best":
-            return config([f"env={self.env}", f"agent={self.agent}", "preset=best"])
-        if self.agent == "ddqn":
-            return config([f"env={self.env}", "preset=paper"])
-        agent = AGENT_CONFIGS[self.agent](name=self.agent)
-        return LearnConfig(env=EnvConfig(name=self.env), agent=agent)
+        PPO trains for whole learning phases, at least two of them.
+        """
+        if self.settings == "best" or self.agent == "ddqn":
+            names = f"env={self.env}", f"agent={self.agent}", f"preset={self.settings}"
+            chosen = sejax.config(names)
+            agent, proxy = chosen.agent, chosen.proxy
+        else:
+            agent, proxy = plugins.configure("agent", {"name": self.agent}), SyntheticConfig()
+        agent = replace(agent, init_episodes=0)
+        facts = plugins.find("env", self.env).facts
+        phase = agent.steps_before_learning(facts.max_steps)  # 0 but for PPO
+        steps = max(2, -(-steps // phase)) * phase if phase else steps
+        training = TrainingConfig(stop_rule="never", max_steps=steps, max_episodes=steps)
+        return agent, proxy, training
 
 
 WITH_REFERENCE = [
@@ -87,14 +90,6 @@ FAMILIES = {
         *OTHERS,
     ]
 }
-
-
-def whole_phases(steps: int, agent: AgentConfig) -> int:
-    """The number of steps, for PPO rounded up to whole learning phases, of which at least two."""
-    if not isinstance(agent, PPOConfig):
-        return steps
-    length = agent.rollout_length(kind("cartpole").max_steps)
-    return max(2, -(-steps // length)) * length
 
 
 def main() -> None:
@@ -207,18 +202,14 @@ def sejax_side(args: argparse.Namespace) -> None:
 
     A request without a seed compiles that, and answers with the SE's weights.
     """
-    from sejax.runtime import configure_xla, enable_compilation_cache
+    from sejax.app.runtime import configure_xla, enable_compilation_cache
 
     configure_xla(1)
     enable_compilation_cache()
     import jax
     import numpy as np
 
-    import sejax
-    from sejax import envs
     from sejax.parallel import spread_over_devices
-    from sejax.proxies.synthetic import make_synthetic
-    from sejax.trainer import make_trainer
 
     programs = {}
 
@@ -226,10 +217,10 @@ def sejax_side(args: argparse.Namespace) -> None:
         return jax.random.split(jax.random.key(seed), args.agents)
 
     def prepare(family: str) -> dict[str, Any]:
-        config = FAMILIES[family].learn_config(args.steps)
-        task = envs.make(config.env.name)
-        env, agent = make_synthetic(task, config.proxy), sejax.make_agent(config.agent, task)
-        train = make_trainer(agent, env, config.training, task.solved_reward)
+        agent_config, proxy_config, training = FAMILIES[family].parts(args.steps)
+        task = sejax.envs.make(FAMILIES[family].env)
+        env, agent = proxy_config.make(task), sejax.make_agent(agent_config, task)
+        train = sejax.make_trainer(agent, env, training)
         weights = env.init_weights(jax.random.key(args.seed))
 
         def train_all(keys: jax.Array, params: Any) -> Any:
@@ -263,11 +254,11 @@ def torch_side(args: argparse.Namespace) -> None:
     prepared = {}
 
     def prepare(family: str, weights: Any) -> dict[str, Any]:
-        config = FAMILIES[family].learn_config(args.steps)
-        env = SyntheticEnv(weights, cast(SyntheticConfig, config.proxy))
+        agent, proxy, training = FAMILIES[family].parts(args.steps)
+        env = SyntheticEnv(weights, proxy)
         reference = importlib.import_module(FAMILIES[family].reference or "")
-        prepared[family] = functools.partial(reference.train, env, config)
-        reference.train(env, FAMILIES[family].learn_config(WARM_UP_STEPS), 0)
+        prepared[family] = functools.partial(reference.train, env, agent, training)
+        reference.train(env, agent, FAMILIES[family].parts(WARM_UP_STEPS)[2], 0)
         return {}
 
     def handle(request: dict[str, Any]) -> dict[str, Any]:

@@ -136,7 +136,7 @@ def show(result: dict[str, Any]) -> None:
 
 def sejax_side(args: argparse.Namespace) -> None:
     """One generation as a compiled program, always from the same fresh state."""
-    from sejax.runtime import configure_xla
+    from sejax.app.runtime import configure_xla
 
     num_devices = args.cores if args.side == ALL else 1
     configure_xla(num_devices)
@@ -146,7 +146,7 @@ def sejax_side(args: argparse.Namespace) -> None:
     import sejax
     from sejax.bilevel import make_program
 
-    program = make_program(sejax.config(overrides(args)))
+    program = make_program(**sejax.config(overrides(args)).parts())
     init = jax.jit(program.init)
     keys = jax.random.key(args.seed)[None]
     state = init(keys)
@@ -172,16 +172,16 @@ def torch_side(args: argparse.Namespace) -> None:
 
     import sejax
 
-    config = sejax.config(overrides(args))
-    pool_context = torch_nes.worker_pool(args.cores)
+    settings = torch_nes.Settings.of(sejax.config(overrides(args)))
+    pool_context = torch_nes.worker_pool(args.cores, settings)
     pool, start = common.measure(pool_context.__enter__)
 
     def handle(request: dict[str, Any]) -> dict[str, Any]:
         run = torch_nes.generation
         (_, outcomes), times = common.measure(
-            lambda: run(request["weights"], config, pool, args.seed)
+            lambda: run(request["weights"], settings, pool, args.seed)
         )
-        incumbents = [outcome.score for outcome in outcomes[2 * config.es.population_size :]]
+        incumbents = [outcome.score for outcome in outcomes[2 * settings.es.population_size :]]
         finite = [score for score in incumbents if math.isfinite(score)]
         return {
             "steps": sum(outcome.train_steps for outcome in outcomes),

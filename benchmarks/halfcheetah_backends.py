@@ -14,7 +14,7 @@ from typing import Any
 import common
 import numpy as np
 
-from sejax.envs.kinds import PHYSICS_BACKENDS
+from sejax.envs.halfcheetah import BACKENDS
 
 GAIT_STEPS = 200
 DT = 0.05  # seconds of a control step: five physics steps of 0.01
@@ -52,7 +52,7 @@ def main() -> None:
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--backends", nargs="+", default=list(PHYSICS_BACKENDS))
+    parser.add_argument("--backends", nargs="+", default=list(BACKENDS))
     parser.add_argument("--gaits", type=int, default=24)
 
 
@@ -104,7 +104,7 @@ def mujoco_returns(actions: np.ndarray) -> tuple[float, np.ndarray]:
 
 def serve_backend(args: argparse.Namespace) -> None:
     """The side of one backend, on one core."""
-    from sejax.runtime import configure_xla
+    from sejax.app.runtime import configure_xla
 
     configure_xla(1)
     import jax
@@ -112,7 +112,7 @@ def serve_backend(args: argparse.Namespace) -> None:
 
     from sejax import envs
 
-    task = envs.make("halfcheetah", args.side)
+    task = envs.make("halfcheetah", backend=args.side)
     actions = jnp.asarray(gaits(args.gaits, args.seed))
     lanes = jnp.resize(actions, (LANES, *actions.shape[1:]))
     state = at_rest_state(task.env)
@@ -142,7 +142,7 @@ def at_rest_state(env: Any) -> Any:
     """The cheetah in its model's own pose, without the noise of a reset."""
     import jax.numpy as jnp
 
-    from sejax.envs.halfcheetah import CheetahState
+    from sejax.envs.dynamics.halfcheetah import CheetahState
 
     system = env._brax.sys
     physics = env._brax.pipeline_init(system.init_q, jnp.zeros(system.qd_size()))

@@ -104,24 +104,19 @@ def show(result: dict[str, Any]) -> None:
 
 def sejax_side(args: argparse.Namespace) -> None:
     """Measures the trainer alone, compiled for one device."""
-    from sejax.runtime import configure_xla
+    from sejax.app.runtime import configure_xla
 
     configure_xla(1)
     import jax
     import numpy as np
 
     import sejax
-    from sejax import envs
-    from sejax.proxies.synthetic import make_synthetic
-    from sejax.trainer import make_trainer
 
-    task = envs.make("cartpole")
     trainings = {}
     for learning in KINDS:
-        config = sejax.config(overrides(args.episodes, learning))
-        env = make_synthetic(task, config.proxy)
-        agent = sejax.make_agent(config.agent, task)
-        trainings[learning] = jax.jit(make_trainer(agent, env, config.training, task.max_steps))
+        parts = sejax.config(overrides(args.episodes, learning)).parts()
+        env = parts["proxy"]
+        trainings[learning] = jax.jit(sejax.make_trainer(parts["agent"], env, parts["training"]))
     weights = env.init_weights(jax.random.key(args.seed))
 
     def handle(request: dict[str, Any]) -> dict[str, Any]:
@@ -146,7 +141,9 @@ def torch_side(args: argparse.Namespace) -> None:
     def handle(request: dict[str, Any]) -> dict[str, Any]:
         config = sejax.config(overrides(args.episodes, request["learning"]))
         env = reference.SyntheticEnv(request["weights"], config.proxy)
-        result, times = common.measure(lambda: reference.train(env, config, request["seed"]))
+        result, times = common.measure(
+            lambda: reference.train(env, config.agent, config.training, request["seed"])
+        )
         return {"steps": result.train_steps, **times}
 
     common.serve({}, handle)

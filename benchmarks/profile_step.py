@@ -135,24 +135,20 @@ def show(result: dict[str, Any]) -> None:
 def step_side(args: argparse.Namespace) -> None:
     """Measures trainings with and without learning, and the matrix product, on one core."""
     os.sched_setaffinity(0, {args.core})
-    from sejax.runtime import configure_xla
+    from sejax.app.runtime import configure_xla
 
     configure_xla(1)
     import jax
     import jax.numpy as jnp
 
     import sejax
-    from sejax import envs
-    from sejax.proxies.synthetic import make_synthetic
-    from sejax.trainer import make_trainer
 
-    task = envs.make("cartpole")
     trainings = []
     for learning in KINDS:
         config = sejax.config(overrides(args.episodes, learning))
-        env = make_synthetic(task, config.proxy)
-        agent = sejax.make_agent(config.agent, task)
-        trainings.append(jax.jit(make_trainer(agent, env, config.training, task.max_steps)))
+        parts = config.parts()
+        task, env = parts["task"], parts["proxy"]
+        trainings.append(jax.jit(sejax.make_trainer(parts["agent"], env, parts["training"])))
     params = env.params(env.init_weights(jax.random.key(args.seed)))
     multiply = jax.jit(jnp.matmul)
     matrix = jax.random.normal(jax.random.key(args.seed), (GEMM_SIZE, GEMM_SIZE))
@@ -175,7 +171,7 @@ def step_side(args: argparse.Namespace) -> None:
 
 def generation_side(args: argparse.Namespace) -> None:
     """Compiles a default generation, says how long it took, and runs it on request."""
-    from sejax.runtime import configure_xla
+    from sejax.app.runtime import configure_xla
 
     configure_xla()
 
@@ -183,7 +179,8 @@ def generation_side(args: argparse.Namespace) -> None:
         import sejax
         from sejax.bilevel import make_program
 
-        return make_program(sejax.config([f"seed={args.seed}", *(QUICK if args.quick else [])]))
+        config = sejax.config([f"seed={args.seed}", *(QUICK if args.quick else [])])
+        return make_program(**config.parts())
 
     program, importing = common.measure(load)
     import jax
@@ -199,7 +196,7 @@ def generation_side(args: argparse.Namespace) -> None:
         (state, info), times = common.measure(lambda: jax.block_until_ready(generation(state)))
         return {
             "wall_s": times["wall_s"],
-            "trainings": program.num_candidates,
+            "trainings": program.strategy.num_candidates,
             "agent_steps": int(info.train_steps_total.item()),
             "peak_memory_mib": common.peak_memory_mib(),
         }

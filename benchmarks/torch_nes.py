@@ -11,13 +11,38 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from multiprocessing import get_context
 from multiprocessing.pool import Pool
-from typing import cast
+from typing import Any
 
 import numpy as np
 import torch
 from torch_reference import SyntheticEnv, Weights, play_test_episodes, train
 
-from sejax.configs import LearnConfig, NESConfig, SyntheticConfig
+from sejax.agents.ddqn import DDQNConfig
+from sejax.es.nes import NESConfig
+from sejax.proxies.configs import SyntheticConfig
+from sejax.training import TrainingConfig
+
+
+@dataclass(frozen=True, kw_only=True)
+class Settings:
+    """Of a generation of SEs for CartPole. Scores are mean test returns."""
+
+    agent: DDQNConfig
+    training: TrainingConfig
+    proxy: SyntheticConfig
+    es: NESConfig
+
+    @classmethod
+    def of(cls, config: Any) -> "Settings":
+        """The same as in a `sejax.config`.
+
+        Raises:
+          ValueError: if it asks for what is not built here.
+        """
+        got = {group: config.name(group) for group in ("env", "proxy", "es", "objective")}
+        if got != {"env": "cartpole", "proxy": "se", "es": "nes", "objective": "max_reward"}:
+            raise ValueError(f"the reference is of cartpole, se, nes and max_reward; got {got}.")
+        return cls(agent=config.agent, training=config.training, proxy=config.proxy, es=config.es)
 
 
 @dataclass(kw_only=True)
@@ -29,14 +54,15 @@ class Outcome:
     cpu_s: float
 
 
-def evaluate(weights: Weights, config: LearnConfig, seed: int) -> Outcome:
+def evaluate(weights: Weights, settings: Settings, seed: int) -> Outcome:
     """Trains a fresh agent on the SE with these weights and tests it on the real task.
 
     Source: paper, Algorithm 1, TrainAgent and EvaluateAgent.
     """
     start = time.process_time()
-    result = train(SyntheticEnv(weights, cast(SyntheticConfig, config.proxy)), config, seed)
-    returns = play_test_episodes(result.agent, config, seed + 1)
+    agent, training = settings.agent, settings.training
+    result = train(SyntheticEnv(weights, settings.proxy), agent, training, seed)
+    returns = play_test_episodes(result.agent, agent, training.test_episodes, seed + 1)
     return Outcome(
         score=math.nan if result.nonfinite else float(returns.mean()),
         train_steps=result.train_steps,
@@ -45,31 +71,36 @@ def evaluate(weights: Weights, config: LearnConfig, seed: int) -> Outcome:
 
 
 @contextmanager
-def worker_pool(num_processes: int) -> Iterator[Pool]:
+def worker_pool(num_processes: int, settings: Settings) -> Iterator[Pool]:
     """A pool of processes with one torch thread each, started and with everything imported."""
     with get_context("spawn").Pool(
         num_processes, initializer=torch.set_num_threads, initargs=(1,)
     ) as pool:
-        pool.map(time.sleep, [0.1] * num_processes, chunksize=1)
+        pool.map(_warm_up, [settings] * num_processes, chunksize=1)
         yield pool
 
 
+def _warm_up(settings: Settings) -> None:
+    """What a process does first: it imports what reading the settings takes."""
+    time.sleep(0.1)  # so that no process takes another's turn
+
+
 def generation(
-    weights: Weights, config: LearnConfig, pool: Pool, seed: int
+    weights: Weights, settings: Settings, pool: Pool, seed: int
 ) -> tuple[Weights, list[Outcome]]:
     """One pass of Algorithm 1's outer loop; returns the next SE and the candidates' outcomes.
 
     Each member tries psi + eps and psi - eps; the last candidates are psi itself. A free process
     takes the next candidate, so that long and short trainings balance out.
     """
-    es = config.es
+    es = settings.es
     psi, unravel = ravel(weights)
     rng = np.random.default_rng(seed)
     noise = es.noise_std * rng.standard_normal((es.population_size, psi.size), dtype=np.float32)
     num_incumbents = es.num_incumbent_evals or es.population_size
     candidates = [*(psi + noise), *(psi - noise), *[psi] * num_incumbents]
     seeds = rng.integers(2**31, size=len(candidates)).tolist()
-    jobs = [(unravel(flat), config, s) for flat, s in zip(candidates, seeds, strict=True)]
+    jobs = [(unravel(flat), settings, s) for flat, s in zip(candidates, seeds, strict=True)]
     outcomes = pool.starmap(evaluate, jobs, chunksize=1)
     scores = np.array([outcome.score for outcome in outcomes])
     return unravel(nes_update(psi, noise, scores, es)), outcomes

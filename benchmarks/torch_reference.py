@@ -2,8 +2,8 @@
 
 What a good PyTorch programmer would write for the paper's design, one small network call after the
 other: DDQN on an SE of three networks, then greedy test episodes on the real CartPole. It means
-the same as `sejax.trainer`, and takes its hyperparameters from the same
-`sejax.config([...])`. It imports neither jax nor gymnax. `torch_nes.py` has the generation,
+the same as `sejax.trainer`, and takes its hyperparameters from the same configurations, which are
+all that it takes from sejax. `torch_nes.py` has the generation,
 `torch_reference_td3.py` and `torch_reference_ppo.py` have other agents.
 
 What was tried for speed, in microseconds on one thread of an AVX-512 machine at the paper's
@@ -30,14 +30,16 @@ import math
 import random
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol, cast
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from sejax.configs import DDQNConfig, LearnConfig, SyntheticConfig, TrainingConfig
+from sejax.agents.ddqn import DDQNConfig
+from sejax.proxies.configs import SyntheticConfig
+from sejax.training import TrainingConfig
 
 OBS_DIM, NUM_ACTIONS, MAX_STEPS = 4, 2, 200  # CartPole-v0; Pendulum has the same limit
 HEADS = {"state": OBS_DIM, "reward": 1, "done": 1}
@@ -337,28 +339,32 @@ class TrainResult:
     nonfinite: bool
 
 
-def train(env: SyntheticEnv, config: LearnConfig, seed: int) -> TrainResult:
+def train(env: SyntheticEnv, hp: DDQNConfig, training: TrainingConfig, seed: int) -> TrainResult:
     """Trains one agent on the SE until the plateau rule fires or its steps or episodes are used up.
+
+    Raises:
+      ValueError: if the configurations ask for what is not built here.
 
     Source: paper, Algorithm 1, TrainAgent.
     """
-    _check(config)
+    if type(hp) is not DDQNConfig or training.stop_rule not in ("plateau", "never"):
+        raise ValueError("the reference is of agent=ddqn, training.stop_rule=plateau or never.")
     torch.manual_seed(seed)
     random.seed(seed)
     rng = np.random.default_rng(seed)
-    hp = cast(DDQNConfig, config.agent)
     agent = init_ddqn(hp)
-    max_steps = config.training.max_steps or config.training.max_episodes * MAX_STEPS
+    max_steps = training.max_steps or training.max_episodes * MAX_STEPS
     buffer = ReplayBuffer(min(hp.buffer_size, max_steps), hp.batch_size)
     returns: list[float] = []
     train_steps = 0
     while True:
         obs = torch.from_numpy(CartPole.reset(rng, 1)[0])
         limit = min(MAX_STEPS, max_steps - train_steps)
-        episode = play_episode(env, agent, buffer, obs, len(returns), limit, config)
+        episode = play_episode(env, agent, buffer, obs, len(returns), limit, hp)
         train_steps += episode.steps
         returns.append(episode.total)
-        if episode.nonfinite or train_steps >= max_steps or should_stop(returns, config):
+        is_over = should_stop(returns, training, hp.init_episodes)
+        if episode.nonfinite or train_steps >= max_steps or is_over:
             break
     nonfinite = episode.nonfinite or not agent.online.all_finite()
     return TrainResult(agent=agent, train_steps=train_steps, returns=returns, nonfinite=nonfinite)
@@ -415,10 +421,9 @@ def play_episode(
     obs: Tensor,
     episode: int,
     max_steps: int,
-    config: LearnConfig,
+    hp: DDQNConfig,
 ) -> Episode:
     """One training episode: each step acts, steps the SE, stores, and learns once."""
-    hp = cast(DDQNConfig, config.agent)
     epsilon = epsilon_at(episode, hp)
     total = 0.0
     num_steps = 0
@@ -446,12 +451,12 @@ def epsilon_at(episode: int, hp: DDQNConfig) -> float:
     return max(hp.epsilon_init * hp.epsilon_decay**episode, hp.epsilon_min)
 
 
-def should_stop(returns: list[float], config: LearnConfig) -> bool:
+def should_stop(returns: list[float], training: TrainingConfig, init_episodes: int) -> bool:
     """Whether training ends after the last of these episodes."""
-    training, episode = config.training, len(returns) - 1
+    episode = len(returns) - 1
     if len(returns) >= training.max_episodes:
         return True
-    may_stop = episode >= config.agent.init_episodes + training.window
+    may_stop = episode >= init_episodes + training.window
     return training.stop_rule == "plateau" and may_stop and is_plateau(returns, training)
 
 
@@ -467,31 +472,18 @@ def is_plateau(returns: list[float], training: TrainingConfig) -> bool:
 
 
 @torch.no_grad()
-def play_test_episodes(agent: DDQNState, config: LearnConfig, seed: int) -> np.ndarray:
-    """Returns `[test_episodes]` of greedy episodes on the real task, all played side by side."""
-    state = CartPole.reset(np.random.default_rng(seed), config.training.test_episodes)
+def play_test_episodes(
+    agent: DDQNState, hp: DDQNConfig, num_episodes: int, seed: int
+) -> np.ndarray:
+    """Returns `[num_episodes]` of greedy episodes on the real task, all played side by side."""
+    state = CartPole.reset(np.random.default_rng(seed), num_episodes)
     active = np.ones(len(state), dtype=bool)
     returns = np.zeros(len(state))
-    activation = cast(DDQNConfig, config.agent).activation
     for _ in range(MAX_STEPS):
-        q_values = mlp(agent.online.values, torch.from_numpy(state), activation)
+        q_values = mlp(agent.online.values, torch.from_numpy(state), hp.activation)
         state, fallen = CartPole.step(state, q_values.argmax(1).numpy())
         returns += active  # 1 for each step, the one that falls included
         active &= ~fallen
         if not active.any():
             break
     return returns
-
-
-def _check(config: LearnConfig) -> None:
-    """Refuses what is not built here, rather than measuring something else."""
-    supported = {
-        "env": (config.env.name, ("cartpole",)),
-        "agent": (config.agent.name, ("ddqn",)),
-        "proxy": (config.proxy.name, ("se",)),
-        "training.stop_rule": (config.training.stop_rule, ("plateau", "never")),
-        "objective": (config.objective.name, ("max_reward",)),
-    }
-    for field, (got, known) in supported.items():
-        if got not in known:
-            raise ValueError(f"{field} must be one of {known} in the reference; got {got!r}.")

@@ -31,27 +31,26 @@ from torch_reference import (
     train_for,
 )
 
-from sejax.agents.configs import PPOConfig
-from sejax.configs import LearnConfig
+from sejax.agents.ppo import PPOConfig
+from sejax.training import TrainingConfig
 
 MAX_LOG_RATIO = 20.0  # as in sejax.agents.ppo
 
 
-def train(env: SyntheticEnv, config: LearnConfig, seed: int) -> TrainResult:
+def train(env: SyntheticEnv, hp: PPOConfig, training: TrainingConfig, seed: int) -> TrainResult:
     """Trains one agent on a CartPole SE for `training.max_steps` steps.
 
     Raises:
-      ValueError: if the configuration asks for what is not built here.
+      ValueError: if the configurations ask for what is not built here.
     """
-    hp, max_steps = config.agent, config.training.max_steps
-    if (config.env.name, hp.name, config.training.stop_rule) != ("cartpole", "ppo", "never"):
-        raise ValueError("the reference is of env=cartpole, agent=ppo, training.stop_rule=never.")
-    if max_steps is None:
-        raise ValueError("training.max_steps must be given.")
+    max_steps = training.max_steps
+    if type(hp) is not PPOConfig or training.stop_rule != "never" or max_steps is None:
+        raise ValueError("the reference is of agent=ppo, training.stop_rule=never, "
+                         "training.max_steps=N.")  # fmt: skip
     torch.manual_seed(seed)
     random.seed(seed)
     rng = np.random.default_rng(seed)
-    agent = PPOAgent(cast(PPOConfig, hp))
+    agent = PPOAgent(hp)
     return train_for(env, agent, lambda: torch.from_numpy(CartPole.reset(rng, 1)[0]), max_steps)
 
 

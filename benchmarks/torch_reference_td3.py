@@ -15,7 +15,6 @@ import math
 import random
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import cast
 
 import numpy as np
 import torch
@@ -33,26 +32,25 @@ from torch_reference import (
     train_for,
 )
 
-from sejax.agents.configs import TD3Config
-from sejax.configs import LearnConfig
+from sejax.agents.td3 import TD3Config
+from sejax.training import TrainingConfig
 
 OBS_DIM, ACTION_DIM, MAX_ACTION = 3, 1, 2.0  # Pendulum-v1
 
 
-def train(env: SyntheticEnv, config: LearnConfig, seed: int) -> TrainResult:
+def train(env: SyntheticEnv, hp: TD3Config, training: TrainingConfig, seed: int) -> TrainResult:
     """Trains one agent on a Pendulum SE for `training.max_steps` steps.
 
     Raises:
-      ValueError: if the configuration asks for what is not built here.
+      ValueError: if the configurations ask for what is not built here.
     """
-    hp, max_steps = config.agent, config.training.max_steps
-    if (config.env.name, hp.name, config.training.stop_rule) != ("pendulum", "td3", "never"):
-        raise ValueError("the reference is of env=pendulum, agent=td3, training.stop_rule=never.")
-    if max_steps is None:
-        raise ValueError("training.max_steps must be given.")
+    max_steps = training.max_steps
+    if type(hp) is not TD3Config or training.stop_rule != "never" or max_steps is None:
+        raise ValueError("the reference is of agent=td3, training.stop_rule=never, "
+                         "training.max_steps=N.")  # fmt: skip
     torch.manual_seed(seed)
     rng = random.Random(seed)
-    agent = TD3Agent(cast(TD3Config, hp), max_steps)
+    agent = TD3Agent(hp, max_steps)
     return train_for(env, agent, lambda: reset_pendulum(rng), max_steps)
 
 

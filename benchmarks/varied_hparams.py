@@ -49,7 +49,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def serve(args: argparse.Namespace) -> None:
     """Compiles the program that varies, then measures each draw both ways."""
-    from sejax.runtime import configure_xla
+    from sejax.app.runtime import configure_xla
 
     configure_xla(1)
     import dataclasses
@@ -57,29 +57,23 @@ def serve(args: argparse.Namespace) -> None:
     import jax
 
     import sejax
-    from sejax import envs
-    from sejax.agents.hparams import make_varied_agents
-    from sejax.proxies.synthetic import make_synthetic
-    from sejax.trainer import make_trainer
 
     size = args.agent_size
     config = sejax.config([
-        *OVERRIDES, f"agent.hidden_size={size}", f"agent.batch_size={size}",
+        *OVERRIDES, "agent_hparams=varied", f"agent.hidden_size={size}", f"agent.batch_size={size}",
         f"agent.num_layers={args.agent_layers}", f"training.max_steps={args.steps}",
     ])  # fmt: skip
-    task = envs.make("cartpole")
-    env = make_synthetic(task, config.proxy)
+    parts = config.parts()
+    task, env, varied = parts["task"], parts["proxy"], parts["agent"]
     params = env.params(env.init_weights(jax.random.key(args.seed)))
-    varied = make_varied_agents(config.agent, task, config.exploration)
-    trainers = [make_trainer(agent, env, config.training) for agent in varied.agents]
 
-    def train_varied(key: Any, values: Any) -> Any:
-        hparams = varied.hparams(values)
-        return jax.lax.switch(
-            varied.branch(values),
-            [lambda key, hparams, t=t: t(key, params, hparams).train_steps for t in trainers],
-            key, hparams,
-        )  # fmt: skip
+    def make_run(agent: sejax.Agent) -> Any:
+        train = sejax.make_trainer(agent, env, config.training)
+        return lambda key, hparams: train(key, params, hparams).train_steps
+
+    def train_varied(key: Any, drawn: Any) -> Any:
+        runs = [make_run(agent) for agent in varied.variants]
+        return jax.lax.switch(drawn.variant, runs, key, drawn.hparams)
 
     key = jax.random.key(args.seed)
     started = time.time()
@@ -88,15 +82,14 @@ def serve(args: argparse.Namespace) -> None:
 
     def handle(request: dict[str, Any]) -> dict[str, Any]:
         key = jax.random.fold_in(jax.random.key(args.seed), request["number"])
-        values = varied.draw(key)
-        plain = {name: float(x) for name, x in values.items()}
+        drawn = varied.draw(key)
+        plain = {name: float(x) for name, x in drawn.values.items()}
         sizes = {name: round(x) for name, x in plain.items() if name != "learning_rate"}
         changes: dict[str, Any] = {**sizes, "learning_rate": plain["learning_rate"]}
         agent = sejax.make_agent(dataclasses.replace(config.agent, **changes), task)
-        train = make_trainer(agent, env, config.training)
-        alone = jax.jit(lambda key: train(key, params).train_steps).lower(key).compile()
-        jax.block_until_ready((program(key, values), alone(key)))
-        runs = {"varied_s": (program, key, values), "alone_s": (alone, key)}
+        alone = jax.jit(agent.fresh(make_run)).lower(key).compile()
+        jax.block_until_ready((program(key, drawn), alone(key)))
+        runs = {"varied_s": (program, key, drawn), "alone_s": (alone, key)}
         seconds = {}
         for name, (run, *inputs) in runs.items():
             _, times = common.measure(functools.partial(wait_for, run, *inputs))

@@ -12,7 +12,7 @@ touches no flag.
 import importlib
 from typing import TYPE_CHECKING, Any
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 _EXPORTS = {
     "AUC": "sejax.objectives",
@@ -33,6 +33,7 @@ _EXPORTS = {
     "PPOConfig": "sejax.agents.ppo",
     "Proxy": "sejax.proxies.files",
     "ProxyEnv": "sejax.proxies.proxy",
+    "ProxyParams": "sejax.proxies.proxy",
     "ProxySet": "sejax.proxies.files",
     "QLearningConfig": "sejax.agents.tabular",
     "RewardConfig": "sejax.proxies.configs",
@@ -46,6 +47,8 @@ _EXPORTS = {
     "TrainingConfig": "sejax.training",
     "Trials": "sejax.es.strategy",
     "config": "sejax.app.compose",
+    "configure_xla": "sejax.app.runtime",
+    "evaluate_agents": "sejax.evaluation",
     "load": "sejax.proxies.files",
     "load_proxy": "sejax.proxies.files",
     "load_set": "sejax.proxies.files",
@@ -56,11 +59,12 @@ _EXPORTS = {
     "register_gymnax": "sejax.proxies.files",
     "save": "sejax.proxies.files",
     "save_set": "sejax.proxies.files",
+    "spread_over_devices": "sejax.parallel",
 }
-_MODULES = ("agents", "envs", "es", "proxies")
+_MODULES = ("agents", "envs", "es", "options", "proxies")
 
 if TYPE_CHECKING:  # what a type checker and an editor see
-    from sejax import agents, envs, es, proxies
+    from sejax import agents, envs, es, options, proxies
     from sejax.agents import make_agent
     from sejax.agents.agent import Agent
     from sejax.agents.count_based import CountBasedConfig
@@ -70,14 +74,16 @@ if TYPE_CHECKING:  # what a type checker and an editor see
     from sejax.agents.tabular import QLearningConfig, SARSAConfig
     from sejax.agents.td3 import DiscreteTD3Config, TD3Config
     from sejax.app.compose import config
+    from sejax.app.runtime import configure_xla
     from sejax.bilevel import LearnResult, make_learner
     from sejax.envs.task import Task
     from sejax.errors import ConfigError
     from sejax.es.evosax import EvosaxConfig
     from sejax.es.nes import NESConfig
     from sejax.es.strategy import Strategy, Trials
-    from sejax.evaluation import make_evaluator
+    from sejax.evaluation import evaluate_agents, make_evaluator
     from sejax.objectives import AUC, AUCSum, MaxReward, Objective, Outcome, RewardThreshold
+    from sejax.parallel import spread_over_devices
     from sejax.proxies.configs import RewardConfig, SyntheticConfig
     from sejax.proxies.files import (
         Proxy,
@@ -89,18 +95,19 @@ if TYPE_CHECKING:  # what a type checker and an editor see
         save,
         save_set,
     )
-    from sejax.proxies.proxy import ProxyEnv
+    from sejax.proxies.proxy import ProxyEnv, ProxyParams
     from sejax.trainer import TrainResult, make_trainer
     from sejax.training import TrainingConfig
 
 __all__ = [
     "AUC", "AUCSum", "Agent", "ConfigError", "CountBasedConfig", "DDQNConfig", "DiscreteTD3Config",
     "DuelingDDQNConfig", "EvosaxConfig", "ICMConfig", "LearnResult", "MaxReward", "NESConfig",
-    "Objective", "Outcome", "PPOConfig", "Proxy", "ProxyEnv", "ProxySet", "QLearningConfig",
-    "RewardConfig", "RewardThreshold", "SARSAConfig", "Strategy", "SyntheticConfig", "TD3Config",
-    "Task", "TrainResult", "TrainingConfig", "Trials", "agents", "config", "envs", "es", "load",
-    "load_proxy", "load_set", "make_agent", "make_evaluator", "make_learner", "make_trainer",
-    "proxies", "register_gymnax", "save", "save_set",
+    "Objective", "Outcome", "PPOConfig", "Proxy", "ProxyEnv", "ProxyParams", "ProxySet",
+    "QLearningConfig", "RewardConfig", "RewardThreshold", "SARSAConfig", "Strategy",
+    "SyntheticConfig", "TD3Config", "Task", "TrainResult", "TrainingConfig", "Trials", "agents",
+    "config", "configure_xla", "envs", "es", "evaluate_agents", "load", "load_proxy", "load_set",
+    "make_agent", "make_evaluator", "make_learner", "make_trainer", "options", "proxies",
+    "register_gymnax", "save", "save_set", "spread_over_devices",
 ]  # fmt: skip
 
 

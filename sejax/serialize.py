@@ -110,12 +110,11 @@ def _convert(value: Any, hint: Any, name: str, field: Any) -> Any:
                 repr(value), f"{name}=[...]")  # fmt: skip
         kind = arguments[0] if arguments else Any
         return (origin or hint)(_convert(x, kind, name, field) for x in value)
-    cls: Any = hint
-    if dataclasses.is_dataclass(cls) and not isinstance(value, cls):
-        known = ", ".join(x.name for x in dataclasses.fields(cls))
+    if isinstance(hint, type) and dataclasses.is_dataclass(hint) and not isinstance(value, hint):
+        known = ", ".join(x.name for x in dataclasses.fields(hint))
         require(isinstance(value, Mapping), name, f"have the fields {known}", "it is more than one "
                 "value", repr(value), f"{name}.{known.partition(',')[0]}=VALUE")  # fmt: skip
-        return from_plain(cls, value, name)
+        return from_plain(hint, value, name)
     if hint in _WORDS:
         return _scalar(value, hint, name, field)
     return value

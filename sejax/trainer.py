@@ -263,7 +263,7 @@ class _Loop:
 
     def discount(self, terminated: Array, truncated: Array, info: Any) -> Array:
         """What a target bootstraps with, before gamma."""
-        discount = jnp.float32(info.get("discount", ~terminated))
+        discount = jnp.float32(info.get("discount", jnp.where(terminated, 0.0, 1.0)))
         return jnp.where(truncated, 0.0, discount) if self.limit_is_terminal else discount
 
     def end_episode(

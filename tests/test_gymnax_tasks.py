@@ -204,10 +204,8 @@ def test_worlds_that_agents_can_take_as_they_are_are_left_alone():
 @pytest.mark.parametrize("space", [spaces.Dict({"x": spaces.Discrete(2)}),
                                    spaces.Tuple([spaces.Discrete(2)])])  # fmt: skip
 def test_spaces_of_several_arrays_are_refused(space):
-    said = (
-        r"^env must have actions in a gymnax Box or Discrete space, because .* in odd\. Wrap the "
-        r"environment so that its actions are one array\.$"
-    )
+    said = (r"^env must have actions in a gymnax Box or Discrete space, because .* in odd\. Wrap "
+            r"the environment so that its actions are one array\.$")  # fmt: skip
     with pytest.raises(ConfigError, match=said):
         odd_task(space)
     with pytest.raises(

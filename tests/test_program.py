@@ -9,7 +9,8 @@ from support import large_ops_in_loops
 from sejax import envs, plugins
 from sejax.agents.ddqn import DDQNConfig, make_ddqn
 from sejax.proxies.configs import RewardConfig, SyntheticConfig
-from sejax.trainer import TrainingConfig, make_trainer
+from sejax.trainer import make_trainer
+from sejax.training import TrainingConfig
 
 CAPACITY = 7919  # rows; nothing else in the program is nearly as long
 

@@ -18,7 +18,8 @@ from sejax.evaluation import make_evaluator, return_area
 from sejax.proxies.configs import RewardConfig
 from sejax.proxies.proxy import ABSURD, World, world_of
 from sejax.proxies.reward import RewardEnv
-from sejax.trainer import TrainingConfig, TrainResult, make_trainer
+from sejax.trainer import TrainResult, make_trainer
+from sejax.training import TrainingConfig
 
 GAMMA = 0.9
 VARIANTS = {  # table "Overview of Reward Network variants"

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from jax.flatten_util import ravel_pytree
 
-from sejax.agents.configs import DDQNConfig
-from sejax.agents.ddqn import make_ddqn
+from sejax.agents.ddqn import DDQNConfig, make_ddqn
 from sejax.agents.replay import Transition
-from sejax.configs import LearnConfig, SyntheticConfig, TrainingConfig
 from sejax.networks import MLP
+from sejax.proxies.configs import SyntheticConfig
+from sejax.training import TrainingConfig
 
 torch = pytest.importorskip("torch")
 sys.path.append(str(Path(__file__).parents[1] / "benchmarks"))
@@ -61,6 +61,6 @@ def test_training_ends_after_the_episodes_or_the_steps(max_steps, steps):
     env = reference.SyntheticEnv(heads, SyntheticConfig(hidden_size=5))
     training = TrainingConfig(stop_rule="never", max_episodes=2, max_steps=max_steps)
     agent = dataclasses.replace(CONFIG, init_episodes=1)
-    result = reference.train(env, LearnConfig(agent=agent, training=training), seed=0)
+    result = reference.train(env, agent, training, seed=0)
     assert result.train_steps == steps
     assert len(result.returns) == 2

@@ -1,7 +1,6 @@
 """benchmarks/torch_reference_ppo.py, the yardstick: its learning phase is sejax's."""
 
 import sys
-from dataclasses import replace
 from pathlib import Path
 
 import jax
@@ -11,12 +10,12 @@ import pytest
 from jax.flatten_util import ravel_pytree
 
 from sejax.agents import replay
-from sejax.agents.configs import PPOConfig
 from sejax.agents.memory import Rollout
-from sejax.agents.ppo import make_ppo
+from sejax.agents.ppo import PPOConfig, make_ppo
 from sejax.agents.replay import Transition
-from sejax.configs import LearnConfig, SyntheticConfig, TrainingConfig
 from sejax.networks import MLP
+from sejax.proxies.configs import SyntheticConfig
+from sejax.training import TrainingConfig
 
 torch = pytest.importorskip("torch")
 sys.path.append(str(Path(__file__).parents[1] / "benchmarks"))
@@ -80,12 +79,10 @@ def test_it_learns_when_the_rollout_is_full():
     heads = {name: reference.params_to_flax(reference.init_mlp([6, 5, size], "leaky_relu"))
              for name, size in reference.HEADS.items()}  # fmt: skip
     env = reference.SyntheticEnv(heads, SyntheticConfig(hidden_size=5))
-    config = LearnConfig(agent=CONFIG, training=TrainingConfig(stop_rule="never", max_steps=1),
-                         proxy=SyntheticConfig(done="threshold"))  # fmt: skip
 
     def actor_after(num_steps):
-        training = replace(config.training, max_steps=num_steps)
-        result = torch_ppo.train(env, replace(config, training=training), seed=0)
+        training = TrainingConfig(stop_rule="never", max_steps=num_steps)
+        result = torch_ppo.train(env, CONFIG, training, seed=0)
         assert result.train_steps == num_steps
         return result.agent.state.networks.values
 

@@ -10,12 +10,17 @@ import pytest
 from jax.flatten_util import ravel_pytree
 
 from sejax import envs
-from sejax.agents.configs import TD3Config
 from sejax.agents.replay import Transition
-from sejax.agents.td3 import LearningNoise, make_learning_step, make_networks, make_td3, tanh_policy
-from sejax.configs import SyntheticConfig
+from sejax.agents.td3 import (
+    LearningNoise,
+    TD3Config,
+    make_learning_step,
+    make_networks,
+    make_td3,
+    tanh_policy,
+)
 from sejax.networks import MLP
-from sejax.proxies.synthetic import make_synthetic
+from sejax.proxies.configs import SyntheticConfig
 
 torch = pytest.importorskip("torch")
 sys.path.append(str(Path(__file__).parents[1] / "benchmarks"))
@@ -91,7 +96,7 @@ def test_the_critics_stacked_are_the_critics():
 
 
 def test_the_se_takes_continuous_actions_as_sejaxs_does():
-    env = make_synthetic(envs.make("pendulum"), SyntheticConfig(hidden_size=6))
+    env = SyntheticConfig(hidden_size=6).make(envs.make("pendulum"))
     weights = env.init_weights(jax.random.key(0))
     obs, action = np.float32([0.6, -0.8, 0.3]), np.float32([1.5])
     step = reference.SyntheticEnv(weights, env.config).step(*map(torch.tensor, (obs, action)))

@@ -16,7 +16,8 @@ from sejax.agents.ddqn import DDQNConfig, make_ddqn
 from sejax.agents.memory import Memory
 from sejax.proxies.configs import SyntheticConfig
 from sejax.rollout import make_recorder, make_tester
-from sejax.trainer import TrainingConfig, is_plateau, is_solved, make_trainer
+from sejax.trainer import is_plateau, is_solved, make_trainer
+from sejax.training import TrainingConfig
 
 WINDOW, TOLERANCE, SOLVED, INIT_EPISODES = 2, 0.25, 1.5, 2
 KEY = jax.random.key(0)

@@ -1,13 +1,22 @@
-"""Agents: bundles of pure functions, a file each with configuration and learning."""
+"""Agents: bundles of pure functions, a file each with configuration and learning.
+
+What one's own agent is made of is here too: `AgentOptions` for its configuration, `traced` for the
+hyperparameters that compiled programs take as arguments, and the memories.
+"""
 
 import functools
 from typing import Any
 
 from sejax import plugins
 from sejax.agents.agent import Agent, AgentOptions, NoExploration, traced
+from sejax.agents.memory import Memory, Rollout, no_memory, replay_memory, rollout_memory
+from sejax.agents.replay import Transition
 from sejax.errors import require
 
-__all__ = ["Agent", "AgentOptions", "NoExploration", "make_agent", "names", "require_fit", "traced"]
+__all__ = [
+    "Agent", "AgentOptions", "Memory", "NoExploration", "Rollout", "Transition", "make_agent",
+    "names", "no_memory", "replay_memory", "require_fit", "rollout_memory", "traced",
+]  # fmt: skip
 
 
 def names() -> list[str]:

@@ -31,6 +31,15 @@ class Transition(NamedTuple):
     next_obs: Array
     weight: Array | float = 1.0
 
+    @property
+    def rows(self) -> "Transition":
+        """A feature-major batch turned: `[batch, obs_dim]`, with a weight `[batch]` for each row.
+
+        Under `jax.vmap` a function of one transition then takes a batch.
+        """
+        weight = jnp.broadcast_to(self.weight, self.reward.shape)
+        return jax.tree.map(jnp.transpose, self._replace(weight=weight))
+
 
 def num_columns(batch: Transition) -> Array | float:
     """Columns of a batch that count, i.e. do not only fill it up."""

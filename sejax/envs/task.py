@@ -36,7 +36,10 @@ class Task:
 
     Attributes:
       name: what it is called, in files too.
-      env: gymnax 1.x `Environment`. Build a task once: what is compiled for it is kept by identity.
+      env: gymnax 1.x `Environment`, of which `reset_env`, `step_env`, `action_space` and
+        `observation_space` are used. A step's `info` may say under "discount" what a target
+        bootstraps with; 1 minus terminated if not. Build a task once: what is compiled for it is
+        kept by identity.
       params: its `EnvParams`; the environment's `default_params` if not given.
       solved_reward: mean return per episode at which the task counts as solved; inf if nobody says.
       max_steps: step limit of an episode; put into `params`, or taken from there if not given.

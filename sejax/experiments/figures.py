@@ -1,8 +1,7 @@
-"""Pictures and tables that the experiments with SEs share."""
+"""Pictures that the experiments share."""
 
-import argparse
-import shlex
-from collections.abc import Sequence
+import contextlib
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +12,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
 from matplotlib.ticker import MaxNLocator
+from PIL import Image
 
 from sejax.files import atomic_path
 
@@ -39,8 +39,8 @@ def learning_curves(curves: pd.DataFrame, solved_reward: float, path: Path) -> N
     lines = lines.ffill()  # a run that stopped when it solved the task stays where it was
     iterations = lines.index.to_numpy() + 1
     mean, std = lines.mean(axis=1), lines.std(axis=1, ddof=0)
-    with plt.rc_context(STYLE):
-        figure, axis = plt.subplots(figsize=(6, 3.6), layout="constrained")
+    with panels(path, 1, 1, (6, 3.6)) as (_, axes):
+        axis = axes[0, 0]
         for index, seed in enumerate(lines.columns):
             axis.plot(iterations, lines[seed], color=REAL, lw=0.7, alpha=0.5,
                       label=None if index else f"NES run ({lines.shape[1]} in all)")  # fmt: skip
@@ -54,7 +54,6 @@ def learning_curves(curves: pd.DataFrame, solved_reward: float, path: Path) -> N
         axis.xaxis.set_major_locator(MaxNLocator(integer=True))
         axis.set_xlim(1, max(iterations[-1], 2))
         axis.legend(fontsize=9, loc="best")
-        write(figure, path)
 
 
 def density(values: Any, grid: Any, low: float, high: float) -> np.ndarray:
@@ -135,11 +134,8 @@ def performance(
              for _, agents in settings.values()]  # fmt: skip
     low = min(x.min() for x in every)
     high = max(low + 1, *(x.max() for x in every))
-    with plt.rc_context(STYLE):
-        figure, axes = plt.subplots(
-            3, len(columns), figsize=(1.2 + 3.6 * len(columns), 8), height_ratios=(1.5, 1, 1),
-            squeeze=False, layout="constrained",
-        )  # fmt: skip
+    size = (1.2 + 3.6 * len(columns), 8)
+    with panels(path, 3, len(columns), size, height_ratios=(1.5, 1, 1)) as (figure, axes):
         for column, (kind, settings) in enumerate(columns.items()):
             top, middle, bottom = axes[:, column]
             densities(top, {label: (color, agents[returns].to_numpy().ravel())
@@ -160,7 +156,6 @@ def performance(
         figure.legend(handles, [f"train: {label}" for label in longest],
                       ncols=len(longest) if len(columns) > 1 else 1,
                       loc="outside upper center")  # fmt: skip
-        write(figure, path)
 
 
 def violins(
@@ -178,11 +173,8 @@ def violins(
     Source: paper, appendix "Evaluation of Individual SE Models".
     """
     num_ses = max(agents["se"].nunique() for agents in kinds.values())
-    with plt.rc_context(STYLE):
-        figure, axes = plt.subplots(
-            len(kinds), 1, figsize=(max(5.0, 1.8 + 0.35 * num_ses), 0.6 + 2.6 * len(kinds)),
-            squeeze=False, layout="constrained",
-        )  # fmt: skip
+    size = (max(5.0, 1.8 + 0.35 * num_ses), 0.6 + 2.6 * len(kinds))
+    with panels(path, len(kinds), 1, size) as (figure, axes):
         for axis, (kind, agents) in zip(axes[:, 0], kinds.items(), strict=True):
             pooled = {se: mine[returns].to_numpy().ravel() for se, mine in agents.groupby("se")}
             order = sorted(pooled, key=lambda se: -pooled[se].mean())
@@ -199,46 +191,46 @@ def violins(
         axes[-1, 0].set_xlabel("SE, by its place in the set; diamonds: means")
         figure.legend([plt.Line2D([], [], color=SOLVED, ls="--")], [f"solved ({solved_reward:g})"],
                       loc="outside upper right", fontsize=9)  # fmt: skip
+
+
+def band(axis: Any, x: Any, mean: Any, low: Any, high: Any, color: str, **line: Any) -> None:
+    """Draws a line with what it may be off by."""
+    axis.plot(x, mean, color=color, **line)
+    axis.fill_between(x, low, high, color=color, alpha=0.2, lw=0)
+
+
+def legend_above(figure: Any, axis: Any, columns: int = 4) -> None:
+    """Puts the legend of one panel above all."""
+    handles, labels = axis.get_legend_handles_labels()
+    figure.legend(handles, labels, ncols=min(len(labels), columns), loc="outside upper center",
+                  fontsize=9)  # fmt: skip
+
+
+@contextlib.contextmanager
+def panels(
+    path: Path, lines: int, columns: int, size: tuple[float, float], **options: Any
+) -> Iterator[tuple[Any, Any]]:
+    """A figure and its axes `[lines, columns]`, which is written when all is drawn.
+
+    Args:
+      path: the picture.
+      lines: of panels.
+      columns: likewise.
+      size: in inches.
+      **options: of `plt.subplots`.
+    """
+    with plt.rc_context(STYLE):
+        figure, axes = plt.subplots(lines, columns, figsize=size, squeeze=False,
+                                    layout="constrained", **options)  # fmt: skip
+        yield figure, axes
         write(figure, path)
 
 
 def write(figure: Any, path: Path) -> None:
-    """Writes and closes a figure."""
+    """Writes and closes a figure, in 256 colours: a third of the bytes."""
     with atomic_path(path) as temporary:
         figure.savefig(temporary, dpi=200)
+        with Image.open(temporary) as picture:
+            few = picture.convert("RGB").quantize(256, dither=Image.Dither.NONE)
+        few.save(temporary, format="png", optimize=True)
     plt.close(figure)
-
-
-def print_table(title: str, table: pd.DataFrame) -> None:
-    """Prints a table of texts."""
-    from rich.console import Console
-    from rich.table import Table
-
-    printed = Table(title=title)
-    for column in table.columns:
-        printed.add_column(str(column))
-    for row in table.itertuples(index=False):
-        printed.add_row(*map(str, row))
-    console = Console(highlight=False)
-    if not console.is_terminal:
-        console.width = 220  # a file has room for whole rows
-    console.print(printed)
-
-
-def command(name: str, args: argparse.Namespace, *options: str | tuple[str, str]) -> str:
-    """The command line of an experiment, with the options that were given.
-
-    Args:
-      name: of the experiment.
-      args: its options, parsed.
-      *options: names of its own options in `args`, or (name there, name on the command line).
-    """
-    words = ["python", "-m", f"sejax.experiments.{name}"]
-    words += ["--quick"] if args.quick else []
-    for option in (*options, "seed"):
-        attribute, flag = (option, option) if isinstance(option, str) else option
-        value = getattr(args, attribute)
-        if value not in (None, []):
-            values = value if isinstance(value, list) else [value]
-            words += [f"--{flag.replace('_', '-')}", *map(str, values)]
-    return shlex.join(words)

@@ -3,53 +3,63 @@
 Source: paper, appendix "Evaluation of Individual SE Models" for CartPole and for Acrobot: 40 SEs,
 1000 agents with drawn hyperparameters on each, 10 test episodes.
 
-Agents are trained as in se_performance; with its `--out` folder, those that it trained on the same
+Agents are trained as in se_performance; with its `out` folder, those that it trained on the same
 SEs are used again.
 """
 
-import argparse
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
+import sejax
 from sejax.errors import ConfigError
-from sejax.experiments import common, se_agents
-
-NAME = "se_models"
-
-
-def main() -> None:
-    """Runs the experiment as the command line says."""
-    common.run_command(NAME, __doc__, add_options, run)
+from sejax.experiments import figures, se_agents
+from sejax.experiments.experiment import Experiment
+from sejax.experiments.se_agents import SeAgents
+from sejax.experiments.settings import setting
+from sejax.experiments.tables import publish
+from sejax.experiments.worlds import return_columns
 
 
-def add_options(parser: argparse.ArgumentParser) -> None:
-    """Options of this experiment."""
-    parser.add_argument("--ses", metavar="FILE", help="SEs, from se_feasibility; with --quick, "
-                        "the shipped cartpole SE")  # fmt: skip
-    se_agents.add_options(parser)
+@dataclass(frozen=True, kw_only=True)
+class SeModels(SeAgents):
+    """Settings of this experiment."""
+
+    name = "se_models"
+    files = "models_"
+
+    ses: str | None = setting(None, quick="cartpole", about="file of SEs, from se_feasibility, or "
+                              "a shipped name")  # fmt: skip
 
 
-def run(args: argparse.Namespace) -> pd.DataFrame:
-    """Trains what is missing, writes everything and returns the table.
+def compute(settings: SeModels) -> pd.DataFrame:
+    """Trains what is missing; a row for each agent.
 
     Raises:
       ConfigError: for a file or settings that cannot work.
     """
-    from sejax.proxies.sets import load_set
+    ses = load(settings)
+    tables = []
+    for kind in settings.agents:
+        world = se_agents.se_world(settings, ses, kind)
+        places = {group.name: place for place, group in enumerate(world.groups)}
+        rows = se_agents.train(settings, world)
+        tables.append(rows.assign(se=rows["group"].map(places)))
+    return pd.concat(tables, ignore_index=True)
 
-    se_agents.fill_in(args)
-    source = args.ses or ("cartpole" if args.quick else None)
-    if source is None:
-        raise ConfigError("--ses must be given, because agents are trained on its SEs; got none. "
-                          "Set --ses=results/se_feasibility/ses.safetensors.")  # fmt: skip
-    ses = load_set(source, "--ses", "se").first(args.num_ses)
-    world = se_agents.se_world(args, ses)
-    pieces = common.Pieces(args.out / "pieces")
-    agents = pd.concat([se_agents.train_all(args, kind, world, pieces) for kind in args.agents])
-    agents["se"] = agents["group"].map({name: i for i, name in enumerate(world.names)})
-    return report(args, ses, agents)
+
+def load(settings: SeModels) -> Any:
+    """The SEs that are tested.
+
+    Raises:
+      ConfigError: for a file that cannot be used, or none.
+    """
+    if settings.ses is None:
+        raise ConfigError("ses must be given, because agents are trained on its SEs; got none. "
+                          "Set ses=results/se_feasibility/cartpole/ses.safetensors.")  # fmt: skip
+    return sejax.load_set(settings.ses, option="ses", kind="se").first(settings.num_ses)
 
 
 def summarise(agents: pd.DataFrame, solved_reward: float) -> pd.DataFrame:
@@ -81,43 +91,37 @@ def rank_correlations(summary: pd.DataFrame) -> pd.DataFrame:
     return means[list(dict.fromkeys(summary["kind"]))].rank().corr()
 
 
-def report(args: argparse.Namespace, ses: Any, agents: pd.DataFrame) -> pd.DataFrame:
-    """Writes the CSV, the picture and the table, prints the table and returns it."""
-    from sejax.experiments import figures
-    from sejax.files import write_text
-
-    task, scores, seeds = ses.task, ses.scores, ses.seeds
-    summary = summarise(agents, task.solved_reward)
-    table = pd.DataFrame([
+def make_table(summary: pd.DataFrame, ses: Any) -> pd.DataFrame:
+    """The summary as texts, with what is known of each SE."""
+    return pd.DataFrame([
         {
             "agent": row.kind,
             "SE": row.se,
-            "run's seed": seeds[row.se],
-            "score when learned": f"{scores[row.se]:.1f}",
+            "run's seed": ses.seeds[row.se],
+            "score when learned": f"{ses.scores[row.se]:.1f}",
             "return": f"{row.return_mean:.1f} ± {row.return_std:.1f}",
             "agents that solve the task": f"{row.solved:.0%}",
             "training steps": f"{row.train_steps:,.0f}",
         }
         for row in summary.itertuples()
     ])  # fmt: skip
-    write_text(args.out / "models_agents.csv", agents.to_csv(index=False))
-    write_text(args.out / "models_summary.csv", summary.to_csv(index=False))
-    kinds = {kind: agents[agents["kind"] == kind] for kind in args.agents}
-    figures.violins(kinds, se_agents.return_columns(agents), task.name, task.solved_reward,
-                    args.out / "models.png")  # fmt: skip
-    title = f"Single SEs of {task.name} (solved at {task.solved_reward:g})"
+
+
+def report(settings: SeModels, rows: pd.DataFrame) -> pd.DataFrame:
+    """Writes the table and the picture."""
+    ses = load(settings)
+    task = ses.task
+    summary = summarise(rows, task.solved_reward)
+    kinds = {str(kind): mine for kind, mine in rows.groupby("kind", sort=False)}
+    figures.violins(kinds, return_columns(rows), task.name, task.solved_reward,
+                    settings.folder / "models.png")  # fmt: skip
     note = (
-        f"Return: mean ± std over {args.num_agents} agents with drawn hyperparameters and "
-        f"{args.test_episodes} test episodes each. The paper has 1000 agents on each of 40 SEs "
-        f"and shows violins only, no numbers.{correlations_text(summary)}"
+        f"Return: mean ± std over {rows['agent'].nunique()} agents with drawn hyperparameters and "
+        f"{len(return_columns(rows))} test episodes each. The paper has 1000 agents on each of 40 "
+        f"SEs and shows violins only, no numbers.{correlations_text(summary)}"
     )
-    command = figures.command(NAME, args, "ses", "agents", "num_agents", "num_ses",
-                              "test_episodes", "max_steps")  # fmt: skip
-    common.write_markdown(args.out / "models_table.md", title, command, table, note)
-    figures.print_table(title, table)
-    print(f"{args.out}: models_agents.csv (every test return), models_summary.csv, models.png and "
-          f"models_table.md.{correlations_text(summary)}")  # fmt: skip
-    return table
+    title = f"Single SEs of {task.name} (solved at {task.solved_reward:g})"
+    return publish(settings, title, make_table(summary, ses), summary, note)
 
 
 def correlations_text(summary: pd.DataFrame) -> str:
@@ -131,5 +135,7 @@ def correlations_text(summary: pd.DataFrame) -> str:
     return f" Rank correlation of the SEs' mean returns: {', '.join(texts)}." if texts else ""
 
 
+EXPERIMENT = Experiment(settings=SeModels, compute=compute, report=report, about=__doc__)
+
 if __name__ == "__main__":
-    main()
+    EXPERIMENT.main()

@@ -4,23 +4,30 @@ Source: paper, section "Performance of SE-trained Agents" and "Transferability o
 densities and bars for CartPole), appendix "Evaluation of Performance and Transferability of SEs on
 the Acrobot Task"; `reference_details.md` 7.1.
 
-On each SE of a set `--num-agents` agents are trained whose hyperparameters are drawn anew for each,
-whatever the SEs were learned with; `--varied` and `--fixed` are sets from se_feasibility, learned
-with `--agent-hparams varied` and without. SEs that did not reach the task's threshold are left out,
+On each SE of a set `num_agents` agents are trained whose hyperparameters are drawn anew for each,
+whatever the SEs were learned with; `varied` and `fixed` are sets from se_feasibility, learned with
+`agent_hparams=varied` and without. SEs that did not reach the task's threshold are left out,
 as in the authors' code, which stores no others. As many groups of agents are trained on the real
-task, or `--real-groups`.
+task, or `real_groups`.
 """
 
-import argparse
-from collections.abc import Iterable
+from dataclasses import dataclass
 from typing import Any
 
 import pandas as pd
 
+import sejax
+from sejax import envs
 from sejax.errors import require
-from sejax.experiments import common, se_agents
+from sejax.experiments import figures, se_agents
+from sejax.experiments.experiment import Experiment
+from sejax.experiments.se_agents import SeAgents
+from sejax.experiments.settings import setting
+from sejax.experiments.tables import bootstrap_interval, publish
+from sejax.experiments.worlds import Group, World, return_columns
+from sejax.options import counts, one_of
+from sejax.training import SOLVED_BY
 
-NAME = "se_performance"
 NUM_BEST = 5
 BEST_FOR = "td3_discrete"
 LABELS = {"real": "real", "varied": "synth., HPs varied", "fixed": "synth., HPs fixed",
@@ -53,77 +60,92 @@ PAPER_RETURNS = {
 }
 
 
-def main() -> None:
-    """Runs the experiment as the command line says."""
-    common.run_command(NAME, __doc__, add_options, run)
+@dataclass(frozen=True, kw_only=True)
+class SePerformance(SeAgents):
+    """Settings of this experiment."""
+
+    name = "se_performance"
+
+    varied: str | None = setting(None, about="file of SEs learned with drawn hyperparameters")
+    fixed: str | None = setting(None, about="file of SEs learned with one agent's; with quick=true "
+                                "and no file, the shipped cartpole SE")  # fmt: skip
+    env: str | None = setting(None, about="task, where no file is given; cartpole")
+    real_groups: int | None = setting(None, counts("it counts groups"), about="groups of agents on "
+                                      "the real task, which takes longest; as many as "
+                                      "SEs")  # fmt: skip
+    real_episodes: int | None = setting(None, counts("it counts episodes"), quick=100, about="at "
+                                        "most, on the real task; 1000 (500 for discrete TD3 in "
+                                        "Acrobot)")  # fmt: skip
+    solved_by: str = setting("train", one_of(SOLVED_BY), about="whose last returns end training "
+                             "on the real task; train, as in the paper's code")  # fmt: skip
 
 
-def add_options(parser: argparse.ArgumentParser) -> None:
-    """Options of this experiment."""
-    parser.add_argument("--varied", metavar="FILE", help="SEs learned with drawn hyperparameters")
-    parser.add_argument("--fixed", metavar="FILE", help="SEs learned with one agent's; with "
-                        "--quick and no file, the shipped cartpole SE")  # fmt: skip
-    parser.add_argument("--env", help="task, where no file is given; cartpole")
-    parser.add_argument("--real-groups", type=int, help="groups of agents on the real task, which "
-                        "takes longest; as many as SEs")  # fmt: skip
-    parser.add_argument("--solved-by", choices=("train", "test"), default="train", help="whose "
-                        "last returns end training on the real task; train, as in the paper's "
-                        "code")  # fmt: skip
-    parser.add_argument("--real-episodes", type=int, help="at most, on the real task; 1000 (500 "
-                        "for discrete TD3 in Acrobot)")  # fmt: skip
-    se_agents.add_options(parser)
-
-
-def run(args: argparse.Namespace) -> pd.DataFrame:
-    """Trains what is missing, writes everything and returns the table.
+def compute(settings: SePerformance) -> pd.DataFrame:
+    """Trains what is missing; a row for each agent.
 
     Raises:
       ConfigError: for files or settings that cannot work.
     """
-    se_agents.fill_in(args)
-    worlds = make_worlds(args)
-    task = worlds["real"].task
-    pieces = common.Pieces(args.out / "pieces")
-    agents = pd.concat(
-        [se_agents.train_all(args, kind, world, pieces).assign(setting=name)
-         for kind in args.agents for name, world in worlds.items()],
-        ignore_index=True,
-    )  # fmt: skip
-    return report(args, task, agents)
+    sets = load_sets(settings)
+    for name, ses in sets.items():
+        print(f"{name}: {ses.size} SEs, {ses.solved().size} of which reached the threshold")
+    task = envs.make(task_name(settings, sets))
+    tables = []
+    for kind in settings.agents:
+        worlds = {"real": real_world(settings, task, sets, kind)}
+        worlds |= {name: se_agents.se_world(settings, ses, kind) for name, ses in sets.items()}
+        tables += [se_agents.train(settings, world).assign(setting=name)
+                   for name, world in worlds.items()]  # fmt: skip
+    return pd.concat(tables, ignore_index=True)
 
 
-def make_worlds(args: argparse.Namespace) -> dict[str, se_agents.World]:
-    """The settings that are compared, `real` first; those without a file are left out.
+def load_sets(settings: SePerformance) -> dict[str, Any]:
+    """The sets of SEs that are compared, by how they were learned; those without a file left out.
 
     Raises:
-      ConfigError: if the SEs are of different tasks.
+      ConfigError: for a file that cannot be used, or of SEs that were learned otherwise.
     """
-    from sejax import envs
-    from sejax.proxies.sets import load_set
-
-    files = {"varied": args.varied, "fixed": args.fixed}
-    if args.quick and not any(files.values()):
-        files["fixed"] = args.env or "cartpole"
-    sets = {name: load_set(file, f"--{name}", "se") for name, file in files.items() if file}
-    for name, ses in sets.items():
-        solved = ses.solved()
-        sets[name] = (solved if solved.size else ses).first(args.num_ses)
-        print(f"{name}: {solved.size} of {ses.size} SEs reached the threshold"
-              f"{'' if solved.size else ', all are used'}", flush=True)  # fmt: skip
-    for name, ses in sets.items():
-        learned_with = "varied" if ses.config.agent_hparams == "varied" else "fixed"
-        require(learned_with == name, f"--{name}", f"be SEs learned with {name} hyperparameters",
+    files = {"varied": settings.varied, "fixed": settings.fixed}
+    if settings.quick and not any(files.values()):
+        files["fixed"] = settings.env or "cartpole"
+    sets = {}
+    for name, file in files.items():
+        if file is None:
+            continue
+        ses = sejax.load_set(file, option=name, kind="se")
+        learned_with = "varied" if ses.config["agent_hparams"] == "varied" else "fixed"
+        require(learned_with == name, name, f"be SEs learned with {name} hyperparameters",
                 "it is what is compared", f"{ses.path} with {learned_with} ones",
-                f"--{learned_with}={ses.path}")  # fmt: skip
-    names = sorted({ses.task.name for ses in sets.values()} | ({args.env} if args.env else set()))
-    require(len(names) <= 1, "--varied, --fixed and --env", "be of one task",
+                f"{learned_with}={ses.path}")  # fmt: skip
+        solved = ses.solved()
+        sets[name] = (solved if solved.size else ses).first(settings.num_ses)
+    return sets
+
+
+def task_name(settings: SePerformance, sets: dict[str, Any]) -> str:
+    """The one task of all sets.
+
+    Raises:
+      ConfigError: if there are several.
+    """
+    asked = {settings.env} if settings.env else set()
+    names = sorted({str(ses.task.name) for ses in sets.values()} | asked)
+    require(len(names) <= 1, "varied, fixed and env", "be of one task",
             "agents are tested on it", ", ".join(names), "files of the same task")  # fmt: skip
-    as_ses = max((ses.size for ses in sets.values()), default=args.num_ses)
-    count = args.real_groups or as_ses
-    task = envs.make(names[0] if names else "cartpole")
-    return {"real": se_agents.real_world(args, task, count)} | {
-        name: se_agents.se_world(args, ses) for name, ses in sets.items()
-    }
+    return names[0] if names else "cartpole"
+
+
+def real_world(settings: SePerformance, task: Any, sets: dict[str, Any], kind: str) -> World:
+    """The real task for a number of groups of agents; training ends by the solved rule."""
+    as_ses = max((ses.size for ses in sets.values()), default=settings.num_ses)
+    count = settings.real_groups or as_ses
+    training = se_agents.real_training(
+        kind, task, settings.real_episodes, max_steps=settings.max_steps,
+        solved_by=settings.solved_by, test_episodes=settings.test_episodes,
+    )  # fmt: skip
+    groups = tuple(Group(f"real-{index:02d}", task.params) for index in range(count))
+    return World(name=kind, env=task.env, task=task, groups=groups, training=training,
+                 agent=se_agents.agent_config(settings, kind), hparams="varied")  # fmt: skip
 
 
 def select_best(agents: pd.DataFrame, count: int = NUM_BEST) -> pd.DataFrame:
@@ -158,12 +180,12 @@ def summarise(agents: pd.DataFrame) -> pd.DataFrame:
     same SE have much in common.
     """
     rows = []
-    for (kind, setting), mine in agents.groupby(["kind", "setting"], sort=False):
-        row = {"kind": kind, "setting": setting, "num_ses": mine["group"].nunique(),
+    for (kind, name), mine in agents.groupby(["kind", "setting"], sort=False):
+        row = {"kind": kind, "setting": name, "num_ses": mine["group"].nunique(),
                "num_agents": len(mine), "num_nonfinite": int(mine["nonfinite"].sum())}  # fmt: skip
         for column in ("train_steps", "train_episodes", "test_return"):
             means = mine.groupby("group")[column].mean()
-            low, high = common.bootstrap_interval(means)
+            low, high = bootstrap_interval(means)
             mean, std = mine[column].mean(), mine[column].std(ddof=0)
             row |= {f"{column}_mean": mean, f"{column}_std": std, f"{column}_low": low,
                     f"{column}_high": high}  # fmt: skip
@@ -203,56 +225,45 @@ def make_table(env_name: str, summary: pd.DataFrame) -> pd.DataFrame:
     ])  # fmt: skip
 
 
-def report(args: argparse.Namespace, task: Any, agents: pd.DataFrame) -> pd.DataFrame:
-    """Writes the CSV, the picture and the table, prints the table and returns it."""
-    from sejax.experiments import figures
-    from sejax.files import write_text
-
-    all_agents = with_best(agents)
-    summary = summarise(all_agents)
-    table = make_table(task.name, summary)
-    write_text(args.out / "agents.csv", agents.to_csv(index=False))
-    write_text(args.out / "summary.csv", summary.to_csv(index=False))
-    draw(task, all_agents, args.agents, args.out / "performance.png")
-    title = f"Agents trained on SEs and tested on {task.name} (solved at {task.solved_reward:g})"
+def report(settings: SePerformance, rows: pd.DataFrame) -> pd.DataFrame:
+    """Writes the table and the picture."""
+    task = envs.make(task_name(settings, load_sets(settings)))
+    agents = with_best(rows)
+    summary = summarise(agents)
+    draw(task, agents, settings.folder / "performance.png")
     note = (
-        f"Mean ± std over agents with drawn hyperparameters, {args.test_episodes} test episodes "
-        'each; in brackets a bootstrap 95% interval that draws SEs, not agents. "Fewer" are '
-        "training steps saved against the real task, for which a group of agents takes the place "
-        f"of an SE. The best SEs of all sets, {NUM_BEST} at most, are chosen by half of their "
-        "agents and shown by the other half. SEs are those of a set that reached the threshold, "
-        "all where none did. The paper has 40 SEs with 10 agents each; where a field is empty it "
-        "gives no number here, but for DDQN in CartPole a mean return on SEs of 190.7, in another "
-        "section. "
-        f"Agents that met a number that is not finite: {int(agents['nonfinite'].sum())}."
+        f"Mean ± std over agents with drawn hyperparameters, {len(return_columns(rows))} test "
+        'episodes each; in brackets a bootstrap 95% interval that draws SEs, not agents. "Fewer" '
+        "are training steps saved against the real task, for which a group of agents takes the "
+        f"place of an SE. The best SEs of all sets, {NUM_BEST} at most, are chosen by half of "
+        "their agents and shown by the other half. SEs are those of a set that reached the "
+        "threshold, all where none did. The paper has 40 SEs with 10 agents each; where a field is "
+        "empty it gives no number here, but for DDQN in CartPole a mean return on SEs of 190.7, in "
+        "another section. "
+        f"Agents that met a number that is not finite: {int(rows['nonfinite'].sum())}."
     )
-    command = figures.command(NAME, args, "varied", "fixed", "env", "agents", "num_agents",
-                              "num_ses", "real_groups", "test_episodes", "solved_by",
-                              "real_episodes", "max_steps")  # fmt: skip
-    common.write_markdown(args.out / "table.md", title, command, table, note)
-    figures.print_table(title, table)
-    print(f"{args.out}: agents.csv (every test return), summary.csv, performance.png and table.md.")
-    return table
+    title = f"Agents trained on SEs and tested on {task.name} (solved at {task.solved_reward:g})"
+    return publish(settings, title, make_table(task.name, summary), summary, note)
 
 
-def draw(task: Any, agents: pd.DataFrame, kinds: Iterable[str], path: Any) -> None:
+def draw(task: Any, agents: pd.DataFrame, path: Any) -> None:
     """Draws densities of the test returns above and bars of steps and episodes below.
 
     Source: paper, figures "Densities based on each 4000 cumulative test rewards".
     """
-    from sejax.experiments import figures
-
     colors = {"real": figures.REAL, "varied": figures.VARIED, "fixed": figures.FIXED,
               "best": figures.BEST}  # fmt: skip
     columns = {
-        kind: {
-            LABELS[setting]: (colors[setting], mine)
-            for setting, mine in agents[agents["kind"] == kind].groupby("setting", sort=False)
+        str(kind): {
+            LABELS[name]: (colors[name], mine)
+            for name, mine in of_kind.groupby("setting", sort=False)
         }
-        for kind in kinds
+        for kind, of_kind in agents.groupby("kind", sort=False)
     }
-    figures.performance(columns, se_agents.return_columns(agents), task.name, path)
+    figures.performance(columns, return_columns(agents), task.name, path)
 
+
+EXPERIMENT = Experiment(settings=SePerformance, compute=compute, report=report, about=__doc__)
 
 if __name__ == "__main__":
-    main()
+    EXPERIMENT.main()

@@ -9,6 +9,7 @@ import copy
 from typing import Any, NamedTuple
 
 import jax
+from flax import struct
 from gymnax.environments import environment
 from jaxtyping import Array
 
@@ -32,12 +33,21 @@ class World(NamedTuple):
     max_steps: int | None = None
 
 
+@struct.dataclass
+class ProxyParams(environment.EnvParams):
+    """Weights of a proxy, as from its `init_weights`, and the real task's step limit."""
+
+    weights: Any = None
+    max_steps_in_episode: int = 1
+
+
 class ProxyEnv(environment.Environment[Any, Any]):
     """A proxy of a task; subclasses add the dynamics (`reset_env`, `step_env`).
 
-    A subclass must give `init_weights` and `params`. `step_env` must put into its `info` under
-    "discount" what a target bootstraps with before the agent's gamma, and may put under "nonfinite"
-    whether a number was met that is not finite, which ends the training.
+    A subclass must give `init_weights`, `reset_env` and `step_env`. The latter may put
+    into its `info` under "discount" what a target bootstraps with before the agent's gamma (1 minus
+    terminated if it is not there), and under "nonfinite" whether a number was met that is not
+    finite, which ends the training.
 
     Attributes:
       task: the real task.
@@ -62,9 +72,9 @@ class ProxyEnv(environment.Environment[Any, Any]):
 
         Args:
           weights: as from `init_weights`.
-          discount: gamma of the agent that it is for; a proxy may have no use for it.
+          discount: gamma of the agent that it is for; most proxies have no use for it.
         """
-        raise NotImplementedError
+        return ProxyParams(weights=weights, max_steps_in_episode=self.task.max_steps)
 
     def prepared(
         self, params: Any, discount: Array | float, limit_is_terminal: Array | bool = False

@@ -172,9 +172,10 @@ class RewardEnv(ProxyEnv):
         if self.config.is_additive:
             reward = real_reward + reward
         sane = jnp.abs(reward) < ABSURD  # False for nan
+        discount = info.get("discount", jnp.where(terminated, 0.0, 1.0))
         info = {
             **info,
-            "discount": jnp.where(sane, info.get("discount", 1.0 - terminated), 0.0),
+            "discount": jnp.where(sane, discount, 0.0),
             "real_reward": jnp.float32(real_reward),
             "nonfinite": ~jnp.isfinite(reward),
         }

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 
 from sejax.envs.task import Task
 from sejax.networks import MLP
-from sejax.proxies.proxy import ABSURD, ProxyEnv
+from sejax.proxies.proxy import ABSURD, ProxyEnv, ProxyParams
 
 if TYPE_CHECKING:  # which makes it
     from sejax.proxies.configs import SyntheticConfig
@@ -23,12 +23,6 @@ if TYPE_CHECKING:  # which makes it
 class SyntheticState(environment.EnvState):
     vector: Array  # [obs_dim]: what the networks see and predict
     time: Array | int
-
-
-@struct.dataclass
-class SyntheticParams(environment.EnvParams):
-    weights: Any = None  # {"state", "reward", "done"}: variables of one MLP each
-    max_steps_in_episode: int = 1
 
 
 class SyntheticEnv(ProxyEnv):
@@ -63,9 +57,6 @@ class SyntheticEnv(ProxyEnv):
             for k, (head, net) in zip(keys, self._nets.items(), strict=True)
         }
 
-    def params(self, weights: Any, discount: Array | float = 1.0) -> SyntheticParams:
-        return SyntheticParams(weights=weights, max_steps_in_episode=self.task.max_steps)
-
     def predict(
         self, weights: Any, vector: Float[Array, " obs_dim"], action: Array
     ) -> tuple[Float[Array, " obs_dim"], Float[Array, ""], Float[Array, ""]]:
@@ -76,7 +67,7 @@ class SyntheticEnv(ProxyEnv):
         out = {head: net.apply({"params": weights[head]}, x) for head, net in self._nets.items()}
         return out["state"], out["reward"][0], out["done"][0]
 
-    def reset_env(self, key: Array, params: SyntheticParams) -> tuple[Array, SyntheticState]:
+    def reset_env(self, key: Array, params: ProxyParams) -> tuple[Array, SyntheticState]:
         obs, _ = self.task.env.reset_env(key, self.task.params)
         if self.task.num_states is not None:
             obs = jax.nn.one_hot(obs, self.task.num_states)
@@ -84,7 +75,7 @@ class SyntheticEnv(ProxyEnv):
         return self.get_obs(state), state
 
     def step_env(
-        self, key: Array, state: SyntheticState, action: Any, params: SyntheticParams
+        self, key: Array, state: SyntheticState, action: Any, params: ProxyParams
     ) -> tuple[Array, SyntheticState, Array, Array, dict[Any, Any]]:
         vector, reward, done = self.predict(params.weights, state.vector, action)
         size = jnp.maximum(jnp.max(jnp.abs(vector)), jnp.maximum(jnp.abs(reward), jnp.abs(done)))
@@ -105,7 +96,7 @@ class SyntheticEnv(ProxyEnv):
             return jnp.argmax(state.vector).astype(jnp.int32)
         return state.vector
 
-    def observation_space(self, params: SyntheticParams | None = None) -> Any:
+    def observation_space(self, params: ProxyParams | None = None) -> Any:
         """The real task's, a box without its bounds: a learned world need not respect them."""
         from gymnax.environments import spaces
 

@@ -1,0 +1,43 @@
+"""Thousands of agents in one compiled program: on a proxy that ships with sejax, and without it.
+
+python train_thousands.py
+python train_thousands.py --agents 100000
+"""
+
+import argparse
+import time
+
+import jax
+
+import sejax
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description="Trains thousands of agents in one program.")
+    parser.add_argument("--agents", type=int, default=4096)
+    args = parser.parse_args()
+    sejax.configure_xla()  # a device for each core
+    proxy, params = sejax.load("cliff_walking-rn")  # the real grid with a learned reward
+    task = proxy.task
+    agent = sejax.make_agent(sejax.QLearningConfig(epsilon_init=0.01, epsilon_min=0.01), task)
+    training = sejax.TrainingConfig(max_episodes=100, stop_rule="solved", test_episodes=1)
+    keys = jax.random.split(jax.random.key(0), args.agents)
+    for name, env, env_params in (("proxy", proxy, params), ("real task", task.env, task.params)):
+        evaluate = sejax.make_evaluator(agent, env, task, training)
+
+        def train_and_test(key, evaluate=evaluate, env_params=env_params):
+            return evaluate(key, env_params)
+
+        program = sejax.spread_over_devices(train_and_test, lanes=1024)  # in lockstep
+        program = jax.jit(program).lower(keys).compile()
+        started = time.perf_counter()
+        outcome = jax.block_until_ready(program(keys))
+        seconds = time.perf_counter() - started
+        print(f"{name}: {args.agents} agents in {seconds:.1f} s on {jax.device_count()} devices, "
+              f"{outcome.train_steps.sum() / seconds:,.0f} training steps a second; each solves it "
+              f"in {outcome.train_steps.mean():.0f} steps, test return "
+              f"{outcome.test_return.mean():.1f}")  # fmt: skip
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,113 @@
+"""Pieces of an experiment that are computed once, and the rows that it leaves behind.
+
+A piece takes minutes (the agents of one SE). It is written as a CSV file as soon as it is done,
+with the settings that it was made with beside it: the same command again computes only what is
+missing.
+"""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from sejax.errors import ConfigError
+from sejax.files import atomic_path, write_text
+from sejax.serialize import flatten
+
+
+class Pieces:
+    """The finished pieces of an experiment.
+
+    Args:
+      folder: where they are.
+      option: the setting that names this folder or one above it, for messages.
+    """
+
+    def __init__(self, folder: Path, option: str = "work"):
+        self.folder = folder
+        self.option = option
+
+    def compute(
+        self, name: str, settings: dict[str, Any], compute: Callable[[], pd.DataFrame]
+    ) -> pd.DataFrame:
+        """A piece's table: read if it is there, else computed and written.
+
+        Args:
+          name: of the files, `<name>.csv` and `<name>.json`.
+          settings: what the piece depends on; plain values.
+          compute: makes the table.
+
+        Raises:
+          ConfigError: if a piece of that name was made with other settings.
+        """
+        (table,) = self.compute_all({name: settings}, lambda _: [compute()])
+        return table
+
+    def compute_all(
+        self,
+        settings: dict[str, dict[str, Any]],
+        compute: Callable[[list[str]], list[pd.DataFrame]],
+    ) -> list[pd.DataFrame]:
+        """As `compute` for several pieces, of which those that are missing are made at once.
+
+        Args:
+          settings: of each piece, by its name.
+          compute: makes the tables of the pieces with the given names.
+        """
+        settings = json.loads(json.dumps(settings, default=str))
+        missing = [name for name, mine in settings.items() if not self._is_there(name, mine)]
+        for name, table in zip(missing, compute(missing) if missing else [], strict=True):
+            write_text(self._file(name, "csv"), table.to_csv(index=False))
+            write_text(self._file(name, "json"), json.dumps(settings[name], indent=2))
+        return [pd.read_csv(self._file(name, "csv")) for name in settings]
+
+    def _file(self, name: str, kind: str) -> Path:
+        return self.folder / f"{name}.{kind}"
+
+    def _is_there(self, name: str, settings: dict[str, Any]) -> bool:
+        table, made_with = self._file(name, "csv"), self._file(name, "json")
+        if not (table.exists() and made_with.exists()):
+            return False
+        there, asked = flatten(json.loads(made_with.read_text())), flatten(settings)
+        differing = sorted(key for key in {*there, *asked} if there.get(key) != asked.get(key))
+        if differing:
+            raise ConfigError(
+                f"{self.option} must be a new folder or that of the same experiment, because "
+                f"finished pieces are used again; got {table} with another "
+                f"{', '.join(differing)}. Set {self.option}=DIR."
+            )
+        return True
+
+
+def write_rows(path: Path, rows: pd.DataFrame) -> None:
+    """Writes the raw rows of an experiment, compressed."""
+    with atomic_path(path) as temporary:
+        rows.to_csv(temporary, index=False, compression="xz")
+
+
+def read_rows(path: Path) -> pd.DataFrame:
+    """The rows that `write_rows` has written.
+
+    Raises:
+      ConfigError: if there are none.
+    """
+    if not path.exists():
+        raise ConfigError(
+            f"from_rows must be false where no rows are kept, because tables are made from them; "
+            f"got true and no {path}. Set from_rows=false, or out=DIR."
+        )
+    return pd.read_csv(path, low_memory=False)  # a column has one type throughout
+
+
+def stack(tables: dict[str, pd.DataFrame]) -> pd.DataFrame:
+    """Several tables as one, told apart by the column `table`."""
+    named = [table.assign(table=name) for name, table in tables.items()]
+    return pd.concat(named, ignore_index=True)
+
+
+def unstack(rows: pd.DataFrame, name: str) -> pd.DataFrame:
+    """A table of `stack`, without the columns of the others."""
+    mine = rows[rows["table"] == name].drop(columns="table")
+    return mine.dropna(axis=1, how="all").infer_objects().reset_index(drop=True)

@@ -1,0 +1,129 @@
+"""An experiment's settings: typed, checked, and complete as soon as they are made.
+
+A field is written once: its default, that of `quick=true`, what must hold, and what it is about.
+"""
+
+import dataclasses
+import shlex
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar, Self, get_origin, get_type_hints
+
+from sejax import errors, serialize
+from sejax.experiments.pieces import Pieces
+from sejax.options import Options, Rule, counts
+
+RUN_PREFIX = "run."  # of a word about the NES runs: run.es.population_size=8
+_SAME = object()
+
+
+def setting(default: Any, rule: Rule | None = None, *, about: str, quick: Any = _SAME) -> Any:
+    """A field of `Settings`.
+
+    Args:
+      default: its value where none is given; None where it may be left open.
+      rule: what must hold, from `sejax.options` or `each_of`.
+      about: a few words for `--help`.
+      quick: the value with `quick=true`; the default if left out.
+    """
+    quick = default if quick is _SAME else quick
+    return dataclasses.field(
+        default=default, metadata={"rule": rule, "about": about, "quick": quick}
+    )
+
+
+def each_of(known: Collection[str]) -> Rule:
+    """A list of these names."""
+    return lambda name, values, default: errors.each_of(name, values, known)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Settings(Options):
+    """What every experiment is told. `of` makes them; a subclass adds its own fields.
+
+    A folder of results holds what is kept: tables, pictures, learned proxies and the raw rows. What
+    makes an experiment go on where it stopped, in `work`, may be thrown away.
+    """
+
+    name: ClassVar[str]  # of the experiment's module
+    files: ClassVar[str] = ""  # prefix of its files in `out`
+
+    quick: bool = setting(False, about="a small version, in minutes")
+    from_rows: bool = setting(False, about="remake tables and pictures from the rows in `out`")
+    out: str | None = setting(None, about="folder of the results; results/NAME[/TASK], quick "
+                              "runs/experiments/NAME-quick[/TASK]")  # fmt: skip
+    work: str | None = setting(None, about="folder of what is not kept; runs/experiments/... for "
+                               "results/..., else work/ in `out`")  # fmt: skip
+    seed: int = setting(0, lambda name, value, _: errors.require_seed(name, value), about="first "
+                        "random seed")  # fmt: skip
+    devices: int | None = setting(None, counts("something must compute"), about="devices to use; "
+                                  "all")  # fmt: skip
+
+    @classmethod
+    def of(cls, **given: Any) -> Self:
+        """Settings from those that are given, by name; what is None or left out has its default.
+
+        Raises:
+          ConfigError: for an unknown field, or a value that cannot be.
+        """
+        known = {name: value for name, value in given.items() if value is not None}
+        lists = {name for name, kind in get_type_hints(cls).items() if get_origin(kind) is tuple}
+        known |= {name: [known[name]] for name in lists & {*known} if isinstance(known[name], str)}
+        return serialize.from_plain(cls, cls.defaults(known) | known, "")
+
+    @classmethod
+    def defaults(cls, given: Mapping[str, Any]) -> dict[str, Any]:
+        """Values of the fields; they may depend on those that are given, as on `quick`."""
+        quick = bool(given.get("quick"))
+        return {
+            field.name: field.metadata["quick"] if quick else field.default
+            for field in dataclasses.fields(cls)
+        }
+
+    @property
+    def folder(self) -> Path:
+        """Where the results go."""
+        if self.out is not None:
+            return Path(self.out)
+        root = Path("runs/experiments", f"{self.name}-quick") if self.quick else (
+            Path("results", self.name))  # fmt: skip
+        return root / (getattr(self, "env", None) or "")  # tasks would be taken for each other
+
+    @property
+    def work_folder(self) -> Path:
+        """Where finished pieces and NES runs are kept until the experiment is done."""
+        if self.work is not None:
+            return Path(self.work)
+        if self.folder.parts[:1] == ("results",):
+            return Path("runs/experiments", *self.folder.parts[1:])
+        return self.folder / "work"
+
+    @property
+    def pieces(self) -> Pieces:
+        """The finished pieces."""
+        return Pieces(self.work_folder / "pieces")
+
+    @property
+    def rows_file(self) -> Path:
+        """The raw rows, from which everything else is made."""
+        return self.folder / f"{self.files}rows.csv.xz"
+
+    def command(self) -> str:
+        """The command that makes these results; of the fields, those that are not as usual."""
+        usual = self.defaults(vars(self))
+        apart = {"out", "work", "devices", "from_rows"}
+        words = ["python", "-m", f"sejax.experiments.{self.name}"]
+        for name, value in vars(self).items():
+            if name == "run":
+                words += [f"{RUN_PREFIX}{override}" for override in value]
+            elif name not in apart and value != (usual[name] if name != "quick" else False):
+                words.append(f"{name}={as_word(value)}")
+        return shlex.join(words)
+
+
+def as_word(value: Any) -> str:
+    """A value as the command line takes it."""
+    if isinstance(value, tuple | list):
+        return f"[{','.join(map(as_word, value))}]"
+    return {"None": "null", "True": "true", "False": "false"}.get(str(value), str(value))
