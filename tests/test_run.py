@@ -236,7 +236,7 @@ runpy.run_module("sejax.run", run_name="__main__", alter_sys=True)
 """
 
 
-def process(*words: str, timeout: float = 300) -> subprocess.CompletedProcess[str]:
+def process(*words: str, timeout: float = 1800) -> subprocess.CompletedProcess[str]:
     """A process of its own, which finds what has been compiled here."""
     cache = {"JAX_COMPILATION_CACHE_DIR": str(jax.config.jax_compilation_cache_dir),
              "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.05"}  # fmt: skip
