@@ -287,9 +287,8 @@ def test_the_area_under_the_curve_is_of_trainings_that_go_on_when_solved(objecti
     config = sejax.config([*LEARN, f"objective={objective}"])
     assert config.training.stop_rule == "solved"
     asked = []
-    monkeypatch.setattr(
-        bilevel, "make_population_scorer", lambda agent, proxy, training, *_: asked.append(training)
-    )
+    monkeypatch.setattr(bilevel, "make_population_evaluator",
+                        lambda agent, proxy, training, *_: asked.append(training))  # fmt: skip
     bilevel.make_program(**config.parts())
     changes = {"stop_rule": "never", "tests_between": 1}
     assert asked == [dataclasses.replace(config.training, **changes)]

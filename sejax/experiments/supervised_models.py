@@ -92,11 +92,11 @@ def collect_all(settings: SupervisedBaseline, ses: Any) -> list[pd.DataFrame]:
 def collect(config: Any, seed: int, max_rows: int) -> pd.DataFrame:
     """Runs NES and draws transitions, all equally likely, from its agents' real test episodes."""
     run = make_recorded_run(config)
-    state = run.init(jax.random.key(seed))
+    state = run.init(jax.random.key(seed)[None])
     sample = Sample(max_rows, np.random.default_rng(seed))
     for number in range(config.generations):
         state, steps = run.generation(state)
-        sample.add(table_of(jax.device_get(steps), number))
+        sample.add(table_of(jax.device_get(steps), config.training.test_episodes, number))
     return sample.table
 
 
@@ -104,9 +104,9 @@ class RecordedRun(NamedTuple):
     """An NES run whose agents' tests are recorded; compiled functions.
 
     Attributes:
-      init: `key -> LearnState`, leaves without their axis of seeds.
-      generation: `state -> (state, (steps, returns))`, leaves `[agent, step, ...]`: that of
-        `Program.generation`, but for what the state says of the best proxy.
+      init: `keys [1] -> LearnState`.
+      generation: `state -> (state, Steps)`, `Program.generation` with the steps of all its tests,
+        leaves `[agent, step, ...]`.
     """
 
     init: Callable[[Any], Any]
@@ -116,82 +116,46 @@ class RecordedRun(NamedTuple):
 @functools.cache
 def make_recorded_run(config: Any) -> RecordedRun:
     """The NES run of a configuration, from any seed: compiled once for all of them."""
-    from sejax.bilevel import Scores, make_program
+    from sejax.bilevel import make_program
+    from sejax.evaluation import make_evaluator, tested_throughout
 
     program = make_program(**config.parts())
-    strategy, trials = program.strategy, program.strategy.trials
-    seed_ids = jnp.asarray(trials.seed_ids(strategy.num_members))
-    evaluate = make_recorded_evaluation(config)
-
-    def init(key: Any) -> Any:
-        return jax.tree.map(lambda x: x[0], program.init(key[None]))
+    agent, proxy, training = program.agent, program.proxy, config.training
+    if program.objective.needs_tests:
+        training = tested_throughout(training)
+    evaluate = make_evaluator(agent, proxy, proxy.task, training, record=True)
+    evaluate_all = spread_over_devices(
+        lambda key, candidate: evaluate(key, proxy.params(program.unravel(candidate))),
+        config.devices, config.lanes, agent.cpu_lanes,
+    )  # fmt: skip
 
     def generation(state: Any) -> Any:
-        key = jax.random.fold_in(state.key, state.generation)
-        key_ask, key_inner, key_tell = jax.random.split(key, 3)
-        members, asked = strategy.ask(key_ask, state.es_state)
-        candidates = trials.candidates(members, strategy.incumbent(asked))
-        keys = jax.vmap(jax.random.fold_in, (None, 0))(key_inner, seed_ids)
-        outcome, steps = evaluate(keys, jax.vmap(program.unravel)(candidates))
-        scores = Scores.of(program.objective(outcome)[None], trials)
-        tried, mean = trials.of_members(scores.tried[0]), scores.incumbent_mean[0]
-        told = strategy.tell(key_tell, members, tried, mean, asked)
-        return state.replace(es_state=told, generation=state.generation + 1), steps
+        asked = program.ask(state)
+        outcome, steps = evaluate_all(asked.keys[0], asked.candidates[0])
+        state, _ = program.tell(state, asked, jax.tree.map(lambda x: x[None], outcome))
+        return state, steps
 
-    return RecordedRun(init=jax.jit(init), generation=jax.jit(generation))
+    return RecordedRun(init=jax.jit(program.init), generation=jax.jit(generation))
 
 
-def make_recorded_evaluation(config: Any) -> Callable[..., Any]:
-    """Builds `evaluate(keys [n], weights [n]) -> (Outcome, (steps, returns))`, leaves `[n, ...]`.
+def table_of(steps: Any, num_episodes: int, generation: int) -> pd.DataFrame:
+    """The transitions that were made, a row each, with the return of their episode.
 
-    The outcomes are those of `sejax.make_evaluator`.
+    Args:
+      steps: `Steps`, NumPy arrays `[agent, num_episodes * max_steps, ...]`.
+      num_episodes: tests of each agent.
+      generation: of the agents.
     """
-    from sejax.evaluation import make_tested_trainer, return_area, tested_throughout
-    from sejax.objectives import Outcome
-    from sejax.rollout import make_recorder
-
-    parts = config.parts()
-    agent, proxy, task, training = (parts[x] for x in ("agent", "proxy", "task", "training"))
-    if parts["objective"].needs_tests:
-        training = tested_throughout(training)
-    num_episodes = training.test_episodes
-
-    def make_run(agent: Any) -> Callable[..., Any]:
-        train = make_tested_trainer(agent, proxy, task, training)
-        record = make_recorder(agent, task, num_episodes)
-
-        def run(key: Any, weights: Any, hparams: Any) -> Any:
-            key_train, key_test = jax.random.split(key)
-            result = train(key_train, proxy.params(weights), hparams)
-            steps = record(key_test, result.agent_state)
-            rewards = jnp.where(steps.valid, steps.reward, 0.0)
-            returns = rewards.reshape(num_episodes, -1).sum(axis=1)
-            outcome = Outcome(
-                test_returns=returns,
-                train_steps=result.train_steps,
-                train_episodes=result.episodes,
-                return_area=return_area(result, returns.mean()),
-                nonfinite=result.nonfinite | ~jnp.isfinite(returns).all(),
-                real_steps=steps.valid.sum() + result.test_steps,
-            )
-            return outcome, (steps, jnp.repeat(returns, task.max_steps))
-
-        return run
-
-    return spread_over_devices(agent.fresh(make_run), config.devices, config.lanes, agent.cpu_lanes)
-
-
-def table_of(steps_and_returns: Any, generation: int) -> pd.DataFrame:
-    """The transitions that were made, a row each, with the return of their episode."""
-    steps, returns = steps_and_returns
     valid = steps.valid
+    rewards = np.where(valid, steps.reward, 0).reshape(len(valid), num_episodes, -1)
+    returns = np.broadcast_to(rewards.sum(axis=2, keepdims=True), rewards.shape)
     obs, next_obs = steps.obs[valid], steps.next_obs[valid]
     columns = {f"state_{i}": obs[:, i] for i in range(obs.shape[1])}
     columns |= {"action": steps.action[valid]}
     columns |= {f"next_state_{i}": next_obs[:, i] for i in range(obs.shape[1])}
     return pd.DataFrame(columns | {
         "reward": steps.reward[valid], "terminated": steps.terminated[valid].astype(int),
-        "return": returns[valid], "generation": generation,
+        "return": returns.reshape(valid.shape)[valid], "generation": generation,
     })  # fmt: skip
 
 
