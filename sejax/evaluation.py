@@ -118,7 +118,7 @@ def return_area(result: TrainResult, final_return: Array) -> Array:
       final_return: of the test after it, for the steps of an episode that the step limit cut off.
 
     Source: paper, appendix "Studying the Influence of Different Reward Network Optimization
-    Objectives" (AUC); `reference_details.md` 5.5.
+    Objectives" (AUC); `docs/reference.md` 5.5.
     """
     returns = result.returns if result.test_returns is None else result.test_returns
     lengths = jnp.diff(result.episode_ends, prepend=0)

@@ -139,7 +139,7 @@ class AUCSum(Options):
     Agents train a number of episodes, so that it rewards short ones where returns are negative, and
     long ones where they are positive.
 
-    Source: `reference_details.md` 5.5.
+    Source: `docs/reference.md` 5.5.
     """
 
     group: ClassVar[str] = "objective"

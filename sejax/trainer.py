@@ -1,7 +1,7 @@
 """The inner loop: one agent's whole training in one world.
 
 Source: paper, Algorithm 1 (TrainAgent) and appendix "Heuristics for Agent Training and Evaluation";
-`reference_details.md` 3.
+`docs/reference.md` 3.
 """
 
 from collections.abc import Callable

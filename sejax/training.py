@@ -1,6 +1,6 @@
 """How long an agent trains, and how it is tested.
 
-Source: paper, appendix "Heuristics for Agent Training and Evaluation"; `reference_details.md` 3.
+Source: paper, appendix "Heuristics for Agent Training and Evaluation"; `docs/reference.md` 3.
 """
 
 import dataclasses

@@ -1,7 +1,7 @@
 """PPO with a clipped ratio and Monte-Carlo returns, for discrete and for continuous actions.
 
 Source: Schulman et al., "Proximal Policy Optimization Algorithms" (2017); the paper's appendix,
-table of PPO; `reference_details.md` 4.5.
+table of PPO; `docs/reference.md` 4.5.
 """
 
 import functools
@@ -67,7 +67,7 @@ class PPOConfig(AgentOptions):
         `update_episodes`, also in the middle of an episode; this is the first whole number that
         does.
 
-        Source: `reference_details.md` 4.5.
+        Source: `docs/reference.md` 4.5.
         """
         return self.update_episodes * max_episode_steps // self.action_repeat + 1
 
@@ -115,7 +115,7 @@ def make_ppo(
     `update` learns once the rollout is full and costs next to nothing before, in lanes too.
 
     Without exploration the agent takes its most probable action. Differs: the authors also test
-    with sampled actions (`reference_details.md` 3.7), and they do not clip actions, so that
+    with sampled actions (`docs/reference.md` 3.7), and they do not clip actions, so that
     MountainCarContinuous charges for what was drawn. The policy delay in the paper's table for PPO
     has no counterpart in their code, nor here.
 
@@ -299,7 +299,7 @@ def discounted_returns(
       ended: 1 at the last step of an episode, else 0.
       discount: gamma.
 
-    Source: `reference_details.md` 4.5. Differs: the authors restart where the stored `done` exceeds
+    Source: `docs/reference.md` 4.5. Differs: the authors restart where the stored `done` exceeds
     0.5, which in an SE is not so at a time limit; returns there run on into the next episode.
     """
 
@@ -342,7 +342,7 @@ def ppo_loss(
       returns: R, normalised.
       hp: clip_ratio (epsilon), value_weight (c_V) and entropy_weight (c_H).
 
-    Source: Schulman et al. (2017), eq. 7 and 9; `reference_details.md` 4.5.
+    Source: Schulman et al. (2017), eq. 7 and 9; `docs/reference.md` 4.5.
     """
     advantage = jax.lax.stop_gradient(returns - value)
     ratio = jnp.exp(jnp.clip(log_prob - old_log_prob, -_MAX_LOG_RATIO, _MAX_LOG_RATIO))
@@ -382,7 +382,7 @@ def gaussian(max_action: float) -> Distribution:
     Differs: the authors' mean is `tanh(outputs)`, which cannot reach the whole range of a task
     whose largest action is not 1, such as Pendulum. The std is in units of the action, as theirs.
 
-    Source: `reference_details.md` 4.5.
+    Source: `docs/reference.md` 4.5.
     """
 
     def mode(outputs: Float[Array, "action_dim *batch"]) -> Float[Array, "action_dim *batch"]:

@@ -116,7 +116,7 @@ def sample(
       to whole blocks of a batch; the columns beyond what was asked for have weight 0. A remainder
       costs more than the arithmetic on up to seven more columns.
 
-    Source: `reference_details.md` 3.5 (with replacement, from the first stored transition on).
+    Source: `docs/reference.md` 3.5 (with replacement, from the first stored transition on).
     """
     size = jnp.minimum(num_stored, rows.shape[0])
     width = rows.shape[1]

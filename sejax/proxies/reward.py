@@ -1,7 +1,7 @@
 """The reward network (RN): the real task with a learned reward in the place of its own.
 
 Source: paper, section "Learning Reward Networks" (table "Overview of Reward Network variants");
-`reference_details.md` 5.
+`docs/reference.md` 5.
 """
 
 from typing import TYPE_CHECKING, Any

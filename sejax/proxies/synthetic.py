@@ -1,6 +1,6 @@
 """The synthetic environment (SE): three small networks in the place of a real task.
 
-Source: paper, section "Learning Synthetic Environments"; `reference_details.md` 1.
+Source: paper, section "Learning Synthetic Environments"; `docs/reference.md` 1.
 """
 
 from typing import TYPE_CHECKING, Any
