@@ -40,7 +40,7 @@ class Experiment:
         """Computes what is missing, writes everything and returns the table.
 
         Raises:
-          ConfigError: for settings that cannot work, or a folder of other settings.
+          ConfigError: for settings or files that cannot work, or a folder of other settings.
         """
         if not settings.from_rows:
             write_rows(settings.rows_file, self.compute(settings))
@@ -88,9 +88,6 @@ def parse(settings: type[Settings], words: Sequence[str]) -> dict[str, Any]:
     """The fields that the words of a command line give, by Hydra's grammar; lists are `[a,b]`.
 
     Words `run.FIELD=VALUE` make the list `run`: they are read by the NES runs' own configuration.
-
-    Raises:
-      ConfigError: for a word that is no override, or an unknown field.
     """
     from hydra import compose, initialize
     from hydra.core.config_store import ConfigStore
@@ -120,11 +117,7 @@ def parse(settings: type[Settings], words: Sequence[str]) -> dict[str, Any]:
 
 
 def _require_words(settings: type[Settings], words: Sequence[str], fields: list[str]) -> None:
-    """Refuses what is not `field=value` with a message of our own, as Hydra's know no fields.
-
-    Raises:
-      ConfigError: for such a word.
-    """
+    """Refuses what is not `field=value` with a message of our own, as Hydra's know no fields."""
     for word in words:
         name, equals, value = word.partition("=")
         if equals and name in fields:

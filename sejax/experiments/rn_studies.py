@@ -10,6 +10,7 @@ authors' scripts have others for it (`reference_details.md` 4.8 and 7.3).
 """
 
 import dataclasses
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -22,7 +23,8 @@ from sejax import ICMConfig, errors, plugins, serialize
 from sejax.app import build, run_directory
 from sejax.errors import ConfigError
 from sejax.experiments import pieces, proxy_runs
-from sejax.experiments.settings import Settings, setting
+from sejax.experiments.proxy_runs import RunSettings
+from sejax.experiments.settings import setting, work_beside
 from sejax.options import counts, one_of
 
 # Paper, table "Overview of Reward Network variants".
@@ -119,22 +121,17 @@ LABELS = {
 def label(name: str) -> str:
     """Name of a world in pictures: the reward that agents get there."""
     text = LABELS[name.removesuffix(AUGMENTED)]
-    is_plain = AUGMENTED not in name
-    return text if is_plain else text.replace("(s')", "(s', v')").replace("(s)", "(s, v)")
+    return text if AUGMENTED not in name else re.sub(r"\(s('?)\)", r"(s\1, v\1)", text)
 
 
 @dataclass(frozen=True, kw_only=True)
-class RnSettings(Settings):
+class RnSettings(RunSettings):
     """Settings about the task and the RNs that are learned; defaults are those of the study."""
 
     env: str = setting("cliff_walking", one_of(STUDIES), about=f"task: {', '.join(STUDIES)}")
     variants: tuple[str, ...] = setting(VARIANTS, about=f"of the RNs: those, with {AUGMENTED}, "
                                         f"{', '.join(WEIGHTED_INFO)}")  # fmt: skip
     learned: int = setting(10, counts("RNs are learned"), about="RNs to learn of each variant")
-    generations: int | None = setting(None, counts("there is nothing to do otherwise"),
-                                      about="outer iterations; the preset's")  # fmt: skip
-    preset: str = setting("best", about="of the NES runs: best, paper")
-    run: tuple[str, ...] = setting((), about="overrides of the NES runs")
     rns_dir: str | None = setting(None, about="where RNs are kept; results/reward_networks, quick "
                                   "rns/ in `out`")  # fmt: skip
 
@@ -176,18 +173,15 @@ def objective_setting() -> Any:
 
 
 def learn(settings: RnSettings, variant: str, objective: str) -> Any:
-    """The RNs of a variant, learned by an objective: a `ProxySet` in the order of their seeds.
-
-    Raises:
-      ConfigError: for settings that cannot work, or a folder with RNs of other settings.
-    """
+    """The RNs of a variant, learned by an objective: a `ProxySet` in the order of their seeds."""
     there = stored(settings, variant, objective)
     known = there.size if there else 0
     if known < settings.learned:
         config = learning_config(settings, variant, objective)
         config = dataclasses.replace(config, seed=settings.seed + known)
-        path, count = set_file(settings, variant, objective), settings.learned - known
-        folder = runs_folder(settings) / path.relative_to(settings.rns_folder).with_suffix("")
+        path, count = file_of(settings, variant, objective), settings.learned - known
+        runs = work_beside(settings.rns_folder, "runs")
+        folder = runs / path.relative_to(settings.rns_folder).with_suffix("")
         configs = proxy_runs.configs_of_runs(config, count, folder, settings.study.runs_at_once)
         print(f"{variant}: learns {count} RNs, {config.generations} generations each; may be "
               "stopped and started again", flush=True)  # fmt: skip
@@ -200,7 +194,7 @@ def learn(settings: RnSettings, variant: str, objective: str) -> Any:
     return there.first(settings.learned)
 
 
-def set_file(settings: RnSettings, variant: str, objective: str) -> Path:
+def file_of(settings: RnSettings, variant: str, objective: str) -> Path:
     """Where the RNs of a variant and objective are kept."""
     return settings.rns_folder / settings.env / objective / f"{variant}.safetensors"
 
@@ -210,13 +204,6 @@ def curves_file(path: Path) -> Path:
     return path.with_suffix(".csv.xz")
 
 
-def runs_folder(settings: RnSettings) -> Path:
-    """Where NES runs go on; those of results are no results."""
-    rns = settings.rns_folder
-    is_result = rns.parts[:1] == ("results",)
-    return Path("runs/experiments", *rns.parts[1:]) if is_result else rns / "runs"
-
-
 def stored(settings: RnSettings, variant: str, objective: str) -> Any:
     """The RNs that are there already, a `ProxySet`; None if they are to be learned.
 
@@ -224,7 +211,7 @@ def stored(settings: RnSettings, variant: str, objective: str) -> Any:
       ConfigError: if they were learned with other settings. Fewer generations are no such settings:
         their runs go on.
     """
-    path = set_file(settings, variant, objective)
+    path = file_of(settings, variant, objective)
     if not path.exists():
         return None
     there = sejax.load_set(path, option="rns_dir", kind="rn")
@@ -251,27 +238,14 @@ def _what_counts(config: Any) -> dict[str, Any]:
 
 
 def check_stored(settings: RnSettings, objectives: Sequence[str]) -> None:
-    """Checks all RNs that are there before any are learned, which may take days.
-
-    Raises:
-      ConfigError: if some were learned with other settings.
-    """
+    """Checks all RNs that are there (see `stored`) before any are learned, which may take days."""
     for objective in objectives:
         for variant in settings.variants:
             stored(settings, variant, objective)
 
 
 def learning_config(settings: RnSettings, variant: str, objective: str) -> Any:
-    """Settings of the NES runs for a variant and objective.
-
-    Raises:
-      ConfigError: for settings that cannot work.
-    """
+    """Settings of the NES runs for a variant and objective."""
     plain = variant.removesuffix(AUGMENTED)
-    overrides = [f"env={settings.env}", "proxy=rn", f"preset={settings.preset}",
-                 f"proxy.variant={plain}", f"proxy.augmented={str(plain != variant).lower()}",
-                 f"objective={objective}"]  # fmt: skip
-    if settings.generations is not None:
-        overrides.append(f"generations={settings.generations}")
-    config = sejax.config([*overrides, *settings.run])
-    return dataclasses.replace(config, devices=settings.devices, seed=settings.seed)
+    return settings.learn_config(["proxy=rn", f"proxy.variant={plain}", f"objective={objective}",
+                                  f"proxy.augmented={plain != variant}"])  # fmt: skip

@@ -19,27 +19,22 @@ from sejax.experiments import figures, se_agents
 from sejax.experiments.experiment import Experiment
 from sejax.experiments.se_agents import SeAgents
 from sejax.experiments.settings import setting
-from sejax.experiments.tables import publish
+from sejax.experiments.tables import as_texts, publish
 from sejax.experiments.worlds import return_columns
 
 
 @dataclass(frozen=True, kw_only=True)
 class SeModels(SeAgents):
-    """Settings of this experiment."""
-
     name = "se_models"
     files = "models_"
 
-    ses: str | None = setting(None, quick="cartpole", about="file of SEs, from se_feasibility, or "
-                              "a shipped name")  # fmt: skip
+    ses: str | None = setting(
+        None, quick="cartpole", about="file of SEs, from se_feasibility, or a shipped name"
+    )
 
 
 def compute(settings: SeModels) -> pd.DataFrame:
-    """Trains what is missing; a row for each agent.
-
-    Raises:
-      ConfigError: for a file or settings that cannot work.
-    """
+    """Trains what is missing; a row for each agent."""
     ses = load(settings)
     tables = []
     for kind in settings.agents:
@@ -51,11 +46,7 @@ def compute(settings: SeModels) -> pd.DataFrame:
 
 
 def load(settings: SeModels) -> Any:
-    """The SEs that are tested.
-
-    Raises:
-      ConfigError: for a file that cannot be used, or none.
-    """
+    """The SEs that are tested."""
     if settings.ses is None:
         raise ConfigError("ses must be given, because agents are trained on its SEs; got none. "
                           "Set ses=results/se_feasibility/cartpole/ses.safetensors.")  # fmt: skip
@@ -63,12 +54,7 @@ def load(settings: SeModels) -> Any:
 
 
 def summarise(agents: pd.DataFrame, solved_reward: float) -> pd.DataFrame:
-    """One row for each kind of agent and SE, the best SE of each kind first.
-
-    Args:
-      agents: with columns `kind`, `se`, `test_return` and `train_steps`.
-      solved_reward: an agent counts as solving the task from this mean test return on.
-    """
+    """One row for each kind of agent and SE, the best SE of each kind first."""
     grouped = agents.groupby(["kind", "se"], sort=False)
     summary = grouped["test_return"].agg(
         return_mean="mean",
@@ -91,26 +77,18 @@ def rank_correlations(summary: pd.DataFrame) -> pd.DataFrame:
     return means[list(dict.fromkeys(summary["kind"]))].rank().corr()
 
 
-def make_table(summary: pd.DataFrame, ses: Any) -> pd.DataFrame:
-    """The summary as texts, with what is known of each SE."""
-    return pd.DataFrame([
-        {
-            "agent": row.kind,
-            "SE": row.se,
-            "run's seed": ses.seeds[row.se],
-            "score when learned": f"{ses.scores[row.se]:.1f}",
-            "return": f"{row.return_mean:.1f} ± {row.return_std:.1f}",
-            "agents that solve the task": f"{row.solved:.0%}",
-            "training steps": f"{row.train_steps:,.0f}",
-        }
-        for row in summary.itertuples()
-    ])  # fmt: skip
-
-
 def report(settings: SeModels, rows: pd.DataFrame) -> pd.DataFrame:
-    """Writes the table and the picture."""
     ses = load(settings)
     task = ses.task
+    columns = {
+        "agent": "{kind}",
+        "SE": lambda row: row.se,
+        "run's seed": lambda row: ses.seeds[row.se],
+        "score when learned": lambda row: f"{ses.scores[row.se]:.1f}",
+        "return": "{return_mean:.1f} ± {return_std:.1f}",
+        "agents that solve the task": "{solved:.0%}",
+        "training steps": "{train_steps:,.0f}",
+    }
     summary = summarise(rows, task.solved_reward)
     kinds = {str(kind): mine for kind, mine in rows.groupby("kind", sort=False)}
     figures.violins(kinds, return_columns(rows), task.name, task.solved_reward,
@@ -121,7 +99,7 @@ def report(settings: SeModels, rows: pd.DataFrame) -> pd.DataFrame:
         f"SEs and shows violins only, no numbers.{correlations_text(summary)}"
     )
     title = f"Single SEs of {task.name} (solved at {task.solved_reward:g})"
-    return publish(settings, title, make_table(summary, ses), summary, note)
+    return publish(settings, title, as_texts(summary, columns), summary, note)
 
 
 def correlations_text(summary: pd.DataFrame) -> str:

@@ -6,9 +6,9 @@ group is a piece that is computed once.
 
 import dataclasses
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import jax
 import numpy as np
@@ -26,46 +26,41 @@ GROUPS_AT_ONCE = 5  # groups of agents in one program, but for one CPU device
 
 
 class Group(NamedTuple):
-    """Where a group of agents trains.
+    """Where a group of agents trains."""
 
-    Attributes:
-      name: in the names of files, and in the rows' column `group`.
-      params: `EnvParams`.
-      fingerprint: what tells its world from those of other groups.
-    """
-
-    name: str
-    params: Any
-    fingerprint: str = ""
+    name: str  # in the names of files, and in the rows' column `group`
+    params: Any  # `EnvParams`
+    fingerprint: str = ""  # what tells its world from those of other groups
 
 
 @dataclass(frozen=True, kw_only=True)
 class World:
-    """What agents are trained in, which, and how long.
+    """What agents are trained in, which, and how long."""
 
-    Attributes:
-      name: in the names of files.
-      env: gymnax environment; `params` are what its groups differ in.
-      task: the real task that agents are tested on.
-      groups: of agents.
-      agent: configuration of all.
-      training: how long they train.
-      exploration: their bonus.
-      hparams: "default", or "varied" if hyperparameters are drawn for each agent.
-      settings: what else the results depend on, such as the proxies' configuration; plain values.
-      is_single: whether its one group takes its keys from the seed itself.
-    """
-
-    name: str
-    env: Any
-    task: Any
+    name: str  # in the names of files
+    env: Any  # gymnax environment; `params` are what its groups differ in
+    task: Any  # the real one, that agents are tested on
     groups: tuple[Group, ...]
-    agent: Any
+    agent: Any  # configuration of all
     training: TrainingConfig
     exploration: Any = field(default_factory=NoExploration)
-    hparams: str = "default"
-    settings: dict[str, Any] = field(default_factory=dict)
-    is_single: bool = False
+    hparams: str = "default"  # or "varied": drawn for each agent
+    settings: dict[str, Any] = field(default_factory=dict)  # what else results depend on; plain
+    is_single: bool = False  # whether its one group takes its keys from the seed itself
+
+    @classmethod
+    def real(cls, task: Any, names: Iterable[str], **rest: Any) -> Self:
+        """The real task for groups of these names."""
+        groups = tuple(Group(name, task.params) for name in names)
+        return cls(env=task.env, task=task, groups=groups, **rest)
+
+    @classmethod
+    def of_set(cls, proxies: Any, names: Iterable[str], **rest: Any) -> Self:
+        """The proxies of a `ProxySet`, one for each group; the first ones again for more groups."""
+        places = [(name, i % proxies.size) for i, name in enumerate(names)]
+        groups = tuple(Group(name, proxies.one(i), proxies.fingerprint(i)) for name, i in places)
+        settings = {"proxy": proxies.config["proxy"], **rest.pop("settings", {})}
+        return cls(env=proxies.env, task=proxies.task, groups=groups, settings=settings, **rest)
 
     def settings_of(self, group: Group) -> dict[str, Any]:
         """What a group's results depend on, beside the random numbers."""
@@ -83,19 +78,13 @@ class World:
 
 @dataclass(frozen=True, kw_only=True)
 class Measure:
-    """What is kept of an agent's training.
+    """What is kept of an agent's training."""
 
-    Attributes:
-      make_run: `(agent, env, task, training) -> run(key, env_params, active)`, whose result has
-        leaves `[]` and `[episode]`.
-      to_table: `(results [agent, ...], drawn hyperparameters [agent]) -> rows`, with a column
-        `agent` and a column `test_return`.
-      say: of the rows of a group, for people.
-    """
-
+    # (agent, env, task, training) -> run(key, env_params, active), with leaves `[]` and `[episode]`
     make_run: Callable[[Any, Any, Any, TrainingConfig], Callable[..., Any]]
+    # (results [agent, ...], drawn hyperparameters [agent]) -> rows, with a column `agent`
     to_table: Callable[[Any, dict[str, np.ndarray]], pd.DataFrame]
-    say: Callable[[pd.DataFrame], str]
+    say: Callable[[pd.DataFrame], str]  # of the rows of a group, for people
 
 
 def train_groups(
@@ -108,19 +97,10 @@ def train_groups(
     """Rows of all agents of a world, with a column `group`; trains the groups that are missing.
 
     The agents of the i-th group have the same seeds in every world: where hyperparameters are
-    drawn, the worlds are compared on equal draws.
-
-    Args:
-      world: where they train.
-      settings: of the experiment: seed, devices, and where finished groups are kept.
-      num_agents: in each group.
-      measure: `OUTCOMES` if not given.
-      at_once: groups in one program, of which all are finished together; see `groups_at_once`.
-
-    Raises:
-      ConfigError: for stored groups of other settings.
+    drawn, the worlds are compared on equal draws. `at_once` groups are one program and finished
+    together; see `groups_at_once`. What is kept of an agent are its `OUTCOMES` by default.
     """
-    measure = measure or OUTCOMES
+    measure = measure or OUTCOMES  # which are defined below
     shared = {"num_agents": num_agents, "seed": settings.seed}
     tables = []
     for first in range(0, len(world.groups), at_once):
@@ -147,8 +127,9 @@ def train(
     at_once: int,
 ) -> list[pd.DataFrame]:
     """The rows of the groups at these places; a program is compiled once for `at_once` of them."""
-    program = make_program(measure, world.agent, world.exploration, world.hparams, world.env,
-                           world.task, world.training, settings.devices)  # fmt: skip
+    program = make_program(
+        measure, world.agent, world.exploration, world.hparams, world.env, world.task,
+        world.training, settings.devices)  # fmt: skip
     padded = [*places, *[places[-1]] * (at_once - len(places))]
     keys = jax.numpy.concatenate([
         agent_keys(settings.seed, None if world.is_single else i, num_agents) for i in padded
@@ -213,12 +194,7 @@ def groups_at_once(devices: int | None) -> int:
 
 
 def training_as_learned(proxies: Any, agent: Any) -> TrainingConfig:
-    """How long an agent trains on SEs: as those that they were learned with.
-
-    Args:
-      proxies: a `ProxySet`.
-      agent: configuration of the agent.
-    """
+    """How long an agent trains on a set of SEs: as those that they were learned with."""
     learned = serialize.from_plain(TrainingConfig, proxies.config["training"], "training")
     learned_with = plugins.configure("agent", proxies.config["agent"])
     return budget_for(learned, agent, learned_with, proxies.task.max_steps)
@@ -271,9 +247,7 @@ def make_curves(agent: Any, env: Any, task: Any, training: TrainingConfig) -> Ca
 def curve_rows(curves: tuple[np.ndarray, np.ndarray], drawn: Any = None) -> pd.DataFrame:
     """A row for each training episode: agent, training steps at its end, mean return of its tests.
 
-    Args:
-      curves: test returns and training steps, `[agent, episode]`.
-      drawn: not kept.
+    The curves are test returns and training steps, `[agent, episode]`.
     """
     tables = []
     for agent, (returns, ends) in enumerate(zip(*curves, strict=True)):
