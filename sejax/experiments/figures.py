@@ -96,6 +96,17 @@ def densities(
     axis.set_xlim(low, high)
 
 
+def histogram(
+    axis: Any, values: Any, edges: Any, color: str, alpha: float, lw: float, **options: Any
+) -> None:
+    """Draws how often values are met, on a logarithmic scale; `options` are of the outline."""
+    weights = options.pop("weights", None)
+    shared: Any = {"bins": edges, "color": color, "weights": weights}
+    axis.hist(values, histtype="stepfilled", alpha=alpha, **shared)
+    axis.hist(values, histtype="step", lw=lw, **shared, **options)
+    axis.set_yscale("log")
+
+
 def bars(axis: Any, groups: dict[str, tuple[str, np.ndarray]], below: Sequence[str]) -> None:
     """Draws means as bars with their std; `groups` are label to (colour, values).
 

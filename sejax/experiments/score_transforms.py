@@ -34,8 +34,8 @@ from sejax.es.score_transforms import TRANSFORMS
 from sejax.es.strategy import Strategy
 from sejax.experiments import figures
 from sejax.experiments.experiment import Experiment
-from sejax.experiments.settings import Settings, setting
-from sejax.experiments.tables import bootstrap_interval, publish
+from sejax.experiments.settings import Settings, count, setting
+from sejax.experiments.tables import as_texts, bootstrap_interval, publish
 from sejax.options import Options, counts
 
 SCORE_TRANSFORMS = tuple(TRANSFORMS)
@@ -62,25 +62,18 @@ PAPER = {"all_better_1": "among the best", "all_better_2": "among the best"}
 
 @dataclass(frozen=True, kw_only=True)
 class ScoreTransforms(Settings):
-    """Settings of this experiment."""
-
     name = "score_transforms"
 
-    runs: int = setting(220, counts("it counts runs"), quick=12, about="of each score transform, "
-                        "with mirrored sampling and as many without")  # fmt: skip
-    generations: int = setting(50, counts("it counts generations"), quick=10, about="of a run at "
-                               "most")  # fmt: skip
+    runs: int = count(220, "runs", quick=12, about="of each score transform, with mirrored "
+                      "sampling and as many without")  # fmt: skip
+    generations: int = count(50, "generations", quick=10, about="of a run at most")
     population: int = setting(16, counts("scores are compared within a generation", least=2),
                               quick=8, about="members of a generation")  # fmt: skip
-    bins: int = setting(9, counts("it counts bins"), quick=3, about="of step sizes")
+    bins: int = count(9, "bins", quick=3, about="of step sizes")
 
 
 def compute(settings: ScoreTransforms) -> pd.DataFrame:
-    """Computes what is missing; a row for each run.
-
-    Raises:
-      ConfigError: for settings that cannot work, or an output folder of other settings.
-    """
+    """Computes what is missing; a row for each run."""
     tables = []
     for mirrored, transform in itertools.product((True, False), SCORE_TRANSFORMS):
         name = f"{transform}-{'mirrored' if mirrored else 'plain'}"
@@ -164,15 +157,10 @@ class AnyNES(Options):
 
 
 class Search(NamedTuple):
-    """Compiled functions over NES runs.
+    """Compiled functions over NES runs."""
 
-    Attributes:
-      init: `(keys [run], step_sizes [run], transform) -> state`; the number of a transform.
-      advance: `state -> state`, a generation of every run that has not solved the task.
-    """
-
-    init: Callable[..., Any]
-    advance: Callable[[Any], Any]
+    init: Callable[..., Any]  # (keys [run], step_sizes [run], number of a transform) -> state
+    advance: Callable[[Any], Any]  # a generation of every run that has not solved the task
 
 
 @functools.cache
@@ -239,25 +227,20 @@ def summarise(runs: pd.DataFrame, bins: int) -> pd.DataFrame:
 def make_table(summary: pd.DataFrame) -> pd.DataFrame:
     """The summary as texts, with the rank of the cell among those of the same sampling."""
     ranks = summary.groupby("mirrored")[["updates", "best_updates"]].rank(method="min")
-    return pd.DataFrame([
-        {
-            "score transform": LABELS[str(row["transform"])],
-            "mirrored": "yes" if row["mirrored"] else "no",
-            "rank": f"{rank['updates']:.0f}",
-            "updates, all step sizes": f"{row['updates']:.1f} "
-                                       f"[{row['updates_low']:.1f}, {row['updates_high']:.1f}]",
-            "solved": f"{row['solved']:.0%}",
-            "best step sizes": f"{row['best_low']:.2g} to {row['best_high']:.2g}",
-            "updates there": f"{row['best_updates']:.1f}",
-            "rank there": f"{rank['best_updates']:.0f}",
-            "paper": PAPER.get(str(row["transform"]), ""),
-        }
-        for (_, row), (_, rank) in zip(summary.iterrows(), ranks.iterrows(), strict=True)
-    ])  # fmt: skip
+    return as_texts(summary.join(ranks.add_suffix("_rank")), {
+        "score transform": lambda row: LABELS[row.transform],
+        "mirrored": lambda row: "yes" if row.mirrored else "no",
+        "rank": "{updates_rank:.0f}",
+        "updates, all step sizes": "{updates:.1f} [{updates_low:.1f}, {updates_high:.1f}]",
+        "solved": "{solved:.0%}",
+        "best step sizes": "{best_low:.2g} to {best_high:.2g}",
+        "updates there": "{best_updates:.1f}",
+        "rank there": "{best_updates_rank:.0f}",
+        "paper": lambda row: PAPER.get(row.transform, ""),
+    })  # fmt: skip
 
 
 def report(settings: ScoreTransforms, rows: pd.DataFrame) -> pd.DataFrame:
-    """Writes the table and the picture."""
     bins, generations = settings.bins, settings.generations
     summary = summarise(rows, bins)
     draw(rows, bins, generations, settings.folder / "score_transforms.png")
@@ -278,33 +261,21 @@ def report(settings: ScoreTransforms, rows: pd.DataFrame) -> pd.DataFrame:
 
 
 def draw(runs: pd.DataFrame, bins: int, generations: int, path: Path) -> None:
-    """Draws every run as a dot, as the paper's figure, and means over bins of step sizes below.
-
-    Args:
-      runs: of all cells.
-      bins: of step sizes.
-      generations: of a run at most; the end of the colour scale.
-      path: the picture.
-    """
+    """Draws every run as a dot, as the paper's figure, and means over bins of step sizes below."""
     scale = plt.Normalize(0, generations)
-    with plt.rc_context(figures.STYLE):
-        figure, axes = plt.subplots(2, 2, figsize=(10, 7.6), sharey=True, layout="constrained")
+    with figures.panels(path, 2, 2, (10, 7.6), sharey=True) as (figure, axes):
         for column, mirrored in enumerate((True, False)):
             mine = runs[runs["mirrored"] == mirrored]
             _dots(axes[0, column], mine, scale)
             _heat_map(axes[1, column], binned(mine, bins), bins, scale)
             axes[0, column].set_title(f"{'with' if mirrored else 'without'} mirrored sampling")
         for axis in axes.ravel():
-            axis.set_xscale("log")
-            axis.set_xlim(*STEP_SIZES)
-            axis.set_xlabel("NES step size")
+            axis.set(xscale="log", xlim=STEP_SIZES, xlabel="NES step size")
         axes[0, 0].set_yticks(range(len(LABELS)), list(LABELS.values()))
-        axes[0, 0].set_ylim(len(LABELS) - 0.5, -0.5)
-        axes[0, 0].set_ylabel("single runs")
+        axes[0, 0].set(ylim=(len(LABELS) - 0.5, -0.5), ylabel="single runs")
         axes[1, 0].set_ylabel("means over bins of step sizes")
         bar = figure.colorbar(plt.cm.ScalarMappable(scale, _COLORS), ax=axes, fraction=0.04)
         bar.set_label(f"updates of the SE until it solves the task ({generations}: not solved)")
-        figures.write(figure, path)
 
 
 _COLORS = "viridis_r"  # dark is slow; even in lightness, so that it reads without colour

@@ -80,7 +80,7 @@ def rank_correlations(summary: pd.DataFrame) -> pd.DataFrame:
 def report(settings: SeModels, rows: pd.DataFrame) -> pd.DataFrame:
     ses = load(settings)
     task = ses.task
-    columns = {
+    columns: dict[str, Any] = {
         "agent": "{kind}",
         "SE": lambda row: row.se,
         "run's seed": lambda row: ses.seeds[row.se],

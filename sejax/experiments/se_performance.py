@@ -84,8 +84,9 @@ def compute(settings: SePerformance) -> pd.DataFrame:
 
 
 def load_sets(settings: SePerformance) -> dict[str, Any]:
-    """The sets of SEs that are compared, by how they were learned; those without a file left out."""
-    files = {name: file for name in ("varied", "fixed") if (file := getattr(settings, name))}
+    """The sets of SEs that are compared, by how they were learned; those with a file."""
+    given = {"varied": settings.varied, "fixed": settings.fixed}
+    files = {name: file for name, file in given.items() if file is not None}
     if settings.quick and not files:
         files["fixed"] = settings.env or "cartpole"
     sets = {}
