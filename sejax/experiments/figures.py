@@ -28,10 +28,7 @@ STYLE: Any = {"font.size": 10, "axes.spines.top": False, "axes.spines.right": Fa
 def learning_curves(curves: pd.DataFrame, solved_reward: float, path: Path) -> None:
     """Draws each run's incumbent mean as a thin line, and their mean with one std.
 
-    Args:
-      curves: rows of all runs, with the columns of `metrics.csv`.
-      solved_reward: the task's threshold, drawn as a line.
-      path: the picture.
+    The curves have the columns of `metrics.csv`; the task's threshold is a line.
 
     Source: paper, figure "Multiple NES runs of Alg. 1".
     """
@@ -49,10 +46,9 @@ def learning_curves(curves: pd.DataFrame, solved_reward: float, path: Path) -> N
         axis.plot(iterations, mean, color=REAL, lw=2.4)
         axis.axhline(solved_reward, color=SOLVED, ls="--", lw=1.2,
                      label=f"solved ({solved_reward:g})")  # fmt: skip
-        axis.set_xlabel("NES outer iteration")
-        axis.set_ylabel("mean return of the incumbent's\nagents on the real task")
+        axis.set(xlabel="NES outer iteration", xlim=(1, max(iterations[-1], 2)),
+                 ylabel="mean return of the incumbent's\nagents on the real task")  # fmt: skip
         axis.xaxis.set_major_locator(MaxNLocator(integer=True))
-        axis.set_xlim(1, max(iterations[-1], 2))
         axis.legend(fontsize=9, loc="best")
 
 
@@ -61,12 +57,6 @@ def density(values: Any, grid: Any, low: float, high: float) -> np.ndarray:
 
     The bandwidth is Scott's, :math:`std \\cdot n^{-1/5}`, and at least 1% of the interval, as
     returns may all be equal. Mass that a kernel would put outside the interval is reflected.
-
-    Args:
-      values: `[n]`.
-      grid: `[points]` where to estimate.
-      low: no value can be lower.
-      high: no value can be higher.
     """
     values, grid = np.asarray(values, float), np.asarray(grid, float)
     bandwidth = max(values.std() * values.size ** (-1 / 5), 0.01 * (high - low), 1e-9)
@@ -91,36 +81,23 @@ def densities(
         axis.plot(grid, line, color=color, lw=1.8)
         axis.fill_between(grid, line, color=color, alpha=0.12, lw=0)
         axis.axvline(returns.mean(), color=color, ls="--", lw=1.1)
-    axis.set_yscale("log")
-    axis.set_ylim(1e-4 * peak, 2 * peak)
-    axis.set_xlim(low, high)
+    axis.set(yscale="log", ylim=(1e-4 * peak, 2 * peak), xlim=(low, high))
 
 
-def histogram(
-    axis: Any, values: Any, edges: Any, color: str, alpha: float, lw: float, **options: Any
-) -> None:
-    """Draws how often values are met, on a logarithmic scale; `options` are of the outline."""
-    weights = options.pop("weights", None)
-    shared: Any = {"bins": edges, "color": color, "weights": weights}
-    axis.hist(values, histtype="stepfilled", alpha=alpha, **shared)
-    axis.hist(values, histtype="step", lw=lw, **shared, **options)
+def histogram(axis: Any, values: Any, alpha: float, lw: float, label: str = "", **how: Any) -> None:
+    """Draws how often values are met, on a logarithmic scale."""
+    axis.hist(values, histtype="stepfilled", alpha=alpha, **how)
+    axis.hist(values, histtype="step", lw=lw, label=label, **how)
     axis.set_yscale("log")
 
 
 def bars(axis: Any, groups: dict[str, tuple[str, np.ndarray]], below: Sequence[str]) -> None:
-    """Draws means as bars with their std; `groups` are label to (colour, values).
-
-    Args:
-      axis: where to draw.
-      groups: a bar each.
-      below: a text under each bar.
-    """
+    """Draws means as bars with their std; `groups` are label to (colour, values)."""
     for index, (color, values) in enumerate(groups.values()):
         mean, std = values.mean(), values.std()
         axis.bar(index, mean, color=color, alpha=0.85, width=0.7)
-        axis.errorbar(
-            index, mean, yerr=[[min(std, mean)], [std]], color="#7a7a7a", capsize=3, lw=1.2
-        )
+        errors = [[min(std, mean)], [std]]
+        axis.errorbar(index, mean, yerr=errors, color="#7a7a7a", capsize=3, lw=1.2)
     axis.set_xticks(range(len(groups)), below, fontsize=8)
     axis.set_ylim(bottom=0)
     axis.ticklabel_format(axis="y", style="plain")
@@ -135,28 +112,26 @@ def performance(
 ) -> None:
     """Draws a column for each kind of agent: densities of returns, bars of steps and episodes.
 
-    Args:
-      columns: kind to setting to (colour, agents).
-      returns: names of the agents' columns with the return of one test episode.
-      task: name of the real task.
-      path: the picture.
+    `columns` are kind to setting to (colour, agents), `returns` the agents' columns with the return
+    of one test episode.
     """
-    every = [agents[returns].to_numpy() for settings in columns.values()
-             for _, agents in settings.values()]  # fmt: skip
-    low = min(x.min() for x in every)
-    high = max(low + 1, *(x.max() for x in every))
+    every = [agents[returns] for mine in columns.values() for _, agents in mine.values()]
+    low = min(x.min(axis=None) for x in every)
+    high = max(low + 1, *(x.max(axis=None) for x in every))
     size = (1.2 + 3.6 * len(columns), 8)
     with panels(path, 3, len(columns), size, height_ratios=(1.5, 1, 1)) as (figure, axes):
         for column, (kind, settings) in enumerate(columns.items()):
-            top, middle, bottom = axes[:, column]
-            densities(top, {label: (color, agents[returns].to_numpy().ravel())
-                            for label, (color, agents) in settings.items()}, low, high)  # fmt: skip
-            top.set_title(AGENT_NAMES.get(kind, kind))
-            top.set_xlabel(f"return of a test episode on {task}")
-            below = [f"{agents[returns].to_numpy().mean():.1f}" for _, agents in settings.values()]
-            for axis, name in ((middle, "train_steps"), (bottom, "train_episodes")):
-                bars(axis, {label: (color, agents[name].to_numpy(float))
-                            for label, (color, agents) in settings.items()}, below)  # fmt: skip
+            top, *lower = axes[:, column]
+
+            def of(names: Any, mine: Any = settings) -> dict[str, tuple[str, np.ndarray]]:
+                return {label: (color, agents[names].to_numpy(float).ravel())
+                        for label, (color, agents) in mine.items()}  # fmt: skip
+
+            densities(top, of(returns), low, high)
+            top.set(title=AGENT_NAMES.get(kind, kind), xlabel=f"return of a test episode on {task}")
+            below = [f"{values.mean():.1f}" for _, values in of(returns).values()]
+            for axis, name in zip(lower, ("train_steps", "train_episodes"), strict=True):
+                bars(axis, of(name), below)
                 axis.set_xlabel("mean return")
         for axis, label in zip(axes[:, 0], ("density (log scale)", "training steps",
                                             "training episodes"), strict=True):  # fmt: skip
@@ -174,12 +149,7 @@ def violins(
 ) -> None:
     """Draws a violin of the returns for each SE, the best first, in a row for each kind of agent.
 
-    Args:
-      kinds: kind of agent to its agents, with a column `se`.
-      returns: names of the agents' columns with the return of one test episode.
-      task: name of the real task.
-      solved_reward: the task's threshold, drawn as a line.
-      path: the picture.
+    Agents have a column `se`, and columns `returns` with the return of one test episode.
 
     Source: paper, appendix "Evaluation of Individual SE Models".
     """
@@ -221,27 +191,14 @@ def legend_above(figure: Any, axis: Any, columns: int = 4) -> None:
 def panels(
     path: Path, lines: int, columns: int, size: tuple[float, float], **options: Any
 ) -> Iterator[tuple[Any, Any]]:
-    """A figure and its axes `[lines, columns]`, which is written when all is drawn.
-
-    Args:
-      path: the picture.
-      lines: of panels.
-      columns: likewise.
-      size: in inches.
-      **options: of `plt.subplots`.
-    """
+    """A figure, its size in inches, and its axes `[lines, columns]`; written when all is drawn."""
     with plt.rc_context(STYLE):
         figure, axes = plt.subplots(lines, columns, figsize=size, squeeze=False,
                                     layout="constrained", **options)  # fmt: skip
         yield figure, axes
-        write(figure, path)
-
-
-def write(figure: Any, path: Path) -> None:
-    """Writes and closes a figure, in 256 colours: a third of the bytes."""
-    with atomic_path(path) as temporary:
-        figure.savefig(temporary, dpi=200)
-        with Image.open(temporary) as picture:
-            few = picture.convert("RGB").quantize(256, dither=Image.Dither.NONE)
-        few.save(temporary, format="png", optimize=True)
-    plt.close(figure)
+        with atomic_path(path) as temporary:
+            figure.savefig(temporary, dpi=200)
+            with Image.open(temporary) as picture:  # in 256 colours: a third of the bytes
+                few = picture.convert("RGB").quantize(256, dither=Image.Dither.NONE)
+            few.save(temporary, format="png", optimize=True)
+        plt.close(figure)

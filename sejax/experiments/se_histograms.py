@@ -298,7 +298,7 @@ def draw(task: Any, rows: pd.DataFrame, path: Path) -> None:
                 samples = {s: mine[mine["source"] == s][column].to_numpy() for s in SOURCES}
                 edges = bin_edges(samples)
                 for source, values in samples.items():
-                    figures.histogram(axis, values, edges, COLORS[source], alpha=0.3, lw=1.1)
+                    figures.histogram(axis, values, 0.3, 1.1, bins=edges, color=COLORS[source])
                 axis.set_xlim(edges[0], edges[-1])
                 axis.set_xlabel(f"next {name}" if name != "reward" else name, fontsize=9)
             line[0].set_ylabel(f"{figures.AGENT_NAMES.get(kind, kind)}\ntransitions")

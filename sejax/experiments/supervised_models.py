@@ -22,7 +22,7 @@ from sejax import plugins
 from sejax.app import build
 from sejax.experiments import se_agents
 from sejax.experiments.se_agents import AGENTS
-from sejax.experiments.settings import Settings, each_of, setting
+from sejax.experiments.settings import Settings, count, each_of, setting
 from sejax.experiments.worlds import HPARAMS
 from sejax.options import counts
 from sejax.parallel import spread_over_devices
@@ -38,19 +38,17 @@ class SupervisedBaseline(Settings):
 
     proxy: str = setting("cartpole", about="SE to compare with, whose settings the NES runs have; "
                          "run directory, file or name")  # fmt: skip
-    models: int = setting(5, counts("it counts models"), quick=2, about="NES runs, and a model for "
-                          "each")  # fmt: skip
-    generations: int = setting(25, counts("it counts generations"), quick=3, about="of an NES run")
+    models: int = count(5, "models", quick=2, about="NES runs, and a model for each")
+    generations: int = count(25, "generations", quick=3, about="of an NES run")
     population: int = setting(16, counts("scores are compared within a generation", least=2),
                               quick=3, about="members of a generation")  # fmt: skip
-    max_rows: int = setting(100_000, counts("it counts transitions"), quick=3000,
-                            about="transitions for a model")  # fmt: skip
-    epochs: int = setting(100, counts("it counts epochs"), quick=20, about="of a fit")
+    max_rows: int = count(100_000, "transitions", quick=3000, about="transitions for a model")
+    epochs: int = count(100, "epochs", quick=20, about="of a fit")
     agents: tuple[str, ...] = setting(("ddqn",), each_of(AGENTS), about=f"of {', '.join(AGENTS)}")
     hparams: tuple[str, ...] = setting(HPARAMS, each_of(HPARAMS), about="of the agents; varied: "
                                        "drawn for each")  # fmt: skip
-    num_agents: int = setting(20, counts("it counts agents"), quick=2, about="for each model")
-    test_episodes: int = setting(10, counts("it counts episodes"), about="of each agent")
+    num_agents: int = count(20, "agents", quick=2, about="for each model")
+    test_episodes: int = count(10, "episodes", about="of each agent")
     max_steps: int | None = setting(None, counts("an agent must train"), about="training steps of "
                                     "an agent on a model; as on the SE")  # fmt: skip
 
@@ -101,15 +99,10 @@ def collect(config: Any, seed: int, max_rows: int) -> pd.DataFrame:
 
 
 class RecordedRun(NamedTuple):
-    """An NES run whose agents' tests are recorded; compiled functions.
+    """An NES run whose agents' tests are recorded; compiled functions."""
 
-    Attributes:
-      init: `keys [1] -> LearnState`.
-      generation: `state -> (state, Steps)`, `Program.generation` with the steps of all its tests,
-        leaves `[agent, step, ...]`.
-    """
-
-    init: Callable[[Any], Any]
+    init: Callable[[Any], Any]  # keys [1] -> LearnState
+    # state -> (state, Steps): `Program.generation` with the steps of all tests, [agent, step, ...]
     generation: Callable[[Any], Any]
 
 
@@ -141,19 +134,15 @@ def make_recorded_run(config: Any) -> RecordedRun:
 def table_of(steps: Any, num_episodes: int, generation: int) -> pd.DataFrame:
     """The transitions that were made, a row each, with the return of their episode.
 
-    Args:
-      steps: `Steps`, NumPy arrays `[agent, num_episodes * max_steps, ...]`.
-      num_episodes: tests of each agent.
-      generation: of the agents.
+    `steps` are `Steps` of NumPy arrays `[agent, num_episodes * max_steps, ...]`.
     """
     valid = steps.valid
     rewards = np.where(valid, steps.reward, 0).reshape(len(valid), num_episodes, -1)
     returns = np.broadcast_to(rewards.sum(axis=2, keepdims=True), rewards.shape)
     obs, next_obs = steps.obs[valid], steps.next_obs[valid]
-    columns = {f"state_{i}": obs[:, i] for i in range(obs.shape[1])}
-    columns |= {"action": steps.action[valid]}
-    columns |= {f"next_state_{i}": next_obs[:, i] for i in range(obs.shape[1])}
-    return pd.DataFrame(columns | {
+    return pd.DataFrame({
+        **{f"state_{i}": x for i, x in enumerate(obs.T)}, "action": steps.action[valid],
+        **{f"next_state_{i}": x for i, x in enumerate(next_obs.T)},
         "reward": steps.reward[valid], "terminated": steps.terminated[valid].astype(int),
         "return": returns.reshape(valid.shape)[valid], "generation": generation,
     })  # fmt: skip
@@ -237,12 +226,9 @@ def arrays_of(rows: pd.DataFrame) -> tuple[np.ndarray, np.ndarray, np.ndarray, n
     """States `[n, obs_dim]`, actions `[n]`, targets [s', r] and ends `[n]`."""
     states = [name for name in rows if name.startswith("state_")]
     targets = [name for name in rows if name.startswith("next_state_")] + ["reward"]
-    return (
-        rows[states].to_numpy(np.float32),
-        rows["action"].to_numpy(np.int32),
-        rows[targets].to_numpy(np.float32),
-        rows["terminated"].to_numpy(np.float32),
-    )
+    return (rows[states].to_numpy(np.float32), rows["action"].to_numpy(np.int32),
+            rows[targets].to_numpy(np.float32),
+            rows["terminated"].to_numpy(np.float32))  # fmt: skip
 
 
 def make_fit(env: Any, num_rows: int, epochs: int) -> Callable[..., Any]:

@@ -5,6 +5,8 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from rich.console import Console
+from rich.table import Table
 
 from sejax.experiments.settings import Settings
 from sejax.files import write_text
@@ -60,9 +62,6 @@ def publish(
 
 def print_table(title: str, table: pd.DataFrame) -> None:
     """Prints a table of texts."""
-    from rich.console import Console
-    from rich.table import Table
-
     printed = Table(*map(str, table.columns), title=title)
     for row in table.itertuples(index=False):
         printed.add_row(*map(str, row))
