@@ -4,7 +4,8 @@ The agents of a row of the paper's figure are trained in worlds: the real task, 
 an exploration bonus, and each of several RNs.
 """
 
-from collections.abc import Iterator, Mapping
+import functools
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,13 +13,12 @@ import numpy as np
 import pandas as pd
 
 from sejax import errors
-from sejax.agents import NoExploration
 from sejax.errors import require
 from sejax.experiments import figures, return_curves, rn_studies, worlds
 from sejax.experiments.rn_studies import RnSettings
-from sejax.experiments.settings import each_of, setting
-from sejax.experiments.tables import bootstrap_interval
-from sejax.experiments.worlds import Group, World
+from sejax.experiments.settings import count, each_of, setting
+from sejax.experiments.tables import as_texts, bootstrap_interval
+from sejax.experiments.worlds import World
 from sejax.options import counts
 from sejax.plugins import name_of
 from sejax.training import TrainingConfig
@@ -49,11 +49,10 @@ class CurveSettings(RnSettings):
     bonuses: tuple[str, ...] = setting((), about="exploration bonuses on the real task to compare "
                                        "with: count_based on cliff_walking, elsewhere icm; or "
                                        "none")  # fmt: skip
-    rns: int = setting(10, counts("it counts RNs"), about="RNs of each variant that agents are "
-                       "trained on, the best")  # fmt: skip
-    bonus_groups: int = setting(10, counts("it counts groups"), about="groups of agents with a "
-                                "bonus, which are dear; as many as RNs are used")  # fmt: skip
-    num_agents: int = setting(10, counts("it counts agents"), about="on each RN, in each row")
+    rns: int = count(10, "RNs", about="RNs of each variant that agents are trained on, the best")
+    bonus_groups: int = count(10, "groups", about="groups of agents with a bonus, which are dear; "
+                              "as many as RNs are used")  # fmt: skip
+    num_agents: int = count(10, "agents", about="on each RN, in each row")
     max_steps: int = setting(5000, counts("an agent must train"), about="training steps; as the "
                              "paper's figure")  # fmt: skip
 
@@ -76,68 +75,42 @@ class CurveSettings(RnSettings):
     @property
     def training(self) -> TrainingConfig:
         """Episodes of training and of tests alternate until a limit."""
-        return TrainingConfig(
-            max_episodes=self.study.max_episodes,
-            max_steps=self.max_steps,
-            stop_rule="never",
-            tests_between=1,
-        )
+        return TrainingConfig(max_episodes=self.study.max_episodes, max_steps=self.max_steps,
+                              stop_rule="never", tests_between=1)  # fmt: skip
 
 
-def real_curves(settings: CurveSettings) -> pd.DataFrame:
+def real_curves(settings: CurveSettings) -> Iterator[pd.DataFrame]:
     """Curves of all agents on the real task, without and with the bonuses that are compared."""
-    task = settings.task
-    tables: list[pd.DataFrame] = []
-    bonuses = {name: bonus for name, bonus in settings.study.bonuses.items()
-               if name in settings.bonuses}  # fmt: skip
-    for name, bonus in {"real": NoExploration(), **bonuses}.items():
-        count = settings.bonus_groups if name in bonuses else settings.rns
-        groups = tuple(Group(f"{i:02d}", task.params) for i in range(count))
-        tables += _curves(settings, "", name, task.env, task, groups, exploration=bonus)
-    return pd.concat(tables, ignore_index=True)
+    make = functools.partial(World.real, settings.task)
+    yield from _curves(settings, make, "real", settings.rns)
+    for name, bonus in settings.study.bonuses.items():
+        if name in settings.bonuses:
+            bonused = functools.partial(make, exploration=bonus)
+            yield from _curves(settings, bonused, name, settings.bonus_groups)
 
 
-def rn_curves(settings: CurveSettings, variant: str, rns: Any, prefix: str = "") -> pd.DataFrame:
-    """Curves of all agents on the RNs of a set.
+def rn_curves(
+    settings: CurveSettings, variant: str, rns: Any, prefix: str = ""
+) -> Iterator[pd.DataFrame]:
+    """Curves of all agents on the RNs of a set, of which each group of agents has one.
 
-    Args:
-      settings: of the experiment.
-      variant: of the RNs.
-      rns: a `ProxySet`; each group of agents has one of them.
-      prefix: of the pieces' names, to tell worlds of one name apart.
+    The prefix, of the pieces' names, tells worlds of one name apart.
     """
-    groups = tuple(Group(f"{i:02d}", rns.one(i), rns.fingerprint(i)) for i in range(rns.size))
-    tables = _curves(settings, prefix, variant, rns.env, rns.task, groups,
-                     settings={"proxy": rns.config["proxy"]})  # fmt: skip
-    return pd.concat(tables, ignore_index=True)
+    make = functools.partial(World.of_set, rns)
+    return _curves(settings, make, variant, rns.size, prefix)
 
 
 def _curves(
-    settings: CurveSettings,
-    prefix: str,
-    name: str,
-    env: Any,
-    task: Any,
-    groups: Any,
-    /,
-    **more: Any,
+    settings: CurveSettings, make: Callable[..., World], name: str, groups: int, prefix: str = ""
 ) -> Iterator[pd.DataFrame]:
     """Those of each row, with the columns `group`, `row` and `world`."""
     for row in settings.rows:
-        world = World(
-            name=f"{prefix}{row}-{name}",
-            env=env,
-            task=task,
-            groups=groups,
-            agent=settings.agent(row),
-            training=settings.training,
-            hparams="varied" if row == "varied" else "default",
-            **more,
-        )
-        num_agents = settings.num_agents
-        curves = worlds.train_groups(world, settings, num_agents, worlds.CURVES)
+        world = make([f"{i:02d}" for i in range(groups)], name=f"{prefix}{row}-{name}",
+                     agent=settings.agent(row), training=settings.training,
+                     hparams="varied" if row == "varied" else "default")  # fmt: skip
+        curves = worlds.train_groups(world, settings, settings.num_agents, worlds.CURVES)
         group = curves["group"].astype(int)
-        number = curves["agent"] + group * num_agents
+        number = curves["agent"] + group * settings.num_agents
         yield curves.assign(agent=number, group=group, row=row, world=name)
 
 
@@ -161,24 +134,22 @@ def summarise(curves: pd.DataFrame, solved_reward: float, max_steps: int) -> pd.
         held = return_curves.on_grid(mine, grid, window=1)
         mean_return = pd.Series(np.nanmean(held, axis=1), index=steps.index)
         counted = steps.clip(upper=max_steps)
-        low, high = interval(counted, groups, str(world))
-        area_low, area_high = interval(mean_return, groups, str(world))
         out.append({
             "row": row, "world": world, "groups": groups.nunique(), "agents": len(steps),
             "solved": float(np.isfinite(steps).mean()), "steps_to_solve": counted.mean(),
-            "steps_low": low, "steps_high": high, "mean_return": mean_return.mean(),
-            "return_low": area_low, "return_high": area_high,
+            **interval(counted, groups, str(world), "steps"), "mean_return": mean_return.mean(),
+            **interval(mean_return, groups, str(world), "return"),
             "last_return": return_curves.last_returns(mine).mean(),
         })  # fmt: skip
     return pd.DataFrame(out)
 
 
-def interval(values: pd.Series, groups: pd.Series, world: str) -> tuple[float, float]:
+def interval(values: pd.Series, groups: pd.Series, world: str, name: str) -> dict[str, float]:
     """95% bootstrap interval of the mean over agents, of which each has a group."""
-    independent = values if world in WITHOUT_RN else values.groupby(groups).mean()
-    if len(independent) < LEAST_FOR_INTERVAL:
-        return np.nan, np.nan
-    return bootstrap_interval(independent)
+    draws = values if world in WITHOUT_RN else values.groupby(groups).mean()
+    has_one = len(draws) >= LEAST_FOR_INTERVAL
+    low, high = bootstrap_interval(draws) if has_one else (np.nan, np.nan)
+    return {f"{name}_low": low, f"{name}_high": high}
 
 
 def step_grid(max_steps: int) -> np.ndarray:
@@ -189,21 +160,19 @@ def step_grid(max_steps: int) -> np.ndarray:
 def make_table(summary: pd.DataFrame) -> pd.DataFrame:
     """The summary as texts."""
     bare = summary[summary["world"] == "real"].set_index("row")["steps_to_solve"]
-    return pd.DataFrame([
-        {
-            "agents": ROWS[row.row],
-            "trained with": row.world,
-            "groups, agents": f"{row.groups}, {row.agents}",
-            "steps to solve": with_interval(row.steps_to_solve, row.steps_low, row.steps_high, 0),
-            "of the bare agent's": f"{row.steps_to_solve / bare[row.row]:.0%}"
-            if row.row in bare else "",
-            "solved": f"{row.solved:.0%}",
-            "mean return over training":
-                with_interval(row.mean_return, row.return_low, row.return_high, 1),
-            "last tests": f"{row.last_return:.1f}",
-        }
-        for row in summary.itertuples()
-    ])  # fmt: skip
+    return as_texts(summary, {
+        "agents": lambda row: ROWS[row.row],
+        "trained with": "{world}",
+        "groups, agents": "{groups}, {agents}",
+        "steps to solve":
+            lambda row: with_interval(row.steps_to_solve, row.steps_low, row.steps_high, 0),
+        "of the bare agent's":
+            lambda row: f"{row.steps_to_solve / bare[row.row]:.0%}" if row.row in bare else "",
+        "solved": "{solved:.0%}",
+        "mean return over training":
+            lambda row: with_interval(row.mean_return, row.return_low, row.return_high, 1),
+        "last tests": "{last_return:.1f}",
+    })  # fmt: skip
 
 
 def with_interval(mean: float, low: float, high: float, digits: int) -> str:
@@ -228,11 +197,7 @@ def draw(
 ) -> None:
     """Draws a line of panels for each kind of curves, and in it a panel for each row of agents.
 
-    Args:
-      settings: of the experiment.
-      curves: by their label on the left.
-      height: of a panel, in inches.
-      name: of the picture.
+    The curves are named by their label on the left; the height is a panel's, in inches.
     """
     shape = len(curves), len(settings.rows)
     size = 0.8 + 3.8 * shape[1], 0.8 + height * shape[0]

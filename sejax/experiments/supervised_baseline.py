@@ -28,14 +28,13 @@ import pandas as pd
 
 import sejax
 from sejax.errors import require
-from sejax.experiments import figures, se_agents, supervised_models
+from sejax.experiments import figures, se_agents, supervised_models, worlds
 from sejax.experiments.experiment import Experiment
 from sejax.experiments.pieces import stack, unstack
 from sejax.experiments.se_agents import AGENTS
 from sejax.experiments.supervised_models import SupervisedBaseline
 from sejax.experiments.tables import as_texts, bootstrap_interval, publish
-from sejax.experiments.worlds import HPARAMS, World, return_columns, train_groups
-from sejax.experiments.worlds import training_as_learned
+from sejax.experiments.worlds import HPARAMS, World, return_columns
 
 BEST = 2  # models in the paper's second figure
 LABELS = {"authors": "model, as the authors", "authors_best": f"model, as the authors, best {BEST}",
@@ -55,7 +54,7 @@ def compute(settings: SupervisedBaseline) -> pd.DataFrame:
     for kind in settings.agents:
         for hparams in settings.hparams:
             for name, world in make_worlds(settings, ses, kind, hparams).items():
-                rows = train_groups(world, settings, settings.num_agents)
+                rows = worlds.train_groups(world, settings, settings.num_agents)
                 tables.append(rows.assign(world=name, kind=kind, hparams=hparams))
     return stack({"agents": pd.concat(tables), "fits": fits,
                   "transitions": supervised_models.summary_of(data)})  # fmt: skip
@@ -82,19 +81,19 @@ def make_worlds(
     sets = {name: sejax.load_set(supervised_models.model_file(settings, name), option="out")
             for name in ("authors", "fair")}  # fmt: skip
     agent = se_agents.agent_config(settings, kind)
-    worlds = {}
+    made = {}
     for name, proxies in (sets | {"se": ses}).items():
-        training = training_as_learned(proxies, agent)
+        training = worlds.training_as_learned(proxies, agent)
         max_steps = se_agents.QUICK_STEPS if settings.quick else training.max_steps
         if settings.max_steps and name != "se":
             max_steps = settings.max_steps
         training = dataclasses.replace(training, max_steps=max_steps,
                                        test_episodes=settings.test_episodes)  # fmt: skip
-        worlds[name] = World.of_set(
+        made[name] = World.of_set(
             proxies, map(str, range(settings.models)), name=f"{kind}-{hparams}-{name}",
             agent=agent, training=training, hparams=hparams,
         )  # fmt: skip
-    return worlds
+    return made
 
 
 def with_best(agents: pd.DataFrame, quality_of_models: list[float]) -> pd.DataFrame:

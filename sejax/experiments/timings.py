@@ -25,9 +25,8 @@ import sejax
 from sejax.app.runtime import available_cores
 from sejax.experiments import figures
 from sejax.experiments.experiment import Experiment
-from sejax.experiments.settings import Settings, each_of, setting
-from sejax.experiments.tables import publish
-from sejax.options import counts
+from sejax.experiments.settings import Settings, count, each_of, setting
+from sejax.experiments.tables import as_texts, publish
 from sejax.parallel import spread_over_devices
 
 PAPER_CORES = 16
@@ -39,11 +38,6 @@ class Row(NamedTuple):
     env: str
     proxy: str
     seconds: float
-
-    @property
-    def presets(self) -> tuple[str, ...]:
-        """What is timed of it."""
-        return ("paper", "best") if self.proxy == "se" else ("best",)
 
 
 ROWS = {
@@ -62,12 +56,10 @@ SETTINGS = {"paper": "the paper's", "best": "our default"}
 
 @dataclass(frozen=True, kw_only=True)
 class Timings(Settings):
-    """Settings of this experiment."""
-
     name = "timings"
 
     rows: tuple[str, ...] = setting(tuple(ROWS), each_of(ROWS), about="tasks and proxies")
-    generations: int = setting(2, counts("it counts iterations"), about="outer iterations to time")
+    generations: int = count(2, "iterations", about="outer iterations to time")
 
 
 def compute(settings: Timings) -> pd.DataFrame:
@@ -77,7 +69,7 @@ def compute(settings: Timings) -> pd.DataFrame:
     for name in settings.rows:
         row = ROWS[name]
         measure = project_halfcheetah if row.env == "halfcheetah" else time_generations
-        for preset in row.presets:
+        for preset in ("paper", "best") if row.proxy == "se" else ("best",):
             made_with = {"row": name, "preset": preset, "quick": settings.quick, "cores": cores,
                          "generations": settings.generations, "seed": settings.seed}  # fmt: skip
             run = functools.partial(measure, settings, row, preset)
@@ -190,22 +182,20 @@ def microseconds_of_a_step(fn: Callable[[Any], Any], num_devices: int, num_steps
 
 
 def report(settings: Timings, timed: pd.DataFrame) -> pd.DataFrame:
-    """Writes the summary, the picture and the table, and returns the table."""
     draw(settings, timed)
     cores = int(timed["cores"].iloc[0])
-    table = pd.DataFrame([
-        {
-            "task": ROWS[row.row].env,
-            "proxy": ROWS[row.row].proxy.upper(),
-            "settings": SETTINGS[row.preset],
-            f"paper, {PAPER_CORES} cores": f"{ROWS[row.row].seconds:g} s",
-            f"sejax, {cores} cores": f"{show(row.seconds)} s ({row.how})",
-            "agents": row.agents,
-            "training steps": f"{row.train_steps:,.0f}",
-            "CPU µs for a training step": f"{row.cpu_seconds / row.train_steps * 1e6:,.1f}",
-        }
-        for row in timed.itertuples()
-    ])  # fmt: skip
+    columns: dict[str, Any] = {
+        "task": lambda row: ROWS[row.row].env,
+        "proxy": lambda row: ROWS[row.row].proxy.upper(),
+        "settings": lambda row: SETTINGS[row.preset],
+        f"paper, {PAPER_CORES} cores": lambda row: f"{ROWS[row.row].seconds:g} s",
+        f"sejax, {cores} cores": lambda row: (
+            f"{row.seconds:{',.0f' if row.seconds >= 10 else '.2g'}} s ({row.how})"),
+        "agents": "{agents}",
+        "training steps": "{train_steps:,.0f}",
+        "CPU µs for a training step":
+            lambda row: f"{row.cpu_seconds / row.train_steps * 1e6:,.1f}",
+    }  # fmt: skip
     note = (
         f"The first {settings.generations} iterations of a run, compiled before. All tests on the "
         "real task are in them. For RNs our default has the paper's agents and sizes. "
@@ -220,12 +210,7 @@ def report(settings: Timings, timed: pd.DataFrame) -> pd.DataFrame:
             f"and {row.learn_us:,.0f}; projected for agents of which none solves the task."
         )
     title = "Seconds for one outer iteration of NES"
-    return publish(settings, title, table, timed, note.strip())
-
-
-def show(seconds: float) -> str:
-    """Two digits of a short time, whole seconds of a long one."""
-    return f"{seconds:,.0f}" if seconds >= 10 else f"{seconds:.2g}"
+    return publish(settings, title, as_texts(timed, columns), timed, note.strip())
 
 
 def draw(settings: Timings, timed: pd.DataFrame) -> None:
@@ -233,8 +218,7 @@ def draw(settings: Timings, timed: pd.DataFrame) -> None:
     rows = [ROWS[name] for name in timed["row"]]
     names = [f"{row.env}\n{row.proxy.upper()}, {SETTINGS[preset]} settings"
              for row, preset in zip(rows, timed["preset"], strict=True)]  # fmt: skip
-    places = np.arange(len(names))
-    cores = int(timed["cores"].iloc[0])
+    places, cores = np.arange(len(names)), int(timed["cores"].iloc[0])
     path, size = settings.folder / "timings.png", (7, 0.9 + 0.55 * len(names))
     with figures.panels(path, 1, 1, size) as (figure, axes):
         axis = axes[0, 0]
