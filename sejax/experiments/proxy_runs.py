@@ -72,12 +72,12 @@ def learn_all(configs: list[Any], option: str = "work") -> pd.DataFrame:
 
 def _said(curve: pd.DataFrame, solved_score: float | None) -> str:
     best = curve.groupby("seed")["best_so_far"].max()
-    text = f"best {best.mean():.1f}"
-    if solved_score is None or len(best) > 1:
-        return text
-    solved = generations_to_solve(curve, solved_score)
-    when = f"solved in generation {solved:.0f}" if np.isfinite(solved) else "not solved"
-    return f"{text}, {when} of {len(curve)}"
+    when = ""
+    if solved_score is not None and len(best) == 1:
+        solved = generations_to_solve(curve, solved_score)
+        how = f"solved in generation {solved:.0f}" if np.isfinite(solved) else "not solved"
+        when = f", {how} of {len(curve)}"
+    return f"best {best.mean():.1f}{when}"
 
 
 def collect(configs: list[Any], path: Path, before: Any = None) -> None:

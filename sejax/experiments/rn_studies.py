@@ -10,6 +10,7 @@ authors' scripts have others for it (`reference_details.md` 4.8 and 7.3).
 """
 
 import dataclasses
+import itertools
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -239,9 +240,8 @@ def _what_counts(config: Any) -> dict[str, Any]:
 
 def check_stored(settings: RnSettings, objectives: Sequence[str]) -> None:
     """Checks all RNs that are there (see `stored`) before any are learned, which may take days."""
-    for objective in objectives:
-        for variant in settings.variants:
-            stored(settings, variant, objective)
+    for objective, variant in itertools.product(objectives, settings.variants):
+        stored(settings, variant, objective)
 
 
 def learning_config(settings: RnSettings, variant: str, objective: str) -> Any:

@@ -77,12 +77,10 @@ def compute(settings: ScoreTransforms) -> pd.DataFrame:
     tables = []
     for mirrored, transform in itertools.product((True, False), SCORE_TRANSFORMS):
         name = f"{transform}-{'mirrored' if mirrored else 'plain'}"
-        made_with = {"transform": transform, "mirrored": mirrored, "runs": settings.runs,
-                     "generations": settings.generations, "population": settings.population,
-                     "seed": settings.seed, "settings": SETTINGS}  # fmt: skip
-        cell = settings.pieces.compute(
-            name, made_with, functools.partial(compute_cell, settings, transform, mirrored)
-        )
+        made_with = {"transform": transform, "mirrored": mirrored, "settings": SETTINGS}
+        made_with |= settings.values("runs", "generations", "population", "seed")
+        make = functools.partial(compute_cell, settings, transform, mirrored)
+        cell = settings.pieces.compute(name, made_with, make)
         print(f"{name}: {cell['updates'].mean():.1f} updates of the SE on average, "
               f"{cell['solved'].mean():.0%} solved", flush=True)  # fmt: skip
         tables.append(cell)
@@ -148,12 +146,9 @@ class AnyNES(Options):
             return state.replace(nes=told)
 
         return dataclasses.replace(
-            each[0],
+            each[0], ask=ask, tell=tell, incumbent=lambda state: each[0].incumbent(state.nes),
             init=lambda key, mean: AnyNESState(each[0].init(key, mean), jnp.int32(0)),
-            ask=ask,
-            tell=tell,
-            incumbent=lambda state: each[0].incumbent(state.nes),
-        )
+        )  # fmt: skip
 
 
 class Search(NamedTuple):
@@ -177,11 +172,9 @@ def make_search(mirrored: bool, population: int, devices: int | None) -> Search:
 
     def init(keys: Any, step_sizes: Any, transform: Any) -> Any:
         state = program.init(keys)
-        es_state = state.es_state.replace(
-            nes=state.es_state.nes.replace(step_size=step_sizes),
-            transform=jnp.full(len(keys), transform),
-        )
-        return state.replace(es_state=es_state)
+        nes = state.es_state.nes.replace(step_size=step_sizes)
+        transforms = jnp.full(len(keys), transform)
+        return state.replace(es_state=state.es_state.replace(nes=nes, transform=transforms))
 
     return Search(init=jax.jit(init), advance=jax.jit(lambda state: program.generation(state)[0]))
 
@@ -196,9 +189,8 @@ def edges_of(bins: int) -> np.ndarray:
 
 def binned(runs: pd.DataFrame, bins: int) -> pd.DataFrame:
     """Mean updates, share solved and number of runs for each cell and bin of step sizes."""
-    place = np.clip(
-        np.searchsorted(edges_of(bins), runs["step_size"], side="right") - 1, 0, bins - 1
-    )
+    place = np.searchsorted(edges_of(bins), runs["step_size"], side="right") - 1
+    place = np.clip(place, 0, bins - 1)
     grouped = runs.assign(bin=place).groupby(["transform", "mirrored", "bin"], sort=False)
     return grouped.agg(updates=("updates", "mean"), solved=("solved", "mean"),
                        runs=("run", "size")).reset_index()  # fmt: skip
@@ -296,9 +288,8 @@ def _heat_map(axis: Any, cells: pd.DataFrame, bins: int, scale: Any) -> None:
     for row, column in itertools.product(range(len(LABELS)), range(bins)):
         value = means.iloc[row, column]
         if np.isfinite(value):
-            dark = scale(value) > 0.45
             axis.text(middles[column], row, f"{value:.0f}", ha="center", va="center", fontsize=8,
-                      color="white" if dark else "black")  # fmt: skip
+                      color="white" if scale(value) > 0.45 else "black")  # fmt: skip
 
 
 EXPERIMENT = Experiment(settings=ScoreTransforms, compute=compute, report=report, about=__doc__)

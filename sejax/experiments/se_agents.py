@@ -10,7 +10,6 @@ from sejax import plugins
 from sejax.experiments.settings import Settings, count, each_of, setting
 from sejax.experiments.worlds import World, groups_at_once, train_groups, training_as_learned
 from sejax.options import counts
-from sejax.training import TrainingConfig
 
 AGENTS = ("ddqn", "dueling_ddqn", "td3_discrete")
 
@@ -57,12 +56,3 @@ def train(settings: SeAgents, world: World) -> pd.DataFrame:
     rows = train_groups(world, settings, settings.num_agents,
                         at_once=groups_at_once(settings.devices))  # fmt: skip
     return rows.assign(kind=world.name)
-
-
-def real_training(kind: str, task: Any, episodes: int | None, **options: Any) -> TrainingConfig:
-    """How long an agent trains on the real task: until it solves it, or the authors' episodes."""
-    # reference_details.md 7.1: discrete TD3 trains 500 episodes on Acrobot, all others 1000.
-    short = task.name == "acrobot" and kind == "td3_discrete"
-    return TrainingConfig(
-        max_episodes=episodes or (500 if short else 1000), stop_rule="solved",
-        time_limit_is_terminal=True, **options)  # fmt: skip

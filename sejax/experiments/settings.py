@@ -23,10 +23,8 @@ def setting(default: Any, rule: Rule | None = None, *, about: str, quick: Any = 
 
     The rule says what must hold, as those of `sejax.options`; `about` is for `--help`.
     """
-    quick = default if quick is _SAME else quick
-    return dataclasses.field(
-        default=default, metadata={"rule": rule, "about": about, "quick": quick}
-    )
+    metadata = {"rule": rule, "about": about, "quick": default if quick is _SAME else quick}
+    return dataclasses.field(default=default, metadata=metadata)
 
 
 def count(default: int | None, things: str, *, about: str, quick: Any = _SAME) -> Any:
@@ -52,16 +50,10 @@ class Settings(Options):
 
     quick: bool = setting(False, about="a small version, in minutes")
     from_rows: bool = setting(False, about="remake tables and pictures from the rows in `out`")
-    out: str | None = setting(
-        None,
-        about="folder of the results; results/NAME[/TASK], quick "
-        "runs/experiments/NAME-quick[/TASK]",
-    )
-    work: str | None = setting(
-        None,
-        about="folder of what is not kept; runs/experiments/... for results/..., else work/ "
-        "in `out`",
-    )
+    out: str | None = setting(None, about="folder of the results; results/NAME[/TASK], quick "
+                              "runs/experiments/NAME-quick[/TASK]")  # fmt: skip
+    work: str | None = setting(None, about="folder of what is not kept; runs/experiments/... for "
+                               "results/..., else work/ in `out`")  # fmt: skip
     seed: int = setting(
         0, lambda name, value, _: errors.require_seed(name, value), about="first random seed"
     )
@@ -80,32 +72,30 @@ class Settings(Options):
     @classmethod
     def defaults(cls, given: Mapping[str, Any]) -> dict[str, Any]:
         """Values of the fields; they may depend on those that are given, as on `quick`."""
-        quick = bool(given.get("quick"))
-        return {
-            field.name: field.metadata["quick"] if quick else field.default
-            for field in dataclasses.fields(cls)
-        }
+        return {field.name: field.metadata["quick"] if given.get("quick") else field.default
+                for field in dataclasses.fields(cls)}  # fmt: skip
 
     @property
     def folder(self) -> Path:
         """Where the results go."""
         if self.out is not None:
             return Path(self.out)
-        root = Path("runs/experiments", f"{self.name}-quick") if self.quick else (
-            Path("results", self.name))  # fmt: skip
-        return root / (getattr(self, "env", None) or "")  # tasks would be taken for each other
+        root = f"runs/experiments/{self.name}-quick" if self.quick else f"results/{self.name}"
+        return Path(root, getattr(self, "env", None) or "")  # else tasks replace each other
 
     @property
     def work_folder(self) -> Path:
         """Where finished pieces and NES runs are kept until the experiment is done."""
-        if self.work is not None:
-            return Path(self.work)
-        return work_beside(self.folder, "work")
+        return work_beside(self.folder, "work") if self.work is None else Path(self.work)
 
     @property
     def pieces(self) -> Pieces:
         """The finished pieces."""
         return Pieces(self.work_folder / "pieces")
+
+    def values(self, *names: str) -> dict[str, Any]:
+        """These fields, for what pieces depend on."""
+        return {name: getattr(self, name) for name in names}
 
     @property
     def rows_file(self) -> Path:

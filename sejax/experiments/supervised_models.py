@@ -192,10 +192,9 @@ def model_file(settings: SupervisedBaseline, variant: str) -> Path:
 def fit_piece(settings: SupervisedBaseline, ses: Any, data: list[pd.DataFrame]) -> pd.DataFrame:
     """Fits all models, stores both variants of them, and returns the errors of each epoch."""
     num_rows = min(len(rows) for rows in data)
-    made_with = {"proxy": ses.config["proxy"], "models": settings.models, "num_rows": num_rows,
-                 "epochs": settings.epochs, "learning_rate": LEARNING_RATE,
-                 "batch_size": BATCH_SIZE, "generations": settings.generations,
-                 "population": settings.population, "seed": settings.seed}  # fmt: skip
+    made_with = {"proxy": ses.config["proxy"], "num_rows": num_rows,
+                 "learning_rate": LEARNING_RATE, "batch_size": BATCH_SIZE}  # fmt: skip
+    made_with |= settings.values("models", "epochs", "generations", "population", "seed")
     fits = settings.pieces.compute("fit", made_with, lambda: fit_all(settings, ses, data, num_rows))
     last = fits[fits["epoch"] == settings.epochs - 1].mean()
     print(f"Models: mean squared error {last['error']:.2g} of [s', r], "

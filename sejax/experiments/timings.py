@@ -70,8 +70,8 @@ def compute(settings: Timings) -> pd.DataFrame:
         row = ROWS[name]
         measure = project_halfcheetah if row.env == "halfcheetah" else time_generations
         for preset in ("paper", "best") if row.proxy == "se" else ("best",):
-            made_with = {"row": name, "preset": preset, "quick": settings.quick, "cores": cores,
-                         "generations": settings.generations, "seed": settings.seed}  # fmt: skip
+            made_with = {"row": name, "preset": preset, "cores": cores}
+            made_with |= settings.values("quick", "generations", "seed")
             run = functools.partial(measure, settings, row, preset)
             timed = settings.pieces.compute(f"{name}-{preset}-{cores}", made_with, run)
             tables.append(timed.assign(row=name, preset=preset, cores=cores))
@@ -132,33 +132,25 @@ def project_halfcheetah(settings: Timings, row: Row, preset: str) -> pd.DataFram
     def environment_steps(key: Any) -> Any:
         def step(state: Any, key: Any) -> Any:
             action = jax.random.uniform(key, (task.action_dim,), minval=-1.0)
-            _, state, reward, _, _ = env.step_env(key, state, action, params)
-            return state, reward
+            return env.step_env(key, state, action, params)[1:3]  # state and reward
 
         _, state = env.reset_env(key, params)
         return jax.lax.scan(step, state, jax.random.split(key, num_steps))[1].sum()
 
     def learning_steps(key: Any) -> Any:
-        state = agent.init(key, agent.hparams)
         size = config.agent.batch_size
-        batch = Transition(
-            jax.random.normal(key, (task.obs_dim, size)),
-            jax.random.uniform(key, (task.action_dim, size), minval=-1.0),
-            jax.random.normal(key, (size,)), jax.numpy.ones(size),
-            jax.random.normal(key, (task.obs_dim, size)),
+        obs = jax.random.normal(key, (task.obs_dim, size))
+        actions = jax.random.uniform(key, (task.action_dim, size), minval=-1.0)
+        batch = Transition(obs, actions, jax.random.normal(key, (size,)), jax.numpy.ones(size), obs)
+        state, _ = jax.lax.scan(
+            lambda state, key: (agent.update(key, state, batch), None),
+            agent.init(key, agent.hparams), jax.random.split(key, num_steps),
         )  # fmt: skip
-
-        def step(state: Any, key: Any) -> Any:
-            return agent.update(key, state, batch), None
-
-        state, _ = jax.lax.scan(step, state, jax.random.split(key, num_steps))
         return jax.tree.leaves(state)[0].sum()
 
     cores = (1, settings.devices or available_cores())
-    env_us, learn_us = (
-        [microseconds_of_a_step(fn, count, num_steps) for count in cores]
-        for fn in (environment_steps, learning_steps)
-    )
+    env_us, learn_us = ([microseconds_of_a_step(fn, count, num_steps) for count in cores]
+                        for fn in (environment_steps, learning_steps))  # fmt: skip
     agents = make_program(**parts).strategy.num_candidates
     episodes = config.training.max_episodes
     train_steps = agents * episodes * task.max_steps
@@ -201,8 +193,8 @@ def report(settings: Timings, timed: pd.DataFrame) -> pd.DataFrame:
         "real task are in them. For RNs our default has the paper's agents and sizes. "
     )
     if settings.quick:
-        note += "quick=true: a few agents with short trainings, not to be compared with the "
-        note += "paper's. "
+        note += ("quick=true: a few agents with short trainings, not to be compared with the "
+                 "paper's. ")  # fmt: skip
     for row in timed[timed["how"] == "projected"].itertuples():
         note += (
             f"HalfCheetah: an environment step takes {row.env_us_one_core:,.0f} µs on one core and "

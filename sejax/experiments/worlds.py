@@ -17,6 +17,7 @@ import pandas as pd
 import sejax
 from sejax import plugins, serialize
 from sejax.agents import NoExploration
+from sejax.experiments import return_curves
 from sejax.experiments.settings import Settings
 from sejax.parallel import spread_over_devices
 from sejax.training import TrainingConfig, budget_for
@@ -65,15 +66,11 @@ class World:
     def settings_of(self, group: Group) -> dict[str, Any]:
         """What a group's results depend on, beside the random numbers."""
         return {
-            "task": self.task.origin,
-            "agent": plugins.describe("agent", self.agent),
+            "task": self.task.origin, "agent": plugins.describe("agent", self.agent),
             "exploration": plugins.describe("exploration", self.exploration),
-            "training": serialize.to_plain(self.training),
-            "hparams": self.hparams,
-            "group": group.name,
-            "weights": group.fingerprint,
-            **self.settings,
-        }
+            "training": serialize.to_plain(self.training), "hparams": self.hparams,
+            "group": group.name, "weights": group.fingerprint, **self.settings,
+        }  # fmt: skip
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,12 +85,9 @@ class Measure:
 
 
 def train_groups(
-    world: World,
-    settings: Settings,
-    num_agents: int,
-    measure: Measure | None = None,
+    world: World, settings: Settings, num_agents: int, measure: Measure | None = None,
     at_once: int = 1,
-) -> pd.DataFrame:
+) -> pd.DataFrame:  # fmt: skip
     """Rows of all agents of a world, with a column `group`; trains the groups that are missing.
 
     The agents of the i-th group have the same seeds in every world: where hyperparameters are
@@ -119,21 +113,18 @@ def train_groups(
 
 
 def train(
-    world: World,
-    settings: Settings,
-    num_agents: int,
-    measure: Measure,
-    places: list[int],
+    world: World, settings: Settings, num_agents: int, measure: Measure, places: list[int],
     at_once: int,
-) -> list[pd.DataFrame]:
+) -> list[pd.DataFrame]:  # fmt: skip
     """The rows of the groups at these places; a program is compiled once for `at_once` of them."""
     program = make_program(
         measure, world.agent, world.exploration, world.hparams, world.env, world.task,
         world.training, settings.devices)  # fmt: skip
     padded = [*places, *[places[-1]] * (at_once - len(places))]
-    keys = jax.numpy.concatenate([
-        agent_keys(settings.seed, None if world.is_single else i, num_agents) for i in padded
-    ])  # fmt: skip
+    key = jax.random.key(settings.seed)
+    own_keys = [key if world.is_single else jax.random.fold_in(key, i) for i in padded]
+    # Of a group's agents, the first ones have the same keys for any number of them.
+    keys = jax.numpy.concatenate([jax.random.split(key, num_agents) for key in own_keys])
     params = jax.tree.map(lambda *each: np.stack(each), *[world.groups[i].params for i in padded])
     active = np.repeat(np.arange(at_once) < len(places), num_agents)
     result = jax.device_get(program(keys, params, active))
@@ -143,23 +134,11 @@ def train(
     ]
 
 
-def agent_keys(seed: int, group: int | None, num_agents: int) -> Any:
-    """A key for each agent of a group, `[agent]`; the first ones are the same for any number."""
-    key = jax.random.key(seed)
-    return jax.random.split(key if group is None else jax.random.fold_in(key, group), num_agents)
-
-
 @functools.cache
 def make_program(
-    measure: Measure,
-    agent: Any,
-    exploration: Any,
-    hparams: str,
-    env: Any,
-    task: Any,
-    training: TrainingConfig,
-    devices: int | None,
-) -> Callable[..., Any]:
+    measure: Measure, agent: Any, exploration: Any, hparams: str, env: Any, task: Any,
+    training: TrainingConfig, devices: int | None,
+) -> Callable[..., Any]:  # fmt: skip
     """Builds `program(keys [agent], params, active [agent]) -> (results, drawn)`, `[agent, ...]`.
 
     The leaves of `params` are `[group, ...]`; the agents of a group follow one another. Nothing is
@@ -206,15 +185,13 @@ def training_as_learned(proxies: Any, agent: Any) -> TrainingConfig:
 def outcome_rows(outcome: Any, drawn: dict[str, np.ndarray]) -> pd.DataFrame:
     """A row for each agent, with a column for each test episode and each drawn hyperparameter."""
     returns = outcome.test_returns.astype(float)
-    columns = {
-        "agent": range(len(returns)),
-        "test_return": returns.mean(axis=1),
-        "nonfinite": outcome.nonfinite,
-        "train_episodes": outcome.train_episodes.astype(float),
+    return pd.DataFrame({
+        "agent": range(len(returns)), "test_return": returns.mean(axis=1),
+        "nonfinite": outcome.nonfinite, "train_episodes": outcome.train_episodes.astype(float),
         "train_steps": outcome.train_steps.astype(float),
-    }
-    columns |= {f"return_{i}": x for i, x in enumerate(returns.T)}
-    return pd.DataFrame(columns | {name: x.astype(float) for name, x in drawn.items()})
+        **{f"return_{i}": x for i, x in enumerate(returns.T)},
+        **{name: x.astype(float) for name, x in drawn.items()},
+    })  # fmt: skip
 
 
 def return_columns(agents: pd.DataFrame) -> list[str]:
@@ -257,17 +234,12 @@ def curve_rows(curves: tuple[np.ndarray, np.ndarray], drawn: Any = None) -> pd.D
     return pd.concat(tables, ignore_index=True)
 
 
-def _say_outcome(rows: pd.DataFrame) -> str:
-    return (f"mean return {rows['test_return'].mean():.1f} after "
-            f"{rows['train_steps'].mean():,.0f} steps")  # fmt: skip
-
-
-def _say_curves(rows: pd.DataFrame) -> str:
-    last = rows.groupby("agent")["test_return"].apply(lambda returns: returns.tail(10).mean())
-    return f"last test returns {last.mean():.1f}"
-
-
 OUTCOMES = Measure(
-    make_run=lambda *args: sejax.make_evaluator(*args), to_table=outcome_rows, say=_say_outcome
-)
-CURVES = Measure(make_run=make_curves, to_table=curve_rows, say=_say_curves)
+    make_run=lambda *args: sejax.make_evaluator(*args), to_table=outcome_rows,
+    say=lambda rows: (f"mean return {rows['test_return'].mean():.1f} after "
+                      f"{rows['train_steps'].mean():,.0f} steps"),
+)  # fmt: skip
+CURVES = Measure(
+    make_run=make_curves, to_table=curve_rows,
+    say=lambda rows: f"last test returns {return_curves.last_returns(rows).mean():.1f}",
+)  # fmt: skip
