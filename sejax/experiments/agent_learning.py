@@ -45,12 +45,10 @@ class Study:
         """Episodes of training and of tests alternate until the step limit."""
         max_steps = min(self.max_steps, QUICK_STEPS) if quick else self.max_steps
         return TrainingConfig(
-            max_episodes=max_steps // SHORTEST_EPISODE,
-            max_steps=max_steps,
-            stop_rule="never",
+            max_episodes=max_steps // SHORTEST_EPISODE, max_steps=max_steps, stop_rule="never",
             tests_between=test_episodes,
             time_limit_is_terminal=False,  # as in the literature; the paper's code ends there
-        )
+        )  # fmt: skip
 
 
 STUDIES = (
@@ -138,7 +136,6 @@ COLUMNS: dict[str, Any] = {
 
 
 def report(settings: AgentLearning, curves: pd.DataFrame) -> pd.DataFrame:
-    """Writes the summary, the picture and the table, and returns the table."""
     draw(settings, curves)
     summary = summarise(curves)
     note = (
@@ -166,12 +163,11 @@ def draw(settings: AgentLearning, curves: pd.DataFrame, points: int = 100) -> No
                 study = STUDIES[int(number)]
                 last_step = study_curves["steps"].max()
                 grid = np.geomspace(last_step / 200, last_step, points)
-                values = return_curves.on_grid(study_curves, grid)
-                known = ~np.isnan(values).any(axis=0)
-                low, high = np.transpose([bootstrap_interval(v) for v in values[:, known].T])
-                label = figures.AGENT_NAMES[study.agent] + "*" * bool(study.hparams)
-                figures.band(axis, grid[known], values[:, known].mean(axis=0), low, high, color,
-                             lw=1.8, label=label)  # fmt: skip
+                figures.band(
+                    axis, grid, return_curves.on_grid(study_curves, grid),
+                    lambda values: np.transpose([bootstrap_interval(v) for v in values.T]), color,
+                    lw=1.8, label=figures.AGENT_NAMES[study.agent] + "*" * bool(study.hparams),
+                )  # fmt: skip
             axis.axhline(sejax.envs.make(env).solved_reward, color="#7a7a7a", ls="--", lw=1)
             axis.set_title(env, fontsize=10)
             axis.set(xscale="log", xlabel="training steps (*: hyperparameters in the table)")

@@ -21,8 +21,9 @@ REAL, VARIED, FIXED, BEST, SOLVED = "#0072B2", "#E69F00", "#009E73", "#000000", 
 AGENT_NAMES = {"ddqn": "DDQN", "dueling_ddqn": "Dueling DDQN", "td3": "TD3",
                "td3_discrete": "discrete TD3", "ppo": "PPO", "q_learning": "Q-learning",
                "sarsa": "SARSA"}  # fmt: skip
-STYLE: Any = {"font.size": 10, "axes.spines.top": False, "axes.spines.right": False,
-         "legend.frameon": False}  # fmt: skip
+STYLE: Any = {
+    "font.size": 10, "axes.spines.top": False, "axes.spines.right": False, "legend.frameon": False,
+}  # fmt: skip
 
 
 def learning_curves(curves: pd.DataFrame, solved_reward: float, path: Path) -> None:
@@ -69,13 +70,11 @@ def density(values: Any, grid: Any, low: float, high: float) -> np.ndarray:
     return np.where(inside, total / (values.size * bandwidth * np.sqrt(2 * np.pi)), 0.0)
 
 
-def densities(
-    axis: Any, groups: dict[str, tuple[str, np.ndarray]], low: float, high: float
-) -> None:
-    """Draws densities of returns in [low, high] with their means; see `bars` for the groups."""
+def densities(axis: Any, groups: list[tuple[str, np.ndarray]], low: float, high: float) -> None:
+    """Draws densities of returns in [low, high] with their means; groups are (colour, values)."""
     grid = np.linspace(low, high, 400)
     peak = 0.0
-    for color, returns in groups.values():
+    for color, returns in groups:
         line = density(returns, grid, low, high)
         peak = max(peak, line.max())
         axis.plot(grid, line, color=color, lw=1.8)
@@ -91,9 +90,9 @@ def histogram(axis: Any, values: Any, alpha: float, lw: float, label: str = "", 
     axis.set_yscale("log")
 
 
-def bars(axis: Any, groups: dict[str, tuple[str, np.ndarray]], below: Sequence[str]) -> None:
-    """Draws means as bars with their std; `groups` are label to (colour, values)."""
-    for index, (color, values) in enumerate(groups.values()):
+def bars(axis: Any, groups: list[tuple[str, np.ndarray]], below: Sequence[str]) -> None:
+    """Draws means as bars with their std, and a text below each; groups are (colour, values)."""
+    for index, (color, values) in enumerate(groups):
         mean, std = values.mean(), values.std()
         axis.bar(index, mean, color=color, alpha=0.85, width=0.7)
         errors = [[min(std, mean)], [std]]
@@ -104,87 +103,18 @@ def bars(axis: Any, groups: dict[str, tuple[str, np.ndarray]], below: Sequence[s
     axis.yaxis.set_major_formatter(lambda x, _: f"{x / 1000:g}k" if x >= 1000 else f"{x:g}")
 
 
-def performance(
-    columns: dict[str, dict[str, tuple[str, pd.DataFrame]]],
-    returns: list[str],
-    task: str,
-    path: Path,
-) -> None:
-    """Draws a column for each kind of agent: densities of returns, bars of steps and episodes.
-
-    `columns` are kind to setting to (colour, agents), `returns` the agents' columns with the return
-    of one test episode.
-    """
-    every = [agents[returns] for mine in columns.values() for _, agents in mine.values()]
-    low = min(x.min(axis=None) for x in every)
-    high = max(low + 1, *(x.max(axis=None) for x in every))
-    size = (1.2 + 3.6 * len(columns), 8)
-    with panels(path, 3, len(columns), size, height_ratios=(1.5, 1, 1)) as (figure, axes):
-        for column, (kind, settings) in enumerate(columns.items()):
-            top, *lower = axes[:, column]
-
-            def of(names: Any, mine: Any = settings) -> dict[str, tuple[str, np.ndarray]]:
-                return {label: (color, agents[names].to_numpy(float).ravel())
-                        for label, (color, agents) in mine.items()}  # fmt: skip
-
-            densities(top, of(returns), low, high)
-            top.set(title=AGENT_NAMES.get(kind, kind), xlabel=f"return of a test episode on {task}")
-            below = [f"{values.mean():.1f}" for _, values in of(returns).values()]
-            for axis, name in zip(lower, ("train_steps", "train_episodes"), strict=True):
-                bars(axis, of(name), below)
-                axis.set_xlabel("mean return")
-        for axis, label in zip(axes[:, 0], ("density (log scale)", "training steps",
-                                            "training episodes"), strict=True):  # fmt: skip
-            axis.set_ylabel(label)
-        longest = max(columns.values(), key=len)
-        handles = [plt.Line2D([], [], color=color, lw=3) for color, _ in longest.values()]
-        # Side by side the labels are as wide as two columns.
-        figure.legend(handles, [f"train: {label}" for label in longest],
-                      ncols=len(longest) if len(columns) > 1 else 1,
-                      loc="outside upper center")  # fmt: skip
+def band(axis: Any, grid: Any, values: Any, ends: Any, color: str, **line: Any) -> None:
+    """Draws the mean of `values [agent, points]` where all are known, with its `ends(values)`."""
+    known = ~np.isnan(values).any(axis=0)
+    axis.plot(grid[known], values[:, known].mean(axis=0), color=color, **line)
+    axis.fill_between(grid[known], *ends(values[:, known]), color=color, alpha=0.2, lw=0)
 
 
-def violins(
-    kinds: dict[str, pd.DataFrame], returns: list[str], task: str, solved_reward: float, path: Path
-) -> None:
-    """Draws a violin of the returns for each SE, the best first, in a row for each kind of agent.
-
-    Agents have a column `se`, and columns `returns` with the return of one test episode.
-
-    Source: paper, appendix "Evaluation of Individual SE Models".
-    """
-    num_ses = max(agents["se"].nunique() for agents in kinds.values())
-    size = (max(5.0, 1.8 + 0.35 * num_ses), 0.6 + 2.6 * len(kinds))
-    with panels(path, len(kinds), 1, size) as (figure, axes):
-        for axis, (kind, agents) in zip(axes[:, 0], kinds.items(), strict=True):
-            pooled = {se: mine[returns].to_numpy().ravel() for se, mine in agents.groupby("se")}
-            order = sorted(pooled, key=lambda se: -pooled[se].mean())
-            parts = axis.violinplot([pooled[se] for se in order], widths=0.85, showextrema=False)
-            for body in parts["bodies"]:
-                body.set(facecolor=REAL, edgecolor=REAL, alpha=0.45)
-            means = [pooled[se].mean() for se in order]
-            axis.plot(range(1, len(order) + 1), means, "D", ms=4, color=BEST, ls="none")
-            axis.axhline(solved_reward, color=SOLVED, ls="--", lw=1.2)
-            axis.set_xlim(0.4, len(order) + 0.6)
-            axis.set_xticks(range(1, len(order) + 1), [f"{se}" for se in order], fontsize=8)
-            axis.set_title(AGENT_NAMES.get(kind, kind), fontsize=10)
-            axis.set_ylabel(f"test return\non {task}")
-        axes[-1, 0].set_xlabel("SE, by its place in the set; diamonds: means")
-        figure.legend([plt.Line2D([], [], color=SOLVED, ls="--")], [f"solved ({solved_reward:g})"],
-                      loc="outside upper right", fontsize=9)  # fmt: skip
-
-
-def band(axis: Any, x: Any, mean: Any, low: Any, high: Any, color: str, **line: Any) -> None:
-    """Draws a line with what it may be off by."""
-    axis.plot(x, mean, color=color, **line)
-    axis.fill_between(x, low, high, color=color, alpha=0.2, lw=0)
-
-
-def legend_above(figure: Any, axis: Any, columns: int = 4) -> None:
+def legend_above(figure: Any, axis: Any, columns: int = 4, fontsize: int | None = 9) -> None:
     """Puts the legend of one panel above all."""
     handles, labels = axis.get_legend_handles_labels()
     figure.legend(handles, labels, ncols=min(len(labels), columns), loc="outside upper center",
-                  fontsize=9)  # fmt: skip
+                  fontsize=fontsize)  # fmt: skip
 
 
 @contextlib.contextmanager

@@ -23,20 +23,11 @@ from sejax.options import counts
 from sejax.plugins import name_of
 from sejax.training import TrainingConfig
 
-ROWS = {
-    "default": "default hyperparameters",
-    "varied": "varied hyperparameters",
-    "transfer": "unseen agent",
-}
+ROWS = {"default": "default hyperparameters", "varied": "varied hyperparameters",
+        "transfer": "unseen agent"}  # fmt: skip
 GRID_POINTS = 200
 WITHOUT_RN = ("real", "count_based", "icm")  # worlds whose groups of agents have nothing in common
 LEAST_FOR_INTERVAL = 5  # independent values
-COLORS = {
-    "real": figures.BEST, "icm": "#7a7a7a", "count_based": "#7a7a7a",
-    "additive_potential": figures.REAL, "exclusive_potential": "#56B4E9",
-    "additive_non_potential": figures.VARIED, "exclusive_non_potential": figures.FIXED,
-    "additive_weighted_info": figures.SOLVED, "exclusive_weighted_info": "#CC79A7",
-}  # fmt: skip
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -224,13 +215,15 @@ def panel(axis: Any, curves: pd.DataFrame, max_steps: int, solved_reward: float)
     grid = step_grid(max_steps)
     for world, mine in curves.groupby("world", sort=False):
         name = str(world)
-        values = return_curves.on_grid(mine, grid, window=1)
-        known = ~np.isnan(values).any(axis=0)
-        mean = values[:, known].mean(axis=0)
-        error = values[:, known].std(axis=0) / np.sqrt(len(values))
         dashed = name in WITHOUT_RN and name != "real"
         style = "--" if dashed else ":" if rn_studies.AUGMENTED in name else "-"
-        color = COLORS[name.removesuffix(rn_studies.AUGMENTED)]
-        figures.band(axis, grid[known], mean, mean - error, mean + error, color, ls=style, lw=1.6,
-                     label=rn_studies.label(name))  # fmt: skip
+        color, _ = rn_studies.SHOWN[name.removesuffix(rn_studies.AUGMENTED)]
+        figures.band(axis, grid, return_curves.on_grid(mine, grid, window=1), standard_errors,
+                     color, ls=style, lw=1.6, label=rn_studies.label(name))  # fmt: skip
     axis.axhline(solved_reward, color="#7a7a7a", ls=":", lw=1)
+
+
+def standard_errors(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Ends of the mean with its standard error, `[points]` each, of `[agent, points]`."""
+    mean, error = values.mean(axis=0), values.std(axis=0) / np.sqrt(len(values))
+    return mean - error, mean + error

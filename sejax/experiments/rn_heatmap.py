@@ -177,10 +177,8 @@ def draw_map(axis: Any, values: np.ndarray) -> Any:
             if cell != " ":
                 axis.text(*middle, {"O": "cliff"}.get(cell, cell), ha="center", va="center",
                           fontsize=6 if cell == "O" else 10, weight="bold")  # fmt: skip
-    shown = axis.add_collection(
-        PolyCollection(triangles, array=colors, cmap="RdYlGn", edgecolors="#555555", lw=0.25,
-                       clim=(0, 1))
-    )  # fmt: skip
+    shown = axis.add_collection(PolyCollection(triangles, array=colors, cmap="RdYlGn", clim=(0, 1),
+                                               edgecolors="#555555", lw=0.25))  # fmt: skip
     axis.set(xlim=(-0.5, 11.5), ylim=(3.5, -0.5), aspect="equal", xticks=[], yticks=[])
     axis.spines[:].set_visible(True)
     return shown

@@ -27,12 +27,8 @@ from sejax.experiments.tables import publish
 
 PICKS = ("best", "worst")
 QUICK_LEARNED = 4
-OBJECTIVE_NAMES = {
-    "reward_threshold": "reward threshold",
-    "auc": "area under the curve",
-    "max_reward": "final return",
-    "auc_sum": "area, not by steps",
-}
+OBJECTIVE_NAMES = {"reward_threshold": "reward threshold", "auc": "area under the curve",
+                   "max_reward": "final return", "auc_sum": "area, not by steps"}  # fmt: skip
 DEFAULT_OBJECTIVES = ("reward_threshold", "auc", "max_reward")
 
 
@@ -63,10 +59,7 @@ class RnObjectives(CurveSettings):
 
 
 def compute(settings: RnObjectives) -> pd.DataFrame:
-    """Learns and trains what is missing; a row for each training episode of each agent.
-
-    Agents without an RN, which are the same beside each objective, are there once.
-    """
+    """As of rn_performance; agents without an RN are there once for all objectives."""
     rn_studies.check_stored(settings, settings.objectives)
     tables = [table.assign(objective="", pick="") for table in rn_curves.real_curves(settings)]
     for objective in settings.objectives:

@@ -23,7 +23,7 @@ import sejax
 from sejax import ICMConfig, errors, plugins, serialize
 from sejax.app import build, run_directory
 from sejax.errors import ConfigError
-from sejax.experiments import pieces, proxy_runs
+from sejax.experiments import figures, pieces, proxy_runs
 from sejax.experiments.proxy_runs import RunSettings
 from sejax.experiments.settings import setting, work_beside
 from sejax.options import counts, one_of
@@ -66,6 +66,7 @@ _CARTPOLE: dict[str, Any] = {
     "init_episodes": 1, "batch_size": 32, "learning_rate": 2.5e-4, "target_update_rate": 0.01,
     "epsilon_min": 0.1, "hidden_size": 64, "num_layers": 1, "buffer_size": 1_000_000,
 }  # fmt: skip
+_FEW: dict[str, Any] = {"variants": ("additive_potential",), "rows": ("default",)}  # when quick
 STUDIES = {
     "cliff_walking": Study(
         # SARSA explores less than the paper's table says, as in the authors' scripts: with an
@@ -79,17 +80,16 @@ STUDIES = {
         agent=sejax.DDQNConfig(**_CARTPOLE), transfer_agent=sejax.DuelingDDQNConfig(**_CARTPOLE),
         bonuses={"icm": ICMConfig()},
         max_episodes=1000, max_steps=50_000,
-        when_quick={"variants": ("additive_potential",), "rows": ("default", "transfer"),
-                    "generations": 2},
+        when_quick=_FEW | {"rows": ("default", "transfer"), "generations": 2},
     ),
     "mountain_car_continuous": Study(
         agent=sejax.TD3Config(init_episodes=50, action_repeat=2),
         transfer_agent=sejax.PPOConfig(action_repeat=5),
         bonuses={"icm": ICMConfig(forward_weight=0.1, reward_scale=0.01, learning_rate=5e-4)},
         max_episodes=3000, max_steps=250_000,
-        when_quick={"variants": ("additive_potential",), "rows": ("default",), "generations": 2,
-                    "run": ("es.population_size=4", "es.num_incumbent_evals=4",
-                            "training.max_episodes=4", "agent.init_episodes=1")},
+        when_quick=_FEW | {"generations": 2, "run": (
+            "es.population_size=4", "es.num_incumbent_evals=4", "training.max_episodes=4",
+            "agent.init_episodes=1")},
     ),
     "halfcheetah": Study(
         agent=sejax.TD3Config(),
@@ -100,28 +100,27 @@ STUDIES = {
         bonuses={"icm": ICMConfig(forward_weight=0.001, reward_scale=0.1, learning_rate=1e-5)},
         variants=(*VARIANTS, *(v + AUGMENTED for v in VARIANTS), *WEIGHTED_INFO),
         max_episodes=1000, max_steps=500_000, learned=5, rns=5, num_agents=5,
-        when_quick={"variants": ("additive_potential",), "rows": ("default",), "generations": 1,
-                    "learned": 1, "num_agents": 2, "bonuses": (),
-                    "run": ("es.population_size=2", "es.num_incumbent_evals=2",
-                            "training.max_episodes=2", "agent.init_episodes=1")},
+        when_quick=_FEW | {"generations": 1, "learned": 1, "num_agents": 2, "bonuses": (), "run": (
+            "es.population_size=2", "es.num_incumbent_evals=2", "training.max_episodes=2",
+            "agent.init_episodes=1")},
     ),
 }  # fmt: skip
-LABELS = {
-    "real": "real reward",
-    "icm": "real reward + ICM",
-    "count_based": "real reward + count-based",
-    "additive_potential": r"$r + \gamma\Phi(s') - \Phi(s)$",
-    "exclusive_potential": r"$\gamma\Phi(s') - \Phi(s)$",
-    "additive_non_potential": r"$r + \Phi(s')$",
-    "exclusive_non_potential": r"$\Phi(s')$",
-    "additive_weighted_info": r"$r + w^\top i'$",
-    "exclusive_weighted_info": r"$w^\top i'$",
+SHOWN = {  # colour of a world, and the reward that agents get there
+    "real": (figures.BEST, "real reward"),
+    "icm": ("#7a7a7a", "real reward + ICM"),
+    "count_based": ("#7a7a7a", "real reward + count-based"),
+    "additive_potential": (figures.REAL, r"$r + \gamma\Phi(s') - \Phi(s)$"),
+    "exclusive_potential": ("#56B4E9", r"$\gamma\Phi(s') - \Phi(s)$"),
+    "additive_non_potential": (figures.VARIED, r"$r + \Phi(s')$"),
+    "exclusive_non_potential": (figures.FIXED, r"$\Phi(s')$"),
+    "additive_weighted_info": (figures.SOLVED, r"$r + w^\top i'$"),
+    "exclusive_weighted_info": ("#CC79A7", r"$w^\top i'$"),
 }
 
 
 def label(name: str) -> str:
     """Name of a world in pictures: the reward that agents get there."""
-    text = LABELS[name.removesuffix(AUGMENTED)]
+    _, text = SHOWN[name.removesuffix(AUGMENTED)]
     return text if AUGMENTED not in name else re.sub(r"\(s('?)\)", r"(s\1, v\1)", text)
 
 

@@ -116,9 +116,6 @@ def draw_step_sizes(count: int, seed: int) -> np.ndarray:
     return np.exp(low + places * (high - low))
 
 
-# --- NES whose step size and score transform are part of its state ------------------------------
-
-
 @struct.dataclass
 class AnyNESState:
     nes: NESState
@@ -177,9 +174,6 @@ def make_search(mirrored: bool, population: int, devices: int | None) -> Search:
         return state.replace(es_state=state.es_state.replace(nes=nes, transform=transforms))
 
     return Search(init=jax.jit(init), advance=jax.jit(lambda state: program.generation(state)[0]))
-
-
-# --- what is made of it --------------------------------------------------------------------------
 
 
 def edges_of(bins: int) -> np.ndarray:

@@ -108,9 +108,6 @@ def training_of(settings: SeHistograms, ses: Any, agent: Any) -> TrainingConfig:
     return dataclasses.replace(training, test_episodes=settings.test_episodes)
 
 
-# --- what is recorded ----------------------------------------------------------------------------
-
-
 @functools.cache
 def transitions(max_rows: int) -> Measure:
     """What is kept of an agent: the last transitions of its training, and its tests'."""
@@ -194,9 +191,6 @@ def rows_of(recorded: dict[str, dict[str, np.ndarray]]) -> pd.DataFrame:
             columns = {"episode": mine["episode"], "reward": mine["reward"].astype(float)}
             tables.append(pd.DataFrame({"source": source, "agent": agent} | columns | states))
     return pd.concat(tables, ignore_index=True)
-
-
-# --- what is made of it --------------------------------------------------------------------------
 
 
 def test_returns(rows: pd.DataFrame) -> pd.Series:

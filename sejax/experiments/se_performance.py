@@ -14,6 +14,8 @@ task, or `real_groups`.
 from dataclasses import dataclass
 from typing import Any
 
+import matplotlib.pyplot as plt
+import numpy as np
 import pandas as pd
 
 import sejax
@@ -30,8 +32,9 @@ from sejax.training import SOLVED_BY, TrainingConfig
 
 NUM_BEST = 5
 BEST_FOR = "td3_discrete"
-LABELS = {"real": "real", "varied": "synth., HPs varied", "fixed": "synth., HPs fixed",
-          "best": "synth., best SEs"}  # fmt: skip
+SHOWN = {"real": (figures.REAL, "real"), "varied": (figures.VARIED, "synth., HPs varied"),
+         "fixed": (figures.FIXED, "synth., HPs fixed"),
+         "best": (figures.BEST, "synth., best SEs")}  # fmt: skip
 
 # Training steps, "mean ± std", in CartPole: reference_details.md 7.1, the values in the scripts of
 # the authors' bar plot; best: the same and paper, section "Transferability of SEs", which also has
@@ -179,7 +182,7 @@ def make_table(env_name: str, summary: pd.DataFrame) -> pd.DataFrame:
 
     return as_texts(summary, {
         "agent": "{kind}",
-        "trained on": lambda row: LABELS[row.setting],
+        "trained on": lambda row: SHOWN[row.setting][1],
         "SEs, agents": "{num_ses}, {num_agents}",
         "training steps": lambda row: measured(row, "train_steps", 0),
         "paper's": lambda row: PAPER_STEPS.get((env_name, row.kind), {}).get(row.setting, ""),
@@ -216,14 +219,36 @@ def draw(task: Any, agents: pd.DataFrame, path: Any) -> None:
 
     Source: paper, figures "Densities based on each 4000 cumulative test rewards".
     """
-    colors = {"real": figures.REAL, "varied": figures.VARIED, "fixed": figures.FIXED,
-              "best": figures.BEST}  # fmt: skip
-    columns = {
-        str(kind): {LABELS[name]: (colors[name], mine)
-                    for name, mine in of_kind.groupby("setting", sort=False)}
-        for kind, of_kind in agents.groupby("kind", sort=False)
-    }  # fmt: skip
-    figures.performance(columns, return_columns(agents), task.name, path)
+    kinds = {str(kind): mine for kind, mine in agents.groupby("kind", sort=False)}
+    returns = return_columns(agents)
+    low = agents[returns].min(axis=None)
+    high = max(low + 1, agents[returns].max(axis=None))
+    labels = ("density (log scale)", "training steps", "training episodes")
+    size = (1.2 + 3.6 * len(kinds), 8)
+    with figures.panels(path, 3, len(kinds), size, height_ratios=(1.5, 1, 1)) as (figure, axes):
+        for (kind, mine), (top, *lower) in zip(kinds.items(), axes.T, strict=True):
+            met = colored(mine, returns)
+            figures.densities(top, met, low, high)
+            top.set(title=figures.AGENT_NAMES.get(kind, kind),
+                    xlabel=f"return of a test episode on {task.name}")  # fmt: skip
+            below = [f"{values.mean():.1f}" for _, values in met]
+            for axis, name in zip(lower, ("train_steps", "train_episodes"), strict=True):
+                figures.bars(axis, colored(mine, name), below)
+                axis.set_xlabel("mean return")
+        for axis, label in zip(axes[:, 0], labels, strict=True):
+            axis.set_ylabel(label)
+        longest = max((mine["setting"].unique() for mine in kinds.values()), key=len)
+        handles = [plt.Line2D([], [], color=SHOWN[name][0], lw=3) for name in longest]
+        # Side by side the labels are as wide as two columns.
+        figure.legend(handles, [f"train: {SHOWN[name][1]}" for name in longest],
+                      ncols=len(longest) if len(kinds) > 1 else 1,
+                      loc="outside upper center")  # fmt: skip
+
+
+def colored(agents: pd.DataFrame, names: str | list[str]) -> list[tuple[str, np.ndarray]]:
+    """Colour and values of these columns for each setting."""
+    return [(SHOWN[str(setting)][0], mine[names].to_numpy(float).ravel())
+            for setting, mine in agents.groupby("setting", sort=False)]  # fmt: skip
 
 
 EXPERIMENT = Experiment(settings=SePerformance, compute=compute, report=report, about=__doc__)

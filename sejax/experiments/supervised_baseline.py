@@ -20,6 +20,7 @@ short for any agent on the real task itself: `max_steps` gives those on the mode
 """
 
 import dataclasses
+import itertools
 from pathlib import Path
 from typing import Any
 
@@ -51,11 +52,10 @@ def compute(settings: SupervisedBaseline) -> pd.DataFrame:
     data = supervised_models.collect_all(settings, ses)
     fits = supervised_models.fit_piece(settings, ses, data)
     tables = []
-    for kind in settings.agents:
-        for hparams in settings.hparams:
-            for name, world in make_worlds(settings, ses, kind, hparams).items():
-                rows = worlds.train_groups(world, settings, settings.num_agents)
-                tables.append(rows.assign(world=name, kind=kind, hparams=hparams))
+    for kind, hparams in itertools.product(settings.agents, settings.hparams):
+        for name, world in make_worlds(settings, ses, kind, hparams).items():
+            rows = worlds.train_groups(world, settings, settings.num_agents)
+            tables.append(rows.assign(world=name, kind=kind, hparams=hparams))
     return stack({"agents": pd.concat(tables), "fits": fits,
                   "transitions": supervised_models.summary_of(data)})  # fmt: skip
 
@@ -74,9 +74,7 @@ def load(settings: SupervisedBaseline) -> Any:
     return ses
 
 
-def make_worlds(
-    settings: SupervisedBaseline, ses: Any, kind: str, hparams: str
-) -> dict[str, World]:
+def make_worlds(settings: Any, ses: Any, kind: str, hparams: str) -> dict[str, World]:
     """The models of both variants and the SE, with as many agents on the SE as on all models."""
     sets = {name: sejax.load_set(supervised_models.model_file(settings, name), option="out")
             for name in ("authors", "fair")}  # fmt: skip
@@ -84,9 +82,8 @@ def make_worlds(
     made = {}
     for name, proxies in (sets | {"se": ses}).items():
         training = worlds.training_as_learned(proxies, agent)
-        max_steps = se_agents.QUICK_STEPS if settings.quick else training.max_steps
-        if settings.max_steps and name != "se":
-            max_steps = settings.max_steps
+        own = settings.max_steps if name != "se" else None
+        max_steps = own or (se_agents.QUICK_STEPS if settings.quick else training.max_steps)
         training = dataclasses.replace(training, max_steps=max_steps,
                                        test_episodes=settings.test_episodes)  # fmt: skip
         made[name] = World.of_set(
@@ -206,8 +203,7 @@ def draw(task: Any, agents: pd.DataFrame, summary: pd.DataFrame, path: Path) -> 
                      xlabel=f"return of a test episode on {task.name}",
                      ylim=(0.5 / num_episodes, 1.1))  # fmt: skip
         axes[0, 0].set_ylabel("share of test episodes")
-        handles, labels = axes[0, 0].get_legend_handles_labels()
-        figure.legend(handles, labels, ncols=3, loc="outside upper center")
+        figures.legend_above(figure, axes[0, 0], 3, fontsize=None)
 
 
 EXPERIMENT = Experiment(settings=SupervisedBaseline, compute=compute, report=report, about=__doc__)

@@ -53,9 +53,6 @@ class SupervisedBaseline(Settings):
                                     "an agent on a model; as on the SE")  # fmt: skip
 
 
-# --- transitions ---------------------------------------------------------------------------------
-
-
 def learning_config(settings: SupervisedBaseline, ses: Any) -> Any:
     """Settings of the NES runs that the transitions come from."""
     config = build.learn_config(ses.config)
@@ -169,19 +166,12 @@ class Sample:
 
 
 def summary_of(data: list[pd.DataFrame]) -> pd.DataFrame:
-    """What is to be known of the transitions, a row for each model.
-
-    Columns: `model`; `transitions`, their number; `episode_return`, the mean over them of their
-    episode's return; `ends`, the share of them that end an episode.
-    """
+    """Number of transitions, mean return of their episodes and share of ends, for each model."""
     return pd.DataFrame({
         "model": range(len(data)), "transitions": [len(rows) for rows in data],
         "episode_return": [rows["return"].mean() for rows in data],
         "ends": [rows["terminated"].mean() for rows in data],
     })  # fmt: skip
-
-
-# --- models --------------------------------------------------------------------------------------
 
 
 def model_file(settings: SupervisedBaseline, variant: str) -> Path:
@@ -202,9 +192,7 @@ def fit_piece(settings: SupervisedBaseline, ses: Any, data: list[pd.DataFrame]) 
     return fits
 
 
-def fit_all(
-    settings: SupervisedBaseline, ses: Any, data: list[pd.DataFrame], num_rows: int
-) -> pd.DataFrame:
+def fit_all(settings: Any, ses: Any, data: list[pd.DataFrame], num_rows: int) -> pd.DataFrame:
     """Fits a model to each run's transitions and writes the models; a row for each epoch."""
     arrays = [arrays_of(rows.iloc[:num_rows]) for rows in data]
     stacked = tuple(np.stack(parts) for parts in zip(*arrays, strict=True))
@@ -225,9 +213,8 @@ def arrays_of(rows: pd.DataFrame) -> tuple[np.ndarray, np.ndarray, np.ndarray, n
     """States `[n, obs_dim]`, actions `[n]`, targets [s', r] and ends `[n]`."""
     states = [name for name in rows if name.startswith("state_")]
     targets = [name for name in rows if name.startswith("next_state_")] + ["reward"]
-    return (rows[states].to_numpy(np.float32), rows["action"].to_numpy(np.int32),
-            rows[targets].to_numpy(np.float32),
-            rows["terminated"].to_numpy(np.float32))  # fmt: skip
+    state, target, end = (rows[x].to_numpy(np.float32) for x in (states, targets, "terminated"))
+    return state, rows["action"].to_numpy(np.int32), target, end
 
 
 def make_fit(env: Any, num_rows: int, epochs: int) -> Callable[..., Any]:
@@ -240,14 +227,11 @@ def make_fit(env: Any, num_rows: int, epochs: int) -> Callable[..., Any]:
     num_batches = num_rows // batch_size
     optimizer = optax.adam(LEARNING_RATE)
 
-    def errors_of(weights: Any, states: Any, actions: Any, targets: Any, ends: Any) -> Any:
+    def loss(weights: Any, states: Any, actions: Any, targets: Any, ends: Any) -> Any:
         state, reward, done = jax.vmap(env.predict, (None, 0, 0))(weights, states, actions)
         predicted = jnp.concatenate([state, reward[:, None]], axis=1)
-        return jnp.stack([jnp.mean((predicted - targets) ** 2), jnp.mean((done - ends) ** 2)])
-
-    def loss(weights: Any, batch: Any) -> Any:
-        errors = errors_of(weights, *batch)
-        return errors.sum(), errors
+        errors = [jnp.mean((predicted - targets) ** 2), jnp.mean((done - ends) ** 2)]
+        return sum(errors), jnp.stack(errors)
 
     def fit(key: Any, *data: Any) -> Any:
         key_init, key_order = jax.random.split(key)
@@ -256,8 +240,8 @@ def make_fit(env: Any, num_rows: int, epochs: int) -> Callable[..., Any]:
 
         def update(carry: Any, rows: Any) -> Any:
             weights, opt_state = carry
-            batch = tuple(x[rows] for x in data)
-            gradient, errors = jax.grad(loss, has_aux=True)(weights, batch)
+            batch = (x[rows] for x in data)
+            gradient, errors = jax.grad(loss, has_aux=True)(weights, *batch)
             step, opt_state = optimizer.update(gradient, opt_state)
             return (optax.apply_updates(weights, step), opt_state), errors
 
@@ -273,9 +257,7 @@ def make_fit(env: Any, num_rows: int, epochs: int) -> Callable[..., Any]:
     return fit
 
 
-def save_models(
-    settings: SupervisedBaseline, ses: Any, weights: Any, variant: str, done: str
-) -> None:
+def save_models(settings: Any, ses: Any, weights: Any, variant: str, done: str) -> None:
     """Stores the models of a variant, as SEs with their use of the done output."""
     env = plugins.make("proxy", dataclasses.replace(ses.env.config, done=done), ses.task)
     each = [jax.tree.map(lambda x, i=i: x[i], weights) for i in range(settings.models)]

@@ -179,9 +179,6 @@ def training_as_learned(proxies: Any, agent: Any) -> TrainingConfig:
     return budget_for(learned, agent, learned_with, proxies.task.max_steps)
 
 
-# --- what is measured ----------------------------------------------------------------------------
-
-
 def outcome_rows(outcome: Any, drawn: dict[str, np.ndarray]) -> pd.DataFrame:
     """A row for each agent, with a column for each test episode and each drawn hyperparameter."""
     returns = outcome.test_returns.astype(float)
