@@ -5,7 +5,7 @@ an exploration bonus, and each of several RNs.
 """
 
 import functools
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -73,32 +73,29 @@ class CurveSettings(RnSettings):
 def real_curves(settings: CurveSettings) -> Iterator[pd.DataFrame]:
     """Curves of all agents on the real task, without and with the bonuses that are compared."""
     make = functools.partial(World.real, settings.task)
-    yield from _curves(settings, make, "real", settings.rns)
+    yield from curves_in(settings, "real", settings.rns, make)
     for name, bonus in settings.study.bonuses.items():
         if name in settings.bonuses:
-            bonused = functools.partial(make, exploration=bonus)
-            yield from _curves(settings, bonused, name, settings.bonus_groups)
+            yield from curves_in(settings, name, settings.bonus_groups, make, exploration=bonus)
 
 
-def rn_curves(
-    settings: CurveSettings, variant: str, rns: Any, prefix: str = ""
-) -> Iterator[pd.DataFrame]:
-    """Curves of all agents on the RNs of a set, of which each group of agents has one.
-
-    The prefix, of the pieces' names, tells worlds of one name apart.
-    """
+def rn_curves(settings: CurveSettings, variant: str, rns: Any, prefix: str = "") -> Any:
+    """Curves of all agents on the RNs of a set, of which each group of agents has one."""
     make = functools.partial(World.of_set, rns)
-    return _curves(settings, make, variant, rns.size, prefix)
+    return curves_in(settings, variant, rns.size, make, prefix)
 
 
-def _curves(
-    settings: CurveSettings, make: Callable[..., World], name: str, groups: int, prefix: str = ""
+def curves_in(
+    settings: CurveSettings, name: str, groups: int, make: Any, prefix: str = "", **more: Any
 ) -> Iterator[pd.DataFrame]:
-    """Those of each row, with the columns `group`, `row` and `world`."""
+    """Those of each row, with the columns `group`, `row` and `world`.
+
+    `make(group names, ...)` makes a world; the prefix tells apart the pieces of worlds of one name.
+    """
     for row in settings.rows:
         world = make([f"{i:02d}" for i in range(groups)], name=f"{prefix}{row}-{name}",
                      agent=settings.agent(row), training=settings.training,
-                     hparams="varied" if row == "varied" else "default")  # fmt: skip
+                     hparams="varied" if row == "varied" else "default", **more)  # fmt: skip
         curves = worlds.train_groups(world, settings, settings.num_agents, worlds.CURVES)
         group = curves["group"].astype(int)
         number = curves["agent"] + group * settings.num_agents
@@ -183,9 +180,7 @@ def common_note(settings: CurveSettings, solved_reward: float) -> str:
     )
 
 
-def draw(
-    settings: CurveSettings, curves: dict[str, pd.DataFrame], height: float, name: str
-) -> None:
+def draw(settings: Any, curves: dict[str, pd.DataFrame], height: float, name: str) -> None:
     """Draws a line of panels for each kind of curves, and in it a panel for each row of agents.
 
     The curves are named by their label on the left; the height is a panel's, in inches.

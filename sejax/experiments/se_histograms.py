@@ -41,11 +41,9 @@ from sejax.experiments.tables import as_texts, publish
 from sejax.experiments.worlds import Measure, World, train_groups, training_as_learned
 from sejax.training import TrainingConfig
 
-SOURCES = ("train", "test", "response")
-LABELS = {"train": "SE, in training", "test": "real task, in tests",
-          "response": "SE, from the tests' states and actions"}  # fmt: skip
-
-COLORS = {"train": figures.REAL, "test": figures.VARIED, "response": figures.FIXED}
+SOURCES = {"train": (figures.REAL, "SE, in training"),
+           "test": (figures.VARIED, "real task, in tests"),
+           "response": (figures.FIXED, "SE, from the tests' states and actions")}  # fmt: skip
 DIMENSIONS = {
     "cartpole": ("cart position (m)", "cart velocity (m/s)", "pole angle (rad)",
                  "pole angular velocity (rad/s)"),
@@ -292,12 +290,14 @@ def draw(task: Any, rows: pd.DataFrame, path: Path) -> None:
                 samples = {s: mine[mine["source"] == s][column].to_numpy() for s in SOURCES}
                 edges = bin_edges(samples)
                 for source, values in samples.items():
-                    figures.histogram(axis, values, 0.3, 1.1, bins=edges, color=COLORS[source])
+                    color, _ = SOURCES[source]
+                    figures.histogram(axis, values, 0.3, 1.1, bins=edges, color=color)
                 axis.set_xlim(edges[0], edges[-1])
                 axis.set_xlabel(f"next {name}" if name != "reward" else name, fontsize=9)
             line[0].set_ylabel(f"{figures.AGENT_NAMES.get(kind, kind)}\ntransitions")
-        handles = [plt.Rectangle((0, 0), 1, 1, color=COLORS[s], alpha=0.6) for s in SOURCES]
-        figure.legend(handles, list(LABELS.values()), ncols=3, loc="outside upper center")
+        colors, labels = zip(*SOURCES.values(), strict=True)
+        handles = [plt.Rectangle((0, 0), 1, 1, color=color, alpha=0.6) for color in colors]
+        figure.legend(handles, labels, ncols=3, loc="outside upper center")
 
 
 EXPERIMENT = Experiment(settings=SeHistograms, compute=compute, report=report, about=__doc__)

@@ -55,13 +55,6 @@ def publish(
     lines = "\n".join("| " + " | ".join(map(str, row)) + " |" for row in rows)
     text = f"# {title}\n\n`{settings.command()}`\n\n{lines}\n\n{note}\n"
     write_text(folder / f"{settings.files}table.md", text)
-    print_table(title, table)
-    print(f"{folder}: {', '.join(sorted(path.name for path in folder.iterdir()))}")
-    return table
-
-
-def print_table(title: str, table: pd.DataFrame) -> None:
-    """Prints a table of texts."""
     printed = Table(*map(str, table.columns), title=title)
     for row in table.itertuples(index=False):
         printed.add_row(*map(str, row))
@@ -69,3 +62,5 @@ def print_table(title: str, table: pd.DataFrame) -> None:
     if not console.is_terminal:
         console.width = 220  # a file has room for whole rows
     console.print(printed)
+    print(f"{folder}: {', '.join(sorted(path.name for path in folder.iterdir()))}")
+    return table

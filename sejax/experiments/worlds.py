@@ -97,9 +97,9 @@ def train_groups(
     measure = measure or OUTCOMES  # which are defined below
     shared = {"num_agents": num_agents, "seed": settings.seed}
     tables = []
-    for first in range(0, len(world.groups), at_once):
-        places = {f"{world.name}-{world.groups[i].name}": i
-                  for i in range(first, min(first + at_once, len(world.groups)))}  # fmt: skip
+    every = [(f"{world.name}-{group.name}", i) for i, group in enumerate(world.groups)]
+    for first in range(0, len(every), at_once):
+        places = dict(every[first : first + at_once])
         named = {name: world.settings_of(world.groups[i]) | shared for name, i in places.items()}
 
         def compute(missing: list[str], places: dict[str, int] = places) -> list[pd.DataFrame]:
