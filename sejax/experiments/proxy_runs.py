@@ -23,7 +23,7 @@ class RunSettings(Settings):
 
     env: str = setting("cartpole", about="task: cartpole, acrobot, ...")
     generations: int | None = count(None, "generations", about="outer iterations; the preset's")
-    preset: str = setting("best", about="of the NES runs: best, paper, paper_performance")
+    preset: str = setting("best", about="of the NES runs: best, paper, for SEs paper_performance")
     run: tuple[str, ...] = setting((), about="overrides of the NES runs, or as below")
 
     def learn_config(self, words: Iterable[str]) -> Any:
