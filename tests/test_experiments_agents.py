@@ -6,7 +6,7 @@ import pytest
 from support import refuse
 
 from sejax.errors import ConfigError
-from sejax.experiments import agent_learning, pieces, return_curves
+from sejax.experiments import agent_learning, pieces, return_curves, worlds
 
 
 def curve(steps, returns):
@@ -47,7 +47,7 @@ def test_every_agent_learns_and_nothing_is_computed_twice(tmp_path, monkeypatch)
         assert mine["steps"].iloc[-1] <= 400
         assert mine["test_return"].between(-150, -12).all()
 
-    monkeypatch.setattr(agent_learning, "train", refuse)
+    monkeypatch.setattr(worlds, "train", refuse)
     pd.testing.assert_frame_equal(agent_learning.EXPERIMENT.run(settings), table)
 
 

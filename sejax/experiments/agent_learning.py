@@ -7,22 +7,20 @@ its training but the step limit. A study is an agent on a task; its hyperparamet
 where `STUDIES` names no others, and its peers are what others report for the same task.
 """
 
-import functools
 from dataclasses import dataclass, field
 from typing import Any
 
-import jax
 import numpy as np
 import pandas as pd
 
 import sejax
 from sejax import plugins
-from sejax.experiments import figures, return_curves, worlds
+from sejax.experiments import figures, return_curves
 from sejax.experiments.experiment import Experiment
 from sejax.experiments.return_curves import WINDOW
-from sejax.experiments.settings import Settings, each_of, setting
-from sejax.experiments.tables import bootstrap_interval, publish
-from sejax.options import counts
+from sejax.experiments.settings import Settings, count, each_of, setting
+from sejax.experiments.tables import as_texts, bootstrap_interval, publish
+from sejax.experiments.worlds import CURVES, World, train_groups
 from sejax.training import TrainingConfig
 
 QUICK_STEPS = 2000
@@ -47,12 +45,10 @@ class Study:
         """Episodes of training and of tests alternate until the step limit."""
         max_steps = min(self.max_steps, QUICK_STEPS) if quick else self.max_steps
         return TrainingConfig(
-            max_episodes=max_steps // SHORTEST_EPISODE,
-            max_steps=max_steps,
-            stop_rule="never",
+            max_episodes=max_steps // SHORTEST_EPISODE, max_steps=max_steps, stop_rule="never",
             tests_between=test_episodes,
             time_limit_is_terminal=False,  # as in the literature; the paper's code ends there
-        )
+        )  # fmt: skip
 
 
 STUDIES = (
@@ -83,14 +79,11 @@ ENVS = tuple(dict.fromkeys(study.env for study in STUDIES))
 
 @dataclass(frozen=True, kw_only=True)
 class AgentLearning(Settings):
-    """What the experiment is told."""
-
     name = "agent_learning"
 
     envs: tuple[str, ...] = setting(ENVS, each_of(ENVS), about="tasks whose agents are trained")
-    num_agents: int = setting(10, counts("it counts agents"), quick=2, about="seeds of each agent")
-    test_episodes: int = setting(1, counts("it counts episodes"), about="after each training "
-                                 "episode")  # fmt: skip
+    num_agents: int = count(10, "agents", quick=2, about="seeds of each agent")
+    test_episodes: int = count(1, "episodes", about="after each training episode")
 
 
 def compute(settings: AgentLearning) -> pd.DataFrame:
@@ -99,34 +92,14 @@ def compute(settings: AgentLearning) -> pd.DataFrame:
     for number, study in enumerate(STUDIES):
         if study.env not in settings.envs:
             continue
-        task = sejax.envs.make(study.env)
         training = study.training(settings.quick, settings.test_episodes)
-        world = worlds.World(
-            name=f"{number:02d}-{study.env}-{study.agent}",
-            env=task.env,
-            task=task,
-            groups=(worlds.Group("all", task.params),),
+        world = World.real(
+            sejax.envs.make(study.env), ["all"], name=f"{number:02d}-{study.env}-{study.agent}",
             agent=plugins.configure("agent", {"name": study.agent, **study.hparams}),
-            training=training,
-        )
-        made_with = world.settings_of(world.groups[0])
-        made_with |= {"num_agents": settings.num_agents, "seed": settings.seed}
-        train_all = functools.partial(train, settings, world)
-        curves = settings.pieces.compute(world.name, made_with, train_all)
-        print(f"{world.name}: {worlds.CURVES.say(curves)}", flush=True)
+            training=training, is_single=True)  # fmt: skip
+        curves = train_groups(world, settings, settings.num_agents, CURVES).drop(columns="group")
         tables.append(curves.assign(study=number, max_steps=training.max_steps))
     return pd.concat(tables, ignore_index=True)
-
-
-def train(settings: AgentLearning, world: worlds.World) -> pd.DataFrame:
-    """Curves of a study's agents, whose keys are split from the seed's own: no group is first."""
-    program = worlds.make_program(worlds.CURVES, world.agent, world.exploration, world.hparams,
-                                  world.env, world.task, world.training,
-                                  settings.devices)  # fmt: skip
-    keys = jax.random.split(jax.random.key(settings.seed), settings.num_agents)
-    params = jax.tree.map(lambda x: np.stack([x]), world.groups[0].params)
-    curves, drawn = jax.device_get(program(keys, params, np.ones(settings.num_agents, bool)))
-    return worlds.CURVES.to_table(curves, drawn)
 
 
 def summarise(curves: pd.DataFrame) -> pd.DataFrame:
@@ -148,28 +121,21 @@ def summarise(curves: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def make_table(summary: pd.DataFrame) -> pd.DataFrame:
-    """The summary as texts, with what others report."""
-    rows = []
-    for row in summary.itertuples():
-        study = STUDIES[row.study]
-        median = row.median_steps_to_solve
-        rows.append({
-            "task": row.env,
-            "agent": row.agent,
-            "other than the paper's": ", ".join(f"{k} {v}" for k, v in study.hparams.items()),
-            "solved": f"{row.num_solved} of {row.num_agents} at {row.threshold:g}",
-            "median steps to solve": f"{median:,.0f}" if np.isfinite(median) else "-",
-            "steps": f"{row.max_steps:,}",
-            f"last {WINDOW} tests": f"{row.last_return:.1f} "
-                                    f"[{row.last_low:.1f}, {row.last_high:.1f}]",
-            "others": study.peers,
-        })  # fmt: skip
-    return pd.DataFrame(rows)
+COLUMNS: dict[str, Any] = {
+    "task": "{env}",
+    "agent": "{agent}",
+    "other than the paper's": lambda row: ", ".join(
+        f"{name} {value}" for name, value in STUDIES[row.study].hparams.items()),
+    "solved": "{num_solved} of {num_agents} at {threshold:g}",
+    "median steps to solve": lambda row: (
+        f"{row.median_steps_to_solve:,.0f}" if np.isfinite(row.median_steps_to_solve) else "-"),
+    "steps": "{max_steps:,}",
+    f"last {WINDOW} tests": "{last_return:.1f} [{last_low:.1f}, {last_high:.1f}]",
+    "others": lambda row: STUDIES[row.study].peers,
+}  # fmt: skip
 
 
 def report(settings: AgentLearning, curves: pd.DataFrame) -> pd.DataFrame:
-    """Writes the summary, the picture and the table, and returns the table."""
     draw(settings, curves)
     summary = summarise(curves)
     note = (
@@ -179,7 +145,7 @@ def report(settings: AgentLearning, curves: pd.DataFrame) -> pd.DataFrame:
         "bootstrap 95% interval. CartPole here is v0, of 200 steps."
     )
     title = "Agents that learn the real tasks"
-    return publish(settings, title, make_table(summary), summary, note)
+    return publish(settings, title, as_texts(summary, COLUMNS), summary, note)
 
 
 def draw(settings: AgentLearning, curves: pd.DataFrame, points: int = 100) -> None:
@@ -197,12 +163,11 @@ def draw(settings: AgentLearning, curves: pd.DataFrame, points: int = 100) -> No
                 study = STUDIES[int(number)]
                 last_step = study_curves["steps"].max()
                 grid = np.geomspace(last_step / 200, last_step, points)
-                values = return_curves.on_grid(study_curves, grid)
-                known = ~np.isnan(values).any(axis=0)
-                low, high = np.transpose([bootstrap_interval(v) for v in values[:, known].T])
-                label = figures.AGENT_NAMES[study.agent] + "*" * bool(study.hparams)
-                figures.band(axis, grid[known], values[:, known].mean(axis=0), low, high, color,
-                             lw=1.8, label=label)  # fmt: skip
+                figures.band(
+                    axis, grid, return_curves.on_grid(study_curves, grid),
+                    lambda values: np.transpose([bootstrap_interval(v) for v in values.T]), color,
+                    lw=1.8, label=figures.AGENT_NAMES[study.agent] + "*" * bool(study.hparams),
+                )  # fmt: skip
             axis.axhline(sejax.envs.make(env).solved_reward, color="#7a7a7a", ls="--", lw=1)
             axis.set_title(env, fontsize=10)
             axis.set(xscale="log", xlabel="training steps (*: hyperparameters in the table)")

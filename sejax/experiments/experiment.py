@@ -20,27 +20,21 @@ from sejax.experiments.settings import RUN_PREFIX, Settings, as_word
 
 @dataclass(frozen=True, kw_only=True)
 class Experiment:
-    """A table or figure of the paper.
+    """A table or figure of the paper."""
 
-    Attributes:
-      settings: what it can be told.
-      compute: `settings -> rows`; computes the pieces that are missing. It checks what a field
-        alone cannot tell, before anything that takes long.
-      report: `(settings, rows) -> table`; writes tables and pictures. It reads rows that were
-        stored as well as new ones.
-      about: the module's docstring.
-    """
-
-    settings: type[Settings]
+    settings: type[Settings]  # what it can be told
+    # settings -> rows: computes the pieces that are missing. It checks what a field alone cannot
+    # tell, before anything that takes long.
     compute: Callable[[Any], pd.DataFrame]
+    # (settings, rows) -> table: writes tables and pictures, of stored rows as well as new ones.
     report: Callable[[Any, pd.DataFrame], pd.DataFrame]
-    about: str | None
+    about: str | None  # the module's docstring
 
     def run(self, settings: Settings) -> pd.DataFrame:
         """Computes what is missing, writes everything and returns the table.
 
         Raises:
-          ConfigError: for settings that cannot work, or a folder of other settings.
+          ConfigError: for settings or files that cannot work, or a folder of other settings.
         """
         if not settings.from_rows:
             write_rows(settings.rows_file, self.compute(settings))
@@ -69,17 +63,15 @@ class Experiment:
     def help(self) -> str:
         """What `--help` prints: all fields with their values."""
         full, quick = (self.settings.defaults({"quick": quick}) for quick in (False, True))
-        rows = []
+        rows = {}
         for field in dataclasses.fields(self.settings):
-            name, about = field.name, field.metadata["about"]
-            shown = f"{name}={as_word(full[name])}"
-            differs = full[name] != quick[name]
-            rows.append((shown, f"{about} (quick: {as_word(quick[name])})" if differs else about))
-        width = min(34, max(len(shown) for shown, _ in rows))
-        lines = [f"  {shown:{width}}  {about}" for shown, about in rows]
-        if any(field.name == "run" for field in dataclasses.fields(self.settings)):
-            lines.append(f"  {RUN_PREFIX + 'FIELD=VALUE':{width}}  override of the NES runs, as of "
-                         "sejax.run")  # fmt: skip
+            usual, other = as_word(full[field.name]), as_word(quick[field.name])
+            differs = f" (quick: {other})" if usual != other else ""
+            rows[f"{field.name}={usual}"] = f"{field.metadata['about']}{differs}"
+        width = min(34, max(map(len, rows)))
+        if "run" in full:
+            rows[f"{RUN_PREFIX}FIELD=VALUE"] = "override of the NES runs, as of sejax.run"
+        lines = [f"  {shown:{width}}  {about}" for shown, about in rows.items()]
         usage = f"python -m sejax.experiments.{self.settings.name} [FIELD=VALUE ...]"
         return "\n".join([usage, "", (self.about or "").strip(), "", "Fields:", *lines])
 
@@ -88,9 +80,6 @@ def parse(settings: type[Settings], words: Sequence[str]) -> dict[str, Any]:
     """The fields that the words of a command line give, by Hydra's grammar; lists are `[a,b]`.
 
     Words `run.FIELD=VALUE` make the list `run`: they are read by the NES runs' own configuration.
-
-    Raises:
-      ConfigError: for a word that is no override, or an unknown field.
     """
     from hydra import compose, initialize
     from hydra.core.config_store import ConfigStore
@@ -120,11 +109,7 @@ def parse(settings: type[Settings], words: Sequence[str]) -> dict[str, Any]:
 
 
 def _require_words(settings: type[Settings], words: Sequence[str], fields: list[str]) -> None:
-    """Refuses what is not `field=value` with a message of our own, as Hydra's know no fields.
-
-    Raises:
-      ConfigError: for such a word.
-    """
+    """Refuses what is not `field=value` with a message of our own, as Hydra's know no fields."""
     for word in words:
         name, equals, value = word.partition("=")
         if equals and name in fields:

@@ -18,29 +18,18 @@ from sejax.serialize import flatten
 
 
 class Pieces:
-    """The finished pieces of an experiment.
+    """The finished pieces of an experiment, in a folder below that of the setting `work`."""
 
-    Args:
-      folder: where they are.
-      option: the setting that names this folder or one above it, for messages.
-    """
-
-    def __init__(self, folder: Path, option: str = "work"):
+    def __init__(self, folder: Path):
         self.folder = folder
-        self.option = option
 
     def compute(
         self, name: str, settings: dict[str, Any], compute: Callable[[], pd.DataFrame]
     ) -> pd.DataFrame:
         """A piece's table: read if it is there, else computed and written.
 
-        Args:
-          name: of the files, `<name>.csv` and `<name>.json`.
-          settings: what the piece depends on; plain values.
-          compute: makes the table.
-
         Raises:
-          ConfigError: if a piece of that name was made with other settings.
+          ConfigError: if a piece of that name was made with other settings; these are plain values.
         """
         (table,) = self.compute_all({name: settings}, lambda _: [compute()])
         return table
@@ -50,12 +39,7 @@ class Pieces:
         settings: dict[str, dict[str, Any]],
         compute: Callable[[list[str]], list[pd.DataFrame]],
     ) -> list[pd.DataFrame]:
-        """As `compute` for several pieces, of which those that are missing are made at once.
-
-        Args:
-          settings: of each piece, by its name.
-          compute: makes the tables of the pieces with the given names.
-        """
+        """As `compute` for several pieces, of which `compute(names)` makes the missing at once."""
         settings = json.loads(json.dumps(settings, default=str))
         missing = [name for name, mine in settings.items() if not self._is_there(name, mine)]
         for name, table in zip(missing, compute(missing) if missing else [], strict=True):
@@ -74,9 +58,9 @@ class Pieces:
         differing = sorted(key for key in {*there, *asked} if there.get(key) != asked.get(key))
         if differing:
             raise ConfigError(
-                f"{self.option} must be a new folder or that of the same experiment, because "
+                f"work must be a new folder or that of the same experiment, because "
                 f"finished pieces are used again; got {table} with another "
-                f"{', '.join(differing)}. Set {self.option}=DIR."
+                f"{', '.join(differing)}. Set work=DIR."
             )
         return True
 
@@ -88,11 +72,7 @@ def write_rows(path: Path, rows: pd.DataFrame) -> None:
 
 
 def read_rows(path: Path) -> pd.DataFrame:
-    """The rows that `write_rows` has written.
-
-    Raises:
-      ConfigError: if there are none.
-    """
+    """The rows that `write_rows` has written."""
     if not path.exists():
         raise ConfigError(
             f"from_rows must be false where no rows are kept, because tables are made from them; "

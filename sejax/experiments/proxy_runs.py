@@ -5,25 +5,44 @@ run directory of its own: one that was stopped goes on, and a finished one is ke
 """
 
 import dataclasses
+from collections.abc import Iterable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
+import sejax
+from sejax.experiments.settings import Settings, count, setting
 
-def configs_of_runs(config: Any, count: int, folder: Path, at_once: int = 1) -> list[Any]:
-    """Configurations of runs with `count` seeds from `config.seed` on, in folders of their own.
 
-    Args:
-      config: of all, a `LearnConfig`.
-      count: seeds in all.
-      folder: where the runs' folders go.
-      at_once: seeds that one program learns.
+@dataclass(frozen=True, kw_only=True)
+class RunSettings(Settings):
+    """Settings about the NES runs."""
+
+    env: str = setting("cartpole", about="task: cartpole, acrobot, ...")
+    generations: int | None = count(None, "generations", about="outer iterations; the preset's")
+    preset: str = setting("best", about="of the NES runs: best, paper, for SEs paper_performance")
+    run: tuple[str, ...] = setting((), about="overrides of the NES runs, or as below")
+
+    def learn_config(self, words: Iterable[str]) -> Any:
+        """The configuration of the NES runs with these overrides; later ones win."""
+        words = [f"env={self.env}", f"preset={self.preset}", *words]
+        if self.generations is not None:
+            words.append(f"generations={self.generations}")
+        config = sejax.config([*words, *self.run])
+        return dataclasses.replace(config, devices=self.devices, seed=self.seed)
+
+
+def configs_of_runs(config: Any, num_runs: int, folder: Path, at_once: int = 1) -> list[Any]:
+    """Configurations of runs with `num_runs` seeds from `config.seed` on, in folders of their own.
+
+    One program learns `at_once` of them.
     """
     configs = []
-    for seed in range(config.seed, config.seed + count, at_once):
-        num_seeds = min(at_once, config.seed + count - seed)
+    for seed in range(config.seed, config.seed + num_runs, at_once):
+        num_seeds = min(at_once, config.seed + num_runs - seed)
         name = f"seed{seed}" if num_seeds == 1 else f"seeds{seed}-{seed + num_seeds - 1}"
         configs.append(dataclasses.replace(
             config, seed=seed, num_seeds=num_seeds, run_dir=str(folder / name)
@@ -32,14 +51,11 @@ def configs_of_runs(config: Any, count: int, folder: Path, at_once: int = 1) -> 
 
 
 def learn_all(configs: list[Any], option: str = "work") -> pd.DataFrame:
-    """Curves of all runs, in rows with the columns of `metrics.csv`.
-
-    Args:
-      configs: from `configs_of_runs`; of what is there already only the rest is computed.
-      option: the setting that names a folder above those of the runs, for messages.
+    """Curves of all runs, in rows with the columns of `metrics.csv`; learns what is not there.
 
     Raises:
-      ConfigError: if a folder holds a run of other settings, or is in use.
+      ConfigError: if a folder, below that which `option` names, holds a run of other settings, or
+        is in use.
     """
     from sejax.app import run_directory, session
 
@@ -56,23 +72,16 @@ def learn_all(configs: list[Any], option: str = "work") -> pd.DataFrame:
 
 def _said(curve: pd.DataFrame, solved_score: float | None) -> str:
     best = curve.groupby("seed")["best_so_far"].max()
-    text = f"best {best.mean():.1f}"
-    if solved_score is None or len(best) > 1:
-        return text
-    solved = generations_to_solve(curve, solved_score)
-    when = f"solved in generation {solved:.0f}" if np.isfinite(solved) else "not solved"
-    return f"{text}, {when} of {len(curve)}"
+    when = ""
+    if solved_score is not None and len(best) == 1:
+        solved = generations_to_solve(curve, solved_score)
+        how = f"solved in generation {solved:.0f}" if np.isfinite(solved) else "not solved"
+        when = f", {how} of {len(curve)}"
+    return f"best {best.mean():.1f}{when}"
 
 
 def collect(configs: list[Any], path: Path, before: Any = None) -> None:
-    """Writes the best proxy of each seed into one file.
-
-    Args:
-      configs: of the runs.
-      path: the file.
-      before: a `ProxySet` of the same settings and earlier seeds, which comes first.
-    """
-    import sejax
+    """Writes the best proxy of each seed into one file, after those of the set `before`."""
     from sejax.app import build
 
     sources: list[Path] = []
@@ -94,11 +103,6 @@ def collect(configs: list[Any], path: Path, before: Any = None) -> None:
 
 
 def generations_to_solve(curve: pd.DataFrame, solved_reward: float) -> float:
-    """Generations until the first whose incumbent mean reaches the threshold; inf if none does.
-
-    Args:
-      curve: one run, in the order of its generations.
-      solved_reward: the threshold.
-    """
+    """Generations of a run until the first whose incumbent mean is high enough; inf if none is."""
     solved = curve["generation"][curve["incumbent_mean"] >= solved_reward]
     return float(solved.iloc[0]) + 1 if len(solved) else np.inf

@@ -11,31 +11,21 @@ import pandas as pd
 WINDOW = 10  # test episodes that a point of a smoothed curve is the mean of
 
 
-def smoothed(curve: pd.DataFrame, window: int = WINDOW) -> np.ndarray:
-    """Mean of the last `window` test returns (of all, if fewer) after each episode of an agent."""
-    return curve["test_return"].rolling(window, min_periods=1).mean().to_numpy()
-
-
 def on_grid(curves: pd.DataFrame, grid: np.ndarray, window: int = WINDOW) -> np.ndarray:
-    """Each agent's smoothed test return at given training steps, `[agent, points]`.
+    """Each agent's mean of its last `window` test returns (of all, if fewer), `[agent, points]`.
 
-    The value at a step is that of the last finished episode; nan before the first.
+    The value at a step of the grid is that of the last finished episode; nan before the first.
     """
     rows = []
     for _, curve in curves.groupby("agent"):
         place = np.searchsorted(curve["steps"], grid, side="right") - 1
-        rows.append(np.where(place >= 0, smoothed(curve, window)[place], np.nan))
+        smoothed = curve["test_return"].rolling(window, min_periods=1).mean().to_numpy()
+        rows.append(np.where(place >= 0, smoothed[place], np.nan))
     return np.stack(rows)
 
 
 def steps_to_solve(curve: pd.DataFrame, solved_reward: float, window: int = WINDOW) -> float:
-    """Training steps until the mean of the last `window` tests is high enough; inf if it never is.
-
-    Args:
-      curve: of one agent, in order.
-      solved_reward: the task's threshold.
-      window: tests in a row.
-    """
+    """Training steps of an agent until `window` tests have a mean high enough; inf if never."""
     full = curve["test_return"].rolling(window).mean().to_numpy()
     solved = np.flatnonzero(full >= solved_reward)
     return float(curve["steps"].iloc[solved[0]]) if len(solved) else np.inf

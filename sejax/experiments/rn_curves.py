@@ -4,6 +4,7 @@ The agents of a row of the paper's figure are trained in worlds: the real task, 
 an exploration bonus, and each of several RNs.
 """
 
+import functools
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -12,31 +13,21 @@ import numpy as np
 import pandas as pd
 
 from sejax import errors
-from sejax.agents import NoExploration
 from sejax.errors import require
 from sejax.experiments import figures, return_curves, rn_studies, worlds
 from sejax.experiments.rn_studies import RnSettings
-from sejax.experiments.settings import each_of, setting
-from sejax.experiments.tables import bootstrap_interval
-from sejax.experiments.worlds import Group, World
+from sejax.experiments.settings import count, each_of, setting
+from sejax.experiments.tables import as_texts, bootstrap_interval
+from sejax.experiments.worlds import World
 from sejax.options import counts
 from sejax.plugins import name_of
 from sejax.training import TrainingConfig
 
-ROWS = {
-    "default": "default hyperparameters",
-    "varied": "varied hyperparameters",
-    "transfer": "unseen agent",
-}
+ROWS = {"default": "default hyperparameters", "varied": "varied hyperparameters",
+        "transfer": "unseen agent"}  # fmt: skip
 GRID_POINTS = 200
 WITHOUT_RN = ("real", "count_based", "icm")  # worlds whose groups of agents have nothing in common
 LEAST_FOR_INTERVAL = 5  # independent values
-COLORS = {
-    "real": figures.BEST, "icm": "#7a7a7a", "count_based": "#7a7a7a",
-    "additive_potential": figures.REAL, "exclusive_potential": "#56B4E9",
-    "additive_non_potential": figures.VARIED, "exclusive_non_potential": figures.FIXED,
-    "additive_weighted_info": figures.SOLVED, "exclusive_weighted_info": "#CC79A7",
-}  # fmt: skip
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,11 +40,10 @@ class CurveSettings(RnSettings):
     bonuses: tuple[str, ...] = setting((), about="exploration bonuses on the real task to compare "
                                        "with: count_based on cliff_walking, elsewhere icm; or "
                                        "none")  # fmt: skip
-    rns: int = setting(10, counts("it counts RNs"), about="RNs of each variant that agents are "
-                       "trained on, the best")  # fmt: skip
-    bonus_groups: int = setting(10, counts("it counts groups"), about="groups of agents with a "
-                                "bonus, which are dear; as many as RNs are used")  # fmt: skip
-    num_agents: int = setting(10, counts("it counts agents"), about="on each RN, in each row")
+    rns: int = count(10, "RNs", about="RNs of each variant that agents are trained on, the best")
+    bonus_groups: int = count(10, "groups", about="groups of agents with a bonus, which are dear; "
+                              "as many as RNs are used")  # fmt: skip
+    num_agents: int = count(10, "agents", about="on each RN, in each row")
     max_steps: int = setting(5000, counts("an agent must train"), about="training steps; as the "
                              "paper's figure")  # fmt: skip
 
@@ -76,68 +66,39 @@ class CurveSettings(RnSettings):
     @property
     def training(self) -> TrainingConfig:
         """Episodes of training and of tests alternate until a limit."""
-        return TrainingConfig(
-            max_episodes=self.study.max_episodes,
-            max_steps=self.max_steps,
-            stop_rule="never",
-            tests_between=1,
-        )
+        return TrainingConfig(max_episodes=self.study.max_episodes, max_steps=self.max_steps,
+                              stop_rule="never", tests_between=1)  # fmt: skip
 
 
-def real_curves(settings: CurveSettings) -> pd.DataFrame:
+def real_curves(settings: CurveSettings) -> Iterator[pd.DataFrame]:
     """Curves of all agents on the real task, without and with the bonuses that are compared."""
-    task = settings.task
-    tables: list[pd.DataFrame] = []
-    bonuses = {name: bonus for name, bonus in settings.study.bonuses.items()
-               if name in settings.bonuses}  # fmt: skip
-    for name, bonus in {"real": NoExploration(), **bonuses}.items():
-        count = settings.bonus_groups if name in bonuses else settings.rns
-        groups = tuple(Group(f"{i:02d}", task.params) for i in range(count))
-        tables += _curves(settings, "", name, task.env, task, groups, exploration=bonus)
-    return pd.concat(tables, ignore_index=True)
+    make = functools.partial(World.real, settings.task)
+    yield from curves_in(settings, "real", settings.rns, make)
+    for name, bonus in settings.study.bonuses.items():
+        if name in settings.bonuses:
+            yield from curves_in(settings, name, settings.bonus_groups, make, exploration=bonus)
 
 
-def rn_curves(settings: CurveSettings, variant: str, rns: Any, prefix: str = "") -> pd.DataFrame:
-    """Curves of all agents on the RNs of a set.
-
-    Args:
-      settings: of the experiment.
-      variant: of the RNs.
-      rns: a `ProxySet`; each group of agents has one of them.
-      prefix: of the pieces' names, to tell worlds of one name apart.
-    """
-    groups = tuple(Group(f"{i:02d}", rns.one(i), rns.fingerprint(i)) for i in range(rns.size))
-    tables = _curves(settings, prefix, variant, rns.env, rns.task, groups,
-                     settings={"proxy": rns.config["proxy"]})  # fmt: skip
-    return pd.concat(tables, ignore_index=True)
+def rn_curves(settings: CurveSettings, variant: str, rns: Any, prefix: str = "") -> Any:
+    """Curves of all agents on the RNs of a set, of which each group of agents has one."""
+    make = functools.partial(World.of_set, rns)
+    return curves_in(settings, variant, rns.size, make, prefix)
 
 
-def _curves(
-    settings: CurveSettings,
-    prefix: str,
-    name: str,
-    env: Any,
-    task: Any,
-    groups: Any,
-    /,
-    **more: Any,
+def curves_in(
+    settings: CurveSettings, name: str, groups: int, make: Any, prefix: str = "", **more: Any
 ) -> Iterator[pd.DataFrame]:
-    """Those of each row, with the columns `group`, `row` and `world`."""
+    """Those of each row, with the columns `group`, `row` and `world`.
+
+    `make(group names, ...)` makes a world; the prefix tells apart the pieces of worlds of one name.
+    """
     for row in settings.rows:
-        world = World(
-            name=f"{prefix}{row}-{name}",
-            env=env,
-            task=task,
-            groups=groups,
-            agent=settings.agent(row),
-            training=settings.training,
-            hparams="varied" if row == "varied" else "default",
-            **more,
-        )
-        num_agents = settings.num_agents
-        curves = worlds.train_groups(world, settings, num_agents, worlds.CURVES)
+        world = make([f"{i:02d}" for i in range(groups)], name=f"{prefix}{row}-{name}",
+                     agent=settings.agent(row), training=settings.training,
+                     hparams="varied" if row == "varied" else "default", **more)  # fmt: skip
+        curves = worlds.train_groups(world, settings, settings.num_agents, worlds.CURVES)
         group = curves["group"].astype(int)
-        number = curves["agent"] + group * num_agents
+        number = curves["agent"] + group * settings.num_agents
         yield curves.assign(agent=number, group=group, row=row, world=name)
 
 
@@ -161,24 +122,22 @@ def summarise(curves: pd.DataFrame, solved_reward: float, max_steps: int) -> pd.
         held = return_curves.on_grid(mine, grid, window=1)
         mean_return = pd.Series(np.nanmean(held, axis=1), index=steps.index)
         counted = steps.clip(upper=max_steps)
-        low, high = interval(counted, groups, str(world))
-        area_low, area_high = interval(mean_return, groups, str(world))
         out.append({
             "row": row, "world": world, "groups": groups.nunique(), "agents": len(steps),
             "solved": float(np.isfinite(steps).mean()), "steps_to_solve": counted.mean(),
-            "steps_low": low, "steps_high": high, "mean_return": mean_return.mean(),
-            "return_low": area_low, "return_high": area_high,
+            **interval(counted, groups, str(world), "steps"), "mean_return": mean_return.mean(),
+            **interval(mean_return, groups, str(world), "return"),
             "last_return": return_curves.last_returns(mine).mean(),
         })  # fmt: skip
     return pd.DataFrame(out)
 
 
-def interval(values: pd.Series, groups: pd.Series, world: str) -> tuple[float, float]:
+def interval(values: pd.Series, groups: pd.Series, world: str, name: str) -> dict[str, float]:
     """95% bootstrap interval of the mean over agents, of which each has a group."""
-    independent = values if world in WITHOUT_RN else values.groupby(groups).mean()
-    if len(independent) < LEAST_FOR_INTERVAL:
-        return np.nan, np.nan
-    return bootstrap_interval(independent)
+    draws = values if world in WITHOUT_RN else values.groupby(groups).mean()
+    has_one = len(draws) >= LEAST_FOR_INTERVAL
+    low, high = bootstrap_interval(draws) if has_one else (np.nan, np.nan)
+    return {f"{name}_low": low, f"{name}_high": high}
 
 
 def step_grid(max_steps: int) -> np.ndarray:
@@ -189,21 +148,19 @@ def step_grid(max_steps: int) -> np.ndarray:
 def make_table(summary: pd.DataFrame) -> pd.DataFrame:
     """The summary as texts."""
     bare = summary[summary["world"] == "real"].set_index("row")["steps_to_solve"]
-    return pd.DataFrame([
-        {
-            "agents": ROWS[row.row],
-            "trained with": row.world,
-            "groups, agents": f"{row.groups}, {row.agents}",
-            "steps to solve": with_interval(row.steps_to_solve, row.steps_low, row.steps_high, 0),
-            "of the bare agent's": f"{row.steps_to_solve / bare[row.row]:.0%}"
-            if row.row in bare else "",
-            "solved": f"{row.solved:.0%}",
-            "mean return over training":
-                with_interval(row.mean_return, row.return_low, row.return_high, 1),
-            "last tests": f"{row.last_return:.1f}",
-        }
-        for row in summary.itertuples()
-    ])  # fmt: skip
+    return as_texts(summary, {
+        "agents": lambda row: ROWS[row.row],
+        "trained with": "{world}",
+        "groups, agents": "{groups}, {agents}",
+        "steps to solve":
+            lambda row: with_interval(row.steps_to_solve, row.steps_low, row.steps_high, 0),
+        "of the bare agent's":
+            lambda row: f"{row.steps_to_solve / bare[row.row]:.0%}" if row.row in bare else "",
+        "solved": "{solved:.0%}",
+        "mean return over training":
+            lambda row: with_interval(row.mean_return, row.return_low, row.return_high, 1),
+        "last tests": "{last_return:.1f}",
+    })  # fmt: skip
 
 
 def with_interval(mean: float, low: float, high: float, digits: int) -> str:
@@ -223,16 +180,10 @@ def common_note(settings: CurveSettings, solved_reward: float) -> str:
     )
 
 
-def draw(
-    settings: CurveSettings, curves: dict[str, pd.DataFrame], height: float, name: str
-) -> None:
+def draw(settings: Any, curves: dict[str, pd.DataFrame], height: float, name: str) -> None:
     """Draws a line of panels for each kind of curves, and in it a panel for each row of agents.
 
-    Args:
-      settings: of the experiment.
-      curves: by their label on the left.
-      height: of a panel, in inches.
-      name: of the picture.
+    The curves are named by their label on the left; the height is a panel's, in inches.
     """
     shape = len(curves), len(settings.rows)
     size = 0.8 + 3.8 * shape[1], 0.8 + height * shape[0]
@@ -259,13 +210,15 @@ def panel(axis: Any, curves: pd.DataFrame, max_steps: int, solved_reward: float)
     grid = step_grid(max_steps)
     for world, mine in curves.groupby("world", sort=False):
         name = str(world)
-        values = return_curves.on_grid(mine, grid, window=1)
-        known = ~np.isnan(values).any(axis=0)
-        mean = values[:, known].mean(axis=0)
-        error = values[:, known].std(axis=0) / np.sqrt(len(values))
         dashed = name in WITHOUT_RN and name != "real"
         style = "--" if dashed else ":" if rn_studies.AUGMENTED in name else "-"
-        color = COLORS[name.removesuffix(rn_studies.AUGMENTED)]
-        figures.band(axis, grid[known], mean, mean - error, mean + error, color, ls=style, lw=1.6,
-                     label=rn_studies.label(name))  # fmt: skip
+        color, _ = rn_studies.SHOWN[name.removesuffix(rn_studies.AUGMENTED)]
+        figures.band(axis, grid, return_curves.on_grid(mine, grid, window=1), standard_errors,
+                     color, ls=style, lw=1.6, label=rn_studies.label(name))  # fmt: skip
     axis.axhline(solved_reward, color="#7a7a7a", ls=":", lw=1)
+
+
+def standard_errors(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Ends of the mean with its standard error, `[points]` each, of `[agent, points]`."""
+    mean, error = values.mean(axis=0), values.std(axis=0) / np.sqrt(len(values))
+    return mean - error, mean + error

@@ -31,8 +31,6 @@ _CORNERS = {0: ((0.5, -0.5), (0.5, 0.5)), 1: ((-0.5, -0.5), (-0.5, 0.5)),
 
 @dataclass(frozen=True, kw_only=True)
 class RnHeatmap(RnSettings):
-    """Settings of this experiment."""
-
     name = "rn_heatmap"
 
     objective: str = rn_studies.objective_setting()
@@ -68,11 +66,10 @@ def rewards_of_moves(rns: Any) -> np.ndarray:
         terminal = grid.is_terminated(state.world, task.params)
         return jnp.where(terminal, jnp.nan, reward)
 
-    over_actions = jax.vmap(reward, (None, None, 0))
-    over_states = jax.vmap(over_actions, (None, 0, None))
-    over_rns = jax.vmap(over_states, (0, None, None))
     states, actions = jnp.arange(task.num_states), jnp.arange(grid.num_actions)
-    return np.asarray(jax.jit(over_rns)(rns.weights, states, actions))
+    for axis in (2, 1, 0):  # over actions, states and RNs
+        reward = jax.vmap(reward, tuple(0 if i == axis else None for i in range(3)))
+    return np.asarray(jax.jit(reward)(rns.weights, states, actions))
 
 
 def by_variant(settings: RnHeatmap, rows: pd.DataFrame) -> dict[str, np.ndarray]:
@@ -107,9 +104,7 @@ def kinds_of_moves() -> dict[str, np.ndarray]:
 def mean_rewards(rewards: np.ndarray, ignore: bool) -> np.ndarray:
     """Mean over RNs, `[state, action]`, in [0, 1] from the lowest to the highest; nan where none.
 
-    Args:
-      rewards: `[rn, state, action]`.
-      ignore: leave out rewards of at most `IGNORED_BELOW`.
+    Rewards of at most `IGNORED_BELOW` can be ignored.
     """
     kept = np.where(rewards <= IGNORED_BELOW, np.nan, rewards) if ignore else rewards
     count = np.isfinite(kept).sum(axis=0)
@@ -130,7 +125,6 @@ def summarise(rewards: dict[str, np.ndarray]) -> pd.DataFrame:
 
 
 def report(settings: RnHeatmap, rows: pd.DataFrame) -> pd.DataFrame:
-    """Writes the summary, the picture and the table, and returns the table."""
     rewards = by_variant(settings, rows)
     draw(settings, rewards)
     summary = summarise(rewards)
@@ -183,10 +177,8 @@ def draw_map(axis: Any, values: np.ndarray) -> Any:
             if cell != " ":
                 axis.text(*middle, {"O": "cliff"}.get(cell, cell), ha="center", va="center",
                           fontsize=6 if cell == "O" else 10, weight="bold")  # fmt: skip
-    shown = axis.add_collection(
-        PolyCollection(triangles, array=colors, cmap="RdYlGn", edgecolors="#555555", lw=0.25,
-                       clim=(0, 1))
-    )  # fmt: skip
+    shown = axis.add_collection(PolyCollection(triangles, array=colors, cmap="RdYlGn", clim=(0, 1),
+                                               edgecolors="#555555", lw=0.25))  # fmt: skip
     axis.set(xlim=(-0.5, 11.5), ylim=(3.5, -0.5), aspect="equal", xticks=[], yticks=[])
     axis.spines[:].set_visible(True)
     return shown

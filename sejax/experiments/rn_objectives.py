@@ -11,6 +11,7 @@ Differs: the area under the curve is divided by the training steps; the authors'
 which falling off the cliff at once is best.
 """
 
+import itertools
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -26,19 +27,13 @@ from sejax.experiments.tables import publish
 
 PICKS = ("best", "worst")
 QUICK_LEARNED = 4
-OBJECTIVE_NAMES = {
-    "reward_threshold": "reward threshold",
-    "auc": "area under the curve",
-    "max_reward": "final return",
-    "auc_sum": "area, not by steps",
-}
+OBJECTIVE_NAMES = {"reward_threshold": "reward threshold", "auc": "area under the curve",
+                   "max_reward": "final return", "auc_sum": "area, not by steps"}  # fmt: skip
 DEFAULT_OBJECTIVES = ("reward_threshold", "auc", "max_reward")
 
 
 @dataclass(frozen=True, kw_only=True)
 class RnObjectives(CurveSettings):
-    """Settings of this experiment."""
-
     name = "rn_objectives"
 
     objectives: tuple[str, ...] = setting(DEFAULT_OBJECTIVES, each_of(OBJECTIVE_NAMES),
@@ -64,12 +59,9 @@ class RnObjectives(CurveSettings):
 
 
 def compute(settings: RnObjectives) -> pd.DataFrame:
-    """Learns and trains what is missing; a row for each training episode of each agent.
-
-    Agents without an RN, which are the same beside each objective, are there once.
-    """
+    """As of rn_performance; agents without an RN are there once for all objectives."""
     rn_studies.check_stored(settings, settings.objectives)
-    tables = [rn_curves.real_curves(settings).assign(objective="", pick="")]
+    tables = [table.assign(objective="", pick="") for table in rn_curves.real_curves(settings)]
     for objective in settings.objectives:
         learned = {variant: rn_studies.learn(settings, variant, objective)
                    for variant in settings.variants}  # fmt: skip
@@ -77,31 +69,27 @@ def compute(settings: RnObjectives) -> pd.DataFrame:
             for variant, rns in learned.items():
                 picked = rns.ranked(settings.rns, worst=pick == "worst")
                 prefix = f"{objective}-{pick}-"
-                curves = rn_curves.rn_curves(settings, variant, picked, prefix)
-                tables.append(curves.assign(objective=objective, pick=pick))
+                tables += [table.assign(objective=objective, pick=pick) for table
+                           in rn_curves.rn_curves(settings, variant, picked, prefix)]  # fmt: skip
     return pd.concat(tables, ignore_index=True)
 
 
 def report(settings: RnObjectives, rows: pd.DataFrame) -> pd.DataFrame:
-    """Writes the summary, the pictures and the table, and returns the table."""
     solved_reward = settings.task.solved_reward
-    without = rows[rows["world"].isin(rn_curves.WITHOUT_RN)]
     summaries: list[pd.DataFrame] = []
     tables: list[pd.DataFrame] = []
-    for objective in settings.objectives:
-        for pick in settings.picks:
-            mine = beside(settings, rows, without, objective, pick)
-            summary = rn_curves.summarise(mine, solved_reward, settings.max_steps)
-            table = rn_curves.make_table(summary)
-            has_rn = ~table["trained with"].isin(rn_curves.WITHOUT_RN)
-            if not tables:
-                tables.append(table[~has_rn].assign(objective="", RNs=""))
-            tables.append(table[has_rn].assign(objective=OBJECTIVE_NAMES[objective], RNs=pick))
-            summaries.append(summary.assign(objective=objective, pick=pick))
+    for objective, pick in itertools.product(settings.objectives, settings.picks):
+        mine = beside(settings, rows, objective, pick)
+        summary = rn_curves.summarise(mine, solved_reward, settings.max_steps)
+        table = rn_curves.make_table(summary)
+        has_rn = ~table["trained with"].isin(rn_curves.WITHOUT_RN)
+        if not tables:
+            tables.append(table[~has_rn].assign(objective="", RNs=""))
+        tables.append(table[has_rn].assign(objective=OBJECTIVE_NAMES[objective], RNs=pick))
+        summaries.append(summary.assign(objective=objective, pick=pick))
     for pick in settings.picks:
-        curves = {f"{OBJECTIVE_NAMES[objective]}\ntest return":
-                  beside(settings, rows, without, objective, pick)
-                  for objective in settings.objectives}  # fmt: skip
+        curves = {f"{OBJECTIVE_NAMES[name]}\ntest return": beside(settings, rows, name, pick)
+                  for name in settings.objectives}  # fmt: skip
         rn_curves.draw(settings, curves, 2.7, f"{pick}.png")
     table = pd.concat(tables, ignore_index=True)
     table = table[["objective", "RNs", *table.columns.drop(["objective", "RNs"])]]
@@ -119,12 +107,10 @@ def report(settings: RnObjectives, rows: pd.DataFrame) -> pd.DataFrame:
     return publish(settings, title, table, pd.concat(summaries), note)
 
 
-def beside(
-    settings: RnObjectives, rows: pd.DataFrame, without: pd.DataFrame, objective: str, pick: str
-) -> pd.DataFrame:
-    """Curves of the RNs picked of an objective, and of the agents without an RN."""
-    mine = rows[(rows["objective"] == objective) & (rows["pick"] == pick)]
-    return rn_curves.by_row(settings, pd.concat([without, mine]))
+def beside(settings: RnObjectives, rows: pd.DataFrame, objective: str, pick: str) -> pd.DataFrame:
+    """Curves of the agents without an RN, which come first, and of the RNs picked."""
+    mine = (rows["objective"] == objective) & (rows["pick"] == pick)
+    return rn_curves.by_row(settings, rows[mine | rows["world"].isin(rn_curves.WITHOUT_RN)])
 
 
 EXPERIMENT = Experiment(settings=RnObjectives, compute=compute, report=report, about=__doc__)

@@ -24,8 +24,6 @@ from sejax.experiments.tables import publish
 
 @dataclass(frozen=True, kw_only=True)
 class RnPerformance(CurveSettings):
-    """Settings of this experiment."""
-
     name = "rn_performance"
 
     objective: str = rn_studies.objective_setting()
@@ -34,15 +32,14 @@ class RnPerformance(CurveSettings):
 def compute(settings: RnPerformance) -> pd.DataFrame:
     """Learns and trains what is missing; a row for each training episode of each agent."""
     rn_studies.check_stored(settings, [settings.objective])
-    tables = [rn_curves.real_curves(settings)]
+    tables = [*rn_curves.real_curves(settings)]
     for variant in settings.variants:
         rns = rn_studies.learn(settings, variant, settings.objective).ranked(settings.rns)
-        tables.append(rn_curves.rn_curves(settings, variant, rns))
+        tables += rn_curves.rn_curves(settings, variant, rns)
     return rn_curves.by_row(settings, pd.concat(tables))
 
 
 def report(settings: RnPerformance, curves: pd.DataFrame) -> pd.DataFrame:
-    """Writes the summary, the picture and the table, and returns the table."""
     solved_reward = settings.task.solved_reward
     rn_curves.draw(settings, {f"test return on {settings.env}": curves}, 3.1, "performance.png")
     summary = rn_curves.summarise(curves, solved_reward, settings.max_steps)

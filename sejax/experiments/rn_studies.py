@@ -10,6 +10,8 @@ authors' scripts have others for it (`reference_details.md` 4.8 and 7.3).
 """
 
 import dataclasses
+import itertools
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -21,8 +23,9 @@ import sejax
 from sejax import ICMConfig, errors, plugins, serialize
 from sejax.app import build, run_directory
 from sejax.errors import ConfigError
-from sejax.experiments import pieces, proxy_runs
-from sejax.experiments.settings import Settings, setting
+from sejax.experiments import figures, pieces, proxy_runs
+from sejax.experiments.proxy_runs import RunSettings
+from sejax.experiments.settings import setting, work_beside
 from sejax.options import counts, one_of
 
 # Paper, table "Overview of Reward Network variants".
@@ -63,6 +66,7 @@ _CARTPOLE: dict[str, Any] = {
     "init_episodes": 1, "batch_size": 32, "learning_rate": 2.5e-4, "target_update_rate": 0.01,
     "epsilon_min": 0.1, "hidden_size": 64, "num_layers": 1, "buffer_size": 1_000_000,
 }  # fmt: skip
+_FEW: dict[str, Any] = {"variants": ("additive_potential",), "rows": ("default",)}  # when quick
 STUDIES = {
     "cliff_walking": Study(
         # SARSA explores less than the paper's table says, as in the authors' scripts: with an
@@ -76,17 +80,16 @@ STUDIES = {
         agent=sejax.DDQNConfig(**_CARTPOLE), transfer_agent=sejax.DuelingDDQNConfig(**_CARTPOLE),
         bonuses={"icm": ICMConfig()},
         max_episodes=1000, max_steps=50_000,
-        when_quick={"variants": ("additive_potential",), "rows": ("default", "transfer"),
-                    "generations": 2},
+        when_quick=_FEW | {"rows": ("default", "transfer"), "generations": 2},
     ),
     "mountain_car_continuous": Study(
         agent=sejax.TD3Config(init_episodes=50, action_repeat=2),
         transfer_agent=sejax.PPOConfig(action_repeat=5),
         bonuses={"icm": ICMConfig(forward_weight=0.1, reward_scale=0.01, learning_rate=5e-4)},
         max_episodes=3000, max_steps=250_000,
-        when_quick={"variants": ("additive_potential",), "rows": ("default",), "generations": 2,
-                    "run": ("es.population_size=4", "es.num_incumbent_evals=4",
-                            "training.max_episodes=4", "agent.init_episodes=1")},
+        when_quick=_FEW | {"generations": 2, "run": (
+            "es.population_size=4", "es.num_incumbent_evals=4", "training.max_episodes=4",
+            "agent.init_episodes=1")},
     ),
     "halfcheetah": Study(
         agent=sejax.TD3Config(),
@@ -97,44 +100,38 @@ STUDIES = {
         bonuses={"icm": ICMConfig(forward_weight=0.001, reward_scale=0.1, learning_rate=1e-5)},
         variants=(*VARIANTS, *(v + AUGMENTED for v in VARIANTS), *WEIGHTED_INFO),
         max_episodes=1000, max_steps=500_000, learned=5, rns=5, num_agents=5,
-        when_quick={"variants": ("additive_potential",), "rows": ("default",), "generations": 1,
-                    "learned": 1, "num_agents": 2, "bonuses": (),
-                    "run": ("es.population_size=2", "es.num_incumbent_evals=2",
-                            "training.max_episodes=2", "agent.init_episodes=1")},
+        when_quick=_FEW | {"generations": 1, "learned": 1, "num_agents": 2, "bonuses": (), "run": (
+            "es.population_size=2", "es.num_incumbent_evals=2", "training.max_episodes=2",
+            "agent.init_episodes=1")},
     ),
 }  # fmt: skip
-LABELS = {
-    "real": "real reward",
-    "icm": "real reward + ICM",
-    "count_based": "real reward + count-based",
-    "additive_potential": r"$r + \gamma\Phi(s') - \Phi(s)$",
-    "exclusive_potential": r"$\gamma\Phi(s') - \Phi(s)$",
-    "additive_non_potential": r"$r + \Phi(s')$",
-    "exclusive_non_potential": r"$\Phi(s')$",
-    "additive_weighted_info": r"$r + w^\top i'$",
-    "exclusive_weighted_info": r"$w^\top i'$",
+SHOWN = {  # colour of a world, and the reward that agents get there
+    "real": (figures.BEST, "real reward"),
+    "icm": ("#7a7a7a", "real reward + ICM"),
+    "count_based": ("#7a7a7a", "real reward + count-based"),
+    "additive_potential": (figures.REAL, r"$r + \gamma\Phi(s') - \Phi(s)$"),
+    "exclusive_potential": ("#56B4E9", r"$\gamma\Phi(s') - \Phi(s)$"),
+    "additive_non_potential": (figures.VARIED, r"$r + \Phi(s')$"),
+    "exclusive_non_potential": (figures.FIXED, r"$\Phi(s')$"),
+    "additive_weighted_info": (figures.SOLVED, r"$r + w^\top i'$"),
+    "exclusive_weighted_info": ("#CC79A7", r"$w^\top i'$"),
 }
 
 
 def label(name: str) -> str:
     """Name of a world in pictures: the reward that agents get there."""
-    text = LABELS[name.removesuffix(AUGMENTED)]
-    is_plain = AUGMENTED not in name
-    return text if is_plain else text.replace("(s')", "(s', v')").replace("(s)", "(s, v)")
+    _, text = SHOWN[name.removesuffix(AUGMENTED)]
+    return text if AUGMENTED not in name else re.sub(r"\(s('?)\)", r"(s\1, v\1)", text)
 
 
 @dataclass(frozen=True, kw_only=True)
-class RnSettings(Settings):
+class RnSettings(RunSettings):
     """Settings about the task and the RNs that are learned; defaults are those of the study."""
 
     env: str = setting("cliff_walking", one_of(STUDIES), about=f"task: {', '.join(STUDIES)}")
     variants: tuple[str, ...] = setting(VARIANTS, about=f"of the RNs: those, with {AUGMENTED}, "
                                         f"{', '.join(WEIGHTED_INFO)}")  # fmt: skip
     learned: int = setting(10, counts("RNs are learned"), about="RNs to learn of each variant")
-    generations: int | None = setting(None, counts("there is nothing to do otherwise"),
-                                      about="outer iterations; the preset's")  # fmt: skip
-    preset: str = setting("best", about="of the NES runs: best, paper")
-    run: tuple[str, ...] = setting((), about="overrides of the NES runs")
     rns_dir: str | None = setting(None, about="where RNs are kept; results/reward_networks, quick "
                                   "rns/ in `out`")  # fmt: skip
 
@@ -176,18 +173,15 @@ def objective_setting() -> Any:
 
 
 def learn(settings: RnSettings, variant: str, objective: str) -> Any:
-    """The RNs of a variant, learned by an objective: a `ProxySet` in the order of their seeds.
-
-    Raises:
-      ConfigError: for settings that cannot work, or a folder with RNs of other settings.
-    """
+    """The RNs of a variant, learned by an objective: a `ProxySet` in the order of their seeds."""
     there = stored(settings, variant, objective)
     known = there.size if there else 0
     if known < settings.learned:
         config = learning_config(settings, variant, objective)
         config = dataclasses.replace(config, seed=settings.seed + known)
-        path, count = set_file(settings, variant, objective), settings.learned - known
-        folder = runs_folder(settings) / path.relative_to(settings.rns_folder).with_suffix("")
+        path, count = file_of(settings, variant, objective), settings.learned - known
+        runs = work_beside(settings.rns_folder, "runs")
+        folder = runs / path.relative_to(settings.rns_folder).with_suffix("")
         configs = proxy_runs.configs_of_runs(config, count, folder, settings.study.runs_at_once)
         print(f"{variant}: learns {count} RNs, {config.generations} generations each; may be "
               "stopped and started again", flush=True)  # fmt: skip
@@ -200,7 +194,7 @@ def learn(settings: RnSettings, variant: str, objective: str) -> Any:
     return there.first(settings.learned)
 
 
-def set_file(settings: RnSettings, variant: str, objective: str) -> Path:
+def file_of(settings: RnSettings, variant: str, objective: str) -> Path:
     """Where the RNs of a variant and objective are kept."""
     return settings.rns_folder / settings.env / objective / f"{variant}.safetensors"
 
@@ -210,13 +204,6 @@ def curves_file(path: Path) -> Path:
     return path.with_suffix(".csv.xz")
 
 
-def runs_folder(settings: RnSettings) -> Path:
-    """Where NES runs go on; those of results are no results."""
-    rns = settings.rns_folder
-    is_result = rns.parts[:1] == ("results",)
-    return Path("runs/experiments", *rns.parts[1:]) if is_result else rns / "runs"
-
-
 def stored(settings: RnSettings, variant: str, objective: str) -> Any:
     """The RNs that are there already, a `ProxySet`; None if they are to be learned.
 
@@ -224,7 +211,7 @@ def stored(settings: RnSettings, variant: str, objective: str) -> Any:
       ConfigError: if they were learned with other settings. Fewer generations are no such settings:
         their runs go on.
     """
-    path = set_file(settings, variant, objective)
+    path = file_of(settings, variant, objective)
     if not path.exists():
         return None
     there = sejax.load_set(path, option="rns_dir", kind="rn")
@@ -251,27 +238,13 @@ def _what_counts(config: Any) -> dict[str, Any]:
 
 
 def check_stored(settings: RnSettings, objectives: Sequence[str]) -> None:
-    """Checks all RNs that are there before any are learned, which may take days.
-
-    Raises:
-      ConfigError: if some were learned with other settings.
-    """
-    for objective in objectives:
-        for variant in settings.variants:
-            stored(settings, variant, objective)
+    """Checks all RNs that are there (see `stored`) before any are learned, which may take days."""
+    for objective, variant in itertools.product(objectives, settings.variants):
+        stored(settings, variant, objective)
 
 
 def learning_config(settings: RnSettings, variant: str, objective: str) -> Any:
-    """Settings of the NES runs for a variant and objective.
-
-    Raises:
-      ConfigError: for settings that cannot work.
-    """
+    """Settings of the NES runs for a variant and objective."""
     plain = variant.removesuffix(AUGMENTED)
-    overrides = [f"env={settings.env}", "proxy=rn", f"preset={settings.preset}",
-                 f"proxy.variant={plain}", f"proxy.augmented={str(plain != variant).lower()}",
-                 f"objective={objective}"]  # fmt: skip
-    if settings.generations is not None:
-        overrides.append(f"generations={settings.generations}")
-    config = sejax.config([*overrides, *settings.run])
-    return dataclasses.replace(config, devices=settings.devices, seed=settings.seed)
+    return settings.learn_config(["proxy=rn", f"proxy.variant={plain}", f"objective={objective}",
+                                  f"proxy.augmented={plain != variant}"])  # fmt: skip

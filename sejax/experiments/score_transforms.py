@@ -34,8 +34,8 @@ from sejax.es.score_transforms import TRANSFORMS
 from sejax.es.strategy import Strategy
 from sejax.experiments import figures
 from sejax.experiments.experiment import Experiment
-from sejax.experiments.settings import Settings, setting
-from sejax.experiments.tables import bootstrap_interval, publish
+from sejax.experiments.settings import Settings, count, setting
+from sejax.experiments.tables import as_texts, bootstrap_interval, publish
 from sejax.options import Options, counts
 
 SCORE_TRANSFORMS = tuple(TRANSFORMS)
@@ -62,34 +62,25 @@ PAPER = {"all_better_1": "among the best", "all_better_2": "among the best"}
 
 @dataclass(frozen=True, kw_only=True)
 class ScoreTransforms(Settings):
-    """Settings of this experiment."""
-
     name = "score_transforms"
 
-    runs: int = setting(220, counts("it counts runs"), quick=12, about="of each score transform, "
-                        "with mirrored sampling and as many without")  # fmt: skip
-    generations: int = setting(50, counts("it counts generations"), quick=10, about="of a run at "
-                               "most")  # fmt: skip
+    runs: int = count(220, "runs", quick=12, about="of each score transform, with mirrored "
+                      "sampling and as many without")  # fmt: skip
+    generations: int = count(50, "generations", quick=10, about="of a run at most")
     population: int = setting(16, counts("scores are compared within a generation", least=2),
                               quick=8, about="members of a generation")  # fmt: skip
-    bins: int = setting(9, counts("it counts bins"), quick=3, about="of step sizes")
+    bins: int = count(9, "bins", quick=3, about="of step sizes")
 
 
 def compute(settings: ScoreTransforms) -> pd.DataFrame:
-    """Computes what is missing; a row for each run.
-
-    Raises:
-      ConfigError: for settings that cannot work, or an output folder of other settings.
-    """
+    """Computes what is missing; a row for each run."""
     tables = []
     for mirrored, transform in itertools.product((True, False), SCORE_TRANSFORMS):
         name = f"{transform}-{'mirrored' if mirrored else 'plain'}"
-        made_with = {"transform": transform, "mirrored": mirrored, "runs": settings.runs,
-                     "generations": settings.generations, "population": settings.population,
-                     "seed": settings.seed, "settings": SETTINGS}  # fmt: skip
-        cell = settings.pieces.compute(
-            name, made_with, functools.partial(compute_cell, settings, transform, mirrored)
-        )
+        made_with = {"transform": transform, "mirrored": mirrored, "settings": SETTINGS}
+        made_with |= settings.values("runs", "generations", "population", "seed")
+        make = functools.partial(compute_cell, settings, transform, mirrored)
+        cell = settings.pieces.compute(name, made_with, make)
         print(f"{name}: {cell['updates'].mean():.1f} updates of the SE on average, "
               f"{cell['solved'].mean():.0%} solved", flush=True)  # fmt: skip
         tables.append(cell)
@@ -125,9 +116,6 @@ def draw_step_sizes(count: int, seed: int) -> np.ndarray:
     return np.exp(low + places * (high - low))
 
 
-# --- NES whose step size and score transform are part of its state ------------------------------
-
-
 @struct.dataclass
 class AnyNESState:
     nes: NESState
@@ -155,24 +143,16 @@ class AnyNES(Options):
             return state.replace(nes=told)
 
         return dataclasses.replace(
-            each[0],
+            each[0], ask=ask, tell=tell, incumbent=lambda state: each[0].incumbent(state.nes),
             init=lambda key, mean: AnyNESState(each[0].init(key, mean), jnp.int32(0)),
-            ask=ask,
-            tell=tell,
-            incumbent=lambda state: each[0].incumbent(state.nes),
-        )
+        )  # fmt: skip
 
 
 class Search(NamedTuple):
-    """Compiled functions over NES runs.
+    """Compiled functions over NES runs."""
 
-    Attributes:
-      init: `(keys [run], step_sizes [run], transform) -> state`; the number of a transform.
-      advance: `state -> state`, a generation of every run that has not solved the task.
-    """
-
-    init: Callable[..., Any]
-    advance: Callable[[Any], Any]
+    init: Callable[..., Any]  # (keys [run], step_sizes [run], number of a transform) -> state
+    advance: Callable[[Any], Any]  # a generation of every run that has not solved the task
 
 
 @functools.cache
@@ -189,16 +169,11 @@ def make_search(mirrored: bool, population: int, devices: int | None) -> Search:
 
     def init(keys: Any, step_sizes: Any, transform: Any) -> Any:
         state = program.init(keys)
-        es_state = state.es_state.replace(
-            nes=state.es_state.nes.replace(step_size=step_sizes),
-            transform=jnp.full(len(keys), transform),
-        )
-        return state.replace(es_state=es_state)
+        nes = state.es_state.nes.replace(step_size=step_sizes)
+        transforms = jnp.full(len(keys), transform)
+        return state.replace(es_state=state.es_state.replace(nes=nes, transform=transforms))
 
     return Search(init=jax.jit(init), advance=jax.jit(lambda state: program.generation(state)[0]))
-
-
-# --- what is made of it --------------------------------------------------------------------------
 
 
 def edges_of(bins: int) -> np.ndarray:
@@ -208,9 +183,8 @@ def edges_of(bins: int) -> np.ndarray:
 
 def binned(runs: pd.DataFrame, bins: int) -> pd.DataFrame:
     """Mean updates, share solved and number of runs for each cell and bin of step sizes."""
-    place = np.clip(
-        np.searchsorted(edges_of(bins), runs["step_size"], side="right") - 1, 0, bins - 1
-    )
+    place = np.searchsorted(edges_of(bins), runs["step_size"], side="right") - 1
+    place = np.clip(place, 0, bins - 1)
     grouped = runs.assign(bin=place).groupby(["transform", "mirrored", "bin"], sort=False)
     return grouped.agg(updates=("updates", "mean"), solved=("solved", "mean"),
                        runs=("run", "size")).reset_index()  # fmt: skip
@@ -239,25 +213,20 @@ def summarise(runs: pd.DataFrame, bins: int) -> pd.DataFrame:
 def make_table(summary: pd.DataFrame) -> pd.DataFrame:
     """The summary as texts, with the rank of the cell among those of the same sampling."""
     ranks = summary.groupby("mirrored")[["updates", "best_updates"]].rank(method="min")
-    return pd.DataFrame([
-        {
-            "score transform": LABELS[str(row["transform"])],
-            "mirrored": "yes" if row["mirrored"] else "no",
-            "rank": f"{rank['updates']:.0f}",
-            "updates, all step sizes": f"{row['updates']:.1f} "
-                                       f"[{row['updates_low']:.1f}, {row['updates_high']:.1f}]",
-            "solved": f"{row['solved']:.0%}",
-            "best step sizes": f"{row['best_low']:.2g} to {row['best_high']:.2g}",
-            "updates there": f"{row['best_updates']:.1f}",
-            "rank there": f"{rank['best_updates']:.0f}",
-            "paper": PAPER.get(str(row["transform"]), ""),
-        }
-        for (_, row), (_, rank) in zip(summary.iterrows(), ranks.iterrows(), strict=True)
-    ])  # fmt: skip
+    return as_texts(summary.join(ranks.add_suffix("_rank")), {
+        "score transform": lambda row: LABELS[row.transform],
+        "mirrored": lambda row: "yes" if row.mirrored else "no",
+        "rank": "{updates_rank:.0f}",
+        "updates, all step sizes": "{updates:.1f} [{updates_low:.1f}, {updates_high:.1f}]",
+        "solved": "{solved:.0%}",
+        "best step sizes": "{best_low:.2g} to {best_high:.2g}",
+        "updates there": "{best_updates:.1f}",
+        "rank there": "{best_updates_rank:.0f}",
+        "paper": lambda row: PAPER.get(row.transform, ""),
+    })  # fmt: skip
 
 
 def report(settings: ScoreTransforms, rows: pd.DataFrame) -> pd.DataFrame:
-    """Writes the table and the picture."""
     bins, generations = settings.bins, settings.generations
     summary = summarise(rows, bins)
     draw(rows, bins, generations, settings.folder / "score_transforms.png")
@@ -278,33 +247,21 @@ def report(settings: ScoreTransforms, rows: pd.DataFrame) -> pd.DataFrame:
 
 
 def draw(runs: pd.DataFrame, bins: int, generations: int, path: Path) -> None:
-    """Draws every run as a dot, as the paper's figure, and means over bins of step sizes below.
-
-    Args:
-      runs: of all cells.
-      bins: of step sizes.
-      generations: of a run at most; the end of the colour scale.
-      path: the picture.
-    """
+    """Draws every run as a dot, as the paper's figure, and means over bins of step sizes below."""
     scale = plt.Normalize(0, generations)
-    with plt.rc_context(figures.STYLE):
-        figure, axes = plt.subplots(2, 2, figsize=(10, 7.6), sharey=True, layout="constrained")
+    with figures.panels(path, 2, 2, (10, 7.6), sharey=True) as (figure, axes):
         for column, mirrored in enumerate((True, False)):
             mine = runs[runs["mirrored"] == mirrored]
             _dots(axes[0, column], mine, scale)
             _heat_map(axes[1, column], binned(mine, bins), bins, scale)
             axes[0, column].set_title(f"{'with' if mirrored else 'without'} mirrored sampling")
         for axis in axes.ravel():
-            axis.set_xscale("log")
-            axis.set_xlim(*STEP_SIZES)
-            axis.set_xlabel("NES step size")
+            axis.set(xscale="log", xlim=STEP_SIZES, xlabel="NES step size")
         axes[0, 0].set_yticks(range(len(LABELS)), list(LABELS.values()))
-        axes[0, 0].set_ylim(len(LABELS) - 0.5, -0.5)
-        axes[0, 0].set_ylabel("single runs")
+        axes[0, 0].set(ylim=(len(LABELS) - 0.5, -0.5), ylabel="single runs")
         axes[1, 0].set_ylabel("means over bins of step sizes")
         bar = figure.colorbar(plt.cm.ScalarMappable(scale, _COLORS), ax=axes, fraction=0.04)
         bar.set_label(f"updates of the SE until it solves the task ({generations}: not solved)")
-        figures.write(figure, path)
 
 
 _COLORS = "viridis_r"  # dark is slow; even in lightness, so that it reads without colour
@@ -325,9 +282,8 @@ def _heat_map(axis: Any, cells: pd.DataFrame, bins: int, scale: Any) -> None:
     for row, column in itertools.product(range(len(LABELS)), range(bins)):
         value = means.iloc[row, column]
         if np.isfinite(value):
-            dark = scale(value) > 0.45
             axis.text(middles[column], row, f"{value:.0f}", ha="center", va="center", fontsize=8,
-                      color="white" if dark else "black")  # fmt: skip
+                      color="white" if scale(value) > 0.45 else "black")  # fmt: skip
 
 
 EXPERIMENT = Experiment(settings=ScoreTransforms, compute=compute, report=report, about=__doc__)

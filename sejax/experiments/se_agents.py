@@ -7,20 +7,14 @@ from typing import Any
 import pandas as pd
 
 from sejax import plugins
-from sejax.experiments.settings import Settings, each_of, setting
-from sejax.experiments.worlds import Group, World, groups_at_once, train_groups, training_as_learned
+from sejax.experiments.settings import Settings, count, each_of, setting
+from sejax.experiments.worlds import World, groups_at_once, train_groups, training_as_learned
 from sejax.options import counts
-from sejax.training import TrainingConfig
 
 AGENTS = ("ddqn", "dueling_ddqn", "td3_discrete")
 
 # Hidden sizes up to 6: one network has room for all of them, and little is compiled.
-QUICK_AGENT: dict[str, Any] = {
-    "hidden_size": 2,
-    "batch_size": 16,
-    "num_layers": 1,
-    "init_episodes": 1,
-}
+QUICK_AGENT: Any = {"hidden_size": 2, "batch_size": 16, "num_layers": 1, "init_episodes": 1}
 QUICK_STEPS = 1500
 
 
@@ -29,12 +23,12 @@ class SeAgents(Settings):
     """Settings about agents with drawn hyperparameters that are trained on the SEs of a set."""
 
     agents: tuple[str, ...] = setting(AGENTS, each_of(AGENTS), about="kinds of agents")
-    num_agents: int = setting(10, counts("it counts agents"), quick=4, about="for each SE")
-    num_ses: int = setting(40, counts("it counts SEs"), quick=3, about="SEs of a set at most")
-    test_episodes: int = setting(10, counts("it counts episodes"), about="of each agent")
-    max_steps: int | None = setting(None, counts("an agent must train"), quick=4000,
-                                    about="training steps at most; as the SEs' own "
-                                    "configuration says")  # fmt: skip
+    num_agents: int = count(10, "agents", quick=4, about="for each SE")
+    num_ses: int = count(40, "SEs", quick=3, about="SEs of a set at most")
+    test_episodes: int = count(10, "episodes", about="of each agent")
+    max_steps: int | None = setting(
+        None, counts("an agent must train"), quick=4000,
+        about="training steps at most; as the SEs' own configuration says")  # fmt: skip
 
 
 def agent_config(settings: Settings, kind: str) -> Any:
@@ -53,14 +47,8 @@ def se_world(settings: SeAgents, ses: Any, kind: str) -> World:
     )
     # The weights' hash is in the name, so that sets can share a folder: se_models then finds those
     # of se_performance.
-    prints = [ses.fingerprint(i) for i in range(ses.size)]
-    groups = tuple(
-        Group(f"se-{seed:02d}-{print_}", ses.one(i), print_)
-        for i, (seed, print_) in enumerate(zip(ses.seeds, prints, strict=True))
-    )
-    return World(name=kind, env=ses.env, task=ses.task, groups=groups, agent=agent,
-                 training=training, hparams="varied",
-                 settings={"proxy": ses.config["proxy"]})  # fmt: skip
+    names = [f"se-{seed:02d}-{ses.fingerprint(i)}" for i, seed in enumerate(ses.seeds)]
+    return World.of_set(ses, names, name=kind, agent=agent, training=training, hparams="varied")
 
 
 def train(settings: SeAgents, world: World) -> pd.DataFrame:
@@ -68,22 +56,3 @@ def train(settings: SeAgents, world: World) -> pd.DataFrame:
     rows = train_groups(world, settings, settings.num_agents,
                         at_once=groups_at_once(settings.devices))  # fmt: skip
     return rows.assign(kind=world.name)
-
-
-def real_training(kind: str, task: Any, episodes: int | None, **options: Any) -> TrainingConfig:
-    """How long an agent trains on the real task: until it solves it.
-
-    Args:
-      kind: of the agent.
-      task: the task.
-      episodes: at most; as in the authors' code if not given.
-      **options: of `TrainingConfig`.
-    """
-    # reference_details.md 7.1: discrete TD3 trains 500 episodes on Acrobot, all others 1000.
-    short = task.name == "acrobot" and kind == "td3_discrete"
-    return TrainingConfig(
-        max_episodes=episodes or (500 if short else 1000),
-        stop_rule="solved",
-        time_limit_is_terminal=True,
-        **options,
-    )

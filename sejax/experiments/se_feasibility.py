@@ -7,7 +7,6 @@ Each run is that of `python -m sejax.run` with the same settings and seed. The b
 into `ses.safetensors`, which the other experiments read (`ses`, `varied`, `fixed`).
 """
 
-import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -15,13 +14,13 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-import sejax
 from sejax.app.build import AGENT_HPARAMS
 from sejax.experiments import figures, proxy_runs
 from sejax.experiments.experiment import Experiment
-from sejax.experiments.settings import Settings, setting
+from sejax.experiments.proxy_runs import RunSettings
+from sejax.experiments.settings import count, setting
 from sejax.experiments.tables import bootstrap_interval, publish
-from sejax.options import counts, one_of
+from sejax.options import one_of
 
 NUM_RUNS = {"cartpole": 10}
 
@@ -38,21 +37,14 @@ PAPER = {"runs": "40", "generations run": "200", "population": "16",
 
 
 @dataclass(frozen=True, kw_only=True)
-class SeFeasibility(Settings):
-    """Settings of this experiment."""
-
+class SeFeasibility(RunSettings):
     name = "se_feasibility"
 
-    env: str = setting("cartpole", about="task: cartpole, acrobot, ...")
-    runs: int = setting(5, counts("it counts runs"), quick=3, about="independent NES runs; "
-                        "cartpole 10")  # fmt: skip
-    generations: int | None = setting(None, counts("it counts generations"), about="outer "
-                                      "iterations; the preset's")  # fmt: skip
+    runs: int = count(5, "runs", quick=3, about="independent NES runs; cartpole 10")
     agent: str = setting("ddqn", about="that the SEs are learned with")
-    agent_hparams: str = setting("default", one_of(AGENT_HPARAMS), about="its hyperparameters; "
-                                 "varied: drawn for each training")  # fmt: skip
-    preset: str = setting("best", about="of the NES runs: best, paper, paper_performance")
-    run: tuple[str, ...] = setting((), about="overrides of the NES runs, or as below")
+    agent_hparams: str = setting(
+        "default", one_of(AGENT_HPARAMS), about="its hyperparameters; varied: drawn for each "
+        "training")  # fmt: skip
 
     @classmethod
     def defaults(cls, given: Mapping[str, Any]) -> dict[str, Any]:
@@ -63,45 +55,28 @@ class SeFeasibility(Settings):
 
 
 def compute(settings: SeFeasibility) -> pd.DataFrame:
-    """Learns what is missing; a row for each generation of each run.
-
-    Raises:
-      ConfigError: for settings that cannot work, or folders of other settings.
-    """
-    runs = proxy_runs.configs_of_runs(
-        learning_config(settings), settings.runs, settings.work_folder / "runs"
-    )
+    """Learns what is missing; a row for each generation of each run."""
+    config, folder = learning_config(settings), settings.work_folder / "runs"
+    runs = proxy_runs.configs_of_runs(config, settings.runs, folder)
     curves = proxy_runs.learn_all(runs)
     proxy_runs.collect(runs, settings.folder / "ses.safetensors")
     return curves
 
 
 def learning_config(settings: SeFeasibility) -> Any:
-    """The configuration of the NES runs; later overrides win."""
-    chosen = [f"env={settings.env}", f"agent={settings.agent}", f"preset={settings.preset}",
-              f"agent_hparams={settings.agent_hparams}"]  # fmt: skip
-    chosen += QUICK if settings.quick else []
-    if settings.generations is not None:
-        chosen.append(f"generations={settings.generations}")
-    config = sejax.config([*chosen, *settings.run])
-    return dataclasses.replace(config, devices=settings.devices, seed=settings.seed)
+    """The configuration of the NES runs."""
+    chosen = [f"agent={settings.agent}", f"agent_hparams={settings.agent_hparams}"]
+    return settings.learn_config(chosen + (QUICK if settings.quick else []))
 
 
 def summarise(curves: pd.DataFrame, solved_reward: float) -> pd.DataFrame:
-    """One row for each run: what it took to solve the task and how far it came.
-
-    Args:
-      curves: rows of all runs, with the columns of `metrics.csv`.
-      solved_reward: the threshold.
-    """
+    """One row for each run: what it took to solve the task and how far it came."""
     rows = []
     for seed, curve in curves.groupby("seed"):
         to_solve = proxy_runs.generations_to_solve(curve, solved_reward)
         at_solving = curve[curve["generation"] + 1 == to_solve]
         rows.append({
-            "seed": seed,
-            "generations": len(curve),
-            "generations_to_solve": to_solve,
+            "seed": seed, "generations": len(curve), "generations_to_solve": to_solve,
             "env_steps_to_solve": at_solving["env_steps_total"].max(),
             "best_incumbent_mean": curve["incumbent_mean"].max(),
             "last_incumbent_mean": curve["incumbent_mean"].iloc[-1],
@@ -148,14 +123,14 @@ def make_table(config: Any, runs: pd.DataFrame) -> pd.DataFrame:
 
 
 def report(settings: SeFeasibility, rows: pd.DataFrame) -> pd.DataFrame:
-    """Writes the table and the picture."""
     config = learning_config(settings)
     solved_reward = config.task().solved_reward
     summary = summarise(rows, solved_reward)
     figures.learning_curves(rows, solved_reward, settings.folder / "learning_curves.png")
     varied = " with varied hyperparameters" if config.agent_hparams == "varied" else ""
     note = (
-        f"Preset {config.preset}. An incumbent mean is over {num_incumbent_evals(config)} fresh "
+        f"Preset {config.preset}. An incumbent mean is over "
+        f"{config.es.num_incumbent_evals or config.es.population_size} fresh "
         f"agents with {config.training.test_episodes} test episodes each; a run counts as solved "
         f"from the first generation in which it reaches {solved_reward:g}. Median and range over "
         "runs; a run that did not solve the task counts as longer than all. The last incumbent "
@@ -164,11 +139,6 @@ def report(settings: SeFeasibility, rows: pd.DataFrame) -> pd.DataFrame:
     )
     title = f"Learning SEs of {settings.env} for {settings.agent} agents{varied}"
     return publish(settings, title, make_table(config, summary), summary, note)
-
-
-def num_incumbent_evals(config: Any) -> int:
-    """Agents that an incumbent mean is over; one for each member if not configured."""
-    return config.es.num_incumbent_evals or config.es.population_size
 
 
 EXPERIMENT = Experiment(settings=SeFeasibility, compute=compute, report=report, about=__doc__)

@@ -36,16 +36,14 @@ from sejax.agents.memory import Memory, MemoryMaker
 from sejax.experiments import figures, se_agents
 from sejax.experiments.experiment import Experiment
 from sejax.experiments.se_agents import AGENTS
-from sejax.experiments.settings import Settings, each_of, setting
-from sejax.experiments.tables import publish
-from sejax.experiments.worlds import Group, Measure, World, train_groups, training_as_learned
-from sejax.options import counts
+from sejax.experiments.settings import Settings, count, each_of, setting
+from sejax.experiments.tables import as_texts, publish
+from sejax.experiments.worlds import Measure, World, train_groups, training_as_learned
 from sejax.training import TrainingConfig
 
-SOURCES = ("train", "test", "response")
-LABELS = {"train": "SE, in training", "test": "real task, in tests",
-          "response": "SE, from the tests' states and actions"}  # fmt: skip
-
+SOURCES = {"train": (figures.REAL, "SE, in training"),
+           "test": (figures.VARIED, "real task, in tests"),
+           "response": (figures.FIXED, "SE, from the tests' states and actions")}  # fmt: skip
 DIMENSIONS = {
     "cartpole": ("cart position (m)", "cart velocity (m/s)", "pole angle (rad)",
                  "pole angular velocity (rad/s)"),
@@ -56,27 +54,21 @@ DIMENSIONS = {
 # Paper, the same appendix: mean test returns of the agents shown; section "Analyzing SE Behavior":
 # 199.3 for CartPole and DDQN.
 PAPER_RETURNS = {
-    ("cartpole", "ddqn"): "199.3",
-    ("cartpole", "dueling_ddqn"): "193.75",
-    ("cartpole", "td3_discrete"): "197.26",
-    ("acrobot", "ddqn"): "-91.62",
-    ("acrobot", "dueling_ddqn"): "-88.56",
-    ("acrobot", "td3_discrete"): "-93.17",
+    "cartpole": {"ddqn": "199.3", "dueling_ddqn": "193.75", "td3_discrete": "197.26"},
+    "acrobot": {"ddqn": "-91.62", "dueling_ddqn": "-88.56", "td3_discrete": "-93.17"},
 }
 
 
 @dataclass(frozen=True, kw_only=True)
 class SeHistograms(Settings):
-    """Settings of this experiment."""
-
     name = "se_histograms"
 
     proxy: str = setting("cartpole", about="SE: a run directory, a file or a shipped name")
     agents: tuple[str, ...] = setting(AGENTS, each_of(AGENTS), about="kinds of agents, a row each")
-    num_agents: int = setting(10, counts("it counts agents"), quick=3, about="of each kind")
-    test_episodes: int = setting(10, counts("it counts episodes"), about="of each agent")
-    max_rows: int = setting(10_000, counts("it counts transitions"), about="training transitions "
-                            "of an agent that are kept, the last ones")  # fmt: skip
+    num_agents: int = count(10, "agents", quick=3, about="of each kind")
+    test_episodes: int = count(10, "episodes", about="of each agent")
+    max_rows: int = count(10_000, "transitions", about="training transitions of an agent that are "
+                          "kept, the last ones")  # fmt: skip
 
     @property
     def rows_file(self) -> Path:
@@ -85,24 +77,17 @@ class SeHistograms(Settings):
 
 
 def compute(settings: SeHistograms) -> pd.DataFrame:
-    """Trains what is missing; a row for each transition.
-
-    Raises:
-      ConfigError: for a proxy or settings that cannot work.
-    """
+    """Trains what is missing; a row for each transition."""
     ses = load(settings)
-    group = Group("all", ses.one(0), ses.fingerprint(0))
     tables = []
     for kind in settings.agents:
         agent = se_agents.agent_config(settings, kind)
-        world = World(
-            name=kind, env=ses.env, task=ses.task, groups=(group,), agent=agent,
-            training=training_of(settings, ses, agent), is_single=True,
+        world = World.of_set(
+            ses, ["all"], name=kind, agent=agent, training=training_of(settings, ses, agent),
             exploration=plugins.configure("exploration", ses.config["exploration"]),
-            settings={"proxy": ses.config["proxy"], "max_rows": settings.max_rows},
+            settings={"max_rows": settings.max_rows}, is_single=True,
         )  # fmt: skip
-        measure = transitions(settings.max_rows)
-        rows = train_groups(world, settings, settings.num_agents, measure)
+        rows = train_groups(world, settings, settings.num_agents, transitions(settings.max_rows))
         tables.append(rows.assign(kind=kind))
     return pd.concat(tables, ignore_index=True).drop(columns="group")
 
@@ -119,9 +104,6 @@ def training_of(settings: SeHistograms, ses: Any, agent: Any) -> TrainingConfig:
         most = min(training.max_steps or se_agents.QUICK_STEPS, se_agents.QUICK_STEPS)
         training = dataclasses.replace(training, max_steps=most)
     return dataclasses.replace(training, test_episodes=settings.test_episodes)
-
-
-# --- what is recorded ----------------------------------------------------------------------------
 
 
 @functools.cache
@@ -168,15 +150,10 @@ def make_recorded_run(
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class LastSteps:
-    """What a recorder keeps.
+    """What a recorder keeps."""
 
-    Attributes:
-      rows: `[capacity, 2 + obs_dim]` of episode, reward and next state, in no order.
-      episode: that goes on, `[]`.
-    """
-
-    rows: Any
-    episode: Any
+    rows: Any  # `[capacity, 2 + obs_dim]` of episode, reward and next state, in no order
+    episode: Any  # that goes on, `[]`
 
 
 def last_steps(capacity: int) -> MemoryMaker:
@@ -201,23 +178,17 @@ def last_steps(capacity: int) -> MemoryMaker:
 def rows_of(recorded: dict[str, dict[str, np.ndarray]]) -> pd.DataFrame:
     """The valid transitions of all agents as a table.
 
-    Args:
-      recorded: by source `next_obs [agent, rows, obs_dim]`, and `reward`, `episode` and `valid`,
-        `[agent, rows]`.
+    Each source has `next_obs [agent, rows, obs_dim]`, and `reward`, `episode` and `valid`,
+    `[agent, rows]`.
     """
     tables = []
     for agent in range(recorded["test"]["valid"].shape[0]):
         for source, every in recorded.items():
             mine = {name: x[agent][every["valid"][agent]] for name, x in every.items()}
-            columns = {"source": source, "agent": agent, "episode": mine["episode"],
-                       "reward": mine["reward"].astype(float)}  # fmt: skip
-            states = mine["next_obs"].astype(float).T
-            columns |= {f"state_{i}": x for i, x in enumerate(states)}
-            tables.append(pd.DataFrame(columns))
+            states = {f"state_{i}": x.astype(float) for i, x in enumerate(mine["next_obs"].T)}
+            columns = {"episode": mine["episode"], "reward": mine["reward"].astype(float)}
+            tables.append(pd.DataFrame({"source": source, "agent": agent} | columns | states))
     return pd.concat(tables, ignore_index=True)
-
-
-# --- what is made of it --------------------------------------------------------------------------
 
 
 def test_returns(rows: pd.DataFrame) -> pd.Series:
@@ -231,48 +202,52 @@ def columns_of(rows: pd.DataFrame) -> list[str]:
     return [*[name for name in rows if name.startswith("state_")], "reward"]
 
 
+def names_of(task: Any, rows: pd.DataFrame) -> dict[str, str]:
+    """What people call these columns."""
+    usual = {name: name.replace("_", " ") for name in columns_of(rows)}
+    return usual | dict(zip(usual, DIMENSIONS.get(task.name, ()), strict=False))
+
+
 def summarise(rows: pd.DataFrame) -> pd.DataFrame:
     """Widths and distances of the distributions, a row for each kind of agent and dimension."""
     out = []
     for kind, mine in rows.groupby("kind", sort=False):
         for column in columns_of(rows):
             samples = {name: mine[mine["source"] == name][column] for name in SOURCES}
+            pairs = ("response", "train"), ("response", "test"), ("train", "test")
             out.append({
-                "kind": kind,
-                "dimension": column,
+                "kind": kind, "dimension": column,
                 **{f"std_{name}": x.std(ddof=0) for name, x in samples.items()},
-                "response_to_train": wasserstein_distance(samples["response"], samples["train"]),
-                "response_to_test": wasserstein_distance(samples["response"], samples["test"]),
-                "train_to_test": wasserstein_distance(samples["train"], samples["test"]),
+                **{f"{a}_to_{b}": wasserstein_distance(samples[a], samples[b]) for a, b in pairs},
             })  # fmt: skip
     return pd.DataFrame(out)
 
 
 def make_table(task: Any, rows: pd.DataFrame, summary: pd.DataFrame) -> pd.DataFrame:
     """The summary as texts; the return stands in each kind's first row."""
-    names = [*DIMENSIONS.get(task.name, ()), "reward"]
-    out = []
-    for kind, mine in summary.groupby("kind", sort=False):
+    names = names_of(task, rows)
+
+    def first(text: Callable[[str], str]) -> Callable[[Any], str]:
+        return lambda row: text(row.kind) if row.dimension == next(iter(names)) else ""
+
+    def returned(kind: str) -> str:
         returns = test_returns(rows[rows["kind"] == kind])
-        for i, (_, row) in enumerate(mine.iterrows()):
-            last = row["dimension"] == "reward"
-            label = names[-1] if last else names[i] if len(names) > 1 else f"state {i}"
-            closer = row["response_to_train"] < row["response_to_test"]
-            out.append({
-                "agent": kind if i == 0 else "",
-                "return": f"{returns.mean():.2f} ± {returns.std():.2f}" if i == 0 else "",
-                "paper's": PAPER_RETURNS.get((task.name, str(kind)), "") if i == 0 else "",
-                "next": label,
-                **{f"std, {name}": f"{row[f'std_{name}']:.3g}" for name in SOURCES},
-                "response to train": f"{row['response_to_train']:.3g}",
-                "response to test": f"{row['response_to_test']:.3g}",
-                "response is closer to": "train" if closer else "test",
-            })  # fmt: skip
-    return pd.DataFrame(out)
+        return f"{returns.mean():.2f} ± {returns.std():.2f}"
+
+    return as_texts(summary, {
+        "agent": first(str),
+        "return": first(returned),
+        "paper's": first(lambda kind: PAPER_RETURNS.get(task.name, {}).get(kind, "")),
+        "next": lambda row: names[row.dimension],
+        **{f"std, {name}": f"{{std_{name}:.3g}}" for name in SOURCES},
+        "response to train": "{response_to_train:.3g}",
+        "response to test": "{response_to_test:.3g}",
+        "response is closer to":
+            lambda row: "train" if row.response_to_train < row.response_to_test else "test",
+    })  # fmt: skip
 
 
 def report(settings: SeHistograms, rows: pd.DataFrame) -> pd.DataFrame:
-    """Writes the table and the picture."""
     task = load(settings).task
     summary = summarise(rows)
     draw(task, rows, settings.folder / "histograms.png")
@@ -306,34 +281,23 @@ def draw(task: Any, rows: pd.DataFrame, path: Path) -> None:
 
     Source: paper, figure "Histograms of next state s' and reward r".
     """
-    kinds, columns = list(rows["kind"].unique()), columns_of(rows)
-    colors = {"train": figures.REAL, "test": figures.VARIED, "response": figures.FIXED}
-    names = [*DIMENSIONS.get(task.name, [f"state {i}" for i in range(len(columns) - 1)]), "reward"]
-    with plt.rc_context(figures.STYLE):
-        figure, axes = plt.subplots(
-            len(kinds), len(columns), figsize=(2.5 * len(columns), 0.8 + 2.2 * len(kinds)),
-            squeeze=False, sharey="row", layout="constrained",
-        )  # fmt: skip
+    kinds, names = list(rows["kind"].unique()), names_of(task, rows)
+    size = 2.5 * len(names), 0.8 + 2.2 * len(kinds)
+    with figures.panels(path, len(kinds), len(names), size, sharey="row") as (figure, axes):
         for line, kind in zip(axes, kinds, strict=True):
-            for axis, column, name in zip(line, columns, names, strict=True):
-                mine = rows[rows["kind"] == kind]
-                _panel(axis, {s: mine[mine["source"] == s][column].to_numpy() for s in SOURCES},
-                       colors)  # fmt: skip
+            mine = rows[rows["kind"] == kind]
+            for axis, (column, name) in zip(line, names.items(), strict=True):
+                samples = {s: mine[mine["source"] == s][column].to_numpy() for s in SOURCES}
+                edges = bin_edges(samples)
+                for source, values in samples.items():
+                    color, _ = SOURCES[source]
+                    figures.histogram(axis, values, 0.3, 1.1, bins=edges, color=color)
+                axis.set_xlim(edges[0], edges[-1])
                 axis.set_xlabel(f"next {name}" if name != "reward" else name, fontsize=9)
             line[0].set_ylabel(f"{figures.AGENT_NAMES.get(kind, kind)}\ntransitions")
-        handles = [plt.Rectangle((0, 0), 1, 1, color=colors[s], alpha=0.6) for s in SOURCES]
-        figure.legend(handles, list(LABELS.values()), ncols=3, loc="outside upper center")
-        figures.write(figure, path)
-
-
-def _panel(axis: Any, samples: dict[str, np.ndarray], colors: dict[str, str]) -> None:
-    edges = bin_edges(samples)
-    for source, values in samples.items():
-        options: dict[str, Any] = {"bins": edges, "color": colors[source]}
-        axis.hist(values, histtype="stepfilled", alpha=0.3, **options)
-        axis.hist(values, histtype="step", lw=1.1, **options)
-    axis.set_yscale("log")
-    axis.set_xlim(edges[0], edges[-1])
+        colors, labels = zip(*SOURCES.values(), strict=True)
+        handles = [plt.Rectangle((0, 0), 1, 1, color=color, alpha=0.6) for color in colors]
+        figure.legend(handles, labels, ncols=3, loc="outside upper center")
 
 
 EXPERIMENT = Experiment(settings=SeHistograms, compute=compute, report=report, about=__doc__)

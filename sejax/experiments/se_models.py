@@ -8,8 +8,10 @@ SEs are used again.
 """
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
+import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
 
@@ -19,27 +21,22 @@ from sejax.experiments import figures, se_agents
 from sejax.experiments.experiment import Experiment
 from sejax.experiments.se_agents import SeAgents
 from sejax.experiments.settings import setting
-from sejax.experiments.tables import publish
+from sejax.experiments.tables import as_texts, publish
 from sejax.experiments.worlds import return_columns
 
 
 @dataclass(frozen=True, kw_only=True)
 class SeModels(SeAgents):
-    """Settings of this experiment."""
-
     name = "se_models"
     files = "models_"
 
-    ses: str | None = setting(None, quick="cartpole", about="file of SEs, from se_feasibility, or "
-                              "a shipped name")  # fmt: skip
+    ses: str | None = setting(
+        None, quick="cartpole", about="file of SEs, from se_feasibility, or a shipped name"
+    )
 
 
 def compute(settings: SeModels) -> pd.DataFrame:
-    """Trains what is missing; a row for each agent.
-
-    Raises:
-      ConfigError: for a file or settings that cannot work.
-    """
+    """Trains what is missing; a row for each agent."""
     ses = load(settings)
     tables = []
     for kind in settings.agents:
@@ -51,11 +48,7 @@ def compute(settings: SeModels) -> pd.DataFrame:
 
 
 def load(settings: SeModels) -> Any:
-    """The SEs that are tested.
-
-    Raises:
-      ConfigError: for a file that cannot be used, or none.
-    """
+    """The SEs that are tested."""
     if settings.ses is None:
         raise ConfigError("ses must be given, because agents are trained on its SEs; got none. "
                           "Set ses=results/se_feasibility/cartpole/ses.safetensors.")  # fmt: skip
@@ -63,18 +56,11 @@ def load(settings: SeModels) -> Any:
 
 
 def summarise(agents: pd.DataFrame, solved_reward: float) -> pd.DataFrame:
-    """One row for each kind of agent and SE, the best SE of each kind first.
-
-    Args:
-      agents: with columns `kind`, `se`, `test_return` and `train_steps`.
-      solved_reward: an agent counts as solving the task from this mean test return on.
-    """
+    """One row for each kind of agent and SE, the best SE of each kind first."""
     grouped = agents.groupby(["kind", "se"], sort=False)
     summary = grouped["test_return"].agg(
-        return_mean="mean",
-        return_std=lambda x: x.std(ddof=0),
-        solved=lambda x: (x >= solved_reward).mean(),
-    )
+        return_mean="mean", return_std=lambda x: x.std(ddof=0),
+        solved=lambda x: (x >= solved_reward).mean())  # fmt: skip
     summary["train_steps"] = grouped["train_steps"].mean()
     kinds = list(dict.fromkeys(agents["kind"]))
     rank = summary.reset_index().assign(order=lambda t: t["kind"].map(kinds.index))
@@ -91,37 +77,27 @@ def rank_correlations(summary: pd.DataFrame) -> pd.DataFrame:
     return means[list(dict.fromkeys(summary["kind"]))].rank().corr()
 
 
-def make_table(summary: pd.DataFrame, ses: Any) -> pd.DataFrame:
-    """The summary as texts, with what is known of each SE."""
-    return pd.DataFrame([
-        {
-            "agent": row.kind,
-            "SE": row.se,
-            "run's seed": ses.seeds[row.se],
-            "score when learned": f"{ses.scores[row.se]:.1f}",
-            "return": f"{row.return_mean:.1f} ± {row.return_std:.1f}",
-            "agents that solve the task": f"{row.solved:.0%}",
-            "training steps": f"{row.train_steps:,.0f}",
-        }
-        for row in summary.itertuples()
-    ])  # fmt: skip
-
-
 def report(settings: SeModels, rows: pd.DataFrame) -> pd.DataFrame:
-    """Writes the table and the picture."""
     ses = load(settings)
     task = ses.task
+    columns: dict[str, Any] = {
+        "agent": "{kind}",
+        "SE": lambda row: row.se,
+        "run's seed": lambda row: ses.seeds[row.se],
+        "score when learned": lambda row: f"{ses.scores[row.se]:.1f}",
+        "return": "{return_mean:.1f} ± {return_std:.1f}",
+        "agents that solve the task": "{solved:.0%}",
+        "training steps": "{train_steps:,.0f}",
+    }
     summary = summarise(rows, task.solved_reward)
-    kinds = {str(kind): mine for kind, mine in rows.groupby("kind", sort=False)}
-    figures.violins(kinds, return_columns(rows), task.name, task.solved_reward,
-                    settings.folder / "models.png")  # fmt: skip
+    draw(task, rows, settings.folder / "models.png")
     note = (
         f"Return: mean ± std over {rows['agent'].nunique()} agents with drawn hyperparameters and "
         f"{len(return_columns(rows))} test episodes each. The paper has 1000 agents on each of 40 "
         f"SEs and shows violins only, no numbers.{correlations_text(summary)}"
     )
     title = f"Single SEs of {task.name} (solved at {task.solved_reward:g})"
-    return publish(settings, title, make_table(summary, ses), summary, note)
+    return publish(settings, title, as_texts(summary, columns), summary, note)
 
 
 def correlations_text(summary: pd.DataFrame) -> str:
@@ -133,6 +109,34 @@ def correlations_text(summary: pd.DataFrame) -> str:
     texts = [f"{a} and {b} {matrix.loc[a, b]:.2f}" for i, a in enumerate(kinds)
              for b in kinds[i + 1 :] if np.isfinite(matrix.loc[a, b])]  # fmt: skip
     return f" Rank correlation of the SEs' mean returns: {', '.join(texts)}." if texts else ""
+
+
+def draw(task: Any, agents: pd.DataFrame, path: Path) -> None:
+    """Draws a violin of the returns for each SE, the best first, in a row for each kind of agent.
+
+    Source: paper, appendix "Evaluation of Individual SE Models".
+    """
+    kinds = list(agents.groupby("kind", sort=False))
+    num_ses = max(mine["se"].nunique() for _, mine in kinds)
+    size = (max(5.0, 1.8 + 0.35 * num_ses), 0.6 + 2.6 * len(kinds))
+    with figures.panels(path, len(kinds), 1, size) as (figure, axes):
+        for axis, (kind, of_kind) in zip(axes[:, 0], kinds, strict=True):
+            pooled = {se: mine[return_columns(mine)].to_numpy().ravel()
+                      for se, mine in of_kind.groupby("se")}  # fmt: skip
+            order = sorted(pooled, key=lambda se: -pooled[se].mean())
+            parts = axis.violinplot([pooled[se] for se in order], widths=0.85, showextrema=False)
+            for body in parts["bodies"]:
+                body.set(facecolor=figures.REAL, edgecolor=figures.REAL, alpha=0.45)
+            places, means = range(1, len(order) + 1), [pooled[se].mean() for se in order]
+            axis.plot(places, means, "D", ms=4, color=figures.BEST, ls="none")
+            axis.axhline(task.solved_reward, color=figures.SOLVED, ls="--", lw=1.2)
+            axis.set_xticks(places, order, fontsize=8)
+            axis.set_title(figures.AGENT_NAMES.get(kind, kind), fontsize=10)
+            axis.set(xlim=(0.4, len(order) + 0.6), ylabel=f"test return\non {task.name}")
+        axes[-1, 0].set_xlabel("SE, by its place in the set; diamonds: means")
+        line = plt.Line2D([], [], color=figures.SOLVED, ls="--")
+        figure.legend([line], [f"solved ({task.solved_reward:g})"], loc="outside upper right",
+                      fontsize=9)  # fmt: skip
 
 
 EXPERIMENT = Experiment(settings=SeModels, compute=compute, report=report, about=__doc__)

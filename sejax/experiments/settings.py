@@ -19,18 +19,17 @@ _SAME = object()
 
 
 def setting(default: Any, rule: Rule | None = None, *, about: str, quick: Any = _SAME) -> Any:
-    """A field of `Settings`.
+    """A field of `Settings`: its default, None where it may be left open, and with `quick=true`.
 
-    Args:
-      default: its value where none is given; None where it may be left open.
-      rule: what must hold, from `sejax.options` or `each_of`.
-      about: a few words for `--help`.
-      quick: the value with `quick=true`; the default if left out.
+    The rule says what must hold, as those of `sejax.options`; `about` is for `--help`.
     """
-    quick = default if quick is _SAME else quick
-    return dataclasses.field(
-        default=default, metadata={"rule": rule, "about": about, "quick": quick}
-    )
+    metadata = {"rule": rule, "about": about, "quick": default if quick is _SAME else quick}
+    return dataclasses.field(default=default, metadata=metadata)
+
+
+def count(default: int | None, things: str, *, about: str, quick: Any = _SAME) -> Any:
+    """A field that counts things."""
+    return setting(default, counts(f"it counts {things}"), about=about, quick=quick)
 
 
 def each_of(known: Collection[str]) -> Rule:
@@ -55,18 +54,16 @@ class Settings(Options):
                               "runs/experiments/NAME-quick[/TASK]")  # fmt: skip
     work: str | None = setting(None, about="folder of what is not kept; runs/experiments/... for "
                                "results/..., else work/ in `out`")  # fmt: skip
-    seed: int = setting(0, lambda name, value, _: errors.require_seed(name, value), about="first "
-                        "random seed")  # fmt: skip
-    devices: int | None = setting(None, counts("something must compute"), about="devices to use; "
-                                  "all")  # fmt: skip
+    seed: int = setting(
+        0, lambda name, value, _: errors.require_seed(name, value), about="first random seed"
+    )
+    devices: int | None = setting(
+        None, counts("something must compute"), about="devices to use; all"
+    )
 
     @classmethod
     def of(cls, **given: Any) -> Self:
-        """Settings from those that are given, by name; what is None or left out has its default.
-
-        Raises:
-          ConfigError: for an unknown field, or a value that cannot be.
-        """
+        """Settings from those that are given, by name; what is None or left out has its default."""
         known = {name: value for name, value in given.items() if value is not None}
         lists = {name for name, kind in get_type_hints(cls).items() if get_origin(kind) is tuple}
         known |= {name: [known[name]] for name in lists & {*known} if isinstance(known[name], str)}
@@ -75,34 +72,30 @@ class Settings(Options):
     @classmethod
     def defaults(cls, given: Mapping[str, Any]) -> dict[str, Any]:
         """Values of the fields; they may depend on those that are given, as on `quick`."""
-        quick = bool(given.get("quick"))
-        return {
-            field.name: field.metadata["quick"] if quick else field.default
-            for field in dataclasses.fields(cls)
-        }
+        return {field.name: field.metadata["quick"] if given.get("quick") else field.default
+                for field in dataclasses.fields(cls)}  # fmt: skip
 
     @property
     def folder(self) -> Path:
         """Where the results go."""
         if self.out is not None:
             return Path(self.out)
-        root = Path("runs/experiments", f"{self.name}-quick") if self.quick else (
-            Path("results", self.name))  # fmt: skip
-        return root / (getattr(self, "env", None) or "")  # tasks would be taken for each other
+        root = f"runs/experiments/{self.name}-quick" if self.quick else f"results/{self.name}"
+        return Path(root, getattr(self, "env", None) or "")  # else tasks replace each other
 
     @property
     def work_folder(self) -> Path:
         """Where finished pieces and NES runs are kept until the experiment is done."""
-        if self.work is not None:
-            return Path(self.work)
-        if self.folder.parts[:1] == ("results",):
-            return Path("runs/experiments", *self.folder.parts[1:])
-        return self.folder / "work"
+        return work_beside(self.folder, "work") if self.work is None else Path(self.work)
 
     @property
     def pieces(self) -> Pieces:
         """The finished pieces."""
         return Pieces(self.work_folder / "pieces")
+
+    def values(self, *names: str) -> dict[str, Any]:
+        """These fields, for what pieces depend on."""
+        return {name: getattr(self, name) for name in names}
 
     @property
     def rows_file(self) -> Path:
@@ -112,14 +105,19 @@ class Settings(Options):
     def command(self) -> str:
         """The command that makes these results; of the fields, those that are not as usual."""
         usual = self.defaults(vars(self))
-        apart = {"out", "work", "devices", "from_rows"}
+        apart = {"out", "work", "devices", "from_rows", "run"}
         words = ["python", "-m", f"sejax.experiments.{self.name}"]
         for name, value in vars(self).items():
-            if name == "run":
-                words += [f"{RUN_PREFIX}{override}" for override in value]
-            elif name not in apart and value != (usual[name] if name != "quick" else False):
+            if name not in apart and value != (usual[name] if name != "quick" else False):
                 words.append(f"{name}={as_word(value)}")
-        return shlex.join(words)
+        return shlex.join([*words, *(RUN_PREFIX + word for word in getattr(self, "run", ()))])
+
+
+def work_beside(folder: Path, name: str) -> Path:
+    """Where what may be thrown away goes: into the folder itself, unless it is of results."""
+    if folder.parts[:1] == ("results",):
+        return Path("runs/experiments", *folder.parts[1:])
+    return folder / name
 
 
 def as_word(value: Any) -> str:

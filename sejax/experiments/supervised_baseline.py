@@ -20,66 +20,48 @@ short for any agent on the real task itself: `max_steps` gives those on the mode
 """
 
 import dataclasses
+import itertools
 from pathlib import Path
 from typing import Any
 
-import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
 
 import sejax
 from sejax.errors import require
-from sejax.experiments import figures, se_agents, supervised_models
+from sejax.experiments import figures, se_agents, supervised_models, worlds
 from sejax.experiments.experiment import Experiment
 from sejax.experiments.pieces import stack, unstack
 from sejax.experiments.se_agents import AGENTS
 from sejax.experiments.supervised_models import SupervisedBaseline
-from sejax.experiments.tables import bootstrap_interval, publish
-from sejax.experiments.worlds import (
-    HPARAMS,
-    Group,
-    World,
-    return_columns,
-    train_groups,
-    training_as_learned,
-)
+from sejax.experiments.tables import as_texts, bootstrap_interval, publish
+from sejax.experiments.worlds import HPARAMS, World, return_columns
 
 BEST = 2  # models in the paper's second figure
 LABELS = {"authors": "model, as the authors", "authors_best": f"model, as the authors, best {BEST}",
           "fair": "model, fair", "se": "SE"}  # fmt: skip
 # Paper, the same subsection, "Result": mean test returns of DDQN agents with drawn hyperparameters.
-PAPER = {
-    ("authors", "ddqn", "varied"): "15.01",
-    ("authors_best", "ddqn", "varied"): "17.73",
-    ("se", "ddqn", "varied"): "190.7",
-}
+PAPER = {("authors", "ddqn", "varied"): "15.01", ("authors_best", "ddqn", "varied"): "17.73",
+         ("se", "ddqn", "varied"): "190.7"}  # fmt: skip
+DRAWN = {"varied": "drawn"}  # what tables and pictures call it
 
 
 def compute(settings: SupervisedBaseline) -> pd.DataFrame:
-    """Computes what is missing: tables of the agents, of the fits and of the transitions.
-
-    Raises:
-      ConfigError: for a proxy or settings that cannot work.
-    """
+    """Computes what is missing: tables of the agents, of the fits and of the transitions."""
     ses = load(settings)
     data = supervised_models.collect_all(settings, ses)
     fits = supervised_models.fit_piece(settings, ses, data)
     tables = []
-    for kind in settings.agents:
-        for hparams in settings.hparams:
-            for name, world in make_worlds(settings, ses, kind, hparams).items():
-                rows = train_groups(world, settings, settings.num_agents)
-                tables.append(rows.assign(world=name, kind=kind, hparams=hparams))
+    for kind, hparams in itertools.product(settings.agents, settings.hparams):
+        for name, world in make_worlds(settings, ses, kind, hparams).items():
+            rows = worlds.train_groups(world, settings, settings.num_agents)
+            tables.append(rows.assign(world=name, kind=kind, hparams=hparams))
     return stack({"agents": pd.concat(tables), "fits": fits,
                   "transitions": supervised_models.summary_of(data)})  # fmt: skip
 
 
 def load(settings: SupervisedBaseline) -> Any:
-    """The SE.
-
-    Raises:
-      ConfigError: if the agents cannot be trained on it, or the tests of its NES run recorded.
-    """
+    """The SE, if agents can be trained on it, and the tests of its NES run recorded."""
     ses = sejax.load_set(settings.proxy, option="proxy", kind="se").first(1)
     require(ses.task.num_states is None and ses.task.num_actions is not None, "proxy",
             "be an SE with vector states and discrete actions", "the agents are made for these",
@@ -92,30 +74,23 @@ def load(settings: SupervisedBaseline) -> Any:
     return ses
 
 
-def make_worlds(
-    settings: SupervisedBaseline, ses: Any, kind: str, hparams: str
-) -> dict[str, World]:
+def make_worlds(settings: Any, ses: Any, kind: str, hparams: str) -> dict[str, World]:
     """The models of both variants and the SE, with as many agents on the SE as on all models."""
     sets = {name: sejax.load_set(supervised_models.model_file(settings, name), option="out")
             for name in ("authors", "fair")}  # fmt: skip
     agent = se_agents.agent_config(settings, kind)
-    worlds = {}
+    made = {}
     for name, proxies in (sets | {"se": ses}).items():
-        training = training_as_learned(proxies, agent)
-        max_steps = se_agents.QUICK_STEPS if settings.quick else training.max_steps
-        if settings.max_steps and name != "se":
-            max_steps = settings.max_steps
+        training = worlds.training_as_learned(proxies, agent)
+        own = settings.max_steps if name != "se" else None
+        max_steps = own or (se_agents.QUICK_STEPS if settings.quick else training.max_steps)
         training = dataclasses.replace(training, max_steps=max_steps,
                                        test_episodes=settings.test_episodes)  # fmt: skip
-        places = [group % proxies.size for group in range(settings.models)]
-        worlds[name] = World(
-            name=f"{kind}-{hparams}-{name}", env=proxies.env, task=proxies.task,
-            groups=tuple(Group(str(group), proxies.one(place), proxies.fingerprint(place))
-                         for group, place in enumerate(places)),
+        made[name] = World.of_set(
+            proxies, map(str, range(settings.models)), name=f"{kind}-{hparams}-{name}",
             agent=agent, training=training, hparams=hparams,
-            settings={"proxy": proxies.config["proxy"]},
         )  # fmt: skip
-    return worlds
+    return made
 
 
 def with_best(agents: pd.DataFrame, quality_of_models: list[float]) -> pd.DataFrame:
@@ -139,10 +114,8 @@ def summarise(agents: pd.DataFrame, solved_reward: float) -> pd.DataFrame:
     """
     rows = []
     for (kind, hparams, name), mine in agents.groupby(["kind", "hparams", "world"]):
-        independent = mine["test_return"]
-        if name != "se":
-            independent = mine.groupby("group")["test_return"].mean()
-        low, high = bootstrap_interval(independent)
+        draws = mine["test_return"] if name == "se" else mine.groupby("group")["test_return"].mean()
+        low, high = bootstrap_interval(draws)
         rows.append({
             "kind": kind, "hparams": hparams, "world": name, "num_agents": len(mine),
             "return_mean": mine["test_return"].mean(),
@@ -161,25 +134,20 @@ def summarise(agents: pd.DataFrame, solved_reward: float) -> pd.DataFrame:
 
 def make_table(summary: pd.DataFrame) -> pd.DataFrame:
     """The summary as texts, with the paper's numbers."""
-    return pd.DataFrame([
-        {
-            "agent": row.kind,
-            "hyperparameters": {"varied": "drawn"}.get(row.hparams, row.hparams),
-            "trained on": LABELS[row.world],
-            "agents": row.num_agents,
-            "return": f"{row.return_mean:.1f} ± {row.return_std:.1f} "
-                      f"[{row.return_low:.1f}, {row.return_high:.1f}]",
-            "paper's": PAPER.get((row.world, row.kind, row.hparams), ""),
-            "solved": f"{row.solved:.0%}",
-            "training steps": f"{row.train_steps:,.0f}",
-            "episodes": f"{row.train_episodes:.1f}",
-        }
-        for row in summary.itertuples()
-    ])  # fmt: skip
+    return as_texts(summary, {
+        "agent": "{kind}",
+        "hyperparameters": lambda row: DRAWN.get(row.hparams, row.hparams),
+        "trained on": lambda row: LABELS[row.world],
+        "agents": "{num_agents}",
+        "return": "{return_mean:.1f} ± {return_std:.1f} [{return_low:.1f}, {return_high:.1f}]",
+        "paper's": lambda row: PAPER.get((row.world, row.kind, row.hparams), ""),
+        "solved": "{solved:.0%}",
+        "training steps": "{train_steps:,.0f}",
+        "episodes": "{train_episodes:.1f}",
+    })  # fmt: skip
 
 
 def report(settings: SupervisedBaseline, rows: pd.DataFrame) -> pd.DataFrame:
-    """Writes the table and the picture."""
     task = load(settings).task
     made, fits, data = (unstack(rows, name) for name in ("agents", "fits", "transitions"))
     agents = with_best(made, data["episode_return"].tolist())
@@ -221,30 +189,21 @@ def draw(task: Any, agents: pd.DataFrame, summary: pd.DataFrame, path: Path) -> 
     edges = np.linspace(returns.min(), max(returns.max(), returns.min() + 1), 41)
     panels = list(agents.groupby(["kind", "hparams"], sort=False))
     num_episodes = max((mine["world"] == "se").sum() for _, mine in panels) * returns.shape[1]
-    with plt.rc_context(figures.STYLE):
-        figure, axes = plt.subplots(1, len(panels), figsize=(1 + 4 * len(panels), 3.6),
-                                    squeeze=False, sharey=True, layout="constrained")  # fmt: skip
+    size = (1 + 4 * len(panels), 3.6)
+    with figures.panels(path, 1, len(panels), size, sharey=True) as (figure, axes):
         for axis, ((kind, hparams), mine) in zip(axes[0], panels, strict=True):
             for name, color in colors.items():
-                _histogram(axis, mine[mine["world"] == name], edges, color, LABELS[name])
-            given = "drawn" if hparams == "varied" else hparams
-            axis.set_title(f"{figures.AGENT_NAMES.get(kind, kind)}, {given} hyperparameters")
-            axis.set_xlabel(f"return of a test episode on {task.name}")
-            axis.set_yscale("log")
-            axis.set_ylim(0.5 / num_episodes, 1.1)
+                met = mine[mine["world"] == name][return_columns(agents)].to_numpy().ravel()
+                figures.histogram(axis, met, 0.2, 1.4, f"{LABELS[name]} (dashed: mean)",
+                                  bins=edges, color=color,
+                                  weights=np.full(met.size, 1 / met.size))  # fmt: skip
+                axis.axvline(met.mean(), color=color, ls="--", lw=1.2)
+            agent = figures.AGENT_NAMES.get(kind, kind)
+            axis.set(title=f"{agent}, {DRAWN.get(hparams, hparams)} hyperparameters",
+                     xlabel=f"return of a test episode on {task.name}",
+                     ylim=(0.5 / num_episodes, 1.1))  # fmt: skip
         axes[0, 0].set_ylabel("share of test episodes")
-        handles, labels = axes[0, 0].get_legend_handles_labels()
-        figure.legend(handles, labels, ncols=3, loc="outside upper center")
-        figures.write(figure, path)
-
-
-def _histogram(axis: Any, agents: pd.DataFrame, edges: np.ndarray, color: str, label: str) -> None:
-    returns = agents[return_columns(agents)].to_numpy().ravel()
-    share = np.full(returns.size, 1 / returns.size)
-    options: dict[str, Any] = {"bins": edges, "weights": share, "color": color}
-    axis.hist(returns, histtype="stepfilled", alpha=0.2, **options)
-    axis.hist(returns, histtype="step", lw=1.4, label=f"{label} (dashed: mean)", **options)
-    axis.axvline(returns.mean(), color=color, ls="--", lw=1.2)
+        figures.legend_above(figure, axes[0, 0], 3, fontsize=None)
 
 
 EXPERIMENT = Experiment(settings=SupervisedBaseline, compute=compute, report=report, about=__doc__)

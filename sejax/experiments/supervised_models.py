@@ -22,7 +22,7 @@ from sejax import plugins
 from sejax.app import build
 from sejax.experiments import se_agents
 from sejax.experiments.se_agents import AGENTS
-from sejax.experiments.settings import Settings, each_of, setting
+from sejax.experiments.settings import Settings, count, each_of, setting
 from sejax.experiments.worlds import HPARAMS
 from sejax.options import counts
 from sejax.parallel import spread_over_devices
@@ -38,24 +38,19 @@ class SupervisedBaseline(Settings):
 
     proxy: str = setting("cartpole", about="SE to compare with, whose settings the NES runs have; "
                          "run directory, file or name")  # fmt: skip
-    models: int = setting(5, counts("it counts models"), quick=2, about="NES runs, and a model for "
-                          "each")  # fmt: skip
-    generations: int = setting(25, counts("it counts generations"), quick=3, about="of an NES run")
+    models: int = count(5, "models", quick=2, about="NES runs, and a model for each")
+    generations: int = count(25, "generations", quick=3, about="of an NES run")
     population: int = setting(16, counts("scores are compared within a generation", least=2),
                               quick=3, about="members of a generation")  # fmt: skip
-    max_rows: int = setting(100_000, counts("it counts transitions"), quick=3000,
-                            about="transitions for a model")  # fmt: skip
-    epochs: int = setting(100, counts("it counts epochs"), quick=20, about="of a fit")
+    max_rows: int = count(100_000, "transitions", quick=3000, about="transitions for a model")
+    epochs: int = count(100, "epochs", quick=20, about="of a fit")
     agents: tuple[str, ...] = setting(("ddqn",), each_of(AGENTS), about=f"of {', '.join(AGENTS)}")
     hparams: tuple[str, ...] = setting(HPARAMS, each_of(HPARAMS), about="of the agents; varied: "
                                        "drawn for each")  # fmt: skip
-    num_agents: int = setting(20, counts("it counts agents"), quick=2, about="for each model")
-    test_episodes: int = setting(10, counts("it counts episodes"), about="of each agent")
+    num_agents: int = count(20, "agents", quick=2, about="for each model")
+    test_episodes: int = count(10, "episodes", about="of each agent")
     max_steps: int | None = setting(None, counts("an agent must train"), about="training steps of "
                                     "an agent on a model; as on the SE")  # fmt: skip
-
-
-# --- transitions ---------------------------------------------------------------------------------
 
 
 def learning_config(settings: SupervisedBaseline, ses: Any) -> Any:
@@ -101,15 +96,10 @@ def collect(config: Any, seed: int, max_rows: int) -> pd.DataFrame:
 
 
 class RecordedRun(NamedTuple):
-    """An NES run whose agents' tests are recorded; compiled functions.
+    """An NES run whose agents' tests are recorded; compiled functions."""
 
-    Attributes:
-      init: `keys [1] -> LearnState`.
-      generation: `state -> (state, Steps)`, `Program.generation` with the steps of all its tests,
-        leaves `[agent, step, ...]`.
-    """
-
-    init: Callable[[Any], Any]
+    init: Callable[[Any], Any]  # keys [1] -> LearnState
+    # state -> (state, Steps): `Program.generation` with the steps of all tests, [agent, step, ...]
     generation: Callable[[Any], Any]
 
 
@@ -141,19 +131,15 @@ def make_recorded_run(config: Any) -> RecordedRun:
 def table_of(steps: Any, num_episodes: int, generation: int) -> pd.DataFrame:
     """The transitions that were made, a row each, with the return of their episode.
 
-    Args:
-      steps: `Steps`, NumPy arrays `[agent, num_episodes * max_steps, ...]`.
-      num_episodes: tests of each agent.
-      generation: of the agents.
+    `steps` are `Steps` of NumPy arrays `[agent, num_episodes * max_steps, ...]`.
     """
     valid = steps.valid
     rewards = np.where(valid, steps.reward, 0).reshape(len(valid), num_episodes, -1)
     returns = np.broadcast_to(rewards.sum(axis=2, keepdims=True), rewards.shape)
     obs, next_obs = steps.obs[valid], steps.next_obs[valid]
-    columns = {f"state_{i}": obs[:, i] for i in range(obs.shape[1])}
-    columns |= {"action": steps.action[valid]}
-    columns |= {f"next_state_{i}": next_obs[:, i] for i in range(obs.shape[1])}
-    return pd.DataFrame(columns | {
+    return pd.DataFrame({
+        **{f"state_{i}": x for i, x in enumerate(obs.T)}, "action": steps.action[valid],
+        **{f"next_state_{i}": x for i, x in enumerate(next_obs.T)},
         "reward": steps.reward[valid], "terminated": steps.terminated[valid].astype(int),
         "return": returns.reshape(valid.shape)[valid], "generation": generation,
     })  # fmt: skip
@@ -180,19 +166,12 @@ class Sample:
 
 
 def summary_of(data: list[pd.DataFrame]) -> pd.DataFrame:
-    """What is to be known of the transitions, a row for each model.
-
-    Columns: `model`; `transitions`, their number; `episode_return`, the mean over them of their
-    episode's return; `ends`, the share of them that end an episode.
-    """
+    """Number of transitions, mean return of their episodes and share of ends, for each model."""
     return pd.DataFrame({
         "model": range(len(data)), "transitions": [len(rows) for rows in data],
         "episode_return": [rows["return"].mean() for rows in data],
         "ends": [rows["terminated"].mean() for rows in data],
     })  # fmt: skip
-
-
-# --- models --------------------------------------------------------------------------------------
 
 
 def model_file(settings: SupervisedBaseline, variant: str) -> Path:
@@ -203,10 +182,9 @@ def model_file(settings: SupervisedBaseline, variant: str) -> Path:
 def fit_piece(settings: SupervisedBaseline, ses: Any, data: list[pd.DataFrame]) -> pd.DataFrame:
     """Fits all models, stores both variants of them, and returns the errors of each epoch."""
     num_rows = min(len(rows) for rows in data)
-    made_with = {"proxy": ses.config["proxy"], "models": settings.models, "num_rows": num_rows,
-                 "epochs": settings.epochs, "learning_rate": LEARNING_RATE,
-                 "batch_size": BATCH_SIZE, "generations": settings.generations,
-                 "population": settings.population, "seed": settings.seed}  # fmt: skip
+    made_with = {"proxy": ses.config["proxy"], "num_rows": num_rows,
+                 "learning_rate": LEARNING_RATE, "batch_size": BATCH_SIZE}  # fmt: skip
+    made_with |= settings.values("models", "epochs", "generations", "population", "seed")
     fits = settings.pieces.compute("fit", made_with, lambda: fit_all(settings, ses, data, num_rows))
     last = fits[fits["epoch"] == settings.epochs - 1].mean()
     print(f"Models: mean squared error {last['error']:.2g} of [s', r], "
@@ -214,9 +192,7 @@ def fit_piece(settings: SupervisedBaseline, ses: Any, data: list[pd.DataFrame]) 
     return fits
 
 
-def fit_all(
-    settings: SupervisedBaseline, ses: Any, data: list[pd.DataFrame], num_rows: int
-) -> pd.DataFrame:
+def fit_all(settings: Any, ses: Any, data: list[pd.DataFrame], num_rows: int) -> pd.DataFrame:
     """Fits a model to each run's transitions and writes the models; a row for each epoch."""
     arrays = [arrays_of(rows.iloc[:num_rows]) for rows in data]
     stacked = tuple(np.stack(parts) for parts in zip(*arrays, strict=True))
@@ -237,12 +213,8 @@ def arrays_of(rows: pd.DataFrame) -> tuple[np.ndarray, np.ndarray, np.ndarray, n
     """States `[n, obs_dim]`, actions `[n]`, targets [s', r] and ends `[n]`."""
     states = [name for name in rows if name.startswith("state_")]
     targets = [name for name in rows if name.startswith("next_state_")] + ["reward"]
-    return (
-        rows[states].to_numpy(np.float32),
-        rows["action"].to_numpy(np.int32),
-        rows[targets].to_numpy(np.float32),
-        rows["terminated"].to_numpy(np.float32),
-    )
+    state, target, end = (rows[x].to_numpy(np.float32) for x in (states, targets, "terminated"))
+    return state, rows["action"].to_numpy(np.int32), target, end
 
 
 def make_fit(env: Any, num_rows: int, epochs: int) -> Callable[..., Any]:
@@ -255,14 +227,11 @@ def make_fit(env: Any, num_rows: int, epochs: int) -> Callable[..., Any]:
     num_batches = num_rows // batch_size
     optimizer = optax.adam(LEARNING_RATE)
 
-    def errors_of(weights: Any, states: Any, actions: Any, targets: Any, ends: Any) -> Any:
+    def loss(weights: Any, states: Any, actions: Any, targets: Any, ends: Any) -> Any:
         state, reward, done = jax.vmap(env.predict, (None, 0, 0))(weights, states, actions)
         predicted = jnp.concatenate([state, reward[:, None]], axis=1)
-        return jnp.stack([jnp.mean((predicted - targets) ** 2), jnp.mean((done - ends) ** 2)])
-
-    def loss(weights: Any, batch: Any) -> Any:
-        errors = errors_of(weights, *batch)
-        return errors.sum(), errors
+        errors = [jnp.mean((predicted - targets) ** 2), jnp.mean((done - ends) ** 2)]
+        return sum(errors), jnp.stack(errors)
 
     def fit(key: Any, *data: Any) -> Any:
         key_init, key_order = jax.random.split(key)
@@ -271,8 +240,8 @@ def make_fit(env: Any, num_rows: int, epochs: int) -> Callable[..., Any]:
 
         def update(carry: Any, rows: Any) -> Any:
             weights, opt_state = carry
-            batch = tuple(x[rows] for x in data)
-            gradient, errors = jax.grad(loss, has_aux=True)(weights, batch)
+            batch = (x[rows] for x in data)
+            gradient, errors = jax.grad(loss, has_aux=True)(weights, *batch)
             step, opt_state = optimizer.update(gradient, opt_state)
             return (optax.apply_updates(weights, step), opt_state), errors
 
@@ -288,9 +257,7 @@ def make_fit(env: Any, num_rows: int, epochs: int) -> Callable[..., Any]:
     return fit
 
 
-def save_models(
-    settings: SupervisedBaseline, ses: Any, weights: Any, variant: str, done: str
-) -> None:
+def save_models(settings: Any, ses: Any, weights: Any, variant: str, done: str) -> None:
     """Stores the models of a variant, as SEs with their use of the done output."""
     env = plugins.make("proxy", dataclasses.replace(ses.env.config, done=done), ses.task)
     each = [jax.tree.map(lambda x, i=i: x[i], weights) for i in range(settings.models)]

@@ -25,9 +25,8 @@ import sejax
 from sejax.app.runtime import available_cores
 from sejax.experiments import figures
 from sejax.experiments.experiment import Experiment
-from sejax.experiments.settings import Settings, each_of, setting
-from sejax.experiments.tables import publish
-from sejax.options import counts
+from sejax.experiments.settings import Settings, count, each_of, setting
+from sejax.experiments.tables import as_texts, publish
 from sejax.parallel import spread_over_devices
 
 PAPER_CORES = 16
@@ -39,11 +38,6 @@ class Row(NamedTuple):
     env: str
     proxy: str
     seconds: float
-
-    @property
-    def presets(self) -> tuple[str, ...]:
-        """What is timed of it."""
-        return ("paper", "best") if self.proxy == "se" else ("best",)
 
 
 ROWS = {
@@ -62,12 +56,10 @@ SETTINGS = {"paper": "the paper's", "best": "our default"}
 
 @dataclass(frozen=True, kw_only=True)
 class Timings(Settings):
-    """Settings of this experiment."""
-
     name = "timings"
 
     rows: tuple[str, ...] = setting(tuple(ROWS), each_of(ROWS), about="tasks and proxies")
-    generations: int = setting(2, counts("it counts iterations"), about="outer iterations to time")
+    generations: int = count(2, "iterations", about="outer iterations to time")
 
 
 def compute(settings: Timings) -> pd.DataFrame:
@@ -77,9 +69,9 @@ def compute(settings: Timings) -> pd.DataFrame:
     for name in settings.rows:
         row = ROWS[name]
         measure = project_halfcheetah if row.env == "halfcheetah" else time_generations
-        for preset in row.presets:
-            made_with = {"row": name, "preset": preset, "quick": settings.quick, "cores": cores,
-                         "generations": settings.generations, "seed": settings.seed}  # fmt: skip
+        for preset in ("paper", "best") if row.proxy == "se" else ("best",):
+            made_with = {"row": name, "preset": preset, "cores": cores}
+            made_with |= settings.values("quick", "generations", "seed")
             run = functools.partial(measure, settings, row, preset)
             timed = settings.pieces.compute(f"{name}-{preset}-{cores}", made_with, run)
             tables.append(timed.assign(row=name, preset=preset, cores=cores))
@@ -140,33 +132,25 @@ def project_halfcheetah(settings: Timings, row: Row, preset: str) -> pd.DataFram
     def environment_steps(key: Any) -> Any:
         def step(state: Any, key: Any) -> Any:
             action = jax.random.uniform(key, (task.action_dim,), minval=-1.0)
-            _, state, reward, _, _ = env.step_env(key, state, action, params)
-            return state, reward
+            return env.step_env(key, state, action, params)[1:3]  # state and reward
 
         _, state = env.reset_env(key, params)
         return jax.lax.scan(step, state, jax.random.split(key, num_steps))[1].sum()
 
     def learning_steps(key: Any) -> Any:
-        state = agent.init(key, agent.hparams)
         size = config.agent.batch_size
-        batch = Transition(
-            jax.random.normal(key, (task.obs_dim, size)),
-            jax.random.uniform(key, (task.action_dim, size), minval=-1.0),
-            jax.random.normal(key, (size,)), jax.numpy.ones(size),
-            jax.random.normal(key, (task.obs_dim, size)),
+        obs = jax.random.normal(key, (task.obs_dim, size))
+        actions = jax.random.uniform(key, (task.action_dim, size), minval=-1.0)
+        batch = Transition(obs, actions, jax.random.normal(key, (size,)), jax.numpy.ones(size), obs)
+        state, _ = jax.lax.scan(
+            lambda state, key: (agent.update(key, state, batch), None),
+            agent.init(key, agent.hparams), jax.random.split(key, num_steps),
         )  # fmt: skip
-
-        def step(state: Any, key: Any) -> Any:
-            return agent.update(key, state, batch), None
-
-        state, _ = jax.lax.scan(step, state, jax.random.split(key, num_steps))
         return jax.tree.leaves(state)[0].sum()
 
     cores = (1, settings.devices or available_cores())
-    env_us, learn_us = (
-        [microseconds_of_a_step(fn, count, num_steps) for count in cores]
-        for fn in (environment_steps, learning_steps)
-    )
+    env_us, learn_us = ([microseconds_of_a_step(fn, count, num_steps) for count in cores]
+                        for fn in (environment_steps, learning_steps))  # fmt: skip
     agents = make_program(**parts).strategy.num_candidates
     episodes = config.training.max_episodes
     train_steps = agents * episodes * task.max_steps
@@ -190,29 +174,27 @@ def microseconds_of_a_step(fn: Callable[[Any], Any], num_devices: int, num_steps
 
 
 def report(settings: Timings, timed: pd.DataFrame) -> pd.DataFrame:
-    """Writes the summary, the picture and the table, and returns the table."""
     draw(settings, timed)
     cores = int(timed["cores"].iloc[0])
-    table = pd.DataFrame([
-        {
-            "task": ROWS[row.row].env,
-            "proxy": ROWS[row.row].proxy.upper(),
-            "settings": SETTINGS[row.preset],
-            f"paper, {PAPER_CORES} cores": f"{ROWS[row.row].seconds:g} s",
-            f"sejax, {cores} cores": f"{show(row.seconds)} s ({row.how})",
-            "agents": row.agents,
-            "training steps": f"{row.train_steps:,.0f}",
-            "CPU µs for a training step": f"{row.cpu_seconds / row.train_steps * 1e6:,.1f}",
-        }
-        for row in timed.itertuples()
-    ])  # fmt: skip
+    columns: dict[str, Any] = {
+        "task": lambda row: ROWS[row.row].env,
+        "proxy": lambda row: ROWS[row.row].proxy.upper(),
+        "settings": lambda row: SETTINGS[row.preset],
+        f"paper, {PAPER_CORES} cores": lambda row: f"{ROWS[row.row].seconds:g} s",
+        f"sejax, {cores} cores": lambda row: (
+            f"{row.seconds:{',.0f' if row.seconds >= 10 else '.2g'}} s ({row.how})"),
+        "agents": "{agents}",
+        "training steps": "{train_steps:,.0f}",
+        "CPU µs for a training step":
+            lambda row: f"{row.cpu_seconds / row.train_steps * 1e6:,.1f}",
+    }  # fmt: skip
     note = (
         f"The first {settings.generations} iterations of a run, compiled before. All tests on the "
         "real task are in them. For RNs our default has the paper's agents and sizes. "
     )
     if settings.quick:
-        note += "quick=true: a few agents with short trainings, not to be compared with the "
-        note += "paper's. "
+        note += ("quick=true: a few agents with short trainings, not to be compared with the "
+                 "paper's. ")  # fmt: skip
     for row in timed[timed["how"] == "projected"].itertuples():
         note += (
             f"HalfCheetah: an environment step takes {row.env_us_one_core:,.0f} µs on one core and "
@@ -220,12 +202,7 @@ def report(settings: Timings, timed: pd.DataFrame) -> pd.DataFrame:
             f"and {row.learn_us:,.0f}; projected for agents of which none solves the task."
         )
     title = "Seconds for one outer iteration of NES"
-    return publish(settings, title, table, timed, note.strip())
-
-
-def show(seconds: float) -> str:
-    """Two digits of a short time, whole seconds of a long one."""
-    return f"{seconds:,.0f}" if seconds >= 10 else f"{seconds:.2g}"
+    return publish(settings, title, as_texts(timed, columns), timed, note.strip())
 
 
 def draw(settings: Timings, timed: pd.DataFrame) -> None:
@@ -233,8 +210,7 @@ def draw(settings: Timings, timed: pd.DataFrame) -> None:
     rows = [ROWS[name] for name in timed["row"]]
     names = [f"{row.env}\n{row.proxy.upper()}, {SETTINGS[preset]} settings"
              for row, preset in zip(rows, timed["preset"], strict=True)]  # fmt: skip
-    places = np.arange(len(names))
-    cores = int(timed["cores"].iloc[0])
+    places, cores = np.arange(len(names)), int(timed["cores"].iloc[0])
     path, size = settings.folder / "timings.png", (7, 0.9 + 0.55 * len(names))
     with figures.panels(path, 1, 1, size) as (figure, axes):
         axis = axes[0, 0]

@@ -6,9 +6,9 @@ group is a piece that is computed once.
 
 import dataclasses
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import jax
 import numpy as np
@@ -17,6 +17,7 @@ import pandas as pd
 import sejax
 from sejax import plugins, serialize
 from sejax.agents import NoExploration
+from sejax.experiments import return_curves
 from sejax.experiments.settings import Settings
 from sejax.parallel import spread_over_devices
 from sejax.training import TrainingConfig, budget_for
@@ -26,106 +27,79 @@ GROUPS_AT_ONCE = 5  # groups of agents in one program, but for one CPU device
 
 
 class Group(NamedTuple):
-    """Where a group of agents trains.
+    """Where a group of agents trains."""
 
-    Attributes:
-      name: in the names of files, and in the rows' column `group`.
-      params: `EnvParams`.
-      fingerprint: what tells its world from those of other groups.
-    """
-
-    name: str
-    params: Any
-    fingerprint: str = ""
+    name: str  # in the names of files, and in the rows' column `group`
+    params: Any  # `EnvParams`
+    fingerprint: str = ""  # what tells its world from those of other groups
 
 
 @dataclass(frozen=True, kw_only=True)
 class World:
-    """What agents are trained in, which, and how long.
+    """What agents are trained in, which, and how long."""
 
-    Attributes:
-      name: in the names of files.
-      env: gymnax environment; `params` are what its groups differ in.
-      task: the real task that agents are tested on.
-      groups: of agents.
-      agent: configuration of all.
-      training: how long they train.
-      exploration: their bonus.
-      hparams: "default", or "varied" if hyperparameters are drawn for each agent.
-      settings: what else the results depend on, such as the proxies' configuration; plain values.
-      is_single: whether its one group takes its keys from the seed itself.
-    """
-
-    name: str
-    env: Any
-    task: Any
+    name: str  # in the names of files
+    env: Any  # gymnax environment; `params` are what its groups differ in
+    task: Any  # the real one, that agents are tested on
     groups: tuple[Group, ...]
-    agent: Any
+    agent: Any  # configuration of all
     training: TrainingConfig
     exploration: Any = field(default_factory=NoExploration)
-    hparams: str = "default"
-    settings: dict[str, Any] = field(default_factory=dict)
-    is_single: bool = False
+    hparams: str = "default"  # or "varied": drawn for each agent
+    settings: dict[str, Any] = field(default_factory=dict)  # what else results depend on; plain
+    is_single: bool = False  # whether its one group takes its keys from the seed itself
+
+    @classmethod
+    def real(cls, task: Any, names: Iterable[str], **rest: Any) -> Self:
+        """The real task for groups of these names."""
+        groups = tuple(Group(name, task.params) for name in names)
+        return cls(env=task.env, task=task, groups=groups, **rest)
+
+    @classmethod
+    def of_set(cls, proxies: Any, names: Iterable[str], **rest: Any) -> Self:
+        """The proxies of a `ProxySet`, one for each group; the first ones again for more groups."""
+        places = [(name, i % proxies.size) for i, name in enumerate(names)]
+        groups = tuple(Group(name, proxies.one(i), proxies.fingerprint(i)) for name, i in places)
+        settings = {"proxy": proxies.config["proxy"], **rest.pop("settings", {})}
+        return cls(env=proxies.env, task=proxies.task, groups=groups, settings=settings, **rest)
 
     def settings_of(self, group: Group) -> dict[str, Any]:
         """What a group's results depend on, beside the random numbers."""
         return {
-            "task": self.task.origin,
-            "agent": plugins.describe("agent", self.agent),
+            "task": self.task.origin, "agent": plugins.describe("agent", self.agent),
             "exploration": plugins.describe("exploration", self.exploration),
-            "training": serialize.to_plain(self.training),
-            "hparams": self.hparams,
-            "group": group.name,
-            "weights": group.fingerprint,
-            **self.settings,
-        }
+            "training": serialize.to_plain(self.training), "hparams": self.hparams,
+            "group": group.name, "weights": group.fingerprint, **self.settings,
+        }  # fmt: skip
 
 
 @dataclass(frozen=True, kw_only=True)
 class Measure:
-    """What is kept of an agent's training.
+    """What is kept of an agent's training."""
 
-    Attributes:
-      make_run: `(agent, env, task, training) -> run(key, env_params, active)`, whose result has
-        leaves `[]` and `[episode]`.
-      to_table: `(results [agent, ...], drawn hyperparameters [agent]) -> rows`, with a column
-        `agent` and a column `test_return`.
-      say: of the rows of a group, for people.
-    """
-
+    # (agent, env, task, training) -> run(key, env_params, active), with leaves `[]` and `[episode]`
     make_run: Callable[[Any, Any, Any, TrainingConfig], Callable[..., Any]]
+    # (results [agent, ...], drawn hyperparameters [agent]) -> rows, with a column `agent`
     to_table: Callable[[Any, dict[str, np.ndarray]], pd.DataFrame]
-    say: Callable[[pd.DataFrame], str]
+    say: Callable[[pd.DataFrame], str]  # of the rows of a group, for people
 
 
 def train_groups(
-    world: World,
-    settings: Settings,
-    num_agents: int,
-    measure: Measure | None = None,
+    world: World, settings: Settings, num_agents: int, measure: Measure | None = None,
     at_once: int = 1,
-) -> pd.DataFrame:
+) -> pd.DataFrame:  # fmt: skip
     """Rows of all agents of a world, with a column `group`; trains the groups that are missing.
 
     The agents of the i-th group have the same seeds in every world: where hyperparameters are
-    drawn, the worlds are compared on equal draws.
-
-    Args:
-      world: where they train.
-      settings: of the experiment: seed, devices, and where finished groups are kept.
-      num_agents: in each group.
-      measure: `OUTCOMES` if not given.
-      at_once: groups in one program, of which all are finished together; see `groups_at_once`.
-
-    Raises:
-      ConfigError: for stored groups of other settings.
+    drawn, the worlds are compared on equal draws. `at_once` groups are one program and finished
+    together; see `groups_at_once`. What is kept of an agent are its `OUTCOMES` by default.
     """
-    measure = measure or OUTCOMES
+    measure = measure or OUTCOMES  # which are defined below
     shared = {"num_agents": num_agents, "seed": settings.seed}
     tables = []
-    for first in range(0, len(world.groups), at_once):
-        places = {f"{world.name}-{world.groups[i].name}": i
-                  for i in range(first, min(first + at_once, len(world.groups)))}  # fmt: skip
+    every = [(f"{world.name}-{group.name}", i) for i, group in enumerate(world.groups)]
+    for first in range(0, len(every), at_once):
+        places = dict(every[first : first + at_once])
         named = {name: world.settings_of(world.groups[i]) | shared for name, i in places.items()}
 
         def compute(missing: list[str], places: dict[str, int] = places) -> list[pd.DataFrame]:
@@ -139,20 +113,18 @@ def train_groups(
 
 
 def train(
-    world: World,
-    settings: Settings,
-    num_agents: int,
-    measure: Measure,
-    places: list[int],
+    world: World, settings: Settings, num_agents: int, measure: Measure, places: list[int],
     at_once: int,
-) -> list[pd.DataFrame]:
+) -> list[pd.DataFrame]:  # fmt: skip
     """The rows of the groups at these places; a program is compiled once for `at_once` of them."""
-    program = make_program(measure, world.agent, world.exploration, world.hparams, world.env,
-                           world.task, world.training, settings.devices)  # fmt: skip
+    program = make_program(
+        measure, world.agent, world.exploration, world.hparams, world.env, world.task,
+        world.training, settings.devices)  # fmt: skip
     padded = [*places, *[places[-1]] * (at_once - len(places))]
-    keys = jax.numpy.concatenate([
-        agent_keys(settings.seed, None if world.is_single else i, num_agents) for i in padded
-    ])  # fmt: skip
+    key = jax.random.key(settings.seed)
+    own_keys = [key if world.is_single else jax.random.fold_in(key, i) for i in padded]
+    # Of a group's agents, the first ones have the same keys for any number of them.
+    keys = jax.numpy.concatenate([jax.random.split(key, num_agents) for key in own_keys])
     params = jax.tree.map(lambda *each: np.stack(each), *[world.groups[i].params for i in padded])
     active = np.repeat(np.arange(at_once) < len(places), num_agents)
     result = jax.device_get(program(keys, params, active))
@@ -162,23 +134,11 @@ def train(
     ]
 
 
-def agent_keys(seed: int, group: int | None, num_agents: int) -> Any:
-    """A key for each agent of a group, `[agent]`; the first ones are the same for any number."""
-    key = jax.random.key(seed)
-    return jax.random.split(key if group is None else jax.random.fold_in(key, group), num_agents)
-
-
 @functools.cache
 def make_program(
-    measure: Measure,
-    agent: Any,
-    exploration: Any,
-    hparams: str,
-    env: Any,
-    task: Any,
-    training: TrainingConfig,
-    devices: int | None,
-) -> Callable[..., Any]:
+    measure: Measure, agent: Any, exploration: Any, hparams: str, env: Any, task: Any,
+    training: TrainingConfig, devices: int | None,
+) -> Callable[..., Any]:  # fmt: skip
     """Builds `program(keys [agent], params, active [agent]) -> (results, drawn)`, `[agent, ...]`.
 
     The leaves of `params` are `[group, ...]`; the agents of a group follow one another. Nothing is
@@ -213,32 +173,22 @@ def groups_at_once(devices: int | None) -> int:
 
 
 def training_as_learned(proxies: Any, agent: Any) -> TrainingConfig:
-    """How long an agent trains on SEs: as those that they were learned with.
-
-    Args:
-      proxies: a `ProxySet`.
-      agent: configuration of the agent.
-    """
+    """How long an agent trains on a set of SEs: as those that they were learned with."""
     learned = serialize.from_plain(TrainingConfig, proxies.config["training"], "training")
     learned_with = plugins.configure("agent", proxies.config["agent"])
     return budget_for(learned, agent, learned_with, proxies.task.max_steps)
 
 
-# --- what is measured ----------------------------------------------------------------------------
-
-
 def outcome_rows(outcome: Any, drawn: dict[str, np.ndarray]) -> pd.DataFrame:
     """A row for each agent, with a column for each test episode and each drawn hyperparameter."""
     returns = outcome.test_returns.astype(float)
-    columns = {
-        "agent": range(len(returns)),
-        "test_return": returns.mean(axis=1),
-        "nonfinite": outcome.nonfinite,
-        "train_episodes": outcome.train_episodes.astype(float),
+    return pd.DataFrame({
+        "agent": range(len(returns)), "test_return": returns.mean(axis=1),
+        "nonfinite": outcome.nonfinite, "train_episodes": outcome.train_episodes.astype(float),
         "train_steps": outcome.train_steps.astype(float),
-    }
-    columns |= {f"return_{i}": x for i, x in enumerate(returns.T)}
-    return pd.DataFrame(columns | {name: x.astype(float) for name, x in drawn.items()})
+        **{f"return_{i}": x for i, x in enumerate(returns.T)},
+        **{name: x.astype(float) for name, x in drawn.items()},
+    })  # fmt: skip
 
 
 def return_columns(agents: pd.DataFrame) -> list[str]:
@@ -271,9 +221,7 @@ def make_curves(agent: Any, env: Any, task: Any, training: TrainingConfig) -> Ca
 def curve_rows(curves: tuple[np.ndarray, np.ndarray], drawn: Any = None) -> pd.DataFrame:
     """A row for each training episode: agent, training steps at its end, mean return of its tests.
 
-    Args:
-      curves: test returns and training steps, `[agent, episode]`.
-      drawn: not kept.
+    The curves are test returns and training steps, `[agent, episode]`.
     """
     tables = []
     for agent, (returns, ends) in enumerate(zip(*curves, strict=True)):
@@ -283,17 +231,12 @@ def curve_rows(curves: tuple[np.ndarray, np.ndarray], drawn: Any = None) -> pd.D
     return pd.concat(tables, ignore_index=True)
 
 
-def _say_outcome(rows: pd.DataFrame) -> str:
-    return (f"mean return {rows['test_return'].mean():.1f} after "
-            f"{rows['train_steps'].mean():,.0f} steps")  # fmt: skip
-
-
-def _say_curves(rows: pd.DataFrame) -> str:
-    last = rows.groupby("agent")["test_return"].apply(lambda returns: returns.tail(10).mean())
-    return f"last test returns {last.mean():.1f}"
-
-
 OUTCOMES = Measure(
-    make_run=lambda *args: sejax.make_evaluator(*args), to_table=outcome_rows, say=_say_outcome
-)
-CURVES = Measure(make_run=make_curves, to_table=curve_rows, say=_say_curves)
+    make_run=lambda *args: sejax.make_evaluator(*args), to_table=outcome_rows,
+    say=lambda rows: (f"mean return {rows['test_return'].mean():.1f} after "
+                      f"{rows['train_steps'].mean():,.0f} steps"),
+)  # fmt: skip
+CURVES = Measure(
+    make_run=make_curves, to_table=curve_rows,
+    say=lambda rows: f"last test returns {return_curves.last_returns(rows).mean():.1f}",
+)  # fmt: skip
