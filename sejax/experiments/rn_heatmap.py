@@ -1,7 +1,7 @@
 """The rewards that RNs have learned for each move on the Cliff Walking map, as a picture of it.
 
 Source: paper, appendix "Qualitative Study of Reward Networks on the Cliff Walking Task" (figure
-"Learned Cliff Walking reward for different reward network types"); `reference_details.md` 7.7.
+"Learned Cliff Walking reward for different reward network types"); `docs/reference.md` 7.7.
 
 Differs: moves out of the goal and the cliff, which end an episode and which no agent ever makes,
 are left out.

@@ -1,7 +1,7 @@
 """What RNs are learned for: the reward threshold, the area under the curve, or the final return.
 
 Source: paper, appendix "Studying the Influence of Different Reward Network Optimization
-Objectives"; `reference_details.md` 7.3 and 7.4.
+Objectives"; `docs/reference.md` 7.3 and 7.4.
 
 As `rn_performance`, once for each objective. The authors' scripts picked the ten RNs with the
 *lowest* scores for two of the three objectives; both choices are shown here, `best` and `worst`, of

@@ -2,7 +2,7 @@
 
 Source: paper, section "Experiments with Reward Networks" (figure with the average cumulative test
 rewards, and the rows for default hyperparameters, varied ones and unseen agents), appendix
-"HalfCheetah RNs Plots"; `reference_details.md` 7.3.
+"HalfCheetah RNs Plots"; `docs/reference.md` 7.3.
 
 The RNs of each variant are learned first (`learned`), and are kept for all experiments. On each of
 the best `rns` of them `num_agents` agents are trained in each row, and as many on the real task

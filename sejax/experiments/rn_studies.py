@@ -6,7 +6,7 @@ beside it. Runs that were interrupted go on, and where more RNs are asked for th
 the further ones are learned.
 
 Differs: on HalfCheetah the unseen agent, PPO, has the ICM and the number of episodes of TD3; the
-authors' scripts have others for it (`reference_details.md` 4.8 and 7.3).
+authors' scripts have others for it (`docs/reference.md` 4.8 and 7.3).
 """
 
 import dataclasses

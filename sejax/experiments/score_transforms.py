@@ -1,7 +1,7 @@
 """Which score transform finds an SE of the 2x2 grid world soonest, over NES step sizes.
 
 Source: paper, appendix "Evaluation of Score Transformation Variants" (figure "Evaluation of
-different score transformation schemes"); `reference_details.md` 2.5 and 6.2.
+different score transformation schemes"); `docs/reference.md` 2.5 and 6.2.
 
 Each run learns an SE with a score transform, with mirrored sampling or without, and a step size
 that is drawn log-uniformly; what counts is how often NES has to update the SE until the agents
@@ -40,7 +40,7 @@ from sejax.options import Options, counts
 
 SCORE_TRANSFORMS = tuple(TRANSFORMS)
 
-# reference_details.md 6.2: default_config_gridworld.yaml as the published runs used it.
+# docs/reference.md 6.2: default_config_gridworld.yaml as the published runs used it.
 SETTINGS = ["env=gridworld_2x2", "agent=q_learning", "agent.learning_rate=0.5",
             "agent.discount=0.9", "agent.epsilon_init=0.5", "agent.epsilon_min=0.01",
             "agent.epsilon_decay=0.95", "agent.init_episodes=5", "proxy.hidden_size=32",

@@ -2,7 +2,7 @@
 
 Source: paper, section "Analyzing SE Behavior" (figure "Histograms of next state s' and reward r")
 and appendix "Qualitative Study of Synthetic Environments for the CartPole and Acrobot Tasks";
-`reference_details.md` 7.2.
+`docs/reference.md` 7.2.
 
 Agents with default hyperparameters are trained on one SE and tested on the real task. Shown are
 

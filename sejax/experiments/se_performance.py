@@ -2,7 +2,7 @@
 
 Source: paper, section "Performance of SE-trained Agents" and "Transferability of SEs" (figure with
 densities and bars for CartPole), appendix "Evaluation of Performance and Transferability of SEs on
-the Acrobot Task"; `reference_details.md` 7.1.
+the Acrobot Task"; `docs/reference.md` 7.1.
 
 On each SE of a set `num_agents` agents are trained whose hyperparameters are drawn anew for each,
 whatever the SEs were learned with; `varied` and `fixed` are sets from se_feasibility, learned with
@@ -36,7 +36,7 @@ SHOWN = {"real": (figures.REAL, "real"), "varied": (figures.VARIED, "synth., HPs
          "fixed": (figures.FIXED, "synth., HPs fixed"),
          "best": (figures.BEST, "synth., best SEs")}  # fmt: skip
 
-# Training steps, "mean ± std", in CartPole: reference_details.md 7.1, the values in the scripts of
+# Training steps, "mean ± std", in CartPole: docs/reference.md 7.1, the values in the scripts of
 # the authors' bar plot; best: the same and paper, section "Transferability of SEs", which also has
 # the returns of TD3. Acrobot: paper, the same section.
 PAPER_STEPS = {
@@ -117,7 +117,7 @@ def real_world(settings: SePerformance, task: Any, sets: dict[str, Any], kind: s
     """The real task for a number of groups of agents; training ends by the solved rule."""
     as_ses = max((ses.size for ses in sets.values()), default=settings.num_ses)
     count = settings.real_groups or as_ses
-    # reference_details.md 7.1: discrete TD3 trains 500 episodes on Acrobot, all others 1000.
+    # docs/reference.md 7.1: discrete TD3 trains 500 episodes on Acrobot, all others 1000.
     usual = 500 if task.name == "acrobot" and kind == "td3_discrete" else 1000
     training = TrainingConfig(
         max_episodes=settings.real_episodes or usual, stop_rule="solved",

@@ -1,7 +1,7 @@
 """Do models fitted to real transitions train agents as SEs do: the supervised baseline.
 
 Source: paper, appendix "Supervised Learning and Synthetic Environments", subsection "Comparing
-Supervised Learning with Synthetic Environments on CartPole"; `reference_details.md` 7.5.
+Supervised Learning with Synthetic Environments on CartPole"; `docs/reference.md` 7.5.
 
 1. `models` NES runs, with the settings that the SE was learned with and `population` members.
    All real test episodes of their agents, those of members and of incumbents, are recorded, and

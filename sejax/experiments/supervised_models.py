@@ -1,7 +1,7 @@
 """Models of a task, fitted by supervised learning to what agents of NES runs met in it.
 
 Source: paper, appendix "Supervised Learning and Synthetic Environments", subsection "Comparing
-Supervised Learning with Synthetic Environments on CartPole"; `reference_details.md` 7.5.
+Supervised Learning with Synthetic Environments on CartPole"; `docs/reference.md` 7.5.
 """
 
 import dataclasses
@@ -27,7 +27,7 @@ from sejax.experiments.worlds import HPARAMS
 from sejax.options import counts
 from sejax.parallel import spread_over_devices
 
-LEARNING_RATE, BATCH_SIZE = 1e-4, 1024  # paper and reference_details.md 7.5
+LEARNING_RATE, BATCH_SIZE = 1e-4, 1024  # paper and docs/reference.md 7.5
 
 
 @dataclass(frozen=True, kw_only=True)
