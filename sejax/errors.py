@@ -54,11 +54,11 @@ def at_least(minimum: float, name: str, value: Any, reason: str, fix: Any) -> No
             f"{name}={fix}")  # fmt: skip
 
 
-def whole(minimum: int, name: str, value: Any, reason: str, fix: Any) -> None:
-    """Checks a count: at least `minimum`, and not more than can be counted."""
+def whole(minimum: int, name: str, value: Any, reason: str, fix: Any, most: int = LARGEST) -> None:
+    """Checks a count: at least `minimum`, and at most what can be counted or built."""
     at_least(minimum, name, value, reason, fix)
-    require(value <= LARGEST, name, f"be at most {LARGEST}", "it is counted in 32 bits", value,
-            f"{name}={fix}")  # fmt: skip
+    limit = "it is counted in 32 bits" if most == LARGEST else "each is built by itself"
+    require(value <= most, name, f"be at most {most}", limit, value, f"{name}={fix}")
 
 
 def positive(name: str, value: Any, reason: str, fix: Any, at_most: float = math.inf) -> None:

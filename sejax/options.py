@@ -20,6 +20,8 @@ from typing import Any, ClassVar
 
 from sejax import errors
 
+MOST_LAYERS = 100  # layers and blocks of a network are traced one by one
+
 Rule = Callable[[str, Any, Any], None]  # (name, value, default) -> None, or raises ConfigError
 
 
@@ -71,11 +73,13 @@ def traced_options(config: Any) -> dict[str, Any]:
 
 
 def counts(
-    reason: str = "there is nothing to learn from or with otherwise", least: int = 1
+    reason: str = "there is nothing to learn from or with otherwise",
+    least: int = 1,
+    most: int = errors.LARGEST,
 ) -> Rule:
-    """A whole number from `least` on."""
+    """A whole number from `least` to `most`."""
     return lambda name, value, default: errors.whole(
-        least, name, value, reason, "null" if default is None else default
+        least, name, value, reason, "null" if default is None else default, most
     )
 
 

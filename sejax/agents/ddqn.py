@@ -23,7 +23,7 @@ from sejax.agents.memory import replay_memory
 from sejax.agents.partial_batch import sum_over_batch
 from sejax.agents.replay import Transition, num_columns
 from sejax.networks import ACTIVATIONS, MLP, DuelingMLP, narrow
-from sejax.options import counts, fraction, one_of, option, positive
+from sejax.options import MOST_LAYERS, counts, fraction, one_of, option, positive
 
 MOVES = "the agent would not move"
 
@@ -35,7 +35,7 @@ class DDQNConfig(AgentOptions):
     batch_size: int = option(128, counts(), varied="triple")
     buffer_size: int = option(100_000, counts())
     hidden_size: int = option(128, counts(), varied="triple")
-    num_layers: int = option(2, counts(), varied="one_more_or_less")
+    num_layers: int = option(2, counts(most=MOST_LAYERS), varied="one_more_or_less")
     activation: str = option("relu", one_of(ACTIVATIONS))
     learning_rate: float = option(1e-3, positive(MOVES), traced=True, varied="triple")
     # tau: weight of the online network in the target's update
@@ -63,7 +63,7 @@ class DuelingDDQNConfig(DDQNConfig):
 
     feature_dim: int = option(128, counts())  # outputs of the part that both streams share
     # Hidden layers of the value and of the advantage stream.
-    stream_num_layers: int = option(1, counts("it counts layers", least=0))
+    stream_num_layers: int = option(1, counts("it counts layers", 0, MOST_LAYERS))
     stream_hidden_size: int = option(128, counts())
 
     def network(self, num_actions: int) -> nn.Module:

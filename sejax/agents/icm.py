@@ -22,7 +22,7 @@ from sejax.agents.agent import Agent, traced
 from sejax.agents.memory import Rollout
 from sejax.agents.replay import Transition
 from sejax.networks import MLP, Dense
-from sejax.options import Options, counts, fraction, not_negative, option, positive
+from sejax.options import MOST_LAYERS, Options, counts, fraction, not_negative, option, positive
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,8 +43,8 @@ class ICMConfig(Options):
     reward_scale: float = option(0.03, not_negative("it scales a bonus"), traced=True)
     feature_dim: int = option(32, counts("the models need units"))
     hidden_size: int = option(128, counts("the models need units"))
-    num_layers: int = option(2, counts("the models need units"))
-    num_residual_blocks: int = option(4, counts("it counts", least=0))
+    num_layers: int = option(2, counts("the models need units", most=MOST_LAYERS))
+    num_residual_blocks: int = option(4, counts("it counts", 0, MOST_LAYERS))
 
     def make(self, agent: Agent, task: Any) -> Agent:
         """The agent with the bonus."""

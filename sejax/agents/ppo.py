@@ -21,7 +21,7 @@ from sejax.agents.agent import Agent, AgentOptions, traced
 from sejax.agents.ddqn import select_action
 from sejax.agents.memory import Rollout, rollout_memory
 from sejax.networks import ACTIVATIONS, MLP, narrow
-from sejax.options import counts, fraction, not_negative, one_of, option, positive
+from sejax.options import MOST_LAYERS, counts, fraction, not_negative, one_of, option, positive
 
 MIN_STD = 0.01  # of the Gaussian policy, in units of the action
 _MAX_LOG_RATIO = 20.0  # exp(20) is beyond any clip, and finite
@@ -39,7 +39,7 @@ class PPOConfig(AgentOptions):
     # PPO learns from the start; this only holds back the stop rule.
     init_episodes: int = option(1, counts("it counts episodes", least=0))
     hidden_size: int = option(64, counts(), varied="triple")
-    num_layers: int = option(2, counts(), varied="one_more_or_less")
+    num_layers: int = option(2, counts(most=MOST_LAYERS), varied="one_more_or_less")
     activation: str = option("relu", one_of(ACTIVATIONS))
     learning_rate: float = option(
         3e-4, positive("the agent would not move"), traced=True, varied="triple"

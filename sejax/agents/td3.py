@@ -24,7 +24,7 @@ from sejax.agents.memory import replay_memory
 from sejax.agents.partial_batch import sum_over_batch
 from sejax.agents.replay import Transition, num_columns
 from sejax.networks import ACTIVATIONS, MLP, narrow
-from sejax.options import counts, fraction, not_negative, one_of, option, positive
+from sejax.options import MOST_LAYERS, counts, fraction, not_negative, one_of, option, positive
 
 _MIN_TEMPERATURE = 1e-6
 
@@ -44,7 +44,7 @@ class TD3Config(AgentOptions):
     batch_size: int = option(256, counts(), varied="triple")
     buffer_size: int = option(100_000, counts())
     hidden_size: int = option(128, counts(), varied="triple")
-    num_layers: int = option(2, counts(), varied="one_more_or_less")
+    num_layers: int = option(2, counts(most=MOST_LAYERS), varied="one_more_or_less")
     activation: str = option("relu", one_of(ACTIVATIONS))
     # Of the actor and the critics.
     learning_rate: float = option(

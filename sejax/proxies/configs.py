@@ -5,7 +5,7 @@ from typing import Any, ClassVar
 
 from sejax.errors import require
 from sejax.networks import ACTIVATIONS
-from sejax.options import Options, counts, one_of, option
+from sejax.options import MOST_LAYERS, Options, counts, one_of, option
 
 DONE_MODES = ("soft", "threshold")
 VARIANTS = (
@@ -21,7 +21,7 @@ class SyntheticConfig(Options):
     group: ClassVar[str] = "proxy"
 
     hidden_size: int = option(128, counts("a layer needs a unit"))
-    num_layers: int = option(1, counts("there is a hidden layer"))
+    num_layers: int = option(1, counts("there is a hidden layer", most=MOST_LAYERS))
     activation: str = option("leaky_relu", one_of(ACTIVATIONS))
     # soft: bootstrap with 1 - d (authors); threshold: with 1 - [d > 0.5]
     done: str = option("soft", one_of(DONE_MODES))
@@ -46,7 +46,7 @@ class RewardConfig(Options):
     default_objective: ClassVar[str] = "reward_threshold"  # of `python -m sejax.run proxy=rn`
 
     hidden_size: int = option(128, counts("a layer needs a unit"))
-    num_layers: int = option(1, counts("there is a hidden layer"))
+    num_layers: int = option(1, counts("there is a hidden layer", most=MOST_LAYERS))
     activation: str = option("prelu", one_of(ACTIVATIONS))
     variant: str = option("additive_potential", one_of(VARIANTS))
     augmented: bool = False  # the network sees the task's observation vector v as well
