@@ -31,7 +31,7 @@ from rich.progress import track
 import sejax
 from sejax import plugins
 from sejax.proxies.configs import SyntheticConfig
-from sejax.trainer import TrainingConfig
+from sejax.training import TrainingConfig
 
 WARM_UP_STEPS = 300
 

@@ -20,7 +20,7 @@ from torch_reference import SyntheticEnv, Weights, play_test_episodes, train
 from sejax.agents.ddqn import DDQNConfig
 from sejax.es.nes import NESConfig
 from sejax.proxies.configs import SyntheticConfig
-from sejax.trainer import TrainingConfig
+from sejax.training import TrainingConfig
 
 
 @dataclass(frozen=True, kw_only=True)

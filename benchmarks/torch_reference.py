@@ -39,7 +39,7 @@ from torch import Tensor
 
 from sejax.agents.ddqn import DDQNConfig
 from sejax.proxies.configs import SyntheticConfig
-from sejax.trainer import TrainingConfig
+from sejax.training import TrainingConfig
 
 OBS_DIM, NUM_ACTIONS, MAX_STEPS = 4, 2, 200  # CartPole-v0; Pendulum has the same limit
 HEADS = {"state": OBS_DIM, "reward": 1, "done": 1}

@@ -32,7 +32,7 @@ from torch_reference import (
 )
 
 from sejax.agents.ppo import PPOConfig
-from sejax.trainer import TrainingConfig
+from sejax.training import TrainingConfig
 
 MAX_LOG_RATIO = 20.0  # as in sejax.agents.ppo
 

@@ -33,7 +33,7 @@ from torch_reference import (
 )
 
 from sejax.agents.td3 import TD3Config
-from sejax.trainer import TrainingConfig
+from sejax.training import TrainingConfig
 
 OBS_DIM, ACTION_DIM, MAX_ACTION = 3, 1, 2.0  # Pendulum-v1
 

@@ -12,7 +12,7 @@ touches no flag.
 import importlib
 from typing import TYPE_CHECKING, Any
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 _EXPORTS = {
     "AUC": "sejax.objectives",
@@ -44,7 +44,7 @@ _EXPORTS = {
     "TD3Config": "sejax.agents.td3",
     "Task": "sejax.envs.task",
     "TrainResult": "sejax.trainer",
-    "TrainingConfig": "sejax.trainer",
+    "TrainingConfig": "sejax.training",
     "Trials": "sejax.es.strategy",
     "config": "sejax.app.compose",
     "configure_xla": "sejax.app.runtime",
@@ -96,7 +96,8 @@ if TYPE_CHECKING:  # what a type checker and an editor see
         save_set,
     )
     from sejax.proxies.proxy import ProxyEnv, ProxyParams
-    from sejax.trainer import TrainingConfig, TrainResult, make_trainer
+    from sejax.trainer import TrainResult, make_trainer
+    from sejax.training import TrainingConfig
 
 __all__ = [
     "AUC", "AUCSum", "Agent", "ConfigError", "CountBasedConfig", "DDQNConfig", "DiscreteTD3Config",

@@ -25,7 +25,7 @@ from sejax.evaluation import make_evaluator, tested_throughout
 from sejax.objectives import MaxReward, Objective, Outcome
 from sejax.parallel import spread_over_devices
 from sejax.proxies.proxy import ProxyEnv
-from sejax.trainer import TrainingConfig
+from sejax.training import TrainingConfig
 
 
 @struct.dataclass
@@ -98,7 +98,11 @@ class Program:
 
     Attributes:
       init: `(keys [seed]) -> LearnState`.
-      generation: `(LearnState) -> (LearnState, GenerationInfo)`, a scan body over all seeds.
+      ask: `(LearnState) -> Asked`, what a generation tries.
+      tell: `(LearnState, Asked, Outcome) -> (LearnState, GenerationInfo)`, the outcome of each
+        trial with leaves `[seed, trials, ...]`.
+      generation: `(LearnState) -> (LearnState, GenerationInfo)`: `ask`, a training for each trial,
+        `tell`; a scan body over all seeds.
       unravel: flat parameters `[dims]` to the proxy's weights.
       proxy: what is learned.
       agent: that learns on it.
@@ -108,6 +112,8 @@ class Program:
     """
 
     init: Callable[[Array], LearnState]
+    ask: Callable[[LearnState], "Asked"]
+    tell: Callable[[LearnState, "Asked", Outcome], tuple[LearnState, GenerationInfo]]
     generation: Callable[[LearnState], tuple[LearnState, GenerationInfo]]
     unravel: Callable[[Array], Any]
     proxy: ProxyEnv
@@ -222,13 +228,12 @@ def make_program(
     training = training or TrainingConfig()
     flat, unravel = ravel_pytree(proxy.init_weights(jax.random.key(0)))
     strategy = _strategy_of(es, flat.size)
-    score_candidates = make_population_scorer(
+    evaluate_all = make_population_evaluator(
         agent, proxy, tested_throughout(training) if objective.needs_tests else training,
         unravel, devices, lanes,
     )  # fmt: skip
     trials = strategy.trials
-    seed_ids = trials.seed_ids(strategy.num_members)
-
+    seed_ids = jnp.asarray(trials.seed_ids(strategy.num_members))
     require(not stop_when_solved or (objective.scores_are_returns and task.is_solvable),
             "stop_when_solved", "be false with this objective and task", "nobody says which score "
             "solves it", "true", "stop_when_solved=false")  # fmt: skip
@@ -253,30 +258,75 @@ def make_program(
         )
         return jax.tree.map(_strongly_typed, state)
 
-    def generation(state: LearnState) -> tuple[LearnState, GenerationInfo]:
-        """One pass of Algorithm 1's outer loop for every seed; a scan body."""
+    def ask(state: LearnState) -> Asked:
         keys = jax.vmap(jax.random.fold_in)(state.key, state.generation)
         key_ask, key_inner, key_tell = (
             k for k in jax.vmap(lambda k: jax.random.split(k, 3))(keys).T
         )
-        members, asked = jax.vmap(strategy.ask)(key_ask, state.es_state)
-        incumbent = jax.vmap(strategy.incumbent)(asked)
-        candidates = jax.vmap(trials.candidates)(members, incumbent)
-        outcome = score_candidates(seed_ids, key_inner, candidates, ~state.finished)
+        members, es_state = jax.vmap(strategy.ask)(key_ask, state.es_state)
+        incumbent = jax.vmap(strategy.incumbent)(es_state)
+        fold = jax.vmap(jax.vmap(jax.random.fold_in, (None, 0)), (0, None))
+        return Asked(
+            members=members,
+            incumbent=incumbent,
+            candidates=jax.vmap(trials.candidates)(members, incumbent),
+            keys=fold(key_inner, seed_ids),
+            key_tell=key_tell,
+            es_state=es_state,
+        )
+
+    def tell(
+        state: LearnState, asked: Asked, outcome: Outcome
+    ) -> tuple[LearnState, GenerationInfo]:
         scores = Scores.of(objective(outcome), trials)
         told = jax.vmap(strategy.tell)(
-            key_tell, members, jax.vmap(trials.of_members)(scores.tried), scores.incumbent_mean,
-            asked,
+            asked.key_tell, asked.members, jax.vmap(trials.of_members)(scores.tried),
+            scores.incumbent_mean, asked.es_state,
         )  # fmt: skip
-        stepped = _advance(state, told, incumbent, scores, outcome)
+        stepped = _advance(state, told, asked.incumbent, scores, outcome)
         if stop_when_solved:
             stepped = stepped.replace(finished=stepped.incumbent_score >= task.solved_reward)
         stepped = jax.tree.map(lambda new, old: _where(state.finished, old, new), stepped, state)
         return stepped, _summarise(state, stepped, scores, outcome)
 
-    return Program(init=init, generation=generation, unravel=unravel, proxy=proxy,
-                   agent=agent, strategy=strategy, objective=objective,
-                   num_dims=flat.size)  # fmt: skip
+    def generation(state: LearnState) -> tuple[LearnState, GenerationInfo]:
+        """One pass of Algorithm 1's outer loop for every seed; a scan body."""
+        asked = ask(state)
+        return tell(state, asked, evaluate_all(asked.keys, asked.candidates, ~state.finished))
+
+    return Program(
+        init=init,
+        ask=ask,
+        tell=tell,
+        generation=generation,
+        unravel=unravel,
+        proxy=proxy,
+        agent=agent,
+        strategy=strategy,
+        objective=objective,
+        num_dims=flat.size,
+    )
+
+
+@struct.dataclass
+class Asked:
+    """What a generation tries, leaves `[seed, ...]`.
+
+    Attributes:
+      members: of the strategy, `[seed, members, dims]`.
+      incumbent: `[seed, dims]`.
+      candidates: what is tried, members and incumbent as often as they are, `[seed, trials, dims]`.
+      keys: of the trainings, `[seed, trials]`.
+      key_tell: `[seed]`.
+      es_state: of the strategy.
+    """
+
+    members: Array
+    incumbent: Array
+    candidates: Array
+    keys: Array
+    key_tell: Array
+    es_state: Any
 
 
 @struct.dataclass
@@ -343,7 +393,7 @@ def _summarise(
     )
 
 
-def make_population_scorer(
+def make_population_evaluator(
     agent: Agent,
     proxy: ProxyEnv,
     training: TrainingConfig,
@@ -351,11 +401,11 @@ def make_population_scorer(
     devices: int | None = None,
     lanes: int | None = None,
 ) -> Callable[..., Outcome]:
-    """Builds `score(seed_ids [n], keys [seed], candidates [seed, n, dims], active [seed])`.
+    """Builds `evaluate(keys [seed, n], candidates [seed, n, dims], active [seed]) -> Outcome`.
 
-    It trains one fresh agent on each candidate, tests it on the real task, and returns an
-    `Outcome` with leaves `[seed, n, ...]`. The trainings are spread over the devices; on each
-    device groups of `lanes` of them follow one another.
+    It trains one fresh agent on each candidate and tests it on the real task; leaves
+    `[seed, n, ...]`. The trainings are spread over the devices; on each device groups of `lanes` of
+    them follow one another.
     """
     evaluate = make_evaluator(agent, proxy, proxy.task, training)
 
@@ -364,17 +414,14 @@ def make_population_scorer(
 
     evaluate_many = spread_over_devices(evaluate_candidate, devices, lanes, agent.cpu_lanes)
 
-    def score(seed_ids: Array, keys: Array, candidates: Array, active: Array) -> Outcome:
+    def evaluate_all(keys: Array, candidates: Array, active: Array) -> Outcome:
         num_seeds, num_candidates, num_dims = candidates.shape
-        fold = jax.vmap(jax.vmap(jax.random.fold_in, (None, 0)), (0, None))
         outcome = evaluate_many(
-            fold(keys, jnp.asarray(seed_ids)).reshape(-1),
-            candidates.reshape(-1, num_dims),
-            jnp.repeat(active, num_candidates),
+            keys.reshape(-1), candidates.reshape(-1, num_dims), jnp.repeat(active, num_candidates)
         )
         return jax.tree.map(lambda x: x.reshape(num_seeds, num_candidates, *x.shape[1:]), outcome)
 
-    return score
+    return evaluate_all
 
 
 def _proxy_of(proxy: Any, task: Task) -> ProxyEnv:
@@ -382,7 +429,11 @@ def _proxy_of(proxy: Any, task: Task) -> ProxyEnv:
         from sejax.proxies.configs import SyntheticConfig
 
         proxy = SyntheticConfig()
-    return plugins.make("proxy", proxy, task) if hasattr(proxy, "make") else proxy
+    made = plugins.make("proxy", proxy, task) if hasattr(proxy, "make") else proxy
+    require(made.task is task, "proxy", "be one of the task given", "agents are tested there",
+            f"one of another ({made.task.name})",
+            "proxy to a configuration, or task to the proxy's")  # fmt: skip
+    return made
 
 
 def _objective_of(objective: Any, task: Task) -> Objective:

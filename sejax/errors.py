@@ -15,7 +15,7 @@ class ConfigError(ValueError):
     """Input that cannot work. Commands print its message and exit with status 2."""
 
 
-def unknown_name(field: str, got: str, known: Iterable[str]) -> ConfigError:
+def unknown_name(field: str, got: object, known: Iterable[str]) -> ConfigError:
     """Error for an unknown choice; lists the known ones, nearest first, and names the override."""
     ranked = nearest(got, known)
     return ConfigError(
@@ -24,7 +24,7 @@ def unknown_name(field: str, got: str, known: Iterable[str]) -> ConfigError:
     )
 
 
-def nearest(got: str, known: Iterable[str]) -> list[str]:
+def nearest(got: object, known: Iterable[str]) -> list[str]:
     """The known names, the most similar first."""
     start = str(got)[:200]  # comparing takes time that grows with the square of the length
     return sorted(known, key=lambda name: -difflib.SequenceMatcher(None, start, name).ratio())
@@ -34,6 +34,11 @@ def shortened(value: object, length: int = 200) -> str:
     """A value as text that leaves room for the rest of a message."""
     text = str(value)
     return text if len(text) <= length else f"{text[:length]}... ({len(text)} characters)"
+
+
+def told(error: BaseException) -> str:
+    """Kind and message of somebody else's error, on one line."""
+    return f"{type(error).__name__}: {shortened(' '.join(str(error).split()))}"
 
 
 def require(holds: Any, field: str, rule: str, reason: str, got: object, fix: str) -> None:
@@ -57,7 +62,7 @@ def whole(minimum: int, name: str, value: Any, reason: str, fix: Any) -> None:
 
 
 def positive(name: str, value: Any, reason: str, fix: Any, at_most: float = math.inf) -> None:
-    require(is_number(value) and value > 0 and math.isfinite(value), name, "be above 0 and finite",
+    require(is_number(value) and 0 < value < math.inf, name, "be above 0 and finite",
             reason, value, f"{name}={fix}")  # fmt: skip
     require(value <= at_most, name, f"be at most {at_most:g}", "the numbers that come of it would "
             "not be finite", value, f"{name}={fix}")  # fmt: skip

@@ -13,15 +13,14 @@ from omegaconf import DictConfig
 from sejax import plugins
 from sejax.app import build, commands, compose, runtime
 from sejax.app.build import EvaluateConfig
-from sejax.errors import ConfigError, require
+from sejax.errors import ConfigError
 
 
 @hydra.main(config_path="conf", config_name="evaluate", version_base="1.3")
-@commands.task
+@commands.guarded
 def main(cfg: DictConfig) -> float:
     """Evaluates as configured and returns the mean test return (for Hydra's sweepers)."""
     config = compose.evaluate_config_of(cfg)
-    runtime.configure_xla(config.devices)
     runtime.enable_compilation_cache()
     return evaluate(config)
 
@@ -109,8 +108,8 @@ def _proxy_study(config: EvaluateConfig) -> Study:
                           f"tested there; got {config.env} for a proxy of {task.name}. Set "
                           f"env={task.name}.")  # fmt: skip
     agent, exploration = config.agent, config.exploration
-    if config.agent_hparams == "nes":
-        agent, exploration = (_learned_with(proxy, group) for group in ("agent", "exploration"))
+    if config.agent_hparams == "as_learned":
+        agent, exploration = proxy.learned_with("agent"), proxy.learned_with("exploration")
     agents.require_fit(agent, exploration, task.facts, task.name)
     group, training = _training_on(proxy, config, agent)
     build.require_real_returns(group, training)
@@ -128,14 +127,10 @@ def _proxy_study(config: EvaluateConfig) -> Study:
 def _load(config: EvaluateConfig) -> Any:
     """The proxy; modules are imported if the command line names them, never because a file does."""
     from sejax import envs
-    from sejax.errors import unknown_name
     from sejax.proxies import files
 
-    if config.proxy not in (*files.pretrained_names(), "real") and not any(
-        character in config.proxy for character in "/."
-    ) and not Path(config.proxy).exists():  # fmt: skip
-        raise unknown_name("proxy", config.proxy, [*files.pretrained_names(), "real"])
-    stored = files.read_config(config.proxy, "proxy")
+    path = files.find(config.proxy, "proxy", also=("real",))
+    stored = files.read_config(path, "proxy")
     task = proxy = None
     if config.env is not None and not plugins.is_registered("env", config.env):
         fields = stored["env"] if stored["env"].get("name") == config.env else {}
@@ -143,34 +138,21 @@ def _load(config: EvaluateConfig) -> Any:
     if config.proxy_kind is not None:
         fields = {**stored["proxy"], "name": config.proxy_kind}
         proxy = plugins.configure("proxy", fields)
-    return files.load_proxy(config.proxy, task, proxy, "proxy")
-
-
-def _learned_with(proxy: Any, group: str) -> Any:
-    """The agent, or its exploration, that a proxy was learned with."""
-    stored = proxy.config.get(group) or {"name": "none"}
-    require(plugins.is_registered(group, stored["name"]), "agent_hparams",
-            f"be default for a proxy learned with a foreign {group}", "what a file names is never "
-            "imported", f"nes for {stored['name']}",
-            f"agent_hparams=default {group}={stored['name']}")  # fmt: skip
-    return plugins.configure(group, stored)
+    return files.load_proxy(path, task, proxy, "proxy")
 
 
 def _training_on(proxy: Any, config: EvaluateConfig, agent: Any) -> tuple[str, Any]:
     """How long agents train on the proxy, and the group of fields that says so."""
-    from sejax.serialize import from_plain
-    from sejax.trainer import TrainingConfig, budget_for
+    from sejax.training import budget_for
 
     if config.training_from == "config":
         return "training", config.training
     if proxy.env.is_real or "training" not in proxy.config:
         # The dynamics are real: agents train and stop as on the real task.
         return "real_training", config.real_training
-    learned = from_plain(TrainingConfig, proxy.config["training"], "training")
-    stored = proxy.config["agent"]
-    then = plugins.configure("agent", stored) if plugins.is_registered("agent", stored["name"]) \
-        else None  # fmt: skip
-    training = budget_for(learned, agent, then, proxy.task.max_steps)
+    is_known = plugins.is_registered("agent", str(proxy.config["agent"].get("name")))
+    then = proxy.learned_with("agent") if is_known else None
+    training = budget_for(proxy.learned_with("training"), agent, then, proxy.task.max_steps)
     test_episodes = config.real_training.test_episodes
     return "real_training", dataclasses.replace(training, test_episodes=test_episodes)
 

@@ -16,18 +16,29 @@ from sejax.agents.agent import Agent
 from sejax.objectives import Outcome
 from sejax.parallel import spread_over_devices
 from sejax.proxies.proxy import world_of
-from sejax.rollout import make_tester
-from sejax.trainer import TrainingConfig, TrainResult, make_trainer
+from sejax.rollout import make_recorder, make_tester
+from sejax.trainer import TrainResult, make_trainer
+from sejax.training import TrainingConfig
 
 
 def make_evaluator(
-    agent: Agent, env: Any, task: Any, training: TrainingConfig
-) -> Callable[..., Outcome]:
+    agent: Agent, env: Any, task: Any, training: TrainingConfig, record: bool = False
+) -> Callable[..., Any]:
     """Builds `evaluate(key, env_params, active=True) -> Outcome` for a fresh agent.
 
     The agent trains in `env`, which may be a proxy or the task itself, and is tested over
     `training.test_episodes` episodes on the task. With `active=False` nothing is computed. If the
     agent's hyperparameters are drawn, they are drawn from the same key first.
+
+    Args:
+      agent: from `sejax.make_agent`, or one of your own.
+      env: gymnax environment to train in.
+      task: the real task.
+      training: stopping rule and limits.
+      record: whether it returns `(Outcome, Steps)`, with every step of the tests
+        (`sejax.rollout.Steps`); the outcome is the same.
+
+    Source: paper, Algorithm 1, TrainAgent and EvaluateAgent.
 
     Example:
       >>> import sejax
@@ -40,16 +51,17 @@ def make_evaluator(
       (10,)
     """
 
-    def make_run(agent: Agent) -> Callable[..., Outcome]:
+    def make_run(agent: Agent) -> Callable[..., Any]:
         test = make_tester(agent, task, training.test_episodes)
+        recorded = make_recorder(agent, task, training.test_episodes) if record else None
         train = make_tested_trainer(agent, env, task, training)
 
-        def run(key: Array, env_params: Any, active: Array | bool, hparams: Any) -> Outcome:
+        def run(key: Array, env_params: Any, active: Array | bool, hparams: Any) -> Any:
             key_train, key_test = jax.random.split(key)
             result = train(key_train, env_params, hparams, active)
             returns, steps = test(key_test, result.agent_state, active)
             real_steps = steps.sum() + result.test_steps
-            return Outcome(
+            outcome = Outcome(
                 test_returns=returns,
                 train_steps=result.train_steps,
                 train_episodes=result.episodes,
@@ -57,6 +69,7 @@ def make_evaluator(
                 nonfinite=result.nonfinite | ~jnp.isfinite(returns).all(),
                 real_steps=real_steps + result.train_steps if world_of(env).is_real else real_steps,
             )
+            return (outcome, recorded(key_test, result.agent_state)) if recorded else outcome
 
         return run
 
@@ -105,7 +118,7 @@ def return_area(result: TrainResult, final_return: Array) -> Array:
       final_return: of the test after it, for the steps of an episode that the step limit cut off.
 
     Source: paper, appendix "Studying the Influence of Different Reward Network Optimization
-    Objectives" (AUC); `reference_details.md` 5.5.
+    Objectives" (AUC); `docs/reference.md` 5.5.
     """
     returns = result.returns if result.test_returns is None else result.test_returns
     lengths = jnp.diff(result.episode_ends, prepend=0)

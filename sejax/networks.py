@@ -20,7 +20,7 @@ PRELU_SLOPE = 0.25
 def uniform_fan_in(fan_in: int) -> Callable[..., Array]:
     """Initialiser U(-1/sqrt(fan_in), 1/sqrt(fan_in)) for weights and biases alike.
 
-    Source: the default of the paper's networks (`reference_details.md` 1.9).
+    Source: the default of the paper's networks (`docs/reference.md` 1.9).
     """
     bound = fan_in**-0.5
 
@@ -95,7 +95,7 @@ class MLP(nn.Module):
     activation; its scale and bias are learned and, as in the authors' code, the same in all layers.
     With `may_narrow` it knows how many units `narrow` has left.
 
-    Source: paper, appendix "SE hyperparameters"; `reference_details.md` 1.10 and 1.11.
+    Source: paper, appendix "SE hyperparameters"; `docs/reference.md` 1.10 and 1.11.
     """
 
     num_outputs: int
@@ -187,7 +187,7 @@ class DuelingMLP(nn.Module):
     batch, so that the Q values of a sample depend on what else is in its batch.
 
     Source: Wang et al., "Dueling Network Architectures for Deep RL" (2016), eq. 9; paper, appendix,
-    tables of DDQN and Dueling DDQN; `reference_details.md` 4.2.
+    tables of DDQN and Dueling DDQN; `docs/reference.md` 4.2.
     """
 
     num_actions: int

@@ -75,6 +75,7 @@ class MaxReward(Options):
     scores_are_returns: ClassVar[bool] = True
 
     def make(self, task: Any) -> Objective:
+        """The objective on a task."""
         return Objective(score=lambda outcome: outcome.test_return, scores_are_returns=True)
 
 
@@ -125,6 +126,7 @@ class AUC(Options):
     scores_are_returns: ClassVar[bool] = False
 
     def make(self, task: Any) -> Objective:
+        """The objective on a task."""
         return Objective(
             score=lambda outcome: outcome.return_area / jnp.maximum(outcome.train_steps, 1),
             needs_tests=True,
@@ -139,13 +141,14 @@ class AUCSum(Options):
     Agents train a number of episodes, so that it rewards short ones where returns are negative, and
     long ones where they are positive.
 
-    Source: `reference_details.md` 5.5.
+    Source: `docs/reference.md` 5.5.
     """
 
     group: ClassVar[str] = "objective"
     scores_are_returns: ClassVar[bool] = False
 
     def make(self, task: Any) -> Objective:
+        """The objective on a task."""
         return Objective(
             score=lambda outcome: outcome.return_area,
             needs_tests=True,

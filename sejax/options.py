@@ -80,8 +80,13 @@ def counts(
 
 
 def not_negative(reason: str = "it is a size") -> Rule:
-    """A number from 0 on."""
-    return lambda name, value, default: errors.at_least(0, name, value, reason, default)
+    """A finite number from 0 on."""
+
+    def rule(name: str, value: Any, default: Any) -> None:
+        errors.at_least(0, name, value, reason, default)
+        errors.require(value < float("inf"), name, "be finite", reason, value, f"{name}={default}")
+
+    return rule
 
 
 def positive(reason: str, at_most: float = float("inf")) -> Rule:

@@ -19,6 +19,7 @@ A name is one that comes with sejax, one that an installed package offers as an 
 `module:attribute`, which imports the module.
 """
 
+import copy
 import dataclasses
 import functools
 import importlib
@@ -29,7 +30,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from sejax import serialize
-from sejax.errors import ConfigError, require, shortened, unknown_name
+from sejax.errors import ConfigError, nearest, require, shortened, told, unknown_name
 
 
 @dataclass(frozen=True)
@@ -129,7 +130,7 @@ def find(group: str, name: str) -> Any:
         except Exception as error:
             raise ConfigError(
                 f"{group} must be a plugin that can be imported; {name!r} of "
-                f"{offered[name].value} raised {type(error).__name__}: {error}."
+                f"{offered[name].value} raised {told(error)}."
             ) from error
         return _as_dataclass(group, name, found)
     family = _family(group, name)
@@ -172,10 +173,9 @@ def defaults(group: str, name: str) -> dict[str, Any]:
         if not field.init or field.name == "name":
             continue
         if field.default_factory is not dataclasses.MISSING:
-            plain[field.name] = field.default_factory()
+            plain[field.name] = serialize.plain(field.default_factory())
         elif field.default is not dataclasses.MISSING:
-            plain[field.name] = list(field.default) if isinstance(field.default, tuple) \
-                else field.default  # fmt: skip
+            plain[field.name] = serialize.plain(field.default)
         else:
             plain[field.name] = "???"
     return plain
@@ -195,33 +195,36 @@ def make(group: str, config: Any, *arguments: Any) -> Any:
 
     Compiled programs are kept by the identity of what they were built from, so that a new instance
     would compile anew.
+
+    Raises:
+      ConfigError: if it makes something of another kind, or cannot be made.
     """
-    plain = tuple(serialize.to_plain(config).items())
     try:
-        return _make(_Made(type(config), repr(plain), arguments, config, group))
+        return _make(group, Same(config), *arguments)
     except TypeError as error:
         if "unhashable" not in str(error):
             raise
         return _checked(group, config, config.make(*arguments))
 
 
-class _Made:
-    """A key that is equal for equal configurations, hashable or not."""
+class Same:
+    """Configurations as a key that is equal if all their fields are, hashable or not."""
 
-    def __init__(self, cls: type, plain: str, arguments: tuple, config: Any, group: str):
-        self.key = (cls, plain, arguments)
-        self.config, self.group = config, group
+    def __init__(self, *configs: Any):
+        self.configs = configs
+        self._key = tuple((type(c), repr(serialize.to_plain(c))) for c in configs)
 
     def __hash__(self) -> int:
-        return hash(self.key)
+        return hash(self._key)
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Made) and self.key == other.key
+        return isinstance(other, Same) and self._key == other._key
 
 
 @functools.cache
-def _make(made: _Made) -> Any:
-    return _checked(made.group, made.config, made.config.make(*made.key[2]))
+def _make(group: str, key: Same, *arguments: Any) -> Any:
+    (config,) = key.configs
+    return _checked(group, config, config.make(*arguments))
 
 
 def _checked(group: str, config: Any, made: Any) -> Any:
@@ -272,16 +275,22 @@ def _import(group: str, path: str) -> Any:
     try:
         found: Any = importlib.import_module(module)
     except Exception as error:
-        reason = f"{type(error).__name__}: {error}"
         raise ConfigError(
-            f"{group} must name a module that can be imported; importing {module!r} for "
-            f"{group}={path} raised {reason}. Run the command in the module's folder, or add that "
-            f"folder to PYTHONPATH."
+            f"{group} must name a module that can be imported; importing {shortened(module)!r} for "
+            f"{group}={shortened(path)} raised {told(error)}. Run the command in the module's "
+            f"folder, or add that folder to PYTHONPATH."
         ) from error
     for part in attribute.split("."):
-        known = [name for name in dir(found) if not name.startswith("_")]
         if not hasattr(found, part):
-            raise unknown_name(f"{group}={module}", part, known or [module])
+            own = {name for name, value in vars(found).items()
+                   if callable(value) and getattr(value, "__module__", None) == module}  # fmt: skip
+            near = nearest(part, sorted(own))
+            raise ConfigError(
+                f"{group} must name a class or function of {module}, because that is what makes "
+                f"it; got {shortened(part)}, which is not there. There are: "
+                f"{', '.join(near) or 'none'}."
+                + (f" Did you mean {group}={module}:{near[0]}?" if near else "")
+            )
         found = getattr(found, part)
     return found
 
@@ -314,21 +323,28 @@ def _from_function(group: str, name: str, function: Callable[..., Any]) -> type:
     require(len(taken) == len(arguments) and not bad, group,
             f"take ({', '.join((*arguments, 'option=default, ...'))})", "each option is a field",
             f"{name}{inspect.signature(function)}", f"{group} to such a function")  # fmt: skip
-    hints = inspect.get_annotations(function, eval_str=True)
+    written = getattr(function, "func", function)  # of a partial, what it is one of
     fields: list[Any] = []
     for parameter in options:
-        kind = hints.get(parameter.name, Any)
-        if parameter.default is inspect.Parameter.empty:
-            fields.append((parameter.name, kind))
-        else:
-            fields.append((parameter.name, kind, dataclasses.field(default=parameter.default)))
+        unknown = parameter.annotation is inspect.Parameter.empty
+        kind = Any if unknown else parameter.annotation
+        fields.append((parameter.name, kind, _field(parameter.default)))
 
     def make(self: Any, *given: Any) -> Any:
         return function(*given, **{p.name: getattr(self, p.name) for p in options})
 
     cls = dataclasses.make_dataclass(
-        function.__name__, fields, namespace={"make": make, "__doc__": function.__doc__},
+        written.__name__, fields, namespace={"make": make, "__doc__": written.__doc__},
         frozen=True, kw_only=True,
     )  # fmt: skip
-    cls.__module__ = function.__module__
+    cls.__module__ = written.__module__
     return cls
+
+
+def _field(default: Any) -> Any:
+    """The field of a parameter with this default."""
+    if default is inspect.Parameter.empty:
+        return dataclasses.field()
+    if type(default).__hash__ is None:  # a list: each configuration has one of its own
+        return dataclasses.field(default_factory=lambda: copy.deepcopy(default))
+    return dataclasses.field(default=default)

@@ -11,7 +11,7 @@ from sejax.app.build import LearnConfig
 
 
 @hydra.main(config_path="conf", config_name="run", version_base="1.3")
-@commands.task
+@commands.guarded
 def main(cfg: DictConfig) -> float:
     """Learns a proxy as configured and returns the best incumbent mean (for Hydra's sweepers)."""
     return learn(compose.learn_config(cfg))
@@ -29,7 +29,6 @@ def learn(config: LearnConfig) -> float:
       ConfigError: if the run directory cannot be used.
       OSError: if a file cannot be written; everything saved before is whole.
     """
-    runtime.configure_xla(config.devices)
     from sejax.app.progress import RunProgress
 
     # Before the task is imported: a refusal must be quick.

@@ -4,6 +4,7 @@ Values are taken as they are meant (`1` for a float, a list for a tuple) and nev
 in them is resolved, imported or executed.
 """
 
+import contextlib
 import dataclasses
 import types
 import typing
@@ -17,7 +18,8 @@ _WORDS = {bool: "true or false", int: "a whole number", float: "a number", str: 
 
 def to_plain(config: Any) -> dict[str, Any]:
     """The fields of a dataclass as plain values: numbers, words, None, lists and dictionaries."""
-    return {field.name: _plain(getattr(config, field.name)) for field in dataclasses.fields(config)}
+    fields = [field.name for field in dataclasses.fields(config) if field.init]
+    return {name: plain(getattr(config, name)) for name in fields}
 
 
 def from_plain(cls: Any, values: Mapping[str, Any], where: str) -> Any:
@@ -32,7 +34,13 @@ def from_plain(cls: Any, values: Mapping[str, Any], where: str) -> Any:
       ConfigError: for a field that is not there, is missing, or has a value of another type.
     """
     fields = {field.name: field for field in dataclasses.fields(cls) if field.init}
-    hints = typing.get_type_hints(cls)
+    try:
+        hints = typing.get_type_hints(cls)
+    except NameError as error:
+        raise ConfigError(
+            f"{where or cls.__name__} must have fields of known types, because values are read by "
+            f"them; got {cls.__name__}, where {error}. Import it where the class is defined."
+        ) from error
     given = {}
     for name, value in values.items():
         if name not in fields:
@@ -67,13 +75,16 @@ def _join(where: str, name: str) -> str:
     return f"{where}.{shortened(name)}" if where else shortened(name)
 
 
-def _plain(value: Any) -> Any:
+def plain(value: Any) -> Any:
+    """One value as `to_plain` has it."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return to_plain(value)
     if isinstance(value, tuple | list):
-        return [_plain(x) for x in value]
+        return [plain(x) for x in value]
     if isinstance(value, Mapping):
-        return {str(key): _plain(x) for key, x in value.items()}
+        return {str(key): plain(x) for key, x in value.items()}
+    if hasattr(value, "tolist"):  # NumPy's and jax's numbers and arrays
+        return value.tolist()
     return value
 
 
@@ -83,10 +94,13 @@ def _convert(value: Any, hint: Any, name: str, field: Any) -> Any:
         return value
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
     if origin in (types.UnionType, typing.Union):
-        if value is None and type(None) in arguments:
-            return None
-        hint = next(kind for kind in arguments if kind is not type(None))
-        return _convert(value, hint, name, field)
+        if type(value) in arguments:  # None too
+            return value
+        *others, last = (kind for kind in arguments if kind is not type(None))
+        for kind in others:
+            with contextlib.suppress(ConfigError):
+                return _convert(value, kind, name, field)
+        return _convert(value, last, name, field)
     if origin is typing.Literal:
         require(value in arguments, name, f"be one of {', '.join(map(str, arguments))}",
                 "nothing else is known", value, f"{name}={arguments[0]}")  # fmt: skip
@@ -96,7 +110,10 @@ def _convert(value: Any, hint: Any, name: str, field: Any) -> Any:
                 repr(value), f"{name}=[...]")  # fmt: skip
         kind = arguments[0] if arguments else Any
         return (origin or hint)(_convert(x, kind, name, field) for x in value)
-    if dataclasses.is_dataclass(hint) and isinstance(value, Mapping):
+    if isinstance(hint, type) and dataclasses.is_dataclass(hint) and not isinstance(value, hint):
+        known = ", ".join(x.name for x in dataclasses.fields(hint))
+        require(isinstance(value, Mapping), name, f"have the fields {known}", "it is more than one "
+                "value", repr(value), f"{name}.{known.partition(',')[0]}=VALUE")  # fmt: skip
         return from_plain(hint, value, name)
     if hint in _WORDS:
         return _scalar(value, hint, name, field)

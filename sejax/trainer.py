@@ -1,13 +1,11 @@
 """The inner loop: one agent's whole training in one world.
 
 Source: paper, Algorithm 1 (TrainAgent) and appendix "Heuristics for Agent Training and Evaluation";
-`reference_details.md` 3.
+`docs/reference.md` 3.
 """
 
-import dataclasses
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -18,43 +16,9 @@ from sejax.agents.agent import Agent
 from sejax.agents.memory import Memory, MemoryMaker
 from sejax.agents.replay import Transition
 from sejax.loops import while_any_active
-from sejax.options import Options, counts, not_negative, one_of, option
+from sejax.training import TrainingConfig
 
-STOP_RULES = ("plateau", "solved", "never")
-SOLVED_BY = ("test", "train")
 _NO_LIMIT = 2**31 - 1
-
-
-@dataclass(frozen=True, kw_only=True)
-class TrainingConfig(Options):
-    """How long an agent trains, and how it is tested."""
-
-    group: ClassVar[str] = "training"
-
-    max_episodes: int = option(1000, counts("it counts episodes"))  # n_e
-    # The stop rule waits for so many training steps.
-    min_steps: int = option(0, counts("it counts steps", least=0))
-    # Training ends after so many steps, whatever the rule says.
-    max_steps: int | None = option(None, counts("an agent must train"))
-    stop_rule: str = option("plateau", one_of(STOP_RULES))  # plateau (SEs), solved (real tasks)
-    # d: episodes in each of the two means that the plateau rule compares
-    window: int = option(10, counts("it counts episodes"))
-    # C_diff: relative change between them that counts as flat
-    plateau_tolerance: float = option(0.01, not_negative("it bounds a relative change"))
-    # Whose last d returns must reach the solved reward.
-    solved_by: str = option("test", one_of(SOLVED_BY))
-    # n_te: greedy episodes on the real task after training
-    test_episodes: int = option(10, counts("it counts episodes"))
-    # Greedy episodes on the real task after each training episode; the solved rule by tests has at
-    # least one.
-    tests_between: int = option(0, counts("it counts episodes", least=0))
-    time_limit_is_terminal: bool = True  # a real episode cut by the limit does not bootstrap
-
-    @property
-    def num_tests_between(self) -> int:
-        """Test episodes after each training episode."""
-        by_tests = self.stop_rule == "solved" and self.solved_by == "test"
-        return max(self.tests_between, int(by_tests))
 
 
 @struct.dataclass
@@ -114,7 +78,7 @@ TestFn = Callable[[Array, Any, Array], tuple[Array, Array]]
 def make_trainer(
     agent: Agent,
     env: Any,
-    training: TrainingConfig = TrainingConfig(),
+    training: TrainingConfig = TrainingConfig(),  # noqa: B008 (frozen)
     solved_reward: float = jnp.inf,
     test_fn: TestFn | None = None,
     recorder: MemoryMaker | None = None,
@@ -169,8 +133,8 @@ def make_trainer(
         env_params = loop.prepare(env_params, hparams)
         key_begin, key_steps = jax.random.split(key)
         state = loop.begin(key_begin, env_params, hparams, active)
-        kept = tuple(memory.init() for memory in loop.memories(state))
-        kept, state = while_any_active(loop.step, kept, state, (key_steps, env_params))
+        remembered = tuple(memory.init() for memory in loop.memories(state))
+        remembered, state = while_any_active(loop.step, remembered, state, (key_steps, env_params))
         return TrainResult(
             agent_state=state.agent_state,
             train_steps=state.train_steps,
@@ -180,7 +144,7 @@ def make_trainer(
             episode_ends=state.episode_ends,
             nonfinite=state.nonfinite | ~_all_finite(state.agent_state),
             test_steps=state.test_steps,
-            recorded=kept[1] if recorder is not None else None,
+            recorded=remembered[1] if recorder is not None else None,
         )
 
     return train
@@ -249,7 +213,7 @@ class _Loop:
         return [make(shapes, self.memory_steps) for make in self.memory_makers]
 
     def step(
-        self, kept: Any, state: _LoopState, consts: Any, masked: bool
+        self, remembered: Any, state: _LoopState, consts: Any, masked: bool
     ) -> tuple[Any, _LoopState]:
         """One agent step: act, step the world, store, learn, and close the episode if it ended."""
         key, env_params = consts
@@ -268,14 +232,14 @@ class _Loop:
             state.obs, action, reward, self.discount(terminated, truncated, info), next_obs
         )
         active = state.active if masked else True
-        kept = tuple(
+        remembered = tuple(
             memory.store(arrays, state.step, transition, ended, active)
-            for memory, arrays in zip(memories, kept, strict=True)
+            for memory, arrays in zip(memories, remembered, strict=True)
         )
 
         def learn(agent_state: Any) -> Any:
             size = self.agent.batch_size(agent_state)
-            batch = memories[0].batch(key_sample, kept[0], state.step + 1, transition, size)
+            batch = memories[0].batch(key_sample, remembered[0], state.step + 1, transition, size)
             return self.agent.update(key_update, agent_state, batch)
 
         agent_state = jax.lax.cond(
@@ -295,11 +259,11 @@ class _Loop:
         state = jax.lax.cond(
             ended, lambda s: self.end_episode(key_end, s, env_params, ended), lambda s: s, state
         )
-        return kept, state
+        return remembered, state
 
     def discount(self, terminated: Array, truncated: Array, info: Any) -> Array:
         """What a target bootstraps with, before gamma."""
-        discount = jnp.float32(info.get("discount", ~terminated))
+        discount = jnp.float32(info.get("discount", jnp.where(terminated, 0.0, 1.0)))
         return jnp.where(truncated, 0.0, discount) if self.limit_is_terminal else discount
 
     def end_episode(
@@ -377,33 +341,6 @@ def is_solved(
     """Whether the mean of the last d returns (of all, if fewer) reaches the solved reward."""
     window = recent.shape[0] // 2
     return recent[window:].sum() / jnp.clip(num_episodes, 1, window) >= solved_reward
-
-
-def budget_for(
-    training: TrainingConfig, agent: Any, learned_with: Any, max_episode_steps: int
-) -> TrainingConfig:
-    """How long an agent trains on a proxy that was learned with another one.
-
-    A step budget grows by the steps for which this agent waits longer with learning than that one:
-    ten long initial episodes, or a rollout of PPO, could use it up.
-
-    Args:
-      training: that the proxy was learned with.
-      agent: configuration of the agent that is to train.
-      learned_with: of the one that the proxy was learned with; None if that is not known.
-      max_episode_steps: the task's step limit.
-    """
-    if training.max_steps is None:
-        return training
-    waits, waited = (steps_before_learning(each, max_episode_steps)
-                     for each in (agent, learned_with))  # fmt: skip
-    return dataclasses.replace(training, max_steps=training.max_steps + max(0, waits - waited))
-
-
-def steps_before_learning(agent: Any, max_episode_steps: int) -> int:
-    """Training steps before an agent first learns, as its configuration says; 0 if it does not."""
-    steps = getattr(agent, "steps_before_learning", None)
-    return 0 if steps is None else steps(max_episode_steps)
 
 
 def _all_finite(tree: Any) -> Array:

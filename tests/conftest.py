@@ -5,10 +5,13 @@ import os
 import platform
 from pathlib import Path
 
-# Compilation is most of the time here. LLVM's optimisation is off, which halves it; XLA's own
-# passes, whose result test_program.py reads, stay on. Command tests start processes without these.
+# Compilation is most of the time here. LLVM's optimisation is off, which halves it, and so are the
+# emitters that take fusions through MLIR, which takes a third off the rest; XLA's own passes, whose
+# result test_program.py reads, stay on. Command tests start processes without these.
 _FLAGS = (
     "--xla_backend_optimization_level=0",
+    "--xla_cpu_use_fusion_emitters=false",
+    "--xla_cpu_parallel_codegen_split_count=1",
     "--xla_force_host_platform_device_count=2",
     "--xla_cpu_multi_thread_eigen=false",
     "--xla_cpu_collective_call_warn_stuck_timeout_seconds=100000",

@@ -10,7 +10,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from flax import struct
-from gymnax.environments import environment
+from gymnax.environments import environment, spaces
 
 from sejax.agents.agent import Agent
 from sejax.agents.memory import replay_memory
@@ -57,6 +57,12 @@ class ScriptedEnv(environment.Environment[ScriptState, ScriptParams]):
 
     def get_obs(self, state, params=None, key=None):
         return jnp.stack([state.time.astype(jnp.float32), state.tag])
+
+    def observation_space(self, params=None):
+        return spaces.Box(-jnp.inf, jnp.inf, (2,), jnp.float32)
+
+    def action_space(self, params=None):
+        return spaces.Discrete(WHO * (MAX_EPISODES + 1))
 
 
 @struct.dataclass
@@ -108,4 +114,5 @@ def scripted_agent(init_episodes=2, buffer_size=1000, batch_size=64):
         memory=replay_memory(batch_size, buffer_size),
         init_episodes=init_episodes,
         learns_from=init_episodes,
+        discount=lambda hparams: 1.0,
     )

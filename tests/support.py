@@ -1,10 +1,35 @@
 """What several test modules share: plain references, and a reader of compiled programs."""
 
-import argparse
 import math
 import re
 
+import jax
 import numpy as np
+
+
+def shapes_of(fn, *args):
+    """What `fn(*args)` returns, as zeros in NumPy; nothing is compiled."""
+    return jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), jax.eval_shape(fn, *args))
+
+
+def random_like(tree, seed=0, scale=0.5):
+    """Normal numbers in the place of a pytree's; nothing is compiled."""
+    rng = np.random.default_rng(seed)
+    return jax.tree.map(lambda x: np.float32(scale * rng.normal(size=x.shape)), tree)
+
+
+def raveled(tree):
+    """A pytree of arrays as one vector, as `ravel_pytree`, in NumPy."""
+    return np.concatenate([np.ravel(x) for x in jax.tree.leaves(tree)])
+
+
+def unraveled(vector, like):
+    """Inverse of `raveled`, for a pytree of arrays like these."""
+    leaves, structure = jax.tree.flatten(like)
+    parts = np.split(np.asarray(vector), np.cumsum([np.size(x) for x in leaves])[:-1])
+    return structure.unflatten(
+        [part.reshape(np.shape(x)) for part, x in zip(parts, leaves, strict=True)]
+    )
 
 
 def numpy_forward(params, x, activation, num_layers, prelu_slope=0.25):
@@ -70,14 +95,6 @@ def large_ops_in_loops(hlo, num_elements):
             if op and math.prod(int(d) for d in op.group(1).split(",") if d) >= num_elements:
                 found.append((op.group(2), line))
     return [(op, line) for op, line in found if op not in IN_PLACE]
-
-
-def experiment_options(experiment, out, *argv):
-    """What the command line of a module of `sejax.experiments` would parse to, with `--quick`."""
-    parser = argparse.ArgumentParser()
-    experiment.add_options(parser)
-    args = parser.parse_args(argv)
-    return argparse.Namespace(**vars(args), quick=True, out=out, seed=3, devices=None)
 
 
 def refuse(*_, **__):

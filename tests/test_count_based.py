@@ -1,17 +1,19 @@
 """sejax.agents.count_based: the bonus by hand and by a plain loop, and in a training."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from sejax import envs
-from sejax.agents.configs import CountBasedConfig, QLearningConfig, SARSAConfig
-from sejax.agents.count_based import with_count_bonus
+from sejax.agents.count_based import CountBasedConfig, with_count_bonus
 from sejax.agents.replay import Transition
-from sejax.agents.tabular import make_q_learning, make_sarsa
-from sejax.configs import TrainingConfig
-from sejax.trainer import make_tester, make_trainer
+from sejax.agents.tabular import QLearningConfig, SARSAConfig, make_q_learning, make_sarsa
+from sejax.rollout import make_tester
+from sejax.trainer import make_trainer
+from sejax.training import TrainingConfig
 
 NUM_STATES, NUM_ACTIONS, BETA = 3, 2, 0.5
 KEY = jax.random.key(0)
@@ -28,8 +30,8 @@ def counting(plain=PLAIN, beta=BETA, num_states=NUM_STATES, num_actions=NUM_ACTI
 
 def step(obs, action, reward, discount=0.0, next_obs=0):
     return Transition(
-        obs=jnp.int32(obs), action=jnp.int32(action), reward=jnp.float32(reward),
-        discount=jnp.float32(discount), next_obs=jnp.int32(next_obs),
+        obs=np.int32(obs), action=np.int32(action), reward=np.float32(reward),
+        discount=np.float32(discount), next_obs=np.int32(next_obs),
     )  # fmt: skip
 
 
@@ -75,17 +77,20 @@ def test_the_agent_inside_learns_as_if_the_bonus_were_paid(make):
 
 def test_it_acts_and_begins_episodes_as_the_agent_inside():
     agent = counting()
-    state = agent.begin_episode(agent.init(KEY, agent.hparams), jnp.int32(1))
-    plain = PLAIN.begin_episode(PLAIN.init(KEY, PLAIN.hparams), jnp.int32(1))
-    assert state.agent_state.epsilon == plain.epsilon == jnp.float32(0.4)  # 0.8 * 0.5
-    keys = jax.random.split(KEY, 50)
-    for explore in (True, False):
-        got, expected = (
-            jax.vmap(lambda key, a=a, s=s, e=explore: a.act(key, s, jnp.int32(2), e))(keys)
-            for a, s in ((agent, state), (PLAIN, plain))
-        )
+
+    @functools.partial(jax.jit, static_argnums=0)
+    def begin_and_act(agent, key):
+        state = agent.begin_episode(agent.init(key, agent.hparams), jnp.int32(1))
+        keys = jax.random.split(key, 50)
+        return state, [jax.vmap(lambda key, e=explore: agent.act(key, state, jnp.int32(2), e))(keys)
+                       for explore in (True, False)]  # fmt: skip
+
+    state, actions = begin_and_act(agent, KEY)
+    plain, expected_actions = begin_and_act(PLAIN, KEY)
+    assert state.agent_state.epsilon == plain.epsilon == np.float32(0.4)  # 0.8 * 0.5
+    for got, expected, number in zip(actions, expected_actions, (2, 1), strict=True):
         np.testing.assert_array_equal(got, expected)
-        assert len(set(got.tolist())) == (2 if explore else 1)
+        assert len(set(got.tolist())) == number
 
 
 def test_beta_and_the_numbers_inside_are_traced():

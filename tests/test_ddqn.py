@@ -6,11 +6,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jax.flatten_util import ravel_pytree
+from support import numpy_forward, shapes_of, unraveled
 
-from sejax.agents.ddqn import DDQNHparams, double_q_targets, make_ddqn, select_action
+from sejax.agents.ddqn import DDQNConfig, double_q_targets, make_ddqn, select_action
 from sejax.agents.replay import Transition
-from sejax.configs import DDQNConfig
 from sejax.networks import MLP
 
 OBS_DIM, NUM_ACTIONS, BATCH = 3, 2, 7
@@ -29,8 +28,8 @@ def random_batch(seed, discount=None):
         "discount": rng.uniform(-0.2, 1.2, BATCH) if discount is None else np.full(BATCH, discount),
         "next_obs": rng.normal(size=(OBS_DIM, BATCH)),
     }
-    action = jnp.int32(rng.integers(0, NUM_ACTIONS, BATCH))
-    return Transition(action=action, **{k: jnp.float32(v) for k, v in columns.items()})
+    action = np.int32(rng.integers(0, NUM_ACTIONS, BATCH))
+    return Transition(action=action, **{k: np.float32(v) for k, v in columns.items()})
 
 
 @pytest.fixture(scope="module")
@@ -40,7 +39,31 @@ def agent():
 
 @pytest.fixture(scope="module")
 def state(agent):
-    return agent.init(jax.random.key(1), agent.hparams)
+    return jax.jit(agent.init)(jax.random.key(1), agent.hparams)
+
+
+@pytest.fixture(scope="module")
+def update(agent):
+    return jax.jit(agent.update)
+
+
+def state_with(agent, params, target_params):
+    """A fresh state with these parameters; nothing is compiled."""
+    state = shapes_of(agent.init, jax.random.key(1), agent.hparams)
+    hparams = jax.tree.map(np.float32, agent.hparams)
+    return state.replace(params=params, target_params=target_params, hparams=hparams)
+
+
+def assert_updates_equal_torchs(golden, case, agent):
+    """Five updates from stored parameters, the first and the last against stored ones."""
+    params = (golden[f"{case}/{name}/0"] for name in ("params", "target_params"))
+    state, update = state_with(agent, *params), jax.jit(agent.update)
+    for number in range(1, 6):
+        state = update(jax.random.key(0), state, random_batch(number))
+        if number in (1, 5):
+            for name in ("params", "target_params"):
+                expected = golden[f"{case}/{name}/{number}"]
+                np.testing.assert_allclose(getattr(state, name), expected, rtol=1e-5, atol=2e-6)
 
 
 def q_network(config):
@@ -49,8 +72,8 @@ def q_network(config):
         NUM_ACTIONS, config.hidden_size, config.num_layers, config.activation,
         learn_prelu_slope=True,
     )  # fmt: skip
-    _, unravel = ravel_pytree(net.init(jax.random.key(0), jnp.zeros(OBS_DIM)))
-    return net, lambda flat: unravel(flat)["params"]
+    template = shapes_of(net.init, jax.random.key(0), np.zeros(OBS_DIM))
+    return net, lambda flat: unraveled(flat, template)["params"]
 
 
 # --- the targets, by hand ------------------------------------------------------------------------
@@ -79,46 +102,33 @@ def test_select_action_picks_each_columns_entry():
 
 @pytest.mark.parametrize("activation", ["tanh", "relu", "leaky_relu", "prelu"])
 def test_updates_equal_torchs_on_the_same_batches(activation):
-    golden = np.load(GOLDEN)  # made by torch_ddqn.py
     config = DDQNConfig(**{**vars(CONFIG), "activation": activation})
     agent = make_ddqn(config, OBS_DIM, NUM_ACTIONS)
-    state = agent.init(jax.random.key(1), agent.hparams)
-    state = state.replace(
-        params=jnp.asarray(golden[f"{activation}/params/0"]),
-        target_params=jnp.asarray(golden[f"{activation}/target_params/0"]),
-    )
-    update = jax.jit(agent.update)
-    for number in range(1, 6):
-        state = update(jax.random.key(0), state, random_batch(number))
-        if number in (1, 5):
-            for name in ("params", "target_params"):
-                expected = golden[f"{activation}/{name}/{number}"]
-                np.testing.assert_allclose(getattr(state, name), expected, rtol=1e-5, atol=2e-6)
+    assert_updates_equal_torchs(np.load(GOLDEN), activation, agent)  # made by torch_ddqn.py
 
 
-def test_the_first_adam_step_moves_each_weight_by_the_learning_rate(agent, state):
+def test_the_first_adam_step_moves_each_weight_by_the_learning_rate(state, update):
     # Adam's first direction is g / (|g| + 1e-8): a sign, wherever the gradient is not tiny.
-    after = jax.jit(agent.update)(jax.random.key(0), state, random_batch(0))
-    np.testing.assert_allclose(np.abs(after.params - state.params), 0.01, rtol=1e-3)
+    after = update(jax.random.key(0), state, random_batch(0))
+    moved = np.asarray(after.params) - np.asarray(state.params)
+    np.testing.assert_allclose(np.abs(moved), 0.01, rtol=1e-3)
 
 
-def test_the_target_network_starts_as_a_copy_and_follows_softly(agent, state):
+def test_the_target_network_starts_as_a_copy_and_follows_softly(state, update):
     np.testing.assert_array_equal(state.target_params, state.params)
-    after = jax.jit(agent.update)(jax.random.key(0), state, random_batch(0))
-    expected = 0.1 * after.params + 0.9 * state.target_params
+    after = update(jax.random.key(0), state, random_batch(0))
+    expected = 0.1 * np.asarray(after.params) + 0.9 * np.asarray(state.target_params)
     np.testing.assert_allclose(after.target_params, expected, rtol=1e-6)
 
 
-def test_a_transition_with_discount_zero_ignores_its_next_state(agent, state):
-    update = jax.jit(agent.update)
-
-    def gradient(batch):
-        return update(jax.random.key(0), state, batch).opt_state.mu  # Adam's first mean: 0.1 g
+def test_a_transition_with_discount_zero_ignores_its_next_state(state, update):
+    def gradient(batch):  # Adam's first mean: 0.1 g
+        return np.asarray(update(jax.random.key(0), state, batch).opt_state.mu)
 
     batch = random_batch(0, discount=0.0)
     elsewhere = batch._replace(next_obs=batch.next_obs + 3.0)
     np.testing.assert_array_equal(gradient(batch), gradient(elsewhere))
-    bootstrapping = jnp.ones(BATCH)
+    bootstrapping = np.ones(BATCH, np.float32)
     a, b = (gradient(x._replace(discount=bootstrapping)) for x in (batch, elsewhere))
     assert np.abs(a - b).max() > 1e-3
 
@@ -145,8 +155,9 @@ def epsilon_in(agent, state):
     begin = jax.jit(agent.begin_episode)
 
     def epsilons(episodes, **hparams):
-        changed = state.replace(hparams=state.hparams._replace(**hparams))
-        return [float(begin(changed, jnp.int32(n)).epsilon) for n in episodes]
+        numbers = {name: np.float32(x) for name, x in hparams.items()}
+        changed = state.replace(hparams=state.hparams._replace(**numbers))
+        return [float(begin(changed, np.int32(n)).epsilon) for n in episodes]
 
     return epsilons
 
@@ -177,24 +188,27 @@ def draw_actions():
     """Exploring actions of 4000 keys and the greedy one, by epsilon; three actions."""
     agent = make_ddqn(CONFIG, OBS_DIM, num_actions=3)
     obs = jnp.array([0.3, -0.2, 0.5])
-    state = agent.init(jax.random.key(0), agent.hparams)
-    keys = jax.random.split(jax.random.key(1), 4000)
+    net = MLP(3, CONFIG.hidden_size, CONFIG.num_layers, CONFIG.activation)
+    template = shapes_of(net.init, jax.random.key(0), obs)
 
     @jax.jit
     def draw(epsilon):
+        state = agent.init(jax.random.key(0), agent.hparams)
+        keys = jax.random.split(jax.random.key(1), 4000)
         act = jax.vmap(agent.act, (0, None, None, None))
         explorer = state.replace(epsilon=epsilon)
-        return act(keys, explorer, obs, True), act(keys, explorer, obs, False)
+        drawn, greedy = (act(keys, explorer, obs, explore) for explore in (True, False))
+        return drawn, greedy, state.params
 
-    net = MLP(3, CONFIG.hidden_size, CONFIG.num_layers, CONFIG.activation)
-    _, unravel = ravel_pytree(net.init(jax.random.key(0), obs))
-    return draw, int(np.argmax(net.apply(unravel(state.params), obs)))
+    params = unraveled(draw(np.float32(0))[2], template)["params"]
+    q_values = numpy_forward(params, np.asarray(obs), CONFIG.activation, CONFIG.num_layers)
+    return draw, int(np.argmax(q_values))
 
 
 @pytest.mark.parametrize("epsilon", [0.0, 0.3, 1.0])
 def test_actions_are_random_with_probability_epsilon_and_greedy_otherwise(draw_actions, epsilon):
     draw, best = draw_actions
-    drawn, greedy = draw(jnp.float32(epsilon))
+    drawn, greedy, _ = draw(np.float32(epsilon))
     assert drawn.dtype == jnp.int32
     np.testing.assert_array_equal(greedy, best)
     # Random actions are uniform, the greedy one included.
@@ -220,40 +234,44 @@ def test_a_two_step_probe_learns_gamma_and_one():
     agent = make_ddqn(config, obs_dim=2, num_actions=2)
     a, b = [1.0, 0.0], [0.0, 1.0]
     batch = Transition(
-        obs=jnp.array([a, a, b, b]).T,
-        action=jnp.array([0, 1, 0, 1]),
-        reward=jnp.array([0.0, 0.0, 1.0, 1.0]),
-        discount=jnp.array([1.0, 1.0, 0.0, 0.0]),
-        next_obs=jnp.array([b, b, a, a]).T,
+        obs=np.float32([a, a, b, b]).T,
+        action=np.int32([0, 1, 0, 1]),
+        reward=np.float32([0.0, 0.0, 1.0, 1.0]),
+        discount=np.float32([1.0, 1.0, 0.0, 0.0]),
+        next_obs=np.float32([b, b, a, a]).T,
     )
 
     def step(state, _):
         return agent.update(jax.random.key(0), state, batch), None
 
-    state = agent.init(jax.random.key(0), agent.hparams)
-    state, _ = jax.lax.scan(step, state, length=600)
-    net = MLP(2, 8, 1, "tanh")
-    _, unravel = ravel_pytree(net.init(jax.random.key(0), jnp.zeros(2)))
-    q_values = net.apply(unravel(state.params), jnp.array([a, b]).T)  # [actions, (A, B)]
-    np.testing.assert_allclose(q_values, [[gamma, 1.0], [gamma, 1.0]], atol=0.02)
+    @jax.jit
+    def learned(key):
+        return jax.lax.scan(step, agent.init(key, agent.hparams), length=600)[0].params
+
+    template = shapes_of(MLP(2, 8, 1, "tanh").init, jax.random.key(0), np.zeros(2))
+    params = unraveled(learned(jax.random.key(0)), template)["params"]
+    for state, value in ((a, gamma), (b, 1.0)):
+        q_values = numpy_forward(params, state, "tanh", 1)
+        np.testing.assert_allclose(q_values, [value, value], atol=0.02)
 
 
 def test_hparams_hold_the_configured_numbers(agent):
-    assert agent.hparams == DDQNHparams(
-        learning_rate=0.01, target_update_rate=0.1, discount=0.9,
-        epsilon_init=1.0, epsilon_min=0.01, epsilon_decay=0.9,
-    )  # fmt: skip
+    assert agent.hparams._asdict() == {
+        "learning_rate": 0.01, "target_update_rate": 0.1, "discount": 0.9,
+        "epsilon_init": 1.0, "epsilon_min": 0.01, "epsilon_decay": 0.9,
+        "hidden_size": None, "batch_size": None,  # all of them
+    }  # fmt: skip
     assert (agent.init_episodes, agent.learns_from) == (10, 10)
 
 
-def test_columns_of_no_weight_change_nothing(agent, state):
+def test_columns_of_no_weight_change_nothing(state, update):
     batch = random_batch(5)
     other = random_batch(6)
     joined = jax.tree.map(
-        lambda a, b: jnp.concatenate([a, b], axis=-1),
-        batch._replace(weight=jnp.ones(BATCH)),
-        other._replace(weight=jnp.zeros(BATCH)),
+        lambda a, b: np.concatenate([a, b], axis=-1),
+        batch._replace(weight=np.ones(BATCH, np.float32)),
+        other._replace(weight=np.zeros(BATCH, np.float32)),
     )
-    alone = agent.update(jax.random.key(0), state, batch)
-    padded = agent.update(jax.random.key(0), state, joined)
+    alone = update(jax.random.key(0), state, batch)
+    padded = update(jax.random.key(0), state, joined)
     np.testing.assert_allclose(padded.params, alone.params, rtol=1e-5, atol=1e-7)

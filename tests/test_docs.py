@@ -2,10 +2,13 @@
 
 import doctest
 import importlib
+import inspect
 import re
 from pathlib import Path
 
 import pytest
+
+import sejax
 
 ROOT = Path(__file__).parents[1]
 MODULES = [
@@ -35,3 +38,14 @@ def test_links_of_the_readme_and_docs_lead_somewhere():
         for target in re.findall(r"\]\(([^)#]+)\)", page.read_text()):
             if not target.startswith("http"):
                 assert (page.parent / target).exists(), f"{page.name} links to {target}"
+
+
+@pytest.mark.parametrize("name", sorted(sejax.__all__))
+def test_every_public_name_is_there_and_says_what_it_is(name):
+    value = getattr(sejax, name)
+    assert value.__doc__ and not value.__doc__.startswith(f"{getattr(value, '__name__', '')}(")
+    for member, method in vars(value).items() if isinstance(value, type) else ():
+        is_field = member in getattr(value, "__dataclass_fields__", ())
+        if inspect.isfunction(method) and not member.startswith("_") and not is_field:
+            documented = [getattr(base, member, None) for base in value.__mro__]
+            assert any(getattr(each, "__doc__", None) for each in documented), f"{name}.{member}"

@@ -1,21 +1,19 @@
 """The dueling network by hand, an update of its agent against torch, and CartPole solved."""
 
+import functools
 from pathlib import Path
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
-from jax.flatten_util import ravel_pytree
-from support import numpy_forward
-from test_ddqn import BATCH, OBS_DIM, random_batch
+from support import numpy_forward, random_like, shapes_of, unraveled
+from test_ddqn import BATCH, OBS_DIM, assert_updates_equal_torchs
 
 from sejax import envs
-from sejax.agents.configs import DuelingDDQNConfig
-from sejax.agents.ddqn import make_ddqn, q_network
-from sejax.configs import TrainingConfig
+from sejax.agents.ddqn import DuelingDDQNConfig, make_ddqn
 from sejax.networks import DuelingMLP
 from sejax.trainer import make_trainer
+from sejax.training import TrainingConfig
 
 NUM_ACTIONS = 2  # as in the batches of test_ddqn
 GOLDEN = Path(__file__).parent / "golden" / "dueling_updates.npz"
@@ -32,17 +30,20 @@ def config_with(activation):
 
 def nested_params(config):
     """Turns the agent's flat parameters into the network's nested ones."""
-    network = q_network(config, NUM_ACTIONS)
-    _, unravel = ravel_pytree(network.init(jax.random.key(0), jnp.zeros(OBS_DIM)))
-    return lambda flat: unravel(flat)["params"]
+    init = config.network(NUM_ACTIONS).init
+    template = shapes_of(init, jax.random.key(0), np.zeros(OBS_DIM))
+    return lambda flat: unraveled(flat, template)["params"]
 
 
+@functools.cache
 def dueling(activation="tanh", num_actions=3, stream_num_layers=2):
+    """The jitted network, and random parameters for it."""
     net = DuelingMLP(
         num_actions, feature_dim=4, hidden_size=5, num_layers=1, stream_hidden_size=6,
         stream_num_layers=stream_num_layers, activation=activation,
     )  # fmt: skip
-    return net, net.init(jax.random.key(1), jnp.zeros(OBS_DIM))
+    variables = shapes_of(net.init, jax.random.key(1), np.zeros(OBS_DIM))
+    return jax.jit(net.apply), random_like(variables)
 
 
 # --- the network ---------------------------------------------------------------------------------
@@ -50,13 +51,13 @@ def dueling(activation="tanh", num_actions=3, stream_num_layers=2):
 
 @pytest.mark.parametrize("activation", ACTIVATIONS)
 def test_forward_equals_a_numpy_loop(activation):
-    net, variables = dueling(activation)
+    apply, variables = dueling(activation)
     params = variables["params"]
     slopes = {}
     if activation == "prelu":  # a slope for each part: a mix-up would be seen
         slopes = {"features": 0.6, "value": -0.3, "advantage": 1.7}
         params = {
-            part: {**params[part], "prelu_slope": jnp.float32(slope)}
+            part: {**params[part], "prelu_slope": np.float32(slope)}
             for part, slope in slopes.items()
         }
     assert set(params) == {"features", "value", "advantage"}
@@ -68,12 +69,12 @@ def test_forward_equals_a_numpy_loop(activation):
         features = part("features", x, 1)
         value, advantage = part("value", features, 2), part("advantage", features, 2)
         expected = [value[0] + advantage[a] - sum(advantage) / 3 for a in range(3)]
-        got = net.apply({"params": params}, jnp.float32(x))
+        got = apply({"params": params}, np.float32(x))
         np.testing.assert_allclose(got, expected, rtol=1e-5, atol=1e-6)
 
 
 def test_streams_may_be_linear():
-    net, variables = dueling(stream_num_layers=0)
+    apply, variables = dueling(stream_num_layers=0)
     params = variables["params"]
     x = np.array([0.3, -1.0, 0.7])
     features = numpy_forward(params["features"], x, "tanh", 1)
@@ -81,26 +82,27 @@ def test_streams_may_be_linear():
         numpy_forward(params[k], features, "tanh", 0) for k in ("value", "advantage")
     )
     expected = value + advantage - advantage.mean()
-    np.testing.assert_allclose(net.apply(variables, jnp.float32(x)), expected, rtol=1e-5)
+    np.testing.assert_allclose(apply(variables, np.float32(x)), expected, rtol=1e-5)
 
 
 def test_the_q_values_of_a_sample_do_not_depend_on_its_batch():
-    net, variables = dueling()
-    batch = 3 * jax.random.normal(jax.random.key(3), (OBS_DIM, 7))  # [feature, batch]
-    together = net.apply(variables, batch)
+    apply, variables = dueling()
+    rng = np.random.default_rng(3)
+    batch = np.float32(3 * rng.normal(size=(OBS_DIM, 7)))  # [feature, batch]
+    together = np.asarray(apply(variables, batch))
     assert together.shape == (3, 7)
     for column in range(7):
-        alone = net.apply(variables, batch[:, column])
+        alone = apply(variables, batch[:, column])
         np.testing.assert_allclose(together[:, column], alone, rtol=1e-5, atol=1e-6)
 
 
 def test_the_mean_of_a_samples_q_values_is_its_value():
-    net, variables = dueling()
+    apply, variables = dueling()
     params = variables["params"]
     x = np.array([1.0, -0.5, 2.0])
     features = numpy_forward(params["features"], x, "tanh", 1)
     value = numpy_forward(params["value"], features, "tanh", 2)
-    np.testing.assert_allclose(net.apply(variables, jnp.float32(x)).mean(), value[0], rtol=1e-5)
+    np.testing.assert_allclose(apply(variables, np.float32(x)).mean(), value[0], rtol=1e-5)
 
 
 # --- the agent -----------------------------------------------------------------------------------
@@ -108,20 +110,8 @@ def test_the_mean_of_a_samples_q_values_is_its_value():
 
 @pytest.mark.parametrize("activation", ACTIVATIONS)
 def test_updates_equal_torchs_on_the_same_batches(activation):
-    golden = np.load(GOLDEN)  # made by torch_dueling.py
     agent = make_ddqn(config_with(activation), OBS_DIM, NUM_ACTIONS)
-    state = agent.init(jax.random.key(1), agent.hparams)
-    state = state.replace(
-        params=jnp.asarray(golden[f"{activation}/params/0"]),
-        target_params=jnp.asarray(golden[f"{activation}/target_params/0"]),
-    )
-    update = jax.jit(agent.update)
-    for number in range(1, 6):
-        state = update(jax.random.key(0), state, random_batch(number))
-        if number in (1, 5):
-            for name in ("params", "target_params"):
-                expected = golden[f"{activation}/{name}/{number}"]
-                np.testing.assert_allclose(getattr(state, name), expected, rtol=1e-5, atol=2e-6)
+    assert_updates_equal_torchs(np.load(GOLDEN), activation, agent)  # made by torch_dueling.py
 
 
 @pytest.mark.slow

@@ -1,12 +1,14 @@
 """sejax.envs: the contract of every real task, and parity with Gymnasium."""
 
+import dataclasses
+
 import gymnasium
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sejax import envs
+from sejax import envs, plugins
 from sejax.errors import ConfigError
 
 GYMNASIUM_IDS = {
@@ -46,6 +48,16 @@ def env_step():
     tasks = {name: envs.make(name) for name in NAMES}
     return {
         name: jax.jit(lambda k, s, a, task=task: task.env.step_env(k, s, a, task.params))
+        for name, task in tasks.items()
+    }
+
+
+@pytest.fixture(scope="module")
+def env_reset():
+    """Jitted `reset_env` of each task, one after another: `(key) -> (obs, state)`."""
+    tasks = {name: envs.make(name) for name in NAMES}
+    return {
+        name: jax.jit(lambda k, task=task: task.env.reset_env(k, task.params))
         for name, task in tasks.items()
     }
 
@@ -105,9 +117,9 @@ def test_reset_of_a_grid_world_is_the_index_of_its_start(name):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_step_returns_what_the_trainer_relies_on(name, env_step):
+def test_a_step_returns_what_the_trainer_relies_on(name, env_step, env_reset):
     task = envs.make(name)
-    obs, state = task.env.reset_env(jax.random.key(0), task.params)
+    obs, state = env_reset[name](jax.random.key(0))
     for action in draw_actions(task, np.random.default_rng(0), 4):
         next_obs, next_state, reward, terminated, info = env_step[name](
             jax.random.key(1), state, action
@@ -120,26 +132,26 @@ def test_a_step_returns_what_the_trainer_relies_on(name, env_step):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_only_the_step_limit_truncates_and_it_does_not_terminate(name):
+def test_only_the_step_limit_truncates_and_it_does_not_terminate(name, env_step, env_reset):
     task = envs.make(name)
-    _, state = task.env.reset_env(jax.random.key(0), task.params)
+    _, state = env_reset[name](jax.random.key(0))
     action = QUIET_ACTION.get(name, 0)
     for steps_before, truncates in [
         (0, False), (task.max_steps - 2, False), (task.max_steps - 1, True),
     ]:  # fmt: skip
-        _, _, _, terminated, truncated, info = task.env.step(
-            jax.random.key(1), state.replace(time=jnp.int32(steps_before)), action, task.params
-        )
-        assert truncated == truncates
+        late = state.replace(time=jnp.int32(steps_before))
+        _, after, _, terminated, info = env_step[name](jax.random.key(1), late, action)
+        assert task.env.is_truncated(after, task.params) == truncates
         assert not terminated
         assert info["discount"] == 1.0
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_vmapped_steps_equal_single_ones(name, env_step):
+def test_vmapped_steps_equal_single_ones(name, env_step, env_reset):
     task = envs.make(name)
     keys = jax.random.split(jax.random.key(0), 6)
-    _, states = jax.vmap(task.env.reset_env, (0, None))(keys, task.params)
+    each = [env_reset[name](key)[1] for key in keys]
+    states = jax.tree.map(lambda *x: jnp.stack(x), *each)
     actions = draw_actions(task, np.random.default_rng(1), 6)
     step = jax.jit(jax.vmap(lambda k, s, a: task.env.step_env(k, s, a, task.params)))
     together = step(keys, states, actions)
@@ -147,6 +159,32 @@ def test_vmapped_steps_equal_single_ones(name, env_step):
         alone = env_step[name](keys[i], jax.tree.map(lambda x, i=i: x[i], states), actions[i])
         for a, b in zip(jax.tree.leaves(together), jax.tree.leaves(alone), strict=True):
             np.testing.assert_allclose(a[i], b, rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_what_is_said_of_a_task_before_it_is_made_is_so(name):
+    config = plugins.configure("env", {"name": name})
+    assert config.facts == envs.facts_of(config) == envs.make(name).facts
+
+
+def test_a_task_says_what_it_was_made_from():
+    for options in ({}, {"goal_reward": -1.0}):
+        task = envs.make("cliff_walking", **options)
+        assert task.origin == {"name": "cliff_walking", "goal_reward": 0.0} | options
+        assert envs.make(**task.origin) is task
+    assert dataclasses.replace(task, origin=None).origin is None
+
+
+def test_a_task_made_by_hand_has_the_limit_that_it_is_given():
+    world = envs.make("gridworld_2x2").env
+    task = envs.Task(name="mine", env=world)
+    assert task.params == world.default_params and task.max_steps == 10
+    assert task.solved_reward == np.inf and not task.is_solvable
+    shorter = envs.Task(name="mine", env=world, max_steps=3)
+    assert shorter.max_steps == shorter.params.max_steps_in_episode == 3
+    assert dataclasses.replace(shorter, max_steps=4).params.max_steps_in_episode == 4
+    with pytest.raises(ConfigError, match=r"^env\.max_steps must be at least 1"):
+        envs.Task(name="mine", env=world, max_steps=0)
 
 
 # --- the paper's numbers -------------------------------------------------------------------------
@@ -218,7 +256,7 @@ def test_initial_states_fill_the_same_range_as_gymnasiums(name, low, high):
 
 
 @pytest.mark.parametrize("name", sorted(GYMNASIUM_IDS))
-def test_steps_from_states_all_over_the_box_equal_gymnasiums(name):
+def test_steps_from_states_all_over_the_box_equal_gymnasiums(name, env_reset):
     task = envs.make(name)
     reference = gymnasium.make(GYMNASIUM_IDS[name])
     reference.reset(seed=0)
@@ -229,7 +267,7 @@ def test_steps_from_states_all_over_the_box_equal_gymnasiums(name):
     expected_obs, expected_reward, expected_terminated = map(np.array, zip(*expected, strict=True))
     if name != "pendulum":  # which never terminates; else both sides of the walls were visited
         assert 0.02 < expected_terminated.mean() < 0.98
-    _, template = task.env.reset_env(jax.random.key(0), task.params)
+    _, template = env_reset[name](jax.random.key(0))
 
     def step(values, action):
         state = set_state(name, template, values)
@@ -250,13 +288,13 @@ def test_steps_from_states_all_over_the_box_equal_gymnasiums(name):
 
 
 @pytest.mark.parametrize("name", sorted(GYMNASIUM_IDS))
-def test_two_hundred_random_steps_equal_gymnasiums(name, env_step):
+def test_two_hundred_random_steps_equal_gymnasiums(name, env_step, env_reset):
     task = envs.make(name)
     reference = gymnasium.make(GYMNASIUM_IDS[name]).unwrapped
     actions = draw_actions(task, np.random.default_rng(1), 200)
     num_episodes = 0
     key = jax.random.key(0)
-    _, template = task.env.reset_env(key, task.params)
+    _, template = env_reset[name](key)
     terminated = True
     for action in actions:
         if terminated:
@@ -273,10 +311,9 @@ def test_two_hundred_random_steps_equal_gymnasiums(name, env_step):
     assert int(state.time) <= 200
 
 
-def test_acrobot_terminates_when_the_tip_is_above_the_line(env_step):
+def test_acrobot_terminates_when_the_tip_is_above_the_line(env_step, env_reset):
     # Straight up: joint 1 at pi, joint 2 at 0. Height -cos(pi) - cos(pi + 0) = 2 > 1.
-    task = envs.make("acrobot")
-    _, state = task.env.reset_env(jax.random.key(0), task.params)
+    _, state = env_reset["acrobot"](jax.random.key(0))
     state = set_state("acrobot", state, [np.pi, 0.0, 0.0, 0.0])
     _, _, reward, terminated, info = env_step["acrobot"](jax.random.key(0), state, jnp.int32(1))
     assert terminated and reward == 0.0 and info["discount"] == 0.0
@@ -300,10 +337,10 @@ def test_acrobot_terminates_when_the_tip_is_above_the_line(env_step):
     ],
 )
 def test_the_car_stops_at_the_walls_and_ends_at_the_goal(
-    env_step, position, velocity, action, expected
+    env_step, env_reset, position, velocity, action, expected
 ):
     name = "mountain_car_continuous"
-    _, template = envs.make(name).env.reset_env(jax.random.key(0), envs.make(name).params)
+    _, template = env_reset[name](jax.random.key(0))
     state = set_state(name, template, [position, velocity])
     obs, _, reward, terminated, info = env_step[name](
         jax.random.key(0), state, np.array([action], np.float32)
@@ -313,9 +350,8 @@ def test_the_car_stops_at_the_walls_and_ends_at_the_goal(
 
 
 @pytest.mark.parametrize("name", ["mountain_car_continuous", "pendulum"])
-def test_a_continuous_action_may_be_a_scalar(name, env_step):
-    task = envs.make(name)
-    _, state = task.env.reset_env(jax.random.key(0), task.params)
+def test_a_continuous_action_may_be_a_scalar(name, env_step, env_reset):
+    _, state = env_reset[name](jax.random.key(0))
     scalar = env_step[name](jax.random.key(0), state, jnp.float32(0.5))
     vector = env_step[name](jax.random.key(0), state, jnp.array([0.5]))
     for a, b in zip(jax.tree.leaves(scalar), jax.tree.leaves(vector), strict=True):
@@ -367,7 +403,7 @@ def cliff_table():
     ids=["cliff_walking", "gridworld_2x2", "maze"],
 )
 def test_every_step_in_a_grid_follows_its_map(rows, rewards, request):
-    from sejax.envs.gridworld import GridParams, GridWorld
+    from sejax.envs.dynamics.gridworld import GridParams, GridWorld
 
     name = request.node.callspec.id
     if name in GRIDS:
@@ -478,7 +514,7 @@ def test_a_grid_episode_runs_to_its_step_limit_if_nothing_ends_it():
     ],
 )
 def test_a_map_that_is_no_grid_world_is_refused(rows, message):
-    from sejax.envs.gridworld import GridWorld
+    from sejax.envs.dynamics.gridworld import GridWorld
 
     with pytest.raises(ValueError, match=message):
         GridWorld(rows)

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from scripted import MAX_EPISODES, MAX_STEPS, ScriptedEnv, script, scripted_agent
 
 from sejax import envs, evaluation
-from sejax.configs import TrainingConfig
+from sejax.training import TrainingConfig
 
 ENV = ScriptedEnv()
 TRAINING = TrainingConfig(max_episodes=MAX_EPISODES, stop_rule="never", test_episodes=3)

@@ -3,10 +3,10 @@
 import numpy as np
 import pandas as pd
 import pytest
-from support import experiment_options, refuse
+from support import refuse
 
 from sejax.errors import ConfigError
-from sejax.experiments import agent_learning, return_curves
+from sejax.experiments import agent_learning, pieces, return_curves, worlds
 
 
 def curve(steps, returns):
@@ -29,14 +29,17 @@ def test_curves_hold_the_value_of_the_last_finished_episode():
 
 def test_every_agent_learns_and_nothing_is_computed_twice(tmp_path, monkeypatch):
     monkeypatch.setattr(agent_learning, "QUICK_STEPS", 400)
-    args = experiment_options(agent_learning, tmp_path, "--envs", "cliff_walking")
-    table = agent_learning.run(args)
+    settings = agent_learning.AgentLearning.of(
+        quick=True, out=str(tmp_path), seed=3, envs="cliff_walking"
+    )
+    table = agent_learning.EXPERIMENT.run(settings)
     assert list(table["agent"]) == ["q_learning", "sarsa", "sarsa"]
     assert (tmp_path / "learning_curves.png").stat().st_size > 10_000
-    assert (
-        "python -m sejax.experiments.agent_learning --quick" in (tmp_path / "table.md").read_text()
-    )
-    curves = pd.read_csv(next((tmp_path / "pieces").glob("*q_learning.csv")))
+    text = (tmp_path / "table.md").read_text()
+    assert "python -m sejax.experiments.agent_learning quick=true" in text
+    rows = pieces.read_rows(settings.rows_file)
+    assert set(rows["study"]) == {6, 7, 8} and set(rows["max_steps"]) == {400}
+    curves = rows[rows["study"] == 6]
     assert set(curves["agent"]) == {0, 1}
     for _, mine in curves.groupby("agent"):
         assert (np.diff(mine["steps"], prepend=0) >= 1).all()
@@ -44,13 +47,13 @@ def test_every_agent_learns_and_nothing_is_computed_twice(tmp_path, monkeypatch)
         assert mine["steps"].iloc[-1] <= 400
         assert mine["test_return"].between(-150, -12).all()
 
-    monkeypatch.setattr(agent_learning, "train", refuse)
-    pd.testing.assert_frame_equal(agent_learning.run(args), table)
+    monkeypatch.setattr(worlds, "train", refuse)
+    pd.testing.assert_frame_equal(agent_learning.EXPERIMENT.run(settings), table)
 
 
 @pytest.mark.parametrize(
-    ("given", "named"), [(["--envs", "cartpol"], "cartpole"), (["--num-agents", "0"], "at least 1")]
+    ("given", "named"), [({"envs": "cartpol"}, "cartpole"), ({"num_agents": 0}, "at least 1")]
 )
 def test_what_cannot_work_is_refused(tmp_path, given, named):
     with pytest.raises(ConfigError, match=named):
-        agent_learning.run(experiment_options(agent_learning, tmp_path, *given))
+        agent_learning.AgentLearning.of(quick=True, out=str(tmp_path), **given)

@@ -1,13 +1,21 @@
 """The experiments on reward networks: what agents reach with them, and what they have learned."""
 
+import dataclasses
+import importlib
+import re
+import shlex
+from pathlib import Path
+
 import numpy as np
 import pandas as pd
 import pytest
-from support import experiment_options, refuse
+from support import refuse
 
+import sejax
+from sejax.app import build, session
 from sejax.errors import ConfigError
 from sejax.experiments import (
-    common,
+    pieces,
     proxy_runs,
     rn_curves,
     rn_heatmap,
@@ -15,13 +23,17 @@ from sejax.experiments import (
     rn_performance,
     rn_studies,
     timings,
+    worlds,
 )
-from sejax.proxies.sets import load_set
+from sejax.experiments.experiment import parse
+from sejax.experiments.rn_heatmap import RnHeatmap
+from sejax.experiments.rn_objectives import RnObjectives
+from sejax.experiments.rn_performance import RnPerformance
+from sejax.experiments.tables import bootstrap_interval
 
-LEARN = ["--variants", "additive_potential", "exclusive_non_potential", "--learned", "3",
-         "--generations", "1", "--set", "training.max_episodes=5",
-         "es.population_size=2"]  # fmt: skip
-TRAIN = ["--rns", "2", "--num-agents", "2", "--max-steps", "150", "--rows", "default"]
+LEARN = {"variants": ("additive_potential", "exclusive_non_potential"), "learned": 3,
+         "generations": 1, "run": ("training.max_episodes=5", "es.population_size=2")}  # fmt: skip
+TRAIN = {"num_agents": 2, "max_steps": 150, "rows": "default"}
 
 
 @pytest.fixture(scope="module")
@@ -32,27 +44,39 @@ def rns_dir(tmp_path_factory):
 
 @pytest.fixture
 def options(rns_dir, tmp_path):
-    """`options(module, *given)`: the options of an experiment that uses those."""
-    rest = [*LEARN, "--rns-dir", str(rns_dir)]
-    return lambda module, *given: experiment_options(module, tmp_path, *rest, *given)
+    """`options(settings, **given)`: the settings of an experiment that uses those."""
+    usual = {"quick": True, "seed": 3, "out": str(tmp_path), "rns_dir": str(rns_dir), **LEARN}
+    return lambda settings, **given: settings.of(**(usual | given))
+
+
+def pieces_of(folder, prefix):
+    """Settings of the pieces of that name."""
+    return [pd.read_json(path, typ="series")
+            for path in sorted((folder / "work" / "pieces").glob(f"{prefix}-*.json"))]  # fmt: skip
+
+
+def refuse_to_compute(monkeypatch):
+    monkeypatch.setattr(worlds, "train", refuse)
+    monkeypatch.setattr(session, "run", refuse)
 
 
 def test_rns_are_learned_stored_and_used_once(options, rns_dir, tmp_path, monkeypatch):
-    args = options(rn_performance, *TRAIN)
-    table = rn_performance.run(args)
-    assert list(table["trained with"]) == ["real", "count_based", *args.variants]
+    settings = options(RnPerformance, rns=2, **TRAIN)
+    run = rn_performance.EXPERIMENT.run
+    table = run(settings)
+    assert list(table["trained with"]) == ["real", "count_based", *settings.variants]
     assert set(table["groups, agents"]) == {"2, 4"}
-    assert (tmp_path / "performance.png").stat().st_size > 10_000
+    assert (tmp_path / "performance.png").stat().st_size > 5_000
     folder = rns_dir / "cliff_walking" / "reward_threshold"
-    rns = load_set(folder / "additive_potential.safetensors", kind="rn")
-    assert rns.size == 3 and rns.config.objective.name == "reward_threshold"
+    rns = sejax.load_set(folder / "additive_potential.safetensors", kind="rn")
+    assert rns.size == 3 and rns.config["objective"]["name"] == "reward_threshold"
     assert len({rns.fingerprint(i) for i in range(3)}) == 3
     assert list(rns.seeds) == [3, 4, 5]
     with pytest.raises(ConfigError, match="proxy=se"):
-        load_set(folder / "additive_potential.safetensors", kind="se")
+        sejax.load_set(folder / "additive_potential.safetensors", kind="se")
 
     # The best two of three, and the worst two, by the scores of the runs' incumbents.
-    curve = pd.read_csv(folder / "curves" / "additive_potential-seeds3-5.csv")
+    curve = pieces.read_rows(folder / "additive_potential.csv.xz")
     np.testing.assert_allclose(rns.scores, curve["incumbent_mean"], rtol=1e-6)
     best, worst = rns.ranked(2), rns.ranked(2, worst=True)
     assert list(best.scores) == sorted(rns.scores)[:0:-1]
@@ -60,79 +84,78 @@ def test_rns_are_learned_stored_and_used_once(options, rns_dir, tmp_path, monkey
     used = {one["weights"] for one in pieces_of(tmp_path, "default-additive_potential")}
     assert used == {best.fingerprint(0), best.fingerprint(1)}
 
-    monkeypatch.setattr(rn_curves, "train_group", refuse)
-    monkeypatch.setattr(proxy_runs, "learn_one", refuse)
-    pd.testing.assert_frame_equal(rn_performance.run(args), table)
-    args.bonus_groups = 1
-    fewer = rn_performance.run(args).set_index("trained with")["groups, agents"]
-    assert fewer["count_based"] == "1, 2" and set(fewer.drop("count_based")) == {"2, 4"}
-    args.bonuses = ["none"]
+    refuse_to_compute(monkeypatch)
+    pd.testing.assert_frame_equal(run(settings), table)
+    fewer = dataclasses.replace(settings, bonus_groups=1)
+    counts = run(fewer).set_index("trained with")["groups, agents"]
+    assert counts["count_based"] == "1, 2" and set(counts.drop("count_based")) == {"2, 4"}
     expected = table[table["trained with"] != "count_based"].reset_index(drop=True)
-    pd.testing.assert_frame_equal(rn_performance.run(args), expected)
-
-
-def pieces_of(folder, prefix):
-    """Settings of the pieces of that name."""
-    return [pd.read_json(path, typ="series")
-            for path in sorted((folder / "pieces").glob(f"{prefix}-*.json"))]  # fmt: skip
+    for nothing in (("none",), ()):
+        without = run(dataclasses.replace(settings, bonuses=nothing))
+        pd.testing.assert_frame_equal(without, expected)
+    monkeypatch.setattr(rn_studies, "stored", refuse)
+    again = dataclasses.replace(settings, bonuses=(), from_rows=True)
+    pd.testing.assert_frame_equal(run(again), expected)
 
 
 def test_a_set_grows_by_the_rns_that_it_lacks(rns_dir, options, monkeypatch):
-    args = options(rn_performance, *TRAIN)
-    rn_studies.fill_in(args)
-    three = rn_studies.learn(args, "additive_potential", "reward_threshold")
+    settings = options(RnPerformance, **TRAIN)
+    three = rn_studies.learn(settings, "additive_potential", "reward_threshold")
     learned = []
-    learn_one = proxy_runs.learn_one
+    run = session.run
 
-    def learn_and_count(config, *rest):
+    def run_and_count(config, *rest):
         learned.append(config.seed)
-        return learn_one(config, *rest)
+        return run(config, *rest)
 
-    monkeypatch.setattr(proxy_runs, "learn_one", learn_and_count)
-    args.learned = 4
-    four = rn_studies.learn(args, "additive_potential", "reward_threshold")
+    monkeypatch.setattr(session, "run", run_and_count)
+    more = dataclasses.replace(settings, learned=4)
+    four = rn_studies.learn(more, "additive_potential", "reward_threshold")
     assert learned == [6] and list(four.seeds) == [3, 4, 5, 6]
     assert list(four.scores[:3]) == list(three.scores)
     assert [four.fingerprint(i) for i in range(3)] == [three.fingerprint(i) for i in range(3)]
     assert four.fingerprint(3) not in [three.fingerprint(i) for i in range(3)]
+    curves = pieces.read_rows(rn_studies.curves_file(four.path))
+    assert list(curves["seed"]) == [3, 4, 5, 6]
 
 
 def test_rns_of_other_settings_are_refused_before_any_are_learned(options, monkeypatch):
-    args = options(rn_performance, *TRAIN)
-    rn_performance.run(args)
-    monkeypatch.setattr(proxy_runs, "learn_one", refuse)
-    monkeypatch.setattr(rn_curves, "train_group", refuse)
-    args.set = [*args.set, "proxy.hidden_size=7"]
-    args.variants = ["exclusive_potential", *args.variants]  # the first is yet to be learned
-    with pytest.raises(ConfigError, match=r"--rns-dir must be .* another proxy\.hidden_size"):
-        rn_performance.run(args)
+    settings = options(RnPerformance, rns=2, **TRAIN)
+    rn_performance.EXPERIMENT.run(settings)
+    refuse_to_compute(monkeypatch)
+    variants = ("exclusive_potential", *settings.variants)  # the first is yet to be learned
+    other = dataclasses.replace(
+        settings, run=(*settings.run, "proxy.hidden_size=7"), variants=variants
+    )
+    with pytest.raises(ConfigError, match=r"rns_dir must be .* another proxy\.hidden_size"):
+        rn_performance.EXPERIMENT.run(other)
 
 
-def test_several_runs_in_one_program_are_those_runs(rns_dir, options, tmp_path):
+def test_several_runs_in_one_program_are_those_runs(options, tmp_path):
     """Seeds that are learned together get the weights that each gets alone."""
-    args = options(rn_performance, *TRAIN)
-    rns = rn_studies.learn(args, "additive_potential", "reward_threshold")
-    (together,) = proxy_runs.configs_of_runs(rns.config, 3, tmp_path, at_once=3)
+    settings = options(RnPerformance, **TRAIN)
+    rns = rn_studies.learn(settings, "additive_potential", "reward_threshold")
+    config = build.learn_config(rns.config)
+    (together,) = proxy_runs.configs_of_runs(config, 3, tmp_path, at_once=3)
     assert together.num_seeds == 3 and together.run_dir.endswith("seeds3-5")
-    alone = proxy_runs.configs_of_runs(rns.config, 3, tmp_path)
+    alone = proxy_runs.configs_of_runs(config, 3, tmp_path)
     assert [config.seed for config in alone] == [3, 4, 5]
-    proxy_runs.learn_all(alone[1:2], common.Pieces(tmp_path / "curves"))
+    proxy_runs.learn_all(alone[1:2])
     proxy_runs.collect(alone[1:2], tmp_path / "alone.safetensors")
-    one = load_set(tmp_path / "alone.safetensors", kind="rn")
+    one = sejax.load_set(tmp_path / "alone.safetensors", kind="rn")
     assert one.seeds[0] == 4 and one.scores[0] == rns.scores[1]
     assert one.fingerprint(0) == rns.fingerprint(1)
 
 
 def test_objectives_are_compared_with_the_best_and_the_worst(options, tmp_path):
-    args = options(rn_objectives, *TRAIN, "--objectives", "reward_threshold", "auc")
-    with pytest.raises(ConfigError, match=r"--learned must be at least 4.*got 3"):
-        rn_objectives.run(args)
-    args = options(rn_objectives, *TRAIN[2:], "--objectives", "reward_threshold", "auc")
-    table = rn_objectives.run(args)
+    given = TRAIN | {"objectives": ("reward_threshold", "auc")}
+    with pytest.raises(ConfigError, match=r"learned must be at least 4.*got 3"):
+        options(RnObjectives, rns=2, **given)
+    table = rn_objectives.EXPERIMENT.run(options(RnObjectives, **given))
     # The real task twice, and for each objective and choice two variants.
     assert len(table) == 2 + 2 * 2 * 2
     for name in ("best", "worst"):
-        assert (tmp_path / f"{name}.png").stat().st_size > 10_000
+        assert (tmp_path / f"{name}.png").stat().st_size > 5_000
     summary = pd.read_csv(tmp_path / "summary.csv")
     real = summary[summary["world"] == "real"]
     assert real["steps_to_solve"].nunique() == 1  # the same agents beside each objective
@@ -145,21 +168,23 @@ def test_objectives_are_compared_with_the_best_and_the_worst(options, tmp_path):
 
 
 def test_the_heat_map_shows_what_the_rns_pay(options, tmp_path):
-    args = options(rn_heatmap)
-    table = rn_heatmap.run(args)
-    assert list(table["variant"]) == args.variants
+    settings = options(RnHeatmap)
+    table = rn_heatmap.EXPERIMENT.run(settings)
+    assert list(table["variant"]) == list(settings.variants)
     assert (tmp_path / "heatmap.png").stat().st_size > 10_000
     summary = pd.read_csv(tmp_path / "summary.csv").set_index(["variant", "move"])
     # 11 moves into the cliff cost 100 and only the additive RNs pay the real reward as well.
     assert summary.loc[("additive_potential", "into the cliff"), "mean"] < -90
     assert summary.loc[("exclusive_non_potential", "into the cliff"), "mean"] > -10
 
-    rns = rn_studies.learn(args, "exclusive_non_potential", "reward_threshold")
+    rns = rn_studies.learn(settings, "exclusive_non_potential", "reward_threshold")
     rewards = rn_heatmap.rewards_of_moves(rns)
     assert rewards.shape == (3, 48, 4) and np.isnan(rewards[:, 37:]).all()
     potential = [float(rns.env.potential(rns.one(1), np.int32(s))) for s in (24, 0)]
     # From the start (row 3) UP leads to state 24, and UP from state 0 stays there.
     np.testing.assert_allclose(rewards[1, [36, 0], 3], potential, rtol=1e-5)
+    stored = rn_heatmap.by_variant(settings, pieces.read_rows(settings.rows_file))
+    np.testing.assert_array_equal(stored["exclusive_non_potential"], rewards)
 
 
 def test_moves_are_those_of_the_map():
@@ -185,9 +210,9 @@ def test_ignored_rewards_do_not_stretch_the_colours():
 
 
 def test_timings_are_of_the_papers_rows(tmp_path):
-    args = experiment_options(timings, tmp_path, "--rows", "cliff_walking-rn",
-                              "--generations", "1")  # fmt: skip
-    table = timings.run(args)
+    settings = timings.Timings.of(quick=True, out=str(tmp_path), rows="cliff_walking-rn",
+                                  generations=1)  # fmt: skip
+    table = timings.EXPERIMENT.run(settings)
     assert table["paper, 16 cores"].iloc[0] == "10 s"
     timed = pd.read_csv(tmp_path / "summary.csv").iloc[0]
     # Two members with two signs and two incumbents, at most 4 episodes of 50 steps each.
@@ -223,7 +248,7 @@ def test_intervals_draw_rns_or_agents_and_need_five_of_them():
         ("real", 140 + 10 * np.arange(10)),
     ):
         (row,) = rn_curves.summarise(curves_of(world, 5), -12.0, max_steps=300).itertuples()
-        assert (row.steps_low, row.steps_high) == common.bootstrap_interval(independent)
+        assert (row.steps_low, row.steps_high) == bootstrap_interval(independent)
         assert row.return_low < row.mean_return < row.return_high
     few = rn_curves.summarise(curves_of("additive_potential", 4), -12.0, max_steps=300)
     assert few[["steps_low", "return_high"]].isna().all(axis=None)
@@ -239,34 +264,62 @@ def test_augmented_variants_are_named_in_pictures():
 @pytest.mark.parametrize(
     ("module", "given", "said"),
     [
-        (rn_performance, ["--env", "acrobot"], "cartpole"),
-        (rn_performance, ["--variants", "additive"], "additive_potential"),
+        (rn_performance, {"env": "acrobot"}, "cartpole"),
+        (rn_performance, {"variants": "additive"}, "additive_potential"),
         (
             rn_performance,
-            ["--env", "cartpole", "--variants", "additive_potential+augm"],
+            {"env": "cartpole", "variants": "additive_potential+augm"},
             "additive",
         ),
-        (rn_performance, ["--rows", "varied", "transfers"], "transfer"),
-        (rn_performance, ["--bonuses", "icm"], "--bonuses must be one of count_based, none.*icm"),
-        (rn_performance, ["--rns", "0"], "at least 1"),
-        (rn_performance, ["--bonus-groups", "0"], "--bonus-groups must be at least 1"),
-        (rn_performance, ["--learned", "0"], "at least 1"),
-        (rn_performance, ["--objective", "steps"], "reward_threshold"),
-        (rn_objectives, ["--picks", "top"], "worst"),
-        (rn_objectives, ["--objectives", "max"], "max_reward"),
-        (rn_heatmap, ["--env", "cartpole"], "cliff_walking"),
-        (rn_heatmap, ["--objective", "steps"], "reward_threshold"),
-        (timings, ["--rows", "pendulum-rn"], "halfcheetah-rn"),
-        (timings, ["--generations", "0"], "at least 1"),
+        (rn_performance, {"rows": ("varied", "transfers")}, "transfer"),
+        (rn_performance, {"bonuses": "icm"}, "bonuses must be one of count_based, none.*icm"),
+        (rn_performance, {"rns": 0}, "at least 1"),
+        (rn_performance, {"rns": 3, "learned": 2}, "rns must be at most 2"),
+        (rn_performance, {"bonus_groups": 0}, "bonus_groups must be at least 1"),
+        (rn_performance, {"learned": 0}, "at least 1"),
+        (rn_performance, {"objective": "steps"}, "reward_threshold"),
+        (rn_objectives, {"picks": "top"}, "worst"),
+        (rn_objectives, {"objectives": "max"}, "max_reward"),
+        (rn_heatmap, {"env": "cartpole"}, "cliff_walking"),
+        (rn_heatmap, {"objective": "steps"}, "reward_threshold"),
+        (timings, {"rows": "pendulum-rn"}, "halfcheetah-rn"),
+        (timings, {"generations": 0}, "at least 1"),
     ],
 )
 def test_what_cannot_work_is_refused(tmp_path, module, given, said):
     with pytest.raises(ConfigError, match=said):
-        module.run(experiment_options(module, tmp_path, *given))
+        module.EXPERIMENT.settings.of(quick=True, out=str(tmp_path), **given)
 
 
-def test_leading_words_are_options_too():
-    words = ["env=cartpole", "max_steps=7", "--quick", "--set", "a=1"]
-    expected = ["--env", "cartpole", "--max-steps", "7", "--quick", "--set", "a=1"]
-    assert common.as_options(words) == expected
-    assert common.as_options([]) == []
+def test_settings_are_those_of_the_task():
+    """What is not given is the paper's, or what makes a small version of it."""
+    usual = RnPerformance.of(env="cartpole")
+    assert (usual.learned, usual.rns, usual.bonus_groups, usual.max_steps) == (10, 10, 10, 50_000)
+    assert usual.bonuses == ("icm",) and usual.run == ()
+    assert usual.training.stop_rule == "never" and usual.training.tests_between == 1
+    few = RnPerformance.of(env="cartpole", learned=5, rns=2)
+    assert (few.rns, few.bonus_groups) == (2, 2) and RnPerformance.of(learned=5).rns == 5
+    quick = RnPerformance.of(env="halfcheetah", quick=True)
+    assert (quick.learned, quick.rns, quick.bonuses, quick.rows) == (1, 1, (), ("default",))
+    assert RnObjectives.of().rns == 10 and RnObjectives.of(learned=12).rns == 6
+    picked = RnObjectives.of(quick=True)
+    assert (picked.learned, picked.rns) == (4, 2)
+    assert RnObjectives.of(quick=True, picks="best", learned=2).rns == 2
+
+
+def test_words_of_the_command_line_are_settings():
+    words = ["env=cartpole", "max_steps=7", "quick=true", "variants=[a,b]", "run.es.x=1"]
+    given = {name: value for name, value in parse(RnPerformance, words).items() if value}
+    assert given == {"env": "cartpole", "max_steps": 7, "quick": True, "variants": ["a", "b"],
+                     "run": ["es.x=1"]}  # fmt: skip
+    assert not any(parse(RnPerformance, []).values())
+
+
+def test_commands_in_the_docs_are_accepted():
+    text = (Path(__file__).parents[1] / "docs" / "results.md").read_text()
+    commands = re.findall(r"^python -m sejax\.experiments\.(\w+)(.*)$", text, re.MULTILINE)
+    assert len(commands) > 15
+    for name, words in commands:
+        settings = importlib.import_module(f"sejax.experiments.{name}").EXPERIMENT.settings
+        made = settings.of(**parse(settings, shlex.split(words)))
+        assert made.command().startswith(f"python -m sejax.experiments.{name}")

@@ -1,43 +1,145 @@
-"""The experiments with SEs: sets of SEs, feasibility, performance, single SEs."""
+"""The experiments with SEs: the framework, sets of SEs, feasibility, performance, single SEs."""
 
 import dataclasses
-import json
 import os
 import shutil
 import subprocess
 import sys
+from dataclasses import dataclass
 
 import jax
 import numpy as np
 import pandas as pd
 import pytest
-from support import experiment_options, refuse
+import yaml
+from support import refuse
 
 import sejax
 from sejax import envs
-from sejax.configs import TrainingConfig
+from sejax.agents.agent import drawing_key
+from sejax.app import session
 from sejax.errors import ConfigError
 from sejax.experiments import (
-    common,
+    experiment,
     figures,
-    proxy_runs,
+    pieces,
     se_agents,
     se_feasibility,
     se_models,
     se_performance,
+    settings,
+    tables,
+    worlds,
 )  # fmt: skip
-from sejax.proxies.sets import load_set, save_set
-from sejax.proxies.synthetic import make_synthetic
+from sejax.options import counts
 
-TINY_RUN = ["generations=3", "es.population_size=2", "es.num_incumbent_evals=2",
-            "agent.hidden_size=4", "agent.batch_size=4", "agent.init_episodes=0",
-            "proxy.hidden_size=4", "training.max_steps=30", "training.test_episodes=1"]  # fmt: skip
+TINY_RUN = ["es.population_size=2", "es.num_incumbent_evals=2", "agent.hidden_size=4",
+            "agent.batch_size=4", "agent.init_episodes=0", "proxy.hidden_size=4",
+            "training.max_steps=30", "training.test_episodes=1"]  # fmt: skip
 TINY_AGENT = {"hidden_size": 2, "batch_size": 4, "num_layers": 1, "init_episodes": 0}
 
 
-def learned(out, *argv):
-    args = experiment_options(se_feasibility, out, "--runs", "2", *argv, "--set", *TINY_RUN)
-    return se_feasibility.run(args)
+# What experiments are told.
+
+
+@dataclass(frozen=True, kw_only=True)
+class Example(settings.Settings):
+    name = "example"
+
+    env: str = settings.setting("cartpole", about="task")
+    agents: tuple[str, ...] = settings.setting(
+        ("ddqn", "ppo"), settings.each_of(("ddqn", "ppo")), about="kinds"
+    )
+    num_agents: int = settings.setting(10, counts("it counts agents"), quick=4, about="of each")
+    run: tuple[str, ...] = settings.setting((), about="overrides")
+
+
+def given(*words):
+    return Example.of(**experiment.parse(Example, words))
+
+
+def test_settings_are_complete_and_say_which_command_makes_them():
+    assert (given().num_agents, given("quick=true").num_agents) == (10, 4)
+    made = given("quick=true", "agents=[ppo]", "num_agents=null", "run.es.noise_std=0.1", "seed=7",
+                 "run.agent.hidden_size=4")  # fmt: skip
+    assert made.run == ("es.noise_std=0.1", "agent.hidden_size=4")
+    assert made == Example.of(quick=True, agents="ppo", seed=7, run=made.run)
+    words = made.command().removeprefix("python -m sejax.experiments.example ").split()
+    assert given(*(word.strip("'") for word in words)) == made and len(words) == 5
+    assert given().command() == "python -m sejax.experiments.example"
+
+
+def test_results_are_apart_from_what_may_be_thrown_away():
+    assert str(given().folder) == "results/example/cartpole"
+    assert str(given().work_folder) == "runs/experiments/example/cartpole"
+    assert str(given("quick=true").folder) == "runs/experiments/example-quick/cartpole"
+    assert str(given("out=results/example/mine").work_folder) == "runs/experiments/example/mine"
+    assert str(given("out=/tmp/mine").work_folder) == "/tmp/mine/work"
+    assert str(given("out=/tmp/mine", "work=/tmp/other").work_folder) == "/tmp/other"
+
+
+@pytest.mark.parametrize(
+    ("word", "message"),
+    [("agents=[dqn]", "agents must be one of ddqn, ppo; got 'dqn'"),
+     ("agents=ddqn,ppo", r"agents must be one value or a list.*Set agents=\[ddqn,ppo\]"),
+     ("num_agents=0", "num_agents must be at least 1, because it counts agents; got 0"),
+     ("num_agents=many", "num_agents must be a whole number"),
+     ("numagents=3", "Did you mean num_agents="), ("--quick", "Did you mean quick="),
+     ("seed=-1", "seed must lie in"), ("devices=0", "devices must be at least 1"),
+     ("seed=[1", "no viable alternative|mismatched input")],
+)  # fmt: skip
+def test_words_that_cannot_work_are_refused(word, message):
+    with pytest.raises(ConfigError, match=message):
+        given(word)
+
+
+def test_help_lists_all_fields_with_their_values():
+    example = experiment.Experiment(settings=Example, compute=refuse, report=refuse, about="What.")
+    text = example.help()
+    assert "What." in text and "num_agents=10" in text and "of each (quick: 4)" in text
+    assert "run.FIELD=VALUE" in text and "agents=[ddqn,ppo]" in text
+
+
+def test_tables_are_remade_from_the_stored_rows(tmp_path):
+    reported = []
+    rows = {"a": pd.DataFrame({"x": [0.1, 1 / 3]}), "b": pd.DataFrame({"flag": [True], "n": [3]})}
+    example = experiment.Experiment(
+        settings=Example, compute=lambda _: pieces.stack(rows), about="",
+        report=lambda _, rows: reported.append(rows) or rows,
+    )  # fmt: skip
+    example.run(Example.of(out=str(tmp_path)))
+    with_rows = Example.of(out=str(tmp_path), from_rows=True)
+    pd.testing.assert_frame_equal(example.run(with_rows), reported[0])
+    pd.testing.assert_frame_equal(pieces.unstack(reported[1], "a"), rows["a"])
+    assert pieces.unstack(reported[1], "b").to_dict("list") == {"flag": [True], "n": [3]}
+    with pytest.raises(ConfigError, match=r"from_rows must be false.*no .*rows\.csv\.xz"):
+        example.run(Example.of(out=str(tmp_path / "none"), from_rows=True))
+
+
+def test_a_kill_while_a_piece_is_written_loses_nothing(tmp_path, monkeypatch):
+    made, done = pieces.Pieces(tmp_path), []
+
+    def compute(count):
+        table = pd.DataFrame({"row": range(count)})
+        return made.compute("p", {"count": count}, lambda: done.append(count) or table)
+
+    written = pieces.write_text
+
+    def killed(path, text):
+        if path.suffix == ".json":
+            raise KeyboardInterrupt
+        written(path, text)
+
+    monkeypatch.setattr(pieces, "write_text", killed)
+    with pytest.raises(KeyboardInterrupt):
+        compute(2)
+    monkeypatch.setattr(pieces, "write_text", written)
+    assert len(compute(2)) == len(compute(2)) == 2 and done == [2, 2]
+    with pytest.raises(ConfigError, match="with another count"):
+        compute(3)
+
+
+# Sets of SEs.
 
 
 @pytest.fixture(scope="module")
@@ -45,10 +147,17 @@ def ses(tmp_path_factory):
     """A file with three SEs of random weights: its path and the weights."""
     path = tmp_path_factory.mktemp("ses") / "ses.safetensors"
     config = sejax.config(["proxy.hidden_size=4", "training.max_steps=40", "agent.init_episodes=0"])
-    env = make_synthetic(envs.make("cartpole"), config.proxy)
+    env = config.parts()["proxy"]
     weights = [env.init_weights(jax.random.key(i)) for i in range(3)]
-    save_set(path, config, weights, [1.0, 2.0, 3.0], [4, 5, 6], [7, 8, 9])
+    records = [{"score": 1.0 + i, "generation": 4 + i, "seed": 7 + i} for i in range(3)]
+    sejax.save_set(path, env, weights, records, plain(config))
     return path, weights
+
+
+def plain(config):
+    from sejax.app import build
+
+    return build.to_plain(config)
 
 
 def assert_equal_trees(a, b):
@@ -58,23 +167,28 @@ def assert_equal_trees(a, b):
 
 def test_a_set_that_is_saved_and_loaded_is_the_same(ses):
     path, weights = ses
-    loaded = load_set(path)
+    loaded = sejax.load_set(path)
     assert loaded.size == 3 and loaded.task.name == "cartpole"
     for i in range(3):
         assert_equal_trees(loaded.one(i).weights, weights[i])
     np.testing.assert_array_equal(loaded.scores, [1, 2, 3])
-    np.testing.assert_array_equal(loaded.generations, [4, 5, 6])
+    assert [record["generation"] for record in loaded.records] == [4, 5, 6]
     np.testing.assert_array_equal(loaded.seeds, [7, 8, 9])
     assert len({loaded.fingerprint(i) for i in range(3)}) == 3
     assert_equal_trees(loaded.first(2).weights, jax.tree.map(lambda x: x[:2], loaded.weights))
     assert loaded.first(None).size == 3
-    some = dataclasses.replace(loaded, scores=np.array([195.0, 194.9, 200.0]))
-    assert list(some.solved().seeds) == [loaded.seeds[0], loaded.seeds[2]]
-    assert dataclasses.replace(loaded, scores=np.zeros(3)).solved().size == 0
+
+
+@pytest.mark.parametrize(("scores", "solved"), [((195.0, 194.9, 200.0), [7, 9]), ((0, 0, 0), [])])
+def test_the_solved_ones_of_a_set_reached_the_threshold(ses, tmp_path, scores, solved):
+    records = [{"score": x, "seed": 7 + i} for i, x in enumerate(scores)]
+    env = sejax.load_set(ses[0]).env
+    sejax.save_set(tmp_path / "s.safetensors", env, ses[1], records)
+    assert list(sejax.load_set(tmp_path / "s.safetensors").solved().seeds) == solved
 
 
 def test_all_ses_of_a_set_step_at_once(ses):
-    loaded = load_set(ses[0])
+    loaded = sejax.load_set(ses[0])
     env, params = loaded.env, loaded.params
     axes = params.replace(weights=0, max_steps_in_episode=None)
     key = jax.random.key(0)
@@ -89,28 +203,31 @@ def test_all_ses_of_a_set_step_at_once(ses):
 
 
 def test_a_single_proxy_is_a_set_of_one(ses, tmp_path):
-    config, weights = load_set(ses[0]).config, ses[1][0]
-    sejax.save(tmp_path / "p.safetensors", config, weights, score=12.5, generation=7, seed=2)
-    loaded = load_set(tmp_path / "p.safetensors")
+    env, weights = sejax.load_set(ses[0]).env, ses[1][0]
+    sejax.save(tmp_path / "p.safetensors", env, weights, score=12.5, generation=7, seed=2)
+    loaded = sejax.load_set(tmp_path / "p.safetensors")
     assert (loaded.size, loaded.scores[0], loaded.seeds[0]) == (1, 12.5, 2)
     assert_equal_trees(loaded.one(0).weights, weights)
-    assert loaded.fingerprint(0) == load_set(ses[0]).fingerprint(0)
+    assert loaded.fingerprint(0) == sejax.load_set(ses[0]).fingerprint(0)
 
 
 def test_files_that_are_no_set_are_refused(ses, tmp_path):
     path, weights = ses
     damaged = tmp_path / "damaged.safetensors"
     damaged.write_bytes(path.read_bytes()[:-20])
-    with pytest.raises(ConfigError, match=r"proxy must be a single proxy.*load_set reads sets"):
+    with pytest.raises(ConfigError, match=r"source must be a single proxy.*load_set reads sets"):
         sejax.load(path)
-    with pytest.raises(ConfigError, match=r"--fixed must be a whole file.*which is damaged"):
-        load_set(damaged, "--fixed")
-    other = sejax.config(["proxy.hidden_size=5"])
-    save_set(tmp_path / "other.safetensors", other, weights, [1] * 3, [1] * 3, [1] * 3)
+    with pytest.raises(ConfigError, match=r"fixed must be a whole safetensors file.*is damaged"):
+        sejax.load_set(damaged, option="fixed")
+    other = sejax.config(["proxy.hidden_size=5"]).parts()["proxy"]
+    sejax.save_set(tmp_path / "other.safetensors", other, weights, [{}] * 3)
     with pytest.raises(ConfigError, match="source must hold the tensors of the network"):
-        load_set(tmp_path / "other.safetensors")
+        sejax.load_set(tmp_path / "other.safetensors")
     with pytest.raises(ConfigError, match="does not exist"):
-        load_set(tmp_path / "none.safetensors")
+        sejax.load_set(tmp_path / "none.safetensors")
+
+
+# Feasibility.
 
 
 def curves(*means):
@@ -139,74 +256,58 @@ def test_runs_that_do_not_solve_the_task_count_as_longer_than_all(values, text):
     assert se_feasibility.median_and_range(values, 50) == text
 
 
-def test_feasibility_learns_as_sejax_run_does_and_goes_on_where_it_stopped(tmp_path, monkeypatch):
-    table = learned(tmp_path)
-    made = pd.read_csv(tmp_path / "learning_curves.csv")
+def learned(out, *run, **given):
+    options = {"runs": 2, "generations": 3, "run": [*TINY_RUN, *run]} | given
+    asked = se_feasibility.SeFeasibility.of(quick=True, seed=3, out=str(out), **options)
+    return se_feasibility.EXPERIMENT.run(asked)
+
+
+@pytest.fixture(scope="module")
+def two_runs(tmp_path_factory):
+    """Two NES runs of three generations: the folder and the table."""
+    out = tmp_path_factory.mktemp("feasibility")
+    return out, learned(out)
+
+
+def test_feasibility_learns_as_sejax_run_does_and_is_not_done_twice(two_runs, monkeypatch):
+    out, table = two_runs
+    made = pieces.read_rows(out / "rows.csv.xz")
     assert made.groupby("seed").size().to_dict() == {3: 3, 4: 3}
-    args = experiment_options(se_feasibility, tmp_path, "--set", *TINY_RUN)
-    config = sejax.config(se_feasibility.overrides(args))
-    result = jax.jit(sejax.make_learner(config))(jax.random.key(4))
+    stored = sejax.load_set(out / "ses.safetensors")
+    config = yaml.safe_load((out / "work/runs/seed4/config.yaml").read_text())
+    assert config["seed"] == 4 and config["proxy"]["hidden_size"] == 4
+    result = jax.jit(sejax.make_learner(session.build.learn_config(config)))(jax.random.key(4))
     mine = made[made["seed"] == 4]
     np.testing.assert_allclose(mine["incumbent_mean"], result.info.incumbent_mean, rtol=1e-6)
-    stored = load_set(tmp_path / "ses.safetensors")
     assert stored.seeds.tolist() == [3, 4]
     assert_equal_trees(stored.one(1).weights, result.weights)
     assert stored.scores[1] == pytest.approx(float(result.score))
 
-    monkeypatch.setattr(proxy_runs, "learn_one", refuse)
-    pd.testing.assert_frame_equal(learned(tmp_path), table)
-    with pytest.raises(ConfigError, match="with another agent_hparams"):
-        learned(tmp_path, "--agent-hparams", "varied")
+    monkeypatch.setattr(session.Chunks, "advance", refuse)
+    pd.testing.assert_frame_equal(learned(out), table)
+    pd.testing.assert_frame_equal(learned(out, from_rows=True), table)
+    with pytest.raises(ConfigError, match=r"differs in agent_hparams.*Set work=DIR"):
+        learned(out, agent_hparams="varied")
 
 
-def test_a_run_that_was_stopped_goes_on_at_its_last_generation(tmp_path):
-    """Learns two generations, then five: the same as five at once."""
-    for out, counts in ((tmp_path / "a", (2, 5)), (tmp_path / "b", (5,))):
-        for count in counts:
-            args = experiment_options(se_feasibility, out, "--runs", "1", "--set", *TINY_RUN)
-            args.overrides = [*args.overrides, f"generations={count}"]
-            se_feasibility.run(args)
-    a, b = (pd.read_csv(tmp_path / x / "learning_curves.csv") for x in "ab")
-    pd.testing.assert_frame_equal(a.drop(columns="wall_s"), b.drop(columns="wall_s"))
+def test_a_run_that_was_stopped_goes_on_at_its_last_generation(two_runs, tmp_path):
+    """Learns one generation, then three: the same as three at once."""
+    for generations in (1, 3):
+        learned(tmp_path, runs=1, generations=generations)
+    at_once = pieces.read_rows(two_runs[0] / "rows.csv.xz").query("seed == 3")
+    gone_on = pieces.read_rows(tmp_path / "rows.csv.xz")
+    pd.testing.assert_frame_equal(gone_on.drop(columns="wall_s"), at_once.drop(columns="wall_s"))
 
 
-def test_a_run_without_its_checkpoint_is_not_replaced(tmp_path):
-    learned(tmp_path)
-    for folder in (tmp_path / "runs").glob("*/checkpoint"):
+def test_a_run_without_its_checkpoint_is_not_replaced(two_runs, tmp_path):
+    shutil.copytree(two_runs[0] / "work", tmp_path / "work")
+    for folder in (tmp_path / "work/runs").glob("*/checkpoint"):
         shutil.rmtree(folder)
-    before = (tmp_path / "runs" / "seed3" / "metrics.csv").read_text()
-    args = experiment_options(se_feasibility, tmp_path, "--set", *TINY_RUN)
-    args.overrides = [*args.overrides, "generations=4"]
-    with pytest.raises(ConfigError, match=r"keep the checkpoints of a run.*with 3 generations"):
-        se_feasibility.run(args)
-    assert (tmp_path / "runs" / "seed3" / "metrics.csv").read_text() == before
-
-
-def test_a_kill_while_a_piece_is_made_longer_loses_nothing(tmp_path, monkeypatch):
-    pieces, rows = common.Pieces(tmp_path), []
-
-    def make(count):
-        rows.append(count)
-        return pd.DataFrame({"row": range(count)})
-
-    def compute(count):
-        return pieces.compute("p", {"count": count}, lambda: make(count), length="count")
-
-    assert len(compute(2)) == len(compute(2)) == 2 and rows == [2]
-    written = common.write_text
-
-    def killed(path, text):
-        if path.suffix == ".json":
-            raise KeyboardInterrupt
-        written(path, text)
-
-    monkeypatch.setattr(common, "write_text", killed)
-    with pytest.raises(KeyboardInterrupt):
-        compute(5)
-    monkeypatch.setattr(common, "write_text", written)
-    assert len(compute(5)) == len(compute(5)) == 5 and rows == [2, 5, 5]
-    with pytest.raises(ConfigError, match="with another count"):
-        compute(3)
+    metrics = tmp_path / "work/runs/seed3/metrics.csv"
+    before = metrics.read_text()
+    with pytest.raises(ConfigError, match=r"checkpoints of a run.*with 3 generations"):
+        learned(tmp_path, generations=4)
+    assert metrics.read_text() == before
 
 
 @pytest.mark.parametrize("preset", ["best", "paper", "paper_performance"])
@@ -232,7 +333,7 @@ def test_intervals_draw_ses_and_not_agents():
     agents = made_up_agents()
     row = se_performance.summarise(agents).iloc[0]
     values = agents["test_return"].to_numpy().reshape(4, 6)
-    low, high = common.bootstrap_interval(values.mean(axis=1))
+    low, high = tables.bootstrap_interval(values.mean(axis=1))
     assert (row["test_return_low"], row["test_return_high"]) == pytest.approx((low, high))
     assert row["test_return_mean"] == pytest.approx(values.mean())
     assert row["test_return_std"] == pytest.approx(np.std(values))
@@ -278,111 +379,130 @@ def test_single_ses_are_sorted_and_their_ranks_correlated():
     assert "td3_discrete and ddqn -1.00" in se_models.correlations_text(summary)
 
 
-def performance(ses, out, *argv):
-    args = experiment_options(se_performance, out, "--fixed", str(ses[0]), "--agents", "ddqn",
-                   "--num-agents", "3", "--num-ses", "2", "--test-episodes", "2",
-                   "--real-episodes", "3", *argv)  # fmt: skip
-    return se_performance.run(args)
+def trained(module, out, **given):
+    """A table of `se_performance` or `se_models` for two SEs and little agents."""
+    options = {"agents": "ddqn", "num_agents": 3, "num_ses": 2, "test_episodes": 2} | given
+    cls = module.EXPERIMENT.settings
+    return module.EXPERIMENT.run(cls.of(quick=True, seed=3, out=str(out), **options))
 
 
-def test_performance_trains_as_evaluation_does_and_goes_on(ses, tmp_path, monkeypatch, capsys):
-    from sejax.agents.configs import DDQNConfig, ExplorationConfig
-    from sejax.agents.hparams import make_varied_agents
-    from sejax.evaluation import evaluate_agents
-
+@pytest.fixture
+def tiny_agents(monkeypatch):
     monkeypatch.setattr(se_agents, "QUICK_AGENT", TINY_AGENT)
+
+
+def performance(ses, out, **given):
+    return trained(se_performance, out, fixed=str(ses[0]), real_episodes=3, **given)
+
+
+def test_performance_trains_as_evaluation_does_and_goes_on(ses, tmp_path, monkeypatch, tiny_agents):
     table = performance(ses, tmp_path)
-    agents = pd.read_csv(tmp_path / "agents.csv")
+    agents = pieces.read_rows(tmp_path / "rows.csv.xz")
     assert agents.groupby("setting").size().to_dict() == {"real": 6, "fixed": 6}
-    stored = load_set(ses[0])
-    mine = agents[agents["group"] == f"se-{stored.seeds[1]:02d}-{stored.fingerprint(1)}"]
-    loaded, task = load_set(ses[0]), envs.make("cartpole")
-    key = jax.random.fold_in(jax.random.key(3), 1)
-    keys = jax.numpy.stack([jax.random.fold_in(key, i) for i in range(3)])
-    varied = make_varied_agents(DDQNConfig(**TINY_AGENT), task, ExplorationConfig())
-    training = dataclasses.replace(loaded.config.training, test_episodes=2)
-    expected = evaluate_agents(varied, loaded.env, loaded.one(1), task, training, keys)
-    np.testing.assert_allclose(mine["test_return"], expected.test_return, rtol=1e-6)
-    np.testing.assert_allclose(mine["return_0"] + mine["return_1"], 2 * mine["test_return"])
-    assert (mine["train_steps"] == 40).all() and mine["hidden_size"].between(1, 6).all()
-    real = agents[agents["setting"] == "real"]
-    real_training = TrainingConfig(max_episodes=3, stop_rule="solved",
-                                   solved_by="train", test_episodes=2)  # fmt: skip
-    expected = evaluate_agents(varied, task.env, task.params, task, real_training, keys)
-    mine = real[real["group"] == "real-01"]
-    np.testing.assert_allclose(mine["test_return"], expected.test_return, rtol=1e-6)
-    np.testing.assert_array_equal(mine["train_steps"], expected.train_steps)
+    check_as_evaluation(ses, agents)
     assert table["trained on"].tolist() == ["real", "synth., HPs fixed"]
     assert (tmp_path / "performance.png").stat().st_size > 10_000
     assert "16887.7" in (tmp_path / "table.md").read_text()
-
-    monkeypatch.setattr(se_agents, "train_groups", refuse)
-    pd.testing.assert_frame_equal(performance(ses, tmp_path), table)
-    with pytest.raises(ConfigError, match=r"with another training\.test_episodes"):
-        performance(ses, tmp_path, "--test-episodes", "4")
-
-    fewer = performance(ses, tmp_path, "--real-groups", "1")
-    assert fewer["SEs, agents"].tolist() == ["1, 3", "2, 6"]
-
-    args = experiment_options(
-        se_models, tmp_path, "--ses", str(ses[0]), "--agents", "ddqn", "--num-agents", "3",
-        "--num-ses", "2", "--test-episodes", "2",
-    )  # fmt: skip
-    single = se_models.run(args)  # finds what se_performance has trained
-    assert set(single["SE"]) == {0, 1} and set(single["run's seed"]) == {7, 8}
-    assert (tmp_path / "models.png").stat().st_size > 10_000
-
-
-def test_agents_of_equal_number_draw_equal_hyperparameters_in_all_settings(
-    ses, tmp_path, monkeypatch
-):
-    monkeypatch.setattr(se_agents, "QUICK_AGENT", TINY_AGENT)
-    performance(ses, tmp_path)
-    agents = pd.read_csv(tmp_path / "agents.csv")
+    # Agents of equal number draw equal hyperparameters in all settings.
     real, fixed = (agents[agents["setting"] == name] for name in ("real", "fixed"))
     for name in ("learning_rate", "batch_size", "hidden_size", "num_layers"):
         np.testing.assert_array_equal(real[name], fixed[name])
         assert real[name].nunique() > 1
 
+    monkeypatch.setattr(worlds, "train", refuse)
+    monkeypatch.setattr(se_performance, "draw", lambda *_: None)
+    pd.testing.assert_frame_equal(performance(ses, tmp_path), table)
+    pd.testing.assert_frame_equal(performance(ses, tmp_path, from_rows=True), table)
+    with pytest.raises(ConfigError, match=r"with another training\.test_episodes"):
+        performance(ses, tmp_path, test_episodes=4)
+
+    fewer = performance(ses, tmp_path, real_groups=1)
+    assert fewer["SEs, agents"].tolist() == ["1, 3", "2, 6"]
+
+    single = trained(se_models, tmp_path, ses=str(ses[0]))  # finds what was trained
+    assert set(single["SE"]) == {0, 1} and set(single["run's seed"]) == {7, 8}
+    assert (tmp_path / "models.png").stat().st_size > 10_000
+
+
+def check_as_evaluation(ses, agents):
+    """Agents of the second groups are those of `make_evaluator` with the same keys and draws."""
+    loaded, task = sejax.load_set(ses[0]), envs.make("cartpole")
+    key = jax.random.fold_in(jax.random.key(3), 1)
+    keys = jax.numpy.stack([jax.random.fold_in(key, i) for i in range(3)])
+    mine = agents[agents["group"] == f"se-{loaded.seeds[1]:02d}-{loaded.fingerprint(1)}"]
+    training = sejax.TrainingConfig(max_steps=40, stop_rule="never", test_episodes=2)
+    chosen, expected = evaluated(loaded.env, loaded.one(1), task, training, keys)
+    np.testing.assert_allclose(mine["test_return"].iloc[chosen], expected.test_return, rtol=1e-6)
+    np.testing.assert_allclose(mine["return_0"] + mine["return_1"], 2 * mine["test_return"])
+    assert (mine["train_steps"] == 40).all() and mine["hidden_size"].between(1, 6).all()
+    mine = agents[agents["group"] == "real-01"]
+    training = sejax.TrainingConfig(max_episodes=3, max_steps=4000, stop_rule="solved",
+                                    solved_by="train", test_episodes=2)  # fmt: skip
+    chosen, expected = evaluated(task.env, task.params, task, training, keys)
+    np.testing.assert_allclose(mine["test_return"].iloc[chosen], expected.test_return, rtol=1e-6)
+    np.testing.assert_array_equal(mine["train_steps"].iloc[chosen], expected.train_steps)
+
+
+def evaluated(env, params, task, training, keys):
+    """Outcomes of the agents that draw networks as deep as the first one does, and which they are.
+
+    All depths would be compiled otherwise.
+    """
+    varied = sejax.make_agent(sejax.DDQNConfig(**TINY_AGENT), task, varied=True)
+    draws = jax.vmap(lambda key: varied.draw(drawing_key(key)))(keys)
+    chosen = np.flatnonzero(draws.variant == draws.variant[0])
+    agent = varied.variants[int(draws.variant[0])]
+
+    @jax.jit
+    def evaluate(key, hparams):
+        fixed = dataclasses.replace(agent, hparams=hparams)
+        return sejax.make_evaluator(fixed, env, task, training)(key, params)
+
+    each = [evaluate(keys[i], jax.tree.map(lambda x, i=i: x[i], draws.hparams)) for i in chosen]
+    return chosen, jax.tree.map(lambda *x: np.stack(x), *each)
+
 
 def test_ses_learned_otherwise_than_the_option_says_are_refused(ses, tmp_path):
-    args = experiment_options(se_performance, tmp_path, "--varied", str(ses[0]))
-    with pytest.raises(ConfigError, match=r"--varied must be SEs learned with varied.*--fixed="):
-        se_performance.run(args)
+    with pytest.raises(ConfigError, match=r"varied must be SEs learned with varied.*fixed="):
+        trained(se_performance, tmp_path, varied=str(ses[0]))
+
+
+def test_ses_of_another_task_are_refused(ses, tmp_path):
+    with pytest.raises(ConfigError, match="must be of one task"):
+        performance(ses, tmp_path, env="acrobot")
 
 
 @pytest.mark.parametrize(
-    ("argv", "message"),
-    [(["--agents", "dqn"], "--agents must be one of ddqn"),
-     (["--num-agents", "0"], "--num-agents must be at least 1"),
-     (["--env", "acrobot"], "must be of one task")],
+    ("name", "words", "message"),
+    [("se_feasibility", ["env=cartpol"], "Did you mean env=cartpole"),
+     ("se_performance", ["fixed=none.safetensors"], "does not exist"),
+     ("se_performance", ["agents=[dqn]"], "agents must be one of ddqn"),
+     ("se_models", [], "ses must be given")],
 )  # fmt: skip
-def test_bad_options_are_refused(argv, message, ses, tmp_path):
-    args = experiment_options(se_performance, tmp_path, "--fixed", str(ses[0]), *argv)
-    with pytest.raises(ConfigError, match=message):
-        se_performance.run(args)
+def test_commands_end_bad_input_with_one_message_and_status_2(
+    name, words, message, tmp_path, capsys, monkeypatch
+):
+    module = __import__(f"sejax.experiments.{name}", fromlist=["EXPERIMENT"])
+    monkeypatch.setattr(experiment.runtime, "enable_compilation_cache", lambda: None)
+    with pytest.raises(SystemExit) as ended:
+        module.EXPERIMENT.main([f"out={tmp_path}", *words])
+    error = capsys.readouterr().err
+    assert ended.value.code == 2 and message in error
+    assert error.startswith("error: ") and error.count("\n") == 1
 
 
-@pytest.mark.parametrize(
-    ("name", "argv", "message"),
-    [("se_feasibility", ["--env", "cartpol"], "Did you mean env=cartpole"),
-     ("se_performance", ["--fixed", "none.safetensors"], "does not exist"),
-     ("se_models", [], "--ses must be given"),
-     ("se_models", ["--seed", "-1"], "--seed must lie in"),
-     ("se_models", ["--devices", "0"], "--devices must be at least 1")],
-)  # fmt: skip
-def test_commands_end_bad_input_with_one_message_and_status_2(name, argv, message, tmp_path):
+def test_a_command_refuses_before_it_imports_gymnax(tmp_path):
+    code = ("import runpy, sys; sys.argv[1:] = ['seed=-1']\n"
+            "try: runpy.run_module('sejax.experiments.se_models', run_name='__main__')\n"
+            "finally: print('gymnax' in sys.modules)")  # fmt: skip
     environment = {key: value for key, value in os.environ.items() if key != "XLA_FLAGS"}
-    done = subprocess.run(
-        [sys.executable, "-m", f"sejax.experiments.{name}", "--out", str(tmp_path), *argv],
-        capture_output=True, text=True, timeout=120, env=environment,
-    )  # fmt: skip
-    assert done.returncode == 2 and message in done.stderr
-    assert done.stderr.startswith("error: ") and done.stderr.count("\n") == 1
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True,
+                          timeout=120, env=environment)  # fmt: skip
+    assert done.returncode == 2 and "seed must lie in" in done.stderr and done.stdout == "False\n"
 
 
-def test_a_piece_says_what_it_was_made_with(ses, tmp_path):
-    learned(tmp_path)
-    settings = json.loads((tmp_path / "pieces" / "seed4.json").read_text())
-    assert settings["seed"] == 4 and settings["proxy.hidden_size"] == 4
-    assert "run_dir" not in settings
+def test_all_experiments_are_listed():
+    done = subprocess.run([sys.executable, "-m", "sejax.experiments"], capture_output=True,
+                          text=True, timeout=120, check=True)  # fmt: skip
+    for module in (se_feasibility, se_models, se_performance):
+        assert f"  {module.EXPERIMENT.settings.name} " in done.stdout

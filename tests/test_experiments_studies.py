@@ -1,6 +1,5 @@
 """The experiments on score transforms, on histograms of SEs and on supervised models."""
 
-import dataclasses
 import re
 from types import SimpleNamespace
 
@@ -9,47 +8,59 @@ import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 import pytest
-import scipy.stats
-from support import experiment_options, numpy_forward, refuse
+from support import numpy_forward, refuse
 
 import sejax
 from sejax import envs
-from sejax.agents.registry import make_agent
+from sejax.app import build
 from sejax.bilevel import make_program
 from sejax.errors import ConfigError
 from sejax.experiments import (
-    common,
+    pieces,
     score_transforms,
+    se_agents,
     se_histograms,
     supervised_baseline,
     supervised_models,
+    tables,
+    worlds,
 )
-from sejax.proxies.sets import load_set, save_set
-from sejax.proxies.synthetic import make_synthetic
-from sejax.trainer import make_tester, make_trainer
+from sejax.rollout import make_recorder, make_tester
+from sejax.trainer import make_trainer
 
-TINY_AGENT = {"hidden_size": 4, "num_layers": 1, "batch_size": 4, "init_episodes": 0}
-TINY_TRANSFORMS = ["--runs", "3", "--generations", "2", "--population", "2", "--slots", "2"]
-TINY_MODELS = ["--models", "3", "--generations", "2", "--population", "2", "--max-rows", "30",
-               "--epochs", "2", "--num-agents", "2", "--test-episodes", "2"]  # fmt: skip
+TINY_AGENT = {"hidden_size": 2, "num_layers": 1, "batch_size": 4, "init_episodes": 0}
+TINY_TRANSFORMS = {"runs": 3, "generations": 2, "population": 2}
+TINY_HISTOGRAMS = {"agents": "ddqn", "num_agents": 2, "test_episodes": 2, "max_rows": 50}
+TINY_MODELS = {"models": 3, "generations": 2, "population": 2, "max_rows": 30, "epochs": 2,
+               "num_agents": 2, "test_episodes": 2}  # fmt: skip
+
+
+def run(module, out, **given):
+    """The table of an experiment with `quick=true` and these settings."""
+    asked = module.EXPERIMENT.settings.of(quick=True, seed=3, out=str(out), **given)
+    return module.EXPERIMENT.run(asked)
+
+
+def save_se(path, *overrides):
+    """Writes an SE of random weights that was learned with these settings."""
+    config = sejax.config(["proxy.hidden_size=4", *overrides])
+    env = config.parts()["proxy"]
+    weights = env.init_weights(jax.random.key(5))
+    sejax.save(path, env, weights, build.to_plain(config), score=1.0, seed=0)
+    return str(path)
 
 
 @pytest.fixture(scope="module")
 def se_file(tmp_path_factory):
-    """A file with an SE of random weights."""
     path = tmp_path_factory.mktemp("se") / "se.safetensors"
-    config = sejax.config(["proxy.hidden_size=4", "training.max_steps=60", "agent.init_episodes=0"])
-    env = make_synthetic(envs.make("cartpole"), config.proxy)
-    save_set(path, config, [env.init_weights(jax.random.key(5))], [1.0], [0], [0])
-    return str(path)
+    return save_se(path, "training.max_steps=60", "agent.init_episodes=0")
 
 
 @pytest.fixture
 def small(monkeypatch):
     """Agents and budgets that cost nothing."""
-    for experiment in (se_histograms, supervised_models):
-        monkeypatch.setattr(experiment, "QUICK_AGENT", TINY_AGENT)
-    monkeypatch.setattr(supervised_models, "QUICK_STEPS", 60)
+    monkeypatch.setattr(se_agents, "QUICK_AGENT", TINY_AGENT)
+    monkeypatch.setattr(se_agents, "QUICK_STEPS", 60)
 
 
 # Score transforms.
@@ -68,57 +79,55 @@ class ScriptedSearch:
 
     def __init__(self, solved_at):
         self.solved_at = np.asarray(solved_at)
-        self.trained = 0  # generations of runs, the measure of the work done
+        self.advanced = 0
 
-    def init(self, keys, sizes):
-        assert np.allclose(sizes, keys / 10), "a run keeps its step size"
-        zeros = np.zeros(len(keys), int)
-        return State(run=keys, generation=zeros, finished=zeros > 0, incumbent_score=zeros)
+    def init(self, keys, sizes, transform):
+        assert transform == score_transforms.SCORE_TRANSFORMS.index("nes")
+        np.testing.assert_allclose(sizes, score_transforms.draw_step_sizes(len(keys), 3), rtol=1e-6)
+        none = np.zeros(len(keys), int)
+        return SimpleNamespace(generation=none, finished=none > 0, incumbent_score=none)
 
-    def advance(self, state, transform):
-        assert transform == 2
-        self.trained += int((~state.finished).sum())
-        made = state.generation + 1
-        finished = state.finished | (made > self.solved_at[state.run])
-        return state.replace(generation=made, finished=finished, incumbent_score=state.run * 100)
-
-    def merge(self, where, a, b):
-        return State(**{k: np.where(where, x, getattr(b, k)) for k, x in vars(a).items()})
+    def advance(self, state):
+        self.advanced += 1
+        made = np.where(state.finished, state.generation, state.generation + 1)
+        score = np.arange(len(made)) * 100
+        return SimpleNamespace(generation=made, finished=made > self.solved_at,
+                               incumbent_score=score)  # fmt: skip
 
 
-class State(SimpleNamespace):
-    def replace(self, **changes):
-        return State(**(vars(self) | changes))
-
-
-@pytest.mark.parametrize("slots", [1, 2, 5])
-def test_runs_follow_one_another_in_slots(slots):
-    solved_at = [3, 0, 9, 1, 4]  # updates before the incumbent solves the task
+@pytest.mark.parametrize(
+    ("solved_at", "updates", "solved", "advanced"),
+    [([3, 0, 9, 1, 4], [3, 0, 5, 1, 4], [True, True, False, True, True], 5),
+     ([1, 0], [1, 0], [True, True], 2)],
+)  # fmt: skip
+def test_a_run_counts_the_updates_before_the_incumbent_that_solves_the_task(
+    solved_at, updates, solved, advanced, monkeypatch
+):
     search = ScriptedSearch(solved_at)
-    updates, solved, scores = score_transforms.solve_all(
-        search, np.arange(5), "nes", np.arange(5) / 10, generations=5, slots=slots
-    )
-    np.testing.assert_array_equal(updates, [3, 0, 5, 1, 4])
-    np.testing.assert_array_equal(solved, [True, True, False, True, True])
-    np.testing.assert_array_equal(scores, [0, 100, 200, 300, 400])
-    assert search.trained == 4 + 1 + 5 + 2 + 5, "an empty slot costs nothing"
+    monkeypatch.setattr(score_transforms, "make_search", lambda *_: search)
+    asked = score_transforms.ScoreTransforms.of(runs=len(updates), generations=5, seed=3)
+    cell = score_transforms.compute_cell(asked, "nes", True)
+    assert list(cell["updates"]) == updates and list(cell["solved"]) == solved
+    assert list(cell["last_score"]) == [100 * run for run in range(len(updates))]
+    assert search.advanced == advanced, "nothing is computed when all runs are over"
 
 
 def test_the_search_is_the_bilevel_loop():
     search = score_transforms.make_search(True, 2, None)
-    keys, sizes = jax.random.split(jax.random.key(0), 3), np.array([0.1, 1.0, 5.0], np.float32)
-    state = search.init(keys, sizes)
+    keys, sizes = jax.random.split(jax.random.key(0), 2), np.array([0.1, 5.0], np.float32)
+    state = search.init(keys, sizes, score_transforms.SCORE_TRANSFORMS.index("single_best"))
     config = sejax.config([*score_transforms.SETTINGS, "es.score_transform=single_best",
                            "es.mirrored=true", "es.population_size=2"])  # fmt: skip
-    program = make_program(config)
+    program = make_program(**config.parts())
     expected = program.init(keys)
     expected = expected.replace(es_state=expected.es_state.replace(step_size=jnp.asarray(sizes)))
     generation = jax.jit(program.generation)
     for _ in range(2):
-        state = search.advance(state, score_transforms.SCORE_TRANSFORMS.index("single_best"))
+        state = search.advance(state)
         expected, _ = generation(expected)
     np.testing.assert_allclose(state.incumbent_score, expected.incumbent_score, rtol=1e-5)
-    np.testing.assert_allclose(state.es_state.mean, expected.es_state.mean, rtol=1e-4, atol=1e-6)
+    np.testing.assert_allclose(state.es_state.nes.mean, expected.es_state.mean, rtol=1e-4,
+                               atol=1e-6)  # fmt: skip
 
 
 def test_the_best_bin_and_the_ranks_are_those_of_the_means():
@@ -139,24 +148,22 @@ def test_the_best_bin_and_the_ranks_are_those_of_the_means():
 
 
 def test_score_transforms_run_and_go_on_where_they_stopped(tmp_path, monkeypatch):
-    table = score_transforms.run(experiment_options(score_transforms, tmp_path, *TINY_TRANSFORMS))
+    table = run(score_transforms, tmp_path, **TINY_TRANSFORMS)
     assert len(table) == 16 and (tmp_path / "score_transforms.png").stat().st_size > 10_000
-    runs = pd.read_csv(tmp_path / "runs.csv")
+    runs = pieces.read_rows(tmp_path / "rows.csv.xz")
     assert len(runs) == 16 * 3 and runs["updates"].between(0, 2).all()
-    assert (runs["solved"] == (runs["last_score"] > 0.8)).all()
+    assert (runs["solved"] == (runs["last_score"] >= 0.8)).all()
     sizes = runs.pivot(index=["transform", "mirrored"], columns="run", values="step_size")
     assert (sizes.nunique() == 1).all(), "all cells have the same step sizes"
-    (tmp_path / "pieces" / "rank-plain.csv").unlink()
+    (tmp_path / "work" / "pieces" / "rank-plain.csv").unlink()
     compute = score_transforms.compute_cell
     made = []
     monkeypatch.setattr(score_transforms, "compute_cell",
                         lambda *args: made.append(args[1:]) or compute(*args))  # fmt: skip
-    again = score_transforms.run(experiment_options(score_transforms, tmp_path, *TINY_TRANSFORMS))
-    assert made == [("rank", False)] and again.equals(table)
+    assert run(score_transforms, tmp_path, **TINY_TRANSFORMS).equals(table)
+    assert made == [("rank", False)]
     with pytest.raises(ConfigError, match="another generations"):
-        score_transforms.run(
-            experiment_options(score_transforms, tmp_path, *TINY_TRANSFORMS, "--generations", "3")
-        )
+        run(score_transforms, tmp_path, **TINY_TRANSFORMS | {"generations": 3})
 
 
 # Histograms.
@@ -164,21 +171,20 @@ def test_score_transforms_run_and_go_on_where_they_stopped(tmp_path, monkeypatch
 
 @pytest.mark.parametrize("capacity", [200, 25])
 def test_a_recorded_training_is_the_training(se_file, capacity):
-    ses = load_set(se_file)
-    agent_config = dataclasses.replace(ses.config.agent, **TINY_AGENT)
-    agent = make_agent(agent_config, ses.task, ses.config.exploration)
-    training = dataclasses.replace(ses.config.training, max_steps=90, max_episodes=12)
-    recording = se_histograms.recording_agent(agent, capacity, 4)
+    ses = sejax.load_set(se_file)
+    agent = sejax.make_agent(sejax.DDQNConfig(**TINY_AGENT), ses.task)
+    training = sejax.TrainingConfig(max_steps=90, max_episodes=12, stop_rule="never")
+    recorder = se_histograms.last_steps(capacity)
     key, params = jax.random.key(1), ses.one(0)
     short = params.replace(max_steps_in_episode=9)
     plain = jax.jit(make_trainer(agent, ses.env, training))(key, short)
-    result = jax.jit(make_trainer(recording, ses.env, training))(key, short)
-    for a, b in zip(jax.tree.leaves(plain.agent_state), jax.tree.leaves(result.agent_state.agent),
+    result = jax.jit(make_trainer(agent, ses.env, training, recorder=recorder))(key, short)
+    for a, b in zip(jax.tree.leaves(plain.agent_state), jax.tree.leaves(result.agent_state),
                     strict=True):  # fmt: skip
         np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-7)
     steps = int(plain.train_steps)
-    assert result.agent_state.num_rows == steps == 90
-    rows = np.asarray(result.agent_state.rows)
+    assert result.train_steps == steps == 90
+    rows = np.asarray(result.recorded.rows)
     if capacity < steps:  # the last ones: the whole of the last episode among them
         last = int(plain.episodes) - 1
         assert rows[:, 0].min() == (steps - capacity) // 9 and rows[:, 0].max() == last
@@ -189,12 +195,12 @@ def test_a_recorded_training_is_the_training(se_file, capacity):
 
 
 def test_recorded_tests_are_the_tests(se_file):
-    ses = load_set(se_file)
-    agent = make_agent(ses.config.agent, ses.task, ses.config.exploration)
+    task = sejax.load_set(se_file).task
+    agent = sejax.make_agent(sejax.DDQNConfig(**TINY_AGENT), task)
     state = agent.init(jax.random.key(0), agent.hparams)
     key = jax.random.key(4)
-    returns, lengths = jax.jit(make_tester(agent, ses.task, 3))(key, state)
-    steps = jax.jit(se_histograms.make_test_recorder(agent, ses.task, 3))(key, state)
+    returns, lengths = jax.jit(make_tester(agent, task, 3))(key, state)
+    steps = jax.jit(make_recorder(agent, task, 3))(key, state)
     valid = np.asarray(steps.valid).reshape(3, -1)
     np.testing.assert_array_equal(valid.sum(axis=1), lengths)
     rewards = np.where(valid, np.asarray(steps.reward).reshape(3, -1), 0)
@@ -204,14 +210,6 @@ def test_recorded_tests_are_the_tests(se_file):
     obs, next_obs = np.asarray(steps.obs), np.asarray(steps.next_obs)
     within = valid[0, 1:]
     np.testing.assert_array_equal(obs[1 : valid.shape[1]][within], next_obs[: within.size][within])
-
-
-def test_the_distance_is_wassersteins():
-    rng = np.random.default_rng(0)
-    for a, b in ((rng.normal(size=50), rng.normal(1, 3, size=31)), (np.ones(3), np.zeros(2))):
-        expected = scipy.stats.wasserstein_distance(a, b)
-        np.testing.assert_allclose(se_histograms.distance(a, b), expected, rtol=1e-10)
-    assert se_histograms.distance([1.0, 2.0], [2.0, 1.0]) == 0
 
 
 def test_the_table_says_which_distribution_the_response_is_closer_to():
@@ -233,20 +231,19 @@ def test_the_table_says_which_distribution_the_response_is_closer_to():
 
 
 def test_histograms_run_and_go_on_where_they_stopped(se_file, tmp_path, monkeypatch, small):
-    argv = ["--proxy", se_file, "--agents", "ddqn", "--num-agents", "2", "--test-episodes", "2",
-            "--max-rows", "50"]  # fmt: skip
-    table = se_histograms.run(experiment_options(se_histograms, tmp_path, *argv))
+    options = TINY_HISTOGRAMS | {"proxy": se_file}
+    table = run(se_histograms, tmp_path, **options)
     assert len(table) == 5 and (tmp_path / "histograms.png").stat().st_size > 10_000
-    rows = pd.read_csv(tmp_path / "pieces" / "ddqn.csv")
+    rows = pieces.read_rows(tmp_path / "work" / "rows.csv.xz")
     by_source = rows.groupby("source").size()
     assert by_source["train"] == 2 * 50 and by_source["test"] == by_source["response"]
     test, response = (rows[rows["source"] == name] for name in ("test", "response"))
     assert (test["reward"] == 1).all() and (test.groupby(["agent", "episode"]).size() > 5).all()
-    check_responses(load_set(se_file), test, response)
-    monkeypatch.setattr(se_histograms, "record", refuse)
-    assert se_histograms.run(experiment_options(se_histograms, tmp_path, *argv)).equals(table)
+    check_responses(sejax.load_set(se_file), test, response)
+    monkeypatch.setattr(worlds, "train", refuse)
+    assert run(se_histograms, tmp_path, **options).equals(table)
     with pytest.raises(ConfigError, match="another max_rows"):
-        se_histograms.run(experiment_options(se_histograms, tmp_path, *argv[:-1], "40"))
+        run(se_histograms, tmp_path, **options | {"max_rows": 40})
 
 
 def check_responses(ses, test, response):
@@ -299,7 +296,7 @@ def random_data(num_rows):
 
 
 def test_the_first_step_of_a_fit_is_adams_on_the_mean_squared_error(se_file):
-    env = load_set(se_file).env
+    env = sejax.load_set(se_file).env
     data = random_data(6)
     states, actions, targets, ends = data
     initial, fitted, errors = supervised_models.make_fit(env, 6, 1)(jax.random.key(2), *data)
@@ -321,7 +318,7 @@ def test_the_first_step_of_a_fit_is_adams_on_the_mean_squared_error(se_file):
 
 
 def test_one_fit_serves_both_models_as_the_networks_share_nothing(se_file):
-    env = load_set(se_file).env
+    env = sejax.load_set(se_file).env
     states, actions, targets, ends = random_data(8)
     fit = jax.jit(supervised_models.make_fit(env, 8, 5))
     _, a, _ = fit(jax.random.key(2), states, actions, targets, ends)
@@ -345,7 +342,7 @@ def test_intervals_draw_models_and_the_best_ones_are_those_of_the_best_episodes(
     agents = supervised_baseline.with_best(agents, [50.0, 10.0, 90.0])
     summary = supervised_baseline.summarise(agents, 195.0).set_index("world")
     assert summary.loc["authors", "return_mean"] == pytest.approx(14)
-    low, high = common.bootstrap_interval([2, 10, 30])
+    low, high = tables.bootstrap_interval([2, 10, 30])
     assert tuple(summary.loc["authors", ["return_low", "return_high"]]) == (low, high)
     assert summary.loc["authors_best", "return_mean"] == pytest.approx(16), "models 0 and 2"
     assert summary.loc["se", "solved"] == 1 and summary.loc["authors", "solved"] == 0
@@ -360,49 +357,53 @@ def test_intervals_draw_models_and_the_best_ones_are_those_of_the_best_episodes(
 
 
 def test_the_supervised_baseline_runs_and_goes_on(se_file, tmp_path, monkeypatch, small):
-    argv = ["--proxy", se_file, *TINY_MODELS]
-    table = supervised_baseline.run(experiment_options(supervised_baseline, tmp_path, *argv))
-    assert list(table["trained on"]) == [
-        text for _ in range(2) for text in supervised_baseline.LABELS.values()
-    ]  # fmt: skip
+    options = TINY_MODELS | {"proxy": se_file, "hparams": "default"}
+    table = run(supervised_baseline, tmp_path, **options)
+    labels = list(supervised_baseline.LABELS.values())
+    assert list(table["trained on"]) == labels
     assert (tmp_path / "supervised_baseline.png").stat().st_size > 10_000
-    rows = pd.read_csv(tmp_path / "pieces" / "transitions-0.csv")
-    check_real_transitions(rows)
+    check_real_transitions(pd.read_csv(tmp_path / "work" / "pieces" / "transitions-0.csv"))
     check_models(tmp_path)
     monkeypatch.setattr(supervised_models, "collect", refuse)
+    monkeypatch.setattr(supervised_baseline, "draw", lambda *_: None)
     monkeypatch.setattr(supervised_models, "fit_all", refuse)
-    monkeypatch.setattr(supervised_baseline, "train_group", refuse)
-    again = supervised_baseline.run(experiment_options(supervised_baseline, tmp_path, *argv))
-    assert again.equals(table)
+    monkeypatch.setattr(worlds, "train", refuse)
+    assert run(supervised_baseline, tmp_path, **options).equals(table)
     with pytest.raises(ConfigError, match="another num_agents"):
-        args = experiment_options(supervised_baseline, tmp_path, *argv, "--num-agents", "3")
-        supervised_baseline.run(args)
+        run(supervised_baseline, tmp_path, **options | {"num_agents": 3})
+    # Agents with drawn hyperparameters are rows of the same table.
+    rows = pieces.read_rows(tmp_path / "rows.csv.xz")
+    drawn = rows[rows["table"] == "agents"].assign(hparams="varied")
+    pieces.write_rows(tmp_path / "rows.csv.xz", pd.concat([rows, drawn]))
+    both = run(supervised_baseline, tmp_path, **options, from_rows=True)
+    assert list(both["trained on"]) == labels * 2
+    pd.testing.assert_frame_equal(both[4:].reset_index(drop=True), table)
 
 
-def test_trainings_that_end_by_tests_can_be_recorded(tmp_path):
-    """An SE learned with the solved rule, whose agents are tested between episodes."""
+def test_a_recorded_run_is_the_bilevel_loop():
+    """With the solved rule, whose agents are tested between episodes."""
     config = sejax.config(["proxy.hidden_size=4", "training.stop_rule=solved",
                            "training.max_episodes=3", "training.max_steps=450",
                            "training.test_episodes=1", "agent.init_episodes=0",
-                           "agent.hidden_size=4", "agent.batch_size=4", "devices=1"])  # fmt: skip
-    env, unravel, mean = supervised_models.make_proxy(config, seed=0)
-    evaluate = supervised_models.make_recorded_evaluation(config, env, unravel)
-    outcome, (steps, _) = evaluate(jax.random.split(jax.random.key(0), 1), mean[None])
-    assert 0 < outcome.train_steps[0] <= 450
-    assert outcome.real_steps[0] > steps.valid.sum()  # those between episodes count as well
+                           "agent.hidden_size=4", "agent.batch_size=4", "devices=1",
+                           "es.population_size=2", "es.num_incumbent_evals=1",
+                           "es.mirrored=false"])  # fmt: skip
+    recorded = supervised_models.make_recorded_run(config)
+    program = make_program(**config.parts())
+    key = jax.random.key(7)
+    state, steps = recorded.generation(recorded.init(key[None]))
+    expected, info = jax.jit(program.generation)(program.init(key[None]))
+    np.testing.assert_allclose(state.es_state.mean, expected.es_state.mean, rtol=1e-4, atol=1e-6)
+    # Those tests between episodes count as real steps, but are not recorded.
+    assert int(info.env_steps_wide[0, 1]) > int(steps.valid.sum()) > 0
 
 
 @pytest.mark.parametrize("overrides", [["agent=ppo"], ["agent=td3_discrete",
                                                         "agent.action_repeat=2"]])  # fmt: skip
 def test_ses_whose_tests_cannot_be_recorded_are_refused(overrides, tmp_path):
-    config = sejax.config(["proxy.hidden_size=4", "training.max_steps=9000", *overrides])
-    env = make_synthetic(envs.make("cartpole"), config.proxy)
-    path = tmp_path / "se.safetensors"
-    save_set(path, config, [env.init_weights(jax.random.key(5))], [1.0], [0], [0])
+    path = save_se(tmp_path / "se.safetensors", "training.max_steps=9000", *overrides)
     with pytest.raises(ConfigError, match="without action repeat"):
-        supervised_baseline.run(
-            experiment_options(supervised_baseline, tmp_path, "--proxy", str(path))
-        )
+        run(supervised_baseline, tmp_path, proxy=path)
 
 
 def check_real_transitions(rows):
@@ -423,10 +424,10 @@ def check_real_transitions(rows):
 def check_models(folder):
     """The variants differ in the network for the end and in what is made of it only."""
     authors, fair = (
-        load_set(folder / f"models-{name}.safetensors") for name in ("authors", "fair")
+        sejax.load_set(folder / f"models-{name}.safetensors") for name in ("authors", "fair")
     )
     assert authors.size == fair.size == 3
-    assert (authors.config.proxy.done, fair.config.proxy.done) == ("soft", "threshold")
+    assert [x.config["proxy"]["done"] for x in (authors, fair)] == ["soft", "threshold"]
     for head, same in (("state", True), ("reward", True), ("done", False)):
         pairs = zip(jax.tree.leaves(authors.weights[head]), jax.tree.leaves(fair.weights[head]),
                     strict=True)  # fmt: skip
@@ -434,23 +435,19 @@ def check_models(folder):
 
 
 @pytest.mark.parametrize(
-    ("experiment", "argv", "message"),
+    ("module", "words", "message"),
     [
-        (score_transforms, ["--runs", "0"], "--runs must be at least 1.*got 0.*--runs="),
-        (score_transforms, ["--population", "1"], "es.population_size must be at least 2"),
-        (se_histograms, ["--agents", "ddqm"], "--agents must be one of ddqn.*got .ddqm"),
-        (se_histograms, ["--proxy", "nowhere"], "cartpole.*got .nowhere"),
-        (supervised_baseline, ["--epochs", "0"], "--epochs must be at least 1.*--epochs=10"),
-        (supervised_baseline, ["--agents", "ppo"], "--agents must be one of.*got .ppo"),
+        (score_transforms, ["runs=0"], "runs must be at least 1.*got 0.*Set runs="),
+        (score_transforms, ["population=1"], "population must be at least 2"),
+        (se_histograms, ["agents=[ddqm]"], "agents must be one of ddqn.*got .ddqm"),
+        (se_histograms, ["proxy=nowhere"], "cartpole.*got .nowhere"),
+        (supervised_baseline, ["epochs=0"], "epochs must be at least 1.*Set epochs=100"),
+        (supervised_baseline, ["agents=ppo"], "agents must be one of.*got .ppo"),
     ],
 )
-def test_bad_input_ends_with_one_message_and_status_2(
-    experiment, argv, message, tmp_path, monkeypatch, capsys
-):
-    args = experiment_options(experiment, tmp_path, *argv)
-    monkeypatch.setattr(common, "parse_args", lambda *_: args)
+def test_bad_input_ends_with_one_message_and_status_2(module, words, message, tmp_path, capsys):
     with pytest.raises(SystemExit) as ended:
-        experiment.main()
+        module.EXPERIMENT.main([f"out={tmp_path}", *words])
     assert ended.value.code == 2
     error = capsys.readouterr().err
     assert re.search(message, error) and error.count("error:") == 1

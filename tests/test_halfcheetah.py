@@ -1,16 +1,21 @@
 """HalfCheetah on brax, and what only its reward networks can see."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from flax import struct
+from gymnax.environments import environment
 from support import numpy_forward
 
 import sejax
 from sejax import envs
-from sejax.configs import RewardConfig
+from sejax.envs.halfcheetah import HalfCheetah
+from sejax.envs.wrappers import Wrapper
 from sejax.errors import ConfigError
-from sejax.proxies.reward import make_reward
+from sejax.proxies.configs import RewardConfig
 
 # brax calls parts of MuJoCo XLA that have been given other names.
 pytestmark = pytest.mark.filterwarnings(
@@ -28,8 +33,8 @@ def task():
 
 
 @pytest.fixture(scope="module")
-def walk(task):
-    """`walk(env, params)`: the first steps of an episode with fixed actions, leaves `[step]`."""
+def walk():
+    """`walk(env)(key)`: the first steps of an episode with fixed actions, leaves `[step]`."""
     actions = jnp.asarray(np.random.default_rng(0).uniform(-1, 1, (NUM_STEPS, 6)), jnp.float32)
 
     def walk(env, params):
@@ -38,16 +43,50 @@ def walk(task):
             truncated = env.is_truncated(state, params)
             return state, (obs, reward, terminated, truncated, info)
 
-        obs, state = env.reset_env(jax.random.key(3), params)
-        return obs, *jax.lax.scan(step, state, actions)[1]
+        def walk(key):
+            obs, state = env.reset_env(key, params)
+            return obs, *jax.lax.scan(step, state, actions)[1]
 
-    compiled = jax.jit(walk, static_argnums=0)
-    return lambda env, params: (actions, *jax.device_get(compiled(env, params)))
+        compiled = jax.jit(walk)
+        return lambda key: (actions, *jax.device_get(compiled(key)))
+
+    return walk
 
 
 @pytest.fixture(scope="module")
-def real(task, walk):
+def real_walk(task, walk):
     return walk(task.env, task.params)
+
+
+@pytest.fixture(scope="module")
+def real(real_walk):
+    return real_walk(jax.random.key(3))
+
+
+class Replay(Wrapper):
+    """HalfCheetah as it went in `real`: its physics take long to compile, and RNs add none."""
+
+    def __init__(self, env, real):
+        super().__init__(env)
+        _, self.first, self.obs, self.reward, self.terminated, _, self.info = real
+
+    def reset_env(self, key, params):
+        return jnp.asarray(self.first), CheetahTime(time=jnp.int32(0))
+
+    def step_env(self, key, state, action, params):
+        made = (self.obs, self.reward, self.terminated, self.info)
+        obs, *rest = jax.tree.map(lambda x: jnp.asarray(x)[state.time], made)
+        return obs, CheetahTime(time=state.time + 1), *rest
+
+
+@struct.dataclass
+class CheetahTime(environment.EnvState):
+    pass
+
+
+@pytest.fixture(scope="module")
+def replayed(task, real):
+    return dataclasses.replace(task, env=Replay(task.env, real))
 
 
 def test_steps_are_braxs(task, real):
@@ -83,22 +122,32 @@ def test_limits_and_sizes_are_the_papers(task):
     assert (task.max_steps, task.solved_reward) == (1000, 3000.0)
     assert (task.obs_dim, task.action_dim, task.max_action) == (17, 6, 1.0)
     assert task.num_states is None and task.num_actions is None
+    assert task.facts == HalfCheetah.facts  # what is said of it before brax is imported
 
 
-def test_each_reset_draws_another_state_and_the_limit_truncates(task):
-    keys = jax.random.split(jax.random.key(0), 2)
-    obs, state = jax.jit(jax.vmap(task.env.reset_env, (0, None)))(keys, task.params)
+def test_each_reset_draws_another_state_and_the_limit_truncates(task, real_walk):
+    obs = [real_walk(key)[1] for key in jax.random.split(jax.random.key(0), 2)]
     assert np.abs(obs[0] - obs[1]).max() > 1e-3
-    late = state.replace(time=jnp.array([999, 1000]))
+    late = CheetahTime(time=jnp.array([999, 1000]))
     assert list(task.env.is_truncated(late, task.params)) == [False, True]
 
 
-def test_augmented_potentials_see_position_and_velocity_of_either_state(task, walk, real):
+def test_reward_networks_keep_what_the_physics_carry(task):
+    env = RewardConfig(augmented=True, hidden_size=4).make(task)
+    obs, state = jax.eval_shape(env.reset_env, jax.random.key(0), env.default_params)
+    after, next_state, reward, *_ = jax.eval_shape(
+        env.step_env, jax.random.key(0), state, jnp.zeros(6), env.default_params
+    )
+    assert (after, next_state) == (obs, state) and reward.shape == ()
+
+
+def test_augmented_potentials_see_position_and_velocity_of_either_state(replayed, walk, real):
     config = RewardConfig(variant="exclusive_potential", augmented=True, hidden_size=4)
-    env = make_reward(task, config)
+    env = config.make(replayed)
     weights = env.init_weights(jax.random.key(1))
     _, first, *_ = real
-    _, rn_first, obs, reward, _, _, info = walk(env, env.params(weights, GAMMA))
+    rn_walk = walk(env, env.params(weights, GAMMA))
+    _, rn_first, obs, reward, _, _, info = rn_walk(jax.random.key(3))
     np.testing.assert_array_equal(rn_first, first)
     v = np.stack([info["x_position"], info["x_velocity"]], axis=1)
     inputs = np.concatenate([obs, v], axis=1)
@@ -108,11 +157,11 @@ def test_augmented_potentials_see_position_and_velocity_of_either_state(task, wa
     np.testing.assert_allclose(reward, expected, rtol=1e-3, atol=1e-4)
 
 
-def test_weighted_info_is_a_linear_reward(task, walk):
-    env = make_reward(task, RewardConfig(variant="additive_weighted_info"))
+def test_weighted_info_is_a_linear_reward(replayed, walk):
+    env = RewardConfig(variant="additive_weighted_info").make(replayed)
     weights = env.init_weights(jax.random.key(2))
     assert weights["info_weights"].shape == (4,) and np.abs(weights["info_weights"]).max() <= 0.5
-    _, _, _, reward, _, _, info = walk(env, env.params(weights))
+    _, _, _, reward, _, _, info = walk(env, env.params(weights))(jax.random.key(3))
     keys = ("x_position", "x_velocity", "reward_run", "reward_ctrl")
     bonus = sum(w * info[key] for w, key in zip(weights["info_weights"], keys, strict=True))
     np.testing.assert_allclose(reward, info["real_reward"] + bonus, rtol=1e-5, atol=1e-6)
@@ -121,19 +170,19 @@ def test_weighted_info_is_a_linear_reward(task, walk):
 def test_the_papers_settings_are_its_own():
     config = sejax.config(["env=halfcheetah", "proxy=rn", "proxy.augmented=true"])
     agent = config.agent
-    assert (agent.name, agent.init_episodes, agent.discount, agent.activation) == (
+    assert (config.name("agent"), agent.init_episodes, agent.discount, agent.activation) == (
         "td3", 20, 0.98, "relu",
     )  # fmt: skip
     assert (config.proxy.hidden_size, config.proxy.activation) == (128, "prelu")
-    assert config.objective.name == "reward_threshold" and config.generations == 50
+    assert config.name("objective") == "reward_threshold" and config.generations == 50
 
 
 @pytest.mark.parametrize(
     ("overrides", "said"),
     [
         (["env=halfcheetah", "proxy=rn", "env.backend=sprung"], "spring"),
-        (["env=cartpole", "+env.backend=mjx"], "only halfcheetah"),
-        (["env=halfcheetah"], "proxy=se"),
+        (["env=cartpole", "+env.backend=mjx"], r"env\.backend must be a field of CartPole"),
+        (["env=halfcheetah", "preset=paper"], "preset=paper for halfcheetah with proxy=se"),
         (["env=cartpole", "proxy=rn", "proxy.augmented=true"], "proxy.augmented=false"),
         (["env=cartpole", "proxy=rn", "proxy.variant=additive_weighted_info"], "potential"),
         (["env=halfcheetah", "proxy=rn", "proxy.variant=exclusive_weighted_info",

@@ -8,12 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from flax import struct
-from support import numpy_forward
+from support import numpy_forward, random_like, shapes_of, unraveled
 
 from sejax.agents.agent import Agent
-from sejax.agents.configs import DDQNConfig, ICMConfig
-from sejax.agents.ddqn import make_ddqn
-from sejax.agents.icm import ICM, ICMOutputs, icm_loss, with_icm
+from sejax.agents.ddqn import DDQNConfig, make_ddqn
+from sejax.agents.icm import ICM, ICMConfig, ICMOutputs, icm_loss, with_icm
 from sejax.agents.memory import Rollout, replay_memory
 from sejax.agents.replay import Transition, pack
 
@@ -32,12 +31,12 @@ def random_batch(seed, kind):
     rng = np.random.default_rng(seed)
     action = rng.integers(0, WIDTH, BATCH) if kind == "index" else rng.normal(size=(WIDTH, BATCH))
     return Transition(
-        obs=jnp.float32(rng.normal(size=(OBS_DIM, BATCH))),
-        action=jnp.int32(action) if kind == "index" else jnp.float32(action),
-        reward=jnp.float32(rng.normal(size=BATCH)),
-        discount=jnp.float32(rng.uniform(0, 1, BATCH)),
-        next_obs=jnp.float32(rng.normal(size=(OBS_DIM, BATCH))),
-        weight=jnp.ones(BATCH),
+        obs=np.float32(rng.normal(size=(OBS_DIM, BATCH))),
+        action=np.int32(action) if kind == "index" else np.float32(action),
+        reward=np.float32(rng.normal(size=BATCH)),
+        discount=np.float32(rng.uniform(0, 1, BATCH)),
+        next_obs=np.float32(rng.normal(size=(OBS_DIM, BATCH))),
+        weight=np.ones(BATCH, np.float32),
     )
 
 
@@ -88,45 +87,48 @@ def model_of(config):
     model = ICM(
         WIDTH, config.feature_dim, config.hidden_size, config.num_layers, config.num_residual_blocks
     )
-    example = (jnp.zeros(OBS_DIM), jnp.zeros(WIDTH), jnp.zeros(OBS_DIM))
-    variables = jax.jit(model.init)(jax.random.key(1), *example)
-    _, unravel = jax.flatten_util.ravel_pytree(variables)
-    return model, variables, unravel
+    example = (np.zeros(OBS_DIM), np.zeros(WIDTH), np.zeros(OBS_DIM))
+    variables = shapes_of(model.init, jax.random.key(1), *example)
+    return model, random_like(variables), lambda flat: unraveled(flat, variables)
 
 
 @pytest.fixture(scope="module")
 def updates():
-    """Jitted updates of the wrapped stub by kind."""
-    return {kind: jax.jit(curious(kind).update) for kind in KINDS}
+    """Jitted updates of the wrapped stub by kind, `(key, state, batch, number=1) -> state`."""
 
+    def updates_of(kind):
+        agent = curious(kind)
 
-@pytest.fixture(scope="module")
-def learn():
-    """`(state, batch, number) -> state` after so many updates on index actions."""
-    update = curious("index").update
-    return jax.jit(
-        lambda state, batch, number: jax.lax.fori_loop(
-            0, number, lambda _, s: update(KEY, s, batch), state
-        )
-    )
+        @jax.jit
+        def update(key, state, batch, number=1):
+            return jax.lax.fori_loop(
+                0, number, lambda _, state: agent.update(key, state, batch), state
+            )
+
+        return update
+
+    return {kind: updates_of(kind) for kind in KINDS}
 
 
 @functools.cache
 def initial(kind):
+    """A fresh state with the parameters that torch started from; nothing is compiled."""
     agent = curious(kind)
-    return jax.jit(agent.init)(jax.random.key(1), agent.hparams)
+    state = shapes_of(agent.init, jax.random.key(1), agent.hparams)
+    hparams = jax.tree.map(np.float32, agent.hparams.icm)
+    return state.replace(params=np.load(GOLDEN)[f"{kind}/params/0"], hparams=hparams)
 
 
 def fresh(kind, **hparams):
     """A wrapped stub with these hyperparameters."""
     state = initial(kind)
-    numbers = {name: jnp.float32(x) for name, x in hparams.items()}
+    numbers = {name: np.float32(x) for name, x in hparams.items()}
     return state.replace(hparams=state.hparams._replace(**numbers))
 
 
 def bonus(state, batch):
     """The bonus that the wrapped stub's agent was shown."""
-    return np.asarray(state.agent_state.reward - batch.reward)
+    return np.asarray(state.agent_state.reward) - np.asarray(batch.reward)
 
 
 # --- the models and the loss, by hand ------------------------------------------------------------
@@ -158,7 +160,8 @@ def test_the_models_equal_numpy_loops():
     config = ICMConfig(**{**vars(CONFIG), "num_layers": 2, "num_residual_blocks": 2})
     model, variables, _ = model_of(config)
     batch = random_batch(0, "vector")
-    got = model.apply(variables, batch.obs, batch.action, batch.next_obs)
+    got = jax.jit(model.apply)(variables, batch.obs, batch.action, batch.next_obs)
+    got = jax.tree.map(np.asarray, got)
     for i in range(BATCH):
         columns = (np.asarray(x)[:, i] for x in (batch.obs, batch.action, batch.next_obs))
         expected = numpy_icm(variables["params"], *columns, num_layers=2, num_blocks=2)
@@ -168,38 +171,41 @@ def test_the_models_equal_numpy_loops():
 
 # Two features, two columns. Squared errors: (1 + 9) / 2 = 5 and (0 + 4) / 2 = 2.
 OUTPUTS = ICMOutputs(
-    next_features=jnp.array([[1.0, 2.0], [3.0, 4.0]]),
-    predicted_next_features=jnp.array([[2.0, 2.0], [0.0, 6.0]]),
-    predicted_action=jnp.array([[0.0, 1.0], [0.0, 3.0], [jnp.log(2.0), 1.0]]),
+    next_features=np.float32([[1.0, 2.0], [3.0, 4.0]]),
+    predicted_next_features=np.float32([[2.0, 2.0], [0.0, 6.0]]),
+    predicted_action=np.float32([[0.0, 1.0], [0.0, 3.0], [np.log(2.0), 1.0]]),
 )
+
+
+loss_of = jax.jit(icm_loss)
 
 
 def test_the_loss_of_index_actions_is_a_softmax_cross_entropy_and_a_squared_error():
     # Softmax: (1/4, 1/4, 1/2) and (1, e^2, 1) / (2 + e^2). The actions taken: 2 and 1.
     inverse = [np.log(2), np.log(2 + np.exp(2)) - 2]
     expected = np.mean([0.8 * inverse[0] + 0.2 * 5, 0.8 * inverse[1] + 0.2 * 2])
-    got = icm_loss(OUTPUTS, jnp.array([2, 1]), forward_weight=0.2)
+    got = loss_of(OUTPUTS, np.array([2, 1]), forward_weight=0.2)
     np.testing.assert_allclose(got, expected, rtol=1e-6)
 
 
 def test_the_loss_of_vector_actions_is_two_squared_errors():
-    action = jnp.array([[1.0, 1.0], [2.0, 3.0], [jnp.log(2.0), 4.0]])
+    action = np.float32([[1.0, 1.0], [2.0, 3.0], [np.log(2.0), 4.0]])
     # (1 + 4 + 0) / 3 and (0 + 0 + 9) / 3.
     expected = np.mean([0.8 * 5 / 3 + 0.2 * 5, 0.8 * 3 + 0.2 * 2])
-    np.testing.assert_allclose(icm_loss(OUTPUTS, action, 0.2), expected, rtol=1e-6)
+    np.testing.assert_allclose(loss_of(OUTPUTS, action, 0.2), expected, rtol=1e-6)
     # The second column alone.
-    got = icm_loss(OUTPUTS, action, 0.2, weight=jnp.array([0.0, 1.0]))
+    got = loss_of(OUTPUTS, action, 0.2, weight=np.float32([0.0, 1.0]))
     np.testing.assert_allclose(got, 0.8 * 3 + 0.2 * 2, rtol=1e-6)
 
 
 def test_large_logits_make_a_large_and_finite_loss():
-    outputs = OUTPUTS._replace(predicted_action=jnp.array([[1e4, -1e4], [-1e4, 1e4]]))
-    np.testing.assert_allclose(icm_loss(outputs, jnp.array([0, 0]), 0.0), 1e4)  # mean of 0 and 2e4
+    outputs = OUTPUTS._replace(predicted_action=np.float32([[1e4, -1e4], [-1e4, 1e4]]))
+    np.testing.assert_allclose(loss_of(outputs, np.array([0, 0]), 0.0), 1e4)  # mean of 0 and 2e4
 
 
 def test_the_forward_models_target_passes_a_gradient_on():
-    gradient = jax.grad(
-        lambda x: icm_loss(OUTPUTS._replace(next_features=x), jnp.array([0, 1]), 1.0)
+    gradient = jax.jit(
+        jax.grad(lambda x: icm_loss(OUTPUTS._replace(next_features=x), np.array([0, 1]), 1.0))
     )
     # d/dt of (p - t)^2 / 4 is (t - p) / 2: mean over two features and two columns.
     expected = (OUTPUTS.next_features - OUTPUTS.predicted_next_features) / 2
@@ -212,7 +218,7 @@ def test_the_forward_models_target_passes_a_gradient_on():
 @pytest.mark.parametrize("kind", KINDS)
 def test_updates_and_bonuses_equal_torchs_on_the_same_batches(kind, updates):
     golden = np.load(GOLDEN)  # made by torch_icm.py
-    state = fresh(kind).replace(params=jnp.asarray(golden[f"{kind}/params/0"]))
+    state = fresh(kind)
     for number in range(1, 6):
         batch = random_batch(number, kind)
         state = updates[kind](KEY, state, batch)
@@ -226,68 +232,83 @@ def test_updates_and_bonuses_equal_torchs_on_the_same_batches(kind, updates):
 # --- what the agent sees -------------------------------------------------------------------------
 
 
-def test_the_bonus_shrinks_for_what_is_seen_often_and_is_larger_for_the_unseen(updates, learn):
+def test_the_bonus_shrinks_for_what_is_seen_often_and_is_larger_for_the_unseen(updates):
     state, update = fresh("index", forward_weight=0.5), updates["index"]
     seen, unseen = random_batch(1, "index"), random_batch(2, "index")
     unseen = unseen._replace(obs=unseen.obs + 3.0, next_obs=unseen.next_obs - 3.0)
     first = bonus(update(KEY, state, seen), seen)
-    state = learn(state, seen, 300)
+    state = update(KEY, state, seen, 300)
     last = bonus(state, seen)
-    frozen = state.replace(hparams=state.hparams._replace(learning_rate=jnp.float32(0)))
+    frozen = state.replace(hparams=state.hparams._replace(learning_rate=np.float32(0)))
     strange = bonus(update(KEY, frozen, unseen), unseen)
     assert last.mean() < 0.1 * first.mean()
     assert strange.mean() > 10 * last.mean()
 
 
-def test_the_inverse_model_learns_which_action_was_taken(learn):
+def test_the_inverse_model_learns_which_action_was_taken(updates):
     # The state moves up with action 1 and down with action 0.
     batch = random_batch(0, "index")
-    move = jnp.where(batch.action == 1, 1.0, -1.0)
+    move = np.where(batch.action == 1, 1.0, -1.0).astype(np.float32)
     batch = batch._replace(next_obs=batch.obs + move)
-    state = learn(fresh("index", forward_weight=0.0), batch, 200)
-    model, _, unravel = model_of(CONFIG)
-    one_hot = jax.nn.one_hot(batch.action, WIDTH, axis=0)
-    logits = model.apply(unravel(state.params), batch.obs, one_hot, batch.next_obs).predicted_action
-    np.testing.assert_array_equal(jnp.argmax(logits, axis=0), batch.action)
+    state = updates["index"](KEY, fresh("index", forward_weight=0.0), batch, 200)
+    _, _, unravel = model_of(CONFIG)
+    params = unravel(state.params)["params"]
+    for i, action in enumerate(batch.action):
+        column = (batch.obs[:, i], np.eye(WIDTH)[action], batch.next_obs[:, i])
+        _, _, logits = numpy_icm(params, *column, CONFIG.num_layers, CONFIG.num_residual_blocks)
+        assert np.argmax(logits) == action
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_columns_of_no_weight_change_nothing(kind, updates):
     counts = np.arange(BATCH) < 4
     batch, other = random_batch(5, kind), random_batch(6, kind)
-    mixed = jax.tree.map(lambda a, b: jnp.where(counts, a, b), batch, other)
-    states, weight = [fresh(kind)] * 2, jnp.float32(counts)
+    mixed = jax.tree.map(lambda a, b: np.where(counts, a, b), batch, other)
+    states, weight = [fresh(kind)] * 2, np.float32(counts)
     for _ in range(2):
         states = [
             updates[kind](KEY, state, x._replace(weight=weight))
             for state, x in zip(states, (batch, mixed), strict=True)
         ]
     np.testing.assert_array_equal(*(state.params for state in states))
-    np.testing.assert_array_equal(*(state.agent_state.reward[:4] for state in states))
-    assert (states[0].agent_state.reward[4:] != states[1].agent_state.reward[4:]).all()
+    rewards = [np.asarray(state.agent_state.reward) for state in states]
+    np.testing.assert_array_equal(*(reward[:4] for reward in rewards))
+    assert (rewards[0][4:] != rewards[1][4:]).all()
+
+
+@functools.cache
+def wrapped_ddqn_state():
+    """A fresh state with random parameters; nothing is compiled."""
+    agent = curious("index", make_ddqn(DDQN, OBS_DIM, WIDTH))
+    state = shapes_of(agent.init, jax.random.key(2), agent.hparams)
+    numbers = jax.tree.map(np.float32, agent.hparams)
+    params, target_params = random_like([state.agent_state.params] * 2)
+    inner = state.agent_state.replace(
+        params=params, target_params=target_params, epsilon=np.float32(1), hparams=numbers.agent
+    )
+    return initial("index").replace(agent_state=inner, hparams=numbers.icm)
 
 
 def test_a_wrapped_ddqn_learns_as_a_plain_one_from_the_rewards_with_the_bonus(updates):
     plain = make_ddqn(DDQN, OBS_DIM, WIDTH)
     agent = curious("index", plain)
-    state, batch = agent.init(jax.random.key(2), agent.hparams), random_batch(3, "index")
+    state, batch = wrapped_ddqn_state(), random_batch(3, "index")
     after = jax.jit(agent.update)(KEY, state, batch)
     stub_state = fresh("index").replace(params=state.params)
-    rewards = updates["index"](KEY, stub_state, batch).agent_state.reward
+    rewards = np.asarray(updates["index"](KEY, stub_state, batch).agent_state.reward)
     assert (rewards > batch.reward).all()
     expected = jax.jit(plain.update)(KEY, state.agent_state, batch._replace(reward=rewards))
     np.testing.assert_allclose(after.agent_state.params, expected.params, rtol=1e-5, atol=1e-7)
-    same = jax.tree.map(
-        lambda a, b: a.dtype == b.dtype and a.weak_type == b.weak_type, state, after
-    )
-    assert jax.tree.all(same)
+    before = jax.eval_shape(agent.init, KEY, agent.hparams)
+    after = jax.eval_shape(agent.update, KEY, before, batch)
+    assert jax.tree.leaves(after) == jax.tree.leaves(before)  # shape, dtype and weak type
 
 
 def test_indices_and_their_one_hot_vectors_have_the_same_bonus(updates):
     # Discrete TD3 keeps vectors: they go to the forward model as they are.
     batch = random_batch(4, "index")
     state = fresh("index", learning_rate=0.0)
-    one_hot = batch._replace(action=jax.nn.one_hot(batch.action, WIDTH, axis=0))
+    one_hot = batch._replace(action=np.eye(WIDTH, dtype=np.float32)[:, batch.action])
     expected = bonus(updates["index"](KEY, state, batch), batch)
     got = bonus(updates["index"](KEY, state, one_hot), batch)
     np.testing.assert_allclose(got, expected, rtol=1e-6, atol=1e-7)
@@ -315,11 +336,17 @@ def test_hyperparameters_are_traced_so_that_a_population_may_vary_them():
 # --- rollouts ------------------------------------------------------------------------------------
 
 
+pack_all = jax.jit(jax.vmap(pack, -1))
+
+
 def as_rollout(batch, is_full=True):
     """The batch as a rollout's rows; the episode ended in the third step."""
     ended = np.float32(np.arange(BATCH) == 2)
-    rows = jnp.concatenate([jax.vmap(pack, -1)(batch), ended[:, None]], axis=1)
-    return Rollout(rows=rows, is_full=jnp.bool_(is_full))
+    columns = (batch.obs, batch.next_obs, np.atleast_2d(batch.action), batch.reward[None],
+               batch.discount[None], ended[None])  # fmt: skip
+    rows = np.concatenate(columns).astype(np.float32).T
+    np.testing.assert_array_equal(rows[:, :-1], pack_all(batch))
+    return Rollout(rows=rows, is_full=np.bool_(is_full))
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -335,9 +362,9 @@ def test_a_full_rollout_gets_the_bonus_first_and_then_trains_the_models_once(kin
         after.agent_state.reward, before.agent_state.reward, rtol=1e-5, atol=1e-6
     )
     np.testing.assert_allclose(after.params, trained.params, rtol=1e-5, atol=1e-6)
-    assert np.abs(trained.agent_state.reward - before.agent_state.reward).max() > 1e-4
+    assert np.abs(bonus(trained, batch) - bonus(before, batch)).max() > 1e-4
     assert after.agent_state.updates == 1
-    changed = np.asarray(after.agent_state.rows != rollout.rows).any(axis=0)
+    changed = (np.asarray(after.agent_state.rows) != rollout.rows).any(axis=0)
     assert list(np.flatnonzero(changed)) == [rollout.rows.shape[1] - 3]  # the rewards alone
 
 
@@ -346,8 +373,9 @@ def test_a_rollout_that_is_not_full_changes_nothing_alone_and_in_lanes(updates):
     waiting = updates["index"](KEY, state, as_rollout(batch, is_full=False))
     jax.tree.map(np.testing.assert_array_equal, waiting, state)
     full = updates["index"](KEY, state, as_rollout(batch))
-    lanes = jax.tree.map(lambda *x: jnp.stack(x), as_rollout(batch, False), as_rollout(batch))
+    lanes = jax.tree.map(lambda *x: np.stack(x), as_rollout(batch, False), as_rollout(batch))
     both = jax.jit(jax.vmap(curious("index").update, (None, None, 0)))(KEY, state, lanes)
+    both = jax.tree.map(np.asarray, both)
     jax.tree.map(lambda x, y: np.testing.assert_array_equal(x[0], y), both, state)
     jax.tree.map(lambda x, y: np.testing.assert_allclose(x[1], y, rtol=1e-5, atol=1e-6), both, full)
 
@@ -360,12 +388,25 @@ def test_everything_else_is_the_wrapped_agents():
     for name in ("memory", "init_episodes", "learns_from", "env_action", "action_repeat"):
         assert getattr(agent, name) is getattr(STUBS["index"], name)
     assert agent.hparams == ((), (0.01, 0.3, 0.5))
+    assert agent.hparams.icm._fields == ("learning_rate", "forward_weight", "reward_scale")
+    state = jax.jit(agent.init)(jax.random.key(1), agent.hparams)
+    expected = initial("index")
+    np.testing.assert_allclose(state.params, expected.params, rtol=1e-5, atol=1e-7)
+    rest = [x.replace(params=None) for x in (state, expected)]
+    jax.tree.map(np.testing.assert_array_equal, *rest)
     ddqn = make_ddqn(DDQN, OBS_DIM, WIDTH)
     agent = curious("index", ddqn)
-    state = agent.begin_episode(agent.init(KEY, agent.hparams), jnp.int32(3))
-    inner = ddqn.begin_episode(state.agent_state, jnp.int32(3))
-    assert state.agent_state.epsilon == inner.epsilon and 0 < inner.epsilon < 1
-    obs = jnp.array([0.3, -0.2, 0.5])
-    for seed in range(5):
-        key = jax.random.key(seed)
-        assert agent.act(key, state, obs, True) == ddqn.act(key, state.agent_state, obs, True)
+    obs = np.float32([0.3, -0.2, 0.5])
+
+    @jax.jit
+    def begin_and_act(state, keys):
+        begun = agent.begin_episode(state, 3)
+        inner = ddqn.begin_episode(state.agent_state, 3)
+        actions = jax.vmap(lambda key: agent.act(key, begun, obs, True))(keys)
+        expected = jax.vmap(lambda key: ddqn.act(key, inner, obs, True))(keys)
+        return begun.agent_state.epsilon, inner.epsilon, actions, expected
+
+    keys = jnp.stack([jax.random.key(seed) for seed in range(5)])
+    epsilon, expected_epsilon, *actions = begin_and_act(wrapped_ddqn_state(), keys)
+    assert epsilon == expected_epsilon and 0 < epsilon < 1
+    np.testing.assert_array_equal(*actions)

@@ -7,34 +7,53 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sejax.configs import EVOSAX_ALGORITHMS, EvosaxConfig, NESConfig
-from sejax.es import make_strategy
-from sejax.es.nes import aggregate, finite_mean
-from sejax.es.strategy import finite_fitness
+from sejax import plugins
+from sejax.es.evosax import ALGORITHMS, EvosaxConfig, finite_fitness
+from sejax.es.nes import NESConfig
 
 NAN, INF = np.nan, np.inf
 DIMS = 6
 MEAN = np.array([0.3, -0.2, 0.1, 0.5, -0.4, 0.2], np.float32)
 
 
+def whole_generations(strategy):
+    """`ask` and `tell` of all that a generation tries, the incumbent included, as bilevel.py does.
+
+    `ask(key, state) -> (candidates, state)`, `tell(key, candidates, scores, state) -> state`.
+    """
+    trials = strategy.trials
+
+    def ask(key, state):
+        members, state = strategy.ask(key, state)
+        return trials.candidates(members, strategy.incumbent(state)), state
+
+    def tell(key, candidates, scores, state):
+        tried, of_incumbent = trials.split(scores)
+        members = candidates[: tried.shape[0] : trials.num_evals]
+        _, incumbent = trials.of_incumbent(of_incumbent, tried)
+        return strategy.tell(key, members, trials.of_members(tried), incumbent, state)
+
+    return ask, tell
+
+
 @functools.cache
 def nes(**fields):
     """Strategy with jitted `ask` and `tell`, by config fields; population 3 unless told."""
-    strategy = make_strategy(NESConfig(**{"population_size": 3, **fields}), DIMS)
-    return strategy, jax.jit(strategy.ask), jax.jit(strategy.tell)
+    strategy = NESConfig(**{"population_size": 3, **fields}).make(DIMS)
+    return strategy, *map(jax.jit, whole_generations(strategy))
 
 
 def asked(seed=1, **fields):
     strategy, ask, tell = nes(**fields)
     state = strategy.init(jax.random.key(0), jnp.array(MEAN))
     candidates, state = ask(jax.random.key(seed), state)
-    return np.asarray(candidates), state, tell
+    return np.asarray(candidates), jax.tree.map(np.asarray, state), tell
 
 
 def told(scores, seed=1, **fields):
     """State after one generation with these scores, and the candidates that had them."""
     candidates, state, tell = asked(seed, **fields)
-    return tell(jax.random.key(2), candidates, jnp.array(scores, jnp.float32), state), candidates
+    return tell(jax.random.key(2), candidates, np.array(scores, np.float32), state), candidates
 
 
 # --- candidates ----------------------------------------------------------------------------------
@@ -52,7 +71,8 @@ def test_candidates_are_plus_then_minus_then_the_incumbents():
     strategy, _, _ = nes(num_evals=2)
     # 3 members, each sign evaluated twice in a row, then one incumbent for each member.
     assert candidates.shape == (3 * 2 + 3 * 2 + 3, DIMS)
-    assert (strategy.num_candidates, strategy.num_incumbent_evals) == (15, 3)
+    assert (strategy.num_candidates, strategy.num_members) == (15, 6)
+    assert strategy.trials.num_incumbent_evals == 3
     np.testing.assert_array_equal(candidates[:12:2], candidates[1:12:2])
     np.testing.assert_allclose(candidates[:6] - MEAN, MEAN - candidates[6:12], atol=1e-7)
     np.testing.assert_array_equal(candidates[12:], np.tile(MEAN, (3, 1)))
@@ -66,15 +86,17 @@ def test_without_mirroring_there_is_no_minus_half():
 
 
 def test_a_generation_of_the_paper_trains_48_agents():
-    strategy = make_strategy(NESConfig(), DIMS)
-    assert (strategy.num_candidates, strategy.num_incumbent_evals) == (48, 16)
+    strategy = NESConfig().make(DIMS)
+    assert (strategy.num_candidates, strategy.trials.num_incumbent_evals) == (48, 16)
+    fewer = NESConfig(num_incumbent_evals=5).make(DIMS)
+    assert (fewer.num_candidates, fewer.trials.num_incumbent_evals) == (37, 5)
 
 
 def test_the_noise_is_normal_with_the_configured_std():
-    strategy = make_strategy(NESConfig(population_size=50, noise_std=0.05), 400)
+    strategy = NESConfig(population_size=50, noise_std=0.05).make(400)
     state = strategy.init(jax.random.key(0), jnp.zeros(400))
-    candidates, _ = strategy.ask(jax.random.key(1), state)
-    noise = np.asarray(candidates[:50]) / 0.05
+    members, _ = jax.jit(strategy.ask)(jax.random.key(1), state)
+    noise = np.asarray(members)[:50] / 0.05
     n = noise.size
     assert abs(noise.mean()) < 5 / np.sqrt(n)
     assert abs(noise.var() - 1) < 5 * np.sqrt(2 / n)
@@ -138,15 +160,16 @@ def test_generations_equal_a_numpy_loop(update_rule, aggregate_by):
         population_size=4, num_evals=3, eval_aggregate=aggregate_by, update_rule=update_rule,
         noise_std=0.2, noise_std_decay=0.9, step_size=0.5, step_size_decay=0.8, weight_decay=0.1,
     )  # fmt: skip
-    strategy = make_strategy(config, DIMS)
+    strategy = config.make(DIMS)
+    ask, tell = map(jax.jit, whole_generations(strategy))
     state = strategy.init(jax.random.key(0), jnp.array(MEAN))
     rng = np.random.default_rng(0)
     mean = MEAN.astype(np.float64)
     for number in range(3):
-        candidates, state = strategy.ask(jax.random.key(number), state)
+        candidates, state = ask(jax.random.key(number), state)
         scores = rng.normal(size=strategy.num_candidates)
         scores[-4:] -= 0.5
-        state = strategy.tell(jax.random.key(0), candidates, jnp.float32(scores), state)
+        state = tell(jax.random.key(0), candidates, jnp.float32(scores), state)
         mean = numpy_generation(
             mean, np.asarray(candidates, np.float64), scores, config,
             noise_std=0.2 * 0.9**number, step_size=0.5 * 0.8**number,
@@ -182,9 +205,10 @@ def test_the_proxy_stays_if_no_member_beats_the_incumbents_mean():
 
 
 def test_diverged_scores_never_reach_the_mean():
-    # Member 0 diverged with both signs; members 1 and 2 score 5 and 3 by their plus. The
-    # incumbents' finite mean is 2: advantages 3 and 1, weights 3/4 and 1/4.
-    scores = [NAN, 5, 3, INF, NAN, 1, 1, NAN, 3]
+    # Member 0 diverged with both signs; members 1 and 2 score 5 and 3 by their plus. The lowest
+    # score of all is 1, which the incumbent's agent that diverged gets: mean (1 + 1 + 4) / 3 = 2,
+    # advantages 3 and 1, weights 3/4 and 1/4.
+    scores = [NAN, 5, 3, INF, NAN, 1, 1, NAN, 4]
     state, candidates = told(scores)
     noise = candidates[:3] - MEAN
     expected = MEAN + 0.75 * noise[1] + 0.25 * noise[2]
@@ -198,21 +222,17 @@ def test_a_generation_that_diverged_as_a_whole_leaves_the_proxy_as_it_was():
 
 def test_enormous_noise_that_diverged_leaves_no_trace():
     # Weights are 0 where eps is 1e30: the product must be 0 and not nan.
-    state, candidates = told([NAN, 1, NAN, NAN, 0, NAN, 0, 0, 0], noise_std=1e30)
-    np.testing.assert_allclose(state.mean, candidates[1], rtol=1e-5)
-    state, _ = told([NAN] * 6 + [0, 0, 0], noise_std=1e30)
-    np.testing.assert_array_equal(state.mean, MEAN)
+    strategy, ask, tell = nes()
+    start = strategy.init(jax.random.key(0), jnp.array(MEAN))
+    candidates, state = ask(jax.random.key(1), start.replace(noise_std=jnp.float32(1e30)))
 
+    def mean_after(scores):
+        return tell(jax.random.key(2), candidates, jnp.array(scores, jnp.float32), state).mean
 
-def test_aggregates_are_not_finite_if_one_evaluation_is_not():
-    scores = jnp.array([[1.0, 3.0], [2.0, NAN], [INF, 0.0], [-4.0, -4.0]])
-    np.testing.assert_array_equal(aggregate(scores, "mean"), [2.0, NAN, NAN, -4.0])
-    np.testing.assert_array_equal(aggregate(scores, "min"), [1.0, NAN, NAN, -4.0])
-
-
-def test_the_finite_mean_leaves_out_what_diverged():
-    assert finite_mean(jnp.array([1.0, NAN, 5.0, -INF])) == 3.0
-    assert np.isnan(finite_mean(jnp.array([NAN, INF])))
+    np.testing.assert_allclose(
+        mean_after([NAN, 1, NAN, NAN, 0, NAN, 0, 0, 0]), candidates[1], rtol=1e-5
+    )
+    np.testing.assert_array_equal(mean_after([NAN] * 6 + [0, 0, 0]), MEAN)
 
 
 # --- statistics ----------------------------------------------------------------------------------
@@ -226,13 +246,14 @@ def test_the_mean_step_on_a_linear_score_points_along_its_gradient(score_transfo
     config = NESConfig(
         population_size=8, noise_std=0.1, score_transform=score_transform, mirrored=mirrored
     )
-    strategy = make_strategy(config, DIMS)
+    strategy = config.make(DIMS)
+    ask, tell = whole_generations(strategy)
     start = strategy.init(jax.random.key(0), jnp.array(MEAN))
 
     def step(key):
-        candidates, state = strategy.ask(key, start)
+        candidates, state = ask(key, start)
         scores = candidates @ jnp.array(gradient, jnp.float32)
-        return strategy.tell(key, candidates, scores, state).mean - MEAN
+        return tell(key, candidates, scores, state).mean - MEAN
 
     steps = np.asarray(jax.jit(jax.vmap(step))(jax.random.split(jax.random.key(1), 2000)))
     along = steps @ direction
@@ -241,26 +262,6 @@ def test_the_mean_step_on_a_linear_score_points_along_its_gradient(score_transfo
     error = across.std(axis=0) / np.sqrt(len(steps))
     assert (np.abs(across.mean(axis=0)) <= 5 * error + 1e-7).all()
     assert along.mean() > 20 * along.std() / np.sqrt(len(steps))
-
-
-# --- seeds ---------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("config", [NESConfig(population_size=3, num_evals=2),
-                                    EvosaxConfig(population_size=4, num_evals=2)])  # fmt: skip
-def test_every_candidate_trains_with_its_own_seed_unless_asked_otherwise(config):
-    strategy = make_strategy(config, DIMS)
-    assert len(set(strategy.seed_ids.tolist())) == strategy.num_candidates
-
-
-def test_common_random_numbers_give_each_evaluation_of_a_member_the_same_seeds():
-    # 3 members, 2 signs, 2 evaluations: seeds 0 and 1 for each; the incumbents 0, 1, 2.
-    config = NESConfig(population_size=3, num_evals=2, common_random_numbers=True)
-    seed_ids = make_strategy(config, DIMS).seed_ids
-    np.testing.assert_array_equal(seed_ids, [0, 1] * 6 + [0, 1, 2])
-    config = EvosaxConfig(population_size=4, num_incumbent_evals=3, common_random_numbers=True)
-    seed_ids = make_strategy(config, DIMS).seed_ids
-    np.testing.assert_array_equal(seed_ids, [0] * 4 + [0, 1, 2])
 
 
 # --- contract of every strategy ------------------------------------------------------------------
@@ -277,7 +278,7 @@ OTHERS = [
             else []
         ),
     )
-    for name in EVOSAX_ALGORITHMS
+    for name in ALGORITHMS
     if name not in USUAL
 ]
 
@@ -286,25 +287,30 @@ def evosax_strategy(name, **fields):
     config = EvosaxConfig(
         name=name, population_size=16, num_incumbent_evals=2, noise_std=0.1, **fields
     )
-    return make_strategy(config, DIMS)
+    return config.make(DIMS)
 
 
 def test_the_names_are_evosaxs_own_distribution_based_algorithms():
     from evosax.algorithms import distribution_based_algorithms
 
     without_a_mean = {"RandomSearch", "SV_CMA_ES", "SV_Open_ES"}
-    assert set(EVOSAX_ALGORITHMS.values()) == set(distribution_based_algorithms) - without_a_mean
-    assert list(EVOSAX_ALGORITHMS) == sorted(EVOSAX_ALGORITHMS)
+    assert set(ALGORITHMS.values()) == set(distribution_based_algorithms) - without_a_mean
+    assert list(ALGORITHMS) == sorted(ALGORITHMS)
+    assert plugins.names("es") == ["nes", *ALGORITHMS]
 
 
-@pytest.mark.parametrize("name", EVOSAX_ALGORITHMS)
+@pytest.mark.parametrize("name", ALGORITHMS)
 def test_every_algorithm_asks_for_its_population_and_the_incumbent(name):
     strategy = evosax_strategy(name)
     state = jax.eval_shape(strategy.init, jax.random.key(0), jnp.array(MEAN))
-    candidates, after_ask = jax.eval_shape(strategy.ask, jax.random.key(1), state)
-    assert candidates.shape == (strategy.num_candidates, DIMS) == (18, DIMS)
-    assert strategy.num_incumbent_evals == 2
-    after = jax.eval_shape(strategy.tell, jax.random.key(2), candidates, jnp.zeros(18), after_ask)
+    members, asked = jax.eval_shape(strategy.ask, jax.random.key(1), state)
+    assert members.shape == (strategy.num_members, DIMS) == (16, DIMS)
+    assert (strategy.num_candidates, strategy.trials.num_incumbent_evals) == (18, 2)
+    assert jax.eval_shape(strategy.incumbent, asked).shape == (DIMS,)
+    scores = members.update(shape=(16,))
+    incumbent = members.update(shape=())
+    key = jax.random.key(2)
+    after = jax.eval_shape(strategy.tell, key, members, scores, incumbent, asked)
     assert jax.eval_shape(strategy.incumbent, after).shape == (DIMS,)
     # A scan carries the state: its structure, shapes and types must not change.
     assert jax.tree.map(lambda x: (x.shape, x.dtype), after) == jax.tree.map(
@@ -320,17 +326,18 @@ def climb(strategy, generations):
 
     Two trainings of each generation diverge, others each time, and in the tenth all do.
     """
+    ask, tell = whole_generations(strategy)
     index = jnp.arange(strategy.num_candidates)
 
     def generation(state, scan):
         number, key = scan
         key_ask, key_tell = jax.random.split(key)
-        candidates, state = strategy.ask(key_ask, state)
+        candidates, state = ask(key_ask, state)
         true_scores = -jnp.sum((candidates - TARGET) ** 2, axis=-1)
         diverged = (5 * number + jnp.array([[0], [1]])) % 16 == index  # [2, candidates]
         scores = jnp.where(diverged[0], NAN, jnp.where(diverged[1], INF, true_scores))
         scores = jnp.where(number == 10, NAN, scores)
-        return strategy.tell(key_tell, candidates, scores, state), true_scores[-1]
+        return tell(key_tell, candidates, scores, state), true_scores[-1]
 
     state = strategy.init(jax.random.key(0), jnp.zeros(DIMS))
     scan = jnp.arange(generations), jax.random.split(jax.random.key(1), generations)
@@ -359,14 +366,14 @@ def test_every_algorithm_maximises_scores_though_some_trainings_diverge(name):
     ids=str,
 )
 def test_the_papers_nes_maximises_scores_though_some_trainings_diverge(fields):
-    scores = climb(make_strategy(NESConfig(population_size=16, **fields), DIMS), 40)
+    scores = climb(NESConfig(population_size=16, **fields).make(DIMS), 40)
     assert scores[0] < -1.1 and scores[-1] > -0.1
 
 
 def test_the_incumbent_of_evosax_is_the_mean_at_the_end_of_the_candidates():
     strategy = evosax_strategy("open_es", num_evals=2)
     state = strategy.init(jax.random.key(0), jnp.array(MEAN))
-    candidates, state = strategy.ask(jax.random.key(1), state)
+    candidates, state = jax.jit(whole_generations(strategy)[0])(jax.random.key(1), state)
     assert candidates.shape == (2 * 16 + 2, DIMS)
     np.testing.assert_array_equal(candidates[:32:2], candidates[1:32:2])
     np.testing.assert_allclose(candidates[-2:], np.tile(MEAN, (2, 1)), rtol=1e-6)

@@ -1,18 +1,27 @@
 """sejax.networks: initial values, layout and the forward pass."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from support import numpy_forward
+from support import numpy_forward, random_like, shapes_of
 
-from sejax.configs import ACTIVATIONS
-from sejax.networks import MLP, PRELU_SLOPE, affine
+from sejax.networks import ACTIVATIONS, MLP, PRELU_SLOPE, affine
+
+
+@functools.cache
+def network(num_inputs, *sizes, **options):
+    """The jitted network, and random parameters for it."""
+    net = MLP(*sizes, **options)
+    shapes = shapes_of(net.init, jax.random.key(0), np.zeros(num_inputs))["params"]
+    return jax.jit(lambda params, x: net.apply({"params": params}, x)), random_like(shapes)
 
 
 def test_initial_weights_and_biases_are_uniform_within_one_over_root_fan_in():
     net = MLP(num_outputs=50, hidden_size=200, num_layers=2, activation="relu")
-    params = net.init(jax.random.key(0), jnp.zeros(9))["params"]
+    params = jax.jit(net.init)(jax.random.key(0), np.zeros(9, np.float32))["params"]
     # fan-in of each layer: the input, then the hidden size twice; for biases that of their layer.
     for layer, (fan_in, fan_out) in enumerate([(9, 200), (200, 200), (200, 50)]):
         bound = fan_in**-0.5
@@ -29,7 +38,7 @@ def test_initial_weights_and_biases_are_uniform_within_one_over_root_fan_in():
 
 def test_layers_are_initialised_independently():
     net = MLP(num_outputs=8, hidden_size=8, num_layers=2, activation="relu")
-    params = net.init(jax.random.key(0), jnp.zeros(8))["params"]
+    params = jax.jit(net.init)(jax.random.key(0), np.zeros(8, np.float32))["params"]
     kernels = [np.asarray(params[f"Dense_{i}"]["kernel"]).ravel() for i in range(3)]
     correlations = np.corrcoef(kernels)[np.triu_indices(3, 1)]
     assert np.abs(correlations).max() < 5 / np.sqrt(64)
@@ -38,66 +47,69 @@ def test_layers_are_initialised_independently():
 @pytest.mark.parametrize("num_layers", [1, 2])
 @pytest.mark.parametrize("activation", ACTIVATIONS)
 def test_forward_equals_a_numpy_loop(activation, num_layers):
-    net = MLP(num_outputs=3, hidden_size=5, num_layers=num_layers, activation=activation)
-    params = net.init(jax.random.key(1), jnp.zeros(4))["params"]
+    apply, params = network(4, 3, 5, num_layers, activation)
     for x in np.random.default_rng(0).normal(size=(5, 4)) * 2:
         expected = numpy_forward(params, x, activation, num_layers)
-        got = net.apply({"params": params}, jnp.float32(x))
-        np.testing.assert_allclose(got, expected, rtol=1e-5, atol=1e-6)
+        np.testing.assert_allclose(apply(params, np.float32(x)), expected, rtol=1e-5, atol=1e-6)
 
 
 def test_a_feature_major_batch_equals_single_inputs():
-    net = MLP(num_outputs=3, hidden_size=5, num_layers=2, activation="tanh")
-    variables = net.init(jax.random.key(2), jnp.zeros(4))
-    batch = jax.random.normal(jax.random.key(3), (4, 7))  # [feature, batch]
-    together = net.apply(variables, batch)
+    apply, params = network(4, 3, 5, 2, "tanh")
+    batch = np.float32(np.random.default_rng(3).normal(size=(4, 7)))  # [feature, batch]
+    together = np.asarray(apply(params, batch))
     assert together.shape == (3, 7)
     for column in range(7):
-        alone = net.apply(variables, batch[:, column])
+        alone = apply(params, batch[:, column])
         np.testing.assert_allclose(together[:, column], alone, rtol=1e-5, atol=1e-6)
 
 
 def test_the_prelu_slope_of_a_proxy_is_fixed_and_no_parameter():
-    net = MLP(num_outputs=1, hidden_size=3, num_layers=2, activation="prelu")
-    params = net.init(jax.random.key(0), jnp.zeros(2))["params"]
+    _, params = network(2, 1, 3, 2, "prelu")
     assert set(params) == {"Dense_0", "Dense_1", "Dense_2"}
     assert PRELU_SLOPE == 0.25
 
 
 def test_a_learned_prelu_slope_is_one_parameter_of_the_whole_network():
     net = MLP(3, hidden_size=5, num_layers=2, activation="prelu", learn_prelu_slope=True)
-    params = net.init(jax.random.key(0), jnp.zeros(4))["params"]
+    x = np.float32([0.3, -1.0, 2.0, -0.5])
+
+    @jax.jit
+    def run(key):
+        drawn = net.init(key, x)["params"]
+        params = {**drawn, "prelu_slope": jnp.float32(0.6)}
+
+        def total(params):
+            out = net.apply({"params": params}, x)
+            return out.sum(), out
+
+        return drawn, *jax.grad(total, has_aux=True)(params)
+
+    params, gradient, got = run(jax.random.key(0))
     assert params["prelu_slope"].shape == () and params["prelu_slope"] == 0.25
-    params = {**params, "prelu_slope": jnp.float32(0.6)}
-    x = np.array([0.3, -1.0, 2.0, -0.5])
     expected = numpy_forward(params, x, "prelu", num_layers=2, prelu_slope=0.6)
-    got = net.apply({"params": params}, jnp.float32(x))
     np.testing.assert_allclose(got, expected, rtol=1e-5, atol=1e-6)
-    gradient = jax.grad(lambda p: net.apply({"params": p}, jnp.float32(x)).sum())(params)
     assert gradient["prelu_slope"] != 0
 
 
 def test_other_activations_have_no_slope_to_learn():
-    net = MLP(3, hidden_size=5, num_layers=1, activation="tanh", learn_prelu_slope=True)
-    params = net.init(jax.random.key(0), jnp.zeros(4))["params"]
+    _, params = network(4, 3, 5, 1, "tanh", learn_prelu_slope=True)
     assert set(params) == {"Dense_0", "Dense_1"}
+
+
+def plain_affine(kernel, bias, x):
+    return kernel @ x + bias[:, None]
 
 
 @pytest.mark.parametrize(("num_inputs", "num_outputs"), [(3, 2), (20, 2), (3, 20), (20, 20)])
 def test_affine_and_its_gradient_equal_the_plain_product(num_inputs, num_outputs):
-    keys = jax.random.split(jax.random.key(0), 4)
-    kernel = jax.random.normal(keys[0], (num_outputs, num_inputs))
-    bias = jax.random.normal(keys[1], (num_outputs,))
-    x = jax.random.normal(keys[2], (num_inputs, 7))
-    weight = jax.random.normal(keys[3], (num_outputs, 7))
+    shapes = [(num_outputs, num_inputs), (num_outputs,), (num_inputs, 7), (num_outputs, 7)]
+    *args, weight = random_like([np.zeros(shape) for shape in shapes], scale=1.0)
 
     def of(fn):
-        return jax.value_and_grad(lambda *args: jnp.sum(weight * fn(*args)), (0, 1, 2))(
-            kernel, bias, x
-        )
+        return jax.value_and_grad(lambda *args: jnp.sum(weight * fn(*args)), (0, 1, 2))
 
-    value, gradients = of(affine)
-    expected, expected_gradients = of(lambda k, b, x: k @ x + b[:, None])
+    both = jax.jit(lambda *args: (of(affine)(*args), of(plain_affine)(*args)))
+    (value, gradients), (expected, expected_gradients) = both(*args)
     np.testing.assert_allclose(value, expected, rtol=1e-5)
     for got, wanted in zip(gradients, expected_gradients, strict=True):
         np.testing.assert_allclose(got, wanted, rtol=1e-4, atol=1e-5)

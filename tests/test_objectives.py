@@ -1,11 +1,15 @@
 """sejax.objectives: what an outcome is worth, by hand."""
 
+import dataclasses
+import re
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sejax.configs import OBJECTIVES, ObjectiveConfig
-from sejax.objectives import Outcome, make_objective
+from sejax import envs, plugins
+from sejax.errors import ConfigError
+from sejax.objectives import AUC, AUCSum, MaxReward, Objective, Outcome, RewardThreshold
 
 
 def outcome(test_return, train_steps, nonfinite):
@@ -21,37 +25,78 @@ def outcome(test_return, train_steps, nonfinite):
     )
 
 
+def task(solved_reward=195.0):
+    return dataclasses.replace(envs.make("cartpole"), solved_reward=solved_reward)
+
+
 def test_max_reward_is_the_test_return():
-    objective = make_objective(ObjectiveConfig(name="max_reward"), solved_reward=195.0)
+    objective = MaxReward().make(task())
     got = objective(outcome([10.0, 200.0, -3.0], [1, 2, 3], [False] * 3))
     np.testing.assert_array_equal(got, [10.0, 200.0, -3.0])
 
 
 def test_reward_threshold_charges_steps_and_the_shortfall():
-    config = ObjectiveConfig(name="reward_threshold", unsolved_weight=100.0)
-    objective = make_objective(config, solved_reward=195.0)
+    objective = RewardThreshold(unsolved_weight=100.0).make(task(195.0))
     # -(500 + 100 * (195 - 190)) = -1000; -(500 + 0) for 195 and for 200.
     got = objective(outcome([190.0, 195.0, 200.0], [500, 500, 500], [False] * 3))
     np.testing.assert_array_equal(got, [-1000.0, -500.0, -500.0])
 
 
 def test_reward_threshold_prefers_fewer_steps_among_the_solved():
-    config = ObjectiveConfig(name="reward_threshold", unsolved_weight=100.0)
-    objective = make_objective(config, solved_reward=-20.0)
+    objective = RewardThreshold(unsolved_weight=100.0).make(task(-20.0))
     got = objective(outcome([-12.0, -12.0, -50.0], [300, 200, 100], [False] * 3))
     # -300, -200, and -(100 + 100 * 30) = -3100.
     np.testing.assert_array_equal(got, [-300.0, -200.0, -3100.0])
 
 
-@pytest.mark.parametrize(("name", "scores"), [("auc", [0, 0.5, 0.5]), ("auc_sum", [0, 1, 2])])
-def test_auc_is_the_mean_under_the_curve_or_the_area(name, scores):
-    objective = make_objective(ObjectiveConfig(name=name), solved_reward=195.0)
+@pytest.mark.parametrize(("config", "scores"), [(AUC(), [0, 0.5, 0.5]), (AUCSum(), [0, 1, 2])])
+def test_auc_is_the_mean_under_the_curve_or_the_area(config, scores):
+    objective = config.make(task())
     got = objective(outcome([1.0, 1.0, 1.0], [1, 2, 4], [False] * 3))  # areas 0, 1, 2
     np.testing.assert_array_equal(got, scores)
 
 
-@pytest.mark.parametrize("name", OBJECTIVES)
+@pytest.mark.parametrize("name", plugins.names("objective"))
 def test_a_training_that_diverged_has_no_score(name):
-    objective = make_objective(ObjectiveConfig(name=name), solved_reward=195.0)
+    objective = plugins.make("objective", plugins.configure("objective", {"name": name}), task())
     got = objective(outcome([200.0, 200.0], [10, 10], [True, False]))
     assert np.isnan(got[0]) and np.isfinite(got[1])
+
+
+def test_an_objective_of_ones_own_has_no_score_for_what_diverged_either():
+    objective = Objective(score=lambda outcome: -outcome.train_episodes.astype(jnp.float32))
+    got = objective(outcome([200.0, 200.0], [10, 10], [True, False]))
+    np.testing.assert_array_equal(got, [np.nan, -1.0])
+
+
+@pytest.mark.parametrize(
+    ("config", "needs_tests", "scores_are_returns"),
+    [
+        (MaxReward(), False, True), (RewardThreshold(), False, False),
+        (AUC(), True, False), (AUCSum(), True, False),
+    ],
+    ids=lambda x: type(x).__name__,
+)  # fmt: skip
+def test_an_objective_says_what_it_looks_at(config, needs_tests, scores_are_returns):
+    objective = config.make(task())
+    assert (objective.needs_tests, objective.scores_are_returns) == (
+        needs_tests, scores_are_returns
+    )  # fmt: skip
+    assert config.scores_are_returns == scores_are_returns  # known before it is made
+    assert bool(objective.meaning) != scores_are_returns
+
+
+def test_the_threshold_is_part_of_what_a_score_means():
+    objective = RewardThreshold(unsolved_weight=2.5).make(task(-110.0))
+    assert objective.meaning == (
+        "minus the training steps of its agents, and 2.5 for each unit of return below -110"
+    )
+
+
+def test_a_threshold_that_nobody_knows_is_refused_with_the_whole_message():
+    message = (
+        "objective must be one that needs no threshold in this task, because nobody says which "
+        "return solves it; got reward_threshold. Set env.solved_reward, or objective=max_reward."
+    )
+    with pytest.raises(ConfigError, match=f"^{re.escape(message)}$"):
+        RewardThreshold().make(task(np.inf))

@@ -1,5 +1,6 @@
 """sejax.agents.ppo: returns and loss by hand, phases against torch, lanes, and bandits."""
 
+import functools
 import re
 from pathlib import Path
 
@@ -7,16 +8,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jax.flatten_util import ravel_pytree
+from support import numpy_forward, raveled, shapes_of, unraveled
 
 from sejax import envs
 from sejax.agents import replay
-from sejax.agents.configs import PPOConfig
+from sejax.agents.agent import traced
 from sejax.agents.memory import Rollout
 from sejax.agents.ppo import (
     MIN_STD,
     SOFTMAX,
-    PPOHparams,
+    PPOConfig,
     discounted_returns,
     gaussian,
     make_ppo,
@@ -24,9 +25,10 @@ from sejax.agents.ppo import (
     ppo_loss,
 )
 from sejax.agents.replay import Transition
-from sejax.configs import TrainingConfig
 from sejax.networks import MLP
-from sejax.trainer import make_tester, make_trainer
+from sejax.rollout import make_tester
+from sejax.trainer import make_trainer
+from sejax.training import TrainingConfig
 
 OBS_DIM, NUM_ACTIONS, ACTION_DIM, MAX_ACTION, MAX_STEPS = 3, 4, 2, 2.0, 6
 STEPS = 13  # two episodes of full length, and one step
@@ -36,9 +38,7 @@ CONFIG = PPOConfig(
     hidden_size=5, num_layers=2, activation="tanh", learning_rate=0.01, discount=0.9,
     update_episodes=2, epochs=3, clip_ratio=0.05, value_weight=0.7, entropy_weight=0.05,
 )  # fmt: skip
-HPARAMS = PPOHparams(
-    learning_rate=0.01, discount=0.9, clip_ratio=0.05, value_weight=0.7, entropy_weight=0.05
-)
+HPARAMS = traced(CONFIG)
 KINDS = ("discrete", "continuous")
 KEY = jax.random.key(0)
 
@@ -57,30 +57,30 @@ def networks(kind, config=CONFIG):
         for size in (num_outputs, 1)
     )
     example = {
-        "actor": actor.init(KEY, jnp.zeros(OBS_DIM)),
-        "critic": critic.init(KEY, jnp.zeros(OBS_DIM)),
-        "std": jnp.zeros(std_dim),
+        "actor": shapes_of(actor.init, KEY, np.zeros(OBS_DIM)),
+        "critic": shapes_of(critic.init, KEY, np.zeros(OBS_DIM)),
+        "std": np.zeros(std_dim),
     }
-    return actor, critic, ravel_pytree(example)[1]
+    return actor, critic, lambda flat: unraveled(flat, example)
 
 
 def random_steps(kind, seed):
     """`STEPS` random transitions, one in a row, and where episodes end."""
     rng = np.random.default_rng(seed)
     if kind == "discrete":
-        action = jnp.int32(rng.integers(0, NUM_ACTIONS, STEPS))
+        action = np.int32(rng.integers(0, NUM_ACTIONS, STEPS))
     else:
-        action = jnp.float32(rng.normal(scale=0.5, size=(STEPS, ACTION_DIM)))
+        action = np.float32(rng.normal(scale=0.5, size=(STEPS, ACTION_DIM)))
     ended = np.zeros(STEPS, np.float32)
     ended[list(ENDS)] = 1.0
     steps = Transition(
-        obs=jnp.float32(rng.normal(size=(STEPS, OBS_DIM))),
+        obs=np.float32(rng.normal(size=(STEPS, OBS_DIM))),
         action=action,
-        reward=jnp.float32(rng.normal(size=STEPS)),
-        discount=jnp.float32(rng.uniform(-0.2, 1.2, STEPS)),  # must not matter
-        next_obs=jnp.float32(rng.normal(size=(STEPS, OBS_DIM))),
+        reward=np.float32(rng.normal(size=STEPS)),
+        discount=np.float32(rng.uniform(-0.2, 1.2, STEPS)),  # must not matter
+        next_obs=np.float32(rng.normal(size=(STEPS, OBS_DIM))),
     )
-    return steps, jnp.array(ended)
+    return steps, ended
 
 
 def pack(steps, ended):
@@ -89,8 +89,18 @@ def pack(steps, ended):
     return jnp.concatenate([jax.vmap(replay.pack)(steps), ended[:, None]], axis=1)
 
 
+jit_pack = jax.jit(pack)
+
+
+@functools.cache
 def rollout(kind, seed=0, is_full=True):
-    return Rollout(rows=pack(*random_steps(kind, seed)), is_full=jnp.bool_(is_full))
+    rows = np.asarray(jit_pack(*random_steps(kind, seed)))
+    return Rollout(rows=rows, is_full=np.bool_(is_full))
+
+
+@functools.cache
+def state_of(agent):
+    return jax.jit(agent.init)(jax.random.key(1), agent.hparams)
 
 
 @pytest.fixture(scope="module", params=KINDS)
@@ -105,7 +115,7 @@ def agent(kind):
 
 @pytest.fixture(scope="module")
 def state(agent):
-    return agent.init(jax.random.key(1), agent.hparams)
+    return state_of(agent)
 
 
 @pytest.fixture(scope="module")
@@ -124,7 +134,8 @@ def test_returns_by_hand():
     # gamma = 0.5. The first episode ends at its third step, the second is cut after two:
     # 4; 2 + 0.5 * 4 = 4; 1 + 0.5 * 4 = 3. Then 6, and 8 + 0.5 * 6 = 11.
     reward, ended = jnp.array([1.0, 2.0, 4.0, 8.0, 6.0]), jnp.array([0.0, 0.0, 1.0, 0.0, 0.0])
-    np.testing.assert_allclose(discounted_returns(reward, ended, 0.5), [3.0, 4.0, 4.0, 11.0, 6.0])
+    got = jax.jit(discounted_returns)(reward, ended, 0.5)
+    np.testing.assert_allclose(got, [3.0, 4.0, 4.0, 11.0, 6.0])
 
 
 @pytest.mark.parametrize("ends", [(), ENDS, (STEPS - 1,), range(STEPS)])
@@ -144,9 +155,10 @@ def test_returns_equal_a_plain_loop(ends):
 
 def test_normalized_returns_have_mean_zero_and_std_one():
     # Mean 2; unbiased variance (1 + 0 + 1) / 2 = 1.
-    np.testing.assert_allclose(normalized(jnp.array([1.0, 2.0, 3.0])), [-1, 0, 1], rtol=2e-5)
-    np.testing.assert_array_equal(normalized(jnp.full(4, 3.0)), 0.0)
-    np.testing.assert_array_equal(normalized(jnp.array([3.0])), 0.0)
+    got = jax.jit(normalized)
+    np.testing.assert_allclose(got(np.float32([1, 2, 3])), [-1, 0, 1], rtol=2e-5)
+    np.testing.assert_array_equal(got(np.float32([3, 3, 3])), 0.0)
+    np.testing.assert_array_equal(got(np.float32([3])), 0.0)
 
 
 # --- the loss ------------------------------------------------------------------------------------
@@ -156,20 +168,18 @@ def loss_inputs():
     """Columns on both sides of the clip with advantages of both signs."""
     rng = np.random.default_rng(3)
     names = ("log_prob", "entropy", "value", "old_log_prob", "returns")
-    inputs = {name: jnp.float32(rng.normal(size=STEPS)) for name in names}
-    return inputs | {"old_log_prob": inputs["log_prob"] + 0.2 * inputs["old_log_prob"]}
+    inputs = {name: np.float32(rng.normal(size=STEPS)) for name in names}
+    return inputs | {"old_log_prob": inputs["log_prob"] + np.float32(0.2) * inputs["old_log_prob"]}
 
 
 def test_loss_by_hand():
-    hp = PPOHparams(
-        learning_rate=0.0, discount=0.0, clip_ratio=0.2, value_weight=0.5, entropy_weight=0.1
-    )
+    hp = HPARAMS._replace(clip_ratio=0.2, value_weight=0.5, entropy_weight=0.1)
     # Ratios 2, 2, 0.5, 0.5 and advantages 1, -1, 1, -1. The smaller of the ratio's and of the
     # clipped ratio's product: min(2, 1.2), min(-2, -1.2), min(0.5, 0.8), min(-0.5, -0.8); mean
     # (1.2 - 2 + 0.5 - 0.8) / 4 = -0.275. Value error 1, entropy 3: 0.275 + 0.5 - 0.3 = 0.475.
-    log_prob = jnp.log(jnp.array([2.0, 2.0, 0.5, 0.5]))
-    returns = jnp.array([1.0, -1.0, 1.0, -1.0])
-    loss = ppo_loss(log_prob, jnp.full(4, 3.0), jnp.zeros(4), jnp.zeros(4), returns, hp)
+    log_prob = np.log(np.float32([2.0, 2.0, 0.5, 0.5]))
+    returns, zeros = np.float32([1.0, -1.0, 1.0, -1.0]), np.zeros(4, np.float32)
+    loss = jax.jit(ppo_loss)(log_prob, zeros + 3, zeros, zeros, returns, hp)
     np.testing.assert_allclose(loss, 0.475, rtol=1e-6)
 
 
@@ -177,19 +187,22 @@ def test_loss_and_gradients_equal_torchs():
     golden = np.load(GOLDEN)  # made by torch_ppo.py
     inputs = loss_inputs()
     others = {name: inputs.pop(name) for name in ("old_log_prob", "returns")}
-    loss, gradients = jax.value_and_grad(lambda x: ppo_loss(**x, **others, hp=HPARAMS))(inputs)
+    loss_fn = jax.jit(jax.value_and_grad(lambda x: ppo_loss(**x, **others, hp=HPARAMS)))
+    loss, gradients = loss_fn(inputs)
     np.testing.assert_allclose(loss, golden["loss"], rtol=1e-6)
     for name, gradient in gradients.items():
         np.testing.assert_allclose(gradient, golden[f"loss/{name}"], rtol=1e-5, atol=1e-7)
 
 
 def test_loss_and_gradients_are_finite_however_far_the_policy_has_moved():
+    @jax.jit
+    @jax.value_and_grad
     def loss(log_prob):
         values = jnp.array([3.0, -3.0])
         return ppo_loss(log_prob, values, values, jnp.zeros(2), jnp.zeros(2), HPARAMS)
 
     for log_ratio in (1e5, -1e5):
-        value, gradient = jax.value_and_grad(loss)(jnp.full(2, log_ratio))
+        value, gradient = loss(np.full(2, log_ratio, np.float32))
         assert np.isfinite(value) and np.isfinite(gradient).all()
 
 
@@ -198,7 +211,7 @@ def test_loss_and_gradients_are_finite_however_far_the_policy_has_moved():
 
 def test_learning_phases_equal_torchs(kind, state, update):
     golden = np.load(GOLDEN)
-    state = state.replace(params=jnp.asarray(golden[f"{kind}/params/0"]))
+    state = state.replace(params=golden[f"{kind}/params/0"])
     for number in (1, 2):
         state = update(KEY, state, rollout(kind, number))
         expected = golden[f"{kind}/params/{number}"]
@@ -209,20 +222,23 @@ def test_nothing_changes_until_the_rollout_is_full(kind, state, update):
     assert_equal(update(KEY, state, rollout(kind, is_full=False)), state)
     after = update(KEY, state, rollout(kind))
     assert after.opt_state.count == CONFIG.epochs
-    assert np.abs(after.params - state.params).max() > 0.01
+    assert np.abs(np.asarray(after.params) - np.asarray(state.params)).max() > 0.01
 
 
-def test_lanes_learn_as_they_would_alone(kind, agent, update):
-    keys = jax.random.split(KEY, 3)
-    states = jax.vmap(agent.init, (0, None))(keys, agent.hparams)
-    rates = jnp.array([0.05, 0.05, 0.01])
-    states = states.replace(hparams=states.hparams._replace(learning_rate=rates))
+def test_lanes_learn_as_they_would_alone(kind, agent, state, update):
+    # With their own parameters and learning rates; the second one's rollout is not full.
+    rates = (0.05, 0.05, 0.01)
+    lanes = [
+        state.replace(params=np.asarray(state.params) * np.float32(scale),
+                      hparams=state.hparams._replace(learning_rate=np.float32(rate)))
+        for scale, rate in zip((1.0, 0.8, -1.2), rates, strict=True)
+    ]  # fmt: skip
     rollouts = [rollout(kind, seed, seed != 1) for seed in range(3)]
-    stacked = jax.tree.map(lambda *x: jnp.stack(x), *rollouts)
-    lanes = jax.jit(jax.vmap(agent.update, (None, 0, 0)))(KEY, states, stacked)
-    for lane in range(3):
-        before, got = (jax.tree.map(lambda x: x[lane], s) for s in (states, lanes))  # noqa: B023
-        alone = update(KEY, before, rollouts[lane])
+    states, stacked = (jax.tree.map(lambda *x: np.stack(x), *each) for each in (lanes, rollouts))
+    together = jax.jit(jax.vmap(agent.update, (None, 0, 0)))(KEY, states, stacked)
+    together = jax.tree.map(np.asarray, together)
+    for lane, (before, own) in enumerate(zip(lanes, rollouts, strict=True)):
+        got, alone = jax.tree.map(lambda x: x[lane], together), update(KEY, before, own)  # noqa: B023
         jax.tree.map(
             lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-6), got, alone
         )
@@ -233,8 +249,8 @@ def test_a_step_without_a_phase_does_none_of_its_work():
     # Were any of these epochs made, this test would not end.
     config = PPOConfig(**{**vars(CONFIG), "epochs": 10**9})
     agent = ppo("discrete", config)
-    states = jax.vmap(agent.init, (0, None))(jax.random.split(KEY, 2), agent.hparams)
-    rollouts = jax.tree.map(lambda x: jnp.stack([x, x]), rollout("discrete", is_full=False))
+    states = jax.tree.map(lambda x: np.stack([x, x]), state_of(ppo("discrete")))
+    rollouts = jax.tree.map(lambda x: np.stack([x, x]), rollout("discrete", is_full=False))
     compiled = jax.jit(jax.vmap(agent.update, (None, 0, 0))).lower(KEY, states, rollouts).compile()
     assert_equal(compiled(KEY, states, rollouts), states)
     # Nor has the compiler moved anything that is as long as the rollout out of the phase.
@@ -252,16 +268,18 @@ def test_a_state_keeps_its_types_so_that_loops_may_carry_it(kind, agent, state):
 
 
 def test_the_std_stops_at_its_floor_and_can_grow_again():
-    config = {**vars(CONFIG), "init_action_std": 0.1, "learning_rate": 0.05}
-    agent = ppo("continuous", PPOConfig(**config))
+    agent = ppo("continuous")
     update = jax.jit(agent.update)
     _, _, unravel = networks("continuous")
 
     def learn(state, entropy_weight):
-        hparams = state.hparams._replace(entropy_weight=jnp.float32(entropy_weight))
+        hparams = state.hparams._replace(entropy_weight=np.float32(entropy_weight),
+                                         learning_rate=np.float32(0.05))  # fmt: skip
         return update(KEY, state.replace(hparams=hparams), rollout("continuous"))
 
-    state = learn(agent.init(KEY, agent.hparams), entropy_weight=-1000.0)
+    state = state_of(agent)
+    params = {**unravel(state.params), "std": np.full(ACTION_DIM, 0.1, np.float32)}
+    state = learn(state.replace(params=raveled(params)), entropy_weight=-1000.0)
     np.testing.assert_array_equal(unravel(state.params)["std"], np.float32(MIN_STD))
     for _ in range(3):
         state = learn(state, entropy_weight=1e5)
@@ -269,10 +287,11 @@ def test_the_std_stops_at_its_floor_and_can_grow_again():
 
 
 def test_a_phase_starts_with_the_step_that_fills_the_rollout(agent):
-    state, obs, zero = agent.init(KEY, agent.hparams), jnp.zeros(OBS_DIM), jnp.float32(0)
-    example = Transition(obs, agent.act(KEY, state, obs, True), zero, zero, obs)
+    state, obs, zero = state_of(agent), np.zeros(OBS_DIM, np.float32), np.float32(0)
+    action = jax.eval_shape(functools.partial(agent.act, explore=True), KEY, state, obs)
+    example = Transition(obs, np.zeros(action.shape, action.dtype), zero, zero, obs)
     memory = agent.memory(example, 10_000)
-    assert memory.init().shape[0] == STEPS
+    assert jax.eval_shape(memory.init).shape[0] == STEPS
 
     def step(carry, number):
         rows, state = carry
@@ -284,7 +303,9 @@ def test_a_phase_starts_with_the_step_that_fills_the_rollout(agent):
         state = agent.update(key, state, batch)
         return (rows, state), state.opt_state.count
 
-    _, counts = jax.lax.scan(step, (memory.init(), state), jnp.arange(2 * STEPS + 3))
+    run = jax.jit(lambda state: jax.lax.scan(step, (memory.init(), state),
+                                             np.arange(2 * STEPS + 3))[1])  # fmt: skip
+    counts = run(state)
     epochs = CONFIG.epochs
     expected = [0] * (STEPS - 1) + [epochs] * STEPS + [2 * epochs] * 4
     np.testing.assert_array_equal(counts, expected)
@@ -301,27 +322,39 @@ def test_a_rollout_is_as_long_as_the_authors(update_episodes, action_repeat):
 
 # --- policies ------------------------------------------------------------------------------------
 
-OBS = jnp.array([0.3, -0.2, 0.5])
+OBS = np.float32([0.3, -0.2, 0.5])
+
+
+@functools.cache
+def drawing(agent):
+    """Actions of 4000 keys, exploring and not."""
+
+    @jax.jit
+    def draw(state):
+        keys = jax.random.split(jax.random.key(2), 4000)
+        return [jax.vmap(lambda key, e=explore: agent.act(key, state, OBS, e))(keys)
+                for explore in (False, True)]  # fmt: skip
+
+    return draw
 
 
 def draw(agent, state, explore):
-    keys = jax.random.split(jax.random.key(2), 4000)
-    return jax.jit(jax.vmap(lambda key: agent.act(key, state, OBS, explore)))(keys)
+    return drawing(agent)(state)[int(explore)]
 
 
 def actor_outputs(kind, state, scale=1.0):
     """The actor's outputs for `OBS`, and the state with its last layer scaled."""
-    actor, _, unravel = networks(kind)
+    _, _, unravel = networks(kind)
     params = unravel(state.params)
     last = params["actor"]["params"][f"Dense_{CONFIG.num_layers}"]
-    last.update({name: scale * value for name, value in last.items()})
-    state = state.replace(params=ravel_pytree(params)[0])
-    return np.asarray(actor.apply(params["actor"], OBS)), state
+    last.update({name: np.float32(scale) * value for name, value in last.items()})
+    outputs = numpy_forward(params["actor"]["params"], OBS, CONFIG.activation, CONFIG.num_layers)
+    return outputs, state.replace(params=raveled(params))
 
 
 def test_discrete_actions_follow_the_softmax_and_tests_its_mode():
     agent = ppo("discrete")
-    outputs, state = actor_outputs("discrete", agent.init(KEY, agent.hparams), scale=4.0)
+    outputs, state = actor_outputs("discrete", state_of(agent), scale=4.0)
     actions = draw(agent, state, explore=True)
     assert actions.dtype == jnp.int32
     expected = np.exp(outputs) / np.exp(outputs).sum()
@@ -335,7 +368,7 @@ def test_discrete_actions_follow_the_softmax_and_tests_its_mode():
 
 def test_continuous_actions_are_normal_around_the_scaled_tanh_and_tests_take_the_mean():
     agent = ppo("continuous")
-    outputs, state = actor_outputs("continuous", agent.init(KEY, agent.hparams), scale=4.0)
+    outputs, state = actor_outputs("continuous", state_of(agent), scale=4.0)
     mean = MAX_ACTION * np.tanh(outputs)
     actions = np.asarray(draw(agent, state, explore=True))
     assert actions.dtype == np.float32
@@ -349,10 +382,10 @@ def test_continuous_actions_are_normal_around_the_scaled_tanh_and_tests_take_the
 
 def test_continuous_actions_are_clipped_for_the_world_only():
     agent = ppo("continuous")
-    state = agent.init(KEY, agent.hparams)
+    state = state_of(agent)
     _, _, unravel = networks("continuous")
-    params = unravel(state.params)
-    wide = state.replace(params=ravel_pytree({**params, "std": jnp.full(ACTION_DIM, 5.0)})[0])
+    params = {**unravel(state.params), "std": np.full(ACTION_DIM, 5.0, np.float32)}
+    wide = state.replace(params=raveled(params))
     actions = draw(agent, wide, explore=True)
     assert np.abs(actions).max() > 2 * MAX_ACTION  # remembered as drawn
     np.testing.assert_array_equal(
@@ -362,14 +395,15 @@ def test_continuous_actions_are_clipped_for_the_world_only():
 
 def test_log_probabilities_and_entropies_by_hand():
     # Odds 1 : 3, hence probabilities 1/4 and 3/4; entropy -(ln(1/4) + 3 ln(3/4)) / 4.
-    outputs = jnp.log(jnp.array([[1.0, 1.0], [3.0, 3.0]]))
-    log_prob, entropy = SOFTMAX.evaluate(outputs, jnp.zeros(0), jnp.array([0, 1]))
+    outputs = np.log(np.float32([[1.0, 1.0], [3.0, 3.0]]))
+    log_prob, entropy = jax.jit(SOFTMAX.evaluate)(outputs, np.zeros(0), np.array([0, 1]))
     np.testing.assert_allclose(np.exp(log_prob), [0.25, 0.75], rtol=1e-6)
     np.testing.assert_allclose(entropy, -(np.log(0.25) + 3 * np.log(0.75)) / 4, rtol=1e-6)
     # Means 0 and std 0.5, 2. The action (1, 2) is 2 and 1 deviations off:
     # density exp(-(4 + 1) / 2) / (2 pi * 0.5 * 2). Entropy ln(2 pi e * 0.5 * 2).
-    std, action = jnp.array([0.5, 2.0]), jnp.array([[1.0], [2.0]])
-    log_prob, entropy = gaussian(MAX_ACTION).evaluate(jnp.zeros((2, 1)), std, action)
+    std, action = np.float32([0.5, 2.0]), np.float32([[1.0], [2.0]])
+    evaluate = jax.jit(gaussian(MAX_ACTION).evaluate)
+    log_prob, entropy = evaluate(np.zeros((2, 1), np.float32), std, action)
     np.testing.assert_allclose(np.exp(log_prob), np.exp(-2.5) / (2 * np.pi), rtol=1e-6)
     np.testing.assert_allclose(entropy, [np.log(2 * np.pi) + 1], rtol=1e-6)
 
@@ -381,7 +415,10 @@ def test_an_agent_has_either_discrete_or_continuous_actions():
 
 
 def test_the_agent_says_what_was_configured(agent):
-    assert agent.hparams == HPARAMS
+    assert agent.hparams._asdict() == {
+        "learning_rate": 0.01, "discount": 0.9, "clip_ratio": 0.05, "value_weight": 0.7,
+        "entropy_weight": 0.05, "hidden_size": None,  # all of it
+    }  # fmt: skip
     assert (agent.init_episodes, agent.learns_from, agent.action_repeat) == (1, 0, 1)
 
 
@@ -389,19 +426,30 @@ def test_the_agent_says_what_was_configured(agent):
 
 
 def solve_bandit(agent, length, reward_fn, num_phases):
-    """The agent after learning phases on episodes of one step each."""
-    obs = jnp.zeros((length, 1))
+    """What the agent does after learning phases on episodes of one step each.
+
+    500 actions as it explores, and the one that it holds to be best.
+    """
+    obs = np.zeros((length, 1), np.float32)
+
+    def acting(state, key, number):
+        act = jax.vmap(lambda key: agent.act(key, state, obs[0], True))
+        return act(jax.random.split(key, number))
 
     def phase(state, key):
-        act = jax.vmap(lambda key: agent.act(key, state, obs[0], True))
-        action = act(jax.random.split(key, length))
+        action = acting(state, key, length)
         reward = reward_fn(agent.env_action(action))
         steps = Transition(obs, action, reward, jnp.zeros(length), obs)
         rows = pack(steps, jnp.ones(length))
         return agent.update(key, state, Rollout(rows, jnp.bool_(True))), None
 
-    state = agent.init(KEY, agent.hparams)
-    return jax.lax.scan(phase, state, jax.random.split(KEY, num_phases))[0]
+    @jax.jit
+    def solve(key):
+        state = agent.init(key, agent.hparams)
+        state = jax.lax.scan(phase, state, jax.random.split(key, num_phases))[0]
+        return acting(state, jax.random.key(3), 500), agent.act(key, state, obs[0], False)
+
+    return solve(KEY)
 
 
 BANDIT = PPOConfig(
@@ -412,17 +460,15 @@ BANDIT = PPOConfig(
 
 def test_a_bandits_better_arm_is_found():
     agent = make_ppo(BANDIT, 1, 3, None, 1.0, max_steps=1)
-    state = solve_bandit(agent, 65, lambda action: jnp.where(action == 1, 1.0, 0.0), 30)
-    keys = jax.random.split(jax.random.key(3), 500)
-    actions = jax.vmap(lambda key: agent.act(key, state, jnp.zeros(1), True))(keys)
-    assert (actions == 1).mean() > 0.95
-    assert agent.act(KEY, state, jnp.zeros(1), False) == 1
+    actions, best = solve_bandit(agent, 65, lambda action: jnp.where(action == 1, 1.0, 0.0), 30)
+    assert (np.asarray(actions) == 1).mean() > 0.95
+    assert best == 1
 
 
 def test_a_continuous_bandits_best_action_is_found_beyond_the_reach_of_a_tanh():
     agent = make_ppo(BANDIT, 1, None, 1, 2.0, max_steps=1)
-    state = solve_bandit(agent, 65, lambda action: -jnp.sum((action - 1.5) ** 2, axis=-1), 40)
-    np.testing.assert_allclose(agent.act(KEY, state, jnp.zeros(1), False), [1.5], atol=0.15)
+    _, best = solve_bandit(agent, 65, lambda action: -jnp.sum((action - 1.5) ** 2, axis=-1), 40)
+    np.testing.assert_allclose(best, [1.5], atol=0.15)
 
 
 # --- learning curves -----------------------------------------------------------------------------

@@ -6,12 +6,11 @@ import jax.numpy as jnp
 import pytest
 from support import large_ops_in_loops
 
-from sejax import envs
-from sejax.agents.ddqn import make_ddqn
-from sejax.configs import DDQNConfig, RewardConfig, SyntheticConfig, TrainingConfig
-from sejax.proxies.reward import make_reward
-from sejax.proxies.synthetic import make_synthetic
+from sejax import envs, plugins
+from sejax.agents.ddqn import DDQNConfig, make_ddqn
+from sejax.proxies.configs import RewardConfig, SyntheticConfig
 from sejax.trainer import make_trainer
+from sejax.training import TrainingConfig
 
 CAPACITY = 7919  # rows; nothing else in the program is nearly as long
 
@@ -19,7 +18,7 @@ CAPACITY = 7919  # rows; nothing else in the program is nearly as long
 @pytest.fixture(scope="module")
 def case():
     """The traced-at-most-once training of a tiny agent in a tiny SE, and how to call it."""
-    env = make_synthetic(envs.make("cartpole"), SyntheticConfig(hidden_size=4))
+    env = plugins.make("proxy", SyntheticConfig(hidden_size=4), envs.make("cartpole"))
     config = DDQNConfig(
         hidden_size=4, num_layers=1, batch_size=4, init_episodes=1, buffer_size=CAPACITY
     )
@@ -31,15 +30,32 @@ def case():
     return train, agent, params
 
 
+@pytest.fixture(scope="module")
+def once(case):
+    """The training, which may be traced once."""
+    chex.clear_trace_counter()
+    return jax.jit(chex.assert_max_traces(case[0], n=1))
+
+
+def arguments(case, seed=0):
+    _, agent, params = case
+    shift = jax.tree.map(lambda w: w + 0.1 * seed, params.weights)
+    return (
+        jax.random.key(seed),
+        params.replace(weights=shift, max_steps_in_episode=jnp.int32(2 + seed)),
+        jax.tree.map(lambda h: jnp.float32(h * (1 + 0.1 * seed)), agent.hparams),
+        jnp.bool_(seed < 2),
+    )
+
+
 def assert_in_place(hlo):
     assert str(CAPACITY) in hlo
     copies = large_ops_in_loops(hlo, num_elements=CAPACITY)
     assert not copies, "\n".join(line[:200] for _, line in copies)
 
 
-def test_a_single_training_neither_copies_nor_selects_its_buffer(case):
-    train, _, params = case
-    assert_in_place(jax.jit(train).lower(jax.random.key(0), params).compile().as_text())
+def test_a_single_training_neither_copies_nor_selects_its_buffer(case, once):
+    assert_in_place(once.lower(*arguments(case)).compile().as_text())
 
 
 def test_trainings_in_lanes_neither_copy_nor_select_their_buffers(case):
@@ -78,27 +94,15 @@ def test_the_checker_finds_a_copy_in_a_loop():
     assert "copy" in {op for op, _ in large_ops_in_loops(hlo, CAPACITY)}
 
 
-def test_a_training_is_traced_once_for_all_values_of_its_arguments(case):
-    train, agent, params = case
-    chex.clear_trace_counter()
-    once = jax.jit(chex.assert_max_traces(train, n=1))
-    steps = set()
-    for seed in range(3):
-        shift = jax.tree.map(lambda w, seed=seed: w + 0.1 * seed, params.weights)
-        result = once(
-            jax.random.key(seed),
-            params.replace(weights=shift, max_steps_in_episode=jnp.int32(2 + seed)),
-            jax.tree.map(lambda h, seed=seed: jnp.float32(h * (1 + 0.1 * seed)), agent.hparams),
-            jnp.bool_(seed < 2),
-        )
-        steps.add(int(result.train_steps))
+def test_a_training_is_traced_once_for_all_values_of_its_arguments(case, once):
+    steps = {int(once(*arguments(case, seed)).train_steps) for seed in range(3)}
     assert len(steps) == 3 and 0 in steps
 
 
 def test_a_buffer_holds_no_more_steps_than_a_training_on_a_proxy_can_have():
     # An RN's agent of the paper has room for a million, of which its training can fill 20,000.
     task = envs.make("cartpole")
-    env = make_reward(task, RewardConfig())
+    env = RewardConfig().make(task)
     agent = make_ddqn(DDQNConfig(buffer_size=1_000_000), task.obs_dim, task.num_actions)
     training = TrainingConfig(max_episodes=100, stop_rule="never")
     key = jax.random.key(0)

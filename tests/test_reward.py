@@ -9,16 +9,17 @@ import pytest
 from support import numpy_forward
 
 import sejax
-from sejax import envs
-from sejax.agents.configs import QLearningConfig
-from sejax.agents.registry import make_agent
-from sejax.bilevel import make_learner
-from sejax.configs import ExplorationConfig, RewardConfig, TrainingConfig
+from sejax import bilevel, envs, plugins
+from sejax.agents import make_agent
+from sejax.agents.tabular import QLearningConfig
+from sejax.app import build
 from sejax.errors import ConfigError
 from sejax.evaluation import make_evaluator, return_area
-from sejax.proxies.reward import RewardEnv, make_reward
-from sejax.proxies.synthetic import ABSURD
+from sejax.proxies.configs import RewardConfig
+from sejax.proxies.proxy import ABSURD, World, world_of
+from sejax.proxies.reward import RewardEnv
 from sejax.trainer import TrainResult, make_trainer
+from sejax.training import TrainingConfig
 
 GAMMA = 0.9
 VARIANTS = {  # table "Overview of Reward Network variants"
@@ -30,7 +31,8 @@ VARIANTS = {  # table "Overview of Reward Network variants"
 
 
 def make_env(task, variant="additive_potential", **changes):
-    return make_reward(envs.make(task), RewardConfig(variant=variant, hidden_size=5, **changes))
+    config = RewardConfig(variant=variant, hidden_size=5, **changes)
+    return plugins.make("proxy", config, envs.make(task))
 
 
 def phi(env, weights, obs):
@@ -153,9 +155,7 @@ def test_a_training_says_whether_the_limit_is_terminal(limit_is_terminal, monkey
     training = TrainingConfig(
         max_episodes=1, max_steps=1, stop_rule="never", time_limit_is_terminal=limit_is_terminal
     )
-    train = make_trainer(
-        make_agent(QLearningConfig(), env.task, ExplorationConfig()), env, training
-    )
+    train = make_trainer(make_agent(QLearningConfig(), env.task), env, training)
     train(jax.random.key(0), env.params(env.init_weights(jax.random.key(0))))
     assert seen == [limit_is_terminal]
 
@@ -222,7 +222,7 @@ def test_the_discount_is_the_agents():
     env = make_env("cliff_walking")
     weights = env.init_weights(jax.random.key(1))
     training = TrainingConfig(max_episodes=1, max_steps=1, stop_rule="never")
-    agent = make_agent(QLearningConfig(discount=GAMMA), env.task, ExplorationConfig())
+    agent = make_agent(QLearningConfig(discount=GAMMA), env.task)
     result = make_trainer(agent, env, training)(jax.random.key(0), env.params(weights, 0.123))
     table = np.asarray(result.agent_state.q_values)
     ((state, action),) = np.argwhere(table != 0)
@@ -241,6 +241,11 @@ def test_prepared_params_look_up_what_the_network_says():
         for one in (params, prepared):
             np.testing.assert_allclose(env.potential(one, jnp.int32(state)), expected, rtol=1e-5)
     assert prepared.discount == np.float32(GAMMA)
+    assert (
+        world_of(env)
+        == World(is_real=True, max_steps=50)
+        == world_of(env.task.env)._replace(max_steps=50)
+    )
     assert make_env("cartpole").prepared(params, GAMMA).potentials is None
 
 
@@ -249,9 +254,10 @@ LEARN = ["env=cliff_walking", "proxy=rn", "generations=1", "es.population_size=2
 
 
 def test_steps_on_a_reward_network_are_real_and_scored():
-    config = sejax.config([*LEARN, "es.num_incumbent_evals=2"])
-    result = jax.jit(make_learner(config))(jax.random.key(0))
-    steps, real = result.info.train_steps_total[0], result.info.env_steps_total[0]
+    config = sejax.config([*LEARN, "es.num_incumbent_evals=2", "devices=1"])
+    result = jax.jit(sejax.make_learner(config))(jax.random.key(0))
+    info = jax.device_get(result.info)
+    steps, real = info.train_steps_total[0], info.env_steps_total[0]
     assert real > steps  # those of the tests between and after the training episodes as well
     # -(n_tr + 100 max(0, C_sol - C_fin)), at most 12 episodes of 50 steps, a return of at least
     # -149 where the task is solved at -20.
@@ -264,19 +270,34 @@ def test_training_on_a_reward_network_stops_when_tests_on_the_real_task_solve_it
     agent = make_agent(config.agent, env.task, config.exploration)
     params = env.params(env.init_weights(jax.random.key(1)))
 
-    def episodes(stop_reward):
-        evaluate = make_evaluator(agent, env, env.task, config.training, stop_reward)
-        return int(evaluate(jax.random.key(0), params).train_episodes)
+    @jax.jit
+    def episodes(solved_reward):
+        task = dataclasses.replace(env.task, solved_reward=solved_reward)
+        evaluate = make_evaluator(agent, env, task, config.training)
+        return evaluate(jax.random.key(0), params).train_episodes
 
     first_that_counts = agent.init_episodes + 1
     assert episodes(-1000.0) == first_that_counts
     assert episodes(0.0) == config.training.max_episodes == 12
 
 
+@pytest.mark.parametrize("objective", ["auc", "auc_sum"])
+def test_the_area_under_the_curve_is_of_trainings_that_go_on_when_solved(objective, monkeypatch):
+    """One that ended there would reward learning late."""
+    config = sejax.config([*LEARN, f"objective={objective}"])
+    assert config.training.stop_rule == "solved"
+    asked = []
+    monkeypatch.setattr(bilevel, "make_population_evaluator",
+                        lambda agent, proxy, training, *_: asked.append(training))  # fmt: skip
+    bilevel.make_program(**config.parts())
+    changes = {"stop_rule": "never", "tests_between": 1}
+    assert asked == [dataclasses.replace(config.training, **changes)]
+
+
 def test_the_area_under_the_curve_is_that_of_tests_over_training_steps():
     env = make_env("cliff_walking")
-    agent = make_agent(QLearningConfig(), env.task, ExplorationConfig())
-    training = TrainingConfig(max_episodes=3, stop_rule="solved", solved_by="test")
+    agent = make_agent(QLearningConfig(), env.task)
+    training = TrainingConfig(max_episodes=3, stop_rule="never", tests_between=1)
 
     def test_fn(key, agent_state, active):
         return jnp.float32(2.0) + agent_state.epsilon, jnp.int32(7)
@@ -287,26 +308,28 @@ def test_the_area_under_the_curve_is_that_of_tests_over_training_steps():
     ends = np.asarray(result.episode_ends)
     assert result.test_steps == 21
     area = return_area(result, jnp.float32(99.0))
-    np.testing.assert_allclose(area, np.diff(ends, prepend=0) @ result.returns)
+    np.testing.assert_allclose(area, np.diff(ends, prepend=0) @ result.test_returns)
     np.testing.assert_allclose(area, (2.0 + 0.1) * ends[-1], rtol=1e-6)
 
 
 def test_the_area_counts_an_episode_that_the_budget_cut_off_with_the_test_after_it():
     result = TrainResult(
         agent_state=None, train_steps=jnp.int32(17), episodes=jnp.int32(2),
-        returns=jnp.array([-5.0, -3.0, jnp.nan]), episode_ends=jnp.array([4, 10, 0]),
-        nonfinite=jnp.bool_(False), test_steps=jnp.int32(0),
+        returns=jnp.array([-5.0, -3.0, jnp.nan]), test_returns=None,
+        episode_ends=jnp.array([4, 10, 0]), nonfinite=jnp.bool_(False),
+        test_steps=jnp.int32(0), recorded=None,
     )  # fmt: skip
     assert return_area(result, jnp.float32(-2.0)) == -5 * 4 - 3 * 6 - 2 * 7
+    tested = result.replace(test_returns=jnp.array([-1.0, -4.0, jnp.nan]))  # where there are some
+    assert return_area(tested, jnp.float32(-2.0)) == -1 * 4 - 4 * 6 - 2 * 7
     nothing = result.replace(episodes=jnp.int32(0), episode_ends=jnp.zeros(3, jnp.int32))
     assert return_area(nothing, jnp.float32(-2.0)) == -2 * 17
 
 
 def test_a_stored_reward_network_comes_back(tmp_path):
-    config = sejax.config([*LEARN, "proxy.variant=exclusive_non_potential"])
-    env = make_reward(envs.make("cliff_walking"), config.proxy)
+    env = make_env("cliff_walking", "exclusive_non_potential")
     weights = env.init_weights(jax.random.key(9))
-    sejax.save(tmp_path / "rn.safetensors", config, weights)
+    sejax.save(tmp_path / "rn.safetensors", env, weights)
     loaded, params = sejax.load(tmp_path / "rn.safetensors")
     assert loaded is env
     jax.tree.map(np.testing.assert_array_equal, params.weights, weights)
@@ -314,9 +337,12 @@ def test_a_stored_reward_network_comes_back(tmp_path):
 
 def test_a_loaded_potential_pays_with_the_discount_of_its_agent(tmp_path):
     config = sejax.config([*LEARN, "proxy.variant=exclusive_potential", "agent.discount=0.7"])
-    env = make_reward(envs.make("cliff_walking"), config.proxy)
+    parts = config.parts()
+    env, agent = parts["proxy"], parts["agent"]
     weights = env.init_weights(jax.random.key(9))
-    sejax.save(tmp_path / "rn.safetensors", config, weights)
+    discount = float(agent.discount(agent.hparams))
+    assert discount == 0.7
+    sejax.save(tmp_path / "rn.safetensors", env, weights, build.to_plain(config), discount)
     for params in (sejax.load(tmp_path / "rn.safetensors")[1],
                    sejax.load_set(tmp_path / "rn.safetensors").one(0)):  # fmt: skip
         _, state = env.reset(jax.random.key(0), params)
@@ -328,10 +354,9 @@ def test_a_loaded_potential_pays_with_the_discount_of_its_agent(tmp_path):
 @pytest.mark.parametrize(
     ("overrides", "said"),
     [
-        (["env=pendulum", "proxy=rn"], "cliff_walking"),
+        (["env=pendulum", "proxy=rn", "preset=paper"], "cliff_walking"),
         (["proxy=rn", "proxy.variant=additive"], "additive_potential"),
         (["proxy=rn", "stop_when_solved=true"], "stop_when_solved=false"),
-        (["objective=auc"], "training.stop_rule=solved"),
         (["proxy=rn", "proxy.done=soft"], "proxy"),
     ],
 )

@@ -5,9 +5,10 @@ import numpy as np
 import pytest
 
 import sejax
+from sejax import plugins
 from sejax.bilevel import make_learner
-from sejax.configs import OBJECTIVES, RN_VARIANTS
-from sejax.envs import kind
+from sejax.experiments.rn_studies import OBJECTIVES
+from sejax.proxies.configs import VARIANTS
 
 pytestmark = [
     pytest.mark.slow,
@@ -22,10 +23,10 @@ SHORT = ["generations=2", "es.population_size=4", "es.num_incumbent_evals=2",
 
 
 @pytest.mark.parametrize("objective", OBJECTIVES)
-@pytest.mark.parametrize("variant", RN_VARIANTS)
+@pytest.mark.parametrize("variant", VARIANTS)
 @pytest.mark.parametrize("task", TASKS)
 def test_every_task_variant_and_objective_learns(task, variant, objective):
-    if variant.endswith("info") and not kind(task).has_info:
+    if variant.endswith("info") and not plugins.find("env", task).facts.has_info:
         pytest.skip("refused: the task tells nothing beyond its observation")
     if task == "halfcheetah" and (variant, objective) not in HALFCHEETAH:
         pytest.skip("compiling its physics takes minutes")

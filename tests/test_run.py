@@ -1,73 +1,67 @@
 """`python -m sejax.run` as a user meets it: files, resume, kills, damage, bad input."""
 
 import csv
+import dataclasses
+import functools
+import math
 import os
 import shutil
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
+import jax
 import pytest
 import yaml
 
 import sejax
-from sejax import checkpoints, commands, run
+from sejax import run
+from sejax.app import build, commands, run_directory, session
+from sejax.app.run_directory import COLUMNS
 from sejax.errors import ConfigError
-from sejax.run_directory import COLUMNS, RunDirectory
+from sejax.proxies import files
 
+# A room of 2 x 2 cells for tables: what takes time is importing and compiling.
 TINY = [
-    "preset=paper", "checkpoint_every=1",
-    "es.population_size=2", "agent.hidden_size=4", "agent.batch_size=4", "agent.init_episodes=1",
-    "proxy.hidden_size=4", "training.max_episodes=2", "training.test_episodes=1", "generations=3",
+    "env=gridworld_2x2", "agent.learning_rate=0.5", "proxy.hidden_size=4", "es.population_size=2",
+    "es.num_incumbent_evals=2", "es.noise_std=1.0", "training.max_steps=30",
+    "training.test_episodes=1", "generations=3", "seed=10",
 ]  # fmt: skip
 FILES = {"config.yaml", "metrics.csv", "proxy.safetensors", "proxy_last.safetensors",
          "checkpoint", "learning_curve.png", "run.json"}  # fmt: skip
+RUN = [sys.executable, "-m", "sejax.run"]
 
 
-def command(*overrides: str, timeout: float = 120) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-m", "sejax.run", *overrides],
-        capture_output=True, text=True, timeout=timeout, env=_environment(),
-    )  # fmt: skip
+@functools.cache
+def chunks(*words):
+    """The compiled program of a configuration, which all runs of it share."""
+    return session.make_chunks(sejax.config([*TINY, *words]))
 
 
-# A shell's background jobs, such as a test run may be, ignore Ctrl-C, and what they start does too.
-HEARS_CTRL_C = (
-    "import runpy, signal; signal.signal(signal.SIGINT, signal.default_int_handler); "
-    "runpy.run_module('sejax.run', run_name='__main__', alter_sys=True)"
-)
+class Report(session.Quiet):
+    """Keeps what is told."""
+
+    def __init__(self):
+        self.said = []
+
+    def print(self, text):
+        self.said.append(text)
 
 
-def start(*overrides: str) -> subprocess.Popen[str]:
-    return subprocess.Popen(
-        [sys.executable, "-c", HEARS_CTRL_C, *overrides],
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=_environment(),
-    )  # fmt: skip
-
-
-def _environment() -> dict[str, str]:
-    return {key: value for key, value in os.environ.items() if key != "XLA_FLAGS"}
+def learn(path, *words, program=()):
+    """A session of a run, as `sejax.run` has it; returns what it told."""
+    config = sejax.config([*TINY, *program, *words, f"run_dir={path}"])
+    report = Report()
+    with run_directory.open_for(config) as directory:
+        session.run(config, directory, chunks(*program), report)
+    return "\n".join(report.said)
 
 
 def rows(path: Path) -> list[dict[str, str]]:
     """Metrics without the one column that depends on the clock."""
     with (path / "metrics.csv").open(newline="") as file:
         return [{k: v for k, v in row.items() if k != "wall_s"} for row in csv.DictReader(file)]
-
-
-def wait_for_rows(path: Path, count: int, process: subprocess.Popen[str]) -> None:
-    deadline = time.time() + 90
-    while time.time() < deadline and process.poll() is None:
-        if (path / "metrics.csv").exists() and len(rows(path)) >= count:
-            return
-        time.sleep(0.05)
-    raise AssertionError(f"no {count} rows in time; the run said {process.communicate()}")
-
-
-def learn(path: Path, *overrides: str) -> float:
-    return run.learn(sejax.config([*TINY, f"run_dir={path}", *overrides]))
 
 
 @pytest.fixture(scope="module")
@@ -78,37 +72,35 @@ def uninterrupted(tmp_path_factory) -> Path:
     return path
 
 
+# --- a run and its files -------------------------------------------------------------------------
+
+
 def test_a_run_writes_the_files_of_the_design(uninterrupted):
     assert {path.name for path in uninterrupted.iterdir()} == FILES
     assert len(rows(uninterrupted)) == 6
     header = (uninterrupted / "metrics.csv").read_text().splitlines()[0]
     assert header == ",".join(COLUMNS)
-    assert yaml.safe_load((uninterrupted / "config.yaml").read_text())["es"]["population_size"] == 2
+    stored = yaml.safe_load((uninterrupted / "config.yaml").read_text())
+    assert stored["es"]["population_size"] == 2
+    words = ["generations=6", f"run_dir={uninterrupted}"]
+    assert build.learn_config(stored) == sejax.config([*TINY, *words])
 
 
 def test_the_stored_proxy_is_the_one_of_the_best_generation(uninterrupted):
-    from sejax.proxies.io import load_proxy
-
     scores = [float(row["incumbent_mean"]) for row in rows(uninterrupted)]
-    metadata = load_proxy(uninterrupted).metadata
-    assert metadata["score"] == pytest.approx(max(scores))
-    assert metadata["generation"] == scores.index(max(scores))
-    last = load_proxy(uninterrupted / "proxy_last.safetensors").metadata
-    assert last["generation"] == 5
+    record = files.load_proxy(uninterrupted).record
+    assert record["score"] == pytest.approx(max(scores))
+    assert record["generation"] == scores.index(max(scores)) not in (0, 5)
+    last = files.load_proxy(uninterrupted / "proxy_last.safetensors").record
+    assert last["generation"] == 5 and last["score"] == pytest.approx(scores[-1])
 
 
-def test_a_run_in_two_sessions_equals_one_in_one(uninterrupted, tmp_path, capsys):
+def test_a_run_in_two_sessions_equals_one_in_one(uninterrupted, tmp_path):
     learn(tmp_path, "generations=4")
-    learn(tmp_path, "generations=6")
-    assert "Going on at generation 4" in capsys.readouterr().out
+    assert "Going on at generation 4" in learn(tmp_path, "generations=6")
     assert rows(tmp_path) == rows(uninterrupted)
     proxy = "proxy.safetensors"
     assert (tmp_path / proxy).read_bytes() == (uninterrupted / proxy).read_bytes()
-
-
-def test_chunks_of_two_generations_give_the_same_metrics(uninterrupted, tmp_path):
-    learn(tmp_path, "generations=6", "checkpoint_every=2")
-    assert rows(tmp_path) == rows(uninterrupted)
 
 
 def test_a_finished_run_is_left_as_it_is(uninterrupted):
@@ -117,14 +109,62 @@ def test_a_finished_run_is_left_as_it_is(uninterrupted):
     assert (uninterrupted / "metrics.csv").read_bytes() == before
 
 
-def test_a_damaged_checkpoint_is_named_and_the_one_before_is_used(uninterrupted, tmp_path, capsys):
+def test_only_two_checkpoints_are_kept(uninterrupted):
+    names = {path.name for path in (uninterrupted / "checkpoint").iterdir()}
+    assert names == {f"sejax-generation-{n}.safetensors" for n in (5, 6)}
+
+
+@pytest.fixture(scope="module")
+def two_seeds(tmp_path_factory) -> Path:
+    """Two runs of six generations in one program, in chunks of two."""
+    path = tmp_path_factory.mktemp("two")
+    learn(path, "generations=6", "checkpoint_every=2", program=("num_seeds=2",))
+    return path
+
+
+def test_chunks_of_two_generations_and_seeds_give_the_same_metrics(uninterrupted, two_seeds):
+    assert [row["seed"] for row in rows(two_seeds)] == ["10", "11"] * 6
+    assert rows(two_seeds)[::2] == rows(uninterrupted)
+
+
+def test_several_seeds_write_a_proxy_each(two_seeds):
+    assert {path.name for path in two_seeds.iterdir()} == FILES | {"proxies"}
+    names = {f"seed{seed}.safetensors" for seed in (10, 11)}
+    assert {path.name for path in (two_seeds / "proxies").iterdir()} == names
+    best = []
+    for i, seed in enumerate((10, 11)):
+        record = files.load_proxy(two_seeds / "proxies" / f"seed{seed}.safetensors").record
+        best.append(max(float(row["incumbent_mean"]) for row in rows(two_seeds)[i::2]))
+        assert record["seed"] == seed and record["score"] == pytest.approx(best[i])
+    assert files.load_proxy(two_seeds).record["score"] == pytest.approx(max(best))
+
+
+def test_a_population_that_diverges_finishes_and_is_counted(tmp_path):
+    shared = chunks()
+
+    def wild_init(keys):
+        state = shared.program.init(keys)
+        noise_std = state.es_state.noise_std * 1e30
+        return state.replace(es_state=state.es_state.replace(noise_std=noise_std))
+
+    wild = session.Chunks(dataclasses.replace(shared.program, init=wild_init))
+    wild._compiled = shared._compiled
+    config = sejax.config([*TINY, "generations=2", f"run_dir={tmp_path}"])
+    with run_directory.open_for(config) as directory:
+        session.run(config, directory, wild)
+    assert [int(row["num_nonfinite"]) for row in rows(tmp_path)] == [4, 4]
+    assert all(math.isfinite(float(row["incumbent_mean"])) for row in rows(tmp_path))
+
+
+# --- damage --------------------------------------------------------------------------------------
+
+
+def test_a_damaged_checkpoint_is_named_and_the_one_before_is_used(uninterrupted, tmp_path):
     learn(tmp_path, "generations=4")
-    newest = tmp_path / "checkpoint" / "4"
-    victim = max((p for p in newest.rglob("*") if p.is_file()), key=lambda p: p.stat().st_size)
-    victim.write_bytes(victim.read_bytes()[:-10])
-    learn(tmp_path, "generations=6")
-    said = capsys.readouterr().out
-    assert f"{newest} is damaged" in said and "Going on at generation 3" in said
+    newest = tmp_path / "checkpoint" / "sejax-generation-4.safetensors"
+    newest.write_bytes(newest.read_bytes()[:-10])
+    said = learn(tmp_path, "generations=6")
+    assert f"{newest} is passed over" in said and "Going on at generation 3" in said
     assert rows(tmp_path) == rows(uninterrupted)
 
 
@@ -138,54 +178,6 @@ def test_a_run_that_lost_its_checkpoints_is_not_replaced(uninterrupted, tmp_path
     assert [file.read_bytes() for file in files] == before
 
 
-def test_a_checkpoint_without_manifest_does_not_count(tmp_path):
-    import jax.numpy as jnp
-
-    checkpoints.save(tmp_path, 1, {"x": jnp.arange(3)})
-    checkpoints.save(tmp_path, 2, {"x": jnp.arange(3) + 1})
-    (tmp_path / "2.json").unlink()
-    state, generation, problems = checkpoints.restore_newest(tmp_path, {"x": jnp.zeros(3, int)})
-    assert generation == 1 and state["x"].tolist() == [0, 1, 2] and len(problems) == 1
-
-
-def test_only_two_checkpoints_are_kept(uninterrupted):
-    names = {path.name for path in (uninterrupted / "checkpoint").iterdir()}
-    assert names == {"5", "5.json", "6", "6.json"}
-
-
-def test_a_killed_run_goes_on_to_the_same_metrics(uninterrupted, tmp_path):
-    process = start(*TINY, "generations=6", f"run_dir={tmp_path}")
-    wait_for_rows(tmp_path, 2, process)
-    process.kill()
-    process.communicate()
-    finished = command(*TINY, "generations=6", f"run_dir={tmp_path}")
-    assert finished.returncode == 0, finished.stderr
-    assert rows(tmp_path) == rows(uninterrupted)
-
-
-def test_ctrl_c_saves_and_exits_130(tmp_path):
-    process = start(*TINY, "generations=100000", f"run_dir={tmp_path}")
-    wait_for_rows(tmp_path, 2, process)
-    process.send_signal(signal.SIGINT)
-    out, err = process.communicate(timeout=60)
-    assert process.returncode == 130, err
-    assert "are saved in" in out
-    assert (tmp_path / "proxy.safetensors").exists()
-
-
-def test_an_interrupt_waits_until_files_are_written():
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    written = []
-    try:
-        with pytest.raises(KeyboardInterrupt), commands.interrupts_held():
-            signal.raise_signal(signal.SIGINT)
-            written.append("all")
-        assert written == ["all"]
-        assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
-    finally:
-        signal.signal(signal.SIGINT, before)
-
-
 def test_another_configuration_in_the_same_directory_is_refused(uninterrupted):
     with pytest.raises(ConfigError, match=r"differs in es\.population_size \(2 there, 3 here\)"):
         learn(uninterrupted, "es.population_size=3")
@@ -195,7 +187,7 @@ def test_an_unwritable_directory_is_a_clear_error(tmp_path):
     blocked = tmp_path / "file"
     blocked.write_text("")
     with pytest.raises(ConfigError, match=r"run_dir must be a folder that can be written.*Set run"):
-        RunDirectory.open(sejax.config([f"run_dir={blocked}/run"]))
+        learn(blocked / "run")
 
 
 def test_a_full_disk_loses_nothing_that_was_written(uninterrupted, tmp_path, monkeypatch):
@@ -219,31 +211,111 @@ def test_a_full_disk_loses_nothing_that_was_written(uninterrupted, tmp_path, mon
     assert rows(tmp_path) == rows(uninterrupted)
 
 
+# --- processes -----------------------------------------------------------------------------------
+
+# `sejax.run` whose process gets a signal when it has told of its second generation. A kill comes at
+# once; Ctrl-C comes from another thread, at whatever the run is doing then. A shell's background
+# jobs, such as a test run may be, ignore Ctrl-C, and what they start does too.
+DRIVER = """
+import os, runpy, signal, sys, threading
+from sejax.app import progress
+
+number = signal.Signals[sys.argv.pop(1)]
+signal.signal(signal.SIGINT, signal.default_int_handler)
+update = progress.RunProgress.update
+
+def told(self, generation, info):
+    update(self, generation, info)
+    if generation == 2 and number == signal.SIGKILL:
+        os.kill(os.getpid(), number)
+    if generation == 2:
+        threading.Timer(0.05, os.kill, (os.getpid(), number)).start()
+
+progress.RunProgress.update = told
+runpy.run_module("sejax.run", run_name="__main__", alter_sys=True)
+"""
+
+
+def process(*words: str, timeout: float = 1800) -> subprocess.CompletedProcess[str]:
+    """A process of its own, which finds what has been compiled here."""
+    cache = {"JAX_COMPILATION_CACHE_DIR": str(jax.config.jax_compilation_cache_dir),
+             "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.05"}  # fmt: skip
+    return subprocess.run(words, capture_output=True, text=True, timeout=timeout,
+                          env=os.environ | cache)  # fmt: skip
+
+
+def test_a_killed_run_goes_on_to_the_same_metrics(uninterrupted, tmp_path):
+    words = [*TINY, "generations=6", f"run_dir={tmp_path}"]
+    killed = process(sys.executable, "-c", DRIVER, "SIGKILL", *words)
+    assert killed.returncode == -signal.SIGKILL, killed.stderr
+    assert len(rows(tmp_path)) == 2
+    finished = process(*RUN, *words)
+    assert finished.returncode == 0, finished.stderr
+    assert "Going on at generation 2" in finished.stdout and "learned" in finished.stdout
+    assert rows(tmp_path) == rows(uninterrupted)
+    assert {path.name for path in tmp_path.iterdir()} == FILES
+
+
+def test_ctrl_c_saves_and_exits_130(tmp_path):
+    words = [*TINY, "generations=1000000", f"run_dir={tmp_path}"]
+    ended = process(sys.executable, "-c", DRIVER, "SIGINT", *words)
+    assert ended.returncode == 130, ended.stderr
+    saved = next(line for line in ended.stdout.splitlines() if "are saved in" in line)
+    assert 2 <= int(saved.split()[1]) <= len(rows(tmp_path))
+    assert (tmp_path / "proxy.safetensors").exists()
+
+
+def test_an_interrupt_waits_until_files_are_written():
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    written = []
+    try:
+        with pytest.raises(KeyboardInterrupt), commands.interrupts_held():
+            signal.raise_signal(signal.SIGINT)
+            written.append("all")
+        assert written == ["all"]
+        assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def test_bad_input_ends_a_process_with_one_message_and_status_2(tmp_path):
+    for word, message in [
+        ("env=cartpol", "Did you mean env=cartpole?"),
+        ("~env=[[1]]", "env must be chosen"),
+    ]:
+        ended = process(*RUN, word, f"run_dir={tmp_path}/run")
+        assert ended.returncode == 2
+        assert message in ended.stderr and len(ended.stderr.strip().splitlines()) == 1
+        assert not (tmp_path / "run").exists()
+
+
 @pytest.mark.parametrize(
     ("override", "message"),
     [
         ("env=cartpol", "Did you mean env=cartpole?"),
         ("es.population_size=1", "es.population_size must be at least 2"),
         ("es.noise_sdt=1", "Did you mean es.noise_std?"),
-        ("devices=x", "could not be converted to Integer"),
+        ("devices=x", "devices must be a whole number"),
     ],
 )
-def test_bad_input_ends_with_one_message_and_status_2(override, message, tmp_path):
-    ended = command(override, f"run_dir={tmp_path}/run")
-    assert ended.returncode == 2
-    assert message in ended.stderr and len(ended.stderr.strip().splitlines()) == 1
+def test_bad_input_ends_with_one_message_and_status_2(
+    override, message, tmp_path, monkeypatch, capsys
+):
+    monkeypatch.setattr(sys, "argv", ["sejax.run", override, f"run_dir={tmp_path}/run"])
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
+    with pytest.raises(SystemExit) as ended:
+        commands.start("run", run.main)
+    said = capsys.readouterr().err
+    assert ended.value.code == 2
+    assert message in said and len(said.strip().splitlines()) == 1
     assert not (tmp_path / "run").exists()
 
 
-def test_several_seeds_write_a_proxy_each(tmp_path):
-    learn(tmp_path, "num_seeds=2", "generations=2")
-    assert sorted(p.name for p in (tmp_path / "proxies").iterdir()) == [
-        "seed0.safetensors",
-        "seed1.safetensors",
-    ]
-    assert [row["seed"] for row in rows(tmp_path)] == ["0", "1", "0", "1"]
-
-
-def test_a_population_that_diverges_finishes_and_is_counted(tmp_path):
-    learn(tmp_path, "es.noise_std=1e30", "generations=2")
-    assert [int(row["num_nonfinite"]) for row in rows(tmp_path)] == [4, 4]
+def test_the_command_says_how_it_ended_and_what_to_do_next(uninterrupted, capsys):
+    best = run.learn(sejax.config([*TINY, "generations=6", f"run_dir={uninterrupted}"]))
+    said = capsys.readouterr().out
+    scores = [float(row["incumbent_mean"]) for row in rows(uninterrupted)]
+    assert best == pytest.approx(max(scores))
+    assert f"best incumbent mean {best:.1f}, solved at 0.8" in said
+    assert f"python -m sejax.evaluate proxy={uninterrupted} agent=q_learning" in said

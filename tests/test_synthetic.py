@@ -6,16 +6,17 @@ import numpy as np
 import pytest
 from support import numpy_forward
 
-from sejax import envs
-from sejax.configs import SyntheticConfig
-from sejax.proxies.synthetic import ABSURD, make_synthetic
+from sejax import envs, plugins
+from sejax.proxies.configs import SyntheticConfig
+from sejax.proxies.proxy import ABSURD, World, world_of
 
 CONFIG = SyntheticConfig(hidden_size=5, num_layers=2, activation="leaky_relu")
 OBS = jnp.array([0.1, -0.2, 0.3, -0.4])
 
 
 def make_env(task="cartpole", **changes):
-    return make_synthetic(envs.make(task), SyntheticConfig(**{**vars(CONFIG), **changes}))
+    config = SyntheticConfig(**{**vars(CONFIG), **changes})
+    return plugins.make("proxy", config, envs.make(task))
 
 
 @pytest.fixture(scope="module")
@@ -203,3 +204,4 @@ def test_spaces_and_names_are_those_of_the_task():
     assert env.observation_space().shape == (6,)
     assert env.name == "Synthetic-acrobot"
     assert make_env("acrobot") is env  # one instance for each configuration
+    assert world_of(env) == World(is_real=False, max_steps=500)

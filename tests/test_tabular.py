@@ -8,12 +8,19 @@ import numpy as np
 import pytest
 
 from sejax import envs
-from sejax.agents.configs import QLearningConfig, SARSAConfig
 from sejax.agents.epsilon_greedy import decayed_epsilon
 from sejax.agents.replay import Transition
-from sejax.agents.tabular import TabularHparams, entry_of, make_q_learning, make_sarsa, mask_of
-from sejax.configs import TrainingConfig
-from sejax.trainer import make_tester, make_trainer
+from sejax.agents.tabular import (
+    QLearningConfig,
+    SARSAConfig,
+    entry_of,
+    make_q_learning,
+    make_sarsa,
+    mask_of,
+)
+from sejax.rollout import make_tester
+from sejax.trainer import make_trainer
+from sejax.training import TrainingConfig
 
 NUM_STATES, NUM_ACTIONS = 5, 3
 KEY = jax.random.key(0)
@@ -28,18 +35,31 @@ def sarsa(num_states=NUM_STATES, num_actions=NUM_ACTIONS, **numbers):
     return make_sarsa(SARSAConfig(**{**NUMBERS, **numbers}), num_states, num_actions)
 
 
+@functools.cache
+def fresh(agent):
+    def begin(key):
+        return agent.begin_episode(agent.init(key, agent.hparams), jnp.int32(0))
+
+    return jax.tree.map(np.asarray, jax.jit(begin)(KEY))
+
+
 def started(agent, q_values=None, epsilon=None):
     """The agent in its first episode, with other values or another epsilon if they are given."""
-    state = agent.begin_episode(agent.init(KEY, agent.hparams), jnp.int32(0))
+    state = fresh(agent)
     if q_values is not None:
-        state = state.replace(q_values=jnp.array(q_values, jnp.float32))
-    return state if epsilon is None else state.replace(epsilon=jnp.float32(epsilon))
+        state = state.replace(q_values=np.array(q_values, np.float32))
+    return state if epsilon is None else state.replace(epsilon=np.float32(epsilon))
+
+
+@functools.cache
+def update_of(agent):
+    return jax.jit(agent.update)
 
 
 def step(obs, action, reward, discount, next_obs):
     return Transition(
-        obs=jnp.int32(obs), action=jnp.int32(action), reward=jnp.float32(reward),
-        discount=jnp.float32(discount), next_obs=jnp.int32(next_obs),
+        obs=np.int32(obs), action=np.int32(action), reward=np.float32(reward),
+        discount=np.float32(discount), next_obs=np.int32(next_obs),
     )  # fmt: skip
 
 
@@ -49,11 +69,11 @@ def random_steps(num_steps, num_states=NUM_STATES, num_actions=NUM_ACTIONS, seed
     soft = rng.uniform(-0.2, 1.2, num_steps)
     discount = np.choose(rng.integers(0, 3, num_steps), [np.zeros(num_steps), 1.0, soft])
     return Transition(
-        obs=jnp.int32(rng.integers(0, num_states, num_steps)),
-        action=jnp.int32(rng.integers(0, num_actions, num_steps)),
-        reward=jnp.float32(rng.normal(size=num_steps)),
-        discount=jnp.float32(discount),
-        next_obs=jnp.int32(rng.integers(0, num_states, num_steps)),
+        obs=np.int32(rng.integers(0, num_states, num_steps)),
+        action=np.int32(rng.integers(0, num_actions, num_steps)),
+        reward=np.float32(rng.normal(size=num_steps)),
+        discount=np.float32(discount),
+        next_obs=np.int32(rng.integers(0, num_states, num_steps)),
     )
 
 
@@ -65,7 +85,7 @@ def learn_all(agent, state, steps, keys):
         state = agent.update(key, state, transition)
         return state, state
 
-    steps = steps._replace(weight=jnp.ones(len(steps.obs)))
+    steps = steps._replace(weight=np.ones(len(steps.obs), np.float32))
     return jax.jit(lambda state: jax.lax.scan(learn, state, (keys, steps))[1])(state)
 
 
@@ -74,7 +94,7 @@ def learn_all(agent, state, steps, keys):
 
 def test_q_learning_moves_one_entry_towards_its_target():
     agent = q_learning()  # learning rate 0.5, discount 0.9
-    update = jax.jit(agent.update)
+    update = update_of(agent)
     state = started(agent)
     np.testing.assert_array_equal(state.q_values, np.zeros((5, 3)))
     state = update(KEY, state, step(2, 1, 4.0, 1.0, 3))  # 0 + 0.5 (4 + 0.9 * 0 - 0) = 2
@@ -91,7 +111,7 @@ def test_q_learning_bootstraps_with_the_best_action_also_among_negative_ones():
     agent = q_learning(learning_rate=1.0)
     table = np.zeros((5, 3))
     table[1] = [-5.0, -2.0, -3.0]
-    state = agent.update(KEY, started(agent, table), step(0, 0, 1.0, 1.0, 1))
+    state = update_of(agent)(KEY, started(agent, table), step(0, 0, 1.0, 1.0, 1))
     np.testing.assert_allclose(state.q_values[0, 0], 1 + 0.9 * -2.0, rtol=1e-6)
 
 
@@ -99,7 +119,7 @@ def test_q_learning_bootstraps_with_the_best_action_also_among_negative_ones():
 def test_a_transition_with_discount_zero_ignores_its_next_state(make):
     agent = make(learning_rate=1.0)
     state = started(agent, np.full((5, 3), 7.0))
-    after = agent.update(KEY, state, step(3, 1, 2.0, 0.0, 4))
+    after = update_of(agent)(KEY, state, step(3, 1, 2.0, 0.0, 4))
     assert after.q_values[3, 1] == 2.0
 
 
@@ -135,7 +155,7 @@ def test_q_learning_equals_a_plain_loop():
 
 def test_sarsa_equals_a_plain_loop_that_draws_from_the_same_bits():
     steps, keys = random_steps(200, seed=1), jax.random.split(KEY, 200)
-    bits = np.asarray(jax.vmap(lambda key: jax.random.bits(key, (2,)))(keys))
+    bits = np.asarray(jax.jit(jax.vmap(lambda key: jax.random.bits(key, (2,))))(keys))
 
     def next_value(i, row):
         if (bits[i, 1] >> 8) / 2**24 < 0.4:  # epsilon
@@ -150,11 +170,12 @@ def test_sarsa_equals_a_plain_loop_that_draws_from_the_same_bits():
 
 
 def test_reading_and_writing_a_table_name_the_same_entry():
-    table = jnp.arange(12).reshape(3, 4)
+    table = np.arange(12).reshape(3, 4)
+    read_and_mask = jax.jit(lambda s, a: (entry_of(jnp.array(table), s, a), mask_of(s, a, (3, 4))))
     for s, a in np.ndindex(3, 4):
-        mask = np.asarray(mask_of(jnp.int32(s), jnp.int32(a), (3, 4)))
+        entry, mask = map(np.asarray, read_and_mask(np.int32(s), np.int32(a)))
         assert mask.sum() == 1 and mask[s, a]
-        assert entry_of(table, jnp.int32(s), jnp.int32(a)) == 4 * s + a
+        assert entry == 4 * s + a
 
 
 def test_an_infinite_entry_elsewhere_does_no_harm():
@@ -162,7 +183,7 @@ def test_an_infinite_entry_elsewhere_does_no_harm():
     table[3, 2] = np.inf
     for agent in (q_learning(), sarsa()):
         state = started(agent, table, epsilon=1.0)
-        after = agent.update(KEY, state, step(0, 0, 1.0, 1.0, 1))
+        after = update_of(agent)(KEY, state, step(0, 0, 1.0, 1.0, 1))
         table_after = np.array(after.q_values)
         assert table_after[0, 0] == 0.5 and table_after[3, 2] == np.inf
         table_after[0, 0] = table_after[3, 2] = 0
@@ -192,9 +213,10 @@ def test_the_defaults_are_the_papers_and_an_agent_is_made_once(make):
     config = QLearningConfig() if make is make_q_learning else SARSAConfig()
     agent = make(config, 48, 4)
     assert agent is make(config, 48, 4)
-    assert agent.hparams == TabularHparams(
-        learning_rate=1.0, discount=0.8, epsilon_init=0.1, epsilon_min=0.1, epsilon_decay=0.0
-    )
+    assert agent.hparams._asdict() == {
+        "learning_rate": 1.0, "discount": 0.8,
+        "epsilon_init": 0.1, "epsilon_min": 0.1, "epsilon_decay": 0.0,
+    }  # fmt: skip
     assert (agent.init_episodes, agent.learns_from) == (0, 0)
 
 
@@ -204,6 +226,15 @@ def test_learning_starts_after_the_initial_episodes():
 
 
 # --- exploration ---------------------------------------------------------------------------------
+
+
+@jax.jit
+def epsilons(numbers, hparams):
+    """Those of five episodes, from the numbers and by the agent that has them."""
+    episodes, agent = jnp.arange(5), q_learning()
+    state = agent.init(KEY, hparams)
+    direct = jax.vmap(lambda episode: decayed_epsilon(*numbers, episode))(episodes)
+    return direct, jax.vmap(agent.begin_episode, (None, 0))(state, episodes).epsilon
 
 
 @pytest.mark.parametrize(
@@ -217,27 +248,26 @@ def test_learning_starts_after_the_initial_episodes():
     ],
 )
 def test_epsilon_decays_by_a_factor_each_episode_down_to_its_minimum(numbers, expected):
-    episodes = jnp.arange(5)
-    direct = jax.vmap(lambda episode: decayed_epsilon(*numbers, episode))(episodes)
-    np.testing.assert_allclose(direct, expected, rtol=1e-6)
     names = ("epsilon_init", "epsilon_min", "epsilon_decay")
     agent = q_learning(**dict(zip(names, numbers, strict=True)))
-    begin = jax.vmap(agent.begin_episode, (None, 0))
-    np.testing.assert_allclose(begin(started(agent), episodes).epsilon, expected, rtol=1e-6)
+    numbers = [np.float32(x) for x in numbers]
+    direct, begun = epsilons(numbers, agent.hparams)
+    np.testing.assert_allclose(direct, expected, rtol=1e-6)
+    np.testing.assert_allclose(begun, expected, rtol=1e-6)
 
 
 @functools.cache
 def drawing(make):
-    """Exploring actions of 4000 keys in state 1: `(table, epsilon) -> [4000]`."""
+    """Actions of 4000 keys in state 1, and the greedy one: `(table, epsilon) -> [4000], []`."""
     agent = make()
-    keys = jax.random.split(jax.random.key(1), 4000)
 
     @jax.jit
-    def draw(table, epsilon):
-        state = started(agent, table, epsilon)
-        return jax.vmap(lambda key: agent.act(key, state, jnp.int32(1), True))(keys)
+    def draw(state):
+        keys = jax.random.split(jax.random.key(1), 4000)
+        drawn = jax.vmap(lambda key: agent.act(key, state, jnp.int32(1), True))(keys)
+        return drawn, agent.act(KEY, state, jnp.int32(1), explore=False)
 
-    return draw
+    return lambda table, epsilon: draw(started(agent, table, epsilon))
 
 
 def assert_shares(drawn, expected):
@@ -252,7 +282,7 @@ def assert_shares(drawn, expected):
 def test_actions_are_random_with_probability_epsilon_and_greedy_otherwise(make, epsilon):
     table = np.zeros((5, 3))
     table[1] = [-1.0, -2.0, 3.0]
-    drawn = drawing(make)(table, epsilon)
+    drawn, _ = drawing(make)(table, epsilon)
     assert drawn.dtype == jnp.int32
     # Random actions are uniform, the greedy one included.
     assert_shares(drawn, np.full(3, epsilon / 3) + (1 - epsilon) * np.array([0, 0, 1]))
@@ -265,10 +295,10 @@ def test_actions_are_random_with_probability_epsilon_and_greedy_otherwise(make, 
 def test_of_equal_actions_the_first_is_greedy(row, best):
     table = np.zeros((5, 3))
     table[1] = row
-    agent = q_learning()
-    action = agent.act(KEY, started(agent, table, 1.0), jnp.int32(1), explore=False)
+    _, action = drawing(q_learning)(table, 1.0)
     assert action == best and action.dtype == jnp.int32
-    assert (drawing(q_learning)(table, 0.0) == best).all()
+    drawn, _ = drawing(q_learning)(table, 0.0)
+    assert (np.asarray(drawn) == best).all()
 
 
 def test_sarsas_next_action_is_drawn_by_the_same_rule():
@@ -278,7 +308,7 @@ def test_sarsas_next_action_is_drawn_by_the_same_rule():
     state = started(agent, table, 0.6)
     keys = jax.random.split(jax.random.key(2), 4000)
     update = jax.jit(jax.vmap(agent.update, (0, None, None)))
-    value = np.asarray(update(keys, state, step(0, 2, 0.0, 1.0, 1)).q_values[:, 0, 2])
+    value = np.asarray(update(keys, state, step(0, 2, 0.0, 1.0, 1)).q_values)[:, 0, 2]
     assert set(value.tolist()) == {10.0, 20.0, 30.0}
     action = np.array([0, 2, 1])[np.round(value / 10 - 1).astype(int)]
     assert_shares(action, np.array([0.2, 0.6, 0.2]))
@@ -385,15 +415,16 @@ def test_sarsa_values_its_own_exploration_and_q_learning_the_best_action(make, w
     # 0 -> 1 for nothing; from 1 action 0 earns 1 and action 1 nothing. With epsilon 0.4 the policy
     # earns 0.6 * 1 + 0.4 * 0.5 = 0.8 there on average, the best action 1.
     agent = make(2, 2, learning_rate=0.05)
-    table = [[0.0, 0.0], [1.0, 0.0]]
+    state = started(agent, [[0.0, 0.0], [1.0, 0.0]])
 
     def learn(key):
         def body(state, key):
             return agent.update(key, state, step(0, 0, 0.0, 1.0, 1)), None
 
-        return jax.lax.scan(body, started(agent, table), jax.random.split(key, 300))[0]
+        return jax.lax.scan(body, state, jax.random.split(key, 300))[0]
 
-    values = jax.jit(jax.vmap(learn))(jax.random.split(KEY, 400)).q_values[:, 0, 0]
+    values = jax.jit(jax.vmap(learn))(jax.random.split(KEY, 400)).q_values
+    values = np.asarray(values)[:, 0, 0]
     error = np.std(values) / np.sqrt(values.size)
     np.testing.assert_allclose(np.mean(values), 0.9 * worth, atol=5 * error + 1e-5)
 
@@ -406,6 +437,7 @@ def test_lanes_equal_single_trainings(make):
     train = make_trainer(agent, task.env, training, task.solved_reward)
     keys = jax.random.split(KEY, 4)
     many = jax.jit(jax.vmap(lambda key: train(key, task.params)))(keys)
+    many = jax.tree.map(np.asarray, many)
     assert len(set(np.asarray(many.train_steps).tolist())) > 1  # they stop at different times
     alone = jax.jit(lambda key: train(key, task.params))
     for i, key in enumerate(keys):

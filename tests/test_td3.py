@@ -8,16 +8,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jax.flatten_util import ravel_pytree
-from support import numpy_forward
+from support import numpy_forward, raveled, shapes_of, unraveled
 
 from sejax import envs
-from sejax.agents.configs import DiscreteTD3Config, TD3Config
 from sejax.agents.replay import Transition
 from sejax.agents.td3 import (
-    DiscreteTD3Hparams,
+    DiscreteTD3Config,
     LearningNoise,
-    TD3Hparams,
+    TD3Config,
     annealed_temperature,
     draw_learning_noise,
     gumbel_softmax,
@@ -29,9 +27,10 @@ from sejax.agents.td3 import (
     smoothed_target_action,
     tanh_policy,
 )
-from sejax.configs import TrainingConfig
 from sejax.networks import MLP
-from sejax.trainer import make_tester, make_trainer
+from sejax.rollout import make_tester
+from sejax.trainer import make_trainer
+from sejax.training import TrainingConfig
 
 OBS_DIM, ACTION_DIM, BATCH, MAX_ACTION = 3, 2, 7, 2.0
 GOLDEN = Path(__file__).parent / "golden" / "td3_updates.npz"
@@ -79,9 +78,19 @@ def state_of(config):
     return jax.jit(agent.init)(jax.random.key(1), agent.hparams)
 
 
+def state_with(config, params):
+    """A fresh state with these parameters (as in `NAMES`); nothing is compiled."""
+    agent = agent_of(config)
+    state = shapes_of(agent.init, jax.random.key(1), agent.hparams)
+    hparams = jax.tree.map(np.float32, agent.hparams)
+    return state.replace(**dict(zip(NAMES, params, strict=True)), hparams=hparams)
+
+
 @functools.cache
-def update_of(config):
-    return jax.jit(agent_of(config).update)
+def learn_of(config):
+    """The jitted learning step, `(state, batch, noise) -> state`."""
+    networks = make_networks(config, OBS_DIM, ACTION_DIM)
+    return jax.jit(make_learning_step(config, networks, policy_of(config)))
 
 
 def case_batch(config, seed, **columns):
@@ -98,17 +107,17 @@ def case_batch(config, seed, **columns):
         "next_obs": rng.normal(size=(OBS_DIM, BATCH)),
         "weight": np.arange(BATCH) < BATCH - 1,
     } | columns
-    return Transition(**{k: jnp.float32(v) for k, v in arrays.items()})
+    return Transition(**{k: np.float32(v) for k, v in arrays.items()})
 
 
 def case_noise(config, seed):
     rng = np.random.default_rng([seed, 1])
     shape = (ACTION_DIM, BATCH)
     # Some of the smoothing noise is beyond the clip, which is 0.5 / 0.4 = 1.25 standard deviations.
-    smoothing = jnp.float32(rng.normal(size=shape))
+    smoothing = np.float32(rng.normal(size=shape))
     if not is_discrete(config):
         return LearningNoise(smoothing, None, None)
-    return LearningNoise(smoothing, *(jnp.float32(rng.gumbel(size=shape)) for _ in range(2)))
+    return LearningNoise(smoothing, *(np.float32(rng.gumbel(size=shape)) for _ in range(2)))
 
 
 def mlp_of(config, num_outputs):
@@ -123,16 +132,17 @@ def initial_params(config):
     """Random parameters, all networks' different, so that it shows which is used where."""
     # A seed with which no gradient is as small as Adam's epsilon: rounding would decide its step.
     rng = np.random.default_rng(2)
-    state = state_of(config)
-    drawn = [jnp.float32(0.5 * rng.normal(size=getattr(state, name).shape)) for name in NAMES]
+    agent = agent_of(config)
+    state = jax.eval_shape(agent.init, jax.random.key(1), agent.hparams)
+    drawn = [np.float32(0.5 * rng.normal(size=getattr(state, name).shape)) for name in NAMES]
 
     def flat(params):
         if "width" in params:  # no weight: the number of units
-            params = {**params, "width": jnp.float32(config.hidden_size)}
-        return ravel_pytree(params)[0]
+            params = {**params, "width": np.float32(config.hidden_size)}
+        return raveled(params)
 
     return [
-        jnp.stack([flat(x) for x in nested]) if isinstance(nested, list) else flat(nested)
+        np.stack([flat(x) for x in nested]) if isinstance(nested, list) else flat(nested)
         for nested in nested_params(config, drawn)
     ]
 
@@ -142,9 +152,7 @@ def nested_params(config, params):
 
     def nest(flat, num_inputs, num_outputs):
         init = mlp_of(config, num_outputs).init
-        template = jax.eval_shape(init, jax.random.key(0), jnp.zeros(num_inputs))
-        _, unravel = ravel_pytree(jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), template))
-        return unravel(flat)["params"]
+        return unraveled(flat, shapes_of(init, jax.random.key(0), np.zeros(num_inputs)))["params"]
 
     nest_actor = functools.partial(nest, num_inputs=OBS_DIM, num_outputs=ACTION_DIM)
     nest_critic = functools.partial(nest, num_inputs=OBS_DIM + ACTION_DIM, num_outputs=1)
@@ -170,11 +178,9 @@ def actor_outputs(config, state, obs):
 def test_updates_equal_torchs_on_the_same_batches_and_noise(case):
     golden = np.load(GOLDEN)  # made by torch_td3.py
     config = CASES[case]
-    networks = make_networks(config, OBS_DIM, ACTION_DIM)
-    learn = jax.jit(make_learning_step(config, networks, policy_of(config)))
-    state = state_of(config).replace(**dict(zip(NAMES, initial_params(config), strict=True)))
+    state = state_with(config, initial_params(config))
     for number in range(1, max(CHECKED_UPDATES) + 1):
-        state = learn(state, case_batch(config, number), case_noise(config, number))
+        state = learn_of(config)(state, case_batch(config, number), case_noise(config, number))
         if number in CHECKED_UPDATES:
             for name in NAMES:
                 np.testing.assert_allclose(
@@ -183,19 +189,33 @@ def test_updates_equal_torchs_on_the_same_batches_and_noise(case):
 
 
 @pytest.mark.parametrize("config", [CONFIG, DISCRETE], ids=["continuous", "discrete"])
-def test_an_update_is_the_learning_step_on_noise_drawn_from_its_key(config):
-    policy = policy_of(config)
-    learn = jax.jit(make_learning_step(config, make_networks(config, OBS_DIM, ACTION_DIM), policy))
-    batch, key = case_batch(config, 0), jax.random.key(3)
-    state = state_of(config).replace(num_updates=jnp.int32(1))
-    got = update_of(config)(key, state, batch)
-    expected = learn(state, batch, draw_learning_noise(key, policy, batch.action.shape))
-    other = update_of(config)(jax.random.key(4), state, batch)
-    for name in NAMES:
-        np.testing.assert_allclose(
-            getattr(got, name), getattr(expected, name), rtol=1e-5, atol=1e-7
-        )
-    assert not np.allclose(got.critic_opt_state.mu, other.critic_opt_state.mu)
+def test_updates_are_learning_steps_on_noise_drawn_from_the_key_alone_and_in_a_population(config):
+    # Members have their own numbers and counters: lane 0 comes to an actor update, lane 1 does not.
+    base, batch = state_of(config), case_batch(config, 0)
+    lanes = [
+        base.replace(num_updates=np.int32(n),
+                     hparams=base.hparams._replace(learning_rate=np.float32(rate)))
+        for n, rate in ((1, 0.01), (2, 0.1))
+    ]  # fmt: skip
+    stacked = jax.tree.map(lambda *x: np.stack(x), *lanes)
+    policy, update = policy_of(config), agent_of(config).update
+
+    @jax.jit
+    def run(key):
+        noise = draw_learning_noise(key, policy, batch.action.shape)
+        many = jax.vmap(update, (None, 0, None))(key, stacked, batch)
+        return noise, many
+
+    key = jax.random.key(3)
+    noise, together = run(key)
+    _, other = run(jax.random.key(4))
+    for i, lane in enumerate(lanes):
+        expected = learn_of(config)(lane, batch, noise)
+        for name in NAMES:
+            np.testing.assert_allclose(
+                getattr(together, name)[i], getattr(expected, name), rtol=1e-5, atol=1e-7
+            )
+    assert not np.allclose(together.critic_opt_state.mu, other.critic_opt_state.mu)
 
 
 def test_noise_is_normal_and_gumbel_and_drawn_independently():
@@ -219,7 +239,8 @@ def test_the_actor_and_all_targets_move_in_every_second_step_the_critics_in_all(
         )
     assert not np.allclose(states[0].critics[0], states[0].critics[1])
     for number in range(1, 5):
-        states.append(update_of(config)(jax.random.key(number), states[-1], case_batch(config, 0)))
+        noise = case_noise(config, number)
+        states.append(learn_of(config)(states[-1], case_batch(config, 0), noise))
         before, after = states[-2:]
         assert int(after.num_updates) == number
         moved = {name: not np.array_equal(getattr(before, name), getattr(after, name))
@@ -236,43 +257,44 @@ def test_the_actor_and_all_targets_move_in_every_second_step_the_critics_in_all(
 
 @pytest.mark.parametrize("config", [CONFIG, DISCRETE], ids=["continuous", "discrete"])
 def test_columns_of_no_weight_change_nothing(config):
-    state = state_of(config).replace(num_updates=jnp.int32(1))  # the next step moves everything
-    batch = case_batch(config, 0)
+    state = state_of(config).replace(num_updates=np.int32(1))  # the next step moves everything
+    batch, noise, learn = case_batch(config, 0), case_noise(config, 0), learn_of(config)
     is_padding = batch.weight == 0
-    other = jax.tree.map(lambda x: jnp.where(is_padding, x + 3.0, x), batch)
+    other = jax.tree.map(lambda x: np.where(is_padding, x + 3.0, x), batch)
     other = other._replace(weight=batch.weight)
-    a, b = (update_of(config)(jax.random.key(0), state, x) for x in (batch, other))
+    a, b = (learn(state, x, noise) for x in (batch, other))
     for name in NAMES:
         np.testing.assert_allclose(getattr(a, name), getattr(b, name), rtol=1e-6, atol=1e-8)
-    counted = batch._replace(weight=jnp.ones(BATCH))
-    all_count = update_of(config)(jax.random.key(0), state, counted)
+    counted = batch._replace(weight=np.ones(BATCH, np.float32))
+    all_count = learn(state, counted, noise)
     assert not np.allclose(a.critic_opt_state.mu, all_count.critic_opt_state.mu, rtol=1e-3)
 
 
 def test_a_transition_with_discount_zero_ignores_its_next_state():
     def gradient(batch):  # Adam's first mean: 0.1 g
-        return update_of(CONFIG)(jax.random.key(0), state_of(CONFIG), batch).critic_opt_state.mu
+        state = learn_of(CONFIG)(state_of(CONFIG), batch, case_noise(CONFIG, 0))
+        return np.asarray(state.critic_opt_state.mu)
 
     batch = case_batch(CONFIG, 0, discount=np.zeros(BATCH))
     elsewhere = batch._replace(next_obs=batch.next_obs + 3.0)
     np.testing.assert_array_equal(gradient(batch), gradient(elsewhere))
-    a, b = (gradient(x._replace(discount=jnp.ones(BATCH))) for x in (batch, elsewhere))
+    ones = np.ones(BATCH, np.float32)
+    a, b = (gradient(x._replace(discount=ones)) for x in (batch, elsewhere))
     assert np.abs(a - b).max() > 1e-3
 
 
 def test_the_critics_losses_are_means_over_the_columns_and_added():
     # With discount 0 the error of a column is Q - r, and the gradient for the bias of a critic's
     # head is twice the mean error. Adam's first mean is a tenth of it.
-    config = replace(CONFIG, activation="tanh")
-    state, batch = state_of(config), case_batch(config, 0, discount=np.zeros(BATCH))
-    after = update_of(config)(jax.random.key(0), state, batch)
-    _, critics, _, _ = nested_params(config, [getattr(state, name) for name in NAMES])
+    state, batch = state_of(CONFIG), case_batch(CONFIG, 0, discount=np.zeros(BATCH))
+    after = learn_of(CONFIG)(state, batch, case_noise(CONFIG, 0))
+    _, critics, _, _ = nested_params(CONFIG, [getattr(state, name) for name in NAMES])
     _, means, _, _ = nested_params(
-        config, [state.actor, after.critic_opt_state.mu, state.actor, state.critics]
+        CONFIG, [state.actor, after.critic_opt_state.mu, state.actor, state.critics]
     )
     inputs = np.concatenate([batch.obs, batch.action]).T[:-1]  # the last column does not count
     for params, mean in zip(critics, means, strict=True):
-        q_values = np.array([numpy_forward(params, x, "tanh", 2)[0] for x in inputs])
+        q_values = np.array([numpy_forward(params, x, "relu", 2)[0] for x in inputs])
         expected = 0.1 * 2 * np.mean(q_values - batch.reward[:-1])
         np.testing.assert_allclose(mean["Dense_2"]["bias"], [expected], rtol=1e-4)
 
@@ -280,15 +302,14 @@ def test_the_critics_losses_are_means_over_the_columns_and_added():
 def test_an_agent_with_units_and_columns_out_of_use_learns_as_a_smaller_one():
     # Three of five units and four of seven columns.
     small_config = replace(DISCRETE, hidden_size=3)
-    key = jax.random.key(2)
-    large, policy = agent_of(DISCRETE), policy_of(DISCRETE)
-    numbers = large.hparams._replace(hidden_size=jnp.float32(3), batch_size=jnp.float32(4))
-    state = jax.jit(large.init)(key, numbers)
+    large = agent_of(DISCRETE)
+    numbers = large.hparams._replace(hidden_size=np.float32(3), batch_size=np.float32(4))
+    state = jax.jit(large.init)(jax.random.key(2), numbers)
     assert float(large.batch_size(state)) == 4 and large.batch_size(state_of(DISCRETE)) is None
 
     def cut(params):
         """Parameters of the units in use, as those of the smaller network."""
-        out = {"width": jnp.float32(3)}
+        out = {"width": np.float32(3)}
         out["LayerNorm_0"] = {name: x[:3] for name, x in params["LayerNorm_0"].items()}
         for i in range(4):
             rows, columns = slice(3 if i < 3 else None), slice(3 if i > 0 else None)
@@ -296,50 +317,25 @@ def test_an_agent_with_units_and_columns_out_of_use_learns_as_a_smaller_one():
             out[f"Dense_{i}"] = {
                 "kernel": layer["kernel"][rows, columns], "bias": layer["bias"][rows]
             }  # fmt: skip
-        return ravel_pytree(out)[0]
+        return raveled(out)
 
     def cut_all(state):
         nested = nested_params(DISCRETE, [getattr(state, name) for name in NAMES])
-        flat = [jnp.stack([cut(x) for x in n]) if isinstance(n, list) else cut(n) for n in nested]
+        flat = [np.stack([cut(x) for x in n]) if isinstance(n, list) else cut(n) for n in nested]
         return dict(zip(NAMES, flat, strict=True))
 
-    small = state_of(small_config).replace(**cut_all(state))
-    learn = jax.jit(
-        make_learning_step(DISCRETE, make_networks(DISCRETE, OBS_DIM, ACTION_DIM), policy)
-    )
-    learn_small = jax.jit(
-        make_learning_step(small_config, make_networks(small_config, OBS_DIM, ACTION_DIM), policy)
-    )
+    small = state_with(small_config, cut_all(state).values())
     for number in range(1, 5):
         batch = case_batch(DISCRETE, number, weight=np.arange(BATCH) < 4)
         noise = case_noise(DISCRETE, number)
-        state, small = learn(state, batch, noise), learn_small(small, batch, noise)
+        state = learn_of(DISCRETE)(state, batch, noise)
+        small = learn_of(small_config)(small, batch, noise)
     for name, got in cut_all(state).items():
         np.testing.assert_allclose(got, getattr(small, name), rtol=1e-4, atol=1e-5)
     # Nothing but the cut part is there, apart from the layer norms' idle scales of 1.
     for name in NAMES:
         num_idle = np.count_nonzero(getattr(state, name)) - np.count_nonzero(getattr(small, name))
         assert num_idle == 2 * np.atleast_2d(getattr(state, name)).shape[0]
-
-
-@pytest.mark.parametrize("config", [CONFIG, DISCRETE], ids=["continuous", "discrete"])
-def test_members_with_their_own_numbers_and_counters_update_under_vmap_as_alone(config):
-    # Lane 0 comes to an actor update, lane 1 does not.
-    base, batch = state_of(config), case_batch(config, 0)
-    lanes = [
-        base.replace(num_updates=jnp.int32(n),
-                     hparams=base.hparams._replace(learning_rate=jnp.float32(rate)))
-        for n, rate in ((1, 0.01), (2, 0.1))
-    ]  # fmt: skip
-    stacked = jax.tree.map(lambda *x: jnp.stack(x), *lanes)
-    key = jax.random.key(0)
-    together = jax.jit(jax.vmap(agent_of(config).update, (None, 0, None)))(key, stacked, batch)
-    for i, lane in enumerate(lanes):
-        alone = update_of(config)(key, lane, batch)
-        for name in NAMES:
-            np.testing.assert_allclose(
-                getattr(together, name)[i], getattr(alone, name), rtol=1e-5, atol=1e-6
-            )
 
 
 @pytest.mark.parametrize("config", [CONFIG, DISCRETE], ids=["continuous", "discrete"])
@@ -368,7 +364,7 @@ def test_smoothing_noise_is_scaled_clipped_and_the_action_clamped():
     # and with 9 std 1.5 + 1 = 2.5, clamped to 2.
     noise = LearningNoise(jnp.array([[1.0, -9.0, 9.0]]), None, None)
     outputs = jnp.array([[0.0, 0.0, np.arctanh(0.75)]])
-    hparams = TD3Hparams(0.0, 0.0, 0.0, 0.0, target_noise_std=0.2, target_noise_clip=0.5)
+    hparams = state_of(CONFIG).hparams._replace(target_noise_std=0.2, target_noise_clip=0.5)
     state = state_of(CONFIG).replace(hparams=hparams)
     got = smoothed_target_action(outputs, noise, state, tanh_policy(1, 2.0))
     np.testing.assert_allclose(got, [[0.4, -1.0, 2.0]], rtol=1e-6)
@@ -401,44 +397,54 @@ def test_gumbel_softmax_by_hand():
 
 def test_one_hot_samples_are_exact_and_have_the_relaxed_gradient():
     rng = np.random.default_rng(0)
-    logits, gumbel = (jnp.float32(rng.normal(size=(4, 6))) for _ in range(2))
-    weights = jnp.float32(rng.normal(size=(4, 6)))
+    logits, gumbel = (np.float32(rng.normal(size=(4, 6))) for _ in range(2))
+    weights = np.float32(rng.normal(size=(4, 6)))
 
-    def value(logits, one_hot):
-        return jnp.sum(weights * gumbel_softmax(logits, gumbel, 0.7, one_hot))
+    @jax.jit
+    def samples_and_gradients(logits):
+        def value(logits, one_hot):
+            sample = gumbel_softmax(logits, gumbel, 0.7, one_hot)
+            return jnp.sum(weights * sample), sample
 
-    hard = np.asarray(gumbel_softmax(logits, gumbel, 0.7, True))
+        return [jax.grad(value, has_aux=True)(logits, one_hot) for one_hot in (True, False)]
+
+    (hard_gradient, hard), (gradient, _) = samples_and_gradients(logits)
     np.testing.assert_array_equal(hard, np.eye(4)[np.argmax(logits + gumbel, axis=0)].T)
-    np.testing.assert_allclose(
-        jax.grad(value)(logits, True), jax.grad(value)(logits, False), rtol=1e-5, atol=1e-7
-    )
+    np.testing.assert_allclose(hard_gradient, gradient, rtol=1e-5, atol=1e-7)
 
 
 def test_samples_follow_the_softmax_of_the_logits():
     probabilities, n = np.array([0.1, 0.2, 0.7]), 4000
     policy = gumbel_softmax_policy(3, 1, one_hot=True)
     state = state_of(DISCRETE)
-    noise = policy.draw(jax.random.key(0), (3, n))
-    logits = jnp.broadcast_to(jnp.log(probabilities)[:, None] + 5.0, (3, n))
-    share = np.asarray(policy.action(logits, noise, state)).mean(axis=1)
+    logits = np.float32(np.tile(np.log(probabilities)[:, None] + 5.0, n))
+    sample = jax.jit(lambda key: policy.action(logits, policy.draw(key, (3, n)), state))
+    share = np.asarray(sample(jax.random.key(0))).mean(axis=1)
     deviation = np.sqrt(probabilities * (1 - probabilities) / n)
     assert (np.abs(share - probabilities) < 5 * deviation).all()
 
 
 def test_the_temperature_falls_linearly_to_its_end_and_stays():
     hparams = agent_of(DISCRETE).hparams._replace(temperature=2.0, final_temperature=0.25)
-    got = [float(annealed_temperature(hparams, jnp.int32(n), 4)) for n in (0, 1, 2, 3, 4, 5, 10**9)]
+    temperature = jax.jit(lambda n: annealed_temperature(hparams, n, 4))
+    got = [float(temperature(np.int32(n))) for n in (0, 1, 2, 3, 4, 5, 10**9)]
     # From 2 to 0.5 in four steps of 0.375.
     np.testing.assert_allclose(got, [2.0, 1.625, 1.25, 0.875, 0.5, 0.5, 0.5], rtol=1e-6)
 
 
 def test_a_final_temperature_of_zero_gives_finite_samples_and_gradients():
     hparams = agent_of(DISCRETE).hparams._replace(final_temperature=0.0)
-    temperature = annealed_temperature(hparams, jnp.int32(9), 4)
-    logits, gumbel = jnp.array([30.0, -30.0, 1.0]), jnp.array([-2.0, 17.0, 0.0])
-    sample, pull = jax.vjp(lambda x: gumbel_softmax(x, gumbel, temperature, False), logits)
+    gumbel, weights = np.float32([-2.0, 17.0, 0.0]), np.float32([1.0, 2.0, 3.0])
+
+    @jax.jit
+    def sample_and_gradient(logits, num_updates):
+        temperature = annealed_temperature(hparams, num_updates, 4)
+        sample, pull = jax.vjp(lambda x: gumbel_softmax(x, gumbel, temperature, False), logits)
+        return sample, pull(weights)[0]
+
+    sample, gradient = sample_and_gradient(np.float32([30.0, -30.0, 1.0]), np.int32(9))
     np.testing.assert_array_equal(sample, [1.0, 0.0, 0.0])
-    assert np.isfinite(pull(jnp.array([1.0, 2.0, 3.0]))[0]).all()
+    assert np.isfinite(gradient).all()
 
 
 # --- acting --------------------------------------------------------------------------------------
@@ -447,17 +453,34 @@ PLAIN = replace(DISCRETE, layer_norm=False, num_layers=2)
 OBS = np.float32([0.3, -0.2, 0.5])
 
 
+def acting_state_of(config):
+    """The state of the plainest agent of the same networks: with equal parameters."""
+    return state_of(replace(config, noisy_tests=False, **(
+        {"one_hot_actions": False} if is_discrete(config) else {}
+    )))  # fmt: skip
+
+
+@functools.cache
+def acting(config, explore):
+    """Actions of 4000 keys, `(state, episode) -> [4000, action_dim]`."""
+    agent = agent_of(config)
+
+    @jax.jit
+    def act(state, episode):
+        state = agent.begin_episode(state, episode)
+        keys = jax.random.split(jax.random.key(1), 4000)
+        return jax.vmap(lambda key: agent.act(key, state, OBS, explore))(keys)
+
+    return act
+
+
 @functools.cache
 def drawn_actions(config, explore, warming_up=False, action_noise_std=0.01):
     """Actions of 4000 keys, `[4000, action_dim]`."""
-    state = state_of(config)
-    state = agent_of(config).begin_episode(
-        state.replace(hparams=state.hparams._replace(action_noise_std=action_noise_std)),
-        jnp.int32(2 if warming_up else 3),
-    )
-    keys = jax.random.split(jax.random.key(1), 4000)
-    act = functools.partial(agent_of(config).act, explore=explore)
-    return np.asarray(jax.jit(jax.vmap(act, (0, None, None)))(keys, state, OBS))
+    state = acting_state_of(config)
+    hparams = state.hparams._replace(action_noise_std=np.float32(action_noise_std))
+    episode = np.int32(2 if warming_up else 3)
+    return np.asarray(acting(config, explore)(state.replace(hparams=hparams), episode))
 
 
 @pytest.mark.parametrize("config", [CONFIG, DISCRETE], ids=["continuous", "discrete"])
@@ -505,7 +528,7 @@ def test_discrete_exploring_adds_noise_to_a_gumbel_softmax_sample():
     assert (sample.sum(1) == 1).all()
     np.testing.assert_allclose((drawn - sample).std(0), 0.01, rtol=0.06)
     assert drawn.min() < 0 and drawn.max() > 1  # not clamped
-    probabilities = np.exp(actor_outputs(one_hot, state_of(one_hot), OBS))
+    probabilities = np.exp(actor_outputs(one_hot, acting_state_of(one_hot), OBS))
     probabilities /= probabilities.sum()
     assert np.abs(sample.mean(0) - probabilities).max() < 5 * 0.5 / np.sqrt(4000)
 
@@ -527,7 +550,7 @@ def test_tests_are_without_noise():
     np.testing.assert_allclose(drawn, np.tile(MAX_ACTION * np.tanh(outputs), (4000, 1)), rtol=1e-5)
     drawn = drawn_actions(PLAIN, explore=False)
     best = int(np.argmax(actor_outputs(PLAIN, state_of(PLAIN), OBS)))
-    index = jax.vmap(agent_of(PLAIN).env_action)(drawn)
+    index = jax.jit(jax.vmap(agent_of(PLAIN).env_action))(drawn)
     assert index.dtype == jnp.int32 and (np.asarray(index) == best).all()
 
 
@@ -545,37 +568,46 @@ def test_noisy_tests_act_as_in_training_but_never_warm_up(config):
 
 def test_the_agent_holds_the_configured_numbers():
     agent = agent_of(replace(CONFIG, action_repeat=4, action_noise_std=0.3, init_episodes=6))
-    assert agent.hparams == TD3Hparams(
-        learning_rate=0.01, target_update_rate=0.1, discount=0.9,
-        action_noise_std=0.3, target_noise_std=0.4, target_noise_clip=0.5,
-    )  # fmt: skip
+    assert agent.hparams._asdict() == {
+        "learning_rate": 0.01, "target_update_rate": 0.1, "discount": 0.9,
+        "action_noise_std": 0.3, "target_noise_std": 0.4, "target_noise_clip": 0.5,
+        "hidden_size": None, "batch_size": None,  # all of them
+    }  # fmt: skip
     assert (agent.action_repeat, agent.init_episodes, agent.learns_from) == (4, 6, 6)
-    assert agent_of(DISCRETE).hparams == DiscreteTD3Hparams(
-        learning_rate=0.01, target_update_rate=0.1, discount=0.9,
-        action_noise_std=0.1, target_noise_std=0.4, target_noise_clip=0.5,
-        temperature=2.0, final_temperature=0.25,
-    )  # fmt: skip
+    assert agent_of(DISCRETE).hparams._asdict() == {
+        "learning_rate": 0.01, "target_update_rate": 0.1, "discount": 0.9,
+        "action_noise_std": 0.1, "target_noise_std": 0.4, "target_noise_clip": 0.5,
+        "temperature": 2.0, "final_temperature": 0.25,
+        "hidden_size": None, "batch_size": None,
+    }  # fmt: skip
 
 
 def test_the_memory_hands_out_action_vectors():
-    action = jnp.array([0.25, -1.5])
-    one = Transition(jnp.ones(3), action, jnp.float32(2.0), jnp.float32(0.5), jnp.zeros(3))
+    action = np.float32([0.25, -1.5])
+    one = Transition(np.ones(3, np.float32), action, np.float32(2.0), np.float32(0.5),
+                     np.zeros(3, np.float32))  # fmt: skip
     memory = agent_of(CONFIG).memory(jax.eval_shape(lambda: one), 10)
-    kept = memory.store(memory.init(), jnp.int32(0), one, False, True)
-    batch = memory.batch(jax.random.key(0), kept, jnp.int32(1), one, None)
+
+    @jax.jit
+    def draw(key):
+        kept = memory.store(memory.init(), jnp.int32(0), one, False, True)
+        return memory.batch(key, kept, jnp.int32(1), one, None)
+
+    batch = draw(jax.random.key(0))
     np.testing.assert_array_equal(batch.action, np.tile(action[:, None], batch.obs.shape[1]))
-    assert float(jnp.sum(batch.weight)) == BATCH
+    assert np.sum(batch.weight) == BATCH
 
 
 def test_layer_norm_comes_after_each_hidden_layer_but_the_first_and_is_shared():
     net = MLP(2, hidden_size=5, num_layers=3, activation="tanh", layer_norm=True)
-    params = net.init(jax.random.key(0), jnp.zeros(4))["params"]
+    params = jax.jit(net.init)(jax.random.key(0), np.zeros(4, np.float32))["params"]
     assert set(params) == {"Dense_0", "Dense_1", "Dense_2", "Dense_3", "LayerNorm_0"}
     rng = np.random.default_rng(0)
-    params["LayerNorm_0"] = {k: jnp.float32(rng.normal(size=5)) for k in ("scale", "bias")}
+    params["LayerNorm_0"] = {k: np.float32(rng.normal(size=5)) for k in ("scale", "bias")}
     norm = {k: np.asarray(v, np.float64) for k, v in params["LayerNorm_0"].items()}
     batch = rng.normal(size=(4, 6))
-    got = net.apply({"params": params}, jnp.float32(batch))
+    apply = jax.jit(net.apply)
+    got = np.asarray(apply({"params": params}, np.float32(batch)))
     for column in range(6):
         x = batch[:, column]
         for layer in range(4):
@@ -587,7 +619,7 @@ def test_layer_norm_comes_after_each_hidden_layer_but_the_first_and_is_shared():
             if layer < 3:
                 x = np.tanh(x)
         np.testing.assert_allclose(got[:, column], x, rtol=1e-4, atol=1e-5)
-        alone = net.apply({"params": params}, jnp.float32(batch[:, column]))
+        alone = apply({"params": params}, np.float32(batch[:, column]))
         np.testing.assert_allclose(alone, x, rtol=1e-4, atol=1e-5)
 
 
@@ -595,10 +627,12 @@ def test_layer_norm_comes_after_each_hidden_layer_but_the_first_and_is_shared():
 
 
 def train_on(agent, batch, num_updates):
+    """The agent after so many updates on a batch; to be called in a jitted function."""
+
     def step(state, key):
         return agent.update(key, state, batch), None
 
-    state = jax.jit(agent.init)(jax.random.key(0), agent.hparams)
+    state = agent.init(jax.random.key(0), agent.hparams)
     return jax.lax.scan(step, state, jax.random.split(jax.random.key(1), num_updates))[0]
 
 
@@ -608,14 +642,19 @@ def test_on_a_one_step_bandit_the_policy_finds_the_best_action():
         hidden_size=16, num_layers=1, activation="tanh", learning_rate=0.01, target_update_rate=0.1
     )
     agent = make_td3(config, obs_dim=1, action_dim=1, max_action=2.0)
-    action = jnp.linspace(-2, 2, 32)[None]
+    action = np.linspace(-2, 2, 32, dtype=np.float32)[None]
+    zeros = np.zeros(32, np.float32)
     batch = Transition(
-        obs=jnp.zeros((1, 32)), action=action, reward=-((action[0] - 0.3) ** 2),
-        discount=jnp.zeros(32), next_obs=jnp.zeros((1, 32)),
+        obs=zeros[None], action=action, reward=-((action[0] - 0.3) ** 2), discount=zeros,
+        next_obs=zeros[None],
     )  # fmt: skip
-    state = train_on(agent, batch, 700)
-    got = agent.act(jax.random.key(0), state, jnp.zeros(1), explore=False)
-    np.testing.assert_allclose(got, [0.3], atol=0.1)
+
+    @jax.jit
+    def trained_action(key):
+        state = train_on(agent, batch, 700)
+        return agent.act(key, state, jnp.zeros(1), explore=False)
+
+    np.testing.assert_allclose(trained_action(jax.random.key(0)), [0.3], atol=0.1)
 
 
 @pytest.mark.parametrize("one_hot", [False, True], ids=["relaxed", "one_hot"])
@@ -629,25 +668,29 @@ def test_on_a_two_state_probe_the_discrete_policy_waits_for_the_larger_reward(on
         target_noise_std=0.0, final_temperature=1.0, one_hot_actions=one_hot,
     )  # fmt: skip
     agent = make_td3_discrete(config, obs_dim=2, num_actions=2)
-    gumbel = jnp.float32(np.random.default_rng(0).gumbel(size=(2, 64)))
-    action = gumbel_softmax(jnp.zeros((2, 64)), gumbel, 0.3, one_hot)
-    taken, in_a = np.argmax(action, axis=0), np.arange(64) % 2 == 0
+    networks = make_networks(config, 2, 2)
+    gumbel = np.float32(np.random.default_rng(0).gumbel(size=(2, 64)))
+    taken, in_a = np.argmax(gumbel, axis=0), np.arange(64) % 2 == 0
     waits = in_a & (taken == 1)
     states = np.float32([[1, 0], [0, 1]])  # columns: A and B
-    batch = Transition(
-        obs=jnp.array(np.where(in_a, states[:, :1], states[:, 1:])),
-        action=action,
-        reward=jnp.float32(np.where(taken == 0, np.where(in_a, 0.5, 1.0), 0.0)),
-        discount=jnp.float32(waits),
-        next_obs=jnp.array(np.where(waits, states[:, 1:], states[:, :1])),
-    )
-    state = train_on(agent, batch, 1000)
-    for obs, best in zip(states.T, (1, 0), strict=True):
-        action = agent.act(jax.random.key(0), state, obs, explore=False)
-        assert int(agent.env_action(action)) == best
-    networks = make_networks(config, 2, 2)
-    for critic in state.critics:
-        got = networks.critic(critic, np.repeat(states, 2, axis=1), np.tile(np.eye(2), 2))
+
+    @jax.jit
+    def run(key):
+        batch = Transition(
+            obs=np.where(in_a, states[:, :1], states[:, 1:]),
+            action=gumbel_softmax(jnp.zeros((2, 64)), gumbel, 0.3, one_hot),
+            reward=np.float32(np.where(taken == 0, np.where(in_a, 0.5, 1.0), 0.0)),
+            discount=np.float32(waits),
+            next_obs=np.where(waits, states[:, 1:], states[:, :1]),
+        )
+        state = train_on(agent, batch, 1000)
+        actions = [agent.env_action(agent.act(key, state, obs, explore=False)) for obs in states.T]
+        pairs = np.repeat(states, 2, axis=1), np.tile(np.eye(2, dtype=np.float32), 2)
+        return actions, [networks.critic(critic, *pairs) for critic in state.critics]
+
+    actions, q_values = run(jax.random.key(0))
+    assert [int(action) for action in actions] == [1, 0]
+    for got in q_values:
         np.testing.assert_allclose(got, [0.5, 0.8, 1.0, 0.0], atol=0.1)
 
 

@@ -15,7 +15,7 @@ from sejax.agents.ppo import PPOConfig, make_ppo
 from sejax.agents.replay import Transition
 from sejax.networks import MLP
 from sejax.proxies.configs import SyntheticConfig
-from sejax.trainer import TrainingConfig
+from sejax.training import TrainingConfig
 
 torch = pytest.importorskip("torch")
 sys.path.append(str(Path(__file__).parents[1] / "benchmarks"))

@@ -1,5 +1,7 @@
 """sejax.trainer: the inner loop against a plain Python one, alone and in lanes."""
 
+import re
+
 import gymnasium
 import jax
 import jax.numpy as jnp
@@ -9,11 +11,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scripted import MAX_EPISODES, MAX_STEPS, WHO, ScriptedEnv, script, scripted_agent
 
-from sejax import envs
-from sejax.agents.ddqn import make_ddqn
-from sejax.configs import DDQNConfig, SyntheticConfig, TrainingConfig
-from sejax.proxies.synthetic import make_synthetic
-from sejax.trainer import is_plateau, is_solved, make_tester, make_trainer
+from sejax import envs, evaluation, plugins
+from sejax.agents.ddqn import DDQNConfig, make_ddqn
+from sejax.agents.memory import Memory
+from sejax.proxies.configs import SyntheticConfig
+from sejax.rollout import make_recorder, make_tester
+from sejax.trainer import is_plateau, is_solved, make_trainer
+from sejax.training import TrainingConfig
 
 WINDOW, TOLERANCE, SOLVED, INIT_EPISODES = 2, 0.25, 1.5, 2
 KEY = jax.random.key(0)
@@ -43,6 +47,7 @@ VARIANTS = {
     "solved": training(stop_rule="solved", solved_by="train"),
     "tested": training(stop_rule="solved", solved_by="test"),
     "cut": training(stop_rule="never", time_limit_is_terminal=True, max_steps=17),
+    "watched": training(stop_rule="plateau", tests_between=1),
     "patient": training(stop_rule="plateau", min_steps=14),
 }
 
@@ -133,8 +138,28 @@ def test_tests_between_episodes_decide_and_are_recorded(trainers):
     # Test returns -1, 0, 1, 2: the mean of the last two is 1.5 after the fourth episode.
     result = trainers["tested"](KEY, script([3] * 12, [1] * 12))
     assert result.episodes == 4
-    np.testing.assert_array_equal(result.returns, [-1, 0, 1, 2] + [np.nan] * 8)
+    np.testing.assert_array_equal(result.test_returns, [-1, 0, 1, 2] + [np.nan] * 8)
+    np.testing.assert_array_equal(result.returns, [3] * 4 + [np.nan] * 8)  # as they were trained
     assert result.test_steps == 4 * 3
+
+
+def test_tests_between_episodes_stop_nothing_if_the_rule_does_not_ask_for_them(trainers):
+    result = trainers["watched"](KEY, script([3] * 12, [1] * 12))
+    assert result.episodes == 5  # flat from the first on: the training's own returns are judged
+    np.testing.assert_array_equal(result.test_returns, [-1, 0, 1, 2, 3] + [np.nan] * 7)
+    np.testing.assert_array_equal(result.returns, [3] * 5 + [np.nan] * 7)
+    assert result.test_steps == 5 * 3
+    assert trainers["plateau"](KEY, script([3] * 12, [1] * 12)).test_returns is None
+
+
+def test_a_solved_training_that_is_tested_throughout_goes_on():
+    solved, flat = VARIANTS["tested"], VARIANTS["plateau"]
+    assert (solved.num_tests_between, flat.num_tests_between) == (1, 0)
+    assert VARIANTS["solved"].num_tests_between == 0  # judged by its own returns
+    assert evaluation.tested_throughout(solved) == training(stop_rule="never", tests_between=1)
+    assert evaluation.tested_throughout(flat) == training(stop_rule="plateau", tests_between=1)
+    thrice = training(stop_rule="never", tests_between=3)
+    assert evaluation.tested_throughout(thrice) == thrice and thrice.num_tests_between == 3
 
 
 def test_learning_starts_with_the_first_episode_after_the_initial_ones(trainers):
@@ -163,8 +188,11 @@ def test_a_step_limit_above_the_default_still_trains_all_episodes(trainers):
 
 
 def test_tests_need_a_test_function():
-    with pytest.raises(ValueError, match=r"solved_by='test' needs a test_fn; got None\."):
-        make_trainer(scripted_agent(), ENV, VARIANTS["tested"])
+    for name in ("tested", "watched"):
+        with pytest.raises(
+            ValueError, match=r"num_tests_between is 1\) need a test_fn; got None\."
+        ):
+            make_trainer(scripted_agent(), ENV, VARIANTS[name])
 
 
 # --- what is stored ------------------------------------------------------------------------------
@@ -313,25 +341,42 @@ def assert_same(many, index, alone):
         np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-4)
 
 
-@pytest.mark.parametrize("variant", ["plateau", "tested"])
-def test_scripted_lanes_equal_single_trainings(trainers, variant):
-    keys = jax.random.split(KEY, 5)
+def scripted_lanes():
+    """Keys, params, weights and whether they run, of six trainings: `[lane, ...]`."""
     rng = np.random.default_rng(0)
-    each = [script(rng.integers(-2, 3, 12), rng.integers(1, 7, 12)) for _ in range(4)]
+    each = [script(rng.integers(-2, 3, 12), rng.integers(1, 7, 12)) for _ in range(5)]
     each.append(script([1] * 12, [3] * 12, nonfinite_episode=1))
     params = jax.tree.map(lambda *x: jnp.stack([jnp.asarray(v) for v in x]), *each)
-    active = jnp.array([True, True, False, True, True])
-    many = jax.jit(jax.vmap(trainers[variant]))(keys, params, jnp.arange(5.0), active)
+    active = jnp.array([True, True, False, True, True, True])
+    return jax.random.split(KEY, 6), params, jnp.arange(6.0), active
+
+
+def assert_lanes_are_single_trainings(train, lanes, many):
     assert len(set(np.asarray(many.train_steps).tolist())) > 2  # stopped at different times
-    for i in range(5):
-        assert_same(many, i, trainers[variant](keys[i], each[i], float(i), active[i]))
+    for i in range(6):
+        alone = jax.tree.map(lambda x, i=i: x[i], lanes)
+        assert_same(many, i, train(*alone))
+
+
+def test_scripted_lanes_equal_single_trainings(trainers):
+    lanes = scripted_lanes()
+    many = jax.jit(jax.vmap(trainers["plateau"]))(*lanes)
+    assert_lanes_are_single_trainings(trainers["plateau"], lanes, many)
+
+
+def test_nested_lanes_equal_single_trainings(trainers):
+    lanes = scripted_lanes()
+    nested = jax.tree.map(lambda x: x.reshape(2, 3, *x.shape[1:]), lanes)
+    many = jax.jit(jax.vmap(jax.vmap(trainers["tested"])))(*nested)
+    many = jax.tree.map(lambda x: x.reshape(6, *x.shape[2:]), many)
+    assert_lanes_are_single_trainings(trainers["tested"], lanes, many)
 
 
 @pytest.fixture(scope="module")
 def ddqn_in_se():
     """Single and vmapped short trainings of a DDQN agent in SEs of different step limits."""
     task = envs.make("cartpole")
-    env = make_synthetic(task, SyntheticConfig(hidden_size=4))
+    env = plugins.make("proxy", SyntheticConfig(hidden_size=4), task)
     config = DDQNConfig(hidden_size=4, num_layers=1, batch_size=4, init_episodes=1)
     train = make_trainer(
         make_ddqn(config, 4, 2), env, training(max_episodes=8, plateau_tolerance=0.3)
@@ -356,31 +401,22 @@ def test_lanes_equal_single_trainings(ddqn_in_se):
 
 @pytest.mark.parametrize("world", ["real", "synthetic"])
 def test_a_time_limit_is_terminal_on_the_real_task_if_asked_and_never_in_an_se(world):
+    """As programs; what they then do is above."""
     task = envs.make("cartpole")
-    synthetic = make_synthetic(task, SyntheticConfig(hidden_size=4))
+    synthetic = plugins.make("proxy", SyntheticConfig(hidden_size=4), task)
     env, params = {
-        "real": (task.env, task.params.replace(max_steps_in_episode=4)),
-        "synthetic": (synthetic, synthetic.default_params.replace(max_steps_in_episode=4)),
+        "real": (task.env, task.params),
+        "synthetic": (synthetic, synthetic.default_params),
     }[world]
-    config = DDQNConfig(hidden_size=4, num_layers=1, batch_size=4, init_episodes=1)
-    trained = [
-        jax.jit(
-            make_trainer(
-                make_ddqn(config, 4, 2), env,
-                training(max_episodes=6, stop_rule="never", time_limit_is_terminal=asked),
-            )
-        )(KEY, params).agent_state.params
+    agent = make_ddqn(DDQNConfig(hidden_size=4, num_layers=1, batch_size=4, init_episodes=1), 4, 2)
+    programs = [
+        str(jax.make_jaxpr(make_trainer(
+            agent, env, training(max_episodes=6, stop_rule="never", time_limit_is_terminal=asked)
+        ))(KEY, params))
         for asked in (False, True)
     ]  # fmt: skip
-    assert np.array_equal(*trained) == (world == "synthetic")
-
-
-def test_nested_lanes_equal_single_trainings(ddqn_in_se):
-    train, keys, params, alone = ddqn_in_se
-    square = jax.tree.map(lambda x: x.reshape(2, 2, *x.shape[1:]), params)
-    many = jax.jit(jax.vmap(jax.vmap(train)))(keys.reshape(2, 2), square)
-    for i in range(4):
-        assert_same(many, divmod(i, 2), alone[i])
+    without, asked = (re.sub("0x[0-9a-f]+", "", program) for program in programs)
+    assert (without == asked) == (world == "synthetic")
 
 
 # --- the test on the real task -------------------------------------------------------------------
@@ -421,3 +457,69 @@ def test_test_episodes_end_at_the_step_limit_and_inactive_ones_do_not_begin():
     returns, steps = test(KEY, state, jnp.bool_(False))
     np.testing.assert_array_equal(returns, 0.0)
     np.testing.assert_array_equal(steps, 0)
+
+
+# --- steps that are kept for whoever looks -------------------------------------------------------
+
+LENGTHS = [2, 3, 6, 1] * 3
+
+
+def row_recorder(example, max_steps):
+    """Keeps episode, time and whether it ended of each step, by the memories' contract."""
+    assert example.obs.shape == (2,) and max_steps == 100
+
+    def store(rows, step, transition, ended, active):
+        row = jnp.stack([transition.action // WHO, transition.obs[0].astype(int), ended])
+        return rows.at[step].set(jnp.where(active, row, rows[step]))
+
+    return Memory(init=lambda: jnp.full((max_steps, 3), -1), store=store, batch=None)
+
+
+@pytest.fixture(scope="module")
+def recorded():
+    """Scripted trainings of 12 and of 5 episodes in lanes, with a recorder: `[lane]`."""
+    config = training(stop_rule="plateau", max_steps=100)
+    train = make_trainer(scripted_agent(INIT_EPISODES), ENV, config, recorder=row_recorder)
+    each = [script(range(12), LENGTHS), script([3] * 12, LENGTHS)]
+    params = jax.tree.map(lambda *x: jnp.stack([jnp.asarray(v) for v in x]), *each)
+    return each, jax.jit(jax.vmap(train))(jax.random.split(KEY, 2), params, jnp.zeros(2))
+
+
+def test_a_recorder_is_handed_every_step_and_none_after_the_last(recorded):
+    _, result = recorded
+    for lane, num_episodes in ((0, 12), (1, 5)):
+        expected = [
+            (episode, time, time + 1 == min(LENGTHS[episode], MAX_STEPS))
+            for episode in range(num_episodes)
+            for time in range(min(LENGTHS[episode], MAX_STEPS))
+        ]
+        assert result.episodes[lane] == num_episodes
+        assert result.train_steps[lane] == len(expected)
+        np.testing.assert_array_equal(result.recorded[lane, : len(expected)], expected)
+        np.testing.assert_array_equal(result.recorded[lane, len(expected) :], -1)
+
+
+def test_a_recorded_training_is_the_training(recorded, trainers):
+    each, result = recorded
+    for lane, key in enumerate(jax.random.split(KEY, 2)):
+        alone = trainers["plateau"](key, each[lane])
+        assert alone.recorded is None
+        with_record = jax.tree.map(lambda x, i=lane: x[i], result.replace(recorded=None))
+        assert_same(jax.tree.map(lambda x: x[None], with_record), 0, alone)
+
+
+def test_recorded_tests_are_the_tests():
+    task = envs.Task(name="script", env=ENV, params=script([2.5] * 12, [3] * 12))
+    agent = scripted_agent()
+    state = agent.begin_episode(agent.init(KEY, 0.0), 0)
+    both = make_tester(agent, task, 3), make_recorder(agent, task, 3)
+    (returns, num_steps), steps = jax.jit(lambda *args: [f(*args) for f in both])(KEY, state)
+    valid = np.array(steps.valid).reshape(3, MAX_STEPS)
+    np.testing.assert_array_equal(valid, [[True] * 3 + [False]] * 3)
+    np.testing.assert_array_equal(valid.sum(axis=1), num_steps)
+    rewards = np.array(steps.reward).reshape(3, MAX_STEPS)
+    np.testing.assert_array_equal((rewards * valid).sum(axis=1), returns)
+    np.testing.assert_array_equal(steps.terminated[valid.ravel()], [False, False, True] * 3)
+    keys = [jax.random.split(key)[0] for key in jax.random.split(KEY, 3)]
+    starts = [float(ENV.reset_env(key, task.params)[0][1]) for key in keys]  # each episode's tag
+    np.testing.assert_array_equal(steps.obs[:, 1].reshape(3, -1)[:, 0], np.float32(starts))

@@ -9,9 +9,9 @@ import numpy as np
 import torch
 from test_ddqn import CONFIG, GOLDEN, NUM_ACTIONS, OBS_DIM, q_network, random_batch
 
-from sejax.agents.ddqn import make_ddqn
+from sejax.agents.ddqn import DDQNConfig, make_ddqn
 from sejax.agents.replay import Transition
-from sejax.configs import ACTIVATIONS, DDQNConfig
+from sejax.networks import ACTIVATIONS
 
 NUM_UPDATES = 5
 

@@ -18,7 +18,7 @@ from test_td3 import (
     nested_params,
 )
 
-from sejax.agents.configs import DiscreteTD3Config
+from sejax.agents.td3 import DiscreteTD3Config
 
 
 class TorchMLP(torch.nn.Module):

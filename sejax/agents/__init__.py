@@ -50,26 +50,12 @@ def make_agent(
       10
     """
     require_fit(config, exploration, task.facts, task.name)
-    return _make_agent(_Same((config, exploration)), task, varied)
-
-
-class _Same:
-    """Configurations that are equal if all their fields are, hashable or not."""
-
-    def __init__(self, configs: tuple[Any, ...]):
-        self.configs = configs
-        self.key = tuple((type(config), repr(vars(config))) for config in configs)
-
-    def __hash__(self) -> int:
-        return hash(self.key)
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Same) and self.key == other.key
+    return _make_agent(plugins.Same(config, exploration), task, varied)
 
 
 @functools.cache
-def _make_agent(configs: _Same, task: Any, varied: bool) -> Agent:
-    config, exploration = configs.configs
+def _make_agent(key: plugins.Same, task: Any, varied: bool) -> Agent:
+    config, exploration = key.configs
 
     def make(config: Any) -> Agent:
         agent = plugins.make("agent", config, task)

@@ -2,7 +2,7 @@
 
 Source: Strehl and Littman, "An Analysis of Model-Based Interval Estimation for Markov Decision
 Processes" (2008); paper, section "Experiments with Reward Networks", paragraph "Baselines", and
-appendix, table of count-based Q-learning; `reference_details.md` 4.7.
+appendix, table of count-based Q-learning; `docs/reference.md` 4.7.
 """
 
 import dataclasses

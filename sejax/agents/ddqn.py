@@ -1,7 +1,7 @@
 """Double DQN with soft target updates and Adam, with a plain or a dueling network.
 
 Source: van Hasselt et al., "Deep RL with Double Q-learning" (2016); the paper's hyperparameter
-tables; `reference_details.md` 4.1 and 4.2.
+tables; `docs/reference.md` 4.1 and 4.2.
 """
 
 import functools
@@ -18,9 +18,9 @@ from jaxtyping import Array, Float
 
 from sejax.agents import flat
 from sejax.agents.agent import Agent, AgentOptions, traced
-from sejax.agents.blocks import sum_over_batch
 from sejax.agents.epsilon_greedy import decayed_epsilon, epsilon_greedy
 from sejax.agents.memory import replay_memory
+from sejax.agents.partial_batch import sum_over_batch
 from sejax.agents.replay import Transition, num_columns
 from sejax.networks import ACTIVATIONS, MLP, DuelingMLP, narrow
 from sejax.options import counts, fraction, one_of, option, positive
@@ -144,7 +144,7 @@ def make_learning_step(
 ) -> Callable[[Array, DDQNState, Transition], DDQNState]:
     """Builds `update(key, state, batch) -> state`: Adam on the squared error to double-Q targets.
 
-    Source: van Hasselt et al. (2016), eq. 4; `reference_details.md` 4.1.
+    Source: van Hasselt et al. (2016), eq. 4; `docs/reference.md` 4.1.
     """
 
     def sum_of_losses(params, target_params, discount, batch: Transition) -> Array:

@@ -13,7 +13,7 @@ def decayed_epsilon(
     It is `init` in episode 0, even where that is less than `minimum`, and
     `max(init * decay**episode, minimum)` afterwards.
 
-    Source: `reference_details.md` 3.4.
+    Source: `docs/reference.md` 3.4.
     """
     epsilon = jnp.maximum(init * decay**episode, minimum)
     return jnp.where(episode == 0, init, epsilon)

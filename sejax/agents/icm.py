@@ -1,7 +1,7 @@
 """Intrinsic curiosity: a bonus for steps whose outcome the agent cannot yet predict.
 
 Source: Pathak et al., "Curiosity-driven Exploration by Self-supervised Prediction" (2017); paper,
-appendix, tables of ICM; `reference_details.md` 4.8. The forward model's residual blocks are those
+appendix, tables of ICM; `docs/reference.md` 4.8. The forward model's residual blocks are those
 of Burda et al., "Large-Scale Study of Curiosity-Driven Learning" (2019).
 """
 
@@ -159,7 +159,7 @@ def with_icm(
     softmax, where the authors' have the number 0 or 1 and one logit. Vectors of discrete actions
     are not one-hot, so that the inverse model learns them by their squared error.
 
-    Source: `reference_details.md` 4.8.
+    Source: `docs/reference.md` 4.8.
 
     Example:
       >>> from sejax.agents.ddqn import DDQNConfig, make_ddqn
@@ -273,7 +273,7 @@ def icm_loss(
     Returns:
       `[]`, the mean over the columns that count.
 
-    Source: Pathak et al. (2017), eq. 2 to 7; `reference_details.md` 4.8.
+    Source: Pathak et al. (2017), eq. 2 to 7; `docs/reference.md` 4.8.
     """
     predicted = outputs.predicted_action
     if _is_index(action):

@@ -1,7 +1,7 @@
 """PPO with a clipped ratio and Monte-Carlo returns, for discrete and for continuous actions.
 
 Source: Schulman et al., "Proximal Policy Optimization Algorithms" (2017); the paper's appendix,
-table of PPO; `reference_details.md` 4.5.
+table of PPO; `docs/reference.md` 4.5.
 """
 
 import functools
@@ -67,7 +67,7 @@ class PPOConfig(AgentOptions):
         `update_episodes`, also in the middle of an episode; this is the first whole number that
         does.
 
-        Source: `reference_details.md` 4.5.
+        Source: `docs/reference.md` 4.5.
         """
         return self.update_episodes * max_episode_steps // self.action_repeat + 1
 
@@ -84,7 +84,7 @@ class PPOState(struct.PyTreeNode):
     hparams: Any  # traced options, and hidden_size in use or None
 
 
-class Policy(NamedTuple):
+class Distribution(NamedTuple):
     """A distribution of actions, given the actor's outputs and the Gaussian's std.
 
     Attributes:
@@ -115,7 +115,7 @@ def make_ppo(
     `update` learns once the rollout is full and costs next to nothing before, in lanes too.
 
     Without exploration the agent takes its most probable action. Differs: the authors also test
-    with sampled actions (`reference_details.md` 3.7), and they do not clip actions, so that
+    with sampled actions (`docs/reference.md` 3.7), and they do not clip actions, so that
     MountainCarContinuous charges for what was drawn. The policy delay in the paper's table for PPO
     has no counterpart in their code, nor here.
 
@@ -144,27 +144,11 @@ def make_ppo(
             f"num_actions={num_actions} and action_dim={action_dim}. Set the other one to None."
         )
     policy = SOFTMAX if action_dim is None else gaussian(max_action)
-    std_dim = action_dim or 0  # a softmax has no std
-    actor, critic = (
-        MLP(size, config.hidden_size, config.num_layers, config.activation, learn_prelu_slope=True)
-        for size in (num_actions or std_dim, 1)
-    )
-
-    networks = {"actor": actor, "critic": critic}
-
-    def init_params(key: Array) -> dict[str, Any]:
-        keys = dict(zip(networks, jax.random.split(key), strict=True))
-        weights = {name: net.init(keys[name], jnp.zeros(obs_dim)) for name, net in networks.items()}
-        return {**weights, "std": jnp.full(std_dim, config.init_action_std, jnp.float32)}
-
-    unflatten = flat.unflattener(init_params)
+    networks = make_networks(config, obs_dim, policy, num_actions, action_dim)
+    learn = make_learning_phase(config, networks, obs_dim, is_discrete=action_dim is None)
 
     def init(key: Array, hparams: Any) -> PPOState:
-        tree = init_params(key)
-        if hparams.hidden_size is not None:
-            for name in networks:
-                tree[name] = {"params": narrow(tree[name]["params"], hparams.hidden_size)}
-        params = flat.flatten(tree)
+        params = networks.init(key, hparams.hidden_size)
         return PPOState(
             params=params,
             opt_state=flat.ADAM.init(params),
@@ -172,24 +156,8 @@ def make_ppo(
         )
 
     def act(key: Array, state: PPOState, obs: Float[Array, " obs_dim"], explore: bool) -> Array:
-        params = unflatten(state.params)
-        outputs: Any = actor.apply(params["actor"], obs)
-        return policy.sample(key, outputs, params["std"]) if explore else policy.mode(outputs)
-
-    def evaluate(params: dict[str, Any], obs: Array, action: Array) -> tuple[Array, Array, Array]:
-        """Log-probabilities and entropies of actions, and the critic's values, `[steps]` each."""
-        outputs: Any = actor.apply(params["actor"], obs)
-        log_prob, entropy = policy.evaluate(outputs, params["std"], action)
-        value: Any = critic.apply(params["critic"], obs)
-        return log_prob, entropy, value[0]
-
-    least_std = {"std": jnp.full(std_dim, MIN_STD)}
-    template = jax.eval_shape(init_params, jax.random.key(0))
-    unbounded = jax.tree.map(lambda x: jnp.full(x.shape, -jnp.inf), template)
-    learn = make_learning_phase(
-        config, evaluate, unflatten, flat.flatten({**unbounded, **least_std}),
-        lambda rollout: rollout.transitions(obs_dim, num_actions is not None),
-    )  # fmt: skip
+        outputs, std = networks.actor(networks.unflatten(state.params), obs)
+        return policy.sample(key, outputs, std) if explore else policy.mode(outputs)
 
     def update(key: Array, state: PPOState, rollout: Rollout) -> PPOState:
         """Learns if the rollout is full.
@@ -223,40 +191,96 @@ def make_ppo(
     )
 
 
-def make_learning_phase(
+class Networks(NamedTuple):
+    """The actor, the critic and the std as functions of one tree of parameters.
+
+    Attributes:
+      init: `(key, hidden_size) -> params`, flat; `hidden_size` is the number of units in use, or
+        None for all.
+      unflatten: of flat parameters to the tree.
+      actor: `(tree, obs) -> (outputs, std)`.
+      evaluate: `(tree, obs, action) -> (log_prob, entropy, value)`, `[steps]` each.
+      least_params: lower bounds of flat parameters: only the std has one.
+    """
+
+    init: Callable[[Array, Array | None], Array]
+    unflatten: Callable[[Array], Any]
+    actor: Callable[[Any, Array], tuple[Array, Array]]
+    evaluate: Callable[[Any, Array, Array], tuple[Array, Array, Array]]
+    least_params: Float[Array, " num_params"]
+
+
+def make_networks(
     config: PPOConfig,
-    evaluate: Callable[[Any, Array, Array], tuple[Array, Array, Array]],
-    unflatten: Callable[[Array], Any],
-    least_params: Float[Array, " num_params"],
-    transitions: Callable[[Rollout], Any],
+    obs_dim: int,
+    policy: Distribution,
+    num_actions: int | None,
+    action_dim: int | None,
+) -> Networks:
+    """An actor `s -> outputs` and a critic `s -> V` of the same hidden layers, and the std."""
+    std_dim = action_dim or 0  # a softmax has no std
+    shape = (config.hidden_size, config.num_layers, config.activation)
+    mlps = {
+        "actor": MLP(num_actions or std_dim, *shape, learn_prelu_slope=True),
+        "critic": MLP(1, *shape, learn_prelu_slope=True),
+    }
+
+    def init_tree(key: Array) -> dict[str, Any]:
+        keys = dict(zip(mlps, jax.random.split(key), strict=True))
+        weights = {name: mlp.init(keys[name], jnp.zeros(obs_dim)) for name, mlp in mlps.items()}
+        return {**weights, "std": jnp.full(std_dim, config.init_action_std, jnp.float32)}
+
+    def init(key: Array, hidden_size: Array | None) -> Array:
+        tree = init_tree(key)
+        if hidden_size is not None:
+            for name in mlps:
+                tree[name] = {"params": narrow(tree[name]["params"], hidden_size)}
+        return flat.flatten(tree)
+
+    def actor(tree: Any, obs: Array) -> tuple[Array, Array]:
+        outputs: Any = mlps["actor"].apply(tree["actor"], obs)
+        return outputs, tree["std"]
+
+    def evaluate(tree: Any, obs: Array, action: Array) -> tuple[Array, Array, Array]:
+        log_prob, entropy = policy.evaluate(*actor(tree, obs), action)
+        value: Any = mlps["critic"].apply(tree["critic"], obs)
+        return log_prob, entropy, value[0]
+
+    template = jax.eval_shape(init_tree, jax.random.key(0))
+    unbounded = jax.tree.map(lambda x: jnp.full(x.shape, -jnp.inf), template)
+    return Networks(
+        init=init,
+        unflatten=flat.unflattener(init_tree),
+        actor=actor,
+        evaluate=evaluate,
+        least_params=flat.flatten({**unbounded, "std": jnp.full(std_dim, MIN_STD)}),
+    )
+
+
+def make_learning_phase(
+    config: PPOConfig, networks: Networks, obs_dim: int, is_discrete: bool
 ) -> Callable[[Array, Any, Rollout, Any], tuple[Array, Any]]:
     """Builds `learn(params, opt_state, rollout, hparams) -> (params, opt_state)`.
 
     A learning phase: `config.epochs` Adam steps on the whole rollout.
-
-    Args:
-      config: the number of epochs.
-      evaluate: `(params, obs, action) -> (log_prob, entropy, value)`.
-      unflatten: of flat parameters.
-      least_params: lower bounds of the parameters: only the std has one.
-      transitions: what a rollout holds.
     """
+    evaluate, unflatten = networks.evaluate, networks.unflatten
 
     def learn(params: Array, opt_state: Any, rollout: Rollout, hp: Any) -> tuple[Array, Any]:
-        steps = transitions(rollout)
+        steps = rollout.transitions(obs_dim, is_discrete)
         returns = normalized(discounted_returns(steps.reward, rollout.ended, hp.discount))
         # These parameters have made the whole rollout.
         old_log_prob, _, _ = evaluate(unflatten(params), steps.obs, steps.action)
 
-        def loss_fn(params: Any) -> Array:
-            log_prob, entropy, value = evaluate(params, steps.obs, steps.action)
+        def loss_fn(tree: Any) -> Array:
+            log_prob, entropy, value = evaluate(tree, steps.obs, steps.action)
             return ppo_loss(log_prob, entropy, value, old_log_prob, returns, hp)
 
         def epoch(number: Array, carry: tuple[Array, Any]) -> tuple[Array, Any]:
             params, opt_state = carry
             gradient = flat.flatten(jax.grad(loss_fn)(unflatten(params)))
             moved, opt_state = flat.adam_step(params, opt_state, gradient, hp.learning_rate)
-            return jnp.maximum(moved, least_params), opt_state
+            return jnp.maximum(moved, networks.least_params), opt_state
 
         return jax.lax.fori_loop(0, config.epochs, epoch, (params, opt_state))
 
@@ -275,7 +299,7 @@ def discounted_returns(
       ended: 1 at the last step of an episode, else 0.
       discount: gamma.
 
-    Source: `reference_details.md` 4.5. Differs: the authors restart where the stored `done` exceeds
+    Source: `docs/reference.md` 4.5. Differs: the authors restart where the stored `done` exceeds
     0.5, which in an SE is not so at a time limit; returns there run on into the next episode.
     """
 
@@ -318,7 +342,7 @@ def ppo_loss(
       returns: R, normalised.
       hp: clip_ratio (epsilon), value_weight (c_V) and entropy_weight (c_H).
 
-    Source: Schulman et al. (2017), eq. 7 and 9; `reference_details.md` 4.5.
+    Source: Schulman et al. (2017), eq. 7 and 9; `docs/reference.md` 4.5.
     """
     advantage = jax.lax.stop_gradient(returns - value)
     ratio = jnp.exp(jnp.clip(log_prob - old_log_prob, -_MAX_LOG_RATIO, _MAX_LOG_RATIO))
@@ -344,7 +368,7 @@ def _evaluate_softmax(
     return select_action(log_probs, action), entropy
 
 
-SOFTMAX = Policy(
+SOFTMAX = Distribution(
     sample=_sample_softmax,
     mode=_softmax_mode,
     evaluate=_evaluate_softmax,
@@ -352,13 +376,13 @@ SOFTMAX = Policy(
 )
 
 
-def gaussian(max_action: float) -> Policy:
+def gaussian(max_action: float) -> Distribution:
     """Independent normal actions with mean `max_action * tanh(outputs)` and a given std.
 
     Differs: the authors' mean is `tanh(outputs)`, which cannot reach the whole range of a task
     whose largest action is not 1, such as Pendulum. The std is in units of the action, as theirs.
 
-    Source: `reference_details.md` 4.5.
+    Source: `docs/reference.md` 4.5.
     """
 
     def mode(outputs: Float[Array, "action_dim *batch"]) -> Float[Array, "action_dim *batch"]:
@@ -378,4 +402,4 @@ def gaussian(max_action: float) -> Policy:
     def env_action(action: Float[Array, " action_dim"]) -> Float[Array, " action_dim"]:
         return jnp.clip(action, -max_action, max_action)
 
-    return Policy(sample=sample, mode=mode, evaluate=evaluate, env_action=env_action)
+    return Distribution(sample=sample, mode=mode, evaluate=evaluate, env_action=env_action)

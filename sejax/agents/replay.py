@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jax.experimental.xla_metadata import set_xla_metadata
 from jaxtyping import Array, Float, Int, UInt32
 
-from sejax.agents.blocks import block_size
+from sejax.agents.partial_batch import block_size
 
 _VECTOR = 8  # float32 lanes of AVX2
 
@@ -37,8 +37,8 @@ class Transition(NamedTuple):
 
         Under `jax.vmap` a function of one transition then takes a batch.
         """
-        turned = jax.tree.map(jnp.transpose, self._replace(weight=None))
-        return turned._replace(weight=jnp.broadcast_to(self.weight, self.reward.shape))
+        weight = jnp.broadcast_to(self.weight, self.reward.shape)
+        return jax.tree.map(jnp.transpose, self._replace(weight=weight))
 
 
 def num_columns(batch: Transition) -> Array | float:
@@ -116,7 +116,7 @@ def sample(
       to whole blocks of a batch; the columns beyond what was asked for have weight 0. A remainder
       costs more than the arithmetic on up to seven more columns.
 
-    Source: `reference_details.md` 3.5 (with replacement, from the first stored transition on).
+    Source: `docs/reference.md` 3.5 (with replacement, from the first stored transition on).
     """
     size = jnp.minimum(num_stored, rows.shape[0])
     width = rows.shape[1]

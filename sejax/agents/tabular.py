@@ -2,7 +2,7 @@
 
 Source: Watkins, "Learning from Delayed Rewards" (1989); Rummery and Niranjan, "On-Line Q-Learning
 Using Connectionist Systems" (1994); paper, appendix, tables of Cliff Walking;
-`reference_details.md` 4.6.
+`docs/reference.md` 4.6.
 """
 
 import functools

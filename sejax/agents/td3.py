@@ -4,7 +4,7 @@ The two share everything but a `Policy`: what becomes of the actor's outputs.
 
 Source: Fujimoto et al., "Addressing Function Approximation Error in Actor-Critic Methods" (2018);
 Jang et al., "Categorical Reparameterization with Gumbel-Softmax" (2017); the paper's
-hyperparameter tables; `reference_details.md` 4.3 and 4.4.
+hyperparameter tables; `docs/reference.md` 4.3 and 4.4.
 """
 
 import functools
@@ -20,8 +20,8 @@ from jaxtyping import Array, Bool, Float, Int
 
 from sejax.agents import flat
 from sejax.agents.agent import Agent, AgentOptions, traced
-from sejax.agents.blocks import sum_over_batch
 from sejax.agents.memory import replay_memory
+from sejax.agents.partial_batch import sum_over_batch
 from sejax.agents.replay import Transition, num_columns
 from sejax.networks import ACTIVATIONS, MLP, narrow
 from sejax.options import counts, fraction, not_negative, one_of, option, positive
@@ -299,7 +299,7 @@ def make_learning_step(
 
     The critics move in every step, the actor and all targets in every `config.policy_delay`-th.
 
-    Source: Fujimoto et al. (2018), algorithm 1; `reference_details.md` 4.3.
+    Source: Fujimoto et al. (2018), algorithm 1; `docs/reference.md` 4.3.
     """
 
     def both_q(critics: Array, obs: Array, action: Array) -> Float[Array, "2 batch"]:
@@ -478,7 +478,7 @@ def annealed_temperature(hparams: Any, num_updates: Array, num_steps: int) -> Ar
     It falls linearly from `hparams.temperature` to its `hparams.final_temperature`-fold in
     `num_steps` learning steps, and stays there.
 
-    Source: `reference_details.md` 4.4.
+    Source: `docs/reference.md` 4.4.
     """
     progress = jnp.minimum(num_updates / num_steps, 1.0)
     factor = 1 + progress * (hparams.final_temperature - 1)

@@ -6,7 +6,7 @@ networks that has room; for each of these, and for each depth, there is a branch
 one where agents train one after another (`lanes=1`); in lanes all of them would run.
 
 Source: paper, table "Agent hyperparameter ranges" and appendix "Varied Agent Hyperparameters";
-`reference_details.md` 4.9.
+`docs/reference.md` 4.9.
 """
 
 import dataclasses
@@ -48,7 +48,7 @@ def ranges_of(config: Any) -> dict[str, Range]:
     Raises:
       ConfigError: if no option says so.
 
-    Source: paper, table "Agent hyperparameter ranges"; tabular agents: `reference_details.md` 4.9.
+    Source: paper, table "Agent hyperparameter ranges"; tabular agents: `docs/reference.md` 4.9.
     """
     hints = get_type_hints(type(config))
     fields = [field for field in dataclasses.fields(config) if field.metadata.get("varied")]

@@ -9,10 +9,10 @@ from typing import Any
 
 from sejax import agents, envs, plugins, serialize
 from sejax.errors import ConfigError, one_of, require, require_seed, shortened, whole
-from sejax.trainer import TrainingConfig, steps_before_learning
+from sejax.training import TrainingConfig, steps_before_learning
 
 AGENT_HPARAMS = ("default", "varied")
-EVALUATION_HPARAMS = (*AGENT_HPARAMS, "nes")
+EVALUATION_HPARAMS = (*AGENT_HPARAMS, "as_learned")
 TRAINING_FROM = ("proxy", "config")
 LEARN_GROUPS = ("env", "proxy", "agent", "exploration", "es", "objective")
 EVALUATE_GROUPS = ("agent", "exploration")
@@ -128,7 +128,7 @@ class EvaluateConfig:
         one_of("training_from", self.training_from, TRAINING_FROM)
         require_seed("seed", self.seed)
         _require_computing(self)
-        for name, idle, usual in (("agent_hparams", "nes", "default"),
+        for name, idle, usual in (("agent_hparams", "as_learned", "default"),
                                   ("training_from", "config", "proxy")):  # fmt: skip
             require(self.proxy != "real" or getattr(self, name) != idle, name,
                     f"be {usual} with proxy=real", "there is no proxy", idle,
@@ -137,11 +137,11 @@ class EvaluateConfig:
 
     def _require_use(self) -> None:
         """Refuses settings that would have no effect."""
-        if self.agent_hparams == "nes":
+        if self.agent_hparams == "as_learned":
             for group, usual in (("agent", "ddqn"), ("exploration", "none")):
                 changed = _differences(group, getattr(self, group), {"name": usual})
-                require(not changed, group, "be left out with agent_hparams=nes", "the proxy says "
-                        "which it was learned with", changed,
+                require(not changed, group, "be left out with agent_hparams=as_learned", "the "
+                        "proxy says which it was learned with", changed,
                         "agent_hparams=default")  # fmt: skip
         instead = "" if self.proxy == "real" else "training_from=config, or "
         changed = _changes(serialize.to_plain(self.training), serialize.to_plain(TrainingConfig()))

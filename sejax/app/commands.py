@@ -2,11 +2,13 @@
 
 import contextlib
 import functools
+import io
 import os
+import re
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import NoReturn
 
@@ -14,7 +16,7 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
-from sejax.app import compose
+from sejax.app import compose, runtime
 from sejax.errors import ConfigError
 
 BAD_INPUT, FAILED, INTERRUPTED = 2, 1, 130
@@ -28,29 +30,54 @@ def start(name: str, main: Callable[[], object]) -> None:
       main: decorated by `hydra.main`.
     """
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra then raises, and the message is ours.
-    words = compose.main_words()
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")  # a terminal of few letters
+    sys.argv[1:] = [_quoted(word) for word in sys.argv[1:]]
+    words = [word for word in sys.argv[1:] if not word.startswith("-")]
     try:
         if sys.path[0] != "":  # `python -m` has put the current folder there, if it still exists
             sys.path.insert(0, "")
         Path.cwd()
+        runtime.configure_xla(_devices(words))  # before a plugin imports what starts jax's devices
+        if {"--help", "-h"} & set(sys.argv[1:]):
+            print(compose.help_text(name, words))
+            return
         compose.register(name, words)
         main()
     except (HydraException, OmegaConfBaseException) as error:
         fail(str(compose.translate_hydra_error(error, words)), BAD_INPUT)
     except ConfigError as error:
         fail(str(error), BAD_INPUT)
+    except BrokenPipeError:  # whoever reads has seen enough
+        leave(0)
     except FileNotFoundError as error:
         fail(f"The current folder is gone ({error}). Change to one that exists.", FAILED)
 
 
-def task(main: Callable[[DictConfig], float]) -> Callable[[DictConfig], float]:
+def _quoted(word: str) -> str:
+    """A word as Hydra's grammar reads it, which knows letters outside of ASCII in quotes alone."""
+    name, equals, value = word.partition("=")
+    if not equals or value.isascii() or value[:1] in "'\"[{":
+        return word
+    escaped = value.replace("\\", "\\\\").replace("'", "\\'")
+    return f"{name}='{escaped}'"
+
+
+def _devices(words: Sequence[str]) -> int | None:
+    """The number of devices that is asked for, if it is one; what is not is refused later."""
+    values = [word.removeprefix("devices=") for word in words if word.startswith("devices=")]
+    return int(values[-1]) if values and re.fullmatch(r"[1-9]\d{0,3}", values[-1]) else None
+
+
+def guarded(main: Callable[[DictConfig], float]) -> Callable[[DictConfig], float]:
     """Decorates what Hydra calls: bad input and files that fail become a message and exit code.
 
     Inside of Hydra's call, as Hydra prints lines of its own for an exception that leaves it.
     """
 
     @functools.wraps(main)
-    def guarded(cfg: DictConfig) -> float:
+    def run(cfg: DictConfig) -> float:
         try:
             return main(cfg)
         except ConfigError as error:
@@ -67,12 +94,12 @@ def task(main: Callable[[DictConfig], float]) -> Callable[[DictConfig], float]:
             fail(f"There is not enough memory: {str(error).splitlines()[0]} Smaller networks, "
                  f"buffers or populations need less.", FAILED)  # fmt: skip
 
-    return guarded
+    return run
 
 
 def fail(message: str, status: int) -> NoReturn:
     """Prints the message and ends the process."""
-    print(f"error: {message}".encode("utf-8", "replace").decode(), file=sys.stderr)
+    print(f"error: {message}", file=sys.stderr)
     sys.exit(status)
 
 
@@ -95,6 +122,7 @@ def interrupts_held() -> Iterator[None]:
 
 def leave(status: int) -> NoReturn:
     """Ends the process at once, even while a program is still running on the devices."""
-    sys.stdout.flush()
-    sys.stderr.flush()
+    for stream in (sys.stdout, sys.stderr):
+        with contextlib.suppress(BrokenPipeError):
+            stream.flush()
     os._exit(status)

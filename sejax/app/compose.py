@@ -6,7 +6,7 @@ and proxy (`sejax.app.presets`).
 """
 
 import re
-import sys
+import textwrap
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -14,18 +14,23 @@ from typing import Any
 from hydra import compose, initialize_config_dir
 from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import ChoiceSweep, Override, QuotedString
 from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from sejax import agents, envs, plugins, serialize
 from sejax.app import build, presets
-from sejax.errors import ConfigError, nearest, shortened, unknown_name
-from sejax.trainer import TrainingConfig
+from sejax.errors import ConfigError, nearest, require, shortened, unknown_name
+from sejax.training import TrainingConfig
 
 CONF_DIR = Path(__file__).parents[1] / "conf"
-_DEFAULT_AGENT, _DEFAULT_OBJECTIVE = "ddqn", "max_reward"
+# As in conf/run.yaml.
+_DEFAULT_ENV, _DEFAULT_PROXY, _DEFAULT_AGENT = "cartpole", "se", "ddqn"
+_DEFAULT_OBJECTIVE = "max_reward"
 _GROUPS = tuple(plugins.GROUPS)
+_INTERNAL = ("base", "tuned", "tuned_agent", "tuned_es")  # groups that no word may choose
 _CHOICE = re.compile(rf"(?:\+\+?)?({'|'.join(_GROUPS)}|preset)=(.*)", re.DOTALL)
 
 
@@ -74,13 +79,46 @@ def to_plain(cfg: DictConfig) -> dict[str, Any]:
     return plain
 
 
-def _compose(name: str, overrides: Sequence[str]) -> DictConfig:
-    register(name, overrides)
+def help_text(name: str, overrides: Sequence[str]) -> str:
+    """What `--help` prints: what can be chosen, and the configuration that these words compose.
+
+    Not Hydra's own, which lists the settings of presets as choices, and takes seconds to.
+
+    Args:
+      name: of the command: run or evaluate.
+      overrides: the words after it.
+
+    Raises:
+      ConfigError: for words that cannot be composed.
+    """
+    cfg = _compose(name, overrides, return_hydra_config=True)
+    about = cfg.hydra.help
+    groups = _GROUPS if name == "run" else build.EVALUATE_GROUPS
+    choices = {
+        group: [*plugins.names(group), *(f"{start}ID" for start in plugins.GROUPS[group].families),
+                "module:attribute"]
+        for group in groups
+    } | ({"preset": presets.names()} if name == "run" else {})  # fmt: skip
+    listed = "\n".join(
+        textwrap.fill(f"  {group}: {', '.join(names)}", 98, subsequent_indent="    ")
+        for group, names in choices.items()
+    )
+    fields = OmegaConf.to_yaml({key: value for key, value in cfg.items() if key != "hydra"})
+    return (
+        f"{about.header}\n\nChoices (group=choice):\n{listed}\n\n"
+        f"Fields, as these words set them (field=value, group.field=value):\n"
+        f"{textwrap.indent(fields, '  ')}\n{about.footer}\n"
+        f"Also: --cfg job (the configuration as YAML), --multirun (sweeps: seed=0,1,2)."
+    )
+
+
+def _compose(name: str, overrides: Sequence[str], **options: Any) -> DictConfig:
     try:
+        register(name, overrides)
         if GlobalHydra.instance().is_initialized():  # within a command: Hydra knows the folder
-            return compose(name, overrides=list(overrides))
+            return compose(name, overrides=list(overrides), **options)
         with initialize_config_dir(str(CONF_DIR), version_base="1.3"):
-            return compose(name, overrides=list(overrides))
+            return compose(name, overrides=list(overrides), **options)
     except (HydraException, OmegaConfBaseException) as error:
         raise translate_hydra_error(error, overrides) from error
 
@@ -96,21 +134,63 @@ def register(name: str, overrides: Sequence[str]) -> None:
       overrides: the words after it.
 
     Raises:
-      ConfigError: for a choice of somebody's own that cannot be imported.
+      ConfigError: for a choice that is none, or one of somebody's own that cannot be imported.
     """
+    groups = _GROUPS if name == "run" else build.EVALUATE_GROUPS
+    _require_choices((*groups, "preset") if name == "run" else groups, overrides)
     store = ConfigStore.instance()
+    for group in (*_GROUPS, "preset", *_INTERNAL):  # `proxy` is a group of run, a field of evaluate
+        store.repo.pop(group, None)
     training = serialize.to_plain(TrainingConfig())
     base = {"training": training}
     if name == "evaluate":
         base["real_training"] = training
     store.store(name="base", node=base)
     chosen = _choices(overrides)
-    groups = _GROUPS if name == "run" else build.EVALUATE_GROUPS
     for group in groups:
         for choice in dict.fromkeys([*plugins.names(group), *chosen.get(group, ())]):
             _register_choice(group, choice, choice in chosen.get(group, ()), overrides)
     if name == "run":
         _register_presets(chosen)
+
+
+def _require_choices(groups: tuple[str, ...], overrides: Sequence[str]) -> None:
+    """Checks the words that choose: Hydra takes none but a name, and looks for it as a file.
+
+    Raises:
+      ConfigError: for a choice that is not known, or is taken away.
+    """
+    parser = OverridesParser.create()
+    for word in overrides:
+        try:
+            override = parser.parse_override(word)
+        except HydraException:
+            continue  # Hydra will say what it cannot read
+        group = override.key_or_group
+        if not group or group in _INTERNAL:
+            raise _unknown_field(group, overrides)
+        if group in groups:
+            require(not override.is_delete(), group, "be chosen", "nothing works without it", word,
+                    f"{group}=NAME")  # fmt: skip
+            for choice in _values(override):
+                _require_choice(group, choice)
+
+
+def _values(override: Override) -> list[Any]:
+    """What a word sets, or each value of a sweep that lists them."""
+    value = override.value()
+    if isinstance(value, ChoiceSweep):
+        return [x.text if isinstance(x, QuotedString) else x for x in value.list]
+    return [] if override.is_sweep_override() else [value]
+
+
+def _require_choice(group: str, choice: Any) -> None:
+    known = presets.names() if group == "preset" else plugins.names(group)
+    is_own = group != "preset" and isinstance(choice, str) and (
+        plugins.is_registered(group, choice) or ":" in choice
+    )  # fmt: skip
+    if choice not in known and not is_own:
+        raise unknown_name(group, choice, known)
 
 
 def _choices(overrides: Iterable[str]) -> dict[str, list[str]]:
@@ -152,11 +232,7 @@ def _agent_for(choice: str, is_own: bool, node: dict[str, Any], overrides: Seque
     if facts is None and (not is_own or "agent" in _choices(overrides)):
         return _DEFAULT_AGENT
     if facts is None:  # the task must be made to know: with the fields that are asked for
-        from sejax.app.runtime import configure_xla
-
         given = {word.partition("=")[0]: word.partition("=")[2] for word in overrides}
-        devices = given.get("devices", "")
-        configure_xla(int(devices) if devices.isdigit() and 0 < int(devices) < 2**16 else None)
         fields = {name.removeprefix("env."): OmegaConf.create({"x": value}).x
                   for name, value in ((n, _parsed(v)) for n, v in given.items())
                   if name.startswith("env.")}  # fmt: skip
@@ -176,13 +252,11 @@ def _parsed(text: str) -> Any:
 
 
 def _register_presets(chosen: dict[str, list[str]]) -> None:
-    """The tuned settings of every pair of a task and a proxy that is known or chosen."""
+    """The tuned settings of the chosen tasks and proxies."""
     for preset in presets.names():
         _store("preset", preset, {"preset": preset}, package="_global_")
-    every = {group: dict.fromkeys([*plugins.names(group), *chosen.get(group, ())])
-             for group in ("env", "proxy")}  # fmt: skip
-    for env in every["env"]:
-        for proxy in every["proxy"]:
+    for env in dict.fromkeys([_DEFAULT_ENV, *chosen.get("env", ())]):
+        for proxy in dict.fromkeys([_DEFAULT_PROXY, *chosen.get("proxy", ())]):
             for preset, kind, choice, values in presets.settings(env, proxy):
                 name = f"{env}-{proxy}" + (f"-{choice}" if choice else "")
                 _store(f"{kind}/{preset}", name, dict(values), package="_global_")
@@ -272,8 +346,3 @@ def _first_line(error: Exception) -> str:
     key = getattr(error, "full_key", None)
     line = shortened((str(message).strip().splitlines() or [type(error).__name__])[0], 400)
     return f"{line.rstrip('.')}{f' in {key}' if key and key not in line else ''}."
-
-
-def main_words() -> list[str]:
-    """The words after a command, without Hydra's own options."""
-    return [word for word in sys.argv[1:] if not word.startswith("--")]

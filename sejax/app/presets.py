@@ -1,6 +1,6 @@
 """Settings that were measured or published, one file for each task and proxy.
 
-A file `conf/preset/<env>-<proxy>.yaml` has a section for each preset: nested values of a run's
+A file `conf/presets/<env>-<proxy>.yaml` has a section for each preset: nested values of a run's
 configuration, `with_agent` and `with_es` for those that only hold with an agent or a strategy, and
 `like` for a section of the same file that it builds on. `general-<proxy>.yaml` serves tasks without
 a file of their own.
@@ -13,7 +13,7 @@ from typing import Any
 
 import yaml
 
-FOLDER = Path(__file__).parents[1] / "conf" / "preset"
+FOLDER = Path(__file__).parents[1] / "conf" / "presets"
 GENERAL = "general"
 
 

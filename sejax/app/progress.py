@@ -123,7 +123,7 @@ class RunProgress:
         agent = config.name("agent")
         # An RN is judged with the agent that it was learned with; an SE is meant for the paper's.
         if program.proxy.is_real and ":" not in agent:
-            return f"{words} agent_hparams=nes"
+            return f"{words} agent_hparams=as_learned"
         return words if agent == "ddqn" else f"{words} agent={agent}"
 
     def _own_arguments(self) -> str:

@@ -12,7 +12,7 @@ from typing import Any, TypeGuard
 
 import yaml
 
-from sejax.app import build, checkpoints
+from sejax.app import checkpoints
 from sejax.app.metrics import COLUMNS, Metrics, MetricsError
 from sejax.app.run_lock import RunLock, acquire
 from sejax.errors import ConfigError
@@ -300,6 +300,8 @@ def open_for(config: Any, hint: str = HINT) -> RunDirectory:
     Raises:
       ConfigError: if it holds another run, is in use, or cannot be written.
     """
+    from sejax.app import build  # which imports jax
+
     seeds = [config.seed + i for i in range(config.num_seeds)]
     return RunDirectory.open(config.resolved_run_dir, build.to_plain(config), seeds, hint)
 

@@ -33,8 +33,7 @@ def configure_xla(num_devices: int | None = None) -> None:
     Args:
       num_devices: CPU devices; None for one per core.
 
-    Once jax has computed, the flags would have no effect: then nothing is done (a sweep's second
-    job; Python code of a user's).
+    Once jax has computed, the flags would have no effect: then nothing is done.
     """
     if is_started():
         return
@@ -62,7 +61,12 @@ def enable_compilation_cache() -> None:
     """
     import jax
 
-    root = os.environ.get("SEJAX_CACHE_DIR", str(Path.home() / ".cache" / "sejax"))
+    root = os.environ.get("SEJAX_CACHE_DIR")
+    if root is None:
+        try:
+            root = str(Path.home() / ".cache" / "sejax")
+        except RuntimeError:  # nobody's home
+            return
     if not root or jax.config.jax_compilation_cache_dir:
         return
     jax.config.update("jax_compilation_cache_dir", str(Path(root) / cpu_fingerprint()))

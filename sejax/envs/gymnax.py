@@ -45,7 +45,7 @@ class GymnaxTask(Options):
         except Exception as error:  # such as a data set that cannot be fetched
             raise errors.ConfigError(
                 f"env must be an environment that gymnax can make here; {gymnax_id} raised "
-                f"{type(error).__name__}: {error}."
+                f"{errors.told(error)}."
             ) from error
         solved = self.solved_reward
         if solved is None:

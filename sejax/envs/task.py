@@ -1,7 +1,7 @@
 """The contract of a task: a real environment that agents are tested on, and what is known of it."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 from sejax import errors
@@ -68,6 +68,8 @@ class Task:
     info_keys: tuple[str, ...] = ()
     augmented_keys: tuple[str, ...] = ()
     origin: dict[str, Any] | None = None
+    _obs_space: Any = field(init=False, repr=False, default=None)
+    _action_space: Any = field(init=False, repr=False, default=None)
 
     def __post_init__(self) -> None:
         from sejax.envs.wrappers import as_vectors
@@ -79,7 +81,11 @@ class Task:
             params = params.replace(max_steps_in_episode=limit)
         object.__setattr__(self, "max_steps", int(limit))
         object.__setattr__(self, "params", params)
-        object.__setattr__(self, "env", as_vectors(self.env, params, self.name))
+        env = as_vectors(self.env, params, self.name)
+        object.__setattr__(self, "env", env)
+        # Once and here: gymnax computes some spaces, and within a program they would have no sizes.
+        object.__setattr__(self, "_obs_space", env.observation_space(params))
+        object.__setattr__(self, "_action_space", env.action_space(params))
 
     @property
     def facts(self) -> Facts:
@@ -99,22 +105,22 @@ class Task:
     @property
     def num_states(self) -> int | None:
         """Number of states of a task whose observation is an index; None for vectors."""
-        return _num_categories(self.env.observation_space(self.params))
+        return _num_categories(self._obs_space)
 
     @property
     def obs_dim(self) -> int:
         """Length of the observation that networks see; an index is one-hot to them."""
-        return self.num_states or int(self.env.observation_space(self.params).shape[0])
+        return self.num_states or int(self._obs_space.shape[0])
 
     @property
     def num_actions(self) -> int | None:
         """Number of discrete actions; None for continuous ones."""
-        return _num_categories(self.env.action_space(self.params))
+        return _num_categories(self._action_space)
 
     @property
     def action_dim(self) -> int:
         """Length of the action that networks see; a discrete one is one-hot to them."""
-        return self.num_actions or int(self.env.action_space(self.params).shape[0])
+        return self.num_actions or int(self._action_space.shape[0])
 
     @property
     def max_action(self) -> float:
@@ -123,7 +129,7 @@ class Task:
             return 1.0
         import numpy as np
 
-        return float(np.max(self.env.action_space(self.params).high))
+        return float(np.max(self._action_space.high))
 
 
 def _num_categories(space: Any) -> int | None:

@@ -98,16 +98,35 @@ class AsVectors(Wrapper):
 
     Observations of any shape are flattened, row by row; an action `[n]` is scaled linearly to the
     bounds of the wrapped world's box and takes its shape. Discrete ones stay as they are.
+
+    Args:
+      env: the world.
+      params: its params, which its spaces are taken from, once: gymnax computes some of them.
     """
+
+    def __init__(self, env: Any, params: Any):
+        super().__init__(env)
+        self._raw_action = env.action_space(params)
+        self._action = self._raw_action
+        if isinstance(self._raw_action, spaces.Box):
+            size = int(np.prod(self._raw_action.shape))
+            self._action = spaces.Box(-1.0, 1.0, (size,), jnp.float32)
+        self._obs = env.observation_space(params)
+        self._is_index = isinstance(self._obs, spaces.Discrete)
+        if not self._is_index:
+            size = int(np.prod(self._obs.shape))
+            bounds = (_full(x, self._obs.shape).reshape(size)
+                      for x in (self._obs.low, self._obs.high))  # fmt: skip
+            self._obs = spaces.Box(*bounds, (size,), jnp.float32)
 
     def reset_env(self, key: Any, params: Any) -> tuple[Any, Any]:
         obs, state = self.env.reset_env(key, params)
         return self._vector(obs), state
 
     def step_env(self, key: Any, state: Any, action: Any, params: Any) -> tuple[Any, ...]:
-        space = self.env.action_space(params)
+        space = self._raw_action
         if isinstance(space, spaces.Box):
-            low, high = (jnp.broadcast_to(x, space.shape) for x in (space.low, space.high))
+            low, high = (_full(x, space.shape) for x in (space.low, space.high))
             action = low + (jnp.reshape(action, space.shape) + 1) / 2 * (high - low)
             action = jnp.clip(action, low, high)
         obs, *rest = self.env.step_env(key, state, action, params)
@@ -117,23 +136,18 @@ class AsVectors(Wrapper):
         return self._vector(self.env.get_obs(state, params, key))
 
     def action_space(self, params: Any = None) -> Any:
-        space = self.env.action_space(params)
-        if isinstance(space, spaces.Discrete):
-            return space
-        return spaces.Box(-1.0, 1.0, (int(np.prod(space.shape)),), jnp.float32)
+        return self._action
 
     def observation_space(self, params: Any = None) -> Any:
-        space = self.env.observation_space(params)
-        if isinstance(space, spaces.Discrete):
-            return space
-        size = int(np.prod(space.shape))
-        bounds = (np.broadcast_to(np.asarray(x, np.float32), space.shape).reshape(size)
-                  for x in (space.low, space.high))  # fmt: skip
-        return spaces.Box(*bounds, (size,), jnp.float32)
+        return self._obs
 
     def _vector(self, obs: Any) -> Float[Array, " obs_dim"] | Array:
-        is_index = isinstance(self.env.observation_space(self.default_params), spaces.Discrete)
-        return obs if is_index else jnp.ravel(obs).astype(jnp.float32)
+        return obs if self._is_index else jnp.ravel(obs).astype(jnp.float32)
+
+
+def _full(bound: Any, shape: tuple[int, ...]) -> np.ndarray:
+    """A space's bound for each of its numbers."""
+    return np.broadcast_to(np.asarray(bound, np.float32), shape)
 
 
 def as_vectors(env: Any, params: Any, name: str) -> Any:
@@ -150,11 +164,11 @@ def as_vectors(env: Any, params: Any, name: str) -> Any:
                 f"vectors and tables take indices; got {space!r} in {name}. Wrap the environment "
                 f"so that its {what} are one array."
             )
-    plain_obs = isinstance(obs, spaces.Discrete) or (
-        len(obs.shape) == 1 and jnp.issubdtype(obs.dtype, jnp.floating)
-    )
+    # What comes, as a space may say otherwise (gymnax's FourRooms).
+    came = jax.eval_shape(lambda: env.reset(jax.random.key(0), params)[0])
+    plain_obs = isinstance(obs, spaces.Discrete) or (came.ndim == 1 and came.dtype == jnp.float32)
     plain_action = isinstance(action, spaces.Discrete) or _is_symmetric(action, name)
-    return env if plain_obs and plain_action else AsVectors(env)
+    return env if plain_obs and plain_action else AsVectors(env, params)
 
 
 def _is_symmetric(space: Any, name: str) -> bool:

@@ -1,6 +1,6 @@
 """The paper's natural evolution strategy.
 
-Source: paper, Algorithm 1 and appendix "NES Score Transformation"; `reference_details.md` 2.
+Source: paper, Algorithm 1 and appendix "NES Score Transformation"; `docs/reference.md` 2.
 """
 
 from dataclasses import dataclass
@@ -69,7 +69,7 @@ def make_nes(config: NESConfig, num_dims: int) -> Strategy:
     with the weights F of the score transform, divided by :math:`n_p \sigma` with
     `update_rule="paper"`.
 
-    Source: paper, Algorithm 1; `reference_details.md` 2.
+    Source: paper, Algorithm 1; `docs/reference.md` 2.
 
     Example:
       >>> strategy = make_nes(NESConfig(population_size=4), num_dims=3)

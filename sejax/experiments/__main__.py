@@ -1,18 +1,20 @@
 """`python -m sejax.experiments`: what there is to run, a line each."""
 
-import importlib
+import ast
 import pkgutil
+from pathlib import Path
 
 from sejax import experiments
 
 
 def main() -> None:
     """Prints each experiment's name and what it shows."""
-    print("python -m sejax.experiments.NAME [--quick] [--help]\n")
-    for name in sorted(module.name for module in pkgutil.iter_modules(experiments.__path__)):
-        module = importlib.import_module(f"sejax.experiments.{name}")
-        if hasattr(module, "NAME"):
-            print(f"  {name:20} {(module.__doc__ or '').partition(chr(10))[0]}")
+    print("python -m sejax.experiments.NAME [quick=true] [FIELD=VALUE ...] [--help]\n")
+    for module in sorted(pkgutil.iter_modules(experiments.__path__), key=lambda m: m.name):
+        source = Path(experiments.__path__[0], f"{module.name}.py").read_text()
+        if "\nEXPERIMENT = " in source:
+            about = ast.get_docstring(ast.parse(source)) or ""
+            print(f"  {module.name:20} {about.partition(chr(10))[0]}")
 
 
 if __name__ == "__main__":

@@ -1,181 +1,110 @@
 """Training agents with learned rewards, and their test returns against training steps.
 
 The agents of a row of the paper's figure are trained in worlds: the real task, the real task with
-an exploration bonus, and each of several RNs. Every group of agents is a piece that is computed
-once.
+an exploration bonus, and each of several RNs.
 """
 
-import argparse
 import functools
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
-from sejax.agents.configs import AgentConfig, ExplorationConfig
-from sejax.configs import EnvConfig, TrainingConfig
-from sejax.experiments import common, return_curves, rn_studies
-from sejax.validation import each_of
+from sejax import errors
+from sejax.errors import require
+from sejax.experiments import figures, return_curves, rn_studies, worlds
+from sejax.experiments.rn_studies import RnSettings
+from sejax.experiments.settings import count, each_of, setting
+from sejax.experiments.tables import as_texts, bootstrap_interval
+from sejax.experiments.worlds import World
+from sejax.options import counts
+from sejax.plugins import name_of
+from sejax.training import TrainingConfig
 
-ROWS = {
-    "default": "default hyperparameters",
-    "varied": "varied hyperparameters",
-    "transfer": "unseen agent",
-}
+ROWS = {"default": "default hyperparameters", "varied": "varied hyperparameters",
+        "transfer": "unseen agent"}  # fmt: skip
 GRID_POINTS = 200
 WITHOUT_RN = ("real", "count_based", "icm")  # worlds whose groups of agents have nothing in common
 LEAST_FOR_INTERVAL = 5  # independent values
 
 
 @dataclass(frozen=True, kw_only=True)
-class World:
-    """What agents are trained in.
+class CurveSettings(RnSettings):
+    """Settings about the agents."""
 
-    Attributes:
-      name: as in `rn_studies.LABELS`.
-      env: gymnax environment.
-      env_config: of the real task that agents are tested on.
-      params: `EnvParams` of each group of agents.
-      fingerprints: what tells the groups' worlds apart.
-      exploration: bonus of the agents.
-      settings: of the RNs; plain values.
+    rows: tuple[str, ...] = setting(tuple(ROWS), each_of(ROWS), about="agents to train: default "
+                                    "(the paper's hyperparameters), varied (drawn for each agent), "
+                                    "transfer (one that the RNs never saw)")  # fmt: skip
+    bonuses: tuple[str, ...] = setting((), about="exploration bonuses on the real task to compare "
+                                       "with: count_based on cliff_walking, elsewhere icm; or "
+                                       "none")  # fmt: skip
+    rns: int = count(10, "RNs", about="RNs of each variant that agents are trained on, the best")
+    bonus_groups: int = count(10, "groups", about="groups of agents with a bonus, which are dear; "
+                              "as many as RNs are used")  # fmt: skip
+    num_agents: int = count(10, "agents", about="on each RN, in each row")
+    max_steps: int = setting(5000, counts("an agent must train"), about="training steps; as the "
+                             "paper's figure")  # fmt: skip
+
+    @classmethod
+    def defaults(cls, given: Mapping[str, Any]) -> dict[str, Any]:
+        usual = super().defaults(given)
+        usual["rns"] = min(usual["rns"], given.get("learned", usual["learned"]))
+        return usual | {"bonus_groups": given.get("rns", usual["rns"])}
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        errors.each_of("bonuses", self.bonuses, (*self.study.bonuses, "none"))
+        require(self.rns <= self.learned, "rns", f"be at most {self.learned}", "so many are "
+                "learned", self.rns, f"learned={self.rns}")  # fmt: skip
+
+    def agent(self, row: str) -> Any:
+        """The agent that is trained in a row."""
+        return self.study.transfer_agent if row == "transfer" else self.study.agent
+
+    @property
+    def training(self) -> TrainingConfig:
+        """Episodes of training and of tests alternate until a limit."""
+        return TrainingConfig(max_episodes=self.study.max_episodes, max_steps=self.max_steps,
+                              stop_rule="never", tests_between=1)  # fmt: skip
+
+
+def real_curves(settings: CurveSettings) -> Iterator[pd.DataFrame]:
+    """Curves of all agents on the real task, without and with the bonuses that are compared."""
+    make = functools.partial(World.real, settings.task)
+    yield from curves_in(settings, "real", settings.rns, make)
+    for name, bonus in settings.study.bonuses.items():
+        if name in settings.bonuses:
+            yield from curves_in(settings, name, settings.bonus_groups, make, exploration=bonus)
+
+
+def rn_curves(settings: CurveSettings, variant: str, rns: Any, prefix: str = "") -> Any:
+    """Curves of all agents on the RNs of a set, of which each group of agents has one."""
+    make = functools.partial(World.of_set, rns)
+    return curves_in(settings, variant, rns.size, make, prefix)
+
+
+def curves_in(
+    settings: CurveSettings, name: str, groups: int, make: Any, prefix: str = "", **more: Any
+) -> Iterator[pd.DataFrame]:
+    """Those of each row, with the columns `group`, `row` and `world`.
+
+    `make(group names, ...)` makes a world; the prefix tells apart the pieces of worlds of one name.
     """
-
-    name: str
-    env: Any
-    env_config: EnvConfig
-    params: tuple[Any, ...]
-    fingerprints: tuple[str, ...]
-    exploration: ExplorationConfig = field(default_factory=ExplorationConfig)
-    settings: dict[str, Any] = field(default_factory=dict)
-
-
-def add_options(parser: argparse.ArgumentParser) -> None:
-    """Options about the agents; with those of `rn_studies`."""
-    rn_studies.add_options(parser)
-    parser.add_argument("--rows", nargs="+", metavar="ROW", help="agents to train: default (the "
-                        "paper's hyperparameters), varied (drawn for each agent), transfer (one "
-                        "that the RNs never saw); all")  # fmt: skip
-    parser.add_argument("--bonuses", nargs="+", metavar="BONUS", help="exploration bonuses on the "
-                        "real task to compare with: count_based on cliff_walking, elsewhere icm; "
-                        "or none")  # fmt: skip
-    parser.add_argument("--bonus-groups", type=int, help="groups of agents with a bonus, which are "
-                        "dear; as many as RNs are used")  # fmt: skip
-    parser.add_argument("--rns", type=int, help="RNs of each variant that agents are trained on, "
-                        "the best; 10, on halfcheetah 5")  # fmt: skip
-    parser.add_argument("--num-agents", type=int, help="on each RN, in each row; 10, on "
-                        "halfcheetah 5")  # fmt: skip
-    parser.add_argument("--max-steps", type=int, help="training steps; as the paper's figure")
+    for row in settings.rows:
+        world = make([f"{i:02d}" for i in range(groups)], name=f"{prefix}{row}-{name}",
+                     agent=settings.agent(row), training=settings.training,
+                     hparams="varied" if row == "varied" else "default", **more)  # fmt: skip
+        curves = worlds.train_groups(world, settings, settings.num_agents, worlds.CURVES)
+        group = curves["group"].astype(int)
+        number = curves["agent"] + group * settings.num_agents
+        yield curves.assign(agent=number, group=group, row=row, world=name)
 
 
-def fill_in(args: argparse.Namespace) -> None:
-    """Sets the options that were not given, and checks all.
-
-    Raises:
-      ConfigError: for an unknown name or a number out of range.
-    """
-    rn_studies.fill_in(args)
-    args.rows = args.rows or list(ROWS)
-    each_of("--rows", args.rows, ROWS)
-    bonuses = rn_studies.STUDIES[args.env].bonuses
-    args.bonuses = list(bonuses) if args.bonuses is None else args.bonuses
-    each_of("--bonuses", args.bonuses, (*bonuses, "none"))
-    common.require_counts(args, "rns", "num_agents", "max_steps", "bonus_groups")
-    args.rns = min(args.rns, args.learned)
-    args.bonus_groups = None if args.bonuses == ["none"] else args.bonus_groups or args.rns
-
-
-def agent_of(args: argparse.Namespace, row: str) -> AgentConfig:
-    """The agent that is trained in a row."""
-    study = rn_studies.STUDIES[args.env]
-    return study.transfer_agent if row == "transfer" else study.agent
-
-
-def real_worlds(args: argparse.Namespace) -> list[World]:
-    """The real task, without and with the bonuses that are compared."""
-    env_config = rn_studies.env_config(args)
-    task = env_config.make()
-    studied = rn_studies.STUDIES[args.env].bonuses
-    worlds = {
-        "real": (ExplorationConfig(), args.rns),
-        **{name: (studied[name], args.bonus_groups) for name in studied if name in args.bonuses},
-    }
-    return [
-        World(name=name, env=task.env, env_config=env_config, params=(task.params,) * groups,
-              fingerprints=("",) * groups, exploration=bonus)
-        for name, (bonus, groups) in worlds.items()
-    ]  # fmt: skip
-
-
-def rn_world(variant: str, rns: Any) -> World:
-    """The RNs of a set, one for each group of agents."""
-    indices = range(rns.size)
-    return World(name=variant, env=rns.env, env_config=rns.config.env,
-                 params=tuple(map(rns.one, indices)),
-                 fingerprints=tuple(map(rns.fingerprint, indices)),
-                 settings=vars(rns.config.proxy))  # fmt: skip
-
-
-def train_all(
-    args: argparse.Namespace, row: str, world: World, pieces: common.Pieces, prefix: str = ""
-) -> pd.DataFrame:
-    """Curves of a row's agents in a world, with the columns `row`, `world`, `group`.
-
-    Args:
-      args: with the options of `add_options`, filled in.
-      row: one of `ROWS`.
-      world: where they train.
-      pieces: where finished groups of agents are kept.
-      prefix: of the pieces' names, to tell worlds of one name apart.
-    """
-    agent = agent_of(args, row)
-    training = TrainingConfig(
-        max_episodes=rn_studies.STUDIES[args.env].max_episodes,
-        max_steps=args.max_steps,
-        test_episodes=1,
-    )
-    tables = []
-    for group in range(len(world.params)):
-        settings = {"env": vars(world.env_config), "agent": vars(agent), "row": row,
-                    "world": world.name, "proxy": world.settings,
-                    "weights": world.fingerprints[group], "exploration": vars(world.exploration),
-                    "training": vars(training), "num_agents": args.num_agents, "group": group,
-                    "seed": args.seed}  # fmt: skip
-        curves = pieces.compute(
-            f"{prefix}{row}-{world.name}-{group:02d}", settings,
-            functools.partial(train_group, args, agent, row, world, training, group),
-        )  # fmt: skip
-        tables.append(curves.assign(agent=curves["agent"] + group * args.num_agents, group=group))
-    curves = pd.concat(tables, ignore_index=True)
-    last = return_curves.last_returns(curves).mean()
-    print(f"{prefix}{row}, {world.name}: last test returns {last:.1f}", flush=True)
-    return curves.assign(row=row, world=world.name)
-
-
-def train_group(
-    args: argparse.Namespace,
-    agent: AgentConfig,
-    row: str,
-    world: World,
-    training: TrainingConfig,
-    group: int,
-) -> pd.DataFrame:
-    """Curves of the agents on one RN, or of a group on the real task."""
-    import jax
-
-    program = return_curves.make_program(
-        agent, world.exploration, world.env, world.env_config.make(), training,
-        "varied" if row == "varied" else "default", args.devices,
-    )  # fmt: skip
-    key = jax.random.fold_in(jax.random.key(args.seed), group)
-    keys = jax.random.split(key, args.num_agents)
-    return return_curves.to_table(*jax.device_get(program(keys, world.params[group])))
-
-
-def by_row(args: argparse.Namespace, curves: pd.DataFrame) -> pd.DataFrame:
+def by_row(settings: CurveSettings, curves: pd.DataFrame) -> pd.DataFrame:
     """The curves, those of the figure's first row of agents first, else in the order they have."""
-    return pd.concat([curves[curves["row"] == row] for row in args.rows], ignore_index=True)
+    return pd.concat([curves[curves["row"] == row] for row in settings.rows], ignore_index=True)
 
 
 def summarise(curves: pd.DataFrame, solved_reward: float, max_steps: int) -> pd.DataFrame:
@@ -188,29 +117,27 @@ def summarise(curves: pd.DataFrame, solved_reward: float, max_steps: int) -> pd.
     out = []
     grid = step_grid(max_steps)
     for (row, world), mine in curves.groupby(["row", "world"], sort=False):
-        agents = mine.groupby(["group", "agent"], sort=False)[["steps", "test_return"]]
-        steps = agents.apply(return_curves.steps_to_solve, solved_reward=solved_reward)
+        groups = mine.groupby("agent")["group"].first()
+        steps = return_curves.all_steps_to_solve(mine, solved_reward)
         held = return_curves.on_grid(mine, grid, window=1)
         mean_return = pd.Series(np.nanmean(held, axis=1), index=steps.index)
         counted = steps.clip(upper=max_steps)
-        low, high = interval(counted, str(world))
-        area_low, area_high = interval(mean_return, str(world))
         out.append({
-            "row": row, "world": world, "groups": mine["group"].nunique(), "agents": len(steps),
+            "row": row, "world": world, "groups": groups.nunique(), "agents": len(steps),
             "solved": float(np.isfinite(steps).mean()), "steps_to_solve": counted.mean(),
-            "steps_low": low, "steps_high": high, "mean_return": mean_return.mean(),
-            "return_low": area_low, "return_high": area_high,
+            **interval(counted, groups, str(world), "steps"), "mean_return": mean_return.mean(),
+            **interval(mean_return, groups, str(world), "return"),
             "last_return": return_curves.last_returns(mine).mean(),
         })  # fmt: skip
     return pd.DataFrame(out)
 
 
-def interval(values: pd.Series, world: str) -> tuple[float, float]:
-    """95% bootstrap interval of the mean over agents, indexed by their group."""
-    independent = values if world in WITHOUT_RN else values.groupby("group").mean()
-    if len(independent) < LEAST_FOR_INTERVAL:
-        return np.nan, np.nan
-    return common.bootstrap_interval(independent)
+def interval(values: pd.Series, groups: pd.Series, world: str, name: str) -> dict[str, float]:
+    """95% bootstrap interval of the mean over agents, of which each has a group."""
+    draws = values if world in WITHOUT_RN else values.groupby(groups).mean()
+    has_one = len(draws) >= LEAST_FOR_INTERVAL
+    low, high = bootstrap_interval(draws) if has_one else (np.nan, np.nan)
+    return {f"{name}_low": low, f"{name}_high": high}
 
 
 def step_grid(max_steps: int) -> np.ndarray:
@@ -221,21 +148,19 @@ def step_grid(max_steps: int) -> np.ndarray:
 def make_table(summary: pd.DataFrame) -> pd.DataFrame:
     """The summary as texts."""
     bare = summary[summary["world"] == "real"].set_index("row")["steps_to_solve"]
-    return pd.DataFrame([
-        {
-            "agents": ROWS[row.row],
-            "trained with": row.world,
-            "groups, agents": f"{row.groups}, {row.agents}",
-            "steps to solve": with_interval(row.steps_to_solve, row.steps_low, row.steps_high, 0),
-            "of the bare agent's": f"{row.steps_to_solve / bare[row.row]:.0%}"
-            if row.row in bare else "",
-            "solved": f"{row.solved:.0%}",
-            "mean return over training":
-                with_interval(row.mean_return, row.return_low, row.return_high, 1),
-            "last tests": f"{row.last_return:.1f}",
-        }
-        for row in summary.itertuples()
-    ])  # fmt: skip
+    return as_texts(summary, {
+        "agents": lambda row: ROWS[row.row],
+        "trained with": "{world}",
+        "groups, agents": "{groups}, {agents}",
+        "steps to solve":
+            lambda row: with_interval(row.steps_to_solve, row.steps_low, row.steps_high, 0),
+        "of the bare agent's":
+            lambda row: f"{row.steps_to_solve / bare[row.row]:.0%}" if row.row in bare else "",
+        "solved": "{solved:.0%}",
+        "mean return over training":
+            lambda row: with_interval(row.mean_return, row.return_low, row.return_high, 1),
+        "last tests": "{last_return:.1f}",
+    })  # fmt: skip
 
 
 def with_interval(mean: float, low: float, high: float, digits: int) -> str:
@@ -244,37 +169,56 @@ def with_interval(mean: float, low: float, high: float, digits: int) -> str:
     return f"{mean:,.{digits}f}{brackets}"
 
 
-def panel(axis: Any, curves: pd.DataFrame, args: argparse.Namespace, solved_reward: float) -> None:
+def common_note(settings: CurveSettings, solved_reward: float) -> str:
+    """What is to be known of every table made of these curves."""
+    return (
+        f"up to {settings.max_steps:,} training steps or {settings.study.max_episodes:,} episodes, "
+        "one greedy test episode after each. Steps to solve: until the mean of "
+        f"{return_curves.WINDOW} tests in a row reaches {solved_reward:g}; an agent that never "
+        f"does counts {settings.max_steps:,}. In brackets bootstrap 95% intervals, for at least "
+        f"five RNs: they draw RNs, and agents on the real task."
+    )
+
+
+def draw(settings: Any, curves: dict[str, pd.DataFrame], height: float, name: str) -> None:
+    """Draws a line of panels for each kind of curves, and in it a panel for each row of agents.
+
+    The curves are named by their label on the left; the height is a panel's, in inches.
+    """
+    shape = len(curves), len(settings.rows)
+    size = 0.8 + 3.8 * shape[1], 0.8 + height * shape[0]
+    solved_reward, path = settings.task.solved_reward, settings.folder / name
+    with figures.panels(path, *shape, size, sharex=True, sharey=True) as (figure, axes):
+        for line, (label, mine) in zip(axes, curves.items(), strict=True):
+            for axis, row in zip(line, settings.rows, strict=True):
+                panel(axis, mine[mine["row"] == row], settings.max_steps, solved_reward)
+            line[0].set_ylabel(label)
+        for axis, row in zip(axes[0], settings.rows, strict=True):
+            agent = figures.AGENT_NAMES[name_of("agent", settings.agent(row))]
+            axis.set_title(f"{agent}, {ROWS[row]}", fontsize=10)
+        for axis in axes[-1]:
+            axis.set_xlabel("training steps")
+        figures.legend_above(figure, axes[0, 0])
+
+
+def panel(axis: Any, curves: pd.DataFrame, max_steps: int, solved_reward: float) -> None:
     """Draws one row's mean test return of each world with its standard error over all agents.
 
     Source: paper, figure "The average cumulative test rewards of agents when trained on different
     RN variants".
     """
-    from sejax.experiments import figures
-
-    colors = {
-        "real": figures.BEST, "icm": "#7a7a7a", "count_based": "#7a7a7a",
-        "additive_potential": figures.REAL, "exclusive_potential": "#56B4E9",
-        "additive_non_potential": figures.VARIED, "exclusive_non_potential": figures.FIXED,
-        "additive_weighted_info": figures.SOLVED, "exclusive_weighted_info": "#CC79A7",
-    }  # fmt: skip
-    grid = step_grid(args.max_steps)
+    grid = step_grid(max_steps)
     for world, mine in curves.groupby("world", sort=False):
         name = str(world)
-        values = return_curves.on_grid(mine, grid, window=1)
-        known = ~np.isnan(values).any(axis=0)
-        mean = values[:, known].mean(axis=0)
-        error = values[:, known].std(axis=0) / np.sqrt(len(values))
-        color = colors[name.removesuffix(rn_studies.AUGMENTED)]
         dashed = name in WITHOUT_RN and name != "real"
         style = "--" if dashed else ":" if rn_studies.AUGMENTED in name else "-"
-        axis.plot(grid[known], mean, color=color, ls=style, lw=1.6, label=rn_studies.label(name))
-        axis.fill_between(grid[known], mean - error, mean + error, color=color, alpha=0.2, lw=0)
+        color, _ = rn_studies.SHOWN[name.removesuffix(rn_studies.AUGMENTED)]
+        figures.band(axis, grid, return_curves.on_grid(mine, grid, window=1), standard_errors,
+                     color, ls=style, lw=1.6, label=rn_studies.label(name))  # fmt: skip
     axis.axhline(solved_reward, color="#7a7a7a", ls=":", lw=1)
 
 
-def panel_title(args: argparse.Namespace, row: str) -> str:
-    """Who is trained in a row."""
-    from sejax.experiments import figures
-
-    return f"{figures.AGENT_NAMES[agent_of(args, row).name]}, {ROWS[row]}"
+def standard_errors(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Ends of the mean with its standard error, `[points]` each, of `[agent, points]`."""
+    mean, error = values.mean(axis=0), values.std(axis=0) / np.sqrt(len(values))
+    return mean - error, mean + error

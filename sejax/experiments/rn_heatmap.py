@@ -1,63 +1,60 @@
 """The rewards that RNs have learned for each move on the Cliff Walking map, as a picture of it.
 
 Source: paper, appendix "Qualitative Study of Reward Networks on the Cliff Walking Task" (figure
-"Learned Cliff Walking reward for different reward network types"); `reference_details.md` 7.7.
+"Learned Cliff Walking reward for different reward network types"); `docs/reference.md` 7.7.
 
 Differs: moves out of the goal and the cliff, which end an episode and which no agent ever makes,
 are left out.
 """
 
-import argparse
-from pathlib import Path
+from dataclasses import dataclass
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 
+from sejax.envs.cliff_walking import MAP
 from sejax.errors import require
-from sejax.experiments import common, rn_studies
+from sejax.experiments import figures, rn_studies
+from sejax.experiments.experiment import Experiment
+from sejax.experiments.rn_studies import RnSettings
+from sejax.experiments.tables import publish
 
-NAME = "rn_heatmap"
 IGNORED_BELOW = -50.0  # the right column leaves out rewards of at most this
 # Corners of the triangle of each action in a cell whose middle is (0, 0), y downwards: the middle
-# and two corners of the cell. Actions as in `sejax.envs.gridworld`: RIGHT, LEFT, DOWN, UP.
+# and two corners of the cell. Actions as in `envs.dynamics.gridworld`: RIGHT, LEFT, DOWN, UP.
 _CORNERS = {0: ((0.5, -0.5), (0.5, 0.5)), 1: ((-0.5, -0.5), (-0.5, 0.5)),
             2: ((-0.5, 0.5), (0.5, 0.5)), 3: ((-0.5, -0.5), (0.5, -0.5))}  # fmt: skip
 
 
-def main() -> None:
-    """Runs the experiment as the command line says."""
-    common.run_command(NAME, __doc__, add_options, run)
+@dataclass(frozen=True, kw_only=True)
+class RnHeatmap(RnSettings):
+    name = "rn_heatmap"
+
+    objective: str = rn_studies.objective_setting()
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require(self.env == "cliff_walking", "env", "be cliff_walking", "the picture is its map",
+                self.env, "env=cliff_walking")  # fmt: skip
 
 
-def add_options(parser: argparse.ArgumentParser) -> None:
-    """Options of this experiment."""
-    rn_studies.add_options(parser)
-    rn_studies.add_objective(parser)
-
-
-def run(args: argparse.Namespace) -> pd.DataFrame:
-    """Learns what is missing, writes everything and returns the table.
-
-    Raises:
-      ConfigError: for settings that cannot work, or a task that is no map.
-    """
-    require(args.env == "cliff_walking", "--env", "be cliff_walking", "the picture is its map",
-            args.env, "--env=cliff_walking")  # fmt: skip
-    rn_studies.fill_in(args)
-    rn_studies.check_stored(args, [args.objective])
-    rewards = {
-        variant: rewards_of_moves(rn_studies.learn(args, variant, args.objective))
-        for variant in args.variants
-    }
-    return report(args, rewards)
+def compute(settings: RnHeatmap) -> pd.DataFrame:
+    """Learns what is missing; a row for each RN and move."""
+    rn_studies.check_stored(settings, [settings.objective])
+    tables = []
+    for variant in settings.variants:
+        rewards = rewards_of_moves(rn_studies.learn(settings, variant, settings.objective))
+        places = zip(("rn", "state", "action"), np.indices(rewards.shape), strict=True)
+        table = pd.DataFrame({name: place.ravel() for name, place in places})
+        tables.append(table.assign(variant=variant, reward=rewards.ravel().astype(float)))
+    return pd.concat(tables, ignore_index=True)
 
 
 def rewards_of_moves(rns: Any) -> np.ndarray:
     """What each RN pays for each move, `[rn, state, action]`; nan out of terminal states."""
-    import jax
-    import jax.numpy as jnp
-
     env, task = rns.env, rns.task
     grid = task.env
 
@@ -69,11 +66,17 @@ def rewards_of_moves(rns: Any) -> np.ndarray:
         terminal = grid.is_terminated(state.world, task.params)
         return jnp.where(terminal, jnp.nan, reward)
 
-    over_actions = jax.vmap(reward, (None, None, 0))
-    over_states = jax.vmap(over_actions, (None, 0, None))
-    over_rns = jax.vmap(over_states, (0, None, None))
     states, actions = jnp.arange(task.num_states), jnp.arange(grid.num_actions)
-    return np.asarray(jax.jit(over_rns)(rns.weights, states, actions))
+    for axis in (2, 1, 0):  # over actions, states and RNs
+        reward = jax.vmap(reward, tuple(0 if i == axis else None for i in range(3)))
+    return np.asarray(jax.jit(reward)(rns.weights, states, actions))
+
+
+def by_variant(settings: RnHeatmap, rows: pd.DataFrame) -> dict[str, np.ndarray]:
+    """The rewards of each variant, `[rn, state, action]`, from the rows."""
+    shape = settings.learned, np.array([list(line) for line in MAP]).size, len(_CORNERS)
+    return {variant: rows[rows["variant"] == variant]["reward"].to_numpy().reshape(shape)
+            for variant in settings.variants}  # fmt: skip
 
 
 def kinds_of_moves() -> dict[str, np.ndarray]:
@@ -101,9 +104,7 @@ def kinds_of_moves() -> dict[str, np.ndarray]:
 def mean_rewards(rewards: np.ndarray, ignore: bool) -> np.ndarray:
     """Mean over RNs, `[state, action]`, in [0, 1] from the lowest to the highest; nan where none.
 
-    Args:
-      rewards: `[rn, state, action]`.
-      ignore: leave out rewards of at most `IGNORED_BELOW`.
+    Rewards of at most `IGNORED_BELOW` can be ignored.
     """
     kept = np.where(rewards <= IGNORED_BELOW, np.nan, rewards) if ignore else rewards
     count = np.isfinite(kept).sum(axis=0)
@@ -123,64 +124,45 @@ def summarise(rewards: dict[str, np.ndarray]) -> pd.DataFrame:
     return pd.DataFrame(out)
 
 
-def report(args: argparse.Namespace, rewards: dict[str, np.ndarray]) -> pd.DataFrame:
-    """Writes the CSV, the picture and the table, prints the table and returns it."""
-    from sejax.experiments import figures
-    from sejax.files import write_text
-
+def report(settings: RnHeatmap, rows: pd.DataFrame) -> pd.DataFrame:
+    rewards = by_variant(settings, rows)
+    draw(settings, rewards)
     summary = summarise(rewards)
-    write_text(args.out / "summary.csv", summary.to_csv(index=False, float_format="%.6g"))
-    draw(rewards, args.out / "heatmap.png")
     texts = summary.assign(text=[f"{row.mean:.1f} ± {row.std:.1f}" for row in summary.itertuples()])
     table = texts.pivot(index="variant", columns="move", values="text")
     table = table.loc[list(rewards), list(kinds_of_moves())].reset_index()
-    title = "Rewards that RNs have learned for the moves on Cliff Walking"
     note = (
-        f"Mean and standard deviation over {args.learned} RNs of each variant, learned by "
-        f"{args.objective}. The edge is the row above the cliff. The paper describes its picture: "
-        "the additive potential RNs pay little for entering the cliff and for going up from the "
-        "edge, and much for going down to it; the additive non-potential ones pay for the shortest "
-        "path; the exclusive non-potential ones only help around the start and the goal; the "
-        "exclusive potential ones look random."
+        f"Mean and standard deviation over {settings.learned} RNs of each variant, learned by "
+        f"{settings.objective}. The edge is the row above the cliff. The paper describes its "
+        "picture: the additive potential RNs pay little for entering the cliff and for going up "
+        "from the edge, and much for going down to it; the additive non-potential ones pay for the "
+        "shortest path; the exclusive non-potential ones only help around the start and the goal; "
+        "the exclusive potential ones look random."
     )
-    command = figures.command(NAME, args, "env", "variants", "objective", "learned", "generations",
-                              "preset", "set", "rns_dir")  # fmt: skip
-    common.write_markdown(args.out / "table.md", title, command, table, note)
-    figures.print_table(title, table)
-    rns_dir = rn_studies.rns_dir(args)
-    print(f"{args.out}: summary.csv, heatmap.png and table.md; the RNs are in {rns_dir}.")
-    return table
+    title = "Rewards that RNs have learned for the moves on Cliff Walking"
+    return publish(settings, title, table, summary, note)
 
 
-def draw(rewards: dict[str, np.ndarray], path: Path) -> None:
+def draw(settings: RnHeatmap, rewards: dict[str, np.ndarray]) -> None:
     """Draws a map for each variant, with all rewards and without the lowest."""
-    import matplotlib.pyplot as plt
-
-    from sejax.experiments import figures
-
     titles = ("all rewards", f"rewards ≤ {IGNORED_BELOW:g} left out")
-    with plt.rc_context(figures.STYLE):
-        figure, axes = plt.subplots(
-            len(rewards), 2, figsize=(11, 0.7 + 2.05 * len(rewards)), squeeze=False,
-            layout="constrained",
-        )  # fmt: skip
+    size = (11, 0.7 + 2.05 * len(rewards))
+    path = settings.folder / "heatmap.png"
+    with figures.panels(path, len(rewards), 2, size) as (figure, axes):
         for line, (variant, mine) in zip(axes, rewards.items(), strict=True):
             for axis, title, ignore in zip(line, titles, (False, True), strict=True):
                 shown = draw_map(axis, mean_rewards(mine, ignore))
                 axis.set_title(f"{rn_studies.label(variant)}: {title}", fontsize=10)
         bar = figure.colorbar(shown, ax=axes, shrink=0.5, pad=0.02)
         bar.set_label("mean reward, from the lowest to the highest")
-        figures.write(figure, path)
 
 
 def draw_map(axis: Any, values: np.ndarray) -> Any:
     """Draws the map with a triangle for each move, coloured by `values [state, action]`."""
     from matplotlib.collections import PolyCollection
 
-    from sejax.envs.gridworld import CLIFF_WALKING
-
     triangles, colors = [], []
-    for row, cells in enumerate(CLIFF_WALKING):
+    for row, cells in enumerate(MAP):
         for column, cell in enumerate(cells):
             state = row * len(cells) + column
             middle = np.array([column, row])
@@ -195,14 +177,14 @@ def draw_map(axis: Any, values: np.ndarray) -> Any:
             if cell != " ":
                 axis.text(*middle, {"O": "cliff"}.get(cell, cell), ha="center", va="center",
                           fontsize=6 if cell == "O" else 10, weight="bold")  # fmt: skip
-    shown = axis.add_collection(
-        PolyCollection(triangles, array=colors, cmap="RdYlGn", edgecolors="#555555", lw=0.25,
-                       clim=(0, 1))
-    )  # fmt: skip
+    shown = axis.add_collection(PolyCollection(triangles, array=colors, cmap="RdYlGn", clim=(0, 1),
+                                               edgecolors="#555555", lw=0.25))  # fmt: skip
     axis.set(xlim=(-0.5, 11.5), ylim=(3.5, -0.5), aspect="equal", xticks=[], yticks=[])
     axis.spines[:].set_visible(True)
     return shown
 
 
+EXPERIMENT = Experiment(settings=RnHeatmap, compute=compute, report=report, about=__doc__)
+
 if __name__ == "__main__":
-    main()
+    EXPERIMENT.main()

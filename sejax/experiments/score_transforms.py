@@ -1,37 +1,46 @@
 """Which score transform finds an SE of the 2x2 grid world soonest, over NES step sizes.
 
 Source: paper, appendix "Evaluation of Score Transformation Variants" (figure "Evaluation of
-different score transformation schemes"); `reference_details.md` 2.5 and 6.2.
+different score transformation schemes"); `docs/reference.md` 2.5 and 6.2.
 
 Each run learns an SE with a score transform, with mirrored sampling or without, and a step size
 that is drawn log-uniformly; what counts is how often NES has to update the SE until the agents
 trained on it solve the task. Runs of a cell, i.e. of a score transform with or without mirrored
-sampling, differ in the step size and the seed only and advance together in slots: where a run
-ends, the next one begins.
+sampling, differ in the step size and the seed only and are one program.
 
 Differs: the paper drew all settings of a run at random; here every cell has as many runs, with the
 same step sizes and seeds. Its own runs were made with an older agent that learned from one random
 earlier transition, and with members' scores that also rewarded a spread of visited states.
 """
 
-import argparse
 import dataclasses
 import functools
 import itertools
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+import jax
+import jax.numpy as jnp
+import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
+from flax import struct
 
-from sejax.configs import SCORE_TRANSFORMS
-from sejax.experiments import common
+import sejax
+from sejax.es.nes import NESConfig, NESState, make_nes
+from sejax.es.score_transforms import TRANSFORMS
+from sejax.es.strategy import Strategy
+from sejax.experiments import figures
+from sejax.experiments.experiment import Experiment
+from sejax.experiments.settings import Settings, count, setting
+from sejax.experiments.tables import as_texts, bootstrap_interval, publish
+from sejax.options import Options, counts
 
-NAME = "score_transforms"
+SCORE_TRANSFORMS = tuple(TRANSFORMS)
 
-# reference_details.md 6.2: default_config_gridworld.yaml as the published runs used it.
+# docs/reference.md 6.2: default_config_gridworld.yaml as the published runs used it.
 SETTINGS = ["env=gridworld_2x2", "agent=q_learning", "agent.learning_rate=0.5",
             "agent.discount=0.9", "agent.epsilon_init=0.5", "agent.epsilon_min=0.01",
             "agent.epsilon_decay=0.95", "agent.init_episodes=5", "proxy.hidden_size=32",
@@ -39,6 +48,8 @@ SETTINGS = ["env=gridworld_2x2", "agent=q_learning", "agent.learning_rate=0.5",
             "training.max_episodes=100", "training.max_steps=null", "training.stop_rule=plateau",
             "training.test_episodes=10", "es.noise_std=0.1", "es.num_incumbent_evals=null",
             "es.noise_std_decay=1"]  # fmt: skip
+# Agents in lockstep on a CPU core: those of a few runs, which cost nothing once these are over.
+CPU_LANES = 384
 STEP_SIZES = (0.01, 10.0)  # the range that the paper's figure shows
 LABELS = {"linear": "linear", "rank": "rank", "nes": "NES", "nes_unnormalized": "NES unnormalized",
           "single_best": "single best", "single_better": "single better",
@@ -49,70 +60,49 @@ LABELS = {"linear": "linear", "rank": "rank", "nes": "NES", "nes_unnormalized": 
 PAPER = {"all_better_1": "among the best", "all_better_2": "among the best"}
 
 
-def main() -> None:
-    """Runs the experiment as the command line says."""
-    common.run_command(NAME, __doc__, add_options, run)
+@dataclass(frozen=True, kw_only=True)
+class ScoreTransforms(Settings):
+    name = "score_transforms"
+
+    runs: int = count(220, "runs", quick=12, about="of each score transform, with mirrored "
+                      "sampling and as many without")  # fmt: skip
+    generations: int = count(50, "generations", quick=10, about="of a run at most")
+    population: int = setting(16, counts("scores are compared within a generation", least=2),
+                              quick=8, about="members of a generation")  # fmt: skip
+    bins: int = count(9, "bins", quick=3, about="of step sizes")
 
 
-def add_options(parser: argparse.ArgumentParser) -> None:
-    """Options of this experiment."""
-    parser.add_argument("--runs", type=int, help="of each score transform, with mirrored sampling "
-                        "and as many without; 220 (3520 in all), quick 12")  # fmt: skip
-    parser.add_argument("--generations", type=int, help="of a run at most; 50, quick 10")
-    parser.add_argument("--population", type=int, help="members of a generation; 16, quick 8")
-    parser.add_argument("--slots", type=int, default=64, help="runs that advance together; 64")
-    parser.add_argument("--bins", type=int, help="of step sizes; 9, quick 3")
-
-
-def fill_in(args: argparse.Namespace) -> None:
-    """Sets the options that were not given.
-
-    Raises:
-      ConfigError: for numbers that cannot work.
-    """
-    defaults = {"runs": (220, 12), "generations": (50, 10), "population": (16, 8), "bins": (9, 3)}
-    for name, (full, quick) in defaults.items():
-        if getattr(args, name) is None:
-            setattr(args, name, quick if args.quick else full)
-    common.require_counts(args, "runs", "generations", "slots", "bins")
-
-
-def run(args: argparse.Namespace) -> pd.DataFrame:
-    """Computes what is missing, writes everything and returns the table.
-
-    Raises:
-      ConfigError: for settings that cannot work, or an output folder of other settings.
-    """
-    fill_in(args)
-    pieces = common.Pieces(args.out / "pieces")
+def compute(settings: ScoreTransforms) -> pd.DataFrame:
+    """Computes what is missing; a row for each run."""
     tables = []
     for mirrored, transform in itertools.product((True, False), SCORE_TRANSFORMS):
         name = f"{transform}-{'mirrored' if mirrored else 'plain'}"
-        settings = {"transform": transform, "mirrored": mirrored, "runs": args.runs,
-                    "generations": args.generations, "population": args.population,
-                    "seed": args.seed, "settings": SETTINGS}  # fmt: skip
-        cell = pieces.compute(
-            name, settings, functools.partial(compute_cell, args, transform, mirrored)
-        )
+        made_with = {"transform": transform, "mirrored": mirrored, "settings": SETTINGS}
+        made_with |= settings.values("runs", "generations", "population", "seed")
+        make = functools.partial(compute_cell, settings, transform, mirrored)
+        cell = settings.pieces.compute(name, made_with, make)
         print(f"{name}: {cell['updates'].mean():.1f} updates of the SE on average, "
               f"{cell['solved'].mean():.0%} solved", flush=True)  # fmt: skip
         tables.append(cell)
-    return report(args, pd.concat(tables, ignore_index=True))
+    return pd.concat(tables, ignore_index=True)
 
 
-def compute_cell(args: argparse.Namespace, transform: str, mirrored: bool) -> pd.DataFrame:
+def compute_cell(settings: ScoreTransforms, transform: str, mirrored: bool) -> pd.DataFrame:
     """Runs of one score transform, a row each."""
-    import jax
-
-    keys = jax.random.split(jax.random.key(args.seed), args.runs)
-    step_sizes = draw_step_sizes(args.runs, args.seed)
-    updates, solved, scores = solve_all(
-        make_search(mirrored, args.population, args.devices), keys, transform, step_sizes,
-        args.generations, min(args.slots, args.runs),
-    )  # fmt: skip
-    return pd.DataFrame({"transform": transform, "mirrored": mirrored, "run": range(args.runs),
-                         "step_size": step_sizes, "updates": updates, "solved": solved,
-                         "last_score": scores})  # fmt: skip
+    keys = jax.random.split(jax.random.key(settings.seed), settings.runs)
+    step_sizes = draw_step_sizes(settings.runs, settings.seed)
+    search = make_search(mirrored, settings.population, settings.devices)
+    state = search.init(keys, np.float32(step_sizes), SCORE_TRANSFORMS.index(transform))
+    for _ in range(settings.generations):
+        state = search.advance(state)  # runs that have solved the task stay as they are
+        if state.finished.all():
+            break
+    solved = np.asarray(state.finished)
+    updates = np.where(solved, np.asarray(state.generation) - 1, settings.generations)
+    return pd.DataFrame({"transform": transform, "mirrored": mirrored,
+                         "run": range(settings.runs), "step_size": step_sizes,
+                         "updates": updates, "solved": solved,
+                         "last_score": np.asarray(state.incumbent_score)})  # fmt: skip
 
 
 def draw_step_sizes(count: int, seed: int) -> np.ndarray:
@@ -126,124 +116,64 @@ def draw_step_sizes(count: int, seed: int) -> np.ndarray:
     return np.exp(low + places * (high - low))
 
 
-def solve_all(
-    search: "Search",
-    keys: Any,
-    transform: str,
-    step_sizes: np.ndarray,
-    generations: int,
-    slots: int,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Runs NES for every key until the incumbent solves the task or `generations` are over.
-
-    Args:
-      search: from `make_search`.
-      keys: `[run]`.
-      transform: name of the score transform of all runs.
-      step_sizes: `[run]`.
-      generations: of a run at most.
-      slots: runs that advance together. The results do not depend on it.
-
-    Returns:
-      Updates before the incumbent that solved the task (`generations`, if none did), whether one
-      did, and the last incumbent mean; `[run]` each.
-    """
-    count = len(keys)
-    updates, solved = np.full(count, generations), np.zeros(count, bool)
-    scores = np.full(count, np.nan)
-    index, sizes = SCORE_TRANSFORMS.index(transform), np.asarray(step_sizes, np.float32)
-    in_slot, waiting = np.arange(slots), slots  # the run in each slot, -1: none; the next run
-    state = search.init(keys[:slots], sizes[:slots])
-    while (in_slot >= 0).any():
-        state = search.advance(state, index)
-        made, is_solved, score = map(
-            np.asarray, (state.generation, state.finished, state.incumbent_score)
-        )
-        ended = (is_solved | (made >= generations)) & (in_slot >= 0)
-        if not ended.any():
-            continue
-        runs = in_slot[ended]
-        updates[runs] = np.where(is_solved[ended], made[ended] - 1, generations)
-        solved[runs], scores[runs] = is_solved[ended], score[ended]
-        in_slot[ended] = -1
-        fresh = np.flatnonzero(ended)[: count - waiting]
-        in_slot[fresh] = np.arange(waiting, waiting + len(fresh))
-        waiting += len(fresh)
-        state = search.merge(ended, search.init(keys[in_slot], sizes[in_slot]), state)
-        state = state.replace(finished=in_slot < 0)  # an empty slot costs nothing
-    return updates, solved, scores
+@struct.dataclass
+class AnyNESState:
+    nes: NESState
+    transform: Any  # number of its score transform, `[]`
 
 
 @dataclass(frozen=True, kw_only=True)
-class Search:
-    """Compiled functions over NES runs that advance together, one in each slot.
+class AnyNES(Options):
+    """NES for any score transform: one program serves all of them, and all step sizes."""
 
-    Attributes:
-      init: `(keys [slot], step_sizes [slot]) -> state`.
-      advance: `(state, transform) -> state`, a generation; the number of a score transform.
-      merge: `(where [slot], a, b) -> state`, of both.
-    """
+    nes: NESConfig
 
-    init: Callable[..., Any]
-    advance: Callable[..., Any]
-    merge: Callable[..., Any]
+    def make(self, num_dims: int) -> Strategy:
+        """The strategy; its state begins with the first transform and the usual step size."""
+        each = [make_nes(dataclasses.replace(self.nes, score_transform=name), num_dims)
+                for name in SCORE_TRANSFORMS]  # fmt: skip
+
+        def ask(key: Any, state: AnyNESState) -> tuple[Any, AnyNESState]:
+            members, nes = each[0].ask(key, state.nes)
+            return members, state.replace(nes=nes)
+
+        def tell(key: Any, members: Any, scores: Any, incumbent: Any, state: AnyNESState) -> Any:
+            told = jax.lax.switch(state.transform, [strategy.tell for strategy in each], key,
+                                  members, scores, incumbent, state.nes)  # fmt: skip
+            return state.replace(nes=told)
+
+        return dataclasses.replace(
+            each[0], ask=ask, tell=tell, incumbent=lambda state: each[0].incumbent(state.nes),
+            init=lambda key, mean: AnyNESState(each[0].init(key, mean), jnp.int32(0)),
+        )  # fmt: skip
+
+
+class Search(NamedTuple):
+    """Compiled functions over NES runs."""
+
+    init: Callable[..., Any]  # (keys [run], step_sizes [run], number of a transform) -> state
+    advance: Callable[[Any], Any]  # a generation of every run that has not solved the task
 
 
 @functools.cache
 def make_search(mirrored: bool, population: int, devices: int | None) -> Search:
-    """Builds the bilevel loop with traced step sizes and score transform: compiled once for all."""
-    import jax
-    import jax.numpy as jnp
-
-    import sejax
+    """Builds the bilevel loop for all step sizes and score transforms."""
     from sejax.bilevel import make_program
 
     overrides = [f"es.mirrored={mirrored}", f"es.population_size={population}"]
-    config = dataclasses.replace(sejax.config(SETTINGS + overrides), devices=devices)
-    program = make_program(config)
+    config = sejax.config([*SETTINGS, *overrides, "stop_when_solved=true"])
+    config = dataclasses.replace(config, devices=devices)
+    parts = config.parts()
+    agent = dataclasses.replace(parts["agent"], cpu_lanes=CPU_LANES)
+    program = make_program(**parts | {"agent": agent, "es": AnyNES(nes=config.es)})
 
-    def init(keys: Any, step_sizes: Any) -> Any:
+    def init(keys: Any, step_sizes: Any, transform: Any) -> Any:
         state = program.init(keys)
-        return state.replace(es_state=state.es_state.replace(step_size=step_sizes))
+        nes = state.es_state.nes.replace(step_size=step_sizes)
+        transforms = jnp.full(len(keys), transform)
+        return state.replace(es_state=state.es_state.replace(nes=nes, transform=transforms))
 
-    def merge(where: Any, a: Any, b: Any) -> Any:
-        return jax.tree.map(lambda x, y: jax.vmap(jnp.where)(where, x, y), a, b)
-
-    advance = make_advance(config, program)
-    return Search(init=jax.jit(init), advance=jax.jit(advance), merge=jax.jit(merge))
-
-
-def make_advance(config: Any, program: Any) -> Callable[..., Any]:
-    """`Program.generation` of a configuration, for any score transform and without its info."""
-    import jax
-
-    from sejax.bilevel import make_population_scorer
-    from sejax.es import make_strategy
-    from sejax.es.nes import finite_mean
-    from sejax.objectives import make_objective
-
-    strategies = [
-        make_strategy(dataclasses.replace(config.es, score_transform=name), program.num_dims)
-        for name in SCORE_TRANSFORMS
-    ]
-    strategy = strategies[0]
-    score_candidates = make_population_scorer(config, program.task, program.env, program.unravel)
-    objective = make_objective(config.objective, program.task.solved_reward)
-
-    def advance(state: Any, transform: Any) -> Any:
-        keys = jax.vmap(jax.random.fold_in)(state.key, state.generation)
-        key_ask, key_inner, key_tell = jax.vmap(lambda key: jax.random.split(key, 3))(keys).T
-        candidates, asked = jax.vmap(strategy.ask)(key_ask, state.es_state)
-        outcome = score_candidates(strategy.seed_ids, key_inner, candidates, ~state.finished)
-        scores = objective(outcome)  # [slot, candidate]
-        told = jax.lax.switch(transform, [jax.vmap(s.tell) for s in strategies], key_tell,
-                              candidates, scores, asked)  # fmt: skip
-        incumbent = jax.vmap(finite_mean)(scores[:, -strategy.num_incumbent_evals :])
-        return state.replace(es_state=told, generation=state.generation + 1,
-                             incumbent_score=incumbent,
-                             finished=incumbent > program.task.solved_reward)  # fmt: skip
-
-    return advance
+    return Search(init=jax.jit(init), advance=jax.jit(lambda state: program.generation(state)[0]))
 
 
 def edges_of(bins: int) -> np.ndarray:
@@ -253,9 +183,8 @@ def edges_of(bins: int) -> np.ndarray:
 
 def binned(runs: pd.DataFrame, bins: int) -> pd.DataFrame:
     """Mean updates, share solved and number of runs for each cell and bin of step sizes."""
-    place = np.clip(
-        np.searchsorted(edges_of(bins), runs["step_size"], side="right") - 1, 0, bins - 1
-    )
+    place = np.searchsorted(edges_of(bins), runs["step_size"], side="right") - 1
+    place = np.clip(place, 0, bins - 1)
     grouped = runs.assign(bin=place).groupby(["transform", "mirrored", "bin"], sort=False)
     return grouped.agg(updates=("updates", "mean"), solved=("solved", "mean"),
                        runs=("run", "size")).reset_index()  # fmt: skip
@@ -270,7 +199,7 @@ def summarise(runs: pd.DataFrame, bins: int) -> pd.DataFrame:
     for (transform, mirrored), cells in binned(runs, bins).groupby(["transform", "mirrored"]):
         mine = runs[(runs["transform"] == transform) & (runs["mirrored"] == mirrored)]
         best = cells.loc[cells["updates"].idxmin()]
-        low, high = common.bootstrap_interval(mine["updates"])
+        low, high = bootstrap_interval(mine["updates"])
         edges = edges_of(bins)[int(best["bin"]) :]
         rows.append({
             "transform": transform, "mirrored": mirrored, "runs": len(mine),
@@ -284,85 +213,55 @@ def summarise(runs: pd.DataFrame, bins: int) -> pd.DataFrame:
 def make_table(summary: pd.DataFrame) -> pd.DataFrame:
     """The summary as texts, with the rank of the cell among those of the same sampling."""
     ranks = summary.groupby("mirrored")[["updates", "best_updates"]].rank(method="min")
-    return pd.DataFrame([
-        {
-            "score transform": LABELS[str(row["transform"])],
-            "mirrored": "yes" if row["mirrored"] else "no",
-            "rank": f"{rank['updates']:.0f}",
-            "updates, all step sizes": f"{row['updates']:.1f} "
-                                       f"[{row['updates_low']:.1f}, {row['updates_high']:.1f}]",
-            "solved": f"{row['solved']:.0%}",
-            "best step sizes": f"{row['best_low']:.2g} to {row['best_high']:.2g}",
-            "updates there": f"{row['best_updates']:.1f}",
-            "rank there": f"{rank['best_updates']:.0f}",
-            "paper": PAPER.get(str(row["transform"]), ""),
-        }
-        for (_, row), (_, rank) in zip(summary.iterrows(), ranks.iterrows(), strict=True)
-    ])  # fmt: skip
+    return as_texts(summary.join(ranks.add_suffix("_rank")), {
+        "score transform": lambda row: LABELS[row.transform],
+        "mirrored": lambda row: "yes" if row.mirrored else "no",
+        "rank": "{updates_rank:.0f}",
+        "updates, all step sizes": "{updates:.1f} [{updates_low:.1f}, {updates_high:.1f}]",
+        "solved": "{solved:.0%}",
+        "best step sizes": "{best_low:.2g} to {best_high:.2g}",
+        "updates there": "{best_updates:.1f}",
+        "rank there": "{best_updates_rank:.0f}",
+        "paper": lambda row: PAPER.get(row.transform, ""),
+    })  # fmt: skip
 
 
-def report(args: argparse.Namespace, runs: pd.DataFrame) -> pd.DataFrame:
-    """Writes the CSV, the pictures and the table, prints the table and returns it."""
-    from sejax.experiments import figures
-    from sejax.files import write_text
-
-    summary = summarise(runs, args.bins)
-    table = make_table(summary)
-    write_text(args.out / "runs.csv", runs.to_csv(index=False))
-    write_text(args.out / "summary.csv", summary.to_csv(index=False))
-    draw(runs, args.bins, args.generations, args.out / "score_transforms.png")
-    both = runs.groupby("mirrored")["updates"].mean()
-    failing = runs.groupby("transform")["solved"].mean().min()
-    title = "Updates of an SE of the 2x2 grid world until it solves the task"
+def report(settings: ScoreTransforms, rows: pd.DataFrame) -> pd.DataFrame:
+    bins, generations = settings.bins, settings.generations
+    summary = summarise(rows, bins)
+    draw(rows, bins, generations, settings.folder / "score_transforms.png")
+    both = rows.groupby("mirrored")["updates"].mean()
+    failing = rows.groupby("transform")["solved"].mean().min()
     note = (
-        f"Means over {args.runs} runs with step sizes from {STEP_SIZES[0]} to {STEP_SIZES[1]:g}, "
-        f"bootstrap 95% interval; a run that {args.generations} generations did not solve counts "
-        f"{args.generations}. Ranks are among those of the same sampling; the best of {args.bins} "
-        f"bins of step sizes looks better than it is. With mirrored sampling {both[True]:.1f} "
-        f"updates on average, without {both[False]:.1f} (paper: mirrored sampling is only "
-        f"marginally better, if at all). The least successful transform solves {failing:.0%} of "
-        "its runs (paper: none fails completely). The paper's figure gives no numbers; \"all "
-        'better" seemed to perform best.'
+        f"Means over {rows['run'].nunique()} runs with step sizes from {STEP_SIZES[0]} to "
+        f"{STEP_SIZES[1]:g}, bootstrap 95% interval; a run that {generations} generations did not "
+        f"solve counts {generations}. Ranks are among those of the same sampling; the best of "
+        f"{bins} bins of step sizes looks better than it is. With mirrored sampling "
+        f"{both[True]:.1f} updates on average, without {both[False]:.1f} (paper: mirrored sampling "
+        "is only marginally better, if at all). The least successful transform solves "
+        f"{failing:.0%} of its runs (paper: none fails completely). The paper's figure gives no "
+        'numbers; "all better" seemed to perform best.'
     )
-    command = figures.command(NAME, args, "runs", "generations", "population", "bins")
-    common.write_markdown(args.out / "table.md", title, command, table, note)
-    figures.print_table(title, table)
-    print(f"{args.out}: runs.csv, summary.csv, score_transforms.png and table.md.")
-    return table
+    title = "Updates of an SE of the 2x2 grid world until it solves the task"
+    return publish(settings, title, make_table(summary), summary, note)
 
 
 def draw(runs: pd.DataFrame, bins: int, generations: int, path: Path) -> None:
-    """Draws every run as a dot, as the paper's figure, and means over bins of step sizes below.
-
-    Args:
-      runs: of all cells.
-      bins: of step sizes.
-      generations: of a run at most; the end of the colour scale.
-      path: the picture.
-    """
-    import matplotlib.pyplot as plt
-
-    from sejax.experiments import figures
-
+    """Draws every run as a dot, as the paper's figure, and means over bins of step sizes below."""
     scale = plt.Normalize(0, generations)
-    with plt.rc_context(figures.STYLE):
-        figure, axes = plt.subplots(2, 2, figsize=(10, 7.6), sharey=True, layout="constrained")
+    with figures.panels(path, 2, 2, (10, 7.6), sharey=True) as (figure, axes):
         for column, mirrored in enumerate((True, False)):
             mine = runs[runs["mirrored"] == mirrored]
             _dots(axes[0, column], mine, scale)
             _heat_map(axes[1, column], binned(mine, bins), bins, scale)
             axes[0, column].set_title(f"{'with' if mirrored else 'without'} mirrored sampling")
         for axis in axes.ravel():
-            axis.set_xscale("log")
-            axis.set_xlim(*STEP_SIZES)
-            axis.set_xlabel("NES step size")
+            axis.set(xscale="log", xlim=STEP_SIZES, xlabel="NES step size")
         axes[0, 0].set_yticks(range(len(LABELS)), list(LABELS.values()))
-        axes[0, 0].set_ylim(len(LABELS) - 0.5, -0.5)
-        axes[0, 0].set_ylabel("single runs")
+        axes[0, 0].set(ylim=(len(LABELS) - 0.5, -0.5), ylabel="single runs")
         axes[1, 0].set_ylabel("means over bins of step sizes")
         bar = figure.colorbar(plt.cm.ScalarMappable(scale, _COLORS), ax=axes, fraction=0.04)
         bar.set_label(f"updates of the SE until it solves the task ({generations}: not solved)")
-        figures.write(figure, path)
 
 
 _COLORS = "viridis_r"  # dark is slow; even in lightness, so that it reads without colour
@@ -383,10 +282,11 @@ def _heat_map(axis: Any, cells: pd.DataFrame, bins: int, scale: Any) -> None:
     for row, column in itertools.product(range(len(LABELS)), range(bins)):
         value = means.iloc[row, column]
         if np.isfinite(value):
-            dark = scale(value) > 0.45
             axis.text(middles[column], row, f"{value:.0f}", ha="center", va="center", fontsize=8,
-                      color="white" if dark else "black")  # fmt: skip
+                      color="white" if scale(value) > 0.45 else "black")  # fmt: skip
 
+
+EXPERIMENT = Experiment(settings=ScoreTransforms, compute=compute, report=report, about=__doc__)
 
 if __name__ == "__main__":
-    main()
+    EXPERIMENT.main()

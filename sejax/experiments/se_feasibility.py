@@ -3,28 +3,31 @@
 Source: paper, section "Experiments with Synthetic Environments", paragraph "Feasibility" (figure
 "Multiple NES runs"), and appendix "Discussion on the Feasibility of Learning SEs".
 
-Each run is that of `python -m sejax.run` with the same settings and seed. Run by run they are
-learned in `<out>/runs/seed<N>`, and the best SE of each goes into `<out>/ses.safetensors`, which
-the other experiments read (`--ses`, `--varied`, `--fixed`).
+Each run is that of `python -m sejax.run` with the same settings and seed. The best SE of each goes
+into `ses.safetensors`, which the other experiments read (`ses`, `varied`, `fixed`).
 """
 
-import argparse
-import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
-from sejax.experiments import common, proxy_runs
+from sejax.app.build import AGENT_HPARAMS
+from sejax.experiments import figures, proxy_runs
+from sejax.experiments.experiment import Experiment
+from sejax.experiments.proxy_runs import RunSettings
+from sejax.experiments.settings import count, setting
+from sejax.experiments.tables import bootstrap_interval, publish
+from sejax.options import one_of
 
-NAME = "se_feasibility"
-NUM_RUNS = {"cartpole": 10, "acrobot": 5}
+NUM_RUNS = {"cartpole": 10}
 
 # A little world and agents that learn enough to be seen moving.
 QUICK = ["generations=8", "es.population_size=12", "es.num_incumbent_evals=8",
          "agent.hidden_size=32", "agent.batch_size=32", "agent.init_episodes=1",
          "training.max_steps=1500", "proxy.hidden_size=32"]  # fmt: skip
-QUICK_RUNS = 3
 
 # Paper, paragraph "Feasibility": "50 NES iterations are often sufficient to find SEs that teach
 # agents to solve a task"; appendix "Discussion on the Feasibility": 40 runs of 200 iterations with
@@ -33,69 +36,47 @@ PAPER = {"runs": "40", "generations run": "200", "population": "16",
          "generations to solve": "often about 50"}  # fmt: skip
 
 
-def main() -> None:
-    """Runs the experiment as the command line says."""
-    common.run_command(NAME, __doc__, add_options, run)
+@dataclass(frozen=True, kw_only=True)
+class SeFeasibility(RunSettings):
+    name = "se_feasibility"
+
+    runs: int = count(5, "runs", quick=3, about="independent NES runs; cartpole 10")
+    agent: str = setting("ddqn", about="that the SEs are learned with")
+    agent_hparams: str = setting(
+        "default", one_of(AGENT_HPARAMS), about="its hyperparameters; varied: drawn for each "
+        "training")  # fmt: skip
+
+    @classmethod
+    def defaults(cls, given: Mapping[str, Any]) -> dict[str, Any]:
+        usual = super().defaults(given)
+        if not given.get("quick"):
+            usual["runs"] = NUM_RUNS.get(given.get("env", usual["env"]), usual["runs"])
+        return usual
 
 
-def add_options(parser: argparse.ArgumentParser) -> None:
-    """Options of this experiment."""
-    parser.add_argument("--env", default="cartpole", help="task: cartpole (default), acrobot, ...")
-    parser.add_argument("--runs", type=int, help="independent NES runs; 10, acrobot 5, quick 3")
-    parser.add_argument("--generations", type=int, help="outer iterations; the preset's")
-    parser.add_argument("--agent-hparams", choices=("default", "varied"), default="default")
-    parser.add_argument("--agent", default="ddqn", help="that the SEs are learned with; ddqn")
-    parser.add_argument("--preset", default="best", help="best, paper, paper_performance")
-    parser.add_argument("--set", nargs="+", default=[], metavar="FIELD=VALUE", dest="overrides",
-                        help="further overrides, as of sejax.run")  # fmt: skip
+def compute(settings: SeFeasibility) -> pd.DataFrame:
+    """Learns what is missing; a row for each generation of each run."""
+    config, folder = learning_config(settings), settings.work_folder / "runs"
+    runs = proxy_runs.configs_of_runs(config, settings.runs, folder)
+    curves = proxy_runs.learn_all(runs)
+    proxy_runs.collect(runs, settings.folder / "ses.safetensors")
+    return curves
 
 
-def run(args: argparse.Namespace) -> pd.DataFrame:
-    """Learns what is missing, writes everything and returns the table.
-
-    Raises:
-      ConfigError: for settings that cannot work, or an output folder of other settings.
-    """
-    import sejax
-    from sejax.errors import require
-
-    config = sejax.config(overrides(args))
-    count = args.runs
-    if count is None:
-        count = QUICK_RUNS if args.quick else NUM_RUNS.get(config.env.name, 5)
-    require(count >= 1, "--runs", "be at least 1", "it counts runs", count, "--runs=5")
-    config = dataclasses.replace(config, devices=args.devices, seed=args.seed)
-    configs = proxy_runs.configs_of_runs(config, count, args.out / "runs")
-    curves = proxy_runs.learn_all(configs, common.Pieces(args.out / "pieces"))
-    proxy_runs.collect(configs, args.out / "ses.safetensors")
-    return report(args, config, curves, config.env.make().solved_reward)
-
-
-def overrides(args: argparse.Namespace) -> list[str]:
-    """The options as overrides of `sejax.config`; later ones win."""
-    chosen = [f"env={args.env}", f"agent={args.agent}", f"preset={args.preset}",
-              f"agent_hparams={args.agent_hparams}"]  # fmt: skip
-    chosen += QUICK if args.quick else []
-    if args.generations is not None:
-        chosen.append(f"generations={args.generations}")
-    return chosen + args.overrides
+def learning_config(settings: SeFeasibility) -> Any:
+    """The configuration of the NES runs."""
+    chosen = [f"agent={settings.agent}", f"agent_hparams={settings.agent_hparams}"]
+    return settings.learn_config(chosen + (QUICK if settings.quick else []))
 
 
 def summarise(curves: pd.DataFrame, solved_reward: float) -> pd.DataFrame:
-    """One row for each run: what it took to solve the task and how far it came.
-
-    Args:
-      curves: rows of all runs, with the columns of `metrics.csv`.
-      solved_reward: the threshold.
-    """
+    """One row for each run: what it took to solve the task and how far it came."""
     rows = []
     for seed, curve in curves.groupby("seed"):
         to_solve = proxy_runs.generations_to_solve(curve, solved_reward)
         at_solving = curve[curve["generation"] + 1 == to_solve]
         rows.append({
-            "seed": seed,
-            "generations": len(curve),
-            "generations_to_solve": to_solve,
+            "seed": seed, "generations": len(curve), "generations_to_solve": to_solve,
             "env_steps_to_solve": at_solving["env_steps_total"].max(),
             "best_incumbent_mean": curve["incumbent_mean"].max(),
             "last_incumbent_mean": curve["incumbent_mean"].iloc[-1],
@@ -108,7 +89,7 @@ def summarise(curves: pd.DataFrame, solved_reward: float) -> pd.DataFrame:
 def median_and_range(values: Any, limit: int) -> str:
     """`median (lowest to highest)` of counts, where inf is "more than the limit"."""
     values = np.sort(np.asarray(values, float))
-    middle = common.median(values)
+    middle = float(np.median(values))
 
     def text(x: float) -> str:
         return f"{x:g}" if np.isfinite(x) else f"> {limit}"
@@ -122,7 +103,7 @@ def make_table(config: Any, runs: pd.DataFrame) -> pd.DataFrame:
     """The statistics of all runs, beside what the paper says of its own."""
     solved = runs[np.isfinite(runs["generations_to_solve"])]
     best, last = runs["best_incumbent_mean"], runs["last_incumbent_mean"]
-    low, high = common.bootstrap_interval(last)
+    low, high = bootstrap_interval(last)
     ours = {
         "runs": str(len(runs)),
         "generations run": f"{runs['generations'].max()}",
@@ -141,47 +122,26 @@ def make_table(config: Any, runs: pd.DataFrame) -> pd.DataFrame:
     ])  # fmt: skip
 
 
-def report(
-    args: argparse.Namespace, config: Any, curves: pd.DataFrame, solved_reward: float
-) -> pd.DataFrame:
-    """Writes the CSV, the picture and the table, prints the table and returns it."""
-    from sejax.experiments import figures
-    from sejax.files import write_text
-
-    runs = summarise(curves, solved_reward)
-    table = make_table(config, runs)
-    write_text(args.out / "learning_curves.csv", curves.to_csv(index=False))
-    write_text(args.out / "runs.csv", runs.to_csv(index=False))
-    figures.learning_curves(curves, solved_reward, args.out / "learning_curves.png")
+def report(settings: SeFeasibility, rows: pd.DataFrame) -> pd.DataFrame:
+    config = learning_config(settings)
+    solved_reward = config.task().solved_reward
+    summary = summarise(rows, solved_reward)
+    figures.learning_curves(rows, solved_reward, settings.folder / "learning_curves.png")
     varied = " with varied hyperparameters" if config.agent_hparams == "varied" else ""
-    title = f"Learning SEs of {config.env.name} for {config.agent.name} agents{varied}"
     note = (
-        f"Preset {config.preset}. An incumbent mean is over {num_incumbent_evals(config)} fresh "
+        f"Preset {config.preset}. An incumbent mean is over "
+        f"{config.es.num_incumbent_evals or config.es.population_size} fresh "
         f"agents with {config.training.test_episodes} test episodes each; a run counts as solved "
         f"from the first generation in which it reaches {solved_reward:g}. Median and range over "
         "runs; a run that did not solve the task counts as longer than all. The last incumbent "
         "mean is that over runs, with a bootstrap 95% interval; the best is a maximum of noisy "
         "means and hence too high: se_performance tests the stored SEs with other agents."
     )
-    common.write_markdown(args.out / "table.md", title, common_command(args), table, note)
-    figures.print_table(title, table)
-    print(f"{args.out}: learning_curves.csv, .png, runs.csv and table.md; the best SE of each run "
-          f"is in {args.out / 'ses.safetensors'}.")  # fmt: skip
-    return table
+    title = f"Learning SEs of {settings.env} for {settings.agent} agents{varied}"
+    return publish(settings, title, make_table(config, summary), summary, note)
 
 
-def num_incumbent_evals(config: Any) -> int:
-    """Agents that an incumbent mean is over; one for each member if not configured."""
-    return config.es.num_incumbent_evals or config.es.population_size
-
-
-def common_command(args: argparse.Namespace) -> str:
-    """The command that makes these results again."""
-    from sejax.experiments.figures import command
-
-    return command(NAME, args, "env", "agent", "agent_hparams", "preset", "runs", "generations",
-                   ("overrides", "set"))  # fmt: skip
-
+EXPERIMENT = Experiment(settings=SeFeasibility, compute=compute, report=report, about=__doc__)
 
 if __name__ == "__main__":
-    main()
+    EXPERIMENT.main()

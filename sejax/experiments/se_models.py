@@ -3,68 +3,64 @@
 Source: paper, appendix "Evaluation of Individual SE Models" for CartPole and for Acrobot: 40 SEs,
 1000 agents with drawn hyperparameters on each, 10 test episodes.
 
-Agents are trained as in se_performance; with its `--out` folder, those that it trained on the same
+Agents are trained as in se_performance; with its `out` folder, those that it trained on the same
 SEs are used again.
 """
 
-import argparse
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
+import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
 
+import sejax
 from sejax.errors import ConfigError
-from sejax.experiments import common, se_agents
-
-NAME = "se_models"
-
-
-def main() -> None:
-    """Runs the experiment as the command line says."""
-    common.run_command(NAME, __doc__, add_options, run)
+from sejax.experiments import figures, se_agents
+from sejax.experiments.experiment import Experiment
+from sejax.experiments.se_agents import SeAgents
+from sejax.experiments.settings import setting
+from sejax.experiments.tables import as_texts, publish
+from sejax.experiments.worlds import return_columns
 
 
-def add_options(parser: argparse.ArgumentParser) -> None:
-    """Options of this experiment."""
-    parser.add_argument("--ses", metavar="FILE", help="SEs, from se_feasibility; with --quick, "
-                        "the shipped cartpole SE")  # fmt: skip
-    se_agents.add_options(parser)
+@dataclass(frozen=True, kw_only=True)
+class SeModels(SeAgents):
+    name = "se_models"
+    files = "models_"
+
+    ses: str | None = setting(
+        None, quick="cartpole", about="file of SEs, from se_feasibility, or a shipped name"
+    )
 
 
-def run(args: argparse.Namespace) -> pd.DataFrame:
-    """Trains what is missing, writes everything and returns the table.
+def compute(settings: SeModels) -> pd.DataFrame:
+    """Trains what is missing; a row for each agent."""
+    ses = load(settings)
+    tables = []
+    for kind in settings.agents:
+        world = se_agents.se_world(settings, ses, kind)
+        places = {group.name: place for place, group in enumerate(world.groups)}
+        rows = se_agents.train(settings, world)
+        tables.append(rows.assign(se=rows["group"].map(places)))
+    return pd.concat(tables, ignore_index=True)
 
-    Raises:
-      ConfigError: for a file or settings that cannot work.
-    """
-    from sejax.proxies.sets import load_set
 
-    se_agents.fill_in(args)
-    source = args.ses or ("cartpole" if args.quick else None)
-    if source is None:
-        raise ConfigError("--ses must be given, because agents are trained on its SEs; got none. "
-                          "Set --ses=results/se_feasibility/ses.safetensors.")  # fmt: skip
-    ses = load_set(source, "--ses", "se").first(args.num_ses)
-    world = se_agents.se_world(args, ses)
-    pieces = common.Pieces(args.out / "pieces")
-    agents = pd.concat([se_agents.train_all(args, kind, world, pieces) for kind in args.agents])
-    agents["se"] = agents["group"].map({name: i for i, name in enumerate(world.names)})
-    return report(args, ses, agents)
+def load(settings: SeModels) -> Any:
+    """The SEs that are tested."""
+    if settings.ses is None:
+        raise ConfigError("ses must be given, because agents are trained on its SEs; got none. "
+                          "Set ses=results/se_feasibility/cartpole/ses.safetensors.")  # fmt: skip
+    return sejax.load_set(settings.ses, option="ses", kind="se").first(settings.num_ses)
 
 
 def summarise(agents: pd.DataFrame, solved_reward: float) -> pd.DataFrame:
-    """One row for each kind of agent and SE, the best SE of each kind first.
-
-    Args:
-      agents: with columns `kind`, `se`, `test_return` and `train_steps`.
-      solved_reward: an agent counts as solving the task from this mean test return on.
-    """
+    """One row for each kind of agent and SE, the best SE of each kind first."""
     grouped = agents.groupby(["kind", "se"], sort=False)
     summary = grouped["test_return"].agg(
-        return_mean="mean",
-        return_std=lambda x: x.std(ddof=0),
-        solved=lambda x: (x >= solved_reward).mean(),
-    )
+        return_mean="mean", return_std=lambda x: x.std(ddof=0),
+        solved=lambda x: (x >= solved_reward).mean())  # fmt: skip
     summary["train_steps"] = grouped["train_steps"].mean()
     kinds = list(dict.fromkeys(agents["kind"]))
     rank = summary.reset_index().assign(order=lambda t: t["kind"].map(kinds.index))
@@ -81,43 +77,27 @@ def rank_correlations(summary: pd.DataFrame) -> pd.DataFrame:
     return means[list(dict.fromkeys(summary["kind"]))].rank().corr()
 
 
-def report(args: argparse.Namespace, ses: Any, agents: pd.DataFrame) -> pd.DataFrame:
-    """Writes the CSV, the picture and the table, prints the table and returns it."""
-    from sejax.experiments import figures
-    from sejax.files import write_text
-
-    task, scores, seeds = ses.task, ses.scores, ses.seeds
-    summary = summarise(agents, task.solved_reward)
-    table = pd.DataFrame([
-        {
-            "agent": row.kind,
-            "SE": row.se,
-            "run's seed": seeds[row.se],
-            "score when learned": f"{scores[row.se]:.1f}",
-            "return": f"{row.return_mean:.1f} ± {row.return_std:.1f}",
-            "agents that solve the task": f"{row.solved:.0%}",
-            "training steps": f"{row.train_steps:,.0f}",
-        }
-        for row in summary.itertuples()
-    ])  # fmt: skip
-    write_text(args.out / "models_agents.csv", agents.to_csv(index=False))
-    write_text(args.out / "models_summary.csv", summary.to_csv(index=False))
-    kinds = {kind: agents[agents["kind"] == kind] for kind in args.agents}
-    figures.violins(kinds, se_agents.return_columns(agents), task.name, task.solved_reward,
-                    args.out / "models.png")  # fmt: skip
-    title = f"Single SEs of {task.name} (solved at {task.solved_reward:g})"
+def report(settings: SeModels, rows: pd.DataFrame) -> pd.DataFrame:
+    ses = load(settings)
+    task = ses.task
+    columns: dict[str, Any] = {
+        "agent": "{kind}",
+        "SE": lambda row: row.se,
+        "run's seed": lambda row: ses.seeds[row.se],
+        "score when learned": lambda row: f"{ses.scores[row.se]:.1f}",
+        "return": "{return_mean:.1f} ± {return_std:.1f}",
+        "agents that solve the task": "{solved:.0%}",
+        "training steps": "{train_steps:,.0f}",
+    }
+    summary = summarise(rows, task.solved_reward)
+    draw(task, rows, settings.folder / "models.png")
     note = (
-        f"Return: mean ± std over {args.num_agents} agents with drawn hyperparameters and "
-        f"{args.test_episodes} test episodes each. The paper has 1000 agents on each of 40 SEs "
-        f"and shows violins only, no numbers.{correlations_text(summary)}"
+        f"Return: mean ± std over {rows['agent'].nunique()} agents with drawn hyperparameters and "
+        f"{len(return_columns(rows))} test episodes each. The paper has 1000 agents on each of 40 "
+        f"SEs and shows violins only, no numbers.{correlations_text(summary)}"
     )
-    command = figures.command(NAME, args, "ses", "agents", "num_agents", "num_ses",
-                              "test_episodes", "max_steps")  # fmt: skip
-    common.write_markdown(args.out / "models_table.md", title, command, table, note)
-    figures.print_table(title, table)
-    print(f"{args.out}: models_agents.csv (every test return), models_summary.csv, models.png and "
-          f"models_table.md.{correlations_text(summary)}")  # fmt: skip
-    return table
+    title = f"Single SEs of {task.name} (solved at {task.solved_reward:g})"
+    return publish(settings, title, as_texts(summary, columns), summary, note)
 
 
 def correlations_text(summary: pd.DataFrame) -> str:
@@ -131,5 +111,35 @@ def correlations_text(summary: pd.DataFrame) -> str:
     return f" Rank correlation of the SEs' mean returns: {', '.join(texts)}." if texts else ""
 
 
+def draw(task: Any, agents: pd.DataFrame, path: Path) -> None:
+    """Draws a violin of the returns for each SE, the best first, in a row for each kind of agent.
+
+    Source: paper, appendix "Evaluation of Individual SE Models".
+    """
+    kinds = list(agents.groupby("kind", sort=False))
+    num_ses = max(mine["se"].nunique() for _, mine in kinds)
+    size = (max(5.0, 1.8 + 0.35 * num_ses), 0.6 + 2.6 * len(kinds))
+    with figures.panels(path, len(kinds), 1, size) as (figure, axes):
+        for axis, (kind, of_kind) in zip(axes[:, 0], kinds, strict=True):
+            pooled = {se: mine[return_columns(mine)].to_numpy().ravel()
+                      for se, mine in of_kind.groupby("se")}  # fmt: skip
+            order = sorted(pooled, key=lambda se: -pooled[se].mean())
+            parts = axis.violinplot([pooled[se] for se in order], widths=0.85, showextrema=False)
+            for body in parts["bodies"]:
+                body.set(facecolor=figures.REAL, edgecolor=figures.REAL, alpha=0.45)
+            places, means = range(1, len(order) + 1), [pooled[se].mean() for se in order]
+            axis.plot(places, means, "D", ms=4, color=figures.BEST, ls="none")
+            axis.axhline(task.solved_reward, color=figures.SOLVED, ls="--", lw=1.2)
+            axis.set_xticks(places, order, fontsize=8)
+            axis.set_title(figures.AGENT_NAMES.get(kind, kind), fontsize=10)
+            axis.set(xlim=(0.4, len(order) + 0.6), ylabel=f"test return\non {task.name}")
+        axes[-1, 0].set_xlabel("SE, by its place in the set; diamonds: means")
+        line = plt.Line2D([], [], color=figures.SOLVED, ls="--")
+        figure.legend([line], [f"solved ({task.solved_reward:g})"], loc="outside upper right",
+                      fontsize=9)  # fmt: skip
+
+
+EXPERIMENT = Experiment(settings=SeModels, compute=compute, report=report, about=__doc__)
+
 if __name__ == "__main__":
-    main()
+    EXPERIMENT.main()

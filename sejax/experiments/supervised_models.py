@@ -1,139 +1,147 @@
 """Models of a task, fitted by supervised learning to what agents of NES runs met in it.
 
 Source: paper, appendix "Supervised Learning and Synthetic Environments", subsection "Comparing
-Supervised Learning with Synthetic Environments on CartPole"; `reference_details.md` 7.5.
+Supervised Learning with Synthetic Environments on CartPole"; `docs/reference.md` 7.5.
 """
 
-import argparse
 import dataclasses
+import functools
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+import jax
+import jax.numpy as jnp
 import numpy as np
+import optax
 import pandas as pd
 
-from sejax.experiments import common
+import sejax
+from sejax import plugins
+from sejax.app import build
+from sejax.experiments import se_agents
+from sejax.experiments.se_agents import AGENTS
+from sejax.experiments.settings import Settings, count, each_of, setting
+from sejax.experiments.worlds import HPARAMS
+from sejax.options import counts
+from sejax.parallel import spread_over_devices
 
-LEARNING_RATE, BATCH_SIZE = 1e-4, 1024  # paper and reference_details.md 7.5
-QUICK_AGENT = {"hidden_size": 8, "num_layers": 1, "batch_size": 8, "init_episodes": 1}
-QUICK_STEPS = 1500
+LEARNING_RATE, BATCH_SIZE = 1e-4, 1024  # paper and docs/reference.md 7.5
 
 
-def learning_config(args: argparse.Namespace, ses: Any) -> Any:
+@dataclass(frozen=True, kw_only=True)
+class SupervisedBaseline(Settings):
+    """Settings of the experiment `supervised_baseline`."""
+
+    name = "supervised_baseline"
+
+    proxy: str = setting("cartpole", about="SE to compare with, whose settings the NES runs have; "
+                         "run directory, file or name")  # fmt: skip
+    models: int = count(5, "models", quick=2, about="NES runs, and a model for each")
+    generations: int = count(25, "generations", quick=3, about="of an NES run")
+    population: int = setting(16, counts("scores are compared within a generation", least=2),
+                              quick=3, about="members of a generation")  # fmt: skip
+    max_rows: int = count(100_000, "transitions", quick=3000, about="transitions for a model")
+    epochs: int = count(100, "epochs", quick=20, about="of a fit")
+    agents: tuple[str, ...] = setting(("ddqn",), each_of(AGENTS), about=f"of {', '.join(AGENTS)}")
+    hparams: tuple[str, ...] = setting(HPARAMS, each_of(HPARAMS), about="of the agents; varied: "
+                                       "drawn for each")  # fmt: skip
+    num_agents: int = count(20, "agents", quick=2, about="for each model")
+    test_episodes: int = count(10, "episodes", about="of each agent")
+    max_steps: int | None = setting(None, counts("an agent must train"), about="training steps of "
+                                    "an agent on a model; as on the SE")  # fmt: skip
+
+
+def learning_config(settings: SupervisedBaseline, ses: Any) -> Any:
     """Settings of the NES runs that the transitions come from."""
-    config = ses.config
-    agent = config.agent
-    training = dataclasses.replace(config.training, test_episodes=args.test_episodes)
-    if args.quick:
-        agent = dataclasses.replace(agent, **QUICK_AGENT)
-        training = dataclasses.replace(training, max_steps=QUICK_STEPS)
-    es = dataclasses.replace(config.es, population_size=args.population,
-                             num_incumbent_evals=args.population)  # fmt: skip
-    return dataclasses.replace(config, agent=agent, training=training, es=es, devices=args.devices)
-
-
-def collect_piece(
-    args: argparse.Namespace, ses: Any, index: int, pieces: common.Pieces
-) -> pd.DataFrame:
-    """The transitions of one NES run."""
-    from sejax.configs import to_dict
-
-    config = learning_config(args, ses)
-    settings = to_dict(config) | {"generations": args.generations, "max_rows": args.max_rows,
-                                  "seed": args.seed + index, "devices": None}  # fmt: skip
-    rows = pieces.compute(
-        f"transitions-{index}", settings,
-        lambda: collect(config, args.seed + index, args.generations, args.max_rows),
+    config = build.learn_config(ses.config)
+    agent, training = config.agent, config.training
+    training = dataclasses.replace(training, test_episodes=settings.test_episodes)
+    if settings.quick:
+        agent = dataclasses.replace(agent, **se_agents.QUICK_AGENT)
+        training = dataclasses.replace(training, max_steps=se_agents.QUICK_STEPS)
+    es = dataclasses.replace(config.es, population_size=settings.population,
+                             num_incumbent_evals=settings.population)  # fmt: skip
+    return dataclasses.replace(
+        config, agent=agent, training=training, es=es, generations=settings.generations,
+        seed=settings.seed, num_seeds=1, devices=settings.devices, run_dir=None,
     )  # fmt: skip
-    print(f"NES run {index}: {len(rows):,} transitions of episodes with mean return "
-          f"{rows['return'].mean():.1f}", flush=True)  # fmt: skip
-    return rows
 
 
-def collect(config: Any, seed: int, generations: int, max_rows: int) -> pd.DataFrame:
+def collect_all(settings: SupervisedBaseline, ses: Any) -> list[pd.DataFrame]:
+    """The transitions of each NES run; every run is a piece."""
+    config = learning_config(settings, ses)
+    made_with = build.to_plain(config) | {"max_rows": settings.max_rows, "devices": None}
+    tables = []
+    for index in range(settings.models):
+        seed = settings.seed + index
+        make = functools.partial(collect, config, seed, settings.max_rows)
+        rows = settings.pieces.compute(f"transitions-{index}", made_with | {"seed": seed}, make)
+        print(f"NES run {index}: {len(rows):,} transitions of episodes with mean return "
+              f"{rows['return'].mean():.1f}", flush=True)  # fmt: skip
+        tables.append(rows)
+    return tables
+
+
+def collect(config: Any, seed: int, max_rows: int) -> pd.DataFrame:
     """Runs NES and draws transitions, all equally likely, from its agents' real test episodes."""
-    import jax
-
-    from sejax.es import make_strategy
-    from sejax.objectives import make_objective
-
-    env, unravel, mean = make_proxy(config, seed)
-    strategy = make_strategy(config.es, mean.size)
-    evaluate = make_recorded_evaluation(config, env, unravel)
-    objective = make_objective(config.objective, env.task.solved_reward)
-    key_es, key_run = jax.random.split(jax.random.key(seed))
-    state = jax.jit(strategy.init)(key_es, mean)
-    ask, tell = jax.jit(strategy.ask), jax.jit(strategy.tell)
-    rng = np.random.default_rng(seed)
-    sample = Sample(max_rows, rng)
-    for generation in range(generations):
-        key_ask, key_tell, key_inner = jax.random.split(jax.random.fold_in(key_run, generation), 3)
-        candidates, asked = ask(key_ask, state)
-        keys = jax.random.split(key_inner, strategy.num_candidates)
-        outcome, steps = evaluate(keys, candidates)
-        state = tell(key_tell, candidates, objective(outcome), asked)
-        sample.add(table_of(jax.device_get(steps), generation))
+    run = make_recorded_run(config)
+    state = run.init(jax.random.key(seed)[None])
+    sample = Sample(max_rows, np.random.default_rng(seed))
+    for number in range(config.generations):
+        state, steps = run.generation(state)
+        sample.add(table_of(jax.device_get(steps), config.training.test_episodes, number))
     return sample.table
 
 
-def make_proxy(config: Any, seed: int) -> tuple[Any, Callable[[Any], Any], Any]:
-    """The SE of a configuration, its weights' form, and random ones to begin with, `[dims]`."""
-    import jax
-    from jax.flatten_util import ravel_pytree
+class RecordedRun(NamedTuple):
+    """An NES run whose agents' tests are recorded; compiled functions."""
 
-    from sejax.proxies.registry import make_proxy
-
-    env = make_proxy(config.env.make(), config.proxy)
-    mean, unravel = ravel_pytree(env.init_weights(jax.random.key(seed)))
-    return env, unravel, mean
+    init: Callable[[Any], Any]  # keys [1] -> LearnState
+    # state -> (state, Steps): `Program.generation` with the steps of all tests, [agent, step, ...]
+    generation: Callable[[Any], Any]
 
 
-def make_recorded_evaluation(
-    config: Any, env: Any, unravel: Callable[[Any], Any]
-) -> Callable[..., Any]:
-    """Builds `evaluate(keys [n], candidates [n, dims]) -> (Outcome, transitions)`, leaves `[n]`."""
-    import jax
-    import jax.numpy as jnp
+@functools.cache
+def make_recorded_run(config: Any) -> RecordedRun:
+    """The NES run of a configuration, from any seed: compiled once for all of them."""
+    from sejax.bilevel import make_program
+    from sejax.evaluation import make_evaluator, tested_throughout
 
-    from sejax.agents.registry import make_agent
-    from sejax.evaluation import make_tested_trainer, return_area
-    from sejax.experiments.se_histograms import make_test_recorder
-    from sejax.objectives import Outcome
-    from sejax.parallel import spread_over_devices
+    program = make_program(**config.parts())
+    agent, proxy, training = program.agent, program.proxy, config.training
+    if program.objective.needs_tests:
+        training = tested_throughout(training)
+    evaluate = make_evaluator(agent, proxy, proxy.task, training, record=True)
+    evaluate_all = spread_over_devices(
+        lambda key, candidate: evaluate(key, proxy.params(program.unravel(candidate))),
+        config.devices, config.lanes, agent.cpu_lanes,
+    )  # fmt: skip
 
-    agent = make_agent(config.agent, env.task, config.exploration)
-    train = make_tested_trainer(agent, env, env.task, config.training)
-    num_episodes = config.training.test_episodes
-    test = make_test_recorder(agent, env.task, num_episodes)
+    def generation(state: Any) -> Any:
+        asked = program.ask(state)
+        outcome, steps = evaluate_all(asked.keys[0], asked.candidates[0])
+        state, _ = program.tell(state, asked, jax.tree.map(lambda x: x[None], outcome))
+        return state, steps
 
-    def one(key: Any, candidate: Any) -> Any:
-        key_train, key_test = jax.random.split(key)
-        result = train(key_train, env.params(unravel(candidate)))
-        steps = test(key_test, result.agent_state)
-        rewards = jnp.where(steps.valid, steps.reward, 0.0)
-        returns = rewards.reshape(num_episodes, -1).sum(axis=1)
-        outcome = Outcome(test_returns=returns, train_steps=result.train_steps,
-                          train_episodes=result.episodes,
-                          return_area=return_area(result, returns.mean()),
-                          nonfinite=result.nonfinite,
-                          real_steps=steps.valid.sum() + result.test_steps)  # fmt: skip
-        return outcome, (steps, jnp.repeat(returns, env.task.max_steps))
-
-    return jax.jit(spread_over_devices(one, config.devices, config.lanes, agent.cpu_lanes))
+    return RecordedRun(init=jax.jit(program.init), generation=jax.jit(generation))
 
 
-def table_of(steps_and_returns: Any, generation: int) -> pd.DataFrame:
-    """The transitions that were made, a row each, with the return of their episode."""
-    steps, returns = steps_and_returns
+def table_of(steps: Any, num_episodes: int, generation: int) -> pd.DataFrame:
+    """The transitions that were made, a row each, with the return of their episode.
+
+    `steps` are `Steps` of NumPy arrays `[agent, num_episodes * max_steps, ...]`.
+    """
     valid = steps.valid
+    rewards = np.where(valid, steps.reward, 0).reshape(len(valid), num_episodes, -1)
+    returns = np.broadcast_to(rewards.sum(axis=2, keepdims=True), rewards.shape)
     obs, next_obs = steps.obs[valid], steps.next_obs[valid]
-    columns = {f"state_{i}": obs[:, i] for i in range(obs.shape[1])}
-    columns |= {"action": steps.action[valid]}
-    columns |= {f"next_state_{i}": next_obs[:, i] for i in range(obs.shape[1])}
-    return pd.DataFrame(columns | {
+    return pd.DataFrame({
+        **{f"state_{i}": x for i, x in enumerate(obs.T)}, "action": steps.action[valid],
+        **{f"next_state_{i}": x for i, x in enumerate(next_obs.T)},
         "reward": steps.reward[valid], "terminated": steps.terminated[valid].astype(int),
-        "return": returns[valid], "generation": generation,
+        "return": returns.reshape(valid.shape)[valid], "generation": generation,
     })  # fmt: skip
 
 
@@ -157,52 +165,47 @@ class Sample:
         return pd.DataFrame() if self._rows is None else self._rows.drop(columns="_drawn")
 
 
-def quality(data: list[pd.DataFrame]) -> list[float]:
-    """Mean return of the episodes that each model's transitions come from."""
-    return [float(rows["return"].mean()) for rows in data]
+def summary_of(data: list[pd.DataFrame]) -> pd.DataFrame:
+    """Number of transitions, mean return of their episodes and share of ends, for each model."""
+    return pd.DataFrame({
+        "model": range(len(data)), "transitions": [len(rows) for rows in data],
+        "episode_return": [rows["return"].mean() for rows in data],
+        "ends": [rows["terminated"].mean() for rows in data],
+    })  # fmt: skip
 
 
-def model_file(args: argparse.Namespace, variant: str) -> Path:
+def model_file(settings: SupervisedBaseline, variant: str) -> Path:
     """Where the models of a variant are stored."""
-    return Path(args.out) / f"models-{variant}.safetensors"
+    return settings.folder / f"models-{variant}.safetensors"
 
 
-def fit_piece(
-    args: argparse.Namespace, ses: Any, data: list[pd.DataFrame], pieces: common.Pieces
-) -> pd.DataFrame:
+def fit_piece(settings: SupervisedBaseline, ses: Any, data: list[pd.DataFrame]) -> pd.DataFrame:
     """Fits all models, stores both variants of them, and returns the errors of each epoch."""
     num_rows = min(len(rows) for rows in data)
-    settings = {"proxy": vars(ses.config.proxy), "models": args.models, "num_rows": num_rows,
-                "epochs": args.epochs, "learning_rate": LEARNING_RATE, "batch_size": BATCH_SIZE,
-                "generations": args.generations, "population": args.population,
-                "seed": args.seed}  # fmt: skip
-    fits = pieces.compute("fit", settings, lambda: fit_all(args, ses, data, num_rows))
-    last = fits[fits["epoch"] == args.epochs - 1].mean()
+    made_with = {"proxy": ses.config["proxy"], "num_rows": num_rows,
+                 "learning_rate": LEARNING_RATE, "batch_size": BATCH_SIZE}  # fmt: skip
+    made_with |= settings.values("models", "epochs", "generations", "population", "seed")
+    fits = settings.pieces.compute("fit", made_with, lambda: fit_all(settings, ses, data, num_rows))
+    last = fits[fits["epoch"] == settings.epochs - 1].mean()
     print(f"Models: mean squared error {last['error']:.2g} of [s', r], "
           f"{last['done_error']:.2g} of the end", flush=True)  # fmt: skip
     return fits
 
 
-def fit_all(
-    args: argparse.Namespace, ses: Any, data: list[pd.DataFrame], num_rows: int
-) -> pd.DataFrame:
+def fit_all(settings: Any, ses: Any, data: list[pd.DataFrame], num_rows: int) -> pd.DataFrame:
     """Fits a model to each run's transitions and writes the models; a row for each epoch."""
-    import jax
-
-    from sejax.parallel import spread_over_devices
-
     arrays = [arrays_of(rows.iloc[:num_rows]) for rows in data]
     stacked = tuple(np.stack(parts) for parts in zip(*arrays, strict=True))
-    keys = jax.random.split(jax.random.key(args.seed), args.models)
-    fit = make_fit(ses.env, num_rows, args.epochs)
-    program = jax.jit(spread_over_devices(fit, args.devices))
+    keys = jax.random.split(jax.random.key(settings.seed), settings.models)
+    fit = make_fit(ses.env, num_rows, settings.epochs)
+    program = jax.jit(spread_over_devices(fit, settings.devices))
     initial, fitted, errors = jax.device_get(program(keys, *stacked))
-    save_models(args, ses, {**fitted, "done": initial["done"]}, "authors", "soft")
-    save_models(args, ses, fitted, "fair", "threshold")
+    save_models(settings, ses, {**fitted, "done": initial["done"]}, "authors", "soft")
+    save_models(settings, ses, fitted, "fair", "threshold")
     return pd.concat([
-        pd.DataFrame({"model": i, "epoch": range(args.epochs), "error": errors[i, :, 0],
+        pd.DataFrame({"model": i, "epoch": range(settings.epochs), "error": errors[i, :, 0],
                       "done_error": errors[i, :, 1]})
-        for i in range(args.models)
+        for i in range(settings.models)
     ])  # fmt: skip
 
 
@@ -210,12 +213,8 @@ def arrays_of(rows: pd.DataFrame) -> tuple[np.ndarray, np.ndarray, np.ndarray, n
     """States `[n, obs_dim]`, actions `[n]`, targets [s', r] and ends `[n]`."""
     states = [name for name in rows if name.startswith("state_")]
     targets = [name for name in rows if name.startswith("next_state_")] + ["reward"]
-    return (
-        rows[states].to_numpy(np.float32),
-        rows["action"].to_numpy(np.int32),
-        rows[targets].to_numpy(np.float32),
-        rows["terminated"].to_numpy(np.float32),
-    )
+    state, target, end = (rows[x].to_numpy(np.float32) for x in (states, targets, "terminated"))
+    return state, rows["action"].to_numpy(np.int32), target, end
 
 
 def make_fit(env: Any, num_rows: int, epochs: int) -> Callable[..., Any]:
@@ -224,22 +223,15 @@ def make_fit(env: Any, num_rows: int, epochs: int) -> Callable[..., Any]:
     The errors are means over an epoch, of [s', r] and of the end. What does not fill the last batch
     of an epoch is left out of it; the order is drawn anew for each.
     """
-    import jax
-    import jax.numpy as jnp
-    import optax
-
     batch_size = min(BATCH_SIZE, num_rows)
     num_batches = num_rows // batch_size
     optimizer = optax.adam(LEARNING_RATE)
 
-    def errors_of(weights: Any, states: Any, actions: Any, targets: Any, ends: Any) -> Any:
+    def loss(weights: Any, states: Any, actions: Any, targets: Any, ends: Any) -> Any:
         state, reward, done = jax.vmap(env.predict, (None, 0, 0))(weights, states, actions)
         predicted = jnp.concatenate([state, reward[:, None]], axis=1)
-        return jnp.stack([jnp.mean((predicted - targets) ** 2), jnp.mean((done - ends) ** 2)])
-
-    def loss(weights: Any, batch: Any) -> Any:
-        errors = errors_of(weights, *batch)
-        return errors.sum(), errors
+        errors = [jnp.mean((predicted - targets) ** 2), jnp.mean((done - ends) ** 2)]
+        return sum(errors), jnp.stack(errors)
 
     def fit(key: Any, *data: Any) -> Any:
         key_init, key_order = jax.random.split(key)
@@ -248,8 +240,8 @@ def make_fit(env: Any, num_rows: int, epochs: int) -> Callable[..., Any]:
 
         def update(carry: Any, rows: Any) -> Any:
             weights, opt_state = carry
-            batch = tuple(x[rows] for x in data)
-            gradient, errors = jax.grad(loss, has_aux=True)(weights, batch)
+            batch = (x[rows] for x in data)
+            gradient, errors = jax.grad(loss, has_aux=True)(weights, *batch)
             step, opt_state = optimizer.update(gradient, opt_state)
             return (optax.apply_updates(weights, step), opt_state), errors
 
@@ -265,14 +257,11 @@ def make_fit(env: Any, num_rows: int, epochs: int) -> Callable[..., Any]:
     return fit
 
 
-def save_models(args: argparse.Namespace, ses: Any, weights: Any, variant: str, done: str) -> None:
+def save_models(settings: Any, ses: Any, weights: Any, variant: str, done: str) -> None:
     """Stores the models of a variant, as SEs with their use of the done output."""
-    import jax
-
-    from sejax.proxies.sets import save_set
-
-    config = dataclasses.replace(ses.config, proxy=dataclasses.replace(ses.config.proxy, done=done))
-    each = [jax.tree.map(lambda x, i=i: x[i], weights) for i in range(args.models)]
-    seeds = [args.seed + i for i in range(args.models)]
-    save_set(model_file(args, variant), config, each, [float("nan")] * args.models,
-             [args.generations] * args.models, seeds)  # fmt: skip
+    env = plugins.make("proxy", dataclasses.replace(ses.env.config, done=done), ses.task)
+    each = [jax.tree.map(lambda x, i=i: x[i], weights) for i in range(settings.models)]
+    records = [{"generation": settings.generations, "seed": settings.seed + i}
+               for i in range(settings.models)]  # fmt: skip
+    config = ses.config | {"proxy": plugins.describe("proxy", env.config)}
+    sejax.save_set(model_file(settings, variant), env, each, records, config, ses.discount)

@@ -4,27 +4,31 @@ Source: paper, appendix "Computational Complexity for Training Synthetic Environ
 Networks" (table "Approximate timings for one NES outer loop").
 
 The first outer iterations of a run are timed, once compiled: SEs with the paper's settings and with
-our default, RNs with our default, which has the paper's agents and sizes. Most of
-their agents are far from solving the task and train for as long as they may: later ones are
-faster. HalfCheetah is projected from its parts, an environment step and a learning step, as no
-iteration of it ends within an hour here.
+our default, RNs with our default, which has the paper's agents and sizes. Most of their agents are
+far from solving the task and train for as long as they may: later ones are faster. HalfCheetah is
+projected from its parts, an environment step and a learning step, as no iteration of it ends within
+an hour here.
 """
 
-import argparse
 import dataclasses
 import functools
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 import pandas as pd
 
-from sejax.experiments import common
-from sejax.runtime import available_cores
-from sejax.validation import each_of
+import sejax
+from sejax.app.runtime import available_cores
+from sejax.experiments import figures
+from sejax.experiments.experiment import Experiment
+from sejax.experiments.settings import Settings, count, each_of, setting
+from sejax.experiments.tables import as_texts, publish
+from sejax.parallel import spread_over_devices
 
-NAME = "timings"
 PAPER_CORES = 16
 
 
@@ -50,140 +54,110 @@ QUICK = ["es.population_size=2", "es.num_incumbent_evals=2", "training.max_episo
 SETTINGS = {"paper": "the paper's", "best": "our default"}
 
 
-def main() -> None:
-    """Runs the experiment as the command line says."""
-    common.run_command(NAME, __doc__, add_options, run)
+@dataclass(frozen=True, kw_only=True)
+class Timings(Settings):
+    name = "timings"
+
+    rows: tuple[str, ...] = setting(tuple(ROWS), each_of(ROWS), about="tasks and proxies")
+    generations: int = count(2, "iterations", about="outer iterations to time")
 
 
-def add_options(parser: argparse.ArgumentParser) -> None:
-    """Options of this experiment."""
-    parser.add_argument("--rows", nargs="+", default=list(ROWS), metavar="ROW",
-                        help=", ".join(ROWS))  # fmt: skip
-    parser.add_argument("--generations", type=int, default=2, help="outer iterations to time; 2")
-
-
-def run(args: argparse.Namespace) -> pd.DataFrame:
-    """Times what is missing, writes everything and returns the table.
-
-    Raises:
-      ConfigError: for an unknown row, or an output folder of other settings.
-    """
-    each_of("--rows", args.rows, ROWS)
-    common.require_counts(args, "generations")
-    pieces = common.Pieces(args.out / "pieces")
-    cores = args.devices or available_cores()
+def compute(settings: Timings) -> pd.DataFrame:
+    """Times what is missing; a row for each task, proxy and preset."""
+    cores = settings.devices or available_cores()
     tables = []
-    for name in args.rows:
+    for name in settings.rows:
         row = ROWS[name]
-        presets = ("paper", "best") if row.proxy == "se" else ("best",)
-        for preset in presets:
-            settings = {"row": name, "preset": preset, "quick": args.quick, "cores": cores,
-                        "generations": args.generations, "seed": args.seed}  # fmt: skip
-            measure = project_halfcheetah if row.env == "halfcheetah" else time_generations
-            table = pieces.compute(
-                f"{name}-{preset}-{cores}", settings,
-                functools.partial(measure, args, row, preset),
-            )  # fmt: skip
-            tables.append(table.assign(row=name, preset=preset, cores=cores))
-            print(f"{name}, {preset}: {table['seconds'].iloc[0]:,.1f} s", flush=True)
-    return report(args, pd.concat(tables, ignore_index=True))
+        measure = project_halfcheetah if row.env == "halfcheetah" else time_generations
+        for preset in ("paper", "best") if row.proxy == "se" else ("best",):
+            made_with = {"row": name, "preset": preset, "cores": cores}
+            made_with |= settings.values("quick", "generations", "seed")
+            run = functools.partial(measure, settings, row, preset)
+            timed = settings.pieces.compute(f"{name}-{preset}-{cores}", made_with, run)
+            tables.append(timed.assign(row=name, preset=preset, cores=cores))
+            print(f"{name}, {preset}: {timed['seconds'].iloc[0]:,.1f} s", flush=True)
+    return pd.concat(tables, ignore_index=True)
 
 
-def config_of(args: argparse.Namespace, row: Row, preset: str) -> Any:
+def config_of(settings: Timings, row: Row, preset: str) -> Any:
     """The configuration that is timed."""
-    import sejax
-
     overrides = [f"env={row.env}", f"proxy={row.proxy}", f"preset={preset}"]
     if row.proxy == "rn":  # the paper does not say which variant; this one needs two potentials
         overrides.append("proxy.variant=additive_potential")
-    if args.quick:
+    if settings.quick:
         overrides += [word for word in QUICK
                       if row.env != "cliff_walking" or "init_episodes" not in word]  # fmt: skip
-    return dataclasses.replace(sejax.config(overrides), devices=args.devices, seed=args.seed)
+    config = sejax.config(overrides)
+    return dataclasses.replace(config, devices=settings.devices, seed=settings.seed)
 
 
-def time_generations(args: argparse.Namespace, row: Row, preset: str) -> pd.DataFrame:
+def time_generations(settings: Timings, row: Row, preset: str) -> pd.DataFrame:
     """Mean wall-clock of the first outer iterations, compiled before."""
-    import jax
+    from sejax.app import session
 
-    from sejax.bilevel import make_program
-    from sejax.experiments.proxy_runs import make_step
-
-    program = make_program(config_of(args, row, preset))
-    step = make_step(program)
-    state = jax.jit(program.init)(jax.random.key(args.seed)[None])
-    warm_up, _ = step(jax.tree.map(lambda x: x.copy(), state.replace(finished=~state.finished)))
-    jax.block_until_ready(warm_up)  # compiled, and run with nothing to do
+    chunks = session.make_chunks(config_of(settings, row, preset))
+    program = chunks.program
+    state = jax.jit(program.init)(jax.random.key(settings.seed)[None])
+    idle = jax.tree.map(lambda x: x.copy(), state.replace(finished=~state.finished))
+    jax.block_until_ready(chunks.advance(idle, 1))  # compiled, and run with nothing to do
     wall, cpu, steps = [], [], []
-    for _ in range(args.generations):
+    for _ in range(settings.generations):
         started, cpu_started = time.perf_counter(), time.process_time()
-        state, info = jax.block_until_ready(step(state))
+        state, info = jax.block_until_ready(chunks.advance(state, 1))
         wall.append(time.perf_counter() - started)
         cpu.append(time.process_time() - cpu_started)
-        steps.append(int(info.train_steps_total[0]))
+        steps.append(int(jax.device_get(info).train_steps_total.item()))
     return pd.DataFrame([{
-        "seconds": np.mean(wall), "cpu_seconds": np.mean(cpu), "agents": program.num_candidates,
-        "train_steps": np.mean(steps), "how": "measured",
+        "seconds": np.mean(wall), "cpu_seconds": np.mean(cpu),
+        "agents": program.strategy.num_candidates, "train_steps": np.mean(steps),
+        "how": "measured",
     }])  # fmt: skip
 
 
-def project_halfcheetah(args: argparse.Namespace, row: Row, preset: str) -> pd.DataFrame:
+def project_halfcheetah(settings: Timings, row: Row, preset: str) -> pd.DataFrame:
     """What an iteration would take if no agent solved the task, from the cost of its parts.
 
     Each agent makes `max_episodes` training and as many test episodes, and learns once for each
     training step after its initial episodes.
     """
-    import jax
-
-    from sejax.agents.registry import make_agent
     from sejax.agents.replay import Transition
     from sejax.bilevel import make_program
-    from sejax.proxies.reward import make_reward
 
-    config = config_of(args, row, preset)
-    task = config.env.make()
-    env = make_reward(task, config.proxy)
-    agent = make_agent(config.agent, task, config.exploration)
+    config = config_of(settings, row, preset)
+    parts = config.parts()
+    task, env, agent = parts["task"], parts["proxy"], parts["agent"]
     params = env.params(env.init_weights(jax.random.key(0)), config.agent.discount)
-    num_steps = 200 if args.quick else 2000
+    num_steps = 200 if settings.quick else 2000
 
     def environment_steps(key: Any) -> Any:
         def step(state: Any, key: Any) -> Any:
             action = jax.random.uniform(key, (task.action_dim,), minval=-1.0)
-            _, state, reward, _, _ = env.step_env(key, state, action, params)
-            return state, reward
+            return env.step_env(key, state, action, params)[1:3]  # state and reward
 
         _, state = env.reset_env(key, params)
         return jax.lax.scan(step, state, jax.random.split(key, num_steps))[1].sum()
 
     def learning_steps(key: Any) -> Any:
-        state = agent.init(key, agent.hparams)
         size = config.agent.batch_size
-        batch = Transition(
-            jax.random.normal(key, (task.obs_dim, size)),
-            jax.random.uniform(key, (task.action_dim, size), minval=-1.0),
-            jax.random.normal(key, (size,)), jax.numpy.ones(size),
-            jax.random.normal(key, (task.obs_dim, size)),
+        obs = jax.random.normal(key, (task.obs_dim, size))
+        actions = jax.random.uniform(key, (task.action_dim, size), minval=-1.0)
+        batch = Transition(obs, actions, jax.random.normal(key, (size,)), jax.numpy.ones(size), obs)
+        state, _ = jax.lax.scan(
+            lambda state, key: (agent.update(key, state, batch), None),
+            agent.init(key, agent.hparams), jax.random.split(key, num_steps),
         )  # fmt: skip
-
-        def step(state: Any, key: Any) -> Any:
-            return agent.update(key, state, batch), None
-
-        state, _ = jax.lax.scan(step, state, jax.random.split(key, num_steps))
         return jax.tree.leaves(state)[0].sum()
 
-    counts = (1, args.devices or available_cores())
-    env_us, learn_us = (
-        [microseconds_of_a_step(fn, count, num_steps) for count in counts]
-        for fn in (environment_steps, learning_steps)
-    )
-    agents = make_program(config).num_candidates
+    cores = (1, settings.devices or available_cores())
+    env_us, learn_us = ([microseconds_of_a_step(fn, count, num_steps) for count in cores]
+                        for fn in (environment_steps, learning_steps))  # fmt: skip
+    agents = make_program(**parts).strategy.num_candidates
     episodes = config.training.max_episodes
     train_steps = agents * episodes * task.max_steps
     learning = agents * (episodes - config.agent.init_episodes) * task.max_steps
-    seconds = (2 * train_steps * env_us[1] + learning * learn_us[1]) / 1e6 / counts[1]
+    seconds = (2 * train_steps * env_us[1] + learning * learn_us[1]) / 1e6 / cores[1]
     return pd.DataFrame([{
-        "seconds": seconds, "cpu_seconds": seconds * counts[1], "agents": agents,
+        "seconds": seconds, "cpu_seconds": seconds * cores[1], "agents": agents,
         "train_steps": train_steps, "how": "projected", "env_us_one_core": env_us[0],
         "env_us": env_us[1], "learn_us_one_core": learn_us[0], "learn_us": learn_us[1],
     }])  # fmt: skip
@@ -191,10 +165,6 @@ def project_halfcheetah(args: argparse.Namespace, row: Row, preset: str) -> pd.D
 
 def microseconds_of_a_step(fn: Callable[[Any], Any], num_devices: int, num_steps: int) -> float:
     """Wall-clock of one step of `fn(key)`, which makes `num_steps`, on each of several devices."""
-    import jax
-
-    from sejax.parallel import spread_over_devices
-
     program = jax.jit(spread_over_devices(fn, num_devices))
     keys = jax.random.split(jax.random.key(0), num_devices)
     jax.block_until_ready(program(keys))
@@ -203,80 +173,61 @@ def microseconds_of_a_step(fn: Callable[[Any], Any], num_devices: int, num_steps
     return (time.perf_counter() - started) / num_steps * 1e6
 
 
-def report(args: argparse.Namespace, timed: pd.DataFrame) -> pd.DataFrame:
-    """Writes the CSV, the picture and the table, prints the table and returns it."""
-    from sejax.experiments import figures
-    from sejax.files import write_text
-
-    write_text(args.out / "summary.csv", timed.to_csv(index=False, float_format="%.6g"))
+def report(settings: Timings, timed: pd.DataFrame) -> pd.DataFrame:
+    draw(settings, timed)
     cores = int(timed["cores"].iloc[0])
-    table = pd.DataFrame([
-        {
-            "task": ROWS[row.row].env,
-            "proxy": ROWS[row.row].proxy.upper(),
-            "settings": SETTINGS[row.preset],
-            f"paper, {PAPER_CORES} cores": f"{ROWS[row.row].seconds:g} s",
-            f"sejax, {cores} cores": f"{show(row.seconds)} s ({row.how})",
-            "agents": row.agents,
-            "training steps": f"{row.train_steps:,.0f}",
-            "CPU µs for a training step": f"{row.cpu_seconds / row.train_steps * 1e6:,.1f}",
-        }
-        for row in timed.itertuples()
-    ])  # fmt: skip
-    draw(timed, args)
-    title = "Seconds for one outer iteration of NES"
+    columns: dict[str, Any] = {
+        "task": lambda row: ROWS[row.row].env,
+        "proxy": lambda row: ROWS[row.row].proxy.upper(),
+        "settings": lambda row: SETTINGS[row.preset],
+        f"paper, {PAPER_CORES} cores": lambda row: f"{ROWS[row.row].seconds:g} s",
+        f"sejax, {cores} cores": lambda row: (
+            f"{row.seconds:{',.0f' if row.seconds >= 10 else '.2g'}} s ({row.how})"),
+        "agents": "{agents}",
+        "training steps": "{train_steps:,.0f}",
+        "CPU µs for a training step":
+            lambda row: f"{row.cpu_seconds / row.train_steps * 1e6:,.1f}",
+    }  # fmt: skip
     note = (
-        f"The first {args.generations} iterations of a run, compiled before. All tests on the "
+        f"The first {settings.generations} iterations of a run, compiled before. All tests on the "
         "real task are in them. For RNs our default has the paper's agents and sizes. "
     )
-    if args.quick:
-        note += "--quick: a few agents with short trainings, not to be compared with the paper's. "
-    parts = timed[timed["how"] == "projected"]
-    for row in parts.itertuples():
+    if settings.quick:
+        note += ("quick=true: a few agents with short trainings, not to be compared with the "
+                 "paper's. ")  # fmt: skip
+    for row in timed[timed["how"] == "projected"].itertuples():
         note += (
             f"HalfCheetah: an environment step takes {row.env_us_one_core:,.0f} µs on one core and "
             f"{row.env_us:,.0f} on each of {cores}, a learning step {row.learn_us_one_core:,.0f} "
             f"and {row.learn_us:,.0f}; projected for agents of which none solves the task."
         )
-    command = figures.command(NAME, args, "rows", "generations", "devices")
-    common.write_markdown(args.out / "table.md", title, command, table, note.strip())
-    figures.print_table(title, table)
-    print(f"{args.out}: summary.csv, timings.png and table.md.")
-    return table
+    title = "Seconds for one outer iteration of NES"
+    return publish(settings, title, as_texts(timed, columns), timed, note.strip())
 
 
-def show(seconds: float) -> str:
-    """Two digits of a short time, whole seconds of a long one."""
-    return f"{seconds:,.0f}" if seconds >= 10 else f"{seconds:.2g}"
-
-
-def draw(timed: pd.DataFrame, args: argparse.Namespace) -> None:
+def draw(settings: Timings, timed: pd.DataFrame) -> None:
     """Draws the seconds of each row beside the paper's."""
-    import matplotlib.pyplot as plt
-
-    from sejax.experiments import figures
-
-    names = [f"{ROWS[row.row].env}\n{ROWS[row.row].proxy.upper()}, {SETTINGS[row.preset]} settings"
-             for row in timed.itertuples()]  # fmt: skip
-    places = np.arange(len(names))
-    cores = int(timed["cores"].iloc[0])
-    with plt.rc_context(figures.STYLE):
-        figure, axis = plt.subplots(figsize=(7, 0.9 + 0.55 * len(names)), layout="constrained")
-        paper = [ROWS[row.row].seconds for row in timed.itertuples()]
-        if not args.quick:  # whose trainings are much shorter
-            axis.barh(places - 0.19, paper, 0.36, color=figures.VARIED,
+    rows = [ROWS[name] for name in timed["row"]]
+    names = [f"{row.env}\n{row.proxy.upper()}, {SETTINGS[preset]} settings"
+             for row, preset in zip(rows, timed["preset"], strict=True)]  # fmt: skip
+    places, cores = np.arange(len(names)), int(timed["cores"].iloc[0])
+    path, size = settings.folder / "timings.png", (7, 0.9 + 0.55 * len(names))
+    with figures.panels(path, 1, 1, size) as (figure, axes):
+        axis = axes[0, 0]
+        if not settings.quick:  # whose trainings are much shorter
+            axis.barh(places - 0.19, [row.seconds for row in rows], 0.36, color=figures.VARIED,
                       label=f"paper, {PAPER_CORES} cores")  # fmt: skip
-        projected = timed["how"].to_numpy() == "projected"
         bars = axis.barh(places + 0.19, timed["seconds"], 0.36, color=figures.REAL,
                          label=f"sejax, {cores} cores (hatched: projected)")  # fmt: skip
-        for bar, is_projected in zip(bars, projected, strict=True):
-            bar.set_hatch("///" if is_projected else "")
+        for bar, how in zip(bars, timed["how"], strict=True):
+            bar.set_hatch("///" if how == "projected" else "")
         axis.set(xscale="log", xlabel="seconds for an outer iteration")
         axis.set_yticks(places, names, fontsize=8)
         axis.invert_yaxis()
-        figure.legend(loc="outside upper center", ncols=2, fontsize=9)
-        figures.write(figure, args.out / "timings.png")
+        figures.legend_above(figure, axis, 2)
 
+
+EXPERIMENT = Experiment(settings=Timings, compute=compute, report=report, about=__doc__)
 
 if __name__ == "__main__":
-    main()
+    EXPERIMENT.main()

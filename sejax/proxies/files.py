@@ -25,6 +25,8 @@ from sejax.errors import ConfigError, require, shortened, unknown_name
 from sejax.files import write_bytes
 from sejax.proxies.proxy import ProxyEnv
 from sejax.sealed import DamagedError, seal, unseal
+from sejax.serialize import from_plain
+from sejax.training import TrainingConfig
 
 FORMAT_VERSION = 2
 PRETRAINED_DIR = Path(__file__).parents[1] / "pretrained"
@@ -52,6 +54,29 @@ class Proxy:
     @property
     def task(self) -> Task:
         return self.env.task
+
+    def learned_with(self, group: str) -> Any:
+        """A part of the configuration that it was learned with, such as `agent` or `training`.
+
+        Raises:
+          ConfigError: if nobody knows, or it is of somebody's own: a file's names are not imported.
+
+        Example:
+          >>> load_proxy("cliff_walking-rn").learned_with("agent").discount
+          0.8
+        """
+        stored = self.config.get(group)
+        where = f"{group} that {self.path.name} was learned with"
+        if group == "training" and isinstance(stored, Mapping):
+            return from_plain(TrainingConfig, stored, group)
+        if not isinstance(stored, Mapping):
+            raise ConfigError(f"The {where} must be in the file; it is not. Give one of your own.")
+        if not plugins.is_registered(group, str(stored.get("name"))):
+            raise ConfigError(
+                f"The {where} must be a registered one, because what a file names is never "
+                f"imported; it is {shortened(stored.get('name'))!r}. Give {group}= yourself."
+            )
+        return plugins.configure(group, stored)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -102,6 +127,10 @@ class ProxySet:
         """`EnvParams` of one of them, as `sejax.load` gives them."""
         weights = jax.tree.map(lambda x: jax.numpy.asarray(x[index]), self.weights)
         return self.env.params(weights, self.discount)
+
+    def learned_with(self, group: str) -> Any:
+        """As `Proxy.learned_with`, for all of them."""
+        return self.proxy(0).learned_with(group)
 
     def proxy(self, index: int) -> Proxy:
         """One of them."""
@@ -310,8 +339,17 @@ def read_config(source: str | Path, option: str = "source") -> dict[str, Any]:
     return _read(find(source, option), option)[1]["config"]
 
 
-def find(source: str | Path, option: str = "source") -> Path:
-    """The file that a run directory, a path or a shipped name stands for."""
+def find(source: str | Path, option: str = "source", also: Sequence[str] = ()) -> Path:
+    """The file that a run directory, a path or a shipped name stands for.
+
+    Args:
+      source: as of `load`.
+      option: what messages call it.
+      also: names beside the shipped ones, for messages.
+
+    Raises:
+      ConfigError: if there is none.
+    """
     path, text = Path(source), shortened(source)
     try:
         is_dir, is_file = path.is_dir(), path.is_file()
@@ -338,7 +376,7 @@ def find(source: str | Path, option: str = "source") -> Path:
     shipped = PRETRAINED_DIR / f"{source}.safetensors"
     if shipped.is_file():
         return shipped
-    raise unknown_name(option, str(source), pretrained_names())
+    raise unknown_name(option, str(source), [*pretrained_names(), *also])
 
 
 def pretrained_names() -> list[str]:
@@ -357,9 +395,10 @@ def _read(path: Path, option: str) -> tuple[dict[str, np.ndarray], dict[str, Any
     try:
         stored = json.loads(metadata.get(_KEY) or metadata["sejax_set"])
         version = stored["format_version"]
-        if version == 1:
+        is_known = type(version) is int and version in (1, FORMAT_VERSION)
+        if is_known and version == 1:
             stored = _from_version_1(stored, is_set=_KEY not in metadata)
-        if type(version) is int and version <= FORMAT_VERSION:
+        if is_known:
             _check_header(stored)
     except (KeyError, ValueError, TypeError, AttributeError, RecursionError) as error:
         raise ConfigError(
@@ -367,7 +406,7 @@ def _read(path: Path, option: str) -> tuple[dict[str, np.ndarray], dict[str, Any
             f"its metadata; {path} has none that is valid ({type(error).__name__}: "
             f"{shortened(error)}). Learn it again."
         ) from error
-    require(version in (1, FORMAT_VERSION), option, f"be of format {FORMAT_VERSION} or 1",
+    require(is_known, option, f"be of format {FORMAT_VERSION} or 1",
             "this version of sejax reads no other", f"{shortened(version)} in {path}",
             f"{option} to a file of this version")  # fmt: skip
     if version == FORMAT_VERSION:
@@ -391,11 +430,13 @@ def _check_header(header: dict[str, Any]) -> None:
     config = header["config"]
     if not all(isinstance(config[group], Mapping) for group in ("env", "proxy")):
         raise ValueError("no task or proxy")
+    if not isinstance(header["task"], str) or not isinstance(header["is_set"], bool):
+        raise ValueError("no name of a task, or nothing that says whether it is a set")
     records = header["proxies"]
     if not records or not all(isinstance(record, Mapping) for record in records):
         raise ValueError("no records")
     for record in records:
-        float(record.get("score", 0)), int(record.get("seed", 0))
+        float(record.get("score", 0)), int(record.get("seed", 0)), int(record.get("generation", 0))
     header["discount"] = float(header["discount"])
 
 
@@ -431,29 +472,27 @@ def _env_of(
     """The environment that a file's metadata describes."""
     config = header["config"]
     if task is None:
-        name = config["env"].get("name")
-        if not plugins.is_registered("env", str(name)):
-            raise ConfigError(
-                f"{option} must be a proxy of a registered task if no task is given, because what "
-                f"a file names is never imported; {path} is one of {shortened(name)!r}. Give the "
-                f"task: sejax.load(path, task=my_task), or env={shortened(name)} on the command "
-                f"line."
-            )
-        task = envs.make_from(plugins.configure("env", config["env"]))
+        task = envs.make_from(_registered("env", "task", "env", path, config, option))
     require(header["task"] == task.name, option, f"be a proxy of {task.name}", "that is the task "
             "given", f"one of {shortened(header['task'])} in {path}",
             f"{option} to a proxy of {task.name}, or another task")  # fmt: skip
     if proxy is None:
-        name = config["proxy"].get("name")
-        if not plugins.is_registered("proxy", str(name)):
-            raise ConfigError(
-                f"{option} must be of a registered kind if no proxy is given, because what a file "
-                f"names is never imported; {path} is a {shortened(name)!r}. Give its configuration:"
-                f" sejax.load(path, proxy=MyProxy()), or proxy_kind={shortened(name)} on the "
-                f"command line."
-            )
-        proxy = plugins.configure("proxy", config["proxy"])
+        proxy = _registered("proxy", "proxy", "proxy_kind", path, config, option)
     return plugins.make("proxy", proxy, task)
+
+
+def _registered(
+    group: str, argument: str, word: str, path: Path, config: Mapping[str, Any], option: str
+) -> Any:
+    """The configuration of a group, if its name is one that sejax or a package has registered."""
+    name = shortened(config[group].get("name"))
+    if not plugins.is_registered(group, str(config[group].get("name"))):
+        raise ConfigError(
+            f"{option} must be a proxy of a registered {group} if no {argument} is given, because "
+            f"what a file names is never imported; {path} is one of {name!r}. Give it: "
+            f"sejax.load(path, {argument}=...), or {word}={name} on the command line."
+        )
+    return plugins.configure(group, config[group])
 
 
 def _check_tensors(

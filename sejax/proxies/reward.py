@@ -1,10 +1,10 @@
 """The reward network (RN): the real task with a learned reward in the place of its own.
 
 Source: paper, section "Learning Reward Networks" (table "Overview of Reward Network variants");
-`reference_details.md` 5.
+`docs/reference.md` 5.
 """
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
@@ -14,8 +14,10 @@ from jaxtyping import Array, Float
 
 from sejax.envs.task import Task
 from sejax.networks import MLP, uniform_fan_in
-from sejax.proxies.configs import RewardConfig
 from sejax.proxies.proxy import ABSURD, ProxyEnv
+
+if TYPE_CHECKING:  # which makes it
+    from sejax.proxies.configs import RewardConfig
 
 
 @struct.dataclass
@@ -72,7 +74,7 @@ class RewardEnv(ProxyEnv):
 
     is_real = True
 
-    def __init__(self, task: Task, config: RewardConfig):
+    def __init__(self, task: Task, config: "RewardConfig"):
         super().__init__(task, config)
         self._augmented_keys = task.augmented_keys if config.augmented else ()
         self._net = MLP(1, config.hidden_size, config.num_layers, config.activation)
@@ -170,7 +172,7 @@ class RewardEnv(ProxyEnv):
         if self.config.is_additive:
             reward = real_reward + reward
         sane = jnp.abs(reward) < ABSURD  # False for nan
-        discount = info.get("discount", jnp.float32(~terminated))
+        discount = info.get("discount", jnp.where(terminated, 0.0, 1.0))
         info = {
             **info,
             "discount": jnp.where(sane, discount, 0.0),

@@ -1,9 +1,9 @@
 """The synthetic environment (SE): three small networks in the place of a real task.
 
-Source: paper, section "Learning Synthetic Environments"; `reference_details.md` 1.
+Source: paper, section "Learning Synthetic Environments"; `docs/reference.md` 1.
 """
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
@@ -13,8 +13,10 @@ from jaxtyping import Array, Float
 
 from sejax.envs.task import Task
 from sejax.networks import MLP
-from sejax.proxies.configs import SyntheticConfig
 from sejax.proxies.proxy import ABSURD, ProxyEnv, ProxyParams
+
+if TYPE_CHECKING:  # which makes it
+    from sejax.proxies.configs import SyntheticConfig
 
 
 @struct.dataclass
@@ -38,7 +40,7 @@ class SyntheticEnv(ProxyEnv):
     reward is 0, and `info["nonfinite"]` says whether it was not even a number.
     """
 
-    def __init__(self, task: Task, config: SyntheticConfig):
+    def __init__(self, task: Task, config: "SyntheticConfig"):
         super().__init__(task, config)
         outputs = {"state": task.obs_dim, "reward": 1, "done": 1}
         self._nets = {

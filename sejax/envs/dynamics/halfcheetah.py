@@ -81,7 +81,7 @@ class HalfCheetahEnv(environment.Environment[CheetahState, CheetahParams]):
     @functools.cached_property
     def _obs_shape(self) -> tuple[int, ...]:
         # brax's `observation_size` plays a reset, op by op.
-        return jax.eval_shape(self._brax.reset, jax.random.key(0)).obs.shape
+        return jax.eval_shape(lambda: self.reset(jax.random.key(0), self.default_params)[0]).shape
 
     def observation_space(self, params: CheetahParams | None = None) -> spaces.Box:
         return spaces.Box(-jnp.inf, jnp.inf, self._obs_shape)

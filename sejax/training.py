@@ -1,0 +1,72 @@
+"""How long an agent trains, and how it is tested.
+
+Source: paper, appendix "Heuristics for Agent Training and Evaluation"; `docs/reference.md` 3.
+"""
+
+import dataclasses
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+from sejax.options import Options, counts, not_negative, one_of, option
+
+STOP_RULES = ("plateau", "solved", "never")
+SOLVED_BY = ("test", "train")
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainingConfig(Options):
+    """How long an agent trains, and how it is tested."""
+
+    group: ClassVar[str] = "training"
+
+    max_episodes: int = option(1000, counts("it counts episodes"))  # n_e
+    # The stop rule waits for so many training steps.
+    min_steps: int = option(0, counts("it counts steps", least=0))
+    # Training ends after so many steps, whatever the rule says.
+    max_steps: int | None = option(None, counts("an agent must train"))
+    stop_rule: str = option("plateau", one_of(STOP_RULES))  # plateau (SEs), solved (real tasks)
+    # d: episodes in each of the two means that the plateau rule compares
+    window: int = option(10, counts("it counts episodes"))
+    # C_diff: relative change between them that counts as flat
+    plateau_tolerance: float = option(0.01, not_negative("it bounds a relative change"))
+    # Whose last d returns must reach the solved reward.
+    solved_by: str = option("test", one_of(SOLVED_BY))
+    # n_te: greedy episodes on the real task after training
+    test_episodes: int = option(10, counts("it counts episodes"))
+    # Greedy episodes on the real task after each training episode; the solved rule by tests has at
+    # least one.
+    tests_between: int = option(0, counts("it counts episodes", least=0))
+    time_limit_is_terminal: bool = True  # a real episode cut by the limit does not bootstrap
+
+    @property
+    def num_tests_between(self) -> int:
+        """Test episodes after each training episode."""
+        by_tests = self.stop_rule == "solved" and self.solved_by == "test"
+        return max(self.tests_between, int(by_tests))
+
+
+def budget_for(
+    training: TrainingConfig, agent: Any, learned_with: Any, max_episode_steps: int
+) -> TrainingConfig:
+    """How long an agent trains on a proxy that was learned with another one.
+
+    A step budget grows by the steps for which this agent waits longer with learning than that one:
+    ten long initial episodes, or a rollout of PPO, could use it up.
+
+    Args:
+      training: that the proxy was learned with.
+      agent: configuration of the agent that is to train.
+      learned_with: of the one that the proxy was learned with; None if that is not known.
+      max_episode_steps: the task's step limit.
+    """
+    if training.max_steps is None:
+        return training
+    waits, waited = (steps_before_learning(each, max_episode_steps)
+                     for each in (agent, learned_with))  # fmt: skip
+    return dataclasses.replace(training, max_steps=training.max_steps + max(0, waits - waited))
+
+
+def steps_before_learning(agent: Any, max_episode_steps: int) -> int:
+    """Training steps before an agent first learns, as its configuration says; 0 if it does not."""
+    steps = getattr(agent, "steps_before_learning", None)
+    return 0 if steps is None else steps(max_episode_steps)

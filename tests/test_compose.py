@@ -1,0 +1,346 @@
+"""sejax.app.compose: every choice composes, bad words are refused with one message."""
+
+import dataclasses
+import functools
+import os
+import subprocess
+import sys
+import typing
+
+import pytest
+from hydra.core.config_store import ConfigStore
+
+import sejax
+from sejax import envs, plugins
+from sejax.app import commands, presets, runtime
+from sejax.app.build import LearnConfig
+from sejax.envs.cliff_walking import CliffWalking
+from sejax.errors import ConfigError
+from sejax.es.evosax import ALGORITHMS, EvosaxConfig
+
+composed_with = functools.cache(lambda *overrides: sejax.config(overrides))
+ENVS = ("cartpole", "acrobot")
+PRESETS = ("best", "paper", "paper_performance")
+
+
+def message(*overrides):
+    """What a user is told about these overrides."""
+    with pytest.raises(ConfigError) as error:
+        sejax.config(overrides)
+    said = str(error.value)
+    assert "\n" not in said and len(said) < 1500
+    return said
+
+
+# --- every choice composes -----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+@pytest.mark.parametrize("env", ENVS)
+def test_every_task_composes_with_every_preset(env, preset):
+    composed = composed_with(f"env={env}", f"preset={preset}")
+    assert isinstance(composed, LearnConfig)
+    assert (composed.name("env"), composed.preset) == (env, preset)
+    # An SE gives no sign of the agent's progress: its own returns level off, or a budget ends.
+    assert composed.training.stop_rule == "plateau" or composed.training.max_steps is not None
+
+
+def test_every_algorithm_of_evosax_composes():
+    assert sejax.config(["es=cma_es"]).es == EvosaxConfig(name="cma_es")
+    store = ConfigStore.instance()  # which has them all since
+    for name in ALGORITHMS:
+        node = store.load(f"es/{name}.yaml").node
+        assert plugins.configure("es", node) == EvosaxConfig(name=name)
+
+
+@pytest.mark.parametrize("name", ["max_reward", "reward_threshold"])
+def test_every_objective_composes(name):
+    assert sejax.config([f"objective={name}"]).name("objective") == name
+
+
+def test_a_reward_network_chooses_its_objective_where_none_is_chosen():
+    assert composed_with("proxy=rn").name("objective") == "reward_threshold"
+    assert sejax.config(["proxy=rn", "objective=max_reward"]).name("objective") == "max_reward"
+
+
+def test_a_task_chooses_its_agent_where_none_is_chosen():
+    names = {env: composed_with(f"env={env}").name("agent") for env in envs.names()}
+    assert names == {
+        "cartpole": "ddqn", "acrobot": "ddqn", "cliff_walking": "q_learning",
+        "gridworld_2x2": "q_learning", "mountain_car_continuous": "td3", "pendulum": "td3",
+        "halfcheetah": "td3",
+    }  # fmt: skip
+    assert sejax.config(["env=pendulum", "agent=ppo"]).name("agent") == "ppo"
+
+
+def test_without_overrides_it_is_the_best_cartpole_se():
+    composed = composed_with()
+    names = [composed.name(group) for group in plugins.GROUPS]
+    assert names == ["cartpole", "ddqn", "none", "se", "max_reward", "nes"]
+    assert composed.preset == "best"
+    assert str(composed.resolved_run_dir) == "runs/cartpole-se-ddqn-s0"
+
+
+def test_the_yaml_files_give_every_field_a_value_of_its_type():
+    for env in ENVS:
+        for preset in PRESETS:
+            composed = composed_with(f"env={env}", f"preset={preset}")
+            for group in (composed, composed.agent, composed.es, composed.training):
+                for name, kind in typing.get_type_hints(type(group)).items():
+                    if kind in (int, float, bool, str):
+                        assert type(getattr(group, name)) is kind, name
+
+
+def test_overrides_win_over_presets():
+    composed = sejax.config(
+        ["preset=paper", "es.noise_std=0.7", "agent.batch_size=3", "generations=9"]
+    )
+    assert (composed.es.noise_std, composed.agent.batch_size, composed.generations) == (0.7, 3, 9)
+    assert composed.es.step_size == 0.148  # the preset's, where nothing was said
+
+
+def test_the_run_directory_names_the_run():
+    composed = sejax.config(["env=acrobot", "seed=7"])
+    assert str(composed.resolved_run_dir) == "runs/acrobot-se-ddqn-s7"
+    assert str(sejax.config(["run_dir=elsewhere"]).resolved_run_dir) == "elsewhere"
+    for changes, name in [
+        ({"exploration": sejax.ICMConfig()}, "cartpole-se-ddqn_icm-s0"),
+        ({"agent_hparams": "varied"}, "cartpole-se-ddqn_varied-s0"),
+        ({"env": plugins.configure("env", {"name": "gymnax/CartPole-v1"})},
+         "gymnax_CartPole-v1-se-ddqn-s0"),
+    ]:  # fmt: skip
+        changed = dataclasses.replace(composed_with(), **changes)
+        assert str(changed.resolved_run_dir) == f"runs/{name}"
+
+
+def test_an_interpolation_is_what_it_names():
+    for value in ("true", "false"):
+        words = ["es.mirrored=${es.common_random_numbers}", f"es.common_random_numbers={value}"]
+        assert sejax.config(words).es.mirrored is (value == "true")
+    assert sejax.config(["seed=3", "agent.num_layers='${seed}'"]).agent.num_layers == 3
+
+
+def test_only_cliff_walking_has_a_choice_of_goal_reward():
+    config = sejax.config(["env=cliff_walking", "env.goal_reward=-1"])
+    assert config.env == CliffWalking(goal_reward=-1.0)
+    assert config.task().params.goal_reward == -1
+    assert message("env=cliff_walking", "env.goal_reward=nan").startswith("env.goal_reward must be")
+    with pytest.raises(ConfigError, match=r"env\.goal_reward must be a field of GridWorld2x2"):
+        envs.make("gridworld_2x2", goal_reward=1.0)
+    said = message("env=cartpole", "env.goal_reward=-1")
+    assert "env.goal_reward, which another choice of env has" in said
+
+
+# --- bad input -----------------------------------------------------------------------------------
+
+
+def test_a_population_of_one_is_refused_with_the_whole_message():
+    assert message("es.population_size=1") == (
+        "es.population_size must be at least 2, because scores are compared within a generation; "
+        "got 1. Set es.population_size=16."
+    )
+
+
+def test_a_value_that_is_no_number_is_refused_with_the_whole_message():
+    assert message("es.noise_std=nan") == (
+        "es.noise_std must be above 0 and finite, because members must differ; got nan. "
+        "Set es.noise_std=0.05."
+    )
+
+
+def test_an_odd_population_is_refused_where_evosax_pairs_perturbations():
+    assert message("es=open_es", "es.population_size=3") == (
+        "es.population_size must be even, because evosax's algorithms pair opposite perturbations; "
+        "got 3. Set es.population_size=4."
+    )
+
+
+@pytest.mark.parametrize(
+    ("override", "field", "nearest"),
+    [
+        ("env=cartpol", "env", "cartpole"),
+        ("agent=dqn", "agent", "ddqn"),
+        ("es=nez", "es", "nes"),
+        ("es=open-es", "es", "open_es"),
+        ("preset=papers", "preset", "paper"),
+        ("objective=max_rewards", "objective", "max_reward"),
+        ("es.score_transform=all_beter_2", "es.score_transform", "all_better_2"),
+        ("proxy.activation=leakyrelu", "proxy.activation", "leaky_relu"),
+        ("training.stop_rule=plato", "training.stop_rule", "plateau"),
+    ],
+)
+def test_an_unknown_choice_lists_the_known_ones_nearest_first(override, field, nearest):
+    got = override.partition("=")[2]
+    said = message(override)
+    assert said.startswith(f"{field} must be one of {nearest}")
+    assert f"got '{got}'" in said and f"Did you mean {field}={nearest}?" in said
+
+
+@pytest.mark.parametrize(
+    ("override", "nearest"),
+    [
+        ("es.populaton_size=3", "es.population_size"),
+        ("generation=3", "generations"),
+        ("agent.learningrate=0.1", "agent.learning_rate"),
+        ("es=open_es es.populationsize=4", "es.population_size"),
+        ("proxy=rn variant=additive_potential", "proxy.variant"),  # the right field, without group
+    ],
+)
+def test_an_unknown_field_names_the_nearest_one(override, nearest):
+    *choices, last = override.split()
+    said = message(*choices, last)
+    assert last.partition("=")[0] in said and f"Did you mean {nearest}?" in said
+
+
+def test_a_field_that_another_algorithm_has_is_not_suggested():
+    assert "Did you mean es.mirrored?" not in message("es=open_es", "es.mirrored=true")
+
+
+@pytest.mark.parametrize(
+    "overrides", [("proxy.name=rn",), ("env.name=no_such_task",), ("agent.name=dqn",)], ids=" ".join
+)
+def test_a_name_that_no_choice_has_is_refused(overrides):
+    message(*overrides)
+
+
+@pytest.mark.parametrize(
+    ("override", "field"),
+    [
+        ("es.population_size=abc", "es.population_size"),
+        ("es.population_size=1.5", "es.population_size"),
+        ("es.noise_std=much", "es.noise_std"),
+        ("stop_when_solved=maybe", "stop_when_solved"),
+        ("agent.hidden_size=[1,2]", "agent.hidden_size"),
+        ("training.max_episodes=null", "training.max_episodes"),
+        ("seed=x", "seed"),
+    ],
+)
+def test_a_value_of_another_type_is_refused_and_the_field_named(override, field):
+    said = message(override)
+    assert said.startswith(f"{field} must be ") and said.endswith(".")
+
+
+@pytest.mark.parametrize(
+    ("overrides", "said"),
+    [
+        (("env=acrobot", "agent=dueling_ddqn", "agent.init_episodes=10"),
+         "training.max_steps must exceed 5000, because dueling_ddqn learns nothing before with "
+         "agent.init_episodes=10; got 4000."),
+        (("agent=ppo", "agent.update_episodes=20"),
+         "training.max_steps must exceed 4001, because ppo learns nothing before"),
+        (("training.stop_rule=solved", "training.solved_by=train"),
+         "training.solved_by must be test with stop_rule=solved"),
+        (("env=cliff_walking", "proxy=rn", "training.solved_by=train"),
+         "training.solved_by must be test with stop_rule=solved"),
+    ],
+)  # fmt: skip
+def test_trainings_that_cannot_teach_or_judge_are_refused(overrides, said):
+    assert message(*overrides).startswith(said)
+
+
+def test_episodes_that_may_end_early_need_no_long_budget():
+    sejax.config(["proxy.done=threshold", "training.max_steps=100"])
+    sejax.config(["proxy=rn", "training.max_steps=100"])
+
+
+@pytest.mark.parametrize("env", presets.tuned("se"))
+def test_agents_learn_within_the_default_budget_of_an_se(env):
+    facts = envs.facts_of(plugins.configure("env", {"name": env}))
+    for name in plugins.names("agent"):
+        agent = plugins.find("agent", name)
+        if agent.states == facts.states and facts.actions in agent.actions:
+            config = sejax.config([f"env={env}", f"agent={name}"])
+            before = config.agent.steps_before_learning(facts.max_steps)
+            budget = config.training.max_steps or config.training.max_episodes * facts.max_steps
+            assert budget >= 2 * before, name
+
+
+# --- words that made a traceback, or were taken for something else -------------------------------
+
+LONG = "d" * 5000
+WILD = [
+    # A choice that is no name.
+    ("env=2", "env must be one of"), ("es=1.5", "es must be one of"),
+    ("es=false", "es must be one of"), ("preset=[1,2]", "preset must be one of"),
+    ("env=null", "env must be one of"), ("env=???", "env must be one of"),
+    (f"agent={LONG}", "(5000 characters)"), (f"env={LONG}", "(5000 characters)"),
+    (f"agent=a:{LONG}", "(5002 characters)"), ("agent=choice(1,2)", "agent must be one of"),
+    ("agent.name=0", "agent must be one of"), ("agent.name=???", "agent must be one of"),
+    # A choice that is taken away.
+    ("~env=[[1]]", "env must be chosen"), ("~env", "env must be chosen"),
+    ("~seed", "seed must be given"),
+    # What is not there.
+    ("agent.num_layers=${nope}", "Interpolation key 'nope' not found in agent.num_layers"),
+    ("seed=${seed}", "Recursive interpolation detected in seed"),
+    ("+new=1", "new must be a field of LearnConfig, because nothing else is read; got 1"),
+    ("+agent.new=1", "agent.new must be a field of DDQNConfig"),
+    ("=1", "override must name a field"), ("tuned_agent=x", "override must name a field"),
+    # Numbers that cannot be counted or computed with; see test_build.py for all of them.
+    ("es.population_size=2147483648", "es.population_size must be at most 2147483647"),
+    ("lanes=99999999999999999999", "lanes must be at most 2147483647"),
+    ("es.noise_std=1e38", "es.noise_std must be at most 1e+06"),
+    ("es.step_size=1e300", "es.step_size must be at most 1e+06"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("word", "said"), WILD, ids=lambda text: text[:30])
+def test_wild_words_are_one_message(word, said):
+    assert said in message(word)
+
+
+@pytest.mark.parametrize(
+    "words",
+    [("env=2",), ("~env=[[1]]",), ("preset=[1,2]",), (f"agent={LONG}",), ("=1",), ("+new=1",),
+     ("agent.num_layers=${nope}",), ("agent.name=???",), ("proxy.hidden_size=2147483648",),
+     ("es.noise_std=1e38",), ("a b",), ("--multirun", "env=1,2"), ("env=ä",)],
+    ids=lambda words: " ".join(words)[:30],
+)  # fmt: skip
+def test_the_command_ends_them_with_the_message_and_status_2(words, monkeypatch, capsys):
+    from sejax import run
+
+    monkeypatch.setattr(sys, "argv", ["sejax.run", *words])
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
+    with pytest.raises(SystemExit) as ended:
+        commands.start("run", run.main)
+    said = capsys.readouterr()
+    assert ended.value.code == 2 and not said.out
+    assert said.err.startswith("error: ") and said.err.count("\n") == 1 and len(said.err) < 1500
+
+
+# --- imports -------------------------------------------------------------------------------------
+
+
+def test_importing_sejax_and_composing_imports_nothing_slow_and_starts_nothing():
+    program = (
+        "import os, sys\n"
+        "before = dict(os.environ)\n"
+        "import sejax\n"
+        "from sejax import errors\n"
+        "slow = {'gymnax', 'evosax', 'torch', 'brax', 'orbax', 'pandas', 'matplotlib'}\n"
+        "heavy = slow | {'jax', 'jaxlib', 'flax', 'optax', 'numpy', 'hydra', 'omegaconf'}\n"
+        "print(sorted(heavy & set(sys.modules)), dict(os.environ) == before)\n"
+        "sejax.config(['env=acrobot', 'es=cma_es'])\n"
+        "try:\n"
+        "    sejax.config(['env=acrobat'])\n"
+        "except sejax.ConfigError:\n"
+        "    pass\n"
+        "import sejax.envs\n"
+        "sejax.envs.names()\n"
+        "from sejax.app import runtime\n"
+        "changed = {k for k in os.environ if os.environ[k] != before.get(k)}\n"
+        "set_by_jax = {'TF_CPP_MIN_LOG_LEVEL', 'TPU_SKIP_MDS_QUERY'}\n"
+        "print(sorted(slow & set(sys.modules)), changed <= set_by_jax, runtime.is_started())\n"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert done.stdout.splitlines() == ["[] True", "[] True False"], done.stdout + done.stderr
+
+
+def test_flags_of_xla_are_left_alone_once_jax_has_started(monkeypatch):
+    import jax
+
+    jax.devices()
+    monkeypatch.setenv("XLA_FLAGS", "--mine=1")
+    assert runtime.is_started()
+    runtime.configure_xla(3)
+    assert os.environ["XLA_FLAGS"] == "--mine=1"

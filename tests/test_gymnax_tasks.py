@@ -1,0 +1,224 @@
+"""Any environment of gymnax as a task: vectors in, vectors out, limits kept."""
+
+import math
+
+import gymnax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from gymnax.environments import spaces
+from gymnax.registration import registered_envs
+
+import sejax
+from sejax import envs, plugins
+from sejax.envs.gymnax import PREFIX, SOLVED_REWARD, GymnaxTask
+from sejax.envs.task import Task
+from sejax.envs.wrappers import AsVectors
+from sejax.errors import ConfigError
+
+DOWNLOADS = {"MNISTBandit-bsuite"}  # what it plays with
+# Not those that a test beside this one may have registered (`sejax.register_gymnax`).
+IDS = [x for x in registered_envs if "/" not in x and x not in DOWNLOADS]
+KEY = jax.random.key(0)
+# One that is flattened, one whose observations are integers in spite of its space, one of indices.
+TAKEN = ["Catch-bsuite", "FourRooms-misc", "FrozenLake-misc"]
+
+
+def task_of(gymnax_id, **options):
+    return envs.make(PREFIX + gymnax_id, **options)
+
+
+@pytest.mark.parametrize("gymnax_id", IDS)
+def test_every_environment_of_gymnax_is_a_task(gymnax_id):
+    """By its types; nothing is computed."""
+    task = task_of(gymnax_id)
+    env, params = task.env, task.params
+    obs, state = jax.eval_shape(env.reset, KEY, params)
+    action = jax.eval_shape(env.action_space(params).sample, KEY)
+    after, next_state, reward, terminated, _ = jax.eval_shape(
+        env.step_env, KEY, state, action, params
+    )
+    kind = lambda tree: jax.tree.map(lambda x: (x.shape, x.dtype), tree)  # noqa: E731
+    if task.num_states is None:
+        assert obs.shape == (task.obs_dim,) and obs.dtype == jnp.float32
+    else:
+        assert obs.shape == () and jnp.issubdtype(obs.dtype, jnp.integer)
+    assert kind(after) == kind(obs) and kind(next_state) == kind(state)
+    assert reward.shape == terminated.shape == () and terminated.dtype == bool
+    if task.num_actions is None:
+        assert action.shape == (task.action_dim,)
+        space = env.action_space(params)
+        np.testing.assert_array_equal(space.high, task.max_action)
+        np.testing.assert_array_equal(space.low, -task.max_action)
+    assert task.max_steps == params.max_steps_in_episode >= 1
+    assert task.name == PREFIX + gymnax_id and task is task_of(gymnax_id)
+    assert task.origin["name"] == task.name
+
+
+@pytest.mark.parametrize("gymnax_id", TAKEN)
+def test_steps_are_those_of_gymnax_as_vectors(gymnax_id):
+    task = task_of(gymnax_id)
+    raw, params = gymnax.make(gymnax_id)
+    seen = lambda obs: obs if task.num_states else jnp.ravel(obs).astype(jnp.float32)  # noqa: E731
+
+    @jax.jit
+    def both(key):
+        def walk(env, seen):
+            obs, state = env.reset_env(key, params)
+            out = env.step_env(key, state, jnp.int32(1), params)
+            return seen(obs), (seen(out[0]), out[1], jnp.float32(out[2]), *out[3:])
+
+        return walk(raw, seen), walk(task.env, lambda obs: obs)
+
+    expected, got = both(jax.random.key(3))
+    assert jax.tree.structure(got) == jax.tree.structure(expected)
+    for a, b in zip(jax.tree.leaves(got), jax.tree.leaves(expected), strict=True):
+        assert a.shape == b.shape and a.dtype == b.dtype
+        np.testing.assert_array_equal(a, b)
+
+
+@pytest.mark.parametrize("gymnax_id", TAKEN)
+def test_agents_train_on_them_and_on_their_proxies(gymnax_id):
+    """By its types: what a loop carries must stay what it is."""
+    task = task_of(gymnax_id)
+    config = sejax.QLearningConfig() if task.num_states else sejax.DDQNConfig(
+        hidden_size=2, num_layers=1, batch_size=2, init_episodes=0)  # fmt: skip
+    agent = sejax.make_agent(config, task)
+    training = sejax.TrainingConfig(max_episodes=2, max_steps=9, stop_rule="never")
+    for proxy in (sejax.SyntheticConfig(hidden_size=2), sejax.RewardConfig(hidden_size=2)):
+        env = plugins.make("proxy", proxy, task)
+        evaluate = sejax.make_evaluator(agent, env, task, training)
+        outcome = jax.eval_shape(lambda key: evaluate(key, env.default_params), KEY)  # noqa: B023
+        assert outcome.test_returns.shape == (10,)
+
+
+def test_the_step_limit_is_gymnaxs_or_the_one_asked_for():
+    assert task_of("CartPole-v1").max_steps == 500
+    task = task_of("CartPole-v1", max_steps=7)
+    assert task.max_steps == task.params.max_steps_in_episode == 7
+    _, state = task.env.reset_env(KEY, task.params)
+    late = state.replace(time=jnp.array([6, 7]))
+    assert task.env.is_truncated(late, task.params).tolist() == [False, True]
+    proxy = plugins.make("proxy", sejax.SyntheticConfig(hidden_size=2), task)
+    assert proxy.default_params.max_steps_in_episode == 7
+    with pytest.raises(ConfigError, match=r"^env\.max_steps must be at least 1, .* got 0\."):
+        task_of("CartPole-v1", max_steps=0)
+    with pytest.raises(ConfigError, match=r"^env\.max_steps must be at most 2147483647"):
+        task_of("CartPole-v1", max_steps=2**31)
+
+
+def test_the_threshold_is_gymnasiums_or_the_one_asked_for():
+    assert {x: task_of(x).solved_reward for x in SOLVED_REWARD} == SOLVED_REWARD
+    assert task_of("CartPole-v1", solved_reward=100).solved_reward == 100.0
+    unknown = task_of("Catch-bsuite")
+    assert unknown.solved_reward == math.inf and not unknown.is_solvable
+    with pytest.raises(ConfigError, match=r"^objective must be one that needs no threshold"):
+        sejax.RewardThreshold().make(unknown)
+
+
+def test_an_unknown_id_lists_those_of_gymnax_nearest_first():
+    with pytest.raises(
+        ConfigError, match=r"^env must be one of gymnax/CartPole-v1, .*got 'gymnax/"
+    ):
+        task_of("CartPole-v7")
+
+
+def test_one_that_cannot_be_made_here_is_one_message(monkeypatch):
+    def make(_):
+        raise OSError("no network\nat all")
+
+    monkeypatch.setattr(gymnax, "make", make)
+    with pytest.raises(ConfigError) as error:
+        GymnaxTask(name=f"{PREFIX}MNISTBandit-bsuite").make()
+    assert str(error.value) == (
+        "env must be an environment that gymnax can make here; MNISTBandit-bsuite raised OSError: "
+        "no network at all."
+    )
+
+
+def test_one_that_another_package_registers_is_a_task():
+    from gymnax.environments.classic_control import cartpole
+
+    if "sejax_tests/Mine-v0" not in registered_envs:
+        gymnax.register("sejax_tests/Mine-v0", cartpole.CartPole)
+    assert task_of("sejax_tests/Mine-v0").obs_dim == 4
+
+
+# --- spaces that gymnax allows -------------------------------------------------------------------
+
+
+class Odd(gymnax.environments.environment.Environment):
+    """A world of any spaces; the observation is what the action came to."""
+
+    def __init__(self, action, obs):
+        self.action, self.obs = action, obs
+
+    def reset_env(self, key, params):
+        return jnp.zeros(self.obs.shape), gymnax.EnvState(time=0)
+
+    def step_env(self, key, state, action, params):
+        return action, state, 0.0, jnp.bool_(False), {}
+
+    def action_space(self, params):
+        return self.action
+
+    def observation_space(self, params):
+        return self.obs
+
+
+def odd_task(action, obs=None):
+    obs = spaces.Box(-1.0, 1.0, (2,)) if obs is None else obs
+    return Task(name="odd", env=Odd(action, obs), params=gymnax.EnvParams(max_steps_in_episode=3))
+
+
+def test_actions_of_an_asymmetric_box_are_scaled_to_its_bounds():
+    low, high = jnp.array([[-1.0], [0.0]]), jnp.array([[3.0], [10.0]])
+    box = spaces.Box(low, high, (2, 1))
+    task = odd_task(box, box)
+    assert isinstance(task.env, AsVectors)
+    assert (task.action_dim, task.max_action, task.num_actions) == (2, 1.0, None)
+    np.testing.assert_array_equal(task.env.observation_space(task.params).low, [-1, 0])
+    np.testing.assert_array_equal(task.env.observation_space(task.params).high, [3, 10])
+    for action, expected in [
+        ([-1.0, -1.0], [-1.0, 0.0]),  # the lower bounds
+        ([1.0, 1.0], [3.0, 10.0]),  # the upper ones
+        ([0.0, 0.0], [1.0, 5.0]),  # their middle
+        ([-0.5, 0.5], [0.0, 7.5]),
+        ([-2.0, 2.0], [-1.0, 10.0]),  # no further
+    ]:
+        obs, *_ = task.env.step_env(KEY, gymnax.EnvState(time=0), jnp.array(action), task.params)
+        np.testing.assert_allclose(obs, expected, rtol=1e-6)
+
+
+def test_worlds_that_agents_can_take_as_they_are_are_left_alone():
+    for action in (spaces.Discrete(2), spaces.Box(-2.0, 2.0, (1,))):
+        assert isinstance(odd_task(action).env, Odd)
+    assert odd_task(spaces.Box(-2.0, 2.0, (1,))).max_action == 2.0
+    for action in (spaces.Box(-2.0, 2.0, ()), spaces.Box(-2.0, 1.0, (1,)),
+                   spaces.Box(jnp.array([-1.0, -2.0]), jnp.array([1.0, 2.0]), (2,))):  # fmt: skip
+        assert isinstance(odd_task(action).env, AsVectors)
+    assert isinstance(odd_task(spaces.Discrete(2), spaces.Box(0, 1, (2, 2))).env, AsVectors)
+
+
+@pytest.mark.parametrize("space", [spaces.Dict({"x": spaces.Discrete(2)}),
+                                   spaces.Tuple([spaces.Discrete(2)])])  # fmt: skip
+def test_spaces_of_several_arrays_are_refused(space):
+    said = (r"^env must have actions in a gymnax Box or Discrete space, because .* in odd\. Wrap "
+            r"the environment so that its actions are one array\.$")  # fmt: skip
+    with pytest.raises(ConfigError, match=said):
+        odd_task(space)
+    with pytest.raises(
+        ConfigError, match=r"^env must have observations in a gymnax Box or Discrete"
+    ):
+        odd_task(spaces.Discrete(2), space)
+
+
+@pytest.mark.parametrize(("low", "high"), [(-jnp.inf, 1.0), (-1.0, jnp.inf), (1.0, 1.0)])
+def test_actions_without_bounds_are_refused(low, high):
+    with pytest.raises(
+        ConfigError,
+        match=r"^env must have bounded actions, because agents draw and "
+        r"squash them within bounds; got Box.* in odd\. Give",
+    ):
+        odd_task(spaces.Box(low, high, (1,)))  # fmt: skip

@@ -1,0 +1,132 @@
+"""Which part of sejax may know which: arrows point down, and only the commands know Hydra."""
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1] / "sejax"
+# Modules and folders of sejax, the highest first. Each may import those below it, and its own
+# folder; not its neighbours. Names in strings (`sejax.plugins`, `sejax.__getattr__`) are looked up
+# when somebody asks for what they stand for: they do not count.
+LAYERS = [
+    {"run", "evaluate", "experiments"},
+    {"app"},
+    {"bilevel"},
+    {"evaluation"},
+    {"trainer", "rollout"},
+    {"proxies"},
+    {"agents", "envs", "es", "objectives"},
+    {"plugins"},
+    {"training", "networks", "loops", "parallel", "counters", "sealed", "files", "serialize"},
+    {"options"},
+    {"errors"},
+    {"", "conf"},
+]
+COMMANDS = ("app", "run", "evaluate", "experiments")
+
+
+def name_of(path):
+    parts = ["sejax", *path.relative_to(ROOT).with_suffix("").parts]
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+MODULES = {name_of(path): path for path in sorted(ROOT.rglob("*.py"))}
+TREES = {name: ast.parse(path.read_text()) for name, path in MODULES.items()}
+
+
+def part_of(module):
+    """The module of the package's top, or the folder, that a module is or lies in."""
+    return module.split(".")[1] if "." in module else ""
+
+
+def is_type_checking(node):
+    return isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test)
+
+
+def imported(node):
+    """Modules that a tree imports anywhere, also within functions, but for type checking."""
+    for child in ast.iter_child_nodes(node):
+        if is_type_checking(child):
+            for other in child.orelse:
+                yield from imported(other)
+        elif isinstance(child, ast.Import):
+            yield from (alias.name for alias in child.names)
+        elif isinstance(child, ast.ImportFrom):
+            assert child.level == 0, "imports are absolute"
+            for alias in child.names:
+                full = f"{child.module}.{alias.name}"
+                yield full if full in MODULES else child.module
+        else:
+            yield from imported(child)
+
+
+GRAPH = {name: {other for other in imported(tree) if other in MODULES}
+         for name, tree in TREES.items()}  # fmt: skip
+
+
+def test_every_part_of_sejax_has_its_place():
+    placed = [part for layer in LAYERS for part in layer]
+    assert len(placed) == len(set(placed))
+    assert {part_of(name) for name in MODULES} == set(placed)
+
+
+def test_arrows_point_down():
+    height = {part: -i for i, layer in enumerate(LAYERS) for part in layer}
+    wrong = [
+        f"{name} imports {other}"
+        for name, others in GRAPH.items()
+        for other in sorted(others)
+        if part_of(other) != part_of(name) and height[part_of(other)] >= height[part_of(name)]
+    ]
+    assert not wrong, "\n".join(wrong)
+
+
+def test_no_modules_import_each_other():
+    done, open_ = set(), []
+
+    def visit(name):
+        if name in open_:
+            raise AssertionError(" -> ".join([*open_[open_.index(name) :], name]))
+        if name not in done:
+            open_.append(name)
+            for other in sorted(GRAPH[name]):
+                visit(other)
+            done.add(open_.pop())
+
+    for name in GRAPH:
+        visit(name)
+
+
+def test_hydra_is_known_to_the_commands_alone():
+    for name, tree in TREES.items():
+        roots = {module.partition(".")[0] for module in imported(tree)}
+        if part_of(name) not in COMMANDS:
+            assert not roots & {"hydra", "omegaconf"}, name
+
+
+def test_the_library_imports_no_hydra():
+    program = (
+        "import sys\n"
+        "import sejax.trainer, sejax.bilevel, sejax.proxies.files\n"
+        "print({'hydra', 'omegaconf'} & set(sys.modules))\n"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert done.stdout.strip() == "set()", done.stdout + done.stderr
+
+
+@pytest.mark.parametrize("folder", ["agents", "proxies"])
+def test_nobody_asks_of_which_class_an_agent_or_a_proxy_is(folder):
+    """What is to be known of one stands in its contract, so that anybody's own may say it too."""
+    classes = {node.name for name, tree in TREES.items() if part_of(name) == folder
+               for node in ast.walk(tree) if isinstance(node, ast.ClassDef)}  # fmt: skip
+    assert len(classes) > 5
+    for name, tree in TREES.items():
+        calls = [node for node in ast.walk(tree) if isinstance(node, ast.Call)]
+        for call in calls if part_of(name) != folder else ():
+            if isinstance(call.func, ast.Name) and call.func.id in ("isinstance", "issubclass"):
+                words = {node.id for node in ast.walk(call.args[1]) if isinstance(node, ast.Name)}
+                words |= {x.attr for x in ast.walk(call.args[1]) if isinstance(x, ast.Attribute)}
+                assert not words & classes, f"{name}: {ast.unparse(call)}"

@@ -1,0 +1,205 @@
+"""sejax.options: a field written once checks itself, and says whether it is traced or varied."""
+
+import dataclasses
+from typing import Any, ClassVar
+
+import pytest
+
+from sejax import options
+from sejax.agents.agent import NoExploration, traced
+from sejax.agents.count_based import CountBasedConfig
+from sejax.agents.ddqn import DDQNConfig, DuelingDDQNConfig
+from sejax.agents.icm import ICMConfig
+from sejax.agents.ppo import PPOConfig
+from sejax.agents.tabular import QLearningConfig, SARSAConfig
+from sejax.agents.td3 import DiscreteTD3Config, TD3Config
+from sejax.agents.varied import ranges_of
+from sejax.errors import ConfigError
+from sejax.options import Options, option, traced_options
+
+NAN, INF = float("nan"), float("inf")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Config(Options):
+    """One option of each rule."""
+
+    group: ClassVar[str] = "group"
+
+    size: int = option(4, options.counts("it is a size"))
+    episodes: int = option(2, options.counts("it counts episodes", least=0))
+    limit: int | None = option(None, options.counts("something must happen"))
+    weight: float = option(0.5, options.not_negative("it is a weight"), traced=True)
+    rate: float = option(0.1, options.positive("nothing would move", 10.0), varied="triple")
+    share: float = option(0.9, options.fraction(), traced=True, varied="tenth_to_one")
+    decay: float = option(1.0, options.shrinks())
+    kind: str = option("plain", options.one_of(("plain", "fancy")))
+    free: Any = "anything"  # a field like any other, which nothing holds for
+    unruled: float = option(3.0)
+
+
+def message(cls=Config, **fields):
+    with pytest.raises(ConfigError) as error:
+        cls(**fields)
+    return str(error.value)
+
+
+# --- rules ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "said"),
+    [
+        ("size", 0, "be at least 1, because it is a size; got 0. Set group.size=4."),
+        ("size", NAN, "be at least 1, because it is a size; got nan. Set group.size=4."),
+        ("size", True, "be at least 1, because it is a size; got True. Set group.size=4."),
+        ("size", "3", "be at least 1, because it is a size; got 3. Set group.size=4."),
+        ("size", None, "be at least 1, because it is a size; got None. Set group.size=4."),
+        ("size", 2**31, "be at most 2147483647, because it is counted in 32 bits; got 2147483648. "
+                        "Set group.size=4."),
+        ("episodes", -1, "be at least 0, because it counts episodes; got -1. "
+                         "Set group.episodes=2."),
+        ("limit", 0, "be at least 1, because something must happen; got 0. Set group.limit=null."),
+        ("weight", -0.1, "be at least 0, because it is a weight; got -0.1. Set group.weight=0.5."),
+        ("weight", NAN, "be at least 0, because it is a weight; got nan. Set group.weight=0.5."),
+        ("rate", 0, "be above 0 and finite, because nothing would move; got 0. "
+                    "Set group.rate=0.1."),
+        ("rate", INF, "be above 0 and finite, because nothing would move; got inf. "
+                      "Set group.rate=0.1."),
+        ("rate", 11, "be at most 10, because the numbers that come of it would not be finite; "
+                     "got 11. Set group.rate=0.1."),
+        ("share", 1.5, "lie in [0, 1], because it is a fraction; got 1.5. Set group.share=0.9."),
+        ("share", -0.5, "lie in [0, 1], because it is a fraction; got -0.5. Set group.share=0.9."),
+        ("share", NAN, "lie in [0, 1], because it is a fraction; got nan. Set group.share=0.9."),
+        ("decay", 0, "lie in (0, 1], because it shrinks each generation; got 0. "
+                     "Set group.decay=1."),
+        ("decay", 1.5, "lie in (0, 1], because it shrinks each generation; got 1.5. "
+                       "Set group.decay=1."),
+        ("kind", "fency", "be one of fancy, plain; got 'fency'. Did you mean group.kind=fancy?"),
+    ],
+)  # fmt: skip
+def test_a_value_that_breaks_its_rule_is_refused_with_the_whole_message(field, value, said):
+    assert message(**{field: value}) == f"group.{field} must {said}"
+
+
+@pytest.mark.parametrize(
+    "fields",
+    [
+        {"size": 1}, {"size": 2**31 - 1}, {"episodes": 0}, {"limit": None}, {"limit": 1},
+        {"weight": 0}, {"weight": 1e30}, {"rate": 1e-30}, {"rate": 10}, {"share": 0}, {"share": 1},
+        {"decay": 1}, {"decay": 1e-6}, {"kind": "fancy"}, {"free": -1}, {"unruled": NAN},
+    ],
+    ids=str,
+)  # fmt: skip
+def test_a_value_at_the_edge_of_its_rule_is_taken(fields):
+    config = Config(**fields)
+    for name, value in fields.items():
+        assert getattr(config, name) is value
+
+
+def test_a_rule_says_why_if_it_is_told_nothing_else():
+    @dataclasses.dataclass(frozen=True, kw_only=True)
+    class Plain(Options):
+        count: int = option(3, options.counts())
+        size: float = option(1.0, options.not_negative())
+
+    assert message(Plain, count=0) == (
+        "count must be at least 1, because there is nothing to learn from or with otherwise; "
+        "got 0. Set count=3."
+    )
+    assert message(Plain, size=-1) == (
+        "size must be at least 0, because it is a size; got -1. Set size=1.0."
+    )
+
+
+def test_the_first_field_that_breaks_its_rule_is_named():
+    assert message(decay=2, share=2, size=0).startswith("group.size must")
+    assert message(decay=2, share=2).startswith("group.share must")
+
+
+def test_a_dataclass_of_ones_own_can_be_checked_by_hand():
+    @dataclasses.dataclass
+    class Foreign:
+        size: int = option(4, options.counts("it is a size"))
+        anything: int = 0
+
+    config = Foreign(size=0, anything=-5)  # it does not check itself
+    with pytest.raises(ConfigError, match=r"^mine\.size must be at least 1, because it is a size"):
+        options.check(config, "mine")
+    options.check(Foreign(), "mine")
+
+
+def test_options_are_frozen_and_given_by_keyword():
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        Config().size = 3
+    with pytest.raises(TypeError, match="positional"):
+        Config(3)
+
+
+# --- what is traced, and what is varied ----------------------------------------------------------
+
+
+def test_traced_options_are_those_that_are_marked_in_the_order_of_the_fields():
+    assert list(traced_options(Config(weight=0.25)).items()) == [("weight", 0.25), ("share", 0.9)]
+    assert traced_options(NoExploration()) == {}
+
+
+def test_traced_hyperparameters_are_a_named_tuple_with_whatever_else_is_said():
+    hparams = traced(Config(), hidden_size=None)
+    assert hparams._asdict() == {"weight": 0.5, "share": 0.9, "hidden_size": None}
+    assert type(hparams) is type(traced(Config(weight=2.0), hidden_size=3))  # one type, one program
+    assert type(hparams).__name__ == "ConfigHparams"
+
+
+DDQN = ("learning_rate", "target_update_rate", "discount", "epsilon_init", "epsilon_min",
+        "epsilon_decay")  # fmt: skip
+TD3 = ("learning_rate", "target_update_rate", "discount", "action_noise_std", "target_noise_std",
+       "target_noise_clip")  # fmt: skip
+TABULAR = ("learning_rate", "discount", "epsilon_init", "epsilon_min", "epsilon_decay")
+
+
+@pytest.mark.parametrize(
+    ("config", "names"),
+    [
+        (DDQNConfig, DDQN), (DuelingDDQNConfig, DDQN), (TD3Config, TD3),
+        (DiscreteTD3Config, (*TD3, "temperature", "final_temperature")),
+        (PPOConfig, ("learning_rate", "discount", "clip_ratio", "value_weight", "entropy_weight")),
+        (QLearningConfig, TABULAR), (SARSAConfig, TABULAR),
+        (ICMConfig, ("learning_rate", "forward_weight", "reward_scale")), (CountBasedConfig, ()),
+    ],
+)  # fmt: skip
+def test_each_agents_numbers_are_traced_and_what_shapes_its_program_is_not(config, names):
+    assert tuple(traced_options(config())) == names
+
+
+NETWORK = {"learning_rate": "triple", "hidden_size": "triple", "num_layers": "one_more_or_less"}
+
+
+@pytest.mark.parametrize(
+    ("config", "marks"),
+    [
+        (DDQNConfig, NETWORK | {"batch_size": "triple"}),
+        (DuelingDDQNConfig, NETWORK | {"batch_size": "triple"}),
+        (TD3Config, NETWORK | {"batch_size": "triple"}),
+        (DiscreteTD3Config, NETWORK | {"batch_size": "triple"}),
+        (PPOConfig, NETWORK),
+        (QLearningConfig, dict.fromkeys(("learning_rate", "discount"), "tenth_to_one")),
+        (SARSAConfig, dict.fromkeys(("learning_rate", "discount"), "tenth_to_one")),
+        (ICMConfig, {}),
+    ],
+)
+def test_each_agent_says_which_of_its_options_are_varied_and_how(config, marks):
+    fields = {field.name: field for field in dataclasses.fields(config)}
+    assert {name: f.metadata["varied"] for name, f in fields.items()
+            if f.metadata.get("varied")} == marks  # fmt: skip
+    if marks:
+        assert set(ranges_of(config())) == set(marks)
+
+
+def test_a_mark_that_nobody_knows_is_a_mistake_of_the_class():
+    @dataclasses.dataclass(frozen=True, kw_only=True)
+    class Wrong(Options):
+        rate: float = option(1.0, varied="double")
+
+    with pytest.raises(ValueError, match=r"^varied must be triple, .*; got 'double'\.$"):
+        ranges_of(Wrong())

@@ -1,0 +1,214 @@
+"""sejax.app.presets: the settings that were published are the paper's, number for number."""
+
+import functools
+
+import pytest
+
+import sejax
+from sejax import plugins
+from sejax.agents.ddqn import DDQNConfig
+from sejax.app import presets
+from sejax.errors import ConfigError
+from sejax.training import TrainingConfig
+
+composed_with = functools.cache(lambda *overrides: sejax.config(overrides))
+ENVS = ("cartpole", "acrobot")
+
+# Table "Hyperparameter configuration spaces optimized for learning SEs": CartPole-v0, Acrobot-v1.
+OPTIMIZED = {
+    "es.step_size": (0.148, 0.727),
+    "es.noise_std": (0.0124, 0.0114),
+    "es.mirrored": (True, True),
+    "es.score_transform": ("all_better_2", "all_better_2"),
+    "proxy.num_layers": (1, 1),
+    "proxy.hidden_size": (83, 167),
+    "proxy.activation": ("leaky_relu", "prelu"),
+    "agent.init_episodes": (1, 20),
+    "agent.batch_size": (199, 149),
+    "agent.learning_rate": (0.000304, 0.00222),
+    "agent.target_update_rate": (0.00848, 0.0209),
+    "agent.discount": (0.988, 0.991),
+    "agent.epsilon_init": (0.809, 0.904),
+    "agent.epsilon_min": (0.0371, 0.0471),
+    "agent.epsilon_decay": (0.961, 0.899),
+    "agent.num_layers": (1, 1),
+    "agent.hidden_size": (57, 112),
+    "agent.activation": ("tanh", "leaky_relu"),
+}
+# Table "Subset of the hyperparameter configuration spaces that we kept fixed". Episode length and
+# solved reward are the tasks' own: see test_envs.py.
+FIXED = {
+    "generations": (200, 200),  # n_o
+    "training.max_episodes": (1000, 1000),  # n_e
+    "training.test_episodes": (10, 10),  # n_te
+    "es.population_size": (16, 16),  # n_p
+    "agent.buffer_size": (100_000, 100_000),
+    "training.window": (10, 10),  # d
+    "training.plateau_tolerance": (0.01, 0.01),  # C_diff
+}
+# Table "Default agent hyperparameters".
+DEFAULT_AGENT = {
+    "agent.init_episodes": 10,
+    "agent.batch_size": 128,
+    "agent.learning_rate": 0.001,
+    "agent.target_update_rate": 0.01,
+    "agent.discount": 0.99,
+    "agent.epsilon_decay": 0.9,
+    "agent.num_layers": 2,
+    "agent.hidden_size": 128,
+    "agent.activation": "relu",
+    "agent.buffer_size": 100_000,
+    "training.max_episodes": 1000,
+}
+
+
+def value_at(composed, path):
+    group, _, name = path.rpartition(".")
+    if name == "name":
+        return composed.name(group)
+    return getattr(getattr(composed, group) if group else composed, name)
+
+
+@pytest.mark.parametrize("path", [*OPTIMIZED, *FIXED])
+def test_the_papers_preset_holds_the_numbers_of_its_tables(path):
+    for column, env in enumerate(ENVS):
+        composed = composed_with(f"env={env}", "preset=paper")
+        assert value_at(composed, path) == (OPTIMIZED | FIXED)[path][column]
+
+
+def test_the_papers_preset_follows_algorithm_1():
+    # psi <- psi + alpha / (n_p sigma) * sum F_i eps_i, for n_o steps whatever is solved.
+    for env in ENVS:
+        composed = composed_with(f"env={env}", "preset=paper")
+        assert composed.es.update_rule == "paper" and composed.es.num_evals == 1
+        assert composed.es.weight_decay == 0 and composed.es.noise_std_decay == 1
+        assert composed.stop_when_solved is False
+        assert composed.name("objective") == "max_reward"
+
+
+@pytest.mark.parametrize("path", DEFAULT_AGENT)
+def test_the_performance_preset_has_the_papers_default_agent(path):
+    for env in ENVS:
+        composed = composed_with(f"env={env}", "preset=paper_performance")
+        assert value_at(composed, path) == DEFAULT_AGENT[path]
+
+
+def test_the_performance_preset_is_how_those_ses_were_made():
+    # The authors' configuration files: sigma 0.05, alpha 1, 128 LeakyReLU units, at most 50
+    # generations, stopped when solved; epsilon from 1 to 0.01.
+    for env in ENVS:
+        composed = composed_with(f"env={env}", "preset=paper_performance")
+        assert (composed.es.noise_std, composed.es.step_size) == (0.05, 1.0)
+        assert (composed.es.update_rule, composed.es.score_transform) == ("authors", "all_better_2")
+        assert (composed.proxy.hidden_size, composed.proxy.activation) == (128, "leaky_relu")
+        assert composed.generations == 50
+        assert (composed.agent.epsilon_init, composed.agent.epsilon_min) == (1.0, 0.01)
+
+
+def test_the_performance_preset_stops_when_solved():
+    assert composed_with("env=cartpole", "preset=paper_performance").stop_when_solved
+    assert composed_with("env=acrobot", "preset=paper_performance").stop_when_solved
+
+
+def test_the_dataclass_defaults_are_the_papers_default_agent():
+    for path, expected in DEFAULT_AGENT.items():
+        group, name = path.split(".")
+        schema = {"agent": DDQNConfig, "training": TrainingConfig}[group]
+        assert getattr(schema(), name) == expected
+
+
+# Appendix "Reward Network Hyperparameters": the tables for learning RNs, a column for each task.
+RN_TASKS = ("cliff_walking", "cartpole", "mountain_car_continuous", "halfcheetah")
+LEARNING_RNS = {
+    "generations": (50,) * 4,
+    "es.population_size": (16,) * 4,
+    "es.step_size": (0.5,) * 4,
+    "es.noise_std": (0.1,) * 4,
+    "es.mirrored": (True,) * 4,
+    "es.score_transform": ("all_better_2",) * 4,
+    "objective.unsolved_weight": (100,) * 4,
+    "training.test_episodes": (1,) * 4,
+    "training.max_episodes": (100,) * 4,
+    "proxy.num_layers": (1,) * 4,
+    "proxy.hidden_size": (32, 64, 128, 128),
+    "proxy.activation": ("prelu",) * 4,
+    "agent.name": ("q_learning", "ddqn", "td3", "td3"),
+    "agent.learning_rate": (1.0, 0.003, 0.003, 0.003),
+    "agent.discount": (0.8, 0.99, 0.99, 0.98),
+    "agent.init_episodes": (None, 1, 50, 20),
+    "agent.batch_size": (None, 192, 192, 192),
+    "agent.target_update_rate": (None, 0.01, 0.01, 0.01),
+    "agent.num_layers": (None, 1, 2, 2),
+    "agent.hidden_size": (None, 64, 128, 128),
+    "agent.activation": (None, "leaky_relu", "leaky_relu", "relu"),
+    "agent.buffer_size": (None, 1_000_000, 100_000, 100_000),
+    "agent.epsilon_init": (0.01, 0.8, None, None),
+    "agent.epsilon_min": (0.01, 0.03, None, None),
+    "agent.epsilon_decay": (0.0, 0.95, None, None),
+    "agent.policy_delay": (None, None, 1, 1),
+    "agent.action_repeat": (None, None, 2, 1),
+    "agent.action_noise_std": (None, None, 0.05, 0.05),
+    "agent.target_noise_std": (None, None, 0.2, 0.2),
+    "agent.target_noise_clip": (None, None, 0.5, 0.5),
+}
+
+
+@pytest.mark.parametrize("path", LEARNING_RNS)
+def test_the_papers_preset_holds_the_numbers_of_its_tables_for_rns(path):
+    for env, expected in zip(RN_TASKS, LEARNING_RNS[path], strict=True):
+        composed = composed_with(f"env={env}", "proxy=rn", "preset=paper")
+        if expected is not None:
+            assert value_at(composed, path) == expected
+
+
+@pytest.mark.parametrize("env", ["mountain_car_continuous", "halfcheetah"])
+def test_ppo_trains_for_more_episodes_on_rns(env):
+    composed = composed_with(f"env={env}", "proxy=rn", "preset=paper", "agent=ppo")
+    assert composed.training.max_episodes == 1000
+
+
+# --- the files -----------------------------------------------------------------------------------
+
+
+def test_what_is_tuned_is_known():
+    assert presets.names() == ["best", "paper", "paper_performance"]
+    assert presets.tuned("rn") == [
+        "cartpole", "cliff_walking", "halfcheetah", "mountain_car_continuous",
+    ]  # fmt: skip
+    assert presets.tuned("se", "paper") == ["acrobot", "cartpole"]
+    assert presets.is_tuned("acrobot", "se") and not presets.is_tuned("acrobot", "rn")
+
+
+def test_every_file_is_of_a_task_and_proxy_and_has_settings_of_known_choices():
+    for path in presets.FOLDER.glob("*.yaml"):
+        env, _, proxy = path.stem.rpartition("-")
+        assert proxy in plugins.names("proxy")
+        assert env in (presets.GENERAL, *plugins.names("env"))
+        kinds = {"tuned_agent": "agent", "tuned_es": "es"}
+        for preset, kind, choice, values in presets.settings(env, proxy):
+            assert preset in presets.names() and isinstance(values, dict)
+            assert choice in plugins.names(kinds[kind]) if kind in kinds else choice == ""
+
+
+def test_a_section_has_the_settings_of_the_one_it_is_like_where_it_says_nothing():
+    paper, best = (
+        composed_with("env=cartpole", "proxy=rn", f"preset={p}") for p in ("paper", "best")
+    )
+    assert paper.proxy.variant == "additive_potential"
+    assert best.proxy.variant == "exclusive_potential"
+    assert paper.agent == best.agent and paper.training == best.training
+    assert (paper.es.step_size, best.es.step_size) == (0.5, 0.5)
+
+
+@pytest.mark.parametrize("proxy", ["se", "rn"])
+def test_a_task_without_a_file_has_general_settings(proxy):
+    composed = composed_with("env=gymnax/MountainCar-v0", f"proxy={proxy}")
+    (general,) = [
+        values for preset, kind, _, values in presets.settings("gymnax/MountainCar-v0", proxy)
+        if (preset, kind) == ("best", "tuned")
+    ]  # fmt: skip
+    assert composed.generations == general["generations"]
+    for name, value in general["training"].items():
+        assert getattr(composed.training, name) == value
+    with pytest.raises(ConfigError, match=r"preset must be one .*cartpole.* Set preset=best, or"):
+        sejax.config(["env=gymnax/MountainCar-v0", f"proxy={proxy}", "preset=paper"])

@@ -1,0 +1,479 @@
+"""sejax.proxies.files: proxies come back as they were, and what is no proxy is one message."""
+
+import dataclasses
+import errno
+import json
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from safetensors.numpy import save_file
+
+import sejax
+from sejax import envs, plugins
+from sejax.errors import ConfigError
+from sejax.proxies import files
+from sejax.proxies.configs import RewardConfig
+from sejax.sealed import seal, unseal
+
+CONFIG = {"preset": "best", "agent": {"name": "q_learning", "discount": 0.7}, "run_dir": "/home/me"}
+
+
+@pytest.fixture(scope="module")
+def env():
+    """A small RN."""
+    config = RewardConfig(hidden_size=2, variant="exclusive_potential")
+    return plugins.make("proxy", config, envs.make("gridworld_2x2"))
+
+
+@pytest.fixture(scope="module")
+def weights(env):
+    """Of three proxies."""
+    return [env.init_weights(key) for key in jax.random.split(jax.random.key(0), 3)]
+
+
+@pytest.fixture
+def path(tmp_path, env, weights):
+    """A stored proxy."""
+    path = tmp_path / "proxy.safetensors"
+    sejax.save(path, env, weights[0], CONFIG, 0.7, score=12.5, generation=7, seed=3)
+    return path
+
+
+def assert_same_weights(a, b):
+    assert jax.tree.structure(a) == jax.tree.structure(b)
+    for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
+        np.testing.assert_array_equal(x, y)
+
+
+def flat(weights):
+    return {f"potential/{layer}/{name}": np.asarray(x)
+            for layer, leaves in weights["potential"].items()
+            for name, x in leaves.items()}  # fmt: skip
+
+
+def header_of(path):
+    return unseal(path.read_bytes(), "sejax")
+
+
+def rewrite(path, change):
+    """The same file, whole and sealed, with other metadata or tensors."""
+    tensors, header = header_of(path)
+    path.write_bytes(seal(*change(tensors, header)))
+
+
+# --- round trips ---------------------------------------------------------------------------------
+
+
+def test_a_proxy_that_is_saved_and_loaded_is_the_same(path, env, weights):
+    loaded, params = sejax.load(path)
+    assert loaded is env, "the same configuration shares one environment, hence its programs"
+    assert_same_weights(params.weights, weights[0])
+    assert params.discount == 0.7
+    proxy = files.load_proxy(path.parent)  # a folder with it
+    assert proxy.record == {"score": 12.5, "generation": 7, "seed": 3}
+    assert proxy.task is envs.make("gridworld_2x2") and proxy.path == path
+    known = {"env": {"name": "gridworld_2x2"}, "proxy": plugins.describe("proxy", env.config)}
+    assert proxy.config == CONFIG | known | {"run_dir": None}  # no path of a machine
+    assert files.read_config(path) == proxy.config
+    assert proxy.learned_with("agent") == sejax.QLearningConfig(discount=0.7)
+
+
+def test_a_proxy_needs_no_configuration_and_no_record(tmp_path, env, weights):
+    sejax.save(tmp_path / "bare.safetensors", env, weights[1])
+    proxy = files.load_proxy(tmp_path / "bare.safetensors")
+    assert proxy.record == {} and proxy.params.discount == 1.0
+    proxies = sejax.load_set(tmp_path / "bare.safetensors")
+    assert np.isnan(proxies.scores) and proxies.seeds == [-1]
+
+
+def test_a_loaded_proxy_steps_as_a_gymnax_environment():
+    env, params = sejax.load("cartpole")
+    obs, state = env.reset(jax.random.key(0), params)
+    obs, state, reward, _terminated, truncated, _info = env.step(
+        jax.random.key(1), state, jnp.int32(1), params
+    )
+    assert obs.shape == (4,) and reward.shape == () and not truncated
+
+
+def test_a_set_that_is_saved_and_loaded_is_the_same(tmp_path, env, weights):
+    path = tmp_path / "set.safetensors"
+    records = [{"score": score, "generation": i, "seed": 5 + i}
+               for i, score in enumerate((0.5, 0.9, -0.1))]  # fmt: skip
+    sejax.save_set(path, env, weights, records, CONFIG, 0.7)
+    proxies = sejax.load_set(path)
+    assert proxies.env is env and proxies.size == 3 and proxies.task is env.task
+    assert proxies.records == tuple(records) and proxies.discount == 0.7
+    assert proxies.scores.tolist() == [0.5, 0.9, -0.1] and proxies.seeds.tolist() == [5, 6, 7]
+    for i in range(3):
+        assert_same_weights(proxies.one(i).weights, weights[i])
+        assert proxies.proxy(i).record == records[i] and proxies.one(i).discount == 0.7
+    assert proxies.params.weights["potential"]["Dense_0"]["kernel"].shape == (3, 2, 4)
+    with pytest.raises(ConfigError, match=r"source must be a single proxy, .* a set of 3\."):
+        sejax.load(path)
+
+
+def test_parts_of_a_set_are_chosen_by_score_and_place(tmp_path, env, weights):
+    path = tmp_path / "set.safetensors"
+    sejax.save_set(
+        path, env, weights, [{"score": s, "seed": i} for i, s in enumerate((0.5, 0.9, 0.8))]
+    )
+    proxies = sejax.load_set(path)
+    assert proxies.ranked(2).seeds.tolist() == [1, 2]
+    assert proxies.ranked(2, worst=True).seeds.tolist() == [0, 2]
+    assert proxies.solved().seeds.tolist() == [1, 2]  # at 0.8
+    assert proxies.first(2).seeds.tolist() == [0, 1] and proxies.first(None).size == 3
+    chosen = proxies.select([2, 0])
+    assert_same_weights(chosen.one(0).weights, weights[2])
+    assert chosen.fingerprint(0) == proxies.fingerprint(2) != proxies.fingerprint(0)
+
+
+def test_a_kind_may_be_asked_for(path):
+    assert files.load_set(path, kind="rn").size == 1
+    with pytest.raises(ConfigError, match=r"^--ses must hold proxies learned with proxy=se, .*=rn"):
+        files.load_set(path, option="--ses", kind="se")
+
+
+def test_registering_with_gymnax_is_idempotent():
+    import gymnax
+
+    ids = sejax.register_gymnax()
+    assert sejax.register_gymnax() == ids
+    for env_id in ids:
+        _env, params = gymnax.make(env_id)
+        shipped = sejax.load(env_id.removeprefix("sejax/"))[1]
+        assert jnp.array_equal(jax.tree.leaves(params)[0], jax.tree.leaves(shipped)[0])
+
+
+# --- files of version 1 --------------------------------------------------------------------------
+
+
+def version_1(**header):
+    env = {"name": "gridworld_2x2", "backend": None, "goal_reward": None}
+    proxy = {"name": "rn", "hidden_size": 2, "num_layers": 1, "activation": "prelu",
+             "variant": "exclusive_potential", "augmented": False,
+             "zero_at_terminal": False}  # fmt: skip
+    objective = {"name": "max_reward", "unsolved_weight": 100.0}
+    config = {"env": env, "proxy": proxy, "objective": objective,
+              "agent": {"name": "q_learning", "discount": 0.7}}  # fmt: skip
+    return {"format_version": 1, "config": config, **header}
+
+
+@pytest.mark.parametrize("name", files.pretrained_names())
+def test_shipped_proxies_load(name):
+    proxy = files.load_proxy(name)
+    assert proxy.path.parent == files.PRETRAINED_DIR
+    for group in ("agent", "exploration", "es", "objective", "training"):
+        assert proxy.learned_with(group) is not None
+    assert proxy.params.discount == proxy.learned_with("agent").discount if "rn" in name else True
+    assert {"score", "generation", "seed", "evaluation"} <= proxy.record.keys()
+
+
+def test_a_proxy_of_version_1_loads(tmp_path, env, weights):
+    path = tmp_path / "old.safetensors"
+    header = version_1(score=0.5, generation=3, seed=8, note="kept")
+    save_file(flat(weights[0]), path, metadata={"sejax": json.dumps(header)})
+    proxy = files.load_proxy(path)
+    assert proxy.env is env and proxy.params.discount == 0.7
+    assert_same_weights(proxy.params.weights, weights[0])
+    assert proxy.record == {"score": 0.5, "generation": 3, "seed": 8, "note": "kept"}
+    assert proxy.learned_with("objective") == sejax.MaxReward()
+    assert plugins.name_of("exploration", proxy.learned_with("exploration")) == "none"
+
+
+def test_a_set_of_version_1_loads(tmp_path, env, weights):
+    path = tmp_path / "old.safetensors"
+    header = version_1(scores=[0.5, 0.9, 0.1], generations=[1, 2, 3], seeds=[0, 1, 2])
+    tensors = {name: np.stack([flat(one)[name] for one in weights]) for name in flat(weights[0])}
+    save_file(tensors, path, metadata={"sejax_set": json.dumps(header)})
+    proxies = sejax.load_set(path)
+    assert proxies.env is env and proxies.discount == 0.7
+    assert proxies.records[1] == {"score": 0.9, "generation": 2, "seed": 1}
+    assert_same_weights(proxies.one(2).weights, weights[2])
+
+
+# --- damage --------------------------------------------------------------------------------------
+
+
+def test_every_flipped_bit_is_noticed(path):
+    """Of the weights and of the version; of the rest one bit in each byte, to save time."""
+    whole = path.read_bytes()
+    files.read_config(path)
+    weights = 8 + int.from_bytes(whole[:8], "little")
+    version = whole.index(b"format_version")
+    every = {*range(8), *range(version, version + 24), *range(weights, len(whole))}
+    for position in range(len(whole)):
+        for bit in range(8) if position in every else [position % 8]:
+            damaged = bytearray(whole)
+            damaged[position] ^= 1 << bit
+            path.write_bytes(damaged)
+            with pytest.raises(ConfigError, match=r"^source must be "):
+                files.read_config(path)
+
+
+def test_a_file_that_is_cut_or_longer_is_refused_with_the_way_out(path):
+    whole = path.read_bytes()
+    for damaged in (whole[:-20], whole[:40], b"", whole + b"x"):
+        path.write_bytes(damaged)
+        with pytest.raises(ConfigError, match=r"whole safetensors file.*which is damaged.*anew fr"):
+            sejax.load(path)
+
+
+def test_a_foreign_safetensors_file_is_refused(tmp_path):
+    save_file({"x": np.zeros(3)}, tmp_path / "x.safetensors")
+    with pytest.raises(ConfigError, match="a file that sejax has written"):
+        sejax.load(tmp_path / "x.safetensors")
+
+
+def nested(depth):
+    value = []
+    for _ in range(depth):
+        value = [value]
+    return value
+
+
+def without(*names):
+    return lambda header: {k: v for k, v in header.items() if k not in names}
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        *(without(name) for name in
+          ("format_version", "config", "task", "is_set", "proxies", "discount")),
+        lambda header: header | {"config": without("env")(header["config"])},
+        lambda header: header | {"config": without("proxy")(header["config"])},
+        *(lambda header, value=value: header | {"config": value} for value in (None, [], 3)),
+        *(lambda header, value=value: header | {"config": header["config"] | {"env": value}}
+          for value in (None, [], "cartpole", {}, {"name": 3}, {"name": None}, {"name": ["x"]},
+                        {"name": "gridworld_2x2", "new": 1})),
+        *(lambda header, value=value: header | {"config": header["config"] | {"proxy": value}}
+          for value in (None, {"name": "rn", "hidden_size": "2"}, {"name": "rn", "new": 1})),
+        *(lambda header, value=value: header | {"proxies": value}
+          for value in (None, [], [None], [3], {}, 3, [{"score": None}], [{"score": "x"}],
+                        [{"seed": None}], [{"seed": []}])),
+        *(lambda header, value=value: header | {"discount": value} for value in (None, "x", [])),
+        *(lambda header, value=value: header | {"format_version": value}
+          for value in (None, 0, 3, "2", 2.5, [], True)),
+        lambda header: header | {"format_version": "9" * 10_000},
+        lambda header: header | {"task": None},
+        lambda header: header | {"task": "t" * 10_000},
+        lambda header: header | {"is_set": "yes"},
+        lambda header: header | {"is_set": None},
+    ],
+)  # fmt: skip
+def test_metadata_of_another_shape_is_one_message(path, change):
+    """Whole files, sealed by somebody who has another idea of what stands in them."""
+    rewrite(path, lambda tensors, header: (tensors, "sejax", change(header)))
+    with pytest.raises(ConfigError) as error:
+        sejax.load(path)
+    said = str(error.value)
+    assert "\n" not in said and len(said) < 2000
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["null", "[]", "3", '"x"', "{}", "", "{", "NaN", '{"format_version": 1}', "[" * 100_000,
+     json.dumps({"format_version": 1, "config": None}),
+     json.dumps(version_1(score=None)), json.dumps(version_1() | {"config": {"env": {}}})],
+    ids=lambda text: text[:30],
+)  # fmt: skip
+def test_metadata_that_is_something_else_is_one_message(tmp_path, weights, text):
+    path = tmp_path / "proxy.safetensors"
+    save_file(flat(weights[0]), path, metadata={"sejax": text})
+    with pytest.raises(ConfigError, match=r"a file that sejax has written.*Learn it again\.$"):
+        sejax.load(path)
+
+
+@pytest.mark.parametrize("column", ["scores", "generations", "seeds"])
+@pytest.mark.parametrize("value", [None, 3, [1.0], [None] * 3, ["x"] * 3])
+def test_columns_of_a_set_of_version_1_that_are_none_are_one_message(
+    tmp_path, weights, column, value
+):
+    path = tmp_path / "set.safetensors"
+    header = version_1(scores=[0.5] * 3, generations=[1] * 3, seeds=[0, 1, 2]) | {column: value}
+    tensors = {name: np.stack([flat(one)[name] for one in weights]) for name in flat(weights[0])}
+    save_file(tensors, path, metadata={"sejax_set": json.dumps(header)})
+    with pytest.raises(ConfigError, match=r"a file that sejax has written"):
+        sejax.load_set(path)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda tensors: {"potential/Dense_0": np.zeros(3, np.float32)} | tensors,  # a prefix
+        lambda tensors: {name: x.astype(np.int32) for name, x in tensors.items()},
+        lambda tensors: {name: x.astype(np.float64) for name, x in tensors.items()},
+        lambda tensors: {name: np.full_like(x, np.nan) for name, x in tensors.items()},
+        lambda tensors: {name: np.full_like(x, np.inf) for name, x in tensors.items()},
+        lambda tensors: {name: x[..., :1] for name, x in tensors.items()},
+        lambda tensors: {"x" + name: x for name, x in tensors.items()},
+        lambda tensors: {"y" * 10_000: np.zeros(1, np.float32)} | tensors,
+        lambda tensors: {},
+    ],
+)
+def test_tensors_that_are_not_the_networks_are_one_message(path, change):
+    rewrite(path, lambda tensors, header: (change(tensors), "sejax", header))
+    with pytest.raises(ConfigError, match=r"must hold the tensors of the network") as error:
+        sejax.load(path)
+    assert len(str(error.value)) < 2000
+
+
+def test_tensors_of_another_shape_are_refused(path, tmp_path, weights):
+    other = RewardConfig(hidden_size=3).make(envs.make("gridworld_2x2"))
+    sejax.save(tmp_path / "p.safetensors", other, weights[0])
+    with pytest.raises(ConfigError, match="must hold the tensors of the network"):
+        sejax.load(tmp_path / "p.safetensors")
+
+
+def test_a_full_disk_is_an_oserror_and_the_older_file_stays(path, env, weights, monkeypatch):
+    before = path.read_bytes()
+
+    def full(*_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr("sejax.files.os.write", full)
+        with pytest.raises(OSError, match="No space left"):
+            sejax.save(path, env, weights[1])
+        with pytest.raises(OSError, match="No space left"):
+            sejax.save_set(path, env, weights, [{}] * 3)
+    assert path.read_bytes() == before
+    assert list(path.parent.iterdir()) == [path], "temporary files are removed"
+
+
+# --- nothing in a file is resolved or imported ---------------------------------------------------
+
+
+def test_interpolations_in_metadata_are_plain_text(path, tmp_path, env, weights, monkeypatch):
+    monkeypatch.setenv("SECRET", "hush")
+    text = "${oc.env:SECRET}"
+    config = CONFIG | {"preset": text, "agent": {"name": "q_learning", "note": text}}
+    sejax.save(path, env, weights[0], config, note=text)
+    proxy = files.load_proxy(path)
+    assert proxy.config["preset"] == proxy.record["note"] == text
+    again = tmp_path / "again.safetensors"
+    sejax.save(again, env, proxy.params.weights, proxy.config, **proxy.record)
+    assert b"hush" not in again.read_bytes() and text.encode() in again.read_bytes()
+    rewrite(path, lambda tensors, header: (tensors, "sejax", header | {"task": text}))
+    with pytest.raises(ConfigError, match=r"one of \$\{oc\.env:SECRET\} in"):
+        sejax.load(path)
+
+
+MINE = """
+import dataclasses
+from sejax import envs
+from sejax.proxies.configs import RewardConfig
+
+@dataclasses.dataclass(frozen=True)
+class Room:
+    size: int = 2
+
+    def make(self):
+        return dataclasses.replace(envs.make("gridworld_2x2"), name="my_room", origin=None)
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Mine(RewardConfig):
+    mine: int = 3
+"""
+
+
+@pytest.fixture
+def mine(tmp_path, monkeypatch):
+    """A file of a foreign kind of proxy of a foreign task, whose module is not imported any more.
+
+    Returns the file, the task and the proxy's configuration.
+    """
+    (tmp_path / "my_file_worlds.py").write_text(MINE)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    task = envs.make("my_file_worlds:Room", size=3)
+    config = plugins.configure("proxy", {"name": "my_file_worlds:Mine", "hidden_size": 2})
+    env = plugins.make("proxy", config, task)
+    path = tmp_path / "mine.safetensors"
+    sejax.save(path, env, env.init_weights(jax.random.key(0)))
+    del sys.modules["my_file_worlds"]
+    return path, task, config
+
+
+def test_a_foreign_task_or_kind_is_never_imported_and_loads_if_it_is_given(mine):
+    path, task, config = mine
+    stored = files.read_config(path)
+    assert stored["env"] == {"name": "my_file_worlds:Room", "size": 3}
+    assert stored["proxy"]["name"] == "my_file_worlds:Mine"
+    before = set(sys.modules)
+    with pytest.raises(
+        ConfigError, match=r"registered env if no task is given.*env=my_file_worlds:R"
+    ):
+        sejax.load(path)
+    with pytest.raises(
+        ConfigError, match=r"registered proxy if no proxy is given.*proxy_kind=my_fi"
+    ):
+        sejax.load(path, task=task)
+    with pytest.raises(ConfigError, match=r"registered env if no task is given"):
+        sejax.load(path, proxy=config)
+    assert set(sys.modules) == before
+    env, _ = sejax.load(path, task=task, proxy=config)
+    assert env.task is task and env.config == config
+    assert "my_file_worlds" not in sys.modules
+
+
+def test_a_task_given_must_be_that_of_the_proxy(path):
+    with pytest.raises(ConfigError, match=r"be a proxy of cliff_walking, .* one of gridworld_2x2"):
+        sejax.load(path, task=envs.make("cliff_walking"))
+    task = dataclasses.replace(envs.make("gridworld_2x2"), solved_reward=0.5)
+    assert files.load_proxy(path, task=task).task is task
+
+
+def test_a_task_made_by_hand_must_be_given(tmp_path, env, weights):
+    task = dataclasses.replace(env.task, name="by hand", origin=None)
+    mine = env.config.make(task)
+    sejax.save(tmp_path / "p.safetensors", mine, weights[0])
+    with pytest.raises(ConfigError, match=r"proxy of a registered env if no task is given"):
+        sejax.load(tmp_path / "p.safetensors")
+    assert sejax.load(tmp_path / "p.safetensors", task=task)[0].task is task
+
+
+# --- names ---------------------------------------------------------------------------------------
+
+
+def test_an_unknown_name_lists_the_shipped_ones():
+    with pytest.raises(ConfigError) as error:
+        sejax.load("carpole")
+    said = str(error.value)
+    assert said.startswith("source must be one of cartpole, ") and "got 'carpole'" in said
+    assert "Did you mean source=cartpole?" in said
+
+
+def test_real_is_no_proxy_that_python_could_load():
+    with pytest.raises(ConfigError) as error:
+        sejax.load("real")
+    said = str(error.value)
+    assert said.startswith("source must be one of ") and "=real?" not in said
+
+
+def test_a_folder_without_a_proxy_says_what_it_is(tmp_path):
+    for load in (sejax.load, sejax.load_set):
+        with pytest.raises(
+            ConfigError, match=r"this is a folder of another sort; got .*Set source"
+        ):
+            load(tmp_path)
+    (tmp_path / "config.yaml").write_text("{}")
+    for load in (sejax.load, sejax.load_set):
+        with pytest.raises(
+            ConfigError, match=r"run has not finished a generation yet; got .*finis"
+        ):
+            load(tmp_path)
+
+
+@pytest.mark.parametrize(
+    "source",
+    ["n" * 10_000, "n" * 10_000 + ".safetensors", "/".join(["n"] * 5000), "a\0b", "\0", "x/../y",
+     "nope.safetensors", "nope/nope"],
+    ids=lambda source: repr(source[:20]),
+)  # fmt: skip
+def test_a_path_that_leads_nowhere_is_one_short_message(source):
+    with pytest.raises(ConfigError, match=r"^source must be ") as error:
+        sejax.load(source)
+    assert len(str(error.value)) < 700

@@ -1,0 +1,385 @@
+"""sejax.agents.varied: what is drawn, and that a narrowed network is exactly a small one."""
+
+import dataclasses
+import functools
+import re
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.flatten_util import ravel_pytree
+
+from sejax import envs
+from sejax.agents import make_agent
+from sejax.agents.agent import Agent, Draw, NoExploration, drawing_key
+from sejax.agents.count_based import CountBasedConfig
+from sejax.agents.ddqn import DDQNConfig, DuelingDDQNConfig, make_ddqn
+from sejax.agents.memory import no_memory
+from sejax.agents.partial_batch import block_size, sum_over_batch
+from sejax.agents.replay import Transition
+from sejax.agents.tabular import QLearningConfig
+from sejax.agents.varied import Range, draw_value, hidden_sizes, ranges_of
+from sejax.errors import ConfigError
+from sejax.evaluation import evaluate_agents, make_evaluator
+from sejax.networks import MLP, narrow
+from sejax.proxies.configs import SyntheticConfig
+from sejax.training import TrainingConfig
+
+OBS_DIM, NUM_ACTIONS = 3, 2
+SMALL, LARGE = 5, 8
+NUM_COLUMNS, BATCH = 70, 130  # of a batch of 130 columns, 70 count: more than one block
+
+
+# --- ranges and draws ----------------------------------------------------------------------------
+
+
+def test_ranges_around_the_default_agent_are_the_papers():
+    ranges = ranges_of(DDQNConfig())
+    assert ranges["learning_rate"] == pytest.approx((1e-3 / 3, 3e-3, True, False))
+    assert ranges["batch_size"] == (42, 384, True, True)
+    assert ranges["hidden_size"] == (42, 384, True, True)
+    assert ranges["num_layers"] == (1, 3, False, True)
+    assert ranges_of(DDQNConfig(num_layers=1))["num_layers"] == (1, 2, False, True)
+    tabular = ranges_of(QLearningConfig())
+    assert tabular == dict.fromkeys(("learning_rate", "discount"), (0.1, 1.0, False, False))
+
+
+@pytest.mark.parametrize(
+    "bounds",
+    [Range(1e-4, 9e-4, True, False), Range(0.1, 1.0, False, False), Range(42, 384, True, True),
+     Range(1, 3, False, True)],
+)  # fmt: skip
+def test_draws_fill_their_range_with_the_density_they_should_have(bounds):
+    keys = jax.random.split(jax.random.key(0), 20_000)
+    drawn = np.asarray(jax.jit(jax.vmap(lambda key: draw_value(key, bounds)))(keys), np.float64)
+    assert drawn.min() >= bounds.low * (1 - 1e-6) and drawn.max() <= bounds.high * (1 + 1e-6)
+    if bounds.integer:
+        np.testing.assert_array_equal(drawn, np.round(drawn))
+        assert {bounds.low, bounds.high} <= set(drawn.tolist())
+    scale = np.log if bounds.log else lambda x: x
+    half = 0.5 if bounds.integer else 0.0
+    low, high = scale(bounds.low - half), scale(bounds.high + half)
+    if bounds.integer:  # spread each integer over its cell, to compare with a uniform density
+        drawn = drawn + np.random.default_rng(0).uniform(-0.5, 0.5, drawn.shape)
+    share = (scale(drawn) - low) / (high - low)
+    assert np.abs(np.sort(share) - np.linspace(0, 1, share.size)).max() < 0.02  # Kolmogorov-Smirnov
+
+
+@pytest.mark.parametrize("num_layers", [1, 2, 3])
+def test_every_hidden_size_has_a_network_and_little_arithmetic_is_wasted(num_layers):
+    sizes = np.array(hidden_sizes(Range(42, 384, True, True), num_layers))
+    assert sizes[-1] == 384 and (np.diff(sizes) > 0).all()
+    drawn = np.arange(42, 385)
+    rooms = np.array([sizes[sizes >= size].min() for size in drawn])
+    # A layer between hidden ones costs the square of its size; sizes are drawn log-uniformly.
+    power = 1 if num_layers == 1 else 2
+    assert (rooms**power / drawn).sum() / (drawn.astype(float) ** (power - 1)).sum() < 1.2
+
+
+@pytest.mark.parametrize("bounds", [Range(7, 72, True, True), Range(19, 171, True, True),
+                                    Range(1, 9, True, True)])  # fmt: skip
+def test_the_smallest_and_the_largest_hidden_size_have_room(bounds):
+    for num_layers in (1, 2):
+        sizes = hidden_sizes(bounds, num_layers)
+        assert bounds.low <= sizes[0] < bounds.low + 32 and sizes[-2:-1] < (bounds.high,)
+        assert bounds.high <= sizes[-1] < bounds.high + 32
+
+
+# --- narrow networks -----------------------------------------------------------------------------
+
+
+def configured(kind, hidden_size, batch_size):
+    make = {"ddqn": DDQNConfig, "dueling": functools.partial(
+        DuelingDDQNConfig, feature_dim=4, stream_hidden_size=4)}[kind]  # fmt: skip
+    return make(
+        hidden_size=hidden_size, batch_size=batch_size, num_layers=2, activation="prelu",
+        learning_rate=0.01, target_update_rate=0.1,
+    )  # fmt: skip
+
+
+def zeros_of(init):
+    """Parameters of the right shapes, without drawing any."""
+    shapes = jax.eval_shape(init, jax.random.key(0), jnp.zeros(OBS_DIM))
+    return jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), shapes)
+
+
+def embed(small, large):
+    """The small network's parameters in a large one's, whose other entries are 0."""
+
+    def place(x, y):
+        return jnp.zeros_like(y).at[tuple(slice(n) for n in x.shape)].set(x)
+
+    return jax.tree.map(place, small, large)
+
+
+def random_batch(num_columns, seed=0):
+    rng = np.random.default_rng(seed)
+    return Transition(
+        obs=np.float32(rng.normal(size=(OBS_DIM, num_columns))),
+        action=np.int32(rng.integers(0, NUM_ACTIONS, num_columns)),
+        reward=np.float32(rng.normal(size=num_columns)),
+        discount=np.float32(rng.uniform(0, 1, num_columns)),
+        next_obs=np.float32(rng.normal(size=(OBS_DIM, num_columns))),
+    )
+
+
+@pytest.mark.parametrize("kind", ["ddqn", "dueling"])
+def test_a_narrowed_agent_learns_exactly_as_a_small_one_on_the_columns_in_use(kind):
+    configs = [configured(kind, SMALL, NUM_COLUMNS), configured(kind, LARGE, BATCH)]
+    small, large = (make_ddqn(config, OBS_DIM, NUM_ACTIONS) for config in configs)
+    templates = [zeros_of(config.network(NUM_ACTIONS).init) for config in configs]
+
+    @jax.jit
+    def widened(params):
+        """The small agent's parameters in the large one."""
+        _, unravel_small = ravel_pytree(templates[0])
+        return ravel_pytree(embed(unravel_small(params), templates[1]))[0]
+
+    state = jax.jit(small.init)(jax.random.key(0), small.hparams)
+    hparams = large.hparams._replace(hidden_size=jnp.float32(SMALL),
+                                     batch_size=jnp.float32(NUM_COLUMNS))  # fmt: skip
+    wide = jax.jit(large.init)(jax.random.key(0), hparams)
+    params = widened(state.params)
+    wide = wide.replace(params=params, target_params=params)
+    update, update_wide = jax.jit(small.update), jax.jit(large.update)
+    weight = np.float32(np.arange(BATCH) < NUM_COLUMNS)
+    for step in range(4):
+        batch = random_batch(BATCH, seed=step)
+        cut = jax.tree.map(lambda x: x[..., :NUM_COLUMNS] if np.ndim(x) else x, batch)
+        state = update(jax.random.key(step), state, cut)
+        wide = update_wide(jax.random.key(step), wide, batch._replace(weight=weight))
+    np.testing.assert_allclose(wide.params, widened(state.params), rtol=2e-5, atol=2e-6)
+    in_use = np.asarray(widened(np.ones_like(state.params)))
+    np.testing.assert_array_equal(np.asarray(wide.params)[in_use == 0], 0.0)
+
+
+def test_narrowed_weights_are_distributed_as_those_of_a_small_network():
+    net, small = (MLP(2, size, 3, "tanh") for size in (96, 40))
+    zeros = jnp.zeros(OBS_DIM)
+
+    @jax.jit
+    @jax.vmap
+    def draw(key):
+        wide = narrow(net.init(key, zeros)["params"], jnp.float32(40))
+        return wide, small.init(key, zeros)["params"]
+
+    wide, plain = draw(jax.random.split(jax.random.key(3), 30))
+    for layer in plain:
+        for name, expected in plain[layer].items():
+            cut = (slice(None), *(slice(n) for n in expected.shape[1:]))
+            got, expected = np.asarray(wide[layer][name])[cut], np.asarray(expected)
+            assert (got != 0).all()
+            assert np.abs(got).max() <= np.abs(expected).max() * 1.1
+            assert got.std() == pytest.approx(expected.std(), rel=0.05)
+
+
+def test_a_layer_norm_sees_only_the_units_in_use():
+    small, large = (
+        MLP(2, size, 3, "tanh", layer_norm=True, may_narrow=True) for size in (SMALL, LARGE)
+    )
+    x = np.float32(np.random.default_rng(0).normal(size=(OBS_DIM, 6)))
+
+    @jax.jit
+    def run(key):
+        params = small.init(key, x)["params"]
+        template = narrow(large.init(key, x)["params"], jnp.float32(SMALL))
+        embedded = embed(params, template) | {"width": template["width"]}
+
+        def loss(params):
+            out = large.apply({"params": params}, x)
+            return jnp.sum(out**2), out
+
+        gradient, got = jax.grad(loss, has_aux=True)(embedded)
+        return got, small.apply({"params": params}, x), gradient
+
+    got, expected, gradient = run(jax.random.key(0))
+    np.testing.assert_allclose(got, expected, rtol=1e-5, atol=1e-6)
+    assert gradient["width"] == 0
+    np.testing.assert_array_equal(np.asarray(gradient["Dense_3"]["kernel"])[:, SMALL:], 0.0)
+
+
+# --- blocks of a batch ---------------------------------------------------------------------------
+
+
+@jax.jit
+def sums_of_columns(batch, batch_size):
+    def total(batch):
+        return jnp.sum(batch["scale"] * batch["weight"] * batch["x"], axis=1)
+
+    return sum_over_batch(total, batch, batch_size), sum_over_batch(total, batch, None)
+
+
+@pytest.mark.parametrize("batch_size", [1, block_size(100), block_size(100) + 1, 100])
+def test_a_sum_over_blocks_is_the_sum_over_the_columns_in_use(batch_size):
+    values = np.arange(100.0, dtype=np.float32)
+    batch = {"x": np.stack([values, 2 * values]), "weight": values < batch_size, "scale": 3.0}
+    expected = 3 * np.arange(batch_size).sum() * np.array([1.0, 2.0])
+    blockwise, at_once = sums_of_columns(batch, np.float32(batch_size))
+    np.testing.assert_allclose(blockwise, expected)
+    np.testing.assert_allclose(at_once, expected)
+
+
+# --- varied agents -------------------------------------------------------------------------------
+
+
+def test_every_drawn_agent_finds_a_network_with_room():
+    task = envs.make("cartpole")
+    config = DDQNConfig(hidden_size=8, num_layers=2, batch_size=16)
+    varied = make_agent(config, task, varied=True)
+    draws = jax.jit(jax.vmap(varied.draw))(jax.random.split(jax.random.key(0), 200))
+    values = {name: np.asarray(x) for name, x in draws.values.items()}
+    bounds = ranges_of(config)
+    assert set(values) == set(bounds)
+    sizes = {depth: hidden_sizes(bounds["hidden_size"], depth) for depth in (1, 2, 3)}
+    assert len(varied.variants) == sum(map(len, sizes.values()))
+
+    @functools.cache
+    def num_params(index):
+        agent = varied.variants[index]
+        return jax.eval_shape(agent.init, jax.random.key(0), agent.hparams).params.shape[0]
+
+    for index, hidden, depth in zip(draws.variant.tolist(), values["hidden_size"],
+                                    values["num_layers"], strict=True):  # fmt: skip
+        room = min(size for size in sizes[int(depth)] if size >= hidden)
+        inner = (int(depth) - 1) * room * (room + 1)
+        assert num_params(index) == room * 5 + inner + 2 * (room + 1)
+    assert len(set(draws.variant.tolist())) == len(varied.variants)
+
+
+def test_what_is_drawn_is_what_the_agent_learns_with_and_comes_from_the_trainings_key():
+    config = DDQNConfig(hidden_size=2, num_layers=1, batch_size=16, discount=0.9)
+    varied = make_agent(config, envs.make("cartpole"), varied=True)
+    key = jax.random.key(3)
+    drawn, values = jax.jit(lambda key: (varied.draw(drawing_key(key)), varied.drawn_values(key)))(
+        key
+    )
+    assert drawn.values == values
+    hparams = drawn.hparams._asdict()
+    for name in ("learning_rate", "batch_size", "hidden_size"):
+        assert hparams.pop(name) == values[name]
+    assert hparams.pop("discount") == 0.9  # what is not varied stays as it was configured
+    # Room for the largest batch is in all variants; the agent itself is the configured one.
+    plain = make_agent(config, envs.make("cartpole"))
+    assert varied.hparams == plain.hparams and plain.drawn_values(key) == {}
+    assert plain.variants == () and plain.draw is None
+
+
+def test_the_agent_inside_an_exploring_one_is_varied():
+    varied = make_agent(QLearningConfig(), envs.make("gridworld_2x2"), CountBasedConfig(), True)
+    (variant,) = varied.variants
+    drawn = jax.jit(varied.draw)(jax.random.key(0))
+    assert drawn.variant == 0
+    expected = variant.hparams.agent._replace(**drawn.values)
+    assert drawn.hparams == variant.hparams._replace(agent=expected)
+    assert drawn.values["discount"] != variant.hparams.agent.discount
+
+
+def test_a_varied_agent_is_made_once():
+    task, config = envs.make("gridworld_2x2"), QLearningConfig()
+    assert make_agent(config, task, varied=True) is make_agent(config, task, NoExploration(), True)
+    assert make_agent(config, task, varied=True) is not make_agent(config, task)
+
+
+@dataclasses.dataclass(frozen=True)
+class ForeignConfig:
+    """Of an agent that knows nothing of sejax's options."""
+
+    learning_rate: float = 0.5
+
+    def make(self, task):
+        return agent_that("is foreign")
+
+
+class Numbers(NamedTuple):
+    rate: float
+
+
+def agent_that(name, **fields):
+    """An agent of which nothing but its identity matters."""
+    return Agent(
+        init=lambda key, hparams: name, act=None, update=None, memory=no_memory(),
+        hparams=Numbers(rate=1.0), **fields,
+    )  # fmt: skip
+
+
+def test_an_agent_none_of_whose_options_is_varied_is_refused_with_the_whole_message():
+    task = envs.make("gridworld_2x2")
+    assert isinstance(make_agent(ForeignConfig(), task), Agent)
+    message = (
+        "agent_hparams must be default with this agent, because none of its options says how it "
+        "is drawn (sejax.options.option(..., varied=...)); got ForeignConfig. "
+        "Set agent_hparams=default."
+    )
+    with pytest.raises(ConfigError, match=f"^{re.escape(message)}$"):
+        make_agent(ForeignConfig(), task, varied=True)
+
+
+# --- whole programs ------------------------------------------------------------------------------
+
+
+def test_a_fresh_agent_is_the_variant_that_was_drawn_with_what_was_drawn_for_it():
+    plain = agent_that("has its own numbers")
+    variants = (agent_that("is the first"), agent_that("is the second"))
+    values = {"rate": jnp.array([0.25, 4.0])}
+
+    def draw(key):
+        index = jax.random.randint(key, (), 0, 2)
+        rate = values["rate"][index]
+        return Draw(variant=index, hparams=Numbers(rate), values={"rate": rate})
+
+    varied = dataclasses.replace(plain, variants=variants, draw=draw)
+    built = []
+
+    def make_run(agent):
+        built.append(agent)
+        which = jnp.int32([plain, *variants].index(agent))
+        return lambda key, x, hparams: (which, hparams.rate * x, jax.random.bits(key))
+
+    keys = jax.random.split(jax.random.key(0), 12)
+    run = jax.jit(varied.fresh(make_run))
+    seen = set()
+
+    @jax.jit
+    def expected(key):  # the run has the training's own key
+        return draw(drawing_key(key)), varied.drawn_values(key), jax.random.bits(key)
+
+    for key in keys:
+        which, scaled, bits = run(key, np.float32(3.0))
+        drawn, values_of_key, expected_bits = expected(key)
+        assert (which, scaled) == (drawn.variant + 1, 3.0 * drawn.hparams.rate)
+        assert bits == expected_bits and values_of_key == drawn.values
+        seen.add(int(which))
+    assert seen == {1, 2} and built == list(variants)
+    # An agent that nothing is drawn for runs with its own.
+    which, scaled, _ = plain.fresh(make_run)(keys[0], 3.0)
+    assert (which, scaled) == (0, 3.0)
+
+
+def test_trainings_with_drawn_hyperparameters_equal_those_with_the_same_given():
+    task = envs.make("cartpole")
+    env = SyntheticConfig(hidden_size=4).make(task)
+    training = TrainingConfig(stop_rule="never", max_steps=60, test_episodes=2)
+    # Two networks, of one and of two layers; hidden sizes from 1 to 6, batches from 1 to 12.
+    config = DDQNConfig(hidden_size=2, num_layers=1, batch_size=4, init_episodes=0)
+    varied = make_agent(config, task, varied=True)
+    assert len(varied.variants) == 2
+    keys = jax.random.split(jax.random.key(5), 3)
+    outcome = evaluate_agents(varied, env, env.default_params, task, training, keys, devices=1)
+
+    @functools.cache
+    def alone(variant):
+        def train(key, hparams):
+            agent = dataclasses.replace(varied.variants[variant], hparams=hparams)
+            return make_evaluator(agent, env, task, training)(key, env.default_params)
+
+        return jax.jit(train)
+
+    draw = jax.jit(lambda key: varied.draw(drawing_key(key)))
+    draws = [draw(key) for key in keys]
+    assert {int(drawn.variant) for drawn in draws} == {0, 1}
+    for i, (key, drawn) in enumerate(zip(keys, draws, strict=True)):
+        expected = alone(int(drawn.variant))(key, drawn.hparams)
+        np.testing.assert_array_equal(outcome.test_returns[i], expected.test_returns)
+        assert outcome.train_steps[i] == expected.train_steps == 60
