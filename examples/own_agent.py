@@ -1,7 +1,14 @@
 """An agent of one's own: SAC, which sejax does not have.
 
-    python own_agent.py                                  # trains 8 agents on Pendulum
-    python -m sejax.run env=pendulum agent=own_agent:SAC agent.learning_rate=1e-3   # learns an SE
+    python own_agent.py
+    python -m sejax.run env=pendulum agent=own_agent:SAC agent.learning_rate=1e-3   # in this folder
+
+The script trains eight agents on Pendulum for 20,000 steps, 20 seconds on four cores:
+
+    test return of each agent: -114 -151 -142 -185 -173 -133 -169 -143
+    mean -151
+
+Of 16 other seeds, 15 returned more than -200 (mean -158), and after 10,000 steps 14 more than -300.
 
 An agent is a `sejax.Agent`, a bundle of pure functions of one agent's state; the inner loop stores
 its steps and calls `update` on batches of them. The dataclass makes it configurable: its fields are
@@ -32,7 +39,11 @@ ADAM = optax.scale_by_adam()  # the learning rate, which is traced, is applied b
 
 @dataclass(frozen=True, kw_only=True)
 class SAC(AgentOptions):
-    """Soft actor-critic with twin critics and an automatic temperature."""
+    """Soft actor-critic with twin critics and an automatic temperature.
+
+    Differs: networks and batches are smaller than the authors' and the learning rate is larger, for
+    small tasks. Actions are random in the first `init_episodes`, before it learns.
+    """
 
     actions: ClassVar[tuple[str, ...]] = ("continuous",)
 

@@ -25,7 +25,7 @@ class LinearSE(Options):
 
     group: ClassVar[str] = "proxy"
 
-    init_std: float = option(0.03, positive("it must have weights"))
+    init_std: float = option(0.3, positive("it must have weights"))
 
     def make(self, task: sejax.Task) -> "LinearEnv":
         return LinearEnv(task, self)
@@ -38,15 +38,15 @@ class LinearState(environment.EnvState):
 
 
 class LinearEnv(sejax.ProxyEnv):
-    r"""One matrix maps state, action and 1 to the change of the state, the reward and the end.
+    r"""Linear dynamics and a quadratic cost, whose best policies are feedback laws.
 
-    .. math:: (s' - s,\; r,\; d) = W (s, a, 1)
+    .. math:: (s' - s,\; c) = W (s, a, 1), \quad r = \max(1 - c^2, 0)
 
-    Episodes start as in the real task and end where d > 0.5.
+    Episodes start as in the real task and end at its step limit.
     """
 
     def init_weights(self, key: Array) -> dict[str, Array]:
-        shape = self.task.obs_dim + 2, self.task.obs_dim + self.task.action_dim + 1
+        shape = self.task.obs_dim + 1, self.task.obs_dim + self.task.action_dim + 1
         return {"matrix": self.config.init_std * jax.random.normal(key, shape)}
 
     def reset_env(self, key: Array, params: sejax.ProxyParams) -> tuple[Array, LinearState]:
@@ -59,21 +59,24 @@ class LinearEnv(sejax.ProxyEnv):
         if self.task.num_actions is not None:
             action = jax.nn.one_hot(action, self.task.num_actions)
         inputs = jnp.concatenate([state.obs, action, jnp.ones(1)])
-        *change, reward, done = params.weights["matrix"] @ inputs
-        obs = jnp.clip(state.obs + jnp.array(change), -100.0, 100.0)  # it may be unstable
-        return obs, LinearState(obs=obs, time=state.time + 1), reward, done > 0.5, {}
+        *change, cost = params.weights["matrix"] @ inputs
+        obs = jnp.clip(state.obs + jnp.array(change), -10.0, 10.0)  # it may be unstable
+        state = LinearState(obs=obs, time=state.time + 1)
+        return obs, state, jnp.maximum(1 - cost**2, 0.0), jnp.bool_(False), {}
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description="Learns a linear synthetic CartPole.")
-    parser.add_argument("--generations", type=int, default=20)
+    parser.add_argument("--generations", type=int, default=25)
     parser.add_argument("--population", type=int, default=32)
     parser.add_argument("--steps", type=int, default=2000, help="of each training")
     parser.add_argument("--out", type=Path, default=Path("linear_cartpole.safetensors"))
     args = parser.parse_args()
     sejax.configure_xla()  # a device for each core
-    parts = sejax.config(["env=cartpole", f"es.population_size={args.population}",
-                          f"training.max_steps={args.steps}"]).parts()  # fmt: skip
+    parts = sejax.config([  # the settings for CartPole, with some changes
+        "env=cartpole", "es.noise_std=0.1", "es.noise_std_decay=1",
+        f"es.population_size={args.population}", f"training.max_steps={args.steps}",
+    ]).parts()  # fmt: skip
     parts["proxy"] = proxy = LinearSE().make(parts["task"])
     learn = sejax.make_learner(**parts, generations=args.generations)
     result = jax.jit(learn)(jax.random.key(0))

@@ -27,7 +27,7 @@ PRINTS = {
     "own_task": r"best -\d+\.\d+ in generation 0; solved at -1",
     "own_agent": r"test return of each agent: -\d+ -\d+\nmean -\d+",
     "own_objective": r"MaxReward: mean return .*\nRiskAverse: mean return",
-    "own_proxy": r"linear_cartpole\.safetensors: best \d+, 42 weights",
+    "own_proxy": r"linear_cartpole\.safetensors: best \d+, 35 weights",
     "read_a_set": r"seed 0, .*3 fresh agents return .*\nseed 1,",
     "train_thousands": r"proxy: 6 agents .*\nreal task: 6 agents .* test return -12\.0",
 }
