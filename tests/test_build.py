@@ -41,9 +41,11 @@ OUT_OF_RANGE = [
       for name in ("training.max_episodes", "training.max_steps", "training.min_steps",
                    "training.window", "training.test_episodes", "training.tests_between",
                    "agent.init_episodes", "agent.batch_size", "agent.buffer_size",
-                   "agent.hidden_size", "agent.num_layers", "generations", "num_seeds",
+                   "agent.hidden_size", "generations", "num_seeds",
                    "checkpoint_every", "es.population_size", "es.num_evals",
-                   "es.num_incumbent_evals", "proxy.hidden_size", "proxy.num_layers")),
+                   "es.num_incumbent_evals", "proxy.hidden_size")),
+    *((f"{name}.num_layers=2147483647", "at most 100, because each is built by itself")
+      for name in ("agent", "proxy")),
 ]  # fmt: skip
 
 
