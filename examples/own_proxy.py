@@ -1,7 +1,14 @@
 """A proxy of one's own: a synthetic environment that is linear, learned for CartPole.
 
-python own_proxy.py
-python -m sejax.run env=cartpole proxy=own_proxy:LinearSE
+    python own_proxy.py
+    python -m sejax.run env=cartpole proxy=own_proxy:LinearSE    # in this folder
+
+The script takes 40 seconds on four cores; agents that act at random return about 20:
+
+    returns of agents that trained on the proxy: 13 28 56 84 124
+    linear_cartpole.safetensors: best 124, 35 weights
+
+A proxy is a gymnax environment whose params hold the weights that are learned.
 """
 
 import argparse

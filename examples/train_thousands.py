@@ -1,7 +1,15 @@
 """Thousands of agents in one compiled program: on a proxy that ships with sejax, and without it.
 
-python train_thousands.py
-python train_thousands.py --agents 100000
+    python train_thousands.py
+
+It takes 8 seconds on four cores, most of them to compile:
+
+    proxy: 4096 agents in 0.2 s on 4 devices, 3,412,946 training steps a second
+      each solves it in 199 steps, test return -12.0
+    real task: 4096 agents in 1.4 s on 4 devices, 4,469,046 training steps a second
+      each solves it in 1490 steps, test return -12.0
+
+The proxy is the real grid with a learned reward, which says where the goal is.
 """
 
 import argparse
@@ -34,8 +42,8 @@ def main() -> None:
         outcome = jax.block_until_ready(program(keys))
         seconds = time.perf_counter() - started
         print(f"{name}: {args.agents} agents in {seconds:.1f} s on {jax.device_count()} devices, "
-              f"{outcome.train_steps.sum() / seconds:,.0f} training steps a second; each solves it "
-              f"in {outcome.train_steps.mean():.0f} steps, test return "
+              f"{outcome.train_steps.sum() / seconds:,.0f} training steps a second\n"
+              f"  each solves it in {outcome.train_steps.mean():.0f} steps, test return "
               f"{outcome.test_return.mean():.1f}")  # fmt: skip
 
 

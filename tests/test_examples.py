@@ -29,7 +29,7 @@ PRINTS = {
     "own_objective": r"MaxReward: mean return .*\nRiskAverse: mean return",
     "own_proxy": r"linear_cartpole\.safetensors: best \d+, 35 weights",
     "read_a_set": r"seed 0, .*3 fresh agents return .*\nseed 1,",
-    "train_thousands": r"proxy: 6 agents .*\nreal task: 6 agents .* test return -12\.0",
+    "train_thousands": r"proxy: 6 agents .*\n.*test return -12\.0\nreal task: 6 agents",
 }
 
 
@@ -215,7 +215,7 @@ def test_sac_learns_pendulum(examples):
     own_agent = examples("own_agent")
     task = sejax.envs.make("pendulum")
     agent = sejax.make_agent(own_agent.SAC(), task)
-    training = sejax.TrainingConfig(stop_rule="never", max_steps=10_000)
+    training = sejax.TrainingConfig(stop_rule="never", max_steps=15_000)
     keys = jax.random.split(jax.random.key(7), 6)
     outcome = sejax.evaluate_agents(agent, task.env, task.params, task, training, keys)
     assert (outcome.test_return > -300).sum() >= 4
