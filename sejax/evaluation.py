@@ -137,7 +137,10 @@ def evaluate_agents(
     lanes: int | None = None,
     devices: int | None = None,
 ) -> Outcome:
-    """Trains and tests one fresh agent for each key, over all devices; leaves `[agent]`."""
+    """Trains and tests one fresh agent for each key, over all devices; leaves `[agent]`.
+
+    It compiles at every call: in a loop, jit `make_evaluator` yourself.
+    """
     evaluate = make_evaluator(agent, env, task, training)
     program = spread_over_devices(
         lambda key: evaluate(key, env_params), devices, lanes, agent.cpu_lanes

@@ -58,7 +58,7 @@ def check(config: Any, group: str) -> None:
       ConfigError: for the first one that does not hold.
     """
     for field in dataclasses.fields(config):
-        rule, value = field.metadata.get("rule"), getattr(config, field.name)
+        rule, value = marks(type(config), field.name).get("rule"), getattr(config, field.name)
         if rule is not None and not (value is None and field.default is None):
             rule(f"{group}.{field.name}" if group else field.name, value, field.default)
 
@@ -68,8 +68,20 @@ def traced_options(config: Any) -> dict[str, Any]:
     return {
         field.name: getattr(config, field.name)
         for field in dataclasses.fields(config)
-        if field.metadata.get("traced")
+        if marks(type(config), field.name).get("traced")
     }
+
+
+def marks(cls: type, name: str) -> dict[str, Any]:
+    """What `option` says of a field: its own, else that of the class which a subclass overrides.
+
+    So that `init_episodes: int = 5` in a subclass changes the default alone.
+    """
+    found: dict[str, Any] = {}
+    for base in reversed(cls.__mro__):
+        field = vars(base).get("__dataclass_fields__", {}).get(name)
+        found |= dict(field.metadata) if field is not None else {}
+    return found
 
 
 def counts(

@@ -203,3 +203,14 @@ def test_a_mark_that_nobody_knows_is_a_mistake_of_the_class():
 
     with pytest.raises(ValueError, match=r"^varied must be triple, .*; got 'double'\.$"):
         ranges_of(Wrong())
+
+
+def test_a_subclass_that_changes_a_default_keeps_rule_and_marks():
+    @dataclasses.dataclass(frozen=True, kw_only=True)
+    class Mine(QLearningConfig):
+        learning_rate: float = 0.5
+
+    assert traced_options(Mine())["learning_rate"] == 0.5
+    with pytest.raises(ConfigError, match=r"agent\.learning_rate must be above 0.*=0\.5\."):
+        Mine(learning_rate=0)
+    assert list(ranges_of(Mine())) == ["learning_rate", "discount"]

@@ -20,6 +20,7 @@ from jaxtyping import Array
 
 from sejax.agents.agent import Agent, Draw, with_hparams
 from sejax.errors import require
+from sejax.options import marks
 
 # Networks of a depth: evenly spaced sizes, since what room to spare costs matters for large ones.
 # With one hidden layer the cost grows with the size, with more of them with its square.
@@ -51,14 +52,15 @@ def ranges_of(config: Any) -> dict[str, Range]:
     Source: paper, table "Agent hyperparameter ranges"; tabular agents: `docs/reference.md` 4.9.
     """
     hints = get_type_hints(type(config))
-    fields = [field for field in dataclasses.fields(config) if field.metadata.get("varied")]
+    said = {field.name: marks(type(config), field.name) for field in dataclasses.fields(config)}
+    fields = [field for field in dataclasses.fields(config) if said[field.name].get("varied")]
     require(fields, "agent_hparams", "be default with this agent", "none of its options says how "
             "it is drawn (sejax.options.option(..., varied=...))", type(config).__name__,
             "agent_hparams=default")  # fmt: skip
     # Traced ones first: which key draws what.
-    ordered = sorted(fields, key=lambda field: not field.metadata["traced"])
+    ordered = sorted(fields, key=lambda field: not said[field.name]["traced"])
     return {
-        field.name: _range(field.metadata["varied"], getattr(config, field.name),
+        field.name: _range(said[field.name]["varied"], getattr(config, field.name),
                            hints[field.name] is int)
         for field in ordered
     }  # fmt: skip

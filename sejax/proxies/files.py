@@ -42,6 +42,7 @@ class Proxy:
       params: its `EnvParams`: the weights, and the discount of the agent it was learned with.
       record: what is known of it: `score`, `generation` and `seed`, where they are.
       config: what it was learned with, nested plain values.
+      discount: of the agent that it was learned with.
       path: the file.
     """
 
@@ -49,6 +50,7 @@ class Proxy:
     params: Any
     record: dict[str, Any]
     config: dict[str, Any]
+    discount: float
     path: Path
 
     @property
@@ -135,7 +137,8 @@ class ProxySet:
     def proxy(self, index: int) -> Proxy:
         """One of them."""
         return Proxy(env=self.env, params=self.one(index), record=self.records[index],
-                     config=self.config, path=self.path)  # fmt: skip
+                     config=self.config, discount=self.discount,
+                     path=self.path)  # fmt: skip
 
     def fingerprint(self, index: int) -> str:
         """Eight letters that tell one's weights from another's."""
