@@ -60,7 +60,8 @@ def _quoted(word: str) -> str:
     name, equals, value = word.partition("=")
     if not equals or value.isascii() or value[:1] in "'\"[{":
         return word
-    escaped = value.replace("\\", "\\\\").replace("'", "\\'")
+    # Within quotes a backslash is one, but before a quote.
+    escaped = re.sub(r"(\\*)('|$)", lambda m: 2 * m[1] + (m[2] and "\\'"), value)
     return f"{name}='{escaped}'"
 
 

@@ -1,0 +1,66 @@
+"""How the commands start: odd words, folders and terminals."""
+
+import io
+import os
+import subprocess
+import sys
+
+import jax
+import pytest
+
+from sejax.app import commands, compose, runtime
+
+
+@pytest.mark.parametrize("value", ["/tmp/ünï-☃", "it's ☃", "back\\slash ☃"])
+def test_a_word_of_letters_outside_of_ascii_reads_back_as_it_was_typed(value):
+    word = commands._quoted(f"run_dir={value}")
+    assert compose.config([word]).run_dir == value
+
+
+def test_other_words_stay_as_they_are():
+    for word in ("run_dir=/tmp/plain", "run_dir='ünï'", "--cfg", "es.noise_std=0.1"):
+        assert commands._quoted(word) == word
+
+
+def test_without_a_home_there_is_no_compilation_cache(monkeypatch):
+    def nobodys_home():
+        raise RuntimeError("Could not determine home directory.")
+
+    changed = []
+    monkeypatch.delenv("SEJAX_CACHE_DIR", raising=False)
+    monkeypatch.setattr(runtime.Path, "home", nobodys_home)
+    monkeypatch.setattr(jax.config, "update", lambda *change: changed.append(change))
+    runtime.enable_compilation_cache()
+    assert changed == []
+
+
+@pytest.mark.parametrize(
+    ("words", "devices"),
+    [(["devices=3"], 3), (["devices=3", "devices=2"], 2), (["devices=0"], None),
+     (["devices=99999999999"], None), (["devices=x"], None), (["seed=1"], None)],
+)  # fmt: skip
+def test_devices_are_known_before_anything_is_composed(words, devices):
+    assert commands._devices(words) == devices
+
+
+def test_a_terminal_of_few_letters_shows_what_it_can(monkeypatch, tmp_path):
+    shown = io.TextIOWrapper(io.BytesIO(), encoding="ascii")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "stdout", shown)
+    monkeypatch.setattr(sys, "argv", ["run"])
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    monkeypatch.setattr(os, "environ", dict(os.environ))
+    commands.start("run", lambda: print("12.0 ± 4.8"))
+    shown.flush()
+    assert shown.buffer.getvalue() == b"12.0 \\xb1 4.8\n"
+
+
+def test_a_current_folder_that_is_gone_is_one_message(tmp_path):
+    gone = tmp_path / "gone"
+    gone.mkdir()
+    script = "import os, sys; os.rmdir(os.getcwd()); sys.argv = ['run']; " \
+             "from sejax.app import commands; commands.start('run', print)"  # fmt: skip
+    done = subprocess.run([sys.executable, "-c", script], cwd=gone, capture_output=True, text=True)
+    assert done.returncode == commands.FAILED
+    assert done.stderr.startswith("error: The current folder is gone")
+    assert "Traceback" not in done.stderr
