@@ -3,7 +3,7 @@
     python own_objective.py
     python -m sejax.run env=cartpole objective=own_objective:RiskAverse    # in this folder
 
-The script learns one proxy by the mean test return and one by its own, a minute on four cores:
+The script learns one proxy by the mean test return and one by its own, 75 seconds on four cores:
 
     MaxReward: mean return 198, deviation between an agent's episodes 2.1
     RiskAverse: mean return 191, deviation between an agent's episodes 4.2

@@ -3,7 +3,7 @@
     python own_proxy.py
     python -m sejax.run env=cartpole proxy=own_proxy:LinearSE    # in this folder
 
-The script takes 40 seconds on four cores; agents that act at random return about 20:
+The script takes 90 seconds on four cores; agents that act at random return about 20:
 
     returns of agents that trained on the proxy: 13 28 56 84 124
     linear_cartpole.safetensors: best 124, 35 weights

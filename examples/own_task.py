@@ -3,7 +3,7 @@
     python own_task.py
     python -m sejax.run env=own_task:make_reacher env.size=3    # in this folder
 
-The script takes 30 seconds on four cores:
+The script takes 50 seconds on four cores:
 
     returns of agents that trained on the proxy: -12.7 -7.3 -5.3 -2.2 -2.3 -2.1 -0.9 -1.4
     best -0.75 in generation 31; solved at -1

@@ -3,7 +3,7 @@
     python read_a_set.py                                  # learns four proxies first
     python read_a_set.py SET.safetensors                  # one of those in results/ of sejax
 
-The first takes 15 seconds, the second 5; there is a line for each proxy:
+The first takes 12 seconds on four cores; there is a line for each proxy:
 
     seed 0, learned with 0.99: 50 fresh agents return 0.97, deviation 0.15
 
