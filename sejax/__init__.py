@@ -24,6 +24,8 @@ _EXPORTS = {
     "DiscreteTD3Config": "sejax.agents.td3",
     "DuelingDDQNConfig": "sejax.agents.ddqn",
     "EvosaxConfig": "sejax.es.evosax",
+    "Families": "sejax.families",
+    "FamiliesConfig": "sejax.families",
     "ICMConfig": "sejax.agents.icm",
     "LearnResult": "sejax.bilevel",
     "MaxReward": "sejax.objectives",
@@ -82,6 +84,7 @@ if TYPE_CHECKING:  # what a type checker and an editor see
     from sejax.es.nes import NESConfig
     from sejax.es.strategy import Strategy, Trials
     from sejax.evaluation import evaluate_agents, make_evaluator
+    from sejax.families import Families, FamiliesConfig
     from sejax.objectives import AUC, AUCSum, MaxReward, Objective, Outcome, RewardThreshold
     from sejax.parallel import spread_over_devices
     from sejax.proxies.configs import RewardConfig, SyntheticConfig
@@ -101,7 +104,7 @@ if TYPE_CHECKING:  # what a type checker and an editor see
 
 __all__ = [
     "AUC", "AUCSum", "Agent", "ConfigError", "CountBasedConfig", "DDQNConfig", "DiscreteTD3Config",
-    "DuelingDDQNConfig", "EvosaxConfig", "ICMConfig", "LearnResult", "MaxReward", "NESConfig",
+    "DuelingDDQNConfig", "EvosaxConfig", "Families", "FamiliesConfig", "ICMConfig", "LearnResult", "MaxReward", "NESConfig",
     "Objective", "Outcome", "PPOConfig", "Proxy", "ProxyEnv", "ProxyParams", "ProxySet",
     "QLearningConfig", "RewardConfig", "RewardThreshold", "SARSAConfig", "Strategy",
     "SyntheticConfig", "TD3Config", "Task", "TrainResult", "TrainingConfig", "Trials", "agents",

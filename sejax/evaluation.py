@@ -77,6 +77,11 @@ def make_evaluator(
     return lambda key, env_params, active=True: run(key, env_params, active)
 
 
+def lanes_on_cpu(agent: Agent, training: TrainingConfig) -> int | None:
+    """Agents in lockstep on a CPU core: 1 where they would wait for the one that trains longest."""
+    return 1 if agent.cpu_lanes is not None and not training.is_fixed_length else agent.cpu_lanes
+
+
 def make_tested_trainer(
     agent: Agent, env: Any, task: Any, training: TrainingConfig, **options: Any
 ) -> Callable[..., TrainResult]:
@@ -143,6 +148,6 @@ def evaluate_agents(
     """
     evaluate = make_evaluator(agent, env, task, training)
     program = spread_over_devices(
-        lambda key: evaluate(key, env_params), devices, lanes, agent.cpu_lanes
+        lambda key: evaluate(key, env_params), devices, lanes, lanes_on_cpu(agent, training)
     )
     return jax.jit(program)(keys)

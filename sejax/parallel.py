@@ -1,6 +1,6 @@
 """Spreading independent pieces of work over devices and lanes."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -32,21 +32,48 @@ def spread_over_devices(
     Raises:
       ConfigError: if there are fewer than `num_devices` devices.
     """
+    spread = spread_groups_over_devices([fn], num_devices, lanes, [cpu_lanes])
+    return lambda *args: spread([args])[0]
+
+
+def spread_groups_over_devices(
+    fns: Sequence[Callable[..., Any]],
+    num_devices: int | None,
+    lanes: int | None,
+    cpu_lanes: Sequence[int | None],
+) -> Callable[[Sequence[tuple[Any, ...]]], list[Any]]:
+    """As `spread_over_devices` for several functions with a group of elements each.
+
+    A device goes from its share of one group to its share of the next without waiting for others.
+
+    Args:
+      fns: a function of one element of each group.
+      num_devices: as of `spread_over_devices`.
+      lanes: likewise.
+      cpu_lanes: likewise, of each group.
+
+    Returns:
+      A function of the groups' arguments, a tuple each, with a leading axis over the elements.
+    """
     available = jax.devices()
     require(num_devices is None or num_devices <= len(available), "devices",
             f"be at most {len(available)}", "that is how many there are", num_devices,
             "devices=null")  # fmt: skip
     count = num_devices or len(available)
+    on_cpu = available[0].platform == "cpu"
 
-    def map_here(*args: Any) -> Any:
+    def map_group(fn: Callable[..., Any], lockstep: int | None, args: tuple[Any, ...]) -> Any:
         def one(args: Any) -> Any:
             return fn(*args)
 
         size = jax.tree.leaves(args)[0].shape[0]
-        batch_size = lanes or (cpu_lanes if available[0].platform == "cpu" else None) or size
+        batch_size = lanes or (lockstep if on_cpu else None) or size
         if batch_size >= size:
             return jax.vmap(one)(args) if size > 1 else jax.lax.map(one, args)
         return jax.lax.map(one, args, batch_size=batch_size if batch_size > 1 else None)
+
+    def map_here(groups: Sequence[tuple[Any, ...]]) -> list[Any]:
+        return [map_group(*each) for each in zip(fns, cpu_lanes, groups, strict=True)]
 
     if count == 1:
         return map_here
@@ -56,18 +83,21 @@ def spread_over_devices(
     axis = PartitionSpec("device")
     mapped = jax.shard_map(map_here, mesh=mesh, in_specs=axis, out_specs=axis, check_vma=False)
 
-    def map_spread(*args: Any) -> Any:
-        size = jax.tree.leaves(args)[0].shape[0]
-        padded = -(-size // count) * count
+    def map_spread(groups: Sequence[tuple[Any, ...]]) -> list[Any]:
+        groups = list(groups)
+        sizes = [jax.tree.leaves(args)[0].shape[0] for args in groups]
 
-        def deal(x: Array) -> Array:
-            x = x[jnp.arange(padded) % size] if padded > size else x
+        def deal(x: Array, padded: int) -> Array:
+            x = x[jnp.arange(padded) % x.shape[0]] if padded > x.shape[0] else x
             return x.reshape(-1, count, *x.shape[1:]).swapaxes(0, 1).reshape(padded, *x.shape[1:])
 
-        def gather(x: Array) -> Array:
-            x = x.reshape(count, -1, *x.shape[1:]).swapaxes(0, 1).reshape(padded, *x.shape[1:])
+        def gather(x: Array, size: int) -> Array:
+            x = x.reshape(count, -1, *x.shape[1:]).swapaxes(0, 1).reshape(x.shape)
             return x[:size]
 
-        return jax.tree.map(gather, mapped(*jax.tree.map(deal, args)))
+        dealt = [jax.tree.map(lambda x, n=-(-size // count) * count: deal(x, n), args)
+                 for args, size in zip(groups, sizes, strict=True)]  # fmt: skip
+        return [jax.tree.map(lambda x, n=size: gather(x, n), out)
+                for out, size in zip(mapped(dealt), sizes, strict=True)]  # fmt: skip
 
     return map_spread

@@ -12,6 +12,7 @@ from flax import struct
 from jaxtyping import Array, Bool, Float
 
 from sejax.agents.agent import Agent
+from sejax.keys import step_keys
 from sejax.loops import while_any_active
 
 
@@ -57,8 +58,8 @@ class _Greedy:
         )
 
     def step(self, key: Array, agent_state: Any, before: _Episode) -> tuple[_Episode, Steps]:
-        """The episode after a decision, and the decision."""
-        key_act, key_env = jax.random.split(key)
+        """The episode after a decision, and the decision; `key` is of the whole episode."""
+        key_act, key_env = step_keys(key, before.num_steps, 2)
         action = self.agent.act(key_act, agent_state, before.obs, explore=False)
         action = self.agent.env_action(action)
         obs, env_state, reward, terminated, info = self.env.step_env(
@@ -86,7 +87,7 @@ def make_tester(agent: Agent, task: Any, num_episodes: int) -> Callable[..., Any
 
     def step(nothing: Array, state: _Episode, consts: Any, masked: bool) -> tuple[Array, _Episode]:
         key, agent_state = consts
-        after, _ = greedy.step(jax.random.fold_in(key, state.num_steps), agent_state, state)
+        after, _ = greedy.step(key, agent_state, state)
         return nothing, after
 
     def episode(key: Array, agent_state: Any, active: Array | bool) -> tuple[Array, Array]:
@@ -114,8 +115,7 @@ def make_recorder(agent: Agent, task: Any, num_episodes: int) -> Callable[[Array
         key_reset, key_steps = jax.random.split(key)
 
         def step(state: _Episode, _: None) -> tuple[_Episode, Steps]:
-            key_step = jax.random.fold_in(key_steps, state.num_steps)
-            after, made = greedy.step(key_step, agent_state, state)
+            after, made = greedy.step(key_steps, agent_state, state)
             return after.replace(active=state.active & after.active), made
 
         start = greedy.begin(key_reset, True)

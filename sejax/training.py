@@ -39,6 +39,11 @@ class TrainingConfig(Options):
     time_limit_is_terminal: bool = True  # a real episode cut by the limit does not bootstrap
 
     @property
+    def is_fixed_length(self) -> bool:
+        """Whether all agents train for as many steps, but for those that run out of episodes."""
+        return self.stop_rule == "never" and self.max_steps is not None
+
+    @property
     def num_tests_between(self) -> int:
         """Test episodes after each training episode."""
         by_tests = self.stop_rule == "solved" and self.solved_by == "test"
