@@ -107,7 +107,7 @@ class Families:
             places.append(family)
         require(counts.all(), "agents", "have weights that leave each family a member", "the "
                 f"proxy must be told by all of them; there are {num_places} perturbations",
-                self.weights, "es.population_size larger, or weights nearer to each other")  # fmt: skip
+                self.weights, "es.population_size larger")  # fmt: skip
         return np.tile(places, num_signs)
 
     def num_evals(self, num_incumbent_evals: int) -> int:
