@@ -61,7 +61,7 @@ class Families:
     agents: tuple[Agent, ...]
     names: tuple[str, ...] = ()
     weights: tuple[float, ...] = ()
-    config: FamiliesConfig = FamiliesConfig()  # noqa: RUF009 (frozen)
+    config: FamiliesConfig = FamiliesConfig()
 
     def __post_init__(self) -> None:
         size = len(self.agents)
