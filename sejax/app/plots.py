@@ -46,7 +46,7 @@ def learning_curve(rows: Sequence[dict[str, Any]], solved_score: float | None, p
         top.legend(frameon=False, fontsize=9, loc="best")
         bottom.set_ylabel("training steps\nof an agent")
         bottom.set_xlabel("NES generation")
-        bottom.set_ylim(0, 1.1 * data["train_steps_mean"].max())
+        bottom.set_ylim(0, 1.1 * data.filter(like="train_steps_mean").to_numpy().max())
         bottom.xaxis.get_major_locator().set_params(integer=True)
         _write(figure, path)
 
@@ -70,7 +70,7 @@ def _families(top: Any, bottom: Any, data: pd.DataFrame) -> None:
     means = data.groupby("generation").mean()
     for i, column in enumerate(x for x in data.columns if x.startswith(start)):
         key, color = column.removeprefix(start), FAMILIES[i % len(FAMILIES)]
-        top.plot(means.index, means[column], color=color, lw=1.3, ls="-.", label=f"of them {key}")
+        top.plot(means.index, means[column], color=color, lw=1.3, ls="-.", label=f"incumbent: {key}")
         bottom.plot(means.index, means[f"train_steps_mean_{key}"], color=color, lw=1, ls="-.")
 
 
