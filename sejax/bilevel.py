@@ -484,11 +484,11 @@ def make_population_evaluator(
 ) -> Callable[..., Outcome]:
     """Builds `evaluate(keys, candidates, active, test_steps=None) -> Outcome`.
 
-    Of `keys [seed, n]`, `candidates [seed, n, dims]`, `active [seed]` and the length of the test
-    episodes that are scored, `[seed]`. It trains one fresh agent on each candidate and tests it on
-    the real task; leaves `[seed, n, ...]`. The trainings are spread over the devices, each device's family by family, as
-    which family trains on which candidate is known when the program is built: no training pays for
-    another family's. Groups of `lanes` of them follow one another.
+    Of `keys [seed, n]`, `candidates [seed, n, dims]`, `active [seed]` and how much of the test
+    episodes is scored, `[seed]`. It trains one fresh agent on each candidate and tests it on the
+    real task; leaves `[seed, n, ...]`. The trainings are spread over the devices, each device's
+    family by family, as it is known when the program is built which family trains on which
+    candidate: no training pays for another family's. Groups of `lanes` of them follow one another.
     """
 
     def evaluator_of(agent: Agent) -> Callable[..., Outcome]:

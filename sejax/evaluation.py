@@ -24,9 +24,9 @@ from sejax.training import TrainingConfig
 def make_evaluator(
     agent: Agent, env: Any, task: Any, training: TrainingConfig, record: bool = False
 ) -> Callable[..., Any]:
-    """Builds `evaluate(key, env_params, active=True, score_steps=None) -> Outcome` for a fresh agent.
+    """Builds `evaluate(key, env_params, active=True, score_steps=None) -> Outcome`.
 
-    The agent trains in `env`, which may be a proxy or the task itself, and is tested over
+    A fresh agent trains in `env`, which may be a proxy or the task itself, and is tested over
     `training.test_episodes` episodes on the task. With `active=False` nothing is computed. If the
     agent's hyperparameters are drawn, they are drawn from the same key first. `score_steps` is the
     length of the test episodes that the objective scores, the task's limit if not given.
