@@ -179,7 +179,7 @@ def test_loss_by_hand():
     # (1.2 - 2 + 0.5 - 0.8) / 4 = -0.275. Value error 1, entropy 3: 0.275 + 0.5 - 0.3 = 0.475.
     log_prob = np.log(np.float32([2.0, 2.0, 0.5, 0.5]))
     returns, zeros = np.float32([1.0, -1.0, 1.0, -1.0]), np.zeros(4, np.float32)
-    loss = jax.jit(ppo_loss)(log_prob, zeros + 3, zeros, zeros, returns, hp)
+    loss = jax.jit(ppo_loss)(log_prob, zeros + 3, zeros, zeros, returns, returns, hp)
     np.testing.assert_allclose(loss, 0.475, rtol=1e-6)
 
 
@@ -187,6 +187,7 @@ def test_loss_and_gradients_equal_torchs():
     golden = np.load(GOLDEN)  # made by torch_ppo.py
     inputs = loss_inputs()
     others = {name: inputs.pop(name) for name in ("old_log_prob", "returns")}
+    others["advantage"] = others["returns"] - inputs["value"]
     loss_fn = jax.jit(jax.value_and_grad(lambda x: ppo_loss(**x, **others, hp=HPARAMS)))
     loss, gradients = loss_fn(inputs)
     np.testing.assert_allclose(loss, golden["loss"], rtol=1e-6)
@@ -199,7 +200,8 @@ def test_loss_and_gradients_are_finite_however_far_the_policy_has_moved():
     @jax.value_and_grad
     def loss(log_prob):
         values = jnp.array([3.0, -3.0])
-        return ppo_loss(log_prob, values, values, jnp.zeros(2), jnp.zeros(2), HPARAMS)
+        zeros = jnp.zeros(2)
+        return ppo_loss(log_prob, values, values, zeros, -values, zeros, HPARAMS)
 
     for log_ratio in (1e5, -1e5):
         value, gradient = loss(np.full(2, log_ratio, np.float32))
@@ -416,7 +418,7 @@ def test_an_agent_has_either_discrete_or_continuous_actions():
 
 def test_the_agent_says_what_was_configured(agent):
     assert agent.hparams._asdict() == {
-        "learning_rate": 0.01, "discount": 0.9, "clip_ratio": 0.05, "value_weight": 0.7,
+        "learning_rate": 0.01, "discount": 0.9, "gae_lambda": 0.95, "clip_ratio": 0.05, "value_weight": 0.7,
         "entropy_weight": 0.05, "hidden_size": None,  # all of it
     }  # fmt: skip
     assert (agent.init_episodes, agent.learns_from, agent.action_repeat) == (1, 0, 1)
