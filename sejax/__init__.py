@@ -38,6 +38,7 @@ _EXPORTS = {
     "QLearningConfig": "sejax.agents.tabular",
     "RewardConfig": "sejax.proxies.configs",
     "RewardThreshold": "sejax.objectives",
+    "SACConfig": "sejax.agents.sac",
     "SARSAConfig": "sejax.agents.tabular",
     "Strategy": "sejax.es.strategy",
     "SyntheticConfig": "sejax.proxies.configs",
@@ -71,6 +72,7 @@ if TYPE_CHECKING:  # what a type checker and an editor see
     from sejax.agents.ddqn import DDQNConfig, DuelingDDQNConfig
     from sejax.agents.icm import ICMConfig
     from sejax.agents.ppo import PPOConfig
+    from sejax.agents.sac import SACConfig
     from sejax.agents.tabular import QLearningConfig, SARSAConfig
     from sejax.agents.td3 import DiscreteTD3Config, TD3Config
     from sejax.app.compose import config
@@ -103,7 +105,7 @@ __all__ = [
     "AUC", "AUCSum", "Agent", "ConfigError", "CountBasedConfig", "DDQNConfig", "DiscreteTD3Config",
     "DuelingDDQNConfig", "EvosaxConfig", "ICMConfig", "LearnResult", "MaxReward", "NESConfig",
     "Objective", "Outcome", "PPOConfig", "Proxy", "ProxyEnv", "ProxyParams", "ProxySet",
-    "QLearningConfig", "RewardConfig", "RewardThreshold", "SARSAConfig", "Strategy",
+    "QLearningConfig", "RewardConfig", "RewardThreshold", "SACConfig", "SARSAConfig", "Strategy",
     "SyntheticConfig", "TD3Config", "Task", "TrainResult", "TrainingConfig", "Trials", "agents",
     "config", "configure_xla", "envs", "es", "evaluate_agents", "load", "load_proxy", "load_set",
     "make_agent", "make_evaluator", "make_learner", "make_trainer", "options", "proxies",

@@ -72,6 +72,7 @@ GROUPS = {
         "td3": "sejax.agents.td3:TD3Config",
         "td3_discrete": "sejax.agents.td3:DiscreteTD3Config",
         "ppo": "sejax.agents.ppo:PPOConfig",
+        "sac": "sejax.agents.sac:SACConfig",
         "q_learning": "sejax.agents.tabular:QLearningConfig",
         "sarsa": "sejax.agents.tabular:SARSAConfig",
     }),
