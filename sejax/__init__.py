@@ -21,6 +21,7 @@ _EXPORTS = {
     "ConfigError": "sejax.errors",
     "CountBasedConfig": "sejax.agents.count_based",
     "DDQNConfig": "sejax.agents.ddqn",
+    "DQNConfig": "sejax.agents.ddqn",
     "DiscreteTD3Config": "sejax.agents.td3",
     "DuelingDDQNConfig": "sejax.agents.ddqn",
     "EvosaxConfig": "sejax.es.evosax",
@@ -69,7 +70,7 @@ if TYPE_CHECKING:  # what a type checker and an editor see
     from sejax.agents import make_agent
     from sejax.agents.agent import Agent
     from sejax.agents.count_based import CountBasedConfig
-    from sejax.agents.ddqn import DDQNConfig, DuelingDDQNConfig
+    from sejax.agents.ddqn import DDQNConfig, DQNConfig, DuelingDDQNConfig
     from sejax.agents.icm import ICMConfig
     from sejax.agents.ppo import PPOConfig
     from sejax.agents.sac import SACConfig
@@ -102,10 +103,11 @@ if TYPE_CHECKING:  # what a type checker and an editor see
     from sejax.training import TrainingConfig
 
 __all__ = [
-    "AUC", "AUCSum", "Agent", "ConfigError", "CountBasedConfig", "DDQNConfig", "DiscreteTD3Config",
-    "DuelingDDQNConfig", "EvosaxConfig", "ICMConfig", "LearnResult", "MaxReward", "NESConfig",
-    "Objective", "Outcome", "PPOConfig", "Proxy", "ProxyEnv", "ProxyParams", "ProxySet",
-    "QLearningConfig", "RewardConfig", "RewardThreshold", "SACConfig", "SARSAConfig", "Strategy",
+    "AUC", "AUCSum", "Agent", "ConfigError", "CountBasedConfig", "DDQNConfig", "DQNConfig",
+    "DiscreteTD3Config", "DuelingDDQNConfig", "EvosaxConfig", "ICMConfig", "LearnResult",
+    "MaxReward", "NESConfig", "Objective", "Outcome", "PPOConfig", "Proxy", "ProxyEnv",
+    "ProxyParams", "ProxySet", "QLearningConfig", "RewardConfig", "RewardThreshold", "SACConfig",
+    "SARSAConfig", "Strategy",
     "SyntheticConfig", "TD3Config", "Task", "TrainResult", "TrainingConfig", "Trials", "agents",
     "config", "configure_xla", "envs", "es", "evaluate_agents", "load", "load_proxy", "load_set",
     "make_agent", "make_evaluator", "make_learner", "make_trainer", "options", "proxies",
