@@ -105,6 +105,14 @@ def not_negative(reason: str = "it is a size") -> Rule:
     return rule
 
 
+def finite(reason: str) -> Rule:
+    """A finite number, of either sign."""
+    return lambda name, value, default: errors.require(
+        errors.is_number(value) and abs(value) < float("inf"), name, "be finite", reason, value,
+        f"{name}={default}",
+    )  # fmt: skip
+
+
 def positive(reason: str, at_most: float = float("inf")) -> Rule:
     """A number above 0."""
     return lambda name, value, default: errors.positive(name, value, reason, default, at_most)
