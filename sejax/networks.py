@@ -13,7 +13,8 @@ import jax.numpy as jnp
 from flax import linen as nn
 from jaxtyping import Array, Float
 
-ACTIVATIONS = ("tanh", "relu", "leaky_relu", "prelu")
+from sejax.options import ACTIVATIONS as ACTIVATIONS
+
 PRELU_SLOPE = 0.25
 
 
