@@ -193,10 +193,10 @@ def parse_args() -> argparse.Namespace:
 
 
 def names_of(text: str) -> list[str]:
-    unknown = set(text.split(",")) - set(ALGORITHMS)
-    if unknown:
-        raise argparse.ArgumentTypeError(f"there is no {', '.join(unknown)}: {', '.join(ALGORITHMS)}")
-    return text.split(",")
+    names = text.split(",")
+    if not set(names) <= set(ALGORITHMS):
+        raise argparse.ArgumentTypeError(f"must be among {', '.join(ALGORITHMS)}; got {text}")
+    return names
 
 
 def numbers(text: str) -> list[int]:
@@ -346,9 +346,7 @@ def report(args: argparse.Namespace, agents: list[str], rows: list[dict[str, Any
         print(f"{agent}: {target:.1f} on the real task itself {as_good(args, agent, rows, target)}")
 
 
-def as_good(
-    args: argparse.Namespace, agent: str, rows: list[dict[str, Any]], target: float
-) -> str:
+def as_good(args: argparse.Namespace, agent: str, rows: list[dict[str, Any]], target: float) -> str:
     """After how many real steps real agents are as good, in words."""
     zoo_total = int(ZOO[agent, TASKS[args.task][0]].total_steps)
     there = [row for row in of(rows, None, agent) if row["total_steps"] == zoo_total]

@@ -17,7 +17,7 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -142,20 +142,20 @@ class SyntheticEnv(gymnasium.Env[Any, Any]):
       ConfigError: if the weights are not those of such networks.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": []}
+    metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012 (as Gymnasium declares it)
 
     def __init__(self, weights: Mapping[str, np.ndarray], config: SyntheticConfig, task: RealTask):
         self.config = config
         self.action_space = task.action_space
         self._num_states = _num_categories(task.observation_space)
         self._num_actions = _num_categories(task.action_space)
-        obs_dim = self._num_states or task.observation_space.shape[0]
-        action_dim = self._num_actions or task.action_space.shape[0]
+        self._obs_dim = _size(task.observation_space, "task.observation_space")
+        action_dim = _size(task.action_space, "task.action_space")
         if self._num_states:
             self.observation_space = task.observation_space
         else:
-            self.observation_space = spaces.Box(-np.inf, np.inf, (obs_dim,), np.float32)
-        _check(weights, _shapes(config, obs_dim, action_dim))
+            self.observation_space = spaces.Box(-np.inf, np.inf, (self._obs_dim,), np.float32)
+        _check(weights, _shapes(config, self._obs_dim, action_dim))
         heads = ["reward"] if config.horizon == 1 else ["state", "reward", "done"]
         self._layers = _joined([_layers(weights, head) for head in heads])
         self._start_layers = _layers(weights, "start")
@@ -203,13 +203,12 @@ class SyntheticEnv(gymnasium.Env[Any, Any]):
 
     def _first_vector(self) -> np.ndarray:
         if self._start_layers:
-            noise = self.np_random.standard_normal(self._start_layers[0][0].shape[1], np.float32)
-            vector = self._forward(self._start_layers, noise)
-            return np.clip(vector, -ABSURD, ABSURD)
+            noise = self.np_random.standard_normal(self._obs_dim, np.float32)
+            return np.clip(self._forward(self._start_layers, noise), -ABSURD, ABSURD)
         assert self._starts is not None
         obs = self._starts(self.np_random)
         if self._num_states:
-            return np.eye(self._num_states, dtype=np.float32)[obs]
+            return np.eye(self._obs_dim, dtype=np.float32)[obs]
         return np.array(obs, np.float32)
 
     def _encode(self, action: Any) -> np.ndarray:
@@ -233,10 +232,11 @@ class SyntheticEnv(gymnasium.Env[Any, Any]):
 
     def _forward(self, layers: "Layers", x: np.ndarray) -> np.ndarray:
         activate = ACTIVATIONS[self.config.activation]
-        for kernel, bias in layers[:-1]:
-            x = activate(kernel @ x + bias)
-        kernel, bias = layers[-1]
-        return kernel @ x + bias
+        *hidden, (last_kernel, last_bias) = layers
+        with np.errstate(over="ignore", invalid="ignore"):  # `step` looks at what comes out
+            for kernel, bias in hidden:
+                x = activate(kernel @ x + bias)
+            return last_kernel @ x + last_bias
 
     def _ends(self, done: float) -> bool:
         """Whether the done output ends the episode."""
@@ -375,3 +375,12 @@ def _check(weights: Mapping[str, np.ndarray], shapes: dict[str, tuple[int, ...]]
 def _num_categories(space: spaces.Space[Any]) -> int | None:
     """Size of a `Discrete` space; None for a `Box`."""
     return int(space.n) if isinstance(space, spaces.Discrete) else None
+
+
+def _size(space: spaces.Space[Any], name: str) -> int:
+    """Length of the vector that networks see; an index is one-hot to them."""
+    is_index = isinstance(space, spaces.Discrete) and space.start == 0
+    is_vector = isinstance(space, spaces.Box) and len(space.shape) == 1
+    require(is_index or is_vector, name, "be a Box of vectors or a Discrete from 0", "networks "
+            "take vectors", space, f"{name} to what `sejax.Task` has")  # fmt: skip
+    return _num_categories(space) or int(space.shape[0])  # type: ignore[index]
