@@ -27,8 +27,8 @@ from gymnasium.envs.registration import EnvSpec
 from sejax import plugins
 from sejax.envs import cliff_walking, gridworld_2x2
 from sejax.errors import ConfigError, require, shortened, told
-from sejax.proxies import stored
-from sejax.proxies.configs import ABSURD, START_HIDDEN_SIZE, SyntheticConfig
+from sejax.proxies import ABSURD, stored
+from sejax.proxies.configs import SyntheticConfig
 
 # The tasks that Gymnasium has too, with the same spaces, dynamics and initial states.
 GYMNASIUM_IDS = {
@@ -155,7 +155,8 @@ class SyntheticEnv(gymnasium.Env[Any, Any]):
             self.observation_space = task.observation_space
         else:
             self.observation_space = spaces.Box(-np.inf, np.inf, (self._obs_dim,), np.float32)
-        _check(weights, _shapes(config, self._obs_dim, action_dim))
+        start_size = len(weights.get("start/Dense_0/bias", ()))
+        _check(weights, _shapes(config, self._obs_dim, action_dim, start_size))
         heads = ["reward"] if config.horizon == 1 else ["state", "reward", "done"]
         self._layers = _joined([_layers(weights, head) for head in heads])
         self._start_layers = _layers(weights, "start")
@@ -346,14 +347,16 @@ def _block_diagonal(blocks: tuple[np.ndarray, ...]) -> np.ndarray:
     return whole
 
 
-def _shapes(config: SyntheticConfig, obs_dim: int, action_dim: int) -> dict[str, tuple[int, ...]]:
-    """Shape of each weight of an SE."""
+def _shapes(
+    config: SyntheticConfig, obs_dim: int, action_dim: int, start_size: int
+) -> dict[str, tuple[int, ...]]:
+    """Shape of each weight of an SE; `start_size`: hidden units of what makes initial states."""
     hidden = [action_dim + obs_dim, *[config.hidden_size] * config.num_layers]
     sizes = {"reward": [*hidden, 1]}
     if config.horizon != 1:
         sizes |= {"state": [*hidden, obs_dim], "done": [*hidden, 1]}
     if config.initial_state == "learned":
-        sizes["start"] = [obs_dim, START_HIDDEN_SIZE, obs_dim]
+        sizes["start"] = [obs_dim, start_size, obs_dim]
     shapes: dict[str, tuple[int, ...]] = {}
     for network, units in sizes.items():
         for i, (num_inputs, num_outputs) in enumerate(itertools.pairwise(units)):

@@ -6,10 +6,6 @@ from typing import Any, ClassVar
 from sejax.errors import require
 from sejax.options import ACTIVATIONS, MOST_LAYERS, Options, counts, one_of, option
 
-# A state or reward beyond this is no world that an agent could learn from: the episode ends. It is
-# far outside every task's range and small enough for its square to stay finite in float32.
-ABSURD = 1e6
-START_HIDDEN_SIZE = 32  # of the network that makes an SE's initial states
 DONE_MODES = ("soft", "threshold", "bernoulli", "sigmoid")
 INITIAL_STATES = ("real", "learned")
 VARIANTS = (

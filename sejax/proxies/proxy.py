@@ -14,7 +14,7 @@ from gymnax.environments import environment
 from jaxtyping import Array
 
 from sejax.envs.task import Task
-from sejax.proxies.configs import ABSURD as ABSURD
+from sejax.proxies import ABSURD as ABSURD
 
 
 class World(NamedTuple):

@@ -15,11 +15,12 @@ from jaxtyping import Array, Bool, Float
 
 from sejax.envs.task import Task
 from sejax.networks import MLP
-from sejax.proxies.configs import ABSURD, START_HIDDEN_SIZE
-from sejax.proxies.proxy import ProxyEnv, ProxyParams, World
+from sejax.proxies.proxy import ABSURD, ProxyEnv, ProxyParams, World
 
 if TYPE_CHECKING:  # which makes it
     from sejax.proxies.configs import SyntheticConfig
+
+START_HIDDEN_SIZE = 32  # of the network that makes initial states
 
 
 @struct.dataclass
