@@ -104,13 +104,13 @@ if TYPE_CHECKING:  # what a type checker and an editor see
 
 __all__ = [
     "AUC", "AUCSum", "Agent", "ConfigError", "CountBasedConfig", "DDQNConfig", "DiscreteTD3Config",
-    "DuelingDDQNConfig", "EvosaxConfig", "Families", "FamiliesConfig", "ICMConfig", "LearnResult", "MaxReward", "NESConfig",
-    "Objective", "Outcome", "PPOConfig", "Proxy", "ProxyEnv", "ProxyParams", "ProxySet",
-    "QLearningConfig", "RewardConfig", "RewardThreshold", "SARSAConfig", "Strategy",
-    "SyntheticConfig", "TD3Config", "Task", "TrainResult", "TrainingConfig", "Trials", "agents",
-    "config", "configure_xla", "envs", "es", "evaluate_agents", "load", "load_proxy", "load_set",
-    "make_agent", "make_evaluator", "make_learner", "make_trainer", "options", "proxies",
-    "register_gymnax", "save", "save_set", "spread_over_devices",
+    "DuelingDDQNConfig", "EvosaxConfig", "Families", "FamiliesConfig", "ICMConfig", "LearnResult",
+    "MaxReward", "NESConfig", "Objective", "Outcome", "PPOConfig", "Proxy", "ProxyEnv",
+    "ProxyParams", "ProxySet", "QLearningConfig", "RewardConfig", "RewardThreshold", "SARSAConfig",
+    "Strategy", "SyntheticConfig", "TD3Config", "Task", "TrainResult", "TrainingConfig", "Trials",
+    "agents", "config", "configure_xla", "envs", "es", "evaluate_agents", "load", "load_proxy",
+    "load_set", "make_agent", "make_evaluator", "make_learner", "make_trainer", "options",
+    "proxies", "register_gymnax", "save", "save_set", "spread_over_devices",
 ]  # fmt: skip
 
 

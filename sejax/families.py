@@ -61,7 +61,7 @@ class Families:
     agents: tuple[Agent, ...]
     names: tuple[str, ...] = ()
     weights: tuple[float, ...] = ()
-    config: FamiliesConfig = FamiliesConfig()  # noqa: RUF009 (frozen)
+    config: FamiliesConfig = FamiliesConfig()
 
     def __post_init__(self) -> None:
         size = len(self.agents)
@@ -107,7 +107,7 @@ class Families:
             places.append(family)
         require(counts.all(), "agents", "have weights that leave each family a member", "the "
                 f"proxy must be told by all of them; there are {num_places} perturbations",
-                self.weights, "es.population_size larger, or weights nearer to each other")  # fmt: skip
+                self.weights, "es.population_size larger")  # fmt: skip
         return np.tile(places, num_signs)
 
     def num_evals(self, num_incumbent_evals: int) -> int:

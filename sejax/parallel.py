@@ -5,6 +5,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 from jax.sharding import AxisType, PartitionSpec
 
@@ -22,8 +23,8 @@ def spread_over_devices(
     Args:
       fn: a function of one element.
       num_devices: None for all.
-      lanes: elements that run in lockstep on one device. None for `cpu_lanes` on a CPU and for all
-        elsewhere.
+      lanes: elements that run in lockstep on one device; fewer are filled up with copies. None for
+        `cpu_lanes` on a CPU and for all elsewhere.
       cpu_lanes: None for all; 1 where a lane would only wait for the others.
 
     Devices take the elements in turn (0, 1, 0, 1, ...), so that each gets its share of long and
@@ -67,10 +68,16 @@ def spread_groups_over_devices(
             return fn(*args)
 
         size = jax.tree.leaves(args)[0].shape[0]
-        batch_size = lanes or (lockstep if on_cpu else None) or size
-        if batch_size >= size:
-            return jax.vmap(one)(args) if size > 1 else jax.lax.map(one, args)
-        return jax.lax.map(one, args, batch_size=batch_size if batch_size > 1 else None)
+        width = lanes or (lockstep if on_cpu else None) or size
+        if width == 1 or size == 1:
+            return jax.lax.map(one, args)
+        # The last batch is filled up with copies: products of another width round otherwise, and
+        # a result must not depend on how many elements a device has.
+        num_batches = -(-size // width)
+        places = np.arange(num_batches * width) % size
+        batches = jax.tree.map(lambda x: x[places].reshape(-1, width, *x.shape[1:]), args)
+        out = jax.lax.map(jax.vmap(one), batches)
+        return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[:size], out)
 
     def map_here(groups: Sequence[tuple[Any, ...]]) -> list[Any]:
         return [map_group(*each) for each in zip(fns, cpu_lanes, groups, strict=True)]

@@ -18,8 +18,8 @@ VARIANTS = (
 class SyntheticConfig(Options):
     """The SE's networks, where its episodes begin, and how they end.
 
-    The paper's SE is `initial_state=real horizon=null done=soft`; the contextual bandit of Liesen et
-    al. (2024) is `initial_state=learned horizon=1`.
+    The paper's SE is `initial_state=real horizon=null done=soft`; the contextual bandit of Liesen
+    et al. (2024) is `initial_state=learned horizon=1`.
     """
 
     group: ClassVar[str] = "proxy"
@@ -28,8 +28,8 @@ class SyntheticConfig(Options):
     num_layers: int = option(1, counts("there is a hidden layer", most=MOST_LAYERS))
     activation: str = option("leaky_relu", one_of(ACTIVATIONS))
     # How the done output d ends an episode. soft: at d > 0.5, but targets bootstrap with 1 - d
-    # (the authors'); threshold: at d > 0.5; bernoulli: with probability clip(d, 0, 1); sigmoid: with
-    # probability sigmoid(d). All but the first are ends that every agent sees.
+    # (the authors'); threshold: at d > 0.5; bernoulli: with probability clip(d, 0, 1); sigmoid:
+    # with probability sigmoid(d). All but the first are ends that every agent sees.
     done: str = option("soft", one_of(DONE_MODES))
     # real: the task's initial states; learned: a network's, from standard normal noise
     initial_state: str = option("real", one_of(INITIAL_STATES))
