@@ -13,7 +13,8 @@ import jax.numpy as jnp
 from flax import linen as nn
 from jaxtyping import Array, Float
 
-ACTIVATIONS = ("tanh", "fast_tanh", "relu", "leaky_relu", "prelu")
+from sejax.options import ACTIVATIONS as ACTIVATIONS
+
 PRELU_SLOPE = 0.25
 
 # For powers of x^2, the lowest first. Of all such functions with slope 1 at 0 and no value above 1

@@ -16,7 +16,7 @@ LAYERS = [
     {"app"},
     {"bilevel"},
     {"evaluation"},
-    {"trainer", "rollout"},
+    {"trainer", "rollout", "gym"},
     {"proxies", "families"},
     {"agents", "envs", "es", "objectives"},
     {"plugins"},
