@@ -3,6 +3,7 @@
 import functools
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -10,7 +11,6 @@ import numpy as np
 import pytest
 from support import numpy_forward, raveled, shapes_of, unraveled
 
-import sejax
 from sejax.agents.replay import Transition
 from sejax.agents.sac import (
     LearningNoise,
@@ -35,9 +35,8 @@ CONFIG = SACConfig(
 # Kind of actions, configuration.
 CASES = {
     "continuous": (False, CONFIG),
-    "continuous_fixed_alpha": (False, replace(CONFIG, alpha=0.2, num_layers=2, activation="prelu")),
     "discrete": (True, CONFIG),
-    "discrete_fixed_alpha": (True, replace(CONFIG, alpha=0.2, num_layers=2, activation="relu")),
+    "fixed_alpha": (True, replace(CONFIG, alpha=0.2, num_layers=2, activation="prelu")),
 }
 KINDS = pytest.mark.parametrize("case", ["continuous", "discrete"])
 NAMES = ("params", "target_critics")
@@ -252,13 +251,13 @@ def test_critics_learn_targets_with_the_entropy_of_the_next_state_and_alpha_near
 
 
 def test_a_fixed_alpha_is_not_learned():
-    case = "discrete_fixed_alpha"
+    case = "fixed_alpha"
     after = learn_of(case)(state_of(case), case_batch(case, 0), case_noise(case, 0))
     assert after.params[-1] == state_of(case).params[-1]
 
 
-@KINDS
-def test_target_critics_start_as_copies_and_follow_softly(case):
+def test_target_critics_start_as_copies_and_follow_softly():
+    case = "discrete"
     agent = agent_of(case)
     fresh = jax.jit(agent.init)(jax.random.key(1), agent.hparams)
     critics_of = networks_of(case).critics_of
@@ -278,18 +277,21 @@ OBS = np.float32([0.3, -0.2, 0.5])
 
 
 @functools.cache
-def drawn_actions(case, explore, episode=3):
-    """Actions of 4000 keys."""
+def drawn_actions(case):
+    """Actions of 4000 keys: of warming up, of exploring after it, and of tests."""
     agent = agent_of(case)
 
     @jax.jit
     def act(state):
-        state = agent.begin_episode(state, np.int32(episode))
-        return jax.vmap(lambda key: agent.act(key, state, OBS, explore))(
-            jax.random.split(jax.random.key(1), 4000)
-        )
+        keys = jax.random.split(jax.random.key(1), 4000)
 
-    return np.asarray(act(state_of(case)), np.float64)
+        def draw(episode, explore):
+            begun = agent.begin_episode(state, np.int32(episode))
+            return jax.vmap(lambda key: agent.act(key, begun, OBS, explore))(keys)
+
+        return draw(2, True), draw(3, True), draw(2, False)
+
+    return [np.asarray(x, np.float64) for x in act(state_of(case))]
 
 
 def actor_outputs(case):
@@ -299,21 +301,21 @@ def actor_outputs(case):
 
 def test_exploring_draws_from_the_policy_and_tests_take_its_mode():
     mean, log_std = np.split(actor_outputs("continuous"), 2)
-    u = np.arctanh(drawn_actions("continuous", explore=True))
+    _, drawn, tested = drawn_actions("continuous")
+    u = np.arctanh(drawn)
     assert (np.abs(u.mean(0) - mean) < 5 * np.exp(log_std) / np.sqrt(4000)).all()
     np.testing.assert_allclose(u.std(0), np.exp(log_std), rtol=0.06)  # 5 / sqrt(2 * 4000)
-    np.testing.assert_allclose(
-        drawn_actions("continuous", explore=False), np.tile(np.tanh(mean), (4000, 1)), rtol=1e-5
-    )
+    np.testing.assert_allclose(tested, np.tile(np.tanh(mean), (4000, 1)), rtol=1e-5)
     logits = actor_outputs("discrete")
     share = np.exp(logits[1]) / np.exp(logits).sum()
-    assert abs(drawn_actions("discrete", explore=True).mean() - share) < 5 * 0.5 / np.sqrt(4000)
-    assert (drawn_actions("discrete", explore=False) == np.argmax(logits)).all()
+    _, drawn, tested = drawn_actions("discrete")
+    assert abs(drawn.mean() - share) < 5 * 0.5 / np.sqrt(4000)
+    assert (tested == np.argmax(logits)).all()
 
 
 @KINDS
 def test_the_first_episodes_are_for_warming_up_uniformly(case):
-    drawn = drawn_actions(case, explore=True, episode=2)
+    drawn, _, _ = drawn_actions(case)
     bins = 2 if CASES[case][0] else 4
     edges = (0, 1) if CASES[case][0] else (-1, 1)
     for column in np.reshape(drawn, (4000, -1)).T:
@@ -353,15 +355,13 @@ def test_the_state_keeps_its_types(case):
 
 
 def test_one_configuration_serves_both_kinds_of_actions():
-    config = SACConfig(hidden_size=8)
-    for env, shape in (("cartpole", ()), ("pendulum", (1,))):
-        task = sejax.envs.make(env)
-        agent = sejax.make_agent(config, task)
-        state = shapes_of(agent.init, jax.random.key(0), agent.hparams)
-        obs = np.zeros(task.obs_dim, np.float32)
-        action = jax.eval_shape(lambda agent=agent, state=state, obs=obs: agent.act(
-            jax.random.key(0), state, obs, True))  # fmt: skip
-        assert action.shape == shape
+    assert set(SACConfig.actions) == {"discrete", "continuous"}
+    discrete = SimpleNamespace(obs_dim=OBS_DIM, num_actions=ACTION_DIM)
+    continuous = SimpleNamespace(
+        obs_dim=OBS_DIM, num_actions=None, action_dim=ACTION_DIM, max_action=MAX_ACTION
+    )
+    assert CONFIG.make(discrete) is agent_of("discrete")
+    assert CONFIG.make(continuous) is agent_of("continuous")
 
 
 def test_an_agent_with_units_and_columns_out_of_use_learns_as_a_smaller_one():
