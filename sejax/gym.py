@@ -12,6 +12,7 @@ Example:
   ((4,), False, False)
 """
 
+import copy
 import itertools
 import math
 from collections.abc import Callable, Mapping
@@ -146,7 +147,7 @@ class SyntheticEnv(gymnasium.Env[Any, Any]):
 
     def __init__(self, weights: Mapping[str, np.ndarray], config: SyntheticConfig, task: RealTask):
         self.config = config
-        self.action_space = task.action_space
+        self.action_space = copy.deepcopy(task.action_space)  # its sampler is this one's
         self._num_states = _num_categories(task.observation_space)
         self._num_actions = _num_categories(task.action_space)
         self._obs_dim = _size(task.observation_space, "task.observation_space")
