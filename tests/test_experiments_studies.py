@@ -199,7 +199,7 @@ def test_recorded_tests_are_the_tests(se_file):
     agent = sejax.make_agent(sejax.DDQNConfig(**TINY_AGENT), task)
     state = agent.init(jax.random.key(0), agent.hparams)
     key = jax.random.key(4)
-    returns, lengths = jax.jit(make_tester(agent, task, 3))(key, state)
+    returns, lengths, _ = jax.jit(make_tester(agent, task, 3))(key, state)
     steps = jax.jit(make_recorder(agent, task, 3))(key, state)
     valid = np.asarray(steps.valid).reshape(3, -1)
     np.testing.assert_array_equal(valid.sum(axis=1), lengths)
