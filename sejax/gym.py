@@ -206,7 +206,7 @@ class SyntheticEnv(gymnasium.Env[Any, Any]):
     def _first_vector(self) -> np.ndarray:
         if self._start_layers:
             noise = self.np_random.standard_normal(self._obs_dim, np.float32)
-            return np.clip(self._forward(self._start_layers, noise), -ABSURD, ABSURD)
+            return np.clip(noise + self._forward(self._start_layers, noise), -ABSURD, ABSURD)
         assert self._starts is not None
         obs = self._starts(self.np_random)
         if self._num_states:
