@@ -18,7 +18,7 @@ from support import random_like, shapes_of
 import sejax
 from sejax import envs, plugins
 from sejax.errors import ConfigError
-from sejax.gym import GYMNASIUM_IDS, RealTask, SyntheticEnv, make
+from sejax.gym import GYMNASIUM_IDS, RealTask, SyntheticEnv, _known_task, make
 from sejax.proxies import ABSURD
 from sejax.proxies.configs import RewardConfig, SyntheticConfig
 
@@ -396,10 +396,11 @@ def test_gymnasiums_tasks_have_the_spaces_of_sejaxs(name):
         assert real.action_space == spaces.Discrete(task.num_actions)
 
 
-def test_a_task_of_gymnax_is_gymnasiums_of_that_id(stored):
-    env = make(stored(jax_se("gymnax/MountainCar-v0", done="threshold")))
-    assert env.action_space == spaces.Discrete(3)
-    position, velocity = env.reset(seed=0)[0]
+@pytest.mark.parametrize(("given", "limit"), [({}, 200), ({"max_steps": 300}, 300)], ids=str)
+def test_a_task_of_gymnax_is_gymnasiums_of_that_id(given, limit):
+    task = _known_task({"name": "gymnax/MountainCar-v0", **given})
+    assert task.action_space == spaces.Discrete(3) and task.max_steps == limit
+    position, velocity = task.starts(np.random.default_rng(0))
     assert -0.6 <= position <= -0.4 and velocity == 0.0
 
 
