@@ -1,8 +1,8 @@
 """Synthetic environments (SEs) for Gymnasium, in NumPy alone: any agent, no JAX.
 
-`make("cartpole")` is a plain `gymnasium.Env`. Importing and stepping it loads neither JAX nor
-gymnax, so that it costs some milliseconds and 20 MB, and forks and pickles as other environments
-do. It needs the extra `gym`: `pip install 'sejax[gym]'`.
+`make("cartpole")` is a plain `gymnasium.Env`. Neither JAX nor gymnax is loaded, so that beyond
+Gymnasium it takes a twentieth of a second and 5 MB, steps in 10 microseconds, and forks and pickles
+as other environments do. It needs the extra `gym`: `pip install 'sejax[gym]'`.
 
 Example:
   >>> env = make("cartpole")
