@@ -21,7 +21,7 @@ LAYERS = [
     {"agents", "envs", "es", "objectives"},
     {"plugins"},
     {"training", "networks", "loops", "parallel", "counters", "sealed", "files", "serialize"},
-    {"options"},
+    {"options", "statistics"},
     {"errors"},
     {"", "conf"},
 ]
