@@ -309,6 +309,9 @@ def make_program(
         state: LearnState, asked: Asked, outcome: Outcome
     ) -> tuple[LearnState, GenerationInfo]:
         scores = Scores.of(objective(outcome), trials, families, family_of_trial)
+        worth = scores
+        if objective.test_steps is not None:  # which members are compared by
+            worth = Scores.of(objective.of_whole_tests(outcome), trials, families, family_of_trial)
         members, incumbent = jax.vmap(
             lambda tried, means: families.comparable(
                 trials.of_members(tried), family_of_member, means
@@ -317,16 +320,18 @@ def make_program(
         told = jax.vmap(strategy.tell)(
             asked.key_tell, asked.members, members, incumbent, asked.es_state
         )
-        stepped = _advance(state, told, asked.incumbent, scores, outcome)
+        stepped = _advance(state, told, asked.incumbent, worth, outcome)
         if stop_when_solved:
             stepped = stepped.replace(finished=stepped.incumbent_score >= task.solved_reward)
         stepped = jax.tree.map(lambda new, old: _where(state.finished, old, new), stepped, state)
-        return stepped, _summarise(state, stepped, scores, outcome, families, family_of_trial)
+        return stepped, _summarise(state, stepped, worth, outcome, families, family_of_trial)
 
     def generation(state: LearnState) -> tuple[LearnState, GenerationInfo]:
         """One pass of Algorithm 1's outer loop for every seed; a scan body."""
         asked = ask(state)
-        return tell(state, asked, evaluate_all(asked.keys, asked.candidates, ~state.finished))
+        test_steps = objective.test_steps and objective.test_steps(state.generation)
+        outcome = evaluate_all(asked.keys, asked.candidates, ~state.finished, test_steps)
+        return tell(state, asked, outcome)
 
     return Program(
         init=init,
@@ -477,18 +482,19 @@ def make_population_evaluator(
     devices: int | None = None,
     lanes: int | None = None,
 ) -> Callable[..., Outcome]:
-    """Builds `evaluate(keys [seed, n], candidates [seed, n, dims], active [seed]) -> Outcome`.
+    """Builds `evaluate(keys, candidates, active, test_steps=None) -> Outcome`.
 
-    It trains one fresh agent on each candidate and tests it on the real task; leaves
-    `[seed, n, ...]`. The trainings are spread over the devices, each device's family by family, as
-    which family trains on which candidate is known when the program is built: no training pays for
-    another family's. Groups of `lanes` of them follow one another.
+    Of `keys [seed, n]`, `candidates [seed, n, dims]`, `active [seed]` and how much of the test
+    episodes is scored, `[seed]`. It trains one fresh agent on each candidate and tests it on the
+    real task; leaves `[seed, n, ...]`. The trainings are spread over the devices, each device's
+    family by family, as it is known when the program is built which family trains on which
+    candidate: no training pays for another family's. Groups of `lanes` of them follow one another.
     """
 
     def evaluator_of(agent: Agent) -> Callable[..., Outcome]:
         evaluate = make_evaluator(agent, proxy, proxy.task, training)
-        return lambda key, candidate, active: evaluate(
-            key, proxy.params(unravel(candidate)), active
+        return lambda key, candidate, active, test_steps: evaluate(
+            key, proxy.params(unravel(candidate)), active, test_steps
         )
 
     places = [np.flatnonzero(family_of_trial == i) for i in range(families.size)]
@@ -498,11 +504,14 @@ def make_population_evaluator(
         [lanes_on_cpu(agent, training) for agent in families.agents],
     )  # fmt: skip
 
-    def evaluate_all(keys: Array, candidates: Array, active: Array) -> Outcome:
+    def evaluate_all(
+        keys: Array, candidates: Array, active: Array, test_steps: Array | None = None
+    ) -> Outcome:
         num_seeds, _, num_dims = candidates.shape
+        of_seeds = (active, test_steps)
         outcomes = evaluate_groups([
             (keys[:, own].reshape(-1), candidates[:, own].reshape(-1, num_dims),
-             jnp.repeat(active, own.size))
+             *jax.tree.map(lambda x, n=own.size: jnp.repeat(x, n), of_seeds))
             for own in places
         ])  # fmt: skip
 

@@ -16,7 +16,7 @@ LAYERS = [
     {"app"},
     {"bilevel"},
     {"evaluation"},
-    {"trainer", "rollout"},
+    {"trainer", "rollout", "gym"},
     {"proxies", "families"},
     {"agents", "envs", "es", "objectives"},
     {"plugins"},
@@ -31,7 +31,7 @@ LAYERS = [
         "files",
         "serialize",
     },
-    {"options"},
+    {"options", "statistics"},
     {"errors"},
     {"", "conf"},
 ]

@@ -473,7 +473,7 @@ def test_the_tester_equals_greedy_episodes_in_gymnasium():
     agent = make_ddqn(DDQNConfig(hidden_size=8, num_layers=1), 4, 2)
     state = agent.init(jax.random.key(2), agent.hparams)
     key = jax.random.key(3)
-    returns, steps = jax.jit(make_tester(agent, task, num_episodes=6))(key, state)
+    returns, steps, _ = jax.jit(make_tester(agent, task, num_episodes=6))(key, state)
     assert returns.shape == (6,) and steps.shape == (6,)
     reference = gymnasium.make("CartPole-v1").unwrapped
     greedy = jax.jit(lambda obs: agent.act(key, state, obs, explore=False))

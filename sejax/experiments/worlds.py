@@ -20,7 +20,7 @@ from sejax.agents import NoExploration
 from sejax.experiments import return_curves
 from sejax.experiments.settings import Settings
 from sejax.parallel import spread_over_devices
-from sejax.training import TrainingConfig, budget_for
+from sejax.training import TrainingConfig
 
 HPARAMS = ("varied", "default")
 GROUPS_AT_ONCE = 5  # groups of agents in one program, but for one CPU device
@@ -174,9 +174,7 @@ def groups_at_once(devices: int | None) -> int:
 
 def training_as_learned(proxies: Any, agent: Any) -> TrainingConfig:
     """How long an agent trains on a set of SEs: as those that they were learned with."""
-    learned = serialize.from_plain(TrainingConfig, proxies.config["training"], "training")
-    learned_with = plugins.configure("agent", proxies.config["agent"])
-    return budget_for(learned, agent, learned_with, proxies.task.max_steps)
+    return proxies.proxy(0).training_for(agent)
 
 
 def outcome_rows(outcome: Any, drawn: dict[str, np.ndarray]) -> pd.DataFrame:

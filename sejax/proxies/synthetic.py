@@ -39,8 +39,8 @@ class SyntheticEnv(ProxyEnv):
 
     What the configuration says of beginnings and ends:
 
-    - `initial_state`: the real task's, or those of a further network, from noise of the state's
-      size.
+    - `initial_state`: the real task's; or learned: standard normal noise plus what a network makes
+      of it, so that a fresh SE's starts surround the origin.
     - `done`: how d terminates an episode. `info["discount"]` is what a target should bootstrap
       with: 1 - d itself if it is "soft" (a learned discount, not confined to [0, 1], which no agent
       outside sees), else 1 - terminated.
@@ -104,7 +104,8 @@ class SyntheticEnv(ProxyEnv):
     def reset_env(self, key: Array, params: ProxyParams) -> tuple[Array, SyntheticState]:
         if self._start is not None:
             noise = jax.random.normal(key, (self.task.obs_dim,))
-            vector: Any = self._start.apply({"params": params.weights["start"]}, noise)
+            moved: Any = self._start.apply({"params": params.weights["start"]}, noise)
+            vector = noise + moved
             vector = jnp.clip(vector, -ABSURD, ABSURD)  # what steps from there call absurd
         else:
             vector, _ = self.task.env.reset_env(key, self.task.params)
