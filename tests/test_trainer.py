@@ -554,17 +554,33 @@ def test_a_recorded_training_is_the_training(recorded, trainers):
         assert_same(jax.tree.map(lambda x: x[None], with_record), 0, alone)
 
 
+def test_a_part_of_a_test_or_more_than_all_of_it_may_be_scored():
+    # Episodes that go on for ever, cut after 4 steps, pay 2.5 in step 4 and in each one after it.
+    task = envs.Task(name="script", env=ENV, params=script([2.5] * 12, [99] * 12))
+    agent = scripted_agent()
+    state = agent.begin_episode(agent.init(KEY, 0.0), 0)
+    test = jax.jit(make_tester(agent, task, 2))
+    for score_steps, scored, played in ((3, 0.0, 4), (4, 2.5, 4), (6, 7.5, 6)):
+        tests = test(KEY, state, True, jnp.int32(score_steps))
+        np.testing.assert_array_equal(tests.scored, [scored] * 2)
+        np.testing.assert_array_equal(tests.returns, [2.5] * 2)  # of the task's own 4 steps
+        np.testing.assert_array_equal(tests.num_steps, [played] * 2)
+
+
 def test_recorded_tests_are_the_tests():
     task = envs.Task(name="script", env=ENV, params=script([2.5] * 12, [3] * 12))
     agent = scripted_agent()
     state = agent.begin_episode(agent.init(KEY, 0.0), 0)
     both = make_tester(agent, task, 3), make_recorder(agent, task, 3)
-    (returns, num_steps), steps = jax.jit(lambda *args: [f(*args) for f in both])(KEY, state)
+    (returns, num_steps, scored), steps = jax.jit(lambda *args: [f(*args) for f in both])(
+        KEY, state
+    )
     valid = np.array(steps.valid).reshape(3, MAX_STEPS)
     np.testing.assert_array_equal(valid, [[True] * 3 + [False]] * 3)
     np.testing.assert_array_equal(valid.sum(axis=1), num_steps)
     rewards = np.array(steps.reward).reshape(3, MAX_STEPS)
     np.testing.assert_array_equal((rewards * valid).sum(axis=1), returns)
+    np.testing.assert_array_equal(scored, returns)  # all that was played
     np.testing.assert_array_equal(steps.terminated[valid.ravel()], [False, False, True] * 3)
     keys = [jax.random.split(key)[0] for key in jax.random.split(KEY, 3)]
     starts = [float(ENV.reset_env(key, task.params)[0][1]) for key in keys]  # each episode's tag
