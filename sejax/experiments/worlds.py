@@ -144,6 +144,8 @@ def make_program(
     The leaves of `params` are `[group, ...]`; the agents of a group follow one another. Nothing is
     computed for an agent that is not active.
     """
+    from sejax.evaluation import lanes_on_cpu
+
     made = sejax.make_agent(agent, task, exploration, hparams == "varied")
     run = measure.make_run(made, env, task, training)
 
@@ -156,7 +158,7 @@ def make_program(
             return run(key, mine, active), made.drawn_values(key)
 
         groups = np.repeat(np.arange(num_groups), keys.shape[0] // num_groups)
-        spread = spread_over_devices(one, devices, cpu_lanes=made.cpu_lanes)
+        spread = spread_over_devices(one, devices, cpu_lanes=lanes_on_cpu(made, training))
         return spread(keys, jax.numpy.asarray(groups), active)
 
     return jax.jit(program)
