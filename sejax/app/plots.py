@@ -70,7 +70,9 @@ def _families(top: Any, bottom: Any, data: pd.DataFrame) -> None:
     means = data.groupby("generation").mean()
     for i, column in enumerate(x for x in data.columns if x.startswith(start)):
         key, color = column.removeprefix(start), FAMILIES[i % len(FAMILIES)]
-        top.plot(means.index, means[column], color=color, lw=1.3, ls="-.", label=f"incumbent: {key}")
+        top.plot(
+            means.index, means[column], color=color, lw=1.3, ls="-.", label=f"incumbent: {key}"
+        )
         bottom.plot(means.index, means[f"train_steps_mean_{key}"], color=color, lw=1, ls="-.")
 
 
