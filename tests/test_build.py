@@ -192,7 +192,7 @@ def test_parts_are_what_make_learner_takes_and_are_built_once():
     assert first["task"] is envs.make("cartpole") is first["proxy"].task
     for name in ("task", "agent", "proxy", "objective"):
         assert first[name] is second[name], "the same parts share their compiled programs"
-    assert first["training"] == TrainingConfig(max_steps=4000, stop_rule="never")
+    assert first["training"] == TrainingConfig(max_steps=2000, max_episodes=2000, stop_rule="never")
     assert first["es"] == config().es
 
 

@@ -237,11 +237,11 @@ def test_several_agents_are_in_the_help():
         ("agents=[ddqn,ppo] agents.ddqn.weight=x", "agents.ddqn.weight must be above 0"),
         ("agents=[ddqn,ppo] agents.ddqn.batch_size=0",
          "agents.ddqn.batch_size must be at least 1, .*Set agents.ddqn.batch_size=128."),
-        ("agents=[ddqn,ppo] agents.ddqn.name=dqn", "agents.ddqn must be one of ddqn"),
+        ("agents=[ddqn,ppo] agents.ddqn.name=ddqnn", "agents.ddqn must be one of ddqn"),
         ("agents=[ddqn,td3]", "agents.td3 must be one of .* in cartpole"),
         ("env=cliff_walking agents=[sarsa,q_learning] exploration=icm",
          "exploration must suit q_learning"),
-        ("agents=[ddqn,ppo] agents.ppo.update_episodes=20",
+        ("proxy.done=soft proxy.horizon=null agents=[ddqn,ppo] agents.ppo.update_episodes=20",
          "training.max_steps must exceed 4001, .* or agents.ppo.update_episodes lower"),
     ],
 )  # fmt: skip
@@ -278,7 +278,7 @@ def test_an_odd_population_is_refused_where_evosax_pairs_perturbations():
     ("override", "field", "nearest"),
     [
         ("env=cartpol", "env", "cartpole"),
-        ("agent=dqn", "agent", "ddqn"),
+        ("agent=ddqnn", "agent", "ddqn"),
         ("es=nez", "es", "nes"),
         ("es=open-es", "es", "open_es"),
         ("preset=papers", "preset", "paper"),
@@ -316,7 +316,7 @@ def test_a_field_that_another_algorithm_has_is_not_suggested():
 
 
 @pytest.mark.parametrize(
-    "overrides", [("proxy.name=rn",), ("env.name=no_such_task",), ("agent.name=dqn",)], ids=" ".join
+    "overrides", [("proxy.name=rn",), ("env.name=no_such_task",), ("agent.name=nope",)], ids=" ".join
 )
 def test_a_name_that_no_choice_has_is_refused(overrides):
     message(*overrides)
@@ -339,13 +339,16 @@ def test_a_value_of_another_type_is_refused_and_the_field_named(override, field)
     assert said.startswith(f"{field} must be ") and said.endswith(".")
 
 
+SOFT = ("proxy.done=soft", "proxy.horizon=null")
+
+
 @pytest.mark.parametrize(
     ("overrides", "said"),
     [
-        (("env=acrobot", "agent=dueling_ddqn", "agent.init_episodes=10"),
+        ((*SOFT, "env=acrobot", "agent=dueling_ddqn", "agent.init_episodes=10"),
          "training.max_steps must exceed 5000, because dueling_ddqn learns nothing before with "
-         "agent.init_episodes=10; got 4000."),
-        (("agent=ppo", "agent.update_episodes=20"),
+         "agent.init_episodes=10; got 2000."),
+        ((*SOFT, "agent=ppo", "agent.update_episodes=20"),
          "training.max_steps must exceed 4001, because ppo learns nothing before"),
         (("training.stop_rule=solved", "training.solved_by=train"),
          "training.solved_by must be test with stop_rule=solved"),
@@ -369,8 +372,10 @@ def test_agents_learn_within_the_default_budget_of_an_se(env):
         agent = plugins.find("agent", name)
         if agent.states == facts.states and facts.actions in agent.actions:
             config = sejax.config([f"env={env}", f"agent={name}"])
-            before = config.agent.steps_before_learning(facts.max_steps)
-            budget = config.training.max_steps or config.training.max_episodes * facts.max_steps
+            longest = config.proxy.max_steps(facts.max_steps)
+            before = config.agent.steps_before_learning(longest)
+            budget = config.training.max_episodes * longest
+            budget = min(budget, config.training.max_steps or budget)
             assert budget >= 2 * before, name
 
 
