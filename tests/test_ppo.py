@@ -20,12 +20,11 @@ from sejax import envs
 from sejax.agents import replay
 from sejax.agents.agent import traced
 from sejax.agents.memory import Rollout
+from sejax.agents.policies import SOFTMAX, gaussian
 from sejax.agents.ppo import (
     MIN_STD,
-    SOFTMAX,
     PPOConfig,
     discounted_returns,
-    gaussian,
     generalized_advantages,
     make_ppo,
     normalized,
@@ -209,7 +208,8 @@ def test_generalized_advantages_equal_plain_loops(ends, at_ends):
     ended = np.isin(np.arange(STEPS), list(ends)).astype(np.float32)
     if at_ends is not None:  # elsewhere 1, as in any task
         steps = steps._replace(discount=np.where(ended, at_ends, 1.0).astype(np.float32))
-    got = jit_advantages(steps, ended, value, next_value, 0.9, 0.8)
+    decay = np.float32(0.9) * steps.discount
+    got = jit_advantages(steps.reward, decay, ended, value, next_value, 0.8)
     expected = advantages_by_definition(steps, ended, value, next_value, 0.9, 0.8)
     np.testing.assert_allclose(got, expected, rtol=1e-5, atol=1e-6)
     if len(ends) == STEPS:  # a world of single steps
