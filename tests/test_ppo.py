@@ -50,7 +50,7 @@ HPARAMS = traced(CONFIG)
 # Three minibatches of four steps, so that each epoch leaves one out.
 GAE = dataclasses.replace(
     CONFIG, advantages="gae", gae_lambda=0.8, rollout_steps=STEPS, num_minibatches=3,
-    max_grad_norm=0.5, adam_eps=1e-5,
+    normalize_rewards=True, max_grad_norm=0.5, adam_eps=1e-5,
 )  # fmt: skip
 CONFIGS = {"discrete": CONFIG, "continuous": CONFIG, "gae": GAE}
 KINDS = tuple(CONFIGS)  # the last one's actions are discrete
@@ -286,6 +286,20 @@ def test_learning_phases_equal_torchs(kind, state, update):
         state = update(KEY, state, rollout(kind, number))
         expected = golden[f"{kind}/params/{number}"]
         np.testing.assert_allclose(state.params, expected, rtol=2e-5, atol=5e-6)
+
+
+def test_with_normalized_rewards_it_does_not_matter_in_what_they_are_paid():
+    agent = ppo("gae")
+    state, update = state_of(agent), jax.jit(agent.update)
+    steps, ended = random_steps("gae", 0)
+    paid_more = np.asarray(jit_pack(steps._replace(reward=1000 * steps.reward), ended))
+    more = update(KEY, state, Rollout(paid_more, np.bool_(True)))
+    np.testing.assert_allclose(
+        more.params, update(KEY, state, rollout("gae")).params, rtol=1e-4, atol=1e-5
+    )
+    # Nor do rewards that never differ blow up, in a world of single steps say.
+    always = np.asarray(jit_pack(steps._replace(reward=0 * ended + 3), 0 * ended + 1))
+    assert np.isfinite(update(KEY, state, Rollout(always, np.bool_(True))).params).all()
 
 
 def test_nothing_changes_until_the_rollout_is_full(kind, state, update):
