@@ -159,7 +159,7 @@ def test_an_odd_population_is_refused_where_evosax_pairs_perturbations():
     ("override", "field", "nearest"),
     [
         ("env=cartpol", "env", "cartpole"),
-        ("agent=dqn", "agent", "ddqn"),
+        ("agent=ddqnn", "agent", "ddqn"),
         ("es=nez", "es", "nes"),
         ("es=open-es", "es", "open_es"),
         ("preset=papers", "preset", "paper"),
