@@ -14,6 +14,7 @@ import pandas as pd
 from sejax.files import atomic_path
 
 INCUMBENT, POPULATION, SOLVED, STEPS = "#1f5fa8", "#d9822b", "#3c8d40", "#6b4c9a"
+FAMILIES = ("#b8336a", "#2a9d8f", "#8d6a2f", "#7b5ea7", "#4d7c0f", "#0e7490", "#9f1239")
 
 
 def learning_curve(rows: Sequence[dict[str, Any]], solved_score: float | None, path: Path) -> None:
@@ -32,6 +33,7 @@ def learning_curve(rows: Sequence[dict[str, Any]], solved_score: float | None, p
         )
         for index, seed in enumerate(seeds):
             _one_seed(top, bottom, data[data["seed"] == seed], len(seeds), first=index == 0)
+        _families(top, bottom, data)
         if len(seeds) > 1:
             mean = data.groupby("generation")["incumbent_mean"].mean()
             top.plot(
@@ -60,6 +62,16 @@ def _one_seed(top: Any, bottom: Any, data: pd.DataFrame, num_seeds: int, first: 
         top.plot(x, data["population_mean"], color=POPULATION, lw=1.3, label="population mean")
         top.plot(x, data["population_max"], color=POPULATION, lw=1, ls=":", label="population max")
     bottom.plot(x, data["train_steps_mean"], color=STEPS, lw=0.9 if thin else 1.8)
+
+
+def _families(top: Any, bottom: Any, data: pd.DataFrame) -> None:
+    """A line for each of several families of agents: the mean of the seeds."""
+    start = "incumbent_mean_"
+    means = data.groupby("generation").mean()
+    for i, column in enumerate(x for x in data.columns if x.startswith(start)):
+        key, color = column.removeprefix(start), FAMILIES[i % len(FAMILIES)]
+        top.plot(means.index, means[column], color=color, lw=1.3, ls="-.", label=f"of them {key}")
+        bottom.plot(means.index, means[f"train_steps_mean_{key}"], color=color, lw=1, ls="-.")
 
 
 def evaluation(tables: dict[str, pd.DataFrame], solved_reward: float, path: Path) -> None:
