@@ -21,6 +21,7 @@ _EXPORTS = {
     "ConfigError": "sejax.errors",
     "CountBasedConfig": "sejax.agents.count_based",
     "DDQNConfig": "sejax.agents.ddqn",
+    "DQNConfig": "sejax.agents.ddqn",
     "DiscreteTD3Config": "sejax.agents.td3",
     "DuelingDDQNConfig": "sejax.agents.ddqn",
     "EvosaxConfig": "sejax.es.evosax",
@@ -40,6 +41,7 @@ _EXPORTS = {
     "QLearningConfig": "sejax.agents.tabular",
     "RewardConfig": "sejax.proxies.configs",
     "RewardThreshold": "sejax.objectives",
+    "SACConfig": "sejax.agents.sac",
     "SARSAConfig": "sejax.agents.tabular",
     "Strategy": "sejax.es.strategy",
     "SyntheticConfig": "sejax.proxies.configs",
@@ -70,9 +72,10 @@ if TYPE_CHECKING:  # what a type checker and an editor see
     from sejax.agents import make_agent
     from sejax.agents.agent import Agent
     from sejax.agents.count_based import CountBasedConfig
-    from sejax.agents.ddqn import DDQNConfig, DuelingDDQNConfig
+    from sejax.agents.ddqn import DDQNConfig, DQNConfig, DuelingDDQNConfig
     from sejax.agents.icm import ICMConfig
     from sejax.agents.ppo import PPOConfig
+    from sejax.agents.sac import SACConfig
     from sejax.agents.tabular import QLearningConfig, SARSAConfig
     from sejax.agents.td3 import DiscreteTD3Config, TD3Config
     from sejax.app.compose import config
@@ -103,14 +106,15 @@ if TYPE_CHECKING:  # what a type checker and an editor see
     from sejax.training import TrainingConfig
 
 __all__ = [
-    "AUC", "AUCSum", "Agent", "ConfigError", "CountBasedConfig", "DDQNConfig", "DiscreteTD3Config",
-    "DuelingDDQNConfig", "EvosaxConfig", "Families", "FamiliesConfig", "ICMConfig", "LearnResult",
-    "MaxReward", "NESConfig", "Objective", "Outcome", "PPOConfig", "Proxy", "ProxyEnv",
-    "ProxyParams", "ProxySet", "QLearningConfig", "RewardConfig", "RewardThreshold", "SARSAConfig",
-    "Strategy", "SyntheticConfig", "TD3Config", "Task", "TrainResult", "TrainingConfig", "Trials",
-    "agents", "config", "configure_xla", "envs", "es", "evaluate_agents", "load", "load_proxy",
-    "load_set", "make_agent", "make_evaluator", "make_learner", "make_trainer", "options",
-    "proxies", "register_gymnax", "save", "save_set", "spread_over_devices",
+    "AUC", "AUCSum", "Agent", "ConfigError", "CountBasedConfig", "DDQNConfig", "DQNConfig",
+    "DiscreteTD3Config", "DuelingDDQNConfig", "EvosaxConfig", "Families", "FamiliesConfig",
+    "ICMConfig", "LearnResult", "MaxReward", "NESConfig", "Objective", "Outcome", "PPOConfig",
+    "Proxy", "ProxyEnv", "ProxyParams", "ProxySet", "QLearningConfig", "RewardConfig",
+    "RewardThreshold", "SACConfig", "SARSAConfig", "Strategy", "SyntheticConfig", "TD3Config",
+    "Task", "TrainResult", "TrainingConfig", "Trials", "agents", "config", "configure_xla", "envs",
+    "es", "evaluate_agents", "load", "load_proxy", "load_set", "make_agent", "make_evaluator",
+    "make_learner", "make_trainer", "options", "proxies", "register_gymnax", "save", "save_set",
+    "spread_over_devices",
 ]  # fmt: skip
 
 

@@ -20,6 +20,7 @@ from typing import Any, ClassVar
 
 from sejax import errors
 
+ACTIVATIONS = ("tanh", "fast_tanh", "relu", "leaky_relu", "prelu")  # of `sejax.networks`
 MOST_LAYERS = 100  # layers and blocks of a network are traced one by one
 
 Rule = Callable[[str, Any, Any], None]  # (name, value, default) -> None, or raises ConfigError
@@ -103,6 +104,14 @@ def not_negative(reason: str = "it is a size") -> Rule:
         errors.require(value < float("inf"), name, "be finite", reason, value, f"{name}={default}")
 
     return rule
+
+
+def finite(reason: str) -> Rule:
+    """A finite number, of either sign."""
+    return lambda name, value, default: errors.require(
+        errors.is_number(value) and abs(value) < float("inf"), name, "be finite", reason, value,
+        f"{name}={default}",
+    )  # fmt: skip
 
 
 def positive(reason: str, at_most: float = float("inf")) -> Rule:

@@ -69,9 +69,11 @@ GROUPS = {
     "agent": Group("sejax.agents", ("task",), {
         "ddqn": "sejax.agents.ddqn:DDQNConfig",
         "dueling_ddqn": "sejax.agents.ddqn:DuelingDDQNConfig",
+        "dqn": "sejax.agents.ddqn:DQNConfig",
         "td3": "sejax.agents.td3:TD3Config",
         "td3_discrete": "sejax.agents.td3:DiscreteTD3Config",
         "ppo": "sejax.agents.ppo:PPOConfig",
+        "sac": "sejax.agents.sac:SACConfig",
         "q_learning": "sejax.agents.tabular:QLearningConfig",
         "sarsa": "sejax.agents.tabular:SARSAConfig",
     }),

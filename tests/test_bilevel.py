@@ -123,7 +123,7 @@ def test_infos_count_generations_and_steps(one_device):
     assert program.strategy.num_candidates == 12  # 4 members with two signs, 4 incumbents
     for number, info in enumerate(infos):
         assert info.generation == number and info.active
-        assert info.train_steps_total == 12 * info.train_steps_mean
+        np.testing.assert_allclose(info.train_steps_total, 12 * info.train_steps_mean, rtol=1e-6)
         assert 0 < info.train_steps_max[0] <= 40
         assert info.num_nonfinite == 0
     real_steps = np.diff([0] + [int(info.env_steps_total[0]) for info in infos])
@@ -303,6 +303,7 @@ def test_every_kind_of_configuration_makes_a_scan_body(words, overrides):
     after, info = jax.eval_shape(program.generation, state)
     kind = lambda tree: jax.tree.map(lambda x: (x.shape, x.dtype), tree)  # noqa: E731
     assert kind(after) == kind(state)
-    wide = ("env_steps_wide", "train_steps_wide")
-    assert {info[name].shape for info in [vars(info)] for name in wide} == {(2, 2)}
-    assert {x.shape for name, x in vars(info).items() if name not in wide} == {(2,)}
+    columns, wide = dict(vars(info)), ("env_steps_wide", "train_steps_wide")
+    assert {x.shape for x in jax.tree.leaves(columns.pop("families"))} == {(2, 1)}  # one family
+    assert {columns.pop(name).shape for name in wide} == {(2, 2)}
+    assert {x.shape for x in columns.values()} == {(2,)}

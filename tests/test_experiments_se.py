@@ -494,7 +494,7 @@ def test_commands_end_bad_input_with_one_message_and_status_2(
 def test_a_command_refuses_before_it_imports_gymnax(tmp_path):
     code = ("import runpy, sys; sys.argv[1:] = ['seed=-1']\n"
             "try: runpy.run_module('sejax.experiments.se_models', run_name='__main__')\n"
-            "finally: print('gymnax' in sys.modules)")  # fmt: skip
+            "finally: print('gymnax.environments.environment' in sys.modules)")  # fmt: skip
     environment = {key: value for key, value in os.environ.items() if key != "XLA_FLAGS"}
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True,
                           timeout=120, env=environment)  # fmt: skip

@@ -163,7 +163,8 @@ TABULAR = ("learning_rate", "discount", "epsilon_init", "epsilon_min", "epsilon_
     [
         (DDQNConfig, DDQN), (DuelingDDQNConfig, DDQN), (TD3Config, TD3),
         (DiscreteTD3Config, (*TD3, "temperature", "final_temperature")),
-        (PPOConfig, ("learning_rate", "discount", "clip_ratio", "value_weight", "entropy_weight")),
+        (PPOConfig, ("learning_rate", "discount", "gae_lambda", "clip_ratio", "value_weight",
+                     "entropy_weight")),
         (QLearningConfig, TABULAR), (SARSAConfig, TABULAR),
         (ICMConfig, ("learning_rate", "forward_weight", "reward_scale")), (CountBasedConfig, ()),
     ],

@@ -11,7 +11,6 @@ from test_ddqn import CONFIG, GOLDEN, NUM_ACTIONS, OBS_DIM, q_network, random_ba
 
 from sejax.agents.ddqn import DDQNConfig, make_ddqn
 from sejax.agents.replay import Transition
-from sejax.networks import ACTIVATIONS
 
 NUM_UPDATES = 5
 
@@ -82,7 +81,7 @@ class TorchDDQN:
 def main():
     """Writes the parameters before, after one, and after five updates on the test's batches."""
     arrays = {}
-    for activation in ACTIVATIONS:
+    for activation in ("tanh", "relu", "leaky_relu", "prelu"):
         config = DDQNConfig(**{**vars(CONFIG), "activation": activation})
         _, nested = q_network(config)
         agent = make_ddqn(config, OBS_DIM, NUM_ACTIONS)

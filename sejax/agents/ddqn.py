@@ -1,7 +1,8 @@
-"""Double DQN with soft target updates and Adam, with a plain or a dueling network.
+"""Double DQN with soft target updates and Adam, with a plain or a dueling network; DQN.
 
-Source: van Hasselt et al., "Deep RL with Double Q-learning" (2016); the paper's hyperparameter
-tables; `docs/reference.md` 4.1 and 4.2.
+Source: van Hasselt et al., "Deep RL with Double Q-learning" (2016); Mnih et al., "Human-level
+control through deep reinforcement learning" (2015); the paper's hyperparameter tables;
+`docs/reference.md` 4.1 and 4.2.
 """
 
 import functools
@@ -14,7 +15,7 @@ import jax.numpy as jnp
 import optax
 from flax import linen as nn
 from flax import struct
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from sejax.agents import flat
 from sejax.agents.agent import Agent, AgentOptions, traced
@@ -26,6 +27,7 @@ from sejax.networks import ACTIVATIONS, MLP, DuelingMLP, narrow
 from sejax.options import MOST_LAYERS, counts, fraction, one_of, option, positive
 
 MOVES = "the agent would not move"
+LOSSES = {"squared": jnp.square, "huber": optax.losses.huber_loss}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,6 +46,14 @@ class DDQNConfig(AgentOptions):
     epsilon_init: float = option(1.0, fraction(), traced=True)
     epsilon_min: float = option(0.01, fraction(), traced=True)
     epsilon_decay: float = option(0.9, fraction(), traced=True)  # factor for each episode
+    # If given, epsilon falls linearly in so many steps from when the agent first learns, whatever
+    # the episodes: for worlds where those have a step or two.
+    exploration_steps: int | None = option(None, counts("it counts steps"), traced=True)
+    double: bool = True  # the online network chooses a target's action; else the target network
+    loss: str = option("squared", one_of(LOSSES))  # of the error; huber: its gradient is clipped
+    target_update_every: int = option(1, counts())  # learning steps for each update of the target
+    train_every: int = option(1, counts())  # agent steps for each time that it learns, ...
+    gradient_steps: int = option(1, counts())  # ... in so many learning steps
 
     def make(self, task: Any) -> Agent:
         """The agent for a task's observations and actions."""
@@ -73,6 +83,17 @@ class DuelingDDQNConfig(DDQNConfig):
         )  # fmt: skip
 
 
+@dataclass(frozen=True, kw_only=True)
+class DQNConfig(DDQNConfig):
+    """DQN: no double Q-learning, clipped errors, a target network that is copied now and then.
+
+    Small and quick, for tasks of a few thousand steps: see docs/agents.md.
+    """
+
+    double: bool = False
+    loss: str = option("huber", one_of(LOSSES))
+
+
 @struct.dataclass
 class DDQNState:
     """One agent."""
@@ -81,6 +102,7 @@ class DDQNState:
     target_params: Float[Array, " num_params"]
     opt_state: optax.OptState
     epsilon: Array
+    num_steps: Int[Array, ""]  # agent steps since it first learned
     hparams: Any  # traced options, and hidden_size and batch_size in use or None
 
 
@@ -98,6 +120,7 @@ def make_ddqn(config: DDQNConfig, obs_dim: int, num_actions: int) -> Agent:
     """
     network = config.network(num_actions)
     unflatten = flat.unflattener(network.init, jnp.zeros(obs_dim))
+    learn = make_learning_step(config, network, unflatten)
 
     def init(key: Array, hparams: Any) -> DDQNState:
         variables = network.init(key, jnp.zeros(obs_dim))
@@ -110,6 +133,7 @@ def make_ddqn(config: DDQNConfig, obs_dim: int, num_actions: int) -> Agent:
             target_params=params,
             opt_state=flat.ADAM.init(params),
             epsilon=jnp.float32(hparams.epsilon_init),
+            num_steps=jnp.int32(0),
             hparams=hparams,
         )
 
@@ -119,46 +143,103 @@ def make_ddqn(config: DDQNConfig, obs_dim: int, num_actions: int) -> Agent:
             return jnp.argmax(q_values).astype(jnp.int32)
         return epsilon_greedy(key, q_values, state.epsilon)
 
+    def batch_size(state: DDQNState) -> Array | None:
+        in_use = state.hparams.batch_size
+        return None if in_use is None else in_use * config.gradient_steps
+
     return Agent(
         init=init,
         begin_episode=begin_episode,
         act=act,
-        update=make_learning_step(network, unflatten),
+        update=make_update(config, learn),
         hparams=traced(config, hidden_size=None, batch_size=None),
-        memory=replay_memory(config.batch_size, config.buffer_size),
+        memory=replay_memory(config.batch_size * config.gradient_steps, config.buffer_size),
         init_episodes=config.init_episodes,
         learns_from=config.init_episodes,
-        batch_size=lambda state: state.hparams.batch_size,
+        batch_size=batch_size,
     )
 
 
 def begin_episode(state: DDQNState, episode: Array) -> DDQNState:
-    """The share of random actions in the episode."""
+    """The share of random actions in the episode, unless it falls with steps."""
     hp = state.hparams
+    if hp.exploration_steps is not None:
+        return state
     epsilon = decayed_epsilon(hp.epsilon_init, hp.epsilon_min, hp.epsilon_decay, episode)
     return state.replace(epsilon=epsilon)
 
 
-def make_learning_step(
-    network: nn.Module, unflatten: Callable[[Array], Any]
+def linear_epsilon(hparams: Any, num_steps: Array) -> Array:
+    """The share of random actions `num_steps` after the agent first learned, `[]`.
+
+    It falls from `hparams.epsilon_init` to its `epsilon_min` in `exploration_steps` and stays.
+
+    Source: Mnih et al. (2015), extended data table 1 (final exploration frame).
+    """
+    progress = jnp.minimum(num_steps / hparams.exploration_steps, 1.0)
+    return hparams.epsilon_init + progress * (hparams.epsilon_min - hparams.epsilon_init)
+
+
+def make_update(
+    config: DDQNConfig, learn: Callable[[DDQNState, Transition], DDQNState]
 ) -> Callable[[Array, DDQNState, Transition], DDQNState]:
-    """Builds `update(key, state, batch) -> state`: Adam on the squared error to double-Q targets.
+    """Builds `update(key, state, batch) -> state`: when to learn, how often, and epsilon."""
+
+    def learn_all(state: DDQNState, batch: Transition) -> DDQNState:
+        if config.gradient_steps == 1:
+            return learn(state, batch)
+        batches = split_batch(batch, config.gradient_steps)
+        return jax.lax.scan(lambda state, batch: (learn(state, batch), None), state, batches)[0]
+
+    def update(key: Array, state: DDQNState, batch: Transition) -> DDQNState:
+        state = state.replace(num_steps=state.num_steps + 1)
+        if state.hparams.exploration_steps is not None:
+            state = state.replace(epsilon=linear_epsilon(state.hparams, state.num_steps))
+        if config.train_every == 1:
+            return learn_all(state, batch)
+        is_due = state.num_steps % config.train_every == 0
+        return jax.lax.cond(is_due, learn_all, lambda state, _: state, state, batch)
+
+    return update
+
+
+def split_batch(batch: Transition, num_parts: int) -> Transition:
+    """A batch as `num_parts` of them, leaves `[part, *feature, column]`.
+
+    They take turns in columns, so that each has its share of those that count.
+    """
+    batch = batch._replace(weight=jnp.broadcast_to(batch.weight, batch.reward.shape))
+
+    def split(x: Array) -> Array:
+        missing = -x.shape[-1] % num_parts
+        padded = jnp.pad(x, [(0, 0)] * (x.ndim - 1) + [(0, missing)])
+        return jnp.moveaxis(padded.reshape(*x.shape[:-1], -1, num_parts), -1, 0)
+
+    return jax.tree.map(split, batch)
+
+
+def make_learning_step(
+    config: DDQNConfig, network: nn.Module, unflatten: Callable[[Array], Any]
+) -> Callable[[DDQNState, Transition], DDQNState]:
+    """Builds `learn(state, batch) -> state`: Adam on the loss of the error to double-Q targets.
 
     Source: van Hasselt et al. (2016), eq. 4; `docs/reference.md` 4.1.
     """
+    loss_fn = LOSSES[config.loss]
 
     def sum_of_losses(params, target_params, discount, batch: Transition) -> Array:
         q_values = network.apply(params, batch.obs)  # [actions, batch]
+        target_next_q: Any = network.apply(target_params, batch.next_obs)
         targets = double_q_targets(
-            network.apply(params, batch.next_obs),
-            network.apply(target_params, batch.next_obs),
+            network.apply(params, batch.next_obs) if config.double else target_next_q,
+            target_next_q,
             batch.reward,
             discount * batch.discount,
         )
         error = select_action(q_values, batch.action) - jax.lax.stop_gradient(targets)
-        return jnp.sum(batch.weight * error**2)
+        return jnp.sum(batch.weight * loss_fn(error))
 
-    def update(key: Array, state: DDQNState, batch: Transition) -> DDQNState:
+    def learn(state: DDQNState, batch: Transition) -> DDQNState:
         hp = state.hparams
         params, target_params = unflatten(state.params), unflatten(state.target_params)
 
@@ -168,13 +249,15 @@ def make_learning_step(
         gradient = sum_over_batch(sum_of_gradients, batch, hp.batch_size) / num_columns(batch)
         moved, opt_state = flat.adam_step(state.params, state.opt_state, gradient, hp.learning_rate)
         tau = hp.target_update_rate
+        if config.target_update_every > 1:
+            tau = jnp.where(opt_state.count % config.target_update_every == 0, tau, 0.0)
         return state.replace(
             params=moved,
             target_params=tau * moved + (1 - tau) * state.target_params,
             opt_state=opt_state,
         )
 
-    return update
+    return learn
 
 
 def double_q_targets(
@@ -186,7 +269,8 @@ def double_q_targets(
     r"""Targets :math:`r + \gamma\, Q'(s', \arg\max_a Q(s', a))`.
 
     Args:
-      online_next_q: Q of the online network at the next states.
+      online_next_q: Q of the online network at the next states, by which actions are chosen. With
+        Q' in its place the targets are DQN's.
       target_next_q: Q' of the target network at the next states.
       reward: in the task's units.
       discount: gamma times the transition's own discount.

@@ -1,7 +1,11 @@
-"""PPO with a clipped ratio and Monte-Carlo returns, for discrete and for continuous actions.
+"""PPO with a clipped ratio, for discrete and for continuous actions.
 
-Source: Schulman et al., "Proximal Policy Optimization Algorithms" (2017); the paper's appendix,
-table of PPO; `docs/reference.md` 4.5.
+With Monte-Carlo returns and all of the rollout in each Adam step, as the paper's code has it, or
+with generalised advantages and shuffled minibatches, as everybody else does.
+
+Source: Schulman et al., "Proximal Policy Optimization Algorithms" (2017); Schulman et al.,
+"High-Dimensional Continuous Control Using Generalized Advantage Estimation" (2016); the paper's
+appendix, table of PPO; `docs/reference.md` 4.5.
 """
 
 import functools
@@ -20,9 +24,12 @@ from sejax.agents import flat
 from sejax.agents.agent import Agent, AgentOptions, traced
 from sejax.agents.ddqn import select_action
 from sejax.agents.memory import Rollout, rollout_memory
+from sejax.agents.replay import Transition
+from sejax.errors import require
 from sejax.networks import ACTIVATIONS, MLP, narrow
 from sejax.options import MOST_LAYERS, counts, fraction, not_negative, one_of, option, positive
 
+ADVANTAGES = ("monte_carlo", "gae")
 MIN_STD = 0.01  # of the Gaussian policy, in units of the action
 _MAX_LOG_RATIO = 20.0  # exp(20) is beyond any clip, and finite
 
@@ -32,6 +39,13 @@ class PPOConfig(AgentOptions):
     """PPO (clip) for discrete and continuous actions (paper, appendix, table of PPO).
 
     The defaults are the paper's for MountainCarContinuous, whose RNs add `action_repeat=5`.
+    Whoever has few steps takes settings like those below (measured: `docs/agents.md`).
+
+    Example:
+      >>> quick = PPOConfig(
+      ...     advantages="gae", rollout_steps=128, num_minibatches=4, epochs=10,
+      ...     learning_rate=2e-3, max_grad_norm=0.5, adam_eps=1e-5, activation="tanh",
+      ... )
     """
 
     actions: ClassVar[tuple[str, ...]] = ("discrete", "continuous")
@@ -46,10 +60,18 @@ class PPOConfig(AgentOptions):
     )
     discount: float = option(0.99, fraction(), traced=True)
     update_episodes: int = option(10, counts())  # of full length, between two learning phases
-    epochs: int = option(80, counts())  # Adam steps on all of the rollout in a learning phase
+    # Decisions between two learning phases; null: as `update_episodes` says.
+    rollout_steps: int | None = option(None, counts())
+    epochs: int = option(80, counts())  # passes over the rollout in a learning phase
+    num_minibatches: int = option(1, counts())  # Adam steps in an epoch, each on its part of it
+    advantages: str = option("monte_carlo", one_of(ADVANTAGES))
+    gae_lambda: float = option(0.95, fraction(), traced=True)  # of advantages=gae
     clip_ratio: float = option(0.2, positive("the agent would not move"), traced=True)
     value_weight: float = option(1.0, not_negative(), traced=True)
     entropy_weight: float = option(0.01, not_negative(), traced=True)
+    # Longest gradient, which a longer one is shortened to.
+    max_grad_norm: float | None = option(None, positive("the agent would not move"))
+    adam_eps: float = option(1e-8, positive("it keeps Adam from dividing by 0"))
     # Of the Gaussian policy; learned.
     init_action_std: float = option(0.5, positive("the agent would not move"))
     action_repeat: int = option(1, counts())
@@ -61,7 +83,7 @@ class PPOConfig(AgentOptions):
                         task.max_steps)  # fmt: skip
 
     def rollout_length(self, max_episode_steps: int) -> int:
-        """Decisions between two learning phases.
+        """Decisions between two learning phases: `rollout_steps`, if that is set.
 
         The authors learn as soon as (decisions x `action_repeat`) / `max_episode_steps` exceeds
         `update_episodes`, also in the middle of an episode; this is the first whole number that
@@ -69,11 +91,20 @@ class PPOConfig(AgentOptions):
 
         Source: `docs/reference.md` 4.5.
         """
+        if self.rollout_steps is not None:
+            return self.rollout_steps
         return self.update_episodes * max_episode_steps // self.action_repeat + 1
 
     def steps_before_learning(self, max_episode_steps: int) -> int:
         """As of any agent; PPO learns once a rollout is full."""
         return self.rollout_length(max_episode_steps) * self.action_repeat
+
+    def optimizer(self) -> optax.GradientTransformation:
+        """Adam's direction, of a gradient that may be shortened first."""
+        adam = optax.scale_by_adam(eps=self.adam_eps)
+        if self.max_grad_norm is None:
+            return adam
+        return optax.chain(optax.clip_by_global_norm(self.max_grad_norm), adam)
 
 
 class PPOState(struct.PyTreeNode):
@@ -130,6 +161,7 @@ def make_ppo(
 
     Raises:
       ValueError: unless exactly one of `num_actions` and `action_dim` is given.
+      ConfigError: if a rollout has fewer than two steps for each minibatch.
 
     Example:
       >>> agent = make_ppo(PPOConfig(), 4, num_actions=2, action_dim=None, max_action=1.0,
@@ -145,13 +177,21 @@ def make_ppo(
         )
     policy = SOFTMAX if action_dim is None else gaussian(max_action)
     networks = make_networks(config, obs_dim, policy, num_actions, action_dim)
-    learn = make_learning_phase(config, networks, obs_dim, is_discrete=action_dim is None)
+    length = config.rollout_length(max_steps)
+    require(
+        config.num_minibatches == 1 or 2 * config.num_minibatches <= length,
+        "agent.num_minibatches", f"be at most half of the rollout's {length} steps",
+        "advantages are compared within a minibatch", config.num_minibatches,
+        f"agent.num_minibatches={max(1, length // 2)}",
+    )  # fmt: skip
+    optimizer = config.optimizer()
+    learn = make_learning_phase(config, networks, optimizer, obs_dim, action_dim is None)
 
     def init(key: Array, hparams: Any) -> PPOState:
         params = networks.init(key, hparams.hidden_size)
         return PPOState(
             params=params,
-            opt_state=flat.ADAM.init(params),
+            opt_state=optimizer.init(params),
             hparams=jax.tree.map(jnp.float32, hparams),
         )
 
@@ -168,10 +208,9 @@ def make_ppo(
 
         def phase(carry: tuple[Array, Array, Any]) -> tuple[Array, Array, Any]:
             _, params, opt_state = carry
-            # XLA would move what depends on the rows alone out of the loop, into every step.
-            rows, params = jax.lax.optimization_barrier((rollout.rows, params))
-            full = rollout._replace(rows=rows)
-            return jnp.bool_(False), *learn(params, opt_state, full, state.hparams)
+            # XLA would move what does not depend on the carry out of the loop, into every step.
+            inputs = jax.lax.optimization_barrier((key, params, rollout.rows))
+            return jnp.bool_(False), *learn(*inputs, opt_state, state.hparams)
 
         _, params, opt_state = jax.lax.while_loop(
             lambda carry: carry[0], phase, (rollout.is_full, state.params, state.opt_state)
@@ -182,7 +221,7 @@ def make_ppo(
         init=init,
         act=act,
         update=update,
-        memory=rollout_memory(config.rollout_length(max_steps)),
+        memory=rollout_memory(length),
         hparams=traced(config, hidden_size=None),
         init_episodes=config.init_episodes,
         learns_from=0,
@@ -199,6 +238,7 @@ class Networks(NamedTuple):
         None for all.
       unflatten: of flat parameters to the tree.
       actor: `(tree, obs) -> (outputs, std)`.
+      critic: `(tree, obs) -> value`, `[steps]`.
       evaluate: `(tree, obs, action) -> (log_prob, entropy, value)`, `[steps]` each.
       least_params: lower bounds of flat parameters: only the std has one.
     """
@@ -206,6 +246,7 @@ class Networks(NamedTuple):
     init: Callable[[Array, Array | None], Array]
     unflatten: Callable[[Array], Any]
     actor: Callable[[Any, Array], tuple[Array, Array]]
+    critic: Callable[[Any, Array], Array]
     evaluate: Callable[[Any, Array, Array], tuple[Array, Array, Array]]
     least_params: Float[Array, " num_params"]
 
@@ -241,10 +282,13 @@ def make_networks(
         outputs: Any = mlps["actor"].apply(tree["actor"], obs)
         return outputs, tree["std"]
 
+    def critic(tree: Any, obs: Array) -> Array:
+        value: Any = mlps["critic"].apply(tree["critic"], obs)
+        return value[0]
+
     def evaluate(tree: Any, obs: Array, action: Array) -> tuple[Array, Array, Array]:
         log_prob, entropy = policy.evaluate(*actor(tree, obs), action)
-        value: Any = mlps["critic"].apply(tree["critic"], obs)
-        return log_prob, entropy, value[0]
+        return log_prob, entropy, critic(tree, obs)
 
     template = jax.eval_shape(init_tree, jax.random.key(0))
     unbounded = jax.tree.map(lambda x: jnp.full(x.shape, -jnp.inf), template)
@@ -252,39 +296,136 @@ def make_networks(
         init=init,
         unflatten=flat.unflattener(init_tree),
         actor=actor,
+        critic=critic,
         evaluate=evaluate,
         least_params=flat.flatten({**unbounded, "std": jnp.full(std_dim, MIN_STD)}),
     )
 
 
-def make_learning_phase(
-    config: PPOConfig, networks: Networks, obs_dim: int, is_discrete: bool
-) -> Callable[[Array, Any, Rollout, Any], tuple[Array, Any]]:
-    """Builds `learn(params, opt_state, rollout, hparams) -> (params, opt_state)`.
+class Batch(NamedTuple):
+    """What a learning phase learns from, steps last: a rollout or a minibatch of it.
 
-    A learning phase: `config.epochs` Adam steps on the whole rollout.
+    Attributes:
+      old_log_prob: of the actions when the rollout was made, in nats.
+      advantage: of the actions; None where it is to be `returns` less the critic's present value.
+      returns: what the critic is to predict.
     """
-    evaluate, unflatten = networks.evaluate, networks.unflatten
 
-    def learn(params: Array, opt_state: Any, rollout: Rollout, hp: Any) -> tuple[Array, Any]:
+    obs: Float[Array, "obs_dim steps"]
+    action: Array
+    old_log_prob: Float[Array, " steps"]
+    advantage: Float[Array, " steps"] | None
+    returns: Float[Array, " steps"]
+
+
+def make_learning_phase(
+    config: PPOConfig,
+    networks: Networks,
+    optimizer: optax.GradientTransformation,
+    obs_dim: int,
+    is_discrete: bool,
+) -> Callable[[Array, Array, Array, Any, Any], tuple[Array, Any]]:
+    """Builds `learn(key, params, rows, opt_state, hparams) -> (params, opt_state)`.
+
+    A learning phase on a rollout's `rows`: `config.epochs` passes over it, each of
+    `config.num_minibatches` Adam steps. A rollout that these do not divide leaves some steps out of
+    each pass.
+    """
+    unflatten = networks.unflatten
+
+    def prepared(tree: Any, rollout: Rollout, hp: Any) -> Batch:
         steps = rollout.transitions(obs_dim, is_discrete)
-        returns = normalized(discounted_returns(steps.reward, rollout.ended, hp.discount))
         # These parameters have made the whole rollout.
-        old_log_prob, _, _ = evaluate(unflatten(params), steps.obs, steps.action)
+        old_log_prob, _, value = networks.evaluate(tree, steps.obs, steps.action)
+        advantage = None
+        if config.advantages == "gae":
+            next_value = networks.critic(tree, steps.next_obs)
+            advantage = generalized_advantages(
+                steps, rollout.ended, value, next_value, hp.discount, hp.gae_lambda
+            )
+            returns = advantage + value
+        else:
+            returns = normalized(discounted_returns(steps.reward, rollout.ended, hp.discount))
+        return Batch(steps.obs, steps.action, old_log_prob, advantage, returns)
 
-        def loss_fn(tree: Any) -> Array:
-            log_prob, entropy, value = evaluate(tree, steps.obs, steps.action)
-            return ppo_loss(log_prob, entropy, value, old_log_prob, returns, hp)
+    def loss_fn(tree: Any, batch: Batch, hp: Any) -> Array:
+        log_prob, entropy, value = networks.evaluate(tree, batch.obs, batch.action)
+        if batch.advantage is None:
+            advantage = jax.lax.stop_gradient(batch.returns - value)
+        else:
+            advantage = normalized(batch.advantage)
+        return ppo_loss(log_prob, entropy, value, batch.old_log_prob, advantage, batch.returns, hp)
 
-        def epoch(number: Array, carry: tuple[Array, Any]) -> tuple[Array, Any]:
+    def learn(key: Array, params: Array, rows: Array, opt_state: Any, hp: Any) -> tuple[Array, Any]:
+        batch = prepared(unflatten(params), Rollout(rows, jnp.bool_(True)), hp)
+        order = shuffled(key, config.epochs, config.num_minibatches, rows.shape[0])
+
+        def adam_step(number: Array, carry: tuple[Array, Any]) -> tuple[Array, Any]:
             params, opt_state = carry
-            gradient = flat.flatten(jax.grad(loss_fn)(unflatten(params)))
-            moved, opt_state = flat.adam_step(params, opt_state, gradient, hp.learning_rate)
+            minibatch = batch
+            if config.num_minibatches > 1:
+                minibatch = jax.tree.map(lambda x: x[..., order[number]], batch)
+            gradient = flat.flatten(jax.grad(loss_fn)(unflatten(params), minibatch, hp))
+            direction: Any
+            direction, opt_state = optimizer.update(gradient, opt_state)
+            moved = params - hp.learning_rate * direction
             return jnp.maximum(moved, networks.least_params), opt_state
 
-        return jax.lax.fori_loop(0, config.epochs, epoch, (params, opt_state))
+        num_updates = config.epochs * config.num_minibatches
+        return jax.lax.fori_loop(0, num_updates, adam_step, (params, opt_state))
 
     return learn
+
+
+def shuffled(
+    key: Array, epochs: int, num_minibatches: int, num_steps: int
+) -> Int[Array, "updates size"]:
+    """Which steps each minibatch has: in each epoch all of them, in random order.
+
+    Each epoch's steps are sorted by random bits, whose last ones are the step's number: a sort of
+    single numbers takes a fifth of the time of `jax.random.permutation`. The bits are MurmurHash3's
+    finaliser of counters that start at random, since XLA would move what threefry does with
+    counters that start at 0 out of the learning phase, into every step.
+    """
+    size = num_steps // num_minibatches
+    x = jax.random.bits(key) + jnp.arange(epochs * num_steps, dtype=jnp.uint32)
+    x = (x ^ (x >> 16)) * jnp.uint32(0x85EBCA6B)
+    x = (x ^ (x >> 13)) * jnp.uint32(0xC2B2AE35)
+    bits = (x ^ (x >> 16)).reshape(epochs, num_steps)
+    mask = jnp.uint32((1 << (num_steps - 1).bit_length()) - 1)
+    order = jax.lax.sort(bits & ~mask | jnp.arange(num_steps, dtype=jnp.uint32)) & mask
+    return order[:, : num_minibatches * size].reshape(-1, size).astype(jnp.int32)
+
+
+def generalized_advantages(
+    steps: Transition,
+    ended: Float[Array, " steps"],
+    value: Float[Array, " steps"],
+    next_value: Float[Array, " steps"],
+    discount: Array | float,
+    gae_lambda: Array | float,
+) -> Float[Array, " steps"]:
+    r"""Advantages :math:`A_t = \delta_t + \gamma d_t \lambda A_{t+1}` within each episode.
+
+    .. math:: \delta_t = r_t + \gamma d_t V(s'_t) - V(s_t)
+
+    where :math:`d_t` is the transition's own discount: 0 where the episode terminated; at a time
+    limit, and where the rollout is cut, the critic's value of the next state stands for what would
+    have come.
+
+    Args:
+      steps: `reward` and `discount` of each step.
+      ended: 1 at the last step of an episode, terminated or truncated, else 0.
+      value: V(s), in units of the reward.
+      next_value: V(s'), likewise.
+      discount: gamma.
+      gae_lambda: lambda; 0 has the least variance, 1 the least bias.
+
+    Source: Schulman et al. (2016), eq. 11 to 16.
+    """
+    decay = discount * steps.discount
+    delta = steps.reward + decay * next_value - value
+    return discounted_sums(delta, gae_lambda * decay, ended)
 
 
 def discounted_returns(
@@ -303,19 +444,26 @@ def discounted_returns(
     0.5, which in an SE is not so at a time limit; returns there run on into the next episode.
     """
 
-    def step(later: Array, x: tuple[Array, Array]) -> tuple[Array, Array]:
-        reward, ended = x
-        now = reward + discount * jnp.where(ended > 0.5, 0.0, later)
+    return discounted_sums(reward, jnp.broadcast_to(discount, reward.shape), ended)
+
+
+def discounted_sums(
+    x: Float[Array, " steps"], decay: Float[Array, " steps"], ended: Float[Array, " steps"]
+) -> Float[Array, " steps"]:
+    """Sums :math:`y_t = x_t + decay_t y_{t+1}` within each episode."""
+
+    def step(later: Array, terms: tuple[Array, Array, Array]) -> tuple[Array, Array]:
+        x, decay, ended = terms
+        now = x + decay * jnp.where(ended > 0.5, 0.0, later)
         return now, now
 
-    _, returns = jax.lax.scan(step, jnp.float32(0), (reward, ended), reverse=True)
-    return returns
+    return jax.lax.scan(step, jnp.float32(0), (x, decay, ended), reverse=True)[1]
 
 
-def normalized(returns: Float[Array, " steps"]) -> Float[Array, " steps"]:
-    """Returns with mean 0 and std 1, the std being the unbiased estimate plus 1e-5."""
-    std = jnp.std(returns, ddof=min(1, returns.shape[0] - 1))
-    return (returns - jnp.mean(returns)) / (std + 1e-5)
+def normalized(x: Float[Array, " steps"]) -> Float[Array, " steps"]:
+    """Numbers with mean 0 and std 1, the std being the unbiased estimate plus 1e-5."""
+    std = jnp.std(x, ddof=min(1, x.shape[0] - 1))
+    return (x - jnp.mean(x)) / (std + 1e-5)
 
 
 def ppo_loss(
@@ -323,6 +471,7 @@ def ppo_loss(
     entropy: Float[Array, " steps"],
     value: Float[Array, " steps"],
     old_log_prob: Float[Array, " steps"],
+    advantage: Float[Array, " steps"],
     returns: Float[Array, " steps"],
     hp: Any,
 ) -> Float[Array, ""]:
@@ -331,20 +480,19 @@ def ppo_loss(
     .. math:: -\overline{\min(\rho A, \mathrm{clip}(\rho, 1-\epsilon, 1+\epsilon) A)}
        + c_V \overline{(V - R)^2} - c_H \overline{H}
 
-    with the ratio :math:`\rho` of the new to the old probability and the advantage
-    :math:`A = R - V`, which passes no gradient.
+    with the ratio :math:`\rho` of the new to the old probability.
 
     Args:
       log_prob: of the actions, in nats.
       entropy: of the policy, in nats.
       value: V of the critic, in units of `returns`.
       old_log_prob: of the actions when the rollout was made.
-      returns: R, normalised.
+      advantage: A of the actions, about 1 in size; passes no gradient.
+      returns: R, what the critic is to predict.
       hp: clip_ratio (epsilon), value_weight (c_V) and entropy_weight (c_H).
 
     Source: Schulman et al. (2017), eq. 7 and 9; `docs/reference.md` 4.5.
     """
-    advantage = jax.lax.stop_gradient(returns - value)
     ratio = jnp.exp(jnp.clip(log_prob - old_log_prob, -_MAX_LOG_RATIO, _MAX_LOG_RATIO))
     clipped = jnp.clip(ratio, 1 - hp.clip_ratio, 1 + hp.clip_ratio)
     surrogate = jnp.mean(jnp.minimum(ratio * advantage, clipped * advantage))

@@ -1,11 +1,10 @@
-"""Configurations of the proxies. Importing this imports no gymnax, which takes seconds."""
+"""Configurations of the proxies. Importing this imports neither JAX nor gymnax."""
 
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
 from sejax.errors import require
-from sejax.networks import ACTIVATIONS
-from sejax.options import MOST_LAYERS, Options, counts, one_of, option
+from sejax.options import ACTIVATIONS, MOST_LAYERS, Options, counts, one_of, option
 
 DONE_MODES = ("soft", "threshold", "bernoulli", "sigmoid")
 INITIAL_STATES = ("real", "learned")

@@ -68,14 +68,14 @@ class SyntheticEnv(ProxyEnv):
     def init_weights(self, key: Array) -> Any:
         """Random weights, `{"state", "reward", "done", "start"}` as far as there are networks."""
         example = jnp.zeros(self.task.action_dim + self.task.obs_dim)
-        keys = jax.random.split(key, len(self._nets))
+        *keys, key_start = jax.random.split(key, len(self._nets) + 1)
         weights = {
             head: net.init(k, example)["params"]
             for k, (head, net) in zip(keys, self._nets.items(), strict=True)
         }
         if self._start is not None:
             noise = jnp.zeros(self.task.obs_dim)
-            weights["start"] = self._start.init(jax.random.fold_in(key, 1), noise)["params"]
+            weights["start"] = self._start.init(key_start, noise)["params"]
         return weights
 
     def params(self, weights: Any, discount: Array | float = 1.0) -> ProxyParams:

@@ -1,0 +1,441 @@
+"""Soft actor-critic, for continuous actions and for discrete ones.
+
+The two share everything but a `Policy`: a Gaussian squashed by tanh, of which one action is drawn
+for each expectation, or a softmax, under which expectations are sums.
+
+Source: Haarnoja et al., "Soft Actor-Critic Algorithms and Applications" (2018); Christodoulou,
+"Soft Actor-Critic for Discrete Action Settings" (2019).
+"""
+
+import functools
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, ClassVar, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import optax
+from flax import struct
+from jaxtyping import Array, Bool, Float
+
+from sejax.agents import flat
+from sejax.agents.agent import Agent, AgentOptions, traced
+from sejax.agents.ddqn import MOVES, select_action
+from sejax.agents.memory import replay_memory
+from sejax.agents.partial_batch import sum_over_batch
+from sejax.agents.replay import Transition, num_columns
+from sejax.networks import ACTIVATIONS, MLP, narrow
+from sejax.options import (
+    MOST_LAYERS,
+    counts,
+    finite,
+    fraction,
+    not_negative,
+    one_of,
+    option,
+    positive,
+)
+
+_MIN_LOG_STD, _MAX_LOG_STD = -20.0, 2.0  # of the Gaussian, as in the authors' code
+
+
+@dataclass(frozen=True, kw_only=True)
+class SACConfig(AgentOptions):
+    """SAC's hyperparameters; the defaults are those of Haarnoja et al. (2018), table 1.
+
+    Differs: the buffer holds 100,000 steps where the authors' holds a million.
+    """
+
+    actions: ClassVar[tuple[str, ...]] = ("discrete", "continuous")
+
+    # With uniformly random actions.
+    init_episodes: int = option(10, counts("it counts episodes", least=0))
+    batch_size: int = option(256, counts(), varied="triple")
+    buffer_size: int = option(100_000, counts())
+    hidden_size: int = option(256, counts(), varied="triple")
+    num_layers: int = option(2, counts(most=MOST_LAYERS), varied="one_more_or_less")
+    activation: str = option("relu", one_of(ACTIVATIONS))
+    # Of the actor, the critics and the temperature.
+    learning_rate: float = option(3e-4, positive(MOVES), traced=True, varied="triple")
+    target_update_rate: float = option(0.005, fraction(), traced=True)  # tau
+    discount: float = option(0.99, fraction(), traced=True)  # gamma
+    action_repeat: int = option(1, counts())  # steps of the world for each decision
+    # Temperature: what a nat of entropy is worth, in reward units. None: learned, as the authors do
+    # to meet a target entropy.
+    alpha: float | None = option(None, not_negative("it weighs the entropy"), traced=True)
+    init_alpha: float = option(1.0, positive("it is learned as a logarithm"), traced=True)
+    # Of actions in [-1, 1], in nats for each dimension.
+    target_entropy: float = option(-1.0, finite("the temperature must settle"), traced=True)
+    # Of discrete actions, as a fraction of the largest, log |A|.
+    target_entropy_fraction: float = option(0.98, fraction(), traced=True)
+
+    def make(self, task: Any) -> Agent:
+        """The agent for a task's observations and actions."""
+        if task.num_actions is None:
+            return make_sac(self, task.obs_dim, task.action_dim, task.max_action)
+        return make_sac_discrete(self, task.obs_dim, task.num_actions)
+
+
+class SACState(struct.PyTreeNode):
+    """One agent. Parameters are flat: the actor's, both critics' and log alpha in one vector."""
+
+    params: Float[Array, " num_params"]
+    target_critics: Float[Array, " num_critic_params"]
+    opt_state: optax.OptState
+    is_warming_up: Bool[Array, ""]
+    hparams: Any  # traced options, and hidden_size and batch_size in use or None
+
+
+class LearningNoise(NamedTuple):
+    """Standard normal numbers of one learning step, `[action_dim, batch]`; None if discrete.
+
+    Attributes:
+      next_action: of the actions drawn for the next states.
+      action: of those drawn for the states.
+    """
+
+    next_action: Array | None
+    action: Array | None
+
+
+# `inputs [in, batch] -> [2, out, batch]`, both critics with some parameters.
+Critics = Callable[[Array], Array]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Policy:
+    """What the two variants differ in. Actions and outputs are `[feature, *batch]`.
+
+    Attributes:
+      num_outputs: of the actor.
+      critic_inputs: how many numbers besides the observation's.
+      critic_outputs: of each critic.
+      target_entropy: `hparams -> []`, in nats.
+      draw: `(key, batch) -> noise`, the randomness of `expected`.
+      sample: `(key, outputs) -> action` of the policy, for one observation.
+      best: `outputs -> action` without any randomness.
+      warm_up: `key -> action`, uniformly random.
+      q_values: `(critics, obs, action) -> [2, batch]`, of actions that were taken.
+      expected: `(critics, obs, outputs, noise) -> (q_value, entropy)`, `[batch]` each: the lesser
+        critic's value and the entropy, in expectation over the policy or for a draw of it.
+      env_action: `action -> action` as the world takes it.
+    """
+
+    num_outputs: int
+    critic_inputs: int
+    critic_outputs: int
+    target_entropy: Callable[[Any], Array]
+    draw: Callable[[Array, int], Array | None]
+    sample: Callable[[Array, Array], Array]
+    best: Callable[[Array], Array]
+    warm_up: Callable[[Array], Array]
+    q_values: Callable[[Critics, Array, Array], Array]
+    expected: Callable[[Critics, Array, Array, Array | None], tuple[Array, Array]]
+    env_action: Callable[[Array], Array]
+
+
+@functools.cache
+def make_sac(config: SACConfig, obs_dim: int, action_dim: int, max_action: float) -> Agent:
+    """Builds the agent for observations `[obs_dim]` and actions `[action_dim]`.
+
+    It remembers actions in [-1, 1]; the world takes `max_action` times as much.
+
+    Example:
+      >>> agent = make_sac(SACConfig(), obs_dim=3, action_dim=1, max_action=2.0)
+      >>> state = agent.init(jax.random.key(0), agent.hparams)
+      >>> agent.act(jax.random.key(1), state, jnp.zeros(3), explore=True).shape
+      (1,)
+    """
+    return _make_agent(config, obs_dim, gaussian_policy(action_dim, max_action))
+
+
+@functools.cache
+def make_sac_discrete(config: SACConfig, obs_dim: int, num_actions: int) -> Agent:
+    """Builds the agent for observations `[obs_dim]` and actions `0..num_actions-1`.
+
+    Example:
+      >>> agent = make_sac_discrete(SACConfig(), obs_dim=4, num_actions=2)
+      >>> state = agent.init(jax.random.key(0), agent.hparams)
+      >>> int(agent.act(jax.random.key(1), state, jnp.zeros(4), explore=True)) in (0, 1)
+      True
+    """
+    return _make_agent(config, obs_dim, softmax_policy(num_actions))
+
+
+def _make_agent(config: SACConfig, obs_dim: int, policy: Policy) -> Agent:
+    networks = make_networks(config, obs_dim, policy)
+    learn = make_learning_step(networks, policy)
+
+    def init(key: Array, hparams: Any) -> SACState:
+        params = networks.init(key, hparams)
+        return SACState(
+            params=params,
+            target_critics=networks.critics_of(params),
+            opt_state=flat.ADAM.init(params),
+            is_warming_up=jnp.bool_(config.init_episodes > 0),
+            hparams=jax.tree.map(jnp.float32, hparams),
+        )
+
+    def begin_episode(state: SACState, episode: Array) -> SACState:
+        return state.replace(is_warming_up=jnp.asarray(episode < config.init_episodes))
+
+    def act(key: Array, state: SACState, obs: Float[Array, " obs_dim"], explore: bool) -> Array:
+        outputs = networks.actor(networks.unflatten(state.params), obs)
+        if not explore:
+            return policy.best(outputs)
+        key_policy, key_warm_up = jax.random.split(key)
+        action = policy.sample(key_policy, outputs)
+        return jnp.where(state.is_warming_up, policy.warm_up(key_warm_up), action)
+
+    def update(key: Array, state: SACState, batch: Transition) -> SACState:
+        return learn(state, batch, draw_learning_noise(key, policy, batch.reward.size))
+
+    return Agent(
+        init=init,
+        begin_episode=begin_episode,
+        act=act,
+        update=update,
+        memory=replay_memory(config.batch_size, config.buffer_size),
+        hparams=traced(config, hidden_size=None, batch_size=None),
+        init_episodes=config.init_episodes,
+        learns_from=config.init_episodes,
+        env_action=policy.env_action,
+        action_repeat=config.action_repeat,
+        batch_size=lambda state: state.hparams.batch_size,
+    )
+
+
+# --- networks ------------------------------------------------------------------------------------
+
+
+class Params(NamedTuple):
+    """Parameters of an agent; the leaves of `critics` are `[2, ...]`."""
+
+    actor: Any
+    critics: Any
+    log_alpha: Array
+
+
+class Networks(NamedTuple):
+    """The actor and the critics as functions of parameters.
+
+    Attributes:
+      init: `(key, hparams) -> params`, `[num_params]`.
+      unflatten: `params [num_params] -> Params`.
+      critics_of: `params [num_params] -> critics [num_critic_params]`.
+      unflatten_critics: `critics [num_critic_params] -> Params.critics`.
+      actor: `(Params, obs) -> outputs`, `[num_outputs, *batch]`.
+      critics: `(Params.critics, inputs) -> outputs`, `[2, critic_outputs, batch]`.
+    """
+
+    init: Callable[[Array, Any], Array]
+    unflatten: Callable[[Array], Params]
+    critics_of: Callable[[Array], Array]
+    unflatten_critics: Callable[[Array], Any]
+    actor: Callable[[Params, Array], Array]
+    critics: Callable[[Any, Array], Array]
+
+
+def make_networks(config: SACConfig, obs_dim: int, policy: Policy) -> Networks:
+    """An actor and two critics of the same hidden layers."""
+
+    def network(num_outputs: int) -> MLP:
+        return MLP(
+            num_outputs, config.hidden_size, config.num_layers, config.activation,
+            learn_prelu_slope=True,
+        )  # fmt: skip
+
+    actor, critic = network(policy.num_outputs), network(policy.critic_outputs)
+
+    def init_network(key: Array, mlp: MLP, num_inputs: int, hidden_size: Array | None) -> Any:
+        variables: Any = mlp.init(key, jnp.zeros(num_inputs))
+        if hidden_size is not None:
+            variables = {"params": narrow(variables["params"], hidden_size)}
+        return variables
+
+    def init_critics(key: Array, hidden_size: Array | None = None) -> Any:
+        num_inputs = obs_dim + policy.critic_inputs
+        return jax.vmap(lambda key: init_network(key, critic, num_inputs, hidden_size))(
+            jax.random.split(key)
+        )
+
+    def init_all(key: Array, hidden_size: Array | None = None) -> Params:
+        key_actor, key_critics = jax.random.split(key)
+        return Params(
+            actor=init_network(key_actor, actor, obs_dim, hidden_size),
+            critics=init_critics(key_critics, hidden_size),
+            log_alpha=jnp.zeros(()),
+        )
+
+    def init(key: Array, hparams: Any) -> Array:
+        params = init_all(key, hparams.hidden_size)
+        return flat.flatten(params._replace(log_alpha=jnp.log(jnp.float32(hparams.init_alpha))))
+
+    unflatten_critics = flat.unflattener(init_critics)
+    sizes = [sum(math.prod(x.shape) for x in jax.tree.leaves(part))
+             for part in jax.eval_shape(init_all, jax.random.key(0))]  # fmt: skip
+    return Networks(
+        init=init,
+        unflatten=flat.unflattener(init_all),
+        critics_of=lambda params: params[sizes[0] : sizes[0] + sizes[1]],
+        unflatten_critics=unflatten_critics,
+        actor=lambda params, obs: actor.apply(params.actor, obs),
+        critics=jax.vmap(critic.apply, (0, None)),
+    )
+
+
+# --- learning ------------------------------------------------------------------------------------
+
+
+def make_learning_step(
+    networks: Networks, policy: Policy
+) -> Callable[[SACState, Transition, LearningNoise], SACState]:
+    r"""Builds `learn(state, batch, noise) -> state`.
+
+    One step of Adam on all three losses from the same parameters, as in the authors' code, each
+    with a gradient for its own parameters alone:
+
+    .. math::
+      y &= r + \gamma d\, E[\min_i Q'_i(s', a') - \alpha \log \pi(a'|s')] \\
+      J_Q &= \tfrac12 \sum_i (Q_i(s, a) - y)^2 \\
+      J_\pi &= E[\alpha \log \pi(a|s) - \min_i Q_i(s, a)] \\
+      J_\alpha &= \log \alpha\, (E[-\log \pi(a|s)] - \bar H)
+
+    Differs: the paper's temperature loss has alpha where its logarithm stands here and in the
+    authors' code; alpha then falls and rises at a rate of its own, whatever it is.
+
+    Source: Haarnoja et al. (2018), equations 5, 7 and 18; Christodoulou (2019), equations 10 to 12.
+    """
+
+    def sum_of_losses(
+        params: Params, target_critics: Any, hp: Any, batch: Transition, noise: LearningNoise
+    ) -> Array:
+        fixed = jax.lax.stop_gradient(params)
+        online, online_fixed, target = (
+            functools.partial(networks.critics, critics)
+            for critics in (params.critics, fixed.critics, target_critics)
+        )
+        alpha = jnp.exp(fixed.log_alpha) if hp.alpha is None else hp.alpha
+        next_q, next_entropy = policy.expected(
+            target, batch.next_obs, networks.actor(fixed, batch.next_obs), noise.next_action
+        )
+        targets = batch.reward + hp.discount * batch.discount * (next_q + alpha * next_entropy)
+        errors = policy.q_values(online, batch.obs, batch.action) - targets
+        q_value, entropy = policy.expected(
+            online_fixed, batch.obs, networks.actor(params, batch.obs), noise.action
+        )
+        losses = 0.5 * jnp.sum(errors**2, axis=0) - (q_value + alpha * entropy)
+        if hp.alpha is None:
+            excess = jax.lax.stop_gradient(entropy) - policy.target_entropy(hp)
+            losses = losses + params.log_alpha * excess
+        return jnp.sum(batch.weight * losses)
+
+    def learn(state: SACState, batch: Transition, noise: LearningNoise) -> SACState:
+        hp = state.hparams
+        params = networks.unflatten(state.params)
+        target_critics = networks.unflatten_critics(state.target_critics)
+
+        def sum_of_gradients(columns: tuple[Transition, LearningNoise]) -> Array:
+            return flat.flatten(jax.grad(sum_of_losses)(params, target_critics, hp, *columns))
+
+        gradient = sum_over_batch(sum_of_gradients, (batch, noise), hp.batch_size)
+        moved, opt_state = flat.adam_step(
+            state.params, state.opt_state, gradient / num_columns(batch), hp.learning_rate
+        )
+        tau = hp.target_update_rate
+        return state.replace(
+            params=moved,
+            opt_state=opt_state,
+            target_critics=tau * networks.critics_of(moved) + (1 - tau) * state.target_critics,
+        )
+
+    return learn
+
+
+def draw_learning_noise(key: Array, policy: Policy, batch: int) -> LearningNoise:
+    """The random numbers of a learning step on so many columns."""
+    return LearningNoise(*(policy.draw(key, batch) for key in jax.random.split(key)))
+
+
+# --- policies ------------------------------------------------------------------------------------
+
+
+def gaussian_policy(action_dim: int, max_action: float) -> Policy:
+    """Continuous actions: the tanh of a Gaussian whose mean and log std are the outputs."""
+
+    def best(outputs: Array) -> Array:
+        return jnp.tanh(outputs[:action_dim])
+
+    def q_values(critics: Critics, obs: Array, action: Array) -> Array:
+        return critics(jnp.concatenate([obs, action]))[:, 0]
+
+    def expected(
+        critics: Critics, obs: Array, outputs: Array, noise: Array | None
+    ) -> tuple[Array, Array]:
+        action, log_p = squashed_gaussian(outputs, noise)
+        return jnp.min(q_values(critics, obs, action), axis=0), -log_p
+
+    return Policy(
+        num_outputs=2 * action_dim,
+        critic_inputs=action_dim,
+        critic_outputs=1,
+        target_entropy=lambda hparams: hparams.target_entropy * action_dim,
+        draw=lambda key, batch: jax.random.normal(key, (action_dim, batch)),
+        sample=lambda key, outputs: squashed_gaussian(
+            outputs, jax.random.normal(key, (action_dim,))
+        )[0],
+        best=best,
+        warm_up=lambda key: jax.random.uniform(key, (action_dim,), minval=-1.0),
+        q_values=q_values,
+        expected=expected,
+        env_action=lambda action: max_action * action,
+    )
+
+
+def squashed_gaussian(
+    outputs: Float[Array, "two_actions *batch"], noise: Any
+) -> tuple[Float[Array, "actions *batch"], Float[Array, "*batch"]]:
+    r"""Actions :math:`\tanh(\mu + \sigma \epsilon)` and the logarithms of their densities.
+
+    Args:
+      outputs: mean and, clipped, log std.
+      noise: standard normal, `[actions, *batch]`.
+
+    Source: Haarnoja et al. (2018), appendix C, eq. 26.
+    """
+    mean, log_std = jnp.split(outputs, 2)
+    log_std = jnp.clip(log_std, _MIN_LOG_STD, _MAX_LOG_STD)
+    u = mean + jnp.exp(log_std) * noise
+    log_normal = -0.5 * noise**2 - log_std - 0.5 * math.log(2 * math.pi)
+    log_slope = 2 * (math.log(2) - u - jax.nn.softplus(-2 * u))  # log(1 - tanh(u)^2), stably
+    return jnp.tanh(u), jnp.sum(log_normal - log_slope, axis=0)
+
+
+def softmax_policy(num_actions: int) -> Policy:
+    """Discrete actions with logits as outputs; critics have an output for each action."""
+
+    def q_values(critics: Critics, obs: Array, action: Array) -> Array:
+        return jax.vmap(select_action, (0, None))(critics(obs), action)
+
+    def expected(
+        critics: Critics, obs: Array, outputs: Array, noise: Array | None
+    ) -> tuple[Array, Array]:
+        log_p = jax.nn.log_softmax(outputs, axis=0)
+        p = jnp.exp(log_p)
+        q_value = jnp.sum(p * jnp.min(critics(obs), axis=0), axis=0)
+        return q_value, -jnp.sum(p * log_p, axis=0)
+
+    return Policy(
+        num_outputs=num_actions,
+        critic_inputs=0,
+        critic_outputs=num_actions,
+        target_entropy=lambda hparams: hparams.target_entropy_fraction * math.log(num_actions),
+        draw=lambda key, batch: None,
+        sample=lambda key, outputs: jax.random.categorical(key, outputs).astype(jnp.int32),
+        best=lambda outputs: jnp.argmax(outputs).astype(jnp.int32),
+        warm_up=lambda key: jax.random.randint(key, (), 0, num_actions),
+        q_values=q_values,
+        expected=expected,
+        env_action=lambda action: action,
+    )
