@@ -1,20 +1,21 @@
 """Agents that others wrote, with settings that others tuned, trained on an SE as it ships.
 
 Stable-Baselines3's PPO, A2C, DQN, SAC and TD3 with RL Zoo's hyperparameters learn on an SE, which
-they see as a plain `gymnasium.Env` (`sejax.gym.make`), and, for comparison, on the real task; each
-is tested greedily on Gymnasium's real task. No line of sejax's agents or of JAX is involved.
+they see as a plain `gymnasium.Env` (`sejax.gym.make`), and for comparison on the real task; each is
+tested greedily on Gymnasium's real task. No agent of sejax and no JAX is involved.
 
-An agent trains once, up to the largest number of steps asked for, and is tested on the way: after
-`steps` it is the agent as it was left by the last update that had seen at most so many. Schedules
-over a training (learning rates, exploration) span that training. Then, with `--real-steps`, real
-agents train with the zoo's schedules until a test is as good as the mean of those that the SE
-taught.
+An agent trains once, for the largest number of steps asked for, and is tested on the way: after n
+steps it is the agent as the last update left it that had seen at most n. Schedules over a training
+(learning rates, exploration) span that training. With `--real-steps` real agents train on with the
+zoo's own schedules, to see after how many steps they are as good as those that the SE taught. Tests
+of real agents are kept in `--real`, and none is made again.
 
-It needs Stable-Baselines3 and Gymnasium beside sejax: `pip install 'sejax[bench]'`.
+It needs Stable-Baselines3 beside sejax, `pip install 'sejax[bench]'`:
+
+    python benchmarks/stock_agents.py cartpole cartpole --steps 1000,2500 --real-steps 50000
 """
 
 import argparse
-import csv
 import itertools
 import multiprocessing
 import time
@@ -22,12 +23,12 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass, field
 from pathlib import Path
-from statistics import fmean, median
 from typing import Any, NamedTuple
 
 import common
 import gymnasium
 import numpy as np
+import pandas as pd
 import stable_baselines3 as sb3
 import torch
 from stable_baselines3.common.callbacks import BaseCallback
@@ -36,6 +37,7 @@ from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckA
 from stable_baselines3.common.vec_env import VecNormalize
 
 import sejax.gym
+from sejax.files import write_text
 
 TASKS = {  # id in Gymnasium, and the step limit
     "cartpole": ("CartPole-v1", 200),  # which is CartPole-v0
@@ -46,6 +48,7 @@ TASKS = {  # id in Gymnasium, and the step limit
     "pendulum": ("Pendulum-v1", 200),
 }
 ALGORITHMS = {"ppo": sb3.PPO, "a2c": sb3.A2C, "dqn": sb3.DQN, "sac": sb3.SAC, "td3": sb3.TD3}
+REAL = "the real task"
 FIRST_TEST_SEED = 10_000  # of test episodes, the same for all agents
 
 
@@ -129,102 +132,113 @@ class Training(NamedTuple):
     """One agent's training.
 
     Attributes:
-      source: an SE, as `sejax.gym.make` takes it; None for the real task.
+      world: an SE, as `sejax.gym.make` takes it, or `REAL`.
       task: one of `TASKS`.
       agent: one of `ALGORITHMS`.
       seed: of the agent and of its world.
-      tests: steps after which it is tested.
       total_steps: what schedules span.
       num_episodes: of each test.
-      target: mean return at which it has learned enough and ends.
+      tests: steps after which it is tested; it ends with the last.
     """
 
-    source: str | None
+    world: str
     task: str
     agent: str
     seed: int
-    tests: tuple[int, ...]
     total_steps: int
     num_episodes: int
-    target: float = np.inf
+    tests: tuple[int, ...]
 
 
 def main() -> None:
-    args = parse_args()
+    args = common.parse_args(__doc__, add_options)
+    if args.quick:
+        args.agents, args.steps, args.seeds, args.episodes = ["ppo"], [500], 2, 5
     env_id, _ = TASKS[args.task]
     agents = args.agents or [agent for agent, of in ZOO if of == env_id]
-    budget = max(args.steps)
-    each = list(itertools.product(agents, range(args.seed, args.seed + args.seeds)))
-    trainings = [
-        Training(source, args.task, agent, seed, tuple(args.steps), budget, args.episodes)
-        for source in (args.source, None)
-        for agent, seed in each
-    ]
-    rows = list(run_all(trainings, args.jobs))
-    targets = {agent: mean_of(rows, args.source, agent, budget) for agent in agents}
-    if args.real_steps:
-        trainings = [until_as_good(args, agent, seed, targets[agent]) for agent, seed in each]
-        rows += list(run_all(trainings, args.jobs))
     path = args.csv or Path(f"results/stock_agents/{args.task}-{Path(args.source).stem}.csv")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("w", newline="") as file:
-        writer = csv.DictWriter(file, list(rows[0]))
-        writer.writeheader()
-        writer.writerows(rows)
-    report(args, agents, rows)
-    print(f"{path} holds every test.")
+    real_path = args.real or Path(f"results/stock_agents/{args.task}-real.csv")
+    real = pd.read_csv(real_path) if real_path.exists() else pd.DataFrame(columns=COLUMNS)
+    each = list(itertools.product(agents, range(args.seed, args.seed + args.seeds)))
+    taught = run_all([in_budget(args, args.source, *one) for one in each], args.jobs)
+    trainings = [in_budget(args, REAL, *one) for one in each]
+    if args.real_steps:
+        trainings += [as_the_zoo(args, *one) for one in each]
+    new = run_all([training for training in trainings if not is_known(real, training)], args.jobs)
+    real = pd.concat([real, new] if len(real) else [new]).drop_duplicates(COLUMNS[:7], keep="last")
+    for table, file in ((taught, path), (real, real_path)):
+        write_text(file, table.sort_values(COLUMNS[:7]).to_csv(index=False))
+    rows = list(summarise(args, agents, taught, real))
+    common.print_table(
+        f"{args.task}: greedy returns on the real task", list(rows[0]),
+        [[str(x) for x in row.values()] for row in rows],
+    )  # fmt: skip
+    common.finish("stock_agents", args, {"task": args.task, "source": args.source, "rows": rows})
 
 
-def parse_args() -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("task", choices=TASKS)
     parser.add_argument("source", help="an SE: a shipped name, a safetensors file, a run directory")
-    parser.add_argument("--agents", type=names_of, metavar="A,B", help=", ".join(ALGORITHMS))
-    parser.add_argument("--steps", type=numbers, default=[1000, 2500, 6000], metavar="N,N")
+    parser.add_argument("--agents", type=agents_of, metavar="A,B", help=", ".join(ALGORITHMS))
+    parser.add_argument("--steps", type=numbers_of, default=[1000, 2500, 6000], metavar="N,N")
     parser.add_argument("--seeds", type=int, default=5, help="agents of each kind")
-    parser.add_argument("--seed", type=int, default=0, help="of the first")
     parser.add_argument("--episodes", type=int, default=20, help="of each test")
-    parser.add_argument("--real-steps", type=int, default=0, help="train real agents at most so "
-                        "long to be as good as the SE's; 0: do not")  # fmt: skip
+    parser.add_argument("--real-steps", type=int, default=0, help="train real agents with the "
+                        "zoo's schedules for as many steps as well")  # fmt: skip
     parser.add_argument("--real-every", type=int, default=1000, help="steps between their tests")
     parser.add_argument("--jobs", type=int, default=1, help="processes, of one thread each")
     parser.add_argument("--csv", type=Path, help="results/stock_agents/TASK-SOURCE.csv")
-    return parser.parse_args()
+    parser.add_argument("--real", type=Path, help="results/stock_agents/TASK-real.csv")
 
 
-def names_of(text: str) -> list[str]:
+def agents_of(text: str) -> list[str]:
     names = text.split(",")
     if not set(names) <= set(ALGORITHMS):
         raise argparse.ArgumentTypeError(f"must be among {', '.join(ALGORITHMS)}; got {text}")
     return names
 
 
-def numbers(text: str) -> list[int]:
-    return sorted(int(float(x)) for x in text.split(","))
+def numbers_of(text: str) -> list[int]:
+    return sorted(int(x) for x in text.split(","))
 
 
-def until_as_good(args: argparse.Namespace, agent: str, seed: int, target: float) -> Training:
-    """A training on the real task with the zoo's own schedules."""
+def in_budget(args: argparse.Namespace, world: str, agent: str, seed: int) -> Training:
+    return Training(world, args.task, agent, seed, max(args.steps), args.episodes,
+                    tuple(args.steps))  # fmt: skip
+
+
+def as_the_zoo(args: argparse.Namespace, agent: str, seed: int) -> Training:
+    """On the real task, with the zoo's own schedules."""
     total = int(ZOO[agent, TASKS[args.task][0]].total_steps)
-    tests = tuple(range(args.real_every, min(args.real_steps, total) + 1, args.real_every))
-    return Training(None, args.task, agent, seed, tests, total, args.episodes, target)
+    tests = range(args.real_every, min(args.real_steps, total) + 1, args.real_every)
+    return Training(REAL, args.task, agent, seed, total, args.episodes, tuple(tests))
 
 
 # --- training ------------------------------------------------------------------------------------
 
+COLUMNS = [*Training._fields[:-1], "steps", "mean_return", "std", "cpu_s"]
 
-def run_all(trainings: Iterable[Training], jobs: int) -> Iterator[dict[str, Any]]:
-    """Rows of all trainings, as they come."""
+
+def is_known(table: pd.DataFrame, training: Training) -> bool:
+    """Whether all its tests are in the table."""
+    same = (table[COLUMNS[:6]] == list(training[:6])).all(axis=1)
+    return set(training.tests) <= set(table[same]["steps"])
+
+
+def run_all(trainings: Iterable[Training], jobs: int) -> pd.DataFrame:
+    """A row for each test of all trainings, printed as they come."""
+    rows = []
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(jobs, context) as pool:
         for future in as_completed([pool.submit(run, training) for training in trainings]):
             for row in future.result():
-                print("  ".join(f"{name} {value}" for name, value in row.items()), flush=True)
-                yield row
+                print(*row, sep="  ", flush=True)
+                rows.append(row)
+    return pd.DataFrame(rows, columns=COLUMNS)
 
 
-def run(training: Training) -> list[dict[str, Any]]:
-    """Trains one agent; a row for each of its tests."""
+def run(training: Training) -> list[tuple[Any, ...]]:
+    """Trains one agent; a row of `COLUMNS` for each of its tests."""
     torch.set_num_threads(1)
     env_id, _ = TASKS[training.task]
     zoo = ZOO[training.agent, env_id]
@@ -242,8 +256,8 @@ def run(training: Training) -> list[dict[str, Any]]:
 
 
 def make_world(training: Training) -> gymnasium.Env[Any, Any]:
-    if training.source is not None:
-        return sejax.gym.make(training.source)
+    if training.world != REAL:
+        return sejax.gym.make(training.world)
     env_id, limit = TASKS[training.task]
     return gymnasium.make(env_id, max_episode_steps=limit)
 
@@ -258,57 +272,43 @@ class Examiner(BaseCallback):
 
     def __init__(self, training: Training):
         super().__init__()
-        self.rows: list[dict[str, Any]] = []
+        self.rows: list[tuple[Any, ...]] = []
         self._training = training
         self._due = list(training.tests)
         self._cpu_s = 0.0  # of training alone
 
     def _on_training_start(self) -> None:
-        self._resumed = time.process_time()
+        self._since = time.process_time()
 
     def _on_step(self) -> bool:
-        """A step beyond n has been made, and no update since: the agent has learned from n."""
+        """Steps have been made and not learned from yet: a test after fewer of them is due."""
         return self._test_up_to(self.num_timesteps - 1)
 
     def _on_training_end(self) -> None:
         self._test_up_to(self.num_timesteps)
 
     def _test_up_to(self, num_steps: int) -> bool:
-        """Makes the tests that are due; whether to go on."""
+        """Makes the tests that are due; returns whether more will be."""
         while self._due and self._due[0] <= num_steps:
-            self._cpu_s += time.process_time() - self._resumed
+            self._cpu_s += time.process_time() - self._since
             returns = test(self.model, self._training)
-            self.rows.append({
-                "trained_on": self._training.source or "real task",
-                "task": self._training.task,
-                "agent": self._training.agent,
-                "seed": self._training.seed,
-                "steps": self._due.pop(0),
-                "total_steps": self._training.total_steps,
-                "mean_return": round(float(returns.mean()), 2),
-                "std": round(float(returns.std()), 2),
-                "cpu_s": round(self._cpu_s, 1),
-            })  # fmt: skip
-            if returns.mean() >= self._training.target:
-                self._due = []
-            self._resumed = time.process_time()
+            self.rows.append((*self._training[:-1], self._due.pop(0), round(returns.mean(), 2),
+                              round(returns.std(), 2), round(self._cpu_s, 2)))  # fmt: skip
+            self._since = time.process_time()
         return bool(self._due)
 
 
 def test(model: Any, training: Training) -> np.ndarray:
-    """Returns of greedy episodes on the real task, `[num_episodes]`, which run side by side."""
+    """Returns of greedy episodes on the real task, `[num_episodes]`, played side by side."""
     env_id, limit = TASKS[training.task]
     envs = [gymnasium.make(env_id, max_episode_steps=limit) for _ in range(training.num_episodes)]
-    obs = [env.reset(seed=FIRST_TEST_SEED + i)[0] for i, env in enumerate(envs)]
-    returns = np.zeros(len(envs))
-    running = list(range(len(envs)))
+    obs = np.stack([env.reset(seed=FIRST_TEST_SEED + i)[0] for i, env in enumerate(envs)])
+    returns, running = np.zeros(len(envs)), list(range(len(envs)))
     normalizer = model.get_vec_normalize_env()
     while running:
-        batch = np.stack([obs[i] for i in running])
-        if normalizer is not None:
-            batch = normalizer.normalize_obs(batch)
-        actions, _ = model.predict(batch, deterministic=True)
-        for i, action in zip(list(running), actions, strict=True):
+        seen = obs[running] if normalizer is None else normalizer.normalize_obs(obs[running])
+        actions, _ = model.predict(seen, deterministic=True)
+        for i, action in zip(tuple(running), actions, strict=True):
             obs[i], reward, terminated, truncated, _ = envs[i].step(action)
             returns[i] += float(reward)
             if terminated or truncated:
@@ -319,44 +319,40 @@ def test(model: Any, training: Training) -> np.ndarray:
 # --- report --------------------------------------------------------------------------------------
 
 
-def of(rows: list[dict[str, Any]], source: str | None, agent: str) -> list[dict[str, Any]]:
-    name = source or "real task"
-    return [row for row in rows if row["trained_on"] == name and row["agent"] == agent]
+def summarise(
+    args: argparse.Namespace, agents: list[str], taught: pd.DataFrame, real: pd.DataFrame
+) -> Iterator[dict[str, Any]]:
+    """A row for each agent and number of steps."""
+    seeds = range(args.seed, args.seed + args.seeds)
+    for agent, steps in itertools.product(agents, args.steps):
+        mine, theirs = (
+            table[(table.agent == agent) & table.seed.isin(seeds)
+                  & (table.num_episodes == args.episodes)]
+            for table in (taught, real)
+        )  # fmt: skip
+        here = mine[mine.steps == steps]
+        there = theirs[(theirs.steps == steps) & (theirs.total_steps == max(args.steps))]
+        yield {
+            "agent": agent,
+            "steps": steps,
+            "SE": round(here.mean_return.mean(), 1),
+            "each seed": ", ".join(f"{x:.1f}" for x in here.sort_values("seed").mean_return),
+            "CPU s": round(here.cpu_s.mean(), 1),
+            "real task": round(there.mean_return.mean(), 1),
+            "real steps to be as good": as_good(theirs, here.mean_return.mean(), len(seeds)),
+        }
 
 
-def mean_of(rows: list[dict[str, Any]], source: str | None, agent: str, steps: int) -> float:
-    return fmean(row["mean_return"] for row in of(rows, source, agent) if row["steps"] == steps)
+def as_good(real: pd.DataFrame, target: float, num_seeds: int) -> str:
+    """Steps to a real agent's first test that reaches a mean: median (smallest to largest).
 
-
-def report(args: argparse.Namespace, agents: list[str], rows: list[dict[str, Any]]) -> None:
-    budget, lines = max(args.steps), []
-    for agent, source, steps in itertools.product(agents, (args.source, None), args.steps):
-        there = [row for row in of(rows, source, agent)
-                 if row["steps"] == steps and row["total_steps"] == budget]  # fmt: skip
-        returns = [row["mean_return"] for row in sorted(there, key=lambda row: row["seed"])]
-        lines.append([agent, "the real task" if source is None else "the SE", f"{steps:,}",
-                      f"{fmean(returns):.1f}", ", ".join(f"{x:.1f}" for x in returns),
-                      f"{fmean(row['cpu_s'] for row in there):.1f}"])  # fmt: skip
-    common.print_table(
-        f"{args.task}: stock agents, {args.episodes} greedy episodes of each on the real task",
-        ["agent", "trained on", "steps", "mean", "each seed", "CPU s"], lines,
-    )  # fmt: skip
-    for agent in agents if args.real_steps else ():
-        target = mean_of(rows, args.source, agent, budget)
-        print(f"{agent}: {target:.1f} on the real task itself {as_good(args, agent, rows, target)}")
-
-
-def as_good(args: argparse.Namespace, agent: str, rows: list[dict[str, Any]], target: float) -> str:
-    """After how many real steps real agents are as good, in words."""
-    zoo_total = int(ZOO[agent, TASKS[args.task][0]].total_steps)
-    there = [row for row in of(rows, None, agent) if row["total_steps"] == zoo_total]
-    reached = [row["steps"] for row in there if row["mean_return"] >= target]
-    missed = args.seeds - len(reached)
-    never = f"; not within {max(row['steps'] for row in there):,} in {missed}" if missed else ""
-    if not reached:
-        return f"by none of {args.seeds} seeds{never}"
-    return (f"after {median(reached):,.0f} steps ({min(reached):,} to {max(reached):,}) in "
-            f"{len(reached)} of {args.seeds} seeds{never}")  # fmt: skip
+    One lucky test is enough, so that it is rather too few.
+    """
+    first = real[real.mean_return >= target].groupby("seed").steps.min()
+    if first.empty:
+        return f"more than {real.steps.max():,}"
+    found = f"{first.median():,.0f} ({first.min():,} to {first.max():,})"
+    return found if len(first) == num_seeds else f"{found}, {len(first)} of {num_seeds} seeds"
 
 
 if __name__ == "__main__":

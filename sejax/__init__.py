@@ -65,10 +65,10 @@ _EXPORTS = {
     "save_set": "sejax.proxies.files",
     "spread_over_devices": "sejax.parallel",
 }
-_MODULES = ("agents", "envs", "es", "options", "proxies")
+_MODULES = ("agents", "envs", "es", "gym", "options", "proxies")
 
 if TYPE_CHECKING:  # what a type checker and an editor see
-    from sejax import agents, envs, es, options, proxies
+    from sejax import agents, envs, es, gym, options, proxies
     from sejax.agents import make_agent
     from sejax.agents.agent import Agent
     from sejax.agents.count_based import CountBasedConfig
@@ -112,9 +112,9 @@ __all__ = [
     "Proxy", "ProxyEnv", "ProxyParams", "ProxySet", "QLearningConfig", "RewardConfig",
     "RewardThreshold", "SACConfig", "SARSAConfig", "Strategy", "SyntheticConfig", "TD3Config",
     "Task", "TrainResult", "TrainingConfig", "Trials", "agents", "config", "configure_xla", "envs",
-    "es", "evaluate_agents", "load", "load_proxy", "load_set", "make_agent", "make_evaluator",
-    "make_learner", "make_trainer", "options", "proxies", "register_gymnax", "save", "save_set",
-    "spread_over_devices",
+    "es", "evaluate_agents", "gym", "load", "load_proxy", "load_set", "make_agent",
+    "make_evaluator", "make_learner", "make_trainer", "options", "proxies", "register_gymnax",
+    "save", "save_set", "spread_over_devices",
 ]  # fmt: skip
 
 

@@ -14,7 +14,7 @@ from jaxtyping import Array
 
 from sejax.agents.agent import Agent
 from sejax.objectives import Outcome
-from sejax.parallel import spread_over_devices
+from sejax.parallel import compiler_options, spread_over_devices
 from sejax.proxies.proxy import world_of
 from sejax.rollout import make_recorder, make_tester
 from sejax.trainer import TrainResult, make_trainer
@@ -156,4 +156,4 @@ def evaluate_agents(
     program = spread_over_devices(
         lambda key: evaluate(key, env_params), devices, lanes, lanes_on_cpu(agent, training)
     )
-    return jax.jit(program)(keys)
+    return jax.jit(program, compiler_options=compiler_options())(keys)

@@ -1,8 +1,8 @@
 """Synthetic environments (SEs) for Gymnasium, in NumPy alone: any agent, no JAX.
 
-`make("cartpole")` is a plain `gymnasium.Env`. Importing and stepping it loads neither JAX nor
-gymnax, so that it costs some milliseconds and 20 MB, and forks and pickles as other environments
-do. It needs the extra `gym`: `pip install 'sejax[gym]'`.
+`make("cartpole")` is a plain `gymnasium.Env`. Neither JAX nor gymnax is loaded, so that beyond
+Gymnasium it takes a twentieth of a second and 5 MB, steps in 10 microseconds, and forks and pickles
+as other environments do. It needs the extra `gym`: `pip install 'sejax[gym]'`.
 
 Example:
   >>> env = make("cartpole")
@@ -12,6 +12,7 @@ Example:
   ((4,), False, False)
 """
 
+import copy
 import itertools
 import math
 from collections.abc import Callable, Mapping
@@ -146,7 +147,7 @@ class SyntheticEnv(gymnasium.Env[Any, Any]):
 
     def __init__(self, weights: Mapping[str, np.ndarray], config: SyntheticConfig, task: RealTask):
         self.config = config
-        self.action_space = task.action_space
+        self.action_space = copy.deepcopy(task.action_space)  # its sampler is this one's
         self._num_states = _num_categories(task.observation_space)
         self._num_actions = _num_categories(task.action_space)
         self._obs_dim = _size(task.observation_space, "task.observation_space")
@@ -205,7 +206,7 @@ class SyntheticEnv(gymnasium.Env[Any, Any]):
     def _first_vector(self) -> np.ndarray:
         if self._start_layers:
             noise = self.np_random.standard_normal(self._obs_dim, np.float32)
-            return np.clip(self._forward(self._start_layers, noise), -ABSURD, ABSURD)
+            return np.clip(noise + self._forward(self._start_layers, noise), -ABSURD, ABSURD)
         assert self._starts is not None
         obs = self._starts(self.np_random)
         if self._num_states:

@@ -1,5 +1,6 @@
 """Spreading independent pieces of work over devices and lanes."""
 
+import functools
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -10,6 +11,24 @@ from jax import Array
 from jax.sharding import AxisType, PartitionSpec
 
 from sejax.errors import require
+
+
+@functools.cache
+def compiler_options() -> dict[str, Any] | None:
+    """What XLA should be told when it compiles whole trainings; None where nothing.
+
+    On a CPU, to use vectors of 512 bits where the CPU has them: its default are 256. A generation
+    takes 0.71 of the time with the paper's DDQN and 0.88 with the default one (`docs/defaults.md`).
+    Sums of wider vectors round otherwise, so that numbers differ in their last bits.
+    """
+    options = {"xla_cpu_prefer_vector_width": 512}
+    if jax.devices()[0].platform != "cpu":
+        return None
+    try:
+        jax.jit(lambda: jnp.int32(0), compiler_options=options).lower().compile()
+    except jax.errors.JaxRuntimeError:  # a version of XLA that has no such option
+        return None
+    return options
 
 
 def spread_over_devices(

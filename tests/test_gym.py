@@ -18,7 +18,7 @@ from support import random_like, shapes_of
 import sejax
 from sejax import envs, plugins
 from sejax.errors import ConfigError
-from sejax.gym import GYMNASIUM_IDS, RealTask, SyntheticEnv, make
+from sejax.gym import GYMNASIUM_IDS, RealTask, SyntheticEnv, _known_task, make
 from sejax.proxies import ABSURD
 from sejax.proxies.configs import RewardConfig, SyntheticConfig
 
@@ -52,7 +52,7 @@ def stored(tmp_path):
     return write
 
 
-def constant(state=0.25, reward=2.0, d=0.0, **config):
+def constant(state=0.25, reward=2.0, d=0.0, max_steps=200, **config):
     """A CartPole SE whose outputs are constants, whatever it sees; d is the done output."""
     config = SyntheticConfig(**SMALL | {"done": "threshold"} | config)
     env = plugins.make("proxy", config, envs.make("cartpole"))
@@ -60,37 +60,38 @@ def constant(state=0.25, reward=2.0, d=0.0, **config):
     for head, value in {"state": state, "reward": reward, "done": d}.items():
         if head in weights:
             weights[head]["Dense_1"]["bias"][:] = value
-    return SyntheticEnv(flat(weights), config, RealTask.of_gymnasium("CartPole-v1", 200))
+    return SyntheticEnv(flat(weights), config, RealTask.of_gymnasium("CartPole-v1", max_steps))
 
 
 # --- the same as in JAX --------------------------------------------------------------------------
 
 
 def assert_equal_steps(env, jax_env, params, num_steps=40):
-    """Steps both from the same states with the same actions, and compares all they say."""
+    """Compares all that both say of steps from the same states; returns how many episodes ended."""
     step = jax.jit(jax_env.step_env)
-    config, rng = jax_env.config, np.random.default_rng(0)
-    num_ended, state = 0, None
+    empty = jax.eval_shape(jax_env.reset_env, KEY, params)[1]
+    is_horizon = jax_env.config.horizon is not None and jax_env.config.horizon_is_terminal
     env.reset(seed=0)
     env.action_space.seed(0)
-    for _ in range(num_steps):
-        if state is None:
-            env.reset()
-            state = jax.eval_shape(jax_env.reset_env, KEY, params)[1]
-            state = state.replace(vector=jnp.asarray(env._vector), time=jnp.int32(0))
+    num_ended, time = 0, 0
+    for i in range(num_steps):
+        state = empty.replace(vector=jnp.asarray(env._vector), time=jnp.int32(time))
         action = env.action_space.sample()
-        expected = step(jax.random.key(rng.integers(99)), state, jnp.asarray(action), params)
-        expected_obs, state, expected_reward, expected_terminated, expected_info = expected
+        out = step(jax.random.key(i), state, jnp.asarray(action), params)
+        expected_obs, state, expected_reward, expected_terminated, expected_info = out
         obs, reward, terminated, truncated, info = env.step(action)
         np.testing.assert_allclose(obs, expected_obs, atol=1e-5, rtol=1e-5)
         np.testing.assert_allclose(reward, expected_reward, atol=1e-5, rtol=1e-5)
-        np.testing.assert_allclose(info["discount"], expected_info["discount"], atol=1e-5)
+        np.testing.assert_allclose(
+            info["discount"], expected_info["discount"], atol=1e-5, rtol=1e-5
+        )
         assert terminated == expected_terminated
-        at_limit = bool(jax_env.is_truncated(state, params))
-        is_horizon = config.horizon is not None and config.horizon_is_terminal
-        assert truncated == (at_limit and not is_horizon)
+        # At a horizon that terminates gymnax's step says that it truncates too.
+        assert truncated == (bool(jax_env.is_truncated(state, params)) and not is_horizon)
+        time += 1
         if terminated or truncated:
-            num_ended, state = num_ended + 1, None
+            num_ended, time = num_ended + 1, 0
+            env.reset()
     return num_ended
 
 
@@ -111,13 +112,10 @@ def assert_equal_steps(env, jax_env, params, num_steps=40):
 )  # fmt: skip
 def test_every_step_is_that_of_the_se_in_jax(stored, task, config):
     jax_env = jax_se(task, **config)
-    weights = random_weights(jax_env)
-    if "done" in weights:
-        last = weights["done"][f"Dense_{jax_env.config.num_layers}"]
-        if config["done"] in ("bernoulli", "sigmoid"):
-            last["kernel"] *= 1e3  # far out, where any draw says the same
-        else:
-            last["bias"][:] = 0.5  # on both sides of the threshold
+    weights = random_weights(jax_env, scale=1.0)
+    if config["done"] in ("bernoulli", "sigmoid"):  # far out, where any draw says the same
+        last = weights["done"]["Dense_1"]
+        last["kernel"], last["bias"] = 1e3 * last["kernel"], 1e3 * last["bias"]
     env = make(stored(jax_env, weights))
     assert assert_equal_steps(env, jax_env, jax_env.params(weights)) > 0
 
@@ -146,13 +144,9 @@ def test_learned_initial_states_are_the_same_function_of_the_noise(stored, scale
 
 def test_noise_of_learned_initial_states_is_standard_normal(stored):
     jax_env = jax_se(**BANDIT)
-    weights = random_weights(jax_env, scale=0.0)
-    # relu(x) - relu(-x) = x, with leaky_relu's slope of 0.01 1.01 times as much.
-    for i in range(4):
-        weights["start"]["Dense_0"]["kernel"][[2 * i, 2 * i + 1], i] = 1, -1
-        weights["start"]["Dense_1"]["kernel"][i, [2 * i, 2 * i + 1]] = 1 / 1.01, -1 / 1.01
-    env = make(stored(jax_env, weights))
-    noise = np.stack([env.reset(seed=0 if i == 0 else None)[0] for i in range(2000)])
+    env = make(stored(jax_env, random_weights(jax_env, scale=0.0)))  # which adds nothing to it
+    env.reset(seed=0)
+    noise = np.stack([env.reset()[0] for _ in range(2000)])
     np.testing.assert_allclose(noise.mean(axis=0), 0, atol=5 / 2000**0.5)
     np.testing.assert_allclose(np.cov(noise.T), np.eye(4), atol=5 * (2 / 2000) ** 0.5)
 
@@ -234,13 +228,7 @@ def test_a_learned_horizon_terminates_or_truncates():
 
 
 def test_an_episode_that_ends_at_its_limit_is_both_terminated_and_truncated():
-    # As with Gymnasium's TimeLimit.
-    env = constant(d=1.0, horizon=1, initial_state="real")
-    assert episode(env) == [(True, False, 0.0)]
-    env = constant(d=1.0, horizon=2, horizon_is_terminal=False)
-    env.reset(seed=0)
-    env._num_steps = 1
-    assert env.step(0)[2:4] == (True, True)
+    assert episode(constant(d=1.0, max_steps=1)) == [(True, True, 0.0)]  # as with TimeLimit
 
 
 def test_a_bandit_leaves_the_state_where_it_began():
@@ -386,7 +374,7 @@ env.reset(seed=0)
 env.step(1)
 envs = AsyncVectorEnv([lambda: sejax.gym.make("cartpole")] * 2, context="fork")
 envs.reset(seed=0)
-print(envs.step([0, 1])[0].shape, sorted({"jax", "flax", "gymnax", "jaxtyping"} & set(sys.modules)))
+print(envs.step([0, 1])[0].shape, sorted({"jax", "flax", "jaxtyping"} & set(sys.modules)))
 envs.close()
 """
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
@@ -408,10 +396,11 @@ def test_gymnasiums_tasks_have_the_spaces_of_sejaxs(name):
         assert real.action_space == spaces.Discrete(task.num_actions)
 
 
-def test_a_task_of_gymnax_is_gymnasiums_of_that_id(stored):
-    env = make(stored(jax_se("gymnax/MountainCar-v0", done="threshold")))
-    assert env.action_space == spaces.Discrete(3)
-    position, velocity = env.reset(seed=0)[0]
+@pytest.mark.parametrize(("given", "limit"), [({}, 200), ({"max_steps": 300}, 300)], ids=str)
+def test_a_task_of_gymnax_is_gymnasiums_of_that_id(given, limit):
+    task = _known_task({"name": "gymnax/MountainCar-v0", **given})
+    assert task.action_space == spaces.Discrete(3) and task.max_steps == limit
+    position, velocity = task.starts(np.random.default_rng(0))
     assert -0.6 <= position <= -0.4 and velocity == 0.0
 
 

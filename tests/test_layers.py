@@ -31,7 +31,7 @@ LAYERS = [
         "files",
         "serialize",
     },
-    {"options"},
+    {"options", "statistics"},
     {"errors"},
     {"", "conf"},
 ]

@@ -358,6 +358,15 @@ def draw_learning_noise(key: Array, policy: Policy, batch: int) -> LearningNoise
     return LearningNoise(*(policy.draw(key, batch) for key in jax.random.split(key)))
 
 
+def lesser(q_values: Float[Array, "2 *values"]) -> Float[Array, "*values"]:
+    """The lesser of the two critics' values.
+
+    `jnp.min` would not do: its gradient divides by how many values equal the minimum, which are
+    none where the compiler computes one of them twice and rounds it differently.
+    """
+    return jnp.minimum(q_values[0], q_values[1])
+
+
 # --- policies ------------------------------------------------------------------------------------
 
 
@@ -374,7 +383,7 @@ def gaussian_policy(action_dim: int, max_action: float) -> Policy:
         critics: Critics, obs: Array, outputs: Array, noise: Array | None
     ) -> tuple[Array, Array]:
         action, log_p = squashed_gaussian(outputs, noise)
-        return jnp.min(q_values(critics, obs, action), axis=0), -log_p
+        return lesser(q_values(critics, obs, action)), -log_p
 
     return Policy(
         num_outputs=2 * action_dim,
@@ -423,7 +432,7 @@ def softmax_policy(num_actions: int) -> Policy:
     ) -> tuple[Array, Array]:
         log_p = jax.nn.log_softmax(outputs, axis=0)
         p = jnp.exp(log_p)
-        q_value = jnp.sum(p * jnp.min(critics(obs), axis=0), axis=0)
+        q_value = jnp.sum(p * lesser(critics(obs)), axis=0)
         return q_value, -jnp.sum(p * log_p, axis=0)
 
     return Policy(

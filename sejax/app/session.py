@@ -11,6 +11,7 @@ import numpy as np
 from sejax.app import build, commands
 from sejax.app.run_directory import RunDirectory
 from sejax.bilevel import Program, make_program
+from sejax.parallel import compiler_options
 from sejax.proxies import files
 
 
@@ -78,7 +79,8 @@ class Chunks:
 
         keys = jax.random.split(jax.random.key(0), num_seeds)
         state = jax.eval_shape(self.program.init, keys)
-        self._compiled[num_seeds, length] = jax.jit(chunk, donate_argnums=0).lower(state).compile()
+        program = jax.jit(chunk, donate_argnums=0, compiler_options=compiler_options())
+        self._compiled[num_seeds, length] = program.lower(state).compile()
 
 
 def make_chunks(config: build.LearnConfig) -> Chunks:

@@ -17,9 +17,9 @@ from sejax.app.families import JOINT, key_of
 from sejax.experiments import budgets, proxy_runs
 from sejax.experiments.proxy_runs import RunSettings
 from sejax.experiments.settings import count, each_of, setting
+from sejax.experiments.tables import iqm_columns, spread
 from sejax.experiments.worlds import HPARAMS, World, groups_at_once, train_groups
 from sejax.options import positive
-from sejax.statistics import bootstrap_interval, interquartile_mean
 
 # A little world and agents that learn enough to be seen moving.
 QUICK = ["es.population_size=12", "es.num_incumbent_evals=6", "training.max_steps=1000",
@@ -99,20 +99,20 @@ def evaluate(settings: FamilyRuns, name: str, ses: Any, config: Any) -> pd.DataF
 
 
 def summarise(agents: pd.DataFrame, by: list[str], solved_reward: float) -> pd.DataFrame:
-    """Mean and interquartile mean of the returns for each value of the columns `by`.
+    """Statistics of the returns (`test_return_...`) for each value of the columns `by`.
 
-    `low` and `high` are the ends of the latter's bootstrap 95% interval. It draws SEs, as the
-    agents of one have much in common, and agents where there is one SE.
+    The mean's interval draws SEs, and agents where there is one SE; that of the interquartile mean
+    draws agents within their SE.
     """
     rows = []
     for values, mine in agents.groupby(by, sort=False):
-        of_ses = mine.groupby("seed")["test_return"].mean()
-        samples = of_ses if len(of_ses) > 1 else mine["test_return"]
-        low, high = bootstrap_interval(samples, statistic=interquartile_mean)
+        returns = mine["test_return"]
+        of_ses = returns.groupby(mine["seed"]).mean()
         rows.append(dict(zip(by, values, strict=True)) | {
-            "num_ses": len(of_ses), "num_agents": len(mine), "mean": mine["test_return"].mean(),
-            "iqm": interquartile_mean(samples), "low": low, "high": high,
-            "solved": (mine["test_return"] >= solved_reward).mean(),
+            "num_ses": len(of_ses), "num_agents": len(mine),
+            **spread(returns, of_ses if len(of_ses) > 1 else returns, "test_return"),
+            **iqm_columns(returns, "test_return", mine["seed"]),
+            "solved": (returns >= solved_reward).mean(),
         })  # fmt: skip
     return pd.DataFrame(rows)
 

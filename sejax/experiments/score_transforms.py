@@ -35,8 +35,9 @@ from sejax.es.strategy import Strategy
 from sejax.experiments import figures
 from sejax.experiments.experiment import Experiment
 from sejax.experiments.settings import Settings, count, setting
-from sejax.experiments.tables import as_texts, bootstrap_interval, publish
+from sejax.experiments.tables import as_texts, publish
 from sejax.options import Options, counts
+from sejax.statistics import bootstrap_interval
 
 SCORE_TRANSFORMS = tuple(TRANSFORMS)
 

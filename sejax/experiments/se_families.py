@@ -22,11 +22,13 @@ from sejax.experiments.experiment import Experiment
 from sejax.experiments.family_runs import FamilyRuns, families_in, known_families
 from sejax.experiments.pieces import stack, unstack
 from sejax.experiments.settings import setting
-from sejax.experiments.tables import publish
+from sejax.experiments.tables import iqm_note, iqm_text, publish
 
 SETS = ("ddqn", "ppo", "td3_discrete", "ddqn+ppo", "ddqn+td3_discrete", "ppo+td3_discrete",
         "ddqn+ppo+td3_discrete")  # fmt: skip
 LEFT_OUT = "°"  # after what families reach that took no part
+CELL = ("{test_return_mean:.1f} [{test_return_low:.1f}, {test_return_high:.1f}]; "
+        f"IQM {iqm_text('test_return')}; {{solved:.0%}}")  # fmt: skip
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -82,8 +84,7 @@ def make_table(summary: pd.DataFrame) -> pd.DataFrame:
         rows.append({
             "learned with": shown(name), "CPU s a run": f"{set_['cpu_s']:,.0f}",
             "runs solved": f"{set_['solved_runs']:.0%}", "hyperparameters": hparams,
-            **{shown(row.kind): f"{row.mean:.1f}; {row.iqm:.1f} [{row.low:.1f}, {row.high:.1f}]; "
-               f"{row.solved:.0%}{'' if row.took_part else LEFT_OUT}"
+            **{shown(row.kind): CELL.format_map(row._asdict()) + ("" if row.took_part else LEFT_OUT)
                for row in mine.itertuples()},
         })  # fmt: skip
     return pd.DataFrame(rows)
@@ -98,19 +99,18 @@ def left_out(summary: pd.DataFrame) -> pd.DataFrame:
     """What each family of the largest set reaches on that, and on the set of the others.
 
     Returns:
-      Rows with `hparams`, `kind`, and of the two sets `mean`, `low` and `high`, called `with_...`
-      and `without_...`; none for sets that were not learned.
+      Rows with `hparams`, `kind` and mean returns, `included` and `left_out`; none for sets that
+      were not learned.
     """
     sets = {frozenset(families_in(name)): name for name in summary["learned_with"].unique()}
     largest = max(sets, key=len)
-    cells = summary.set_index(["learned_with", "hparams", "kind"])[["mean", "low", "high"]]
+    means = summary.set_index(["learned_with", "hparams", "kind"])["test_return_mean"]
     rows = []
-    for (name, hparams, kind), whole in cells.iterrows():  # type: ignore[misc]
+    for (name, hparams, kind), mean in means.items():  # type: ignore[misc]
         others = sets.get(largest - {kind})
         if name == sets[largest] and kind in largest and others is not None:
-            part = cells.loc[others, hparams, kind]
-            rows.append({"hparams": hparams, "kind": kind, **whole.add_prefix("with_"),
-                         **part.add_prefix("without_")})  # fmt: skip
+            rows.append({"hparams": hparams, "kind": kind, "included": mean,
+                         "left_out": means[others, hparams, kind]})  # fmt: skip
     return pd.DataFrame(rows)
 
 
@@ -118,25 +118,25 @@ def findings(summary: pd.DataFrame) -> str:
     """Sentences on what was measured."""
     texts = []
     for hparams, mine in summary.groupby("hparams", sort=False):
-        means = mine.groupby("took_part")["mean"].mean()
+        means = mine.groupby("took_part")["test_return_mean"].mean()
         shares = {True: "on SEs that were learned with it", False: "on others"}
         apart = " and ".join(f"{means[x]:.1f} {where}" for x, where in shares.items() if x in means)
         texts.append(f"With {hparams} hyperparameters a family's mean return is {apart}.")
-        worst = mine.groupby("learned_with", sort=False).agg({"mean": "min", "cpu_s": "first"})
-        best = worst["mean"].idxmax()
-        others = worst["mean"].drop(best)
+        sets = mine.groupby("learned_with", sort=False)
+        worst, cost = sets["test_return_mean"].min(), sets["cpu_s"].first()
+        best = worst.idxmax()
+        others = worst.drop(best)
         if len(others):
             texts.append(
-                f"The worst of the tested families reaches most, {worst['mean'][best]:.1f}, where "
-                f"SEs were learned with {shown(str(best))}, for {worst['cpu_s'][best]:,.0f} CPU s "
-                f"a run ({others.min():.1f} to {others.max():.1f} with other sets, for "
-                f"{worst['cpu_s'].drop(best).min():,.0f} to "
-                f"{worst['cpu_s'].drop(best).max():,.0f})."
+                f"The worst of the tested families reaches most, {worst[best]:.1f}, where SEs "
+                f"were learned with {shown(str(best))}, for {cost[best]:,.0f} CPU s a run "
+                f"({others.min():.1f} to {others.max():.1f} with other sets, for "
+                f"{cost.drop(best).min():,.0f} to {cost.drop(best).max():,.0f})."
             )
     for row in left_out(summary).itertuples():
         texts.append(
-            f"{shown(row.kind)} ({row.hparams}) reaches {row.without_mean:.1f} where it alone is "
-            f"left out, and {row.with_mean:.1f} where it takes part."
+            f"{shown(row.kind)} ({row.hparams}) reaches {row.left_out:.1f} where it alone is "
+            f"left out, and {row.included:.1f} where it takes part."
         )
     return " ".join(texts)
 
@@ -148,11 +148,11 @@ def report(settings: SeFamilies, rows: pd.DataFrame) -> pd.DataFrame:
     first = summary.iloc[0]
     note = (
         f"{settings.runs} NES runs with each set of families; of each the best SE trains "
-        f"{settings.num_agents} fresh agents of each family. Cells: mean return; interquartile "
-        "mean over the SEs' means, with a bootstrap 95% interval that draws SEs (agents, where "
-        f"there is one SE); share of the {first['num_agents']} agents that solve the task "
-        f"({task.solved_reward:g}); {LEFT_OUT} a family that took no part in learning. CPU s are "
-        f"those of the generations, without compilation. {findings(summary)}"
+        f"{settings.num_agents} fresh agents of each family. Cells: mean return, with a bootstrap "
+        "95% interval that draws SEs (agents, where there is one SE); interquartile mean; share of "
+        f"the {first['num_agents']} agents that solve the task ({task.solved_reward:g}); "
+        f"{LEFT_OUT} a family that took no part in learning. CPU s are those of the generations, "
+        f"without compilation. {findings(summary)}{iqm_note('within each SE')}"
     )
     title = f"Agents tested on {task.name}, trained on SEs learned with other families of agents"
     return publish(settings, title, make_table(summary), summary, note)
@@ -161,17 +161,19 @@ def report(settings: SeFamilies, rows: pd.DataFrame) -> pd.DataFrame:
 def draw(summary: pd.DataFrame, task: Any, path: Any) -> None:
     """Draws mean returns as a map for each kind of hyperparameters, and what each set cost."""
     hparams = list(summary["hparams"].unique())
-    cells = {name: summary[summary["hparams"] == name].pivot(
-        index="learned_with", columns="kind") for name in hparams}  # fmt: skip
+    cells = {name: mine.pivot(index="learned_with", columns="kind")
+             for name, mine in summary.groupby("hparams")}  # fmt: skip
     sets, kinds = (list(summary[x].unique()) for x in ("learned_with", "kind"))
-    low, high = summary["mean"].min(), max(summary["mean"].max(), summary["mean"].min() + 1)
+    low = summary["test_return_mean"].min()
+    high = max(summary["test_return_mean"].max(), low + 1)
     size = (3.4 + (1.0 + 0.85 * len(kinds)) * len(hparams), 1.8 + 0.5 * len(sets))
     widths = [1.0 * len(kinds)] * len(hparams) + [2.0]
     with figures.panels(path, 1, len(hparams) + 1, size, width_ratios=widths) as (figure, axes):
         for axis, name in zip(axes[0], hparams, strict=False):
             of_sets = cells[name].reindex(sets)
-            means, parts = (of_sets[x][kinds].to_numpy() for x in ("mean", "took_part"))
-            image = axis.imshow(means.astype(float), vmin=low, vmax=high, cmap="viridis",
+            means = of_sets["test_return_mean"][kinds].to_numpy()
+            parts = of_sets["took_part"][kinds].to_numpy()
+            image = axis.imshow(means, vmin=low, vmax=high, cmap="viridis",
                                 aspect="auto")  # fmt: skip
             for (i, j), mean in np.ndenumerate(means):
                 dark = mean < (low + high) / 2

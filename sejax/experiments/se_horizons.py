@@ -9,7 +9,6 @@ Source: the paper's SE (the task's limit and initial states) and that of Liesen 
 Minimal Reinforcement Learning Environments" (2024), a bandit with learned ones.
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -23,6 +22,8 @@ from sejax.experiments.family_runs import FamilyRuns
 from sejax.experiments.pieces import stack, unstack
 from sejax.experiments.settings import each_of, setting
 from sejax.experiments.tables import as_texts, publish
+from sejax.experiments.worlds import HPARAMS
+from sejax.options import positive
 from sejax.proxies.configs import DONE_MODES, INITIAL_STATES
 from sejax.statistics import bootstrap_interval
 
@@ -71,12 +72,12 @@ class SeHorizons(FamilyRuns):
                                       quick=("dueling_ddqn",), about="families that the best SE "
                                       "of each kind is tested with")  # fmt: skip
 
-    @classmethod
-    def defaults(cls, given: Mapping[str, Any]) -> dict[str, Any]:
-        quick = bool(given.get("quick"))
-        return super().defaults(given) | {
-            "cpu_budget_s": 4.0 if quick else 60.0, "tested_hparams": ("default",),
-        }  # fmt: skip
+    tested_hparams: tuple[str, ...] = setting(
+        ("default",), each_of(HPARAMS), about="their hyperparameters; the first are shown"
+    )
+    cpu_budget_s: float | None = setting(
+        60.0, positive("it is time"), quick=4.0, about="CPU seconds of a run, without compilation"
+    )
 
     @property
     def kinds(self) -> list[Kind]:
@@ -122,7 +123,8 @@ def summarise_runs(
             "to_solve": to_solve,
             "cpu_s_to_solve": curve["cpu_s"].cumsum()[to_solve - 1] if is_solved else np.inf,
             "stays_solved": (later >= solved_reward).mean(),
-            "cpu_s": curve["cpu_s"].mean(), "train_steps": curve["train_steps_mean"].mean(),
+            "cpu_s": curve["cpu_s"].mean(), "cpu_s_in_all": curve["cpu_s"].sum(),
+            "train_steps": curve["train_steps_mean"].mean(),
             "env_steps": curve["env_steps_total"].iloc[-1],
         })  # fmt: skip
     return pd.DataFrame(rows)
@@ -142,7 +144,7 @@ def summarise(runs: pd.DataFrame, transfer: pd.DataFrame) -> pd.DataFrame:
             **mine[["generations", "cpu_s", "train_steps", "env_steps"]].mean(),
         })  # fmt: skip
     transferred = transfer[transfer["hparams"] == transfer["hparams"].iloc[0]]
-    means = transferred.pivot(index=BY, columns="kind", values="mean").add_prefix("on_")
+    means = transferred.pivot(index=BY, columns="kind", values="test_return_mean").add_prefix("on_")
     return pd.DataFrame(rows).join(means, on=BY)
 
 
@@ -212,7 +214,7 @@ def report(settings: SeHorizons, rows: pd.DataFrame) -> pd.DataFrame:
     transfer = family_runs.summarise(unstack(rows, "agents"), [*BY, "hparams", "kind"],
                                      task.solved_reward)  # fmt: skip
     summary = summarise(runs, transfer)
-    draw(settings, task, runs, summary, settings.folder / "horizons.png")
+    draw(task, runs, summary, settings.ends[0], settings.folder / "horizons.png")
     note = (
         f"SEs learned with {' + '.join(settings.agents)}, {settings.runs} runs of "
         f"{settings.cpu_budget_s:g} CPU s each (generations that began before these were spent; "
@@ -228,11 +230,12 @@ def report(settings: SeHorizons, rows: pd.DataFrame) -> pd.DataFrame:
     return publish(settings, title, make_table(summary), summary, note)
 
 
-def draw(
-    settings: SeHorizons, task: Any, runs: pd.DataFrame, summary: pd.DataFrame, path: Any
-) -> None:
-    """Draws returns against horizons, and CPU seconds to solve the task beside them."""
-    ends = [NO_END, settings.ends[0]]
+def draw(task: Any, runs: pd.DataFrame, summary: pd.DataFrame, end: str, path: Any) -> None:
+    """Draws returns against horizons of SEs that end like this, and CPU seconds to solve the task.
+
+    A cross is a run that has not solved it, where its budget was spent.
+    """
+    ends = [NO_END, end]
     horizons = list(summary["horizon"].unique())
     tested = [name for name in summary if name.startswith("on_")]
     shown = summary[summary["end"].isin(ends)].groupby("starts", sort=False)
@@ -250,8 +253,7 @@ def draw(
             solved = np.isfinite(own["cpu_s_to_solve"])
             x = own["horizon"].map(horizons.index) + shift
             right.plot(x[solved], own["cpu_s_to_solve"][solved], "o", ms=5, color=color, alpha=0.7)
-            right.plot(x[~solved], np.full((~solved).sum(), settings.cpu_budget_s), "x", ms=6,
-                       color=color, alpha=0.7)  # fmt: skip
+            right.plot(x[~solved], own["cpu_s_in_all"][~solved], "x", ms=6, color=color, alpha=0.7)
         left.axhline(task.solved_reward, color=figures.SOLVED, ls="--", lw=1.2,
                      label=f"solved ({task.solved_reward:g})")  # fmt: skip
         left.set(ylabel=f"mean return on {task.name}")

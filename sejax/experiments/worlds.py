@@ -21,7 +21,7 @@ from sejax.agents import NoExploration
 from sejax.experiments import return_curves
 from sejax.experiments.settings import Settings
 from sejax.parallel import spread_over_devices
-from sejax.training import TrainingConfig, budget_for, steps_before_learning
+from sejax.training import TrainingConfig
 
 HPARAMS = ("varied", "default")
 GROUPS_AT_ONCE = 5  # groups of agents in one program, but for one CPU device
@@ -181,21 +181,8 @@ def groups_at_once(devices: int | None) -> int:
 
 
 def training_as_learned(proxies: Any, agent: Any) -> TrainingConfig:
-    """How long an agent trains on a set of SEs: as those that they were learned with.
-
-    Of several, as the one that waited longest with learning.
-    """
-    from sejax.app import families
-
-    learned = serialize.from_plain(TrainingConfig, proxies.config["training"], "training")
-    several = families.from_plain(proxies.config.get("agents"))
-    learned_with = (
-        [family.agent for family in several.families] if several
-        else [plugins.configure("agent", proxies.config["agent"])]
-    )  # fmt: skip
-    max_steps = proxies.task.max_steps
-    longest = max(learned_with, key=lambda each: steps_before_learning(each, max_steps))
-    return budget_for(learned, agent, longest, max_steps)
+    """How long an agent trains on a set of SEs: as those that they were learned with."""
+    return proxies.proxy(0).training_for(agent)
 
 
 def outcome_rows(outcome: Any, drawn: dict[str, np.ndarray]) -> pd.DataFrame:

@@ -33,7 +33,7 @@ from sejax.proxies.stored import (
 )
 from sejax.sealed import seal
 from sejax.serialize import from_plain
-from sejax.training import TrainingConfig
+from sejax.training import TrainingConfig, budget_for
 
 __all__ = [
     "FORMAT_VERSION", "PRETRAINED_DIR", "Proxy", "ProxySet", "find", "load", "load_proxy",
@@ -76,12 +76,48 @@ class Proxy:
           0.8
         """
         stored = self.config.get(group)
-        where = f"{group} that {self.path.name} was learned with"
         if group == "training" and isinstance(stored, Mapping):
             return from_plain(TrainingConfig, stored, group)
+        return self._configured(group, stored)
+
+    def learned_agents(self) -> dict[str, Any]:
+        """The agents that it was learned with, one or several families, by their keys.
+
+        Raises:
+          ConfigError: as `learned_with`.
+
+        Example:
+          >>> list(load_proxy("cliff_walking-rn").learned_agents())
+          ['q_learning']
+        """
+        stored = self._stored_agents()
+        return {key: self._configured("agent", values) for key, values in stored.items()}
+
+    def training_for(self, agent: Any) -> TrainingConfig:
+        """How long an agent trains on it: as those that it was learned with (`budget_for`).
+
+        Raises:
+          ConfigError: as `learned_with`.
+        """
+        known = [plugins.configure("agent", values) for values in self._stored_agents().values()
+                 if _is_registered("agent", values)]  # fmt: skip
+        max_steps = self.env.world.max_steps or self.task.max_steps
+        return budget_for(self.learned_with("training"), agent, known, max_steps)
+
+    def _stored_agents(self) -> dict[str, Any]:
+        """Plain values of the agents that it was learned with."""
+        families = self.config.get("agents")
+        if not isinstance(families, Mapping):
+            stored = self.config.get("agent")
+            return {str(stored.get("name")) if isinstance(stored, Mapping) else "": stored}
+        return {key: {name: x for name, x in values.items() if name != "weight"}
+                for key, values in families.items() if isinstance(values, Mapping)}  # fmt: skip
+
+    def _configured(self, group: str, stored: Any) -> Any:
+        where = f"{group} that {self.path.name} was learned with"
         if not isinstance(stored, Mapping):
             raise ConfigError(f"The {where} must be in the file; it is not. Give one of your own.")
-        if not plugins.is_registered(group, str(stored.get("name"))):
+        if not _is_registered(group, stored):
             raise ConfigError(
                 f"The {where} must be a registered one, because what a file names is never "
                 f"imported; it is {shortened(stored.get('name'))!r}. Give {group}= yourself."
@@ -361,13 +397,18 @@ def _registered(
 ) -> Any:
     """The configuration of a group, if its name is one that sejax or a package has registered."""
     name = shortened(config[group].get("name"))
-    if not plugins.is_registered(group, str(config[group].get("name"))):
+    if not _is_registered(group, config[group]):
         raise ConfigError(
             f"{option} must be a proxy of a registered {group} if no {argument} is given, because "
             f"what a file names is never imported; {path} is one of {name!r}. Give it: "
             f"sejax.load(path, {argument}=...), or {word}={name} on the command line."
         )
     return plugins.configure(group, config[group])
+
+
+def _is_registered(group: str, stored: Any) -> bool:
+    """Whether plain values name what sejax or a package has registered."""
+    return isinstance(stored, Mapping) and plugins.is_registered(group, str(stored.get("name")))
 
 
 def _check_tensors(

@@ -1,0 +1,464 @@
+"""sejax.agents.sac: updates against torch, targets and temperature by hand, acting, probe MDPs."""
+
+import functools
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from support import numpy_forward, raveled, shapes_of, unraveled
+
+from sejax.agents.replay import Transition
+from sejax.agents.sac import (
+    LearningNoise,
+    SACConfig,
+    draw_learning_noise,
+    gaussian_policy,
+    make_learning_step,
+    make_networks,
+    make_sac,
+    make_sac_discrete,
+    softmax_policy,
+    squashed_gaussian,
+)
+
+OBS_DIM, ACTION_DIM, BATCH, MAX_ACTION = 3, 2, 7, 2.0
+GOLDEN = Path(__file__).parent / "golden" / "sac_updates.npz"
+CONFIG = SACConfig(
+    hidden_size=5, num_layers=1, activation="tanh", batch_size=BATCH, learning_rate=0.01,
+    target_update_rate=0.1, discount=0.9, init_episodes=3, init_alpha=0.3, target_entropy=-0.7,
+    target_entropy_fraction=0.4,
+)  # fmt: skip
+# Kind of actions, configuration.
+CASES = {
+    "continuous": (False, CONFIG),
+    "discrete": (True, CONFIG),
+    "fixed_alpha": (True, replace(CONFIG, alpha=0.2, num_layers=2, activation="prelu")),
+}
+KINDS = pytest.mark.parametrize("case", ["continuous", "discrete"])
+NAMES = ("params", "target_critics")
+CHECKED_UPDATES = (1, 3)
+
+
+def policy_of(case):
+    return softmax_policy(ACTION_DIM) if CASES[case][0] else gaussian_policy(ACTION_DIM, MAX_ACTION)
+
+
+@functools.cache
+def agent_of(case):
+    is_discrete, config = CASES[case]
+    if is_discrete:
+        return make_sac_discrete(config, OBS_DIM, ACTION_DIM)
+    return make_sac(config, OBS_DIM, ACTION_DIM, MAX_ACTION)
+
+
+@functools.cache
+def networks_of(case):
+    return make_networks(CASES[case][1], OBS_DIM, policy_of(case))
+
+
+@functools.cache
+def learn_of(case):
+    """The jitted learning step, `(state, batch, noise) -> state`."""
+    return jax.jit(make_learning_step(networks_of(case), policy_of(case)))
+
+
+@functools.cache
+def state_of(case):
+    """A state whose networks all differ, so that it shows which is used where."""
+    agent = agent_of(case)
+    state = shapes_of(agent.init, jax.random.key(1), agent.hparams)
+    rng = np.random.default_rng(2)
+    drawn = {name: np.float32(0.5 * rng.normal(size=getattr(state, name).shape)) for name in NAMES}
+    drawn["params"][-1] = np.log(0.3)  # log alpha
+    return state.replace(**drawn, hparams=jax.tree.map(np.float32, agent.hparams))
+
+
+def nested(case, state):
+    """A state's parameters as `Params`, and its target critics, by layer."""
+    networks = networks_of(case)
+    like = jax.eval_shape(networks.unflatten, state.params)
+    return unraveled(state.params, like), unraveled(state.target_critics, like.critics)
+
+
+def case_batch(case, seed, **columns):
+    """A random batch whose last column does not count."""
+    rng = np.random.default_rng(seed)
+    action = rng.uniform(-1, 1, (ACTION_DIM, BATCH))
+    arrays = {
+        "obs": rng.normal(size=(OBS_DIM, BATCH)),
+        "reward": rng.normal(size=BATCH),
+        "discount": rng.uniform(-0.2, 1.2, BATCH),
+        "next_obs": rng.normal(size=(OBS_DIM, BATCH)),
+        "weight": np.arange(BATCH) < BATCH - 1,
+    } | columns
+    arrays = {name: np.float32(x) for name, x in arrays.items()}
+    is_discrete = CASES[case][0]
+    action = np.int32(action[0] > 0) if is_discrete else np.float32(action)
+    return Transition(action=action, **arrays)
+
+
+def case_noise(case, seed):
+    if CASES[case][0]:
+        return LearningNoise(None, None)
+    rng = np.random.default_rng([seed, 1])
+    return LearningNoise(*np.float32(rng.normal(size=(2, ACTION_DIM, BATCH))))
+
+
+def assert_close(a, b, **tolerance):
+    for name in NAMES:
+        np.testing.assert_allclose(getattr(a, name), getattr(b, name), **tolerance)
+
+
+# --- updates against torch -----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_updates_equal_torchs_on_the_same_batches_and_noise(case):
+    golden = np.load(GOLDEN)  # made by torch_sac.py
+    state = state_of(case)
+    for number in range(1, max(CHECKED_UPDATES) + 1):
+        state = learn_of(case)(state, case_batch(case, number), case_noise(case, number))
+        if number in CHECKED_UPDATES:
+            for name in NAMES:
+                np.testing.assert_allclose(
+                    getattr(state, name), golden[f"{case}/{name}/{number}"], rtol=2e-5, atol=4e-6
+                )
+
+
+@KINDS
+def test_updates_are_learning_steps_on_noise_drawn_from_the_key_alone_and_in_lanes(case):
+    base, batch = state_of(case), case_batch(case, 0)
+    lanes = [base.replace(hparams=base.hparams._replace(learning_rate=np.float32(rate)))
+             for rate in (0.01, 0.1)]  # fmt: skip
+    stacked = jax.tree.map(lambda *x: np.stack(x), *lanes)
+
+    @jax.jit
+    def run(key):
+        noise = draw_learning_noise(key, policy_of(case), BATCH)
+        return noise, jax.vmap(agent_of(case).update, (None, 0, None))(key, stacked, batch)
+
+    noise, together = run(jax.random.key(3))
+    for i, lane in enumerate(lanes):
+        alone = learn_of(case)(lane, batch, noise)
+        assert_close(jax.tree.map(lambda x, i=i: x[i], together), alone, rtol=1e-5, atol=1e-7)
+
+
+@KINDS
+def test_columns_of_no_weight_change_nothing(case):
+    batch, noise = case_batch(case, 0), case_noise(case, 0)
+    is_padding = batch.weight == 0
+    other = batch._replace(reward=batch.reward + 3 * is_padding, obs=batch.obs + 3 * is_padding)
+    a, b = (learn_of(case)(state_of(case), x, noise) for x in (batch, other))
+    assert_close(a, b, rtol=1e-6, atol=1e-8)
+    counted = batch._replace(weight=np.ones(BATCH, np.float32))
+    all_count = learn_of(case)(state_of(case), counted, noise)
+    assert not np.allclose(a.opt_state.mu, all_count.opt_state.mu, rtol=1e-3)
+
+
+@KINDS
+def test_a_transition_with_discount_zero_ignores_its_next_state(case):
+    def gradient(batch):  # Adam's first mean: 0.1 g
+        return learn_of(case)(state_of(case), batch, case_noise(case, 0)).opt_state.mu
+
+    batch = case_batch(case, 0, discount=np.zeros(BATCH))
+    elsewhere = batch._replace(next_obs=batch.next_obs + 3.0)
+    np.testing.assert_array_equal(gradient(batch), gradient(elsewhere))
+    ones = np.ones(BATCH, np.float32)
+    a, b = (gradient(x._replace(discount=ones)) for x in (batch, elsewhere))
+    assert np.abs(a - b).max() > 1e-3
+
+
+# --- by hand -------------------------------------------------------------------------------------
+
+
+def test_a_softmax_weighs_the_lesser_critics_values_and_has_its_entropy():
+    # Logits 0 and ln 3: probabilities 1/4 and 3/4. Critics (1, 8) and (5, 2), the lesser (1, 2):
+    # 1/4 * 1 + 3/4 * 2 = 1.75. Entropy: 1/4 ln 4 + 3/4 ln 4/3 = 0.562335.
+    critics = np.float32([[[1.0], [8.0]], [[5.0], [2.0]]])  # [critic, action, batch]
+    policy = softmax_policy(2)
+    outputs = np.float32([[0.0], [np.log(3)]])
+    q_value, entropy = policy.expected(lambda obs: critics, np.zeros((3, 1)), outputs, None)
+    np.testing.assert_allclose(q_value, [1.75], rtol=1e-6)
+    np.testing.assert_allclose(entropy, [0.562335], rtol=1e-5)
+    taken = policy.q_values(lambda obs: critics, np.zeros((3, 1)), np.int32([1]))
+    np.testing.assert_array_equal(taken, [[8.0], [2.0]])
+
+
+def test_a_squashed_gaussians_density_by_hand():
+    # Mean 0.5, std e^-1, noise 0.2: u = 0.573576, a = tanh u = 0.518086.
+    # log N = -0.02 + 1 - 0.918939 = 0.061061; log(1 - a^2) = -0.312477; difference 0.373538.
+    action, log_p = squashed_gaussian(np.float32([0.5, -1.0]), np.float32([0.2]))
+    np.testing.assert_allclose(action, [np.tanh(0.5 + 0.2 / np.e)], rtol=1e-6)
+    u = 0.5 + 0.2 / np.e
+    expected = -0.02 + 1 - 0.5 * np.log(2 * np.pi) - np.log(1 - np.tanh(u) ** 2)
+    np.testing.assert_allclose(log_p, expected, rtol=1e-5)
+    # Far out the slope's logarithm is 2 (ln 2 - |u|), where 1 - tanh^2 is 0 in float32, and the log
+    # std is at most 2.
+    action, log_p = squashed_gaussian(np.float32([30.0, 9.0]), np.float32([0.0]))
+    expected = -2 - 0.5 * np.log(2 * np.pi) - 2 * (np.log(2) - 30)
+    np.testing.assert_allclose([action[0], log_p], [1.0, expected], rtol=1e-6)
+
+
+@KINDS
+def test_critics_learn_targets_with_the_entropy_of_the_next_state_and_alpha_nears_its_target(case):
+    state, batch, noise = state_of(case), case_batch(case, 0), case_noise(case, 0)
+    params, target_critics = nested(case, state)
+    alpha, is_discrete = 0.3, CASES[case][0]
+
+    def forward(params, x):
+        return numpy_forward(params["params"], x, "tanh", 1)
+
+    def soft_values(critics, obs, noise):
+        """The lesser critic's value and the entropy, by formulas of their own."""
+        outputs = forward(params.actor, obs)
+        pair = [jax.tree.map(lambda x, i=i: x[i], critics) for i in range(2)]
+        if is_discrete:
+            p = np.exp(outputs) / np.exp(outputs).sum()
+            return p @ np.minimum(*(forward(x, obs) for x in pair)), -p @ np.log(p)
+        u = outputs[:2] + np.exp(outputs[2:]) * noise
+        density = np.exp(-(noise**2) / 2) / np.sqrt(2 * np.pi) / np.exp(outputs[2:])
+        density = density / (1 - np.tanh(u) ** 2)
+        inputs = np.concatenate([obs, np.tanh(u)])
+        return min(forward(x, inputs)[0] for x in pair), -np.log(density).sum()
+
+    errors, excess = [], []
+    target_entropy = 0.4 * np.log(2) if is_discrete else 2 * -0.7
+    for i in range(BATCH - 1):  # the last column does not count
+        q, entropy = soft_values(
+            target_critics, batch.next_obs[:, i], None if is_discrete else noise.next_action[:, i]
+        )
+        target = batch.reward[i] + 0.9 * batch.discount[i] * (q + alpha * entropy)
+        critic = jax.tree.map(lambda x: x[1], params.critics)
+        obs, action = batch.obs[:, i], batch.action[..., i]
+        q = forward(critic, obs)[action] if is_discrete else (
+            forward(critic, np.concatenate([obs, action]))[0])  # fmt: skip
+        errors.append(q - target)
+        noise_now = None if is_discrete else noise.action[:, i]
+        excess.append(soft_values(params.critics, obs, noise_now)[1] - target_entropy)
+    after = learn_of(case)(state, batch, noise)
+    means, _ = nested(case, after.replace(params=after.opt_state.mu))  # Adam's first: 0.1 g
+    # The gradient for the bias of a head is the mean error (discrete: summed over its actions),
+    # that for log alpha the mean entropy above the target.
+    head = means.critics["params"]["Dense_1"]["bias"][1].sum()
+    np.testing.assert_allclose(head, 0.1 * np.mean(errors), rtol=1e-4)
+    np.testing.assert_allclose(means.log_alpha, 0.1 * np.mean(excess), rtol=1e-4)
+    moved = after.params[-1] - state.params[-1]
+    np.testing.assert_allclose(moved, -0.01 * np.sign(np.mean(excess)), rtol=1e-3)
+
+
+def test_a_fixed_alpha_is_not_learned():
+    case = "fixed_alpha"
+    after = learn_of(case)(state_of(case), case_batch(case, 0), case_noise(case, 0))
+    assert after.params[-1] == state_of(case).params[-1]
+
+
+def test_target_critics_start_as_copies_and_follow_softly():
+    case = "discrete"
+    agent = agent_of(case)
+    fresh = jax.jit(agent.init)(jax.random.key(1), agent.hparams)
+    critics_of = networks_of(case).critics_of
+    np.testing.assert_array_equal(fresh.target_critics, critics_of(fresh.params))
+    np.testing.assert_allclose(fresh.params[-1], np.log(0.3), rtol=1e-6)
+    pair = nested(case, fresh)[0].critics["params"]["Dense_0"]["kernel"]
+    assert not np.allclose(*pair)
+    before = state_of(case)
+    after = learn_of(case)(before, case_batch(case, 0), case_noise(case, 0))
+    expected = 0.1 * critics_of(after.params) + 0.9 * before.target_critics
+    np.testing.assert_allclose(after.target_critics, expected, rtol=1e-6)
+
+
+# --- acting --------------------------------------------------------------------------------------
+
+OBS = np.float32([0.3, -0.2, 0.5])
+
+
+@functools.cache
+def drawn_actions(case):
+    """Actions of 4000 keys: of warming up, of exploring after it, and of tests."""
+    agent = agent_of(case)
+
+    @jax.jit
+    def act(state):
+        keys = jax.random.split(jax.random.key(1), 4000)
+
+        def draw(episode, explore):
+            begun = agent.begin_episode(state, np.int32(episode))
+            return jax.vmap(lambda key: agent.act(key, begun, OBS, explore))(keys)
+
+        return draw(2, True), draw(3, True), draw(2, False)
+
+    return [np.asarray(x, np.float64) for x in act(state_of(case))]
+
+
+def actor_outputs(case):
+    actor = nested(case, state_of(case))[0].actor["params"]
+    return numpy_forward(actor, OBS, "tanh", 1)
+
+
+def test_exploring_draws_from_the_policy_and_tests_take_its_mode():
+    mean, log_std = np.split(actor_outputs("continuous"), 2)
+    _, drawn, tested = drawn_actions("continuous")
+    u = np.arctanh(drawn)
+    assert (np.abs(u.mean(0) - mean) < 5 * np.exp(log_std) / np.sqrt(4000)).all()
+    np.testing.assert_allclose(u.std(0), np.exp(log_std), rtol=0.06)  # 5 / sqrt(2 * 4000)
+    np.testing.assert_allclose(tested, np.tile(np.tanh(mean), (4000, 1)), rtol=1e-5)
+    logits = actor_outputs("discrete")
+    share = np.exp(logits[1]) / np.exp(logits).sum()
+    _, drawn, tested = drawn_actions("discrete")
+    assert abs(drawn.mean() - share) < 5 * 0.5 / np.sqrt(4000)
+    assert (tested == np.argmax(logits)).all()
+
+
+@KINDS
+def test_the_first_episodes_are_for_warming_up_uniformly(case):
+    drawn, _, _ = drawn_actions(case)
+    bins = 2 if CASES[case][0] else 4
+    edges = (0, 1) if CASES[case][0] else (-1, 1)
+    for column in np.reshape(drawn, (4000, -1)).T:
+        share = np.histogram(column, bins=bins, range=edges)[0] / 4000
+        assert np.abs(share - 1 / bins).max() < 5 * np.sqrt(0.25 / 4000)
+    begin = agent_of(case).begin_episode
+    got = [bool(begin(state_of(case), jnp.int32(n)).is_warming_up) for n in range(5)]
+    assert got == [True, True, True, False, False]
+    assert (agent_of(case).init_episodes, agent_of(case).learns_from) == (3, 3)
+
+
+def test_the_world_takes_continuous_actions_in_its_own_units():
+    action = agent_of("continuous").env_action(jnp.float32([0.5, -1.0]))
+    np.testing.assert_array_equal(action, [1.0, -2.0])
+
+
+# --- the agent as a whole ------------------------------------------------------------------------
+
+
+@KINDS
+def test_the_state_keeps_its_types(case):
+    agent = agent_of(case)
+
+    def types(fn, *args):
+        return jax.tree.map(lambda x: (x.shape, x.dtype, x.weak_type), jax.eval_shape(fn, *args))
+
+    kept = types(agent.init, jax.random.key(0), agent.hparams)
+    assert types(lambda x: x, state_of(case)) == kept
+    assert types(agent.begin_episode, state_of(case), jnp.int32(1)) == kept
+    assert types(agent.update, jax.random.key(0), state_of(case), case_batch(case, 0)) == kept
+    acting = [
+        types(functools.partial(agent.act, explore=explore), jax.random.key(0), state_of(case), OBS)
+        for explore in (True, False)
+    ]
+    action = ((), jnp.int32, False) if CASES[case][0] else ((ACTION_DIM,), jnp.float32, False)
+    assert acting == [action] * 2
+
+
+def test_one_configuration_serves_both_kinds_of_actions():
+    assert set(SACConfig.actions) == {"discrete", "continuous"}
+    discrete = SimpleNamespace(obs_dim=OBS_DIM, num_actions=ACTION_DIM)
+    continuous = SimpleNamespace(
+        obs_dim=OBS_DIM, num_actions=None, action_dim=ACTION_DIM, max_action=MAX_ACTION
+    )
+    assert CONFIG.make(discrete) is agent_of("discrete")
+    assert CONFIG.make(continuous) is agent_of("continuous")
+
+
+def test_an_agent_with_units_and_columns_out_of_use_learns_as_a_smaller_one():
+    # Three of five units and four of seven columns.
+    case = "discrete"
+    small_config = replace(CONFIG, hidden_size=3)
+    large = agent_of(case)
+    numbers = large.hparams._replace(hidden_size=np.float32(3), batch_size=np.float32(4))
+    state = jax.jit(large.init)(jax.random.key(2), numbers)
+    assert float(large.batch_size(state)) == 4 and large.batch_size(state_of(case)) is None
+
+    def cut(params):
+        layers = {"Dense_0": {"kernel": params["Dense_0"]["kernel"][..., :3, :],
+                              "bias": params["Dense_0"]["bias"][..., :3]},
+                  "Dense_1": {"kernel": params["Dense_1"]["kernel"][..., :3],
+                              "bias": params["Dense_1"]["bias"]}}  # fmt: skip
+        return {"params": layers}
+
+    def cut_all(state):
+        params, target_critics = nested(case, state)
+        params = params._replace(
+            actor=cut(params.actor["params"]), critics=cut(params.critics["params"])
+        )
+        return {"params": raveled(params),
+                "target_critics": raveled(cut(target_critics["params"]))}  # fmt: skip
+
+    small_agent = make_sac_discrete(small_config, OBS_DIM, ACTION_DIM)
+    small = shapes_of(small_agent.init, jax.random.key(0), small_agent.hparams)
+    hparams = jax.tree.map(np.float32, small_agent.hparams)
+    small = small.replace(**cut_all(state), hparams=hparams)
+    networks = make_networks(small_config, OBS_DIM, policy_of(case))
+    learn_small = jax.jit(make_learning_step(networks, policy_of(case)))
+    for number in (1, 2):
+        batch = case_batch(case, number, weight=np.arange(BATCH) < 4)
+        state = learn_of(case)(state, batch, case_noise(case, 0))
+        small = learn_small(small, batch, case_noise(case, 0))
+    for name, got in cut_all(state).items():
+        np.testing.assert_allclose(got, getattr(small, name), rtol=1e-4, atol=1e-5)
+
+
+# --- probes --------------------------------------------------------------------------------------
+
+
+def train_on(agent, batch, num_updates):
+    """The agent after so many updates on a batch; to be called in a jitted function."""
+
+    def step(state, key):
+        return agent.update(key, state, batch), None
+
+    state = agent.init(jax.random.key(0), agent.hparams)
+    return jax.lax.scan(step, state, jax.random.split(jax.random.key(1), num_updates))[0]
+
+
+def test_on_a_one_step_bandit_the_policy_finds_the_best_action():
+    # Reward -(a - 0.6)^2 for actions in [-2, 2], whatever the observation; nothing follows.
+    config = SACConfig(hidden_size=16, num_layers=1, learning_rate=0.01, alpha=0.01)
+    agent = make_sac(config, obs_dim=1, action_dim=1, max_action=2.0)
+    action = np.linspace(-1, 1, 32, dtype=np.float32)[None]
+    zeros = np.zeros(32, np.float32)
+    batch = Transition(obs=zeros[None], action=action, reward=-((2 * action[0] - 0.6) ** 2),
+                       discount=zeros, next_obs=zeros[None])  # fmt: skip
+
+    @jax.jit
+    def trained_action(key):
+        state = train_on(agent, batch, 600)
+        return agent.env_action(agent.act(key, state, jnp.zeros(1), explore=False))
+
+    np.testing.assert_allclose(trained_action(jax.random.key(0)), [0.6], atol=0.2)
+
+
+def test_on_a_two_state_probe_values_and_policy_are_the_soft_optimal_ones():
+    # In A, action 0 ends the episode with 0.5 and action 1 leads to B with nothing. In B, action 0
+    # ends it with 1 and action 1 with 0. With alpha 0.5 and gamma 0.8 the best policy is
+    # softmax(Q / alpha) and a state's value alpha log sum exp(Q / alpha): V(B) = 0.5 ln(e^2 + 1) =
+    # 1.0635, Q(A) = [0.5, 0.8 * 1.0635] and so on. The end looks like A: bootstrapping there would
+    # show.
+    alpha, gamma = 0.5, 0.8
+    config = SACConfig(hidden_size=16, num_layers=1, activation="tanh", learning_rate=0.02,
+                       target_update_rate=0.1, discount=gamma, alpha=alpha)  # fmt: skip
+    agent = make_sac_discrete(config, obs_dim=2, num_actions=2)
+    networks = make_networks(config, 2, softmax_policy(2))
+    a, b = [1.0, 0.0], [0.0, 1.0]
+    batch = Transition(obs=np.float32([a, a, b, b]).T, action=np.int32([0, 1, 0, 1]),
+                       reward=np.float32([0.5, 0.0, 1.0, 0.0]),
+                       discount=np.float32([0.0, 1.0, 0.0, 0.0]),
+                       next_obs=np.float32([a, b, a, a]).T)  # fmt: skip
+
+    @jax.jit
+    def learned():
+        params = networks.unflatten(train_on(agent, batch, 500).params)
+        states = np.eye(2, dtype=np.float32)  # columns: A and B
+        policy = jax.nn.softmax(networks.actor(params, states), axis=0)
+        return networks.critics(params.critics, states), policy
+
+    value_b = alpha * np.log(np.exp(1 / alpha) + 1)
+    q_values = np.array([[0.5, 1.0], [gamma * value_b, 0.0]])  # [action, state]
+    expected = np.exp(q_values / alpha) / np.exp(q_values / alpha).sum(axis=0)
+    got, policy = learned()
+    np.testing.assert_allclose(got, np.stack([q_values] * 2), atol=0.03)
+    np.testing.assert_allclose(policy, expected, atol=0.03)

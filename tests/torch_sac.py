@@ -1,0 +1,176 @@
+"""SAC in torch, for both kinds of actions: makes the golden numbers of `test_sac.py`.
+
+torch is large and not needed for the tests, so that what it computed is kept in the repository.
+Densities and entropies are those of torch's distributions, and each loss has an optimizer of its
+own. Remake it with `python tests/torch_sac.py` where torch is installed.
+"""
+
+import jax
+import numpy as np
+import torch
+from test_sac import (
+    ACTION_DIM,
+    CASES,
+    CHECKED_UPDATES,
+    GOLDEN,
+    NAMES,
+    case_batch,
+    case_noise,
+    nested,
+    state_of,
+)
+from torch.distributions import Categorical, Independent, Normal, TransformedDistribution
+from torch.distributions.transforms import TanhTransform
+
+
+class TorchMLP(torch.nn.Module):
+    def __init__(self, params, config):
+        super().__init__()
+        self.layers = torch.nn.ModuleList()
+        for i in range(config.num_layers + 1):
+            kernel, bias = params[f"Dense_{i}"]["kernel"], params[f"Dense_{i}"]["bias"]
+            layer = torch.nn.Linear(kernel.shape[1], kernel.shape[0])
+            layer.weight.data = torch.tensor(np.array(kernel))
+            layer.bias.data = torch.tensor(np.array(bias))
+            self.layers.append(layer)
+        kinds = {"tanh": torch.nn.Tanh, "relu": torch.nn.ReLU, "prelu": torch.nn.PReLU}
+        self.activate = kinds[config.activation]()
+        if config.activation == "prelu":
+            self.activate.weight.data = torch.tensor([float(params["prelu_slope"])])
+
+    def forward(self, x):
+        for layer in self.layers[:-1]:
+            x = self.activate(layer(x))
+        return self.layers[-1](x)
+
+    def nested(self):
+        out = {
+            f"Dense_{i}": {"kernel": m.weight.detach().numpy(), "bias": m.bias.detach().numpy()}
+            for i, m in enumerate(self.layers)
+        }
+        if isinstance(self.activate, torch.nn.PReLU):
+            out["prelu_slope"] = self.activate.weight.detach().numpy()[0]
+        return out
+
+
+class TorchSAC:
+    """One agent; activations are `[batch, feature]`."""
+
+    def __init__(self, case):
+        self.is_discrete, self.config = CASES[case]
+        params, target_critics = nested(case, state_of(case))
+
+        def pair(critics):
+            return torch.nn.ModuleList(
+                TorchMLP(jax.tree.map(lambda x, i=i: x[i], critics["params"]), self.config)
+                for i in range(2)
+            )
+
+        self.actor = TorchMLP(params.actor["params"], self.config)
+        self.critics, self.target_critics = pair(params.critics), pair(target_critics)
+        self.log_alpha = torch.nn.Parameter(torch.tensor(float(params.log_alpha)))
+        self.optimizers = [
+            torch.optim.Adam(parameters, lr=self.config.learning_rate)
+            for parameters in (
+                self.actor.parameters(), self.critics.parameters(), [self.log_alpha]
+            )
+        ]  # fmt: skip
+
+    def alpha(self):
+        if self.config.alpha is not None:
+            return self.config.alpha
+        return self.log_alpha.exp().detach()
+
+    def soft_values(self, critics, obs, noise):
+        """The lesser critic's value and the entropy."""
+        outputs = self.actor(obs)
+        if self.is_discrete:
+            policy = Categorical(logits=outputs)
+            q = torch.minimum(*(critic(obs) for critic in critics))
+            return (policy.probs * q).sum(1), policy.entropy()
+        mean, log_std = outputs.chunk(2, dim=1)
+        gaussian = Normal(mean, log_std.clamp(-20, 2).exp())
+        u = gaussian.mean + gaussian.stddev * noise
+        squash = TanhTransform(cache_size=1)
+        policy = Independent(TransformedDistribution(gaussian, [squash]), 1)
+        action = squash(u)
+        q = torch.minimum(*(self.q_value(critic, obs, action) for critic in critics))
+        return q, -policy.log_prob(action)
+
+    def q_value(self, critic, obs, action):
+        if self.is_discrete:
+            return critic(obs).gather(1, action[:, None])[:, 0]
+        return critic(torch.cat([obs, action], dim=1))[:, 0]
+
+    def update(self, batch, noise):
+        config = self.config
+        counted = torch.tensor(np.array(batch.weight)) > 0
+
+        def columns(x):
+            return None if x is None else torch.tensor(np.array(x)).T[counted]
+
+        obs, next_obs, next_noise, noise = map(columns, (batch.obs, batch.next_obs, *noise))
+        action = columns(batch.action)
+        action = action.long() if self.is_discrete else action
+        reward, discount = columns(batch.reward), columns(batch.discount)
+        with torch.no_grad():
+            q, entropy = self.soft_values(self.target_critics, next_obs, next_noise)
+            target = reward + config.discount * discount * (q + self.alpha() * entropy)
+        critic_loss = sum(
+            0.5 * torch.nn.functional.mse_loss(self.q_value(critic, obs, action), target)
+            for critic in self.critics
+        )
+        q, entropy = self.soft_values(self.critics, obs, noise)
+        actor_loss = (-self.alpha() * entropy - q).mean()
+        goal = (
+            config.target_entropy_fraction * np.log(ACTION_DIM)
+            if self.is_discrete else config.target_entropy * ACTION_DIM
+        )  # fmt: skip
+        alpha_loss = (self.log_alpha * (entropy.detach() - goal)).mean()
+        losses = [actor_loss, critic_loss, alpha_loss]
+        groups = [list(self.actor.parameters()), list(self.critics.parameters()), [self.log_alpha]]
+        gradients = [torch.autograd.grad(loss, group, retain_graph=True)
+                     for loss, group in zip(losses, groups, strict=True)]  # fmt: skip
+        if config.alpha is not None:
+            del gradients[2]
+        for optimizer, group, gradient in zip(self.optimizers, groups, gradients, strict=False):
+            for parameter, value in zip(group, gradient, strict=True):
+                parameter.grad = value
+            optimizer.step()
+        tau = config.target_update_rate
+        pairs = zip(self.critics.parameters(), self.target_critics.parameters(), strict=True)
+        with torch.no_grad():
+            for fast, slow in pairs:
+                slow.copy_(tau * fast + (1 - tau) * slow)
+
+    def flat(self):
+        """Parameters as the agent keeps them."""
+
+        def vector(tree):
+            return np.concatenate([np.ravel(x) for x in jax.tree.leaves(tree)])
+
+        def stacked(critics):
+            return jax.tree.map(lambda *x: np.stack(x), *(critic.nested() for critic in critics))
+
+        log_alpha = self.log_alpha.detach().numpy()
+        return {
+            "params": vector([self.actor.nested(), stacked(self.critics), log_alpha]),
+            "target_critics": vector(stacked(self.target_critics)),
+        }
+
+
+def main():
+    """Writes all parameters after some of the updates on the test's batches and noise."""
+    arrays = {}
+    for case in CASES:
+        reference = TorchSAC(case)
+        for number in range(1, max(CHECKED_UPDATES) + 1):
+            reference.update(case_batch(case, number), case_noise(case, number))
+            if number in CHECKED_UPDATES:
+                after = reference.flat()
+                arrays |= {f"{case}/{name}/{number}": after[name].copy() for name in NAMES}
+    np.savez(GOLDEN, **arrays)
+
+
+if __name__ == "__main__":
+    main()
