@@ -316,7 +316,9 @@ def test_a_field_that_another_algorithm_has_is_not_suggested():
 
 
 @pytest.mark.parametrize(
-    "overrides", [("proxy.name=rn",), ("env.name=no_such_task",), ("agent.name=nope",)], ids=" ".join
+    "overrides",
+    [("proxy.name=rn",), ("env.name=no_such_task",), ("agent.name=nope",)],
+    ids=" ".join,
 )
 def test_a_name_that_no_choice_has_is_refused(overrides):
     message(*overrides)

@@ -24,7 +24,10 @@ from sejax.training import TrainingConfig, budget_for
 
 TINY = ["agent.hidden_size=4", "agent.batch_size=4", "agent.init_episodes=0", "num_agents=3",
         "real_training.max_episodes=2"]  # fmt: skip
-SOFT = ("proxy.done=soft", "proxy.horizon=null")  # an SE whose episodes may be as long as the task's
+SOFT = (
+    "proxy.done=soft",
+    "proxy.horizon=null",
+)  # an SE whose episodes may be as long as the task's
 ROOM = [
     "agent=q_learning",
     "num_agents=2",

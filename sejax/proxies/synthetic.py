@@ -5,11 +5,10 @@ and learned initial states: Liesen et al., "Discovering Minimal Reinforcement Le
 (2024).
 """
 
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from flax import struct
 from gymnax.environments import environment
 from jaxtyping import Array, Bool, Float
@@ -17,33 +16,12 @@ from jaxtyping import Array, Bool, Float
 from sejax.envs.task import Task
 from sejax.networks import MLP
 from sejax.proxies.proxy import ABSURD, ProxyEnv, ProxyParams, World
+from sejax.proxies.units import units_of
 
 if TYPE_CHECKING:  # which makes it
     from sejax.proxies.configs import SyntheticConfig
 
 START_HIDDEN_SIZE = 32  # of the network that makes initial states
-
-
-class Units(NamedTuple):
-    """What is 0, and what is 1 more than that, for a network: `[obs_dim]` each."""
-
-    middle: np.ndarray
-    one: np.ndarray
-
-
-def units_of(task: Task) -> Units:
-    """Units by the bounds of a task's observations; 0 and 1 for numbers without.
-
-    One is half of the way from the middle to a bound. Some spaces write "none" as huge numbers.
-    """
-    shape = (task.obs_dim,)
-    if task.num_states is not None:
-        return Units(np.zeros(shape, np.float32), np.ones(shape, np.float32))
-    space = task.env.observation_space(task.params)
-    low, high = (np.broadcast_to(np.asarray(x, np.float32), shape) for x in (space.low, space.high))
-    bounded = (np.abs(low) < ABSURD) & (np.abs(high) < ABSURD)
-    low, high = np.where(bounded, low, -2.0), np.where(bounded, high, 2.0)
-    return Units(middle=(low + high) / 2, one=(high - low) / 4)
 
 
 @struct.dataclass
@@ -84,7 +62,10 @@ class SyntheticEnv(ProxyEnv):
             head: MLP(size, config.hidden_size, config.num_layers, config.activation)
             for head, size in outputs.items()
         }
-        self._units = units_of(task) if config.state_units == "bounds" else None
+        self._units = None
+        if config.state_units == "bounds" and task.num_states is None:
+            space = task.env.observation_space(task.params)
+            self._units = units_of(space.low, space.high, task.obs_dim)
         self._start = None
         if config.initial_state == "learned":
             self._start = MLP(task.obs_dim, START_HIDDEN_SIZE, 1, config.activation)
@@ -120,22 +101,20 @@ class SyntheticEnv(ProxyEnv):
         """
         if self.task.num_actions is not None:
             action = jax.nn.one_hot(action, self.task.num_actions)
-        x = jnp.concatenate([action, self._to_units(vector)])
+        seen = vector if self._units is None else self._units.encode(vector)
+        x = jnp.concatenate([action, seen])
         out = {head: net.apply({"params": weights[head]}, x) for head, net in self._nets.items()}
-        state = self._from_units(out["state"]) if "state" in out else vector
-        return state, out["reward"][0], out["done"][0] if "done" in out else jnp.float32(1)
-
-    def _to_units(self, vector: Float[Array, " obs_dim"]) -> Float[Array, " obs_dim"]:
-        return vector if self._units is None else (vector - self._units.middle) / self._units.one
-
-    def _from_units(self, vector: Float[Array, " obs_dim"]) -> Float[Array, " obs_dim"]:
-        return vector if self._units is None else self._units.middle + vector * self._units.one
+        if self.config.horizon == 1:
+            return vector, out["reward"][0], jnp.float32(1)
+        state = out["state"] if self._units is None else self._units.decode(out["state"])
+        return state, out["reward"][0], out["done"][0]
 
     def reset_env(self, key: Array, params: ProxyParams) -> tuple[Array, SyntheticState]:
         if self._start is not None:
             noise = jax.random.normal(key, (self.task.obs_dim,))
             moved: Any = self._start.apply({"params": params.weights["start"]}, noise)
-            vector = self._from_units(noise + moved)
+            vector = noise + moved
+            vector = vector if self._units is None else self._units.decode(vector)
             vector = jnp.clip(vector, -ABSURD, ABSURD)  # what steps from there call absurd
         else:
             vector, _ = self.task.env.reset_env(key, self.task.params)
