@@ -67,9 +67,9 @@ def test_a_reward_network_chooses_its_objective_where_none_is_chosen():
 def test_a_task_chooses_its_agent_where_none_is_chosen():
     names = {env: composed_with(f"env={env}").name("agent") for env in envs.names()}
     assert names == {
-        "cartpole": "ddqn", "acrobot": "ddqn", "cliff_walking": "q_learning",
-        "gridworld_2x2": "q_learning", "mountain_car_continuous": "td3", "pendulum": "td3",
-        "halfcheetah": "td3",
+        "cartpole": "ddqn", "cartpole_v1": "ddqn", "acrobot": "ddqn", "cliff_walking": "q_learning",
+        "gridworld_2x2": "q_learning", "mountain_car": "ddqn", "mountain_car_continuous": "td3",
+        "pendulum": "td3", "halfcheetah": "td3",
     }  # fmt: skip
     assert sejax.config(["env=pendulum", "agent=ppo"]).name("agent") == "ppo"
 
