@@ -157,7 +157,7 @@ def test_episodes_of_one_step_extend_a_step_budget_by_as_little(tmp_path):
 def test_each_of_several_agents_trains_as_long_as_it_must(tmp_path):
     """An SE learned with two families: neither they nor others wait beyond their budget."""
     words = ("agents=[ddqn,ppo]", "proxy.hidden_size=4", "agents.ddqn.init_episodes=2",
-             "agents.ppo.update_episodes=1", "training.max_steps=4000", *SOFT)  # fmt: skip
+             "agents.ppo.rollout_steps=100", "training.max_steps=4000", *SOFT)  # fmt: skip
     path = save(tmp_path / "proxy.safetensors", *words)
     composed = evaluate_config(f"proxy={path}", "agent=[ddqn,dueling_ddqn,ppo]", words=[])
     budgets = {
