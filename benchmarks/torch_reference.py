@@ -67,6 +67,7 @@ def mlp(params: list[Tensor], x: Tensor, activation: str) -> Tensor:
 
 ACTIVATIONS: dict[str, Callable[[Tensor], Tensor]] = {
     "tanh": torch.tanh,
+    "fast_tanh": torch.tanh,
     "relu": torch.relu_,  # in place, as nothing else needs what comes in
     "leaky_relu": F.leaky_relu,
 }

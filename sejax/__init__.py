@@ -25,6 +25,8 @@ _EXPORTS = {
     "DiscreteTD3Config": "sejax.agents.td3",
     "DuelingDDQNConfig": "sejax.agents.ddqn",
     "EvosaxConfig": "sejax.es.evosax",
+    "Families": "sejax.families",
+    "FamiliesConfig": "sejax.families",
     "ICMConfig": "sejax.agents.icm",
     "LearnResult": "sejax.bilevel",
     "MaxReward": "sejax.objectives",
@@ -63,10 +65,10 @@ _EXPORTS = {
     "save_set": "sejax.proxies.files",
     "spread_over_devices": "sejax.parallel",
 }
-_MODULES = ("agents", "envs", "es", "options", "proxies")
+_MODULES = ("agents", "envs", "es", "gym", "options", "proxies")
 
 if TYPE_CHECKING:  # what a type checker and an editor see
-    from sejax import agents, envs, es, options, proxies
+    from sejax import agents, envs, es, gym, options, proxies
     from sejax.agents import make_agent
     from sejax.agents.agent import Agent
     from sejax.agents.count_based import CountBasedConfig
@@ -85,6 +87,7 @@ if TYPE_CHECKING:  # what a type checker and an editor see
     from sejax.es.nes import NESConfig
     from sejax.es.strategy import Strategy, Trials
     from sejax.evaluation import evaluate_agents, make_evaluator
+    from sejax.families import Families, FamiliesConfig
     from sejax.objectives import AUC, AUCSum, MaxReward, Objective, Outcome, RewardThreshold
     from sejax.parallel import spread_over_devices
     from sejax.proxies.configs import RewardConfig, SyntheticConfig
@@ -104,14 +107,14 @@ if TYPE_CHECKING:  # what a type checker and an editor see
 
 __all__ = [
     "AUC", "AUCSum", "Agent", "ConfigError", "CountBasedConfig", "DDQNConfig", "DQNConfig",
-    "DiscreteTD3Config", "DuelingDDQNConfig", "EvosaxConfig", "ICMConfig", "LearnResult",
-    "MaxReward", "NESConfig", "Objective", "Outcome", "PPOConfig", "Proxy", "ProxyEnv",
-    "ProxyParams", "ProxySet", "QLearningConfig", "RewardConfig", "RewardThreshold", "SACConfig",
-    "SARSAConfig", "Strategy",
-    "SyntheticConfig", "TD3Config", "Task", "TrainResult", "TrainingConfig", "Trials", "agents",
-    "config", "configure_xla", "envs", "es", "evaluate_agents", "load", "load_proxy", "load_set",
-    "make_agent", "make_evaluator", "make_learner", "make_trainer", "options", "proxies",
-    "register_gymnax", "save", "save_set", "spread_over_devices",
+    "DiscreteTD3Config", "DuelingDDQNConfig", "EvosaxConfig", "Families", "FamiliesConfig",
+    "ICMConfig", "LearnResult", "MaxReward", "NESConfig", "Objective", "Outcome", "PPOConfig",
+    "Proxy", "ProxyEnv", "ProxyParams", "ProxySet", "QLearningConfig", "RewardConfig",
+    "RewardThreshold", "SACConfig", "SARSAConfig", "Strategy", "SyntheticConfig", "TD3Config",
+    "Task", "TrainResult", "TrainingConfig", "Trials", "agents", "config", "configure_xla", "envs",
+    "es", "evaluate_agents", "gym", "load", "load_proxy", "load_set", "make_agent",
+    "make_evaluator", "make_learner", "make_trainer", "options", "proxies", "register_gymnax",
+    "save", "save_set", "spread_over_devices",
 ]  # fmt: skip
 
 

@@ -5,12 +5,14 @@ Assembles a proxy, an agent, a strategy and an objective; owns no maths of its o
 Source: paper, Algorithm 1.
 """
 
+import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
@@ -20,10 +22,11 @@ from sejax.agents.agent import Agent
 from sejax.counters import exact, wide_add, wide_sum, wide_zeros
 from sejax.envs.task import Task
 from sejax.errors import require
-from sejax.es.strategy import Strategy, finite_mean
-from sejax.evaluation import make_evaluator, tested_throughout
+from sejax.es.strategy import Strategy, Trials, finite_mean
+from sejax.evaluation import lanes_on_cpu, make_evaluator, tested_throughout
+from sejax.families import Families
 from sejax.objectives import MaxReward, Objective, Outcome
-from sejax.parallel import spread_over_devices
+from sejax.parallel import spread_groups_over_devices
 from sejax.proxies.proxy import ProxyEnv
 from sejax.training import TrainingConfig
 
@@ -37,8 +40,10 @@ class LearnState:
     generation: Array
     incumbent: Float[Array, "seed dims"]  # as measured in the last generation, before its update
     incumbent_score: Array
+    incumbent_scores: Float[Array, "seed family"]  # of which it is made
     best: Float[Array, "seed dims"]
     best_score: Array
+    best_scores: Float[Array, "seed family"]
     best_generation: Array
     env_steps: Array  # a wide count, see `sejax.counters`
     finished: Array  # stop_when_solved: the run is over and its generations cost nothing
@@ -58,6 +63,7 @@ class GenerationInfo:
     train_steps_max: Array
     train_episodes_mean: Array
     num_nonfinite: Array
+    families: "FamilyInfo"
     env_steps_wide: Array  # `[seed, 2]`; see `env_steps_total`
     train_steps_wide: Array  # `[seed, 2]`; see `train_steps_total`
     active: Array
@@ -71,6 +77,16 @@ class GenerationInfo:
     def train_steps_total(self) -> Any:
         """Steps of all agents in this generation, NumPy int64; for an info on the host."""
         return exact(self.train_steps_wide)
+
+
+@struct.dataclass
+class FamilyInfo:
+    """The same for each family of agents, `[seed, family]`."""
+
+    incumbent_mean: Array
+    population_mean: Array
+    train_steps_mean: Array
+    num_nonfinite: Array
 
 
 @struct.dataclass
@@ -105,7 +121,7 @@ class Program:
         `tell`; a scan body over all seeds.
       unravel: flat parameters `[dims]` to the proxy's weights.
       proxy: what is learned.
-      agent: that learns on it.
+      families: of agents that learn on it; one, if there is a single agent.
       strategy: that learns it.
       objective: that it is learned by.
       num_dims: length of a parameter vector.
@@ -117,7 +133,7 @@ class Program:
     generation: Callable[[LearnState], tuple[LearnState, GenerationInfo]]
     unravel: Callable[[Array], Any]
     proxy: ProxyEnv
-    agent: Agent
+    families: Families
     strategy: Strategy
     objective: Objective
     num_dims: int
@@ -125,6 +141,11 @@ class Program:
     @property
     def task(self) -> Task:
         return self.proxy.task
+
+    @property
+    def agent(self) -> Agent:
+        """The agent, or that of the first family."""
+        return self.families.agents[0]
 
     @property
     def solved_score(self) -> float | None:
@@ -138,7 +159,7 @@ def make_learner(
     config: Any = None,
     *,
     task: Task | None = None,
-    agent: Agent | None = None,
+    agent: Agent | Families | None = None,
     proxy: Any = None,
     es: Any = None,
     objective: Any = None,
@@ -157,7 +178,8 @@ def make_learner(
       config: from `sejax.config`, in the place of all others. Its `seed`, `num_seeds`, `run_dir`
         and `checkpoint_every` are the command's and play no part here.
       task: the real task.
-      agent: that learns on the proxies, from `sejax.make_agent` or one of your own.
+      agent: that learns on the proxies, from `sejax.make_agent` or one of your own; or several of
+        them (`sejax.Families`), among which the members of a generation take turns.
       proxy: a `ProxyEnv` of the task, or a configuration that makes one; an SE if not given.
       es: a configuration with `make(num_dims) -> Strategy`; the paper's NES if not given.
       objective: an `Objective`, or a configuration that makes one; the mean test return if not
@@ -214,7 +236,7 @@ def make_learner(
 def make_program(
     *,
     task: Task,
-    agent: Agent,
+    agent: Agent | Families,
     proxy: Any = None,
     es: Any = None,
     objective: Any = None,
@@ -226,13 +248,19 @@ def make_program(
     """Assembles the bilevel loop for `[seed]` independent runs; arguments as of `make_learner`."""
     proxy, objective = _proxy_of(proxy, task), _objective_of(objective, task)
     training = training or TrainingConfig()
-    flat, unravel = ravel_pytree(proxy.init_weights(jax.random.key(0)))
-    strategy = _strategy_of(es, flat.size)
+    num_dims, unravel = _flat_weights(proxy)
+    families, strategy = Families.of(agent), _strategy_of(es, num_dims)
+    trials = dataclasses.replace(
+        strategy.trials,
+        num_incumbent_evals=families.num_evals(strategy.trials.num_incumbent_evals),
+    )
+    strategy = dataclasses.replace(strategy, trials=trials)
+    family_of_member = families.of_members(strategy.num_members, strategy.num_signs)
+    family_of_trial = trials.families(family_of_member, families.size)
     evaluate_all = make_population_evaluator(
-        agent, proxy, tested_throughout(training) if objective.needs_tests else training,
-        unravel, devices, lanes,
+        families, proxy, tested_throughout(training) if objective.needs_tests else training,
+        unravel, family_of_trial, devices, lanes,
     )  # fmt: skip
-    trials = strategy.trials
     seed_ids = jnp.asarray(trials.seed_ids(strategy.num_members))
     require(not stop_when_solved or (objective.scores_are_returns and task.is_solvable),
             "stop_when_solved", "be false with this objective and task", "nobody says which score "
@@ -250,8 +278,10 @@ def make_program(
             generation=jnp.zeros(num_seeds, jnp.int32),
             incumbent=mean,
             incumbent_score=jnp.full(num_seeds, -jnp.inf),
+            incumbent_scores=jnp.full((num_seeds, families.size), -jnp.inf),
             best=mean,
             best_score=jnp.full(num_seeds, -jnp.inf),
+            best_scores=jnp.full((num_seeds, families.size), -jnp.inf),
             best_generation=jnp.full(num_seeds, -1, jnp.int32),
             env_steps=wide_zeros(num_seeds),
             finished=jnp.zeros(num_seeds, bool),
@@ -278,21 +308,30 @@ def make_program(
     def tell(
         state: LearnState, asked: Asked, outcome: Outcome
     ) -> tuple[LearnState, GenerationInfo]:
-        scores = Scores.of(objective(outcome), trials)
+        scores = Scores.of(objective(outcome), trials, families, family_of_trial)
+        worth = scores
+        if objective.test_steps is not None:  # which members are compared by
+            worth = Scores.of(objective.of_whole_tests(outcome), trials, families, family_of_trial)
+        members, incumbent = jax.vmap(
+            lambda tried, means: families.comparable(
+                trials.of_members(tried), family_of_member, means
+            )
+        )(scores.tried, scores.family_means)
         told = jax.vmap(strategy.tell)(
-            asked.key_tell, asked.members, jax.vmap(trials.of_members)(scores.tried),
-            scores.incumbent_mean, asked.es_state,
-        )  # fmt: skip
-        stepped = _advance(state, told, asked.incumbent, scores, outcome)
+            asked.key_tell, asked.members, members, incumbent, asked.es_state
+        )
+        stepped = _advance(state, told, asked.incumbent, worth, outcome)
         if stop_when_solved:
             stepped = stepped.replace(finished=stepped.incumbent_score >= task.solved_reward)
         stepped = jax.tree.map(lambda new, old: _where(state.finished, old, new), stepped, state)
-        return stepped, _summarise(state, stepped, scores, outcome)
+        return stepped, _summarise(state, stepped, worth, outcome, families, family_of_trial)
 
     def generation(state: LearnState) -> tuple[LearnState, GenerationInfo]:
         """One pass of Algorithm 1's outer loop for every seed; a scan body."""
         asked = ask(state)
-        return tell(state, asked, evaluate_all(asked.keys, asked.candidates, ~state.finished))
+        test_steps = objective.test_steps and objective.test_steps(state.generation)
+        outcome = evaluate_all(asked.keys, asked.candidates, ~state.finished, test_steps)
+        return tell(state, asked, outcome)
 
     return Program(
         init=init,
@@ -301,10 +340,10 @@ def make_program(
         generation=generation,
         unravel=unravel,
         proxy=proxy,
-        agent=agent,
+        families=families,
         strategy=strategy,
         objective=objective,
-        num_dims=flat.size,
+        num_dims=num_dims,
     )
 
 
@@ -334,24 +373,43 @@ class Scores:
     """What a generation's trainings are worth, leaves `[seed, ...]`.
 
     Attributes:
-      tried: of the members' trials, `[seed, trials]`; not finite for agents that diverged.
+      all: of all trials, in the task's unit or the objective's, `[seed, trials]`; not finite for
+        agents that diverged.
+      tried: of the members' trials, `[seed, tried]`.
       incumbent: of the incumbent's, with agents that diverged ranked last.
-      incumbent_mean: of these, `[seed]`; nan if none survived.
-      num_nonfinite: trainings that diverged, `[seed]`.
+      family_means: means of these for each family, `[seed, family]`; nan where none survived.
+      incumbent_mean: what the incumbent is worth, `[seed]`; nan if none survived of a family.
     """
 
+    all: Array
     tried: Array
     incumbent: Array
+    family_means: Array
     incumbent_mean: Array
-    num_nonfinite: Array
 
     @classmethod
-    def of(cls, scores: Float[Array, "seed trials"], trials: Any) -> "Scores":
+    def of(
+        cls,
+        scores: Float[Array, "seed trials"],
+        trials: Trials,
+        families: Families,
+        family_of_trial: np.ndarray,
+    ) -> "Scores":
         tried, incumbent = jax.vmap(trials.split)(scores)
-        repaired, mean = jax.vmap(trials.of_incumbent)(incumbent, tried)
-        num_nonfinite = (~jnp.isfinite(scores)).sum(axis=1)
-        return cls(tried=tried, incumbent=repaired, incumbent_mean=mean,
-                   num_nonfinite=num_nonfinite)  # fmt: skip
+        family_tried, family_incumbent = (
+            family_of_trial[: tried.shape[1]], family_of_trial[tried.shape[1] :]
+        )  # fmt: skip
+        means = []
+        for i in range(families.size):
+            places = np.flatnonzero(family_incumbent == i)
+            repaired, mean = jax.vmap(trials.of_incumbent)(
+                incumbent[:, places], tried[:, family_tried == i]
+            )
+            incumbent = incumbent.at[:, places].set(repaired)
+            means.append(mean)
+        family_means = jnp.stack(means, axis=1)
+        return cls(all=scores, tried=tried, incumbent=incumbent, family_means=family_means,
+                   incumbent_mean=jax.vmap(families.aggregated)(family_means))  # fmt: skip
 
 
 def _advance(
@@ -360,22 +418,36 @@ def _advance(
     """Records what this generation measured of its incumbent and keeps the best one."""
     score = scores.incumbent_mean
     score = jnp.where(jnp.isfinite(score), score, -jnp.inf)
+    family_means = jnp.where(jnp.isfinite(scores.family_means), scores.family_means, -jnp.inf)
     better = score > state.best_score
     return state.replace(
         es_state=told,
         generation=state.generation + 1,
         incumbent=incumbent,
         incumbent_score=score,
+        incumbent_scores=family_means,
         best=_where(better, incumbent, state.best),
         best_score=jnp.where(better, score, state.best_score),
+        best_scores=_where(better, family_means, state.best_scores),
         best_generation=jnp.where(better, state.generation, state.best_generation),
         env_steps=wide_add(state.env_steps, wide_sum(outcome.real_steps)),
     )
 
 
 def _summarise(
-    before: LearnState, after: LearnState, scores: Scores, outcome: Outcome
+    before: LearnState,
+    after: LearnState,
+    scores: Scores,
+    outcome: Outcome,
+    families: Families,
+    family_of_trial: np.ndarray,
 ) -> GenerationInfo:
+    diverged = ~jnp.isfinite(scores.all)
+    num_tried = scores.tried.shape[1]
+
+    def of_families(of_one: Callable[[np.ndarray], Array]) -> Array:
+        return jnp.stack([of_one(family_of_trial == i) for i in range(families.size)], axis=1)
+
     return GenerationInfo(
         generation=before.generation,
         incumbent_mean=scores.incumbent_mean,
@@ -386,7 +458,15 @@ def _summarise(
         train_steps_mean=outcome.train_steps.mean(axis=1),
         train_steps_max=outcome.train_steps.max(axis=1),
         train_episodes_mean=outcome.train_episodes.mean(axis=1),
-        num_nonfinite=scores.num_nonfinite,
+        num_nonfinite=diverged.sum(axis=1),
+        families=FamilyInfo(
+            incumbent_mean=scores.family_means,
+            population_mean=of_families(
+                lambda own: jax.vmap(finite_mean)(scores.tried[:, own[:num_tried]])
+            ),
+            train_steps_mean=of_families(lambda own: outcome.train_steps[:, own].mean(axis=1)),
+            num_nonfinite=of_families(lambda own: diverged[:, own].sum(axis=1)),
+        ),
         env_steps_wide=after.env_steps,
         train_steps_wide=wide_sum(outcome.train_steps),
         active=~before.finished,
@@ -394,34 +474,61 @@ def _summarise(
 
 
 def make_population_evaluator(
-    agent: Agent,
+    families: Families,
     proxy: ProxyEnv,
     training: TrainingConfig,
     unravel: Callable[[Array], Any],
+    family_of_trial: np.ndarray,
     devices: int | None = None,
     lanes: int | None = None,
 ) -> Callable[..., Outcome]:
-    """Builds `evaluate(keys [seed, n], candidates [seed, n, dims], active [seed]) -> Outcome`.
+    """Builds `evaluate(keys, candidates, active, test_steps=None) -> Outcome`.
 
-    It trains one fresh agent on each candidate and tests it on the real task; leaves
-    `[seed, n, ...]`. The trainings are spread over the devices; on each device groups of `lanes` of
-    them follow one another.
+    Of `keys [seed, n]`, `candidates [seed, n, dims]`, `active [seed]` and how much of the test
+    episodes is scored, `[seed]`. It trains one fresh agent on each candidate and tests it on the
+    real task; leaves `[seed, n, ...]`. The trainings are spread over the devices, each device's
+    family by family, as it is known when the program is built which family trains on which
+    candidate: no training pays for another family's. Groups of `lanes` of them follow one another.
     """
-    evaluate = make_evaluator(agent, proxy, proxy.task, training)
 
-    def evaluate_candidate(key: Array, candidate: Array, active: Array) -> Outcome:
-        return evaluate(key, proxy.params(unravel(candidate)), active)
-
-    evaluate_many = spread_over_devices(evaluate_candidate, devices, lanes, agent.cpu_lanes)
-
-    def evaluate_all(keys: Array, candidates: Array, active: Array) -> Outcome:
-        num_seeds, num_candidates, num_dims = candidates.shape
-        outcome = evaluate_many(
-            keys.reshape(-1), candidates.reshape(-1, num_dims), jnp.repeat(active, num_candidates)
+    def evaluator_of(agent: Agent) -> Callable[..., Outcome]:
+        evaluate = make_evaluator(agent, proxy, proxy.task, training)
+        return lambda key, candidate, active, test_steps: evaluate(
+            key, proxy.params(unravel(candidate)), active, test_steps
         )
-        return jax.tree.map(lambda x: x.reshape(num_seeds, num_candidates, *x.shape[1:]), outcome)
+
+    places = [np.flatnonzero(family_of_trial == i) for i in range(families.size)]
+    order = np.argsort(np.concatenate(places))
+    evaluate_groups = spread_groups_over_devices(
+        [evaluator_of(agent) for agent in families.agents], devices, lanes,
+        [lanes_on_cpu(agent, training) for agent in families.agents],
+    )  # fmt: skip
+
+    def evaluate_all(
+        keys: Array, candidates: Array, active: Array, test_steps: Array | None = None
+    ) -> Outcome:
+        num_seeds, _, num_dims = candidates.shape
+        of_seeds = (active, test_steps)
+        outcomes = evaluate_groups([
+            (keys[:, own].reshape(-1), candidates[:, own].reshape(-1, num_dims),
+             *jax.tree.map(lambda x, n=own.size: jnp.repeat(x, n), of_seeds))
+            for own in places
+        ])  # fmt: skip
+
+        def merged(*parts: Array) -> Array:
+            by_seed = [x.reshape(num_seeds, -1, *x.shape[1:]) for x in parts]
+            return jnp.concatenate(by_seed, axis=1)[:, order] if len(parts) > 1 else by_seed[0]
+
+        return jax.tree.map(merged, *outcomes)
 
     return evaluate_all
+
+
+def _flat_weights(proxy: ProxyEnv) -> tuple[int, Callable[[Array], Any]]:
+    """Length of a proxy's flat parameters, and what makes weights of them."""
+    shapes = jax.eval_shape(proxy.init_weights, jax.random.key(0))
+    flat, unravel = ravel_pytree(jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), shapes))
+    return flat.size, unravel
 
 
 def _proxy_of(proxy: Any, task: Task) -> ProxyEnv:

@@ -1,6 +1,7 @@
 """`python -m sejax.evaluate`: train fresh agents on a stored proxy, test them on the real task."""
 
 import dataclasses
+import json
 import math
 import time
 from dataclasses import dataclass
@@ -13,7 +14,9 @@ from omegaconf import DictConfig
 from sejax import plugins
 from sejax.app import build, commands, compose, runtime
 from sejax.app.build import EvaluateConfig
+from sejax.app.families import AgentFamily, families_of, named
 from sejax.errors import ConfigError
+from sejax.training import TrainingConfig
 
 
 @hydra.main(config_path="conf", config_name="evaluate", version_base="1.3")
@@ -40,25 +43,35 @@ def evaluate(config: EvaluateConfig) -> float:
     from sejax.files import write_text
 
     study = _real_study(config) if config.proxy == "real" else _proxy_study(config)
-    tables = {name: _train_and_test(config, study, name) for name in study.worlds}
-    table = pd.concat([t.assign(world=name) for name, t in tables.items()])
+    tables = {(world, family.key): _train_and_test(config, study, world, family)
+              for world in study.worlds for family in study.families}  # fmt: skip
+    table = pd.concat([t.assign(world=world) for (world, _), t in tables.items()])
     out_dir, solved_reward = study.out_dir, study.task.solved_reward
     out_dir.mkdir(parents=True, exist_ok=True)
     write_text(out_dir / "evaluation.csv", table.to_csv(index=False))
     plots.evaluation(tables, solved_reward, out_dir / "evaluation.png")
-    summary = summarise(table)
-    write_text(out_dir / "evaluation.json", summary.to_json(orient="index", indent=2))
+    summary = summarise(table, ["world", "agent"] if study.has_several else ["world"])
+    write_text(out_dir / "evaluation.json", _as_json(summary))
     _print_table(summary, study, config)
-    return float(next(iter(tables.values()))["test_return"].mean())
+    first = table[table["world"] == next(iter(study.worlds))]
+    return float(first["test_return"].mean())
 
 
-def summarise(table: Any) -> Any:
-    """Mean and standard deviation of each column for each world, as a data frame."""
-    columns = ["test_return", "train_steps", "train_episodes"]
-    summary = table.groupby("world", sort=False)[columns].agg(["mean", "std"])
+def summarise(table: Any, by: list[str]) -> Any:
+    """Mean and standard deviation of each column for each group, as a data frame."""
+    grouped = table.groupby(by, sort=False)
+    summary = grouped[["test_return", "train_steps", "train_episodes"]].agg(["mean", "std"])
     summary.columns = [f"{name}_{statistic}" for name, statistic in summary.columns]
-    grouped = table.groupby("world", sort=False)
     return summary.assign(num_agents=grouped.size(), num_nonfinite=grouped["nonfinite"].sum())
+
+
+def _as_json(summary: Any) -> str:
+    """An object for each world; with several agents, in it one for each of them."""
+    if summary.index.nlevels == 1:
+        return str(summary.to_json(orient="index", indent=2))
+    worlds = summary.index.get_level_values("world").unique()
+    nested = {world: json.loads(summary.loc[world].to_json(orient="index")) for world in worlds}
+    return json.dumps(nested, indent=2)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,17 +80,22 @@ class Study:
 
     Attributes:
       task: the real task, on which all are tested.
-      worlds: name to `(env, env_params, training)`.
-      agent: configuration of the agents.
-      exploration: likewise.
+      worlds: name to `(env, env_params, training)`, how long each of the agents trains there by its
+        key.
+      families: the agents.
+      exploration: of all of them.
       out_dir: where the files go.
     """
 
     task: Any
-    worlds: dict[str, tuple[Any, Any, Any]]
-    agent: Any
+    worlds: dict[str, tuple[Any, Any, dict[str, TrainingConfig]]]
+    families: tuple[AgentFamily, ...]
     exploration: Any
     out_dir: Path
+
+    @property
+    def has_several(self) -> bool:
+        return len(self.families) > 1
 
 
 def _real_study(config: EvaluateConfig) -> Study:
@@ -88,11 +106,15 @@ def _real_study(config: EvaluateConfig) -> Study:
         raise ConfigError("env must be given with proxy=real, because the task cannot be read "
                           "from a proxy; got none. Set env=cartpole.")  # fmt: skip
     spec = plugins.configure("env", {"name": config.env})
-    agents.require_fit(config.agent, config.exploration, envs.facts_of(spec), config.env)
+    families = families_of(config)
+    for family in families:
+        with named(family.field):
+            agents.require_fit(family.agent, config.exploration, envs.facts_of(spec), config.env)
     task = envs.make_from(spec)
-    worlds = {"the real task": (task.env, task.params, config.real_training)}
+    training = {family.key: config.real_training for family in families}
+    worlds = {"the real task": (task.env, task.params, training)}
     out_dir = Path(config.out_dir or Path("runs", f"evaluate-{_as_file_name(task.name)}"))
-    return Study(task=task, worlds=worlds, agent=config.agent, exploration=config.exploration,
+    return Study(task=task, worlds=worlds, families=families, exploration=config.exploration,
                  out_dir=out_dir)  # fmt: skip
 
 
@@ -107,20 +129,27 @@ def _proxy_study(config: EvaluateConfig) -> Study:
         raise ConfigError(f"env must be the proxy's own task, because agents trained on it are "
                           f"tested there; got {config.env} for a proxy of {task.name}. Set "
                           f"env={task.name}.")  # fmt: skip
-    agent, exploration = config.agent, config.exploration
+    families, exploration = families_of(config), config.exploration
     if config.agent_hparams == "as_learned":
-        agent, exploration = proxy.learned_with("agent"), proxy.learned_with("exploration")
-    agents.require_fit(agent, exploration, task.facts, task.name)
-    group, training = _training_on(proxy, config, agent)
-    build.require_real_returns(group, training)
-    if getattr(proxy.env.config, "may_never_end", False):
-        build.require_learning(group, training, agent, task.max_steps)
-    worlds = {"the proxy": (proxy.env, proxy.params, training)}
+        families = tuple(AgentFamily(key=key, field="agent", agent=agent)
+                         for key, agent in proxy.learned_agents().items())  # fmt: skip
+        exploration = proxy.learned_with("exploration")
+    trainings = {}
+    for family in families:
+        with named(family.field):
+            agents.require_fit(family.agent, exploration, task.facts, task.name)
+            group, training = _training_on(proxy, config, family.agent)
+            build.require_real_returns(group, training)
+            if getattr(proxy.env.config, "may_never_end", False):
+                build.require_learning(group, training, family.agent, task.max_steps)
+        trainings[family.key] = training
+    worlds = {"the proxy": (proxy.env, proxy.params, trainings)}
     if config.baseline:
-        worlds["the real task"] = (task.env, task.params, config.real_training)
+        real_training = dict.fromkeys(trainings, config.real_training)
+        worlds["the real task"] = (task.env, task.params, real_training)
     shipped = proxy.path.parent == files.PRETRAINED_DIR
     beside = Path("runs", f"evaluate-{proxy.path.stem}") if shipped else proxy.path.parent
-    return Study(task=task, worlds=worlds, agent=agent, exploration=exploration,
+    return Study(task=task, worlds=worlds, families=families, exploration=exploration,
                  out_dir=Path(config.out_dir or beside))  # fmt: skip
 
 
@@ -143,40 +172,41 @@ def _load(config: EvaluateConfig) -> Any:
 
 def _training_on(proxy: Any, config: EvaluateConfig, agent: Any) -> tuple[str, Any]:
     """How long agents train on the proxy, and the group of fields that says so."""
-    from sejax.training import budget_for
-
     if config.training_from == "config":
         return "training", config.training
     if proxy.env.is_real or "training" not in proxy.config:
         # The dynamics are real: agents train and stop as on the real task.
         return "real_training", config.real_training
-    is_known = plugins.is_registered("agent", str(proxy.config["agent"].get("name")))
-    then = proxy.learned_with("agent") if is_known else None
-    training = budget_for(proxy.learned_with("training"), agent, then, proxy.task.max_steps)
     test_episodes = config.real_training.test_episodes
-    return "real_training", dataclasses.replace(training, test_episodes=test_episodes)
+    training = dataclasses.replace(proxy.training_for(agent), test_episodes=test_episodes)
+    return "real_training", training
 
 
-def _train_and_test(config: EvaluateConfig, study: Study, world: str) -> Any:
+def _train_and_test(config: EvaluateConfig, study: Study, world: str, family: AgentFamily) -> Any:
+    """A row for each agent of a family, as a data frame."""
     import jax
     import pandas as pd
 
     from sejax.agents import make_agent
     from sejax.evaluation import evaluate_agents
 
-    env, env_params, training = study.worlds[world]
+    env, env_params, trainings = study.worlds[world]
     varied = config.agent_hparams == "varied"
-    agent = make_agent(study.agent, study.task, study.exploration, varied)
+    agent = make_agent(family.agent, study.task, study.exploration, varied)
     keys = jax.random.split(jax.random.key(config.seed), config.num_agents)
     started = time.time()
     outcome = evaluate_agents(
-        agent, env, env_params, study.task, training, keys, config.lanes, config.devices
-    )
+        agent, env, env_params, study.task, trainings[family.key], keys, config.lanes,
+        config.devices,
+    )  # fmt: skip
     outcome = jax.device_get(outcome)
     drawn = jax.device_get(jax.vmap(agent.drawn_values)(keys))
-    print(f"{world}: {config.num_agents} agents in {time.time() - started:.1f} s", flush=True)
-    columns = {"agent": range(config.num_agents), "test_return": outcome.test_return,
-               **vars(outcome), **drawn}  # fmt: skip
+    who = f"{family.key} agents" if study.has_several else "agents"
+    print(f"{world}: {config.num_agents} {who} in {time.time() - started:.1f} s", flush=True)
+    numbers: dict[str, Any] = {"agent": range(config.num_agents)}
+    if study.has_several:
+        numbers = {"agent": family.key, "number": range(config.num_agents)}
+    columns = {**numbers, "test_return": outcome.test_return, **vars(outcome), **drawn}
     del columns["test_returns"]
     return pd.DataFrame(columns)
 
@@ -185,15 +215,16 @@ def _print_table(summary: Any, study: Study, config: EvaluateConfig) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    name, solved_at = plugins.name_of("agent", study.agent), study.task.solved_reward
+    agents = "agents of each family" if study.has_several else f"{study.families[0].key} agents"
+    solved_at = study.task.solved_reward
     solved = f" (solved at {solved_at:g})" if study.task.is_solvable else ""
-    table = Table(title=f"{config.num_agents} fresh {name} agents, tested on "
-                        f"{study.task.name}{solved}")  # fmt: skip
-    for column in ("trained on", "return", "training steps", "training episodes"):
-        table.add_column(column, justify="left" if column == "trained on" else "right")
-    for world, row in summary.iterrows():
+    table = Table(title=f"{config.num_agents} fresh {agents}, tested on {study.task.name}{solved}")
+    labels = ["trained on", "agent"][: summary.index.nlevels]
+    for column in (*labels, "return", "training steps", "training episodes"):
+        table.add_column(column, justify="left" if column in labels else "right")
+    for index, row in summary.iterrows():
         table.add_row(
-            str(world),
+            *([index] if len(labels) == 1 else index),
             _spread(row.test_return_mean, row.test_return_std, 1),
             _spread(row.train_steps_mean, row.train_steps_std, 0),
             _spread(row.train_episodes_mean, row.train_episodes_std, 1),

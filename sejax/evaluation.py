@@ -14,7 +14,7 @@ from jaxtyping import Array
 
 from sejax.agents.agent import Agent
 from sejax.objectives import Outcome
-from sejax.parallel import spread_over_devices
+from sejax.parallel import compiler_options, spread_over_devices
 from sejax.proxies.proxy import world_of
 from sejax.rollout import make_recorder, make_tester
 from sejax.trainer import TrainResult, make_trainer
@@ -24,11 +24,12 @@ from sejax.training import TrainingConfig
 def make_evaluator(
     agent: Agent, env: Any, task: Any, training: TrainingConfig, record: bool = False
 ) -> Callable[..., Any]:
-    """Builds `evaluate(key, env_params, active=True) -> Outcome` for a fresh agent.
+    """Builds `evaluate(key, env_params, active=True, score_steps=None) -> Outcome`.
 
-    The agent trains in `env`, which may be a proxy or the task itself, and is tested over
+    A fresh agent trains in `env`, which may be a proxy or the task itself, and is tested over
     `training.test_episodes` episodes on the task. With `active=False` nothing is computed. If the
-    agent's hyperparameters are drawn, they are drawn from the same key first.
+    agent's hyperparameters are drawn, they are drawn from the same key first. `score_steps` is the
+    length of the test episodes that the objective scores, the task's limit if not given.
 
     Args:
       agent: from `sejax.make_agent`, or one of your own.
@@ -56,17 +57,20 @@ def make_evaluator(
         recorded = make_recorder(agent, task, training.test_episodes) if record else None
         train = make_tested_trainer(agent, env, task, training)
 
-        def run(key: Array, env_params: Any, active: Array | bool, hparams: Any) -> Any:
+        def run(
+            key: Array, env_params: Any, active: Array | bool, score_steps: Any, hparams: Any
+        ) -> Any:
             key_train, key_test = jax.random.split(key)
             result = train(key_train, env_params, hparams, active)
-            returns, steps = test(key_test, result.agent_state, active)
-            real_steps = steps.sum() + result.test_steps
+            tests = test(key_test, result.agent_state, active, score_steps)
+            real_steps = tests.num_steps.sum() + result.test_steps
             outcome = Outcome(
-                test_returns=returns,
+                test_returns=tests.returns,
+                scored_returns=tests.scored,
                 train_steps=result.train_steps,
                 train_episodes=result.episodes,
-                return_area=return_area(result, returns.mean()),
-                nonfinite=result.nonfinite | ~jnp.isfinite(returns).all(),
+                return_area=return_area(result, tests.returns.mean()),
+                nonfinite=result.nonfinite | ~jnp.isfinite(tests.returns).all(),
                 real_steps=real_steps + result.train_steps if world_of(env).is_real else real_steps,
             )
             return (outcome, recorded(key_test, result.agent_state)) if recorded else outcome
@@ -74,7 +78,14 @@ def make_evaluator(
         return run
 
     run = agent.fresh(make_run)
-    return lambda key, env_params, active=True: run(key, env_params, active)
+    return lambda key, env_params, active=True, score_steps=None: run(
+        key, env_params, active, score_steps
+    )
+
+
+def lanes_on_cpu(agent: Agent, training: TrainingConfig) -> int | None:
+    """Agents in lockstep on a CPU core: 1 where they would wait for the one that trains longest."""
+    return 1 if agent.cpu_lanes is not None and not training.is_fixed_length else agent.cpu_lanes
 
 
 def make_tested_trainer(
@@ -94,8 +105,8 @@ def make_tested_trainer(
     test = make_tester(agent, task, max(1, training.num_tests_between))
 
     def test_between(key: Array, agent_state: Any, active: Array) -> tuple[Array, Array]:
-        returns, steps = test(key, agent_state, active)
-        return returns.mean(), steps.sum()
+        tests = test(key, agent_state, active)
+        return tests.returns.mean(), tests.num_steps.sum()
 
     return make_trainer(agent, env, training, task.solved_reward, test_fn=test_between, **options)
 
@@ -143,6 +154,6 @@ def evaluate_agents(
     """
     evaluate = make_evaluator(agent, env, task, training)
     program = spread_over_devices(
-        lambda key: evaluate(key, env_params), devices, lanes, agent.cpu_lanes
+        lambda key: evaluate(key, env_params), devices, lanes, lanes_on_cpu(agent, training)
     )
-    return jax.jit(program)(keys)
+    return jax.jit(program, compiler_options=compiler_options())(keys)

@@ -13,8 +13,40 @@ import jax.numpy as jnp
 from flax import linen as nn
 from jaxtyping import Array, Float
 
-ACTIVATIONS = ("tanh", "relu", "leaky_relu", "prelu")
+from sejax.options import ACTIVATIONS as ACTIVATIONS
+
 PRELU_SLOPE = 0.25
+
+# For powers of x^2, the lowest first. Of all such functions with slope 1 at 0 and no value above 1
+# the nearest to tanh up to where it is cut: by linear programs, bisecting the error.
+_TANH_NUMERATOR = (1.0, 0.123211934, 2.29220956e-3, 3.99148978e-6)
+_TANH_DENOMINATOR = (1.0, 0.45653853, 2.11477332e-2, 1.4388554e-4)
+_TANH_CUT = 7.0
+
+
+@jax.custom_jvp
+def fast_tanh(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+    """An odd rational function of degree 7 over 6 in place of tanh, whose input is cut at +-7.
+
+    Off by at most 1.4e-6 anywhere, increasing but for rounding, and within [-1, 1]. XLA's own tanh
+    is exact to rounding and takes 13 over 6, and autodiff of a quotient costs more than the
+    derivative used here, 1 - y^2. A step of `preset=paper`'s DDQN takes 0.83 of the time with it.
+    """
+    x = jnp.clip(x, -_TANH_CUT, _TANH_CUT)
+    square = x * x
+    return x * _polynomial(_TANH_NUMERATOR, square) / _polynomial(_TANH_DENOMINATOR, square)
+
+
+@fast_tanh.defjvp
+def _fast_tanh_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
+    (x,), (dx,) = primals, tangents
+    y = fast_tanh(x)
+    return y, (1 - y * y) * dx
+
+
+def _polynomial(coefficients: tuple[float, ...], x: Any) -> Any:
+    """Its value, by Horner's scheme; the coefficient of the lowest power comes first."""
+    return functools.reduce(lambda total, c: total * x + c, reversed(coefficients))
 
 
 def uniform_fan_in(fan_in: int) -> Callable[..., Array]:
@@ -141,7 +173,8 @@ class MLP(nn.Module):
             if self.learn_prelu_slope:
                 slope = self.param("prelu_slope", nn.initializers.constant(PRELU_SLOPE), ())
             return lambda x: jnp.where(x >= 0, x, slope * x)
-        return {"tanh": jnp.tanh, "relu": nn.relu, "leaky_relu": nn.leaky_relu}[self.activation]
+        return {"tanh": jnp.tanh, "fast_tanh": fast_tanh, "relu": nn.relu,
+                "leaky_relu": nn.leaky_relu}[self.activation]  # fmt: skip
 
 
 def narrow(params: dict[str, Any], hidden_size: Array) -> dict[str, Any]:

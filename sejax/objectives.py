@@ -9,7 +9,7 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
 from sejax.errors import require
-from sejax.options import Options, not_negative, option
+from sejax.options import Options, counts, not_negative, option
 
 
 @struct.dataclass
@@ -18,6 +18,7 @@ class Outcome:
 
     Attributes:
       test_returns: return of each test episode on the real task, in reward units.
+      scored_returns: the same for the steps of each that the objective has asked for.
       train_steps: steps in the training world.
       train_episodes: episodes there.
       return_area: sum over those episodes of their return times their length; the returns are those
@@ -28,6 +29,7 @@ class Outcome:
     """
 
     test_returns: Float[Array, "*agent episode"]
+    scored_returns: Float[Array, "*agent episode"]
     train_steps: Int[Array, "*agent"]
     train_episodes: Int[Array, "*agent"]
     return_area: Float[Array, "*agent"]
@@ -51,32 +53,61 @@ class Objective:
         each of them, and none stops because it has solved the task.
       scores_are_returns: whether scores are mean returns, which the task's threshold can be held
         against.
+      test_steps: `generation -> steps`, how much of the test episodes it scores, if not all: a
+        curriculum. Only the members are scored by it; what an incumbent is worth is said by whole
+        episodes.
       meaning: of a score, for people.
     """
 
     score: Callable[[Outcome], Float[Array, "*agent"]]
     needs_tests: bool = False
     scores_are_returns: bool = False
+    test_steps: Callable[[Array], Array] | None = None
     meaning: str = ""
 
     def __call__(self, outcome: Outcome) -> Float[Array, "*agent"]:
         """Scores; nan for trainings that diverged."""
         return jnp.where(outcome.nonfinite, jnp.nan, self.score(outcome))
 
+    def of_whole_tests(self, outcome: Outcome) -> Float[Array, "*agent"]:
+        """Mean returns of whole test episodes, whatever of them is scored; nan likewise."""
+        return jnp.where(outcome.nonfinite, jnp.nan, outcome.test_return)
+
 
 @dataclass(frozen=True, kw_only=True)
 class MaxReward(Options):
-    """The mean test return (SEs).
+    """The mean test return (SEs), of all of the test episodes or, at first, of other lengths.
 
-    Source: paper, Algorithm 1, EvaluateAgent.
+    Short ones (a Pendulum is rewarded for where it goes at once) or long ones (a car that reaches
+    the hill at all) tell proxies apart that a whole episode of the task's does not.
+
+    Source: paper, Algorithm 1, EvaluateAgent; the curriculum: Liesen et al., "Discovering Minimal
+    Reinforcement Learning Environments" (2024).
     """
 
     group: ClassVar[str] = "objective"
     scores_are_returns: ClassVar[bool] = True
 
+    # Steps of a test episode that are scored in the first generation; null: the task's limit.
+    first_test_steps: int | None = option(None, counts("there is nothing to score otherwise"))
+    # Generation from which on the task's limit counts; before, the steps change linearly.
+    curriculum_generations: int = option(50, counts("it is the length of a curriculum"))
+
     def make(self, task: Any) -> Objective:
         """The objective on a task."""
-        return Objective(score=lambda outcome: outcome.test_return, scores_are_returns=True)
+        if self.first_test_steps is None:
+            return Objective(score=lambda outcome: outcome.test_return, scores_are_returns=True)
+        first, last = self.first_test_steps, task.max_steps
+
+        def test_steps(generation: Array) -> Array:
+            done = jnp.minimum(generation / self.curriculum_generations, 1.0)
+            return jnp.round(first + done * (last - first)).astype(jnp.int32)
+
+        return Objective(
+            score=lambda outcome: outcome.scored_returns.mean(axis=-1),
+            scores_are_returns=True,
+            test_steps=test_steps,
+        )
 
 
 @dataclass(frozen=True, kw_only=True)

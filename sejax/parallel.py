@@ -1,14 +1,34 @@
 """Spreading independent pieces of work over devices and lanes."""
 
-from collections.abc import Callable
+import functools
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 from jax.sharding import AxisType, PartitionSpec
 
 from sejax.errors import require
+
+
+@functools.cache
+def compiler_options() -> dict[str, Any] | None:
+    """What XLA should be told when it compiles whole trainings; None where nothing.
+
+    On a CPU, to use vectors of 512 bits where the CPU has them: its default are 256. On an AMD EPYC
+    a generation takes 0.71 of the time with the paper's DDQN and 0.88 with the default one. Sums of
+    wider vectors round otherwise, so that numbers differ in their last bits.
+    """
+    options = {"xla_cpu_prefer_vector_width": 512}
+    if jax.devices()[0].platform != "cpu":
+        return None
+    try:
+        jax.jit(lambda: jnp.int32(0), compiler_options=options).lower().compile()
+    except jax.errors.JaxRuntimeError:  # a version of XLA that has no such option
+        return None
+    return options
 
 
 def spread_over_devices(
@@ -22,31 +42,66 @@ def spread_over_devices(
     Args:
       fn: a function of one element.
       num_devices: None for all.
-      lanes: elements that run in lockstep on one device. None for `cpu_lanes` on a CPU and for all
-        elsewhere.
+      lanes: elements that run in lockstep on one device; fewer are filled up with copies. None for
+        `cpu_lanes` on a CPU and for all elsewhere.
       cpu_lanes: None for all; 1 where a lane would only wait for the others.
 
     Devices take the elements in turn (0, 1, 0, 1, ...), so that each gets its share of long and
-    short ones. The result does not depend on the number of devices.
+    short ones. The result does not depend on the number of devices: to the bit where lanes are 1 or
+    a power of two, up to rounding otherwise, as lanes that do not fill a CPU's vectors are not all
+    computed alike.
 
     Raises:
       ConfigError: if there are fewer than `num_devices` devices.
+    """
+    spread = spread_groups_over_devices([fn], num_devices, lanes, [cpu_lanes])
+    return lambda *args: spread([args])[0]
+
+
+def spread_groups_over_devices(
+    fns: Sequence[Callable[..., Any]],
+    num_devices: int | None,
+    lanes: int | None,
+    cpu_lanes: Sequence[int | None],
+) -> Callable[[Sequence[tuple[Any, ...]]], list[Any]]:
+    """As `spread_over_devices` for several functions with a group of elements each.
+
+    A device goes from its share of one group to its share of the next without waiting for others.
+
+    Args:
+      fns: a function of one element of each group.
+      num_devices: as of `spread_over_devices`.
+      lanes: likewise.
+      cpu_lanes: likewise, of each group.
+
+    Returns:
+      A function of the groups' arguments, a tuple each, with a leading axis over the elements.
     """
     available = jax.devices()
     require(num_devices is None or num_devices <= len(available), "devices",
             f"be at most {len(available)}", "that is how many there are", num_devices,
             "devices=null")  # fmt: skip
     count = num_devices or len(available)
+    on_cpu = available[0].platform == "cpu"
 
-    def map_here(*args: Any) -> Any:
+    def map_group(fn: Callable[..., Any], lockstep: int | None, args: tuple[Any, ...]) -> Any:
         def one(args: Any) -> Any:
             return fn(*args)
 
         size = jax.tree.leaves(args)[0].shape[0]
-        batch_size = lanes or (cpu_lanes if available[0].platform == "cpu" else None) or size
-        if batch_size >= size:
-            return jax.vmap(one)(args) if size > 1 else jax.lax.map(one, args)
-        return jax.lax.map(one, args, batch_size=batch_size if batch_size > 1 else None)
+        width = lanes or (lockstep if on_cpu else None) or size
+        if width == 1:
+            return jax.lax.map(one, args)
+        # The last batch is filled up with copies: products of another width round otherwise, and
+        # a result must not depend on how many elements a device has.
+        num_batches = -(-size // width)
+        places = np.arange(num_batches * width) % size
+        batches = jax.tree.map(lambda x: x[places].reshape(-1, width, *x.shape[1:]), args)
+        out = jax.lax.map(jax.vmap(one), batches)
+        return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[:size], out)
+
+    def map_here(groups: Sequence[tuple[Any, ...]]) -> list[Any]:
+        return [map_group(*each) for each in zip(fns, cpu_lanes, groups, strict=True)]
 
     if count == 1:
         return map_here
@@ -56,18 +111,21 @@ def spread_over_devices(
     axis = PartitionSpec("device")
     mapped = jax.shard_map(map_here, mesh=mesh, in_specs=axis, out_specs=axis, check_vma=False)
 
-    def map_spread(*args: Any) -> Any:
-        size = jax.tree.leaves(args)[0].shape[0]
-        padded = -(-size // count) * count
+    def map_spread(groups: Sequence[tuple[Any, ...]]) -> list[Any]:
+        groups = list(groups)
+        sizes = [jax.tree.leaves(args)[0].shape[0] for args in groups]
 
-        def deal(x: Array) -> Array:
-            x = x[jnp.arange(padded) % size] if padded > size else x
+        def deal(x: Array, padded: int) -> Array:
+            x = x[jnp.arange(padded) % x.shape[0]] if padded > x.shape[0] else x
             return x.reshape(-1, count, *x.shape[1:]).swapaxes(0, 1).reshape(padded, *x.shape[1:])
 
-        def gather(x: Array) -> Array:
-            x = x.reshape(count, -1, *x.shape[1:]).swapaxes(0, 1).reshape(padded, *x.shape[1:])
+        def gather(x: Array, size: int) -> Array:
+            x = x.reshape(count, -1, *x.shape[1:]).swapaxes(0, 1).reshape(x.shape)
             return x[:size]
 
-        return jax.tree.map(gather, mapped(*jax.tree.map(deal, args)))
+        dealt = [jax.tree.map(lambda x, n=-(-size // count) * count: deal(x, n), args)
+                 for args, size in zip(groups, sizes, strict=True)]  # fmt: skip
+        return [jax.tree.map(lambda x, n=size: gather(x, n), out)
+                for out, size in zip(mapped(dealt), sizes, strict=True)]  # fmt: skip
 
     return map_spread

@@ -9,9 +9,10 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 from flax import struct
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from sejax.agents.agent import Agent
+from sejax.keys import step_keys
 from sejax.loops import while_any_active
 
 
@@ -26,6 +27,21 @@ class Steps(NamedTuple):
     valid: Bool[Array, " step"]
 
 
+class Tests(NamedTuple):
+    """What came of greedy episodes.
+
+    Attributes:
+      returns: of each, within the task's step limit.
+      num_steps: played.
+      scored: return of the first `score_steps` steps, which may be fewer than the limit allows, or
+        more; `returns`, if nothing is said of them.
+    """
+
+    returns: Float[Array, " episode"]
+    num_steps: Int[Array, " episode"]
+    scored: Float[Array, " episode"]
+
+
 @struct.dataclass
 class _Episode:
     """Carry of an episode."""
@@ -33,6 +49,7 @@ class _Episode:
     active: Array
     num_steps: Array  # of the task
     total: Array
+    scored: Array  # return of the steps that count for the objective
     obs: Array
     env_state: Any
 
@@ -52,23 +69,38 @@ class _Greedy:
             active=jnp.asarray(active),
             num_steps=jnp.int32(0),
             total=jnp.float32(0),
+            scored=jnp.float32(0),
             obs=obs,
             env_state=env_state,
         )
 
-    def step(self, key: Array, agent_state: Any, before: _Episode) -> tuple[_Episode, Steps]:
-        """The episode after a decision, and the decision."""
-        key_act, key_env = jax.random.split(key)
+    def step(
+        self, key: Array, agent_state: Any, before: _Episode, score_steps: Array | None = None
+    ) -> tuple[_Episode, Steps]:
+        """The episode after a decision, and the decision; `key` is of the whole episode.
+
+        With `score_steps` the episode may last for so many steps, beyond the task's limit too.
+        """
+        key_act, key_env = step_keys(key, before.num_steps, 2)
         action = self.agent.act(key_act, agent_state, before.obs, explore=False)
         action = self.agent.env_action(action)
         obs, env_state, reward, terminated, info = self.env.step_env(
             key_env, before.env_state, action, self.params
         )
-        ended = terminated | self.env.is_truncated(env_state, self.params)
+        scored = before.scored + reward
+        if score_steps is None:
+            total, truncated = scored, self.env.is_truncated(env_state, self.params)
+        else:
+            limit = self.params.max_steps_in_episode
+            total = jnp.where(before.num_steps < limit, before.total + reward, before.total)
+            scored = jnp.where(before.num_steps < score_steps, scored, before.scored)
+            longest = self.params.replace(max_steps_in_episode=jnp.maximum(limit, score_steps))
+            truncated = self.env.is_truncated(env_state, longest)
         after = _Episode(
-            active=~ended,
+            active=~(terminated | truncated),
             num_steps=before.num_steps + info.get("num_steps", 1),
-            total=before.total + reward,
+            total=total,
+            scored=scored,
             obs=obs,
             env_state=env_state,
         )
@@ -77,7 +109,7 @@ class _Greedy:
 
 
 def make_tester(agent: Agent, task: Any, num_episodes: int) -> Callable[..., Any]:
-    """Builds `test(key, agent_state, active=True) -> (returns, steps)`, both `[num_episodes]`.
+    """Builds `test(key, agent_state, active=True, score_steps=None) -> Tests`.
 
     Episodes on the real task without exploration, each from a fresh initial state. With
     `active=False` nothing is played and all are 0.
@@ -85,19 +117,26 @@ def make_tester(agent: Agent, task: Any, num_episodes: int) -> Callable[..., Any
     greedy = _Greedy(agent, task)
 
     def step(nothing: Array, state: _Episode, consts: Any, masked: bool) -> tuple[Array, _Episode]:
-        key, agent_state = consts
-        after, _ = greedy.step(jax.random.fold_in(key, state.num_steps), agent_state, state)
+        key, agent_state, score_steps = consts
+        after, _ = greedy.step(key, agent_state, state, score_steps)
         return nothing, after
 
-    def episode(key: Array, agent_state: Any, active: Array | bool) -> tuple[Array, Array]:
+    def episode(key: Array, agent_state: Any, active: Array | bool, score_steps: Any) -> Tests:
         key_reset, key_steps = jax.random.split(key)
         state = greedy.begin(key_reset, active)
-        _, state = while_any_active(step, jnp.zeros(0), state, (key_steps, agent_state))
-        return state.total, state.num_steps
+        consts = (key_steps, agent_state, score_steps)
+        _, state = while_any_active(step, jnp.zeros(0), state, consts)
+        return Tests(state.total, state.num_steps, state.scored)
 
-    def test(key: Array, agent_state: Any, active: Array | bool = True) -> tuple[Array, Array]:
+    def test(
+        key: Array,
+        agent_state: Any,
+        active: Array | bool = True,
+        score_steps: Array | None = None,
+    ) -> Tests:
         keys = jax.random.split(key, num_episodes)
-        return jax.vmap(episode, in_axes=(0, None, None))(keys, agent_state, active)
+        in_axes = (0, None, None, None)
+        return jax.vmap(episode, in_axes)(keys, agent_state, active, score_steps)
 
     return test
 
@@ -114,8 +153,7 @@ def make_recorder(agent: Agent, task: Any, num_episodes: int) -> Callable[[Array
         key_reset, key_steps = jax.random.split(key)
 
         def step(state: _Episode, _: None) -> tuple[_Episode, Steps]:
-            key_step = jax.random.fold_in(key_steps, state.num_steps)
-            after, made = greedy.step(key_step, agent_state, state)
+            after, made = greedy.step(key_steps, agent_state, state)
             return after.replace(active=state.active & after.active), made
 
         start = greedy.begin(key_reset, True)

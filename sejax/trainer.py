@@ -15,6 +15,7 @@ from jaxtyping import Array, Float, Int
 from sejax.agents.agent import Agent
 from sejax.agents.memory import Memory, MemoryMaker
 from sejax.agents.replay import Transition
+from sejax.keys import step_keys
 from sejax.loops import while_any_active
 from sejax.training import TrainingConfig
 
@@ -52,8 +53,32 @@ class TrainResult:
 
 
 @struct.dataclass
+class _Curve:
+    """A row for each finished episode, `[max_episodes]`; large, so that it is written in place."""
+
+    returns: Array
+    ends: Array
+    test_returns: Array | None
+
+    def with_episode(
+        self, episode: Array, episode_return: Array, end: Array, tested: Array, ended: Array
+    ) -> "_Curve":
+        """The episode's row is written if it has ended: an index out of range is dropped."""
+        row = jnp.where(ended, episode, self.ends.shape[0])
+
+        def written(column: Array, value: Array) -> Array:
+            return column.at[row].set(value, mode="drop")
+
+        return _Curve(
+            returns=written(self.returns, episode_return),
+            ends=written(self.ends, end),
+            test_returns=None if self.test_returns is None else written(self.test_returns, tested),
+        )
+
+
+@struct.dataclass
 class _LoopState:
-    """Carry of the step loop. What the agent remembers is carried beside it."""
+    """Carry of the step loop. What the agent remembers, and the curve, are carried beside it."""
 
     active: Array
     step: Array  # decisions
@@ -64,11 +89,9 @@ class _LoopState:
     env_state: Any
     agent_state: Any
     recent: Array  # [2 * window]: the last returns that the stop rule judges, newest last
-    returns: Array  # [max_episodes]
-    test_returns: Array | None  # [max_episodes]
-    episode_ends: Array  # [max_episodes]
     nonfinite: Array
     test_steps: Array
+    tested: Array  # mean return of the last tests
 
 
 # `(key, agent_state, active) -> (mean return, steps)`, on the real task.
@@ -134,14 +157,16 @@ def make_trainer(
         key_begin, key_steps = jax.random.split(key)
         state = loop.begin(key_begin, env_params, hparams, active)
         remembered = tuple(memory.init() for memory in loop.memories(state))
-        remembered, state = while_any_active(loop.step, remembered, state, (key_steps, env_params))
+        (remembered, curve), state = while_any_active(
+            loop.step, (remembered, loop.empty_curve()), state, (key_steps, env_params)
+        )
         return TrainResult(
             agent_state=state.agent_state,
             train_steps=state.train_steps,
             episodes=state.episode,
-            returns=state.returns,
-            test_returns=state.test_returns,
-            episode_ends=state.episode_ends,
+            returns=curve.returns,
+            test_returns=curve.test_returns,
+            episode_ends=curve.ends,
             nonfinite=state.nonfinite | ~_all_finite(state.agent_state),
             test_steps=state.test_steps,
             recorded=remembered[1] if recorder is not None else None,
@@ -183,7 +208,6 @@ class _Loop:
         key_agent, key_reset = jax.random.split(key)
         obs, env_state = self.env.reset_env(key_reset, env_params)
         agent_state = self.agent.init(key_agent, hparams)
-        no_returns = jnp.full(self.training.max_episodes, jnp.nan)
         return _LoopState(
             active=jnp.asarray(active),
             step=jnp.int32(0),
@@ -194,11 +218,17 @@ class _Loop:
             env_state=env_state,
             agent_state=self.agent.begin_episode(agent_state, jnp.int32(0)),
             recent=jnp.zeros(2 * self.training.window),
-            returns=no_returns,
-            test_returns=None if self.test_fn is None else no_returns,
-            episode_ends=jnp.zeros(self.training.max_episodes, jnp.int32),
             nonfinite=jnp.bool_(False),
             test_steps=jnp.int32(0),
+            tested=jnp.float32(0),
+        )
+
+    def empty_curve(self) -> _Curve:
+        no_returns = jnp.full(self.training.max_episodes, jnp.nan)
+        return _Curve(
+            returns=no_returns,
+            ends=jnp.zeros(self.training.max_episodes, jnp.int32),
+            test_returns=None if self.test_fn is None else no_returns,
         )
 
     def memories(self, state: _LoopState) -> list[Memory]:
@@ -213,14 +243,12 @@ class _Loop:
         return [make(shapes, self.memory_steps) for make in self.memory_makers]
 
     def step(
-        self, remembered: Any, state: _LoopState, consts: Any, masked: bool
+        self, large: Any, state: _LoopState, consts: Any, masked: bool
     ) -> tuple[Any, _LoopState]:
         """One agent step: act, step the world, store, learn, and close the episode if it ended."""
-        key, env_params = consts
+        (remembered, curve), (key, env_params) = large, consts
         memories = self.memories(state)
-        key_act, key_env, key_sample, key_update, key_end = jax.random.split(
-            jax.random.fold_in(key, state.step), 5
-        )
+        key_act, key_env, key_sample, key_update, *keys_end = step_keys(key, state.step, 6)
         action = self.agent.act(key_act, state.agent_state, state.obs, explore=True)
         next_obs, env_state, reward, terminated, info = self.env.step_env(
             key_env, state.env_state, self.agent.env_action(action), env_params
@@ -256,10 +284,14 @@ class _Loop:
             nonfinite=nonfinite,
             active=train_steps < self.max_steps,
         )
+        before = state
         state = jax.lax.cond(
-            ended, lambda s: self.end_episode(key_end, s, env_params, ended), lambda s: s, state
+            ended, lambda s: self.end_episode(keys_end, s, env_params, ended), lambda s: s, state
         )
-        return remembered, state
+        curve = curve.with_episode(
+            before.episode, before.episode_return, train_steps, state.tested, ended & active
+        )
+        return (remembered, curve), state
 
     def discount(self, terminated: Array, truncated: Array, info: Any) -> Array:
         """What a target bootstraps with, before gamma."""
@@ -267,20 +299,17 @@ class _Loop:
         return jnp.where(truncated, 0.0, discount) if self.limit_is_terminal else discount
 
     def end_episode(
-        self, key: Array, state: _LoopState, env_params: Any, ended: Array
+        self, keys: list[Array], state: _LoopState, env_params: Any, ended: Array
     ) -> _LoopState:
         """Records the episode, decides whether training goes on, and starts the next one.
 
         In lanes this runs for all of them if it runs for one; `ended` spares the others the test.
         """
-        key_reset, key_test = jax.random.split(key)
+        key_reset, key_test = keys
         judged = state.episode_return
-        if self.test_fn is not None and state.test_returns is not None:
+        if self.test_fn is not None:
             tested, num_steps = self.test_fn(key_test, state.agent_state, ended)
-            state = state.replace(
-                test_returns=state.test_returns.at[state.episode].set(tested),
-                test_steps=state.test_steps + num_steps,
-            )
+            state = state.replace(tested=tested, test_steps=state.test_steps + num_steps)
             judged = tested if self.training.solved_by == "test" else judged
         if self.training.stop_rule == "plateau":
             judged = state.episode_return
@@ -296,8 +325,6 @@ class _Loop:
             env_state=env_state,
             agent_state=self.agent.begin_episode(state.agent_state, num_episodes),
             recent=recent,
-            returns=state.returns.at[state.episode].set(state.episode_return),
-            episode_ends=state.episode_ends.at[state.episode].set(state.train_steps),
         )
 
     def stops(self, state: _LoopState, recent: Array) -> Array:

@@ -4,6 +4,7 @@ Source: paper, appendix "Heuristics for Agent Training and Evaluation"; `docs/re
 """
 
 import dataclasses
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -39,6 +40,11 @@ class TrainingConfig(Options):
     time_limit_is_terminal: bool = True  # a real episode cut by the limit does not bootstrap
 
     @property
+    def is_fixed_length(self) -> bool:
+        """Whether all agents train for as many steps, but for those that run out of episodes."""
+        return self.stop_rule == "never" and self.max_steps is not None
+
+    @property
     def num_tests_between(self) -> int:
         """Test episodes after each training episode."""
         by_tests = self.stop_rule == "solved" and self.solved_by == "test"
@@ -46,23 +52,23 @@ class TrainingConfig(Options):
 
 
 def budget_for(
-    training: TrainingConfig, agent: Any, learned_with: Any, max_episode_steps: int
+    training: TrainingConfig, agent: Any, learned_with: Iterable[Any], max_episode_steps: int
 ) -> TrainingConfig:
-    """How long an agent trains on a proxy that was learned with another one.
+    """How long an agent trains on a proxy that was learned with others.
 
-    A step budget grows by the steps for which this agent waits longer with learning than that one:
-    ten long initial episodes, or a rollout of PPO, could use it up.
+    A step budget grows by the steps for which this agent waits longer with learning than any of
+    those: ten long initial episodes, or a rollout of PPO, could use it up.
 
     Args:
       training: that the proxy was learned with.
       agent: configuration of the agent that is to train.
-      learned_with: of the one that the proxy was learned with; None if that is not known.
-      max_episode_steps: the task's step limit.
+      learned_with: of those that the proxy was learned with, as far as they are known.
+      max_episode_steps: that the proxy's episodes may take.
     """
     if training.max_steps is None:
         return training
-    waits, waited = (steps_before_learning(each, max_episode_steps)
-                     for each in (agent, learned_with))  # fmt: skip
+    waits = steps_before_learning(agent, max_episode_steps)
+    waited = max((steps_before_learning(x, max_episode_steps) for x in learned_with), default=0)
     return dataclasses.replace(training, max_steps=training.max_steps + max(0, waits - waited))
 
 

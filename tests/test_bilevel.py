@@ -123,7 +123,7 @@ def test_infos_count_generations_and_steps(one_device):
     assert program.strategy.num_candidates == 12  # 4 members with two signs, 4 incumbents
     for number, info in enumerate(infos):
         assert info.generation == number and info.active
-        assert info.train_steps_total == 12 * info.train_steps_mean
+        np.testing.assert_allclose(info.train_steps_total, 12 * info.train_steps_mean, rtol=1e-6)
         assert 0 < info.train_steps_max[0] <= 40
         assert info.num_nonfinite == 0
     real_steps = np.diff([0] + [int(info.env_steps_total[0]) for info in infos])
@@ -154,6 +154,25 @@ def test_the_programs_loops_neither_copy_nor_select_a_buffer(one_device):
         if "f32[40,11]" in line.split("(")[0] and op in ("copy", "select")
     ]
     assert not copies, copies
+
+
+def test_a_curriculum_compares_members_by_a_part_and_incumbents_by_whole_tests():
+    program = program_of("objective.first_test_steps=1", words=ROOM)
+    state = program.init(KEYS[:1])
+    # Of 8 members and 4 incumbents all whole tests are alike; the fourth member's part is best.
+    whole, part = np.full((1, 12, 2), 0.5, np.float32), np.zeros((1, 12, 2), np.float32)
+    part[0, 3] = 0.25
+    counts = np.full((1, 12), 3, np.int32)
+    outcome = sejax.Outcome(
+        test_returns=whole, scored_returns=part, train_steps=counts, train_episodes=counts,
+        return_area=part[..., 0], nonfinite=counts < 0, real_steps=counts,
+    )  # fmt: skip
+    asked, after, info = jax.jit(lambda s: (a := program.ask(s), *program.tell(s, a, outcome)))(
+        state
+    )
+    # All Better 2 with one member that is better: the mean moves to it.
+    np.testing.assert_allclose(after.es_state.mean[0], asked.members[0, 3], rtol=1e-5, atol=1e-6)
+    assert info.incumbent_mean == info.population_mean == after.best_score == 0.5
 
 
 # --- the same numbers, however it is run ---------------------------------------------------------
@@ -303,6 +322,7 @@ def test_every_kind_of_configuration_makes_a_scan_body(words, overrides):
     after, info = jax.eval_shape(program.generation, state)
     kind = lambda tree: jax.tree.map(lambda x: (x.shape, x.dtype), tree)  # noqa: E731
     assert kind(after) == kind(state)
-    wide = ("env_steps_wide", "train_steps_wide")
-    assert {info[name].shape for info in [vars(info)] for name in wide} == {(2, 2)}
-    assert {x.shape for name, x in vars(info).items() if name not in wide} == {(2,)}
+    columns, wide = dict(vars(info)), ("env_steps_wide", "train_steps_wide")
+    assert {x.shape for x in jax.tree.leaves(columns.pop("families"))} == {(2, 1)}  # one family
+    assert {columns.pop(name).shape for name in wide} == {(2, 2)}
+    assert {x.shape for x in columns.values()} == {(2,)}

@@ -29,7 +29,7 @@ from sejax.experiments.experiment import parse
 from sejax.experiments.rn_heatmap import RnHeatmap
 from sejax.experiments.rn_objectives import RnObjectives
 from sejax.experiments.rn_performance import RnPerformance
-from sejax.experiments.tables import bootstrap_interval
+from sejax.statistics import bootstrap_interval
 
 LEARN = {"variants": ("additive_potential", "exclusive_non_potential"), "learned": 3,
          "generations": 1, "run": ("training.max_episodes=5", "es.population_size=2")}  # fmt: skip

@@ -28,10 +28,10 @@ from sejax.experiments import (
     se_models,
     se_performance,
     settings,
-    tables,
     worlds,
 )  # fmt: skip
 from sejax.options import counts
+from sejax.statistics import bootstrap_interval, interquartile_mean
 
 TINY_RUN = ["es.population_size=2", "es.num_incumbent_evals=2", "agent.hidden_size=4",
             "agent.batch_size=4", "agent.init_episodes=0", "proxy.hidden_size=4",
@@ -333,11 +333,24 @@ def test_intervals_draw_ses_and_not_agents():
     agents = made_up_agents()
     row = se_performance.summarise(agents).iloc[0]
     values = agents["test_return"].to_numpy().reshape(4, 6)
-    low, high = tables.bootstrap_interval(values.mean(axis=1))
+    low, high = bootstrap_interval(values.mean(axis=1))
     assert (row["test_return_low"], row["test_return_high"]) == pytest.approx((low, high))
     assert row["test_return_mean"] == pytest.approx(values.mean())
     assert row["test_return_std"] == pytest.approx(np.std(values))
     assert (row["num_ses"], row["num_agents"]) == (4, 24)
+
+
+def test_intervals_of_interquartile_means_draw_agents_within_ses():
+    agents = made_up_agents()
+    row = se_performance.summarise(agents).iloc[0]
+    values = agents["test_return"].to_numpy().reshape(4, 6)
+    assert row["test_return_iqm"] == interquartile_mean(values.ravel())
+    ends = bootstrap_interval(*values, statistic=interquartile_mean)
+    assert (row["test_return_iqm_low"], row["test_return_iqm_high"]) == ends
+    assert ends[1] - ends[0] < 2 < row["test_return_high"] - row["test_return_low"]
+    real = se_performance.summarise(agents.assign(setting="real")).iloc[0]
+    ends = bootstrap_interval(values.ravel(), statistic=interquartile_mean)
+    assert (real["test_return_iqm_low"], real["test_return_iqm_high"]) == ends
 
 
 def test_the_best_ses_are_shown_by_agents_that_did_not_select_them():
@@ -494,7 +507,7 @@ def test_commands_end_bad_input_with_one_message_and_status_2(
 def test_a_command_refuses_before_it_imports_gymnax(tmp_path):
     code = ("import runpy, sys; sys.argv[1:] = ['seed=-1']\n"
             "try: runpy.run_module('sejax.experiments.se_models', run_name='__main__')\n"
-            "finally: print('gymnax' in sys.modules)")  # fmt: skip
+            "finally: print('gymnax.environments.environment' in sys.modules)")  # fmt: skip
     environment = {key: value for key, value in os.environ.items() if key != "XLA_FLAGS"}
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True,
                           timeout=120, env=environment)  # fmt: skip

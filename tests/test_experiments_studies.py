@@ -22,10 +22,10 @@ from sejax.experiments import (
     se_histograms,
     supervised_baseline,
     supervised_models,
-    tables,
     worlds,
 )
 from sejax.rollout import make_recorder, make_tester
+from sejax.statistics import bootstrap_interval
 from sejax.trainer import make_trainer
 
 TINY_AGENT = {"hidden_size": 2, "num_layers": 1, "batch_size": 4, "init_episodes": 0}
@@ -199,7 +199,7 @@ def test_recorded_tests_are_the_tests(se_file):
     agent = sejax.make_agent(sejax.DDQNConfig(**TINY_AGENT), task)
     state = agent.init(jax.random.key(0), agent.hparams)
     key = jax.random.key(4)
-    returns, lengths = jax.jit(make_tester(agent, task, 3))(key, state)
+    returns, lengths, _ = jax.jit(make_tester(agent, task, 3))(key, state)
     steps = jax.jit(make_recorder(agent, task, 3))(key, state)
     valid = np.asarray(steps.valid).reshape(3, -1)
     np.testing.assert_array_equal(valid.sum(axis=1), lengths)
@@ -342,7 +342,7 @@ def test_intervals_draw_models_and_the_best_ones_are_those_of_the_best_episodes(
     agents = supervised_baseline.with_best(agents, [50.0, 10.0, 90.0])
     summary = supervised_baseline.summarise(agents, 195.0).set_index("world")
     assert summary.loc["authors", "return_mean"] == pytest.approx(14)
-    low, high = tables.bootstrap_interval([2, 10, 30])
+    low, high = bootstrap_interval([2, 10, 30])
     assert tuple(summary.loc["authors", ["return_low", "return_high"]]) == (low, high)
     assert summary.loc["authors_best", "return_mean"] == pytest.approx(16), "models 0 and 2"
     assert summary.loc["se", "solved"] == 1 and summary.loc["authors", "solved"] == 0

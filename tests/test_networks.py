@@ -8,7 +8,16 @@ import numpy as np
 import pytest
 from support import numpy_forward, random_like, shapes_of
 
-from sejax.networks import ACTIVATIONS, MLP, PRELU_SLOPE, affine
+from sejax.networks import (
+    _TANH_DENOMINATOR,
+    _TANH_NUMERATOR,
+    ACTIVATIONS,
+    MLP,
+    PRELU_SLOPE,
+    _polynomial,
+    affine,
+    fast_tanh,
+)
 
 
 @functools.cache
@@ -51,6 +60,43 @@ def test_forward_equals_a_numpy_loop(activation, num_layers):
     for x in np.random.default_rng(0).normal(size=(5, 4)) * 2:
         expected = numpy_forward(params, x, activation, num_layers)
         np.testing.assert_allclose(apply(params, np.float32(x)), expected, rtol=1e-5, atol=1e-6)
+
+
+@functools.cache
+def fast_tanh_on_a_grid():
+    """Points, and there the value and the derivative of `fast_tanh`."""
+    x = np.linspace(-12, 12, 400_001, dtype=np.float32)
+    return x, *map(np.asarray, jax.jit(lambda x: jax.jvp(fast_tanh, (x,), (jnp.ones_like(x),)))(x))
+
+
+def test_fast_tanh_is_tanh_within_its_stated_error():
+    x, y, slope = fast_tanh_on_a_grid()
+    exact = np.tanh(np.float64(x))
+    assert 0.9e-6 < np.abs(y - exact).max() <= 1.4e-6
+    near_zero = np.abs(x) < 0.1
+    np.testing.assert_allclose(y[near_zero], exact[near_zero], rtol=1e-6)
+    np.testing.assert_allclose(slope, 1 - exact**2, atol=3e-6)
+
+
+def test_fast_tanh_is_odd_within_one_and_increases_but_for_rounding():
+    x, y, slope = fast_tanh_on_a_grid()
+    np.testing.assert_array_equal(y, -y[::-1])
+    assert np.abs(y).max() <= 1 and slope.min() >= 0
+    np.testing.assert_array_equal(y[x >= 7], y[-1])
+    assert np.diff(y).min() > -4 * np.finfo(np.float32).eps  # of numerator, denominator, quotient
+    powers = np.float64(x) ** 2
+    exact = x * _polynomial(_TANH_NUMERATOR, powers) / _polynomial(_TANH_DENOMINATOR, powers)
+    assert np.diff(exact[np.abs(x) <= 7]).min() > 0
+
+
+def test_fast_tanh_of_extremes():
+    x = np.float32([0, -0.0, 1e-30, 1e30, -np.inf, np.inf, np.nan])
+    y, slope = jax.jvp(fast_tanh, (x,), (np.ones_like(x),))
+    np.testing.assert_allclose(y, np.tanh(x), atol=1e-6)
+    np.testing.assert_allclose(slope, 1 - np.tanh(x) ** 2, atol=3e-6)
+    np.testing.assert_array_equal(y[:3], x[:3])
+    # Its derivative is written out, and can itself be differentiated: tanh'' = -2 y (1 - y^2).
+    np.testing.assert_allclose(jax.grad(jax.grad(fast_tanh))(0.5), -0.72686198, atol=1e-5)
 
 
 def test_a_feature_major_batch_equals_single_inputs():

@@ -1,5 +1,6 @@
-"""sejax.agents.ppo: returns and loss by hand, phases against torch, lanes, and bandits."""
+"""sejax.agents.ppo: advantages and loss by hand, phases against torch, lanes, and probes."""
 
+import dataclasses
 import functools
 import re
 from pathlib import Path
@@ -7,24 +8,31 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import pytest
+from flax import struct
+from gymnax.environments import environment, spaces
+from jax.flatten_util import ravel_pytree
 from support import numpy_forward, raveled, shapes_of, unraveled
 
+import sejax
 from sejax import envs
 from sejax.agents import replay
 from sejax.agents.agent import traced
 from sejax.agents.memory import Rollout
+from sejax.agents.policies import SOFTMAX, gaussian
 from sejax.agents.ppo import (
     MIN_STD,
-    SOFTMAX,
     PPOConfig,
     discounted_returns,
-    gaussian,
+    generalized_advantages,
     make_ppo,
     normalized,
     ppo_loss,
+    shuffled,
 )
 from sejax.agents.replay import Transition
+from sejax.errors import ConfigError
 from sejax.networks import MLP
 from sejax.rollout import make_tester
 from sejax.trainer import make_trainer
@@ -39,19 +47,25 @@ CONFIG = PPOConfig(
     update_episodes=2, epochs=3, clip_ratio=0.05, value_weight=0.7, entropy_weight=0.05,
 )  # fmt: skip
 HPARAMS = traced(CONFIG)
-KINDS = ("discrete", "continuous")
+# Three minibatches of four steps, so that each epoch leaves one out.
+GAE = dataclasses.replace(
+    CONFIG, advantages="gae", gae_lambda=0.8, rollout_steps=STEPS, num_minibatches=3,
+    normalize_rewards=True, max_grad_norm=0.5, adam_eps=1e-5,
+)  # fmt: skip
+CONFIGS = {"discrete": CONFIG, "continuous": CONFIG, "gae": GAE}
+KINDS = tuple(CONFIGS)  # the last one's actions are discrete
 KEY = jax.random.key(0)
 
 
-def ppo(kind, config=CONFIG):
-    discrete = kind == "discrete"
-    return make_ppo(config, OBS_DIM, NUM_ACTIONS if discrete else None,
-                    None if discrete else ACTION_DIM, MAX_ACTION, MAX_STEPS)  # fmt: skip
+def ppo(kind, config=None):
+    continuous = kind == "continuous"
+    return make_ppo(config or CONFIGS[kind], OBS_DIM, None if continuous else NUM_ACTIONS,
+                    ACTION_DIM if continuous else None, MAX_ACTION, MAX_STEPS)  # fmt: skip
 
 
 def networks(kind, config=CONFIG):
     """The actor, the critic, and the function from flat parameters to the nested ones."""
-    num_outputs, std_dim = (NUM_ACTIONS, 0) if kind == "discrete" else (ACTION_DIM, ACTION_DIM)
+    num_outputs, std_dim = (ACTION_DIM,) * 2 if kind == "continuous" else (NUM_ACTIONS, 0)
     actor, critic = (
         MLP(size, config.hidden_size, config.num_layers, config.activation, learn_prelu_slope=True)
         for size in (num_outputs, 1)
@@ -67,7 +81,7 @@ def networks(kind, config=CONFIG):
 def random_steps(kind, seed):
     """`STEPS` random transitions, one in a row, and where episodes end."""
     rng = np.random.default_rng(seed)
-    if kind == "discrete":
+    if kind != "continuous":
         action = np.int32(rng.integers(0, NUM_ACTIONS, STEPS))
     else:
         action = np.float32(rng.normal(scale=0.5, size=(STEPS, ACTION_DIM)))
@@ -77,7 +91,7 @@ def random_steps(kind, seed):
         obs=np.float32(rng.normal(size=(STEPS, OBS_DIM))),
         action=action,
         reward=np.float32(rng.normal(size=STEPS)),
-        discount=np.float32(rng.uniform(-0.2, 1.2, STEPS)),  # must not matter
+        discount=np.float32(rng.uniform(-0.2, 1.2, STEPS)),  # soft; must not matter to returns
         next_obs=np.float32(rng.normal(size=(STEPS, OBS_DIM))),
     )
     return steps, ended
@@ -123,6 +137,10 @@ def update(agent):
     return jax.jit(agent.update)
 
 
+def adam_steps(state):
+    return optax.tree.get(state.opt_state, "count")
+
+
 def assert_equal(a, b):
     jax.tree.map(np.testing.assert_array_equal, a, b)
 
@@ -161,6 +179,56 @@ def test_normalized_returns_have_mean_zero_and_std_one():
     np.testing.assert_array_equal(got(np.float32([3])), 0.0)
 
 
+# --- advantages ----------------------------------------------------------------------------------
+
+
+def advantages_by_definition(steps, ended, value, next_value, gamma, gae_lambda):
+    """Each step's sum of discounted one-step errors, in plain loops over what follows it."""
+    expected = np.zeros(len(ended))
+    for start in range(len(ended)):
+        weight = 1.0
+        for t in range(start, len(ended)):
+            decay = gamma * steps.discount[t]
+            expected[start] += weight * (steps.reward[t] + decay * next_value[t] - value[t])
+            weight *= decay * gae_lambda
+            if ended[t]:
+                break
+    return expected
+
+
+# What the steps at which episodes end bootstrap with: nothing, if they terminated; fully, if they
+# were truncated. The rollout's last step does so whether its episode has ended or not.
+@pytest.mark.parametrize(
+    "ends, at_ends", [((), None), (ENDS, 0.0), (ENDS, 1.0), (range(STEPS), 0.0), (ENDS, None)]
+)
+def test_generalized_advantages_equal_plain_loops(ends, at_ends):
+    steps, ended = random_steps("gae", 0)
+    rng = np.random.default_rng(1)
+    value, next_value = np.float32(rng.normal(size=(2, STEPS)))
+    ended = np.isin(np.arange(STEPS), list(ends)).astype(np.float32)
+    if at_ends is not None:  # elsewhere 1, as in any task
+        steps = steps._replace(discount=np.where(ended, at_ends, 1.0).astype(np.float32))
+    decay = np.float32(0.9) * steps.discount
+    got = jit_advantages(steps.reward, decay, ended, value, next_value, 0.8)
+    expected = advantages_by_definition(steps, ended, value, next_value, 0.9, 0.8)
+    np.testing.assert_allclose(got, expected, rtol=1e-5, atol=1e-6)
+    if len(ends) == STEPS:  # a world of single steps
+        np.testing.assert_allclose(got, steps.reward - value, rtol=1e-6)
+
+
+jit_advantages = jax.jit(generalized_advantages)
+
+
+def test_each_epoch_learns_from_each_step_once_and_in_an_order_of_its_own():
+    order = np.asarray(jax.jit(shuffled, static_argnums=(1, 2, 3))(KEY, 400, 4, STEPS))
+    assert order.shape == (1600, 3)
+    epochs = np.sort(order.reshape(400, 12))
+    assert (np.diff(epochs) > 0).all() and epochs.min() == 0 and epochs.max() == STEPS - 1
+    # Every step is as often in any place: 400 / 13 times, within five standard deviations.
+    for place in order.reshape(400, 12).T:
+        assert np.abs(np.bincount(place, minlength=STEPS) - 400 / STEPS).max() < 5 * 5.4
+
+
 # --- the loss ------------------------------------------------------------------------------------
 
 
@@ -179,7 +247,7 @@ def test_loss_by_hand():
     # (1.2 - 2 + 0.5 - 0.8) / 4 = -0.275. Value error 1, entropy 3: 0.275 + 0.5 - 0.3 = 0.475.
     log_prob = np.log(np.float32([2.0, 2.0, 0.5, 0.5]))
     returns, zeros = np.float32([1.0, -1.0, 1.0, -1.0]), np.zeros(4, np.float32)
-    loss = jax.jit(ppo_loss)(log_prob, zeros + 3, zeros, zeros, returns, hp)
+    loss = jax.jit(ppo_loss)(log_prob, zeros + 3, zeros, zeros, returns, returns, hp)
     np.testing.assert_allclose(loss, 0.475, rtol=1e-6)
 
 
@@ -187,6 +255,7 @@ def test_loss_and_gradients_equal_torchs():
     golden = np.load(GOLDEN)  # made by torch_ppo.py
     inputs = loss_inputs()
     others = {name: inputs.pop(name) for name in ("old_log_prob", "returns")}
+    others["advantage"] = others["returns"] - inputs["value"]
     loss_fn = jax.jit(jax.value_and_grad(lambda x: ppo_loss(**x, **others, hp=HPARAMS)))
     loss, gradients = loss_fn(inputs)
     np.testing.assert_allclose(loss, golden["loss"], rtol=1e-6)
@@ -199,7 +268,8 @@ def test_loss_and_gradients_are_finite_however_far_the_policy_has_moved():
     @jax.value_and_grad
     def loss(log_prob):
         values = jnp.array([3.0, -3.0])
-        return ppo_loss(log_prob, values, values, jnp.zeros(2), jnp.zeros(2), HPARAMS)
+        zeros = jnp.zeros(2)
+        return ppo_loss(log_prob, values, values, zeros, -values, zeros, HPARAMS)
 
     for log_ratio in (1e5, -1e5):
         value, gradient = loss(np.full(2, log_ratio, np.float32))
@@ -218,10 +288,24 @@ def test_learning_phases_equal_torchs(kind, state, update):
         np.testing.assert_allclose(state.params, expected, rtol=2e-5, atol=5e-6)
 
 
+def test_with_normalized_rewards_it_does_not_matter_in_what_they_are_paid():
+    agent = ppo("gae")
+    state, update = state_of(agent), jax.jit(agent.update)
+    steps, ended = random_steps("gae", 0)
+    paid_more = np.asarray(jit_pack(steps._replace(reward=1000 * steps.reward), ended))
+    more = update(KEY, state, Rollout(paid_more, np.bool_(True)))
+    np.testing.assert_allclose(
+        more.params, update(KEY, state, rollout("gae")).params, rtol=1e-4, atol=1e-5
+    )
+    # Nor do rewards that never differ blow up, in a world of single steps say.
+    always = np.asarray(jit_pack(steps._replace(reward=0 * ended + 3), 0 * ended + 1))
+    assert np.isfinite(update(KEY, state, Rollout(always, np.bool_(True))).params).all()
+
+
 def test_nothing_changes_until_the_rollout_is_full(kind, state, update):
     assert_equal(update(KEY, state, rollout(kind, is_full=False)), state)
     after = update(KEY, state, rollout(kind))
-    assert after.opt_state.count == CONFIG.epochs
+    assert adam_steps(after) == CONFIG.epochs * CONFIGS[kind].num_minibatches
     assert np.abs(np.asarray(after.params) - np.asarray(state.params)).max() > 0.01
 
 
@@ -245,12 +329,12 @@ def test_lanes_learn_as_they_would_alone(kind, agent, state, update):
         assert (lane == 1) == bool((got.params == before.params).all())
 
 
-def test_a_step_without_a_phase_does_none_of_its_work():
-    # Were any of these epochs made, this test would not end.
-    config = PPOConfig(**{**vars(CONFIG), "epochs": 10**9})
-    agent = ppo("discrete", config)
-    states = jax.tree.map(lambda x: np.stack([x, x]), state_of(ppo("discrete")))
-    rollouts = jax.tree.map(lambda x: np.stack([x, x]), rollout("discrete", is_full=False))
+@pytest.mark.parametrize("kind, epochs", [("discrete", 10**9), ("gae", 7)])
+def test_a_step_without_a_phase_does_none_of_its_work(kind, epochs):
+    # Were any of a thousand million epochs made, this test would not end.
+    agent = ppo(kind, dataclasses.replace(CONFIGS[kind], epochs=epochs))
+    states = jax.tree.map(lambda x: np.stack([x, x]), state_of(ppo(kind)))
+    rollouts = jax.tree.map(lambda x: np.stack([x, x]), rollout(kind, is_full=False))
     compiled = jax.jit(jax.vmap(agent.update, (None, 0, 0))).lower(KEY, states, rollouts).compile()
     assert_equal(compiled(KEY, states, rollouts), states)
     # Nor has the compiler moved anything that is as long as the rollout out of the phase.
@@ -301,13 +385,13 @@ def test_a_phase_starts_with_the_step_that_fills_the_rollout(agent):
         rows = memory.store(rows, number, transition, number % 5 == 4, True)
         batch = memory.batch(key, rows, number + 1, transition, None)
         state = agent.update(key, state, batch)
-        return (rows, state), state.opt_state.count
+        return (rows, state), adam_steps(state)
 
     run = jax.jit(lambda state: jax.lax.scan(step, (memory.init(), state),
                                              np.arange(2 * STEPS + 3))[1])  # fmt: skip
     counts = run(state)
-    epochs = CONFIG.epochs
-    expected = [0] * (STEPS - 1) + [epochs] * STEPS + [2 * epochs] * 4
+    phase = CONFIG.epochs * (3 if agent is ppo("gae") else 1)
+    expected = [0] * (STEPS - 1) + [phase] * STEPS + [2 * phase] * 4
     np.testing.assert_array_equal(counts, expected)
 
 
@@ -318,6 +402,14 @@ def test_a_rollout_is_as_long_as_the_authors(update_episodes, action_repeat):
         decisions, time_step = decisions + 1, time_step + action_repeat
     config = PPOConfig(update_episodes=update_episodes, action_repeat=action_repeat)
     assert config.rollout_length(max_steps) == decisions
+    given = dataclasses.replace(config, rollout_steps=17)
+    assert given.rollout_length(max_steps) == 17
+    assert given.steps_before_learning(max_steps) == 17 * action_repeat
+
+
+def test_a_minibatch_has_at_least_two_steps():
+    with pytest.raises(ConfigError, match=r"at most half of the rollout's 13.*got 7\. Set .*=6\."):
+        ppo("gae", dataclasses.replace(GAE, num_minibatches=7))
 
 
 # --- policies ------------------------------------------------------------------------------------
@@ -417,7 +509,8 @@ def test_an_agent_has_either_discrete_or_continuous_actions():
 def test_the_agent_says_what_was_configured(agent):
     assert agent.hparams._asdict() == {
         "learning_rate": 0.01, "discount": 0.9, "clip_ratio": 0.05, "value_weight": 0.7,
-        "entropy_weight": 0.05, "hidden_size": None,  # all of it
+        "gae_lambda": 0.8 if agent is ppo("gae") else 0.95, "entropy_weight": 0.05,
+        "hidden_size": None,  # all of it
     }  # fmt: skip
     assert (agent.init_episodes, agent.learns_from, agent.action_repeat) == (1, 0, 1)
 
@@ -469,6 +562,84 @@ def test_a_continuous_bandits_best_action_is_found_beyond_the_reach_of_a_tanh():
     agent = make_ppo(BANDIT, 1, None, 1, 2.0, max_steps=1)
     _, best = solve_bandit(agent, 65, lambda action: -jnp.sum((action - 1.5) ** 2, axis=-1), 40)
     np.testing.assert_allclose(best, [1.5], atol=0.15)
+
+
+def test_the_critic_bootstraps_with_each_transitions_own_discount():
+    # A reward of 1 in each step of episodes of four, with gamma = 0.8: V = 1 / (1 - 0.8 d), which
+    # is 1 where episodes terminate with each step, 5 where they are truncated after four.
+    config = dataclasses.replace(
+        BANDIT, advantages="gae", rollout_steps=64, num_minibatches=2, discount=0.8
+    )
+    agent = make_ppo(config, 1, 2, None, 1.0, max_steps=4)
+    obs, ones = np.ones((64, 1), np.float32), jnp.ones(64)
+
+    @jax.jit
+    def value(discount, ended):
+        steps = Transition(obs, jnp.zeros(64), ones, discount * ones, obs)
+        full = Rollout(pack(steps, ended), jnp.bool_(True))
+
+        def phase(state, key):
+            return agent.update(key, state, full), None
+
+        state = agent.init(KEY, agent.hparams)
+        state = jax.lax.scan(phase, state, jax.random.split(KEY, 100))[0]
+        critic = MLP(1, BANDIT.hidden_size, 1, "tanh")
+        template = {"actor": MLP(2, BANDIT.hidden_size, 1, "tanh").init(KEY, obs[0]),
+                    "critic": critic.init(KEY, obs[0]), "std": jnp.zeros(0)}  # fmt: skip
+        params = ravel_pytree(template)[1](state.params)
+        return critic.apply(params["critic"], obs[0])[0]
+
+    fourth = np.float32(np.arange(64) % 4 == 3)
+    np.testing.assert_allclose(value(0.0, np.ones(64, np.float32)), 1.0, rtol=0.02)
+    np.testing.assert_allclose(value(1.0, fourth), 5.0, rtol=0.02)
+    np.testing.assert_allclose(value(0.5, fourth), 1 / (1 - 0.4), rtol=0.02)
+
+
+@struct.dataclass
+class Context(environment.EnvState):
+    obs: jax.Array
+
+
+class ContextualBandit(environment.Environment):
+    """Episodes of one step: 1 for the action that is the sign of the first of three numbers."""
+
+    num_actions = 2
+    default_params = environment.EnvParams(max_steps_in_episode=1)
+
+    def reset_env(self, key, params):
+        obs = jax.random.normal(key, (3,))
+        return obs, Context(time=jnp.int32(0), obs=obs)
+
+    def step_env(self, key, state, action, params):
+        reward = jnp.float32(action == (state.obs[0] > 0))
+        return state.obs, state.replace(time=state.time + 1), reward, jnp.bool_(True), {}
+
+    def observation_space(self, params):
+        return spaces.Box(-10.0, 10.0, (3,))
+
+    def action_space(self, params):
+        return spaces.Discrete(2)
+
+
+def test_a_contextual_bandit_of_single_steps_is_learned_in_2000_of_them():
+    task = sejax.Task(name="bandit", env=ContextualBandit())
+    agent = sejax.make_agent(
+        PPOConfig(
+            advantages="gae", rollout_steps=128, num_minibatches=4, epochs=10, hidden_size=16,
+            num_layers=1, activation="tanh", learning_rate=3e-3, max_grad_norm=0.5,
+        ), task,
+    )  # fmt: skip
+    training = TrainingConfig(max_episodes=2000, stop_rule="never")
+    train = make_trainer(agent, task.env, training)
+
+    @jax.jit
+    def accuracy(key):
+        contexts = jax.random.normal(jax.random.key(1), (1000, 3))
+        state = train(key, task.params).agent_state
+        actions = jax.vmap(lambda obs: agent.act(key, state, obs, False))(contexts)
+        return jnp.mean(actions == (contexts[:, 0] > 0))
+
+    assert accuracy(KEY) > 0.95
 
 
 # --- learning curves -----------------------------------------------------------------------------

@@ -1,4 +1,6 @@
-"""sejax.proxies.synthetic: the SE's equations, its ends of episodes, and plain gymnax usage."""
+"""sejax.proxies.synthetic: the SE's equations, how episodes begin and end, plain gymnax usage."""
+
+import itertools
 
 import jax
 import jax.numpy as jnp
@@ -7,6 +9,7 @@ import pytest
 from support import numpy_forward
 
 from sejax import envs, plugins
+from sejax.errors import ConfigError
 from sejax.proxies.configs import SyntheticConfig
 from sejax.proxies.proxy import ABSURD, World, world_of
 
@@ -34,10 +37,16 @@ def step():
 
 def constant_weights(state, reward, done):
     """Weights with which the three outputs are these constants, whatever the input."""
-    shapes = jax.eval_shape(make_env().init_weights, jax.random.key(0))
+    return constant_heads(make_env(), state=state, reward=reward, done=done)
+
+
+def constant_heads(env, **values):
+    """Weights of an SE with which the networks named have constant outputs, and others 0."""
+    shapes = jax.eval_shape(env.init_weights, jax.random.key(0))
     weights = jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), shapes)
-    for head, value in {"state": state, "reward": reward, "done": done}.items():
-        weights[head][f"Dense_{CONFIG.num_layers}"]["bias"][:] = value
+    for head, value in values.items():
+        *_, last = sorted(weights[head])
+        weights[head][last]["bias"][:] = value
     return weights
 
 
@@ -136,6 +145,202 @@ def test_outputs_just_below_absurd_are_a_world(step):
     np.testing.assert_allclose(obs, 0.99 * ABSURD)
     np.testing.assert_allclose(reward, 0.99 * ABSURD)
     assert not terminated and not info["nonfinite"]
+
+
+# --- ends by chance ------------------------------------------------------------------------------
+
+D = np.array([-np.inf, -0.5, 0.0, 0.1, 0.5, 0.9, 1.0, 7.0, np.inf])
+OF_END = {
+    "bernoulli": np.clip(D, 0, 1),
+    # 1 / (1 + exp(-0.5)) = 1 / 1.606531 = 0.622459, and so on.
+    "sigmoid": [0, 0.377541, 0.5, 0.524979, 0.622459, 0.710950, 0.731059, 0.999089, 1],
+}
+
+
+@pytest.mark.parametrize("mode", ["bernoulli", "sigmoid"])
+def test_a_drawn_end_comes_as_often_as_the_done_output_says(mode):
+    num_keys = 10_000
+    ends = jax.vmap(jax.vmap(make_env(done=mode).ends, (0, None)), (None, 0))
+    keys = jax.random.split(jax.random.key(0), num_keys)
+    shares = np.asarray(jax.jit(ends)(keys, jnp.float32(D)).mean(axis=1))
+    for share, probability in zip(shares, OF_END[mode], strict=True):
+        # The limits are exact, what lies between them is within 5 standard errors.
+        error = np.sqrt(probability * (1 - probability) / num_keys)
+        assert share == probability if error == 0 else abs(share - probability) < 5 * error
+
+
+@pytest.mark.parametrize(("mode", "done"), [("bernoulli", 0.4), ("sigmoid", -1.0)])
+def test_an_agent_sees_a_drawn_end_as_it_sees_any_other(mode, done):
+    env = make_env(done=mode)
+    params = env.params(constant_heads(env, state=0.7, reward=1.5, done=done))
+    _, state = env.reset_env(jax.random.key(0), params)
+    step = jax.jit(jax.vmap(env.step_env, (0, None, None, None)))
+    obs, _, reward, terminated, info = step(
+        jax.random.split(jax.random.key(1), 50), state, 1, params
+    )
+    assert 0 < np.sum(terminated) < 50
+    np.testing.assert_array_equal(info["discount"], 1.0 - terminated)
+    np.testing.assert_allclose(obs, 0.7)  # the state after an end is the predicted one
+    np.testing.assert_array_equal(reward, 1.5)
+    assert not info["nonfinite"].any()
+
+
+@pytest.mark.parametrize("mode", ["bernoulli", "sigmoid"])
+def test_an_output_that_is_no_number_ends_an_episode_whatever_is_drawn(mode):
+    env = make_env(done=mode)
+    step = jax.jit(lambda key, w: env.step_env(key, state, 1, env.params(w))[2:])
+    _, state = env.reset_env(jax.random.key(0), env.default_params)
+    for outputs in ({"done": np.nan}, {"reward": 2 * ABSURD}):
+        weights = constant_heads(env, **{"done": -5.0, **outputs})
+        reward, terminated, info = step(jax.random.key(1), weights)
+        assert terminated and reward == 0.0 and info["discount"] == 0.0
+        assert info["nonfinite"] == ("done" in outputs)
+
+
+# --- learned beginnings --------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("task", "horizon"), [("cartpole", None), ("cliff_walking", 1)])
+def test_learned_starts_are_normal_noise_moved_by_a_network(task, horizon):
+    env = make_env(task, initial_state="learned", horizon=horizon)
+    params = env.params(env.init_weights(jax.random.key(2)))
+    keys = jax.random.split(jax.random.key(0), 4)
+    obs, state = jax.jit(jax.vmap(env.reset_env, (0, None)))(keys, params)
+    for key, seen, start in zip(keys, obs, state.vector, strict=True):
+        noise = jax.random.normal(key, (env.task.obs_dim,))
+        expected = noise + numpy_forward(params.weights["start"], noise, CONFIG.activation, 1)
+        np.testing.assert_allclose(start, expected, rtol=1e-5, atol=1e-6)
+        # Where states are discrete the agent sees the index of the largest entry.
+        np.testing.assert_array_equal(seen, np.argmax(start) if task == "cliff_walking" else start)
+    np.testing.assert_array_equal(state.time, 0)
+    assert len(np.unique(np.asarray(state.vector), axis=0)) == 4
+
+
+def test_no_two_networks_begin_with_the_same_numbers():
+    weights = make_env(initial_state="learned").init_weights(jax.random.key(0))
+    assert set(weights) == {"state", "reward", "done", "start"}
+    kernels = [np.asarray(net["Dense_0"]["kernel"]) for net in weights.values()]
+    drawn = [x.ravel()[:16] * np.sqrt(x.shape[1]) for x in kernels]  # from U(-1, 1)
+    for a, b in itertools.combinations(drawn, 2):
+        assert not np.isclose(a, b, rtol=1e-3).any()
+
+
+def test_a_discrete_task_goes_on_from_the_vector_and_not_from_what_is_seen():
+    env = make_env("cliff_walking", initial_state="learned")
+    params = env.params(env.init_weights(jax.random.key(2)))
+    _, state = env.reset_env(jax.random.key(0), params)
+    obs, after, *_ = env.step_env(jax.random.key(1), state, 3, params)
+    one_hot = [0.0, 0.0, 0.0, 1.0]
+    x = np.concatenate([one_hot, state.vector])
+    expected = numpy_forward(params.weights["state"], x, CONFIG.activation, CONFIG.num_layers)
+    np.testing.assert_allclose(after.vector, expected, rtol=1e-4, atol=1e-6)
+    assert obs == np.argmax(after.vector) and env.observation_space().contains(obs)
+
+
+@pytest.mark.parametrize("start", [2 * ABSURD, -np.inf, np.nan])
+def test_an_absurd_start_is_an_episode_of_one_step_that_pays_nothing(start):
+    env = make_env(initial_state="learned", horizon=1)
+    params = env.params(constant_heads(env, start=start, reward=1.0))
+    obs, state = env.reset_env(jax.random.key(0), params)
+    np.testing.assert_array_equal(obs, np.clip(start, -ABSURD, ABSURD) + np.zeros(4))
+    _, _, reward, terminated, info = env.step_env(jax.random.key(1), state, 0, params)
+    assert terminated and reward == 0.0 and info["discount"] == 0.0
+    assert info["nonfinite"] == np.isnan(start)
+
+
+# --- horizons ------------------------------------------------------------------------------------
+
+
+def walk(env, weights, num_steps=3):
+    """`(terminated, truncated, discount)` of the first steps of an episode, `[step]` each."""
+    params = env.params(weights)
+
+    def step(state, key):
+        _, state, _, terminated, info = env.step_env(key, state, 1, params)
+        return state, (terminated, env.is_truncated(state, params), info["discount"])
+
+    _, state = env.reset_env(jax.random.key(0), params)
+    return jax.lax.scan(step, state, jax.random.split(jax.random.key(1), num_steps))[1]
+
+
+@pytest.mark.parametrize(
+    ("done", "is_terminal", "discounts"),
+    [
+        # d = 0.25 ends nothing. Soft: targets bootstrap with 0.75, at a terminal horizon with 0.
+        ("soft", True, [0.75, 0.75, 0]),
+        ("soft", False, [0.75, 0.75, 0.75]),
+        ("threshold", True, [1, 1, 0]),
+        ("threshold", False, [1, 1, 1]),
+    ],
+)
+def test_a_horizon_terminates_an_episode_or_cuts_it(done, is_terminal, discounts):
+    env = make_env(done=done, horizon=3, horizon_is_terminal=is_terminal)
+    terminated, truncated, discount = walk(env, constant_heads(env, done=0.25))
+    np.testing.assert_array_equal(terminated, [False, False, is_terminal])
+    np.testing.assert_array_equal(truncated, [False, False, True])
+    np.testing.assert_allclose(discount, discounts)
+    assert world_of(env) == World(is_real=False, max_steps=3)
+    assert env.default_params.max_steps_in_episode == 3
+
+
+def test_a_done_output_ends_an_episode_before_its_horizon():
+    env = make_env(done="threshold", horizon=3)
+    terminated, truncated, discount = walk(env, constant_heads(env, done=0.6), num_steps=1)
+    assert terminated[0] and not truncated[0] and discount[0] == 0.0
+
+
+def test_an_episode_begins_anew_after_its_horizon():
+    env = make_env(done="threshold", horizon=2)
+    params = env.params(constant_heads(env, state=0.7))
+    _, state = env.reset(jax.random.key(0), params)
+    for time in (1, 0):
+        obs, state, _, terminated, truncated, info = env.step(jax.random.key(1), state, 0, params)
+        assert state.time == time and terminated == truncated == (time == 0)
+    np.testing.assert_allclose(info["final_observation"], 0.7)
+    assert np.abs(obs).max() <= 0.05
+
+
+@pytest.mark.parametrize("done", ["soft", "threshold", "bernoulli", "sigmoid"])
+def test_a_bandit_has_a_reward_and_nothing_else(done):
+    env = make_env(done=done, horizon=1)
+    weights = env.init_weights(jax.random.key(4))
+    assert set(weights) == {"reward"}
+    params = env.params(weights)
+    start, state = env.reset_env(jax.random.key(0), params)
+    real, _ = env.task.env.reset_env(jax.random.key(0), env.task.params)
+    np.testing.assert_array_equal(start, real)
+    obs, _, reward, terminated, info = env.step_env(jax.random.key(1), state, 1, params)
+    np.testing.assert_array_equal(obs, start)
+    x = np.concatenate([[0.0, 1.0], start])
+    expected = numpy_forward(weights["reward"], x, CONFIG.activation, CONFIG.num_layers)
+    np.testing.assert_allclose(reward, expected[0], rtol=1e-5)
+    assert terminated and info["discount"] == 0.0 and not info["nonfinite"]
+    assert world_of(env).max_steps == 1
+
+
+def test_a_bandit_with_learned_starts_has_two_networks():
+    weights = make_env(horizon=1, initial_state="learned").init_weights(jax.random.key(0))
+    assert set(weights) == {"reward", "start"}
+    shapes = [weights["start"][f"Dense_{i}"]["kernel"].shape for i in range(2)]
+    assert shapes == [(32, 4), (4, 32)]
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"done": "maybe"}, r"^proxy\.done must be one of .*sigmoid.* got 'maybe'\."),
+        ({"initial_state": "any"}, r"^proxy\.initial_state must be one of .*real.* got 'any'\."),
+        ({"horizon": 0}, r"^proxy\.horizon must be at least 1, .* got 0\."),
+        (
+            {"horizon": 1, "horizon_is_terminal": False},
+            r"^proxy\.horizon_is_terminal must be true with proxy\.horizon=1, because there is no "
+            r"next state to bootstrap with; got false\. Set proxy\.horizon_is_terminal=true\.$",
+        ),
+    ],
+)
+def test_what_no_episode_can_be_is_refused(fields, message):
+    with pytest.raises(ConfigError, match=message):
+        SyntheticConfig(**fields)
 
 
 # --- as a gymnax environment ---------------------------------------------------------------------

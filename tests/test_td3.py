@@ -702,7 +702,7 @@ def mean_test_return(agent, task, training):
     def run(key):
         key_train, key_test = jax.random.split(key)
         result = make_trainer(agent, task.env, training, task.solved_reward)(key_train, task.params)
-        returns, _ = make_tester(agent, task, 10)(key_test, result.agent_state)
+        returns, *_ = make_tester(agent, task, 10)(key_test, result.agent_state)
         return returns, result.train_steps
 
     returns, train_steps = run(jax.random.key(0))

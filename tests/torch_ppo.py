@@ -8,14 +8,28 @@ import jax
 import numpy as np
 import torch
 from jax.flatten_util import ravel_pytree
-from test_ppo import CONFIG, GOLDEN, KINDS, MAX_ACTION, loss_inputs, networks, ppo, random_steps
+from test_ppo import (
+    CONFIG,
+    CONFIGS,
+    GOLDEN,
+    KEY,
+    KINDS,
+    MAX_ACTION,
+    STEPS,
+    loss_inputs,
+    networks,
+    ppo,
+    random_steps,
+)
+
+from sejax.agents.ppo import shuffled
 
 NUM_PHASES = 2
 
 
-def loss_fn(log_prob, entropy, value, old_log_prob, returns):
+def loss_fn(log_prob, entropy, value, old_log_prob, returns, advantage=None):
     ratio = torch.exp(log_prob - old_log_prob)
-    advantage = (returns - value).detach()
+    advantage = (returns - value).detach() if advantage is None else normalized(advantage)
     clipped = ratio.clamp(1 - CONFIG.clip_ratio, 1 + CONFIG.clip_ratio)
     surrogate = torch.min(ratio * advantage, clipped * advantage)
     error = torch.nn.functional.mse_loss(value, returns)
@@ -23,15 +37,23 @@ def loss_fn(log_prob, entropy, value, old_log_prob, returns):
     return terms.mean()
 
 
+def normalized(x):
+    return (x - x.mean()) / (x.std() + 1e-5)
+
+
 class TorchPPO:
     """The same agent in torch, from the same parameters."""
 
     def __init__(self, kind, params):
-        self.kind = kind
+        self.kind, self.config = kind, CONFIGS[kind]
         self.actor, self.critic = (self._network(params[name]) for name in ("actor", "critic"))
         self.std = torch.nn.Parameter(torch.tensor(np.array(params["std"])))
         parameters = [*self.actor.parameters(), *self.critic.parameters(), self.std]
-        self.optimizer = torch.optim.Adam(parameters, lr=CONFIG.learning_rate)
+        self.parameters = parameters
+        self.returns = []  # of all rollouts
+        self.optimizer = torch.optim.Adam(
+            parameters, lr=CONFIG.learning_rate, eps=self.config.adam_eps
+        )
 
     def _network(self, params):
         layers = []
@@ -43,29 +65,70 @@ class TorchPPO:
         return torch.nn.Sequential(*layers[:-1])
 
     def evaluate(self, obs, action):
-        if self.kind == "discrete":
+        if self.kind != "continuous":
             policy = torch.distributions.Categorical(logits=self.actor(obs))
             return policy.log_prob(action.long()), policy.entropy()
         policy = torch.distributions.Normal(torch.tanh(self.actor(obs)) * MAX_ACTION, self.std)
         return policy.log_prob(action).sum(1), policy.entropy().sum(1)
 
-    def learn(self, obs, action, reward, ended):
-        returns, later = [], 0.0
-        for r, end in zip(reversed(reward.tolist()), reversed(ended.tolist()), strict=True):
-            later = r + CONFIG.discount * (0.0 if end else later)
-            returns.insert(0, later)
-        returns = torch.tensor(returns)
-        returns = (returns - returns.mean()) / (returns.std() + 1e-5)
-        old_log_prob = self.evaluate(obs, action)[0].detach()
-        for _ in range(CONFIG.epochs):
-            log_prob, entropy = self.evaluate(obs, action)
-            value = self.critic(obs)[:, 0]
-            loss = loss_fn(log_prob, entropy, value, old_log_prob, returns)
+    def learn(self, steps, ended):
+        steps = steps._replace(weight=0.0)
+        steps = type(steps)(*(torch.tensor(np.array(x)) for x in steps))
+        old_log_prob = self.evaluate(steps.obs, steps.action)[0].detach()
+        if self.config.advantages == "gae":
+            returns, advantage = self.bootstrapped(steps, ended)
+        else:
+            returns, advantage = self.monte_carlo(steps, ended), None
+        moved = []
+        for rows in self.minibatches():
+            log_prob, entropy = self.evaluate(steps.obs[rows], steps.action[rows])
+            value = self.critic(steps.obs[rows])[:, 0]
+            part = None if advantage is None else advantage[rows]
+            loss = loss_fn(log_prob, entropy, value, old_log_prob[rows], returns[rows], part)
+            moved.append((torch.exp(log_prob - old_log_prob[rows]) - 1).abs())
             self.optimizer.zero_grad()
             loss.backward()
+            if self.config.max_grad_norm is not None:
+                torch.nn.utils.clip_grad_norm_(self.parameters, self.config.max_grad_norm)
             self.optimizer.step()
-        moved = (torch.exp(log_prob - old_log_prob) - 1).abs()
+        moved = torch.cat(moved[1:])
         assert (moved > CONFIG.clip_ratio).any() and (moved < CONFIG.clip_ratio).any()
+
+    def minibatches(self):
+        """The steps that each Adam step learns from; which ones is a matter of sejax's draw."""
+        config = self.config
+        if config.num_minibatches == 1:
+            return [slice(None)] * config.epochs
+        order = shuffled(KEY, config.epochs, config.num_minibatches, STEPS)
+        return [torch.tensor(np.array(rows)).long() for rows in order]
+
+    @torch.no_grad()
+    def bootstrapped(self, steps, ended):
+        """Returns of TD(lambda) and generalised advantages."""
+        discounts = self.config.discount * steps.discount
+        reward = steps.reward
+        if self.config.normalize_rewards:
+            later = 0.0
+            for t in reversed(range(len(ended))):
+                later = reward[t] + discounts[t] * (0.0 if ended[t] else later)
+                self.returns.append(later)
+            reward = reward / torch.stack(self.returns).std(correction=0)
+        advantage, later = [], 0.0
+        value, next_value = self.critic(steps.obs)[:, 0], self.critic(steps.next_obs)[:, 0]
+        for t in reversed(range(len(ended))):
+            delta = reward[t] + discounts[t] * next_value[t] - value[t]
+            later = delta + discounts[t] * self.config.gae_lambda * (0.0 if ended[t] else later)
+            advantage.insert(0, later)
+        advantage = torch.stack(advantage)
+        return advantage + value, advantage
+
+    def monte_carlo(self, steps, ended):
+        """Normalised returns."""
+        returns, later = [], 0.0
+        for r, end in zip(reversed(steps.reward.tolist()), reversed(ended), strict=True):
+            later = r + CONFIG.discount * (0.0 if end else later)
+            returns.insert(0, later)
+        return normalized(torch.tensor(returns))
 
     def flat(self):
         def arrays(network):
@@ -111,8 +174,7 @@ def main():
         arrays[f"{kind}/params/0"] = params
         for number in range(1, NUM_PHASES + 1):
             steps, ended = random_steps(kind, number)
-            columns = (steps.obs, steps.action, steps.reward, ended)
-            reference.learn(*(torch.tensor(np.array(x)) for x in columns))
+            reference.learn(steps, ended)
             arrays[f"{kind}/params/{number}"] = reference.flat()
     np.savez(GOLDEN, **{name: np.asarray(x) for name, x in arrays.items()})
 

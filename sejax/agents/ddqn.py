@@ -27,6 +27,9 @@ from sejax.networks import ACTIVATIONS, MLP, DuelingMLP, narrow
 from sejax.options import MOST_LAYERS, counts, fraction, one_of, option, positive
 
 MOVES = "the agent would not move"
+# Small agents train in lockstep on a core: measured, 2.3 times as fast as alone. Twice as many gain
+# another 3%, and a population is filled up to whole groups.
+SMALL_LANES = 8
 LOSSES = {"squared": jnp.square, "huber": optax.losses.huber_loss}
 
 
@@ -58,6 +61,11 @@ class DDQNConfig(AgentOptions):
     def make(self, task: Any) -> Agent:
         """The agent for a task's observations and actions."""
         return make_ddqn(self, task.obs_dim, task.num_actions)
+
+    @property
+    def is_small(self) -> bool:
+        """Whether what surrounds the products of a learning step takes longer than they do."""
+        return self.num_layers == 1 and self.hidden_size * self.batch_size <= 64 * 64
 
     def network(self, num_actions: int) -> nn.Module:
         """Maps observations `[obs_dim, *batch]` to Q values `[num_actions, *batch]`."""
@@ -155,6 +163,7 @@ def make_ddqn(config: DDQNConfig, obs_dim: int, num_actions: int) -> Agent:
         init_episodes=config.init_episodes,
         learns_from=config.init_episodes,
         batch_size=batch_size,
+        cpu_lanes=SMALL_LANES if config.is_small else 1,
     )
 
 

@@ -1,8 +1,9 @@
 """Random actions now and then, fewer from episode to episode."""
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
+
+from sejax.keys import words
 
 
 def decayed_epsilon(
@@ -22,8 +23,11 @@ def decayed_epsilon(
 def epsilon_greedy(
     key: Array, q_row: Float[Array, " num_actions"], epsilon: Array
 ) -> Int[Array, ""]:
-    """A uniform action with probability epsilon, else the first of the best."""
-    bits = jax.random.bits(key, (2,))
+    """A uniform action with probability epsilon, else the first of the best.
+
+    The key's own words decide; it must not be used for anything else.
+    """
+    bits = words(key)
     random_action = (bits[0] % jnp.uint32(q_row.shape[0])).astype(jnp.int32)
     uniform = (bits[1] >> 8).astype(jnp.float32) * jnp.float32(2**-24)
     return jnp.where(uniform < epsilon, random_action, jnp.argmax(q_row).astype(jnp.int32))

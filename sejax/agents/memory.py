@@ -3,12 +3,12 @@
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from sejax.agents import replay
 from sejax.agents.replay import Transition
+from sejax.keys import words
 
 
 class Memory(NamedTuple):
@@ -78,8 +78,7 @@ def replay_memory(batch_size: int, buffer_size: int) -> MemoryMaker:
             transition: Transition,
             in_use: Array | None = None,
         ) -> Transition:
-            seed = jax.random.bits(key)
-            return replay.sample(rows, seed, num_steps, batch_size, action_dim, in_use)
+            return replay.sample(rows, words(key)[0], num_steps, batch_size, action_dim, in_use)
 
         return Memory(
             init=lambda: replay.init(capacity, obs_dim, action_dim),

@@ -1,11 +1,14 @@
-"""PPO with a clipped ratio and Monte-Carlo returns, for discrete and for continuous actions.
+"""PPO with a clipped ratio, for discrete and for continuous actions.
 
-Source: Schulman et al., "Proximal Policy Optimization Algorithms" (2017); the paper's appendix,
-table of PPO; `docs/reference.md` 4.5.
+With Monte-Carlo returns and all of the rollout in each Adam step, as the paper's code has it, or
+with generalised advantages and shuffled minibatches, as everybody else does.
+
+Source: Schulman et al., "Proximal Policy Optimization Algorithms" (2017); Schulman et al.,
+"High-Dimensional Continuous Control Using Generalized Advantage Estimation" (2016); the paper's
+appendix, table of PPO; `docs/reference.md` 4.5.
 """
 
 import functools
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
@@ -18,11 +21,13 @@ from jaxtyping import Array, Float, Int
 
 from sejax.agents import flat
 from sejax.agents.agent import Agent, AgentOptions, traced
-from sejax.agents.ddqn import select_action
 from sejax.agents.memory import Rollout, rollout_memory
+from sejax.agents.policies import SOFTMAX, Distribution, gaussian
+from sejax.errors import require
 from sejax.networks import ACTIVATIONS, MLP, narrow
 from sejax.options import MOST_LAYERS, counts, fraction, not_negative, one_of, option, positive
 
+ADVANTAGES = ("monte_carlo", "gae")
 MIN_STD = 0.01  # of the Gaussian policy, in units of the action
 _MAX_LOG_RATIO = 20.0  # exp(20) is beyond any clip, and finite
 
@@ -32,6 +37,13 @@ class PPOConfig(AgentOptions):
     """PPO (clip) for discrete and continuous actions (paper, appendix, table of PPO).
 
     The defaults are the paper's for MountainCarContinuous, whose RNs add `action_repeat=5`.
+    Whoever has few steps takes settings like those below (measured: `docs/agents.md`).
+
+    Example:
+      >>> quick = PPOConfig(
+      ...     advantages="gae", rollout_steps=128, num_minibatches=4, epochs=10,
+      ...     learning_rate=2e-3, max_grad_norm=0.5, adam_eps=1e-5, activation="tanh",
+      ... )
     """
 
     actions: ClassVar[tuple[str, ...]] = ("discrete", "continuous")
@@ -46,10 +58,20 @@ class PPOConfig(AgentOptions):
     )
     discount: float = option(0.99, fraction(), traced=True)
     update_episodes: int = option(10, counts())  # of full length, between two learning phases
-    epochs: int = option(80, counts())  # Adam steps on all of the rollout in a learning phase
+    # Decisions between two learning phases; null: as `update_episodes` says.
+    rollout_steps: int | None = option(None, counts())
+    epochs: int = option(80, counts())  # passes over the rollout in a learning phase
+    num_minibatches: int = option(1, counts())  # Adam steps in an epoch, each on its part of it
+    advantages: str = option("monte_carlo", one_of(ADVANTAGES))
+    gae_lambda: float = option(0.95, fraction(), traced=True)  # of advantages=gae
     clip_ratio: float = option(0.2, positive("the agent would not move"), traced=True)
     value_weight: float = option(1.0, not_negative(), traced=True)
     entropy_weight: float = option(0.01, not_negative(), traced=True)
+    # Divides rewards by the running std of returns, with advantages=gae.
+    normalize_rewards: bool = False
+    # Longest gradient, which a longer one is shortened to.
+    max_grad_norm: float | None = option(None, positive("the agent would not move"))
+    adam_eps: float = option(1e-8, positive("it keeps Adam from dividing by 0"))
     # Of the Gaussian policy; learned.
     init_action_std: float = option(0.5, positive("the agent would not move"))
     action_repeat: int = option(1, counts())
@@ -61,7 +83,7 @@ class PPOConfig(AgentOptions):
                         task.max_steps)  # fmt: skip
 
     def rollout_length(self, max_episode_steps: int) -> int:
-        """Decisions between two learning phases.
+        """Decisions between two learning phases: `rollout_steps`, if that is set.
 
         The authors learn as soon as (decisions x `action_repeat`) / `max_episode_steps` exceeds
         `update_episodes`, also in the middle of an episode; this is the first whole number that
@@ -69,11 +91,20 @@ class PPOConfig(AgentOptions):
 
         Source: `docs/reference.md` 4.5.
         """
+        if self.rollout_steps is not None:
+            return self.rollout_steps
         return self.update_episodes * max_episode_steps // self.action_repeat + 1
 
     def steps_before_learning(self, max_episode_steps: int) -> int:
         """As of any agent; PPO learns once a rollout is full."""
         return self.rollout_length(max_episode_steps) * self.action_repeat
+
+    def optimizer(self) -> optax.GradientTransformation:
+        """Adam's direction, of a gradient that may be shortened first."""
+        adam = optax.scale_by_adam(eps=self.adam_eps)
+        if self.max_grad_norm is None:
+            return adam
+        return optax.chain(optax.clip_by_global_norm(self.max_grad_norm), adam)
 
 
 class PPOState(struct.PyTreeNode):
@@ -81,24 +112,8 @@ class PPOState(struct.PyTreeNode):
 
     params: Float[Array, " num_params"]
     opt_state: optax.OptState
+    return_sums: Float[Array, "3"]  # of 1, returns and their squares; 0 if nobody needs them
     hparams: Any  # traced options, and hidden_size in use or None
-
-
-class Distribution(NamedTuple):
-    """A distribution of actions, given the actor's outputs and the Gaussian's std.
-
-    Attributes:
-      sample: `(key, outputs, std) -> action`, for one observation.
-      mode: `outputs -> action`, for one observation.
-      evaluate: `(outputs, std, action) -> (log_prob, entropy)`, for `[outputs, batch]` and a batch
-        of actions; both `[batch]`, in nats.
-      env_action: `action -> action` as the world takes it.
-    """
-
-    sample: Callable[[Array, Array, Array], Array]
-    mode: Callable[[Array], Array]
-    evaluate: Callable[[Array, Array, Array], tuple[Array, Array]]
-    env_action: Callable[[Array], Array]
 
 
 @functools.cache
@@ -130,6 +145,7 @@ def make_ppo(
 
     Raises:
       ValueError: unless exactly one of `num_actions` and `action_dim` is given.
+      ConfigError: if a rollout has fewer than two steps for each minibatch.
 
     Example:
       >>> agent = make_ppo(PPOConfig(), 4, num_actions=2, action_dim=None, max_action=1.0,
@@ -145,13 +161,22 @@ def make_ppo(
         )
     policy = SOFTMAX if action_dim is None else gaussian(max_action)
     networks = make_networks(config, obs_dim, policy, num_actions, action_dim)
-    learn = make_learning_phase(config, networks, obs_dim, is_discrete=action_dim is None)
+    length = config.rollout_length(max_steps)
+    require(
+        config.num_minibatches == 1 or 2 * config.num_minibatches <= length,
+        "agent.num_minibatches", f"be at most half of the rollout's {length} steps",
+        "advantages are compared within a minibatch", config.num_minibatches,
+        f"agent.num_minibatches={max(1, length // 2)}",
+    )  # fmt: skip
+    optimizer = config.optimizer()
+    learn = make_learning_phase(config, networks, optimizer, obs_dim, action_dim is None)
 
     def init(key: Array, hparams: Any) -> PPOState:
         params = networks.init(key, hparams.hidden_size)
         return PPOState(
             params=params,
-            opt_state=flat.ADAM.init(params),
+            opt_state=optimizer.init(params),
+            return_sums=jnp.zeros(3),
             hparams=jax.tree.map(jnp.float32, hparams),
         )
 
@@ -166,23 +191,21 @@ def make_ppo(
         whereas this loop runs only when some lane's rollout is full.
         """
 
-        def phase(carry: tuple[Array, Array, Any]) -> tuple[Array, Array, Any]:
-            _, params, opt_state = carry
-            # XLA would move what depends on the rows alone out of the loop, into every step.
-            rows, params = jax.lax.optimization_barrier((rollout.rows, params))
-            full = rollout._replace(rows=rows)
-            return jnp.bool_(False), *learn(params, opt_state, full, state.hparams)
+        def phase(carry: tuple[Array, PPOState]) -> tuple[Array, PPOState]:
+            _, state = carry
+            # XLA would move what does not depend on the carry out of the loop, into every step.
+            inputs = (key, state.params, rollout.rows)
+            own_key, params, rows = jax.lax.optimization_barrier(inputs)
+            state, full = state.replace(params=params), rollout._replace(rows=rows)
+            return jnp.bool_(False), learn(own_key, state, full)
 
-        _, params, opt_state = jax.lax.while_loop(
-            lambda carry: carry[0], phase, (rollout.is_full, state.params, state.opt_state)
-        )
-        return state.replace(params=params, opt_state=opt_state)
+        return jax.lax.while_loop(lambda carry: carry[0], phase, (rollout.is_full, state))[1]
 
     return Agent(
         init=init,
         act=act,
         update=update,
-        memory=rollout_memory(config.rollout_length(max_steps)),
+        memory=rollout_memory(length),
         hparams=traced(config, hidden_size=None),
         init_episodes=config.init_episodes,
         learns_from=0,
@@ -199,6 +222,7 @@ class Networks(NamedTuple):
         None for all.
       unflatten: of flat parameters to the tree.
       actor: `(tree, obs) -> (outputs, std)`.
+      critic: `(tree, obs) -> value`, `[steps]`.
       evaluate: `(tree, obs, action) -> (log_prob, entropy, value)`, `[steps]` each.
       least_params: lower bounds of flat parameters: only the std has one.
     """
@@ -206,6 +230,7 @@ class Networks(NamedTuple):
     init: Callable[[Array, Array | None], Array]
     unflatten: Callable[[Array], Any]
     actor: Callable[[Any, Array], tuple[Array, Array]]
+    critic: Callable[[Any, Array], Array]
     evaluate: Callable[[Any, Array, Array], tuple[Array, Array, Array]]
     least_params: Float[Array, " num_params"]
 
@@ -241,10 +266,13 @@ def make_networks(
         outputs: Any = mlps["actor"].apply(tree["actor"], obs)
         return outputs, tree["std"]
 
+    def critic(tree: Any, obs: Array) -> Array:
+        value: Any = mlps["critic"].apply(tree["critic"], obs)
+        return value[0]
+
     def evaluate(tree: Any, obs: Array, action: Array) -> tuple[Array, Array, Array]:
         log_prob, entropy = policy.evaluate(*actor(tree, obs), action)
-        value: Any = mlps["critic"].apply(tree["critic"], obs)
-        return log_prob, entropy, value[0]
+        return log_prob, entropy, critic(tree, obs)
 
     template = jax.eval_shape(init_tree, jax.random.key(0))
     unbounded = jax.tree.map(lambda x: jnp.full(x.shape, -jnp.inf), template)
@@ -252,39 +280,151 @@ def make_networks(
         init=init,
         unflatten=flat.unflattener(init_tree),
         actor=actor,
+        critic=critic,
         evaluate=evaluate,
         least_params=flat.flatten({**unbounded, "std": jnp.full(std_dim, MIN_STD)}),
     )
 
 
-def make_learning_phase(
-    config: PPOConfig, networks: Networks, obs_dim: int, is_discrete: bool
-) -> Callable[[Array, Any, Rollout, Any], tuple[Array, Any]]:
-    """Builds `learn(params, opt_state, rollout, hparams) -> (params, opt_state)`.
+class Batch(NamedTuple):
+    """What a learning phase learns from, steps last: a rollout or a minibatch of it.
 
-    A learning phase: `config.epochs` Adam steps on the whole rollout.
+    Attributes:
+      old_log_prob: of the actions when the rollout was made, in nats.
+      advantage: of the actions; None where it is to be `returns` less the critic's present value.
+      returns: what the critic is to predict.
     """
-    evaluate, unflatten = networks.evaluate, networks.unflatten
 
-    def learn(params: Array, opt_state: Any, rollout: Rollout, hp: Any) -> tuple[Array, Any]:
-        steps = rollout.transitions(obs_dim, is_discrete)
-        returns = normalized(discounted_returns(steps.reward, rollout.ended, hp.discount))
+    obs: Float[Array, "obs_dim steps"]
+    action: Array
+    old_log_prob: Float[Array, " steps"]
+    advantage: Float[Array, " steps"] | None
+    returns: Float[Array, " steps"]
+
+
+def make_learning_phase(
+    config: PPOConfig,
+    networks: Networks,
+    optimizer: optax.GradientTransformation,
+    obs_dim: int,
+    is_discrete: bool,
+) -> Callable[[Array, PPOState, Rollout], PPOState]:
+    """Builds `learn(key, state, rollout) -> state`, a learning phase.
+
+    It passes `config.epochs` times over the rollout, each time in `config.num_minibatches` Adam
+    steps. A rollout that these do not divide leaves some steps out of each pass.
+    """
+    unflatten = networks.unflatten
+
+    def prepared(state: PPOState, rollout: Rollout) -> tuple[Batch, Array]:
+        """The rollout as it is learned from, and the sums over all returns so far."""
+        hp, tree, sums = state.hparams, unflatten(state.params), state.return_sums
+        steps, ended = rollout.transitions(obs_dim, is_discrete), rollout.ended
         # These parameters have made the whole rollout.
-        old_log_prob, _, _ = evaluate(unflatten(params), steps.obs, steps.action)
+        old_log_prob, _, value = networks.evaluate(tree, steps.obs, steps.action)
+        if config.advantages == "monte_carlo":
+            returns = normalized(discounted_returns(steps.reward, ended, hp.discount))
+            return Batch(steps.obs, steps.action, old_log_prob, None, returns), sums
+        decay = hp.discount * steps.discount
+        reward = steps.reward
+        if config.normalize_rewards:
+            sums = sums + power_sums(discounted_sums(reward, decay, ended))
+            reward = reward / std_of(sums)
+        next_value = networks.critic(tree, steps.next_obs)
+        advantage = generalized_advantages(reward, decay, ended, value, next_value, hp.gae_lambda)
+        return Batch(steps.obs, steps.action, old_log_prob, advantage, advantage + value), sums
 
-        def loss_fn(tree: Any) -> Array:
-            log_prob, entropy, value = evaluate(tree, steps.obs, steps.action)
-            return ppo_loss(log_prob, entropy, value, old_log_prob, returns, hp)
+    def loss_fn(tree: Any, batch: Batch, hp: Any) -> Array:
+        log_prob, entropy, value = networks.evaluate(tree, batch.obs, batch.action)
+        if batch.advantage is None:
+            advantage = jax.lax.stop_gradient(batch.returns - value)
+        else:
+            advantage = normalized(batch.advantage)
+        return ppo_loss(log_prob, entropy, value, batch.old_log_prob, advantage, batch.returns, hp)
 
-        def epoch(number: Array, carry: tuple[Array, Any]) -> tuple[Array, Any]:
+    def learn(key: Array, state: PPOState, rollout: Rollout) -> PPOState:
+        hp = state.hparams
+        batch, return_sums = prepared(state, rollout)
+        order = shuffled(key, config.epochs, config.num_minibatches, batch.returns.size)
+
+        def adam_step(number: Array, carry: tuple[Array, Any]) -> tuple[Array, Any]:
             params, opt_state = carry
-            gradient = flat.flatten(jax.grad(loss_fn)(unflatten(params)))
-            moved, opt_state = flat.adam_step(params, opt_state, gradient, hp.learning_rate)
+            minibatch = batch
+            if config.num_minibatches > 1:
+                minibatch = jax.tree.map(lambda x: x[..., order[number]], batch)
+            gradient = flat.flatten(jax.grad(loss_fn)(unflatten(params), minibatch, hp))
+            direction: Any
+            direction, opt_state = optimizer.update(gradient, opt_state)
+            moved = params - hp.learning_rate * direction
             return jnp.maximum(moved, networks.least_params), opt_state
 
-        return jax.lax.fori_loop(0, config.epochs, epoch, (params, opt_state))
+        num_updates = config.epochs * config.num_minibatches
+        params, opt_state = jax.lax.fori_loop(
+            0, num_updates, adam_step, (state.params, state.opt_state)
+        )
+        return state.replace(params=params, opt_state=opt_state, return_sums=return_sums)
 
     return learn
+
+
+def shuffled(
+    key: Array, epochs: int, num_minibatches: int, num_steps: int
+) -> Int[Array, "updates size"]:
+    """Which steps each minibatch has: in each epoch all of them, in random order.
+
+    Each epoch's steps are sorted by random bits, whose last ones are the step's number: a sort of
+    single numbers takes a fifth of the time of `jax.random.permutation`. The bits are MurmurHash3's
+    finaliser of counters that start at random, since XLA would move what threefry does with
+    counters that start at 0 out of the learning phase, into every step.
+    """
+    size = num_steps // num_minibatches
+    x = jax.random.bits(key) + jnp.arange(epochs * num_steps, dtype=jnp.uint32)
+    x = (x ^ (x >> 16)) * jnp.uint32(0x85EBCA6B)
+    x = (x ^ (x >> 13)) * jnp.uint32(0xC2B2AE35)
+    bits = (x ^ (x >> 16)).reshape(epochs, num_steps)
+    mask = jnp.uint32((1 << (num_steps - 1).bit_length()) - 1)
+    order = jax.lax.sort(bits & ~mask | jnp.arange(num_steps, dtype=jnp.uint32)) & mask
+    return order[:, : num_minibatches * size].reshape(-1, size).astype(jnp.int32)
+
+
+def generalized_advantages(
+    reward: Float[Array, " steps"],
+    decay: Float[Array, " steps"],
+    ended: Float[Array, " steps"],
+    value: Float[Array, " steps"],
+    next_value: Float[Array, " steps"],
+    gae_lambda: Array | float,
+) -> Float[Array, " steps"]:
+    r"""Advantages :math:`A_t = \delta_t + \gamma_t \lambda A_{t+1}` within each episode.
+
+    .. math:: \delta_t = r_t + \gamma_t V(s'_t) - V(s_t)
+
+    At a time limit, and where the rollout is cut, the critic's value of the next state stands for
+    what would have come.
+
+    Args:
+      reward: in units of the critic's values.
+      decay: gamma times the transition's own discount, which is 0 where the episode terminated.
+      ended: 1 at the last step of an episode, terminated or truncated, else 0.
+      value: V(s).
+      next_value: V(s').
+      gae_lambda: lambda; 0 has the least variance, 1 the least bias.
+
+    Source: Schulman et al. (2016), eq. 11 to 16.
+    """
+    delta = reward + decay * next_value - value
+    return discounted_sums(delta, gae_lambda * decay, ended)
+
+
+def power_sums(x: Float[Array, " steps"]) -> Float[Array, "3"]:
+    """How many numbers there are, their sum, and that of their squares."""
+    return jnp.stack([jnp.float32(x.size), jnp.sum(x), jnp.sum(x**2)])
+
+
+def std_of(power_sums: Float[Array, "3"]) -> Float[Array, ""]:
+    """Standard deviation, and at least 1e-4, which leaves rewards finite that are always 0."""
+    count, total, squares = power_sums
+    return jnp.sqrt(jnp.maximum(squares / count - (total / count) ** 2, 1e-8))
 
 
 def discounted_returns(
@@ -303,19 +443,26 @@ def discounted_returns(
     0.5, which in an SE is not so at a time limit; returns there run on into the next episode.
     """
 
-    def step(later: Array, x: tuple[Array, Array]) -> tuple[Array, Array]:
-        reward, ended = x
-        now = reward + discount * jnp.where(ended > 0.5, 0.0, later)
+    return discounted_sums(reward, jnp.broadcast_to(discount, reward.shape), ended)
+
+
+def discounted_sums(
+    x: Float[Array, " steps"], decay: Float[Array, " steps"], ended: Float[Array, " steps"]
+) -> Float[Array, " steps"]:
+    """Sums :math:`y_t = x_t + decay_t y_{t+1}` within each episode."""
+
+    def step(later: Array, terms: tuple[Array, Array, Array]) -> tuple[Array, Array]:
+        x, decay, ended = terms
+        now = x + decay * jnp.where(ended > 0.5, 0.0, later)
         return now, now
 
-    _, returns = jax.lax.scan(step, jnp.float32(0), (reward, ended), reverse=True)
-    return returns
+    return jax.lax.scan(step, jnp.float32(0), (x, decay, ended), reverse=True)[1]
 
 
-def normalized(returns: Float[Array, " steps"]) -> Float[Array, " steps"]:
-    """Returns with mean 0 and std 1, the std being the unbiased estimate plus 1e-5."""
-    std = jnp.std(returns, ddof=min(1, returns.shape[0] - 1))
-    return (returns - jnp.mean(returns)) / (std + 1e-5)
+def normalized(x: Float[Array, " steps"]) -> Float[Array, " steps"]:
+    """Numbers with mean 0 and std 1, the std being the unbiased estimate plus 1e-5."""
+    std = jnp.std(x, ddof=min(1, x.shape[0] - 1))
+    return (x - jnp.mean(x)) / (std + 1e-5)
 
 
 def ppo_loss(
@@ -323,6 +470,7 @@ def ppo_loss(
     entropy: Float[Array, " steps"],
     value: Float[Array, " steps"],
     old_log_prob: Float[Array, " steps"],
+    advantage: Float[Array, " steps"],
     returns: Float[Array, " steps"],
     hp: Any,
 ) -> Float[Array, ""]:
@@ -331,75 +479,21 @@ def ppo_loss(
     .. math:: -\overline{\min(\rho A, \mathrm{clip}(\rho, 1-\epsilon, 1+\epsilon) A)}
        + c_V \overline{(V - R)^2} - c_H \overline{H}
 
-    with the ratio :math:`\rho` of the new to the old probability and the advantage
-    :math:`A = R - V`, which passes no gradient.
+    with the ratio :math:`\rho` of the new to the old probability.
 
     Args:
       log_prob: of the actions, in nats.
       entropy: of the policy, in nats.
       value: V of the critic, in units of `returns`.
       old_log_prob: of the actions when the rollout was made.
-      returns: R, normalised.
+      advantage: A of the actions, about 1 in size; passes no gradient.
+      returns: R, what the critic is to predict.
       hp: clip_ratio (epsilon), value_weight (c_V) and entropy_weight (c_H).
 
     Source: Schulman et al. (2017), eq. 7 and 9; `docs/reference.md` 4.5.
     """
-    advantage = jax.lax.stop_gradient(returns - value)
     ratio = jnp.exp(jnp.clip(log_prob - old_log_prob, -_MAX_LOG_RATIO, _MAX_LOG_RATIO))
     clipped = jnp.clip(ratio, 1 - hp.clip_ratio, 1 + hp.clip_ratio)
     surrogate = jnp.mean(jnp.minimum(ratio * advantage, clipped * advantage))
     value_error = jnp.mean((value - returns) ** 2)
     return -surrogate + hp.value_weight * value_error - hp.entropy_weight * jnp.mean(entropy)
-
-
-def _sample_softmax(key: Array, outputs: Float[Array, " actions"], std: Array) -> Int[Array, ""]:
-    return jax.random.categorical(key, outputs).astype(jnp.int32)
-
-
-def _softmax_mode(outputs: Float[Array, " actions"]) -> Int[Array, ""]:
-    return jnp.argmax(outputs).astype(jnp.int32)
-
-
-def _evaluate_softmax(
-    outputs: Float[Array, "actions batch"], std: Array, action: Int[Array, " batch"]
-) -> tuple[Float[Array, " batch"], Float[Array, " batch"]]:
-    log_probs = jax.nn.log_softmax(outputs, axis=0)
-    entropy = -jnp.sum(jnp.exp(log_probs) * log_probs, axis=0)
-    return select_action(log_probs, action), entropy
-
-
-SOFTMAX = Distribution(
-    sample=_sample_softmax,
-    mode=_softmax_mode,
-    evaluate=_evaluate_softmax,
-    env_action=lambda action: action,
-)
-
-
-def gaussian(max_action: float) -> Distribution:
-    """Independent normal actions with mean `max_action * tanh(outputs)` and a given std.
-
-    Differs: the authors' mean is `tanh(outputs)`, which cannot reach the whole range of a task
-    whose largest action is not 1, such as Pendulum. The std is in units of the action, as theirs.
-
-    Source: `docs/reference.md` 4.5.
-    """
-
-    def mode(outputs: Float[Array, "action_dim *batch"]) -> Float[Array, "action_dim *batch"]:
-        return max_action * jnp.tanh(outputs)
-
-    def sample(key: Array, outputs: Array, std: Array) -> Float[Array, " action_dim"]:
-        return mode(outputs) + std * jax.random.normal(key, outputs.shape)
-
-    def evaluate(
-        outputs: Float[Array, "action_dim batch"], std: Array, action: Array
-    ) -> tuple[Float[Array, " batch"], Float[Array, " batch"]]:
-        standardized = (action - mode(outputs)) / std[:, None]
-        log_scale = jnp.sum(jnp.log(std) + 0.5 * math.log(2 * math.pi))
-        log_prob = -0.5 * jnp.sum(standardized**2, axis=0) - log_scale
-        return log_prob, jnp.broadcast_to(log_scale + 0.5 * std.size, log_prob.shape)
-
-    def env_action(action: Float[Array, " action_dim"]) -> Float[Array, " action_dim"]:
-        return jnp.clip(action, -max_action, max_action)
-
-    return Distribution(sample=sample, mode=mode, evaluate=evaluate, env_action=env_action)

@@ -139,7 +139,9 @@ def make_varied(config: Any, make: Callable[[Any], Agent]) -> Agent:
             values=values,
         )
 
-    return dataclasses.replace(agent, variants=tuple(variants), draw=draw)
+    # In lockstep all branches would run.
+    lanes = agent.cpu_lanes if len(variants) == 1 else 1
+    return dataclasses.replace(agent, variants=tuple(variants), draw=draw, cpu_lanes=lanes)
 
 
 def smallest_with_room(shapes: list[tuple[int, int]], values: dict[str, Array]) -> Array:

@@ -8,7 +8,10 @@ from pathlib import Path
 from typing import Any
 
 from sejax import agents, envs, plugins, serialize
+from sejax.app import families
+from sejax.app.families import AgentsConfig, families_of
 from sejax.errors import ConfigError, one_of, require, require_seed, shortened, whole
+from sejax.families import Families
 from sejax.training import TrainingConfig, steps_before_learning
 
 AGENT_HPARAMS = ("default", "varied")
@@ -32,7 +35,8 @@ class LearnConfig:
     preset: str
     env: Any
     proxy: Any
-    agent: Any
+    agent: Any  # None where there are several
+    agents: AgentsConfig | None  # None where there is one
     exploration: Any
     es: Any
     objective: Any
@@ -62,14 +66,18 @@ class LearnConfig:
                 "solved", f"true with objective={self.name('objective')}",
                 "stop_when_solved=false")  # fmt: skip
         facts, task_name = envs.facts_of(self.env), self.name("env")
-        agents.require_fit(self.agent, self.exploration, facts, task_name)
         if hasattr(self.proxy, "require_task"):
             self.proxy.require_task(facts, task_name)
-        if getattr(self.proxy, "may_never_end", False):
-            require_learning("training", self.training, self.agent, facts.max_steps)
+        for family in families_of(self):
+            with families.named(family.field):
+                agents.require_fit(family.agent, self.exploration, facts, task_name)
+                if getattr(self.proxy, "may_never_end", False):
+                    require_learning("training", self.training, family.agent, facts.max_steps)
 
     def name(self, group: str) -> str:
-        """The name by which a group's choice was made."""
+        """The name by which a group's choice was made; several agents are `ddqn+ppo`."""
+        if group == "agent":
+            return families.JOINT.join(family.key for family in families_of(self))
         return plugins.name_of(group, getattr(self, group))
 
     def task(self) -> envs.Task:
@@ -79,10 +87,9 @@ class LearnConfig:
     def parts(self) -> dict[str, Any]:
         """The objects that it describes, as `sejax.make_learner` takes them."""
         task = self.task()
-        varied = self.agent_hparams == "varied"
         return {
             "task": task,
-            "agent": agents.make_agent(self.agent, task, self.exploration, varied),
+            "agent": self._learners(task),
             "proxy": plugins.make("proxy", self.proxy, task),
             "es": self.es,
             "objective": plugins.make("objective", self.objective, task),
@@ -92,6 +99,16 @@ class LearnConfig:
             "lanes": self.lanes,
         }
 
+    def _learners(self, task: envs.Task) -> Any:
+        """The agent, or the families of agents, that learn on the proxies."""
+        varied, each = self.agent_hparams == "varied", families_of(self)
+        made = tuple(agents.make_agent(x.agent, task, self.exploration, varied) for x in each)
+        if self.agents is None:
+            return made[0]
+        return Families(agents=made, names=tuple(x.key for x in each),
+                        weights=tuple(x.weight for x in each),
+                        config=self.agents)  # fmt: skip
+
     @property
     def resolved_run_dir(self) -> Path:
         explored = self.name("exploration")
@@ -99,7 +116,7 @@ class LearnConfig:
         varied = "_varied" if self.agent_hparams == "varied" else ""
         agent = f"{self.name('agent')}{explored}{varied}"
         name = f"{self.name('env')}-{self.name('proxy')}-{agent}-s{self.seed}"
-        return Path(self.run_dir or Path("runs", re.sub(r"[^\w.-]+", "_", name)))
+        return Path(self.run_dir or Path("runs", re.sub(r"[^\w.+-]+", "_", name)))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -109,7 +126,8 @@ class EvaluateConfig:
     proxy: str
     proxy_kind: str | None  # a kind of proxy of somebody's own, which its file's name never imports
     env: str | None
-    agent: Any
+    agent: Any  # None where there are several
+    agents: AgentsConfig | None  # None where there is one
     exploration: Any
     agent_hparams: str
     training_from: str  # how long agents train: as the proxy was learned, or `training`
@@ -138,6 +156,10 @@ class EvaluateConfig:
     def _require_use(self) -> None:
         """Refuses settings that would have no effect."""
         if self.agent_hparams == "as_learned":
+            require(self.agents is None, "agents", "be left out with agent_hparams=as_learned",
+                    "the proxy says which it was learned with",
+                    families.JOINT.join(family.key for family in families_of(self)),
+                    "agent_hparams=default")  # fmt: skip
             for group, usual in (("agent", "ddqn"), ("exploration", "none")):
                 changed = _differences(group, getattr(self, group), {"name": usual})
                 require(not changed, group, "be left out with agent_hparams=as_learned", "the "
@@ -171,7 +193,8 @@ def to_plain(config: LearnConfig | EvaluateConfig) -> dict[str, Any]:
     """Inverse of `learn_config` and `evaluate_config`."""
     groups = LEARN_GROUPS if isinstance(config, LearnConfig) else EVALUATE_GROUPS
     return {
-        field.name: plugins.describe(field.name, value) if field.name in groups
+        field.name: families.to_plain(value) if field.name == "agents"
+        else plugins.describe(field.name, value) if field.name in groups and value is not None
         else serialize.to_plain(value) if field.name in TRAININGS else value
         for field in dataclasses.fields(config)
         for value in [getattr(config, field.name)]
@@ -180,6 +203,12 @@ def to_plain(config: LearnConfig | EvaluateConfig) -> dict[str, Any]:
 
 def _from_plain(schema: Any, groups: tuple[str, ...], values: Mapping[str, Any]) -> Any:
     typed: dict[str, Any] = dict(values)
+    typed["agents"] = families.from_plain(values.get("agents"))
+    if typed["agents"] is not None:
+        require(values.get("agent") is None, "agent", "be left out with agents",
+                "all of them are named there", shortened(values.get("agent")),
+                "agents=[...] alone")  # fmt: skip
+        typed["agent"], groups = None, tuple(x for x in groups if x != "agent")
     for group in groups:
         require(group in values, group, "be chosen", "nothing works without", "none",
                 f"{group}=NAME")  # fmt: skip

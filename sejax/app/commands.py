@@ -16,7 +16,7 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
-from sejax.app import compose, runtime
+from sejax.app import compose, families, runtime
 from sejax.errors import ConfigError
 
 BAD_INPUT, FAILED, INTERRUPTED = 2, 1, 130
@@ -33,9 +33,10 @@ def start(name: str, main: Callable[[], object]) -> None:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")  # a terminal of few letters
-    sys.argv[1:] = [_quoted(word) for word in sys.argv[1:]]
-    words = [word for word in sys.argv[1:] if not word.startswith("-")]
+    words: list[str] = []
     try:
+        sys.argv[1:] = families.in_one_choice([_quoted(word) for word in sys.argv[1:]])
+        words = [word for word in sys.argv[1:] if not word.startswith("-")]
         if sys.path[0] != "":  # `python -m` has put the current folder there, if it still exists
             sys.path.insert(0, "")
         Path.cwd()

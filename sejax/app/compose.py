@@ -21,7 +21,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from sejax import agents, envs, plugins, serialize
-from sejax.app import build, presets
+from sejax.app import build, families, presets
 from sejax.errors import ConfigError, nearest, require, shortened, unknown_name
 from sejax.training import TrainingConfig
 
@@ -113,6 +113,7 @@ def help_text(name: str, overrides: Sequence[str]) -> str:
 
 
 def _compose(name: str, overrides: Sequence[str], **options: Any) -> DictConfig:
+    overrides = families.in_one_choice(overrides)
     try:
         register(name, overrides)
         if GlobalHydra.instance().is_initialized():  # within a command: Hydra knows the folder
@@ -131,7 +132,7 @@ def register(name: str, overrides: Sequence[str]) -> None:
 
     Args:
       name: of the command: run or evaluate.
-      overrides: the words after it.
+      overrides: the words after it, with several agents in one choice (`families.in_one_choice`).
 
     Raises:
       ConfigError: for a choice that is none, or one of somebody's own that cannot be imported.
@@ -149,7 +150,11 @@ def register(name: str, overrides: Sequence[str]) -> None:
     chosen = _choices(overrides)
     for group in groups:
         for choice in dict.fromkeys([*plugins.names(group), *chosen.get(group, ())]):
-            _register_choice(group, choice, choice in chosen.get(group, ()), overrides)
+            if group == "agent" and families.JOINT in choice:
+                node = families.node(choice, shares=name == "run")
+                _store(group, choice, node, package="_global_")
+            else:
+                _register_choice(group, choice, choice in chosen.get(group, ()), overrides)
     if name == "run":
         _register_presets(chosen)
 
@@ -184,13 +189,17 @@ def _values(override: Override) -> list[Any]:
     return [] if override.is_sweep_override() else [value]
 
 
-def _require_choice(group: str, choice: Any) -> None:
+def _require_choice(group: str, choice: Any, field: str = "") -> None:
+    if group == "agent" and isinstance(choice, str) and families.JOINT in choice:
+        for name in families.members(choice):
+            _require_choice(group, name, "agents")
+        return
     known = presets.names() if group == "preset" else plugins.names(group)
     is_own = group != "preset" and isinstance(choice, str) and (
         plugins.is_registered(group, choice) or ":" in choice
     )  # fmt: skip
     if choice not in known and not is_own:
-        raise unknown_name(group, choice, known)
+        raise unknown_name(field or group, choice, known)
 
 
 def _choices(overrides: Iterable[str]) -> dict[str, list[str]]:
@@ -257,7 +266,10 @@ def _register_presets(chosen: dict[str, list[str]]) -> None:
         _store("preset", preset, {"preset": preset}, package="_global_")
     for env in dict.fromkeys([_DEFAULT_ENV, *chosen.get("env", ())]):
         for proxy in dict.fromkeys([_DEFAULT_PROXY, *chosen.get("proxy", ())]):
-            for preset, kind, choice, values in presets.settings(env, proxy):
+            settings = list(presets.settings(env, proxy))
+            settings += [tuned for choice in chosen.get("agent", ()) if families.JOINT in choice
+                         for tuned in families.tuned(choice, settings)]  # fmt: skip
+            for preset, kind, choice, values in settings:
                 name = f"{env}-{proxy}" + (f"-{choice}" if choice else "")
                 _store(f"{kind}/{preset}", name, dict(values), package="_global_")
 
@@ -302,7 +314,12 @@ def _no_preset(name: str) -> ConfigError:
 
 
 def _unknown_field(key: str, overrides: Iterable[str]) -> ConfigError:
-    group, known = key.rpartition(".")[0], _known_fields(_choices(overrides))
+    chosen = _choices(overrides)
+    if key.startswith("agents."):
+        refusal = families.unknown_field(key, chosen.get("agent", ()))
+        if refusal is not None:
+            return refusal
+    group, known = key.rpartition(".")[0], _known_fields(chosen)
     siblings = [name for name in known if name.rpartition(".")[0] == group]
     if key in siblings:
         return ConfigError(
@@ -322,13 +339,16 @@ def _known_fields(chosen: dict[str, list[str]]) -> list[str]:
     import dataclasses
 
     schemas = (build.LearnConfig, build.EvaluateConfig)
-    typed = {*plugins.GROUPS, *build.TRAININGS}
+    typed = {*plugins.GROUPS, *build.TRAININGS, "agents"}
     known = [f.name for schema in schemas for f in dataclasses.fields(schema)
              if f.name not in typed]  # fmt: skip
     for group in plugins.GROUPS:
         for choice in dict.fromkeys([*plugins.names(group), *chosen.get(group, ())]):
             try:
-                known += [f"{group}.{name}" for name in plugins.defaults(group, choice)]
+                if group == "agent" and families.JOINT in choice:
+                    known += serialize.flatten(families.node(choice, shares=True))
+                else:
+                    known += [f"{group}.{name}" for name in plugins.defaults(group, choice)]
             except ConfigError:
                 continue
     for training in build.TRAININGS:

@@ -8,6 +8,7 @@ generations that the checkpoint does not have, and are dropped when the run goes
 import hashlib
 import os
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,8 @@ COLUMNS = (
     "best_so_far", "train_steps_mean", "train_steps_max", "train_episodes_mean", "num_nonfinite",
     "env_steps_total", "wall_s",
 )  # fmt: skip
-HEADER = ",".join(COLUMNS).encode() + b"\n"
+# For each of several families of agents, with its key at the end; see `columns_of`.
+FAMILY_COLUMNS = ("incumbent_mean", "population_mean", "train_steps_mean", "num_nonfinite")
 _INTEGER = re.compile(rb"-?[0-9]{1,20}")
 
 
@@ -28,17 +30,26 @@ class MetricsError(ValueError):
     """The rows are not those that they must be; the message is a clause that says why."""
 
 
+def columns_of(families: Sequence[str] = ()) -> tuple[str, ...]:
+    """The columns of a run: with several families of agents, four more for each of them."""
+    several = families if len(families) > 1 else ()
+    return COLUMNS + tuple(f"{name}_{key}" for key in several for name in FAMILY_COLUMNS)
+
+
 class Metrics:
     """The rows of a run.
 
     Attributes:
       path: the file.
+      columns: the names of its columns.
       generations: finished generations of each seed.
     """
 
-    def __init__(self, path: Path, seeds: list[int]):
+    def __init__(self, path: Path, seeds: list[int], families: Sequence[str] = ()):
         self.path = path
+        self.columns = columns_of(families)
         self.generations = [0] * len(seeds)
+        self._families = families if len(families) > 1 else ()
         self._seeds = seeds
         self._size = 0
         self._hash = hashlib.sha256()
@@ -50,7 +61,7 @@ class Metrics:
         if self._rows is None:
             lines = self._read().decode("utf-8", "replace").split("\n")[1:-1]
             cells = (line.split(",") for line in lines)
-            self._rows = [dict(zip(COLUMNS, row, strict=False)) for row in cells]
+            self._rows = [dict(zip(self.columns, row, strict=False)) for row in cells]
         return self._rows
 
     def vouch(self) -> dict[str, Any]:
@@ -107,7 +118,8 @@ class Metrics:
         """Adds the rows of a chunk; they are on the disk when this returns.
 
         Args:
-          info: `[generation, seed]` arrays called as the columns, and `active`, which masks rows.
+          info: `[generation, seed]` arrays called as the columns, and `active`, which masks rows;
+            in `families` those of the families, `[generation, seed, family]`.
           wall_s: seconds since the start of the run.
 
         Raises:
@@ -119,18 +131,21 @@ class Metrics:
         data = b"".join(",".join(row).encode() + b"\n" for row in rows)
         if not data:
             return
-        data = data if self._size else HEADER + data
+        data = data if self._size else self._header + data
         append(self.path, data, at=self._size)
         self._size += len(data)
         self._hash.update(data)
         self.generations = counts
         if self._rows is not None:
-            self._rows += [dict(zip(COLUMNS, row, strict=True)) for row in rows]
+            self._rows += [dict(zip(self.columns, row, strict=True)) for row in rows]
 
     def _rows_of(self, info: Any, wall_s: float, counts: list[int]) -> list[list[str]]:
         """Cells of the active rows, generation by generation; counts them."""
         given = [name for name in COLUMNS if name not in ("seed", "wall_s")]
         values = {name: np.asarray(getattr(info, name)) for name in given}
+        for i, key in enumerate(self._families):
+            values |= {f"{name}_{key}": np.asarray(getattr(info.families, name))[..., i]
+                       for name in FAMILY_COLUMNS}  # fmt: skip
         rows = []
         for g, s in np.argwhere(np.asarray(info.active)):
             cells = {name: _format(column[g, s]) for name, column in values.items()}
@@ -139,8 +154,12 @@ class Metrics:
                                  f"row is of generation {cells['generation']}")  # fmt: skip
             counts[s] += 1
             cells |= {"seed": str(self._seeds[s]), "wall_s": f"{wall_s:.3f}"}
-            rows.append([cells[name] for name in COLUMNS])
+            rows.append([cells[name] for name in self.columns])
         return rows
+
+    @property
+    def _header(self) -> bytes:
+        return ",".join(self.columns).encode() + b"\n"
 
     def _read(self) -> bytes:
         try:
@@ -157,10 +176,10 @@ class Metrics:
         counts = list(counts)
         first = data.count(b"\n", 0, start) + 1
         lines = data[start:].split(b"\n")[:-1]
-        if not start and lines and lines.pop(0) + b"\n" != HEADER:
+        if not start and lines and lines.pop(0) + b"\n" != self._header:
             raise MetricsError("line 1 does not name the columns")
         for number, line in enumerate(lines, first + (not start)):
-            generation, seed = _key(line, number)
+            generation, seed = self._key(line, number)
             if seed not in self._seeds:
                 raise MetricsError(f"line {number} is of seed {seed}, which the run does not have")
             expected = counts[self._seeds.index(seed)]
@@ -172,6 +191,13 @@ class Metrics:
                                    f"{number}")  # fmt: skip
             counts[self._seeds.index(seed)] += 1
         return counts
+
+    def _key(self, line: bytes, number: int) -> tuple[int, int]:
+        """Generation and seed of a row."""
+        cells = line.split(b",")
+        if len(cells) != len(self.columns) or not all(map(_INTEGER.fullmatch, cells[:2])):
+            raise MetricsError(f"line {number} is not a row")
+        return int(cells[0]), int(cells[1])
 
     def _what_is_wrong(self, data: bytes, vouched: dict[str, int]) -> str:
         """A clause about rows whose digest is not the one vouched for."""
@@ -185,14 +211,6 @@ class Metrics:
             if count < vouched[str(seed)]:
                 return f"seed {seed} has {count} of {vouched[str(seed)]} generations"
         return "its rows are not those that were written"
-
-
-def _key(line: bytes, number: int) -> tuple[int, int]:
-    """Generation and seed of a row."""
-    cells = line.split(b",")
-    if len(cells) != len(COLUMNS) or not all(map(_INTEGER.fullmatch, cells[:2])):
-        raise MetricsError(f"line {number} is not a row")
-    return int(cells[0]), int(cells[1])
 
 
 def _format(value: Any) -> str:

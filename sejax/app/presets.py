@@ -3,7 +3,7 @@
 A file `conf/presets/<env>-<proxy>.yaml` has a section for each preset: nested values of a run's
 configuration, `with_agent` and `with_es` for those that only hold with an agent or a strategy, and
 `like` for a section of the same file that it builds on. `general-<proxy>.yaml` serves tasks without
-a file of their own.
+a file of their own, and those whose section says `like: general`.
 """
 
 import functools
@@ -67,7 +67,11 @@ def _sections(stem: str) -> dict[str, Any]:
     merged: dict[str, Any] = {}
     for name, section in raw.items():  # a section stands after the one that it builds on
         section = dict(section)
-        base = merged[section.pop("like")] if "like" in section else {}
+        like = section.pop("like", None)
+        if like == GENERAL:
+            base = _sections(f"{GENERAL}-{stem.rpartition('-')[2]}")[name]
+        else:
+            base = merged[like] if like else {}
         merged[name] = _merge(base, section)
     return merged
 

@@ -7,8 +7,10 @@ import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeRemainingColumn
 
+from sejax import plugins
 from sejax.app import presets
 from sejax.app.build import LearnConfig
+from sejax.app.families import families_of
 
 DRAW_EVERY_S = 30.0
 
@@ -18,7 +20,7 @@ class RunProgress:
 
     def __init__(self, config: LearnConfig):
         self._config = config
-        self._console = Console(highlight=False)
+        self._console = Console(highlight=False, markup=False)
         self._live = self._console.is_terminal
         self._progress = Progress(
             SpinnerColumn(),
@@ -68,7 +70,8 @@ class RunProgress:
         self._last = now
         text = (
             f"incumbent {np.nanmean(info.incumbent_mean[-1]):.1f} ± "
-            f"{np.nanmean(info.incumbent_std[-1]):.1f}, best {np.max(info.best_so_far[-1]):.1f}, "
+            f"{np.nanmean(info.incumbent_std[-1]):.1f}{self._of_families(info)}, "
+            f"best {np.max(info.best_so_far[-1]):.1f}, "
             f"{np.mean(info.train_steps_mean[-1]):,.0f} steps an agent, {steps_per_s:,.0f} steps/s"
         )
         num_nonfinite = int(np.sum(info.num_nonfinite))
@@ -79,6 +82,13 @@ class RunProgress:
         self._progress.update(self._task, completed=generation, description=text)
         if not self._live:
             self.print(f"generation {generation}/{self._config.generations}: {text}")
+
+    def _of_families(self, info: Any) -> str:
+        """The incumbent of each of several families of agents."""
+        families = families_of(self._config)
+        means = np.nanmean(info.families.incumbent_mean[-1], axis=0)  # [seed, family] -> [family]
+        each = [f"{family.key} {mean:.1f}" for family, mean in zip(families, means, strict=True)]
+        return f" ({', '.join(each)})" if len(each) > 1 else ""
 
     def time_to_draw(self) -> bool:
         """Whether the picture is old enough to be drawn again."""
@@ -120,10 +130,12 @@ class RunProgress:
             words += f" env={config.name('env')}"
         if ":" in config.name("proxy"):
             words += f" proxy_kind={config.name('proxy')}"
-        agent = config.name("agent")
+        agent = ",".join(plugins.name_of("agent", each.agent) for each in families_of(config))
         # An RN is judged with the agent that it was learned with; an SE is meant for the paper's.
         if program.proxy.is_real and ":" not in agent:
             return f"{words} agent_hparams=as_learned"
+        if config.agents is not None:
+            return f"{words} agent=[{agent}]"
         return words if agent == "ddqn" else f"{words} agent={agent}"
 
     def _own_arguments(self) -> str:

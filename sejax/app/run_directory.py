@@ -6,6 +6,7 @@ files as they are. Nothing here imports jax before a state is restored: a refusa
 """
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any, TypeGuard
@@ -34,22 +35,24 @@ class RunDirectory:
     """
 
     def __init__(
-        self, path: Path, config: dict[str, Any], seeds: list[int], hint: str, lock: RunLock
-    ):
+        self, path: Path, config: dict[str, Any], seeds: list[int], hint: str, lock: RunLock,
+        families: Sequence[str] = (),
+    ):  # fmt: skip
         self.path = path
         self.config = json.loads(json.dumps(config))  # as it reads back: tuples are lists
         self.seeds = seeds
         self._hint = hint
         self._lock = lock
-        self._table = Metrics(self.metrics, seeds)
+        self._table = Metrics(self.metrics, seeds, families)
         self._stored = self._stored_config()
         newest = checkpoints.newest_record(self.checkpoints)
         self._record = newest[1] if newest else None
 
     @classmethod
     def open(
-        cls, path: str | Path, config: dict[str, Any], seeds: list[int], hint: str = HINT
-    ) -> "RunDirectory":
+        cls, path: str | Path, config: dict[str, Any], seeds: list[int], hint: str = HINT,
+        families: Sequence[str] = (),
+    ) -> "RunDirectory":  # fmt: skip
         """Makes the folder, or opens that of an earlier session of the same run.
 
         Args:
@@ -57,6 +60,7 @@ class RunDirectory:
           config: the configuration, plain values in nested mappings; `checkpoint_every` is read.
           seeds: the `seed` column of the metrics.
           hint: last sentence of a refusal: how to choose another folder.
+          families: of agents, as the metrics call them; several have columns of their own.
 
         Raises:
           ConfigError: if it holds a run of another configuration, is in use by another process, or
@@ -72,7 +76,7 @@ class RunDirectory:
                 f"got {path} ({error}). {hint}"
             ) from error
         try:
-            directory = cls(path, config, [int(seed) for seed in seeds], hint, lock)
+            directory = cls(path, config, [int(seed) for seed in seeds], hint, lock, families)
             directory._refuse_another_run()
             for folder in (path, path / "proxies", directory.checkpoints):
                 remove_leftovers(folder)
@@ -301,9 +305,11 @@ def open_for(config: Any, hint: str = HINT) -> RunDirectory:
       ConfigError: if it holds another run, is in use, or cannot be written.
     """
     from sejax.app import build  # which imports jax
+    from sejax.app.families import families_of
 
     seeds = [config.seed + i for i in range(config.num_seeds)]
-    return RunDirectory.open(config.resolved_run_dir, build.to_plain(config), seeds, hint)
+    keys = [family.key for family in families_of(config)]
+    return RunDirectory.open(config.resolved_run_dir, build.to_plain(config), seeds, hint, keys)
 
 
 def _same(a: Any, b: Any) -> bool:

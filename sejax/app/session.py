@@ -11,6 +11,7 @@ import numpy as np
 from sejax.app import build, commands
 from sejax.app.run_directory import RunDirectory
 from sejax.bilevel import Program, make_program
+from sejax.parallel import compiler_options
 from sejax.proxies import files
 
 
@@ -78,7 +79,8 @@ class Chunks:
 
         keys = jax.random.split(jax.random.key(0), num_seeds)
         state = jax.eval_shape(self.program.init, keys)
-        self._compiled[num_seeds, length] = jax.jit(chunk, donate_argnums=0).lower(state).compile()
+        program = jax.jit(chunk, donate_argnums=0, compiler_options=compiler_options())
+        self._compiled[num_seeds, length] = program.lower(state).compile()
 
 
 def make_chunks(config: build.LearnConfig) -> Chunks:
@@ -171,17 +173,22 @@ class Proxies:
           OSError: if a file cannot be written.
         """
         best, last = int(np.argmax(state.best_score)), int(np.argmax(state.incumbent_score))
-        self._save("proxy", best, state.best, state.best_score, state.best_generation)
+        best_ones = (state.best, state.best_score, state.best_scores, state.best_generation)
+        self._save("proxy", best, *best_ones)
         self._save("proxy_last", last, state.incumbent, state.incumbent_score,
-                   state.generation - 1)  # fmt: skip
+                   state.incumbent_scores, state.generation - 1)  # fmt: skip
         for i in range(self.config.num_seeds) if self.config.num_seeds > 1 else ():
             generation = int(state.best_generation[i])
             if self._stored.get(i) != generation:  # few are new
                 name = f"proxies/seed{self.config.seed + i}"
-                self._save(name, i, state.best, state.best_score, state.best_generation)
+                self._save(name, i, *best_ones)
                 self._stored[i] = generation
 
-    def _save(self, name: str, index: int, flat: Any, score: Any, generation: Any) -> None:
+    def _save(
+        self, name: str, index: int, flat: Any, score: Any, scores: Any, generation: Any
+    ) -> None:
+        names = self.program.families.names
+        of_families = dict(zip(names, map(float, scores[index]), strict=True))
         files.save(
             self.folder / f"{name}.safetensors",
             self.program.proxy,
@@ -191,6 +198,7 @@ class Proxies:
             score=float(score[index]),
             generation=int(generation[index]),
             seed=self.config.seed + index,
+            **({"scores": of_families} if len(names) > 1 else {}),
         )
 
 

@@ -6,7 +6,10 @@ A task is a file here, with its facts on top and what takes seconds to import in
 from typing import Any
 
 from sejax import plugins
+from sejax.envs import light_gymnax
 from sejax.envs.task import Facts, Task
+
+light_gymnax.install()
 
 __all__ = ["Facts", "Task", "facts_of", "make", "make_from", "names"]
 

@@ -77,7 +77,7 @@ def make_nes(config: NESConfig, num_dims: int) -> Strategy:
       >>> strategy.ask(jax.random.key(1), state)[0].shape  # +eps and -eps
       (8, 3)
     """
-    num_pairs = config.population_size
+    num_pairs, num_signs = config.population_size, 2 if config.mirrored else 1
     transform = TRANSFORMS[config.score_transform]
 
     def init(key: Array, mean: Float[Array, " dims"]) -> NESState:
@@ -113,7 +113,8 @@ def make_nes(config: NESConfig, num_dims: int) -> Strategy:
         ask=ask,
         tell=tell,
         incumbent=lambda state: state.mean,
-        num_members=num_pairs * (2 if config.mirrored else 1),
+        num_members=num_pairs * num_signs,
+        num_signs=num_signs,
         trials=trials_of(config, config.num_incumbent_evals or num_pairs),
     )
 

@@ -39,6 +39,11 @@ class Trials:
             [np.arange(num_tried) % self.num_evals, np.arange(self.num_incumbent_evals)]
         )
 
+    def families(self, of_members: np.ndarray, num_families: int) -> np.ndarray:
+        """The family of agents of each trial, `[num_trials]`; the incumbent's take turns."""
+        of_incumbent = np.arange(self.num_incumbent_evals) % num_families
+        return np.concatenate([np.repeat(of_members, self.num_evals), of_incumbent])
+
     def candidates(
         self, members: Float[Array, "members dims"], incumbent: Float[Array, " dims"]
     ) -> Float[Array, "trials dims"]:
@@ -87,6 +92,7 @@ class Strategy:
         scores are better, and scores that are not finite rank worst.
       incumbent: `(state) -> [dims]`, the proxy that the strategy stands for.
       num_members: proxies in a generation beside the incumbent.
+      num_signs: blocks of members, at the same place of which stand the signs of one perturbation.
       trials: how often each is tried.
     """
 
@@ -95,6 +101,7 @@ class Strategy:
     tell: Callable[..., Any]
     incumbent: Callable[[Any], Array]
     num_members: int
+    num_signs: int = 1
     trials: Trials = Trials()
 
     @property

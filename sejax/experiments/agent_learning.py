@@ -19,8 +19,9 @@ from sejax.experiments import figures, return_curves
 from sejax.experiments.experiment import Experiment
 from sejax.experiments.return_curves import WINDOW
 from sejax.experiments.settings import Settings, count, each_of, setting
-from sejax.experiments.tables import as_texts, bootstrap_interval, publish
+from sejax.experiments.tables import as_texts, iqm_columns, iqm_note, iqm_text, publish
 from sejax.experiments.worlds import CURVES, World, train_groups
+from sejax.statistics import bootstrap_interval
 from sejax.training import TrainingConfig
 
 QUICK_STEPS = 2000
@@ -117,6 +118,7 @@ def summarise(curves: pd.DataFrame) -> pd.DataFrame:
             "num_solved": int(np.isfinite(to_solve).sum()),
             "median_steps_to_solve": np.median(to_solve),
             "last_return": last.mean(), "last_low": low, "last_high": high,
+            **iqm_columns(last, "last"),
         })  # fmt: skip
     return pd.DataFrame(rows)
 
@@ -131,6 +133,7 @@ COLUMNS: dict[str, Any] = {
         f"{row.median_steps_to_solve:,.0f}" if np.isfinite(row.median_steps_to_solve) else "-"),
     "steps": "{max_steps:,}",
     f"last {WINDOW} tests": "{last_return:.1f} [{last_low:.1f}, {last_high:.1f}]",
+    "IQM": iqm_text("last"),
     "others": lambda row: STUDIES[row.study].peers,
 }  # fmt: skip
 
@@ -142,7 +145,7 @@ def report(settings: AgentLearning, curves: pd.DataFrame) -> pd.DataFrame:
         f"{settings.num_agents} seeds of each; after each training episode "
         f"{settings.test_episodes} greedy test episode. Solved: the mean of {WINDOW} tests in a "
         f"row reaches the threshold at some time. The last {WINDOW} tests: mean over seeds, "
-        "bootstrap 95% interval. CartPole here is v0, of 200 steps."
+        f"bootstrap 95% interval. CartPole here is v0, of 200 steps.{iqm_note()}"
     )
     title = "Agents that learn the real tasks"
     return publish(settings, title, as_texts(summary, COLUMNS), summary, note)

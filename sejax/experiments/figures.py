@@ -15,12 +15,13 @@ from matplotlib.ticker import MaxNLocator
 from PIL import Image
 
 from sejax.files import atomic_path
+from sejax.statistics import performance_profile
 
 # Okabe and Ito's palette, which those with any kind of colour blindness can tell apart.
 REAL, VARIED, FIXED, BEST, SOLVED = "#0072B2", "#E69F00", "#009E73", "#000000", "#B03A73"
 AGENT_NAMES = {"ddqn": "DDQN", "dueling_ddqn": "Dueling DDQN", "td3": "TD3",
-               "td3_discrete": "discrete TD3", "ppo": "PPO", "q_learning": "Q-learning",
-               "sarsa": "SARSA"}  # fmt: skip
+               "td3_discrete": "discrete TD3", "ppo": "PPO", "sac": "SAC", "dqn": "DQN",
+               "q_learning": "Q-learning", "sarsa": "SARSA"}  # fmt: skip
 STYLE: Any = {
     "font.size": 10, "axes.spines.top": False, "axes.spines.right": False, "legend.frameon": False,
 }  # fmt: skip
@@ -108,6 +109,17 @@ def band(axis: Any, grid: Any, values: Any, ends: Any, color: str, **line: Any) 
     known = ~np.isnan(values).any(axis=0)
     axis.plot(grid[known], values[:, known].mean(axis=0), color=color, **line)
     axis.fill_between(grid[known], *ends(values[:, known]), color=color, alpha=0.2, lw=0)
+
+
+def profile(
+    axis: Any, strata: Sequence[Any], low: float, high: float, color: str, label: str
+) -> None:
+    """Draws the share of runs with more than each score in [low, high], and its 95% interval."""
+    grid = np.linspace(low, high, 200)
+    shares, *ends = performance_profile(*strata, thresholds=grid)
+    axis.plot(grid, shares, color=color, lw=1.8, label=label)
+    axis.fill_between(grid, *ends, color=color, alpha=0.2, lw=0)
+    axis.set(xlim=(low, high), ylim=(0, 1.02))
 
 
 def legend_above(figure: Any, axis: Any, columns: int = 4, fontsize: int | None = 9) -> None:

@@ -17,10 +17,11 @@ from sejax.errors import require
 from sejax.experiments import figures, return_curves, rn_studies, worlds
 from sejax.experiments.rn_studies import RnSettings
 from sejax.experiments.settings import count, each_of, setting
-from sejax.experiments.tables import as_texts, bootstrap_interval
+from sejax.experiments.tables import as_texts, iqm_columns, iqm_note, iqm_text
 from sejax.experiments.worlds import World
 from sejax.options import counts
 from sejax.plugins import name_of
+from sejax.statistics import bootstrap_interval
 from sejax.training import TrainingConfig
 
 ROWS = {"default": "default hyperparameters", "varied": "varied hyperparameters",
@@ -127,6 +128,7 @@ def summarise(curves: pd.DataFrame, solved_reward: float, max_steps: int) -> pd.
             "solved": float(np.isfinite(steps).mean()), "steps_to_solve": counted.mean(),
             **interval(counted, groups, str(world), "steps"), "mean_return": mean_return.mean(),
             **interval(mean_return, groups, str(world), "return"),
+            **iqm_columns(mean_return, "return", None if world in WITHOUT_RN else groups),
             "last_return": return_curves.last_returns(mine).mean(),
         })  # fmt: skip
     return pd.DataFrame(out)
@@ -159,6 +161,7 @@ def make_table(summary: pd.DataFrame) -> pd.DataFrame:
         "solved": "{solved:.0%}",
         "mean return over training":
             lambda row: with_interval(row.mean_return, row.return_low, row.return_high, 1),
+        "IQM": iqm_text("return"),
         "last tests": "{last_return:.1f}",
     })  # fmt: skip
 
@@ -176,7 +179,7 @@ def common_note(settings: CurveSettings, solved_reward: float) -> str:
         "one greedy test episode after each. Steps to solve: until the mean of "
         f"{return_curves.WINDOW} tests in a row reaches {solved_reward:g}; an agent that never "
         f"does counts {settings.max_steps:,}. In brackets bootstrap 95% intervals, for at least "
-        f"five RNs: they draw RNs, and agents on the real task."
+        f"five RNs: they draw RNs, and agents on the real task.{iqm_note('within each RN')}"
     )
 
 

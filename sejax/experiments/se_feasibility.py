@@ -19,8 +19,9 @@ from sejax.experiments import figures, proxy_runs
 from sejax.experiments.experiment import Experiment
 from sejax.experiments.proxy_runs import RunSettings
 from sejax.experiments.settings import count, setting
-from sejax.experiments.tables import bootstrap_interval, publish
+from sejax.experiments.tables import iqm_columns, iqm_note, iqm_text, publish
 from sejax.options import one_of
+from sejax.statistics import bootstrap_interval
 
 NUM_RUNS = {"cartpole": 10}
 
@@ -114,6 +115,7 @@ def make_table(config: Any, runs: pd.DataFrame) -> pd.DataFrame:
         if len(solved) else "-",
         "best incumbent mean": f"{best.median():.1f} ({best.min():.1f} to {best.max():.1f})",
         "last incumbent mean": f"{last.mean():.1f} [{low:.1f}, {high:.1f}]",
+        "last incumbent mean, IQM": iqm_text("last").format_map(iqm_columns(last, "last")),
         "wall minutes of a run": f"{runs['wall_min'].mean():.1f}",
     }  # fmt: skip
     return pd.DataFrame([
@@ -136,6 +138,7 @@ def report(settings: SeFeasibility, rows: pd.DataFrame) -> pd.DataFrame:
         "runs; a run that did not solve the task counts as longer than all. The last incumbent "
         "mean is that over runs, with a bootstrap 95% interval; the best is a maximum of noisy "
         "means and hence too high: se_performance tests the stored SEs with other agents."
+        f"{iqm_note(of='runs')}"
     )
     title = f"Learning SEs of {settings.env} for {settings.agent} agents{varied}"
     return publish(settings, title, make_table(config, summary), summary, note)

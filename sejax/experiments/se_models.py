@@ -21,7 +21,7 @@ from sejax.experiments import figures, se_agents
 from sejax.experiments.experiment import Experiment
 from sejax.experiments.se_agents import SeAgents
 from sejax.experiments.settings import setting
-from sejax.experiments.tables import as_texts, publish
+from sejax.experiments.tables import as_texts, iqm_columns, iqm_note, iqm_text, publish
 from sejax.experiments.worlds import return_columns
 
 
@@ -61,6 +61,8 @@ def summarise(agents: pd.DataFrame, solved_reward: float) -> pd.DataFrame:
     summary = grouped["test_return"].agg(
         return_mean="mean", return_std=lambda x: x.std(ddof=0),
         solved=lambda x: (x >= solved_reward).mean())  # fmt: skip
+    iqms = [iqm_columns(returns, "return") for _, returns in grouped["test_return"]]
+    summary = summary.assign(**pd.DataFrame(iqms, index=summary.index))
     summary["train_steps"] = grouped["train_steps"].mean()
     kinds = list(dict.fromkeys(agents["kind"]))
     rank = summary.reset_index().assign(order=lambda t: t["kind"].map(kinds.index))
@@ -86,6 +88,7 @@ def report(settings: SeModels, rows: pd.DataFrame) -> pd.DataFrame:
         "run's seed": lambda row: ses.seeds[row.se],
         "score when learned": lambda row: f"{ses.scores[row.se]:.1f}",
         "return": "{return_mean:.1f} ± {return_std:.1f}",
+        "IQM": iqm_text("return"),
         "agents that solve the task": "{solved:.0%}",
         "training steps": "{train_steps:,.0f}",
     }
@@ -94,7 +97,7 @@ def report(settings: SeModels, rows: pd.DataFrame) -> pd.DataFrame:
     note = (
         f"Return: mean ± std over {rows['agent'].nunique()} agents with drawn hyperparameters and "
         f"{len(return_columns(rows))} test episodes each. The paper has 1000 agents on each of 40 "
-        f"SEs and shows violins only, no numbers.{correlations_text(summary)}"
+        f"SEs and shows violins only, no numbers.{correlations_text(summary)}{iqm_note()}"
     )
     title = f"Single SEs of {task.name} (solved at {task.solved_reward:g})"
     return publish(settings, title, as_texts(summary, columns), summary, note)

@@ -25,7 +25,15 @@ from sejax.experiments import figures, se_agents
 from sejax.experiments.experiment import Experiment
 from sejax.experiments.se_agents import SeAgents
 from sejax.experiments.settings import count, setting
-from sejax.experiments.tables import as_texts, publish, spread
+from sejax.experiments.tables import (
+    as_texts,
+    in_strata,
+    iqm_columns,
+    iqm_note,
+    iqm_text,
+    publish,
+    spread,
+)
 from sejax.experiments.worlds import World, return_columns
 from sejax.options import one_of
 from sejax.training import SOLVED_BY, TrainingConfig
@@ -153,8 +161,9 @@ def with_best(agents: pd.DataFrame) -> pd.DataFrame:
 def summarise(agents: pd.DataFrame) -> pd.DataFrame:
     """Means, deviations and intervals for each kind of agent and setting.
 
-    Deviations are over agents; intervals come from drawing SEs (groups) again, since agents of the
-    same SE have much in common.
+    Deviations are over agents; intervals of means come from drawing SEs (groups) again, since
+    agents of the same SE have much in common, those of interquartile means from drawing agents
+    within their SE.
     """
     rows = []
     for (kind, name), mine in agents.groupby(["kind", "setting"], sort=False):
@@ -162,8 +171,14 @@ def summarise(agents: pd.DataFrame) -> pd.DataFrame:
                "num_agents": len(mine), "num_nonfinite": int(mine["nonfinite"].sum())}  # fmt: skip
         for column in ("train_steps", "train_episodes", "test_return"):
             row |= spread(mine[column], mine.groupby("group")[column].mean(), column)
+        row |= iqm_columns(mine["test_return"], "test_return", strata(mine, str(name)))
         rows.append(row)
     return pd.DataFrame(rows)
+
+
+def strata(agents: pd.DataFrame, name: str) -> pd.Series | None:
+    """Labels of the SEs that agents are drawn within; groups on the real task share it."""
+    return None if name == "real" else agents["group"]
 
 
 def make_table(env_name: str, summary: pd.DataFrame) -> pd.DataFrame:
@@ -189,6 +204,7 @@ def make_table(env_name: str, summary: pd.DataFrame) -> pd.DataFrame:
         "fewer": fewer,
         "episodes": lambda row: measured(row, "train_episodes", 1),
         "return": lambda row: measured(row, "test_return", 1),
+        "IQM": iqm_text("test_return"),
         "paper's return":
             lambda row: PAPER_RETURNS.get((env_name, row.kind), {}).get(row.setting, ""),
     })  # fmt: skip
@@ -199,6 +215,7 @@ def report(settings: SePerformance, rows: pd.DataFrame) -> pd.DataFrame:
     agents = with_best(rows)
     summary = summarise(agents)
     draw(task, agents, settings.folder / "performance.png")
+    draw_profiles(task, agents, settings.folder / "profiles.png")
     note = (
         f"Mean ± std over agents with drawn hyperparameters, {len(return_columns(rows))} test "
         'episodes each; in brackets a bootstrap 95% interval that draws SEs, not agents. "Fewer" '
@@ -209,6 +226,7 @@ def report(settings: SePerformance, rows: pd.DataFrame) -> pd.DataFrame:
         "empty it gives no number here, but for DDQN in CartPole a mean return on SEs of 190.7, in "
         "another section. "
         f"Agents that met a number that is not finite: {int(rows['nonfinite'].sum())}."
+        f"{iqm_note('within each SE')}"
     )
     title = f"Agents trained on SEs and tested on {task.name} (solved at {task.solved_reward:g})"
     return publish(settings, title, make_table(task.name, summary), summary, note)
@@ -243,6 +261,24 @@ def draw(task: Any, agents: pd.DataFrame, path: Any) -> None:
         figure.legend(handles, [f"train: {SHOWN[name][1]}" for name in longest],
                       ncols=len(longest) if len(kinds) > 1 else 1,
                       loc="outside upper center")  # fmt: skip
+
+
+def draw_profiles(task: Any, agents: pd.DataFrame, path: Any) -> None:
+    """Draws performance profiles of the agents' mean test returns, a panel for each kind."""
+    kinds = list(agents.groupby("kind", sort=False))
+    low, high = agents["test_return"].min(), agents["test_return"].max()
+    size = (1.2 + 3.6 * len(kinds), 3.6)
+    with figures.panels(path, 1, len(kinds), size, sharey=True) as (figure, axes):
+        for axis, (kind, of_kind) in zip(axes[0], kinds, strict=True):
+            for name, mine in of_kind.groupby("setting", sort=False):
+                color, label = SHOWN[str(name)]
+                runs = in_strata(mine["test_return"], strata(mine, str(name)))
+                figures.profile(axis, runs, low, high, color, f"train: {label}")
+            axis.axvline(task.solved_reward, color=figures.SOLVED, ls="--", lw=1.1)
+            axis.set(title=figures.AGENT_NAMES.get(str(kind), kind),
+                     xlabel=f"return of an agent on {task.name}")  # fmt: skip
+        axes[0, 0].set_ylabel("share of agents with more")
+        figures.legend_above(figure, max(axes[0], key=lambda axis: len(axis.lines)), 2)
 
 
 def colored(agents: pd.DataFrame, names: str | list[str]) -> list[tuple[str, np.ndarray]]:

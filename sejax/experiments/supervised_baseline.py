@@ -34,8 +34,9 @@ from sejax.experiments.experiment import Experiment
 from sejax.experiments.pieces import stack, unstack
 from sejax.experiments.se_agents import AGENTS
 from sejax.experiments.supervised_models import SupervisedBaseline
-from sejax.experiments.tables import as_texts, bootstrap_interval, publish
+from sejax.experiments.tables import as_texts, iqm_columns, iqm_note, iqm_text, publish
 from sejax.experiments.worlds import HPARAMS, World, return_columns
+from sejax.statistics import bootstrap_interval
 
 BEST = 2  # models in the paper's second figure
 LABELS = {"authors": "model, as the authors", "authors_best": f"model, as the authors, best {BEST}",
@@ -121,6 +122,7 @@ def summarise(agents: pd.DataFrame, solved_reward: float) -> pd.DataFrame:
             "return_mean": mine["test_return"].mean(),
             "return_std": mine[return_columns(mine)].to_numpy().std(),
             "return_low": low, "return_high": high,
+            **iqm_columns(mine["test_return"], "return", None if name == "se" else mine["group"]),
             "solved": (mine["test_return"] >= solved_reward).mean(),
             "train_steps": mine["train_steps"].mean(),
             "train_episodes": mine["train_episodes"].mean(),
@@ -140,6 +142,7 @@ def make_table(summary: pd.DataFrame) -> pd.DataFrame:
         "trained on": lambda row: LABELS[row.world],
         "agents": "{num_agents}",
         "return": "{return_mean:.1f} ± {return_std:.1f} [{return_low:.1f}, {return_high:.1f}]",
+        "IQM": iqm_text("return"),
         "paper's": lambda row: PAPER.get((row.world, row.kind, row.hparams), ""),
         "solved": "{solved:.0%}",
         "training steps": "{train_steps:,.0f}",
@@ -164,7 +167,7 @@ def report(settings: SupervisedBaseline, rows: pd.DataFrame) -> pd.DataFrame:
         f"5e-07), {last['done_error']:.2g} of the end. As the authors: the network for the end "
         "keeps its random weights. Fair: it is fitted too, and used. The best models are those of "
         "the runs with the best episodes. Agents that met a number that is not finite: "
-        f"{diverged_text(agents)}."
+        f"{diverged_text(agents)}.{iqm_note('within each model')}"
     )
     title = f"Agents trained on supervised models of {task.name} and on an SE"
     return publish(settings, title, make_table(summary), summary, note)

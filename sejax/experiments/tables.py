@@ -3,28 +3,13 @@
 from collections.abc import Callable, Mapping
 from typing import Any
 
-import numpy as np
 import pandas as pd
 from rich.console import Console
 from rich.table import Table
 
 from sejax.experiments.settings import Settings
 from sejax.files import write_text
-
-
-def bootstrap_interval(
-    values: Any, level: float = 0.95, num_resamples: int = 2000, seed: int = 0
-) -> tuple[float, float]:
-    """Percentile bootstrap confidence interval of the mean of independent values `[n]`.
-
-    Average what belongs together (the agents of one proxy) before: only independent values may be
-    drawn one by one.
-    """
-    values = np.asarray(values, float)
-    draws = np.random.default_rng(seed).integers(0, values.size, (num_resamples, values.size))
-    means = values[draws].mean(axis=1)
-    low, high = np.quantile(means, [(1 - level) / 2, (1 + level) / 2])
-    return float(low), float(high)
+from sejax.statistics import bootstrap_interval, interquartile_mean
 
 
 def spread(values: pd.Series, draws: Any, name: str) -> dict[str, float]:
@@ -32,6 +17,32 @@ def spread(values: pd.Series, draws: Any, name: str) -> dict[str, float]:
     low, high = bootstrap_interval(draws)
     columns = {"mean": values.mean(), "std": values.std(ddof=0), "low": low, "high": high}
     return {f"{name}_{statistic}": value for statistic, value in columns.items()}
+
+
+def in_strata(values: pd.Series, labels: pd.Series | None) -> list[pd.Series]:
+    """Values apart by their labels; all together where there are none."""
+    return [values] if labels is None else [mine for _, mine in values.groupby(labels)]
+
+
+def iqm_columns(values: pd.Series, name: str, strata: pd.Series | None = None) -> dict[str, float]:
+    """Interquartile mean and its interval as columns `NAME_iqm`, `NAME_iqm_low`, `NAME_iqm_high`.
+
+    The values are drawn again within their strata, which are labels of them.
+    """
+    ends = bootstrap_interval(*in_strata(values, strata), statistic=interquartile_mean)
+    columns = {"iqm": interquartile_mean(values), "iqm_low": ends[0], "iqm_high": ends[1]}
+    return {f"{name}_{statistic}": value for statistic, value in columns.items()}
+
+
+def iqm_text(name: str) -> str:
+    """The format of these columns for `as_texts`."""
+    return f"{{{name}_iqm:,.1f}} [{{{name}_iqm_low:,.1f}}, {{{name}_iqm_high:,.1f}}]"
+
+
+def iqm_note(where: str = "", of: str = "agents") -> str:
+    """What is to be known of such columns, and within what is drawn."""
+    return (f" IQM: the interquartile mean over {of}, in brackets a stratified bootstrap 95% "
+            f"interval, which draws {' '.join(filter(None, (of, where)))}.")  # fmt: skip
 
 
 def as_texts(

@@ -1,13 +1,13 @@
-"""Configurations of the proxies. Importing this imports no gymnax, which takes seconds."""
+"""Configurations of the proxies. Importing this imports neither JAX nor gymnax."""
 
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
 from sejax.errors import require
-from sejax.networks import ACTIVATIONS
-from sejax.options import MOST_LAYERS, Options, counts, one_of, option
+from sejax.options import ACTIVATIONS, MOST_LAYERS, Options, counts, one_of, option
 
-DONE_MODES = ("soft", "threshold")
+DONE_MODES = ("soft", "threshold", "bernoulli", "sigmoid")
+INITIAL_STATES = ("real", "learned")
 VARIANTS = (
     "additive_potential", "exclusive_potential", "additive_non_potential",
     "exclusive_non_potential", "additive_weighted_info", "exclusive_weighted_info",
@@ -16,20 +16,44 @@ VARIANTS = (
 
 @dataclass(frozen=True, kw_only=True)
 class SyntheticConfig(Options):
-    """The SE's three networks, and how their done output is used."""
+    """The SE's networks, where its episodes begin, and how they end.
+
+    The paper's SE is `initial_state=real horizon=null done=soft`; the contextual bandit of Liesen
+    et al. (2024) is `initial_state=learned horizon=1`.
+    """
 
     group: ClassVar[str] = "proxy"
 
     hidden_size: int = option(128, counts("a layer needs a unit"))
     num_layers: int = option(1, counts("there is a hidden layer", most=MOST_LAYERS))
     activation: str = option("leaky_relu", one_of(ACTIVATIONS))
-    # soft: bootstrap with 1 - d (authors); threshold: with 1 - [d > 0.5]
+    # How the done output d ends an episode. soft: at d > 0.5, but targets bootstrap with 1 - d
+    # (the authors'); threshold: at d > 0.5; bernoulli: with probability clip(d, 0, 1); sigmoid:
+    # with probability sigmoid(d). All but the first are ends that every agent sees.
     done: str = option("soft", one_of(DONE_MODES))
+    # real: the task's initial states; learned: a network's, from standard normal noise
+    initial_state: str = option("real", one_of(INITIAL_STATES))
+    # Steps of an episode; null: the task's limit. 1: a contextual bandit, which has neither a
+    # next-state nor a done network.
+    horizon: int | None = option(None, counts("an episode has steps"))
+    # Whether the horizon terminates an episode, so that nothing is bootstrapped there, or cuts it,
+    # as the task's limit does.
+    horizon_is_terminal: bool = True
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require(self.horizon != 1 or self.horizon_is_terminal, "proxy.horizon_is_terminal",
+                "be true with proxy.horizon=1", "there is no next state to bootstrap with", "false",
+                "proxy.horizon_is_terminal=true")  # fmt: skip
 
     @property
     def may_never_end(self) -> bool:
         """Whether most of what it may become never ends an episode."""
-        return self.done == "soft"
+        return self.done == "soft" and self.horizon is None
+
+    def max_steps(self, task_max_steps: int) -> int:
+        """Steps of an episode at most."""
+        return task_max_steps if self.horizon is None else self.horizon
 
     def make(self, task: Any) -> Any:
         """The SE of a task."""

@@ -8,7 +8,6 @@ all of it. Nothing in a file is executed, resolved or imported when it is read.
 
 import dataclasses
 import hashlib
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,20 +16,29 @@ from typing import Any
 import jax
 import numpy as np
 from flax.traverse_util import flatten_dict, unflatten_dict
-from safetensors import SafetensorError, safe_open
 
 from sejax import envs, plugins
 from sejax.envs.task import Task
-from sejax.errors import ConfigError, require, shortened, unknown_name
+from sejax.errors import ConfigError, require, shortened
 from sejax.files import write_bytes
 from sejax.proxies.proxy import ProxyEnv
-from sejax.sealed import DamagedError, seal, unseal
+from sejax.proxies.stored import (
+    FORMAT_VERSION,
+    KEY,
+    PRETRAINED_DIR,
+    find,
+    pretrained_names,
+    read,
+    read_config,
+)
+from sejax.sealed import seal
 from sejax.serialize import from_plain
-from sejax.training import TrainingConfig
+from sejax.training import TrainingConfig, budget_for
 
-FORMAT_VERSION = 2
-PRETRAINED_DIR = Path(__file__).parents[1] / "pretrained"
-_KEY = "sejax"
+__all__ = [
+    "FORMAT_VERSION", "PRETRAINED_DIR", "Proxy", "ProxySet", "find", "load", "load_proxy",
+    "load_set", "pretrained_names", "read_config", "register_gymnax", "save", "save_set",
+]  # fmt: skip
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,12 +76,48 @@ class Proxy:
           0.8
         """
         stored = self.config.get(group)
-        where = f"{group} that {self.path.name} was learned with"
         if group == "training" and isinstance(stored, Mapping):
             return from_plain(TrainingConfig, stored, group)
+        return self._configured(group, stored)
+
+    def learned_agents(self) -> dict[str, Any]:
+        """The agents that it was learned with, one or several families, by their keys.
+
+        Raises:
+          ConfigError: as `learned_with`.
+
+        Example:
+          >>> list(load_proxy("cliff_walking-rn").learned_agents())
+          ['q_learning']
+        """
+        stored = self._stored_agents()
+        return {key: self._configured("agent", values) for key, values in stored.items()}
+
+    def training_for(self, agent: Any) -> TrainingConfig:
+        """How long an agent trains on it: as those that it was learned with (`budget_for`).
+
+        Raises:
+          ConfigError: as `learned_with`.
+        """
+        known = [plugins.configure("agent", values) for values in self._stored_agents().values()
+                 if _is_registered("agent", values)]  # fmt: skip
+        max_steps = self.env.world.max_steps or self.task.max_steps
+        return budget_for(self.learned_with("training"), agent, known, max_steps)
+
+    def _stored_agents(self) -> dict[str, Any]:
+        """Plain values of the agents that it was learned with."""
+        families = self.config.get("agents")
+        if not isinstance(families, Mapping):
+            stored = self.config.get("agent")
+            return {str(stored.get("name")) if isinstance(stored, Mapping) else "": stored}
+        return {key: {name: x for name, x in values.items() if name != "weight"}
+                for key, values in families.items() if isinstance(values, Mapping)}  # fmt: skip
+
+    def _configured(self, group: str, stored: Any) -> Any:
+        where = f"{group} that {self.path.name} was learned with"
         if not isinstance(stored, Mapping):
             raise ConfigError(f"The {where} must be in the file; it is not. Give one of your own.")
-        if not plugins.is_registered(group, str(stored.get("name"))):
+        if not _is_registered(group, stored):
             raise ConfigError(
                 f"The {where} must be a registered one, because what a file names is never "
                 f"imported; it is {shortened(stored.get('name'))!r}. Give {group}= yourself."
@@ -241,7 +285,7 @@ def _write(
         "is_set": is_set,
         "proxies": [dict(record) for record in records],
     }
-    write_bytes(path, seal(tensors, _KEY, header))
+    write_bytes(path, seal(tensors, KEY, header))
 
 
 # --- reading -------------------------------------------------------------------------------------
@@ -318,7 +362,7 @@ def load_set(
       (1, 0.8)
     """
     path = find(source, option)
-    tensors, header = _read(path, option)
+    tensors, header = read(path, option)
     config = header["config"]
     name = config["proxy"].get("name")
     require(kind in (None, name), option, f"hold proxies learned with proxy={kind}",
@@ -331,142 +375,6 @@ def load_set(
     weights = unflatten_dict({tuple(name.split("/")): x for name, x in tensors.items()})
     return ProxySet(env=env, weights=weights, records=tuple(header["proxies"]), config=config,
                     discount=header["discount"], path=path)  # fmt: skip
-
-
-def read_config(source: str | Path, option: str = "source") -> dict[str, Any]:
-    """What the proxies of a file were learned with, nested plain values.
-
-    Raises:
-      ConfigError: if there is no such file, or it is damaged or of another format.
-    """
-    return _read(find(source, option), option)[1]["config"]
-
-
-def find(source: str | Path, option: str = "source", also: Sequence[str] = ()) -> Path:
-    """The file that a run directory, a path or a shipped name stands for.
-
-    Args:
-      source: as of `load`.
-      option: what messages call it.
-      also: names beside the shipped ones, for messages.
-
-    Raises:
-      ConfigError: if there is none.
-    """
-    path, text = Path(source), shortened(source)
-    try:
-        is_dir, is_file = path.is_dir(), path.is_file()
-    except (OSError, ValueError) as error:
-        raise ConfigError(
-            f"{option} must be a path; got {text} ({type(error).__name__})."
-        ) from None
-    if is_dir:
-        path = path / "proxy.safetensors"
-        is_run = (path.parent / "config.yaml").exists()
-        require(path.exists(), option, "be a run directory with a proxy.safetensors", "the run has "
-                "not finished a generation yet" if is_run else "this is a folder of another sort",
-                str(path.parent), f"{option} to a file, or finish the run first" if is_run else
-                f"{option} to a run directory or a file")  # fmt: skip
-        return path
-    if is_file:
-        return path
-    if path.suffix or len(path.parts) != 1:
-        raise ConfigError(
-            f"{option} must be a run directory, a safetensors file or a shipped name, because "
-            f"weights are read from it; got {text}, which does not exist. Shipped names: "
-            f"{', '.join(pretrained_names())}."
-        )
-    shipped = PRETRAINED_DIR / f"{source}.safetensors"
-    if shipped.is_file():
-        return shipped
-    raise unknown_name(option, str(source), [*pretrained_names(), *also])
-
-
-def pretrained_names() -> list[str]:
-    """Names of the proxies that ship with the package."""
-    return sorted(path.stem for path in PRETRAINED_DIR.glob("*.safetensors"))
-
-
-def _read(path: Path, option: str) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """Tensors and header of a file, checked against its digest and brought to this format."""
-    try:
-        with safe_open(path, framework="np") as file:
-            metadata = dict(file.metadata() or {})
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-    except (SafetensorError, OSError, ValueError, TypeError) as error:
-        raise _damaged(path, option, str(error)) from error
-    try:
-        stored = json.loads(metadata.get(_KEY) or metadata["sejax_set"])
-        version = stored["format_version"]
-        is_known = type(version) is int and version in (1, FORMAT_VERSION)
-        if is_known and version == 1:
-            stored = _from_version_1(stored, is_set=_KEY not in metadata)
-        if is_known:
-            _check_header(stored)
-    except (KeyError, ValueError, TypeError, AttributeError, RecursionError) as error:
-        raise ConfigError(
-            f"{option} must be a file that sejax has written, because the network is rebuilt from "
-            f"its metadata; {path} has none that is valid ({type(error).__name__}: "
-            f"{shortened(error)}). Learn it again."
-        ) from error
-    require(is_known, option, f"be of format {FORMAT_VERSION} or 1",
-            "this version of sejax reads no other", f"{shortened(version)} in {path}",
-            f"{option} to a file of this version")  # fmt: skip
-    if version == FORMAT_VERSION:
-        try:
-            tensors, _ = unseal(path.read_bytes(), _KEY)
-        except DamagedError as error:
-            raise _damaged(path, option, str(error)) from error
-    return tensors, stored
-
-
-def _damaged(path: Path, option: str, how: str) -> ConfigError:
-    return ConfigError(
-        f"{option} must be a whole safetensors file, because weights are read from it; got {path}, "
-        f"which is damaged ({shortened(how)}). The command that wrote it writes it anew from its "
-        f"checkpoint."
-    )
-
-
-def _check_header(header: dict[str, Any]) -> None:
-    """Raises ValueError for metadata of another shape."""
-    config = header["config"]
-    if not all(isinstance(config[group], Mapping) for group in ("env", "proxy")):
-        raise ValueError("no task or proxy")
-    if not isinstance(header["task"], str) or not isinstance(header["is_set"], bool):
-        raise ValueError("no name of a task, or nothing that says whether it is a set")
-    records = header["proxies"]
-    if not records or not all(isinstance(record, Mapping) for record in records):
-        raise ValueError("no records")
-    for record in records:
-        float(record.get("score", 0)), int(record.get("seed", 0)), int(record.get("generation", 0))
-    header["discount"] = float(header["discount"])
-
-
-def _from_version_1(stored: Any, is_set: bool) -> dict[str, Any]:
-    """A header of version 1, which had two kinds of files and no digest, as this one has it."""
-    config = _upgraded(stored["config"])
-    names = ("score", "generation", "seed")
-    if is_set:
-        columns = [stored[f"{name}s"] for name in names]
-        records = [dict(zip(names, row, strict=True)) for row in zip(*columns, strict=True)]
-    else:
-        records = [{k: v for k, v in stored.items() if k not in ("format_version", "config")}]
-    agent = config.get("agent") or {}
-    return {"format_version": FORMAT_VERSION, "task": config["env"]["name"], "config": config,
-            "discount": agent.get("discount", 1.0), "is_set": is_set,
-            "proxies": records}  # fmt: skip
-
-
-def _upgraded(config: Any) -> dict[str, Any]:
-    """A configuration of version 1, in which choices had the fields of all of their kind."""
-    config = dict(config)
-    config["env"] = {k: v for k, v in config["env"].items() if v is not None}
-    config.setdefault("exploration", {"name": "none"})
-    objective = dict(config.get("objective") or {"name": "max_reward"})
-    if objective["name"] != "reward_threshold":
-        objective.pop("unsolved_weight", None)
-    return config | {"objective": objective}
 
 
 def _env_of(
@@ -489,13 +397,18 @@ def _registered(
 ) -> Any:
     """The configuration of a group, if its name is one that sejax or a package has registered."""
     name = shortened(config[group].get("name"))
-    if not plugins.is_registered(group, str(config[group].get("name"))):
+    if not _is_registered(group, config[group]):
         raise ConfigError(
             f"{option} must be a proxy of a registered {group} if no {argument} is given, because "
             f"what a file names is never imported; {path} is one of {name!r}. Give it: "
             f"sejax.load(path, {argument}=...), or {word}={name} on the command line."
         )
     return plugins.configure(group, config[group])
+
+
+def _is_registered(group: str, stored: Any) -> bool:
+    """Whether plain values name what sejax or a package has registered."""
+    return isinstance(stored, Mapping) and plugins.is_registered(group, str(stored.get("name")))
 
 
 def _check_tensors(

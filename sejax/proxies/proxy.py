@@ -14,10 +14,7 @@ from gymnax.environments import environment
 from jaxtyping import Array
 
 from sejax.envs.task import Task
-
-# A state or reward beyond this is no world that an agent could learn from: the episode ends. It is
-# far outside every task's range and small enough for its square to stay finite in float32.
-ABSURD = 1e6
+from sejax.proxies import ABSURD as ABSURD
 
 
 class World(NamedTuple):

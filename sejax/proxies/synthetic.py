@@ -1,6 +1,8 @@
-"""The synthetic environment (SE): three small networks in the place of a real task.
+"""The synthetic environment (SE): small networks in the place of a real task.
 
-Source: paper, section "Learning Synthetic Environments"; `docs/reference.md` 1.
+Source: paper, section "Learning Synthetic Environments"; `docs/reference.md` 1. One-step episodes
+and learned initial states: Liesen et al., "Discovering Minimal Reinforcement Learning Environments"
+(2024).
 """
 
 from typing import TYPE_CHECKING, Any
@@ -9,14 +11,16 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 from gymnax.environments import environment
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from sejax.envs.task import Task
 from sejax.networks import MLP
-from sejax.proxies.proxy import ABSURD, ProxyEnv, ProxyParams
+from sejax.proxies.proxy import ABSURD, ProxyEnv, ProxyParams, World
 
 if TYPE_CHECKING:  # which makes it
     from sejax.proxies.configs import SyntheticConfig
+
+START_HIDDEN_SIZE = 32  # of the network that makes initial states
 
 
 @struct.dataclass
@@ -31,10 +35,18 @@ class SyntheticEnv(ProxyEnv):
     Each network maps the action (one-hot if discrete) and the state to the next state, the reward
     or the done output d. Where states are discrete, the networks' state is a vector with an entry
     for each of them, one-hot at first and then whatever the network makes of it; the agent observes
-    the index of its largest entry. The episode terminates where d > 0.5; initial states are the
-    real task's. `info["discount"]` is what a target should bootstrap with: 1 - d itself if
-    `done="soft"` (a learned discount, not confined to [0, 1]), or 1 - terminated if
-    `done="threshold"`.
+    the index of its largest entry.
+
+    What the configuration says of beginnings and ends:
+
+    - `initial_state`: the real task's; or learned: standard normal noise plus what a network makes
+      of it, so that a fresh SE's starts surround the origin.
+    - `done`: how d terminates an episode. `info["discount"]` is what a target should bootstrap
+      with: 1 - d itself if it is "soft" (a learned discount, not confined to [0, 1], which no agent
+      outside sees), else 1 - terminated.
+    - `horizon`: steps of an episode, whose last one terminates it if `horizon_is_terminal`. With
+      one step there are no networks of state and end, and the state stays as it is. At the task's
+      own limit, with no horizon, the episode is truncated.
 
     An output that is not finite, or absurd, ends the episode: the state stays where it was, the
     reward is 0, and `info["nonfinite"]` says whether it was not even a number.
@@ -42,36 +54,64 @@ class SyntheticEnv(ProxyEnv):
 
     def __init__(self, task: Task, config: "SyntheticConfig"):
         super().__init__(task, config)
-        outputs = {"state": task.obs_dim, "reward": 1, "done": 1}
+        outputs = {"reward": 1} if config.horizon == 1 else {
+            "state": task.obs_dim, "reward": 1, "done": 1,
+        }  # fmt: skip
         self._nets = {
             head: MLP(size, config.hidden_size, config.num_layers, config.activation)
             for head, size in outputs.items()
         }
+        self._start = None
+        if config.initial_state == "learned":
+            self._start = MLP(task.obs_dim, START_HIDDEN_SIZE, 1, config.activation)
 
     def init_weights(self, key: Array) -> Any:
-        """Random weights of the three networks, `{"state", "reward", "done"}`."""
+        """Random weights, `{"state", "reward", "done", "start"}` as far as there are networks."""
         example = jnp.zeros(self.task.action_dim + self.task.obs_dim)
-        keys = jax.random.split(key, len(self._nets))
-        return {
+        *keys, key_start = jax.random.split(key, len(self._nets) + 1)
+        weights = {
             head: net.init(k, example)["params"]
             for k, (head, net) in zip(keys, self._nets.items(), strict=True)
         }
+        if self._start is not None:
+            noise = jnp.zeros(self.task.obs_dim)
+            weights["start"] = self._start.init(key_start, noise)["params"]
+        return weights
+
+    def params(self, weights: Any, discount: Array | float = 1.0) -> ProxyParams:
+        return ProxyParams(
+            weights=weights, max_steps_in_episode=self.config.max_steps(self.task.max_steps)
+        )
+
+    @property
+    def world(self) -> World:
+        return World(is_real=False, max_steps=self.config.max_steps(self.task.max_steps))
 
     def predict(
         self, weights: Any, vector: Float[Array, " obs_dim"], action: Array
     ) -> tuple[Float[Array, " obs_dim"], Float[Array, ""], Float[Array, ""]]:
-        """The networks' raw outputs: next state, reward and done output d."""
+        """The networks' raw outputs: next state, reward and done output d.
+
+        In a bandit the first is `vector`, and the last 1.
+        """
         if self.task.num_actions is not None:
             action = jax.nn.one_hot(action, self.task.num_actions)
         x = jnp.concatenate([action, vector])
         out = {head: net.apply({"params": weights[head]}, x) for head, net in self._nets.items()}
-        return out["state"], out["reward"][0], out["done"][0]
+        state, done = out.get("state", vector), out.get("done", jnp.ones(1))
+        return state, out["reward"][0], done[0]
 
     def reset_env(self, key: Array, params: ProxyParams) -> tuple[Array, SyntheticState]:
-        obs, _ = self.task.env.reset_env(key, self.task.params)
-        if self.task.num_states is not None:
-            obs = jax.nn.one_hot(obs, self.task.num_states)
-        state = SyntheticState(vector=obs, time=jnp.int32(0))
+        if self._start is not None:
+            noise = jax.random.normal(key, (self.task.obs_dim,))
+            moved: Any = self._start.apply({"params": params.weights["start"]}, noise)
+            vector = noise + moved
+            vector = jnp.clip(vector, -ABSURD, ABSURD)  # what steps from there call absurd
+        else:
+            vector, _ = self.task.env.reset_env(key, self.task.params)
+            if self.task.num_states is not None:
+                vector = jax.nn.one_hot(vector, self.task.num_states)
+        state = SyntheticState(vector=vector, time=jnp.int32(0))
         return self.get_obs(state), state
 
     def step_env(
@@ -80,16 +120,26 @@ class SyntheticEnv(ProxyEnv):
         vector, reward, done = self.predict(params.weights, state.vector, action)
         size = jnp.maximum(jnp.max(jnp.abs(vector)), jnp.maximum(jnp.abs(reward), jnp.abs(done)))
         sane = size < ABSURD  # False for nan
-        vector = jnp.where(sane, vector, state.vector)
-        reward = jnp.where(sane, reward, 0.0)
-        terminated = (done > 0.5) | ~sane
-        discount = 1.0 - done if self.config.done == "soft" else 1.0 - terminated
+        state = SyntheticState(vector=jnp.where(sane, vector, state.vector), time=state.time + 1)
+        ends = self.ends(key, done) | ~sane
+        at_horizon = jnp.bool_(False)
+        if self.config.horizon is not None and self.config.horizon_is_terminal:
+            at_horizon = state.time >= params.max_steps_in_episode
+        terminated = ends | at_horizon
+        discount = 1.0 - done if self.config.done == "soft" else 1.0 - ends
         info = {
-            "discount": jnp.where(sane, discount, 0.0),
+            "discount": jnp.where(sane & ~at_horizon, discount, 0.0),
             "nonfinite": ~jnp.isfinite(size),
         }
-        state = SyntheticState(vector=vector, time=state.time + 1)
-        return self.get_obs(state), state, reward, terminated, info
+        return self.get_obs(state), state, jnp.where(sane, reward, 0.0), terminated, info
+
+    def ends(self, key: Array, done: Float[Array, ""]) -> Bool[Array, ""]:
+        """Whether the done output ends the episode."""
+        if self.config.done == "bernoulli":
+            return jax.random.uniform(key) < done  # in [0, 1): never for d <= 0, always for d >= 1
+        if self.config.done == "sigmoid":
+            return jax.random.uniform(key) < jax.nn.sigmoid(done)
+        return done > 0.5
 
     def get_obs(self, state: SyntheticState, params: Any = None, key: Any = None) -> Array:
         if self.task.num_states is not None:

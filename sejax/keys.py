@@ -1,0 +1,62 @@
+"""Random keys for each step of a loop, by a hash.
+
+`jax.random.fold_in` and `split` run threefry, 20 rounds for each two words, which at the sizes of
+these agents takes as long as a quarter of a learning step. What a step needs is cheaper: words that
+no other step and no other purpose shares. These are the finaliser of a well-mixing 32-bit hash over
+the loop's key, the step and the purpose; `jax.random` makes of a key that they form whatever it
+makes of any.
+"""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Int, UInt32
+
+_WEYL = 0x9E3779B9  # 2**32 / golden ratio, odd: its multiples are spread evenly
+
+
+def step_keys(key: Array, step: Int[Array, ""], num: int) -> tuple[Array, ...]:
+    """`num` independent keys for one step of a loop.
+
+    Args:
+      key: of the loop, a typed key of any implementation.
+      step: number of the step.
+      num: how many (static).
+
+    Returns:
+      Keys of the same implementation. For threefry, with its two words, two keys of a loop
+      coincide by chance alone, with probability 2**-64 for a pair.
+
+    Example:
+      >>> a, b = step_keys(jax.random.key(0), jnp.int32(7), 2)
+      >>> float(jax.random.uniform(a)) != float(jax.random.uniform(b))
+      True
+    """
+    data = jax.random.key_data(key)
+    size = data.shape[-1]
+    # Two chained accumulators, so that the state of a step has 64 bits.
+    low, high = data[0], data[-1]
+    low = _mix(low ^ _mix(jnp.uint32(step)))
+    high = _mix(high + low * jnp.uint32(_WEYL) + jnp.uint32(step))
+    count = (1 + jnp.arange(num * size, dtype=jnp.uint32)) * jnp.uint32(_WEYL)
+    is_low = jnp.arange(num * size) % 2 == 0
+    hashed = _mix(jnp.where(is_low, low, high) + count)
+    keys = jax.random.wrap_key_data(hashed.reshape(num, size), impl=jax.random.key_impl(key))
+    return tuple(keys[i] for i in range(num))
+
+
+def words(key: Array) -> UInt32[Array, " words"]:
+    """The words of a step's key, random bits themselves for whoever needs no more than these.
+
+    There are two, or more where `jax.random`'s implementation has longer keys.
+    """
+    return jax.random.key_data(key)
+
+
+def _mix(x: UInt32[Array, "*shape"]) -> UInt32[Array, "*shape"]:
+    """A bijection of 32 bits in which each bit of the input moves about half of the output.
+
+    Source: C. Wellons, "Prospecting for hash functions" (2018), lowbias32.
+    """
+    x = (x ^ (x >> 16)) * jnp.uint32(0x7FEB352D)
+    x = (x ^ (x >> 15)) * jnp.uint32(0x846CA68B)
+    return x ^ (x >> 16)

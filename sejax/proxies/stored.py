@@ -1,0 +1,155 @@
+"""What a proxy's file holds, read without JAX: tensors, and a header of plain values.
+
+`sejax.proxies.files` makes environments of it for JAX, `sejax.gym` one for Gymnasium.
+"""
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from safetensors import SafetensorError, safe_open
+
+from sejax.errors import ConfigError, require, shortened, unknown_name
+from sejax.sealed import DamagedError, unseal
+
+FORMAT_VERSION = 2
+PRETRAINED_DIR = Path(__file__).parents[1] / "pretrained"
+KEY = "sejax"  # of the metadata's entry
+
+
+def read_config(source: str | Path, option: str = "source") -> dict[str, Any]:
+    """What the proxies of a file were learned with, nested plain values.
+
+    Raises:
+      ConfigError: if there is no such file, or it is damaged or of another format.
+    """
+    return read(find(source, option), option)[1]["config"]
+
+
+def find(source: str | Path, option: str = "source", also: Sequence[str] = ()) -> Path:
+    """The file that a run directory, a path or a shipped name stands for.
+
+    Args:
+      source: as of `load`.
+      option: what messages call it.
+      also: names beside the shipped ones, for messages.
+
+    Raises:
+      ConfigError: if there is none.
+    """
+    path, text = Path(source), shortened(source)
+    try:
+        is_dir, is_file = path.is_dir(), path.is_file()
+    except (OSError, ValueError) as error:
+        raise ConfigError(
+            f"{option} must be a path; got {text} ({type(error).__name__})."
+        ) from None
+    if is_dir:
+        path = path / "proxy.safetensors"
+        is_run = (path.parent / "config.yaml").exists()
+        require(path.exists(), option, "be a run directory with a proxy.safetensors", "the run has "
+                "not finished a generation yet" if is_run else "this is a folder of another sort",
+                str(path.parent), f"{option} to a file, or finish the run first" if is_run else
+                f"{option} to a run directory or a file")  # fmt: skip
+        return path
+    if is_file:
+        return path
+    if path.suffix or len(path.parts) != 1:
+        raise ConfigError(
+            f"{option} must be a run directory, a safetensors file or a shipped name, because "
+            f"weights are read from it; got {text}, which does not exist. Shipped names: "
+            f"{', '.join(pretrained_names())}."
+        )
+    shipped = PRETRAINED_DIR / f"{source}.safetensors"
+    if shipped.is_file():
+        return shipped
+    raise unknown_name(option, str(source), [*pretrained_names(), *also])
+
+
+def pretrained_names() -> list[str]:
+    """Names of the proxies that ship with the package."""
+    return sorted(path.stem for path in PRETRAINED_DIR.glob("*.safetensors"))
+
+
+def read(path: Path, option: str) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """Tensors and header of a file, checked against its digest and brought to this format."""
+    try:
+        with safe_open(path, framework="np") as file:
+            metadata = dict(file.metadata() or {})
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    except (SafetensorError, OSError, ValueError, TypeError) as error:
+        raise _damaged(path, option, str(error)) from error
+    try:
+        stored = json.loads(metadata.get(KEY) or metadata["sejax_set"])
+        version = stored["format_version"]
+        is_known = type(version) is int and version in (1, FORMAT_VERSION)
+        if is_known and version == 1:
+            stored = _from_version_1(stored, is_set=KEY not in metadata)
+        if is_known:
+            _check_header(stored)
+    except (KeyError, ValueError, TypeError, AttributeError, RecursionError) as error:
+        raise ConfigError(
+            f"{option} must be a file that sejax has written, because the network is rebuilt from "
+            f"its metadata; {path} has none that is valid ({type(error).__name__}: "
+            f"{shortened(error)}). Learn it again."
+        ) from error
+    require(is_known, option, f"be of format {FORMAT_VERSION} or 1",
+            "this version of sejax reads no other", f"{shortened(version)} in {path}",
+            f"{option} to a file of this version")  # fmt: skip
+    if version == FORMAT_VERSION:
+        try:
+            tensors, _ = unseal(path.read_bytes(), KEY)
+        except DamagedError as error:
+            raise _damaged(path, option, str(error)) from error
+    return tensors, stored
+
+
+def _damaged(path: Path, option: str, how: str) -> ConfigError:
+    return ConfigError(
+        f"{option} must be a whole safetensors file, because weights are read from it; got {path}, "
+        f"which is damaged ({shortened(how)}). The command that wrote it writes it anew from its "
+        f"checkpoint."
+    )
+
+
+def _check_header(header: dict[str, Any]) -> None:
+    """Raises ValueError for metadata of another shape."""
+    config = header["config"]
+    if not all(isinstance(config[group], Mapping) for group in ("env", "proxy")):
+        raise ValueError("no task or proxy")
+    if not isinstance(header["task"], str) or not isinstance(header["is_set"], bool):
+        raise ValueError("no name of a task, or nothing that says whether it is a set")
+    records = header["proxies"]
+    if not records or not all(isinstance(record, Mapping) for record in records):
+        raise ValueError("no records")
+    for record in records:
+        float(record.get("score", 0)), int(record.get("seed", 0)), int(record.get("generation", 0))
+    header["discount"] = float(header["discount"])
+
+
+def _from_version_1(stored: Any, is_set: bool) -> dict[str, Any]:
+    """A header of version 1, which had two kinds of files and no digest, as this one has it."""
+    config = _upgraded(stored["config"])
+    names = ("score", "generation", "seed")
+    if is_set:
+        columns = [stored[f"{name}s"] for name in names]
+        records = [dict(zip(names, row, strict=True)) for row in zip(*columns, strict=True)]
+    else:
+        records = [{k: v for k, v in stored.items() if k not in ("format_version", "config")}]
+    agent = config.get("agent") or {}
+    return {"format_version": FORMAT_VERSION, "task": config["env"]["name"], "config": config,
+            "discount": agent.get("discount", 1.0), "is_set": is_set,
+            "proxies": records}  # fmt: skip
+
+
+def _upgraded(config: Any) -> dict[str, Any]:
+    """A configuration of version 1, in which choices had the fields of all of their kind."""
+    config = dict(config)
+    config["env"] = {k: v for k, v in config["env"].items() if v is not None}
+    config.setdefault("exploration", {"name": "none"})
+    objective = dict(config.get("objective") or {"name": "max_reward"})
+    if objective["name"] != "reward_threshold":
+        objective.pop("unsolved_weight", None)
+    return config | {"objective": objective}

@@ -1,0 +1,453 @@
+"""sejax.gym: the same SEs as in JAX, as Gymnasium environments that need none of it."""
+
+import json
+import pickle
+import subprocess
+import sys
+
+import gymnasium
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from gymnasium import spaces
+from gymnasium.utils.env_checker import check_env
+from safetensors.numpy import save_file
+from support import random_like, shapes_of
+
+import sejax
+from sejax import envs, plugins
+from sejax.errors import ConfigError
+from sejax.gym import GYMNASIUM_IDS, RealTask, SyntheticEnv, _known_task, make
+from sejax.proxies import ABSURD
+from sejax.proxies.configs import RewardConfig, SyntheticConfig
+
+KEY = jax.random.key(0)
+SMALL = {"hidden_size": 5}
+BANDIT = {"initial_state": "learned", "horizon": 1, "done": "threshold"}
+
+
+def jax_se(task="cartpole", **config):
+    return plugins.make("proxy", SyntheticConfig(**SMALL | config), envs.make(task))
+
+
+def random_weights(env, seed=0, scale=0.5):
+    return random_like(shapes_of(env.init_weights, KEY), seed, scale)
+
+
+def flat(weights):
+    return {f"{network}/{layer}/{name}": x for network, layers in weights.items()
+            for layer, leaves in layers.items() for name, x in leaves.items()}  # fmt: skip
+
+
+@pytest.fixture
+def stored(tmp_path):
+    """Writes an SE and returns its file."""
+
+    def write(env, weights=None):
+        path = tmp_path / "se.safetensors"
+        sejax.save(path, env, random_weights(env) if weights is None else weights)
+        return path
+
+    return write
+
+
+def constant(state=0.25, reward=2.0, d=0.0, max_steps=200, **config):
+    """A CartPole SE whose outputs are constants, whatever it sees; d is the done output."""
+    config = SyntheticConfig(**SMALL | {"done": "threshold"} | config)
+    env = plugins.make("proxy", config, envs.make("cartpole"))
+    weights = random_weights(env, scale=0.0)
+    for head, value in {"state": state, "reward": reward, "done": d}.items():
+        if head in weights:
+            weights[head]["Dense_1"]["bias"][:] = value
+    return SyntheticEnv(flat(weights), config, RealTask.of_gymnasium("CartPole-v1", max_steps))
+
+
+# --- the same as in JAX --------------------------------------------------------------------------
+
+
+def assert_equal_steps(env, jax_env, params, num_steps=40):
+    """Compares all that both say of steps from the same states; returns how many episodes ended."""
+    step = jax.jit(jax_env.step_env)
+    empty = jax.eval_shape(jax_env.reset_env, KEY, params)[1]
+    is_horizon = jax_env.config.horizon is not None and jax_env.config.horizon_is_terminal
+    env.reset(seed=0)
+    env.action_space.seed(0)
+    num_ended, time = 0, 0
+    for i in range(num_steps):
+        state = empty.replace(vector=jnp.asarray(env._vector), time=jnp.int32(time))
+        action = env.action_space.sample()
+        out = step(jax.random.key(i), state, jnp.asarray(action), params)
+        expected_obs, state, expected_reward, expected_terminated, expected_info = out
+        obs, reward, terminated, truncated, info = env.step(action)
+        np.testing.assert_allclose(obs, expected_obs, atol=1e-5, rtol=1e-5)
+        np.testing.assert_allclose(reward, expected_reward, atol=1e-5, rtol=1e-5)
+        np.testing.assert_allclose(
+            info["discount"], expected_info["discount"], atol=1e-5, rtol=1e-5
+        )
+        assert terminated == expected_terminated
+        # At a horizon that terminates gymnax's step says that it truncates too.
+        assert truncated == (bool(jax_env.is_truncated(state, params)) and not is_horizon)
+        time += 1
+        if terminated or truncated:
+            num_ended, time = num_ended + 1, 0
+            env.reset()
+    return num_ended
+
+
+@pytest.mark.parametrize(
+    ("task", "config"),
+    [
+        ("cartpole", {"done": "soft"}),
+        ("acrobot", {"done": "threshold", "num_layers": 2, "activation": "prelu"}),
+        ("gridworld_2x2", {"done": "threshold", "activation": "relu"}),
+        ("cartpole", {"done": "threshold", "activation": "fast_tanh", "horizon": 3}),
+        ("pendulum", {"done": "bernoulli", "activation": "tanh", "initial_state": "learned"}),
+        ("cartpole", {"done": "sigmoid", "horizon": 3}),
+        ("mountain_car_continuous", {"done": "threshold", "horizon": 3,
+                                     "horizon_is_terminal": False}),
+        ("cartpole", BANDIT),
+        ("gridworld_2x2", {"done": "soft", "horizon": 1}),
+    ],
+    ids=str,
+)  # fmt: skip
+def test_every_step_is_that_of_the_se_in_jax(stored, task, config):
+    jax_env = jax_se(task, **config)
+    weights = random_weights(jax_env, scale=1.0)
+    if config["done"] in ("bernoulli", "sigmoid"):  # far out, where any draw says the same
+        last = weights["done"]["Dense_1"]
+        last["kernel"], last["bias"] = 1e3 * last["kernel"], 1e3 * last["bias"]
+    env = make(stored(jax_env, weights))
+    assert assert_equal_steps(env, jax_env, jax_env.params(weights)) > 0
+
+
+@pytest.mark.parametrize("name", ["cartpole", "acrobot"])
+def test_shipped_ses_are_the_same(name):
+    jax_env, params = sejax.load(name)
+    assert_equal_steps(make(name), jax_env, params)
+
+
+@pytest.mark.parametrize("scale", [0.5, 1e4], ids=["usual", "beyond what is absurd"])
+def test_learned_initial_states_are_the_same_function_of_the_noise(stored, scale):
+    jax_env = jax_se(**BANDIT)
+    weights = random_weights(jax_env, scale=scale)
+    env = make(stored(jax_env, weights))
+    expected, _ = jax_env.reset_env(KEY, jax_env.params(weights))
+
+    class SameNoise(np.random.Generator):
+        def standard_normal(self, *_):
+            return np.asarray(jax.random.normal(KEY, (4,)))
+
+    env.np_random = SameNoise(np.random.PCG64(0))
+    np.testing.assert_allclose(env.reset()[0], expected, rtol=1e-5, atol=1e-5)
+    assert (np.abs(expected).max() == ABSURD) == (scale > 1)
+
+
+def test_noise_of_learned_initial_states_is_standard_normal(stored):
+    jax_env = jax_se(**BANDIT)
+    env = make(stored(jax_env, random_weights(jax_env, scale=0.0)))  # which adds nothing to it
+    env.reset(seed=0)
+    noise = np.stack([env.reset()[0] for _ in range(2000)])
+    np.testing.assert_allclose(noise.mean(axis=0), 0, atol=5 / 2000**0.5)
+    np.testing.assert_allclose(np.cov(noise.T), np.eye(4), atol=5 * (2 / 2000) ** 0.5)
+
+
+def test_a_file_of_version_1_is_the_same_se(tmp_path, stored):
+    jax_env = jax_se(done="threshold")
+    weights = random_weights(jax_env)
+    proxy = {"name": "se", "hidden_size": 5, "num_layers": 1, "activation": "leaky_relu",
+             "done": "threshold"}  # fmt: skip
+    header = {"format_version": 1, "score": 1.0,
+              "config": {"env": {"name": "cartpole", "backend": None}, "proxy": proxy}}  # fmt: skip
+    old = tmp_path / "old.safetensors"
+    save_file(flat(weights), old, metadata={"sejax": json.dumps(header)})
+    env, same = make(old), make(stored(jax_env, weights))
+    assert env.config == same.config
+    assert env.reset(seed=0)[0].tolist() == same.reset(seed=0)[0].tolist()
+    assert env.step(1)[0].tolist() == same.step(1)[0].tolist()
+
+
+# --- ends ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("mode", "d", "terminates", "discount"),
+    [
+        ("soft", -0.2, False, 1.2), ("soft", 0.5, False, 0.5), ("soft", 0.6, True, 0.4),
+        ("threshold", 0.5, False, 1.0), ("threshold", 0.6, True, 0.0),
+        ("bernoulli", -0.2, False, 1.0), ("bernoulli", 1.0, True, 0.0),
+        ("sigmoid", -1e5, False, 1.0), ("sigmoid", 1e5, True, 0.0),
+    ],
+)  # fmt: skip
+def test_the_done_output_ends_an_episode_as_configured(mode, d, terminates, discount):
+    env = constant(d=d, done=mode)
+    env.reset(seed=0)
+    obs, reward, terminated, truncated, info = env.step(0)
+    assert (obs == 0.25).all() and reward == 2.0
+    assert terminated is terminates and truncated is False
+    assert info["discount"] == pytest.approx(discount)
+    assert type(reward) is float and type(info["discount"]) is float
+
+
+@pytest.mark.parametrize(
+    ("mode", "d", "probability"),
+    [("bernoulli", 0.3, 0.3), ("sigmoid", -1.0, 1 / (1 + np.e)), ("sigmoid", 2.0, 0.8808)],
+)
+def test_ends_are_drawn_with_their_probability(mode, d, probability):
+    env = constant(d=d, done=mode)
+    env.reset(seed=0)
+    count = 2000
+    ended = 0
+    for _ in range(count):
+        ended += env.step(0)[2]
+        env.reset()
+    assert abs(ended / count - probability) < 5 * (probability * (1 - probability) / count) ** 0.5
+
+
+def episode(env):
+    """Ends of all steps of an episode."""
+    env.reset(seed=0)
+    steps = []
+    while not steps or not any(steps[-1][:2]):
+        _, _, terminated, truncated, info = env.step(1)
+        steps.append((terminated, truncated, info["discount"]))
+    return steps
+
+
+def test_an_episode_is_truncated_at_the_tasks_limit():
+    assert episode(constant()) == [(False, False, 1.0)] * 199 + [(False, True, 1.0)]
+
+
+def test_a_learned_horizon_terminates_or_truncates():
+    on = (False, False, 1.0)
+    assert episode(constant(horizon=3)) == [on, on, (True, False, 0.0)]
+    cut = constant(horizon=3, horizon_is_terminal=False)
+    assert episode(cut) == [on, on, (False, True, 1.0)]
+    # soft: whatever d says, nothing is bootstrapped at a horizon that terminates
+    soft = constant(horizon=2, done="soft", d=-0.5)
+    assert episode(soft) == [(False, False, 1.5), (True, False, 0.0)]
+
+
+def test_an_episode_that_ends_at_its_limit_is_both_terminated_and_truncated():
+    assert episode(constant(d=1.0, max_steps=1)) == [(True, True, 0.0)]  # as with TimeLimit
+
+
+def test_a_bandit_leaves_the_state_where_it_began():
+    env = constant(**BANDIT)
+    first, _ = env.reset(seed=0)
+    obs, reward, terminated, truncated, _ = env.step(1)
+    assert (obs == first).all() and reward == 2.0 and terminated and not truncated
+
+
+@pytest.mark.parametrize(
+    "outputs",
+    [{"state": np.inf}, {"reward": np.nan}, {"d": -np.inf}, {"state": 2e6}, {"reward": -2e6}],
+    ids=str,
+)
+@pytest.mark.parametrize("mode", ["soft", "bernoulli"])
+def test_an_absurd_or_nonfinite_output_ends_the_episode_where_it_was(mode, outputs):
+    finite = {name: x if np.isfinite(x) else 0.0 for name, x in outputs.items()}
+    env = constant(**finite, done=mode)
+    _, last_bias = env._layers[-1]
+    last_bias += [*[outputs.get("state", 0.0)] * 4, outputs.get("reward", 0), outputs.get("d", 0)]
+    first, _ = env.reset(seed=0)
+    obs, reward, terminated, _, info = env.step(0)
+    assert (obs == first).all() and reward == 0.0 and terminated is True
+    assert info["discount"] == 0.0
+
+
+def test_an_overflow_within_the_networks_ends_the_episode_without_a_warning():
+    env = constant()
+    for kernel, _ in env._layers:
+        kernel[:] = 3e38
+    env.reset(seed=0)
+    assert env.step(0)[2]
+
+
+# --- as a Gymnasium environment ------------------------------------------------------------------
+
+CHECKED = [("cartpole", {"done": "threshold"}), ("cartpole", BANDIT),
+           ("pendulum", {"done": "bernoulli"}), ("gridworld_2x2", {"done": "sigmoid"})]  # fmt: skip
+
+
+@pytest.mark.parametrize(("task", "config"), CHECKED, ids=str)
+@pytest.mark.filterwarnings(
+    "ignore:.*Box observation space m.*imum value is -?infinity:UserWarning",
+    "ignore:.*recommend using a symmetric and normalized space:UserWarning",  # Pendulum's torque
+)
+def test_gymnasiums_checker_passes(stored, task, config):
+    check_env(make(stored(jax_se(task, **config))))
+
+
+def test_spaces_are_the_tasks_without_bounds_of_the_observations(stored):
+    env = make("acrobot")
+    assert env.observation_space == spaces.Box(-np.inf, np.inf, (6,), np.float32)
+    assert env.action_space == spaces.Discrete(3)
+    assert env.render_mode is None and env.metadata["render_modes"] == []
+    env = make(stored(jax_se("cliff_walking")))
+    assert env.observation_space == spaces.Discrete(48)
+    assert env.action_space == spaces.Discrete(4)
+    assert env.reset(seed=0) == (36, {})  # the map's S, at the beginning of its last row
+
+
+def test_a_seed_makes_episodes_again_and_starts_are_the_real_tasks():
+    real = gymnasium.make("CartPole-v1")
+    env = make("cartpole")
+
+    def play(seed):
+        seen = [env.reset(seed=seed)[0]]
+        for _ in range(3):
+            seen += [env.step(1)[0], env.reset()[0]]
+        return np.stack(seen)
+
+    np.testing.assert_array_equal(play(5), play(5))
+    assert not np.allclose(play(5), play(6))
+    np.testing.assert_array_equal(env.reset(seed=7)[0], real.reset(seed=7)[0])
+    np.testing.assert_array_equal(env.reset()[0], real.reset()[0])
+    assert not np.allclose(make("cartpole").reset()[0], make("cartpole").reset()[0])
+
+
+@pytest.mark.parametrize(("task", "config"), CHECKED, ids=str)
+def test_a_pickled_environment_goes_on_as_it_would_have(stored, task, config):
+    env = make(stored(jax_se(task, **config)))
+    env.reset(seed=0)
+    copy = pickle.loads(pickle.dumps(env))
+    env.action_space.seed(0)
+    for _ in range(5):
+        action = env.action_space.sample()
+        (obs, *rest), (same_obs, *same_rest) = env.step(action), copy.step(action)
+        np.testing.assert_array_equal(obs, same_obs)
+        assert rest == same_rest
+        np.testing.assert_array_equal(env.reset()[0], copy.reset()[0])
+
+
+def test_the_spec_makes_it_again_and_adds_no_second_time_limit(stored):
+    path = stored(jax_se())
+    env = make(path)
+    again = gymnasium.make(env.spec)
+    assert again.unwrapped.config == env.config
+    assert env.spec.id == "sejax/cartpole" and env.spec.max_episode_steps is None
+    assert gymnasium.make(gymnasium.envs.registration.EnvSpec.from_json(env.spec.to_json()))
+
+
+def test_what_is_returned_is_the_callers():
+    env = make("cartpole")
+    first, _ = env.reset(seed=0)
+    first[:] = np.nan
+    obs, *_ = env.step(0)
+    obs[:] = np.nan
+    assert np.isfinite(env.step(0)[0]).all()
+
+
+def test_a_step_needs_an_episode_and_an_action_of_the_space(stored):
+    env = constant(d=1.0)
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        env.step(0)
+    env.reset(seed=0)
+    for action in (-1, 2, 0.5, None):
+        with pytest.raises(gymnasium.error.InvalidAction, match=r"is none of Discrete\(2\)"):
+            env.step(action)
+    assert env.step(np.int64(1))[2]
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        env.step(0)
+    env = make(stored(jax_se("pendulum")))
+    env.reset(seed=0)
+    with pytest.raises(gymnasium.error.InvalidAction, match=r"is none of Box"):
+        env.step(0.5)
+
+
+def test_continuous_actions_are_clipped_to_the_bounds(stored):
+    env = make(stored(jax_se("pendulum")))
+    seen = []
+    for action in (2.0, 7.0, -2.0):
+        env.reset(seed=0)
+        seen.append(env.step([action])[0])
+    assert (seen[0] == seen[1]).all() and (seen[0] != seen[2]).any()
+
+
+def test_it_runs_without_jax_and_in_forked_processes():
+    program = """
+import sys
+import sejax.gym
+from gymnasium.vector import AsyncVectorEnv
+env = sejax.gym.make("cartpole")
+env.reset(seed=0)
+env.step(1)
+envs = AsyncVectorEnv([lambda: sejax.gym.make("cartpole")] * 2, context="fork")
+envs.reset(seed=0)
+print(envs.step([0, 1])[0].shape, sorted({"jax", "flax", "jaxtyping"} & set(sys.modules)))
+envs.close()
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert done.stdout.strip() == "(2, 4) []", done.stdout + done.stderr
+
+
+# --- tasks ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", sorted({*GYMNASIUM_IDS} & {*envs.names()} - {"halfcheetah"}))
+def test_gymnasiums_tasks_have_the_spaces_of_sejaxs(name):
+    task, real = envs.make(name), RealTask.of_gymnasium(GYMNASIUM_IDS[name])
+    assert real.observation_space.shape == (task.obs_dim,)
+    if task.num_actions is None:
+        assert real.action_space.shape == (task.action_dim,)
+        assert np.allclose(real.action_space.high, task.max_action)
+        assert np.allclose(real.action_space.low, -task.max_action)
+    else:
+        assert real.action_space == spaces.Discrete(task.num_actions)
+
+
+@pytest.mark.parametrize(("given", "limit"), [({}, 200), ({"max_steps": 300}, 300)], ids=str)
+def test_a_task_of_gymnax_is_gymnasiums_of_that_id(given, limit):
+    task = _known_task({"name": "gymnax/MountainCar-v0", **given})
+    assert task.action_space == spaces.Discrete(3) and task.max_steps == limit
+    position, velocity = task.starts(np.random.default_rng(0))
+    assert -0.6 <= position <= -0.4 and velocity == 0.0
+
+
+def a_start(rng):
+    return rng.uniform(1, 2, size=3)
+
+
+def test_an_unknown_task_must_be_given(stored):
+    from gymnax.environments.classic_control import pendulum
+
+    task = sejax.Task(name="mine", env=pendulum.Pendulum(), max_steps=7)
+    path = stored(plugins.make("proxy", SyntheticConfig(**SMALL, done="bernoulli"), task))
+    with pytest.raises(ConfigError, match=r"^task must be given for mine.*RealTask\("):
+        make(path)
+    box = spaces.Box(-2, 2, (1,))
+    mine = RealTask(observation_space=spaces.Box(-8, 8, (3,)), action_space=box, max_steps=7)
+    with pytest.raises(ConfigError, match=r"^task.starts must be given for an SE whose initial"):
+        make(path, mine)
+    mine = RealTask(**vars(mine) | {"starts": a_start})
+    env = make(path, mine)
+    assert ((env.reset(seed=0)[0] >= 1) & (env.reset()[0] <= 2)).all()
+    assert gymnasium.make(env.spec).reset(seed=1)[0].tolist() == env.reset(seed=1)[0].tolist()
+    assert make(path, "Pendulum-v1").action_space == box
+    with pytest.raises(ConfigError, match=r"^weights must be those of the SE's networks"):
+        make(path, "CartPole-v1")
+    with pytest.raises(
+        ConfigError, match=r"^task must be one that Gymnasium can make .*Nothing-v1"
+    ):
+        make(path, "Nothing-v1")
+    images = RealTask(observation_space=spaces.Box(0, 1, (2, 2)), action_space=box, max_steps=7)
+    with pytest.raises(ConfigError, match=r"^task.observation_space must be a Box of vectors or a"):
+        make(path, images)
+
+
+def test_what_is_no_single_se_is_one_message(tmp_path, stored):
+    rn = plugins.make("proxy", RewardConfig(hidden_size=2), envs.make("cartpole"))
+    with pytest.raises(ConfigError, match=r"^source must be a synthetic environment.*proxy=rn in"):
+        make(stored(rn))
+    env = jax_se()
+    path = tmp_path / "set.safetensors"
+    sejax.save_set(path, env, [random_weights(env)] * 2, [{}, {}])
+    with pytest.raises(ConfigError, match=r"^source must be a single proxy"):
+        make(path)
+    with pytest.raises(ConfigError, match=r"^source must be one of .*got 'carpole'"):
+        make("carpole")
+    weights = random_weights(env)
+    weights["reward"]["Dense_0"]["bias"][0] = np.nan
+    with pytest.raises(ConfigError, match=r"^weights must be .* numbers that are not finite"):
+        make(stored(env, weights))

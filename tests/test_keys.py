@@ -1,0 +1,149 @@
+"""sejax.keys: the keys of a loop's steps are bits that nothing but chance relates."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from sejax.keys import step_keys, words
+
+NUM_STEPS, NUM_PURPOSES = 20_000, 6  # those of the trainer
+LOOPS = (0, 1, 2**31 - 1)  # seeds
+
+
+def data_of(key, step, num=NUM_PURPOSES):
+    return jnp.stack([words(k) for k in step_keys(key, step, num)])
+
+
+of_steps = jax.jit(jax.vmap(data_of, (None, 0)))
+
+
+@pytest.fixture(scope="module")
+def drawn():
+    """Words of all steps and purposes of three loops, `[loop, step, purpose, 2]`."""
+    steps = jnp.arange(NUM_STEPS)
+    return np.stack([of_steps(jax.random.key(seed), steps) for seed in LOOPS])
+
+
+# --- the hash ------------------------------------------------------------------------------------
+
+
+def plain_mix(x):
+    """C. Wellons's lowbias32 in Python's integers."""
+    x ^= x >> 16
+    x = x * 0x7FEB352D % 2**32
+    x ^= x >> 15
+    x = x * 0x846CA68B % 2**32
+    return x ^ x >> 16
+
+
+def plain_words(low, high, step, num):
+    weyl = 0x9E3779B9
+    low = plain_mix(low ^ plain_mix(step))
+    high = plain_mix((high + low * weyl + step) % 2**32)
+    pairs = []
+    for purpose in range(num):
+        first, second = 2 * purpose + 1, 2 * purpose + 2
+        pairs.append([plain_mix((low + first * weyl) % 2**32),
+                      plain_mix((high + second * weyl) % 2**32)])  # fmt: skip
+    return pairs
+
+
+@pytest.mark.parametrize("loop", [(0, 0), (1, 0), (0xDEADBEEF, 12345), (2**32 - 1, 2**32 - 1)])
+def test_keys_are_the_hash_in_plain_integers(loop):
+    key = jax.random.wrap_key_data(jnp.array(loop, jnp.uint32))
+    steps = [0, 1, 2, 199, 2**31 - 1]
+    got = of_steps(key, jnp.array(steps))
+    np.testing.assert_array_equal(
+        got, np.array([plain_words(*loop, step, NUM_PURPOSES) for step in steps], np.uint32)
+    )
+
+
+def test_the_mixing_function_by_hand():
+    # 1 * 0x7FEB352D; ^ (>> 15: 0xFFD6) = 0x7FEBCAFB; * 0x846CA68B = 0x6889F849 mod 2**32;
+    # ^ (>> 16) = 0x688990C0.
+    assert (plain_mix(0), plain_mix(1)) == (0, 0x688990C0)
+    assert len({plain_mix(x) for x in range(2**16)}) == 2**16
+
+
+# --- statistics ----------------------------------------------------------------------------------
+
+
+def test_no_two_steps_purposes_or_loops_share_a_key(drawn):
+    keys = np.uint64(drawn[..., 0]) << np.uint64(32) | np.uint64(drawn[..., 1])
+    assert np.unique(keys).size == keys.size == 3 * NUM_STEPS * NUM_PURPOSES
+
+
+def test_a_loops_words_for_one_purpose_are_all_different(drawn):
+    # The first word alone seeds a draw from the replay buffer: no step repeats another's batch.
+    for first in drawn[..., 0].transpose(0, 2, 1).reshape(-1, NUM_STEPS):
+        assert np.unique(first).size == NUM_STEPS
+
+
+def test_each_word_is_uniform(drawn):
+    # Chi-square of 256 equally likely values has mean 255 and variance 510.
+    for of_word in drawn.transpose(0, 2, 3, 1).reshape(-1, NUM_STEPS):
+        for shift in (0, 8, 16, 24):
+            counts = np.bincount(of_word >> shift & 255, minlength=256)
+            expected = NUM_STEPS / 256
+            chi_square = ((counts - expected) ** 2 / expected).sum()
+            assert abs(chi_square - 255) < 5.5 * np.sqrt(510)
+
+
+def test_no_bit_follows_another_of_its_step_or_of_the_next(drawn):
+    for of_loop in drawn[:, :3000].reshape(len(LOOPS), 3000, -1):
+        bits = np.unpackbits(of_loop.view(np.uint8), axis=1).astype(np.float32) * 2 - 1
+        pairs = np.concatenate([bits[:-1], bits[1:]], axis=1)  # [step, 2 * 384]
+        correlations = pairs.T @ pairs / len(pairs)
+        np.fill_diagonal(correlations, 0)
+        # 295,000 pairs: the largest of as many normal numbers is 5 standard deviations, seldom 6.5.
+        assert np.abs(correlations).max() < 6.5 / np.sqrt(len(pairs))
+
+
+def test_each_bit_of_the_loops_key_moves_half_of_every_word():
+    key = np.array([0x12345678, 0x9ABCDEF0], np.uint32)
+    flipped = np.stack([key ^ np.array(flip, np.uint32)
+                        for i in range(32) for flip in ([1 << i, 0], [0, 1 << i])])  # fmt: skip
+    steps = jnp.arange(200)
+    keys = jax.random.wrap_key_data(jnp.concatenate([key[None], flipped]))
+    plain, *others = jax.jit(jax.vmap(jax.vmap(data_of, (None, 0)), (0, None)))(keys, steps)
+    plain = np.asarray(plain)
+    for i, other in enumerate(np.asarray(others)):
+        moved = np.unpackbits((plain ^ other).view(np.uint8), axis=-1).reshape(*plain.shape, 32)
+        share = moved.mean(axis=(0, 1, 3))  # of the first words and of the second
+        # The high half of the key is in the second words alone.
+        assert abs(share[1] - 0.5) < 0.02
+        assert share[0] == 0 if i % 2 else abs(share[0] - 0.5) < 0.02
+
+
+# --- as keys of JAX ------------------------------------------------------------------------------
+
+
+def test_jit_and_vmap_change_no_bit(drawn):
+    for seed, of_loop in zip(LOOPS, drawn, strict=True):
+        for step in (0, 1, 777):
+            np.testing.assert_array_equal(
+                data_of(jax.random.key(seed), jnp.int32(step)), of_loop[step]
+            )
+
+
+def test_fewer_keys_are_the_first_of_more():
+    keys = (step_keys(jax.random.key(3), jnp.int32(5), num) for num in (2, 6))
+    few, many = (np.stack([words(k) for k in each]) for each in keys)
+    np.testing.assert_array_equal(few, many[:2])
+
+
+@pytest.mark.parametrize("impl", ["threefry2x32", "rbg", "unsafe_rbg"])
+def test_keys_have_the_implementation_of_the_loops(impl):
+    @jax.jit
+    def draw(steps):
+        keys = jax.vmap(lambda step: jnp.stack(step_keys(jax.random.key(7, impl=impl), step, 3)))
+        return keys(steps)
+
+    keys = draw(jnp.arange(500)).reshape(-1)
+    assert str(jax.random.key_impl(keys)) == impl
+    data = np.asarray(jax.random.key_data(keys))
+    assert len(np.unique(data, axis=0)) == 1500
+    assert data.shape[1] == words(keys[0]).size == (2 if impl == "threefry2x32" else 4)
+    uniform = jax.jit(jax.vmap(jax.random.uniform))(keys)
+    assert abs(float(uniform.mean()) - 0.5) < 5 / np.sqrt(12 * 1500)
