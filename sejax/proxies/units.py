@@ -37,4 +37,4 @@ def units_of(low: Any, high: Any, obs_dim: int) -> Units:
     low, high = (np.broadcast_to(np.asarray(x, np.float32), (obs_dim,)) for x in (low, high))
     bounded = (np.abs(low) < ABSURD) & (np.abs(high) < ABSURD)
     low, high = np.where(bounded, low, -2), np.where(bounded, high, 2)
-    return Units(np.float32((low + high) / 2), np.float32((high - low) / 4))
+    return Units(((low + high) / 2).astype(np.float32), ((high - low) / 4).astype(np.float32))
