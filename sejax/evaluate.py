@@ -207,7 +207,7 @@ def _train_and_test(config: EvaluateConfig, study: Study, world: str, family: Ag
     if study.has_several:
         numbers = {"agent": family.key, "number": range(config.num_agents)}
     columns = {**numbers, "test_return": outcome.test_return, **vars(outcome), **drawn}
-    del columns["test_returns"]
+    del columns["test_returns"], columns["scored_returns"]  # of each episode
     return pd.DataFrame(columns)
 
 
