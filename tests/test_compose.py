@@ -226,8 +226,12 @@ def test_a_value_of_another_type_is_refused_and_the_field_named(override, field)
         (("env=acrobot", "agent=dueling_ddqn", "agent.init_episodes=10"),
          "training.max_steps must exceed 5000, because dueling_ddqn learns nothing before with "
          "agent.init_episodes=10; got 4000."),
-        (("agent=ppo", "agent.update_episodes=20"),
-         "training.max_steps must exceed 4001, because ppo learns nothing before"),
+        (("agent=ppo", "agent.rollout_steps=5000"),
+         "training.max_steps must exceed 5000, because ppo learns nothing before with "
+         "agent.rollout_steps=5000; got 4000."),
+        (("agent=ppo", "agent.rollout_steps=null", "agent.update_episodes=20"),
+         "training.max_steps must exceed 4001, because ppo learns nothing before with "
+         "agent.update_episodes=20"),
         (("training.stop_rule=solved", "training.solved_by=train"),
          "training.solved_by must be test with stop_rule=solved"),
         (("env=cliff_walking", "proxy=rn", "training.solved_by=train"),
