@@ -44,9 +44,10 @@ def train(env: SyntheticEnv, hp: PPOConfig, training: TrainingConfig, seed: int)
       ValueError: if the configurations ask for what is not built here.
     """
     max_steps = training.max_steps
-    if type(hp) is not PPOConfig or training.stop_rule != "never" or max_steps is None:
-        raise ValueError("the reference is of agent=ppo, training.stop_rule=never, "
-                         "training.max_steps=N.")  # fmt: skip
+    is_papers = type(hp) is PPOConfig and hp.advantages == "monte_carlo" and not hp.rollout_steps
+    if not is_papers or training.stop_rule != "never" or max_steps is None:
+        raise ValueError("the reference is of agent=ppo, agent.advantages=monte_carlo, "
+                         "training.stop_rule=never, training.max_steps=N.")  # fmt: skip
     torch.manual_seed(seed)
     random.seed(seed)
     rng = np.random.default_rng(seed)

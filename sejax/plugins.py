@@ -59,9 +59,11 @@ _EVOSAX = (
 GROUPS = {
     "env": Group("sejax.envs", (), {
         "cartpole": "sejax.envs.cartpole:CartPole",
+        "cartpole_v1": "sejax.envs.cartpole_v1:CartPoleV1",
         "acrobot": "sejax.envs.acrobot:Acrobot",
         "cliff_walking": "sejax.envs.cliff_walking:CliffWalking",
         "gridworld_2x2": "sejax.envs.gridworld_2x2:GridWorld2x2",
+        "mountain_car": "sejax.envs.mountain_car:MountainCar",
         "mountain_car_continuous": "sejax.envs.mountain_car_continuous:MountainCarContinuous",
         "pendulum": "sejax.envs.pendulum:Pendulum",
         "halfcheetah": "sejax.envs.halfcheetah:HalfCheetah",

@@ -156,6 +156,25 @@ def test_the_programs_loops_neither_copy_nor_select_a_buffer(one_device):
     assert not copies, copies
 
 
+def test_a_curriculum_compares_members_by_a_part_and_incumbents_by_whole_tests():
+    program = program_of("objective.first_test_steps=1", words=ROOM)
+    state = program.init(KEYS[:1])
+    # Of 8 members and 4 incumbents all whole tests are alike; the fourth member's part is best.
+    whole, part = np.full((1, 12, 2), 0.5, np.float32), np.zeros((1, 12, 2), np.float32)
+    part[0, 3] = 0.25
+    counts = np.full((1, 12), 3, np.int32)
+    outcome = sejax.Outcome(
+        test_returns=whole, scored_returns=part, train_steps=counts, train_episodes=counts,
+        return_area=part[..., 0], nonfinite=counts < 0, real_steps=counts,
+    )  # fmt: skip
+    asked, after, info = jax.jit(lambda s: (a := program.ask(s), *program.tell(s, a, outcome)))(
+        state
+    )
+    # All Better 2 with one member that is better: the mean moves to it.
+    np.testing.assert_allclose(after.es_state.mean[0], asked.members[0, 3], rtol=1e-5, atol=1e-6)
+    assert info.incumbent_mean == info.population_mean == after.best_score == 0.5
+
+
 # --- the same numbers, however it is run ---------------------------------------------------------
 
 

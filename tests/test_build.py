@@ -13,6 +13,7 @@ from sejax import envs, plugins
 from sejax.agents.ddqn import DDQNConfig
 from sejax.app import build
 from sejax.app.build import LearnConfig
+from sejax.app.families import families_of
 from sejax.errors import ConfigError, require, unknown_name
 from sejax.es.nes import NESConfig
 from sejax.training import TrainingConfig
@@ -109,6 +110,7 @@ def test_a_config_error_is_a_value_error_with_the_projects_form():
         ("env=acrobot", "preset=paper", "seed=3", "run_dir=some/where"),
         ("es=cma_es", "devices=2", "lanes=4", "training.max_steps=1000"),
         ("env=cliff_walking", "proxy=rn", "exploration=count_based", "env.goal_reward=-1"),
+        ("agents=[ppo,ddqn]", "agents.ddqn.weight=2", "agents.aggregate=min"),
     ],
     ids=" ".join,
 )
@@ -150,6 +152,28 @@ def test_plain_values_that_lack_something_are_refused(missing):
         build.learn_config(plain)
 
 
+def test_values_of_before_there_were_families_are_read():
+    plain = build.to_plain(config())
+    assert plain.pop("agents") is None
+    assert build.learn_config(plain) == config()
+
+
+def test_one_agent_or_several_are_given_not_both():
+    several = build.to_plain(config("agents=[ppo,ddqn]"))
+    assert several["agent"] is None
+    with pytest.raises(ConfigError, match=r"^agent must be left out with agents, .*'ddqn'"):
+        build.learn_config(several | {"agent": {"name": "ddqn"}})
+    with pytest.raises(ConfigError, match=r"^agents must hold an agent"):
+        build.learn_config(several | {"agents": {"aggregate": "min"}})
+
+
+def test_agents_are_the_same_in_whichever_order_they_stand():
+    plain = build.to_plain(config("agents=[ppo,ddqn]"))
+    turned = plain | {"agents": dict(reversed(plain["agents"].items()))}
+    assert build.learn_config(turned) == build.learn_config(plain)
+    assert [x.key for x in families_of(build.learn_config(turned))] == ["ddqn", "ppo"]
+
+
 def test_configurations_are_hashable_so_that_what_they_build_is_cached():
     first, second = (build.learn_config(build.to_plain(config())) for _ in range(2))
     assert first.agent is not second.agent and first == second
@@ -168,7 +192,7 @@ def test_parts_are_what_make_learner_takes_and_are_built_once():
     assert first["task"] is envs.make("cartpole") is first["proxy"].task
     for name in ("task", "agent", "proxy", "objective"):
         assert first[name] is second[name], "the same parts share their compiled programs"
-    assert first["training"] == TrainingConfig(max_steps=4000, stop_rule="never")
+    assert first["training"] == TrainingConfig(max_steps=2000, max_episodes=2000, stop_rule="never")
     assert first["es"] == config().es
 
 
@@ -178,6 +202,18 @@ def test_a_varied_agent_is_drawn_anew_for_each_training():
     agent = varied.parts()["agent"]
     assert agent.variants and agent.draw is not None
     assert fixed.parts()["agent"].variants == ()
+
+
+def test_several_agents_are_families_each_made_as_it_is_alone():
+    words = ("env=gridworld_2x2", "agents=[sarsa,q_learning]", "agents.sarsa.weight=3",
+             "agents.compared_by=rank")  # fmt: skip
+    several = config(*words)
+    made, task = several.parts()["agent"], several.task()
+    assert (made.names, made.weights) == (("q_learning", "sarsa"), (1.0, 3.0))
+    assert (made.config.compared_by, made.config.aggregate) == ("rank", "mean")
+    assert made.agents == tuple(sejax.make_agent(x.agent, task) for x in families_of(several))
+    varied = build.learn_config(build.to_plain(several) | {"agent_hparams": "varied"})
+    assert all(agent.draw is not None for agent in varied.parts()["agent"].agents)
 
 
 def test_a_configuration_that_says_facts_is_judged_without_making_the_task(monkeypatch):

@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import os
+import re
 import subprocess
 import sys
 import typing
@@ -12,7 +13,7 @@ from hydra.core.config_store import ConfigStore
 
 import sejax
 from sejax import envs, plugins
-from sejax.app import commands, presets, runtime
+from sejax.app import commands, compose, families, presets, runtime
 from sejax.app.build import LearnConfig
 from sejax.envs.cliff_walking import CliffWalking
 from sejax.errors import ConfigError
@@ -66,9 +67,9 @@ def test_a_reward_network_chooses_its_objective_where_none_is_chosen():
 def test_a_task_chooses_its_agent_where_none_is_chosen():
     names = {env: composed_with(f"env={env}").name("agent") for env in envs.names()}
     assert names == {
-        "cartpole": "ddqn", "acrobot": "ddqn", "cliff_walking": "q_learning",
-        "gridworld_2x2": "q_learning", "mountain_car_continuous": "td3", "pendulum": "td3",
-        "halfcheetah": "td3",
+        "cartpole": "ddqn", "cartpole_v1": "ddqn", "acrobot": "ddqn", "cliff_walking": "q_learning",
+        "gridworld_2x2": "q_learning", "mountain_car": "ddqn", "mountain_car_continuous": "td3",
+        "pendulum": "td3", "halfcheetah": "td3",
     }  # fmt: skip
     assert sejax.config(["env=pendulum", "agent=ppo"]).name("agent") == "ppo"
 
@@ -131,6 +132,127 @@ def test_only_cliff_walking_has_a_choice_of_goal_reward():
     assert "env.goal_reward, which another choice of env has" in said
 
 
+# --- several agents ------------------------------------------------------------------------------
+
+SEVERAL = ("agents=[td3_discrete,ddqn]",)
+
+
+def test_several_agents_compose_with_fields_of_their_own():
+    words = ("agents.ddqn.batch_size=32", "agents.td3_discrete.weight=2", "agents.aggregate=min",
+             "agents.compared_by=rank")  # fmt: skip
+    composed = sejax.config([*SEVERAL, *words])
+    agents = composed.agents
+    assert composed.agent is None and composed.name("agent") == "ddqn+td3_discrete"
+    assert (agents.aggregate, agents.compared_by) == ("min", "rank")
+    assert [(x.key, x.weight) for x in agents.families] == [("ddqn", 1.0), ("td3_discrete", 2.0)]
+    assert agents.families[0].agent.batch_size == 32
+    assert str(composed.resolved_run_dir) == "runs/cartpole-se-ddqn+td3_discrete-s0"
+
+
+@pytest.mark.parametrize("preset", ["best", "paper"])
+def test_each_of_several_agents_has_the_tuned_settings_that_it_has_alone(preset):
+    words = ("env=acrobot", f"preset={preset}", "training.max_steps=null")
+    for family in composed_with(*words, *SEVERAL).agents.families:
+        assert family.agent == composed_with(*words, f"agent={family.key}").agent
+    ddqn = sejax.config([*words, *SEVERAL, "agents.ddqn.batch_size=7"]).agents.families[0].agent
+    alone = sejax.config([*words, "agent=ddqn", "agent.batch_size=7"]).agent
+    assert ddqn == alone  # what is said wins
+
+
+@pytest.mark.parametrize(
+    "words",
+    [("agent=[td3_discrete,ddqn]",), ("agents=[ddqn,td3_discrete]",), ("agents=ddqn+td3_discrete",),
+     ("agents=[ddqn,'td3_discrete']",), ("agents=[]", "agent=[ddqn,td3_discrete]")],
+    ids=" ".join,
+)  # fmt: skip
+def test_several_agents_may_be_written_so(words):
+    assert sejax.config(words) == composed_with(*SEVERAL)
+
+
+def test_one_agent_in_a_list_has_a_list_of_fields_and_none_are_none():
+    (family,) = composed_with("agents=ddqn").agents.families
+    assert composed_with("agents=[ddqn]") == composed_with("agents=ddqn")
+    assert family.agent == composed_with().agent
+    assert sejax.config(["agents=[]"]) == sejax.config(["agents=null"]) == composed_with()
+
+
+def test_an_agent_of_ones_own_may_be_one_of_several(monkeypatch, tmp_path):
+    (tmp_path / "my_words.py").write_text(
+        "import dataclasses, sejax\n"
+        "@dataclasses.dataclass(frozen=True, kw_only=True)\n"
+        "class Mine(sejax.DDQNConfig):\n"
+        "    extra: int = 3\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    words = ["agents=[ppo,my_words:Mine]", "agents.my_words_Mine.extra=4",
+             "agents.my_words_Mine.init_episodes=1"]  # fmt: skip
+    mine, ppo = sejax.config(words).agents.families
+    assert (mine.key, mine.agent.extra, ppo.key) == ("my_words_Mine", 4, "ppo")
+    own = plugins.find("agent", "my_words:Mine")
+    assert plugins.name_of("agent", own()) == "my_words:Mine"
+
+
+def test_sweeps_over_tasks_and_agents_have_the_settings_of_each(tmp_path, monkeypatch):
+    words = ["env=cartpole,acrobot", "agents=[ddqn,ppo],ddqn", "agent=ddqn,[ddqn,ppo]"]
+    written = families.in_one_choice(words[:2])
+    assert written == ["env=cartpole,acrobot", "agent=ddqn+ppo,ddqn+"]
+    assert families.in_one_choice(words[2:]) == ["agent=ddqn,ddqn+ppo"]
+    compose.register("run", written)
+    store = ConfigStore.instance()
+    for task in ("cartpole", "acrobot"):
+        alone = {name: store.load(f"tuned_agent/best/{task}-se-{name}.yaml").node.agent
+                 for name in ("ddqn", "ppo")}  # fmt: skip
+        both = store.load(f"tuned_agent/best/{task}-se-ddqn+ppo.yaml").node.agents
+        one = store.load(f"tuned_agent/best/{task}-se-ddqn+.yaml").node.agents
+        assert both == alone and one == {"ddqn": alone["ddqn"]}
+
+
+def test_several_agents_are_in_the_help():
+    said = compose.help_text("run", ["agent=[ddqn,ppo]"])
+    assert "agents=[ddqn,td3_discrete,ppo]" in said  # how they are chosen
+    assert "  agents:\n    aggregate: mean\n    compared_by: advantage\n    ddqn:\n" in said
+    assert "\n  agent:\n" not in said
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ("agents=[ddqn,td3_discret]",
+         "agents must be one of td3_discrete, .*Did you mean agents=td3_discrete?"),
+        ("agents=[ddqn,ddqn]", "agents must name each agent once, .* got ddqn"),
+        ("agents=3", "agents must be one of .* got '3'"),
+        ("agent=[1,2]", "agent must be one of .* got '1'"),
+        ("agents=[[ddqn]]", "agents must be one of "), ("agents={a:1}", "agents must be one of "),
+        ("agents=[ddqn,no_module_of:mine]", "agent must name a module that can be imported"),
+        ("agents=[ddqn,ppo] agent.batch_size=3",
+         "agent.batch_size must be left out with agents=[ddqn,ppo].*agents.ddqn.batch_size=3."),
+        ("agents=[ddqn,ppo] agent=td3_discrete",
+         "agent must be left out with agents=[ddqn,ppo], .*Set agents=[ddqn,ppo,td3_discrete]"),
+        ("agents=[ddqn,ppo] agents.ddqn.batchsize=3", "Did you mean agents.ddqn.batch_size?"),
+        ("agents=[ddqn,ppo] agents.td3.batch_size=3",
+         "agents.td3.batch_size must be of one of the agents ddqn, ppo, .*[ddqn,ppo,td3]"),
+        ("agents=[ddqn,ppo] agents.wieght=3", "got agents.wieght"),
+        ("agents=[ddqn,ppo] +agents.more=3", "agents.more must be an agent with its fields"),
+        ("agents.aggregate=min", "agents.aggregate must come with several agents"),
+        ("agents=[ddqn,ppo] agents.aggregate=worst", "agents.aggregate must be one of"),
+        ("agents=[ddqn,ppo] agents.compared_by=x", "agents.compared_by must be one of"),
+        ("agents=[ddqn,ppo] agents.ddqn.weight=0", "agents.ddqn.weight must be above 0 and finite"),
+        ("agents=[ddqn,ppo] agents.ddqn.weight=x", "agents.ddqn.weight must be above 0"),
+        ("agents=[ddqn,ppo] agents.ddqn.batch_size=0",
+         "agents.ddqn.batch_size must be at least 1, .*Set agents.ddqn.batch_size=128."),
+        ("agents=[ddqn,ppo] agents.ddqn.name=ddqnn", "agents.ddqn must be one of ddqn"),
+        ("agents=[ddqn,td3]", "agents.td3 must be one of .* in cartpole"),
+        ("env=cliff_walking agents=[sarsa,q_learning] exploration=icm",
+         "exploration must suit q_learning"),
+        ("proxy.done=soft proxy.horizon=null agents=[ddqn,ppo] agents.ppo.rollout_steps=3000",
+         "training.max_steps must exceed 3000, .* or agents.ppo.rollout_steps lower"),
+    ],
+)  # fmt: skip
+def test_several_agents_that_cannot_be_are_one_message(words, said):
+    pattern = ".*".join(re.escape(part) for part in said.split(".*"))
+    assert re.search(pattern, message(*words.split()))
+
+
 # --- bad input -----------------------------------------------------------------------------------
 
 
@@ -159,7 +281,7 @@ def test_an_odd_population_is_refused_where_evosax_pairs_perturbations():
     ("override", "field", "nearest"),
     [
         ("env=cartpol", "env", "cartpole"),
-        ("agent=dqn", "agent", "ddqn"),
+        ("agent=ddqnn", "agent", "ddqn"),
         ("es=nez", "es", "nes"),
         ("es=open-es", "es", "open_es"),
         ("preset=papers", "preset", "paper"),
@@ -197,7 +319,9 @@ def test_a_field_that_another_algorithm_has_is_not_suggested():
 
 
 @pytest.mark.parametrize(
-    "overrides", [("proxy.name=rn",), ("env.name=no_such_task",), ("agent.name=dqn",)], ids=" ".join
+    "overrides",
+    [("proxy.name=rn",), ("env.name=no_such_task",), ("agent.name=nope",)],
+    ids=" ".join,
 )
 def test_a_name_that_no_choice_has_is_refused(overrides):
     message(*overrides)
@@ -220,14 +344,21 @@ def test_a_value_of_another_type_is_refused_and_the_field_named(override, field)
     assert said.startswith(f"{field} must be ") and said.endswith(".")
 
 
+SOFT = ("proxy.done=soft", "proxy.horizon=null")
+
+
 @pytest.mark.parametrize(
     ("overrides", "said"),
     [
-        (("env=acrobot", "agent=dueling_ddqn", "agent.init_episodes=10"),
+        ((*SOFT, "env=acrobot", "agent=dueling_ddqn", "agent.init_episodes=10"),
          "training.max_steps must exceed 5000, because dueling_ddqn learns nothing before with "
-         "agent.init_episodes=10; got 4000."),
-        (("agent=ppo", "agent.update_episodes=20"),
-         "training.max_steps must exceed 4001, because ppo learns nothing before"),
+         "agent.init_episodes=10; got 2000."),
+        ((*SOFT, "agent=ppo", "agent.rollout_steps=null", "agent.update_episodes=20"),
+         "training.max_steps must exceed 4001, because ppo learns nothing before with "
+         "agent.update_episodes=20; got 2000."),
+        ((*SOFT, "agent=ppo", "agent.rollout_steps=3000"),
+         "training.max_steps must exceed 3000, because ppo learns nothing before with "
+         "agent.rollout_steps=3000; got 2000."),
         (("training.stop_rule=solved", "training.solved_by=train"),
          "training.solved_by must be test with stop_rule=solved"),
         (("env=cliff_walking", "proxy=rn", "training.solved_by=train"),
@@ -250,8 +381,10 @@ def test_agents_learn_within_the_default_budget_of_an_se(env):
         agent = plugins.find("agent", name)
         if agent.states == facts.states and facts.actions in agent.actions:
             config = sejax.config([f"env={env}", f"agent={name}"])
-            before = config.agent.steps_before_learning(facts.max_steps)
-            budget = config.training.max_steps or config.training.max_episodes * facts.max_steps
+            longest = config.proxy.max_steps(facts.max_steps)
+            before = config.agent.steps_before_learning(longest)
+            budget = config.training.max_episodes * longest
+            budget = min(budget, config.training.max_steps or budget)
             assert budget >= 2 * before, name
 
 

@@ -1,5 +1,6 @@
 """sejax.agents.ddqn: targets by hand, updates against torch, exploration, and a probe MDP."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import jax
@@ -10,7 +11,7 @@ from support import numpy_forward, shapes_of, unraveled
 
 from sejax.agents.ddqn import DDQNConfig, double_q_targets, make_ddqn, select_action
 from sejax.agents.replay import Transition
-from sejax.networks import MLP
+from sejax.networks import ACTIVATIONS, MLP
 
 OBS_DIM, NUM_ACTIONS, BATCH = 3, 2, 7
 GOLDEN = Path(__file__).parent / "golden" / "ddqn_updates.npz"
@@ -18,6 +19,10 @@ CONFIG = DDQNConfig(
     hidden_size=5, num_layers=2, activation="tanh", batch_size=BATCH,
     learning_rate=0.01, target_update_rate=0.1, discount=0.9,
 )  # fmt: skip
+CASES = {activation: replace(CONFIG, activation=activation) for activation in ACTIVATIONS} | {
+    "dqn": replace(CONFIG, double=False, loss="huber", target_update_every=2,
+                   target_update_rate=1.0),
+}  # fmt: skip
 
 
 def random_batch(seed, discount=None):
@@ -92,6 +97,13 @@ def test_targets_take_the_online_networks_action_and_the_target_networks_value()
     np.testing.assert_allclose(double_q_targets(online, target, reward, discount), [37.0, 9.0, 0.5])
 
 
+def test_dqns_targets_take_the_target_networks_best_value():
+    target = jnp.array([[10.0, 20.0], [40.0, 50.0]])
+    # 1 + 0.9 * 40 = 37 and -1 + 0.5 * 50 = 24.
+    got = double_q_targets(target, target, jnp.array([1.0, -1.0]), jnp.array([0.9, 0.5]))
+    np.testing.assert_allclose(got, [37.0, 24.0])
+
+
 def test_select_action_picks_each_columns_entry():
     q_values = jnp.array([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]])
     np.testing.assert_array_equal(select_action(q_values, jnp.array([1, 0, 1])), [4.0, 2.0, 6.0])
@@ -100,11 +112,10 @@ def test_select_action_picks_each_columns_entry():
 # --- updates against torch -----------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("activation", ["tanh", "relu", "leaky_relu", "prelu"])
-def test_updates_equal_torchs_on_the_same_batches(activation):
-    config = DDQNConfig(**{**vars(CONFIG), "activation": activation})
-    agent = make_ddqn(config, OBS_DIM, NUM_ACTIONS)
-    assert_updates_equal_torchs(np.load(GOLDEN), activation, agent)  # made by torch_ddqn.py
+@pytest.mark.parametrize("case", CASES)
+def test_updates_equal_torchs_on_the_same_batches(case):
+    agent = make_ddqn(CASES[case], OBS_DIM, NUM_ACTIONS)
+    assert_updates_equal_torchs(np.load(GOLDEN), case, agent)  # made by torch_ddqn.py
 
 
 def test_the_first_adam_step_moves_each_weight_by_the_learning_rate(state, update):
@@ -144,6 +155,73 @@ def test_hyperparameters_are_traced_so_that_a_population_may_vary_them(agent):
     moved = jax.jit(jax.vmap(after))(rates)
     np.testing.assert_array_equal(moved[0], 0.0)
     np.testing.assert_allclose(moved[2], 10 * moved[1], rtol=1e-3, atol=1e-6)
+
+
+# --- when it learns ------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def rarely():
+    """An agent that learns in every second step, twice, with epsilon by steps; its update."""
+    config = replace(
+        CONFIG, train_every=2, gradient_steps=2, exploration_steps=4, epsilon_init=0.9,
+        epsilon_min=0.1,
+    )  # fmt: skip
+    agent = make_ddqn(config, OBS_DIM, NUM_ACTIONS)
+    return agent, jax.jit(agent.update)
+
+
+def in_turns(parts):
+    """Batches whose columns take turns, and a last column that does not count."""
+    counted = [part._replace(weight=np.ones(BATCH, np.float32)) for part in parts]
+    batch = jax.tree.map(lambda *x: np.stack(x, -1).reshape(*x[0].shape[:-1], -1), *counted)
+    batch = jax.tree.map(lambda x: np.concatenate([x, x[..., -1:]], -1), batch)
+    batch.weight[-1] = 0
+    return batch
+
+
+def test_every_second_step_learns_twice_from_a_batch_of_twice_the_columns(rarely, state, update):
+    agent, learn = rarely
+    parts = [random_batch(number) for number in (1, 2)]
+    batch = in_turns(parts)
+    start = state_with(agent, np.asarray(state.params), np.asarray(state.target_params))
+    first = learn(jax.random.key(0), start, batch)
+    np.testing.assert_array_equal(first.params, state.params)
+    second = learn(jax.random.key(0), first, batch)
+    expected = state
+    for part in parts:
+        expected = update(jax.random.key(0), expected, part)
+    np.testing.assert_allclose(second.params, expected.params, rtol=1e-5, atol=1e-7)
+    np.testing.assert_allclose(second.target_params, expected.target_params, rtol=1e-5, atol=1e-7)
+    assert int(second.opt_state.count) == 2
+
+
+def test_the_memory_draws_a_batch_for_each_gradient_step(rarely):
+    agent, _ = rarely
+    numbers = agent.hparams._replace(batch_size=np.float32(3))
+    state = shapes_of(agent.init, jax.random.key(1), numbers)
+    assert agent.batch_size(state.replace(hparams=numbers)) == 6
+    one = Transition(np.zeros(3, np.float32), np.int32(0), np.float32(0), np.float32(0),
+                     np.zeros(3, np.float32))  # fmt: skip
+    memory = agent.memory(one, 10)
+    batch = jax.eval_shape(
+        lambda key: memory.batch(key, memory.init(), jnp.int32(1), one), jax.random.key(0)
+    )
+    assert batch.reward.shape == (16,)  # 2 * 7, in whole vectors
+
+
+def test_epsilon_by_steps_falls_linearly_whatever_the_episodes(rarely):
+    agent, learn = rarely
+    batch = in_turns([random_batch(0)] * 2)
+    state = shapes_of(agent.init, jax.random.key(1), agent.hparams)
+    state = state.replace(hparams=jax.tree.map(np.float32, agent.hparams), epsilon=np.float32(0.9))
+    epsilons = []
+    for episode in range(6):  # of one step
+        state = agent.begin_episode(state, np.int32(episode))
+        epsilons.append(float(state.epsilon))
+        state = learn(jax.random.key(0), state, batch)
+    # From 0.9 to 0.1 in four steps of 0.2.
+    np.testing.assert_allclose(epsilons, [0.9, 0.7, 0.5, 0.3, 0.1, 0.1], rtol=1e-5)
 
 
 # --- exploration ---------------------------------------------------------------------------------
@@ -258,7 +336,7 @@ def test_a_two_step_probe_learns_gamma_and_one():
 def test_hparams_hold_the_configured_numbers(agent):
     assert agent.hparams._asdict() == {
         "learning_rate": 0.01, "target_update_rate": 0.1, "discount": 0.9,
-        "epsilon_init": 1.0, "epsilon_min": 0.01, "epsilon_decay": 0.9,
+        "epsilon_init": 1.0, "epsilon_min": 0.01, "epsilon_decay": 0.9, "exploration_steps": None,
         "hidden_size": None, "batch_size": None,  # all of them
     }  # fmt: skip
     assert (agent.init_episodes, agent.learns_from) == (10, 10)

@@ -13,26 +13,34 @@ from sejax.errors import ConfigError
 
 GYMNASIUM_IDS = {
     "cartpole": "CartPole-v1",
+    "cartpole_v1": "CartPole-v1",
     "acrobot": "Acrobot-v1",
+    "mountain_car": "MountainCar-v0",
     "mountain_car_continuous": "MountainCarContinuous-v0",
     "pendulum": "Pendulum-v1",
 }
+CARTPOLE_FIELDS = ("x", "x_dot", "theta", "theta_dot")
 STATE_FIELDS = {
-    "cartpole": ("x", "x_dot", "theta", "theta_dot"),
+    "cartpole": CARTPOLE_FIELDS,
+    "cartpole_v1": CARTPOLE_FIELDS,
     "acrobot": ("joint_angle1", "joint_angle2", "velocity_1", "velocity_2"),
+    "mountain_car": ("position", "velocity"),
     "mountain_car_continuous": ("position", "velocity"),
     "pendulum": ("theta", "theta_dot"),
 }
 # Corners of the box that states are drawn from. CartPole: up to the walls (|x| = 2.4, 12 degrees),
 # so that a step crosses them. Acrobot and the pendulum: all angles and speeds, where clipping and
-# wrapping act. The car: from the left wall over the goal to the right wall, at all speeds.
+# wrapping act. The cars: from the left wall over the goal to the right wall, at all speeds.
 CARTPOLE_HIGH = np.array([2.4, 4.0, 12 * 2 * np.pi / 360, 4.0])
 ACROBOT_HIGH = np.array([np.pi, np.pi, 4 * np.pi, 9 * np.pi])
 PENDULUM_HIGH = np.array([5 * np.pi, 8.0])
+CAR_BOX = (np.array([-1.2, -0.07]), np.array([0.6, 0.07]))
 STATE_BOX = {
     "cartpole": (-CARTPOLE_HIGH, CARTPOLE_HIGH),
+    "cartpole_v1": (-CARTPOLE_HIGH, CARTPOLE_HIGH),
     "acrobot": (-ACROBOT_HIGH, ACROBOT_HIGH),
-    "mountain_car_continuous": (np.array([-1.2, -0.07]), np.array([0.6, 0.07])),
+    "mountain_car": CAR_BOX,
+    "mountain_car_continuous": CAR_BOX,
     "pendulum": (-PENDULUM_HIGH, PENDULUM_HIGH),
 }
 GRIDS = ("cliff_walking", "gridworld_2x2")
@@ -194,16 +202,18 @@ def test_a_task_made_by_hand_has_the_limit_that_it_is_given():
     ("name", "max_steps", "solved_reward"),
     [
         ("cartpole", 200, 195.0),
+        ("cartpole_v1", 500, 475.0),
         ("acrobot", 500, -100.0),
         ("cliff_walking", 50, -20.0),
         ("gridworld_2x2", 10, 0.8),
+        ("mountain_car", 200, -110.0),
         ("mountain_car_continuous", 999, 90.0),
         ("pendulum", 200, -250.0),
     ],
 )
 def test_limits_are_the_papers(name, max_steps, solved_reward):
-    # Paper, tables of fixed hyperparameters; the 2x2 room's are its authors', and the pendulum's
-    # are Gymnasium's step limit and our threshold.
+    # Paper, tables of fixed hyperparameters; the 2x2 room's are its authors', the pendulum's are
+    # Gymnasium's step limit and our threshold. CartPole-v1 and MountainCar: Gymnasium's registry.
     task = envs.make(name)
     assert (task.max_steps, task.solved_reward) == (max_steps, solved_reward)
 
@@ -212,9 +222,11 @@ def test_limits_are_the_papers(name, max_steps, solved_reward):
     ("name", "num_states", "obs_dim", "num_actions", "action_dim", "max_action"),
     [
         ("cartpole", None, 4, 2, 2, 1.0),
+        ("cartpole_v1", None, 4, 2, 2, 1.0),
         ("acrobot", None, 6, 3, 3, 1.0),
         ("cliff_walking", 48, 48, 4, 4, 1.0),
         ("gridworld_2x2", 4, 4, 4, 4, 1.0),
+        ("mountain_car", None, 2, 3, 3, 1.0),
         ("mountain_car_continuous", None, 2, None, 1, 1.0),
         ("pendulum", None, 3, None, 1, 2.0),
     ],
@@ -232,7 +244,9 @@ def test_sizes_tell_discrete_from_continuous(
     ("name", "low", "high"),
     [
         ("cartpole", [-0.05] * 4, [0.05] * 4),
+        ("cartpole_v1", [-0.05] * 4, [0.05] * 4),
         ("acrobot", [-0.1] * 4, [0.1] * 4),
+        ("mountain_car", [-0.6, 0.0], [-0.4, 0.0]),
         ("mountain_car_continuous", [-0.6, 0.0], [-0.4, 0.0]),
         ("pendulum", [-np.pi, -1.0], [np.pi, 1.0]),
     ],

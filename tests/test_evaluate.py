@@ -10,11 +10,13 @@ import sys
 import jax
 import pandas as pd
 import pytest
+from support import is_drawn
 
 import sejax
 from sejax.agents.ppo import PPOConfig
 from sejax.agents.tabular import QLearningConfig
 from sejax.app import build, commands, compose
+from sejax.app.families import families_of
 from sejax.errors import ConfigError
 from sejax.evaluate import _proxy_study, evaluate
 from sejax.proxies import files
@@ -22,6 +24,10 @@ from sejax.training import TrainingConfig, budget_for
 
 TINY = ["agent.hidden_size=4", "agent.batch_size=4", "agent.init_episodes=0", "num_agents=3",
         "real_training.max_episodes=2"]  # fmt: skip
+SOFT = (
+    "proxy.done=soft",
+    "proxy.horizon=null",
+)  # an SE whose episodes may be as long as the task's
 ROOM = [
     "agent=q_learning",
     "num_agents=2",
@@ -44,7 +50,7 @@ def learned(*words):
 
 def save(path, *words):
     config, env, weights = learned(*words)
-    discount = config.agent.discount
+    discount = families_of(config)[0].agent.discount
     sejax.save(path, env, weights, build.to_plain(config), discount, score=1.0, seed=0)
     return path
 
@@ -53,7 +59,7 @@ def save(path, *words):
 def stored(tmp_path_factory):
     """The file of an SE for DDQN agents."""
     path = tmp_path_factory.mktemp("proxy") / "proxy.safetensors"
-    words = ("proxy.hidden_size=4", "training.max_steps=50", "agent.init_episodes=0")
+    words = ("proxy.hidden_size=4", "training.max_steps=50", "agent.init_episodes=0", *SOFT)
     return save(path, *words)
 
 
@@ -86,6 +92,26 @@ def test_evaluation_writes_a_row_for_each_agent_and_their_means(evaluated):
     assert "3 fresh ddqn agents" in printed
 
 
+def test_several_agents_are_in_one_table(room, tmp_path, capsys):
+    words = ["agent=[sarsa,q_learning]", "agents.sarsa.learning_rate=0.5", *ROOM[1:]]
+    mean = evaluate(evaluate_config(f"proxy={room}", f"out_dir={tmp_path}", words=words))
+    table = pd.read_csv(tmp_path / "evaluation.csv")
+    counts = table.groupby(["world", "agent"]).size().to_dict()
+    assert counts == dict.fromkeys(
+        [(world, agent) for world in ("the proxy", "the real task")
+         for agent in ("q_learning", "sarsa")], 2,
+    )  # fmt: skip
+    assert mean == pytest.approx(table[table.world == "the proxy"].test_return.mean(), rel=1e-5)
+    summary = json.loads((tmp_path / "evaluation.json").read_text())
+    of_sarsa = table[(table.world == "the real task") & (table.agent == "sarsa")]
+    assert summary["the real task"]["sarsa"]["train_steps_mean"] == pytest.approx(
+        of_sarsa.train_steps.mean()
+    )
+    printed = capsys.readouterr().out
+    assert "2 fresh agents of each family" in printed and printed.count("sarsa") == 4
+    assert is_drawn(tmp_path / "evaluation.png")
+
+
 def test_agents_train_as_the_proxy_was_learned(evaluated):
     table = pd.read_csv(evaluated[1] / "evaluation.csv")
     assert (table[table.world == "the proxy"].train_steps == 50).all()
@@ -103,20 +129,55 @@ def test_initial_episodes_beyond_the_proxys_own_extend_its_step_budget(stored):
     then, training = proxy.learned_with("agent"), proxy.learned_with("training")
     assert (then.init_episodes, training.max_steps) == (0, 50)
 
-    def budget(agent, then=then):
+    def budget(agent, *then):
         return budget_for(training, agent, then, proxy.task.max_steps).max_steps
 
-    assert budget(dataclasses.replace(then, init_episodes=3)) == 50 + 3 * 200
-    assert budget(PPOConfig(update_episodes=2)) == 50 + 401
-    assert budget(then) == 50
-    assert budget(then, None) == 50  # nobody knows what it was learned with
+    assert budget(dataclasses.replace(then, init_episodes=3), then) == 50 + 3 * 200
+    assert budget(PPOConfig(update_episodes=2), then) == 50 + 401
+    assert budget(then, then) == 50
+    assert budget(then) == 50  # nobody knows what it was learned with
+    # Of several that it was learned with, the one that waits longest counts.
+    assert budget(PPOConfig(update_episodes=2), then, PPOConfig(update_episodes=1)) == 50 + 200
     unlimited = TrainingConfig()
-    assert budget_for(unlimited, PPOConfig(), then, 200) is unlimited
+    assert budget_for(unlimited, PPOConfig(), [then], 200) is unlimited
     # That is what an evaluation trains with.
-    _, _, used = _proxy_study(evaluate_config(f"proxy={stored}", "agent.init_episodes=3")).worlds[
-        "the proxy"
-    ]
+    study = _proxy_study(evaluate_config(f"proxy={stored}", "agent.init_episodes=3"))
+    used = study.worlds["the proxy"][2]["ddqn"]
     assert used.max_steps == 650 and used.stop_rule == training.stop_rule
+
+
+def test_episodes_of_one_step_extend_a_step_budget_by_as_little(tmp_path):
+    words = ("proxy.hidden_size=4", "training.max_steps=50", "agent.init_episodes=0",
+             "proxy.horizon=1")  # fmt: skip
+    proxy = files.load_proxy(save(tmp_path / "proxy.safetensors", *words))
+    later = dataclasses.replace(proxy.learned_with("agent"), init_episodes=3)
+    assert proxy.training_for(later).max_steps == 53
+
+
+def test_each_of_several_agents_trains_as_long_as_it_must(tmp_path):
+    """An SE learned with two families: neither they nor others wait beyond their budget."""
+    words = ("agents=[ddqn,ppo]", "proxy.hidden_size=4", "agents.ddqn.init_episodes=2",
+             "agents.ppo.rollout_steps=100", "training.max_steps=4000", *SOFT)  # fmt: skip
+    path = save(tmp_path / "proxy.safetensors", *words)
+    composed = evaluate_config(f"proxy={path}", "agent=[ddqn,dueling_ddqn,ppo]", words=[])
+    budgets = {
+        key: training.max_steps
+        for key, training in _proxy_study(composed).worlds["the proxy"][2].items()
+    }
+    # Learned with 4000 steps, of which DDQN waits 2 * 200; here 10 episodes, as PPO collects.
+    waits = {"ddqn": 10 * 200, "dueling_ddqn": 10 * 200, "ppo": 10 * 200 + 1}
+    assert budgets == {key: 4000 + wait - 2 * 200 for key, wait in waits.items()}
+    as_learned = _proxy_study(
+        evaluate_config(f"proxy={path}", "agent_hparams=as_learned", words=[])
+    )
+    assert as_learned.families == tuple(
+        dataclasses.replace(x, field="agent", weight=1.0) for x in families_of(learned(*words)[0])
+    )
+    assert as_learned.worlds["the proxy"][2]["ppo"].max_steps == 4000
+    with pytest.raises(
+        ConfigError, match=r"^The agent that proxy\.safetensors was learned with mu"
+    ):
+        files.load_proxy(path).learned_with("agent")
 
 
 @pytest.mark.parametrize(
@@ -133,11 +194,15 @@ def test_initial_episodes_beyond_the_proxys_own_extend_its_step_budget(stored):
         (["num_agents=0"], "num_agents must be at least 1"),
         (["env=[1]"], "env must be a word"),
         (["agent=2"], "agent must be one of"),
+        (["agent=[q_learning,sarsa]", "agents.sarsa.weight=2"], "got agents.sarsa.weight"),
+        (["agent=[ddqn,ppo]", "agent_hparams=as_learned"],
+         r"agents must be left out with agent_hparams=as_learned.*got ddqn\+ppo"),
     ],
 )  # fmt: skip
 def test_settings_that_cannot_be_or_have_no_effect_are_refused(given, message, stored):
+    words = [] if given[0].startswith("agent=[") else TINY
     with pytest.raises(ConfigError, match=message):
-        evaluate_config(f"proxy={stored}", *given)
+        evaluate_config(f"proxy={stored}", *given, words=words)
 
 
 @pytest.mark.parametrize(
@@ -177,8 +242,9 @@ def test_agents_like_those_of_the_run_bring_their_exploration(tmp_path, capsys):
                  "devices=1", "real_training.max_episodes=2"]  # fmt: skip
     composed = evaluate_config(*overrides, words=[])
     study = _proxy_study(composed)
-    assert (study.agent, study.exploration) == (config.agent, config.exploration)
-    assert study.worlds["the proxy"][2] == composed.real_training  # its dynamics are real
+    assert study.families[0].agent == config.agent and study.exploration == config.exploration
+    # Its dynamics are real.
+    assert study.worlds["the proxy"][2] == {"q_learning": composed.real_training}
     evaluate(composed)
     assert "2 fresh q_learning agents" in capsys.readouterr().out
 

@@ -316,8 +316,9 @@ def told(scores, incumbents, **config):
     returns = np.concatenate([scores, incumbents], axis=1).astype(np.float32)
     counts = np.full(returns.shape, 3, np.int32)
     outcome = Outcome(
-        test_returns=returns[..., None], train_steps=counts, train_episodes=counts,
-        return_area=returns, nonfinite=~np.isfinite(returns), real_steps=counts,
+        test_returns=returns[..., None], scored_returns=returns[..., None], train_steps=counts,
+        train_episodes=counts, return_area=returns, nonfinite=~np.isfinite(returns),
+        real_steps=counts,
     )  # fmt: skip
     state = program.init(KEYS)
     return jax.jit(lambda s: program.tell(s, program.ask(s), outcome))(state)

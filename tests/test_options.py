@@ -8,9 +8,10 @@ import pytest
 from sejax import options
 from sejax.agents.agent import NoExploration, traced
 from sejax.agents.count_based import CountBasedConfig
-from sejax.agents.ddqn import DDQNConfig, DuelingDDQNConfig
+from sejax.agents.ddqn import DDQNConfig, DQNConfig, DuelingDDQNConfig
 from sejax.agents.icm import ICMConfig
 from sejax.agents.ppo import PPOConfig
+from sejax.agents.sac import SACConfig
 from sejax.agents.tabular import QLearningConfig, SARSAConfig
 from sejax.agents.td3 import DiscreteTD3Config, TD3Config
 from sejax.agents.varied import ranges_of
@@ -32,6 +33,7 @@ class Config(Options):
     weight: float = option(0.5, options.not_negative("it is a weight"), traced=True)
     rate: float = option(0.1, options.positive("nothing would move", 10.0), varied="triple")
     share: float = option(0.9, options.fraction(), traced=True, varied="tenth_to_one")
+    goal: float = option(-1.0, options.finite("it is aimed at"))
     decay: float = option(1.0, options.shrinks())
     kind: str = option("plain", options.one_of(("plain", "fancy")))
     free: Any = "anything"  # a field like any other, which nothing holds for
@@ -71,6 +73,9 @@ def message(cls=Config, **fields):
         ("share", 1.5, "lie in [0, 1], because it is a fraction; got 1.5. Set group.share=0.9."),
         ("share", -0.5, "lie in [0, 1], because it is a fraction; got -0.5. Set group.share=0.9."),
         ("share", NAN, "lie in [0, 1], because it is a fraction; got nan. Set group.share=0.9."),
+        ("goal", INF, "be finite, because it is aimed at; got inf. Set group.goal=-1.0."),
+        ("goal", NAN, "be finite, because it is aimed at; got nan. Set group.goal=-1.0."),
+        ("goal", "low", "be finite, because it is aimed at; got low. Set group.goal=-1.0."),
         ("decay", 0, "lie in (0, 1], because it shrinks each generation; got 0. "
                      "Set group.decay=1."),
         ("decay", 1.5, "lie in (0, 1], because it shrinks each generation; got 1.5. "
@@ -87,7 +92,7 @@ def test_a_value_that_breaks_its_rule_is_refused_with_the_whole_message(field, v
     [
         {"size": 1}, {"size": 2**31 - 1}, {"episodes": 0}, {"limit": None}, {"limit": 1},
         {"weight": 0}, {"weight": 1e30}, {"rate": 1e-30}, {"rate": 10}, {"share": 0}, {"share": 1},
-        {"decay": 1}, {"decay": 1e-6}, {"kind": "fancy"}, {"free": -1}, {"unruled": NAN},
+        {"decay": 1}, {"decay": 1e-6}, {"goal": -3}, {"kind": "fancy"}, {"free": -1}, {"unruled": NAN},
     ],
     ids=str,
 )  # fmt: skip
@@ -152,16 +157,19 @@ def test_traced_hyperparameters_are_a_named_tuple_with_whatever_else_is_said():
 
 
 DDQN = ("learning_rate", "target_update_rate", "discount", "epsilon_init", "epsilon_min",
-        "epsilon_decay")  # fmt: skip
+        "epsilon_decay", "exploration_steps")  # fmt: skip
 TD3 = ("learning_rate", "target_update_rate", "discount", "action_noise_std", "target_noise_std",
        "target_noise_clip")  # fmt: skip
+SAC = ("learning_rate", "target_update_rate", "discount", "alpha", "init_alpha", "target_entropy",
+       "target_entropy_fraction")  # fmt: skip
 TABULAR = ("learning_rate", "discount", "epsilon_init", "epsilon_min", "epsilon_decay")
 
 
 @pytest.mark.parametrize(
     ("config", "names"),
     [
-        (DDQNConfig, DDQN), (DuelingDDQNConfig, DDQN), (TD3Config, TD3),
+        (DDQNConfig, DDQN), (DuelingDDQNConfig, DDQN), (DQNConfig, DDQN), (TD3Config, TD3),
+        (SACConfig, SAC),
         (DiscreteTD3Config, (*TD3, "temperature", "final_temperature")),
         (PPOConfig, ("learning_rate", "discount", "gae_lambda", "clip_ratio", "value_weight",
                      "entropy_weight")),
@@ -181,6 +189,8 @@ NETWORK = {"learning_rate": "triple", "hidden_size": "triple", "num_layers": "on
     [
         (DDQNConfig, NETWORK | {"batch_size": "triple"}),
         (DuelingDDQNConfig, NETWORK | {"batch_size": "triple"}),
+        (DQNConfig, NETWORK | {"batch_size": "triple"}),
+        (SACConfig, NETWORK | {"batch_size": "triple"}),
         (TD3Config, NETWORK | {"batch_size": "triple"}),
         (DiscreteTD3Config, NETWORK | {"batch_size": "triple"}),
         (PPOConfig, NETWORK),

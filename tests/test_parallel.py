@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from sejax.errors import ConfigError
-from sejax.parallel import spread_over_devices
+from sejax.networks import MLP
+from sejax.parallel import spread_groups_over_devices, spread_over_devices
 
 
 def work(key, x):
@@ -45,6 +46,54 @@ def test_the_number_of_devices_changes_no_bit():
     one, two = (jax.jit(spread_over_devices(work, n))(keys, xs) for n in (1, 2))
     for name in one:
         np.testing.assert_array_equal(one[name], two[name])
+
+
+NET = MLP(1, 8, 1, "tanh")
+INPUTS = np.random.default_rng(0).normal(size=(5, 16)).astype(np.float32)
+
+
+def train_network(key):
+    """Weights after a few steps of gradient descent, which are made of products that round."""
+
+    def loss(params, inputs):
+        return jnp.mean((NET.apply(params, inputs) - jnp.sin(inputs[:1])) ** 2)
+
+    def step(params, _):
+        slopes = jax.grad(loss)(params, jnp.asarray(INPUTS))
+        return jax.tree.map(lambda x, slope: x - 0.3 * slope, params, slopes), None
+
+    return jax.lax.scan(step, NET.init(key, INPUTS[:, 0]), length=10)[0]
+
+
+@pytest.mark.parametrize(("size", "lanes"), [(5, 1), (5, 4), (2, 4)])
+def test_the_number_of_devices_changes_no_bit_of_a_trained_network(size, lanes):
+    # Neither 5 trainings nor the shares of two devices, 3 and 1 of them, are whole batches.
+    keys = split(jax.random.key(0), size)
+    one, two = (jax.jit(spread_over_devices(train_network, n, lanes))(keys) for n in (1, 2))
+    jax.tree.map(np.testing.assert_array_equal, one, two)
+    # The lanes do what each does alone.
+    alone = jax.jit(train_network)(keys[-1])
+    jax.tree.map(lambda x, y: np.testing.assert_allclose(x[-1], y, rtol=1e-4, atol=1e-6),
+                 one, alone)  # fmt: skip
+
+
+@pytest.mark.parametrize("num_devices", [1, 2])
+@pytest.mark.parametrize("lanes", [None, 2])
+def test_groups_have_a_function_a_size_and_lanes_each(num_devices, lanes):
+    def scaled(x):
+        return {"scaled": 3 * x}
+
+    sizes = (5, 1, 4)
+    groups = [(split(jax.random.key(i), n), np.arange(2.0 * n, dtype=np.float32).reshape(n, 2))
+              for i, n in enumerate(sizes)]  # fmt: skip
+    spread = spread_groups_over_devices([work, scaled, work], num_devices, lanes, [1, None, 3])
+    got = jax.jit(spread)([groups[0], (groups[1][1],), groups[2]])
+    np.testing.assert_array_equal(got[1]["scaled"], 3 * groups[1][1])
+    for group in (0, 2):
+        keys, xs = groups[group]
+        for i in range(sizes[group]):
+            for name, value in alone(keys[i], xs[i]).items():
+                np.testing.assert_allclose(got[group][name][i], value, rtol=1e-6)
 
 
 def test_two_devices_share_the_work():

@@ -20,12 +20,11 @@ from sejax import envs
 from sejax.agents import replay
 from sejax.agents.agent import traced
 from sejax.agents.memory import Rollout
+from sejax.agents.policies import SOFTMAX, gaussian
 from sejax.agents.ppo import (
     MIN_STD,
-    SOFTMAX,
     PPOConfig,
     discounted_returns,
-    gaussian,
     generalized_advantages,
     make_ppo,
     normalized,
@@ -51,7 +50,7 @@ HPARAMS = traced(CONFIG)
 # Three minibatches of four steps, so that each epoch leaves one out.
 GAE = dataclasses.replace(
     CONFIG, advantages="gae", gae_lambda=0.8, rollout_steps=STEPS, num_minibatches=3,
-    max_grad_norm=0.5, adam_eps=1e-5,
+    normalize_rewards=True, max_grad_norm=0.5, adam_eps=1e-5,
 )  # fmt: skip
 CONFIGS = {"discrete": CONFIG, "continuous": CONFIG, "gae": GAE}
 KINDS = tuple(CONFIGS)  # the last one's actions are discrete
@@ -209,7 +208,8 @@ def test_generalized_advantages_equal_plain_loops(ends, at_ends):
     ended = np.isin(np.arange(STEPS), list(ends)).astype(np.float32)
     if at_ends is not None:  # elsewhere 1, as in any task
         steps = steps._replace(discount=np.where(ended, at_ends, 1.0).astype(np.float32))
-    got = jit_advantages(steps, ended, value, next_value, 0.9, 0.8)
+    decay = np.float32(0.9) * steps.discount
+    got = jit_advantages(steps.reward, decay, ended, value, next_value, 0.8)
     expected = advantages_by_definition(steps, ended, value, next_value, 0.9, 0.8)
     np.testing.assert_allclose(got, expected, rtol=1e-5, atol=1e-6)
     if len(ends) == STEPS:  # a world of single steps
@@ -286,6 +286,20 @@ def test_learning_phases_equal_torchs(kind, state, update):
         state = update(KEY, state, rollout(kind, number))
         expected = golden[f"{kind}/params/{number}"]
         np.testing.assert_allclose(state.params, expected, rtol=2e-5, atol=5e-6)
+
+
+def test_with_normalized_rewards_it_does_not_matter_in_what_they_are_paid():
+    agent = ppo("gae")
+    state, update = state_of(agent), jax.jit(agent.update)
+    steps, ended = random_steps("gae", 0)
+    paid_more = np.asarray(jit_pack(steps._replace(reward=1000 * steps.reward), ended))
+    more = update(KEY, state, Rollout(paid_more, np.bool_(True)))
+    np.testing.assert_allclose(
+        more.params, update(KEY, state, rollout("gae")).params, rtol=1e-4, atol=1e-5
+    )
+    # Nor do rewards that never differ blow up, in a world of single steps say.
+    always = np.asarray(jit_pack(steps._replace(reward=0 * ended + 3), 0 * ended + 1))
+    assert np.isfinite(update(KEY, state, Rollout(always, np.bool_(True))).params).all()
 
 
 def test_nothing_changes_until_the_rollout_is_full(kind, state, update):

@@ -184,7 +184,7 @@ def test_every_file_is_of_a_task_and_proxy_and_has_settings_of_known_choices():
         env, _, proxy = path.stem.rpartition("-")
         assert proxy in plugins.names("proxy")
         assert env in (presets.GENERAL, *plugins.names("env"))
-        kinds = {"tuned_agent": "agent", "tuned_es": "es"}
+        kinds = {"tuned_agent": "agent", "tuned_es": "es", "tuned_objective": "objective"}
         for preset, kind, choice, values in presets.settings(env, proxy):
             assert preset in presets.names() and isinstance(values, dict)
             assert choice in plugins.names(kinds[kind]) if kind in kinds else choice == ""

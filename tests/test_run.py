@@ -5,6 +5,7 @@ import dataclasses
 import functools
 import math
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -14,10 +15,13 @@ from pathlib import Path
 import jax
 import pytest
 import yaml
+from support import is_drawn
 
 import sejax
 from sejax import run
 from sejax.app import build, commands, run_directory, session
+from sejax.app.metrics import FAMILY_COLUMNS
+from sejax.app.progress import RunProgress
 from sejax.app.run_directory import COLUMNS
 from sejax.errors import ConfigError
 from sejax.proxies import files
@@ -154,6 +158,73 @@ def test_a_population_that_diverges_finishes_and_is_counted(tmp_path):
         session.run(config, directory, wild)
     assert [int(row["num_nonfinite"]) for row in rows(tmp_path)] == [4, 4]
     assert all(math.isfinite(float(row["incumbent_mean"])) for row in rows(tmp_path))
+
+
+# --- families of agents --------------------------------------------------------------------------
+
+FAMILIES = ("agents=[sarsa,q_learning]",)
+OWN = [word for word in TINY if not word.startswith("agent.")]
+
+
+@functools.cache
+def family_chunks():
+    return session.make_chunks(sejax.config([*OWN, *FAMILIES]))
+
+
+def learn_families(path, *words):
+    """A session of a run with two families; returns the line that is printed of its last chunk."""
+    config = sejax.config([*OWN, *words, f"run_dir={path}"])
+    with run_directory.open_for(config) as directory, RunProgress(config) as report:
+        session.run(config, directory, family_chunks(), report)
+
+
+@pytest.fixture(scope="module")
+def two_families(tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp("families")
+    learn_families(path, *FAMILIES, "generations=5")
+    return path
+
+
+def test_metrics_and_proxies_tell_of_each_family(two_families):
+    keys = ("q_learning", "sarsa")
+    made = rows(two_families)
+    assert list(made[0]) == [
+        *(name for name in COLUMNS if name != "wall_s"),
+        *(f"{name}_{key}" for key in keys for name in FAMILY_COLUMNS),
+    ]
+    for row in made:
+        mean = sum(float(row[f"incumbent_mean_{key}"]) for key in keys) / 2
+        assert float(row["incumbent_mean"]) == pytest.approx(mean, abs=1e-6)
+        assert all(row[f"num_nonfinite_{key}"] == "0" for key in keys)
+    for name, of in (("proxy", None), ("proxy_last", -1)):
+        record = files.load_proxy(two_families / f"{name}.safetensors").record
+        row = made[record["generation"] if of is None else of]
+        scores = {key: pytest.approx(float(row[f"incumbent_mean_{key}"])) for key in keys}
+        assert record["scores"] == scores
+
+
+def test_a_run_of_families_goes_on_whichever_way_they_are_named(two_families, tmp_path, capsys):
+    learn_families(tmp_path, *FAMILIES, "generations=2")
+    assert re.search(
+        r"incumbent \S+ ± \S+ \(q_learning \S+, sarsa \S+\), best", capsys.readouterr().out
+    )
+    learn_families(tmp_path, "agents=[q_learning,sarsa]", "generations=5")
+    assert "Going on at generation 2" in capsys.readouterr().out
+    assert rows(tmp_path) == rows(two_families)
+    proxy = "proxy.safetensors"
+    assert (tmp_path / proxy).read_bytes() == (two_families / proxy).read_bytes()
+    assert is_drawn(tmp_path / "learning_curve.png")
+
+
+def test_other_families_in_the_same_directory_are_refused(two_families):
+    with pytest.raises(ConfigError, match=r"differs in agents\.sarsa\.weight \(1\.0 there, 2\.0"):
+        learn_families(two_families, *FAMILIES, "agents.sarsa.weight=2")
+
+
+def test_the_command_names_all_families_for_the_evaluation(two_families, capsys):
+    run.learn(sejax.config([*OWN, *FAMILIES, "generations=5", f"run_dir={two_families}"]))
+    said = capsys.readouterr().out
+    assert f"sejax.evaluate proxy={two_families} agent=[q_learning,sarsa] num_agents=20" in said
 
 
 # --- damage --------------------------------------------------------------------------------------

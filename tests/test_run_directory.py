@@ -174,6 +174,30 @@ def test_floats_read_back_as_the_same_float32(tmp_path):
     np.testing.assert_array_equal(read, values.ravel())
 
 
+def test_several_families_have_columns_of_their_own(tmp_path):
+    def open_families(*keys):
+        return RunDirectory.open(tmp_path, CONFIG, SEEDS, families=keys)
+
+    info = info_of(0, 1)
+    each = np.arange(4).reshape(1, 2, 2)  # [generation, seed, family]
+    info.families = SimpleNamespace(**dict.fromkeys(metrics.FAMILY_COLUMNS, each))
+    with open_families("ddqn", "ppo") as directory:
+        directory.resume(TEMPLATE)
+        directory.append(info, 1.0)
+        directory.commit(1, state_after(1))
+        assert list(directory.rows[0])[-5:] == [
+            "num_nonfinite_ddqn", "incumbent_mean_ppo", "population_mean_ppo",
+            "train_steps_mean_ppo", "num_nonfinite_ppo",
+        ]  # fmt: skip
+        written = [[row[f"incumbent_mean_{key}"] for key in ("ddqn", "ppo")]
+                   for row in directory.rows]  # fmt: skip
+        assert written == [["0", "1"], ["2", "3"]]
+        kept = list(directory.rows)
+    with open_families("ddqn", "ppo") as directory:
+        assert directory.resume(TEMPLATE)[1] == 1 and directory.rows == kept
+    assert metrics.columns_of(["ddqn"]) == metrics.columns_of() == COLUMNS
+
+
 def test_rows_are_the_same_read_or_kept(tmp_path):
     with open_run(tmp_path) as directory:
         directory.resume(TEMPLATE)

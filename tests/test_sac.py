@@ -15,7 +15,6 @@ from sejax.agents.replay import Transition
 from sejax.agents.sac import (
     LearningNoise,
     SACConfig,
-    draw_learning_noise,
     gaussian_policy,
     make_learning_step,
     make_networks,
@@ -138,7 +137,7 @@ def test_updates_are_learning_steps_on_noise_drawn_from_the_key_alone_and_in_lan
 
     @jax.jit
     def run(key):
-        noise = draw_learning_noise(key, policy_of(case), BATCH)
+        noise = policy_of(case).draw(key, BATCH)
         return noise, jax.vmap(agent_of(case).update, (None, 0, None))(key, stacked, batch)
 
     noise, together = run(jax.random.key(3))

@@ -201,14 +201,14 @@ def test_an_output_that_is_no_number_ends_an_episode_whatever_is_drawn(mode):
 
 
 @pytest.mark.parametrize(("task", "horizon"), [("cartpole", None), ("cliff_walking", 1)])
-def test_learned_starts_are_a_network_of_normal_noise(task, horizon):
+def test_learned_starts_are_normal_noise_moved_by_a_network(task, horizon):
     env = make_env(task, initial_state="learned", horizon=horizon)
     params = env.params(env.init_weights(jax.random.key(2)))
     keys = jax.random.split(jax.random.key(0), 4)
     obs, state = jax.jit(jax.vmap(env.reset_env, (0, None)))(keys, params)
     for key, seen, start in zip(keys, obs, state.vector, strict=True):
         noise = jax.random.normal(key, (env.task.obs_dim,))
-        expected = numpy_forward(params.weights["start"], noise, CONFIG.activation, 1)
+        expected = noise + numpy_forward(params.weights["start"], noise, CONFIG.activation, 1)
         np.testing.assert_allclose(start, expected, rtol=1e-5, atol=1e-6)
         # Where states are discrete the agent sees the index of the largest entry.
         np.testing.assert_array_equal(seen, np.argmax(start) if task == "cliff_walking" else start)

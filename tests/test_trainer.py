@@ -10,10 +10,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from scripted import MAX_EPISODES, MAX_STEPS, WHO, ScriptedEnv, script, scripted_agent
+from support import numpy_forward
 
 from sejax import envs, evaluation, plugins
 from sejax.agents.ddqn import DDQNConfig, make_ddqn
 from sejax.agents.memory import Memory
+from sejax.agents.tabular import QLearningConfig
 from sejax.proxies.configs import SyntheticConfig
 from sejax.rollout import make_recorder, make_tester
 from sejax.trainer import is_plateau, is_solved, make_trainer
@@ -195,6 +197,30 @@ def test_tests_need_a_test_function():
             make_trainer(scripted_agent(), ENV, VARIANTS[name])
 
 
+def test_a_world_of_one_step_has_an_episode_for_each_step():
+    task = envs.make("gridworld_2x2")
+    env = plugins.make("proxy", SyntheticConfig(hidden_size=4, horizon=1), task)
+    config = QLearningConfig(learning_rate=1.0, epsilon_init=1.0, epsilon_min=1.0)
+    params = env.params(env.init_weights(KEY))
+    never = training(max_episodes=40, max_steps=40, stop_rule="never")
+    train = make_trainer(plugins.make("agent", config, task), env, never)
+    many = jax.jit(jax.vmap(train, (0, None)))(jax.random.split(KEY, 3), params)
+    # The start is one state, so that there is one reward for each action, which is its value.
+    _, start = env.reset_env(KEY, params)
+    rewards = [
+        numpy_forward(params.weights["reward"], [*one_hot, *start.vector], "leaky_relu", 1)[0]
+        for one_hot in np.eye(task.num_actions)
+    ]
+    for i in range(3):
+        assert many.train_steps[i] == many.episodes[i] == 40
+        np.testing.assert_array_equal(many.episode_ends[i], np.arange(1, 41))
+        distance = np.abs(np.subtract.outer(np.asarray(many.returns[i]), rewards))
+        assert distance.min(axis=1).max() < 1e-5
+        assert set(distance.argmin(axis=1)) == set(range(task.num_actions))
+        state = np.argmax(start.vector)
+        np.testing.assert_allclose(many.agent_state.q_values[i, state], rewards, rtol=1e-4)
+
+
 # --- what is stored ------------------------------------------------------------------------------
 
 
@@ -358,10 +384,30 @@ def assert_lanes_are_single_trainings(train, lanes, many):
         assert_same(many, i, train(*alone))
 
 
-def test_scripted_lanes_equal_single_trainings(trainers):
-    lanes = scripted_lanes()
-    many = jax.jit(jax.vmap(trainers["plateau"]))(*lanes)
-    assert_lanes_are_single_trainings(trainers["plateau"], lanes, many)
+@pytest.fixture(scope="module")
+def in_lanes(trainers):
+    """The results of `scripted_lanes` by the plateau rule."""
+    return jax.jit(jax.vmap(trainers["plateau"]))(*scripted_lanes())
+
+
+def test_scripted_lanes_equal_single_trainings(trainers, in_lanes):
+    assert_lanes_are_single_trainings(trainers["plateau"], scripted_lanes(), in_lanes)
+
+
+def test_a_lanes_curve_has_its_own_episodes_and_nothing_after_them(in_lanes):
+    _, params, _, active = scripted_lanes()
+    for i in range(5):  # the sixth meets a number that is none
+        history, lengths = [], np.minimum(params.lengths[i], MAX_STEPS)
+        if active[i]:
+            history, _, _ = plain_training(
+                params.returns[i].tolist(), params.lengths[i].tolist(), "plateau"
+            )
+        num, rest = len(history), MAX_EPISODES - len(history)
+        ends = np.cumsum(lengths)[:num].tolist()
+        np.testing.assert_array_equal(in_lanes.returns[i], history + [np.nan] * rest)
+        np.testing.assert_array_equal(in_lanes.episode_ends[i], ends + [0] * rest)
+    np.testing.assert_array_equal(in_lanes.returns[5], [1, 0] + [np.nan] * 10)
+    np.testing.assert_array_equal(in_lanes.episode_ends[5], [3, 5] + [0] * 10)
 
 
 def test_nested_lanes_equal_single_trainings(trainers):
@@ -451,10 +497,10 @@ def test_test_episodes_end_at_the_step_limit_and_inactive_ones_do_not_begin():
     agent = scripted_agent()
     state = agent.begin_episode(agent.init(KEY, 0.0), 0)
     test = jax.jit(make_tester(agent, task, num_episodes=3))
-    returns, steps = test(KEY, state)
+    returns, steps, _ = test(KEY, state)
     np.testing.assert_array_equal(returns, [2.5] * 3)
     np.testing.assert_array_equal(steps, [MAX_STEPS] * 3)
-    returns, steps = test(KEY, state, jnp.bool_(False))
+    returns, steps, _ = test(KEY, state, jnp.bool_(False))
     np.testing.assert_array_equal(returns, 0.0)
     np.testing.assert_array_equal(steps, 0)
 
@@ -508,17 +554,33 @@ def test_a_recorded_training_is_the_training(recorded, trainers):
         assert_same(jax.tree.map(lambda x: x[None], with_record), 0, alone)
 
 
+def test_a_part_of_a_test_or_more_than_all_of_it_may_be_scored():
+    # Episodes that go on for ever, cut after 4 steps, pay 2.5 in step 4 and in each one after it.
+    task = envs.Task(name="script", env=ENV, params=script([2.5] * 12, [99] * 12))
+    agent = scripted_agent()
+    state = agent.begin_episode(agent.init(KEY, 0.0), 0)
+    test = jax.jit(make_tester(agent, task, 2))
+    for score_steps, scored, played in ((3, 0.0, 4), (4, 2.5, 4), (6, 7.5, 6)):
+        tests = test(KEY, state, True, jnp.int32(score_steps))
+        np.testing.assert_array_equal(tests.scored, [scored] * 2)
+        np.testing.assert_array_equal(tests.returns, [2.5] * 2)  # of the task's own 4 steps
+        np.testing.assert_array_equal(tests.num_steps, [played] * 2)
+
+
 def test_recorded_tests_are_the_tests():
     task = envs.Task(name="script", env=ENV, params=script([2.5] * 12, [3] * 12))
     agent = scripted_agent()
     state = agent.begin_episode(agent.init(KEY, 0.0), 0)
     both = make_tester(agent, task, 3), make_recorder(agent, task, 3)
-    (returns, num_steps), steps = jax.jit(lambda *args: [f(*args) for f in both])(KEY, state)
+    (returns, num_steps, scored), steps = jax.jit(lambda *args: [f(*args) for f in both])(
+        KEY, state
+    )
     valid = np.array(steps.valid).reshape(3, MAX_STEPS)
     np.testing.assert_array_equal(valid, [[True] * 3 + [False]] * 3)
     np.testing.assert_array_equal(valid.sum(axis=1), num_steps)
     rewards = np.array(steps.reward).reshape(3, MAX_STEPS)
     np.testing.assert_array_equal((rewards * valid).sum(axis=1), returns)
+    np.testing.assert_array_equal(scored, returns)  # all that was played
     np.testing.assert_array_equal(steps.terminated[valid.ravel()], [False, False, True] * 3)
     keys = [jax.random.split(key)[0] for key in jax.random.split(KEY, 3)]
     starts = [float(ENV.reset_env(key, task.params)[0][1]) for key in keys]  # each episode's tag

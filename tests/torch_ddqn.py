@@ -7,9 +7,9 @@ Remake it with `python tests/torch_ddqn.py` where torch is installed.
 import jax
 import numpy as np
 import torch
-from test_ddqn import CONFIG, GOLDEN, NUM_ACTIONS, OBS_DIM, q_network, random_batch
+from test_ddqn import CASES, GOLDEN, NUM_ACTIONS, OBS_DIM, q_network, random_batch
 
-from sejax.agents.ddqn import DDQNConfig, make_ddqn
+from sejax.agents.ddqn import make_ddqn
 from sejax.agents.replay import Transition
 
 NUM_UPDATES = 5
@@ -24,6 +24,7 @@ class TorchDDQN:
         self.target, self.target_slope = self._network(target_params)
         parameters = [*self.online.parameters()] + ([self.slope] if self.slope is not None else [])
         self.optimizer = torch.optim.Adam(parameters, lr=config.learning_rate)
+        self.num_updates = 0
 
     def _network(self, params):
         layers = []
@@ -54,14 +55,22 @@ class TorchDDQN:
         q = self.q_values(self.online, self.slope, obs)
         q = q.gather(1, tensors.action.long()[:, None])[:, 0]
         with torch.no_grad():
-            best = self.q_values(self.online, self.slope, next_obs).argmax(1)
             values = self.q_values(self.target, self.target_slope, next_obs)
-            value = values.gather(1, best[:, None])[:, 0]
+            if self.config.double:
+                best = self.q_values(self.online, self.slope, next_obs).argmax(1)
+                value = values.gather(1, best[:, None])[:, 0]
+            else:
+                value = values.max(1).values
             goal = tensors.reward + self.config.discount * tensors.discount * value
-        loss = torch.nn.functional.mse_loss(q, goal)
+        kinds = {"squared": torch.nn.functional.mse_loss,
+                 "huber": torch.nn.functional.smooth_l1_loss}  # fmt: skip
+        loss = kinds[self.config.loss](q, goal)
         self.optimizer.zero_grad()
         loss.backward()
         self.optimizer.step()
+        self.num_updates += 1
+        if self.num_updates % self.config.target_update_every:
+            return
         tau = self.config.target_update_rate
         with torch.no_grad():
             pairs = [*zip(self.target.parameters(), self.online.parameters(), strict=True)]
@@ -81,15 +90,14 @@ class TorchDDQN:
 def main():
     """Writes the parameters before, after one, and after five updates on the test's batches."""
     arrays = {}
-    for activation in ("tanh", "relu", "leaky_relu", "prelu"):
-        config = DDQNConfig(**{**vars(CONFIG), "activation": activation})
+    for case, config in CASES.items():
         _, nested = q_network(config)
         agent = make_ddqn(config, OBS_DIM, NUM_ACTIONS)
         params = agent.init(jax.random.key(1), agent.hparams).params
         # Target and online network apart from the start, so that it shows which is used where.
         target_params = params[::-1]
         reference = TorchDDQN(nested(params), nested(target_params), config)
-        arrays |= {f"{activation}/params/0": params, f"{activation}/target_params/0": target_params}
+        arrays |= {f"{case}/params/0": params, f"{case}/target_params/0": target_params}
         for number in range(1, NUM_UPDATES + 1):
             reference.update(random_batch(number))
             if number in (1, NUM_UPDATES):
@@ -98,7 +106,7 @@ def main():
                     ("target_params", reference.target, reference.target_slope),
                 ):
                     flat, _ = jax.flatten_util.ravel_pytree(reference.arrays(layers, slope))
-                    arrays[f"{activation}/{name}/{number}"] = flat
+                    arrays[f"{case}/{name}/{number}"] = flat
     np.savez(GOLDEN, **{name: np.asarray(x) for name, x in arrays.items()})
 
 

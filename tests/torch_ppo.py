@@ -50,6 +50,7 @@ class TorchPPO:
         self.std = torch.nn.Parameter(torch.tensor(np.array(params["std"])))
         parameters = [*self.actor.parameters(), *self.critic.parameters(), self.std]
         self.parameters = parameters
+        self.returns = []  # of all rollouts
         self.optimizer = torch.optim.Adam(
             parameters, lr=CONFIG.learning_rate, eps=self.config.adam_eps
         )
@@ -104,12 +105,19 @@ class TorchPPO:
     @torch.no_grad()
     def bootstrapped(self, steps, ended):
         """Returns of TD(lambda) and generalised advantages."""
+        discounts = self.config.discount * steps.discount
+        reward = steps.reward
+        if self.config.normalize_rewards:
+            later = 0.0
+            for t in reversed(range(len(ended))):
+                later = reward[t] + discounts[t] * (0.0 if ended[t] else later)
+                self.returns.append(later)
+            reward = reward / torch.stack(self.returns).std(correction=0)
         advantage, later = [], 0.0
         value, next_value = self.critic(steps.obs)[:, 0], self.critic(steps.next_obs)[:, 0]
         for t in reversed(range(len(ended))):
-            discount = self.config.discount * steps.discount[t]
-            delta = steps.reward[t] + discount * next_value[t] - value[t]
-            later = delta + discount * self.config.gae_lambda * (0.0 if ended[t] else later)
+            delta = reward[t] + discounts[t] * next_value[t] - value[t]
+            later = delta + discounts[t] * self.config.gae_lambda * (0.0 if ended[t] else later)
             advantage.insert(0, later)
         advantage = torch.stack(advantage)
         return advantage + value, advantage

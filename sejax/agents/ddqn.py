@@ -93,13 +93,11 @@ class DuelingDDQNConfig(DDQNConfig):
 
 @dataclass(frozen=True, kw_only=True)
 class DQNConfig(DDQNConfig):
-    """DQN: no double Q-learning, clipped errors, a target network that is copied now and then.
-
-    Small and quick, for tasks of a few thousand steps: see docs/agents.md.
-    """
+    """DQN: without double Q-learning, and with an epsilon that falls by steps."""
 
     double: bool = False
-    loss: str = option("huber", one_of(LOSSES))
+    epsilon_min: float = 0.05
+    exploration_steps: int | None = 1000
 
 
 @struct.dataclass

@@ -9,7 +9,6 @@ appendix, table of PPO; `docs/reference.md` 4.5.
 """
 
 import functools
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
@@ -22,9 +21,8 @@ from jaxtyping import Array, Float, Int
 
 from sejax.agents import flat
 from sejax.agents.agent import Agent, AgentOptions, traced
-from sejax.agents.ddqn import select_action
 from sejax.agents.memory import Rollout, rollout_memory
-from sejax.agents.replay import Transition
+from sejax.agents.policies import SOFTMAX, Distribution, gaussian
 from sejax.errors import require
 from sejax.networks import ACTIVATIONS, MLP, narrow
 from sejax.options import MOST_LAYERS, counts, fraction, not_negative, one_of, option, positive
@@ -39,12 +37,14 @@ class PPOConfig(AgentOptions):
     """PPO (clip) for discrete and continuous actions (paper, appendix, table of PPO).
 
     The defaults are the paper's for MountainCarContinuous, whose RNs add `action_repeat=5`.
-    Whoever has few steps takes settings like those below (measured: `docs/agents.md`).
+    Whoever has few steps takes settings like those below, which solve CartPole in some 4,000 steps
+    (`docs/agents.md`, as all settings of `preset=best`).
 
     Example:
       >>> quick = PPOConfig(
-      ...     advantages="gae", rollout_steps=128, num_minibatches=4, epochs=10,
-      ...     learning_rate=2e-3, max_grad_norm=0.5, adam_eps=1e-5, activation="tanh",
+      ...     advantages="gae", normalize_rewards=True, rollout_steps=128, num_minibatches=4,
+      ...     epochs=10, activation="tanh", learning_rate=2e-3, gae_lambda=0.9, clip_ratio=0.1,
+      ...     value_weight=0.5, max_grad_norm=0.5, adam_eps=1e-5,
       ... )
     """
 
@@ -69,6 +69,8 @@ class PPOConfig(AgentOptions):
     clip_ratio: float = option(0.2, positive("the agent would not move"), traced=True)
     value_weight: float = option(1.0, not_negative(), traced=True)
     entropy_weight: float = option(0.01, not_negative(), traced=True)
+    # Divides rewards by the running std of returns, with advantages=gae.
+    normalize_rewards: bool = False
     # Longest gradient, which a longer one is shortened to.
     max_grad_norm: float | None = option(None, positive("the agent would not move"))
     adam_eps: float = option(1e-8, positive("it keeps Adam from dividing by 0"))
@@ -112,24 +114,8 @@ class PPOState(struct.PyTreeNode):
 
     params: Float[Array, " num_params"]
     opt_state: optax.OptState
+    return_sums: Float[Array, "3"]  # of 1, returns and their squares; 0 if nobody needs them
     hparams: Any  # traced options, and hidden_size in use or None
-
-
-class Distribution(NamedTuple):
-    """A distribution of actions, given the actor's outputs and the Gaussian's std.
-
-    Attributes:
-      sample: `(key, outputs, std) -> action`, for one observation.
-      mode: `outputs -> action`, for one observation.
-      evaluate: `(outputs, std, action) -> (log_prob, entropy)`, for `[outputs, batch]` and a batch
-        of actions; both `[batch]`, in nats.
-      env_action: `action -> action` as the world takes it.
-    """
-
-    sample: Callable[[Array, Array, Array], Array]
-    mode: Callable[[Array], Array]
-    evaluate: Callable[[Array, Array, Array], tuple[Array, Array]]
-    env_action: Callable[[Array], Array]
 
 
 @functools.cache
@@ -192,6 +178,7 @@ def make_ppo(
         return PPOState(
             params=params,
             opt_state=optimizer.init(params),
+            return_sums=jnp.zeros(3),
             hparams=jax.tree.map(jnp.float32, hparams),
         )
 
@@ -206,16 +193,15 @@ def make_ppo(
         whereas this loop runs only when some lane's rollout is full.
         """
 
-        def phase(carry: tuple[Array, Array, Any]) -> tuple[Array, Array, Any]:
-            _, params, opt_state = carry
+        def phase(carry: tuple[Array, PPOState]) -> tuple[Array, PPOState]:
+            _, state = carry
             # XLA would move what does not depend on the carry out of the loop, into every step.
-            inputs = jax.lax.optimization_barrier((key, params, rollout.rows))
-            return jnp.bool_(False), *learn(*inputs, opt_state, state.hparams)
+            inputs = (key, state.params, rollout.rows)
+            own_key, params, rows = jax.lax.optimization_barrier(inputs)
+            state, full = state.replace(params=params), rollout._replace(rows=rows)
+            return jnp.bool_(False), learn(own_key, state, full)
 
-        _, params, opt_state = jax.lax.while_loop(
-            lambda carry: carry[0], phase, (rollout.is_full, state.params, state.opt_state)
-        )
-        return state.replace(params=params, opt_state=opt_state)
+        return jax.lax.while_loop(lambda carry: carry[0], phase, (rollout.is_full, state))[1]
 
     return Agent(
         init=init,
@@ -324,29 +310,31 @@ def make_learning_phase(
     optimizer: optax.GradientTransformation,
     obs_dim: int,
     is_discrete: bool,
-) -> Callable[[Array, Array, Array, Any, Any], tuple[Array, Any]]:
-    """Builds `learn(key, params, rows, opt_state, hparams) -> (params, opt_state)`.
+) -> Callable[[Array, PPOState, Rollout], PPOState]:
+    """Builds `learn(key, state, rollout) -> state`, a learning phase.
 
-    A learning phase on a rollout's `rows`: `config.epochs` passes over it, each of
-    `config.num_minibatches` Adam steps. A rollout that these do not divide leaves some steps out of
-    each pass.
+    It passes `config.epochs` times over the rollout, each time in `config.num_minibatches` Adam
+    steps. A rollout that these do not divide leaves some steps out of each pass.
     """
     unflatten = networks.unflatten
 
-    def prepared(tree: Any, rollout: Rollout, hp: Any) -> Batch:
-        steps = rollout.transitions(obs_dim, is_discrete)
+    def prepared(state: PPOState, rollout: Rollout) -> tuple[Batch, Array]:
+        """The rollout as it is learned from, and the sums over all returns so far."""
+        hp, tree, sums = state.hparams, unflatten(state.params), state.return_sums
+        steps, ended = rollout.transitions(obs_dim, is_discrete), rollout.ended
         # These parameters have made the whole rollout.
         old_log_prob, _, value = networks.evaluate(tree, steps.obs, steps.action)
-        advantage = None
-        if config.advantages == "gae":
-            next_value = networks.critic(tree, steps.next_obs)
-            advantage = generalized_advantages(
-                steps, rollout.ended, value, next_value, hp.discount, hp.gae_lambda
-            )
-            returns = advantage + value
-        else:
-            returns = normalized(discounted_returns(steps.reward, rollout.ended, hp.discount))
-        return Batch(steps.obs, steps.action, old_log_prob, advantage, returns)
+        if config.advantages == "monte_carlo":
+            returns = normalized(discounted_returns(steps.reward, ended, hp.discount))
+            return Batch(steps.obs, steps.action, old_log_prob, None, returns), sums
+        decay = hp.discount * steps.discount
+        reward = steps.reward
+        if config.normalize_rewards:
+            sums = sums + power_sums(discounted_sums(reward, decay, ended))
+            reward = reward / std_of(sums)
+        next_value = networks.critic(tree, steps.next_obs)
+        advantage = generalized_advantages(reward, decay, ended, value, next_value, hp.gae_lambda)
+        return Batch(steps.obs, steps.action, old_log_prob, advantage, advantage + value), sums
 
     def loss_fn(tree: Any, batch: Batch, hp: Any) -> Array:
         log_prob, entropy, value = networks.evaluate(tree, batch.obs, batch.action)
@@ -356,9 +344,10 @@ def make_learning_phase(
             advantage = normalized(batch.advantage)
         return ppo_loss(log_prob, entropy, value, batch.old_log_prob, advantage, batch.returns, hp)
 
-    def learn(key: Array, params: Array, rows: Array, opt_state: Any, hp: Any) -> tuple[Array, Any]:
-        batch = prepared(unflatten(params), Rollout(rows, jnp.bool_(True)), hp)
-        order = shuffled(key, config.epochs, config.num_minibatches, rows.shape[0])
+    def learn(key: Array, state: PPOState, rollout: Rollout) -> PPOState:
+        hp = state.hparams
+        batch, return_sums = prepared(state, rollout)
+        order = shuffled(key, config.epochs, config.num_minibatches, batch.returns.size)
 
         def adam_step(number: Array, carry: tuple[Array, Any]) -> tuple[Array, Any]:
             params, opt_state = carry
@@ -372,7 +361,10 @@ def make_learning_phase(
             return jnp.maximum(moved, networks.least_params), opt_state
 
         num_updates = config.epochs * config.num_minibatches
-        return jax.lax.fori_loop(0, num_updates, adam_step, (params, opt_state))
+        params, opt_state = jax.lax.fori_loop(
+            0, num_updates, adam_step, (state.params, state.opt_state)
+        )
+        return state.replace(params=params, opt_state=opt_state, return_sums=return_sums)
 
     return learn
 
@@ -398,34 +390,43 @@ def shuffled(
 
 
 def generalized_advantages(
-    steps: Transition,
+    reward: Float[Array, " steps"],
+    decay: Float[Array, " steps"],
     ended: Float[Array, " steps"],
     value: Float[Array, " steps"],
     next_value: Float[Array, " steps"],
-    discount: Array | float,
     gae_lambda: Array | float,
 ) -> Float[Array, " steps"]:
-    r"""Advantages :math:`A_t = \delta_t + \gamma d_t \lambda A_{t+1}` within each episode.
+    r"""Advantages :math:`A_t = \delta_t + \gamma_t \lambda A_{t+1}` within each episode.
 
-    .. math:: \delta_t = r_t + \gamma d_t V(s'_t) - V(s_t)
+    .. math:: \delta_t = r_t + \gamma_t V(s'_t) - V(s_t)
 
-    where :math:`d_t` is the transition's own discount: 0 where the episode terminated; at a time
-    limit, and where the rollout is cut, the critic's value of the next state stands for what would
-    have come.
+    At a time limit, and where the rollout is cut, the critic's value of the next state stands for
+    what would have come.
 
     Args:
-      steps: `reward` and `discount` of each step.
+      reward: in units of the critic's values.
+      decay: gamma times the transition's own discount, which is 0 where the episode terminated.
       ended: 1 at the last step of an episode, terminated or truncated, else 0.
-      value: V(s), in units of the reward.
-      next_value: V(s'), likewise.
-      discount: gamma.
+      value: V(s).
+      next_value: V(s').
       gae_lambda: lambda; 0 has the least variance, 1 the least bias.
 
     Source: Schulman et al. (2016), eq. 11 to 16.
     """
-    decay = discount * steps.discount
-    delta = steps.reward + decay * next_value - value
+    delta = reward + decay * next_value - value
     return discounted_sums(delta, gae_lambda * decay, ended)
+
+
+def power_sums(x: Float[Array, " steps"]) -> Float[Array, "3"]:
+    """How many numbers there are, their sum, and that of their squares."""
+    return jnp.stack([jnp.float32(x.size), jnp.sum(x), jnp.sum(x**2)])
+
+
+def std_of(power_sums: Float[Array, "3"]) -> Float[Array, ""]:
+    """Standard deviation, and at least 1e-4, which leaves rewards finite that are always 0."""
+    count, total, squares = power_sums
+    return jnp.sqrt(jnp.maximum(squares / count - (total / count) ** 2, 1e-8))
 
 
 def discounted_returns(
@@ -498,56 +499,3 @@ def ppo_loss(
     surrogate = jnp.mean(jnp.minimum(ratio * advantage, clipped * advantage))
     value_error = jnp.mean((value - returns) ** 2)
     return -surrogate + hp.value_weight * value_error - hp.entropy_weight * jnp.mean(entropy)
-
-
-def _sample_softmax(key: Array, outputs: Float[Array, " actions"], std: Array) -> Int[Array, ""]:
-    return jax.random.categorical(key, outputs).astype(jnp.int32)
-
-
-def _softmax_mode(outputs: Float[Array, " actions"]) -> Int[Array, ""]:
-    return jnp.argmax(outputs).astype(jnp.int32)
-
-
-def _evaluate_softmax(
-    outputs: Float[Array, "actions batch"], std: Array, action: Int[Array, " batch"]
-) -> tuple[Float[Array, " batch"], Float[Array, " batch"]]:
-    log_probs = jax.nn.log_softmax(outputs, axis=0)
-    entropy = -jnp.sum(jnp.exp(log_probs) * log_probs, axis=0)
-    return select_action(log_probs, action), entropy
-
-
-SOFTMAX = Distribution(
-    sample=_sample_softmax,
-    mode=_softmax_mode,
-    evaluate=_evaluate_softmax,
-    env_action=lambda action: action,
-)
-
-
-def gaussian(max_action: float) -> Distribution:
-    """Independent normal actions with mean `max_action * tanh(outputs)` and a given std.
-
-    Differs: the authors' mean is `tanh(outputs)`, which cannot reach the whole range of a task
-    whose largest action is not 1, such as Pendulum. The std is in units of the action, as theirs.
-
-    Source: `docs/reference.md` 4.5.
-    """
-
-    def mode(outputs: Float[Array, "action_dim *batch"]) -> Float[Array, "action_dim *batch"]:
-        return max_action * jnp.tanh(outputs)
-
-    def sample(key: Array, outputs: Array, std: Array) -> Float[Array, " action_dim"]:
-        return mode(outputs) + std * jax.random.normal(key, outputs.shape)
-
-    def evaluate(
-        outputs: Float[Array, "action_dim batch"], std: Array, action: Array
-    ) -> tuple[Float[Array, " batch"], Float[Array, " batch"]]:
-        standardized = (action - mode(outputs)) / std[:, None]
-        log_scale = jnp.sum(jnp.log(std) + 0.5 * math.log(2 * math.pi))
-        log_prob = -0.5 * jnp.sum(standardized**2, axis=0) - log_scale
-        return log_prob, jnp.broadcast_to(log_scale + 0.5 * std.size, log_prob.shape)
-
-    def env_action(action: Float[Array, " action_dim"]) -> Float[Array, " action_dim"]:
-        return jnp.clip(action, -max_action, max_action)
-
-    return Distribution(sample=sample, mode=mode, evaluate=evaluate, env_action=env_action)

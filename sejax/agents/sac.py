@@ -44,7 +44,8 @@ _MIN_LOG_STD, _MAX_LOG_STD = -20.0, 2.0  # of the Gaussian, as in the authors' c
 class SACConfig(AgentOptions):
     """SAC's hyperparameters; the defaults are those of Haarnoja et al. (2018), table 1.
 
-    Differs: the buffer holds 100,000 steps where the authors' holds a million.
+    Differs: the buffer holds 100,000 steps where the authors' holds a million. Christodoulou (2019)
+    has a target entropy of 0.98 of the largest, with which SAC does not learn CartPole.
     """
 
     actions: ClassVar[tuple[str, ...]] = ("discrete", "continuous")
@@ -67,8 +68,8 @@ class SACConfig(AgentOptions):
     init_alpha: float = option(1.0, positive("it is learned as a logarithm"), traced=True)
     # Of actions in [-1, 1], in nats for each dimension.
     target_entropy: float = option(-1.0, finite("the temperature must settle"), traced=True)
-    # Of discrete actions, as a fraction of the largest, log |A|.
-    target_entropy_fraction: float = option(0.98, fraction(), traced=True)
+    # Of discrete actions, as a fraction of the largest, log |A|: see docs/agents.md.
+    target_entropy_fraction: float = option(0.2, fraction(), traced=True)
 
     def make(self, task: Any) -> Agent:
         """The agent for a task's observations and actions."""
@@ -112,10 +113,10 @@ class Policy:
       critic_inputs: how many numbers besides the observation's.
       critic_outputs: of each critic.
       target_entropy: `hparams -> []`, in nats.
-      draw: `(key, batch) -> noise`, the randomness of `expected`.
-      sample: `(key, outputs) -> action` of the policy, for one observation.
+      draw: `(key, batch) -> LearningNoise` for so many columns.
+      sample: `(key, outputs, is_uniform) -> action` of the policy, or a uniform one, for one
+        observation.
       best: `outputs -> action` without any randomness.
-      warm_up: `key -> action`, uniformly random.
       q_values: `(critics, obs, action) -> [2, batch]`, of actions that were taken.
       expected: `(critics, obs, outputs, noise) -> (q_value, entropy)`, `[batch]` each: the lesser
         critic's value and the entropy, in expectation over the policy or for a draw of it.
@@ -126,10 +127,9 @@ class Policy:
     critic_inputs: int
     critic_outputs: int
     target_entropy: Callable[[Any], Array]
-    draw: Callable[[Array, int], Array | None]
-    sample: Callable[[Array, Array], Array]
+    draw: Callable[[Array, int], LearningNoise]
+    sample: Callable[[Array, Array, Array], Array]
     best: Callable[[Array], Array]
-    warm_up: Callable[[Array], Array]
     q_values: Callable[[Critics, Array, Array], Array]
     expected: Callable[[Critics, Array, Array, Array | None], tuple[Array, Array]]
     env_action: Callable[[Array], Array]
@@ -184,12 +184,10 @@ def _make_agent(config: SACConfig, obs_dim: int, policy: Policy) -> Agent:
         outputs = networks.actor(networks.unflatten(state.params), obs)
         if not explore:
             return policy.best(outputs)
-        key_policy, key_warm_up = jax.random.split(key)
-        action = policy.sample(key_policy, outputs)
-        return jnp.where(state.is_warming_up, policy.warm_up(key_warm_up), action)
+        return policy.sample(key, outputs, state.is_warming_up)
 
     def update(key: Array, state: SACState, batch: Transition) -> SACState:
-        return learn(state, batch, draw_learning_noise(key, policy, batch.reward.size))
+        return learn(state, batch, policy.draw(key, batch.reward.size))
 
     return Agent(
         init=init,
@@ -353,11 +351,6 @@ def make_learning_step(
     return learn
 
 
-def draw_learning_noise(key: Array, policy: Policy, batch: int) -> LearningNoise:
-    """The random numbers of a learning step on so many columns."""
-    return LearningNoise(*(policy.draw(key, batch) for key in jax.random.split(key)))
-
-
 def lesser(q_values: Float[Array, "2 *values"]) -> Float[Array, "*values"]:
     """The lesser of the two critics' values.
 
@@ -373,8 +366,13 @@ def lesser(q_values: Float[Array, "2 *values"]) -> Float[Array, "*values"]:
 def gaussian_policy(action_dim: int, max_action: float) -> Policy:
     """Continuous actions: the tanh of a Gaussian whose mean and log std are the outputs."""
 
-    def best(outputs: Array) -> Array:
-        return jnp.tanh(outputs[:action_dim])
+    def draw(key: Array, batch: int) -> LearningNoise:
+        return LearningNoise(*jax.random.normal(key, (2, action_dim, batch)))
+
+    def sample(key: Array, outputs: Array, is_uniform: Array) -> Array:
+        noise = jax.random.normal(key, (action_dim,))
+        uniform = jax.lax.erf(noise / math.sqrt(2))  # its distribution function, times 2, less 1
+        return jnp.where(is_uniform, uniform, squashed_gaussian(outputs, noise)[0])
 
     def q_values(critics: Critics, obs: Array, action: Array) -> Array:
         return critics(jnp.concatenate([obs, action]))[:, 0]
@@ -390,12 +388,9 @@ def gaussian_policy(action_dim: int, max_action: float) -> Policy:
         critic_inputs=action_dim,
         critic_outputs=1,
         target_entropy=lambda hparams: hparams.target_entropy * action_dim,
-        draw=lambda key, batch: jax.random.normal(key, (action_dim, batch)),
-        sample=lambda key, outputs: squashed_gaussian(
-            outputs, jax.random.normal(key, (action_dim,))
-        )[0],
-        best=best,
-        warm_up=lambda key: jax.random.uniform(key, (action_dim,), minval=-1.0),
+        draw=draw,
+        sample=sample,
+        best=lambda outputs: jnp.tanh(outputs[:action_dim]),
         q_values=q_values,
         expected=expected,
         env_action=lambda action: max_action * action,
@@ -424,6 +419,10 @@ def squashed_gaussian(
 def softmax_policy(num_actions: int) -> Policy:
     """Discrete actions with logits as outputs; critics have an output for each action."""
 
+    def sample(key: Array, outputs: Array, is_uniform: Array) -> Array:
+        logits = jnp.where(is_uniform, 0.0, outputs)
+        return jax.random.categorical(key, logits).astype(jnp.int32)
+
     def q_values(critics: Critics, obs: Array, action: Array) -> Array:
         return jax.vmap(select_action, (0, None))(critics(obs), action)
 
@@ -440,10 +439,9 @@ def softmax_policy(num_actions: int) -> Policy:
         critic_inputs=0,
         critic_outputs=num_actions,
         target_entropy=lambda hparams: hparams.target_entropy_fraction * math.log(num_actions),
-        draw=lambda key, batch: None,
-        sample=lambda key, outputs: jax.random.categorical(key, outputs).astype(jnp.int32),
+        draw=lambda key, batch: LearningNoise(None, None),
+        sample=sample,
         best=lambda outputs: jnp.argmax(outputs).astype(jnp.int32),
-        warm_up=lambda key: jax.random.randint(key, (), 0, num_actions),
         q_values=q_values,
         expected=expected,
         env_action=lambda action: action,

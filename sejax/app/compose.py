@@ -30,7 +30,8 @@ CONF_DIR = Path(__file__).parents[1] / "conf"
 _DEFAULT_ENV, _DEFAULT_PROXY, _DEFAULT_AGENT = "cartpole", "se", "ddqn"
 _DEFAULT_OBJECTIVE = "max_reward"
 _GROUPS = tuple(plugins.GROUPS)
-_INTERNAL = ("base", "tuned", "tuned_agent", "tuned_es")  # groups that no word may choose
+# Groups that no word may choose.
+_INTERNAL = ("base", "tuned", "tuned_agent", "tuned_es", "tuned_objective")
 _CHOICE = re.compile(rf"(?:\+\+?)?({'|'.join(_GROUPS)}|preset)=(.*)", re.DOTALL)
 
 
@@ -297,7 +298,7 @@ def translate_hydra_error(error: Exception, overrides: Iterable[str] = ()) -> Co
             return unknown_name(group, got, presets.names())
     key = _between(text, "Could not override '", "'")
     if key:
-        return _unknown_field(key, families.in_one_choice(list(overrides)))
+        return _unknown_field(key, overrides)
     return ConfigError(_first_line(error))
 
 
@@ -346,10 +347,9 @@ def _known_fields(chosen: dict[str, list[str]]) -> list[str]:
         for choice in dict.fromkeys([*plugins.names(group), *chosen.get(group, ())]):
             try:
                 if group == "agent" and families.JOINT in choice:
-                    node = families.node(choice, shares=True)
-                    known += serialize.flatten(node)
-                    continue
-                known += [f"{group}.{name}" for name in plugins.defaults(group, choice)]
+                    known += serialize.flatten(families.node(choice, shares=True))
+                else:
+                    known += [f"{group}.{name}" for name in plugins.defaults(group, choice)]
             except ConfigError:
                 continue
     for training in build.TRAININGS:

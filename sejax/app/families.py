@@ -22,7 +22,7 @@ from sejax.families import FamiliesConfig
 
 JOINT = "+"  # between the agents of a choice, and after a single one
 _SHARED = tuple(serialize.to_plain(FamiliesConfig()))
-_CHOICE = re.compile(r"(\+{0,2})agents?=")
+_CHOICE = re.compile(r"agents?=")
 _KEY = re.compile(r"\w[\w-]*")
 
 
@@ -149,8 +149,7 @@ def in_one_choice(words: Sequence[str]) -> list[str]:
 
 def _in_one_choice(word: str) -> str | None:
     """A word, which may choose agents; None for no agents, which chooses nothing."""
-    match = _CHOICE.match(word)
-    if match is None:
+    if not _CHOICE.match(word):
         return word
     try:
         override = OverridesParser.create().parse_override(word)
@@ -162,8 +161,7 @@ def _in_one_choice(word: str) -> str | None:
     values = value.list if isinstance(value, ChoiceSweep) else [value]
     if group == "agent" and not any(isinstance(value, list) for value in values):
         return word
-    choices = [_choice_of(group, value) for value in values]
-    return f"{match[1]}agent={','.join(choices)}"
+    return f"agent={','.join(_choice_of(group, value) for value in values)}"
 
 
 def _choice_of(group: str, value: Any) -> str:

@@ -20,8 +20,8 @@ from sejax.statistics import performance_profile
 # Okabe and Ito's palette, which those with any kind of colour blindness can tell apart.
 REAL, VARIED, FIXED, BEST, SOLVED = "#0072B2", "#E69F00", "#009E73", "#000000", "#B03A73"
 AGENT_NAMES = {"ddqn": "DDQN", "dueling_ddqn": "Dueling DDQN", "td3": "TD3",
-               "td3_discrete": "discrete TD3", "ppo": "PPO", "q_learning": "Q-learning",
-               "sarsa": "SARSA"}  # fmt: skip
+               "td3_discrete": "discrete TD3", "ppo": "PPO", "sac": "SAC", "dqn": "DQN",
+               "q_learning": "Q-learning", "sarsa": "SARSA"}  # fmt: skip
 STYLE: Any = {
     "font.size": 10, "axes.spines.top": False, "axes.spines.right": False, "legend.frameon": False,
 }  # fmt: skip

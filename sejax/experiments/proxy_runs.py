@@ -5,7 +5,7 @@ run directory of its own: one that was stopped goes on, and a finished one is ke
 """
 
 import dataclasses
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -50,8 +50,23 @@ def configs_of_runs(config: Any, num_runs: int, folder: Path, at_once: int = 1) 
     return configs
 
 
-def learn_all(configs: list[Any], option: str = "work") -> pd.DataFrame:
+def run_to_end(config: Any, directory: Any, chunks: Any) -> pd.DataFrame:
+    """Learns a run, or what is left of it, in its folder; its curve."""
+    from sejax.app import session
+
+    session.run(config, directory, chunks)
+    return pd.read_csv(directory.metrics)
+
+
+def learn_all(
+    configs: list[Any], option: str = "work", learn: Callable[..., pd.DataFrame] = run_to_end
+) -> pd.DataFrame:
     """Curves of all runs, in rows with the columns of `metrics.csv`; learns what is not there.
+
+    Args:
+      configs: of the runs.
+      option: that names the folder where they are, for messages.
+      learn: `(config, directory, chunks) -> curve` of one run, as from `budgets.timed`.
 
     Raises:
       ConfigError: if a folder, below that which `option` names, holds a run of other settings, or
@@ -63,8 +78,7 @@ def learn_all(configs: list[Any], option: str = "work") -> pd.DataFrame:
     curves = []
     for config in configs:
         with run_directory.open_for(config, f"Set {option}=DIR.") as directory:
-            session.run(config, directory, chunks)
-            curve = pd.read_csv(directory.metrics)
+            curve = learn(config, directory, chunks)
         print(f"{config.run_dir}: {_said(curve, chunks.program.solved_score)}", flush=True)
         curves.append(curve)
     return pd.concat(curves, ignore_index=True)

@@ -164,9 +164,8 @@ def make_search(mirrored: bool, population: int, devices: int | None) -> Search:
     overrides = [f"es.mirrored={mirrored}", f"es.population_size={population}"]
     config = sejax.config([*SETTINGS, *overrides, "stop_when_solved=true"])
     config = dataclasses.replace(config, devices=devices)
-    parts = config.parts()
-    agent = dataclasses.replace(parts["agent"], cpu_lanes=CPU_LANES)
-    program = make_program(**parts | {"agent": agent, "es": AnyNES(nes=config.es)})
+    lanes = CPU_LANES if jax.default_backend() == "cpu" else None
+    program = make_program(**config.parts() | {"lanes": lanes, "es": AnyNES(nes=config.es)})
 
     def init(keys: Any, step_sizes: Any, transform: Any) -> Any:
         state = program.init(keys)

@@ -107,7 +107,7 @@ class RecordedRun(NamedTuple):
 def make_recorded_run(config: Any) -> RecordedRun:
     """The NES run of a configuration, from any seed: compiled once for all of them."""
     from sejax.bilevel import make_program
-    from sejax.evaluation import make_evaluator, tested_throughout
+    from sejax.evaluation import lanes_on_cpu, make_evaluator, tested_throughout
 
     program = make_program(**config.parts())
     agent, proxy, training = program.agent, program.proxy, config.training
@@ -116,7 +116,7 @@ def make_recorded_run(config: Any) -> RecordedRun:
     evaluate = make_evaluator(agent, proxy, proxy.task, training, record=True)
     evaluate_all = spread_over_devices(
         lambda key, candidate: evaluate(key, proxy.params(program.unravel(candidate))),
-        config.devices, config.lanes, agent.cpu_lanes,
+        config.devices, config.lanes, lanes_on_cpu(agent, training),
     )  # fmt: skip
 
     def generation(state: Any) -> Any:

@@ -6,6 +6,7 @@ group is a piece that is computed once.
 
 import dataclasses
 import functools
+import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple, Self
@@ -82,6 +83,7 @@ class Measure:
     # (results [agent, ...], drawn hyperparameters [agent]) -> rows, with a column `agent`
     to_table: Callable[[Any, dict[str, np.ndarray]], pd.DataFrame]
     say: Callable[[pd.DataFrame], str]  # of the rows of a group, for people
+    is_timed: bool = False  # whether rows have a column `cpu_s`, what an agent has cost
 
 
 def train_groups(
@@ -127,9 +129,13 @@ def train(
     keys = jax.numpy.concatenate([jax.random.split(key, num_agents) for key in own_keys])
     params = jax.tree.map(lambda *each: np.stack(each), *[world.groups[i].params for i in padded])
     active = np.repeat(np.arange(at_once) < len(places), num_agents)
+    if measure.is_timed:  # without compilation
+        jax.block_until_ready(program(keys, params, np.zeros_like(active)))
+    started = time.process_time()
     result = jax.device_get(program(keys, params, active))
+    cost = {"cpu_s": (time.process_time() - started) / active.sum()} if measure.is_timed else {}
     return [
-        measure.to_table(*jax.tree.map(lambda x, i=i: x[i : i + num_agents], result))
+        measure.to_table(*jax.tree.map(lambda x, i=i: x[i : i + num_agents], result)).assign(**cost)
         for i in range(0, len(places) * num_agents, num_agents)
     ]
 
@@ -144,6 +150,8 @@ def make_program(
     The leaves of `params` are `[group, ...]`; the agents of a group follow one another. Nothing is
     computed for an agent that is not active.
     """
+    from sejax.evaluation import lanes_on_cpu
+
     made = sejax.make_agent(agent, task, exploration, hparams == "varied")
     run = measure.make_run(made, env, task, training)
 
@@ -156,7 +164,7 @@ def make_program(
             return run(key, mine, active), made.drawn_values(key)
 
         groups = np.repeat(np.arange(num_groups), keys.shape[0] // num_groups)
-        spread = spread_over_devices(one, devices, cpu_lanes=made.cpu_lanes)
+        spread = spread_over_devices(one, devices, cpu_lanes=lanes_on_cpu(made, training))
         return spread(keys, jax.numpy.asarray(groups), active)
 
     return jax.jit(program)

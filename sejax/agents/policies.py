@@ -1,0 +1,84 @@
+"""Distributions of actions that a network's outputs stand for: a softmax, and a Gaussian.
+
+Source: `docs/reference.md` 4.5.
+"""
+
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from sejax.agents.ddqn import select_action
+
+
+class Distribution(NamedTuple):
+    """A distribution of actions, given the actor's outputs and the Gaussian's std.
+
+    Attributes:
+      sample: `(key, outputs, std) -> action`, for one observation.
+      mode: `outputs -> action`, for one observation.
+      evaluate: `(outputs, std, action) -> (log_prob, entropy)`, for `[outputs, batch]` and a batch
+        of actions; both `[batch]`, in nats.
+      env_action: `action -> action` as the world takes it.
+    """
+
+    sample: Callable[[Array, Array, Array], Array]
+    mode: Callable[[Array], Array]
+    evaluate: Callable[[Array, Array, Array], tuple[Array, Array]]
+    env_action: Callable[[Array], Array]
+
+
+def _sample_softmax(key: Array, outputs: Float[Array, " actions"], std: Array) -> Int[Array, ""]:
+    return jax.random.categorical(key, outputs).astype(jnp.int32)
+
+
+def _softmax_mode(outputs: Float[Array, " actions"]) -> Int[Array, ""]:
+    return jnp.argmax(outputs).astype(jnp.int32)
+
+
+def _evaluate_softmax(
+    outputs: Float[Array, "actions batch"], std: Array, action: Int[Array, " batch"]
+) -> tuple[Float[Array, " batch"], Float[Array, " batch"]]:
+    log_probs = jax.nn.log_softmax(outputs, axis=0)
+    entropy = -jnp.sum(jnp.exp(log_probs) * log_probs, axis=0)
+    return select_action(log_probs, action), entropy
+
+
+SOFTMAX = Distribution(
+    sample=_sample_softmax,
+    mode=_softmax_mode,
+    evaluate=_evaluate_softmax,
+    env_action=lambda action: action,
+)
+
+
+def gaussian(max_action: float) -> Distribution:
+    """Independent normal actions with mean `max_action * tanh(outputs)` and a given std.
+
+    Differs: the authors' mean is `tanh(outputs)`, which cannot reach the whole range of a task
+    whose largest action is not 1, such as Pendulum. The std is in units of the action, as theirs.
+
+    Source: `docs/reference.md` 4.5.
+    """
+
+    def mode(outputs: Float[Array, "action_dim *batch"]) -> Float[Array, "action_dim *batch"]:
+        return max_action * jnp.tanh(outputs)
+
+    def sample(key: Array, outputs: Array, std: Array) -> Float[Array, " action_dim"]:
+        return mode(outputs) + std * jax.random.normal(key, outputs.shape)
+
+    def evaluate(
+        outputs: Float[Array, "action_dim batch"], std: Array, action: Array
+    ) -> tuple[Float[Array, " batch"], Float[Array, " batch"]]:
+        standardized = (action - mode(outputs)) / std[:, None]
+        log_scale = jnp.sum(jnp.log(std) + 0.5 * math.log(2 * math.pi))
+        log_prob = -0.5 * jnp.sum(standardized**2, axis=0) - log_scale
+        return log_prob, jnp.broadcast_to(log_scale + 0.5 * std.size, log_prob.shape)
+
+    def env_action(action: Float[Array, " action_dim"]) -> Float[Array, " action_dim"]:
+        return jnp.clip(action, -max_action, max_action)
+
+    return Distribution(sample=sample, mode=mode, evaluate=evaluate, env_action=env_action)
