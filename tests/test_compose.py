@@ -21,7 +21,7 @@ from sejax.es.evosax import ALGORITHMS, EvosaxConfig
 
 composed_with = functools.cache(lambda *overrides: sejax.config(overrides))
 ENVS = ("cartpole", "acrobot")
-PRESETS = ("best", "paper", "paper_performance")
+PRESETS = ("best", "paper", "paper_performance", "soft")
 
 
 def message(*overrides):

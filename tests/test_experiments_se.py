@@ -192,7 +192,7 @@ def test_all_ses_of_a_set_step_at_once(ses):
     env, params = loaded.env, loaded.params
     axes = params.replace(weights=0, max_steps_in_episode=None)
     key = jax.random.key(0)
-    obs, state = env.reset_env(key, params)
+    obs, state = env.reset_env(key, loaded.one(0))
 
     def reward(params):
         return env.step_env(key, state, jax.numpy.int32(1), params)[2]

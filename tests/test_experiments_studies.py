@@ -53,7 +53,7 @@ def save_se(path, *overrides):
 @pytest.fixture(scope="module")
 def se_file(tmp_path_factory):
     path = tmp_path_factory.mktemp("se") / "se.safetensors"
-    return save_se(path, "training.max_steps=60", "agent.init_episodes=0")
+    return save_se(path, "preset=soft", "training.max_steps=60", "agent.init_episodes=0")
 
 
 @pytest.fixture

@@ -180,7 +180,7 @@ def test_ppo_on_ses_is_the_default(env):
 
 
 def test_what_is_tuned_is_known():
-    assert presets.names() == ["best", "paper", "paper_performance"]
+    assert presets.names() == ["best", "paper", "paper_performance", "soft"]
     assert presets.tuned("rn") == [
         "cartpole", "cliff_walking", "halfcheetah", "mountain_car_continuous",
     ]  # fmt: skip

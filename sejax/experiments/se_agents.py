@@ -17,6 +17,8 @@ AGENTS = ("ddqn", "dueling_ddqn", "td3_discrete")
 QUICK_AGENT: Any = {"hidden_size": 2, "batch_size": 16, "num_layers": 1, "init_episodes": 1}
 QUICK_STEPS = 1500
 
+SOFT_SE = "results/soft_ses/cartpole.safetensors"  # with dynamics to look into, as the paper's
+
 
 @dataclass(frozen=True, kw_only=True)
 class SeAgents(Settings):

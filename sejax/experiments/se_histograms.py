@@ -35,7 +35,7 @@ from sejax.agents import replay
 from sejax.agents.memory import Memory, MemoryMaker
 from sejax.experiments import figures, se_agents
 from sejax.experiments.experiment import Experiment
-from sejax.experiments.se_agents import AGENTS
+from sejax.experiments.se_agents import AGENTS, SOFT_SE
 from sejax.experiments.settings import Settings, count, each_of, setting
 from sejax.experiments.tables import as_texts, publish
 from sejax.experiments.worlds import Measure, World, train_groups, training_as_learned
@@ -63,7 +63,7 @@ PAPER_RETURNS = {
 class SeHistograms(Settings):
     name = "se_histograms"
 
-    proxy: str = setting("cartpole", about="SE: a run directory, a file or a shipped name")
+    proxy: str = setting(SOFT_SE, about="SE: a run directory, a file or a shipped name")
     agents: tuple[str, ...] = setting(AGENTS, each_of(AGENTS), about="kinds of agents, a row each")
     num_agents: int = count(10, "agents", quick=3, about="of each kind")
     test_episodes: int = count(10, "episodes", about="of each agent")

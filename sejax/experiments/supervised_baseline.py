@@ -32,7 +32,7 @@ from sejax.errors import require
 from sejax.experiments import figures, se_agents, supervised_models, worlds
 from sejax.experiments.experiment import Experiment
 from sejax.experiments.pieces import stack, unstack
-from sejax.experiments.se_agents import AGENTS
+from sejax.experiments.se_agents import AGENTS, SOFT_SE
 from sejax.experiments.supervised_models import SupervisedBaseline
 from sejax.experiments.tables import as_texts, iqm_columns, iqm_note, iqm_text, publish
 from sejax.experiments.worlds import HPARAMS, World, return_columns
@@ -66,12 +66,14 @@ def load(settings: SupervisedBaseline) -> Any:
     ses = sejax.load_set(settings.proxy, option="proxy", kind="se").first(1)
     require(ses.task.num_states is None and ses.task.num_actions is not None, "proxy",
             "be an SE with vector states and discrete actions", "the agents are made for these",
-            f"one of {ses.task.name}", "proxy=cartpole")  # fmt: skip
-    learned_with = ses.config["agent"]
+            f"one of {ses.task.name}", f"proxy={SOFT_SE}")  # fmt: skip
+    require(ses.env.config.horizon != 1, "proxy", "be an SE whose episodes have several steps",
+            "a supervised model predicts next states", "a bandit", f"proxy={SOFT_SE}")  # fmt: skip
+    learned_with = ses.config["agent"] or {"name": "several agents"}
     require(learned_with["name"] in AGENTS and learned_with.get("action_repeat", 1) == 1,
             "proxy", f"be an SE learned with {', '.join(AGENTS)}, without action repeat", "the "
             "recorded NES runs have its agent, and their every step is a row",
-            f"one learned with {learned_with['name']}", "proxy=cartpole")  # fmt: skip
+            f"one learned with {learned_with['name']}", f"proxy={SOFT_SE}")  # fmt: skip
     return ses
 
 

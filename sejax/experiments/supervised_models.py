@@ -21,7 +21,7 @@ import sejax
 from sejax import plugins
 from sejax.app import build
 from sejax.experiments import se_agents
-from sejax.experiments.se_agents import AGENTS
+from sejax.experiments.se_agents import AGENTS, SOFT_SE
 from sejax.experiments.settings import Settings, count, each_of, setting
 from sejax.experiments.worlds import HPARAMS
 from sejax.options import counts
@@ -36,7 +36,7 @@ class SupervisedBaseline(Settings):
 
     name = "supervised_baseline"
 
-    proxy: str = setting("cartpole", about="SE to compare with, whose settings the NES runs have; "
+    proxy: str = setting(SOFT_SE, about="SE to compare with, whose settings the NES runs have; "
                          "run directory, file or name")  # fmt: skip
     models: int = count(5, "models", quick=2, about="NES runs, and a model for each")
     generations: int = count(25, "generations", quick=3, about="of an NES run")

@@ -31,8 +31,8 @@ def units_of(low: Any, high: Any, obs_dim: int) -> Units:
     A number without bounds stays as it is; some spaces write "none" as a huge number.
 
     Example:
-      >>> units_of([-1.2, -np.inf], [0.6, np.inf], 2).one.tolist()
-      [0.44999998807907104, 1.0]
+      >>> units_of([-1.5, -np.inf], [0.5, np.inf], 2).one.tolist()
+      [0.5, 1.0]
     """
     low, high = (np.broadcast_to(np.asarray(x, np.float32), (obs_dim,)) for x in (low, high))
     bounded = (np.abs(low) < ABSURD) & (np.abs(high) < ABSURD)
