@@ -14,7 +14,7 @@ def main() -> None:
         source = Path(experiments.__path__[0], f"{module.name}.py").read_text()
         if "\nEXPERIMENT = " in source:
             about = ast.get_docstring(ast.parse(source)) or ""
-            print(f"  {module.name:20} {about.partition(chr(10))[0]}")
+            print(f"  {module.name:22} {about.partition(chr(10))[0]}")
 
 
 if __name__ == "__main__":
