@@ -29,14 +29,15 @@ SETTINGS = {
     "best": ["preset=best"],
     "paper": ["preset=paper"],
     "paper_performance": ["preset=paper_performance", "stop_when_solved=false"],
-    # The default with one thing changed; 128 trainings in a generation as there.
-    "threshold": ["proxy.done=threshold"],
-    "unmirrored": ["es.mirrored=false", "es.population_size=128"],
-    "rank": ["es.score_transform=rank", "es.step_size=0.03"],
-    "nes_unnormalized": ["es.score_transform=nes_unnormalized", "es.step_size=0.06"],
-    "snes": ["es=snes", "es.population_size=128", "es.noise_std=0.06"],
-    "open_es": ["es=open_es", "es.population_size=128", "es.noise_std=0.06"],
-    "sep_cma_es": ["es=sep_cma_es", "es.population_size=128", "es.noise_std=0.06"],
+    "soft": ["preset=soft"],
+    # The soft preset with one thing changed; 128 trainings in a generation as there.
+    "threshold": ["preset=soft", "proxy.done=threshold"],
+    "unmirrored": ["preset=soft", "es.mirrored=false", "es.population_size=128"],
+    "rank": ["preset=soft", "es.score_transform=rank", "es.step_size=0.03"],
+    "nes_unnormalized": ["preset=soft", "es.score_transform=nes_unnormalized", "es.step_size=0.06"],
+    "snes": ["preset=soft", "es=snes", "es.population_size=128", "es.noise_std=0.06"],
+    "open_es": ["preset=soft", "es=open_es", "es.population_size=128", "es.noise_std=0.06"],
+    "sep_cma_es": ["preset=soft", "es=sep_cma_es", "es.population_size=128", "es.noise_std=0.06"],
 }
 COLUMNS = ["preset", "seed", "generation", "incumbent_mean", "env_steps_total", "wall_s", "cpu_s"]
 QUICK = ["es.population_size=4", "agent.init_episodes=1", "training.max_steps=1000"]
