@@ -193,16 +193,16 @@ def test_an_agent_of_ones_own_may_be_one_of_several(monkeypatch, tmp_path):
 
 
 def test_sweeps_over_tasks_and_agents_have_the_settings_of_each(tmp_path, monkeypatch):
-    words = ["env=cartpole,acrobot", "agents=[ddqn,ppo],ddqn", "agent=ddqn,[ddqn,ppo]"]
+    words = ["env=cartpole,acrobot", "agents=[ddqn,sac],ddqn", "agent=ddqn,[ddqn,sac]"]
     written = families.in_one_choice(words[:2])
-    assert written == ["env=cartpole,acrobot", "agent=ddqn+ppo,ddqn+"]
-    assert families.in_one_choice(words[2:]) == ["agent=ddqn,ddqn+ppo"]
+    assert written == ["env=cartpole,acrobot", "agent=ddqn+sac,ddqn+"]
+    assert families.in_one_choice(words[2:]) == ["agent=ddqn,ddqn+sac"]
     compose.register("run", written)
     store = ConfigStore.instance()
     for task in ("cartpole", "acrobot"):
         alone = {name: store.load(f"tuned_agent/best/{task}-se-{name}.yaml").node.agent
-                 for name in ("ddqn", "ppo")}  # fmt: skip
-        both = store.load(f"tuned_agent/best/{task}-se-ddqn+ppo.yaml").node.agents
+                 for name in ("ddqn", "sac")}  # fmt: skip
+        both = store.load(f"tuned_agent/best/{task}-se-ddqn+sac.yaml").node.agents
         one = store.load(f"tuned_agent/best/{task}-se-ddqn+.yaml").node.agents
         assert both == alone and one == {"ddqn": alone["ddqn"]}
 
