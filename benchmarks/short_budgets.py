@@ -20,7 +20,7 @@ from sejax.app import presets
 
 BUDGETS = (2000, 5000, 10_000, 20_000)
 ROWS = {
-    "cartpole": ("ddqn", "dqn", "sac"),
+    "cartpole": ("ddqn", "dqn", "sac", "td3_discrete"),
     "acrobot": ("ddqn", "dqn", "sac"),
     "pendulum": ("td3", "sac"),
     "mountain_car_continuous": ("td3", "sac"),

@@ -92,7 +92,8 @@ def test_a_value_that_breaks_its_rule_is_refused_with_the_whole_message(field, v
     [
         {"size": 1}, {"size": 2**31 - 1}, {"episodes": 0}, {"limit": None}, {"limit": 1},
         {"weight": 0}, {"weight": 1e30}, {"rate": 1e-30}, {"rate": 10}, {"share": 0}, {"share": 1},
-        {"decay": 1}, {"decay": 1e-6}, {"goal": -3}, {"kind": "fancy"}, {"free": -1}, {"unruled": NAN},
+        {"decay": 1}, {"decay": 1e-6}, {"goal": -3}, {"kind": "fancy"}, {"free": -1},
+        {"unruled": NAN},
     ],
     ids=str,
 )  # fmt: skip
