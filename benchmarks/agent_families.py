@@ -1,11 +1,11 @@
 """CPU time of one agent step for each family of agents on one core: sejax against eager PyTorch.
 
 Each family trains `--agents` agents for `--steps` steps on a fresh SE. Hyperparameters are the
-paper's: for DDQN those of CartPole, for the others the defaults. Families with a PyTorch reference
-are measured at those of `preset=best` as well, where networks and batches are small. Agents learn
-from the first step on; training never stops early, and a fresh SE hardly ever ends an episode. PPO
-learns when its rollout is full: it trains for a multiple of that many steps, at least two, so that
-acting and learning have their usual shares.
+paper's: for DDQN those of CartPole, for PPO `PPOConfig.paper()`, for the others the defaults.
+Families with a PyTorch reference are measured at those of `preset=best` as well, where networks and
+batches are small. Agents learn from the first step on; training never stops early, and a fresh SE
+hardly ever ends an episode. PPO learns when its rollout is full: it trains for a multiple of that
+many steps, at least two, so that acting and learning have their usual shares.
 
 sejax trains the agents as the commands do, through `spread_over_devices` and with the agent's own
 number of lanes, but on one device. PyTorch trains `--torch-agents` of them one after the other, for
@@ -61,6 +61,8 @@ class Family:
             names = f"env={self.env}", f"agent={self.agent}", f"preset={self.settings}"
             chosen = sejax.config(names)
             agent, proxy = chosen.agent, chosen.proxy
+        elif self.agent == "ppo":
+            agent, proxy = sejax.PPOConfig.paper(), SyntheticConfig()
         else:
             agent, proxy = plugins.configure("agent", {"name": self.agent}), SyntheticConfig()
         agent = replace(agent, init_episodes=0)
@@ -77,6 +79,7 @@ WITH_REFERENCE = [
     Family(agent="ppo", env="cartpole", reference="torch_reference_ppo"),
 ]
 OTHERS = [
+    Family(agent="ppo", env="cartpole", settings="best"),  # generalised advantages, as no reference
     Family(agent="dueling_ddqn", env="cartpole"),
     Family(agent="td3_discrete", env="cartpole"),
     Family(agent="q_learning", env="cliff_walking"),
@@ -86,7 +89,7 @@ FAMILIES = {
     f"{family.agent}, {family.settings}": family
     for family in [
         *WITH_REFERENCE,
-        *(replace(family, settings="best") for family in WITH_REFERENCE),
+        *(replace(family, settings="best") for family in WITH_REFERENCE if family.agent != "ppo"),
         *OTHERS,
     ]
 }

@@ -96,7 +96,7 @@ def run_seed(args: argparse.Namespace, setting: str, seed: int, generations: int
                *(QUICK if args.quick else [])]  # fmt: skip
     subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
     metrics = pd.read_csv(path / "metrics.csv")
-    cpu_s = json.loads((path / "run.json").read_text())["cpu_s_of_last_session"]
+    cpu_s = json.loads((path / "run.json").read_text())["cpu_s"]
     # All of a run's generations are alike enough to share out the CPU time by wall-clock.
     cpu_per_wall = cpu_s / metrics["wall_s"].iloc[-1]
     return metrics.assign(preset=setting, cpu_s=metrics["wall_s"] * cpu_per_wall)[COLUMNS]

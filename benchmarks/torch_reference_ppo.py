@@ -35,6 +35,7 @@ from sejax.agents.ppo import PPOConfig
 from sejax.training import TrainingConfig
 
 MAX_LOG_RATIO = 20.0  # as in sejax.agents.ppo
+AS_IN_THE_PAPER = ("advantages", "rollout_steps", "num_minibatches", "max_grad_norm", "adam_eps")
 
 
 def train(env: SyntheticEnv, hp: PPOConfig, training: TrainingConfig, seed: int) -> TrainResult:
@@ -44,8 +45,12 @@ def train(env: SyntheticEnv, hp: PPOConfig, training: TrainingConfig, seed: int)
       ValueError: if the configurations ask for what is not built here.
     """
     max_steps = training.max_steps
-    if type(hp) is not PPOConfig or training.stop_rule != "never" or max_steps is None:
-        raise ValueError("the reference is of agent=ppo, training.stop_rule=never, "
+    paper = PPOConfig.paper()
+    is_papers = type(hp) is PPOConfig and all(
+        getattr(hp, name) == getattr(paper, name) for name in AS_IN_THE_PAPER
+    )
+    if not is_papers or training.stop_rule != "never" or max_steps is None:
+        raise ValueError("the reference is of PPOConfig.paper(), training.stop_rule=never, "
                          "training.max_steps=N.")  # fmt: skip
     torch.manual_seed(seed)
     random.seed(seed)

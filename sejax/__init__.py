@@ -34,6 +34,7 @@ _EXPORTS = {
     "Objective": "sejax.objectives",
     "Outcome": "sejax.objectives",
     "PPOConfig": "sejax.agents.ppo",
+    "PretrainedProxy": "sejax.proxies.zoo",
     "Proxy": "sejax.proxies.files",
     "ProxyEnv": "sejax.proxies.proxy",
     "ProxyParams": "sejax.proxies.proxy",
@@ -60,6 +61,7 @@ _EXPORTS = {
     "make_evaluator": "sejax.evaluation",
     "make_learner": "sejax.bilevel",
     "make_trainer": "sejax.trainer",
+    "pretrained": "sejax.proxies.zoo",
     "register_gymnax": "sejax.proxies.files",
     "save": "sejax.proxies.files",
     "save_set": "sejax.proxies.files",
@@ -102,6 +104,7 @@ if TYPE_CHECKING:  # what a type checker and an editor see
         save_set,
     )
     from sejax.proxies.proxy import ProxyEnv, ProxyParams
+    from sejax.proxies.zoo import PretrainedProxy, pretrained
     from sejax.trainer import TrainResult, make_trainer
     from sejax.training import TrainingConfig
 
@@ -109,12 +112,12 @@ __all__ = [
     "AUC", "AUCSum", "Agent", "ConfigError", "CountBasedConfig", "DDQNConfig", "DQNConfig",
     "DiscreteTD3Config", "DuelingDDQNConfig", "EvosaxConfig", "Families", "FamiliesConfig",
     "ICMConfig", "LearnResult", "MaxReward", "NESConfig", "Objective", "Outcome", "PPOConfig",
-    "Proxy", "ProxyEnv", "ProxyParams", "ProxySet", "QLearningConfig", "RewardConfig",
-    "RewardThreshold", "SACConfig", "SARSAConfig", "Strategy", "SyntheticConfig", "TD3Config",
-    "Task", "TrainResult", "TrainingConfig", "Trials", "agents", "config", "configure_xla", "envs",
-    "es", "evaluate_agents", "gym", "load", "load_proxy", "load_set", "make_agent",
-    "make_evaluator", "make_learner", "make_trainer", "options", "proxies", "register_gymnax",
-    "save", "save_set", "spread_over_devices",
+    "PretrainedProxy", "Proxy", "ProxyEnv", "ProxyParams", "ProxySet", "QLearningConfig",
+    "RewardConfig", "RewardThreshold", "SACConfig", "SARSAConfig", "Strategy", "SyntheticConfig",
+    "TD3Config", "Task", "TrainResult", "TrainingConfig", "Trials", "agents", "config",
+    "configure_xla", "envs", "es", "evaluate_agents", "gym", "load", "load_proxy", "load_set",
+    "make_agent", "make_evaluator", "make_learner", "make_trainer", "options", "pretrained",
+    "proxies", "register_gymnax", "save", "save_set", "spread_over_devices",
 ]  # fmt: skip
 
 

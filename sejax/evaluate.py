@@ -206,9 +206,8 @@ def _train_and_test(config: EvaluateConfig, study: Study, world: str, family: Ag
     numbers: dict[str, Any] = {"agent": range(config.num_agents)}
     if study.has_several:
         numbers = {"agent": family.key, "number": range(config.num_agents)}
-    columns = {**numbers, "test_return": outcome.test_return, **vars(outcome), **drawn}
-    del columns["test_returns"]
-    return pd.DataFrame(columns)
+    of_agents = {name: x for name, x in vars(outcome).items() if x.ndim == 1}  # not of episodes
+    return pd.DataFrame({**numbers, "test_return": outcome.test_return, **of_agents, **drawn})
 
 
 def _print_table(summary: Any, study: Study, config: EvaluateConfig) -> None:

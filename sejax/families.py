@@ -78,7 +78,7 @@ class Families:
     @classmethod
     def of(cls, agent: "Agent | Families") -> "Families":
         """One agent as a family."""
-        return cls(agents=(agent,)) if isinstance(agent, Agent) else agent
+        return agent if isinstance(agent, Families) else cls(agents=(agent,))
 
     @property
     def size(self) -> int:

@@ -30,6 +30,7 @@ from sejax.envs import cliff_walking, gridworld_2x2
 from sejax.errors import ConfigError, require, shortened, told
 from sejax.proxies import ABSURD, stored
 from sejax.proxies.configs import SyntheticConfig
+from sejax.proxies.units import units_of
 
 # The tasks that Gymnasium has too, with the same spaces, dynamics and initial states.
 GYMNASIUM_IDS = {
@@ -60,7 +61,8 @@ class RealTask:
     """What an SE takes from the task that it stands in for.
 
     Attributes:
-      observation_space: a `Box` of vectors, whose bounds do not matter, or `Discrete`.
+      observation_space: a `Box` of vectors, whose bounds only matter to an SE that has its units by
+        them (`state_units=bounds`), or `Discrete`.
       action_space: a `Discrete`, or a `Box` of vectors.
       max_steps: steps after which an episode is cut, if the SE has no horizon of its own.
       starts: the first observation of an episode, drawn with a generator; must be picklable for the
@@ -162,6 +164,10 @@ class SyntheticEnv(gymnasium.Env[Any, Any]):
         heads = ["reward"] if config.horizon == 1 else ["state", "reward", "done"]
         self._layers = _joined([_layers(weights, head) for head in heads])
         self._start_layers = _layers(weights, "start")
+        self._units = None
+        if config.state_units == "bounds" and isinstance(task.observation_space, spaces.Box):
+            space = task.observation_space
+            self._units = units_of(space.low.ravel(), space.high.ravel(), self._obs_dim)
         self._starts = task.starts
         require(self._starts or self._start_layers, "task.starts", "be given for an SE whose "
                 "initial states are the real task's", "episodes begin there", None,
@@ -207,7 +213,9 @@ class SyntheticEnv(gymnasium.Env[Any, Any]):
     def _first_vector(self) -> np.ndarray:
         if self._start_layers:
             noise = self.np_random.standard_normal(self._obs_dim, np.float32)
-            return np.clip(noise + self._forward(self._start_layers, noise), -ABSURD, ABSURD)
+            vector = noise + self._forward(self._start_layers, noise)
+            vector = vector if self._units is None else self._units.decode(vector)
+            return np.clip(vector, -ABSURD, ABSURD)
         assert self._starts is not None
         obs = self._starts(self.np_random)
         if self._num_states:
@@ -228,9 +236,12 @@ class SyntheticEnv(gymnasium.Env[Any, Any]):
 
     def _predict(self, action: np.ndarray, vector: np.ndarray) -> np.ndarray:
         """Next state, reward and done output d, `[obs_dim + 2]`; in a bandit the state stays."""
-        outputs = self._forward(self._layers, np.concatenate([action, vector]))
+        seen = vector if self._units is None else self._units.encode(vector)
+        outputs = self._forward(self._layers, np.concatenate([action, seen]))
         if self.config.horizon == 1:
             return np.concatenate([vector, outputs, [1]], dtype=np.float32)
+        if self._units is not None:
+            outputs[: self._obs_dim] = self._units.decode(outputs[: self._obs_dim])
         return outputs
 
     def _forward(self, layers: "Layers", x: np.ndarray) -> np.ndarray:

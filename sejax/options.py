@@ -132,6 +132,16 @@ def shrinks() -> Rule:
     )  # fmt: skip
 
 
+def or_none(rule: Rule) -> Rule:
+    """None, or what another rule says; for an option that may be left open, but has a default."""
+
+    def either(name: str, value: Any, default: Any) -> None:
+        if value is not None:
+            rule(name, value, default)
+
+    return either
+
+
 def one_of(known: Collection[str]) -> Rule:
     """One of these names."""
     return lambda name, value, default: errors.one_of(name, value, known)

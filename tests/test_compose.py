@@ -199,9 +199,12 @@ def test_sweeps_over_tasks_and_agents_have_the_settings_of_each(tmp_path, monkey
     assert families.in_one_choice(words[2:]) == ["agent=ddqn,ddqn+ppo"]
     compose.register("run", written)
     store = ConfigStore.instance()
-    tuned = store.load("tuned_agent/best/acrobot-se-ddqn+ppo.yaml").node
-    assert (tuned.agents.ddqn.batch_size, tuned.agents.ppo.update_episodes) == (64, 1)
-    assert "ppo" not in store.load("tuned_agent/best/cartpole-se-ddqn+.yaml").node.agents
+    for task in ("cartpole", "acrobot"):
+        alone = {name: store.load(f"tuned_agent/best/{task}-se-{name}.yaml").node.agent
+                 for name in ("ddqn", "ppo")}  # fmt: skip
+        both = store.load(f"tuned_agent/best/{task}-se-ddqn+ppo.yaml").node.agents
+        one = store.load(f"tuned_agent/best/{task}-se-ddqn+.yaml").node.agents
+        assert both == alone and one == {"ddqn": alone["ddqn"]}
 
 
 def test_several_agents_are_in_the_help():
@@ -241,8 +244,8 @@ def test_several_agents_are_in_the_help():
         ("agents=[ddqn,td3]", "agents.td3 must be one of .* in cartpole"),
         ("env=cliff_walking agents=[sarsa,q_learning] exploration=icm",
          "exploration must suit q_learning"),
-        ("proxy.done=soft proxy.horizon=null agents=[ddqn,ppo] agents.ppo.update_episodes=20",
-         "training.max_steps must exceed 4001, .* or agents.ppo.update_episodes lower"),
+        ("proxy.done=soft proxy.horizon=null agents=[ddqn,ppo] agents.ppo.rollout_steps=3000",
+         "training.max_steps must exceed 3000, .* or agents.ppo.rollout_steps lower"),
     ],
 )  # fmt: skip
 def test_several_agents_that_cannot_be_are_one_message(words, said):
@@ -316,7 +319,9 @@ def test_a_field_that_another_algorithm_has_is_not_suggested():
 
 
 @pytest.mark.parametrize(
-    "overrides", [("proxy.name=rn",), ("env.name=no_such_task",), ("agent.name=nope",)], ids=" ".join
+    "overrides",
+    [("proxy.name=rn",), ("env.name=no_such_task",), ("agent.name=nope",)],
+    ids=" ".join,
 )
 def test_a_name_that_no_choice_has_is_refused(overrides):
     message(*overrides)
@@ -348,8 +353,12 @@ SOFT = ("proxy.done=soft", "proxy.horizon=null")
         ((*SOFT, "env=acrobot", "agent=dueling_ddqn", "agent.init_episodes=10"),
          "training.max_steps must exceed 5000, because dueling_ddqn learns nothing before with "
          "agent.init_episodes=10; got 2000."),
-        ((*SOFT, "agent=ppo", "agent.update_episodes=20"),
-         "training.max_steps must exceed 4001, because ppo learns nothing before"),
+        ((*SOFT, "agent=ppo", "agent.rollout_steps=null", "agent.update_episodes=20"),
+         "training.max_steps must exceed 4001, because ppo learns nothing before with "
+         "agent.update_episodes=20; got 2000."),
+        ((*SOFT, "agent=ppo", "agent.rollout_steps=3000"),
+         "training.max_steps must exceed 3000, because ppo learns nothing before with "
+         "agent.rollout_steps=3000; got 2000."),
         (("training.stop_rule=solved", "training.solved_by=train"),
          "training.solved_by must be test with stop_rule=solved"),
         (("env=cliff_walking", "proxy=rn", "training.solved_by=train"),

@@ -24,7 +24,10 @@ from sejax.training import TrainingConfig, budget_for
 
 TINY = ["agent.hidden_size=4", "agent.batch_size=4", "agent.init_episodes=0", "num_agents=3",
         "real_training.max_episodes=2"]  # fmt: skip
-SOFT = ("proxy.done=soft", "proxy.horizon=null")  # an SE whose episodes may be as long as the task's
+SOFT = (
+    "proxy.done=soft",
+    "proxy.horizon=null",
+)  # an SE whose episodes may be as long as the task's
 ROOM = [
     "agent=q_learning",
     "num_agents=2",
@@ -130,11 +133,12 @@ def test_initial_episodes_beyond_the_proxys_own_extend_its_step_budget(stored):
         return budget_for(training, agent, then, proxy.task.max_steps).max_steps
 
     assert budget(dataclasses.replace(then, init_episodes=3), then) == 50 + 3 * 200
-    assert budget(PPOConfig(update_episodes=2), then) == 50 + 401
+    long, short = (PPOConfig.paper(update_episodes=number) for number in (2, 1))
+    assert budget(long, then) == 50 + 401
     assert budget(then, then) == 50
     assert budget(then) == 50  # nobody knows what it was learned with
     # Of several that it was learned with, the one that waits longest counts.
-    assert budget(PPOConfig(update_episodes=2), then, PPOConfig(update_episodes=1)) == 50 + 200
+    assert budget(long, then, short) == 50 + 200
     unlimited = TrainingConfig()
     assert budget_for(unlimited, PPOConfig(), [then], 200) is unlimited
     # That is what an evaluation trains with.
@@ -154,9 +158,10 @@ def test_episodes_of_one_step_extend_a_step_budget_by_as_little(tmp_path):
 def test_each_of_several_agents_trains_as_long_as_it_must(tmp_path):
     """An SE learned with two families: neither they nor others wait beyond their budget."""
     words = ("agents=[ddqn,ppo]", "proxy.hidden_size=4", "agents.ddqn.init_episodes=2",
-             "agents.ppo.update_episodes=1", "training.max_steps=4000", *SOFT)  # fmt: skip
+             "agents.ppo.rollout_steps=100", "training.max_steps=4000", *SOFT)  # fmt: skip
     path = save(tmp_path / "proxy.safetensors", *words)
-    composed = evaluate_config(f"proxy={path}", "agent=[ddqn,dueling_ddqn,ppo]", words=[])
+    composed = evaluate_config(f"proxy={path}", "agent=[ddqn,dueling_ddqn,ppo]",
+                               "agents.ppo.rollout_steps=null", words=[])  # fmt: skip
     budgets = {
         key: training.max_steps
         for key, training in _proxy_study(composed).worlds["the proxy"][2].items()

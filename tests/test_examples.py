@@ -202,8 +202,9 @@ def test_the_reacher_is_solved_by_moving_towards_the_target(examples):
 
 def test_risk_is_a_deviation_between_an_agents_episodes(examples):
     objective = examples("own_objective").RiskAverse(aversion=2.0).make(None)
+    returns = jnp.array([[1.0, 3.0], [2.0, 2.0], [5.0, 5.0]])
     outcome = sejax.Outcome(
-        test_returns=jnp.array([[1.0, 3.0], [2.0, 2.0], [5.0, 5.0]]), train_steps=jnp.ones(3, int),
+        test_returns=returns, scored_returns=returns, train_steps=jnp.ones(3, int),
         train_episodes=jnp.ones(3, int), return_area=jnp.zeros(3), real_steps=jnp.ones(3, int),
         nonfinite=jnp.array([False, False, True]),
     )  # fmt: skip

@@ -100,7 +100,11 @@ def assert_equal_steps(env, jax_env, params, num_steps=40):
     [
         ("cartpole", {"done": "soft"}),
         ("acrobot", {"done": "threshold", "num_layers": 2, "activation": "prelu"}),
-        ("gridworld_2x2", {"done": "threshold", "activation": "relu"}),
+        ("gridworld_2x2", {"done": "threshold", "activation": "relu", "state_units": "bounds"}),
+        ("mountain_car", {"done": "threshold", "state_units": "bounds",
+                          "initial_state": "learned"}),
+        ("cartpole", {"done": "threshold", "state_units": "bounds", "horizon": 2}),
+        ("pendulum", {"done": "threshold", "state_units": "bounds", "horizon": 1}),
         ("cartpole", {"done": "threshold", "activation": "fast_tanh", "horizon": 3}),
         ("pendulum", {"done": "bernoulli", "activation": "tanh", "initial_state": "learned"}),
         ("cartpole", {"done": "sigmoid", "horizon": 3}),

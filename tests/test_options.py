@@ -30,6 +30,7 @@ class Config(Options):
     size: int = option(4, options.counts("it is a size"))
     episodes: int = option(2, options.counts("it counts episodes", least=0))
     limit: int | None = option(None, options.counts("something must happen"))
+    window: int | None = option(8, options.or_none(options.counts("it is a length")))
     weight: float = option(0.5, options.not_negative("it is a weight"), traced=True)
     rate: float = option(0.1, options.positive("nothing would move", 10.0), varied="triple")
     share: float = option(0.9, options.fraction(), traced=True, varied="tenth_to_one")
@@ -62,6 +63,7 @@ def message(cls=Config, **fields):
         ("episodes", -1, "be at least 0, because it counts episodes; got -1. "
                          "Set group.episodes=2."),
         ("limit", 0, "be at least 1, because something must happen; got 0. Set group.limit=null."),
+        ("window", 0, "be at least 1, because it is a length; got 0. Set group.window=8."),
         ("weight", -0.1, "be at least 0, because it is a weight; got -0.1. Set group.weight=0.5."),
         ("weight", NAN, "be at least 0, because it is a weight; got nan. Set group.weight=0.5."),
         ("rate", 0, "be above 0 and finite, because nothing would move; got 0. "
@@ -91,6 +93,7 @@ def test_a_value_that_breaks_its_rule_is_refused_with_the_whole_message(field, v
     "fields",
     [
         {"size": 1}, {"size": 2**31 - 1}, {"episodes": 0}, {"limit": None}, {"limit": 1},
+        {"window": None}, {"window": 1},
         {"weight": 0}, {"weight": 1e30}, {"rate": 1e-30}, {"rate": 10}, {"share": 0}, {"share": 1},
         {"decay": 1}, {"decay": 1e-6}, {"goal": -3}, {"kind": "fancy"}, {"free": -1},
         {"unruled": NAN},

@@ -42,7 +42,7 @@ OBS_DIM, NUM_ACTIONS, ACTION_DIM, MAX_ACTION, MAX_STEPS = 3, 4, 2, 2.0, 6
 STEPS = 13  # two episodes of full length, and one step
 ENDS = (3, 4, 9)  # last steps of episodes; the rollout is cut within the fourth
 GOLDEN = Path(__file__).parent / "golden" / "ppo_updates.npz"
-CONFIG = PPOConfig(
+CONFIG = PPOConfig.paper(
     hidden_size=5, num_layers=2, activation="tanh", learning_rate=0.01, discount=0.9,
     update_episodes=2, epochs=3, clip_ratio=0.05, value_weight=0.7, entropy_weight=0.05,
 )  # fmt: skip
@@ -400,7 +400,7 @@ def test_a_rollout_is_as_long_as_the_authors(update_episodes, action_repeat):
     max_steps, decisions, time_step = 50, 0, 0
     while not time_step / max_steps > update_episodes:
         decisions, time_step = decisions + 1, time_step + action_repeat
-    config = PPOConfig(update_episodes=update_episodes, action_repeat=action_repeat)
+    config = PPOConfig.paper(update_episodes=update_episodes, action_repeat=action_repeat)
     assert config.rollout_length(max_steps) == decisions
     given = dataclasses.replace(config, rollout_steps=17)
     assert given.rollout_length(max_steps) == 17
@@ -545,7 +545,7 @@ def solve_bandit(agent, length, reward_fn, num_phases):
     return solve(KEY)
 
 
-BANDIT = PPOConfig(
+BANDIT = PPOConfig.paper(
     hidden_size=4, num_layers=1, activation="tanh", learning_rate=0.03, update_episodes=64,
     epochs=5,
 )  # fmt: skip
@@ -623,12 +623,7 @@ class ContextualBandit(environment.Environment):
 
 def test_a_contextual_bandit_of_single_steps_is_learned_in_2000_of_them():
     task = sejax.Task(name="bandit", env=ContextualBandit())
-    agent = sejax.make_agent(
-        PPOConfig(
-            advantages="gae", rollout_steps=128, num_minibatches=4, epochs=10, hidden_size=16,
-            num_layers=1, activation="tanh", learning_rate=3e-3, max_grad_norm=0.5,
-        ), task,
-    )  # fmt: skip
+    agent = sejax.make_agent(PPOConfig(hidden_size=16, num_layers=1), task)
     training = TrainingConfig(max_episodes=2000, stop_rule="never")
     train = make_trainer(agent, task.env, training)
 
@@ -647,14 +642,14 @@ def test_a_contextual_bandit_of_single_steps_is_learned_in_2000_of_them():
 # An agent that has not learned has returns of about 20 and -1200.
 LEARNING = {
     "cartpole": (
-        PPOConfig(
+        PPOConfig.paper(
             activation="tanh", learning_rate=1e-3, update_episodes=4, epochs=20, discount=0.98
         ),
         TrainingConfig(max_episodes=1000, stop_rule="never", max_steps=80_000),
         195.0,
     ),
     "pendulum": (
-        PPOConfig(
+        PPOConfig.paper(
             activation="tanh", learning_rate=2e-3, update_episodes=10, epochs=30,
             discount=0.9, init_action_std=1.0, entropy_weight=0.0,
         ),

@@ -7,8 +7,10 @@ import pytest
 import sejax
 from sejax import plugins
 from sejax.agents.ddqn import DDQNConfig
+from sejax.agents.ppo import PPOConfig
 from sejax.app import presets
 from sejax.errors import ConfigError
+from sejax.experiments.rn_studies import STUDIES
 from sejax.training import TrainingConfig
 
 composed_with = functools.cache(lambda *overrides: sejax.config(overrides))
@@ -161,10 +163,17 @@ def test_the_papers_preset_holds_the_numbers_of_its_tables_for_rns(path):
             assert value_at(composed, path) == expected
 
 
+@pytest.mark.parametrize("preset", ["paper", "best"])
 @pytest.mark.parametrize("env", ["mountain_car_continuous", "halfcheetah"])
-def test_ppo_trains_for_more_episodes_on_rns(env):
-    composed = composed_with(f"env={env}", "proxy=rn", "preset=paper", "agent=ppo")
+def test_ppo_on_rns_is_the_papers_and_trains_for_more_episodes(env, preset):
+    composed = composed_with(f"env={env}", "proxy=rn", f"preset={preset}", "agent=ppo")
     assert composed.training.max_episodes == 1000
+    assert composed.agent == STUDIES[env].transfer_agent  # see test_experiments_tables.py
+
+
+@pytest.mark.parametrize("env", ["cartpole", "pendulum", "mountain_car_continuous"])
+def test_ppo_on_ses_is_the_default(env):
+    assert composed_with(f"env={env}", "agent=ppo").agent == PPOConfig()
 
 
 # --- the files -----------------------------------------------------------------------------------
@@ -184,7 +193,7 @@ def test_every_file_is_of_a_task_and_proxy_and_has_settings_of_known_choices():
         env, _, proxy = path.stem.rpartition("-")
         assert proxy in plugins.names("proxy")
         assert env in (presets.GENERAL, *plugins.names("env"))
-        kinds = {"tuned_agent": "agent", "tuned_es": "es"}
+        kinds = {"tuned_agent": "agent", "tuned_es": "es", "tuned_objective": "objective"}
         for preset, kind, choice, values in presets.settings(env, proxy):
             assert preset in presets.names() and isinstance(values, dict)
             assert choice in plugins.names(kinds[kind]) if kind in kinds else choice == ""

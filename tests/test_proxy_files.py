@@ -168,7 +168,7 @@ def test_shipped_proxies_load(name):
     for group in ("agent", "exploration", "es", "objective", "training"):
         assert proxy.learned_with(group) is not None
     assert proxy.params.discount == proxy.learned_with("agent").discount if "rn" in name else True
-    assert {"score", "generation", "seed", "evaluation"} <= proxy.record.keys()
+    assert {"score", "generation", "seed", "evaluations", "card"} <= proxy.record.keys()
 
 
 def test_a_proxy_of_version_1_loads(tmp_path, env, weights):

@@ -25,7 +25,7 @@ import torch_reference_ppo as torch_ppo  # noqa: E402
 
 OBS_DIM, NUM_ACTIONS = reference.OBS_DIM, reference.NUM_ACTIONS
 STEPS = 12
-CONFIG = PPOConfig(
+CONFIG = PPOConfig.paper(
     hidden_size=9, num_layers=2, learning_rate=0.01, discount=0.9, update_episodes=1, epochs=3,
     clip_ratio=0.02, value_weight=0.7, entropy_weight=0.05,
 )  # fmt: skip

@@ -497,10 +497,10 @@ def test_test_episodes_end_at_the_step_limit_and_inactive_ones_do_not_begin():
     agent = scripted_agent()
     state = agent.begin_episode(agent.init(KEY, 0.0), 0)
     test = jax.jit(make_tester(agent, task, num_episodes=3))
-    returns, steps = test(KEY, state)
+    returns, steps, _ = test(KEY, state)
     np.testing.assert_array_equal(returns, [2.5] * 3)
     np.testing.assert_array_equal(steps, [MAX_STEPS] * 3)
-    returns, steps = test(KEY, state, jnp.bool_(False))
+    returns, steps, _ = test(KEY, state, jnp.bool_(False))
     np.testing.assert_array_equal(returns, 0.0)
     np.testing.assert_array_equal(steps, 0)
 

@@ -245,7 +245,8 @@ def require_learning(
       ConfigError: if it does not.
     """
     before = steps_before_learning(agent, max_episode_steps)
-    waits = "update_episodes" if hasattr(agent, "update_episodes") else "init_episodes"
+    names = ("rollout_steps", "update_episodes", "init_episodes")
+    waits = next((name for name in names if getattr(agent, name, None) is not None), names[-1])
     require(training.max_steps is None or training.max_steps > before, f"{name}.max_steps",
             f"exceed {before}", f"{plugins.name_of('agent', agent)} learns nothing before with "
             f"agent.{waits}={getattr(agent, waits, None)}", training.max_steps,

@@ -30,7 +30,8 @@ CONF_DIR = Path(__file__).parents[1] / "conf"
 _DEFAULT_ENV, _DEFAULT_PROXY, _DEFAULT_AGENT = "cartpole", "se", "ddqn"
 _DEFAULT_OBJECTIVE = "max_reward"
 _GROUPS = tuple(plugins.GROUPS)
-_INTERNAL = ("base", "tuned", "tuned_agent", "tuned_es")  # groups that no word may choose
+# Groups that no word may choose.
+_INTERNAL = ("base", "tuned", "tuned_agent", "tuned_es", "tuned_objective")
 _CHOICE = re.compile(rf"(?:\+\+?)?({'|'.join(_GROUPS)}|preset)=(.*)", re.DOTALL)
 
 

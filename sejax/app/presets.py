@@ -1,9 +1,10 @@
 """Settings that were measured or published, one file for each task and proxy.
 
 A file `conf/presets/<env>-<proxy>.yaml` has a section for each preset: nested values of a run's
-configuration, `with_agent` and `with_es` for those that only hold with an agent or a strategy, and
-`like` for a section of the same file that it builds on. `general-<proxy>.yaml` serves tasks without
-a file of their own, and those whose section says `like: general`.
+configuration, `with_agent`, `with_es` and `with_objective` for those that only hold with an agent,
+a strategy or an objective, and `like` for a section of the same file that it builds on.
+`general-<proxy>.yaml` serves tasks without a file of their own, and those whose section says
+`like: general`.
 """
 
 import functools
@@ -39,8 +40,8 @@ def settings(env: str, proxy: str) -> Iterator[tuple[str, str, str, dict[str, An
     """All settings for a task and proxy.
 
     Yields:
-      `(preset, kind, choice, values)` with kind "tuned" (choice empty), "tuned_agent" or "tuned_es"
-      (choice: the agent or the strategy).
+      `(preset, kind, choice, values)` with kind "tuned" (choice empty), "tuned_agent", "tuned_es"
+      or "tuned_objective" (choice: the agent, the strategy or the objective).
     """
     stem = f"{env}-{proxy}"
     if not is_tuned(env, proxy):
@@ -49,9 +50,9 @@ def settings(env: str, proxy: str) -> Iterator[tuple[str, str, str, dict[str, An
             yield "best", "tuned", "", {"generations": 50}
             return
     for preset, section in _sections(stem).items():
-        common = {k: v for k, v in section.items() if k not in ("with_agent", "with_es")}
+        common = {k: v for k, v in section.items() if not k.startswith("with_")}
         yield preset, "tuned", "", common
-        for kind in ("agent", "es"):
+        for kind in ("agent", "es", "objective"):
             for choice, values in section.get(f"with_{kind}", {}).items():
                 yield preset, f"tuned_{kind}", choice, values
 

@@ -6,6 +6,7 @@ files as they are. Nothing here imports jax before a state is restored: a refusa
 """
 
 import json
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from types import TracebackType
@@ -123,6 +124,11 @@ class RunDirectory:
         metrics = self._record["metrics"] if _is_record(self._record) else {"generations": {}}
         return max(metrics["generations"].values(), default=0)
 
+    @property
+    def cpu_s(self) -> float:
+        """CPU seconds of the sessions up to the newest checkpoint; nan if it does not say."""
+        return self._record.get("cpu_s", math.nan) if _is_record(self._record) else 0.0
+
     def resume(self, template: Any) -> tuple[Any, int, list[str]]:
         """Restores the newest whole checkpoint and drops metrics that it does not include.
 
@@ -167,17 +173,18 @@ class RunDirectory:
         """
         self._table.append(info, wall_s)
 
-    def commit(self, generation: int, state: Any) -> None:
+    def commit(self, generation: int, state: Any, cpu_s: float = 0.0) -> None:
         """Writes the checkpoint of what was appended: the chunk now counts.
 
         Args:
           generation: generations finished.
           state: pytree of arrays.
+          cpu_s: CPU seconds since the start of the run, of all sessions.
 
         Raises:
           OSError: if it cannot be written; the run goes on from the checkpoint before.
         """
-        record = {"config": self.config, "metrics": self._table.vouch()}
+        record = {"config": self.config, "metrics": self._table.vouch(), "cpu_s": cpu_s}
         checkpoints.save(self.checkpoints, generation, state, record)
         self._record = record
 

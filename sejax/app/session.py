@@ -11,6 +11,7 @@ import numpy as np
 from sejax.app import build, commands
 from sejax.app.run_directory import RunDirectory
 from sejax.bilevel import Program, make_program
+from sejax.counters import exact
 from sejax.parallel import compiler_options
 from sejax.proxies import files
 
@@ -125,6 +126,11 @@ def run(
         report.print(f"Going on at generation {generation} of {directory.path}.")
         proxies.save(jax.device_get(state))  # again, as somebody may have damaged them
     wall_before = float(directory.rows[-1]["wall_s"]) if directory.rows else 0.0
+    cpu_before = directory.cpu_s
+
+    def cpu_s() -> float:
+        return cpu_before + time.process_time() - cpu_started
+
     state = jax.tree.map(lambda x: x.copy(), state)  # own buffers, so that they can be donated
     while generation < config.generations and not bool(state.finished.all()):
         length = min(config.checkpoint_every, config.generations - generation)
@@ -139,7 +145,7 @@ def run(
         with commands.interrupts_held():
             directory.append(info, wall_before + time.time() - started)
             proxies.save(host_state)
-            directory.commit(generation, state)
+            directory.commit(generation, state, cpu_s())
         report.update(generation, info)
         if report.time_to_draw():
             draw(directory, program)
@@ -150,7 +156,8 @@ def run(
         best_score=float(state.best_score.max()),
         generations=generation,
         wall_s=round(wall_before + time.time() - started, 1),
-        cpu_s_of_last_session=round(time.process_time() - cpu_started, 1),
+        cpu_s=round(cpu_s(), 1),
+        **_cost(state, directory, program.strategy.num_candidates),
         devices=[str(device) for device in jax.devices()],
         versions=_versions(),
     )
@@ -209,6 +216,16 @@ def draw(directory: RunDirectory, program: Program) -> None:
     if directory.rows:
         path = directory.path / "learning_curve.png"
         plots.learning_curve(directory.rows, program.solved_score, path)
+
+
+def _cost(state: Any, directory: RunDirectory, num_candidates: int) -> dict[str, int]:
+    """What the generations of all seeds took, in agents and steps."""
+    steps_of_agents = sum(float(row["train_steps_mean"]) for row in directory.rows)
+    return {
+        "agents": len(directory.rows) * num_candidates,
+        "train_steps": round(steps_of_agents * num_candidates),
+        "real_steps": int(exact(state.env_steps).sum()),
+    }
 
 
 def _wait(state: Any) -> None:

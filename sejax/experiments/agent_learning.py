@@ -39,8 +39,13 @@ class Study:
     env: str
     agent: str
     max_steps: int  # of training
-    hparams: dict[str, Any] = field(default_factory=dict)  # others than the paper's, the defaults
+    hparams: dict[str, Any] = field(default_factory=dict)  # others than the paper's
     peers: str = ""  # what others report
+
+    def configuration(self) -> Any:
+        """The paper's agent, which is the default but for PPO, with `hparams`."""
+        cls = plugins.find("agent", self.agent)
+        return (sejax.PPOConfig.paper if cls is sejax.PPOConfig else cls)(**self.hparams)
 
     def training(self, quick: bool, test_episodes: int) -> TrainingConfig:
         """Episodes of training and of tests alternate until the step limit."""
@@ -96,8 +101,7 @@ def compute(settings: AgentLearning) -> pd.DataFrame:
         training = study.training(settings.quick, settings.test_episodes)
         world = World.real(
             sejax.envs.make(study.env), ["all"], name=f"{number:02d}-{study.env}-{study.agent}",
-            agent=plugins.configure("agent", {"name": study.agent, **study.hparams}),
-            training=training, is_single=True)  # fmt: skip
+            agent=study.configuration(), training=training, is_single=True)  # fmt: skip
         curves = train_groups(world, settings, settings.num_agents, CURVES).drop(columns="group")
         tables.append(curves.assign(study=number, max_steps=training.max_steps))
     return pd.concat(tables, ignore_index=True)

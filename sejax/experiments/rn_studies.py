@@ -84,7 +84,7 @@ STUDIES = {
     ),
     "mountain_car_continuous": Study(
         agent=sejax.TD3Config(init_episodes=50, action_repeat=2),
-        transfer_agent=sejax.PPOConfig(action_repeat=5),
+        transfer_agent=sejax.PPOConfig.paper(action_repeat=5),
         bonuses={"icm": ICMConfig(forward_weight=0.1, reward_scale=0.01, learning_rate=5e-4)},
         max_episodes=3000, max_steps=250_000,
         when_quick=_FEW | {"generations": 2, "run": (
@@ -93,7 +93,7 @@ STUDIES = {
     ),
     "halfcheetah": Study(
         agent=sejax.TD3Config(),
-        transfer_agent=sejax.PPOConfig(
+        transfer_agent=sejax.PPOConfig.paper(
             hidden_size=128, activation="tanh", learning_rate=1e-5, update_episodes=1, epochs=10,
             entropy_weight=0.001, init_action_std=0.1,
         ),

@@ -193,8 +193,12 @@ def rank_correlation(a: np.ndarray, b: np.ndarray) -> float:
     """Spearman's rho of `[n]` and `[n]`, with mean ranks for ties; nan where all are equal."""
     if np.ptp(a) == 0 or np.ptp(b) == 0:
         return np.nan
-    ranks = [pd.Series(x).rank() for x in (a, b)]
-    return float(np.corrcoef(*ranks)[0, 1])
+    return float(np.corrcoef(_ranks(a), _ranks(b))[0, 1])
+
+
+def _ranks(values: np.ndarray) -> np.ndarray:
+    _, places, counts = np.unique(values, return_inverse=True, return_counts=True)
+    return (counts.cumsum() - (counts - 1) / 2)[places]
 
 
 def with_intervals(

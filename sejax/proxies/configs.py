@@ -8,6 +8,7 @@ from sejax.options import ACTIVATIONS, MOST_LAYERS, Options, counts, one_of, opt
 
 DONE_MODES = ("soft", "threshold", "bernoulli", "sigmoid")
 INITIAL_STATES = ("real", "learned")
+STATE_UNITS = ("raw", "bounds")
 VARIANTS = (
     "additive_potential", "exclusive_potential", "additive_non_potential",
     "exclusive_non_potential", "additive_weighted_info", "exclusive_weighted_info",
@@ -33,6 +34,10 @@ class SyntheticConfig(Options):
     done: str = option("soft", one_of(DONE_MODES))
     # real: the task's initial states; learned: a network's, from standard normal noise
     initial_state: str = option("real", one_of(INITIAL_STATES))
+    # Units in which the networks see and make states. raw: the task's own; bounds: half the way
+    # from the middle of its observation space to the bounds, where it has such, is 1. A car's
+    # velocity lies in [-0.07, 0.07]: noise of 1, or a weight, is no measure for it.
+    state_units: str = option("raw", one_of(STATE_UNITS))
     # Steps of an episode; null: the task's limit. 1: a contextual bandit, which has neither a
     # next-state nor a done network.
     horizon: int | None = option(None, counts("an episode has steps"))

@@ -27,6 +27,7 @@ from sejax.proxies.stored import (
     KEY,
     PRETRAINED_DIR,
     find,
+    learned_agents,
     pretrained_names,
     read,
     read_config,
@@ -90,7 +91,7 @@ class Proxy:
           >>> list(load_proxy("cliff_walking-rn").learned_agents())
           ['q_learning']
         """
-        stored = self._stored_agents()
+        stored = learned_agents(self.config)
         return {key: self._configured("agent", values) for key, values in stored.items()}
 
     def training_for(self, agent: Any) -> TrainingConfig:
@@ -99,19 +100,11 @@ class Proxy:
         Raises:
           ConfigError: as `learned_with`.
         """
-        known = [plugins.configure("agent", values) for values in self._stored_agents().values()
+        known = [plugins.configure("agent", values)
+                 for values in learned_agents(self.config).values()
                  if _is_registered("agent", values)]  # fmt: skip
         max_steps = self.env.world.max_steps or self.task.max_steps
         return budget_for(self.learned_with("training"), agent, known, max_steps)
-
-    def _stored_agents(self) -> dict[str, Any]:
-        """Plain values of the agents that it was learned with."""
-        families = self.config.get("agents")
-        if not isinstance(families, Mapping):
-            stored = self.config.get("agent")
-            return {str(stored.get("name")) if isinstance(stored, Mapping) else "": stored}
-        return {key: {name: x for name, x in values.items() if name != "weight"}
-                for key, values in families.items() if isinstance(values, Mapping)}  # fmt: skip
 
     def _configured(self, group: str, stored: Any) -> Any:
         where = f"{group} that {self.path.name} was learned with"

@@ -73,6 +73,16 @@ def pretrained_names() -> list[str]:
     return sorted(path.stem for path in PRETRAINED_DIR.glob("*.safetensors"))
 
 
+def learned_agents(config: Mapping[str, Any]) -> dict[str, Any]:
+    """Plain values of the agents, one or several families, that a configuration is of, by key."""
+    families = config.get("agents")
+    if not isinstance(families, Mapping):
+        agent = config.get("agent")
+        return {str(agent.get("name")) if isinstance(agent, Mapping) else "": agent}
+    return {key: {name: x for name, x in values.items() if name != "weight"}
+            for key, values in families.items() if isinstance(values, Mapping)}  # fmt: skip
+
+
 def read(path: Path, option: str) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """Tensors and header of a file, checked against its digest and brought to this format."""
     try:

@@ -16,6 +16,7 @@ from jaxtyping import Array, Bool, Float
 from sejax.envs.task import Task
 from sejax.networks import MLP
 from sejax.proxies.proxy import ABSURD, ProxyEnv, ProxyParams, World
+from sejax.proxies.units import units_of
 
 if TYPE_CHECKING:  # which makes it
     from sejax.proxies.configs import SyntheticConfig
@@ -61,6 +62,10 @@ class SyntheticEnv(ProxyEnv):
             head: MLP(size, config.hidden_size, config.num_layers, config.activation)
             for head, size in outputs.items()
         }
+        self._units = None
+        if config.state_units == "bounds" and task.num_states is None:
+            space = task.env.observation_space(task.params)
+            self._units = units_of(space.low, space.high, task.obs_dim)
         self._start = None
         if config.initial_state == "learned":
             self._start = MLP(task.obs_dim, START_HIDDEN_SIZE, 1, config.activation)
@@ -96,16 +101,20 @@ class SyntheticEnv(ProxyEnv):
         """
         if self.task.num_actions is not None:
             action = jax.nn.one_hot(action, self.task.num_actions)
-        x = jnp.concatenate([action, vector])
+        seen = vector if self._units is None else self._units.encode(vector)
+        x = jnp.concatenate([action, seen])
         out = {head: net.apply({"params": weights[head]}, x) for head, net in self._nets.items()}
-        state, done = out.get("state", vector), out.get("done", jnp.ones(1))
-        return state, out["reward"][0], done[0]
+        if self.config.horizon == 1:
+            return vector, out["reward"][0], jnp.float32(1)
+        state = out["state"] if self._units is None else self._units.decode(out["state"])
+        return state, out["reward"][0], out["done"][0]
 
     def reset_env(self, key: Array, params: ProxyParams) -> tuple[Array, SyntheticState]:
         if self._start is not None:
             noise = jax.random.normal(key, (self.task.obs_dim,))
             moved: Any = self._start.apply({"params": params.weights["start"]}, noise)
             vector = noise + moved
+            vector = vector if self._units is None else self._units.decode(vector)
             vector = jnp.clip(vector, -ABSURD, ABSURD)  # what steps from there call absurd
         else:
             vector, _ = self.task.env.reset_env(key, self.task.params)

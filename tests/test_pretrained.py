@@ -1,0 +1,97 @@
+"""The proxies that ship: what is said of them, and that anybody's agents learn on them."""
+
+import math
+import subprocess
+import sys
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pytest
+from plain_agents import agent_for, learn, mean_return
+
+import sejax
+from sejax import envs
+from sejax.gym import GYMNASIUM_IDS, make
+from sejax.proxies import zoo
+from sejax.proxies.files import PRETRAINED_DIR
+
+PROXIES = {proxy.name: proxy for proxy in sejax.pretrained()}
+SES = [name for name, proxy in PROXIES.items() if proxy.kind == "se"]
+TOOLS = Path(__file__).parents[1] / "tools"
+
+
+# --- what is said of them ------------------------------------------------------------------------
+
+
+def test_they_are_listed_as_a_table_without_jax():
+    program = "import sejax, sys; print(sejax.pretrained()); assert 'jax' not in sys.modules"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    head, *rows = done.stdout.splitlines()
+    assert head.split() == ["name", "kind", "task", "learned", "with", "tested", "with", "return",
+                            "steps", "CPU", "s", "kB"]  # fmt: skip
+    assert [row.split()[0] for row in rows] == list(PROXIES)
+    assert len({row.index(f" {PROXIES[row.split()[0]].kind} ") for row in rows}) == 1, "a column"
+
+
+@pytest.mark.parametrize("name", PROXIES)
+def test_each_says_what_it_teaches_and_carries_its_card(name):
+    proxy = PROXIES[name]
+    assert proxy.agents and all(map(math.isfinite, proxy.scores.values()))
+    assert proxy.on_proxy and all(each.num_agents >= 10 for each in proxy.on_proxy)
+    assert proxy.size_kb == pytest.approx((PRETRAINED_DIR / f"{name}.safetensors").stat().st_size
+                                          / 1000)  # fmt: skip
+    assert proxy.card.startswith(f"# {name}\n")
+    for said in (f"`{proxy.task}`", f'sejax.load("{name}")', "Apache-2.0"):
+        assert said in proxy.card
+    for each in proxy.evaluations:
+        assert f"{each.return_mean:.1f} ± {each.return_std:.1f}" in proxy.card
+
+
+@pytest.mark.parametrize("name", SES)
+def test_each_se_says_what_it_cost(name):
+    proxy = PROXIES[name]
+    learning = proxy.learning
+    assert learning.cpu_s > 0 and learning.real_steps > 0
+    assert learning.train_steps > learning.agents > learning.generations > proxy.generation
+    for said in (learning.command, f"{learning.cpu_s:,.0f} CPU seconds"):
+        assert said in proxy.card
+
+
+@pytest.mark.parametrize("name", SES)
+def test_the_command_of_each_se_composes_what_its_file_was_learned_with(name):
+    words = PROXIES[name].learning.command.removeprefix("python -m sejax.run ").split()
+    config, stored = sejax.config(words), sejax.load_proxy(name)
+    assert config.env == type(config.env)(**_fields(stored.config["env"]))
+    assert config.proxy == stored.env.config and config.es == stored.learned_with("es")
+    assert config.training == stored.learned_with("training")
+
+
+def _fields(values):
+    return {name: value for name, value in values.items() if name != "name"}
+
+
+def test_the_page_is_what_the_tool_makes(monkeypatch):
+    monkeypatch.syspath_prepend(TOOLS)
+    import make_zoo
+
+    assert make_zoo.PAGE.read_text(encoding="utf-8") == make_zoo.page()
+
+
+def test_ranges_are_from_the_lowest_to_the_highest():
+    assert zoo.spread([], ".0f") == "" and zoo.spread([2.0, 1.0, 3.0], ".0f") == "1 to 3"
+
+
+# --- what they teach -----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", SES)
+def test_an_agent_that_sees_gymnasiums_five_values_alone_learns_the_task(name):
+    """Two of three agents solve a task of which they have never seen a step."""
+    task = envs.make(PROXIES[name].task)
+    real = gymnasium.make(GYMNASIUM_IDS[task.name], max_episode_steps=task.max_steps)
+    env = make(name)
+    agents = [learn(agent_for(env, seed), env, num_steps=4000, seed=seed) for seed in range(3)]
+    returns = [mean_return(agent, real, num_episodes=10, seed=100) for agent in agents]
+    assert np.median(returns) >= task.solved_reward, returns

@@ -1,0 +1,95 @@
+"""A proxy's model card: Markdown that its file carries, and of which `docs/zoo.md` is made."""
+
+from sejax.proxies.zoo import Evaluation, Learning, PretrainedProxy
+
+KINDS = {"se": "synthetic environment (SE)", "rn": "reward network (RN)"}
+ENDS = {
+    "threshold": "an episode terminates where the done output exceeds 1/2",
+    "bernoulli": "an episode terminates with the probability that the done output is",
+    "sigmoid": "an episode terminates with the probability that the done output's sigmoid is",
+    "soft": 'agents must bootstrap with `info["discount"]`, through which it teaches: '
+            "`terminated` alone tells them nothing",
+}  # fmt: skip
+
+
+def card_of(proxy: PretrainedProxy) -> str:
+    """The card; of what is not known it says nothing."""
+    parts = [f"# {proxy.name}", _about(proxy), "## What it teaches", _lesson(proxy)]
+    if proxy.learning:
+        parts += ["## How it was learned, and what that cost", _cost(proxy, proxy.learning)]
+    return "\n\n".join([*parts, "## How to use it", _usage(proxy), "## Licence", _LICENCE])
+
+
+_LICENCE = "Apache-2.0, as sejax, which made it: no data of anybody's is in it."
+
+
+def _about(proxy: PretrainedProxy) -> str:
+    if proxy.kind == "rn":
+        return (f"A {KINDS['rn']} for the task `{proxy.task}`: the dynamics are the real task's, "
+                f"the reward is made by a small learned network. Agents that train on it need "
+                f"fewer steps for the real task, where they are tested.")  # fmt: skip
+    starts = {"real": "the real task's", "learned": "made by a network from noise"}
+    return (
+        f"A {KINDS['se']} that stands in for the task `{proxy.task}`: small networks make the "
+        f"rewards and states of a world of its own. Agents train on it alone, without a step of "
+        f"the real task, and are then used there. Do not expect its states or rewards to be like "
+        f"the real ones.\n\n"
+        f"Initial states are {starts[proxy.initial_state]}. {_episodes(proxy)}"
+    )
+
+
+def _episodes(proxy: PretrainedProxy) -> str:
+    if proxy.horizon == 1:
+        length = "An episode is one step, after which it terminates: a contextual bandit."
+    else:
+        most = f"{proxy.horizon} steps" if proxy.horizon else "as many steps as the real task's"
+        length = f"Episodes have at most {most}; {ENDS[proxy.ends]}."
+    if proxy.ends == "soft":
+        return length
+    return (f"{length} It is a Markov decision process like any other: observation, reward, "
+            f"`terminated` and `truncated` say all that there is to know, so that any agent may "
+            f"learn on it.")  # fmt: skip
+
+
+def _lesson(proxy: PretrainedProxy) -> str:
+    """What fresh agents reached, as a table."""
+    rows = "\n".join(_row(each) for each in proxy.evaluations)
+    return (
+        f"Fresh agents, each trained for the steps given and then tested on the real task "
+        f"(mean and standard deviation of the agents' mean returns):\n\n"
+        f"| agent | hyperparameters | trained on | return | training steps | agents |\n"
+        f"| --- | --- | --- | --- | --- | --- |\n{rows}"
+    )
+
+
+def _row(each: Evaluation) -> str:
+    hparams = {"default": "default", "varied": "drawn for each", "as_learned": "as it was learned"}
+    world = {"proxy": "this proxy", "real": "the real task"}
+    return (f"| {each.agent} | {hparams[each.hparams]} | {world[each.world]} | "
+            f"{each.return_mean:.1f} ± {each.return_std:.1f} | {each.train_steps:,.0f} | "
+            f"{each.num_agents} |")  # fmt: skip
+
+
+def _cost(proxy: PretrainedProxy, learning: Learning) -> str:
+    scores = ", ".join(f"{agent} {score:.1f}" for agent, score in proxy.scores.items())
+    return (
+        f"With agents of {' and '.join(proxy.agents)}, by an evolution strategy that sees only how "
+        f"they do on the real task (Ferreira et al., ICLR 2022): it is the proxy of generation "
+        f"{proxy.generation} of seed {proxy.seed}, when it scored {scores}.\n\n"
+        f"    {learning.command}\n\n"
+        f"The whole run: {learning.cpu_s:,.0f} CPU seconds, {learning.generations} generations, "
+        f"{learning.agents:,} agents trained for {learning.train_steps:,} steps on the proxies; "
+        f"{learning.real_steps:,} steps on the real task"
+        + (", all of them tests." if proxy.kind == "se" else ".")
+    )
+
+
+def _usage(proxy: PretrainedProxy) -> str:
+    name = proxy.name
+    gym = f'env = sejax.gym.make("{name}")  # a gymnasium.Env, in NumPy: any agent, no JAX\n'
+    return (
+        f"```python\nimport sejax\n\n{gym if proxy.kind == 'se' else ''}"
+        f'env, params = sejax.load("{name}")  # a gymnax environment, in JAX\n```\n\n'
+        f"`python -m sejax.evaluate proxy={name}` trains agents on it and tests them on the real "
+        f"task."
+    )
