@@ -66,7 +66,7 @@ class SACConfig(AgentOptions):
     # to meet a target entropy.
     alpha: float | None = option(None, not_negative("it weighs the entropy"), traced=True)
     init_alpha: float = option(1.0, positive("it is learned as a logarithm"), traced=True)
-    # Of actions in [-1, 1], in nats for each dimension.
+    # Of actions in [-1, 1], in nats for each dimension; a uniform one's is the largest, log 2.
     target_entropy: float = option(-1.0, finite("the temperature must settle"), traced=True)
     # Of discrete actions, as a fraction of the largest, log |A|: see docs/agents.md.
     target_entropy_fraction: float = option(0.2, fraction(), traced=True)
