@@ -83,7 +83,7 @@ def learn(agent, env, num_steps, seed, random_steps=500, batch_size=64):
 
 
 class DQN:
-    """Deep Q-learning with a slow target network and actions that are 5% random."""
+    """Deep Q-learning with a slow target network, by which it acts, 5% of the time at random."""
 
     def __init__(self, env, seed, discount=0.99):
         self.num_actions, self.discount = int(env.action_space.n), discount
@@ -92,7 +92,7 @@ class DQN:
         self.target = self.values.copy()
 
     def act(self, obs):
-        return int(self.values(obs[None]).argmax())
+        return int(self.target(obs[None]).argmax())
 
     def explore(self, obs, rng):
         return int(rng.integers(self.num_actions)) if rng.random() < 0.05 else self.act(obs)

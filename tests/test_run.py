@@ -3,6 +3,7 @@
 import csv
 import dataclasses
 import functools
+import json
 import math
 import os
 import re
@@ -105,6 +106,21 @@ def test_a_run_in_two_sessions_equals_one_in_one(uninterrupted, tmp_path):
     assert rows(tmp_path) == rows(uninterrupted)
     proxy = "proxy.safetensors"
     assert (tmp_path / proxy).read_bytes() == (uninterrupted / proxy).read_bytes()
+
+
+def test_what_a_run_cost_adds_up_over_its_sessions(uninterrupted, tmp_path):
+    def costs(path):
+        ended = json.loads((path / "run.json").read_text())
+        return {name: ended[name] for name in ("agents", "train_steps", "real_steps", "cpu_s")}
+
+    learn(tmp_path, "generations=4")
+    first = costs(tmp_path)
+    learn(tmp_path, "generations=6")
+    both, whole = costs(tmp_path), costs(uninterrupted)
+    assert both.pop("cpu_s") >= first["cpu_s"] > 0 and whole.pop("cpu_s") > 0
+    assert both == whole
+    assert whole["real_steps"] == int(rows(uninterrupted)[-1]["env_steps_total"])
+    assert whole["agents"] % 6 == 0 and whole["train_steps"] > first["train_steps"] > 0
 
 
 def test_a_finished_run_is_left_as_it_is(uninterrupted):
