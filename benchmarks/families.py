@@ -30,8 +30,8 @@ def main() -> None:
     names = args.families.split(",")
     ratios = [row["together"] * len(names) / sum(row[name] for name in names) for row in rounds]
     together = median(row["together"] for row in rounds)
-    print(f"A generation of {args.families} takes {together:.2f} CPU s, "
-          f"{median(ratios):.2f} of its parts ({min(ratios):.2f} to {max(ratios):.2f}).")  # fmt: skip
+    shown = common.show_spread(common.spread(ratios), 2)
+    print(f"A generation of {args.families} takes {together:.2f} CPU s, {shown} of its parts.")
     common.finish("families", args, {"ratio": median(ratios), "ratios": ratios, "rounds": rounds})
 
 
