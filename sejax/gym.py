@@ -2,14 +2,15 @@
 
 `make("cartpole")` is a plain `gymnasium.Env`. Neither JAX nor gymnax is loaded, so that beyond
 Gymnasium it takes a twentieth of a second and 5 MB, steps in 10 microseconds, and forks and pickles
-as other environments do. It needs the extra `gym`: `pip install 'sejax[gym]'`.
+as as other environments do. It needs the extra `gym`: `pip install 'sejax[gym]'`. Episodes of the
+shipped SEs have one step.
 
 Example:
   >>> env = make("cartpole")
   >>> obs, info = env.reset(seed=0)
   >>> obs, reward, terminated, truncated, info = env.step(1)
   >>> obs.shape, terminated, truncated
-  ((4,), False, False)
+  ((4,), True, False)
 """
 
 import copy

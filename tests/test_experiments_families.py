@@ -308,7 +308,7 @@ def test_a_tuned_agent_trains_on_the_real_task_as_long_as_on_the_se():
     assert parts.agent.batch_size == 7 and parts.ses.size == 1
     trainings = parts.trainings
     assert list(trainings) == ["se", "same", "long"]
-    assert trainings["same"].max_steps == trainings["se"].max_steps == 4000
+    assert trainings["same"].max_steps == trainings["se"].max_steps == 2000
     assert trainings["same"].stop_rule == "never" and trainings["long"].stop_rule == "solved"
     assert dataclasses.asdict(trainings["long"])["max_steps"] == 100_000
     with pytest.raises(ConfigError, match=r"ses must be of acrobot.*env=cartpole"):

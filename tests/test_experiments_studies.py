@@ -401,7 +401,8 @@ def test_a_recorded_run_is_the_bilevel_loop():
 @pytest.mark.parametrize("overrides", [["agent=ppo"], ["agent=td3_discrete",
                                                         "agent.action_repeat=2"]])  # fmt: skip
 def test_ses_whose_tests_cannot_be_recorded_are_refused(overrides, tmp_path):
-    path = save_se(tmp_path / "se.safetensors", "training.max_steps=9000", *overrides)
+    words = ("preset=soft", "training.max_steps=9000", *overrides)
+    path = save_se(tmp_path / "se.safetensors", *words)
     with pytest.raises(ConfigError, match="without action repeat"):
         run(supervised_baseline, tmp_path, proxy=path)
 

@@ -294,9 +294,10 @@ def test_spaces_are_the_tasks_without_bounds_of_the_observations(stored):
     assert env.reset(seed=0) == (36, {})  # the map's S, at the beginning of its last row
 
 
-def test_a_seed_makes_episodes_again_and_starts_are_the_real_tasks():
+def test_a_seed_makes_episodes_again_and_starts_are_the_real_tasks(stored):
     real = gymnasium.make("CartPole-v1")
-    env = make("cartpole")
+    path = stored(jax_se())
+    env = make(path)
 
     def play(seed):
         seen = [env.reset(seed=seed)[0]]
@@ -308,7 +309,7 @@ def test_a_seed_makes_episodes_again_and_starts_are_the_real_tasks():
     assert not np.allclose(play(5), play(6))
     np.testing.assert_array_equal(env.reset(seed=7)[0], real.reset(seed=7)[0])
     np.testing.assert_array_equal(env.reset()[0], real.reset()[0])
-    assert not np.allclose(make("cartpole").reset()[0], make("cartpole").reset()[0])
+    assert not np.allclose(make(path).reset()[0], make(path).reset()[0])
 
 
 @pytest.mark.parametrize(("task", "config"), CHECKED, ids=str)
@@ -334,8 +335,8 @@ def test_the_spec_makes_it_again_and_adds_no_second_time_limit(stored):
     assert gymnasium.make(gymnasium.envs.registration.EnvSpec.from_json(env.spec.to_json()))
 
 
-def test_what_is_returned_is_the_callers():
-    env = make("cartpole")
+def test_what_is_returned_is_the_callers(stored):
+    env = make(stored(jax_se()))
     first, _ = env.reset(seed=0)
     first[:] = np.nan
     obs, *_ = env.step(0)
