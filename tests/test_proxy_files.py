@@ -168,7 +168,7 @@ def test_shipped_proxies_load(name):
     for group in ("exploration", "es", "objective", "training"):
         assert proxy.learned_with(group) is not None
     agents = proxy.learned_agents()
-    assert proxy.params.discount == agents[next(iter(agents))].discount
+    assert proxy.discount == agents[next(iter(agents))].discount
     assert {"score", "generation", "seed", "evaluations", "card"} <= proxy.record.keys()
 
 
