@@ -92,9 +92,7 @@ def test_a_proxy_needs_no_configuration_and_no_record(tmp_path, env, weights):
 def test_a_loaded_proxy_steps_as_a_gymnax_environment():
     env, params = sejax.load("cartpole")
     obs, state = env.reset(jax.random.key(0), params)
-    obs, state, reward, terminated, *_ = env.step(
-        jax.random.key(1), state, jnp.int32(1), params
-    )
+    obs, state, reward, terminated, *_ = env.step(jax.random.key(1), state, jnp.int32(1), params)
     assert obs.shape == (4,) and reward.shape == () and terminated  # after its only step
 
 
