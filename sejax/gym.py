@@ -36,6 +36,7 @@ from sejax.proxies.units import units_of
 # The tasks that Gymnasium has too, with the same spaces, dynamics and initial states.
 GYMNASIUM_IDS = {
     "cartpole": "CartPole-v1",
+    "cartpole_v1": "CartPole-v1",
     "acrobot": "Acrobot-v1",
     "mountain_car": "MountainCar-v0",
     "mountain_car_continuous": "MountainCarContinuous-v0",
