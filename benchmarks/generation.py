@@ -145,12 +145,14 @@ def sejax_side(args: argparse.Namespace) -> None:
 
     import sejax
     from sejax.bilevel import make_program
+    from sejax.parallel import compiler_options
 
     program = make_program(**sejax.config(overrides(args)).parts())
     init = jax.jit(program.init)
     keys = jax.random.key(args.seed)[None]
     state = init(keys)
-    compiled, start = common.measure(lambda: jax.jit(program.generation).lower(state).compile())
+    generation = jax.jit(program.generation, compiler_options=compiler_options())
+    compiled, start = common.measure(lambda: generation.lower(state).compile())
     weights = jax.tree.map(lambda x: np.asarray(x).tolist(), program.unravel(state.incumbent[0]))
 
     def handle(request: dict[str, Any]) -> dict[str, Any]:

@@ -111,12 +111,14 @@ def sejax_side(args: argparse.Namespace) -> None:
     import numpy as np
 
     import sejax
+    from sejax.parallel import compiler_options
 
     trainings = {}
     for learning in KINDS:
         parts = sejax.config(overrides(args.episodes, learning)).parts()
         env = parts["proxy"]
-        trainings[learning] = jax.jit(sejax.make_trainer(parts["agent"], env, parts["training"]))
+        train = sejax.make_trainer(parts["agent"], env, parts["training"])
+        trainings[learning] = jax.jit(train, compiler_options=compiler_options())
     weights = env.init_weights(jax.random.key(args.seed))
 
     def handle(request: dict[str, Any]) -> dict[str, Any]:
