@@ -52,6 +52,16 @@ def words(key: Array) -> UInt32[Array, " words"]:
     return jax.random.key_data(key)
 
 
+def murmur(x: UInt32[Array, "*shape"]) -> UInt32[Array, "*shape"]:
+    """The finaliser of MurmurHash3, a bijection of 32 bits: makes counters look like random bits.
+
+    Source: A. Appleby, MurmurHash3 (2011), fmix32.
+    """
+    x = (x ^ (x >> 16)) * jnp.uint32(0x85EBCA6B)
+    x = (x ^ (x >> 13)) * jnp.uint32(0xC2B2AE35)
+    return x ^ (x >> 16)
+
+
 def _mix(x: UInt32[Array, "*shape"]) -> UInt32[Array, "*shape"]:
     """A bijection of 32 bits in which each bit of the input moves about half of the output.
 

@@ -24,6 +24,7 @@ from sejax.agents.agent import Agent, AgentOptions, traced
 from sejax.agents.memory import Rollout, rollout_memory
 from sejax.agents.policies import SOFTMAX, Distribution, gaussian
 from sejax.errors import require
+from sejax.keys import murmur
 from sejax.networks import ACTIVATIONS, MLP, narrow
 from sejax.options import (
     MOST_LAYERS,
@@ -401,10 +402,8 @@ def shuffled(
     counters that start at 0 out of the learning phase, into every step.
     """
     size = num_steps // num_minibatches
-    x = jax.random.bits(key) + jnp.arange(epochs * num_steps, dtype=jnp.uint32)
-    x = (x ^ (x >> 16)) * jnp.uint32(0x85EBCA6B)
-    x = (x ^ (x >> 13)) * jnp.uint32(0xC2B2AE35)
-    bits = (x ^ (x >> 16)).reshape(epochs, num_steps)
+    counter = jax.random.bits(key) + jnp.arange(epochs * num_steps, dtype=jnp.uint32)
+    bits = murmur(counter).reshape(epochs, num_steps)
     mask = jnp.uint32((1 << (num_steps - 1).bit_length()) - 1)
     order = jax.lax.sort(bits & ~mask | jnp.arange(num_steps, dtype=jnp.uint32)) & mask
     return order[:, : num_minibatches * size].reshape(-1, size).astype(jnp.int32)

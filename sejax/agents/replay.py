@@ -11,6 +11,7 @@ from jax.experimental.xla_metadata import set_xla_metadata
 from jaxtyping import Array, Float, Int, UInt32
 
 from sejax.agents.partial_batch import block_size
+from sejax.keys import murmur
 
 _VECTOR = 8  # float32 lanes of AVX2
 
@@ -183,10 +184,7 @@ def sample_indices(
     size / 2**24.
     """
     counter = jnp.uint32(first) + jnp.arange(batch_size, dtype=jnp.uint32)
-    x = seed + counter * jnp.uint32(0x9E3779B9)
-    x = (x ^ (x >> 16)) * jnp.uint32(0x85EBCA6B)
-    x = (x ^ (x >> 13)) * jnp.uint32(0xC2B2AE35)
-    x = x ^ (x >> 16)
+    x = murmur(seed + counter * jnp.uint32(0x9E3779B9))
     fraction = (x >> 8).astype(jnp.float32) * jnp.float32(2**-24)  # [0, 1)
     index = (fraction * size.astype(jnp.float32)).astype(jnp.int32)
     return jnp.minimum(index, size - 1)  # rounding may reach size
