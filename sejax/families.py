@@ -41,12 +41,13 @@ class Families:
     Attributes:
       agents: from `sejax.make_agent`, or of one's own.
       names: of the families, for tables; their numbers if not given.
-      weights: shares of the members that train each; equal if not given.
+      weights: shares of the members that train each; equal if not given. A family of weight 0
+        judges the incumbent alone.
       config: how their scores are put together.
 
     Raises:
-      ConfigError: for no agents, other numbers of names and weights, or weights that are not
-        positive.
+      ConfigError: for no agents, other numbers of names and weights, negative weights, or none
+        above 0.
 
     Example:
       >>> import sejax
@@ -72,8 +73,9 @@ class Families:
         for what in (self.names, self.weights):
             require(len(what) == size, "agents", f"have {size} names and weights", "each agent is "
                     "a family", what, "names=() and weights=()")  # fmt: skip
-        require(all(w > 0 for w in self.weights), "agents", "have positive weights", "a family of "
-                "weight 0 is none", self.weights, "agents=[...] without it")  # fmt: skip
+        require(min(self.weights) >= 0 and max(self.weights) > 0, "agents", "have weights of at "
+                "least 0, and one above", "the members of a generation take turns among them",
+                self.weights, "weights=()")  # fmt: skip
 
     @classmethod
     def of(cls, agent: "Agent | Families") -> "Families":
@@ -87,7 +89,8 @@ class Families:
     def of_members(self, num_members: int, num_signs: int = 1) -> np.ndarray:
         """The family that each member trains, `[num_members]`.
 
-        Places are dealt by the weights, each to the family that is furthest behind its share.
+        Places are dealt by the weights, each to the family that is furthest behind its share; a
+        family of weight 0 gets none.
         Members that are the signs of one perturbation train the same family, as they are compared
         with each other.
 
@@ -95,18 +98,19 @@ class Families:
           ConfigError: if there are more families than there are perturbations.
         """
         num_places = num_members // num_signs
-        require(num_places >= self.size, "es.population_size", f"be at least {self.size}",
-                "each family needs a member", num_places,
-                f"es.population_size={self.size}")  # fmt: skip
         shares = np.array(self.weights) / sum(self.weights)
+        num_trained = np.count_nonzero(shares)
+        require(num_places >= num_trained, "es.population_size", f"be at least {num_trained}",
+                "each family needs a member", num_places,
+                f"es.population_size={num_trained}")  # fmt: skip
         counts = np.zeros(self.size)
         places = []
         for place in range(num_places):
             family = int(np.argmax(shares * (place + 1) - counts))
             counts[family] += 1
             places.append(family)
-        require(counts.all(), "agents", "have weights that leave each family a member", "the "
-                f"proxy must be told by all of them; there are {num_places} perturbations",
+        require(counts[shares > 0].all(), "agents", "have weights that leave each family a member",
+                f"the proxy must be told by all of them; there are {num_places} perturbations",
                 self.weights, "es.population_size larger")  # fmt: skip
         return np.tile(places, num_signs)
 
@@ -138,7 +142,7 @@ class Families:
             return scores, incumbent_means[0]
         compare = _ranks if self.config.compared_by == "rank" else _advantages
         compared = scores
-        for i in range(self.size):
+        for i in np.unique(family):
             places = np.flatnonzero(family == i)
             own = scores[places]
             mean = jnp.where(jnp.isfinite(incumbent_means[i]), incumbent_means[i], finite_mean(own))

@@ -170,8 +170,8 @@ class SyntheticEnv(gymnasium.Env[Any, Any]):
             space = task.observation_space
             self._units = units_of(space.low.ravel(), space.high.ravel(), self._obs_dim)
         self._starts = task.starts
-        require(self._starts or self._start_layers, "task.starts", "be given for an SE whose "
-                "initial states are the real task's", "episodes begin there", None,
+        require(self._starts or config.initial_state != "real", "task.starts", "be given for an SE "
+                "whose initial states are the real task's", "episodes begin there", None,
                 "RealTask(starts=...)")  # fmt: skip
         self._max_steps = config.max_steps(task.max_steps)
         self._one_hot = np.eye(action_dim, dtype=np.float32)
@@ -212,9 +212,10 @@ class SyntheticEnv(gymnasium.Env[Any, Any]):
         return self._observe(vector), reward if is_sane else 0.0, terminated, truncated, info
 
     def _first_vector(self) -> np.ndarray:
-        if self._start_layers:
-            noise = self.np_random.standard_normal(self._obs_dim, np.float32)
-            vector = noise + self._forward(self._start_layers, noise)
+        if self.config.initial_state != "real":
+            vector = noise = self.np_random.standard_normal(self._obs_dim, np.float32)
+            if self._start_layers:
+                vector = noise + self._forward(self._start_layers, noise)
             vector = vector if self._units is None else self._units.decode(vector)
             return np.clip(vector, -ABSURD, ABSURD)
         assert self._starts is not None

@@ -78,6 +78,7 @@ GROUPS = {
         "sac": "sejax.agents.sac:SACConfig",
         "q_learning": "sejax.agents.tabular:QLearningConfig",
         "sarsa": "sejax.agents.tabular:SARSAConfig",
+        "boltzmann": "sejax.agents.boltzmann:BoltzmannConfig",
     }),
     "exploration": Group("sejax.explorations", ("agent", "task"), {
         "none": "sejax.agents.agent:NoExploration",

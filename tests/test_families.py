@@ -48,6 +48,9 @@ def test_places_are_dealt_to_the_family_that_is_furthest_behind_its_share():
     np.testing.assert_array_equal(dealt, [0, 1, 0, 2, 1, 0] * 2)
     np.testing.assert_array_equal(families(2).of_members(5), [0, 1, 0, 1, 0])
     np.testing.assert_array_equal(families(1).of_members(3), [0, 0, 0])
+    # A family of weight 0 judges incumbents alone, and needs no room among the members.
+    np.testing.assert_array_equal(families(2, weights=(0.0, 3.0)).of_members(3), [1, 1, 1])
+    np.testing.assert_array_equal(families(2, weights=(0.0, 3.0)).of_members(1), [1])
 
 
 def test_both_signs_of_a_perturbation_train_the_same_family():
@@ -85,9 +88,8 @@ def test_the_incumbent_is_tried_by_as_many_agents_of_each_family(asked, num, eva
             r"^agents must have 2 names and weights, .*; got \(1\.0, 2\.0, 3\.0\)\.",
         ),
         (
-            lambda: families(2, weights=(1.0, 0.0)),
-            r"^agents must have positive weights, because a family of weight 0 is none; "
-            r"got \(1\.0, 0\.0\)\.",
+            lambda: families(2, weights=(0.0, 0.0)),
+            r"^agents must have weights of at least 0, and one above, .*; got \(0\.0, 0\.0\)\.",
         ),
         (
             lambda: families(3).of_members(4, num_signs=2),

@@ -112,6 +112,7 @@ def assert_equal_steps(env, jax_env, params, num_steps=40):
                                      "horizon_is_terminal": False}),
         ("cartpole", BANDIT),
         ("gridworld_2x2", {"done": "soft", "horizon": 1}),
+        ("pendulum", {"done": "threshold", "state_units": "bounds", "initial_state": "noise"}),
     ],
     ids=str,
 )  # fmt: skip
@@ -147,8 +148,9 @@ def test_learned_initial_states_are_the_same_function_of_the_noise(stored, scale
     assert (np.abs(expected).max() == ABSURD) == (scale > 1)
 
 
-def test_noise_of_learned_initial_states_is_standard_normal(stored):
-    jax_env = jax_se(**BANDIT)
+@pytest.mark.parametrize("initial_state", ["learned", "noise"])
+def test_noise_of_initial_states_is_standard_normal(stored, initial_state):
+    jax_env = jax_se(**BANDIT | {"initial_state": initial_state})
     env = make(stored(jax_env, random_weights(jax_env, scale=0.0)))  # which adds nothing to it
     env.reset(seed=0)
     noise = np.stack([env.reset()[0] for _ in range(2000)])

@@ -216,6 +216,17 @@ def test_learned_starts_are_normal_noise_moved_by_a_network(task, horizon):
     assert len(np.unique(np.asarray(state.vector), axis=0)) == 4
 
 
+def test_starts_of_noise_are_that_in_the_units_of_the_networks():
+    env = make_env("pendulum", initial_state="noise", state_units="bounds", horizon=1)
+    weights = env.init_weights(jax.random.key(2))
+    assert set(weights) == {"reward"}
+    obs, state = env.reset_env(jax.random.key(0), env.params(weights))
+    # Bounds of 1, 1 and 8: half of the way there is 1.
+    expected = np.array([0.5, 0.5, 4.0]) * jax.random.normal(jax.random.key(0), (3,))
+    np.testing.assert_allclose(state.vector, expected, rtol=1e-6)
+    np.testing.assert_array_equal(obs, state.vector)
+
+
 def test_no_two_networks_begin_with_the_same_numbers():
     weights = make_env(initial_state="learned").init_weights(jax.random.key(0))
     assert set(weights) == {"state", "reward", "done", "start"}

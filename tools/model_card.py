@@ -28,7 +28,8 @@ def _about(proxy: PretrainedProxy) -> str:
         return (f"A {KINDS['rn']} for the task `{proxy.task}`: the dynamics are the real task's, "
                 f"the reward is made by a small learned network. Agents that train on it need "
                 f"fewer steps for the real task, where they are tested.")  # fmt: skip
-    starts = {"real": "the real task's", "learned": "made by a network from noise"}
+    starts = {"real": "the real task's", "learned": "made by a network from noise",
+              "noise": "standard normal noise"}  # fmt: skip
     return (
         f"A {KINDS['se']} that stands in for the task `{proxy.task}`: small networks make the "
         f"rewards and states of a world of its own. Agents train on it alone, without a step of "

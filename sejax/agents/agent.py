@@ -36,6 +36,8 @@ class Agent:
       variants: agents of other sizes, of which each training takes one, if hyperparameters are
         drawn for each (`sejax.agents.varied`); empty if they are not.
       draw: `key -> Draw`, which one and with which hyperparameters.
+      solve: `(env, env_params, hparams) -> state`, the trained agent, where a world's optimum is
+        known; then nothing is trained. None for agents that learn.
     """
 
     init: Callable[..., Any]
@@ -53,6 +55,7 @@ class Agent:
     cpu_lanes: int | None = 1
     variants: tuple["Agent", ...] = ()
     draw: Callable[[Array], "Draw"] | None = None
+    solve: Callable[[Any, Any, Any], Any] | None = None
 
     def fresh(self, make_run: Callable[["Agent"], Callable[..., Any]]) -> Callable[..., Any]:
         """Builds `run(key, *args)` for a fresh agent, whose hyperparameters may be drawn first.

@@ -17,7 +17,7 @@ from hydra.core.override_parser.types import ChoiceSweep, QuotedString
 from hydra.errors import HydraException
 
 from sejax import plugins, serialize
-from sejax.errors import ConfigError, positive, require, shortened, unknown_name
+from sejax.errors import ConfigError, is_number, require, shortened, unknown_name
 from sejax.families import FamiliesConfig
 
 JOINT = "+"  # between the agents of a choice, and after a single one
@@ -34,7 +34,7 @@ class AgentFamily:
       key: what tables call it.
       field: what the command line and messages call it.
       agent: its configuration.
-      weight: its share of a generation's members.
+      weight: its share of a generation's members; with 0 it judges incumbents alone.
     """
 
     key: str
@@ -85,7 +85,8 @@ def _family(key: str, values: Any) -> AgentFamily:
                 "each is a family", shortened(values), "agent=ddqn")  # fmt: skip
         fields = dict(values)
         weight = fields.pop("weight", 1.0)
-        positive("agent.weight", weight, "it is a share of the members", 1, at_most=1e6)
+        require(is_number(weight) and 0 <= weight <= 1e6, "agent.weight", "lie in [0, 1e6]",
+                "it is a share of the members", weight, "agent.weight=1")  # fmt: skip
         agent = plugins.configure("agent", fields)
     return AgentFamily(key=key, field=field, agent=agent, weight=float(weight))
 

@@ -62,7 +62,7 @@ class SeHorizons(FamilyRuns):
         (1, 2, 5, 20, None), quick=(1, None), about="steps of an SE's episodes; null: the task's "
         "limit")  # fmt: skip
     starts: tuple[str, ...] = setting(
-        INITIAL_STATES, each_of(INITIAL_STATES), about="initial states of the SEs"
+        ("real", "learned"), each_of(INITIAL_STATES), about="initial states of the SEs"
     )
     ends: tuple[str, ...] = setting(
         ("threshold",), each_of(DONE_MODES), about="how episodes of several steps end; the figure "

@@ -7,7 +7,7 @@ from sejax.errors import require
 from sejax.options import ACTIVATIONS, MOST_LAYERS, Options, counts, one_of, option
 
 DONE_MODES = ("soft", "threshold", "bernoulli", "sigmoid")
-INITIAL_STATES = ("real", "learned")
+INITIAL_STATES = ("real", "learned", "noise")
 STATE_UNITS = ("raw", "bounds")
 VARIANTS = (
     "additive_potential", "exclusive_potential", "additive_non_potential",
@@ -32,7 +32,8 @@ class SyntheticConfig(Options):
     # (the authors'); threshold: at d > 0.5; bernoulli: with probability clip(d, 0, 1); sigmoid:
     # with probability sigmoid(d). All but the first are ends that every agent sees.
     done: str = option("soft", one_of(DONE_MODES))
-    # real: the task's initial states; learned: a network's, from standard normal noise
+    # real: the task's initial states; learned: standard normal noise, moved by a network; noise:
+    # that alone, in the units of `state_units`, where nothing would tell the network what to learn.
     initial_state: str = option("real", one_of(INITIAL_STATES))
     # Units in which the networks see and make states. raw: the task's own; bounds: half the way
     # from the middle of its observation space to the bounds, where it has such, is 1. A car's

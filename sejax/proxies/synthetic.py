@@ -40,8 +40,8 @@ class SyntheticEnv(ProxyEnv):
 
     What the configuration says of beginnings and ends:
 
-    - `initial_state`: the real task's; or learned: standard normal noise plus what a network makes
-      of it, so that a fresh SE's starts surround the origin.
+    - `initial_state`: the real task's; or standard normal noise; or learned: noise plus what a
+      network makes of it, so that a fresh SE's starts surround the origin.
     - `done`: how d terminates an episode. `info["discount"]` is what a target should bootstrap
       with: 1 - d itself if it is "soft" (a learned discount, not confined to [0, 1], which no agent
       outside sees), else 1 - terminated.
@@ -109,11 +109,23 @@ class SyntheticEnv(ProxyEnv):
         state = out["state"] if self._units is None else self._units.decode(out["state"])
         return state, out["reward"][0], out["done"][0]
 
+    @property
+    def is_bandit(self) -> bool:
+        """Whether every episode is one step, so that its reward is all there is to gain."""
+        return self.config.horizon == 1
+
+    def bandit_reward(
+        self, weights: Any, obs: Float[Array, " obs_dim"], action: Array
+    ) -> Float[Array, ""]:
+        """The reward of an action, where states are what agents observe."""
+        return self.predict(weights, obs, action)[1]
+
     def reset_env(self, key: Array, params: ProxyParams) -> tuple[Array, SyntheticState]:
-        if self._start is not None:
-            noise = jax.random.normal(key, (self.task.obs_dim,))
-            moved: Any = self._start.apply({"params": params.weights["start"]}, noise)
-            vector = noise + moved
+        if self.config.initial_state != "real":
+            vector = noise = jax.random.normal(key, (self.task.obs_dim,))
+            if self._start is not None:
+                moved: Any = self._start.apply({"params": params.weights["start"]}, noise)
+                vector = noise + moved
             vector = vector if self._units is None else self._units.decode(vector)
             vector = jnp.clip(vector, -ABSURD, ABSURD)  # what steps from there call absurd
         else:

@@ -71,7 +71,7 @@ class PretrainedProxy:
       generation: that one.
       seed: of its run.
       horizon: steps of its episodes at most; None for the task's limit.
-      initial_state: of its episodes: real or learned.
+      initial_state: of its episodes: real, learned or noise.
       ends: what ends them: horizon, the done output (soft, threshold, bernoulli, sigmoid) or real.
       evaluations: of fresh agents.
       learning: its run; None if it was not recorded.

@@ -1,0 +1,117 @@
+r"""What every agent strives for in a one-step SE, without training one.
+
+An SE whose episodes are one step is a contextual bandit, and for a bandit the policy that maximises
+reward plus `temperature` times entropy is known:
+
+.. math:: \pi(a \mid s) \propto \exp(r(s, a) / \tau)
+
+Where trainings are the inner loop's whole cost, SEs can be learned with this policy in their place.
+It is what soft actor-critic tends to, and a stern examiner: it plays at random between actions
+whose rewards lie within the temperature of each other, so an SE has to tell them apart clearly.
+
+Source: Ziebart, "Modeling Purposeful Adaptive Behavior with the Principle of Maximum Causal
+Entropy" (2010); Haarnoja et al., "Reinforcement Learning with Deep Energy-Based Policies" (2017),
+theorem 1, of which a bandit is the case without a next state.
+"""
+
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jaxtyping import Array, Float
+
+from sejax.agents.agent import Agent, traced
+from sejax.agents.memory import no_memory
+from sejax.errors import require
+from sejax.options import Options, counts, option, positive
+
+MOST_DIMS = 2  # of continuous actions: there are num_points to the power of these
+
+
+@dataclass(frozen=True, kw_only=True)
+class BoltzmannConfig(Options):
+    """The Boltzmann policy of a one-step SE's rewards."""
+
+    group: ClassVar[str] = "agent"
+    states: ClassVar[str] = "vector"
+    actions: ClassVar[tuple[str, ...]] = ("discrete", "continuous")
+
+    # What a nat of entropy is worth, in the SE's rewards.
+    temperature: float = option(
+        0.3, positive("a policy without entropy is told nothing of how clear rewards are"),
+        traced=True,
+    )  # fmt: skip
+    # Values of each number of a continuous action, evenly spaced over its range.
+    num_points: int = option(33, counts("a policy chooses", least=2))
+
+    def make(self, task: Any) -> Agent:
+        """The agent for a task's actions.
+
+        Raises:
+          ConfigError: for continuous actions of more than two numbers.
+        """
+        if task.num_actions is not None:
+            return make_boltzmann(self, jnp.arange(task.num_actions))
+        require(task.action_dim <= MOST_DIMS, "agent", "be one that learns where actions have more "
+                f"than {MOST_DIMS} numbers", "the Boltzmann policy tries every action of a grid",
+                f"boltzmann for {task.action_dim} of them", "agent=sac")  # fmt: skip
+        points = np.linspace(-task.max_action, task.max_action, self.num_points, dtype=np.float32)
+        grid = np.meshgrid(*[points] * task.action_dim, indexing="ij")
+        return make_boltzmann(self, jnp.stack([x.ravel() for x in grid], axis=1))
+
+
+class BoltzmannState(struct.PyTreeNode):
+    """One agent: the rewards of its world, and how it weighs them."""
+
+    reward: Any  # `(obs, action) -> []`, a pytree
+    hparams: Any
+
+
+def make_boltzmann(config: BoltzmannConfig, actions: Array) -> Agent:
+    """The policy over some actions, `[num_actions]` indices or `[num_actions, action_dim]`.
+
+    It takes no step of training: `Agent.solve` reads the rewards of the world, an SE with
+    `proxy.horizon=1`. Tests play the policy as it is, at random.
+
+    Example:
+      >>> import sejax
+      >>> env, params = sejax.load("cartpole")
+      >>> agent = sejax.make_agent(BoltzmannConfig(), env.task)
+      >>> state = agent.solve(env, params, agent.hparams)
+      >>> int(agent.act(jax.random.key(0), state, jnp.zeros(4), explore=False)) in (0, 1)
+      True
+    """
+
+    def solve(env: Any, env_params: Any, hparams: Any) -> BoltzmannState:
+        require(getattr(env, "is_bandit", False), "agent", "be one that learns, or the proxy an SE "
+                "whose episodes are one step", "the Boltzmann policy is known there alone",
+                f"boltzmann in {env.name}", "agent=ddqn, or proxy.horizon=1")  # fmt: skip
+        reward = jax.tree_util.Partial(env.bandit_reward, env_params.weights)
+        return BoltzmannState(reward=reward, hparams=jax.tree.map(jnp.float32, hparams))
+
+    def act(key: Array, state: BoltzmannState, obs: Array, explore: bool) -> Array:
+        return actions[jax.random.categorical(key, log_weights(state, obs, actions))]
+
+    return Agent(
+        init=_needs_no_training,
+        act=act,
+        update=_needs_no_training,
+        memory=no_memory(),
+        hparams=traced(config),
+        discount=lambda hparams: 1.0,
+        solve=solve,
+    )
+
+
+def log_weights(
+    state: BoltzmannState, obs: Float[Array, " obs_dim"], actions: Array
+) -> Float[Array, " num_actions"]:
+    """Logarithms of the actions' probabilities, but for a constant."""
+    return jax.vmap(state.reward, (None, 0))(obs, actions) / state.hparams.temperature
+
+
+def _needs_no_training(*_: Any) -> Any:
+    raise NotImplementedError("the Boltzmann policy is solved for, not trained: Agent.solve")
