@@ -19,6 +19,7 @@ from sejax.statistics import performance_profile
 
 # Okabe and Ito's palette, which those with any kind of colour blindness can tell apart.
 REAL, VARIED, FIXED, BEST, SOLVED = "#0072B2", "#E69F00", "#009E73", "#000000", "#B03A73"
+TUNED = "#56B4E9"
 AGENT_NAMES = {"ddqn": "DDQN", "dueling_ddqn": "Dueling DDQN", "td3": "TD3",
                "td3_discrete": "discrete TD3", "ppo": "PPO", "sac": "SAC", "dqn": "DQN",
                "q_learning": "Q-learning", "sarsa": "SARSA"}  # fmt: skip
