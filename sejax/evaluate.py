@@ -15,7 +15,7 @@ from sejax import plugins
 from sejax.app import build, commands, compose, runtime
 from sejax.app.build import EvaluateConfig
 from sejax.app.families import AgentFamily, families_of, named
-from sejax.errors import ConfigError
+from sejax.errors import ConfigError, require
 from sejax.training import TrainingConfig
 
 
@@ -145,6 +145,10 @@ def _proxy_study(config: EvaluateConfig) -> Study:
         trainings[family.key] = training
     worlds = {"the proxy": (proxy.env, proxy.params, trainings)}
     if config.baseline:
+        for family in families:
+            require(not getattr(family.agent, "is_solved_for", False), "baseline", "be false with "
+                    f"{family.field}={family.key}", "only a one-step SE can be solved for", "true",
+                    "baseline=false")  # fmt: skip
         real_training = dict.fromkeys(trainings, config.real_training)
         worlds["the real task"] = (task.env, task.params, real_training)
     shipped = proxy.path.parent == files.PRETRAINED_DIR

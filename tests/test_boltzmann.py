@@ -8,8 +8,10 @@ import pytest
 import sejax
 from sejax import envs
 from sejax.agents.boltzmann import BoltzmannConfig, log_weights
+from sejax.app import compose
 from sejax.bilevel import make_program
 from sejax.errors import ConfigError
+from sejax.evaluate import evaluate
 from sejax.families import Families
 from sejax.objectives import AUC
 from sejax.proxies.configs import SyntheticConfig
@@ -138,3 +140,9 @@ def test_where_it_cannot_be_solved_for_it_says_so():
         BoltzmannConfig().make(
             type("Task", (), {"num_actions": None, "action_dim": 3, "max_action": 1.0})
         )
+
+
+def test_the_command_asks_for_no_baseline_before_it_trains_anything():
+    config = compose.evaluate_config(["proxy=cartpole", "agent=boltzmann"])
+    with pytest.raises(ConfigError, match=r"^baseline must be false with agent=boltzmann, "):
+        evaluate(config)

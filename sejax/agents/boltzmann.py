@@ -38,6 +38,7 @@ class BoltzmannConfig(Options):
     group: ClassVar[str] = "agent"
     states: ClassVar[str] = "vector"
     actions: ClassVar[tuple[str, ...]] = ("discrete", "continuous")
+    is_solved_for: ClassVar[bool] = True  # and cannot train on the real task
 
     # What a nat of entropy is worth, in the SE's rewards.
     temperature: float = option(
