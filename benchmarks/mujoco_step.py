@@ -28,7 +28,7 @@ def main() -> None:
         return
     if args.quick:
         args.tasks, args.repeats = args.tasks[:1], min(args.repeats, 2)
-    where = common.machine()
+    where = common.machine(("jax", "mujoco", "brax", "gymnasium", "sejax"))
     result: dict[str, Any] = {"tasks": {}, "machine": where}
     for task in args.tasks:
         names = ["mujoco", "gymnasium", *(ON_HALFCHEETAH if task == "halfcheetah" else ())]

@@ -44,7 +44,7 @@ class Physics:
 
     A state is what MuJoCo needs to go on to the same bits (`mjSTATE_INTEGRATION`, and the bodies'
     positions for the next `Report.xpos_change`): doubles, as pairs of 32-bit words, `[num_words]`.
-    Rounded to single precision it would be another trajectory after some hundred steps.
+    Rounded to single precision it would be another trajectory within a hundred steps.
 
     Both functions take one element; under `vmap` a batch is one call, whose elements are stepped
     one after the other. Devices step at the same time.
