@@ -48,8 +48,8 @@ class MujocoEnv(environment.Environment[MujocoState, MujocoParams]):
         self.config = config
         self.physics = physics.of_gymnasium(self.file, self.frame_skip, self.with_forces)
         model = self.physics.model
-        self._qpos0 = np.float32(model.qpos0)
-        self._high = np.float32(model.actuator_ctrlrange[:, 1])
+        self._qpos0 = np.asarray(model.qpos0, np.float32)
+        self._high = np.asarray(model.actuator_ctrlrange[:, 1], np.float32)
 
     def draw_start(self, key: Array) -> tuple[Float[Array, " nq"], Float[Array, " nv"]]:
         """Positions and velocities of a reset."""
@@ -78,8 +78,8 @@ class MujocoEnv(environment.Environment[MujocoState, MujocoParams]):
     ) -> tuple[Float[Array, " nq"], Float[Array, " nv"]]:
         """The model's own pose at rest and noise: uniform in +-`scale`, or with that deviation."""
         key_qpos, key_qvel = jax.random.split(key)
-        (nq,), nv = self._qpos0.shape, self.physics.model.nv
-        qpos = self._qpos0 + jax.random.uniform(key_qpos, (nq,), minval=-scale, maxval=scale)
+        nq, nv = self.physics.model.nq, self.physics.model.nv
+        qpos = jax.random.uniform(key_qpos, (nq,), minval=-scale, maxval=scale) + self._qpos0
         if normal_velocities:
             return qpos, scale * jax.random.normal(key_qvel, (nv,))
         return qpos, jax.random.uniform(key_qvel, (nv,), minval=-scale, maxval=scale)
@@ -109,8 +109,9 @@ class MujocoEnv(environment.Environment[MujocoState, MujocoParams]):
         rewards = self.rewards(now, action, healthy)
         discount = jnp.where(terminated, 0.0, 1.0)
         info = {**self.tells(now), **rewards, "discount": discount}
+        reward = sum(rewards.values(), jnp.float32(0))
         state = MujocoState(physics=after, time=state.time + 1)
-        return self.observe(now), state, sum(rewards.values()), terminated, info
+        return self.observe(now), state, reward, terminated, info
 
     def is_terminated(self, state: MujocoState, params: MujocoParams) -> Array:
         """False: whether a step terminates is known when it is made."""

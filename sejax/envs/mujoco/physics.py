@@ -65,9 +65,10 @@ class Physics:
         handlers.SejaxMujocoRegister(self._id, self.model._address)
         self.num_words = 2 * handlers.SejaxMujocoLength(self.model._address)
         nq, nv, nbody = self.model.nq, self.model.nv, self.model.nbody
-        self._shapes = Report(qpos=(nq,), qvel=(nv,), qpos_change=(nq,), xpos=(nbody, 3),
-                              xpos_change=(nbody, 3),
-                              cfrc_ext=(nbody if with_forces else 0, 6))  # fmt: skip
+        self._shapes = {
+            "qpos": (nq,), "qvel": (nv,), "qpos_change": (nq,), "xpos": (nbody, 3),
+            "xpos_change": (nbody, 3), "cfrc_ext": (nbody if with_forces else 0, 6),
+        }  # as step.cc reports them, one after the other  # fmt: skip
 
     @property
     def dt(self) -> float:
@@ -95,14 +96,17 @@ class Physics:
         for array, shape in arguments:
             if array.shape != shape:
                 raise ValueError(f"{target} must get arrays of shape {shape}; got {array.shape}")
-        sizes = [int(np.prod(shape)) for shape in self._shapes]
+        sizes = [int(np.prod(shape)) for shape in self._shapes.values()]
         results = (jax.ShapeDtypeStruct((self.num_words,), jnp.uint32),
                    jax.ShapeDtypeStruct((sum(sizes),), jnp.float32))  # fmt: skip
         call = jax.ffi.ffi_call(target, results, vmap_method="broadcast_all")
         state, numbers = call(*(array for array, _ in arguments), model=self._id, **attributes)
         parts = jnp.split(numbers, np.cumsum(sizes)[:-1])
-        shaped = (x.reshape(shape) for x, shape in zip(parts, self._shapes, strict=True))
-        return state, Report(*shaped)
+        shaped = {
+            name: x.reshape(shape)
+            for (name, shape), x in zip(self._shapes.items(), parts, strict=True)
+        }
+        return state, Report(**shaped)
 
 
 @functools.cache
