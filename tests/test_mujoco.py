@@ -5,6 +5,7 @@ import os
 import shutil
 import subprocess
 import sys
+import tempfile
 import threading
 from concurrent.futures import ThreadPoolExecutor
 
@@ -393,6 +394,13 @@ def test_other_devices_than_the_cpu_are_refused(monkeypatch):
 
 
 # --- slow: builds and long runs ------------------------------------------------------------------
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("folder", ["", "/proc/nowhere"])
+def test_without_a_cache_folder_it_is_built_all_the_same(folder):
+    done = run_program("memory", "reacher", "10", SEJAX_CACHE_DIR=folder)
+    assert tempfile.gettempdir() in done.stdout
 
 
 @pytest.mark.slow

@@ -1,5 +1,6 @@
 """The shared library that `step.cc` becomes: built on first use, and kept."""
 
+import contextlib
 import ctypes
 import functools
 import hashlib
@@ -34,16 +35,17 @@ def load() -> ctypes.CDLL:
 
     It is built if it is not in the cache folder (`sejax.files.cache_folder`), which takes some
     seconds. Processes that build it at the same time do not disturb each other. With the cache
-    switched off each process builds its own.
+    switched off, or where it cannot be written, each process builds its own.
 
     Raises:
       NoCompilerError: if it has to be built and cannot be.
     """
     folder = files.cache_folder()
-    if folder is None:
-        with tempfile.TemporaryDirectory() as temporary:
-            return _register(_built_in(Path(temporary)))
-    return _register(_built_in(folder))
+    if folder is not None:
+        with contextlib.suppress(OSError):
+            return _register(_built_in(folder))
+    with tempfile.TemporaryDirectory() as temporary:
+        return _register(_built_in(Path(temporary)))
 
 
 def file_name() -> str:

@@ -2,7 +2,7 @@
 //
 // What MuJoCo needs to go on exactly where it was goes in and comes out, as doubles in pairs of
 // 32-bit words, since JAX has no doubles by default: its integration state, and after it the
-// positions of all bodies as it computed them last, `size` doubles in all. Those lag behind the
+// positions of all bodies as it computed them last, `Length` doubles in all. Those lag behind the
 // joints by a part of a step, and some of Gymnasium's rewards are made of them.
 //
 // Leading axes of the arguments are a batch, whose elements are stepped one after the other. Each
@@ -43,16 +43,25 @@ struct Workspace {
   std::unique_ptr<mjData, FreeData> data;
 };
 
-std::shared_mutex models_mutex;
-std::unordered_map<int64_t, const mjModel*> models;  // grows only, and what is in it stays
+// All models by their numbers. It only grows, and is never destroyed: XLA's threads may outlive it.
+struct Models {
+  std::shared_mutex mutex;
+  std::unordered_map<int64_t, const mjModel*> by_id;
+};
+
+Models& AllModels() {
+  static Models& models = *new Models();
+  return models;
+}
 
 // This thread's workspace for a model; without a model if there is none of that number.
 Workspace& WorkspaceOf(int64_t id) {
   thread_local std::unordered_map<int64_t, Workspace> workspaces;
   Workspace& found = workspaces[id];
   if (found.model == nullptr) {
-    std::shared_lock lock(models_mutex);
-    if (auto model = models.find(id); model != models.end()) {
+    Models& all = AllModels();
+    std::shared_lock lock(all.mutex);
+    if (auto model = all.by_id.find(id); model != all.by_id.end()) {
       found.model = model->second;
       found.data.reset(mj_makeData(found.model));
     }
@@ -222,8 +231,9 @@ ffi::Error Step(int64_t id, int64_t frame_skip, Words state, Floats ctrl, ffi::R
 
 // Keeps a copy of a model under a number; one that is there stays.
 extern "C" void SejaxMujocoRegister(int64_t id, const mjModel* model) {
-  std::unique_lock lock(models_mutex);
-  if (models.find(id) == models.end()) models[id] = mj_copyModel(nullptr, model);
+  Models& all = AllModels();
+  std::unique_lock lock(all.mutex);
+  if (all.by_id.find(id) == all.by_id.end()) all.by_id[id] = mj_copyModel(nullptr, model);
 }
 
 // Doubles in a state of this model.
