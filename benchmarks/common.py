@@ -125,14 +125,18 @@ def show_spread(values: dict[str, float], digits: int = 1) -> str:
     return f"{middle} ({low} to {high})"
 
 
-def machine() -> dict[str, Any]:
-    """Where this was measured; the load before the start says how busy the machine was."""
+def machine(packages: Sequence[str] = ("jax", "torch", "sejax")) -> dict[str, Any]:
+    """Where this was measured; the load before the start says how busy the machine was.
+
+    Args:
+      packages: those whose versions matter.
+    """
     return {
         "cpu": _cpu_model(),
         "cores": len(available_cores()),
         "load_before": round(os.getloadavg()[0], 2),
         "python": platform.python_version(),
-        **{package: version(package) for package in ("jax", "torch", "sejax")},
+        **{package: version(package) for package in packages},
     }
 
 

@@ -16,6 +16,7 @@ import numpy as np
 
 from sejax.envs.halfcheetah import BACKENDS
 
+BRAX = BACKENDS[1:]  # the first is MuJoCo itself
 GAIT_STEPS = 200
 DT = 0.05  # seconds of a control step: five physics steps of 0.01
 MUJOCO_FRAMES = 5
@@ -52,7 +53,7 @@ def main() -> None:
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--backends", nargs="+", default=list(BACKENDS))
+    parser.add_argument("--backends", nargs="+", default=list(BRAX))
     parser.add_argument("--gaits", type=int, default=24)
 
 

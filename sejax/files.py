@@ -20,6 +20,22 @@ except ImportError:  # not on Windows
 _TEMPORARY = re.compile(r"\.(?P<name>.+)\.sejax-[0-9a-f]{8}(?P<suffix>\.[^.]*)?")
 
 
+def cache_folder() -> Path | None:
+    """Where sejax keeps what it can make again; need not exist.
+
+    Returns:
+      `SEJAX_CACHE_DIR`, else `sejax` in the user's folder for caches (`XDG_CACHE_HOME`, which is
+      `~/.cache` if it is not set). None if `SEJAX_CACHE_DIR` is set to nothing, or nobody's home.
+    """
+    root = os.environ.get("SEJAX_CACHE_DIR")
+    if root is not None:
+        return Path(root) if root else None
+    try:
+        return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "sejax"
+    except RuntimeError:
+        return None
+
+
 @contextlib.contextmanager
 def atomic_path(path: Path) -> Iterator[Path]:
     """Yields a temporary path beside `path` that takes its place when the block succeeds.

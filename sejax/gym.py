@@ -42,6 +42,12 @@ GYMNASIUM_IDS = {
     "mountain_car_continuous": "MountainCarContinuous-v0",
     "pendulum": "Pendulum-v1",
     "halfcheetah": "HalfCheetah-v5",
+    "hopper": "Hopper-v5",
+    "walker2d": "Walker2d-v5",
+    "swimmer": "Swimmer-v5",
+    "inverted_pendulum": "InvertedPendulum-v5",
+    "ant": "Ant-v5",
+    "reacher": "Reacher-v5",
 }
 # Gymnasium's Cliff Walking numbers the actions otherwise; the start and the sizes are on the maps.
 _MAPS = {"cliff_walking": cliff_walking.MAP, "gridworld_2x2": gridworld_2x2.MAP}

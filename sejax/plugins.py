@@ -67,6 +67,12 @@ GROUPS = {
         "mountain_car_continuous": "sejax.envs.mountain_car_continuous:MountainCarContinuous",
         "pendulum": "sejax.envs.pendulum:Pendulum",
         "halfcheetah": "sejax.envs.halfcheetah:HalfCheetah",
+        "hopper": "sejax.envs.hopper:Hopper",
+        "walker2d": "sejax.envs.walker2d:Walker2d",
+        "swimmer": "sejax.envs.swimmer:Swimmer",
+        "inverted_pendulum": "sejax.envs.inverted_pendulum:InvertedPendulum",
+        "ant": "sejax.envs.ant:Ant",
+        "reacher": "sejax.envs.reacher:Reacher",
     }, {"gymnax/": "sejax.envs.gymnax:GymnaxTask"}),
     "agent": Group("sejax.agents", ("task",), {
         "ddqn": "sejax.agents.ddqn:DDQNConfig",

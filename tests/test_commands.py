@@ -28,6 +28,7 @@ def test_without_a_home_there_is_no_compilation_cache(monkeypatch):
 
     changed = []
     monkeypatch.delenv("SEJAX_CACHE_DIR", raising=False)
+    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
     monkeypatch.setattr(runtime.Path, "home", nobodys_home)
     monkeypatch.setattr(jax.config, "update", lambda *change: changed.append(change))
     runtime.enable_compilation_cache()

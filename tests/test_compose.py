@@ -69,7 +69,8 @@ def test_a_task_chooses_its_agent_where_none_is_chosen():
     assert names == {
         "cartpole": "ddqn", "cartpole_v1": "ddqn", "acrobot": "ddqn", "cliff_walking": "q_learning",
         "gridworld_2x2": "q_learning", "mountain_car": "ddqn", "mountain_car_continuous": "td3",
-        "pendulum": "td3", "halfcheetah": "td3",
+        "pendulum": "td3", "halfcheetah": "td3", "hopper": "td3", "walker2d": "td3",
+        "swimmer": "td3", "inverted_pendulum": "td3", "ant": "td3", "reacher": "td3",
     }  # fmt: skip
     assert sejax.config(["env=pendulum", "agent=ppo"]).name("agent") == "ppo"
 

@@ -29,7 +29,7 @@ NUM_STEPS = 5
 @pytest.fixture(scope="module")
 def task():
     pytest.importorskip("brax")
-    return envs.make("halfcheetah")
+    return envs.make("halfcheetah", backend="mjx")
 
 
 @pytest.fixture(scope="module")

@@ -6,6 +6,8 @@ import platform
 import sys
 from pathlib import Path
 
+from sejax import files
+
 _NEVER_SECONDS = 1_000_000
 
 
@@ -61,15 +63,10 @@ def enable_compilation_cache() -> None:
     """
     import jax
 
-    root = os.environ.get("SEJAX_CACHE_DIR")
-    if root is None:
-        try:
-            root = str(Path.home() / ".cache" / "sejax")
-        except RuntimeError:  # nobody's home
-            return
-    if not root or jax.config.jax_compilation_cache_dir:
+    root = files.cache_folder()
+    if root is None or jax.config.jax_compilation_cache_dir:
         return
-    jax.config.update("jax_compilation_cache_dir", str(Path(root) / cpu_fingerprint()))
+    jax.config.update("jax_compilation_cache_dir", str(root / cpu_fingerprint()))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
 
 

@@ -1,0 +1,30 @@
+"""Ant-v5 on MuJoCo, 1000 steps; needs the extra `mujoco`."""
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+from sejax.envs import mujoco
+from sejax.envs.task import Facts, Task
+from sejax.options import Options, finite, not_negative, option
+
+
+@dataclass(frozen=True, kw_only=True)
+class Ant(Options):
+    """A body on four legs that is paid for walking in one direction and for its health.
+
+    Source: Gymnasium's registry (episode length and reward threshold); options are Gymnasium's.
+    """
+
+    group: ClassVar[str] = "env"
+    facts: ClassVar[Facts] = Facts("vector", "continuous", max_steps=1000, has_info=True)
+
+    forward_reward_weight: float = option(1.0, finite("it weighs a reward"))
+    ctrl_cost_weight: float = option(0.5, not_negative("it weighs a cost"))
+    contact_cost_weight: float = option(5e-4, not_negative("it weighs a cost"))
+    healthy_reward: float = option(1.0, finite("it is a reward"))
+    terminate_when_unhealthy: bool = True
+    include_cfrc_ext_in_observation: bool = True  # forces from without on each body
+    reset_noise_scale: float = option(0.1, not_negative("it is a range"))
+
+    def make(self) -> Task:
+        return mujoco.make_task("ant", self, solved_reward=6000.0)

@@ -1,0 +1,118 @@
+"""A MuJoCo model's reset and step as pure functions of JAX."""
+
+import functools
+import hashlib
+import importlib.util
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from jaxtyping import Array, Float, UInt32
+
+from sejax.envs.mujoco import library
+
+
+class Report(NamedTuple):
+    """What MuJoCo says after a step, in single precision; lengths in m, angles in rad, times in s.
+
+    Attributes:
+      qpos: `[nq]` positions of the joints.
+      qvel: `[nv]` their velocities.
+      qpos_change: `[nq]` by how much the positions differ from those before, which is subtracted
+        in double precision; 0 after a reset.
+      xpos: `[nbody, 3]` positions of the bodies as MuJoCo computed them last, which is before the
+        end of the step: after its start, or after the last of the Runge-Kutta method's stages.
+      xpos_change: `[nbody, 3]` by how much they differ from those that the step before reported.
+      cfrc_ext: `[nbody, 6]` torques and forces from without on each body, in N m and N; 0 after a
+        reset. `[0, 6]` if they are not asked for.
+    """
+
+    qpos: Float[Array, " nq"]
+    qvel: Float[Array, " nv"]
+    qpos_change: Float[Array, " nq"]
+    xpos: Float[Array, "nbody 3"]
+    xpos_change: Float[Array, "nbody 3"]
+    cfrc_ext: Float[Array, "nbody 6"]
+
+
+class Physics:
+    """A model, stepped by MuJoCo on the CPU, in double precision.
+
+    A state is what MuJoCo needs to go on to the same bits (`mjSTATE_INTEGRATION`, and the bodies'
+    positions for the next `Report.xpos_change`): doubles, as pairs of 32-bit words, `[num_words]`.
+    Rounded to single precision it would be another trajectory within a hundred steps.
+
+    Both functions take one element; under `vmap` a batch is one call, whose elements are stepped
+    one after the other. Devices step at the same time.
+
+    Args:
+      path: of the model's XML, which must stand for itself, without files that it includes.
+      frame_skip: MuJoCo's steps in one step.
+      with_forces: whether reports have `cfrc_ext`, which takes time.
+    """
+
+    def __init__(self, path: Path, frame_skip: int, with_forces: bool = False):
+        self.model = mujoco.MjModel.from_xml_path(str(path))
+        self.frame_skip = frame_skip
+        # By its content, so that a compiled program that is kept finds it in another process.
+        digest = hashlib.sha256(path.read_bytes() + version("mujoco").encode()).digest()
+        self._id = np.frombuffer(digest, np.int64)[0]
+        handlers = library.load()
+        handlers.SejaxMujocoRegister(self._id, self.model._address)
+        self.num_words = 2 * handlers.SejaxMujocoLength(self.model._address)
+        nq, nv, nbody = self.model.nq, self.model.nv, self.model.nbody
+        self._shapes = {
+            "qpos": (nq,), "qvel": (nv,), "qpos_change": (nq,), "xpos": (nbody, 3),
+            "xpos_change": (nbody, 3), "cfrc_ext": (nbody if with_forces else 0, 6),
+        }  # as step.cc reports them, one after the other  # fmt: skip
+
+    @property
+    def dt(self) -> float:
+        """Seconds of a step."""
+        return self.model.opt.timestep * self.frame_skip
+
+    def reset(
+        self, qpos: Float[Array, " nq"], qvel: Float[Array, " nv"]
+    ) -> tuple[UInt32[Array, " num_words"], Report]:
+        """A new simulation with these positions and velocities."""
+        return self._call("sejax_mujoco_reset", (qpos, (self.model.nq,)), (qvel, (self.model.nv,)))
+
+    def step(
+        self, state: UInt32[Array, " num_words"], ctrl: Float[Array, " nu"]
+    ) -> tuple[UInt32[Array, " num_words"], Report]:
+        """`frame_skip` of MuJoCo's steps with the same controls, which it clips to their range.
+
+        Controls of which one is not a number count as 0, as in MuJoCo. A simulation that explodes
+        begins anew from the model's own pose, as there.
+        """
+        arguments = (state, (self.num_words,)), (ctrl, (self.model.nu,))
+        return self._call("sejax_mujoco_step", *arguments, frame_skip=np.int64(self.frame_skip))
+
+    def _call(self, target: str, *arguments: Any, **attributes: Any) -> tuple[Array, Report]:
+        for array, shape in arguments:
+            if array.shape != shape:
+                raise ValueError(f"{target} must get arrays of shape {shape}; got {array.shape}")
+        sizes = [int(np.prod(shape)) for shape in self._shapes.values()]
+        results = (jax.ShapeDtypeStruct((self.num_words,), jnp.uint32),
+                   jax.ShapeDtypeStruct((sum(sizes),), jnp.float32))  # fmt: skip
+        call = jax.ffi.ffi_call(target, results, vmap_method="broadcast_all")
+        state, numbers = call(*(array for array, _ in arguments), model=self._id, **attributes)
+        parts = jnp.split(numbers, np.cumsum(sizes)[:-1])
+        shaped = {
+            name: x.reshape(shape)
+            for (name, shape), x in zip(self._shapes.items(), parts, strict=True)
+        }
+        return state, Report(**shaped)
+
+
+@functools.cache
+def of_gymnasium(file: str, frame_skip: int, with_forces: bool = False) -> Physics:
+    """The physics of one of the models that come with Gymnasium, such as `"hopper.xml"`."""
+    spec = importlib.util.find_spec("gymnasium")
+    assert spec is not None and spec.origin is not None
+    assets = Path(spec.origin).parent / "envs" / "mujoco" / "assets"
+    return Physics(assets / file, frame_skip, with_forces)

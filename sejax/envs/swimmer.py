@@ -1,0 +1,26 @@
+"""Swimmer-v5 on MuJoCo, 1000 steps; needs the extra `mujoco`."""
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+from sejax.envs import mujoco
+from sejax.envs.task import Facts, Task
+from sejax.options import Options, finite, not_negative, option
+
+
+@dataclass(frozen=True, kw_only=True)
+class Swimmer(Options):
+    """Three links in a viscous plane that are paid for swimming in one direction.
+
+    Source: Gymnasium's registry (episode length and reward threshold); options are Gymnasium's.
+    """
+
+    group: ClassVar[str] = "env"
+    facts: ClassVar[Facts] = Facts("vector", "continuous", max_steps=1000, has_info=True)
+
+    forward_reward_weight: float = option(1.0, finite("it weighs a reward"))
+    ctrl_cost_weight: float = option(1e-4, not_negative("it weighs a cost"))
+    reset_noise_scale: float = option(0.1, not_negative("it is a range"))
+
+    def make(self) -> Task:
+        return mujoco.make_task("swimmer", self, solved_reward=360.0)

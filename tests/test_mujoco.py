@@ -1,0 +1,487 @@
+"""MuJoCo behind XLA's foreign function interface, and the tasks on it beside Gymnasium's."""
+
+import importlib.util
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+import threading
+from concurrent.futures import ThreadPoolExecutor
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy import stats
+
+import sejax
+from sejax import envs
+from sejax.envs.halfcheetah import HalfCheetah
+from sejax.envs.hopper import Hopper
+from sejax.errors import ConfigError
+from sejax.parallel import spread_over_devices
+from sejax.proxies.configs import RewardConfig
+
+gymnasium = pytest.importorskip("gymnasium")
+mujoco = pytest.importorskip("mujoco")
+if not any(map(shutil.which, (os.environ.get("CXX") or "c++", "c++", "g++", "clang++"))):
+    pytest.skip("no C++ compiler", allow_module_level=True)
+
+from sejax.envs.mujoco import library  # noqa: E402, which imports mujoco
+from sejax.envs.mujoco.physics import of_gymnasium  # noqa: E402
+
+IDS = {
+    "halfcheetah": "HalfCheetah-v5",
+    "hopper": "Hopper-v5",
+    "walker2d": "Walker2d-v5",
+    "swimmer": "Swimmer-v5",
+    "inverted_pendulum": "InvertedPendulum-v5",
+    "ant": "Ant-v5",
+    "reacher": "Reacher-v5",
+}
+NAMES = tuple(IDS)
+# Gymnasium's keyword arguments, other than its defaults.
+OPTIONS = {
+    "hopper": {"forward_reward_weight": 0.5, "ctrl_cost_weight": 0.1, "healthy_reward": 2.0,
+               "terminate_when_unhealthy": False},
+    "ant": {"forward_reward_weight": 2.0, "contact_cost_weight": 0.1,
+            "include_cfrc_ext_in_observation": False},
+    "reacher": {"reward_dist_weight": 3.0, "reward_control_weight": 0.5},
+}  # fmt: skip
+NUM_STEPS = 1000
+# Beyond the bounds, where MuJoCo clips and costs go on; so small that the pole stands for a while.
+SCALE = {"inverted_pendulum": 0.01}
+RENAMED = {"reward_forward": "reward_run"}  # the paper's name, of v3, for halfcheetah alone
+
+
+@pytest.fixture(scope="module")
+def in_gymnasium():
+    """`in_gymnasium(name, **options)`: Gymnasium's environment, without a step limit."""
+    if importlib.util.find_spec("imageio") is None:
+        pytest.skip("Gymnasium's MuJoCo environments need imageio: pip install 'gymnasium[mujoco]'")
+    return lambda name, **options: gymnasium.make(IDS[name], **options).unwrapped
+
+
+@pytest.fixture(scope="module")
+def walk():
+    """`walk(task)(key, actions)`: `(start, obs, steps)` with leaves `[step]` in `steps`; jitted."""
+    compiled = {}
+
+    def walk_of(task):
+        def walk(key, actions):
+            obs, state = task.env.reset_env(key, task.params)
+
+            def step(state, action):
+                obs, state, *rest = task.env.step_env(None, state, action, task.params)
+                return state, (obs, state.physics, *rest)
+
+            return state.physics, obs, jax.lax.scan(step, state, actions)[1]
+
+        return compiled.setdefault(task, jax.jit(walk))
+
+    return walk_of
+
+
+def draw_actions(task, num_steps, seed=0):
+    scale = SCALE.get(task.name, 1.2) * task.max_action
+    shape = (num_steps, task.action_dim)
+    return np.float32(np.random.default_rng(seed).uniform(-scale, scale, shape))
+
+
+def integration_state(words, model):
+    """What MuJoCo steps on from, as doubles `[n]`, of a state of `Physics`."""
+    size = mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_INTEGRATION)
+    return np.asarray(words).view(np.float64)[..., :size]
+
+
+def start_of(words, model):
+    """Positions and velocities; the time is before them."""
+    state = integration_state(words, model)
+    return state[..., 1 : 1 + model.nq], state[..., 1 + model.nq : 1 + model.nq + model.nv]
+
+
+def play_in_gymnasium(env, qpos, qvel, actions):
+    """First observation, and of each step `(obs, reward, terminated, info, state)`."""
+    env.reset(seed=0)
+    mujoco.mj_resetData(env.model, env.data)
+    env.set_state(qpos, qvel)
+    first, steps = env._get_obs(), []
+    kind = mujoco.mjtState.mjSTATE_INTEGRATION
+    for action in actions:
+        obs, reward, terminated, _, info = env.step(action)
+        state = np.empty(mujoco.mj_stateSize(env.model, kind))
+        mujoco.mj_getState(env.model, env.data, state, kind)
+        steps.append((obs, reward, terminated, info, state))
+    return first, jax.tree.map(lambda *x: np.array(x), *steps)
+
+
+# --- equal to Gymnasium --------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("name", "options"), [*((name, {}) for name in NAMES), *OPTIONS.items()], ids=str
+)
+def test_a_thousand_steps_equal_gymnasiums(name, options, walk, in_gymnasium):
+    task, env = envs.make(name, **options), in_gymnasium(name, **options)
+    actions = draw_actions(task, NUM_STEPS)
+    start, first, steps = jax.device_get(walk(task)(jax.random.key(1), actions))
+    obs, states, reward, terminated, info = steps
+    expected_first, expected = play_in_gymnasium(env, *start_of(start, env.model), actions)
+    np.testing.assert_allclose(first, expected_first, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(obs, expected[0], rtol=0, atol=1e-5)
+    np.testing.assert_allclose(reward, expected[1], rtol=0, atol=1e-5)
+    np.testing.assert_array_equal(terminated, expected[2])
+    np.testing.assert_array_equal(info["discount"], 1.0 - terminated)
+    renamed = RENAMED if name == "halfcheetah" else {}
+    told = {renamed.get(key, key): value for key, value in expected[3].items()}
+    assert {*info} == {*told, "discount"}
+    for key, value in told.items():
+        np.testing.assert_allclose(info[key], value, rtol=0, atol=1e-5, err_msg=key)
+    np.testing.assert_array_equal(integration_state(states, env.model), expected[4])
+    if name in ("hopper", "walker2d", "inverted_pendulum"):  # both kinds of steps were compared
+        can_end = options.get("terminate_when_unhealthy", True)
+        assert terminated.any() == can_end and not terminated.all()
+
+
+@pytest.mark.parametrize("name", ["hopper", "walker2d", "ant"])
+def test_who_is_healthy_is_as_in_gymnasium_on_both_sides_of_every_bound(name, in_gymnasium):
+    task, env, num = envs.make(name), in_gymnasium(name), 300
+    rng = np.random.default_rng(0)
+    qpos = np.float32(env.init_qpos + rng.uniform(-0.3, 0.3, (num, env.model.nq)))
+    qpos[:, 2 if name == "ant" else 1] = rng.uniform(0.1, 2.5, num)
+    qvel = np.float32(rng.uniform(-1, 1, (num, env.model.nv)) * rng.choice([1, 102], (num, 1)))
+    physics = task.env.physics
+    healthy = jax.jit(jax.vmap(lambda *x: task.env.is_healthy(physics.reset(*x)[1])))(qpos, qvel)
+    expected = []
+    for row in zip(qpos, qvel, strict=True):
+        env.set_state(*row)
+        expected.append(env.is_healthy)
+    np.testing.assert_array_equal(healthy, expected)
+    assert 10 < np.sum(expected) < num - 10
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_limits_thresholds_and_spaces_are_gymnasiums(name, in_gymnasium):
+    task, spec, env = envs.make(name), gymnasium.spec(IDS[name]), in_gymnasium(name)
+    assert task.max_steps == task.params.max_steps_in_episode == spec.max_episode_steps
+    # The paper's threshold for HalfCheetah; Gymnasium has none for Walker2d.
+    ours = {"halfcheetah": 3000.0, "walker2d": 4000.0}
+    assert task.solved_reward == ours.get(name, spec.reward_threshold)
+    assert env.observation_space.shape == (task.obs_dim,)
+    low, high = env.action_space.low, env.action_space.high
+    assert (low == -task.max_action).all() and (high == task.max_action).all()
+    assert low.shape == (task.action_dim,) and task.num_actions is None
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_resets_are_drawn_as_gymnasiums(name, in_gymnasium):
+    task, env, num = envs.make(name), in_gymnasium(name), 300
+    keys = jax.random.split(jax.random.key(0), num)
+    draw = jax.jit(jax.vmap(task.env.draw_start))  # what `reset_env` begins from, as tested above
+    ours = np.concatenate(draw(keys), axis=1)
+    env.reset(seed=0)
+    theirs = np.empty_like(ours)
+    for row in theirs:
+        env.reset_model()
+        row[:] = env.state_vector()
+    for mine, reference in zip(ours.T, theirs.T, strict=True):
+        if np.ptp(reference) == 0:  # the speed of the reacher's target
+            np.testing.assert_array_equal(mine, reference)
+        else:
+            assert stats.ks_2samp(mine, reference).pvalue > 1e-4
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_what_is_said_of_a_task_before_mujoco_is_imported_is_so(name):
+    config = sejax.plugins.configure("env", {"name": name})
+    task = envs.make(name)
+    assert config.facts == task.facts and task.name == name
+    assert {*task.augmented_keys} <= {*task.info_keys}
+    _, _, reward, _, info = jax.eval_shape(
+        task.env.step_env, None, *_reset_shapes(task), task.params
+    )
+    assert {*task.info_keys} <= {*info} and reward.dtype == jnp.float32
+    assert all(info[key].shape == () for key in task.info_keys)
+
+
+def _reset_shapes(task):
+    _, state = jax.eval_shape(task.env.reset_env, jax.random.key(0), task.params)
+    return state, jax.ShapeDtypeStruct((task.action_dim,), jnp.float32)
+
+
+def test_reward_networks_see_where_the_body_is():
+    task = envs.make("swimmer")
+    env = RewardConfig(augmented=True, hidden_size=4).make(task)
+    keys = ("x_position", "y_position", "x_velocity", "y_velocity")
+    assert task.augmented_keys == keys
+    weights = jax.eval_shape(env.init_weights, jax.random.key(0))
+    assert weights["potential"]["Dense_0"]["kernel"].shape == (4, task.obs_dim + len(keys))
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"name": "hopper", "reset_noise_scale": -1.0}, r"env\.reset_noise_scale must be at least"),
+        ({"name": "ant", "ctrl_cost_weight": float("inf")}, r"env\.ctrl_cost_weight must be fin"),
+        ({"name": "halfcheetah", "backend": "mujocco"}, r"Did you mean env\.backend=mujoco"),
+        ({"name": "reacher", "backend": "mjx"}, r"env\.backend must be a field of Reacher"),
+    ],
+)
+def test_options_that_make_no_sense_are_refused(options, said):
+    with pytest.raises(ConfigError, match=said):
+        envs.make(**options)
+
+
+# --- pure, in every transformation ---------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def ant_walks(walk):
+    """`(walk, keys, actions, each)`: an ant's walks, and what they give one after another."""
+    task = envs.make("ant")
+    keys, actions = jax.random.split(jax.random.key(0), 6), draw_actions(task, 40)
+    one = walk(task)
+    each = [jax.device_get(one(key, actions)) for key in keys]
+    return one, keys, actions, jax.tree.map(lambda *x: np.stack(x), *each)
+
+
+def assert_equal_bits(a, b):
+    for x, y in zip(jax.tree.leaves(jax.device_get(a)), jax.tree.leaves(b), strict=True):
+        np.testing.assert_array_equal(x, y)
+
+
+def test_lanes_equal_single_walks_to_the_bit(ant_walks):
+    one, keys, actions, each = ant_walks
+    nested = jax.vmap(jax.vmap(one, (0, None)), (0, None))
+    together = jax.jit(nested)(keys.reshape(2, 3), actions)
+    assert_equal_bits(jax.tree.map(lambda x: x.reshape(6, *x.shape[2:]), together), each)
+
+
+def test_two_devices_and_a_map_on_each_equal_single_walks_to_the_bit(ant_walks):
+    one, keys, actions, each = ant_walks
+    spread = spread_over_devices(lambda key: one(key, actions), num_devices=2, lanes=1)
+    assert_equal_bits(jax.jit(spread)(keys), each)
+
+
+def test_threads_do_not_disturb_each_other(ant_walks):
+    one, keys, actions, each = ant_walks
+    with ThreadPoolExecutor(3) as pool:
+        walks = list(pool.map(lambda key: one(key, actions), keys))
+    assert_equal_bits(jax.tree.map(lambda *x: np.stack(x), *map(jax.device_get, walks)), each)
+
+
+def test_a_walk_goes_on_from_its_state_whatever_was_stepped_between(ant_walks):
+    _, _, actions, each = ant_walks
+    ant, hopper = of_gymnasium("ant.xml", 5, True), of_gymnasium("hopper.xml", 4)
+    ant_step, hopper_step = jax.jit(ant.step), jax.jit(hopper.step)
+    _, _, (_, states, *_) = jax.tree.map(lambda x: x[2], each)
+    other = hopper.reset(jnp.ones(6), jnp.zeros(6))[0]
+    for before, after, action in zip(states[:10], states[1:11], actions[1:11], strict=True):
+        other, _ = hopper_step(other, action[:3])
+        ant_step(states[-1], -action)
+        np.testing.assert_array_equal(ant_step(before, action)[0], after)
+
+
+def test_a_step_rounds_what_changed_and_not_where_it_is():
+    """Far from the origin single precision would round the velocity to a grid of 0.16 m/s."""
+    physics = of_gymnasium("half_cheetah.xml", 5)
+    step = jax.jit(physics.step)
+    changes = []
+    for x in (0.0, 1e5):
+        state, _ = physics.reset(jnp.zeros(9).at[0].set(x), jnp.ones(9))
+        changes.append(step(state, jnp.full(6, 0.5))[1].qpos_change)
+    np.testing.assert_allclose(changes[0], changes[1], rtol=0, atol=1e-6)
+
+
+def test_controls_that_are_no_numbers_count_as_none_and_leave_no_log(monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    physics = of_gymnasium("hopper.xml", 4)
+    step = jax.jit(physics.step)
+    state, _ = physics.reset(jnp.ones(6), jnp.zeros(6))
+    with_nan, idle = (step(state, ctrl)[1] for ctrl in (jnp.array([1, jnp.nan, 1]), jnp.zeros(3)))
+    assert_equal_bits(with_nan, jax.device_get(idle))
+    task = envs.make("hopper")
+    reward = task.env.rewards(idle, jnp.array([1, jnp.nan, 1]), jnp.bool_(True))["reward_ctrl"]
+    assert np.isnan(reward) and not list(tmp_path.iterdir())
+
+
+# --- what cannot be ------------------------------------------------------------------------------
+
+
+def call(target="sejax_mujoco_step", shapes=(None, (3,)), results=(None, None), **attributes):
+    """A call of the library with a hopper's shapes but for those given."""
+    physics = of_gymnasium("hopper.xml", 4)
+    words, report = (physics.num_words,), (2 * 6 + 6 + 6 * 5,)
+    shapes = [words if shape is None else shape for shape in shapes]
+    kinds = (jnp.float32 if target.endswith("reset") else jnp.uint32, jnp.float32)
+    made = [jnp.zeros(shape, kind) for shape, kind in zip(shapes, kinds, strict=True)]
+    outs = [jax.ShapeDtypeStruct(shape or default, kind) for shape, default, kind in
+            zip(results, (words, report), (jnp.uint32, jnp.float32), strict=True)]  # fmt: skip
+    given = {"model": physics._id, "frame_skip": np.int64(1)} | attributes
+    if target.endswith("reset"):
+        del given["frame_skip"]
+    return jax.block_until_ready(jax.ffi.ffi_call(target, outs)(*made, **given))
+
+
+MALFORMED = [
+    ({"shapes": (None, (4,))}, r"ctrl must have shape \[\*batch, 3\].* got \[4\]"),
+    ({"shapes": (None, ())}, r"ctrl must have shape .* got \[\]"),
+    ({"shapes": (None, (2, 3))}, r"ctrl must have shape .* got \[2, 3\]"),
+    ({"shapes": ((2, 146), (3, 3))}, r"ctrl must have shape .* got \[3, 3\]"),
+    ({"results": ((10,), None)}, r"the next state must have shape .* got \[10\]"),
+    ({"results": (None, (7,))}, r"the report must have shape .* got \[7\]"),
+    ({"results": (None, (2, 48))}, r"the report must have shape .* got \[2, 48\]"),
+    ({"model": np.int64(5)}, "NOT_FOUND: model must be one that is registered; got 5"),
+    ({"frame_skip": np.int64(0)}, "frame_skip must be at least 1"),
+    ({"target": "sejax_mujoco_reset", "shapes": ((6,), (5,))}, r"qvel must have shape .* \[5\]"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("changed", "said"), MALFORMED, ids=range(len(MALFORMED)))
+def test_malformed_calls_are_errors_that_say_what_must_hold(changed, said):
+    call()  # as it should be
+    with pytest.raises(jax.errors.JaxRuntimeError, match=said):
+        call(**changed)
+
+
+def test_wrong_shapes_are_refused_while_tracing():
+    physics = of_gymnasium("hopper.xml", 4)
+    state, _ = physics.reset(jnp.zeros(6), jnp.zeros(6))
+    with pytest.raises(ValueError, match=r"must get arrays of shape \(3,\); got \(4,\)"):
+        physics.step(state, jnp.zeros(4))
+
+
+@pytest.fixture
+def unbuilt(monkeypatch, tmp_path):
+    """As if the library had never been built or loaded."""
+    monkeypatch.setenv("SEJAX_CACHE_DIR", str(tmp_path))
+    monkeypatch.setattr(library, "load", library.load.__wrapped__)
+    return tmp_path
+
+
+@pytest.mark.parametrize(
+    ("config", "fix"), [(HalfCheetah(), ", or set env.backend=mjx."), (Hopper(), "g++.")]
+)
+def test_without_a_compiler_one_message_says_what_can_be_done(config, fix, unbuilt, monkeypatch):
+    monkeypatch.setenv("CXX", "no-such-compiler")
+    monkeypatch.setattr(library, "COMPILERS", ("none-either",))
+    with pytest.raises(ConfigError, match=r"needs a C\+\+ compiler.*\$CXX, none-either") as raised:
+        config.make()
+    assert str(raised.value).endswith(fix) and not list(unbuilt.iterdir())
+
+
+def test_a_compiler_that_fails_is_quoted_and_leaves_nothing(unbuilt, monkeypatch):
+    monkeypatch.setenv("CXX", "sh -c 'echo no standard library >&2; exit 1'")
+    with pytest.raises(ConfigError, match="sh failed with: no standard library"):
+        HalfCheetah().make()
+    assert not list(unbuilt.iterdir())
+
+
+@pytest.mark.parametrize("package", ["mujoco", "gymnasium"])
+def test_without_a_package_the_message_names_the_extra(package, monkeypatch):
+    monkeypatch.setitem(sys.modules, package, None)
+    with pytest.raises(
+        ConfigError, match=r"pip install 'sejax\[mujoco\]', or set env\.backend=mjx"
+    ):
+        HalfCheetah().make()
+
+
+def test_other_devices_than_the_cpu_are_refused(monkeypatch):
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    with pytest.raises(ConfigError, match=r"must run on the CPU.*got gpu\. Set JAX_PLATFORMS=cpu"):
+        Hopper().make()
+
+
+# --- slow: builds and long runs ------------------------------------------------------------------
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("folder", ["", "/proc/nowhere"])
+def test_without_a_cache_folder_it_is_built_all_the_same(folder):
+    done = run_program("memory", "reacher", "10", SEJAX_CACHE_DIR=folder)
+    assert tempfile.gettempdir() in done.stdout
+
+
+@pytest.mark.slow
+def test_builders_at_the_same_time_leave_one_library(tmp_path):
+    barrier = threading.Barrier(3)
+
+    def build(_):
+        barrier.wait()
+        return library._built_in(tmp_path)
+
+    with ThreadPoolExecutor(3) as pool:
+        paths = set(pool.map(build, range(3)))
+    assert paths == {tmp_path / library.file_name()} == {*tmp_path.iterdir()}
+
+
+PROGRAM = """
+import re, resource, sys
+import jax, jax.numpy as jnp, numpy as np
+from sejax.envs.mujoco import library
+if sys.argv[1] == "sanitizers":
+    # Undefined, since MuJoCo's headers know clang's sanitizers alone.
+    library.FLAGS = (*library.FLAGS, "-g", "-fsanitize=address,undefined",
+                     "-fno-sanitize-recover=all", "-U__SANITIZE_ADDRESS__")
+from sejax import envs
+for name in sys.argv[2].split(","):
+    task, num_steps = envs.make(name), int(sys.argv[3])
+
+    def walk(key):
+        def step(i, carry):
+            state, total = carry
+            action = jnp.sin(i * 0.3 + jnp.arange(task.action_dim, dtype=jnp.float32))
+            _, state, reward, *_ = task.env.step_env(None, state, action, task.params)
+            return state, total + reward
+
+        state = task.env.reset_env(key, task.params)[1]
+        return jax.lax.fori_loop(0, num_steps, step, (state, jnp.float32(0)))[1]
+
+    walks = jax.jit(jax.vmap(walk)).lower(jax.random.split(jax.random.key(0), 2)).compile()
+    grown = []
+    for seed in range(3):
+        out = walks(jax.random.split(jax.random.key(seed), 2))
+        assert np.isfinite(out).all()
+        grown.append(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
+    assert grown[2] - grown[1] < 2048, grown  # KiB, in as many steps
+if sys.argv[1] == "sanitizers":
+    sys.path.insert(0, sys.argv[4])
+    import test_mujoco
+    for changed, said in test_mujoco.MALFORMED:
+        try:
+            test_mujoco.call(**changed)
+        except jax.errors.JaxRuntimeError as error:
+            assert re.search(said, str(error)), error
+        else:
+            raise AssertionError(changed)
+print("done", library.load()._name)
+"""
+
+
+def run_program(*arguments, **variables):
+    environment = {**os.environ, "XLA_FLAGS": "", **variables}
+    done = subprocess.run([sys.executable, "-c", PROGRAM, *arguments], capture_output=True,
+                          text=True, env=environment)  # fmt: skip
+    assert done.returncode == 0 and done.stdout.startswith("done"), done.stdout + done.stderr
+    return done
+
+
+@pytest.mark.slow
+def test_sanitizers_find_nothing_in_walks_and_malformed_calls(tmp_path):
+    # The sanitizer comes first in a process, and must find the functions that throw exceptions.
+    runtimes = [
+        subprocess.run([*library._compiler(), f"-print-file-name={name}"], capture_output=True,
+                       text=True).stdout.strip() for name in ("libasan.so", "libstdc++.so.6")
+    ]  # fmt: skip
+    if not all(map(os.path.isabs, runtimes)):
+        pytest.skip("the compiler has no address sanitizer")
+    tests = os.path.dirname(__file__)
+    done = run_program("sanitizers", ",".join(NAMES), "100", tests, LD_PRELOAD=" ".join(runtimes),
+                       SEJAX_CACHE_DIR=str(tmp_path), ASAN_OPTIONS="detect_leaks=0")  # fmt: skip
+    assert str(tmp_path) in done.stdout and "runtime error" not in done.stderr
+
+
+@pytest.mark.slow
+def test_memory_does_not_grow_over_a_million_steps():
+    run_program("memory", "reacher", "200000")  # two lanes, three times
