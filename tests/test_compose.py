@@ -18,6 +18,7 @@ from sejax.app.build import LearnConfig
 from sejax.envs.cliff_walking import CliffWalking
 from sejax.errors import ConfigError
 from sejax.es.evosax import ALGORITHMS, EvosaxConfig
+from sejax.training import steps_before_learning
 
 composed_with = functools.cache(lambda *overrides: sejax.config(overrides))
 ENVS = ("cartpole", "acrobot")
@@ -237,8 +238,8 @@ def test_several_agents_are_in_the_help():
         ("agents.aggregate=min", "agents.aggregate must come with several agents"),
         ("agents=[ddqn,ppo] agents.aggregate=worst", "agents.aggregate must be one of"),
         ("agents=[ddqn,ppo] agents.compared_by=x", "agents.compared_by must be one of"),
-        ("agents=[ddqn,ppo] agents.ddqn.weight=0", "agents.ddqn.weight must be above 0 and finite"),
-        ("agents=[ddqn,ppo] agents.ddqn.weight=x", "agents.ddqn.weight must be above 0"),
+        ("agents=[ddqn,ppo] agents.ddqn.weight=-1", "agents.ddqn.weight must lie in [0, 1e6]"),
+        ("agents=[ddqn,ppo] agents.ddqn.weight=x", "agents.ddqn.weight must lie in [0, 1e6]"),
         ("agents=[ddqn,ppo] agents.ddqn.batch_size=0",
          "agents.ddqn.batch_size must be at least 1, .*Set agents.ddqn.batch_size=128."),
         ("agents=[ddqn,ppo] agents.ddqn.name=ddqnn", "agents.ddqn must be one of ddqn"),
@@ -383,7 +384,7 @@ def test_agents_learn_within_the_default_budget_of_an_se(env):
         if agent.states == facts.states and facts.actions in agent.actions:
             config = sejax.config([f"env={env}", f"agent={name}"])
             longest = config.proxy.max_steps(facts.max_steps)
-            before = config.agent.steps_before_learning(longest)
+            before = steps_before_learning(config.agent, longest)
             budget = config.training.max_episodes * longest
             budget = min(budget, config.training.max_steps or budget)
             assert budget >= 2 * before, name
