@@ -415,11 +415,15 @@ class Scores:
 def _advance(
     state: LearnState, told: Any, incumbent: Array, scores: Scores, outcome: Outcome
 ) -> LearnState:
-    """Records what this generation measured of its incumbent and keeps the best one."""
+    """Records what this generation measured of its incumbent and keeps the best one.
+
+    Of equally good incumbents the last stays: where the task's highest return ends the comparison,
+    the search goes on to weights that teach under perturbation too.
+    """
     score = scores.incumbent_mean
     score = jnp.where(jnp.isfinite(score), score, -jnp.inf)
     family_means = jnp.where(jnp.isfinite(scores.family_means), scores.family_means, -jnp.inf)
-    better = score > state.best_score
+    better = (score >= state.best_score) & jnp.isfinite(score)
     return state.replace(
         es_state=told,
         generation=state.generation + 1,

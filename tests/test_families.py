@@ -308,7 +308,7 @@ def test_one_family_is_the_program_of_its_agent():
 # --- solved by all -------------------------------------------------------------------------------
 
 
-def told(scores, incumbents, **config):
+def told(scores, incumbents, state=None, **config):
     """State and info after a generation whose test returns these were, for each seed."""
     group = Families(agents=AGENTS, config=FamiliesConfig(**config))
     program = program_of(
@@ -322,7 +322,7 @@ def told(scores, incumbents, **config):
         train_episodes=counts, return_area=returns, nonfinite=~np.isfinite(returns),
         real_steps=counts,
     )  # fmt: skip
-    state = program.init(KEYS)
+    state = program.init(KEYS) if state is None else state
     return jax.jit(lambda s: program.tell(s, program.ask(s), outcome))(state)
 
 
@@ -335,6 +335,15 @@ def test_a_run_stops_when_what_the_incumbent_is_worth_solves_the_task(aggregate)
     worth = incumbents.mean(axis=1) if aggregate == "mean" else incumbents.min(axis=1)
     np.testing.assert_allclose(after.best_score, worth, rtol=1e-6)
     np.testing.assert_allclose(info.families.incumbent_mean, incumbents, rtol=1e-6)
+
+
+def test_of_equally_good_incumbents_the_last_is_kept():
+    scores, equal = np.zeros((2, 2)), [[0.25, 0.0], [0.25, 0.0]]
+    first, _ = told(scores, equal)
+    then, _ = told(scores, [[0.25, 0.0], [0.0, 0.0]], first)
+    np.testing.assert_array_equal(then.best_generation, [1, 0])
+    np.testing.assert_array_equal(then.best[0], then.incumbent[0])
+    np.testing.assert_array_equal(then.best_score, first.best_score)
 
 
 def test_an_incumbent_that_no_agent_of_a_family_survived_is_never_the_best():

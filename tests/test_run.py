@@ -31,7 +31,7 @@ from sejax.proxies import files
 TINY = [
     "env=gridworld_2x2", "agent.learning_rate=0.5", "proxy.hidden_size=4", "es.population_size=2",
     "es.num_incumbent_evals=2", "es.noise_std=1.0", "training.max_steps=30",
-    "training.test_episodes=1", "generations=3", "seed=10",
+    "training.test_episodes=1", "generations=3", "seed=12",
 ]  # fmt: skip
 FILES = {"config.yaml", "metrics.csv", "proxy.safetensors", "proxy_last.safetensors",
          "checkpoint", "learning_curve.png", "run.json"}  # fmt: skip
@@ -95,7 +95,8 @@ def test_the_stored_proxy_is_the_one_of_the_best_generation(uninterrupted):
     scores = [float(row["incumbent_mean"]) for row in rows(uninterrupted)]
     record = files.load_proxy(uninterrupted).record
     assert record["score"] == pytest.approx(max(scores))
-    assert record["generation"] == scores.index(max(scores)) not in (0, 5)
+    best = max(range(6), key=lambda generation: (scores[generation], generation))
+    assert record["generation"] == best not in (0, 5)
     last = files.load_proxy(uninterrupted / "proxy_last.safetensors").record
     assert last["generation"] == 5 and last["score"] == pytest.approx(scores[-1])
 
@@ -143,16 +144,16 @@ def two_seeds(tmp_path_factory) -> Path:
 
 
 def test_chunks_of_two_generations_and_seeds_give_the_same_metrics(uninterrupted, two_seeds):
-    assert [row["seed"] for row in rows(two_seeds)] == ["10", "11"] * 6
+    assert [row["seed"] for row in rows(two_seeds)] == ["12", "13"] * 6
     assert rows(two_seeds)[::2] == rows(uninterrupted)
 
 
 def test_several_seeds_write_a_proxy_each(two_seeds):
     assert {path.name for path in two_seeds.iterdir()} == FILES | {"proxies"}
-    names = {f"seed{seed}.safetensors" for seed in (10, 11)}
+    names = {f"seed{seed}.safetensors" for seed in (12, 13)}
     assert {path.name for path in (two_seeds / "proxies").iterdir()} == names
     best = []
-    for i, seed in enumerate((10, 11)):
+    for i, seed in enumerate((12, 13)):
         record = files.load_proxy(two_seeds / "proxies" / f"seed{seed}.safetensors").record
         best.append(max(float(row["incumbent_mean"]) for row in rows(two_seeds)[i::2]))
         assert record["seed"] == seed and record["score"] == pytest.approx(best[i])
