@@ -272,6 +272,7 @@ def test_augmented_variants_are_named_in_pictures():
             "additive",
         ),
         (rn_performance, {"rows": ("varied", "transfers")}, "transfer"),
+        (rn_performance, {"rows": "tuned"}, "rows must be one of transfer"),
         (rn_performance, {"bonuses": "icm"}, "bonuses must be one of count_based, none.*icm"),
         (rn_performance, {"rns": 0}, "at least 1"),
         (rn_performance, {"rns": 3, "learned": 2}, "rns must be at most 2"),
@@ -296,7 +297,14 @@ def test_settings_are_those_of_the_task():
     usual = RnPerformance.of(env="cartpole")
     assert (usual.learned, usual.rns, usual.bonus_groups, usual.max_steps) == (10, 10, 10, 50_000)
     assert usual.bonuses == ("icm",) and usual.run == ()
-    assert usual.training.stop_rule == "never" and usual.training.tests_between == 1
+    assert usual.rows == ("default", "varied", "transfer", "tuned")
+    training = {row: usual.training(row) for row in usual.rows}
+    assert training["default"].stop_rule == "never" and training["default"].tests_between == 1
+    assert training["varied"].time_limit_is_terminal > training["tuned"].time_limit_is_terminal
+    assert usual.agent("default").learning_rate == 2.5e-4  # the paper's table
+    assert usual.agent("tuned") == sejax.config(["env=cartpole", "agent=ddqn"]).agent
+    quick_td3 = RnPerformance.of(env="mountain_car_continuous").agent("varied")
+    assert quick_td3 == sejax.config(["env=mountain_car_continuous", "proxy=rn"]).agent
     few = RnPerformance.of(env="cartpole", learned=5, rns=2)
     assert (few.rns, few.bonus_groups) == (2, 2) and RnPerformance.of(learned=5).rns == 5
     quick = RnPerformance.of(env="halfcheetah", quick=True)

@@ -25,7 +25,7 @@ from sejax.statistics import bootstrap_interval
 from sejax.training import TrainingConfig
 
 ROWS = {"default": "default hyperparameters", "varied": "varied hyperparameters",
-        "transfer": "unseen agent"}  # fmt: skip
+        "transfer": "unseen agent", "tuned": "tuned for few steps"}  # fmt: skip
 GRID_POINTS = 200
 WITHOUT_RN = ("real", "count_based", "icm")  # worlds whose groups of agents have nothing in common
 LEAST_FOR_INTERVAL = 5  # independent values
@@ -35,9 +35,13 @@ LEAST_FOR_INTERVAL = 5  # independent values
 class CurveSettings(RnSettings):
     """Settings about the agents."""
 
-    rows: tuple[str, ...] = setting(tuple(ROWS), each_of(ROWS), about="agents to train: default "
-                                    "(the paper's hyperparameters), varied (drawn for each agent), "
-                                    "transfer (one that the RNs never saw)")  # fmt: skip
+    rows: tuple[str, ...] = setting(
+        rn_studies.ROWS,
+        each_of(ROWS),
+        about="agents to train: default (the paper's "
+        "hyperparameters), varied (drawn for each agent), transfer (one that the RNs never saw), "
+        "on cartpole tuned (for few steps)",
+    )
     bonuses: tuple[str, ...] = setting((), about="exploration bonuses on the real task to compare "
                                        "with: count_based on cliff_walking, elsewhere icm; or "
                                        "none")  # fmt: skip
@@ -56,19 +60,27 @@ class CurveSettings(RnSettings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        errors.each_of("rows", self.rows, self.study.rows)
         errors.each_of("bonuses", self.bonuses, (*self.study.bonuses, "none"))
         require(self.rns <= self.learned, "rns", f"be at most {self.learned}", "so many are "
                 "learned", self.rns, f"learned={self.rns}")  # fmt: skip
 
     def agent(self, row: str) -> Any:
         """The agent that is trained in a row."""
-        return self.study.transfer_agent if row == "transfer" else self.study.agent
+        if row == "transfer":
+            return self.study.transfer_agent
+        if row == "tuned":
+            return worlds.tuned_agent(self.env, self.study.tuned_agent)
+        return self.study.agent or self.learning_agent
 
-    @property
-    def training(self) -> TrainingConfig:
-        """Episodes of training and of tests alternate until a limit."""
+    def training(self, row: str) -> TrainingConfig:
+        """Episodes of training and of tests alternate until a limit.
+
+        At the task's time limit tuned agents bootstrap, as they were tuned; the paper's do not.
+        """
         return TrainingConfig(max_episodes=self.study.max_episodes, max_steps=self.max_steps,
-                              stop_rule="never", tests_between=1)  # fmt: skip
+                              stop_rule="never", tests_between=1,
+                              time_limit_is_terminal=row != "tuned")  # fmt: skip
 
 
 def real_curves(settings: CurveSettings) -> Iterator[pd.DataFrame]:
@@ -95,7 +107,7 @@ def curves_in(
     """
     for row in settings.rows:
         world = make([f"{i:02d}" for i in range(groups)], name=f"{prefix}{row}-{name}",
-                     agent=settings.agent(row), training=settings.training,
+                     agent=settings.agent(row), training=settings.training(row),
                      hparams="varied" if row == "varied" else "default", **more)  # fmt: skip
         curves = worlds.train_groups(world, settings, settings.num_agents, worlds.CURVES)
         group = curves["group"].astype(int)

@@ -150,10 +150,10 @@ def real_world(settings: SePerformance, task: Any, sets: dict[str, Any], kind: s
 
 def tuned_world(settings: SePerformance, real: World, kind: str) -> World:
     """The real task for agents of the settings that were found there, not drawn."""
-    chosen = sejax.config([f"env={real.task.name}", f"agent={kind}"]).agent
     return dataclasses.replace(
         real, name=f"{kind}-tuned", hparams="default",
-        agent=se_agents.agent_config(settings, kind) if settings.quick else chosen,
+        agent=se_agents.agent_config(settings, kind) if settings.quick
+        else worlds.tuned_agent(real.task.name, kind),
         training=dataclasses.replace(real.training, time_limit_is_terminal=False),
     )  # fmt: skip
 

@@ -180,6 +180,11 @@ def groups_at_once(devices: int | None) -> int:
     return 1 if alone else GROUPS_AT_ONCE
 
 
+def tuned_agent(env: str, kind: str) -> Any:
+    """The agent of that kind with what was found on real tasks for few steps (docs/agents.md)."""
+    return sejax.config([f"env={env}", f"agent={kind}"]).agent
+
+
 def training_as_learned(proxies: Any, agent: Any) -> TrainingConfig:
     """How long an agent trains on a set of SEs: as those that they were learned with."""
     return proxies.proxy(0).training_for(agent)
