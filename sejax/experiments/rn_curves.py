@@ -69,7 +69,7 @@ class CurveSettings(RnSettings):
         """The agent that is trained in a row."""
         if row == "transfer":
             return self.study.transfer_agent
-        if row == "tuned":
+        if row == "tuned" and self.study.tuned_agent:
             return worlds.tuned_agent(self.env, self.study.tuned_agent)
         return self.study.agent or self.learning_agent
 

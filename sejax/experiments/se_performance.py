@@ -39,7 +39,7 @@ from sejax.experiments.tables import (
     publish,
     spread,
 )
-from sejax.experiments.worlds import World, return_columns
+from sejax.experiments.worlds import World, return_columns, tuned_agent
 from sejax.options import one_of
 from sejax.training import SOLVED_BY, TrainingConfig
 
@@ -153,7 +153,7 @@ def tuned_world(settings: SePerformance, real: World, kind: str) -> World:
     return dataclasses.replace(
         real, name=f"{kind}-tuned", hparams="default",
         agent=se_agents.agent_config(settings, kind) if settings.quick
-        else worlds.tuned_agent(real.task.name, kind),
+        else tuned_agent(real.task.name, kind),
         training=dataclasses.replace(real.training, time_limit_is_terminal=False),
     )  # fmt: skip
 
