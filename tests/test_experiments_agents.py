@@ -1,10 +1,13 @@
 """The experiment on how agents learn the real tasks."""
 
+import dataclasses
+
 import numpy as np
 import pandas as pd
 import pytest
 from support import refuse
 
+import sejax
 from sejax.errors import ConfigError
 from sejax.experiments import agent_learning, pieces, return_curves, worlds
 
@@ -49,6 +52,17 @@ def test_every_agent_learns_and_nothing_is_computed_twice(tmp_path, monkeypatch)
 
     monkeypatch.setattr(worlds, "train", refuse)
     pd.testing.assert_frame_equal(agent_learning.EXPERIMENT.run(settings), table)
+
+
+def test_the_agents_of_reward_networks_train_as_there_but_to_the_end():
+    study = agent_learning.PresetStudy(env="pendulum", agent="td3", max_steps=20_000)
+    preset = sejax.config(["env=pendulum", "proxy=rn"])
+    assert study.configuration() == preset.agent != sejax.TD3Config()
+    assert dataclasses.replace(sejax.TD3Config(), **study.changes()) == preset.agent
+    training = study.training(quick=False, test_episodes=2)
+    assert (preset.training.stop_rule, training.stop_rule) == ("solved", "never")
+    assert (training.max_episodes, training.max_steps) == (100, 20_000)
+    assert (training.tests_between, training.time_limit_is_terminal) == (2, False)
 
 
 @pytest.mark.parametrize(

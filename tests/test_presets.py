@@ -163,6 +163,16 @@ def test_the_papers_preset_holds_the_numbers_of_its_tables_for_rns(path):
             assert value_at(composed, path) == expected
 
 
+@pytest.mark.parametrize("env", ["mountain_car_continuous", "halfcheetah", "pendulum"])
+def test_the_best_preset_has_a_quick_td3_for_continuous_tasks(env):
+    composed = composed_with(f"env={env}", "proxy=rn")
+    assert composed.name("agent") == "td3"
+    assert composed.agent.hidden_size == composed.agent.batch_size == 64
+    assert composed.agent.init_episodes <= composed.training.max_episodes // 5
+    # Only on Pendulum, which never terminates, does it matter whether it learns at all.
+    assert composed.training.time_limit_is_terminal == (env != "pendulum")
+
+
 @pytest.mark.parametrize("preset", ["paper", "best"])
 @pytest.mark.parametrize("env", ["mountain_car_continuous", "halfcheetah"])
 def test_ppo_on_rns_is_the_papers_and_trains_for_more_episodes(env, preset):
@@ -182,7 +192,7 @@ def test_ppo_on_ses_is_the_default(env):
 def test_what_is_tuned_is_known():
     assert presets.names() == ["best", "paper", "paper_performance", "soft"]
     assert presets.tuned("rn") == [
-        "cartpole", "cliff_walking", "halfcheetah", "mountain_car_continuous",
+        "cartpole", "cliff_walking", "halfcheetah", "mountain_car_continuous", "pendulum",
     ]  # fmt: skip
     assert presets.tuned("se", "paper") == ["acrobot", "cartpole"]
     assert presets.is_tuned("acrobot", "se") and not presets.is_tuned("acrobot", "rn")

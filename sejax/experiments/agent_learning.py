@@ -3,10 +3,12 @@
 Source: paper, Algorithm 1, TrainAgent and EvaluateAgent, with the real task in the SE's place.
 
 After each training episode an agent plays `test_episodes` greedy ones on the task, and nothing ends
-its training but the step limit. A study is an agent on a task; its hyperparameters are the paper's
-where `STUDIES` names no others, and its peers are what others report for the same task.
+its training but its limits. A study is an agent on a task; its hyperparameters are the paper's
+where `STUDIES` names no others, or those that reward networks of the task are learned with; its
+peers are what others report for the same task.
 """
 
+import dataclasses
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -14,7 +16,7 @@ import numpy as np
 import pandas as pd
 
 import sejax
-from sejax import plugins
+from sejax import plugins, serialize
 from sejax.experiments import figures, return_curves
 from sejax.experiments.experiment import Experiment
 from sejax.experiments.return_curves import WINDOW
@@ -47,6 +49,15 @@ class Study:
         cls = plugins.find("agent", self.agent)
         return (sejax.PPOConfig.paper if cls is sejax.PPOConfig else cls)(**self.hparams)
 
+    def changes(self) -> dict[str, Any]:
+        """The hyperparameters that are not the paper's."""
+        return self.hparams
+
+    @property
+    def label(self) -> str:
+        """Its name in pictures."""
+        return figures.AGENT_NAMES[self.agent] + "*" * bool(self.hparams)
+
     def training(self, quick: bool, test_episodes: int) -> TrainingConfig:
         """Episodes of training and of tests alternate until the step limit."""
         max_steps = min(self.max_steps, QUICK_STEPS) if quick else self.max_steps
@@ -55,6 +66,35 @@ class Study:
             tests_between=test_episodes,
             time_limit_is_terminal=False,  # as in the literature; the paper's code ends there
         )  # fmt: skip
+
+
+@dataclass(frozen=True, kw_only=True)
+class PresetStudy(Study):
+    """The agent that reward networks of a task are learned with, trained as there.
+
+    Its hyperparameters and the limit of episodes are those of `preset=best`; `max_steps` is what so
+    many episodes take if none ends early.
+    """
+
+    def configuration(self) -> Any:
+        return self._preset().agent
+
+    def changes(self) -> dict[str, Any]:
+        papers = serialize.to_plain(super().configuration())
+        ours = serialize.to_plain(self.configuration())
+        return {name: value for name, value in ours.items() if value != papers[name]}
+
+    def training(self, quick: bool, test_episodes: int) -> TrainingConfig:
+        max_steps = min(self.max_steps, QUICK_STEPS) if quick else self.max_steps
+        return dataclasses.replace(self._preset().training, max_steps=max_steps,
+                                   stop_rule="never", tests_between=test_episodes)  # fmt: skip
+
+    @property
+    def label(self) -> str:
+        return f"quick {figures.AGENT_NAMES[self.agent]}*"
+
+    def _preset(self) -> Any:
+        return sejax.config([f"env={self.env}", "proxy=rn", f"agent={self.agent}"])
 
 
 STUDIES = (
@@ -79,6 +119,12 @@ STUDIES = (
     Study(env="cliff_walking", agent="sarsa", max_steps=5_000,
           hparams={"discount": 1.0, "epsilon_init": 0.01, "epsilon_min": 0.0,
                    "epsilon_decay": 0.9}, peers="optimal: -12"),
+    PresetStudy(env="pendulum", agent="td3", max_steps=20_000,
+                       peers=f"-151.9 after 20,000 steps ({ZOO})"),
+    PresetStudy(env="mountain_car_continuous", agent="td3", max_steps=99_900,
+                       peers=f"93.5 after 300,000 steps ({ZOO})"),
+    PresetStudy(env="halfcheetah", agent="td3", max_steps=100_000,
+                       peers=f"9,656 on HalfCheetah-v3 after 1,000,000 steps ({ZOO})"),
 )  # fmt: skip
 ENVS = tuple(dict.fromkeys(study.env for study in STUDIES))
 
@@ -120,6 +166,7 @@ def summarise(curves: pd.DataFrame) -> pd.DataFrame:
             "study": number, "env": study.env, "agent": study.agent,
             "num_agents": len(last), "max_steps": mine["max_steps"].iloc[0], "threshold": threshold,
             "num_solved": int(np.isfinite(to_solve).sum()),
+            "num_solved_at_the_end": int((last >= threshold).sum()),
             "median_steps_to_solve": np.median(to_solve),
             "last_return": last.mean(), "last_low": low, "last_high": high,
             **iqm_columns(last, "last"),
@@ -131,8 +178,9 @@ COLUMNS: dict[str, Any] = {
     "task": "{env}",
     "agent": "{agent}",
     "other than the paper's": lambda row: ", ".join(
-        f"{name} {value}" for name, value in STUDIES[row.study].hparams.items()),
+        f"{name} {value}" for name, value in STUDIES[row.study].changes().items()),
     "solved": "{num_solved} of {num_agents} at {threshold:g}",
+    "still at the end": "{num_solved_at_the_end}",
     "median steps to solve": lambda row: (
         f"{row.median_steps_to_solve:,.0f}" if np.isfinite(row.median_steps_to_solve) else "-"),
     "steps": "{max_steps:,}",
@@ -148,8 +196,9 @@ def report(settings: AgentLearning, curves: pd.DataFrame) -> pd.DataFrame:
     note = (
         f"{settings.num_agents} seeds of each; after each training episode "
         f"{settings.test_episodes} greedy test episode. Solved: the mean of {WINDOW} tests in a "
-        f"row reaches the threshold at some time. The last {WINDOW} tests: mean over seeds, "
-        f"bootstrap 95% interval. CartPole here is v0, of 200 steps.{iqm_note()}"
+        f"row reaches the threshold at some time, at the end if that of the last {WINDOW} does. "
+        f"The last {WINDOW} tests: mean over seeds, bootstrap 95% interval. CartPole here is v0, "
+        f"of 200 steps.{iqm_note()}"
     )
     title = "Agents that learn the real tasks"
     return publish(settings, title, as_texts(summary, COLUMNS), summary, note)
@@ -167,13 +216,12 @@ def draw(settings: AgentLearning, curves: pd.DataFrame, points: int = 100) -> No
             axis.set_visible(False)
         for axis, (env, mine) in zip(axes.ravel(), tasks, strict=False):
             for color, (number, study_curves) in zip(palette, mine.groupby("study"), strict=False):
-                study = STUDIES[int(number)]
                 last_step = study_curves["steps"].max()
                 grid = np.geomspace(last_step / 200, last_step, points)
                 figures.band(
                     axis, grid, return_curves.on_grid(study_curves, grid),
                     lambda values: np.transpose([bootstrap_interval(v) for v in values.T]), color,
-                    lw=1.8, label=figures.AGENT_NAMES[study.agent] + "*" * bool(study.hparams),
+                    lw=1.8, label=STUDIES[int(number)].label,
                 )  # fmt: skip
             axis.axhline(sejax.envs.make(env).solved_reward, color="#7a7a7a", ls="--", lw=1)
             axis.set_title(env, fontsize=10)
