@@ -14,7 +14,6 @@ import argparse
 from pathlib import Path
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 import sejax
@@ -31,7 +30,7 @@ def learn_a_set(path: Path, size: int) -> None:
         task=task, agent=agent, proxy=proxy, es=sejax.NESConfig(noise_std=0.1), generations=20,
         training=sejax.TrainingConfig(max_steps=1000, stop_rule="never"), devices=1,
     )  # fmt: skip
-    results = jax.jit(jax.vmap(learn))(jax.random.split(jax.random.key(0), size))
+    results = jax.device_get(jax.jit(jax.vmap(learn))(jax.random.split(jax.random.key(0), size)))
     weights = [jax.tree.map(lambda x, i=i: x[i], results.weights) for i in range(size)]
     records = [{"seed": i, "score": float(x)} for i, x in enumerate(results.score)]
     sejax.save_set(path, proxy, weights, records)
@@ -54,9 +53,9 @@ def main() -> None:
     def train_and_test(key: jax.Array, weights: object) -> sejax.Outcome:
         return evaluate(key, proxies.env.params(weights, proxies.discount))
 
-    number = jnp.repeat(jnp.arange(proxies.size), args.agents)  # of each agent's proxy
+    number = np.repeat(np.arange(proxies.size), args.agents)  # of each agent's proxy
     keys = jax.random.split(jax.random.key(1), number.size)
-    weights = jax.tree.map(lambda x: jnp.asarray(x)[number], proxies.weights)
+    weights = jax.tree.map(lambda x: x[number], proxies.weights)
     program = sejax.spread_over_devices(train_and_test, cpu_lanes=agent.cpu_lanes)
     outcome = jax.jit(program)(keys, weights)
     returns = np.asarray(outcome.test_return).reshape(proxies.size, args.agents)

@@ -10,6 +10,7 @@ from pathlib import Path
 # result test_program.py reads, stay on. Command tests start processes without these.
 _FLAGS = (
     "--xla_backend_optimization_level=0",
+    "--xla_llvm_disable_expensive_passes=true",
     "--xla_cpu_use_fusion_emitters=false",
     "--xla_cpu_parallel_codegen_split_count=1",
     "--xla_force_host_platform_device_count=2",

@@ -21,7 +21,7 @@ TINY = {
     "own_objective": ["--generations=1", "--population=2", "--agents=2", "--steps=250"],
     "own_proxy": ["--generations=1", "--population=2", "--steps=250"],
     "read_a_set": ["--agents=3", "--size=2"],
-    "train_thousands": ["--agents=6"],
+    "train_thousands": ["--agents=6", "--lanes=2"],
 }
 PRINTS = {
     "own_task": r"best -\d+\.\d+ in generation 0; solved at -1",
