@@ -10,6 +10,7 @@ authors' scripts have others for it (`docs/reference.md` 4.8 and 7.3).
 """
 
 import dataclasses
+import functools
 import itertools
 import re
 from collections.abc import Mapping, Sequence
@@ -243,6 +244,7 @@ def check_stored(settings: RnSettings, objectives: Sequence[str]) -> None:
         stored(settings, variant, objective)
 
 
+@functools.cache
 def learning_config(settings: RnSettings, variant: str, objective: str) -> Any:
     """Settings of the NES runs for a variant and objective."""
     plain = variant.removesuffix(AUGMENTED)
