@@ -121,16 +121,23 @@ def test_a_run_counts_the_updates_before_the_incumbent_that_solves_the_task(
 def test_the_search_is_the_bilevel_loop(few_lanes):
     search = score_transforms.make_search(True, 2, None)
     keys, sizes = jax.random.split(jax.random.key(0), 3), np.float32([0.1, 1.0, 5.0])
-    state = search.init(keys, sizes, score_transforms.SCORE_TRANSFORMS.index("single_best"))
+    transform = score_transforms.SCORE_TRANSFORMS.index("single_best")
+    state = start = search.init(keys, sizes, transform)
     config = sejax.config([*score_transforms.SETTINGS, "es.score_transform=single_best",
                            "es.mirrored=true", "es.population_size=2"])  # fmt: skip
     program = make_program(**config.parts())
-    expected = jax.jit(program.init)(keys)
-    expected = expected.replace(es_state=expected.es_state.replace(step_size=jnp.asarray(sizes)))
-    generation = jax.jit(program.generation)
+
+    @jax.jit
+    def init(keys):
+        state = program.init(keys)
+        return state.replace(es_state=state.es_state.replace(step_size=jnp.asarray(sizes)))
+
+    expected, generation = init(keys), jax.jit(program.generation)
     for _ in range(2):
         state = search.advance(state)
         expected, _ = generation(expected)
+    for new, old in zip(jax.tree.leaves(state), jax.tree.leaves(start), strict=True):
+        assert new.sharding.is_equivalent_to(old.sharding, old.ndim), "else it is compiled twice"
     np.testing.assert_allclose(state.incumbent_score, expected.incumbent_score, rtol=1e-5)
     np.testing.assert_allclose(state.es_state.nes.mean, expected.es_state.mean, rtol=1e-4,
                                atol=1e-6)  # fmt: skip
