@@ -11,7 +11,6 @@ from pathlib import Path
 # result test_program.py reads, stay on. Command tests start processes without these.
 _FLAGS = (
     "--xla_backend_optimization_level=0",
-    "--xla_llvm_disable_expensive_passes=true",
     "--xla_cpu_use_fusion_emitters=false",
     "--xla_cpu_parallel_codegen_split_count=1",
     "--xla_force_host_platform_device_count=2",
@@ -25,6 +24,7 @@ os.environ.setdefault("JAX_PLATFORMS", "cpu")
 import hypothesis  # noqa: E402
 import jax  # noqa: E402
 import pytest  # noqa: E402
+from hydra.core.config_store import ConfigStore  # noqa: E402
 
 
 def _cpu_model() -> str:
@@ -52,6 +52,10 @@ hypothesis.settings.register_profile(
 )
 hypothesis.settings.load_profile("sejax")
 
+
+# Hydra copies all that can be chosen for each configuration, and again what it takes of that: the
+# second copy is enough, and a fifth of the time.
+ConfigStore.__deepcopy__ = lambda self, memo: self
 
 # What is imported stays, and tracing makes many objects that reference counts free: looking
 # through all of them at Python's usual pace takes a tenth of the time.
