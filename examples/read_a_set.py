@@ -14,7 +14,6 @@ import argparse
 from pathlib import Path
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 import sejax
@@ -22,16 +21,16 @@ import sejax
 AGENT = sejax.QLearningConfig()
 
 
-def learn_a_set(path: Path, size: int) -> None:
+def learn_a_set(path: Path, size: int, generations: int) -> None:
     """Learns synthetic environments of a small grid from several seeds at once."""
     task = sejax.envs.make("gridworld_2x2")
     proxy = sejax.SyntheticConfig(hidden_size=16, done="threshold").make(task)
     agent = sejax.make_agent(AGENT, task)
     learn = sejax.make_learner(
-        task=task, agent=agent, proxy=proxy, es=sejax.NESConfig(noise_std=0.1), generations=20,
-        training=sejax.TrainingConfig(max_steps=1000, stop_rule="never"), devices=1,
+        task=task, agent=agent, proxy=proxy, es=sejax.NESConfig(noise_std=0.1), devices=1,
+        training=sejax.TrainingConfig(max_steps=1000, stop_rule="never"), generations=generations,
     )  # fmt: skip
-    results = jax.jit(jax.vmap(learn))(jax.random.split(jax.random.key(0), size))
+    results = jax.device_get(jax.jit(jax.vmap(learn))(jax.random.split(jax.random.key(0), size)))
     weights = [jax.tree.map(lambda x, i=i: x[i], results.weights) for i in range(size)]
     records = [{"seed": i, "score": float(x)} for i, x in enumerate(results.score)]
     sejax.save_set(path, proxy, weights, records)
@@ -42,10 +41,11 @@ def main() -> None:
     parser.add_argument("path", type=Path, nargs="?", default=Path("my_set.safetensors"))
     parser.add_argument("--agents", type=int, default=50, help="on each proxy")
     parser.add_argument("--size", type=int, default=4, help="of the set, if it must be learned")
+    parser.add_argument("--generations", type=int, default=20, help="in which it is learned")
     args = parser.parse_args()
     sejax.configure_xla()  # a device for each core
     if not args.path.exists():
-        learn_a_set(args.path, args.size)
+        learn_a_set(args.path, args.size, args.generations)
     proxies = sejax.load_set(args.path)
     agent = sejax.make_agent(AGENT, proxies.task)
     training = sejax.TrainingConfig(max_steps=1000, stop_rule="never")
@@ -54,9 +54,9 @@ def main() -> None:
     def train_and_test(key: jax.Array, weights: object) -> sejax.Outcome:
         return evaluate(key, proxies.env.params(weights, proxies.discount))
 
-    number = jnp.repeat(jnp.arange(proxies.size), args.agents)  # of each agent's proxy
+    number = np.repeat(np.arange(proxies.size), args.agents)  # of each agent's proxy
     keys = jax.random.split(jax.random.key(1), number.size)
-    weights = jax.tree.map(lambda x: jnp.asarray(x)[number], proxies.weights)
+    weights = jax.tree.map(lambda x: x[number], proxies.weights)
     program = sejax.spread_over_devices(train_and_test, cpu_lanes=agent.cpu_lanes)
     outcome = jax.jit(program)(keys, weights)
     returns = np.asarray(outcome.test_return).reshape(proxies.size, args.agents)

@@ -23,6 +23,7 @@ import sejax
 def main() -> None:
     parser = argparse.ArgumentParser(description="Trains thousands of agents in one program.")
     parser.add_argument("--agents", type=int, default=4096)
+    parser.add_argument("--lanes", type=int, default=1024, help="agents in lockstep on a device")
     args = parser.parse_args()
     sejax.configure_xla()  # a device for each core
     proxy, params = sejax.load("cliff_walking-rn")  # the real grid with a learned reward
@@ -36,7 +37,7 @@ def main() -> None:
         def train_and_test(key, evaluate=evaluate, env_params=env_params):
             return evaluate(key, env_params)
 
-        program = sejax.spread_over_devices(train_and_test, lanes=1024)  # in lockstep
+        program = sejax.spread_over_devices(train_and_test, lanes=args.lanes)
         program = jax.jit(program).lower(keys).compile()
         started = time.perf_counter()
         outcome = jax.block_until_ready(program(keys))

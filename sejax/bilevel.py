@@ -14,10 +14,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
-from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from sejax import plugins
+from sejax.agents import flat
 from sejax.agents.agent import Agent
 from sejax.counters import exact, wide_add, wide_sum, wide_zeros
 from sejax.envs.task import Task
@@ -26,7 +26,7 @@ from sejax.es.strategy import Strategy, Trials, finite_mean
 from sejax.evaluation import lanes_on_cpu, make_evaluator, tested_throughout
 from sejax.families import Families
 from sejax.objectives import MaxReward, Objective, Outcome
-from sejax.parallel import spread_groups_over_devices
+from sejax.parallel import copy_to_devices, spread_groups_over_devices
 from sejax.proxies.proxy import ProxyEnv
 from sejax.training import TrainingConfig
 
@@ -271,7 +271,7 @@ def make_program(
         key_weights, key_es, key_run = (
             k for k in jax.vmap(lambda k: jax.random.split(k, 3))(keys).T
         )
-        mean = jax.vmap(lambda key: ravel_pytree(proxy.init_weights(key))[0])(key_weights)
+        mean = jax.vmap(lambda key: flat.flatten(proxy.init_weights(key)))(key_weights)
         state = LearnState(
             key=key_run,
             es_state=jax.vmap(strategy.init)(key_es, mean),
@@ -286,7 +286,7 @@ def make_program(
             env_steps=wide_zeros(num_seeds),
             finished=jnp.zeros(num_seeds, bool),
         )
-        return jax.tree.map(_strongly_typed, state)
+        return copy_to_devices(jax.tree.map(_strongly_typed, state), devices)
 
     def ask(state: LearnState) -> Asked:
         keys = jax.vmap(jax.random.fold_in)(state.key, state.generation)
@@ -531,8 +531,7 @@ def make_population_evaluator(
 def _flat_weights(proxy: ProxyEnv) -> tuple[int, Callable[[Array], Any]]:
     """Length of a proxy's flat parameters, and what makes weights of them."""
     shapes = jax.eval_shape(proxy.init_weights, jax.random.key(0))
-    flat, unravel = ravel_pytree(jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), shapes))
-    return flat.size, unravel
+    return sum(x.size for x in jax.tree.leaves(shapes)), flat.inverse_of_flatten(shapes)
 
 
 def _proxy_of(proxy: Any, task: Task) -> ProxyEnv:

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jax.sharding import AxisType, PartitionSpec
+from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 
 from sejax.errors import require
 
@@ -58,6 +58,22 @@ def spread_over_devices(
     return lambda *args: spread([args])[0]
 
 
+def copy_to_devices(tree: Any, num_devices: int | None = None) -> Any:
+    """The arrays of a pytree with a copy on each device, as what is spread returns them.
+
+    A jitted loop is compiled anew if its state comes back from devices on which it did not start.
+    """
+    mesh = _mesh(num_devices)
+    if mesh.size == 1:
+        return tree
+    return jax.lax.with_sharding_constraint(tree, NamedSharding(mesh, PartitionSpec()))
+
+
+def _mesh(num_devices: int | None) -> Mesh:
+    devices = jax.devices()[: num_devices or None]
+    return jax.make_mesh((len(devices),), ("device",), (AxisType.Auto,), devices=devices)
+
+
 def spread_groups_over_devices(
     fns: Sequence[Callable[..., Any]],
     num_devices: int | None,
@@ -81,7 +97,7 @@ def spread_groups_over_devices(
     require(num_devices is None or num_devices <= len(available), "devices",
             f"be at most {len(available)}", "that is how many there are", num_devices,
             "devices=null")  # fmt: skip
-    count = num_devices or len(available)
+    mesh = _mesh(num_devices)
     on_cpu = available[0].platform == "cpu"
 
     def map_group(fn: Callable[..., Any], lockstep: int | None, args: tuple[Any, ...]) -> Any:
@@ -103,11 +119,9 @@ def spread_groups_over_devices(
     def map_here(groups: Sequence[tuple[Any, ...]]) -> list[Any]:
         return [map_group(*each) for each in zip(fns, cpu_lanes, groups, strict=True)]
 
+    count = mesh.size
     if count == 1:
         return map_here
-    mesh = jax.make_mesh(
-        (count,), ("device",), axis_types=(AxisType.Auto,), devices=available[:count]
-    )
     axis = PartitionSpec("device")
     mapped = jax.shard_map(map_here, mesh=mesh, in_specs=axis, out_specs=axis, check_vma=False)
 

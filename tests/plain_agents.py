@@ -69,16 +69,19 @@ def learn(agent, env, num_steps, seed, random_steps=500, batch_size=64):
     """Trains an agent for a number of steps and returns it; its first actions are drawn blindly."""
     rng = np.random.default_rng(seed)
     env.action_space.seed(seed)
-    memory = []  # observation, action, reward, whether it goes on, next observation
+    memory = None  # observation, action, reward, whether it goes on, next observation
     obs, _ = env.reset(seed=seed)
     for step in range(num_steps):
         action = env.action_space.sample() if step < random_steps else agent.explore(obs, rng)
         next_obs, reward, terminated, truncated, _ = env.step(action)
-        memory.append((obs, action, reward, not terminated, next_obs))
+        row = (obs, action, reward, not terminated, next_obs)
+        memory = memory or [np.empty((num_steps, *np.shape(x)), np.float32) for x in row]
+        for column, x in zip(memory, row, strict=True):
+            column[step] = x
         obs = env.reset()[0] if terminated or truncated else next_obs
         if step >= batch_size:
-            batch = [memory[i] for i in rng.integers(len(memory), size=batch_size)]
-            agent.update(*(np.stack(x).astype(np.float32) for x in zip(*batch, strict=True)), rng)
+            places = rng.integers(step + 1, size=batch_size)
+            agent.update(*(column[places] for column in memory), rng)
     return agent
 
 

@@ -42,7 +42,7 @@ def program_of(*overrides, words=TINY):
 
 def compiled(program, keys):
     """The generation as an executable, and the initial state for these keys."""
-    state = program.init(keys)
+    state = jax.jit(program.init)(keys)
     return jax.jit(program.generation).lower(state).compile(), state
 
 

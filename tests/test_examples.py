@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from support import random_like, shapes_of
 
 import sejax
 
@@ -20,8 +21,8 @@ TINY = {
     "own_agent": ["--seeds=2", "--steps=20"],
     "own_objective": ["--generations=1", "--population=2", "--agents=2", "--steps=250"],
     "own_proxy": ["--generations=1", "--population=2", "--steps=250"],
-    "read_a_set": ["--agents=3", "--size=2"],
-    "train_thousands": ["--agents=6"],
+    "read_a_set": ["--agents=3", "--size=2", "--generations=2"],
+    "train_thousands": ["--agents=6", "--lanes=2"],
 }
 PRINTS = {
     "own_task": r"best -\d+\.\d+ in generation 0; solved at -1",
@@ -123,9 +124,9 @@ def test_a_sac_update_is_one_that_was_derived_anew(examples):
     own_agent = examples("own_agent")
     networks = own_agent.Networks(own_agent.Actor(ACTION_DIM, HIDDEN), own_agent.Critic(HIDDEN))
     rng = np.random.default_rng(0)
-    params = networks.init(jax.random.key(0), jnp.zeros(OBS_DIM), jnp.zeros(ACTION_DIM))
-    params = jax.tree.map(lambda x: x + jnp.float32(rng.normal(size=x.shape)) / 2, params)
-    target_critics = jax.tree.map(lambda x: x + 0.1, params["critics"])
+    shapes = shapes_of(networks.init, jax.random.key(0), np.zeros(OBS_DIM), np.zeros(ACTION_DIM))
+    params = random_like(shapes, seed=1)
+    target_critics = jax.tree.map(lambda x: x + np.float32(0.1), params["critics"])
     hparams = sejax.agents.traced(own_agent.SAC(discount=0.9, target_update_rate=0.1))
     state = own_agent.SACState(params=params, target_critics=target_critics, hparams=hparams,
                                opt_state=own_agent.ADAM.init(params),
@@ -136,7 +137,7 @@ def test_a_sac_update_is_one_that_was_derived_anew(examples):
               "discount": rng.uniform(-0.2, 1.2, BATCH),
               "weight": np.array([1, 1, 1, 1, 0])}  # fmt: skip
     noise = rng.normal(size=(2, BATCH, ACTION_DIM))
-    batch = sejax.agents.Transition(**{name: jnp.float32(x) for name, x in arrays.items()})
+    batch = sejax.agents.Transition(**{name: np.float32(x) for name, x in arrays.items()})
     after = jax.jit(lambda *args: own_agent.learn(networks, *args))(state, batch, noise)
 
     in_float64 = jax.tree.map(lambda x: np.asarray(x, np.float64), (params, target_critics))

@@ -66,6 +66,12 @@ def small(monkeypatch):
 # Score transforms.
 
 
+@pytest.fixture
+def few_lanes(monkeypatch):
+    """Lanes that these few runs fill."""
+    monkeypatch.setattr(score_transforms, "CPU_LANES", 8)
+
+
 def test_step_sizes_are_spread_evenly_over_the_logarithm():
     sizes = score_transforms.draw_step_sizes(12, seed=1)
     places = np.log10(sizes) + 2  # 0.01 -> 0, 10 -> 3
@@ -112,19 +118,26 @@ def test_a_run_counts_the_updates_before_the_incumbent_that_solves_the_task(
     assert search.advanced == advanced, "nothing is computed when all runs are over"
 
 
-def test_the_search_is_the_bilevel_loop():
+def test_the_search_is_the_bilevel_loop(few_lanes):
     search = score_transforms.make_search(True, 2, None)
-    keys, sizes = jax.random.split(jax.random.key(0), 2), np.array([0.1, 5.0], np.float32)
-    state = search.init(keys, sizes, score_transforms.SCORE_TRANSFORMS.index("single_best"))
+    keys, sizes = jax.random.split(jax.random.key(0), 3), np.float32([0.1, 1.0, 5.0])
+    transform = score_transforms.SCORE_TRANSFORMS.index("single_best")
+    state = start = search.init(keys, sizes, transform)
     config = sejax.config([*score_transforms.SETTINGS, "es.score_transform=single_best",
                            "es.mirrored=true", "es.population_size=2"])  # fmt: skip
     program = make_program(**config.parts())
-    expected = program.init(keys)
-    expected = expected.replace(es_state=expected.es_state.replace(step_size=jnp.asarray(sizes)))
-    generation = jax.jit(program.generation)
+
+    @jax.jit
+    def init(keys):
+        state = program.init(keys)
+        return state.replace(es_state=state.es_state.replace(step_size=jnp.asarray(sizes)))
+
+    expected, generation = init(keys), jax.jit(program.generation)
     for _ in range(2):
         state = search.advance(state)
         expected, _ = generation(expected)
+    for new, old in zip(jax.tree.leaves(state), jax.tree.leaves(start), strict=True):
+        assert new.sharding.is_equivalent_to(old.sharding, old.ndim), "else it is compiled twice"
     np.testing.assert_allclose(state.incumbent_score, expected.incumbent_score, rtol=1e-5)
     np.testing.assert_allclose(state.es_state.nes.mean, expected.es_state.mean, rtol=1e-4,
                                atol=1e-6)  # fmt: skip
@@ -147,7 +160,7 @@ def test_the_best_bin_and_the_ranks_are_those_of_the_means():
     assert list(table["rank"]) == ["1", "2"] and list(table["rank there"]) == ["2", "1"]
 
 
-def test_score_transforms_run_and_go_on_where_they_stopped(tmp_path, monkeypatch):
+def test_score_transforms_run_and_go_on_where_they_stopped(tmp_path, monkeypatch, few_lanes):
     table = run(score_transforms, tmp_path, **TINY_TRANSFORMS)
     assert len(table) == 16 and (tmp_path / "score_transforms.png").stat().st_size > 10_000
     runs = pieces.read_rows(tmp_path / "rows.csv.xz")
@@ -392,7 +405,7 @@ def test_a_recorded_run_is_the_bilevel_loop():
     program = make_program(**config.parts())
     key = jax.random.key(7)
     state, steps = recorded.generation(recorded.init(key[None]))
-    expected, info = jax.jit(program.generation)(program.init(key[None]))
+    expected, info = jax.jit(program.generation)(jax.jit(program.init)(key[None]))
     np.testing.assert_allclose(state.es_state.mean, expected.es_state.mean, rtol=1e-4, atol=1e-6)
     # Those tests between episodes count as real steps, but are not recorded.
     assert int(info.env_steps_wide[0, 1]) > int(steps.valid.sum()) > 0

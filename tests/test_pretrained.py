@@ -92,6 +92,10 @@ def test_an_agent_that_sees_gymnasiums_five_values_alone_learns_the_task(name):
     task = envs.make(PROXIES[name].task)
     real = gymnasium.make(GYMNASIUM_IDS[task.name], max_episode_steps=task.max_steps)
     env = make(name)
-    agents = [learn(agent_for(env, seed), env, num_steps=4000, seed=seed) for seed in range(3)]
-    returns = [mean_return(agent, real, num_episodes=10, seed=100) for agent in agents]
-    assert np.median(returns) >= task.solved_reward, returns
+    returns = []
+    for seed in range(3):
+        agent = learn(agent_for(env, seed), env, num_steps=4000, seed=seed)
+        returns.append(mean_return(agent, real, num_episodes=10, seed=100))
+        if sum(np.array(returns) >= task.solved_reward) == 2:
+            return  # whatever the third would do
+    pytest.fail(f"returns of the agents: {returns}")

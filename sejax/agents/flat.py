@@ -4,7 +4,6 @@ from collections.abc import Callable
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import optax
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
@@ -19,8 +18,21 @@ def flatten(tree: Any) -> Array:
 
 def unflattener(init: Callable[..., Any], *example: Any) -> Callable[[Array], Any]:
     """Builds the inverse of `flatten` for what `init(key, *example)` returns."""
-    template = jax.eval_shape(init, jax.random.key(0), *example)
-    return ravel_pytree(jax.tree.map(lambda x: jnp.zeros(x.shape), template))[1]
+    return inverse_of_flatten(jax.eval_shape(init, jax.random.key(0), *example))
+
+
+def inverse_of_flatten(shapes: Any) -> Callable[[Array], Any]:
+    """The inverse of `flatten`, built from shapes alone: `ravel_pytree` would compute a vector."""
+    leaves, structure = jax.tree.flatten(shapes)
+
+    def unflatten(vector: Array) -> Any:
+        parts = jax.lax.split(vector, [leaf.size for leaf in leaves])
+        return structure.unflatten([
+            part.reshape(leaf.shape).astype(leaf.dtype)
+            for part, leaf in zip(parts, leaves, strict=True)
+        ])  # fmt: skip
+
+    return unflatten
 
 
 def adam_step(

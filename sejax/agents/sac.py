@@ -143,7 +143,7 @@ def make_sac(config: SACConfig, obs_dim: int, action_dim: int, max_action: float
 
     Example:
       >>> agent = make_sac(SACConfig(), obs_dim=3, action_dim=1, max_action=2.0)
-      >>> state = agent.init(jax.random.key(0), agent.hparams)
+      >>> state = jax.jit(agent.init)(jax.random.key(0), agent.hparams)
       >>> agent.act(jax.random.key(1), state, jnp.zeros(3), explore=True).shape
       (1,)
     """
@@ -156,7 +156,7 @@ def make_sac_discrete(config: SACConfig, obs_dim: int, num_actions: int) -> Agen
 
     Example:
       >>> agent = make_sac_discrete(SACConfig(), obs_dim=4, num_actions=2)
-      >>> state = agent.init(jax.random.key(0), agent.hparams)
+      >>> state = jax.jit(agent.init)(jax.random.key(0), agent.hparams)
       >>> int(agent.act(jax.random.key(1), state, jnp.zeros(4), explore=True)) in (0, 1)
       True
     """

@@ -155,7 +155,7 @@ def make_td3(config: TD3Config, obs_dim: int, action_dim: int, max_action: float
 
     Example:
       >>> agent = make_td3(TD3Config(), obs_dim=3, action_dim=1, max_action=2.0)
-      >>> state = agent.init(jax.random.key(0), agent.hparams)
+      >>> state = jax.jit(agent.init)(jax.random.key(0), agent.hparams)
       >>> agent.act(jax.random.key(1), state, jnp.zeros(3), explore=True).shape
       (1,)
     """
@@ -176,7 +176,7 @@ def make_td3_discrete(config: DiscreteTD3Config, obs_dim: int, num_actions: int)
 
     Example:
       >>> agent = make_td3_discrete(DiscreteTD3Config(), obs_dim=4, num_actions=2)
-      >>> state = agent.init(jax.random.key(0), agent.hparams)
+      >>> state = jax.jit(agent.init)(jax.random.key(0), agent.hparams)
       >>> action = agent.act(jax.random.key(1), state, jnp.zeros(4), explore=True)
       >>> action.shape, int(agent.env_action(action)) in (0, 1)
       ((2,), True)

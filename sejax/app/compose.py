@@ -5,6 +5,7 @@ its names stand for (`sejax.plugins`), those of a task's tuned settings from one
 and proxy (`sejax.app.presets`).
 """
 
+import functools
 import re
 import textwrap
 from collections.abc import Iterable, Sequence
@@ -150,7 +151,9 @@ def register(name: str, overrides: Sequence[str]) -> None:
     store.store(name="base", node=base)
     chosen = _choices(overrides)
     for group in groups:
-        for choice in dict.fromkeys([*plugins.names(group), *chosen.get(group, ())]):
+        store.repo[group] = dict(_built_in_nodes(group))
+        others = dict.fromkeys([*plugins.names(group), *chosen.get(group, ())])
+        for choice in (name for name in others if name not in plugins.GROUPS[group].built_in):
             if group == "agent" and families.JOINT in choice:
                 node = families.node(choice, shares=name == "run")
                 _store(group, choice, node, package="_global_")
@@ -211,6 +214,16 @@ def _choices(overrides: Iterable[str]) -> dict[str, list[str]]:
         choices = [value.strip(" '\"") for value in values.split(",")]
         found.setdefault(match[1], []).extend(value for value in choices if value)
     return found
+
+
+@functools.cache
+def _built_in_nodes(group: str) -> dict[str, Any]:
+    """Hydra's nodes of what comes with sejax, which are the same whatever the words; by file."""
+    repo = ConfigStore.instance().repo
+    repo.pop(group, None)
+    for choice in plugins.GROUPS[group].built_in:
+        _register_choice(group, choice, False, ())
+    return dict(repo.pop(group))
 
 
 def _register_choice(group: str, choice: str, is_chosen: bool, overrides: Sequence[str]) -> None:

@@ -12,6 +12,7 @@ on MountainCarContinuous, and five times that on HalfCheetah.
 """
 
 import dataclasses
+import functools
 import itertools
 import re
 from collections.abc import Mapping, Sequence
@@ -254,6 +255,7 @@ def check_stored(settings: RnSettings, objectives: Sequence[str]) -> None:
         stored(settings, variant, objective)
 
 
+@functools.cache
 def learning_config(settings: RnSettings, variant: str, objective: str) -> Any:
     """Settings of the NES runs for a variant and objective."""
     plain = variant.removesuffix(AUGMENTED)
