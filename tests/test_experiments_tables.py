@@ -4,8 +4,8 @@ import pytest
 
 from sejax.experiments.rn_studies import STUDIES
 
-# The tables of default hyperparameters, for agents that are trained on learned RNs. SARSA's are not
-# here: see `STUDIES`.
+# The tables of default hyperparameters, for agents that are trained on learned RNs. SARSA and TD3
+# are not here: see `STUDIES`.
 AFTER_LEARNING = {
     ("cliff_walking", "agent"): {"learning_rate": 1.0, "discount": 0.8, "epsilon_init": 0.1,
                                  "epsilon_min": 0.1, "epsilon_decay": 0.0},
@@ -19,18 +19,6 @@ AFTER_LEARNING = {
         "discount": 0.99, "epsilon_init": 1.0, "epsilon_min": 0.1, "epsilon_decay": 0.9,
         "num_layers": 1, "hidden_size": 64, "activation": "relu", "buffer_size": 1_000_000,
         "feature_dim": 128, "stream_num_layers": 1, "stream_hidden_size": 128,
-    },
-    ("mountain_car_continuous", "agent"): {
-        "init_episodes": 50, "batch_size": 256, "learning_rate": 0.0003, "discount": 0.99,
-        "target_update_rate": 0.005, "policy_delay": 2, "action_repeat": 2,
-        "action_noise_std": 0.1, "target_noise_std": 0.2, "target_noise_clip": 0.5,
-        "num_layers": 2, "hidden_size": 128, "activation": "relu", "buffer_size": 100_000,
-    },
-    ("halfcheetah", "agent"): {
-        "init_episodes": 20, "batch_size": 256, "learning_rate": 0.0003, "discount": 0.99,
-        "target_update_rate": 0.005, "policy_delay": 2, "action_repeat": 1,
-        "action_noise_std": 0.1, "target_noise_std": 0.2, "target_noise_clip": 0.5,
-        "num_layers": 2, "hidden_size": 128, "activation": "relu", "buffer_size": 100_000,
     },
     ("mountain_car_continuous", "transfer_agent"): {
         "epochs": 80, "learning_rate": 0.0003, "update_episodes": 10, "discount": 0.99,
