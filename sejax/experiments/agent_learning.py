@@ -120,11 +120,11 @@ STUDIES = (
           hparams={"discount": 1.0, "epsilon_init": 0.01, "epsilon_min": 0.0,
                    "epsilon_decay": 0.9}, peers="optimal: -12"),
     PresetStudy(env="pendulum", agent="td3", max_steps=20_000,
-                       peers=f"-151.9 after 20,000 steps ({ZOO})"),
+                peers=f"-151.9 after 20,000 steps ({ZOO})"),
     PresetStudy(env="mountain_car_continuous", agent="td3", max_steps=99_900,
-                       peers=f"93.5 after 300,000 steps ({ZOO})"),
+                peers=f"93.5 after 300,000 steps ({ZOO})"),
     PresetStudy(env="halfcheetah", agent="td3", max_steps=100_000,
-                       peers=f"9,656 on HalfCheetah-v3 after 1,000,000 steps ({ZOO})"),
+                peers=f"9,656 on HalfCheetah-v3 after 1,000,000 steps ({ZOO})"),
 )  # fmt: skip
 ENVS = tuple(dict.fromkeys(study.env for study in STUDIES))
 

@@ -38,9 +38,9 @@ class CurveSettings(RnSettings):
     rows: tuple[str, ...] = setting(
         rn_studies.ROWS,
         each_of(ROWS),
-        about="agents to train: default (the paper's "
-        "hyperparameters), varied (drawn for each agent), transfer (one that the RNs never saw), "
-        "on cartpole tuned (for few steps)",
+        about="agents to train: default (the paper's hyperparameters; on continuous tasks those of "
+        "the quick agent that RNs are learned with), varied (drawn for each agent), transfer (one "
+        "that the RNs never saw), on cartpole tuned (for few steps)",
     )
     bonuses: tuple[str, ...] = setting((), about="exploration bonuses on the real task to compare "
                                        "with: count_based on cliff_walking, elsewhere icm; or "
@@ -192,6 +192,12 @@ def common_note(settings: CurveSettings, solved_reward: float) -> str:
         f"{return_curves.WINDOW} tests in a row reaches {solved_reward:g}; an agent that never "
         f"does counts {settings.max_steps:,}. In brackets bootstrap 95% intervals, for at least "
         f"five RNs: they draw RNs, and agents on the real task.{iqm_note('within each RN')}"
+        + (
+            ""
+            if settings.study.agent
+            else " Default hyperparameters are those of the agent that "
+            "the RNs were learned with, not the paper's."
+        )
     )
 
 
