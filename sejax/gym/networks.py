@@ -7,7 +7,7 @@ import numpy as np
 
 from sejax.errors import ConfigError, shortened
 
-Layers = list[tuple[np.ndarray, np.ndarray]]  # kernel [in, out] and bias [out] of each
+Layers = list[tuple[np.ndarray, np.ndarray]]  # kernel [out, in] and bias [out] of each
 Shapes = dict[str, tuple[int, ...]]
 
 ACTIVATIONS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
@@ -20,23 +20,20 @@ ACTIVATIONS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
 
 
 def forward(layers: Layers, activation: str, x: np.ndarray) -> np.ndarray:
-    """Outputs `[*batch, out]` of inputs `[*batch, in]`; they may overflow, which the caller sees."""
+    """Outputs `[*batch, out]` of inputs `[*batch, in]`; they may overflow without a warning."""
     activate = ACTIVATIONS[activation]
     *hidden, (last_kernel, last_bias) = layers
     with np.errstate(over="ignore", invalid="ignore"):
         for kernel, bias in hidden:
-            x = activate(x @ kernel + bias)
-        return x @ last_kernel + last_bias
+            x = activate(x @ kernel.T + bias)
+        return x @ last_kernel.T + last_bias
 
 
 def layers_of(weights: Mapping[str, np.ndarray], network: str) -> Layers:
-    """A network's layers, none if it is not there; files hold kernels as `[out, in]`."""
+    """A network's layers, none if it is not there."""
     names = (f"{network}/Dense_{i}" for i in itertools.count())
     there = itertools.takewhile(lambda name: f"{name}/kernel" in weights, names)
-    return [
-        (np.ascontiguousarray(weights[f"{name}/kernel"].T), weights[f"{name}/bias"])
-        for name in there
-    ]
+    return [(weights[f"{name}/kernel"], weights[f"{name}/bias"]) for name in there]
 
 
 def joined(networks: Sequence[Layers]) -> Layers:
@@ -47,7 +44,7 @@ def joined(networks: Sequence[Layers]) -> Layers:
     whole: Layers = []
     for parts in zip(*networks, strict=True):
         kernels, biases = zip(*parts, strict=True)
-        kernel = _block_diagonal(kernels) if whole else np.concatenate(kernels, axis=1)
+        kernel = _block_diagonal(kernels) if whole else np.concatenate(kernels)
         whole.append((kernel, np.concatenate(biases)))
     return whole
 

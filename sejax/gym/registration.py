@@ -43,23 +43,20 @@ def make(
     Example:
       >>> make("acrobot").observation_space.shape
       (6,)
-      >>> make("cartpole-rn").unwrapped
-      <CartPoleEnv<sejax/cartpole-rn>>
+      >>> make("cartpole-rn").spec.id
+      'sejax/cartpole-rn'
     """
     weights, header = read(source)
-    is_rn = _is_rn(header)
-    if is_rn:
-        env = RewardNetwork(_real_env(header, task, render_mode), source)
+    env: SyntheticEnv | RewardNetwork
+    name = header["task"].replace("/", "-")
+    if _is_rn(header):
+        env, name = RewardNetwork(_real_env(header, task, render_mode), source), f"{name}-rn"
     else:
-        require(render_mode is None, "render_mode", "be None for an SE", "its states have no picture",
-                render_mode, "render_mode=None")  # fmt: skip
+        require(render_mode is None, "render_mode", "be None for an SE", "its states have no "
+                "picture", render_mode, "render_mode=None")  # fmt: skip
         env = SyntheticEnv(_world(weights, header, task))
-    options = {"task": task, "render_mode": render_mode}
-    # No max_episode_steps: it would be a second time limit, by a wrapper.
-    env.spec = _spec(header["task"].replace("/", "-") + ("-rn" if is_rn else ""), source=str(source),
-                     **{name: x for name, x in options.items() if x is not None})  # fmt: skip
-    if is_rn:
-        env.unwrapped.spec = env.spec
+    options = {"source": str(source), "task": task, "render_mode": render_mode}
+    env.spec = _spec(name, **{key: x for key, x in options.items() if x is not None})
     return env
 
 
@@ -129,7 +126,7 @@ def make_sb3(source: Source, num_envs: int = 1, task: RealTask | str | None = No
 
 
 def register() -> list[str]:
-    """Registers the shipped proxies with Gymnasium as `sejax/<name>`; importing `sejax.gym` does it.
+    """Registers the shipped proxies as `sejax/<name>`; importing `sejax.gym` does it.
 
     Returns:
       The ids, for `gymnasium.make` and `gymnasium.make_vec`.
@@ -145,6 +142,7 @@ def register() -> list[str]:
 
 
 def _spec(name: str, **kwargs: Any) -> EnvSpec:
+    """How Gymnasium makes it; without `max_episode_steps`, a second time limit by a wrapper."""
     return EnvSpec(
         id=f"{NAMESPACE}/{name}", entry_point="sejax.gym:make",
         vector_entry_point="sejax.gym:make_vec", kwargs=kwargs,

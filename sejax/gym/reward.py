@@ -44,8 +44,8 @@ class RewardNetwork(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
 
     Dynamics, spaces, starts and ends are the environment's own; with r its reward and
     :math:`\Phi` the network, agents get r or 0 (additive or exclusive) plus
-    :math:`\gamma \Phi(s') - \Phi(s)`, :math:`\Phi(s')` or :math:`w^\top i'` (potential, non-potential
-    or weighted info). `info["real_reward"]` is r, `info["discount"]` 0 where the episode has
+    :math:`\gamma \Phi(s') - \Phi(s)`, :math:`\Phi(s')` or :math:`w^\top i'` (potential,
+    non-potential or weighted info). `info["real_reward"]` is r, `info["discount"]` 0 where the episode has
     terminated and 1 elsewhere. A reward that is not finite or beyond 1e6 is 0 and terminates.
 
     A gamma belongs to a potential, and it is the agent's: the default is that of the agent which
@@ -66,11 +66,11 @@ class RewardNetwork(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
         are not known.
 
     Example:
-      >>> env = RewardNetwork(gymnasium.make("MountainCarContinuous-v0"), "mountain_car_continuous-rn")
+      >>> env = RewardNetwork(gymnasium.make("CartPole-v1"), "cartpole-rn", discount=0.98)
       >>> obs, info = env.reset(seed=0)
-      >>> obs, reward, terminated, truncated, info = env.step([0.5])
-      >>> info["real_reward"]
-      -0.025
+      >>> obs, reward, terminated, truncated, info = env.step(1)
+      >>> info["real_reward"], reward == 1.0
+      (1.0, False)
     """
 
     def __init__(
@@ -92,7 +92,7 @@ class RewardNetwork(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
         self.limit_is_terminal = limit_is_terminal
         require(not isinstance(env.unwrapped, CliffWalkingEnv), "env", "be sejax's Cliff Walking",
                 "in Gymnasium's, falling off the cliff ends no episode and actions are numbered "
-                "otherwise", env, f"env to sejax.gym.make({str(source)!r}), which is whole")  # fmt: skip
+                "otherwise", env, f"env=sejax.gym.make({str(source)!r}), whole as it is")  # fmt: skip
         self._info_keys = self._keys(header["task"], info_keys)
         obs_dim = vector_size(env.observation_space, "env.observation_space")
         self._num_states = num_categories(env.observation_space)
@@ -146,7 +146,7 @@ class RewardNetwork(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
         return self._made_as or super().spec
 
     @spec.setter
-    def spec(self, value: EnvSpec) -> None:
+    def spec(self, value: EnvSpec | None) -> None:
         self._made_as = value
 
     def _bonus(self, obs: Any, told: np.ndarray, ends: bool) -> float:
@@ -180,7 +180,7 @@ class RewardNetwork(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
         if keys is None:
             raise ConfigError(
                 f"info_keys must be given for {task}, because this RN needs numbers of a step's "
-                f"info and only tasks of sejax's own are known here ({', '.join(known)}); got none. "
+                f"info and only those of {', '.join(known)} are known here; got none. "
                 f"Set sejax.gym.RewardNetwork(env, source, info_keys=[...]) to "
                 f"`sejax.Task.{'info' if self.config.weighs_info else 'augmented'}_keys`."
             )

@@ -17,13 +17,13 @@ from sejax.proxies.units import units_of
 
 
 class Step(NamedTuple):
-    """What a step of one episode or of several comes to; each `[*lanes]`."""
+    """What a step comes to: of one episode numbers, of several arrays `[lanes]`."""
 
     vector: np.ndarray  # [*lanes, obs_dim]
-    reward: np.ndarray
-    terminated: np.ndarray
-    truncated: np.ndarray
-    discount: np.ndarray
+    reward: Any
+    terminated: Any
+    truncated: Any
+    discount: Any
 
 
 class SyntheticWorld:
@@ -64,6 +64,7 @@ class SyntheticWorld:
         heads = ["reward"] if config.horizon == 1 else ["state", "reward", "done"]
         self._layers = networks.joined([networks.layers_of(weights, head) for head in heads])
         self._start_layers = networks.layers_of(weights, "start")
+        self._limit_is_terminal = config.horizon is not None and config.horizon_is_terminal
         self._units = None
         if config.state_units == "bounds" and isinstance(task.observation_space, spaces.Box):
             space = task.observation_space
@@ -110,20 +111,16 @@ class SyntheticWorld:
         Raises:
           gymnasium.error.InvalidAction: for an action that is none of the space's.
         """
-        array = np.asarray(action)
-        is_known = array.shape == space.shape
         if self._num_actions:
-            is_known = is_known and array.dtype.kind in "iu"
-            if is_known and 0 <= array.min() and array.max() < self._num_actions:
+            array = np.asarray(action) if space.shape else action
+            if space.contains(array):
                 return self._one_hot[array]
-        elif is_known and array.dtype.kind in "fiu":
+        elif np.shape(action) == space.shape:
             low, high = self.action_space.low, self.action_space.high  # type: ignore[attr-defined]
-            return np.minimum(np.maximum(array.astype(np.float32), low), high)
+            return np.minimum(np.maximum(np.asarray(action, np.float32), low), high)
         raise gymnasium.error.InvalidAction(f"{action!r} is none of {space}")
 
-    def step(
-        self, vector: np.ndarray, action: np.ndarray, time: Any, chance: np.ndarray | float | None
-    ) -> Step:
+    def step(self, vector: np.ndarray, action: np.ndarray, time: Any, chance: Any = None) -> Step:
         """One step of each episode.
 
         Args:
@@ -133,19 +130,23 @@ class SyntheticWorld:
           chance: uniform in [0, 1), `[*lanes]`, if `draws_ends`.
         """
         outputs = self._predict(action, vector)  # [*lanes, obs_dim + 2]
-        sane = np.abs(outputs).max(axis=-1) < ABSURD  # False for nan
-        if not sane.all():
-            stays = np.zeros_like(outputs)  # where it was, without a reward; d = 1 ends it
+        absurd: Any = False
+        if not np.abs(outputs).max() < ABSURD:  # nan is not either
+            absurd = ~(np.abs(outputs).max(axis=-1) < ABSURD)
+            stays = np.zeros_like(outputs)  # where it was, without a reward
             stays[..., :-2], stays[..., -1] = vector, 1
-            outputs = np.where(sane[..., None], outputs, stays)
-        done, at_limit = outputs[..., -1], time >= self.max_steps
-        ends = self._ends(done, chance) | ~sane
-        discount = 1 - (done if self.config.done == "soft" else ends)
-        terminated, truncated = ends, at_limit
-        if self.config.horizon is not None and self.config.horizon_is_terminal:
-            terminated, truncated = ends | at_limit, at_limit & False
+            outputs = np.where(absurd[..., None], stays, outputs)
+        reward, done = outputs[..., -2], outputs[..., -1]
+        if outputs.ndim == 1:  # one at a time, Python's numbers are quicker than NumPy's
+            reward, done = reward.item(), done.item()
+        at_limit = time >= self.max_steps
+        terminated = self._ends(done, chance) | absurd
+        discount = 1 - (done if self.config.done == "soft" else terminated)
+        truncated = at_limit
+        if self._limit_is_terminal:
+            terminated, truncated = terminated | at_limit, at_limit & False
             discount = discount * (1 - at_limit)
-        return Step(outputs[..., :-2], outputs[..., -2], terminated, truncated, discount)
+        return Step(outputs[..., :-2], reward, terminated, truncated, discount)
 
     def observe(self, vector: np.ndarray) -> np.ndarray:
         """What agents see of a state, a copy: `[*lanes, obs_dim]`, or an index `[*lanes]`."""
@@ -162,7 +163,7 @@ class SyntheticWorld:
             outputs[..., :-2] = self._units.decode(outputs[..., :-2])
         return outputs
 
-    def _ends(self, done: np.ndarray, chance: np.ndarray | float | None) -> np.ndarray:
+    def _ends(self, done: Any, chance: Any) -> Any:
         """Whether the done output ends the episode."""
         if not self.draws_ends:
             return done > 0.5

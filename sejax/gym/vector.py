@@ -9,6 +9,7 @@ from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
+from sejax.errors import require
 from sejax.gym.synthetic import SyntheticWorld
 
 PREFETCHED = 32  # starts that a lane draws at once, where nothing else draws from its generator
@@ -54,7 +55,7 @@ class SyntheticVectorEnv(VectorEnv[Any, Any, np.ndarray]):
         self._num_used = np.full(num_envs, num_drawn)  # of those
 
     @property
-    def np_random(self) -> tuple[np.random.Generator | None, ...]:  # type: ignore[override]
+    def np_random(self) -> tuple[np.random.Generator | None, ...]:  # type: ignore[misc, override]
         """The generator of each lane; None before the first reset."""
         return tuple(self._rngs)
 
@@ -76,16 +77,15 @@ class SyntheticVectorEnv(VectorEnv[Any, Any, np.ndarray]):
           options: `reset_mask`, `[num_envs]` of bool: only these lanes.
 
         Raises:
-          ValueError: for seeds or a mask of another length.
+          ConfigError: for seeds or a mask of another length.
         """
         seeds = self._listed(seed)
         mask = np.asarray((options or {}).get("reset_mask", np.ones(self.num_envs, np.bool_)))
-        if len(seeds) != self.num_envs or mask.shape != (self.num_envs,) or mask.dtype != np.bool_:
-            raise ValueError(
-                f"seed and reset_mask must have an entry for each of {self.num_envs} lanes, because "
-                f"each is reset by its own; got {len(seeds)} seeds and a mask of {mask.dtype} "
-                f"{mask.shape}. Give one int as seed, and a mask of bool."
-            )
+        require(len(seeds) == self.num_envs, "seed", "have an entry for each lane", "each has a "
+                "generator of its own", f"{len(seeds)} for {self.num_envs}", "seed=0")  # fmt: skip
+        require(mask.shape == (self.num_envs,) and mask.dtype == np.bool_, "options.reset_mask",
+                "be a bool for each lane", "it says which begin anew", f"{mask.dtype} {mask.shape} "
+                f"for {self.num_envs}", "options={'reset_mask': ended}")  # fmt: skip
         lanes = np.flatnonzero(mask)
         for lane in lanes:
             if self._rngs[lane] is None or seeds[lane] is not None:
