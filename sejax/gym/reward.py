@@ -45,8 +45,9 @@ class RewardNetwork(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
     Dynamics, spaces, starts and ends are the environment's own; with r its reward and
     :math:`\Phi` the network, agents get r or 0 (additive or exclusive) plus
     :math:`\gamma \Phi(s') - \Phi(s)`, :math:`\Phi(s')` or :math:`w^\top i'` (potential,
-    non-potential or weighted info). `info["real_reward"]` is r, `info["discount"]` 0 where the episode has
-    terminated and 1 elsewhere. A reward that is not finite or beyond 1e6 is 0 and terminates.
+    non-potential or weighted info). `info["real_reward"]` is r, `info["discount"]` 0 where the
+    episode has terminated and 1 elsewhere. A reward that is not finite or beyond 1e6 is 0 and
+    terminates.
 
     A gamma belongs to a potential, and it is the agent's: the default is that of the agent which
     the RN was learned with.
@@ -92,7 +93,8 @@ class RewardNetwork(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
         self.limit_is_terminal = limit_is_terminal
         require(not isinstance(env.unwrapped, CliffWalkingEnv), "env", "be sejax's Cliff Walking",
                 "in Gymnasium's, falling off the cliff ends no episode and actions are numbered "
-                "otherwise", env, f"env=sejax.gym.make({str(source)!r}), whole as it is")  # fmt: skip
+                "otherwise", env,
+                f"env=sejax.gym.make({str(source)!r}), which is whole")  # fmt: skip
         self._info_keys = self._keys(header["task"], info_keys)
         obs_dim = vector_size(env.observation_space, "env.observation_space")
         self._num_states = num_categories(env.observation_space)

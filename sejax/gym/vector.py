@@ -54,8 +54,8 @@ class SyntheticVectorEnv(VectorEnv[Any, Any, np.ndarray]):
         self._drawn = np.zeros((num_envs, num_drawn, world.obs_dim), np.float32)
         self._num_used = np.full(num_envs, num_drawn)  # of those
 
-    @property
-    def np_random(self) -> tuple[np.random.Generator | None, ...]:  # type: ignore[misc, override]
+    @property  # type: ignore[misc]
+    def np_random(self) -> tuple[np.random.Generator | None, ...]:  # type: ignore[override]
         """The generator of each lane; None before the first reset."""
         return tuple(self._rngs)
 
