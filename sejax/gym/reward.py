@@ -169,8 +169,9 @@ class RewardNetwork(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
         except KeyError as error:
             raise ConfigError(
                 f"env must tell {', '.join(self._info_keys)} in a step's info, because this RN "
-                f"{'weighs' if self.config.weighs_info else 'sees'} it; got {', '.join(info)}. Set "
-                f"sejax.gym.RewardNetwork(..., info_keys=[...]) to what it is called there."
+                f"{'weighs' if self.config.weighs_info else 'sees'} it; got "
+                f"{', '.join(info) or 'none'}. Set sejax.gym.RewardNetwork(..., info_keys=[...]) "
+                f"to what it is called there."
             ) from error
 
     def _keys(self, task: str, given: Sequence[str] | None) -> tuple[str, ...]:
