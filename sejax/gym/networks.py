@@ -10,6 +10,10 @@ from sejax.errors import ConfigError, shortened
 Layers = list[tuple[np.ndarray, np.ndarray]]  # kernel [out, in] and bias [out] of each
 Shapes = dict[str, tuple[int, ...]]
 
+# Activations that are computed at once. Arrays of 96 KB stay in the cache, and below the size from
+# which C's allocator asks the system for fresh pages each time, which took ten times the product.
+BLOCK = 24 * 1024
+
 ACTIVATIONS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     "tanh": np.tanh,
     "fast_tanh": np.tanh,  # which differs by at most 1.4e-6
@@ -21,12 +25,20 @@ ACTIVATIONS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
 
 def forward(layers: Layers, activation: str, x: np.ndarray) -> np.ndarray:
     """Outputs `[*batch, out]` of inputs `[*batch, in]`; they may overflow without a warning."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        if x.ndim == 1:
+            return _apply(layers, activation, x)
+        size = max(1, BLOCK // max(len(bias) for _, bias in layers))
+        blocks = [x[i : i + size] for i in range(0, len(x), size)]
+        return np.concatenate([_apply(layers, activation, block) for block in blocks])
+
+
+def _apply(layers: Layers, activation: str, x: np.ndarray) -> np.ndarray:
     activate = ACTIVATIONS[activation]
     *hidden, (last_kernel, last_bias) = layers
-    with np.errstate(over="ignore", invalid="ignore"):
-        for kernel, bias in hidden:
-            x = activate(x @ kernel.T + bias)
-        return x @ last_kernel.T + last_bias
+    for kernel, bias in hidden:
+        x = activate(x @ kernel.T + bias)
+    return x @ last_kernel.T + last_bias
 
 
 def layers_of(weights: Mapping[str, np.ndarray], network: str) -> Layers:

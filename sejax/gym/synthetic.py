@@ -98,7 +98,7 @@ class SyntheticWorld:
         if self._start_layers:
             vector = drawn + networks.forward(self._start_layers, self.config.activation, drawn)
         vector = vector if self._units is None else self._units.decode(vector)
-        return np.clip(vector, -ABSURD, ABSURD)
+        return np.minimum(np.maximum(vector, np.float32(-ABSURD)), np.float32(ABSURD))
 
     def encode(self, action: Any, space: spaces.Space[Any]) -> np.ndarray:
         """Actions as the networks see them, `[*lanes, action_dim]`: one-hot if they are discrete.

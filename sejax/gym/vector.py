@@ -107,7 +107,8 @@ class SyntheticVectorEnv(VectorEnv[Any, Any, np.ndarray]):
         if None in self._rngs or (self._ended.any() and not is_next_step):
             raise gymnasium.error.ResetNeeded("call reset() first: a lane has no running episode")
         encoded = self.world.encode(actions, self.action_space)
-        waiting, lanes = np.flatnonzero(self._ended), np.flatnonzero(~self._ended)
+        goes_on = ~self._ended
+        waiting, lanes = np.flatnonzero(self._ended), np.flatnonzero(goes_on)
         rewards, discounts = np.zeros(self.num_envs), np.zeros(self.num_envs)
         terminated, truncated = np.zeros((2, self.num_envs), np.bool_)
         if lanes.size:
@@ -120,7 +121,7 @@ class SyntheticVectorEnv(VectorEnv[Any, Any, np.ndarray]):
             terminated[lanes], truncated[lanes] = step.terminated, step.truncated
         self._begin(waiting)
         self._ended = terminated | truncated
-        infos = _told(discounts, np.isin(np.arange(self.num_envs), lanes))
+        infos = _told(discounts, goes_on)
         if self.autoreset_mode is AutoresetMode.SAME_STEP and self._ended.any():
             infos = self._final(discounts)
             self._begin(np.flatnonzero(self._ended))
