@@ -22,6 +22,7 @@ from sejax.gym import GYMNASIUM_IDS, RealTask, SyntheticEnv, SyntheticWorld, mak
 from sejax.gym.tasks import real_task
 from sejax.proxies import ABSURD
 from sejax.proxies.configs import SyntheticConfig
+from sejax.proxies.stored import pretrained_names
 
 KEY = jax.random.key(0)
 SMALL = {"hidden_size": 5}
@@ -287,6 +288,15 @@ def test_gymnasiums_checker_passes(stored, task, config):
     check_env(make(stored(jax_se(task, **config))))
 
 
+@pytest.mark.parametrize("name", [x for x in pretrained_names() if not x.endswith("-rn")])
+@pytest.mark.filterwarnings(
+    "ignore:.*Box observation space m.*imum value is -?infinity:UserWarning",
+    "ignore:.*recommend using a symmetric and normalized space:UserWarning",  # Pendulum's torque
+)
+def test_gymnasiums_checker_passes_for_what_ships(name):
+    check_env(make(name))
+
+
 def test_spaces_are_the_tasks_without_bounds_of_the_observations(stored):
     env = make("acrobot")
     assert env.observation_space == spaces.Box(-np.inf, np.inf, (6,), np.float32)
@@ -372,6 +382,15 @@ def test_continuous_actions_are_clipped_to_the_bounds(stored):
         env.reset(seed=0)
         seen.append(env.step([action])[0])
     assert (seen[0] == seen[1]).all() and (seen[0] != seen[2]).any()
+
+
+def test_what_ships_is_registered_once_and_by_its_name():
+    ids = sejax.gym.register()
+    assert ids == sejax.gym.register() == [f"sejax/{name}" for name in pretrained_names()]
+    env = gymnasium.make("sejax/cartpole")
+    assert env.spec.id == "sejax/cartpole" and "TimeLimit" not in str(env)
+    assert str(gymnasium.make(env.spec)) == str(gymnasium.make("sejax.gym:sejax/cartpole"))
+    np.testing.assert_array_equal(env.reset(seed=1)[0], make("cartpole").reset(seed=1)[0])
 
 
 def test_it_runs_without_jax_and_in_forked_processes():

@@ -4,8 +4,10 @@ They need the extra `sb3`, which `dev` has not (torch is 200 MB): `make test-sb3
 """
 
 import pickle
+import re
 import subprocess
 import sys
+from pathlib import Path
 
 import gymnasium
 import numpy as np
@@ -25,6 +27,7 @@ try:
     from sejax.gym.sb3 import SyntheticVecEnv
 except ImportError:
     PPO = None
+PAGE = Path(__file__).parents[1] / "docs/gymnasium.md"
 needs_sb3 = pytest.mark.skipif(PPO is None, reason="needs the extra sb3: make test-sb3")
 
 
@@ -109,3 +112,23 @@ def test_an_agent_of_theirs_trains_there(name):
     model = PPO("MlpPolicy", envs, n_steps=16, batch_size=16, n_epochs=1, seed=0, device="cpu")
     model.learn(128)
     assert model.num_timesteps == 128 and len(model.ep_info_buffer) > 0
+
+
+@needs_sb3
+@pytest.mark.filterwarnings("ignore:Evaluation environment is not wrapped:UserWarning")
+def test_the_page_runs_and_its_torch_networks_are_the_se():
+    blocks = re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
+    assert len(blocks) > 5
+    for block in blocks:
+        names = {}
+        exec(compile(block.replace("2_500", "256"), PAGE.name, "exec"), names)
+        if "load_file" in block:
+            world = sejax.gym.make("cartpole").world
+            noise, actions = names["noise"].numpy(), names["actions"].numpy().argmax(axis=1)
+            first = world.first(noise)
+            encoded = np.eye(2, dtype=np.float32)[actions]
+            step = world.step(first, encoded, np.ones(len(actions)))
+            np.testing.assert_allclose(names["obs"].detach(), first, atol=1e-5)
+            np.testing.assert_allclose(names["rewards"].detach()[:, 0], step.reward, atol=1e-5)
+            return
+    pytest.fail("no recipe for torch")

@@ -158,7 +158,9 @@ class SyntheticWorld:
         inputs = np.concatenate([action, seen], axis=-1)
         outputs = networks.forward(self._layers, self.config.activation, inputs)
         if self.config.horizon == 1:
-            return np.concatenate([vector, outputs, np.ones_like(outputs)], axis=-1)
+            whole = np.empty((*vector.shape[:-1], self.obs_dim + 2), np.float32)
+            whole[..., :-2], whole[..., -2:-1], whole[..., -1] = vector, outputs, 1
+            return whole
         if self._units is not None:
             outputs[..., :-2] = self._units.decode(outputs[..., :-2])
         return outputs
