@@ -7,7 +7,7 @@ import numpy as np
 
 from sejax.errors import ConfigError, shortened
 
-Layers = list[tuple[np.ndarray, np.ndarray]]  # kernel [out, in] and bias [out] of each
+Layers = list[tuple[np.ndarray, np.ndarray]]  # kernel [in, out] and bias [out] of each
 Shapes = dict[str, tuple[int, ...]]
 
 # Activations that are computed at once. Arrays of 96 KB stay in the cache, and below the size from
@@ -37,15 +37,19 @@ def _apply(layers: Layers, activation: str, x: np.ndarray) -> np.ndarray:
     activate = ACTIVATIONS[activation]
     *hidden, (last_kernel, last_bias) = layers
     for kernel, bias in hidden:
-        x = activate(x @ kernel.T + bias)
-    return x @ last_kernel.T + last_bias
+        x = x @ kernel
+        x += bias
+        x = activate(x)
+    x = x @ last_kernel
+    x += last_bias
+    return x
 
 
 def layers_of(weights: Mapping[str, np.ndarray], network: str) -> Layers:
-    """A network's layers, none if it is not there."""
+    """A network's layers, none if it is not there; files hold kernels as `[out, in]`."""
     names = (f"{network}/Dense_{i}" for i in itertools.count())
     there = itertools.takewhile(lambda name: f"{name}/kernel" in weights, names)
-    return [(weights[f"{name}/kernel"], weights[f"{name}/bias"]) for name in there]
+    return [(weights[f"{name}/kernel"].T, weights[f"{name}/bias"]) for name in there]
 
 
 def joined(networks: Sequence[Layers]) -> Layers:
@@ -56,7 +60,8 @@ def joined(networks: Sequence[Layers]) -> Layers:
     whole: Layers = []
     for parts in zip(*networks, strict=True):
         kernels, biases = zip(*parts, strict=True)
-        kernel = _block_diagonal(kernels) if whole else np.concatenate(kernels)
+        blocks = [kernel.T for kernel in kernels]
+        kernel = (_block_diagonal(blocks) if whole else np.concatenate(blocks)).T
         whole.append((kernel, np.concatenate(biases)))
     return whole
 
