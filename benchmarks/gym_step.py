@@ -124,7 +124,7 @@ def make_env(side: str) -> Any:
 
     if not side.startswith("numpy"):
         return gymnasium.make(side)
-    source = {"numpy": ONE_STEP, "numpy-soft": SOFT, "numpy-rn": "cartpole-rn"}[side]
+    source: Path | str = {"numpy": ONE_STEP, "numpy-soft": SOFT, "numpy-rn": "cartpole-rn"}[side]
     return sejax.gym.make(source)
 
 

@@ -9,6 +9,7 @@ from sejax.errors import require, shortened
 from sejax.proxies import stored
 
 Source = str | Path
+KINDS = {"se": "a synthetic environment", "rn": "a reward network"}
 
 
 def read(source: Source, kind: str | None = None) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
@@ -26,10 +27,8 @@ def read(source: Source, kind: str | None = None) -> tuple[dict[str, np.ndarray]
     weights, header = stored.read(path, "source")
     require(not header["is_set"], "source", "be a single proxy", "an agent trains in one world",
             f"{path}, a set", "source to a run directory")  # fmt: skip
-    there = header["config"]["proxy"].get("name")
-    require(there in (kind or "se", kind or "rn"), "source",
-            {"rn": "be a reward network", "se": "be a synthetic environment"}.get(
-                str(kind), "be a synthetic environment or a reward network"),
+    there, wanted = header["config"]["proxy"].get("name"), [kind] if kind else list(KINDS)
+    require(there in wanted, "source", f"be {' or '.join(KINDS[each] for each in wanted)}",
             "this takes its networks" if kind else "other proxies are JAX code",
             f"proxy={shortened(there)} in {path}",
             "source to such a proxy; sejax.load reads all proxies")  # fmt: skip
