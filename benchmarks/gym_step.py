@@ -124,8 +124,10 @@ def make_env(side: str) -> Any:
 
     if not side.startswith("numpy"):
         return gymnasium.make(side)
-    source: Path | str = {"numpy": ONE_STEP, "numpy-soft": SOFT, "numpy-rn": "cartpole-rn"}[side]
-    return sejax.gym.make(source)
+    sources: dict[str, Path | str] = {
+        "numpy": ONE_STEP, "numpy-soft": SOFT, "numpy-rn": "cartpole-rn"
+    }  # fmt: skip
+    return sejax.gym.make(sources[side])
 
 
 def make_gymnax(num_envs: int | None = None) -> Any:
