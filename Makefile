@@ -4,7 +4,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: run test test-slow lint typecheck clean
+.PHONY: run test test-slow test-sb3 lint typecheck clean
 
 run: $(VENV)/.installed
 	$(BIN)/python -m sejax.run env=cartpole stop_when_solved=true
@@ -14,6 +14,11 @@ test: $(VENV)/.installed-dev
 
 test-slow: $(VENV)/.installed-dev
 	$(BIN)/python -m pytest -m slow -n 2 --dist worksteal
+
+# What needs Stable-Baselines3, and with it torch, which the suite leaves out.
+test-sb3: $(VENV)/.installed-dev
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[sb3]'
+	$(BIN)/python -m pytest tests/test_gym_sb3.py
 
 lint: $(VENV)/.installed-dev
 	$(BIN)/ruff format --check .

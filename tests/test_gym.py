@@ -18,9 +18,11 @@ from support import random_like, shapes_of
 import sejax
 from sejax import envs, plugins
 from sejax.errors import ConfigError
-from sejax.gym import GYMNASIUM_IDS, RealTask, SyntheticEnv, _known_task, make
+from sejax.gym import GYMNASIUM_IDS, RealTask, SyntheticEnv, SyntheticWorld, make
+from sejax.gym.tasks import real_task
 from sejax.proxies import ABSURD
-from sejax.proxies.configs import RewardConfig, SyntheticConfig
+from sejax.proxies.configs import SyntheticConfig
+from sejax.proxies.stored import pretrained_names
 
 KEY = jax.random.key(0)
 SMALL = {"hidden_size": 5}
@@ -60,7 +62,8 @@ def constant(state=0.25, reward=2.0, d=0.0, max_steps=200, **config):
     for head, value in {"state": state, "reward": reward, "done": d}.items():
         if head in weights:
             weights[head]["Dense_1"]["bias"][:] = value
-    return SyntheticEnv(flat(weights), config, RealTask.of_gymnasium("CartPole-v1", max_steps))
+    task = RealTask.of_gymnasium("CartPole-v1", max_steps)
+    return SyntheticEnv(SyntheticWorld(flat(weights), config, task))
 
 
 # --- the same as in JAX --------------------------------------------------------------------------
@@ -141,7 +144,7 @@ def test_learned_initial_states_are_the_same_function_of_the_noise(stored, scale
 
     class SameNoise(np.random.Generator):
         def standard_normal(self, *_):
-            return np.asarray(jax.random.normal(KEY, (4,)))
+            return np.asarray(jax.random.normal(KEY, (4,)))[None]
 
     env.np_random = SameNoise(np.random.PCG64(0))
     np.testing.assert_allclose(env.reset()[0], expected, rtol=1e-5, atol=1e-5)
@@ -254,7 +257,7 @@ def test_a_bandit_leaves_the_state_where_it_began():
 def test_an_absurd_or_nonfinite_output_ends_the_episode_where_it_was(mode, outputs):
     finite = {name: x if np.isfinite(x) else 0.0 for name, x in outputs.items()}
     env = constant(**finite, done=mode)
-    _, last_bias = env._layers[-1]
+    _, last_bias = env.world._layers[-1]
     last_bias += [*[outputs.get("state", 0.0)] * 4, outputs.get("reward", 0), outputs.get("d", 0)]
     first, _ = env.reset(seed=0)
     obs, reward, terminated, _, info = env.step(0)
@@ -264,7 +267,7 @@ def test_an_absurd_or_nonfinite_output_ends_the_episode_where_it_was(mode, outpu
 
 def test_an_overflow_within_the_networks_ends_the_episode_without_a_warning():
     env = constant()
-    for kernel, _ in env._layers:
+    for kernel, _ in env.world._layers:
         kernel[:] = 3e38
     env.reset(seed=0)
     assert env.step(0)[2]
@@ -283,6 +286,15 @@ CHECKED = [("cartpole", {"done": "threshold"}), ("cartpole", BANDIT),
 )
 def test_gymnasiums_checker_passes(stored, task, config):
     check_env(make(stored(jax_se(task, **config))))
+
+
+@pytest.mark.parametrize("name", [x for x in pretrained_names() if not x.endswith("-rn")])
+@pytest.mark.filterwarnings(
+    "ignore:.*Box observation space m.*imum value is -?infinity:UserWarning",
+    "ignore:.*recommend using a symmetric and normalized space:UserWarning",  # Pendulum's torque
+)
+def test_gymnasiums_checker_passes_for_what_ships(name):
+    check_env(make(name))
 
 
 def test_spaces_are_the_tasks_without_bounds_of_the_observations(stored):
@@ -372,6 +384,15 @@ def test_continuous_actions_are_clipped_to_the_bounds(stored):
     assert (seen[0] == seen[1]).all() and (seen[0] != seen[2]).any()
 
 
+def test_what_ships_is_registered_once_and_by_its_name():
+    ids = sejax.gym.register()
+    assert ids == sejax.gym.register() == [f"sejax/{name}" for name in pretrained_names()]
+    env = gymnasium.make("sejax/cartpole")
+    assert env.spec.id == "sejax/cartpole" and "TimeLimit" not in str(env)
+    assert str(gymnasium.make(env.spec)) == str(gymnasium.make("sejax.gym:sejax/cartpole"))
+    np.testing.assert_array_equal(env.reset(seed=1)[0], make("cartpole").reset(seed=1)[0])
+
+
 def test_it_runs_without_jax_and_in_forked_processes():
     program = """
 import sys
@@ -407,7 +428,7 @@ def test_gymnasiums_tasks_have_the_spaces_of_sejaxs(name):
 
 @pytest.mark.parametrize(("given", "limit"), [({}, 200), ({"max_steps": 300}, 300)], ids=str)
 def test_a_task_of_gymnax_is_gymnasiums_of_that_id(given, limit):
-    task = _known_task({"name": "gymnax/MountainCar-v0", **given})
+    task = real_task({"name": "gymnax/MountainCar-v0", **given})
     assert task.action_space == spaces.Discrete(3) and task.max_steps == limit
     position, velocity = task.starts(np.random.default_rng(0))
     assert -0.6 <= position <= -0.4 and velocity == 0.0
@@ -433,7 +454,7 @@ def test_an_unknown_task_must_be_given(stored):
     assert ((env.reset(seed=0)[0] >= 1) & (env.reset()[0] <= 2)).all()
     assert gymnasium.make(env.spec).reset(seed=1)[0].tolist() == env.reset(seed=1)[0].tolist()
     assert make(path, "Pendulum-v1").action_space == box
-    with pytest.raises(ConfigError, match=r"^weights must be those of the SE's networks"):
+    with pytest.raises(ConfigError, match=r"^weights must be those of the proxy's networks"):
         make(path, "CartPole-v1")
     with pytest.raises(
         ConfigError, match=r"^task must be one that Gymnasium can make .*Nothing-v1"
@@ -445,10 +466,15 @@ def test_an_unknown_task_must_be_given(stored):
 
 
 def test_what_is_no_single_se_is_one_message(tmp_path, stored):
-    rn = plugins.make("proxy", RewardConfig(hidden_size=2), envs.make("cartpole"))
-    with pytest.raises(ConfigError, match=r"^source must be a synthetic environment.*proxy=rn in"):
-        make(stored(rn))
     env = jax_se()
+    other = tmp_path / "other.safetensors"
+    sejax.save(other, env, random_weights(env), config={"proxy": {"name": "mine:LinearSE"}})
+    with pytest.raises(
+        ConfigError,
+        match=r"^source must be a synthetic environment or a reward "
+        r"network, because other proxies are JAX code; got proxy=mine:LinearSE in",
+    ):
+        make(other)  # fmt: skip
     path = tmp_path / "set.safetensors"
     sejax.save_set(path, env, [random_weights(env)] * 2, [{}, {}])
     with pytest.raises(ConfigError, match=r"^source must be a single proxy"):

@@ -1,0 +1,31 @@
+"""Stored proxies for Gymnasium and Stable-Baselines3, in NumPy alone: any agent, no JAX.
+
+`make` makes an environment of a synthetic environment (SE) or a reward network (RN), `make_vec` and
+`make_sb3` vector environments, and `RewardNetwork` puts an RN around an environment that you have.
+Importing this registers what ships with the package, as `sejax/<name>`. Neither JAX nor gymnax is
+loaded, so that environments fork and pickle as others do. Extras: `gym`, and `sb3` for `make_sb3`.
+How to use it all: docs/gymnasium.md.
+
+Example:
+  >>> env = gymnasium.make("sejax/cartpole")  # or make(...), of a run directory or a file
+  >>> obs, info = env.reset(seed=0)
+  >>> obs, reward, terminated, truncated, info = env.step(1)
+  >>> obs.shape, terminated, truncated  # episodes of the shipped SEs have one step
+  ((4,), True, False)
+"""
+
+import gymnasium
+
+from sejax.gym.gridworld import GridWorld
+from sejax.gym.registration import make, make_sb3, make_vec, register
+from sejax.gym.reward import RewardNetwork
+from sejax.gym.synthetic import SyntheticEnv, SyntheticWorld
+from sejax.gym.tasks import GYMNASIUM_IDS, RealTask
+from sejax.gym.vector import SyntheticVectorEnv
+
+__all__ = [
+    "GYMNASIUM_IDS", "GridWorld", "RealTask", "RewardNetwork", "SyntheticEnv",
+    "SyntheticVectorEnv", "SyntheticWorld", "gymnasium", "make", "make_sb3", "make_vec", "register",
+]  # fmt: skip
+
+register()

@@ -1,0 +1,178 @@
+"""From the name or the file of a proxy to environments."""
+
+from collections.abc import Mapping
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import gymnasium
+import numpy as np
+from gymnasium.envs.registration import EnvSpec
+from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
+
+from sejax import plugins
+from sejax.errors import ConfigError, require, whole
+from sejax.gym.reward import RewardNetwork
+from sejax.gym.source import Source, read
+from sejax.gym.synthetic import SyntheticEnv, SyntheticWorld
+from sejax.gym.tasks import RealTask, make_gymnasium, real_env, real_task, unknown_task
+from sejax.gym.vector import SyntheticVectorEnv
+from sejax.proxies import stored
+
+if TYPE_CHECKING:
+    from stable_baselines3.common.vec_env import VecEnv
+
+NAMESPACE = "sejax"  # of the ids
+
+
+def make(
+    source: Source, task: RealTask | str | None = None, *, render_mode: str | None = None
+) -> gymnasium.Env[Any, Any]:
+    """Makes a stored proxy a Gymnasium environment: an SE, or the real task with an RN's reward.
+
+    Args:
+      source: a run directory, a safetensors file of one proxy, or the name of one that ships with
+        the package.
+      task: the real task, or its id in Gymnasium; needed if it is none that sejax and Gymnasium
+        both know. For an RN an id; `RewardNetwork` goes around any environment.
+      render_mode: of an RN's real task, as of `gymnasium.make`.
+
+    Raises:
+      ConfigError: if there is no such file, it is damaged, it holds several proxies or one that is
+        JAX code, or its task is not known.
+
+    Example:
+      >>> make("acrobot").observation_space.shape
+      (6,)
+      >>> make("cartpole-rn").spec.id
+      'sejax/cartpole-rn'
+    """
+    weights, header = read(source)
+    env: SyntheticEnv | RewardNetwork
+    name = header["task"].replace("/", "-")
+    if _is_rn(header):
+        env, name = RewardNetwork(_real_env(header, task, render_mode), source), f"{name}-rn"
+    else:
+        require(render_mode is None, "render_mode", "be None for an SE", "its states have no "
+                "picture", render_mode, "render_mode=None")  # fmt: skip
+        env = SyntheticEnv(_world(weights, header, task))
+    options = {"source": str(source), "task": task, "render_mode": render_mode}
+    env.spec = _spec(name, **{key: x for key, x in options.items() if x is not None})
+    return env
+
+
+def make_vec(
+    source: Source,
+    num_envs: int = 1,
+    task: RealTask | str | None = None,
+    *,
+    autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
+) -> VectorEnv[Any, Any, Any]:
+    """Makes a stored proxy a Gymnasium vector environment.
+
+    All lanes of an SE are one pass through its networks. An RN's are environments of the real task
+    one after the other, as Gymnasium has them.
+
+    Args:
+      source: as of `make`.
+      num_envs: lanes.
+      task: as of `make`.
+      autoreset_mode: what happens where an episode ends; see `SyntheticVectorEnv`.
+
+    Raises:
+      ConfigError: as `make`, or for less than one lane.
+
+    Example:
+      >>> envs = make_vec("cartpole", num_envs=8)
+      >>> obs, infos = envs.reset(seed=0)
+      >>> obs.shape, envs.metadata["autoreset_mode"].value
+      ((8, 4), 'NextStep')
+    """
+    whole(1, "num_envs", num_envs, "there is a lane", 8)
+    weights, header = read(source)
+    if _is_rn(header):
+        env_fns = [partial(make, source, task)] * num_envs
+        return SyncVectorEnv(env_fns, autoreset_mode=autoreset_mode)
+    return SyntheticVectorEnv(_world(weights, header, task), num_envs, autoreset_mode)
+
+
+def make_sb3(source: Source, num_envs: int = 1, task: RealTask | str | None = None) -> "VecEnv":
+    """Makes a stored proxy a `VecEnv` of Stable-Baselines3.
+
+    All lanes of an SE are one pass through its networks. An RN's are environments of the real task
+    in a `DummyVecEnv`.
+
+    Args:
+      source: as of `make`.
+      num_envs: lanes.
+      task: as of `make`.
+
+    Raises:
+      ConfigError: as `make_vec`, or without Stable-Baselines3.
+    """
+    whole(1, "num_envs", num_envs, "there is a lane", 8)
+    try:
+        from stable_baselines3.common.vec_env import DummyVecEnv
+
+        from sejax.gym.sb3 import SyntheticVecEnv
+    except ImportError as error:
+        raise ConfigError(
+            f"make_sb3 needs Stable-Baselines3, because it makes one of its VecEnvs; got {error}. "
+            f"Install it with pip install 'sejax[sb3]'."
+        ) from error
+    weights, header = read(source)
+    if _is_rn(header):
+        return DummyVecEnv([partial(make, source, task)] * num_envs)
+    return SyntheticVecEnv(_world(weights, header, task), num_envs)
+
+
+def register() -> list[str]:
+    """Registers the shipped proxies as `sejax/<name>`; importing `sejax.gym` does it.
+
+    Returns:
+      The ids, for `gymnasium.make` and `gymnasium.make_vec`.
+
+    Example:
+      >>> register()[0], gymnasium.make("sejax/acrobot").action_space
+      ('sejax/acrobot', Discrete(3))
+    """
+    specs = [_spec(name, source=name) for name in stored.pretrained_names()]
+    for spec in specs:
+        gymnasium.registry.setdefault(spec.id, spec)
+    return [spec.id for spec in specs]
+
+
+def _spec(name: str, **kwargs: Any) -> EnvSpec:
+    """How Gymnasium makes it; without `max_episode_steps`, a second time limit by a wrapper."""
+    return EnvSpec(
+        id=f"{NAMESPACE}/{name}", entry_point="sejax.gym:make",
+        vector_entry_point="sejax.gym:make_vec", kwargs=kwargs,
+    )  # fmt: skip
+
+
+def _is_rn(header: Mapping[str, Any]) -> bool:
+    return header["config"]["proxy"]["name"] == "rn"
+
+
+def _world(
+    weights: Mapping[str, np.ndarray], header: Mapping[str, Any], task: RealTask | str | None
+) -> SyntheticWorld:
+    """What a file of an SE holds."""
+    config = plugins.configure("proxy", header["config"]["proxy"])
+    if isinstance(task, str):
+        task = RealTask.of_gymnasium(task)
+    return SyntheticWorld(weights, config, task or real_task(header["config"]["env"]))
+
+
+def _real_env(
+    header: Mapping[str, Any], task: RealTask | str | None, render_mode: str | None
+) -> gymnasium.Env[Any, Any]:
+    """The task of an RN."""
+    require(not isinstance(task, RealTask), "task", "be an id of Gymnasium for a reward network",
+            "its dynamics are the real task's", task,
+            "sejax.gym.RewardNetwork(env, source)")  # fmt: skip
+    if isinstance(task, str):
+        return make_gymnasium(task, render_mode=render_mode)
+    env = real_env(header["config"]["env"], render_mode)
+    if env is None:
+        raise unknown_task(header["config"]["env"], "sejax.gym.RewardNetwork(env, source)")
+    return env

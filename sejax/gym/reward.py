@@ -1,0 +1,197 @@
+"""Reward networks (RNs) in NumPy, around a Gymnasium environment of their task."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium.envs.registration import EnvSpec
+from gymnasium.envs.toy_text.cliffwalking import CliffWalkingEnv
+from gymnasium.utils import RecordConstructorArgs
+
+from sejax import plugins
+from sejax.errors import ConfigError, require
+from sejax.gym import networks
+from sejax.gym.source import Source, read
+from sejax.gym.tasks import num_categories, vector_size
+from sejax.proxies import ABSURD
+from sejax.proxies.configs import RewardConfig
+
+_PLANE = ("x_position", "y_position", "distance_from_origin", "x_velocity", "y_velocity",
+          "reward_forward", "reward_ctrl")  # fmt: skip
+_LEG = ("x_position", "x_velocity", "z_distance_from_origin", "reward_forward", "reward_ctrl",
+        "reward_survive")  # fmt: skip
+# `sejax.Task.info_keys` and `augmented_keys` by the names that Gymnasium has for them.
+INFO_KEYS: dict[str, tuple[str, ...]] = {
+    "halfcheetah": ("x_position", "x_velocity", "reward_forward", "reward_ctrl"),
+    "hopper": _LEG,
+    "walker2d": _LEG,
+    "swimmer": _PLANE,
+    "ant": (*_PLANE, "reward_contact", "reward_survive"),
+    "reacher": ("reward_dist", "reward_ctrl"),
+}
+AUGMENTED_KEYS: dict[str, tuple[str, ...]] = {
+    "halfcheetah": ("x_position", "x_velocity"),
+    "hopper": ("x_position", "x_velocity"),
+    "walker2d": ("x_position", "x_velocity"),
+    "swimmer": ("x_position", "y_position", "x_velocity", "y_velocity"),
+    "ant": ("x_position", "y_position", "x_velocity", "y_velocity"),
+}
+
+
+class RewardNetwork(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
+    r"""An environment whose reward is made by an RN; see `sejax.proxies.reward.RewardEnv`.
+
+    Dynamics, spaces, starts and ends are the environment's own; with r its reward and
+    :math:`\Phi` the network, agents get r or 0 (additive or exclusive) plus
+    :math:`\gamma \Phi(s') - \Phi(s)`, :math:`\Phi(s')` or :math:`w^\top i'` (potential,
+    non-potential or weighted info). `info["real_reward"]` is r, `info["discount"]` 0 where the
+    episode has terminated and 1 elsewhere. A reward that is not finite or beyond 1e6 is 0 and
+    terminates.
+
+    A gamma belongs to a potential, and it is the agent's: the default is that of the agent which
+    the RN was learned with.
+
+    Args:
+      env: of the RN's task, its step limit included (`gymnasium.make` sees to it).
+      source: a run directory, a safetensors file of one RN, or the name of one that ships with the
+        package.
+      discount: gamma of the agent that will train.
+      info_keys: what of a step's `info` the RN weighs (`*_weighted_info`) or sees (`augmented`), in
+        the order of `sejax.Task`; needed for a task that is not sejax's own.
+      limit_is_terminal: whether the agent does not bootstrap at the step limit, for an RN with
+        `zero_at_terminal`; agents written for Gymnasium do.
+
+    Raises:
+      ConfigError: if the environment is not of the RN's task as far as its spaces tell, or the keys
+        are not known.
+
+    Example:
+      >>> env = RewardNetwork(gymnasium.make("CartPole-v1"), "cartpole-rn", discount=0.98)
+      >>> obs, info = env.reset(seed=0)
+      >>> obs, reward, terminated, truncated, info = env.step(1)
+      >>> info["real_reward"], reward == 1.0
+      (1.0, False)
+    """
+
+    def __init__(
+        self,
+        env: gymnasium.Env[Any, Any],
+        source: Source,
+        discount: float | None = None,
+        info_keys: Sequence[str] | None = None,
+        limit_is_terminal: bool = False,
+    ):
+        RecordConstructorArgs.__init__(
+            self, source=str(source), discount=discount, info_keys=info_keys,
+            limit_is_terminal=limit_is_terminal,
+        )  # fmt: skip
+        super().__init__(env)
+        weights, header = read(source, "rn")
+        self.config: RewardConfig = plugins.configure("proxy", header["config"]["proxy"])
+        self.discount = float(header["discount"] if discount is None else discount)
+        self.limit_is_terminal = limit_is_terminal
+        require(not isinstance(env.unwrapped, CliffWalkingEnv), "env", "be sejax's Cliff Walking",
+                "in Gymnasium's, falling off the cliff ends no episode and actions are numbered "
+                "otherwise", env,
+                f"env=sejax.gym.make({str(source)!r}), which is whole")  # fmt: skip
+        self._info_keys = self._keys(header["task"], info_keys)
+        obs_dim = vector_size(env.observation_space, "env.observation_space")
+        self._num_states = num_categories(env.observation_space)
+        networks.check(weights, _shapes(self.config, obs_dim, len(self._info_keys)))
+        self._weights = weights.get("info_weights")  # [info_keys]
+        self._layers = networks.layers_of(weights, "potential")
+        self._table = None  # [num_states]: potentials, where states are counted
+        if self._num_states and self._layers:
+            self._table = self._apply(np.eye(obs_dim, dtype=np.float32)).tolist()
+        self._potential = 0.0  # of the state that the agent is in
+        self._made_as: EnvSpec | None = None
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Begins an episode of the environment."""
+        obs, info = self.env.reset(seed=seed, options=options)
+        nothing = np.zeros(len(self._info_keys), np.float32)  # v before the first step, as in JAX
+        self._potential = self.potential(obs, nothing)
+        return obs, info
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        """One step of the environment, with the RN's reward.
+
+        Raises:
+          ConfigError: if `info` lacks what the RN weighs or sees.
+        """
+        obs, real_reward, terminated, truncated, info = self.env.step(action)
+        real_reward, terminated, truncated = float(real_reward), bool(terminated), bool(truncated)
+        ends = terminated or (truncated and self.limit_is_terminal)
+        reward = self._bonus(obs, self._told(info), ends)
+        if self.config.is_additive:
+            reward += real_reward
+        if not abs(reward) < ABSURD:  # nan is not either
+            reward, terminated = 0.0, True
+        info = {**info, "discount": float(not terminated), "real_reward": real_reward}
+        return obs, reward, terminated, truncated, info
+
+    def potential(self, obs: Any, told: Any = ()) -> float:
+        """The network's output for an observation, and what `info` told of it if it sees that."""
+        if self._table is not None:
+            return self._table[obs]
+        if not self._layers:
+            return 0.0
+        vector = np.asarray(obs, np.float32)
+        return float(self._apply(np.concatenate([vector, told]) if len(told) else vector))
+
+    @property
+    def spec(self) -> EnvSpec | None:
+        """That of `sejax.gym.make`, which makes all of it; else the environment's, with this."""
+        return self._made_as or super().spec
+
+    @spec.setter
+    def spec(self, value: EnvSpec | None) -> None:
+        self._made_as = value
+
+    def _bonus(self, obs: Any, told: np.ndarray, ends: bool) -> float:
+        """What a transition is worth beside the real reward."""
+        if self._weights is not None:
+            return float(self._weights @ told)
+        before, self._potential = self._potential, self.potential(obs, told)
+        after = 0.0 if ends and self.config.zero_at_terminal else self._potential
+        return self.discount * after - before if self.config.is_potential_based else after
+
+    def _apply(self, inputs: np.ndarray) -> np.ndarray:
+        return networks.forward(self._layers, self.config.activation, inputs)[..., 0]
+
+    def _told(self, info: dict[str, Any]) -> np.ndarray:
+        """What the RN weighs or sees of a step's `info`, `[info_keys]`."""
+        try:
+            return np.array([info[key] for key in self._info_keys], np.float32)
+        except KeyError as error:
+            raise ConfigError(
+                f"env must tell {', '.join(self._info_keys)} in a step's info, because this RN "
+                f"{'weighs' if self.config.weighs_info else 'sees'} it; got "
+                f"{', '.join(info) or 'none'}. Set sejax.gym.RewardNetwork(..., info_keys=[...]) "
+                f"to what it is called there."
+            ) from error
+
+    def _keys(self, task: str, given: Sequence[str] | None) -> tuple[str, ...]:
+        """Entries of `info` that the RN needs."""
+        if not (self.config.weighs_info or self.config.augmented):
+            return ()
+        known = INFO_KEYS if self.config.weighs_info else AUGMENTED_KEYS
+        keys = known.get(task) if given is None else tuple(given)
+        if keys is None:
+            raise ConfigError(
+                f"info_keys must be given for {task}, because this RN needs numbers of a step's "
+                f"info and only those of {', '.join(known)} are known here; got none. "
+                f"Set sejax.gym.RewardNetwork(env, source, info_keys=[...]) to "
+                f"`sejax.Task.{'info' if self.config.weighs_info else 'augmented'}_keys`."
+            )
+        return keys
+
+
+def _shapes(config: RewardConfig, obs_dim: int, num_keys: int) -> networks.Shapes:
+    if config.weighs_info:
+        return {"info_weights": (num_keys,)}
+    hidden = [config.hidden_size] * config.num_layers
+    return networks.shapes_of("potential", [obs_dim + num_keys, *hidden, 1])

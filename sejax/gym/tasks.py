@@ -1,0 +1,182 @@
+"""The real tasks behind proxies, as Gymnasium has them."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+from gymnasium.wrappers import TimeLimit
+
+from sejax import plugins
+from sejax.errors import ConfigError, require, shortened, told
+from sejax.gym.gridworld import MAPS, GridWorld
+
+# The tasks that Gymnasium has too, with the same spaces, dynamics and initial states.
+GYMNASIUM_IDS = {
+    "cartpole": "CartPole-v1",
+    "cartpole_v1": "CartPole-v1",
+    "acrobot": "Acrobot-v1",
+    "mountain_car": "MountainCar-v0",
+    "mountain_car_continuous": "MountainCarContinuous-v0",
+    "pendulum": "Pendulum-v1",
+    "halfcheetah": "HalfCheetah-v5",
+    "hopper": "Hopper-v5",
+    "walker2d": "Walker2d-v5",
+    "swimmer": "Swimmer-v5",
+    "inverted_pendulum": "InvertedPendulum-v5",
+    "ant": "Ant-v5",
+    "reacher": "Reacher-v5",
+}
+GYMNASIUM_BACKENDS = ("mujoco", "mjx")  # of halfcheetah: the others move otherwise
+PREFIX = "gymnax/"
+
+Starts = Callable[[np.random.Generator], Any]
+
+
+@dataclass(frozen=True, kw_only=True)
+class RealTask:
+    """What an SE takes from the task that it stands in for.
+
+    Attributes:
+      observation_space: a `Box` of vectors, whose bounds only matter to an SE that has its units by
+        them (`state_units=bounds`), or `Discrete`.
+      action_space: a `Discrete`, or a `Box` of vectors.
+      max_steps: steps after which an episode is cut, if the SE has no horizon of its own.
+      starts: the first observation of an episode, drawn with a generator; must be picklable for the
+        environment to be. None if the SE has learned its initial states.
+    """
+
+    observation_space: spaces.Space[Any]
+    action_space: spaces.Space[Any]
+    max_steps: int
+    starts: Starts | None = None
+
+    @classmethod
+    def of_gymnasium(cls, env_id: str, max_steps: int | None = None) -> "RealTask":
+        """A task that Gymnasium knows.
+
+        Args:
+          env_id: such as `"CartPole-v1"`.
+          max_steps: in the place of Gymnasium's limit.
+
+        Raises:
+          ConfigError: if Gymnasium cannot make it, or has no limit for it and none is given.
+        """
+        return cls.of_env(make_gymnasium(env_id, max_steps))
+
+    @classmethod
+    def of_env(cls, env: gymnasium.Env[Any, Any]) -> "RealTask":
+        """A task given as an environment with Gymnasium's `TimeLimit` around it.
+
+        Raises:
+          ConfigError: if it has no such limit.
+        """
+        limit = env.spec.max_episode_steps if env.spec else None
+        require(limit, "task", "have a step limit", "an episode of an SE may never end by itself",
+                env, "max_steps")  # fmt: skip
+        return cls(
+            observation_space=env.observation_space, action_space=env.action_space,
+            max_steps=int(limit or 0), starts=_EnvStarts(env.unwrapped),
+        )  # fmt: skip
+
+
+class _EnvStarts:
+    """First observations of an environment."""
+
+    def __init__(self, env: gymnasium.Env[Any, Any]):
+        self._env = env
+
+    def __call__(self, rng: np.random.Generator) -> Any:
+        self._env.np_random = rng
+        return self._env.reset()[0]
+
+
+def make_gymnasium(
+    env_id: str, max_steps: int | None = None, **options: Any
+) -> gymnasium.Env[Any, Any]:
+    """An environment of Gymnasium's registry.
+
+    Args:
+      env_id: such as `"CartPole-v1"`.
+      max_steps: in the place of Gymnasium's limit.
+      **options: of the environment.
+
+    Raises:
+      ConfigError: if Gymnasium cannot make it.
+    """
+    try:
+        return gymnasium.make(
+            env_id, max_episode_steps=max_steps, disable_env_checker=True, **options
+        )
+    except (gymnasium.error.Error, ImportError) as error:
+        raise ConfigError(
+            f"task must be one that Gymnasium can make here, because initial states, actions and "
+            f"an RN's steps are those of the real task; {env_id} raised {told(error)}."
+        ) from error
+
+
+def real_env(
+    config: Mapping[str, Any], render_mode: str | None = None
+) -> gymnasium.Env[Any, Any] | None:
+    """The task that a file's metadata names, with its step limit; None if none here is the same.
+
+    Args:
+      config: of the task, plain values with a `name`.
+      render_mode: as of `gymnasium.make`.
+    """
+    options = dict(config)
+    name, backend = str(options.pop("name", "")), options.pop("backend", "mujoco")
+    if name not in (*GYMNASIUM_IDS, *MAPS) or backend not in GYMNASIUM_BACKENDS:
+        return None
+    max_steps = plugins.find("env", name).facts.max_steps
+    if name in MAPS:
+        return TimeLimit(GridWorld(name, **options), max_steps)
+    return make_gymnasium(GYMNASIUM_IDS[name], max_steps, render_mode=render_mode, **options)
+
+
+def real_task(config: Mapping[str, Any]) -> RealTask:
+    """What an SE takes from the task that a file's metadata names.
+
+    Raises:
+      ConfigError: if it is one that must be given.
+    """
+    if (env := real_env(config)) is not None:
+        return RealTask.of_env(env)
+    gymnax_id = str(config.get("name")).removeprefix(PREFIX)
+    if gymnax_id != config.get("name") and gymnax_id in gymnasium.registry:
+        return RealTask.of_gymnasium(gymnax_id, config.get("max_steps"))
+    raise unknown_task(config, "sejax.gym.make(source, task=sejax.gym.RealTask(...))")
+
+
+def unknown_task(config: Mapping[str, Any], fix: str) -> ConfigError:
+    """Error for a task that only the caller can say."""
+    named = ", ".join(f"{key}={value}" for key, value in config.items() if key != "name")
+    name = shortened(str(config.get("name")) + (f" ({named})" if named else ""))
+    return ConfigError(
+        f"task must be given for {name}, because Gymnasium knows no environment that is the same; "
+        f"got none. Known: {', '.join([*GYMNASIUM_IDS, *MAPS])}. Set {fix}, or to an id of "
+        f"Gymnasium."
+    )
+
+
+# --- spaces --------------------------------------------------------------------------------------
+
+
+def num_categories(space: spaces.Space[Any]) -> int | None:
+    """Size of a `Discrete` space; None for a `Box`."""
+    return int(space.n) if isinstance(space, spaces.Discrete) else None
+
+
+def vector_size(space: spaces.Space[Any], name: str) -> int:
+    """Length of the vector that networks see; an index is one-hot to them.
+
+    Raises:
+      ConfigError: for a space of another kind.
+    """
+    is_index = isinstance(space, spaces.Discrete) and space.start == 0
+    is_vector = isinstance(space, spaces.Box) and len(space.shape) == 1
+    require(is_index or is_vector, name, "be a Box of vectors or a Discrete from 0", "networks "
+            "take vectors", space, f"{name} to what `sejax.Task` has")  # fmt: skip
+    return num_categories(space) or int(space.shape[0])  # type: ignore[index]

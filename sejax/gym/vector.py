@@ -1,0 +1,174 @@
+"""Many episodes of an SE side by side: each step is one pass through its networks."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium.utils import seeding
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+
+from sejax.errors import require
+from sejax.gym.synthetic import SyntheticWorld
+
+PREFETCHED = 32  # starts that a lane draws at once, where nothing else draws from its generator
+
+
+class SyntheticVectorEnv(VectorEnv[Any, Any, np.ndarray]):
+    """Episodes of an SE in lanes, as a Gymnasium vector environment.
+
+    Lane i is what `SyntheticEnv` is after `reset(seed=seed + i)`, to rounding, whatever happens in
+    other lanes: each has a generator of its own, which draws its starts and ends. Infos, and what
+    is done where an episode ends, are those of `gymnasium.vector.SyncVectorEnv`.
+
+    Args:
+      world: of the SE.
+      num_envs: lanes.
+      autoreset_mode: NextStep (the step after an end ignores the action and begins an episode),
+        SameStep (the end's step returns the next episode's first observation, and the last one's
+        own as `infos["final_obs"]`), or Disabled (`reset(options={"reset_mask": ended})`).
+    """
+
+    def __init__(
+        self,
+        world: SyntheticWorld,
+        num_envs: int,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
+    ):
+        self.world = world
+        self.num_envs = num_envs
+        self.autoreset_mode = AutoresetMode(autoreset_mode)
+        self.metadata = {"render_modes": [], "autoreset_mode": self.autoreset_mode}
+        self.single_observation_space = world.observation_space
+        self.single_action_space = world.action_space
+        self.observation_space = batch_space(world.observation_space, num_envs)
+        self.action_space = batch_space(world.action_space, num_envs)
+        self._vectors = np.zeros((num_envs, world.obs_dim), np.float32)
+        self._times = np.zeros(num_envs, np.int64)
+        self._ended = np.zeros(num_envs, np.bool_)
+        self._rngs: list[np.random.Generator | None] = [None] * num_envs
+        self._seeds: list[int | None] = [None] * num_envs
+        # A generator gives the same numbers one by one and all at once, which is quicker.
+        num_drawn = PREFETCHED if world.draws_noise and not world.draws_ends else 1
+        self._drawn = np.zeros((num_envs, num_drawn, world.obs_dim), np.float32)
+        self._num_used = np.full(num_envs, num_drawn)  # of those
+
+    @property  # type: ignore[misc]
+    def np_random(self) -> tuple[np.random.Generator | None, ...]:  # type: ignore[override]
+        """The generator of each lane; None before the first reset."""
+        return tuple(self._rngs)
+
+    @property
+    def np_random_seed(self) -> tuple[int | None, ...]:  # type: ignore[override]
+        """The seed of each lane; None before the first reset."""
+        return tuple(self._seeds)
+
+    def reset(
+        self,
+        *,
+        seed: int | Sequence[int | None] | None = None,
+        options: dict[str, Any] | None = None,
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        """Begins an episode in each lane.
+
+        Args:
+          seed: of the first lane, the next ones have the numbers that follow; or one for each.
+          options: `reset_mask`, `[num_envs]` of bool: only these lanes.
+
+        Raises:
+          ConfigError: for seeds or a mask of another length.
+        """
+        seeds = self._listed(seed)
+        mask = np.asarray((options or {}).get("reset_mask", np.ones(self.num_envs, np.bool_)))
+        require(len(seeds) == self.num_envs, "seed", "have an entry for each lane", "each has a "
+                "generator of its own", f"{len(seeds)} for {self.num_envs}", "seed=0")  # fmt: skip
+        require(mask.shape == (self.num_envs,) and mask.dtype == np.bool_, "options.reset_mask",
+                "be a bool for each lane", "it says which begin anew", f"{mask.dtype} {mask.shape} "
+                f"for {self.num_envs}", "options={'reset_mask': ended}")  # fmt: skip
+        lanes = np.flatnonzero(mask)
+        for lane in lanes:
+            if self._rngs[lane] is None or seeds[lane] is not None:
+                self._rngs[lane], self._seeds[lane] = seeding.np_random(seeds[lane])
+                self._num_used[lane] = self._drawn.shape[1]  # what it had drawn before is void
+        self._begin(lanes)
+        return self.world.observe(self._vectors), {}
+
+    def step(
+        self, actions: Any
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+        """One step of each lane.
+
+        Raises:
+          gymnasium.error.ResetNeeded: if a lane has no episode that goes on.
+          gymnasium.error.InvalidAction: for actions that are none of the space's.
+        """
+        is_next_step = self.autoreset_mode is AutoresetMode.NEXT_STEP
+        if None in self._rngs or (self._ended.any() and not is_next_step):
+            raise gymnasium.error.ResetNeeded("call reset() first: a lane has no running episode")
+        encoded = self.world.encode(actions, self.action_space)
+        goes_on = ~self._ended
+        waiting, lanes = np.flatnonzero(self._ended), np.flatnonzero(goes_on)
+        rewards, discounts = np.zeros(self.num_envs), np.zeros(self.num_envs)
+        terminated, truncated = np.zeros((2, self.num_envs), np.bool_)
+        if lanes.size:
+            self._times[lanes] += 1
+            step = self.world.step(
+                self._vectors[lanes], encoded[lanes], self._times[lanes], self._chance(lanes)
+            )
+            self._vectors[lanes] = step.vector
+            rewards[lanes], discounts[lanes] = step.reward, step.discount
+            terminated[lanes], truncated[lanes] = step.terminated, step.truncated
+        self._begin(waiting)
+        self._ended = terminated | truncated
+        infos = _told(discounts, goes_on)
+        if self.autoreset_mode is AutoresetMode.SAME_STEP and self._ended.any():
+            infos = self._final(discounts)
+            self._begin(np.flatnonzero(self._ended))
+        return self.world.observe(self._vectors), rewards, terminated, truncated, infos
+
+    def _final(self, discounts: np.ndarray) -> dict[str, Any]:
+        """Infos of a step whose ended lanes will begin anew at once."""
+        ended = self._ended.copy()
+        final_obs = np.full(self.num_envs, None, dtype=object)
+        obs = self.world.observe(self._vectors)
+        for lane in np.flatnonzero(ended):
+            final_obs[lane] = obs[lane]
+        return {
+            "final_obs": final_obs, "_final_obs": ended,
+            "final_info": _told(discounts, ended), "_final_info": ended.copy(),
+            **_told(discounts, ~ended),
+        }  # fmt: skip
+
+    def _begin(self, lanes: np.ndarray) -> None:
+        """Puts lanes at the beginning of an episode."""
+        if not lanes.size:
+            return
+        num_drawn = self._drawn.shape[1]
+        for lane in lanes[self._num_used[lanes] == num_drawn]:
+            rng = self._rngs[lane]
+            assert rng is not None
+            self._drawn[lane], self._num_used[lane] = self.world.draw(rng, num_drawn), 0
+        self._vectors[lanes] = self.world.first(self._drawn[lanes, self._num_used[lanes]])
+        self._num_used[lanes] += 1
+        self._times[lanes], self._ended[lanes] = 0, False
+
+    def _chance(self, lanes: np.ndarray) -> np.ndarray | None:
+        """What decides over ends, `[lanes]`, drawn with each lane's own generator."""
+        if not self.world.draws_ends:
+            return None
+        return np.array([self._rngs[lane].random() for lane in lanes])  # type: ignore[union-attr]
+
+    def _listed(self, seed: int | Sequence[int | None] | None) -> list[int | None]:
+        if seed is None:
+            return [None] * self.num_envs
+        if isinstance(seed, int | np.integer):
+            return [int(seed) + lane for lane in range(self.num_envs)]
+        return list(seed)
+
+
+def _told(discounts: np.ndarray, lanes: np.ndarray) -> dict[str, np.ndarray]:
+    """Discounts of some lanes, in the form that Gymnasium has for infos; nothing if of none."""
+    if not lanes.any():
+        return {}
+    return {"discount": np.where(lanes, discounts, 0.0), "_discount": lanes}

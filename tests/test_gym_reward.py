@@ -1,0 +1,301 @@
+"""Reward networks around Gymnasium's environments: each reward, worked by hand."""
+
+import importlib
+import json
+import pickle
+
+import gymnasium
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+from gymnasium.wrappers import TimeLimit, TransformReward
+from safetensors.numpy import save_file
+from support import numpy_forward, random_like, shapes_of
+
+import sejax
+from sejax import envs, plugins
+from sejax.envs import cliff_walking, gridworld_2x2
+from sejax.errors import ConfigError
+from sejax.gym import GridWorld, RewardNetwork, make
+from sejax.gym.reward import AUGMENTED_KEYS, INFO_KEYS
+from sejax.proxies import stored
+from sejax.proxies.configs import VARIANTS, RewardConfig
+
+KEY = jax.random.key(0)
+NETWORKS = [variant for variant in VARIANTS if "info" not in variant]
+
+
+class Walk(gymnasium.Env):
+    """A walk along a line that tells its place and speed, and pays and ends as it is told to."""
+
+    observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (2,), np.float64)
+    action_space = gymnasium.spaces.Box(-1, 1, (1,), np.float32)
+
+    def __init__(self, reward=0.5, length=1000):
+        self.reward, self.length = reward, length
+
+    def _see(self):
+        return np.array([self.place, np.cos(self.place)])
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.place, self.num_steps = 0.25, 0
+        return self._see(), {"x_position": self.place}
+
+    def step(self, action):
+        self.place += float(action[0])
+        self.num_steps += 1
+        info = {"x_position": self.place, "x_velocity": float(action[0]), "reward_forward": 3.0,
+                "reward_ctrl": -1.0}  # fmt: skip
+        return self._see(), np.float64(self.reward), self.num_steps >= self.length, False, info
+
+
+def stored_rn(tmp_path, num_inputs, task="cartpole", discount=0.9, scale=0.5, **config):
+    """An RN's file of random weights, written by hand in the format of version 1; the weights."""
+    config = RewardConfig(hidden_size=5, **config)
+    units = [("Dense_0", 5, num_inputs), ("Dense_1", 1, 5)]
+    sizes = {} if config.weighs_info else {
+        name: {"kernel": np.zeros((rows, columns)), "bias": np.zeros(rows)}
+        for name, rows, columns in units
+    }  # fmt: skip
+    weights = random_like(sizes, 2, scale)
+    flat = {f"potential/{layer}/{k}": x for layer, both in weights.items() for k, x in both.items()}
+    if config.weighs_info:
+        weights = flat["info_weights"] = random_like(np.zeros(num_inputs), 3, scale)
+    header = {"format_version": 1, "score": 1.0, "config": {
+        "env": {"name": task}, "proxy": {"name": "rn", **vars(config)},
+        "agent": {"discount": discount}}}  # fmt: skip
+    path = tmp_path / "rn.safetensors"
+    save_file(flat, path, metadata={"sejax": json.dumps(header)})
+    return path, weights
+
+
+def phi(weights, *inputs):
+    return numpy_forward(weights, np.concatenate(inputs), "prelu", 1)[0]
+
+
+def expected_reward(variant, real, before, after, discount=0.9):
+    shaped = {"potential": discount * after - before, "non_potential": after}
+    additive, _, kind = variant.partition("_")
+    return shaped[kind] + (real if additive == "additive" else 0.0)
+
+
+# --- rewards -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("variant", NETWORKS)
+@pytest.mark.parametrize("zero_at_terminal", [False, True])
+def test_every_variant_pays_what_its_equation_says(tmp_path, variant, zero_at_terminal):
+    path, weights = stored_rn(tmp_path, 2, variant=variant, zero_at_terminal=zero_at_terminal)
+    env = RewardNetwork(Walk(length=2), path)
+    obs, _ = env.reset(seed=0)
+    for action in ([0.5], [-0.25]):
+        before = phi(weights, obs)
+        obs, reward, terminated, truncated, info = env.step(action)
+        after = 0.0 if terminated and zero_at_terminal else phi(weights, obs)
+        assert reward == pytest.approx(expected_reward(variant, 0.5, before, after), abs=1e-5)
+        assert info["real_reward"] == 0.5 and info["discount"] == 1.0 - terminated
+        assert [type(x) for x in (reward, terminated, truncated)] == [float, bool, bool]
+    assert terminated
+
+
+@pytest.mark.parametrize("limit_is_terminal", [False, True])
+def test_the_step_limit_is_an_end_for_whom_it_is_one(tmp_path, limit_is_terminal):
+    path, weights = stored_rn(tmp_path, 2, variant="exclusive_non_potential", zero_at_terminal=True)
+    env = RewardNetwork(TimeLimit(Walk(), 1), path, limit_is_terminal=limit_is_terminal)
+    env.reset()
+    obs, reward, terminated, truncated, _ = env.step([0.5])
+    assert truncated and not terminated
+    assert reward == pytest.approx(0.0 if limit_is_terminal else phi(weights, obs), abs=1e-6)
+
+
+def test_a_potential_has_the_discount_of_the_agent_that_trains(tmp_path):
+    path, weights = stored_rn(tmp_path, 2, discount=0.7, variant="exclusive_potential")
+    for given, gamma in ((None, 0.7), (0.99, 0.99)):
+        env = RewardNetwork(Walk(), path, discount=given)
+        before = phi(weights, env.reset()[0])
+        obs, reward, *_ = env.step([0.5])
+        assert reward == pytest.approx(gamma * phi(weights, obs) - before, abs=1e-5)
+
+
+@pytest.mark.parametrize("given", [None, ["x_position", "x_velocity"]])
+def test_an_augmented_network_sees_info_of_its_own_state(tmp_path, given):
+    """Zeros before the first step, whatever `reset` tells, as in JAX."""
+    task = "halfcheetah" if given is None else "mine"
+    path, weights = stored_rn(tmp_path, 4, task, variant="exclusive_potential", augmented=True)
+    env = RewardNetwork(Walk(), path, info_keys=given)
+    obs, _ = env.reset()
+    before = phi(weights, obs, [0, 0])
+    for action in (0.5, -0.25):
+        obs, reward, _, _, info = env.step([action])
+        after = phi(weights, obs, [info["x_position"], action])
+        assert reward == pytest.approx(0.9 * after - before, abs=1e-5)
+        before = after
+
+
+@pytest.mark.parametrize("variant", ["additive_weighted_info", "exclusive_weighted_info"])
+def test_weighted_info_is_a_product(tmp_path, variant):
+    path, weights = stored_rn(tmp_path, 4, "halfcheetah", variant=variant)
+    env = RewardNetwork(Walk(), path)
+    env.reset()
+    _, reward, *_ = env.step([0.5])
+    expected = weights @ [0.75, 0.5, 3.0, -1.0] + (0.5 if variant.startswith("add") else 0.0)
+    assert reward == pytest.approx(expected, abs=1e-5)
+
+
+@pytest.mark.parametrize("real", [np.nan, np.inf, -2e6])
+def test_an_absurd_reward_is_none_and_terminates(tmp_path, real):
+    path, _ = stored_rn(tmp_path, 2, variant="additive_potential")
+    env = RewardNetwork(Walk(reward=real), path)
+    env.reset()
+    _, reward, terminated, _, info = env.step([0.5])
+    assert reward == 0.0 and terminated is True and info["discount"] == 0.0
+
+
+def test_rewards_are_those_of_the_rn_in_jax():
+    """The shipped one, on CartPole's own steps."""
+    env, proxy = make("cartpole-rn"), sejax.load_proxy("cartpole-rn")
+    env.action_space.seed(0)
+    obs, _ = env.reset(seed=0)
+    before, after, rewards = [], [], []
+    for _ in range(50):
+        before.append(obs)
+        obs, reward, terminated, truncated, _ = env.step(env.action_space.sample())
+        after.append(obs)
+        rewards.append(reward)
+        if terminated or truncated:
+            obs, _ = env.reset()
+    phi = jax.jit(jax.vmap(lambda x: proxy.env.potential(proxy.params, x)))
+    before, after = phi(jnp.stack(before + after)).reshape(2, -1)
+    np.testing.assert_allclose(rewards, proxy.params.discount * after - before, atol=1e-5)
+
+
+# --- tasks ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("name", "rows"), [("cliff_walking", cliff_walking.MAP),
+                                            ("gridworld_2x2", gridworld_2x2.MAP)])  # fmt: skip
+def test_grid_worlds_are_those_in_jax(name, rows):
+    """Every step from every state, by the tables of the one in JAX, which has tests of its own."""
+    task, env = envs.make(name), GridWorld(name)
+    world, params = task.env, task.params
+    assert env.reset(seed=0) == (world._start, {})
+    for state, action in np.ndindex(len("".join(rows)), 4):
+        env._index = state
+        obs, reward, terminated, truncated, _ = env.step(action)
+        goal, hole = world._goal[obs], world._hole[obs]
+        assert (obs, terminated, truncated) == (world._next[state, action], goal | hole, False)
+        assert reward == (params.goal_reward if goal else params.hole_reward if hole
+                          else params.step_reward)  # fmt: skip
+
+
+def test_a_grid_world_needs_an_episode_and_one_of_four_actions():
+    env = GridWorld("cliff_walking", goal_reward=-1.0)
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        env.step(0)
+    env.reset()
+    with pytest.raises(gymnasium.error.InvalidAction, match=r"4 is none of Discrete\(4\)"):
+        env.step(4)
+    assert env.step(0)[1:3] == (-100.0, True)
+    env._index = 35
+    assert env.step(2) == (47, -1.0, True, False, {})
+
+
+def test_the_time_limit_is_the_tasks_and_there_once():
+    env = gymnasium.make("sejax/mountain_car_continuous-rn")
+    env.reset(seed=0)
+    ends = [env.step([0.0])[2:4] for _ in range(999)]
+    assert ends == [(False, False)] * 998 + [(False, True)]
+    limits = str(env).count("TimeLimit")
+    assert limits == 1 and str(gymnasium.make(env.spec)) == str(env)
+    env = make("cliff_walking-rn")
+    env.reset()
+    assert [env.step(3)[3] for _ in range(50)] == [False] * 49 + [True]
+
+
+@pytest.mark.parametrize("name", [x for x in stored.pretrained_names() if x.endswith("-rn")])
+@pytest.mark.filterwarnings("ignore:.*different from the unwrapped version:UserWarning",
+                            "ignore:.*m.*imum value is -?infinity:UserWarning",
+                            "ignore:.*Not able to test alternative:UserWarning")  # fmt: skip
+def test_gymnasiums_checker_passes(name):
+    check_env(make(name), skip_render_check=True)
+
+
+def test_a_pickled_one_goes_on_as_it_would_have():
+    env = make("cartpole-rn")
+    env.reset(seed=0)
+    env.step(1)
+    copy = pickle.loads(pickle.dumps(env))
+    for _ in range(3):
+        (obs, *rest), (same_obs, *same_rest) = env.step(0), copy.step(0)
+        np.testing.assert_array_equal(obs, same_obs)
+        assert rest == same_rest
+    np.testing.assert_array_equal(env.reset()[0], copy.reset()[0])
+
+
+def test_the_spec_of_a_wrapper_makes_the_wrapper_again(tmp_path):
+    path, _ = stored_rn(tmp_path, 4, variant="exclusive_potential")
+    env = RewardNetwork(gymnasium.make("CartPole-v1"), path, discount=0.5)
+    again = gymnasium.make(type(env.spec).from_json(env.spec.to_json()))
+    assert again.discount == 0.5 and again.spec.max_episode_steps == 500
+    both = [TransformReward(x, lambda r: 2 * r) for x in (env, again)]
+    for x in both:
+        x.reset(seed=0)
+    assert both[0].step(1)[1] == both[1].step(1)[1]
+
+
+def test_numbers_of_info_have_gymnasiums_names():
+    """Those of sejax's tasks; v5's halfcheetah has another name for one."""
+    renamed = {"reward_run": "reward_forward"}
+    told = {name for name in plugins.names("env") if plugins.find("env", name).facts.has_info}
+    assert told == set(INFO_KEYS)
+    for name in told:
+        world = importlib.import_module(f"sejax.envs.mujoco.{name}").Env
+        assert tuple(renamed.get(key, key) for key in world.info_keys) == INFO_KEYS[name]
+        assert world.augmented_keys == AUGMENTED_KEYS.get(name, ())
+
+
+# --- what cannot be ------------------------------------------------------------------------------
+
+
+def test_what_does_not_fit_is_one_message(tmp_path):
+    with pytest.raises(ConfigError, match=r"^source must be a reward network, because this takes "
+                       r"its networks; got proxy=se in .*cartpole"):  # fmt: skip
+        RewardNetwork(gymnasium.make("CartPole-v1"), "cartpole")
+    with pytest.raises(ConfigError, match=r"^weights must be those of the proxy's networks"):
+        RewardNetwork(gymnasium.make("MountainCar-v0"), "cartpole-rn")
+    with pytest.raises(ConfigError, match=r"^env must be sejax's Cliff Walking, because in "
+                       r"Gymnasium's, .*Set env=sejax\.gym\.make\('cliff_walk"):  # fmt: skip
+        RewardNetwork(gymnasium.make("CliffWalking-v1"), "cliff_walking-rn")
+    with pytest.raises(ConfigError, match=r"^task must be an id of Gymnasium for a reward network"):
+        make("cartpole-rn", sejax.gym.RealTask.of_gymnasium("CartPole-v1"))
+    with pytest.raises(ConfigError, match=r"^render_mode must be None for an SE"):
+        make("cartpole", render_mode="rgb_array")
+    assert make("cartpole-rn", "CartPole-v1").get_wrapper_attr("_max_episode_steps") == 500
+
+
+def test_info_that_is_not_there_is_one_message(tmp_path):
+    path, _ = stored_rn(tmp_path, 4, "halfcheetah", variant="exclusive_weighted_info")
+    env = RewardNetwork(gymnasium.make("CartPole-v1"), path)
+    env.reset()
+    with pytest.raises(ConfigError, match=r"^env must tell x_position, x_velocity, .* in a step's "
+                       r"info, because this RN weighs it; got none\. Set"):  # fmt: skip
+        env.step(0)
+    path, _ = stored_rn(tmp_path, 4, "mine", variant="exclusive_weighted_info")
+    with pytest.raises(ConfigError, match=r"^info_keys must be given for mine, .* got none\. Set"):
+        RewardNetwork(gymnasium.make("CartPole-v1"), path)
+
+
+def test_a_task_that_gymnasium_has_not_must_be_given(tmp_path):
+    for task in ({"name": "gymnax/Pendulum-v1"}, {"name": "halfcheetah", "backend": "spring"}):
+        env = envs.make("pendulum")
+        rn = plugins.make("proxy", RewardConfig(hidden_size=2), env)
+        path = tmp_path / "rn.safetensors"
+        weights = random_like(shapes_of(rn.init_weights, KEY))
+        sejax.save(path, rn, weights, config={"env": task})
+        with pytest.raises(ConfigError, match=r"^task must be given for (gymnax/|halfcheetah \(b"
+                           r"ackend=spring\)).* Set sejax\.gym\.RewardNetwork\(env, "):  # fmt: skip
+            make(path)
+        assert make(path, "Pendulum-v1").reset(seed=0)[0].shape == (3,)

@@ -1,0 +1,134 @@
+"""Proxies as `VecEnv`s of Stable-Baselines3, whose own `DummyVecEnv` of single ones says the same.
+
+They need the extra `sb3`, which `dev` has not (torch is 200 MB): `make test-sb3`.
+"""
+
+import pickle
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pytest
+from test_gym_vector import SES, world_of
+
+import sejax.gym
+from sejax.errors import ConfigError
+from sejax.gym import SyntheticEnv
+from sejax.proxies import stored
+
+try:
+    from stable_baselines3 import PPO
+    from stable_baselines3.common.env_checker import check_env
+    from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor
+
+    from sejax.gym.sb3 import SyntheticVecEnv
+except ImportError:
+    PPO = None
+PAGE = Path(__file__).parents[1] / "docs/gymnasium.md"
+needs_sb3 = pytest.mark.skipif(PPO is None, reason="needs the extra sb3: make test-sb3")
+
+
+def test_without_it_one_message_says_what_to_install(monkeypatch):
+    for module in ("stable_baselines3", "stable_baselines3.common.vec_env"):
+        monkeypatch.setitem(sys.modules, module, None)
+    with pytest.raises(ConfigError, match=r"^make_sb3 needs Stable-Baselines3, .*sejax\[sb3\]'\.$"):
+        sejax.gym.make_sb3("cartpole")
+
+
+def test_nothing_imports_it_unasked():
+    program = """
+import sys
+import sejax
+sejax.pretrained()
+print("gymnasium" in sys.modules)
+import sejax.gym
+sejax.gym.make_vec("cartpole", 2).reset(seed=0)
+sejax.gym.make("cartpole-rn").reset(seed=0)
+print(sorted({"jax", "flax", "stable_baselines3", "torch"} & set(sys.modules)))
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert done.stdout.split("\n") == ["False", "[]", ""], done.stdout + done.stderr
+
+
+@needs_sb3
+@pytest.mark.parametrize("name", SES)
+def test_lanes_are_single_environments(name):
+    world, num_envs = world_of(**SES[name]), 3
+    lanes = SyntheticVecEnv(world, num_envs)
+    singles = DummyVecEnv([lambda: SyntheticEnv(world)] * num_envs)
+    lanes.action_space.seed(0)
+    assert lanes.seed(5) == singles.seed(5) == [5, 6, 7]
+    np.testing.assert_allclose(lanes.reset(), singles.reset(), atol=1e-5)
+    num_ended = 0
+    for _ in range(40):
+        actions = np.stack([lanes.action_space.sample() for _ in range(num_envs)])
+        *got, infos = lanes.step(actions)
+        *expected, expected_infos = singles.step(actions)
+        for a, b in zip(got, expected, strict=True):
+            assert a.dtype == b.dtype and a.shape == b.shape
+            np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-5)
+        for a, b in zip(infos, expected_infos, strict=True):
+            assert a.keys() == b.keys() and a["TimeLimit.truncated"] is b["TimeLimit.truncated"]
+            for key in a:
+                np.testing.assert_allclose(a[key], b[key], rtol=1e-5, atol=1e-5)
+        num_ended += got[2].sum()
+    assert num_ended > num_envs
+    copy = pickle.loads(pickle.dumps(lanes))
+    np.testing.assert_array_equal(lanes.step(actions)[0], copy.step(actions)[0])
+    np.testing.assert_array_equal(lanes.reset(), copy.reset())
+
+
+@needs_sb3
+def test_lanes_share_their_attributes():
+    envs = sejax.gym.make_sb3("cartpole", 3)
+    assert envs.get_attr("render_mode") == [None] * 3 and not envs.has_attr("nothing")
+    assert [x.horizon for x in envs.get_attr("config", indices=[0, 2])] == [1, 1]
+    envs.set_attr("tag", 7)
+    assert envs.get_attr("tag", 1) == [7]
+    with pytest.raises(NotImplementedError, match="indices=None"):
+        envs.set_attr("tag", 7, indices=[1])
+    assert envs.env_method("get_wrapper_attr", "tag", indices=[0]) == [7]
+    with pytest.raises(NotImplementedError, match="lanes reset together"):
+        envs.env_method("reset")
+    assert envs.env_is_wrapped(gymnasium.Wrapper) == [False] * 3
+    envs.close()
+
+
+@needs_sb3
+@pytest.mark.parametrize("name", stored.pretrained_names())
+@pytest.mark.filterwarnings("ignore:We recommend you to use a symmetric:UserWarning")
+def test_its_checker_passes_for_what_ships(name):
+    check_env(sejax.gym.make(name))
+    check_env(gymnasium.make(f"sejax/{name}"))
+
+
+@needs_sb3
+@pytest.mark.parametrize("name", ["cartpole", "cartpole-rn"])
+def test_an_agent_of_theirs_trains_there(name):
+    envs = VecMonitor(sejax.gym.make_sb3(name, 4))
+    model = PPO("MlpPolicy", envs, n_steps=16, batch_size=16, n_epochs=1, seed=0, device="cpu")
+    model.learn(128)
+    assert model.num_timesteps == 128 and len(model.ep_info_buffer) > 0
+
+
+@needs_sb3
+@pytest.mark.filterwarnings("ignore:Evaluation environment is not wrapped:UserWarning")
+def test_the_page_runs_and_its_torch_networks_are_the_se():
+    blocks = re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
+    assert len(blocks) > 5
+    for block in blocks:
+        names = {}
+        exec(compile(block.replace("2_500", "256"), PAGE.name, "exec"), names)
+        if "load_file" in block:
+            world = sejax.gym.make("cartpole").world
+            noise, actions = names["noise"].numpy(), names["actions"].numpy().argmax(axis=1)
+            first = world.first(noise)
+            encoded = np.eye(2, dtype=np.float32)[actions]
+            step = world.step(first, encoded, np.ones(len(actions)))
+            np.testing.assert_allclose(names["obs"].detach(), first, atol=1e-5)
+            np.testing.assert_allclose(names["rewards"].detach()[:, 0], step.reward, atol=1e-5)
+            return
+    pytest.fail("no recipe for torch")
