@@ -13,8 +13,8 @@ throughput with all devices over that with one, both on the same work: their sco
 the last digit, and the benchmark says whether they are. The speed-up stays below the number of
 cores where one device is left with a long training, or other processes take part of a core, and
 because two devices of a process take a tenth more CPU time than one for the same work (6.2 s and
-6.9, where two processes take as much as one each): XLA's matrix library keeps objects that devices hand on to
-each other, through locks and with memory that the other thread has to free.
+6.9, where two processes take as much as one each): XLA's matrix library keeps objects that devices
+hand on to each other, through locks and with memory that the other thread has to free.
 
 `--quick` has 2 members and trainings of at most 5 episodes, the same for both sides; tests and the
 outer loop then weigh more. It leaves out the parallel speed-up, for which that is too short, and
