@@ -158,6 +158,7 @@ def run(
         ended=ended,
         best_score=float(state.best_score.max()),
         generations=generation,
+        solved_score=program.solved_score,
         wall_s=round(wall_before + time.time() - started, 1),
         cpu_s=round(cpu_s(), 1),
         **_cost(state, directory, program.strategy.num_candidates),

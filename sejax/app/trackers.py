@@ -282,7 +282,8 @@ class Follower:
     def _log(self, generation: int, rows: list[dict[str, str]], info: Any) -> None:
         if self._tracker is None:
             self._tracker = self._open()
-        values, scores = {}, {}
+        values: dict[str, float] = {}
+        scores: dict[str, np.ndarray] = {}
         for row in rows:
             seed = self._directory.seeds.index(int(row["seed"]))
             start = f"seed{row['seed']}/" if len(self._directory.seeds) > 1 else ""
