@@ -38,13 +38,13 @@ def evaluate_words(
     return [*words, "num_agents=20"]
 
 
-def of_stored(stored: dict[str, Any], path: Path, has_ended: bool) -> list[tuple[str, str]]:
+def of_stored(stored: dict[str, Any], path: Path, generations: int | None) -> list[tuple[str, str]]:
     """What can be done with a stored run, each with its command.
 
     Args:
       stored: the run's configuration as `config.yaml` has it; nothing that it names is imported.
       path: the run directory.
-      has_ended: or whether generations are left.
+      generations: that it may go on to; None if it is over.
     """
     kind = str(stored["proxy"]["name"])
     words = evaluate_words(
@@ -55,14 +55,23 @@ def of_stored(stored: dict[str, Any], path: Path, has_ended: bool) -> list[tuple
     if not any(":" in name for name in (kind, str(stored["env"]["name"]))):
         steps.append(("Use it as a gymnax environment",
                       f"env, params = sejax.load({json.dumps(str(path))})"))  # fmt: skip
-    generations = int(stored["generations"])
-    if has_ended:
-        generations *= 2
-    again = run_words(stored | {"run_dir": str(path), "generations": generations})
+    changes = {"run_dir": str(path), "generations": generations}
+    again = run_words(stored | changes) if generations is not None else None
     if again is not None:
-        about = "Go on with more generations" if has_ended else "Go on where it stopped"
-        steps.append((about, _command("sejax.run", again)))
+        steps.append((f"Go on, to generation {generations:,}", _command("sejax.run", again)))
     return steps
+
+
+def require_run(stored: dict[str, Any]) -> None:
+    """Checks that a stored configuration names what `of_stored` says.
+
+    Raises:
+      LookupError, TypeError, AttributeError, ValueError: if it does not.
+    """
+    for group in ("env", "proxy"):
+        str(stored[group]["name"])
+    agent_names(stored)
+    int(stored["generations"])
 
 
 def agent_names(stored: dict[str, Any]) -> list[str]:
@@ -87,9 +96,11 @@ def run_words(stored: dict[str, Any]) -> list[str] | None:
     chosen += [f"agents=[{','.join(several)}]"] if several else []
     try:
         usual = build.to_plain(compose.config(chosen))
-        chosen += [f"{group}={name}" for group, name in names.items()
-                   if (usual[group] or {}).get("name") != name]  # fmt: skip
-        usual, asked = (flatten(x) for x in (build.to_plain(compose.config(chosen)), stored))
+        others = [f"{group}={name}" for group, name in names.items()
+                  if (usual[group] or {}).get("name") != name]  # fmt: skip
+        chosen += others
+        usual = flatten(build.to_plain(compose.config(chosen)) if others else usual)
+        asked = flatten(stored)
         words = chosen + [f"{name}={_word(value)}" for name, value in asked.items()
                           if name in usual and usual[name] != value]  # fmt: skip
         composed = flatten(build.to_plain(compose.config(words)))

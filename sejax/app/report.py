@@ -98,6 +98,7 @@ class Run:
             "proxy": str(self.config.get("proxy.name")).upper(),
             "agent": ", ".join(next_steps.agent_names(self.stored)),
             "ended": self.how_it_ended,
+            "seeds": number(self.rows["seed"].nunique()),
             "best incumbent": MISSING,
         }
         if best is not None:
@@ -105,9 +106,6 @@ class Run:
             facts["in generation (from 0)"] = number(best["generation"])
         if self.solved_score is not None:
             facts["solved at"] = number(self.solved_score)
-        num_seeds = self.rows["seed"].nunique()
-        if num_seeds > 1:
-            facts["seeds"] = number(num_seeds)
         return facts | {called: number(self.ended[name]) for name, called in COSTS.items()
                         if name in self.ended}  # fmt: skip
 
@@ -148,9 +146,14 @@ class Run:
         return [{name: number(value) for name, value in row.items()}
                 for row in chosen.to_dict("records")]  # fmt: skip
 
-    @property
+    @cached_property
     def commands(self) -> list[tuple[str, str]]:
-        return next_steps.of_stored(self.stored, self.path, self.has_ended)
+        """What can be done next, each with its command; a run that ends when solved stays so."""
+        generations = int(self.stored["generations"])
+        more: int | None = 2 * generations if self.has_ended else generations
+        if self.has_ended and self.ended.get("ended") == "solved":
+            more = None
+        return next_steps.of_stored(self.stored, self.path, more)
 
 
 # --- reading -------------------------------------------------------------------------------------
@@ -175,7 +178,7 @@ def _read(path: Path, name: str) -> Run:
         rows = pd.read_csv(path / "metrics.csv")
         ended = path / "run.json"
         agents = path / "evaluation.csv"
-        next_steps.of_stored(stored, path, has_ended=False)  # whether it is a run's
+        next_steps.require_run(stored)
         run = Run(
             path=path, name=name, stored=dict(stored), rows=_complete(rows, COLUMNS),
             ended=dict(json.loads(ended.read_text(encoding="utf-8"))) if ended.exists() else {},
@@ -227,13 +230,12 @@ def page(runs: Sequence[Run]) -> str:
     return environment.get_template("report.html").render(
         title=title,
         runs=runs,
-        facts=list(dict.fromkeys(name for run in runs for name in run.facts)),
+        facts=_side_by_side([run.facts for run in runs]),
         curves=report_figures.curves(runs),
         comparison=report_figures.comparison(runs),
         evaluations=report_figures.evaluations(runs),
         settings=settings(runs),
         environments=_side_by_side([run.environment for run in runs]),
-        missing=MISSING,
         version=version("sejax"),
     )
 

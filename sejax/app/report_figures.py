@@ -16,7 +16,7 @@ from sejax.app import plots
 
 STYLE: Any = {
     "svg.fonttype": "none", "svg.hashsalt": "sejax", "figure.facecolor": "none",
-    "axes.facecolor": "none", "savefig.facecolor": "none", "text.parse_math": False,
+    "axes.facecolor": "none", "figure.constrained_layout.h_pad": 0.12, "savefig.facecolor": "none", "text.parse_math": False,
 }  # fmt: skip
 COLORS = (plots.INCUMBENT, plots.POPULATION, *plots.FAMILIES)
 MARKERS = "osD^vP*X"
@@ -105,7 +105,8 @@ def _evaluation(run: Any, prefix: str) -> Figure | None:
 def _svg(draw: Callable[[Path], None], prefix: str) -> Markup:
     """What `draw` writes as SVG, made to stand in a page: its ids begin with the prefix.
 
-    Black becomes the colour of the page's text.
+    Black becomes the colour of the page's text, which matplotlib has escaped; the width follows the
+    page within what can be read.
     """
     with mpl.rc_context(STYLE), tempfile.TemporaryDirectory() as folder:
         path = Path(folder, "figure.svg")
@@ -114,9 +115,12 @@ def _svg(draw: Callable[[Path], None], prefix: str) -> Markup:
     svg = svg[svg.index("<svg") :]
     svg = re.sub(r"<metadata>.*?</metadata>", "", svg, flags=re.DOTALL)
     svg = re.sub(r'(\bid="|url\(#|href="#)', rf"\g<1>{prefix}-", svg)
-    svg = re.sub(r'(<svg[^>]*?) height="[^"]*"([^>]*?) width="[^"]*"', r"\1\2", svg, count=1)
-    svg = svg.replace("<svg", '<svg aria-hidden="true"', 1).replace("#000000", "currentColor")
-    return Markup(svg)  # matplotlib escapes the text in it
+    head, body = svg.split(">", maxsplit=1)
+    points = float(head.partition('width="')[2].partition("pt")[0])
+    head = re.sub(r' (width|height)="[^"]*"', "", head)
+    limits = f"min-width: {0.7 * points:.0f}px; max-width: {1.5 * points:.0f}px"
+    body = body.replace("#000000", "currentColor")
+    return Markup(f'{head} aria-hidden="true" style="{limits}">{body}')
 
 
 def _label(name: object) -> str:

@@ -93,8 +93,12 @@ class TensorBoard:
     def __init__(self, run: TrackedRun):
         from tensorboardX import SummaryWriter
 
-        # What an earlier session wrote of later generations does not count.
-        self._writer = SummaryWriter(str(run.folder / "tensorboard"), purge_step=run.generations)
+        # What an earlier session wrote of later generations does not count. Its file would be
+        # replaced, if it began in the same second, but for the suffix.
+        self._writer = SummaryWriter(
+            str(run.folder / "tensorboard"), purge_step=run.generations,
+            filename_suffix=f".{run.generations}",
+        )  # fmt: skip
         text = yaml.safe_dump(run.config, sort_keys=False)
         self._writer.add_text("config", f"```\n{text}```", run.generations)
 
