@@ -4,7 +4,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: run test test-slow lint typecheck clean
+.PHONY: run test test-slow test-trackers lint typecheck clean
 
 run: $(VENV)/.installed
 	$(BIN)/python -m sejax.run env=cartpole stop_when_solved=true
@@ -14,6 +14,13 @@ test: $(VENV)/.installed-dev
 
 test-slow: $(VENV)/.installed-dev
 	$(BIN)/python -m pytest -m slow -n 2 --dist worksteal
+
+# The newest of what trackers need, in an environment of its own: trackio and constraints.txt have no
+# pillow in common.
+test-trackers:
+	$(PYTHON) -m venv $(VENV)-trackers
+	$(VENV)-trackers/bin/python -m pip install --quiet --editable '.[tensorboard,trackio,wandb]' pytest hypothesis
+	$(VENV)-trackers/bin/python -m pytest tests/test_trackers.py
 
 lint: $(VENV)/.installed-dev
 	$(BIN)/ruff format --check .
@@ -35,4 +42,4 @@ $(VENV)/.installed-dev: $(VENV)/.installed
 	touch $@
 
 clean:
-	rm -rf $(VENV)
+	rm -rf $(VENV) $(VENV)-trackers
