@@ -16,7 +16,8 @@ from sejax.app import plots
 
 STYLE: Any = {
     "svg.fonttype": "none", "svg.hashsalt": "sejax", "figure.facecolor": "none",
-    "axes.facecolor": "none", "figure.constrained_layout.h_pad": 0.12, "savefig.facecolor": "none", "text.parse_math": False,
+    "axes.facecolor": "none", "savefig.facecolor": "none", "text.parse_math": False,
+    "figure.constrained_layout.h_pad": 0.12,
 }  # fmt: skip
 COLORS = (plots.INCUMBENT, plots.POPULATION, *plots.FAMILIES)
 MARKERS = "osD^vP*X"
