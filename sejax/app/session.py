@@ -133,6 +133,8 @@ def run(
 
     state = jax.tree.map(lambda x: x.copy(), state)  # own buffers, so that they can be donated
     with trackers.Follower(config, directory, report) as follower:
+        if generation < config.generations and not bool(state.finished.all()):
+            follower.open()
         follower.tell()  # what it has missed
         while generation < config.generations and not bool(state.finished.all()):
             length = min(config.checkpoint_every, config.generations - generation)
@@ -149,7 +151,8 @@ def run(
                 proxies.save(host_state)
                 directory.commit(generation, state, cpu_s())
             report.update(generation, info)
-            follower.tell(info)
+            with commands.interrupts_held():
+                follower.tell(info)
             if report.time_to_draw():
                 draw(directory, program)
         ended = "solved" if bool(state.finished.all()) else "finished"

@@ -238,6 +238,12 @@ class Follower:
         self._end()
 
     @_guarded
+    def open(self) -> None:
+        """Begins with the tracker, or goes on with it; `tell` does so too, where there is news."""
+        if self._tracker is None:
+            self._tracker = self._open()
+
+    @_guarded
     def tell(self, info: Any = None) -> None:
         """Tells of the rows of `metrics.csv` that are new.
 
@@ -245,8 +251,6 @@ class Follower:
           info: of the last chunk, on the host; leaves `[generation, seed]`. Without it, nothing is
             known but the rows.
         """
-        if not self._records:
-            self._records = self._read()
         rows = self._directory.rows[self._num_rows :]
         self._num_rows += len(rows)
         for generation, of_seeds in itertools.groupby(rows, lambda row: int(row["generation"])):
@@ -264,12 +268,6 @@ class Follower:
             if self._tracker is not None:
                 self._tracker.close()
 
-    def _read(self) -> dict[str, Any]:
-        path = self._directory.path / RECORD
-        records: dict[str, Any] = json.loads(path.read_text("utf-8")) if path.exists() else {}
-        records.setdefault(self._name, {"id": secrets.token_hex(4), "generations": 0})
-        return records
-
     def _open(self) -> Tracker:
         made: Tracker = self._config.make(
             TrackedRun(folder=self._directory.path.resolve(), id=self._record["id"],
@@ -279,7 +277,11 @@ class Follower:
 
     @property
     def _record(self) -> dict[str, Any]:
-        """What this tracker knows: the `id` that it has given the run, and its `generations`."""
+        """What this tracker knows: the run's `id` there, and how many `generations`."""
+        if not self._records:
+            path = self._directory.path / RECORD
+            self._records = json.loads(path.read_text("utf-8")) if path.exists() else {}
+            self._records.setdefault(self._name, {"id": secrets.token_hex(4), "generations": 0})
         record: dict[str, Any] = self._records[self._name]
         return record
 
