@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 import sejax
-from sejax.app import trackers
+from sejax.app import follower, trackers
 from sejax.app.metrics import columns_of
 from sejax.app.session import Quiet
 from sejax.errors import ConfigError
@@ -72,10 +72,10 @@ def follow(plugin, folder, told=None, infos=(None,)):
     """A session that tells of what the folder has."""
     config = types.SimpleNamespace(tracker=plugin)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(trackers.plugins, "name_of", lambda group, config: "mine:tracker")
-        with trackers.Follower(config, folder, told or Told()) as follower:
+        patch.setattr(follower.plugins, "name_of", lambda group, config: "mine:tracker")
+        with follower.Follower(config, folder, told or Told()) as following:
             for info in infos:
-                follower.tell(info)
+                following.tell(info)
 
 
 def logged(listener):
@@ -167,8 +167,8 @@ def tracked(path, config):
         folder = directory(path, generations)
         told = Told()
         context = types.SimpleNamespace(tracker=config)
-        with trackers.Follower(context, folder, told) as follower:
-            follower.tell(chunk([0, 1] if not number else [2]))
+        with follower.Follower(context, folder, told) as following:
+            following.tell(chunk([0, 1] if not number else [2]))
         assert not told.said, told.said
 
 

@@ -8,7 +8,8 @@ from typing import Any, Protocol
 import jax
 import numpy as np
 
-from sejax.app import build, commands, runtime, trackers
+from sejax.app import build, commands, runtime
+from sejax.app.follower import Follower
 from sejax.app.run_directory import RunDirectory
 from sejax.bilevel import Program, make_program
 from sejax.counters import exact
@@ -132,7 +133,7 @@ def run(
         return cpu_before + time.process_time() - cpu_started
 
     state = jax.tree.map(lambda x: x.copy(), state)  # own buffers, so that they can be donated
-    with trackers.Follower(config, directory, report) as follower:
+    with Follower(config, directory, report) as follower:
         if generation < config.generations and not bool(state.finished.all()):
             follower.open()
         follower.tell()  # what it has missed
