@@ -4,7 +4,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: run test test-slow test-sb3 lint typecheck clean
+.PHONY: run test test-slow test-sb3 test-trackers lint typecheck clean
 
 run: $(VENV)/.installed
 	$(BIN)/python -m sejax.run env=cartpole stop_when_solved=true
@@ -19,6 +19,13 @@ test-slow: $(VENV)/.installed-dev
 test-sb3: $(VENV)/.installed-dev
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[sb3]'
 	$(BIN)/python -m pytest tests/test_gym_sb3.py
+
+# The newest of what trackers need, in an environment of its own: trackio and constraints.txt have no
+# pillow in common.
+test-trackers:
+	$(PYTHON) -m venv $(VENV)-trackers
+	$(VENV)-trackers/bin/python -m pip install --quiet --editable '.[tensorboard,trackio,wandb]' pytest hypothesis
+	$(VENV)-trackers/bin/python -m pytest tests/test_trackers.py
 
 lint: $(VENV)/.installed-dev
 	$(BIN)/ruff format --check .
@@ -40,4 +47,4 @@ $(VENV)/.installed-dev: $(VENV)/.installed
 	touch $@
 
 clean:
-	rm -rf $(VENV)
+	rm -rf $(VENV) $(VENV)-trackers

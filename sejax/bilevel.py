@@ -63,6 +63,7 @@ class GenerationInfo:
     train_steps_max: Array
     train_episodes_mean: Array
     num_nonfinite: Array
+    member_scores: Float[Array, "seed tried"]  # of each of the members' trials; no column
     families: "FamilyInfo"
     env_steps_wide: Array  # `[seed, 2]`; see `env_steps_total`
     train_steps_wide: Array  # `[seed, 2]`; see `train_steps_total`
@@ -463,6 +464,7 @@ def _summarise(
         train_steps_max=outcome.train_steps.max(axis=1),
         train_episodes_mean=outcome.train_episodes.mean(axis=1),
         num_nonfinite=diverged.sum(axis=1),
+        member_scores=scores.tried,
         families=FamilyInfo(
             incumbent_mean=scores.family_means,
             population_mean=of_families(

@@ -192,20 +192,22 @@ def _train_and_test(config: EvaluateConfig, study: Study, world: str, family: Ag
     import pandas as pd
 
     from sejax.agents import make_agent
+    from sejax.app.progress import Tally
     from sejax.evaluation import evaluate_agents
 
     env, env_params, trainings = study.worlds[world]
     varied = config.agent_hparams == "varied"
     agent = make_agent(family.agent, study.task, study.exploration, varied)
     keys = jax.random.split(jax.random.key(config.seed), config.num_agents)
-    started = time.time()
-    outcome = evaluate_agents(
-        agent, env, env_params, study.task, trainings[family.key], keys, config.lanes,
-        config.devices,
-    )  # fmt: skip
-    outcome = jax.device_get(outcome)
-    drawn = jax.device_get(jax.vmap(agent.drawn_values)(keys))
     who = f"{family.key} agents" if study.has_several else "agents"
+    started = time.time()
+    with Tally(config.num_agents, f"{who} on {world}") as tally:
+        outcome = evaluate_agents(
+            agent, env, env_params, study.task, trainings[family.key], keys, config.lanes,
+            config.devices, tally.add if tally.is_live else None,
+        )  # fmt: skip
+        outcome = jax.device_get(outcome)
+    drawn = jax.device_get(jax.vmap(agent.drawn_values)(keys))
     print(f"{world}: {config.num_agents} {who} in {time.time() - started:.1f} s", flush=True)
     numbers: dict[str, Any] = {"agent": range(config.num_agents)}
     if study.has_several:

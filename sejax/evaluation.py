@@ -147,13 +147,21 @@ def evaluate_agents(
     keys: Array,
     lanes: int | None = None,
     devices: int | None = None,
+    on_done: Callable[[], None] | None = None,
 ) -> Outcome:
     """Trains and tests one fresh agent for each key, over all devices; leaves `[agent]`.
 
-    It compiles at every call: in a loop, jit `make_evaluator` yourself.
+    It compiles at every call: in a loop, jit `make_evaluator` yourself. `on_done` is called from
+    the program's threads as each agent ends, also for copies that fill up the last lanes. The
+    numbers are the same with it, but jax keeps no compiled program that calls back.
     """
     evaluate = make_evaluator(agent, env, task, training)
-    program = spread_over_devices(
-        lambda key: evaluate(key, env_params), devices, lanes, lanes_on_cpu(agent, training)
-    )
+
+    def one(key: Array) -> Outcome:
+        outcome: Outcome = evaluate(key, env_params)
+        if on_done is not None:
+            jax.debug.callback(lambda _: on_done(), outcome.test_return)
+        return outcome
+
+    program = spread_over_devices(one, devices, lanes, lanes_on_cpu(agent, training))
     return jax.jit(program, compiler_options=compiler_options())(keys)

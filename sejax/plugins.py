@@ -13,6 +13,7 @@ group         entry points            `make(...)` gives
 `proxy`       `sejax.proxies`         `(task)` a `sejax.ProxyEnv`
 `objective`   `sejax.objectives`      `(task)` a `sejax.Objective`
 `es`          `sejax.strategies`      `(num_dims)` a `sejax.Strategy`
+`tracker`     `sejax.trackers`        `(run)` a `sejax.app.trackers.Tracker`
 ============= ======================= ==============================================
 
 A name is one that comes with sejax, one that an installed package offers as an entry point, or
@@ -104,6 +105,12 @@ GROUPS = {
     "es": Group("sejax.strategies", ("num_dims",), {
         "nes": "sejax.es.nes:NESConfig",
         **dict.fromkeys(_EVOSAX, "sejax.es.evosax:EvosaxConfig"),
+    }),
+    "tracker": Group("sejax.trackers", ("run",), {
+        "none": "sejax.app.trackers:NoTracker",
+        "tensorboard": "sejax.app.trackers:TensorBoardConfig",
+        "wandb": "sejax.app.trackers:WandbConfig",
+        "trackio": "sejax.app.trackers:TrackioConfig",
     }),
 }  # fmt: skip
 

@@ -10,12 +10,13 @@ import sys
 import jax
 import pandas as pd
 import pytest
+from rich.console import Console
 from support import is_drawn
 
 import sejax
 from sejax.agents.ppo import PPOConfig
 from sejax.agents.tabular import QLearningConfig
-from sejax.app import build, commands, compose
+from sejax.app import build, commands, compose, progress
 from sejax.app.families import families_of
 from sejax.errors import ConfigError
 from sejax.evaluate import _proxy_study, evaluate
@@ -110,6 +111,30 @@ def test_several_agents_are_in_one_table(room, tmp_path, capsys):
     printed = capsys.readouterr().out
     assert "2 fresh agents of each family" in printed and printed.count("sarsa") == 4
     assert is_drawn(tmp_path / "evaluation.png")
+
+
+@pytest.mark.slow
+def test_a_live_line_counts_the_agents_and_changes_no_number(room, tmp_path, monkeypatch):
+    lines = []
+
+    class Live(progress.Tally):
+        def __init__(self, total, things):
+            lines.append((total, things, []))
+            terminal = Console(file=io.StringIO(), force_terminal=True)
+            super().__init__(total, things, terminal)
+
+        def add(self, count=1):
+            lines[-1][-1].append(count)
+            super().add(count)
+
+    words = [f"proxy={room}", "num_agents=3"]
+    evaluate(evaluate_config(*words, f"out_dir={tmp_path}/quiet", words=ROOM))
+    monkeypatch.setattr(progress, "Tally", Live)
+    evaluate(evaluate_config(*words, f"out_dir={tmp_path}/live", words=ROOM))
+    quiet, live = (tmp_path / name / "evaluation.csv" for name in ("quiet", "live"))
+    assert live.read_bytes() == quiet.read_bytes()
+    done = [1, 1, 1]
+    assert lines == [(3, "agents on the proxy", done), (3, "agents on the real task", done)]
 
 
 def test_agents_train_as_the_proxy_was_learned(evaluated):

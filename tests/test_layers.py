@@ -12,7 +12,7 @@ ROOT = Path(__file__).parents[1] / "sejax"
 # folder; not its neighbours. Names in strings (`sejax.plugins`, `sejax.__getattr__`) are looked up
 # when somebody asks for what they stand for: they do not count.
 LAYERS = [
-    {"run", "evaluate", "experiments"},
+    {"run", "evaluate", "report", "experiments"},
     {"app"},
     {"bilevel"},
     {"evaluation"},
@@ -35,7 +35,7 @@ LAYERS = [
     {"errors"},
     {"", "conf"},
 ]
-COMMANDS = ("app", "run", "evaluate", "experiments")
+COMMANDS = ("app", "run", "evaluate", "report", "experiments")
 
 
 def name_of(path):

@@ -177,6 +177,54 @@ def test_a_population_that_diverges_finishes_and_is_counted(tmp_path):
     assert all(math.isfinite(float(row["incumbent_mean"])) for row in rows(tmp_path))
 
 
+# --- trackers ------------------------------------------------------------------------------------
+
+TRACKER = """
+import json
+from pathlib import Path
+
+class Lines:
+    def __init__(self, run, fail_at):
+        self.path, self.fail_at = run.folder.parent / "lines", fail_at
+    def log(self, generation, values, scores):
+        if generation == self.fail_at:
+            raise RuntimeError("out of paper")
+        members = scores.get("member_scores", [])
+        line = [generation, values["incumbent_mean"], list(map(float, members))]
+        with self.path.open("a") as file:
+            file.write(json.dumps(line) + chr(10))
+    def show(self, name, picture, generations):
+        assert picture.exists()
+    def close(self):
+        pass
+
+def make(run, fail_at: int | None = None):
+    return Lines(run, fail_at)
+"""
+
+
+def test_a_tracker_of_ones_own_is_told_what_the_files_have(uninterrupted, tmp_path, monkeypatch):
+    (tmp_path / "my_tracker.py").write_text(TRACKER)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    learn(tmp_path / "run", "generations=4", "tracker=my_tracker:make")
+    said = learn(tmp_path / "run", "generations=6", "tracker=my_tracker:make", "tracker.fail_at=5")
+    assert "tracker=my_tracker:make has failed" in said and "RuntimeError: out of paper" in said
+    made = rows(tmp_path / "run")
+    assert made == rows(uninterrupted)
+    proxies = [(path / "proxy.safetensors").read_bytes() for path in (tmp_path / "run",
+                                                                      uninterrupted)]  # fmt: skip
+    assert proxies[0] == proxies[1]
+    lines = [json.loads(line) for line in (tmp_path / "lines").read_text().splitlines()]
+    assert [line[0] for line in lines] == [0, 1, 2, 3, 4]
+    for (_, mean, scores), row in zip(lines, made, strict=False):
+        assert mean == float(row["incumbent_mean"])
+        assert max(scores) == pytest.approx(float(row["population_max"]))
+        assert sum(scores) / len(scores) == pytest.approx(float(row["population_mean"]))
+    learn(tmp_path / "run", "generations=6", "tracker=my_tracker:make")  # what it has missed
+    last = json.loads((tmp_path / "lines").read_text().splitlines()[-1])
+    assert last == [5, float(made[5]["incumbent_mean"]), []]
+
+
 # --- families of agents --------------------------------------------------------------------------
 
 FAMILIES = ("agents=[sarsa,q_learning]",)

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from sejax import agents, envs, plugins, serialize
-from sejax.app import families
+from sejax.app import families, trackers
 from sejax.app.families import AgentsConfig, families_of
 from sejax.errors import ConfigError, one_of, require, require_seed, shortened, whole
 from sejax.families import Families
@@ -17,7 +17,7 @@ from sejax.training import TrainingConfig, steps_before_learning
 AGENT_HPARAMS = ("default", "varied")
 EVALUATION_HPARAMS = (*AGENT_HPARAMS, "as_learned")
 TRAINING_FROM = ("proxy", "config")
-LEARN_GROUPS = ("env", "proxy", "agent", "exploration", "es", "objective")
+LEARN_GROUPS = ("env", "proxy", "agent", "exploration", "es", "objective", "tracker")
 EVALUATE_GROUPS = ("agent", "exploration")
 TRAININGS = ("training", "real_training")
 
@@ -40,6 +40,7 @@ class LearnConfig:
     exploration: Any
     es: Any
     objective: Any
+    tracker: Any  # who is told of the run beside its files
     training: TrainingConfig
     agent_hparams: str  # default: the agent's; varied: drawn anew for each training
     generations: int  # n_o
@@ -59,6 +60,7 @@ class LearnConfig:
         require_seed("seed + num_seeds - 1", self.seed + self.num_seeds - 1)
         whole(1, "checkpoint_every", self.checkpoint_every, "it counts generations", 1)
         _require_computing(self)
+        trackers.require_package(self.tracker)
         require_real_returns("training", self.training)
         returns = getattr(self.objective, "scores_are_returns", None)
         require(not self.stop_when_solved or returns is not False, "stop_when_solved",
@@ -178,7 +180,8 @@ def learn_config(values: Mapping[str, Any]) -> LearnConfig:
     Raises:
       ConfigError: for an unknown, missing or bad field, or parts that cannot work together.
     """
-    return _from_plain(LearnConfig, LEARN_GROUPS, values)
+    untracked = {"tracker": {"name": "none"}}  # of a stored proxy: nobody follows what is over
+    return _from_plain(LearnConfig, LEARN_GROUPS, untracked | dict(values))
 
 
 def evaluate_config(values: Mapping[str, Any]) -> EvaluateConfig:

@@ -1,18 +1,66 @@
-"""The live progress line of `sejax.run`, and its last words."""
+"""Live lines of progress on a terminal, and the last words of `sejax.run`."""
 
 import time
 from typing import Any
 
 import numpy as np
 from rich.console import Console
-from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    Progress,
+    SpinnerColumn,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
 
 from sejax import plugins
-from sejax.app import presets
+from sejax.app import next_steps, presets
 from sejax.app.build import LearnConfig
 from sejax.app.families import families_of
 
 DRAW_EVERY_S = 30.0
+
+
+class Tally:
+    """One live line on a terminal: how many are done of all, and the time left; nothing elsewhere.
+
+    Example:
+      >>> with Tally(20, "agents on the proxy") as tally:
+      ...     tally.add(5)
+      >>> tally.is_live
+      False
+    """
+
+    def __init__(self, total: int, things: str, console: Console | None = None):
+        console = console or Console(highlight=False, markup=False)
+        self.is_live = console.is_terminal
+        self._progress = Progress(
+            SpinnerColumn(),
+            TextColumn("{task.completed:,.0f}/{task.total:,.0f} {task.description}"),
+            BarColumn(bar_width=16),
+            TimeElapsedColumn(),
+            TextColumn("left"),
+            TimeRemainingColumn(),
+            console=console,
+            disable=not self.is_live,
+            transient=True,
+        )
+        self._task = self._progress.add_task(things, total=total)
+        self._total = total
+
+    def __enter__(self) -> "Tally":
+        self._progress.start()
+        return self
+
+    def __exit__(self, *_: Any) -> None:
+        self._progress.stop()
+
+    def add(self, count: int = 1) -> None:
+        """Counts what is done, from any thread; there are no more than all."""
+        self._progress.update(self._task, advance=count)
+        if self._progress.tasks[0].completed > self._total:
+            self._progress.update(self._task, completed=self._total)
 
 
 class RunProgress:
@@ -108,7 +156,11 @@ class RunProgress:
             verdict = (
                 f"{solved}: best incumbent mean {best:.1f}, solved at {program.solved_score:g}"
             )
-        path = directory.path
+        path, config = directory.path, self._config
+        agents = [plugins.name_of("agent", each.agent) for each in families_of(config)]
+        words = next_steps.evaluate_words(
+            path, config.name("env"), config.name("proxy"), agents, program.proxy.is_real
+        )
         title = "learned" if ended == "finished" else ended
         self._console.rule(f"{program.task.name}: {title}", align="left")
         self.print(
@@ -117,26 +169,10 @@ class RunProgress:
             f"  {path}/learning_curve.png   how it was learned\n"
             f"  {path}/metrics.csv          a row for each generation\n\n"
             f"Train fresh agents on it, and on the real task beside them:\n"
-            f"  python -m sejax.evaluate proxy={path}{self._own_words(program)} num_agents=20\n"
+            f"  python -m sejax.evaluate {' '.join(words)}\n"
             f"Use it as a gymnax environment:\n"
             f'  env, params = sejax.load("{path}"{self._own_arguments()})'
         )
-
-    def _own_words(self, program: Any) -> str:
-        """What `sejax.evaluate` must be told beside the proxy."""
-        config = self._config
-        words = ""
-        if ":" in config.name("env"):
-            words += f" env={config.name('env')}"
-        if ":" in config.name("proxy"):
-            words += f" proxy_kind={config.name('proxy')}"
-        agent = ",".join(plugins.name_of("agent", each.agent) for each in families_of(config))
-        # An RN is judged with the agent that it was learned with; an SE is meant for the paper's.
-        if program.proxy.is_real and ":" not in agent:
-            return f"{words} agent_hparams=as_learned"
-        if config.agents is not None:
-            return f"{words} agent=[{agent}]"
-        return words if agent == "ddqn" else f"{words} agent={agent}"
 
     def _own_arguments(self) -> str:
         """What `sejax.load` must be given beside the proxy."""

@@ -23,8 +23,9 @@ from sejax.serialize import flatten
 
 __all__ = ["COLUMNS", "FREE_FIELDS", "RunDirectory", "open_for"]
 
-# Fields that say how or how long to compute, not what: they may change between two sessions.
-FREE_FIELDS = {"generations", "devices", "checkpoint_every", "run_dir"}
+# Fields, and groups of them, that say how or how long to compute, not what: they may change between
+# two sessions.
+FREE_FIELDS = {"generations", "devices", "checkpoint_every", "run_dir", "tracker"}
 HINT = "Set run_dir=FOLDER."
 _SHOWN = 10  # differing fields that a message names
 
@@ -244,7 +245,8 @@ class RunDirectory:
         differing = [
             f"{name} ({_short(old.get(name))} there, {_short(asked.get(name))} here)"
             for name in sorted(old.keys() | asked.keys())
-            if name not in FREE_FIELDS and not _same(old.get(name), asked.get(name))
+            if name.partition(".")[0] not in FREE_FIELDS
+            and not _same(old.get(name), asked.get(name))
         ]
         if differing:
             more = f" and {len(differing) - _SHOWN} more" if len(differing) > _SHOWN else ""

@@ -5,6 +5,7 @@ import os
 import platform
 import sys
 from pathlib import Path
+from typing import Any
 
 from sejax import files
 
@@ -68,6 +69,20 @@ def enable_compilation_cache() -> None:
         return
     jax.config.update("jax_compilation_cache_dir", str(root / cpu_fingerprint()))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
+
+
+def machine() -> dict[str, Any]:
+    """What kind of machine this is; not which."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        models = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    except OSError:
+        models = []
+    return {
+        "system": f"{platform.system()} {platform.release()}",
+        "processor": models[0] if models else platform.processor() or platform.machine(),
+        "cores": available_cores(),
+    }
 
 
 def cpu_fingerprint() -> str:

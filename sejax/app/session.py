@@ -8,7 +8,8 @@ from typing import Any, Protocol
 import jax
 import numpy as np
 
-from sejax.app import build, commands
+from sejax.app import build, commands, runtime
+from sejax.app.follower import Follower
 from sejax.app.run_directory import RunDirectory
 from sejax.bilevel import Program, make_program
 from sejax.counters import exact
@@ -132,33 +133,41 @@ def run(
         return cpu_before + time.process_time() - cpu_started
 
     state = jax.tree.map(lambda x: x.copy(), state)  # own buffers, so that they can be donated
-    while generation < config.generations and not bool(state.finished.all()):
-        length = min(config.checkpoint_every, config.generations - generation)
-        if not chunks.is_ready(config.num_seeds, length):
-            report.say("compiling")
-            chunks.compile(config.num_seeds, length)
-            report.compiled()
-        state, info = chunks.advance(state, length)
-        _wait(state)
-        generation += length
-        host_state, info = jax.device_get((state, info))
-        with commands.interrupts_held():
-            directory.append(info, wall_before + time.time() - started)
-            proxies.save(host_state)
-            directory.commit(generation, state, cpu_s())
-        report.update(generation, info)
-        if report.time_to_draw():
-            draw(directory, program)
-    ended = "solved" if bool(state.finished.all()) else "finished"
-    draw(directory, program)
+    with Follower(config, directory, report) as follower:
+        if generation < config.generations and not bool(state.finished.all()):
+            follower.open()
+        follower.tell()  # what it has missed
+        while generation < config.generations and not bool(state.finished.all()):
+            length = min(config.checkpoint_every, config.generations - generation)
+            if not chunks.is_ready(config.num_seeds, length):
+                report.say("compiling")
+                chunks.compile(config.num_seeds, length)
+                report.compiled()
+            state, info = chunks.advance(state, length)
+            _wait(state)
+            generation += length
+            host_state, info = jax.device_get((state, info))
+            with commands.interrupts_held():
+                directory.append(info, wall_before + time.time() - started)
+                proxies.save(host_state)
+                directory.commit(generation, state, cpu_s())
+            report.update(generation, info)
+            with commands.interrupts_held():
+                follower.tell(info)
+            if report.time_to_draw():
+                draw(directory, program)
+        ended = "solved" if bool(state.finished.all()) else "finished"
+        draw(directory, program)
     directory.write_summary(
         ended=ended,
         best_score=float(state.best_score.max()),
         generations=generation,
+        solved_score=program.solved_score,
         wall_s=round(wall_before + time.time() - started, 1),
         cpu_s=round(cpu_s(), 1),
         **_cost(state, directory, program.strategy.num_candidates),
         devices=[str(device) for device in jax.devices()],
+        machine=runtime.machine(),
         versions=_versions(),
     )
     return ended
@@ -169,7 +178,8 @@ class Proxies:
 
     def __init__(self, config: build.LearnConfig, folder: Path, program: Program):
         self.config, self.folder, self.program = config, folder, program
-        self._plain = build.to_plain(config)
+        # Who followed the run is no part of what was learned.
+        self._plain = {k: v for k, v in build.to_plain(config).items() if k != "tracker"}
         self._discount = float(program.agent.discount(program.agent.hparams))
         self._stored: dict[int, int] = {}  # generation of each seed's best one that is on the disk
 

@@ -73,14 +73,17 @@ def learn_all(
         is in use.
     """
     from sejax.app import run_directory, session
+    from sejax.app.progress import Tally
 
     chunks = session.make_chunks(configs[0])
     curves = []
-    for config in configs:
-        with run_directory.open_for(config, f"Set {option}=DIR.") as directory:
-            curve = learn(config, directory, chunks)
-        print(f"{config.run_dir}: {_said(curve, chunks.program.solved_score)}", flush=True)
-        curves.append(curve)
+    with Tally(sum(config.num_seeds for config in configs), "NES runs") as tally:
+        for config in configs:
+            with run_directory.open_for(config, f"Set {option}=DIR.") as directory:
+                curve = learn(config, directory, chunks)
+            print(f"{config.run_dir}: {_said(curve, chunks.program.solved_score)}", flush=True)
+            curves.append(curve)
+            tally.add(config.num_seeds)
     return pd.concat(curves, ignore_index=True)
 
 

@@ -246,7 +246,7 @@ def _what_counts(config: Any) -> dict[str, Any]:
     """What a run depends on; not how it is computed, with which others, or where it is kept."""
     free = run_directory.FREE_FIELDS - {"generations"} | {"lanes", "num_seeds"}
     flat = serialize.flatten(build.to_plain(config))
-    return {name: value for name, value in flat.items() if name not in free}
+    return {name: value for name, value in flat.items() if name.partition(".")[0] not in free}
 
 
 def check_stored(settings: RnSettings, objectives: Sequence[str]) -> None:

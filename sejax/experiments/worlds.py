@@ -18,6 +18,7 @@ import pandas as pd
 import sejax
 from sejax import plugins, serialize
 from sejax.agents import NoExploration
+from sejax.app.progress import Tally
 from sejax.experiments import return_curves
 from sejax.experiments.settings import Settings
 from sejax.parallel import spread_over_devices
@@ -100,17 +101,20 @@ def train_groups(
     shared = {"num_agents": num_agents, "seed": settings.seed}
     tables = []
     every = [(f"{world.name}-{group.name}", i) for i, group in enumerate(world.groups)]
-    for first in range(0, len(every), at_once):
-        places = dict(every[first : first + at_once])
-        named = {name: world.settings_of(world.groups[i]) | shared for name, i in places.items()}
+    with Tally(len(every) * num_agents, f"agents: {world.name}") as tally:
+        for first in range(0, len(every), at_once):
+            places = dict(every[first : first + at_once])
+            named = {n: world.settings_of(world.groups[i]) | shared for n, i in places.items()}
 
-        def compute(missing: list[str], places: dict[str, int] = places) -> list[pd.DataFrame]:
-            chosen = [places[name] for name in missing]
-            return train(world, settings, num_agents, measure, chosen, at_once)
+            def compute(missing: list[str], places: dict[str, int] = places) -> list[pd.DataFrame]:
+                chosen = [places[name] for name in missing]
+                return train(world, settings, num_agents, measure, chosen, at_once)
 
-        for name, table in zip(places, settings.pieces.compute_all(named, compute), strict=True):
-            print(f"{name}: {measure.say(table)}", flush=True)
-            tables.append(table.assign(group=world.groups[places[name]].name))
+            made = settings.pieces.compute_all(named, compute)
+            for name, table in zip(places, made, strict=True):
+                print(f"{name}: {measure.say(table)}", flush=True)
+                tables.append(table.assign(group=world.groups[places[name]].name))
+                tally.add(num_agents)
     return pd.concat(tables, ignore_index=True)
 
 

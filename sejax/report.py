@@ -1,0 +1,69 @@
+"""`python -m sejax.report RUN_DIR...`: a page about a run, or one that compares several.
+
+The page is one HTML file that needs nothing else. Beside an evaluation in the run directory
+(`python -m sejax.evaluate`), it shows that too.
+"""
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from sejax.app import commands
+from sejax.errors import require
+
+USAGE = """python -m sejax.report RUN_DIR... [out=FILE]
+
+Writes a page about a run, or one that compares several: curves, tables, settings, versions, and the
+commands to go on. It is one HTML file that needs nothing else.
+
+  RUN_DIR    a folder that python -m sejax.run has made
+  out=FILE   the page; report.html in the run directory, of several runs in the current folder"""
+
+
+def main(words: Sequence[str] | None = None) -> None:
+    """Writes the report that the command line asks for; bad input ends it with one message."""
+    words = sys.argv[1:] if words is None else words
+    if {"--help", "-h"} & {*words}:
+        print(USAGE)
+        return
+    write: Any = commands.guarded(lambda _: _main(words))
+    write(words)
+
+
+def _main(words: Sequence[str]) -> float:
+    outs = [word.removeprefix("out=") for word in words if word.startswith("out=")]
+    folders = [Path(word) for word in words if not word.startswith("out=")]
+    print(report(folders, Path(outs[-1]) if outs else None))
+    return float(len(folders))
+
+
+def report(folders: Sequence[Path], out: Path | None = None) -> Path:
+    """Writes the page about these run directories.
+
+    Args:
+      folders: run directories.
+      out: the file; `report.html` in the only run directory, or in the current folder.
+
+    Returns:
+      The file.
+
+    Raises:
+      ConfigError: if there is no run, or one that cannot be read.
+      OSError: if the file cannot be written.
+    """
+    from sejax.app import report as pages
+    from sejax.files import write_text
+
+    require(folders, "RUN_DIR", "be given", "the report is about it", "none",
+            "one or several: python -m sejax.report runs/cartpole-se-ddqn-s0")  # fmt: skip
+    if out is None:
+        out = Path(folders[0] if len(folders) == 1 else ".", "report.html")
+    require(not out.is_dir(), "out", "be a file", "the page is written there", f"the folder {out}",
+            f"out={out / 'report.html'}")  # fmt: skip
+    write_text(out, pages.page(pages.read(folders)))
+    return out
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,185 @@
+"""`python -m sejax.report`: pages about runs, made of their files alone."""
+
+import functools
+import json
+from html.parser import HTMLParser
+
+import pytest
+import yaml
+
+import sejax
+from sejax import report
+from sejax.app import build, commands, next_steps
+from sejax.app import report as pages
+from sejax.app.metrics import columns_of
+
+HOSTILE = "<script>alert(1)</script>$\\frac{"
+
+
+@functools.cache
+def stored(*words):
+    """A run's configuration as its file has it."""
+    return yaml.safe_dump(build.to_plain(sejax.config([*words, "generations=3"])), sort_keys=False)
+
+
+def write_run(path, *words, means=(10.0, 196.0, 150.0), ended=True, **changes):
+    """The files of a run with these incumbent means."""
+    path.mkdir()
+    config = yaml.safe_load(stored(*words)) | changes
+    (path / "config.yaml").write_text(yaml.safe_dump(config, sort_keys=False))
+    rows = [f"{i},0,{mean},{5.0},{mean - 1},{mean + 1},{max(means[: i + 1])},2000,2000,20.5,0,"
+            f"{1000 * (i + 1)},{2.5 * i}" for i, mean in enumerate(means)]  # fmt: skip
+    (path / "metrics.csv").write_text("\n".join([",".join(columns_of()), *rows, ""]))
+    summary = {
+        "ended": "finished", "generations": len(means), "solved_score": 195.0, "wall_s": 12.5,
+        "train_steps": 123456, "devices": ["TFRT_CPU_0"], "machine": {"processor": "A CPU"},
+        "versions": {"python": "3.11", "sejax": "0.2"},
+    }  # fmt: skip
+    if ended:
+        (path / "run.json").write_text(json.dumps(summary))
+    return path
+
+
+def evaluate(path, worlds=("the proxy", "the real task")):
+    rows = [f"{world},{i},{190 + i},{2000 * (place + 1)},20"
+            for place, world in enumerate(worlds) for i in range(3)]  # fmt: skip
+    (path / "evaluation.csv").write_text(
+        "\n".join(["world,agent,test_return,train_steps,train_episodes", *rows, ""])
+    )
+
+
+class Page(HTMLParser):
+    """What a browser would see: elements with their attributes, and the text of each."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.elements, self.texts, self.open = [], [], []
+        self.feed(text)
+
+    def handle_starttag(self, tag, attributes):
+        self.elements.append((tag, dict(attributes)))
+
+    def handle_data(self, data):
+        self.texts.append(data.strip())
+
+    def of(self, tag):
+        return [attributes for name, attributes in self.elements if name == tag]
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """A run with an evaluation, and the page about it."""
+    run = write_run(tmp_path_factory.mktemp("whole") / "run", seed=3)
+    evaluate(run)
+    out = report.report([run])
+    assert out == run / "report.html"
+    return run, Page(out.read_text())
+
+
+def test_the_page_of_a_run_says_what_its_files_say(whole):
+    run, page = whole
+    for text in ("solved, after 3 of 3 generations", "196.0 ± 5.0", "195", "123,456", "A CPU",
+                 "0.2", "agent.learning_rate", "the real task", "191.0 ± 1.0"):  # fmt: skip
+        assert any(text in x for x in page.texts), text
+    assert f"python -m sejax.evaluate proxy={run} num_agents=20" in page.texts
+    again = f"python -m sejax.run env=cartpole proxy=se generations=6 seed=3 run_dir={run}"
+    assert again in page.texts
+
+
+@pytest.fixture
+def no_words(monkeypatch):
+    """Leaves the command that goes on out of a page: to compose its words takes a second."""
+    monkeypatch.setattr(next_steps, "run_words", lambda stored: None)
+
+
+def test_the_page_needs_nothing_else_and_says_what_figures_show(whole):
+    _, page = whole
+    tags = {tag for tag, _ in page.elements}
+    assert not tags & {"script", "link", "img", "iframe", "object", "image"}
+    ids = [x["id"] for _, x in page.elements if "id" in x]
+    assert len(ids) == len(set(ids))
+    for tag, attributes in page.elements:
+        for name, value in attributes.items():
+            assert name in ("xmlns", "xmlns:xlink") or "//" not in (value or ""), (tag, name)
+            assert name not in ("href", "xlink:href") or value[1:] in ids
+    figures = page.of("figure")
+    assert len(figures) == 2 and all(x["role"] == "img" and x["aria-label"] for x in figures)
+    assert page.of("html")[0]["lang"] == "en" and page.of("meta")
+
+
+def test_what_differs_between_runs_comes_first(tmp_path):
+    runs = [write_run(tmp_path / f"seed{i}", seed=i) for i in range(3)]
+    rows = pages.settings(pages.read(runs))
+    assert rows[0] == ("seed", ["0", "1", "2"], True)
+    assert not any(differs for _, _, differs in rows[1:])
+
+
+def test_what_comes_from_files_is_text(tmp_path, monkeypatch, no_words):
+    run = write_run(tmp_path / f"_{HOSTILE.replace('/', '')}", preset=HOSTILE)
+    evaluate(run, worlds=(HOSTILE, f"_{HOSTILE}"))
+    summary = json.loads((run / "run.json").read_text())
+    summary["versions"] = {HOSTILE: HOSTILE}
+    (run / "run.json").write_text(json.dumps(summary))
+    other = write_run(tmp_path / "b", env={"name": HOSTILE})
+    monkeypatch.chdir(tmp_path)
+    text = report.report([run, other]).read_text()
+    assert "<script" not in text
+    page = Page((tmp_path / "report.html").read_text())
+    assert any(HOSTILE in x for x in page.texts) and "2 runs compared" in page.texts
+    assert len(page.of("figure")) == 4
+    assert [x.get("class") for x in page.of("tr")].count("differs") == 2  # preset and env.name
+
+
+def test_a_run_that_goes_on_is_told_as_such(tmp_path):
+    run = write_run(tmp_path / "run", ended=False)
+    with (run / "metrics.csv").open("a") as file:
+        file.write("3,0,11.5,2")  # a row that is being written
+    (read,) = pages.read([run])
+    assert read.generations == 3 and read.how_it_ended.startswith("not ended: 3 of 3")
+    assert read.environment == {} and read.solved_score is None
+    assert "Go on, to generation 3" in dict(read.commands)
+
+
+def test_many_generations_are_thinned_to_the_last(tmp_path):
+    run = write_run(tmp_path / "run", means=[float(i) for i in range(1000)])
+    (read,) = pages.read([run])
+    assert 50 <= len(read.thinned) <= pages.MOST_ROWS
+    assert read.thinned[-1]["generation"] == "999"
+
+
+def test_the_words_of_a_run_compose_its_configuration():
+    words = ["agents=[ddqn,ppo]", "agents.ppo.weight=2", "es=snes", "run_dir='a b,c=é'"]
+    config = sejax.config(words)
+    found = next_steps.run_words(build.to_plain(config))
+    assert found is not None and sejax.config(found) == config
+
+
+def test_nothing_that_a_file_names_is_imported(tmp_path, monkeypatch):
+    (tmp_path / "mine_for_reports.py").write_text("raise SystemExit('imported')")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    run = write_run(tmp_path / "run", env={"name": "mine_for_reports:make"})
+    ((_, command),) = pages.read([run])[0].commands
+    assert "env=mine_for_reports:make" in command
+
+
+def test_folders_that_are_no_runs_are_refused(tmp_path, capsys, no_words):
+    broken = write_run(tmp_path / "broken")
+    (broken / "run.json").write_text("[")
+    half = write_run(tmp_path / "half", agent="ddqn")
+    for words, said in [
+        ([], "RUN_DIR must be given"),
+        ([str(tmp_path)], "RUN_DIR must be the folder of a run"),
+        ([str(broken)], "JSONDecodeError"),
+        ([str(half)], "RUN_DIR must be the folder of a run"),
+        ([str(write_run(tmp_path / "run")), f"out={tmp_path}"], "out must be a file"),
+    ]:
+        with pytest.raises(SystemExit) as ended:
+            report.main(words)
+        error = capsys.readouterr().err
+        assert ended.value.code == commands.BAD_INPUT
+        assert said in error and len(error.strip().splitlines()) == 1
+
+
+def test_help_says_how_to_use_it(capsys):
+    report.main(["--help"])
+    assert "python -m sejax.report RUN_DIR..." in capsys.readouterr().out
