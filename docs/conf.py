@@ -5,10 +5,13 @@ they stand, and a link that leads somewhere in the repository leads there on the
 """
 
 import sys
+import typing
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 sys.path[:0] = [str(ROOT), str(ROOT / "docs" / "_ext")]
+
+typing.GENERATING_DOCUMENTATION = "sejax"  # type: ignore[attr-defined] # jaxtyping then names `Array` plainly
 
 import sejax  # noqa: E402
 
@@ -26,6 +29,7 @@ extensions = [
     "sphinx_copybutton",
     "field_tables",
     "mathml",
+    "page_links",
 ]
 root_doc = "docs/index"
 include_patterns = [
@@ -46,7 +50,12 @@ nb_merge_streams = True
 
 default_role = "code"  # docstrings have single backticks
 autodoc_class_signature = "mixed"
-autodoc_default_options = {"members": True, "member-order": "bysource"}
+autodoc_default_options = {
+    "members": True,
+    "special-members": "__call__",
+    "exclude-members": "replace",  # of flax's dataclasses, one as the other
+    "member-order": "bysource",
+}
 autodoc_typehints_format = "short"
 autodoc_preserve_defaults = True
 autosummary_generate = False

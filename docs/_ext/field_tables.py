@@ -57,7 +57,7 @@ def add_table(app: Sphinx, what: str, name: str, cls: Any, options: Any, lines: 
     if not table:
         return
     columns = [0, 1, 2, 3] if any(default for _, _, default, _ in table) else [0, 1, 3]
-    cells = [("field", "type", "default", "")]
+    cells = [("field", "type", "default", "what it is")]
     cells += [(*(f"``{x}``" if x else "" for x in row), escape(about)) for *row, about in table]
     lines += ["", ".. list-table::", "   :header-rows: 1", ""]
     for row in cells:
