@@ -15,6 +15,8 @@ from typing import Any
 
 from sphinx.application import Sphinx
 
+from sejax.experiments.settings import Settings
+
 
 def comments_of_fields(cls: type) -> dict[str, str]:
     """The comment above or behind each field that the class itself has."""
@@ -37,16 +39,20 @@ def comments_of_fields(cls: type) -> dict[str, str]:
 
 
 def rows(cls: type) -> Iterator[tuple[str, str, str, str]]:
-    """Name, type, default and meaning of each field."""
+    """Name, type, default and meaning of each field; of an experiment, of those of its own."""
     comments: dict[str, str] = {}
     for base in reversed(cls.__mro__):
         if dataclasses.is_dataclass(base):
             comments |= {name: text for name, text in comments_of_fields(base).items() if text}
+    shared = (
+        dataclasses.fields(Settings) if cls is not Settings and issubclass(cls, Settings) else ()
+    )
     for field in dataclasses.fields(cls):
-        if field.init and not field.name.startswith("_"):
+        if field.init and not field.name.startswith("_") and field not in shared:
             default = "" if field.default is dataclasses.MISSING else repr(field.default)
             meaning = field.metadata.get("about") or comments.get(field.name, "")
-            yield field.name, inspect.formatannotation(field.type), default, meaning
+            type_name = re.sub(r"(\w+\.)+(?=\w)", "", inspect.formatannotation(field.type))
+            yield field.name, type_name, default, meaning
 
 
 def add_table(app: Sphinx, what: str, name: str, cls: Any, options: Any, lines: list[str]) -> None:
