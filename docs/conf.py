@@ -31,6 +31,7 @@ extensions = [
     "mathml",
     "page_links",
 ]
+highlight_language = "text"
 root_doc = "docs/index"
 include_patterns = [
     "README.md", "CHANGELOG.md", "CONTRIBUTING.md", "docs/**.md", "results/**.md",
@@ -43,7 +44,7 @@ myst_enable_extensions = ["colon_fence", "dollarmath"]
 myst_heading_anchors = 4  # as the forge names them
 nb_execution_mode = "force"
 nb_execution_raise_on_error = True
-nb_execution_timeout = 300  # seconds of a cell
+nb_execution_timeout = -1  # however slow the machine
 nb_merge_streams = True
 
 # --- the API reference ---------------------------------------------------------------------------
