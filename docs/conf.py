@@ -30,6 +30,7 @@ extensions = [
     "field_tables",
     "mathml",
     "page_links",
+    "root_page",
 ]
 highlight_language = "text"
 root_doc = "docs/index"
@@ -71,6 +72,5 @@ html_theme = "furo"
 html_title = "sejax"
 html_static_path = ["_static"]
 html_css_files = ["site.css"]
-html_extra_path = ["_extra"]  # index.html leads to the start page
 html_copy_source = False
 copybutton_exclude = ".linenos, .gp, .go"
