@@ -1,10 +1,11 @@
 # make run: learn a CartPole synthetic environment until it is solved.  make test: the test suite.
-# Both make .venv first if it is missing; python3.11 or newer, pip, make and git are all they need.
+# make docs: the site, in docs/_build/html.  make linkcheck: its links to other sites.
+# All make .venv first if it is missing; python3.11 or newer, pip, make and git are all they need.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: run test test-slow test-sb3 test-trackers lint typecheck clean
+.PHONY: run test test-slow test-sb3 test-trackers lint typecheck docs linkcheck clean
 
 run: $(VENV)/.installed
 	$(BIN)/python -m sejax.run env=cartpole stop_when_solved=true
@@ -34,6 +35,12 @@ lint: $(VENV)/.installed-dev
 typecheck: $(VENV)/.installed-dev
 	$(BIN)/mypy
 
+docs: $(VENV)/.installed-docs
+	$(BIN)/python -m sphinx -W --keep-going -n -b html -c docs . docs/_build/html
+
+linkcheck: $(VENV)/.installed-docs
+	$(BIN)/python -m sphinx -b linkcheck -c docs -D nb_execution_mode=off . docs/_build/linkcheck
+
 $(BIN)/python:
 	$(PYTHON) -c 'import sys; assert sys.version_info >= (3, 11), "Python 3.11 or newer is needed: make PYTHON=python3.11"'
 	$(PYTHON) -m venv $(VENV)
@@ -46,5 +53,9 @@ $(VENV)/.installed-dev: $(VENV)/.installed
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev]'
 	touch $@
 
+$(VENV)/.installed-docs: $(VENV)/.installed
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[docs]'
+	touch $@
+
 clean:
-	rm -rf $(VENV) $(VENV)-trackers
+	rm -rf $(VENV) $(VENV)-trackers docs/_build

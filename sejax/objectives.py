@@ -122,9 +122,8 @@ class RewardThreshold(Options):
     group: ClassVar[str] = "objective"
     scores_are_returns: ClassVar[bool] = False
 
-    unsolved_weight: float = option(
-        100.0, not_negative("a shortfall must not be rewarded")
-    )  # w_sol
+    # w_sol: training steps that a unit of missing return is worth
+    unsolved_weight: float = option(100.0, not_negative("a shortfall must not be rewarded"))
 
     def make(self, task: Any) -> Objective:
         """The objective on a task.

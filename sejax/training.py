@@ -20,7 +20,7 @@ class TrainingConfig(Options):
 
     group: ClassVar[str] = "training"
 
-    max_episodes: int = option(1000, counts("it counts episodes"))  # n_e
+    max_episodes: int = option(1000, counts("it counts episodes"))  # n_e: of a training at most
     # The stop rule waits for so many training steps.
     min_steps: int = option(0, counts("it counts steps", least=0))
     # Training ends after so many steps, whatever the rule says.

@@ -1,4 +1,7 @@
-"""The examples in docstrings and in the README run as they stand."""
+"""The examples in docstrings and documents run as they stand, and the pages are one site.
+
+`make docs` checks more: it builds the site, and runs its notebooks.
+"""
 
 import doctest
 import importlib
@@ -16,6 +19,11 @@ MODULES = [
     for path in sorted((ROOT / "sejax").rglob("*.py"))
     if ">>>" in path.read_text()
 ]
+PAGES = [
+    *sorted(ROOT.glob("*.md")),
+    *(page for page in sorted((ROOT / "docs").rglob("*.md")) if "_build" not in page.parts),
+    *sorted((ROOT / "results").rglob("*.md")),
+]
 
 
 @pytest.mark.parametrize("name", MODULES)
@@ -25,19 +33,65 @@ def test_docstring_examples_run(name):
     assert results.attempted > 0 and results.failed == 0
 
 
+def python_blocks(page):
+    return re.findall(r"^```python\n(.*?)^```", page.read_text(), re.DOTALL | re.MULTILINE)
+
+
 @pytest.mark.slow
-def test_the_readmes_python_runs():
-    blocks = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
+@pytest.mark.parametrize("page", ["README.md", "docs/index.md", "docs/howto/jax.md"])
+def test_the_python_of_a_page_runs(page):
+    blocks = python_blocks(ROOT / page)
     assert blocks
     for block in blocks:
-        exec(compile(block, "README.md", "exec"), {})
+        exec(compile(block, page, "exec"), {})
 
 
-def test_links_of_the_readme_and_docs_lead_somewhere():
-    for page in [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]:
-        for target in re.findall(r"\]\(([^)#]+)\)", page.read_text()):
-            if not target.startswith("http"):
-                assert (page.parent / target).exists(), f"{page.name} links to {target}"
+def test_the_python_of_all_pages_can_be_read():
+    for page in PAGES:
+        for block in python_blocks(page):
+            compile(block, page, "exec")
+
+
+def anchors(page):
+    """What the forge and the site call the headings of a page."""
+    text = re.sub(r"^```.*?^```", "", page.read_text(), flags=re.DOTALL | re.MULTILINE)
+    headings = re.findall(r"^#+ (.*)$", text, re.MULTILINE)
+    return {re.sub(r"[^\w -]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+def test_links_lead_somewhere():
+    for page in PAGES:
+        for link in re.findall(r"\]\(([^)\s]+)\)", page.read_text()):
+            if not link.startswith("http"):
+                target, _, anchor = link.partition("#")
+                path = page.parent / target if target else page
+                assert path.exists(), f"{page.name} links to {link}"
+                assert not anchor or anchor in anchors(path), f"{page.name} links to {link}"
+
+
+def test_every_page_is_in_a_table_of_contents():
+    listed = {ROOT / "docs/index.md"}
+    for page in PAGES:
+        for tree in re.findall(r"^```{toctree}\n(.*?)^```", page.read_text(), re.DOTALL | re.M):
+            for line in filter(None, tree.splitlines()):
+                entry = re.sub(r".*<(.*)>", r"\1", line)
+                if not entry.startswith(":"):
+                    listed |= {path.resolve() for path in page.parent.glob(f"{entry}.md")}
+    assert set(PAGES) == listed
+
+
+@pytest.mark.parametrize("name", sorted(set(sejax.__all__) - set(sejax._MODULES)))
+def test_every_public_name_is_in_the_api_reference(name):
+    pages = "".join(page.read_text() for page in (ROOT / "docs/api").glob("*.md"))
+    blocks = re.findall(r"^\.\. currentmodule:: sejax$(.*?)^```", pages, re.DOTALL | re.M)
+    assert re.search(rf"^\.\. auto\w+:: {name}$", "".join(blocks), re.M)
+
+
+def test_every_experiment_is_in_the_api_reference():
+    page = (ROOT / "docs/api/experiments.md").read_text()
+    for module in (ROOT / "sejax/experiments").glob("*.py"):
+        if "\nEXPERIMENT = " in module.read_text():
+            assert f".. automodule:: sejax.experiments.{module.stem}\n" in page
 
 
 @pytest.mark.parametrize("name", sorted(sejax.__all__))

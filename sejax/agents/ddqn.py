@@ -37,16 +37,16 @@ LOSSES = {"squared": jnp.square, "huber": optax.losses.huber_loss}
 class DDQNConfig(AgentOptions):
     """DDQN's hyperparameters; the defaults are the paper's "default agent hyperparameters"."""
 
-    batch_size: int = option(128, counts(), varied="triple")
-    buffer_size: int = option(100_000, counts())
-    hidden_size: int = option(128, counts(), varied="triple")
+    batch_size: int = option(128, counts(), varied="triple")  # transitions
+    buffer_size: int = option(100_000, counts())  # steps that are remembered
+    hidden_size: int = option(128, counts(), varied="triple")  # units of each hidden layer
     num_layers: int = option(2, counts(most=MOST_LAYERS), varied="one_more_or_less")
     activation: str = option("relu", one_of(ACTIVATIONS))
-    learning_rate: float = option(1e-3, positive(MOVES), traced=True, varied="triple")
+    learning_rate: float = option(1e-3, positive(MOVES), traced=True, varied="triple")  # of Adam
     # tau: weight of the online network in the target's update
     target_update_rate: float = option(0.01, fraction(), traced=True)
     discount: float = option(0.99, fraction(), traced=True)  # gamma
-    epsilon_init: float = option(1.0, fraction(), traced=True)
+    epsilon_init: float = option(1.0, fraction(), traced=True)  # share of random actions
     epsilon_min: float = option(0.01, fraction(), traced=True)
     epsilon_decay: float = option(0.9, fraction(), traced=True)  # factor for each episode
     # If given, epsilon falls linearly in so many steps from when the agent first learns, whatever

@@ -1,0 +1,98 @@
+"""A table of a dataclass's fields, under its docstring: type, default, and what it is.
+
+What a field is stands beside it in the source, in a comment or as `about` in its metadata, and is
+written nowhere else.
+"""
+
+import ast
+import dataclasses
+import inspect
+import io
+import re
+import tokenize
+from collections.abc import Iterator
+from typing import Any
+
+from sphinx.application import Sphinx
+
+from sejax.experiments.settings import Settings
+
+
+def comments_of_fields(cls: type) -> dict[str, str]:
+    """The comment above or behind each field that the class itself has."""
+    source = inspect.cleandoc(inspect.getsource(cls))
+    above: dict[int, str] = {}  # by line: comments that have it for themselves
+    behind: dict[int, str] = {}
+    for token in tokenize.generate_tokens(io.StringIO(source).readline):
+        if token.type == tokenize.COMMENT and not token.string.startswith("# fmt:"):
+            alone = token.line.lstrip().startswith("#")
+            (above if alone else behind)[token.start[0]] = token.string.lstrip("# ")
+    found = {}
+    for node in ast.parse(source).body[0].body:  # type: ignore[attr-defined]
+        if isinstance(node, ast.AnnAssign):
+            first = node.lineno
+            while first - 1 in above:
+                first -= 1
+            lines = [above.get(i) or behind.get(i, "") for i in range(first, node.end_lineno + 1)]
+            found[ast.unparse(node.target)] = " ".join(filter(None, lines))
+    return found
+
+
+def rows(cls: type) -> Iterator[tuple[str, str, str, str]]:
+    """Name, type, default and meaning of each field; of an experiment, of those of its own."""
+    comments: dict[str, str] = {}
+    for base in reversed(cls.__mro__):
+        if dataclasses.is_dataclass(base):
+            comments |= {name: text for name, text in comments_of_fields(base).items() if text}
+    shared = (
+        dataclasses.fields(Settings) if cls is not Settings and issubclass(cls, Settings) else ()
+    )
+    for field in dataclasses.fields(cls):
+        if field.init and not field.name.startswith("_") and field not in shared:
+            default = "" if field.default is dataclasses.MISSING else repr(field.default)
+            meaning = field.metadata.get("about") or comments.get(field.name, "")
+            type_name = re.sub(r"(\w+\.)+(?=\w)", "", inspect.formatannotation(field.type))
+            yield field.name, type_name, default, meaning
+
+
+def add_table(app: Sphinx, what: str, name: str, cls: Any, options: Any, lines: list[str]) -> None:
+    """Adds the table to a dataclass whose docstring does not list its attributes."""
+    if what != "class" or not dataclasses.is_dataclass(cls) or "Attributes:" in (cls.__doc__ or ""):
+        return
+    table = list(rows(cls))
+    if not table:
+        return
+    columns = [0, 1, 2, 3] if any(default for _, _, default, _ in table) else [0, 1, 3]
+    cells = [("field", "type", "default", "what it is")]
+    cells += [(*(f"``{x}``" if x else "" for x in row), escape(about)) for *row, about in table]
+    lines += ["", ".. list-table::", "   :header-rows: 1", ""]
+    for row in cells:
+        lines += [f"   {' ' if i else '*'} - {row[i]}" for i in columns]
+    lines.append("")
+
+
+def escape(text: str) -> str:
+    """A comment as reStructuredText that means nothing else."""
+    return re.sub(r"([*|_\\])", r"\\\1", text)
+
+
+def shorten_signature(
+    app: Sphinx, what: str, name: str, cls: Any, options: Any, signature: str, returns: str
+) -> tuple[str, str] | None:
+    """Leaves out of a signature what the table says."""
+    is_tabled = what == "class" and dataclasses.is_dataclass(cls)
+    return ("(**fields)", "") if is_tabled else None
+
+
+def skip_aliases(
+    app: Sphinx, what: str, name: str, member: Any, skip: bool, options: Any
+) -> bool | None:
+    """Leaves out the fields of named tuples, which the signature names."""
+    return True if (member.__doc__ or "").startswith("Alias for field number") else None
+
+
+def setup(app: Sphinx) -> dict[str, bool]:
+    app.connect("autodoc-process-docstring", add_table)
+    app.connect("autodoc-process-signature", shorten_signature)
+    app.connect("autodoc-skip-member", skip_aliases)
+    return {"parallel_read_safe": True, "parallel_write_safe": True}
