@@ -276,8 +276,8 @@ def make(source: str | Path, task: RealTask | str | None = None) -> SyntheticEnv
     """Makes a stored SE a Gymnasium environment.
 
     Args:
-      source: a run directory, a safetensors file of one SE, or the name of one that ships with the
-        package.
+      source: a run directory, a safetensors file of one SE, the name of one that ships with the
+        package, or one on the Hugging Face Hub (`hf://user/repo`).
       task: the real task, or its id in Gymnasium; needed if it is none that sejax and Gymnasium
         both know.
 
