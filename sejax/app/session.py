@@ -8,6 +8,7 @@ from typing import Any, Protocol
 import jax
 import numpy as np
 
+from sejax import __version__
 from sejax.app import build, commands
 from sejax.app.run_directory import RunDirectory
 from sejax.bilevel import Program, make_program
@@ -237,5 +238,6 @@ def _wait(state: Any) -> None:
 def _versions() -> dict[str, str]:
     from importlib.metadata import version
 
-    packages = ("sejax", "jax", "jaxlib", "flax", "optax", "evosax", "gymnax", "numpy")
-    return {"python": platform.python_version(), **{name: version(name) for name in packages}}
+    packages = ("jax", "jaxlib", "flax", "optax", "evosax", "gymnax", "numpy")
+    return {"python": platform.python_version(), "sejax": __version__,
+            **{name: version(name) for name in packages}}  # fmt: skip
