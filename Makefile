@@ -4,7 +4,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: run test test-slow lint typecheck clean
+.PHONY: run test test-slow test-lowest test-latest lint typecheck dist clean
 
 run: $(VENV)/.installed
 	$(BIN)/python -m sejax.run env=cartpole stop_when_solved=true
@@ -14,6 +14,23 @@ test: $(VENV)/.installed-dev
 
 test-slow: $(VENV)/.installed-dev
 	$(BIN)/python -m pytest -m slow -n 2 --dist worksteal
+
+# A part of the suite with the oldest versions that pyproject.toml allows, and with the newest.
+VERSIONS := networks ddqn synthetic nes proxy_files gym hub compose plugins run
+test-lowest: CONSTRAINTS := --constraint constraints-lowest.txt
+test-lowest test-latest: test-%: $(BIN)/python
+	$(BIN)/python -m venv --clear build/venv-$*
+	build/venv-$*/bin/python -m pip install --quiet $(CONSTRAINTS) --editable '.[gym,hub]' \
+	    chex hypothesis pytest pytest-xdist
+	build/venv-$*/bin/python -m pytest -n 2 --dist loadfile $(VERSIONS:%=tests/test_%.py)
+
+# The wheel and the sdist in dist/, tested in an environment of their own.
+dist: $(VENV)/.installed-dist
+	rm -rf dist
+	$(BIN)/python -m build --quiet
+	$(BIN)/python -m twine check --strict dist/*
+	$(BIN)/python -m pytest -m dist tests/test_dist.py
+	$(BIN)/python -m pytest tests/test_hub.py
 
 lint: $(VENV)/.installed-dev
 	$(BIN)/ruff format --check .
@@ -34,5 +51,9 @@ $(VENV)/.installed-dev: $(VENV)/.installed
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev]'
 	touch $@
 
+$(VENV)/.installed-dist: $(VENV)/.installed-dev
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dist]'
+	touch $@
+
 clean:
-	rm -rf $(VENV)
+	rm -rf $(VENV) build dist

@@ -93,7 +93,8 @@ class Handler(BaseHTTPRequestHandler):
             is_new = repo not in self.server.commits
             if is_new:
                 self.server.commits[repo] = []
-                self.server.private[repo] = asked.get("visibility") == "private"
+                said = {"visibility": None, "private": False} | asked  # by huggingface_hub 2, or 1
+                self.server.private[repo] = said["visibility"] == "private" or said["private"]
             self.answer_json({"url": f"{self.server.url}/{repo}"}, 200 if is_new else 409)
         elif parts[1] == "validate-yaml":
             self.answer_json({"errors": [], "warnings": []})
