@@ -160,8 +160,8 @@ def test_the_commands_run(run):
             "es.num_incumbent_evals=1", "training.max_steps=30", "devices=1",
             "run_dir=here"]  # fmt: skip
     assert "here/proxy.safetensors" in run("-m", "sejax.run", *tiny)
-    evaluated = run("-m", "sejax.evaluate", "proxy=here", "num_agents=2", "devices=1",
-                    "real_training.max_episodes=2")  # fmt: skip
+    evaluated = run("-m", "sejax.evaluate", "proxy=here", "agent=q_learning", "num_agents=2",
+                    "devices=1", "real_training.max_episodes=2")  # fmt: skip
     assert "here/evaluation.csv" in evaluated
     listed = run("-m", "sejax.experiments")
     names = {path.stem for path in (ROOT / "sejax" / "experiments").glob("*.py")
