@@ -16,11 +16,11 @@ test-slow: $(VENV)/.installed-dev
 	$(BIN)/python -m pytest -m slow -n 2 --dist worksteal
 
 # A part of the suite with the oldest versions that pyproject.toml allows, and with the newest.
-VERSIONS := networks ddqn synthetic nes proxy_files gym hub compose plugins run
+VERSIONS := networks ddqn synthetic nes proxy_files gym hub mujoco compose plugins run
 test-lowest: CONSTRAINTS := --constraint constraints-lowest.txt
 test-lowest test-latest: test-%: $(BIN)/python
 	$(BIN)/python -m venv --clear build/venv-$*
-	build/venv-$*/bin/python -m pip install --quiet $(CONSTRAINTS) --editable '.[gym,hub]' \
+	build/venv-$*/bin/python -m pip install --quiet $(CONSTRAINTS) --editable '.[gym,hub,mujoco]' \
 	    chex hypothesis pytest pytest-xdist
 	build/venv-$*/bin/python -m pytest -n 2 --dist loadfile $(VERSIONS:%=tests/test_%.py)
 
