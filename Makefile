@@ -21,7 +21,7 @@ test-lowest: CONSTRAINTS := --constraint constraints-lowest.txt
 test-lowest test-latest: test-%: $(BIN)/python
 	$(BIN)/python -m venv --clear build/venv-$*
 	build/venv-$*/bin/python -m pip install --quiet $(CONSTRAINTS) --editable '.[gym,hub,mujoco]' \
-	    chex hypothesis pytest pytest-xdist
+	    chex hypothesis imageio pytest pytest-xdist
 	build/venv-$*/bin/python -m pytest -n 2 --dist loadfile $(VERSIONS:%=tests/test_%.py)
 
 # The wheel and the sdist in dist/, tested in an environment of their own.
