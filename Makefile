@@ -5,7 +5,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: run test test-slow test-sb3 test-trackers lint typecheck docs linkcheck clean
+.PHONY: run test test-slow test-sb3 test-trackers test-examples lint typecheck docs linkcheck clean
 
 run: $(VENV)/.installed
 	$(BIN)/python -m sejax.run env=cartpole stop_when_solved=true
@@ -27,6 +27,13 @@ test-trackers:
 	$(PYTHON) -m venv $(VENV)-trackers
 	$(VENV)-trackers/bin/python -m pip install --quiet --editable '.[tensorboard,trackio,wandb]' pytest hypothesis
 	$(VENV)-trackers/bin/python -m pytest tests/test_trackers.py
+
+# The examples with agents of other packages, in an environment of its own. On Linux, PyPI's torch brings
+# CUDA along; PIP_EXTRA_INDEX_URL may name an index that has it without.
+test-examples:
+	$(PYTHON) -m venv $(VENV)-examples
+	$(VENV)-examples/bin/python -m pip install --quiet --constraint constraints.txt --editable '.[examples]' hypothesis pytest
+	$(VENV)-examples/bin/python -m pytest tests/test_examples.py
 
 lint: $(VENV)/.installed-dev
 	$(BIN)/ruff format --check .
@@ -58,4 +65,4 @@ $(VENV)/.installed-docs: $(VENV)/.installed
 	touch $@
 
 clean:
-	rm -rf $(VENV) $(VENV)-trackers docs/_build
+	rm -rf $(VENV) $(VENV)-trackers $(VENV)-examples docs/_build
