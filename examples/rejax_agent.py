@@ -1,0 +1,73 @@
+"""DQN of rejax on a shipped synthetic environment (SE) as a gymnax environment.
+
+    pip install sejax rejax
+    python rejax_agent.py
+
+Ten agents train on the SE, and ten on CartPole itself, each ten in one compiled program. All are
+tested on CartPole as they go.
+"""
+
+import argparse
+from typing import Any
+
+import gymnax
+import jax
+import numpy as np
+import rejax
+from gymnax.environments.environment import Environment
+from jax import Array
+from rejax.evaluate import evaluate
+
+import sejax
+
+MAX_STEPS = 200  # of CartPole
+
+
+class OneDone:
+    """An environment of gymnax 1.0 as rejax 0.1 knows them: `step` returns one `done`."""
+
+    def __init__(self, env: Environment):
+        self.env = env
+        self.default_params = env.default_params
+        self.reset = env.reset
+        self.action_space = env.action_space
+        self.observation_space = env.observation_space
+
+    def step(self, *args: Any) -> tuple[Array, Any, Array, Array, dict[Any, Any]]:
+        obs, state, reward, terminated, truncated, info = self.env.step(*args)
+        return obs, state, reward, terminated | truncated, info
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description="Trains rejax's DQN on an SE and on CartPole.")
+    parser.add_argument("--steps", type=int, default=2500, help="of each training")
+    parser.add_argument("--test-every", type=int, default=500, help="steps")
+    parser.add_argument("--agents", type=int, default=10, help="on each of the two")
+    parser.add_argument("--episodes", type=int, default=10, help="of each test")
+    args = parser.parse_args()
+    sejax.register_gymnax()
+    synthetic, weights = gymnax.make("sejax/cartpole")
+    real, real_params = gymnax.make("CartPole-v1")
+    real_params = real_params.replace(max_steps_in_episode=MAX_STEPS)
+
+    def test_on_real(algorithm: rejax.DQN, state: Any, key: Array) -> Array:
+        act = algorithm.make_act(state)
+        _, returns = evaluate(act, key, OneDone(real), real_params, args.episodes, MAX_STEPS)
+        return returns.mean()
+
+    keys = jax.random.split(jax.random.key(0), args.agents)
+    for name, env, params in (("the SE", synthetic, weights), ("CartPole", real, real_params)):
+        algorithm = rejax.DQN.create(
+            env=OneDone(env), env_params=params, total_timesteps=args.steps,
+            eval_freq=args.test_every, buffer_size=args.steps, fill_buffer=args.steps // 10,
+            batch_size=64, learning_rate=1e-3, target_update_freq=50, polyak=0.0,
+            exploration_fraction=0.5,
+        ).replace(eval_callback=test_on_real)  # fmt: skip
+        _, returns = jax.jit(jax.vmap(algorithm.train))(keys)  # [agent, test]
+        means = np.mean(returns, axis=0)
+        print(f"return on CartPole every {args.test_every} steps on {name}:",
+              *(f"{x:.0f}" for x in means))  # fmt: skip
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,45 @@
+"""DQN of sbx, Stable-Baselines3 in JAX, on the synthetic environment (SE) of CartPole.
+
+    pip install 'sejax[sb3]' sbx-rl
+    python sbx_agent.py
+
+Five agents train for 2,500 steps on the SE, as many on CartPole itself. All are tested there.
+
+Agent and SE pass NumPy arrays to one another, and only the agent is JAX. Where both are to be one
+compiled program: `rejax_agent.py`.
+"""
+
+import argparse
+
+import gymnasium
+from sbx import DQN
+from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.monitor import Monitor
+
+import sejax.gym
+
+HPARAMS = dict(  # RL Zoo's
+    learning_rate=2.3e-3, batch_size=64, buffer_size=100_000, learning_starts=1000, gamma=0.99,
+    target_update_interval=10, train_freq=256, gradient_steps=128, exploration_fraction=0.16,
+    exploration_final_eps=0.04, policy_kwargs={"net_arch": [256, 256]},
+)  # fmt: skip
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description="Trains sbx's DQN on an SE and on CartPole.")
+    parser.add_argument("--steps", type=int, default=2500, help="of each training")
+    parser.add_argument("--seeds", type=int, default=5, help="agents on each of the two")
+    parser.add_argument("--episodes", type=int, default=10, help="of each agent's test")
+    args = parser.parse_args()
+    real = Monitor(gymnasium.make("CartPole-v1", max_episode_steps=200))
+    for name, env in (("the SE", sejax.gym.make_sb3("cartpole")), ("CartPole", real)):
+        print(f"return on CartPole after {args.steps} steps on {name}:", end="", flush=True)
+        for seed in range(args.seeds):
+            model = DQN("MlpPolicy", env, seed=seed, **HPARAMS).learn(args.steps)
+            mean_return, _ = evaluate_policy(model, real, n_eval_episodes=args.episodes)
+            print(f" {mean_return:.0f}", end="", flush=True)
+        print()
+
+
+if __name__ == "__main__":
+    main()
