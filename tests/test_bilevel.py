@@ -325,4 +325,6 @@ def test_every_kind_of_configuration_makes_a_scan_body(words, overrides):
     columns, wide = dict(vars(info)), ("env_steps_wide", "train_steps_wide")
     assert {x.shape for x in jax.tree.leaves(columns.pop("families"))} == {(2, 1)}  # one family
     assert {columns.pop(name).shape for name in wide} == {(2, 2)}
+    num_tried = program.strategy.num_members * program.strategy.trials.num_evals
+    assert columns.pop("member_scores").shape == (2, num_tried)
     assert {x.shape for x in columns.values()} == {(2,)}

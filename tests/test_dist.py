@@ -15,7 +15,7 @@ import zipfile
 from pathlib import Path
 
 import pytest
-from test_examples import PRINTS, TINY
+from test_examples import NEEDS, PRINTS, TINY
 
 import sejax
 
@@ -169,7 +169,7 @@ def test_the_commands_run(run):
     assert "preset" in run("-m", "sejax.run", "--help")
 
 
-@pytest.mark.parametrize("name", TINY)
+@pytest.mark.parametrize("name", sorted(set(TINY) - set(NEEDS)))
 def test_the_examples_run(name, run, tmp_path):
     shutil.copy(ROOT / "examples" / f"{name}.py", tmp_path)
     assert re.search(PRINTS[name], run(f"{name}.py", *TINY[name]))
