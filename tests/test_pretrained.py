@@ -86,7 +86,10 @@ def test_ranges_are_from_the_lowest_to_the_highest():
 # --- what they teach -----------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", SES)
+@pytest.mark.parametrize(
+    "name", [name if name == "cartpole" else pytest.param(name, marks=pytest.mark.slow)
+             for name in SES]
+)  # fmt: skip
 def test_an_agent_that_sees_gymnasiums_five_values_alone_learns_the_task(name):
     """Two of three agents solve a task of which they have never seen a step."""
     task = envs.make(PROXIES[name].task)
