@@ -4,7 +4,14 @@
     python sb3_agents.py
 
 PPO and DQN train for 2,500 steps, three of each on each task's SE and three on the task itself.
-All are tested on the task.
+All are tested on the task: mean return and its deviation between agents. It takes 50 seconds of one
+core:
+
+    task      agent     trained on the SE    on the real task
+    cartpole  PPO             200.0 ± 0.0         63.4 ± 63.3
+    cartpole  DQN             200.0 ± 0.0         160.1 ± 7.5
+    acrobot   PPO             -80.8 ± 1.8      -252.7 ± 177.7
+    acrobot   DQN             -85.5 ± 6.0        -500.0 ± 0.0
 
 Hyperparameters are RL Zoo's for CartPole, on Acrobot too. With its own for each task, and more
 agents: `benchmarks/stock_agents.py`.
