@@ -62,7 +62,7 @@ def make_real(task: str) -> gymnasium.Env[Any, Any]:
 
 
 def train_and_test(agent: str, task: str, make_envs: Callable[[], VecEnv], args: Any) -> str:
-    """Mean returns of agents on the real task after training elsewhere or there."""
+    """Mean return on the real task, and its deviation between agents, after training."""
     means = []
     for seed in range(args.seeds):
         make_agent, _ = AGENTS[agent]
