@@ -12,7 +12,7 @@ core:
     PPO with the RN: solved after 2,500 3,500 6,500 2,500 2,500 steps, median 2,500
     PPO without it: solved after 8,500 6,000 2,500 2,500 inf steps, median 6,000
 
-(inf: not within 10,000.) PPO first learns after 2,048 steps, so that 2,500 are the fewest there are.
+(inf: not within 10,000.) PPO first learns after 2,048 steps: 2,500 are the fewest that it can need.
 
 The RN was learned with a DDQN of sejax. It pays differences of a potential in the place of
 CartPole's reward, which these agents never see, and takes the agent's discount for that.
