@@ -1,11 +1,12 @@
 # make run: learn a CartPole synthetic environment until it is solved.  make test: the test suite.
-# make docs: the site, in docs/_build/html.  make linkcheck: its links to other sites.
+# make docs: the site, in docs/_build/html.  make dist: the packages, in dist/.
 # All make .venv first if it is missing; python3.11 or newer, pip, make and git are all they need.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: run test test-slow test-sb3 test-trackers test-examples lint typecheck docs linkcheck clean
+.PHONY: run test test-slow test-examples test-trackers test-lowest test-latest lint typecheck docs \
+    linkcheck dist clean
 
 run: $(VENV)/.installed
 	$(BIN)/python -m sejax.run env=cartpole stop_when_solved=true
@@ -16,24 +17,32 @@ test: $(VENV)/.installed-dev
 test-slow: $(VENV)/.installed-dev
 	$(BIN)/python -m pytest -m slow -n 2 --dist worksteal
 
-# What needs Stable-Baselines3, and with it torch, which the suite leaves out.
-test-sb3: $(VENV)/.installed-dev
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[sb3]'
-	$(BIN)/python -m pytest tests/test_gym_sb3.py
+# --- with packages that the suite leaves out, each in an environment of its own in build/ -----------
 
-# The newest of what trackers need, in an environment of its own: trackio and constraints.txt have no
-# pillow in common.
-test-trackers:
-	$(PYTHON) -m venv $(VENV)-trackers
-	$(VENV)-trackers/bin/python -m pip install --quiet --editable '.[tensorboard,trackio,wandb]' pytest hypothesis
-	$(VENV)-trackers/bin/python -m pytest tests/test_trackers.py
+define environment
+	$(PYTHON) -m venv --clear build/$@
+	build/$@/bin/python -m pip install --quiet $(1)
+endef
 
-# The examples with agents of other packages, in an environment of its own. On Linux, PyPI's torch brings
-# CUDA along; PIP_EXTRA_INDEX_URL may name an index that has it without.
+# Stable-Baselines3, sbx, rejax. On Linux, PyPI's torch brings CUDA along; PIP_EXTRA_INDEX_URL may name
+# an index that has it without.
 test-examples:
-	$(PYTHON) -m venv $(VENV)-examples
-	$(VENV)-examples/bin/python -m pip install --quiet --constraint constraints.txt --editable '.[examples]' hypothesis pytest
-	$(VENV)-examples/bin/python -m pytest tests/test_examples.py
+	$(call environment,--constraint constraints.txt --editable '.[examples]' chex hypothesis pytest)
+	build/$@/bin/python -m pytest tests/test_examples.py tests/test_gym_sb3.py
+
+# The newest trackers: trackio and constraints.txt have no pillow in common.
+test-trackers:
+	$(call environment,--editable '.[tensorboard,trackio,wandb]' chex hypothesis pytest)
+	build/$@/bin/python -m pytest tests/test_trackers.py
+
+# A part of the suite with the oldest versions that pyproject.toml allows, and with the newest.
+VERSIONS := networks ddqn synthetic nes proxy_files gym hub mujoco compose plugins run
+test-lowest: CONSTRAINTS := --constraint constraints-lowest.txt
+test-lowest test-latest:
+	$(call environment,$(CONSTRAINTS) --editable '.[gym,hub,mujoco]' chex hypothesis imageio pytest pytest-xdist)
+	build/$@/bin/python -m pytest -n 2 --dist loadfile $(VERSIONS:%=tests/test_%.py)
+
+# --- the code, its site, its packages ---------------------------------------------------------------
 
 lint: $(VENV)/.installed-dev
 	$(BIN)/ruff format --check .
@@ -48,6 +57,14 @@ docs: $(VENV)/.installed-docs
 linkcheck: $(VENV)/.installed-docs
 	$(BIN)/python -m sphinx -b linkcheck -c docs -D nb_execution_mode=off . docs/_build/linkcheck
 
+# The wheel is tested in an environment of its own.
+dist: $(VENV)/.installed-dist
+	rm -rf dist
+	$(BIN)/python -m build --quiet
+	$(BIN)/python -m twine check --strict dist/*
+	$(BIN)/python -m pytest -m dist tests/test_dist.py
+	$(BIN)/python -m pytest tests/test_hub.py
+
 $(BIN)/python:
 	$(PYTHON) -c 'import sys; assert sys.version_info >= (3, 11), "Python 3.11 or newer is needed: make PYTHON=python3.11"'
 	$(PYTHON) -m venv $(VENV)
@@ -56,13 +73,9 @@ $(VENV)/.installed: $(BIN)/python pyproject.toml constraints.txt
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable .
 	touch $@
 
-$(VENV)/.installed-dev: $(VENV)/.installed
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev]'
-	touch $@
-
-$(VENV)/.installed-docs: $(VENV)/.installed
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[docs]'
+$(VENV)/.installed-%: $(VENV)/.installed
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[$*]'
 	touch $@
 
 clean:
-	rm -rf $(VENV) $(VENV)-trackers $(VENV)-examples docs/_build
+	rm -rf $(VENV) build dist docs/_build

@@ -62,6 +62,7 @@ _EXPORTS = {
     "make_learner": "sejax.bilevel",
     "make_trainer": "sejax.trainer",
     "pretrained": "sejax.proxies.zoo",
+    "push": "sejax.proxies.sharing",
     "register_gymnax": "sejax.proxies.files",
     "save": "sejax.proxies.files",
     "save_set": "sejax.proxies.files",
@@ -104,6 +105,7 @@ if TYPE_CHECKING:  # what a type checker and an editor see
         save_set,
     )
     from sejax.proxies.proxy import ProxyEnv, ProxyParams
+    from sejax.proxies.sharing import push
     from sejax.proxies.zoo import PretrainedProxy, pretrained
     from sejax.trainer import TrainResult, make_trainer
     from sejax.training import TrainingConfig
@@ -117,7 +119,7 @@ __all__ = [
     "TD3Config", "Task", "TrainResult", "TrainingConfig", "Trials", "agents", "config",
     "configure_xla", "envs", "es", "evaluate_agents", "gym", "load", "load_proxy", "load_set",
     "make_agent", "make_evaluator", "make_learner", "make_trainer", "options", "pretrained",
-    "proxies", "register_gymnax", "save", "save_set", "spread_over_devices",
+    "proxies", "push", "register_gymnax", "save", "save_set", "spread_over_devices",
 ]  # fmt: skip
 
 

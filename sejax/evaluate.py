@@ -11,7 +11,7 @@ from typing import Any
 import hydra
 from omegaconf import DictConfig
 
-from sejax import plugins
+from sejax import hub, plugins
 from sejax.app import build, commands, compose, runtime
 from sejax.app.build import EvaluateConfig
 from sejax.app.families import AgentFamily, families_of, named
@@ -151,8 +151,11 @@ def _proxy_study(config: EvaluateConfig) -> Study:
                     "baseline=false")  # fmt: skip
         real_training = dict.fromkeys(trainings, config.real_training)
         worlds["the real task"] = (task.env, task.params, real_training)
-    shipped = proxy.path.parent == files.PRETRAINED_DIR
-    beside = Path("runs", f"evaluate-{proxy.path.stem}") if shipped else proxy.path.parent
+    beside = proxy.path.parent
+    if beside == files.PRETRAINED_DIR:
+        beside = Path("runs", f"evaluate-{proxy.path.stem}")
+    elif hub.is_address(config.proxy):
+        beside = Path("runs", f"evaluate-{_as_file_name(config.proxy.removeprefix(hub.SCHEME))}")
     return Study(task=task, worlds=worlds, families=families, exploration=exploration,
                  out_dir=Path(config.out_dir or beside))  # fmt: skip
 

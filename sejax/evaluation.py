@@ -6,7 +6,7 @@ Agents".
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Literal, overload
 
 import jax
 import jax.numpy as jnp
@@ -16,11 +16,19 @@ from sejax.agents.agent import Agent
 from sejax.objectives import Outcome
 from sejax.parallel import compiler_options, spread_over_devices
 from sejax.proxies.proxy import world_of
-from sejax.rollout import make_recorder, make_tester
+from sejax.rollout import Steps, make_recorder, make_tester
 from sejax.trainer import TrainResult, make_trainer
 from sejax.training import TrainingConfig
 
 
+@overload
+def make_evaluator(
+    agent: Agent, env: Any, task: Any, training: TrainingConfig, record: Literal[False] = False
+) -> Callable[..., Outcome]: ...
+@overload
+def make_evaluator(
+    agent: Agent, env: Any, task: Any, training: TrainingConfig, record: Literal[True]
+) -> Callable[..., tuple[Outcome, Steps]]: ...
 def make_evaluator(
     agent: Agent, env: Any, task: Any, training: TrainingConfig, record: bool = False
 ) -> Callable[..., Any]:

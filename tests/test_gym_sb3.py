@@ -1,6 +1,6 @@
 """Proxies as `VecEnv`s of Stable-Baselines3, whose own `DummyVecEnv` of single ones says the same.
 
-They need the extra `sb3`, which `dev` has not (torch is 200 MB): `make test-sb3`.
+They need the extra `sb3`, which `dev` has not (torch is 200 MB): `make test-examples`.
 """
 
 import pickle
@@ -28,7 +28,7 @@ try:
 except ImportError:
     PPO = None
 PAGE = Path(__file__).parents[1] / "docs/gymnasium.md"
-needs_sb3 = pytest.mark.skipif(PPO is None, reason="needs the extra sb3: make test-sb3")
+needs_sb3 = pytest.mark.skipif(PPO is None, reason="needs the extra sb3: make test-examples")
 
 
 def test_without_it_one_message_says_what_to_install(monkeypatch):

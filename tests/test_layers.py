@@ -29,6 +29,7 @@ LAYERS = [
         "counters",
         "sealed",
         "files",
+        "hub",
         "serialize",
     },
     {"options", "statistics"},

@@ -21,12 +21,11 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import model_card
 import yaml
 
 import sejax
 from sejax.app import build
-from sejax.proxies import files, zoo
+from sejax.proxies import card, files, zoo
 from sejax.serialize import flatten
 
 FREE_FIELDS = ("run_dir", "devices", "checkpoint_every")  # how to compute, not what
@@ -59,7 +58,7 @@ def main() -> None:
                                  args.overrides)
         ]  # fmt: skip
         save(alone, proxy, **more)
-        more["card"] = model_card.card_of(zoo.describe(alone))
+        more["card"] = card.card_of(zoo.describe(alone))
     target = args.out / f"{args.name}.safetensors"
     save(target, proxy, **more)
     print(f"{more['card']}\n{zoo.Zoo([zoo.describe(target)])}\n\n{target}")

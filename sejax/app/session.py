@@ -8,6 +8,7 @@ from typing import Any, Protocol
 import jax
 import numpy as np
 
+from sejax import __version__
 from sejax.app import build, commands, runtime
 from sejax.app.follower import Follower
 from sejax.app.run_directory import RunDirectory
@@ -247,5 +248,6 @@ def _wait(state: Any) -> None:
 def _versions() -> dict[str, str]:
     from importlib.metadata import version
 
-    packages = ("sejax", "jax", "jaxlib", "flax", "optax", "evosax", "gymnax", "numpy")
-    return {"python": platform.python_version(), **{name: version(name) for name in packages}}
+    packages = ("jax", "jaxlib", "flax", "optax", "evosax", "gymnax", "numpy")
+    return {"python": platform.python_version(), "sejax": __version__,
+            **{name: version(name) for name in packages}}  # fmt: skip

@@ -1,10 +1,13 @@
 """Configurations of the proxies. Importing this imports neither JAX nor gymnax."""
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from sejax.errors import require
 from sejax.options import ACTIVATIONS, MOST_LAYERS, Options, counts, one_of, option
+
+if TYPE_CHECKING:
+    from sejax.proxies.proxy import ProxyEnv
 
 DONE_MODES = ("soft", "threshold", "bernoulli", "sigmoid")
 INITIAL_STATES = ("real", "learned", "noise")
@@ -61,7 +64,7 @@ class SyntheticConfig(Options):
         """Steps of an episode at most."""
         return task_max_steps if self.horizon is None else self.horizon
 
-    def make(self, task: Any) -> Any:
+    def make(self, task: Any) -> "ProxyEnv":
         """The SE of a task."""
         from sejax.proxies.synthetic import SyntheticEnv
 
@@ -103,7 +106,7 @@ class RewardConfig(Options):
                     f"{task_name}", "its steps tell nothing beside the observation", value,
                     f"proxy.{name}={fix}")  # fmt: skip
 
-    def make(self, task: Any) -> Any:
+    def make(self, task: Any) -> "ProxyEnv":
         """The RN of a task.
 
         Raises:

@@ -291,8 +291,8 @@ def load(source: str | Path, task: Task | None = None, proxy: Any = None) -> tup
     take `params.replace(discount=...)`; `make_trainer` does so by itself.
 
     Args:
-      source: a run directory, a safetensors file, or the name of a proxy that ships with the
-        package (`pretrained_names()`).
+      source: a run directory, a safetensors file, the name of a proxy that ships with the package
+        (`pretrained_names()`), or one on the Hugging Face Hub: `hf://user/repo` (`sejax.hub`).
       task: of the proxy; needed if it is none that a registered name makes, as a file's names are
         never imported.
       proxy: its configuration; needed likewise for a kind of proxy of your own.

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from safetensors import SafetensorError, safe_open
 
+from sejax import hub
 from sejax.errors import ConfigError, require, shortened, unknown_name
 from sejax.sealed import DamagedError, unseal
 
@@ -29,7 +30,7 @@ def read_config(source: str | Path, option: str = "source") -> dict[str, Any]:
 
 
 def find(source: str | Path, option: str = "source", also: Sequence[str] = ()) -> Path:
-    """The file that a run directory, a path or a shipped name stands for.
+    """The file that a run directory, a path, a shipped name or an address on the Hub stands for.
 
     Args:
       source: as of `load`.
@@ -37,8 +38,10 @@ def find(source: str | Path, option: str = "source", also: Sequence[str] = ()) -
       also: names beside the shipped ones, for messages.
 
     Raises:
-      ConfigError: if there is none.
+      ConfigError: if there is none, or it cannot be fetched.
     """
+    if hub.is_address(source):
+        return hub.fetch(str(source), option)
     path, text = Path(source), shortened(source)
     try:
         is_dir, is_file = path.is_dir(), path.is_file()

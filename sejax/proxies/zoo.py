@@ -67,9 +67,9 @@ class PretrainedProxy:
       kind: se or rn.
       task: that it stands in for.
       scores: the incumbent's mean score with each family of agents that it was learned with, in the
-        generation that it is of; for an SE a test return.
-      generation: that one.
-      seed: of its run.
+        generation that it is of; for an SE a test return. None of them if it was not recorded.
+      generation: that one; None likewise.
+      seed: of its run; None likewise.
       horizon: steps of its episodes at most; None for the task's limit.
       initial_state: of its episodes: real, learned or noise.
       ends: what ends them: horizon, the done output (soft, threshold, bernoulli, sigmoid) or real.
@@ -83,8 +83,8 @@ class PretrainedProxy:
     kind: str
     task: str
     scores: dict[str, float]
-    generation: int
-    seed: int
+    generation: int | None
+    seed: int | None
     horizon: int | None
     initial_state: str
     ends: str
@@ -126,22 +126,28 @@ def pretrained() -> Zoo:
     return Zoo(describe(stored.PRETRAINED_DIR / f"{name}.safetensors") for name in names)
 
 
-def describe(path: Path) -> PretrainedProxy:
+def describe(path: Path, name: str | None = None) -> PretrainedProxy:
     """What a file of one proxy says of it.
+
+    Args:
+      path: of the file.
+      name: of the proxy; the file's if None.
 
     Raises:
       ConfigError: if it is damaged, or of another format.
     """
     _, header = stored.read(path, "source")
     config, record = header["config"], header["proxies"][0]
-    families = list(stored.learned_agents(config))
+    scores = record.get("scores")
+    if scores is None and "score" in record:
+        scores = dict.fromkeys(stored.learned_agents(config), record["score"])
     return PretrainedProxy(
-        name=path.stem,
-        kind=config["proxy"]["name"],
+        name=name or path.stem,
+        kind=str(config["proxy"].get("name")),
         task=header["task"],
-        scores=record.get("scores", dict.fromkeys(families, record["score"])),
-        generation=record["generation"],
-        seed=record["seed"],
+        scores=scores or {},
+        generation=record.get("generation"),
+        seed=record.get("seed"),
         evaluations=tuple(serialize.from_plain(Evaluation, each, "evaluation")
                           for each in record.get("evaluations", ())),
         learning=serialize.from_plain(Learning, record["learning"], "learning")
@@ -154,7 +160,7 @@ def describe(path: Path) -> PretrainedProxy:
 
 def _world(config: Mapping[str, Any]) -> dict[str, Any]:
     """Of which kind the episodes are."""
-    if config["name"] != "se":
+    if config.get("name") != "se":
         return {"horizon": None, "initial_state": "real", "ends": "real"}
     se = plugins.configure("proxy", config)
     ends = "horizon" if se.horizon == 1 else se.done

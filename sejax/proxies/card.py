@@ -1,5 +1,11 @@
-"""A proxy's model card: Markdown that its file carries, and of which `docs/zoo.md` is made."""
+"""A proxy's model card, in Markdown.
 
+Shipped files carry theirs, of which `docs/zoo.md` is made; `sejax.push` puts one beside the file.
+"""
+
+from collections.abc import Sequence
+
+from sejax import hub
 from sejax.proxies.zoo import Evaluation, Learning, PretrainedProxy
 
 KINDS = {"se": "synthetic environment (SE)", "rn": "reward network (RN)"}
@@ -12,18 +18,40 @@ ENDS = {
 }  # fmt: skip
 
 
-def card_of(proxy: PretrainedProxy) -> str:
-    """The card; of what is not known it says nothing."""
-    parts = [f"# {proxy.name}", _about(proxy), "## What it teaches", _lesson(proxy)]
-    if proxy.learning:
-        parts += ["## How it was learned, and what that cost", _cost(proxy, proxy.learning)]
-    return "\n\n".join([*parts, "## How to use it", _usage(proxy), "## Licence", _LICENCE])
+SHIPPED_LICENCE = "Apache-2.0, as sejax, which made it: no data of anybody's is in it."
+_WORDS = {"task": "env", "proxy": "proxy_kind"}  # what arguments of `sejax.load` are in commands
 
 
-_LICENCE = "Apache-2.0, as sejax, which made it: no data of anybody's is in it."
+def card_of(
+    proxy: PretrainedProxy,
+    source: str | None = None,
+    needs: Sequence[str] = (),
+    licence: str = SHIPPED_LICENCE,
+) -> str:
+    """The card; of what is not known it says nothing.
+
+    Args:
+      proxy: what is known of it.
+      source: that `sejax.load` takes; the proxy's name if None.
+      needs: the arguments that `sejax.load` takes beside it, as a file's names are not imported.
+      licence: a sentence, or the licence's name.
+    """
+    parts = [f"# {proxy.name}", _about(proxy)]
+    if proxy.evaluations:
+        parts += ["## What it teaches", _lesson(proxy)]
+    if proxy.scores and proxy.learning:
+        parts += ["## How it was learned, and what that cost",
+                  f"{_origin(proxy)}\n\n{_cost(proxy, proxy.learning)}"]  # fmt: skip
+    elif proxy.scores:
+        parts += ["## How it was learned", _origin(proxy)]
+    usage = _usage(proxy, source or proxy.name, needs)
+    return "\n\n".join([*parts, "## How to use it", usage, "## Licence", licence])
 
 
 def _about(proxy: PretrainedProxy) -> str:
+    if proxy.kind not in KINDS:
+        return (f"A proxy for the task `{proxy.task}`, of the kind `{proxy.kind}`, which is its "
+                f"author's own.")  # fmt: skip
     if proxy.kind == "rn":
         return (f"A {KINDS['rn']} for the task `{proxy.task}`: the dynamics are the real task's, "
                 f"the reward is made by a small learned network. Agents that train on it need "
@@ -71,12 +99,19 @@ def _row(each: Evaluation) -> str:
             f"{each.num_agents} |")  # fmt: skip
 
 
-def _cost(proxy: PretrainedProxy, learning: Learning) -> str:
+def _origin(proxy: PretrainedProxy) -> str:
     scores = ", ".join(f"{agent} {score:.1f}" for agent, score in proxy.scores.items())
+    numbers = {"generation": proxy.generation, "seed": proxy.seed}
+    place = [f"{name} {number}" for name, number in numbers.items() if number is not None]
+    which = f"it is the proxy of {' of '.join(place)}, when it" if place else "it"
     return (
         f"With agents of {' and '.join(proxy.agents)}, by an evolution strategy that sees only how "
-        f"they do on the real task (Ferreira et al., ICLR 2022): it is the proxy of generation "
-        f"{proxy.generation} of seed {proxy.seed}, when it scored {scores}.\n\n"
+        f"they do on the real task (Ferreira et al., ICLR 2022): {which} scored {scores}."
+    )
+
+
+def _cost(proxy: PretrainedProxy, learning: Learning) -> str:
+    return (
         f"    {learning.command}\n\n"
         f"The whole run: {learning.cpu_s:,.0f} CPU seconds, {learning.generations} generations, "
         f"{learning.agents:,} agents trained for {learning.train_steps:,} steps on the proxies; "
@@ -85,12 +120,15 @@ def _cost(proxy: PretrainedProxy, learning: Learning) -> str:
     )
 
 
-def _usage(proxy: PretrainedProxy) -> str:
-    name = proxy.name
-    gym = f'env = sejax.gym.make("{name}")  # a gymnasium.Env, in NumPy: any agent, no JAX\n'
+def _usage(proxy: PretrainedProxy, source: str, needs: Sequence[str]) -> str:
+    given = "".join(f", {name}=..." for name in needs)
+    words = "".join(f" {_WORDS[name]}=..." for name in needs)
+    call = f'("{source}"{given})'
+    gym = f"env = sejax.gym.make{call}  # a gymnasium.Env, in NumPy: any agent, no JAX\n"
+    install = "With `pip install 'sejax[hub]'`:\n\n" if hub.is_address(source) else ""
     return (
-        f"```python\nimport sejax\n\n{gym if proxy.kind == 'se' else ''}"
-        f'env, params = sejax.load("{name}")  # a gymnax environment, in JAX\n```\n\n'
-        f"`python -m sejax.evaluate proxy={name}` trains agents on it and tests them on the real "
-        f"task."
+        f"{install}```python\nimport sejax\n\n{gym if proxy.kind == 'se' else ''}"
+        f"env, params = sejax.load{call}  # a gymnax environment, in JAX\n```\n\n"
+        f"`python -m sejax.evaluate proxy={source}{words}` trains agents on it and tests them on "
+        f"the real task."
     )

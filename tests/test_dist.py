@@ -1,0 +1,189 @@
+"""The wheel and the sdist, as whoever installs them meets them: `make dist` makes and tests them.
+
+The wheel is installed into an environment of its own, and all that is run there is run in a folder
+that is not the repository.
+"""
+
+import email
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tarfile
+import zipfile
+from pathlib import Path
+
+import pytest
+from test_examples import PRINTS, TINY
+
+import sejax
+
+pytestmark = pytest.mark.dist
+ROOT = Path(__file__).parents[1]
+
+# What a user's first lines are.
+SCRIPT = """\
+import jax
+
+import sejax
+import sejax.gym
+
+proxy = sejax.load_proxy("cartpole")
+agent = sejax.make_agent(sejax.DDQNConfig(init_episodes=1, hidden_size=4), proxy.task)
+train = sejax.make_trainer(
+    agent, proxy.env, sejax.TrainingConfig(max_steps=20, stop_rule="never")
+)
+trained: sejax.TrainResult = jax.jit(train)(jax.random.key(0), proxy.params)
+evaluate = sejax.make_evaluator(agent, proxy.env, proxy.task, sejax.TrainingConfig())
+learn = sejax.make_learner(sejax.config(["env=gridworld_2x2", "agent=q_learning"]))
+shapes: sejax.LearnResult = jax.eval_shape(learn, jax.random.key(0))
+env = sejax.gym.make("cartpole")
+obs, info = env.reset(seed=0)
+obs, reward, terminated, truncated, info = env.step(1)
+print(int(trained.train_steps), shapes.score.shape, float(reward) < 1e9, len(sejax.pretrained()))
+"""
+
+
+def one(pattern):
+    """The file in dist/; `make dist` leaves one of each."""
+    (path,) = (ROOT / "dist").glob(pattern)
+    return path
+
+
+@pytest.fixture(scope="module")
+def wheel():
+    with zipfile.ZipFile(one("*.whl")) as wheel:
+        yield {name: wheel.read(name) for name in wheel.namelist() if not name.endswith("/")}
+
+
+@pytest.fixture(scope="module")
+def python(tmp_path_factory):
+    """The interpreter of a bare environment with the wheel."""
+    folder = tmp_path_factory.mktemp("bare")
+    subprocess.run([sys.executable, "-m", "venv", folder], check=True)
+    python = folder / "bin" / "python"
+    install(python, one("*.whl"))
+    return python
+
+
+def install(python, *what):
+    pip = [python, "-m", "pip", "install", "--quiet", "--constraint", ROOT / "constraints.txt"]
+    subprocess.run([*pip, *what], check=True)
+
+
+@pytest.fixture
+def run(python, tmp_path):
+    """Runs the environment's Python in an empty folder and returns what it printed."""
+
+    def run(*words):
+        environ = {name: x for name, x in os.environ.items()
+                   if name not in ("PYTHONPATH", "XLA_FLAGS")}  # fmt: skip
+        done = subprocess.run([python, *words], cwd=tmp_path, env=environ, capture_output=True,
+                              text=True)  # fmt: skip
+        assert done.returncode == 0, done.stdout + done.stderr
+        return done.stdout
+
+    return run
+
+
+# --- what is in them -----------------------------------------------------------------------------
+
+
+def of_git(folder):
+    """Files of the repository in a folder, new ones too."""
+    command = ["git", "ls-files", "--cached", "--others", "--exclude-standard", folder]
+    done = subprocess.run(command, cwd=ROOT, check=True, capture_output=True, text=True)
+    return {name for name in done.stdout.splitlines() if (ROOT / name).exists()}
+
+
+def test_the_wheel_is_the_package_as_git_has_it(wheel):
+    """It is built of what the sdist holds (`python -m build`), which hence is enough."""
+    package = {name: x for name, x in wheel.items() if ".dist-info/" not in name}
+    assert set(package) == of_git("sejax")
+    assert all((ROOT / name).read_bytes() == x for name, x in package.items())
+    assert {"sejax/envs/mujoco/step.cc", "sejax/conf/run.yaml", "sejax/py.typed",
+            "sejax/pretrained/cartpole.safetensors"} < set(package)  # fmt: skip
+
+
+def test_the_sdist_holds_the_package_and_what_builds_it_alone():
+    with tarfile.open(one("*.tar.gz")) as sdist:
+        names = {member.name.partition("/")[2] for member in sdist if member.isfile()}
+    made = {name for name in names if ".egg-info/" in name} | {"PKG-INFO", "setup.cfg"}
+    beside = {"CHANGELOG.md", "CITATION.cff", "LICENSE", "MANIFEST.in", "README.md",
+              "pyproject.toml"}  # fmt: skip
+    assert names - made == of_git("sejax") | beside
+
+
+def test_the_metadata_are_those_of_the_repository(wheel):
+    (text,) = (x for name, x in wheel.items() if name.endswith(".dist-info/METADATA"))
+    metadata = email.message_from_bytes(text)
+    version = re.search(r"^version: (.*)$", (ROOT / "CITATION.cff").read_text(), re.MULTILINE)
+    assert metadata["Version"] == sejax.__version__ == version[1]
+    assert metadata["License-Expression"] == "Apache-2.0"
+    (licence,) = (x for name, x in wheel.items() if name.endswith("/licenses/LICENSE"))
+    assert licence == (ROOT / "LICENSE").read_bytes()
+
+
+# --- what they do, bare --------------------------------------------------------------------------
+
+
+def test_what_is_imported_is_the_wheel(run, python):
+    place, version = run("-c", "import sejax; print(sejax.__file__, sejax.__version__)").split()
+    assert Path(place).is_relative_to(python.parents[1]) and version == sejax.__version__
+
+
+def test_every_shipped_proxy_loads_or_says_what_to_install(run):
+    program = """\
+import sejax
+for proxy in sejax.pretrained():
+    try:
+        env, params = sejax.load(proxy.name)
+        print(proxy.name, env.task.name == proxy.task)
+    except sejax.ConfigError as error:
+        print(proxy.name, "sejax[mujoco]" in str(error))
+"""
+    lines = dict(line.split() for line in run("-c", program).splitlines())
+    assert lines == {proxy.name: "True" for proxy in sejax.pretrained()}
+
+
+def test_what_needs_an_extra_says_which(run):
+    said = run("-c", "import sejax\n"
+               "try: sejax.load('hf://me/se')\n"
+               "except sejax.ConfigError as error: print(error)")  # fmt: skip
+    assert said.endswith("Install it with pip install 'sejax[hub]'.\n")
+
+
+def test_the_commands_run(run):
+    tiny = ["env=gridworld_2x2", "proxy.hidden_size=4", "es.population_size=2", "generations=1",
+            "es.num_incumbent_evals=1", "training.max_steps=30", "devices=1",
+            "run_dir=here"]  # fmt: skip
+    assert "here/proxy.safetensors" in run("-m", "sejax.run", *tiny)
+    evaluated = run("-m", "sejax.evaluate", "proxy=here", "agent=q_learning", "num_agents=2",
+                    "devices=1", "real_training.max_episodes=2")  # fmt: skip
+    assert "here/evaluation.csv" in evaluated
+    listed = run("-m", "sejax.experiments")
+    names = {path.stem for path in (ROOT / "sejax" / "experiments").glob("*.py")
+             if "\nEXPERIMENT = " in path.read_text()}  # fmt: skip
+    assert set(re.findall(r"^  (\w+)", listed, re.MULTILINE)) == names
+    assert "preset" in run("-m", "sejax.run", "--help")
+
+
+@pytest.mark.parametrize("name", TINY)
+def test_the_examples_run(name, run, tmp_path):
+    shutil.copy(ROOT / "examples" / f"{name}.py", tmp_path)
+    assert re.search(PRINTS[name], run(f"{name}.py", *TINY[name]))
+
+
+# --- with the extra gym --------------------------------------------------------------------------
+
+
+def test_a_users_script_runs_and_mypy_finds_nothing_in_it(run, python, tmp_path):
+    install(python, f"{one('*.whl')}[gym]")
+    (tmp_path / "script.py").write_text(SCRIPT)
+    count = len(sejax.pretrained())
+    assert run("script.py") == f"20 () True {count}\n"
+    mypy = [sys.executable, "-m", "mypy", "--strict", "--python-executable", python,
+            "--cache-dir", tmp_path / "cache", "script.py"]  # fmt: skip
+    done = subprocess.run(mypy, cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout

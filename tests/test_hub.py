@@ -1,0 +1,264 @@
+"""Proxies on the Hugging Face Hub: a server of this process stands for it (`fake_hub.py`)."""
+
+import builtins
+import importlib.util
+
+import numpy as np
+import pytest
+import yaml
+from fake_hub import oid, serving
+
+import sejax
+from sejax import hub
+from sejax.errors import ConfigError
+from sejax.proxies import stored
+
+SHIPPED = stored.PRETRAINED_DIR / "cartpole.safetensors"
+needs_the_extra = pytest.mark.skipif(
+    importlib.util.find_spec("huggingface_hub") is None, reason="needs pip install 'sejax[hub]'"
+)
+
+
+@pytest.fixture(scope="module")
+def server():
+    with serving() as server:
+        yield server
+
+
+@pytest.fixture
+def the_hub(server, monkeypatch, tmp_path):
+    """An empty Hub, an empty cache, and a user who may write."""
+    from huggingface_hub import constants
+
+    monkeypatch.setattr(constants, "ENDPOINT", server.url)
+    template = f"{server.url}/{{repo_id}}/resolve/{{revision}}/{{filename}}"
+    monkeypatch.setattr(constants, "HUGGINGFACE_CO_URL_TEMPLATE", template)
+    monkeypatch.setattr(constants, "HF_HUB_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setattr(constants, "HF_TOKEN_PATH", str(tmp_path / "token"))
+    monkeypatch.setenv("HF_TOKEN", "hf_secret")
+    monkeypatch.setenv("HF_HUB_DISABLE_PROGRESS_BARS", "1")
+    server.reset()
+    return server
+
+
+# --- addresses -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("address", "parts"), [
+    ("hf://me/my-se", ("me/my-se", None, "proxy.safetensors")),
+    ("hf://me/my.se@v1.0", ("me/my.se", "v1.0", "proxy.safetensors")),
+    ("hf://me/se@refs/pr/3/a/b.safetensors", ("me/se", "refs/pr/3", "a/b.safetensors")),
+    ("hf://me/se/last.safetensors", ("me/se", None, "last.safetensors")),
+])  # fmt: skip
+def test_an_address_names_repository_revision_and_file(address, parts):
+    assert hub.parse(address) == hub.Address(*parts)
+
+
+@pytest.mark.parametrize("address", [
+    "hf://", "hf://me", "hf://me/", "hf://me/se/", "hf://me/se/pytorch_model.bin",
+    "hf://me/se/proxy.pkl", "hf://me/se/../../x.safetensors", "hf://../se", "hf://me/se@",
+    "hf://me/se/.hidden.safetensors", "hf://me/se/proxy.safetensors\n", "hf://datasets/me/se",
+])  # fmt: skip
+def test_what_is_no_address_or_no_safetensors_file_is_refused(address):
+    with pytest.raises(ConfigError, match=r"(?s)^proxy must be hf://USER/REPO, .*Set proxy=hf://"):
+        hub.parse(address, "proxy")
+
+
+def test_a_missing_extra_is_one_line_that_says_what_to_install(monkeypatch):
+    importing = builtins.__import__
+
+    def without_the_hub(name, *args, **kwargs):
+        if name.partition(".")[0] == "huggingface_hub":
+            raise ModuleNotFoundError("No module named 'huggingface_hub'")
+        return importing(name, *args, **kwargs)
+
+    monkeypatch.setattr(builtins, "__import__", without_the_hub)
+    for use in (lambda: sejax.load("hf://me/se"), lambda: sejax.push("cartpole", "me/se")):
+        with pytest.raises(ConfigError, match=r"got .*me/se .*pip install 'sejax\[hub\]'\.$"):
+            use()
+
+
+# --- what is pushed and loaded -------------------------------------------------------------------
+
+
+@needs_the_extra
+def test_a_proxy_that_is_pushed_is_loaded_everywhere_as_it_was(the_hub):
+    address = sejax.push("cartpole", "me/my-cartpole", private=True)
+    assert address == "hf://me/my-cartpole" and the_hub.private == {"me/my-cartpole": True}
+    (files,) = the_hub.commits["me/my-cartpole"]
+    assert sorted(files) == ["README.md", "proxy.safetensors"]
+    assert files["proxy.safetensors"] == SHIPPED.read_bytes()
+    env, params = sejax.load(address)
+    shipped_env, shipped = sejax.load("cartpole")
+    assert env is shipped_env
+    assert_same_weights(params.weights, shipped.weights)
+    assert_same_weights(sejax.load_set(address).one(0).weights, shipped.weights)
+    assert sejax.load_proxy(address).task.name == "cartpole"
+    assert stored.read_config(address) == stored.read_config("cartpole")
+
+
+@needs_the_extra
+def test_gymnasium_environments_come_from_there_without_jax(the_hub):
+    pytest.importorskip("gymnasium")
+    env = sejax.gym.make(sejax.push("cartpole", "me/se"))
+    ours = sejax.gym.make("cartpole")
+    obs, _ = env.reset(seed=3)
+    np.testing.assert_array_equal(obs, ours.reset(seed=3)[0])
+    np.testing.assert_array_equal(env.step(1)[0], ours.step(1)[0])
+
+
+def assert_same_weights(a, b):
+    for network in b:
+        for layer in b[network]:
+            for name, x in b[network][layer].items():
+                np.testing.assert_array_equal(a[network][layer][name], x)
+
+
+@needs_the_extra
+def test_a_run_directory_is_pushed_and_a_card_says_what_is_known_of_it(the_hub, tmp_path):
+    env, params = sejax.load("pendulum")
+    config = {"agents": {"sac": {"name": "sac"}}}
+    sejax.save(tmp_path / "proxy.safetensors", env, params.weights, config, score=-150.0,
+               generation=7, seed=2)  # fmt: skip
+    sejax.push(tmp_path, "me/swing-up", license="mit")
+    front, card = front_and_card(the_hub, "me/swing-up")
+    assert front == {
+        "library_name": "sejax", "license": "mit", "pipeline_tag": "reinforcement-learning",
+        "tags": ["reinforcement-learning", "jax", "synthetic-environment", "pendulum"],
+    }  # fmt: skip
+    assert card.startswith("# swing-up\n") and card.endswith("## Licence\n\nmit")
+    for said in ("generation 7 of seed 2, when it scored sac -150.0", "sejax[hub]",
+                 'sejax.load("hf://me/swing-up")', 'sejax.gym.make("hf://me/swing-up")',
+                 "proxy=hf://me/swing-up`"):  # fmt: skip
+        assert said in card
+    assert "What it teaches" not in card and "None" not in card
+
+
+@needs_the_extra
+def test_a_shipped_ones_card_keeps_what_it_teaches(the_hub):
+    sejax.push("cliff_walking-rn", "me/rn")
+    front, card = front_and_card(the_hub, "me/rn")
+    assert "reward-network" in front["tags"] and front["license"] == "apache-2.0"
+    rows = [line for line in sejax.load_proxy("cliff_walking-rn").record["card"].splitlines()
+            if line.startswith("| q_learning")]  # fmt: skip
+    assert rows and all(row in card for row in rows) and "sejax.gym.make" not in card
+
+
+def front_and_card(server, repo):
+    text = server.commits[repo][-1]["README.md"].decode()
+    empty, front, card = text.split("---\n", 2)
+    assert not empty
+    return yaml.safe_load(front), card.lstrip()
+
+
+@needs_the_extra
+def test_ones_own_task_is_to_be_given(the_hub, tmp_path):
+    task = sejax.Task(name="mine", env=sejax.envs.make("cartpole").env, solved_reward=1.0,
+                      max_steps=10)  # fmt: skip
+    env = sejax.SyntheticConfig(hidden_size=2).make(task)
+    weights = {name: {layer: {key: np.zeros(x.shape, np.float32) for key, x in leaves.items()}
+                      for layer, leaves in layers.items()}
+               for name, layers in shapes_of(env).items()}  # fmt: skip
+    path = tmp_path / "mine.safetensors"
+    sejax.save(path, env, weights)
+    address = sejax.push(path, "me/mine")
+    _, card = front_and_card(the_hub, "me/mine")
+    assert 'sejax.load("hf://me/mine", task=...)' in card and "env=..." in card
+    assert "it scored" not in card
+    assert sejax.load(address, task=task)[0].task is task
+
+
+def shapes_of(env):
+    import jax
+
+    return jax.eval_shape(env.init_weights, jax.random.key(0))
+
+
+@needs_the_extra
+def test_a_set_is_not_pushed(the_hub, tmp_path):
+    env, params = sejax.load("cartpole")
+    sejax.save_set(tmp_path / "set.safetensors", env, [params.weights] * 2, [{}, {}])
+    with pytest.raises(ConfigError, match=r"^source must be a single proxy, .* a set\."):
+        sejax.push(tmp_path / "set.safetensors", "me/set")
+    assert not the_hub.commits
+
+
+@needs_the_extra
+def test_a_revision_is_what_was_then_and_none_is_what_is_now(the_hub):
+    address = sejax.push("cartpole", "me/se")
+    sejax.push("acrobot", "me/se")
+    then = oid("me/se", 0)
+    assert sejax.load_proxy(f"{address}@{then}").task.name == "cartpole"
+    assert sejax.load_proxy(address).task.name == "acrobot"
+    assert sejax.load_proxy(f"{address}@main/proxy.safetensors").task.name == "acrobot"
+
+
+@needs_the_extra
+def test_without_a_network_what_was_fetched_before_serves(the_hub, monkeypatch):
+    from huggingface_hub import constants
+
+    address = sejax.push("cartpole", "me/se")
+    sejax.push("cartpole", "me/other")
+    sejax.load(address)
+    monkeypatch.setattr(constants, "HF_HUB_OFFLINE", True)
+    assert sejax.load_proxy(address).task.name == "cartpole"
+    with pytest.raises(ConfigError, match=r"the Hub cannot be reached, and no copy is here\. Conn"):
+        sejax.load("hf://me/other")
+
+
+# --- what can go wrong ---------------------------------------------------------------------------
+
+
+@needs_the_extra
+@pytest.mark.parametrize(("address", "message"), [
+    ("hf://me/nothing", r"got hf://me/nothing: there is no such repository, or it is private\."),
+    ("hf://me/se@v9", r"no such revision\. Leave it out"),
+    ("hf://me/se/last.safetensors", r"no such file\. Name one: hf://USER/REPO/FILE"),
+    ("hf://me/hidden", r"there is no such repository, or it is private\. .* hf auth login\.$"),
+    ("hf://me/gated", r"its owner gives access on request\."),
+    ("hf://me/large/large.safetensors", r"at most 100,000,000 bytes, .*got 100,000,001 bytes"),
+    ("hf://me/pickle", r"^source must be a whole safetensors file, .*damaged"),
+    ("hf://me/foreign", r"^source must be a file that sejax has written"),
+])  # fmt: skip
+def test_each_failure_is_one_message(the_hub, tmp_path, address, message):
+    from safetensors.numpy import save
+
+    the_hub.commits = {
+        "me/se": [{"proxy.safetensors": SHIPPED.read_bytes()}],
+        "me/large": [{"large.safetensors": b""}],
+        "me/pickle": [{"proxy.safetensors": b"\x80\x04cos\nsystem\n(S'true'\ntR."}],
+        "me/foreign": [{"proxy.safetensors": save({"x": np.zeros(2, np.float32)})}],
+    }
+    the_hub.refused = {"me/hidden": (401, "RepoNotFound"), "me/gated": (403, "GatedRepo")}
+    the_hub.claimed_sizes = {"large.safetensors": hub.MOST_BYTES + 1}
+    with pytest.raises(ConfigError, match=message):
+        sejax.load(address)
+    assert not list(tmp_path.rglob("large.safetensors")), "nothing of it is fetched"
+
+
+@needs_the_extra
+def test_who_may_not_write_is_told(the_hub, monkeypatch):
+    monkeypatch.setenv("HF_TOKEN", "hf_other")
+    with pytest.raises(ConfigError, match=r"^repo must be within reach.* hf auth login"):
+        sejax.push("cartpole", "me/se")
+    monkeypatch.setattr("huggingface_hub.constants.ENDPOINT", "http://127.0.0.1:9")
+    with pytest.raises(ConfigError, match=r"^repo must be within reach.*ConnectError"):
+        sejax.push("cartpole", "me/se")
+
+
+def test_a_repository_has_an_owner_and_a_name():
+    for repo in ("se", "me/se/x", "hf://me/se", "me/../se", ""):
+        with pytest.raises(ConfigError, match=r"^repo must be USER/REPO, "):
+            sejax.push("cartpole", repo)
+
+
+@needs_the_extra
+def test_the_command_evaluates_what_is_there_and_writes_in_the_working_folder(the_hub):
+    from sejax.app import compose
+    from sejax.evaluate import _proxy_study
+
+    sejax.push("cartpole", "me/se")
+    config = compose.evaluate_config([f"proxy=hf://me/se@{oid('me/se', 0)}"])
+    study = _proxy_study(config)
+    assert study.task.name == "cartpole"
+    assert str(study.out_dir) == f"runs/evaluate-me_se@{oid('me/se', 0)}"
