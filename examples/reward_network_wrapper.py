@@ -43,7 +43,7 @@ def steps_to_solve(agent: str, env: gymnasium.Env[Any, Any], seed: int, args: An
     """Training steps until the test that solves CartPole; infinite if none does."""
     model = AGENTS[agent]("MlpPolicy", env, gamma=DISCOUNT, seed=seed, device="cpu")
     test = EvalCallback(
-        make_vec_env(make_real, args.episodes), StopTrainingOnRewardThreshold(SOLVED),
+        make_vec_env(make_real, args.episodes, seed=10_000), StopTrainingOnRewardThreshold(SOLVED),
         eval_freq=args.test_every, n_eval_episodes=args.episodes, verbose=0,
     )  # fmt: skip
     model.learn(args.max_steps, test)

@@ -34,6 +34,7 @@ from stable_baselines3.common.vec_env import VecEnv
 import sejax.gym
 
 TASKS = {"cartpole": ("CartPole-v1", 200), "acrobot": ("Acrobot-v1", 500)}  # id and step limit
+TEST_SEED = 10_000
 
 
 def linear(initial: float) -> Callable[[float], float]:
@@ -58,7 +59,9 @@ AGENTS: dict[str, tuple[Callable[..., Any], int]] = {
 
 def make_real(task: str) -> gymnasium.Env[Any, Any]:
     env_id, max_steps = TASKS[task]
-    return Monitor(gymnasium.make(env_id, max_episode_steps=max_steps))
+    env = Monitor(gymnasium.make(env_id, max_episode_steps=max_steps))
+    env.reset(seed=TEST_SEED)  # of tests; an agent that trains there sets its own
+    return env
 
 
 def train_and_test(agent: str, task: str, make_envs: Callable[[], VecEnv], args: Any) -> str:
