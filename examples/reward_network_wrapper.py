@@ -4,10 +4,18 @@
     python reward_network_wrapper.py
 
 A2C and PPO with their default hyperparameters train until ten episodes on CartPole return 195 on
-average, tested every 500 steps, at most 10,000 steps; four of each with the RN, four without.
+average, tested every 500 steps; five of each with the RN, five without. It takes 90 seconds of one
+core:
 
-The RN was learned with a DDQN of sejax. It pays with a potential in the place of CartPole's reward,
-which these agents never see, and so needs the discount of the agent.
+    A2C with the RN: solved after 500 1,500 500 500 inf steps, median 500
+    A2C without it: solved after 1,500 6,500 6,000 10,000 7,000 steps, median 6,500
+    PPO with the RN: solved after 2,500 3,500 6,500 2,500 2,500 steps, median 2,500
+    PPO without it: solved after 8,500 6,000 2,500 2,500 inf steps, median 6,000
+
+(inf: not within 10,000.) PPO first learns after 2,048 steps: 2,500 are the fewest that it can need.
+
+The RN was learned with a DDQN of sejax. It pays differences of a potential in the place of
+CartPole's reward, which these agents never see, and takes the agent's discount for that.
 """
 
 import argparse
@@ -35,7 +43,7 @@ def steps_to_solve(agent: str, env: gymnasium.Env[Any, Any], seed: int, args: An
     """Training steps until the test that solves CartPole; infinite if none does."""
     model = AGENTS[agent]("MlpPolicy", env, gamma=DISCOUNT, seed=seed, device="cpu")
     test = EvalCallback(
-        make_vec_env(make_real, args.episodes), StopTrainingOnRewardThreshold(SOLVED),
+        make_vec_env(make_real, args.episodes, seed=10_000), StopTrainingOnRewardThreshold(SOLVED),
         eval_freq=args.test_every, n_eval_episodes=args.episodes, verbose=0,
     )  # fmt: skip
     model.learn(args.max_steps, test)

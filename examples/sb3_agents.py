@@ -4,7 +4,14 @@
     python sb3_agents.py
 
 PPO and DQN train for 2,500 steps, three of each on each task's SE and three on the task itself.
-All are tested on the task.
+All are tested on the task: mean return and its deviation between agents. It takes 50 seconds of one
+core:
+
+    task      agent     trained on the SE    on the real task
+    cartpole  PPO             200.0 ± 0.0         63.4 ± 63.3
+    cartpole  DQN             200.0 ± 0.0         160.1 ± 7.5
+    acrobot   PPO             -80.8 ± 1.8      -252.7 ± 177.7
+    acrobot   DQN             -85.5 ± 6.0        -500.0 ± 0.0
 
 Hyperparameters are RL Zoo's for CartPole, on Acrobot too. With its own for each task, and more
 agents: `benchmarks/stock_agents.py`.
@@ -27,6 +34,7 @@ from stable_baselines3.common.vec_env import VecEnv
 import sejax.gym
 
 TASKS = {"cartpole": ("CartPole-v1", 200), "acrobot": ("Acrobot-v1", 500)}  # id and step limit
+TEST_SEED = 10_000
 
 
 def linear(initial: float) -> Callable[[float], float]:
@@ -51,11 +59,13 @@ AGENTS: dict[str, tuple[Callable[..., Any], int]] = {
 
 def make_real(task: str) -> gymnasium.Env[Any, Any]:
     env_id, max_steps = TASKS[task]
-    return Monitor(gymnasium.make(env_id, max_episode_steps=max_steps))
+    env = Monitor(gymnasium.make(env_id, max_episode_steps=max_steps))
+    env.reset(seed=TEST_SEED)  # of tests; an agent that trains there sets its own
+    return env
 
 
 def train_and_test(agent: str, task: str, make_envs: Callable[[], VecEnv], args: Any) -> str:
-    """Mean returns of agents on the real task after training elsewhere or there."""
+    """Mean return on the real task, and its deviation between agents, after training."""
     means = []
     for seed in range(args.seeds):
         make_agent, _ = AGENTS[agent]

@@ -29,7 +29,7 @@ TINY = {
                     "--learning-starts=40", "--batch-size=4", "--target-frequency=2"],
     "reward_network_wrapper": ["--agents=A2C", "--seeds=1", "--max-steps=10", "--test-every=5",
                                "--episodes=1"],
-    "rejax_agent": ["--steps=20", "--test-every=10", "--agents=2", "--episodes=2"],
+    "rejax_agent": ["--steps=80", "--test-every=40", "--agents=2", "--episodes=2"],
 }  # fmt: skip
 PRINTS = {
     "own_task": r"best -\d+\.\d+ in generation 0; solved at -1",
@@ -42,7 +42,7 @@ PRINTS = {
     "sbx_agent": r"after 10 steps on the SE: \d+\n.*on CartPole: \d+\n",
     "cleanrl_dqn": r"return on CartPole-v1 every 30 steps on sejax\.gym:sejax/cartpole: \d+ \d+\n",
     "reward_network_wrapper": r"A2C with the RN: solved after .*median .*\nA2C without it: ",
-    "rejax_agent": r"every 10 steps on the SE: \d+ \d+ \d+\n.*on CartPole: \d+ \d+ \d+\n",
+    "rejax_agent": r"every 40 steps on the SE: \d+ \d+ \d+\n.*on CartPole: \d+ \d+ \d+\n",
 }
 # What is not in the development environment; `make test-examples` has it.
 NEEDS = {
