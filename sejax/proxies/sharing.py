@@ -33,7 +33,7 @@ def push(
       message: of the commit.
 
     Returns:
-      Its address, `hf://user/repo`.
+      Its address, which `sejax.load` takes.
 
     Raises:
       ConfigError: if there is no such proxy, it is a set, or the repository cannot be written.
