@@ -27,7 +27,7 @@ endef
 # Stable-Baselines3, sbx, rejax. On Linux, PyPI's torch brings CUDA along; PIP_EXTRA_INDEX_URL may name
 # an index that has it without.
 test-examples:
-	$(call environment,--constraint constraints.txt --editable '.[examples]' chex hypothesis pytest)
+	$(call environment,--constraint constraints.txt --editable '.[examples,mujoco]' chex hypothesis imageio pytest)
 	build/$@/bin/python -m pytest tests/test_examples.py tests/test_gym_sb3.py
 
 # The newest trackers: trackio and constraints.txt have no pillow in common.

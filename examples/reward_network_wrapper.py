@@ -8,9 +8,9 @@ average, tested every 500 steps; five of each with the RN, five without. It take
 core:
 
     A2C with the RN: solved after 500 1,500 500 500 inf steps, median 500
-    A2C without it: solved after 1,500 6,500 6,000 10,000 7,000 steps, median 6,500
-    PPO with the RN: solved after 2,500 3,500 6,500 2,500 2,500 steps, median 2,500
-    PPO without it: solved after 8,500 6,000 2,500 2,500 inf steps, median 6,000
+    A2C without it: solved after 1,500 6,500 6,000 6,500 7,500 steps, median 6,500
+    PPO with the RN: solved after 2,500 4,500 6,500 2,500 2,500 steps, median 2,500
+    PPO without it: solved after 8,500 5,000 2,500 2,500 8,500 steps, median 5,000
 
 (inf: not within 10,000.) PPO first learns after 2,048 steps: 2,500 are the fewest that it can need.
 

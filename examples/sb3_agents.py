@@ -8,10 +8,10 @@ All are tested on the task: mean return and its deviation between agents. It tak
 core:
 
     task      agent     trained on the SE    on the real task
-    cartpole  PPO             200.0 ± 0.0         63.4 ± 63.3
-    cartpole  DQN             200.0 ± 0.0         160.1 ± 7.5
-    acrobot   PPO             -80.8 ± 1.8      -252.7 ± 177.7
-    acrobot   DQN             -85.5 ± 6.0        -500.0 ± 0.0
+    cartpole  PPO             200.0 ± 0.0         75.0 ± 79.2
+    cartpole  DQN             200.0 ± 0.0        165.0 ± 11.3
+    acrobot   PPO             -91.2 ± 8.0      -258.1 ± 175.5
+    acrobot   DQN             -75.8 ± 0.2        -500.0 ± 0.0
 
 Hyperparameters are RL Zoo's for CartPole, on Acrobot too. With its own for each task, and more
 agents: `benchmarks/stock_agents.py`.
