@@ -19,28 +19,24 @@ test-slow: $(VENV)/.installed-dev
 
 # --- with packages that the suite leaves out, each in an environment of its own in build/ -----------
 
-define environment
+test-examples test-trackers test-lowest test-latest:
 	$(PYTHON) -m venv --clear build/$@
-	build/$@/bin/python -m pip install --quiet $(1)
-endef
+	build/$@/bin/python -m pip install --quiet $(PACKAGES) pytest pytest-xdist chex hypothesis
+	build/$@/bin/python -m pytest -n 2 --dist loadfile $(TESTS:%=tests/test_%.py)
 
 # Stable-Baselines3, sbx, rejax. On Linux, PyPI's torch brings CUDA along; PIP_EXTRA_INDEX_URL may name
 # an index that has it without.
-test-examples:
-	$(call environment,--constraint constraints.txt --editable '.[examples,mujoco]' chex hypothesis imageio pytest)
-	build/$@/bin/python -m pytest tests/test_examples.py tests/test_gym_sb3.py
+test-examples: PACKAGES := --constraint constraints.txt --editable '.[examples,mujoco]' imageio
+test-examples: TESTS := examples gym_sb3
 
 # The newest trackers: trackio and constraints.txt have no pillow in common.
-test-trackers:
-	$(call environment,--editable '.[tensorboard,trackio,wandb]' chex hypothesis pytest)
-	build/$@/bin/python -m pytest tests/test_trackers.py
+test-trackers: PACKAGES := --editable '.[tensorboard,trackio,wandb]'
+test-trackers: TESTS := trackers
 
 # A part of the suite with the oldest versions that pyproject.toml allows, and with the newest.
-VERSIONS := networks ddqn synthetic nes proxy_files gym hub mujoco compose plugins run
-test-lowest: CONSTRAINTS := --constraint constraints-lowest.txt
-test-lowest test-latest:
-	$(call environment,$(CONSTRAINTS) --editable '.[gym,hub,mujoco]' chex hypothesis imageio pytest pytest-xdist)
-	build/$@/bin/python -m pytest -n 2 --dist loadfile $(VERSIONS:%=tests/test_%.py)
+test-lowest: PACKAGES := --constraint constraints-lowest.txt --editable '.[gym,hub,mujoco]' imageio
+test-latest: PACKAGES := --editable '.[gym,hub,mujoco]' imageio
+test-lowest test-latest: TESTS := networks ddqn synthetic nes proxy_files gym hub mujoco compose plugins run
 
 # --- the code, its site, its packages ---------------------------------------------------------------
 
