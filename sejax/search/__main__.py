@@ -1,0 +1,74 @@
+"""`python -m sejax.search`: the command."""
+
+import contextlib
+import sys
+from collections.abc import Sequence
+from importlib.util import find_spec
+
+from sejax.app import commands, runtime
+from sejax.errors import ConfigError
+from sejax.search import settings
+from sejax.search.settings import Search
+
+
+def main(words: Sequence[str]) -> None:
+    """Searches as the words say; the same words go on where it stopped.
+
+    Raises:
+      ConfigError: for words or a study that cannot be searched, or without Optuna.
+      OSError: if a file cannot be written.
+    """
+    search = settings.read(words)
+    if find_spec("optuna") is None:
+        raise ConfigError("sejax.search needs Optuna, because it decides what is tried. Install it "
+                          "with pip install 'sejax[search]'.")  # fmt: skip
+    from sejax.search import results, study
+
+    found, search = study.open_study(search)
+    runner = _runner(search)
+    settings.require_fields(search, runner.config([]))
+    runtime.enable_compilation_cache()
+    print(f"Study {search.study} in {search.folder}: {', '.join(search.space)}.", flush=True)
+    try:
+        study.work(found, search, runner, lambda text: print(text, flush=True))
+    except KeyboardInterrupt:
+        print(f"Interrupted. What has ended is saved in {search.folder}, the trial at hand is queued "
+              f"again; the same command goes on from there.")  # fmt: skip
+        commands.leave(commands.INTERRUPTED)
+    words = results.write(found, search, runner.command)
+    results.print_table(found, search)
+    if not words:
+        print("No trial was completed.")
+        return
+    if search.is_of_agent:
+        words = _verified(found, search, runner)
+    print(f"\nThe best:\n  {results.override_line(words, search, runner.command)}")
+    print(f"{search.folder}/trials.csv, pareto.png, best.txt and preset.yaml hold what was found.")
+
+
+def _runner(search: Search):  # type: ignore[no-untyped-def]
+    if search.is_of_agent:
+        from sejax.search.tuning import Tuning
+
+        return Tuning(search)
+    from sejax.search.learning import Learning
+
+    return Learning(search)
+
+
+def _verified(found, search, runner) -> list[str]:  # type: ignore[no-untyped-def]
+    """The overrides of the best on the real task."""
+    from sejax.search import results, verification
+
+    table = verification.verify(found, search, runner)
+    verification.print_table(table, found, search)
+    best = int(table["trial"].iloc[0])
+    (trial,) = [trial for trial in found.get_trials(deepcopy=False) if trial.number == best]
+    words = results.words_of(trial, search)
+    results.write_best(words, search, runner.command)
+    return words
+
+
+if __name__ == "__main__":
+    with contextlib.suppress(BrokenPipeError):
+        commands.start_plain("search", main)
