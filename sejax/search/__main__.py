@@ -1,7 +1,5 @@
 """`python -m sejax.search`: the command."""
 
-import contextlib
-import sys
 from collections.abc import Sequence
 from importlib.util import find_spec
 
@@ -70,5 +68,4 @@ def _verified(found, search, runner) -> list[str]:  # type: ignore[no-untyped-de
 
 
 if __name__ == "__main__":
-    with contextlib.suppress(BrokenPipeError):
-        commands.start_plain("search", main)
+    commands.start_with_words(main, settings.help_text())

@@ -13,7 +13,8 @@ from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException
 
 from sejax import plugins, serialize
-from sejax.errors import ConfigError, require
+from sejax.app import build
+from sejax.errors import ConfigError, require, unknown_name
 from sejax.options import Options, counts, one_of, option, positive
 from sejax.search import spaces
 
@@ -21,6 +22,7 @@ SAMPLERS = ("tpe", "random")
 PRUNERS = ("hyperband", "median", "none")
 SCORES = ("mean", "worst")
 MEASURES = ("last", "best", "mean")
+_TAKEN = {"generations", "num_seeds", "checkpoint_every", "run_dir", "out_dir"}  # by the search
 # Fields that may differ between the workers of a study, and between its sessions.
 FREE_FIELDS = ("trials", "timeout", "storage", "search_dir", "heartbeat", "sampler_seed")
 
@@ -192,3 +194,43 @@ def _plain(text: str) -> Any:
 def _as_file_name(name: str) -> str:
     return re.sub(r"[^\w.+-]+", "_", name)
 
+
+
+def require_fields(search: Search, config: Any) -> None:
+    """Checks that what is searched are fields of the command.
+
+    Args:
+      search: what is searched.
+      config: of the command with the fixed words alone.
+
+    Raises:
+      ConfigError: if one is not.
+    """
+    groups = build.EVALUATE_GROUPS if search.is_of_agent else build.LEARN_GROUPS
+    known = {*serialize.flatten(build.to_plain(config)), *groups} - _TAKEN
+    for name in search.space:
+        if name not in known:
+            raise unknown_name("What is searched", name, known)
+
+
+def help_text() -> str:
+    """What `--help` prints."""
+    about = {"sampler": SAMPLERS, "pruner": PRUNERS, "score": SCORES, "measure": MEASURES,
+             "space": (*spaces.names(), "FILE.yaml")}  # fmt: skip
+    fields = "\n".join(
+        f"  {name}: {'null' if value is None else value}"
+        + (f"  ({', '.join(about[name])})" if name in about else "")
+        for name, value in serialize.to_plain(SearchConfig()).items()
+    )
+    return (
+        "Search hyperparameters with Optuna; a trial is a run of sejax.run, generations its budget.\n"
+        "With proxy=RUN_DIR, a file or a shipped name: an agent's, trained on that proxy.\n\n"
+        "  python -m sejax.search env=cartpole es.noise_std='tag(log, interval(0.01, 0.3))'\n"
+        "  python -m sejax.search env=cartpole preset=paper space=paper_se trials=60\n"
+        "  python -m sejax.search proxy=cartpole agent=ppo space=agent\n"
+        "  python -m sejax.search study=NAME storage=URL   # one more worker\n\n"
+        f"Fields:\n{fields}\n\n"
+        "All other words are those of python -m sejax.run (with a proxy: sejax.evaluate); sweeps "
+        "among\nthem are searched: choice(a,b), range(1,9,2), interval(0,1), int(interval(1,10)), "
+        "tag(log, ...),\ntag(log, inverse, ...) in 1 - x. The same command goes on where it stopped."
+    )
