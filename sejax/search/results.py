@@ -180,12 +180,12 @@ def print_table(study: optuna.Study, search: Search) -> None:
                   "that were not pruned")  # fmt: skip
     for column in ("trial", "mean", "worst", "generations", "training steps", "seconds"):
         shown.add_column(column, justify="right")
-    shown.add_column("settings", overflow="fold")
+    shown.add_column("settings", no_wrap=True)
     for trial in done[:SHOWN]:
         kept = trial.user_attrs
-        shown.add_row(str(trial.number), f"{kept['mean']:.1f}", f"{kept['worst']:.1f}",
+        shown.add_row(str(trial.number), f"{kept['mean']:.4g}", f"{kept['worst']:.4g}",
                       str(kept["generations"]), f"{kept['cost']:,}", f"{kept['seconds']:.0f}",
-                      " ".join(words_of(trial, search)))  # fmt: skip
+                      "\n".join(words_of(trial, search)))  # fmt: skip
     console.print(shown)
     rows = table(study, search)
     if len(rows):

@@ -77,7 +77,8 @@ class Dimension:
 
     def _written(self, value: float) -> str:
         """Within the bounds, which rounding may leave."""
-        return f"{min(max(float(f'{value:.{DIGITS}g}'), self.low), self.high):.{DIGITS + 2}g}"
+        rounded = float(f"{value:.{DIGITS}g}")
+        return f"{min(max(rounded, self.low), self.high):.12g}"
 
 
 def parse(name: str, text: str) -> Dimension:

@@ -141,7 +141,7 @@ class Objective:
             self._say(f"trial {self.trial.number}: refused: {kept['refused']}")
             return
         score = kept.get(self._search.config.score)
-        self._say(f"trial {self.trial.number}: {'not finite' if score is None else f'{score:.1f}'}, "
+        self._say(f"trial {self.trial.number}: {'not finite' if score is None else f'{score:.4g}'}, "
                   f"{how} at generation {kept['generations']}/"
                   f"{self._search.config.max_generations}: {' '.join(words)}")  # fmt: skip
 

@@ -50,12 +50,12 @@ def print_table(table: Any, study: optuna.Study, search: Search) -> None:
                   "training steps")  # fmt: skip
     for column in ("trial", "rank there", "trained on the proxy", "on the real task", "real steps"):
         shown.add_column(column, justify="right")
-    shown.add_column("settings", overflow="fold")
+    shown.add_column("settings", no_wrap=True)
     for row in table.itertuples():
         shown.add_row(str(row.trial), str(row.rank),
                       f"{row.proxy_return:.1f} ± {row.proxy_std:.1f}",
                       f"{row.real_return:.1f} ± {row.real_std:.1f}", f"{row.real_steps:,.0f}",
-                      " ".join(results.words_of(trials[row.trial], search)))  # fmt: skip
+                      "\n".join(results.words_of(trials[row.trial], search)))  # fmt: skip
     console = Console(highlight=False)
     console.print(shown)
     if len(table) > 2 and table["proxy_return"].nunique() > 1 and table["real_return"].nunique() > 1:
