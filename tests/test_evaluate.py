@@ -19,7 +19,7 @@ from sejax.agents.tabular import QLearningConfig
 from sejax.app import build, commands, compose, progress
 from sejax.app.families import families_of
 from sejax.errors import ConfigError
-from sejax.evaluate import proxy_study, evaluate
+from sejax.evaluate import evaluate, proxy_study
 from sejax.proxies import files
 from sejax.training import TrainingConfig, budget_for
 
@@ -194,9 +194,7 @@ def test_each_of_several_agents_trains_as_long_as_it_must(tmp_path):
     # Learned with 4000 steps, of which DDQN waits 2 * 200; here 10 episodes, as PPO collects.
     waits = {"ddqn": 10 * 200, "dueling_ddqn": 10 * 200, "ppo": 10 * 200 + 1}
     assert budgets == {key: 4000 + wait - 2 * 200 for key, wait in waits.items()}
-    as_learned = proxy_study(
-        evaluate_config(f"proxy={path}", "agent_hparams=as_learned", words=[])
-    )
+    as_learned = proxy_study(evaluate_config(f"proxy={path}", "agent_hparams=as_learned", words=[]))
     assert as_learned.families == tuple(
         dataclasses.replace(x, field="agent", weight=1.0) for x in families_of(learned(*words)[0])
     )

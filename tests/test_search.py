@@ -1,9 +1,12 @@
-"""Studies: what trials tell them, what happens to those that die, and what is written at the end."""
+"""Studies: what trials tell them, what becomes of those that die, and what is written."""
 
 import os
+import shutil
 import signal
+import socket
 import subprocess
 import sys
+import tempfile
 import time
 from pathlib import Path
 
@@ -195,7 +198,7 @@ def test_an_error_is_no_trial_and_ends_the_worker(tmp_path):
 
 
 def test_workers_join_by_the_studys_name_and_other_searches_are_refused(tmp_path):
-    found, search = opened(tmp_path, "env=acrobot", "study=mine", "seeds=2")
+    _, search = opened(tmp_path, "env=acrobot", "study=mine", "seeds=2")
     url = search.storage
     joined, theirs = study.open_study(settings.read(["study=mine", f"storage={url}"]))
     assert joined.study_name == "mine" and theirs.stored() == search.stored()
@@ -271,7 +274,9 @@ def test_the_newest_directory_is_copied_with_its_checkpoint_first(tmp_path, monk
     monkeypatch.setattr(
         trials.shutil, "copytree", lambda s, d, **k: (copied.append(s.name), tree(s, d, **k))
     )
-    monkeypatch.setattr(trials.shutil, "copy2", lambda s, d: (copied.append(Path(s).name), one(s, d)))
+    monkeypatch.setattr(
+        trials.shutil, "copy2", lambda s, d: (copied.append(Path(s).name), one(s, d))
+    )
     assert trials.take_over(tmp_path / "0005", [tmp_path / "0000", old, tmp_path / "0003"])
     assert copied[0] == "checkpoint"
     assert sorted(x.name for x in (tmp_path / "0005").iterdir()) == ["checkpoint", "metrics.csv"]
@@ -304,7 +309,8 @@ def test_the_presets_section_makes_the_settings_of_the_override_line(tmp_path, m
 
 def test_what_was_found_is_written(tmp_path):
     found, search = opened(tmp_path, "trials=11", "sampler=random", "pruner=none",
-                           "min_generations=1", "max_generations=1", "es.step_size=interval(0.5,1)")  # fmt: skip
+                           "min_generations=1", "max_generations=1",
+                           "es.step_size=interval(0.5,1)")  # fmt: skip
 
     class Two(Runner):
         def config(self, words, folder=None):
@@ -359,11 +365,6 @@ def command(path, *words):
             f"search_dir={path}", *words]  # fmt: skip
 
 
-def ended_trials(url, name="gridworld_2x2-se-q_learning"):
-    found = optuna.load_study(study_name=name, storage=url)
-    return [x for x in found.get_trials(deepcopy=False) if x.state.name != "FAIL"], found
-
-
 def run_with_casualties(path, *words):
     """Two workers, one of which is killed and the other stopped for longer than it may be."""
     workers = [subprocess.Popen(command(path, *words), stdout=subprocess.DEVNULL) for _ in "ab"]
@@ -380,8 +381,9 @@ def run_with_casualties(path, *words):
     return third
 
 
-def check_study(path, url):
-    left, found = ended_trials(url)
+def check_study(url, name="gridworld_2x2-se-q_learning"):
+    found = optuna.load_study(study_name=name, storage=url)
+    left = [x for x in found.trials if x.state.name != "FAIL"]
     assert {x.state.name for x in left} <= {"COMPLETE", "PRUNED"} and len(left) >= 12
     retried = {number for x in found.trials for number in x.user_attrs.get(study.HISTORY, [])}
     failed = {x.number for x in found.trials if x.state.name == "FAIL"}
@@ -397,13 +399,45 @@ def check_study(path, url):
 def test_a_killed_and_a_stopped_worker_cost_the_study_no_trial(tmp_path):
     run_with_casualties(tmp_path / "s")
     url = f"sqlite:///{tmp_path / 's' / 'study.db'}"
-    check_study(tmp_path / "s", url)
+    check_study(url)
     import sqlite3
 
     with sqlite3.connect(tmp_path / "s" / "study.db") as connection:
         assert connection.execute("PRAGMA integrity_check").fetchone() == ("ok",)
     again = subprocess.run(command(tmp_path / "s"), capture_output=True, text=True)
     assert again.returncode == 0 and "The best:" in again.stdout
+
+
+@pytest.fixture
+def postgres(tmp_path):
+    """URL of a database of a server of our own."""
+    pytest.importorskip("psycopg2", reason="needs psycopg2-binary")
+    programs = sorted(Path("/usr/lib/postgresql").glob("*/bin/initdb"))
+    if not programs:
+        pytest.skip("needs PostgreSQL's server: apt install postgresql")
+    folder = Path(tempfile.mkdtemp(dir="/tmp"))  # a path that the server's user can enter
+    who = {"user": "postgres"} if os.geteuid() == 0 else {}  # the server refuses root
+    if who:
+        shutil.chown(folder, **who)
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    started = [programs[-1].with_name("pg_ctl"), "-D", folder / "db", "-w"]
+    options = f"-p {port} -c listen_addresses=127.0.0.1 -k {folder}"
+    subprocess.run([programs[-1], "-D", folder / "db", "-U", "me", "-A", "trust"], check=True,
+                   cwd=folder, stdout=subprocess.DEVNULL, **who)  # fmt: skip
+    subprocess.run([*started, "-o", options, "-l", folder / "log", "start"], check=True,
+                   cwd=folder, stdout=subprocess.DEVNULL, **who)  # fmt: skip
+    yield f"postgresql://me@127.0.0.1:{port}/postgres"
+    subprocess.run([*started, "-m", "immediate", "stop"], check=True, cwd=folder,
+                   stdout=subprocess.DEVNULL, **who)  # fmt: skip
+    shutil.rmtree(folder)
+
+
+@pytest.mark.slow
+def test_the_same_with_postgresql(tmp_path, postgres):
+    run_with_casualties(tmp_path / "s", f"storage={postgres}", "study=there")
+    check_study(postgres, "there")
 
 
 @pytest.mark.slow

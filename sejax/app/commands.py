@@ -19,7 +19,8 @@ from sejax.app import compose, families, runtime
 from sejax.errors import ConfigError
 
 BAD_INPUT, FAILED, INTERRUPTED = 2, 1, 130
-Given, Result = TypeVar("Given"), TypeVar("Result")
+Given = TypeVar("Given")
+Result = TypeVar("Result")
 
 
 def start(name: str, main: Callable[[], object]) -> None:

@@ -30,8 +30,8 @@ def main(words: Sequence[str]) -> None:
     try:
         study.work(found, search, runner, lambda text: print(text, flush=True))
     except KeyboardInterrupt:
-        print(f"Interrupted. What has ended is saved in {search.folder}, the trial at hand is queued "
-              f"again; the same command goes on from there.")  # fmt: skip
+        print(f"Interrupted. What has ended is saved in {search.folder}, and the trial at hand is "
+              f"queued again; the same command goes on from there.")  # fmt: skip
         commands.leave(commands.INTERRUPTED)
     words = results.write(found, search, runner.command)
     results.print_table(found, search)

@@ -1,9 +1,9 @@
 """Compiled programs that trials share: those whose configurations differ in traced numbers alone.
 
 Which numbers a program may take as arguments the options say (`sejax.options.option(traced=True)`):
-learning rates, discounts and the like of agents, and the step size and noise of NES. Everything else
-shapes the program. With the numbers as arguments it computes what it does with them as constants,
-up to rounding.
+learning rates, discounts and the like of agents, and the step size and noise of NES. Everything
+else shapes the program. With the numbers as arguments it computes what it does with them as
+constants, up to rounding.
 """
 
 import copy
@@ -130,7 +130,9 @@ class SharedChunks(Chunks):
 
 def static_of(config: Any) -> dict[str, Any]:
     """A configuration's class, and its fields that are not traced, or left open."""
-    traced = [f.name for f in dataclasses.fields(config) if marks(type(config), f.name).get("traced")]
+    traced = [
+        f.name for f in dataclasses.fields(config) if marks(type(config), f.name).get("traced")
+    ]
     fields = _without(to_plain(config), [x for x in traced if getattr(config, x) is not None])
     return {"class": f"{type(config).__module__}:{type(config).__qualname__}", **fields}
 

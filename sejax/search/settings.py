@@ -54,7 +54,9 @@ class SearchConfig(Options):
     search_dir: str | None = None  # null: runs/search-<study>
     timeout: float | None = option(None, positive("no trial would start"))  # s; none starts later
     heartbeat: int = option(15, counts("workers must show that they live"))  # s
-    verify: int = option(10, counts("the best are tried on the real task"))  # of a search on a proxy
+    verify: int = option(
+        10, counts("the best are tried on the real task")
+    )  # of a search on a proxy
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -195,7 +197,6 @@ def _as_file_name(name: str) -> str:
     return re.sub(r"[^\w.+-]+", "_", name)
 
 
-
 def require_fields(search: Search, config: Any) -> None:
     """Checks that what is searched are fields of the command.
 
@@ -222,15 +223,17 @@ def help_text() -> str:
         + (f"  ({', '.join(about[name])})" if name in about else "")
         for name, value in serialize.to_plain(SearchConfig()).items()
     )
-    return (
-        "Search hyperparameters with Optuna; a trial is a run of sejax.run, generations its budget.\n"
-        "With proxy=RUN_DIR, a file or a shipped name: an agent's, trained on that proxy.\n\n"
-        "  python -m sejax.search env=cartpole es.noise_std='tag(log, interval(0.01, 0.3))'\n"
-        "  python -m sejax.search env=cartpole preset=paper space=paper_se trials=60\n"
-        "  python -m sejax.search proxy=cartpole agent=ppo space=agent\n"
-        "  python -m sejax.search study=NAME storage=URL   # one more worker\n\n"
-        f"Fields:\n{fields}\n\n"
-        "All other words are those of python -m sejax.run (with a proxy: sejax.evaluate); sweeps "
-        "among\nthem are searched: choice(a,b), range(1,9,2), interval(0,1), int(interval(1,10)), "
-        "tag(log, ...),\ntag(log, inverse, ...) in 1 - x. The same command goes on where it stopped."
-    )
+    return f"""Search hyperparameters with Optuna; a trial is a run, its generations the budget.
+With proxy=RUN_DIR, a file or a shipped name: those of an agent that is trained on that proxy.
+
+  python -m sejax.search env=cartpole es.noise_std='tag(log, interval(0.01, 0.3))'
+  python -m sejax.search env=cartpole preset=paper space=paper_se trials=60
+  python -m sejax.search proxy=cartpole agent=ppo space=agent
+  python -m sejax.search study=NAME storage=URL   # one more worker
+
+Fields:
+{fields}
+
+All other words are those of python -m sejax.run (with a proxy: sejax.evaluate); sweeps among them
+are searched: choice(a,b), range(1,9,2), interval(0,1), int(interval(1,10)), tag(log, ...), and
+tag(log, inverse, ...) in 1 - x. The same command goes on where it stopped."""

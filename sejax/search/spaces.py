@@ -34,7 +34,7 @@ class Dimension:
       text: Hydra's sweep.
       values: of a choice, as the command line has them; empty for a range.
       low, high: bounds, both included.
-      step: of a range of whole numbers or of floats; None for an interval of floats.
+      step: of a range of whole numbers; None for one of floats.
       log: whether the scale is logarithmic.
       inverse: whether it is so in 1 - value.
     """
@@ -44,7 +44,7 @@ class Dimension:
     values: tuple[str, ...] = ()
     low: float = 0.0
     high: float = 0.0
-    step: float | None = None
+    step: int | None = None
     log: bool = False
     inverse: bool = False
 
@@ -61,11 +61,10 @@ class Dimension:
             low, high = (round(1 - x, 12) for x in (self.high, self.low))
             value = trial.suggest_float(self.parameter, low, high, log=True)
             return self._written(1 - value)
-        whole = all(isinstance(x, int) for x in (self.low, self.high, self.step))
-        if whole and self.step is not None:
+        if self.step is not None:
             return str(trial.suggest_int(self.name, int(self.low), int(self.high),
-                                         step=int(self.step), log=self.log))  # fmt: skip
-        value = trial.suggest_float(self.name, self.low, self.high, step=self.step, log=self.log)
+                                         step=self.step, log=self.log))  # fmt: skip
+        value = trial.suggest_float(self.name, self.low, self.high, log=self.log)
         return self._written(value)
 
     def of(self, params: Mapping[str, Any]) -> str:
@@ -98,33 +97,37 @@ def parse(name: str, text: str) -> Dimension:
     sweep = override.value()
     tags = set(getattr(sweep, "tags", ()))
     log, inverse = "log" in tags, "inverse" in tags
-    require(tags <= {"log", "inverse"} and (log or not inverse), name,
-            "have the tags log, or log and inverse", "nothing else is known", ", ".join(sorted(tags)),
-            f"{name}='tag(log, inverse, interval(0.9, 0.999))'")  # fmt: skip
-    match sweep:
-        case ChoiceSweep():
-            plain = [x.text if isinstance(x, QuotedString) else x for x in sweep.list]
-            values = tuple(map(word, plain))
-            return Dimension(name=name, text=text, values=values)
-        case RangeSweep(start=start, stop=stop, step=step) if start is not None and stop is not None:
-            whole = all(isinstance(x, int) for x in (start, stop, step))
-            # As Python's, without its end.
-            last = start + step * (-(-(stop - start) // step) - 1) if whole else stop - step
-            bounds = {"low": start, "high": last, "step": None if log and not whole else step}
-        case IntervalSweep(start=start, end=end) if start is not None and end is not None:
-            whole = isinstance(start, int) and isinstance(end, int)
-            bounds = {"low": start, "high": end, "step": 1 if whole else None}
-        case _:
-            raise _no_sweep(name, text)
-    require(bounds["low"] <= bounds["high"], name, "be a range that grows", "there is nothing in it "
-            "otherwise", shortened(text), f"{name}='{EXAMPLE}'")  # fmt: skip
-    require(not log or inverse or (bounds["low"] > 0 and bounds["step"] in (None, 1)), name,
-            "begin above 0 and have steps of 1 with log", "it is drawn in its logarithm",
+    example = f"{name}='tag(log, inverse, interval(0.9, 0.999))'"
+    require(tags <= {"log", "inverse"} and (log or not inverse), name, "have the tags log, or log "
+            "and inverse", "nothing else is known", ", ".join(sorted(tags)), example)  # fmt: skip
+    if isinstance(sweep, ChoiceSweep):
+        plain = [x.text if isinstance(x, QuotedString) else x for x in sweep.list]
+        return Dimension(name=name, text=text, values=tuple(map(word, plain)))
+    low, high, step = _range(name, text, sweep)
+    require(low <= high, name, "be a range that grows", "there is nothing in it otherwise",
             shortened(text), f"{name}='{EXAMPLE}'")  # fmt: skip
-    require(not inverse or bounds["high"] < 1, name, "end below 1 with inverse", "it is drawn in the "
-            "logarithm of the distance", shortened(text),
-            f"{name}='tag(log, inverse, interval(0.9, 0.999))'")  # fmt: skip
-    return Dimension(name=name, text=text, log=log, inverse=inverse, **bounds)
+    require(not log or inverse or (low > 0 and step in (None, 1)), name, "begin above 0 and have "
+            "steps of 1 with log", "it is drawn in its logarithm", shortened(text),
+            f"{name}='{EXAMPLE}'")  # fmt: skip
+    require(not inverse or high < 1, name, "end below 1 with inverse", "it is drawn in the "
+            "logarithm of the distance", shortened(text), example)  # fmt: skip
+    return Dimension(name=name, text=text, low=low, high=high, step=step, log=log, inverse=inverse)
+
+
+def _range(name: str, text: str, sweep: Any) -> tuple[float, float, int | None]:
+    """Bounds, both included, and the step of a sweep that is a range; no step for floats.
+
+    Raises:
+      ConfigError: if it is none.
+    """
+    match sweep:
+        case RangeSweep(start=int(start), stop=int(stop), step=int(step)) if step > 0:
+            return start, start + step * (-(-(stop - start) // step) - 1), step  # without its end
+        case IntervalSweep(start=int(start), end=int(end)):
+            return start, end, 1
+        case IntervalSweep(start=float(start), end=float(end)):
+            return start, end, None
+    raise _no_sweep(name, text)
 
 
 def _no_sweep(name: str, text: str) -> ConfigError:

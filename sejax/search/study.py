@@ -93,8 +93,8 @@ def work(
             _run_one(study, objective)
         else:
             if not waits:
-                say(f"Waiting for {count[TrialState.RUNNING]} trials of other workers, or for their "
-                    f"heartbeats to end ({GRACE * config.heartbeat} s).")  # fmt: skip
+                say(f"Waiting for {count[TrialState.RUNNING]} trials of other workers, or for "
+                    f"their heartbeats to end ({GRACE * config.heartbeat} s).")  # fmt: skip
             waits = True
             time.sleep(min(1.0, config.heartbeat))
 
@@ -140,10 +140,11 @@ class Objective:
         if "refused" in kept:
             self._say(f"trial {self.trial.number}: refused: {kept['refused']}")
             return
-        score = kept.get(self._search.config.score)
-        self._say(f"trial {self.trial.number}: {'not finite' if score is None else f'{score:.4g}'}, "
-                  f"{how} at generation {kept['generations']}/"
-                  f"{self._search.config.max_generations}: {' '.join(words)}")  # fmt: skip
+        config = self._search.config
+        score = kept.get(config.score)
+        worth = "not finite" if score is None else f"{score:.4g}"
+        self._say(f"trial {self.trial.number}: {worth}, {how} at generation "
+                  f"{kept['generations']}/{config.max_generations}: {' '.join(words)}")  # fmt: skip
 
 
 def trial_folder(search: Search, number: int) -> Path:

@@ -139,8 +139,8 @@ def _stored_rounds(path: Path) -> list[dict[str, Any]]:
         return []
     except (ValueError, TypeError, KeyError) as error:
         raise ConfigError(
-            f"search_dir must keep the rounds of its trials, because a trial goes on from them; got "
-            f"{path}, which cannot be read. Remove it; its trial begins anew."
+            f"search_dir must keep the rounds of its trials, because a trial goes on from them; "
+            f"got {path}, which cannot be read. Remove it; its trial begins anew."
         ) from error
     return rounds
 

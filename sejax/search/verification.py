@@ -19,8 +19,8 @@ def verify(study: optuna.Study, search: Search, runner: Tuning) -> Any:
     Rows of an earlier session are kept.
 
     Returns:
-      A row for each of the best `search.config.verify` trials, as a data frame, the best on the real
-      task first.
+      A row for each of the best `search.config.verify` trials, as a data frame, the best on the
+      real task first.
     """
     import pandas as pd
 
@@ -58,6 +58,10 @@ def print_table(table: Any, study: optuna.Study, search: Search) -> None:
                       "\n".join(results.words_of(trials[row.trial], search)))  # fmt: skip
     console = Console(highlight=False)
     console.print(shown)
-    if len(table) > 2 and table["proxy_return"].nunique() > 1 and table["real_return"].nunique() > 1:
+    if (
+        len(table) > 2
+        and table["proxy_return"].nunique() > 1
+        and table["real_return"].nunique() > 1
+    ):
         agreed = spearmanr(table["proxy_return"], table["real_return"]).statistic
         console.print(f"Rank correlation of the two columns: {agreed:.2f}.")
