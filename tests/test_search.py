@@ -76,7 +76,7 @@ def test_hyperband_ends_trials_that_are_behind_and_every_trial_ends(tmp_path):
     assert set(pruned["generations"]) == {1}  # the one rung below the last generation
     assert set(table[table["state"] == "complete"]["generations"]) == {3}
     assert len(runner.ran) == table["generations"].sum()  # a pruned trial stops at once
-    best = results.ranked(found, search)[0]
+    best = results.ranked(found)[0]
     assert best.params["es.noise_std"] == max(x.params["es.noise_std"] for x in found.trials)
 
 
@@ -318,7 +318,7 @@ def test_what_was_found_is_written(tmp_path):
 
     study.work(found, search, Two(search), lambda text: None)
     words = results.write(found, search, "sejax.run")
-    best = results.ranked(found, search)[0]
+    best = results.ranked(found)[0]
     assert words[0] == f"es.noise_std={search.space['es.noise_std'].of(best.params)}"
     assert (tmp_path / "best.txt").read_text() == f"python -m sejax.run {' '.join(words)}\n"
     assert len(pd.read_csv(tmp_path / "trials.csv")) == 11
@@ -368,17 +368,20 @@ def command(path, *words):
 def run_with_casualties(path, *words):
     """Two workers, one of which is killed and the other stopped for longer than it may be."""
     workers = [subprocess.Popen(command(path, *words), stdout=subprocess.DEVNULL) for _ in "ab"]
-    while not (path / "trials" / "0003").exists():
-        assert all(worker.poll() is None for worker in workers)
-        time.sleep(0.1)
-    workers[0].kill()
-    workers[0].wait()
-    os.kill(workers[1].pid, signal.SIGSTOP)
-    third = subprocess.run(command(path, *words), capture_output=True, text=True, timeout=500)
-    os.kill(workers[1].pid, signal.SIGCONT)
-    assert third.returncode == 0, third.stderr
-    assert workers[1].wait(timeout=300) == 0
-    return third
+    try:
+        while not (path / "trials" / "0003").exists():
+            assert all(worker.poll() is None for worker in workers)
+            time.sleep(0.1)
+        workers[0].kill()
+        os.kill(workers[1].pid, signal.SIGSTOP)
+        third = subprocess.run(command(path, *words), capture_output=True, text=True, timeout=500)
+        os.kill(workers[1].pid, signal.SIGCONT)
+        assert third.returncode == 0, third.stderr
+        assert workers[1].wait(timeout=300) == 0
+    finally:
+        for worker in workers:
+            worker.kill()
+            worker.wait()
 
 
 def check_study(url, name="gridworld_2x2-se-q_learning"):

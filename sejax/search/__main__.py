@@ -2,11 +2,15 @@
 
 from collections.abc import Sequence
 from importlib.util import find_spec
+from typing import TYPE_CHECKING, Any
 
 from sejax.app import commands, runtime
 from sejax.errors import ConfigError
 from sejax.search import settings
 from sejax.search.settings import Search
+
+if TYPE_CHECKING:
+    from sejax.search.study import Runner
 
 
 def main(words: Sequence[str]) -> None:
@@ -22,9 +26,10 @@ def main(words: Sequence[str]) -> None:
                           "with pip install 'sejax[search]'.")  # fmt: skip
     from sejax.search import results, study
 
+    if not search.names_study_alone:  # before a study is made of it
+        settings.require_fields(search, _runner(search).config([]))
     found, search = study.open_study(search)
     runner = _runner(search)
-    settings.require_fields(search, runner.config([]))
     runtime.enable_compilation_cache()
     print(f"Study {search.study} in {search.folder}: {', '.join(search.space)}.", flush=True)
     try:
@@ -33,18 +38,18 @@ def main(words: Sequence[str]) -> None:
         print(f"Interrupted. What has ended is saved in {search.folder}, and the trial at hand is "
               f"queued again; the same command goes on from there.")  # fmt: skip
         commands.leave(commands.INTERRUPTED)
-    words = results.write(found, search, runner.command)
+    best = results.write(found, search, runner.command)
     results.print_table(found, search)
-    if not words:
+    if not best:
         print("No trial was completed.")
         return
     if search.is_of_agent:
-        words = _verified(found, search, runner)
-    print(f"\nThe best:\n  {results.override_line(words, search, runner.command)}")
+        best = _verified(found, search, runner)
+    print(f"\nThe best:\n  {results.override_line(best, search, runner.command)}")
     print(f"{search.folder}/trials.csv, pareto.png, best.txt and preset.yaml hold what was found.")
 
 
-def _runner(search: Search):  # type: ignore[no-untyped-def]
+def _runner(search: Search) -> "Runner":
     if search.is_of_agent:
         from sejax.search.tuning import Tuning
 
@@ -54,15 +59,14 @@ def _runner(search: Search):  # type: ignore[no-untyped-def]
     return Learning(search)
 
 
-def _verified(found, search, runner) -> list[str]:  # type: ignore[no-untyped-def]
+def _verified(found: Any, search: Search, runner: Any) -> list[str]:
     """The overrides of the best on the real task."""
     from sejax.search import results, verification
 
     table = verification.verify(found, search, runner)
     verification.print_table(table, found, search)
-    best = int(table["trial"].iloc[0])
-    (trial,) = [trial for trial in found.get_trials(deepcopy=False) if trial.number == best]
-    words = results.words_of(trial, search)
+    best = found.get_trials(deepcopy=False)[int(table["trial"].iloc[0])]
+    words = results.words_of(best, search)
     results.write_best(words, search, runner.command)
     return words
 

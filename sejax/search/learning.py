@@ -61,7 +61,8 @@ class Learning:
         with open_for(config, "Set search_dir=FOLDER.") as directory:
             chunks = self._programs.chunks(config)
             num_candidates = chunks.program.strategy.num_candidates
-            report = _Report(directory, follower, num_candidates)
+            over_at = chunks.program.solved_score if config.stop_when_solved else None
+            report = _Report(directory, follower, num_candidates, over_at)
             session.run(config, directory, chunks, report)
             return progress_of(directory, num_candidates)
 
@@ -69,12 +70,17 @@ class Learning:
 class _Report(session.Quiet):
     """Hears of each generation after its files are written, so that to end there loses nothing."""
 
-    def __init__(self, directory: RunDirectory, follower: Follower, num_candidates: int):
+    def __init__(
+        self, directory: RunDirectory, follower: Follower, num_candidates: int,
+        over_at: float | None,
+    ):  # fmt: skip
         self._directory, self._follower = directory, follower
-        self._num_candidates = num_candidates
+        self._num_candidates, self._over_at = num_candidates, over_at
 
     def update(self, generation: int, info: Any) -> None:
-        self._follower.tell(progress_of(self._directory, self._num_candidates))
+        progress = progress_of(self._directory, self._num_candidates)
+        if self._over_at is None or not (progress.scores[-1] >= self._over_at).all():
+            self._follower.tell(progress)  # what is over by itself is not pruned
 
 
 def progress_of(directory: RunDirectory, num_candidates: int) -> Progress:

@@ -24,13 +24,14 @@ from sejax.serialize import to_plain
 
 # Fields of a run that shape no program; a chunk's length and seeds are counted by themselves.
 _FREE = ("preset", "seed", "num_seeds", "generations", "checkpoint_every", "run_dir", "tracker")
+KEPT = 16  # shapes whose programs stay in memory
 
 
 class Programs:
     """Programs by their shape.
 
     Attributes:
-      shapes: those that were met.
+      shapes: those that were used last.
     """
 
     def __init__(self) -> None:
@@ -39,7 +40,11 @@ class Programs:
     def chunks(self, config: build.LearnConfig) -> Chunks:
         """The chunks of a run, compiled if none of its shape was."""
         numbers = numbers_of(config)
-        shape = self.shapes.setdefault(shape_of(config, numbers), Shape(config))
+        key = shape_of(config, numbers)
+        shape = self.shapes.pop(key, None) or Shape(config)
+        self.shapes[key] = shape  # the last used is the last to go
+        if len(self.shapes) > KEPT:
+            del self.shapes[next(iter(self.shapes))]
         return SharedChunks(make_program(**config.parts()), shape, numbers)
 
 

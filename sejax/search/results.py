@@ -19,7 +19,7 @@ NEEDED = 10  # completed trials, before importances say anything
 ENDED = (TrialState.COMPLETE, TrialState.PRUNED)
 
 
-def ranked(study: optuna.Study, search: Search) -> list[FrozenTrial]:
+def ranked(study: optuna.Study) -> list[FrozenTrial]:
     """Completed trials, the best first; of equal ones that which cost less."""
     done = [t for t in study.get_trials(deepcopy=False) if t.state == TrialState.COMPLETE]
     return sorted(done, key=lambda trial: (-float(trial.value or 0.0), trial.user_attrs["cost"]))
@@ -155,7 +155,7 @@ def write(study: optuna.Study, search: Search, command: str) -> list[str]:
     write_text(search.folder / "trials.csv", rows.to_csv(index=False))
     if len(rows) and rows[search.config.score].notna().any():
         draw_pareto(rows, search, search.folder / "pareto.png")
-    done = ranked(study, search)
+    done = ranked(study)
     if not done:
         return []
     words = words_of(done[0], search)
@@ -175,7 +175,7 @@ def print_table(study: optuna.Study, search: Search) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    console, done = Console(highlight=False), ranked(study, search)
+    console, done = Console(highlight=False), ranked(study)
     shown = Table(title=f"{search.study}: the best {min(SHOWN, len(done))} of {len(done)} trials "
                   "that were not pruned")  # fmt: skip
     for column in ("trial", "mean", "worst", "generations", "training steps", "seconds"):

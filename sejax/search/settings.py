@@ -24,7 +24,7 @@ SCORES = ("mean", "worst")
 MEASURES = ("last", "best", "mean")
 _TAKEN = {"generations", "num_seeds", "checkpoint_every", "run_dir", "out_dir"}  # by the search
 # Fields that may differ between the workers of a study, and between its sessions.
-FREE_FIELDS = ("trials", "timeout", "storage", "search_dir", "heartbeat", "sampler_seed")
+FREE_FIELDS = ("trials", "timeout", "storage", "search_dir", "sampler_seed")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -116,13 +116,19 @@ class Search:
             "search": own,
             "fixed": list(self.fixed),
             "space": {name: x.text for name, x in self.space.items()},
+            "folder": str(self.folder.resolve()),
         }
 
     @classmethod
     def from_stored(cls, stored: dict[str, Any], config: SearchConfig) -> "Search":
-        """Inverse of `stored`, with the free fields of a worker's own configuration."""
+        """Inverse of `stored`, with the free fields of a worker's own configuration.
+
+        Its folder is that of the study's maker, if that is there and no other is asked for.
+        """
+        folder = stored["folder"] if Path(stored["folder"]).is_dir() else None
+        search_dir = config.search_dir or folder
         return cls(
-            config=dataclasses.replace(config, **stored["search"]),
+            config=dataclasses.replace(config, **stored["search"], search_dir=search_dir),
             fixed=tuple(stored["fixed"]),
             space={name: spaces.parse(name, text) for name, text in stored["space"].items()},
         )

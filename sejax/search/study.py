@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 import optuna
+import sqlalchemy.exc
 from optuna.trial import TrialState
 
 from sejax.errors import ConfigError, require, told
@@ -23,6 +24,7 @@ from sejax.search.trials import Follower, Lost, Progress, take_over
 STORED = "sejax"  # the study's attribute that holds what is searched
 RETRIES = 3  # of a trial; one that takes its process down each time is given up then
 GRACE = 4  # heartbeats that may be missed
+ATTEMPTS = 3  # to open a storage, with a second between them
 REDUCTION_FACTOR = 3  # eta of Hyperband
 HISTORY = "retried"  # the trial's attribute with the numbers of those before
 
@@ -30,7 +32,9 @@ HISTORY = "retried"  # the trial's attribute with the numbers of those before
 class Runner(Protocol):
     """What makes a trial of settings: `sejax.search.learning` and `tuning`."""
 
-    def config(self, words: list[str], folder: Path) -> Any: ...
+    command: str
+
+    def config(self, words: list[str], folder: Path | None = None) -> Any: ...
     def run(self, config: Any, follower: Follower, is_inherited: bool) -> Progress: ...
 
 
@@ -56,7 +60,10 @@ def open_study(search: Search) -> tuple[optuna.Study, Search]:
             )  # fmt: skip
         stored = study.user_attrs.get(STORED)
         if stored is not None:
-            search = _joined(search, stored)
+            joined = _joined(search, stored)
+            if joined.config.heartbeat != search.config.heartbeat:
+                return open_study(joined)  # each worker goes by the same
+            search = joined
             study.sampler, study.pruner = _sampler(search), _pruner(search)
         else:
             require(search.space, "space", "be given, or sweeps of fields", "there is nothing to "
@@ -188,14 +195,20 @@ def _storage(search: Search) -> optuna.storages.RDBStorage:
     options: dict[str, Any] = {"pool_pre_ping": True}
     if url.startswith("sqlite"):
         options = {"connect_args": {"timeout": 60}}  # s that one worker waits for another's write
-    try:
-        with _unchanged():
-            return optuna.storages.RDBStorage(
-                url, engine_kwargs=options, heartbeat_interval=heartbeat,
-                grace_period=GRACE * heartbeat, heartbeat_stale_trial_callback=queue_again,
-            )  # fmt: skip
-    except Exception as error:  # of SQLAlchemy, of any driver, or that there is none
-        raise _unusable(search, error) from error
+    for attempt in range(ATTEMPTS):
+        try:
+            with _unchanged():
+                return optuna.storages.RDBStorage(
+                    url, engine_kwargs=options, heartbeat_interval=heartbeat,
+                    grace_period=GRACE * heartbeat, heartbeat_stale_trial_callback=queue_again,
+                )  # fmt: skip
+        except sqlalchemy.exc.DatabaseError as error:  # another worker makes the tables just now
+            if attempt == ATTEMPTS - 1:
+                raise _unusable(search, error) from error
+            time.sleep(1.0)
+        except Exception as error:  # of SQLAlchemy, of any driver, or that there is none
+            raise _unusable(search, error) from error
+    raise AssertionError
 
 
 def _unusable(search: Search, error: Exception) -> ConfigError:

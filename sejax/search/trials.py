@@ -1,6 +1,7 @@
 """A trial's own side: what it tells the study, and how one goes on that another process began."""
 
 import contextlib
+import dataclasses
 import math
 import shutil
 from collections.abc import Sequence
@@ -64,16 +65,13 @@ class Follower:
           Lost: as of `tell`.
         """
         num_generations, most = len(progress.scores), self._search.config.max_generations
-        whole = np.concatenate(
-            [progress.scores, np.repeat(progress.scores[-1:], most - num_generations, axis=0)]
-        )
-        self.tell(progress)
-        kept = Progress(scores=whole, cost=progress.cost, seconds=progress.seconds)
-        for step in range(num_generations + 1, most + 1):
-            self._report(self.score(kept, step), step)
-            self._trial.should_prune()  # so that the pruner hears of it
-        self.keep(kept, most, num_generations)
-        score = self.score(kept, most)
+        rest = np.repeat(progress.scores[-1:], most - num_generations, axis=0)
+        whole = dataclasses.replace(progress, scores=np.concatenate([progress.scores, rest]))
+        for step in range(self._told + 1, most + 1):
+            self._report(self.score(whole, step), step)
+            self._trial.should_prune()  # so that the pruner knows it; nothing is left to be saved
+        self.keep(whole, most, num_generations)
+        score = self.score(whole, most)
         if not math.isfinite(score):
             raise optuna.TrialPruned
         return score

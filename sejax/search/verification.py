@@ -24,7 +24,7 @@ def verify(study: optuna.Study, search: Search, runner: Tuning) -> Any:
     """
     import pandas as pd
 
-    path, best = search.folder / FILE, results.ranked(study, search)[: search.config.verify]
+    path, best = search.folder / FILE, results.ranked(study)[: search.config.verify]
     known = pd.read_csv(path).set_index("trial").to_dict("index") if path.exists() else {}
     rows = []
     for rank, trial in enumerate(best, 1):
