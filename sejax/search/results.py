@@ -178,12 +178,13 @@ def print_table(study: optuna.Study, search: Search) -> None:
     console, done = Console(highlight=False), ranked(study)
     shown = Table(title=f"{search.study}: the best {min(SHOWN, len(done))} of {len(done)} trials "
                   "that were not pruned")  # fmt: skip
-    for column in ("trial", "mean", "worst", "generations", "training steps", "seconds"):
-        shown.add_column(column, justify="right")
-    shown.add_column("settings", no_wrap=True)
+    scores = ("mean", "worst") if search.config.seeds > 1 else ("mean",)
+    for column in ("trial", *scores, "generations", "training steps", "s"):
+        shown.add_column(column, justify="right", no_wrap=column != "training steps")
+    shown.add_column("settings", overflow="fold")
     for trial in done[:SHOWN]:
         kept = trial.user_attrs
-        shown.add_row(str(trial.number), f"{kept['mean']:.4g}", f"{kept['worst']:.4g}",
+        shown.add_row(str(trial.number), *(f"{kept[name]:.4g}" for name in scores),
                       str(kept["generations"]), f"{kept['cost']:,}", f"{kept['seconds']:.0f}",
                       "\n".join(words_of(trial, search)))  # fmt: skip
     console.print(shown)

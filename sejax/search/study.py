@@ -195,7 +195,9 @@ def _storage(search: Search) -> optuna.storages.RDBStorage:
     options: dict[str, Any] = {"pool_pre_ping": True}
     if url.startswith("sqlite"):
         options = {"connect_args": {"timeout": 60}}  # s that one worker waits for another's write
-    for attempt in range(ATTEMPTS):
+    attempts = ATTEMPTS
+    while True:
+        attempts -= 1
         try:
             with _unchanged():
                 return optuna.storages.RDBStorage(
@@ -203,12 +205,11 @@ def _storage(search: Search) -> optuna.storages.RDBStorage:
                     grace_period=GRACE * heartbeat, heartbeat_stale_trial_callback=queue_again,
                 )  # fmt: skip
         except sqlalchemy.exc.DatabaseError as error:  # another worker makes the tables just now
-            if attempt == ATTEMPTS - 1:
+            if not attempts:
                 raise _unusable(search, error) from error
             time.sleep(1.0)
         except Exception as error:  # of SQLAlchemy, of any driver, or that there is none
             raise _unusable(search, error) from error
-    raise AssertionError
 
 
 def _unusable(search: Search, error: Exception) -> ConfigError:

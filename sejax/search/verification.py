@@ -50,7 +50,7 @@ def print_table(table: Any, study: optuna.Study, search: Search) -> None:
                   "training steps")  # fmt: skip
     for column in ("trial", "rank there", "trained on the proxy", "on the real task", "real steps"):
         shown.add_column(column, justify="right")
-    shown.add_column("settings", no_wrap=True)
+    shown.add_column("settings", overflow="fold")
     for row in table.itertuples():
         shown.add_row(str(row.trial), str(row.rank),
                       f"{row.proxy_return:.1f} ± {row.proxy_std:.1f}",
