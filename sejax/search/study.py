@@ -25,6 +25,7 @@ STORED = "sejax"  # the study's attribute that holds what is searched
 RETRIES = 3  # of a trial; one that takes its process down each time is given up then
 GRACE = 4  # heartbeats that may be missed
 ATTEMPTS = 3  # to open a storage, with a second between them
+LONGEST_WAIT = 3600  # s, for another worker's write to SQLite; one that was stopped in it blocks
 REDUCTION_FACTOR = 3  # eta of Hyperband
 HISTORY = "retried"  # the trial's attribute with the numbers of those before
 
@@ -194,16 +195,20 @@ def _storage(search: Search) -> optuna.storages.RDBStorage:
         search.folder.mkdir(parents=True, exist_ok=True)
     options: dict[str, Any] = {"pool_pre_ping": True}
     if url.startswith("sqlite"):
-        options = {"connect_args": {"timeout": 60}}  # s that one worker waits for another's write
+        options = {"connect_args": {"timeout": LONGEST_WAIT}}
     attempts = ATTEMPTS
     while True:
         attempts -= 1
         try:
             with _unchanged():
-                return optuna.storages.RDBStorage(
+                storage = optuna.storages.RDBStorage(
                     url, engine_kwargs=options, heartbeat_interval=heartbeat,
                     grace_period=GRACE * heartbeat, heartbeat_stale_trial_callback=queue_again,
                 )  # fmt: skip
+            if url.startswith("sqlite"):
+                with storage.engine.connect() as connection:  # shorter locks, and none for readers
+                    connection.exec_driver_sql("PRAGMA journal_mode=WAL")
+            return storage
         except sqlalchemy.exc.DatabaseError as error:  # another worker makes the tables just now
             if not attempts:
                 raise _unusable(search, error) from error
@@ -214,12 +219,12 @@ def _storage(search: Search) -> optuna.storages.RDBStorage:
 
 def _unusable(search: Search, error: Exception) -> ConfigError:
     cause = error.__cause__ or error
-    driver = ("pip install psycopg2-binary, or " if isinstance(cause, ImportError) and
-              search.storage.startswith("postgres") else "")  # fmt: skip
+    fix = "Set storage=null for a file in search_dir."
+    if isinstance(cause, ImportError) and search.storage.startswith("postgresql:"):
+        fix = "Install its driver with pip install 'psycopg[binary]'."
     return ConfigError(
         f"storage must be a database that can be used, because the study is kept there; got "
-        f"{search.storage.partition('://')[0]} ({told(cause)}). {driver[:1].upper()}{driver[1:]}"
-        f"{'s' if driver else 'S'}et storage=null for a file in search_dir."
+        f"{search.storage.partition('://')[0]} ({told(cause)}). {fix}"
     )
 
 
