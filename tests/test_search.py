@@ -373,10 +373,12 @@ def stop(worker, database):
         os.kill(worker.pid, signal.SIGSTOP)
         if not database.exists():  # it is elsewhere
             return
-        with contextlib.closing(sqlite3.connect(database, timeout=1)) as connection:
-            with contextlib.suppress(sqlite3.OperationalError):
-                connection.execute("BEGIN IMMEDIATE")
-                return
+        with (
+            contextlib.closing(sqlite3.connect(database, timeout=1)) as connection,
+            contextlib.suppress(sqlite3.OperationalError),
+        ):
+            connection.execute("BEGIN IMMEDIATE")
+            return
         os.kill(worker.pid, signal.SIGCONT)
         time.sleep(0.1)
 
