@@ -137,6 +137,8 @@ def test_every_preset_names_fields_of_its_command_with_bounds_that_are_taken(nam
         (["pruner=asha"], "pruner must be one of"),
         (["es.noise_std=interval(1"], "must read name=value.*es.noise_std"),
         (["trials=many"], "trials must be a whole number"),
+        (["generations=9"], r"generations must be left out.*got 9\. Set max_generations=27"),
+        (["run_dir=a,b"], r"run_dir must be left out.*Set search_dir=FOLDER"),
     ],
 )
 def test_bad_words_get_one_sentence(words, message):
@@ -146,7 +148,7 @@ def test_bad_words_get_one_sentence(words, message):
 
 def test_a_field_that_does_not_exist_is_not_searched():
     search = settings.read(["es.noise_stdd=interval(0.1,0.2)"])
-    with pytest.raises(ConfigError, match=r"es\.noise_stdd.*Did you mean.*es\.noise_std"):
+    with pytest.raises(ConfigError, match=r"es\.noise_stdd must be a field.*mean es\.noise_std\?"):
         settings.require_fields(search, compose.config([]))
 
 

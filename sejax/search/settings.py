@@ -14,7 +14,7 @@ from hydra.errors import HydraException
 
 from sejax import plugins, serialize
 from sejax.app import build
-from sejax.errors import ConfigError, require, unknown_name
+from sejax.errors import ConfigError, nearest, require
 from sejax.options import Options, counts, one_of, option, positive
 from sejax.search import spaces
 
@@ -22,7 +22,11 @@ SAMPLERS = ("tpe", "random")
 PRUNERS = ("hyperband", "median", "none")
 SCORES = ("mean", "worst")
 MEASURES = ("last", "best", "mean")
-_TAKEN = {"generations", "num_seeds", "checkpoint_every", "run_dir", "out_dir"}  # by the search
+# Fields of the command that are the search's, and which of its own to set in their place.
+TAKEN = {
+    "generations": "max_generations=27", "num_seeds": "seeds=3", "run_dir": "search_dir=FOLDER",
+    "out_dir": "search_dir=FOLDER", "checkpoint_every": "min_generations=3",
+}  # fmt: skip
 # Fields that may differ between the workers of a study, and between its sessions.
 FREE_FIELDS = ("trials", "timeout", "storage", "search_dir", "sampler_seed")
 
@@ -167,6 +171,8 @@ def read(words: Sequence[str]) -> Search:
             values[name] = text if name == "storage" and text != "null" else _plain(text)
             continue
         override = _parsed(word)
+        require(name not in TAKEN, name, "be left out", "the search sets it for each trial", text,
+                TAKEN.get(name, ""))  # fmt: skip
         if override.is_sweep_override():
             swept[override.get_key_element()] = spaces.parse(override.get_key_element(), text)
         else:
@@ -214,10 +220,14 @@ def require_fields(search: Search, config: Any) -> None:
       ConfigError: if one is not.
     """
     groups = build.EVALUATE_GROUPS if search.is_of_agent else build.LEARN_GROUPS
-    known = {*serialize.flatten(build.to_plain(config)), *groups} - _TAKEN
+    known = {*serialize.flatten(build.to_plain(config)), *groups}
     for name in search.space:
         if name not in known:
-            raise unknown_name("What is searched", name, known)
+            close = nearest(name, known)[:5]
+            raise ConfigError(
+                f"{name} must be a field of the trials, because it is searched; got one that they "
+                f"do not have. Did you mean {close[0]}? Others: {', '.join(close[1:])}."
+            )
 
 
 def help_text() -> str:
