@@ -182,7 +182,8 @@ def make_learner(
       agent: that learns on the proxies, from `sejax.make_agent` or one of your own; or several of
         them (`sejax.Families`), among which the members of a generation take turns.
       proxy: a `ProxyEnv` of the task, or a configuration that makes one; an SE if not given.
-      es: a configuration with `make(num_dims) -> Strategy`; the paper's NES if not given.
+      es: a `Strategy` over the proxy's weights, or a configuration with `make(num_dims) ->
+        Strategy`; the paper's NES if not given.
       objective: an `Objective`, or a configuration that makes one; the mean test return if not
         given.
       training: how long each agent trains, and how it is tested.
@@ -558,7 +559,7 @@ def _strategy_of(es: Any, num_dims: int) -> Strategy:
         from sejax.es.nes import NESConfig
 
         es = NESConfig()
-    return plugins.make("es", es, num_dims)
+    return es if isinstance(es, Strategy) else plugins.make("es", es, num_dims)
 
 
 def _strongly_typed(x: Array) -> Array:

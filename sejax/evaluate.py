@@ -42,7 +42,7 @@ def evaluate(config: EvaluateConfig) -> float:
     from sejax.app import plots
     from sejax.files import write_text
 
-    study = _real_study(config) if config.proxy == "real" else _proxy_study(config)
+    study = _real_study(config) if config.proxy == "real" else proxy_study(config)
     tables = {(world, family.key): _train_and_test(config, study, world, family)
               for world in study.worlds for family in study.families}  # fmt: skip
     table = pd.concat([t.assign(world=world) for (world, _), t in tables.items()])
@@ -118,7 +118,7 @@ def _real_study(config: EvaluateConfig) -> Study:
                  out_dir=out_dir)  # fmt: skip
 
 
-def _proxy_study(config: EvaluateConfig) -> Study:
+def proxy_study(config: EvaluateConfig) -> Study:
     """Agents on a proxy, and on its real task beside them."""
     from sejax import agents
     from sejax.proxies import files

@@ -19,7 +19,7 @@ from sejax.agents.tabular import QLearningConfig
 from sejax.app import build, commands, compose, progress
 from sejax.app.families import families_of
 from sejax.errors import ConfigError
-from sejax.evaluate import _proxy_study, evaluate
+from sejax.evaluate import evaluate, proxy_study
 from sejax.proxies import files
 from sejax.training import TrainingConfig, budget_for
 
@@ -167,7 +167,7 @@ def test_initial_episodes_beyond_the_proxys_own_extend_its_step_budget(stored):
     unlimited = TrainingConfig()
     assert budget_for(unlimited, PPOConfig(), [then], 200) is unlimited
     # That is what an evaluation trains with.
-    study = _proxy_study(evaluate_config(f"proxy={stored}", "agent.init_episodes=3"))
+    study = proxy_study(evaluate_config(f"proxy={stored}", "agent.init_episodes=3"))
     used = study.worlds["the proxy"][2]["ddqn"]
     assert used.max_steps == 650 and used.stop_rule == training.stop_rule
 
@@ -189,14 +189,12 @@ def test_each_of_several_agents_trains_as_long_as_it_must(tmp_path):
                                "agents.ppo.rollout_steps=null", words=[])  # fmt: skip
     budgets = {
         key: training.max_steps
-        for key, training in _proxy_study(composed).worlds["the proxy"][2].items()
+        for key, training in proxy_study(composed).worlds["the proxy"][2].items()
     }
     # Learned with 4000 steps, of which DDQN waits 2 * 200; here 10 episodes, as PPO collects.
     waits = {"ddqn": 10 * 200, "dueling_ddqn": 10 * 200, "ppo": 10 * 200 + 1}
     assert budgets == {key: 4000 + wait - 2 * 200 for key, wait in waits.items()}
-    as_learned = _proxy_study(
-        evaluate_config(f"proxy={path}", "agent_hparams=as_learned", words=[])
-    )
+    as_learned = proxy_study(evaluate_config(f"proxy={path}", "agent_hparams=as_learned", words=[]))
     assert as_learned.families == tuple(
         dataclasses.replace(x, field="agent", weight=1.0) for x in families_of(learned(*words)[0])
     )
@@ -268,7 +266,7 @@ def test_agents_like_those_of_the_run_bring_their_exploration(tmp_path, capsys):
     overrides = [f"proxy={path}", "agent_hparams=as_learned", "num_agents=2", "baseline=false",
                  "devices=1", "real_training.max_episodes=2"]  # fmt: skip
     composed = evaluate_config(*overrides, words=[])
-    study = _proxy_study(composed)
+    study = proxy_study(composed)
     assert study.families[0].agent == config.agent and study.exploration == config.exploration
     # Its dynamics are real.
     assert study.worlds["the proxy"][2] == {"q_learning": composed.real_training}

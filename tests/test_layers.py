@@ -12,6 +12,7 @@ ROOT = Path(__file__).parents[1] / "sejax"
 # folder; not its neighbours. Names in strings (`sejax.plugins`, `sejax.__getattr__`) are looked up
 # when somebody asks for what they stand for: they do not count.
 LAYERS = [
+    {"search"},
     {"run", "evaluate", "report", "experiments"},
     {"app"},
     {"bilevel"},
@@ -36,7 +37,7 @@ LAYERS = [
     {"errors"},
     {"", "conf"},
 ]
-COMMANDS = ("app", "run", "evaluate", "report", "experiments")
+COMMANDS = ("app", "run", "evaluate", "report", "search", "experiments")
 
 
 def name_of(path):

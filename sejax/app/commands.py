@@ -10,16 +10,17 @@ import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import NoReturn
+from typing import NoReturn, TypeVar
 
 from hydra.errors import HydraException
-from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
 from sejax.app import compose, families, runtime
 from sejax.errors import ConfigError
 
 BAD_INPUT, FAILED, INTERRUPTED = 2, 1, 130
+Given = TypeVar("Given")
+Result = TypeVar("Result")
 
 
 def start(name: str, main: Callable[[], object]) -> None:
@@ -30,22 +31,45 @@ def start(name: str, main: Callable[[], object]) -> None:
       main: decorated by `hydra.main`.
     """
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra then raises, and the message is ours.
-    for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="backslashreplace")  # a terminal of few letters
-    words: list[str] = []
-    try:
-        sys.argv[1:] = families.in_one_choice([_quoted(word) for word in sys.argv[1:]])
-        words = [word for word in sys.argv[1:] if not word.startswith("-")]
-        if sys.path[0] != "":  # `python -m` has put the current folder there, if it still exists
-            sys.path.insert(0, "")
-        Path.cwd()
-        runtime.configure_xla(_devices(words))  # before a plugin imports what starts jax's devices
+    with _messages() as words:
+        words += _prepared()
         if {"--help", "-h"} & set(sys.argv[1:]):
             print(compose.help_text(name, words))
             return
         compose.register(name, words)
         main()
+
+
+def start_with_words(main: Callable[[Sequence[str]], object], help_text: str) -> None:
+    """Runs a main function that reads the words itself; errors become messages as of `start`."""
+    with _messages() as words:
+        words += _prepared()
+        if {"--help", "-h"} & set(sys.argv[1:]):
+            print(help_text)
+            return
+        guarded(main)(words)
+
+
+def _prepared() -> list[str]:
+    """Sets the process up, and returns the words after the command."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")  # a terminal of few letters
+    sys.argv[1:] = families.in_one_choice([_quoted(word) for word in sys.argv[1:]])
+    words = [word for word in sys.argv[1:] if not word.startswith("-")]
+    if sys.path[0] != "":  # `python -m` has put the current folder there, if it still exists
+        sys.path.insert(0, "")
+    Path.cwd()
+    runtime.configure_xla(_devices(words))  # before a plugin imports what starts jax's devices
+    return words
+
+
+@contextlib.contextmanager
+def _messages() -> Iterator[list[str]]:
+    """Ends the process with one message for what was refused; yields a list for the words."""
+    words: list[str] = []
+    try:
+        yield words
     except (HydraException, OmegaConfBaseException) as error:
         fail(str(compose.translate_hydra_error(error, words)), BAD_INPUT)
     except ConfigError as error:
@@ -72,16 +96,16 @@ def _devices(words: Sequence[str]) -> int | None:
     return int(values[-1]) if values and re.fullmatch(r"[1-9]\d{0,3}", values[-1]) else None
 
 
-def guarded(main: Callable[[DictConfig], float]) -> Callable[[DictConfig], float]:
-    """Decorates what Hydra calls: bad input and files that fail become a message and exit code.
+def guarded(main: Callable[[Given], Result]) -> Callable[[Given], Result]:
+    """Decorates a main function: bad input and files that fail become a message and exit code.
 
     Inside of Hydra's call, as Hydra prints lines of its own for an exception that leaves it.
     """
 
     @functools.wraps(main)
-    def run(cfg: DictConfig) -> float:
+    def run(given: Given) -> Result:
         try:
-            return main(cfg)
+            return main(given)
         except ConfigError as error:
             fail(str(error), BAD_INPUT)
         except OSError as error:

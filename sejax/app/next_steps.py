@@ -101,7 +101,7 @@ def run_words(stored: dict[str, Any]) -> list[str] | None:
         chosen += others
         usual = flatten(build.to_plain(compose.config(chosen)) if others else usual)
         asked = flatten(stored)
-        words = chosen + [f"{name}={_word(value)}" for name, value in asked.items()
+        words = chosen + [f"{name}={word(value)}" for name, value in asked.items()
                           if name in usual and usual[name] != value]  # fmt: skip
         composed = flatten(build.to_plain(compose.config(words)))
     except (ConfigError, LookupError, TypeError, AttributeError):
@@ -113,10 +113,10 @@ def _command(module: str, words: Sequence[str]) -> str:
     return shlex.join(["python", "-m", module, *words])
 
 
-def _word(value: Any) -> str:
+def word(value: Any) -> str:
     """A value as Hydra's grammar reads it: text in quotes where it is more than a word."""
     if isinstance(value, list):
-        return f"[{','.join(map(_word, value))}]"
+        return f"[{','.join(map(word, value))}]"
     if value is None or isinstance(value, bool):
         return {None: "null", True: "true", False: "false"}[value]
     if not isinstance(value, str) or re.fullmatch(r"[\w./+-]+", value, re.ASCII):

@@ -57,6 +57,10 @@ class Chunks:
         self.program = program
         self._compiled: dict[tuple[int, int], Any] = {}
 
+    def init(self, keys: Any) -> Any:
+        """The state before the first generation, for keys `[seed]`."""
+        return jax.jit(self.program.init)(keys)
+
     def is_ready(self, num_seeds: int, length: int) -> bool:
         """Whether such a chunk has been compiled."""
         return (num_seeds, length) in self._compiled
@@ -119,7 +123,7 @@ def run(
     program = chunks.program
     started, cpu_started = time.time(), time.process_time()
     seeds = config.seed + jax.numpy.arange(config.num_seeds)
-    state = jax.jit(program.init)(jax.vmap(jax.random.key)(seeds))
+    state = chunks.init(jax.vmap(jax.random.key)(seeds))
     state, generation, problems = directory.resume(state)
     for problem in problems:
         report.print(problem)

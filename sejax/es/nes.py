@@ -32,15 +32,19 @@ class NESConfig(Options):
         None, counts("the incumbent's score selects the proxy")
     )
     # sigma: std of the weight perturbation
-    noise_std: float = option(0.05, positive("members must differ", _LARGEST))
-    noise_std_decay: float = option(1.0, shrinks())  # factor on sigma after each generation
-    step_size: float = option(1.0, positive("the proxy would not move", _LARGEST))  # alpha
-    step_size_decay: float = option(1.0, shrinks())  # factor on alpha after each generation
+    noise_std: float = option(0.05, positive("members must differ", _LARGEST), traced=True)
+    # factor on sigma after each generation
+    noise_std_decay: float = option(1.0, shrinks(), traced=True)
+    # alpha
+    step_size: float = option(1.0, positive("the proxy would not move", _LARGEST), traced=True)
+    # factor on alpha after each generation
+    step_size_decay: float = option(1.0, shrinks(), traced=True)
     mirrored: bool = True  # each member tries +eps and -eps and keeps the better sign
     score_transform: str = option("all_better_2", one_of(TRANSFORMS))
     # authors: psi += alpha sum F eps; paper: that divided by n_p sigma
     update_rule: str = option("authors", one_of(UPDATE_RULES))
-    weight_decay: float = option(0.0, fraction())  # psi shrinks by this before each update
+    # psi shrinks by this before each update
+    weight_decay: float = option(0.0, fraction(), traced=True)
     num_evals: int = option(1, counts("a member needs a score"))  # agents on each perturbed proxy
     eval_aggregate: str = option("mean", one_of(AGGREGATES))  # what their scores make
     common_random_numbers: bool = False  # the same inner seeds for all members of a generation

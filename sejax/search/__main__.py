@@ -1,0 +1,75 @@
+"""`python -m sejax.search`: the command."""
+
+from collections.abc import Sequence
+from importlib.util import find_spec
+from typing import TYPE_CHECKING, Any
+
+from sejax.app import commands, runtime
+from sejax.errors import ConfigError
+from sejax.search import settings
+from sejax.search.settings import Search
+
+if TYPE_CHECKING:
+    from sejax.search.study import Runner
+
+
+def main(words: Sequence[str]) -> None:
+    """Searches as the words say; the same words go on where it stopped.
+
+    Raises:
+      ConfigError: for words or a study that cannot be searched, or without Optuna.
+      OSError: if a file cannot be written.
+    """
+    search = settings.read(words)
+    if find_spec("optuna") is None:
+        raise ConfigError("sejax.search needs Optuna, because it decides what is tried. Install it "
+                          "with pip install 'sejax[search]'.")  # fmt: skip
+    from sejax.search import results, study
+
+    if not search.names_study_alone:  # before a study is made of it
+        settings.require_fields(search, _runner(search).config([]))
+    found, search = study.open_study(search)
+    runner = _runner(search)
+    runtime.enable_compilation_cache()
+    print(f"Study {search.study} in {search.folder}: {', '.join(search.space)}.", flush=True)
+    try:
+        study.work(found, search, runner, lambda text: print(text, flush=True))
+    except KeyboardInterrupt:
+        print(f"Interrupted. What has ended is saved in {search.folder}, and the trial at hand is "
+              f"queued again; the same command goes on from there.")  # fmt: skip
+        commands.leave(commands.INTERRUPTED)
+    best = results.write(found, search, runner.command)
+    results.print_table(found, search)
+    if not best:
+        print("No trial was completed.")
+        return
+    if search.is_of_agent:
+        best = _verified(found, search, runner)
+    print(f"\nThe best:\n  {results.override_line(best, search, runner.command)}")
+    print(f"{search.folder}/trials.csv, pareto.png, best.txt and preset.yaml hold what was found.")
+
+
+def _runner(search: Search) -> "Runner":
+    if search.is_of_agent:
+        from sejax.search.tuning import Tuning
+
+        return Tuning(search)
+    from sejax.search.learning import Learning
+
+    return Learning(search)
+
+
+def _verified(found: Any, search: Search, runner: Any) -> list[str]:
+    """The overrides of the best on the real task."""
+    from sejax.search import results, verification
+
+    table = verification.verify(found, search, runner)
+    verification.print_table(table, found, search)
+    best = found.get_trials(deepcopy=False)[int(table["trial"].iloc[0])]
+    words = results.words_of(best, search)
+    results.write_best(words, search, runner.command)
+    return words
+
+
+if __name__ == "__main__":
+    commands.start_with_words(main, settings.help_text())

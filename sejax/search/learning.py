@@ -1,0 +1,98 @@
+"""Trials that learn a proxy: runs of `sejax.run`, each in a directory of its own."""
+
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sejax.app import build, compose, session
+from sejax.app.next_steps import word
+from sejax.app.run_directory import RunDirectory, open_for
+from sejax.errors import ConfigError
+from sejax.search.programs import Programs
+from sejax.search.settings import Search
+from sejax.search.trials import Follower, Progress
+
+
+class Learning:
+    """Learns a proxy in each trial."""
+
+    command = "sejax.run"
+
+    def __init__(self, search: Search):
+        self._search = search
+        self._programs = Programs()
+
+    def config(self, words: Sequence[str], folder: Path | None = None) -> build.LearnConfig:
+        """The configuration of a trial.
+
+        Raises:
+          ConfigError: if it is none that can run.
+        """
+        own = [f"generations={self._search.config.max_generations}",
+               f"num_seeds={self._search.config.seeds}", "checkpoint_every=1"]  # fmt: skip
+        where = [f"run_dir={word(str(folder))}"] if folder is not None else []
+        return compose.config([*self._search.fixed, *words, *own, *where])
+
+    def run(self, config: build.LearnConfig, follower: Follower, is_inherited: bool) -> Progress:
+        """Runs a trial, or what is left of it, and tells the study as it goes.
+
+        Args:
+          config: of the trial.
+          follower: told each generation.
+          is_inherited: whether its directory is the copy of another's, which may be unusable: then
+            the trial begins anew.
+
+        Raises:
+          ConfigError: if the directory cannot be used.
+          optuna.TrialPruned, Lost: as of `Follower.tell`.
+        """
+        try:
+            return self._run(config, follower)
+        except ConfigError:
+            if not is_inherited:
+                raise
+            shutil.rmtree(config.resolved_run_dir)
+            return self._run(config, follower)
+
+    def _run(self, config: build.LearnConfig, follower: Follower) -> Progress:
+        with open_for(config, "Set search_dir=FOLDER.") as directory:
+            chunks = self._programs.chunks(config)
+            num_candidates = chunks.program.strategy.num_candidates
+            over_at = chunks.program.solved_score if config.stop_when_solved else None
+            report = _Report(directory, follower, num_candidates, over_at)
+            session.run(config, directory, chunks, report)
+            return progress_of(directory, num_candidates)
+
+
+class _Report(session.Quiet):
+    """Hears of each generation after its files are written, so that to end there loses nothing."""
+
+    def __init__(
+        self, directory: RunDirectory, follower: Follower, num_candidates: int,
+        over_at: float | None,
+    ):  # fmt: skip
+        self._directory, self._follower = directory, follower
+        self._num_candidates, self._over_at = num_candidates, over_at
+
+    def update(self, generation: int, info: Any) -> None:
+        progress = progress_of(self._directory, self._num_candidates)
+        if self._over_at is None or not (progress.scores[-1] >= self._over_at).all():
+            self._follower.tell(progress)  # what is over by itself is not pruned
+
+
+def progress_of(directory: RunDirectory, num_candidates: int) -> Progress:
+    """What a run's rows say."""
+    rows, seeds = directory.rows, directory.seeds
+    of_seeds = {seed: [float(row["incumbent_mean"]) for row in rows if int(row["seed"]) == seed]
+                for seed in seeds}  # fmt: skip
+    length = max(map(len, of_seeds.values()))
+    scores = np.array([own + own[-1:] * (length - len(own)) for own in of_seeds.values()]).T
+    steps = sum(float(row["train_steps_mean"]) for row in rows)
+    return Progress(
+        scores=np.where(np.isfinite(scores), scores, np.nan),
+        cost=round(steps * num_candidates),
+        seconds=float(rows[-1]["wall_s"]),
+    )

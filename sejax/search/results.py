@@ -1,0 +1,197 @@
+"""What a search found: a table, what mattered, what it cost, and the best to go on with."""
+
+import shlex
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import optuna
+import yaml
+from optuna.trial import FrozenTrial, TrialState
+
+from sejax.app import presets
+from sejax.files import atomic_path, write_text
+from sejax.search.settings import Search
+
+SHOWN = 10
+NEEDED = 10  # completed trials, before importances say anything
+ENDED = (TrialState.COMPLETE, TrialState.PRUNED)
+
+
+def ranked(study: optuna.Study) -> list[FrozenTrial]:
+    """Completed trials, the best first; of equal ones that which cost less."""
+    done = [t for t in study.get_trials(deepcopy=False) if t.state == TrialState.COMPLETE]
+    return sorted(done, key=lambda trial: (-float(trial.value or 0.0), trial.user_attrs["cost"]))
+
+
+def words_of(trial: FrozenTrial, search: Search) -> list[str]:
+    """The overrides that make the trial's settings."""
+    return [f"{name}={x.of(trial.params)}" for name, x in search.space.items()]
+
+
+def override_line(words: Sequence[str], search: Search, command: str) -> str:
+    """The command that runs with these settings."""
+    return shlex.join(["python", "-m", command, *search.fixed, *words])
+
+
+def table(study: optuna.Study, search: Search) -> Any:
+    """A row for each trial that ended, as a data frame."""
+    import pandas as pd
+
+    rows = []
+    for trial in study.get_trials(deepcopy=False):
+        if trial.state in ENDED:
+            kept = trial.user_attrs
+            rows.append({
+                "trial": trial.number, "state": trial.state.name.lower(),
+                **{name: kept.get(name) for name in
+                   ("mean", "worst", "generations", "cost", "seconds")},
+                **{name: x.of(trial.params) for name, x in search.space.items()
+                   if x.parameter in trial.params},
+            })  # fmt: skip
+    return pd.DataFrame(rows)
+
+
+def saved_by_pruning(rows: Any, search: Search) -> str:
+    """A sentence on the generations that pruned trials did not run."""
+    pruned = rows[rows["state"] == "pruned"]
+    ran, most = pruned["generations"].fillna(0).sum(), search.config.max_generations
+    saved, all_of_them = len(pruned) * most - ran, len(rows) * most
+    return (f"{len(pruned)} of {len(rows)} trials were pruned, which saved {saved:,.0f} of "
+            f"{all_of_them:,} generations ({saved / max(all_of_them, 1):.0%}).")  # fmt: skip
+
+
+def importances(study: optuna.Study, search: Search) -> dict[str, float]:
+    """The share of each field in what makes scores differ, the largest first; by PED-ANOVA.
+
+    Empty where fewer than ten trials are complete, or fewer than two fields searched. Pruned trials
+    are left out, so that it is about the better settings.
+
+    Source: Watanabe et al., 2023, "PED-ANOVA" (Optuna's default).
+    """
+    done = [t for t in study.get_trials(deepcopy=False) if t.state == TrialState.COMPLETE]
+    if len(done) < NEEDED or len(search.space) < 2:
+        return {}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # fields that all good trials have alike
+        found = optuna.importance.get_param_importances(study)
+    names = {x.parameter: name for name, x in search.space.items()}
+    return {names[parameter]: share for parameter, share in found.items() if parameter in names}
+
+
+def pareto_front(rows: Any, score: str) -> Any:
+    """The rows that none beats in score at the same cost or less, by cost."""
+    ordered = rows.dropna(subset=[score]).sort_values(["cost", score], ascending=[True, False])
+    before = ordered[score].cummax().shift(fill_value=float("-inf"))
+    return ordered[ordered[score] > before]
+
+
+def draw_pareto(rows: Any, search: Search, path: Path) -> None:
+    """Draws score against cost, a point for each trial, and the front."""
+    import matplotlib as mpl
+
+    mpl.use("Agg")
+    import matplotlib.pyplot as plt
+
+    from sejax.app.plots import INCUMBENT, POPULATION
+
+    score = search.config.score
+    front = pareto_front(rows, score)
+    with plt.rc_context({"font.size": 10, "axes.spines.top": False, "axes.spines.right": False}):
+        figure, axis = plt.subplots(figsize=(7, 4.2), layout="constrained")
+        for state, color in (("pruned", "0.6"), ("complete", INCUMBENT)):
+            some = rows[rows["state"] == state]
+            axis.plot(some["cost"], some[score], "o", ms=5, mew=0, alpha=0.75, color=color,
+                      label=f"{state} ({len(some)})")  # fmt: skip
+        axis.step(front["cost"], front[score], where="post", color=POPULATION, lw=1.4,
+                  label="best for its cost")  # fmt: skip
+        for _, row in front.iterrows():
+            axis.annotate(f"{row['trial']:.0f}", (row["cost"], row[score]), fontsize=8,
+                          textcoords="offset points", xytext=(4, -10))  # fmt: skip
+        axis.set_xscale("log")
+        axis.set_xlabel("training steps of all agents of the trial")
+        many = f", {score} of {search.config.seeds} seeds" if search.config.seeds > 1 else ""
+        axis.set_ylabel(f"score ({search.measure} of generations{many})")
+        axis.legend(frameon=False, fontsize=9)
+        with atomic_path(path) as temporary:
+            figure.savefig(temporary, dpi=150)
+        plt.close(figure)
+
+
+def preset_text(words: Sequence[str], search: Search) -> str:
+    """The settings as a section of a file `conf/presets/<env>-<proxy>.yaml`.
+
+    What belongs to an agent, a strategy or an objective is under `with_agent` and so on.
+    """
+    choices = {"agent": search.choice("agent", "ddqn"), "es": search.choice("es", "nes"),
+               "objective": search.choice("objective", "max_reward")}  # fmt: skip
+    preset, env = search.choice("preset", "best"), search.choice("env", "cartpole")
+    tuned = presets.is_tuned(env, search.choice("proxy", "se"))
+    section: dict[str, Any] = {"like": preset if tuned else presets.GENERAL}
+    for word in [*search.fixed, *words]:
+        name, _, value = word.lstrip("+").partition("=")
+        group, _, field = name.partition(".")
+        if not field and name not in ("agent_hparams", "stop_when_solved"):
+            continue  # a choice, which is no setting, or how the trials were run
+        place = section
+        if group in choices:
+            place = place.setdefault(f"with_{group}", {}).setdefault(choices[group], {})
+        if field:
+            place = place.setdefault(group, {})
+        place[field or name] = yaml.safe_load(value)
+    return yaml.safe_dump({"searched": section}, sort_keys=False)
+
+
+def write(study: optuna.Study, search: Search, command: str) -> list[str]:
+    """Writes the files of what was found.
+
+    `trials.csv`, `pareto.png`, and of the best trial `best.txt` and `preset.yaml`.
+
+    Returns:
+      The best trial's overrides; empty if none is complete.
+    """
+    rows = table(study, search)
+    write_text(search.folder / "trials.csv", rows.to_csv(index=False))
+    if len(rows) and rows[search.config.score].notna().any():
+        draw_pareto(rows, search, search.folder / "pareto.png")
+    done = ranked(study)
+    if not done:
+        return []
+    words = words_of(done[0], search)
+    write_best(words, search, command)
+    return words
+
+
+def write_best(words: Sequence[str], search: Search, command: str) -> None:
+    """Writes the settings as a command and as a preset."""
+    line = override_line(words, search, command)
+    write_text(search.folder / "best.txt", line + "\n")
+    write_text(search.folder / "preset.yaml", f"# {line}\n{preset_text(words, search)}")
+
+
+def print_table(study: optuna.Study, search: Search) -> None:
+    """Prints the best trials, what mattered, and what pruning saved."""
+    from rich.console import Console
+    from rich.table import Table
+
+    console, done = Console(highlight=False), ranked(study)
+    shown = Table(title=f"{search.study}: the best {min(SHOWN, len(done))} of {len(done)} trials "
+                  "that were not pruned")  # fmt: skip
+    scores = ("mean", "worst") if search.config.seeds > 1 else ("mean",)
+    for column in ("trial", *scores, "generations", "training steps", "s"):
+        shown.add_column(column, justify="right", no_wrap=column != "training steps")
+    shown.add_column("settings", overflow="fold")
+    for trial in done[:SHOWN]:
+        kept = trial.user_attrs
+        shown.add_row(str(trial.number), *(f"{kept[name]:.4g}" for name in scores),
+                      str(kept["generations"]), f"{kept['cost']:,}", f"{kept['seconds']:.0f}",
+                      "\n".join(words_of(trial, search)))  # fmt: skip
+    console.print(shown)
+    rows = table(study, search)
+    if len(rows):
+        console.print(saved_by_pruning(rows, search))
+    shares = importances(study, search)
+    if shares:
+        listed = ", ".join(f"{name} {share:.0%}" for name, share in shares.items())
+        console.print(f"What mattered (PED-ANOVA): {listed}", soft_wrap=True)

@@ -1,0 +1,255 @@
+"""The words of a search: its own fields, what it searches, and what stays fixed."""
+
+import dataclasses
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar
+
+import yaml
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override
+from hydra.errors import HydraException
+
+from sejax import plugins, serialize
+from sejax.app import build
+from sejax.errors import ConfigError, nearest, require
+from sejax.options import Options, counts, one_of, option, positive
+from sejax.search import spaces
+
+SAMPLERS = ("tpe", "random")
+PRUNERS = ("hyperband", "median", "none")
+SCORES = ("mean", "worst")
+MEASURES = ("last", "best", "mean")
+# Fields of the command that are the search's, and which of its own to set in their place.
+TAKEN = {
+    "generations": "max_generations=27", "num_seeds": "seeds=3", "run_dir": "search_dir=FOLDER",
+    "out_dir": "search_dir=FOLDER", "checkpoint_every": "min_generations=3",
+}  # fmt: skip
+# Fields that may differ between the workers of a study, and between its sessions.
+FREE_FIELDS = ("trials", "timeout", "storage", "search_dir", "sampler_seed")
+
+
+@dataclass(frozen=True, kw_only=True)
+class SearchConfig(Options):
+    """The fields of `python -m sejax.search`; all others are those of the command it searches for.
+
+    The defaults of sampler, pruner and generations are the paper's setting, BOHB with a reduction
+    factor of 3 (appendix, "SE hyperparameters"; `docs/reference.md` 7.10).
+    """
+
+    group: ClassVar[str] = ""
+
+    trials: int = option(60, counts("there is nothing to compare otherwise"))  # that end
+    sampler: str = option("tpe", one_of(SAMPLERS))
+    sampler_seed: int | None = None  # null: drawn, so that workers do not draw alike
+    pruner: str = option("hyperband", one_of(PRUNERS))
+    min_generations: int = option(3, counts("a trial must show something"))  # before one is pruned
+    max_generations: int = option(27, counts("there is nothing to do otherwise"))
+    seeds: int = option(1, counts("a trial needs a run"))  # runs of a trial, in one program
+    score: str = option("mean", one_of(SCORES))  # of a trial, over its seeds
+    # What a seed counts for. last: its last generation's score; best: its best so far; mean: the
+    # mean of all so far, which rewards learning early. null: last for a proxy, mean for an agent.
+    measure: str | None = option(None, one_of(MEASURES))
+    space: str | None = None  # a preset of ranges; a file of one's own
+    study: str | None = None  # null: <env>-<proxy>-<agent>
+    storage: str | None = None  # null: SQLite in search_dir; any URL that Optuna takes
+    search_dir: str | None = None  # null: runs/search-<study>
+    timeout: float | None = option(None, positive("no trial would start"))  # s; none starts later
+    heartbeat: int = option(15, counts("workers must show that they live"))  # s
+    verify: int = option(
+        10, counts("the best are tried on the real task")
+    )  # of a search on a proxy
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require(self.max_generations >= self.min_generations, "max_generations",
+                f"be at least min_generations={self.min_generations}", "none is pruned before",
+                self.max_generations, f"max_generations={9 * self.min_generations}")  # fmt: skip
+
+
+@dataclass(frozen=True, kw_only=True)
+class Search:
+    """What is searched.
+
+    Attributes:
+      config: the search's own fields.
+      fixed: words for all trials.
+      space: dimensions by the field's name.
+    """
+
+    config: SearchConfig
+    fixed: tuple[str, ...]
+    space: dict[str, spaces.Dimension]
+
+    @property
+    def is_of_agent(self) -> bool:
+        """Whether agents are tuned on a proxy that exists, in the place of how to learn one."""
+        name = self.choice("proxy", "se")
+        return name not in plugins.names("proxy") and ":" not in name
+
+    @property
+    def measure(self) -> str:
+        return self.config.measure or ("mean" if self.is_of_agent else "last")
+
+    def choice(self, group: str, default: str) -> str:
+        """What the fixed words choose of a group."""
+        chosen = [w.partition("=")[2] for w in self.fixed if w.startswith(f"{group}=")]
+        return chosen[-1] if chosen else default
+
+    @property
+    def study(self) -> str:
+        """The study's name."""
+        return self.config.study or self._default_name()
+
+    @property
+    def folder(self) -> Path:
+        return Path(self.config.search_dir or Path("runs", f"search-{_as_file_name(self.study)}"))
+
+    @property
+    def storage(self) -> str:
+        """URL of the database."""
+        return self.config.storage or f"sqlite:///{self.folder / 'study.db'}"
+
+    def stored(self) -> dict[str, Any]:
+        """What the workers of a study must have in common, as plain values."""
+        fields = serialize.to_plain(self.config)
+        own = {k: v for k, v in fields.items() if k not in (*FREE_FIELDS, "space", "study")}
+        return {
+            "search": own,
+            "fixed": list(self.fixed),
+            "space": {name: x.text for name, x in self.space.items()},
+            "folder": str(self.folder.resolve()),
+        }
+
+    @classmethod
+    def from_stored(cls, stored: dict[str, Any], config: SearchConfig) -> "Search":
+        """Inverse of `stored`, with the free fields of a worker's own configuration.
+
+        Its folder is that of the study's maker, if that is there and no other is asked for.
+        """
+        folder = stored["folder"] if Path(stored["folder"]).is_dir() else None
+        search_dir = config.search_dir or folder
+        return cls(
+            config=dataclasses.replace(config, **stored["search"], search_dir=search_dir),
+            fixed=tuple(stored["fixed"]),
+            space={name: spaces.parse(name, text) for name, text in stored["space"].items()},
+        )
+
+    @property
+    def names_study_alone(self) -> bool:
+        """Whether the words ask for nothing but to join a study that exists."""
+        usual = serialize.to_plain(SearchConfig())
+        given = serialize.to_plain(self.config)
+        asked = {k for k, v in given.items() if v != usual[k]} - {*FREE_FIELDS, "study"}
+        return self.config.study is not None and not (asked or self.fixed or self.space)
+
+    def _default_name(self) -> str:
+        if self.is_of_agent:
+            proxy = Path(self.choice("proxy", "")).name
+            return f"{self.choice('agent', 'ddqn')}-on-{proxy.removesuffix('.safetensors')}"
+        names = [self.choice(group, default) for group, default in
+                 (("env", "cartpole"), ("proxy", "se"), ("agent", "ddqn"))]  # fmt: skip
+        return "-".join(names)
+
+
+def read(words: Sequence[str]) -> Search:
+    """A search from the words of its command line.
+
+    Words that name a field of `SearchConfig` set it; sweeps in Hydra's syntax are searched; the
+    rest stays fixed. A field that is fixed, or has a space of its own, is left out of `space=`.
+
+    Raises:
+      ConfigError: for a bad value, a word that cannot be read, or a space that cannot be searched.
+    """
+    own = {field.name for field in dataclasses.fields(SearchConfig)}
+    values, fixed, swept = {}, [], {}
+    for word in words:
+        name, equals, text = word.partition("=")
+        if equals and name in own:
+            values[name] = text if name == "storage" and text != "null" else _plain(text)
+            continue
+        override = _parsed(word)
+        require(name not in TAKEN, name, "be left out", "the search sets it for each trial", text,
+                TAKEN.get(name, ""))  # fmt: skip
+        if override.is_sweep_override():
+            swept[override.get_key_element()] = spaces.parse(override.get_key_element(), text)
+        else:
+            fixed.append(word)
+    config = serialize.from_plain(SearchConfig, values, "")
+    search = Search(config=config, fixed=tuple(fixed), space=swept)
+    if config.space is None:
+        return search
+    preset = spaces.preset(config.space, search.choice("agent", "ddqn"), search.is_of_agent)
+    given = {word.partition("=")[0] for word in fixed} | set(swept)
+    offered = {name: x for name, x in preset.items() if name not in given}
+    return dataclasses.replace(search, space={**offered, **swept})
+
+
+def _parsed(word: str) -> Override:
+    try:
+        return OverridesParser.create().parse_override(word)
+    except HydraException as error:
+        raise ConfigError(
+            f"A word must read name=value, because the search is made of them; got {word} "
+            f"({' '.join(str(error).split())[:200]}). Put what is more than a word in quotes: "
+            f"'name=tag(log, interval(0.01, 0.3))'."
+        ) from error
+
+
+def _plain(text: str) -> Any:
+    try:
+        return yaml.safe_load(text)
+    except yaml.YAMLError:
+        return text
+
+
+def _as_file_name(name: str) -> str:
+    return re.sub(r"[^\w.+-]+", "_", name)
+
+
+def require_fields(search: Search, config: Any) -> None:
+    """Checks that what is searched are fields of the command.
+
+    Args:
+      search: what is searched.
+      config: of the command with the fixed words alone.
+
+    Raises:
+      ConfigError: if one is not.
+    """
+    groups = build.EVALUATE_GROUPS if search.is_of_agent else build.LEARN_GROUPS
+    known = {*serialize.flatten(build.to_plain(config)), *groups}
+    for name in search.space:
+        if name not in known:
+            close = nearest(name, known)[:5]
+            raise ConfigError(
+                f"{name} must be a field of the trials, because it is searched; got one that they "
+                f"do not have. Did you mean {close[0]}? Others: {', '.join(close[1:])}."
+            )
+
+
+def help_text() -> str:
+    """What `--help` prints."""
+    about = {"sampler": SAMPLERS, "pruner": PRUNERS, "score": SCORES, "measure": MEASURES,
+             "space": (*spaces.names(), "FILE.yaml")}  # fmt: skip
+    fields = "\n".join(
+        f"  {name}: {'null' if value is None else value}"
+        + (f"  ({', '.join(about[name])})" if name in about else "")
+        for name, value in serialize.to_plain(SearchConfig()).items()
+    )
+    return f"""Search hyperparameters with Optuna; a trial is a run, its generations the budget.
+With proxy=RUN_DIR, a file or a shipped name: those of an agent that is trained on that proxy.
+
+  python -m sejax.search env=cartpole es.noise_std='tag(log, interval(0.01, 0.3))'
+  python -m sejax.search env=cartpole preset=paper space=paper_se trials=60
+  python -m sejax.search proxy=cartpole agent=ppo space=agent
+  python -m sejax.search study=NAME storage=URL   # one more worker
+
+Fields:
+{fields}
+
+All other words are those of python -m sejax.run (with a proxy: sejax.evaluate); sweeps among them
+are searched: choice(a,b), range(1,9,2), interval(0,1), int(interval(1,10)), tag(log, ...), and
+tag(log, inverse, ...) in 1 - x. The same command goes on where it stopped."""

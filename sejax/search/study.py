@@ -1,0 +1,279 @@
+"""The study: its storage, and the loop in which a worker takes one trial after another.
+
+Workers of a study share nothing but the database. Each shows by heartbeats that it lives; a trial
+whose worker has not done so for some time counts as failed, and is queued again.
+"""
+
+import contextlib
+import logging
+import time
+import warnings
+from collections import Counter
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, Protocol
+
+import optuna
+import sqlalchemy.exc
+from optuna.trial import TrialState
+
+from sejax.errors import ConfigError, require, told
+from sejax.search.settings import Search
+from sejax.search.trials import Follower, Lost, Progress, take_over
+
+STORED = "sejax"  # the study's attribute that holds what is searched
+RETRIES = 3  # of a trial; one that takes its process down each time is given up then
+GRACE = 4  # heartbeats that may be missed
+ATTEMPTS = 3  # to open a storage, with a second between them
+LONGEST_WAIT = 3600  # s, for another worker's write to SQLite; one that was stopped in it blocks
+REDUCTION_FACTOR = 3  # eta of Hyperband
+HISTORY = "retried"  # the trial's attribute with the numbers of those before
+
+
+class Runner(Protocol):
+    """What makes a trial of settings: `sejax.search.learning` and `tuning`."""
+
+    command: str
+
+    def config(self, words: list[str], folder: Path | None = None) -> Any: ...
+    def run(self, config: Any, follower: Follower, is_inherited: bool) -> Progress: ...
+
+
+def open_study(search: Search) -> tuple[optuna.Study, Search]:
+    """Makes the study, or joins one that is there.
+
+    Returns:
+      The study, and what it searches: with `study=NAME` and no word of what to search, that is what
+      the study's maker asked for.
+
+    Raises:
+      ConfigError: if the storage cannot be used, the study is one of other settings, or there is
+        nothing to search.
+    """
+    optuna.logging.set_verbosity(optuna.logging.ERROR)
+    logging.getLogger("alembic").setLevel(logging.WARNING)
+    storage = _storage(search)
+    try:
+        with _unchanged():
+            study = optuna.create_study(
+                study_name=search.study, storage=storage, direction="maximize",
+                sampler=_sampler(search), pruner=_pruner(search), load_if_exists=True,
+            )  # fmt: skip
+        stored = study.user_attrs.get(STORED)
+        if stored is not None:
+            joined = _joined(search, stored)
+            if joined.config.heartbeat != search.config.heartbeat:
+                return open_study(joined)  # each worker goes by the same
+            search = joined
+            study.sampler, study.pruner = _sampler(search), _pruner(search)
+        else:
+            require(search.space, "space", "be given, or sweeps of fields", "there is nothing to "
+                    "search otherwise", "none", "space=paper_se, or es.noise_std='tag(log, "
+                    "interval(0.01, 0.3))'")  # fmt: skip
+            study.set_user_attr(STORED, search.stored())
+    except optuna.exceptions.StorageInternalError as error:
+        raise _unusable(search, error) from error
+    return study, search
+
+
+def work(
+    study: optuna.Study, search: Search, runner: Runner, say: Callable[[str], None] = print
+) -> None:
+    """Takes trials until as many as asked for have ended, also those that others left behind.
+
+    With several workers a few more than `trials` may end, as each looks before it takes one.
+
+    Raises:
+      KeyboardInterrupt: after queueing the trial at hand again.
+      ConfigError, OSError: of a trial that cannot be written.
+    """
+    config, started, waits = search.config, time.monotonic(), False
+    objective = Objective(search, runner, say)
+    while config.timeout is None or time.monotonic() - started < config.timeout:
+        with _unchanged():
+            optuna.storages.fail_stale_trials(study)
+        count = Counter(trial.state for trial in study.get_trials(deepcopy=False))
+        ended = count[TrialState.COMPLETE] + count[TrialState.PRUNED]
+        if ended >= config.trials:
+            return
+        if count[TrialState.WAITING] or ended + count[TrialState.RUNNING] < config.trials:
+            waits = False
+            _run_one(study, objective)
+        else:
+            if not waits:
+                say(f"Waiting for {count[TrialState.RUNNING]} trials of other workers, or for "
+                    f"their heartbeats to end ({GRACE * config.heartbeat} s).")  # fmt: skip
+            waits = True
+            time.sleep(min(1.0, config.heartbeat))
+
+
+class Objective:
+    """What Optuna calls for a trial."""
+
+    def __init__(self, search: Search, runner: Runner, say: Callable[[str], None]):
+        self._search, self._runner, self._say = search, runner, say
+        self.trial: Any = None
+        self.is_lost = False
+
+    def __call__(self, trial: optuna.Trial) -> float:
+        self.trial, self.is_lost = trial, False
+        words = [f"{name}={x.suggest(trial)}" for name, x in self._search.space.items()]
+        try:
+            score = self._run(trial, words)
+        except optuna.TrialPruned:
+            self._tell("pruned", words)
+            raise
+        except (Lost, optuna.exceptions.UpdateFinishedTrialError):
+            self.is_lost = True
+            self._say(f"trial {trial.number}: was taken for dead and is another worker's now")
+            raise
+        self._tell("complete", words)
+        return score
+
+    def _run(self, trial: optuna.Trial, words: list[str]) -> float:
+        folder = trial_folder(self._search, trial.number)
+        history = trial.user_attrs.get(HISTORY, [])
+        before = [trial_folder(self._search, number) for number in history]
+        is_inherited = take_over(folder, before)
+        try:
+            config = self._runner.config(words, folder)
+        except ConfigError as error:  # settings that cannot work together are no trial's fault
+            trial.set_user_attr("refused", str(error))
+            raise optuna.TrialPruned from error
+        follower = Follower(trial, self._search)
+        return follower.finish(self._runner.run(config, follower, is_inherited))
+
+    def _tell(self, how: str, words: list[str]) -> None:
+        kept = self.trial.user_attrs
+        if "refused" in kept:
+            self._say(f"trial {self.trial.number}: refused: {kept['refused']}")
+            return
+        config = self._search.config
+        score = kept.get(config.score)
+        worth = "not finite" if score is None else f"{score:.4g}"
+        self._say(f"trial {self.trial.number}: {worth}, {how} at generation "
+                  f"{kept['generations']}/{config.max_generations}: {' '.join(words)}")  # fmt: skip
+
+
+def trial_folder(search: Search, number: int) -> Path:
+    return search.folder / "trials" / f"{number:04d}"
+
+
+def queue_again(study: optuna.Study, trial: optuna.trial.FrozenTrial) -> None:
+    """Queues a trial that its worker did not end, under a new number and with the same settings.
+
+    What Hyperband noted of it stays behind: the new number is of another bracket, and the trial's
+    generations so far are told there anew, from its files.
+    """
+    history = [*trial.user_attrs.get(HISTORY, []), trial.number]
+    if len(history) > RETRIES:
+        return
+    study.add_trial(
+        optuna.create_trial(
+            state=TrialState.WAITING, params=trial.params, distributions=trial.distributions,
+            user_attrs={HISTORY: history},
+        )
+    )  # fmt: skip
+
+
+def _run_one(study: optuna.Study, objective: Objective) -> None:
+    with _unchanged():
+        try:
+            study.optimize(objective, n_trials=1)
+        except KeyboardInterrupt:
+            (interrupted,) = [x for x in study.get_trials() if x.number == objective.trial.number]
+            queue_again(study, interrupted)
+            raise
+        except (Lost, ValueError, optuna.exceptions.UpdateFinishedTrialError):
+            if not objective.is_lost:  # then Optuna refuses to end what another has ended
+                raise
+
+
+def _storage(search: Search) -> optuna.storages.RDBStorage:
+    url, heartbeat = search.storage, search.config.heartbeat
+    if search.config.storage is None:
+        search.folder.mkdir(parents=True, exist_ok=True)
+    options: dict[str, Any] = {"pool_pre_ping": True}
+    if url.startswith("sqlite"):
+        options = {"connect_args": {"timeout": LONGEST_WAIT}}
+    attempts = ATTEMPTS
+    while True:
+        attempts -= 1
+        try:
+            with _unchanged():
+                storage = optuna.storages.RDBStorage(
+                    url, engine_kwargs=options, heartbeat_interval=heartbeat,
+                    grace_period=GRACE * heartbeat, heartbeat_stale_trial_callback=queue_again,
+                )  # fmt: skip
+            if url.startswith("sqlite"):
+                with storage.engine.connect() as connection:  # shorter locks, and none for readers
+                    connection.exec_driver_sql("PRAGMA journal_mode=WAL")
+            return storage
+        except sqlalchemy.exc.DatabaseError as error:  # another worker makes the tables just now
+            if not attempts:
+                raise _unusable(search, error) from error
+            time.sleep(1.0)
+        except Exception as error:  # of SQLAlchemy, of any driver, or that there is none
+            raise _unusable(search, error) from error
+
+
+def _unusable(search: Search, error: Exception) -> ConfigError:
+    cause = error.__cause__ or error
+    fix = "Set storage=null for a file in search_dir."
+    if isinstance(cause, ImportError) and search.storage.startswith("postgresql:"):
+        fix = "Install its driver with pip install 'psycopg[binary]'."
+    return ConfigError(
+        f"storage must be a database that can be used, because the study is kept there; got "
+        f"{search.storage.partition('://')[0]} ({told(cause)}). {fix}"
+    )
+
+
+def _sampler(search: Search) -> optuna.samplers.BaseSampler:
+    seed = search.config.sampler_seed
+    if search.config.sampler == "random":
+        return optuna.samplers.RandomSampler(seed=seed)
+    return optuna.samplers.TPESampler(seed=seed)
+
+
+def _pruner(search: Search) -> optuna.pruners.BasePruner:
+    config = search.config
+    match config.pruner:
+        case "hyperband":
+            return optuna.pruners.HyperbandPruner(
+                config.min_generations, config.max_generations, REDUCTION_FACTOR
+            )
+        case "median":
+            return optuna.pruners.MedianPruner(n_warmup_steps=config.min_generations - 1)
+    return optuna.pruners.NopPruner()
+
+
+def _joined(search: Search, stored: dict[str, Any]) -> Search:
+    """The stored search with a worker's own free fields.
+
+    Raises:
+      ConfigError: if the worker asks for another search.
+    """
+    if not search.names_study_alone:
+        asked = search.stored()
+        differing = [
+            f"{name} ({there.get(name, 'not')} there, {here.get(name, 'not')} here)"
+            for part in ("search", "space")
+            for there, here in [(stored[part], asked[part])]
+            for name in sorted(there.keys() | here.keys())
+            if there.get(name) != here.get(name)
+        ]
+        if sorted(stored["fixed"]) != sorted(asked["fixed"]):
+            differing.append(f"{' '.join(stored['fixed'])} there, {' '.join(asked['fixed'])} here")
+        require(not differing, "study", "be new or of the same search",
+                "its trials are compared with each other",
+                f"{search.study}, which differs in {', '.join(differing)}",
+                "study=NAME, or give study and storage alone to join")  # fmt: skip
+    return Search.from_stored(stored, search.config)
+
+
+@contextlib.contextmanager
+def _unchanged() -> Iterator[None]:
+    """Without Optuna's warnings that heartbeats may change."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
+        yield

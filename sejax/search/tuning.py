@@ -1,0 +1,154 @@
+"""Trials that tune an agent on a proxy: what they cost the real task is tests.
+
+A generation is a round of `seeds` fresh agents, each trained on the proxy and tested on the real
+task; a seed's score is its agent's return there. At the end the best settings train agents on the
+real task, which alone says what they are worth there.
+"""
+
+import dataclasses
+import json
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sejax import serialize
+from sejax.app import build, compose
+from sejax.app.next_steps import word
+from sejax.errors import ConfigError, require
+from sejax.files import write_text
+from sejax.search.programs import static_of, structure_of
+from sejax.search.settings import Search
+from sejax.search.trials import Follower, Progress
+
+ROUNDS = "rounds.json"
+
+
+class Tuning:
+    """Trains agents on the proxy in each trial."""
+
+    command = "sejax.evaluate"
+
+    def __init__(self, search: Search):
+        self._search = search
+        self._compiled: dict[str, Any] = {}
+
+    def config(self, words: Sequence[str], folder: Path | None = None) -> build.EvaluateConfig:
+        """The configuration of a trial.
+
+        Raises:
+          ConfigError: if it is none that can run.
+        """
+        where = [f"out_dir={word(str(folder))}"] if folder is not None else []
+        config = compose.evaluate_config([*self._search.fixed, *words, *where])
+        require(config.agents is None, "agent", "be one", "its settings are searched", "several",
+                "agent=ppo")  # fmt: skip
+        require(config.agent_hparams == "default", "agent_hparams", "be default",
+                "the trial's settings are those that are tried", config.agent_hparams,
+                "agent_hparams=default")  # fmt: skip
+        return config
+
+    def run(self, config: build.EvaluateConfig, follower: Follower, is_inherited: bool) -> Progress:
+        """Runs a trial, or what is left of it; arguments and errors as of `Learning.run`."""
+        path = Path(config.out_dir or ".") / ROUNDS
+        rounds = _stored_rounds(path)
+        while len(rounds) < self._search.config.max_generations:
+            if rounds:
+                follower.tell(_progress_of(rounds))
+            started = time.time()
+            outcome = self.outcome(config, "the proxy", len(rounds), self._search.config.seeds)
+            rounds.append({"returns": outcome.test_return.tolist(),
+                           "cost": int(np.sum(outcome.train_steps, dtype=np.int64)),
+                           "seconds": time.time() - started})  # fmt: skip
+            write_text(path, json.dumps(rounds))
+        return _progress_of(rounds)
+
+    def outcome(
+        self, config: build.EvaluateConfig, world: str, generation: int, num_agents: int
+    ) -> Any:
+        """The outcome of fresh agents in a world of `sejax.evaluate`, leaves `[agent]`, NumPy."""
+        import jax
+
+        from sejax.agents import make_agent
+        from sejax.evaluate import proxy_study
+
+        study = proxy_study(config)
+        (family,) = study.families
+        agent = make_agent(family.agent, study.task, study.exploration)
+        training = study.worlds[world][2][family.key]
+        key = json.dumps(
+            [world, static_of(family.agent), static_of(study.exploration),
+             serialize.to_plain(training), structure_of(agent.hparams), num_agents]
+        )  # fmt: skip
+        if key not in self._compiled:
+            self._compiled[key] = _make_rounds(agent, study, world, training, config)
+        seed = jax.random.fold_in(jax.random.key(config.seed), generation)
+        keys = jax.random.split(seed, num_agents)
+        return jax.device_get(self._compiled[key](keys, agent.hparams))
+
+    def verify(self, config: build.EvaluateConfig) -> dict[str, float]:
+        """Returns and steps of agents trained with these settings, on the proxy and the real task.
+
+        Agents are `num_agents` fresh ones in each, of keys that no trial has had.
+        """
+        values: dict[str, float] = {}
+        for world, name in (("the proxy", "proxy"), ("the real task", "real")):
+            fresh = self._search.config.max_generations
+            outcome = self.outcome(config, world, fresh, config.num_agents)
+            values[f"{name}_return"] = float(np.mean(outcome.test_return))
+            values[f"{name}_std"] = float(np.std(outcome.test_return))
+            values[f"{name}_steps"] = float(np.mean(outcome.train_steps))
+        return values
+
+
+def _make_rounds(agent: Any, study: Any, world: str, training: Any, config: Any) -> Any:
+    """`rounds(keys, hparams) -> Outcome`, compiled at its first call."""
+    import jax
+    import jax.numpy as jnp
+
+    from sejax.evaluation import lanes_on_cpu, make_evaluator
+    from sejax.parallel import compiler_options, spread_over_devices
+
+    env, env_params, _ = study.worlds[world]
+
+    def one(key: Any, hparams: Any) -> Any:
+        tried = dataclasses.replace(agent, hparams=hparams)
+        return make_evaluator(tried, env, study.task, training)(key, env_params)
+
+    spread = spread_over_devices(one, config.devices, config.lanes, lanes_on_cpu(agent, training))
+
+    def rounds(keys: Any, hparams: Any) -> Any:
+        of_each = jax.tree.map(lambda x: jnp.broadcast_to(x, keys.shape), hparams)
+        return spread(keys, of_each)
+
+    return jax.jit(rounds, compiler_options=compiler_options())
+
+
+def _stored_rounds(path: Path) -> list[dict[str, Any]]:
+    """The rounds of an earlier session; none if there was none.
+
+    Raises:
+      ConfigError: if the file is not one that a trial writes.
+    """
+    try:
+        rounds: list[dict[str, Any]] = json.loads(path.read_text(encoding="utf-8"))
+        _progress_of(rounds) if rounds else None
+    except FileNotFoundError:
+        return []
+    except (ValueError, TypeError, KeyError) as error:
+        raise ConfigError(
+            f"search_dir must keep the rounds of its trials, because a trial goes on from them; "
+            f"got {path}, which cannot be read. Remove it; its trial begins anew."
+        ) from error
+    return rounds
+
+
+def _progress_of(rounds: Sequence[dict[str, Any]]) -> Progress:
+    scores = np.array([each["returns"] for each in rounds], float)
+    return Progress(
+        scores=np.where(np.isfinite(scores), scores, np.nan),
+        cost=sum(each["cost"] for each in rounds),
+        seconds=sum(each["seconds"] for each in rounds),
+    )

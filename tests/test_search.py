@@ -1,0 +1,476 @@
+"""Studies: what trials tell them, what becomes of those that die, and what is written."""
+
+import contextlib
+import os
+import shutil
+import signal
+import socket
+import sqlite3
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+optuna = pytest.importorskip("optuna", reason="needs Optuna: pip install 'sejax[search]'")
+
+from sejax.app import build, compose, presets  # noqa: E402
+from sejax.errors import ConfigError  # noqa: E402
+from sejax.search import results, settings, study, trials  # noqa: E402
+from sejax.search.trials import Follower, Progress  # noqa: E402
+
+SPACE = "es.noise_std=interval(0.1, 0.9)"
+
+
+class Runner:
+    """Trials whose score in each generation is 100 noise_std + generation, kept in a file."""
+
+    def __init__(self, search):
+        self.most = search.config.max_generations
+        self.ran = []
+
+    def config(self, words, folder=None):
+        (value,) = [float(word.partition("=")[2]) for word in words]
+        return value, folder
+
+    def run(self, config, follower, is_inherited):
+        value, folder = config
+        folder.mkdir(parents=True, exist_ok=True)
+        done = folder / "done"
+        start = int(done.read_text()) if is_inherited and done.exists() else 0
+        for generation in range(start + 1, self.most + 1):
+            self.ran.append((folder.name, generation))
+            done.write_text(str(generation))
+            self.meanwhile(folder.name, generation)
+            follower.tell(self.progress(value, generation))
+        return self.progress(value, self.most)
+
+    def meanwhile(self, name, generation):
+        pass
+
+    def progress(self, value, generations):
+        scores = 100 * value + np.arange(1.0, generations + 1)[:, None]
+        return Progress(scores=scores, cost=1000 * generations, seconds=1.0)
+
+
+def opened(path, *words):
+    search = settings.read([SPACE, f"search_dir={path}", "sampler_seed=0", *words])
+    return study.open_study(search)
+
+
+def states(found):
+    return [trial.state.name for trial in found.get_trials(deepcopy=False)]
+
+
+def test_hyperband_ends_trials_that_are_behind_and_every_trial_ends(tmp_path):
+    found, search = opened(tmp_path, "trials=12", "sampler=random", "min_generations=1",
+                           "max_generations=3")  # fmt: skip
+    runner = Runner(search)
+    study.work(found, search, runner, lambda text: None)
+    ended = states(found)
+    assert len(ended) == 12 and set(ended) == {"COMPLETE", "PRUNED"}
+    table = results.table(found, search)
+    pruned = table[table["state"] == "pruned"]
+    assert set(pruned["generations"]) == {1}  # the one rung below the last generation
+    assert set(table[table["state"] == "complete"]["generations"]) == {3}
+    assert len(runner.ran) == table["generations"].sum()  # a pruned trial stops at once
+    best = results.ranked(found)[0]
+    assert best.params["es.noise_std"] == max(x.params["es.noise_std"] for x in found.trials)
+
+
+def test_the_median_pruner_is_taken_by_name(tmp_path):
+    found, search = opened(tmp_path, "pruner=median", "trials=8", "min_generations=1",
+                           "max_generations=2")  # fmt: skip
+    study.work(found, search, Runner(search), lambda text: None)
+    assert states(found)[:5] == ["COMPLETE"] * 5 and "PRUNED" in states(found)
+
+
+def take(found):
+    """A trial as a worker has it; Optuna wants heartbeats from its own loop alone."""
+    with pytest.warns(UserWarning, match="Heartbeat"):
+        return found.ask()
+
+
+def kill(found, number):
+    """What is left of a worker that died long ago."""
+    storage = found._storage._backend
+    trial_id = found.trials[number]._trial_id
+    with storage.engine.begin() as connection:
+        storage.record_heartbeat(trial_id)
+        connection.exec_driver_sql(
+            f"UPDATE trial_heartbeats SET heartbeat='2020-01-01 00:00:00' WHERE trial_id={trial_id}"
+        )
+
+
+def test_a_trial_whose_worker_died_is_retried_and_goes_on_from_its_files(tmp_path):
+    words = ("trials=2", "pruner=none", "max_generations=5")
+    found, search = opened(tmp_path, *words)
+    dead = take(found)
+    value = search.space["es.noise_std"].suggest(dead)
+    folder = study.trial_folder(search, dead.number)
+    folder.mkdir(parents=True)
+    (folder / "done").write_text("3")
+    (folder / "sejax.lock").write_text("of the dead")
+    kill(found, dead.number)
+
+    found, search = opened(tmp_path, *words)
+    runner = Runner(search)
+    study.work(found, search, runner, lambda text: None)
+    assert states(found) == ["FAIL", "COMPLETE", "COMPLETE"]
+    again = found.trials[1]
+    assert search.space["es.noise_std"].of(again.params) == value
+    assert again.user_attrs[study.HISTORY] == [0]
+    assert [x for x in runner.ran if x[0] == "0001"] == [("0001", 4), ("0001", 5)]
+    assert sorted(again.intermediate_values) == [1, 2, 3, 4, 5]  # those before, told anew
+    assert not (study.trial_folder(search, 1) / "sejax.lock").exists()
+
+
+def test_a_trial_that_takes_its_process_down_each_time_is_given_up(tmp_path):
+    found, search = opened(tmp_path, "trials=1", "pruner=none", "max_generations=3")
+    for number in range(study.RETRIES + 1):
+        assert take(found).number == number
+        kill(found, number)
+        with pytest.warns(optuna.exceptions.ExperimentalWarning):
+            optuna.storages.fail_stale_trials(found)
+    assert states(found) == ["FAIL"] * (study.RETRIES + 1)  # and none waits
+    study.work(found, search, Runner(search), lambda text: None)
+    assert states(found)[-1] == "COMPLETE"
+
+
+def test_an_interrupted_trial_is_queued_again(tmp_path):
+    class Interrupted(Runner):
+        def meanwhile(self, name, generation):
+            if (name, generation) == ("0001", 2):
+                raise KeyboardInterrupt
+
+    words = ("trials=3", "pruner=none", "max_generations=3")
+    found, search = opened(tmp_path, *words)
+    with pytest.raises(KeyboardInterrupt):
+        study.work(found, search, Interrupted(search), lambda text: None)
+    assert states(found) == ["COMPLETE", "FAIL", "WAITING"]
+    found, search = opened(tmp_path, *words)
+    runner = Runner(search)
+    study.work(found, search, runner, lambda text: None)
+    assert states(found) == ["COMPLETE", "FAIL", "COMPLETE", "COMPLETE"]
+    assert runner.ran[0] == ("0002", 3)
+
+
+def test_a_worker_that_was_taken_for_dead_leaves_the_trial_to_others(tmp_path):
+    found, search = opened(tmp_path, "trials=2", "pruner=none", "max_generations=3")
+
+    class Stopped(Runner):
+        def meanwhile(self, name, generation):
+            if (name, generation) == ("0000", 2):  # another worker has seen no heartbeats
+                trial = found.trials[0]
+                found._storage.set_trial_state_values(trial._trial_id, optuna.trial.TrialState.FAIL)
+                study.queue_again(found, trial)
+
+    said = []
+    study.work(found, search, Stopped(search), said.append)
+    assert states(found) == ["FAIL", "COMPLETE", "COMPLETE"]
+    assert any("taken for dead" in line for line in said)
+
+
+def test_settings_that_cannot_work_together_are_pruned_with_their_reason(tmp_path):
+    class Picky(Runner):
+        def config(self, words, folder=None):
+            if folder.name == "0000":
+                raise ConfigError("no such pair")
+            return super().config(words, folder)
+
+    found, search = opened(tmp_path, "trials=2", "pruner=none", "max_generations=3")
+    study.work(found, search, Picky(search), lambda text: None)
+    assert states(found) == ["PRUNED", "COMPLETE"]
+    assert found.trials[0].user_attrs["refused"] == "no such pair"
+    assert len(results.table(found, search)) == 2
+
+
+def test_an_error_is_no_trial_and_ends_the_worker(tmp_path):
+    class Broken(Runner):
+        def meanwhile(self, name, generation):
+            raise ValueError("a bug")
+
+    found, search = opened(tmp_path, "trials=2")
+    with pytest.raises(ValueError, match="a bug"):
+        study.work(found, search, Broken(search), lambda text: None)
+
+
+def test_workers_join_by_the_studys_name_and_other_searches_are_refused(tmp_path):
+    _, search = opened(tmp_path, "env=acrobot", "study=mine", "seeds=2")
+    url = search.storage
+    joined, theirs = study.open_study(settings.read(["study=mine", f"storage={url}"]))
+    assert joined.study_name == "mine" and theirs.stored() == search.stored()
+    assert theirs.config.seeds == 2
+    with pytest.raises(ConfigError, match=r"differs in seeds \(2 there, 3 here\)"):
+        opened(tmp_path, "env=acrobot", "study=mine", "seeds=3")
+    with pytest.raises(ConfigError, match="env=acrobot there, env=cartpole here"):
+        opened(tmp_path, "env=cartpole", "study=mine", "seeds=2")
+    with pytest.raises(ConfigError, match="space must be given"):
+        study.open_study(settings.read(["study=other", f"storage={url}"]))
+
+
+def test_a_storage_that_cannot_be_used_is_refused_without_its_password(tmp_path):
+    search = settings.read([SPACE, "storage=nothing://me:secret@there/x"])
+    with pytest.raises(ConfigError, match="storage must be a database") as caught:
+        study.open_study(search)
+    assert "secret" not in str(caught.value)
+
+
+class Told:
+    """A trial that keeps what it is told."""
+
+    def __init__(self):
+        self.values, self.kept = {}, {}
+
+    def report(self, value, step):
+        self.values[step] = value
+
+    def should_prune(self):
+        return False
+
+    def set_user_attr(self, name, value):
+        self.kept[name] = value
+
+
+@pytest.mark.parametrize(
+    ("measure", "score", "expected"),
+    # Two seeds with 1, 5, 3 and 2, 0, 4 that end after the third of four generations.
+    [
+        ("last", "mean", [1.5, 2.5, 3.5, 3.5]),
+        ("last", "worst", [1, 0, 3, 3]),
+        ("best", "mean", [1.5, 3.5, 4.5, 4.5]),
+        ("mean", "mean", [1.5, 2, 2.5, 2.75]),  # (1 + 5 + 3 + 3) / 4 = 3, (2 + 0 + 4 + 4) / 4 = 2.5
+        ("mean", "worst", [1, 1, 2, 2.5]),
+    ],
+)
+def test_scores_are_of_generations_and_seeds_as_asked(measure, score, expected):
+    search = settings.read(
+        [SPACE, f"measure={measure}", f"score={score}", "seeds=2", "max_generations=4"]
+    )
+    trial = Told()
+    progress = Progress(scores=np.array([[1.0, 2], [5, 0], [3, 4]]), cost=7, seconds=1.0)
+    value = Follower(trial, search).finish(progress)
+    assert list(trial.values.values()) == pytest.approx(expected)
+    assert value == pytest.approx(expected[-1])
+    assert trial.kept["generations"] == 3 and trial.kept["cost"] == 7
+
+
+def test_what_is_not_finite_is_pruned():
+    search = settings.read([SPACE, "max_generations=3"])
+    progress = Progress(scores=np.array([[1.0], [np.nan], [np.nan]]), cost=7, seconds=1.0)
+    with pytest.raises(optuna.TrialPruned):
+        Follower(Told(), search).finish(progress)
+
+
+def test_the_newest_directory_is_copied_with_its_checkpoint_first(tmp_path, monkeypatch):
+    old = tmp_path / "0001"
+    (old / "checkpoint").mkdir(parents=True)
+    for name in ("checkpoint/x", "metrics.csv", "sejax.lock", ".metrics.csv.sejax-00000000.csv"):
+        (old / name).write_text(name)
+    copied = []
+    tree, one = trials.shutil.copytree, trials.shutil.copy2
+    monkeypatch.setattr(
+        trials.shutil, "copytree", lambda s, d, **k: (copied.append(s.name), tree(s, d, **k))
+    )
+    monkeypatch.setattr(
+        trials.shutil, "copy2", lambda s, d: (copied.append(Path(s).name), one(s, d))
+    )
+    assert trials.take_over(tmp_path / "0005", [tmp_path / "0000", old, tmp_path / "0003"])
+    assert copied[0] == "checkpoint"
+    assert sorted(x.name for x in (tmp_path / "0005").iterdir()) == ["checkpoint", "metrics.csv"]
+    assert not trials.take_over(tmp_path / "0006", [tmp_path / "0004"])
+
+
+def test_the_front_has_what_none_beats_at_its_cost():
+    rows = pd.DataFrame(
+        {"trial": range(5), "cost": [1, 2, 3, 3, 4], "mean": [5.0, 4.0, 7.0, 6.0, 7.0]}
+    )
+    assert results.pareto_front(rows, "mean")["trial"].tolist() == [0, 2]
+
+
+def test_the_presets_section_makes_the_settings_of_the_override_line(tmp_path, monkeypatch):
+    fixed = ["env=cartpole", "training.max_steps=900", "agent_hparams=varied", "trials=3"]
+    search = settings.read([*fixed, SPACE, "agent.batch_size=16,32", "proxy.hidden_size=8,9"])
+    words = ["es.noise_std=0.25", "agent.batch_size=16", "proxy.hidden_size=9"]
+    asked = build.to_plain(compose.config([*search.fixed, *words]))
+
+    here = (presets.FOLDER / "cartpole-se.yaml").read_text()
+    for file in presets.FOLDER.glob("*.yaml"):
+        (tmp_path / file.name).write_text(file.read_text())
+    (tmp_path / "cartpole-se.yaml").write_text(f"{here}\n{results.preset_text(words, search)}")
+    monkeypatch.setattr(presets, "FOLDER", tmp_path)
+    presets._sections.cache_clear()
+    made = build.to_plain(compose.config(["env=cartpole", "preset=searched"]))
+    presets._sections.cache_clear()
+    assert made == {**asked, "preset": "searched"}
+
+
+def test_what_was_found_is_written(tmp_path):
+    found, search = opened(tmp_path, "trials=11", "sampler=random", "pruner=none",
+                           "min_generations=1", "max_generations=1",
+                           "es.step_size=interval(0.5,1)")  # fmt: skip
+
+    class Two(Runner):
+        def config(self, words, folder=None):
+            return super().config(words[:1], folder)
+
+    study.work(found, search, Two(search), lambda text: None)
+    words = results.write(found, search, "sejax.run")
+    best = results.ranked(found)[0]
+    assert words[0] == f"es.noise_std={search.space['es.noise_std'].of(best.params)}"
+    assert (tmp_path / "best.txt").read_text() == f"python -m sejax.run {' '.join(words)}\n"
+    assert len(pd.read_csv(tmp_path / "trials.csv")) == 11
+    assert (tmp_path / "pareto.png").stat().st_size > 5000
+    shares = results.importances(found, search)
+    assert max(shares, key=shares.get) == "es.noise_std"
+
+
+# --- real searches -------------------------------------------------------------------------------
+
+SMALL = ("env=gridworld_2x2", "agent=q_learning", "proxy.hidden_size=8", "es.population_size=4",
+         "training.max_steps=50")  # fmt: skip
+
+
+@pytest.mark.slow
+def test_trials_of_a_shape_share_one_program_and_its_numbers_are_those_of_a_run(tmp_path):
+    from sejax.app import session
+    from sejax.app.run_directory import open_for
+    from sejax.search.programs import Programs
+
+    programs = Programs()
+
+    def rows(name, chunks_of, *words):
+        config = compose.config([*SMALL, "generations=3", f"run_dir={tmp_path / name}", *words])
+        with open_for(config) as directory:
+            session.run(config, directory, chunks_of(config))
+            return [{k: float(v) for k, v in row.items() if k != "wall_s"}
+                    for row in directory.rows]  # fmt: skip
+
+    numbers = ("es.noise_std=0.2", "es.step_size=0.7", "agent.learning_rate=0.5")
+    other = rows("other", programs.chunks)
+    shared = rows("shared", programs.chunks, *numbers)
+    assert len(programs.shapes) == 1
+    assert shared != other
+    for one, two in zip(shared, rows("plain", session.make_chunks, *numbers), strict=True):
+        assert one == pytest.approx(two, rel=1e-5)
+    rows("wider", programs.chunks, "proxy.hidden_size=9")
+    assert len(programs.shapes) == 2
+
+
+def command(path, *words):
+    return [sys.executable, "-m", "sejax.search", *SMALL, "es.noise_std=interval(0.05,0.5)",
+            "min_generations=1", "max_generations=6", "trials=12", "heartbeat=1", "devices=1",
+            f"search_dir={path}", *words]  # fmt: skip
+
+
+def stop(worker, database):
+    """Stops it outside of a write to SQLite, which would make all others wait for it."""
+    while True:
+        os.kill(worker.pid, signal.SIGSTOP)
+        if not database.exists():  # it is elsewhere
+            return
+        with (
+            contextlib.closing(sqlite3.connect(database, timeout=1)) as connection,
+            contextlib.suppress(sqlite3.OperationalError),
+        ):
+            connection.execute("BEGIN IMMEDIATE")
+            return
+        os.kill(worker.pid, signal.SIGCONT)
+        time.sleep(0.1)
+
+
+def run_with_casualties(path, *words):
+    """Two workers, one of which is killed and the other stopped for longer than it may be."""
+    workers = [subprocess.Popen(command(path, *words), stdout=subprocess.DEVNULL) for _ in "ab"]
+    try:
+        while not (path / "trials" / "0003").exists():
+            assert all(worker.poll() is None for worker in workers)
+            time.sleep(0.1)
+        workers[0].kill()
+        stop(workers[1], path / "study.db")
+        third = subprocess.run(command(path, *words), capture_output=True, text=True, timeout=500)
+        os.kill(workers[1].pid, signal.SIGCONT)
+        assert third.returncode == 0, third.stderr
+        assert workers[1].wait(timeout=300) == 0
+    finally:
+        for worker in workers:
+            worker.kill()
+            worker.wait()
+
+
+def check_study(url, name="gridworld_2x2-se-q_learning"):
+    found = optuna.load_study(study_name=name, storage=url)
+    left = [x for x in found.trials if x.state.name != "FAIL"]
+    assert {x.state.name for x in left} <= {"COMPLETE", "PRUNED"} and len(left) >= 12
+    retried = {number for x in found.trials for number in x.user_attrs.get(study.HISTORY, [])}
+    failed = {x.number for x in found.trials if x.state.name == "FAIL"}
+    assert failed and failed <= retried
+    # What a retried trial was told is what an undisturbed one would have been.
+    for again in (x for x in left if study.HISTORY in x.user_attrs):
+        before = found.trials[again.user_attrs[study.HISTORY][-1]].intermediate_values
+        for step in before.keys() & again.intermediate_values.keys():
+            assert again.intermediate_values[step] == pytest.approx(before[step], rel=1e-5)
+
+
+@pytest.mark.slow
+def test_a_killed_and_a_stopped_worker_cost_the_study_no_trial(tmp_path):
+    run_with_casualties(tmp_path / "s")
+    url = f"sqlite:///{tmp_path / 's' / 'study.db'}"
+    check_study(url)
+    with contextlib.closing(sqlite3.connect(tmp_path / "s" / "study.db")) as connection:
+        assert connection.execute("PRAGMA integrity_check").fetchone() == ("ok",)
+    again = subprocess.run(command(tmp_path / "s"), capture_output=True, text=True)
+    assert again.returncode == 0 and "The best:" in again.stdout
+
+
+@pytest.fixture
+def postgres(tmp_path):
+    """URL of a database of a server of our own."""
+    pytest.importorskip("psycopg", reason="needs its driver: pip install 'psycopg[binary]'")
+    programs = sorted(Path("/usr/lib/postgresql").glob("*/bin/initdb"))
+    if not programs:
+        pytest.skip("needs PostgreSQL's server: apt install postgresql")
+    folder = Path(tempfile.mkdtemp(dir="/tmp"))  # a path that the server's user can enter
+    who = {"user": "postgres"} if os.geteuid() == 0 else {}  # the server refuses root
+    if who:
+        shutil.chown(folder, **who)
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    started = [programs[-1].with_name("pg_ctl"), "-D", folder / "db", "-w"]
+    options = f"-p {port} -c listen_addresses=127.0.0.1 -k {folder}"
+    subprocess.run([programs[-1], "-D", folder / "db", "-U", "me", "-A", "trust"], check=True,
+                   cwd=folder, stdout=subprocess.DEVNULL, **who)  # fmt: skip
+    subprocess.run([*started, "-o", options, "-l", folder / "log", "start"], check=True,
+                   cwd=folder, stdout=subprocess.DEVNULL, **who)  # fmt: skip
+    yield f"postgresql://me@127.0.0.1:{port}/postgres"
+    subprocess.run([*started, "-m", "immediate", "stop"], check=True, cwd=folder,
+                   stdout=subprocess.DEVNULL, **who)  # fmt: skip
+    shutil.rmtree(folder)
+
+
+@pytest.mark.slow
+def test_the_same_with_postgresql(tmp_path, postgres):
+    run_with_casualties(tmp_path / "s", f"storage={postgres}", "study=there")
+    check_study(postgres, "there")
+
+
+@pytest.mark.slow
+def test_an_agent_is_tuned_on_a_proxy_and_verified_on_the_real_task(tmp_path):
+    words = ["proxy=cartpole", "agent=boltzmann_is_none"]
+    done = subprocess.run([sys.executable, "-m", "sejax.search", *words, "space=agent"],
+                          capture_output=True, text=True, cwd=tmp_path)  # fmt: skip
+    assert done.returncode == 2 and "agent must be one of" in done.stderr
+    words = ["proxy=cartpole", "agent=ppo", "space=agent", "trials=3", "min_generations=1",
+             "max_generations=2", "verify=2", "num_agents=2", "real_training.max_steps=2000",
+             "pruner=none", f"search_dir={tmp_path}"]  # fmt: skip
+    done = subprocess.run([sys.executable, "-m", "sejax.search", *words],
+                          capture_output=True, text=True)  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    table = pd.read_csv(tmp_path / "verification.csv")
+    assert len(table) == 2 and table["real_return"].is_monotonic_decreasing
+    assert (tmp_path / "best.txt").read_text().startswith("python -m sejax.evaluate proxy=cartpole")
