@@ -255,10 +255,10 @@ def test_a_repository_has_an_owner_and_a_name():
 @needs_the_extra
 def test_the_command_evaluates_what_is_there_and_writes_in_the_working_folder(the_hub):
     from sejax.app import compose
-    from sejax.evaluate import _proxy_study
+    from sejax.evaluate import proxy_study
 
     sejax.push("cartpole", "me/se")
     config = compose.evaluate_config([f"proxy=hf://me/se@{oid('me/se', 0)}"])
-    study = _proxy_study(config)
+    study = proxy_study(config)
     assert study.task.name == "cartpole"
     assert str(study.out_dir) == f"runs/evaluate-me_se@{oid('me/se', 0)}"
