@@ -44,8 +44,8 @@ def test_every_task_variant_and_objective_learns(task, variant, objective):
 
 
 def test_cliff_walking_rns_teach_faster_than_the_real_reward():
-    """Ten generations already find a reward with which Q-learning needs fewer steps."""
-    config = sejax.config(["env=cliff_walking", "proxy=rn", "generations=10",
+    """Twenty generations already find a reward with which Q-learning needs fewer steps."""
+    config = sejax.config(["env=cliff_walking", "proxy=rn", "generations=20",
                            "proxy.variant=additive_non_potential"])  # fmt: skip
     info = jax.device_get(jax.jit(make_learner(config))(jax.random.key(0)).info)
     # Scores are minus the steps to solve, where all agents solve the task.
