@@ -26,7 +26,7 @@ from sejax.es.strategy import Strategy, Trials, finite_mean
 from sejax.evaluation import lanes_on_cpu, make_evaluator, tested_throughout
 from sejax.families import Families
 from sejax.objectives import MaxReward, Objective, Outcome
-from sejax.parallel import copy_to_devices, spread_groups_over_devices
+from sejax.parallel import copy_to_devices, spread_groups_over_devices, spread_over_devices
 from sejax.proxies.proxy import ProxyEnv
 from sejax.training import TrainingConfig
 
@@ -120,9 +120,15 @@ class Program:
         trial with leaves `[seed, trials, ...]`.
       generation: `(LearnState) -> (LearnState, GenerationInfo)`: `ask`, a training for each trial,
         `tell`; a scan body over all seeds.
+      test_steps: `(LearnState) -> [seed]`, how much of the test episodes is scored; None: all.
+      share_of: `(family) -> evaluate`, where `evaluate(keys [n], candidates [n, dims], active [n],
+        test_steps [n])` is the outcome of n trials of a family on one device, leaves `[n, ...]`:
+        for processes that divide a generation's trials among themselves.
       unravel: flat parameters `[dims]` to the proxy's weights.
       proxy: what is learned.
       families: of agents that learn on it; one, if there is a single agent.
+      family_of_trial: index of the family of each trial, `[trials]`.
+      cpu_lanes: agents of each family that train in lockstep on a CPU core; None for all.
       strategy: that learns it.
       objective: that it is learned by.
       num_dims: length of a parameter vector.
@@ -132,9 +138,13 @@ class Program:
     ask: Callable[[LearnState], "Asked"]
     tell: Callable[[LearnState, "Asked", Outcome], tuple[LearnState, GenerationInfo]]
     generation: Callable[[LearnState], tuple[LearnState, GenerationInfo]]
+    test_steps: Callable[[LearnState], Array | None]
+    share_of: Callable[[int], Callable[..., Outcome]]
     unravel: Callable[[Array], Any]
     proxy: ProxyEnv
     families: Families
+    family_of_trial: np.ndarray
+    cpu_lanes: tuple[int | None, ...]
     strategy: Strategy
     objective: Objective
     num_dims: int
@@ -252,6 +262,8 @@ def make_program(
     training = training or TrainingConfig()
     num_dims, unravel = _flat_weights(proxy)
     families, strategy = Families.of(agent), _strategy_of(es, num_dims)
+    if objective.needs_tests:
+        training = tested_throughout(training)
     trials = dataclasses.replace(
         strategy.trials,
         num_incumbent_evals=families.num_evals(strategy.trials.num_incumbent_evals),
@@ -260,9 +272,9 @@ def make_program(
     family_of_member = families.of_members(strategy.num_members, strategy.num_signs)
     family_of_trial = trials.families(family_of_member, families.size)
     evaluate_all = make_population_evaluator(
-        families, proxy, tested_throughout(training) if objective.needs_tests else training,
-        unravel, family_of_trial, devices, lanes,
-    )  # fmt: skip
+        families, proxy, training, unravel, family_of_trial, devices, lanes
+    )
+    cpu_lanes = tuple(lanes_on_cpu(agent, training) for agent in families.agents)
     seed_ids = jnp.asarray(trials.seed_ids(strategy.num_members))
     require(not stop_when_solved or (objective.scores_are_returns and task.is_solvable),
             "stop_when_solved", "be false with this objective and task", "nobody says which score "
@@ -331,18 +343,28 @@ def make_program(
     def generation(state: LearnState) -> tuple[LearnState, GenerationInfo]:
         """One pass of Algorithm 1's outer loop for every seed; a scan body."""
         asked = ask(state)
-        test_steps = objective.test_steps and objective.test_steps(state.generation)
-        outcome = evaluate_all(asked.keys, asked.candidates, ~state.finished, test_steps)
+        outcome = evaluate_all(asked.keys, asked.candidates, ~state.finished, test_steps(state))
         return tell(state, asked, outcome)
+
+    def test_steps(state: LearnState) -> Array | None:
+        return objective.test_steps and objective.test_steps(state.generation)
+
+    def share_of(family: int) -> Callable[..., Outcome]:
+        trial = make_trial(families.agents[family], proxy, training, unravel)
+        return spread_over_devices(trial, 1, lanes, cpu_lanes[family])
 
     return Program(
         init=init,
         ask=ask,
         tell=tell,
         generation=generation,
+        test_steps=test_steps,
+        share_of=share_of,
         unravel=unravel,
         proxy=proxy,
         families=families,
+        family_of_trial=family_of_trial,
+        cpu_lanes=cpu_lanes,
         strategy=strategy,
         objective=objective,
         num_dims=num_dims,
@@ -498,16 +520,10 @@ def make_population_evaluator(
     candidate: no training pays for another family's. Groups of `lanes` of them follow one another.
     """
 
-    def evaluator_of(agent: Agent) -> Callable[..., Outcome]:
-        evaluate = make_evaluator(agent, proxy, proxy.task, training)
-        return lambda key, candidate, active, test_steps: evaluate(
-            key, proxy.params(unravel(candidate)), active, test_steps
-        )
-
     places = [np.flatnonzero(family_of_trial == i) for i in range(families.size)]
     order = np.argsort(np.concatenate(places))
     evaluate_groups = spread_groups_over_devices(
-        [evaluator_of(agent) for agent in families.agents], devices, lanes,
+        [make_trial(agent, proxy, training, unravel) for agent in families.agents], devices, lanes,
         [lanes_on_cpu(agent, training) for agent in families.agents],
     )  # fmt: skip
 
@@ -529,6 +545,16 @@ def make_population_evaluator(
         return jax.tree.map(merged, *outcomes)
 
     return evaluate_all
+
+
+def make_trial(
+    agent: Agent, proxy: ProxyEnv, training: TrainingConfig, unravel: Callable[[Array], Any]
+) -> Callable[..., Outcome]:
+    """Builds `trial(key, candidate [dims], active, test_steps) -> Outcome`: one fresh agent's."""
+    evaluate = make_evaluator(agent, proxy, proxy.task, training)
+    return lambda key, candidate, active, test_steps: evaluate(
+        key, proxy.params(unravel(candidate)), active, test_steps
+    )
 
 
 def _flat_weights(proxy: ProxyEnv) -> tuple[int, Callable[[Array], Any]]:

@@ -14,6 +14,7 @@ group         entry points            `make(...)` gives
 `objective`   `sejax.objectives`      `(task)` a `sejax.Objective`
 `es`          `sejax.strategies`      `(num_dims)` a `sejax.Strategy`
 `tracker`     `sejax.trackers`        `(run)` a `sejax.app.trackers.Tracker`
+`machines`    `sejax.machines`        `(config, folder, say)`: see `sejax.machines.configs`
 ============= ======================= ==============================================
 
 A name is one that comes with sejax, one that an installed package offers as an entry point, or
@@ -111,6 +112,10 @@ GROUPS = {
         "tensorboard": "sejax.app.trackers:TensorBoardConfig",
         "wandb": "sejax.app.trackers:WandbConfig",
         "trackio": "sejax.app.trackers:TrackioConfig",
+    }),
+    "machines": Group("sejax.machines", ("config", "folder", "say"), {
+        "local": "sejax.machines.configs:LocalConfig",
+        "ray": "sejax.machines.configs:RayConfig",
     }),
 }  # fmt: skip
 

@@ -40,8 +40,8 @@ def learn(config: LearnConfig) -> float:
             from sejax.app import session
 
             runtime.enable_compilation_cache()
-            chunks = session.make_chunks(config)
-            ended = session.run(config, directory, chunks, progress)
+            with config.machines.make(config, directory.path, progress.print) as chunks:
+                ended = session.run(config, directory, chunks, progress)
         except KeyboardInterrupt:
             progress.stop()
             print(f"Interrupted. {directory.finished_generations} generations are saved in "

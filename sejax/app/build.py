@@ -12,12 +12,14 @@ from sejax.app import families, trackers
 from sejax.app.families import AgentsConfig, families_of
 from sejax.errors import ConfigError, one_of, require, require_seed, shortened, whole
 from sejax.families import Families
+from sejax.machines import configs as machines
 from sejax.training import TrainingConfig, steps_before_learning
 
 AGENT_HPARAMS = ("default", "varied")
 EVALUATION_HPARAMS = (*AGENT_HPARAMS, "as_learned")
 TRAINING_FROM = ("proxy", "config")
-LEARN_GROUPS = ("env", "proxy", "agent", "exploration", "es", "objective", "tracker")
+LEARN_GROUPS = ("env", "proxy", "agent", "exploration", "es", "objective", "tracker",
+                "machines")  # fmt: skip
 EVALUATE_GROUPS = ("agent", "exploration")
 TRAININGS = ("training", "real_training")
 
@@ -41,6 +43,7 @@ class LearnConfig:
     es: Any
     objective: Any
     tracker: Any  # who is told of the run beside its files
+    machines: Any  # where trainings are computed
     training: TrainingConfig
     agent_hparams: str  # default: the agent's; varied: drawn anew for each training
     generations: int  # n_o
@@ -61,6 +64,7 @@ class LearnConfig:
         whole(1, "checkpoint_every", self.checkpoint_every, "it counts generations", 1)
         _require_computing(self)
         trackers.require_package(self.tracker)
+        machines.require_usable(self.machines, self.devices)
         require_real_returns("training", self.training)
         returns = getattr(self.objective, "scores_are_returns", None)
         require(not self.stop_when_solved or returns is not False, "stop_when_solved",
@@ -180,8 +184,9 @@ def learn_config(values: Mapping[str, Any]) -> LearnConfig:
     Raises:
       ConfigError: for an unknown, missing or bad field, or parts that cannot work together.
     """
-    untracked = {"tracker": {"name": "none"}}  # of a stored proxy: nobody follows what is over
-    return _from_plain(LearnConfig, LEARN_GROUPS, untracked | dict(values))
+    # A stored proxy does not say who followed its run, or where it was computed.
+    unsaid = {"tracker": {"name": "none"}, "machines": {"name": "local"}}
+    return _from_plain(LearnConfig, LEARN_GROUPS, unsaid | dict(values))
 
 
 def evaluate_config(values: Mapping[str, Any]) -> EvaluateConfig:

@@ -91,7 +91,12 @@ def _quoted(word: str) -> str:
 
 
 def _devices(words: Sequence[str]) -> int | None:
-    """The number of devices that is asked for, if it is one; what is not is refused later."""
+    """The number of devices that is asked for, if it is one; what is not is refused later.
+
+    One where trainings are computed elsewhere.
+    """
+    if any(word.startswith("machines=") and word != "machines=local" for word in words):
+        return 1
     values = [word.removeprefix("devices=") for word in words if word.startswith("devices=")]
     return int(values[-1]) if values and re.fullmatch(r"[1-9]\d{0,3}", values[-1]) else None
 

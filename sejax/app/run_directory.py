@@ -25,7 +25,7 @@ __all__ = ["COLUMNS", "FREE_FIELDS", "RunDirectory", "open_for"]
 
 # Fields, and groups of them, that say how or how long to compute, not what: they may change between
 # two sessions.
-FREE_FIELDS = {"generations", "devices", "checkpoint_every", "run_dir", "tracker"}
+FREE_FIELDS = {"generations", "devices", "checkpoint_every", "run_dir", "tracker", "machines"}
 HINT = "Set run_dir=FOLDER."
 _SHOWN = 10  # differing fields that a message names
 

@@ -55,6 +55,7 @@ class Chunks:
 
     def __init__(self, program: Program):
         self.program = program
+        self.cpu_s = 0.0  # of other processes than this one
         self._compiled: dict[tuple[int, int], Any] = {}
 
     def init(self, keys: Any) -> Any:
@@ -135,7 +136,7 @@ def run(
     cpu_before = directory.cpu_s
 
     def cpu_s() -> float:
-        return cpu_before + time.process_time() - cpu_started
+        return cpu_before + time.process_time() - cpu_started + chunks.cpu_s
 
     state = jax.tree.map(lambda x: x.copy(), state)  # own buffers, so that they can be donated
     with Follower(config, directory, report) as follower:
@@ -183,8 +184,9 @@ class Proxies:
 
     def __init__(self, config: build.LearnConfig, folder: Path, program: Program):
         self.config, self.folder, self.program = config, folder, program
-        # Who followed the run is no part of what was learned.
-        self._plain = {k: v for k, v in build.to_plain(config).items() if k != "tracker"}
+        # Who followed the run and where it was computed are no part of what was learned.
+        plain = build.to_plain(config)
+        self._plain = {k: v for k, v in plain.items() if k not in ("tracker", "machines")}
         self._discount = float(program.agent.discount(program.agent.hparams))
         self._stored: dict[int, int] = {}  # generation of each seed's best one that is on the disk
 

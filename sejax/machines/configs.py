@@ -1,0 +1,72 @@
+"""What `machines=` chooses."""
+
+import contextlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any, ClassVar
+
+from sejax import plugins
+from sejax.errors import ConfigError, require
+from sejax.options import Options, counts, not_negative, option, positive
+
+
+@dataclass(frozen=True, kw_only=True)
+class LocalConfig(Options):
+    """This process: one compiled program over its devices."""
+
+    group: ClassVar[str] = "machines"
+    is_elsewhere: ClassVar[bool] = False
+
+    def make(
+        self, config: Any, folder: Path, say: Callable[[str], None]
+    ) -> contextlib.AbstractContextManager[Any]:
+        """The generations of a run, as `sejax.app.session.Chunks`."""
+        from sejax.app import session
+
+        return contextlib.nullcontext(session.make_chunks(config))
+
+
+@dataclass(frozen=True, kw_only=True)
+class RayConfig(Options):
+    """Worker processes on a Ray cluster: that of `RAY_ADDRESS`, or one on this machine."""
+
+    group: ClassVar[str] = "machines"
+    is_elsewhere: ClassVar[bool] = True
+    package: ClassVar[str] = "ray"
+
+    # worker processes; null: one for each CPU core of the cluster, or for each GPU
+    workers: int | None = option(None, counts("somebody must compute"))
+    # 0: workers compute on a CPU core each; a part of one: several workers share a GPU
+    gpus_per_worker: float = option(0.0, not_negative("it is a share of GPUs"))
+    # seconds after which a worker is given up while nobody has shown how long a training takes
+    patience_s: float = option(3600.0, positive("a worker needs time to compile and to train"))
+
+    def make(
+        self, config: Any, folder: Path, say: Callable[[str], None]
+    ) -> contextlib.AbstractContextManager[Any]:
+        """The generations of a run, as `sejax.app.session.Chunks`."""
+        from sejax.machines import ray_crew
+
+        return ray_crew.chunks_of(self, config, folder, say)
+
+
+def require_usable(config: Any, devices: int | None) -> None:
+    """Checks what can be checked before anything is imported.
+
+    Raises:
+      ConfigError: without the package that a choice needs, or for devices of this process where it
+        does not compute.
+    """
+    name = plugins.name_of("machines", config)
+    package = getattr(config, "package", None)
+    if package is not None and find_spec(package) is None:
+        raise ConfigError(
+            f"machines must be one that is installed, because trainings are sent there; got {name} "
+            f"without the package {package}. Install it with pip install 'sejax[{name}]', or set "
+            f"machines=local."
+        )
+    elsewhere = getattr(config, "is_elsewhere", False)
+    require(not elsewhere or devices is None, "devices", f"be left out with machines={name}",
+            "each worker has one", devices, "machines.workers=N, or machines=local")  # fmt: skip
