@@ -1,7 +1,6 @@
 """Generations of a run whose trainings are done elsewhere."""
 
 import time
-from collections.abc import Callable
 from types import TracebackType
 from typing import Any
 
@@ -30,8 +29,9 @@ class RemoteChunks:
         self.program = program
         self.cpu_s = 0.0  # of the workers, for trainings that counted
         self._hand_out, self._ledger = hand_out, ledger
-        self._asks: dict[int, Any] = {}
-        self._tells: dict[int, Any] = {}
+        # One program asks and tells, and runs twice in a generation: XLA fuses what is told with what
+        # was asked, so that two programs would round candidates otherwise than `Program.generation`.
+        self._compiled: dict[int, Any] = {}
 
     def __enter__(self) -> "RemoteChunks":
         return self
@@ -50,37 +50,25 @@ class RemoteChunks:
 
     def is_ready(self, num_seeds: int, length: int) -> bool:
         """Whether this process has compiled its part for so many seeds."""
-        return num_seeds in self._asks
+        return num_seeds in self._compiled
 
     def compile(self, num_seeds: int, length: int) -> None:
         """Compiles this process's part, and waits for a worker that has compiled its own.
 
         Raises:
-          ConfigError: if workers say that they cannot work with this process.
-          RuntimeError: if none gets ready.
+          ConfigError: if none gets ready.
         """
         program = self.program
 
-        def ask(state: Any) -> tuple[Any, ...]:
+        def generation(state: Any, outcome: Outcome) -> tuple[Any, ...]:
             asked = program.ask(state)
-            return jax.random.key_data(asked.keys), asked.candidates, program.test_steps(state)
-
-        def tell(state: Any, outcome: Outcome) -> tuple[Any, ...]:
-            # Asked again, candidates and all: XLA fuses what is told with what was asked, and
-            # rounds otherwise where it finds that in memory.
-            asked = program.ask(state)
-            return *program.tell(state, asked, outcome), asked.candidates
+            trials = jax.random.key_data(asked.keys), asked.candidates, program.test_steps(state)
+            return program.tell(state, asked, outcome), trials
 
         keys = jax.random.split(jax.random.key(0), num_seeds)
-        state = jax.eval_shape(program.init, keys)
-        outcome = self._outcome_shapes(num_seeds)
-
-        def compiled(function: Callable[..., Any], *shapes: Any) -> Any:
-            jitted = jax.jit(function, compiler_options=compiler_options())
-            return jitted.lower(*shapes).compile()
-
-        self._asks[num_seeds] = compiled(ask, state)
-        self._tells[num_seeds] = compiled(tell, state, outcome)
+        shapes = jax.eval_shape(program.init, keys), self._outcome_shapes(num_seeds)
+        jitted = jax.jit(generation, compiler_options=compiler_options())
+        self._compiled[num_seeds] = jitted.lower(*shapes).compile()
         self._hand_out.get_ready()
 
     def advance(self, state: Any, length: int) -> tuple[Any, Any]:
@@ -90,7 +78,8 @@ class RemoteChunks:
           The state, and an info with leaves `[length, seed]`.
 
         Raises:
-          ConfigError, RuntimeError: as of `compile`, or if a training fails everywhere.
+          ConfigError: if no worker gets ready.
+          RuntimeError: if a training fails everywhere.
           OSError: if `machines.csv` cannot be written.
         """
         num_seeds = state.generation.shape[0]
@@ -99,16 +88,18 @@ class RemoteChunks:
         infos = []
         for _ in range(length):
             outcome = self._outcome(num_seeds, state)
-            state, info, _ = self._tells[num_seeds](state, outcome)
+            (state, info), _ = self._compiled[num_seeds](state, outcome)
             infos.append(info)
         return state, jax.tree.map(lambda *each: jnp.stack(each), *infos)
 
     def _outcome(self, num_seeds: int, state: Any) -> Outcome:
         """What comes of a generation's trials, leaves `[seed, trials, ...]`."""
-        keys, candidates, test_steps = jax.device_get(self._asks[num_seeds](state))
+        shapes = self._outcome_shapes(num_seeds)
+        nothing = jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), shapes)
+        _, trials = self._compiled[num_seeds](state, nothing)
+        keys, candidates, test_steps = jax.device_get(trials)
         active = ~np.asarray(state.finished)
         num_trials = keys.shape[1]
-        shapes = self._outcome_shapes(num_seeds)
 
         def work_of(share: Share) -> Work:
             seeds, trials = np.divmod(share.places, num_trials)

@@ -147,8 +147,8 @@ class HandOut:
           The outcomes of shares that make up all trials, and what each worker did.
 
         Raises:
-          RuntimeError: if a share fails everywhere, or no worker gets ready.
-          ConfigError: if workers say that they cannot work with this driver.
+          RuntimeError: if a share fails everywhere.
+          ConfigError: if no worker gets ready.
         """
         plan = _Plan(families, self._capacities, self._is_lockstep)
         done: dict[Hashable, Done] = defaultdict(Done)
@@ -265,11 +265,14 @@ class HandOut:
 
     def _start_failed(self, error: Exception) -> None:
         self._failed_starts += 1
-        is_last_straw = isinstance(error, ConfigError) or self._failed_starts >= MOST_FAILURES
-        if is_last_straw and not any(hand.about for hand in self._hands.values()):
+        is_hopeless = isinstance(error, ConfigError) or self._failed_starts >= MOST_FAILURES
+        if is_hopeless and not any(hand.about for hand in self._hands.values()):
             if isinstance(error, ConfigError):
                 raise error
-            raise RuntimeError(f"No worker gets ready: {told(error)}") from error
+            raise ConfigError(
+                f"machines must have workers that get ready, because they compute; the last "
+                f"{MOST_FAILURES} did not: {told(error)}. Install what the driver has on each."
+            ) from error
         if self._failed_starts == MOST_FAILURES:
             self._say(f"No more workers are started, as the last {MOST_FAILURES} did not get ready "
                       f"({told(error)}).")  # fmt: skip

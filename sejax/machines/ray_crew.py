@@ -160,6 +160,9 @@ def _came(reference: Any) -> Any:
         return ray.get(reference)
     except ray.exceptions.RayTaskError as error:  # raised by the worker
         return error.cause if isinstance(error.cause, Exception) else error
+    except ray.exceptions.ActorDiedError as error:
+        words = [line.strip() for line in str(error).splitlines() if line.strip()]
+        return RuntimeError(words[-1])  # the lines before are of Ray's own code
     except ray.exceptions.RayError as error:
         return error
 
