@@ -1,7 +1,10 @@
 """Studies: what trials tell them, what becomes of those that die, and what is written."""
 
+import atexit
 import contextlib
+import functools
 import os
+import shlex
 import shutil
 import signal
 import socket
@@ -18,7 +21,7 @@ import pytest
 
 optuna = pytest.importorskip("optuna", reason="needs Optuna: pip install 'sejax[search]'")
 
-from sejax.app import build, compose, presets  # noqa: E402
+from sejax.app import compose  # noqa: E402
 from sejax.errors import ConfigError  # noqa: E402
 from sejax.search import results, settings, study, trials  # noqa: E402
 from sejax.search.trials import Follower, Progress  # noqa: E402
@@ -57,9 +60,33 @@ class Runner:
         return Progress(scores=scores, cost=1000 * generations, seconds=1.0)
 
 
+def read(path, *words):
+    return settings.read([SPACE, f"search_dir={path}", "sampler_seed=0", *words])
+
+
+@functools.cache
+def empty_database():
+    """A database with Optuna's tables, which take longer to make than most of these tests."""
+    folder = Path(tempfile.mkdtemp())
+    atexit.register(shutil.rmtree, folder)
+    found, _ = study.open_study(read(folder, "study=none"))
+    found._storage._backend.engine.dispose()
+    optuna.delete_study(study_name="none", storage=f"sqlite:///{folder / 'study.db'}")
+    return folder / "study.db"
+
+
 def opened(path, *words):
-    search = settings.read([SPACE, f"search_dir={path}", "sampler_seed=0", *words])
-    return study.open_study(search)
+    """A study in a database, where others may be at work on it."""
+    if not (path / "study.db").exists():
+        shutil.copy(empty_database(), path)
+    return study.open_study(read(path, *words))
+
+
+def in_memory(path, *words):
+    """A study of one worker."""
+    search = read(path, *words)
+    parts = {"sampler": study._sampler(search), "pruner": study._pruner(search)}
+    return optuna.create_study(direction="maximize", **parts), search
 
 
 def states(found):
@@ -67,7 +94,7 @@ def states(found):
 
 
 def test_hyperband_ends_trials_that_are_behind_and_every_trial_ends(tmp_path):
-    found, search = opened(tmp_path, "trials=12", "sampler=random", "min_generations=1",
+    found, search = in_memory(tmp_path, "trials=12", "sampler=random", "min_generations=1",
                            "max_generations=3")  # fmt: skip
     runner = Runner(search)
     study.work(found, search, runner, lambda text: None)
@@ -83,7 +110,7 @@ def test_hyperband_ends_trials_that_are_behind_and_every_trial_ends(tmp_path):
 
 
 def test_the_median_pruner_is_taken_by_name(tmp_path):
-    found, search = opened(tmp_path, "pruner=median", "trials=8", "min_generations=1",
+    found, search = in_memory(tmp_path, "pruner=median", "trials=8", "min_generations=1",
                            "max_generations=2")  # fmt: skip
     study.work(found, search, Runner(search), lambda text: None)
     assert states(found)[:5] == ["COMPLETE"] * 5 and "PRUNED" in states(found)
@@ -182,7 +209,7 @@ def test_settings_that_cannot_work_together_are_pruned_with_their_reason(tmp_pat
                 raise ConfigError("no such pair")
             return super().config(words, folder)
 
-    found, search = opened(tmp_path, "trials=2", "pruner=none", "max_generations=3")
+    found, search = in_memory(tmp_path, "trials=2", "pruner=none", "max_generations=3")
     study.work(found, search, Picky(search), lambda text: None)
     assert states(found) == ["PRUNED", "COMPLETE"]
     assert found.trials[0].user_attrs["refused"] == "no such pair"
@@ -194,7 +221,7 @@ def test_an_error_is_no_trial_and_ends_the_worker(tmp_path):
         def meanwhile(self, name, generation):
             raise ValueError("a bug")
 
-    found, search = opened(tmp_path, "trials=2")
+    found, search = in_memory(tmp_path, "trials=2")
     with pytest.raises(ValueError, match="a bug"):
         study.work(found, search, Broken(search), lambda text: None)
 
@@ -292,25 +319,20 @@ def test_the_front_has_what_none_beats_at_its_cost():
     assert results.pareto_front(rows, "mean")["trial"].tolist() == [0, 2]
 
 
-def test_the_presets_section_makes_the_settings_of_the_override_line(tmp_path, monkeypatch):
-    fixed = ["env=cartpole", "training.max_steps=900", "agent_hparams=varied", "trials=3"]
-    search = settings.read([*fixed, SPACE, "agent.batch_size=16,32", "proxy.hidden_size=8,9"])
-    words = ["es.noise_std=0.25", "agent.batch_size=16", "proxy.hidden_size=9"]
-    asked = build.to_plain(compose.config([*search.fixed, *words]))
-
-    here = (presets.FOLDER / "cartpole-se.yaml").read_text()
-    for file in presets.FOLDER.glob("*.yaml"):
-        (tmp_path / file.name).write_text(file.read_text())
-    (tmp_path / "cartpole-se.yaml").write_text(f"{here}\n{results.preset_text(words, search)}")
-    monkeypatch.setattr(presets, "FOLDER", tmp_path)
-    presets._sections.cache_clear()
-    made = build.to_plain(compose.config(["env=cartpole", "preset=searched"]))
-    presets._sections.cache_clear()
-    assert made == {**asked, "preset": "searched"}
+def test_the_preset_file_makes_the_settings_of_the_override_line(tmp_path):
+    fixed = ["env=acrobot", "preset=paper", "agent_hparams=varied", "devices=1", "trials=3"]
+    search = read(tmp_path, *fixed, "agent.batch_size=16,32")
+    words = ["es.noise_std=0.25", "agent.batch_size=16"]
+    results.write_best(words, search, "sejax.run")
+    (line,) = (tmp_path / "best.txt").read_text().splitlines()
+    asked = compose.config(shlex.split(line)[3:])
+    preset = results.preset_line(search, "sejax.run").partition(" sejax.run ")[2]
+    assert compose.config([preset, "devices=1"]) == asked
+    assert asked.es.noise_std == 0.25 and asked.preset == "paper"
 
 
 def test_what_was_found_is_written(tmp_path):
-    found, search = opened(tmp_path, "trials=11", "sampler=random", "pruner=none",
+    found, search = in_memory(tmp_path, "trials=11", "sampler=random", "pruner=none",
                            "min_generations=1", "max_generations=1",
                            "es.step_size=interval(0.5,1)")  # fmt: skip
 
