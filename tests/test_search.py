@@ -353,12 +353,22 @@ def test_what_was_found_is_written(tmp_path):
 
 # --- real searches -------------------------------------------------------------------------------
 
-SMALL = ("env=gridworld_2x2", "agent=q_learning", "proxy.hidden_size=8", "es.population_size=4",
-         "training.max_steps=50")  # fmt: skip
+GRID = ("env=gridworld_2x2", "proxy.hidden_size=8", "es.population_size=4",
+        "training.max_steps=50")  # fmt: skip
+SMALL = (*GRID, "agent=q_learning")
 
 
 @pytest.mark.slow
-def test_trials_of_a_shape_share_one_program_and_its_numbers_are_those_of_a_run(tmp_path):
+@pytest.mark.parametrize(
+    ("agents", "number"),
+    [
+        ("agent=q_learning", "agent.learning_rate=0.5"),
+        ("agents=[q_learning,sarsa]", "agents.sarsa.learning_rate=0.5"),
+    ],
+)
+def test_trials_of_a_shape_share_one_program_and_its_numbers_are_those_of_a_run(
+    tmp_path, agents, number
+):
     from sejax.app import session
     from sejax.app.run_directory import open_for
     from sejax.search.programs import Programs
@@ -366,13 +376,15 @@ def test_trials_of_a_shape_share_one_program_and_its_numbers_are_those_of_a_run(
     programs = Programs()
 
     def rows(name, chunks_of, *words):
-        config = compose.config([*SMALL, "generations=3", f"run_dir={tmp_path / name}", *words])
+        config = compose.config(
+            [*GRID, agents, "generations=3", f"run_dir={tmp_path / name}", *words]
+        )
         with open_for(config) as directory:
             session.run(config, directory, chunks_of(config))
             return [{k: float(v) for k, v in row.items() if k != "wall_s"}
                     for row in directory.rows]  # fmt: skip
 
-    numbers = ("es.noise_std=0.2", "es.step_size=0.7", "agent.learning_rate=0.5")
+    numbers = ("es.noise_std=0.2", "es.step_size=0.7", number)
     other = rows("other", programs.chunks)
     shared = rows("shared", programs.chunks, *numbers)
     assert len(programs.shapes) == 1

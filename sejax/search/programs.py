@@ -18,7 +18,7 @@ from sejax.app import build
 from sejax.app.families import families_of
 from sejax.app.session import Chunks
 from sejax.bilevel import Program, make_program
-from sejax.families import Families
+from sejax.families import Families, FamiliesConfig
 from sejax.options import marks, traced_options
 from sejax.serialize import to_plain
 
@@ -65,7 +65,10 @@ def shape_of(config: build.LearnConfig, numbers: dict[str, Any]) -> str:
     if numbers["agents"]:
         learners = Families.of(config.parts()["agent"])
         plain["agent"] = [static_of(family.agent) for family in families_of(config)]
-        plain["agents"] = [learners.names, learners.weights, to_plain(learners.config)]
+        shared = {
+            f.name: getattr(learners.config, f.name) for f in dataclasses.fields(FamiliesConfig)
+        }
+        plain["agents"] = [learners.names, learners.weights, shared]
         plain["exploration"] = static_of(config.exploration)
     return json.dumps([plain, structure_of(numbers)], sort_keys=True, default=str)
 

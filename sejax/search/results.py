@@ -182,7 +182,7 @@ def print_table(study: optuna.Study, search: Search) -> None:
     shown = Table(title=f"{search.study}: the best {min(SHOWN, len(done))} of {len(done)} trials "
                   "that were not pruned")  # fmt: skip
     scores = ("mean", "worst") if search.config.seeds > 1 else ("mean",)
-    for column in ("trial", *scores, "generations", "training steps", "s"):
+    for column in ("trial", *scores, "genera-\ntions", "training\nsteps", "s"):
         shown.add_column(column, justify="right")
     shown.add_column("settings", no_wrap=True)
     for trial in done[:SHOWN]:
