@@ -23,7 +23,7 @@ optuna = pytest.importorskip("optuna", reason="needs Optuna: pip install 'sejax[
 
 from sejax.app import compose  # noqa: E402
 from sejax.errors import ConfigError  # noqa: E402
-from sejax.search import results, settings, study, trials  # noqa: E402
+from sejax.search import results, settings, spaces, study, trials  # noqa: E402
 from sejax.search.trials import Follower, Progress  # noqa: E402
 
 SPACE = "es.noise_std=interval(0.1, 0.9)"
@@ -122,15 +122,15 @@ def take(found):
         return found.ask()
 
 
+def age_heartbeats(found):
+    with found._storage._backend.engine.begin() as connection:
+        connection.exec_driver_sql("UPDATE trial_heartbeats SET heartbeat='2020-01-01 00:00:00'")
+
+
 def kill(found, number):
     """What is left of a worker that died long ago."""
-    storage = found._storage._backend
-    trial_id = found.trials[number]._trial_id
-    with storage.engine.begin() as connection:
-        storage.record_heartbeat(trial_id)
-        connection.exec_driver_sql(
-            f"UPDATE trial_heartbeats SET heartbeat='2020-01-01 00:00:00' WHERE trial_id={trial_id}"
-        )
+    found._storage.record_heartbeat(found.trials[number]._trial_id)
+    age_heartbeats(found)
 
 
 def test_a_trial_whose_worker_died_is_retried_and_goes_on_from_its_files(tmp_path):
@@ -186,20 +186,51 @@ def test_an_interrupted_trial_is_queued_again(tmp_path):
     assert runner.ran[0] == ("0002", 3)
 
 
-def test_a_worker_that_was_taken_for_dead_leaves_the_trial_to_others(tmp_path):
-    found, search = opened(tmp_path, "trials=2", "pruner=none", "max_generations=3")
+@pytest.mark.parametrize("moment", ["begins", "computes", "ends"])
+def test_a_worker_that_was_taken_for_dead_leaves_the_trial_to_others(tmp_path, monkeypatch, moment):
+    found, search = in_memory(tmp_path, "trials=2", "pruner=none", "max_generations=3")
+    said = []
+
+    def stopped():
+        """Stops for so long that another worker takes the first trial."""
+        (trial,) = found.trials
+        found._storage.set_trial_state_values(trial._trial_id, optuna.trial.TrialState.FAIL)
+        study.queue_again(found, trial)
 
     class Stopped(Runner):
         def meanwhile(self, name, generation):
-            if (name, generation) == ("0000", 2):  # another worker has seen no heartbeats
-                trial = found.trials[0]
-                found._storage.set_trial_state_values(trial._trial_id, optuna.trial.TrialState.FAIL)
-                study.queue_again(found, trial)
+            if moment == "computes" and (name, generation) == ("0000", 2):
+                stopped()
 
-    said = []
-    study.work(found, search, Stopped(search), said.append)
+    def suggest(self, trial):
+        if moment == "begins" and trial.number == 0:
+            stopped()
+        return own_suggest(self, trial)
+
+    def say(line):
+        said.append(line)
+        if moment == "ends" and line.startswith("trial 0") and "complete" in line:
+            stopped()
+
+    own_suggest = spaces.Dimension.suggest
+    monkeypatch.setattr(spaces.Dimension, "suggest", suggest)
+    study.work(found, search, Stopped(search), say)
     assert states(found) == ["FAIL", "COMPLETE", "COMPLETE"]
     assert any("taken for dead" in line for line in said)
+
+
+def test_a_trial_whose_worker_died_before_its_first_heartbeat_is_retried(tmp_path, monkeypatch):
+    found, search = opened(tmp_path, "trials=1", "pruner=none", "max_generations=3")
+    take(found)
+    naps = iter("ab")
+
+    def later(seconds):
+        next(naps)  # it waits once
+        age_heartbeats(found)
+
+    monkeypatch.setattr(study.time, "sleep", later)
+    study.work(found, search, Runner(search), lambda text: None)
+    assert states(found) == ["FAIL", "COMPLETE"]
 
 
 def test_settings_that_cannot_work_together_are_pruned_with_their_reason(tmp_path):
