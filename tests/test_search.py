@@ -219,8 +219,11 @@ def test_a_worker_that_was_taken_for_dead_leaves_the_trial_to_others(tmp_path, m
     assert any("taken for dead" in line for line in said)
 
 
-def test_a_trial_whose_worker_died_before_its_first_heartbeat_is_retried(tmp_path, monkeypatch):
+def test_a_trial_whose_worker_died_before_its_first_heartbeat_is_not_left_behind(
+    tmp_path, monkeypatch
+):
     found, search = opened(tmp_path, "trials=1", "pruner=none", "max_generations=3")
+    study.work(found, search, Runner(search), lambda text: None)
     take(found)
     naps = iter("ab")
 
@@ -230,7 +233,7 @@ def test_a_trial_whose_worker_died_before_its_first_heartbeat_is_retried(tmp_pat
 
     monkeypatch.setattr(study.time, "sleep", later)
     study.work(found, search, Runner(search), lambda text: None)
-    assert states(found) == ["FAIL", "COMPLETE"]
+    assert states(found) == ["COMPLETE", "FAIL", "COMPLETE"]
 
 
 def test_settings_that_cannot_work_together_are_pruned_with_their_reason(tmp_path):

@@ -81,11 +81,10 @@ def equally_good(trials: Sequence[FrozenTrial], search: Search) -> str:
     """A sentence on ranked trials that share the best score, and what may tell them apart."""
     sentence = f"{num_best(trials)} of {len(trials)} share the best score."
     if search.is_of_agent:
-        return (f"{sentence} Agents that train for less on the proxy may differ: "
-                f"training_from=config training.max_steps=500")  # fmt: skip
-    return sentence + (
-        "" if search.measure == "mean" else " To reward learning early: measure=mean"
-    )
+        return (f"{sentence} Agents that train for less on the proxy may differ: training_from="
+                f"config training.stop_rule=never training.max_steps=1000")  # fmt: skip
+    hint = " To reward learning early: measure=mean" if search.measure != "mean" else ""
+    return sentence + hint
 
 
 def importances(study: optuna.Study, search: Search) -> dict[str, float]:
@@ -182,13 +181,13 @@ def print_table(study: optuna.Study, search: Search) -> None:
     shown = Table(title=f"{search.study}: the best {min(SHOWN, len(done))} of {len(done)} trials "
                   "that were not pruned")  # fmt: skip
     scores = ("mean", "worst") if search.config.seeds > 1 else ("mean",)
-    for column in ("trial", *scores, "genera-\ntions", "training\nsteps", "s"):
+    for column in ("trial", *scores, "genera-\ntions", "training\nsteps"):
         shown.add_column(column, justify="right")
     shown.add_column("settings", no_wrap=True)
     for trial in done[:SHOWN]:
         kept = trial.user_attrs
         shown.add_row(str(trial.number), *(f"{kept[name]:.4g}" for name in scores),
-                      str(kept["generations"]), f"{kept['cost']:,}", f"{kept['seconds']:.0f}",
+                      str(kept["generations"]), f"{kept['cost']:,}",
                       "\n".join(f"{name}={x.shown(trial.params)}"
                                 for name, x in search.space.items()))  # fmt: skip
     console.print(shown)

@@ -79,7 +79,7 @@ def open_study(search: Search) -> tuple[optuna.Study, Search]:
 def work(
     study: optuna.Study, search: Search, runner: Runner, say: Callable[[str], None] = print
 ) -> None:
-    """Takes trials until as many as asked for have ended, also those that others left behind.
+    """Takes trials until as many as asked for have ended, and all that others left behind.
 
     With several workers a few more than `trials` may end, as each looks before it takes one.
 
@@ -94,7 +94,7 @@ def work(
             optuna.storages.fail_stale_trials(study)
         count = Counter(trial.state for trial in study.get_trials(deepcopy=False))
         ended = count[TrialState.COMPLETE] + count[TrialState.PRUNED]
-        if ended >= config.trials:
+        if ended >= config.trials and not count[TrialState.WAITING] + count[TrialState.RUNNING]:
             return
         if count[TrialState.WAITING] or ended + count[TrialState.RUNNING] < config.trials:
             waits = False
