@@ -130,7 +130,7 @@ def draw_pareto(rows: Any, search: Search, path: Path) -> None:
             axis.plot(some["cost"], some[score], "o", ms=5, mew=0, alpha=0.75, color=color,
                       label=f"{state} ({len(some)})")  # fmt: skip
         axis.step(front["cost"], front[score], where="post", color=POPULATION, lw=1.4,
-                  label="best for its cost, by number")  # fmt: skip
+                  label="best for its cost, with its number")  # fmt: skip
         for _, row in front.iterrows():
             axis.annotate(f"{row['trial']:.0f}", (row["cost"], row[score]), fontsize=8,
                           textcoords="offset points", xytext=(4, -10))  # fmt: skip
