@@ -58,6 +58,7 @@ def test_inverse_logarithms_are_drawn_in_the_distance_from_1():
     assert (kind, log) == ("float", True)
     assert math.isclose(low, 0.001) and math.isclose(high, 0.1)
     assert dimension.of({"1 - agent.discount": 0.05}) == "0.95"
+    assert dimension.shown({"1 - agent.discount": 0.0013249}) == "0.99868"
 
 
 def test_written_values_stay_within_their_bounds():
@@ -114,6 +115,18 @@ def test_what_is_fixed_or_has_a_space_of_its_own_is_left_out_of_the_preset():
     assert search.space["proxy.hidden_size"].high == 192
 
 
+def test_each_of_several_agents_has_the_ranges_of_its_own():
+    search = settings.read(["agents=[ddqn,ppo]", "space=agent", "agents.ppo.discount=0.9"])
+    assert search.fixed == ("agent=ddqn+ppo", "agents.ppo.discount=0.9")
+    assert {"agents.ddqn.learning_rate", "agents.ddqn.discount"} <= set(search.space)
+    assert "agents.ppo.clip_ratio" in search.space and "agents.ppo.discount" not in search.space
+    lows = [f"{name}={x.suggest(Trial())}" for name, x in search.space.items()]
+    config = compose.config([*search.fixed, *lows])
+    settings.require_fields(search, config)
+    ddqn, ppo = config.agents.families
+    assert (ddqn.agent.learning_rate, ppo.agent.clip_ratio) == (0.0001, 0.05)
+
+
 @pytest.mark.parametrize("name", spaces.names())
 def test_every_preset_names_fields_of_its_command_with_bounds_that_are_taken(name):
     agents = yaml.safe_load((spaces.FOLDER / f"{name}.yaml").read_text())["with_agent"]
@@ -133,6 +146,7 @@ def test_every_preset_names_fields_of_its_command_with_bounds_that_are_taken(nam
     [
         (["space=nothing"], r"space must be one of .*agent.*, or a YAML file; got nothing"),
         (["space=agent", "agent=boltzmann"], "agent must be one of ddqn.*got boltzmann"),
+        (["space=agent", "agents=[ddqn,boltzmann]"], "agent must be one of ddqn.*got boltzmann"),
         (["min_generations=9", "max_generations=3"], "max_generations must be at least"),
         (["pruner=asha"], "pruner must be one of"),
         (["es.noise_std=interval(1"], "must read name=value.*es.noise_std"),

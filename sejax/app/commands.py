@@ -15,7 +15,7 @@ from typing import NoReturn, TypeVar
 from hydra.errors import HydraException
 from omegaconf.errors import OmegaConfBaseException
 
-from sejax.app import compose, families, runtime
+from sejax.app import compose, runtime
 from sejax.errors import ConfigError
 
 BAD_INPUT, FAILED, INTERRUPTED = 2, 1, 130
@@ -55,7 +55,7 @@ def _prepared() -> list[str]:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")  # a terminal of few letters
-    sys.argv[1:] = families.in_one_choice([_quoted(word) for word in sys.argv[1:]])
+    sys.argv[1:] = compose.hydra_words([_quoted(word) for word in sys.argv[1:]])
     words = [word for word in sys.argv[1:] if not word.startswith("-")]
     if sys.path[0] != "":  # `python -m` has put the current folder there, if it still exists
         sys.path.insert(0, "")

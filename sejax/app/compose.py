@@ -23,6 +23,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from sejax import agents, envs, plugins, serialize
 from sejax.app import build, families, presets
+from sejax.app.words import ENDING, without_files
 from sejax.errors import ConfigError, nearest, require, shortened, unknown_name
 from sejax.training import TrainingConfig
 
@@ -100,7 +101,7 @@ def help_text(name: str, overrides: Sequence[str]) -> str:
         group: [*plugins.names(group), *(f"{start}ID" for start in plugins.GROUPS[group].families),
                 "module:attribute"]
         for group in groups
-    } | ({"preset": presets.names()} if name == "run" else {})  # fmt: skip
+    } | ({"preset": [*presets.names(), f"FILE{ENDING}"]} if name == "run" else {})  # fmt: skip
     listed = "\n".join(
         textwrap.fill(f"  {group}: {', '.join(names)}", 98, subsequent_indent="    ")
         for group, names in choices.items()
@@ -114,8 +115,17 @@ def help_text(name: str, overrides: Sequence[str]) -> str:
     )
 
 
+def hydra_words(words: Sequence[str]) -> list[str]:
+    """A command's words as Hydra is told them: preset files read, several agents in one choice.
+
+    Raises:
+      ConfigError: for a file or agents that cannot be.
+    """
+    return families.in_one_choice(without_files(words))
+
+
 def _compose(name: str, overrides: Sequence[str], **options: Any) -> DictConfig:
-    overrides = families.in_one_choice(overrides)
+    overrides = hydra_words(overrides)
     try:
         register(name, overrides)
         if GlobalHydra.instance().is_initialized():  # within a command: Hydra knows the folder
@@ -134,7 +144,7 @@ def register(name: str, overrides: Sequence[str]) -> None:
 
     Args:
       name: of the command: run or evaluate.
-      overrides: the words after it, with several agents in one choice (`families.in_one_choice`).
+      overrides: the words after it, as of `hydra_words`.
 
     Raises:
       ConfigError: for a choice that is none, or one of somebody's own that cannot be imported.

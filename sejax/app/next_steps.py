@@ -1,7 +1,6 @@
 """What can be done with a run: the commands that go on with it."""
 
 import json
-import re
 import shlex
 from collections.abc import Sequence
 from pathlib import Path
@@ -9,6 +8,7 @@ from typing import Any
 
 from sejax import plugins
 from sejax.app import build, compose
+from sejax.app.words import word
 from sejax.errors import ConfigError
 from sejax.serialize import flatten
 
@@ -111,15 +111,3 @@ def run_words(stored: dict[str, Any]) -> list[str] | None:
 
 def _command(module: str, words: Sequence[str]) -> str:
     return shlex.join(["python", "-m", module, *words])
-
-
-def word(value: Any) -> str:
-    """A value as Hydra's grammar reads it: text in quotes where it is more than a word."""
-    if isinstance(value, list):
-        return f"[{','.join(map(word, value))}]"
-    if value is None or isinstance(value, bool):
-        return {None: "null", True: "true", False: "false"}[value]
-    if not isinstance(value, str) or re.fullmatch(r"[\w./+-]+", value, re.ASCII):
-        return str(value)
-    escaped = value.replace("'", "\\'")
-    return f"'{escaped}'"

@@ -1,7 +1,9 @@
 """The one driver of a run: chunks of generations, each saved before the next one starts."""
 
+import copy
 import platform
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -51,16 +53,37 @@ class Chunks:
 
     Left to `jax.jit` a chunk would be compiled anew for the state's every placement on the devices:
     new, restored, or as the chunk before returned it.
+
+    Args:
+      program: what a run is told by; its generations are what is compiled, if there is no `make`.
+      make: `make(*arguments) -> Program`, traced, of a program whose numbers are arguments of what
+        is compiled.
+      arguments: pytrees with which `make` gives `program`.
+
+    Attributes:
+      cpu_s: CPU seconds of other processes than this one.
     """
 
-    def __init__(self, program: Program):
+    cpu_s = 0.0
+
+    def __init__(
+        self, program: Program, make: Callable[..., Program] | None = None,
+        arguments: tuple[Any, ...] = (),
+    ):  # fmt: skip
         self.program = program
-        self.cpu_s = 0.0  # of other processes than this one
+        self._make, self._arguments = make or (lambda: program), arguments
+        self._init = jax.jit(lambda keys, *arguments: self._make(*arguments).init(keys))
         self._compiled: dict[tuple[int, int], Any] = {}
+
+    def sharing(self, program: Program, arguments: tuple[Any, ...]) -> "Chunks":
+        """The chunks of a program of other arguments, by the same executables."""
+        chunks = copy.copy(self)
+        chunks.program, chunks._arguments = program, arguments
+        return chunks
 
     def init(self, keys: Any) -> Any:
         """The state before the first generation, for keys `[seed]`."""
-        return jax.jit(self.program.init)(keys)
+        return self._init(keys, *self._arguments)
 
     def is_ready(self, num_seeds: int, length: int) -> bool:
         """Whether such a chunk has been compiled."""
@@ -75,20 +98,19 @@ class Chunks:
         num_seeds = state.generation.shape[0]
         if not self.is_ready(num_seeds, length):
             self.compile(num_seeds, length)
-        return self._compiled[num_seeds, length](state)
+        return self._compiled[num_seeds, length](state, *self._arguments)
 
     def compile(self, num_seeds: int, length: int) -> None:
         """Compiles a chunk."""
 
-        def chunk(state: Any) -> Any:
-            return jax.lax.scan(
-                lambda state, _: self.program.generation(state), state, length=length
-            )
+        def chunk(state: Any, *arguments: Any) -> Any:
+            program = self._make(*arguments)
+            return jax.lax.scan(lambda state, _: program.generation(state), state, length=length)
 
         keys = jax.random.split(jax.random.key(0), num_seeds)
-        state = jax.eval_shape(self.program.init, keys)
+        state = jax.eval_shape(self._init, keys, *self._arguments)
         program = jax.jit(chunk, donate_argnums=0, compiler_options=compiler_options())
-        self._compiled[num_seeds, length] = program.lower(state).compile()
+        self._compiled[num_seeds, length] = program.lower(state, *self._arguments).compile()
 
 
 def make_chunks(config: build.LearnConfig) -> Chunks:

@@ -46,6 +46,7 @@ def main(words: Sequence[str]) -> None:
     if search.is_of_agent:
         best = _verified(found, search, runner)
     print(f"\nThe best:\n  {results.override_line(best, search, runner.command)}")
+    print(f"The same:\n  {results.preset_line(search, runner.command)}")
     print(f"{search.folder}/trials.csv, pareto.png, best.txt and preset.yaml hold what was found.")
 
 
@@ -64,7 +65,7 @@ def _verified(found: Any, search: Search, runner: Any) -> list[str]:
     from sejax.search import results, verification
 
     table = verification.verify(found, search, runner)
-    verification.print_table(table, found, search)
+    verification.print_table(table, search, runner.config([]).num_agents)
     best = found.get_trials(deepcopy=False)[int(table["trial"].iloc[0])]
     words = results.words_of(best, search)
     results.write_best(words, search, runner.command)

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from sejax.app import build, compose, session
-from sejax.app.next_steps import word
 from sejax.app.run_directory import RunDirectory, open_for
+from sejax.app.words import word
 from sejax.errors import ConfigError
 from sejax.search.programs import Programs
 from sejax.search.settings import Search

@@ -9,6 +9,7 @@ constants, up to rounding.
 import copy
 import dataclasses
 import json
+from functools import partial
 from typing import Any
 
 import jax
@@ -17,13 +18,13 @@ from sejax.app import build
 from sejax.app.families import families_of
 from sejax.app.session import Chunks
 from sejax.bilevel import Program, make_program
-from sejax.families import Families
+from sejax.families import Families, FamiliesConfig
 from sejax.options import marks, traced_options
-from sejax.parallel import compiler_options
 from sejax.serialize import to_plain
 
 # Fields of a run that shape no program; a chunk's length and seeds are counted by themselves.
-_FREE = ("preset", "seed", "num_seeds", "generations", "checkpoint_every", "run_dir", "tracker")
+_FREE = ("preset", "seed", "num_seeds", "generations", "checkpoint_every", "run_dir", "tracker",
+         "machines")  # fmt: skip
 KEPT = 16  # shapes whose programs stay in memory
 
 
@@ -31,21 +32,21 @@ class Programs:
     """Programs by their shape.
 
     Attributes:
-      shapes: those that were used last.
+      shapes: chunks of those that were used last, with the numbers of the first of their kind.
     """
 
     def __init__(self) -> None:
-        self.shapes: dict[str, Shape] = {}
+        self.shapes: dict[str, Chunks] = {}
 
     def chunks(self, config: build.LearnConfig) -> Chunks:
         """The chunks of a run, compiled if none of its shape was."""
-        numbers = numbers_of(config)
-        key = shape_of(config, numbers)
-        shape = self.shapes.pop(key, None) or Shape(config)
-        self.shapes[key] = shape  # the last used is the last to go
+        program, numbers = make_program(**config.parts()), numbers_of(config)
+        key, make = shape_of(config, numbers), partial(_with_numbers, config, program.num_dims)
+        chunks = self.shapes.pop(key, None) or Chunks(program, make, (numbers,))
+        self.shapes[key] = chunks  # the last used is the last to go
         if len(self.shapes) > KEPT:
             del self.shapes[next(iter(self.shapes))]
-        return SharedChunks(make_program(**config.parts()), shape, numbers)
+        return chunks.sharing(program, (numbers,))
 
 
 def numbers_of(config: build.LearnConfig) -> dict[str, Any]:
@@ -65,7 +66,10 @@ def shape_of(config: build.LearnConfig, numbers: dict[str, Any]) -> str:
     if numbers["agents"]:
         learners = Families.of(config.parts()["agent"])
         plain["agent"] = [static_of(family.agent) for family in families_of(config)]
-        plain["agents"] = [learners.names, learners.weights, to_plain(learners.config)]
+        shared = {
+            f.name: getattr(learners.config, f.name) for f in dataclasses.fields(FamiliesConfig)
+        }
+        plain["agents"] = [learners.names, learners.weights, shared]
         plain["exploration"] = static_of(config.exploration)
     return json.dumps([plain, structure_of(numbers)], sort_keys=True, default=str)
 
@@ -76,61 +80,20 @@ def structure_of(numbers: Any) -> list[Any]:
     return [str(structure), [type(leaf).__name__ for leaf in leaves]]
 
 
-class Shape:
-    """The programs of one shape, and what was compiled of them.
-
-    Attributes:
-      compiled: executables by what they are for.
-    """
-
-    def __init__(self, config: build.LearnConfig):
-        self._config = config
-        self._num_dims = make_program(**config.parts()).num_dims
-        self.compiled: dict[tuple[int, int], Any] = {}
-        self.init = jax.jit(lambda keys, numbers: self.program(numbers).init(keys))
-
-    def program(self, numbers: dict[str, Any]) -> Program:
-        """The program with these numbers, which may be traced."""
-        parts = self._config.parts()
-        if numbers["agents"]:
-            families = Families.of(parts["agent"])
-            learners = tuple(dataclasses.replace(agent, hparams=hparams) for agent, hparams in
-                             zip(families.agents, numbers["agents"], strict=True))  # fmt: skip
-            parts["agent"] = dataclasses.replace(families, agents=learners)
-        if numbers["es"]:
-            es = copy.copy(self._config.es)  # not checked again: a traced number is none
-            for name, number in numbers["es"].items():
-                object.__setattr__(es, name, number)
-            parts["es"] = es.make(self._num_dims)
-        return make_program(**parts)
-
-
-class SharedChunks(Chunks):
-    """A run's chunks, whose executables are those of its shape."""
-
-    def __init__(self, program: Program, shape: Shape, numbers: dict[str, Any]):
-        super().__init__(program)
-        self._shape, self._numbers = shape, numbers
-        self._compiled = shape.compiled
-
-    def init(self, keys: Any) -> Any:
-        return self._shape.init(keys, self._numbers)
-
-    def advance(self, state: Any, length: int) -> tuple[Any, Any]:
-        num_seeds = state.generation.shape[0]
-        if not self.is_ready(num_seeds, length):
-            self.compile(num_seeds, length)
-        return self._compiled[num_seeds, length](state, self._numbers)
-
-    def compile(self, num_seeds: int, length: int) -> None:
-        def chunk(state: Any, numbers: dict[str, Any]) -> Any:
-            program = self._shape.program(numbers)
-            return jax.lax.scan(lambda state, _: program.generation(state), state, length=length)
-
-        keys = jax.random.split(jax.random.key(0), num_seeds)
-        state = jax.eval_shape(self._shape.init, keys, self._numbers)
-        program = jax.jit(chunk, donate_argnums=0, compiler_options=compiler_options())
-        self._compiled[num_seeds, length] = program.lower(state, self._numbers).compile()
+def _with_numbers(config: build.LearnConfig, num_dims: int, numbers: dict[str, Any]) -> Program:
+    """The program of a configuration with other numbers, which may be traced."""
+    parts = config.parts()
+    if numbers["agents"]:
+        families = Families.of(parts["agent"])
+        learners = tuple(dataclasses.replace(agent, hparams=hparams) for agent, hparams in
+                         zip(families.agents, numbers["agents"], strict=True))  # fmt: skip
+        parts["agent"] = dataclasses.replace(families, agents=learners)
+    if numbers["es"]:
+        es = copy.copy(config.es)  # not checked again: a traced number is none
+        for name, number in numbers["es"].items():
+            object.__setattr__(es, name, number)
+        parts["es"] = es.make(num_dims)
+    return make_program(**parts)
 
 
 def static_of(config: Any) -> dict[str, Any]:

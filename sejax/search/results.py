@@ -7,15 +7,15 @@ from pathlib import Path
 from typing import Any
 
 import optuna
-import yaml
 from optuna.trial import FrozenTrial, TrialState
 
-from sejax.app import presets
+from sejax.app.words import file_text, word
 from sejax.files import atomic_path, write_text
 from sejax.search.settings import Search
 
 SHOWN = 10
 NEEDED = 10  # completed trials, before importances say anything
+HOW = ("seed", "devices", "lanes", "tracker")  # fields of how trials ran, which are no settings
 ENDED = (TrialState.COMPLETE, TrialState.PRUNED)
 
 
@@ -25,14 +25,29 @@ def ranked(study: optuna.Study) -> list[FrozenTrial]:
     return sorted(done, key=lambda trial: (-float(trial.value or 0.0), trial.user_attrs["cost"]))
 
 
+def num_best(trials: Sequence[FrozenTrial]) -> int:
+    """How many of ranked trials are as good as the best."""
+    return sum(trial.value == trials[0].value for trial in trials)
+
+
 def words_of(trial: FrozenTrial, search: Search) -> list[str]:
     """The overrides that make the trial's settings."""
     return [f"{name}={x.of(trial.params)}" for name, x in search.space.items()]
 
 
+def preset_file(search: Search) -> Path:
+    """Where the best settings are, for `preset=`."""
+    return search.folder / "preset.yaml"
+
+
 def override_line(words: Sequence[str], search: Search, command: str) -> str:
     """The command that runs with these settings."""
     return shlex.join(["python", "-m", command, *search.fixed, *words])
+
+
+def preset_line(search: Search, command: str) -> str:
+    """The command that reads these settings from their file."""
+    return shlex.join(["python", "-m", command, f"preset={word(str(preset_file(search)))}"])
 
 
 def table(study: optuna.Study, search: Search) -> Any:
@@ -62,16 +77,26 @@ def saved_by_pruning(rows: Any, search: Search) -> str:
             f"{all_of_them:,} generations ({saved / max(all_of_them, 1):.0%}).")  # fmt: skip
 
 
+def equally_good(trials: Sequence[FrozenTrial], search: Search) -> str:
+    """A sentence on ranked trials that share the best score, and what may tell them apart."""
+    sentence = f"{num_best(trials)} of {len(trials)} share the best score."
+    if search.is_of_agent:
+        return (f"{sentence} Agents that train for less on the proxy may differ: training_from="
+                f"config training.stop_rule=never training.max_steps=1000")  # fmt: skip
+    hint = " To reward learning early: measure=mean" if search.measure != "mean" else ""
+    return sentence + hint
+
+
 def importances(study: optuna.Study, search: Search) -> dict[str, float]:
     """The share of each field in what makes scores differ, the largest first; by PED-ANOVA.
 
-    Empty where fewer than ten trials are complete, or fewer than two fields searched. Pruned trials
-    are left out, so that it is about the better settings.
+    Empty where fewer than ten trials are complete, half of them equally good, or fewer than two
+    fields searched. Pruned trials are left out, so that it is about the better settings.
 
     Source: Watanabe et al., 2023, "PED-ANOVA" (Optuna's default).
     """
-    done = [t for t in study.get_trials(deepcopy=False) if t.state == TrialState.COMPLETE]
-    if len(done) < NEEDED or len(search.space) < 2:
+    done = ranked(study)
+    if len(done) < NEEDED or 2 * num_best(done) >= len(done) or len(search.space) < 2:
         return {}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # fields that all good trials have alike
@@ -105,7 +130,7 @@ def draw_pareto(rows: Any, search: Search, path: Path) -> None:
             axis.plot(some["cost"], some[score], "o", ms=5, mew=0, alpha=0.75, color=color,
                       label=f"{state} ({len(some)})")  # fmt: skip
         axis.step(front["cost"], front[score], where="post", color=POPULATION, lw=1.4,
-                  label="best for its cost")  # fmt: skip
+                  label="best for its cost, with its number")  # fmt: skip
         for _, row in front.iterrows():
             axis.annotate(f"{row['trial']:.0f}", (row["cost"], row[score]), fontsize=8,
                           textcoords="offset points", xytext=(4, -10))  # fmt: skip
@@ -113,34 +138,10 @@ def draw_pareto(rows: Any, search: Search, path: Path) -> None:
         axis.set_xlabel("training steps of all agents of the trial")
         many = f", {score} of {search.config.seeds} seeds" if search.config.seeds > 1 else ""
         axis.set_ylabel(f"score ({search.measure} of generations{many})")
-        axis.legend(frameon=False, fontsize=9)
+        axis.legend(frameon=False, fontsize=9, loc="best")
         with atomic_path(path) as temporary:
             figure.savefig(temporary, dpi=150)
         plt.close(figure)
-
-
-def preset_text(words: Sequence[str], search: Search) -> str:
-    """The settings as a section of a file `conf/presets/<env>-<proxy>.yaml`.
-
-    What belongs to an agent, a strategy or an objective is under `with_agent` and so on.
-    """
-    choices = {"agent": search.choice("agent", "ddqn"), "es": search.choice("es", "nes"),
-               "objective": search.choice("objective", "max_reward")}  # fmt: skip
-    preset, env = search.choice("preset", "best"), search.choice("env", "cartpole")
-    tuned = presets.is_tuned(env, search.choice("proxy", "se"))
-    section: dict[str, Any] = {"like": preset if tuned else presets.GENERAL}
-    for word in [*search.fixed, *words]:
-        name, _, value = word.lstrip("+").partition("=")
-        group, _, field = name.partition(".")
-        if not field and name not in ("agent_hparams", "stop_when_solved"):
-            continue  # a choice, which is no setting, or how the trials were run
-        place = section
-        if group in choices:
-            place = place.setdefault(f"with_{group}", {}).setdefault(choices[group], {})
-        if field:
-            place = place.setdefault(group, {})
-        place[field or name] = yaml.safe_load(value)
-    return yaml.safe_dump({"searched": section}, sort_keys=False)
 
 
 def write(study: optuna.Study, search: Search, command: str) -> list[str]:
@@ -167,7 +168,8 @@ def write_best(words: Sequence[str], search: Search, command: str) -> None:
     """Writes the settings as a command and as a preset."""
     line = override_line(words, search, command)
     write_text(search.folder / "best.txt", line + "\n")
-    write_text(search.folder / "preset.yaml", f"# {line}\n{preset_text(words, search)}")
+    settings = [word for word in [*search.fixed, *words] if word.partition("=")[0] not in HOW]
+    write_text(preset_file(search), f"# {line}\n{file_text(settings)}")
 
 
 def print_table(study: optuna.Study, search: Search) -> None:
@@ -179,15 +181,18 @@ def print_table(study: optuna.Study, search: Search) -> None:
     shown = Table(title=f"{search.study}: the best {min(SHOWN, len(done))} of {len(done)} trials "
                   "that were not pruned")  # fmt: skip
     scores = ("mean", "worst") if search.config.seeds > 1 else ("mean",)
-    for column in ("trial", *scores, "generations", "training steps", "s"):
-        shown.add_column(column, justify="right", no_wrap=column != "training steps")
-    shown.add_column("settings", overflow="fold")
+    for column in ("trial", *scores, "genera-\ntions", "training\nsteps"):
+        shown.add_column(column, justify="right")
+    shown.add_column("settings", no_wrap=True)
     for trial in done[:SHOWN]:
         kept = trial.user_attrs
         shown.add_row(str(trial.number), *(f"{kept[name]:.4g}" for name in scores),
-                      str(kept["generations"]), f"{kept['cost']:,}", f"{kept['seconds']:.0f}",
-                      "\n".join(words_of(trial, search)))  # fmt: skip
+                      str(kept["generations"]), f"{kept['cost']:,}",
+                      "\n".join(f"{name}={x.shown(trial.params)}"
+                                for name, x in search.space.items()))  # fmt: skip
     console.print(shown)
+    if done and num_best(done) > 1:
+        console.print(equally_good(done, search), soft_wrap=True)
     rows = table(study, search)
     if len(rows):
         console.print(saved_by_pruning(rows, search))

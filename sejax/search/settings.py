@@ -13,7 +13,7 @@ from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException
 
 from sejax import plugins, serialize
-from sejax.app import build
+from sejax.app import build, compose
 from sejax.errors import ConfigError, nearest, require
 from sejax.options import Options, counts, one_of, option, positive
 from sejax.search import spaces
@@ -158,14 +158,15 @@ def read(words: Sequence[str]) -> Search:
     """A search from the words of its command line.
 
     Words that name a field of `SearchConfig` set it; sweeps in Hydra's syntax are searched; the
-    rest stays fixed. A field that is fixed, or has a space of its own, is left out of `space=`.
+    rest stays fixed, those of a preset file too. A field that is fixed, or has a space of its own,
+    is left out of `space=`.
 
     Raises:
       ConfigError: for a bad value, a word that cannot be read, or a space that cannot be searched.
     """
     own = {field.name for field in dataclasses.fields(SearchConfig)}
     values, fixed, swept = {}, [], {}
-    for word in words:
+    for word in compose.hydra_words(words):
         name, equals, text = word.partition("=")
         if equals and name in own:
             values[name] = text if name == "storage" and text != "null" else _plain(text)

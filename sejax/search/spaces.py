@@ -17,11 +17,13 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import ChoiceSweep, IntervalSweep, QuotedString, RangeSweep
 from hydra.errors import HydraException
 
-from sejax.app.next_steps import word
+from sejax.app import families
+from sejax.app.words import word
 from sejax.errors import ConfigError, nearest, require, shortened
 
 FOLDER = Path(__file__).parents[1] / "conf" / "spaces"
 DIGITS = 6  # of a float: what the override line says is what was tried
+SHOWN_DIGITS = 3
 EXAMPLE = "tag(log, interval(0.01, 0.3))"
 
 
@@ -73,6 +75,14 @@ class Dimension:
         if self.inverse:
             return self._written(1 - value)
         return self._written(value) if isinstance(value, float) else str(value)
+
+    def shown(self, params: Mapping[str, Any]) -> str:
+        """The value as tables have it: three digits, of the distance from 1 where that is drawn."""
+        value = params[self.parameter]
+        if not isinstance(value, float):
+            return self.of(params)
+        rounded = float(f"{value:.{SHOWN_DIGITS}g}")
+        return f"{1 - rounded if self.inverse else rounded:.12g}"
 
     def _written(self, value: float) -> str:
         """Within the bounds, which rounding may leave."""
@@ -147,7 +157,7 @@ def preset(name: str, agent: str, of_agent: bool) -> dict[str, Dimension]:
 
     Args:
       name: of the preset, or a path that ends in .yaml.
-      agent: the chosen agent.
+      agent: the chosen agent; of several each has the ranges of its own (`ddqn+ppo`).
       of_agent: whether agents are tuned on a proxy, so that the agent's own fields alone count.
 
     Raises:
@@ -166,9 +176,18 @@ def preset(name: str, agent: str, of_agent: bool) -> dict[str, Dimension]:
     require(isinstance(content, dict), "space", "map fields to sweeps", "they are searched",
             f"{path} with a {type(content).__name__}", "space=paper_se")  # fmt: skip
     of_agents = content.pop("with_agent", {})
-    require(content or agent in of_agents, "agent", f"be one of {', '.join(of_agents)} with "
-            f"space={name}", "it has no ranges for others", agent,
-            f"agent={next(iter(of_agents), 'ddqn')}")  # fmt: skip
-    content |= of_agents.get(agent, {})
+    has_others, are_several = bool(content), families.JOINT in agent
+    for each in families.members(agent):
+        require(has_others or each in of_agents, "agent", f"be one of {', '.join(of_agents)} with "
+                f"space={name}", "it has no ranges for others", each,
+                f"agent={next(iter(of_agents), 'ddqn')}")  # fmt: skip
+        ranges = of_agents.get(each, {})
+        content |= _of_family(families.key_of(each), ranges) if are_several else ranges
     chosen = {k: v for k, v in content.items() if not of_agent or k.startswith("agent.")}
     return {field: parse(field, str(text)) for field, text in chosen.items()}
+
+
+def _of_family(key: str, ranges: Mapping[str, Any]) -> dict[str, Any]:
+    """An agent's own ranges where it is one of several; what all share has no place in them."""
+    return {f"agents.{key}.{field.removeprefix('agent.')}": text
+            for field, text in ranges.items() if field.startswith("agent.")}  # fmt: skip

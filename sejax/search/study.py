@@ -79,7 +79,7 @@ def open_study(search: Search) -> tuple[optuna.Study, Search]:
 def work(
     study: optuna.Study, search: Search, runner: Runner, say: Callable[[str], None] = print
 ) -> None:
-    """Takes trials until as many as asked for have ended, also those that others left behind.
+    """Takes trials until as many as asked for have ended, and all that others left behind.
 
     With several workers a few more than `trials` may end, as each looks before it takes one.
 
@@ -94,7 +94,7 @@ def work(
             optuna.storages.fail_stale_trials(study)
         count = Counter(trial.state for trial in study.get_trials(deepcopy=False))
         ended = count[TrialState.COMPLETE] + count[TrialState.PRUNED]
-        if ended >= config.trials:
+        if ended >= config.trials and not count[TrialState.WAITING] + count[TrialState.RUNNING]:
             return
         if count[TrialState.WAITING] or ended + count[TrialState.RUNNING] < config.trials:
             waits = False
@@ -103,31 +103,49 @@ def work(
             if not waits:
                 say(f"Waiting for {count[TrialState.RUNNING]} trials of other workers, or for "
                     f"their heartbeats to end ({GRACE * config.heartbeat} s).")  # fmt: skip
+                _begin_heartbeats(study)
             waits = True
             time.sleep(min(1.0, config.heartbeat))
 
 
+def _begin_heartbeats(study: optuna.Study) -> None:
+    """Records a heartbeat of each running trial, as a worker that died before its first had none.
+
+    Optuna would take such a trial for one that goes on for ever. A worker that lives records later
+    ones.
+    """
+    if optuna.storages._heartbeat.is_heartbeat_enabled(study._storage):
+        for trial in study.get_trials(deepcopy=False, states=(TrialState.RUNNING,)):
+            study._storage.record_heartbeat(trial._trial_id)
+
+
 class Objective:
-    """What Optuna calls for a trial."""
+    """What Optuna calls for a trial.
+
+    Attributes:
+      trial: the last one.
+      is_done: whether all of it is computed, or it was found to be another worker's.
+    """
 
     def __init__(self, search: Search, runner: Runner, say: Callable[[str], None]):
-        self._search, self._runner, self._say = search, runner, say
+        self._search, self._runner, self.say = search, runner, say
         self.trial: Any = None
-        self.is_lost = False
+        self.is_done = False
 
     def __call__(self, trial: optuna.Trial) -> float:
-        self.trial, self.is_lost = trial, False
-        words = [f"{name}={x.suggest(trial)}" for name, x in self._search.space.items()]
+        self.trial = trial
         try:
+            words = [f"{name}={x.suggest(trial)}" for name, x in self._search.space.items()]
             score = self._run(trial, words)
         except optuna.TrialPruned:
             self._tell("pruned", words)
+            self.is_done = True
             raise
         except (Lost, optuna.exceptions.UpdateFinishedTrialError):
-            self.is_lost = True
-            self._say(f"trial {trial.number}: was taken for dead and is another worker's now")
+            self.is_done = True
             raise
         self._tell("complete", words)
+        self.is_done = True
         return score
 
     def _run(self, trial: optuna.Trial, words: list[str]) -> float:
@@ -146,12 +164,12 @@ class Objective:
     def _tell(self, how: str, words: list[str]) -> None:
         kept = self.trial.user_attrs
         if "refused" in kept:
-            self._say(f"trial {self.trial.number}: refused: {kept['refused']}")
+            self.say(f"trial {self.trial.number}: refused: {kept['refused']}")
             return
         config = self._search.config
         score = kept.get(config.score)
         worth = "not finite" if score is None else f"{score:.4g}"
-        self._say(f"trial {self.trial.number}: {worth}, {how} at generation "
+        self.say(f"trial {self.trial.number}: {worth}, {how} at generation "
                   f"{kept['generations']}/{config.max_generations}: {' '.join(words)}")  # fmt: skip
 
 
@@ -159,7 +177,7 @@ def trial_folder(search: Search, number: int) -> Path:
     return search.folder / "trials" / f"{number:04d}"
 
 
-def queue_again(study: optuna.Study, trial: optuna.trial.FrozenTrial) -> None:
+def queue_again(study: optuna.Study, trial: optuna.Trial | optuna.trial.FrozenTrial) -> None:
     """Queues a trial that its worker did not end, under a new number and with the same settings.
 
     What Hyperband noted of it stays behind: the new number is of another bracket, and the trial's
@@ -177,16 +195,25 @@ def queue_again(study: optuna.Study, trial: optuna.trial.FrozenTrial) -> None:
 
 
 def _run_one(study: optuna.Study, objective: Objective) -> None:
+    objective.trial, objective.is_done = None, False
     with _unchanged():
         try:
             study.optimize(objective, n_trials=1)
         except KeyboardInterrupt:
-            (interrupted,) = [x for x in study.get_trials() if x.number == objective.trial.number]
-            queue_again(study, interrupted)
+            if _has_failed(study, objective.trial):
+                queue_again(study, objective.trial)
             raise
-        except (Lost, ValueError, optuna.exceptions.UpdateFinishedTrialError):
-            if not objective.is_lost:  # then Optuna refuses to end what another has ended
+        except Exception:  # of several kinds, where Optuna cannot end what another has ended
+            if not (objective.is_done and _has_failed(study, objective.trial)):
                 raise
+            objective.say(f"trial {objective.trial.number}: was taken for dead and is another "
+                          f"worker's now")  # fmt: skip
+
+
+def _has_failed(study: optuna.Study, trial: optuna.Trial | None) -> bool:
+    """Whether a trial, if there is one, counts as failed by now."""
+    failed = study.get_trials(deepcopy=False, states=(TrialState.FAIL,))
+    return trial is not None and trial.number in [each.number for each in failed]
 
 
 def _storage(search: Search) -> optuna.storages.RDBStorage:

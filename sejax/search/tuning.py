@@ -16,7 +16,7 @@ import numpy as np
 
 from sejax import serialize
 from sejax.app import build, compose
-from sejax.app.next_steps import word
+from sejax.app.words import word
 from sejax.errors import ConfigError, require
 from sejax.files import write_text
 from sejax.search.programs import static_of, structure_of
@@ -87,6 +87,12 @@ class Tuning:
         seed = jax.random.fold_in(jax.random.key(config.seed), generation)
         keys = jax.random.split(seed, num_agents)
         return jax.device_get(self._compiled[key](keys, agent.hparams))
+
+    def solved_reward(self, config: build.EvaluateConfig) -> float:
+        """The return at which the real task counts as solved; inf if nobody says."""
+        from sejax.evaluate import proxy_study
+
+        return float(proxy_study(config).task.solved_reward)
 
     def verify(self, config: build.EvaluateConfig) -> dict[str, float]:
         """Returns and steps of agents trained with these settings, on the proxy and the real task.
