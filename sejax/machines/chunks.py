@@ -29,9 +29,10 @@ class RemoteChunks:
         self.program = program
         self.cpu_s = 0.0  # of the workers, for trainings that counted
         self._hand_out, self._ledger = hand_out, ledger
-        # One program asks and tells, and runs twice in a generation: XLA fuses what is told with what
-        # was asked, so that two programs would round candidates otherwise than `Program.generation`.
+        # One program asks and tells, and runs twice in a generation: XLA fuses what is told with
+        # what was asked, so that two would round candidates otherwise than `Program.generation`.
         self._compiled: dict[int, Any] = {}
+        self._shapes: dict[int, Outcome] = {}  # of a generation's outcome, by the number of seeds
 
     def __enter__(self) -> "RemoteChunks":
         return self
@@ -66,7 +67,8 @@ class RemoteChunks:
             return program.tell(state, asked, outcome), trials
 
         keys = jax.random.split(jax.random.key(0), num_seeds)
-        shapes = jax.eval_shape(program.init, keys), self._outcome_shapes(num_seeds)
+        self._shapes[num_seeds] = self._outcome_shapes(num_seeds)
+        shapes = jax.eval_shape(program.init, keys), self._shapes[num_seeds]
         jitted = jax.jit(generation, compiler_options=compiler_options())
         self._compiled[num_seeds] = jitted.lower(*shapes).compile()
         self._hand_out.get_ready()
@@ -94,7 +96,7 @@ class RemoteChunks:
 
     def _outcome(self, num_seeds: int, state: Any) -> Outcome:
         """What comes of a generation's trials, leaves `[seed, trials, ...]`."""
-        shapes = self._outcome_shapes(num_seeds)
+        shapes = self._shapes[num_seeds]
         nothing = jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), shapes)
         _, trials = self._compiled[num_seeds](state, nothing)
         keys, candidates, test_steps = jax.device_get(trials)
@@ -128,9 +130,10 @@ class RemoteChunks:
         for share, outcome in outcomes:
             for name, x in outcome.items():
                 merged[name][share.places] = x
-        return Outcome(**{
+        leaves: dict[str, Any] = {
             name: x.reshape(num_seeds, num_trials, *x.shape[1:]) for name, x in merged.items()
-        })  # fmt: skip
+        }
+        return Outcome(**leaves)
 
     def _outcome_shapes(self, num_seeds: int) -> Outcome:
         """Shapes and types of a generation's outcome."""
