@@ -10,21 +10,23 @@ import time
 import warnings
 from collections.abc import Callable, Hashable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import ray
 
 from sejax.errors import ConfigError, told
 from sejax.machines import scorer
 from sejax.machines.chunks import CAPACITY, RemoteChunks
-from sejax.machines.configs import RayConfig
 from sejax.machines.handout import HandOut
 from sejax.machines.ledger import Ledger
+
+if TYPE_CHECKING:
+    from sejax.machines.configs import RayConfig
 
 
 @contextlib.contextmanager
 def chunks_of(
-    machines: RayConfig, config: Any, folder: Path, say: Callable[[str], None]
+    machines: "RayConfig", config: Any, folder: Path, say: Callable[[str], None]
 ) -> Iterator[RemoteChunks]:
     """Generations of a run on a Ray cluster, which is left at the end.
 
@@ -72,7 +74,7 @@ def connected() -> Iterator[None]:
         ray.shutdown()
 
 
-def require_workers(machines: RayConfig) -> int:
+def require_workers(machines: "RayConfig") -> int:
     """The number of workers that a run has now.
 
     Raises:
@@ -90,7 +92,7 @@ def require_workers(machines: RayConfig) -> int:
 
 
 def shares_of(
-    config: Any, program: Any, machines: RayConfig, num_workers: int
+    config: Any, program: Any, machines: "RayConfig", num_workers: int
 ) -> tuple[tuple[int, ...], tuple[bool, ...]]:
     """Most trials in a share, and whether it takes as long with fewer, of each family.
 
@@ -111,7 +113,7 @@ def shares_of(
 class RayCrew:
     """The workers of one run."""
 
-    def __init__(self, machines: RayConfig, config: dict[str, Any], capacities: tuple[int, ...]):
+    def __init__(self, machines: "RayConfig", config: dict[str, Any], capacities: tuple[int, ...]):
         """Of a run's plain configuration, and most trials in a share by family."""
         self._machines = machines
         self._arguments = (config, capacities, scorer.versions())
@@ -167,7 +169,7 @@ def _came(reference: Any) -> Any:
         return error
 
 
-def _room(machines: RayConfig, resources: dict[str, float]) -> int:
+def _room(machines: "RayConfig", resources: dict[str, float]) -> int:
     """Workers that the machines of a cluster have room for."""
     room = resources.get("CPU", 0.0)
     if machines.gpus_per_worker:

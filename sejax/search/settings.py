@@ -1,6 +1,7 @@
 """The words of a search: its own fields, what it searches, and what stays fixed."""
 
 import dataclasses
+import functools
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -98,6 +99,13 @@ class Search:
         chosen = [w.partition("=")[2] for w in self.fixed if w.startswith(f"{group}=")]
         return chosen[-1] if chosen else default
 
+    @functools.cached_property
+    def agent(self) -> str:
+        """The name of the agent: what is said, or what the task and the proxy choose."""
+        said = self.choice("agent", "ddqn" if self.is_of_agent else "")
+        choices = [word for word in self.fixed if "." not in word.partition("=")[0]]
+        return said or compose.config(choices).name("agent")
+
     @property
     def study(self) -> str:
         """The study's name."""
@@ -148,10 +156,8 @@ class Search:
     def _default_name(self) -> str:
         if self.is_of_agent:
             proxy = Path(self.choice("proxy", "")).name
-            return f"{self.choice('agent', 'ddqn')}-on-{proxy.removesuffix('.safetensors')}"
-        names = [self.choice(group, default) for group, default in
-                 (("env", "cartpole"), ("proxy", "se"), ("agent", "ddqn"))]  # fmt: skip
-        return "-".join(names)
+            return f"{self.agent}-on-{proxy.removesuffix('.safetensors')}"
+        return "-".join([self.choice("env", "cartpole"), self.choice("proxy", "se"), self.agent])
 
 
 def read(words: Sequence[str]) -> Search:
@@ -182,7 +188,7 @@ def read(words: Sequence[str]) -> Search:
     search = Search(config=config, fixed=tuple(fixed), space=swept)
     if config.space is None:
         return search
-    preset = spaces.preset(config.space, search.choice("agent", "ddqn"), search.is_of_agent)
+    preset = spaces.preset(config.space, search.agent, search.is_of_agent)
     given = {word.partition("=")[0] for word in fixed} | set(swept)
     offered = {name: x for name, x in preset.items() if name not in given}
     return dataclasses.replace(search, space={**offered, **swept})
