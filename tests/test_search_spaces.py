@@ -115,6 +115,20 @@ def test_what_is_fixed_or_has_a_space_of_its_own_is_left_out_of_the_preset():
     assert search.space["proxy.hidden_size"].high == 192
 
 
+def test_a_preset_has_the_ranges_of_the_agent_that_the_task_chooses():
+    search = settings.read(["env=cliff_walking", "proxy=rn", "space=paper_rn"])
+    assert search.study == "cliff_walking-rn-q_learning"
+    assert "agent.epsilon_decay" in search.space and "agent.batch_size" not in search.space
+
+
+def test_machines_are_where_trials_are_made_and_no_setting():
+    search = settings.read(["env=acrobot", "machines=local", "es.noise_std=0.1,0.2"])
+    assert search.fixed == ("env=acrobot",) and not search.machines.is_elsewhere
+    assert "machines" not in search.stored()["fixed"]
+    with pytest.raises(ConfigError, match="machines"):
+        settings.read(["machines=slurm", "es.noise_std=0.1,0.2"])
+
+
 def test_each_of_several_agents_has_the_ranges_of_its_own():
     search = settings.read(["agents=[ddqn,ppo]", "space=agent", "agents.ppo.discount=0.9"])
     assert search.fixed == ("agent=ddqn+ppo", "agents.ppo.discount=0.9")
@@ -168,7 +182,9 @@ def test_a_field_that_does_not_exist_is_not_searched():
 
 def test_stored_searches_read_back():
     search = settings.read(["env=acrobot", "space=paper_se", "seeds=3", "trials=5"])
-    joined = settings.Search.from_stored(search.stored(), settings.SearchConfig(trials=9))
+    joined = settings.Search.from_stored(
+        search.stored(), settings.SearchConfig(trials=9), search.machines
+    )
     assert joined.stored() == search.stored()
     assert (joined.config.seeds, joined.config.trials) == (3, 9)
 

@@ -88,7 +88,7 @@ def require_workers(machines: "RayConfig") -> int:
             f"on a cluster with {resources.get('GPU', 0):g} GPUs. Set machines.gpus_per_worker=0, "
             f"or machines.workers=N if they will come."
         )
-    return machines.workers or _room(machines, resources) or 1
+    return num_workers(machines) or 1
 
 
 def shares_of(
@@ -125,7 +125,7 @@ class RayCrew:
         self._num_started = 0
 
     def recruit(self) -> list[Hashable]:
-        wanted = self._machines.workers or _room(self._machines, ray.cluster_resources())
+        wanted = num_workers(self._machines)
         new: list[Hashable] = []
         while len(self._actors) < wanted:
             self._num_started += 1
@@ -147,7 +147,7 @@ class RayCrew:
         ready, _ = ray.wait(references, num_returns=1, timeout=timeout_s)
         if ready and len(references) > 1:
             ready, _ = ray.wait(references, num_returns=len(references), timeout=0)
-        return [(self._pending.pop(each), _came(each)) for each in ready]
+        return [(self._pending.pop(each), result_of(each)) for each in ready]
 
     def dismiss(self, worker: Hashable) -> None:
         actor = self._actors.pop(worker, None)
@@ -156,7 +156,7 @@ class RayCrew:
             ray.kill(actor)
 
 
-def _came(reference: Any) -> Any:
+def result_of(reference: Any) -> Any:
     """What a worker returned, or the exception by which it failed or was lost."""
     try:
         return ray.get(reference)
@@ -169,8 +169,11 @@ def _came(reference: Any) -> Any:
         return error
 
 
-def _room(machines: "RayConfig", resources: dict[str, float]) -> int:
-    """Workers that the machines of a cluster have room for."""
+def num_workers(machines: "RayConfig") -> int:
+    """Workers that are asked for, or that the cluster's machines have room for now."""
+    if machines.workers:
+        return machines.workers
+    resources = ray.cluster_resources()
     room = resources.get("CPU", 0.0)
     if machines.gpus_per_worker:
         room = min(room, resources.get("GPU", 0.0) / machines.gpus_per_worker)

@@ -27,13 +27,18 @@ def main(words: Sequence[str]) -> None:
     from sejax.search import results, study
 
     if not search.names_study_alone:  # before a study is made of it
-        settings.require_fields(search, _runner(search).config([]))
+        settings.require_fields(search, runner_of(search).config([]))
     found, search = study.open_study(search)
-    runner = _runner(search)
+    runner = runner_of(search)
     runtime.enable_compilation_cache()
     print(f"Study {search.study} in {search.folder}: {', '.join(search.space)}.", flush=True)
     try:
-        study.work(found, search, runner, lambda text: print(text, flush=True))
+        if search.machines.is_elsewhere:
+            from sejax.search import cluster
+
+            cluster.work(found, search, _say)
+        else:
+            study.work(found, search, runner, _say)
     except KeyboardInterrupt:
         print(f"Interrupted. What has ended is saved in {search.folder}, and the trial at hand is "
               f"queued again; the same command goes on from there.")  # fmt: skip
@@ -50,7 +55,11 @@ def main(words: Sequence[str]) -> None:
     print(f"{search.folder}/trials.csv, pareto.png, best.txt and preset.yaml hold what was found.")
 
 
-def _runner(search: Search) -> "Runner":
+def _say(text: str) -> None:
+    print(text, flush=True)
+
+
+def runner_of(search: Search) -> "Runner":
     if search.is_of_agent:
         from sejax.search.tuning import Tuning
 

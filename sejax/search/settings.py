@@ -78,11 +78,13 @@ class Search:
       config: the search's own fields.
       fixed: words for all trials.
       space: dimensions by the field's name.
+      machines: where this process has trials made: a plugin's configuration.
     """
 
     config: SearchConfig
     fixed: tuple[str, ...]
     space: dict[str, spaces.Dimension]
+    machines: Any
 
     @property
     def is_of_agent(self) -> bool:
@@ -132,7 +134,7 @@ class Search:
         }
 
     @classmethod
-    def from_stored(cls, stored: dict[str, Any], config: SearchConfig) -> "Search":
+    def from_stored(cls, stored: dict[str, Any], config: SearchConfig, machines: Any) -> "Search":
         """Inverse of `stored`, with the free fields of a worker's own configuration.
 
         Its folder is that of the study's maker, if that is there and no other is asked for.
@@ -142,6 +144,7 @@ class Search:
         return cls(
             config=dataclasses.replace(config, **stored["search"], search_dir=search_dir),
             fixed=tuple(stored["fixed"]),
+            machines=machines,
             space={name: spaces.parse(name, text) for name, text in stored["space"].items()},
         )
 
@@ -172,10 +175,14 @@ def read(words: Sequence[str]) -> Search:
     """
     own = {field.name for field in dataclasses.fields(SearchConfig)}
     values, fixed, swept = {}, [], {}
+    machines = {"name": "local"}
     for word in compose.hydra_words(words):
         name, equals, text = word.partition("=")
         if equals and name in own:
             values[name] = text if name == "storage" and text != "null" else _plain(text)
+            continue
+        if name.partition(".")[0] == "machines":
+            machines[name.partition(".")[2] or "name"] = _plain(text)
             continue
         override = _parsed(word)
         require(name not in TAKEN, name, "be left out", "the search sets it for each trial", text,
@@ -185,13 +192,20 @@ def read(words: Sequence[str]) -> Search:
         else:
             fixed.append(word)
     config = serialize.from_plain(SearchConfig, values, "")
-    search = Search(config=config, fixed=tuple(fixed), space=swept)
+    search = Search(config=config, fixed=tuple(fixed), space=swept, machines=_machines(machines))
     if config.space is None:
         return search
     preset = spaces.preset(config.space, search.agent, search.is_of_agent)
     given = {word.partition("=")[0] for word in fixed} | set(swept)
     offered = {name: x for name, x in preset.items() if name not in given}
     return dataclasses.replace(search, space={**offered, **swept})
+
+
+def _machines(values: dict[str, Any]) -> Any:
+    one_of(("local", "ray"))("machines", values["name"], "local")
+    machines = plugins.configure("machines", values)
+    plugins.require_package("machines", machines, "trials are made there")
+    return machines
 
 
 def _parsed(word: str) -> Override:

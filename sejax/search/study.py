@@ -138,13 +138,13 @@ class Objective:
             words = [f"{name}={x.suggest(trial)}" for name, x in self._search.space.items()]
             score = self._run(trial, words)
         except optuna.TrialPruned:
-            self._tell("pruned", words)
+            self.say(sentence(trial, "pruned", self._search))
             self.is_done = True
             raise
         except (Lost, optuna.exceptions.UpdateFinishedTrialError):
             self.is_done = True
             raise
-        self._tell("complete", words)
+        self.say(sentence(trial, "complete", self._search))
         self.is_done = True
         return score
 
@@ -161,16 +161,17 @@ class Objective:
         follower = Follower(trial, self._search)
         return follower.finish(self._runner.run(config, follower, is_inherited))
 
-    def _tell(self, how: str, words: list[str]) -> None:
-        kept = self.trial.user_attrs
-        if "refused" in kept:
-            self.say(f"trial {self.trial.number}: refused: {kept['refused']}")
-            return
-        config = self._search.config
-        score = kept.get(config.score)
-        worth = "not finite" if score is None else f"{score:.4g}"
-        self.say(f"trial {self.trial.number}: {worth}, {how} at generation "
-                  f"{kept['generations']}/{config.max_generations}: {' '.join(words)}")  # fmt: skip
+
+def sentence(trial: optuna.Trial | optuna.trial.FrozenTrial, how: str, search: Search) -> str:
+    """What is said of a trial that has ended: complete or pruned."""
+    kept = trial.user_attrs
+    if "refused" in kept:
+        return f"trial {trial.number}: refused: {kept['refused']}"
+    score = kept.get(search.config.score)
+    worth = "not finite" if score is None else f"{score:.4g}"
+    words = " ".join(f"{name}={x.of(trial.params)}" for name, x in search.space.items())
+    return (f"trial {trial.number}: {worth}, {how} at generation "
+            f"{kept['generations']}/{search.config.max_generations}: {words}")  # fmt: skip
 
 
 def trial_folder(search: Search, number: int) -> Path:
@@ -295,7 +296,7 @@ def _joined(search: Search, stored: dict[str, Any]) -> Search:
                 "its trials are compared with each other",
                 f"{search.study}, which differs in {', '.join(differing)}",
                 "study=NAME, or give study and storage alone to join")  # fmt: skip
-    return Search.from_stored(stored, search.config)
+    return Search.from_stored(stored, search.config, search.machines)
 
 
 @contextlib.contextmanager
