@@ -2,15 +2,12 @@
 
 from collections.abc import Sequence
 from importlib.util import find_spec
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from sejax.app import commands, runtime
 from sejax.errors import ConfigError
 from sejax.search import settings
 from sejax.search.settings import Search
-
-if TYPE_CHECKING:
-    from sejax.search.study import Runner
 
 
 def main(words: Sequence[str]) -> None:
@@ -27,9 +24,9 @@ def main(words: Sequence[str]) -> None:
     from sejax.search import results, study
 
     if not search.names_study_alone:  # before a study is made of it
-        settings.require_fields(search, runner_of(search).config([]))
+        settings.require_fields(search, study.runner_of(search).config([]))
     found, search = study.open_study(search)
-    runner = runner_of(search)
+    runner = study.runner_of(search)
     runtime.enable_compilation_cache()
     print(f"Study {search.study} in {search.folder}: {', '.join(search.space)}.", flush=True)
     try:
@@ -57,16 +54,6 @@ def main(words: Sequence[str]) -> None:
 
 def _say(text: str) -> None:
     print(text, flush=True)
-
-
-def runner_of(search: Search) -> "Runner":
-    if search.is_of_agent:
-        from sejax.search.tuning import Tuning
-
-        return Tuning(search)
-    from sejax.search.learning import Learning
-
-    return Learning(search)
 
 
 def _verified(found: Any, search: Search, runner: Any) -> list[str]:

@@ -70,8 +70,7 @@ def _work(words: list[str]) -> None:
 
     runtime.configure_xla(1)
     from sejax.search import settings, study
-    from sejax.search.__main__ import runner_of
 
     runtime.enable_compilation_cache()
     found, search = study.open_study(settings.read(words))
-    study.work(found, search, runner_of(search), lambda text: None)
+    study.work(found, search, study.runner_of(search), lambda text: None)

@@ -39,6 +39,17 @@ class Runner(Protocol):
     def run(self, config: Any, follower: Follower, is_inherited: bool) -> Progress: ...
 
 
+def runner_of(search: Search) -> Runner:
+    """What makes the trials of a search."""
+    if search.is_of_agent:
+        from sejax.search.tuning import Tuning
+
+        return Tuning(search)
+    from sejax.search.learning import Learning
+
+    return Learning(search)
+
+
 def open_study(search: Search) -> tuple[optuna.Study, Search]:
     """Makes the study, or joins one that is there.
 
