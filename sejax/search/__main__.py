@@ -5,6 +5,7 @@ from importlib.util import find_spec
 from typing import Any
 
 from sejax.app import commands, runtime
+from sejax.app.run_lock import acquire
 from sejax.errors import ConfigError
 from sejax.search import settings
 from sejax.search.settings import Search
@@ -45,8 +46,14 @@ def main(words: Sequence[str]) -> None:
     if not best:
         print("No trial was completed.")
         return
-    if search.is_of_agent:
-        best = _verified(found, search, runner)
+    if search.num_verified:
+        try:
+            lock = acquire(search.folder / "verification.lock", "Wait for it.")
+        except ConfigError:
+            print("Another worker is at it to try the best ones again.")
+        else:
+            best = _verified(found, search, runner)
+            lock.release()
     print(f"\nThe best:\n  {results.override_line(best, search, runner.command)}")
     print(f"The same:\n  {results.preset_line(search, runner.command)}")
     print(f"{search.folder}/trials.csv, pareto.png, best.txt and preset.yaml hold what was found.")
@@ -57,11 +64,12 @@ def _say(text: str) -> None:
 
 
 def _verified(found: Any, search: Search, runner: Any) -> list[str]:
-    """The overrides of the best on the real task."""
+    """The overrides of those that were best when they were tried again."""
     from sejax.search import results, verification
 
     table = verification.verify(found, search, runner)
-    verification.print_table(table, search, runner.config([]).num_agents)
+    num_agents = getattr(runner.config([]), "num_agents", 0)
+    verification.print_table(table, search, num_agents)
     best = found.get_trials(deepcopy=False)[int(table["trial"].iloc[0])]
     words = results.words_of(best, search)
     results.write_best(words, search, runner.command)

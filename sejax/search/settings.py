@@ -29,7 +29,15 @@ TAKEN = {
     "out_dir": "search_dir=FOLDER", "checkpoint_every": "min_generations=3",
 }  # fmt: skip
 # Fields that may differ between the workers of a study, and between its sessions.
-FREE_FIELDS = ("trials", "timeout", "storage", "search_dir", "sampler_seed")
+FREE_FIELDS = (
+    "trials",
+    "timeout",
+    "storage",
+    "search_dir",
+    "sampler_seed",
+    "verify",
+    "fresh_seeds",
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,9 +67,10 @@ class SearchConfig(Options):
     search_dir: str | None = None  # null: runs/search-<study>
     timeout: float | None = option(None, positive("no trial would start"))  # s; none starts later
     heartbeat: int = option(15, counts("workers must show that they live"))  # s
-    verify: int = option(
-        10, counts("the best are tried on the real task")
-    )  # of a search on a proxy
+    # The best trials that are tried again, as the best score of many is the luckiest too: on the
+    # real task after a search on a proxy (null: 10), else with seeds that are new (null: 5).
+    verify: int | None = option(None, counts("the best are tried again", least=0))
+    fresh_seeds: int = option(5, counts("the best are tried again with them"))
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -91,6 +100,12 @@ class Search:
         """Whether agents are tuned on a proxy that exists, in the place of how to learn one."""
         name = self.choice("proxy", "se")
         return name not in plugins.names("proxy") and ":" not in name
+
+    @property
+    def num_verified(self) -> int:
+        """How many of the best are tried again."""
+        usual = 10 if self.is_of_agent else 5
+        return usual if self.config.verify is None else self.config.verify
 
     @property
     def measure(self) -> str:
