@@ -97,11 +97,13 @@ def shares_of(
     """Most trials in a share, and whether it takes as long with fewer, of each family.
 
     On a CPU they are the same for any number of workers, as agents in lockstep round by how many
-    there are. A worker with a GPU takes its part of a generation at once.
+    there are; a share has one group of lanes, so that nobody waits for a second one. A worker with
+    a GPU takes its part of a generation at once.
     """
     capacities, is_lockstep = [], []
     for family, cpu_lanes in enumerate(program.cpu_lanes):
-        lanes, capacity = config.lanes or cpu_lanes, CAPACITY
+        lanes = config.lanes or cpu_lanes
+        capacity = lanes if lanes and lanes > 1 else CAPACITY
         if machines.gpus_per_worker:
             num_trials = config.num_seeds * int((program.family_of_trial == family).sum())
             lanes, capacity = config.lanes, -(-num_trials // num_workers)
