@@ -31,6 +31,8 @@ import common
 import numpy as np
 from scale_model import Costs, World, draw, hand_out_pending_s, simulate
 
+from sejax.machines.chunks import CAPACITY
+
 GROUPS, ALONE = "trainings-lanes", "trainings-1"
 SIDES = {
     "local-1": "local, 1 device",
@@ -292,7 +294,7 @@ def trainings_side(config: Any, folder: Path, num_cores: int) -> Iterator[Measur
     program = make_program(**config.parts() | {"devices": 1})
     capacities = tuple(config.lanes or lanes or 1 for lanes in program.cpu_lanes)
     crew = Here(scorer.Scorer(build.to_plain(config), capacities, scorer.versions()))
-    with RemoteChunks(program, HandOut(crew, capacities, [True] * len(capacities))) as chunks:
+    with RemoteChunks(program, HandOut(crew, capacities, capacities)) as chunks:
         chunks.compile(config.num_seeds, 1)
 
         def extra(wall_s: float) -> dict[str, Any]:
@@ -336,11 +338,14 @@ def model(result: dict[str, Any]) -> dict[str, Any]:
         share_s=share_s,
         gap_s=max(0.0, (one["handing_s"] - one["busy_s"]) / one["shares"] - share_s),
         pending_s=result["pending_s"] + hand_out_pending_s(),
-        bytes_each=(one["bytes_out"] + one["bytes_in"]) / one["shares"],
+        bytes_each=(one["bytes_out"] + one["bytes_in"]) / len(result["seconds"][GROUPS][0]),
     )
+    in_groups = CAPACITY // result["lanes"]
     checks = {}
     for n in (1, 2):
-        said = median(simulate(each, n, costs, 1).wall_s for each in result["seconds"][GROUPS])
+        said = median(
+            simulate(each, n, costs, in_groups).wall_s for each in result["seconds"][GROUPS]
+        )
         measured = result["sides"][f"ray-{n}"]["wall_s"]
         checks[str(n)] = {"model_s": said, "measured_s": measured, "error": said / measured - 1}
     worlds, wired = worlds_of(result), dataclasses.replace(costs, bandwidth=GIGABIT)
@@ -357,15 +362,15 @@ def worlds_of(result: dict[str, Any]) -> dict[str, World]:
     for population in (64, 1024):
         trials = 2 * population + 16
         world = World(seconds=groups, count=trials // result["lanes"], num_trials=trials,
-                      capacity=1, dims=result["dims"])  # fmt: skip
+                      capacity=CAPACITY // result["lanes"], dims=result["dims"])  # fmt: skip
         worlds[f"CartPole SE, {trials:,} trainings"] = world
         worlds[f"CartPole SE, {trials:,} trainings, lanes=1"] = dataclasses.replace(
-            world, seconds=alone, count=trials, capacity=16
+            world, seconds=alone, count=trials, capacity=CAPACITY
         )
     with HALFCHEETAH.open(encoding="utf-8") as file:
         seconds = np.array([float(row["cpu_s"]) for row in csv.DictReader(file)])
     worlds["HalfCheetah RN, 48 trainings"] = World(
-        seconds=seconds, count=48, num_trials=48, capacity=16, dims=HALFCHEETAH_DIMS
+        seconds=seconds, count=48, num_trials=48, capacity=CAPACITY, dims=HALFCHEETAH_DIMS
     )
     return worlds
 

@@ -78,10 +78,10 @@ def simulate(
       seconds: what is handed out takes: of each training, or of each group of lanes.
       num_workers: all ready.
       costs: what else there is.
-      capacity: most of `seconds` in a share; 1 for lanes, of which a share is a group.
+      capacity: most of `seconds` in a share.
     """
     crew = Simulated(np.asarray(seconds, float), num_workers, costs)
-    hand_out = HandOut(crew, [capacity], [False], clock=lambda: crew.now)
+    hand_out = HandOut(crew, [capacity], [1], clock=lambda: crew.now)
     hand_out.get_ready()
     crew.now = 0.0
     places = np.arange(len(seconds))
