@@ -84,7 +84,7 @@ def test_phi_is_the_networks_output_times_its_scale():
 
 
 def test_weighted_info_has_no_output_to_scale():
-    with pytest.raises(ConfigError, match=r"output_scale must be 1 .* got 0\.1\. Set proxy\.output"):
+    with pytest.raises(ConfigError, match=r"output_scale must be 1 .* got 0\.1\."):
         RewardConfig(variant="additive_weighted_info", output_scale=0.1)
 
 

@@ -82,8 +82,8 @@ class RewardConfig(Options):
     num_layers: int = option(1, counts("there is a hidden layer", most=MOST_LAYERS))
     activation: str = option("prelu", one_of(ACTIVATIONS))
     variant: str = option("additive_potential", one_of(VARIANTS))
-    # Phi is this times what the network puts out. A few tenths are a reward that is summed over a
-    # hundred steps: agents with high learning rates fail on values of that size (docs/results.md).
+    # Phi is this times the network's output. Some agents learn only from small rewards
+    # (docs/results.md, MountainCarContinuous).
     output_scale: float = option(1.0, positive("a reward of 0 teaches nothing", 1e6))
     augmented: bool = False  # the network sees the task's observation vector v as well
     zero_at_terminal: bool = False  # Phi is 0 where episodes end for the agent; see RewardEnv
