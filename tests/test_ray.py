@@ -28,7 +28,8 @@ pytestmark = [
     ),
 ]
 
-RUN = [sys.executable, "-m", "sejax.run", "env=cartpole", "generations=12", "checkpoint_every=1"]
+RUN = [sys.executable, "-m", "sejax.run", "env=cartpole", "es.population_size=8",
+       "generations=12", "checkpoint_every=1"]  # fmt: skip
 ENVIRONMENT = {
     **{name: x for name, x in os.environ.items() if not name.startswith(("XLA_FLAGS", "RAY_"))},
     "PYTHONPATH": str(Path(__file__).parents[1]),

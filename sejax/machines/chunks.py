@@ -29,9 +29,10 @@ class RemoteChunks:
         self.program = program
         self.cpu_s = 0.0  # of the workers, for trainings that counted
         self._hand_out, self._ledger = hand_out, ledger
-        # One program asks and tells, and runs twice in a generation: XLA fuses what is told with what
-        # was asked, so that two programs would round candidates otherwise than `Program.generation`.
-        self._compiled: dict[int, Any] = {}
+        # One program asks and tells, and runs twice in a generation: XLA fuses what is told with
+        # what was asked, so that two would round candidates otherwise than `Program.generation`.
+        self._compiled: dict[int, Any] = {}  # by the number of seeds
+        self._shapes: dict[int, Outcome] = {}  # of a generation's outcome, likewise
 
     def __enter__(self) -> "RemoteChunks":
         return self
@@ -59,6 +60,7 @@ class RemoteChunks:
           ConfigError: if none gets ready.
         """
         program = self.program
+        self._hand_out.start()  # workers compile meanwhile
 
         def generation(state: Any, outcome: Outcome) -> tuple[Any, ...]:
             asked = program.ask(state)
@@ -66,9 +68,10 @@ class RemoteChunks:
             return program.tell(state, asked, outcome), trials
 
         keys = jax.random.split(jax.random.key(0), num_seeds)
-        shapes = jax.eval_shape(program.init, keys), self._outcome_shapes(num_seeds)
+        state = jax.eval_shape(program.init, keys)
+        self._shapes[num_seeds] = self._outcome_shapes(num_seeds, state)
         jitted = jax.jit(generation, compiler_options=compiler_options())
-        self._compiled[num_seeds] = jitted.lower(*shapes).compile()
+        self._compiled[num_seeds] = jitted.lower(state, self._shapes[num_seeds]).compile()
         self._hand_out.get_ready()
 
     def advance(self, state: Any, length: int) -> tuple[Any, Any]:
@@ -94,7 +97,7 @@ class RemoteChunks:
 
     def _outcome(self, num_seeds: int, state: Any) -> Outcome:
         """What comes of a generation's trials, leaves `[seed, trials, ...]`."""
-        shapes = self._outcome_shapes(num_seeds)
+        shapes = self._shapes[num_seeds]
         nothing = jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), shapes)
         _, trials = self._compiled[num_seeds](state, nothing)
         keys, candidates, test_steps = jax.device_get(trials)
@@ -132,10 +135,9 @@ class RemoteChunks:
             name: x.reshape(num_seeds, num_trials, *x.shape[1:]) for name, x in merged.items()
         })  # fmt: skip
 
-    def _outcome_shapes(self, num_seeds: int) -> Outcome:
-        """Shapes and types of a generation's outcome."""
+    def _outcome_shapes(self, num_seeds: int, state: Any) -> Outcome:
+        """Shapes and types of a generation's outcome, of those of its state."""
         program = self.program
-        state = jax.eval_shape(program.init, jax.random.split(jax.random.key(0), num_seeds))
         num_trials = len(program.family_of_trial)
         keys = jax.random.split(jax.random.key(0), 1)
         test_steps = jax.eval_shape(program.test_steps, state)

@@ -21,7 +21,7 @@ from sejax.machines.scorer import About, Scored, Work
 COPIED_AFTER = 2.0  # times what a share has been seen to take, until another worker begins it too
 GIVEN_UP_AFTER = 10.0  # times that, until its worker counts as hanging
 LEAST_S = 20.0  # before which none counts as hanging
-MOST_FAILURES = 5  # of one share, or of starts that follow one another: that is no accident any more
+MOST_FAILURES = 5  # of one share, or of starts in succession: that is no accident any more
 LOOK_S = 1.0  # between looks at what hangs, and for machines that have come
 ALONE_S = 30.0  # without any worker, until somebody is told
 
@@ -135,9 +135,13 @@ class HandOut:
         """Who a worker that was given a share is."""
         return self._known[worker]
 
+    def start(self) -> None:
+        """Starts workers, without waiting for them to get ready."""
+        self._look()
+
     def get_ready(self) -> None:
         """Waits until the first worker is ready; raises as `score` does."""
-        self._look()
+        self.start()
         while not any(hand.about for hand in self._hands.values()):
             self._events()
 

@@ -65,7 +65,9 @@ class About:
 class Scorer:
     """The compiled trainings of a run; one to a process."""
 
-    def __init__(self, config: dict[str, Any], capacities: tuple[int, ...], versions: dict[str, str]):
+    def __init__(
+        self, config: dict[str, Any], capacities: tuple[int, ...], versions: dict[str, str]
+    ):
         """Of a run's plain configuration, most trials in a share by family, and the driver's."""
         self._config, self._capacities, self._versions = config, capacities, versions
         self._programs: list[Any] = []
