@@ -2,6 +2,8 @@
 
 import itertools
 import random
+import re
+from pathlib import Path
 from unittest import mock
 
 import jax
@@ -15,7 +17,7 @@ import sejax
 from sejax.app import session
 from sejax.bilevel import make_program
 from sejax.errors import ConfigError
-from sejax.machines import handout, ledger, scorer
+from sejax.machines import configs, handout, ledger, scorer
 from sejax.machines.chunks import RemoteChunks, problem
 from sejax.machines.handout import HandOut, Lost
 from sejax.machines.scorer import About, Scored, Work
@@ -466,3 +468,55 @@ TINY = ["env=gridworld_2x2", "agent=q_learning", "agent.learning_rate=0.5",
 def test_trainings_that_are_handed_out_give_the_numbers_of_one_process_to_the_last_bit():
     finished = require_equal_numbers(TINY, 4, num_seeds=2)
     assert [True, False] in finished or [False, True] in finished  # nothing is trained for one
+
+
+CASES = {
+    "families": [*TINY[:1], "agents=[q_learning,sarsa]", *TINY[3:]],
+    "lockstep": ["env=cartpole", "es.population_size=4", "training.max_episodes=5"],
+    "several agents": ["env=cartpole", "agents=[ddqn,ppo]", "es.population_size=4",
+                       "training.max_episodes=5"],
+    "continuous actions": ["env=pendulum", "es.population_size=4", "training.max_episodes=3"],
+    **{es: ["env=cliff_walking", "proxy=rn", f"es={es}", "es.population_size=8",
+            "training.max_episodes=20"] for es in ("nes", "cma_es", "open_es", "snes", "pgpe")},
+}  # fmt: skip
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("case", CASES)
+def test_so_do_all_kinds_of_agents_and_strategies(case):
+    require_equal_numbers([*CASES[case], "checkpoint_every=1"], 3, num_seeds=2)
+
+
+# --- the command ---------------------------------------------------------------------------------
+
+
+def test_without_ray_one_line_says_what_to_install(monkeypatch):
+    monkeypatch.setattr(configs, "find_spec", lambda name: None)
+    with pytest.raises(
+        ConfigError,
+        match=r"^machines must be .*pip install 'sejax\[ray\]', or set "
+        r"machines=local\.$",
+    ):
+        sejax.config(["machines=ray"])  # fmt: skip
+
+
+def test_one_module_imports_ray_and_one_function_that_module():
+    sources = {path.name: path.read_text() for path in Path(sejax.__file__).parent.rglob("*.py")}
+    found = [
+        name for name, text in sources.items() if re.search(r"^ *(import|from) ray\b", text, re.M)
+    ]
+    assert found == ["ray_crew.py"]
+    found = [name for name, text in sources.items() if re.search(r"import.* ray_crew", text)]
+    assert (
+        found == ["configs.py"]
+        and "\n        from sejax.machines import ray_crew" in sources[found[0]]
+    )
+
+
+def test_devices_are_the_workers_own(monkeypatch):
+    monkeypatch.setattr(configs, "find_spec", lambda name: "there")
+    with pytest.raises(ConfigError, match=r"^devices must be left out with machines=ray.*got 2\."):
+        sejax.config(["machines=ray", "devices=2"])
+    assert sejax.config(["machines=ray", "machines.workers=3"]).machines.workers == 3
+    with pytest.raises(ConfigError, match=r"^machines\.workers must be"):
+        sejax.config(["machines=ray", "machines.workers=0"])
