@@ -1,8 +1,11 @@
 """Trainings that are handed out: workers that die, hang, lie, come and go, and the same numbers."""
 
 import itertools
+import os
 import random
 import re
+import subprocess
+import sys
 from pathlib import Path
 from unittest import mock
 
@@ -484,7 +487,14 @@ CASES = {
 @pytest.mark.slow
 @pytest.mark.parametrize("case", CASES)
 def test_so_do_all_kinds_of_agents_and_strategies(case):
-    require_equal_numbers([*CASES[case], "checkpoint_every=1"], 3, num_seeds=2)
+    # Compiled as commands are: without optimisation fusions round otherwise in larger programs.
+    program = ("from sejax.app import runtime; runtime.configure_xla(1)\n"
+               "import sys, test_machines\n"
+               "test_machines.require_equal_numbers(sys.argv[1:], 3, num_seeds=2)")  # fmt: skip
+    environment = {name: x for name, x in os.environ.items() if name != "XLA_FLAGS"}
+    done = subprocess.run([sys.executable, "-c", program, *CASES[case]], env=environment,
+                          cwd=Path(__file__).parent, capture_output=True, text=True)  # fmt: skip
+    assert done.returncode == 0, done.stderr
 
 
 # --- the command ---------------------------------------------------------------------------------
