@@ -62,6 +62,25 @@ def is_there(pid):
     return False
 
 
+def processes(session):
+    """Those of a session: of the process that has begun it, and its descendants."""
+    found = []
+    for pid in (int(path.name) for path in Path("/proc").glob("[0-9]*")):
+        with contextlib.suppress(ProcessLookupError):
+            if os.getsid(pid) == session and is_there(pid):
+                found.append(pid)
+    return found
+
+
+def end(process):
+    """Kills a process and its session."""
+    while found := processes(process.pid):
+        for pid in found:
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGKILL)
+    process.wait()
+
+
 class Node:
     """A node of one CPU; its processes are those of a session."""
 
@@ -76,23 +95,12 @@ class Node:
             )  # fmt: skip
         wait_for(lambda: "Ray runtime started" in self.log.read_text())
 
-    def processes(self):
-        found = []
-        for pid in (int(path.name) for path in Path("/proc").glob("[0-9]*")):
-            with contextlib.suppress(ProcessLookupError):
-                if os.getsid(pid) == self.process.pid and is_there(pid):
-                    found.append(pid)
-        return found
-
     def workers(self):
-        return [pid for pid in self.processes() if command_line(pid).startswith("ray::Scorer")]
+        mine = processes(self.process.pid)
+        return [pid for pid in mine if command_line(pid).startswith("ray::Scorer")]
 
     def kill(self):
-        while found := self.processes():
-            for pid in found:
-                with contextlib.suppress(ProcessLookupError):
-                    os.kill(pid, signal.SIGKILL)
-        self.process.wait()
+        end(self.process)
 
 
 class Cluster:
@@ -125,11 +133,17 @@ class Cluster:
 
 
 @pytest.fixture(scope="module")
-def cluster():
-    with tempfile.TemporaryDirectory(prefix="sejax", ignore_cleanup_errors=True) as folder:
-        made = Cluster(Path(folder))
-        yield made
-        made.close()
+def folder():
+    """A folder whose path is short, as that of a socket must be."""
+    with tempfile.TemporaryDirectory(prefix="sejax", ignore_cleanup_errors=True) as made:
+        yield Path(made)
+
+
+@pytest.fixture(scope="module")
+def cluster(folder):
+    made = Cluster(folder)
+    yield made
+    made.close()
 
 
 class Driver:
@@ -142,14 +156,14 @@ class Driver:
         with self.log.open("w") as log:
             self.process = subprocess.Popen([*RUN, f"run_dir={folder / 'run'}", *words],
                                             stdin=subprocess.DEVNULL, stdout=log,
-                                            stderr=subprocess.STDOUT, env=environment)  # fmt: skip
+                                            stderr=subprocess.STDOUT, env=environment,
+                                            start_new_session=True)  # fmt: skip
 
     def __enter__(self):
         return self
 
     def __exit__(self, *_):
-        self.process.kill()
-        self.process.wait()
+        end(self.process)
 
     def wait(self, status=0):
         assert self.process.wait(timeout=500) == status, self.log.read_text()
@@ -232,3 +246,51 @@ def test_a_run_has_the_same_rows_whatever_is_killed_or_stopped_and_when(
           f"shares lost; {last.log.read_text().count(chr(10))} lines said")  # fmt: skip
     assert results(tmp_path) == wanted
     wait_for(lambda: not any(map(is_there, there)))
+
+
+def test_a_run_goes_on_with_or_without_the_cluster(cluster, wanted, tmp_path):
+    for generations, machines in ((4, "local"), (8, "ray"), (12, "local")):
+        words = f"machines={machines}", f"generations={generations}"
+        with Driver(tmp_path, *words, environment=cluster.environment) as driver:
+            driver.wait()
+    assert results(tmp_path) == wanted
+
+
+def test_a_stopped_worker_is_given_up_and_another_started(cluster, tmp_path):
+    words = "machines=ray", "generations=1000"
+    with Driver(tmp_path, *words, environment=cluster.environment) as driver:
+        wait_for(lambda: len(cluster.workers()) == 2 and driver.generations() > 2)
+        there = set(cluster.workers())
+        stopped = min(there)
+        started = time.monotonic()
+        os.kill(stopped, signal.SIGSTOP)
+        wait_for(lambda: not is_there(stopped), 300)
+        print(f"gone after {time.monotonic() - started:.1f} s")
+        (new,) = wait_for(lambda: set(cluster.workers()) - there)
+        wait_for(lambda: f",{new}," in (tmp_path / "run" / "machines.csv").read_text())
+
+
+def test_a_stopped_worker_of_a_killed_driver_makes_room(cluster, wanted, tmp_path):
+    with Driver(tmp_path, "machines=ray", environment=cluster.environment) as driver:
+        wait_for(driver.generations)
+        stopped = cluster.workers()
+        for pid in stopped:
+            os.kill(pid, signal.SIGSTOP)
+    with Driver(tmp_path, "machines=ray", environment=cluster.environment) as driver:
+        driver.wait()
+    assert results(tmp_path) == wanted
+    assert not any(map(is_there, stopped))
+
+
+@pytest.mark.parametrize("given", [signal.SIGINT, signal.SIGKILL])
+def test_nothing_is_left_of_a_driver_that_started_its_own_ray(folder, tmp_path, given):
+    environment = ENVIRONMENT | {"RAY_ADDRESS": "local", "RAY_TMPDIR": str(folder)}
+    words = "machines=ray", "machines.workers=2", "generations=1000"
+    with Driver(tmp_path, *words, environment=environment) as driver:
+        wait_for(driver.generations)
+        driver.process.send_signal(given)
+        driver.wait({signal.SIGINT: 130, signal.SIGKILL: -signal.SIGKILL}[given])
+        wait_for(lambda: not processes(driver.process.pid))
+    said = driver.log.read_text().splitlines()
+    left = [line for line in said if not line.startswith("generation ")]
+    assert len(left) == (given == signal.SIGINT), left
