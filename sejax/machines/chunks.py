@@ -126,8 +126,10 @@ class RemoteChunks:
         if self._ledger is not None:
             about = {worker: self._hand_out.about(worker) for worker in done}
             self._ledger.write(int(state.generation.max()), wall_s, about, done)
-        merged = {name: np.zeros((num_seeds * num_trials, *x.shape[2:]), x.dtype)
-                  for name, x in vars(shapes).items()}  # fmt: skip
+        merged: dict[str, Any] = {
+            name: np.zeros((num_seeds * num_trials, *x.shape[2:]), x.dtype)
+            for name, x in vars(shapes).items()
+        }
         for share, outcome in outcomes:
             for name, x in outcome.items():
                 merged[name][share.places] = x
