@@ -107,7 +107,7 @@ class HandOut:
         self,
         crew: Crew,
         capacities: Sequence[int],
-        is_lockstep: Sequence[bool],
+        lanes: Sequence[int],
         patience_s: float = 3600.0,
         say: Callable[[str], None] = lambda text: None,
         clock: Callable[[], float] = time.monotonic,
@@ -117,12 +117,12 @@ class HandOut:
         Args:
           crew: the workers.
           capacities: most trials in a share, by family.
-          is_lockstep: whether a share takes as long with few trials as with many, by family.
+          lanes: trials in lockstep, by family; so many take as long as a single one.
           patience_s: seconds that a worker may take while nobody has shown how long it takes.
           say: told what a person should know.
           clock: seconds.
         """
-        self._crew, self._capacities, self._is_lockstep = crew, capacities, is_lockstep
+        self._crew, self._capacities, self._lanes = crew, capacities, lanes
         self._patience_s, self._say, self._clock = patience_s, say, clock
         self._hands: dict[Hashable, _Hand] = {}
         self._known: dict[Hashable, About] = {}
@@ -165,7 +165,7 @@ class HandOut:
           RuntimeError: if a share fails everywhere.
           ConfigError: if no worker gets ready.
         """
-        plan = _Plan(families, self._capacities, self._is_lockstep)
+        plan = _Plan(families, self._capacities, self._lanes)
         done: dict[Hashable, Done] = defaultdict(Done)
         self._seen = [self._seen[1] or self._seen[0], {}]
         # Who goes while it has nothing to do is missed when it is sent something, and no share is
@@ -214,8 +214,7 @@ class HandOut:
 
     def _size(self, share: Share) -> int:
         """Trials that a share takes the time of."""
-        lockstep = self._is_lockstep[share.family]
-        return self._capacities[share.family] if lockstep else len(share.places)
+        return _whole(len(share.places), self._lanes[share.family])
 
     def _expected(self, share: Share) -> float | None:
         """Seconds that a share takes at most, by what was seen; None if nothing was."""
@@ -310,14 +309,11 @@ class _Plan:
     """The shares of a generation: not cut yet, given to workers, to be given again, done."""
 
     def __init__(
-        self,
-        families: Sequence[np.ndarray],
-        capacities: Sequence[int],
-        is_lockstep: Sequence[bool],
+        self, families: Sequence[np.ndarray], capacities: Sequence[int], lanes: Sequence[int]
     ):
         self.outcomes: list[tuple[Share, Any]] = []
         self._left = [np.asarray(places) for places in families]
-        self._capacities, self._is_lockstep = capacities, is_lockstep
+        self._capacities, self._lanes = capacities, lanes
         self._again: deque[Share] = deque()
         self._holders: dict[Share, int] = {}  # workers that have a share which is not done
 
@@ -331,9 +327,8 @@ class _Plan:
             return self._again.popleft()
         for family, places in enumerate(self._left):
             if len(places):
-                size = self._capacities[family]
-                if not self._is_lockstep[family]:
-                    size = min(size, -(-len(places) // (2 * num_workers)))
+                fair = _whole(-(-len(places) // (2 * num_workers)), self._lanes[family])
+                size = min(self._capacities[family], fair)
                 self._left[family] = places[size:]
                 return Share(family, places[:size])
         return None
@@ -369,3 +364,8 @@ class _Plan:
         if not self._holders[share]:
             del self._holders[share]
             self._again.append(share)
+
+
+def _whole(num_trials: int, lanes: int) -> int:
+    """As many trials in whole groups of lanes."""
+    return lanes * -(-num_trials // lanes)

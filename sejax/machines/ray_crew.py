@@ -39,9 +39,9 @@ def chunks_of(
     program = make_program(**config.parts() | {"devices": 1})
     with connected():
         num_workers = require_workers(machines)
-        capacities, is_lockstep = shares_of(config, program, machines, num_workers)
+        capacities, lanes = shares_of(config, program, machines, num_workers)
         crew = RayCrew(machines, build.to_plain(config), capacities)
-        hand_out = HandOut(crew, capacities, is_lockstep, machines.patience_s, say)
+        hand_out = HandOut(crew, capacities, lanes, machines.patience_s, say)
         with RemoteChunks(program, hand_out, Ledger(folder)) as chunks:
             yield chunks
 
@@ -93,21 +93,22 @@ def require_workers(machines: "RayConfig") -> int:
 
 def shares_of(
     config: Any, program: Any, machines: "RayConfig", num_workers: int
-) -> tuple[tuple[int, ...], tuple[bool, ...]]:
-    """Most trials in a share, and whether it takes as long with fewer, of each family.
+) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    """Most trials in a share, and how many of them run in lockstep, of each family.
 
     On a CPU they are the same for any number of workers, as agents in lockstep round by how many
     there are. A worker with a GPU takes its part of a generation at once.
     """
-    capacities, is_lockstep = [], []
+    capacities, widths = [], []
     for family, cpu_lanes in enumerate(program.cpu_lanes):
         lanes, capacity = config.lanes or cpu_lanes, CAPACITY
         if machines.gpus_per_worker:
             num_trials = config.num_seeds * int((program.family_of_trial == family).sum())
             lanes, capacity = config.lanes, -(-num_trials // num_workers)
-        capacities.append(capacity if lanes is None else lanes * -(-capacity // lanes))
-        is_lockstep.append(lanes != 1)
-    return tuple(capacities), tuple(is_lockstep)
+        width = lanes or capacity
+        capacities.append(width * -(-capacity // width))
+        widths.append(width)
+    return tuple(capacities), tuple(widths)
 
 
 class RayCrew:
