@@ -28,7 +28,7 @@ class Costs:
     """What is no training.
 
     Attributes:
-      serial_s: of the driver in a generation: ask and tell, and its files.
+      serial_s: of the driver in a generation: ask and tell.
       share_s: of the driver, to send a share and to take its outcome.
       pending_s: of the driver for each event and each worker that it waits for.
       gap_s: of a worker between two shares, beyond what the driver does.
