@@ -20,7 +20,7 @@ import sejax
 from sejax.app import session
 from sejax.bilevel import make_program
 from sejax.errors import ConfigError
-from sejax.machines import configs, handout, ledger, scorer
+from sejax.machines import handout, ledger, scorer
 from sejax.machines.chunks import RemoteChunks, problem
 from sejax.machines.handout import HandOut, Lost
 from sejax.machines.scorer import About, Scored, Work
@@ -101,8 +101,8 @@ class Crew:
         self.due.pop(worker, None)
 
 
-def hand_out_of(crew, capacities=(16,), is_lockstep=(False,), **options):
-    return HandOut(crew, capacities, is_lockstep, say=crew.said.append, clock=crew.clock, **options)
+def hand_out_of(crew, capacities=(16,), lanes=(1,), **options):
+    return HandOut(crew, capacities, lanes, say=crew.said.append, clock=crew.clock, **options)
 
 
 def score(hand_out, *sizes):
@@ -133,7 +133,7 @@ def score(hand_out, *sizes):
 
 def test_shares_shrink_and_make_up_all_trials_of_each_family():
     crew = Crew(room=2)
-    shares, done = score(hand_out_of(crew, (16, 4), (False, False)), 100, 10)
+    shares, done = score(hand_out_of(crew, (16, 4), (1, 1)), 100, 10)
     sizes = [len(keys) for *_, keys in crew.sent]
     assert sizes == [16, 16, 16, 13, 10, 8, 6, 4, 3, 2, 2, 1, 1, 1, 1, 3, 2, 2, 1, 1, 1]
     assert [share.family for share in shares].count(1) == 6
@@ -143,7 +143,7 @@ def test_shares_shrink_and_make_up_all_trials_of_each_family():
 
 def test_shares_of_agents_in_lockstep_are_whole():
     crew = Crew(room=3)
-    score(hand_out_of(crew, (16,), (True,)), 40)
+    score(hand_out_of(crew, (16,), (16,)), 40)
     assert [len(keys) for *_, keys in crew.sent] == [16, 16, 8]
 
 
@@ -215,7 +215,7 @@ def test_numbers_that_are_not_finite_are_believed_of_agents_that_diverged():
 def test_a_share_that_hangs_is_copied_by_an_idle_worker_and_its_worker_given_up_later():
     bad = {(1, 3): (FOREVER, None)}
     crew = Crew(room=2, fate=lambda *turn: bad.get(turn, (1.0, None)))
-    hand_out = hand_out_of(crew, (1,), (True,))
+    hand_out = hand_out_of(crew, (1,), (1,))
     score(hand_out, 4)  # the first three turns of both, with the start
     before = crew.now
     _, done = score(hand_out, 4)
@@ -232,7 +232,7 @@ def test_a_share_that_hangs_is_copied_by_an_idle_worker_and_its_worker_given_up_
 def test_the_first_answer_counts_and_a_late_one_is_dropped():
     late = {(1, 3): (9.5, None)}
     crew = Crew(room=2, fate=lambda *turn: late.get(turn, (1.0, None)))
-    hand_out = hand_out_of(crew, (1,), (True,))
+    hand_out = hand_out_of(crew, (1,), (1,))
     score(hand_out, 4)
     score(hand_out, 4)
     _, done = score(hand_out, 16)  # the answer comes in this one
@@ -243,7 +243,7 @@ def test_the_first_answer_counts_and_a_late_one_is_dropped():
 def test_nobody_has_more_than_one_copy_of_a_share_at_a_time():
     bad = {(1, 3): (FOREVER, None)}
     crew = Crew(room=4, fate=lambda worker, turn: bad.get((worker, turn), (worker, None)))
-    hand_out = hand_out_of(crew, (1,), (True,))
+    hand_out = hand_out_of(crew, (1,), (1,))
     for _ in range(6):
         score(hand_out, 8)
     copies = [tuple(keys) for at, worker, keys in crew.sent if worker == 1][-1]
@@ -255,7 +255,7 @@ def test_nobody_has_more_than_one_copy_of_a_share_at_a_time():
 def test_trainings_that_take_far_longer_than_those_before_are_let_end():
     # 100 seconds where there was one: given up after 20, 40 and 80 seconds, then waited for.
     crew = Crew(room=1, fate=lambda worker, turn: (100.0 if worker > 1 or turn > 3 else 1.0, None))
-    hand_out = hand_out_of(crew, (1,), (True,))
+    hand_out = hand_out_of(crew, (1,), (1,))
     score(hand_out, 3)
     _, done = score(hand_out, 1)
     assert len(crew.dismissed) == 3 and done[4].shares == 1
@@ -293,7 +293,7 @@ def test_a_share_that_kills_its_workers_ends_the_run():
 
 def test_machines_join_within_and_between_generations():
     crew = Crew(room=1)
-    hand_out = hand_out_of(crew, (1,), (True,))
+    hand_out = hand_out_of(crew, (1,), (1,))
     plain = crew.wait
 
     def wait(timeout_s):
@@ -311,7 +311,7 @@ def test_machines_join_within_and_between_generations():
 
 def test_many_workers_of_one_node_may_go_while_they_are_idle():
     crew = Crew(room=40)
-    hand_out = hand_out_of(crew, (16,), (True,))
+    hand_out = hand_out_of(crew, (16,), (16,))
     score(hand_out, 40 * 16)
     crew.leave(*range(1, 38))
     shares, _ = score(hand_out, 48)  # three shares, each of which is sent to many that are gone
@@ -391,8 +391,8 @@ def test_whatever_workers_do_generations_are_whole_and_right(seed):
     crew = Crew(room=rng.randint(1, 6), fate=fate)
     families = [rng.randint(1, 40) for _ in range(rng.randint(1, 3))]
     capacities = [rng.randint(1, 16) for _ in families]
-    lockstep = [rng.random() < 0.5 for _ in families]
-    hand_out = hand_out_of(crew, capacities, lockstep, patience_s=60.0)
+    lanes = [rng.choice([1, capacity]) for capacity in capacities]
+    hand_out = hand_out_of(crew, capacities, lanes, patience_s=60.0)
     plain = crew.wait
 
     def wait(timeout_s):
@@ -447,7 +447,7 @@ def require_equal_numbers(words, generations, num_seeds=1, length=1):
     crew = InProcess(program, capacities)
     local = session.Chunks(program)
     finished = []
-    with RemoteChunks(program, hand_out_of(crew, capacities, [False] * len(capacities))) as remote:
+    with RemoteChunks(program, hand_out_of(crew, capacities, [1] * len(capacities))) as remote:
         keys = jax.vmap(jax.random.key)(jnp.arange(num_seeds))
         state, other = local.init(keys), remote.init(keys)
         for _ in range(generations):
@@ -501,7 +501,7 @@ def test_so_do_all_kinds_of_agents_and_strategies(case):
 
 
 def test_without_ray_one_line_says_what_to_install(monkeypatch):
-    monkeypatch.setattr(configs, "find_spec", lambda name: None)
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     with pytest.raises(
         ConfigError,
         match=r"^machines must be .*pip install 'sejax\[ray\]', or set "
@@ -510,22 +510,22 @@ def test_without_ray_one_line_says_what_to_install(monkeypatch):
         sejax.config(["machines=ray"])  # fmt: skip
 
 
-def test_one_module_imports_ray_and_one_function_that_module():
+def test_ray_is_imported_where_a_run_or_a_search_asks_for_it_alone():
     sources = {path.name: path.read_text() for path in Path(sejax.__file__).parent.rglob("*.py")}
-    found = [
-        name for name, text in sources.items() if re.search(r"^ *(import|from) ray\b", text, re.M)
-    ]
-    assert found == ["ray_crew.py"]
-    found = [name for name, text in sources.items() if re.search(r"import.* ray_crew", text)]
-    assert (
-        found == ["configs.py"]
-        and "\n        from sejax.machines import ray_crew" in sources[found[0]]
-    )
+
+    def importing(what):
+        return {name for name, text in sources.items() if re.search(what, text, re.M)}
+
+    assert importing(r"^ *(import|from) ray\b") == {"ray_crew.py", "cluster.py"}
+    assert importing(r"^(import|from) .*\b(ray_crew|cluster)$") == {"cluster.py"}
+    within = importing(r"^ +from sejax.machines import ray_crew$")
+    assert within == {"configs.py"}
+    assert importing(r"^ +from sejax.search import cluster$") == {"__main__.py"}
 
 
 def test_devices_are_the_workers_own(monkeypatch):
-    monkeypatch.setattr(configs, "find_spec", lambda name: "there")
-    with pytest.raises(ConfigError, match=r"^devices must be left out with machines=ray.*got 2\."):
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: "there")
+    with pytest.raises(ConfigError, match=r"^devices must be left out .*got 2\."):
         sejax.config(["machines=ray", "devices=2"])
     assert sejax.config(["machines=ray", "machines.workers=3"]).machines.workers == 3
     with pytest.raises(ConfigError, match=r"^machines\.workers must be"):
