@@ -5,8 +5,8 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: run test test-slow test-examples test-trackers test-lowest test-latest lint typecheck docs \
-    linkcheck dist clean
+.PHONY: run test test-slow test-examples test-trackers test-ray test-lowest test-latest lint typecheck \
+    docs linkcheck dist clean
 
 run: $(VENV)/.installed
 	$(BIN)/python -m sejax.run env=cartpole stop_when_solved=true
@@ -19,10 +19,10 @@ test-slow: $(VENV)/.installed-dev
 
 # --- with packages that the suite leaves out, each in an environment of its own in build/ -----------
 
-test-examples test-trackers test-lowest test-latest:
+test-examples test-trackers test-ray test-lowest test-latest:
 	$(PYTHON) -m venv --clear build/$@
 	build/$@/bin/python -m pip install --quiet $(PACKAGES) pytest pytest-xdist chex hypothesis
-	build/$@/bin/python -m pytest -n 2 --dist loadfile $(TESTS:%=tests/test_%.py)
+	build/$@/bin/python -m pytest $(OPTIONS) -n 2 --dist loadfile $(TESTS:%=tests/test_%.py)
 
 # Stable-Baselines3, sbx, rejax. On Linux, PyPI's torch brings CUDA along; PIP_EXTRA_INDEX_URL may name
 # an index that has it without.
@@ -32,6 +32,11 @@ test-examples: TESTS := examples gym_sb3
 # The newest trackers: trackio and constraints.txt have no pillow in common.
 test-trackers: PACKAGES := --editable '.[tensorboard,trackio,wandb]'
 test-trackers: TESTS := trackers
+
+# A Ray cluster of two nodes on this machine, whose processes are killed and stopped: half an hour.
+test-ray: PACKAGES := --constraint constraints.txt --editable '.[ray]'
+test-ray: TESTS := ray
+test-ray: OPTIONS := -m slow
 
 # A part of the suite with the oldest versions that pyproject.toml allows, and with the newest.
 test-lowest: PACKAGES := --constraint constraints-lowest.txt --editable '.[gym,hub,mujoco]' imageio

@@ -129,6 +129,37 @@ def test_machines_are_where_trials_are_made_and_no_setting():
         settings.read(["machines=slurm", "es.noise_std=0.1,0.2"])
 
 
+@pytest.mark.parametrize(
+    ("text", "value", "parameter"),
+    [("choice(tanh, relu)", "relu", "relu"), ("choice(true, false)", True, "true"),
+     ("choice(tanh, relu)", "prelu", None), ("interval(0.1, 1)", 1, 1.0),
+     ("interval(0.1, 1)", 2.0, None), ("int(interval(1, 10))", 3, 3),
+     ("range(16, 65, 16)", 40, None), ("interval(0.1, 1)", "often", None),
+     ("tag(log, inverse, interval(0.9, 0.999))", 0.99, 0.01)],
+)  # fmt: skip
+def test_a_value_has_its_place_in_a_range_or_none(text, value, parameter):
+    dimension = spaces.parse("a.b", text)
+    assert dimension.parameter_of(value) == parameter
+    if parameter is not None:
+        found = dimension.of({dimension.parameter: parameter})
+        assert found == {True: "true"}.get(value, f"{value}") or float(found) == value
+
+
+def test_what_one_has_is_tried_first(tmp_path):
+    pytest.importorskip("optuna")
+    from sejax.search import study
+
+    words = ["env=cartpole", "space=paper_se", f"search_dir={tmp_path}"]
+    search = settings.read(words)
+    usual = settings.fields_of(search, compose.config(["env=cartpole"]))
+    found, search = study.open_study(search, usual)
+    study.open_study(search, usual)  # who joins adds none
+    (first,) = found.trials
+    asked = first.system_attrs["fixed_params"]
+    assert asked["es.noise_std"] == usual["es.noise_std"]
+    assert asked["1 - agent.discount"] == pytest.approx(0.01)
+
+
 def test_each_of_several_agents_has_the_ranges_of_its_own():
     search = settings.read(["agents=[ddqn,ppo]", "space=agent", "agents.ppo.discount=0.9"])
     assert search.fixed == ("agent=ddqn+ppo", "agents.ppo.discount=0.9")

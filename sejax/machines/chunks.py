@@ -31,8 +31,8 @@ class RemoteChunks:
         self._hand_out, self._ledger = hand_out, ledger
         # One program asks and tells, and runs twice in a generation: XLA fuses what is told with
         # what was asked, so that two would round candidates otherwise than `Program.generation`.
-        self._compiled: dict[int, Any] = {}
-        self._shapes: dict[int, Outcome] = {}  # of a generation's outcome, by the number of seeds
+        self._compiled: dict[int, Any] = {}  # by the number of seeds
+        self._shapes: dict[int, Outcome] = {}  # of a generation's outcome, likewise
 
     def __enter__(self) -> "RemoteChunks":
         return self
@@ -60,6 +60,7 @@ class RemoteChunks:
           ConfigError: if none gets ready.
         """
         program = self.program
+        self._hand_out.start()  # workers compile meanwhile
 
         def generation(state: Any, outcome: Outcome) -> tuple[Any, ...]:
             asked = program.ask(state)
@@ -67,10 +68,10 @@ class RemoteChunks:
             return program.tell(state, asked, outcome), trials
 
         keys = jax.random.split(jax.random.key(0), num_seeds)
-        self._shapes[num_seeds] = self._outcome_shapes(num_seeds)
-        shapes = jax.eval_shape(program.init, keys), self._shapes[num_seeds]
+        state = jax.eval_shape(program.init, keys)
+        self._shapes[num_seeds] = self._outcome_shapes(num_seeds, state)
         jitted = jax.jit(generation, compiler_options=compiler_options())
-        self._compiled[num_seeds] = jitted.lower(*shapes).compile()
+        self._compiled[num_seeds] = jitted.lower(state, self._shapes[num_seeds]).compile()
         self._hand_out.get_ready()
 
     def advance(self, state: Any, length: int) -> tuple[Any, Any]:
@@ -125,8 +126,10 @@ class RemoteChunks:
         if self._ledger is not None:
             about = {worker: self._hand_out.about(worker) for worker in done}
             self._ledger.write(int(state.generation.max()), wall_s, about, done)
-        merged = {name: np.zeros((num_seeds * num_trials, *x.shape[2:]), x.dtype)
-                  for name, x in vars(shapes).items()}  # fmt: skip
+        merged: dict[str, Any] = {
+            name: np.zeros((num_seeds * num_trials, *x.shape[2:]), x.dtype)
+            for name, x in vars(shapes).items()
+        }
         for share, outcome in outcomes:
             for name, x in outcome.items():
                 merged[name][share.places] = x
@@ -135,10 +138,9 @@ class RemoteChunks:
         }
         return Outcome(**leaves)
 
-    def _outcome_shapes(self, num_seeds: int) -> Outcome:
-        """Shapes and types of a generation's outcome."""
+    def _outcome_shapes(self, num_seeds: int, state: Any) -> Outcome:
+        """Shapes and types of a generation's outcome, of those of its state."""
         program = self.program
-        state = jax.eval_shape(program.init, jax.random.split(jax.random.key(0), num_seeds))
         num_trials = len(program.family_of_trial)
         keys = jax.random.split(jax.random.key(0), 1)
         test_steps = jax.eval_shape(program.test_steps, state)

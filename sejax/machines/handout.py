@@ -21,9 +21,13 @@ from sejax.machines.scorer import About, Scored, Work
 COPIED_AFTER = 2.0  # times what a share has been seen to take, until another worker begins it too
 GIVEN_UP_AFTER = 10.0  # times that, until its worker counts as hanging
 LEAST_S = 20.0  # before which none counts as hanging
-MOST_FAILURES = 5  # of one share, or of workers that start: that is no accident any more
+MOST_FAILURES = 5  # of one share, or of starts in succession: that is no accident any more
 LOOK_S = 1.0  # between looks at what hangs, and for machines that have come
 ALONE_S = 30.0  # without any worker, until somebody is told
+
+
+class Lost(Exception):
+    """A worker is gone, whatever it did."""
 
 
 class Crew(Protocol):
@@ -40,19 +44,26 @@ class Crew(Protocol):
 
         Returns:
           The workers, each with an `About` if it has got ready, a `Scored`, or the exception by
-          which it failed or was lost.
+          which it failed; `Lost` if it is gone.
         """
 
     def dismiss(self, worker: Hashable) -> None:
         """Ends a worker, whatever it does."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class Share:
-    """Trials of one family: their places among all `[seed, trial]` of a generation, flat."""
+    """Trials of one family.
+
+    Attributes:
+      family: index.
+      places: of the trials among all `[seed, trial]` of a generation, flat.
+      failures: workers that have failed at them.
+    """
 
     family: int
     places: np.ndarray
+    failures: int = 0
 
 
 @dataclass
@@ -117,16 +128,20 @@ class HandOut:
         self._known: dict[Hashable, About] = {}
         # Longest seconds a trial, by family: in the last generation and in this one.
         self._seen: list[dict[int, float]] = [{}, {}]
-        self._failed_starts = 0
+        self._failed_starts, self._start_failed_at = 0, -np.inf
         self._looked = self._staffed = clock()
 
     def about(self, worker: Hashable) -> About:
         """Who a worker that was given a share is."""
         return self._known[worker]
 
+    def start(self) -> None:
+        """Starts workers, without waiting for them to get ready."""
+        self._look()
+
     def get_ready(self) -> None:
         """Waits until the first worker is ready; raises as `score` does."""
-        self._look()
+        self.start()
         while not any(hand.about for hand in self._hands.values()):
             self._events()
 
@@ -153,6 +168,9 @@ class HandOut:
         plan = _Plan(families, self._capacities, self._lanes)
         done: dict[Hashable, Done] = defaultdict(Done)
         self._seen = [self._seen[1] or self._seen[0], {}]
+        # Who goes while it has nothing to do is missed when it is sent something, and no share is
+        # to blame: a node may go with more workers than a share may fail at.
+        idle = {worker for worker, hand in self._hands.items() if hand.about and not hand.share}
         self._look()
         while not plan.is_complete:
             for worker, hand in self._hands.items():
@@ -170,12 +188,13 @@ class HandOut:
                 problem = told(came) if isinstance(came, Exception) else problem_of(share, came)
                 if problem is not None:
                     self._dismiss(worker)
-                    plan.fail(share, problem)
+                    plan.fail(share, problem, not (worker in idle and isinstance(came, Lost)))
                     done[worker].lost += 1
                 elif plan.finish(share, came.outcome):
                     self._note(done[worker], share, came, seconds)
                 else:
                     done[worker].lost += 1
+                idle.discard(worker)
         return plan.outcomes, done
 
     def close(self) -> None:
@@ -231,7 +250,7 @@ class HandOut:
                 self._known[worker] = what
             elif hand.share is None:
                 self._dismiss(worker)
-                self._start_failed(what)
+                self._start_failed(hand, what, now)
             else:
                 ended.append((worker, hand.share, what, now - hand.since))
                 hand.share = None
@@ -248,12 +267,15 @@ class HandOut:
         if hand.about is not None and hand.share is None:
             return np.inf
         expected = self._expected(hand.share) if hand.share else None
-        return max(LEAST_S, GIVEN_UP_AFTER * expected) if expected else self._patience_s
+        if hand.share is None or not expected:
+            return self._patience_s
+        # Twice as long for the next one: it may be the training that takes longer than any before.
+        return max(LEAST_S, GIVEN_UP_AFTER * expected) * 2**hand.share.failures
 
     def _look(self) -> None:
         """Starts workers where machines have come, or others were lost."""
         now = self._looked = self._clock()
-        if self._failed_starts < MOST_FAILURES:
+        if self._failed_starts < MOST_FAILURES or not self._hands:
             for worker in self._crew.recruit():
                 self._hands[worker] = _Hand(now)
         if self._hands:
@@ -262,8 +284,10 @@ class HandOut:
             self._staffed = now
             self._say("No machine has room for a worker; waiting for one.")
 
-    def _start_failed(self, error: Exception) -> None:
-        self._failed_starts += 1
+    def _start_failed(self, hand: _Hand, error: Exception, now: float) -> None:
+        if hand.since >= self._start_failed_at:  # those before may have gone with one node
+            self._failed_starts += 1
+            self._start_failed_at = now
         is_hopeless = isinstance(error, ConfigError) or self._failed_starts >= MOST_FAILURES
         if is_hopeless and not any(hand.about for hand in self._hands.values()):
             if isinstance(error, ConfigError):
@@ -272,7 +296,7 @@ class HandOut:
                 f"machines must have workers that get ready, because they compute; the last "
                 f"{MOST_FAILURES} did not: {told(error)}. Install what the driver has on each."
             ) from error
-        if self._failed_starts == MOST_FAILURES:
+        if self._failed_starts == MOST_FAILURES and self._start_failed_at == now:
             self._say(f"No more workers are started, as the last {MOST_FAILURES} did not get ready "
                       f"({told(error)}).")  # fmt: skip
 
@@ -292,7 +316,6 @@ class _Plan:
         self._capacities, self._lanes = capacities, lanes
         self._again: deque[Share] = deque()
         self._holders: dict[Share, int] = {}  # workers that have a share which is not done
-        self._failures: dict[Share, int] = defaultdict(int)
 
     @property
     def is_complete(self) -> bool:
@@ -323,16 +346,16 @@ class _Plan:
         self.outcomes.append((share, outcome))
         return True
 
-    def fail(self, share: Share, problem: str) -> None:
-        """A worker will not bring the share.
+    def fail(self, share: Share, problem: str, counts: bool) -> None:
+        """A worker will not bring the share; `counts`: that may be because of the share.
 
         Raises:
           RuntimeError: if that has happened too often.
         """
         if share not in self._holders:
             return
-        self._failures[share] += 1
-        if self._failures[share] >= MOST_FAILURES:
+        share.failures += counts
+        if share.failures >= MOST_FAILURES:
             raise RuntimeError(
                 f"{MOST_FAILURES} workers have failed at the same {len(share.places)} trainings, "
                 f"the last one so: {problem}"

@@ -17,7 +17,7 @@ import ray
 from sejax.errors import ConfigError, told
 from sejax.machines import scorer
 from sejax.machines.chunks import CAPACITY, RemoteChunks
-from sejax.machines.handout import HandOut
+from sejax.machines.handout import HandOut, Lost
 from sejax.machines.ledger import Ledger
 
 if TYPE_CHECKING:
@@ -165,9 +165,9 @@ def result_of(reference: Any) -> Any:
         return error.cause if isinstance(error.cause, Exception) else error
     except ray.exceptions.ActorDiedError as error:
         words = [line.strip() for line in str(error).splitlines() if line.strip()]
-        return RuntimeError(words[-1])  # the lines before are of Ray's own code
+        return Lost(words[-1])  # the lines before are of Ray's own code
     except ray.exceptions.RayError as error:
-        return error
+        return Lost(told(error))
 
 
 def num_workers(machines: "RayConfig") -> int:

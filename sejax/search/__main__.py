@@ -24,9 +24,12 @@ def main(words: Sequence[str]) -> None:
                           "with pip install 'sejax[search]'.")  # fmt: skip
     from sejax.search import results, study
 
+    usual = None
     if not search.names_study_alone:  # before a study is made of it
-        settings.require_fields(search, study.runner_of(search).config([]))
-    found, search = study.open_study(search)
+        config = study.runner_of(search).config([])
+        settings.require_fields(search, config)
+        usual = settings.fields_of(search, config)
+    found, search = study.open_study(search, usual)
     runner = study.runner_of(search)
     runtime.enable_compilation_cache()
     print(f"Study {search.study} in {search.folder}: {', '.join(search.space)}.", flush=True)

@@ -245,6 +245,18 @@ def _as_file_name(name: str) -> str:
     return re.sub(r"[^\w.+-]+", "_", name)
 
 
+def fields_of(search: Search, config: Any) -> dict[str, Any]:
+    """Values of all fields of the command, of its choices too, by their names on the command line.
+
+    Args:
+      search: what is searched.
+      config: of the command with the fixed words alone.
+    """
+    groups = build.EVALUATE_GROUPS if search.is_of_agent else build.LEARN_GROUPS
+    values = serialize.flatten(build.to_plain(config))
+    return {**{group: values.get(f"{group}.name") for group in groups}, **values}
+
+
 def require_fields(search: Search, config: Any) -> None:
     """Checks that what is searched are fields of the command.
 
@@ -255,8 +267,7 @@ def require_fields(search: Search, config: Any) -> None:
     Raises:
       ConfigError: if one is not.
     """
-    groups = build.EVALUATE_GROUPS if search.is_of_agent else build.LEARN_GROUPS
-    known = {*serialize.flatten(build.to_plain(config)), *groups}
+    known = fields_of(search, config)
     for name in search.space:
         if name not in known:
             close = nearest(name, known)[:5]

@@ -9,7 +9,7 @@ import logging
 import time
 import warnings
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -52,8 +52,15 @@ def runner_of(search: Search) -> Runner:
     return Learning(search)
 
 
-def open_study(search: Search) -> tuple[optuna.Study, Search]:
+def open_study(
+    search: Search, usual: Mapping[str, Any] | None = None
+) -> tuple[optuna.Study, Search]:
     """Makes the study, or joins one that is there.
+
+    Args:
+      search: what is searched.
+      usual: values of fields, by name, that a new study tries first: what one has is what one wants
+        to beat. Not tried if they are not among what is searched.
 
     Returns:
       The study, and what it searches: with `study=NAME` and no word of what to search, that is what
@@ -76,7 +83,7 @@ def open_study(search: Search) -> tuple[optuna.Study, Search]:
         if stored is not None:
             joined = _joined(search, stored)
             if joined.config.heartbeat != search.config.heartbeat:
-                return open_study(joined)  # each worker goes by the same
+                return open_study(joined, usual)  # each worker goes by the same
             search = joined
             study.sampler, study.pruner = _sampler(search), _pruner(search)
         else:
@@ -84,6 +91,11 @@ def open_study(search: Search) -> tuple[optuna.Study, Search]:
                     "search otherwise", "none", "space=paper_se, or es.noise_std='tag(log, "
                     "interval(0.01, 0.3))'")  # fmt: skip
             study.set_user_attr(STORED, search.stored())
+            first = {x.parameter: x.parameter_of(usual.get(name))
+                     for name, x in search.space.items()} if usual else {}  # fmt: skip
+            if first and None not in first.values():
+                with _unchanged():
+                    study.enqueue_trial(first)
     except optuna.exceptions.StorageInternalError as error:
         raise _unusable(search, error) from error
     return study, search

@@ -1,0 +1,296 @@
+"""Runs on a Ray cluster of two nodes here, whose processes are killed and stopped meanwhile.
+
+They need the extra `ray`, which `dev` has not (70 MB): `make test-ray`. Other clusters of this
+machine are left alone: ports and folders are our own, and so are the processes that are ended.
+"""
+
+import contextlib
+import csv
+import importlib.util
+import os
+import random
+import secrets
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import pytest
+from safetensors.numpy import load_file
+
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(
+        importlib.util.find_spec("ray") is None, reason="needs the extra ray: make test-ray"
+    ),
+]
+
+RUN = [sys.executable, "-m", "sejax.run", "env=cartpole", "es.population_size=8",
+       "generations=12", "checkpoint_every=1"]  # fmt: skip
+ENVIRONMENT = {
+    **{name: x for name, x in os.environ.items() if not name.startswith(("XLA_FLAGS", "RAY_"))},
+    "PYTHONPATH": str(Path(__file__).parents[1]),
+    "RAY_AUTH_MODE": "token",
+    "RAY_AUTH_TOKEN": secrets.token_hex(32),
+    "RAY_USAGE_STATS_ENABLED": "0",
+    "RAY_worker_niceness": "0",  # beside whatever else runs here
+}
+
+
+def wait_for(what, seconds=120):
+    """What `what()` returns as soon as it is something."""
+    end = time.monotonic() + seconds
+    while not (found := what()):
+        assert time.monotonic() < end
+        time.sleep(0.05)
+    return found
+
+
+def command_line(pid):
+    with contextlib.suppress(OSError):
+        return Path(f"/proc/{pid}/cmdline").read_bytes().replace(b"\0", b" ").decode()
+    return ""
+
+
+def is_there(pid):
+    """Whether a process is, and is no dead one whose parent has not looked."""
+    with contextlib.suppress(OSError):
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    return False
+
+
+def processes(session):
+    """Those of a session: of the process that has begun it, and its descendants."""
+    found = []
+    for pid in (int(path.name) for path in Path("/proc").glob("[0-9]*")):
+        with contextlib.suppress(ProcessLookupError):
+            if os.getsid(pid) == session and is_there(pid):
+                found.append(pid)
+    return found
+
+
+def end(process):
+    """Kills a process and its session."""
+    while found := processes(process.pid):
+        for pid in found:
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGKILL)
+    process.wait()
+
+
+class Node:
+    """A node of one CPU; its processes are those of a session."""
+
+    def __init__(self, folder, *words):
+        self.log = folder / f"{time.monotonic_ns()}.log"
+        with self.log.open("w") as log:
+            self.process = subprocess.Popen(
+                [sys.executable, "-m", "ray.scripts.scripts", "start", "--block", "--num-cpus=1",
+                 "--node-ip-address=127.0.0.1", "--object-store-memory=100000000", *words],
+                start_new_session=True, stdin=subprocess.DEVNULL, stdout=log,
+                stderr=subprocess.STDOUT, env=ENVIRONMENT,
+            )  # fmt: skip
+        wait_for(lambda: "Ray runtime started" in self.log.read_text())
+
+    def workers(self):
+        mine = processes(self.process.pid)
+        return [pid for pid in mine if command_line(pid).startswith("ray::Scorer")]
+
+    def kill(self):
+        end(self.process)
+
+
+class Cluster:
+    """Two nodes."""
+
+    def __init__(self, folder):
+        self.folder = folder
+        with socket.socket() as free:
+            free.bind(("127.0.0.1", 0))
+            self.port = free.getsockname()[1]
+        self.environment = {**ENVIRONMENT, "RAY_ADDRESS": f"127.0.0.1:{self.port}"}
+        self.head = Node(folder, "--head", f"--port={self.port}", f"--temp-dir={folder}",
+                         "--include-dashboard=false")  # fmt: skip
+        self.other = self._join()
+
+    def _join(self):
+        return Node(self.folder, f"--address=127.0.0.1:{self.port}")
+
+    def workers(self):
+        return self.head.workers() + self.other.workers()
+
+    def replace_other(self):
+        """Ends the second node at once; a new one joins."""
+        self.other.kill()
+        self.other = self._join()
+
+    def close(self):
+        self.other.kill()
+        self.head.kill()
+
+
+@pytest.fixture(scope="module")
+def folder():
+    """A folder whose path is short, as that of a socket must be."""
+    with tempfile.TemporaryDirectory(prefix="sejax", ignore_cleanup_errors=True) as made:
+        yield Path(made)
+
+
+@pytest.fixture(scope="module")
+def cluster(folder):
+    made = Cluster(folder)
+    yield made
+    made.close()
+
+
+class Driver:
+    """A command, as a process."""
+
+    def __init__(self, folder, *words, environment=ENVIRONMENT):
+        self.folder = folder
+        folder.mkdir(exist_ok=True)
+        self.log = folder / f"{time.monotonic_ns()}.log"
+        with self.log.open("w") as log:
+            self.process = subprocess.Popen([*RUN, f"run_dir={folder / 'run'}", *words],
+                                            stdin=subprocess.DEVNULL, stdout=log,
+                                            stderr=subprocess.STDOUT, env=environment,
+                                            start_new_session=True)  # fmt: skip
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        end(self.process)
+
+    def wait(self, status=0):
+        assert self.process.wait(timeout=500) == status, self.log.read_text()
+
+    def generations(self):
+        path = self.folder / "run" / "metrics.csv"
+        return len(path.read_text().splitlines()) - 1 if path.exists() else 0
+
+
+def results(folder):
+    """What must not differ: metrics without times, and the proxies' weights."""
+    with (folder / "run" / "metrics.csv").open(newline="") as file:
+        rows = [{k: x for k, x in row.items() if k != "wall_s"} for row in csv.DictReader(file)]
+    weights = {
+        (name, layer): x.tolist()
+        for name in ("proxy", "proxy_last")
+        for layer, x in load_file(folder / "run" / f"{name}.safetensors").items()
+    }
+    return rows, weights
+
+
+@pytest.fixture(scope="module")
+def wanted(tmp_path_factory):
+    """What a run of this process gives."""
+    folder = tmp_path_factory.mktemp("local")
+    with Driver(folder, "devices=1") as driver:
+        driver.wait()
+    return results(folder)
+
+
+@pytest.fixture(scope="module")
+def seconds(cluster, wanted, tmp_path_factory):
+    """How long an undisturbed run takes from its first worker on."""
+    folder = tmp_path_factory.mktemp("undisturbed")
+    with Driver(folder, "machines=ray", environment=cluster.environment) as driver:
+        wait_for(cluster.workers)
+        started = time.monotonic()
+        driver.wait()
+    assert results(folder) == wanted
+    return time.monotonic() - started
+
+
+def kill_worker(cluster, driver, rng):
+    os.kill(rng.choice(wait_for(cluster.workers)), signal.SIGKILL)
+
+
+def kill_node(cluster, driver, rng):
+    cluster.replace_other()
+
+
+def kill_driver(cluster, driver, rng):
+    driver.process.kill()
+    driver.process.wait()
+    return Driver(driver.folder, "machines=ray", environment=cluster.environment)
+
+
+def stop_worker(cluster, driver, rng):
+    os.kill(rng.choice(wait_for(cluster.workers)), signal.SIGSTOP)
+
+
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("fault", [kill_worker, kill_node, kill_driver, stop_worker])
+def test_a_run_has_the_same_rows_whatever_is_killed_or_stopped_and_when(
+    cluster, wanted, seconds, tmp_path, fault, seed
+):
+    rng = random.Random(f"{fault.__name__} {seed}")
+    with Driver(tmp_path, "machines=ray", environment=cluster.environment) as driver:
+        wait_for(cluster.workers)
+        moment = rng.uniform(0, 0.9 * seconds)
+        time.sleep(moment)
+        saved, there = driver.generations(), set(cluster.workers())
+        started = time.monotonic()
+        with fault(cluster, driver, rng) or contextlib.nullcontext(driver) as last:
+            last.wait()
+    took = time.monotonic() - started
+    with (tmp_path / "run" / "machines.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    print(f"{fault.__name__} after {moment:.1f} s, {saved} generations saved; {took:.1f} s more, "
+          f"{len({row['pid'] for row in rows})} workers, {sum(int(x['lost']) for x in rows)} "
+          f"shares lost; {last.log.read_text().count(chr(10))} lines said")  # fmt: skip
+    assert results(tmp_path) == wanted
+    wait_for(lambda: not any(map(is_there, there)))
+
+
+def test_a_run_goes_on_with_or_without_the_cluster(cluster, wanted, tmp_path):
+    for generations, machines in ((4, "local"), (8, "ray"), (12, "local")):
+        words = f"machines={machines}", f"generations={generations}"
+        with Driver(tmp_path, *words, environment=cluster.environment) as driver:
+            driver.wait()
+    assert results(tmp_path) == wanted
+
+
+def test_a_stopped_worker_is_given_up_and_another_started(cluster, tmp_path):
+    words = "machines=ray", "generations=1000"
+    with Driver(tmp_path, *words, environment=cluster.environment) as driver:
+        wait_for(lambda: len(cluster.workers()) == 2 and driver.generations() > 2)
+        there = set(cluster.workers())
+        stopped = min(there)
+        started = time.monotonic()
+        os.kill(stopped, signal.SIGSTOP)
+        wait_for(lambda: not is_there(stopped), 300)
+        print(f"gone after {time.monotonic() - started:.1f} s")
+        (new,) = wait_for(lambda: set(cluster.workers()) - there)
+        wait_for(lambda: f",{new}," in (tmp_path / "run" / "machines.csv").read_text())
+
+
+def test_a_stopped_worker_of_a_killed_driver_makes_room(cluster, wanted, tmp_path):
+    with Driver(tmp_path, "machines=ray", environment=cluster.environment) as driver:
+        wait_for(driver.generations)
+        stopped = cluster.workers()
+        for pid in stopped:
+            os.kill(pid, signal.SIGSTOP)
+    with Driver(tmp_path, "machines=ray", environment=cluster.environment) as driver:
+        driver.wait()
+    assert results(tmp_path) == wanted
+    assert not any(map(is_there, stopped))
+
+
+@pytest.mark.parametrize("given", [signal.SIGINT, signal.SIGKILL])
+def test_nothing_is_left_of_a_driver_that_started_its_own_ray(folder, tmp_path, given):
+    environment = ENVIRONMENT | {"RAY_ADDRESS": "local", "RAY_TMPDIR": str(folder)}
+    words = "machines=ray", "machines.workers=2", "generations=1000"
+    with Driver(tmp_path, *words, environment=environment) as driver:
+        wait_for(driver.generations)
+        driver.process.send_signal(given)
+        driver.wait({signal.SIGINT: 130, signal.SIGKILL: -signal.SIGKILL}[given])
+        wait_for(lambda: not processes(driver.process.pid))
+    said = driver.log.read_text().splitlines()
+    left = [line for line in said if not line.startswith("generation ")]
+    assert len(left) == (given == signal.SIGINT), left
