@@ -26,6 +26,7 @@ import dataclasses
 import functools
 import importlib
 import importlib.metadata
+import importlib.util
 import inspect
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -228,6 +229,22 @@ def make(group: str, config: Any, *arguments: Any) -> Any:
         if "unhashable" not in str(error):
             raise
         return _checked(group, config, config.make(*arguments))
+
+
+def require_package(group: str, config: Any, reason: str) -> None:
+    """Checks that the package which a plugin names as its `package` is there; imports nothing.
+
+    Raises:
+      ConfigError: if it is not.
+    """
+    package = getattr(config, "package", None)
+    if package is not None and importlib.util.find_spec(package) is None:
+        name, usual = name_of(group, config), next(iter(GROUPS[group].built_in))
+        raise ConfigError(
+            f"{group} must be one that is installed, because {reason}; got {name} without the "
+            f"package {package}. Install it with pip install 'sejax[{name}]', or set "
+            f"{group}={usual}."
+        )
 
 
 class Same:

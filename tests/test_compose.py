@@ -79,7 +79,7 @@ def test_a_task_chooses_its_agent_where_none_is_chosen():
 def test_without_overrides_it_is_the_best_cartpole_se():
     composed = composed_with()
     names = [composed.name(group) for group in plugins.GROUPS]
-    assert names == ["cartpole", "ddqn", "none", "se", "max_reward", "nes", "none"]
+    assert names == ["cartpole", "ddqn", "none", "se", "max_reward", "nes", "none", "local"]
     assert composed.preset == "best"
     assert str(composed.resolved_run_dir) == "runs/cartpole-se-ddqn-s0"
 

@@ -101,6 +101,14 @@ def test_every_variant_pays_what_its_equation_says(tmp_path, variant, zero_at_te
     assert terminated
 
 
+def test_a_network_pays_its_output_times_its_scale(tmp_path):
+    path, weights = stored_rn(tmp_path, 2, variant="exclusive_non_potential", output_scale=0.1)
+    env = RewardNetwork(Walk(), path)
+    env.reset()
+    obs, reward, *_ = env.step([0.5])
+    assert reward == pytest.approx(0.1 * phi(weights, obs), abs=1e-6)
+
+
 @pytest.mark.parametrize("limit_is_terminal", [False, True])
 def test_the_step_limit_is_an_end_for_whom_it_is_one(tmp_path, limit_is_terminal):
     path, weights = stored_rn(tmp_path, 2, variant="exclusive_non_potential", zero_at_terminal=True)

@@ -14,6 +14,7 @@ ROOT = Path(__file__).parents[1] / "sejax"
 LAYERS = [
     {"search"},
     {"run", "evaluate", "report", "experiments"},
+    {"machines"},
     {"app"},
     {"bilevel"},
     {"evaluation"},
@@ -37,7 +38,7 @@ LAYERS = [
     {"errors"},
     {"", "conf"},
 ]
-COMMANDS = ("app", "run", "evaluate", "report", "search", "experiments")
+COMMANDS = ("app", "run", "evaluate", "report", "search", "machines", "experiments")
 
 
 def name_of(path):

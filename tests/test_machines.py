@@ -20,7 +20,7 @@ import sejax
 from sejax.app import session
 from sejax.bilevel import make_program
 from sejax.errors import ConfigError
-from sejax.machines import configs, handout, ledger, scorer
+from sejax.machines import handout, ledger, scorer
 from sejax.machines.chunks import RemoteChunks, problem
 from sejax.machines.handout import HandOut, Lost
 from sejax.machines.scorer import About, Scored, Work
@@ -501,7 +501,7 @@ def test_so_do_all_kinds_of_agents_and_strategies(case):
 
 
 def test_without_ray_one_line_says_what_to_install(monkeypatch):
-    monkeypatch.setattr(configs, "find_spec", lambda name: None)
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     with pytest.raises(
         ConfigError,
         match=r"^machines must be .*pip install 'sejax\[ray\]', or set "
@@ -510,22 +510,16 @@ def test_without_ray_one_line_says_what_to_install(monkeypatch):
         sejax.config(["machines=ray"])  # fmt: skip
 
 
-def test_one_module_imports_ray_and_one_function_that_module():
-    sources = {path.name: path.read_text() for path in Path(sejax.__file__).parent.rglob("*.py")}
-    found = [
-        name for name, text in sources.items() if re.search(r"^ *(import|from) ray\b", text, re.M)
-    ]
-    assert found == ["ray_crew.py"]
-    found = [name for name, text in sources.items() if re.search(r"import.* ray_crew", text)]
-    assert (
-        found == ["configs.py"]
-        and "\n        from sejax.machines import ray_crew" in sources[found[0]]
-    )
+def test_ray_is_imported_by_two_modules_that_others_import_where_it_is_asked_for():
+    imports = r"^(import ray\b|from ray\b|from sejax\.\w+ import .*\b(ray_crew|cluster)\b)"
+    found = {path.name for path in Path(sejax.__file__).parent.rglob("*.py")
+             if re.search(imports, path.read_text(), re.MULTILINE)}  # fmt: skip
+    assert found == {"ray_crew.py", "cluster.py"}
 
 
 def test_devices_are_the_workers_own(monkeypatch):
-    monkeypatch.setattr(configs, "find_spec", lambda name: "there")
-    with pytest.raises(ConfigError, match=r"^devices must be left out with machines=ray.*got 2\."):
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: "there")
+    with pytest.raises(ConfigError, match=r"^devices must be left out with trainings .*got 2\."):
         sejax.config(["machines=ray", "devices=2"])
     assert sejax.config(["machines=ray", "machines.workers=3"]).machines.workers == 3
     with pytest.raises(ConfigError, match=r"^machines\.workers must be"):

@@ -75,6 +75,19 @@ def test_rewards_are_those_of_the_table(task, variant):
         np.testing.assert_allclose(reward, expected, rtol=1e-5, atol=1e-6)
 
 
+def test_phi_is_the_networks_output_times_its_scale():
+    env = make_env("cliff_walking", "additive_non_potential", output_scale=0.1)
+    weights = env.init_weights(jax.random.key(1))
+    for _, _, reward, next_obs, _, real in trajectory(env, weights, [3, 0, 1, 2]):
+        expected = real + 0.1 * phi(env, weights, next_obs)
+        np.testing.assert_allclose(reward, expected, rtol=1e-5, atol=1e-6)
+
+
+def test_weighted_info_has_no_output_to_scale():
+    with pytest.raises(ConfigError, match=r"output_scale must be 1 .* got 0\.1\."):
+        RewardConfig(variant="additive_weighted_info", output_scale=0.1)
+
+
 def test_everything_but_the_reward_is_the_real_tasks():
     env = make_env("cartpole")
     task, params = env.task, env.default_params

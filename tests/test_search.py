@@ -23,7 +23,8 @@ optuna = pytest.importorskip("optuna", reason="needs Optuna: pip install 'sejax[
 
 from sejax.app import compose  # noqa: E402
 from sejax.errors import ConfigError  # noqa: E402
-from sejax.search import results, settings, spaces, study, trials  # noqa: E402
+from sejax.search import results, settings, spaces, study, trials, verification  # noqa: E402
+from sejax.search.learning import Learning  # noqa: E402
 from sejax.search.trials import Follower, Progress  # noqa: E402
 
 SPACE = "es.noise_std=interval(0.1, 0.9)"
@@ -551,3 +552,24 @@ def test_an_agent_is_tuned_on_a_proxy_and_verified_on_the_real_task(tmp_path):
     assert len(table) == 2
     assert table["real_return"].clip(upper=195).is_monotonic_decreasing  # then by steps
     assert (tmp_path / "best.txt").read_text().startswith("python -m sejax.evaluate proxy=cartpole")
+
+
+@pytest.mark.slow
+def test_the_best_are_tried_again_with_other_seeds(tmp_path):
+    words = ["env=gridworld_2x2", "agent=q_learning", "es.noise_std=0.05,0.3", "trials=2",
+             "pruner=none", "sampler_seed=0", "min_generations=1", "max_generations=2",
+             "es.population_size=2",
+             "training.max_steps=50", "verify=1", "fresh_seeds=3", "devices=1"]  # fmt: skip
+    found, search = opened(tmp_path, *words)
+    runner = Learning(search)
+    study.work(found, search, runner, lambda text: None)
+    table = verification.verify(found, search, runner)
+    (best,) = table.to_dict("records")
+    assert best["trial"] == results.ranked(found)[0].number and best["rank"] == 1
+    folder = tmp_path / "verified" / f"{best['trial']:04d}"
+    rows = pd.read_csv(folder / "metrics.csv")
+    assert sorted(set(rows["seed"])) == [1, 2, 3]  # 0 was the trial's
+    last = rows[rows["generation"] == 1]["incumbent_mean"]
+    assert best["mean"] == pytest.approx(last.mean()) and best["worst"] == last.min()
+    runner.verify = None  # what was tried is kept
+    assert verification.verify(found, search, runner).to_dict("records") == [best]

@@ -115,6 +115,51 @@ def test_what_is_fixed_or_has_a_space_of_its_own_is_left_out_of_the_preset():
     assert search.space["proxy.hidden_size"].high == 192
 
 
+def test_a_preset_has_the_ranges_of_the_agent_that_the_task_chooses():
+    search = settings.read(["env=cliff_walking", "proxy=rn", "space=paper_rn"])
+    assert search.study == "cliff_walking-rn-q_learning"
+    assert "agent.epsilon_decay" in search.space and "agent.batch_size" not in search.space
+
+
+def test_machines_are_where_trials_are_made_and_no_setting():
+    search = settings.read(["env=acrobot", "machines=local", "es.noise_std=0.1,0.2"])
+    assert search.fixed == ("env=acrobot",) and not search.machines.is_elsewhere
+    assert "machines" not in search.stored()["fixed"]
+    with pytest.raises(ConfigError, match="machines"):
+        settings.read(["machines=slurm", "es.noise_std=0.1,0.2"])
+
+
+@pytest.mark.parametrize(
+    ("text", "value", "parameter"),
+    [("choice(tanh, relu)", "relu", "relu"), ("choice(true, false)", True, "true"),
+     ("choice(tanh, relu)", "prelu", None), ("interval(0.1, 1)", 1, 1.0),
+     ("interval(0.1, 1)", 2.0, None), ("int(interval(1, 10))", 3, 3),
+     ("range(16, 65, 16)", 40, None), ("interval(0.1, 1)", "often", None),
+     ("tag(log, inverse, interval(0.9, 0.999))", 0.99, 0.01)],
+)  # fmt: skip
+def test_a_value_has_its_place_in_a_range_or_none(text, value, parameter):
+    dimension = spaces.parse("a.b", text)
+    assert dimension.parameter_of(value) == parameter
+    if parameter is not None:
+        found = dimension.of({dimension.parameter: parameter})
+        assert found == {True: "true"}.get(value, f"{value}") or float(found) == value
+
+
+def test_what_one_has_is_tried_first(tmp_path):
+    pytest.importorskip("optuna")
+    from sejax.search import study
+
+    words = ["env=cartpole", "space=paper_se", f"search_dir={tmp_path}"]
+    search = settings.read(words)
+    usual = settings.fields_of(search, compose.config(["env=cartpole"]))
+    found, search = study.open_study(search, usual)
+    study.open_study(search, usual)  # who joins adds none
+    (first,) = found.trials
+    asked = first.system_attrs["fixed_params"]
+    assert asked["es.noise_std"] == usual["es.noise_std"]
+    assert asked["1 - agent.discount"] == pytest.approx(0.01)
+
+
 def test_each_of_several_agents_has_the_ranges_of_its_own():
     search = settings.read(["agents=[ddqn,ppo]", "space=agent", "agents.ppo.discount=0.9"])
     assert search.fixed == ("agent=ddqn+ppo", "agents.ppo.discount=0.9")
@@ -168,7 +213,9 @@ def test_a_field_that_does_not_exist_is_not_searched():
 
 def test_stored_searches_read_back():
     search = settings.read(["env=acrobot", "space=paper_se", "seeds=3", "trials=5"])
-    joined = settings.Search.from_stored(search.stored(), settings.SearchConfig(trials=9))
+    joined = settings.Search.from_stored(
+        search.stored(), settings.SearchConfig(trials=9), search.machines
+    )
     assert joined.stored() == search.stored()
     assert (joined.config.seeds, joined.config.trials) == (3, 9)
 

@@ -152,7 +152,7 @@ def test_nobody_is_told_without_a_tracker(tmp_path):
 
 
 def test_a_package_that_is_missing_is_named_before_anything_starts(monkeypatch):
-    monkeypatch.setattr(trackers, "find_spec", lambda name: None)
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     with pytest.raises(ConfigError) as error:
         sejax.config(["tracker=wandb"])
     assert "pip install 'sejax[wandb]'" in str(error.value) and "\n" not in str(error.value)

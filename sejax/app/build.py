@@ -8,11 +8,10 @@ from pathlib import Path
 from typing import Any
 
 from sejax import agents, envs, plugins, serialize
-from sejax.app import families, trackers
+from sejax.app import families
 from sejax.app.families import AgentsConfig, families_of
 from sejax.errors import ConfigError, one_of, require, require_seed, shortened, whole
 from sejax.families import Families
-from sejax.machines import configs as machines
 from sejax.training import TrainingConfig, steps_before_learning
 
 AGENT_HPARAMS = ("default", "varied")
@@ -63,8 +62,12 @@ class LearnConfig:
         require_seed("seed + num_seeds - 1", self.seed + self.num_seeds - 1)
         whole(1, "checkpoint_every", self.checkpoint_every, "it counts generations", 1)
         _require_computing(self)
-        trackers.require_package(self.tracker)
-        machines.require_usable(self.machines, self.devices)
+        plugins.require_package("tracker", self.tracker, "the run is told to it")
+        plugins.require_package("machines", self.machines, "trainings are sent there")
+        elsewhere = getattr(self.machines, "is_elsewhere", False)
+        require(not elsewhere or self.devices is None, "devices", "be left out with trainings on "
+                "other machines", "each worker has one", self.devices, "machines.workers=N in its "
+                "place, or machines=local")  # fmt: skip
         require_real_returns("training", self.training)
         returns = getattr(self.objective, "scores_are_returns", None)
         require(not self.stop_when_solved or returns is not False, "stop_when_solved",

@@ -5,15 +5,13 @@ Each is told what the run directory has; by whom and when, see `sejax.app.follow
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, ClassVar, Protocol
 
 import numpy as np
 import yaml
 
-from sejax import plugins
-from sejax.errors import ConfigError, told
+from sejax.errors import told
 from sejax.serialize import flatten
 
 
@@ -166,19 +164,3 @@ class TrackioConfig:
         name = f"{run.folder.name}-{run.id}"
         config = flatten(run.config)
         return Wandb(trackio, trackio.init(self.project, name, config=config, resume="allow"))
-
-
-def require_package(config: Any) -> None:
-    """Checks that the package of a tracker is there, without importing it.
-
-    Raises:
-      ConfigError: if it is not.
-    """
-    package = getattr(config, "package", None)
-    if package is not None and find_spec(package) is None:
-        name = plugins.name_of("tracker", config)
-        raise ConfigError(
-            f"tracker must be one that is installed, because the run is told to it; got {name} "
-            f"without the package {package}. Install it with pip install 'sejax[{name}]', or set "
-            f"tracker=none."
-        )

@@ -134,7 +134,7 @@ class RewardNetwork(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
         return obs, reward, terminated, truncated, info
 
     def potential(self, obs: Any, told: Any = ()) -> float:
-        """The network's output for an observation, and what `info` told of it if it sees that."""
+        """Phi of an observation, and of what `info` told of it if it sees that."""
         if self._table is not None:
             return self._table[obs]
         if not self._layers:
@@ -160,7 +160,8 @@ class RewardNetwork(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
         return self.discount * after - before if self.config.is_potential_based else after
 
     def _apply(self, inputs: np.ndarray) -> np.ndarray:
-        return networks.forward(self._layers, self.config.activation, inputs)[..., 0]
+        outputs = networks.forward(self._layers, self.config.activation, inputs)
+        return self.config.output_scale * outputs[..., 0]
 
     def _told(self, info: dict[str, Any]) -> np.ndarray:
         """What the RN weighs or sees of a step's `info`, `[info_keys]`."""

@@ -126,16 +126,17 @@ class RemoteChunks:
         if self._ledger is not None:
             about = {worker: self._hand_out.about(worker) for worker in done}
             self._ledger.write(int(state.generation.max()), wall_s, about, done)
-        merged: dict[str, Any] = {
+        merged = {
             name: np.zeros((num_seeds * num_trials, *x.shape[2:]), x.dtype)
             for name, x in vars(shapes).items()
         }
         for share, outcome in outcomes:
             for name, x in outcome.items():
                 merged[name][share.places] = x
-        return Outcome(**{
+        leaves: dict[str, Any] = {
             name: x.reshape(num_seeds, num_trials, *x.shape[1:]) for name, x in merged.items()
-        })  # fmt: skip
+        }
+        return Outcome(**leaves)
 
     def _outcome_shapes(self, num_seeds: int, state: Any) -> Outcome:
         """Shapes and types of a generation's outcome, of those of its state."""

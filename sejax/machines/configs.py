@@ -3,12 +3,9 @@
 import contextlib
 from collections.abc import Callable
 from dataclasses import dataclass
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, ClassVar
 
-from sejax import plugins
-from sejax.errors import ConfigError, require
 from sejax.options import Options, counts, not_negative, option, positive
 
 
@@ -50,23 +47,3 @@ class RayConfig(Options):
         from sejax.machines import ray_crew
 
         return ray_crew.chunks_of(self, config, folder, say)
-
-
-def require_usable(config: Any, devices: int | None) -> None:
-    """Checks what can be checked before anything is imported.
-
-    Raises:
-      ConfigError: without the package that a choice needs, or for devices of this process where it
-        does not compute.
-    """
-    name = plugins.name_of("machines", config)
-    package = getattr(config, "package", None)
-    if package is not None and find_spec(package) is None:
-        raise ConfigError(
-            f"machines must be one that is installed, because trainings are sent there; got {name} "
-            f"without the package {package}. Install it with pip install 'sejax[{name}]', or set "
-            f"machines=local."
-        )
-    elsewhere = getattr(config, "is_elsewhere", False)
-    require(not elsewhere or devices is None, "devices", f"be left out with machines={name}",
-            "each worker has one", devices, "machines.workers=N, or machines=local")  # fmt: skip

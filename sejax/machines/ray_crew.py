@@ -10,21 +10,23 @@ import time
 import warnings
 from collections.abc import Callable, Hashable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import ray
 
 from sejax.errors import ConfigError, told
 from sejax.machines import scorer
 from sejax.machines.chunks import CAPACITY, RemoteChunks
-from sejax.machines.configs import RayConfig
 from sejax.machines.handout import HandOut, Lost
 from sejax.machines.ledger import Ledger
+
+if TYPE_CHECKING:
+    from sejax.machines.configs import RayConfig
 
 
 @contextlib.contextmanager
 def chunks_of(
-    machines: RayConfig, config: Any, folder: Path, say: Callable[[str], None]
+    machines: "RayConfig", config: Any, folder: Path, say: Callable[[str], None]
 ) -> Iterator[RemoteChunks]:
     """Generations of a run on a Ray cluster, which is left at the end.
 
@@ -72,7 +74,7 @@ def connected() -> Iterator[None]:
         ray.shutdown()
 
 
-def require_workers(machines: RayConfig) -> int:
+def require_workers(machines: "RayConfig") -> int:
     """The number of workers that a run has now.
 
     Raises:
@@ -86,11 +88,11 @@ def require_workers(machines: RayConfig) -> int:
             f"on a cluster with {resources.get('GPU', 0):g} GPUs. Set machines.gpus_per_worker=0, "
             f"or machines.workers=N if they will come."
         )
-    return machines.workers or _room(machines, resources) or 1
+    return num_workers(machines) or 1
 
 
 def shares_of(
-    config: Any, program: Any, machines: RayConfig, num_workers: int
+    config: Any, program: Any, machines: "RayConfig", num_workers: int
 ) -> tuple[tuple[int, ...], tuple[bool, ...]]:
     """Most trials in a share, and whether it takes as long with fewer, of each family.
 
@@ -111,7 +113,7 @@ def shares_of(
 class RayCrew:
     """The workers of one run."""
 
-    def __init__(self, machines: RayConfig, config: dict[str, Any], capacities: tuple[int, ...]):
+    def __init__(self, machines: "RayConfig", config: dict[str, Any], capacities: tuple[int, ...]):
         """Of a run's plain configuration, and most trials in a share by family."""
         self._machines = machines
         self._arguments = (config, capacities, scorer.versions())
@@ -123,7 +125,7 @@ class RayCrew:
         self._num_started = 0
 
     def recruit(self) -> list[Hashable]:
-        wanted = self._machines.workers or _room(self._machines, ray.cluster_resources())
+        wanted = num_workers(self._machines)
         new: list[Hashable] = []
         while len(self._actors) < wanted:
             self._num_started += 1
@@ -145,7 +147,7 @@ class RayCrew:
         ready, _ = ray.wait(references, num_returns=1, timeout=timeout_s)
         if ready and len(references) > 1:
             ready, _ = ray.wait(references, num_returns=len(references), timeout=0)
-        return [(self._pending.pop(each), _came(each)) for each in ready]
+        return [(self._pending.pop(each), result_of(each)) for each in ready]
 
     def dismiss(self, worker: Hashable) -> None:
         actor = self._actors.pop(worker, None)
@@ -154,7 +156,7 @@ class RayCrew:
             ray.kill(actor)
 
 
-def _came(reference: Any) -> Any:
+def result_of(reference: Any) -> Any:
     """What a worker returned, or the exception by which it failed or was lost."""
     try:
         return ray.get(reference)
@@ -167,8 +169,11 @@ def _came(reference: Any) -> Any:
         return Lost(told(error))
 
 
-def _room(machines: RayConfig, resources: dict[str, float]) -> int:
-    """Workers that the machines of a cluster have room for."""
+def num_workers(machines: "RayConfig") -> int:
+    """Workers that are asked for, or that the cluster's machines have room for now."""
+    if machines.workers:
+        return machines.workers
+    resources = ray.cluster_resources()
     room = resources.get("CPU", 0.0)
     if machines.gpus_per_worker:
         room = min(room, resources.get("GPU", 0.0) / machines.gpus_per_worker)

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from sejax.errors import require
-from sejax.options import ACTIVATIONS, MOST_LAYERS, Options, counts, one_of, option
+from sejax.options import ACTIVATIONS, MOST_LAYERS, Options, counts, one_of, option, positive
 
 if TYPE_CHECKING:
     from sejax.proxies.proxy import ProxyEnv
@@ -82,6 +82,9 @@ class RewardConfig(Options):
     num_layers: int = option(1, counts("there is a hidden layer", most=MOST_LAYERS))
     activation: str = option("prelu", one_of(ACTIVATIONS))
     variant: str = option("additive_potential", one_of(VARIANTS))
+    # Phi is this times the network's output. Some agents learn only from small rewards
+    # (docs/results.md, MountainCarContinuous).
+    output_scale: float = option(1.0, positive("a reward of 0 teaches nothing", 1e6))
     augmented: bool = False  # the network sees the task's observation vector v as well
     zero_at_terminal: bool = False  # Phi is 0 where episodes end for the agent; see RewardEnv
 
@@ -91,6 +94,9 @@ class RewardConfig(Options):
             require(not (self.weighs_info and getattr(self, name)), f"proxy.{name}",
                     "be false with weighted info", f"{self.variant} has no network",
                     "true", f"proxy.{name}=false")  # fmt: skip
+        require(self.output_scale == 1 or not self.weighs_info, "proxy.output_scale",
+                "be 1 with weighted info", f"{self.variant} has no network", self.output_scale,
+                "proxy.output_scale=1")  # fmt: skip
 
     def require_task(self, facts: Any, task_name: str) -> None:
         """Checks that the task tells what this variant needs.

@@ -62,6 +62,8 @@ class RewardEnv(ProxyEnv):
     with the discount of a whole decision, as in the authors' code; for it the potentials of the
     steps between do not cancel.
 
+    :math:`\Phi` is the network's output times `output_scale`, 1 in the paper.
+
     `augmented` networks see the task's observation vector v as well (`Task.augmented_keys`):
     :math:`\Phi(s, v)` and :math:`\Phi(s', v')`. The authors' code has v' in both, and on
     HalfCheetah the two parts of the reward beside position and velocity. The last two
@@ -116,7 +118,7 @@ class RewardEnv(ProxyEnv):
     def potential(
         self, params: RewardParams, obs: Array, augmentation: Array | tuple[()] = ()
     ) -> Float[Array, ""]:
-        """The network's output for an observation of the task, and v of it if augmented."""
+        r""":math:`\Phi` of an observation of the task, and of v if augmented."""
         if params.potentials is not None:
             return params.potentials[obs]
         if self.task.num_states is not None:
@@ -125,7 +127,8 @@ class RewardEnv(ProxyEnv):
         return self._apply(params.weights, inputs)
 
     def _apply(self, weights: Any, inputs: Float[Array, "in *batch"]) -> Float[Array, "*batch"]:
-        return self._net.apply({"params": weights["potential"]}, inputs)[0]
+        outputs: Any = self._net.apply({"params": weights["potential"]}, inputs)
+        return self.config.output_scale * outputs[0]
 
     def bonus(
         self, params: RewardParams, state: RewardState, next_state: RewardState, info: Any,

@@ -2,15 +2,13 @@
 
 from collections.abc import Sequence
 from importlib.util import find_spec
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from sejax.app import commands, runtime
+from sejax.app.run_lock import acquire
 from sejax.errors import ConfigError
 from sejax.search import settings
 from sejax.search.settings import Search
-
-if TYPE_CHECKING:
-    from sejax.search.study import Runner
 
 
 def main(words: Sequence[str]) -> None:
@@ -26,14 +24,22 @@ def main(words: Sequence[str]) -> None:
                           "with pip install 'sejax[search]'.")  # fmt: skip
     from sejax.search import results, study
 
+    usual = None
     if not search.names_study_alone:  # before a study is made of it
-        settings.require_fields(search, _runner(search).config([]))
-    found, search = study.open_study(search)
-    runner = _runner(search)
+        config = study.runner_of(search).config([])
+        settings.require_fields(search, config)
+        usual = settings.fields_of(search, config)
+    found, search = study.open_study(search, usual)
+    runner = study.runner_of(search)
     runtime.enable_compilation_cache()
     print(f"Study {search.study} in {search.folder}: {', '.join(search.space)}.", flush=True)
     try:
-        study.work(found, search, runner, lambda text: print(text, flush=True))
+        if search.machines.is_elsewhere:
+            from sejax.search import cluster
+
+            cluster.work(found, search, _say)
+        else:
+            study.work(found, search, runner, _say)
     except KeyboardInterrupt:
         print(f"Interrupted. What has ended is saved in {search.folder}, and the trial at hand is "
               f"queued again; the same command goes on from there.")  # fmt: skip
@@ -43,29 +49,30 @@ def main(words: Sequence[str]) -> None:
     if not best:
         print("No trial was completed.")
         return
-    if search.is_of_agent:
-        best = _verified(found, search, runner)
+    if search.num_verified:
+        try:
+            lock = acquire(search.folder / "verification.lock", "Wait for it.")
+        except ConfigError:
+            print("Another worker is at it to try the best ones again.")
+        else:
+            best = _verified(found, search, runner)
+            lock.release()
     print(f"\nThe best:\n  {results.override_line(best, search, runner.command)}")
     print(f"The same:\n  {results.preset_line(search, runner.command)}")
     print(f"{search.folder}/trials.csv, pareto.png, best.txt and preset.yaml hold what was found.")
 
 
-def _runner(search: Search) -> "Runner":
-    if search.is_of_agent:
-        from sejax.search.tuning import Tuning
-
-        return Tuning(search)
-    from sejax.search.learning import Learning
-
-    return Learning(search)
+def _say(text: str) -> None:
+    print(text, flush=True)
 
 
 def _verified(found: Any, search: Search, runner: Any) -> list[str]:
-    """The overrides of the best on the real task."""
+    """The overrides of those that were best when they were tried again."""
     from sejax.search import results, verification
 
     table = verification.verify(found, search, runner)
-    verification.print_table(table, search, runner.config([]).num_agents)
+    num_agents = getattr(runner.config([]), "num_agents", 0)
+    verification.print_table(table, search, num_agents)
     best = found.get_trials(deepcopy=False)[int(table["trial"].iloc[0])]
     words = results.words_of(best, search)
     results.write_best(words, search, runner.command)

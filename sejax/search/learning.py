@@ -13,7 +13,7 @@ from sejax.app.words import word
 from sejax.errors import ConfigError
 from sejax.search.programs import Programs
 from sejax.search.settings import Search
-from sejax.search.trials import Follower, Progress
+from sejax.search.trials import Follower, Progress, whole, worth
 
 
 class Learning:
@@ -25,14 +25,17 @@ class Learning:
         self._search = search
         self._programs = Programs()
 
-    def config(self, words: Sequence[str], folder: Path | None = None) -> build.LearnConfig:
-        """The configuration of a trial.
+    def config(
+        self, words: Sequence[str], folder: Path | None = None, num_seeds: int | None = None
+    ) -> build.LearnConfig:
+        """The configuration of a trial, or of as many other seeds.
 
         Raises:
           ConfigError: if it is none that can run.
         """
         own = [f"generations={self._search.config.max_generations}",
-               f"num_seeds={self._search.config.seeds}", "checkpoint_every=1"]  # fmt: skip
+               f"num_seeds={num_seeds or self._search.config.seeds}",
+               "checkpoint_every=1"]  # fmt: skip
         where = [f"run_dir={word(str(folder))}"] if folder is not None else []
         return compose.config([*self._search.fixed, *words, *own, *where])
 
@@ -56,6 +59,31 @@ class Learning:
                 raise
             shutil.rmtree(config.resolved_run_dir)
             return self._run(config, follower)
+
+    def verify(self, words: Sequence[str], number: int) -> dict[str, float]:
+        """What settings are worth with seeds that no trial has had; goes on where it stopped.
+
+        Args:
+          words: the settings.
+          number: of their trial.
+        """
+        search, usual = self._search, self.config([])
+        fresh = [f"seed={usual.seed + usual.num_seeds}"]
+        folder = search.folder / "verified" / f"{number:04d}"
+        config = self.config([*words, *fresh], folder, search.config.fresh_seeds)
+        with open_for(config, "Set search_dir=FOLDER.") as directory:
+            chunks = self._programs.chunks(config)
+            session.run(config, directory, chunks)
+            progress = progress_of(directory, chunks.program.strategy.num_candidates)
+            lengths = [sum(int(row["seed"]) == seed for row in directory.rows)
+                       for seed in directory.seeds]  # fmt: skip
+        generations = search.config.max_generations
+        return {**worth(whole(progress, generations), generations, search),
+                "generations": float(np.mean(lengths))}  # fmt: skip
+
+    def order(self, row: dict[str, float]) -> tuple[float, float]:
+        """By which the best rows of `verify` come first."""
+        return -row[self._search.config.score], row["generations"]
 
     def _run(self, config: build.LearnConfig, follower: Follower) -> Progress:
         with open_for(config, "Set search_dir=FOLDER.") as directory:

@@ -1,6 +1,7 @@
 """The words of a search: its own fields, what it searches, and what stays fixed."""
 
 import dataclasses
+import functools
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -28,7 +29,15 @@ TAKEN = {
     "out_dir": "search_dir=FOLDER", "checkpoint_every": "min_generations=3",
 }  # fmt: skip
 # Fields that may differ between the workers of a study, and between its sessions.
-FREE_FIELDS = ("trials", "timeout", "storage", "search_dir", "sampler_seed")
+FREE_FIELDS = (
+    "trials",
+    "timeout",
+    "storage",
+    "search_dir",
+    "sampler_seed",
+    "verify",
+    "fresh_seeds",
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,9 +67,10 @@ class SearchConfig(Options):
     search_dir: str | None = None  # null: runs/search-<study>
     timeout: float | None = option(None, positive("no trial would start"))  # s; none starts later
     heartbeat: int = option(15, counts("workers must show that they live"))  # s
-    verify: int = option(
-        10, counts("the best are tried on the real task")
-    )  # of a search on a proxy
+    # The best trials that are tried again, as the best score of many is the luckiest too: on the
+    # real task after a search on a proxy (null: 10), else with seeds that are new (null: 5).
+    verify: int | None = option(None, counts("the best are tried again", least=0))
+    fresh_seeds: int = option(5, counts("the best are tried again with them"))
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -77,17 +87,25 @@ class Search:
       config: the search's own fields.
       fixed: words for all trials.
       space: dimensions by the field's name.
+      machines: where this process has trials made: a plugin's configuration.
     """
 
     config: SearchConfig
     fixed: tuple[str, ...]
     space: dict[str, spaces.Dimension]
+    machines: Any
 
     @property
     def is_of_agent(self) -> bool:
         """Whether agents are tuned on a proxy that exists, in the place of how to learn one."""
         name = self.choice("proxy", "se")
         return name not in plugins.names("proxy") and ":" not in name
+
+    @property
+    def num_verified(self) -> int:
+        """How many of the best are tried again."""
+        usual = 10 if self.is_of_agent else 5
+        return usual if self.config.verify is None else self.config.verify
 
     @property
     def measure(self) -> str:
@@ -97,6 +115,13 @@ class Search:
         """What the fixed words choose of a group."""
         chosen = [w.partition("=")[2] for w in self.fixed if w.startswith(f"{group}=")]
         return chosen[-1] if chosen else default
+
+    @functools.cached_property
+    def agent(self) -> str:
+        """The name of the agent: what is said, or what the task and the proxy choose."""
+        said = self.choice("agent", "ddqn" if self.is_of_agent else "")
+        choices = [word for word in self.fixed if "." not in word.partition("=")[0]]
+        return said or compose.config(choices).name("agent")
 
     @property
     def study(self) -> str:
@@ -124,7 +149,7 @@ class Search:
         }
 
     @classmethod
-    def from_stored(cls, stored: dict[str, Any], config: SearchConfig) -> "Search":
+    def from_stored(cls, stored: dict[str, Any], config: SearchConfig, machines: Any) -> "Search":
         """Inverse of `stored`, with the free fields of a worker's own configuration.
 
         Its folder is that of the study's maker, if that is there and no other is asked for.
@@ -134,6 +159,7 @@ class Search:
         return cls(
             config=dataclasses.replace(config, **stored["search"], search_dir=search_dir),
             fixed=tuple(stored["fixed"]),
+            machines=machines,
             space={name: spaces.parse(name, text) for name, text in stored["space"].items()},
         )
 
@@ -148,10 +174,8 @@ class Search:
     def _default_name(self) -> str:
         if self.is_of_agent:
             proxy = Path(self.choice("proxy", "")).name
-            return f"{self.choice('agent', 'ddqn')}-on-{proxy.removesuffix('.safetensors')}"
-        names = [self.choice(group, default) for group, default in
-                 (("env", "cartpole"), ("proxy", "se"), ("agent", "ddqn"))]  # fmt: skip
-        return "-".join(names)
+            return f"{self.agent}-on-{proxy.removesuffix('.safetensors')}"
+        return "-".join([self.choice("env", "cartpole"), self.choice("proxy", "se"), self.agent])
 
 
 def read(words: Sequence[str]) -> Search:
@@ -166,10 +190,14 @@ def read(words: Sequence[str]) -> Search:
     """
     own = {field.name for field in dataclasses.fields(SearchConfig)}
     values, fixed, swept = {}, [], {}
+    machines = {"name": "local"}
     for word in compose.hydra_words(words):
         name, equals, text = word.partition("=")
         if equals and name in own:
             values[name] = text if name == "storage" and text != "null" else _plain(text)
+            continue
+        if name.partition(".")[0] == "machines":
+            machines[name.partition(".")[2] or "name"] = _plain(text)
             continue
         override = _parsed(word)
         require(name not in TAKEN, name, "be left out", "the search sets it for each trial", text,
@@ -179,13 +207,20 @@ def read(words: Sequence[str]) -> Search:
         else:
             fixed.append(word)
     config = serialize.from_plain(SearchConfig, values, "")
-    search = Search(config=config, fixed=tuple(fixed), space=swept)
+    search = Search(config=config, fixed=tuple(fixed), space=swept, machines=_machines(machines))
     if config.space is None:
         return search
-    preset = spaces.preset(config.space, search.choice("agent", "ddqn"), search.is_of_agent)
+    preset = spaces.preset(config.space, search.agent, search.is_of_agent)
     given = {word.partition("=")[0] for word in fixed} | set(swept)
     offered = {name: x for name, x in preset.items() if name not in given}
     return dataclasses.replace(search, space={**offered, **swept})
+
+
+def _machines(values: dict[str, Any]) -> Any:
+    one_of(("local", "ray"))("machines", values["name"], "local")
+    machines = plugins.configure("machines", values)
+    plugins.require_package("machines", machines, "trials are made there")
+    return machines
 
 
 def _parsed(word: str) -> Override:
@@ -210,6 +245,18 @@ def _as_file_name(name: str) -> str:
     return re.sub(r"[^\w.+-]+", "_", name)
 
 
+def fields_of(search: Search, config: Any) -> dict[str, Any]:
+    """Values of all fields of the command, of its choices too, by their names on the command line.
+
+    Args:
+      search: what is searched.
+      config: of the command with the fixed words alone.
+    """
+    groups = build.EVALUATE_GROUPS if search.is_of_agent else build.LEARN_GROUPS
+    values = serialize.flatten(build.to_plain(config))
+    return {**{group: values.get(f"{group}.name") for group in groups}, **values}
+
+
 def require_fields(search: Search, config: Any) -> None:
     """Checks that what is searched are fields of the command.
 
@@ -220,8 +267,7 @@ def require_fields(search: Search, config: Any) -> None:
     Raises:
       ConfigError: if one is not.
     """
-    groups = build.EVALUATE_GROUPS if search.is_of_agent else build.LEARN_GROUPS
-    known = {*serialize.flatten(build.to_plain(config)), *groups}
+    known = fields_of(search, config)
     for name in search.space:
         if name not in known:
             close = nearest(name, known)[:5]

@@ -76,6 +76,17 @@ class Dimension:
             return self._written(1 - value)
         return self._written(value) if isinstance(value, float) else str(value)
 
+    def parameter_of(self, value: Any) -> Any:
+        """What stands for a field's value in stored parameters; None if it is not among these."""
+        if self.values:
+            return word(value) if word(value) in self.values else None
+        is_number = isinstance(value, int | float) and not isinstance(value, bool)
+        if not is_number or not self.low <= value <= self.high:
+            return None
+        if self.step is not None:
+            return value if isinstance(value, int) and not (value - self.low) % self.step else None
+        return round(1 - value, 12) if self.inverse else float(value)
+
     def shown(self, params: Mapping[str, Any]) -> str:
         """The value as tables have it: three digits, of the distance from 1 where that is drawn."""
         value = params[self.parameter]

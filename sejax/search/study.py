@@ -9,7 +9,7 @@ import logging
 import time
 import warnings
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -37,10 +37,30 @@ class Runner(Protocol):
 
     def config(self, words: list[str], folder: Path | None = None) -> Any: ...
     def run(self, config: Any, follower: Follower, is_inherited: bool) -> Progress: ...
+    def verify(self, words: list[str], number: int) -> dict[str, float]: ...
+    def order(self, row: dict[str, float]) -> tuple[float, float]: ...
 
 
-def open_study(search: Search) -> tuple[optuna.Study, Search]:
+def runner_of(search: Search) -> Runner:
+    """What makes the trials of a search."""
+    if search.is_of_agent:
+        from sejax.search.tuning import Tuning
+
+        return Tuning(search)
+    from sejax.search.learning import Learning
+
+    return Learning(search)
+
+
+def open_study(
+    search: Search, usual: Mapping[str, Any] | None = None
+) -> tuple[optuna.Study, Search]:
     """Makes the study, or joins one that is there.
+
+    Args:
+      search: what is searched.
+      usual: values of fields, by name, that a new study tries first: what one has is what one wants
+        to beat. Not tried if they are not among what is searched.
 
     Returns:
       The study, and what it searches: with `study=NAME` and no word of what to search, that is what
@@ -63,7 +83,7 @@ def open_study(search: Search) -> tuple[optuna.Study, Search]:
         if stored is not None:
             joined = _joined(search, stored)
             if joined.config.heartbeat != search.config.heartbeat:
-                return open_study(joined)  # each worker goes by the same
+                return open_study(joined, usual)  # each worker goes by the same
             search = joined
             study.sampler, study.pruner = _sampler(search), _pruner(search)
         else:
@@ -71,6 +91,11 @@ def open_study(search: Search) -> tuple[optuna.Study, Search]:
                     "search otherwise", "none", "space=paper_se, or es.noise_std='tag(log, "
                     "interval(0.01, 0.3))'")  # fmt: skip
             study.set_user_attr(STORED, search.stored())
+            first = {x.parameter: x.parameter_of(usual.get(name))
+                     for name, x in search.space.items()} if usual else {}  # fmt: skip
+            if first and None not in first.values():
+                with _unchanged():
+                    study.enqueue_trial(first)
     except optuna.exceptions.StorageInternalError as error:
         raise _unusable(search, error) from error
     return study, search
@@ -138,13 +163,13 @@ class Objective:
             words = [f"{name}={x.suggest(trial)}" for name, x in self._search.space.items()]
             score = self._run(trial, words)
         except optuna.TrialPruned:
-            self._tell("pruned", words)
+            self.say(sentence(trial, "pruned", self._search))
             self.is_done = True
             raise
         except (Lost, optuna.exceptions.UpdateFinishedTrialError):
             self.is_done = True
             raise
-        self._tell("complete", words)
+        self.say(sentence(trial, "complete", self._search))
         self.is_done = True
         return score
 
@@ -161,16 +186,17 @@ class Objective:
         follower = Follower(trial, self._search)
         return follower.finish(self._runner.run(config, follower, is_inherited))
 
-    def _tell(self, how: str, words: list[str]) -> None:
-        kept = self.trial.user_attrs
-        if "refused" in kept:
-            self.say(f"trial {self.trial.number}: refused: {kept['refused']}")
-            return
-        config = self._search.config
-        score = kept.get(config.score)
-        worth = "not finite" if score is None else f"{score:.4g}"
-        self.say(f"trial {self.trial.number}: {worth}, {how} at generation "
-                  f"{kept['generations']}/{config.max_generations}: {' '.join(words)}")  # fmt: skip
+
+def sentence(trial: optuna.Trial | optuna.trial.FrozenTrial, how: str, search: Search) -> str:
+    """What is said of a trial that has ended: complete or pruned."""
+    kept = trial.user_attrs
+    if "refused" in kept:
+        return f"trial {trial.number}: refused: {kept['refused']}"
+    score = kept.get(search.config.score)
+    worth = "not finite" if score is None else f"{score:.4g}"
+    words = " ".join(f"{name}={x.of(trial.params)}" for name, x in search.space.items())
+    return (f"trial {trial.number}: {worth}, {how} at generation "
+            f"{kept['generations']}/{search.config.max_generations}: {words}")  # fmt: skip
 
 
 def trial_folder(search: Search, number: int) -> Path:
@@ -295,7 +321,7 @@ def _joined(search: Search, stored: dict[str, Any]) -> Search:
                 "its trials are compared with each other",
                 f"{search.study}, which differs in {', '.join(differing)}",
                 "study=NAME, or give study and storage alone to join")  # fmt: skip
-    return Search.from_stored(stored, search.config)
+    return Search.from_stored(stored, search.config, search.machines)
 
 
 @contextlib.contextmanager

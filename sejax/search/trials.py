@@ -65,41 +65,30 @@ class Follower:
           Lost: as of `tell`.
         """
         num_generations, most = len(progress.scores), self._search.config.max_generations
-        rest = np.repeat(progress.scores[-1:], most - num_generations, axis=0)
-        whole = dataclasses.replace(progress, scores=np.concatenate([progress.scores, rest]))
+        progress = whole(progress, most)
         for step in range(self._told + 1, most + 1):
-            self._report(self.score(whole, step), step)
+            self._report(self.score(progress, step), step)
             self._trial.should_prune()  # so that the pruner knows it; nothing is left to be saved
-        self.keep(whole, most, num_generations)
-        score = self.score(whole, most)
+        self.keep(progress, most, num_generations)
+        score = self.score(progress, most)
         if not math.isfinite(score):
             raise optuna.TrialPruned
         return score
 
     def score(self, progress: Progress, step: int) -> float:
         """What the trial is worth after `step` generations."""
-        return _aggregates(self._measured(progress, step))[self._search.config.score]
+        return worth(progress, step, self._search)[self._search.config.score]
 
     def keep(self, progress: Progress, step: int, generations: int | None = None) -> None:
         """Keeps with the trial what the table says of it."""
         values = {
-            **_aggregates(self._measured(progress, step)),
+            **worth(progress, step, self._search),
             "generations": generations or step,
             "cost": progress.cost,
             "seconds": round(progress.seconds, 1),
         }
         for name, value in values.items():
             self._trial.set_user_attr(name, value if np.isfinite(value) else None)
-
-    def _measured(self, progress: Progress, step: int) -> np.ndarray:
-        """A number for each seed, `[seed]`."""
-        so_far = progress.scores[:step]
-        match self._search.measure:
-            case "best":
-                return np.fmax.reduce(so_far)
-            case "mean":
-                return so_far.mean(axis=0)
-        return so_far[-1]
 
     def _report(self, score: float, step: int) -> None:
         try:
@@ -108,8 +97,23 @@ class Follower:
             raise Lost from error
 
 
-def _aggregates(of_seeds: np.ndarray) -> dict[str, float]:
+def worth(progress: Progress, step: int, search: Search) -> dict[str, float]:
+    """What a trial is worth after `step` generations: mean and worst of its seeds."""
+    so_far = progress.scores[:step]
+    match search.measure:
+        case "best":
+            of_seeds = np.fmax.reduce(so_far)
+        case "mean":
+            of_seeds = so_far.mean(axis=0)
+        case _:
+            of_seeds = so_far[-1]
     return {"mean": float(of_seeds.mean()), "worst": float(of_seeds.min())}
+
+
+def whole(progress: Progress, generations: int) -> Progress:
+    """A trial that was over early, with its last scores to the end."""
+    rest = np.repeat(progress.scores[-1:], generations - len(progress.scores), axis=0)
+    return dataclasses.replace(progress, scores=np.concatenate([progress.scores, rest]))
 
 
 def take_over(folder: Path, predecessors: Sequence[Path]) -> bool:

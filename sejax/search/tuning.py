@@ -94,11 +94,16 @@ class Tuning:
 
         return float(proxy_study(config).task.solved_reward)
 
-    def verify(self, config: build.EvaluateConfig) -> dict[str, float]:
+    def verify(self, words: Sequence[str], number: int) -> dict[str, float]:
         """Returns and steps of agents trained with these settings, on the proxy and the real task.
 
         Agents are `num_agents` fresh ones in each, of keys that no trial has had.
+
+        Args:
+          words: the settings.
+          number: of their trial.
         """
+        config = self.config(words)
         values: dict[str, float] = {}
         for world, name in (("the proxy", "proxy"), ("the real task", "real")):
             fresh = self._search.config.max_generations
@@ -107,6 +112,11 @@ class Tuning:
             values[f"{name}_std"] = float(np.std(outcome.test_return))
             values[f"{name}_steps"] = float(np.mean(outcome.train_steps))
         return values
+
+    def order(self, row: dict[str, float]) -> tuple[float, float]:
+        """By which the best rows of `verify` come first; of settings that solve, the quickest."""
+        solved = self.solved_reward(self.config([]))
+        return -min(row["real_return"], solved), row["real_steps"]
 
 
 def _make_rounds(agent: Any, study: Any, world: str, training: Any, config: Any) -> Any:
