@@ -511,16 +511,17 @@ def test_without_ray_one_line_says_what_to_install(monkeypatch):
 
 
 def test_ray_is_imported_where_a_run_or_a_search_asks_for_it_alone():
-    sources = {path.name: path.read_text() for path in Path(sejax.__file__).parent.rglob("*.py")}
+    root = Path(sejax.__file__).parent
+    sources = {path.relative_to(root).as_posix(): path.read_text() for path in root.rglob("*.py")}
 
     def importing(what):
         return {name for name, text in sources.items() if re.search(what, text, re.M)}
 
-    assert importing(r"^ *(import|from) ray\b") == {"ray_crew.py", "cluster.py"}
-    assert importing(r"^(import|from) .*\b(ray_crew|cluster)$") == {"cluster.py"}
-    within = importing(r"^ +from sejax.machines import ray_crew$")
-    assert within == {"configs.py"}
-    assert importing(r"^ +from sejax.search import cluster$") == {"__main__.py"}
+    crew, cluster = "machines/ray_crew.py", "search/cluster.py"
+    assert importing(r"^ *(import|from) ray\b") == {crew, cluster}
+    assert importing(r"^from .*\b(ray_crew|cluster)$") == {cluster}
+    assert importing(r"^ +from sejax.machines import ray_crew$") == {"machines/configs.py"}
+    assert importing(r"^ +from sejax.search import cluster$") == {"search/__main__.py"}
 
 
 def test_devices_are_the_workers_own(monkeypatch):

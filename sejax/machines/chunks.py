@@ -126,7 +126,7 @@ class RemoteChunks:
         if self._ledger is not None:
             about = {worker: self._hand_out.about(worker) for worker in done}
             self._ledger.write(int(state.generation.max()), wall_s, about, done)
-        merged: dict[str, Any] = {
+        merged = {
             name: np.zeros((num_seeds * num_trials, *x.shape[2:]), x.dtype)
             for name, x in vars(shapes).items()
         }
