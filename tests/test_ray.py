@@ -282,6 +282,15 @@ def test_a_stopped_worker_of_a_killed_driver_makes_room(cluster, wanted, tmp_pat
     assert not any(map(is_there, stopped))
 
 
+@pytest.fixture
+def heard():
+    """Ctrl-C is heard by the processes that are started, whatever started this one."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("heard")
 @pytest.mark.parametrize("given", [signal.SIGINT, signal.SIGKILL])
 def test_nothing_is_left_of_a_driver_that_started_its_own_ray(folder, tmp_path, given):
     environment = ENVIRONMENT | {"RAY_ADDRESS": "local", "RAY_TMPDIR": str(folder)}
