@@ -429,6 +429,7 @@ def performance(ses, out, **given):
     return trained(se_performance, out, fixed=str(ses[0]), real_episodes=3, **given)
 
 
+@pytest.mark.slow
 def test_performance_trains_as_evaluation_does_and_goes_on(ses, tmp_path, monkeypatch, tiny_agents):
     table = performance(ses, tmp_path)
     agents = pieces.read_rows(tmp_path / "rows.csv.xz")

@@ -89,6 +89,7 @@ def replayed(task, real):
     return dataclasses.replace(task, env=Replay(task.env, real))
 
 
+@pytest.mark.slow
 def test_steps_are_braxs(task, real):
     from brax.envs.half_cheetah import Halfcheetah
 
