@@ -56,6 +56,7 @@ def clock(monkeypatch):
     monkeypatch.setattr(budgets, "time", Clock())
 
 
+@pytest.mark.slow
 def test_a_run_ends_with_its_budget_and_goes_on_with_a_larger_one(tmp_path, clock, monkeypatch):
     table = horizons(tmp_path, cpu_budget_s=1.5)
     rows = pieces.read_rows(tmp_path / "rows.csv.xz")

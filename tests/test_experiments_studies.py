@@ -369,6 +369,7 @@ def test_intervals_draw_models_and_the_best_ones_are_those_of_the_best_episodes(
     assert supervised_baseline.with_best(few, [1.0, 2.0]) is few
 
 
+@pytest.mark.slow
 def test_the_supervised_baseline_runs_and_goes_on(se_file, tmp_path, monkeypatch, small):
     options = TINY_MODELS | {"proxy": se_file, "hparams": "default"}
     table = run(supervised_baseline, tmp_path, **options)
