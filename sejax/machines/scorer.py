@@ -81,8 +81,6 @@ class Scorer:
         from sejax.app import runtime
 
         runtime.configure_xla(1)
-        import jax
-
         from sejax.app import build
         from sejax.bilevel import make_program
 
@@ -102,7 +100,6 @@ class Scorer:
             compile_share(program, family, capacity)
             for family, capacity in enumerate(self._capacities)
         ]
-        jax.block_until_ready(jax.numpy.zeros(()))
         return About(socket.gethostname(), os.getpid(), time.process_time())
 
     def score(self, work: Work) -> Scored:
