@@ -1,4 +1,4 @@
-"""The one error that bad input raises, and the checks that raise it.
+"""The error that bad input raises, the checks that raise it, and that of failed computing.
 
 Every message has one form: what must hold, why, what came, and how to mend it.
 """
@@ -13,6 +13,10 @@ LARGEST = 2**31 - 1  # steps, episodes and sizes are counted in 32 bits
 
 class ConfigError(ValueError):
     """Input that cannot work. Commands print its message and exit with status 2."""
+
+
+class FailedError(RuntimeError):
+    """Computing that cannot go on. Commands print its message and exit with status 1."""
 
 
 def unknown_name(field: str, got: object, known: Iterable[str]) -> ConfigError:

@@ -9,6 +9,7 @@ import jax
 import pytest
 
 from sejax.app import commands, compose, runtime
+from sejax.errors import FailedError
 
 
 @pytest.mark.parametrize("value", ["/tmp/ünï-☃", "it's ☃", "back\\slash ☃"])
@@ -54,6 +55,16 @@ def test_a_terminal_of_few_letters_shows_what_it_can(monkeypatch, tmp_path):
     commands.start("run", lambda: print("12.0 ± 4.8"))
     shown.flush()
     assert shown.buffer.getvalue() == b"12.0 \\xb1 4.8\n"
+
+
+def test_computing_that_cannot_go_on_is_one_message(capsys):
+    def main(words):
+        raise FailedError("5 workers have failed.")
+
+    with pytest.raises(SystemExit) as left:
+        commands.guarded(main)([])
+    assert left.value.code == commands.FAILED
+    assert capsys.readouterr().err == "error: 5 workers have failed.\n"
 
 
 def test_a_current_folder_that_is_gone_is_one_message(tmp_path):

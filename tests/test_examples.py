@@ -69,10 +69,10 @@ def test_every_example_is_tested():
 
 
 def _marked(name):
-    """An example that needs another package, whose warnings are its own."""
-    return (
-        pytest.param(name, marks=pytest.mark.filterwarnings("default")) if name in NEEDS else name
-    )
+    """An example with its marks: warnings of another package are its own."""
+    own = [pytest.mark.filterwarnings("default")] if name in NEEDS else []
+    # The dearest, whose objective a command uses below.
+    return pytest.param(name, marks=[*own, *[pytest.mark.slow] * (name == "own_objective")])
 
 
 @pytest.mark.parametrize("name", [_marked(name) for name in TINY])

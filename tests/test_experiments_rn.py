@@ -60,6 +60,7 @@ def refuse_to_compute(monkeypatch):
     monkeypatch.setattr(session, "run", refuse)
 
 
+@pytest.mark.slow
 def test_rns_are_learned_stored_and_used_once(options, rns_dir, tmp_path, monkeypatch):
     settings = options(RnPerformance, rns=2, **TRAIN)
     run = rn_performance.EXPERIMENT.run

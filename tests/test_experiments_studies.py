@@ -118,6 +118,7 @@ def test_a_run_counts_the_updates_before_the_incumbent_that_solves_the_task(
     assert search.advanced == advanced, "nothing is computed when all runs are over"
 
 
+@pytest.mark.slow
 def test_the_search_is_the_bilevel_loop(few_lanes):
     search = score_transforms.make_search(True, 2, None)
     keys, sizes = jax.random.split(jax.random.key(0), 3), np.float32([0.1, 1.0, 5.0])
@@ -160,6 +161,7 @@ def test_the_best_bin_and_the_ranks_are_those_of_the_means():
     assert list(table["rank"]) == ["1", "2"] and list(table["rank there"]) == ["2", "1"]
 
 
+@pytest.mark.slow
 def test_score_transforms_run_and_go_on_where_they_stopped(tmp_path, monkeypatch, few_lanes):
     table = run(score_transforms, tmp_path, **TINY_TRANSFORMS)
     assert len(table) == 16 and (tmp_path / "score_transforms.png").stat().st_size > 10_000

@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 import sejax
 from sejax.app import session
 from sejax.bilevel import make_program
-from sejax.errors import ConfigError
+from sejax.errors import ConfigError, FailedError
 from sejax.machines import handout, ledger, scorer
 from sejax.machines.chunks import RemoteChunks, problem
 from sejax.machines.handout import HandOut, Lost
@@ -275,16 +275,16 @@ def test_a_share_that_fails_everywhere_ends_the_run():
         return 1.0, ValueError("no such instruction") if turn else None
 
     with pytest.raises(
-        RuntimeError,
-        match=r"^5 workers have failed at the same 1 trainings, the "
-        r"last one so: ValueError: no such instruction$",
+        FailedError,
+        match=r"^5 workers have failed at the same 1 trainings, the last one so: "
+        r"ValueError: no such instruction\. The generations .* with machines=local goes on",
     ):
         score(hand_out_of(Crew(fate=fate)), 1)  # fmt: skip
 
 
 def test_a_share_that_kills_its_workers_ends_the_run():
     crew = Crew(fate=lambda worker, turn: (1.0, Lost("killed") if turn else None))
-    with pytest.raises(RuntimeError, match=r"Lost: killed$"):
+    with pytest.raises(FailedError, match=r"Lost: killed\."):
         score(hand_out_of(crew), 1)
 
 

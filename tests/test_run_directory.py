@@ -15,8 +15,9 @@ import numpy as np
 import pytest
 import yaml
 
+import sejax
 from sejax.app import checkpoints, metrics, run_lock
-from sejax.app.run_directory import COLUMNS, RunDirectory, flatten
+from sejax.app.run_directory import COLUMNS, RunDirectory, flatten, open_for
 from sejax.errors import ConfigError
 
 CONFIG = {"seed": 0, "generations": 9, "checkpoint_every": 1, "run_dir": None,
@@ -378,6 +379,24 @@ def test_free_fields_may_change_and_are_written_when_the_run_goes_on(run):
     go(run, 7, run_dir="elsewhere", devices=3)
     stored = yaml.safe_load((run / "config.yaml").read_text())
     assert (stored["generations"], stored["run_dir"], stored["devices"]) == (7, "elsewhere", 3)
+
+
+def test_a_run_of_a_version_without_a_field_goes_on_with_its_default(tmp_path):
+    words = ["proxy=rn", f"run_dir={tmp_path}"]
+    with open_for(sejax.config(words)) as directory:
+        directory.resume(TEMPLATE)
+    stored = yaml.safe_load((tmp_path / "config.yaml").read_text())
+    assert stored["proxy"].pop("output_scale") == 1.0
+    (tmp_path / "config.yaml").write_text(yaml.safe_dump(stored))
+    with pytest.raises(ConfigError, match=r"proxy.output_scale \(1.0 there, 0.5 here\)\. Take"):
+        open_for(sejax.config([*words, "proxy.output_scale=0.5"]))
+    with pytest.raises(ConfigError, match=r"es.noise_std \(\S+ there, 0.5 here\)\. Take"):
+        open_for(sejax.config([*words, "es.noise_std=0.5"]))
+    open_for(sejax.config(words)).close()
+    stored["es"]["fashion"] = 1  # of a version that had other fields
+    (tmp_path / "config.yaml").write_text(yaml.safe_dump(stored))
+    with pytest.raises(ConfigError, match=r"es.fashion \(1 there, None here\)"):
+        open_for(sejax.config(words))
 
 
 def test_with_the_configuration_lost_that_of_the_checkpoint_counts(run, whole):

@@ -2,6 +2,7 @@
 
 import atexit
 import contextlib
+import dataclasses
 import functools
 import os
 import shlex
@@ -21,9 +22,9 @@ import pytest
 
 optuna = pytest.importorskip("optuna", reason="needs Optuna: pip install 'sejax[search]'")
 
-from sejax.app import compose  # noqa: E402
+from sejax.app import commands, compose  # noqa: E402
 from sejax.errors import ConfigError  # noqa: E402
-from sejax.search import results, settings, spaces, study, trials, verification  # noqa: E402
+from sejax.search import __main__, results, settings, spaces, study, trials, verification  # noqa: E402
 from sejax.search.learning import Learning  # noqa: E402
 from sejax.search.trials import Follower, Progress  # noqa: E402
 
@@ -273,6 +274,31 @@ def test_workers_join_by_the_studys_name_and_other_searches_are_refused(tmp_path
         opened(tmp_path, "env=cartpole", "study=mine", "seeds=2")
     with pytest.raises(ConfigError, match="space must be given"):
         study.open_study(settings.read(["study=other", f"storage={url}"]))
+
+
+def test_a_study_of_a_version_with_other_fields_is_joined(tmp_path):
+    made, search = opened(tmp_path, "seeds=2")
+    stored = search.stored()
+    stored["search"] = {"seeds": 2, "max_generations": 27, "verify": 7}  # verify is free today
+    made.set_user_attr(study.STORED, stored)
+    _, theirs = opened(tmp_path, "seeds=2", "verify=3")
+    assert theirs.config == dataclasses.replace(search.config, verify=3)
+    with pytest.raises(ConfigError, match=r"differs in score \(mean there, worst here\)"):
+        opened(tmp_path, "seeds=2", "score=worst")
+
+
+def test_a_verification_that_is_interrupted_says_how_to_go_on(tmp_path, monkeypatch, capsys):
+    def interrupted(*words):
+        raise KeyboardInterrupt
+
+    left = []
+    found, search = in_memory(tmp_path)
+    monkeypatch.setattr(verification, "verify", interrupted)
+    monkeypatch.setattr(commands, "leave", lambda status: left.append(status) or sys.exit(status))
+    with pytest.raises(SystemExit):
+        __main__._verified(found, search, Runner(search))
+    assert left == [commands.INTERRUPTED]
+    assert "the same command goes on with the others" in capsys.readouterr().out
 
 
 def test_a_storage_that_cannot_be_used_is_refused_without_its_password(tmp_path):

@@ -16,7 +16,7 @@ from hydra.errors import HydraException
 from omegaconf.errors import OmegaConfBaseException
 
 from sejax.app import compose, runtime
-from sejax.errors import ConfigError
+from sejax.errors import ConfigError, FailedError
 
 BAD_INPUT, FAILED, INTERRUPTED = 2, 1, 130
 Given = TypeVar("Given")
@@ -119,6 +119,8 @@ def guarded(main: Callable[[Given], Result]) -> Callable[[Given], Result]:
                 f"whole; run the same command again to go on from there.",
                 FAILED,
             )
+        except FailedError as error:
+            fail(str(error), FAILED)
         except RuntimeError as error:
             if "RESOURCE_EXHAUSTED" not in str(error) and "Out of memory" not in str(error):
                 raise

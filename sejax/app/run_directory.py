@@ -7,7 +7,7 @@ files as they are. Nothing here imports jax before a state is restored: a refusa
 
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any, TypeGuard
@@ -38,9 +38,10 @@ class RunDirectory:
 
     def __init__(
         self, path: Path, config: dict[str, Any], seeds: list[int], hint: str, lock: RunLock,
-        families: Sequence[str] = (),
+        families: Sequence[str] = (), completed: Callable[[dict[str, Any]], dict[str, Any]] = dict,
     ):  # fmt: skip
         self.path = path
+        self._completed = completed
         self.config = json.loads(json.dumps(config))  # as it reads back: tuples are lists
         self.seeds = seeds
         self._hint = hint
@@ -53,7 +54,7 @@ class RunDirectory:
     @classmethod
     def open(
         cls, path: str | Path, config: dict[str, Any], seeds: list[int], hint: str = HINT,
-        families: Sequence[str] = (),
+        families: Sequence[str] = (), completed: Callable[[dict[str, Any]], dict[str, Any]] = dict,
     ) -> "RunDirectory":  # fmt: skip
         """Makes the folder, or opens that of an earlier session of the same run.
 
@@ -63,6 +64,8 @@ class RunDirectory:
           seeds: the `seed` column of the metrics.
           hint: last sentence of a refusal: how to choose another folder.
           families: of agents, as the metrics call them; several have columns of their own.
+          completed: a stored configuration with the fields that a former version did not write;
+            new ones have a default that changes no number.
 
         Raises:
           ConfigError: if it holds a run of another configuration, is in use by another process, or
@@ -78,7 +81,9 @@ class RunDirectory:
                 f"got {path} ({error}). {hint}"
             ) from error
         try:
-            directory = cls(path, config, [int(seed) for seed in seeds], hint, lock, families)
+            directory = cls(
+                path, config, [int(seed) for seed in seeds], hint, lock, families, completed
+            )
             directory._refuse_another_run()
             for folder in (path, path / "proxies", directory.checkpoints):
                 remove_leftovers(folder)
@@ -241,13 +246,8 @@ class RunDirectory:
             )
 
     def _refuse_other_config(self, stored: dict[str, Any]) -> None:
-        old, asked = flatten(stored), flatten(self.config)
-        differing = [
-            f"{name} ({_short(old.get(name))} there, {_short(asked.get(name))} here)"
-            for name in sorted(old.keys() | asked.keys())
-            if name.partition(".")[0] not in FREE_FIELDS
-            and not _same(old.get(name), asked.get(name))
-        ]
+        differing = self._differing(stored)
+        differing = differing and self._differing(self._completed(stored))
         if differing:
             more = f" and {len(differing) - _SHOWN} more" if len(differing) > _SHOWN else ""
             raise ConfigError(
@@ -255,6 +255,15 @@ class RunDirectory:
                 f"on where it stopped; {self.path} differs in {', '.join(differing[:_SHOWN])}"
                 f"{more}. Take a new folder, or use the values there. {self._hint}"
             )
+
+    def _differing(self, stored: dict[str, Any]) -> list[str]:
+        old, asked = flatten(stored), flatten(self.config)
+        return [
+            f"{name} ({_short(old.get(name))} there, {_short(asked.get(name))} here)"
+            for name in sorted(old.keys() | asked.keys())
+            if name.partition(".")[0] not in FREE_FIELDS
+            and not _same(old.get(name), asked.get(name))
+        ]
 
     def _vouched(self, generation: int, record: Any) -> dict[str, Any]:
         """What the checkpoint keeps of the metrics, which were compared with it.
@@ -318,7 +327,16 @@ def open_for(config: Any, hint: str = HINT) -> RunDirectory:
 
     seeds = [config.seed + i for i in range(config.num_seeds)]
     keys = [family.key for family in families_of(config)]
-    return RunDirectory.open(config.resolved_run_dir, build.to_plain(config), seeds, hint, keys)
+
+    def completed(stored: dict[str, Any]) -> dict[str, Any]:
+        try:
+            return build.to_plain(build.learn_config(stored))
+        except ConfigError:  # of another version that had other fields
+            return stored
+
+    return RunDirectory.open(
+        config.resolved_run_dir, build.to_plain(config), seeds, hint, keys, completed
+    )
 
 
 def _same(a: Any, b: Any) -> bool:

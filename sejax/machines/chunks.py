@@ -82,7 +82,7 @@ class RemoteChunks:
 
         Raises:
           ConfigError: if no worker gets ready.
-          RuntimeError: if a training fails everywhere.
+          FailedError: if a training fails everywhere.
           OSError: if `machines.csv` cannot be written.
         """
         num_seeds = state.generation.shape[0]

@@ -15,7 +15,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from sejax.errors import ConfigError, told
+from sejax.errors import ConfigError, FailedError, told
 from sejax.machines.scorer import About, Scored, Work
 
 COPIED_AFTER = 2.0  # times what a share has been seen to take, until another worker begins it too
@@ -162,7 +162,7 @@ class HandOut:
           The outcomes of shares that make up all trials, and what each worker did.
 
         Raises:
-          RuntimeError: if a share fails everywhere.
+          FailedError: if a share fails everywhere.
           ConfigError: if no worker gets ready.
         """
         plan = _Plan(families, self._capacities, self._lanes)
@@ -350,15 +350,16 @@ class _Plan:
         """A worker will not bring the share; `counts`: that may be because of the share.
 
         Raises:
-          RuntimeError: if that has happened too often.
+          FailedError: if that has happened too often.
         """
         if share not in self._holders:
             return
         share.failures += counts
         if share.failures >= MOST_FAILURES:
-            raise RuntimeError(
+            raise FailedError(
                 f"{MOST_FAILURES} workers have failed at the same {len(share.places)} trainings, "
-                f"the last one so: {problem}"
+                f"the last one so: {problem}. The generations before are saved; the same command "
+                f"with machines=local goes on from there on this machine alone."
             )
         self._holders[share] -= 1
         if not self._holders[share]:

@@ -50,13 +50,7 @@ def main(words: Sequence[str]) -> None:
         print("No trial was completed.")
         return
     if search.num_verified:
-        try:
-            lock = acquire(search.folder / "verification.lock", "Wait for it.")
-        except ConfigError:
-            print("Another worker is at it to try the best ones again.")
-        else:
-            best = _verified(found, search, runner)
-            lock.release()
+        best = _verified(found, search, runner) or best
     print(f"\nThe best:\n  {results.override_line(best, search, runner.command)}")
     print(f"The same:\n  {results.preset_line(search, runner.command)}")
     print(f"{search.folder}/trials.csv, pareto.png, best.txt and preset.yaml hold what was found.")
@@ -67,12 +61,26 @@ def _say(text: str) -> None:
 
 
 def _verified(found: Any, search: Search, runner: Any) -> list[str]:
-    """The overrides of those that were best when they were tried again."""
+    """The overrides of those that were best when they were tried again.
+
+    Empty if another worker is at it.
+    """
     from sejax.search import results, verification
 
-    table = verification.verify(found, search, runner)
-    num_agents = getattr(runner.config([]), "num_agents", 0)
-    verification.print_table(table, search, num_agents)
+    try:
+        lock = acquire(search.folder / "verification.lock", "Wait for it.")
+    except ConfigError:
+        print("Another worker is at it to try the best ones again.")
+        return []
+    try:
+        table = verification.verify(found, search, runner)
+    except KeyboardInterrupt:
+        print(f"Interrupted. Those of the best that were tried again are in {search.folder}; the "
+              f"same command goes on with the others.")  # fmt: skip
+        commands.leave(commands.INTERRUPTED)
+    finally:
+        lock.release()
+    verification.print_table(table, search, getattr(runner.config([]), "num_agents", 0))
     best = found.get_trials(deepcopy=False)[int(table["trial"].iloc[0])]
     words = results.words_of(best, search)
     results.write_best(words, search, runner.command)

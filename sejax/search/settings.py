@@ -139,10 +139,8 @@ class Search:
 
     def stored(self) -> dict[str, Any]:
         """What the workers of a study must have in common, as plain values."""
-        fields = serialize.to_plain(self.config)
-        own = {k: v for k, v in fields.items() if k not in (*FREE_FIELDS, "space", "study")}
         return {
-            "search": own,
+            "search": _common(serialize.to_plain(self.config)),
             "fixed": list(self.fixed),
             "space": {name: x.text for name, x in self.space.items()},
             "folder": str(self.folder.resolve()),
@@ -176,6 +174,16 @@ class Search:
             proxy = Path(self.choice("proxy", "")).name
             return f"{self.agent}-on-{proxy.removesuffix('.safetensors')}"
         return "-".join([self.choice("env", "cartpole"), self.choice("proxy", "se"), self.agent])
+
+
+def completed(stored: dict[str, Any]) -> dict[str, Any]:
+    """What a former version stored of a search, with the fields of today."""
+    usual = serialize.to_plain(SearchConfig())
+    return stored | {"search": _common(usual | stored["search"])}
+
+
+def _common(fields: dict[str, Any]) -> dict[str, Any]:
+    return {k: v for k, v in fields.items() if k not in (*FREE_FIELDS, "space", "study")}
 
 
 def read(words: Sequence[str]) -> Search:

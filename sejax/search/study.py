@@ -18,7 +18,7 @@ import sqlalchemy.exc
 from optuna.trial import TrialState
 
 from sejax.errors import ConfigError, require, told
-from sejax.search.settings import Search
+from sejax.search.settings import Search, completed
 from sejax.search.trials import Follower, Lost, Progress, take_over
 
 STORED = "sejax"  # the study's attribute that holds what is searched
@@ -81,7 +81,7 @@ def open_study(
             )  # fmt: skip
         stored = study.user_attrs.get(STORED)
         if stored is not None:
-            joined = _joined(search, stored)
+            joined = _joined(search, completed(stored))
             if joined.config.heartbeat != search.config.heartbeat:
                 return open_study(joined, usual)  # each worker goes by the same
             search = joined
