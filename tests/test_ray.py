@@ -7,6 +7,7 @@ machine are left alone: ports and folders are our own, and so are the processes 
 import contextlib
 import csv
 import importlib.util
+import itertools
 import os
 import random
 import secrets
@@ -28,8 +29,9 @@ pytestmark = [
     ),
 ]
 
+GENERATIONS = 12
 RUN = [sys.executable, "-m", "sejax.run", "env=cartpole", "es.population_size=8",
-       "generations=12", "checkpoint_every=1"]  # fmt: skip
+       f"generations={GENERATIONS}", "checkpoint_every=1"]  # fmt: skip
 ENVIRONMENT = {
     **{name: x for name, x in os.environ.items() if not name.startswith(("XLA_FLAGS", "RAY_"))},
     "PYTHONPATH": str(Path(__file__).parents[1]),
@@ -196,14 +198,25 @@ def wanted(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def seconds(cluster, wanted, tmp_path_factory):
-    """How long an undisturbed run takes from its first worker on."""
-    folder = tmp_path_factory.mktemp("undisturbed")
+    """How long the generations of an undisturbed run take, the first from its first worker on."""
+    folder, ends = tmp_path_factory.mktemp("undisturbed"), []
     with Driver(folder, "machines=ray", environment=cluster.environment) as driver:
         wait_for(cluster.workers)
         started = time.monotonic()
+        for generation in range(GENERATIONS):
+            wait_for(lambda: driver.generations() > generation)  # noqa: B023
+            ends.append(time.monotonic())
         driver.wait()
     assert results(folder) == wanted
-    return time.monotonic() - started
+    return [end - before for before, end in itertools.pairwise([started, *ends])]
+
+
+def wait_until(moment, driver, seconds):
+    """Waits for a moment of a run, in generations; never for its end, however fast it is here."""
+    wait_for(lambda: driver.generations() >= int(moment))
+    end = time.monotonic() + moment % 1 * seconds[int(moment)]
+    while time.monotonic() < end and driver.generations() < GENERATIONS - 1:
+        time.sleep(0.01)
 
 
 def kill_worker(cluster, driver, rng):
@@ -232,8 +245,8 @@ def test_a_run_has_the_same_rows_whatever_is_killed_or_stopped_and_when(
     rng = random.Random(f"{fault.__name__} {seed}")
     with Driver(tmp_path, "machines=ray", environment=cluster.environment) as driver:
         wait_for(cluster.workers)
-        moment = rng.uniform(0, 0.9 * seconds)
-        time.sleep(moment)
+        moment = rng.uniform(0, GENERATIONS - 1)
+        wait_until(moment, driver, seconds)
         saved, there = driver.generations(), set(cluster.workers())
         started = time.monotonic()
         with fault(cluster, driver, rng) or contextlib.nullcontext(driver) as last:
@@ -241,7 +254,7 @@ def test_a_run_has_the_same_rows_whatever_is_killed_or_stopped_and_when(
     took = time.monotonic() - started
     with (tmp_path / "run" / "machines.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
-    print(f"{fault.__name__} after {moment:.1f} s, {saved} generations saved; {took:.1f} s more, "
+    print(f"{fault.__name__} after {moment:.2f} generations, {saved} saved; {took:.1f} s more, "
           f"{len({row['pid'] for row in rows})} workers, {sum(int(x['lost']) for x in rows)} "
           f"shares lost; {last.log.read_text().count(chr(10))} lines said")  # fmt: skip
     assert results(tmp_path) == wanted

@@ -16,6 +16,7 @@ from sejax.search.settings import Search
 SHOWN = 10
 NEEDED = 10  # completed trials, before importances say anything
 HOW = ("seed", "devices", "lanes", "tracker")  # fields of how trials ran, which are no settings
+NUMBER = (24, 12)  # pixels of a number in the picture
 ENDED = (TrialState.COMPLETE, TrialState.PRUNED)
 
 
@@ -130,11 +131,16 @@ def draw_pareto(rows: Any, search: Search, path: Path) -> None:
             axis.plot(some["cost"], some[score], "o", ms=5, mew=0, alpha=0.75, color=color,
                       label=f"{state} ({len(some)})")  # fmt: skip
         axis.step(front["cost"], front[score], where="post", color=POPULATION, lw=1.4,
-                  label="best for its cost, with its number")  # fmt: skip
-        for _, row in front.iterrows():
-            axis.annotate(f"{row['trial']:.0f}", (row["cost"], row[score]), fontsize=8,
-                          textcoords="offset points", xytext=(4, -10))  # fmt: skip
+                  label="best for its cost, with numbers")  # fmt: skip
         axis.set_xscale("log")
+        figure.draw_without_rendering()  # which lays the axes out
+        places = axis.transData.transform(front[["cost", score]])
+        named: list[Any] = []
+        for place, (_, row) in reversed(list(zip(places, front.iterrows(), strict=True))):
+            if all((abs(place - other) > NUMBER).any() for other in named):
+                axis.annotate(f"{row['trial']:.0f}", (row["cost"], row[score]), fontsize=8,
+                              textcoords="offset points", xytext=(4, -10))  # fmt: skip
+                named.append(place)
         axis.set_xlabel("training steps of all agents of the trial")
         many = f", {score} of {search.config.seeds} seeds" if search.config.seeds > 1 else ""
         axis.set_ylabel(f"score ({search.measure} of generations{many})")
