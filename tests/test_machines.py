@@ -342,6 +342,13 @@ def test_without_any_machine_somebody_is_told_and_it_is_waited_for():
     assert crew.now == pytest.approx(102, abs=2)
 
 
+def test_while_no_worker_is_ready_somebody_is_told():
+    crew = Crew(room=2, fate=lambda worker, turn: (70.0, None))
+    hand_out_of(crew).get_ready()
+    told = "None of 2 workers is ready yet: they compile, or other jobs hold what they need"
+    assert [text.partition(" (")[0] for text in crew.said] == [told] * 2
+
+
 def test_workers_that_never_get_ready_end_the_run():
     crew = Crew(room=3, fate=lambda worker, turn: (1.0, OSError("no space")))
     with pytest.raises(

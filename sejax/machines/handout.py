@@ -23,7 +23,7 @@ GIVEN_UP_AFTER = 10.0  # times that, until its worker counts as hanging
 LEAST_S = 20.0  # before which none counts as hanging
 MOST_FAILURES = 5  # of one share, or of starts in succession: that is no accident any more
 LOOK_S = 1.0  # between looks at what hangs, and for machines that have come
-ALONE_S = 30.0  # without any worker, until somebody is told
+ALONE_S = 30.0  # without any worker that is ready, until somebody is told
 
 
 class Lost(Exception):
@@ -278,11 +278,15 @@ class HandOut:
         if self._failed_starts < MOST_FAILURES or not self._hands:
             for worker in self._crew.recruit():
                 self._hands[worker] = _Hand(now)
-        if self._hands:
+        if any(hand.about for hand in self._hands.values()):
             self._staffed = now
         elif now - self._staffed > ALONE_S:
             self._staffed = now
-            self._say("No machine has room for a worker; waiting for one.")
+            self._say(
+                f"None of {len(self._hands)} workers is ready yet: they compile, or other jobs "
+                f"hold what they need (ray status). Waiting for one."
+                if self._hands else "No machine has room for a worker; waiting for one."
+            )  # fmt: skip
 
     def _start_failed(self, hand: _Hand, error: Exception, now: float) -> None:
         if hand.since >= self._start_failed_at:  # those before may have gone with one node
