@@ -3,6 +3,7 @@
 import atexit
 import contextlib
 import dataclasses
+import errno
 import functools
 import os
 import shlex
@@ -262,6 +263,24 @@ def test_an_error_is_no_trial_and_ends_the_worker(tmp_path):
         study.work(found, search, Broken(search), lambda text: None)
 
 
+def test_a_trial_that_cannot_be_written_is_queued_again_and_goes_on(tmp_path):
+    class Full(Runner):
+        is_full = True
+
+        def meanwhile(self, name, generation):
+            if self.is_full and (name, generation) == ("0001", 2):
+                Full.is_full = False
+                raise OSError(errno.ENOSPC, "No space left on device")
+
+    found, search = in_memory(tmp_path, "trials=3", "pruner=none", "max_generations=3")
+    with pytest.raises(OSError, match="No space"):
+        study.work(found, search, Full(search), lambda text: None)
+    study.work(found, search, Full(search), lambda text: None)
+    assert states(found) == ["COMPLETE", "FAIL", "COMPLETE", "COMPLETE"]
+    assert found.trials[2].user_attrs[study.HISTORY] == [1]
+    assert found.trials[2].params == found.trials[1].params
+
+
 def test_workers_join_by_the_studys_name_and_other_searches_are_refused(tmp_path):
     _, search = opened(tmp_path, "env=acrobot", "study=mine", "seeds=2")
     url = search.storage
@@ -272,8 +291,11 @@ def test_workers_join_by_the_studys_name_and_other_searches_are_refused(tmp_path
         opened(tmp_path, "env=acrobot", "study=mine", "seeds=3")
     with pytest.raises(ConfigError, match="env=acrobot there, env=cartpole here"):
         opened(tmp_path, "env=cartpole", "study=mine", "seeds=2")
-    with pytest.raises(ConfigError, match="space must be given"):
+    with pytest.raises(ConfigError, match="study must be one that is there.* got other.* has mine"):
         study.open_study(settings.read(["study=other", f"storage={url}"]))
+    with pytest.raises(ConfigError, match="space must be given"):
+        study.open_study(settings.read(["study=other", "seeds=2", f"storage={url}"]))
+    assert optuna.get_all_study_names(url) == ["mine"]
 
 
 def test_a_study_of_a_version_with_other_fields_is_joined(tmp_path):
@@ -371,6 +393,34 @@ def test_the_newest_directory_is_copied_with_its_checkpoint_first(tmp_path, monk
     assert copied[0] == "checkpoint"
     assert sorted(x.name for x in (tmp_path / "0005").iterdir()) == ["checkpoint", "metrics.csv"]
     assert not trials.take_over(tmp_path / "0006", [tmp_path / "0004"])
+
+
+def test_a_checkpoint_that_is_replaced_while_it_is_copied_does_no_harm(tmp_path, monkeypatch):
+    old = tmp_path / "0000" / "checkpoint"
+    old.mkdir(parents=True)
+    for name in ("1.msgpack", "2.msgpack"):
+        (old / name).write_text(name)
+    one = trials.shutil.copy2
+
+    def copy(source, to):
+        (old / "1.msgpack").unlink(missing_ok=True)
+        return one(source, to)
+
+    monkeypatch.setattr(trials.shutil, "copy2", copy)
+    assert trials.take_over(tmp_path / "0001", [tmp_path / "0000"])
+    assert [x.name for x in (tmp_path / "0001" / "checkpoint").iterdir()] == ["2.msgpack"]
+
+
+def test_what_was_refused_is_not_what_pruning_saved(tmp_path):
+    rows = pd.DataFrame({"state": ["complete", "pruned", "pruned"], "generations": [4, 1, None]})
+    said = results.saved_by_pruning(rows, read(tmp_path, "max_generations=4"))
+    assert said == ("1 of 2 trials were pruned, which saved 3 of 8 generations (38%). "
+                    "Refused as they were: 1.")  # fmt: skip
+
+
+def test_names_are_text_whatever_yaml_takes_them_for():
+    config = settings.read([SPACE, "study=2024-01-01", "search_dir=007", "storage=null"]).config
+    assert (config.study, config.search_dir, config.storage) == ("2024-01-01", "007", None)
 
 
 def test_the_front_has_what_none_beats_at_its_cost():

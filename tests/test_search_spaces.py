@@ -73,6 +73,7 @@ def test_written_values_stay_within_their_bounds():
         ("3", r"es\.x must be a sweep of Hydra's.*got 3\. Set es\.x="),
         ("glob(*)", "must be a sweep"),
         ("interval(0, 1", "must be a sweep"),
+        ("interval(0.1, inf)", r"have finite bounds.*got interval\(0.1, inf\)"),
         ("interval(2, 1)", r"be a range that grows.*got interval\(2, 1\)"),
         ("tag(log, interval(0, 1))", "begin above 0"),
         ("tag(inverse, interval(0, 1))", "have the tags log, or log and inverse"),
@@ -195,6 +196,8 @@ def test_every_preset_names_fields_of_its_command_with_bounds_that_are_taken(nam
         (["min_generations=9", "max_generations=3"], "max_generations must be at least"),
         (["pruner=asha"], "pruner must be one of"),
         (["es.noise_std=interval(1"], "must read name=value.*es.noise_std"),
+        (["sampler_seed=-1"], "sampler_seed must be at least 0"),
+        (["proxy=real"], r"proxy must be learned, .* got real\. Set proxy=cartpole"),
         (["trials=many"], "trials must be a whole number"),
         (["generations=9"], r"generations must be left out.*got 9\. Set max_generations=27"),
         (["run_dir=a,b"], r"run_dir must be left out.*Set search_dir=FOLDER"),
@@ -203,6 +206,15 @@ def test_every_preset_names_fields_of_its_command_with_bounds_that_are_taken(nam
 def test_bad_words_get_one_sentence(words, message):
     with pytest.raises(ConfigError, match=message):
         settings.read(words)
+
+
+@pytest.mark.parametrize("text", ["[ddqn]", "{ddqn: 3}"])
+def test_a_file_of_ranges_maps_agents_to_theirs(tmp_path, text):
+    (tmp_path / "mine.yaml").write_text(f"with_agent: {text}")
+    with pytest.raises(ConfigError, match="space must map agents to their sweeps"):
+        settings.read([f"space={tmp_path / 'mine.yaml'}"])
+    (tmp_path / "mine.yaml").write_text("es.noise_std: interval(0.1, 0.2)\nwith_agent:\n")
+    assert list(settings.read([f"space={tmp_path / 'mine.yaml'}"]).space) == ["es.noise_std"]
 
 
 def test_a_field_that_does_not_exist_is_not_searched():

@@ -70,12 +70,15 @@ def table(study: optuna.Study, search: Search) -> Any:
 
 
 def saved_by_pruning(rows: Any, search: Search) -> str:
-    """A sentence on the generations that pruned trials did not run."""
-    pruned = rows[rows["state"] == "pruned"]
-    ran, most = pruned["generations"].fillna(0).sum(), search.config.max_generations
-    saved, all_of_them = len(pruned) * most - ran, len(rows) * most
-    return (f"{len(pruned)} of {len(rows)} trials were pruned, which saved {saved:,.0f} of "
-            f"{all_of_them:,} generations ({saved / max(all_of_them, 1):.0%}).")  # fmt: skip
+    """A sentence on the generations that pruned trials did not run; what was refused had none."""
+    begun = rows.dropna(subset=["generations"])
+    pruned, most = begun[begun["state"] == "pruned"], search.config.max_generations
+    saved, all_of_them = len(pruned) * most - pruned["generations"].sum(), len(begun) * most
+    num_refused = len(rows) - len(begun)
+    refused = f" Refused as they were: {num_refused}." if num_refused else ""
+    return (f"{len(pruned)} of {len(begun)} trials were pruned, which saved {saved:,.0f} of "
+            f"{all_of_them:,} generations "
+            f"({saved / max(all_of_them, 1):.0%}).{refused}")  # fmt: skip
 
 
 def equally_good(trials: Sequence[FrozenTrial], search: Search) -> str:
@@ -127,7 +130,7 @@ def draw_pareto(rows: Any, search: Search, path: Path) -> None:
     with plt.rc_context({"font.size": 10, "axes.spines.top": False, "axes.spines.right": False}):
         figure, axis = plt.subplots(figsize=(7, 4.2), layout="constrained")
         for state, color in (("pruned", "0.6"), ("complete", INCUMBENT)):
-            some = rows[rows["state"] == state]
+            some = rows[(rows["state"] == state) & rows[score].notna()]
             axis.plot(some["cost"], some[score], "o", ms=5, mew=0, alpha=0.75, color=color,
                       label=f"{state} ({len(some)})")  # fmt: skip
         axis.step(front["cost"], front[score], where="post", color=POPULATION, lw=1.4,

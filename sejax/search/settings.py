@@ -23,6 +23,8 @@ SAMPLERS = ("tpe", "random")
 PRUNERS = ("hyperband", "median", "none")
 SCORES = ("mean", "worst")
 MEASURES = ("last", "best", "mean")
+# Fields that are text, whatever YAML takes it for: study=2024-01-01.
+TEXTS = ("study", "storage", "search_dir", "space")
 # Fields of the command that are the search's, and which of its own to set in their place.
 TAKEN = {
     "generations": "max_generations=27", "num_seeds": "seeds=3", "run_dir": "search_dir=FOLDER",
@@ -52,7 +54,8 @@ class SearchConfig(Options):
 
     trials: int = option(60, counts("there is nothing to compare otherwise"))  # that end
     sampler: str = option("tpe", one_of(SAMPLERS))
-    sampler_seed: int | None = None  # null: drawn, so that workers do not draw alike
+    # null: drawn, so that workers do not draw alike.
+    sampler_seed: int | None = option(None, counts("it seeds a generator", least=0))
     pruner: str = option("hyperband", one_of(PRUNERS))
     min_generations: int = option(3, counts("a trial must show something"))  # before one is pruned
     max_generations: int = option(27, counts("there is nothing to do otherwise"))
@@ -202,7 +205,9 @@ def read(words: Sequence[str]) -> Search:
     for word in compose.hydra_words(words):
         name, equals, text = word.partition("=")
         if equals and name in own:
-            values[name] = text if name == "storage" and text != "null" else _plain(text)
+            value = _plain(text)
+            is_text = name in TEXTS and value is not None and not isinstance(value, str)
+            values[name] = text if is_text else value
             continue
         if name.partition(".")[0] == "machines":
             machines[name.partition(".")[2] or "name"] = _plain(text)
@@ -216,6 +221,9 @@ def read(words: Sequence[str]) -> Search:
             fixed.append(word)
     config = serialize.from_plain(SearchConfig, values, "")
     search = Search(config=config, fixed=tuple(fixed), space=swept, machines=_machines(machines))
+    require(search.choice("proxy", "se") != "real", "proxy", "be learned, or be one to tune agents "
+            "on", "trials on the real task cost what a proxy saves", "real",
+            "proxy=cartpole, or env=cartpole proxy=se")  # fmt: skip
     if config.space is None:
         return search
     preset = spaces.preset(config.space, search.agent, search.is_of_agent)

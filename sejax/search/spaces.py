@@ -7,6 +7,7 @@ from 1, which the paper's tables call "True (inv.)".
 A file of a space holds sweeps by the names of fields, and under `with_agent` those of an agent.
 """
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -125,6 +126,8 @@ def parse(name: str, text: str) -> Dimension:
         plain = [x.text if isinstance(x, QuotedString) else x for x in sweep.list]
         return Dimension(name=name, text=text, values=tuple(map(word, plain)))
     low, high, step = _range(name, text, sweep)
+    require(math.isfinite(low) and math.isfinite(high), name, "have finite bounds", "all between "
+            "them is drawn", shortened(text), f"{name}='{EXAMPLE}'")  # fmt: skip
     require(low <= high, name, "be a range that grows", "there is nothing in it otherwise",
             shortened(text), f"{name}='{EXAMPLE}'")  # fmt: skip
     require(not log or inverse or (low > 0 and step in (None, 1)), name, "begin above 0 and have "
@@ -186,7 +189,10 @@ def preset(name: str, agent: str, of_agent: bool) -> dict[str, Dimension]:
         ) from error
     require(isinstance(content, dict), "space", "map fields to sweeps", "they are searched",
             f"{path} with a {type(content).__name__}", "space=paper_se")  # fmt: skip
-    of_agents = content.pop("with_agent", {})
+    of_agents = content.pop("with_agent", None) or {}
+    require(isinstance(of_agents, dict) and all(isinstance(x, dict) for x in of_agents.values()),
+            "space", "map agents to their sweeps under with_agent", "each has its own",
+            f"{path} with {shortened(of_agents)} there", "space=paper_se")  # fmt: skip
     has_others, are_several = bool(content), families.JOINT in agent
     for each in families.members(agent):
         require(has_others or each in of_agents, "agent", f"be one of {', '.join(of_agents)} with "

@@ -17,7 +17,7 @@ import optuna
 import sqlalchemy.exc
 from optuna.trial import TrialState
 
-from sejax.errors import ConfigError, require, told
+from sejax.errors import ConfigError, require, shortened, told
 from sejax.search.settings import Search, completed
 from sejax.search.trials import Follower, Lost, Progress, take_over
 
@@ -25,6 +25,7 @@ STORED = "sejax"  # the study's attribute that holds what is searched
 RETRIES = 3  # of a trial; one that takes its process down each time is given up then
 GRACE = 4  # heartbeats that may be missed
 ATTEMPTS = 3  # to open a storage, with a second between them
+MAKING_S = 5  # for another process to write what a study searches
 LONGEST_WAIT = 3600  # s, for another worker's write to SQLite; one that was stopped in it blocks
 REDUCTION_FACTOR = 3  # eta of Hyperband
 HISTORY = "retried"  # the trial's attribute with the numbers of those before
@@ -72,9 +73,15 @@ def open_study(
     """
     optuna.logging.set_verbosity(optuna.logging.ERROR)
     logging.getLogger("alembic").setLevel(logging.WARNING)
+    if not search.names_study_alone:
+        require(search.space, "space", "be given, or sweeps of fields", "there is nothing to "
+                "search otherwise", "none", "space=paper_se, or es.noise_std='tag(log, "
+                "interval(0.01, 0.3))'")  # fmt: skip
     storage = _storage(search)
     try:
         with _unchanged():
+            if search.names_study_alone:
+                _require_study(search, storage)
             study = optuna.create_study(
                 study_name=search.study, storage=storage, direction="maximize",
                 sampler=_sampler(search), pruner=_pruner(search), load_if_exists=True,
@@ -87,18 +94,36 @@ def open_study(
             search = joined
             study.sampler, study.pruner = _sampler(search), _pruner(search)
         else:
-            require(search.space, "space", "be given, or sweeps of fields", "there is nothing to "
-                    "search otherwise", "none", "space=paper_se, or es.noise_std='tag(log, "
-                    "interval(0.01, 0.3))'")  # fmt: skip
             study.set_user_attr(STORED, search.stored())
             first = {x.parameter: x.parameter_of(usual.get(name))
                      for name, x in search.space.items()} if usual else {}  # fmt: skip
             if first and None not in first.values():
                 with _unchanged():
-                    study.enqueue_trial(first)
+                    study.enqueue_trial(first, skip_if_exists=True)
     except optuna.exceptions.StorageInternalError as error:
         raise _unusable(search, error) from error
     return study, search
+
+
+def _require_study(search: Search, storage: optuna.storages.RDBStorage) -> None:
+    """Checks that a study which is named alone is there, and waits while another process makes it.
+
+    Raises:
+      ConfigError: if it is not.
+    """
+    for _ in range(MAKING_S):
+        made = {each.study_name: each for each in optuna.get_all_study_summaries(storage)}
+        if search.study in made and STORED in made[search.study].user_attrs:
+            return
+        if search.study not in made:
+            break
+        time.sleep(1.0)
+    there = [name for name, each in made.items() if STORED in each.user_attrs]
+    raise ConfigError(
+        f"study must be one that is there, because nothing says what to search otherwise; got "
+        f"{shortened(search.study)}, and the storage has {', '.join(there) or 'none'}. Set "
+        f"study=NAME storage=URL, or say what to search: space=paper_se."
+    )
 
 
 def work(
@@ -109,7 +134,7 @@ def work(
     With several workers a few more than `trials` may end, as each looks before it takes one.
 
     Raises:
-      KeyboardInterrupt: after queueing the trial at hand again.
+      KeyboardInterrupt: after queueing the trial at hand again, as after the following.
       ConfigError, OSError: of a trial that cannot be written.
     """
     config, started, waits = search.config, time.monotonic(), False
@@ -230,7 +255,10 @@ def _run_one(study: optuna.Study, objective: Objective) -> None:
                 queue_again(study, objective.trial)
             raise
         except Exception:  # of several kinds, where Optuna cannot end what another has ended
-            if not (objective.is_done and _has_failed(study, objective.trial)):
+            has_failed = _has_failed(study, objective.trial)
+            if has_failed and not objective.is_done:
+                queue_again(study, objective.trial)  # a full disk, or no memory here
+            if not (has_failed and objective.is_done):
                 raise
             objective.say(f"trial {objective.trial.number}: was taken for dead and is another "
                           f"worker's now")  # fmt: skip

@@ -136,10 +136,16 @@ def take_over(folder: Path, predecessors: Sequence[Path]) -> bool:
         source = found / name
         if name == "sejax.lock" or name.startswith("."):
             continue
-        with contextlib.suppress(FileNotFoundError):  # replaced meanwhile
-            if source.is_dir():
-                shutil.copytree(source, partial / name, ignore=shutil.ignore_patterns(".*"))
-            else:
-                shutil.copy2(source, partial / name)
+        if source.is_dir():
+            shutil.copytree(source, partial / name, ignore=shutil.ignore_patterns(".*"),
+                            copy_function=_copy_if_there)  # fmt: skip
+        else:
+            _copy_if_there(source, partial / name)
     partial.rename(folder)
     return True
+
+
+def _copy_if_there(source: str | Path, to: str | Path) -> None:
+    """Copies a file that may be removed meanwhile, as a checkpoint is once a newer one is there."""
+    with contextlib.suppress(FileNotFoundError):
+        shutil.copy2(source, to)
