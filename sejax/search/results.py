@@ -75,7 +75,7 @@ def saved_by_pruning(rows: Any, search: Search) -> str:
     pruned, most = begun[begun["state"] == "pruned"], search.config.max_generations
     saved, all_of_them = len(pruned) * most - pruned["generations"].sum(), len(begun) * most
     num_refused = len(rows) - len(begun)
-    refused = f" Refused as they were: {num_refused}." if num_refused else ""
+    refused = f" Refused: {num_refused}." if num_refused else ""
     return (f"{len(pruned)} of {len(begun)} trials were pruned, which saved {saved:,.0f} of "
             f"{all_of_them:,} generations "
             f"({saved / max(all_of_them, 1):.0%}).{refused}")  # fmt: skip
