@@ -1,22 +1,26 @@
 """A study whose workers are processes on a Ray cluster.
 
-They share nothing but the study's database, as any workers do: Ray starts them where there is room,
-and another in the place of one that is lost.
+They share nothing but the study's database, as any workers do: Ray starts them where there is room.
+Another is started in the place of one that is lost, and one that hangs is ended after the study.
 """
 
+import contextlib
 import time
 from collections.abc import Callable
 from typing import Any
 
 import optuna
 import ray
+from optuna.trial import TrialState
 
 from sejax.errors import require, told
 from sejax.machines import ray_crew
 from sejax.machines.handout import LOOK_S, MOST_FAILURES
 from sejax.search.results import ENDED
 from sejax.search.settings import Search
-from sejax.search.study import sentence
+from sejax.search.study import begin_heartbeats, fail_stale, sentence
+
+LAST_LOOKS = 10  # after the study, at workers that look each second whether it is over
 
 
 def work(study: optuna.Study, search: Search, say: Callable[[str], None]) -> None:
@@ -26,33 +30,93 @@ def work(study: optuna.Study, search: Search, say: Callable[[str], None]) -> Non
       ConfigError: if the cluster cannot be reached or no worker can work there.
       KeyboardInterrupt: the trials at hand are queued again once their heartbeats have ended.
     """
-    machines = search.machines
     with ray_crew.connected():
-        ray_crew.require_workers(machines)
-        start = ray.remote(num_cpus=1, num_gpus=machines.gpus_per_worker, max_retries=0)(_work)
-        running: list[Any] = []
-        failures, is_over = 0, False
-        told_of = {trial.number for trial in study.get_trials(deepcopy=False, states=ENDED)}
-        while running or not is_over:
-            room = ray_crew.num_workers(machines) if not is_over else 0
-            running += [start.remote(_words(search)) for _ in range(room - len(running))]
-            if not running:
-                time.sleep(LOOK_S)
-                continue
-            ready, running = ray.wait(running, num_returns=1, timeout=LOOK_S)
-            for trial in study.get_trials(deepcopy=False, states=ENDED):
-                if trial.number not in told_of:
-                    told_of.add(trial.number)
-                    say(sentence(trial, trial.state.name.lower(), search))
-            for each in ready:
-                came = ray_crew.result_of(each)
-                is_over = is_over or not isinstance(came, Exception)
-                failures = failures + 1 if isinstance(came, Exception) else 0
-                if isinstance(came, Exception):
-                    say(f"A worker was lost ({told(came)}).")
-                    require(failures < MOST_FAILURES, "machines", "have workers that stay", "they "
-                            "make the trials", f"{failures} lost in a row, the last by "
-                            f"{told(came)}", "machines=local to see why")  # fmt: skip
+        ray_crew.require_workers(search.machines)
+        with contextlib.closing(_Workers(search)) as workers:
+            _attend(study, search, workers, say)
+
+
+class _Workers:
+    """Workers on the cluster.
+
+    Attributes:
+      failures: losses in succession; workers that go together, as with their node, are one.
+    """
+
+    def __init__(self, search: Search):
+        self._search = search
+        self._start = ray.remote(
+            num_cpus=1, num_gpus=search.machines.gpus_per_worker, max_retries=0
+        )(_work)
+        self._running: dict[Any, int] = {}  # each with the losses when it was started
+        self._losses = 0
+        self.failures = 0
+
+    def __len__(self) -> int:
+        return len(self._running)
+
+    def recruit(self) -> None:
+        """Starts workers where there is room."""
+        for _ in range(ray_crew.num_workers(self._search.machines) - len(self)):
+            self._running[self._start.remote(_words(self._search))] = self._losses
+
+    def wait(self) -> list[Any]:
+        """Waits until a worker ends, or for a while.
+
+        Returns:
+          What it returned, or the exception by which it failed or was lost; empty if none ended.
+        """
+        if not self._running:
+            time.sleep(LOOK_S)
+            return []
+        ready, _ = ray.wait(list(self._running), num_returns=1, timeout=LOOK_S)
+        came = []
+        for worker in ready:
+            losses_before = self._running.pop(worker)
+            came.append(ray_crew.result_of(worker))
+            # Those that were there at the last loss may have gone with the same node.
+            if isinstance(came[-1], Exception) and losses_before == self._losses:
+                self._losses += 1
+                self.failures += 1
+        return came
+
+    def close(self) -> None:
+        """Ends workers, whatever they do."""
+        for worker in self._running:
+            ray.cancel(worker, force=True)
+
+
+def _attend(
+    study: optuna.Study, search: Search, workers: _Workers, say: Callable[[str], None]
+) -> None:
+    """Keeps workers at a study until it is over and they have ended, or all but those that hang."""
+    told_of = {trial.number for trial in study.get_trials(deepcopy=False, states=ENDED)}
+    is_over, last_looks = False, 0
+    while not is_over or len(workers):
+        if not is_over:
+            workers.recruit()
+        came = workers.wait()
+        for trial in study.get_trials(deepcopy=False, states=ENDED):
+            if trial.number not in told_of:
+                told_of.add(trial.number)
+                say(sentence(trial, trial.state.name.lower(), search))
+                workers.failures = 0
+        for error in (each for each in came if isinstance(each, Exception)):
+            say(f"A worker was lost ({told(error)}).")
+            require(is_over or workers.failures < MOST_FAILURES, "machines", "have workers that "
+                    "stay", "they make the trials", f"{workers.failures} lost in a row, the last "
+                    f"by {told(error)}", "machines=local to see why")  # fmt: skip
+        if not is_over and any(not isinstance(each, Exception) for each in came):
+            is_over = True  # or the time is, and trials that others have begun go on
+            begin_heartbeats(study)
+        if is_over:
+            fail_stale(study)
+            is_anyone_busy = study.get_trials(deepcopy=False, states=(TrialState.RUNNING,))
+            last_looks = 0 if is_anyone_busy else last_looks + (not came)
+        if last_looks == LAST_LOOKS:
+            say(f"The study is over; workers that have not noticed in {LAST_LOOKS * LOOK_S:.0f} s "
+                f"are ended: {len(workers)}.")  # fmt: skip
+            return
 
 
 def _words(search: Search) -> list[str]:

@@ -140,8 +140,7 @@ def work(
     config, started, waits = search.config, time.monotonic(), False
     objective = Objective(search, runner, say)
     while config.timeout is None or time.monotonic() - started < config.timeout:
-        with _unchanged():
-            optuna.storages.fail_stale_trials(study)
+        fail_stale(study)
         count = Counter(trial.state for trial in study.get_trials(deepcopy=False))
         ended = count[TrialState.COMPLETE] + count[TrialState.PRUNED]
         if ended >= config.trials and not count[TrialState.WAITING] + count[TrialState.RUNNING]:
@@ -153,12 +152,18 @@ def work(
             if not waits:
                 say(f"Waiting for {count[TrialState.RUNNING]} trials of other workers, or for "
                     f"their heartbeats to end ({GRACE * config.heartbeat} s).")  # fmt: skip
-                _begin_heartbeats(study)
+                begin_heartbeats(study)
             waits = True
             time.sleep(min(1.0, config.heartbeat))
 
 
-def _begin_heartbeats(study: optuna.Study) -> None:
+def fail_stale(study: optuna.Study) -> None:
+    """Counts trials as failed whose heartbeats have ended, and queues them again."""
+    with _unchanged():
+        optuna.storages.fail_stale_trials(study)
+
+
+def begin_heartbeats(study: optuna.Study) -> None:
     """Records a heartbeat of each running trial, as a worker that died before its first had none.
 
     Optuna would take such a trial for one that goes on for ever. A worker that lives records later
