@@ -644,7 +644,7 @@ def test_the_best_are_tried_again_with_other_seeds(tmp_path):
     table = verification.verify(found, search, runner)
     (best,) = table.to_dict("records")
     assert best["trial"] == results.ranked(found)[0].number and best["rank"] == 1
-    folder = tmp_path / "verified" / f"{best['trial']:04d}"
+    folder = tmp_path / "verified" / f"{best['trial']:04d}-3"
     rows = pd.read_csv(folder / "metrics.csv")
     assert sorted(set(rows["seed"])) == [1, 2, 3]  # 0 was the trial's
     last = rows[rows["generation"] == 1]["incumbent_mean"]

@@ -80,7 +80,7 @@ def _verified(found: Any, search: Search, runner: Any) -> list[str]:
         commands.leave(commands.INTERRUPTED)
     finally:
         lock.release()
-    verification.print_table(table, search, getattr(runner.config([]), "num_agents", 0))
+    verification.print_table(table, search)
     best = found.get_trials(deepcopy=False)[int(table["trial"].iloc[0])]
     words = results.words_of(best, search)
     results.write_best(words, search, runner.command)

@@ -1,5 +1,6 @@
 """Trials that learn a proxy: runs of `sejax.run`, each in a directory of its own."""
 
+import math
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
@@ -60,6 +61,10 @@ class Learning:
             shutil.rmtree(config.resolved_run_dir)
             return self._run(config, follower)
 
+    def num_fresh(self) -> int:
+        """How many seeds `verify` runs."""
+        return self._search.config.fresh_seeds
+
     def verify(self, words: Sequence[str], number: int) -> dict[str, float]:
         """What settings are worth with seeds that no trial has had; goes on where it stopped.
 
@@ -69,8 +74,8 @@ class Learning:
         """
         search, usual = self._search, self.config([])
         fresh = [f"seed={usual.seed + usual.num_seeds}"]
-        folder = search.folder / "verified" / f"{number:04d}"
-        config = self.config([*words, *fresh], folder, search.config.fresh_seeds)
+        folder = search.folder / "verified" / f"{number:04d}-{self.num_fresh()}"
+        config = self.config([*words, *fresh], folder, self.num_fresh())
         with open_for(config, "Set search_dir=FOLDER.") as directory:
             chunks = self._programs.chunks(config)
             session.run(config, directory, chunks)
@@ -82,8 +87,9 @@ class Learning:
                 "generations": float(np.mean(lengths))}  # fmt: skip
 
     def order(self, row: dict[str, float]) -> tuple[float, float]:
-        """By which the best rows of `verify` come first."""
-        return -row[self._search.config.score], row["generations"]
+        """By which the best rows of `verify` come first, and those that are not finite last."""
+        score = row[self._search.config.score]
+        return (-score, row["generations"]) if math.isfinite(score) else (math.inf, 0.0)
 
     def _run(self, config: build.LearnConfig, follower: Follower) -> Progress:
         with open_for(config, "Set search_dir=FOLDER.") as directory:

@@ -2,11 +2,12 @@
 
 A generation is a round of `seeds` fresh agents, each trained on the proxy and tested on the real
 task; a seed's score is its agent's return there. At the end the best settings train agents on the
-real task, which alone says what they are worth there.
+real task, which alone says what they are worth there; with `baseline=false`, on the proxy alone.
 """
 
 import dataclasses
 import json
+import math
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -22,25 +23,38 @@ from sejax.files import write_text
 from sejax.search.programs import static_of, structure_of
 from sejax.search.settings import Search
 from sejax.search.trials import Follower, Progress
+from sejax.serialize import flatten
 
 ROUNDS = "rounds.json"
+WORLDS = {"the proxy": "proxy", "the real task": "real"}  # and what columns call them
+SHOWN = 3  # differing fields that a message names
 
 
 class Tuning:
-    """Trains agents on the proxy in each trial."""
+    """Trains agents on the proxy in each trial.
+
+    Raises:
+      ConfigError: if the proxy is not to be found here, which is no fault of a trial's settings.
+    """
 
     command = "sejax.evaluate"
 
     def __init__(self, search: Search):
+        from sejax.proxies import files
+
         self._search = search
+        self._usual = compose.evaluate_config(search.fixed)
+        files.find(self._usual.proxy, "proxy")
         self._compiled: dict[str, Any] = {}
 
     def config(self, words: Sequence[str], folder: Path | None = None) -> build.EvaluateConfig:
         """The configuration of a trial.
 
         Raises:
-          ConfigError: if it is none that can run.
+          ConfigError: if it is none that can run, or its agents would not learn on the proxy.
         """
+        from sejax.evaluate import proxy_study
+
         where = [f"out_dir={word(str(folder))}"] if folder is not None else []
         config = compose.evaluate_config([*self._search.fixed, *words, *where])
         require(config.agents is None, "agent", "be one", "its settings are searched", "several",
@@ -48,13 +62,20 @@ class Tuning:
         require(config.agent_hparams == "default", "agent_hparams", "be default",
                 "the trial's settings are those that are tried", config.agent_hparams,
                 "agent_hparams=default")  # fmt: skip
+        proxy_study(config)  # which checks what is asked of the proxy
         return config
 
     def run(self, config: build.EvaluateConfig, follower: Follower, is_inherited: bool) -> Progress:
         """Runs a trial, or what is left of it; arguments and errors as of `Learning.run`."""
         path = Path(config.out_dir or ".") / ROUNDS
-        rounds = _stored_rounds(path)
-        while len(rounds) < self._search.config.max_generations:
+        settings, most = self._settings_of(config), self._search.config.max_generations
+        try:
+            rounds = _stored_rounds(path, settings)[:most]
+        except ConfigError:
+            if not is_inherited:
+                raise
+            rounds = []
+        while len(rounds) < most:
             if rounds:
                 follower.tell(_progress_of(rounds))
             started = time.time()
@@ -62,8 +83,16 @@ class Tuning:
             rounds.append({"returns": outcome.test_return.tolist(),
                            "cost": int(np.sum(outcome.train_steps, dtype=np.int64)),
                            "seconds": time.time() - started})  # fmt: skip
-            write_text(path, json.dumps(rounds))
+            write_text(path, json.dumps({"settings": settings, "rounds": rounds}))
         return _progress_of(rounds)
+
+    def _settings_of(self, config: build.EvaluateConfig) -> dict[str, Any]:
+        """What a trial's rounds are of, by field, as it reads back from JSON."""
+        fields = flatten(build.to_plain(dataclasses.replace(config, out_dir=None)))
+        read_back: dict[str, Any] = json.loads(
+            json.dumps({**fields, "seeds": self._search.config.seeds})
+        )
+        return read_back
 
     def outcome(
         self, config: build.EvaluateConfig, world: str, generation: int, num_agents: int
@@ -94,19 +123,26 @@ class Tuning:
 
         return float(proxy_study(config).task.solved_reward)
 
+    def num_fresh(self) -> int:
+        """How many agents `verify` trains in each world."""
+        return self._usual.num_agents
+
     def verify(self, words: Sequence[str], number: int) -> dict[str, float]:
         """Returns and steps of agents trained with these settings, on the proxy and the real task.
 
-        Agents are `num_agents` fresh ones in each, of keys that no trial has had.
+        Agents are `num_agents` fresh ones in each, of keys that no trial has had; with
+        `baseline=false` none train on the real task.
 
         Args:
           words: the settings.
           number: of their trial.
         """
+        from sejax.evaluate import proxy_study
+
         config = self.config(words)
         values: dict[str, float] = {}
-        for world, name in (("the proxy", "proxy"), ("the real task", "real")):
-            fresh = self._search.config.max_generations
+        for world in proxy_study(config).worlds:
+            fresh, name = self._search.config.max_generations, WORLDS[world]
             outcome = self.outcome(config, world, fresh, config.num_agents)
             values[f"{name}_return"] = float(np.mean(outcome.test_return))
             values[f"{name}_std"] = float(np.std(outcome.test_return))
@@ -114,9 +150,15 @@ class Tuning:
         return values
 
     def order(self, row: dict[str, float]) -> tuple[float, float]:
-        """By which the best rows of `verify` come first; of settings that solve, the quickest."""
-        solved = self.solved_reward(self.config([]))
-        return -min(row["real_return"], solved), row["real_steps"]
+        """By which the best rows of `verify` come first; of settings that solve, the quickest.
+
+        Rows that are not finite come last.
+        """
+        where = "real" if self._usual.baseline else "proxy"
+        score = row[f"{where}_return"]
+        if not math.isfinite(score):
+            return math.inf, 0.0
+        return -min(score, self.solved_reward(self._usual)), row[f"{where}_steps"]
 
 
 def _make_rounds(agent: Any, study: Any, world: str, training: Any, config: Any) -> Any:
@@ -142,22 +184,35 @@ def _make_rounds(agent: Any, study: Any, world: str, training: Any, config: Any)
     return jax.jit(rounds, compiler_options=compiler_options())
 
 
-def _stored_rounds(path: Path) -> list[dict[str, Any]]:
+def _stored_rounds(path: Path, settings: dict[str, Any]) -> list[dict[str, Any]]:
     """The rounds of an earlier session; none if there was none.
 
     Raises:
-      ConfigError: if the file is not one that a trial writes.
+      ConfigError: if the file is not one that a trial writes, or is of a trial with other settings.
     """
     try:
-        rounds: list[dict[str, Any]] = json.loads(path.read_text(encoding="utf-8"))
+        stored = json.loads(path.read_text(encoding="utf-8"))
+        there: dict[str, Any] = dict(stored["settings"])
+        rounds: list[dict[str, Any]] = stored["rounds"]
         _progress_of(rounds) if rounds else None
     except FileNotFoundError:
         return []
     except (ValueError, TypeError, KeyError) as error:
         raise ConfigError(
             f"search_dir must keep the rounds of its trials, because a trial goes on from them; "
-            f"got {path}, which cannot be read. Remove it; its trial begins anew."
+            f"got {path}, which cannot be read or does not say what settings it is of. Remove it; "
+            f"its trial begins anew."
         ) from error
+    differing = [f"{name} ({there.get(name)} there, {settings.get(name)} here)"
+                 for name in sorted(there.keys() | settings.keys())
+                 if repr(there.get(name)) != repr(settings.get(name))]  # fmt: skip
+    if differing:
+        more = f" and {len(differing) - SHOWN} more" if len(differing) > SHOWN else ""
+        raise ConfigError(
+            f"search_dir must be of one study, because a trial goes on from the rounds that it "
+            f"finds there; {path} differs in {', '.join(differing[:SHOWN])}{more}. Set "
+            f"search_dir=FOLDER, a new one."
+        )
     return rounds
 
 
