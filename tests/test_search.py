@@ -14,7 +14,9 @@ import sqlite3
 import subprocess
 import sys
 import tempfile
+import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -279,6 +281,23 @@ def test_a_trial_that_cannot_be_written_is_queued_again_and_goes_on(tmp_path):
     assert states(found) == ["COMPLETE", "FAIL", "COMPLETE", "COMPLETE"]
     assert found.trials[2].user_attrs[study.HISTORY] == [1]
     assert found.trials[2].params == found.trials[1].params
+
+
+def test_no_two_workers_get_the_same_waiting_trial(tmp_path):
+    found, _ = opened(tmp_path, "study=mine")
+    for _ in range(20):
+        found.enqueue_trial({})
+    url, start = f"sqlite:///{tmp_path / 'study.db'}", threading.Barrier(2)
+
+    def take(_):
+        mine, _ = study.open_study(settings.read(["study=mine", f"storage={url}"]))
+        start.wait()
+        return [mine._pop_waiting_trial_id() for _ in range(20)]
+
+    with ThreadPoolExecutor(2) as pool:
+        taken = [number for each in pool.map(take, range(2)) for number in each if number]
+    assert sorted(taken) == [trial._trial_id for trial in found.trials]
+    assert states(found) == ["RUNNING"] * 20 and found.trials[0].datetime_start
 
 
 def test_workers_join_by_the_studys_name_and_other_searches_are_refused(tmp_path):

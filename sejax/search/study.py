@@ -4,29 +4,24 @@ Workers of a study share nothing but the database. Each shows by heartbeats that
 whose worker has not done so for some time counts as failed, and is queued again.
 """
 
-import contextlib
 import logging
 import time
-import warnings
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Protocol
 
 import optuna
-import sqlalchemy.exc
 from optuna.trial import TrialState
 
-from sejax.errors import ConfigError, require, shortened, told
+from sejax.errors import ConfigError, require, shortened
 from sejax.search.settings import Search, completed
+from sejax.search.storage import GRACE, open_storage, quietly, unusable
 from sejax.search.trials import Follower, Lost, Progress, take_over
 
 STORED = "sejax"  # the study's attribute that holds what is searched
 RETRIES = 3  # of a trial; one that takes its process down each time is given up then
-GRACE = 4  # heartbeats that may be missed
-ATTEMPTS = 3  # to open a storage, with a second between them
 MAKING_S = 5  # for another process to write what a study searches
-LONGEST_WAIT = 3600  # s, for another worker's write to SQLite; one that was stopped in it blocks
 REDUCTION_FACTOR = 3  # eta of Hyperband
 HISTORY = "retried"  # the trial's attribute with the numbers of those before
 
@@ -78,9 +73,9 @@ def open_study(
         require(search.space, "space", "be given, or sweeps of fields", "there is nothing to "
                 "search otherwise", "none", "space=paper_se, or es.noise_std='tag(log, "
                 "interval(0.01, 0.3))'")  # fmt: skip
-    storage = _storage(search)
+    storage = open_storage(search, queue_again)
     try:
-        with _unchanged():
+        with quietly():
             if search.names_study_alone:
                 _require_study(search, storage)
             study = optuna.create_study(
@@ -99,10 +94,10 @@ def open_study(
             first = {x.parameter: x.parameter_of(usual.get(name))
                      for name, x in search.space.items()} if usual else {}  # fmt: skip
             if first and None not in first.values():
-                with _unchanged():
+                with quietly():
                     study.enqueue_trial(first, skip_if_exists=True)
     except optuna.exceptions.StorageInternalError as error:
-        raise _unusable(search, error) from error
+        raise unusable(search, error) from error
     return study, search
 
 
@@ -160,7 +155,7 @@ def work(
 
 def fail_stale(study: optuna.Study) -> None:
     """Counts trials as failed whose heartbeats have ended, and queues them again."""
-    with _unchanged():
+    with quietly():
         optuna.storages.fail_stale_trials(study)
 
 
@@ -253,7 +248,7 @@ def queue_again(study: optuna.Study, trial: optuna.Trial | optuna.trial.FrozenTr
 
 def _run_one(study: optuna.Study, objective: Objective) -> None:
     objective.trial, objective.is_done = None, False
-    with _unchanged():
+    with quietly():
         try:
             study.optimize(objective, n_trials=1)
         except KeyboardInterrupt:
@@ -274,45 +269,6 @@ def _has_failed(study: optuna.Study, trial: optuna.Trial | None) -> bool:
     """Whether a trial, if there is one, counts as failed by now."""
     failed = study.get_trials(deepcopy=False, states=(TrialState.FAIL,))
     return trial is not None and trial.number in [each.number for each in failed]
-
-
-def _storage(search: Search) -> optuna.storages.RDBStorage:
-    url, heartbeat = search.storage, search.config.heartbeat
-    if search.config.storage is None:
-        search.folder.mkdir(parents=True, exist_ok=True)
-    options: dict[str, Any] = {"pool_pre_ping": True}
-    if url.startswith("sqlite"):
-        options = {"connect_args": {"timeout": LONGEST_WAIT}}
-    attempts = ATTEMPTS
-    while True:
-        attempts -= 1
-        try:
-            with _unchanged():
-                storage = optuna.storages.RDBStorage(
-                    url, engine_kwargs=options, heartbeat_interval=heartbeat,
-                    grace_period=GRACE * heartbeat, heartbeat_stale_trial_callback=queue_again,
-                )  # fmt: skip
-            if url.startswith("sqlite"):
-                with storage.engine.connect() as connection:  # shorter locks, and none for readers
-                    connection.exec_driver_sql("PRAGMA journal_mode=WAL")
-            return storage
-        except sqlalchemy.exc.DatabaseError as error:  # another worker makes the tables just now
-            if not attempts:
-                raise _unusable(search, error) from error
-            time.sleep(1.0)
-        except Exception as error:  # of SQLAlchemy, of any driver, or that there is none
-            raise _unusable(search, error) from error
-
-
-def _unusable(search: Search, error: Exception) -> ConfigError:
-    cause = error.__cause__ or error
-    fix = "Set storage=null for a file in search_dir."
-    if isinstance(cause, ImportError) and search.storage.startswith("postgresql:"):
-        fix = "Install its driver with pip install 'psycopg[binary]'."
-    return ConfigError(
-        f"storage must be a database that can be used, because the study is kept there; got "
-        f"{search.storage.partition('://')[0]} ({told(cause)}). {fix}"
-    )
 
 
 def _sampler(search: Search) -> optuna.samplers.BaseSampler:
@@ -356,11 +312,3 @@ def _joined(search: Search, stored: dict[str, Any]) -> Search:
                 f"{search.study}, which differs in {', '.join(differing)}",
                 "study=NAME, or give study and storage alone to join")  # fmt: skip
     return Search.from_stored(stored, search.config, search.machines)
-
-
-@contextlib.contextmanager
-def _unchanged() -> Iterator[None]:
-    """Without Optuna's warnings that heartbeats may change."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
-        yield
