@@ -46,7 +46,7 @@ class Cluster:
 
     def __init__(self, room, fate):
         self.room, self.fate, self.now = room, fate, 0.0
-        self.started, self.cancelled, self.said = 0, [], []
+        self.started, self.cancelled, self.said, self.timeouts = 0, [], [], []
         self.study = optuna.create_study(sampler=optuna.samplers.RandomSampler(seed=0))
         self._ends, self._trials = {}, []  # of workers; what happens to trials, and when
 
@@ -63,6 +63,9 @@ class Cluster:
     def _end(self, state):
         (trial,) = self.study.get_trials(states=(TrialState.RUNNING,))
         self.study.tell(trial.number, 50.0 if state == TrialState.COMPLETE else None, state)
+
+    def monotonic(self):
+        return self.now
 
     def sleep(self, seconds):
         self.now += seconds
@@ -87,6 +90,7 @@ class Cluster:
 
     def _start(self, words):
         assert "study=some" in words
+        self.timeouts += [word for word in words if word.startswith("timeout=")]
         worker, self.started = self.started, self.started + 1
         self._ends[worker] = self.fate(worker, self.now)
         return worker
@@ -117,12 +121,13 @@ def search(monkeypatch):
             sys.modules.pop(f"{package}.{name}", None)
             vars(importlib.import_module(package)).pop(name, None)
 
-    def run(cluster):
+    def run(cluster, **fields):
         monkeypatch.setitem(sys.modules, "ray", cluster)
         searching = importlib.import_module("sejax.search.cluster")
         monkeypatch.setattr(searching, "time", cluster)
         machines = SimpleNamespace(workers=None, gpus_per_worker=0)
-        asked = dataclasses.replace(SEARCH, machines=machines)
+        config = dataclasses.replace(SEARCH.config, **fields)
+        asked = dataclasses.replace(SEARCH, config=config, machines=machines)
         searching.work(cluster.study, asked, cluster.said.append)
 
     forget()
@@ -217,3 +222,10 @@ def test_a_worker_that_is_lost_after_the_study_is_not_missed(search):
     search(cluster)
     assert cluster.said == [LOST] * 5
     assert (cluster.now, cluster.started, cluster.cancelled) == (11.0, 6, [])
+
+
+def test_a_worker_in_anothers_place_has_the_time_that_is_left(search):
+    cluster = Cluster(1, lambda worker, start: (FOREVER, None) if worker else (40.0, lost()))
+    search(cluster, timeout=100.0)
+    assert cluster.timeouts == ["timeout=100.0", "timeout=60.0"]
+    assert (cluster.now, cluster.started, cluster.cancelled) == (110.0, 2, [1])

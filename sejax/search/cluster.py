@@ -48,6 +48,7 @@ class _Workers:
         self._start = ray.remote(
             num_cpus=1, num_gpus=search.machines.gpus_per_worker, max_retries=0
         )(_work)
+        self._started_at = time.monotonic()
         self._running: dict[Any, int] = {}  # each with the losses when it was started
         self._losses = 0
         self.failures = 0
@@ -55,10 +56,17 @@ class _Workers:
     def __len__(self) -> int:
         return len(self._running)
 
+    @property
+    def timeout(self) -> float | None:
+        """Seconds that are left in which trials may begin; None for any number of them."""
+        whole = self._search.config.timeout
+        return None if whole is None else whole - (time.monotonic() - self._started_at)
+
     def recruit(self) -> None:
         """Starts workers where there is room."""
+        words = _words(self._search, self.timeout)
         for _ in range(ray_crew.num_workers(self._search.machines) - len(self)):
-            self._running[self._start.remote(_words(self._search))] = self._losses
+            self._running[self._start.remote(words)] = self._losses
 
     def wait(self) -> list[Any]:
         """Waits until a worker ends, or for a while.
@@ -93,7 +101,8 @@ def _attend(
     told_of = {trial.number for trial in study.get_trials(deepcopy=False, states=ENDED)}
     is_over, last_looks = False, 0
     while not is_over or len(workers):
-        if not is_over:
+        is_late = workers.timeout is not None and workers.timeout <= 0
+        if not is_over and not is_late:
             workers.recruit()
         came = workers.wait()
         for trial in study.get_trials(deepcopy=False, states=ENDED):
@@ -106,7 +115,7 @@ def _attend(
             require(is_over or workers.failures < MOST_FAILURES, "machines", "have workers that "
                     "stay", "they make the trials", f"{workers.failures} lost in a row, the last "
                     f"by {told(error)}", "machines=local to see why")  # fmt: skip
-        if not is_over and any(not isinstance(each, Exception) for each in came):
+        if not is_over and (is_late or any(not isinstance(each, Exception) for each in came)):
             is_over = True  # or the time is, and trials that others have begun go on
             begin_heartbeats(study)
         if is_over:
@@ -119,12 +128,12 @@ def _attend(
             return
 
 
-def _words(search: Search) -> list[str]:
+def _words(search: Search, timeout: float | None) -> list[str]:
     """The words by which a worker joins, and has what may differ between workers."""
     folder = search.folder.resolve()
     own = {"study": search.study, "search_dir": folder,
            "storage": search.config.storage or f"sqlite:///{folder / 'study.db'}",
-           "trials": search.config.trials, "timeout": search.config.timeout}  # fmt: skip
+           "trials": search.config.trials, "timeout": timeout}  # fmt: skip
     return [f"{name}={value}" for name, value in own.items() if value is not None]
 
 
