@@ -8,7 +8,7 @@ import contextlib
 import dataclasses
 import types
 import typing
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import Any
 
 from sejax.errors import ConfigError, nearest, require, shortened
@@ -69,6 +69,33 @@ def flatten(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
         else:
             flat[f"{prefix}{key}"] = value
     return flat
+
+
+def differences(
+    there: Mapping[str, Any], here: Mapping[str, Any], free: Collection[str] = (), most: int = 10
+) -> str:
+    """The fields in which two nested settings differ, for a message; empty if in none.
+
+    Args:
+      there: settings that were stored.
+      here: those that are asked for.
+      free: groups and fields of the first level that may differ.
+      most: fields that are named.
+
+    Example:
+      >>> differences({"es": {"noise_std": 0.1}, "seed": 0}, {"es": {"noise_std": 0.2}, "seed": 0})
+      'es.noise_std (0.1 there, 0.2 here)'
+    """
+    old, asked = flatten(there), flatten(here)
+    differing = [
+        f"{name} ({shortened(old.get(name), 60)} there, {shortened(asked.get(name), 60)} here)"
+        for name in sorted(old.keys() | asked.keys())
+        if name.partition(".")[0] not in free
+        # In the second way nan is nan.
+        and old.get(name) != asked.get(name) and repr(old.get(name)) != repr(asked.get(name))
+    ]  # fmt: skip
+    more = f" and {len(differing) - most} more" if len(differing) > most else ""
+    return ", ".join(differing[:most]) + more
 
 
 def _join(where: str, name: str) -> str:

@@ -17,8 +17,9 @@ import yaml
 
 import sejax
 from sejax.app import checkpoints, metrics, run_lock
-from sejax.app.run_directory import COLUMNS, RunDirectory, flatten, open_for
+from sejax.app.run_directory import COLUMNS, RunDirectory, open_for
 from sejax.errors import ConfigError
+from sejax.serialize import flatten
 
 CONFIG = {"seed": 0, "generations": 9, "checkpoint_every": 1, "run_dir": None,
           "es": {"noise_std": 0.0124, "population_size": 16}}  # fmt: skip

@@ -19,7 +19,7 @@ from sejax.app.metrics import COLUMNS, Metrics, MetricsError
 from sejax.app.run_lock import RunLock, acquire
 from sejax.errors import ConfigError
 from sejax.files import remove_leftovers, write_text
-from sejax.serialize import flatten
+from sejax.serialize import differences
 
 __all__ = ["COLUMNS", "FREE_FIELDS", "RunDirectory", "open_for"]
 
@@ -27,7 +27,6 @@ __all__ = ["COLUMNS", "FREE_FIELDS", "RunDirectory", "open_for"]
 # two sessions.
 FREE_FIELDS = {"generations", "devices", "checkpoint_every", "run_dir", "tracker", "machines"}
 HINT = "Set run_dir=FOLDER."
-_SHOWN = 10  # differing fields that a message names
 
 
 class RunDirectory:
@@ -246,24 +245,14 @@ class RunDirectory:
             )
 
     def _refuse_other_config(self, stored: dict[str, Any]) -> None:
-        differing = self._differing(stored)
-        differing = differing and self._differing(self._completed(stored))
-        if differing:
-            more = f" and {len(differing) - _SHOWN} more" if len(differing) > _SHOWN else ""
-            raise ConfigError(
-                f"run_dir must be new or hold a run of the same configuration, because a run goes "
-                f"on where it stopped; {self.path} differs in {', '.join(differing[:_SHOWN])}"
-                f"{more}. Take a new folder, or use the values there. {self._hint}"
-            )
-
-    def _differing(self, stored: dict[str, Any]) -> list[str]:
-        old, asked = flatten(stored), flatten(self.config)
-        return [
-            f"{name} ({_short(old.get(name))} there, {_short(asked.get(name))} here)"
-            for name in sorted(old.keys() | asked.keys())
-            if name.partition(".")[0] not in FREE_FIELDS
-            and not _same(old.get(name), asked.get(name))
-        ]
+        if differences(stored, self.config, FREE_FIELDS):
+            differing = differences(self._completed(stored), self.config, FREE_FIELDS)
+            if differing:
+                raise ConfigError(
+                    f"run_dir must be new or hold a run of the same configuration, because a run "
+                    f"goes on where it stopped; {self.path} differs in {differing}. Take a new "
+                    f"folder, or use the values there. {self._hint}"
+                )
 
     def _vouched(self, generation: int, record: Any) -> dict[str, Any]:
         """What the checkpoint keeps of the metrics, which were compared with it.
@@ -337,15 +326,6 @@ def open_for(config: Any, hint: str = HINT) -> RunDirectory:
     return RunDirectory.open(
         config.resolved_run_dir, build.to_plain(config), seeds, hint, keys, completed
     )
-
-
-def _same(a: Any, b: Any) -> bool:
-    return a == b or repr(a) == repr(b)  # nan is nan
-
-
-def _short(value: Any) -> str:
-    text = str(value)
-    return text if len(text) <= 60 else f"{text[:57]}..."
 
 
 def _is_record(record: Any) -> TypeGuard[dict[str, Any]]:

@@ -23,11 +23,10 @@ from sejax.files import write_text
 from sejax.search.programs import static_of, structure_of
 from sejax.search.settings import Search
 from sejax.search.trials import Follower, Progress
-from sejax.serialize import flatten
+from sejax.serialize import differences, flatten
 
 ROUNDS = "rounds.json"
 WORLDS = {"the proxy": "proxy", "the real task": "real"}  # and what columns call them
-SHOWN = 3  # differing fields that a message names
 
 
 class Tuning:
@@ -203,15 +202,11 @@ def _stored_rounds(path: Path, settings: dict[str, Any]) -> list[dict[str, Any]]
             f"got {path}, which cannot be read or does not say what settings it is of. Remove it; "
             f"its trial begins anew."
         ) from error
-    differing = [f"{name} ({there.get(name)} there, {settings.get(name)} here)"
-                 for name in sorted(there.keys() | settings.keys())
-                 if repr(there.get(name)) != repr(settings.get(name))]  # fmt: skip
+    differing = differences(there, settings, most=3)
     if differing:
-        more = f" and {len(differing) - SHOWN} more" if len(differing) > SHOWN else ""
         raise ConfigError(
             f"search_dir must be of one study, because a trial goes on from the rounds that it "
-            f"finds there; {path} differs in {', '.join(differing[:SHOWN])}{more}. Set "
-            f"search_dir=FOLDER, a new one."
+            f"finds there; {path} differs in {differing}. Set search_dir=FOLDER, a new one."
         )
     return rounds
 
