@@ -304,7 +304,9 @@ def test_settings_are_those_of_the_task():
     assert training["varied"].time_limit_is_terminal > training["tuned"].time_limit_is_terminal
     assert usual.agent("default").learning_rate == 2.5e-4  # the paper's table
     assert usual.agent("tuned") == sejax.config(["env=cartpole", "agent=ddqn"]).agent
-    quick_td3 = RnPerformance.of(env="mountain_car_continuous").agent("varied")
+    mountain_car = RnPerformance.of(env="mountain_car_continuous")
+    assert mountain_car.agent("tuned").rollout_steps == 256
+    quick_td3 = mountain_car.agent("varied")
     assert quick_td3 == sejax.config(["env=mountain_car_continuous", "proxy=rn"]).agent
     few = RnPerformance.of(env="cartpole", learned=5, rns=2)
     assert (few.rns, few.bonus_groups) == (2, 2) and RnPerformance.of(learned=5).rns == 5

@@ -40,7 +40,8 @@ class CurveSettings(RnSettings):
         each_of(ROWS),
         about="agents to train: default (the paper's hyperparameters; on continuous tasks those of "
         "the quick agent that RNs are learned with), varied (drawn for each agent), transfer (one "
-        "that the RNs never saw), on cartpole tuned (for few steps)",
+        "that the RNs never saw), tuned (on the real task for few steps: DDQN on cartpole, PPO on "
+        "mountain_car_continuous)",
     )
     bonuses: tuple[str, ...] = setting((), about="exploration bonuses on the real task to compare "
                                        "with: count_based on cliff_walking, elsewhere icm; or "
@@ -70,7 +71,7 @@ class CurveSettings(RnSettings):
         if row == "transfer":
             return self.study.transfer_agent
         if row == "tuned" and self.study.tuned_agent:
-            return worlds.tuned_agent(self.env, self.study.tuned_agent)
+            return self.study.tuned_agent()
         return self.study.agent or self.learning_agent
 
     def training(self, row: str) -> TrainingConfig:

@@ -15,7 +15,7 @@ import dataclasses
 import functools
 import itertools
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -26,7 +26,7 @@ import sejax
 from sejax import ICMConfig, errors, plugins, serialize
 from sejax.app import build, run_directory
 from sejax.errors import ConfigError
-from sejax.experiments import figures, pieces, proxy_runs
+from sejax.experiments import figures, pieces, proxy_runs, worlds
 from sejax.experiments.proxy_runs import RunSettings
 from sejax.experiments.settings import setting, work_beside
 from sejax.options import counts, one_of
@@ -53,7 +53,8 @@ class Study:
 
     agent: Any  # of the rows with default and varied hyperparameters; None: that of `preset=best`
     transfer_agent: Any  # of the row with an unseen agent
-    tuned_agent: str | None = None  # kind of that which was tuned for few steps, if another one
+    # Makes the one that was tuned on the real task for few steps, if it is another one.
+    tuned_agent: Callable[[], Any] | None = None
     rows: tuple[str, ...] = ROWS  # of the figure: `rn_curves.ROWS`
     bonuses: dict[str, Any]  # exploration bonuses that are compared on the real task
     variants: tuple[str, ...] = VARIANTS
@@ -84,7 +85,8 @@ STUDIES = {
     ),
     "cartpole": Study(
         agent=sejax.DDQNConfig(**_CARTPOLE), transfer_agent=sejax.DuelingDDQNConfig(**_CARTPOLE),
-        tuned_agent="ddqn", rows=(*ROWS, "tuned"),
+        tuned_agent=functools.partial(worlds.tuned_agent, "cartpole", "ddqn"),
+        rows=(*ROWS, "tuned"),
         bonuses={"icm": ICMConfig()},
         max_episodes=1000, max_steps=50_000,
         when_quick=_FEW | {"rows": ("default", "transfer"), "generations": 2},
@@ -92,6 +94,12 @@ STUDIES = {
     "mountain_car_continuous": Study(
         agent=None,
         transfer_agent=sejax.PPOConfig.paper(action_repeat=5),
+        # docs/agents.md, "PPO in few steps"
+        tuned_agent=functools.partial(
+            sejax.PPOConfig.paper, action_repeat=5, rollout_steps=256, learning_rate=0.0015,
+            init_action_std=1.0,
+        ),
+        rows=(*ROWS, "tuned"),
         bonuses={"icm": ICMConfig(forward_weight=0.1, reward_scale=0.01, learning_rate=5e-4)},
         max_episodes=3000, max_steps=250_000,
         when_quick=_FEW | {"generations": 2, "run": (
