@@ -23,6 +23,7 @@ TUNED = "#56B4E9"
 AGENT_NAMES = {"ddqn": "DDQN", "dueling_ddqn": "Dueling DDQN", "td3": "TD3",
                "td3_discrete": "discrete TD3", "ppo": "PPO", "sac": "SAC", "dqn": "DQN",
                "q_learning": "Q-learning", "sarsa": "SARSA"}  # fmt: skip
+LEGEND_COLUMN = 1.4  # inches that a label with its line takes
 STYLE: Any = {
     "font.size": 10, "axes.spines.top": False, "axes.spines.right": False, "legend.frameon": False,
 }  # fmt: skip
@@ -124,10 +125,11 @@ def profile(
 
 
 def legend_above(figure: Any, axis: Any, columns: int = 4, fontsize: int | None = 9) -> None:
-    """Puts the legend of one panel above all."""
+    """Puts the legend of one panel above all, in so many columns, if the figure is wide enough."""
     handles, labels = axis.get_legend_handles_labels()
-    figure.legend(handles, labels, ncols=min(len(labels), columns), loc="outside upper center",
-                  fontsize=fontsize)  # fmt: skip
+    room = max(1, int(figure.get_figwidth() / LEGEND_COLUMN))
+    figure.legend(handles, labels, ncols=min(len(labels), columns, room),
+                  loc="outside upper center", fontsize=fontsize)  # fmt: skip
 
 
 @contextlib.contextmanager
