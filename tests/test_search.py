@@ -74,8 +74,7 @@ def empty_database():
     """A database with Optuna's tables, which take longer to make than most of these tests."""
     folder = Path(tempfile.mkdtemp())
     atexit.register(shutil.rmtree, folder)
-    found, _ = study.open_study(read(folder, "study=none"))
-    found._storage._backend.engine.dispose()
+    study.open_study(read(folder, "study=none"))
     optuna.delete_study(study_name="none", storage=f"sqlite:///{folder / 'study.db'}")
     return folder / "study.db"
 
@@ -83,7 +82,11 @@ def empty_database():
 def opened(path, *words):
     """A study in a database, where others may be at work on it."""
     if not (path / "study.db").exists():
-        shutil.copy(empty_database(), path)
+        with (  # of SQLite's own: part of the database is in its log while a connection is open
+            contextlib.closing(sqlite3.connect(empty_database())) as empty,
+            contextlib.closing(sqlite3.connect(path / "study.db")) as copy,
+        ):
+            empty.backup(copy)
     return study.open_study(read(path, *words))
 
 
