@@ -1,6 +1,8 @@
 """The experiments with SEs: the framework, sets of SEs, feasibility, performance, single SEs."""
 
 import dataclasses
+import fnmatch
+import json
 import os
 import shutil
 import subprocess
@@ -31,6 +33,7 @@ from sejax.experiments import (
     worlds,
 )  # fmt: skip
 from sejax.options import counts
+from sejax.serialize import flatten
 from sejax.statistics import bootstrap_interval, interquartile_mean
 
 TINY_RUN = ["es.population_size=2", "es.num_incumbent_evals=2", "agent.hidden_size=4",
@@ -114,6 +117,43 @@ def test_tables_are_remade_from_the_stored_rows(tmp_path):
     assert pieces.unstack(reported[1], "b").to_dict("list") == {"flag": [True], "n": [3]}
     with pytest.raises(ConfigError, match=r"from_rows must be false.*no .*rows\.csv\.xz"):
         example.run(Example.of(out=str(tmp_path / "none"), from_rows=True))
+
+
+def test_results_say_what_each_piece_was_made_with(tmp_path):
+    settings = Example.of(out=str(tmp_path))
+    agents = {
+        "quick": {"name": "td3", "noise": {"std": 0.1}},
+        "slow": {"name": "ppo", "epochs": 80},
+    }
+    made_with = {  # names have three parts or four; slow is a row and a world
+        f"{prefix}{row}-{world}-{group}": {
+            "agent": agents[row], "seed": 0, "weights": f"{world}{group}", "prefix": prefix,
+            "odd": (row, group) == ("quick", "1") and world == "rn",
+        }
+        for prefix in ("", "auc-") for row in agents for world in ("rn", "slow") for group in "01"
+    }  # fmt: skip
+    rows = pd.DataFrame({"x": [0.0]})
+
+    def compute(settings):
+        for name, mine in made_with.items():
+            settings.pieces.compute(name, mine, lambda: rows)
+        return rows
+
+    def report(settings, rows):
+        return rows
+
+    example = experiment.Experiment(settings=Example, compute=compute, report=report, about="")
+    for _ in ("computed", "read"):
+        example.run(Example.of(out=str(tmp_path)))
+        stored = json.loads(settings.made_with_file.read_text())
+        assert stored["*"] == {"seed": 0} and stored["*-rn-1"] == {"weights": "rn1"}
+        for name, mine in made_with.items():
+            found = [stored[pattern] for pattern in stored if fnmatch.fnmatchcase(name, pattern)]
+            assert {key: x for each in found for key, x in each.items()} == flatten(mine)
+            assert all(each.items() <= flatten(mine).items() for each in found)  # none disagree
+        settings.made_with_file.unlink()
+    example.run(Example.of(out=str(tmp_path), from_rows=True))
+    assert not settings.made_with_file.exists()
 
 
 def test_a_kill_while_a_piece_is_written_loses_nothing(tmp_path, monkeypatch):

@@ -5,6 +5,7 @@ The command `python -m sejax.experiments.NAME` has the grammar of `python -m sej
 """
 
 import dataclasses
+import json
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -14,8 +15,9 @@ import pandas as pd
 
 from sejax.app import commands, runtime
 from sejax.errors import ConfigError, nearest, require, shortened
-from sejax.experiments.pieces import read_rows, write_rows
+from sejax.experiments.pieces import by_pattern, read_rows, write_rows
 from sejax.experiments.settings import RUN_PREFIX, Settings, as_word
+from sejax.files import write_text
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,6 +40,9 @@ class Experiment:
         """
         if not settings.from_rows:
             write_rows(settings.rows_file, self.compute(settings))
+            if settings.pieces.made_with:
+                made_with = by_pattern(settings.pieces.made_with)
+                write_text(settings.made_with_file, json.dumps(made_with, indent=1) + "\n")
         return self.report(settings, read_rows(settings.rows_file))
 
     def main(self, words: Sequence[str] | None = None) -> None:

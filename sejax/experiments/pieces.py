@@ -5,8 +5,10 @@ with the settings that it was made with beside it: the same command again comput
 missing.
 """
 
+import fnmatch
+import itertools
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +25,7 @@ class Pieces:
 
     def __init__(self, folder: Path):
         self.folder = folder
+        self.made_with: dict[str, dict[str, Any]] = {}  # settings of those that were asked for
 
     def compute(
         self, name: str, settings: dict[str, Any], compute: Callable[[], pd.DataFrame]
@@ -46,6 +49,7 @@ class Pieces:
         for name, table in zip(missing, compute(missing) if missing else [], strict=True):
             write_text(self._file(name, "csv"), table.to_csv(index=False))
             write_text(self._file(name, "json"), json.dumps(settings[name], indent=2))
+        self.made_with |= settings
         return [pd.read_csv(self._file(name, "csv")) for name in settings]
 
     def _file(self, name: str, kind: str) -> Path:
@@ -64,6 +68,53 @@ class Pieces:
                 f"{', '.join(differing)}. Set work=DIR."
             )
         return True
+
+
+_SEPARATOR = "-"  # between the parts of a piece's name
+_ABSENT = object()
+
+
+def by_pattern(made_with: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
+    """Settings of many pieces by patterns of their names, so that what they share is there once.
+
+    A piece has the settings of all patterns that `fnmatch.fnmatchcase` finds in its name, such as
+    `*` and `default-*-00`: those by the fewest parts that tell which pieces have which value.
+
+    Args:
+      made_with: settings of each piece, by its name; nested ones become `a.b`.
+    """
+    flat = {name: flatten(dict(settings)) for name, settings in made_with.items()}
+    levels = [  # patterns by ever more parts, with the pieces that each finds
+        {pattern: fnmatch.filter(flat, pattern) for pattern in {_pattern(n, kept) for n in flat}}
+        for kept in _subsets(max((name.count(_SEPARATOR) + 1 for name in flat), default=0))
+    ]
+    levels.append({name: [name] for name in flat})
+    found: dict[str, dict[str, Any]] = {}
+    for key in sorted({key for settings in flat.values() for key in settings}):
+        values = {name: settings.get(key, _ABSENT) for name, settings in flat.items()}
+        level = next(level for level in levels if all(
+            values[name] == values[names[0]] for names in level.values() for name in names
+        ))  # fmt: skip
+        for pattern, names in sorted(level.items()):
+            if values[names[0]] is not _ABSENT:
+                found.setdefault(pattern, {})[key] = values[names[0]]
+    return {pattern: found[pattern] for level in levels for pattern in sorted(level)
+            if pattern in found}  # fmt: skip
+
+
+def _subsets(size: int) -> Iterator[tuple[int, ...]]:
+    """Places of parts, counted from a name's end, where all names have the same."""
+    for count in range(size):
+        yield from itertools.combinations(range(-1, -size - 1, -1), count)
+
+
+def _pattern(name: str, kept: tuple[int, ...]) -> str:
+    """The name with `*` for all parts but those kept."""
+    parts = name.split(_SEPARATOR)
+    if not kept:
+        return "*"
+    shown = [part if i - len(parts) in kept else "*" for i, part in enumerate(parts)]
+    return _SEPARATOR.join(shown)
 
 
 # Training steps grow along each curve: kept as differences, a table takes two thirds of the room.

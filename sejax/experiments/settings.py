@@ -4,6 +4,7 @@ A field is written once: its default, that of `quick=true`, what must hold, and 
 """
 
 import dataclasses
+import functools
 import shlex
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
@@ -88,9 +89,9 @@ class Settings(Options):
         """Where finished pieces and NES runs are kept until the experiment is done."""
         return work_beside(self.folder, "work") if self.work is None else Path(self.work)
 
-    @property
+    @functools.cached_property
     def pieces(self) -> Pieces:
-        """The finished pieces."""
+        """The finished pieces, which know what was asked of them."""
         return Pieces(self.work_folder / "pieces")
 
     def values(self, *names: str) -> dict[str, Any]:
@@ -102,12 +103,18 @@ class Settings(Options):
         """The raw rows, from which everything else is made."""
         return self.folder / f"{self.files}rows.csv.xz"
 
+    @property
+    def made_with_file(self) -> Path:
+        """What the rows were measured with: `pieces.by_pattern`."""
+        return self.folder / f"{self.files}settings.json"
+
     def command(self) -> str:
         """The command that makes these results; of the fields, those that are not as usual."""
-        usual = self.defaults(vars(self))
+        mine = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+        usual = self.defaults(mine)
         apart = {"out", "work", "devices", "from_rows", "run"}
         words = ["python", "-m", f"sejax.experiments.{self.name}"]
-        for name, value in vars(self).items():
+        for name, value in mine.items():
             if name not in apart and value != (usual[name] if name != "quick" else False):
                 words.append(f"{name}={as_word(value)}")
         return shlex.join([*words, *(RUN_PREFIX + word for word in getattr(self, "run", ()))])
