@@ -296,6 +296,15 @@ def test_runs_that_do_not_solve_the_task_count_as_longer_than_all(values, text):
     assert se_feasibility.median_and_range(values, 50) == text
 
 
+@pytest.mark.parametrize(("env", "agent", "has_paper"),
+                         [("pendulum", "td3", False), ("acrobot", "ddqn", True)])  # fmt: skip
+def test_runs_have_the_tasks_agent_and_the_papers_numbers_where_it_has_some(env, agent, has_paper):
+    config = se_feasibility.learning_config(se_feasibility.SeFeasibility.of(env=env))
+    assert config.name("agent") == agent
+    table = se_feasibility.make_table(config, se_feasibility.summarise(curves([10], [20]), 195))
+    assert any(table["paper"]) == has_paper
+
+
 def learned(out, *run, **given):
     options = {"runs": 2, "generations": 3, "run": [*TINY_RUN, *run]} | given
     asked = se_feasibility.SeFeasibility.of(quick=True, seed=3, out=str(out), **options)
