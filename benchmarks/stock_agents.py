@@ -46,6 +46,7 @@ TASKS = {  # id in Gymnasium, and the step limit
     "mountain_car": ("MountainCar-v0", 200),
     "mountain_car_continuous": ("MountainCarContinuous-v0", 999),
     "pendulum": ("Pendulum-v1", 200),
+    "halfcheetah": ("HalfCheetah-v5", 1000),
 }
 ALGORITHMS = {"ppo": sb3.PPO, "a2c": sb3.A2C, "dqn": sb3.DQN, "sac": sb3.SAC, "td3": sb3.TD3}
 REAL = "the real task"
@@ -77,7 +78,8 @@ def linear(initial: float) -> Callable[[float], float]:
 
 
 # Source: hyperparams/{ppo,a2c,dqn,sac,td3}.yml of https://github.com/DLR-RM/rl-baselines3-zoo, at
-# 00128b5 (ppo, sac), c6c209e (a2c), ce95481 (dqn) and a02f4fb (td3, there for Pendulum-v0).
+# 00128b5 (ppo, sac), c6c209e (a2c), ce95481 (dqn) and a02f4fb (td3, there for Pendulum-v0). Of
+# HalfCheetah they have v4 (ppo, 208b6fd) and v3 (sac).
 WIDE: dict[str, Any] = {"net_arch": [256, 256]}
 ZOO = {
     ("ppo", "CartPole-v1"): Zoo(1e5, num_envs=8, hparams=dict(
@@ -94,6 +96,11 @@ ZOO = {
     ("ppo", "Pendulum-v1"): Zoo(1e5, num_envs=4, hparams=dict(
         n_steps=1024, gae_lambda=0.95, gamma=0.9, n_epochs=10, ent_coef=0.0, learning_rate=1e-3,
         clip_range=0.2, use_sde=True, sde_sample_freq=4)),
+    ("ppo", "HalfCheetah-v5"): Zoo(1e6, normalize=True, hparams=dict(
+        n_steps=512, batch_size=64, gae_lambda=0.92, gamma=0.98, n_epochs=20, ent_coef=0.000401762,
+        learning_rate=2.0633e-5, clip_range=0.1, max_grad_norm=0.8, vf_coef=0.58096,
+        policy_kwargs=dict(log_std_init=-2, ortho_init=False, activation_fn=torch.nn.ReLU,
+                           net_arch=dict(pi=[256, 256], vf=[256, 256])))),
     ("a2c", "CartPole-v1"): Zoo(5e5, num_envs=8, hparams=dict(ent_coef=0.0)),
     ("a2c", "Acrobot-v1"): Zoo(5e5, num_envs=16, normalize=True, hparams=dict(ent_coef=0.0)),
     ("a2c", "MountainCar-v0"): Zoo(1e6, num_envs=16, normalize=True, hparams=dict(ent_coef=0.0)),
@@ -121,6 +128,7 @@ ZOO = {
         gradient_steps=32, gamma=0.9999, tau=0.01, learning_starts=0, use_sde=True,
         policy_kwargs=dict(log_std_init=-3.67, net_arch=[64, 64]))),
     ("sac", "Pendulum-v1"): Zoo(2e4, hparams=dict(learning_rate=1e-3)),
+    ("sac", "HalfCheetah-v5"): Zoo(1e6, hparams=dict(learning_starts=10_000)),
     ("td3", "MountainCarContinuous-v0"): Zoo(3e5, noise=("ornstein-uhlenbeck", 0.5)),
     ("td3", "Pendulum-v1"): Zoo(2e4, noise=("normal", 0.1), hparams=dict(
         gamma=0.98, buffer_size=200_000, learning_starts=10_000, gradient_steps=-1,
