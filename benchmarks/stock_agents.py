@@ -16,6 +16,7 @@ It needs Stable-Baselines3 beside sejax, `pip install 'sejax[bench]'`:
 """
 
 import argparse
+import ast
 import itertools
 import multiprocessing
 import time
@@ -142,7 +143,7 @@ class Training(NamedTuple):
     Attributes:
       world: an SE, as `sejax.gym.make` takes it, or `REAL`.
       task: one of `TASKS`.
-      agent: one of `ALGORITHMS`.
+      agent: one of `ALGORITHMS`, and changes of the zoo's settings: `sac learning_rate=1e-3`.
       seed: of the agent and of its world.
       total_steps: what schedules span.
       num_episodes: of each test.
@@ -187,7 +188,8 @@ def main() -> None:
 def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("task", choices=TASKS)
     parser.add_argument("source", help="an SE: a shipped name, a safetensors file, a run directory")
-    parser.add_argument("--agents", type=agents_of, metavar="A,B", help=", ".join(ALGORITHMS))
+    parser.add_argument("--agents", type=agents_of, metavar="A,B", help=", ".join(ALGORITHMS) + "; "
+                        "with other settings than the zoo's: 'sac learning_rate=1e-3'")  # fmt: skip
     parser.add_argument("--steps", type=numbers_of, default=[1000, 2500, 6000], metavar="N,N")
     parser.add_argument("--seeds", type=int, default=5, help="agents of each kind")
     parser.add_argument("--episodes", type=int, default=20, help="of each test")
@@ -201,9 +203,15 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def agents_of(text: str) -> list[str]:
     names = text.split(",")
-    if not set(names) <= set(ALGORITHMS):
+    changes = [word for name in names for word in name.split()[1:]]
+    if not {kind_of(name) for name in names} <= {*ALGORITHMS} or not all("=" in x for x in changes):
         raise argparse.ArgumentTypeError(f"must be among {', '.join(ALGORITHMS)}; got {text}")
     return names
+
+
+def kind_of(agent: str) -> str:
+    """One of `ALGORITHMS`, of a name that may have settings behind it."""
+    return (agent.split() or [""])[0]
 
 
 def numbers_of(text: str) -> list[int]:
@@ -217,7 +225,7 @@ def in_budget(args: argparse.Namespace, world: str, agent: str, seed: int) -> Tr
 
 def as_the_zoo(args: argparse.Namespace, agent: str, seed: int) -> Training:
     """On the real task, with the zoo's own schedules."""
-    total = int(ZOO[agent, TASKS[args.task][0]].total_steps)
+    total = int(ZOO[kind_of(agent), TASKS[args.task][0]].total_steps)
     tests = range(args.real_every, min(args.real_steps, total) + 1, args.real_every)
     return Training(REAL, args.task, agent, seed, total, args.episodes, tuple(tests))
 
@@ -249,14 +257,16 @@ def run(training: Training) -> list[tuple[Any, ...]]:
     """Trains one agent; a row of `COLUMNS` for each of its tests."""
     torch.set_num_threads(1)
     env_id, _ = TASKS[training.task]
-    zoo = ZOO[training.agent, env_id]
-    hparams = dict(zoo.hparams)
+    kind = kind_of(training.agent)
+    zoo = ZOO[kind, env_id]
+    changes = (word.split("=", 1) for word in training.agent.split()[1:])
+    hparams = zoo.hparams | {name: ast.literal_eval(value) for name, value in changes}
     envs: Any = make_vec_env(lambda: make_world(training), zoo.num_envs, seed=training.seed)
     if zoo.normalize:
         envs = VecNormalize(envs, gamma=hparams.get("gamma", 0.99))
     if zoo.noise:
         hparams["action_noise"] = make_noise(*zoo.noise, envs.action_space.shape)
-    algorithm: Any = ALGORITHMS[training.agent]
+    algorithm: Any = ALGORITHMS[kind]
     model = algorithm("MlpPolicy", envs, seed=training.seed, device="cpu", **hparams)
     examiner = Examiner(training)
     model.learn(training.total_steps, examiner)
