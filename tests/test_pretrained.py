@@ -91,7 +91,7 @@ def test_ranges_are_from_the_lowest_to_the_highest():
              for name in SES]
 )  # fmt: skip
 def test_an_agent_that_sees_gymnasiums_five_values_alone_learns_the_task(name):
-    """Two of three agents solve a task of which they have never seen a step, or the cheetah runs."""
+    """Two of three solve a task of which they have never seen a step; the cheetah runs."""
     task = envs.make(PROXIES[name].task)
     real = gymnasium.make(GYMNASIUM_IDS[task.name], max_episode_steps=task.max_steps)
     env = make(name)
