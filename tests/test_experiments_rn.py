@@ -308,6 +308,12 @@ def test_settings_are_those_of_the_task():
     assert mountain_car.agent("tuned").rollout_steps == 256
     quick_td3 = mountain_car.agent("varied")
     assert quick_td3 == sejax.config(["env=mountain_car_continuous", "proxy=rn"]).agent
+    ppo = RnPerformance.of(env="mountain_car_continuous", run=("agent=ppo",))
+    for study, variant, scale in ((mountain_car, "exclusive_non_potential", 0.1),
+                                  (mountain_car, "exclusive_potential", 1.0),
+                                  (ppo, "exclusive_non_potential", 1.0)):  # fmt: skip
+        learned = rn_studies.learning_config(study, variant, "reward_threshold").proxy
+        assert (learned.variant, learned.output_scale) == (variant, scale)
     few = RnPerformance.of(env="cartpole", learned=5, rns=2)
     assert (few.rns, few.bonus_groups) == (2, 2) and RnPerformance.of(learned=5).rns == 5
     quick = RnPerformance.of(env="halfcheetah", quick=True)

@@ -58,8 +58,6 @@ class Study:
     rows: tuple[str, ...] = ROWS  # of the figure: `rn_curves.ROWS`
     bonuses: dict[str, Any]  # exploration bonuses that are compared on the real task
     variants: tuple[str, ...] = VARIANTS
-    # Of variants whose networks' output is scaled (`proxy.output_scale`): docs/results.md.
-    output_scales: Mapping[str, float] = field(default_factory=dict)
     max_episodes: int  # that the paper trains
     max_steps: int  # training steps that its figure shows
     learned: int = 10  # RNs of each variant
@@ -103,7 +101,6 @@ STUDIES = {
         ),
         rows=(*ROWS, "tuned"),
         bonuses={"icm": ICMConfig(forward_weight=0.1, reward_scale=0.01, learning_rate=5e-4)},
-        output_scales={"exclusive_non_potential": 0.1},
         max_episodes=3000, max_steps=250_000,
         when_quick=_FEW | {"generations": 2, "run": (
             "es.population_size=4", "es.num_incumbent_evals=4", "training.max_episodes=4",
@@ -268,9 +265,13 @@ def check_stored(settings: RnSettings, objectives: Sequence[str]) -> None:
 
 @functools.cache
 def learning_config(settings: RnSettings, variant: str, objective: str) -> Any:
-    """Settings of the NES runs for a variant and objective."""
+    """Settings of the NES runs for a variant and objective.
+
+    The scale of a network's output is the preset's for the preset's own variant, and 1 for others.
+    """
     plain = variant.removesuffix(AUGMENTED)
-    scale = settings.study.output_scales.get(plain, 1.0)
+    usual = settings.learn_config(["proxy=rn"]).proxy
+    scale = usual.output_scale if plain == usual.variant else 1.0
     return settings.learn_config([
         "proxy=rn", f"proxy.variant={plain}", f"proxy.augmented={plain != variant}",
         f"proxy.output_scale={scale}", f"objective={objective}",
