@@ -1,5 +1,6 @@
 """sejax.gym: the same SEs as in JAX, as Gymnasium environments that need none of it."""
 
+import dataclasses
 import json
 import pickle
 import subprocess
@@ -428,7 +429,7 @@ def test_gymnasiums_tasks_have_the_spaces_of_sejaxs(name):
 
 @pytest.mark.parametrize(("given", "limit"), [({}, 200), ({"max_steps": 300}, 300)], ids=str)
 def test_a_task_of_gymnax_is_gymnasiums_of_that_id(given, limit):
-    task = real_task({"name": "gymnax/MountainCar-v0", **given})
+    task = real_task({"config": {"env": {"name": "gymnax/MountainCar-v0", **given}}}, True)
     assert task.action_space == spaces.Discrete(3) and task.max_steps == limit
     position, velocity = task.starts(np.random.default_rng(0))
     assert -0.6 <= position <= -0.4 and velocity == 0.0
@@ -463,6 +464,24 @@ def test_an_unknown_task_must_be_given(stored):
     images = RealTask(observation_space=spaces.Box(0, 1, (2, 2)), action_space=box, max_steps=7)
     with pytest.raises(ConfigError, match=r"^task.observation_space must be a Box of vectors or a"):
         make(path, images)
+
+
+def test_an_se_with_its_own_starts_needs_no_task(stored, monkeypatch):
+    task = dataclasses.replace(envs.make("pendulum"), name="mine", origin=None)
+    config = SyntheticConfig(**SMALL, initial_state="learned", state_units="bounds")
+    path = stored(plugins.make("proxy", config, task))
+    env, given = make(path), make(path, "Pendulum-v1")
+    assert (env.action_space, env.observation_space) == (given.action_space, spaces.Box(
+        -np.inf, np.inf, (3,)))  # fmt: skip
+    for each in (env, given):
+        each.reset(seed=0)
+    action = np.array([0.5], np.float32)
+    for _ in range(3):
+        here, there = env.step(action), given.step(action)
+        np.testing.assert_array_equal(here[0], there[0])
+        assert here[1:4] == there[1:4]
+    monkeypatch.setattr(gymnasium, "make", None)
+    assert make("halfcheetah").action_space == spaces.Box(-1, 1, (6,))
 
 
 def test_what_is_no_single_se_is_one_message(tmp_path, stored):

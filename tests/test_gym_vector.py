@@ -144,7 +144,8 @@ def test_gymnasium_makes_the_shipped_ones_by_their_names():
                                     autoreset_mode=AutoresetMode.SAME_STEP)):  # fmt: skip
         assert isinstance(made, SyntheticVectorEnv) and made.spec.id == "sejax/cartpole"
         obs, _ = made.reset(seed=4)
-        assert obs.shape == (3, 4) and (obs[0] == make("cartpole").reset(seed=4)[0]).all()
+        assert obs.shape == (3, 4)  # products of other shapes round otherwise on some machines
+        np.testing.assert_allclose(obs[0], make("cartpole").reset(seed=4)[0], rtol=0, atol=1e-6)
     synced = gymnasium.make_vec("sejax/cartpole", num_envs=2, vectorization_mode="sync")
     np.testing.assert_allclose(synced.reset(seed=4)[0], obs[:2], atol=1e-6)
 

@@ -3,8 +3,10 @@
 import dataclasses
 import errno
 import json
+import math
 import sys
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -13,9 +15,10 @@ from safetensors.numpy import save_file
 
 import sejax
 from sejax import envs, plugins
+from sejax.envs import absent
 from sejax.errors import ConfigError
-from sejax.proxies import files
-from sejax.proxies.configs import RewardConfig
+from sejax.proxies import files, stored
+from sejax.proxies.configs import RewardConfig, SyntheticConfig
 from sejax.sealed import seal, unseal
 
 CONFIG = {"preset": "best", "agent": {"name": "q_learning", "discount": 0.7}, "run_dir": "/home/me"}
@@ -257,6 +260,15 @@ def without(*names):
         *(lambda header, value=value: header | {"discount": value} for value in (None, "x", [])),
         *(lambda header, value=value: header | {"format_version": value}
           for value in (None, 0, 3, "2", 2.5, [], True)),
+        *(lambda header, value=value: header | {"interface": header["interface"] | value}
+          for value in ({"max_steps": 0}, {"max_steps": "9"}, {"action": None},
+                        {"action": "n"}, {"action": {"n": 0}}, {"action": {"n": 2.0}},
+                        {"action": {"n": 2**40}}, {"action": {"low": [0], "high": []}},
+                        {"action": {"low": [], "high": []}}, {"action": {"low": [0]}},
+                        {"action": {"low": ["x"], "high": [1]}},
+                        {"action": {"low": [math.nan], "high": [1]}},
+                        {"action": {"low": [10**400], "high": [1]}})),
+        lambda header: header | {"interface": None},
         lambda header: header | {"format_version": "9" * 10_000},
         lambda header: header | {"task": None},
         lambda header: header | {"task": "t" * 10_000},
@@ -403,15 +415,14 @@ def test_a_foreign_task_or_kind_is_never_imported_and_loads_if_it_is_given(mine)
     assert stored["env"] == {"name": "my_file_worlds:Room", "size": 3}
     assert stored["proxy"]["name"] == "my_file_worlds:Mine"
     before = set(sys.modules)
+    for given in ({}, {"task": task}):
+        with pytest.raises(
+            ConfigError, match=r"registered proxy if no proxy is given.*proxy_kind=my_fi"
+        ):
+            sejax.load(path, **given)
     with pytest.raises(
         ConfigError, match=r"registered env if no task is given.*env=my_file_worlds:R"
     ):
-        sejax.load(path)
-    with pytest.raises(
-        ConfigError, match=r"registered proxy if no proxy is given.*proxy_kind=my_fi"
-    ):
-        sejax.load(path, task=task)
-    with pytest.raises(ConfigError, match=r"registered env if no task is given"):
         sejax.load(path, proxy=config)
     assert set(sys.modules) == before
     env, _ = sejax.load(path, task=task, proxy=config)
@@ -433,6 +444,83 @@ def test_a_task_made_by_hand_must_be_given(tmp_path, env, weights):
     with pytest.raises(ConfigError, match=r"proxy of a registered env if no task is given"):
         sejax.load(tmp_path / "p.safetensors")
     assert sejax.load(tmp_path / "p.safetensors", task=task)[0].task is task
+
+
+# --- without the task ----------------------------------------------------------------------------
+
+
+def an_se_of(task, **config):
+    env = SyntheticConfig(**{"hidden_size": 3, "initial_state": "learned"} | config).make(task)
+    return env, env.init_weights(jax.random.key(0))
+
+
+def test_an_se_with_its_own_starts_needs_no_task(tmp_path):
+    task = dataclasses.replace(envs.make("pendulum"), name="by hand", origin=None)
+    env, weights = an_se_of(task, state_units="bounds")
+    path = tmp_path / "se.safetensors"
+    sejax.save(path, env, weights)
+    there, params = sejax.load(path)
+    assert there.task.interface == task.interface
+    for key in jax.random.split(jax.random.key(0), 3):
+        episode = [rollout(world, params, key) for world in (env, there)]
+        chex.assert_trees_all_equal(*episode)
+    assert sejax.load(path)[0] is there  # and what was compiled for it is used again
+    assert sejax.make_agent(sejax.TD3Config(), there.task)
+    for use in (lambda: files.load_proxy(path).task, lambda: files.load_set(path).solved(),
+                lambda: rollout(there.task.env, there.task.params, jax.random.key(0))):  # fmt: skip
+        with pytest.raises(ConfigError, match=r"proxy of a registered env if no task is given"):
+            use()
+    assert files.load_proxy(path, task=task).task is task
+
+
+def rollout(env, params, key, num_steps=4):
+    """Observations and rewards of an episode with random actions."""
+    obs, state = env.reset_env(key, params)
+    seen = [obs]
+    for step_key in jax.random.split(key, num_steps):
+        action = env.action_space(params).sample(step_key)
+        obs, state, reward, *_ = env.step_env(step_key, state, action, params)
+        seen += [obs, reward]
+    return seen
+
+
+@pytest.mark.parametrize("made", [
+    lambda task: an_se_of(task, initial_state="real"),
+    lambda task: an_rn_of(task),
+], ids=["an SE that begins there", "an RN"])  # fmt: skip
+def test_what_runs_its_task_needs_it(tmp_path, made):
+    env, weights = made(dataclasses.replace(envs.make("pendulum"), name="by hand", origin=None))
+    sejax.save(tmp_path / "p.safetensors", env, weights)
+    with pytest.raises(ConfigError, match=r"proxy of a registered env if no task is given"):
+        sejax.load(tmp_path / "p.safetensors")
+
+
+def an_rn_of(task):
+    env = RewardConfig(hidden_size=3).make(task)
+    return env, env.init_weights(jax.random.key(0))
+
+
+def test_the_shipped_cheetah_needs_no_mujoco(monkeypatch):
+    def without(*_):
+        raise ConfigError("env=halfcheetah needs MuJoCo.")
+
+    monkeypatch.setattr("sejax.envs.make_from", without)
+    env, params = sejax.load("halfcheetah")
+    _, obs, reward = rollout(env, params, jax.random.key(0), num_steps=1)
+    assert obs.shape == (17,) and jnp.isfinite(reward)
+    assert env.task.interface == stored.read(files.find("halfcheetah"), "source")[1]["interface"]
+    with pytest.raises(ConfigError, match="needs MuJoCo"):
+        sejax.load("halfcheetah-rn")
+
+
+@pytest.mark.parametrize("name", ["cartpole", "cliff_walking", "pendulum", "gymnax/Pong-misc"])
+def test_spaces_of_a_task_come_back_from_plain_values(name):
+    task = envs.make(name)
+    again = absent.make(name, json.loads(json.dumps(task.interface)), "")
+    assert again.interface == task.interface
+    assert (again.obs_dim, again.action_dim) == (task.obs_dim, task.action_dim)
+    assert (again.num_states, again.num_actions) == (task.num_states, task.num_actions)
+    assert (again.max_action, again.max_steps) == (task.max_action, task.max_steps)
 
 
 # --- names ---------------------------------------------------------------------------------------

@@ -98,6 +98,17 @@ class Task:
         )
 
     @property
+    def interface(self) -> dict[str, Any]:
+        """What agents see of it, plain values that a proxy's file keeps.
+
+        `observation` and `action` are `{"n": categories}` or the bounds of a vector, `{"low": [x],
+        "high": [x]}` with None where there is none; `max_steps` is the step limit.
+        """
+        return {"observation": _plain_space(self._obs_space),
+                "action": _plain_space(self._action_space),
+                "max_steps": self.max_steps}  # fmt: skip
+
+    @property
     def is_solvable(self) -> bool:
         """Whether it is known what counts as solved."""
         return math.isfinite(self.solved_reward)
@@ -137,3 +148,15 @@ def _num_categories(space: Any) -> int | None:
     from gymnax.environments import spaces
 
     return int(space.n) if isinstance(space, spaces.Discrete) else None
+
+
+def _plain_space(space: Any) -> dict[str, Any]:
+    """A space of `Task.interface`."""
+    import numpy as np
+
+    if (n := _num_categories(space)) is not None:
+        return {"n": n}
+    bounds = {"low": space.low, "high": space.high}
+    return {name: [float(x) if math.isfinite(x) else None
+                   for x in np.broadcast_to(np.asarray(bound), space.shape)]
+            for name, bound in bounds.items()}  # fmt: skip

@@ -160,7 +160,9 @@ def _world(
     config = plugins.configure("proxy", header["config"]["proxy"])
     if isinstance(task, str):
         task = RealTask.of_gymnasium(task)
-    return SyntheticWorld(weights, config, task or real_task(header["config"]["env"]))
+    if task is None:
+        task = real_task(header, needs_starts=config.needs_task)
+    return SyntheticWorld(weights, config, task)
 
 
 def _real_env(

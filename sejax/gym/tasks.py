@@ -67,6 +67,13 @@ class RealTask:
         return cls.of_env(make_gymnasium(env_id, max_steps))
 
     @classmethod
+    def of_interface(cls, interface: Mapping[str, Any]) -> "RealTask":
+        """What a proxy's file says of its task, `sejax.Task.interface`; it has no `starts`."""
+        return cls(observation_space=_space(interface["observation"]),
+                   action_space=_space(interface["action"]),
+                   max_steps=interface["max_steps"])  # fmt: skip
+
+    @classmethod
     def of_env(cls, env: gymnasium.Env[Any, Any]) -> "RealTask":
         """A task given as an environment with Gymnasium's `TimeLimit` around it.
 
@@ -136,12 +143,19 @@ def real_env(
     return make_gymnasium(GYMNASIUM_IDS[name], max_steps, render_mode=render_mode, **options)
 
 
-def real_task(config: Mapping[str, Any]) -> RealTask:
-    """What an SE takes from the task that a file's metadata names.
+def real_task(header: Mapping[str, Any], needs_starts: bool) -> RealTask:
+    """What an SE takes from the task that its file is of: from the file itself, if that will do.
+
+    Args:
+      header: of the file.
+      needs_starts: whether its episodes begin where the real task's do.
 
     Raises:
       ConfigError: if it is one that must be given.
     """
+    if "interface" in header and not needs_starts:
+        return RealTask.of_interface(header["interface"])
+    config = header["config"]["env"]
     if (env := real_env(config)) is not None:
         return RealTask.of_env(env)
     gymnax_id = str(config.get("name")).removeprefix(PREFIX)
@@ -162,6 +176,17 @@ def unknown_task(config: Mapping[str, Any], fix: str) -> ConfigError:
 
 
 # --- spaces --------------------------------------------------------------------------------------
+
+
+def _space(plain: Mapping[str, Any]) -> spaces.Space[Any]:
+    """A space of `sejax.Task.interface`."""
+    if "n" in plain:
+        return spaces.Discrete(plain["n"])
+    low, high = (
+        np.array([end if x is None else x for x in plain[name]], np.float32)
+        for name, end in (("low", -np.inf), ("high", np.inf))
+    )
+    return spaces.Box(low, high, dtype=np.float32)
 
 
 def num_categories(space: spaces.Space[Any]) -> int | None:

@@ -60,6 +60,11 @@ class SyntheticConfig(Options):
         """Whether most of what it may become never ends an episode."""
         return self.done == "soft" and self.horizon is None
 
+    @property
+    def needs_task(self) -> bool:
+        """Whether its task must run where it is used; what agents see of it is in a file."""
+        return self.initial_state == "real"
+
     def max_steps(self, task_max_steps: int) -> int:
         """Steps of an episode at most."""
         return task_max_steps if self.horizon is None else self.horizon

@@ -18,6 +18,8 @@ import numpy as np
 from flax.traverse_util import flatten_dict, unflatten_dict
 
 from sejax import envs, plugins
+from sejax.envs import absent
+from sejax.envs.absent import require_present
 from sejax.envs.task import Task
 from sejax.errors import ConfigError, require, shortened
 from sejax.files import write_bytes
@@ -64,7 +66,12 @@ class Proxy:
 
     @property
     def task(self) -> Task:
-        return self.env.task
+        """The real task.
+
+        Raises:
+          ConfigError: if it cannot be had here, and the file told what the proxy needs of it.
+        """
+        return require_present(self.env.task)
 
     def learned_with(self, group: str) -> Any:
         """A part of the configuration that it was learned with, such as `agent` or `training`.
@@ -103,7 +110,7 @@ class Proxy:
         known = [plugins.configure("agent", values)
                  for values in learned_agents(self.config).values()
                  if _is_registered("agent", values)]  # fmt: skip
-        max_steps = self.env.world.max_steps or self.task.max_steps
+        max_steps = self.env.world.max_steps or self.env.task.max_steps
         return budget_for(self.learned_with("training"), agent, known, max_steps)
 
     def _configured(self, group: str, stored: Any) -> Any:
@@ -141,7 +148,12 @@ class ProxySet:
 
     @property
     def task(self) -> Task:
-        return self.env.task
+        """The real task.
+
+        Raises:
+          ConfigError: if it cannot be had here, and the file told what the proxy needs of it.
+        """
+        return require_present(self.env.task)
 
     @property
     def size(self) -> int:
@@ -273,6 +285,7 @@ def _write(
     header: dict[str, Any] = {
         "format_version": FORMAT_VERSION,
         "task": env.task.name,
+        "interface": env.task.interface,
         "config": known | dict(config or {}) | {"run_dir": None},  # no path of a machine
         "discount": float(discount),
         "is_set": is_set,
@@ -294,7 +307,9 @@ def load(source: str | Path, task: Task | None = None, proxy: Any = None) -> tup
       source: a run directory, a safetensors file, the name of a proxy that ships with the package
         (`pretrained_names()`), or one on the Hugging Face Hub: `hf://user/repo` (`sejax.hub`).
       task: of the proxy; needed if it is none that a registered name makes, as a file's names are
-        never imported.
+        never imported. An SE whose initial states are not the real task's can do without, or
+        without the package that its task needs: what agents see is in the file, and only what would
+        reset or step the real task fails.
       proxy: its configuration; needed likewise for a kind of proxy of your own.
 
     Raises:
@@ -375,13 +390,18 @@ def _env_of(
 ) -> ProxyEnv:
     """The environment that a file's metadata describes."""
     config = header["config"]
+    if proxy is None:
+        proxy = _registered("proxy", "proxy", "proxy_kind", path, config, option)
     if task is None:
-        task = envs.make_from(_registered("env", "task", "env", path, config, option))
+        try:
+            task = envs.make_from(_registered("env", "task", "env", path, config, option))
+        except ConfigError as error:
+            if "interface" not in header or getattr(proxy, "needs_task", True):
+                raise
+            task = absent.make(header["task"], header["interface"], reason=str(error))
     require(header["task"] == task.name, option, f"be a proxy of {task.name}", "that is the task "
             "given", f"one of {shortened(header['task'])} in {path}",
             f"{option} to a proxy of {task.name}, or another task")  # fmt: skip
-    if proxy is None:
-        proxy = _registered("proxy", "proxy", "proxy_kind", path, config, option)
     return plugins.make("proxy", proxy, task)
 
 

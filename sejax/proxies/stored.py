@@ -4,6 +4,7 @@
 """
 
 import json
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,7 @@ import numpy as np
 from safetensors import SafetensorError, safe_open
 
 from sejax import hub
-from sejax.errors import ConfigError, require, shortened, unknown_name
+from sejax.errors import LARGEST, ConfigError, require, shortened, unknown_name
 from sejax.sealed import DamagedError, unseal
 
 FORMAT_VERSION = 2
@@ -102,7 +103,8 @@ def read(path: Path, option: str) -> tuple[dict[str, np.ndarray], dict[str, Any]
             stored = _from_version_1(stored, is_set=KEY not in metadata)
         if is_known:
             _check_header(stored)
-    except (KeyError, ValueError, TypeError, AttributeError, RecursionError) as error:
+    except (LookupError, ValueError, TypeError, AttributeError, ArithmeticError,
+            RecursionError) as error:  # fmt: skip
         raise ConfigError(
             f"{option} must be a file that sejax has written, because the network is rebuilt from "
             f"its metadata; {path} has none that is valid ({type(error).__name__}: "
@@ -140,6 +142,23 @@ def _check_header(header: dict[str, Any]) -> None:
     for record in records:
         float(record.get("score", 0)), int(record.get("seed", 0)), int(record.get("generation", 0))
     header["discount"] = float(header["discount"])
+    if "interface" in header:  # which older files lack
+        _check_interface(header["interface"])
+
+
+def _check_interface(interface: Any) -> None:
+    """Raises an error for what is no `Task.interface`."""
+    counts = [interface["max_steps"]]
+    for space in (interface["observation"], interface["action"]):
+        if "n" in space:
+            counts.append(space["n"])
+            continue
+        low, high = space["low"], space["high"]
+        are_numbers = all(x is None or math.isfinite(x) for x in (*low, *high))
+        if not (are_numbers and len(low) == len(high) > 0):
+            raise ValueError("a space of vectors without bounds")
+    if not all(type(count) is int and 0 < count <= LARGEST for count in counts):
+        raise ValueError("a space or step limit that is no whole number above 0")
 
 
 def _from_version_1(stored: Any, is_set: bool) -> dict[str, Any]:
