@@ -140,8 +140,9 @@ def proxy_study(config: EvaluateConfig) -> Study:
             agents.require_fit(family.agent, exploration, task.facts, task.name)
             group, training = _training_on(proxy, config, family.agent)
             build.require_real_returns(group, training)
-            if getattr(proxy.env.config, "may_never_end", False):
-                build.require_learning(group, training, family.agent, task.max_steps)
+            if getattr(proxy.env.config, "lasts_to_the_limit", False):
+                build.require_learning(group, training, family.agent, proxy.env.world.max_steps,
+                                       task.max_steps)  # fmt: skip
         trainings[family.key] = training
     worlds = {"the proxy": (proxy.env, proxy.params, trainings)}
     if config.baseline:

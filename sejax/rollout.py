@@ -84,18 +84,21 @@ class _Greedy:
         key_act, key_env = step_keys(key, before.num_steps, 2)
         action = self.agent.act(key_act, agent_state, before.obs, explore=False)
         action = self.agent.env_action(action)
-        obs, env_state, reward, terminated, info = self.env.step_env(
-            key_env, before.env_state, action, self.params
-        )
-        scored = before.scored + reward
-        if score_steps is None:
-            total, truncated = scored, self.env.is_truncated(env_state, self.params)
-        else:
+        params = longest = self.params
+        is_within: Any = True  # the task's limit, where a repeated action ends too
+        if score_steps is not None:
             limit = self.params.max_steps_in_episode
-            total = jnp.where(before.num_steps < limit, before.total + reward, before.total)
+            is_within, most = before.num_steps < limit, jnp.maximum(limit, score_steps)
+            longest = self.params.replace(max_steps_in_episode=most)
+            params = self.params.replace(max_steps_in_episode=jnp.where(is_within, limit, most))
+        obs, env_state, reward, terminated, info = self.env.step_env(
+            key_env, before.env_state, action, params
+        )
+        truncated = self.env.is_truncated(env_state, longest)
+        total = scored = before.scored + reward
+        if score_steps is not None:
+            total = jnp.where(is_within, before.total + reward, before.total)
             scored = jnp.where(before.num_steps < score_steps, scored, before.scored)
-            longest = self.params.replace(max_steps_in_episode=jnp.maximum(limit, score_steps))
-            truncated = self.env.is_truncated(env_state, longest)
         after = _Episode(
             active=~(terminated | truncated),
             num_steps=before.num_steps + info.get("num_steps", 1),

@@ -59,7 +59,7 @@ def unseal(data: bytes, kind: str) -> tuple[dict[str, np.ndarray], dict[str, Any
         raise DamagedError("its content does not match its digest")
     try:
         return load(data), manifest
-    except (SafetensorError, ValueError, KeyError, TypeError) as error:
+    except (SafetensorError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise DamagedError(f"its tensors cannot be read: {error}") from error
 
 

@@ -52,8 +52,9 @@ class TrainingConfig(Options):
 
 
 def budget_for(
-    training: TrainingConfig, agent: Any, learned_with: Iterable[Any], max_episode_steps: int
-) -> TrainingConfig:
+    training: TrainingConfig, agent: Any, learned_with: Iterable[Any], max_episode_steps: int,
+    task_max_steps: int,
+) -> TrainingConfig:  # fmt: skip
     """How long an agent trains on a proxy that was learned with others.
 
     A step budget grows by the steps for which this agent waits longer with learning than any of
@@ -64,15 +65,17 @@ def budget_for(
       agent: configuration of the agent that is to train.
       learned_with: of those that the proxy was learned with, as far as they are known.
       max_episode_steps: that the proxy's episodes may take.
+      task_max_steps: that the real task's may take.
     """
     if training.max_steps is None:
         return training
-    waits = steps_before_learning(agent, max_episode_steps)
-    waited = max((steps_before_learning(x, max_episode_steps) for x in learned_with), default=0)
-    return dataclasses.replace(training, max_steps=training.max_steps + max(0, waits - waited))
+    waits, *waited = (steps_before_learning(each, max_episode_steps, task_max_steps)
+                      for each in (agent, *learned_with))  # fmt: skip
+    longer = max(0, waits - max(waited, default=0))
+    return dataclasses.replace(training, max_steps=training.max_steps + longer)
 
 
-def steps_before_learning(agent: Any, max_episode_steps: int) -> int:
+def steps_before_learning(agent: Any, max_episode_steps: int, task_max_steps: int) -> int:
     """Training steps before an agent first learns, as its configuration says; 0 if it does not."""
     steps = getattr(agent, "steps_before_learning", None)
-    return 0 if steps is None else steps(max_episode_steps)
+    return 0 if steps is None else steps(max_episode_steps, task_max_steps)

@@ -155,7 +155,7 @@ def test_initial_episodes_beyond_the_proxys_own_extend_its_step_budget(stored):
     assert (then.init_episodes, training.max_steps) == (0, 50)
 
     def budget(agent, *then):
-        return budget_for(training, agent, then, proxy.task.max_steps).max_steps
+        return budget_for(training, agent, then, 200, 200).max_steps
 
     assert budget(dataclasses.replace(then, init_episodes=3), then) == 50 + 3 * 200
     long, short = (PPOConfig.paper(update_episodes=number) for number in (2, 1))
@@ -165,7 +165,11 @@ def test_initial_episodes_beyond_the_proxys_own_extend_its_step_budget(stored):
     # Of several that it was learned with, the one that waits longest counts.
     assert budget(long, then, short) == 50 + 200
     unlimited = TrainingConfig()
-    assert budget_for(unlimited, PPOConfig(), [then], 200) is unlimited
+    assert budget_for(unlimited, PPOConfig(), [then], 200, 200) is unlimited
+    # A rollout is as long as the task's episodes, initial episodes are as long as the proxy's.
+    assert budget_for(training, long, [then], 1, 200).max_steps == 50 + 401
+    waits = dataclasses.replace(then, init_episodes=3)
+    assert budget_for(training, waits, [then], 1, 200).max_steps == 50 + 3
     # That is what an evaluation trains with.
     study = proxy_study(evaluate_config(f"proxy={stored}", "agent.init_episodes=3"))
     used = study.worlds["the proxy"][2]["ddqn"]

@@ -23,7 +23,8 @@ from sejax.gym import GYMNASIUM_IDS, RealTask, SyntheticEnv, SyntheticWorld, mak
 from sejax.gym.tasks import real_task
 from sejax.proxies import ABSURD
 from sejax.proxies.configs import SyntheticConfig
-from sejax.proxies.stored import pretrained_names
+from sejax.proxies.stored import find, pretrained_names
+from sejax.sealed import seal, unseal
 
 KEY = jax.random.key(0)
 SMALL = {"hidden_size": 5}
@@ -350,6 +351,13 @@ def test_the_spec_makes_it_again_and_adds_no_second_time_limit(stored):
     assert gymnasium.make(gymnasium.envs.registration.EnvSpec.from_json(env.spec.to_json()))
 
 
+@pytest.mark.parametrize("name", ["by hand", "a(b)/c", "@"])
+def test_a_task_may_be_called_what_gymnasium_would_not(stored, name):
+    task = dataclasses.replace(envs.make("cartpole"), name=name, origin=None)
+    env = make(stored(plugins.make("proxy", SyntheticConfig(**SMALL, **BANDIT), task)))
+    assert gymnasium.make(env.spec).reset(seed=0)[0].shape == (4,)
+
+
 def test_what_is_returned_is_the_callers(stored):
     env = make(stored(jax_se()))
     first, _ = env.reset(seed=0)
@@ -374,6 +382,15 @@ def test_a_step_needs_an_episode_and_an_action_of_the_space(stored):
     env.reset(seed=0)
     with pytest.raises(gymnasium.error.InvalidAction, match=r"is none of Box"):
         env.step(0.5)
+
+
+def test_bools_are_actions_and_no_masks():
+    rewards: dict[int, set[float]] = {0: set(), 1: set()}
+    for action in (1, True, np.array(1), 0, False):
+        env = make("cartpole")
+        env.reset(seed=0)
+        rewards[int(action)].add(env.step(action)[1])
+    assert len(rewards[0]) == len(rewards[1]) == 1 and rewards[0] != rewards[1]
 
 
 def test_continuous_actions_are_clipped_to_the_bounds(stored):
@@ -504,3 +521,29 @@ def test_what_is_no_single_se_is_one_message(tmp_path, stored):
     weights["reward"]["Dense_0"]["bias"][0] = np.nan
     with pytest.raises(ConfigError, match=r"^weights must be .* numbers that are not finite"):
         make(stored(env, weights))
+
+
+@pytest.mark.parametrize(
+    "name, given",
+    [("halfcheetah-rn", {"xml_file": "/etc/hostname"}), ("cartpole-rn", {"render_mode": "human"}),
+     ("cartpole-rn", {"sutton_barto_reward": True}), ("cliff_walking-rn", {"goal_reward": "x"}),
+     ("cliff_walking-rn", {"bogus": 1})],
+)  # fmt: skip
+def test_a_strangers_file_sets_no_options_that_the_task_does_not_have_here(tmp_path, name, given):
+    tensors, header = unseal(find(name).read_bytes(), "sejax")
+    header["config"]["env"] |= given
+    path = tmp_path / "strangers.safetensors"
+    path.write_bytes(seal(tensors, "sejax", header))
+    with pytest.raises(ConfigError, match=rf"^env\.{next(iter(given))} must be"):
+        make(path)
+
+
+def test_weights_of_another_type_are_refused_as_in_jax(tmp_path):
+    tensors, header = unseal(find("cartpole").read_bytes(), "sejax")
+    path = tmp_path / "double.safetensors"
+    path.write_bytes(seal({k: x.astype(float) for k, x in tensors.items()}, "sejax", header))
+    with pytest.raises(ConfigError, match=r"^weights must be those of .* got .*float64"):
+        make(path)
+    path.write_bytes(seal(tensors | {"start/Dense_0/bias": np.float32([1])[0]}, "sejax", header))
+    with pytest.raises(ConfigError, match=r"^weights must be those of"):
+        make(path)

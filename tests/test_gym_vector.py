@@ -158,3 +158,12 @@ def test_a_reward_networks_lanes_are_gymnasiums():
     assert envs.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
     with pytest.raises(ConfigError, match=r"^num_envs must be at least 1, because there is a lane"):
         make_vec("cartpole", 0)
+
+
+def test_bools_are_actions_and_no_masks():
+    rewards = []
+    for actions in (np.array([1, 0, 1]), np.array([True, False, True])):
+        envs = SyntheticVectorEnv(world_of(), 3)
+        envs.reset(seed=0)
+        rewards.append(envs.step(actions)[1])
+    np.testing.assert_array_equal(*rewards)

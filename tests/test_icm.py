@@ -1,5 +1,6 @@
 """sejax.agents.icm: models and loss by hand, updates against torch, and what the agent sees."""
 
+import dataclasses
 import functools
 from pathlib import Path
 
@@ -381,6 +382,12 @@ def test_a_rollout_that_is_not_full_changes_nothing_alone_and_in_lanes(updates):
 
 
 # --- the rest of the agent -----------------------------------------------------------------------
+
+
+def test_an_agents_hyperparameters_may_be_any_pytree():
+    plain = STUBS["index"]
+    agent = curious("index", dataclasses.replace(plain, hparams={"discount": 0.9}))
+    assert agent.hparams[0] == {"discount": 0.9}
 
 
 def test_everything_else_is_the_wrapped_agents():

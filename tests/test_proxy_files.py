@@ -257,7 +257,8 @@ def without(*names):
         *(lambda header, value=value: header | {"proxies": value}
           for value in (None, [], [None], [3], {}, 3, [{"score": None}], [{"score": "x"}],
                         [{"seed": None}], [{"seed": []}])),
-        *(lambda header, value=value: header | {"discount": value} for value in (None, "x", [])),
+        *(lambda header, value=value: header | {"discount": value}
+          for value in (None, "x", [], math.nan, -0.1, 1.5)),
         *(lambda header, value=value: header | {"format_version": value}
           for value in (None, 0, 3, "2", 2.5, [], True)),
         *(lambda header, value=value: header | {"interface": header["interface"] | value}
@@ -266,6 +267,7 @@ def without(*names):
                         {"action": {"n": 2**40}}, {"action": {"low": [0], "high": []}},
                         {"action": {"low": [], "high": []}}, {"action": {"low": [0]}},
                         {"action": {"low": ["x"], "high": [1]}},
+                        {"action": {"low": [1], "high": [0]}},
                         {"action": {"low": [math.nan], "high": [1]}},
                         {"action": {"low": [10**400], "high": [1]}})),
         lambda header: header | {"interface": None},
@@ -338,6 +340,16 @@ def test_tensors_of_another_shape_are_refused(path, tmp_path, weights):
     sejax.save(tmp_path / "p.safetensors", other, weights[0])
     with pytest.raises(ConfigError, match="must hold the tensors of the network"):
         sejax.load(tmp_path / "p.safetensors")
+
+
+def test_tensors_of_types_that_numpy_lacks_are_refused(path):
+    tensors, header = header_of(path)
+    data = seal({name: x.astype(np.uint8) for name, x in tensors.items()}, "sejax", header)
+    data = data.replace(b'"U8"', b'"F8_E5M2"', 1)  # longer by 5: taken from the padding's count
+    size = int.from_bytes(data[:8], "little") + 5
+    path.write_bytes(size.to_bytes(8, "little") + data[8:])
+    with pytest.raises(ConfigError, match="which is damaged"):
+        sejax.load(path)
 
 
 def test_a_full_disk_is_an_oserror_and_the_older_file_stays(path, env, weights, monkeypatch):
@@ -466,6 +478,9 @@ def test_an_se_with_its_own_starts_needs_no_task(tmp_path):
         chex.assert_trees_all_equal(*episode)
     assert sejax.load(path)[0] is there  # and what was compiled for it is used again
     assert sejax.make_agent(sejax.TD3Config(), there.task)
+    again = tmp_path / "again.safetensors"
+    sejax.save(again, there, params.weights)
+    assert files.read_config(again)["env"] == files.read_config(path)["env"]
     for use in (lambda: files.load_proxy(path).task, lambda: files.load_set(path).solved(),
                 lambda: rollout(there.task.env, there.task.params, jax.random.key(0))):  # fmt: skip
         with pytest.raises(ConfigError, match=r"proxy of a registered env if no task is given"):
@@ -516,7 +531,8 @@ def test_the_shipped_cheetah_needs_no_mujoco(monkeypatch):
 @pytest.mark.parametrize("name", ["cartpole", "cliff_walking", "pendulum", "gymnax/Pong-misc"])
 def test_spaces_of_a_task_come_back_from_plain_values(name):
     task = envs.make(name)
-    again = absent.make(name, json.loads(json.dumps(task.interface)), "")
+    again = absent.make(name, json.loads(json.dumps(task.interface)), task.origin, "")
+    assert again.origin == task.origin
     assert again.interface == task.interface
     assert (again.obs_dim, again.action_dim) == (task.obs_dim, task.action_dim)
     assert (again.num_states, again.num_actions) == (task.num_states, task.num_actions)

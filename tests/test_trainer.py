@@ -1,5 +1,6 @@
 """sejax.trainer: the inner loop against a plain Python one, alone and in lanes."""
 
+import dataclasses
 import re
 
 import gymnasium
@@ -17,7 +18,7 @@ from sejax.agents.ddqn import DDQNConfig, make_ddqn
 from sejax.agents.memory import Memory
 from sejax.agents.tabular import QLearningConfig
 from sejax.proxies.configs import SyntheticConfig
-from sejax.rollout import make_recorder, make_tester
+from sejax.rollout import _Greedy, make_recorder, make_tester
 from sejax.trainer import is_plateau, is_solved, make_trainer
 from sejax.training import TrainingConfig
 
@@ -555,16 +556,29 @@ def test_a_recorded_training_is_the_training(recorded, trainers):
 
 
 def test_a_part_of_a_test_or_more_than_all_of_it_may_be_scored():
-    # Episodes that go on for ever, cut after 4 steps, pay 2.5 in step 4 and in each one after it.
+    # Episodes that go on for ever, cut after 4 steps, pay 2.5 in step 4 and in the last one.
     task = envs.Task(name="script", env=ENV, params=script([2.5] * 12, [99] * 12))
     agent = scripted_agent()
     state = agent.begin_episode(agent.init(KEY, 0.0), 0)
     test = jax.jit(make_tester(agent, task, 2))
-    for score_steps, scored, played in ((3, 0.0, 4), (4, 2.5, 4), (6, 7.5, 6)):
+    for score_steps, scored, played in ((3, 0.0, 4), (4, 2.5, 4), (6, 5.0, 6)):
         tests = test(KEY, state, True, jnp.int32(score_steps))
         np.testing.assert_array_equal(tests.scored, [scored] * 2)
         np.testing.assert_array_equal(tests.returns, [2.5] * 2)  # of the task's own 4 steps
         np.testing.assert_array_equal(tests.num_steps, [played] * 2)
+
+
+def test_actions_are_repeated_beyond_the_tasks_limit_too():
+    # Limit 4: decisions of 3 and 1 steps, then of 3 and 2 up to the 9 that are scored.
+    task = envs.Task(name="script", env=ENV, params=script([2.5] * 12, [99] * 12))
+    agent = dataclasses.replace(scripted_agent(), action_repeat=3)
+    state = agent.begin_episode(agent.init(KEY, 0.0), 0)
+    step = jax.jit(_Greedy(agent, task).step)
+    episode, made = _Greedy(agent, task).begin(KEY, True), []
+    while episode.active:
+        episode, _ = step(KEY, state, episode, jnp.int32(9))
+        made.append(int(episode.num_steps))
+    assert made == [3, 4, 7, 9]
 
 
 def test_recorded_tests_are_the_tests():

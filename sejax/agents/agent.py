@@ -13,9 +13,11 @@ from sejax.agents.memory import MemoryMaker
 from sejax.options import Options, counts, option, traced_options
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Agent:
     """What the inner loop needs of an agent. All functions are pure and act on one agent.
+
+    Build an agent once: what is compiled for it is kept by identity.
 
     Attributes:
       init: `(key, hparams) -> state`. `hparams` are the agent's traced numbers, kept in its state.
@@ -119,8 +121,13 @@ class AgentOptions(Options):
     # Episodes before learning starts and before a stop rule may judge.
     init_episodes: int = option(10, counts("it counts episodes", least=0))
 
-    def steps_before_learning(self, max_episode_steps: int) -> int:
-        """Training steps before the agent first learns, where episodes have this length."""
+    def steps_before_learning(self, max_episode_steps: int, task_max_steps: int) -> int:
+        """Training steps before the agent first learns.
+
+        Args:
+          max_episode_steps: of the episodes that it trains on, which last so long.
+          task_max_steps: limit of the task that it was made for.
+        """
         return self.init_episodes * max_episode_steps
 
 

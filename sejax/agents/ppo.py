@@ -106,10 +106,10 @@ class PPOConfig(AgentOptions):
         return make_ppo(self, task.obs_dim, task.num_actions, action_dim, task.max_action,
                         task.max_steps)  # fmt: skip
 
-    def rollout_length(self, max_episode_steps: int) -> int:
+    def rollout_length(self, task_max_steps: int) -> int:
         """Decisions between two learning phases: `rollout_steps`, if that is set.
 
-        The authors learn as soon as (decisions x `action_repeat`) / `max_episode_steps` exceeds
+        The authors learn as soon as (decisions x `action_repeat`) / `task_max_steps` exceeds
         `update_episodes`, also in the middle of an episode; this is the first whole number that
         does.
 
@@ -117,11 +117,11 @@ class PPOConfig(AgentOptions):
         """
         if self.rollout_steps is not None:
             return self.rollout_steps
-        return self.update_episodes * max_episode_steps // self.action_repeat + 1
+        return self.update_episodes * task_max_steps // self.action_repeat + 1
 
-    def steps_before_learning(self, max_episode_steps: int) -> int:
-        """As of any agent; PPO learns once a rollout is full."""
-        return self.rollout_length(max_episode_steps) * self.action_repeat
+    def steps_before_learning(self, max_episode_steps: int, task_max_steps: int) -> int:
+        """As of any agent; PPO learns once a rollout is full, whose length is by the task."""
+        return self.rollout_length(task_max_steps) * self.action_repeat
 
     def optimizer(self) -> optax.GradientTransformation:
         """Adam's direction, of a gradient that may be shortened first."""

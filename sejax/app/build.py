@@ -80,8 +80,10 @@ class LearnConfig:
         for family in families_of(self):
             with families.named(family.field):
                 agents.require_fit(family.agent, self.exploration, facts, task_name)
-                if getattr(self.proxy, "may_never_end", False):
-                    require_learning("training", self.training, family.agent, facts.max_steps)
+                if getattr(self.proxy, "lasts_to_the_limit", False):
+                    require_learning("training", self.training, family.agent,
+                                     self.proxy.max_steps(facts.max_steps),
+                                     facts.max_steps)  # fmt: skip
 
     def name(self, group: str) -> str:
         """The name by which a group's choice was made; several agents are `ddqn+ppo`."""
@@ -246,16 +248,16 @@ def require_real_returns(name: str, training: TrainingConfig) -> None:
 
 
 def require_learning(
-    name: str, training: TrainingConfig, agent: Any, max_episode_steps: int
+    name: str, training: TrainingConfig, agent: Any, max_episode_steps: int, task_max_steps: int
 ) -> None:
-    """Checks that a step budget lets an agent learn in a world whose episodes may never end.
+    """Checks that a step budget lets an agent learn in a world whose episodes last to their limit.
 
-    Most SEs with soft ends are such, so that initial episodes take all steps that they may.
+    One-step SEs are such, and most with soft ends, which may never end an episode.
 
     Raises:
       ConfigError: if it does not.
     """
-    before = steps_before_learning(agent, max_episode_steps)
+    before = steps_before_learning(agent, max_episode_steps, task_max_steps)
     names = ("rollout_steps", "update_episodes", "init_episodes")
     waits = next((name for name in names if getattr(agent, name, None) is not None), names[-1])
     require(training.max_steps is None or training.max_steps > before, f"{name}.max_steps",

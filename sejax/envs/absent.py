@@ -59,21 +59,23 @@ class AbsentEnv(environment.Environment[Any, Any]):
         return self._observation
 
 
-def make(name: str, interface: dict[str, Any], reason: str) -> Task:
+def make(name: str, interface: dict[str, Any], origin: dict[str, Any], reason: str) -> Task:
     """The task of that name, built once; what needs more than its interface raises `reason`.
 
     Args:
       name: of the task.
       interface: as of `Task.interface`.
+      origin: as of `Task.origin`, for files that are written of it.
       reason: why the task itself cannot be had.
     """
-    return _make(name, json.dumps(interface, sort_keys=True), reason)
+    return _make(name, json.dumps([interface, origin], sort_keys=True), reason)
 
 
 @functools.cache
-def _make(name: str, interface: str, reason: str) -> Task:
-    known = json.loads(interface)
-    return Task(name=name, env=AbsentEnv(name, known, reason), max_steps=known["max_steps"])
+def _make(name: str, known: str, reason: str) -> Task:
+    interface, origin = json.loads(known)
+    return Task(name=name, env=AbsentEnv(name, interface, reason),
+                max_steps=interface["max_steps"], origin=origin)  # fmt: skip
 
 
 def require_present(task: Task) -> Task:

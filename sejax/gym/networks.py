@@ -94,9 +94,10 @@ def check(weights: Mapping[str, np.ndarray], shapes: Shapes) -> None:
     """Checks that a file's tensors are those of the networks that its metadata describes.
 
     Raises:
-      ConfigError: if they are not, or not finite.
+      ConfigError: if they are not, not float32, or not finite.
     """
-    there = {name: x.shape for name, x in weights.items()}
+    there = {name: x.shape if x.dtype == np.float32 else (x.dtype, x.shape)
+             for name, x in weights.items()}  # fmt: skip
     if there != shapes or not all(np.isfinite(x).all() for x in weights.values()):
         what = "numbers that are not finite" if there == shapes else shortened(there)
         raise ConfigError(

@@ -1,5 +1,6 @@
 """From the name or the file of a proxy to environments."""
 
+import re
 from collections.abc import Mapping
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -48,7 +49,7 @@ def make(
     """
     weights, header = read(source)
     env: SyntheticEnv | RewardNetwork
-    name = header["task"].replace("/", "-")
+    name = re.sub(r"[^\w.:-]+", "-", header["task"]) or "proxy"  # as Gymnasium's ids must be
     if _is_rn(header):
         env, name = RewardNetwork(_real_env(header, task, render_mode), source), f"{name}-rn"
     else:

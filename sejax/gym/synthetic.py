@@ -113,8 +113,8 @@ class SyntheticWorld:
         """
         if self._num_actions:
             array = np.asarray(action) if space.shape else action
-            if space.contains(array):
-                return self._one_hot[array]
+            if space.contains(array):  # also of bools, which would be a mask
+                return self._one_hot[array.astype(np.intp) if space.shape else int(array)]
         elif np.shape(action) == space.shape:
             low, high = self.action_space.low, self.action_space.high  # type: ignore[attr-defined]
             return np.minimum(np.maximum(np.asarray(action, np.float32), low), high)
@@ -244,6 +244,6 @@ def _shapes(
         shapes |= networks.shapes_of("state", [*units, obs_dim])
         shapes |= networks.shapes_of("done", [*units, 1])
     if config.initial_state == "learned":
-        start_size = len(weights.get("start/Dense_0/bias", ()))
+        (start_size,) = np.shape(weights.get("start/Dense_0/bias", ()))[:1] or (0,)
         shapes |= networks.shapes_of("start", [obs_dim, start_size, obs_dim])
     return shapes

@@ -9,7 +9,7 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.wrappers import TimeLimit
 
-from sejax import plugins
+from sejax import plugins, serialize
 from sejax.errors import ConfigError, require, shortened, told
 from sejax.gym.gridworld import MAPS, GridWorld
 
@@ -132,12 +132,20 @@ def real_env(
     Args:
       config: of the task, plain values with a `name`.
       render_mode: as of `gymnasium.make`.
+
+    Raises:
+      ConfigError: for an option that the task does not have here, or Gymnasium cannot make it.
     """
-    options = dict(config)
-    name, backend = str(options.pop("name", "")), options.pop("backend", "mujoco")
-    if name not in (*GYMNASIUM_IDS, *MAPS) or backend not in GYMNASIUM_BACKENDS:
+    name = str(config.get("name"))
+    if name not in (*GYMNASIUM_IDS, *MAPS):
         return None
-    max_steps = plugins.find("env", name).facts.max_steps
+    # Gymnasium takes more options, such as the path of a model: what a file says is read as
+    # everywhere, by the fields that the task has here.
+    spec = plugins.configure("env", config)
+    options = serialize.to_plain(spec)
+    if options.pop("backend", "mujoco") not in GYMNASIUM_BACKENDS:
+        return None
+    max_steps = spec.facts.max_steps
     if name in MAPS:
         return TimeLimit(GridWorld(name, **options), max_steps)
     return make_gymnasium(GYMNASIUM_IDS[name], max_steps, render_mode=render_mode, **options)
@@ -160,7 +168,7 @@ def real_task(header: Mapping[str, Any], needs_starts: bool) -> RealTask:
         return RealTask.of_env(env)
     gymnax_id = str(config.get("name")).removeprefix(PREFIX)
     if gymnax_id != config.get("name") and gymnax_id in gymnasium.registry:
-        return RealTask.of_gymnasium(gymnax_id, config.get("max_steps"))
+        return RealTask.of_gymnasium(gymnax_id, plugins.configure("env", config).max_steps)
     raise unknown_task(config, "sejax.gym.make(source, task=sejax.gym.RealTask(...))")
 
 

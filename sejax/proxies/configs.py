@@ -56,9 +56,9 @@ class SyntheticConfig(Options):
                 "proxy.horizon_is_terminal=true")  # fmt: skip
 
     @property
-    def may_never_end(self) -> bool:
-        """Whether most of what it may become never ends an episode."""
-        return self.done == "soft" and self.horizon is None
+    def lasts_to_the_limit(self) -> bool:
+        """Whether the episodes of most of what it may become take all steps that they may."""
+        return self.horizon == 1 or (self.done == "soft" and self.horizon is None)
 
     @property
     def needs_task(self) -> bool:

@@ -110,8 +110,9 @@ class Proxy:
         known = [plugins.configure("agent", values)
                  for values in learned_agents(self.config).values()
                  if _is_registered("agent", values)]  # fmt: skip
-        max_steps = self.env.world.max_steps or self.env.task.max_steps
-        return budget_for(self.learned_with("training"), agent, known, max_steps)
+        limit = self.env.task.max_steps
+        return budget_for(self.learned_with("training"), agent, known,
+                          self.env.world.max_steps or limit, limit)  # fmt: skip
 
     def _configured(self, group: str, stored: Any) -> Any:
         where = f"{group} that {self.path.name} was learned with"
@@ -398,7 +399,7 @@ def _env_of(
         except ConfigError as error:
             if "interface" not in header or getattr(proxy, "needs_task", True):
                 raise
-            task = absent.make(header["task"], header["interface"], reason=str(error))
+            task = absent.make(header["task"], header["interface"], config["env"], str(error))
     require(header["task"] == task.name, option, f"be a proxy of {task.name}", "that is the task "
             "given", f"one of {shortened(header['task'])} in {path}",
             f"{option} to a proxy of {task.name}, or another task")  # fmt: skip

@@ -93,7 +93,7 @@ def read(path: Path, option: str) -> tuple[dict[str, np.ndarray], dict[str, Any]
         with safe_open(path, framework="np") as file:
             metadata = dict(file.metadata() or {})
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-    except (SafetensorError, OSError, ValueError, TypeError) as error:
+    except (SafetensorError, OSError, ValueError, TypeError, AttributeError) as error:
         raise _damaged(path, option, str(error)) from error
     try:
         stored = json.loads(metadata.get(KEY) or metadata["sejax_set"])
@@ -142,6 +142,8 @@ def _check_header(header: dict[str, Any]) -> None:
     for record in records:
         float(record.get("score", 0)), int(record.get("seed", 0)), int(record.get("generation", 0))
     header["discount"] = float(header["discount"])
+    if not 0 <= header["discount"] <= 1:
+        raise ValueError("a discount outside of [0, 1]")
     if "interface" in header:  # which older files lack
         _check_interface(header["interface"])
 
@@ -157,6 +159,8 @@ def _check_interface(interface: Any) -> None:
         are_numbers = all(x is None or math.isfinite(x) for x in (*low, *high))
         if not (are_numbers and len(low) == len(high) > 0):
             raise ValueError("a space of vectors without bounds")
+        if any(None not in pair and pair[0] > pair[1] for pair in zip(low, high, strict=True)):
+            raise ValueError("a space whose bounds are in the wrong order")
     if not all(type(count) is int and 0 < count <= LARGEST for count in counts):
         raise ValueError("a space or step limit that is no whole number above 0")
 
