@@ -15,7 +15,7 @@ from sejax import hub, plugins
 from sejax.app import build, commands, compose, runtime
 from sejax.app.build import EvaluateConfig
 from sejax.app.families import AgentFamily, families_of, named
-from sejax.errors import ConfigError, require
+from sejax.errors import ConfigError, require, told
 from sejax.training import TrainingConfig
 
 
@@ -24,6 +24,9 @@ from sejax.training import TrainingConfig
 def main(cfg: DictConfig) -> float:
     """Evaluates as configured and returns the mean test return (for Hydra's sweepers)."""
     config = compose.evaluate_config_of(cfg)
+    own = commands.name_in_sweep(known=()) if config.out_dir is None else ""
+    if own:  # or all jobs of a sweep would have one folder
+        config = dataclasses.replace(config, out_dir=f"runs/evaluate-{own}")
     runtime.enable_compilation_cache()
     return evaluate(config)
 
@@ -35,24 +38,31 @@ def evaluate(config: EvaluateConfig) -> float:
       The mean test return of the agents trained on the proxy (on the real task for `proxy=real`).
 
     Raises:
-      ConfigError: for an unknown or damaged proxy, or a task that is not the proxy's.
+      ConfigError: for an unknown or damaged proxy, a task that is not the proxy's, or a folder that
+        cannot be written.
     """
     import pandas as pd
 
     from sejax.app import plots
-    from sejax.files import write_text
+    from sejax.files import require_writable, write_text
 
     study = _real_study(config) if config.proxy == "real" else proxy_study(config)
+    out_dir, solved_reward = study.out_dir, study.task.solved_reward
+    try:
+        require_writable(out_dir)  # before agents train for nothing
+    except OSError as error:
+        raise ConfigError(
+            f"out_dir must be a folder that files can be written to, because what agents return is "
+            f"kept there; got {out_dir} ({told(error)}). Set out_dir=DIR."
+        ) from error
     tables = {(world, family.key): _train_and_test(config, study, world, family)
               for world in study.worlds for family in study.families}  # fmt: skip
     table = pd.concat([t.assign(world=world) for (world, _), t in tables.items()])
-    out_dir, solved_reward = study.out_dir, study.task.solved_reward
-    out_dir.mkdir(parents=True, exist_ok=True)
-    write_text(out_dir / "evaluation.csv", table.to_csv(index=False))
-    plots.evaluation(tables, solved_reward, out_dir / "evaluation.png")
     summary = summarise(table, ["world", "agent"] if study.has_several else ["world"])
-    write_text(out_dir / "evaluation.json", _as_json(summary))
     _print_table(summary, study, config)
+    write_text(out_dir / "evaluation.csv", table.to_csv(index=False))
+    write_text(out_dir / "evaluation.json", _as_json(summary))
+    plots.evaluation(tables, solved_reward, out_dir / "evaluation.png")
     first = table[table["world"] == next(iter(study.worlds))]
     return float(first["test_return"].mean())
 

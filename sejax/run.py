@@ -3,18 +3,24 @@
 Running the same command on an existing run directory goes on where it stopped.
 """
 
+import dataclasses
+
 import hydra
 from omegaconf import DictConfig
 
 from sejax.app import commands, compose, runtime
-from sejax.app.build import LearnConfig
+from sejax.app.build import IN_RUN_DIR, LearnConfig
 
 
 @hydra.main(config_path="conf", config_name="run", version_base="1.3")
 @commands.guarded
 def main(cfg: DictConfig) -> float:
     """Learns a proxy as configured and returns the best incumbent mean (for Hydra's sweepers)."""
-    return learn(compose.learn_config(cfg))
+    config = compose.learn_config(cfg)
+    own = commands.name_in_sweep(IN_RUN_DIR) if config.run_dir is None else ""
+    if own:  # or all jobs of a sweep would have one folder
+        config = dataclasses.replace(config, run_dir=f"{config.resolved_run_dir}_{own}")
+    return learn(config)
 
 
 def learn(config: LearnConfig) -> float:

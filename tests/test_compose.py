@@ -400,7 +400,8 @@ WILD = [
     ("env=null", "env must be one of"), ("env=???", "env must be one of"),
     (f"agent={LONG}", "(5000 characters)"), (f"env={LONG}", "(5000 characters)"),
     (f"agent=a:{LONG}", "(5002 characters)"), ("agent=choice(1,2)", "agent must be one of"),
-    ("agent.name=0", "agent must be one of"), ("agent.name=???", "agent must be one of"),
+    ("agent.name=0", "Set agent=0."), ("agent.name=???", "agent.name must not be set"),
+    ("env.name=acrobot", "Set env=acrobot."),
     # A choice that is taken away.
     ("~env=[[1]]", "env must be chosen"), ("~env", "env must be chosen"),
     ("~seed", "seed must be given"),

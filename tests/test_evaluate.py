@@ -137,6 +137,13 @@ def test_a_live_line_counts_the_agents_and_changes_no_number(room, tmp_path, mon
     assert lines == [(3, "agents on the proxy", done), (3, "agents on the real task", done)]
 
 
+def test_a_folder_that_cannot_be_written_is_said_before_agents_train(room, tmp_path, monkeypatch):
+    (tmp_path / "file").write_text("")
+    monkeypatch.setattr("sejax.evaluate._train_and_test", None)
+    with pytest.raises(ConfigError, match=r"^out_dir must be a folder that .* Set out_dir=DIR\."):
+        evaluate(evaluate_config(f"proxy={room}", f"out_dir={tmp_path}/file/x", words=ROOM))
+
+
 def test_agents_train_as_the_proxy_was_learned(evaluated):
     table = pd.read_csv(evaluated[1] / "evaluation.csv")
     assert (table[table.world == "the proxy"].train_steps == 50).all()

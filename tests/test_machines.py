@@ -360,7 +360,19 @@ def test_workers_that_never_get_ready_end_the_run():
     crew = Crew(room=3, fate=lambda worker, turn: (1.0, ConfigError("other versions")))
     with pytest.raises(ConfigError, match=r"^other versions$"):
         hand_out_of(crew).get_ready()
-    assert crew.dismissed == [1]
+    assert crew.dismissed == [1, 2, 3]
+
+
+def test_a_machine_with_other_versions_ends_no_run_that_others_get_ready_for():
+    def fate(worker, turn):
+        return (1.0, ConfigError("other versions")) if worker == 1 else (30.0, None)
+
+    crew = Crew(room=3, fate=fate)
+    hand_out = hand_out_of(crew)
+    hand_out.get_ready()
+    assert 1 in crew.dismissed
+    _, done = score(hand_out, 100)
+    assert done and 1 not in done
 
 
 def test_workers_that_do_not_get_ready_are_given_up_where_others_are():

@@ -76,6 +76,13 @@ def whole(tmp_path_factory):
     return run, Page(out.read_text())
 
 
+@pytest.mark.parametrize("value, text", [
+    (0.0004, "0"), (2.9996, "3"), (1000.0001, "1,000"), (0.25, "0.25"), (12, "12"), ("x", "x"),
+])  # fmt: skip
+def test_numbers_have_no_trailing_point(value, text):
+    assert pages.number(value) == text
+
+
 def test_the_page_of_a_run_says_what_its_files_say(whole):
     run, page = whole
     for text in ("solved, after 3 of 3 generations", "196.0 ± 5.0", "195", "123,456", "A CPU",

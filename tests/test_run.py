@@ -11,16 +11,21 @@ import shutil
 import signal
 import subprocess
 import sys
+import types
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import jax
+import numpy as np
 import pytest
 import yaml
+from hydra.core.hydra_config import HydraConfig
+from hydra.types import RunMode
 from support import is_drawn
 
 import sejax
 from sejax import run
-from sejax.app import build, checkpoints, commands, run_directory, session
+from sejax.app import build, checkpoints, commands, progress, run_directory, session
 from sejax.app.metrics import FAMILY_COLUMNS
 from sejax.app.progress import RunProgress
 from sejax.app.run_directory import COLUMNS
@@ -456,3 +461,33 @@ def test_the_command_says_how_it_ended_and_what_to_do_next(uninterrupted, capsys
     assert best == pytest.approx(max(scores))
     assert f"best incumbent mean {best:.1f}, solved at 0.8" in said
     assert f"python -m sejax.evaluate proxy={uninterrupted} agent=q_learning" in said
+
+
+# --- sweeps --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("mode, words, name", [
+    ("RUN", ["es.noise_std=0.03"], ""),
+    ("MULTIRUN", ["es.noise_std=0.03", "seed=1", "env=acrobot"], "es.noise_std_0.03"),
+    ("MULTIRUN", ["seed=1"], ""),
+    ("MULTIRUN", ["agent.learning_rate=0.1", "+a=[1, 2]"], "agent.learning_rate_0.1_+a_1_2_"),
+])  # fmt: skip
+def test_a_job_of_a_sweep_has_a_folder_of_its_own(monkeypatch, mode, words, name):
+    job = types.SimpleNamespace(mode=RunMode[mode],
+                                overrides=types.SimpleNamespace(task=words))  # fmt: skip
+    monkeypatch.setattr(HydraConfig, "initialized", lambda: True)
+    monkeypatch.setattr(HydraConfig, "get", lambda: job)
+    assert commands.name_in_sweep(build.IN_RUN_DIR) == name
+    job.overrides.task = [f"agent.x={'9' * 500}"]
+    assert len(commands.name_in_sweep(build.IN_RUN_DIR)) <= 120
+
+
+def test_a_progress_line_is_of_the_generations_that_ran():
+    active = np.array([[True, True, False], [True, False, False]])
+    last = progress._last_rows(Rows(active=active, values=np.arange(6.0).reshape(2, 3)))
+    np.testing.assert_array_equal(last.values, [3.0, 1.0])  # of the third seed none
+
+
+class Rows(NamedTuple):
+    active: Any
+    values: Any

@@ -25,6 +25,8 @@ import pytest
 
 optuna = pytest.importorskip("optuna", reason="needs Optuna: pip install 'sejax[search]'")
 
+from optuna.trial import TrialState  # noqa: E402
+
 from sejax.app import commands, compose  # noqa: E402
 from sejax.errors import ConfigError  # noqa: E402
 from sejax.search import __main__, results, settings, spaces, study, trials, verification  # noqa: E402
@@ -122,6 +124,57 @@ def test_the_median_pruner_is_taken_by_name(tmp_path):
                            "max_generations=2")  # fmt: skip
     study.work(found, search, Runner(search), lambda text: None)
     assert states(found)[:5] == ["COMPLETE"] * 5 and "PRUNED" in states(found)
+
+
+def test_the_median_pruner_spares_the_first_generations(tmp_path):
+    found, search = in_memory(tmp_path, "pruner=median", "trials=10", "min_generations=3",
+                           "max_generations=4", "sampler=random")  # fmt: skip
+    study.work(found, search, Runner(search), lambda text: None)
+    pruned = [trial.last_step for trial in found.trials if trial.state.name == "PRUNED"]
+    assert pruned and min(pruned) == 3
+
+
+@pytest.mark.parametrize("sampler", ["random", "tpe"])
+def test_a_search_that_goes_on_draws_what_it_has_not_drawn(tmp_path, sampler):
+    words = (f"sampler={sampler}", "pruner=none", "min_generations=1", "max_generations=1")
+    for count in (3, 6):
+        found, search = opened(tmp_path, *words, f"trials={count}")
+        study.work(found, search, Runner(search), lambda text: None)
+    drawn = [trial.params["es.noise_std"] for trial in found.trials]
+    assert len(set(drawn)) == len(drawn) == 6
+    uninterrupted, search = in_memory(tmp_path / "other", *words, "trials=3")
+    study.work(uninterrupted, search, Runner(search), lambda text: None)
+    assert drawn[:3] == [trial.params["es.noise_std"] for trial in uninterrupted.trials]
+
+
+def test_one_worker_alone_counts_a_trial_as_failed(tmp_path):
+    found, _ = opened(tmp_path)
+    others = [opened(tmp_path)[0]._storage for _ in range(3)]
+    for _ in range(5):
+        trial, barrier = take(found), threading.Barrier(3)
+
+        def fail(storage, trial=trial, barrier=barrier):
+            barrier.wait()
+            with contextlib.suppress(optuna.exceptions.UpdateFinishedTrialError):
+                return storage.set_trial_state_values(trial._trial_id, TrialState.FAIL)
+
+        with ThreadPoolExecutor(3) as pool:
+            assert sorted(map(str, pool.map(fail, others))) == ["None", "None", "True"]
+
+
+def test_a_trial_that_another_has_failed_is_queued_once_and_ctrl_c_stays_ctrl_c(tmp_path):
+    found, search = opened(tmp_path, "trials=3", "pruner=none")
+
+    class TakenForDead(Runner):
+        def meanwhile(self, name, generation):
+            number = int(name)
+            study.queue_again(found, found.trials[number])
+            found.tell(number, state=TrialState.FAIL)
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        study.work(found, search, TakenForDead(search), lambda text: None)
+    assert states(found) == ["FAIL", "WAITING"]
 
 
 def take(found):
@@ -462,6 +515,10 @@ def test_the_preset_file_makes_the_settings_of_the_override_line(tmp_path):
     (line,) = (tmp_path / "best.txt").read_text().splitlines()
     asked = compose.config(shlex.split(line)[3:])
     preset = results.preset_line(search, "sejax.run").partition(" sejax.run ")[2]
+    assert compose.config([preset, "devices=1"]) == asked
+    tracked = read(tmp_path, *fixed, "tracker=tensorboard", "agent.batch_size=16,32")
+    tracked = dataclasses.replace(tracked, fixed=(*tracked.fixed, "tracker.project=mine"))
+    results.write_best(words, tracked, "sejax.run")
     assert compose.config([preset, "devices=1"]) == asked
     assert asked.es.noise_std == 0.25 and asked.preset == "paper"
 

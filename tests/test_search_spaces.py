@@ -133,7 +133,9 @@ def test_machines_are_where_trials_are_made_and_no_setting():
 @pytest.mark.parametrize(
     ("text", "value", "parameter"),
     [("choice(tanh, relu)", "relu", "relu"), ("choice(true, false)", True, "true"),
-     ("choice(tanh, relu)", "prelu", None), ("interval(0.1, 1)", 1, 1.0),
+     ("choice(tanh, relu)", "prelu", None),
+     ("choice(1, 0.5)", 1.0, "1"), ("choice(1.0, 2.0)", 2, "2.0"), ("choice(0, 1)", True, None),
+     ("interval(0.1, 1)", 1, 1.0),
      ("interval(0.1, 1)", 2.0, None), ("int(interval(1, 10))", 3, 3),
      ("range(16, 65, 16)", 40, None), ("interval(0.1, 1)", "often", None),
      ("tag(log, inverse, interval(0.9, 0.999))", 0.99, 0.01)],

@@ -3,6 +3,7 @@
 import json
 import struct
 import types
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -224,3 +225,16 @@ def test_trackio_keeps_one_run_on_this_machine(tmp_path, monkeypatch):
     steps = {step: values for step, values in told if "incumbent_mean" in values}
     assert sorted(steps) == [0, 1, 2] and steps[2]["incumbent_mean"] == 2.5
     assert steps[0]["member_scores"]["_type"] == "trackio.histogram"
+
+
+def test_the_picture_takes_no_step_that_a_run_which_goes_on_will_log():
+    """wandb drops what is logged with a step below the last one."""
+    module = types.SimpleNamespace(Image=str, Histogram=list)
+    steps = []
+    run = types.SimpleNamespace(log=lambda values, step: steps.append(step), finish=lambda: None)
+    for generations in (range(3), range(3, 5)):
+        wandb = trackers.Wandb(module, run)
+        for generation in generations:
+            wandb.log(generation, {}, {})
+        wandb.show("learning_curve", Path("a.png"), generations.stop)
+    assert steps == [0, 1, 2, 2, 3, 4, 4]

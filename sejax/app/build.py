@@ -22,6 +22,9 @@ LEARN_GROUPS = ("env", "proxy", "agent", "exploration", "es", "objective", "trac
 EVALUATE_GROUPS = ("agent", "exploration")
 TRAININGS = ("training", "real_training")
 
+# Fields that the default run directory is named by.
+IN_RUN_DIR = ("env", "proxy", "agent", "agents", "exploration", "agent_hparams", "seed")
+
 
 @dataclass(frozen=True, kw_only=True)
 class LearnConfig:
@@ -122,6 +125,7 @@ class LearnConfig:
 
     @property
     def resolved_run_dir(self) -> Path:
+        """The run directory: by default named by `IN_RUN_DIR`."""
         explored = self.name("exploration")
         explored = "" if explored == "none" else f"_{explored}"
         varied = "_varied" if self.agent_hparams == "varied" else ""

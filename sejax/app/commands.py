@@ -2,23 +2,27 @@
 
 import contextlib
 import functools
+import hashlib
 import io
 import os
 import re
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from pathlib import Path
 from typing import NoReturn, TypeVar
 
+from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
+from hydra.types import RunMode
 from omegaconf.errors import OmegaConfBaseException
 
 from sejax.app import compose, runtime
 from sejax.errors import ConfigError, FailedError
 
 BAD_INPUT, FAILED, INTERRUPTED = 2, 1, 130
+LONGEST_NAME = 120  # characters of a folder's
 Given = TypeVar("Given")
 Result = TypeVar("Result")
 
@@ -38,6 +42,21 @@ def start(name: str, main: Callable[[], object]) -> None:
             return
         compose.register(name, words)
         main()
+
+
+def name_in_sweep(known: Collection[str]) -> str:
+    """What tells a job of a Hydra sweep from the others, for its folder; empty outside of sweeps.
+
+    Args:
+      known: fields that the folder's name has already.
+    """
+    job = HydraConfig.get() if HydraConfig.initialized() else None
+    if job is None or job.mode != RunMode.MULTIRUN:
+        return ""
+    words = [word for word in job.overrides.task  # of what the sweep is over
+             if word not in sys.argv and word.partition("=")[0].lstrip("+") not in known]  # fmt: skip
+    name = re.sub(r"[^\w.+-]+", "_", ",".join(words))
+    return name if len(name) <= LONGEST_NAME else hashlib.sha256(name.encode()).hexdigest()[:16]
 
 
 def start_with_words(main: Callable[[Sequence[str]], object], help_text: str) -> None:

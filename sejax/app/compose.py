@@ -34,6 +34,7 @@ _DEFAULT_OBJECTIVE = "max_reward"
 _GROUPS = tuple(plugins.GROUPS)
 # Groups that no word may choose.
 _INTERNAL = ("base", "tuned", "tuned_agent", "tuned_es", "tuned_objective")
+_NAME = re.compile(r"(\w+)\.name")
 _CHOICE = re.compile(rf"(?:\+\+?)?({'|'.join(_GROUPS)}|preset)=(.*)", re.DOTALL)
 
 
@@ -188,6 +189,12 @@ def _require_choices(groups: tuple[str, ...], overrides: Sequence[str]) -> None:
         group = override.key_or_group
         if not group or group in _INTERNAL:
             raise _unknown_field(group, overrides)
+        if (named := _NAME.fullmatch(group)) and named[1] in groups:
+            # It would choose after the settings that are tuned for the choice were looked up.
+            raise ConfigError(
+                f"{group} must not be set, because a choice brings more than its name; got "
+                f"{shortened(word)}. Set {named[1]}={shortened(word.partition('=')[2])}."
+            )
         if group in groups:
             require(not override.is_delete(), group, "be chosen", "nothing works without it", word,
                     f"{group}=NAME")  # fmt: skip

@@ -112,15 +112,20 @@ class RunProgress:
         self._last = time.time()
 
     def update(self, generation: int, info: Any) -> None:
-        """Shows what the last generation of a chunk, leaves `[generation, seed]`, came to."""
+        """Shows what the last generation of a chunk, leaves `[generation, seed]`, came to.
+
+        Of each seed the last one that it ran: afterwards nothing is trained, and numbers mean
+        nothing.
+        """
         now = time.time()
+        last = _last_rows(info)
         steps_per_s = np.sum(info.train_steps_total) / max(now - self._last, 1e-9)
         self._last = now
         text = (
-            f"incumbent {np.nanmean(info.incumbent_mean[-1]):.1f} ± "
-            f"{np.nanmean(info.incumbent_std[-1]):.1f}{self._of_families(info)}, "
+            f"incumbent {np.nanmean(last.incumbent_mean):.1f} ± "
+            f"{np.nanmean(last.incumbent_std):.1f}{self._of_families(last)}, "
             f"best {np.max(info.best_so_far[-1]):.1f}, "
-            f"{np.mean(info.train_steps_mean[-1]):,.0f} steps an agent, {steps_per_s:,.0f} steps/s"
+            f"{np.mean(last.train_steps_mean):,.0f} steps an agent, {steps_per_s:,.0f} steps/s"
         )
         num_nonfinite = int(np.sum(info.num_nonfinite))
         if num_nonfinite:
@@ -131,10 +136,10 @@ class RunProgress:
         if not self._live:
             self.print(f"generation {generation}/{self._config.generations}: {text}")
 
-    def _of_families(self, info: Any) -> str:
+    def _of_families(self, last: Any) -> str:
         """The incumbent of each of several families of agents."""
         families = families_of(self._config)
-        means = np.nanmean(info.families.incumbent_mean[-1], axis=0)  # [seed, family] -> [family]
+        means = np.nanmean(last.families.incumbent_mean, axis=0)  # [seed, family] -> [family]
         each = [f"{family.key} {mean:.1f}" for family, mean in zip(families, means, strict=True)]
         return f" ({', '.join(each)})" if len(each) > 1 else ""
 
@@ -178,3 +183,13 @@ class RunProgress:
         """What `sejax.load` must be given beside the proxy."""
         task = ", task=my_task" if ":" in self._config.name("env") else ""
         return task + (", proxy=my_proxy_config" if ":" in self._config.name("proxy") else "")
+
+
+def _last_rows(info: Any) -> Any:
+    """Of each seed that ran in a chunk the last generation that it ran, leaves `[seed, ...]`."""
+    import jax
+
+    ran = np.asarray(info.active)  # [generation, seed]
+    seeds = np.flatnonzero(ran.any(axis=0))
+    last = len(ran) - 1 - np.argmax(ran[::-1, seeds], axis=0)
+    return jax.tree.map(lambda x: x[last, seeds], info)

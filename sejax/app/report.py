@@ -269,7 +269,7 @@ def number(value: Any) -> str:
     """A number with three decimals at most."""
     if not isinstance(value, int | float) or not math.isfinite(value):
         return str(value)
-    return f"{value:,.0f}" if value == round(value) else f"{value:,.3f}".rstrip("0")
+    return f"{value:,.0f}" if value == round(value) else f"{value:,.3f}".rstrip("0").rstrip(".")
 
 
 def spread(mean: float, std: float, digits: int = 1) -> str:

@@ -189,7 +189,7 @@ def run(
     directory.write_summary(
         ended=ended,
         best_score=float(state.best_score.max()),
-        generations=generation,
+        generations=directory.finished_generations,  # fewer than advanced, if it was solved
         solved_score=program.solved_score,
         wall_s=round(wall_before + time.time() - started, 1),
         cpu_s=round(cpu_s(), 1),

@@ -144,7 +144,9 @@ class Wandb:
         self._run.log({"generation": generation, **values, **histograms}, step=generation)
 
     def show(self, name: str, picture: Path, generations: int) -> None:
-        self._run.log({name: self._module.Image(str(picture))}, step=generations)
+        # With the last row, which is open still: a step of its own would be the next row's, which
+        # a run that goes on could not log any more.
+        self._run.log({name: self._module.Image(str(picture))}, step=max(generations - 1, 0))
 
     def close(self) -> None:
         self._run.finish()

@@ -293,7 +293,7 @@ class HandOut:
             self._failed_starts += 1
             self._start_failed_at = now
         is_hopeless = isinstance(error, ConfigError) or self._failed_starts >= MOST_FAILURES
-        if is_hopeless and not any(hand.about for hand in self._hands.values()):
+        if is_hopeless and not self._hands:  # those that compile still may get ready
             if isinstance(error, ConfigError):
                 raise error
             raise ConfigError(

@@ -117,6 +117,8 @@ class RayCrew:
     def __init__(self, machines: "RayConfig", config: dict[str, Any], capacities: tuple[int, ...]):
         """Of a run's plain configuration, and most trials in a share by family."""
         self._machines = machines
+        # What a worker has no use for it need not have installed.
+        config = {k: x for k, x in config.items() if k not in ("tracker", "machines")}
         self._arguments = (config, capacities, scorer.versions())
         self._scorer = ray.remote(
             num_cpus=1, num_gpus=machines.gpus_per_worker, max_restarts=0, max_task_retries=0

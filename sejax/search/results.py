@@ -177,7 +177,8 @@ def write_best(words: Sequence[str], search: Search, command: str) -> None:
     """Writes the settings as a command and as a preset."""
     line = override_line(words, search, command)
     write_text(search.folder / "best.txt", line + "\n")
-    settings = [word for word in [*search.fixed, *words] if word.partition("=")[0] not in HOW]
+    settings = [word for word in [*search.fixed, *words]
+                if word.partition("=")[0].partition(".")[0] not in HOW]  # fmt: skip
     write_text(preset_file(search), f"# {line}\n{file_text(settings)}")
 
 

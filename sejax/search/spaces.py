@@ -80,8 +80,9 @@ class Dimension:
     def parameter_of(self, value: Any) -> Any:
         """What stands for a field's value in stored parameters; None if it is not among these."""
         if self.values:
-            return word(value) if word(value) in self.values else None
-        is_number = isinstance(value, int | float) and not isinstance(value, bool)
+            same = (each for each in self.values if each == word(value) or _same(each, value))
+            return next(same, None)
+        is_number = _is_number(value)
         if not is_number or not self.low <= value <= self.high:
             return None
         if self.step is not None:
@@ -100,6 +101,18 @@ class Dimension:
         """Within the bounds, which rounding may leave."""
         rounded = float(f"{value:.{DIGITS}g}")
         return f"{min(max(rounded, self.low), self.high):.12g}"
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def _same(written: str, value: Any) -> bool:
+    """Whether a choice's word is this number, as 1 is 1.0."""
+    try:
+        return _is_number(value) and float(written) == value
+    except ValueError:
+        return False
 
 
 def parse(name: str, text: str) -> Dimension:

@@ -4,7 +4,7 @@ import contextlib
 import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from datetime import datetime
+from datetime import UTC, datetime
 from typing import Any
 
 import optuna
@@ -22,26 +22,34 @@ LONGEST_WAIT = 3600  # s, for another worker's write to SQLite; one that was sto
 
 
 class Storage(optuna.storages.RDBStorage):
-    """A storage of which no two workers get the same waiting trial.
+    """A storage of which no two workers get the same waiting trial, or fail the same running one.
 
-    Optuna reads that a trial waits, and then takes it, with a lock on its row meanwhile. SQLite has
-    none: two workers that start together had the same trial 26 times of 30. Here taking it is one
+    Optuna reads a trial's state, and then changes it, with a lock on its row meanwhile. SQLite has
+    none: two workers that start together had the same trial 26 times of 30. Here both are one
     statement that looks by itself, on any database.
     """
 
     def set_trial_state_values(
         self, trial_id: int, state: TrialState, values: Sequence[float] | None = None
     ) -> bool:
-        if state != TrialState.RUNNING:
-            return super().set_trial_state_values(trial_id, state, values)
-        taken = (
+        if state == TrialState.RUNNING:
+            return self._move(trial_id, TrialState.WAITING, state, "datetime_start")
+        is_failure = state == TrialState.FAIL and values is None
+        if is_failure and self._move(trial_id, TrialState.RUNNING, state, "datetime_complete"):
+            return True
+        return super().set_trial_state_values(trial_id, state, values)
+
+    def _move(self, trial_id: int, before: TrialState, after: TrialState, when: str) -> bool:
+        """Whether the trial had that state, and has the other one from now on."""
+        now = datetime.now(UTC).replace(tzinfo=None)  # as Optuna has it
+        moved = (
             sqlalchemy.update(TrialModel)
-            .where(TrialModel.trial_id == trial_id, TrialModel.state == TrialState.WAITING)
-            .values(state=TrialState.RUNNING, datetime_start=datetime.now())
+            .where(TrialModel.trial_id == trial_id, TrialModel.state == before)
+            .values(**{"state": after, when: now})
         )
         try:
             with self.engine.begin() as connection:
-                return bool(connection.execute(taken).rowcount)
+                return bool(connection.execute(moved).rowcount)
         except sqlalchemy.exc.SQLAlchemyError as error:
             raise optuna.exceptions.StorageInternalError(told(error)) from error
 

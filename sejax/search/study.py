@@ -5,12 +5,14 @@ whose worker has not done so for some time counts as failed, and is queued again
 """
 
 import logging
+import os
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Protocol
 
+import numpy as np
 import optuna
 from optuna.trial import TrialState
 
@@ -88,7 +90,7 @@ def open_study(
             if joined.config.heartbeat != search.config.heartbeat:
                 return open_study(joined, usual)  # each worker goes by the same
             search = joined
-            study.sampler, study.pruner = _sampler(search), _pruner(search)
+            study.sampler, study.pruner = _sampler(search, study), _pruner(search)
         else:
             study.set_user_attr(STORED, search.stored())
             first = {x.parameter: x.parameter_of(usual.get(name))
@@ -176,12 +178,13 @@ class Objective:
     Attributes:
       trial: the last one.
       is_done: whether all of it is computed, or it was found to be another worker's.
+      is_interrupted: whether a person has ended it.
     """
 
     def __init__(self, search: Search, runner: Runner, say: Callable[[str], None]):
         self._search, self._runner, self.say = search, runner, say
         self.trial: Any = None
-        self.is_done = False
+        self.is_done = self.is_interrupted = False
 
     def __call__(self, trial: optuna.Trial) -> float:
         self.trial = trial
@@ -194,6 +197,9 @@ class Objective:
             raise
         except (Lost, optuna.exceptions.UpdateFinishedTrialError):
             self.is_done = True
+            raise
+        except KeyboardInterrupt:
+            self.is_interrupted = True  # Optuna raises another error if it cannot end the trial
             raise
         self.say(sentence(trial, "complete", self._search))
         self.is_done = True
@@ -236,8 +242,9 @@ def queue_again(study: optuna.Study, trial: optuna.Trial | optuna.trial.FrozenTr
     generations so far are told there anew, from its files.
     """
     history = [*trial.user_attrs.get(HISTORY, []), trial.number]
-    if len(history) > RETRIES:
-        return
+    others = study.get_trials(deepcopy=False)
+    if len(history) > RETRIES or any(x.user_attrs.get(HISTORY) == history for x in others):
+        return  # given up, or another worker has queued it
     study.add_trial(
         optuna.create_trial(
             state=TrialState.WAITING, params=trial.params, distributions=trial.distributions,
@@ -255,10 +262,12 @@ def _run_one(study: optuna.Study, objective: Objective) -> None:
             if _has_failed(study, objective.trial):
                 queue_again(study, objective.trial)
             raise
-        except Exception:  # of several kinds, where Optuna cannot end what another has ended
+        except Exception as error:  # of several kinds, where Optuna cannot end what another has
             has_failed = _has_failed(study, objective.trial)
             if has_failed and not objective.is_done:
                 queue_again(study, objective.trial)  # a full disk, or no memory here
+            if objective.is_interrupted:
+                raise KeyboardInterrupt from error
             if not (has_failed and objective.is_done):
                 raise
             objective.say(f"trial {objective.trial.number}: was taken for dead and is another "
@@ -271,8 +280,14 @@ def _has_failed(study: optuna.Study, trial: optuna.Trial | None) -> bool:
     return trial is not None and trial.number in [each.number for each in failed]
 
 
-def _sampler(search: Search) -> optuna.samplers.BaseSampler:
+def _sampler(search: Search, joined: optuna.Study | None = None) -> optuna.samplers.BaseSampler:
+    """The sampler, which draws anew in a study that is joined or goes on."""
     seed = search.config.sampler_seed
+    if seed is not None and joined is not None:
+        trials = joined.get_trials(deepcopy=False)
+        is_alone = trials and not any(trial.state == TrialState.RUNNING for trial in trials)
+        others = [] if is_alone else [os.getpid()]  # workers that come at the same time
+        seed = int(np.random.SeedSequence([seed, len(trials), *others]).generate_state(1)[0])
     if search.config.sampler == "random":
         return optuna.samplers.RandomSampler(seed=seed)
     return optuna.samplers.TPESampler(seed=seed)
@@ -286,7 +301,7 @@ def _pruner(search: Search) -> optuna.pruners.BasePruner:
                 config.min_generations, config.max_generations, REDUCTION_FACTOR
             )
         case "median":
-            return optuna.pruners.MedianPruner(n_warmup_steps=config.min_generations - 1)
+            return optuna.pruners.MedianPruner(n_warmup_steps=config.min_generations)
     return optuna.pruners.NopPruner()
 
 
