@@ -18,6 +18,7 @@ It needs Stable-Baselines3 beside sejax, `pip install 'sejax[bench]'`:
 import argparse
 import ast
 import itertools
+import math
 import multiprocessing
 import time
 from collections.abc import Callable, Iterable, Iterator
@@ -364,13 +365,19 @@ def summarise(
 def as_good(real: pd.DataFrame, target: float, num_seeds: int) -> str:
     """Steps to a real agent's first test that reaches a mean: median (smallest to largest).
 
-    One lucky test is enough, so that it is rather too few.
+    One lucky test is enough, so that it is rather too few. A seed that is never as good took more
+    than all of its steps.
     """
+    most = real.steps.max()
     first = real[real.mean_return >= target].groupby("seed").steps.min()
+    never = num_seeds - len(first)
     if first.empty:
-        return f"more than {real.steps.max():,}"
-    found = f"{first.median():,.0f} ({first.min():,} to {first.max():,})"
-    return found if len(first) == num_seeds else f"{found}, {len(first)} of {num_seeds} seeds"
+        return f"more than {most:,}"
+    steps = sorted([*first, *[math.inf] * never])
+    middle, *ends = (f"{x:,.0f}" if math.isfinite(x) else f"more than {most:,}"
+                     for x in (float(np.median(steps)), steps[0], steps[-1]))  # fmt: skip
+    found = f"{middle} ({ends[0]} to {ends[1]})"
+    return f"{found}, {len(first)} of {num_seeds} seeds" if never else found
 
 
 if __name__ == "__main__":

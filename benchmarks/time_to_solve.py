@@ -7,8 +7,9 @@ as solved at the first generation whose incumbent mean (fresh agents, none of wh
 reaches the task's threshold, and goes on to the end, to show whether the incumbent stays solved.
 
 Reported for each setting: in how many seeds it solved, and the generations, wall-clock minutes
-(start, compilation and all files included), CPU minutes and real environment steps to that point;
-then the share of later generations in which the incumbent was still solved.
+(compilation and all files included, Python's start and imports not), CPU minutes and real
+environment steps to that point, of those that solved it; then the share of later generations in
+which the incumbent was still solved.
 """
 
 import argparse
@@ -117,7 +118,9 @@ def summarise(name: str, curves: list[pd.DataFrame], solved_reward: float) -> di
                     "wall minutes": row["wall_s"] / 60,
                     "CPU minutes": row["cpu_s"] / 60,
                     "real steps": row["env_steps_total"],
-                    "solved afterwards": is_solved[first:].mean(),
+                    "solved afterwards": is_solved[first + 1 :].mean()
+                    if first + 1 < len(curve)
+                    else np.nan,
                 }
             )
     last = pd.concat([curve.tail(5) for curve in curves])["incumbent_mean"]

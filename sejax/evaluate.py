@@ -68,7 +68,11 @@ def evaluate(config: EvaluateConfig) -> float:
 
 
 def summarise(table: Any, by: list[str]) -> Any:
-    """Mean and standard deviation of each column for each group, as a data frame."""
+    """Mean and standard deviation of each column for each group, as a data frame.
+
+    A test return that is not a number counts as the worst of all.
+    """
+    table = table.fillna({"test_return": table["test_return"].min()})
     grouped = table.groupby(by, sort=False)
     summary = grouped[["test_return", "train_steps", "train_episodes"]].agg(["mean", "std"])
     summary.columns = [f"{name}_{statistic}" for name, statistic in summary.columns]
@@ -203,6 +207,7 @@ def _training_on(proxy: Any, config: EvaluateConfig, agent: Any) -> tuple[str, A
 def _train_and_test(config: EvaluateConfig, study: Study, world: str, family: AgentFamily) -> Any:
     """A row for each agent of a family, as a data frame."""
     import jax
+    import numpy as np
     import pandas as pd
 
     from sejax.agents import make_agent
@@ -227,6 +232,7 @@ def _train_and_test(config: EvaluateConfig, study: Study, world: str, family: Ag
     if study.has_several:
         numbers = {"agent": family.key, "number": range(config.num_agents)}
     of_agents = {name: x for name, x in vars(outcome).items() if x.ndim == 1}  # not of episodes
+    of_agents["nonfinite"] |= ~np.isfinite(outcome.test_return)  # the real task tells of none
     return pd.DataFrame({**numbers, "test_return": outcome.test_return, **of_agents, **drawn})
 
 

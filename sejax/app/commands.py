@@ -53,8 +53,8 @@ def name_in_sweep(known: Collection[str]) -> str:
     job = HydraConfig.get() if HydraConfig.initialized() else None
     if job is None or job.mode != RunMode.MULTIRUN:
         return ""
-    words = [word for word in job.overrides.task  # of what the sweep is over
-             if word not in sys.argv and word.partition("=")[0].lstrip("+") not in known]  # fmt: skip
+    swept = [word for word in job.overrides.task if word not in sys.argv]
+    words = [word for word in swept if word.partition("=")[0].lstrip("+") not in known]
     name = re.sub(r"[^\w.+-]+", "_", ",".join(words))
     return name if len(name) <= LONGEST_NAME else hashlib.sha256(name.encode()).hexdigest()[:16]
 

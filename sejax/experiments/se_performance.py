@@ -224,13 +224,20 @@ def make_table(env_name: str, summary: pd.DataFrame) -> pd.DataFrame:
         "training steps": lambda row: measured(row, "train_steps", 0),
         "paper's": lambda row: PAPER_STEPS.get((env_name, row.kind), {}).get(row.setting, ""),
         "fewer": lambda row: fewer(row, "real"),
-        "than tuned": lambda row: fewer(row, "tuned"),
+        **({"than tuned": lambda row: fewer(row, "tuned")} if has_tuned(summary) else {}),
         "episodes": lambda row: measured(row, "train_episodes", 1),
         "return": lambda row: measured(row, "test_return", 1),
         "IQM": iqm_text("test_return"),
         "paper's return":
             lambda row: PAPER_RETURNS.get((env_name, row.kind), {}).get(row.setting, ""),
     })  # fmt: skip
+
+
+AND_TUNED = ", and against agents there with fixed settings that were tuned for it"
+
+
+def has_tuned(rows: pd.DataFrame) -> bool:
+    return bool((rows["setting"] == "tuned").any())
 
 
 def report(settings: SePerformance, rows: pd.DataFrame) -> pd.DataFrame:
@@ -243,7 +250,7 @@ def report(settings: SePerformance, rows: pd.DataFrame) -> pd.DataFrame:
         f"Mean ± std over agents with drawn hyperparameters, {len(return_columns(rows))} test "
         'episodes each; in brackets a bootstrap 95% interval that draws SEs, not agents. "Fewer" '
         "are training steps saved against the real task, for which a group of agents takes the "
-        "place of an SE, and against agents there with fixed settings that were tuned for it. "
+        f"place of an SE{AND_TUNED if has_tuned(summary) else ''}. "
         f"The best SEs of all sets, {NUM_BEST} at most, are chosen by half of "
         "their agents and shown by the other half. SEs are those of a set that reached the "
         "threshold, all where none did. The paper has 40 SEs with 10 agents each; where a field is "

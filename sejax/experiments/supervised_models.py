@@ -166,7 +166,10 @@ class Sample:
 
 
 def summary_of(data: list[pd.DataFrame]) -> pd.DataFrame:
-    """Number of transitions, mean return of their episodes and share of ends, for each model."""
+    """Of each model its transitions: how many, the mean return of their episodes, share of ends.
+
+    Long episodes, which have many, count more in the mean.
+    """
     return pd.DataFrame({
         "model": range(len(data)), "transitions": [len(rows) for rows in data],
         "episode_return": [rows["return"].mean() for rows in data],

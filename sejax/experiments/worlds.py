@@ -115,7 +115,7 @@ def train_groups(
                 print(f"{name}: {measure.say(table)}", flush=True)
                 tables.append(table.assign(group=world.groups[places[name]].name))
                 tally.add(num_agents)
-    return pd.concat(tables, ignore_index=True)
+    return worst_for_diverged(pd.concat(tables, ignore_index=True), world.name)
 
 
 def train(
@@ -199,11 +199,28 @@ def outcome_rows(outcome: Any, drawn: dict[str, np.ndarray]) -> pd.DataFrame:
     returns = outcome.test_returns.astype(float)
     return pd.DataFrame({
         "agent": range(len(returns)), "test_return": returns.mean(axis=1),
-        "nonfinite": outcome.nonfinite, "train_episodes": outcome.train_episodes.astype(float),
+        "nonfinite": outcome.nonfinite | ~np.isfinite(returns).all(axis=1),
+        "train_episodes": outcome.train_episodes.astype(float),
         "train_steps": outcome.train_steps.astype(float),
         **{f"return_{i}": x for i, x in enumerate(returns.T)},
         **{name: x.astype(float) for name, x in drawn.items()},
     })  # fmt: skip
+
+
+def worst_for_diverged(rows: pd.DataFrame, name: str) -> pd.DataFrame:
+    """Rows in which tests of agents that diverged return the worst that others did, and says so.
+
+    A mean would leave them out, and so be better for each of them.
+    """
+    lost = rows["test_return"].isna()
+    if not lost.any():
+        return rows
+    returns = ["test_return", *return_columns(rows)]
+    worst = float(rows[returns].min(axis=None))
+    count = len(rows[lost].groupby([key for key in ("group", "agent") if key in rows]))
+    print(f"{name}: {count} agents diverged; their tests count as the worst return seen there, "
+          f"{worst:.1f}.", flush=True)  # fmt: skip
+    return rows.fillna(dict.fromkeys(returns, worst))
 
 
 def return_columns(agents: pd.DataFrame) -> list[str]:

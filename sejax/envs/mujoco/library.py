@@ -51,7 +51,8 @@ def load() -> ctypes.CDLL:
 def file_name() -> str:
     """What the library is called: there is one for each version of all that it is made of."""
     parts = (SOURCE.read_text(), " ".join(FLAGS), version("mujoco"), version("jaxlib"),
-             platform.system(), platform.machine(), *platform.libc_ver())  # fmt: skip
+             platform.system(), platform.machine(), *platform.libc_ver(),
+             *_given_compiler()[1:])  # fmt: skip
     digest = hashlib.sha256("\0".join(parts).encode()).hexdigest()[:16]
     return f"mujoco-{version('mujoco')}-jaxlib-{version('jaxlib')}-{platform.machine()}-{digest}.so"
 
@@ -88,11 +89,14 @@ def _built_in(folder: Path) -> Path:
 
 def _compiler() -> list[str]:
     """The command of a C++ compiler, with the options that `CXX` may have."""
-    given = shlex.split(os.environ.get("CXX", ""))
-    for command in (given, *([name] for name in COMPILERS)):
+    for command in (_given_compiler(), *([name] for name in COMPILERS)):
         if command and shutil.which(command[0]):
             return command
     raise NoCompilerError(f"found none of $CXX, {', '.join(COMPILERS)}")
+
+
+def _given_compiler() -> list[str]:
+    return shlex.split(os.environ.get("CXX", ""))
 
 
 def _register(path: Path) -> ctypes.CDLL:
