@@ -61,6 +61,7 @@ def at_least(minimum: float, name: str, value: Any, reason: str, fix: Any) -> No
 def whole(minimum: int, name: str, value: Any, reason: str, fix: Any, most: int = LARGEST) -> None:
     """Checks a count: at least `minimum`, and at most what can be counted or built."""
     at_least(minimum, name, value, reason, fix)
+    require(value == value // 1, name, "be a whole number", reason, value, f"{name}={fix}")
     limit = "it is counted in 32 bits" if most == LARGEST else "each is built by itself"
     require(value <= most, name, f"be at most {most}", limit, value, f"{name}={fix}")
 

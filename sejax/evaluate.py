@@ -24,9 +24,10 @@ from sejax.training import TrainingConfig
 def main(cfg: DictConfig) -> float:
     """Evaluates as configured and returns the mean test return (for Hydra's sweepers)."""
     config = compose.evaluate_config_of(cfg)
-    own = commands.name_in_sweep(known=()) if config.out_dir is None else ""
+    own = commands.name_in_sweep(known=("out_dir",))
     if own:  # or all jobs of a sweep would have one folder
-        config = dataclasses.replace(config, out_dir=f"runs/evaluate-{own}")
+        folder = f"runs/evaluate-{own}" if config.out_dir is None else f"{config.out_dir}/{own}"
+        config = dataclasses.replace(config, out_dir=folder)
     runtime.enable_compilation_cache()
     return evaluate(config)
 
@@ -232,7 +233,8 @@ def _train_and_test(config: EvaluateConfig, study: Study, world: str, family: Ag
     if study.has_several:
         numbers = {"agent": family.key, "number": range(config.num_agents)}
     of_agents = {name: x for name, x in vars(outcome).items() if x.ndim == 1}  # not of episodes
-    of_agents["nonfinite"] |= ~np.isfinite(outcome.test_return)  # the real task tells of none
+    # The real task does not tell of numbers that are none.
+    of_agents["nonfinite"] = of_agents["nonfinite"] | ~np.isfinite(outcome.test_return)
     return pd.DataFrame({**numbers, "test_return": outcome.test_return, **of_agents, **drawn})
 
 

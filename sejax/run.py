@@ -17,9 +17,11 @@ from sejax.app.build import IN_RUN_DIR, LearnConfig
 def main(cfg: DictConfig) -> float:
     """Learns a proxy as configured and returns the best incumbent mean (for Hydra's sweepers)."""
     config = compose.learn_config(cfg)
-    own = commands.name_in_sweep(IN_RUN_DIR) if config.run_dir is None else ""
+    given = config.run_dir
+    own = commands.name_in_sweep(IN_RUN_DIR if given is None else ("run_dir",))
     if own:  # or all jobs of a sweep would have one folder
-        config = dataclasses.replace(config, run_dir=f"{config.resolved_run_dir}_{own}")
+        folder = f"{config.resolved_run_dir}_{own}" if given is None else f"{given}/{own}"
+        config = dataclasses.replace(config, run_dir=folder)
     return learn(config)
 
 

@@ -43,8 +43,9 @@ OUT_OF_RANGE = [
                    "training.window", "training.test_episodes", "training.tests_between",
                    "agent.init_episodes", "agent.batch_size", "agent.buffer_size",
                    "agent.hidden_size", "generations", "num_seeds",
-                   "checkpoint_every", "es.population_size", "es.num_evals",
+                   "checkpoint_every", "es.num_evals",
                    "es.num_incumbent_evals", "proxy.hidden_size")),
+    ("es.population_size=100001", "at most 100000, because each is built by itself"),
     *((f"{name}.num_layers=2147483647", "at most 100, because each is built by itself")
       for name in ("agent", "proxy")),
 ]  # fmt: skip

@@ -412,7 +412,7 @@ WILD = [
     ("+agent.new=1", "agent.new must be a field of DDQNConfig"),
     ("=1", "override must name a field"), ("tuned_agent=x", "override must name a field"),
     # Numbers that cannot be counted or computed with; see test_build.py for all of them.
-    ("es.population_size=2147483648", "es.population_size must be at most 2147483647"),
+    ("es.population_size=2147483648", "es.population_size must be at most 100000"),
     ("lanes=99999999999999999999", "lanes must be at most 2147483647"),
     ("es.noise_std=1e38", "es.noise_std must be at most 1e+06"),
     ("es.step_size=1e300", "es.step_size must be at most 1e+06"),

@@ -280,7 +280,11 @@ def test_what_does_not_fit_is_one_message(tmp_path):
     with pytest.raises(ConfigError, match=r"^task must be an id of Gymnasium for a reward network"):
         make("cartpole-rn", sejax.gym.RealTask.of_gymnasium("CartPole-v1"))
     with pytest.raises(ConfigError, match=r"^render_mode must be None for an SE"):
-        make("cartpole", render_mode="rgb_array")
+        make("cartpole", render_mode="human")
+    assert make("cartpole", render_mode="rgb_array")  # as Stable-Baselines3's make_vec_env asks
+    for discount in (float("nan"), 3):
+        with pytest.raises(ConfigError, match=r"^discount must lie in \[0, 1\]"):
+            RewardNetwork(gymnasium.make("CartPole-v1"), "cartpole-rn", discount)
     assert make("cartpole-rn", "CartPole-v1").get_wrapper_attr("_max_episode_steps") == 500
 
 

@@ -12,6 +12,7 @@ from pathlib import Path
 import gymnasium
 import numpy as np
 import pytest
+from gymnasium.wrappers import TransformObservation
 from test_gym_vector import SES, world_of
 
 import sejax.gym
@@ -132,3 +133,20 @@ def test_the_page_runs_and_its_torch_networks_are_the_se():
             np.testing.assert_allclose(names["rewards"].detach()[:, 0], step.reward, atol=1e-5)
             return
     pytest.fail("no recipe for torch")
+
+
+@needs_sb3
+def test_sb3s_own_entry_takes_an_se_and_an_agent_goes_on_with_the_real_task():
+    """docs/gymnasium.md: make_vec_env asks for pictures, and set_env compares spaces."""
+    from stable_baselines3.common.env_util import make_vec_env
+
+    envs = make_vec_env("sejax/cartpole", n_envs=2)
+    assert envs.reset().shape == (2, 4)
+    agent = PPO("MlpPolicy", envs, n_steps=32, batch_size=32).learn(64)
+
+    def real():
+        env = gymnasium.make("CartPole-v1")
+        return TransformObservation(env, lambda obs: obs, envs.observation_space)
+
+    agent.set_env(make_vec_env(real, n_envs=2))
+    agent.learn(64)

@@ -387,6 +387,7 @@ def test_a_run_of_a_version_without_a_field_goes_on_with_its_default(tmp_path):
     with open_for(sejax.config(words)) as directory:
         directory.resume(TEMPLATE)
     stored = yaml.safe_load((tmp_path / "config.yaml").read_text())
+    (tmp_path / "proxy.safetensors").touch()  # of a generation
     assert stored["proxy"].pop("output_scale") == 1.0
     (tmp_path / "config.yaml").write_text(yaml.safe_dump(stored))
     with pytest.raises(ConfigError, match=r"proxy.output_scale \(1.0 there, 0.5 here\)\. Take"):
@@ -398,6 +399,15 @@ def test_a_run_of_a_version_without_a_field_goes_on_with_its_default(tmp_path):
     (tmp_path / "config.yaml").write_text(yaml.safe_dump(stored))
     with pytest.raises(ConfigError, match=r"es.fashion \(1 there, None here\)"):
         open_for(sejax.config(words))
+
+
+def test_a_run_that_failed_before_its_first_generation_is_in_nobodys_way(tmp_path):
+    words = [f"run_dir={tmp_path}", "generations=1"]
+    with open_for(sejax.config([*words, "proxy.hidden_size=1000"])) as directory:
+        directory.resume(TEMPLATE)
+    with open_for(sejax.config([*words, "proxy.hidden_size=4"])) as directory:
+        directory.resume(TEMPLATE)
+    assert yaml.safe_load((tmp_path / "config.yaml").read_text())["proxy"]["hidden_size"] == 4
 
 
 def test_with_the_configuration_lost_that_of_the_checkpoint_counts(run, whole):

@@ -288,7 +288,7 @@ def test_a_horizon_terminates_an_episode_or_cuts_it(done, is_terminal, discounts
     env = make_env(done=done, horizon=3, horizon_is_terminal=is_terminal)
     terminated, truncated, discount = walk(env, constant_heads(env, done=0.25))
     np.testing.assert_array_equal(terminated, [False, False, is_terminal])
-    np.testing.assert_array_equal(truncated, [False, False, True])
+    np.testing.assert_array_equal(truncated, [False, False, not is_terminal])  # as in sejax.gym
     np.testing.assert_allclose(discount, discounts)
     assert world_of(env) == World(is_real=False, max_steps=3)
     assert env.default_params.max_steps_in_episode == 3
@@ -306,7 +306,7 @@ def test_an_episode_begins_anew_after_its_horizon():
     _, state = env.reset(jax.random.key(0), params)
     for time in (1, 0):
         obs, state, _, terminated, truncated, info = env.step(jax.random.key(1), state, 0, params)
-        assert state.time == time and terminated == truncated == (time == 0)
+        assert state.time == time and terminated == (time == 0) and not truncated
     np.testing.assert_allclose(info["final_observation"], 0.7)
     assert np.abs(obs).max() <= 0.05
 

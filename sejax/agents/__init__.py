@@ -49,6 +49,8 @@ def make_agent(
       >>> agent.init_episodes
       10
     """
+    require(hasattr(task, "facts"), "task", "be a sejax.Task", "an agent is made for its spaces",
+            type(task).__name__, "task to env.task, or sejax.Task(name=..., env=env)")  # fmt: skip
     require_fit(config, exploration, task.facts, task.name)
     return _make_agent(plugins.Same(config, exploration), task, varied)
 

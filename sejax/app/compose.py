@@ -6,6 +6,7 @@ and proxy (`sejax.app.presets`).
 """
 
 import functools
+import itertools
 import re
 import textwrap
 from collections.abc import Iterable, Sequence
@@ -122,6 +123,10 @@ def hydra_words(words: Sequence[str]) -> list[str]:
     Raises:
       ConfigError: for a file or agents that cannot be.
     """
+    for before, word in itertools.pairwise(["", *words]):
+        is_override = "=" in word or word[:1] in ("-", "~", "") or before.startswith("-")
+        require(is_override, "a word", "be FIELD=VALUE", "nothing else is read", word,
+                f"env={word} or proxy={word}, if that is meant")  # fmt: skip
     return families.in_one_choice(without_files(words))
 
 

@@ -233,11 +233,13 @@ class RunDirectory:
         """
         known = [self._stored] if self._stored is not None else []
         known += [self._record["config"]] if _is_record(self._record) else []
-        for stored in known:
-            self._refuse_other_config(stored)
         lost = [file.name for file in (self.metrics, self.proxy) if file.exists()]
         lost += ["checkpoints"] if checkpoints.generations(self.checkpoints) else []
-        if lost and not known:
+        if not lost:
+            return  # a run that failed before its first generation is in nobody's way
+        for stored in known:
+            self._refuse_other_config(stored)
+        if not known:
             raise ConfigError(
                 f"run_dir must be new or hold a run with its configuration, because what is there "
                 f"would be replaced; got {self.path} with {lost[0]} and without config.yaml. Put "

@@ -74,6 +74,13 @@ class Task:
     def __post_init__(self) -> None:
         from sejax.envs.wrappers import as_vectors
 
+        errors.require(hasattr(self.env, "default_params"), "env", "be a gymnax environment",
+                       "its params are asked for", type(self.env).__name__,
+                       "env to the first of the pair that gymnax.make returns")  # fmt: skip
+        is_nan = isinstance(self.solved_reward, float) and math.isnan(self.solved_reward)
+        errors.require(not is_nan, "env.solved_reward", "be a number",
+                       "returns are compared with it", self.solved_reward,
+                       "env.solved_reward=inf if nobody says")  # fmt: skip
         params = self.env.default_params if self.params is None else self.params
         limit = params.max_steps_in_episode if self.max_steps is None else self.max_steps
         errors.whole(1, "env.max_steps", limit, "an episode has steps", 200)

@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 from sejax.errors import require
 from sejax.es.nes import trials_of
 from sejax.es.strategy import AGGREGATES, Strategy
-from sejax.options import Options, counts, one_of, option, positive, shrinks
+from sejax.options import MOST_MEMBERS, Options, counts, one_of, option, positive, shrinks
 
 # Name -> evosax's class. Listed here because importing evosax takes a second; a test holds the list
 # against evosax's own. Left out are RandomSearch and the two SV algorithms, which have no single
@@ -62,7 +62,9 @@ class EvosaxConfig(Options):
 
     name: str = option("open_es", one_of(ALGORITHMS))
     # Candidates in a generation.
-    population_size: int = option(32, counts("scores are compared within a generation", least=2))
+    population_size: int = option(
+        32, counts("scores are compared within a generation", 2, MOST_MEMBERS)
+    )
     # Agents trained on the distribution's mean.
     num_incumbent_evals: int = option(16, counts("the incumbent's score selects the proxy"))
     # Initial std of the search distribution.

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 
 from sejax.es.score_transforms import TRANSFORMS
 from sejax.es.strategy import AGGREGATES, Strategy, Trials
-from sejax.options import Options, counts, fraction, one_of, option, positive, shrinks
+from sejax.options import MOST_MEMBERS, Options, counts, fraction, one_of, option, positive, shrinks
 
 UPDATE_RULES = ("authors", "paper")
 _LARGEST = 1e6  # larger steps or noise lead to weights whose products are not finite
@@ -26,7 +26,9 @@ class NESConfig(Options):
     group: ClassVar[str] = "es"
 
     # n_p: members in a generation
-    population_size: int = option(16, counts("scores are compared within a generation", least=2))
+    population_size: int = option(
+        16, counts("scores are compared within a generation", 2, MOST_MEMBERS)
+    )
     # Agents on the incumbent; null: one for each member, as in the paper.
     num_incumbent_evals: int | None = option(
         None, counts("the incumbent's score selects the proxy")

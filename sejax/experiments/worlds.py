@@ -212,8 +212,7 @@ def worst_for_diverged(rows: pd.DataFrame, name: str) -> pd.DataFrame:
 
     A mean would leave them out, and so be better for each of them.
     """
-    lost = rows["test_return"].isna()
-    if not lost.any():
+    if "test_return" not in rows or not (lost := rows["test_return"].isna()).any():
         return rows
     returns = ["test_return", *return_columns(rows)]
     worst = float(rows[returns].min(axis=None))

@@ -35,7 +35,8 @@ def make(
         the package.
       task: the real task, or its id in Gymnasium; needed if it is none that sejax and Gymnasium
         both know. For an RN an id; `RewardNetwork` goes around any environment.
-      render_mode: of an RN's real task, as of `gymnasium.make`.
+      render_mode: of an RN's real task, as of `gymnasium.make`; an SE has no pictures, and ignores
+        rgb_array.
 
     Raises:
       ConfigError: if there is no such file, it is damaged, it holds several proxies or one that is
@@ -53,8 +54,9 @@ def make(
     if _is_rn(header):
         env, name = RewardNetwork(_real_env(header, task, render_mode), source), f"{name}-rn"
     else:
-        require(render_mode is None, "render_mode", "be None for an SE", "its states have no "
-                "picture", render_mode, "render_mode=None")  # fmt: skip
+        # Stable-Baselines3's make_vec_env asks for rgb_array, whether anybody will look or not.
+        require(render_mode in (None, "rgb_array"), "render_mode", "be None for an SE", "its "
+                "states have no picture", render_mode, "render_mode=None")  # fmt: skip
         env = SyntheticEnv(_world(weights, header, task))
     options = {"source": str(source), "task": task, "render_mode": render_mode}
     env.spec = _spec(name, **{key: x for key, x in options.items() if x is not None})
@@ -88,7 +90,7 @@ def make_vec(
       >>> obs.shape, envs.metadata["autoreset_mode"].value
       ((8, 4), 'NextStep')
     """
-    whole(1, "num_envs", num_envs, "there is a lane", 8)
+    whole(1, "num_envs", num_envs, "each is an episode at a time", 8)
     weights, header = read(source)
     if _is_rn(header):
         env_fns = [partial(make, source, task)] * num_envs
@@ -110,7 +112,7 @@ def make_sb3(source: Source, num_envs: int = 1, task: RealTask | str | None = No
     Raises:
       ConfigError: as `make_vec`, or without Stable-Baselines3.
     """
-    whole(1, "num_envs", num_envs, "there is a lane", 8)
+    whole(1, "num_envs", num_envs, "each is an episode at a time", 8)
     try:
         from stable_baselines3.common.vec_env import DummyVecEnv
 

@@ -10,7 +10,7 @@ from gymnasium.envs.toy_text.cliffwalking import CliffWalkingEnv
 from gymnasium.utils import RecordConstructorArgs
 
 from sejax import plugins
-from sejax.errors import ConfigError, require
+from sejax.errors import ConfigError, fraction, require
 from sejax.gym import networks
 from sejax.gym.source import Source, read
 from sejax.gym.tasks import num_categories, vector_size
@@ -89,6 +89,8 @@ class RewardNetwork(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
         super().__init__(env)
         weights, header = read(source, "rn")
         self.config: RewardConfig = plugins.configure("proxy", header["config"]["proxy"])
+        if discount is not None:
+            fraction("discount", discount, header["discount"])
         self.discount = float(header["discount"] if discount is None else discount)
         self.limit_is_terminal = limit_is_terminal
         require(not isinstance(env.unwrapped, CliffWalkingEnv), "env", "be sejax's Cliff Walking",

@@ -9,7 +9,7 @@ from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from sejax.errors import require
+from sejax.errors import one_of, require
 from sejax.gym.synthetic import SyntheticWorld
 
 PREFETCHED = 32  # starts that a lane draws at once, where nothing else draws from its generator
@@ -38,7 +38,10 @@ class SyntheticVectorEnv(VectorEnv[Any, Any, np.ndarray]):
     ):
         self.world = world
         self.num_envs = num_envs
-        self.autoreset_mode = AutoresetMode(autoreset_mode)
+        modes = [mode.value for mode in AutoresetMode]
+        mode: Any = getattr(autoreset_mode, "value", autoreset_mode)
+        one_of("autoreset_mode", mode, modes)
+        self.autoreset_mode = AutoresetMode(mode)
         self.metadata = {"render_modes": [], "autoreset_mode": self.autoreset_mode}
         self.single_observation_space = world.observation_space
         self.single_action_space = world.action_space

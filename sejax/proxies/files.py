@@ -160,6 +160,9 @@ class ProxySet:
     def size(self) -> int:
         return len(self.records)
 
+    def __len__(self) -> int:
+        return self.size
+
     @property
     def scores(self) -> np.ndarray:
         """`[size]` float64; nan where there is none."""
@@ -172,7 +175,10 @@ class ProxySet:
 
     @property
     def params(self) -> Any:
-        """All proxies as one `EnvParams`; only `weights` has the leading axis."""
+        """All proxies as one `EnvParams`; only `weights` has the leading axis.
+
+        To `vmap` over them: `vmap(lambda w: f(env.params(w, discount)))(weights)`.
+        """
         return self.env.params(self.weights, self.discount)
 
     def one(self, index: int) -> Any:

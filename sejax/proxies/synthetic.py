@@ -162,6 +162,12 @@ class SyntheticEnv(ProxyEnv):
             return jax.random.uniform(key) < jax.nn.sigmoid(done)
         return done > 0.5
 
+    def is_truncated(self, state: SyntheticState, params: ProxyParams) -> Any:
+        """At the limit, but for a horizon that terminates the episode."""
+        if self.config.horizon is not None and self.config.horizon_is_terminal:
+            return jnp.bool_(False)
+        return super().is_truncated(state, params)
+
     def get_obs(self, state: SyntheticState, params: Any = None, key: Any = None) -> Array:
         if self.task.num_states is not None:
             return jnp.argmax(state.vector).astype(jnp.int32)
