@@ -24,8 +24,8 @@ test-examples test-trackers test-ray test-lowest test-latest:
 	build/$@/bin/python -m pip install --quiet $(PACKAGES) pytest pytest-xdist chex hypothesis
 	build/$@/bin/python -m pytest $(OPTIONS) -n 2 --dist loadfile $(TESTS:%=tests/test_%.py)
 
-# Stable-Baselines3, sbx, rejax, and the PyTorch code that benchmarks compare with. On Linux, PyPI's torch brings CUDA along; PIP_EXTRA_INDEX_URL may name
-# an index that has it without.
+# Stable-Baselines3, sbx, rejax, and the PyTorch code that benchmarks compare with. On Linux, PyPI's
+# torch brings CUDA along; PIP_EXTRA_INDEX_URL may name an index that has it without.
 test-examples: PACKAGES := --constraint constraints.txt --editable '.[examples,mujoco]' imageio
 test-examples: TESTS := examples gym_sb3 torch_reference torch_reference_ppo torch_reference_td3 torch_nes
 
