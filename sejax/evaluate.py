@@ -16,7 +16,7 @@ from sejax.app import build, commands, compose, runtime
 from sejax.app.build import EvaluateConfig
 from sejax.app.families import AgentFamily, families_of, named
 from sejax.errors import ConfigError, require, told
-from sejax.training import TrainingConfig
+from sejax.training import TrainingConfig, require_reachable
 
 
 @hydra.main(config_path="conf", config_name="evaluate", version_base="1.3")
@@ -155,6 +155,8 @@ def proxy_study(config: EvaluateConfig) -> Study:
             agents.require_fit(family.agent, exploration, task.facts, task.name)
             group, training = _training_on(proxy, config, family.agent)
             build.require_real_returns(group, training)
+            if proxy.env.world.max_steps is not None:
+                require_reachable(group, training, proxy.env.world.max_steps)
             if getattr(proxy.env.config, "lasts_to_the_limit", False):
                 build.require_learning(group, training, family.agent, proxy.env.world.max_steps,
                                        task.max_steps)  # fmt: skip
@@ -197,9 +199,12 @@ def _training_on(proxy: Any, config: EvaluateConfig, agent: Any) -> tuple[str, A
     """How long agents train on the proxy, and the group of fields that says so."""
     if config.training_from == "config":
         return "training", config.training
-    if proxy.env.is_real or "training" not in proxy.config:
-        # The dynamics are real: agents train and stop as on the real task.
+    if proxy.env.is_real:  # agents train and stop as on the real task
         return "real_training", config.real_training
+    require("training" in proxy.config, "training_from", "be config for an SE whose file does not "
+            "say how long agents trained on it", "tests on the real task must not stop them",
+            config.training_from, "training_from=config training.stop_rule=never "
+            "training.max_steps=2000 training.max_episodes=2000")  # fmt: skip
     test_episodes = config.real_training.test_episodes
     training = dataclasses.replace(proxy.training_for(agent), test_episodes=test_episodes)
     return "real_training", training

@@ -13,6 +13,8 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from sejax.agents.agent import Agent
+from sejax.envs.task import Task
+from sejax.errors import require
 from sejax.objectives import Outcome
 from sejax.parallel import compiler_options, spread_over_devices
 from sejax.proxies.proxy import world_of
@@ -53,12 +55,15 @@ def make_evaluator(
       >>> import sejax
       >>> env, params = sejax.load("cartpole")
       >>> agent = sejax.make_agent(sejax.DDQNConfig(init_episodes=1), env.task)
-      >>> training = sejax.TrainingConfig(max_steps=4000, stop_rule="never")
+      >>> training = sejax.TrainingConfig(max_steps=2000, max_episodes=2000, stop_rule="never")
       >>> evaluate = make_evaluator(agent, env, env.task, training)
       >>> outcome = jax.eval_shape(evaluate, jax.random.key(0), params)
       >>> outcome.test_returns.shape
       (10,)
     """
+
+    require(isinstance(task, Task), "task", "be a sejax.Task", "agents are tested on it",
+            type(task).__name__, "task=env.task of a proxy, or sejax.envs.make(name)")  # fmt: skip
 
     def make_run(agent: Agent) -> Callable[..., Any]:
         test = make_tester(agent, task, training.test_episodes)
@@ -158,6 +163,8 @@ def evaluate_agents(
     on_done: Callable[[], None] | None = None,
 ) -> Outcome:
     """Trains and tests one fresh agent for each key, over all devices; leaves `[agent]`.
+
+    `env, env_params` are what `sejax.load` returns, `task` the real one.
 
     It compiles at every call: in a loop, jit `make_evaluator` yourself. `on_done` is called from
     the program's threads as each agent ends, also for copies that fill up the last lanes. The

@@ -18,7 +18,7 @@ from sejax.agents.replay import Transition
 from sejax.errors import require
 from sejax.keys import step_keys
 from sejax.loops import while_any_active
-from sejax.training import TrainingConfig
+from sejax.training import TrainingConfig, require_reachable
 
 _NO_LIMIT = 2**31 - 1
 
@@ -130,6 +130,8 @@ def make_trainer(
         agent; what it kept is `TrainResult.recorded`.
 
     Raises:
+      ConfigError: for arguments of other kinds, or if `training` has a fixed number of steps and
+        too few episodes for them.
       ValueError: if tests are asked for and no `test_fn` is given.
 
     Source: paper, Algorithm 1, TrainAgent.
@@ -144,6 +146,7 @@ def make_trainer(
       >>> result.returns.shape
       (8, 20)
     """
+    _require_parts(agent, env, training)
     if training.num_tests_between and test_fn is None:
         raise ValueError(
             f"tests after each episode (training.num_tests_between is "
@@ -176,6 +179,20 @@ def make_trainer(
         )
 
     return train
+
+
+def _require_parts(agent: Any, env: Any, training: Any) -> None:
+    """Checks that the arguments are what they are called, in their order."""
+    require(isinstance(agent, Agent), "agent", "be a sejax.Agent", "it acts and learns",
+            type(agent).__name__, "agent=sejax.make_agent(config, task)")  # fmt: skip
+    require(hasattr(env, "step_env"), "env", "be a gymnax environment", "the agent trains there",
+            type(env).__name__, "env to the first of the pair that sejax.load returns, or to "
+            "task.env")  # fmt: skip
+    require(isinstance(training, TrainingConfig), "training", "be a sejax.TrainingConfig", "it says "
+            "how long", type(training).__name__,
+            "training=sejax.TrainingConfig(max_episodes=100)")  # fmt: skip
+    require(not jax.config.jax_enable_x64, "jax_enable_x64", "be off", "sejax counts and computes "
+            "in 32 bits", "true", "JAX_ENABLE_X64=0")  # fmt: skip
 
 
 def _make_solver(
@@ -231,6 +248,7 @@ class _Loop:
         self.env = repeat_actions(env, agent.action_repeat)
         self.max_steps = self.memory_steps = training.max_steps or _NO_LIMIT
         if world.max_steps is not None:
+            require_reachable("training", training, world.max_steps)
             self.memory_steps = min(self.max_steps, training.max_episodes * world.max_steps)
         self.memory_makers = (agent.memory, *([] if recorder is None else [recorder]))
         self.prepare = lambda params, hparams: prepare(

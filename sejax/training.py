@@ -8,6 +8,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
+from sejax.errors import require
 from sejax.options import Options, counts, not_negative, one_of, option
 
 STOP_RULES = ("plateau", "solved", "never")
@@ -58,7 +59,8 @@ def budget_for(
     """How long an agent trains on a proxy that was learned with others.
 
     A step budget grows by the steps for which this agent waits longer with learning than any of
-    those: ten long initial episodes, or a rollout of PPO, could use it up.
+    those: ten long initial episodes, or a rollout of PPO, could use it up. Episodes, which may have
+    one step, grow in number with it.
 
     Args:
       training: that the proxy was learned with.
@@ -72,7 +74,29 @@ def budget_for(
     waits, *waited = (steps_before_learning(each, max_episode_steps, task_max_steps)
                       for each in (agent, *learned_with))  # fmt: skip
     longer = max(0, waits - max(waited, default=0))
-    return dataclasses.replace(training, max_steps=training.max_steps + longer)
+    return dataclasses.replace(training, max_steps=training.max_steps + longer,
+                               max_episodes=training.max_episodes + longer)  # fmt: skip
+
+
+def require_reachable(name: str, training: TrainingConfig, max_episode_steps: int) -> None:
+    """Checks that a training of fixed length does not run out of episodes before.
+
+    Args:
+      name: of the group of fields.
+      training: the limits.
+      max_episode_steps: that an episode may take.
+
+    Raises:
+      ConfigError: if even the longest episodes are too few.
+    """
+    if not training.is_fixed_length:
+        return
+    assert training.max_steps is not None
+    episodes = -(-training.max_steps // max_episode_steps)
+    require(training.max_episodes >= episodes, f"{name}.max_episodes", f"be at least {episodes}",
+            f"{name}.max_steps={training.max_steps} takes as many episodes of at most "
+            f"{max_episode_steps} steps", training.max_episodes,
+            f"{name}.max_episodes={episodes}")  # fmt: skip
 
 
 def steps_before_learning(agent: Any, max_episode_steps: int, task_max_steps: int) -> int:

@@ -175,6 +175,8 @@ def test_initial_episodes_beyond_the_proxys_own_extend_its_step_budget(stored):
     assert budget_for(unlimited, PPOConfig(), [then], 200, 200) is unlimited
     # A rollout is as long as the task's episodes, initial episodes are as long as the proxy's.
     assert budget_for(training, long, [then], 1, 200).max_steps == 50 + 401
+    # Of one step each: as many episodes more.
+    assert budget_for(training, long, [then], 1, 200).max_episodes == training.max_episodes + 401
     waits = dataclasses.replace(then, init_episodes=3)
     assert budget_for(training, waits, [then], 1, 200).max_steps == 50 + 3
     # That is what an evaluation trains with.
@@ -267,6 +269,19 @@ def test_one_agent_has_no_deviation(tmp_path, capsys):
     assert "nan" not in printed and "1 fresh q_learning agents" in printed
     # The real task alone can be evaluated.
     assert set(pd.read_csv(tmp_path / "evaluation.csv").world) == {"the real task"}
+
+
+def test_an_se_that_does_not_say_how_long_agents_trained_needs_the_config(room, tmp_path):
+    """Tests on the real task, by which agents there stop, are not for an SE."""
+    proxies = files.load_set(room)
+    bare = tmp_path / "bare.safetensors"
+    sejax.save(bare, proxies.env, proxies.proxy(0).params.weights)
+    words = [f"proxy={bare}", "num_agents=1", "baseline=false", f"out_dir={tmp_path}"]
+    with pytest.raises(ConfigError, match=r"^training_from must be config for an SE whose file do"):
+        proxy_study(evaluate_config(*words, words=ROOM))
+    given = ["training_from=config", "training.max_steps=7", "training.stop_rule=never"]
+    study = proxy_study(evaluate_config(*words, *given, words=ROOM))
+    assert study.worlds["the proxy"][2]["q_learning"].max_steps == 7
 
 
 def test_agents_like_those_of_the_run_bring_their_exploration(tmp_path, capsys):

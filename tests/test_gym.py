@@ -472,8 +472,13 @@ def test_an_unknown_task_must_be_given(stored):
     assert ((env.reset(seed=0)[0] >= 1) & (env.reset()[0] <= 2)).all()
     assert gymnasium.make(env.spec).reset(seed=1)[0].tolist() == env.reset(seed=1)[0].tolist()
     assert make(path, "Pendulum-v1").action_space == box
-    with pytest.raises(ConfigError, match=r"^weights must be those of the proxy's networks"):
+    with pytest.raises(ConfigError, match=r"^task must have the actions that .*got Discrete\(2\)"):
         make(path, "CartPole-v1")
+    other = RealTask(**vars(mine) | {"action_space": spaces.Box(0, 4, (1,))})
+    with pytest.raises(ConfigError, match=r"^task must have the actions that .*RescaleAction"):
+        make(path, other)
+    with pytest.raises(ConfigError, match=r"^task must be a sejax.gym.RealTask, or an id.*got int"):
+        make(path, 8)
     with pytest.raises(
         ConfigError, match=r"^task must be one that Gymnasium can make .*Nothing-v1"
     ):
@@ -517,10 +522,12 @@ def test_what_is_no_single_se_is_one_message(tmp_path, stored):
         make(path)
     with pytest.raises(ConfigError, match=r"^source must be one of .*got 'carpole'"):
         make("carpole")
-    weights = random_weights(env)
-    weights["reward"]["Dense_0"]["bias"][0] = np.nan
+    path = stored(env)
+    tensors, header = unseal(path.read_bytes(), "sejax")
+    tensors = {name: np.full_like(x, np.nan) for name, x in tensors.items()}
+    path.write_bytes(seal(tensors, "sejax", header))
     with pytest.raises(ConfigError, match=r"^weights must be .* numbers that are not finite"):
-        make(stored(env, weights))
+        make(path)
 
 
 @pytest.mark.parametrize(

@@ -272,7 +272,7 @@ def test_what_does_not_fit_is_one_message(tmp_path):
     with pytest.raises(ConfigError, match=r"^source must be a reward network, because this takes "
                        r"its networks; got proxy=se in .*cartpole"):  # fmt: skip
         RewardNetwork(gymnasium.make("CartPole-v1"), "cartpole")
-    with pytest.raises(ConfigError, match=r"^weights must be those of the proxy's networks"):
+    with pytest.raises(ConfigError, match=r"^env must have observations such as those of cartpole"):
         RewardNetwork(gymnasium.make("MountainCar-v0"), "cartpole-rn")
     with pytest.raises(ConfigError, match=r"^env must be sejax's Cliff Walking, because in "
                        r"Gymnasium's, .*Set env=sejax\.gym\.make\('cliff_walk"):  # fmt: skip
@@ -306,7 +306,7 @@ def test_a_task_that_gymnasium_has_not_must_be_given(tmp_path):
         rn = plugins.make("proxy", RewardConfig(hidden_size=2), env)
         path = tmp_path / "rn.safetensors"
         weights = random_like(shapes_of(rn.init_weights, KEY))
-        sejax.save(path, rn, weights, config={"env": task})
+        sejax.save(path, rn, weights, config={"env": task}, discount=0.9)
         with pytest.raises(ConfigError, match=r"^task must be given for (gymnax/|halfcheetah \(b"
                            r"ackend=spring\)).* Set sejax\.gym\.RewardNetwork\(env, "):  # fmt: skip
             make(path)

@@ -158,7 +158,7 @@ class Odd(gymnax.environments.environment.Environment):
         return jnp.zeros(self.obs.shape), gymnax.EnvState(time=0)
 
     def step_env(self, key, state, action, params):
-        return action, state, 0.0, jnp.bool_(False), {}
+        return jnp.resize(action, self.obs.shape), state, 0.0, jnp.bool_(False), {}
 
     def action_space(self, params):
         return self.action
@@ -222,3 +222,50 @@ def test_actions_without_bounds_are_refused(low, high):
         r"squash them within bounds; got Box.* in odd\. Give",
     ):
         odd_task(spaces.Box(low, high, (1,)))  # fmt: skip
+
+
+class Plain:
+    """What is not derived from gymnax's `Environment` has no `is_truncated`."""
+
+    default_params = gymnax.EnvParams(max_steps_in_episode=3)
+
+    def reset_env(self, key, params):
+        return jnp.zeros(2), gymnax.EnvState(time=0)
+
+    def step_env(self, key, state, action, params):
+        return jnp.zeros(2), state, 0.0, jnp.bool_(False), {}
+
+    reset = reset_env
+
+    def action_space(self, params):
+        return spaces.Discrete(2)
+
+    def observation_space(self, params):
+        return spaces.Box(-1.0, 1.0, (2,))
+
+
+class Short(Plain):
+    is_truncated = Odd.is_truncated
+
+    def reset_env(self, key, params):
+        return jnp.zeros(3), gymnax.EnvState(time=0)
+
+
+class Four(Short):
+    reset_env = Plain.reset_env
+
+    def step_env(self, key, state, action, params):
+        return jnp.zeros(2), state, 0.0, jnp.bool_(False)
+
+
+@pytest.mark.parametrize("world, said", [
+    (Plain, r"raised AttributeError: .*is_truncated.*Derive it from gymnax's Environment\.$"),
+    (Short, r"have \(2,\) as the shape of reset_env's observation, .*got \(3,\) in mine"),
+    (Four, r"five values.*raised ValueError: not enough values to unpack"),
+])  # fmt: skip
+def test_what_is_no_environment_is_told_before_an_agent_trains(world, said):
+    with pytest.raises(ConfigError, match=rf"^env must .*{said}"):
+        Task(name="mine", env=world())
+    with pytest.raises(ConfigError, match=r"^env\.solved_reward must be a number"):
+        Task(name="mine", env=Odd(spaces.Discrete(2), spaces.Box(-1.0, 1.0, (2,))),
+             params=Plain.default_params, solved_reward="high")  # fmt: skip

@@ -71,8 +71,9 @@ def rewrite(path, change):
 
 
 def test_a_proxy_that_is_saved_and_loaded_is_the_same(path, env, weights):
+    assert sejax.load_set(path).env is env, "sets share one environment, hence its programs"
     loaded, params = sejax.load(path)
-    assert loaded is env, "the same configuration shares one environment, hence its programs"
+    assert loaded.config == env.config and loaded.default_params is params
     assert_same_weights(params.weights, weights[0])
     assert params.discount == 0.7
     proxy = files.load_proxy(path.parent)  # a folder with it
@@ -85,9 +86,9 @@ def test_a_proxy_that_is_saved_and_loaded_is_the_same(path, env, weights):
 
 
 def test_a_proxy_needs_no_configuration_and_no_record(tmp_path, env, weights):
-    sejax.save(tmp_path / "bare.safetensors", env, weights[1])
+    sejax.save(tmp_path / "bare.safetensors", env, weights[1], discount=0.7)
     proxy = files.load_proxy(tmp_path / "bare.safetensors")
-    assert proxy.record == {} and proxy.params.discount == 1.0
+    assert proxy.record == {} and proxy.params.discount == 0.7
     proxies = sejax.load_set(tmp_path / "bare.safetensors")
     assert np.isnan(proxies.scores) and proxies.seeds == [-1]
 
@@ -95,8 +96,10 @@ def test_a_proxy_needs_no_configuration_and_no_record(tmp_path, env, weights):
 def test_a_loaded_proxy_steps_as_a_gymnax_environment():
     env, params = sejax.load("cartpole")
     obs, state = env.reset(jax.random.key(0), params)
-    obs, state, reward, terminated, *_ = env.step(jax.random.key(1), state, jnp.int32(1), params)
+    key, action = jax.random.key(1), jnp.int32(1)
+    obs, after, reward, terminated, *_ = env.step(key, state, action, params)
     assert obs.shape == (4,) and reward.shape == () and terminated  # after its only step
+    assert env.step(key, state, action)[2] == reward, "wrappers may leave the params out"
 
 
 def test_a_set_that_is_saved_and_loaded_is_the_same(tmp_path, env, weights):
@@ -119,8 +122,9 @@ def test_a_set_that_is_saved_and_loaded_is_the_same(tmp_path, env, weights):
 def test_parts_of_a_set_are_chosen_by_score_and_place(tmp_path, env, weights):
     path = tmp_path / "set.safetensors"
     sejax.save_set(
-        path, env, weights, [{"score": s, "seed": i} for i, s in enumerate((0.5, 0.9, 0.8))]
-    )
+        path, env, weights, [{"score": s, "seed": i} for i, s in enumerate((0.5, 0.9, 0.8))],
+        discount=0.7,
+    )  # fmt: skip
     proxies = sejax.load_set(path)
     assert proxies.ranked(2).seeds.tolist() == [1, 2]
     assert proxies.ranked(2, worst=True).seeds.tolist() == [0, 2]
@@ -179,7 +183,7 @@ def test_a_proxy_of_version_1_loads(tmp_path, env, weights):
     header = version_1(score=0.5, generation=3, seed=8, note="kept")
     save_file(flat(weights[0]), path, metadata={"sejax": json.dumps(header)})
     proxy = files.load_proxy(path)
-    assert proxy.env is env and proxy.params.discount == 0.7
+    assert proxy.env.config == env.config and proxy.params.discount == 0.7
     assert_same_weights(proxy.params.weights, weights[0])
     assert proxy.record == {"score": 0.5, "generation": 3, "seed": 8, "note": "kept"}
     assert proxy.learned_with("objective") == sejax.MaxReward()
@@ -335,11 +339,44 @@ def test_tensors_that_are_not_the_networks_are_one_message(path, change):
     assert len(str(error.value)) < 2000
 
 
-def test_tensors_of_another_shape_are_refused(path, tmp_path, weights):
-    other = RewardConfig(hidden_size=3).make(envs.make("gridworld_2x2"))
-    sejax.save(tmp_path / "p.safetensors", other, weights[0])
+def test_tensors_of_another_shape_are_refused(path):
+    def with_a_larger_network(tensors, header):
+        config = header["config"]
+        proxy = config["proxy"] | {"hidden_size": 3}
+        return tensors, "sejax", header | {"config": config | {"proxy": proxy}}
+
+    rewrite(path, with_a_larger_network)
     with pytest.raises(ConfigError, match="must hold the tensors of the network"):
-        sejax.load(tmp_path / "p.safetensors")
+        sejax.load(path)
+
+
+@pytest.mark.parametrize("given, said", [
+    ({"weights": {"potential": {}}}, r"^weights must have the shapes \{.*Reward-gridworld"),
+    ({"weights": RewardConfig}, r"^weights must be nested dict.*Set weights to params\.weights"),
+    ({"discount": None}, r"^discount must be given for a potential-based.*=params\.discount"),
+    ({"discount": 5.0}, r"^config, discount and record must be plain .*outside of \[0, 1"),
+    ({"score": "high"}, r"^config, discount and record must be plain values"),
+    ({"config": {"es": sejax.NESConfig()}}, r"^config, discount and record must be plain values"),
+])  # fmt: skip
+def test_what_could_not_be_loaded_is_not_saved_over_what_can(path, env, weights, given, said):
+    before = path.read_bytes()
+    given = {"weights": weights[1], "discount": 0.7} | given
+    with pytest.raises(ConfigError, match=said):
+        sejax.save(path, env, **given)
+    with pytest.raises(ConfigError, match=r"^records must be one for each proxy, .*1 for 2"):
+        sejax.save_set(path, env, weights[:2], [{}], discount=0.7)
+    given = jax.tree.map(lambda x: x.at[..., 0].set(jnp.nan), weights[1])
+    with pytest.raises(ConfigError, match=r"^weights must be finite, .*others in potential/Dense"):
+        sejax.save(path, env, given, discount=0.7)
+    assert path.read_bytes() == before
+
+
+def test_doubles_and_arrays_of_one_number_are_saved_as_floats_and_numbers(path, env, weights):
+    doubles = jax.tree.map(lambda x: np.asarray(x, np.float64), weights[1])
+    record = {"score": jnp.float32(0.5), "seed": np.int64(3)}
+    sejax.save(path, env, doubles, discount=np.float32(0.5), **record)
+    assert files.load_proxy(path).record == {"score": 0.5, "seed": 3}
+    assert_same_weights(files.load_proxy(path).params.weights, weights[1])
 
 
 def test_tensors_of_types_that_numpy_lacks_are_refused(path):
@@ -361,9 +398,9 @@ def test_a_full_disk_is_an_oserror_and_the_older_file_stays(path, env, weights, 
     with monkeypatch.context() as patch:
         patch.setattr("sejax.files.os.write", full)
         with pytest.raises(OSError, match="No space left"):
-            sejax.save(path, env, weights[1])
+            sejax.save(path, env, weights[1], discount=0.7)
         with pytest.raises(OSError, match="No space left"):
-            sejax.save_set(path, env, weights, [{}] * 3)
+            sejax.save_set(path, env, weights, [{}] * 3, discount=0.7)
     assert path.read_bytes() == before
     assert list(path.parent.iterdir()) == [path], "temporary files are removed"
 
@@ -375,11 +412,11 @@ def test_interpolations_in_metadata_are_plain_text(path, tmp_path, env, weights,
     monkeypatch.setenv("SECRET", "hush")
     text = "${oc.env:SECRET}"
     config = CONFIG | {"preset": text, "agent": {"name": "q_learning", "note": text}}
-    sejax.save(path, env, weights[0], config, note=text)
+    sejax.save(path, env, weights[0], config, 0.7, note=text)
     proxy = files.load_proxy(path)
     assert proxy.config["preset"] == proxy.record["note"] == text
     again = tmp_path / "again.safetensors"
-    sejax.save(again, env, proxy.params.weights, proxy.config, **proxy.record)
+    sejax.save(again, env, proxy.params.weights, proxy.config, proxy.discount, **proxy.record)
     assert b"hush" not in again.read_bytes() and text.encode() in again.read_bytes()
     rewrite(path, lambda tensors, header: (tensors, "sejax", header | {"task": text}))
     with pytest.raises(ConfigError, match=r"one of \$\{oc\.env:SECRET\} in"):
@@ -416,7 +453,7 @@ def mine(tmp_path, monkeypatch):
     config = plugins.configure("proxy", {"name": "my_file_worlds:Mine", "hidden_size": 2})
     env = plugins.make("proxy", config, task)
     path = tmp_path / "mine.safetensors"
-    sejax.save(path, env, env.init_weights(jax.random.key(0)))
+    sejax.save(path, env, env.init_weights(jax.random.key(0)), discount=0.7)
     del sys.modules["my_file_worlds"]
     return path, task, config
 
@@ -447,12 +484,17 @@ def test_a_task_given_must_be_that_of_the_proxy(path):
         sejax.load(path, task=envs.make("cliff_walking"))
     task = dataclasses.replace(envs.make("gridworld_2x2"), solved_reward=0.5)
     assert files.load_proxy(path, task=task).task is task
+    longer = dataclasses.replace(task, max_steps=task.max_steps + 1)
+    with pytest.raises(
+        ConfigError, match=rf"^task must have the max_steps .*{task.max_steps}, bec"
+    ):
+        sejax.load(path, task=longer)
 
 
 def test_a_task_made_by_hand_must_be_given(tmp_path, env, weights):
     task = dataclasses.replace(env.task, name="by hand", origin=None)
     mine = env.config.make(task)
-    sejax.save(tmp_path / "p.safetensors", mine, weights[0])
+    sejax.save(tmp_path / "p.safetensors", mine, weights[0], discount=0.7)
     with pytest.raises(ConfigError, match=r"proxy of a registered env if no task is given"):
         sejax.load(tmp_path / "p.safetensors")
     assert sejax.load(tmp_path / "p.safetensors", task=task)[0].task is task
@@ -476,7 +518,7 @@ def test_an_se_with_its_own_starts_needs_no_task(tmp_path):
     for key in jax.random.split(jax.random.key(0), 3):
         episode = [rollout(world, params, key) for world in (env, there)]
         chex.assert_trees_all_equal(*episode)
-    assert sejax.load(path)[0] is there  # and what was compiled for it is used again
+    assert sejax.load(path)[0].task is there.task
     assert sejax.make_agent(sejax.TD3Config(), there.task)
     again = tmp_path / "again.safetensors"
     sejax.save(again, there, params.weights)
@@ -505,7 +547,7 @@ def rollout(env, params, key, num_steps=4):
 ], ids=["an SE that begins there", "an RN"])  # fmt: skip
 def test_what_runs_its_task_needs_it(tmp_path, made):
     env, weights = made(dataclasses.replace(envs.make("pendulum"), name="by hand", origin=None))
-    sejax.save(tmp_path / "p.safetensors", env, weights)
+    sejax.save(tmp_path / "p.safetensors", env, weights, discount=0.7)
     with pytest.raises(ConfigError, match=r"proxy of a registered env if no task is given"):
         sejax.load(tmp_path / "p.safetensors")
 

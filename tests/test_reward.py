@@ -344,7 +344,7 @@ def test_a_stored_reward_network_comes_back(tmp_path):
     weights = env.init_weights(jax.random.key(9))
     sejax.save(tmp_path / "rn.safetensors", env, weights)
     loaded, params = sejax.load(tmp_path / "rn.safetensors")
-    assert loaded is env
+    assert loaded.config == env.config and loaded.task is env.task
     jax.tree.map(np.testing.assert_array_equal, params.weights, weights)
 
 

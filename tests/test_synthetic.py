@@ -50,6 +50,19 @@ def constant_heads(env, **values):
     return weights
 
 
+@pytest.mark.parametrize("config", [{}, {"horizon": 1, "initial_state": "learned"}])
+def test_continuous_actions_are_clipped_to_the_tasks_bounds(config):
+    env = make_env("pendulum", **config)
+    params = env.params(env.init_weights(jax.random.key(2)))
+    _, state = env.reset_env(jax.random.key(0), params)
+
+    def seen(action):
+        obs, _, reward, *_ = env.step_env(jax.random.key(1), state, jnp.array([action]), params)
+        return [*map(float, obs), float(reward)]
+
+    assert seen(50.0) == seen(2.0) != seen(1.9) and seen(-3.0) == seen(-2.0)
+
+
 # --- equations -----------------------------------------------------------------------------------
 
 

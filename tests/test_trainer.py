@@ -17,6 +17,7 @@ from sejax import envs, evaluation, plugins
 from sejax.agents.ddqn import DDQNConfig, make_ddqn
 from sejax.agents.memory import Memory
 from sejax.agents.tabular import QLearningConfig
+from sejax.errors import ConfigError
 from sejax.proxies.configs import SyntheticConfig
 from sejax.rollout import _Greedy, make_recorder, make_tester
 from sejax.trainer import is_plateau, is_solved, make_trainer
@@ -599,3 +600,37 @@ def test_recorded_tests_are_the_tests():
     keys = [jax.random.split(key)[0] for key in jax.random.split(KEY, 3)]
     starts = [float(ENV.reset_env(key, task.params)[0][1]) for key in keys]  # each episode's tag
     np.testing.assert_array_equal(steps.obs[:, 1].reshape(3, -1)[:, 0], np.float32(starts))
+
+
+# --- what cannot be ------------------------------------------------------------------------------
+
+
+def test_a_length_that_the_episodes_cannot_reach_is_refused():
+    """One-step SEs: the default's 1,000 episodes are 1,000 steps."""
+    task = envs.make("cartpole")
+    agent = plugins.make("agent", DDQNConfig(init_episodes=1), task)
+    env = SyntheticConfig(initial_state="learned", horizon=1).make(task)
+    asked = TrainingConfig(max_steps=4000, stop_rule="never")
+    with pytest.raises(ConfigError, match=r"^training\.max_episodes must be at least 4000, because "
+                       r"training\.max_steps=4000 takes .*of at most 1 steps; got 1000\. Set train"
+                       r"ing\.max_episodes=4000\.$"):  # fmt: skip
+        make_trainer(agent, env, asked)
+    assert make_trainer(agent, env, dataclasses.replace(asked, max_episodes=4000))
+    assert make_trainer(agent, env, dataclasses.replace(asked, stop_rule="plateau"))  # a bound
+    assert make_trainer(agent, task.env, asked)  # whose params may allow any length
+
+
+@pytest.mark.parametrize("swapped, said", [
+    (lambda agent, task: (task.env, agent), r"^agent must be a sejax\.Agent, .*make_agent\("),
+    (lambda agent, task: (agent, (task.env, task.params)), r"^env must be a gymnax .*got tuple\."),
+    (lambda agent, task: (agent, task.env, {"max_steps": 3}), r"^training must be a sejax\.Train"),
+])  # fmt: skip
+def test_arguments_of_other_kinds_are_one_message(swapped, said):
+    task = envs.make("gridworld_2x2")
+    agent = plugins.make("agent", QLearningConfig(), task)
+    with pytest.raises(ConfigError, match=said):
+        make_trainer(*swapped(agent, task))
+    with pytest.raises(ConfigError, match=r"^task must be a sejax\.Task, .*got GridWorld"):
+        evaluation.make_evaluator(agent, task.env, task.env, TrainingConfig())
+    with jax.enable_x64(True), pytest.raises(ConfigError, match=r"^jax_enable_x64 must be off"):
+        make_trainer(agent, task.env)

@@ -51,6 +51,9 @@ def make_agent(
     """
     require(hasattr(task, "facts"), "task", "be a sejax.Task", "an agent is made for its spaces",
             type(task).__name__, "task to env.task, or sejax.Task(name=..., env=env)")  # fmt: skip
+    require(hasattr(config, "make") and not isinstance(config, type), "config", "be an agent's "
+            "configuration", "the agent is made by it", config,
+            "config to such as sejax.DDQNConfig()")  # fmt: skip
     require_fit(config, exploration, task.facts, task.name)
     return _make_agent(plugins.Same(config, exploration), task, varied)
 

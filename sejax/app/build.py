@@ -12,7 +12,7 @@ from sejax.app import families
 from sejax.app.families import AgentsConfig, families_of
 from sejax.errors import ConfigError, one_of, require, require_seed, shortened, whole
 from sejax.families import Families
-from sejax.training import TrainingConfig, steps_before_learning
+from sejax.training import TrainingConfig, require_reachable, steps_before_learning
 
 AGENT_HPARAMS = ("default", "varied")
 EVALUATION_HPARAMS = (*AGENT_HPARAMS, "as_learned")
@@ -80,6 +80,8 @@ class LearnConfig:
         facts, task_name = envs.facts_of(self.env), self.name("env")
         if hasattr(self.proxy, "require_task"):
             self.proxy.require_task(facts, task_name)
+        if hasattr(self.proxy, "lasts_to_the_limit"):  # an SE
+            require_reachable("training", self.training, self.proxy.max_steps(facts.max_steps))
         for family in families_of(self):
             with families.named(family.field):
                 agents.require_fit(family.agent, self.exploration, facts, task_name)

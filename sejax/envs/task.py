@@ -36,8 +36,10 @@ class Task:
 
     Attributes:
       name: what it is called, in files too.
-      env: gymnax 1.x `Environment`, of which `reset_env`, `step_env`, `action_space` and
-        `observation_space` are used. A step's `info` may say under "discount" what a target
+      env: gymnax 1.x `Environment`, of which `reset_env`, `step_env`, `is_truncated`,
+        `action_space`, `observation_space` and `default_params` are used; its params have
+        `max_steps_in_episode`, its state has `time`. `step_env` returns observation, state, reward,
+        terminated and info. A step's `info` may say under "discount" what a target
         bootstraps with; 1 minus terminated if not. Build a task once: what is compiled for it is
         kept by identity.
       params: its `EnvParams`; the environment's `default_params` if not given.
@@ -50,7 +52,8 @@ class Task:
         which whoever loads a proxy of it must give.
 
     Raises:
-      ConfigError: for an observation or action space that is neither discrete nor a bounded box.
+      ConfigError: for an observation or action space that is neither discrete nor a bounded box, or
+        an environment that cannot be reset and stepped.
 
     Example:
       >>> import gymnax
@@ -78,7 +81,8 @@ class Task:
                        "its params are asked for", type(self.env).__name__,
                        "env to the first of the pair that gymnax.make returns")  # fmt: skip
         is_nan = isinstance(self.solved_reward, float) and math.isnan(self.solved_reward)
-        errors.require(not is_nan, "env.solved_reward", "be a number",
+        is_odd = is_nan or isinstance(self.solved_reward, str | None)  # a traced one is fine
+        errors.require(not is_odd, "env.solved_reward", "be a number",
                        "returns are compared with it", self.solved_reward,
                        "env.solved_reward=inf if nobody says")  # fmt: skip
         params = self.env.default_params if self.params is None else self.params
@@ -89,6 +93,8 @@ class Task:
         object.__setattr__(self, "max_steps", int(limit))
         object.__setattr__(self, "params", params)
         env = as_vectors(self.env, params, self.name)
+        if not type(self.env).__module__.startswith(("sejax.", "gymnax.")):
+            _try(env, params, self.name)  # seconds for some, which have tests of their own
         object.__setattr__(self, "env", env)
         # Once and here: gymnax computes some spaces, and within a program they would have no sizes.
         object.__setattr__(self, "_obs_space", env.observation_space(params))
@@ -148,6 +154,39 @@ class Task:
         import numpy as np
 
         return float(np.max(self._action_space.high))
+
+
+def _try(env: Any, params: Any, name: str) -> None:
+    """Traces a step, so that what an environment lacks is told before an agent trains there.
+
+    Raises:
+      ConfigError: if it cannot be made, or returns something else than five values.
+    """
+    import jax
+
+    def step(key: Any) -> Any:
+        obs, state = env.reset_env(key, params)
+        action = env.action_space(params).sample(key)
+        next_obs, state, reward, terminated, _ = env.step_env(key, state, action, params)
+        env.is_truncated(state, params)
+        return obs, next_obs, reward, terminated, state.time
+
+    try:
+        obs, next_obs, reward, terminated, _ = jax.eval_shape(step, jax.random.key(0))
+    except Exception as error:
+        raise errors.ConfigError(
+            f"env must be a gymnax 1.x environment with reset_env, step_env (five values), "
+            f"is_truncated and a state with time, because agents train and are tested there; "
+            f"{name} raised {errors.told(error)}. Derive it from gymnax's Environment."
+        ) from error
+    shape = tuple(env.observation_space(params).shape)
+    for what, got, wanted in (("reset_env's observation", obs, shape),
+                              ("step_env's observation", next_obs, shape),
+                              ("step_env's reward", reward, ()),
+                              ("step_env's terminated", terminated, ())):  # fmt: skip
+        errors.require(got.shape == wanted, "env", f"have {wanted} as the shape of {what}", "its "
+                       "space, or an episode at a time, says so", f"{got.shape} in {name}",
+                       "env to one that returns that")  # fmt: skip
 
 
 def _num_categories(space: Any) -> int | None:

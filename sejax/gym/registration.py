@@ -15,7 +15,7 @@ from sejax.errors import ConfigError, require, whole
 from sejax.gym.reward import RewardNetwork
 from sejax.gym.source import Source, read
 from sejax.gym.synthetic import SyntheticEnv, SyntheticWorld
-from sejax.gym.tasks import RealTask, make_gymnasium, real_env, real_task, unknown_task
+from sejax.gym.tasks import RealTask, is_close, make_gymnasium, real_env, real_task, unknown_task
 from sejax.gym.vector import SyntheticVectorEnv
 from sejax.proxies import stored
 
@@ -163,8 +163,17 @@ def _world(
     config = plugins.configure("proxy", header["config"]["proxy"])
     if isinstance(task, str):
         task = RealTask.of_gymnasium(task)
+    require(task is None or isinstance(task, RealTask), "task", "be a sejax.gym.RealTask, or an id of "
+            "Gymnasium", "an SE takes its spaces from there", type(task).__name__,
+            "task=sejax.gym.RealTask.of_env(env)")  # fmt: skip
     if task is None:
         task = real_task(header, needs_starts=config.needs_task)
+    elif "interface" in header:
+        learned = RealTask.of_interface(header["interface"]).action_space
+        require(is_close(task.action_space, learned), "task", f"have the actions that the SE was "
+                f"learned with, {learned}", "others mean something else to its networks",
+                task.action_space, "task to one with these, as gymnasium.wrappers.RescaleAction "
+                "makes of the real environment")  # fmt: skip
     return SyntheticWorld(weights, config, task)
 
 

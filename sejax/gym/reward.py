@@ -13,7 +13,7 @@ from sejax import plugins
 from sejax.errors import ConfigError, fraction, require
 from sejax.gym import networks
 from sejax.gym.source import Source, read
-from sejax.gym.tasks import num_categories, vector_size
+from sejax.gym.tasks import RealTask, num_categories, vector_size
 from sejax.proxies import ABSURD
 from sejax.proxies.configs import RewardConfig
 
@@ -100,6 +100,12 @@ class RewardNetwork(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
         self._info_keys = self._keys(header["task"], info_keys)
         obs_dim = vector_size(env.observation_space, "env.observation_space")
         self._num_states = num_categories(env.observation_space)
+        if "interface" in header:
+            learned = RealTask.of_interface(header["interface"]).observation_space
+            require((self._num_states, obs_dim) == (num_categories(learned), vector_size(learned, "")),
+                    "env", f"have observations such as those of {header['task']}, {learned}",
+                    "the network sees them", env.observation_space,
+                    f"env to an environment of {header['task']}")  # fmt: skip
         networks.check(weights, _shapes(self.config, obs_dim, len(self._info_keys)))
         self._weights = weights.get("info_weights")  # [info_keys]
         self._layers = networks.layers_of(weights, "potential")

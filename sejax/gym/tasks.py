@@ -197,6 +197,14 @@ def _space(plain: Mapping[str, Any]) -> spaces.Space[Any]:
     return spaces.Box(low, high, dtype=np.float32)
 
 
+def is_close(space: spaces.Space[Any], other: spaces.Space[Any]) -> bool:
+    """Whether two spaces are the same, but for rounding and the dtype."""
+    if isinstance(space, spaces.Box) and isinstance(other, spaces.Box):
+        bounds = ((space.low, other.low), (space.high, other.high))
+        return space.shape == other.shape and all(np.allclose(*pair) for pair in bounds)
+    return num_categories(space) == num_categories(other)
+
+
 def num_categories(space: spaces.Space[Any]) -> int | None:
     """Size of a `Discrete` space; None for a `Box`."""
     return int(space.n) if isinstance(space, spaces.Discrete) else None

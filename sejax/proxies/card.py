@@ -19,6 +19,10 @@ ENDS = {
 
 
 SHIPPED_LICENCE = "Apache-2.0, as sejax, which made it: no data of anybody's is in it."
+_SCORES = {  # what a score says, where it is no return
+    "reward_threshold": " (minus the training steps until the task was solved, and a penalty where "
+                        "it was not)",
+}  # fmt: skip
 _WORDS = {"task": "env", "proxy": "proxy_kind"}  # what arguments of `sejax.load` are in commands
 
 
@@ -54,8 +58,9 @@ def _about(proxy: PretrainedProxy) -> str:
                 f"author's own.")  # fmt: skip
     if proxy.kind == "rn":
         return (f"A {KINDS['rn']} for the task `{proxy.task}`: the dynamics are the real task's, "
-                f"the reward is made by a small learned network. Agents that train on it need "
-                f"fewer steps for the real task, where they are tested.")  # fmt: skip
+                f"the reward is made by a small learned network, so that agents like those it was "
+                f"learned with need fewer steps for the real task, where they are tested. To "
+                f"others it may do nothing, or harm.")  # fmt: skip
     starts = {"real": "the real task's", "learned": "made by a network from noise",
               "noise": "standard normal noise"}  # fmt: skip
     return (
@@ -104,9 +109,10 @@ def _origin(proxy: PretrainedProxy) -> str:
     numbers = {"generation": proxy.generation, "seed": proxy.seed}
     place = [f"{name} {number}" for name, number in numbers.items() if number is not None]
     which = f"it is the proxy of {' of '.join(place)}, when it" if place else "it"
+    meaning = _SCORES.get(proxy.objective, "")
     return (
         f"With agents of {' and '.join(proxy.agents)}, by an evolution strategy that sees only how "
-        f"they do on the real task (Ferreira et al., ICLR 2022): {which} scored {scores}."
+        f"they do on the real task (Ferreira et al., ICLR 2022): {which} scored {scores}{meaning}."
     )
 
 
@@ -123,6 +129,9 @@ def _cost(proxy: PretrainedProxy, learning: Learning) -> str:
 def _usage(proxy: PretrainedProxy, source: str, needs: Sequence[str]) -> str:
     given = "".join(f", {name}=..." for name in needs)
     words = "".join(f" {_WORDS[name]}=..." for name in needs)
+    best = max(proxy.on_proxy, key=lambda each: each.return_mean, default=None)
+    if best is not None and best.hparams != "default":
+        words += f" agent_hparams={best.hparams}"
     call = f'("{source}"{given})'
     gym = f"env = sejax.gym.make{call}  # a gymnasium.Env, in NumPy: any agent, no JAX\n"
     install = "With `pip install 'sejax[hub]'`:\n\n" if hub.is_address(source) else ""

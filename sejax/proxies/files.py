@@ -21,13 +21,14 @@ from sejax import envs, plugins
 from sejax.envs import absent
 from sejax.envs.absent import require_present
 from sejax.envs.task import Task
-from sejax.errors import ConfigError, require, shortened
+from sejax.errors import ConfigError, require, shortened, told
 from sejax.files import write_bytes
 from sejax.proxies.proxy import ProxyEnv
 from sejax.proxies.stored import (
     FORMAT_VERSION,
     KEY,
     PRETRAINED_DIR,
+    check_header,
     find,
     learned_agents,
     pretrained_names,
@@ -49,7 +50,7 @@ class Proxy:
     """A stored proxy.
 
     Attributes:
-      env: the SE or RN, a gymnax environment.
+      env: the SE or RN, a gymnax environment whose `default_params` are the params.
       params: its `EnvParams`: the weights, and the discount of the agent it was learned with.
       record: what is known of it: `score`, `generation` and `seed`, where they are.
       config: what it was learned with, nested plain values.
@@ -131,7 +132,7 @@ class ProxySet:
     """Proxies that share a configuration, and hence every compiled program.
 
     Attributes:
-      env: the SE or RN; its weights are what differs.
+      env: the SE or RN, whose weights are what differs; its `default_params` are random ones.
       weights: leaves `[size, ...]`, NumPy float32.
       records: of each what is known of it: `score` (incumbent mean that it was chosen for),
         `generation` (that measured it) and `seed` (of its run).
@@ -191,8 +192,9 @@ class ProxySet:
         return self.proxy(0).learned_with(group)
 
     def proxy(self, index: int) -> Proxy:
-        """One of them."""
-        return Proxy(env=self.env, params=self.one(index), record=self.records[index],
+        """One of them; its `env` is a copy that has its params as default ones."""
+        params = self.one(index)
+        return Proxy(env=self.env.with_default_params(params), params=params, record=self.records[index],
                      config=self.config, discount=self.discount,
                      path=self.path)  # fmt: skip
 
@@ -234,7 +236,7 @@ def save(
     env: ProxyEnv,
     weights: Any,
     config: Mapping[str, Any] | None = None,
-    discount: float = 1.0,
+    discount: float | None = None,
     **record: Any,
 ) -> None:
     """Writes a proxy atomically.
@@ -242,12 +244,15 @@ def save(
     Args:
       path: the file, `*.safetensors`.
       env: the proxy.
-      weights: as from its `init_weights`.
+      weights: as from its `init_weights`; kept as float32.
       config: what it was learned with, nested plain values; task and kind of proxy are added.
-      discount: of the agent that it was learned with, which a potential-based RN pays with.
+      discount: of the agent that it was learned with, which a potential-based RN pays with and
+        cannot do without; 1 where none is given.
       **record: plain values to keep with it, such as `score`, `generation` and `seed`.
 
     Raises:
+      ConfigError: for weights that are not the proxy's or not finite, a potential-based RN without
+        a discount, or a configuration or record that `load` would not take. An older file stays.
       OSError: if it cannot be written; an older file stays as it was.
 
     Example:
@@ -258,8 +263,7 @@ def save(
       >>> load_proxy(path).record
       {'score': 195.0}
     """
-    tensors = {name: np.asarray(x) for name, x in flatten_dict(weights, sep="/").items()}
-    _write(Path(path), env, tensors, config, discount, [record], is_set=False)
+    _write(Path(path), env, _tensors_of(env, weights), config, discount, [record], is_set=False)
 
 
 def save_set(
@@ -268,23 +272,46 @@ def save_set(
     weights: Sequence[Any],
     records: Sequence[Mapping[str, Any]],
     config: Mapping[str, Any] | None = None,
-    discount: float = 1.0,
+    discount: float | None = None,
 ) -> None:
     """Writes a set of proxies atomically; arguments as of `save`, with a record for each.
 
     Raises:
+      ConfigError: as `save`, or if there are not as many records as proxies.
       OSError: if it cannot be written; an older file stays as it was.
     """
-    flat = [flatten_dict(one, sep="/") for one in weights]
-    tensors = {name: np.stack([np.asarray(one[name], np.float32) for one in flat])
-               for name in flat[0]}  # fmt: skip
+    require(len(weights) == len(records) > 0, "records", "be one for each proxy", "they say which "
+            "is which", f"{len(records)} for {len(weights)}", "records=[{}] * len(weights)"
+            )  # fmt: skip
+    each = [_tensors_of(env, one) for one in weights]
+    tensors = {name: np.stack([one[name] for one in each]) for name in each[0]}
     _write(Path(path), env, tensors, config, discount, records, is_set=True)
+
+
+def _tensors_of(env: ProxyEnv, weights: Any) -> dict[str, np.ndarray]:
+    """The weights of one proxy by `network/layer/parameter`, checked."""
+    require(isinstance(weights, Mapping), "weights", "be nested dictionaries as env.init_weights "
+            "returns", "they are kept by their names", type(weights).__name__,
+            "weights to params.weights")  # fmt: skip
+    tensors = {name: np.asarray(x, np.float32)
+               for name, x in flatten_dict(weights, sep="/").items()}  # fmt: skip
+    wanted = {name: x.shape for name, x in _shapes_of(env).items()}
+    there = {name: x.shape for name, x in tensors.items()}
+    require(there == wanted, "weights", f"have the shapes {shortened(wanted)}", f"they are those "
+            f"of {env.name}", there, "weights to those of this env")  # fmt: skip
+    odd = [name for name, x in tensors.items() if not np.isfinite(x).all()]
+    require(not odd, "weights", "be finite", "no agent could train on others", f"others in "
+            f"{', '.join(odd)}", "weights to ones that were scored")  # fmt: skip
+    return tensors
 
 
 def _write(
     path: Path, env: ProxyEnv, tensors: dict[str, np.ndarray], config: Mapping[str, Any] | None,
-    discount: float, records: Sequence[Mapping[str, Any]], is_set: bool,
+    discount: float | None, records: Sequence[Mapping[str, Any]], is_set: bool,
 ) -> None:  # fmt: skip
+    require(discount is not None or not getattr(env.config, "is_potential_based", False),
+            "discount", "be given for a potential-based reward network", "its reward is made with "
+            "it", discount, "discount=params.discount, that of the agent")  # fmt: skip
     known = {
         "env": env.task.origin or {"name": env.task.name},
         "proxy": plugins.describe("proxy", env.config),
@@ -294,11 +321,25 @@ def _write(
         "task": env.task.name,
         "interface": env.task.interface,
         "config": known | dict(config or {}) | {"run_dir": None},  # no path of a machine
-        "discount": float(discount),
+        "discount": 1.0 if discount is None else float(discount),
         "is_set": is_set,
-        "proxies": [dict(record) for record in records],
+        "proxies": [{name: _plain(x) for name, x in record.items()} for record in records],
     }
-    write_bytes(path, seal(tensors, KEY, header))
+    try:
+        check_header(header)
+        sealed = seal(tensors, KEY, header)
+    except (LookupError, ValueError, TypeError) as error:
+        raise ConfigError(
+            f"config, discount and record must be plain values that sejax.load takes, because they "
+            f"are kept beside the weights; got {told(error)}. Give score, generation and seed as "
+            f"numbers, and config as sejax.config(...) has it."
+        ) from error
+    write_bytes(path, sealed)
+
+
+def _plain(value: Any) -> Any:
+    """A number for an array of one, such as a result's score."""
+    return value.item() if hasattr(value, "dtype") and np.ndim(value) == 0 else value
 
 
 # --- reading -------------------------------------------------------------------------------------
@@ -319,9 +360,13 @@ def load(source: str | Path, task: Task | None = None, proxy: Any = None) -> tup
         reset or step the real task fails.
       proxy: its configuration; needed likewise for a kind of proxy of your own.
 
+    Returns:
+      The environment, whose `default_params` are the same params, for wrappers that leave them out.
+
     Raises:
       ConfigError: if there is no such proxy, the file is damaged or of another format, it holds
-        several, or its task or kind is not known.
+        several, its task or kind is not known, or the task given is not the file's: its spaces or
+        its step limit are others.
 
     Example:
       >>> env, params = load("cartpole")
@@ -399,6 +444,7 @@ def _env_of(
     config = header["config"]
     if proxy is None:
         proxy = _registered("proxy", "proxy", "proxy_kind", path, config, option)
+    given = task is not None
     if task is None:
         try:
             task = envs.make_from(_registered("env", "task", "env", path, config, option))
@@ -409,6 +455,12 @@ def _env_of(
     require(header["task"] == task.name, option, f"be a proxy of {task.name}", "that is the task "
             "given", f"one of {shortened(header['task'])} in {path}",
             f"{option} to a proxy of {task.name}, or another task")  # fmt: skip
+    if given and "interface" in header:
+        for what, stored in header["interface"].items():
+            there = task.interface.get(what)
+            require(there == stored, "task", f"have the {what} of the task that the proxy was "
+                    f"learned for, {shortened(stored)}", f"{path} is a proxy of that one", there,
+                    f"task to a sejax.Task with that {what}")  # fmt: skip
     return plugins.make("proxy", proxy, task)
 
 
@@ -434,8 +486,7 @@ def _is_registered(group: str, stored: Any) -> bool:
 def _check_tensors(
     path: Path, option: str, env: ProxyEnv, tensors: dict[str, np.ndarray], count: int
 ) -> None:
-    expected = flatten_dict(jax.eval_shape(env.init_weights, jax.random.key(0)), sep="/")
-    wanted = {name: ("float32", (count, *x.shape)) for name, x in expected.items()}
+    wanted = {name: ("float32", (count, *x.shape)) for name, x in _shapes_of(env).items()}
     there = {name: (str(x.dtype), x.shape) for name, x in tensors.items()}
     finite = there == wanted and all(np.isfinite(x).all() for x in tensors.values())
     if not finite:
@@ -444,6 +495,11 @@ def _check_tensors(
             f"{option} must hold the tensors of the network in its metadata, because they are its "
             f"weights; {path} has {what} in place of {shortened(wanted)}. Learn it again."
         )
+
+
+def _shapes_of(env: ProxyEnv) -> dict[str, Any]:
+    """Shape and dtype of each of a proxy's weights."""
+    return flatten_dict(jax.eval_shape(env.init_weights, jax.random.key(0)), sep="/")
 
 
 # --- gymnax --------------------------------------------------------------------------------------
@@ -467,10 +523,9 @@ def register_gymnax() -> list[str]:
 
 @dataclass(frozen=True)
 class _Factory:
-    """Makes a shipped proxy whose default params are its weights."""
+    """Makes a shipped proxy."""
 
     name: str
 
     def __call__(self) -> Any:
-        env, params = load(self.name)
-        return env.with_default_params(params)
+        return load(self.name)[0]

@@ -43,10 +43,11 @@ def find(source: str | Path, option: str = "source", also: Sequence[str] = ()) -
     """
     if hub.is_address(source):
         return hub.fetch(str(source), option)
-    path, text = Path(source), shortened(source)
+    text = shortened(source)
     try:
+        path = Path(source)
         is_dir, is_file = path.is_dir(), path.is_file()
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, TypeError) as error:
         raise ConfigError(
             f"{option} must be a path; got {text} ({type(error).__name__})."
         ) from None
@@ -102,7 +103,7 @@ def read(path: Path, option: str) -> tuple[dict[str, np.ndarray], dict[str, Any]
         if is_known and version == 1:
             stored = _from_version_1(stored, is_set=KEY not in metadata)
         if is_known:
-            _check_header(stored)
+            check_header(stored)
     except (LookupError, ValueError, TypeError, AttributeError, ArithmeticError,
             RecursionError) as error:  # fmt: skip
         raise ConfigError(
@@ -129,8 +130,12 @@ def _damaged(path: Path, option: str, how: str) -> ConfigError:
     )
 
 
-def _check_header(header: dict[str, Any]) -> None:
-    """Raises ValueError for metadata of another shape."""
+def check_header(header: dict[str, Any]) -> None:
+    """Checks the metadata of a file.
+
+    Raises:
+      LookupError, ValueError or TypeError: for metadata of another shape.
+    """
     config = header["config"]
     if not all(isinstance(config[group], Mapping) for group in ("env", "proxy")):
         raise ValueError("no task or proxy")

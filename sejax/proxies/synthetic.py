@@ -49,6 +49,8 @@ class SyntheticEnv(ProxyEnv):
       one step there are no networks of state and end, and the state stays as it is. At the task's
       own limit, with no horizon, the episode is truncated.
 
+    Continuous actions are clipped to the task's bounds, as by the task itself.
+
     An output that is not finite, or absurd, ends the episode: the state stays where it was, the
     reward is 0, and `info["nonfinite"]` says whether it was not even a number.
     """
@@ -138,6 +140,8 @@ class SyntheticEnv(ProxyEnv):
     def step_env(
         self, key: Array, state: SyntheticState, action: Any, params: ProxyParams
     ) -> tuple[Array, SyntheticState, Array, Array, dict[Any, Any]]:
+        if self.task.num_actions is None:  # beyond its bounds the networks were never taught
+            action = jnp.clip(action, -self.task.max_action, self.task.max_action)
         vector, reward, done = self.predict(params.weights, state.vector, action)
         size = jnp.maximum(jnp.max(jnp.abs(vector)), jnp.maximum(jnp.abs(reward), jnp.abs(done)))
         sane = size < ABSURD  # False for nan

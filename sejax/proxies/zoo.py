@@ -68,6 +68,7 @@ class PretrainedProxy:
       task: that it stands in for.
       scores: the incumbent's mean score with each family of agents that it was learned with, in the
         generation that it is of; for an SE a test return. None of them if it was not recorded.
+      objective: what they score; "" if it was not recorded.
       generation: that one; None likewise.
       seed: of its run; None likewise.
       horizon: steps of its episodes at most; None for the task's limit.
@@ -83,6 +84,7 @@ class PretrainedProxy:
     kind: str
     task: str
     scores: dict[str, float]
+    objective: str = ""
     generation: int | None
     seed: int | None
     horizon: int | None
@@ -146,6 +148,7 @@ def describe(path: Path, name: str | None = None) -> PretrainedProxy:
         kind=str(config["proxy"].get("name")),
         task=header["task"],
         scores=scores or {},
+        objective=str((config.get("objective") or {}).get("name", "")),
         generation=record.get("generation"),
         seed=record.get("seed"),
         evaluations=tuple(serialize.from_plain(Evaluation, each, "evaluation")
