@@ -183,13 +183,13 @@ def make_trainer(
 
 def _require_parts(agent: Any, env: Any, training: Any) -> None:
     """Checks that the arguments are what they are called, in their order."""
-    require(isinstance(agent, Agent), "agent", "be a sejax.Agent", "it acts and learns",
+    require(hasattr(agent, "learns_from"), "agent", "be a sejax.Agent", "it acts and learns",
             type(agent).__name__, "agent=sejax.make_agent(config, task)")  # fmt: skip
     require(hasattr(env, "step_env"), "env", "be a gymnax environment", "the agent trains there",
             type(env).__name__, "env to the first of the pair that sejax.load returns, or to "
             "task.env")  # fmt: skip
-    require(isinstance(training, TrainingConfig), "training", "be a sejax.TrainingConfig", "it says "
-            "how long", type(training).__name__,
+    require(isinstance(training, TrainingConfig), "training", "be a sejax.TrainingConfig",
+            "it says how long agents train", type(training).__name__,
             "training=sejax.TrainingConfig(max_episodes=100)")  # fmt: skip
     require(not jax.config.jax_enable_x64, "jax_enable_x64", "be off", "sejax counts and computes "
             "in 32 bits", "true", "JAX_ENABLE_X64=0")  # fmt: skip

@@ -97,7 +97,7 @@ def test_a_loaded_proxy_steps_as_a_gymnax_environment():
     env, params = sejax.load("cartpole")
     obs, state = env.reset(jax.random.key(0), params)
     key, action = jax.random.key(1), jnp.int32(1)
-    obs, after, reward, terminated, *_ = env.step(key, state, action, params)
+    obs, _, reward, terminated, *_ = env.step(key, state, action, params)
     assert obs.shape == (4,) and reward.shape == () and terminated  # after its only step
     assert env.step(key, state, action)[2] == reward, "wrappers may leave the params out"
 

@@ -96,6 +96,10 @@ class LearnConfig:
             return families.JOINT.join(family.key for family in families_of(self))
         return plugins.name_of(group, getattr(self, group))
 
+    def plain(self) -> dict[str, Any]:
+        """Nested plain values, as in `config.yaml`; what `sejax.save` keeps with a proxy."""
+        return to_plain(self)
+
     def task(self) -> envs.Task:
         """The real task; it is built once."""
         return envs.make_from(self.env)

@@ -163,8 +163,8 @@ def _world(
     config = plugins.configure("proxy", header["config"]["proxy"])
     if isinstance(task, str):
         task = RealTask.of_gymnasium(task)
-    require(task is None or isinstance(task, RealTask), "task", "be a sejax.gym.RealTask, or an id of "
-            "Gymnasium", "an SE takes its spaces from there", type(task).__name__,
+    require(task is None or isinstance(task, RealTask), "task", "be a sejax.gym.RealTask, or an id "
+            "of Gymnasium", "an SE takes its spaces from there", type(task).__name__,
             "task=sejax.gym.RealTask.of_env(env)")  # fmt: skip
     if task is None:
         task = real_task(header, needs_starts=config.needs_task)

@@ -102,8 +102,9 @@ class RewardNetwork(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
         self._num_states = num_categories(env.observation_space)
         if "interface" in header:
             learned = RealTask.of_interface(header["interface"]).observation_space
-            require((self._num_states, obs_dim) == (num_categories(learned), vector_size(learned, "")),
-                    "env", f"have observations such as those of {header['task']}, {learned}",
+            wanted = num_categories(learned), vector_size(learned, "observation_space")
+            require((self._num_states, obs_dim) == wanted, "env",
+                    f"have observations such as those of {header['task']}, {learned}",
                     "the network sees them", env.observation_space,
                     f"env to an environment of {header['task']}")  # fmt: skip
         networks.check(weights, _shapes(self.config, obs_dim, len(self._info_keys)))

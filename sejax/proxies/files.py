@@ -194,8 +194,8 @@ class ProxySet:
     def proxy(self, index: int) -> Proxy:
         """One of them; its `env` is a copy that has its params as default ones."""
         params = self.one(index)
-        return Proxy(env=self.env.with_default_params(params), params=params, record=self.records[index],
-                     config=self.config, discount=self.discount,
+        return Proxy(env=self.env.with_default_params(params), params=params,
+                     record=self.records[index], config=self.config, discount=self.discount,
                      path=self.path)  # fmt: skip
 
     def fingerprint(self, index: int) -> str:
