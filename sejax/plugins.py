@@ -345,8 +345,8 @@ def _as_dataclass(group: str, name: str, found: Any) -> Any:
     else:
         raise ConfigError(
             f"{group} must name a dataclass with make({', '.join(arguments)}), or a function that "
-            f"takes ({', '.join((*arguments, '**options'))}), because its fields are the options; "
-            f'{name} is {shortened(found)}. See the README, "Adding to it".'
+            f"takes ({', '.join((*arguments, 'option=default, ...'))}), because its fields are the "
+            f'options; {name} is {shortened(found)}. See the README, "Adding to it".'
         )
     if f"{cls.__module__}:{cls.__qualname__}" != name:
         _NAMES[cls] = name

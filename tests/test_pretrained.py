@@ -1,6 +1,7 @@
 """The proxies that ship: what is said of them, and that anybody's agents learn on them."""
 
 import math
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -12,6 +13,8 @@ from plain_agents import agent_for, learn, mean_return
 
 import sejax
 from sejax import envs
+from sejax.app.compose import evaluate_config
+from sejax.evaluate import proxy_study
 from sejax.gym import GYMNASIUM_IDS, make
 from sejax.proxies import zoo
 from sejax.proxies.files import PRETRAINED_DIR
@@ -47,6 +50,10 @@ def test_each_says_what_it_teaches_and_carries_its_card(name):
         assert said in proxy.card
     for each in proxy.evaluations:
         assert f"{each.return_mean:.1f} ± {each.return_std:.1f}" in proxy.card
+    (words,) = re.findall(r"`python -m sejax\.evaluate (.*)` trains agents", proxy.card)
+    study = proxy_study(evaluate_config(words.split()))
+    best = max(proxy.on_proxy, key=lambda each: each.return_mean)
+    assert best.agent in study.worlds["the proxy"][2], "the command trains what did best"
 
 
 @pytest.mark.parametrize("name", SES)

@@ -10,7 +10,7 @@ from support import numpy_forward
 
 import sejax
 from sejax import bilevel, envs, plugins
-from sejax.agents import make_agent
+from sejax.agents import Agent, make_agent
 from sejax.agents.tabular import QLearningConfig
 from sejax.app import build
 from sejax.errors import ConfigError
@@ -242,6 +242,17 @@ def test_the_discount_is_the_agents():
     (row,) = trajectory(env, weights, [action])
     assert state == 36
     np.testing.assert_allclose(table[state, action], row[2], rtol=1e-5)
+
+
+def test_an_agent_without_a_discount_is_told_where_one_is_needed():
+    agent = Agent(init=None, act=None, update=None, memory=None, hparams={"rate": 0.1})
+    env = make_env("cliff_walking")
+    with pytest.raises(
+        ConfigError, match=r"^agent must say its discount, because additive_potential"
+    ):
+        env.prepared(env.default_params, agent.discount(agent.hparams))
+    env = make_env("cliff_walking", "exclusive_non_potential")
+    assert env.prepared(env.default_params, agent.discount(agent.hparams)).discount == 1
 
 
 def test_prepared_params_look_up_what_the_network_says():

@@ -31,7 +31,7 @@ class Agent:
       learns_from: first episode, counted from 0, in which the agent learns.
       env_action: `action -> action` as the world takes it.
       action_repeat: steps of the world for each decision.
-      discount: `hparams -> []`, gamma, which a potential-based reward needs.
+      discount: `hparams -> []`, gamma, which a potential-based reward needs; None if there is none.
       batch_size: `state -> []` or None: columns of a batch in use, where hyperparameters vary.
       cpu_lanes: agents that best train in lockstep on a CPU core; None for as many as there are.
         A network keeps a core busy alone, a table does not.
@@ -52,7 +52,7 @@ class Agent:
     learns_from: int = 0
     env_action: Callable[[Any], Any] = lambda action: action
     action_repeat: int = 1
-    discount: Callable[[Any], Any] = lambda hparams: hparams.discount
+    discount: Callable[[Any], Any] = lambda hparams: getattr(hparams, "discount", None)
     batch_size: Callable[[Any], Any] = lambda state: None
     cpu_lanes: int | None = 1
     variants: tuple["Agent", ...] = ()

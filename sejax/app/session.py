@@ -209,7 +209,8 @@ class Proxies:
         # Who followed the run and where it was computed are no part of what was learned.
         plain = build.to_plain(config)
         self._plain = {k: v for k, v in plain.items() if k not in ("tracker", "machines")}
-        self._discount = float(program.agent.discount(program.agent.hparams))
+        discount = program.agent.discount(program.agent.hparams)
+        self._discount = None if discount is None else float(discount)
         self._stored: dict[int, int] = {}  # generation of each seed's best one that is on the disk
 
     def save(self, state: Any) -> None:

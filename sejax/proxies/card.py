@@ -5,7 +5,7 @@ Shipped files carry theirs, of which `docs/zoo.md` is made; `sejax.push` puts on
 
 from collections.abc import Sequence
 
-from sejax import hub
+from sejax import hub, plugins
 from sejax.proxies.zoo import Evaluation, Learning, PretrainedProxy
 
 KINDS = {"se": "synthetic environment (SE)", "rn": "reward network (RN)"}
@@ -126,12 +126,26 @@ def _cost(proxy: PretrainedProxy, learning: Learning) -> str:
     )
 
 
+def _words_of_best(proxy: PretrainedProxy) -> str:
+    """Words for `sejax.evaluate` that train the agents which learned best."""
+    best = max(proxy.on_proxy, key=lambda each: each.return_mean, default=None)
+    if best is None:
+        return ""
+    if best.hparams != "as_learned":
+        return f" agent={best.agent}" + (
+            " agent_hparams=varied" if best.hparams == "varied" else ""
+        )
+    of_sejax = [plugins.find("agent", name) for name in proxy.agents
+                if plugins.is_registered("agent", name)]  # fmt: skip
+    # Who is solved for on an SE cannot train on the real task beside it.
+    alone = any(getattr(agent, "is_solved_for", False) for agent in of_sejax)
+    return " agent_hparams=as_learned" + (" baseline=false" if alone else "")
+
+
 def _usage(proxy: PretrainedProxy, source: str, needs: Sequence[str]) -> str:
     given = "".join(f", {name}=..." for name in needs)
     words = "".join(f" {_WORDS[name]}=..." for name in needs)
-    best = max(proxy.on_proxy, key=lambda each: each.return_mean, default=None)
-    if best is not None and best.hparams != "default":
-        words += f" agent_hparams={best.hparams}"
+    words += _words_of_best(proxy)
     call = f'("{source}"{given})'
     gym = f"env = sejax.gym.make{call}  # a gymnasium.Env, in NumPy: any agent, no JAX\n"
     install = "With `pip install 'sejax[hub]'`:\n\n" if hub.is_address(source) else ""

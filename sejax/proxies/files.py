@@ -470,10 +470,11 @@ def _registered(
     """The configuration of a group, if its name is one that sejax or a package has registered."""
     name = shortened(config[group].get("name"))
     if not _is_registered(group, config[group]):
+        named = name if ":" in name else f"my_module:function, one that makes {name},"
         raise ConfigError(
             f"{option} must be a proxy of a registered {group} if no {argument} is given, because "
             f"what a file names is never imported; {path} is one of {name!r}. Give it: "
-            f"sejax.load(path, {argument}=...), or {word}={name} on the command line."
+            f"sejax.load(path, {argument}=...), or {word}={named} on the command line."
         )
     return plugins.configure(group, config[group])
 

@@ -74,13 +74,13 @@ class ProxyEnv(environment.Environment[Any, Any]):
         return ProxyParams(weights=weights, max_steps_in_episode=self.task.max_steps)
 
     def prepared(
-        self, params: Any, discount: Array | float, limit_is_terminal: Array | bool = False
+        self, params: Any, discount: Array | float | None, limit_is_terminal: Array | bool = False
     ) -> Any:
         """The same params for a whole training of an agent.
 
         Args:
           params: of the proxy.
-          discount: the agent's.
+          discount: the agent's; None if it has none.
           limit_is_terminal: whether the agent does not bootstrap at the step limit.
         """
         return params
@@ -121,7 +121,7 @@ def world_of(env: Any) -> World:
     return getattr(env, "world", World())
 
 
-def prepare(env: Any, params: Any, discount: Array | float, limit_is_terminal: bool) -> Any:
+def prepare(env: Any, params: Any, discount: Array | float | None, limit_is_terminal: bool) -> Any:
     """A world's params for a whole training: `ProxyEnv.prepared` if there is one."""
     prepared = getattr(env, "prepared", None)
     return params if prepared is None else prepared(params, discount, limit_is_terminal)

@@ -13,6 +13,7 @@ from gymnax.environments import environment
 from jaxtyping import Array, Float
 
 from sejax.envs.task import Task
+from sejax.errors import require
 from sejax.networks import MLP, uniform_fan_in
 from sejax.proxies.proxy import ABSURD, ProxyEnv
 
@@ -97,20 +98,26 @@ class RewardEnv(ProxyEnv):
     def prepared(
         self,
         params: RewardParams,
-        discount: Array | float,
+        discount: Array | float | None,
         limit_is_terminal: Array | bool = False,
     ) -> RewardParams:
         """The same for a whole training of an agent.
 
+        Raises:
+          ConfigError: if the reward needs a discount and the agent has none.
+
         Where states are counted, all potentials are computed at once: a step then looks its two up.
         They are these weights': with other weights prepare again.
         """
+        require(discount is not None or not self.config.is_potential_based, "agent", "say its "
+                "discount", f"{self.config.variant} pays with it", "none",
+                "Agent(discount=lambda hparams: ...)")  # fmt: skip
         potentials = None
         if self.task.num_states is not None and not self.config.weighs_info:
             states = jnp.arange(self.task.num_states)
             potentials = self._apply(params.weights, jax.nn.one_hot(states, states.size))
         return params.replace(
-            discount=jnp.float32(discount),
+            discount=jnp.float32(1.0 if discount is None else discount),
             limit_is_terminal=jnp.bool_(limit_is_terminal),
             potentials=potentials,
         )
