@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-import math
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -167,7 +166,7 @@ def proxy_study(config: EvaluateConfig) -> Study:
             require(not getattr(family.agent, "is_solved_for", False), "baseline", "be false with "
                     f"{family.field}={family.key}", "only a one-step SE can be solved for", "true",
                     "baseline=false")  # fmt: skip
-        real_training = dict.fromkeys(trainings, config.real_training)
+        real_training = dict.fromkeys(trainings, _real_training(config, proxy))
         worlds["the real task"] = (task.env, task.params, real_training)
     beside = proxy.path.parent
     if beside == files.PRETRAINED_DIR:
@@ -200,7 +199,7 @@ def _training_on(proxy: Any, config: EvaluateConfig, agent: Any) -> tuple[str, A
     if config.training_from == "config":
         return "training", config.training
     if proxy.env.is_real:  # agents train and stop as on the real task
-        return "real_training", config.real_training
+        return "real_training", _real_training(config, proxy)
     require("training" in proxy.config, "training_from", "be config for an SE whose file does not "
             "say how long agents trained on it", "tests on the real task must not stop them",
             config.training_from, "training_from=config training.stop_rule=never "
@@ -208,6 +207,15 @@ def _training_on(proxy: Any, config: EvaluateConfig, agent: Any) -> tuple[str, A
     test_episodes = config.real_training.test_episodes
     training = dataclasses.replace(proxy.training_for(agent), test_episodes=test_episodes)
     return "real_training", training
+
+
+def _real_training(config: EvaluateConfig, proxy: Any) -> TrainingConfig:
+    """How agents train on real dynamics; those of an RN's run take its limit as they did there."""
+    as_learned = config.agent_hparams == "as_learned" and "training" in proxy.config
+    if not (as_learned and proxy.env.is_real):
+        return config.real_training
+    is_terminal = proxy.learned_with("training").time_limit_is_terminal
+    return dataclasses.replace(config.real_training, time_limit_is_terminal=is_terminal)
 
 
 def _train_and_test(config: EvaluateConfig, study: Study, world: str, family: AgentFamily) -> Any:
@@ -247,6 +255,8 @@ def _print_table(summary: Any, study: Study, config: EvaluateConfig) -> None:
     from rich.console import Console
     from rich.table import Table
 
+    from sejax.app.report import spread
+
     agents = "agents of each family" if study.has_several else f"{study.families[0].key} agents"
     solved_at = study.task.solved_reward
     solved = f" (solved at {solved_at:g})" if study.task.is_solvable else ""
@@ -257,9 +267,9 @@ def _print_table(summary: Any, study: Study, config: EvaluateConfig) -> None:
     for index, row in summary.iterrows():
         table.add_row(
             *([index] if len(labels) == 1 else index),
-            _spread(row.test_return_mean, row.test_return_std, 1),
-            _spread(row.train_steps_mean, row.train_steps_std, 0),
-            _spread(row.train_episodes_mean, row.train_episodes_std, 1),
+            spread(row.test_return_mean, row.test_return_std, 1),
+            spread(row.train_steps_mean, row.train_steps_std, 0),
+            spread(row.train_episodes_mean, row.train_episodes_std, 1),
         )
     console = Console(highlight=False)
     console.print(table)
@@ -268,11 +278,6 @@ def _print_table(summary: Any, study: Study, config: EvaluateConfig) -> None:
         console.print(f"{diverged} agents met a number that is not finite.")
     console.print(f"{study.out_dir}/evaluation.csv, .json and .png hold every agent.",
                   soft_wrap=True)  # fmt: skip
-
-
-def _spread(mean: float, std: float, digits: int) -> str:
-    """Mean and deviation; one agent has none."""
-    return f"{mean:,.{digits}f}" + (f" ± {std:,.{digits}f}" if math.isfinite(std) else "")
 
 
 def _as_file_name(name: str) -> str:

@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 
 from sejax.agents.agent import Agent
 from sejax.errors import require
-from sejax.es.strategy import AGGREGATES, finite_mean
+from sejax.es.strategy import AGGREGATES, finite_mean, is_tie
 from sejax.options import Options, one_of, option
 
 COMPARED_BY = ("advantage", "rank")
@@ -151,15 +151,16 @@ class Families:
 
 
 def _advantages(scores: Float[Array, " members"], incumbent: Array) -> Float[Array, " members"]:
-    return scores - incumbent
+    return jnp.where(is_tie(scores, incumbent), 0.0, scores - incumbent)
 
 
 def _ranks(scores: Float[Array, " members"], incumbent: Array) -> Float[Array, " members"]:
     """Shares of the members that are worse, less that of the incumbent."""
 
-    def share_below(score: Array) -> Array:
-        worse = scores < score  # False where either is not a number
-        return (worse.sum() + 0.5 * (scores == score).sum()) / scores.shape[0]
+    def share_below(score: Array, same: Array) -> Array:
+        worse = (scores < score) & ~same  # False where either is not a number
+        return (worse.sum() + 0.5 * same.sum()) / scores.shape[0]
 
-    shares = jax.vmap(share_below)(scores) - share_below(incumbent)
+    below = jax.vmap(lambda score: share_below(score, scores == score))(scores)
+    shares = below - share_below(incumbent, is_tie(scores, incumbent))
     return jnp.where(jnp.isfinite(scores), shares, jnp.nan)

@@ -70,6 +70,16 @@ def atomic_path(path: Path) -> Iterator[Path]:
         temporary.unlink(missing_ok=True)
 
 
+def as_file_name(text: str) -> str:
+    """The text with what a file's name had better not have made underscores.
+
+    Example:
+      >>> as_file_name("env=mine:Task,seed=1")
+      'env_mine_Task_seed_1'
+    """
+    return re.sub(r"[^\w.+-]+", "_", text)
+
+
 def write_text(path: Path, text: str) -> None:
     """Replaces the file's text atomically."""
     write_bytes(path, text.encode("utf-8"))

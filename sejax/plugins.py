@@ -146,7 +146,7 @@ def find(group: str, name: str) -> Any:
     if not isinstance(name, str):
         raise unknown_name(group, shortened(name), names(group))
     if name in kind.built_in:
-        return _attribute(group, kind.built_in[name])
+        return _attribute(kind.built_in[name])
     offered = _offered(group)
     if name in offered:
         try:
@@ -159,7 +159,7 @@ def find(group: str, name: str) -> Any:
         return _as_dataclass(group, name, found)
     family = _family(group, name)
     if family is not None:
-        return _attribute(group, family)
+        return _attribute(family)
     if ":" in name:
         return _as_dataclass(group, name, _import(group, name))
     raise unknown_name(group, name, names(group))
@@ -273,11 +273,10 @@ def _checked(group: str, config: Any, made: Any) -> Any:
               "exploration": "sejax.agents.agent:Agent", "proxy": "sejax.proxies.proxy:ProxyEnv",
               "objective": "sejax.objectives:Objective",
               "es": "sejax.es.strategy:Strategy"}[group]  # fmt: skip
-    module, _, attribute = wanted.partition(":")
-    kind = getattr(importlib.import_module(module), attribute)
-    require(isinstance(made, kind), group, f"make a sejax.{attribute}", "that is what is used",
+    kind = _attribute(wanted)
+    require(isinstance(made, kind), group, f"make a sejax.{kind.__name__}", "that is what is used",
             f"{type(made).__name__} from {name_of(group, config)}",
-            f"{group} to a plugin that returns a sejax.{attribute}")  # fmt: skip
+            f"{group} to a plugin that returns a sejax.{kind.__name__}")  # fmt: skip
     return made
 
 
@@ -301,7 +300,7 @@ def _offered(group: str) -> dict[str, Any]:
     return {point.name: point for point in points if point.name not in GROUPS[group].built_in}
 
 
-def _attribute(group: str, path: str) -> Any:
+def _attribute(path: str) -> Any:
     module, _, attribute = path.partition(":")
     return getattr(importlib.import_module(module), attribute)
 

@@ -7,7 +7,6 @@ The page is one HTML file that needs nothing else. Beside an evaluation in the r
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from sejax.app import commands
 from sejax.errors import require
@@ -27,15 +26,13 @@ def main(words: Sequence[str] | None = None) -> None:
     if {"--help", "-h"} & {*words}:
         print(USAGE)
         return
-    write: Any = commands.guarded(lambda _: _main(words))
-    write(words)
+    commands.guarded(_main)(words)
 
 
-def _main(words: Sequence[str]) -> float:
+def _main(words: Sequence[str]) -> None:
     outs = [word.removeprefix("out=") for word in words if word.startswith("out=")]
     folders = [Path(word) for word in words if not word.startswith("out=")]
     print(report(folders, Path(outs[-1]) if outs else None))
-    return float(len(folders))
 
 
 def report(folders: Sequence[Path], out: Path | None = None) -> Path:

@@ -15,12 +15,10 @@ from jaxtyping import Array, Float, Int
 from sejax.agents.agent import Agent
 from sejax.agents.memory import Memory, MemoryMaker
 from sejax.agents.replay import Transition
-from sejax.errors import require
+from sejax.errors import LARGEST, require
 from sejax.keys import step_keys
 from sejax.loops import while_any_active
 from sejax.training import TrainingConfig, require_reachable
-
-_NO_LIMIT = 2**31 - 1
 
 
 @struct.dataclass
@@ -246,7 +244,7 @@ class _Loop:
         self.limit_is_terminal = limit_is_terminal
         self.test_fn = test_fn if training.num_tests_between else None
         self.env = repeat_actions(env, agent.action_repeat)
-        self.max_steps = self.memory_steps = training.max_steps or _NO_LIMIT
+        self.max_steps = self.memory_steps = training.max_steps or LARGEST
         if world.max_steps is not None:
             require_reachable("training", training, world.max_steps)
             self.memory_steps = min(self.max_steps, training.max_episodes * world.max_steps)
@@ -361,9 +359,7 @@ class _Loop:
         if self.test_fn is not None:
             tested, num_steps = self.test_fn(key_test, state.agent_state, ended)
             state = state.replace(tested=tested, test_steps=state.test_steps + num_steps)
-            judged = tested if self.training.solved_by == "test" else judged
-        if self.training.stop_rule == "plateau":
-            judged = state.episode_return
+            judged = tested if self.training.stops_by_tests else judged
         recent = jnp.concatenate([state.recent[1:], judged[None]])
         stop = self.stops(state, recent)
         obs, env_state = self.env.reset_env(key_reset, env_params)

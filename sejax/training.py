@@ -46,10 +46,14 @@ class TrainingConfig(Options):
         return self.stop_rule == "never" and self.max_steps is not None
 
     @property
+    def stops_by_tests(self) -> bool:
+        """Whether tests between training episodes say that the task is solved."""
+        return self.stop_rule == "solved" and self.solved_by == "test"
+
+    @property
     def num_tests_between(self) -> int:
         """Test episodes after each training episode."""
-        by_tests = self.stop_rule == "solved" and self.solved_by == "test"
-        return max(self.tests_between, int(by_tests))
+        return max(self.tests_between, int(self.stops_by_tests))
 
 
 def budget_for(

@@ -271,6 +271,16 @@ def test_one_agent_has_no_deviation(tmp_path, capsys):
     assert set(pd.read_csv(tmp_path / "evaluation.csv").world) == {"the real task"}
 
 
+def test_agents_of_an_rn_take_the_time_limit_as_they_learned_it(tmp_path):
+    """Pendulum's bootstrap there; on the real task beside the RN they do likewise."""
+    path = save(tmp_path / "proxy.safetensors", "env=pendulum", "proxy=rn")
+    words = [f"proxy={path}", f"out_dir={tmp_path}"]
+    for given, expected in (["agent_hparams=as_learned"], False), (["agent=td3"], True):
+        study = proxy_study(evaluate_config(*words, *given, words=[]))
+        for _, _, trainings in study.worlds.values():
+            assert trainings["td3"].time_limit_is_terminal == expected
+
+
 def test_an_se_that_does_not_say_how_long_agents_trained_needs_the_config(room, tmp_path):
     """Tests on the real task, by which agents there stop, are not for an SE."""
     proxies = files.load_set(room)

@@ -153,6 +153,13 @@ def test_scores_are_compared_within_their_family(by, incumbents):
     assert incumbent == 0.0
 
 
+@pytest.mark.parametrize("by", COMPARED_BY)
+def test_what_ties_with_the_incumbent_but_for_rounding_moves_nothing(by):
+    mean = np.float32(-93.3) - np.float32(2e-5)  # as a mean of equal scores may be off
+    got, _ = compare([-93.3, 0.0, -93.3, 1.0], [0, 1, 0, 1], [mean, 0.5], by)
+    assert got[0] == got[2] == 0 and got[1] < 0 < got[3]
+
+
 def test_comparison_by_hand():
     scores, family, incumbents = [190, -80, 200, -100, 170, NAN], [0, 1, 0, 1, 0, 1], [185, -90]
     got, _ = compare(scores, family, incumbents, "advantage")

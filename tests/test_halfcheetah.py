@@ -185,6 +185,7 @@ def test_the_papers_settings_are_its_own():
         (["env=cartpole", "+env.backend=mjx"], r"env\.backend must be a field of CartPole"),
         (["env=halfcheetah", "preset=paper"], "preset=paper for halfcheetah with proxy=se"),
         (["env=cartpole", "proxy=rn", "proxy.augmented=true"], "proxy.augmented=false"),
+        (["env=reacher", "proxy=rn", "proxy.augmented=true"], "proxy.augmented=false"),  # has no v
         (["env=cartpole", "proxy=rn", "proxy.variant=additive_weighted_info"], "potential"),
         (["env=halfcheetah", "proxy=rn", "proxy.variant=exclusive_weighted_info",
           "proxy.augmented=true"], "has no network"),

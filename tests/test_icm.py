@@ -11,11 +11,14 @@ import pytest
 from flax import struct
 from support import numpy_forward, random_like, shapes_of, unraveled
 
+from sejax import envs
+from sejax.agents import make_agent
 from sejax.agents.agent import Agent
 from sejax.agents.ddqn import DDQNConfig, make_ddqn
 from sejax.agents.icm import ICM, ICMConfig, ICMOutputs, icm_loss, with_icm
 from sejax.agents.memory import Rollout, replay_memory
 from sejax.agents.replay import Transition, pack
+from sejax.errors import ConfigError
 
 OBS_DIM, WIDTH, BATCH = 3, 2, 7  # WIDTH: actions to choose from, or length of an action
 GOLDEN = Path(__file__).parent / "golden" / "icm_updates.npz"
@@ -417,3 +420,15 @@ def test_everything_else_is_the_wrapped_agents():
     epsilon, expected_epsilon, *actions = begin_and_act(wrapped_ddqn_state(), keys)
     assert epsilon == expected_epsilon and 0 < epsilon < 1
     np.testing.assert_array_equal(*actions)
+
+
+@pytest.mark.parametrize("field", ["train_every", "gradient_steps"])
+def test_an_agent_that_does_not_learn_once_at_each_step_is_refused(field):
+    task = envs.make("cartpole")
+    with pytest.raises(
+        ConfigError, match=rf"^agent\.{field} must be 1 with exploration=icm, .*got 4"
+    ):
+        make_agent(DDQNConfig(**{field: 4}), task, ICMConfig())
+    assert make_agent(DDQNConfig(), task, ICMConfig()) and make_agent(
+        DDQNConfig(**{field: 4}), task
+    )

@@ -253,7 +253,7 @@ def test_an_attribute_may_be_anything_that_is_found(module):
         said = refused("objective", f"{name}:{attribute}")
         assert said.startswith(
             "objective must name a dataclass with make(task), or a function that takes (task, "
-            "**options), because its fields are the options; "
+            "option=default, ...), because its fields are the options; "
         ), said
         assert f"{name}:{attribute} is " in said
     for attribute in ("too_few", "of_any"):

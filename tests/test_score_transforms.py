@@ -173,3 +173,15 @@ def test_only_members_better_than_the_incumbent_weigh(name, scores, incumbent):
     assert weights.any() == better.any()
     if name == "all_better_2" and better.any():
         np.testing.assert_allclose(weights.sum(), 1, rtol=1e-5)
+
+
+@pytest.mark.parametrize("name", ["single_better", "all_better_1", "all_better_2"])
+@pytest.mark.parametrize("score", [0.99, -0.1, -93.3, -99_900.1])
+def test_rounding_of_the_incumbents_mean_is_no_advantage(name, score):
+    """A mean in single precision of equal scores may be some last digits below them."""
+    score = np.float32(score)
+    for below in range(8):
+        incumbent = score - np.float32(below) * np.spacing(np.abs(score))
+        assert not transform(name, [score] * 4, incumbent).any()
+    better = score + np.float32(1e-4) * np.abs(score)
+    np.testing.assert_array_equal(transform(name, [score, better, score], score), [0, 1, 0])

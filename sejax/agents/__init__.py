@@ -90,12 +90,21 @@ def require_fit(agent: Any, exploration: Any, facts: Any, task_name: str) -> Non
         require(False, "agent", f"be one of {', '.join(fitting)} in {task_name}",
                 f"its states are {facts.states} and its actions {facts.actions}",
                 plugins.name_of("agent", agent), f"agent={fitting[0]}")  # fmt: skip
+    for field in ("train_every", "gradient_steps") if _learns_each_step(exploration) else ():
+        value = getattr(agent, field, 1)
+        require(value == 1, f"agent.{field}", "be 1 with "
+                f"exploration={plugins.name_of('exploration', exploration)}", "its module learns "
+                "once at each step, and so must the agent", value, f"agent.{field}=1")  # fmt: skip
     wanted = getattr(exploration, "states", None)
     name = plugins.name_of("agent", agent)
     require(wanted in (None, getattr(agent, "states", wanted)), "exploration", f"suit {name}",
             f"{plugins.name_of('exploration', exploration)} is made for agents with {wanted} "
             "states", plugins.name_of("exploration", exploration),
             "exploration=none")  # fmt: skip
+
+
+def _learns_each_step(exploration: Any) -> bool:
+    return getattr(exploration, "learns_each_step", False)
 
 
 def default_for(facts: Any) -> str:

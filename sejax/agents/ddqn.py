@@ -23,8 +23,8 @@ from sejax.agents.epsilon_greedy import decayed_epsilon, epsilon_greedy
 from sejax.agents.memory import replay_memory
 from sejax.agents.partial_batch import sum_over_batch
 from sejax.agents.replay import Transition, num_columns
-from sejax.networks import ACTIVATIONS, MLP, DuelingMLP, narrow
-from sejax.options import MOST_LAYERS, counts, fraction, one_of, option, positive
+from sejax.networks import MLP, DuelingMLP, narrow
+from sejax.options import ACTIVATIONS, MOST_LAYERS, counts, fraction, one_of, option, positive
 
 MOVES = "the agent would not move"
 # Small agents train in lockstep on a core: measured, 2.3 times as fast as alone. Twice as many gain

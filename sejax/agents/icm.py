@@ -35,6 +35,7 @@ class ICMConfig(Options):
 
     group: ClassVar[str] = "exploration"
     states: ClassVar[str] = "vector"  # of the agents that it is made for
+    learns_each_step: ClassVar[bool] = True  # and so must the agent
 
     learning_rate: float = option(1e-5, positive("Adam would not move"), traced=True)
     # beta: the forward model's share of the loss

@@ -25,8 +25,9 @@ from sejax.agents.memory import Rollout, rollout_memory
 from sejax.agents.policies import SOFTMAX, Distribution, gaussian
 from sejax.errors import require
 from sejax.keys import murmur
-from sejax.networks import ACTIVATIONS, MLP, narrow
+from sejax.networks import MLP, narrow
 from sejax.options import (
+    ACTIVATIONS,
     MOST_LAYERS,
     counts,
     fraction,

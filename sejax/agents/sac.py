@@ -25,8 +25,9 @@ from sejax.agents.ddqn import MOVES, select_action
 from sejax.agents.memory import replay_memory
 from sejax.agents.partial_batch import sum_over_batch
 from sejax.agents.replay import Transition, num_columns
-from sejax.networks import ACTIVATIONS, MLP, narrow
+from sejax.networks import MLP, narrow
 from sejax.options import (
+    ACTIVATIONS,
     MOST_LAYERS,
     counts,
     finite,

@@ -23,8 +23,17 @@ from sejax.agents.agent import Agent, AgentOptions, traced
 from sejax.agents.memory import replay_memory
 from sejax.agents.partial_batch import sum_over_batch
 from sejax.agents.replay import Transition, num_columns
-from sejax.networks import ACTIVATIONS, MLP, narrow
-from sejax.options import MOST_LAYERS, counts, fraction, not_negative, one_of, option, positive
+from sejax.networks import MLP, narrow
+from sejax.options import (
+    ACTIVATIONS,
+    MOST_LAYERS,
+    counts,
+    fraction,
+    not_negative,
+    one_of,
+    option,
+    positive,
+)
 
 _MIN_TEMPERATURE = 1e-6
 

@@ -1,7 +1,6 @@
 """A command's configuration: typed, validated, and able to make the objects that it describes."""
 
 import dataclasses
-import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,8 +9,9 @@ from typing import Any
 from sejax import agents, envs, plugins, serialize
 from sejax.app import families
 from sejax.app.families import AgentsConfig, families_of
-from sejax.errors import ConfigError, one_of, require, require_seed, shortened, whole
+from sejax.errors import one_of, require, require_seed, shortened, whole
 from sejax.families import Families
+from sejax.files import as_file_name
 from sejax.training import TrainingConfig, require_reachable, steps_before_learning
 
 AGENT_HPARAMS = ("default", "varied")
@@ -55,7 +55,7 @@ class LearnConfig:
     lanes: int | None  # agents in lockstep on one device; null: what suits agent and device
     devices: int | None  # devices to spread the population over; null: all
     checkpoint_every: int  # generations
-    run_dir: str | None  # null: runs/<env>-<proxy>-<agent>-s<seed>
+    run_dir: str | None  # null: runs/<env>-<proxy>-<agent>[_<exploration>][_varied]-s<seed>
 
     def __post_init__(self) -> None:
         one_of("agent_hparams", self.agent_hparams, AGENT_HPARAMS)
@@ -137,7 +137,7 @@ class LearnConfig:
         varied = "_varied" if self.agent_hparams == "varied" else ""
         agent = f"{self.name('agent')}{explored}{varied}"
         name = f"{self.name('env')}-{self.name('proxy')}-{agent}-s{self.seed}"
-        return Path(self.run_dir or Path("runs", re.sub(r"[^\w.+-]+", "_", name)))
+        return Path(self.run_dir or Path("runs", as_file_name(name)))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -182,7 +182,7 @@ class EvaluateConfig:
                     families.JOINT.join(family.key for family in families_of(self)),
                     "agent_hparams=default")  # fmt: skip
             for group, usual in (("agent", "ddqn"), ("exploration", "none")):
-                changed = _differences(group, getattr(self, group), {"name": usual})
+                changed = _differences(group, getattr(self, group), usual)
                 require(not changed, group, "be left out with agent_hparams=as_learned", "the "
                         "proxy says which it was learned with", changed,
                         "agent_hparams=default")  # fmt: skip
@@ -282,15 +282,11 @@ def _require_computing(config: Any) -> None:
             whole(1, name, getattr(config, name), "something must compute", "null")
 
 
-def _differences(group: str, config: Any, usual: dict[str, Any]) -> str:
+def _differences(group: str, config: Any, usual: str) -> str:
     """Fields of a group that are not as usual, for messages; its name if that differs."""
-    given, expected = plugins.describe(group, config), plugins.defaults(group, usual["name"])
-    return str(given["name"]) if given["name"] != usual["name"] else _changes(given, expected)
+    given, expected = plugins.describe(group, config), plugins.defaults(group, usual)
+    return str(given["name"]) if given["name"] != usual else _changes(given, expected)
 
 
 def _changes(given: dict[str, Any], usual: dict[str, Any]) -> str:
     return ", ".join(f"{k}={v}" for k, v in given.items() if v != usual.get(k))
-
-
-__all__ = ["ConfigError", "EvaluateConfig", "LearnConfig", "evaluate_config", "learn_config",
-           "to_plain"]  # fmt: skip

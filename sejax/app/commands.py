@@ -20,6 +20,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from sejax.app import compose, runtime
 from sejax.errors import ConfigError, FailedError
+from sejax.files import as_file_name
 
 BAD_INPUT, FAILED, INTERRUPTED = 2, 1, 130
 LONGEST_NAME = 120  # characters of a folder's
@@ -55,7 +56,7 @@ def name_in_sweep(known: Collection[str]) -> str:
         return ""
     swept = [word for word in job.overrides.task if word not in sys.argv]
     words = [word for word in swept if word.partition("=")[0].lstrip("+") not in known]
-    name = re.sub(r"[^\w.+-]+", "_", ",".join(words))
+    name = as_file_name(",".join(words))
     return name if len(name) <= LONGEST_NAME else hashlib.sha256(name.encode()).hexdigest()[:16]
 
 

@@ -279,7 +279,7 @@ def _agent_for(choice: str, is_own: bool, node: dict[str, Any], overrides: Seque
     if facts is None:  # the task must be made to know: with the fields that are asked for
         given = {word.partition("=")[0]: word.partition("=")[2] for word in overrides}
         fields = {name.removeprefix("env."): OmegaConf.create({"x": value}).x
-                  for name, value in ((n, _parsed(v)) for n, v in given.items())
+                  for name, value in ((n, parsed(v)) for n, v in given.items())
                   if name.startswith("env.")}  # fmt: skip
         if "???" in {**node, **fields}.values():
             return _DEFAULT_AGENT  # what is missing is said later
@@ -287,7 +287,8 @@ def _agent_for(choice: str, is_own: bool, node: dict[str, Any], overrides: Seque
     return agents.default_for(facts)
 
 
-def _parsed(text: str) -> Any:
+def parsed(text: str) -> Any:
+    """What YAML reads in a word's value; the text itself if it reads nothing."""
     import yaml
 
     try:

@@ -25,7 +25,9 @@ class HalfCheetah(Options):
     """
 
     group: ClassVar[str] = "env"
-    facts: ClassVar[Facts] = Facts("vector", "continuous", max_steps=1000, has_info=True)
+    facts: ClassVar[Facts] = Facts(
+        "vector", "continuous", max_steps=1000, has_info=True, has_vector=True
+    )
 
     backend: str = option(BACKENDS[0], one_of(BACKENDS))  # physics
 

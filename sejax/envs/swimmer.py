@@ -16,7 +16,9 @@ class Swimmer(Options):
     """
 
     group: ClassVar[str] = "env"
-    facts: ClassVar[Facts] = Facts("vector", "continuous", max_steps=1000, has_info=True)
+    facts: ClassVar[Facts] = Facts(
+        "vector", "continuous", max_steps=1000, has_info=True, has_vector=True
+    )
 
     forward_reward_weight: float = option(1.0, finite("it weighs a reward"))
     ctrl_cost_weight: float = option(1e-4, not_negative("it weighs a cost"))

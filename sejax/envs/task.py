@@ -18,12 +18,14 @@ class Facts(NamedTuple):
       actions: "discrete" or "continuous".
       max_steps: step limit of an episode.
       has_info: whether its steps tell more than the observation; see `Task.info_keys`.
+      has_vector: whether some of that describes the state alone; see `Task.augmented_keys`.
     """
 
     states: str
     actions: str
     max_steps: int
     has_info: bool = False
+    has_vector: bool = False
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -108,6 +110,7 @@ class Task:
             actions="continuous" if self.num_actions is None else "discrete",
             max_steps=self.max_steps,
             has_info=bool(self.info_keys),
+            has_vector=bool(self.augmented_keys),
         )
 
     @property

@@ -1,32 +1,22 @@
 """Walker2d-v5 on MuJoCo, 1000 steps; needs the extra `mujoco`."""
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 from sejax.envs import mujoco
-from sejax.envs.task import Facts, Task
-from sejax.options import Options, finite, not_negative, option
+from sejax.envs.hopper import Hopper
+from sejax.envs.task import Task
 
 
 @dataclass(frozen=True, kw_only=True)
-class Walker2d(Options):
+class Walker2d(Hopper):
     """A planar body on two legs that is paid for walking forward without falling.
 
     Gymnasium has no reward threshold for it. The solved reward is our choice, below the 4,683 that
     TD3's authors report after 1e6 steps.
 
     Source: Gymnasium's registry (episode length); Fujimoto et al., 2018, table 1. Options are
-    Gymnasium's.
+    Gymnasium's, the same as Hopper's.
     """
-
-    group: ClassVar[str] = "env"
-    facts: ClassVar[Facts] = Facts("vector", "continuous", max_steps=1000, has_info=True)
-
-    forward_reward_weight: float = option(1.0, finite("it weighs a reward"))
-    ctrl_cost_weight: float = option(1e-3, not_negative("it weighs a cost"))
-    healthy_reward: float = option(1.0, finite("it is a reward"))
-    terminate_when_unhealthy: bool = True
-    reset_noise_scale: float = option(5e-3, not_negative("it is a range"))
 
     def make(self) -> Task:
         return mujoco.make_task("walker2d", self, solved_reward=4000.0)

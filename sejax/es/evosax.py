@@ -12,8 +12,7 @@ import optax
 from jaxtyping import Array, Float
 
 from sejax.errors import require
-from sejax.es.nes import trials_of
-from sejax.es.strategy import AGGREGATES, Strategy
+from sejax.es.strategy import AGGREGATES, LARGEST, Strategy, trials_of
 from sejax.options import MOST_MEMBERS, Options, counts, one_of, option, positive, shrinks
 
 # Name -> evosax's class. Listed here because importing evosax takes a second; a test holds the list
@@ -47,7 +46,6 @@ ALGORITHMS = {
     "snes": "SNES",
     "xnes": "xNES",
 }
-_LARGEST = 1e6
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,11 +66,11 @@ class EvosaxConfig(Options):
     # Agents trained on the distribution's mean.
     num_incumbent_evals: int = option(16, counts("the incumbent's score selects the proxy"))
     # Initial std of the search distribution.
-    noise_std: float = option(0.05, positive("candidates must differ", _LARGEST))
+    noise_std: float = option(0.05, positive("candidates must differ", LARGEST))
     # Factor for each generation, where the algorithm takes a schedule.
     noise_std_decay: float = option(1.0, shrinks())
     # Learning rate of Adam on the mean, where the algorithm takes one.
-    step_size: float = option(0.05, positive("the mean would not move", _LARGEST))
+    step_size: float = option(0.05, positive("the mean would not move", LARGEST))
     num_evals: int = option(1, counts("a candidate needs a score"))
     eval_aggregate: str = option("mean", one_of(AGGREGATES))
     common_random_numbers: bool = False

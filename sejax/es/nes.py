@@ -4,7 +4,7 @@ Source: paper, Algorithm 1 and appendix "NES Score Transformation"; `docs/refere
 """
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -12,11 +12,10 @@ from flax import struct
 from jaxtyping import Array, Float
 
 from sejax.es.score_transforms import TRANSFORMS
-from sejax.es.strategy import AGGREGATES, Strategy, Trials
+from sejax.es.strategy import AGGREGATES, LARGEST, Strategy, trials_of
 from sejax.options import MOST_MEMBERS, Options, counts, fraction, one_of, option, positive, shrinks
 
 UPDATE_RULES = ("authors", "paper")
-_LARGEST = 1e6  # larger steps or noise lead to weights whose products are not finite
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,11 +33,11 @@ class NESConfig(Options):
         None, counts("the incumbent's score selects the proxy")
     )
     # sigma: std of the weight perturbation
-    noise_std: float = option(0.05, positive("members must differ", _LARGEST), traced=True)
+    noise_std: float = option(0.05, positive("members must differ", LARGEST), traced=True)
     # factor on sigma after each generation
     noise_std_decay: float = option(1.0, shrinks(), traced=True)
     # alpha
-    step_size: float = option(1.0, positive("the proxy would not move", _LARGEST), traced=True)
+    step_size: float = option(1.0, positive("the proxy would not move", LARGEST), traced=True)
     # factor on alpha after each generation
     step_size_decay: float = option(1.0, shrinks(), traced=True)
     mirrored: bool = True  # each member tries +eps and -eps and keeps the better sign
@@ -122,16 +121,6 @@ def make_nes(config: NESConfig, num_dims: int) -> Strategy:
         num_members=num_pairs * num_signs,
         num_signs=num_signs,
         trials=trials_of(config, config.num_incumbent_evals or num_pairs),
-    )
-
-
-def trials_of(config: Any, num_incumbent_evals: int) -> Trials:
-    """How often the proxies of a generation are tried, as a strategy's configuration says."""
-    return Trials(
-        num_evals=config.num_evals,
-        aggregate=config.eval_aggregate,
-        num_incumbent_evals=num_incumbent_evals,
-        common_random_numbers=config.common_random_numbers,
     )
 
 

@@ -12,6 +12,8 @@ from collections.abc import Callable
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from sejax.es.strategy import is_tie
+
 Scores = Float[Array, " pop"]
 ScoreTransform = Callable[[Scores, Float[Array, ""]], Scores]
 
@@ -35,8 +37,9 @@ def rank(scores: Scores, incumbent: Float[Array, ""]) -> Scores:
 
     :math:`R_i` counts the members with a lower score, so that ties share a rank.
     """
-    ranks = _num_lower(scores)
-    return _safe_divide(ranks - ranks.min(), ranks.max() - ranks.min())
+    scores = _ranked_last(scores)
+    ranks = (scores[None, :] < scores[:, None]).sum(axis=1).astype(jnp.float32)
+    return _safe_divide(ranks, ranks.max())  # the lowest is 0
 
 
 def nes(scores: Scores, incumbent: Float[Array, ""]) -> Scores:
@@ -95,14 +98,15 @@ TRANSFORMS: dict[str, ScoreTransform] = {
 
 
 def _advantage(scores: Scores, incumbent: Float[Array, ""]) -> Scores:
-    """Advantage over the incumbent, 0 for members that are not better.
+    """Advantage over the incumbent, 0 for members that are not better by more than rounding.
 
     Every member with a finite score is better than an incumbent without one.
     """
     finite = _floor_nonfinite(scores)
     below_all = finite.min() - jnp.maximum(finite.max() - finite.min(), 1.0)
     floor = jnp.where(jnp.isfinite(incumbent), incumbent, below_all)
-    return jnp.where(jnp.isfinite(scores), jnp.maximum(scores - floor, 0.0), 0.0)
+    is_better = jnp.isfinite(scores) & ~is_tie(scores, floor)
+    return jnp.where(is_better, jnp.maximum(scores - floor, 0.0), 0.0)
 
 
 def _log_utilities(scores: Scores) -> Scores:
@@ -118,11 +122,6 @@ def _log_utilities(scores: Scores) -> Scores:
 def _any_differ(scores: Scores) -> Array:
     ranked = _ranked_last(scores)
     return ranked.max() > ranked.min()
-
-
-def _num_lower(scores: Scores) -> Scores:
-    scores = _ranked_last(scores)
-    return (scores[None, :] < scores[:, None]).sum(axis=1).astype(jnp.float32)
 
 
 def _ranked_last(scores: Scores) -> Scores:

@@ -6,9 +6,11 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 AGGREGATES = ("mean", "min")
+LARGEST = 1e6  # larger steps or noise lead to weights whose products are not finite
+_TIE = 1e-6  # of the incumbent's score, and at least in the score's unit
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,6 +83,16 @@ class Trials:
         return repaired, finite_mean(repaired)
 
 
+def trials_of(config: Any, num_incumbent_evals: int) -> Trials:
+    """How often the proxies of a generation are tried, as a strategy's configuration says."""
+    return Trials(
+        num_evals=config.num_evals,
+        aggregate=config.eval_aggregate,
+        num_incumbent_evals=num_incumbent_evals,
+        common_random_numbers=config.common_random_numbers,
+    )
+
+
 @dataclass(frozen=True, kw_only=True)
 class Strategy:
     """An outer optimiser over flat parameter vectors `[dims]`; pure functions.
@@ -108,6 +120,15 @@ class Strategy:
     def num_candidates(self) -> int:
         """Trainings in a generation."""
         return self.num_members * self.trials.num_evals + self.trials.num_incumbent_evals
+
+
+def is_tie(scores: Float[Array, "*n"], incumbent: Float[Array, ""]) -> Bool[Array, "*n"]:
+    """Whether scores are the incumbent's but for rounding.
+
+    In single precision the mean of equal scores may be a few last digits off, whose share of each
+    other would be weights as large as any. The authors' code asks for a difference of 1e-6.
+    """
+    return jnp.abs(scores - incumbent) <= _TIE * jnp.maximum(1.0, jnp.abs(incumbent))
 
 
 def finite_mean(scores: Float[Array, " n"]) -> Float[Array, ""]:

@@ -58,8 +58,7 @@ class Experiment:
         runtime.configure_xla(settings.devices)
         runtime.enable_compilation_cache()
         try:
-            guarded: Any = commands.guarded(lambda _: float(len(self.run(settings))))
-            guarded(settings)
+            commands.guarded(self.run)(settings)
         except KeyboardInterrupt:
             print(f"Interrupted. What is finished is kept in {settings.work_folder}; the same "
                   "command goes on from there.")  # fmt: skip

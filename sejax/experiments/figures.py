@@ -59,7 +59,7 @@ def learning_curves(curves: pd.DataFrame, solved_reward: float, path: Path) -> N
 def density(values: Any, grid: Any, low: float, high: float) -> np.ndarray:
     r"""Gaussian kernel density estimate of values in [low, high], per unit of the values.
 
-    The bandwidth is Scott's, :math:`std \\cdot n^{-1/5}`, and at least 1% of the interval, as
+    The bandwidth is Scott's, :math:`std \cdot n^{-1/5}`, and at least 1% of the interval, as
     returns may all be equal. Mass that a kernel would put outside the interval is reflected.
     """
     values, grid = np.asarray(values, float), np.asarray(grid, float)

@@ -157,7 +157,7 @@ def report(settings: SupervisedBaseline, rows: pd.DataFrame) -> pd.DataFrame:
     made, fits, data = (unstack(rows, name) for name in ("agents", "fits", "transitions"))
     agents = with_best(made, data["episode_return"].tolist())
     summary = summarise(agents, task.solved_reward)
-    draw(task, agents, summary, settings.folder / "supervised_baseline.png")
+    draw(task, agents, settings.folder / "supervised_baseline.png")
     last = fits[fits["epoch"] == fits["epoch"].max()].mean()
     note = (
         f"Mean ± std over test episodes and a bootstrap 95% interval that draws models, for the SE "
@@ -185,7 +185,7 @@ def diverged_text(agents: pd.DataFrame) -> str:
     return ", ".join(texts) or "none"
 
 
-def draw(task: Any, agents: pd.DataFrame, summary: pd.DataFrame, path: Path) -> None:
+def draw(task: Any, agents: pd.DataFrame, path: Path) -> None:
     """Draws histograms of the test returns, a panel for each agent and choice of hyperparameters.
 
     Source: paper, figure "Comparing the cumulative test reward densities", top.

@@ -1,7 +1,6 @@
 """Generations of a run whose trainings are done elsewhere."""
 
 import time
-from types import TracebackType
 from typing import Any
 
 import jax
@@ -37,12 +36,7 @@ class RemoteChunks:
     def __enter__(self) -> "RemoteChunks":
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: Any) -> None:
         self._hand_out.close()
 
     def init(self, keys: Any) -> Any:

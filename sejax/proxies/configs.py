@@ -109,13 +109,13 @@ class RewardConfig(Options):
         Raises:
           ConfigError: if it does not.
         """
-        fields = (("variant", self.weighs_info, "additive_potential"),
-                  ("augmented", self.augmented, "false"))  # fmt: skip
-        for name, needs_info, fix in fields:
+        fields = (("variant", self.weighs_info, facts.has_info, "additive_potential"),
+                  ("augmented", self.augmented, facts.has_vector, "false"))  # fmt: skip
+        for name, is_needed, is_there, fix in fields:
             value = getattr(self, name)
-            require(facts.has_info or not needs_info, f"proxy.{name}", f"do without {value} in "
-                    f"{task_name}", "its steps tell nothing beside the observation", value,
-                    f"proxy.{name}={fix}")  # fmt: skip
+            require(is_there or not is_needed, f"proxy.{name}", f"do without {value} in "
+                    f"{task_name}", "its steps tell nothing of the state beside the observation",
+                    value, f"proxy.{name}={fix}")  # fmt: skip
 
     def make(self, task: Any) -> "ProxyEnv":
         """The RN of a task.

@@ -14,7 +14,6 @@ from gymnax.environments import environment
 from jaxtyping import Array
 
 from sejax.envs.task import Task
-from sejax.proxies import ABSURD as ABSURD
 
 
 class World(NamedTuple):

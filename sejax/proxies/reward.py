@@ -15,7 +15,8 @@ from jaxtyping import Array, Float
 from sejax.envs.task import Task
 from sejax.errors import require
 from sejax.networks import MLP, uniform_fan_in
-from sejax.proxies.proxy import ABSURD, ProxyEnv
+from sejax.proxies import ABSURD
+from sejax.proxies.proxy import ProxyEnv
 
 if TYPE_CHECKING:  # which makes it
     from sejax.proxies.configs import RewardConfig
@@ -103,11 +104,11 @@ class RewardEnv(ProxyEnv):
     ) -> RewardParams:
         """The same for a whole training of an agent.
 
-        Raises:
-          ConfigError: if the reward needs a discount and the agent has none.
-
         Where states are counted, all potentials are computed at once: a step then looks its two up.
         They are these weights': with other weights prepare again.
+
+        Raises:
+          ConfigError: if the reward needs a discount and the agent has none.
         """
         require(discount is not None or not self.config.is_potential_based, "agent", "say its "
                 "discount", f"{self.config.variant} pays with it", "none",

@@ -15,7 +15,8 @@ from jaxtyping import Array, Bool, Float
 
 from sejax.envs.task import Task
 from sejax.networks import MLP
-from sejax.proxies.proxy import ABSURD, ProxyEnv, ProxyParams, World
+from sejax.proxies import ABSURD
+from sejax.proxies.proxy import ProxyEnv, ProxyParams, World
 from sejax.proxies.units import units_of
 
 if TYPE_CHECKING:  # which makes it

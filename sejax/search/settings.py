@@ -2,13 +2,11 @@
 
 import dataclasses
 import functools
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
-import yaml
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException
@@ -16,6 +14,7 @@ from hydra.errors import HydraException
 from sejax import plugins, serialize
 from sejax.app import build, compose
 from sejax.errors import ConfigError, nearest, require
+from sejax.files import as_file_name
 from sejax.options import Options, counts, one_of, option, positive
 from sejax.search import spaces
 
@@ -65,7 +64,7 @@ class SearchConfig(Options):
     # mean of all so far, which rewards learning early. null: last for a proxy, mean for an agent.
     measure: str | None = option(None, one_of(MEASURES))
     space: str | None = None  # a preset of ranges; a file of one's own
-    study: str | None = None  # null: <env>-<proxy>-<agent>
+    study: str | None = None  # null: <env>-<proxy>-<agent>, or <agent>-on-<proxy>
     storage: str | None = None  # null: SQLite in search_dir; any URL that Optuna takes
     search_dir: str | None = None  # null: runs/search-<study>
     timeout: float | None = option(None, positive("no trial would start"))  # s; none starts later
@@ -133,7 +132,7 @@ class Search:
 
     @property
     def folder(self) -> Path:
-        return Path(self.config.search_dir or Path("runs", f"search-{_as_file_name(self.study)}"))
+        return Path(self.config.search_dir or Path("runs", f"search-{as_file_name(self.study)}"))
 
     @property
     def storage(self) -> str:
@@ -143,7 +142,7 @@ class Search:
     def stored(self) -> dict[str, Any]:
         """What the workers of a study must have in common, as plain values."""
         return {
-            "search": _common(serialize.to_plain(self.config)),
+            "search": _common(serialize.tocompose.parsed(self.config)),
             "fixed": list(self.fixed),
             "space": {name: x.text for name, x in self.space.items()},
             "folder": str(self.folder.resolve()),
@@ -167,8 +166,8 @@ class Search:
     @property
     def names_study_alone(self) -> bool:
         """Whether the words ask for nothing but to join a study that exists."""
-        usual = serialize.to_plain(SearchConfig())
-        given = serialize.to_plain(self.config)
+        usual = serialize.tocompose.parsed(SearchConfig())
+        given = serialize.tocompose.parsed(self.config)
         asked = {k for k, v in given.items() if v != usual[k]} - {*FREE_FIELDS, "study"}
         return self.config.study is not None and not (asked or self.fixed or self.space)
 
@@ -181,7 +180,7 @@ class Search:
 
 def completed(stored: dict[str, Any]) -> dict[str, Any]:
     """What a former version stored of a search, with the fields of today."""
-    usual = serialize.to_plain(SearchConfig())
+    usual = serialize.tocompose.parsed(SearchConfig())
     return stored | {"search": _common(usual | stored["search"])}
 
 
@@ -205,12 +204,12 @@ def read(words: Sequence[str]) -> Search:
     for word in compose.hydra_words(words):
         name, equals, text = word.partition("=")
         if equals and name in own:
-            value = _plain(text)
+            value = compose.parsed(text)
             is_text = name in TEXTS and value is not None and not isinstance(value, str)
             values[name] = text if is_text else value
             continue
         if name.partition(".")[0] == "machines":
-            machines[name.partition(".")[2] or "name"] = _plain(text)
+            machines[name.partition(".")[2] or "name"] = compose.parsed(text)
             continue
         override = _parsed(word)
         require(name not in TAKEN, name, "be left out", "the search sets it for each trial", text,
@@ -219,7 +218,7 @@ def read(words: Sequence[str]) -> Search:
             swept[override.get_key_element()] = spaces.parse(override.get_key_element(), text)
         else:
             fixed.append(word)
-    config = serialize.from_plain(SearchConfig, values, "")
+    config = serialize.fromcompose.parsed(SearchConfig, values, "")
     search = Search(config=config, fixed=tuple(fixed), space=swept, machines=_machines(machines))
     require(search.choice("proxy", "se") != "real", "proxy", "be learned, or be one to tune agents "
             "on", "trials on the real task cost what a proxy saves", "real",
@@ -250,17 +249,6 @@ def _parsed(word: str) -> Override:
         ) from error
 
 
-def _plain(text: str) -> Any:
-    try:
-        return yaml.safe_load(text)
-    except yaml.YAMLError:
-        return text
-
-
-def _as_file_name(name: str) -> str:
-    return re.sub(r"[^\w.+-]+", "_", name)
-
-
 def fields_of(search: Search, config: Any) -> dict[str, Any]:
     """Values of all fields of the command, of its choices too, by their names on the command line.
 
@@ -269,7 +257,7 @@ def fields_of(search: Search, config: Any) -> dict[str, Any]:
       config: of the command with the fixed words alone.
     """
     groups = build.EVALUATE_GROUPS if search.is_of_agent else build.LEARN_GROUPS
-    values = serialize.flatten(build.to_plain(config))
+    values = serialize.flatten(build.tocompose.parsed(config))
     return {**{group: values.get(f"{group}.name") for group in groups}, **values}
 
 
@@ -300,7 +288,7 @@ def help_text() -> str:
     fields = "\n".join(
         f"  {name}: {'null' if value is None else value}"
         + (f"  ({', '.join(about[name])})" if name in about else "")
-        for name, value in serialize.to_plain(SearchConfig()).items()
+        for name, value in serialize.tocompose.parsed(SearchConfig()).items()
     )
     return f"""Search hyperparameters with Optuna; a trial is a run, its generations the budget.
 With proxy=RUN_DIR, a file or a shipped name: those of an agent that is trained on that proxy.

@@ -20,7 +20,7 @@ from hydra.errors import HydraException
 
 from sejax.app import families
 from sejax.app.words import word
-from sejax.errors import ConfigError, nearest, require, shortened
+from sejax.errors import ConfigError, is_number, nearest, require, shortened
 
 FOLDER = Path(__file__).parents[1] / "conf" / "spaces"
 DIGITS = 6  # of a float: what the override line says is what was tried
@@ -82,8 +82,7 @@ class Dimension:
         if self.values:
             same = (each for each in self.values if each == word(value) or _same(each, value))
             return next(same, None)
-        is_number = _is_number(value)
-        if not is_number or not self.low <= value <= self.high:
+        if not is_number(value) or not self.low <= value <= self.high:
             return None
         if self.step is not None:
             return value if isinstance(value, int) and not (value - self.low) % self.step else None
@@ -103,14 +102,10 @@ class Dimension:
         return f"{min(max(rounded, self.low), self.high):.12g}"
 
 
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool)
-
-
 def _same(written: str, value: Any) -> bool:
     """Whether a choice's word is this number, as 1 is 1.0."""
     try:
-        return _is_number(value) and float(written) == value
+        return is_number(value) and float(written) == value
     except ValueError:
         return False
 

@@ -3,9 +3,8 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from sejax.envs.mujoco.environment import MujocoEnv, control_cost
+from sejax.envs.mujoco.environment import MujocoEnv, control_cost, plane
 from sejax.envs.mujoco.physics import Report
-from sejax.envs.mujoco.swimmer import plane
 
 TORSO = 1
 

@@ -132,3 +132,14 @@ class MujocoEnv(environment.Environment[MujocoState, MujocoParams]):
 def control_cost(action: Float[Array, " nu"], weight: float) -> Float[Array, ""]:
     """The part of the reward that charges for control."""
     return -weight * jnp.sum(action**2)
+
+
+def plane(position: Float[Array, "2"], velocity: Float[Array, "2"]) -> dict[str, Float[Array, ""]]:
+    """What Gymnasium tells of a body that moves in a plane."""
+    return {
+        "x_position": position[0],
+        "y_position": position[1],
+        "distance_from_origin": jnp.linalg.norm(position),
+        "x_velocity": velocity[0],
+        "y_velocity": velocity[1],
+    }

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from sejax.envs.mujoco.environment import MujocoEnv
+from sejax.envs.mujoco.environment import MujocoEnv, control_cost
 from sejax.envs.mujoco.physics import Report
 
 RADIUS = 0.2  # m, of the disc that the target is in
@@ -51,7 +51,7 @@ class Env(MujocoEnv):
         config = self.config
         return {
             "reward_dist": -config.reward_dist_weight * jnp.linalg.norm(self._miss(now)),
-            "reward_ctrl": -config.reward_control_weight * jnp.sum(action**2),
+            "reward_ctrl": control_cost(action, config.reward_control_weight),
         }
 
     def _miss(self, now: Report) -> Float[Array, "3"]:

@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from sejax.envs.mujoco.environment import MujocoEnv, control_cost
+from sejax.envs.mujoco.environment import MujocoEnv, control_cost, plane
 from sejax.envs.mujoco.physics import Report
 
 
@@ -42,14 +42,3 @@ class Env(MujocoEnv):
 
     def tells(self, now: Report) -> dict[str, Float[Array, ""]]:
         return plane(now.qpos[:2], self.velocity(now.qpos_change[:2]))
-
-
-def plane(position: Float[Array, "2"], velocity: Float[Array, "2"]) -> dict[str, Float[Array, ""]]:
-    """What Gymnasium tells of a body that moves in a plane."""
-    return {
-        "x_position": position[0],
-        "y_position": position[1],
-        "distance_from_origin": jnp.linalg.norm(position),
-        "x_velocity": velocity[0],
-        "y_velocity": velocity[1],
-    }
