@@ -16,8 +16,7 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Float
 
-from sejax import plugins
-from sejax.agents import flat
+from sejax import flat, plugins
 from sejax.agents.agent import Agent
 from sejax.counters import exact, wide_add, wide_sum, wide_zeros
 from sejax.envs.task import Task

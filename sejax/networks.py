@@ -13,8 +13,6 @@ import jax.numpy as jnp
 from flax import linen as nn
 from jaxtyping import Array, Float
 
-from sejax.options import ACTIVATIONS as ACTIVATIONS
-
 PRELU_SLOPE = 0.25
 
 
@@ -196,6 +194,16 @@ class MLP(nn.Module):
             return lambda x: jnp.where(x >= 0, x, slope * x)
         return {"tanh": tanh, "fast_tanh": fast_tanh, "relu": nn.relu,
                 "leaky_relu": nn.leaky_relu}[self.activation]  # fmt: skip
+
+
+def init_narrowed(
+    network: nn.Module, key: Array, num_inputs: int, hidden_size: Array | None = None
+) -> Any:
+    """Variables of a fresh network, of which `hidden_size` hidden units count; None for all."""
+    variables: Any = network.init(key, jnp.zeros(num_inputs))
+    if hidden_size is None:
+        return variables
+    return {"params": narrow(variables["params"], hidden_size)}
 
 
 def narrow(params: dict[str, Any], hidden_size: Array) -> dict[str, Any]:

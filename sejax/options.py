@@ -21,6 +21,7 @@ from typing import Any, ClassVar
 from sejax import errors
 
 ACTIVATIONS = ("tanh", "fast_tanh", "relu", "leaky_relu", "prelu")  # of `sejax.networks`
+MOVES = "the agent would not move"  # otherwise: why learning rates are above 0
 MOST_MEMBERS = 100_000  # of a population, each with the weights of a proxy
 MOST_LAYERS = 100  # layers and blocks of a network are traced one by one
 

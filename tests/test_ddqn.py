@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 from support import numpy_forward, shapes_of, unraveled
 
-from sejax.agents.ddqn import DDQNConfig, double_q_targets, make_ddqn, select_action
+from sejax.agents.ddqn import DDQNConfig, double_q_targets, make_ddqn
+from sejax.agents.policies import select_action
 from sejax.agents.replay import Transition
-from sejax.networks import ACTIVATIONS, MLP
+from sejax.networks import MLP
+from sejax.options import ACTIVATIONS
 
 OBS_DIM, NUM_ACTIONS, BATCH = 3, 2, 7
 GOLDEN = Path(__file__).parent / "golden" / "ddqn_updates.npz"

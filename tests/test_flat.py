@@ -1,4 +1,4 @@
-"""sejax.agents.flat: parameters as one vector and back, and Adam against a plain loop and optax."""
+"""sejax.flat: parameters as one vector and back, and Adam against a plain loop and optax."""
 
 import jax
 import jax.numpy as jnp
@@ -6,7 +6,7 @@ import numpy as np
 import optax
 from support import random_like, raveled, shapes_of
 
-from sejax.agents import flat
+from sejax import flat
 from sejax.networks import MLP
 
 NET = MLP(2, hidden_size=3, num_layers=1, activation="prelu", learn_prelu_slope=True)

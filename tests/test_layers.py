@@ -25,6 +25,7 @@ LAYERS = [
     {
         "training",
         "networks",
+        "flat",
         "loops",
         "parallel",
         "keys",

@@ -9,13 +9,13 @@ import pytest
 from support import numpy_forward, random_like, shapes_of
 
 from sejax.networks import (
-    ACTIVATIONS,
     MLP,
     PRELU_SLOPE,
     affine,
     fast_tanh,
     tanh,
 )
+from sejax.options import ACTIVATIONS
 
 
 @functools.cache

@@ -17,16 +17,25 @@ from flax import linen as nn
 from flax import struct
 from jaxtyping import Array, Float, Int
 
-from sejax.agents import flat
+from sejax import flat
 from sejax.agents.agent import Agent, AgentOptions, traced
 from sejax.agents.epsilon_greedy import decayed_epsilon, epsilon_greedy
 from sejax.agents.memory import replay_memory
 from sejax.agents.partial_batch import sum_over_batch
+from sejax.agents.policies import select_action
 from sejax.agents.replay import Transition, num_columns
-from sejax.networks import MLP, DuelingMLP, narrow
-from sejax.options import ACTIVATIONS, MOST_LAYERS, counts, fraction, one_of, option, positive
+from sejax.networks import MLP, DuelingMLP, init_narrowed
+from sejax.options import (
+    ACTIVATIONS,
+    MOST_LAYERS,
+    MOVES,
+    counts,
+    fraction,
+    one_of,
+    option,
+    positive,
+)
 
-MOVES = "the agent would not move"
 # Small agents train in lockstep on a core: measured, 2.3 times as fast as alone. Twice as many gain
 # another 3%, and a population is filled up to whole groups.
 SMALL_LANES = 8
@@ -129,10 +138,7 @@ def make_ddqn(config: DDQNConfig, obs_dim: int, num_actions: int) -> Agent:
     learn = make_learning_step(config, network, unflatten)
 
     def init(key: Array, hparams: Any) -> DDQNState:
-        variables = network.init(key, jnp.zeros(obs_dim))
-        if hparams.hidden_size is not None:
-            variables = {"params": narrow(variables["params"], hparams.hidden_size)}
-        params = flat.flatten(variables)
+        params = flat.flatten(init_narrowed(network, key, obs_dim, hparams.hidden_size))
         hparams = jax.tree.map(jnp.float32, hparams)
         return DDQNState(
             params=params,
@@ -286,9 +292,3 @@ def double_q_targets(
     """
     best = jnp.argmax(online_next_q, axis=0)
     return reward + discount * select_action(target_next_q, best)
-
-
-def select_action(q_values: Float[Array, "actions batch"], action: Array) -> Float[Array, " batch"]:
-    """Q of each column's action, by mask: gathers and their gradients are slow on CPU."""
-    mask = jnp.arange(q_values.shape[0])[:, None] == action[None, :]
-    return jnp.sum(jnp.where(mask, q_values, 0.0), axis=0)

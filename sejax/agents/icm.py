@@ -17,7 +17,7 @@ from flax import linen as nn
 from flax import struct
 from jaxtyping import Array, Float
 
-from sejax.agents import flat
+from sejax import flat
 from sejax.agents.agent import Agent, traced
 from sejax.agents.memory import Rollout
 from sejax.agents.replay import Transition

@@ -11,8 +11,6 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from sejax.agents.ddqn import select_action
-
 
 class Distribution(NamedTuple):
     """A distribution of actions, given the actor's outputs and the Gaussian's std.
@@ -82,3 +80,9 @@ def gaussian(max_action: float) -> Distribution:
         return jnp.clip(action, -max_action, max_action)
 
     return Distribution(sample=sample, mode=mode, evaluate=evaluate, env_action=env_action)
+
+
+def select_action(q_values: Float[Array, "actions batch"], action: Array) -> Float[Array, " batch"]:
+    """Q of each column's action, by mask: gathers and their gradients are slow on CPU."""
+    mask = jnp.arange(q_values.shape[0])[:, None] == action[None, :]
+    return jnp.sum(jnp.where(mask, q_values, 0.0), axis=0)

@@ -19,16 +19,17 @@ import optax
 from flax import struct
 from jaxtyping import Array, Float, Int
 
-from sejax.agents import flat
+from sejax import flat
 from sejax.agents.agent import Agent, AgentOptions, traced
 from sejax.agents.memory import Rollout, rollout_memory
 from sejax.agents.policies import SOFTMAX, Distribution, gaussian
 from sejax.errors import require
 from sejax.keys import murmur
-from sejax.networks import MLP, narrow
+from sejax.networks import MLP, init_narrowed
 from sejax.options import (
     ACTIVATIONS,
     MOST_LAYERS,
+    MOVES,
     counts,
     fraction,
     not_negative,
@@ -64,9 +65,7 @@ class PPOConfig(AgentOptions):
     hidden_size: int = option(64, counts(), varied="triple")
     num_layers: int = option(2, counts(most=MOST_LAYERS), varied="one_more_or_less")
     activation: str = option("tanh", one_of(ACTIVATIONS))
-    learning_rate: float = option(
-        2e-3, positive("the agent would not move"), traced=True, varied="triple"
-    )
+    learning_rate: float = option(2e-3, positive(MOVES), traced=True, varied="triple")
     discount: float = option(0.99, fraction(), traced=True)
     # Decisions between two learning phases; null: as `update_episodes` says.
     rollout_steps: int | None = option(128, or_none(counts()))
@@ -75,16 +74,16 @@ class PPOConfig(AgentOptions):
     num_minibatches: int = option(4, counts())  # Adam steps in an epoch, each on its part of it
     advantages: str = option("gae", one_of(ADVANTAGES))
     gae_lambda: float = option(0.9, fraction(), traced=True)  # of advantages=gae
-    clip_ratio: float = option(0.1, positive("the agent would not move"), traced=True)
+    clip_ratio: float = option(0.1, positive(MOVES), traced=True)
     value_weight: float = option(0.5, not_negative(), traced=True)
     entropy_weight: float = option(0.01, not_negative(), traced=True)
     # Divides rewards by the running std of returns, with advantages=gae.
     normalize_rewards: bool = True
     # Longest gradient, which a longer one is shortened to.
-    max_grad_norm: float | None = option(0.5, or_none(positive("the agent would not move")))
+    max_grad_norm: float | None = option(0.5, or_none(positive(MOVES)))
     adam_eps: float = option(1e-5, positive("it keeps Adam from dividing by 0"))
     # Of the Gaussian policy; learned.
-    init_action_std: float = option(0.5, positive("the agent would not move"))
+    init_action_std: float = option(0.5, positive(MOVES))
     action_repeat: int = option(1, counts())
 
     @classmethod
@@ -275,17 +274,14 @@ def make_networks(
         "critic": MLP(1, *shape, learn_prelu_slope=True),
     }
 
-    def init_tree(key: Array) -> dict[str, Any]:
+    def init_tree(key: Array, hidden_size: Array | None = None) -> dict[str, Any]:
         keys = dict(zip(mlps, jax.random.split(key), strict=True))
-        weights = {name: mlp.init(keys[name], jnp.zeros(obs_dim)) for name, mlp in mlps.items()}
+        weights = {name: init_narrowed(mlp, keys[name], obs_dim, hidden_size)
+                   for name, mlp in mlps.items()}  # fmt: skip
         return {**weights, "std": jnp.full(std_dim, config.init_action_std, jnp.float32)}
 
     def init(key: Array, hidden_size: Array | None) -> Array:
-        tree = init_tree(key)
-        if hidden_size is not None:
-            for name in mlps:
-                tree[name] = {"params": narrow(tree[name]["params"], hidden_size)}
-        return flat.flatten(tree)
+        return flat.flatten(init_tree(key, hidden_size))
 
     def actor(tree: Any, obs: Array) -> tuple[Array, Array]:
         outputs: Any = mlps["actor"].apply(tree["actor"], obs)

@@ -19,16 +19,17 @@ import optax
 from flax import struct
 from jaxtyping import Array, Bool, Float
 
-from sejax.agents import flat
+from sejax import flat
 from sejax.agents.agent import Agent, AgentOptions, traced
-from sejax.agents.ddqn import MOVES, select_action
 from sejax.agents.memory import replay_memory
 from sejax.agents.partial_batch import sum_over_batch
+from sejax.agents.policies import select_action
 from sejax.agents.replay import Transition, num_columns
-from sejax.networks import MLP, narrow
+from sejax.networks import MLP, init_narrowed
 from sejax.options import (
     ACTIVATIONS,
     MOST_LAYERS,
+    MOVES,
     counts,
     finite,
     fraction,
@@ -247,22 +248,16 @@ def make_networks(config: SACConfig, obs_dim: int, policy: Policy) -> Networks:
 
     actor, critic = network(policy.num_outputs), network(policy.critic_outputs)
 
-    def init_network(key: Array, mlp: MLP, num_inputs: int, hidden_size: Array | None) -> Any:
-        variables: Any = mlp.init(key, jnp.zeros(num_inputs))
-        if hidden_size is not None:
-            variables = {"params": narrow(variables["params"], hidden_size)}
-        return variables
-
     def init_critics(key: Array, hidden_size: Array | None = None) -> Any:
         num_inputs = obs_dim + policy.critic_inputs
-        return jax.vmap(lambda key: init_network(key, critic, num_inputs, hidden_size))(
+        return jax.vmap(lambda key: init_narrowed(critic, key, num_inputs, hidden_size))(
             jax.random.split(key)
         )
 
     def init_all(key: Array, hidden_size: Array | None = None) -> Params:
         key_actor, key_critics = jax.random.split(key)
         return Params(
-            actor=init_network(key_actor, actor, obs_dim, hidden_size),
+            actor=init_narrowed(actor, key_actor, obs_dim, hidden_size),
             critics=init_critics(key_critics, hidden_size),
             log_alpha=jnp.zeros(()),
         )

@@ -19,7 +19,7 @@ from sejax.agents.agent import Agent, AgentOptions, traced
 from sejax.agents.epsilon_greedy import decayed_epsilon, epsilon_greedy
 from sejax.agents.memory import no_memory
 from sejax.agents.replay import Transition
-from sejax.options import counts, fraction, option, positive
+from sejax.options import MOVES, counts, fraction, option, positive
 
 # `(key, q_row [num_actions], epsilon) -> []`: what the next state is worth to the target.
 NextValue = Callable[[Array, Array, Array], Array]
@@ -32,9 +32,7 @@ class QLearningConfig(AgentOptions):
     states: ClassVar[str] = "discrete"
 
     init_episodes: int = option(0, counts("it counts episodes", least=0))
-    learning_rate: float = option(
-        1.0, positive("the agent would not move"), traced=True, varied="tenth_to_one"
-    )
+    learning_rate: float = option(1.0, positive(MOVES), traced=True, varied="tenth_to_one")
     discount: float = option(0.8, fraction(), traced=True, varied="tenth_to_one")
     epsilon_init: float = option(0.1, fraction(), traced=True)
     epsilon_min: float = option(0.1, fraction(), traced=True)

@@ -18,15 +18,16 @@ import optax
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
-from sejax.agents import flat
+from sejax import flat
 from sejax.agents.agent import Agent, AgentOptions, traced
 from sejax.agents.memory import replay_memory
 from sejax.agents.partial_batch import sum_over_batch
 from sejax.agents.replay import Transition, num_columns
-from sejax.networks import MLP, narrow
+from sejax.networks import MLP, init_narrowed
 from sejax.options import (
     ACTIVATIONS,
     MOST_LAYERS,
+    MOVES,
     counts,
     fraction,
     not_negative,
@@ -56,9 +57,7 @@ class TD3Config(AgentOptions):
     num_layers: int = option(2, counts(most=MOST_LAYERS), varied="one_more_or_less")
     activation: str = option("relu", one_of(ACTIVATIONS))
     # Of the actor and the critics.
-    learning_rate: float = option(
-        3e-4, positive("the agent would not move"), traced=True, varied="triple"
-    )
+    learning_rate: float = option(3e-4, positive(MOVES), traced=True, varied="triple")
     target_update_rate: float = option(0.005, fraction(), traced=True)
     discount: float = option(0.99, fraction(), traced=True)
     policy_delay: int = option(2, counts())  # learning steps for each one of actor and targets
@@ -84,13 +83,11 @@ class DiscreteTD3Config(TD3Config):
     init_episodes: int = option(10, counts("it counts episodes", least=0))
     batch_size: int = option(128, counts(), varied="triple")
     activation: str = option("tanh", one_of(ACTIVATIONS))
-    learning_rate: float = option(
-        5e-4, positive("the agent would not move"), traced=True, varied="triple"
-    )
+    learning_rate: float = option(5e-4, positive(MOVES), traced=True, varied="triple")
     target_update_rate: float = option(0.01, fraction(), traced=True)
     layer_norm: bool = True  # after each hidden layer but the first, as in the authors' code
     # Of the Gumbel-Softmax at the start.
-    temperature: float = option(1.0, positive("the agent would not move"), traced=True)
+    temperature: float = option(1.0, positive(MOVES), traced=True)
     final_temperature: float = option(0.05, fraction(), traced=True)  # as a fraction of it, ...
     temperature_steps: int = option(2000, counts())  # ... reached linearly after so many updates
     one_hot_actions: bool = False  # straight-through one-hot actions in place of soft ones
@@ -275,10 +272,7 @@ def make_networks(config: TD3Config, obs_dim: int, action_dim: int) -> Networks:
         unflatten = flat.unflattener(mlp.init, jnp.zeros(num_inputs))
 
         def init(key: Array, hidden_size: Array | None) -> Array:
-            variables: Any = mlp.init(key, jnp.zeros(num_inputs))
-            if hidden_size is not None:
-                variables = {"params": narrow(variables["params"], hidden_size)}
-            return flat.flatten(variables)
+            return flat.flatten(init_narrowed(mlp, key, num_inputs, hidden_size))
 
         return init, lambda params, x: mlp.apply(unflatten(params), x)
 
