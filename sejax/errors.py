@@ -54,12 +54,21 @@ def require(holds: Any, field: str, rule: str, reason: str, got: object, fix: st
 
 
 def at_least(minimum: float, name: str, value: Any, reason: str, fix: Any) -> None:
+    """Checks a number that has a least value.
+
+    Raises:
+      ConfigError: if it is below, or no number.
+    """
     require(is_number(value) and value >= minimum, name, f"be at least {minimum}", reason, value,
             f"{name}={fix}")  # fmt: skip
 
 
 def whole(minimum: int, name: str, value: Any, reason: str, fix: Any, most: int = LARGEST) -> None:
-    """Checks a count: at least `minimum`, and at most what can be counted or built."""
+    """Checks a count: at least `minimum`, and at most what can be counted or built.
+
+    Raises:
+      ConfigError: if it is less, more, or no whole number.
+    """
     at_least(minimum, name, value, reason, fix)
     require(value == value // 1, name, "be a whole number", reason, value, f"{name}={fix}")
     limit = "it is counted in 32 bits" if most == LARGEST else "each is built by itself"
@@ -67,6 +76,11 @@ def whole(minimum: int, name: str, value: Any, reason: str, fix: Any, most: int 
 
 
 def positive(name: str, value: Any, reason: str, fix: Any, at_most: float = math.inf) -> None:
+    """Checks a finite number above 0.
+
+    Raises:
+      ConfigError: if it is none, or above `at_most`.
+    """
     require(is_number(value) and 0 < value < math.inf, name, "be above 0 and finite",
             reason, value, f"{name}={fix}")  # fmt: skip
     require(value <= at_most, name, f"be at most {at_most:g}", "the numbers that come of it would "
@@ -74,16 +88,27 @@ def positive(name: str, value: Any, reason: str, fix: Any, at_most: float = math
 
 
 def fraction(name: str, value: Any, fix: Any) -> None:
+    """Checks a number in [0, 1].
+
+    Raises:
+      ConfigError: if it is none.
+    """
     require(is_number(value) and 0 <= value <= 1, name, "lie in [0, 1]", "it is a fraction", value,
             f"{name}={fix}")  # fmt: skip
 
 
 def one_of(name: str, value: str, known: Collection[str]) -> None:
+    """Checks a choice.
+
+    Raises:
+      ConfigError: if it is none of the known ones.
+    """
     if value not in known:
         raise unknown_name(name, value, known)
 
 
 def each_of(name: str, values: Iterable[str], known: Collection[str]) -> None:
+    """As `one_of`, for several."""
     for value in values:
         one_of(name, value, known)
 
@@ -99,4 +124,5 @@ def require_seed(name: str, seed: Any) -> None:
 
 
 def is_number(value: Any) -> bool:
+    """Whether it is an int or a float, which a bool is not here."""
     return isinstance(value, int | float) and not isinstance(value, bool)

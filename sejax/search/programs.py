@@ -9,6 +9,7 @@ constants, up to rounding.
 import copy
 import dataclasses
 import json
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -42,11 +43,17 @@ class Programs:
         """The chunks of a run, compiled if none of its shape was."""
         program, numbers = make_program(**config.parts()), numbers_of(config)
         key, make = shape_of(config, numbers), partial(_with_numbers, config, program.num_dims)
-        chunks = self.shapes.pop(key, None) or Chunks(program, make, (numbers,))
-        self.shapes[key] = chunks  # the last used is the last to go
-        if len(self.shapes) > KEPT:
-            del self.shapes[next(iter(self.shapes))]
+        chunks = kept(self.shapes, key, lambda: Chunks(program, make, (numbers,)))
         return chunks.sharing(program, (numbers,))
+
+
+def kept(cache: dict[str, Any], key: str, make: Callable[[], Any]) -> Any:
+    """What is cached under a key, made if it is not; the `KEPT` that were used last stay."""
+    value = cache.pop(key, None) or make()
+    cache[key] = value  # the last used is the last to go
+    if len(cache) > KEPT:
+        del cache[next(iter(cache))]
+    return value
 
 
 def numbers_of(config: build.LearnConfig) -> dict[str, Any]:

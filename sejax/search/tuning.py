@@ -20,7 +20,7 @@ from sejax.app import build, compose
 from sejax.app.words import word
 from sejax.errors import ConfigError, require
 from sejax.files import write_text
-from sejax.search.programs import KEPT, static_of, structure_of
+from sejax.search.programs import kept, static_of, structure_of
 from sejax.search.settings import Search
 from sejax.search.trials import Follower, Progress
 from sejax.serialize import differences, flatten
@@ -110,12 +110,9 @@ class Tuning:
             [world, static_of(family.agent), static_of(study.exploration),
              serialize.to_plain(training), structure_of(agent.hparams), num_agents]
         )  # fmt: skip
-        rounds = self._compiled.pop(key, None) or _make_rounds(
-            agent, study, world, training, config
+        rounds = kept(
+            self._compiled, key, lambda: _make_rounds(agent, study, world, training, config)
         )
-        self._compiled[key] = rounds  # the last used is the last to go
-        if len(self._compiled) > KEPT:
-            del self._compiled[next(iter(self._compiled))]
         seed = jax.random.fold_in(jax.random.key(config.seed), generation)
         keys = jax.random.split(seed, num_agents)
         return jax.device_get(rounds(keys, agent.hparams))
