@@ -39,9 +39,10 @@ def python_blocks(page):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("page", ["README.md", "docs/index.md", "docs/howto/jax.md"])
-def test_the_python_of_a_page_runs(page):
+def test_the_python_of_a_page_runs(page, tmp_path, monkeypatch):
     blocks = python_blocks(ROOT / page)
     assert blocks
+    monkeypatch.chdir(tmp_path)  # some of it writes files
     for block in blocks:
         exec(compile(block, page, "exec"), {})
 
