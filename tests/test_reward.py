@@ -15,8 +15,9 @@ from sejax.agents.tabular import QLearningConfig
 from sejax.app import build
 from sejax.errors import ConfigError
 from sejax.evaluation import make_evaluator, return_area
+from sejax.proxies import ABSURD
 from sejax.proxies.configs import RewardConfig
-from sejax.proxies.proxy import ABSURD, World, world_of
+from sejax.proxies.proxy import World, world_of
 from sejax.proxies.reward import RewardEnv
 from sejax.trainer import TrainResult, make_trainer
 from sejax.training import TrainingConfig

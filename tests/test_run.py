@@ -26,9 +26,8 @@ from support import is_drawn
 import sejax
 from sejax import run
 from sejax.app import build, checkpoints, commands, progress, run_directory, session
-from sejax.app.metrics import FAMILY_COLUMNS
+from sejax.app.metrics import COLUMNS, FAMILY_COLUMNS
 from sejax.app.progress import RunProgress
-from sejax.app.run_directory import COLUMNS
 from sejax.errors import ConfigError
 from sejax.proxies import files
 

@@ -17,7 +17,8 @@ import yaml
 
 import sejax
 from sejax.app import checkpoints, metrics, run_lock
-from sejax.app.run_directory import COLUMNS, RunDirectory, open_for
+from sejax.app.metrics import COLUMNS
+from sejax.app.run_directory import RunDirectory, open_for
 from sejax.errors import ConfigError
 from sejax.serialize import flatten
 

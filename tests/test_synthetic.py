@@ -10,8 +10,9 @@ from support import numpy_forward
 
 from sejax import envs, plugins
 from sejax.errors import ConfigError
+from sejax.proxies import ABSURD
 from sejax.proxies.configs import SyntheticConfig
-from sejax.proxies.proxy import ABSURD, World, world_of
+from sejax.proxies.proxy import World, world_of
 
 CONFIG = SyntheticConfig(hidden_size=5, num_layers=2, activation="leaky_relu")
 OBS = jnp.array([0.1, -0.2, 0.3, -0.4])

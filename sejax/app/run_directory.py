@@ -14,13 +14,13 @@ from typing import Any, TypeGuard
 import yaml
 
 from sejax.app import checkpoints
-from sejax.app.metrics import COLUMNS, Metrics, MetricsError
+from sejax.app.metrics import Metrics, MetricsError
 from sejax.app.run_lock import RunLock, acquire
 from sejax.errors import ConfigError
 from sejax.files import remove_leftovers, write_text
 from sejax.serialize import differences
 
-__all__ = ["COLUMNS", "FREE_FIELDS", "RunDirectory", "open_for"]
+__all__ = ["FREE_FIELDS", "RunDirectory", "open_for"]
 
 # Fields, and groups of them, that say how or how long to compute, not what: they may change between
 # two sessions.

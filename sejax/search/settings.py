@@ -142,7 +142,7 @@ class Search:
     def stored(self) -> dict[str, Any]:
         """What the workers of a study must have in common, as plain values."""
         return {
-            "search": _common(serialize.tocompose.parsed(self.config)),
+            "search": _common(serialize.to_plain(self.config)),
             "fixed": list(self.fixed),
             "space": {name: x.text for name, x in self.space.items()},
             "folder": str(self.folder.resolve()),
@@ -166,8 +166,8 @@ class Search:
     @property
     def names_study_alone(self) -> bool:
         """Whether the words ask for nothing but to join a study that exists."""
-        usual = serialize.tocompose.parsed(SearchConfig())
-        given = serialize.tocompose.parsed(self.config)
+        usual = serialize.to_plain(SearchConfig())
+        given = serialize.to_plain(self.config)
         asked = {k for k, v in given.items() if v != usual[k]} - {*FREE_FIELDS, "study"}
         return self.config.study is not None and not (asked or self.fixed or self.space)
 
@@ -180,7 +180,7 @@ class Search:
 
 def completed(stored: dict[str, Any]) -> dict[str, Any]:
     """What a former version stored of a search, with the fields of today."""
-    usual = serialize.tocompose.parsed(SearchConfig())
+    usual = serialize.to_plain(SearchConfig())
     return stored | {"search": _common(usual | stored["search"])}
 
 
@@ -218,7 +218,7 @@ def read(words: Sequence[str]) -> Search:
             swept[override.get_key_element()] = spaces.parse(override.get_key_element(), text)
         else:
             fixed.append(word)
-    config = serialize.fromcompose.parsed(SearchConfig, values, "")
+    config = serialize.from_plain(SearchConfig, values, "")
     search = Search(config=config, fixed=tuple(fixed), space=swept, machines=_machines(machines))
     require(search.choice("proxy", "se") != "real", "proxy", "be learned, or be one to tune agents "
             "on", "trials on the real task cost what a proxy saves", "real",
@@ -257,7 +257,7 @@ def fields_of(search: Search, config: Any) -> dict[str, Any]:
       config: of the command with the fixed words alone.
     """
     groups = build.EVALUATE_GROUPS if search.is_of_agent else build.LEARN_GROUPS
-    values = serialize.flatten(build.tocompose.parsed(config))
+    values = serialize.flatten(build.to_plain(config))
     return {**{group: values.get(f"{group}.name") for group in groups}, **values}
 
 
@@ -288,7 +288,7 @@ def help_text() -> str:
     fields = "\n".join(
         f"  {name}: {'null' if value is None else value}"
         + (f"  ({', '.join(about[name])})" if name in about else "")
-        for name, value in serialize.tocompose.parsed(SearchConfig()).items()
+        for name, value in serialize.to_plain(SearchConfig()).items()
     )
     return f"""Search hyperparameters with Optuna; a trial is a run, its generations the budget.
 With proxy=RUN_DIR, a file or a shipped name: those of an agent that is trained on that proxy.
