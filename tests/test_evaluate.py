@@ -14,6 +14,7 @@ from rich.console import Console
 from support import is_drawn
 
 import sejax
+from sejax import envs, plugins
 from sejax.agents.ppo import PPOConfig
 from sejax.agents.tabular import QLearningConfig
 from sejax.app import build, commands, compose, progress
@@ -332,10 +333,24 @@ def test_a_proxy_of_another_task_is_refused(stored):
 
 def test_agents_that_do_not_suit_the_task_are_refused(room):
     with pytest.raises(ConfigError, match=r"agent must be one of q_learning, sarsa in gridworld"):
-        evaluate(evaluate_config(f"proxy={room}"))
+        evaluate(evaluate_config(f"proxy={room}", "agent=ddqn"))
     with pytest.raises(ConfigError, match=r"agent must be one of .*ddqn.* in cartpole"):
         evaluate(evaluate_config("proxy=real", "env=cartpole", words=ROOM))
     assert isinstance(evaluate_config("proxy=real", words=ROOM).agent, QLearningConfig)
+
+
+def test_where_no_agent_is_named_it_is_the_tasks_own(room, tmp_path):
+    """Also for a stranger's task, which is not imported: what agents see is in the file."""
+    task = dataclasses.replace(envs.make("pendulum"), name="theirs", origin={"name": "their:Task"})
+    env = sejax.SyntheticConfig(hidden_size=4, initial_state="learned", horizon=1).make(task)
+    sejax.save(tmp_path / "theirs.safetensors", env, env.init_weights(jax.random.key(0)))
+    for proxy, kind in ((room, "q_learning"), ("pendulum", "td3"), ("acrobot", "ddqn"),
+                        (tmp_path / "theirs.safetensors", "td3"), ("nope", "ddqn"),
+                        ("real env=gridworld_2x2", "q_learning"), ("real", "ddqn")):  # fmt: skip
+        config = evaluate_config(*f"proxy={proxy}".split(), words=[])
+        assert plugins.name_of("agent", config.agent) == kind
+        assert config.agent == plugins.configure("agent", {"name": kind})
+    assert "their" not in sys.modules
 
 
 def test_a_missing_proxy_or_task_says_what_to_set():

@@ -18,6 +18,8 @@ __all__ = [
     "names", "no_memory", "replay_memory", "require_fit", "rollout_memory", "traced",
 ]  # fmt: skip
 
+DEFAULTS = ("ddqn", "td3", "q_learning")  # of which the first that suits a task is its own
+
 
 def names() -> list[str]:
     """Names of the agents that come with sejax or with installed packages."""
@@ -109,7 +111,7 @@ def _learns_each_step(exploration: Any) -> bool:
 
 def default_for(facts: Any) -> str:
     """The agent that is chosen for a task where none is asked for: the first that suits it."""
-    return next(name for name in ("ddqn", "td3", "q_learning")
+    return next(name for name in DEFAULTS
                 if _suits(plugins.find("agent", name), facts))  # fmt: skip
 
 

@@ -181,7 +181,9 @@ class EvaluateConfig:
                     "the proxy says which it was learned with",
                     families.JOINT.join(family.key for family in families_of(self)),
                     "agent_hparams=default")  # fmt: skip
-            for group, usual in (("agent", "ddqn"), ("exploration", "none")):
+            named = plugins.name_of("agent", self.agent)
+            for group, usual in (("agent", named if named in agents.DEFAULTS else "ddqn"),
+                                 ("exploration", "none")):  # fmt: skip
                 changed = _differences(group, getattr(self, group), usual)
                 require(not changed, group, "be left out with agent_hparams=as_learned", "the "
                         "proxy says which it was learned with", changed,

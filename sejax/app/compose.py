@@ -9,7 +9,7 @@ import functools
 import itertools
 import re
 import textwrap
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -26,12 +26,14 @@ from sejax import agents, envs, plugins, serialize
 from sejax.app import build, families, presets
 from sejax.app.words import ENDING, without_files
 from sejax.errors import ConfigError, nearest, require, shortened, unknown_name
+from sejax.proxies import stored
 from sejax.training import TrainingConfig
 
 CONF_DIR = Path(__file__).parents[1] / "conf"
 # As in conf/run.yaml.
 _DEFAULT_ENV, _DEFAULT_PROXY, _DEFAULT_AGENT = "cartpole", "se", "ddqn"
 _DEFAULT_OBJECTIVE = "max_reward"
+_OF_TASK = "of_task"  # as in conf/evaluate.yaml
 _GROUPS = tuple(plugins.GROUPS)
 # Groups that no word may choose.
 _INTERNAL = ("base", "tuned", "tuned_agent", "tuned_es", "tuned_objective")
@@ -177,6 +179,8 @@ def register(name: str, overrides: Sequence[str]) -> None:
                 _register_choice(group, choice, choice in chosen.get(group, ()), overrides)
     if name == "run":
         _register_presets(chosen)
+    else:
+        _store("agent", _OF_TASK, plugins.defaults("agent", _agent_of_proxy(chosen)))
 
 
 def _require_choices(groups: tuple[str, ...], overrides: Sequence[str]) -> None:
@@ -285,6 +289,29 @@ def _agent_for(choice: str, is_own: bool, node: dict[str, Any], overrides: Seque
             return _DEFAULT_AGENT  # what is missing is said later
         facts = envs.facts_of(plugins.configure("env", {**node, **fields}))
     return agents.default_for(facts)
+
+
+def _agent_of_proxy(chosen: Mapping[str, Sequence[str]]) -> str:
+    """The agent that is evaluated on a proxy where the command line names none."""
+    source, env = (chosen.get(group, [""])[0] for group in ("proxy", "env"))
+    try:
+        if source not in ("", "real"):
+            _, header = stored.read(stored.find(source), "proxy")
+            if "interface" in header:
+                return agents.default_for(_facts_of(header["interface"]))
+            env = str(header["config"]["env"].get("name"))
+        return agents.default_for(envs.facts_of(plugins.configure("env", {"name": env})))
+    except ConfigError:
+        return _DEFAULT_AGENT  # what is wrong is said later
+
+
+def _facts_of(interface: Mapping[str, Any]) -> envs.Facts:
+    """What a proxy's file says of its task, `sejax.Task.interface`."""
+    return envs.Facts(
+        states="discrete" if "n" in interface["observation"] else "vector",
+        actions="discrete" if "n" in interface["action"] else "continuous",
+        max_steps=interface["max_steps"],
+    )
 
 
 def parsed(text: str) -> Any:
