@@ -56,7 +56,8 @@ def serve(args: argparse.Namespace) -> None:
     from sejax.app import session
 
     names = args.families.split(",")
-    words = ["env=cartpole", f"training.max_steps={args.steps}", f"seed={args.seed}",
+    words = ["env=cartpole", f"training.max_steps={args.steps}",
+             f"training.max_episodes={args.steps}", f"seed={args.seed}",
              f"es.population_size={args.members}"]  # fmt: skip
     # As many agents on the incumbent in each program as divide evenly.
     words.append(f"es.num_incumbent_evals={2 * len(names)}")

@@ -62,6 +62,7 @@ def serve(args: argparse.Namespace) -> None:
     config = sejax.config([
         *OVERRIDES, "agent_hparams=varied", f"agent.hidden_size={size}", f"agent.batch_size={size}",
         f"agent.num_layers={args.agent_layers}", f"training.max_steps={args.steps}",
+        f"training.max_episodes={args.steps}",
     ])  # fmt: skip
     parts = config.parts()
     task, env, varied = parts["task"], parts["proxy"], parts["agent"]

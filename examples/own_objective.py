@@ -41,12 +41,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="Learns CartPole SEs by two objectives.")
     parser.add_argument("--generations", type=int, default=12)
     parser.add_argument("--population", type=int, default=64)
-    parser.add_argument("--steps", type=int, default=4000, help="of each training")
+    parser.add_argument("--steps", type=int, default=2000, help="of each training")
     parser.add_argument("--agents", type=int, default=64, help="trained on each of the two")
     args = parser.parse_args()
     sejax.configure_xla()  # a device for each core
     config = sejax.config(["env=cartpole", f"es.population_size={args.population}",
-                           f"training.max_steps={args.steps}"])  # fmt: skip
+                           f"training.max_steps={args.steps}",
+                           f"training.max_episodes={args.steps}"])  # fmt: skip
     for objective in (sejax.MaxReward(), RiskAverse(aversion=1.0)):
         parts = {**config.parts(), "objective": objective}
         learn = sejax.make_learner(**parts, generations=args.generations)

@@ -83,6 +83,7 @@ def main() -> None:
     parts = sejax.config([  # the settings for CartPole, with some changes
         "env=cartpole", "es.noise_std=0.1", "es.noise_std_decay=1",
         f"es.population_size={args.population}", f"training.max_steps={args.steps}",
+        f"training.max_episodes={args.steps}",
     ]).parts()  # fmt: skip
     parts["proxy"] = proxy = LinearSE().make(parts["task"])
     learn = sejax.make_learner(**parts, generations=args.generations)

@@ -275,6 +275,10 @@ def make_program(
     )
     cpu_lanes = tuple(lanes_on_cpu(agent, training) for agent in families.agents)
     seed_ids = jnp.asarray(trials.seed_ids(strategy.num_members))
+    one_unit = families.size == 1 and objective.test_steps is None
+    require(one_unit or not strategy.remembers_scores, "es", "be one that compares the members of "
+            "a generation alone", "several families, or a curriculum, give each generation's "
+            "scores a unit of its own", "one that remembers scores", "es=nes")  # fmt: skip
     require(not stop_when_solved or (objective.scores_are_returns and task.is_solvable),
             "stop_when_solved", "be false with this objective and task", "nobody says which score "
             "solves it", "true", "stop_when_solved=false")  # fmt: skip

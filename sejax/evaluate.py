@@ -154,7 +154,8 @@ def proxy_study(config: EvaluateConfig) -> Study:
             agents.require_fit(family.agent, exploration, task.facts, task.name)
             group, training = _training_on(proxy, config, family.agent)
             build.require_real_returns(group, training)
-            if proxy.env.world.max_steps is not None:
+            trains = not getattr(family.agent, "is_solved_for", False)
+            if trains and proxy.env.world.max_steps is not None:
                 require_reachable(group, training, proxy.env.world.max_steps)
             if getattr(proxy.env.config, "lasts_to_the_limit", False):
                 build.require_learning(group, training, family.agent, proxy.env.world.max_steps,
@@ -215,6 +216,11 @@ def _real_training(config: EvaluateConfig, proxy: Any) -> TrainingConfig:
     if not (as_learned and proxy.env.is_real):
         return config.real_training
     is_terminal = proxy.learned_with("training").time_limit_is_terminal
+    usual = TrainingConfig().time_limit_is_terminal
+    require(config.real_training.time_limit_is_terminal in (usual, is_terminal),
+            "real_training.time_limit_is_terminal", "be left out with agent_hparams=as_learned",
+            "the proxy says how its agents took the limit", "false",
+            "agent_hparams=default, or leave it out")  # fmt: skip
     return dataclasses.replace(config.real_training, time_limit_is_terminal=is_terminal)
 
 

@@ -64,7 +64,7 @@ def budget_for(
 
     A step budget grows by the steps for which this agent waits longer with learning than any of
     those: ten long initial episodes, or a rollout of PPO, could use it up. Episodes, which may have
-    one step, grow in number with it.
+    one step, grow in number with it. No more steps are asked for than there were episodes for.
 
     Args:
       training: that the proxy was learned with.
@@ -73,12 +73,15 @@ def budget_for(
       max_episode_steps: that the proxy's episodes may take.
       task_max_steps: that the real task's may take.
     """
-    if training.max_steps is None:
+    max_steps = training.max_steps
+    if max_steps is None:
         return training
+    if training.is_fixed_length:  # as long as the episodes allowed, in files of older versions
+        max_steps = min(max_steps, training.max_episodes * max_episode_steps)
     waits, *waited = (steps_before_learning(each, max_episode_steps, task_max_steps)
                       for each in (agent, *learned_with))  # fmt: skip
     longer = max(0, waits - max(waited, default=0))
-    return dataclasses.replace(training, max_steps=training.max_steps + longer,
+    return dataclasses.replace(training, max_steps=max_steps + longer,
                                max_episodes=training.max_episodes + longer)  # fmt: skip
 
 

@@ -22,6 +22,7 @@ from sejax.app.families import families_of
 from sejax.errors import ConfigError
 from sejax.evaluate import evaluate, proxy_study
 from sejax.proxies import files
+from sejax.sealed import seal, unseal
 from sejax.training import TrainingConfig, budget_for
 
 TINY = ["agent.hidden_size=4", "agent.batch_size=4", "agent.init_episodes=0", "num_agents=3",
@@ -350,7 +351,25 @@ def test_where_no_agent_is_named_it_is_the_tasks_own(room, tmp_path):
         config = evaluate_config(*f"proxy={proxy}".split(), words=[])
         assert plugins.name_of("agent", config.agent) == kind
         assert config.agent == plugins.configure("agent", {"name": kind})
+    # An older file, which lacks that: its task's name is not imported, nor made.
+    path = tmp_path / "theirs.safetensors"
+    tensors, header = unseal(path.read_bytes(), "sejax")
+    header.pop("interface")
+    path.write_bytes(seal(tensors, "sejax", header))
+    assert plugins.name_of("agent", evaluate_config(f"proxy={path}", words=[]).agent) == "ddqn"
     assert "their" not in sys.modules
+
+
+def test_of_several_proxies_the_last_word_counts_and_a_sweep_needs_an_agent():
+    def agent_of(*words):
+        compose.register("evaluate", words)
+        return compose.ConfigStore.instance().repo["agent"]["of_task.yaml"].node["name"]
+
+    assert agent_of("proxy=cartpole", "proxy=pendulum") == "td3"
+    assert agent_of("proxy=cartpole,acrobot") == "ddqn"
+    with pytest.raises(ConfigError, match=r"^agent must be given, .*got none, with ddqn, td3 for"):
+        compose.register("evaluate", ["proxy=cartpole,pendulum"])
+    compose.register("evaluate", ["proxy=cartpole,pendulum", "agent=ppo"])
 
 
 def test_a_missing_proxy_or_task_says_what_to_set():

@@ -7,7 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import sejax
 from sejax import plugins
+from sejax.errors import ConfigError
 from sejax.es.evosax import ALGORITHMS, EvosaxConfig, finite_fitness
 from sejax.es.nes import NESConfig
 
@@ -293,8 +295,9 @@ def evosax_strategy(name, **fields):
 def test_the_names_are_evosaxs_own_distribution_based_algorithms():
     from evosax.algorithms import distribution_based_algorithms
 
-    without_a_mean = {"RandomSearch", "SV_CMA_ES", "SV_Open_ES"}
-    assert set(ALGORITHMS.values()) == set(distribution_based_algorithms) - without_a_mean
+    without_a_mean, of_gradients = {"RandomSearch", "SV_CMA_ES", "SV_Open_ES"}, {"GuidedES"}
+    left_out = without_a_mean | of_gradients
+    assert set(ALGORITHMS.values()) == set(distribution_based_algorithms) - left_out
     assert list(ALGORITHMS) == sorted(ALGORITHMS)
     assert plugins.names("es") == ["nes", *ALGORITHMS]
 
@@ -316,6 +319,31 @@ def test_every_algorithm_asks_for_its_population_and_the_incumbent(name):
     assert jax.tree.map(lambda x: (x.shape, x.dtype), after) == jax.tree.map(
         lambda x: (x.shape, x.dtype), state
     )
+
+
+@pytest.mark.parametrize("name", ALGORITHMS)
+def test_candidates_have_our_std_and_come_in_pairs_where_the_strategy_says_so(name):
+    dims, std = 200, 0.05
+    strategy = EvosaxConfig(name=name, population_size=32, noise_std=std).make(dims)
+    state = strategy.init(jax.random.key(0), jnp.zeros(dims))
+    members, _ = jax.jit(strategy.ask)(jax.random.key(1), state)
+    opposite = bool(jnp.abs(members[:16] + members[16:]).max() < 1e-6)
+    assert strategy.num_signs == (2 if opposite else 1)
+    # ASEBO's candidates are shorter by the root of the dimensions, its own definition; those of
+    # gradientless descent have radii from a 200th of the std to all of it.
+    wanted = {"asebo": std / np.sqrt(dims), "gradientless_descent": None}.get(name, std)
+    spread = float(jnp.std(members))
+    assert spread == pytest.approx(wanted, rel=0.15) if wanted else 0.1 * std < spread < std
+
+
+def test_algorithms_that_remember_scores_want_them_in_one_unit():
+    words = ["env=gridworld_2x2", "es=hill_climbing"]
+    assert sejax.make_learner(sejax.config(words))
+    for more in (["agents=[q_learning,sarsa]"], ["objective.first_test_steps=2"]):
+        with pytest.raises(
+            ConfigError, match=r"^es must be one that compares the members of a gen"
+        ):
+            sejax.make_learner(sejax.config([*words, *more]))
 
 
 TARGET = np.array([0.5, -0.4, 0.3, -0.2, 0.6, -0.5], np.float32)
@@ -384,3 +412,5 @@ def test_nonfinite_fitness_is_just_worse_than_the_worst():
     np.testing.assert_array_equal(finite_fitness(jnp.array([1.0, NAN, 3.0, INF])), [1, 5, 3, 5])
     np.testing.assert_array_equal(finite_fitness(jnp.array([2.0, -INF])), [2, 3])
     np.testing.assert_array_equal(finite_fitness(jnp.array([NAN, INF])), [0, 0])
+    # Who remembers the best must not take that for one.
+    np.testing.assert_array_equal(finite_fitness(jnp.array([NAN, INF]), INF), [INF, INF])

@@ -356,6 +356,7 @@ def test_tensors_of_another_shape_are_refused(path):
     ({"discount": None}, r"^discount must be given for a potential-based.*=params\.discount"),
     ({"discount": 5.0}, r"^config, discount and record must be plain .*outside of \[0, 1"),
     ({"score": "high"}, r"^config, discount and record must be plain values"),
+    ({"config": sejax.NESConfig()}, r"^config must be nested plain values.*\.plain\(\)"),
     ({"config": {"es": sejax.NESConfig()}}, r"^config, discount and record must be plain values"),
 ])  # fmt: skip
 def test_what_could_not_be_loaded_is_not_saved_over_what_can(path, env, weights, given, said):
@@ -479,16 +480,21 @@ def test_a_foreign_task_or_kind_is_never_imported_and_loads_if_it_is_given(mine)
     assert "my_file_worlds" not in sys.modules
 
 
-def test_a_task_given_must_be_that_of_the_proxy(path):
+def test_a_task_given_must_be_that_of_the_proxy(path, tmp_path):
     with pytest.raises(ConfigError, match=r"be a proxy of cliff_walking, .* one of gridworld_2x2"):
         sejax.load(path, task=envs.make("cliff_walking"))
     task = dataclasses.replace(envs.make("gridworld_2x2"), solved_reward=0.5)
     assert files.load_proxy(path, task=task).task is task
     longer = dataclasses.replace(task, max_steps=task.max_steps + 1)
-    with pytest.raises(
-        ConfigError, match=rf"^task must have the max_steps .*{task.max_steps}, bec"
-    ):
-        sejax.load(path, task=longer)
+    assert sejax.load(path, task=longer)[0].task is longer  # an RN: the same dynamics
+    se = tmp_path / "se.safetensors"
+    env, weights = an_se_of(dataclasses.replace(envs.make("pendulum"), name="theirs", origin=None))
+    sejax.save(se, env, weights)
+    for change, said in (({"max_steps": 7}, "max_steps of"),
+                         ({"env": envs.make("acrobot").env}, "observation of")):  # fmt: skip
+        other = dataclasses.replace(env.task, **{"params": None, "max_steps": 200} | change)
+        with pytest.raises(ConfigError, match=f"^task must have the {said}"):
+            sejax.load(se, task=other)
 
 
 def test_a_task_made_by_hand_must_be_given(tmp_path, env, weights):

@@ -111,8 +111,9 @@ def _learns_each_step(exploration: Any) -> bool:
 
 def default_for(facts: Any) -> str:
     """The agent that is chosen for a task where none is asked for: the first that suits it."""
-    return next(name for name in DEFAULTS
-                if _suits(plugins.find("agent", name), facts))  # fmt: skip
+    fitting = (name for name in DEFAULTS
+               if _suits(plugins.find("agent", name), facts))  # fmt: skip
+    return next(fitting, DEFAULTS[0])  # which will be refused, if none does
 
 
 def _suits(agent: Any, facts: Any) -> bool:

@@ -80,7 +80,8 @@ class LearnConfig:
         facts, task_name = envs.facts_of(self.env), self.name("env")
         if hasattr(self.proxy, "require_task"):
             self.proxy.require_task(facts, task_name)
-        if hasattr(self.proxy, "lasts_to_the_limit"):  # an SE
+        train = not all(getattr(x.agent, "is_solved_for", False) for x in families_of(self))
+        if train and hasattr(self.proxy, "lasts_to_the_limit"):  # an SE
             require_reachable("training", self.training, self.proxy.max_steps(facts.max_steps))
         for family in families_of(self):
             with families.named(family.field):

@@ -5,6 +5,7 @@ its names stand for (`sejax.plugins`), those of a task's tuned settings from one
 and proxy (`sejax.app.presets`).
 """
 
+import contextlib
 import functools
 import itertools
 import re
@@ -180,7 +181,7 @@ def register(name: str, overrides: Sequence[str]) -> None:
     if name == "run":
         _register_presets(chosen)
     else:
-        _store("agent", _OF_TASK, plugins.defaults("agent", _agent_of_proxy(chosen)))
+        _store("agent", _OF_TASK, plugins.defaults("agent", _agent_of_proxy(overrides)))
 
 
 def _require_choices(groups: tuple[str, ...], overrides: Sequence[str]) -> None:
@@ -291,16 +292,48 @@ def _agent_for(choice: str, is_own: bool, node: dict[str, Any], overrides: Seque
     return agents.default_for(facts)
 
 
-def _agent_of_proxy(chosen: Mapping[str, Sequence[str]]) -> str:
-    """The agent that is evaluated on a proxy where the command line names none."""
-    source, env = (chosen.get(group, [""])[0] for group in ("proxy", "env"))
+def _agent_of_proxy(overrides: Sequence[str]) -> str:
+    """The agent that is evaluated on a proxy where the command line names none.
+
+    Raises:
+      ConfigError: for a sweep over proxies that want different ones.
+    """
+    values = _last_values(overrides, ("agent", "agents", "proxy", "env"))
+    if "agent" in values or "agents" in values:
+        return _DEFAULT_AGENT  # whatever: it is not used
+    found = {_agent_on(str(proxy), env) for proxy in values.get("proxy", [""])
+             for env in values.get("env", [None])}  # fmt: skip
+    require(len(found) == 1, "agent", "be given", "the proxies of this sweep have tasks of "
+            "different kinds", f"none, with {', '.join(sorted(found))} for them",
+            "agent=ppo, which suits all with vectors as states")  # fmt: skip
+    return found.pop()
+
+
+def _last_values(overrides: Sequence[str], names: Sequence[str]) -> dict[str, list[Any]]:
+    """What the last word of each name sets: a value, or those of a sweep."""
+    found = {}
+    parser = OverridesParser.create()
+    for word in overrides:
+        with contextlib.suppress(HydraException):  # Hydra will say what it cannot read
+            override = parser.parse_override(word)
+            if override.key_or_group in names:
+                found[override.key_or_group] = [
+                    x.text if isinstance(x, QuotedString) else x for x in _values(override)
+                ]
+    return found
+
+
+def _agent_on(source: str, env: Any) -> str:
+    """The agent of one proxy's task; what a file names is not imported."""
+    given = {"name": env} if isinstance(env, str) else None
     try:
         if source not in ("", "real"):
             _, header = stored.read(stored.find(source), "proxy")
             if "interface" in header:
                 return agents.default_for(_facts_of(header["interface"]))
-            env = str(header["config"]["env"].get("name"))
-        return agents.default_for(envs.facts_of(plugins.configure("env", {"name": env})))
+            known = plugins.is_registered("env", str(header["config"]["env"].get("name")))
+            given = given or (header["config"]["env"] if known else None)
+        return agents.default_for(envs.facts_of(plugins.configure("env", given or {})))
     except ConfigError:
         return _DEFAULT_AGENT  # what is wrong is said later
 

@@ -235,6 +235,8 @@ class Proxies:
         self, name: str, index: int, flat: Any, score: Any, scores: Any, generation: Any
     ) -> None:
         names = self.program.families.names
+        if not np.isfinite(flat[index]).all():  # a mean that is lost; the file before it stays
+            return
         of_families = dict(zip(names, map(float, scores[index]), strict=True))
         files.save(
             self.folder / f"{name}.safetensors",

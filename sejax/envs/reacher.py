@@ -16,7 +16,9 @@ class Reacher(Options):
     """
 
     group: ClassVar[str] = "env"
-    facts: ClassVar[Facts] = Facts("vector", "continuous", max_steps=50, has_info=True)
+    facts: ClassVar[Facts] = Facts(
+        "vector", "continuous", max_steps=50, has_info=True, has_vector=False
+    )
 
     reward_dist_weight: float = option(1.0, not_negative("it weighs a cost"))
     reward_control_weight: float = option(1.0, not_negative("it weighs a cost"))

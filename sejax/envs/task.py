@@ -18,14 +18,15 @@ class Facts(NamedTuple):
       actions: "discrete" or "continuous".
       max_steps: step limit of an episode.
       has_info: whether its steps tell more than the observation; see `Task.info_keys`.
-      has_vector: whether some of that describes the state alone; see `Task.augmented_keys`.
+      has_vector: whether some of that describes the state alone (`Task.augmented_keys`); None: only
+        the task says.
     """
 
     states: str
     actions: str
     max_steps: int
     has_info: bool = False
-    has_vector: bool = False
+    has_vector: bool | None = None
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -40,8 +41,9 @@ class Task:
       name: what it is called, in files too.
       env: gymnax 1.x `Environment`, of which `reset_env`, `step_env`, `is_truncated`,
         `action_space`, `observation_space` and `default_params` are used; its params have
-        `max_steps_in_episode`, its state has `time`. `step_env` returns observation, state, reward,
-        terminated and info. A step's `info` may say under "discount" what a target
+        `max_steps_in_episode`, its state has `time` for RNs with
+        `zero_at_terminal`. `step_env` returns observation, state, reward, terminated and info. A
+        step's `info` may say under "discount" what a target
         bootstraps with; 1 minus terminated if not. Build a task once: what is compiled for it is
         kept by identity.
       params: its `EnvParams`; the environment's `default_params` if not given.
@@ -172,14 +174,14 @@ def _try(env: Any, params: Any, name: str) -> None:
         action = env.action_space(params).sample(key)
         next_obs, state, reward, terminated, _ = env.step_env(key, state, action, params)
         env.is_truncated(state, params)
-        return obs, next_obs, reward, terminated, state.time
+        return obs, next_obs, reward, terminated
 
     try:
-        obs, next_obs, reward, terminated, _ = jax.eval_shape(step, jax.random.key(0))
+        obs, next_obs, reward, terminated = jax.eval_shape(step, jax.random.key(0))
     except Exception as error:
         raise errors.ConfigError(
-            f"env must be a gymnax 1.x environment with reset_env, step_env (five values), "
-            f"is_truncated and a state with time, because agents train and are tested there; "
+            f"env must be a gymnax 1.x environment with reset_env, step_env (five values) and "
+            f"is_truncated, because agents train and are tested there; "
             f"{name} raised {errors.told(error)}. Derive it from gymnax's Environment."
         ) from error
     shape = tuple(env.observation_space(params).shape)

@@ -17,7 +17,7 @@ from sejax.options import MOST_MEMBERS, Options, counts, one_of, option, positiv
 
 # Name -> evosax's class. Listed here because importing evosax takes a second; a test holds the list
 # against evosax's own. Left out are RandomSearch and the two SV algorithms, which have no single
-# mean that could be the incumbent.
+# mean that could be the incumbent, and GuidedES, which wants gradients.
 ALGORITHMS = {
     "ars": "ARS",
     "asebo": "ASEBO",
@@ -28,7 +28,6 @@ ALGORITHMS = {
     "esmc": "ESMC",
     "evotf_es": "EvoTF_ES",
     "gradientless_descent": "GradientlessDescent",
-    "guided_es": "GuidedES",
     "hill_climbing": "HillClimbing",
     "iamalgam_full": "iAMaLGaM_Full",
     "iamalgam_univariate": "iAMaLGaM_Univariate",
@@ -46,6 +45,14 @@ ALGORITHMS = {
     "snes": "SNES",
     "xnes": "xNES",
 }
+
+# Whose candidates are pairs of opposite perturbations, one half of them after the other.
+PAIRED = ("ars", "asebo", "cr_fm_nes", "noise_reuse_es", "open_es", "persistent_es", "pgpe")
+# Which hold scores against those of earlier generations.
+REMEMBERING = ("gradientless_descent", "hill_climbing", "iamalgam_full", "iamalgam_univariate",
+               "simulated_annealing")  # fmt: skip
+# The step of whose mean has a natural scale.
+NATURAL = ("des", "simple_es", "snes", "xnes")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -91,14 +98,21 @@ def make_evosax(config: EvosaxConfig, num_dims: int) -> Strategy:
     algorithm, params = _build(config, num_dims)
 
     def tell(key: Array, members: Array, scores: Array, incumbent_score: Array, state: Any) -> Any:
-        return algorithm.tell(key, members, finite_fitness(-scores), state, params)[0]
+        fitness = finite_fitness(-scores, jnp.inf if remembers else 0.0)
+        return algorithm.tell(key, members, fitness, state, params)[0]
 
+    def init(key: Array, mean: Array) -> Any:
+        return _with_std(config, algorithm.init(key, mean, params))
+
+    remembers = config.name in REMEMBERING
     return Strategy(
-        init=lambda key, mean: algorithm.init(key, mean, params),
+        init=init,
         ask=lambda key, state: algorithm.ask(key, state, params),
         tell=tell,
         incumbent=algorithm.get_mean,
         num_members=config.population_size,
+        num_signs=2 if config.name in PAIRED else 1,
+        remembers_scores=remembers,
         trials=trials_of(config, config.num_incumbent_evals),
     )
 
@@ -111,27 +125,44 @@ def _build(config: EvosaxConfig, num_dims: int) -> tuple[Any, Any]:
     accepted = inspect.signature(cls.__init__).parameters
     options: dict[str, Any] = {}
     if "std_schedule" in accepted:
+        own = not config.name.startswith("iamalgam")  # which add the schedule to a covariance
         options["std_schedule"] = optax.exponential_decay(
-            config.noise_std, transition_steps=1, decay_rate=config.noise_std_decay
+            own * config.noise_std, transition_steps=1, decay_rate=config.noise_std_decay
         )
     if "optimizer" in accepted:
-        natural = config.name in ("snes", "xnes", "des")  # their mean update has a natural scale
+        natural = config.name in NATURAL
         options["optimizer"] = optax.sgd(1.0) if natural else optax.adam(config.step_size)
     algorithm = cls(population_size=config.population_size, solution=jnp.zeros(num_dims), **options)
     params = algorithm.default_params
     if hasattr(params, "std_init"):
         params = params.replace(std_init=config.noise_std)
+    if hasattr(params, "radius_max"):  # candidates' radii, from a 200th of it
+        params = params.replace(
+            radius_max=config.noise_std,
+            radius_min=config.noise_std * params.radius_min / params.radius_max,
+        )
     return algorithm, params
 
 
-def finite_fitness(fitness: Float[Array, " pop"]) -> Float[Array, " pop"]:
+def _with_std(config: EvosaxConfig, state: Any) -> Any:
+    """A first state with our std where evosax has another beside it."""
+    if config.name == "xnes":  # std_init stands in its shape matrix as well
+        return state.replace(B=state.B / config.noise_std)
+    if config.name.startswith("iamalgam"):
+        return state.replace(C=config.noise_std**2 * state.C)
+    return state
+
+
+def finite_fitness(
+    fitness: Float[Array, " pop"], of_none: Array | float = 0.0
+) -> Float[Array, " pop"]:
     """Fitness (minimised) with entries that are not finite just worse than the worst finite one.
 
     An infinity would poison the algorithms that standardise, so the gap is that between best and
-    worst, or 1.
+    worst, or 1. Where none is finite all are `of_none`.
     """
     finite = jnp.isfinite(fitness)
     worst = jnp.max(jnp.where(finite, fitness, -jnp.inf))
     best = jnp.min(jnp.where(finite, fitness, jnp.inf))
     replacement = worst + jnp.maximum(worst - best, 1.0)
-    return jnp.where(finite, fitness, jnp.where(finite.any(), replacement, 0.0))
+    return jnp.where(finite, fitness, jnp.where(finite.any(), replacement, of_none))

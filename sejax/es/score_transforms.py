@@ -105,7 +105,7 @@ def _advantage(scores: Scores, incumbent: Float[Array, ""]) -> Scores:
     finite = _floor_nonfinite(scores)
     below_all = finite.min() - jnp.maximum(finite.max() - finite.min(), 1.0)
     floor = jnp.where(jnp.isfinite(incumbent), incumbent, below_all)
-    is_better = jnp.isfinite(scores) & ~is_tie(scores, floor)
+    is_better = jnp.isfinite(scores) & ~(jnp.isfinite(incumbent) & is_tie(scores, incumbent))
     return jnp.where(is_better, jnp.maximum(scores - floor, 0.0), 0.0)
 
 

@@ -105,6 +105,8 @@ class Strategy:
       incumbent: `(state) -> [dims]`, the proxy that the strategy stands for.
       num_members: proxies in a generation beside the incumbent.
       num_signs: blocks of members, at the same place of which stand the signs of one perturbation.
+      remembers_scores: whether scores are held against those of earlier generations, so that they
+        must be in one unit.
       trials: how often each is tried.
     """
 
@@ -114,6 +116,7 @@ class Strategy:
     incumbent: Callable[[Any], Array]
     num_members: int
     num_signs: int = 1
+    remembers_scores: bool = False
     trials: Trials = Trials()
 
     @property

@@ -164,7 +164,8 @@ def summarise(curves: pd.DataFrame) -> pd.DataFrame:
         low, high = bootstrap_interval(last)
         rows.append({
             "study": number, "env": study.env, "agent": study.agent,
-            "num_agents": len(last), "max_steps": mine["max_steps"].iloc[0], "threshold": threshold,
+            "num_agents": len(last), "max_steps": mine["max_steps"].iloc[0],
+            "made_steps": mine.groupby("agent")["steps"].max().mean(), "threshold": threshold,
             "num_solved": int(np.isfinite(to_solve).sum()),
             "num_solved_at_the_end": int((last >= threshold).sum()),
             "median_steps_to_solve": np.median(to_solve),
@@ -183,7 +184,8 @@ COLUMNS: dict[str, Any] = {
     "still at the end": "{num_solved_at_the_end}",
     "median steps to solve": lambda row: (
         f"{row.median_steps_to_solve:,.0f}" if np.isfinite(row.median_steps_to_solve) else "-"),
-    "steps": "{max_steps:,}",
+    "steps, at most": "{max_steps:,}",
+    "made": "{made_steps:,.0f}",
     f"last {WINDOW} tests": "{last_return:.1f} [{last_low:.1f}, {last_high:.1f}]",
     "IQM": iqm_text("last"),
     "others": lambda row: STUDIES[row.study].peers,
@@ -197,7 +199,9 @@ def report(settings: AgentLearning, curves: pd.DataFrame) -> pd.DataFrame:
         f"{settings.num_agents} seeds of each; after each training episode "
         f"{settings.test_episodes} greedy test episode. Solved: the mean of {WINDOW} tests in a "
         f"row reaches the threshold at some time, at the end if that of the last {WINDOW} does. "
-        f"The last {WINDOW} tests: mean over seeds, bootstrap 95% interval. CartPole here is v0, "
+        "Made: steps until the last episode that ended, on average; some are limited by their "
+        f"number of episodes. The last {WINDOW} tests: mean over seeds, bootstrap 95% interval. "
+        "CartPole here is v0, "
         f"of 200 steps.{iqm_note()}"
     )
     title = "Agents that learn the real tasks"

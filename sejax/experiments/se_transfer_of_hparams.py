@@ -84,6 +84,7 @@ def parts_of(settings: SeTransferOfHparams) -> Parts:
     learned = training_as_learned(ses, config.agent)
     on_se = dataclasses.replace(
         learned, max_steps=settings.max_steps or learned.max_steps,
+        max_episodes=max(learned.max_episodes, settings.max_steps or 0),
         test_episodes=settings.test_episodes)  # fmt: skip
     require(on_se.max_steps is not None, "max_steps", "be given with this SE", "agents on the real "
             "task train as long, and its own trained until a rule stopped them", "null",
@@ -168,7 +169,8 @@ def quality(chooser: np.ndarray, target: np.ndarray) -> dict[str, float]:
     """How good one set of returns is for choosing a configuration for the real task.
 
     Args:
-      chooser: `[2, config]`, by which one is chosen twice; of equal ones the first.
+      chooser: `[2, config]`, by which one is chosen twice; of equally good ones any, so that
+        the mean over them is what a choice is worth.
       target: `[2, config]`, independent halves of the returns there; each judges the choice that
         the other half of the target's, or of the chooser's, has made.
 
@@ -182,7 +184,7 @@ def quality(chooser: np.ndarray, target: np.ndarray) -> dict[str, float]:
     judges = target[::-1]
 
     def judged(by: np.ndarray) -> float:
-        return float(np.mean([judges[half, by[half].argmax()] for half in (0, 1)]))
+        return float(np.mean([judges[i, by[i] == by[i].max()].mean() for i in (0, 1)]))
 
     best = judged(target)
     return {"rho": rank_correlation(*pair), "chosen": judged(chooser),

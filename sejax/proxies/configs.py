@@ -113,9 +113,10 @@ class RewardConfig(Options):
                   ("augmented", self.augmented, facts.has_vector, "false"))  # fmt: skip
         for name, is_needed, is_there, fix in fields:
             value = getattr(self, name)
-            require(is_there or not is_needed, f"proxy.{name}", f"do without {value} in "
-                    f"{task_name}", "its steps tell nothing of the state beside the observation",
-                    value, f"proxy.{name}={fix}")  # fmt: skip
+            require(is_there is not False or not is_needed, f"proxy.{name}",
+                    f"do without {value} in {task_name}",
+                    "its steps tell nothing of the state beside the observation", value,
+                    f"proxy.{name}={fix}")  # fmt: skip
 
     def make(self, task: Any) -> "ProxyEnv":
         """The RN of a task.

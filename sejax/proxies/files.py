@@ -8,6 +8,7 @@ all of it. Nothing in a file is executed, resolved or imported when it is read.
 
 import dataclasses
 import hashlib
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -312,6 +313,9 @@ def _write(
     require(discount is not None or not getattr(env.config, "is_potential_based", False),
             "discount", "be given for a potential-based reward network", "its reward is made with "
             "it", discount, "discount=params.discount, that of the agent")  # fmt: skip
+    require(isinstance(config, Mapping | None), "config", "be nested plain values", "they are kept "
+            "beside the weights", type(config).__name__,
+            "config=sejax.config(...).plain()")  # fmt: skip
     known = {
         "env": env.task.origin or {"name": env.task.name},
         "proxy": plugins.describe("proxy", env.config),
@@ -332,7 +336,7 @@ def _write(
         raise ConfigError(
             f"config, discount and record must be plain values that sejax.load takes, because they "
             f"are kept beside the weights; got {told(error)}. Give score, generation and seed as "
-            f"numbers, and config as sejax.config(...) has it."
+            f"numbers, and config as sejax.config(...).plain() has it."
         ) from error
     write_bytes(path, sealed)
 
@@ -456,12 +460,41 @@ def _env_of(
             "given", f"one of {shortened(header['task'])} in {path}",
             f"{option} to a proxy of {task.name}, or another task")  # fmt: skip
     if given and "interface" in header:
-        for what, stored in header["interface"].items():
-            there = task.interface.get(what)
-            require(there == stored, "task", f"have the {what} of the task that the proxy was "
-                    f"learned for, {shortened(stored)}", f"{path} is a proxy of that one", there,
-                    f"task to a sejax.Task with that {what}")  # fmt: skip
+        _require_same(header["interface"], task.interface, proxy, path)
     return plugins.make("proxy", proxy, task)
+
+
+def _require_same(learned: Mapping[str, Any], given: Mapping[str, Any], proxy: Any, path: Path
+                  ) -> None:  # fmt: skip
+    """Checks that a task given is that of the proxy, as far as the proxy depends on it.
+
+    An RN is for the same dynamics with another step limit too, and an SE in the task's raw units
+    does not know the bounds of observations.
+    """
+    is_se = hasattr(proxy, "lasts_to_the_limit")
+    with_bounds = {"observation": getattr(proxy, "state_units", "raw") == "bounds", "action": True}
+    for what, wanted in learned.items():
+        there = given[what]
+        if what in with_bounds:
+            same = _is_same_space(wanted, there, with_bounds[what])
+        else:
+            same = there == wanted or not is_se
+        require(same, "task", f"have the {what} of the task that the proxy was learned for, "
+                f"{shortened(wanted)}", f"{path} is a proxy of that one", there,
+                f"task to a sejax.Task with that {what}")  # fmt: skip
+
+
+def _is_same_space(one: Mapping[str, Any], other: Mapping[str, Any], with_bounds: bool) -> bool:
+    """Whether two spaces of `Task.interface` are the same, but for rounding."""
+    if "n" in one or "n" in other:
+        return one == other
+    if len(one["low"]) != len(other["low"]):
+        return False
+    ends = [(a, b) for end in ("low", "high") for a, b in zip(one[end], other[end], strict=True)]
+    return not with_bounds or all(
+        a == b if a is None or b is None else math.isclose(a, b, rel_tol=1e-5, abs_tol=1e-8)
+        for a, b in ends
+    )
 
 
 def _registered(

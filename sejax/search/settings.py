@@ -121,8 +121,10 @@ class Search:
     @functools.cached_property
     def agent(self) -> str:
         """The name of the agent: what is said, or what the task and the proxy choose."""
-        said = self.choice("agent", "ddqn" if self.is_of_agent else "")
+        said = self.choice("agent", "")
         choices = [word for word in self.fixed if "." not in word.partition("=")[0]]
+        if self.is_of_agent and not said:
+            return plugins.name_of("agent", compose.evaluate_config(choices).agent)
         return said or compose.config(choices).name("agent")
 
     @property
