@@ -18,8 +18,8 @@ class Facts(NamedTuple):
       actions: "discrete" or "continuous".
       max_steps: step limit of an episode.
       has_info: whether its steps tell more than the observation; see `Task.info_keys`.
-      has_vector: whether some of that describes the state alone (`Task.augmented_keys`); None: only
-        the task says.
+      has_vector: whether some of that describes the state alone (`Task.augmented_keys`); None where
+        nothing is told, or only the task knows.
     """
 
     states: str
@@ -112,7 +112,7 @@ class Task:
             actions="continuous" if self.num_actions is None else "discrete",
             max_steps=self.max_steps,
             has_info=bool(self.info_keys),
-            has_vector=bool(self.augmented_keys),
+            has_vector=bool(self.augmented_keys) if self.info_keys else None,
         )
 
     @property

@@ -109,11 +109,12 @@ class RewardConfig(Options):
         Raises:
           ConfigError: if it does not.
         """
+        has_vector = facts.has_info if facts.has_vector is None else facts.has_vector
         fields = (("variant", self.weighs_info, facts.has_info, "additive_potential"),
-                  ("augmented", self.augmented, facts.has_vector, "false"))  # fmt: skip
+                  ("augmented", self.augmented, has_vector, "false"))  # fmt: skip
         for name, is_needed, is_there, fix in fields:
             value = getattr(self, name)
-            require(is_there is not False or not is_needed, f"proxy.{name}",
+            require(is_there or not is_needed, f"proxy.{name}",
                     f"do without {value} in {task_name}",
                     "its steps tell nothing of the state beside the observation", value,
                     f"proxy.{name}={fix}")  # fmt: skip
