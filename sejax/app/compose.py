@@ -300,7 +300,7 @@ def _agent_of_proxy(overrides: Sequence[str]) -> str:
     """
     values = _last_values(overrides, ("agent", "agents", "proxy", "env"))
     if "agent" in values or "agents" in values:
-        return _DEFAULT_AGENT  # whatever: it is not used
+        return _DEFAULT_AGENT  # not used
     found = {_agent_on(str(proxy), env) for proxy in values.get("proxy", [""])
              for env in values.get("env", [None])}  # fmt: skip
     require(len(found) == 1, "agent", "be given", "the proxies of this sweep have tasks of "

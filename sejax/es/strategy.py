@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float
 
 AGGREGATES = ("mean", "min")
 LARGEST = 1e6  # larger steps or noise lead to weights whose products are not finite
-_TIE = 1e-6  # of the incumbent's score, and at least in the score's unit
+_TIE = 1e-6  # of the incumbent's score, or of 1 where that is smaller
 
 
 @dataclass(frozen=True, kw_only=True)

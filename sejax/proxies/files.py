@@ -369,8 +369,8 @@ def load(source: str | Path, task: Task | None = None, proxy: Any = None) -> tup
 
     Raises:
       ConfigError: if there is no such proxy, the file is damaged or of another format, it holds
-        several, its task or kind is not known, or the task given is not the file's: its spaces or
-        its step limit are others.
+        several, its task or kind is not known, or the task given is not the file's: its spaces are
+        others, or for an SE its step limit.
 
     Example:
       >>> env, params = load("cartpole")
