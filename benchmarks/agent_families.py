@@ -1,7 +1,8 @@
 """CPU time of one agent step for each family of agents on one core: sejax against eager PyTorch.
 
-Each family trains `--agents` agents for `--steps` steps on a fresh SE. Hyperparameters are the
-paper's: for DDQN those of CartPole, for PPO `PPOConfig.paper()`, for the others the defaults.
+Each family trains `--agents` agents for `--steps` steps on a fresh SE of the paper's kind, soft and
+with the task's step limit. Hyperparameters are the paper's: for DDQN those of CartPole, with the SE
+of its table, for PPO `PPOConfig.paper()`, for the others the defaults.
 Families with a PyTorch reference are measured at those of `preset=best` as well, where networks and
 batches are small. Agents learn from the first step on; training never stops early, and a fresh SE
 hardly ever ends an episode. PPO learns when its rollout is full: it trains for a multiple of that
@@ -57,17 +58,18 @@ class Family:
 
         PPO trains for whole learning phases, at least two of them.
         """
+        proxy = SyntheticConfig()  # that of `preset=best` is of one-step episodes
         if self.settings == "best" or self.agent == "ddqn":
             names = f"env={self.env}", f"agent={self.agent}", f"preset={self.settings}"
             chosen = sejax.config(names)
-            agent, proxy = chosen.agent, chosen.proxy
+            agent, proxy = chosen.agent, chosen.proxy if self.settings == "paper" else proxy
         elif self.agent == "ppo":
-            agent, proxy = sejax.PPOConfig.paper(), SyntheticConfig()
+            agent = sejax.PPOConfig.paper()
         else:
-            agent, proxy = plugins.configure("agent", {"name": self.agent}), SyntheticConfig()
+            agent = plugins.configure("agent", {"name": self.agent})
         agent = replace(agent, init_episodes=0)
-        facts = plugins.find("env", self.env).facts
-        phase = agent.steps_before_learning(facts.max_steps)  # 0 but for PPO
+        limit = plugins.find("env", self.env).facts.max_steps
+        phase = agent.steps_before_learning(limit, limit)  # 0 but for PPO
         steps = max(2, -(-steps // phase)) * phase if phase else steps
         training = TrainingConfig(stop_rule="never", max_steps=steps, max_episodes=steps)
         return agent, proxy, training
