@@ -235,8 +235,6 @@ class Plain:
     def step_env(self, key, state, action, params):
         return jnp.zeros(2), state, 0.0, jnp.bool_(False), {}
 
-    reset = reset_env
-
     def action_space(self, params):
         return spaces.Discrete(2)
 
@@ -258,7 +256,26 @@ class Four(Short):
         return jnp.zeros(2), state, 0.0, jnp.bool_(False)
 
 
+class NoReset(Short):
+    def reset_env(self, key, params):
+        raise NotImplementedError("a reset")
+
+
+class NoSpace(Short):
+    def action_space(self, params):
+        raise KeyError("actions")
+
+
+class NoParams(Short):
+    @property
+    def default_params(self):
+        raise NotImplementedError("params")
+
+
 @pytest.mark.parametrize("world, said", [
+    (NoReset, r"five values.*raised NotImplementedError: a reset\."),
+    (NoSpace, r"five values.*raised KeyError: 'actions'\."),
+    (NoParams, r"five values.*raised NotImplementedError: params\."),
     (Plain, r"raised AttributeError: .*is_truncated.*Derive it from gymnax's Environment\.$"),
     (Short, r"have \(2,\) as the shape of reset_env's observation, .*got \(3,\) in mine"),
     (Four, r"five values.*raised ValueError: not enough values to unpack"),
@@ -266,6 +283,11 @@ class Four(Short):
 def test_what_is_no_environment_is_told_before_an_agent_trains(world, said):
     with pytest.raises(ConfigError, match=rf"^env must .*{said}"):
         Task(name="mine", env=world())
+
+
+def test_params_without_a_limit_and_an_odd_threshold_are_refused():
+    with pytest.raises(ConfigError, match=r"^params must have max_steps_in.*got EnvState"):
+        Task(name="mine", env=Short(), params=gymnax.EnvState(time=0))
     with pytest.raises(ConfigError, match=r"^env\.solved_reward must be a number"):
         Task(name="mine", env=Odd(spaces.Discrete(2), spaces.Box(-1.0, 1.0, (2,))),
              params=Plain.default_params, solved_reward="high")  # fmt: skip

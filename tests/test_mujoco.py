@@ -6,7 +6,6 @@ import shutil
 import subprocess
 import sys
 import tempfile
-import threading
 from concurrent.futures import ThreadPoolExecutor
 
 import jax
@@ -294,16 +293,47 @@ def test_a_step_rounds_what_changed_and_not_where_it_is():
     np.testing.assert_allclose(changes[0], changes[1], rtol=0, atol=1e-6)
 
 
-def test_controls_that_are_no_numbers_count_as_none_and_leave_no_log(monkeypatch, tmp_path):
+@pytest.mark.parametrize(
+    "ctrl", [[1, 5, 1], [1, np.nan, 1], [1, np.inf, 1], [0.1, -np.inf, 0], [1, -1e11, 0.3]]
+)
+def test_odd_controls_are_taken_as_mujoco_takes_them_and_leave_no_log(ctrl, monkeypatch, tmp_path):
+    physics = of_gymnasium("hopper.xml", 4)
+    data = mujoco.MjData(physics.model)
+    data.qpos[:], data.ctrl[:] = 1, np.float32(ctrl)
     monkeypatch.chdir(tmp_path)
+    state, _ = physics.reset(jnp.ones(6), jnp.zeros(6))
+    _, now = jax.jit(physics.step)(state, jnp.array(ctrl))
+    assert not list(tmp_path.iterdir())
+    mujoco.mj_step(physics.model, data, 4)
+    np.testing.assert_array_equal(now.qpos, np.float32(data.qpos))
+    np.testing.assert_array_equal(now.qvel, np.float32(data.qvel))
+
+
+def test_a_control_that_is_no_number_is_charged_as_it_is():
+    task = envs.make("hopper")
+    _, state = task.env.reset_env(jax.random.key(0), task.params)
+    action = jnp.array([1, jnp.nan, 1])
+    _, _, reward, _, info = task.env.step_env(None, state, action, task.params)
+    assert np.isnan(reward) and np.isnan(info["reward_ctrl"])
+
+
+def test_a_simulation_that_explodes_begins_anew_and_leaves_no_log(monkeypatch, tmp_path, capfd):
     physics = of_gymnasium("hopper.xml", 4)
     step = jax.jit(physics.step)
-    state, _ = physics.reset(jnp.ones(6), jnp.zeros(6))
-    with_nan, idle = (step(state, ctrl)[1] for ctrl in (jnp.array([1, jnp.nan, 1]), jnp.zeros(3)))
-    assert_equal_bits(with_nan, jax.device_get(idle))
-    task = envs.make("hopper")
-    reward = task.env.rewards(idle, jnp.array([1, jnp.nan, 1]), jnp.bool_(True))["reward_ctrl"]
-    assert np.isnan(reward) and not list(tmp_path.iterdir())
+    monkeypatch.chdir(tmp_path)
+    rest, _ = physics.reset(physics.model.qpos0, jnp.zeros(6))
+    state, _ = physics.reset(jnp.ones(6), jnp.zeros(6).at[3:].set(1e11))
+    exploded = step(state, jnp.zeros(3))[1]
+    np.testing.assert_allclose(exploded.qpos, step(rest, jnp.zeros(3))[1].qpos, atol=1e-6)
+    assert not list(tmp_path.iterdir()) and capfd.readouterr() == ("", "")
+
+
+def test_where_jax_has_doubles_a_task_is_the_same():
+    task, key = envs.make("reacher"), jax.random.key(0)
+    with jax.enable_x64(True):
+        obs, state = task.env.reset_env(key, task.params)
+        obs, *_ = task.env.step_env(None, state, np.ones(2), task.params)
+    assert np.isfinite(obs).all() and task.env.num_actions == 2
 
 
 # --- what cannot be ------------------------------------------------------------------------------
@@ -356,7 +386,7 @@ def test_wrong_shapes_are_refused_while_tracing():
 def unbuilt(monkeypatch, tmp_path):
     """As if the library had never been built or loaded."""
     monkeypatch.setenv("SEJAX_CACHE_DIR", str(tmp_path))
-    monkeypatch.setattr(library, "load", library.load.__wrapped__)
+    monkeypatch.setattr(library, "_load", library._load.__wrapped__)
     return tmp_path
 
 
@@ -366,16 +396,26 @@ def unbuilt(monkeypatch, tmp_path):
 def test_without_a_compiler_one_message_says_what_can_be_done(config, fix, unbuilt, monkeypatch):
     monkeypatch.setenv("CXX", "no-such-compiler")
     monkeypatch.setattr(library, "COMPILERS", ("none-either",))
-    with pytest.raises(ConfigError, match=r"needs a C\+\+ compiler.*\$CXX, none-either") as raised:
+    with pytest.raises(ConfigError, match=r"no C\+\+ compiler.*\$CXX, none-either") as raised:
         config.make()
     assert str(raised.value).endswith(fix) and not list(unbuilt.iterdir())
 
 
 def test_a_compiler_that_fails_is_quoted_and_leaves_nothing(unbuilt, monkeypatch):
     monkeypatch.setenv("CXX", "sh -c 'echo no standard library >&2; exit 1'")
-    with pytest.raises(ConfigError, match="sh failed with: no standard library"):
+    with pytest.raises(ConfigError, match=r"sh failed with: no standard library\. Mend that"):
+        HalfCheetah().make()
+    monkeypatch.setenv("CXX", "'g++")
+    with pytest.raises(ConfigError, match=r"CXX is no command, 'g\+\+ \(No closing quotation\)"):
         HalfCheetah().make()
     assert not list(unbuilt.iterdir())
+
+
+def test_a_library_that_cannot_be_loaded_is_one_message(unbuilt, monkeypatch):
+    monkeypatch.setattr(library, "build", lambda path: path.write_text("nothing"))
+    with pytest.raises(ConfigError, match=r"env=hopper needs .*cannot be loaded \(OSError: .*Set "
+                       "SEJAX_CACHE_DIR, or TMPDIR, to"):  # fmt: skip
+        Hopper().make()
 
 
 @pytest.mark.parametrize("package", ["mujoco", "gymnasium"])
@@ -405,19 +445,30 @@ def test_without_a_cache_folder_it_is_built_all_the_same(folder):
 
 @pytest.mark.slow
 def test_builders_at_the_same_time_leave_one_library(tmp_path):
-    barrier = threading.Barrier(3)
-
-    def build(_):
-        barrier.wait()
-        return library._built_in(tmp_path)
-
     with ThreadPoolExecutor(3) as pool:
-        paths = set(pool.map(build, range(3)))
-    assert paths == {tmp_path / library.file_name()} == {*tmp_path.iterdir()}
+        each = [pool.submit(run_program, "memory", "reacher", "10", SEJAX_CACHE_DIR=str(tmp_path))
+                for _ in range(3)]  # fmt: skip
+    path = tmp_path / library.file_name()
+    assert all(str(path) in done.result().stdout for done in each)
+    assert [*tmp_path.iterdir()] == [path]
+
+
+@pytest.mark.slow
+def test_one_that_cannot_be_loaded_is_built_anew(tmp_path):
+    path = tmp_path / library.file_name()
+    path.write_text("nothing")
+    done = run_program("memory", "reacher", "10", SEJAX_CACHE_DIR=".", cwd=tmp_path)
+    assert str(path) in done.stdout and path.stat().st_size > 10_000
+
+
+@pytest.mark.slow
+def test_threads_that_make_the_first_task_share_a_library_without_a_cache():
+    run_program("threads", "reacher,hopper", "10", SEJAX_CACHE_DIR="")
 
 
 PROGRAM = """
 import re, resource, sys
+from concurrent.futures import ThreadPoolExecutor
 import jax, jax.numpy as jnp, numpy as np
 from sejax.envs.mujoco import library
 if sys.argv[1] == "sanitizers":
@@ -425,6 +476,9 @@ if sys.argv[1] == "sanitizers":
     library.FLAGS = (*library.FLAGS, "-g", "-fsanitize=address,undefined",
                      "-fno-sanitize-recover=all", "-U__SANITIZE_ADDRESS__")
 from sejax import envs
+if sys.argv[1] == "threads":
+    with ThreadPoolExecutor(2) as pool:
+        list(pool.map(envs.make, sys.argv[2].split(",")))
 for name in sys.argv[2].split(","):
     task, num_steps = envs.make(name), int(sys.argv[3])
 
@@ -459,10 +513,10 @@ print("done", library.load()._name)
 """
 
 
-def run_program(*arguments, **variables):
+def run_program(*arguments, cwd=None, **variables):
     environment = {**os.environ, "XLA_FLAGS": "", **variables}
     done = subprocess.run([sys.executable, "-c", PROGRAM, *arguments], capture_output=True,
-                          text=True, env=environment)  # fmt: skip
+                          text=True, env=environment, cwd=cwd)  # fmt: skip
     assert done.returncode == 0 and done.stdout.startswith("done"), done.stdout + done.stderr
     return done
 

@@ -1,6 +1,8 @@
 """The contract of a task: a real environment that agents are tested on, and what is known of it."""
 
+import contextlib
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -81,7 +83,10 @@ class Task:
     def __post_init__(self) -> None:
         from sejax.envs.wrappers import as_vectors
 
-        errors.require(hasattr(self.env, "default_params"), "env", "be a gymnax environment",
+        with _says_what_it_must_be(self.name):
+            is_env = hasattr(self.env, "default_params")
+            params = self.env.default_params if is_env and self.params is None else self.params
+        errors.require(is_env, "env", "be a gymnax environment",
                        "its params are asked for", type(self.env).__name__,
                        "env to the first of the pair that gymnax.make returns")  # fmt: skip
         is_nan = isinstance(self.solved_reward, float) and math.isnan(self.solved_reward)
@@ -89,14 +94,17 @@ class Task:
         errors.require(not is_odd, "env.solved_reward", "be a number",
                        "returns are compared with it", self.solved_reward,
                        "env.solved_reward=inf if nobody says")  # fmt: skip
-        params = self.env.default_params if self.params is None else self.params
+        errors.require(hasattr(params, "max_steps_in_episode"), "params", "have "
+                       "max_steps_in_episode", "episodes are cut there", type(params).__name__,
+                       "params to a gymnax EnvParams")  # fmt: skip
         limit = params.max_steps_in_episode if self.max_steps is None else self.max_steps
         errors.whole(1, "env.max_steps", limit, "an episode has steps", 200)
         if self.max_steps is not None and params.max_steps_in_episode != limit:
             params = params.replace(max_steps_in_episode=limit)
         object.__setattr__(self, "max_steps", int(limit))
         object.__setattr__(self, "params", params)
-        env = as_vectors(self.env, params, self.name)
+        with _says_what_it_must_be(self.name):
+            env = as_vectors(self.env, params, self.name)
         if not type(self.env).__module__.startswith(("sejax.", "gymnax.")):
             _try(env, params, self.name)  # seconds for some, which have tests of their own
         object.__setattr__(self, "env", env)
@@ -161,6 +169,21 @@ class Task:
         return float(np.max(self._action_space.high))
 
 
+@contextlib.contextmanager
+def _says_what_it_must_be(name: str) -> Iterator[None]:
+    """Whatever an environment raises within is a `ConfigError`."""
+    try:
+        yield
+    except errors.ConfigError:
+        raise
+    except Exception as error:
+        raise errors.ConfigError(
+            f"env must be a gymnax 1.x environment with default_params, spaces, reset_env, "
+            f"step_env (five values) and is_truncated, because agents train and are tested there; "
+            f"{name} raised {errors.told(error)}. Derive it from gymnax's Environment."
+        ) from error
+
+
 def _try(env: Any, params: Any, name: str) -> None:
     """Traces a step, so that what an environment lacks is told before an agent trains there.
 
@@ -176,14 +199,8 @@ def _try(env: Any, params: Any, name: str) -> None:
         env.is_truncated(state, params)
         return obs, next_obs, reward, terminated
 
-    try:
+    with _says_what_it_must_be(name):
         obs, next_obs, reward, terminated = jax.eval_shape(step, jax.random.key(0))
-    except Exception as error:
-        raise errors.ConfigError(
-            f"env must be a gymnax 1.x environment with reset_env, step_env (five values) and "
-            f"is_truncated, because agents train and are tested there; "
-            f"{name} raised {errors.told(error)}. Derive it from gymnax's Environment."
-        ) from error
     shape = tuple(env.observation_space(params).shape)
     for what, got, wanted in (("reset_env's observation", obs, shape),
                               ("step_env's observation", next_obs, shape),

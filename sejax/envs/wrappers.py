@@ -166,7 +166,7 @@ def as_vectors(env: Any, params: Any, name: str) -> Any:
             )
     plain_obs = isinstance(obs, spaces.Discrete) or getattr(env, "observes_vectors", False)
     if not plain_obs:  # what comes, as a space may say otherwise (gymnax's FourRooms)
-        came = jax.eval_shape(lambda: env.reset(jax.random.key(0), params)[0])
+        came = jax.eval_shape(lambda: env.reset_env(jax.random.key(0), params)[0])
         plain_obs = came.ndim == 1 and came.dtype == jnp.float32
     plain_action = isinstance(action, spaces.Discrete) or _is_symmetric(action, name)
     return env if plain_obs and plain_action else AsVectors(env, params)

@@ -80,6 +80,10 @@ class HalfCheetahEnv(environment.Environment[CheetahState, CheetahParams]):
     def name(self) -> str:
         return f"HalfCheetah-{self.backend}"
 
+    @property
+    def num_actions(self) -> int:
+        return self._brax.action_size
+
     def action_space(self, params: CheetahParams | None = None) -> spaces.Box:
         limits = np.ones(self._brax.action_size, np.float32)
         return spaces.Box(-limits, limits, limits.shape)

@@ -22,7 +22,8 @@ def make_task(name: str, config: Any, solved_reward: float, otherwise: str = "")
       otherwise: what else can be done where MuJoCo cannot be had, for messages.
 
     Raises:
-      ConfigError: without the extra `mujoco`, a C++ compiler or a CPU as jax's default device.
+      ConfigError: without the extra `mujoco`, a C++ compiler that works or a CPU as jax's default
+        device.
     """
     try:
         import gymnasium  # noqa: F401, whose models are read
@@ -41,10 +42,10 @@ def make_task(name: str, config: Any, solved_reward: float, otherwise: str = "")
             f"JAX_PLATFORMS=cpu{otherwise}")  # fmt: skip
     try:
         library.load()
-    except library.NoCompilerError as error:
+    except library.BuildError as error:
         raise ConfigError(
-            f"env={name} needs a C++ compiler, because the code between XLA and MuJoCo is built "
-            f"on first use; {error}. Install one, such as g++{otherwise}."
+            f"env={name} needs the code between XLA and MuJoCo, which is compiled on first use; "
+            f"{error}{otherwise}."
         ) from error
     env = importlib.import_module(f"{__name__}.{name}").Env(config)
     return Task(name=name, env=env, max_steps=config.facts.max_steps, solved_reward=solved_reward,

@@ -121,6 +121,10 @@ class MujocoEnv(environment.Environment[MujocoState, MujocoParams]):
     def name(self) -> str:
         return self.gymnasium_id
 
+    @property
+    def num_actions(self) -> int:
+        return len(self._high)
+
     def action_space(self, params: MujocoParams | None = None) -> spaces.Box:
         return spaces.Box(-self._high, self._high, self._high.shape)
 

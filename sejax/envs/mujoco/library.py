@@ -10,6 +10,7 @@ import shlex
 import shutil
 import subprocess
 import tempfile
+import threading
 from importlib.metadata import version
 from pathlib import Path
 
@@ -17,35 +18,56 @@ import jax
 import mujoco
 
 from sejax import files
-from sejax.errors import ConfigError, shortened
+from sejax.errors import ConfigError, shortened, told
 
 SOURCE = Path(__file__).with_name("step.cc")
 FLAGS = ("-O2", "-std=c++17", "-shared", "-fPIC")
 COMPILERS = ("c++", "g++", "clang++")  # tried in this order, after $CXX
 TARGETS = {"sejax_mujoco_reset": "SejaxMujocoReset", "sejax_mujoco_step": "SejaxMujocoStep"}
+_LOADING = threading.Lock()
 
 
-class NoCompilerError(ConfigError):
-    """There is no C++ compiler, or it cannot build the library."""
+class BuildError(ConfigError):
+    """The library cannot be built or loaded; the message says why, and what helps."""
 
 
-@functools.cache
 def load() -> ctypes.CDLL:
     """The library of this process, whose handlers XLA then knows as `TARGETS`.
 
     It is built if it is not in the cache folder (`sejax.files.cache_folder`), which takes some
     seconds. Processes that build it at the same time do not disturb each other. With the cache
-    switched off, or where it cannot be written, each process builds its own.
+    switched off, or where it cannot be written or what lies there not be loaded, each process
+    builds its own.
 
     Raises:
-      NoCompilerError: if it has to be built and cannot be.
+      BuildError: if it has to be built and cannot be.
     """
+    with _LOADING:  # XLA takes one library of a process, and no second one
+        return _load()
+
+
+@functools.cache
+def _load() -> ctypes.CDLL:
     folder = files.cache_folder()
-    if folder is not None:
-        with contextlib.suppress(OSError):
-            return _register(_built_in(folder))
-    with tempfile.TemporaryDirectory() as temporary:
-        return _register(_built_in(Path(temporary)))
+    kept = folder / file_name() if folder else None
+    with contextlib.suppress(OSError):
+        if kept is not None and kept.exists():
+            return _register(kept)
+    try:
+        with tempfile.TemporaryDirectory() as temporary:
+            built = Path(temporary) / file_name()
+            build(built)
+            with contextlib.suppress(OSError):
+                if kept is not None:
+                    with files.atomic_path(kept) as place:
+                        shutil.copyfile(built, place)
+                    return _register(kept)
+            return _register(built)
+    except OSError as error:
+        raise BuildError(
+            f"it was built, and cannot be loaded ({told(error)}). Set SEJAX_CACHE_DIR, or TMPDIR, "
+            "to a folder that programs can be run from"
+        ) from error
 
 
 def file_name() -> str:
@@ -64,27 +86,23 @@ def build(path: Path) -> None:
     MuJoCo is bound by its file's name alone, as the process has it loaded already.
 
     Raises:
-      NoCompilerError: if there is no compiler, or it fails.
+      BuildError: if there is no compiler, or it fails.
     """
     package = Path(mujoco.__file__).parent
-    (shared,) = (x for x in package.glob("libmujoco*") if x.suffix == ".dylib" or ".so" in x.name)
+    libraries = sorted(x for x in package.glob("libmujoco*")
+                       if x.suffix == ".dylib" or ".so" in x.name)  # fmt: skip
+    if not libraries:
+        raise BuildError(f"{package} has no libmujoco. Install MuJoCo with pip install mujoco")
     command = [*_compiler(), *FLAGS, f"-I{package / 'include'}", f"-I{jax.ffi.include_dir()}",
-               str(SOURCE), str(shared), "-o", str(path)]  # fmt: skip
+               str(SOURCE), str(libraries[0]), "-o", str(path)]  # fmt: skip
     try:
         subprocess.run(command, check=True, capture_output=True, text=True)
     except (OSError, subprocess.CalledProcessError) as error:
         said = getattr(error, "stderr", None) or str(error)
-        raise NoCompilerError(
-            f"{command[0]} failed with: {shortened(said.strip(), 1000)}"
+        raise BuildError(
+            f"{command[0]} failed with: {shortened(said.strip(), 1000)}. Mend that, or set CXX to "
+            "another compiler"
         ) from error
-
-
-def _built_in(folder: Path) -> Path:
-    path = folder / file_name()
-    if not path.exists():
-        with files.atomic_path(path) as temporary:
-            build(temporary)
-    return path
 
 
 def _compiler() -> list[str]:
@@ -92,15 +110,23 @@ def _compiler() -> list[str]:
     for command in (_given_compiler(), *([name] for name in COMPILERS)):
         if command and shutil.which(command[0]):
             return command
-    raise NoCompilerError(f"found none of $CXX, {', '.join(COMPILERS)}")
+    raise BuildError(
+        f"it found no C++ compiler, none of $CXX, {', '.join(COMPILERS)}. Install one, such as g++"
+    )
 
 
 def _given_compiler() -> list[str]:
-    return shlex.split(os.environ.get("CXX", ""))
+    command = os.environ.get("CXX", "")
+    try:
+        return shlex.split(command)
+    except ValueError as error:
+        raise BuildError(
+            f"CXX is no command, {command} ({error}). Set CXX to a compiler"
+        ) from error
 
 
 def _register(path: Path) -> ctypes.CDLL:
-    library = ctypes.CDLL(str(path))
+    library = ctypes.CDLL(str(path.absolute()))  # else it is searched for where libraries lie
     library.SejaxMujocoRegister.argtypes = [ctypes.c_int64, ctypes.c_void_p]
     library.SejaxMujocoRegister.restype = None
     library.SejaxMujocoLength.argtypes = [ctypes.c_void_p]

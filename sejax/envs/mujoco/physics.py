@@ -79,6 +79,7 @@ class Physics:
         self, qpos: Float[Array, " nq"], qvel: Float[Array, " nv"]
     ) -> tuple[UInt32[Array, " num_words"], Report]:
         """A new simulation with these positions and velocities."""
+        qpos, qvel = (jnp.asarray(x, jnp.float32) for x in (qpos, qvel))
         return self._call("sejax_mujoco_reset", (qpos, (self.model.nq,)), (qvel, (self.model.nv,)))
 
     def step(
@@ -89,6 +90,7 @@ class Physics:
         Controls of which one is not a number count as 0, as in MuJoCo. A simulation that explodes
         begins anew from the model's own pose, as there.
         """
+        ctrl = jnp.asarray(ctrl, jnp.float32)
         arguments = (state, (self.num_words,)), (ctrl, (self.model.nu,))
         return self._call("sejax_mujoco_step", *arguments, frame_skip=np.int64(self.frame_skip))
 

@@ -83,6 +83,12 @@ class DefaultFloatingPoint {
   std::fenv_t before_;
 };
 
+// MuJoCo prints a warning, and adds it to a log file, where it has not counted one of its kind. A
+// call has no effect but its result.
+void Silence(mjData* d) {
+  for (int i = 0; i < mjNWARNING; ++i) d->warning[i].number = 1;
+}
+
 int64_t Length(const mjModel* m) { return mj_stateSize(m, kState) + 3 * m->nbody; }
 
 int64_t BatchSize(Axes axes) {
@@ -189,6 +195,7 @@ ffi::Error Reset(int64_t id, Floats qpos, Floats qvel, ffi::Result<Words> state,
     mj_resetData(m, d);
     std::copy_n(qpos.typed_data() + b * m->nq, m->nq, d->qpos);
     std::copy_n(qvel.typed_data() + b * m->nv, m->nv, d->qvel);
+    Silence(d);
     mj_forward(m, d);
     results.Write(b, d, d->qpos, d->xpos);
   }
@@ -217,10 +224,11 @@ ffi::Error Step(int64_t id, int64_t frame_skip, Words state, Floats ctrl, ffi::R
     const mjtNum* before = reinterpret_cast<const mjtNum*>(state.typed_data()) + b * Length(m);
     mj_setState(m, d, before, kState);
     const float* control = ctrl.typed_data() + b * m->nu;
-    // With one that is no number MuJoCo takes all for 0, but writes a log file besides.
-    bool bad = std::any_of(control, control + m->nu, [](float x) { return mju_isBad(x); });
-    for (int i = 0; i < m->nu; ++i) d->ctrl[i] = bad ? 0 : control[i];
-    for (int64_t i = 0; i < frame_skip; ++i) mj_step(m, d);
+    std::copy_n(control, m->nu, d->ctrl);
+    for (int64_t i = 0; i < frame_skip; ++i) {
+      Silence(d);  // again, as a simulation that begins anew forgets what it has counted
+      mj_step(m, d);
+    }
     if (results.has_forces()) mj_rnePostConstraint(m, d);
     results.Write(b, d, before + qpos_offset, before + xpos_offset);
   }
