@@ -26,7 +26,7 @@ test-examples test-trackers test-ray test-lowest test-latest:
 
 # Stable-Baselines3, sbx, rejax, and the PyTorch code that benchmarks compare with. On Linux, PyPI's
 # torch brings CUDA along; PIP_EXTRA_INDEX_URL may name an index that has it without.
-test-examples: PACKAGES := --constraint constraints.txt --editable '.[examples,mujoco]' imageio
+test-examples: PACKAGES := --constraint constraints.txt --editable '.[examples,mujoco]'
 test-examples: TESTS := examples gym_sb3 torch_reference torch_reference_ppo torch_reference_td3 torch_nes
 
 # The newest trackers: trackio and constraints.txt have no pillow in common.
@@ -39,8 +39,8 @@ test-ray: TESTS := ray
 test-ray: OPTIONS := -m slow
 
 # A part of the suite with the oldest versions that pyproject.toml allows, and with the newest.
-test-lowest: PACKAGES := --constraint constraints-lowest.txt --editable '.[gym,hub,mujoco]' imageio
-test-latest: PACKAGES := --editable '.[gym,hub,mujoco]' imageio
+test-lowest: PACKAGES := --constraint constraints-lowest.txt --editable '.[gym,hub,mujoco]'
+test-latest: PACKAGES := --editable '.[gym,hub,mujoco]'
 test-lowest test-latest: TESTS := networks ddqn synthetic nes proxy_files gym hub mujoco compose plugins run
 
 # --- the code, its site, its packages ---------------------------------------------------------------
@@ -66,9 +66,10 @@ dist: $(VENV)/.installed-dist
 	$(BIN)/python -m pytest -m dist tests/test_dist.py
 	$(BIN)/python -m pytest tests/test_hub.py
 
+# Without its package python3-venv Debian's python makes half of one, and fails.
 $(BIN)/python:
 	$(PYTHON) -c 'import sys; assert sys.version_info >= (3, 11), "Python 3.11 or newer is needed: make PYTHON=python3.11"'
-	$(PYTHON) -m venv $(VENV)
+	$(PYTHON) -m venv $(VENV) || { rm -rf $(VENV); exit 1; }
 
 $(VENV)/.installed: $(BIN)/python pyproject.toml constraints.txt
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable .

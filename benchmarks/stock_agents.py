@@ -164,10 +164,12 @@ def main() -> None:
     args = common.parse_args(__doc__, add_options)
     if args.quick:
         args.agents, args.steps, args.seeds, args.episodes = ["ppo"], [500], 2, 5
+    # A look leaves the results that are kept alone.
+    folder = Path("runs/stock_agents" if args.quick else "results/stock_agents")
     env_id, _ = TASKS[args.task]
     agents = args.agents or [agent for agent, of in ZOO if of == env_id]
-    path = args.csv or Path(f"results/stock_agents/{args.task}-{Path(args.source).stem}.csv")
-    real_path = args.real or Path(f"results/stock_agents/{args.task}-real.csv")
+    path = args.csv or folder / f"{args.task}-{Path(args.source).stem}.csv"
+    real_path = args.real or folder / f"{args.task}-real.csv"
     real = pd.read_csv(real_path) if real_path.exists() else pd.DataFrame(columns=COLUMNS)
     each = list(itertools.product(agents, range(args.seed, args.seed + args.seeds)))
     taught = run_all([in_budget(args, args.source, *one) for one in each], args.jobs)

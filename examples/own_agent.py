@@ -1,4 +1,4 @@
-"""An agent of one's own: SAC, which sejax does not have.
+"""An agent of one's own: SAC, written once more, in one file (sejax's is `agent=sac`).
 
     python own_agent.py
     python -m sejax.run env=pendulum agent=own_agent:SAC agent.learning_rate=1e-3   # in this folder

@@ -2,6 +2,7 @@
 
 import math
 import re
+import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -68,7 +69,7 @@ def test_each_se_says_what_it_cost(name):
 
 @pytest.mark.parametrize("name", SES)
 def test_the_command_of_each_se_composes_what_its_file_was_learned_with(name):
-    words = PROXIES[name].learning.command.removeprefix("python -m sejax.run ").split()
+    words = shlex.split(PROXIES[name].learning.command)[3:]
     config, stored = sejax.config(words), sejax.load_proxy(name)
     assert config.env == type(config.env)(**_fields(stored.config["env"]))
     assert config.proxy == stored.env.config and config.es == stored.learned_with("es")

@@ -13,6 +13,7 @@ docs/zoo.md anew.
 import argparse
 import dataclasses
 import json
+import shlex
 import subprocess
 import sys
 import tempfile
@@ -83,7 +84,7 @@ def learning_of(path: Path) -> dict[str, Any]:
     config = yaml.safe_load((path / "config.yaml").read_text())
     costs = {name: ended[name] for name in ("generations", "agents", "train_steps", "real_steps",
                                             "cpu_s")}  # fmt: skip
-    command = f"python -m sejax.run {' '.join(words_of(config))}"
+    command = f"python -m sejax.run {shlex.join(words_of(config))}"
     return {"learning": dataclasses.asdict(zoo.Learning(command=command, **costs))}
 
 
