@@ -207,10 +207,10 @@ def sejax_side(args: argparse.Namespace) -> None:
 
     A request without a seed compiles that, and answers with the SE's weights.
     """
-    from sejax.app.runtime import configure_xla, enable_compilation_cache
+    from sejax.app.runtime import configure_jax, configure_xla
 
     configure_xla(1)
-    enable_compilation_cache()
+    configure_jax()
     import jax
     import numpy as np
 

@@ -142,14 +142,14 @@ def serve(args: argparse.Namespace) -> None:
     cores = args.cores[: 2 if number == "2" else 1]
     os.sched_setaffinity(0, cores)
     os.environ["RAY_ADDRESS"] = "local"  # a cluster of its own
-    from sejax.app.runtime import configure_xla, enable_compilation_cache
+    from sejax.app.runtime import configure_jax, configure_xla
 
     configure_xla(len(cores) if kind == "local" else 1)
     import jax
 
     import sejax
 
-    enable_compilation_cache()
+    configure_jax()
     lanes = ["lanes=1"] if args.side == ALONE else []
     config = sejax.config(["env=cartpole", f"seed={args.seed}", *args.overrides, *lanes])
     with tempfile.TemporaryDirectory() as folder, contextlib.ExitStack() as stack:

@@ -27,7 +27,7 @@ def main(cfg: DictConfig) -> float:
     if own:  # or all jobs of a sweep would have one folder
         folder = f"runs/evaluate-{own}" if config.out_dir is None else f"{config.out_dir}/{own}"
         config = dataclasses.replace(config, out_dir=folder)
-    runtime.enable_compilation_cache()
+    runtime.configure_jax()
     return evaluate(config)
 
 

@@ -47,7 +47,7 @@ def learn(config: LearnConfig) -> float:
             progress.say("importing jax and the task")
             from sejax.app import session
 
-            runtime.enable_compilation_cache()
+            runtime.configure_jax()
             with config.machines.make(config, directory.path, progress.print) as chunks:
                 ended = session.run(config, directory, chunks, progress)
         except KeyboardInterrupt:

@@ -13,7 +13,7 @@ from flax import struct
 from jaxtyping import Array, Float, Int
 
 from sejax.agents.agent import Agent
-from sejax.agents.memory import Memory, MemoryMaker
+from sejax.agents.memory import Memory, MemoryMaker, Rollout
 from sejax.agents.replay import Transition
 from sejax.errors import LARGEST, require
 from sejax.keys import step_keys
@@ -309,6 +309,7 @@ class _Loop:
             state.obs, action, reward, self.discount(terminated, truncated, info), next_obs
         )
         active = state.active if masked else True
+        finished = ended & active  # an episode that counts
         remembered = tuple(
             memory.store(arrays, state.step, transition, ended, active)
             for memory, arrays in zip(memories, remembered, strict=True)
@@ -317,6 +318,9 @@ class _Loop:
         def learn(agent_state: Any) -> Any:
             size = self.agent.batch_size(agent_state)
             batch = memories[0].batch(key_sample, remembered[0], state.step + 1, transition, size)
+            if masked and isinstance(batch, Rollout):
+                # All lanes would go through the phases of one that has stopped, again and again.
+                batch = batch._replace(is_full=batch.is_full & active)
             return self.agent.update(key_update, agent_state, batch)
 
         agent_state = jax.lax.cond(
@@ -335,10 +339,10 @@ class _Loop:
         )
         before = state
         state = jax.lax.cond(
-            ended, lambda s: self.end_episode(keys_end, s, env_params, ended), lambda s: s, state
+            ended, lambda s: self.end_episode(keys_end, s, env_params, finished), lambda s: s, state
         )
         curve = curve.with_episode(
-            before.episode, before.episode_return, train_steps, state.tested, ended & active
+            before.episode, before.episode_return, train_steps, state.tested, finished
         )
         return (remembered, curve), state
 
@@ -348,16 +352,16 @@ class _Loop:
         return jnp.where(truncated, 0.0, discount) if self.limit_is_terminal else discount
 
     def end_episode(
-        self, keys: list[Array], state: _LoopState, env_params: Any, ended: Array
+        self, keys: list[Array], state: _LoopState, env_params: Any, finished: Array
     ) -> _LoopState:
         """Records the episode, decides whether training goes on, and starts the next one.
 
-        In lanes this runs for all of them if it runs for one; `ended` spares the others the test.
+        In lanes this runs for all if it runs for one; `finished` spares the others the test.
         """
         key_reset, key_test = keys
         judged = state.episode_return
         if self.test_fn is not None:
-            tested, num_steps = self.test_fn(key_test, state.agent_state, ended)
+            tested, num_steps = self.test_fn(key_test, state.agent_state, finished)
             state = state.replace(tested=tested, test_steps=state.test_steps + num_steps)
             judged = tested if self.training.stops_by_tests else judged
         recent = jnp.concatenate([state.recent[1:], judged[None]])

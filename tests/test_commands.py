@@ -32,8 +32,8 @@ def test_without_a_home_there_is_no_compilation_cache(monkeypatch):
     monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
     monkeypatch.setattr(runtime.Path, "home", nobodys_home)
     monkeypatch.setattr(jax.config, "update", lambda *change: changed.append(change))
-    runtime.enable_compilation_cache()
-    assert changed == []
+    runtime.configure_jax()
+    assert changed == [("jax_default_matmul_precision", "highest")]
 
 
 @pytest.mark.parametrize(

@@ -473,6 +473,43 @@ def test_importing_sejax_and_composing_imports_nothing_slow_and_starts_nothing()
     assert done.stdout.splitlines() == ["[] True", "[] True False"], done.stdout + done.stderr
 
 
+@pytest.mark.parametrize(("files", "cores"), [
+    ({}, 64), ({"cpu.max": "max 100000\n"}, 64), ({"cpu.max": "250000 100000\n"}, 2),
+    ({"cpu.max": "50000 100000\n"}, 1), ({"cpu.max": "9000000 100000\n"}, 64),
+    ({"cpu/cpu.cfs_quota_us": "-1\n", "cpu/cpu.cfs_period_us": "100000\n"}, 64),
+    ({"cpu/cpu.cfs_quota_us": "300000\n", "cpu/cpu.cfs_period_us": "100000\n"}, 3),
+])  # fmt: skip
+def test_a_containers_quota_is_a_number_of_cores(files, cores, tmp_path, monkeypatch):
+    monkeypatch.setattr(os, "sched_getaffinity", lambda pid: range(64), raising=False)
+    monkeypatch.setattr(runtime, "CGROUPS", tmp_path)
+    for name, text in files.items():
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text(text)
+    assert runtime.available_cores() == cores
+
+
+def test_a_process_keeps_to_its_share_of_a_gpu_and_to_single_precision():
+    """In processes of their own, as jax is told before it starts."""
+    program = (
+        "import os, sys, jax\n"
+        "from sejax.app import runtime\n"
+        "runtime.take_share_of_gpu(float(sys.argv[1])); runtime.configure_jax()\n"
+        "print(jax.config.jax_platforms, os.environ.get('XLA_PYTHON_CLIENT_MEM_FRACTION'),"
+        " jax.config.jax_default_matmul_precision)\n"
+    )
+    unset = ("JAX_PLATFORMS", "XLA_PYTHON_CLIENT_MEM_FRACTION", "JAX_DEFAULT_MATMUL_PRECISION")
+    clean = {name: x for name, x in os.environ.items() if name not in unset}
+
+    def told(share, **variables):
+        done = subprocess.run([sys.executable, "-c", program, str(share)], text=True, check=True,
+                              capture_output=True, env=clean | variables)  # fmt: skip
+        return done.stdout.split()
+
+    assert told(0) == ["cpu", "None", "highest"]
+    assert told(0.5, JAX_DEFAULT_MATMUL_PRECISION="float32") == ["None", "0.450", "float32"]
+    assert told(1) == ["None", "None", "highest"]
+
+
 def test_flags_of_xla_are_left_alone_once_jax_has_started(monkeypatch):
     import jax
 

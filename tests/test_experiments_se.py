@@ -566,7 +566,7 @@ def test_commands_end_bad_input_with_one_message_and_status_2(
     name, words, message, tmp_path, capsys, monkeypatch
 ):
     module = __import__(f"sejax.experiments.{name}", fromlist=["EXPERIMENT"])
-    monkeypatch.setattr(experiment.runtime, "enable_compilation_cache", lambda: None)
+    monkeypatch.setattr(experiment.runtime, "configure_jax", lambda: None)
     with pytest.raises(SystemExit) as ended:
         module.EXPERIMENT.main([f"out={tmp_path}", *words])
     error = capsys.readouterr().err

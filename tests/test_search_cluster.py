@@ -88,8 +88,8 @@ class Cluster:
         assert options == {"num_cpus": 1, "num_gpus": 0, "max_retries": 0}
         return lambda function: SimpleNamespace(remote=self._start)
 
-    def _start(self, words):
-        assert "study=some" in words
+    def _start(self, words, gpu_share):
+        assert "study=some" in words and gpu_share == 0
         self.timeouts += [word for word in words if word.startswith("timeout=")]
         worker, self.started = self.started, self.started + 1
         self._ends[worker] = self.fate(worker, self.now)

@@ -1,6 +1,7 @@
 """sejax.trainer: the inner loop against a plain Python one, alone and in lanes."""
 
 import dataclasses
+import functools
 import re
 
 import gymnasium
@@ -15,7 +16,7 @@ from support import numpy_forward
 
 from sejax import envs, evaluation, plugins
 from sejax.agents.ddqn import DDQNConfig, make_ddqn
-from sejax.agents.memory import Memory
+from sejax.agents.memory import Memory, rollout_memory
 from sejax.agents.tabular import QLearningConfig
 from sejax.errors import ConfigError
 from sejax.proxies.configs import SyntheticConfig
@@ -418,6 +419,34 @@ def test_nested_lanes_equal_single_trainings(trainers):
     many = jax.jit(jax.vmap(jax.vmap(trainers["tested"])))(*nested)
     many = jax.tree.map(lambda x: x.reshape(6, *x.shape[2:]), many)
     assert_lanes_are_single_trainings(trainers["tested"], lanes, many)
+
+
+def test_a_lane_that_has_stopped_has_nobody_wait_for_its_tests_and_phases():
+    """Its last step is made again until all lanes have stopped; what it would do is left out."""
+    seen = {"tests": 0, "phases": 0}
+
+    def count(what, happens):
+        seen[what] += bool(happens)
+
+    def tested(key, agent_state, active):
+        jax.debug.callback(functools.partial(count, "tests"), active)
+        return jnp.float32(0), jnp.int32(1)
+
+    def update(key, state, rollout):
+        jax.debug.callback(functools.partial(count, "phases"), rollout.is_full)
+        return state
+
+    agent = dataclasses.replace(
+        scripted_agent(init_episodes=0), update=update, memory=rollout_memory(13)
+    )
+    config = training(stop_rule="never", max_steps=24, tests_between=1)
+    train = make_trainer(agent, ENV, config, test_fn=tested)
+    each = [script([1] * 12, [length] * 12) for length in (1, 2)]  # 12 steps, then waits; 24
+    params = jax.tree.map(lambda *x: jnp.stack([jnp.asarray(v) for v in x]), *each)
+    result = jax.jit(jax.vmap(train))(jax.random.split(KEY, 2), params)
+    jax.effects_barrier()
+    np.testing.assert_array_equal(result.train_steps, [12, 24])
+    assert seen == {"tests": 12 + 12, "phases": 1}  # the lane that waits is at a step 13
 
 
 @pytest.fixture(scope="module")

@@ -1,6 +1,8 @@
 """How the commands start XLA. Libraries that import sejax keep their own settings."""
 
+import contextlib
 import hashlib
+import math
 import os
 import platform
 import sys
@@ -9,12 +11,27 @@ from typing import Any
 
 from sejax import files
 
+CGROUPS = Path("/sys/fs/cgroup")
 _NEVER_SECONDS = 1_000_000
 
 
 def available_cores() -> int:
-    """CPU cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    """CPU cores that this process may use: those it may run on, or fewer of a container's quota."""
+    affine = hasattr(os, "sched_getaffinity")
+    cores = len(os.sched_getaffinity(0)) if affine else os.cpu_count() or 1
+    return max(1, int(min(cores, _quota(CGROUPS))))
+
+
+def _quota(cgroups: Path) -> float:
+    """CPUs that a container may use, as in `docker run --cpus=2`; inf where nothing is said."""
+    with contextlib.suppress(OSError, ValueError):  # version 2: "200000 100000", or "max 100000"
+        quota, period = (cgroups / "cpu.max").read_text().split()
+        return int(quota) / int(period)
+    with contextlib.suppress(OSError, ValueError):
+        quota, period = ((cgroups / "cpu" / f"cpu.cfs_{name}_us").read_text()
+                         for name in ("quota", "period"))  # fmt: skip
+        return int(quota) / int(period) if int(quota) > 0 else math.inf
+    return math.inf
 
 
 def is_started() -> bool:
@@ -56,14 +73,39 @@ def configure_xla(num_devices: int | None = None) -> None:
         os.environ.setdefault("NPROC", "1")
 
 
-def enable_compilation_cache() -> None:
-    """Keeps compiled programs between runs, in a folder for this kind of CPU.
+def take_share_of_gpu(share: float) -> None:
+    """Keeps this process on its CPU core, or to its part of the GPU's memory.
 
-    Code compiled for another CPU is rejected or unsafe, so that the folder's name depends on the
-    CPU's model and features. `SEJAX_CACHE_DIR` moves it; set to nothing it switches the cache off.
+    Must run before jax first computes; after that nothing is done. Other processes of this machine
+    may have jax's accelerators then.
+
+    Args:
+      share: of one GPU, in [0, 1]; 0 for the CPU.
+    """
+    if is_started():
+        return
+    if share == 0:
+        import jax
+
+        jax.config.update("jax_platforms", "cpu")
+    elif share < 1:  # jax takes three quarters of what is there
+        os.environ.setdefault("XLA_PYTHON_CLIENT_MEM_FRACTION", f"{0.9 * share:.3f}")
+
+
+def configure_jax() -> None:
+    """What the commands ask of jax; what the user has set stays.
+
+    Matrices are multiplied in single precision on GPUs too, as on CPUs and in `sejax.gym`: recent
+    ones round factors to ten bits otherwise, and a proxy is another one there.
+
+    Compiled programs are kept between runs, in a folder for this kind of CPU: code compiled for
+    another one is rejected or unsafe, so that the folder's name depends on the CPU's model and
+    features. `SEJAX_CACHE_DIR` moves it; set to nothing it switches the cache off.
     """
     import jax
 
+    if jax.config.jax_default_matmul_precision is None:
+        jax.config.update("jax_default_matmul_precision", "highest")
     root = files.cache_folder()
     if root is None or jax.config.jax_compilation_cache_dir:
         return

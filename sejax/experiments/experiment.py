@@ -56,7 +56,7 @@ class Experiment:
         except ConfigError as error:
             commands.fail(str(error), commands.BAD_INPUT)
         runtime.configure_xla(settings.devices)
-        runtime.enable_compilation_cache()
+        runtime.configure_jax()
         try:
             commands.guarded(self.run)(settings)
         except KeyboardInterrupt:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
-from sejax.options import Options, counts, not_negative, option, positive
+from sejax.options import Options, counts, fraction, option, positive
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,8 +35,8 @@ class RayConfig(Options):
 
     # worker processes; null: one for each CPU core of the cluster, or for each GPU
     workers: int | None = option(None, counts("somebody must compute"))
-    # 0: workers compute on a CPU core each; a part of one: several workers share a GPU
-    gpus_per_worker: float = option(0.0, not_negative("it is a share of GPUs"))
+    # 0: workers compute on a CPU core each; 0.5: two workers share a GPU
+    gpus_per_worker: float = option(0.0, fraction())
     # seconds after which a worker is given up while nobody has shown how long a training takes
     patience_s: float = option(3600.0, positive("a worker needs time to compile and to train"))
 

@@ -33,7 +33,9 @@ def chunks_of(
     Raises:
       ConfigError: if the cluster cannot be reached, or has nothing to compute on.
     """
-    from sejax.app import build
+    from sejax.app import build, runtime
+
+    runtime.take_share_of_gpu(0)  # all of them are the workers'
     from sejax.bilevel import make_program
 
     program = make_program(**config.parts() | {"devices": 1})
@@ -119,7 +121,7 @@ class RayCrew:
         self._machines = machines
         # What a worker has no use for it need not have installed.
         config = {k: x for k, x in config.items() if k not in ("tracker", "machines")}
-        self._arguments = (config, capacities, scorer.versions())
+        self._arguments = (config, capacities, scorer.versions(), machines.gpus_per_worker)
         self._scorer = ray.remote(
             num_cpus=1, num_gpus=machines.gpus_per_worker, max_restarts=0, max_task_retries=0
         )(scorer.Scorer)

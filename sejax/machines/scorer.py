@@ -66,10 +66,15 @@ class Scorer:
     """The compiled trainings of a run; one to a process."""
 
     def __init__(
-        self, config: dict[str, Any], capacities: tuple[int, ...], versions: dict[str, str]
-    ):
-        """Of a run's plain configuration, most trials in a share by family, and the driver's."""
+        self, config: dict[str, Any], capacities: tuple[int, ...], versions: dict[str, str],
+        gpu_share: float = 0,
+    ):  # fmt: skip
+        """Of a run's plain configuration, most trials in a share by family, and the driver's.
+
+        `gpu_share` is the part of a GPU that this process has; 0 for a CPU core.
+        """
         self._config, self._capacities, self._versions = config, capacities, versions
+        self._gpu_share = gpu_share
         self._programs: list[Any] = []
 
     def prepare(self) -> About:
@@ -81,6 +86,7 @@ class Scorer:
         from sejax.app import runtime
 
         runtime.configure_xla(1)
+        runtime.take_share_of_gpu(self._gpu_share)
         from sejax.app import build
         from sejax.bilevel import make_program
 
@@ -93,7 +99,7 @@ class Scorer:
                 f"{', '.join(differing)} on {socket.gethostname()}, where the driver has {there}. "
                 f"Install the same there."
             )
-        runtime.enable_compilation_cache()
+        runtime.configure_jax()
         config = build.learn_config(self._config)
         program = make_program(**config.parts() | {"devices": 1})
         self._programs = [

@@ -31,7 +31,7 @@ def main(words: Sequence[str]) -> None:
         usual = settings.fields_of(search, config)
     found, search = study.open_study(search, usual)
     runner = study.runner_of(search)
-    runtime.enable_compilation_cache()
+    runtime.configure_jax()
     print(f"Study {search.study} in {search.folder}: {', '.join(search.space)}.", flush=True)
     try:
         if search.machines.is_elsewhere:

@@ -13,6 +13,7 @@ import optuna
 import ray
 from optuna.trial import TrialState
 
+from sejax.app import runtime
 from sejax.errors import require, told
 from sejax.machines import ray_crew
 from sejax.machines.handout import LOOK_S, MOST_FAILURES
@@ -30,6 +31,7 @@ def work(study: optuna.Study, search: Search, say: Callable[[str], None]) -> Non
       ConfigError: if the cluster cannot be reached or no worker can work there.
       KeyboardInterrupt: the trials at hand are queued again once their heartbeats have ended.
     """
+    runtime.take_share_of_gpu(0)  # all of them are the workers'
     with ray_crew.connected():
         ray_crew.require_workers(search.machines)
         with contextlib.closing(_Workers(search)) as workers:
@@ -66,7 +68,8 @@ class _Workers:
         """Starts workers where there is room."""
         words = _words(self._search, self.timeout)
         for _ in range(ray_crew.num_workers(self._search.machines) - len(self)):
-            self._running[self._start.remote(words)] = self._losses
+            started = self._start.remote(words, self._search.machines.gpus_per_worker)
+            self._running[started] = self._losses
 
     def wait(self) -> list[Any]:
         """Waits until a worker ends, or for a while.
@@ -137,13 +140,12 @@ def _words(search: Search, timeout: float | None) -> list[str]:
     return [f"{name}={value}" for name, value in own.items() if value is not None]
 
 
-def _work(words: list[str]) -> None:
+def _work(words: list[str], gpu_share: float = 0) -> None:
     """A worker: joins the study and takes trials until there are none."""
-    from sejax.app import runtime
-
     runtime.configure_xla(1)
+    runtime.take_share_of_gpu(gpu_share)
     from sejax.search import settings, study
 
-    runtime.enable_compilation_cache()
+    runtime.configure_jax()
     found, search = study.open_study(settings.read(words))
     study.work(found, search, study.runner_of(search), lambda text: None)
