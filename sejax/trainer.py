@@ -423,4 +423,4 @@ def is_solved(
 
 def _all_finite(tree: Any) -> Array:
     leaves = [x for x in jax.tree.leaves(tree) if jnp.issubdtype(x.dtype, jnp.floating)]
-    return jnp.stack([jnp.all(jnp.isfinite(x)) for x in leaves]).all()
+    return jnp.array([jnp.all(jnp.isfinite(x)) for x in leaves], bool).all()

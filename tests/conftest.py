@@ -9,7 +9,7 @@ from pathlib import Path
 
 # Compilation is most of the time here. LLVM's optimisation is off, which halves it, and so are the
 # emitters that take fusions through MLIR, which takes a third off the rest; XLA's own passes, whose
-# result test_program.py reads, stay on. Command tests start processes without these.
+# result test_program.py reads, stay on. Processes that tests start have these too.
 _FLAGS = (
     "--xla_backend_optimization_level=0",
     # From jaxlib 0.11 on the flag is unknown, of which XLA dies.

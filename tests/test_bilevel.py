@@ -137,6 +137,30 @@ def test_generations_of_one_seed_differ_and_so_do_seeds(one_device):
     assert len({float(info.population_mean[0]) for info in infos}) == 3
 
 
+def test_no_two_trials_generations_or_seeds_have_a_key_in_common(one_device):
+    program, _, ((states, _), (others, _)) = one_device
+    asked = [program.ask(state).keys for state in (states[0], states[1], others[0])]
+    data = np.concatenate([np.asarray(jax.random.key_data(keys)).reshape(-1, 2) for keys in asked])
+    assert len(data) == 3 * program.strategy.num_candidates
+    assert len(np.unique(data, axis=0)) == len(data)
+
+
+def test_perturbations_are_drawn_anew_in_each_generation(one_device):
+    program, _, ((states, _), _) = one_device
+    first, second = (program.ask(state) for state in states[:2])
+    drawn = [np.asarray(asked.members - asked.incumbent[:, None]) for asked in (first, second)]
+    assert np.abs(np.corrcoef(*(x.ravel() for x in drawn))[0, 1]) < 0.5
+
+
+def test_common_random_numbers_are_common_to_the_members_alone():
+    program = program_of("es.common_random_numbers=true", "es.num_evals=2", words=ROOM)
+    keys = np.asarray(jax.random.key_data(program.ask(program.init(KEYS[:1])).keys))[0]
+    ids = program.strategy.trials.seed_ids(program.strategy.num_members)
+    same = (keys[:, None] == keys[None]).all(axis=-1)
+    np.testing.assert_array_equal(same, np.equal.outer(ids, ids))
+    assert 1 < len(np.unique(ids)) < len(ids)
+
+
 def test_all_generations_run_in_one_executable(one_device):
     program, _, ((states, _), _) = one_device
     weak = lambda tree: jax.tree.map(lambda x: x.weak_type, tree)  # noqa: E731
@@ -245,11 +269,6 @@ def test_seeds_of_one_program_equal_separate_runs_and_stop_when_solved(room):
         if states[number + 1].finished[other]:
             break
         assert_equal(states[number + 1].best[other], alone[number + 1].best[0])
-
-
-def test_solved_runs_go_on_unless_asked_to_stop(one_device):
-    _, _, runs = one_device
-    assert not any(state.finished.any() for states, _ in runs for state in states)
 
 
 # --- trouble -------------------------------------------------------------------------------------

@@ -4,13 +4,36 @@ import dataclasses
 
 import jax
 import jax.numpy as jnp
+import pytest
 from scripted import MAX_EPISODES, MAX_STEPS, ScriptedEnv, script, scripted_agent
 
-from sejax import envs, evaluation
+import sejax
+from sejax import envs, evaluation, plugins
+from sejax.proxies.configs import RewardConfig, SyntheticConfig
 from sejax.training import TrainingConfig
 
 ENV = ScriptedEnv()
 TRAINING = TrainingConfig(max_episodes=MAX_EPISODES, stop_rule="never", test_episodes=3)
+
+
+def test_tests_between_are_as_many_as_asked_and_the_area_is_over_all_steps():
+    """Trained to 31 steps: ten episodes of three that return 0 to 9 in tests, and one step more."""
+    params = script(range(12), [99] * 12)
+    task = envs.Task(name="script", env=ENV, params=params, solved_reward=99.0)
+    training = dataclasses.replace(TRAINING, max_steps=31, tests_between=2)
+    evaluate = jax.jit(evaluation.make_evaluator(scripted_agent(), ENV, task, training))
+    outcome = evaluate(jax.random.key(0), script([5] * 12, [3] * 12))
+    assert (outcome.train_steps, outcome.train_episodes) == (31, 10)
+    # The state of the agent says the episode that begins; the last tests are after its last step.
+    assert outcome.real_steps == 31 + 10 * 2 * MAX_STEPS + 3 * MAX_STEPS
+    assert outcome.test_return == 10
+    assert outcome.return_area == 3 * sum(range(10)) + 1 * 10
+
+
+def test_returns_that_are_no_numbers_make_an_outcome_of_an_agent_that_diverged():
+    task = envs.Task(name="script", env=ENV, params=script([float("nan")] * 12, [99] * 12))
+    evaluate = jax.jit(evaluation.make_evaluator(scripted_agent(), ENV, task, TRAINING))
+    assert evaluate(jax.random.key(0), script([5] * 12, [3] * 12)).nonfinite
 
 
 def scripted_task(**fields):
@@ -35,3 +58,29 @@ def test_an_outcome_counts_training_and_tests():
     assert diverged.nonfinite and diverged.train_steps == 5
     nothing = evaluate(jax.random.key(0), script([5] * 12, [3] * 12), jnp.bool_(False))
     assert nothing.train_steps == 0 and nothing.real_steps == 0
+
+
+@pytest.mark.parametrize(("env", "agent", "exploration", "varied", "proxy"), [
+    ("pendulum", "td3", "none", False, SyntheticConfig(hidden_size=2)),
+    ("pendulum", "td3", "icm", False, RewardConfig(hidden_size=2)),
+    ("pendulum", "sac", "icm", False, SyntheticConfig(hidden_size=2)),
+    ("pendulum", "ppo", "icm", False, SyntheticConfig(hidden_size=2)),
+    ("cartpole", "td3_discrete", "none", False, SyntheticConfig(hidden_size=2)),
+    ("cartpole", "ddqn", "icm", False, RewardConfig(hidden_size=2)),
+    pytest.param("pendulum", "sac", "icm", True, SyntheticConfig(hidden_size=2),
+                 marks=pytest.mark.slow),  # which is traced for every size that may be drawn
+    pytest.param("cartpole", "ddqn", "icm", True, RewardConfig(hidden_size=2),
+                 marks=pytest.mark.slow),
+])  # fmt: skip
+def test_every_kind_of_agent_can_be_trained_on_every_kind_of_proxy(
+    env, agent, exploration, varied, proxy
+):
+    task = envs.make(env)
+    config = plugins.configure("agent", {"name": agent})
+    bonus = plugins.configure("exploration", {"name": exploration})
+    made = sejax.make_agent(config, task, bonus, varied)
+    world = plugins.make("proxy", proxy, task)
+    training = TrainingConfig(max_steps=5, max_episodes=5, stop_rule="never", test_episodes=3)
+    evaluate = evaluation.make_evaluator(made, world, task, training)
+    outcome = jax.eval_shape(lambda key: evaluate(key, world.default_params), jax.random.key(0))
+    assert outcome.test_returns.shape == (3,)

@@ -295,6 +295,12 @@ def test_the_columns_of_each_family_are_means_over_its_trainings(two):
             assert got.shape == (2, 2)
             np.testing.assert_allclose(got[:, i], expected, rtol=1e-5, err_msg=name)
     np.testing.assert_allclose(info.population_mean, scores[:, :12].mean(axis=1), rtol=1e-6)
+    np.testing.assert_allclose(info.population_max, scores[:, :12].max(axis=1), rtol=1e-6)
+    np.testing.assert_allclose(info.incumbent_std, scores[:, 12:].std(axis=1), rtol=1e-5)
+    np.testing.assert_allclose(
+        info.train_episodes_mean, outcome.train_episodes.mean(axis=1), rtol=1e-6
+    )
+    np.testing.assert_array_equal(info.train_steps_max, outcome.train_steps.max(axis=1))
     np.testing.assert_array_equal(info.train_steps_total, outcome.train_steps.sum(axis=1))
     np.testing.assert_array_equal(info.env_steps_total, outcome.real_steps.sum(axis=1))
 
@@ -315,11 +321,11 @@ def test_one_family_is_the_program_of_its_agent():
 # --- solved by all -------------------------------------------------------------------------------
 
 
-def told(scores, incumbents, state=None, **config):
+def told(scores, incumbents, state=None, stop_when_solved=True, **config):
     """State and info after a generation whose test returns these were, for each seed."""
     group = Families(agents=AGENTS, config=FamiliesConfig(**config))
     program = program_of(
-        group, stop_when_solved=True,
+        group, stop_when_solved=stop_when_solved,
         es=NESConfig(population_size=2, mirrored=False, num_incumbent_evals=2),
     )  # fmt: skip
     returns = np.concatenate([scores, incumbents], axis=1).astype(np.float32)
@@ -342,6 +348,12 @@ def test_a_run_stops_when_what_the_incumbent_is_worth_solves_the_task(aggregate)
     worth = incumbents.mean(axis=1) if aggregate == "mean" else incumbents.min(axis=1)
     np.testing.assert_allclose(after.best_score, worth, rtol=1e-6)
     np.testing.assert_allclose(info.families.incumbent_mean, incumbents, rtol=1e-6)
+
+
+def test_solved_runs_go_on_unless_asked_to_stop():
+    solved = np.full((2, 2), TASK.solved_reward + 1)
+    after, _ = told(np.zeros((2, 2)), solved, stop_when_solved=False)
+    assert not after.finished.any() and (after.best_score > TASK.solved_reward).all()
 
 
 def test_of_equally_good_incumbents_the_last_is_kept():

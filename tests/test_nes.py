@@ -336,6 +336,21 @@ def test_candidates_have_our_std_and_come_in_pairs_where_the_strategy_says_so(na
     assert spread == pytest.approx(wanted, rel=0.15) if wanted else 0.1 * std < spread < std
 
 
+def test_step_size_and_decay_of_the_noise_reach_an_algorithm():
+    dims, key = 200, jax.random.key(0)
+    strategy = EvosaxConfig(
+        name="open_es", population_size=64, noise_std=0.1, noise_std_decay=0.5, step_size=0.02
+    ).make(dims)
+    state, spreads, means = strategy.init(key, jnp.zeros(dims)), [], []
+    for i in range(3):
+        members, state = strategy.ask(jax.random.key(i), state)
+        spreads.append(float(jnp.std(members - strategy.incumbent(state))))
+        state = strategy.tell(key, members, members.sum(axis=1), jnp.float32(0), state)
+        means.append(np.asarray(strategy.incumbent(state)))
+    np.testing.assert_allclose(spreads, [0.1, 0.05, 0.025], rtol=0.1)
+    np.testing.assert_allclose(np.abs(means[0]), 0.02, rtol=1e-2)  # Adam's first step
+
+
 def test_algorithms_that_remember_scores_want_them_in_one_unit():
     words = ["env=gridworld_2x2", "es=hill_climbing"]
     assert sejax.make_learner(sejax.config(words))

@@ -241,6 +241,19 @@ def test_starts_of_noise_are_that_in_the_units_of_the_networks():
     np.testing.assert_array_equal(obs, state.vector)
 
 
+def test_units_of_bounds_are_from_the_middle_with_half_of_the_way_as_one():
+    """MountainCar: positions in [-1.2, 0.6], velocities in [-0.07, 0.07]."""
+    env = make_env("mountain_car", state_units="bounds", done="threshold")
+    middle, one = np.array([-0.3, 0.0]), np.array([0.45, 0.035])
+    obs, weights = np.array([0.2, -0.05]), env.init_weights(jax.random.key(3))
+    seen = np.concatenate([[0, 1, 0], (obs - middle) / one])
+    state, reward, _ = env.predict(weights, jnp.float32(obs), jnp.int32(1))
+    change, paid = (numpy_forward(weights[head], seen, CONFIG.activation, CONFIG.num_layers)
+                    for head in ("state", "reward"))  # fmt: skip
+    np.testing.assert_allclose(state, middle + one * change, rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(reward, paid[0], rtol=1e-5, atol=1e-6)
+
+
 def test_no_two_networks_begin_with_the_same_numbers():
     weights = make_env(initial_state="learned").init_weights(jax.random.key(0))
     assert set(weights) == {"state", "reward", "done", "start"}

@@ -356,6 +356,60 @@ def test_solved_means_that_the_last_window_reaches_the_threshold(recent, num_epi
     assert bool(is_solved(recent, jnp.int32(num_episodes), 195.0)) == solved
 
 
+# --- what it asks of an agent --------------------------------------------------------------------
+
+
+OFFSET = 5000  # the world's action 0 as the agent means it
+
+
+def test_the_world_sees_what_the_agent_means_and_the_memory_what_it_did():
+    plain = scripted_agent(batch_size=32)
+    empty = plain.init(KEY, 0.0)
+    empty = empty.replace(batch=empty.batch._replace(weight=jnp.zeros(32)))
+    agent = dataclasses.replace(
+        plain,
+        init=lambda key, hparams: empty,
+        act=lambda key, state, obs, explore: OFFSET + plain.act(key, state, obs, explore),
+        env_action=lambda action: action - OFFSET,
+        batch_size=lambda state: jnp.float32(3),
+    )
+    train = jax.jit(make_trainer(agent, ENV, training(stop_rule="never")))
+    result = train(KEY, script(range(12), [3] * 12))
+    assert result.train_steps == 36
+    np.testing.assert_array_equal(result.returns, np.arange(12))
+    drawn = result.agent_state.batch
+    assert (np.asarray(drawn.action) >= OFFSET).all()
+    assert drawn.weight.sum() == 3  # as many as the agent wants
+    task = envs.Task(name="script", env=ENV, params=script(range(12), [3] * 12))
+    tests = make_tester(agent, task, 2)(KEY, agent.begin_episode(empty, 7))
+    np.testing.assert_array_equal(tests.returns, [7, 7])
+    np.testing.assert_array_equal(tests.num_steps, [3, 3])
+
+
+def test_a_memory_is_asked_when_it_has_the_step_just_made():
+    def counting(example, max_steps):
+        return Memory(init=lambda: jnp.int32(0), store=lambda count, *_: count + 1,
+                      batch=lambda key, count, num_steps, *_: (count, num_steps))  # fmt: skip
+
+    def update(key, state, batch):
+        count, num_steps = batch
+        return state.replace(min_discount=jnp.minimum(state.min_discount, count == num_steps))
+
+    agent = dataclasses.replace(scripted_agent(init_episodes=0), memory=counting, update=update)
+    result = make_trainer(agent, ENV, training(stop_rule="never"))(KEY, script([0] * 12, [3] * 12))
+    assert result.agent_state.min_discount == 1
+
+
+def test_an_agent_without_weights_trains_too():
+    agent = dataclasses.replace(
+        scripted_agent(), init=lambda key, hparams: jnp.int32(0), update=lambda key, state, batch:
+        state, begin_episode=lambda state, episode: jnp.int32(episode),
+        act=lambda key, state, obs, explore: WHO * state + obs[0].astype(jnp.int32),
+    )  # fmt: skip
+    result = make_trainer(agent, ENV, training(stop_rule="never"))(KEY, script([1] * 12, [2] * 12))
+    assert result.train_steps == 24 and not result.nonfinite
+
+
 # --- lanes ---------------------------------------------------------------------------------------
 
 

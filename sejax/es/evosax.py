@@ -126,8 +126,9 @@ def _build(config: EvosaxConfig, num_dims: int) -> tuple[Any, Any]:
     options: dict[str, Any] = {}
     if "std_schedule" in accepted:
         own = not config.name.startswith("iamalgam")  # which add the schedule to a covariance
+        # evosax asks for the next generation's with the number of the one before.
         options["std_schedule"] = optax.exponential_decay(
-            own * config.noise_std, transition_steps=1, decay_rate=config.noise_std_decay
+            own * config.noise_std * config.noise_std_decay, 1, config.noise_std_decay
         )
     if "optimizer" in accepted:
         natural = config.name in NATURAL
@@ -146,6 +147,8 @@ def _build(config: EvosaxConfig, num_dims: int) -> tuple[Any, Any]:
 
 def _with_std(config: EvosaxConfig, state: Any) -> Any:
     """A first state with our std where evosax has another beside it."""
+    if config.noise_std_decay != 1 and hasattr(state, "std"):  # which is the second generation's
+        state = state.replace(std=state.std / config.noise_std_decay)
     if config.name == "xnes":  # std_init stands in its shape matrix as well
         return state.replace(B=state.B / config.noise_std)
     if config.name.startswith("iamalgam"):
