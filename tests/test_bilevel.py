@@ -161,6 +161,33 @@ def test_common_random_numbers_are_common_to_the_members_alone():
     assert 1 < len(np.unique(ids)) < len(ids)
 
 
+def test_members_are_compared_by_tests_as_long_as_the_curriculum_says():
+    """A generation is ask, the trials one by one with tests of one step, and tell."""
+    config = tiny("devices=1", "objective.first_test_steps=1", words=ROOM)
+    parts = config.parts()
+    program, task = make_program(**parts), parts["task"]
+    proxy = plugins.make("proxy", config.proxy, task)
+    agent = sejax.make_agent(config.agent, task)
+    evaluate = sejax.make_evaluator(agent, proxy, task, config.training)
+    state = program.init(KEYS[:1])
+    assert program.test_steps(state) == 1 < task.max_steps
+    asked = program.ask(state)
+
+    def one(trial):
+        key, candidate = trial
+        return evaluate(key, proxy.params(program.unravel(candidate)), True, jnp.int32(1))
+
+    outcome = jax.jit(lambda: jax.lax.map(one, (asked.keys[0], asked.candidates[0])))()
+    assert (outcome.scored_returns != outcome.test_returns).any()
+    after, info = jax.jit(program.generation)(state)
+    told, wanted = program.tell(state, asked, jax.tree.map(lambda x: x[None], outcome))
+    np.testing.assert_allclose(after.es_state.mean, told.es_state.mean, rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(info.incumbent_mean, wanted.incumbent_mean, rtol=1e-6)
+    whole = outcome.replace(scored_returns=outcome.test_returns)
+    other, _ = program.tell(state, asked, jax.tree.map(lambda x: x[None], whole))
+    assert not np.allclose(other.es_state.mean, told.es_state.mean, rtol=1e-3)
+
+
 def test_all_generations_run_in_one_executable(one_device):
     program, _, ((states, _), _) = one_device
     weak = lambda tree: jax.tree.map(lambda x: x.weak_type, tree)  # noqa: E731

@@ -120,6 +120,30 @@ def test_the_dataclass_defaults_are_the_papers_default_agent():
         assert getattr(schema(), name) == expected
 
 
+# What docs/agents.md says of DQN; the authors' discrete TD3 (its block in their default
+# configuration); Haarnoja et al. (2018), table 1.
+OTHER_AGENTS = {
+    sejax.DQNConfig: {"double": False, "epsilon_min": 0.05, "exploration_steps": 1000},
+    sejax.DiscreteTD3Config: {
+        "learning_rate": 5e-4, "target_update_rate": 0.01, "policy_delay": 2, "batch_size": 128,
+        "activation": "tanh", "hidden_size": 128, "num_layers": 2, "layer_norm": True,
+        "temperature": 1.0, "one_hot_actions": False, "action_noise_std": 0.1,
+        "target_noise_std": 0.2, "target_noise_clip": 0.5,
+    },
+    sejax.SACConfig: {
+        "learning_rate": 3e-4, "discount": 0.99, "num_layers": 2, "hidden_size": 256,
+        "batch_size": 256, "activation": "relu", "target_entropy": -1.0,
+        "target_update_rate": 0.005,
+    },
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("config", OTHER_AGENTS, ids=lambda config: config.__name__)
+def test_other_agents_have_the_defaults_of_their_papers(config):
+    wanted = OTHER_AGENTS[config]
+    assert {name: getattr(config(), name) for name in wanted} == wanted
+
+
 # Appendix "Reward Network Hyperparameters": the tables for learning RNs, a column for each task.
 RN_TASKS = ("cliff_walking", "cartpole", "mountain_car_continuous", "halfcheetah")
 LEARNING_RNS = {
