@@ -1,6 +1,7 @@
 # make run: learn a CartPole synthetic environment until it is solved.  make test: the test suite.
 # make docs: the site, in docs/_build/html.  make dist: the packages, in dist/.
-# All make .venv first if it is missing; python3.11 or newer, pip, make and git are all they need.
+# All make .venv first if it is missing; python3.11 or newer with pip and venv, make and git are all
+# they need.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
@@ -69,7 +70,7 @@ dist: $(VENV)/.installed-dist
 # Without its package python3-venv Debian's python makes half of one, and fails.
 $(BIN)/python:
 	$(PYTHON) -c 'import sys; assert sys.version_info >= (3, 11), "Python 3.11 or newer is needed: make PYTHON=python3.11"'
-	$(PYTHON) -m venv $(VENV) || { rm -rf $(VENV); exit 1; }
+	$(PYTHON) -m venv $(VENV) || { rm -f $(BIN)/python*; exit 1; }
 
 $(VENV)/.installed: $(BIN)/python pyproject.toml constraints.txt
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable .

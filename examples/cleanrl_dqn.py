@@ -1,6 +1,6 @@
 """DQN in a single file in the style of CleanRL, trained on a synthetic environment (SE).
 
-    pip install 'sejax[gym]' torch
+    pip install '.[gym]' torch
     python cleanrl_dqn.py
     python cleanrl_dqn.py --env-id CartPole-v1                   # on the real task
 

@@ -1,6 +1,6 @@
 """DQN of rejax on a shipped synthetic environment (SE) as a gymnax environment.
 
-    pip install sejax rejax
+    pip install . rejax
     python rejax_agent.py
 
 Ten agents train on the SE, and ten on CartPole itself, each ten in one compiled program. All are

@@ -1,6 +1,6 @@
 """A reward network (RN) as a wrapper around CartPole, under agents of Stable-Baselines3.
 
-    pip install 'sejax[sb3]'
+    pip install '.[sb3]'
     python reward_network_wrapper.py
 
 A2C and PPO with their default hyperparameters train until ten episodes on CartPole return 195 on

@@ -1,6 +1,6 @@
 """Agents of Stable-Baselines3 on the synthetic environments (SEs) of two tasks, beside the tasks.
 
-    pip install 'sejax[sb3]'
+    pip install '.[sb3]'
     python sb3_agents.py
 
 PPO and DQN train for 2,500 steps, three of each on each task's SE and three on the task itself.

@@ -1,6 +1,6 @@
 """DQN of sbx, Stable-Baselines3 in JAX, on the synthetic environment (SE) of CartPole.
 
-    pip install 'sejax[sb3]' sbx-rl
+    pip install '.[sb3]' sbx-rl
     python sbx_agent.py
 
 Five agents train for 2,500 steps on the SE, as many on CartPole itself. All are tested there.

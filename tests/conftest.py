@@ -9,7 +9,8 @@ from pathlib import Path
 
 # Compilation is most of the time here. LLVM's optimisation is off, which halves it, and so are the
 # emitters that take fusions through MLIR, which takes a third off the rest; XLA's own passes, whose
-# result test_program.py reads, stay on. Processes that tests start have these too.
+# result test_program.py reads, stay on. Processes that tests start have these too unless they
+# clear them.
 _FLAGS = (
     "--xla_backend_optimization_level=0",
     # From jaxlib 0.11 on the flag is unknown, of which XLA dies.

@@ -33,7 +33,7 @@ def test_without_a_home_there_is_no_compilation_cache(monkeypatch):
     monkeypatch.setattr(runtime.Path, "home", nobodys_home)
     monkeypatch.setattr(jax.config, "update", lambda *change: changed.append(change))
     runtime.configure_jax()
-    assert changed == [("jax_default_matmul_precision", "highest")]
+    assert not [name for name, _ in changed if "cache" in name]
 
 
 @pytest.mark.parametrize(

@@ -494,10 +494,10 @@ def test_a_process_keeps_to_its_share_of_a_gpu_and_to_single_precision():
         "import os, sys, jax\n"
         "from sejax.app import runtime\n"
         "runtime.take_share_of_gpu(float(sys.argv[1])); runtime.configure_jax()\n"
-        "print(jax.config.jax_platforms, os.environ.get('XLA_PYTHON_CLIENT_MEM_FRACTION'),"
+        "print(jax.config.jax_platforms, os.environ.get('XLA_CLIENT_MEM_FRACTION'),"
         " jax.config.jax_default_matmul_precision)\n"
     )
-    unset = ("JAX_PLATFORMS", "XLA_PYTHON_CLIENT_MEM_FRACTION", "JAX_DEFAULT_MATMUL_PRECISION")
+    unset = ("JAX_PLATFORMS", "XLA_CLIENT_MEM_FRACTION", "JAX_DEFAULT_MATMUL_PRECISION")
     clean = {name: x for name, x in os.environ.items() if name not in unset}
 
     def told(share, **variables):

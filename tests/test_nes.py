@@ -321,10 +321,12 @@ def test_every_algorithm_asks_for_its_population_and_the_incumbent(name):
     )
 
 
+@pytest.mark.parametrize("decay", [1.0, 0.5])
 @pytest.mark.parametrize("name", ALGORITHMS)
-def test_candidates_have_our_std_and_come_in_pairs_where_the_strategy_says_so(name):
+def test_candidates_have_our_std_and_come_in_pairs_where_the_strategy_says_so(name, decay):
     dims, std = 200, 0.05
-    strategy = EvosaxConfig(name=name, population_size=32, noise_std=std).make(dims)
+    config = EvosaxConfig(name=name, population_size=32, noise_std=std, noise_std_decay=decay)
+    strategy = config.make(dims)
     state = strategy.init(jax.random.key(0), jnp.zeros(dims))
     members, _ = jax.jit(strategy.ask)(jax.random.key(1), state)
     opposite = bool(jnp.abs(members[:16] + members[16:]).max() < 1e-6)

@@ -14,7 +14,9 @@ optuna = pytest.importorskip("optuna", reason="needs Optuna: pip install 'sejax[
 
 from optuna.trial import TrialState  # noqa: E402
 
+from sejax.app import runtime  # noqa: E402
 from sejax.errors import ConfigError  # noqa: E402
+from sejax.machines import scorer  # noqa: E402
 from sejax.search import settings  # noqa: E402
 
 FOREVER = float("inf")
@@ -82,14 +84,14 @@ class Cluster:
         return True
 
     def cluster_resources(self):
-        return {"CPU": float(self.room)}
+        return {"CPU": float(self.room), "GPU": float(self.room)}
 
     def remote(self, **options):
-        assert options == {"num_cpus": 1, "num_gpus": 0, "max_retries": 0}
+        assert options == {"num_cpus": 1, "num_gpus": 0.5, "max_retries": 0}
         return lambda function: SimpleNamespace(remote=self._start)
 
     def _start(self, words, gpu_share):
-        assert "study=some" in words and gpu_share == 0
+        assert "study=some" in words and gpu_share == 0.5
         self.timeouts += [word for word in words if word.startswith("timeout=")]
         worker, self.started = self.started, self.started + 1
         self._ends[worker] = self.fate(worker, self.now)
@@ -125,7 +127,7 @@ def search(monkeypatch):
         monkeypatch.setitem(sys.modules, "ray", cluster)
         searching = importlib.import_module("sejax.search.cluster")
         monkeypatch.setattr(searching, "time", cluster)
-        machines = SimpleNamespace(workers=None, gpus_per_worker=0)
+        machines = SimpleNamespace(workers=None, gpus_per_worker=0.5)
         config = dataclasses.replace(SEARCH.config, **fields)
         asked = dataclasses.replace(SEARCH, config=config, machines=machines)
         searching.work(cluster.study, asked, cluster.said.append)
@@ -229,3 +231,38 @@ def test_a_worker_in_anothers_place_has_the_time_that_is_left(search):
     search(cluster, timeout=100.0)
     assert cluster.timeouts == ["timeout=100.0", "timeout=60.0"]
     assert (cluster.now, cluster.started, cluster.cancelled) == (110.0, 2, [1])
+
+
+def test_workers_keep_to_their_share_of_a_gpu_and_the_driver_to_the_cpu(search, monkeypatch):
+    class Told(Exception):
+        pass
+
+    taken, actors = [], []
+
+    def take(share):
+        taken.append(share)
+        if share:
+            raise Told
+
+    def remote(**options):
+        def start(*arguments):
+            actors.append((options["num_gpus"], scorer.Scorer(*arguments)))
+            return SimpleNamespace(prepare=SimpleNamespace(remote=lambda: len(actors)))
+
+        return lambda function: SimpleNamespace(remote=start)
+
+    monkeypatch.setattr(runtime, "take_share_of_gpu", take)
+    cluster = Cluster(1, lambda worker, start: (5.0, None))
+    search(cluster)
+    assert taken == [0]  # of the search's driver
+    with pytest.raises(Told):
+        importlib.import_module("sejax.search.cluster")._work(["study=some"], 0.5)
+    cluster.remote = remote
+    crew = importlib.import_module("sejax.machines.ray_crew").RayCrew(
+        SimpleNamespace(workers=1, gpus_per_worker=0.5), {}, (4,)
+    )
+    crew.recruit()
+    ((num_gpus, worker),) = actors
+    with pytest.raises(Told):
+        worker.prepare()
+    assert num_gpus == 0.5 and taken == [0, 0.5, 0.5]

@@ -76,11 +76,11 @@ def configure_xla(num_devices: int | None = None) -> None:
 def take_share_of_gpu(share: float) -> None:
     """Keeps this process on its CPU core, or to its part of the GPU's memory.
 
-    Must run before jax first computes; after that nothing is done. Other processes of this machine
-    may have jax's accelerators then.
+    Must run before jax first computes; after that nothing is done.
 
     Args:
-      share: of one GPU, in [0, 1]; 0 for the CPU.
+      share: of one GPU, in [0, 1]; 0 for the CPU, whatever `JAX_PLATFORMS` says, so that other
+        processes have the GPUs.
     """
     if is_started():
         return
@@ -88,8 +88,8 @@ def take_share_of_gpu(share: float) -> None:
         import jax
 
         jax.config.update("jax_platforms", "cpu")
-    elif share < 1:  # jax takes three quarters of what is there
-        os.environ.setdefault("XLA_PYTHON_CLIENT_MEM_FRACTION", f"{0.9 * share:.3f}")
+    elif share < 1 and "XLA_PYTHON_CLIENT_MEM_FRACTION" not in os.environ:  # its older name
+        os.environ.setdefault("XLA_CLIENT_MEM_FRACTION", f"{0.9 * share:.3f}")  # 0.75 is usual
 
 
 def configure_jax() -> None:

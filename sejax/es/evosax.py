@@ -102,7 +102,7 @@ def make_evosax(config: EvosaxConfig, num_dims: int) -> Strategy:
         return algorithm.tell(key, members, fitness, state, params)[0]
 
     def init(key: Array, mean: Array) -> Any:
-        return _with_std(config, algorithm.init(key, mean, params))
+        return _with_std(config, algorithm, algorithm.init(key, mean, params))
 
     remembers = config.name in REMEMBERING
     return Strategy(
@@ -145,9 +145,9 @@ def _build(config: EvosaxConfig, num_dims: int) -> tuple[Any, Any]:
     return algorithm, params
 
 
-def _with_std(config: EvosaxConfig, state: Any) -> Any:
-    """A first state with our std where evosax has another beside it."""
-    if config.noise_std_decay != 1 and hasattr(state, "std"):  # which is the second generation's
+def _with_std(config: EvosaxConfig, algorithm: Any, state: Any) -> Any:
+    """A first state with our std where evosax has another, or another beside it."""
+    if config.noise_std_decay != 1 and hasattr(algorithm, "std_schedule"):  # begins one too late
         state = state.replace(std=state.std / config.noise_std_decay)
     if config.name == "xnes":  # std_init stands in its shape matrix as well
         return state.replace(B=state.B / config.noise_std)

@@ -53,21 +53,21 @@ def _load() -> ctypes.CDLL:
     with contextlib.suppress(OSError):
         if kept is not None and kept.exists():
             return _register(kept)
-    try:
-        with tempfile.TemporaryDirectory() as temporary:
-            built = Path(temporary) / file_name()
-            build(built)
-            with contextlib.suppress(OSError):
-                if kept is not None:
-                    with files.atomic_path(kept) as place:
-                        shutil.copyfile(built, place)
-                    return _register(kept)
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as temporary:
+        built = Path(temporary) / file_name()
+        build(built)
+        with contextlib.suppress(OSError):
+            if kept is not None:
+                with files.atomic_path(kept) as place:
+                    shutil.copyfile(built, place)
+                return _register(kept)
+        try:
             return _register(built)
-    except OSError as error:
-        raise BuildError(
-            f"it was built, and cannot be loaded ({told(error)}). Set SEJAX_CACHE_DIR, or TMPDIR, "
-            "to a folder that programs can be run from"
-        ) from error
+        except OSError as error:
+            raise BuildError(
+                f"the library was built, and cannot be loaded ({told(error)}). Set "
+                "SEJAX_CACHE_DIR, or TMPDIR, to a folder that programs can be run from"
+            ) from error
 
 
 def file_name() -> str:
@@ -111,7 +111,7 @@ def _compiler() -> list[str]:
         if command and shutil.which(command[0]):
             return command
     raise BuildError(
-        f"it found no C++ compiler, none of $CXX, {', '.join(COMPILERS)}. Install one, such as g++"
+        f"no C++ compiler was found, none of $CXX, {', '.join(COMPILERS)}. Install one, such as g++"
     )
 
 
