@@ -13,7 +13,7 @@ from flax import struct
 from jaxtyping import Array, Float, Int
 
 from sejax.agents.agent import Agent
-from sejax.agents.memory import Memory, MemoryMaker, Rollout
+from sejax.agents.memory import Memory, MemoryMaker
 from sejax.agents.replay import Transition
 from sejax.errors import LARGEST, require
 from sejax.keys import step_keys
@@ -318,9 +318,7 @@ class _Loop:
         def learn(agent_state: Any) -> Any:
             size = self.agent.batch_size(agent_state)
             batch = memories[0].batch(key_sample, remembered[0], state.step + 1, transition, size)
-            if masked and isinstance(batch, Rollout):
-                # All lanes would go through the phases of one that has stopped, again and again.
-                batch = batch._replace(is_full=batch.is_full & active)
+            batch = memories[0].rest(batch, active) if masked else batch
             return self.agent.update(key_update, agent_state, batch)
 
         agent_state = jax.lax.cond(

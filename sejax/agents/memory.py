@@ -21,11 +21,15 @@ class Memory(NamedTuple):
       batch: `(key, arrays, num_steps, transition, batch_size) -> batch` for `Agent.update`, after
         `num_steps` steps, the last of which was `transition`. Columns from `batch_size` on, if that
         is given, have weight 0.
+      rest: `(batch, active) -> batch`, which an agent that has stopped makes nothing of: in lanes
+        its updates are made, in vain, until all have stopped. Where updates always take as long
+        there is nothing to gain, and the batch stays as it is.
     """
 
     init: Callable[[], Any]
     store: Callable[..., Any]
     batch: Callable[..., Any]
+    rest: Callable[[Any, Array | bool], Any] = lambda batch, active: batch
 
 
 # `(example, max_steps) -> Memory`: for transitions like `example`, of which there are at most
@@ -113,7 +117,10 @@ def rollout_memory(length: int) -> MemoryMaker:
             return Rollout(rows=rows, is_full=num_steps % length == 0)
 
         width = replay.row_width(obs_dim, action_dim) + 1
-        return Memory(init=lambda: jnp.zeros((length, width)), store=store, batch=batch)
+        return Memory(
+            init=lambda: jnp.zeros((length, width)), store=store, batch=batch,
+            rest=lambda rollout, active: rollout._replace(is_full=rollout.is_full & active),
+        )  # fmt: skip
 
     return make
 
