@@ -62,7 +62,9 @@ class Family:
         if self.settings == "best" or self.agent == "ddqn":
             names = f"env={self.env}", f"agent={self.agent}", f"preset={self.settings}"
             chosen = sejax.config(names)
-            agent, proxy = chosen.agent, chosen.proxy if self.settings == "paper" else proxy
+            agent = chosen.agent
+            if self.settings == "paper":
+                proxy = chosen.proxy
         elif self.agent == "ppo":
             agent = sejax.PPOConfig.paper()
         else:

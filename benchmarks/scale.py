@@ -293,7 +293,7 @@ def trainings_side(config: Any, folder: Path, num_cores: int) -> Iterator[Measur
 
     program = make_program(**config.parts() | {"devices": 1})
     capacities = tuple(config.lanes or lanes or 1 for lanes in program.cpu_lanes)
-    crew = Here(scorer.Scorer(build.to_plain(config), capacities, scorer.versions()))
+    crew = Here(scorer.Scorer(build.to_plain(config), capacities, scorer.versions(), 0))
     with RemoteChunks(program, HandOut(crew, capacities, capacities)) as chunks:
         chunks.compile(config.num_seeds, 1)
 

@@ -67,7 +67,7 @@ class Scorer:
 
     def __init__(
         self, config: dict[str, Any], capacities: tuple[int, ...], versions: dict[str, str],
-        gpu_share: float = 0,
+        gpu_share: float,
     ):  # fmt: skip
         """Of a run's plain configuration, most trials in a share by family, and the driver's.
 

@@ -140,7 +140,7 @@ def _words(search: Search, timeout: float | None) -> list[str]:
     return [f"{name}={value}" for name, value in own.items() if value is not None]
 
 
-def _work(words: list[str], gpu_share: float = 0) -> None:
+def _work(words: list[str], gpu_share: float) -> None:
     """A worker: joins the study and takes trials until there are none."""
     runtime.configure_xla(1)
     runtime.take_share_of_gpu(gpu_share)
