@@ -3,8 +3,10 @@
 Every message has one form: what must hold, why, what came, and how to mend it.
 """
 
+import contextlib
 import difflib
 import math
+import numbers
 from collections.abc import Collection, Iterable
 from typing import Any
 
@@ -124,5 +126,13 @@ def require_seed(name: str, seed: Any) -> None:
 
 
 def is_number(value: Any) -> bool:
-    """Whether it is an int or a float, which a bool is not here."""
-    return isinstance(value, int | float) and not isinstance(value, bool)
+    """Whether it is an int or a float, NumPy's too; a bool is none here."""
+    return isinstance(value, numbers.Real) and not isinstance(value, bool)
+
+
+def as_python(value: Any) -> Any:
+    """A number or bool of NumPy or jax as Python's; all else, traced ones too, as it is."""
+    if getattr(value, "shape", None) == () and hasattr(value, "item"):
+        with contextlib.suppress(TypeError):  # a traced one has no value yet
+            return value.item()
+    return value

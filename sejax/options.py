@@ -55,13 +55,17 @@ class Options:
 
 
 def check(config: Any, group: str) -> None:
-    """Checks all fields of a dataclass that have a rule.
+    """Checks all fields of a dataclass that have a rule; makes numbers of NumPy or jax Python's.
 
     Raises:
       ConfigError: for the first one that does not hold.
     """
     for field in dataclasses.fields(config):
-        rule, value = marks(type(config), field.name).get("rule"), getattr(config, field.name)
+        given = getattr(config, field.name)
+        value = errors.as_python(given)
+        if value is not given:
+            object.__setattr__(config, field.name, value)
+        rule = marks(type(config), field.name).get("rule")
         if rule is not None and not (value is None and field.default is None):
             rule(f"{group}.{field.name}" if group else field.name, value, field.default)
 

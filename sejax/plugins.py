@@ -30,7 +30,7 @@ import importlib.util
 import inspect
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Optional
 
 from sejax import serialize
 from sejax.errors import ConfigError, nearest, require, shortened, told, unknown_name
@@ -207,8 +207,7 @@ def defaults(group: str, name: str) -> dict[str, Any]:
 
 def name_of(group: str, config: Any) -> str:
     """The name by which `find` finds a configuration's class again."""
-    own = {field.name for field in dataclasses.fields(config)}
-    if "name" in own:
+    if "name" in getattr(type(config), "__dataclass_fields__", {}):
         return str(config.name)
     cls = type(config)
     return _NAMES.get(cls) or _built_in_name(group, cls) or f"{cls.__module__}:{cls.__qualname__}"
@@ -248,17 +247,41 @@ def require_package(group: str, config: Any, reason: str) -> None:
 
 
 class Same:
-    """Configurations as a key that is equal if all their fields are, hashable or not."""
+    """Configurations as a key that is equal if all their fields are, hashable or not.
+
+    What is no dataclass is equal to itself alone.
+    """
 
     def __init__(self, *configs: Any):
-        self.configs = configs
-        self._key = tuple((type(c), repr(serialize.to_plain(c))) for c in configs)
+        self.configs = configs  # also keeps alive what the key knows by its address
+        self._key = tuple(map(_content, configs))
 
     def __hash__(self) -> int:
         return hash(self._key)
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Same) and self._key == other._key
+
+
+def _content(value: Any) -> Any:
+    """What makes two values the same, hashable: of dataclasses at any depth class and fields."""
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        # Also what is no argument of the class, as a flax module's parent.
+        return type(value), tuple(_content(getattr(value, field.name, None))
+                                  for field in dataclasses.fields(value) if field.init)  # fmt: skip
+    if isinstance(value, tuple | list):
+        return type(value), tuple(map(_content, value))
+    if isinstance(value, Mapping):
+        return type(value), tuple((repr(name), _content(x)) for name, x in value.items())
+    if isinstance(value, bool | int | float | str | None):
+        return repr(value)  # by which 1, 1.0 and True are not the same, and nan is
+    if hasattr(value, "tolist"):  # NumPy's and jax's numbers and arrays
+        return type(value), str(value.dtype), repr(value.tolist())
+    try:
+        hash(value)
+    except TypeError:
+        return type(value), id(value)
+    return type(value), value
 
 
 @functools.cache
@@ -367,6 +390,8 @@ def _from_function(group: str, name: str, function: Callable[..., Any]) -> type:
     for parameter in options:
         unknown = parameter.annotation is inspect.Parameter.empty
         kind = Any if unknown else parameter.annotation
+        if parameter.default is None:  # which `length: float = None` may be too
+            kind = Optional[kind]  # noqa: UP045 (it may be a string)
         fields.append((parameter.name, kind, _field(parameter.default)))
 
     def make(self: Any, *given: Any) -> Any:

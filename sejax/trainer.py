@@ -15,6 +15,7 @@ from jaxtyping import Array, Float, Int
 from sejax.agents.agent import Agent
 from sejax.agents.memory import Memory, MemoryMaker
 from sejax.agents.replay import Transition
+from sejax.envs.task import require_own_steps
 from sejax.errors import LARGEST, require
 from sejax.keys import step_keys
 from sejax.loops import while_any_active
@@ -186,6 +187,7 @@ def _require_parts(agent: Any, env: Any, training: Any) -> None:
     require(hasattr(env, "step_env"), "env", "be a gymnax environment", "the agent trains there",
             type(env).__name__, "env to the first of the pair that sejax.load returns, or to "
             "task.env")  # fmt: skip
+    require_own_steps(env)
     require(isinstance(training, TrainingConfig), "training", "be a sejax.TrainingConfig",
             "it says how long agents train", type(training).__name__,
             "training=sejax.TrainingConfig(max_episodes=100)")  # fmt: skip

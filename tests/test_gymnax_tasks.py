@@ -1,6 +1,7 @@
 """Any environment of gymnax as a task: vectors in, vectors out, limits kept."""
 
 import math
+from typing import NamedTuple
 
 import gymnax
 import jax
@@ -158,7 +159,7 @@ class Odd(gymnax.environments.environment.Environment):
         return jnp.zeros(self.obs.shape), gymnax.EnvState(time=0)
 
     def step_env(self, key, state, action, params):
-        return jnp.resize(action, self.obs.shape), state, 0.0, jnp.bool_(False), {}
+        return jnp.resize(jnp.float32(action), self.obs.shape), state, 0.0, jnp.bool_(False), {}
 
     def action_space(self, params):
         return self.action
@@ -204,8 +205,8 @@ def test_worlds_that_agents_can_take_as_they_are_are_left_alone():
 @pytest.mark.parametrize("space", [spaces.Dict({"x": spaces.Discrete(2)}),
                                    spaces.Tuple([spaces.Discrete(2)])])  # fmt: skip
 def test_spaces_of_several_arrays_are_refused(space):
-    said = (r"^env must have actions in a gymnax Box or Discrete space, because .* in odd\. Wrap "
-            r"the environment so that its actions are one array\.$")  # fmt: skip
+    said = (r"^env must have actions in a gymnax Box or Discrete space, because .* in odd\. Make "
+            r"them one array in a subclass of sejax\.envs\.wrappers\.Wrapper\.$")  # fmt: skip
     with pytest.raises(ConfigError, match=said):
         odd_task(space)
     with pytest.raises(
@@ -291,3 +292,57 @@ def test_params_without_a_limit_and_an_odd_threshold_are_refused():
     with pytest.raises(ConfigError, match=r"^env\.solved_reward must be a number"):
         Task(name="mine", env=Odd(spaces.Discrete(2), spaces.Box(-1.0, 1.0, (2,))),
              params=Plain.default_params, solved_reward="high")  # fmt: skip
+
+
+def test_a_wrapper_whose_step_would_never_be_called_is_refused():
+    from gymnax.environments.classic_control import cartpole
+    from gymnax.wrappers.purerl import StickyActionWrapper
+
+    wrapped = StickyActionWrapper(cartpole.CartPole(), 1.0)
+    said = (
+        r"^env must have a class with reset_env and step_env, .*got StickyActionWrapper\. Set env "
+    )
+    with pytest.raises(ConfigError, match=said):
+        Task(name="sticky", env=wrapped)
+    task = Task(name="plain", env=cartpole.CartPole())
+    agent = sejax.make_agent(sejax.DDQNConfig(), task)
+    with pytest.raises(ConfigError, match=said):
+        sejax.make_trainer(agent, wrapped)
+
+
+class Counts(Short):
+    """A world whose state is a counter, of a dtype that may change by the first step."""
+
+    reset_env = Plain.reset_env
+    after, terminated = jnp.int32(1), False
+
+    def step_env(self, key, state, action, params):
+        return jnp.zeros(2), state.replace(time=self.after), 0.0, jnp.asarray(self.terminated), {}
+
+
+class Drifts(Counts):
+    after = jnp.float32(1)
+
+
+class Done(Counts):
+    terminated = 0.0
+
+
+def test_what_no_loop_could_carry_is_told():
+    assert Task(name="mine", env=Counts()).max_steps == 3
+    said = (r"^env must keep the shapes and dtypes that reset_env returns, .*; got state\.time "
+            r"\(\(\), 'int32'\) and then \(\(\), 'float32'\) in mine")  # fmt: skip
+    with pytest.raises(ConfigError, match=said):
+        Task(name="mine", env=Drifts())
+    with pytest.raises(ConfigError, match=r"^env must return a bool as .* got float32 in mine"):
+        Task(name="mine", env=Done())
+
+
+def test_limits_may_be_numbers_of_numpy_and_jax_but_must_be_replaceable():
+    class Limit(NamedTuple):
+        max_steps_in_episode: int = 3
+
+    assert Task(name="mine", env=Counts(), params=Limit(jnp.int32(4))).max_steps == 4
+    assert type(Task(name="mine", env=Counts(), max_steps=np.int64(7)).max_steps) is int
+    with pytest.raises(ConfigError, match=r"^params must have a method replace, or max_steps_in"):
+        Task(name="mine", env=Counts(), params=Limit(), max_steps=5)

@@ -3,6 +3,8 @@
 import dataclasses
 from typing import Any, ClassVar
 
+import jax.numpy as jnp
+import numpy as np
 import pytest
 
 from sejax import options
@@ -229,3 +231,13 @@ def test_a_subclass_that_changes_a_default_keeps_rule_and_marks():
     with pytest.raises(ConfigError, match=r"agent\.learning_rate must be above 0.*=0\.5\."):
         Mine(learning_rate=0)
     assert list(ranges_of(Mine())) == ["learning_rate", "discount"]
+
+
+def test_numbers_of_numpy_and_jax_become_pythons():
+    config = Config(size=np.int64(3), rate=np.float32(0.5), share=jnp.float32(0.25),
+                    unruled=np.float64(2), limit=jnp.int32(9))  # fmt: skip
+    assert config == Config(size=3, rate=0.5, share=0.25, unruled=2.0, limit=9)
+    assert {type(getattr(config, name)) for name in ("size", "limit")} == {int}
+    assert {type(getattr(config, name)) for name in ("rate", "share", "unruled")} == {float}
+    assert "got True" in message(size=np.bool_(True))
+    assert "got [3]" in message(size=np.array([3]))

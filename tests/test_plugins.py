@@ -4,10 +4,12 @@ import dataclasses
 import importlib.metadata
 import re
 import sys
+from typing import Any
 
 import jax
 import numpy as np
 import pytest
+from flax import linen as nn
 
 import sejax
 from sejax import envs, plugins
@@ -534,3 +536,60 @@ def test_options_that_words_cannot_say_are_one_message(module):
     assert "\n" not in str(error.value)
     config = plugins.find("objective", f"{name}:f")()
     assert plugins.make("objective", config, envs.make("cartpole")).score is print
+
+
+class Plain(nn.Module):
+    features: int = 8
+
+
+class Residual(nn.Module):
+    features: int = 8
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Torso:
+    """An agent's configuration that holds another dataclass, a number, a list and a function."""
+
+    torso: nn.Module = Plain()  # noqa: RUF009 (frozen)
+    rate: float = 1.0
+    sizes: Any = (1, 2)
+    act: Any = len
+
+    def make(self, task):
+        return dataclasses.replace(sejax.QLearningConfig().make(task))
+
+
+def test_configurations_are_the_same_if_classes_and_fields_are_at_any_depth():
+    task = envs.make("cliff_walking")
+
+    def made(config):
+        return sejax.make_agent(config, task)
+
+    assert made(Torso()) is made(Torso(torso=Plain(features=8)))
+    assert made(Torso(sizes=[np.float32(1)])) is made(Torso(sizes=[np.float32(1)]))
+    others = [Torso(torso=Residual()), Torso(torso=Plain(features=9)), Torso(rate=1),
+              Torso(act=sum), Torso(sizes=[1, 2]), Torso(sizes=(1, 2.0)), Torso(sizes={"a": 1}),
+              Torso(sizes=np.array([1, 2]))]  # fmt: skip
+    agents = {id(made(config)) for config in (Torso(), *others)}
+    assert len(agents) == 1 + len(others)
+
+
+def test_what_is_no_dataclass_is_the_same_as_itself_alone():
+    class Mine:
+        make = Torso.make
+
+    task, one = envs.make("cliff_walking"), Mine()
+    assert sejax.make_agent(one, task) is sejax.make_agent(one, task)
+    assert sejax.make_agent(one, task) is not sejax.make_agent(Mine(), task)
+
+
+def test_a_tasks_lists_and_what_may_be_none_are_options_of_the_command_line(module):
+    name = module(
+        "import sejax\n"
+        "def make(sizes: list[int] = [1, 2], length: float = None):\n"
+        "    task = sejax.envs.make('cartpole')\n"
+        "    return sejax.Task(name=f'of_{sizes}_{length}', env=task.env, params=task.params)\n"
+    )
+    for words, named in (([], "of_[1, 2]_None"), (["env.length=null"], "of_[1, 2]_None"),
+                         (["env.sizes=[3,4]", "env.length=2"], "of_[3, 4]_2.0")):  # fmt: skip
+        assert sejax.config([f"env={name}:make", *words]).task().name == named

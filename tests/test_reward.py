@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from gymnax.environments.classic_control import cartpole
 from support import numpy_forward
 
 import sejax
@@ -23,6 +24,7 @@ from sejax.trainer import TrainResult, make_trainer
 from sejax.training import TrainingConfig
 
 GAMMA = 0.9
+KEY = jax.random.key(0)
 VARIANTS = {  # table "Overview of Reward Network variants"
     "additive_potential": lambda r, before, after: r + GAMMA * after - before,
     "exclusive_potential": lambda r, before, after: GAMMA * after - before,
@@ -388,3 +390,31 @@ def test_a_loaded_potential_pays_with_the_discount_of_its_agent(tmp_path):
 def test_what_makes_no_sense_is_refused(overrides, said):
     with pytest.raises(ConfigError, match=said):
         sejax.config(overrides)
+
+
+def test_an_episode_ends_where_the_tasks_own_does():
+    class Early(cartpole.CartPole):
+        def is_truncated(self, state, params):
+            return (state.time >= params.max_steps_in_episode) | (state.time >= 3)
+
+    task = sejax.Task(name="early", env=Early())
+    config = RewardConfig(variant="exclusive_potential", hidden_size=5, zero_at_terminal=True)
+    env = plugins.make("proxy", config, task)
+    params = env.prepared(env.params(env.init_weights(KEY)), GAMMA, limit_is_terminal=True)
+    obs, state = env.reset_env(KEY, params)
+    for cut in (False, False, True):
+        before = env.potential(params, obs)
+        obs, state, reward, terminated, _ = env.step_env(KEY, state, 0, params)
+        assert bool(env.is_truncated(state, params)) == cut and not terminated
+        after = 0.0 if cut else GAMMA * env.potential(params, obs)
+        np.testing.assert_allclose(reward, after - before, rtol=1e-5)
+
+
+@pytest.mark.parametrize("task", ["cartpole", "cliff_walking"])
+def test_a_reward_network_steps_in_double_precision_too(task):
+    env = make_env(task)
+    with jax.enable_x64(True):
+        params = env.params(env.init_weights(KEY))
+        _, state = env.reset(KEY, params)
+        out = jax.eval_shape(env.step, KEY, state, jnp.int32(0), params)
+    assert out[2].shape == ()

@@ -283,9 +283,8 @@ def _agent_for(choice: str, is_own: bool, node: dict[str, Any], overrides: Seque
         return _DEFAULT_AGENT
     if facts is None:  # the task must be made to know: with the fields that are asked for
         given = {word.partition("=")[0]: word.partition("=")[2] for word in overrides}
-        fields = {name.removeprefix("env."): OmegaConf.create({"x": value}).x
-                  for name, value in ((n, parsed(v)) for n, v in given.items())
-                  if name.startswith("env.")}  # fmt: skip
+        fields = {name.removeprefix("env."): to_plain(OmegaConf.create({"x": parsed(value)}))["x"]
+                  for name, value in given.items() if name.startswith("env.")}  # fmt: skip
         if "???" in {**node, **fields}.values():
             return _DEFAULT_AGENT  # what is missing is said later
         facts = envs.facts_of(plugins.configure("env", {**node, **fields}))

@@ -89,6 +89,7 @@ class Task:
         errors.require(is_env, "env", "be a gymnax environment",
                        "its params are asked for", type(self.env).__name__,
                        "env to the first of the pair that gymnax.make returns")  # fmt: skip
+        require_own_steps(self.env)
         is_nan = isinstance(self.solved_reward, float) and math.isnan(self.solved_reward)
         is_odd = is_nan or isinstance(self.solved_reward, str | None)  # a traced one is fine
         errors.require(not is_odd, "env.solved_reward", "be a number",
@@ -98,8 +99,12 @@ class Task:
                        "max_steps_in_episode", "episodes are cut there", type(params).__name__,
                        "params to a gymnax EnvParams")  # fmt: skip
         limit = params.max_steps_in_episode if self.max_steps is None else self.max_steps
+        limit = errors.as_python(limit)
         errors.whole(1, "env.max_steps", limit, "an episode has steps", 200)
         if self.max_steps is not None and params.max_steps_in_episode != limit:
+            errors.require(hasattr(params, "replace"), "params", "have a method replace, or "
+                           f"max_steps_in_episode={limit}", "that is the task's max_steps", params,
+                           "params to a gymnax EnvParams, or max_steps=None")  # fmt: skip
             params = params.replace(max_steps_in_episode=limit)
         object.__setattr__(self, "max_steps", int(limit))
         object.__setattr__(self, "params", params)
@@ -169,6 +174,21 @@ class Task:
         return float(np.max(self._action_space.high))
 
 
+def require_own_steps(env: Any) -> None:
+    """Checks that an environment is none which hands on to another what is called here.
+
+    Raises:
+      ConfigError: for a wrapper of gymnax's kind: it changes `step`, and its `step_env` is that of
+        the environment in it, so that what it does would silently be left out.
+    """
+    missing = [name for name in ("reset_env", "step_env") if not hasattr(type(env), name)]
+    errors.require(not missing, "env", f"have a class with {' and '.join(missing or ['step_env'])}",
+                   "episodes are cut and begun anew around these, and a wrapper's reset and step "
+                   "are never called", type(env).__name__,
+                   "env to a subclass of sejax.envs.wrappers.Wrapper that changes reset_env and "
+                   "step_env")  # fmt: skip
+
+
 @contextlib.contextmanager
 def _says_what_it_must_be(name: str) -> Iterator[None]:
     """Whatever an environment raises within is a `ConfigError`."""
@@ -195,12 +215,14 @@ def _try(env: Any, params: Any, name: str) -> None:
     def step(key: Any) -> Any:
         obs, state = env.reset_env(key, params)
         action = env.action_space(params).sample(key)
-        next_obs, state, reward, terminated, _ = env.step_env(key, state, action, params)
-        env.is_truncated(state, params)
-        return obs, next_obs, reward, terminated
+        next_obs, next_state, reward, terminated, _ = env.step_env(key, state, action, params)
+        env.is_truncated(next_state, params)
+        return obs, state, next_obs, next_state, reward, terminated
 
     with _says_what_it_must_be(name):
-        obs, next_obs, reward, terminated = jax.eval_shape(step, jax.random.key(0))
+        obs, state, next_obs, next_state, reward, terminated = jax.eval_shape(
+            step, jax.random.key(0)
+        )
     shape = tuple(env.observation_space(params).shape)
     for what, got, wanted in (("reset_env's observation", obs, shape),
                               ("step_env's observation", next_obs, shape),
@@ -209,6 +231,19 @@ def _try(env: Any, params: Any, name: str) -> None:
         errors.require(got.shape == wanted, "env", f"have {wanted} as the shape of {what}", "its "
                        "space, or an episode at a time, says so", f"{got.shape} in {name}",
                        "env to one that returns that")  # fmt: skip
+    errors.require(terminated.dtype == bool, "env", "return a bool as step_env's terminated", "a "
+                   "loop is compiled that ends by it", f"{terminated.dtype} in {name}",
+                   "env to one that returns such as terminated > 0")  # fmt: skip
+    began, went_on = (
+        {jax.tree_util.keystr(path, simple=True, separator="."): (x.shape, str(x.dtype))
+         for path, x in jax.tree_util.tree_leaves_with_path(each)}
+        for each in ({"state": state, "obs": obs}, {"state": next_state, "obs": next_obs})
+    )  # fmt: skip
+    changed = [f"{key} {began.get(key)} and then {went_on.get(key)}"
+               for key in {**began, **went_on} if began.get(key) != went_on.get(key)]  # fmt: skip
+    errors.require(not changed, "env", "keep the shapes and dtypes that reset_env returns", "an "
+                   "episode is one compiled loop", f"{', '.join(changed)} in {name}",
+                   "env to one whose step_env returns the same")  # fmt: skip
 
 
 def _num_categories(space: Any) -> int | None:

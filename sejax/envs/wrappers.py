@@ -161,8 +161,8 @@ def as_vectors(env: Any, params: Any, name: str) -> Any:
         if not isinstance(space, spaces.Box | spaces.Discrete):
             raise ConfigError(
                 f"env must have {what} in a gymnax Box or Discrete space, because networks take "
-                f"vectors and tables take indices; got {space!r} in {name}. Wrap the environment "
-                f"so that its {what} are one array."
+                f"vectors and tables take indices; got {space!r} in {name}. Make them "
+                f"one array in a subclass of sejax.envs.wrappers.Wrapper."
             )
     plain_obs = isinstance(obs, spaces.Discrete) or getattr(env, "observes_vectors", False)
     if not plain_obs:  # what comes, as a space may say otherwise (gymnax's FourRooms)

@@ -155,8 +155,8 @@ class RewardEnv(ProxyEnv):
             return params.weights["info_weights"] @ _select(info, self.task.info_keys)
         after = self.potential(params, next_state.obs, next_state.augmentation)
         if self.config.zero_at_terminal:
-            at_limit = next_state.time >= params.max_steps_in_episode
-            after = jnp.where(terminated | (params.limit_is_terminal & at_limit), 0.0, after)
+            is_cut = self.is_truncated(next_state, params)
+            after = jnp.where(terminated | (params.limit_is_terminal & is_cut), 0.0, after)
         if not self.config.is_potential_based:
             return after
         before = self.potential(params, state.obs, state.augmentation)
@@ -164,7 +164,7 @@ class RewardEnv(ProxyEnv):
 
     def reset_env(self, key: Array, params: RewardParams) -> tuple[Array, RewardState]:
         obs, world = self.task.env.reset_env(key, self.task.params)
-        nothing = jnp.zeros(len(self._augmented_keys))
+        nothing = jnp.zeros(len(self._augmented_keys), jnp.float32)
         return obs, RewardState(world=world, obs=obs, augmentation=nothing, time=jnp.int32(0))
 
     def step_env(
@@ -191,6 +191,10 @@ class RewardEnv(ProxyEnv):
             "nonfinite": ~jnp.isfinite(reward),
         }
         return obs, next_state, jnp.where(sane, reward, 0.0), terminated | ~sane, info
+
+    def is_truncated(self, state: RewardState, params: RewardParams) -> Array:
+        at_limit = state.time >= params.max_steps_in_episode
+        return at_limit | self.task.env.is_truncated(state.world, self.task.params)
 
     def get_obs(self, state: RewardState, params: Any = None, key: Any = None) -> Array:
         return state.obs
