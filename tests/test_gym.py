@@ -5,6 +5,7 @@ import json
 import pickle
 import subprocess
 import sys
+from pathlib import Path
 
 import gymnasium
 import jax
@@ -13,6 +14,7 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 from gymnasium.utils.env_checker import check_env
+from gymnasium.wrappers import TransformObservation
 from safetensors.numpy import save_file
 from support import random_like, shapes_of
 
@@ -554,3 +556,36 @@ def test_weights_of_another_type_are_refused_as_in_jax(tmp_path):
     path.write_bytes(seal(tensors | {"start/Dense_0/bias": np.float32([1])[0]}, "sejax", header))
     with pytest.raises(ConfigError, match=r"^weights must be those of"):
         make(path)
+
+
+def test_an_se_keeps_its_step_limit_on_another_task_of_its_kind(stored):
+    env = plugins.make("proxy", SyntheticConfig(**SMALL), envs.make("cartpole"))
+    path = stored(env)
+    assert make(path).world.max_steps == make(path, "CartPole-v1").world.max_steps == 200
+    task = RealTask.of_gymnasium("CartPole-v1")
+    with pytest.raises(ConfigError, match=r"^task must have the max_steps .* 200, .*got 500\. Set "
+                       r"task=dataclasses\.replace\(task, max_steps=200\)"):  # fmt: skip
+        make(path, task)
+    assert make(path, dataclasses.replace(task, max_steps=200)).world.max_steps == 200
+    bandit = stored(plugins.make("proxy", SyntheticConfig(**SMALL, horizon=1),
+                                 envs.make("cartpole")))  # fmt: skip
+    assert make(bandit, task).world.max_steps == 1  # whatever the task's
+    old = "results/soft_ses/cartpole.safetensors"  # a file that does not say what agents see
+    path = Path(__file__).parents[1] / old
+    assert make(path, "CartPole-v1").world.max_steps == 200
+
+
+def test_starts_are_as_the_environments_wrappers_show_them(stored):
+    path = stored(plugins.make("proxy", SyntheticConfig(**SMALL), envs.make("cartpole")))
+    real = gymnasium.make("CartPole-v1", max_episode_steps=200)
+    wrapped = TransformObservation(real, lambda obs: 10 * obs, real.observation_space)
+    se = make(path, RealTask.of_env(wrapped))
+    np.testing.assert_array_equal(se.reset(seed=0)[0], wrapped.reset(seed=0)[0])
+
+
+def test_vector_environments_take_a_render_mode_as_single_ones_do():
+    assert gymnasium.make_vec("sejax/cartpole", num_envs=np.int64(2), render_mode="rgb_array")
+    with pytest.raises(ConfigError, match=r"^render_mode must be None for an SE"):
+        sejax.gym.make_vec("cartpole", 2, render_mode="human")
+    envs_of_rn = sejax.gym.make_vec("mountain_car_continuous-rn", 1, render_mode="rgb_array")
+    assert envs_of_rn.envs[0].render_mode == "rgb_array"

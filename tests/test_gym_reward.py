@@ -10,7 +10,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
-from gymnasium.wrappers import TimeLimit, TransformReward
+from gymnasium.wrappers import (
+    FlattenObservation,
+    NormalizeObservation,
+    RescaleAction,
+    TimeLimit,
+    TransformReward,
+)  # fmt: skip
 from safetensors.numpy import save_file
 from support import numpy_forward, random_like, shapes_of
 
@@ -286,6 +292,45 @@ def test_what_does_not_fit_is_one_message(tmp_path):
         with pytest.raises(ConfigError, match=r"^discount must lie in \[0, 1\]"):
             RewardNetwork(gymnasium.make("CartPole-v1"), "cartpole-rn", discount)
     assert make("cartpole-rn", "CartPole-v1").get_wrapper_attr("_max_episode_steps") == 500
+
+
+def test_the_network_sees_the_tasks_own_observations():
+    cartpole = gymnasium.make("CartPole-v1")
+    with pytest.raises(ConfigError, match=r"^env must have the observations of cartpole as they ar"
+                       r".*<NormalizeObservation.*Set gymnasium\.wrappers that ch"):  # fmt: skip
+        RewardNetwork(TransformReward(NormalizeObservation(cartpole), float), "cartpole-rn")
+    assert NormalizeObservation(RewardNetwork(cartpole, "cartpole-rn")).reset(seed=0)
+    with pytest.raises(
+        ConfigError, match=r"^env must have actions such as those of cartpole, Disc"
+    ):
+        RewardNetwork(gymnasium.make("InvertedPendulum-v5"), "cartpole-rn")
+    # Actions may be another agent's, and observations made what the network sees.
+    car = gymnasium.make("MountainCarContinuous-v0")
+    for env in (
+        RescaleAction(car, np.float32(-2), np.float32(2)),
+        FlattenObservation(InADict(car)),
+    ):
+        rewards = RewardNetwork(env, "mountain_car_continuous-rn")
+        rewards.reset(seed=0)
+        assert np.isfinite(rewards.step(np.array([0.5], np.float32))[1])
+
+
+class InADict(gymnasium.Wrapper):
+    """An environment that is given its observations in a dictionary, and has them so itself."""
+
+    unwrapped = property(lambda self: self)
+
+    def __init__(self, env):
+        super().__init__(env)
+        self.observation_space = gymnasium.spaces.Dict({"obs": env.observation_space})
+
+    def reset(self, **options):
+        obs, info = self.env.reset(**options)
+        return {"obs": obs}, info
+
+    def step(self, action):
+        obs, *rest = self.env.step(action)
+        return {"obs": obs}, *rest
 
 
 def test_info_that_is_not_there_is_one_message(tmp_path):

@@ -15,7 +15,15 @@ from sejax.errors import ConfigError, require, whole
 from sejax.gym.reward import RewardNetwork
 from sejax.gym.source import Source, read
 from sejax.gym.synthetic import SyntheticEnv, SyntheticWorld
-from sejax.gym.tasks import RealTask, is_close, make_gymnasium, real_env, real_task, unknown_task
+from sejax.gym.tasks import (
+    RealTask,
+    is_close,
+    make_gymnasium,
+    real_env,
+    real_task,
+    step_limit,
+    unknown_task,
+)
 from sejax.gym.vector import SyntheticVectorEnv
 from sejax.proxies import stored
 
@@ -34,7 +42,8 @@ def make(
       source: a run directory, a safetensors file of one proxy, or the name of one that ships with
         the package.
       task: the real task, or its id in Gymnasium; needed if it is none that sejax and Gymnasium
-        both know. For an RN an id; `RewardNetwork` goes around any environment.
+        both know. Episodes of an SE keep the step limit in its file. For an RN an id;
+        `RewardNetwork` goes around any environment.
       render_mode: of an RN's real task, as of `gymnasium.make`; an SE has no pictures, and ignores
         rgb_array.
 
@@ -54,9 +63,7 @@ def make(
     if _is_rn(header):
         env, name = RewardNetwork(_real_env(header, task, render_mode), source), f"{name}-rn"
     else:
-        # Stable-Baselines3's make_vec_env asks for rgb_array, whether anybody will look or not.
-        require(render_mode in (None, "rgb_array"), "render_mode", "be None for an SE", "its "
-                "states have no picture", render_mode, "render_mode=None")  # fmt: skip
+        _require_no_picture(render_mode)
         env = SyntheticEnv(_world(weights, header, task))
     options = {"source": str(source), "task": task, "render_mode": render_mode}
     env.spec = _spec(name, **{key: x for key, x in options.items() if x is not None})
@@ -69,6 +76,7 @@ def make_vec(
     task: RealTask | str | None = None,
     *,
     autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
+    render_mode: str | None = None,
 ) -> VectorEnv[Any, Any, Any]:
     """Makes a stored proxy a Gymnasium vector environment.
 
@@ -80,6 +88,7 @@ def make_vec(
       num_envs: lanes.
       task: as of `make`.
       autoreset_mode: what happens where an episode ends; see `SyntheticVectorEnv`.
+      render_mode: as of `make`.
 
     Raises:
       ConfigError: as `make`, or for less than one lane.
@@ -93,8 +102,9 @@ def make_vec(
     whole(1, "num_envs", num_envs, "each is an episode at a time", 8)
     weights, header = read(source)
     if _is_rn(header):
-        env_fns = [partial(make, source, task)] * num_envs
+        env_fns = [partial(make, source, task, render_mode=render_mode)] * int(num_envs)
         return SyncVectorEnv(env_fns, autoreset_mode=autoreset_mode)
+    _require_no_picture(render_mode)
     return SyntheticVectorEnv(_world(weights, header, task), num_envs, autoreset_mode)
 
 
@@ -152,6 +162,12 @@ def _spec(name: str, **kwargs: Any) -> EnvSpec:
     )  # fmt: skip
 
 
+def _require_no_picture(render_mode: str | None) -> None:
+    # Stable-Baselines3's make_vec_env asks for rgb_array, whether anybody will look or not.
+    require(render_mode in (None, "rgb_array"), "render_mode", "be None for an SE", "its states "
+            "have no picture", render_mode, "render_mode=None")  # fmt: skip
+
+
 def _is_rn(header: Mapping[str, Any]) -> bool:
     return header["config"]["proxy"]["name"] == "rn"
 
@@ -161,8 +177,9 @@ def _world(
 ) -> SyntheticWorld:
     """What a file of an SE holds."""
     config = plugins.configure("proxy", header["config"]["proxy"])
+    limit = step_limit(header)
     if isinstance(task, str):
-        task = RealTask.of_gymnasium(task)
+        task = RealTask.of_gymnasium(task, limit)
     require(task is None or isinstance(task, RealTask), "task", "be a sejax.gym.RealTask, or an id "
             "of Gymnasium", "an SE takes its spaces from there", type(task).__name__,
             "task=sejax.gym.RealTask.of_env(env)")  # fmt: skip
@@ -174,6 +191,10 @@ def _world(
                 f"learned with, {learned}", "others mean something else to its networks",
                 task.action_space, "task to one with these, as gymnasium.wrappers.RescaleAction "
                 "makes of the real environment")  # fmt: skip
+    own = task.max_steps if limit is None else limit
+    require(config.max_steps(task.max_steps) == config.max_steps(own), "task", f"have the "
+            f"max_steps that the SE was learned with, {own}", "its episodes end there",
+            task.max_steps, f"task=dataclasses.replace(task, max_steps={own})")  # fmt: skip
     return SyntheticWorld(weights, config, task)
 
 

@@ -53,7 +53,8 @@ class RewardNetwork(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
     the RN was learned with.
 
     Args:
-      env: of the RN's task, its step limit included (`gymnasium.make` sees to it).
+      env: of the RN's task, its step limit included (`gymnasium.make` sees to it). Wrappers that
+        change observations or rewards go around this one, as the network knows the task's own.
       source: a run directory, a safetensors file of one RN, or the name of one that ships with the
         package.
       discount: gamma of the agent that will train.
@@ -101,12 +102,7 @@ class RewardNetwork(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
         obs_dim = vector_size(env.observation_space, "env.observation_space")
         self._num_states = num_categories(env.observation_space)
         if "interface" in header:
-            learned = RealTask.of_interface(header["interface"]).observation_space
-            wanted = num_categories(learned), vector_size(learned, "observation_space")
-            require((self._num_states, obs_dim) == wanted, "env",
-                    f"have observations such as those of {header['task']}, {learned}",
-                    "the network sees them", env.observation_space,
-                    f"env to an environment of {header['task']}")  # fmt: skip
+            _require_task(env, RealTask.of_interface(header["interface"]), header["task"])
         networks.check(weights, _shapes(self.config, obs_dim, len(self._info_keys)))
         self._weights = weights.get("info_weights")  # [info_keys]
         self._layers = networks.layers_of(weights, "potential")
@@ -198,6 +194,35 @@ class RewardNetwork(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
                 f"`sejax.Task.{'info' if self.config.weighs_info else 'augmented'}_keys`."
             )
         return keys
+
+
+def _require_task(env: gymnasium.Env[Any, Any], learned: RealTask, name: str) -> None:
+    """Checks that an environment is of a task, as far as its spaces and wrappers tell."""
+    wanted, fix = learned.observation_space, f"env to an environment of {name}"
+    require(_kind(env.observation_space) == _kind(wanted), "env",
+            f"have observations such as those of {name}, {wanted}", "the network sees them",
+            env.observation_space, fix)  # fmt: skip
+    whole = env.unwrapped
+    # Wrappers may turn actions of one kind into another's, so it is the innermost that tells.
+    kinds = _kind(whole.action_space), _kind(learned.action_space)
+    require(None in kinds or kinds[0] == kinds[1], "env",
+            f"have actions such as those of {name}, {learned.action_space}", "it is another task "
+            "otherwise", whole.action_space, fix)  # fmt: skip
+    if _kind(whole.observation_space) != _kind(wanted):
+        return  # a wrapper makes them what the network sees
+    while env is not whole:
+        require(not isinstance(env, gymnasium.ObservationWrapper), "env", f"have the observations "
+                f"of {name} as they are", "the network has seen no others", env,
+                "gymnasium.wrappers that change observations around RewardNetwork, not below "
+                "it")  # fmt: skip
+        env = env.env  # type: ignore[attr-defined]
+
+
+def _kind(space: Any) -> tuple[str, Any] | None:
+    """What must be equal for two spaces to be of one task; None for one that is not known."""
+    if isinstance(space, gymnasium.spaces.Discrete):
+        return "discrete", int(space.n)
+    return ("box", space.shape) if isinstance(space, gymnasium.spaces.Box) else None
 
 
 def _shapes(config: RewardConfig, obs_dim: int, num_keys: int) -> networks.Shapes:

@@ -85,18 +85,18 @@ class RealTask:
                 env, "max_steps")  # fmt: skip
         return cls(
             observation_space=env.observation_space, action_space=env.action_space,
-            max_steps=int(limit or 0), starts=_EnvStarts(env.unwrapped),
+            max_steps=int(limit or 0), starts=_EnvStarts(env),
         )  # fmt: skip
 
 
 class _EnvStarts:
-    """First observations of an environment."""
+    """First observations of an environment, as its wrappers show them."""
 
     def __init__(self, env: gymnasium.Env[Any, Any]):
         self._env = env
 
     def __call__(self, rng: np.random.Generator) -> Any:
-        self._env.np_random = rng
+        self._env.unwrapped.np_random = rng
         return self._env.reset()[0]
 
 
@@ -170,6 +170,16 @@ def real_task(header: Mapping[str, Any], needs_starts: bool) -> RealTask:
     if gymnax_id != config.get("name") and gymnax_id in gymnasium.registry:
         return RealTask.of_gymnasium(gymnax_id, plugins.configure("env", config).max_steps)
     raise unknown_task(config, "sejax.gym.make(source, task=sejax.gym.RealTask(...))")
+
+
+def step_limit(header: Mapping[str, Any]) -> int | None:
+    """Steps of an episode of the task that a file is of; None if neither file nor task says."""
+    if "interface" in header:
+        return int(header["interface"]["max_steps"])
+    config = header["config"]["env"]
+    if config.get("name") not in (*GYMNASIUM_IDS, *MAPS):
+        return None
+    return int(plugins.configure("env", config).facts.max_steps)
 
 
 def unknown_task(config: Mapping[str, Any], fix: str) -> ConfigError:
