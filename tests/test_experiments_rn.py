@@ -5,6 +5,7 @@ import importlib
 import re
 import shlex
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
@@ -101,9 +102,14 @@ def test_rns_are_learned_stored_and_used_once(options, rns_dir, tmp_path, monkey
     pd.testing.assert_frame_equal(run(again), expected)
 
 
-def test_a_set_grows_by_the_rns_that_it_lacks(rns_dir, options, monkeypatch):
+def learning_config(settings):
+    return rn_studies.learning_config(settings, "additive_potential", "reward_threshold")
+
+
+def test_a_set_grows_by_the_rns_that_it_lacks(rns_dir, options, monkeypatch, tmp_path):
     settings = options(RnPerformance, **TRAIN)
     three = rn_studies.learn(settings, "additive_potential", "reward_threshold")
+    before = three.path.read_bytes()
     learned = []
     run = session.run
 
@@ -120,6 +126,15 @@ def test_a_set_grows_by_the_rns_that_it_lacks(rns_dir, options, monkeypatch):
     assert four.fingerprint(3) not in [three.fingerprint(i) for i in range(3)]
     curves = pieces.read_rows(rn_studies.curves_file(four.path))
     assert list(curves["seed"]) == [3, 4, 5, 6]
+    three.path.write_bytes(before)  # as if killed before the set was written
+    again = rn_studies.learn(more, "additive_potential", "reward_threshold")
+    assert list(again.seeds) == [3, 4, 5, 6]
+    assert pieces.read_rows(rn_studies.curves_file(four.path)).equals(curves)
+    fewer = dataclasses.replace(learning_config(more), generations=0 + 1, run_dir=str(tmp_path))
+    (tmp_path / "metrics.csv").write_text("generation,seed\n0,3\n1,3\n")
+    monkeypatch.setattr(session, "run", lambda *rest: None)
+    with pytest.raises(ConfigError, match=r"^generations must be at least 2, .*got 1\. Set"):
+        proxy_runs.run_to_end(fewer, SimpleNamespace(metrics=tmp_path / "metrics.csv"), None)
 
 
 def test_rns_of_other_settings_are_refused_before_any_are_learned(options, monkeypatch):
@@ -245,6 +260,29 @@ def test_the_summary_is_over_agents():
     assert never["steps_to_solve"] == 300 and never["solved"] == 0.0
 
 
+def test_shares_are_of_the_groups_of_the_same_seeds():
+    # Steps to solve of group g: 140 + 20 g and 150 + 20 g.
+    curves = pd.concat([curves_of("real", 5), curves_of("icm", 2), curves_of("real_rn", 5)])
+    summary = rn_curves.summarise(curves, -12.0, max_steps=300).set_index("world")
+    assert summary["steps_to_solve"].tolist() == [185, 155, 185]
+    assert summary["share_of_bare"].tolist() == [1, 1, 1]
+    alone = rn_curves.summarise(curves_of("icm", 2), -12.0, max_steps=300)
+    assert np.isnan(alone["share_of_bare"][0]) and not rn_curves.make_table(alone).iat[0, 4]
+
+
+def test_rows_of_other_settings_are_refused():
+    settings = RnPerformance.of(env="cartpole", rows="default", rns=5, bonus_groups=2, learned=5)
+    rows = pd.concat(
+        [curves_of("real", 5), curves_of("icm", 2), curves_of("additive_potential", 5)]
+    )
+    rn_curves.require_rows(settings, rows)
+    for wrong, said in (({"rns": 4}, r"^rns must be 5, .*got 4\. Set rns=5, or from_rows=false"),
+                        ({"bonus_groups": 5}, r"^bonus_groups must be 2, .* groups of icm; got 5"),
+                        ({"rows": ("tuned",)}, r"^rows must name default, .*tuned")):  # fmt: skip
+        with pytest.raises(ConfigError, match=said):
+            rn_curves.require_rows(dataclasses.replace(settings, **wrong), rows)
+
+
 def test_intervals_draw_rns_or_agents_and_need_five_of_them():
     for world, independent in (
         ("additive_potential", 145 + 20 * np.arange(5)),  # the groups' means
@@ -344,6 +382,8 @@ def test_commands_in_the_docs_are_accepted():
         settings = importlib.import_module(f"sejax.experiments.{name}").EXPERIMENT.settings
         made = settings.of(**parse(settings, shlex.split(words)))
         again = settings.of(**parse(settings, shlex.split(made.command())[3:]))
-        assert dataclasses.replace(made, out=None, work=None) == again
+        assert dataclasses.replace(made, out=again.out, work=None) == again
+        if made.folder.parts[0] == "results":  # and it replaces no other results
+            assert again.folder == made.folder
         if isinstance(made, RunSettings):  # and so are the words of its runs
             made.learn_config(["proxy=rn"] if isinstance(made, RnSettings) else [])

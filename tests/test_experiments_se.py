@@ -377,21 +377,32 @@ def made_up_agents(num_ses=4, num_agents=6):
     return pd.DataFrame(rows)
 
 
-def test_intervals_draw_ses_and_not_agents():
-    agents = made_up_agents()
+def test_intervals_draw_ses_and_not_agents_but_on_the_real_task():
+    agents = made_up_agents(num_ses=5)
     row = se_performance.summarise(agents).iloc[0]
-    values = agents["test_return"].to_numpy().reshape(4, 6)
+    values = agents["test_return"].to_numpy().reshape(5, 6)
     low, high = bootstrap_interval(values.mean(axis=1))
     assert (row["test_return_low"], row["test_return_high"]) == pytest.approx((low, high))
     assert row["test_return_mean"] == pytest.approx(values.mean())
     assert row["test_return_std"] == pytest.approx(np.std(values))
-    assert (row["num_ses"], row["num_agents"]) == (4, 24)
+    assert (row["num_ses"], row["num_agents"]) == (5, 30)
+    real = se_performance.summarise(agents.assign(setting="real")).iloc[0]
+    ends = bootstrap_interval(values.ravel())
+    assert (real["test_return_low"], real["test_return_high"]) == pytest.approx(ends)
+
+
+def test_fewer_than_five_ses_have_no_interval():
+    summary = se_performance.summarise(made_up_agents(num_ses=4))
+    assert np.isnan(summary["test_return_low"][0]) and np.isnan(summary["train_steps_high"][0])
+    assert "[" not in se_performance.make_table("cartpole", summary)["return"][0]
+    summary = se_performance.summarise(made_up_agents(num_ses=5))
+    assert "[" in se_performance.make_table("cartpole", summary)["return"][0]
 
 
 def test_intervals_of_interquartile_means_draw_agents_within_ses():
-    agents = made_up_agents()
+    agents = made_up_agents(num_ses=5)
     row = se_performance.summarise(agents).iloc[0]
-    values = agents["test_return"].to_numpy().reshape(4, 6)
+    values = agents["test_return"].to_numpy().reshape(5, 6)
     assert row["test_return_iqm"] == interquartile_mean(values.ravel())
     ends = bootstrap_interval(*values, statistic=interquartile_mean)
     assert (row["test_return_iqm_low"], row["test_return_iqm_high"]) == ends

@@ -155,6 +155,9 @@ def test_the_best_bin_and_the_ranks_are_those_of_the_means():
     assert (first.transform, first.updates, first.solved) == ("nes", 6.0, 1.0)
     assert (second.transform, second.updates, second.solved) == ("rank", 16.0, 0.75)
     assert second.best_updates == 4 and second.best_low == pytest.approx(0.1)
+    assert (first.behind, second.behind) == (0.0, 10.0)  # runs are 5, 15, -1 and 21 behind
+    ends = bootstrap_interval([5, 15, -1, 21])
+    assert (second.behind_low, second.behind_high) == pytest.approx(ends)
     cells = score_transforms.binned(runs, bins=3).set_index(["transform", "bin"])
     assert cells.loc[("rank", 0), "updates"] == 15 and cells.loc[("rank", 0), "runs"] == 2
     table = score_transforms.make_table(summary)

@@ -101,8 +101,8 @@ def evaluate(settings: FamilyRuns, name: str, ses: Any, config: Any) -> pd.DataF
 def summarise(agents: pd.DataFrame, by: list[str], solved_reward: float) -> pd.DataFrame:
     """Statistics of the returns (`test_return_...`) for each value of the columns `by`.
 
-    The mean's interval draws SEs, and agents where there is one SE; that of the interquartile mean
-    draws agents within their SE.
+    The mean's interval draws SEs, of which there must be five, and agents where there is one SE;
+    that of the interquartile mean draws agents within their SE.
     """
     rows = []
     for values, mine in agents.groupby(by, sort=False):

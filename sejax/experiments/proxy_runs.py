@@ -14,6 +14,7 @@ import numpy as np
 import pandas as pd
 
 import sejax
+from sejax.errors import require
 from sejax.experiments.settings import Settings, count, setting
 
 
@@ -51,11 +52,20 @@ def configs_of_runs(config: Any, num_runs: int, folder: Path, at_once: int = 1) 
 
 
 def run_to_end(config: Any, directory: Any, chunks: Any) -> pd.DataFrame:
-    """Learns a run, or what is left of it, in its folder; its curve."""
+    """Learns a run, or what is left of it, in its folder; its curve.
+
+    Raises:
+      ConfigError: if it has gone on for more generations than are asked for.
+    """
     from sejax.app import session
 
     session.run(config, directory, chunks)
-    return pd.read_csv(directory.metrics)
+    curve = pd.read_csv(directory.metrics)
+    there = int(curve["generation"].max()) + 1
+    require(there <= config.generations, "generations", f"be at least {there}", "a run in "
+            f"{config.run_dir} has so many, and its proxy is the best of all", config.generations,
+            f"generations={there}, or another folder")  # fmt: skip
+    return curve
 
 
 def learn_all(

@@ -14,21 +14,19 @@ import pandas as pd
 
 from sejax import errors
 from sejax.errors import require
-from sejax.experiments import figures, return_curves, rn_studies, worlds
+from sejax.experiments import figures, return_curves, rn_studies, tables, worlds
 from sejax.experiments.rn_studies import RnSettings
 from sejax.experiments.settings import count, each_of, setting
 from sejax.experiments.tables import as_texts, iqm_columns, iqm_note, iqm_text
 from sejax.experiments.worlds import World
 from sejax.options import counts
 from sejax.plugins import name_of
-from sejax.statistics import bootstrap_interval
 from sejax.training import TrainingConfig
 
 ROWS = {"default": "default hyperparameters", "varied": "varied hyperparameters",
         "transfer": "unseen agent", "tuned": "tuned for few steps"}  # fmt: skip
 GRID_POINTS = 200
 WITHOUT_RN = ("real", "count_based", "icm")  # worlds whose groups of agents have nothing in common
-LEAST_FOR_INTERVAL = 5  # independent values
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -121,21 +119,39 @@ def by_row(settings: CurveSettings, curves: pd.DataFrame) -> pd.DataFrame:
     return pd.concat([curves[curves["row"] == row] for row in settings.rows], ignore_index=True)
 
 
+def require_rows(settings: CurveSettings, curves: pd.DataFrame) -> None:
+    """Checks that rows which are there are of as many groups as a table's text will say.
+
+    Raises:
+      ConfigError: if they are not, as where other settings made them.
+    """
+    for (row, world), mine in curves.groupby(["row", "world"], sort=False):
+        require(row in settings.rows, "rows", f"name {row}", f"{settings.rows_file} has such rows",
+                ", ".join(settings.rows), f"rows=[{row},...]")  # fmt: skip
+        name = "bonus_groups" if world in settings.study.bonuses else "rns"
+        there, asked = mine["group"].nunique(), getattr(settings, name)
+        require(there == asked, name, f"be {there}", f"{settings.rows_file} has so many groups of "
+                f"{world}", asked, f"{name}={there}, or from_rows=false")  # fmt: skip
+
+
 def summarise(curves: pd.DataFrame, solved_reward: float, max_steps: int) -> pd.DataFrame:
     """One row for each row of the figure and world.
 
     An agent that did not solve the task counts `max_steps`. Intervals come from drawing RNs again,
     since agents of one RN have much in common, and agents where there are no RNs; of fewer than
-    `LEAST_FOR_INTERVAL` there is none (nan).
+    five there is none (nan).
     """
     out = []
     grid = step_grid(max_steps)
+    bare: dict[Any, Any] = {}  # steps and group of each agent on the real task, by row
     for (row, world), mine in curves.groupby(["row", "world"], sort=False):
         groups = mine.groupby("agent")["group"].first()
         steps = return_curves.all_steps_to_solve(mine, solved_reward)
         held = return_curves.on_grid(mine, grid, window=1)
         mean_return = pd.Series(np.nanmean(held, axis=1), index=steps.index)
         counted = steps.clip(upper=max_steps)
+        if world == "real":
+            bare[row] = counted, groups
         out.append({
             "row": row, "world": world, "groups": groups.nunique(), "agents": len(steps),
             "solved": float(np.isfinite(steps).mean()), "steps_to_solve": counted.mean(),
@@ -143,15 +159,23 @@ def summarise(curves: pd.DataFrame, solved_reward: float, max_steps: int) -> pd.
             **interval(mean_return, groups, str(world), "return"),
             **iqm_columns(mean_return, "return", None if world in WITHOUT_RN else groups),
             "last_return": return_curves.last_returns(mine).mean(),
+            "share_of_bare": share_of_bare(counted, groups, bare.get(row)),
         })  # fmt: skip
     return pd.DataFrame(out)
 
 
+def share_of_bare(steps: pd.Series, groups: pd.Series, bare: Any) -> float:
+    """Mean steps as a share of those of the groups of the same seeds on the real task, if any.
+
+    A bonus has fewer groups, and where hyperparameters are drawn the groups' draws differ.
+    """
+    real, of_group = bare if bare is not None else (pd.Series(dtype=float), pd.Series(dtype=int))
+    return float(steps.mean() / real[of_group.isin(groups.unique())].mean())
+
+
 def interval(values: pd.Series, groups: pd.Series, world: str, name: str) -> dict[str, float]:
     """95% bootstrap interval of the mean over agents, of which each has a group."""
-    draws = values if world in WITHOUT_RN else values.groupby(groups).mean()
-    has_one = len(draws) >= LEAST_FOR_INTERVAL
-    low, high = bootstrap_interval(draws) if has_one else (np.nan, np.nan)
+    low, high = tables.interval(values if world in WITHOUT_RN else values.groupby(groups).mean())
     return {f"{name}_low": low, f"{name}_high": high}
 
 
@@ -162,7 +186,6 @@ def step_grid(max_steps: int) -> np.ndarray:
 
 def make_table(summary: pd.DataFrame) -> pd.DataFrame:
     """The summary as texts."""
-    bare = summary[summary["world"] == "real"].set_index("row")["steps_to_solve"]
     return as_texts(summary, {
         "agents": lambda row: ROWS[row.row],
         "trained with": "{world}",
@@ -170,7 +193,7 @@ def make_table(summary: pd.DataFrame) -> pd.DataFrame:
         "steps to solve":
             lambda row: with_interval(row.steps_to_solve, row.steps_low, row.steps_high, 0),
         "of the bare agent's":
-            lambda row: f"{row.steps_to_solve / bare[row.row]:.0%}" if row.row in bare else "",
+            lambda row: f"{row.share_of_bare:.0%}" if np.isfinite(row.share_of_bare) else "",
         "solved": "{solved:.0%}",
         "mean return over training":
             lambda row: with_interval(row.mean_return, row.return_low, row.return_high, 1),
@@ -181,8 +204,7 @@ def make_table(summary: pd.DataFrame) -> pd.DataFrame:
 
 def with_interval(mean: float, low: float, high: float, digits: int) -> str:
     """A mean and its interval, if it has one."""
-    brackets = f" [{low:,.{digits}f}, {high:,.{digits}f}]" if np.isfinite(low) else ""
-    return f"{mean:,.{digits}f}{brackets}"
+    return f"{mean:,.{digits}f}{tables.brackets(low, high, digits)}"
 
 
 def common_note(settings: CurveSettings, solved_reward: float) -> str:
@@ -191,7 +213,9 @@ def common_note(settings: CurveSettings, solved_reward: float) -> str:
         f"up to {settings.max_steps:,} training steps or {settings.study.max_episodes:,} episodes, "
         "one greedy test episode after each. Steps to solve: until the mean of "
         f"{return_curves.WINDOW} tests in a row reaches {solved_reward:g}; an agent that never "
-        f"does counts {settings.max_steps:,}. In brackets bootstrap 95% intervals, for at least "
+        f"does counts {settings.max_steps:,}. The share of the bare agent's is of as many groups, "
+        "of the same seeds. Where episodes end before the steps do, a curve and its mean go on as "
+        "the last test. In brackets bootstrap 95% intervals, for at least "
         f"five RNs: they draw RNs, and agents on the real task.{iqm_note('within each RN')}"
         + (
             ""

@@ -207,7 +207,8 @@ def learn(settings: RnSettings, variant: str, objective: str) -> Any:
               "stopped and started again", flush=True)  # fmt: skip
         curves = [proxy_runs.learn_all(configs, "rns_dir")]
         if there:
-            curves.insert(0, pieces.read_rows(curves_file(path)))
+            before = pieces.read_rows(curves_file(path))  # with those beyond, if stopped right here
+            curves.insert(0, before[before["seed"] < config.seed])
         pieces.write_rows(curves_file(path), pd.concat(curves, ignore_index=True))
         proxy_runs.collect(configs, path, there)
         there = sejax.load_set(path, option="rns_dir", kind="rn")

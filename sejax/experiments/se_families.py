@@ -22,13 +22,12 @@ from sejax.experiments.experiment import Experiment
 from sejax.experiments.family_runs import FamilyRuns, families_in, known_families
 from sejax.experiments.pieces import stack, unstack
 from sejax.experiments.settings import setting
-from sejax.experiments.tables import iqm_note, iqm_text, publish
+from sejax.experiments.tables import brackets, iqm_note, iqm_text, publish
 
 SETS = ("ddqn", "ppo", "td3_discrete", "ddqn+ppo", "ddqn+td3_discrete", "ppo+td3_discrete",
         "ddqn+ppo+td3_discrete")  # fmt: skip
 LEFT_OUT = "°"  # after what families reach that took no part
-CELL = ("{test_return_mean:.1f} [{test_return_low:.1f}, {test_return_high:.1f}]; "
-        f"IQM {iqm_text('test_return')}; {{solved:.0%}}")  # fmt: skip
+IQM_AND_SOLVED = f"IQM {iqm_text('test_return')}; {{solved:.0%}}"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,10 +83,16 @@ def make_table(summary: pd.DataFrame) -> pd.DataFrame:
         rows.append({
             "learned with": shown(name), "CPU s a run": f"{set_['cpu_s']:,.0f}",
             "runs solved": f"{set_['solved_runs']:.0%}", "hyperparameters": hparams,
-            **{shown(row.kind): CELL.format_map(row._asdict()) + ("" if row.took_part else LEFT_OUT)
-               for row in mine.itertuples()},
+            **{shown(row.kind): cell(row) for row in mine.itertuples()},
         })  # fmt: skip
     return pd.DataFrame(rows)
+
+
+def cell(row: Any) -> str:
+    """What a family reaches on a set."""
+    mean = f"{row.test_return_mean:.1f}{brackets(row.test_return_low, row.test_return_high, 1)}"
+    mark = "" if row.took_part else LEFT_OUT
+    return f"{mean}; {IQM_AND_SOLVED.format_map(row._asdict())}{mark}"
 
 
 def shown(name: str) -> str:

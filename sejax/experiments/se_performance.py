@@ -32,6 +32,7 @@ from sejax.experiments.se_agents import SeAgents
 from sejax.experiments.settings import count, setting
 from sejax.experiments.tables import (
     as_texts,
+    brackets,
     in_strata,
     iqm_columns,
     iqm_note,
@@ -183,15 +184,17 @@ def summarise(agents: pd.DataFrame) -> pd.DataFrame:
     """Means, deviations and intervals for each kind of agent and setting.
 
     Deviations are over agents; intervals of means come from drawing SEs (groups) again, since
-    agents of the same SE have much in common, those of interquartile means from drawing agents
-    within their SE.
+    agents of the same SE have much in common, or agents on the real task, where groups have
+    nothing in common; of fewer than five there is none (nan). Those of interquartile means come
+    from drawing agents within their SE.
     """
     rows = []
     for (kind, name), mine in agents.groupby(["kind", "setting"], sort=False):
         row = {"kind": kind, "setting": name, "num_ses": mine["group"].nunique(),
                "num_agents": len(mine), "num_nonfinite": int(mine["nonfinite"].sum())}  # fmt: skip
         for column in ("train_steps", "train_episodes", "test_return"):
-            row |= spread(mine[column], mine.groupby("group")[column].mean(), column)
+            of_ses = mine.groupby("group")[column].mean()
+            row |= spread(mine[column], mine[column] if name in ON_REAL else of_ses, column)
         row |= iqm_columns(mine["test_return"], "test_return", strata(mine, str(name)))
         rows.append(row)
     return pd.DataFrame(rows)
@@ -208,9 +211,9 @@ def make_table(env_name: str, summary: pd.DataFrame) -> pd.DataFrame:
              for name in ON_REAL}  # fmt: skip
 
     def measured(row: Any, column: str, digits: int) -> str:
-        mean, std, *ends = (f"{getattr(row, f'{column}_{x}'):,.{digits}f}"
-                            for x in ("mean", "std", "low", "high"))  # fmt: skip
-        return f"{mean} ± {std}" + (f" [{', '.join(ends)}]" if row.num_ses > 1 else "")
+        mean, std, low, high = (getattr(row, f"{column}_{x}")
+                                for x in ("mean", "std", "low", "high"))  # fmt: skip
+        return f"{mean:,.{digits}f} ± {std:,.{digits}f}{brackets(low, high, digits)}"
 
     def fewer(row: Any, than: str) -> str:
         if row.setting in ON_REAL[: ON_REAL.index(than) + 1] or row.kind not in steps[than]:
@@ -248,7 +251,8 @@ def report(settings: SePerformance, rows: pd.DataFrame) -> pd.DataFrame:
     draw_profiles(task, agents, settings.folder / "profiles.png")
     note = (
         f"Mean ± std over agents with drawn hyperparameters, {len(return_columns(rows))} test "
-        'episodes each; in brackets a bootstrap 95% interval that draws SEs, not agents. "Fewer" '
+        "episodes each; in brackets a bootstrap 95% interval, for at least five SEs: it draws SEs, "
+        'and agents on the real task. "Fewer" '
         "are training steps saved against the real task, for which a group of agents takes the "
         f"place of an SE{AND_TUNED if has_tuned(summary) else ''}. "
         f"The best SEs of all sets, {NUM_BEST} at most, are chosen by half of "

@@ -79,8 +79,10 @@ class Settings(Options):
     @property
     def folder(self) -> Path:
         """Where the results go."""
-        if self.out is not None:
-            return Path(self.out)
+        return self._usual_folder if self.out is None else Path(self.out)
+
+    @property
+    def _usual_folder(self) -> Path:
         root = f"runs/experiments/{self.name}-quick" if self.quick else f"results/{self.name}"
         return Path(root, getattr(self, "env", None) or "")  # else tasks replace each other
 
@@ -112,7 +114,9 @@ class Settings(Options):
         """The command that makes these results; of the fields, those that are not as usual."""
         mine = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
         usual = self.defaults(mine)
-        apart = {"out", "work", "devices", "from_rows", "run"}
+        apart = {"work", "devices", "from_rows", "run"}
+        if self.folder.parts[:1] != ("results",) or self.folder == self._usual_folder:
+            apart |= {"out"}  # a folder of somebody's own is no part of what is done
         words = ["python", "-m", f"sejax.experiments.{self.name}"]
         for name, value in mine.items():
             if name not in apart and value != (usual[name] if name != "quick" else False):

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Mapping
 from typing import Any
 
+import numpy as np
 import pandas as pd
 from rich.console import Console
 from rich.table import Table
@@ -11,10 +12,22 @@ from sejax.experiments.settings import Settings
 from sejax.files import write_text
 from sejax.statistics import bootstrap_interval, interquartile_mean
 
+LEAST_FOR_INTERVAL = 5  # independent values: two bracket the truth half of the time
+
+
+def interval(draws: Any) -> tuple[float, float]:
+    """95% bootstrap interval of the mean of what is drawn again; nan for fewer than five."""
+    return bootstrap_interval(draws) if len(draws) >= LEAST_FOR_INTERVAL else (np.nan, np.nan)
+
+
+def brackets(low: float, high: float, digits: int) -> str:
+    """An interval as it stands behind a mean; empty if there is none."""
+    return f" [{low:,.{digits}f}, {high:,.{digits}f}]" if np.isfinite(low) else ""
+
 
 def spread(values: pd.Series, draws: Any, name: str) -> dict[str, float]:
-    """Mean, std and interval of values as columns `NAME_mean`, ...; `draws` are drawn again."""
-    low, high = bootstrap_interval(draws)
+    """Mean, std and `interval` of values as columns `NAME_mean`, ...; `draws` are drawn again."""
+    low, high = interval(draws)
     columns = {"mean": values.mean(), "std": values.std(ddof=0), "low": low, "high": high}
     return {f"{name}_{statistic}": value for statistic, value in columns.items()}
 
