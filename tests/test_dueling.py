@@ -10,7 +10,7 @@ from support import numpy_forward, random_like, shapes_of, unraveled
 from test_ddqn import BATCH, OBS_DIM, assert_updates_equal_torchs
 
 from sejax import envs
-from sejax.agents.ddqn import DuelingDDQNConfig, make_ddqn
+from sejax.agents.ddqn import DDQNConfig, DuelingDDQNConfig, make_ddqn
 from sejax.networks import DuelingMLP
 from sejax.trainer import make_trainer
 from sejax.training import TrainingConfig
@@ -125,3 +125,10 @@ def test_it_solves_cartpole():
     num_episodes = int(result.episodes)
     assert num_episodes < 1000
     assert result.returns[num_episodes - training.window : num_episodes].mean() >= 195
+
+
+def test_one_trains_alone_on_a_core():
+    # In lockstep its streams' products take longer; DDQN of the same size gains by it.
+    small = {"hidden_size": 64, "num_layers": 1, "batch_size": 32}
+    assert make_ddqn(DuelingDDQNConfig(**small), 4, 2).cpu_lanes == 1
+    assert make_ddqn(DDQNConfig(**small), 4, 2).cpu_lanes > 1

@@ -88,6 +88,8 @@ class DDQNConfig(AgentOptions):
 class DuelingDDQNConfig(DDQNConfig):
     """DDQN with a dueling network (paper, appendix, tables of DDQN and Dueling DDQN)."""
 
+    is_small = False  # products of its streams: in lockstep a learning step takes 1.5 times as long
+
     feature_dim: int = option(128, counts())  # outputs of the part that both streams share
     # Hidden layers of the value and of the advantage stream.
     stream_num_layers: int = option(1, counts("it counts layers", 0, MOST_LAYERS))
