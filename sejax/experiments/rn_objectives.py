@@ -94,9 +94,11 @@ def report(settings: RnObjectives, rows: pd.DataFrame) -> pd.DataFrame:
         rn_curves.draw(settings, curves, 2.7, f"{pick}.png")
     table = pd.concat(tables, ignore_index=True)
     table = table[["objective", "RNs", *table.columns.drop(["objective", "RNs"])]]
+    ends = " and with the ".join({"best": "highest", "worst": "lowest"}[pick]
+                                 for pick in settings.picks)  # fmt: skip
     note = (
         f"{settings.learned} RNs of each variant were learned by each objective. Of these the "
-        f"{settings.rns} with the highest and with the lowest scores (best, worst) train "
+        f"{settings.rns} with the {ends} scores ({', '.join(settings.picks)}) train "
         f"{settings.num_agents} agents each, for {rn_curves.common_note(settings, solved_reward)} "
         "The area is by training steps, where the authors' code has the sum. The paper shows "
         "curves and gives no numbers; those for the area and the final return are, by a slip in "
