@@ -3,7 +3,6 @@
 Every message has one form: what must hold, why, what came, and how to mend it.
 """
 
-import contextlib
 import difflib
 import math
 import numbers
@@ -126,13 +125,18 @@ def require_seed(name: str, seed: Any) -> None:
 
 
 def is_number(value: Any) -> bool:
-    """Whether it is an int or a float, NumPy's too; a bool is none here."""
-    return isinstance(value, numbers.Real) and not isinstance(value, bool)
+    """Whether it is an int or a float, which a bool is not here; see `as_python`."""
+    return isinstance(value, int | float) and not isinstance(value, bool)
 
 
 def as_python(value: Any) -> Any:
     """A number or bool of NumPy or jax as Python's; all else, traced ones too, as it is."""
-    if getattr(value, "shape", None) == () and hasattr(value, "item"):
-        with contextlib.suppress(TypeError):  # a traced one has no value yet
-            return value.item()
-    return value
+    is_one = getattr(value, "shape", None) == () and hasattr(value, "item")
+    if not is_one or isinstance(value, type):
+        return value
+    try:
+        number = value.item()
+    except (TypeError, NotImplementedError):  # a traced one has no value yet, a key has none
+        return value
+    return float(number) if isinstance(number, numbers.Real) and not isinstance(
+        number, bool | int | float) else number  # fmt: skip

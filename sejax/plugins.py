@@ -275,8 +275,10 @@ def _content(value: Any) -> Any:
         return type(value), tuple((repr(name), _content(x)) for name, x in value.items())
     if isinstance(value, bool | int | float | str | None):
         return repr(value)  # by which 1, 1.0 and True are not the same, and nan is
-    if hasattr(value, "tolist"):  # NumPy's and jax's numbers and arrays
-        return type(value), str(value.dtype), repr(value.tolist())
+    if isinstance(value, set | frozenset):
+        return type(value), frozenset(map(_content, value))
+    if hasattr(value, "tolist") and hasattr(value, "dtype") and not isinstance(value, type):
+        return type(value), str(value.dtype), repr(value.tolist())  # NumPy's and jax's
     try:
         hash(value)
     except TypeError:

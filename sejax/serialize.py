@@ -110,7 +110,9 @@ def plain(value: Any) -> Any:
         return [plain(x) for x in value]
     if isinstance(value, Mapping):
         return {str(key): plain(x) for key, x in value.items()}
-    if hasattr(value, "tolist"):  # NumPy's and jax's numbers and arrays
+    if hasattr(value, "tolist") and not isinstance(
+        value, type
+    ):  # NumPy's and jax's numbers and arrays
         return value.tolist()
     return value
 

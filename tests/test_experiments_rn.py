@@ -5,7 +5,6 @@ import importlib
 import re
 import shlex
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
@@ -130,11 +129,10 @@ def test_a_set_grows_by_the_rns_that_it_lacks(rns_dir, options, monkeypatch, tmp
     again = rn_studies.learn(more, "additive_potential", "reward_threshold")
     assert list(again.seeds) == [3, 4, 5, 6]
     assert pieces.read_rows(rn_studies.curves_file(four.path)).equals(curves)
-    fewer = dataclasses.replace(learning_config(more), generations=0 + 1, run_dir=str(tmp_path))
-    (tmp_path / "metrics.csv").write_text("generation,seed\n0,3\n1,3\n")
-    monkeypatch.setattr(session, "run", lambda *rest: None)
+    longer = pd.DataFrame({"generation": [0, 1], "seed": 3, "incumbent_mean": 0.0})
+    one = dataclasses.replace(learning_config(more), run_dir=str(tmp_path / "one"))
     with pytest.raises(ConfigError, match=r"^generations must be at least 2, .*got 1\. Set"):
-        proxy_runs.run_to_end(fewer, SimpleNamespace(metrics=tmp_path / "metrics.csv"), None)
+        proxy_runs.learn_all([one], learn=lambda *rest: longer)
 
 
 def test_rns_of_other_settings_are_refused_before_any_are_learned(options, monkeypatch):
@@ -271,14 +269,16 @@ def test_shares_are_of_the_groups_of_the_same_seeds():
 
 
 def test_rows_of_other_settings_are_refused():
-    settings = RnPerformance.of(env="cartpole", rows="default", rns=5, bonus_groups=2, learned=5)
+    settings = RnPerformance.of(env="cartpole", rows="default", rns=5, bonus_groups=2, learned=5,
+                                num_agents=2)  # fmt: skip
     rows = pd.concat(
         [curves_of("real", 5), curves_of("icm", 2), curves_of("additive_potential", 5)]
     )
     rn_curves.require_rows(settings, rows)
     for wrong, said in (({"rns": 4}, r"^rns must be 5, .*got 4\. Set rns=5, or from_rows=false"),
                         ({"bonus_groups": 5}, r"^bonus_groups must be 2, .* groups of icm; got 5"),
-                        ({"rows": ("tuned",)}, r"^rows must name default, .*tuned")):  # fmt: skip
+                        ({"rows": ("default", "tuned")}, r"^rows must be default, .*tuned"),
+                        ({"num_agents": 10}, r"^num_agents must be 2, .*got 10")):  # fmt: skip
         with pytest.raises(ConfigError, match=said):
             rn_curves.require_rows(dataclasses.replace(settings, **wrong), rows)
 

@@ -585,6 +585,7 @@ def test_starts_are_as_the_environments_wrappers_show_them(stored):
 
 def test_vector_environments_take_a_render_mode_as_single_ones_do():
     assert gymnasium.make_vec("sejax/cartpole", num_envs=np.int64(2), render_mode="rgb_array")
+    assert sejax.gym.make_vec("cartpole", 2.0).num_envs == 2
     with pytest.raises(ConfigError, match=r"^render_mode must be None for an SE"):
         sejax.gym.make_vec("cartpole", 2, render_mode="human")
     envs_of_rn = sejax.gym.make_vec("mountain_car_continuous-rn", 1, render_mode="rgb_array")

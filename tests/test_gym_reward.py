@@ -11,10 +11,13 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 from gymnasium.wrappers import (
+    DtypeObservation,
     FlattenObservation,
     NormalizeObservation,
     RescaleAction,
     TimeLimit,
+    TransformAction,
+    TransformObservation,
     TransformReward,
 )  # fmt: skip
 from safetensors.numpy import save_file
@@ -313,6 +316,31 @@ def test_the_network_sees_the_tasks_own_observations():
         rewards = RewardNetwork(env, "mountain_car_continuous-rn")
         rewards.reset(seed=0)
         assert np.isfinite(rewards.step(np.array([0.5], np.float32))[1])
+
+
+def test_actions_may_be_made_and_numbers_kept_by_wrappers():
+    car = gymnasium.make("MountainCarContinuous-v0")
+    for env in (DtypeObservation(car, np.float32), FlattenObservation(car), Hidden(car)):
+        assert RewardNetwork(env, "mountain_car_continuous-rn").reset(seed=0)
+    two = gymnasium.spaces.Discrete(2)
+    pushes = TransformAction(Walk(), lambda a: [a - 0.5], two)
+    assert RewardNetwork(TransformObservation(pushes, lambda x: np.tile(x, 2), FOUR), "cartpole-rn")
+
+
+FOUR = gymnasium.spaces.Box(-np.inf, np.inf, (4,), np.float64)
+
+
+class Hidden(gymnasium.Env):
+    """An environment that holds another and is no wrapper, as far as Gymnasium can tell."""
+
+    unwrapped = property(lambda self: self._inner.unwrapped)
+
+    def __init__(self, inner):
+        self._inner = inner
+        self.observation_space, self.action_space = inner.observation_space, inner.action_space
+
+    def reset(self, **options):
+        return self._inner.reset(**options)
 
 
 class InADict(gymnasium.Wrapper):

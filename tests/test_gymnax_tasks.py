@@ -299,15 +299,29 @@ def test_a_wrapper_whose_step_would_never_be_called_is_refused():
     from gymnax.wrappers.purerl import StickyActionWrapper
 
     wrapped = StickyActionWrapper(cartpole.CartPole(), 1.0)
-    said = (
-        r"^env must have a class with reset_env and step_env, .*got StickyActionWrapper\. Set env "
-    )
+    said = (r"^env must change reset_env in place of reset and change step_env in place of step, "
+            r".*got StickyActionWrapper\. Set env to a subclass of")  # fmt: skip
     with pytest.raises(ConfigError, match=said):
         Task(name="sticky", env=wrapped)
     task = Task(name="plain", env=cartpole.CartPole())
     agent = sejax.make_agent(sejax.DDQNConfig(), task)
     with pytest.raises(ConfigError, match=said):
         sejax.make_trainer(agent, wrapped)
+
+    class Half:  # changes what is called, and hands on the rest
+        def __init__(self, env):
+            self.env = env
+
+        def __getattr__(self, name):
+            return getattr(self.env, name)
+
+        def step_env(self, key, state, action, params):
+            obs, state, reward, *rest = self.env.step_env(key, state, action, params)
+            return obs, state, 2 * reward, *rest
+
+    half = Task(name="half", env=Half(cartpole.CartPole()))
+    _, state = half.env.reset_env(KEY, half.params)
+    assert half.env.step_env(KEY, state, 0, half.params)[2] == 2
 
 
 class Counts(Short):

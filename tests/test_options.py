@@ -1,8 +1,10 @@
 """sejax.options: a field written once checks itself, and says whether it is traced or varied."""
 
 import dataclasses
+from fractions import Fraction
 from typing import Any, ClassVar
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -241,3 +243,7 @@ def test_numbers_of_numpy_and_jax_become_pythons():
     assert {type(getattr(config, name)) for name in ("rate", "share", "unruled")} == {float}
     assert "got True" in message(size=np.bool_(True))
     assert "got [3]" in message(size=np.array([3]))
+    assert type(Config(rate=np.longdouble(0.5)).rate) is float
+    assert "got 3" in message(size=Fraction(3))
+    key = jax.random.key(0)
+    assert Config(free=key).free is key and Config(free=np.float32).free is np.float32

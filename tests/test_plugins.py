@@ -7,6 +7,7 @@ import sys
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from flax import linen as nn
@@ -567,9 +568,12 @@ def test_configurations_are_the_same_if_classes_and_fields_are_at_any_depth():
 
     assert made(Torso()) is made(Torso(torso=Plain(features=8)))
     assert made(Torso(sizes=[np.float32(1)])) is made(Torso(sizes=[np.float32(1)]))
+    assert made(Torso(sizes={1, 2})) is made(Torso(sizes={2, 1}))
     others = [Torso(torso=Residual()), Torso(torso=Plain(features=9)), Torso(rate=1),
               Torso(act=sum), Torso(sizes=[1, 2]), Torso(sizes=(1, 2.0)), Torso(sizes={"a": 1}),
-              Torso(sizes=np.array([1, 2]))]  # fmt: skip
+              Torso(sizes={1}), Torso(sizes=np.array([1, 2])),
+              Torso(torso=nn.Dense(3, dtype=np.float32)),
+              Torso(torso=nn.Dense(3, dtype=jnp.float16))]  # fmt: skip
     agents = {id(made(config)) for config in (Torso(), *others)}
     assert len(agents) == 1 + len(others)
 

@@ -175,18 +175,20 @@ class Task:
 
 
 def require_own_steps(env: Any) -> None:
-    """Checks that an environment is none which hands on to another what is called here.
+    """Checks that an environment is no wrapper of gymnax's kind.
+
+    Such a one changes `step`, and its `step_env` is that of the environment in it: what it does
+    would silently be left out.
 
     Raises:
-      ConfigError: for a wrapper of gymnax's kind: it changes `step`, and its `step_env` is that of
-        the environment in it, so that what it does would silently be left out.
+      ConfigError: for a class with `step` and no `step_env`, or `reset` and no `reset_env`.
     """
-    missing = [name for name in ("reset_env", "step_env") if not hasattr(type(env), name)]
-    errors.require(not missing, "env", f"have a class with {' and '.join(missing or ['step_env'])}",
-                   "episodes are cut and begun anew around these, and a wrapper's reset and step "
-                   "are never called", type(env).__name__,
-                   "env to a subclass of sejax.envs.wrappers.Wrapper that changes reset_env and "
-                   "step_env")  # fmt: skip
+    left_out = [name for name in ("reset", "step")
+                if hasattr(type(env), name) and not hasattr(type(env), f"{name}_env")]  # fmt: skip
+    errors.require(not left_out, "env", " and ".join(f"change {name}_env in place of {name}"
+                   for name in left_out), "episodes are cut and begun anew around reset_env and "
+                   "step_env, and these two are never called", type(env).__name__,
+                   "env to a subclass of sejax.envs.wrappers.Wrapper")  # fmt: skip
 
 
 @contextlib.contextmanager

@@ -52,20 +52,11 @@ def configs_of_runs(config: Any, num_runs: int, folder: Path, at_once: int = 1) 
 
 
 def run_to_end(config: Any, directory: Any, chunks: Any) -> pd.DataFrame:
-    """Learns a run, or what is left of it, in its folder; its curve.
-
-    Raises:
-      ConfigError: if it has gone on for more generations than are asked for.
-    """
+    """Learns a run, or what is left of it, in its folder; its curve."""
     from sejax.app import session
 
     session.run(config, directory, chunks)
-    curve = pd.read_csv(directory.metrics)
-    there = int(curve["generation"].max()) + 1
-    require(there <= config.generations, "generations", f"be at least {there}", "a run in "
-            f"{config.run_dir} has so many, and its proxy is the best of all", config.generations,
-            f"generations={there}, or another folder")  # fmt: skip
-    return curve
+    return pd.read_csv(directory.metrics)
 
 
 def learn_all(
@@ -79,8 +70,8 @@ def learn_all(
       learn: `(config, directory, chunks) -> curve` of one run, as from `budgets.timed`.
 
     Raises:
-      ConfigError: if a folder, below that which `option` names, holds a run of other settings, or
-        is in use.
+      ConfigError: if a folder, below that which `option` names, holds a run of other settings or
+        of more generations than are asked for, or is in use.
     """
     from sejax.app import run_directory, session
     from sejax.app.progress import Tally
@@ -91,10 +82,18 @@ def learn_all(
         for config in configs:
             with run_directory.open_for(config, f"Set {option}=DIR.") as directory:
                 curve = learn(config, directory, chunks)
+            _require_no_more(config, curve)
             print(f"{config.run_dir}: {_said(curve, chunks.program.solved_score)}", flush=True)
             curves.append(curve)
             tally.add(config.num_seeds)
     return pd.concat(curves, ignore_index=True)
+
+
+def _require_no_more(config: Any, curve: pd.DataFrame) -> None:
+    there = int(curve["generation"].max()) + 1 if len(curve) else 0
+    require(there <= config.generations, "generations", f"be at least {there}", "a run in "
+            f"{config.run_dir} has so many, and its proxy is the best of all", config.generations,
+            f"generations={there}, or another folder")  # fmt: skip
 
 
 def _said(curve: pd.DataFrame, solved_score: float | None) -> str:

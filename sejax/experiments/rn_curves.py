@@ -125,9 +125,15 @@ def require_rows(settings: CurveSettings, curves: pd.DataFrame) -> None:
     Raises:
       ConfigError: if they are not, as where other settings made them.
     """
-    for (row, world), mine in curves.groupby(["row", "world"], sort=False):
-        require(row in settings.rows, "rows", f"name {row}", f"{settings.rows_file} has such rows",
-                ", ".join(settings.rows), f"rows=[{row},...]")  # fmt: skip
+    there, asked = list(curves["row"].drop_duplicates()), list(settings.rows)
+    require(sorted(there) == sorted(asked), "rows", f"be {', '.join(there)}", "these are in "
+            f"{settings.rows_file}", ", ".join(asked),
+            f"rows=[{','.join(there)}], or from_rows=false")  # fmt: skip
+    for (_, world), mine in curves.groupby(["row", "world"], sort=False):
+        agents = mine["agent"].nunique() // mine["group"].nunique()
+        require(agents == settings.num_agents, "num_agents", f"be {agents}",
+                f"{settings.rows_file} has so many in a group", settings.num_agents,
+                f"num_agents={agents}, or from_rows=false")  # fmt: skip
         name = "bonus_groups" if world in settings.study.bonuses else "rns"
         there, asked = mine["group"].nunique(), getattr(settings, name)
         require(there == asked, name, f"be {there}", f"{settings.rows_file} has so many groups of "

@@ -154,9 +154,10 @@ def report(settings: SeFamilies, rows: pd.DataFrame) -> pd.DataFrame:
     note = (
         f"{settings.runs} NES runs with each set of families; of each the best SE trains "
         f"{settings.num_agents} fresh agents of each family. Cells: mean return, with a bootstrap "
-        "95% interval that draws SEs (agents, where there is one SE); interquartile mean; share of "
-        f"the {first['num_agents']} agents that solve the task ({task.solved_reward:g}); "
-        f"{LEFT_OUT} a family that took no part in learning. CPU s are those of the generations, "
+        "95% interval for at least five SEs, which it draws (agents, where there is one SE); "
+        f"interquartile mean; share of the {first['num_agents']} agents that solve "
+        f"the task ({task.solved_reward:g}); {LEFT_OUT} a family that took no part in learning. "
+        "CPU s are those of the generations, "
         f"without compilation. {findings(summary)}{iqm_note('within each SE')}"
     )
     title = f"Agents tested on {task.name}, trained on SEs learned with other families of agents"

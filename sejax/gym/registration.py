@@ -11,7 +11,7 @@ from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
 
 from sejax import plugins
-from sejax.errors import ConfigError, require, whole
+from sejax.errors import ConfigError, as_python, require, whole
 from sejax.gym.reward import RewardNetwork
 from sejax.gym.source import Source, read
 from sejax.gym.synthetic import SyntheticEnv, SyntheticWorld
@@ -99,10 +99,10 @@ def make_vec(
       >>> obs.shape, envs.metadata["autoreset_mode"].value
       ((8, 4), 'NextStep')
     """
-    whole(1, "num_envs", num_envs, "each is an episode at a time", 8)
+    num_envs = _count(num_envs)
     weights, header = read(source)
     if _is_rn(header):
-        env_fns = [partial(make, source, task, render_mode=render_mode)] * int(num_envs)
+        env_fns = [partial(make, source, task, render_mode=render_mode)] * num_envs
         return SyncVectorEnv(env_fns, autoreset_mode=autoreset_mode)
     _require_no_picture(render_mode)
     return SyntheticVectorEnv(_world(weights, header, task), num_envs, autoreset_mode)
@@ -122,7 +122,7 @@ def make_sb3(source: Source, num_envs: int = 1, task: RealTask | str | None = No
     Raises:
       ConfigError: as `make_vec`, or without Stable-Baselines3.
     """
-    whole(1, "num_envs", num_envs, "each is an episode at a time", 8)
+    num_envs = _count(num_envs)
     try:
         from stable_baselines3.common.vec_env import DummyVecEnv
 
@@ -160,6 +160,12 @@ def _spec(name: str, **kwargs: Any) -> EnvSpec:
         id=f"{NAMESPACE}/{name}", entry_point="sejax.gym:make",
         vector_entry_point="sejax.gym:make_vec", kwargs=kwargs,
     )  # fmt: skip
+
+
+def _count(num_envs: Any) -> int:
+    num_envs = as_python(num_envs)
+    whole(1, "num_envs", num_envs, "each is an episode at a time", 8)
+    return int(num_envs)
 
 
 def _require_no_picture(render_mode: str | None) -> None:

@@ -1,6 +1,6 @@
 """Reward networks (RNs) in NumPy, around a Gymnasium environment of their task."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import gymnasium
@@ -8,9 +8,10 @@ import numpy as np
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.envs.toy_text.cliffwalking import CliffWalkingEnv
 from gymnasium.utils import RecordConstructorArgs
+from gymnasium.wrappers import DtypeObservation, FlattenObservation
 
 from sejax import plugins
-from sejax.errors import ConfigError, fraction, require
+from sejax.errors import ConfigError, as_python, fraction, require
 from sejax.gym import networks
 from sejax.gym.source import Source, read
 from sejax.gym.tasks import RealTask, num_categories, vector_size
@@ -21,6 +22,7 @@ _PLANE = ("x_position", "y_position", "distance_from_origin", "x_velocity", "y_v
           "reward_forward", "reward_ctrl")  # fmt: skip
 _LEG = ("x_position", "x_velocity", "z_distance_from_origin", "reward_forward", "reward_ctrl",
         "reward_survive")  # fmt: skip
+SAME_NUMBERS = (DtypeObservation, FlattenObservation)  # wrappers that change no number
 # `sejax.Task.info_keys` and `augmented_keys` by the names that Gymnasium has for them.
 INFO_KEYS: dict[str, tuple[str, ...]] = {
     "halfcheetah": ("x_position", "x_velocity", "reward_forward", "reward_ctrl"),
@@ -90,6 +92,7 @@ class RewardNetwork(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
         super().__init__(env)
         weights, header = read(source, "rn")
         self.config: RewardConfig = plugins.configure("proxy", header["config"]["proxy"])
+        discount = as_python(discount)
         if discount is not None:
             fraction("discount", discount, header["discount"])
         self.discount = float(header["discount"] if discount is None else discount)
@@ -202,27 +205,34 @@ def _require_task(env: gymnasium.Env[Any, Any], learned: RealTask, name: str) ->
     require(_kind(env.observation_space) == _kind(wanted), "env",
             f"have observations such as those of {name}, {wanted}", "the network sees them",
             env.observation_space, fix)  # fmt: skip
-    whole = env.unwrapped
-    # Wrappers may turn actions of one kind into another's, so it is the innermost that tells.
-    kinds = _kind(whole.action_space), _kind(learned.action_space)
-    require(None in kinds or kinds[0] == kinds[1], "env",
+    layers = list(_layers(env))
+    # Wrappers may make actions of one kind of another: some layer has the task's.
+    acts = {_kind(layer.action_space) for layer in layers}
+    require(not acts.isdisjoint({_kind(learned.action_space), None}), "env",
             f"have actions such as those of {name}, {learned.action_space}", "it is another task "
-            "otherwise", whole.action_space, fix)  # fmt: skip
-    if _kind(whole.observation_space) != _kind(wanted):
+            "otherwise", env.action_space, fix)  # fmt: skip
+    if _kind(layers[-1].observation_space) != _kind(wanted):
         return  # a wrapper makes them what the network sees
-    while env is not whole:
-        require(not isinstance(env, gymnasium.ObservationWrapper), "env", f"have the observations "
-                f"of {name} as they are", "the network has seen no others", env,
-                "gymnasium.wrappers that change observations around RewardNetwork, not below "
-                "it")  # fmt: skip
-        env = env.env  # type: ignore[attr-defined]
+    odd = [each for each in layers if isinstance(each, gymnasium.ObservationWrapper)
+           and not isinstance(each, SAME_NUMBERS)]  # fmt: skip
+    require(not odd, "env", f"have the observations of {name} as they are", "the network has seen "
+            "no others", odd[0] if odd else env, "gymnasium.wrappers that change observations "
+            "around RewardNetwork, not below it")  # fmt: skip
+
+
+def _layers(env: gymnasium.Env[Any, Any]) -> Iterator[gymnasium.Env[Any, Any]]:
+    """An environment and what it is wrapped around, the innermost last."""
+    yield env
+    while isinstance(env, gymnasium.Wrapper):
+        env = env.env
+        yield env
 
 
 def _kind(space: Any) -> tuple[str, Any] | None:
     """What must be equal for two spaces to be of one task; None for one that is not known."""
     if isinstance(space, gymnasium.spaces.Discrete):
         return "discrete", int(space.n)
-    return ("box", space.shape) if isinstance(space, gymnasium.spaces.Box) else None
+    return ("box", int(np.prod(space.shape))) if isinstance(space, gymnasium.spaces.Box) else None
 
 
 def _shapes(config: RewardConfig, obs_dim: int, num_keys: int) -> networks.Shapes:
