@@ -110,11 +110,8 @@ def plain(value: Any) -> Any:
         return [plain(x) for x in value]
     if isinstance(value, Mapping):
         return {str(key): plain(x) for key, x in value.items()}
-    if hasattr(value, "tolist") and not isinstance(
-        value, type
-    ):  # NumPy's and jax's numbers and arrays
-        return value.tolist()
-    return value
+    is_array = hasattr(value, "tolist") and not isinstance(value, type)  # NumPy's and jax's
+    return value.tolist() if is_array else value
 
 
 def _convert(value: Any, hint: Any, name: str, field: Any) -> Any:
