@@ -432,3 +432,10 @@ def test_an_agent_that_does_not_learn_once_at_each_step_is_refused(field):
     assert make_agent(DDQNConfig(), task, ICMConfig()) and make_agent(
         DDQNConfig(**{field: 4}), task
     )
+
+
+def test_a_curious_agent_trains_alone_on_a_core():
+    # In lockstep the bonus' networks take 1.4 times as long, however small the agent's own are.
+    task, small = envs.make("cartpole"), DDQNConfig(hidden_size=64, num_layers=1, batch_size=32)
+    assert make_agent(small, task).cpu_lanes > 1
+    assert make_agent(small, task, ICMConfig()).cpu_lanes == 1

@@ -246,6 +246,7 @@ def with_icm(
         act=act,
         update=update,
         hparams=CuriousHparams(agent=agent.hparams, icm=traced(config)),
+        cpu_lanes=1,  # its networks are no small ones, whatever the agent's
         discount=lambda hparams: agent.discount(hparams.agent),
         batch_size=lambda state: agent.batch_size(state.agent_state),
     )
