@@ -249,7 +249,7 @@ def require_package(group: str, config: Any, reason: str) -> None:
 class Same:
     """Configurations as a key that is equal if all their fields are, hashable or not.
 
-    What is no dataclass is equal to itself alone.
+    What is no dataclass is equal to what it says, by default to itself alone.
     """
 
     def __init__(self, *configs: Any):
@@ -266,7 +266,7 @@ class Same:
 def _content(value: Any) -> Any:
     """What makes two values the same, hashable: of dataclasses at any depth class and fields."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        # Also what is no argument of the class, as a flax module's parent.
+        # A flax module that is nobody's part may have no parent.
         return type(value), tuple(_content(getattr(value, field.name, None))
                                   for field in dataclasses.fields(value) if field.init)  # fmt: skip
     if isinstance(value, tuple | list):
