@@ -264,6 +264,8 @@ def test_shares_are_of_the_groups_of_the_same_seeds():
     summary = rn_curves.summarise(curves, -12.0, max_steps=300).set_index("world")
     assert summary["steps_to_solve"].tolist() == [185, 155, 185]
     assert summary["share_of_bare"].tolist() == [1, 1, 1]
+    turned = pd.concat([curves_of("icm", 1), curves_of("real", 5)])  # in whatever order
+    assert rn_curves.summarise(turned, -12.0, max_steps=300)["share_of_bare"].tolist() == [1, 1]
     alone = rn_curves.summarise(curves_of("icm", 2), -12.0, max_steps=300)
     assert np.isnan(alone["share_of_bare"][0]) and not rn_curves.make_table(alone).iat[0, 4]
 

@@ -149,15 +149,14 @@ def summarise(curves: pd.DataFrame, solved_reward: float, max_steps: int) -> pd.
     """
     out = []
     grid = step_grid(max_steps)
-    bare: dict[Any, Any] = {}  # steps and group of each agent on the real task, by row
+    solved: dict[Any, Any] = {}  # steps and group of each agent, by row and world
     for (row, world), mine in curves.groupby(["row", "world"], sort=False):
         groups = mine.groupby("agent")["group"].first()
         steps = return_curves.all_steps_to_solve(mine, solved_reward)
         held = return_curves.on_grid(mine, grid, window=1)
         mean_return = pd.Series(np.nanmean(held, axis=1), index=steps.index)
         counted = steps.clip(upper=max_steps)
-        if world == "real":
-            bare[row] = counted, groups
+        solved[row, world] = counted, groups
         out.append({
             "row": row, "world": world, "groups": groups.nunique(), "agents": len(steps),
             "solved": float(np.isfinite(steps).mean()), "steps_to_solve": counted.mean(),
@@ -165,18 +164,20 @@ def summarise(curves: pd.DataFrame, solved_reward: float, max_steps: int) -> pd.
             **interval(mean_return, groups, str(world), "return"),
             **iqm_columns(mean_return, "return", None if world in WITHOUT_RN else groups),
             "last_return": return_curves.last_returns(mine).mean(),
-            "share_of_bare": share_of_bare(counted, groups, bare.get(row)),
         })  # fmt: skip
-    return pd.DataFrame(out)
+    shares = [share_of_bare(*mine, *solved[row, "real"]) if (row, "real") in solved else np.nan
+              for (row, _), mine in solved.items()]  # fmt: skip
+    return pd.DataFrame(out).assign(share_of_bare=shares)
 
 
-def share_of_bare(steps: pd.Series, groups: pd.Series, bare: Any) -> float:
-    """Mean steps as a share of those of the groups of the same seeds on the real task, if any.
+def share_of_bare(
+    steps: pd.Series, groups: pd.Series, bare_steps: pd.Series, bare_groups: pd.Series
+) -> float:
+    """Mean steps as a share of those of the groups of the same seeds on the real task.
 
     A bonus has fewer groups, and where hyperparameters are drawn the groups' draws differ.
     """
-    real, of_group = bare if bare is not None else (pd.Series(dtype=float), pd.Series(dtype=int))
-    return float(steps.mean() / real[of_group.isin(groups.unique())].mean())
+    return float(steps.mean() / bare_steps[bare_groups.isin(groups.unique())].mean())
 
 
 def interval(values: pd.Series, groups: pd.Series, world: str, name: str) -> dict[str, float]:

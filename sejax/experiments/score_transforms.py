@@ -37,7 +37,7 @@ from sejax.experiments.experiment import Experiment
 from sejax.experiments.settings import Settings, count, setting
 from sejax.experiments.tables import as_texts, publish
 from sejax.options import Options, counts
-from sejax.statistics import bootstrap_interval
+from sejax.statistics import NUM_RESAMPLES, bootstrap_interval
 
 SCORE_TRANSFORMS = tuple(TRANSFORMS)
 
@@ -217,13 +217,13 @@ def summarise(runs: pd.DataFrame, bins: int) -> pd.DataFrame:
     return pd.DataFrame(rows).sort_values(["updates", "transform"], ignore_index=True)
 
 
-def share_of_best(runs: pd.DataFrame, num_resamples: int = 2000) -> dict[bool, float]:
+def share_of_best(runs: pd.DataFrame) -> dict[bool, float]:
     """How often, of runs drawn again, the best cell of a sampling is the same, by `mirrored`."""
     shares = {}
     for mirrored, mine in runs.groupby("mirrored"):
         updates = mine.pivot(index="run", columns="transform", values="updates").to_numpy()
         rng = np.random.default_rng(0)
-        drawn = rng.integers(0, len(updates), (num_resamples, len(updates)))
+        drawn = rng.integers(0, len(updates), (NUM_RESAMPLES, len(updates)))
         winners = updates[drawn].mean(axis=1).argmin(axis=1)
         shares[bool(mirrored)] = float((winners == updates.mean(axis=0).argmin()).mean())
     return shares
