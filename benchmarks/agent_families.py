@@ -30,7 +30,7 @@ import common
 from rich.progress import track
 
 import sejax
-from sejax import plugins
+from sejax import registry
 from sejax.proxies.configs import SyntheticConfig
 from sejax.training import TrainingConfig
 
@@ -68,9 +68,9 @@ class Family:
         elif self.agent == "ppo":
             agent = sejax.PPOConfig.paper()
         else:
-            agent = plugins.configure("agent", {"name": self.agent})
-        agent = replace(agent, init_episodes=0)
-        limit = plugins.find("env", self.env).facts.max_steps
+            agent = registry.configure("agent", {"name": self.agent})
+        agent = replace(agent, warmup_episodes=0)
+        limit = registry.find("env", self.env).facts.max_steps
         phase = agent.steps_before_learning(limit, limit)  # 0 but for PPO
         steps = max(2, -(-steps // phase)) * phase if phase else steps
         training = TrainingConfig(stop_rule="never", max_steps=steps, max_episodes=steps)
@@ -209,14 +209,14 @@ def sejax_side(args: argparse.Namespace) -> None:
 
     A request without a seed compiles that, and answers with the SE's weights.
     """
-    from sejax.app.runtime import configure_jax, configure_xla
+    from sejax.cli.runtime import configure_jax, configure_xla
 
     configure_xla(1)
     configure_jax()
     import jax
     import numpy as np
 
-    from sejax.parallel import spread_over_devices
+    from sejax.ops.parallel import spread_over_devices
 
     programs = {}
 
@@ -232,7 +232,7 @@ def sejax_side(args: argparse.Namespace) -> None:
 
         def train_all(keys: jax.Array, params: Any) -> Any:
             one = functools.partial(train, env_params=params)
-            return spread_over_devices(one, cpu_lanes=agent.cpu_lanes)(keys)
+            return spread_over_devices(one, cpu_num_parallel=agent.cpu_num_parallel)(keys)
 
         params = env.params(weights)
         programs[family] = jax.jit(train_all).lower(keys(0), params).compile(), params

@@ -47,13 +47,13 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def serve(args: argparse.Namespace) -> None:
     """Compiles all programs, then measures a generation of each."""
-    from sejax.app.runtime import configure_xla
+    from sejax.cli.runtime import configure_xla
 
     configure_xla(1)
     import jax
 
     import sejax
-    from sejax.app import session
+    from sejax.cli import session
 
     names = args.families.split(",")
     words = ["env=cartpole", f"training.max_steps={args.steps}",

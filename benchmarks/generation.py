@@ -139,7 +139,7 @@ def show(result: dict[str, Any]) -> None:
 
 def sejax_side(args: argparse.Namespace) -> None:
     """One generation as a compiled program, always from the same fresh state."""
-    from sejax.app.runtime import configure_xla
+    from sejax.cli.runtime import configure_xla
 
     num_devices = args.cores if args.side == ALL else 1
     configure_xla(num_devices)
@@ -148,7 +148,7 @@ def sejax_side(args: argparse.Namespace) -> None:
 
     import sejax
     from sejax.bilevel import make_program
-    from sejax.parallel import compiler_options
+    from sejax.ops.parallel import compiler_options
 
     program = make_program(**sejax.config(overrides(args)).parts())
     init = jax.jit(program.init)

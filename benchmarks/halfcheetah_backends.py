@@ -105,7 +105,7 @@ def mujoco_returns(actions: np.ndarray) -> tuple[float, np.ndarray]:
 
 def serve_backend(args: argparse.Namespace) -> None:
     """The side of one backend, on one core."""
-    from sejax.app.runtime import configure_xla
+    from sejax.cli.runtime import configure_xla
 
     configure_xla(1)
     import jax
@@ -115,7 +115,7 @@ def serve_backend(args: argparse.Namespace) -> None:
 
     task = envs.make("halfcheetah", backend=args.side)
     actions = jnp.asarray(gaits(args.gaits, args.seed))
-    lanes = jnp.resize(actions, (LANES, *actions.shape[1:]))
+    num_parallel = jnp.resize(actions, (LANES, *actions.shape[1:]))
     state = at_rest_state(task.env)
 
     def play(gait: Any) -> Any:
@@ -127,9 +127,9 @@ def serve_backend(args: argparse.Namespace) -> None:
 
     def handle(_: dict[str, Any]) -> dict[str, Any]:
         one, compiling = common.measure(lambda: jax.jit(play).lower(actions[0]).compile())
-        many = jax.jit(jax.vmap(play)).lower(lanes).compile()
+        many = jax.jit(jax.vmap(play)).lower(num_parallel).compile()
         returns, used = common.measure(lambda: [float(one(gait)) for gait in actions])
-        _, in_lanes = common.measure(lambda: jax.block_until_ready(many(lanes)))
+        _, in_lanes = common.measure(lambda: jax.block_until_ready(many(num_parallel)))
         return {
             "step_us": used["cpu_s"] / (args.gaits * GAIT_STEPS) * 1e6,
             "lanes_us": in_lanes["cpu_s"] / (LANES * GAIT_STEPS) * 1e6,

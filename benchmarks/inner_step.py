@@ -3,8 +3,8 @@
 Both sides train DDQN agents with the paper's hyperparameters (`preset=paper`) on the same fresh SE
 and are kept to the same core; they take turns, so that a disturbance meets both. Two kinds of step
 are measured: with learning (act, step the SE, store, sample a batch, one update) and without
-(`agent.init_episodes` out of reach). Training never stops early, and a fresh SE hardly ever ends an
-episode, so that every training is `--episodes` times 200 steps. Compilation and a first training
+(`agent.warmup_episodes` out of reach). Training never stops early, and a fresh SE hardly ever ends
+an episode, so that every training is `--episodes` times 200 steps. Compilation and a first training
 are not counted.
 
 CPU time, unlike wall-clock, excludes what other processes take, but a busy machine still slows both
@@ -104,14 +104,14 @@ def show(result: dict[str, Any]) -> None:
 
 def sejax_side(args: argparse.Namespace) -> None:
     """Measures the trainer alone, compiled for one device."""
-    from sejax.app.runtime import configure_xla
+    from sejax.cli.runtime import configure_xla
 
     configure_xla(1)
     import jax
     import numpy as np
 
     import sejax
-    from sejax.parallel import compiler_options
+    from sejax.ops.parallel import compiler_options
 
     trainings = {}
     for learning in KINDS:
@@ -153,11 +153,11 @@ def torch_side(args: argparse.Namespace) -> None:
 
 def overrides(episodes: int, learning: bool) -> list[str]:
     """The configuration in which every step learns, or none does."""
-    init_episodes = 0 if learning else episodes
+    warmup_episodes = 0 if learning else episodes
     return [
         *OVERRIDES,
         f"training.max_episodes={episodes}",
-        f"agent.init_episodes={init_episodes}",
+        f"agent.warmup_episodes={warmup_episodes}",
     ]
 
 

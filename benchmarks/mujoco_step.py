@@ -125,7 +125,7 @@ def serve_gymnasium(args: argparse.Namespace) -> None:
 def serve_sejax(args: argparse.Namespace) -> None:
     """The side of one of sejax's physics."""
     os.sched_setaffinity(0, {args.core})
-    from sejax.app.runtime import configure_xla
+    from sejax.cli.runtime import configure_xla
 
     configure_xla(1)
     import jax
@@ -148,13 +148,13 @@ def serve_sejax(args: argparse.Namespace) -> None:
 
 def serve_devices(args: argparse.Namespace) -> None:
     """The side that has two devices."""
-    from sejax.app.runtime import configure_xla
+    from sejax.cli.runtime import configure_xla
 
     configure_xla(2)
     import jax
 
     from sejax import envs
-    from sejax.parallel import spread_over_devices
+    from sejax.ops.parallel import spread_over_devices
 
     walk = walk_of(envs.make(args.task), NUM_STEPS["mujoco"])
     keys = jax.random.split(jax.random.key(args.seed), WALKS)

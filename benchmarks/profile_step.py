@@ -135,7 +135,7 @@ def show(result: dict[str, Any]) -> None:
 def step_side(args: argparse.Namespace) -> None:
     """Measures trainings with and without learning, and the matrix product, on one core."""
     os.sched_setaffinity(0, {args.core})
-    from sejax.app.runtime import configure_xla
+    from sejax.cli.runtime import configure_xla
 
     configure_xla(1)
     import jax
@@ -171,7 +171,7 @@ def step_side(args: argparse.Namespace) -> None:
 
 def generation_side(args: argparse.Namespace) -> None:
     """Compiles a default generation, says how long it took, and runs it on request."""
-    from sejax.app.runtime import configure_xla
+    from sejax.cli.runtime import configure_xla
 
     configure_xla()
 

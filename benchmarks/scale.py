@@ -7,7 +7,7 @@ scores must be equal to the last digit. "overhead" compares wall-clock generatio
 "serial" is the driver's time before the first share leaves and after the last has come: ask and
 tell. "idle" is the share of the workers' time in which they did not compute, from `machines.csv`.
 Two more sides take the time of what is handed out, in their own process: of groups of lanes, as
-they are by default, and of single trainings (`lanes=1`).
+they are by default, and of single trainings (`num_parallel=1`).
 
 From these times `scale_model.py` says what a generation takes with one worker and with two, which
 is held against what was measured, and with more. `--out FOLDER` stores figure and table; `--model
@@ -40,7 +40,7 @@ SIDES = {
     "local-2": "local, 2 devices",
     "ray-2": "Ray, 2 workers",
     GROUPS: "in the driver",
-    ALONE: "in the driver, lanes=1",
+    ALONE: "in the driver, num_parallel=1",
 }
 WORKERS = (1, 2, 10, 100, 1000)
 GRID = sorted({round(10 ** (i / 8)) for i in range(25)} | set(WORKERS))  # of the figure
@@ -53,7 +53,7 @@ class Measured(NamedTuple):
     """What a side measures.
 
     Attributes:
-      chunks: generations, as `sejax.app.session.Chunks`.
+      chunks: generations, as `sejax.cli.session.Chunks`.
       extra: what else there is to tell of the last generation, given its wall-clock seconds.
       ready: what else the side says when it has started.
     """
@@ -142,7 +142,7 @@ def serve(args: argparse.Namespace) -> None:
     cores = args.cores[: 2 if number == "2" else 1]
     os.sched_setaffinity(0, cores)
     os.environ["RAY_ADDRESS"] = "local"  # a cluster of its own
-    from sejax.app.runtime import configure_jax, configure_xla
+    from sejax.cli.runtime import configure_jax, configure_xla
 
     configure_xla(len(cores) if kind == "local" else 1)
     import jax
@@ -150,8 +150,8 @@ def serve(args: argparse.Namespace) -> None:
     import sejax
 
     configure_jax()
-    lanes = ["lanes=1"] if args.side == ALONE else []
-    config = sejax.config(["env=cartpole", f"seed={args.seed}", *args.overrides, *lanes])
+    num_parallel = ["num_parallel=1"] if args.side == ALONE else []
+    config = sejax.config(["env=cartpole", f"seed={args.seed}", *args.overrides, *num_parallel])
     with tempfile.TemporaryDirectory() as folder, contextlib.ExitStack() as stack:
         path = Path(folder)
         make = {"local": local_side, "ray": ray_side, "trainings": trainings_side}[kind]
@@ -160,7 +160,8 @@ def serve(args: argparse.Namespace) -> None:
         state = initial(config, side.chunks)
         program = side.chunks.program
         about = {"trials": len(program.family_of_trial), "dims": program.num_dims,
-                 "lanes": config.lanes or program.cpu_lanes[0] or 1}  # fmt: skip
+                 "num_parallel": config.num_parallel
+                 or program.cpu_num_parallel[0] or 1}  # fmt: skip
 
         def advance() -> Any:
             return jax.block_until_ready(side.chunks.advance(state, 1))
@@ -187,7 +188,7 @@ def initial(config: Any, chunks: Any) -> Any:
 @contextlib.contextmanager
 def local_side(config: Any, folder: Path, num_cores: int) -> Iterator[Measured]:
     """The compiled program with a device for each core."""
-    from sejax.app import session
+    from sejax.cli import session
 
     chunks = session.make_chunks(config)
     chunks.compile(config.num_seeds, 1)
@@ -285,14 +286,16 @@ class Here:
 @contextlib.contextmanager
 def trainings_side(config: Any, folder: Path, num_cores: int) -> Iterator[Measured]:
     """Shares of one group of lanes each, scored in this process."""
-    from sejax.app import build
     from sejax.bilevel import make_program
+    from sejax.cli import build
     from sejax.machines import scorer
     from sejax.machines.chunks import RemoteChunks
     from sejax.machines.handout import HandOut
 
     program = make_program(**config.parts() | {"devices": 1})
-    capacities = tuple(config.lanes or lanes or 1 for lanes in program.cpu_lanes)
+    capacities = tuple(
+        config.num_parallel or num_parallel or 1 for num_parallel in program.cpu_num_parallel
+    )
     crew = Here(scorer.Scorer(build.to_plain(config), capacities, scorer.versions(), 0))
     with RemoteChunks(program, HandOut(crew, capacities, capacities)) as chunks:
         chunks.compile(config.num_seeds, 1)
@@ -306,11 +309,11 @@ def trainings_side(config: Any, folder: Path, num_cores: int) -> Iterator[Measur
 
 @contextlib.contextmanager
 def files_of(config: Any, folder: Path, chunks: Any) -> Iterator[Callable[[Any, Any], None]]:
-    """Writes what a run writes after a chunk of generations, as `sejax.app.session.run` does."""
+    """Writes what a run writes after a chunk of generations, as `sejax.cli.session.run` does."""
     import jax
 
-    from sejax.app import session
-    from sejax.app.run_directory import open_for
+    from sejax.cli import session
+    from sejax.cli.run_directory import open_for
 
     config = dataclasses.replace(config, run_dir=str(folder / "run"))
     with open_for(config) as directory:
@@ -361,7 +364,7 @@ def check(seconds: list[float], num_workers: int, costs: Costs, result: dict[str
     the workers computed in all.
     """
     scale = result["sides"][f"ray-{num_workers}"]["busy_s"] / sum(seconds)
-    capacity = -(-CAPACITY // result["lanes"])
+    capacity = -(-CAPACITY // result["num_parallel"])
     return simulate(scale * np.array(seconds), num_workers, costs, capacity)
 
 
@@ -371,10 +374,11 @@ def worlds_of(result: dict[str, Any]) -> dict[str, World]:
     worlds = {}
     for population in (64, 1024):
         trials = 2 * population + 16
-        world = World(seconds=groups, count=trials // result["lanes"], num_trials=trials,
-                      capacity=-(-CAPACITY // result["lanes"]), dims=result["dims"])  # fmt: skip
+        world = World(seconds=groups, count=trials // result["num_parallel"], num_trials=trials,
+                      capacity=-(-CAPACITY // result["num_parallel"]),
+                      dims=result["dims"])  # fmt: skip
         worlds[f"CartPole SE, {trials:,} trainings"] = world
-        worlds[f"CartPole SE, {trials:,} trainings, lanes=1"] = dataclasses.replace(
+        worlds[f"CartPole SE, {trials:,} trainings, num_parallel=1"] = dataclasses.replace(
             world, seconds=alone, count=trials, capacity=CAPACITY
         )
     with HALFCHEETAH.open(encoding="utf-8") as file:

@@ -16,28 +16,28 @@ import jax
 import numpy as np
 
 import sejax
-from sejax import plugins
+from sejax import registry
 
 BUDGETS = (2000, 5000, 10_000, 20_000)
-SMALL = {"init_episodes": 1, "batch_size": 64, "hidden_size": 64, "num_layers": 1}
+SMALL = {"warmup_episodes": 1, "batch_size": 64, "hidden_size": 64, "num_layers": 1}
 BY_STEPS = {"exploration_steps": 1000, "epsilon_min": 0.05}
-QUICK = {"learning_rate": 3e-3, "target_update_rate": 0.05}
+QUICK = {"learning_rate": 3e-3, "tau": 0.05}
 SAC_PENDULUM = {"activation": "fast_tanh", "learning_rate": 0.01, "discount": 0.98}
-TD3_PENDULUM = {"init_episodes": 3, "learning_rate": 5e-3, "target_update_rate": 0.01,
+TD3_PENDULUM = {"warmup_episodes": 3, "learning_rate": 5e-3, "tau": 0.01,
                 "discount": 0.98}  # fmt: skip
 # Exploration is all that is hard there: random episodes, repeated actions, and an entropy near that
 # of uniform ones.
-SAC_CAR = {"init_episodes": 4, "activation": "fast_tanh", "learning_rate": 0.01,
-           "target_update_rate": 0.02, "target_entropy": 0.5, "action_repeat": 8}  # fmt: skip
+SAC_CAR = {"warmup_episodes": 4, "activation": "fast_tanh", "learning_rate": 0.01,
+           "tau": 0.02, "target_entropy": 0.5, "action_repeat": 8}  # fmt: skip
 # Task, agent, options beside `SMALL`.
 ROWS: tuple[tuple[str, str, dict[str, Any]], ...] = (
     ("cartpole", "ddqn", {}),
     ("cartpole", "ddqn", BY_STEPS),
-    ("cartpole", "dqn", {"target_update_rate": 0.02}),
+    ("cartpole", "dqn", {"tau": 0.02}),
     ("cartpole", "sac", QUICK),
     ("cartpole", "td3_discrete", {**QUICK, "one_hot_actions": True}),
     ("acrobot", "ddqn", BY_STEPS),
-    ("acrobot", "dqn", {"target_update_rate": 0.02}),
+    ("acrobot", "dqn", {"tau": 0.02}),
     ("acrobot", "sac", QUICK),
     ("pendulum", "sac", SAC_PENDULUM),
     ("pendulum", "td3", TD3_PENDULUM),
@@ -51,7 +51,7 @@ def measure(
 ) -> tuple[np.ndarray, float]:
     """Test returns `[budget, seed]`, and CPU microseconds of a training step."""
     task = sejax.envs.make(env)
-    config = plugins.configure("agent", {"name": agent, **SMALL, **options})
+    config = registry.configure("agent", {"name": agent, **SMALL, **options})
     made = sejax.make_agent(config, task)
     keys = jax.random.split(jax.random.key(0), num_seeds)
     returns, seconds, steps = [], 0.0, 0

@@ -12,7 +12,7 @@ from typing import Any
 
 import common
 
-from sejax.app.runtime import configure_xla
+from sejax.cli.runtime import configure_xla
 
 TASKS = ("cartpole", "acrobot")
 FOLDER = Path(__file__).parents[1] / "results/soft_ses"

@@ -39,7 +39,7 @@ from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckA
 from stable_baselines3.common.vec_env import VecNormalize
 
 import sejax.gym
-from sejax.files import write_text
+from sejax.ops.files import write_text
 
 TASKS = {  # id in Gymnasium, and the step limit
     "cartpole": ("CartPole-v1", 200),  # which is CartPole-v0

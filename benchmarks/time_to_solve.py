@@ -24,7 +24,7 @@ import numpy as np
 import pandas as pd
 
 from sejax import envs
-from sejax.files import write_text
+from sejax.ops.files import write_text
 
 SETTINGS = {
     "best": ["preset=best"],
@@ -41,7 +41,7 @@ SETTINGS = {
     "sep_cma_es": ["preset=soft", "es=sep_cma_es", "es.population_size=128", "es.noise_std=0.06"],
 }
 COLUMNS = ["preset", "seed", "generation", "incumbent_mean", "env_steps_total", "wall_s", "cpu_s"]
-QUICK = ["es.population_size=4", "agent.init_episodes=1", "training.max_steps=1000"]
+QUICK = ["es.population_size=4", "agent.warmup_episodes=1", "training.max_steps=1000"]
 
 
 def main() -> None:

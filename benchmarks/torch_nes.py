@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from torch_reference import SyntheticEnv, Weights, play_test_episodes, train
 
-from sejax.agents.ddqn import DDQNConfig
+from sejax.agents.dqn import DDQNConfig
 from sejax.es.nes import NESConfig
 from sejax.proxies.configs import SyntheticConfig
 from sejax.training import TrainingConfig

@@ -2,7 +2,7 @@
 
 What a good PyTorch programmer would write for the paper's design, one small network call after the
 other: DDQN on an SE of three networks, then greedy test episodes on the real CartPole. It means
-the same as `sejax.trainer`, and takes its hyperparameters from the same configurations, which are
+the same as `sejax.training`, and takes its hyperparameters from the same configurations, which are
 all that it takes from sejax. `torch_nes.py` has the generation,
 `torch_reference_td3.py` and `torch_reference_ppo.py` have other agents.
 
@@ -37,7 +37,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from sejax.agents.ddqn import DDQNConfig
+from sejax.agents.dqn import DDQNConfig
 from sejax.proxies.configs import SyntheticConfig
 from sejax.training import TrainingConfig
 
@@ -84,7 +84,7 @@ def init_mlp(sizes: list[int], activation: str) -> list[Tensor]:
 
 
 def params_from_flax(tree: dict[str, Any]) -> list[Tensor]:
-    """Parameters for `mlp` from those of a `sejax.networks.MLP`: `{"Dense_0": {"kernel", ...}}`."""
+    """Parameters for `mlp` from those of an `MLP` of `sejax.ops.networks`."""
     layers = sorted((name for name in tree if name.startswith("Dense_")), key=_layer_number)
     arrays = [tree[name][leaf] for name in layers for leaf in ("kernel", "bias")]
     arrays += [np.reshape(tree["prelu_slope"], (1,))] if "prelu_slope" in tree else []
@@ -318,7 +318,7 @@ def ddqn_loss(state: DDQNState, batch: Batch, config: DDQNConfig) -> Tensor:
 def ddqn_update(state: DDQNState, batch: Batch, config: DDQNConfig) -> None:
     """One step of Adam on `ddqn_loss` and one soft update of the target network, in place."""
     state.online.descend(ddqn_loss(state, batch, config), config.learning_rate)
-    torch._foreach_lerp_(state.target, state.online.values, config.target_update_rate)
+    torch._foreach_lerp_(state.target, state.online.values, config.tau)
 
 
 @torch.no_grad()
@@ -332,7 +332,7 @@ def greedy_action(state: DDQNState, obs: Tensor, activation: str) -> int:
 
 @dataclass(kw_only=True)
 class TrainResult:
-    """What came of one training: as `sejax.trainer.TrainResult`."""
+    """What came of one training: as `sejax.training.TrainResult`."""
 
     agent: Any
     train_steps: int
@@ -364,7 +364,7 @@ def train(env: SyntheticEnv, hp: DDQNConfig, training: TrainingConfig, seed: int
         episode = play_episode(env, agent, buffer, obs, len(returns), limit, hp)
         train_steps += episode.steps
         returns.append(episode.total)
-        is_over = should_stop(returns, training, hp.init_episodes)
+        is_over = should_stop(returns, training, hp.warmup_episodes)
         if episode.nonfinite or train_steps >= max_steps or is_over:
             break
     nonfinite = episode.nonfinite or not agent.online.all_finite()
@@ -436,7 +436,7 @@ def play_episode(
             action = greedy_action(agent, obs, hp.activation)
         next_obs, reward, discount, terminated, nonfinite = env.step(obs, action)
         buffer.store(obs, next_obs, action, reward, discount)
-        if episode >= hp.init_episodes:
+        if episode >= hp.warmup_episodes:
             ddqn_update(agent, buffer.sample(), hp)
         obs = next_obs
         total += reward
@@ -452,12 +452,12 @@ def epsilon_at(episode: int, hp: DDQNConfig) -> float:
     return max(hp.epsilon_init * hp.epsilon_decay**episode, hp.epsilon_min)
 
 
-def should_stop(returns: list[float], training: TrainingConfig, init_episodes: int) -> bool:
+def should_stop(returns: list[float], training: TrainingConfig, warmup_episodes: int) -> bool:
     """Whether training ends after the last of these episodes."""
     episode = len(returns) - 1
     if len(returns) >= training.max_episodes:
         return True
-    may_stop = episode >= init_episodes + training.window
+    may_stop = episode >= warmup_episodes + training.window
     return training.stop_rule == "plateau" and may_stop and is_plateau(returns, training)
 
 

@@ -136,7 +136,7 @@ def td3_update(state: TD3State, batch: Batch, smoothing: Tensor, config: TD3Conf
         torch._foreach_lerp_(
             [*state.target_actor, *state.target_critics],
             [*state.actor.values, *state.critics.values],
-            config.target_update_rate,
+            config.tau,
         )
 
 
@@ -171,7 +171,7 @@ class TD3Agent:
         self.state = init_td3(config)
         self._config = config
         self._buffer = ReplayBuffer(capacity, config.batch_size, OBS_DIM, ACTION_DIM)
-        self._warm_up_episodes = config.init_episodes
+        self._warm_up_episodes = config.warmup_episodes
 
     @torch.no_grad()
     def act(self, obs: Tensor) -> Tensor:

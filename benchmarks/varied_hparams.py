@@ -14,7 +14,7 @@ from typing import Any
 
 import common
 
-OVERRIDES = ["training.stop_rule=never", "agent.init_episodes=0"]
+OVERRIDES = ["training.stop_rule=never", "agent.warmup_episodes=0"]
 
 
 def main() -> None:
@@ -49,7 +49,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def serve(args: argparse.Namespace) -> None:
     """Compiles the program that varies, then measures each draw both ways."""
-    from sejax.app.runtime import configure_xla
+    from sejax.cli.runtime import configure_xla
 
     configure_xla(1)
     import dataclasses

@@ -42,7 +42,7 @@ class SAC(AgentOptions):
     """Soft actor-critic with twin critics and an automatic temperature.
 
     Differs: networks and batches are smaller than the authors' and the learning rate is larger, for
-    small tasks. Actions are random in the first `init_episodes`, before it learns.
+    small tasks. Actions are random in the first `warmup_episodes`, before it learns.
     """
 
     actions: ClassVar[tuple[str, ...]] = ("continuous",)
@@ -51,7 +51,7 @@ class SAC(AgentOptions):
     buffer_size: int = option(100_000, counts())
     hidden_size: int = option(64, counts())
     learning_rate: float = option(1e-3, positive("it must learn"), traced=True, varied="triple")
-    target_update_rate: float = option(0.005, fraction(), traced=True)  # tau
+    tau: float = option(0.005, fraction(), traced=True)  # tau
     discount: float = option(0.99, fraction(), traced=True)  # gamma
 
     def make(self, task: sejax.Task) -> sejax.Agent:
@@ -65,7 +65,7 @@ class SAC(AgentOptions):
                             hparams=jax.tree.map(jnp.float32, hparams))  # fmt: skip
 
         def begin_episode(state: SACState, episode: Array) -> SACState:
-            return state.replace(is_warming_up=episode < self.init_episodes)
+            return state.replace(is_warming_up=episode < self.warmup_episodes)
 
         def act(key: Array, state: SACState, obs: Array, explore: bool) -> Array:
             key_warm_up, key_noise = jax.random.split(key)
@@ -82,7 +82,7 @@ class SAC(AgentOptions):
         return sejax.Agent(
             init=init, begin_episode=begin_episode, act=act, update=update, hparams=traced(self),
             memory=replay_memory(self.batch_size, self.buffer_size),
-            init_episodes=self.init_episodes, learns_from=self.init_episodes,
+            warmup_episodes=self.warmup_episodes, learns_from=self.warmup_episodes,
             env_action=lambda action: task.max_action * action,  # remembered in [-1, 1]
         )  # fmt: skip
 
@@ -191,9 +191,7 @@ def learn(networks: Networks, state: SACState, batch: Transition, noise: Array) 
     hp = state.hparams
     direction, opt_state = ADAM.update(jax.grad(mean_loss)(state.params), state.opt_state)
     params = jax.tree.map(lambda x, d: x - hp.learning_rate * d, state.params, direction)
-    target_critics = optax.incremental_update(
-        params["critics"], state.target_critics, hp.target_update_rate
-    )
+    target_critics = optax.incremental_update(params["critics"], state.target_critics, hp.tau)
     return state.replace(params=params, target_critics=target_critics, opt_state=opt_state)
 
 

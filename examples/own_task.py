@@ -80,7 +80,7 @@ def main() -> None:
     sejax.configure_xla()  # a device for each core
     task = make_reacher(size=3)
     agent = sejax.make_agent(sejax.TD3Config(
-        init_episodes=1, batch_size=64, hidden_size=64, num_layers=1, learning_rate=3e-3,
+        warmup_episodes=1, batch_size=64, hidden_size=64, num_layers=1, learning_rate=3e-3,
     ), task)  # fmt: skip
     learn = sejax.make_learner(
         task=task, agent=agent, proxy=sejax.SyntheticConfig(hidden_size=32, done="threshold"),

@@ -37,7 +37,7 @@ def main() -> None:
         def train_and_test(key, evaluate=evaluate, env_params=env_params):
             return evaluate(key, env_params)
 
-        program = sejax.spread_over_devices(train_and_test, lanes=args.lanes)
+        program = sejax.spread_over_devices(train_and_test, num_parallel=args.num_parallel)
         program = jax.jit(program).lower(keys).compile()
         started = time.perf_counter()
         outcome = jax.block_until_ready(program(keys))

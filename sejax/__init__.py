@@ -17,16 +17,16 @@ __version__ = "0.2.0"
 _EXPORTS = {
     "AUC": "sejax.objectives",
     "AUCSum": "sejax.objectives",
-    "Agent": "sejax.agents.agent",
+    "Agent": "sejax.agents.base",
     "ConfigError": "sejax.errors",
     "CountBasedConfig": "sejax.agents.count_based",
-    "DDQNConfig": "sejax.agents.ddqn",
-    "DQNConfig": "sejax.agents.ddqn",
+    "DDQNConfig": "sejax.agents.dqn",
+    "DQNConfig": "sejax.agents.dqn",
     "DiscreteTD3Config": "sejax.agents.td3",
-    "DuelingDDQNConfig": "sejax.agents.ddqn",
+    "DuelingDDQNConfig": "sejax.agents.dqn",
     "EvosaxConfig": "sejax.es.evosax",
-    "Families": "sejax.families",
-    "FamiliesConfig": "sejax.families",
+    "Families": "sejax.agents.mixture",
+    "FamiliesConfig": "sejax.agents.mixture",
     "ICMConfig": "sejax.agents.icm",
     "LearnResult": "sejax.bilevel",
     "MaxReward": "sejax.objectives",
@@ -36,23 +36,23 @@ _EXPORTS = {
     "PPOConfig": "sejax.agents.ppo",
     "PretrainedProxy": "sejax.proxies.zoo",
     "Proxy": "sejax.proxies.files",
-    "ProxyEnv": "sejax.proxies.proxy",
-    "ProxyParams": "sejax.proxies.proxy",
+    "ProxyEnv": "sejax.proxies.base",
+    "ProxyParams": "sejax.proxies.base",
     "ProxySet": "sejax.proxies.files",
     "QLearningConfig": "sejax.agents.tabular",
     "RewardConfig": "sejax.proxies.configs",
     "RewardThreshold": "sejax.objectives",
     "SACConfig": "sejax.agents.sac",
     "SARSAConfig": "sejax.agents.tabular",
-    "Strategy": "sejax.es.strategy",
+    "Strategy": "sejax.es.base",
     "SyntheticConfig": "sejax.proxies.configs",
     "TD3Config": "sejax.agents.td3",
-    "Task": "sejax.envs.task",
-    "TrainResult": "sejax.trainer",
+    "Task": "sejax.envs.base",
+    "TrainResult": "sejax.training",
     "TrainingConfig": "sejax.training",
-    "Trials": "sejax.es.strategy",
-    "config": "sejax.app.compose",
-    "configure_xla": "sejax.app.runtime",
+    "Trials": "sejax.es.base",
+    "config": "sejax.cli.compose",
+    "configure_xla": "sejax.cli.runtime",
     "evaluate_agents": "sejax.evaluation",
     "load": "sejax.proxies.files",
     "load_proxy": "sejax.proxies.files",
@@ -60,39 +60,40 @@ _EXPORTS = {
     "make_agent": "sejax.agents",
     "make_evaluator": "sejax.evaluation",
     "make_learner": "sejax.bilevel",
-    "make_trainer": "sejax.trainer",
+    "make_trainer": "sejax.training",
     "pretrained": "sejax.proxies.zoo",
     "push": "sejax.proxies.sharing",
     "register_gymnax": "sejax.proxies.files",
     "save": "sejax.proxies.files",
     "save_set": "sejax.proxies.files",
-    "spread_over_devices": "sejax.parallel",
+    "spread_over_devices": "sejax.ops.parallel",
 }
 _MODULES = ("agents", "envs", "es", "gym", "options", "proxies")
 
 if TYPE_CHECKING:  # what a type checker and an editor see
     from sejax import agents, envs, es, gym, options, proxies
     from sejax.agents import make_agent
-    from sejax.agents.agent import Agent
+    from sejax.agents.base import Agent
     from sejax.agents.count_based import CountBasedConfig
-    from sejax.agents.ddqn import DDQNConfig, DQNConfig, DuelingDDQNConfig
+    from sejax.agents.dqn import DDQNConfig, DQNConfig, DuelingDDQNConfig
     from sejax.agents.icm import ICMConfig
+    from sejax.agents.mixture import Families, FamiliesConfig
     from sejax.agents.ppo import PPOConfig
     from sejax.agents.sac import SACConfig
     from sejax.agents.tabular import QLearningConfig, SARSAConfig
     from sejax.agents.td3 import DiscreteTD3Config, TD3Config
-    from sejax.app.compose import config
-    from sejax.app.runtime import configure_xla
     from sejax.bilevel import LearnResult, make_learner
-    from sejax.envs.task import Task
+    from sejax.cli.compose import config
+    from sejax.cli.runtime import configure_xla
+    from sejax.envs.base import Task
     from sejax.errors import ConfigError
+    from sejax.es.base import Strategy, Trials
     from sejax.es.evosax import EvosaxConfig
     from sejax.es.nes import NESConfig
-    from sejax.es.strategy import Strategy, Trials
     from sejax.evaluation import evaluate_agents, make_evaluator
-    from sejax.families import Families, FamiliesConfig
     from sejax.objectives import AUC, AUCSum, MaxReward, Objective, Outcome, RewardThreshold
-    from sejax.parallel import spread_over_devices
+    from sejax.ops.parallel import spread_over_devices
+    from sejax.proxies.base import ProxyEnv, ProxyParams
     from sejax.proxies.configs import RewardConfig, SyntheticConfig
     from sejax.proxies.files import (
         Proxy,
@@ -104,23 +105,70 @@ if TYPE_CHECKING:  # what a type checker and an editor see
         save,
         save_set,
     )
-    from sejax.proxies.proxy import ProxyEnv, ProxyParams
     from sejax.proxies.sharing import push
     from sejax.proxies.zoo import PretrainedProxy, pretrained
-    from sejax.trainer import TrainResult, make_trainer
-    from sejax.training import TrainingConfig
+    from sejax.training import TrainingConfig, TrainResult, make_trainer
 
 __all__ = [
-    "AUC", "AUCSum", "Agent", "ConfigError", "CountBasedConfig", "DDQNConfig", "DQNConfig",
-    "DiscreteTD3Config", "DuelingDDQNConfig", "EvosaxConfig", "Families", "FamiliesConfig",
-    "ICMConfig", "LearnResult", "MaxReward", "NESConfig", "Objective", "Outcome", "PPOConfig",
-    "PretrainedProxy", "Proxy", "ProxyEnv", "ProxyParams", "ProxySet", "QLearningConfig",
-    "RewardConfig", "RewardThreshold", "SACConfig", "SARSAConfig", "Strategy", "SyntheticConfig",
-    "TD3Config", "Task", "TrainResult", "TrainingConfig", "Trials", "agents", "config",
-    "configure_xla", "envs", "es", "evaluate_agents", "gym", "load", "load_proxy", "load_set",
-    "make_agent", "make_evaluator", "make_learner", "make_trainer", "options", "pretrained",
-    "proxies", "push", "register_gymnax", "save", "save_set", "spread_over_devices",
-]  # fmt: skip
+    "AUC",
+    "AUCSum",
+    "Agent",
+    "ConfigError",
+    "CountBasedConfig",
+    "DDQNConfig",
+    "DQNConfig",
+    "DiscreteTD3Config",
+    "DuelingDDQNConfig",
+    "EvosaxConfig",
+    "Families",
+    "FamiliesConfig",
+    "ICMConfig",
+    "LearnResult",
+    "MaxReward",
+    "NESConfig",
+    "Objective",
+    "Outcome",
+    "PPOConfig",
+    "PretrainedProxy",
+    "Proxy",
+    "ProxyEnv",
+    "ProxyParams",
+    "ProxySet",
+    "QLearningConfig",
+    "RewardConfig",
+    "RewardThreshold",
+    "SACConfig",
+    "SARSAConfig",
+    "Strategy",
+    "SyntheticConfig",
+    "TD3Config",
+    "Task",
+    "TrainResult",
+    "TrainingConfig",
+    "Trials",
+    "agents",
+    "config",
+    "configure_xla",
+    "envs",
+    "es",
+    "evaluate_agents",
+    "gym",
+    "load",
+    "load_proxy",
+    "load_set",
+    "make_agent",
+    "make_evaluator",
+    "make_learner",
+    "make_trainer",
+    "options",
+    "pretrained",
+    "proxies",
+    "push",
+    "register_gymnax",
+    "save",
+    "save_set",
+    "spread_over_devices",
+]
 
 
 def __getattr__(name: str) -> Any:

@@ -16,17 +16,18 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Float
 
-from sejax import flat, plugins
-from sejax.agents.agent import Agent
-from sejax.counters import exact, wide_add, wide_sum, wide_zeros
-from sejax.envs.task import Task
+from sejax import registry
+from sejax.agents.base import Agent
+from sejax.agents.mixture import Families
+from sejax.envs.base import Task
 from sejax.errors import require
-from sejax.es.strategy import Strategy, Trials, finite_mean
-from sejax.evaluation import lanes_on_cpu, make_evaluator, tested_throughout
-from sejax.families import Families
+from sejax.es.base import Strategy, Trials, finite_mean
+from sejax.evaluation import make_evaluator, num_parallel_on_cpu, tested_throughout
 from sejax.objectives import MaxReward, Objective, Outcome
-from sejax.parallel import copy_to_devices, spread_groups_over_devices, spread_over_devices
-from sejax.proxies.proxy import ProxyEnv
+from sejax.ops import flat
+from sejax.ops.counters import exact, wide_add, wide_sum, wide_zeros
+from sejax.ops.parallel import copy_to_devices, spread_groups_over_devices, spread_over_devices
+from sejax.proxies.base import ProxyEnv
 from sejax.training import TrainingConfig
 
 
@@ -44,7 +45,7 @@ class LearnState:
     best_score: Array
     best_scores: Float[Array, "seed family"]
     best_generation: Array
-    env_steps: Array  # a wide count, see `sejax.counters`
+    env_steps: Array  # a wide count, see `sejax.ops.counters`
     finished: Array  # stop_when_solved: the run is over and its generations cost nothing
 
 
@@ -127,7 +128,7 @@ class Program:
       proxy: what is learned.
       families: of agents that learn on it; one, if there is a single agent.
       family_of_trial: index of the family of each trial, `[trials]`.
-      cpu_lanes: agents of each family that train in lockstep on a CPU core; None for all.
+      cpu_num_parallel: agents of each family that train in lockstep on a CPU core; None for all.
       strategy: that learns it.
       objective: that it is learned by.
       num_dims: length of a parameter vector.
@@ -143,7 +144,7 @@ class Program:
     proxy: ProxyEnv
     families: Families
     family_of_trial: np.ndarray
-    cpu_lanes: tuple[int | None, ...]
+    cpu_num_parallel: tuple[int | None, ...]
     strategy: Strategy
     objective: Objective
     num_dims: int
@@ -177,7 +178,7 @@ def make_learner(
     generations: int = 50,
     stop_when_solved: bool = False,
     devices: int | None = None,
-    lanes: int | None = None,
+    num_parallel: int | None = None,
 ) -> Callable[[Array], LearnResult]:
     """Builds `learn(key) -> LearnResult`: all of Algorithm 1 as one pure function.
 
@@ -199,7 +200,7 @@ def make_learner(
       generations: n_o of Algorithm 1.
       stop_when_solved: whether a run ends at its first incumbent mean above the threshold.
       devices: to spread the population over; None for all.
-      lanes: agents in lockstep on one device; None for what suits agent and device.
+      num_parallel: agents in lockstep on one device; None for what suits agent and device.
 
     Raises:
       ConfigError: if the parts do not fit each other, or there are not so many devices.
@@ -222,9 +223,16 @@ def make_learner(
     if task is None or agent is None:
         raise TypeError("make_learner needs a configuration, or a task and an agent.")
     program = make_program(
-        task=task, agent=agent, proxy=proxy, es=es, objective=objective, training=training,
-        stop_when_solved=stop_when_solved, devices=devices, lanes=lanes,
-    )  # fmt: skip
+        task=task,
+        agent=agent,
+        proxy=proxy,
+        es=es,
+        objective=objective,
+        training=training,
+        stop_when_solved=stop_when_solved,
+        devices=devices,
+        num_parallel=num_parallel,
+    )
 
     def learn(key: Array) -> LearnResult:
         state, info = jax.lax.scan(
@@ -254,7 +262,7 @@ def make_program(
     training: TrainingConfig | None = None,
     stop_when_solved: bool = False,
     devices: int | None = None,
-    lanes: int | None = None,
+    num_parallel: int | None = None,
 ) -> Program:
     """Assembles the bilevel loop for `[seed]` independent runs; arguments as of `make_learner`."""
     proxy, objective = _proxy_of(proxy, task), _objective_of(objective, task)
@@ -271,17 +279,27 @@ def make_program(
     family_of_member = families.of_members(strategy.num_members, strategy.num_signs)
     family_of_trial = trials.families(family_of_member, families.size)
     evaluate_all = make_population_evaluator(
-        families, proxy, training, unravel, family_of_trial, devices, lanes
+        families, proxy, training, unravel, family_of_trial, devices, num_parallel
     )
-    cpu_lanes = tuple(lanes_on_cpu(agent, training) for agent in families.agents)
+    cpu_num_parallel = tuple(num_parallel_on_cpu(agent, training) for agent in families.agents)
     seed_ids = jnp.asarray(trials.seed_ids(strategy.num_members))
     one_unit = families.size == 1 and objective.test_steps is None
-    require(one_unit or not strategy.remembers_scores, "es", "be one that compares the members of "
-            "a generation alone", "several families, or a curriculum, give each generation's "
-            "scores a unit of its own", "one that remembers scores", "es=nes")  # fmt: skip
-    require(not stop_when_solved or (objective.scores_are_returns and task.is_solvable),
-            "stop_when_solved", "be false with this objective and task", "nobody says which score "
-            "solves it", "true", "stop_when_solved=false")  # fmt: skip
+    require(
+        one_unit or not strategy.remembers_scores,
+        "es",
+        "be one that compares the members of a generation alone",
+        "several families, or a curriculum, give each generation's scores a unit of its own",
+        "one that remembers scores",
+        "es=nes",
+    )
+    require(
+        not stop_when_solved or (objective.scores_are_returns and task.is_solvable),
+        "stop_when_solved",
+        "be false with this objective and task",
+        "nobody says which score solves it",
+        "true",
+        "stop_when_solved=false",
+    )
 
     def init(keys: Array) -> LearnState:
         num_seeds = keys.shape[0]
@@ -354,7 +372,7 @@ def make_program(
 
     def share_of(family: int) -> Callable[..., Outcome]:
         trial = make_trial(families.agents[family], proxy, training, unravel)
-        return spread_over_devices(trial, 1, lanes, cpu_lanes[family])
+        return spread_over_devices(trial, 1, num_parallel, cpu_num_parallel[family])
 
     return Program(
         init=init,
@@ -367,7 +385,7 @@ def make_program(
         proxy=proxy,
         families=families,
         family_of_trial=family_of_trial,
-        cpu_lanes=cpu_lanes,
+        cpu_num_parallel=cpu_num_parallel,
         strategy=strategy,
         objective=objective,
         num_dims=num_dims,
@@ -424,8 +442,9 @@ class Scores:
     ) -> "Scores":
         tried, incumbent = jax.vmap(trials.split)(scores)
         family_tried, family_incumbent = (
-            family_of_trial[: tried.shape[1]], family_of_trial[tried.shape[1] :]
-        )  # fmt: skip
+            family_of_trial[: tried.shape[1]],
+            family_of_trial[tried.shape[1] :],
+        )
         means = []
         for i in range(families.size):
             places = np.flatnonzero(family_incumbent == i)
@@ -435,8 +454,13 @@ class Scores:
             incumbent = incumbent.at[:, places].set(repaired)
             means.append(mean)
         family_means = jnp.stack(means, axis=1)
-        return cls(all=scores, tried=tried, incumbent=incumbent, family_means=family_means,
-                   incumbent_mean=jax.vmap(families.aggregated)(family_means))  # fmt: skip
+        return cls(
+            all=scores,
+            tried=tried,
+            incumbent=incumbent,
+            family_means=family_means,
+            incumbent_mean=jax.vmap(families.aggregated)(family_means),
+        )
 
 
 def _advance(
@@ -512,7 +536,7 @@ def make_population_evaluator(
     unravel: Callable[[Array], Any],
     family_of_trial: np.ndarray,
     devices: int | None = None,
-    lanes: int | None = None,
+    num_parallel: int | None = None,
 ) -> Callable[..., Outcome]:
     """Builds `evaluate(keys, candidates, active, test_steps=None) -> Outcome`.
 
@@ -520,26 +544,33 @@ def make_population_evaluator(
     episodes is scored, `[seed]`. It trains one fresh agent on each candidate and tests it on the
     real task; leaves `[seed, n, ...]`. The trainings are spread over the devices, each device's
     family by family, as it is known when the program is built which family trains on which
-    candidate: no training pays for another family's. Groups of `lanes` of them follow one another.
+    candidate: no training pays for another family's. Batches of `num_parallel` follow one another.
     """
 
     places = [np.flatnonzero(family_of_trial == i) for i in range(families.size)]
     order = np.argsort(np.concatenate(places))
     evaluate_groups = spread_groups_over_devices(
-        [make_trial(agent, proxy, training, unravel) for agent in families.agents], devices, lanes,
-        [lanes_on_cpu(agent, training) for agent in families.agents],
-    )  # fmt: skip
+        [make_trial(agent, proxy, training, unravel) for agent in families.agents],
+        devices,
+        num_parallel,
+        [num_parallel_on_cpu(agent, training) for agent in families.agents],
+    )
 
     def evaluate_all(
         keys: Array, candidates: Array, active: Array, test_steps: Array | None = None
     ) -> Outcome:
         num_seeds, _, num_dims = candidates.shape
         of_seeds = (active, test_steps)
-        outcomes = evaluate_groups([
-            (keys[:, own].reshape(-1), candidates[:, own].reshape(-1, num_dims),
-             *jax.tree.map(lambda x, n=own.size: jnp.repeat(x, n), of_seeds))
-            for own in places
-        ])  # fmt: skip
+        outcomes = evaluate_groups(
+            [
+                (
+                    keys[:, own].reshape(-1),
+                    candidates[:, own].reshape(-1, num_dims),
+                    *jax.tree.map(lambda x, n=own.size: jnp.repeat(x, n), of_seeds),
+                )
+                for own in places
+            ]
+        )
 
         def merged(*parts: Array) -> Array:
             by_seed = [x.reshape(num_seeds, -1, *x.shape[1:]) for x in parts]
@@ -571,16 +602,21 @@ def _proxy_of(proxy: Any, task: Task) -> ProxyEnv:
         from sejax.proxies.configs import SyntheticConfig
 
         proxy = SyntheticConfig()
-    made = plugins.make("proxy", proxy, task) if hasattr(proxy, "make") else proxy
-    require(made.task is task, "proxy", "be one of the task given", "agents are tested there",
-            f"one of another ({made.task.name})",
-            "proxy to a configuration, or task to the proxy's")  # fmt: skip
+    made = registry.make("proxy", proxy, task) if hasattr(proxy, "make") else proxy
+    require(
+        made.task is task,
+        "proxy",
+        "be one of the task given",
+        "agents are tested there",
+        f"one of another ({made.task.name})",
+        "proxy to a configuration, or task to the proxy's",
+    )
     return made
 
 
 def _objective_of(objective: Any, task: Task) -> Objective:
     objective = MaxReward() if objective is None else objective
-    return plugins.make("objective", objective, task) if hasattr(objective, "make") else objective
+    return registry.make("objective", objective, task) if hasattr(objective, "make") else objective
 
 
 def _strategy_of(es: Any, num_dims: int) -> Strategy:
@@ -588,7 +624,7 @@ def _strategy_of(es: Any, num_dims: int) -> Strategy:
         from sejax.es.nes import NESConfig
 
         es = NESConfig()
-    return es if isinstance(es, Strategy) else plugins.make("es", es, num_dims)
+    return es if isinstance(es, Strategy) else registry.make("es", es, num_dims)
 
 
 def _strongly_typed(x: Array) -> Array:

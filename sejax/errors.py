@@ -60,8 +60,14 @@ def at_least(minimum: float, name: str, value: Any, reason: str, fix: Any) -> No
     Raises:
       ConfigError: if it is below, or no number.
     """
-    require(is_number(value) and value >= minimum, name, f"be at least {minimum}", reason, value,
-            f"{name}={fix}")  # fmt: skip
+    require(
+        is_number(value) and value >= minimum,
+        name,
+        f"be at least {minimum}",
+        reason,
+        value,
+        f"{name}={fix}",
+    )
 
 
 def whole(minimum: int, name: str, value: Any, reason: str, fix: Any, most: int = LARGEST) -> None:
@@ -82,10 +88,22 @@ def positive(name: str, value: Any, reason: str, fix: Any, at_most: float = math
     Raises:
       ConfigError: if it is none, or above `at_most`.
     """
-    require(is_number(value) and 0 < value < math.inf, name, "be above 0 and finite",
-            reason, value, f"{name}={fix}")  # fmt: skip
-    require(value <= at_most, name, f"be at most {at_most:g}", "the numbers that come of it would "
-            "not be finite", value, f"{name}={fix}")  # fmt: skip
+    require(
+        is_number(value) and 0 < value < math.inf,
+        name,
+        "be above 0 and finite",
+        reason,
+        value,
+        f"{name}={fix}",
+    )
+    require(
+        value <= at_most,
+        name,
+        f"be at most {at_most:g}",
+        "the numbers that come of it would not be finite",
+        value,
+        f"{name}={fix}",
+    )
 
 
 def fraction(name: str, value: Any, fix: Any) -> None:
@@ -94,8 +112,14 @@ def fraction(name: str, value: Any, fix: Any) -> None:
     Raises:
       ConfigError: if it is none.
     """
-    require(is_number(value) and 0 <= value <= 1, name, "lie in [0, 1]", "it is a fraction", value,
-            f"{name}={fix}")  # fmt: skip
+    require(
+        is_number(value) and 0 <= value <= 1,
+        name,
+        "lie in [0, 1]",
+        "it is a fraction",
+        value,
+        f"{name}={fix}",
+    )
 
 
 def one_of(name: str, value: str, known: Collection[str]) -> None:
@@ -120,8 +144,14 @@ def require_seed(name: str, seed: Any) -> None:
     Raises:
       ConfigError: if it is not.
     """
-    require(is_number(seed) and 0 <= seed < 2**31, name, "lie in [0, 2**31)",
-            "it is a 32-bit number", seed, f"{name}=0")  # fmt: skip
+    require(
+        is_number(seed) and 0 <= seed < 2**31,
+        name,
+        "lie in [0, 2**31)",
+        "it is a 32-bit number",
+        seed,
+        f"{name}=0",
+    )
 
 
 def is_number(value: Any) -> bool:
@@ -138,5 +168,8 @@ def as_python(value: Any) -> Any:
         number = value.item()
     except (TypeError, NotImplementedError):  # a traced one has no value yet, a key has none
         return value
-    return float(number) if isinstance(number, numbers.Real) and not isinstance(
-        number, bool | int | float) else number  # fmt: skip
+    return (
+        float(number)
+        if isinstance(number, numbers.Real) and not isinstance(number, bool | int | float)
+        else number
+    )

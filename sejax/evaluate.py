@@ -10,11 +10,12 @@ from typing import Any
 import hydra
 from omegaconf import DictConfig
 
-from sejax import hub, plugins
-from sejax.app import build, commands, compose, runtime
-from sejax.app.build import EvaluateConfig
-from sejax.app.families import AgentFamily, families_of, named
+from sejax import registry
+from sejax.cli import build, commands, compose, runtime
+from sejax.cli.build import EvaluateConfig
+from sejax.cli.families import AgentFamily, families_of, named
 from sejax.errors import ConfigError, require, told
+from sejax.proxies import hub
 from sejax.training import TrainingConfig, require_reachable
 
 
@@ -43,8 +44,8 @@ def evaluate(config: EvaluateConfig) -> float:
     """
     import pandas as pd
 
-    from sejax.app import plots
-    from sejax.files import require_writable, write_text
+    from sejax.cli import plots
+    from sejax.ops.files import require_writable, write_text
 
     study = _real_study(config) if config.proxy == "real" else proxy_study(config)
     out_dir, solved_reward = study.out_dir, study.task.solved_reward
@@ -55,8 +56,11 @@ def evaluate(config: EvaluateConfig) -> float:
             f"out_dir must be a folder that files can be written to, because what agents return is "
             f"kept there; got {out_dir} ({told(error)}). Set out_dir=DIR."
         ) from error
-    tables = {(world, family.key): _train_and_test(config, study, world, family)
-              for world in study.worlds for family in study.families}  # fmt: skip
+    tables = {
+        (world, family.key): _train_and_test(config, study, world, family)
+        for world in study.worlds
+        for family in study.families
+    }
     table = pd.concat([t.assign(world=world) for (world, _), t in tables.items()])
     summary = summarise(table, ["world", "agent"] if study.has_several else ["world"])
     _print_table(summary, study, config)
@@ -117,9 +121,11 @@ def _real_study(config: EvaluateConfig) -> Study:
     from sejax import agents, envs
 
     if config.env is None:
-        raise ConfigError("env must be given with proxy=real, because the task cannot be read "
-                          "from a proxy; got none. Set env=cartpole.")  # fmt: skip
-    spec = plugins.configure("env", {"name": config.env})
+        raise ConfigError(
+            "env must be given with proxy=real, because the task cannot be read "
+            "from a proxy; got none. Set env=cartpole."
+        )
+    spec = registry.configure("env", {"name": config.env})
     families = families_of(config)
     for family in families:
         with named(family.field):
@@ -128,8 +134,9 @@ def _real_study(config: EvaluateConfig) -> Study:
     training = {family.key: config.real_training for family in families}
     worlds = {"the real task": (task.env, task.params, training)}
     out_dir = Path(config.out_dir or Path("runs", f"evaluate-{_as_file_name(task.name)}"))
-    return Study(task=task, worlds=worlds, families=families, exploration=config.exploration,
-                 out_dir=out_dir)  # fmt: skip
+    return Study(
+        task=task, worlds=worlds, families=families, exploration=config.exploration, out_dir=out_dir
+    )
 
 
 def proxy_study(config: EvaluateConfig) -> Study:
@@ -140,13 +147,17 @@ def proxy_study(config: EvaluateConfig) -> Study:
     proxy = _load(config)
     task = proxy.task
     if config.env not in (None, task.name, proxy.config["env"].get("name")):
-        raise ConfigError(f"env must be the proxy's own task, because agents trained on it are "
-                          f"tested there; got {config.env} for a proxy of {task.name}. Set "
-                          f"env={task.name}.")  # fmt: skip
+        raise ConfigError(
+            f"env must be the proxy's own task, because agents trained on it are "
+            f"tested there; got {config.env} for a proxy of {task.name}. Set "
+            f"env={task.name}."
+        )
     families, exploration = families_of(config), config.exploration
     if config.agent_hparams == "as_learned":
-        families = tuple(AgentFamily(key=key, field="agent", agent=agent)
-                         for key, agent in proxy.learned_agents().items())  # fmt: skip
+        families = tuple(
+            AgentFamily(key=key, field="agent", agent=agent)
+            for key, agent in proxy.learned_agents().items()
+        )
         exploration = proxy.learned_with("exploration")
     trainings = {}
     for family in families:
@@ -158,15 +169,21 @@ def proxy_study(config: EvaluateConfig) -> Study:
             if trains and proxy.env.world.max_steps is not None:
                 require_reachable(group, training, proxy.env.world.max_steps)
             if getattr(proxy.env.config, "lasts_to_the_limit", False):
-                build.require_learning(group, training, family.agent, proxy.env.world.max_steps,
-                                       task.max_steps)  # fmt: skip
+                build.require_learning(
+                    group, training, family.agent, proxy.env.world.max_steps, task.max_steps
+                )
         trainings[family.key] = training
     worlds = {"the proxy": (proxy.env, proxy.params, trainings)}
     if config.baseline:
         for family in families:
-            require(not getattr(family.agent, "is_solved_for", False), "baseline", "be false with "
-                    f"{family.field}={family.key}", "only a one-step SE can be solved for", "true",
-                    "baseline=false")  # fmt: skip
+            require(
+                not getattr(family.agent, "is_solved_for", False),
+                "baseline",
+                f"be false with {family.field}={family.key}",
+                "only a one-step SE can be solved for",
+                "true",
+                "baseline=false",
+            )
         real_training = dict.fromkeys(trainings, _real_training(config, proxy))
         worlds["the real task"] = (task.env, task.params, real_training)
     beside = proxy.path.parent
@@ -174,8 +191,13 @@ def proxy_study(config: EvaluateConfig) -> Study:
         beside = Path("runs", f"evaluate-{proxy.path.stem}")
     elif hub.is_address(config.proxy):
         beside = Path("runs", f"evaluate-{_as_file_name(config.proxy.removeprefix(hub.SCHEME))}")
-    return Study(task=task, worlds=worlds, families=families, exploration=exploration,
-                 out_dir=Path(config.out_dir or beside))  # fmt: skip
+    return Study(
+        task=task,
+        worlds=worlds,
+        families=families,
+        exploration=exploration,
+        out_dir=Path(config.out_dir or beside),
+    )
 
 
 def _load(config: EvaluateConfig) -> Any:
@@ -186,12 +208,12 @@ def _load(config: EvaluateConfig) -> Any:
     path = files.find(config.proxy, "proxy", also=("real",))
     stored = files.read_config(path, "proxy")
     task = proxy = None
-    if config.env is not None and not plugins.is_registered("env", config.env):
+    if config.env is not None and not registry.is_registered("env", config.env):
         fields = stored["env"] if stored["env"].get("name") == config.env else {}
-        task = envs.make_from(plugins.configure("env", {**fields, "name": config.env}))
+        task = envs.make_from(registry.configure("env", {**fields, "name": config.env}))
     if config.proxy_kind is not None:
         fields = {**stored["proxy"], "name": config.proxy_kind}
-        proxy = plugins.configure("proxy", fields)
+        proxy = registry.configure("proxy", fields)
     return files.load_proxy(path, task, proxy, "proxy")
 
 
@@ -201,10 +223,15 @@ def _training_on(proxy: Any, config: EvaluateConfig, agent: Any) -> tuple[str, A
         return "training", config.training
     if proxy.env.is_real:  # agents train and stop as on the real task
         return "real_training", _real_training(config, proxy)
-    require("training" in proxy.config, "training_from", "be config for an SE whose file does not "
-            "say how long agents trained on it", "tests on the real task must not stop them",
-            config.training_from, "training_from=config training.stop_rule=never "
-            "training.max_steps=2000 training.max_episodes=2000")  # fmt: skip
+    require(
+        "training" in proxy.config,
+        "training_from",
+        "be config for an SE whose file does not say how long agents trained on it",
+        "tests on the real task must not stop them",
+        config.training_from,
+        "training_from=config training.stop_rule=never "
+        "training.max_steps=2000 training.max_episodes=2000",
+    )
     test_episodes = config.real_training.test_episodes
     training = dataclasses.replace(proxy.training_for(agent), test_episodes=test_episodes)
     return "real_training", training
@@ -217,10 +244,14 @@ def _real_training(config: EvaluateConfig, proxy: Any) -> TrainingConfig:
         return config.real_training
     is_terminal = proxy.learned_with("training").time_limit_is_terminal
     usual = TrainingConfig().time_limit_is_terminal
-    require(config.real_training.time_limit_is_terminal in (usual, is_terminal),
-            "real_training.time_limit_is_terminal", "be left out with agent_hparams=as_learned",
-            "the proxy says how its agents took the limit", "false",
-            "agent_hparams=default, or leave it out")  # fmt: skip
+    require(
+        config.real_training.time_limit_is_terminal in (usual, is_terminal),
+        "real_training.time_limit_is_terminal",
+        "be left out with agent_hparams=as_learned",
+        "the proxy says how its agents took the limit",
+        "false",
+        "agent_hparams=default, or leave it out",
+    )
     return dataclasses.replace(config.real_training, time_limit_is_terminal=is_terminal)
 
 
@@ -231,7 +262,7 @@ def _train_and_test(config: EvaluateConfig, study: Study, world: str, family: Ag
     import pandas as pd
 
     from sejax.agents import make_agent
-    from sejax.app.progress import Tally
+    from sejax.cli.progress import Tally
     from sejax.evaluation import evaluate_agents
 
     env, env_params, trainings = study.worlds[world]
@@ -242,9 +273,16 @@ def _train_and_test(config: EvaluateConfig, study: Study, world: str, family: Ag
     started = time.time()
     with Tally(config.num_agents, f"{who} on {world}") as tally:
         outcome = evaluate_agents(
-            agent, env, env_params, study.task, trainings[family.key], keys, config.lanes,
-            config.devices, tally.add if tally.is_live else None,
-        )  # fmt: skip
+            agent,
+            env,
+            env_params,
+            study.task,
+            trainings[family.key],
+            keys,
+            config.num_parallel,
+            config.devices,
+            tally.add if tally.is_live else None,
+        )
         outcome = jax.device_get(outcome)
     drawn = jax.device_get(jax.vmap(agent.drawn_values)(keys))
     print(f"{world}: {config.num_agents} {who} in {time.time() - started:.1f} s", flush=True)
@@ -261,7 +299,7 @@ def _print_table(summary: Any, study: Study, config: EvaluateConfig) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    from sejax.app.report import spread
+    from sejax.cli.report import spread
 
     agents = "agents of each family" if study.has_several else f"{study.families[0].key} agents"
     solved_at = study.task.solved_reward
@@ -282,8 +320,9 @@ def _print_table(summary: Any, study: Study, config: EvaluateConfig) -> None:
     diverged = int(summary["num_nonfinite"].sum())
     if diverged:
         console.print(f"{diverged} agents met a number that is not finite.")
-    console.print(f"{study.out_dir}/evaluation.csv, .json and .png hold every agent.",
-                  soft_wrap=True)  # fmt: skip
+    console.print(
+        f"{study.out_dir}/evaluation.csv, .json and .png hold every agent.", soft_wrap=True
+    )
 
 
 def _as_file_name(name: str) -> str:

@@ -12,15 +12,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from sejax.agents.agent import Agent
-from sejax.envs.task import Task
+from sejax.agents.base import Agent
+from sejax.envs.base import Task
 from sejax.errors import require
 from sejax.objectives import Outcome
-from sejax.parallel import compiler_options, spread_over_devices
-from sejax.proxies.proxy import world_of
+from sejax.ops.parallel import compiler_options, spread_over_devices
+from sejax.proxies.base import world_of
 from sejax.rollout import Steps, make_recorder, make_tester
-from sejax.trainer import TrainResult, make_trainer
-from sejax.training import TrainingConfig
+from sejax.training import TrainingConfig, TrainResult, make_trainer
 
 
 @overload
@@ -54,7 +53,7 @@ def make_evaluator(
     Example:
       >>> import sejax
       >>> env, params = sejax.load("cartpole")
-      >>> agent = sejax.make_agent(sejax.DDQNConfig(init_episodes=1), env.task)
+      >>> agent = sejax.make_agent(sejax.DDQNConfig(warmup_episodes=1), env.task)
       >>> training = sejax.TrainingConfig(max_steps=2000, max_episodes=2000, stop_rule="never")
       >>> evaluate = make_evaluator(agent, env, env.task, training)
       >>> outcome = jax.eval_shape(evaluate, jax.random.key(0), params)
@@ -62,8 +61,14 @@ def make_evaluator(
       (10,)
     """
 
-    require(isinstance(task, Task), "task", "be a sejax.Task", "agents are tested on it",
-            type(task).__name__, "task=env.task of a proxy, or sejax.envs.make(name)")  # fmt: skip
+    require(
+        isinstance(task, Task),
+        "task",
+        "be a sejax.Task",
+        "agents are tested on it",
+        type(task).__name__,
+        "task=env.task of a proxy, or sejax.envs.make(name)",
+    )
 
     def make_run(agent: Agent) -> Callable[..., Any]:
         test = make_tester(agent, task, training.test_episodes)
@@ -96,9 +101,13 @@ def make_evaluator(
     )
 
 
-def lanes_on_cpu(agent: Agent, training: TrainingConfig) -> int | None:
+def num_parallel_on_cpu(agent: Agent, training: TrainingConfig) -> int | None:
     """Agents in lockstep on a CPU core: 1 where they would wait for the one that trains longest."""
-    return 1 if agent.cpu_lanes is not None and not training.is_fixed_length else agent.cpu_lanes
+    return (
+        1
+        if agent.cpu_num_parallel is not None and not training.is_fixed_length
+        else agent.cpu_num_parallel
+    )
 
 
 def make_tested_trainer(
@@ -158,7 +167,7 @@ def evaluate_agents(
     task: Any,
     training: TrainingConfig,
     keys: Array,
-    lanes: int | None = None,
+    num_parallel: int | None = None,
     devices: int | None = None,
     on_done: Callable[[], None] | None = None,
 ) -> Outcome:
@@ -178,5 +187,5 @@ def evaluate_agents(
             jax.debug.callback(lambda _: on_done(), outcome.test_return)
         return outcome
 
-    program = spread_over_devices(one, devices, lanes, lanes_on_cpu(agent, training))
+    program = spread_over_devices(one, devices, num_parallel, num_parallel_on_cpu(agent, training))
     return jax.jit(program, compiler_options=compiler_options())(keys)

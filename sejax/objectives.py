@@ -131,16 +131,23 @@ class RewardThreshold(Options):
         Raises:
           ConfigError: if nobody says when the task is solved.
         """
-        require(task.is_solvable, "objective", "be one that needs no threshold in this task",
-                "nobody says which return solves it", "reward_threshold",
-                "env.solved_reward, or objective=max_reward")  # fmt: skip
+        require(
+            task.is_solvable,
+            "objective",
+            "be one that needs no threshold in this task",
+            "nobody says which return solves it",
+            "reward_threshold",
+            "env.solved_reward, or objective=max_reward",
+        )
 
         def score(outcome: Outcome) -> Array:
             shortfall = jnp.maximum(0.0, task.solved_reward - outcome.test_return)
             return -(outcome.train_steps + self.unsolved_weight * shortfall)
 
-        meaning = (f"minus the training steps of its agents, and {self.unsolved_weight:g} for each "
-                   f"unit of return below {task.solved_reward:g}")  # fmt: skip
+        meaning = (
+            f"minus the training steps of its agents, and {self.unsolved_weight:g} for each "
+            f"unit of return below {task.solved_reward:g}"
+        )
         return Objective(score=score, meaning=meaning)
 
 

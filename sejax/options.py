@@ -20,7 +20,7 @@ from typing import Any, ClassVar
 
 from sejax import errors
 
-ACTIVATIONS = ("tanh", "fast_tanh", "relu", "leaky_relu", "prelu")  # of `sejax.networks`
+ACTIVATIONS = ("tanh", "fast_tanh", "relu", "leaky_relu", "prelu")  # of `sejax.ops.networks`
 MOVES = "the agent would not move"  # otherwise: why learning rates are above 0
 MOST_MEMBERS = 100_000  # of a population, each with the weights of a proxy
 MOST_LAYERS = 100  # layers and blocks of a network are traced one by one
@@ -82,7 +82,7 @@ def traced_options(config: Any) -> dict[str, Any]:
 def marks(cls: type, name: str) -> dict[str, Any]:
     """What `option` says of a field: its own, else that of the class which a subclass overrides.
 
-    So that `init_episodes: int = 5` in a subclass changes the default alone.
+    So that `warmup_episodes: int = 5` in a subclass changes the default alone.
     """
     found: dict[str, Any] = {}
     for base in reversed(cls.__mro__):
@@ -115,9 +115,13 @@ def not_negative(reason: str = "it is a size") -> Rule:
 def finite(reason: str) -> Rule:
     """A finite number, of either sign."""
     return lambda name, value, default: errors.require(
-        errors.is_number(value) and abs(value) < float("inf"), name, "be finite", reason, value,
+        errors.is_number(value) and abs(value) < float("inf"),
+        name,
+        "be finite",
+        reason,
+        value,
         f"{name}={default}",
-    )  # fmt: skip
+    )
 
 
 def positive(reason: str, at_most: float = float("inf")) -> Rule:
@@ -133,9 +137,13 @@ def fraction() -> Rule:
 def shrinks() -> Rule:
     """A factor in (0, 1]."""
     return lambda name, value, default: errors.require(
-        errors.is_number(value) and 0 < value <= 1, name, "lie in (0, 1]",
-        "it shrinks each generation", value, f"{name}={default:g}",
-    )  # fmt: skip
+        errors.is_number(value) and 0 < value <= 1,
+        name,
+        "lie in (0, 1]",
+        "it shrinks each generation",
+        value,
+        f"{name}={default:g}",
+    )
 
 
 def or_none(rule: Rule) -> Rule:

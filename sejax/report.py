@@ -8,7 +8,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from sejax.app import commands
+from sejax.cli import commands
 from sejax.errors import require
 
 USAGE = """python -m sejax.report RUN_DIR... [out=FILE]
@@ -49,15 +49,27 @@ def report(folders: Sequence[Path], out: Path | None = None) -> Path:
       ConfigError: if there is no run, or one that cannot be read.
       OSError: if the file cannot be written.
     """
-    from sejax.app import report as pages
-    from sejax.files import write_text
+    from sejax.cli import report as pages
+    from sejax.ops.files import write_text
 
-    require(folders, "RUN_DIR", "be given", "the report is about it", "none",
-            "one or several: python -m sejax.report runs/cartpole-se-ddqn-s0")  # fmt: skip
+    require(
+        folders,
+        "RUN_DIR",
+        "be given",
+        "the report is about it",
+        "none",
+        "one or several: python -m sejax.report runs/cartpole-se-ddqn-s0",
+    )
     if out is None:
         out = Path(folders[0] if len(folders) == 1 else ".", "report.html")
-    require(not out.is_dir(), "out", "be a file", "the page is written there", f"the folder {out}",
-            f"out={out / 'report.html'}")  # fmt: skip
+    require(
+        not out.is_dir(),
+        "out",
+        "be a file",
+        "the page is written there",
+        f"the folder {out}",
+        f"out={out / 'report.html'}",
+    )
     write_text(out, pages.page(pages.read(folders)))
     return out
 

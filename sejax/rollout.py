@@ -11,9 +11,9 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
-from sejax.agents.agent import Agent
-from sejax.keys import step_keys
-from sejax.loops import while_any_active
+from sejax.agents.base import Agent
+from sejax.ops.keys import step_keys
+from sejax.ops.loops import while_any_active
 
 
 class Steps(NamedTuple):

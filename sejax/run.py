@@ -8,8 +8,8 @@ import dataclasses
 import hydra
 from omegaconf import DictConfig
 
-from sejax.app import commands, compose, runtime
-from sejax.app.build import IN_RUN_DIR, LearnConfig
+from sejax.cli import commands, compose, runtime
+from sejax.cli.build import IN_RUN_DIR, LearnConfig
 
 
 @hydra.main(config_path="conf", config_name="run", version_base="1.3")
@@ -37,23 +37,25 @@ def learn(config: LearnConfig) -> float:
       ConfigError: if the run directory cannot be used.
       OSError: if a file cannot be written; everything saved before is whole.
     """
-    from sejax.app.progress import RunProgress
+    from sejax.cli.progress import RunProgress
 
     # Before the task is imported: a refusal must be quick.
-    from sejax.app.run_directory import open_for
+    from sejax.cli.run_directory import open_for
 
     with open_for(config) as directory, RunProgress(config) as progress:
         try:
             progress.say("importing jax and the task")
-            from sejax.app import session
+            from sejax.cli import session
 
             runtime.configure_jax()
             with config.machines.make(config, directory.path, progress.print) as chunks:
                 ended = session.run(config, directory, chunks, progress)
         except KeyboardInterrupt:
             progress.stop()
-            print(f"Interrupted. {directory.finished_generations} generations are saved in "
-                  f"{directory.path}; the same command goes on from there.")  # fmt: skip
+            print(
+                f"Interrupted. {directory.finished_generations} generations are saved in "
+                f"{directory.path}; the same command goes on from there."
+            )
             commands.leave(commands.INTERRUPTED)
         best = max(float(row["best_so_far"]) for row in directory.rows)
         progress.finish(directory, chunks.program, best, ended)

@@ -16,6 +16,10 @@ from sejax.errors import ConfigError, nearest, require, shortened
 _WORDS = {bool: "true or false", int: "a whole number", float: "a number", str: "a word"}
 
 
+# Fields that had another name in files of older versions.
+RENAMED = {"init_episodes": "warmup_episodes", "target_update_rate": "tau", "lanes": "num_parallel"}
+
+
 def to_plain(config: Any) -> dict[str, Any]:
     """The fields of a dataclass as plain values: numbers, words, None, lists and dictionaries."""
     fields = [field.name for field in dataclasses.fields(config) if field.init]
@@ -42,7 +46,8 @@ def from_plain(cls: Any, values: Mapping[str, Any], where: str) -> Any:
             f"them; got {cls.__name__}, where {error}. Import it where the class is defined."
         ) from error
     given = {}
-    for name, value in values.items():
+    for stored_name, value in values.items():
+        name = stored_name if stored_name in fields else RENAMED.get(stored_name, stored_name)
         if name not in fields:
             known = nearest(str(name), fields)
             raise ConfigError(
@@ -92,8 +97,9 @@ def differences(
         for name in sorted(old.keys() | asked.keys())
         if name.partition(".")[0] not in free
         # In the second way nan is nan.
-        and old.get(name) != asked.get(name) and repr(old.get(name)) != repr(asked.get(name))
-    ]  # fmt: skip
+        and old.get(name) != asked.get(name)
+        and repr(old.get(name)) != repr(asked.get(name))
+    ]
     more = f" and {len(differing) - most} more" if len(differing) > most else ""
     return ", ".join(differing[:most]) + more
 
@@ -128,18 +134,36 @@ def _convert(value: Any, hint: Any, name: str, field: Any) -> Any:
                 return _convert(value, kind, name, field)
         return _convert(value, last, name, field)
     if origin is typing.Literal:
-        require(value in arguments, name, f"be one of {', '.join(map(str, arguments))}",
-                "nothing else is known", value, f"{name}={arguments[0]}")  # fmt: skip
+        require(
+            value in arguments,
+            name,
+            f"be one of {', '.join(map(str, arguments))}",
+            "nothing else is known",
+            value,
+            f"{name}={arguments[0]}",
+        )
         return value
     if origin in (tuple, list) or hint in (tuple, list):
-        require(isinstance(value, list | tuple), name, "be a list", "it holds several values",
-                repr(value), f"{name}=[...]")  # fmt: skip
+        require(
+            isinstance(value, list | tuple),
+            name,
+            "be a list",
+            "it holds several values",
+            repr(value),
+            f"{name}=[...]",
+        )
         kind = arguments[0] if arguments else Any
         return (origin or hint)(_convert(x, kind, name, field) for x in value)
     if isinstance(hint, type) and dataclasses.is_dataclass(hint) and not isinstance(value, hint):
         known = ", ".join(x.name for x in dataclasses.fields(hint))
-        require(isinstance(value, Mapping), name, f"have the fields {known}", "it is more than one "
-                "value", repr(value), f"{name}.{known.partition(',')[0]}=VALUE")  # fmt: skip
+        require(
+            isinstance(value, Mapping),
+            name,
+            f"have the fields {known}",
+            "it is more than one value",
+            repr(value),
+            f"{name}.{known.partition(',')[0]}=VALUE",
+        )
         return from_plain(hint, value, name)
     if hint in _WORDS:
         return _scalar(value, hint, name, field)
@@ -161,5 +185,8 @@ def _scalar(value: Any, kind: type, name: str, field: Any) -> Any:
 
 def _text(value: Any) -> str:
     """A value as the command line takes it."""
-    return {None: "null", True: "true", False: "false"}.get(value, str(value)) \
-        if isinstance(value, bool | None) else str(value)  # fmt: skip
+    return (
+        {None: "null", True: "true", False: "false"}.get(value, str(value))
+        if isinstance(value, bool | None)
+        else str(value)
+    )

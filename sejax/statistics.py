@@ -33,9 +33,12 @@ def interquartile_mean(scores: Any) -> Any:
 
 
 def bootstrap_interval(
-    *strata: Any, statistic: Callable[[Any], Any] = mean, level: float = LEVEL,
-    num_resamples: int = NUM_RESAMPLES, seed: int = 0,
-) -> tuple[float, float]:  # fmt: skip
+    *strata: Any,
+    statistic: Callable[[Any], Any] = mean,
+    level: float = LEVEL,
+    num_resamples: int = NUM_RESAMPLES,
+    seed: int = 0,
+) -> tuple[float, float]:
     """Percentile confidence interval of a statistic of all runs: the stratified bootstrap.
 
     Runs are drawn again, with replacement, within each stratum. They must be independent: average
@@ -54,9 +57,12 @@ def bootstrap_interval(
 
 
 def performance_profile(
-    *strata: Any, thresholds: Any, level: float = LEVEL, num_resamples: int = NUM_RESAMPLES,
+    *strata: Any,
+    thresholds: Any,
+    level: float = LEVEL,
+    num_resamples: int = NUM_RESAMPLES,
     seed: int = 0,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Fraction of runs with a score above each threshold, and its interval at each.
 
     Args:
@@ -77,9 +83,13 @@ def performance_profile(
 
 
 def probability_of_improvement(
-    strata: Sequence[Any], others: Sequence[Any], *, level: float = LEVEL,
-    num_resamples: int = NUM_RESAMPLES, seed: int = 0,
-) -> tuple[float, float, float]:  # fmt: skip
+    strata: Sequence[Any],
+    others: Sequence[Any],
+    *,
+    level: float = LEVEL,
+    num_resamples: int = NUM_RESAMPLES,
+    seed: int = 0,
+) -> tuple[float, float, float]:
     """Probability that a run beats one of the others, averaged over strata, and its interval.
 
     A tie counts half: Mann and Whitney's statistic as a share of all pairs.

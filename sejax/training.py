@@ -1,14 +1,26 @@
-"""How long an agent trains, and how it is tested.
+"""The inner loop: how long an agent trains, and one agent's whole training in one world.
 
-Source: paper, appendix "Heuristics for Agent Training and Evaluation"; `docs/reference.md` 3.
+Source: paper, Algorithm 1 (TrainAgent) and appendix "Heuristics for Agent Training and Evaluation";
+`docs/reference.md` 3.
 """
 
 import dataclasses
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-from sejax.errors import require
+import jax
+import jax.numpy as jnp
+from flax import struct
+from jaxtyping import Array, Float, Int
+
+from sejax.agents.base import Agent
+from sejax.agents.memory import Memory, MemoryMaker
+from sejax.agents.replay import Transition
+from sejax.envs.base import require_own_steps
+from sejax.errors import LARGEST, require
+from sejax.ops.keys import step_keys
+from sejax.ops.loops import while_any_active
 from sejax.options import Options, counts, not_negative, one_of, option
 
 STOP_RULES = ("plateau", "solved", "never")
@@ -57,9 +69,12 @@ class TrainingConfig(Options):
 
 
 def budget_for(
-    training: TrainingConfig, agent: Any, learned_with: Iterable[Any], max_episode_steps: int,
+    training: TrainingConfig,
+    agent: Any,
+    learned_with: Iterable[Any],
+    max_episode_steps: int,
     task_max_steps: int,
-) -> TrainingConfig:  # fmt: skip
+) -> TrainingConfig:
     """How long an agent trains on a proxy that was learned with others.
 
     A step budget grows by the steps for which this agent waits longer with learning than any of
@@ -78,11 +93,14 @@ def budget_for(
         return training
     if training.is_fixed_length:  # as long as the episodes allowed, in files of older versions
         max_steps = min(max_steps, training.max_episodes * max_episode_steps)
-    waits, *waited = (steps_before_learning(each, max_episode_steps, task_max_steps)
-                      for each in (agent, *learned_with))  # fmt: skip
+    waits, *waited = (
+        steps_before_learning(each, max_episode_steps, task_max_steps)
+        for each in (agent, *learned_with)
+    )
     longer = max(0, waits - max(waited, default=0))
-    return dataclasses.replace(training, max_steps=max_steps + longer,
-                               max_episodes=training.max_episodes + longer)  # fmt: skip
+    return dataclasses.replace(
+        training, max_steps=max_steps + longer, max_episodes=training.max_episodes + longer
+    )
 
 
 def require_reachable(name: str, training: TrainingConfig, max_episode_steps: int) -> None:
@@ -100,13 +118,448 @@ def require_reachable(name: str, training: TrainingConfig, max_episode_steps: in
         return
     assert training.max_steps is not None
     episodes = -(-training.max_steps // max_episode_steps)
-    require(training.max_episodes >= episodes, f"{name}.max_episodes", f"be at least {episodes}",
-            f"{name}.max_steps={training.max_steps} takes as many episodes of at most "
-            f"{max_episode_steps} steps", training.max_episodes,
-            f"{name}.max_episodes={episodes}")  # fmt: skip
+    require(
+        training.max_episodes >= episodes,
+        f"{name}.max_episodes",
+        f"be at least {episodes}",
+        f"{name}.max_steps={training.max_steps} takes as many episodes of at most "
+        f"{max_episode_steps} steps",
+        training.max_episodes,
+        f"{name}.max_episodes={episodes}",
+    )
 
 
 def steps_before_learning(agent: Any, max_episode_steps: int, task_max_steps: int) -> int:
     """Training steps before an agent first learns, as its configuration says; 0 if it does not."""
     steps = getattr(agent, "steps_before_learning", None)
     return 0 if steps is None else steps(max_episode_steps, task_max_steps)
+
+
+@struct.dataclass
+class TrainResult:
+    """What came of one training.
+
+    Attributes:
+      agent_state: the trained agent.
+      train_steps: steps in the training world, `[]` int32.
+      episodes: finished training episodes, `[]` int32.
+      returns: return of each training episode in the training world, `[max_episodes]`; nan after
+        the last.
+      test_returns: mean return of the tests on the real task after each training episode, likewise;
+        None if there are no such tests.
+      episode_ends: training steps at the end of each training episode, `[max_episodes]` int32; 0
+        after the last.
+      nonfinite: whether a number that is not finite was met: an output of the world or a weight.
+      test_steps: real steps spent on tests between training episodes, `[]` int32.
+      recorded: what the recorder has kept of the training's steps, if there was one.
+    """
+
+    agent_state: Any
+    train_steps: Array
+    episodes: Array
+    returns: Float[Array, " max_episodes"]
+    test_returns: Float[Array, " max_episodes"] | None
+    episode_ends: Int[Array, " max_episodes"]
+    nonfinite: Array
+    test_steps: Array
+    recorded: Any
+
+
+@struct.dataclass
+class _Curve:
+    """A row for each finished episode, `[max_episodes]`; large, so that it is written in place."""
+
+    returns: Array
+    ends: Array
+    test_returns: Array | None
+
+    def with_episode(
+        self, episode: Array, episode_return: Array, end: Array, tested: Array, ended: Array
+    ) -> "_Curve":
+        """The episode's row is written if it has ended: an index out of range is dropped."""
+        row = jnp.where(ended, episode, self.ends.shape[0])
+
+        def written(column: Array, value: Array) -> Array:
+            return column.at[row].set(value, mode="drop")
+
+        return _Curve(
+            returns=written(self.returns, episode_return),
+            ends=written(self.ends, end),
+            test_returns=None if self.test_returns is None else written(self.test_returns, tested),
+        )
+
+
+@struct.dataclass
+class _LoopState:
+    """Carry of the step loop. What the agent remembers, and the curve, are carried beside it."""
+
+    active: Array
+    step: Array  # decisions
+    train_steps: Array  # steps of the world
+    episode: Array
+    episode_return: Array
+    obs: Array
+    env_state: Any
+    agent_state: Any
+    recent: Array  # [2 * window]: the last returns that the stop rule judges, newest last
+    nonfinite: Array
+    test_steps: Array
+    tested: Array  # mean return of the last tests
+
+
+# `(key, agent_state, active) -> (mean return, steps)`, on the real task.
+TestFn = Callable[[Array, Any, Array], tuple[Array, Array]]
+
+
+def make_trainer(
+    agent: Agent,
+    env: Any,
+    training: TrainingConfig = TrainingConfig(),
+    solved_reward: float = jnp.inf,
+    test_fn: TestFn | None = None,
+    recorder: MemoryMaker | None = None,
+) -> Callable[..., TrainResult]:
+    """Builds `train(key, env_params, hparams, active=True) -> TrainResult` for one agent.
+
+    The result is pure; `vmap` it over keys, parameters and hyperparameters. Under `vmap` the lanes
+    run in lockstep until the last one has stopped, without copies of replay buffers. With
+    `active=False` nothing is computed.
+
+    Args:
+      agent: from `sejax.make_agent`, or one of your own.
+      env: gymnax environment to train in: real, synthetic or reward-shaped. A potential-based
+        reward has the agent's discount, whatever its params say. The plateau rule, the default,
+        reads the returns of this world; for tests on the real task see `sejax.make_evaluator`. In a
+        proxy whose params allow longer episodes than its task the buffer may hold fewer steps than
+        the agent asks for.
+      training: stopping rule and limits. `time_limit_is_terminal` speaks of real time limits and is
+        ignored in an SE: there the last step of an episode bootstraps with what the done network
+        says, as in the authors' code.
+      solved_reward: for `stop_rule="solved"`.
+      test_fn: plays tests on the real task; called after each training episode if
+        `training.num_tests_between` is not 0.
+      recorder: keeps steps for whoever looks at the training, as an agent's `memory` does for the
+        agent; what it kept is `TrainResult.recorded`.
+
+    Raises:
+      ConfigError: for arguments of other kinds, or if `training` has a fixed number of steps and
+        too few episodes for them.
+      ValueError: if tests are asked for and no `test_fn` is given.
+
+    Source: paper, Algorithm 1, TrainAgent.
+
+    Example:
+      >>> import sejax
+      >>> task = sejax.envs.make("cliff_walking")
+      >>> agent = sejax.make_agent(sejax.QLearningConfig(), task)
+      >>> train = make_trainer(agent, task.env, TrainingConfig(max_episodes=20))
+      >>> result = jax.jit(jax.vmap(train, (0, None)))(
+      ...     jax.random.split(jax.random.key(0), 8), task.params)
+      >>> result.returns.shape
+      (8, 20)
+    """
+    _require_parts(agent, env, training)
+    if training.num_tests_between and test_fn is None:
+        raise ValueError(
+            f"tests after each episode (training.num_tests_between is "
+            f"{training.num_tests_between}) need a test_fn; got None."
+        )
+    if agent.solve is not None:
+        return _make_solver(agent, env, training, recorder)
+    loop = _Loop(agent, env, training, solved_reward, test_fn, recorder)
+
+    def train(
+        key: Array, env_params: Any, hparams: Any = agent.hparams, active: Array | bool = True
+    ) -> TrainResult:
+        env_params = loop.prepare(env_params, hparams)
+        key_begin, key_steps = jax.random.split(key)
+        state = loop.begin(key_begin, env_params, hparams, active)
+        remembered = tuple(memory.init() for memory in loop.memories(state))
+        (remembered, curve), state = while_any_active(
+            loop.step, (remembered, loop.empty_curve()), state, (key_steps, env_params)
+        )
+        return TrainResult(
+            agent_state=state.agent_state,
+            train_steps=state.train_steps,
+            episodes=state.episode,
+            returns=curve.returns,
+            test_returns=curve.test_returns,
+            episode_ends=curve.ends,
+            nonfinite=state.nonfinite | ~_all_finite(state.agent_state),
+            test_steps=state.test_steps,
+            recorded=remembered[1] if recorder is not None else None,
+        )
+
+    return train
+
+
+def _require_parts(agent: Any, env: Any, training: Any) -> None:
+    """Checks that the arguments are what they are called, in their order."""
+    require(
+        hasattr(agent, "learns_from"),
+        "agent",
+        "be a sejax.Agent",
+        "it acts and learns",
+        type(agent).__name__,
+        "agent=sejax.make_agent(config, task)",
+    )
+    require(
+        hasattr(env, "step_env"),
+        "env",
+        "be a gymnax environment",
+        "the agent trains there",
+        type(env).__name__,
+        "env to the first of the pair that sejax.load returns, or to task.env",
+    )
+    require_own_steps(env)
+    require(
+        isinstance(training, TrainingConfig),
+        "training",
+        "be a sejax.TrainingConfig",
+        "it says how long agents train",
+        type(training).__name__,
+        "training=sejax.TrainingConfig(max_episodes=100)",
+    )
+    require(
+        not jax.config.jax_enable_x64,
+        "jax_enable_x64",
+        "be off",
+        "sejax counts and computes in 32 bits",
+        "true",
+        "JAX_ENABLE_X64=0",
+    )
+
+
+def _make_solver(
+    agent: Agent, env: Any, training: TrainingConfig, recorder: MemoryMaker | None
+) -> Callable[..., TrainResult]:
+    """The `train` of an agent that knows its world's optimum: no steps, and an empty curve."""
+    require(
+        training.num_tests_between == 0 and recorder is None,
+        "agent",
+        "be one that learns where its training is looked at",
+        "there is no learning curve without one",
+        "one that is solved for",
+        "agent=ddqn, or objective=max_reward training.tests_between=0",
+    )
+    assert agent.solve is not None
+    solve = agent.solve
+
+    def train(
+        key: Array, env_params: Any, hparams: Any = agent.hparams, active: Array | bool = True
+    ) -> TrainResult:
+        state = solve(env, env_params, hparams)
+        return TrainResult(
+            agent_state=state,
+            train_steps=jnp.int32(0),
+            episodes=jnp.int32(0),
+            returns=jnp.full(training.max_episodes, jnp.nan),
+            test_returns=None,
+            episode_ends=jnp.zeros(training.max_episodes, jnp.int32),
+            nonfinite=~_all_finite(state),
+            test_steps=jnp.int32(0),
+            recorded=None,
+        )
+
+    return train
+
+
+class _Loop:
+    """The step loop of one agent in one world; pure functions of its carry."""
+
+    def __init__(
+        self,
+        agent: Agent,
+        env: Any,
+        training: TrainingConfig,
+        solved_reward: float,
+        test_fn: TestFn | None,
+        recorder: MemoryMaker | None,
+    ):
+        from sejax.envs.wrappers import repeat_actions
+        from sejax.proxies.base import prepare, world_of
+
+        world = world_of(env)
+        limit_is_terminal = training.time_limit_is_terminal and world.is_real
+        self.agent, self.training, self.solved_reward = agent, training, solved_reward
+        self.limit_is_terminal = limit_is_terminal
+        self.test_fn = test_fn if training.num_tests_between else None
+        self.env = repeat_actions(env, agent.action_repeat)
+        self.max_steps = self.memory_steps = training.max_steps or LARGEST
+        if world.max_steps is not None:
+            require_reachable("training", training, world.max_steps)
+            self.memory_steps = min(self.max_steps, training.max_episodes * world.max_steps)
+        self.memory_makers = (agent.memory, *([] if recorder is None else [recorder]))
+        self.prepare = lambda params, hparams: prepare(
+            env, params, agent.discount(hparams), limit_is_terminal
+        )
+
+    def begin(self, key: Array, env_params: Any, hparams: Any, active: Array | bool) -> _LoopState:
+        key_agent, key_reset = jax.random.split(key)
+        obs, env_state = self.env.reset_env(key_reset, env_params)
+        agent_state = self.agent.init(key_agent, hparams)
+        return _LoopState(
+            active=jnp.asarray(active),
+            step=jnp.int32(0),
+            train_steps=jnp.int32(0),
+            episode=jnp.int32(0),
+            episode_return=jnp.float32(0),
+            obs=obs,
+            env_state=env_state,
+            agent_state=self.agent.begin_episode(agent_state, jnp.int32(0)),
+            recent=jnp.zeros(2 * self.training.window),
+            nonfinite=jnp.bool_(False),
+            test_steps=jnp.int32(0),
+            tested=jnp.float32(0),
+        )
+
+    def empty_curve(self) -> _Curve:
+        no_returns = jnp.full(self.training.max_episodes, jnp.nan)
+        return _Curve(
+            returns=no_returns,
+            ends=jnp.zeros(self.training.max_episodes, jnp.int32),
+            test_returns=None if self.test_fn is None else no_returns,
+        )
+
+    def memories(self, state: _LoopState) -> list[Memory]:
+        """What the agent keeps of its steps, and what the recorder does."""
+
+        def example() -> Transition:
+            act = self.agent.act
+            action = act(jax.random.key(0), state.agent_state, state.obs, explore=True)
+            return Transition(state.obs, action, jnp.float32(0), jnp.float32(0), state.obs)
+
+        shapes = jax.eval_shape(example)
+        return [make(shapes, self.memory_steps) for make in self.memory_makers]
+
+    def step(
+        self, large: Any, state: _LoopState, consts: Any, masked: bool
+    ) -> tuple[Any, _LoopState]:
+        """One agent step: act, step the world, store, learn, and close the episode if it ended."""
+        (remembered, curve), (key, env_params) = large, consts
+        memories = self.memories(state)
+        key_act, key_env, key_sample, key_update, *keys_end = step_keys(key, state.step, 6)
+        action = self.agent.act(key_act, state.agent_state, state.obs, explore=True)
+        next_obs, env_state, reward, terminated, info = self.env.step_env(
+            key_env, state.env_state, self.agent.env_action(action), env_params
+        )
+        truncated = self.env.is_truncated(env_state, env_params)
+        nonfinite = state.nonfinite | info.get("nonfinite", False)
+        ended = terminated | truncated | nonfinite
+        transition = Transition(
+            state.obs, action, reward, self.discount(terminated, truncated, info), next_obs
+        )
+        active = state.active if masked else True
+        finished = ended & active  # an episode that counts
+        remembered = tuple(
+            memory.store(arrays, state.step, transition, ended, active)
+            for memory, arrays in zip(memories, remembered, strict=True)
+        )
+
+        def learn(agent_state: Any) -> Any:
+            size = self.agent.batch_size(agent_state)
+            batch = memories[0].batch(key_sample, remembered[0], state.step + 1, transition, size)
+            batch = memories[0].rest(batch, active) if masked else batch
+            return self.agent.update(key_update, agent_state, batch)
+
+        agent_state = jax.lax.cond(
+            state.episode >= self.agent.learns_from, learn, lambda s: s, state.agent_state
+        )
+        train_steps = state.train_steps + info.get("num_steps", 1)
+        state = state.replace(
+            step=state.step + 1,
+            train_steps=train_steps,
+            episode_return=state.episode_return + reward,
+            obs=next_obs,
+            env_state=env_state,
+            agent_state=agent_state,
+            nonfinite=nonfinite,
+            active=train_steps < self.max_steps,
+        )
+        before = state
+        state = jax.lax.cond(
+            ended, lambda s: self.end_episode(keys_end, s, env_params, finished), lambda s: s, state
+        )
+        curve = curve.with_episode(
+            before.episode, before.episode_return, train_steps, state.tested, finished
+        )
+        return (remembered, curve), state
+
+    def discount(self, terminated: Array, truncated: Array, info: Any) -> Array:
+        """What a target bootstraps with, before gamma."""
+        discount = jnp.float32(info.get("discount", jnp.where(terminated, 0.0, 1.0)))
+        return jnp.where(truncated, 0.0, discount) if self.limit_is_terminal else discount
+
+    def end_episode(
+        self, keys: list[Array], state: _LoopState, env_params: Any, finished: Array
+    ) -> _LoopState:
+        """Records the episode, decides whether training goes on, and starts the next one.
+
+        In lanes this runs for all if it runs for one; `finished` spares the others the test.
+        """
+        key_reset, key_test = keys
+        judged = state.episode_return
+        if self.test_fn is not None:
+            tested, num_steps = self.test_fn(key_test, state.agent_state, finished)
+            state = state.replace(tested=tested, test_steps=state.test_steps + num_steps)
+            judged = tested if self.training.stops_by_tests else judged
+        recent = jnp.concatenate([state.recent[1:], judged[None]])
+        stop = self.stops(state, recent)
+        obs, env_state = self.env.reset_env(key_reset, env_params)
+        num_episodes = state.episode + 1
+        return state.replace(
+            active=state.active & ~stop,
+            episode=num_episodes,
+            episode_return=jnp.float32(0),
+            obs=obs,
+            env_state=env_state,
+            agent_state=self.agent.begin_episode(state.agent_state, num_episodes),
+            recent=recent,
+        )
+
+    def stops(self, state: _LoopState, recent: Array) -> Array:
+        """Whether training ends with the episode that has just ended."""
+        training, first = self.training, self.agent.warmup_episodes
+        num_episodes = state.episode + 1
+        stop = (num_episodes >= training.max_episodes) | state.nonfinite
+        may_stop = (state.episode >= first) & (state.train_steps >= training.min_steps)
+        if training.stop_rule == "plateau":
+            flat = is_plateau(recent, num_episodes, training.plateau_tolerance)
+            return stop | (may_stop & flat & (state.episode >= first + training.window))
+        if training.stop_rule == "solved":
+            return stop | (may_stop & is_solved(recent, num_episodes, self.solved_reward))
+        return stop
+
+
+def is_plateau(
+    recent: Float[Array, " two_windows"], num_episodes: Array, tolerance: float
+) -> Array:
+    r"""Whether the mean return of the last d episodes is close to that of the d before.
+
+    .. math:: |\bar C_d - \bar C_{2d}| / |\bar C_{2d}| \le C_{diff}
+
+    Args:
+      recent: `[2 d]` returns, newest last; entries before the first episode are 0.
+      num_episodes: episodes so far. With fewer than 2d the older window is shorter, and an empty
+        one has mean 0.
+      tolerance: C_diff.
+
+    Source: paper, appendix "Heuristics for Agent Training and Evaluation".
+    """
+    window = recent.shape[0] // 2
+    older = recent[:window].sum() / jnp.clip(num_episodes - window, 1, window)
+    newer = recent[window:].sum() / jnp.clip(num_episodes, 1, window)
+    return jnp.abs(newer - older) <= tolerance * (jnp.abs(older) + 1e-9)
+
+
+def is_solved(
+    recent: Float[Array, " two_windows"], num_episodes: Array, solved_reward: float
+) -> Array:
+    """Whether the mean of the last d returns (of all, if fewer) reaches the solved reward."""
+    window = recent.shape[0] // 2
+    return recent[window:].sum() / jnp.clip(num_episodes, 1, window) >= solved_reward
+
+
+def _all_finite(tree: Any) -> Array:
+    leaves = [x for x in jax.tree.leaves(tree) if jnp.issubdtype(x.dtype, jnp.floating)]
+    return jnp.array([jnp.all(jnp.isfinite(x)) for x in leaves], bool).all()

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from flax import struct
 from gymnax.environments import environment, spaces
 
-from sejax.agents.agent import Agent
+from sejax.agents.base import Agent
 from sejax.agents.memory import replay_memory
 from sejax.agents.replay import Transition
 
@@ -81,7 +81,7 @@ def script(returns, lengths, **fields):
     )
 
 
-def scripted_agent(init_episodes=2, buffer_size=1000, batch_size=64):
+def scripted_agent(warmup_episodes=2, buffer_size=1000, batch_size=64):
     empty = Transition(
         obs=jnp.zeros((2, batch_size)),
         action=jnp.zeros(batch_size, jnp.int32),
@@ -112,7 +112,7 @@ def scripted_agent(init_episodes=2, buffer_size=1000, batch_size=64):
         update=update,
         hparams=0.0,
         memory=replay_memory(batch_size, buffer_size),
-        init_episodes=init_episodes,
-        learns_from=init_episodes,
+        warmup_episodes=warmup_episodes,
+        learns_from=warmup_episodes,
         discount=lambda hparams: 1.0,
     )

@@ -10,24 +10,25 @@ import pytest
 from support import large_ops_in_loops
 
 import sejax
-from sejax import plugins
+from sejax import registry
 from sejax.bilevel import make_learner, make_program
-from sejax.counters import exact
 from sejax.errors import ConfigError
-from sejax.es.strategy import Trials
+from sejax.es.base import Trials
+from sejax.ops.counters import exact
 
 # 40 steps for each of 12 agents: short enough for rounding not to grow into other actions.
 TINY = [
     "proxy.hidden_size=4", "agent.hidden_size=4", "agent.num_layers=1", "agent.batch_size=4",
     "preset=paper_performance", "stop_when_solved=false",
-    "agent.init_episodes=0", "es.population_size=4", "es.noise_std=1.0", "training.max_episodes=3",
+    "agent.warmup_episodes=0", "es.population_size=4", "es.noise_std=1.0",
+    "training.max_episodes=3",
     "training.max_steps=40", "training.window=2", "training.test_episodes=2", "generations=3",
 ]  # fmt: skip
 # Tables in a room of 2 x 2 cells: the same loops, which compile in a third of the time.
 ROOM = [
     "env=gridworld_2x2", "agent.learning_rate=0.5", "proxy.hidden_size=4", "es.population_size=4",
     "es.noise_std=1.0", "training.max_episodes=5", "training.max_steps=30", "training.window=2",
-    "training.test_episodes=2", "generations=3", "lanes=1",
+    "training.test_episodes=2", "generations=3", "num_parallel=1",
 ]  # fmt: skip
 KEYS = jax.random.split(jax.random.key(0), 2)
 
@@ -166,7 +167,7 @@ def test_members_are_compared_by_tests_as_long_as_the_curriculum_says():
     config = tiny("devices=1", "objective.first_test_steps=1", words=ROOM)
     parts = config.parts()
     program, task = make_program(**parts), parts["task"]
-    proxy = plugins.make("proxy", config.proxy, task)
+    proxy = registry.make("proxy", config.proxy, task)
     agent = sejax.make_agent(config.agent, task)
     evaluate = sejax.make_evaluator(agent, proxy, task, config.training)
     state = program.init(KEYS[:1])
@@ -255,7 +256,7 @@ def test_a_learner_vmapped_over_keys_equals_separate_runs(room):
 
 def test_four_lanes_give_the_same_numbers_as_one(room):
     _, _, ((states, infos), _) = room
-    program = program_of("devices=1", "lanes=4", words=ROOM)
+    program = program_of("devices=1", "num_parallel=4", words=ROOM)
     lane_states, lane_infos = run(*compiled(program, KEYS[:1]), 2)
     assert_equal(lane_states[2], states[2], rtol=1e-4, atol=1e-5)
     assert_equal(lane_infos, infos[:2], rtol=1e-4, atol=1e-5)
@@ -271,7 +272,7 @@ def test_seeds_of_one_program_equal_separate_runs_and_stop_when_solved(room):
     assert first != second
     parts = tiny("devices=1", "num_seeds=2", "stop_when_solved=true", words=ROOM).parts()
     task = dataclasses.replace(parts["task"], solved_reward=(first + second) / 2)
-    proxy = plugins.make("proxy", parts["proxy"].config, task)
+    proxy = registry.make("proxy", parts["proxy"].config, task)
     program = make_program(**parts | {"task": task, "proxy": proxy})
     assert program.solved_score == task.solved_reward
     states, infos = run(*compiled(program, KEYS), 3)
@@ -362,7 +363,7 @@ def test_more_devices_than_there_are_is_refused():
 )  # fmt: skip
 def test_every_kind_of_configuration_makes_a_scan_body(words, overrides):
     # Tracing only: the state that comes out has the types of the one that goes in.
-    assert {"open_es", "cma_es", "snes"} <= set(plugins.names("es"))
+    assert {"open_es", "cma_es", "snes"} <= set(registry.names("es"))
     program = program_of(*overrides, words=words)
     state = jax.eval_shape(program.init, KEYS)
     after, info = jax.eval_shape(program.generation, state)

@@ -8,11 +8,11 @@ import pytest
 import sejax
 from sejax import envs
 from sejax.agents.boltzmann import BoltzmannConfig
-from sejax.app import compose
+from sejax.agents.mixture import Families
 from sejax.bilevel import make_program
+from sejax.cli import compose
 from sejax.errors import ConfigError
 from sejax.evaluate import evaluate
-from sejax.families import Families
 from sejax.objectives import AUC
 from sejax.proxies.configs import SyntheticConfig
 
@@ -104,7 +104,7 @@ def test_the_outer_loop_learns_a_bandit_without_a_step_of_training():
     """And a family of weight 0 trains on incumbents alone."""
     boltzmann = sejax.make_agent(BoltzmannConfig(), CARTPOLE)
     ddqn = sejax.make_agent(
-        sejax.DDQNConfig(hidden_size=8, num_layers=1, batch_size=8, init_episodes=1), CARTPOLE
+        sejax.DDQNConfig(hidden_size=8, num_layers=1, batch_size=8, warmup_episodes=1), CARTPOLE
     )
     program = program_of(
         Families(agents=(boltzmann, ddqn), names=("boltzmann", "ddqn"), weights=(1.0, 0.0))

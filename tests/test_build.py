@@ -1,4 +1,4 @@
-"""sejax.app.build: a command's configuration, as plain values and as the objects it describes."""
+"""sejax.cli.build: a command's configuration, as plain values and as the objects it describes."""
 
 import copy
 import functools
@@ -9,11 +9,11 @@ import yaml
 from hydra.core.override_parser.overrides_parser import OverridesParser
 
 import sejax
-from sejax import envs, plugins
-from sejax.agents.ddqn import DDQNConfig
-from sejax.app import build
-from sejax.app.build import LearnConfig
-from sejax.app.families import families_of
+from sejax import envs
+from sejax.agents.dqn import DDQNConfig
+from sejax.cli import build
+from sejax.cli.build import LearnConfig
+from sejax.cli.families import families_of
 from sejax.errors import ConfigError, require, unknown_name
 from sejax.es.nes import NESConfig
 from sejax.training import TrainingConfig
@@ -30,18 +30,19 @@ OUT_OF_RANGE = [
     ("agent.epsilon_decay=-0.1", "[0, 1]"), ("agent.learning_rate=0", "above 0"),
     ("agent.batch_size=0", "at least 1"), ("agent.buffer_size=0", "at least 1"),
     ("agent.hidden_size=0", "at least 1"), ("agent.num_layers=0", "at least 1"),
-    ("agent.init_episodes=-1", "at least 0"), ("proxy.hidden_size=0", "at least 1"),
+    ("agent.warmup_episodes=-1", "at least 0"), ("proxy.hidden_size=0", "at least 1"),
     ("training.max_episodes=0", "at least 1"), ("training.window=0", "at least 1"),
     ("training.test_episodes=0", "at least 1"), ("training.plateau_tolerance=nan", "at least 0"),
     ("training.plateau_tolerance=inf", "be finite"), ("objective.unsolved_weight=inf", "be finite"),
     ("objective.unsolved_weight=-1", "at least 0"), ("generations=0", "at least 1"),
     ("seed=-1", "[0, 2**31)"), ("seed=2147483648", "[0, 2**31)"), ("num_seeds=0", "at least 1"),
-    ("lanes=0", "at least 1"), ("devices=0", "at least 1"), ("checkpoint_every=0", "at least 1"),
-    ("lanes=99999999999999999999", LARGEST),
+    ("num_parallel=0", "at least 1"), ("devices=0", "at least 1"),
+    ("checkpoint_every=0", "at least 1"),
+    ("num_parallel=99999999999999999999", LARGEST),
     *((f"{name}={2**31}", LARGEST)
       for name in ("training.max_episodes", "training.max_steps", "training.min_steps",
                    "training.window", "training.test_episodes", "training.tests_between",
-                   "agent.init_episodes", "agent.batch_size", "agent.buffer_size",
+                   "agent.warmup_episodes", "agent.batch_size", "agent.buffer_size",
                    "agent.hidden_size", "generations", "num_seeds",
                    "checkpoint_every", "es.num_evals",
                    "es.num_incumbent_evals", "proxy.hidden_size")),
@@ -109,7 +110,7 @@ def test_a_config_error_is_a_value_error_with_the_projects_form():
     [
         (),
         ("env=acrobot", "preset=paper", "seed=3", "run_dir=some/where"),
-        ("es=cma_es", "devices=2", "lanes=4", "training.max_steps=1000"),
+        ("es=cma_es", "devices=2", "num_parallel=4", "training.max_steps=1000"),
         ("env=cliff_walking", "proxy=rn", "exploration=count_based", "env.goal_reward=-1"),
         ("agents=[ppo,ddqn]", "agents.ddqn.weight=2", "agents.aggregate=min"),
     ],
@@ -188,7 +189,7 @@ def test_parts_are_what_make_learner_takes_and_are_built_once():
     first, second = (build.learn_config(build.to_plain(config())).parts() for _ in range(2))
     assert first.keys() == second.keys() == {
         "task", "agent", "proxy", "es", "objective", "training", "stop_when_solved", "devices",
-        "lanes",
+        "num_parallel",
     }  # fmt: skip
     assert first["task"] is envs.make("cartpole") is first["proxy"].task
     for name in ("task", "agent", "proxy", "objective"):

@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 from safetensors.numpy import save as serialize
 
-from sejax import sealed
-from sejax.app import checkpoints
-from sejax.files import remove_leftovers
+from sejax.cli import checkpoints
+from sejax.ops import sealed
+from sejax.ops.files import remove_leftovers
 
 KIND = "sejax_checkpoint"
 

@@ -8,7 +8,7 @@ import sys
 import jax
 import pytest
 
-from sejax.app import commands, compose, runtime
+from sejax.cli import commands, compose, runtime
 from sejax.errors import FailedError
 
 
@@ -71,7 +71,7 @@ def test_a_current_folder_that_is_gone_is_one_message(tmp_path):
     gone = tmp_path / "gone"
     gone.mkdir()
     script = "import os, sys; os.rmdir(os.getcwd()); sys.argv = ['run']; " \
-             "from sejax.app import commands; commands.start('run', print)"  # fmt: skip
+             "from sejax.cli import commands; commands.start('run', print)"  # fmt: skip
     done = subprocess.run([sys.executable, "-c", script], cwd=gone, capture_output=True, text=True)
     assert done.returncode == commands.FAILED
     assert done.stderr.startswith("error: The current folder is gone")

@@ -1,4 +1,4 @@
-"""sejax.app.compose: every choice composes, bad words are refused with one message."""
+"""sejax.cli.compose: every choice composes, bad words are refused with one message."""
 
 import dataclasses
 import functools
@@ -12,9 +12,9 @@ import pytest
 from hydra.core.config_store import ConfigStore
 
 import sejax
-from sejax import envs, plugins
-from sejax.app import commands, compose, families, presets, runtime
-from sejax.app.build import LearnConfig
+from sejax import envs, registry
+from sejax.cli import commands, compose, families, presets, runtime
+from sejax.cli.build import LearnConfig
 from sejax.envs.cliff_walking import CliffWalking
 from sejax.errors import ConfigError
 from sejax.es.evosax import ALGORITHMS, EvosaxConfig
@@ -52,7 +52,7 @@ def test_every_algorithm_of_evosax_composes():
     store = ConfigStore.instance()  # which has them all since
     for name in ALGORITHMS:
         node = store.load(f"es/{name}.yaml").node
-        assert plugins.configure("es", node) == EvosaxConfig(name=name)
+        assert registry.configure("es", node) == EvosaxConfig(name=name)
 
 
 @pytest.mark.parametrize("name", ["max_reward", "reward_threshold"])
@@ -78,7 +78,7 @@ def test_a_task_chooses_its_agent_where_none_is_chosen():
 
 def test_without_overrides_it_is_the_best_cartpole_se():
     composed = composed_with()
-    names = [composed.name(group) for group in plugins.GROUPS]
+    names = [composed.name(group) for group in registry.GROUPS]
     assert names == ["cartpole", "ddqn", "none", "se", "max_reward", "nes", "none", "local"]
     assert composed.preset == "best"
     assert str(composed.resolved_run_dir) == "runs/cartpole-se-ddqn-s0"
@@ -109,7 +109,7 @@ def test_the_run_directory_names_the_run():
     for changes, name in [
         ({"exploration": sejax.ICMConfig()}, "cartpole-se-ddqn_icm-s0"),
         ({"agent_hparams": "varied"}, "cartpole-se-ddqn_varied-s0"),
-        ({"env": plugins.configure("env", {"name": "gymnax/CartPole-v1"})},
+        ({"env": registry.configure("env", {"name": "gymnax/CartPole-v1"})},
          "gymnax_CartPole-v1-se-ddqn-s0"),
     ]:  # fmt: skip
         changed = dataclasses.replace(composed_with(), **changes)
@@ -187,11 +187,11 @@ def test_an_agent_of_ones_own_may_be_one_of_several(monkeypatch, tmp_path):
     )
     monkeypatch.syspath_prepend(tmp_path)
     words = ["agents=[ppo,my_words:Mine]", "agents.my_words_Mine.extra=4",
-             "agents.my_words_Mine.init_episodes=1"]  # fmt: skip
+             "agents.my_words_Mine.warmup_episodes=1"]  # fmt: skip
     mine, ppo = sejax.config(words).agents.families
     assert (mine.key, mine.agent.extra, ppo.key) == ("my_words_Mine", 4, "ppo")
-    own = plugins.find("agent", "my_words:Mine")
-    assert plugins.name_of("agent", own()) == "my_words:Mine"
+    own = registry.find("agent", "my_words:Mine")
+    assert registry.name_of("agent", own()) == "my_words:Mine"
 
 
 def test_sweeps_over_tasks_and_agents_have_the_settings_of_each(tmp_path, monkeypatch):
@@ -352,9 +352,9 @@ SOFT = ("proxy.done=soft", "proxy.horizon=null")
 @pytest.mark.parametrize(
     ("overrides", "said"),
     [
-        ((*SOFT, "env=acrobot", "agent=dueling_ddqn", "agent.init_episodes=10"),
+        ((*SOFT, "env=acrobot", "agent=dueling_ddqn", "agent.warmup_episodes=10"),
          "training.max_steps must exceed 5000, because dueling_ddqn learns nothing before with "
-         "agent.init_episodes=10; got 2000."),
+         "agent.warmup_episodes=10; got 2000."),
         ((*SOFT, "agent=ppo", "agent.rollout_steps=null", "agent.update_episodes=20"),
          "training.max_steps must exceed 4001, because ppo learns nothing before with "
          "agent.update_episodes=20; got 2000."),
@@ -378,9 +378,9 @@ def test_episodes_that_may_end_early_need_no_long_budget():
 
 @pytest.mark.parametrize("env", presets.tuned("se"))
 def test_agents_learn_within_the_default_budget_of_an_se(env):
-    facts = envs.facts_of(plugins.configure("env", {"name": env}))
-    for name in plugins.names("agent"):
-        agent = plugins.find("agent", name)
+    facts = envs.facts_of(registry.configure("env", {"name": env}))
+    for name in registry.names("agent"):
+        agent = registry.find("agent", name)
         if agent.states == facts.states and facts.actions in agent.actions:
             config = sejax.config([f"env={env}", f"agent={name}"])
             longest = config.proxy.max_steps(facts.max_steps)
@@ -413,7 +413,7 @@ WILD = [
     ("=1", "override must name a field"), ("tuned_agent=x", "override must name a field"),
     # Numbers that cannot be counted or computed with; see test_build.py for all of them.
     ("es.population_size=2147483648", "es.population_size must be at most 100000"),
-    ("lanes=99999999999999999999", "lanes must be at most 2147483647"),
+    ("num_parallel=99999999999999999999", "num_parallel must be at most 2147483647"),
     ("es.noise_std=1e38", "es.noise_std must be at most 1e+06"),
     ("es.step_size=1e300", "es.step_size must be at most 1e+06"),
 ]  # fmt: skip
@@ -464,7 +464,7 @@ def test_importing_sejax_and_composing_imports_nothing_slow_and_starts_nothing()
         "    pass\n"
         "import sejax.envs\n"
         "sejax.envs.names()\n"
-        "from sejax.app import runtime\n"
+        "from sejax.cli import runtime\n"
         "changed = {k for k in os.environ if os.environ[k] != before.get(k)}\n"
         "set_by_jax = {'TF_CPP_MIN_LOG_LEVEL', 'TPU_SKIP_MDS_QUERY'}\n"
         "print(sorted(slow & set(sys.modules)), changed <= set_by_jax, runtime.is_started())\n"
@@ -492,7 +492,7 @@ def test_a_process_keeps_to_its_share_of_a_gpu_and_to_single_precision():
     """In processes of their own, as jax is told before it starts."""
     program = (
         "import os, sys, jax\n"
-        "from sejax.app import runtime\n"
+        "from sejax.cli import runtime\n"
         "runtime.take_share_of_gpu(float(sys.argv[1])); runtime.configure_jax()\n"
         "print(jax.config.jax_platforms, os.environ.get('XLA_CLIENT_MEM_FRACTION'),"
         " jax.config.jax_default_matmul_precision)\n"

@@ -12,8 +12,7 @@ from sejax.agents.count_based import CountBasedConfig, with_count_bonus
 from sejax.agents.replay import Transition
 from sejax.agents.tabular import QLearningConfig, SARSAConfig, make_q_learning, make_sarsa
 from sejax.rollout import make_tester
-from sejax.trainer import make_trainer
-from sejax.training import TrainingConfig
+from sejax.training import TrainingConfig, make_trainer
 
 NUM_STATES, NUM_ACTIONS, BETA = 3, 2, 0.5
 KEY = jax.random.key(0)
@@ -107,10 +106,10 @@ def test_beta_and_the_numbers_inside_are_traced():
 
 
 def test_an_agent_is_made_once_and_keeps_the_rest_of_the_contract():
-    plain = make_q_learning(QLearningConfig(init_episodes=3), NUM_STATES, NUM_ACTIONS)
+    plain = make_q_learning(QLearningConfig(warmup_episodes=3), NUM_STATES, NUM_ACTIONS)
     agent = counting(plain)
     assert agent is counting(plain)
-    assert (agent.init_episodes, agent.learns_from) == (3, 3)
+    assert (agent.warmup_episodes, agent.learns_from) == (3, 3)
     assert agent.memory is plain.memory
 
 
@@ -119,7 +118,7 @@ def test_an_agent_is_made_once_and_keeps_the_rest_of_the_contract():
 
 def test_in_a_training_each_learning_step_counts_and_returns_stay_without_the_bonus():
     task = envs.make("cliff_walking")
-    plain = make_q_learning(QLearningConfig(init_episodes=2), 48, 4)
+    plain = make_q_learning(QLearningConfig(warmup_episodes=2), 48, 4)
     agent = counting(plain, 0.1, 48, 4)
     config = TrainingConfig(max_episodes=200, stop_rule="never")
     train, test = make_trainer(agent, task.env, config), make_tester(agent, task, 1)

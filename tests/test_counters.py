@@ -1,11 +1,11 @@
-"""sejax.counters: counts beyond 32 bits are those of Python's integers."""
+"""sejax.ops.counters: counts beyond 32 bits are those of Python's integers."""
 
 import jax
 import numpy as np
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from sejax.counters import exact, wide_add, wide_sum, wide_zeros
+from sejax.ops.counters import exact, wide_add, wide_sum, wide_zeros
 
 LENGTH = 9
 number = st.integers(0, 2**31 - 1)

@@ -1,4 +1,4 @@
-"""sejax.agents.ddqn: targets by hand, updates against torch, exploration, and a probe MDP."""
+"""sejax.agents.dqn: targets by hand, updates against torch, exploration, and a probe MDP."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -9,22 +9,22 @@ import numpy as np
 import pytest
 from support import numpy_forward, shapes_of, unraveled
 
-from sejax.agents.ddqn import DDQNConfig, double_q_targets, make_ddqn
+from sejax.agents.dqn import DDQNConfig, double_q_targets, make_ddqn
 from sejax.agents.policies import select_action
 from sejax.agents.replay import Transition
-from sejax.networks import MLP
+from sejax.ops.networks import MLP
 from sejax.options import ACTIVATIONS
 
 OBS_DIM, NUM_ACTIONS, BATCH = 3, 2, 7
 GOLDEN = Path(__file__).parent / "golden" / "ddqn_updates.npz"
 CONFIG = DDQNConfig(
     hidden_size=5, num_layers=2, activation="tanh", batch_size=BATCH,
-    learning_rate=0.01, target_update_rate=0.1, discount=0.9,
+    learning_rate=0.01, tau=0.1, discount=0.9,
 )  # fmt: skip
 EXACT = [activation for activation in ACTIVATIONS if activation != "fast_tanh"]
 CASES = {activation: replace(CONFIG, activation=activation) for activation in EXACT} | {
     "dqn": replace(CONFIG, double=False, loss="huber", target_update_every=2,
-                   target_update_rate=1.0),
+                   tau=1.0),
 }  # fmt: skip
 
 
@@ -315,7 +315,7 @@ def test_a_two_step_probe_learns_gamma_and_one():
     gamma = 0.7
     config = DDQNConfig(
         hidden_size=8, num_layers=1, activation="tanh", learning_rate=0.02,
-        target_update_rate=0.1, discount=gamma,
+        tau=0.1, discount=gamma,
     )  # fmt: skip
     agent = make_ddqn(config, obs_dim=2, num_actions=2)
     a, b = [1.0, 0.0], [0.0, 1.0]
@@ -343,11 +343,11 @@ def test_a_two_step_probe_learns_gamma_and_one():
 
 def test_hparams_hold_the_configured_numbers(agent):
     assert agent.hparams._asdict() == {
-        "learning_rate": 0.01, "target_update_rate": 0.1, "discount": 0.9,
+        "learning_rate": 0.01, "tau": 0.1, "discount": 0.9,
         "epsilon_init": 1.0, "epsilon_min": 0.01, "epsilon_decay": 0.9, "exploration_steps": None,
         "hidden_size": None, "batch_size": None,  # all of them
     }  # fmt: skip
-    assert (agent.init_episodes, agent.learns_from) == (10, 10)
+    assert (agent.warmup_episodes, agent.learns_from) == (10, 10)
 
 
 def test_columns_of_no_weight_change_nothing(state, update):

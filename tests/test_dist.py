@@ -30,7 +30,7 @@ import sejax
 import sejax.gym
 
 proxy = sejax.load_proxy("cartpole")
-agent = sejax.make_agent(sejax.DDQNConfig(init_episodes=1, hidden_size=4), proxy.task)
+agent = sejax.make_agent(sejax.DDQNConfig(warmup_episodes=1, hidden_size=4), proxy.task)
 train = sejax.make_trainer(
     agent, proxy.env, sejax.TrainingConfig(max_steps=20, stop_rule="never")
 )

@@ -10,17 +10,16 @@ from support import numpy_forward, random_like, shapes_of, unraveled
 from test_ddqn import BATCH, OBS_DIM, assert_updates_equal_torchs
 
 from sejax import envs
-from sejax.agents.ddqn import DDQNConfig, DuelingDDQNConfig, make_ddqn
-from sejax.networks import DuelingMLP
-from sejax.trainer import make_trainer
-from sejax.training import TrainingConfig
+from sejax.agents.dqn import DDQNConfig, DuelingDDQNConfig, make_ddqn
+from sejax.ops.networks import DuelingMLP
+from sejax.training import TrainingConfig, make_trainer
 
 NUM_ACTIONS = 2  # as in the batches of test_ddqn
 GOLDEN = Path(__file__).parent / "golden" / "dueling_updates.npz"
 ACTIVATIONS = ("tanh", "prelu")
 CONFIG = DuelingDDQNConfig(
     hidden_size=5, num_layers=2, feature_dim=4, stream_hidden_size=6, stream_num_layers=1,
-    activation="tanh", batch_size=BATCH, learning_rate=0.01, target_update_rate=0.1, discount=0.9,
+    activation="tanh", batch_size=BATCH, learning_rate=0.01, tau=0.1, discount=0.9,
 )  # fmt: skip
 
 
@@ -130,5 +129,5 @@ def test_it_solves_cartpole():
 def test_one_trains_alone_on_a_core():
     # In lockstep its streams' products take longer; DDQN of the same size gains by it.
     small = {"hidden_size": 64, "num_layers": 1, "batch_size": 32}
-    assert make_ddqn(DuelingDDQNConfig(**small), 4, 2).cpu_lanes == 1
-    assert make_ddqn(DDQNConfig(**small), 4, 2).cpu_lanes > 1
+    assert make_ddqn(DuelingDDQNConfig(**small), 4, 2).cpu_num_parallel == 1
+    assert make_ddqn(DDQNConfig(**small), 4, 2).cpu_num_parallel > 1

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sejax import envs, plugins
+from sejax import envs, registry
 from sejax.errors import ConfigError
 
 GYMNASIUM_IDS = {
@@ -173,7 +173,7 @@ def test_vmapped_steps_equal_single_ones(name, env_step, env_reset):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_what_is_said_of_a_task_before_it_is_made_is_so(name):
-    config = plugins.configure("env", {"name": name})
+    config = registry.configure("env", {"name": name})
     assert config.facts == envs.facts_of(config) == envs.make(name).facts
 
 

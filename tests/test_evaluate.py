@@ -14,18 +14,18 @@ from rich.console import Console
 from support import is_drawn
 
 import sejax
-from sejax import envs, plugins
+from sejax import envs, registry
 from sejax.agents.ppo import PPOConfig
 from sejax.agents.tabular import QLearningConfig
-from sejax.app import build, commands, compose, progress
-from sejax.app.families import families_of
+from sejax.cli import build, commands, compose, progress
+from sejax.cli.families import families_of
 from sejax.errors import ConfigError
 from sejax.evaluate import evaluate, proxy_study
+from sejax.ops.sealed import seal, unseal
 from sejax.proxies import files
-from sejax.sealed import seal, unseal
 from sejax.training import TrainingConfig, budget_for
 
-TINY = ["agent.hidden_size=4", "agent.batch_size=4", "agent.init_episodes=0", "num_agents=3",
+TINY = ["agent.hidden_size=4", "agent.batch_size=4", "agent.warmup_episodes=0", "num_agents=3",
         "real_training.max_episodes=2"]  # fmt: skip
 SOFT = (
     "proxy.done=soft",
@@ -62,7 +62,7 @@ def save(path, *words):
 def stored(tmp_path_factory):
     """The file of an SE for DDQN agents."""
     path = tmp_path_factory.mktemp("proxy") / "proxy.safetensors"
-    words = ("proxy.hidden_size=4", "training.max_steps=50", "agent.init_episodes=0", *SOFT)
+    words = ("proxy.hidden_size=4", "training.max_steps=50", "agent.warmup_episodes=0", *SOFT)
     return save(path, *words)
 
 
@@ -161,12 +161,12 @@ def test_agents_train_as_configured_if_asked(room, tmp_path):
 def test_initial_episodes_beyond_the_proxys_own_extend_its_step_budget(stored):
     proxy = files.load_proxy(stored)  # learned with no initial episode and 50 steps
     then, training = proxy.learned_with("agent"), proxy.learned_with("training")
-    assert (then.init_episodes, training.max_steps) == (0, 50)
+    assert (then.warmup_episodes, training.max_steps) == (0, 50)
 
     def budget(agent, *then):
         return budget_for(training, agent, then, 200, 200).max_steps
 
-    assert budget(dataclasses.replace(then, init_episodes=3), then) == 50 + 3 * 200
+    assert budget(dataclasses.replace(then, warmup_episodes=3), then) == 50 + 3 * 200
     long, short = (PPOConfig.paper(update_episodes=number) for number in (2, 1))
     assert budget(long, then) == 50 + 401
     assert budget(then, then) == 50
@@ -179,25 +179,25 @@ def test_initial_episodes_beyond_the_proxys_own_extend_its_step_budget(stored):
     assert budget_for(training, long, [then], 1, 200).max_steps == 50 + 401
     # Of one step each: as many episodes more.
     assert budget_for(training, long, [then], 1, 200).max_episodes == training.max_episodes + 401
-    waits = dataclasses.replace(then, init_episodes=3)
+    waits = dataclasses.replace(then, warmup_episodes=3)
     assert budget_for(training, waits, [then], 1, 200).max_steps == 50 + 3
     # That is what an evaluation trains with.
-    study = proxy_study(evaluate_config(f"proxy={stored}", "agent.init_episodes=3"))
+    study = proxy_study(evaluate_config(f"proxy={stored}", "agent.warmup_episodes=3"))
     used = study.worlds["the proxy"][2]["ddqn"]
     assert used.max_steps == 650 and used.stop_rule == training.stop_rule
 
 
 def test_episodes_of_one_step_extend_a_step_budget_by_as_little(tmp_path):
-    words = ("proxy.hidden_size=4", "training.max_steps=50", "agent.init_episodes=0",
+    words = ("proxy.hidden_size=4", "training.max_steps=50", "agent.warmup_episodes=0",
              "proxy.horizon=1")  # fmt: skip
     proxy = files.load_proxy(save(tmp_path / "proxy.safetensors", *words))
-    later = dataclasses.replace(proxy.learned_with("agent"), init_episodes=3)
+    later = dataclasses.replace(proxy.learned_with("agent"), warmup_episodes=3)
     assert proxy.training_for(later).max_steps == 53
 
 
 def test_each_of_several_agents_trains_as_long_as_it_must(tmp_path):
     """An SE learned with two families: neither they nor others wait beyond their budget."""
-    words = ("agents=[ddqn,ppo]", "proxy.hidden_size=4", "agents.ddqn.init_episodes=2",
+    words = ("agents=[ddqn,ppo]", "proxy.hidden_size=4", "agents.ddqn.warmup_episodes=2",
              "agents.ppo.rollout_steps=100", "training.max_steps=4000", *SOFT)  # fmt: skip
     path = save(tmp_path / "proxy.safetensors", *words)
     composed = evaluate_config(f"proxy={path}", "agent=[ddqn,dueling_ddqn,ppo]",
@@ -249,7 +249,7 @@ def test_settings_that_cannot_be_or_have_no_effect_are_refused(given, message, s
     ("given", "message"),
     [
         (["training.solved_by=train", "training.stop_rule=solved"], "training.solved_by must be"),
-        (["training.max_steps=300", "agent.init_episodes=2"], "max_steps must exceed 400"),
+        (["training.max_steps=300", "agent.warmup_episodes=2"], "max_steps must exceed 400"),
     ],
 )
 def test_trainings_that_sejax_run_refuses_are_refused(given, message, stored):
@@ -349,14 +349,14 @@ def test_where_no_agent_is_named_it_is_the_tasks_own(room, tmp_path):
                         (tmp_path / "theirs.safetensors", "td3"), ("nope", "ddqn"),
                         ("real env=gridworld_2x2", "q_learning"), ("real", "ddqn")):  # fmt: skip
         config = evaluate_config(*f"proxy={proxy}".split(), words=[])
-        assert plugins.name_of("agent", config.agent) == kind
-        assert config.agent == plugins.configure("agent", {"name": kind})
+        assert registry.name_of("agent", config.agent) == kind
+        assert config.agent == registry.configure("agent", {"name": kind})
     # An older file, which lacks that: its task's name is not imported, nor made.
     path = tmp_path / "theirs.safetensors"
     tensors, header = unseal(path.read_bytes(), "sejax")
     header.pop("interface")
     path.write_bytes(seal(tensors, "sejax", header))
-    assert plugins.name_of("agent", evaluate_config(f"proxy={path}", words=[]).agent) == "ddqn"
+    assert registry.name_of("agent", evaluate_config(f"proxy={path}", words=[]).agent) == "ddqn"
     assert "their" not in sys.modules
 
 

@@ -8,7 +8,7 @@ import pytest
 from scripted import MAX_EPISODES, MAX_STEPS, ScriptedEnv, script, scripted_agent
 
 import sejax
-from sejax import envs, evaluation, plugins
+from sejax import envs, evaluation, registry
 from sejax.proxies.configs import RewardConfig, SyntheticConfig
 from sejax.training import TrainingConfig
 
@@ -76,10 +76,10 @@ def test_every_kind_of_agent_can_be_trained_on_every_kind_of_proxy(
     env, agent, exploration, varied, proxy
 ):
     task = envs.make(env)
-    config = plugins.configure("agent", {"name": agent})
-    bonus = plugins.configure("exploration", {"name": exploration})
+    config = registry.configure("agent", {"name": agent})
+    bonus = registry.configure("exploration", {"name": exploration})
     made = sejax.make_agent(config, task, bonus, varied)
-    world = plugins.make("proxy", proxy, task)
+    world = registry.make("proxy", proxy, task)
     training = TrainingConfig(max_steps=5, max_episodes=5, stop_rule="never", test_episodes=3)
     evaluate = evaluation.make_evaluator(made, world, task, training)
     outcome = jax.eval_shape(lambda key: evaluate(key, world.default_params), jax.random.key(0))

@@ -22,7 +22,7 @@ TINY = {
     "own_objective": ["--generations=1", "--population=2", "--agents=2", "--steps=250"],
     "own_proxy": ["--generations=1", "--population=2", "--steps=250"],
     "read_a_set": ["--agents=3", "--size=2", "--generations=2"],
-    "train_thousands": ["--agents=6", "--lanes=2"],
+    "train_thousands": ["--agents=6", "--num_parallel=2"],
     "sb3_agents": ["--steps=10", "--seeds=1", "--episodes=1"],
     "sbx_agent": ["--steps=10", "--seeds=1", "--episodes=1"],
     "cleanrl_dqn": ["--total-steps=60", "--test-every=30", "--test-episodes=1",
@@ -87,7 +87,7 @@ def test_a_command_takes_a_task_an_agent_a_proxy_and_an_objective_from_its_folde
     for name in ("own_task", "own_agent", "own_proxy", "own_objective"):
         shutil.copy(EXAMPLES / f"{name}.py", tmp_path)
     choices = ["env=own_task:make_reacher", "env.size=4", "agent=own_agent:SAC",
-               "agent.hidden_size=8", "agent.init_episodes=1", "proxy=own_proxy:LinearSE",
+               "agent.hidden_size=8", "agent.warmup_episodes=1", "proxy=own_proxy:LinearSE",
                "objective=own_objective:RiskAverse", "objective.aversion=2"]  # fmt: skip
     small = ["generations=1", "es.population_size=2", "es.num_incumbent_evals=1", "devices=1",
              "training.max_steps=30", "run_dir=here"]  # fmt: skip
@@ -155,7 +155,7 @@ def test_a_sac_update_is_one_that_was_derived_anew(examples):
     shapes = shapes_of(networks.init, jax.random.key(0), np.zeros(OBS_DIM), np.zeros(ACTION_DIM))
     params = random_like(shapes, seed=1)
     target_critics = jax.tree.map(lambda x: x + np.float32(0.1), params["critics"])
-    hparams = sejax.agents.traced(own_agent.SAC(discount=0.9, target_update_rate=0.1))
+    hparams = sejax.agents.traced(own_agent.SAC(discount=0.9, tau=0.1))
     state = own_agent.SACState(params=params, target_critics=target_critics, hparams=hparams,
                                opt_state=own_agent.ADAM.init(params),
                                is_warming_up=jnp.bool_(False))  # fmt: skip
@@ -198,7 +198,7 @@ def test_a_sac_update_is_one_that_was_derived_anew(examples):
 def test_sac_learns_on_proxies_within_nes(examples):
     own_agent, own_task = examples("own_agent"), examples("own_task")
     task = own_task.make_reacher()
-    agent = sejax.make_agent(own_agent.SAC(hidden_size=8, batch_size=8, init_episodes=1), task)
+    agent = sejax.make_agent(own_agent.SAC(hidden_size=8, batch_size=8, warmup_episodes=1), task)
     learn = sejax.make_learner(
         task=task, agent=agent, proxy=sejax.SyntheticConfig(hidden_size=8),
         es=sejax.NESConfig(population_size=2, num_incumbent_evals=1), generations=2, devices=1,

@@ -12,7 +12,7 @@ from support import is_drawn, refuse
 
 import sejax
 from sejax import envs
-from sejax.app import session
+from sejax.cli import session
 from sejax.errors import ConfigError
 from sejax.experiments import (
     budgets,
@@ -26,7 +26,7 @@ from sejax.experiments import (
 TINY_RUN = ["es.population_size=2", "es.num_incumbent_evals=2", "proxy.hidden_size=4",
             "training.max_steps=30", "training.test_episodes=1",
             *(f"agents.{name}.{field}" for name in ("ddqn", "dueling_ddqn")
-              for field in ("hidden_size=4", "batch_size=4", "init_episodes=0"))]  # fmt: skip
+              for field in ("hidden_size=4", "batch_size=4", "warmup_episodes=0"))]  # fmt: skip
 
 
 # Budgets, with one tiny run of `se_horizons`.

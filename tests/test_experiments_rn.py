@@ -12,7 +12,7 @@ import pytest
 from support import is_drawn, refuse
 
 import sejax
-from sejax.app import build, session
+from sejax.cli import build, session
 from sejax.errors import ConfigError
 from sejax.experiments import (
     pieces,

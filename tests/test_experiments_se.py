@@ -18,8 +18,8 @@ from support import refuse
 
 import sejax
 from sejax import envs
-from sejax.agents.agent import drawing_key
-from sejax.app import session
+from sejax.agents.base import drawing_key
+from sejax.cli import session
 from sejax.errors import ConfigError
 from sejax.experiments import (
     experiment,
@@ -37,9 +37,9 @@ from sejax.serialize import flatten
 from sejax.statistics import bootstrap_interval, interquartile_mean
 
 TINY_RUN = ["es.population_size=2", "es.num_incumbent_evals=2", "agent.hidden_size=4",
-            "agent.batch_size=4", "agent.init_episodes=0", "proxy.hidden_size=4",
+            "agent.batch_size=4", "agent.warmup_episodes=0", "proxy.hidden_size=4",
             "training.max_steps=30", "training.test_episodes=1"]  # fmt: skip
-TINY_AGENT = {"hidden_size": 2, "batch_size": 4, "num_layers": 1, "init_episodes": 0}
+TINY_AGENT = {"hidden_size": 2, "batch_size": 4, "num_layers": 1, "warmup_episodes": 0}
 
 
 # What experiments are told.
@@ -186,7 +186,9 @@ def test_a_kill_while_a_piece_is_written_loses_nothing(tmp_path, monkeypatch):
 def ses(tmp_path_factory):
     """A file with three SEs of random weights: its path and the weights."""
     path = tmp_path_factory.mktemp("ses") / "ses.safetensors"
-    config = sejax.config(["proxy.hidden_size=4", "training.max_steps=40", "agent.init_episodes=0"])
+    config = sejax.config(
+        ["proxy.hidden_size=4", "training.max_steps=40", "agent.warmup_episodes=0"]
+    )
     env = config.parts()["proxy"]
     weights = [env.init_weights(jax.random.key(i)) for i in range(3)]
     records = [{"score": 1.0 + i, "generation": 4 + i, "seed": 7 + i} for i in range(3)]
@@ -195,7 +197,7 @@ def ses(tmp_path_factory):
 
 
 def plain(config):
-    from sejax.app import build
+    from sejax.cli import build
 
     return build.to_plain(config)
 
@@ -362,7 +364,7 @@ def test_a_run_without_its_checkpoint_is_not_replaced(two_runs, tmp_path):
 @pytest.mark.parametrize("env", ["cartpole", "acrobot"])
 def test_quick_runs_are_long_enough_to_learn(env, preset):
     config = sejax.config([f"env={env}", f"preset={preset}", *se_feasibility.QUICK])
-    assert config.agent.init_episodes == 1
+    assert config.agent.warmup_episodes == 1
 
 
 def made_up_agents(num_ses=4, num_agents=6):

@@ -12,8 +12,8 @@ from support import numpy_forward, refuse
 
 import sejax
 from sejax import envs
-from sejax.app import build
 from sejax.bilevel import make_program
+from sejax.cli import build
 from sejax.errors import ConfigError
 from sejax.experiments import (
     pieces,
@@ -26,9 +26,9 @@ from sejax.experiments import (
 )
 from sejax.rollout import make_recorder, make_tester
 from sejax.statistics import bootstrap_interval
-from sejax.trainer import make_trainer
+from sejax.training import make_trainer
 
-TINY_AGENT = {"hidden_size": 2, "num_layers": 1, "batch_size": 4, "init_episodes": 0}
+TINY_AGENT = {"hidden_size": 2, "num_layers": 1, "batch_size": 4, "warmup_episodes": 0}
 TINY_TRANSFORMS = {"runs": 3, "generations": 2, "population": 2}
 TINY_HISTOGRAMS = {"agents": "ddqn", "num_agents": 2, "test_episodes": 2, "max_rows": 50}
 TINY_MODELS = {"models": 3, "generations": 2, "population": 2, "max_rows": 30, "epochs": 2,
@@ -53,7 +53,7 @@ def save_se(path, *overrides):
 @pytest.fixture(scope="module")
 def se_file(tmp_path_factory):
     path = tmp_path_factory.mktemp("se") / "se.safetensors"
-    return save_se(path, "preset=soft", "training.max_steps=60", "agent.init_episodes=0")
+    return save_se(path, "preset=soft", "training.max_steps=60", "agent.warmup_episodes=0")
 
 
 @pytest.fixture
@@ -404,7 +404,7 @@ def test_a_recorded_run_is_the_bilevel_loop():
     """With the solved rule, whose agents are tested between episodes."""
     config = sejax.config(["proxy.hidden_size=4", "training.stop_rule=solved",
                            "training.max_episodes=3", "training.max_steps=450",
-                           "training.test_episodes=1", "agent.init_episodes=0",
+                           "training.test_episodes=1", "agent.warmup_episodes=0",
                            "agent.hidden_size=4", "agent.batch_size=4", "devices=1",
                            "es.population_size=2", "es.num_incumbent_evals=1",
                            "es.mirrored=false"])  # fmt: skip

@@ -10,12 +10,12 @@ AFTER_LEARNING = {
     ("cliff_walking", "agent"): {"learning_rate": 1.0, "discount": 0.8, "epsilon_init": 0.1,
                                  "epsilon_min": 0.1, "epsilon_decay": 0.0},
     ("cartpole", "agent"): {
-        "init_episodes": 1, "batch_size": 32, "learning_rate": 0.00025, "target_update_rate": 0.01,
+        "warmup_episodes": 1, "batch_size": 32, "learning_rate": 0.00025, "tau": 0.01,
         "discount": 0.99, "epsilon_init": 1.0, "epsilon_min": 0.1, "epsilon_decay": 0.9,
         "num_layers": 1, "hidden_size": 64, "activation": "relu", "buffer_size": 1_000_000,
     },
     ("cartpole", "transfer_agent"): {
-        "init_episodes": 1, "batch_size": 32, "learning_rate": 0.00025, "target_update_rate": 0.01,
+        "warmup_episodes": 1, "batch_size": 32, "learning_rate": 0.00025, "tau": 0.01,
         "discount": 0.99, "epsilon_init": 1.0, "epsilon_min": 0.1, "epsilon_decay": 0.9,
         "num_layers": 1, "hidden_size": 64, "activation": "relu", "buffer_size": 1_000_000,
         "feature_dim": 128, "stream_num_layers": 1, "stream_hidden_size": 128,

@@ -1,4 +1,4 @@
-"""sejax.families: members that take turns among agents, and what their scores make."""
+"""sejax.agents.mixture: members that take turns among agents, and what their scores make."""
 
 import dataclasses
 import re
@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 
 import sejax
-from sejax import envs, plugins
+from sejax import envs, registry
+from sejax.agents.mixture import COMPARED_BY, Families, FamiliesConfig
 from sejax.bilevel import Scores, make_population_evaluator, make_program
 from sejax.errors import ConfigError
+from sejax.es.base import Trials
 from sejax.es.nes import NESConfig
-from sejax.es.strategy import Trials
 from sejax.evaluation import make_evaluator
-from sejax.families import COMPARED_BY, Families, FamiliesConfig
 from sejax.objectives import Outcome
 from sejax.proxies.configs import SyntheticConfig
 from sejax.training import TrainingConfig
@@ -206,7 +206,7 @@ def test_the_incumbents_agents_that_diverged_rank_last_within_their_family():
 
 # --- programs ------------------------------------------------------------------------------------
 
-PROXY = plugins.make("proxy", SyntheticConfig(hidden_size=4, done="threshold"), TASK)
+PROXY = registry.make("proxy", SyntheticConfig(hidden_size=4, done="threshold"), TASK)
 TRAINING = TrainingConfig(max_episodes=5, max_steps=30, stop_rule="never", test_episodes=2)
 ES = NESConfig(population_size=3, noise_std=1.0, num_evals=2, num_incumbent_evals=3)
 KEYS = jax.random.split(jax.random.key(0), 2)
@@ -215,7 +215,7 @@ KEYS = jax.random.split(jax.random.key(0), 2)
 def program_of(agent, **fields):
     return make_program(
         **{"task": TASK, "agent": agent, "proxy": PROXY, "es": ES, "training": TRAINING,
-           "lanes": 1, "devices": 2, **fields}
+           "num_parallel": 1, "devices": 2, **fields}
     )  # fmt: skip
 
 
@@ -256,7 +256,13 @@ def two():
 
 def test_each_candidate_is_trained_by_its_family_and_no_other(two):
     evaluate = make_population_evaluator(
-        two.program.families, PROXY, TRAINING, two.program.unravel, two.family, devices=2, lanes=1
+        two.program.families,
+        PROXY,
+        TRAINING,
+        two.program.unravel,
+        two.family,
+        devices=2,
+        num_parallel=1,
     )
     got = jax.jit(evaluate)(two.asked.keys, two.asked.candidates, jnp.ones(2, bool))
     jax.tree.map(np.testing.assert_array_equal, jax.device_get(got), two.outcome)
@@ -380,7 +386,7 @@ def test_an_incumbent_that_no_agent_of_a_family_survived_is_never_the_best():
 
 def test_two_families_are_one_program_with_a_training_loop_for_each():
     task = envs.make("cartpole")
-    config = sejax.DDQNConfig(hidden_size=4, num_layers=1, batch_size=4, init_episodes=1)
+    config = sejax.DDQNConfig(hidden_size=4, num_layers=1, batch_size=4, warmup_episodes=1)
     sizes = (31, 37)  # rows of the replay buffers, which tell the loops apart
     agents = tuple(
         sejax.make_agent(dataclasses.replace(config, buffer_size=size), task) for size in sizes
@@ -388,7 +394,7 @@ def test_two_families_are_one_program_with_a_training_loop_for_each():
     program = make_program(
         task=task, agent=Families(agents=agents), proxy=SyntheticConfig(hidden_size=4),
         es=NESConfig(population_size=7), training=dataclasses.replace(TRAINING, max_steps=40),
-        devices=2, lanes=1,
+        devices=2, num_parallel=1,
     )  # fmt: skip
     lowered = jax.jit(program.generation).lower(jax.eval_shape(program.init, KEYS))
     hlo = lowered.compile().as_text()

@@ -1,4 +1,4 @@
-"""sejax.flat: parameters as one vector and back, and Adam against a plain loop and optax."""
+"""sejax.ops.flat: parameters as one vector and back, and Adam against a plain loop and optax."""
 
 import jax
 import jax.numpy as jnp
@@ -6,8 +6,8 @@ import numpy as np
 import optax
 from support import random_like, raveled, shapes_of
 
-from sejax import flat
-from sejax.networks import MLP
+from sejax.ops import flat
+from sejax.ops.networks import MLP
 
 NET = MLP(2, hidden_size=3, num_layers=1, activation="prelu", learn_prelu_slope=True)
 TREE = random_like(shapes_of(NET.init, jax.random.key(0), np.zeros(4)))

@@ -19,14 +19,14 @@ from safetensors.numpy import save_file
 from support import random_like, shapes_of
 
 import sejax
-from sejax import envs, plugins
+from sejax import envs, registry
 from sejax.errors import ConfigError
 from sejax.gym import GYMNASIUM_IDS, RealTask, SyntheticEnv, SyntheticWorld, make
 from sejax.gym.tasks import real_task
+from sejax.ops.sealed import seal, unseal
 from sejax.proxies import ABSURD
 from sejax.proxies.configs import SyntheticConfig
 from sejax.proxies.stored import find, pretrained_names
-from sejax.sealed import seal, unseal
 
 KEY = jax.random.key(0)
 SMALL = {"hidden_size": 5}
@@ -34,7 +34,7 @@ BANDIT = {"initial_state": "learned", "horizon": 1, "done": "threshold"}
 
 
 def jax_se(task="cartpole", **config):
-    return plugins.make("proxy", SyntheticConfig(**SMALL | config), envs.make(task))
+    return registry.make("proxy", SyntheticConfig(**SMALL | config), envs.make(task))
 
 
 def random_weights(env, seed=0, scale=0.5):
@@ -61,7 +61,7 @@ def stored(tmp_path):
 def constant(state=0.25, reward=2.0, d=0.0, max_steps=200, **config):
     """A CartPole SE whose outputs are constants, whatever it sees; d is the done output."""
     config = SyntheticConfig(**SMALL | {"done": "threshold"} | config)
-    env = plugins.make("proxy", config, envs.make("cartpole"))
+    env = registry.make("proxy", config, envs.make("cartpole"))
     weights = random_weights(env, scale=0.0)
     for head, value in {"state": state, "reward": reward, "done": d}.items():
         if head in weights:
@@ -356,7 +356,7 @@ def test_the_spec_makes_it_again_and_adds_no_second_time_limit(stored):
 @pytest.mark.parametrize("name", ["by hand", "a(b)/c", "@"])
 def test_a_task_may_be_called_what_gymnasium_would_not(stored, name):
     task = dataclasses.replace(envs.make("cartpole"), name=name, origin=None)
-    env = make(stored(plugins.make("proxy", SyntheticConfig(**SMALL, **BANDIT), task)))
+    env = make(stored(registry.make("proxy", SyntheticConfig(**SMALL, **BANDIT), task)))
     assert gymnasium.make(env.spec).reset(seed=0)[0].shape == (4,)
 
 
@@ -462,7 +462,7 @@ def test_an_unknown_task_must_be_given(stored):
     from gymnax.environments.classic_control import pendulum
 
     task = sejax.Task(name="mine", env=pendulum.Pendulum(), max_steps=7)
-    path = stored(plugins.make("proxy", SyntheticConfig(**SMALL, done="bernoulli"), task))
+    path = stored(registry.make("proxy", SyntheticConfig(**SMALL, done="bernoulli"), task))
     with pytest.raises(ConfigError, match=r"^task must be given for mine.*RealTask\("):
         make(path)
     box = spaces.Box(-2, 2, (1,))
@@ -493,7 +493,7 @@ def test_an_unknown_task_must_be_given(stored):
 def test_an_se_with_its_own_starts_needs_no_task(stored, monkeypatch):
     task = dataclasses.replace(envs.make("pendulum"), name="mine", origin=None)
     config = SyntheticConfig(**SMALL, initial_state="learned", state_units="bounds")
-    path = stored(plugins.make("proxy", config, task))
+    path = stored(registry.make("proxy", config, task))
     env, given = make(path), make(path, "Pendulum-v1")
     assert (env.action_space, env.observation_space) == (given.action_space, spaces.Box(
         -np.inf, np.inf, (3,)))  # fmt: skip
@@ -559,7 +559,7 @@ def test_weights_of_another_type_are_refused_as_in_jax(tmp_path):
 
 
 def test_an_se_keeps_its_step_limit_on_another_task_of_its_kind(stored):
-    env = plugins.make("proxy", SyntheticConfig(**SMALL), envs.make("cartpole"))
+    env = registry.make("proxy", SyntheticConfig(**SMALL), envs.make("cartpole"))
     path = stored(env)
     assert make(path).world.max_steps == make(path, "CartPole-v1").world.max_steps == 200
     task = RealTask.of_gymnasium("CartPole-v1")
@@ -567,7 +567,7 @@ def test_an_se_keeps_its_step_limit_on_another_task_of_its_kind(stored):
                        r"task=dataclasses\.replace\(task, max_steps=200\)"):  # fmt: skip
         make(path, task)
     assert make(path, dataclasses.replace(task, max_steps=200)).world.max_steps == 200
-    bandit = stored(plugins.make("proxy", SyntheticConfig(**SMALL, horizon=1),
+    bandit = stored(registry.make("proxy", SyntheticConfig(**SMALL, horizon=1),
                                  envs.make("cartpole")))  # fmt: skip
     assert make(bandit, task).world.max_steps == 1  # whatever the task's
     old = "results/soft_ses/cartpole.safetensors"  # a file that does not say what agents see
@@ -576,7 +576,7 @@ def test_an_se_keeps_its_step_limit_on_another_task_of_its_kind(stored):
 
 
 def test_starts_are_as_the_environments_wrappers_show_them(stored):
-    path = stored(plugins.make("proxy", SyntheticConfig(**SMALL), envs.make("cartpole")))
+    path = stored(registry.make("proxy", SyntheticConfig(**SMALL), envs.make("cartpole")))
     real = gymnasium.make("CartPole-v1", max_episode_steps=200)
     wrapped = TransformObservation(real, lambda obs: 10 * obs, real.observation_space)
     se = make(path, RealTask.of_env(wrapped))

@@ -24,7 +24,7 @@ from safetensors.numpy import save_file
 from support import numpy_forward, random_like, shapes_of
 
 import sejax
-from sejax import envs, plugins
+from sejax import envs, registry
 from sejax.envs import cliff_walking, gridworld_2x2
 from sejax.errors import ConfigError
 from sejax.gym import GridWorld, RewardNetwork, make
@@ -266,7 +266,7 @@ def test_the_spec_of_a_wrapper_makes_the_wrapper_again(tmp_path):
 def test_numbers_of_info_have_gymnasiums_names():
     """Those of sejax's tasks; v5's halfcheetah has another name for one."""
     renamed = {"reward_run": "reward_forward"}
-    told = {name for name in plugins.names("env") if plugins.find("env", name).facts.has_info}
+    told = {name for name in registry.names("env") if registry.find("env", name).facts.has_info}
     assert told == set(INFO_KEYS)
     for name in told:
         world = importlib.import_module(f"sejax.envs.mujoco.{name}").Env
@@ -376,7 +376,7 @@ def test_info_that_is_not_there_is_one_message(tmp_path):
 def test_a_task_that_gymnasium_has_not_must_be_given(tmp_path):
     for task in ({"name": "gymnax/Pendulum-v1"}, {"name": "halfcheetah", "backend": "spring"}):
         env = envs.make("pendulum")
-        rn = plugins.make("proxy", RewardConfig(hidden_size=2), env)
+        rn = registry.make("proxy", RewardConfig(hidden_size=2), env)
         path = tmp_path / "rn.safetensors"
         weights = random_like(shapes_of(rn.init_weights, KEY))
         sejax.save(path, rn, weights, config={"env": task}, discount=0.9)

@@ -12,9 +12,9 @@ from gymnax.environments import spaces
 from gymnax.registration import registered_envs
 
 import sejax
-from sejax import envs, plugins
+from sejax import envs, registry
+from sejax.envs.base import Task
 from sejax.envs.gymnax import PREFIX, SOLVED_REWARD, GymnaxTask
-from sejax.envs.task import Task
 from sejax.envs.wrappers import AsVectors
 from sejax.errors import ConfigError
 
@@ -84,11 +84,11 @@ def test_agents_train_on_them_and_on_their_proxies(gymnax_id):
     """By its types: what a loop carries must stay what it is."""
     task = task_of(gymnax_id)
     config = sejax.QLearningConfig() if task.num_states else sejax.DDQNConfig(
-        hidden_size=2, num_layers=1, batch_size=2, init_episodes=0)  # fmt: skip
+        hidden_size=2, num_layers=1, batch_size=2, warmup_episodes=0)  # fmt: skip
     agent = sejax.make_agent(config, task)
     training = sejax.TrainingConfig(max_episodes=2, max_steps=9, stop_rule="never")
     for proxy in (sejax.SyntheticConfig(hidden_size=2), sejax.RewardConfig(hidden_size=2)):
-        env = plugins.make("proxy", proxy, task)
+        env = registry.make("proxy", proxy, task)
         evaluate = sejax.make_evaluator(agent, env, task, training)
         outcome = jax.eval_shape(lambda key: evaluate(key, env.default_params), KEY)  # noqa: B023
         assert outcome.test_returns.shape == (10,)
@@ -101,7 +101,7 @@ def test_the_step_limit_is_gymnaxs_or_the_one_asked_for():
     _, state = task.env.reset_env(KEY, task.params)
     late = state.replace(time=jnp.array([6, 7]))
     assert task.env.is_truncated(late, task.params).tolist() == [False, True]
-    proxy = plugins.make("proxy", sejax.SyntheticConfig(hidden_size=2), task)
+    proxy = registry.make("proxy", sejax.SyntheticConfig(hidden_size=2), task)
     assert proxy.default_params.max_steps_in_episode == 7
     with pytest.raises(ConfigError, match=r"^env\.max_steps must be at least 1, .* got 0\."):
         task_of("CartPole-v1", max_steps=0)

@@ -171,7 +171,7 @@ def test_weighted_info_is_a_linear_reward(replayed, walk):
 def test_the_papers_settings_are_its_own():
     config = sejax.config(["env=halfcheetah", "proxy=rn", "preset=paper", "proxy.augmented=true"])
     agent = config.agent
-    assert (config.name("agent"), agent.init_episodes, agent.discount, agent.activation) == (
+    assert (config.name("agent"), agent.warmup_episodes, agent.discount, agent.activation) == (
         "td3", 20, 0.98, "relu",
     )  # fmt: skip
     assert (config.proxy.hidden_size, config.proxy.activation) == (128, "prelu")

@@ -9,9 +9,8 @@ import yaml
 from fake_hub import oid, serving
 
 import sejax
-from sejax import hub
 from sejax.errors import ConfigError
-from sejax.proxies import stored
+from sejax.proxies import hub, stored
 
 SHIPPED = stored.PRETRAINED_DIR / "cartpole.safetensors"
 needs_the_extra = pytest.mark.skipif(
@@ -254,7 +253,7 @@ def test_a_repository_has_an_owner_and_a_name():
 
 @needs_the_extra
 def test_the_command_evaluates_what_is_there_and_writes_in_the_working_folder(the_hub):
-    from sejax.app import compose
+    from sejax.cli import compose
     from sejax.evaluate import proxy_study
 
     sejax.push("cartpole", "me/se")

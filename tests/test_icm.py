@@ -13,8 +13,8 @@ from support import numpy_forward, random_like, shapes_of, unraveled
 
 from sejax import envs
 from sejax.agents import make_agent
-from sejax.agents.agent import Agent
-from sejax.agents.ddqn import DDQNConfig, make_ddqn
+from sejax.agents.base import Agent
+from sejax.agents.dqn import DDQNConfig, make_ddqn
 from sejax.agents.icm import ICM, ICMConfig, ICMOutputs, icm_loss, with_icm
 from sejax.agents.memory import Rollout, replay_memory
 from sejax.agents.replay import Transition, pack
@@ -71,7 +71,7 @@ def stub_agent(kind):
         update=update,
         memory=replay_memory(BATCH, 10),
         hparams=(),
-        init_episodes=3,
+        warmup_episodes=3,
         learns_from=2,
         env_action=jnp.negative,
         action_repeat=2,
@@ -377,8 +377,8 @@ def test_a_rollout_that_is_not_full_changes_nothing_alone_and_in_lanes(updates):
     waiting = updates["index"](KEY, state, as_rollout(batch, is_full=False))
     jax.tree.map(np.testing.assert_array_equal, waiting, state)
     full = updates["index"](KEY, state, as_rollout(batch))
-    lanes = jax.tree.map(lambda *x: np.stack(x), as_rollout(batch, False), as_rollout(batch))
-    both = jax.jit(jax.vmap(curious("index").update, (None, None, 0)))(KEY, state, lanes)
+    num_parallel = jax.tree.map(lambda *x: np.stack(x), as_rollout(batch, False), as_rollout(batch))
+    both = jax.jit(jax.vmap(curious("index").update, (None, None, 0)))(KEY, state, num_parallel)
     both = jax.tree.map(np.asarray, both)
     jax.tree.map(lambda x, y: np.testing.assert_array_equal(x[0], y), both, state)
     jax.tree.map(lambda x, y: np.testing.assert_allclose(x[1], y, rtol=1e-5, atol=1e-6), both, full)
@@ -395,7 +395,7 @@ def test_an_agents_hyperparameters_may_be_any_pytree():
 
 def test_everything_else_is_the_wrapped_agents():
     agent = curious("index")
-    for name in ("memory", "init_episodes", "learns_from", "env_action", "action_repeat"):
+    for name in ("memory", "warmup_episodes", "learns_from", "env_action", "action_repeat"):
         assert getattr(agent, name) is getattr(STUBS["index"], name)
     assert agent.hparams == ((), (0.01, 0.3, 0.5))
     assert agent.hparams.icm._fields == ("learning_rate", "forward_weight", "reward_scale")
@@ -437,5 +437,5 @@ def test_an_agent_that_does_not_learn_once_at_each_step_is_refused(field):
 def test_a_curious_agent_trains_alone_on_a_core():
     # In lockstep the bonus' networks take 1.4 times as long, however small the agent's own are.
     task, small = envs.make("cartpole"), DDQNConfig(hidden_size=64, num_layers=1, batch_size=32)
-    assert make_agent(small, task).cpu_lanes > 1
-    assert make_agent(small, task, ICMConfig()).cpu_lanes == 1
+    assert make_agent(small, task).cpu_num_parallel > 1
+    assert make_agent(small, task, ICMConfig()).cpu_num_parallel == 1

@@ -1,11 +1,11 @@
-"""sejax.keys: the keys of a loop's steps are bits that nothing but chance relates."""
+"""sejax.ops.keys: the keys of a loop's steps are bits that nothing but chance relates."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sejax.keys import step_keys, words
+from sejax.ops.keys import step_keys, words
 
 NUM_STEPS, NUM_PURPOSES = 20_000, 6  # those of the trainer
 LOOPS = (0, 1, 2**31 - 1)  # seeds

@@ -7,7 +7,7 @@ LIGHT = """
 import sys
 import sejax
 assert sejax.envs.make("cartpole").max_steps == 200
-import sejax.proxies.proxy
+import sejax.proxies.base
 from gymnax.environments import environment, spaces
 from gymnax.environments.classic_control import cartpole
 sejax.load("cartpole")

@@ -1,4 +1,4 @@
-"""sejax.loops: every lane gets what it would get alone, at any depth of vmap."""
+"""sejax.ops.loops: every lane gets what it would get alone, at any depth of vmap."""
 
 import jax
 import jax.numpy as jnp
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from flax import struct
 
-from sejax.loops import while_any_active
+from sejax.ops.loops import while_any_active
 
 
 @struct.dataclass

@@ -17,8 +17,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import sejax
-from sejax.app import session
 from sejax.bilevel import make_program
+from sejax.cli import session
 from sejax.errors import ConfigError, FailedError
 from sejax.machines import handout, ledger, scorer
 from sejax.machines.chunks import RemoteChunks, problem
@@ -101,8 +101,10 @@ class Crew:
         self.due.pop(worker, None)
 
 
-def hand_out_of(crew, capacities=(16,), lanes=(1,), **options):
-    return HandOut(crew, capacities, lanes, say=crew.said.append, clock=crew.clock, **options)
+def hand_out_of(crew, capacities=(16,), num_parallel=(1,), **options):
+    return HandOut(
+        crew, capacities, num_parallel, say=crew.said.append, clock=crew.clock, **options
+    )
 
 
 def score(hand_out, *sizes):
@@ -410,8 +412,8 @@ def test_whatever_workers_do_generations_are_whole_and_right(seed):
     crew = Crew(room=rng.randint(1, 6), fate=fate)
     families = [rng.randint(1, 40) for _ in range(rng.randint(1, 3))]
     capacities = [rng.randint(1, 16) for _ in families]
-    lanes = [rng.choice([1, capacity]) for capacity in capacities]
-    hand_out = hand_out_of(crew, capacities, lanes, patience_s=60.0)
+    num_parallel = [rng.choice([1, capacity]) for capacity in capacities]
+    hand_out = hand_out_of(crew, capacities, num_parallel, patience_s=60.0)
     plain = crew.wait
 
     def wait(timeout_s):
@@ -507,7 +509,7 @@ CASES = {
 @pytest.mark.parametrize("case", CASES)
 def test_so_do_all_kinds_of_agents_and_strategies(case):
     # Compiled as commands are: without optimisation fusions round otherwise in larger programs.
-    program = ("from sejax.app import runtime; runtime.configure_xla(1)\n"
+    program = ("from sejax.cli import runtime; runtime.configure_xla(1)\n"
                "import sys, test_machines\n"
                "test_machines.require_equal_numbers(sys.argv[1:], 3, num_seeds=2)")  # fmt: skip
     environment = {name: x for name, x in os.environ.items() if name != "XLA_FLAGS"}

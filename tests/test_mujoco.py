@@ -19,7 +19,7 @@ from sejax import envs
 from sejax.envs.halfcheetah import HalfCheetah
 from sejax.envs.hopper import Hopper
 from sejax.errors import ConfigError
-from sejax.parallel import spread_over_devices
+from sejax.ops.parallel import spread_over_devices
 from sejax.proxies.configs import RewardConfig
 
 gymnasium = pytest.importorskip("gymnasium")
@@ -193,7 +193,7 @@ def test_resets_are_drawn_as_gymnasiums(name, in_gymnasium):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_what_is_said_of_a_task_before_mujoco_is_imported_is_so(name):
-    config = sejax.plugins.configure("env", {"name": name})
+    config = sejax.registry.configure("env", {"name": name})
     task = envs.make(name)
     assert config.facts == task.facts and task.name == name
     assert {*task.augmented_keys} <= {*task.info_keys}

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import sejax
-from sejax import plugins
+from sejax import registry
 from sejax.errors import ConfigError
 from sejax.es.evosax import ALGORITHMS, EvosaxConfig, finite_fitness
 from sejax.es.nes import NESConfig
@@ -299,7 +299,7 @@ def test_the_names_are_evosaxs_own_distribution_based_algorithms():
     left_out = without_a_mean | of_gradients
     assert set(ALGORITHMS.values()) == set(distribution_based_algorithms) - left_out
     assert list(ALGORITHMS) == sorted(ALGORITHMS)
-    assert plugins.names("es") == ["nes", *ALGORITHMS]
+    assert registry.names("es") == ["nes", *ALGORITHMS]
 
 
 @pytest.mark.parametrize("name", ALGORITHMS)

@@ -1,4 +1,4 @@
-"""sejax.networks: initial values, layout and the forward pass."""
+"""sejax.ops.networks: initial values, layout and the forward pass."""
 
 import functools
 
@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from support import numpy_forward, random_like, shapes_of
 
-from sejax.networks import (
+from sejax.ops.networks import (
     MLP,
     PRELU_SLOPE,
     affine,

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sejax import envs, plugins
+from sejax import envs, registry
 from sejax.errors import ConfigError
 from sejax.objectives import AUC, AUCSum, MaxReward, Objective, Outcome, RewardThreshold
 
@@ -73,9 +73,9 @@ def test_auc_is_the_mean_under_the_curve_or_the_area(config, scores):
     np.testing.assert_array_equal(got, scores)
 
 
-@pytest.mark.parametrize("name", plugins.names("objective"))
+@pytest.mark.parametrize("name", registry.names("objective"))
 def test_a_training_that_diverged_has_no_score(name):
-    objective = plugins.make("objective", plugins.configure("objective", {"name": name}), task())
+    objective = registry.make("objective", registry.configure("objective", {"name": name}), task())
     got = objective(outcome([200.0, 200.0], [10, 10], [True, False]))
     assert np.isnan(got[0]) and np.isfinite(got[1])
 

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from sejax import options
-from sejax.agents.agent import NoExploration, traced
+from sejax.agents.base import NoExploration, traced
 from sejax.agents.count_based import CountBasedConfig
-from sejax.agents.ddqn import DDQNConfig, DQNConfig, DuelingDDQNConfig
+from sejax.agents.dqn import DDQNConfig, DQNConfig, DuelingDDQNConfig
 from sejax.agents.icm import ICMConfig
 from sejax.agents.ppo import PPOConfig
 from sejax.agents.sac import SACConfig
@@ -164,11 +164,11 @@ def test_traced_hyperparameters_are_a_named_tuple_with_whatever_else_is_said():
     assert type(hparams).__name__ == "ConfigHparams"
 
 
-DDQN = ("learning_rate", "target_update_rate", "discount", "epsilon_init", "epsilon_min",
+DDQN = ("learning_rate", "tau", "discount", "epsilon_init", "epsilon_min",
         "epsilon_decay", "exploration_steps")  # fmt: skip
-TD3 = ("learning_rate", "target_update_rate", "discount", "action_noise_std", "target_noise_std",
+TD3 = ("learning_rate", "tau", "discount", "action_noise_std", "target_noise_std",
        "target_noise_clip")  # fmt: skip
-SAC = ("learning_rate", "target_update_rate", "discount", "alpha", "init_alpha", "target_entropy",
+SAC = ("learning_rate", "tau", "discount", "alpha", "init_alpha", "target_entropy",
        "target_entropy_fraction")  # fmt: skip
 TABULAR = ("learning_rate", "discount", "epsilon_init", "epsilon_min", "epsilon_decay")
 

@@ -1,4 +1,4 @@
-"""sejax.parallel: the same results in the same order, however the work is spread."""
+"""sejax.ops.parallel: the same results in the same order, however the work is spread."""
 
 import os
 import subprocess
@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from sejax.errors import ConfigError
-from sejax.networks import MLP
-from sejax.parallel import spread_groups_over_devices, spread_over_devices
+from sejax.ops.networks import MLP
+from sejax.ops.parallel import spread_groups_over_devices, spread_over_devices
 
 
 def work(key, x):
@@ -26,13 +26,13 @@ split = jax.jit(jax.random.split, static_argnums=1)
 
 
 @pytest.mark.parametrize(
-    ("num_devices", "lanes"), [(1, 1), (1, 3), (2, 1), (2, 2), (2, 100), (None, None)]
+    ("num_devices", "num_parallel"), [(1, 1), (1, 3), (2, 1), (2, 2), (2, 100), (None, None)]
 )
-def test_results_come_back_in_order_for_every_size(num_devices, lanes):
+def test_results_come_back_in_order_for_every_size(num_devices, num_parallel):
     for size in (1, 2, 5):
         keys = split(jax.random.key(0), size)
         xs = np.arange(2.0 * size, dtype=np.float32).reshape(size, 2)
-        got = jax.jit(spread_over_devices(work, num_devices, lanes))(keys, xs)
+        got = jax.jit(spread_over_devices(work, num_devices, num_parallel))(keys, xs)
         got = jax.tree.map(np.asarray, got)
         assert got["walked"].shape == (size, 2) and got["steps"].shape == (size,)
         for i in range(size):
@@ -65,11 +65,11 @@ def train_network(key):
     return jax.lax.scan(step, NET.init(key, INPUTS[:, 0]), length=10)[0]
 
 
-@pytest.mark.parametrize(("size", "lanes"), [(5, 1), (5, 4), (2, 4)])
-def test_the_number_of_devices_changes_no_bit_of_a_trained_network(size, lanes):
+@pytest.mark.parametrize(("size", "num_parallel"), [(5, 1), (5, 4), (2, 4)])
+def test_the_number_of_devices_changes_no_bit_of_a_trained_network(size, num_parallel):
     # Neither 5 trainings nor the shares of two devices, 3 and 1 of them, are whole batches.
     keys = split(jax.random.key(0), size)
-    one, two = (jax.jit(spread_over_devices(train_network, n, lanes))(keys) for n in (1, 2))
+    one, two = (jax.jit(spread_over_devices(train_network, n, num_parallel))(keys) for n in (1, 2))
     jax.tree.map(np.testing.assert_array_equal, one, two)
     # The lanes do what each does alone.
     alone = jax.jit(train_network)(keys[-1])
@@ -78,15 +78,17 @@ def test_the_number_of_devices_changes_no_bit_of_a_trained_network(size, lanes):
 
 
 @pytest.mark.parametrize("num_devices", [1, 2])
-@pytest.mark.parametrize("lanes", [None, 2])
-def test_groups_have_a_function_a_size_and_lanes_each(num_devices, lanes):
+@pytest.mark.parametrize("num_parallel", [None, 2])
+def test_groups_have_a_function_a_size_and_lanes_each(num_devices, num_parallel):
     def scaled(x):
         return {"scaled": 3 * x}
 
     sizes = (5, 1, 4)
     groups = [(split(jax.random.key(i), n), np.arange(2.0 * n, dtype=np.float32).reshape(n, 2))
               for i, n in enumerate(sizes)]  # fmt: skip
-    spread = spread_groups_over_devices([work, scaled, work], num_devices, lanes, [1, None, 3])
+    spread = spread_groups_over_devices(
+        [work, scaled, work], num_devices, num_parallel, [1, None, 3]
+    )
     got = jax.jit(spread)([groups[0], (groups[1][1],), groups[2]])
     np.testing.assert_array_equal(got[1]["scaled"], 3 * groups[1][1])
     for group in (0, 2):
@@ -114,7 +116,7 @@ def test_more_devices_than_there_are_is_refused():
 def test_there_may_be_far_more_devices_than_elements():
     program = (
         "import jax.numpy as jnp\n"
-        "from sejax.parallel import spread_over_devices\n"
+        "from sejax.ops.parallel import spread_over_devices\n"
         "print(spread_over_devices(lambda x: x + 1, 8)(jnp.arange(3.0)).tolist())\n"
     )
     environment = {**os.environ, "XLA_FLAGS": "--xla_force_host_platform_device_count=8"}

@@ -1,4 +1,4 @@
-"""sejax.plugins: names become objects; one's own parts take part in everything."""
+"""sejax.registry: names become objects; one's own parts take part in everything."""
 
 import dataclasses
 import importlib.metadata
@@ -13,17 +13,17 @@ import pytest
 from flax import linen as nn
 
 import sejax
-from sejax import envs, plugins
-from sejax.app import build
+from sejax import envs, registry
+from sejax.cli import build
 from sejax.errors import ConfigError
 from sejax.es.evosax import ALGORITHMS
 
-EVERY = [(group, name) for group in plugins.GROUPS for name in plugins.GROUPS[group].built_in]
+EVERY = [(group, name) for group in registry.GROUPS for name in registry.GROUPS[group].built_in]
 
 
 def refused(group, name, **fields):
     with pytest.raises(ConfigError) as error:
-        plugins.configure(group, {"name": name, **fields})
+        registry.configure(group, {"name": name, **fields})
     said = str(error.value)
     assert "\n" not in said and len(said) < 1500
     return said
@@ -48,25 +48,25 @@ def module(tmp_path, monkeypatch, request):
 
 @pytest.mark.parametrize(("group", "name"), EVERY)
 def test_defaults_configure_and_describe_are_inverses(group, name):
-    config = plugins.configure(group, {"name": name})
-    plain = plugins.describe(group, config)
-    assert plain == plugins.defaults(group, name)
-    assert plugins.configure(group, plain) == config
-    assert plugins.name_of(group, config) == name
-    assert type(config) is plugins.find(group, name)
-    assert plugins.is_registered(group, name)
+    config = registry.configure(group, {"name": name})
+    plain = registry.describe(group, config)
+    assert plain == registry.defaults(group, name)
+    assert registry.configure(group, plain) == config
+    assert registry.name_of(group, config) == name
+    assert type(config) is registry.find(group, name)
+    assert registry.is_registered(group, name)
 
 
 def test_every_algorithm_of_evosax_has_its_name():
-    assert set(plugins.names("es")) == {"nes", *ALGORITHMS}
+    assert set(registry.names("es")) == {"nes", *ALGORITHMS}
 
 
 def test_a_family_of_names_is_one_dataclass():
-    config = plugins.configure("env", {"name": "gymnax/MountainCar-v0", "max_steps": 90})
+    config = registry.configure("env", {"name": "gymnax/MountainCar-v0", "max_steps": 90})
     assert config == envs.gymnax.GymnaxTask(name="gymnax/MountainCar-v0", max_steps=90)
-    assert plugins.configure("env", plugins.describe("env", config)) == config
-    assert plugins.is_registered("env", "gymnax/anything")
-    assert not plugins.is_registered("agent", "gymnax/anything")
+    assert registry.configure("env", registry.describe("env", config)) == config
+    assert registry.is_registered("env", "gymnax/anything")
+    assert not registry.is_registered("agent", "gymnax/anything")
 
 
 def test_equal_configurations_make_the_same_object():
@@ -78,10 +78,10 @@ def test_equal_configurations_make_the_same_object():
         ("objective", {"name": "max_reward"}, (task,)),
         ("es", {"name": "nes", "population_size": 2}, (5,)),
     ]:
-        configs = [plugins.configure(group, values) for _ in range(2)]
-        first, second = (plugins.make(group, config, *arguments) for config in configs)
+        configs = [registry.configure(group, values) for _ in range(2)]
+        first, second = (registry.make(group, config, *arguments) for config in configs)
         assert configs[0] is not configs[1] and first is second
-    assert plugins.make("es", configs[0], 6) is not first
+    assert registry.make("es", configs[0], 6) is not first
     assert sejax.make_agent(sejax.QLearningConfig(), task) is sejax.make_agent(
         sejax.QLearningConfig(), task
     )
@@ -89,9 +89,9 @@ def test_equal_configurations_make_the_same_object():
 
 def test_configurations_that_differ_make_objects_that_differ():
     task = envs.make("gridworld_2x2")
-    a, b = (plugins.make("proxy", sejax.SyntheticConfig(hidden_size=n), task) for n in (3, 4))
+    a, b = (registry.make("proxy", sejax.SyntheticConfig(hidden_size=n), task) for n in (3, 4))
     assert a is not b
-    assert plugins.make("env", plugins.configure("env", {"name": "cliff_walking"})) is not a.task
+    assert registry.make("env", registry.configure("env", {"name": "cliff_walking"})) is not a.task
 
     @dataclasses.dataclass(frozen=True)
     class Mapped:
@@ -101,9 +101,9 @@ def test_configurations_that_differ_make_objects_that_differ():
             return sejax.Objective(score=lambda outcome: self.table[0] * outcome.test_return)
 
     tables = [np.zeros(5000), np.arange(5000) == 2500]
-    made = [plugins.make("objective", Mapped(table), task) for table in tables]
+    made = [registry.make("objective", Mapped(table), task) for table in tables]
     assert made[0] is not made[1]
-    assert made[0] is plugins.make("objective", Mapped(np.zeros(5000)), task)
+    assert made[0] is registry.make("objective", Mapped(np.zeros(5000)), task)
 
 
 # --- entry points of installed packages ----------------------------------------------------------
@@ -126,14 +126,14 @@ def offered(module, monkeypatch):
         return points if group == "sejax.agents" else []
 
     monkeypatch.setattr(importlib.metadata, "entry_points", entry_points)
-    plugins._offered.cache_clear()
+    registry._offered.cache_clear()
     yield name
-    plugins._offered.cache_clear()
+    registry._offered.cache_clear()
 
 
 def test_a_packages_plugin_is_known_by_its_name_and_imported_when_it_is_chosen(offered):
-    assert plugins.names("agent")[-2:] == ["mine", "broken"]
-    assert plugins.is_registered("agent", "mine") and offered not in sys.modules
+    assert registry.names("agent")[-2:] == ["mine", "broken"]
+    assert registry.is_registered("agent", "mine") and offered not in sys.modules
     sejax.config()  # somebody else's choice does not import it
     assert offered not in sys.modules
     words = ["env=gridworld_2x2", "agent=mine", "agent.extra=3", "agent.discount=0.5"]
@@ -145,7 +145,7 @@ def test_a_packages_plugin_is_known_by_its_name_and_imported_when_it_is_chosen(o
 
 
 def test_a_name_of_sejaxs_own_cannot_be_taken_over(offered):
-    assert plugins.find("agent", "ddqn") is sejax.DDQNConfig
+    assert registry.find("agent", "ddqn") is sejax.DDQNConfig
 
 
 def test_a_packages_plugin_that_is_broken_is_one_message(offered):
@@ -209,17 +209,17 @@ a_number = 3
 
 def test_a_dataclass_of_ones_own_is_found_by_its_module_and_name(module):
     name = module(SEVERAL)
-    config = plugins.configure("objective", {"name": f"{name}:Scaled", "scale": 3, "needed": 1})
+    config = registry.configure("objective", {"name": f"{name}:Scaled", "scale": 3, "needed": 1})
     assert config.scale == 3.0 and type(config) is sys.modules[name].Scaled
-    assert plugins.name_of("objective", config) == f"{name}:Scaled"
-    assert plugins.configure("objective", plugins.describe("objective", config)) == config
-    assert plugins.defaults("objective", f"{name}:Scaled") == {
+    assert registry.name_of("objective", config) == f"{name}:Scaled"
+    assert registry.configure("objective", registry.describe("objective", config)) == config
+    assert registry.defaults("objective", f"{name}:Scaled") == {
         "name": f"{name}:Scaled", "scale": 2.0, "needed": "???",
     }  # fmt: skip
-    objective = plugins.make("objective", config, envs.make("cartpole"))
+    objective = registry.make("objective", config, envs.make("cartpole"))
     assert isinstance(objective, sejax.Objective)
-    assert plugins.find("objective", f"{name}:Outer.Inner") is type(config)
-    assert not plugins.is_registered("objective", f"{name}:Scaled")
+    assert registry.find("objective", f"{name}:Outer.Inner") is type(config)
+    assert not registry.is_registered("objective", f"{name}:Scaled")
     said = refused("objective", f"{name}:Scaled")
     assert said == ("objective.needed must be given, because it has no default; got none. "
                     "Set objective.needed=VALUE.")  # fmt: skip
@@ -227,26 +227,26 @@ def test_a_dataclass_of_ones_own_is_found_by_its_module_and_name(module):
 
 def test_a_functions_parameters_are_its_options(module):
     name = f"{module(SEVERAL)}:scaled"
-    assert plugins.defaults("objective", name) == {
+    assert registry.defaults("objective", name) == {
         "name": name, "scale": "???", "offset": 0.0, "steps": [1, 2], "also": [3],
     }  # fmt: skip
-    config = plugins.configure("objective", {"name": name, "scale": 3, "steps": [4]})
+    config = registry.configure("objective", {"name": name, "scale": 3, "steps": [4]})
     assert (config.scale, config.offset, config.steps) == (3.0, 0.0, (4,))
     assert config.also == [3] and config.also is not type(config)(scale=1.0).also
-    assert plugins.configure("objective", plugins.describe("objective", config)) == config
+    assert registry.configure("objective", registry.describe("objective", config)) == config
     task = envs.make("cartpole")
-    made = plugins.make("objective", config, task)
-    assert isinstance(made, sejax.Objective) and made is plugins.make("objective", config, task)
+    made = registry.make("objective", config, task)
+    assert isinstance(made, sejax.Objective) and made is registry.make("objective", config, task)
     assert "objective.scale must be a number" in refused("objective", name, scale="x")
     assert "objective.scal must be a field of scaled" in refused("objective", name, scal=1)
 
 
 def test_a_partial_function_is_a_plugin_too(module):
     name = f"{module(SEVERAL)}:doubled"
-    config = plugins.configure("objective", {"name": name})
+    config = registry.configure("objective", {"name": name})
     assert (config.scale, config.offset) == (2.0, 0.0)
-    assert plugins.name_of("objective", config) == name
-    made = plugins.make("objective", config, envs.make("cartpole"))
+    assert registry.name_of("objective", config) == name
+    made = registry.make("objective", config, envs.make("cartpole"))
     assert isinstance(made, sejax.Objective)
 
 
@@ -270,13 +270,13 @@ def test_fields_of_unknown_types_are_one_message(module):
 
 
 def test_a_plugin_must_make_what_its_group_is_of(module):
-    config = plugins.configure("objective", {"name": f"{module(SEVERAL)}:wrong"})
+    config = registry.configure("objective", {"name": f"{module(SEVERAL)}:wrong"})
     with pytest.raises(
         ConfigError,
         match=r"^objective must make a sejax\.Objective, because that "
         r"is what is used; got int from mine_.*:wrong\. Set obj",
     ):
-        plugins.make("objective", config, envs.make("cartpole"))  # fmt: skip
+        registry.make("objective", config, envs.make("cartpole"))  # fmt: skip
 
 
 def test_a_module_that_is_not_there_or_raises_is_one_message(module):
@@ -308,7 +308,7 @@ def test_what_is_no_module_and_attribute_is_not_imported(name):
 @pytest.mark.parametrize("values", [None, 3, "ddqn", [], {}, {"discount": 0.5}])
 def test_values_without_a_name_are_refused(values):
     with pytest.raises(ConfigError, match=r"^agent must be a choice with its fields, because one"):
-        plugins.configure("agent", values)
+        registry.configure("agent", values)
 
 
 @pytest.mark.parametrize("name", [None, 3, ["ddqn"], {"a": 1}, "", "x" * 10_000])
@@ -506,7 +506,7 @@ def test_the_same_parts_as_objects_are_the_same_program(own):
 def test_a_task_that_says_no_discount_has_reward_networks(own):
     mine, _, _ = own
     task = mine.LineTask().make()
-    env = plugins.make("proxy", sejax.RewardConfig(hidden_size=2), task)
+    env = registry.make("proxy", sejax.RewardConfig(hidden_size=2), task)
     params = env.default_params
     _, state = env.reset_env(jax.random.key(0), params)
     for place, discount in ((0, 1.0), (3, 0.0)):
@@ -535,8 +535,8 @@ def test_options_that_words_cannot_say_are_one_message(module):
     with pytest.raises(ConfigError) as error:
         sejax.config([f"objective={name}:f"])
     assert "\n" not in str(error.value)
-    config = plugins.find("objective", f"{name}:f")()
-    assert plugins.make("objective", config, envs.make("cartpole")).score is print
+    config = registry.find("objective", f"{name}:f")()
+    assert registry.make("objective", config, envs.make("cartpole")).score is print
 
 
 class Plain(nn.Module):

@@ -18,7 +18,7 @@ from support import numpy_forward, raveled, shapes_of, unraveled
 import sejax
 from sejax import envs
 from sejax.agents import replay
-from sejax.agents.agent import traced
+from sejax.agents.base import traced
 from sejax.agents.memory import Rollout
 from sejax.agents.policies import SOFTMAX, gaussian
 from sejax.agents.ppo import (
@@ -33,10 +33,9 @@ from sejax.agents.ppo import (
 )
 from sejax.agents.replay import Transition
 from sejax.errors import ConfigError
-from sejax.networks import MLP
+from sejax.ops.networks import MLP
 from sejax.rollout import make_tester
-from sejax.trainer import make_trainer
-from sejax.training import TrainingConfig
+from sejax.training import TrainingConfig, make_trainer
 
 OBS_DIM, NUM_ACTIONS, ACTION_DIM, MAX_ACTION, MAX_STEPS = 3, 4, 2, 2.0, 6
 STEPS = 13  # two episodes of full length, and one step
@@ -312,16 +311,18 @@ def test_nothing_changes_until_the_rollout_is_full(kind, state, update):
 def test_lanes_learn_as_they_would_alone(kind, agent, state, update):
     # With their own parameters and learning rates; the second one's rollout is not full.
     rates = (0.05, 0.05, 0.01)
-    lanes = [
+    num_parallel = [
         state.replace(params=np.asarray(state.params) * np.float32(scale),
                       hparams=state.hparams._replace(learning_rate=np.float32(rate)))
         for scale, rate in zip((1.0, 0.8, -1.2), rates, strict=True)
     ]  # fmt: skip
     rollouts = [rollout(kind, seed, seed != 1) for seed in range(3)]
-    states, stacked = (jax.tree.map(lambda *x: np.stack(x), *each) for each in (lanes, rollouts))
+    states, stacked = (
+        jax.tree.map(lambda *x: np.stack(x), *each) for each in (num_parallel, rollouts)
+    )
     together = jax.jit(jax.vmap(agent.update, (None, 0, 0)))(KEY, states, stacked)
     together = jax.tree.map(np.asarray, together)
-    for lane, (before, own) in enumerate(zip(lanes, rollouts, strict=True)):
+    for lane, (before, own) in enumerate(zip(num_parallel, rollouts, strict=True)):
         got, alone = jax.tree.map(lambda x: x[lane], together), update(KEY, before, own)  # noqa: B023
         jax.tree.map(
             lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-6), got, alone
@@ -513,7 +514,7 @@ def test_the_agent_says_what_was_configured(agent):
         "gae_lambda": 0.8 if agent is ppo("gae") else 0.95, "entropy_weight": 0.05,
         "hidden_size": None,  # all of it
     }  # fmt: skip
-    assert (agent.init_episodes, agent.learns_from, agent.action_repeat) == (1, 0, 1)
+    assert (agent.warmup_episodes, agent.learns_from, agent.action_repeat) == (1, 0, 1)
 
 
 # --- probes --------------------------------------------------------------------------------------

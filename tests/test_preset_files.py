@@ -1,9 +1,9 @@
-"""sejax.app.words: words from a preset file, and the file that stands for words."""
+"""sejax.cli.words: words from a preset file, and the file that stands for words."""
 
 import pytest
 
 import sejax
-from sejax.app import compose, words
+from sejax.cli import compose, words
 from sejax.errors import ConfigError
 
 

@@ -1,4 +1,4 @@
-"""sejax.app.presets: the settings that were published are the paper's, number for number."""
+"""sejax.cli.presets: the settings that were published are the paper's, number for number."""
 
 import dataclasses
 import functools
@@ -6,10 +6,10 @@ import functools
 import pytest
 
 import sejax
-from sejax import plugins
-from sejax.agents.ddqn import DDQNConfig
+from sejax import registry
+from sejax.agents.dqn import DDQNConfig
 from sejax.agents.ppo import PPOConfig
-from sejax.app import presets
+from sejax.cli import presets
 from sejax.errors import ConfigError
 from sejax.experiments.rn_studies import STUDIES
 from sejax.training import TrainingConfig
@@ -26,10 +26,10 @@ OPTIMIZED = {
     "proxy.num_layers": (1, 1),
     "proxy.hidden_size": (83, 167),
     "proxy.activation": ("leaky_relu", "prelu"),
-    "agent.init_episodes": (1, 20),
+    "agent.warmup_episodes": (1, 20),
     "agent.batch_size": (199, 149),
     "agent.learning_rate": (0.000304, 0.00222),
-    "agent.target_update_rate": (0.00848, 0.0209),
+    "agent.tau": (0.00848, 0.0209),
     "agent.discount": (0.988, 0.991),
     "agent.epsilon_init": (0.809, 0.904),
     "agent.epsilon_min": (0.0371, 0.0471),
@@ -51,10 +51,10 @@ FIXED = {
 }
 # Table "Default agent hyperparameters".
 DEFAULT_AGENT = {
-    "agent.init_episodes": 10,
+    "agent.warmup_episodes": 10,
     "agent.batch_size": 128,
     "agent.learning_rate": 0.001,
-    "agent.target_update_rate": 0.01,
+    "agent.tau": 0.01,
     "agent.discount": 0.99,
     "agent.epsilon_decay": 0.9,
     "agent.num_layers": 2,
@@ -125,7 +125,7 @@ def test_the_dataclass_defaults_are_the_papers_default_agent():
 OTHER_AGENTS = {
     sejax.DQNConfig: {"double": False, "epsilon_min": 0.05, "exploration_steps": 1000},
     sejax.DiscreteTD3Config: {
-        "learning_rate": 5e-4, "target_update_rate": 0.01, "policy_delay": 2, "batch_size": 128,
+        "learning_rate": 5e-4, "tau": 0.01, "policy_delay": 2, "batch_size": 128,
         "activation": "tanh", "hidden_size": 128, "num_layers": 2, "layer_norm": True,
         "temperature": 1.0, "one_hot_actions": False, "action_noise_std": 0.1,
         "target_noise_std": 0.2, "target_noise_clip": 0.5,
@@ -133,7 +133,7 @@ OTHER_AGENTS = {
     sejax.SACConfig: {
         "learning_rate": 3e-4, "discount": 0.99, "num_layers": 2, "hidden_size": 256,
         "batch_size": 256, "activation": "relu", "target_entropy": -1.0,
-        "target_update_rate": 0.005,
+        "tau": 0.005,
     },
 }  # fmt: skip
 
@@ -162,9 +162,9 @@ LEARNING_RNS = {
     "agent.name": ("q_learning", "ddqn", "td3", "td3"),
     "agent.learning_rate": (1.0, 0.003, 0.003, 0.003),
     "agent.discount": (0.8, 0.99, 0.99, 0.98),
-    "agent.init_episodes": (None, 1, 50, 20),
+    "agent.warmup_episodes": (None, 1, 50, 20),
     "agent.batch_size": (None, 192, 192, 192),
-    "agent.target_update_rate": (None, 0.01, 0.01, 0.01),
+    "agent.tau": (None, 0.01, 0.01, 0.01),
     "agent.num_layers": (None, 1, 2, 2),
     "agent.hidden_size": (None, 64, 128, 128),
     "agent.activation": (None, "leaky_relu", "leaky_relu", "relu"),
@@ -193,7 +193,7 @@ def test_the_best_preset_has_a_quick_td3_for_continuous_tasks(env):
     composed = composed_with(f"env={env}", "proxy=rn")
     assert composed.name("agent") == "td3"
     assert composed.agent.hidden_size == composed.agent.batch_size == 64
-    assert composed.agent.init_episodes <= composed.training.max_episodes // 5
+    assert composed.agent.warmup_episodes <= composed.training.max_episodes // 5
     # Only on Pendulum, which never terminates, does it matter whether it learns at all.
     assert composed.training.time_limit_is_terminal == (env != "pendulum")
 
@@ -239,12 +239,12 @@ def test_what_is_tuned_is_known():
 def test_every_file_is_of_a_task_and_proxy_and_has_settings_of_known_choices():
     for path in presets.FOLDER.glob("*.yaml"):
         env, _, proxy = path.stem.rpartition("-")
-        assert proxy in plugins.names("proxy")
-        assert env in (presets.GENERAL, *plugins.names("env"))
+        assert proxy in registry.names("proxy")
+        assert env in (presets.GENERAL, *registry.names("env"))
         kinds = {"tuned_agent": "agent", "tuned_es": "es", "tuned_objective": "objective"}
         for preset, kind, choice, values in presets.settings(env, proxy):
             assert preset in presets.names() and isinstance(values, dict)
-            assert choice in plugins.names(kinds[kind]) if kind in kinds else choice == ""
+            assert choice in registry.names(kinds[kind]) if kind in kinds else choice == ""
 
 
 def test_a_section_has_the_settings_of_the_one_it_is_like_where_it_says_nothing():

@@ -6,11 +6,10 @@ import jax.numpy as jnp
 import pytest
 from support import large_ops_in_loops
 
-from sejax import envs, plugins
-from sejax.agents.ddqn import DDQNConfig, make_ddqn
+from sejax import envs, registry
+from sejax.agents.dqn import DDQNConfig, make_ddqn
 from sejax.proxies.configs import RewardConfig, SyntheticConfig
-from sejax.trainer import make_trainer
-from sejax.training import TrainingConfig
+from sejax.training import TrainingConfig, make_trainer
 
 CAPACITY = 7919  # rows of the replay buffer
 MAX_EPISODES = 8009  # rows of the learning curve; nothing else in the program is nearly as long
@@ -19,9 +18,9 @@ MAX_EPISODES = 8009  # rows of the learning curve; nothing else in the program i
 @pytest.fixture(scope="module")
 def case():
     """The traced-at-most-once training of a tiny agent in a tiny SE, and how to call it."""
-    env = plugins.make("proxy", SyntheticConfig(hidden_size=4), envs.make("cartpole"))
+    env = registry.make("proxy", SyntheticConfig(hidden_size=4), envs.make("cartpole"))
     config = DDQNConfig(
-        hidden_size=4, num_layers=1, batch_size=4, init_episodes=1, buffer_size=CAPACITY
+        hidden_size=4, num_layers=1, batch_size=4, warmup_episodes=1, buffer_size=CAPACITY
     )
     agent = make_ddqn(config, 4, 2)
     train = make_trainer(agent, env, TrainingConfig(max_episodes=MAX_EPISODES, window=2))
@@ -62,9 +61,9 @@ def test_a_single_training_neither_copies_nor_selects_its_buffer_and_its_curve(c
 
 def test_trainings_in_lanes_neither_copy_nor_select_their_buffers_and_curves(case):
     train, _, params = case
-    lanes = jax.jit(jax.vmap(train, (0, None)))
+    num_parallel = jax.jit(jax.vmap(train, (0, None)))
     keys = jax.random.split(jax.random.key(0), 3)
-    assert_in_place(lanes.lower(keys, params).compile().as_text(), MAX_EPISODES)
+    assert_in_place(num_parallel.lower(keys, params).compile().as_text(), MAX_EPISODES)
 
 
 def test_the_checker_finds_the_select_of_a_plainly_vmapped_loop():

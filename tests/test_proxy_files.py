@@ -14,12 +14,12 @@ import pytest
 from safetensors.numpy import save_file
 
 import sejax
-from sejax import envs, plugins
+from sejax import envs, registry
 from sejax.envs import absent
 from sejax.errors import ConfigError
+from sejax.ops.sealed import seal, unseal
 from sejax.proxies import files, stored
 from sejax.proxies.configs import RewardConfig, SyntheticConfig
-from sejax.sealed import seal, unseal
 
 CONFIG = {"preset": "best", "agent": {"name": "q_learning", "discount": 0.7}, "run_dir": "/home/me"}
 
@@ -28,7 +28,7 @@ CONFIG = {"preset": "best", "agent": {"name": "q_learning", "discount": 0.7}, "r
 def env():
     """A small RN."""
     config = RewardConfig(hidden_size=2, variant="exclusive_potential")
-    return plugins.make("proxy", config, envs.make("gridworld_2x2"))
+    return registry.make("proxy", config, envs.make("gridworld_2x2"))
 
 
 @pytest.fixture(scope="module")
@@ -79,7 +79,7 @@ def test_a_proxy_that_is_saved_and_loaded_is_the_same(path, env, weights):
     proxy = files.load_proxy(path.parent)  # a folder with it
     assert proxy.record == {"score": 12.5, "generation": 7, "seed": 3}
     assert proxy.task is envs.make("gridworld_2x2") and proxy.path == path
-    known = {"env": {"name": "gridworld_2x2"}, "proxy": plugins.describe("proxy", env.config)}
+    known = {"env": {"name": "gridworld_2x2"}, "proxy": registry.describe("proxy", env.config)}
     assert proxy.config == CONFIG | known | {"run_dir": None}  # no path of a machine
     assert files.read_config(path) == proxy.config
     assert proxy.learned_with("agent") == sejax.QLearningConfig(discount=0.7)
@@ -187,7 +187,7 @@ def test_a_proxy_of_version_1_loads(tmp_path, env, weights):
     assert_same_weights(proxy.params.weights, weights[0])
     assert proxy.record == {"score": 0.5, "generation": 3, "seed": 8, "note": "kept"}
     assert proxy.learned_with("objective") == sejax.MaxReward()
-    assert plugins.name_of("exploration", proxy.learned_with("exploration")) == "none"
+    assert registry.name_of("exploration", proxy.learned_with("exploration")) == "none"
 
 
 def test_a_set_of_version_1_loads(tmp_path, env, weights):
@@ -397,7 +397,7 @@ def test_a_full_disk_is_an_oserror_and_the_older_file_stays(path, env, weights, 
         raise OSError(errno.ENOSPC, "No space left on device")
 
     with monkeypatch.context() as patch:
-        patch.setattr("sejax.files.os.write", full)
+        patch.setattr("sejax.ops.files.os.write", full)
         with pytest.raises(OSError, match="No space left"):
             sejax.save(path, env, weights[1], discount=0.7)
         with pytest.raises(OSError, match="No space left"):
@@ -451,8 +451,8 @@ def mine(tmp_path, monkeypatch):
     (tmp_path / "my_file_worlds.py").write_text(MINE)
     monkeypatch.syspath_prepend(str(tmp_path))
     task = envs.make("my_file_worlds:Room", size=3)
-    config = plugins.configure("proxy", {"name": "my_file_worlds:Mine", "hidden_size": 2})
-    env = plugins.make("proxy", config, task)
+    config = registry.configure("proxy", {"name": "my_file_worlds:Mine", "hidden_size": 2})
+    env = registry.make("proxy", config, task)
     path = tmp_path / "mine.safetensors"
     sejax.save(path, env, env.init_weights(jax.random.key(0)), discount=0.7)
     del sys.modules["my_file_worlds"]

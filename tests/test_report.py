@@ -9,9 +9,9 @@ import yaml
 
 import sejax
 from sejax import report
-from sejax.app import build, commands, next_steps
-from sejax.app import report as pages
-from sejax.app.metrics import columns_of
+from sejax.cli import build, commands, next_steps
+from sejax.cli import report as pages
+from sejax.cli.metrics import columns_of
 
 HOSTILE = "<script>alert(1)</script>$\\frac{"
 

@@ -10,18 +10,17 @@ from gymnax.environments.classic_control import cartpole
 from support import numpy_forward
 
 import sejax
-from sejax import bilevel, envs, plugins
+from sejax import bilevel, envs, registry
 from sejax.agents import Agent, make_agent
 from sejax.agents.tabular import QLearningConfig
-from sejax.app import build
+from sejax.cli import build
 from sejax.errors import ConfigError
 from sejax.evaluation import make_evaluator, return_area
 from sejax.proxies import ABSURD
+from sejax.proxies.base import World, world_of
 from sejax.proxies.configs import RewardConfig
-from sejax.proxies.proxy import World, world_of
 from sejax.proxies.reward import RewardEnv
-from sejax.trainer import TrainResult, make_trainer
-from sejax.training import TrainingConfig
+from sejax.training import TrainingConfig, TrainResult, make_trainer
 
 GAMMA = 0.9
 KEY = jax.random.key(0)
@@ -35,7 +34,7 @@ VARIANTS = {  # table "Overview of Reward Network variants"
 
 def make_env(task, variant="additive_potential", **changes):
     config = RewardConfig(variant=variant, hidden_size=5, **changes)
-    return plugins.make("proxy", config, envs.make(task))
+    return registry.make("proxy", config, envs.make(task))
 
 
 def phi(env, weights, obs):
@@ -303,7 +302,7 @@ def test_training_on_a_reward_network_stops_when_tests_on_the_real_task_solve_it
         evaluate = make_evaluator(agent, env, task, config.training)
         return evaluate(jax.random.key(0), params).train_episodes
 
-    first_that_counts = agent.init_episodes + 1
+    first_that_counts = agent.warmup_episodes + 1
     assert episodes(-1000.0) == first_that_counts
     assert episodes(0.0) == config.training.max_episodes == 12
 
@@ -399,7 +398,7 @@ def test_an_episode_ends_where_the_tasks_own_does():
 
     task = sejax.Task(name="early", env=Early())
     config = RewardConfig(variant="exclusive_potential", hidden_size=5, zero_at_terminal=True)
-    env = plugins.make("proxy", config, task)
+    env = registry.make("proxy", config, task)
     params = env.prepared(env.params(env.init_weights(KEY)), GAMMA, limit_is_terminal=True)
     obs, state = env.reset_env(KEY, params)
     for cut in (False, False, True):

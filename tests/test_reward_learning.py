@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import sejax
-from sejax import plugins
+from sejax import registry
 from sejax.bilevel import make_learner
 from sejax.experiments.rn_studies import OBJECTIVES
 from sejax.proxies.configs import VARIANTS
@@ -27,13 +27,13 @@ SHORT = ["generations=2", "es.population_size=4", "es.num_incumbent_evals=2",
 @pytest.mark.parametrize("variant", VARIANTS)
 @pytest.mark.parametrize("task", TASKS)
 def test_every_task_variant_and_objective_learns(task, variant, objective):
-    if variant.endswith("info") and not plugins.find("env", task).facts.has_info:
+    if variant.endswith("info") and not registry.find("env", task).facts.has_info:
         pytest.skip("refused: the task tells nothing beyond its observation")
     if task == "halfcheetah" and (variant, objective) not in HALFCHEETAH:
         pytest.skip("its agents are large")
     overrides = [f"env={task}", "proxy=rn", f"proxy.variant={variant}", f"objective={objective}"]
     if task != "cliff_walking":
-        overrides += ["agent.init_episodes=1", "training.max_steps=1200"]
+        overrides += ["agent.warmup_episodes=1", "training.max_steps=1200"]
     config = sejax.config([*overrides, *SHORT])
     result = jax.jit(make_learner(config))(jax.random.key(0))
     info = jax.device_get(result.info)
@@ -52,7 +52,7 @@ def test_cliff_walking_rns_teach_faster_than_the_real_reward():
                            "proxy.variant=additive_non_potential"])  # fmt: skip
     learned = jax.jit(make_learner(config))(jax.random.key(0)).weights
     task = config.task()
-    env, agent = plugins.make("proxy", config.proxy, task), sejax.make_agent(config.agent, task)
+    env, agent = registry.make("proxy", config.proxy, task), sejax.make_agent(config.agent, task)
     steps = []
     for weights in (learned, jax.tree.map(np.zeros_like, learned)):
         params = env.params(weights, config.agent.discount)

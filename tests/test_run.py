@@ -25,9 +25,9 @@ from support import is_drawn
 
 import sejax
 from sejax import run
-from sejax.app import build, checkpoints, commands, progress, run_directory, session
-from sejax.app.metrics import COLUMNS, FAMILY_COLUMNS
-from sejax.app.progress import RunProgress
+from sejax.cli import build, checkpoints, commands, progress, run_directory, session
+from sejax.cli.metrics import COLUMNS, FAMILY_COLUMNS
+from sejax.cli.progress import RunProgress
 from sejax.errors import ConfigError
 from sejax.proxies import files
 
@@ -343,7 +343,7 @@ def test_a_full_disk_loses_nothing_that_was_written(uninterrupted, tmp_path, mon
         fsync(descriptor)
 
     with monkeypatch.context() as patch:
-        patch.setattr("sejax.files.os.fsync", full)
+        patch.setattr("sejax.ops.files.os.fsync", full)
         with pytest.raises(OSError, match="No space left"):
             learn(tmp_path, "generations=6")
     assert (tmp_path / "metrics.csv").read_bytes() == before
@@ -359,7 +359,7 @@ def test_a_full_disk_loses_nothing_that_was_written(uninterrupted, tmp_path, mon
 # jobs, such as a test run may be, ignore Ctrl-C, and what they start does too.
 DRIVER = """
 import os, runpy, signal, sys, threading
-from sejax.app import progress
+from sejax.cli import progress
 
 number = signal.Signals[sys.argv.pop(1)]
 signal.signal(signal.SIGINT, signal.default_int_handler)

@@ -16,9 +16,9 @@ import pytest
 import yaml
 
 import sejax
-from sejax.app import checkpoints, metrics, run_lock
-from sejax.app.metrics import COLUMNS
-from sejax.app.run_directory import RunDirectory, open_for
+from sejax.cli import checkpoints, metrics, run_lock
+from sejax.cli.metrics import COLUMNS
+from sejax.cli.run_directory import RunDirectory, open_for
 from sejax.errors import ConfigError
 from sejax.serialize import flatten
 
@@ -238,7 +238,7 @@ def test_settings_are_flattened_by_their_names():
 
 def test_a_refusal_does_not_import_jax(run):
     code = (
-        "import sys; from sejax.app.run_directory import RunDirectory\n"
+        "import sys; from sejax.cli.run_directory import RunDirectory\n"
         f"try: RunDirectory.open({str(run)!r}, {{'seed': 3}}, [3])\n"
         "except ValueError as error: print(error)\n"
         "assert 'jax' not in sys.modules"
@@ -668,7 +668,7 @@ def test_rows_are_on_the_disk_before_the_checkpoint_that_vouches_for_them(run, m
 
 
 def test_leftovers_of_killed_runs_are_removed_and_those_in_use_are_not(run):
-    from sejax.files import atomic_path
+    from sejax.ops.files import atomic_path
 
     dead = run / ".metrics.csv.sejax-0123abcd.csv"
     dead.write_text("half")
@@ -682,7 +682,7 @@ def test_leftovers_of_killed_runs_are_removed_and_those_in_use_are_not(run):
 
 HOLD = """
 import sys
-from sejax.app.run_directory import RunDirectory
+from sejax.cli.run_directory import RunDirectory
 directory = RunDirectory.open(sys.argv[1], {}, [0])
 print("held", flush=True)
 sys.stdin.readline()

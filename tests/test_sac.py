@@ -28,7 +28,7 @@ OBS_DIM, ACTION_DIM, BATCH, MAX_ACTION = 3, 2, 7, 2.0
 GOLDEN = Path(__file__).parent / "golden" / "sac_updates.npz"
 CONFIG = SACConfig(
     hidden_size=5, num_layers=1, activation="tanh", batch_size=BATCH, learning_rate=0.01,
-    target_update_rate=0.1, discount=0.9, init_episodes=3, init_alpha=0.3, target_entropy=-0.7,
+    tau=0.1, discount=0.9, warmup_episodes=3, init_alpha=0.3, target_entropy=-0.7,
     target_entropy_fraction=0.4,
 )  # fmt: skip
 # Kind of actions, configuration.
@@ -131,9 +131,9 @@ def test_updates_equal_torchs_on_the_same_batches_and_noise(case):
 @KINDS
 def test_updates_are_learning_steps_on_noise_drawn_from_the_key_alone_and_in_lanes(case):
     base, batch = state_of(case), case_batch(case, 0)
-    lanes = [base.replace(hparams=base.hparams._replace(learning_rate=np.float32(rate)))
+    num_parallel = [base.replace(hparams=base.hparams._replace(learning_rate=np.float32(rate)))
              for rate in (0.01, 0.1)]  # fmt: skip
-    stacked = jax.tree.map(lambda *x: np.stack(x), *lanes)
+    stacked = jax.tree.map(lambda *x: np.stack(x), *num_parallel)
 
     @jax.jit
     def run(key):
@@ -141,7 +141,7 @@ def test_updates_are_learning_steps_on_noise_drawn_from_the_key_alone_and_in_lan
         return noise, jax.vmap(agent_of(case).update, (None, 0, None))(key, stacked, batch)
 
     noise, together = run(jax.random.key(3))
-    for i, lane in enumerate(lanes):
+    for i, lane in enumerate(num_parallel):
         alone = learn_of(case)(lane, batch, noise)
         assert_close(jax.tree.map(lambda x, i=i: x[i], together), alone, rtol=1e-5, atol=1e-7)
 
@@ -323,7 +323,7 @@ def test_the_first_episodes_are_for_warming_up_uniformly(case):
     begin = agent_of(case).begin_episode
     got = [bool(begin(state_of(case), jnp.int32(n)).is_warming_up) for n in range(5)]
     assert got == [True, True, True, False, False]
-    assert (agent_of(case).init_episodes, agent_of(case).learns_from) == (3, 3)
+    assert (agent_of(case).warmup_episodes, agent_of(case).learns_from) == (3, 3)
 
 
 def test_the_world_takes_continuous_actions_in_its_own_units():
@@ -439,7 +439,7 @@ def test_on_a_two_state_probe_values_and_policy_are_the_soft_optimal_ones():
     # show.
     alpha, gamma = 0.5, 0.8
     config = SACConfig(hidden_size=16, num_layers=1, activation="tanh", learning_rate=0.02,
-                       target_update_rate=0.1, discount=gamma, alpha=alpha)  # fmt: skip
+                       tau=0.1, discount=gamma, alpha=alpha)  # fmt: skip
     agent = make_sac_discrete(config, obs_dim=2, num_actions=2)
     networks = make_networks(config, 2, softmax_policy(2))
     a, b = [1.0, 0.0], [0.0, 1.0]

@@ -27,7 +27,7 @@ optuna = pytest.importorskip("optuna", reason="needs Optuna: pip install 'sejax[
 
 from optuna.trial import TrialState  # noqa: E402
 
-from sejax.app import commands, compose  # noqa: E402
+from sejax.cli import commands, compose  # noqa: E402
 from sejax.errors import ConfigError  # noqa: E402
 from sejax.search import __main__, results, settings, spaces, study, trials, verification  # noqa: E402
 from sejax.search.learning import Learning  # noqa: E402
@@ -561,8 +561,8 @@ SMALL = (*GRID, "agent=q_learning")
 def test_trials_of_a_shape_share_one_program_and_its_numbers_are_those_of_a_run(
     tmp_path, agents, number
 ):
-    from sejax.app import session
-    from sejax.app.run_directory import open_for
+    from sejax.cli import session
+    from sejax.cli.run_directory import open_for
     from sejax.search.programs import Programs
 
     programs = Programs()

@@ -14,7 +14,7 @@ optuna = pytest.importorskip("optuna", reason="needs Optuna: pip install 'sejax[
 
 from optuna.trial import TrialState  # noqa: E402
 
-from sejax.app import runtime  # noqa: E402
+from sejax.cli import runtime  # noqa: E402
 from sejax.errors import ConfigError  # noqa: E402
 from sejax.machines import scorer  # noqa: E402
 from sejax.search import settings  # noqa: E402

@@ -5,7 +5,7 @@ import math
 import pytest
 import yaml
 
-from sejax.app import compose
+from sejax.cli import compose
 from sejax.errors import ConfigError
 from sejax.search import __main__ as command
 from sejax.search import settings, spaces

@@ -14,7 +14,7 @@ optuna = pytest.importorskip("optuna", reason="needs Optuna: pip install 'sejax[
 
 from test_search import Runner, in_memory  # noqa: E402
 
-from sejax.app import compose  # noqa: E402
+from sejax.cli import compose  # noqa: E402
 from sejax.errors import ConfigError  # noqa: E402
 from sejax.search import __main__, results, settings, study, verification  # noqa: E402
 from sejax.search.learning import Learning  # noqa: E402

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from support import numpy_forward
 
-from sejax import envs, plugins
+from sejax import envs, registry
 from sejax.errors import ConfigError
 from sejax.proxies import ABSURD
+from sejax.proxies.base import World, world_of
 from sejax.proxies.configs import SyntheticConfig
-from sejax.proxies.proxy import World, world_of
 
 CONFIG = SyntheticConfig(hidden_size=5, num_layers=2, activation="leaky_relu")
 OBS = jnp.array([0.1, -0.2, 0.3, -0.4])
@@ -20,7 +20,7 @@ OBS = jnp.array([0.1, -0.2, 0.3, -0.4])
 
 def make_env(task="cartpole", **changes):
     config = SyntheticConfig(**{**vars(CONFIG), **changes})
-    return plugins.make("proxy", config, envs.make(task))
+    return registry.make("proxy", config, envs.make(task))
 
 
 @pytest.fixture(scope="module")

@@ -27,20 +27,19 @@ from sejax.agents.td3 import (
     smoothed_target_action,
     tanh_policy,
 )
-from sejax.networks import MLP
+from sejax.ops.networks import MLP
 from sejax.rollout import make_tester
-from sejax.trainer import make_trainer
-from sejax.training import TrainingConfig
+from sejax.training import TrainingConfig, make_trainer
 
 OBS_DIM, ACTION_DIM, BATCH, MAX_ACTION = 3, 2, 7, 2.0
 GOLDEN = Path(__file__).parent / "golden" / "td3_updates.npz"
 CONFIG = TD3Config(
     hidden_size=5, num_layers=2, activation="relu", batch_size=BATCH, learning_rate=0.01,
-    target_update_rate=0.1, discount=0.9, init_episodes=3, target_noise_std=0.4,
+    tau=0.1, discount=0.9, warmup_episodes=3, target_noise_std=0.4,
 )  # fmt: skip
 DISCRETE = DiscreteTD3Config(
     hidden_size=5, num_layers=3, activation="tanh", batch_size=BATCH, learning_rate=0.01,
-    target_update_rate=0.1, discount=0.9, init_episodes=3, target_noise_std=0.4, temperature=2.0,
+    tau=0.1, discount=0.9, warmup_episodes=3, target_noise_std=0.4, temperature=2.0,
     final_temperature=0.25, temperature_steps=4,
 )  # fmt: skip
 CASES = {
@@ -192,12 +191,12 @@ def test_updates_equal_torchs_on_the_same_batches_and_noise(case):
 def test_updates_are_learning_steps_on_noise_drawn_from_the_key_alone_and_in_a_population(config):
     # Members have their own numbers and counters: lane 0 comes to an actor update, lane 1 does not.
     base, batch = state_of(config), case_batch(config, 0)
-    lanes = [
+    num_parallel = [
         base.replace(num_updates=np.int32(n),
                      hparams=base.hparams._replace(learning_rate=np.float32(rate)))
         for n, rate in ((1, 0.01), (2, 0.1))
     ]  # fmt: skip
-    stacked = jax.tree.map(lambda *x: np.stack(x), *lanes)
+    stacked = jax.tree.map(lambda *x: np.stack(x), *num_parallel)
     policy, update = policy_of(config), agent_of(config).update
 
     @jax.jit
@@ -209,7 +208,7 @@ def test_updates_are_learning_steps_on_noise_drawn_from_the_key_alone_and_in_a_p
     key = jax.random.key(3)
     noise, together = run(key)
     _, other = run(jax.random.key(4))
-    for i, lane in enumerate(lanes):
+    for i, lane in enumerate(num_parallel):
         expected = learn_of(config)(lane, batch, noise)
         for name in NAMES:
             np.testing.assert_allclose(
@@ -488,7 +487,7 @@ def test_the_first_episodes_are_for_warming_up(config):
     begin = agent_of(config).begin_episode
     got = [bool(begin(state_of(config), jnp.int32(n)).is_warming_up) for n in range(5)]
     assert got == [True, True, True, False, False]
-    assert (agent_of(config).init_episodes, agent_of(config).learns_from) == (3, 3)
+    assert (agent_of(config).warmup_episodes, agent_of(config).learns_from) == (3, 3)
 
 
 def test_warm_up_actions_are_uniform_in_the_range():
@@ -567,15 +566,15 @@ def test_noisy_tests_act_as_in_training_but_never_warm_up(config):
 
 
 def test_the_agent_holds_the_configured_numbers():
-    agent = agent_of(replace(CONFIG, action_repeat=4, action_noise_std=0.3, init_episodes=6))
+    agent = agent_of(replace(CONFIG, action_repeat=4, action_noise_std=0.3, warmup_episodes=6))
     assert agent.hparams._asdict() == {
-        "learning_rate": 0.01, "target_update_rate": 0.1, "discount": 0.9,
+        "learning_rate": 0.01, "tau": 0.1, "discount": 0.9,
         "action_noise_std": 0.3, "target_noise_std": 0.4, "target_noise_clip": 0.5,
         "hidden_size": None, "batch_size": None,  # all of them
     }  # fmt: skip
-    assert (agent.action_repeat, agent.init_episodes, agent.learns_from) == (4, 6, 6)
+    assert (agent.action_repeat, agent.warmup_episodes, agent.learns_from) == (4, 6, 6)
     assert agent_of(DISCRETE).hparams._asdict() == {
-        "learning_rate": 0.01, "target_update_rate": 0.1, "discount": 0.9,
+        "learning_rate": 0.01, "tau": 0.1, "discount": 0.9,
         "action_noise_std": 0.1, "target_noise_std": 0.4, "target_noise_clip": 0.5,
         "temperature": 2.0, "final_temperature": 0.25,
         "hidden_size": None, "batch_size": None,
@@ -638,9 +637,7 @@ def train_on(agent, batch, num_updates):
 
 def test_on_a_one_step_bandit_the_policy_finds_the_best_action():
     # Reward -(a - 0.3)^2 for actions in [-2, 2], whatever the observation; nothing follows.
-    config = TD3Config(
-        hidden_size=16, num_layers=1, activation="tanh", learning_rate=0.01, target_update_rate=0.1
-    )
+    config = TD3Config(hidden_size=16, num_layers=1, activation="tanh", learning_rate=0.01, tau=0.1)
     agent = make_td3(config, obs_dim=1, action_dim=1, max_action=2.0)
     action = np.linspace(-2, 2, 32, dtype=np.float32)[None]
     zeros = np.zeros(32, np.float32)
@@ -664,7 +661,7 @@ def test_on_a_two_state_probe_the_discrete_policy_waits_for_the_larger_reward(on
     # Q(B) = [1, 0], policy 1 in A and 0 in B. The end looks like A: bootstrapping there would show.
     # The actions are such as the policy gives, as critics are wild where they have seen nothing.
     config = DiscreteTD3Config(
-        hidden_size=16, num_layers=2, learning_rate=0.003, target_update_rate=0.1, discount=0.8,
+        hidden_size=16, num_layers=2, learning_rate=0.003, tau=0.1, discount=0.8,
         target_noise_std=0.0, final_temperature=1.0, one_hot_actions=one_hot,
     )  # fmt: skip
     agent = make_td3_discrete(config, obs_dim=2, num_actions=2)
@@ -713,7 +710,7 @@ def mean_test_return(agent, task, training):
 @pytest.mark.slow
 def test_td3_solves_pendulum_in_20000_steps():
     task = envs.make("pendulum")
-    config = TD3Config(init_episodes=5, batch_size=128, learning_rate=1e-3)
+    config = TD3Config(warmup_episodes=5, batch_size=128, learning_rate=1e-3)
     agent = make_td3(config, task.obs_dim, task.action_dim, task.max_action)
     training = TrainingConfig(
         max_episodes=100, max_steps=20_000, stop_rule="never", time_limit_is_terminal=False

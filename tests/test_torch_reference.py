@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from jax.flatten_util import ravel_pytree
 
-from sejax.agents.ddqn import DDQNConfig, make_ddqn
+from sejax.agents.dqn import DDQNConfig, make_ddqn
 from sejax.agents.replay import Transition
-from sejax.networks import MLP
+from sejax.ops.networks import MLP
 from sejax.proxies.configs import SyntheticConfig
 from sejax.training import TrainingConfig
 
@@ -60,7 +60,7 @@ def test_training_ends_after_the_episodes_or_the_steps(max_steps, steps):
     heads["done"]["Dense_1"]["bias"] -= 10  # never
     env = reference.SyntheticEnv(heads, SyntheticConfig(hidden_size=5))
     training = TrainingConfig(stop_rule="never", max_episodes=2, max_steps=max_steps)
-    agent = dataclasses.replace(CONFIG, init_episodes=1)
+    agent = dataclasses.replace(CONFIG, warmup_episodes=1)
     result = reference.train(env, agent, training, seed=0)
     assert result.train_steps == steps
     assert len(result.returns) == 2

@@ -13,7 +13,7 @@ from sejax.agents import replay
 from sejax.agents.memory import Rollout
 from sejax.agents.ppo import PPOConfig, make_ppo
 from sejax.agents.replay import Transition
-from sejax.networks import MLP
+from sejax.ops.networks import MLP
 from sejax.proxies.configs import SyntheticConfig
 from sejax.training import TrainingConfig
 

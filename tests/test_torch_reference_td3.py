@@ -19,7 +19,7 @@ from sejax.agents.td3 import (
     make_td3,
     tanh_policy,
 )
-from sejax.networks import MLP
+from sejax.ops.networks import MLP
 from sejax.proxies.configs import SyntheticConfig
 
 torch = pytest.importorskip("torch")
@@ -31,7 +31,7 @@ import torch_reference_td3 as torch_td3  # noqa: E402
 OBS_DIM, ACTION_DIM, MAX_ACTION = torch_td3.OBS_DIM, torch_td3.ACTION_DIM, torch_td3.MAX_ACTION
 BATCH, NUM_UPDATES = 8, 3
 CONFIG = TD3Config(
-    hidden_size=9, num_layers=2, batch_size=BATCH, learning_rate=0.01, target_update_rate=0.1,
+    hidden_size=9, num_layers=2, batch_size=BATCH, learning_rate=0.01, tau=0.1,
     discount=0.9, target_noise_std=0.4,
 )  # fmt: skip
 

@@ -10,9 +10,9 @@ import pytest
 from PIL import Image
 
 import sejax
-from sejax.app import follower, trackers
-from sejax.app.metrics import columns_of
-from sejax.app.session import Quiet
+from sejax.cli import follower, trackers
+from sejax.cli.metrics import columns_of
+from sejax.cli.session import Quiet
 from sejax.errors import ConfigError
 
 

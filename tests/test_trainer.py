@@ -1,4 +1,4 @@
-"""sejax.trainer: the inner loop against a plain Python one, alone and in lanes."""
+"""sejax.training: the inner loop against a plain Python one, alone and in lanes."""
 
 import dataclasses
 import functools
@@ -14,15 +14,14 @@ from hypothesis import strategies as st
 from scripted import MAX_EPISODES, MAX_STEPS, WHO, ScriptedEnv, script, scripted_agent
 from support import numpy_forward
 
-from sejax import envs, evaluation, plugins
-from sejax.agents.ddqn import DDQNConfig, make_ddqn
+from sejax import envs, evaluation, registry
+from sejax.agents.dqn import DDQNConfig, make_ddqn
 from sejax.agents.memory import Memory, rollout_memory
 from sejax.agents.tabular import QLearningConfig
 from sejax.errors import ConfigError
 from sejax.proxies.configs import SyntheticConfig
 from sejax.rollout import _Greedy, make_recorder, make_tester
-from sejax.trainer import is_plateau, is_solved, make_trainer
-from sejax.training import TrainingConfig
+from sejax.training import TrainingConfig, is_plateau, is_solved, make_trainer
 
 WINDOW, TOLERANCE, SOLVED, INIT_EPISODES = 2, 0.25, 1.5, 2
 KEY = jax.random.key(0)
@@ -202,11 +201,11 @@ def test_tests_need_a_test_function():
 
 def test_a_world_of_one_step_has_an_episode_for_each_step():
     task = envs.make("gridworld_2x2")
-    env = plugins.make("proxy", SyntheticConfig(hidden_size=4, horizon=1), task)
+    env = registry.make("proxy", SyntheticConfig(hidden_size=4, horizon=1), task)
     config = QLearningConfig(learning_rate=1.0, epsilon_init=1.0, epsilon_min=1.0)
     params = env.params(env.init_weights(KEY))
     never = training(max_episodes=40, max_steps=40, stop_rule="never")
-    train = make_trainer(plugins.make("agent", config, task), env, never)
+    train = make_trainer(registry.make("agent", config, task), env, never)
     many = jax.jit(jax.vmap(train, (0, None)))(jax.random.split(KEY, 3), params)
     # The start is one state, so that there is one reward for each action, which is its value.
     _, start = env.reset_env(KEY, params)
@@ -395,7 +394,7 @@ def test_a_memory_is_asked_when_it_has_the_step_just_made():
         count, num_steps = batch
         return state.replace(min_discount=jnp.minimum(state.min_discount, count == num_steps))
 
-    agent = dataclasses.replace(scripted_agent(init_episodes=0), memory=counting, update=update)
+    agent = dataclasses.replace(scripted_agent(warmup_episodes=0), memory=counting, update=update)
     result = make_trainer(agent, ENV, training(stop_rule="never"))(KEY, script([0] * 12, [3] * 12))
     assert result.agent_state.min_discount == 1
 
@@ -434,10 +433,10 @@ def scripted_lanes():
     return jax.random.split(KEY, 6), params, jnp.arange(6.0), active
 
 
-def assert_lanes_are_single_trainings(train, lanes, many):
+def assert_lanes_are_single_trainings(train, num_parallel, many):
     assert len(set(np.asarray(many.train_steps).tolist())) > 2  # stopped at different times
     for i in range(6):
-        alone = jax.tree.map(lambda x, i=i: x[i], lanes)
+        alone = jax.tree.map(lambda x, i=i: x[i], num_parallel)
         assert_same(many, i, train(*alone))
 
 
@@ -468,11 +467,11 @@ def test_a_lanes_curve_has_its_own_episodes_and_nothing_after_them(in_lanes):
 
 
 def test_nested_lanes_equal_single_trainings(trainers):
-    lanes = scripted_lanes()
-    nested = jax.tree.map(lambda x: x.reshape(2, 3, *x.shape[1:]), lanes)
+    num_parallel = scripted_lanes()
+    nested = jax.tree.map(lambda x: x.reshape(2, 3, *x.shape[1:]), num_parallel)
     many = jax.jit(jax.vmap(jax.vmap(trainers["tested"])))(*nested)
     many = jax.tree.map(lambda x: x.reshape(6, *x.shape[2:]), many)
-    assert_lanes_are_single_trainings(trainers["tested"], lanes, many)
+    assert_lanes_are_single_trainings(trainers["tested"], num_parallel, many)
 
 
 def test_a_lane_that_has_stopped_has_nobody_wait_for_its_tests_and_phases():
@@ -491,7 +490,7 @@ def test_a_lane_that_has_stopped_has_nobody_wait_for_its_tests_and_phases():
         return state
 
     agent = dataclasses.replace(
-        scripted_agent(init_episodes=0), update=update, memory=rollout_memory(13)
+        scripted_agent(warmup_episodes=0), update=update, memory=rollout_memory(13)
     )
     config = training(stop_rule="never", max_steps=24, tests_between=1)
     train = make_trainer(agent, ENV, config, test_fn=tested)
@@ -507,8 +506,8 @@ def test_a_lane_that_has_stopped_has_nobody_wait_for_its_tests_and_phases():
 def ddqn_in_se():
     """Single and vmapped short trainings of a DDQN agent in SEs of different step limits."""
     task = envs.make("cartpole")
-    env = plugins.make("proxy", SyntheticConfig(hidden_size=4), task)
-    config = DDQNConfig(hidden_size=4, num_layers=1, batch_size=4, init_episodes=1)
+    env = registry.make("proxy", SyntheticConfig(hidden_size=4), task)
+    config = DDQNConfig(hidden_size=4, num_layers=1, batch_size=4, warmup_episodes=1)
     train = make_trainer(
         make_ddqn(config, 4, 2), env, training(max_episodes=8, plateau_tolerance=0.3)
     )
@@ -534,12 +533,14 @@ def test_lanes_equal_single_trainings(ddqn_in_se):
 def test_a_time_limit_is_terminal_on_the_real_task_if_asked_and_never_in_an_se(world):
     """As programs; what they then do is above."""
     task = envs.make("cartpole")
-    synthetic = plugins.make("proxy", SyntheticConfig(hidden_size=4), task)
+    synthetic = registry.make("proxy", SyntheticConfig(hidden_size=4), task)
     env, params = {
         "real": (task.env, task.params),
         "synthetic": (synthetic, synthetic.default_params),
     }[world]
-    agent = make_ddqn(DDQNConfig(hidden_size=4, num_layers=1, batch_size=4, init_episodes=1), 4, 2)
+    agent = make_ddqn(
+        DDQNConfig(hidden_size=4, num_layers=1, batch_size=4, warmup_episodes=1), 4, 2
+    )
     programs = [
         str(jax.make_jaxpr(make_trainer(
             agent, env, training(max_episodes=6, stop_rule="never", time_limit_is_terminal=asked)
@@ -691,7 +692,7 @@ def test_recorded_tests_are_the_tests():
 def test_a_length_that_the_episodes_cannot_reach_is_refused():
     """One-step SEs: the default's 1,000 episodes are 1,000 steps."""
     task = envs.make("cartpole")
-    agent = plugins.make("agent", DDQNConfig(init_episodes=1), task)
+    agent = registry.make("agent", DDQNConfig(warmup_episodes=1), task)
     env = SyntheticConfig(initial_state="learned", horizon=1).make(task)
     asked = TrainingConfig(max_steps=4000, stop_rule="never")
     with pytest.raises(ConfigError, match=r"^training\.max_episodes must be at least 4000, because "
@@ -710,7 +711,7 @@ def test_a_length_that_the_episodes_cannot_reach_is_refused():
 ])  # fmt: skip
 def test_arguments_of_other_kinds_are_one_message(swapped, said):
     task = envs.make("gridworld_2x2")
-    agent = plugins.make("agent", QLearningConfig(), task)
+    agent = registry.make("agent", QLearningConfig(), task)
     with pytest.raises(ConfigError, match=said):
         make_trainer(*swapped(agent, task))
     with pytest.raises(ConfigError, match=r"^task must be a sejax\.Task, .*got GridWorld"):

@@ -1,12 +1,12 @@
-"""sejax.es.strategy: how often the proxies of a generation are tried, and what comes of it."""
+"""sejax.es.base: how often the proxies of a generation are tried, and what comes of it."""
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from sejax.es.base import Trials, finite_mean
 from sejax.es.evosax import EvosaxConfig
 from sejax.es.nes import NESConfig
-from sejax.es.strategy import Trials, finite_mean
 
 NAN, INF = np.nan, np.inf
 

@@ -13,9 +13,9 @@ from jax.flatten_util import ravel_pytree
 
 from sejax import envs
 from sejax.agents import make_agent
-from sejax.agents.agent import Agent, Draw, NoExploration, drawing_key
+from sejax.agents.base import Agent, Draw, NoExploration, drawing_key
 from sejax.agents.count_based import CountBasedConfig
-from sejax.agents.ddqn import DDQNConfig, DuelingDDQNConfig, make_ddqn
+from sejax.agents.dqn import DDQNConfig, DuelingDDQNConfig, make_ddqn
 from sejax.agents.memory import no_memory
 from sejax.agents.partial_batch import block_size, sum_over_batch
 from sejax.agents.replay import Transition
@@ -23,7 +23,7 @@ from sejax.agents.tabular import QLearningConfig
 from sejax.agents.varied import Range, draw_value, hidden_sizes, ranges_of
 from sejax.errors import ConfigError
 from sejax.evaluation import evaluate_agents, make_evaluator
-from sejax.networks import MLP, narrow
+from sejax.ops.networks import MLP, narrow
 from sejax.proxies.configs import SyntheticConfig
 from sejax.training import TrainingConfig
 
@@ -95,7 +95,7 @@ def configured(kind, hidden_size, batch_size):
         DuelingDDQNConfig, feature_dim=4, stream_hidden_size=4)}[kind]  # fmt: skip
     return make(
         hidden_size=hidden_size, batch_size=batch_size, num_layers=2, activation="prelu",
-        learning_rate=0.01, target_update_rate=0.1,
+        learning_rate=0.01, tau=0.1,
     )  # fmt: skip
 
 
@@ -362,7 +362,7 @@ def test_trainings_with_drawn_hyperparameters_equal_those_with_the_same_given():
     env = SyntheticConfig(hidden_size=4).make(task)
     training = TrainingConfig(stop_rule="never", max_steps=60, test_episodes=2)
     # Two networks, of one and of two layers; hidden sizes from 1 to 6, batches from 1 to 12.
-    config = DDQNConfig(hidden_size=2, num_layers=1, batch_size=4, init_episodes=0)
+    config = DDQNConfig(hidden_size=2, num_layers=1, batch_size=4, warmup_episodes=0)
     varied = make_agent(config, task, varied=True)
     assert len(varied.variants) == 2
     keys = jax.random.split(jax.random.key(5), 3)

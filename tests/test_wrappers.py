@@ -10,8 +10,7 @@ from scripted import MAX_EPISODES, MAX_STEPS, ScriptedEnv, script, scripted_agen
 
 from sejax import envs
 from sejax.envs.wrappers import repeat_actions
-from sejax.trainer import make_trainer
-from sejax.training import TrainingConfig
+from sejax.training import TrainingConfig, make_trainer
 
 KEY = jax.random.key(0)
 

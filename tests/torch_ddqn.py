@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from test_ddqn import CASES, GOLDEN, NUM_ACTIONS, OBS_DIM, q_network, random_batch
 
-from sejax.agents.ddqn import make_ddqn
+from sejax.agents.dqn import make_ddqn
 from sejax.agents.replay import Transition
 
 NUM_UPDATES = 5
@@ -71,7 +71,7 @@ class TorchDDQN:
         self.num_updates += 1
         if self.num_updates % self.config.target_update_every:
             return
-        tau = self.config.target_update_rate
+        tau = self.config.tau
         with torch.no_grad():
             pairs = [*zip(self.target.parameters(), self.online.parameters(), strict=True)]
             if self.slope is not None:

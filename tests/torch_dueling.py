@@ -12,7 +12,7 @@ from test_ddqn import OBS_DIM, random_batch
 from test_dueling import ACTIVATIONS, GOLDEN, NUM_ACTIONS, config_with, nested_params
 from torch_ddqn import NUM_UPDATES, TorchDDQN
 
-from sejax.agents.ddqn import make_ddqn
+from sejax.agents.dqn import make_ddqn
 
 PARTS = ("features", "value", "advantage")
 

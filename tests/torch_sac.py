@@ -137,7 +137,7 @@ class TorchSAC:
             for parameter, value in zip(group, gradient, strict=True):
                 parameter.grad = value
             optimizer.step()
-        tau = config.target_update_rate
+        tau = config.tau
         pairs = zip(self.critics.parameters(), self.target_critics.parameters(), strict=True)
         with torch.no_grad():
             for fast, slow in pairs:

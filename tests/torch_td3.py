@@ -142,7 +142,7 @@ class TorchTD3:
 
     @torch.no_grad()
     def move_targets(self):
-        tau = self.config.target_update_rate
+        tau = self.config.tau
         networks = [self.actor, *self.critics]
         targets = [self.target_actor, *self.target_critics]
         for network, target in zip(networks, targets, strict=True):

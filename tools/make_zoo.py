@@ -7,7 +7,7 @@ import re
 from pathlib import Path
 
 import sejax
-from sejax.files import write_text
+from sejax.ops.files import write_text
 from sejax.proxies.zoo import PretrainedProxy, spread
 
 PAGE = Path(__file__).parents[1] / "docs" / "zoo.md"

@@ -25,7 +25,7 @@ import jax
 import yaml
 
 import sejax
-from sejax.app import build
+from sejax.cli import build
 from sejax.proxies import card, files, zoo
 from sejax.serialize import flatten
 

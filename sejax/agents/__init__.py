@@ -7,23 +7,34 @@ hyperparameters that compiled programs take as arguments, and the memories.
 import functools
 from typing import Any
 
-from sejax import plugins
-from sejax.agents.agent import Agent, AgentOptions, NoExploration, traced
+from sejax import registry
+from sejax.agents.base import Agent, AgentOptions, NoExploration, traced
 from sejax.agents.memory import Memory, Rollout, no_memory, replay_memory, rollout_memory
 from sejax.agents.replay import Transition
 from sejax.errors import require
 
 __all__ = [
-    "Agent", "AgentOptions", "Memory", "NoExploration", "Rollout", "Transition", "make_agent",
-    "names", "no_memory", "replay_memory", "require_fit", "rollout_memory", "traced",
-]  # fmt: skip
+    "Agent",
+    "AgentOptions",
+    "Memory",
+    "NoExploration",
+    "Rollout",
+    "Transition",
+    "make_agent",
+    "names",
+    "no_memory",
+    "replay_memory",
+    "require_fit",
+    "rollout_memory",
+    "traced",
+]
 
 DEFAULTS = ("ddqn", "td3", "q_learning")  # of which the first that suits a task is its own
 
 
 def names() -> list[str]:
     """Names of the agents that come with sejax or with installed packages."""
-    return plugins.names("agent")
+    return registry.names("agent")
 
 
 def make_agent(
@@ -48,25 +59,36 @@ def make_agent(
     Example:
       >>> import sejax
       >>> agent = make_agent(sejax.DDQNConfig(hidden_size=64), sejax.envs.make("cartpole"))
-      >>> agent.init_episodes
+      >>> agent.warmup_episodes
       10
     """
-    require(hasattr(task, "facts"), "task", "be a sejax.Task", "an agent is made for its spaces",
-            type(task).__name__, "task to env.task, or sejax.Task(name=..., env=env)")  # fmt: skip
-    require(hasattr(config, "make") and not isinstance(config, type), "config", "be an agent's "
-            "configuration", "the agent is made by it", config,
-            "config to such as sejax.DDQNConfig()")  # fmt: skip
+    require(
+        hasattr(task, "facts"),
+        "task",
+        "be a sejax.Task",
+        "an agent is made for its spaces",
+        type(task).__name__,
+        "task to env.task, or sejax.Task(name=..., env=env)",
+    )
+    require(
+        hasattr(config, "make") and not isinstance(config, type),
+        "config",
+        "be an agent's configuration",
+        "the agent is made by it",
+        config,
+        "config to such as sejax.DDQNConfig()",
+    )
     require_fit(config, exploration, task.facts, task.name)
-    return _make_agent(plugins.Same(config, exploration), task, varied)
+    return _make_agent(registry.Same(config, exploration), task, varied)
 
 
 @functools.cache
-def _make_agent(key: plugins.Same, task: Any, varied: bool) -> Agent:
+def _make_agent(key: registry.Same, task: Any, varied: bool) -> Agent:
     config, exploration = key.configs
 
     def make(config: Any) -> Agent:
-        agent = plugins.make("agent", config, task)
-        return plugins.make("exploration", exploration, agent, task)
+        agent = registry.make("agent", config, task)
+        return registry.make("exploration", exploration, agent, task)
 
     if not varied:
         return make(config)
@@ -88,21 +110,35 @@ def require_fit(agent: Any, exploration: Any, facts: Any, task_name: str) -> Non
       ConfigError: if it cannot.
     """
     if not _suits(agent, facts):
-        fitting = [name for name in names() if _suits(plugins.find("agent", name), facts)]
-        require(False, "agent", f"be one of {', '.join(fitting)} in {task_name}",
-                f"its states are {facts.states} and its actions {facts.actions}",
-                plugins.name_of("agent", agent), f"agent={fitting[0]}")  # fmt: skip
+        fitting = [name for name in names() if _suits(registry.find("agent", name), facts)]
+        require(
+            False,
+            "agent",
+            f"be one of {', '.join(fitting)} in {task_name}",
+            f"its states are {facts.states} and its actions {facts.actions}",
+            registry.name_of("agent", agent),
+            f"agent={fitting[0]}",
+        )
     for field in ("train_every", "gradient_steps") if _learns_each_step(exploration) else ():
         value = getattr(agent, field, 1)
-        require(value == 1, f"agent.{field}", "be 1 with "
-                f"exploration={plugins.name_of('exploration', exploration)}", "its module learns "
-                "once at each step, and so must the agent", value, f"agent.{field}=1")  # fmt: skip
+        require(
+            value == 1,
+            f"agent.{field}",
+            f"be 1 with exploration={registry.name_of('exploration', exploration)}",
+            "its module learns once at each step, and so must the agent",
+            value,
+            f"agent.{field}=1",
+        )
     wanted = getattr(exploration, "states", None)
-    name = plugins.name_of("agent", agent)
-    require(wanted in (None, getattr(agent, "states", wanted)), "exploration", f"suit {name}",
-            f"{plugins.name_of('exploration', exploration)} is made for agents with {wanted} "
-            "states", plugins.name_of("exploration", exploration),
-            "exploration=none")  # fmt: skip
+    name = registry.name_of("agent", agent)
+    require(
+        wanted in (None, getattr(agent, "states", wanted)),
+        "exploration",
+        f"suit {name}",
+        f"{registry.name_of('exploration', exploration)} is made for agents with {wanted} states",
+        registry.name_of("exploration", exploration),
+        "exploration=none",
+    )
 
 
 def _learns_each_step(exploration: Any) -> bool:
@@ -111,8 +147,7 @@ def _learns_each_step(exploration: Any) -> bool:
 
 def default_for(facts: Any) -> str:
     """The agent that is chosen for a task where none is asked for: the first that suits it."""
-    fitting = (name for name in DEFAULTS
-               if _suits(plugins.find("agent", name), facts))  # fmt: skip
+    fitting = (name for name in DEFAULTS if _suits(registry.find("agent", name), facts))
     return next(fitting, DEFAULTS[0])  # which will be refused, if none does
 
 

@@ -23,7 +23,7 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Float
 
-from sejax.agents.agent import Agent, traced
+from sejax.agents.base import Agent, traced
 from sejax.agents.memory import no_memory
 from sejax.errors import require
 from sejax.options import Options, counts, option, positive
@@ -42,9 +42,10 @@ class BoltzmannConfig(Options):
 
     # What a nat of entropy is worth, in the SE's rewards.
     temperature: float = option(
-        0.3, positive("a policy without entropy is told nothing of how clear rewards are"),
+        0.3,
+        positive("a policy without entropy is told nothing of how clear rewards are"),
         traced=True,
-    )  # fmt: skip
+    )
     # Values of each number of a continuous action, evenly spaced over its range.
     num_points: int = option(33, counts("a policy chooses", least=2))
 
@@ -56,9 +57,14 @@ class BoltzmannConfig(Options):
         """
         if task.num_actions is not None:
             return make_boltzmann(self, jnp.arange(task.num_actions))
-        require(task.action_dim <= MOST_DIMS, "agent", "be one that learns where actions have more "
-                f"than {MOST_DIMS} numbers", "the Boltzmann policy tries every action of a grid",
-                f"boltzmann for {task.action_dim} of them", "agent=sac")  # fmt: skip
+        require(
+            task.action_dim <= MOST_DIMS,
+            "agent",
+            f"be one that learns where actions have more than {MOST_DIMS} numbers",
+            "the Boltzmann policy tries every action of a grid",
+            f"boltzmann for {task.action_dim} of them",
+            "agent=sac",
+        )
         points = np.linspace(-task.max_action, task.max_action, self.num_points, dtype=np.float32)
         grid = np.meshgrid(*[points] * task.action_dim, indexing="ij")
         return make_boltzmann(self, jnp.stack([x.ravel() for x in grid], axis=1))
@@ -87,9 +93,14 @@ def make_boltzmann(config: BoltzmannConfig, actions: Array) -> Agent:
     """
 
     def solve(env: Any, env_params: Any, hparams: Any) -> BoltzmannState:
-        require(getattr(env, "is_bandit", False), "agent", "be one that learns, or the proxy an SE "
-                "whose episodes are one step", "the Boltzmann policy is known there alone",
-                f"boltzmann in {env.name}", "agent=ddqn, or proxy.horizon=1")  # fmt: skip
+        require(
+            getattr(env, "is_bandit", False),
+            "agent",
+            "be one that learns, or the proxy an SE whose episodes are one step",
+            "the Boltzmann policy is known there alone",
+            f"boltzmann in {env.name}",
+            "agent=ddqn, or proxy.horizon=1",
+        )
         reward = jax.tree_util.Partial(env.bandit_reward, env_params.weights)
         return BoltzmannState(reward=reward, hparams=jax.tree.map(jnp.float32, hparams))
 

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Int
 
-from sejax.agents.agent import Agent
+from sejax.agents.base import Agent
 from sejax.agents.replay import Transition
 from sejax.agents.tabular import entry_of, mask_of
 from sejax.options import Options, not_negative, option, positive

@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from sejax.keys import words
+from sejax.ops.keys import words
 
 
 def decayed_epsilon(

@@ -17,11 +17,11 @@ from flax import linen as nn
 from flax import struct
 from jaxtyping import Array, Float
 
-from sejax import flat
-from sejax.agents.agent import Agent, traced
+from sejax.agents.base import Agent, traced
 from sejax.agents.memory import Rollout
 from sejax.agents.replay import Transition
-from sejax.networks import MLP, Dense
+from sejax.ops import flat
+from sejax.ops.networks import MLP, Dense
 from sejax.options import MOST_LAYERS, Options, counts, fraction, not_negative, option, positive
 
 
@@ -163,7 +163,7 @@ def with_icm(
     Source: `docs/reference.md` 4.8.
 
     Example:
-      >>> from sejax.agents.ddqn import DDQNConfig, make_ddqn
+      >>> from sejax.agents.dqn import DDQNConfig, make_ddqn
       >>> plain = make_ddqn(DDQNConfig(), obs_dim=4, num_actions=2)
       >>> agent = with_icm(plain, ICMConfig(), obs_dim=4, num_actions=2, action_dim=None)
       >>> state = agent.init(jax.random.key(0), agent.hparams)
@@ -173,9 +173,12 @@ def with_icm(
     action_width = num_actions or action_dim
     assert action_width is not None, "an action has a number of choices or a length"
     model = ICM(
-        action_width, config.feature_dim, config.hidden_size, config.num_layers,
+        action_width,
+        config.feature_dim,
+        config.hidden_size,
+        config.num_layers,
         config.num_residual_blocks,
-    )  # fmt: skip
+    )
     example = (jnp.zeros(obs_dim), jnp.zeros(action_width), jnp.zeros(obs_dim))
     unflatten = flat.unflattener(model.init, *example)
 
@@ -246,7 +249,7 @@ def with_icm(
         act=act,
         update=update,
         hparams=CuriousHparams(agent=agent.hparams, icm=traced(config)),
-        cpu_lanes=1,  # its networks are no small ones, whatever the agent's
+        cpu_num_parallel=1,  # its networks are no small ones, whatever the agent's
         discount=lambda hparams: agent.discount(hparams.agent),
         batch_size=lambda state: agent.batch_size(state.agent_state),
     )

@@ -8,7 +8,7 @@ from jaxtyping import Array, Bool, Float
 
 from sejax.agents import replay
 from sejax.agents.replay import Transition
-from sejax.keys import words
+from sejax.ops.keys import words
 
 
 class Memory(NamedTuple):
@@ -118,9 +118,11 @@ def rollout_memory(length: int) -> MemoryMaker:
 
         width = replay.row_width(obs_dim, action_dim) + 1
         return Memory(
-            init=lambda: jnp.zeros((length, width)), store=store, batch=batch,
+            init=lambda: jnp.zeros((length, width)),
+            store=store,
+            batch=batch,
             rest=lambda rollout, active: rollout._replace(is_full=rollout.is_full & active),
-        )  # fmt: skip
+        )
 
     return make
 

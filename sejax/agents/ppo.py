@@ -19,13 +19,13 @@ import optax
 from flax import struct
 from jaxtyping import Array, Float, Int
 
-from sejax import flat
-from sejax.agents.agent import Agent, AgentOptions, traced
+from sejax.agents.base import Agent, AgentOptions, traced
 from sejax.agents.memory import Rollout, rollout_memory
 from sejax.agents.policies import SOFTMAX, Distribution, gaussian
 from sejax.errors import require
-from sejax.keys import murmur
-from sejax.networks import MLP, init_narrowed
+from sejax.ops import flat
+from sejax.ops.keys import murmur
+from sejax.ops.networks import MLP, init_narrowed
 from sejax.options import (
     ACTIVATIONS,
     MOST_LAYERS,
@@ -43,11 +43,19 @@ ADVANTAGES = ("monte_carlo", "gae")
 MIN_STD = 0.01  # of the Gaussian policy, in units of the action
 _MAX_LOG_RATIO = 20.0  # exp(20) is beyond any clip, and finite
 _PAPER: dict[str, Any] = {  # where it differs from the defaults
-    "advantages": "monte_carlo", "normalize_rewards": False, "rollout_steps": None,
-    "num_minibatches": 1, "epochs": 80, "activation": "relu", "learning_rate": 3e-4,
-    "clip_ratio": 0.2, "value_weight": 1.0, "max_grad_norm": None, "adam_eps": 1e-8,
+    "advantages": "monte_carlo",
+    "normalize_rewards": False,
+    "rollout_steps": None,
+    "num_minibatches": 1,
+    "epochs": 80,
+    "activation": "relu",
+    "learning_rate": 3e-4,
+    "clip_ratio": 0.2,
+    "value_weight": 1.0,
+    "max_grad_norm": None,
+    "adam_eps": 1e-8,
     "gae_lambda": 0.95,
-}  # fmt: skip
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,7 +69,7 @@ class PPOConfig(AgentOptions):
     actions: ClassVar[tuple[str, ...]] = ("discrete", "continuous")
 
     # PPO learns from the start; this only holds back the stop rule.
-    init_episodes: int = option(1, counts("it counts episodes", least=0))
+    warmup_episodes: int = option(1, counts("it counts episodes", least=0))
     hidden_size: int = option(64, counts(), varied="triple")
     num_layers: int = option(2, counts(most=MOST_LAYERS), varied="one_more_or_less")
     activation: str = option("tanh", one_of(ACTIVATIONS))
@@ -103,8 +111,9 @@ class PPOConfig(AgentOptions):
     def make(self, task: Any) -> Agent:
         """The agent for a task's observations and actions."""
         action_dim = task.action_dim if task.num_actions is None else None
-        return make_ppo(self, task.obs_dim, task.num_actions, action_dim, task.max_action,
-                        task.max_steps)  # fmt: skip
+        return make_ppo(
+            self, task.obs_dim, task.num_actions, action_dim, task.max_action, task.max_steps
+        )
 
     def rollout_length(self, task_max_steps: int) -> int:
         """Decisions between two learning phases: `rollout_steps`, if that is set.
@@ -188,10 +197,12 @@ def make_ppo(
     length = config.rollout_length(max_steps)
     require(
         config.num_minibatches == 1 or 2 * config.num_minibatches <= length,
-        "agent.num_minibatches", f"be at most half of the rollout's {length} steps",
-        "advantages are compared within a minibatch", config.num_minibatches,
+        "agent.num_minibatches",
+        f"be at most half of the rollout's {length} steps",
+        "advantages are compared within a minibatch",
+        config.num_minibatches,
         f"agent.num_minibatches={max(1, length // 2)}",
-    )  # fmt: skip
+    )
     optimizer = config.optimizer()
     learn = make_learning_phase(config, networks, optimizer, obs_dim, action_dim is None)
 
@@ -231,7 +242,7 @@ def make_ppo(
         update=update,
         memory=rollout_memory(length),
         hparams=traced(config, hidden_size=None),
-        init_episodes=config.init_episodes,
+        warmup_episodes=config.warmup_episodes,
         learns_from=0,
         env_action=policy.env_action,
         action_repeat=config.action_repeat,
@@ -276,8 +287,9 @@ def make_networks(
 
     def init_tree(key: Array, hidden_size: Array | None = None) -> dict[str, Any]:
         keys = dict(zip(mlps, jax.random.split(key), strict=True))
-        weights = {name: init_narrowed(mlp, keys[name], obs_dim, hidden_size)
-                   for name, mlp in mlps.items()}  # fmt: skip
+        weights = {
+            name: init_narrowed(mlp, keys[name], obs_dim, hidden_size) for name, mlp in mlps.items()
+        }
         return {**weights, "std": jnp.full(std_dim, config.init_action_std, jnp.float32)}
 
     def init(key: Array, hidden_size: Array | None) -> Array:

@@ -11,7 +11,7 @@ from jax.experimental.xla_metadata import set_xla_metadata
 from jaxtyping import Array, Float, Int, UInt32
 
 from sejax.agents.partial_batch import block_size
-from sejax.keys import murmur
+from sejax.ops.keys import murmur
 
 _VECTOR = 8  # float32 lanes of AVX2
 
@@ -61,8 +61,13 @@ def init(
 
 def pack(transition: Transition) -> Float[Array, " width"]:
     """One transition as a row."""
-    parts = (transition.obs, transition.next_obs, transition.action, transition.reward,
-             transition.discount)  # fmt: skip
+    parts = (
+        transition.obs,
+        transition.next_obs,
+        transition.action,
+        transition.reward,
+        transition.discount,
+    )
     return jnp.concatenate([jnp.atleast_1d(x).astype(jnp.float32) for x in parts])
 
 
@@ -125,9 +130,11 @@ def sample(
     def columns(first: Array | int, count: int) -> Float[Array, "width count"]:
         index = sample_indices(seed, size, count, first)[None, :] * width
         return jax.lax.platform_dependent(
-            rows.reshape(-1), index + jnp.arange(width)[:, None], cpu=_gather_outlined,
+            rows.reshape(-1),
+            index + jnp.arange(width)[:, None],
+            cpu=_gather_outlined,
             default=_gather,
-        )  # fmt: skip
+        )
 
     step = _VECTOR if in_use is None else block_size(batch_size)
     padded_size = -(-batch_size // step) * step

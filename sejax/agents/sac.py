@@ -19,13 +19,13 @@ import optax
 from flax import struct
 from jaxtyping import Array, Bool, Float
 
-from sejax import flat
-from sejax.agents.agent import Agent, AgentOptions, traced
+from sejax.agents.base import Agent, AgentOptions, traced
 from sejax.agents.memory import replay_memory
 from sejax.agents.partial_batch import sum_over_batch
 from sejax.agents.policies import select_action
 from sejax.agents.replay import Transition, num_columns
-from sejax.networks import MLP, init_narrowed
+from sejax.ops import flat
+from sejax.ops.networks import MLP, init_narrowed
 from sejax.options import (
     ACTIVATIONS,
     MOST_LAYERS,
@@ -53,7 +53,7 @@ class SACConfig(AgentOptions):
     actions: ClassVar[tuple[str, ...]] = ("discrete", "continuous")
 
     # With uniformly random actions.
-    init_episodes: int = option(10, counts("it counts episodes", least=0))
+    warmup_episodes: int = option(10, counts("it counts episodes", least=0))
     batch_size: int = option(256, counts(), varied="triple")
     buffer_size: int = option(100_000, counts())
     hidden_size: int = option(256, counts(), varied="triple")
@@ -61,7 +61,7 @@ class SACConfig(AgentOptions):
     activation: str = option("relu", one_of(ACTIVATIONS))
     # Of the actor, the critics and the temperature.
     learning_rate: float = option(3e-4, positive(MOVES), traced=True, varied="triple")
-    target_update_rate: float = option(0.005, fraction(), traced=True)  # tau
+    tau: float = option(0.005, fraction(), traced=True)  # tau
     discount: float = option(0.99, fraction(), traced=True)  # gamma
     action_repeat: int = option(1, counts())  # steps of the world for each decision
     # Temperature: what a nat of entropy is worth, in reward units. None: learned, as the authors do
@@ -175,12 +175,12 @@ def _make_agent(config: SACConfig, obs_dim: int, policy: Policy) -> Agent:
             params=params,
             target_critics=networks.critics_of(params),
             opt_state=flat.ADAM.init(params),
-            is_warming_up=jnp.bool_(config.init_episodes > 0),
+            is_warming_up=jnp.bool_(config.warmup_episodes > 0),
             hparams=jax.tree.map(jnp.float32, hparams),
         )
 
     def begin_episode(state: SACState, episode: Array) -> SACState:
-        return state.replace(is_warming_up=jnp.asarray(episode < config.init_episodes))
+        return state.replace(is_warming_up=jnp.asarray(episode < config.warmup_episodes))
 
     def act(key: Array, state: SACState, obs: Float[Array, " obs_dim"], explore: bool) -> Array:
         outputs = networks.actor(networks.unflatten(state.params), obs)
@@ -198,8 +198,8 @@ def _make_agent(config: SACConfig, obs_dim: int, policy: Policy) -> Agent:
         update=update,
         memory=replay_memory(config.batch_size, config.buffer_size),
         hparams=traced(config, hidden_size=None, batch_size=None),
-        init_episodes=config.init_episodes,
-        learns_from=config.init_episodes,
+        warmup_episodes=config.warmup_episodes,
+        learns_from=config.warmup_episodes,
         env_action=policy.env_action,
         action_repeat=config.action_repeat,
         batch_size=lambda state: state.hparams.batch_size,
@@ -242,9 +242,12 @@ def make_networks(config: SACConfig, obs_dim: int, policy: Policy) -> Networks:
 
     def network(num_outputs: int) -> MLP:
         return MLP(
-            num_outputs, config.hidden_size, config.num_layers, config.activation,
+            num_outputs,
+            config.hidden_size,
+            config.num_layers,
+            config.activation,
             learn_prelu_slope=True,
-        )  # fmt: skip
+        )
 
     actor, critic = network(policy.num_outputs), network(policy.critic_outputs)
 
@@ -267,8 +270,10 @@ def make_networks(config: SACConfig, obs_dim: int, policy: Policy) -> Networks:
         return flat.flatten(params._replace(log_alpha=jnp.log(jnp.float32(hparams.init_alpha))))
 
     unflatten_critics = flat.unflattener(init_critics)
-    sizes = [sum(math.prod(x.shape) for x in jax.tree.leaves(part))
-             for part in jax.eval_shape(init_all, jax.random.key(0))]  # fmt: skip
+    sizes = [
+        sum(math.prod(x.shape) for x in jax.tree.leaves(part))
+        for part in jax.eval_shape(init_all, jax.random.key(0))
+    ]
     return Networks(
         init=init,
         unflatten=flat.unflattener(init_all),
@@ -337,7 +342,7 @@ def make_learning_step(
         moved, opt_state = flat.adam_step(
             state.params, state.opt_state, gradient / num_columns(batch), hp.learning_rate
         )
-        tau = hp.target_update_rate
+        tau = hp.tau
         return state.replace(
             params=moved,
             opt_state=opt_state,

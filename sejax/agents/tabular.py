@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Float, Int
 
-from sejax.agents.agent import Agent, AgentOptions, traced
+from sejax.agents.base import Agent, AgentOptions, traced
 from sejax.agents.epsilon_greedy import decayed_epsilon, epsilon_greedy
 from sejax.agents.memory import no_memory
 from sejax.agents.replay import Transition
@@ -31,7 +31,7 @@ class QLearningConfig(AgentOptions):
 
     states: ClassVar[str] = "discrete"
 
-    init_episodes: int = option(0, counts("it counts episodes", least=0))
+    warmup_episodes: int = option(0, counts("it counts episodes", least=0))
     learning_rate: float = option(1.0, positive(MOVES), traced=True, varied="tenth_to_one")
     discount: float = option(0.8, fraction(), traced=True, varied="tenth_to_one")
     epsilon_init: float = option(0.1, fraction(), traced=True)
@@ -149,9 +149,9 @@ def _make_tabular(
         update=update,
         hparams=traced(config),
         memory=no_memory(),
-        init_episodes=config.init_episodes,
-        learns_from=config.init_episodes,
-        cpu_lanes=None,
+        warmup_episodes=config.warmup_episodes,
+        learns_from=config.warmup_episodes,
+        cpu_num_parallel=None,
     )
 
 

@@ -18,12 +18,12 @@ import optax
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
-from sejax import flat
-from sejax.agents.agent import Agent, AgentOptions, traced
+from sejax.agents.base import Agent, AgentOptions, traced
 from sejax.agents.memory import replay_memory
 from sejax.agents.partial_batch import sum_over_batch
 from sejax.agents.replay import Transition, num_columns
-from sejax.networks import MLP, init_narrowed
+from sejax.ops import flat
+from sejax.ops.networks import MLP, init_narrowed
 from sejax.options import (
     ACTIVATIONS,
     MOST_LAYERS,
@@ -44,13 +44,13 @@ class TD3Config(AgentOptions):
     """TD3's hyperparameters (paper, appendix "MountainCarContinuous-v0 and HalfCheetah-v3").
 
     The defaults are the paper's for HalfCheetah; for MountainCarContinuous it has
-    `init_episodes=50 action_repeat=2`.
+    `warmup_episodes=50 action_repeat=2`.
     """
 
     actions: ClassVar[tuple[str, ...]] = ("continuous",)
 
     # With uniformly random actions.
-    init_episodes: int = option(20, counts("it counts episodes", least=0))
+    warmup_episodes: int = option(20, counts("it counts episodes", least=0))
     batch_size: int = option(256, counts(), varied="triple")
     buffer_size: int = option(100_000, counts())
     hidden_size: int = option(128, counts(), varied="triple")
@@ -58,7 +58,7 @@ class TD3Config(AgentOptions):
     activation: str = option("relu", one_of(ACTIVATIONS))
     # Of the actor and the critics.
     learning_rate: float = option(3e-4, positive(MOVES), traced=True, varied="triple")
-    target_update_rate: float = option(0.005, fraction(), traced=True)
+    tau: float = option(0.005, fraction(), traced=True)
     discount: float = option(0.99, fraction(), traced=True)
     policy_delay: int = option(2, counts())  # learning steps for each one of actor and targets
     action_repeat: int = option(1, counts())  # steps of the world for each decision
@@ -80,11 +80,11 @@ class DiscreteTD3Config(TD3Config):
 
     actions: ClassVar[tuple[str, ...]] = ("discrete",)
 
-    init_episodes: int = option(10, counts("it counts episodes", least=0))
+    warmup_episodes: int = option(10, counts("it counts episodes", least=0))
     batch_size: int = option(128, counts(), varied="triple")
     activation: str = option("tanh", one_of(ACTIVATIONS))
     learning_rate: float = option(5e-4, positive(MOVES), traced=True, varied="triple")
-    target_update_rate: float = option(0.01, fraction(), traced=True)
+    tau: float = option(0.01, fraction(), traced=True)
     layer_norm: bool = True  # after each hidden layer but the first, as in the authors' code
     # Of the Gumbel-Softmax at the start.
     temperature: float = option(1.0, positive(MOVES), traced=True)
@@ -205,12 +205,12 @@ def _make_agent(config: TD3Config, obs_dim: int, policy: Policy) -> Agent:
             actor_opt_state=flat.ADAM.init(actor),
             critic_opt_state=flat.ADAM.init(critics),
             num_updates=jnp.int32(0),
-            is_warming_up=jnp.bool_(config.init_episodes > 0),
+            is_warming_up=jnp.bool_(config.warmup_episodes > 0),
             hparams=jax.tree.map(jnp.float32, hparams),
         )
 
     def begin_episode(state: TD3State, episode: Array) -> TD3State:
-        return state.replace(is_warming_up=jnp.asarray(episode < config.init_episodes))
+        return state.replace(is_warming_up=jnp.asarray(episode < config.warmup_episodes))
 
     def act(key: Array, state: TD3State, obs: Float[Array, " obs_dim"], explore: bool) -> Array:
         outputs = networks.actor(state.actor, obs)
@@ -234,8 +234,8 @@ def _make_agent(config: TD3Config, obs_dim: int, policy: Policy) -> Agent:
         update=update,
         memory=replay_memory(config.batch_size, config.buffer_size),
         hparams=traced(config, hidden_size=None, batch_size=None),
-        init_episodes=config.init_episodes,
-        learns_from=config.init_episodes,
+        warmup_episodes=config.warmup_episodes,
+        learns_from=config.warmup_episodes,
         env_action=policy.env_action,
         action_repeat=config.action_repeat,
         batch_size=lambda state: state.hparams.batch_size,
@@ -266,9 +266,14 @@ def make_networks(config: TD3Config, obs_dim: int, action_dim: int) -> Networks:
 
     def network(num_inputs: int, num_outputs: int) -> tuple[Callable, Callable]:
         mlp = MLP(
-            num_outputs, config.hidden_size, config.num_layers, config.activation,
-            learn_prelu_slope=True, layer_norm=layer_norm, may_narrow=True,
-        )  # fmt: skip
+            num_outputs,
+            config.hidden_size,
+            config.num_layers,
+            config.activation,
+            learn_prelu_slope=True,
+            layer_norm=layer_norm,
+            may_narrow=True,
+        )
         unflatten = flat.unflattener(mlp.init, jnp.zeros(num_inputs))
 
         def init(key: Array, hidden_size: Array | None) -> Array:
@@ -337,7 +342,7 @@ def make_learning_step(
         actor, opt_state = flat.adam_step(
             state.actor, state.actor_opt_state, gradient, hp.learning_rate
         )
-        tau = hp.target_update_rate
+        tau = hp.tau
         return state.replace(
             actor=actor,
             actor_opt_state=opt_state,

@@ -3,7 +3,7 @@
 All of them are one program. Learning rate and batch size are traced numbers; a hidden size is that
 of a network in which the other units are switched off (`networks.narrow`), in the smallest of a few
 networks that has room; for each of these, and for each depth, there is a branch. A branch is a real
-one where agents train one after another (`lanes=1`); in lanes all of them would run.
+one where agents train one after another (`num_parallel=1`); in lanes all of them would run.
 
 Source: paper, table "Agent hyperparameter ranges" and appendix "Varied Agent Hyperparameters";
 `docs/reference.md` 4.9.
@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from sejax.agents.agent import Agent, Draw, with_hparams
+from sejax.agents.base import Agent, Draw, with_hparams
 from sejax.errors import require
 from sejax.options import marks
 
@@ -54,16 +54,22 @@ def ranges_of(config: Any) -> dict[str, Range]:
     hints = get_type_hints(type(config))
     said = {field.name: marks(type(config), field.name) for field in dataclasses.fields(config)}
     fields = [field for field in dataclasses.fields(config) if said[field.name].get("varied")]
-    require(fields, "agent_hparams", "be default with this agent", "none of its options says how "
-            "it is drawn (sejax.options.option(..., varied=...))", type(config).__name__,
-            "agent_hparams=default")  # fmt: skip
+    require(
+        fields,
+        "agent_hparams",
+        "be default with this agent",
+        "none of its options says how it is drawn (sejax.options.option(..., varied=...))",
+        type(config).__name__,
+        "agent_hparams=default",
+    )
     # Traced ones first: which key draws what.
     ordered = sorted(fields, key=lambda field: not said[field.name]["traced"])
     return {
-        field.name: _range(said[field.name]["varied"], getattr(config, field.name),
-                           hints[field.name] is int)
+        field.name: _range(
+            said[field.name]["varied"], getattr(config, field.name), hints[field.name] is int
+        )
         for field in ordered
-    }  # fmt: skip
+    }
 
 
 def _range(how: str, value: Any, integer: bool) -> Range:
@@ -118,8 +124,11 @@ def make_varied(config: Any, make: Callable[[Any], Agent]) -> Agent:
     variants = [agent]
     if "hidden_size" in ranges:
         low, high = int(ranges["num_layers"].low), int(ranges["num_layers"].high)
-        shapes = [(depth, size) for depth in range(low, high + 1)
-                  for size in hidden_sizes(ranges["hidden_size"], depth)]  # fmt: skip
+        shapes = [
+            (depth, size)
+            for depth in range(low, high + 1)
+            for size in hidden_sizes(ranges["hidden_size"], depth)
+        ]
         room = {"batch_size": int(ranges["batch_size"].high)} if "batch_size" in ranges else {}
         variants = [
             make(dataclasses.replace(config, num_layers=depth, hidden_size=size, **room))
@@ -140,8 +149,10 @@ def make_varied(config: Any, make: Callable[[Any], Agent]) -> Agent:
         )
 
     # In lockstep all branches would run.
-    lanes = agent.cpu_lanes if len(variants) == 1 else 1
-    return dataclasses.replace(agent, variants=tuple(variants), draw=draw, cpu_lanes=lanes)
+    num_parallel = agent.cpu_num_parallel if len(variants) == 1 else 1
+    return dataclasses.replace(
+        agent, variants=tuple(variants), draw=draw, cpu_num_parallel=num_parallel
+    )
 
 
 def smallest_with_room(shapes: list[tuple[int, int]], values: dict[str, Array]) -> Array:

@@ -5,9 +5,9 @@ A task is a file here, with its facts on top and what takes seconds to import in
 
 from typing import Any
 
-from sejax import plugins
+from sejax import registry
 from sejax.envs import light_gymnax
-from sejax.envs.task import Facts, Task
+from sejax.envs.base import Facts, Task
 
 light_gymnax.install()
 
@@ -16,7 +16,7 @@ __all__ = ["Facts", "Task", "facts_of", "make", "make_from", "names"]
 
 def names() -> list[str]:
     """Names that `make` takes, beside `gymnax/ID` and `module:attribute`."""
-    return plugins.names("env")
+    return registry.names("env")
 
 
 def make(name: str, **options: Any) -> Task:
@@ -34,14 +34,14 @@ def make(name: str, **options: Any) -> Task:
       >>> make("cartpole").solved_reward
       195.0
     """
-    return make_from(plugins.configure("env", {"name": name, **options}))
+    return make_from(registry.configure("env", {"name": name, **options}))
 
 
 def make_from(config: Any) -> Task:
     """The task that a configuration describes, built once; it knows where it came from."""
-    task = plugins.make("env", config)
+    task = registry.make("env", config)
     if task.origin is None:
-        object.__setattr__(task, "origin", plugins.describe("env", config))
+        object.__setattr__(task, "origin", registry.describe("env", config))
     return task
 
 

@@ -11,7 +11,7 @@ from typing import Any, NoReturn
 import jax.numpy as jnp
 from gymnax.environments import environment, spaces
 
-from sejax.envs.task import Task
+from sejax.envs.base import Task
 from sejax.errors import ConfigError
 
 
@@ -74,8 +74,12 @@ def make(name: str, interface: dict[str, Any], origin: dict[str, Any], reason: s
 @functools.cache
 def _make(name: str, known: str, reason: str) -> Task:
     interface, origin = json.loads(known)
-    return Task(name=name, env=AbsentEnv(name, interface, reason),
-                max_steps=interface["max_steps"], origin=origin)  # fmt: skip
+    return Task(
+        name=name,
+        env=AbsentEnv(name, interface, reason),
+        max_steps=interface["max_steps"],
+        origin=origin,
+    )
 
 
 def require_present(task: Task) -> Task:

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import ClassVar
 
-from sejax.envs.task import Facts, Task
+from sejax.envs.base import Facts, Task
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -18,5 +18,10 @@ class CartPoleV1:
     def make(self) -> Task:
         from gymnax.environments.classic_control import cartpole
 
-        return Task(name="cartpole_v1", env=cartpole.CartPole(), params=cartpole.EnvParams(),
-                    max_steps=self.facts.max_steps, solved_reward=475.0)  # fmt: skip
+        return Task(
+            name="cartpole_v1",
+            env=cartpole.CartPole(),
+            params=cartpole.EnvParams(),
+            max_steps=self.facts.max_steps,
+            solved_reward=475.0,
+        )

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from sejax import errors
-from sejax.envs.task import Facts, Task
+from sejax.envs.base import Facts, Task
 
 MAP = (
     "            ",
@@ -27,13 +27,24 @@ class CliffWalking:
     goal_reward: float = 0.0  # of the move into the goal: 0 in the authors' code; paper's text: -1
 
     def __post_init__(self) -> None:
-        errors.require(abs(self.goal_reward) < float("inf"), "env.goal_reward", "be finite",
-                       "it is a reward", self.goal_reward, "env.goal_reward=-1")  # fmt: skip
+        errors.require(
+            abs(self.goal_reward) < float("inf"),
+            "env.goal_reward",
+            "be finite",
+            "it is a reward",
+            self.goal_reward,
+            "env.goal_reward=-1",
+        )
 
     def make(self) -> Task:
         from sejax.envs.dynamics.gridworld import GridParams, GridWorld
 
-        params = GridParams(step_reward=-1.0, goal_reward=self.goal_reward, hole_reward=-100.0,
-                            max_steps_in_episode=self.facts.max_steps)  # fmt: skip
-        return Task(name="cliff_walking", env=GridWorld(MAP, params), params=params,
-                    solved_reward=-20.0)  # fmt: skip
+        params = GridParams(
+            step_reward=-1.0,
+            goal_reward=self.goal_reward,
+            hole_reward=-100.0,
+            max_steps_in_episode=self.facts.max_steps,
+        )
+        return Task(
+            name="cliff_walking", env=GridWorld(MAP, params), params=params, solved_reward=-20.0
+        )

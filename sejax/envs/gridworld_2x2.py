@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import ClassVar
 
-from sejax.envs.task import Facts, Task
+from sejax.envs.base import Facts, Task
 
 MAP = (
     "S ",
@@ -23,7 +23,12 @@ class GridWorld2x2:
     def make(self) -> Task:
         from sejax.envs.dynamics.gridworld import GridParams, GridWorld
 
-        params = GridParams(step_reward=-0.01, goal_reward=1.0, hole_reward=-1.0,
-                            max_steps_in_episode=self.facts.max_steps)  # fmt: skip
-        return Task(name="gridworld_2x2", env=GridWorld(MAP, params), params=params,
-                    solved_reward=0.8)  # fmt: skip
+        params = GridParams(
+            step_reward=-0.01,
+            goal_reward=1.0,
+            hole_reward=-1.0,
+            max_steps_in_episode=self.facts.max_steps,
+        )
+        return Task(
+            name="gridworld_2x2", env=GridWorld(MAP, params), params=params, solved_reward=0.8
+        )

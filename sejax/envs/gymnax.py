@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from sejax import errors
-from sejax.envs.task import Task
+from sejax.envs.base import Task
 from sejax.options import Options, counts, option
 
 PREFIX = "gymnax/"
@@ -50,5 +50,6 @@ class GymnaxTask(Options):
         solved = self.solved_reward
         if solved is None:
             solved = SOLVED_REWARD.get(gymnax_id, math.inf)
-        return Task(name=self.name, env=env, params=params, solved_reward=solved,
-                    max_steps=self.max_steps)  # fmt: skip
+        return Task(
+            name=self.name, env=env, params=params, solved_reward=solved, max_steps=self.max_steps
+        )

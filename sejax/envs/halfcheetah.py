@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from sejax.envs import mujoco
-from sejax.envs.task import Facts, Task
+from sejax.envs.base import Facts, Task
 from sejax.errors import ConfigError
 from sejax.options import Options, one_of, option
 
@@ -46,7 +46,11 @@ class HalfCheetah(Options):
                 f"installed ({error}). Install it with pip install 'sejax[brax]'."
             ) from error
         return Task(
-            name="halfcheetah", env=env, params=CheetahParams(), max_steps=self.facts.max_steps,
-            solved_reward=SOLVED_REWARD, info_keys=INFO_KEYS,
+            name="halfcheetah",
+            env=env,
+            params=CheetahParams(),
+            max_steps=self.facts.max_steps,
+            solved_reward=SOLVED_REWARD,
+            info_keys=INFO_KEYS,
             augmented_keys=("x_position", "x_velocity"),
-        )  # fmt: skip
+        )

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import ClassVar
 
-from sejax.envs.task import Facts, Task
+from sejax.envs.base import Facts, Task
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -18,6 +18,10 @@ class MountainCar:
     def make(self) -> Task:
         from gymnax.environments.classic_control import mountain_car
 
-        return Task(name="mountain_car", env=mountain_car.MountainCar(),
-                    params=mountain_car.EnvParams(), max_steps=self.facts.max_steps,
-                    solved_reward=-110.0)  # fmt: skip
+        return Task(
+            name="mountain_car",
+            env=mountain_car.MountainCar(),
+            params=mountain_car.EnvParams(),
+            max_steps=self.facts.max_steps,
+            solved_reward=-110.0,
+        )

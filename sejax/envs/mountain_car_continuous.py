@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import ClassVar
 
-from sejax.envs.task import Facts, Task
+from sejax.envs.base import Facts, Task
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -18,6 +18,10 @@ class MountainCarContinuous:
     def make(self) -> Task:
         from sejax.envs.dynamics.mountain_car_continuous import EnvParams, MountainCarContinuousEnv
 
-        return Task(name="mountain_car_continuous", env=MountainCarContinuousEnv(),
-                    params=EnvParams(), max_steps=self.facts.max_steps,
-                    solved_reward=90.0)  # fmt: skip
+        return Task(
+            name="mountain_car_continuous",
+            env=MountainCarContinuousEnv(),
+            params=EnvParams(),
+            max_steps=self.facts.max_steps,
+            solved_reward=90.0,
+        )

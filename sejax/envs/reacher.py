@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from sejax.envs import mujoco
-from sejax.envs.task import Facts, Task
+from sejax.envs.base import Facts, Task
 from sejax.options import Options, not_negative, option
 
 

@@ -3,8 +3,8 @@
 from dataclasses import dataclass
 
 from sejax.envs import mujoco
+from sejax.envs.base import Task
 from sejax.envs.hopper import Hopper
-from sejax.envs.task import Task
 
 
 @dataclass(frozen=True, kw_only=True)

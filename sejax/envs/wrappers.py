@@ -115,8 +115,9 @@ class AsVectors(Wrapper):
         self._is_index = isinstance(self._obs, spaces.Discrete)
         if not self._is_index:
             size = int(np.prod(self._obs.shape))
-            bounds = (_full(x, self._obs.shape).reshape(size)
-                      for x in (self._obs.low, self._obs.high))  # fmt: skip
+            bounds = (
+                _full(x, self._obs.shape).reshape(size) for x in (self._obs.low, self._obs.high)
+            )
             self._obs = spaces.Box(*bounds, (size,), jnp.float32)
 
     def reset_env(self, key: Any, params: Any) -> tuple[Any, Any]:

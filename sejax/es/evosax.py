@@ -12,7 +12,7 @@ import optax
 from jaxtyping import Array, Float
 
 from sejax.errors import require
-from sejax.es.strategy import AGGREGATES, LARGEST, Strategy, trials_of
+from sejax.es.base import AGGREGATES, LARGEST, Strategy, trials_of
 from sejax.options import MOST_MEMBERS, Options, counts, one_of, option, positive, shrinks
 
 # Name -> evosax's class. Listed here because importing evosax takes a second; a test holds the list
@@ -49,8 +49,13 @@ ALGORITHMS = {
 # Whose candidates are pairs of opposite perturbations, one half of them after the other.
 PAIRED = ("ars", "asebo", "cr_fm_nes", "noise_reuse_es", "open_es", "persistent_es", "pgpe")
 # Which hold scores against those of earlier generations.
-REMEMBERING = ("gradientless_descent", "hill_climbing", "iamalgam_full", "iamalgam_univariate",
-               "simulated_annealing")  # fmt: skip
+REMEMBERING = (
+    "gradientless_descent",
+    "hill_climbing",
+    "iamalgam_full",
+    "iamalgam_univariate",
+    "simulated_annealing",
+)
 # The step of whose mean has a natural scale.
 NATURAL = ("des", "simple_es", "snes", "xnes")
 
@@ -84,9 +89,14 @@ class EvosaxConfig(Options):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require(self.population_size % 2 == 0, "es.population_size", "be even",
-                "evosax's algorithms pair opposite perturbations", self.population_size,
-                f"es.population_size={self.population_size + 1}")  # fmt: skip
+        require(
+            self.population_size % 2 == 0,
+            "es.population_size",
+            "be even",
+            "evosax's algorithms pair opposite perturbations",
+            self.population_size,
+            f"es.population_size={self.population_size + 1}",
+        )
 
     def make(self, num_dims: int) -> Strategy:
         """The algorithm over vectors of `num_dims` numbers."""

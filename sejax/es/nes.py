@@ -11,8 +11,8 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Float
 
+from sejax.es.base import AGGREGATES, LARGEST, Strategy, trials_of
 from sejax.es.score_transforms import TRANSFORMS
-from sejax.es.strategy import AGGREGATES, LARGEST, Strategy, trials_of
 from sejax.options import MOST_MEMBERS, Options, counts, fraction, one_of, option, positive, shrinks
 
 UPDATE_RULES = ("authors", "paper")

@@ -12,7 +12,7 @@ from collections.abc import Callable
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from sejax.es.strategy import is_tie
+from sejax.es.base import is_tie
 
 Scores = Float[Array, " pop"]
 ScoreTransform = Callable[[Scores, Float[Array, ""]], Scores]
@@ -92,9 +92,17 @@ def all_better_2(scores: Scores, incumbent: Float[Array, ""]) -> Scores:
 
 TRANSFORMS: dict[str, ScoreTransform] = {
     f.__name__: f
-    for f in (linear, rank, nes, nes_unnormalized, single_best, single_better,
-              all_better_1, all_better_2)
-}  # fmt: skip
+    for f in (
+        linear,
+        rank,
+        nes,
+        nes_unnormalized,
+        single_best,
+        single_better,
+        all_better_1,
+        all_better_2,
+    )
+}
 
 
 def _advantage(scores: Scores, incumbent: Float[Array, ""]) -> Scores:

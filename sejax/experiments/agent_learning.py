@@ -16,7 +16,7 @@ import numpy as np
 import pandas as pd
 
 import sejax
-from sejax import plugins, serialize
+from sejax import registry, serialize
 from sejax.experiments import figures, return_curves
 from sejax.experiments.experiment import Experiment
 from sejax.experiments.return_curves import WINDOW
@@ -46,7 +46,7 @@ class Study:
 
     def configuration(self) -> Any:
         """The paper's agent, which is the default but for PPO, with `hparams`."""
-        cls = plugins.find("agent", self.agent)
+        cls = registry.find("agent", self.agent)
         return (sejax.PPOConfig.paper if cls is sejax.PPOConfig else cls)(**self.hparams)
 
     def changes(self) -> dict[str, Any]:
@@ -62,10 +62,12 @@ class Study:
         """Episodes of training and of tests alternate until the step limit."""
         max_steps = min(self.max_steps, QUICK_STEPS) if quick else self.max_steps
         return TrainingConfig(
-            max_episodes=max_steps // SHORTEST_EPISODE, max_steps=max_steps, stop_rule="never",
+            max_episodes=max_steps // SHORTEST_EPISODE,
+            max_steps=max_steps,
+            stop_rule="never",
             tests_between=test_episodes,
             time_limit_is_terminal=False,  # as in the literature; the paper's code ends there
-        )  # fmt: skip
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,8 +88,12 @@ class PresetStudy(Study):
 
     def training(self, quick: bool, test_episodes: int) -> TrainingConfig:
         max_steps = min(self.max_steps, QUICK_STEPS) if quick else self.max_steps
-        return dataclasses.replace(self._preset().training, max_steps=max_steps,
-                                   stop_rule="never", tests_between=test_episodes)  # fmt: skip
+        return dataclasses.replace(
+            self._preset().training,
+            max_steps=max_steps,
+            stop_rule="never",
+            tests_between=test_episodes,
+        )
 
     @property
     def label(self) -> str:
@@ -99,33 +105,76 @@ class PresetStudy(Study):
 
 STUDIES = (
     Study(env="cartpole", agent="ddqn", max_steps=20_000, peers=PAPER_DDQN),
-    Study(env="cartpole", agent="dueling_ddqn", max_steps=20_000, peers="12,745 steps to solve, "
-          "likewise"),
-    Study(env="cartpole", agent="td3_discrete", max_steps=20_000, peers="17,875 steps and a return "
-          "of 152, likewise"),
-    Study(env="cartpole", agent="ppo", max_steps=100_000,
-          hparams={"activation": "tanh", "learning_rate": 1e-3, "discount": 0.98,
-                   "update_episodes": 4, "epochs": 20},
-          peers=f"500.0 of 500 on CartPole-v1 after 100,000 steps ({ZOO})"),
-    Study(env="pendulum", agent="td3", max_steps=20_000,
-          hparams={"learning_rate": 1e-3, "discount": 0.98, "init_episodes": 10},
-          peers=f"-151.9 after 20,000 steps ({ZOO})"),
-    Study(env="pendulum", agent="ppo", max_steps=200_000,
-          hparams={"activation": "tanh", "learning_rate": 5e-4, "discount": 0.95,
-                   "entropy_weight": 0.0, "init_action_std": 1.0},
-          peers=f"-172.2 after 100,000 steps ({ZOO})"),
+    Study(
+        env="cartpole",
+        agent="dueling_ddqn",
+        max_steps=20_000,
+        peers="12,745 steps to solve, likewise",
+    ),
+    Study(
+        env="cartpole",
+        agent="td3_discrete",
+        max_steps=20_000,
+        peers="17,875 steps and a return of 152, likewise",
+    ),
+    Study(
+        env="cartpole",
+        agent="ppo",
+        max_steps=100_000,
+        hparams={
+            "activation": "tanh",
+            "learning_rate": 1e-3,
+            "discount": 0.98,
+            "update_episodes": 4,
+            "epochs": 20,
+        },
+        peers=f"500.0 of 500 on CartPole-v1 after 100,000 steps ({ZOO})",
+    ),
+    Study(
+        env="pendulum",
+        agent="td3",
+        max_steps=20_000,
+        hparams={"learning_rate": 1e-3, "discount": 0.98, "warmup_episodes": 10},
+        peers=f"-151.9 after 20,000 steps ({ZOO})",
+    ),
+    Study(
+        env="pendulum",
+        agent="ppo",
+        max_steps=200_000,
+        hparams={
+            "activation": "tanh",
+            "learning_rate": 5e-4,
+            "discount": 0.95,
+            "entropy_weight": 0.0,
+            "init_action_std": 1.0,
+        },
+        peers=f"-172.2 after 100,000 steps ({ZOO})",
+    ),
     Study(env="cliff_walking", agent="q_learning", max_steps=2_000, peers="optimal: -12"),
     Study(env="cliff_walking", agent="sarsa", max_steps=2_000, peers="optimal: -12"),
-    Study(env="cliff_walking", agent="sarsa", max_steps=5_000,
-          hparams={"discount": 1.0, "epsilon_init": 0.01, "epsilon_min": 0.0,
-                   "epsilon_decay": 0.9}, peers="optimal: -12"),
-    PresetStudy(env="pendulum", agent="td3", max_steps=20_000,
-                peers=f"-151.9 after 20,000 steps ({ZOO})"),
-    PresetStudy(env="mountain_car_continuous", agent="td3", max_steps=99_900,
-                peers=f"93.5 after 300,000 steps ({ZOO})"),
-    PresetStudy(env="halfcheetah", agent="td3", max_steps=100_000,
-                peers=f"9,656 on HalfCheetah-v3 after 1,000,000 steps ({ZOO})"),
-)  # fmt: skip
+    Study(
+        env="cliff_walking",
+        agent="sarsa",
+        max_steps=5_000,
+        hparams={"discount": 1.0, "epsilon_init": 0.01, "epsilon_min": 0.0, "epsilon_decay": 0.9},
+        peers="optimal: -12",
+    ),
+    PresetStudy(
+        env="pendulum", agent="td3", max_steps=20_000, peers=f"-151.9 after 20,000 steps ({ZOO})"
+    ),
+    PresetStudy(
+        env="mountain_car_continuous",
+        agent="td3",
+        max_steps=99_900,
+        peers=f"93.5 after 300,000 steps ({ZOO})",
+    ),
+    PresetStudy(
+        env="halfcheetah",
+        agent="td3",
+        max_steps=100_000,
+        peers=f"9,656 on HalfCheetah-v3 after 1,000,000 steps ({ZOO})",
+    ),
+)
 ENVS = tuple(dict.fromkeys(study.env for study in STUDIES))
 
 
@@ -146,8 +195,13 @@ def compute(settings: AgentLearning) -> pd.DataFrame:
             continue
         training = study.training(settings.quick, settings.test_episodes)
         world = World.real(
-            sejax.envs.make(study.env), ["all"], name=f"{number:02d}-{study.env}-{study.agent}",
-            agent=study.configuration(), training=training, is_single=True)  # fmt: skip
+            sejax.envs.make(study.env),
+            ["all"],
+            name=f"{number:02d}-{study.env}-{study.agent}",
+            agent=study.configuration(),
+            training=training,
+            is_single=True,
+        )
         curves = train_groups(world, settings, settings.num_agents, CURVES).drop(columns="group")
         tables.append(curves.assign(study=number, max_steps=training.max_steps))
     return pd.concat(tables, ignore_index=True)
@@ -162,16 +216,24 @@ def summarise(curves: pd.DataFrame) -> pd.DataFrame:
         to_solve = return_curves.all_steps_to_solve(mine, threshold)
         last = return_curves.last_returns(mine)
         low, high = bootstrap_interval(last)
-        rows.append({
-            "study": number, "env": study.env, "agent": study.agent,
-            "num_agents": len(last), "max_steps": mine["max_steps"].iloc[0],
-            "made_steps": mine.groupby("agent")["steps"].max().mean(), "threshold": threshold,
-            "num_solved": int(np.isfinite(to_solve).sum()),
-            "num_solved_at_the_end": int((last >= threshold).sum()),
-            "median_steps_to_solve": np.median(to_solve),
-            "last_return": last.mean(), "last_low": low, "last_high": high,
-            **iqm_columns(last, "last"),
-        })  # fmt: skip
+        rows.append(
+            {
+                "study": number,
+                "env": study.env,
+                "agent": study.agent,
+                "num_agents": len(last),
+                "max_steps": mine["max_steps"].iloc[0],
+                "made_steps": mine.groupby("agent")["steps"].max().mean(),
+                "threshold": threshold,
+                "num_solved": int(np.isfinite(to_solve).sum()),
+                "num_solved_at_the_end": int((last >= threshold).sum()),
+                "median_steps_to_solve": np.median(to_solve),
+                "last_return": last.mean(),
+                "last_low": low,
+                "last_high": high,
+                **iqm_columns(last, "last"),
+            }
+        )
     return pd.DataFrame(rows)
 
 
@@ -179,17 +241,19 @@ COLUMNS: dict[str, Any] = {
     "task": "{env}",
     "agent": "{agent}",
     "other than the paper's": lambda row: ", ".join(
-        f"{name} {value}" for name, value in STUDIES[row.study].changes().items()),
+        f"{name} {value}" for name, value in STUDIES[row.study].changes().items()
+    ),
     "solved": "{num_solved} of {num_agents} at {threshold:g}",
     "still at the end": "{num_solved_at_the_end}",
     "median steps to solve": lambda row: (
-        f"{row.median_steps_to_solve:,.0f}" if np.isfinite(row.median_steps_to_solve) else "-"),
+        f"{row.median_steps_to_solve:,.0f}" if np.isfinite(row.median_steps_to_solve) else "-"
+    ),
     "steps, at most": "{max_steps:,}",
     "made": "{made_steps:,.0f}",
     f"last {WINDOW} tests": "{last_return:.1f} [{last_low:.1f}, {last_high:.1f}]",
     "IQM": iqm_text("last"),
     "others": lambda row: STUDIES[row.study].peers,
-}  # fmt: skip
+}
 
 
 def report(settings: AgentLearning, curves: pd.DataFrame) -> pd.DataFrame:
@@ -223,10 +287,14 @@ def draw(settings: AgentLearning, curves: pd.DataFrame, points: int = 100) -> No
                 last_step = study_curves["steps"].max()
                 grid = np.geomspace(last_step / 200, last_step, points)
                 figures.band(
-                    axis, grid, return_curves.on_grid(study_curves, grid),
-                    lambda values: np.transpose([bootstrap_interval(v) for v in values.T]), color,
-                    lw=1.8, label=STUDIES[int(number)].label,
-                )  # fmt: skip
+                    axis,
+                    grid,
+                    return_curves.on_grid(study_curves, grid),
+                    lambda values: np.transpose([bootstrap_interval(v) for v in values.T]),
+                    color,
+                    lw=1.8,
+                    label=STUDIES[int(number)].label,
+                )
             axis.axhline(sejax.envs.make(env).solved_reward, color="#7a7a7a", ls="--", lw=1)
             axis.set_title(env, fontsize=10)
             axis.set(xscale="log", xlabel="training steps (*: hyperparameters in the table)")

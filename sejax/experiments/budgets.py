@@ -15,8 +15,8 @@ import jax
 import numpy as np
 import pandas as pd
 
-from sejax.app import session
-from sejax.files import write_text
+from sejax.cli import session
+from sejax.ops.files import write_text
 
 # (config, run directory, chunks) -> curve, as `proxy_runs.learn_all` takes it.
 Learn = Callable[[Any, Any, session.Chunks], pd.DataFrame]

@@ -13,11 +13,11 @@ from typing import Any
 
 import pandas as pd
 
-from sejax.app import commands, runtime
+from sejax.cli import commands, runtime
 from sejax.errors import ConfigError, nearest, require, shortened
 from sejax.experiments.pieces import by_pattern, read_rows, write_rows
 from sejax.experiments.settings import RUN_PREFIX, Settings, as_word
-from sejax.files import write_text
+from sejax.ops.files import write_text
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,8 +60,10 @@ class Experiment:
         try:
             commands.guarded(self.run)(settings)
         except KeyboardInterrupt:
-            print(f"Interrupted. What is finished is kept in {settings.work_folder}; the same "
-                  "command goes on from there.")  # fmt: skip
+            print(
+                f"Interrupted. What is finished is kept in {settings.work_folder}; the same "
+                "command goes on from there."
+            )
             commands.leave(commands.INTERRUPTED)
 
     def help(self) -> str:
@@ -90,7 +92,7 @@ def parse(settings: type[Settings], words: Sequence[str]) -> dict[str, Any]:
     from hydra.errors import HydraException
     from omegaconf.errors import OmegaConfBaseException
 
-    from sejax.app.compose import to_plain, translate_hydra_error
+    from sejax.cli.compose import to_plain, translate_hydra_error
 
     fields = [field.name for field in dataclasses.fields(settings)]
     has_runs = "run" in fields
@@ -117,9 +119,14 @@ def _require_words(settings: type[Settings], words: Sequence[str], fields: list[
     for word in words:
         name, equals, value = word.partition("=")
         if equals and name in fields:
-            require("," not in value or value[0] in "[\"'", name, "be one value or a list in "
-                    "brackets", "commas separate a list's values", value,
-                    f"{name}=[{value}]")  # fmt: skip
+            require(
+                "," not in value or value[0] in "[\"'",
+                name,
+                "be one value or a list in brackets",
+                "commas separate a list's values",
+                value,
+                f"{name}=[{value}]",
+            )
             continue
         ranked = nearest(name.lstrip("-").replace("-", "_"), fields)
         raise ConfigError(

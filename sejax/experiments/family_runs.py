@@ -12,8 +12,8 @@ from typing import Any
 import pandas as pd
 
 import sejax
-from sejax import plugins
-from sejax.app.families import JOINT, key_of
+from sejax import registry
+from sejax.cli.families import JOINT, key_of
 from sejax.experiments import budgets, proxy_runs
 from sejax.experiments.proxy_runs import RunSettings
 from sejax.experiments.settings import count, each_of, setting
@@ -22,9 +22,13 @@ from sejax.experiments.worlds import HPARAMS, World, groups_at_once, train_group
 from sejax.options import positive
 
 # A little world and agents that learn enough to be seen moving.
-QUICK = ["es.population_size=12", "es.num_incumbent_evals=6", "training.max_steps=1000",
-         "proxy.hidden_size=32"]  # fmt: skip
-QUICK_AGENT = {"hidden_size": 32, "batch_size": 32, "num_layers": 1, "init_episodes": 1}
+QUICK = [
+    "es.population_size=12",
+    "es.num_incumbent_evals=6",
+    "training.max_steps=1000",
+    "proxy.hidden_size=32",
+]
+QUICK_AGENT = {"hidden_size": 32, "batch_size": 32, "num_layers": 1, "warmup_episodes": 1}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,13 +38,18 @@ class FamilyRuns(RunSettings):
     runs: int = count(5, "runs", quick=2, about="NES runs of each, of the same seeds everywhere")
     tested: tuple[str, ...] = setting((), about="families of agents that SEs are tested with")
     tested_hparams: tuple[str, ...] = setting(
-        HPARAMS, each_of(HPARAMS), quick=("default",), about="their hyperparameters; varied: drawn "
-        "for each")  # fmt: skip
+        HPARAMS,
+        each_of(HPARAMS),
+        quick=("default",),
+        about="their hyperparameters; varied: drawn for each",
+    )
     num_agents: int = count(10, "agents", quick=4, about="of each family on each SE")
     test_episodes: int = count(10, "episodes", about="of each agent")
     cpu_budget_s: float | None = setting(
-        None, positive("it is time"), about="CPU seconds after which a run ends, without "
-        "compilation")  # fmt: skip
+        None,
+        positive("it is time"),
+        about="CPU seconds after which a run ends, without compilation",
+    )
 
     def config_with(self, names: Sequence[str], others: Iterable[str], words: Any = ()) -> Any:
         """The configuration of NES runs with these families.
@@ -60,9 +69,12 @@ class FamilyRuns(RunSettings):
         if self.quick:
             chosen += QUICK
             for name in names:
-                known = plugins.defaults("agent", name)
-                chosen += [f"agents.{key_of(name)}.{field}={value}"
-                           for field, value in QUICK_AGENT.items() if field in known]  # fmt: skip
+                known = registry.defaults("agent", name)
+                chosen += [
+                    f"agents.{key_of(name)}.{field}={value}"
+                    for field, value in QUICK_AGENT.items()
+                    if field in known
+                ]
         return own.learn_config(chosen)
 
 
@@ -89,12 +101,18 @@ def evaluate(settings: FamilyRuns, name: str, ses: Any, config: Any) -> pd.DataF
     seeds = {f"{name}-{seed:02d}-{ses.fingerprint(i)}": seed for i, seed in enumerate(ses.seeds)}
     tables = []
     for hparams in settings.tested_hparams:
-        world = World.of_set(ses, seeds, name=f"{family.key}-{hparams}", agent=family.agent,
-                             training=training, hparams=hparams)  # fmt: skip
-        rows = train_groups(world, settings, settings.num_agents,
-                            at_once=groups_at_once(settings.devices))  # fmt: skip
-        tables.append(rows.assign(kind=family.key, hparams=hparams,
-                                  seed=rows["group"].map(seeds)))  # fmt: skip
+        world = World.of_set(
+            ses,
+            seeds,
+            name=f"{family.key}-{hparams}",
+            agent=family.agent,
+            training=training,
+            hparams=hparams,
+        )
+        rows = train_groups(
+            world, settings, settings.num_agents, at_once=groups_at_once(settings.devices)
+        )
+        tables.append(rows.assign(kind=family.key, hparams=hparams, seed=rows["group"].map(seeds)))
     return pd.concat(tables, ignore_index=True)
 
 
@@ -108,12 +126,16 @@ def summarise(agents: pd.DataFrame, by: list[str], solved_reward: float) -> pd.D
     for values, mine in agents.groupby(by, sort=False):
         returns = mine["test_return"]
         of_ses = returns.groupby(mine["seed"]).mean()
-        rows.append(dict(zip(by, values, strict=True)) | {
-            "num_ses": len(of_ses), "num_agents": len(mine),
-            **spread(returns, of_ses if len(of_ses) > 1 else returns, "test_return"),
-            **iqm_columns(returns, "test_return", mine["seed"]),
-            "solved": (returns >= solved_reward).mean(),
-        })  # fmt: skip
+        rows.append(
+            dict(zip(by, values, strict=True))
+            | {
+                "num_ses": len(of_ses),
+                "num_agents": len(mine),
+                **spread(returns, of_ses if len(of_ses) > 1 else returns, "test_return"),
+                **iqm_columns(returns, "test_return", mine["seed"]),
+                "solved": (returns >= solved_reward).mean(),
+            }
+        )
     return pd.DataFrame(rows)
 
 

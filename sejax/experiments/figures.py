@@ -14,19 +14,30 @@ import pandas as pd
 from matplotlib.ticker import MaxNLocator
 from PIL import Image
 
-from sejax.files import atomic_path
+from sejax.ops.files import atomic_path
 from sejax.statistics import performance_profile
 
 # Okabe and Ito's palette, which those with any kind of colour blindness can tell apart.
 REAL, VARIED, FIXED, BEST, SOLVED = "#0072B2", "#E69F00", "#009E73", "#000000", "#B03A73"
 TUNED = "#56B4E9"
-AGENT_NAMES = {"ddqn": "DDQN", "dueling_ddqn": "Dueling DDQN", "td3": "TD3",
-               "td3_discrete": "discrete TD3", "ppo": "PPO", "sac": "SAC", "dqn": "DQN",
-               "q_learning": "Q-learning", "sarsa": "SARSA"}  # fmt: skip
+AGENT_NAMES = {
+    "ddqn": "DDQN",
+    "dueling_ddqn": "Dueling DDQN",
+    "td3": "TD3",
+    "td3_discrete": "discrete TD3",
+    "ppo": "PPO",
+    "sac": "SAC",
+    "dqn": "DQN",
+    "q_learning": "Q-learning",
+    "sarsa": "SARSA",
+}
 LEGEND_COLUMN = 1.4  # inches that a label with its line takes
 STYLE: Any = {
-    "font.size": 10, "axes.spines.top": False, "axes.spines.right": False, "legend.frameon": False,
-}  # fmt: skip
+    "font.size": 10,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "legend.frameon": False,
+}
 
 
 def learning_curves(curves: pd.DataFrame, solved_reward: float, path: Path) -> None:
@@ -43,15 +54,32 @@ def learning_curves(curves: pd.DataFrame, solved_reward: float, path: Path) -> N
     with panels(path, 1, 1, (6, 3.6)) as (_, axes):
         axis = axes[0, 0]
         for index, seed in enumerate(lines.columns):
-            axis.plot(iterations, lines[seed], color=REAL, lw=0.7, alpha=0.5,
-                      label=None if index else f"NES run ({lines.shape[1]} in all)")  # fmt: skip
-        axis.fill_between(iterations, mean - std, mean + std, color=REAL, alpha=0.15, lw=0,
-                          label="mean ± std of the runs")  # fmt: skip
+            axis.plot(
+                iterations,
+                lines[seed],
+                color=REAL,
+                lw=0.7,
+                alpha=0.5,
+                label=None if index else f"NES run ({lines.shape[1]} in all)",
+            )
+        axis.fill_between(
+            iterations,
+            mean - std,
+            mean + std,
+            color=REAL,
+            alpha=0.15,
+            lw=0,
+            label="mean ± std of the runs",
+        )
         axis.plot(iterations, mean, color=REAL, lw=2.4)
-        axis.axhline(solved_reward, color=SOLVED, ls="--", lw=1.2,
-                     label=f"solved ({solved_reward:g})")  # fmt: skip
-        axis.set(xlabel="NES outer iteration", xlim=(1, max(iterations[-1], 2)),
-                 ylabel="mean return of the incumbent's\nagents on the real task")  # fmt: skip
+        axis.axhline(
+            solved_reward, color=SOLVED, ls="--", lw=1.2, label=f"solved ({solved_reward:g})"
+        )
+        axis.set(
+            xlabel="NES outer iteration",
+            xlim=(1, max(iterations[-1], 2)),
+            ylabel="mean return of the incumbent's\nagents on the real task",
+        )
         axis.xaxis.set_major_locator(MaxNLocator(integer=True))
         axis.legend(fontsize=9, loc="best")
 
@@ -128,8 +156,13 @@ def legend_above(figure: Any, axis: Any, columns: int = 4, fontsize: int | None 
     """Puts the legend of one panel above all, in so many columns, if the figure is wide enough."""
     handles, labels = axis.get_legend_handles_labels()
     room = max(1, int(figure.get_figwidth() / LEGEND_COLUMN))
-    figure.legend(handles, labels, ncols=min(len(labels), columns, room),
-                  loc="outside upper center", fontsize=fontsize)  # fmt: skip
+    figure.legend(
+        handles,
+        labels,
+        ncols=min(len(labels), columns, room),
+        loc="outside upper center",
+        fontsize=fontsize,
+    )
 
 
 @contextlib.contextmanager
@@ -138,8 +171,9 @@ def panels(
 ) -> Iterator[tuple[Any, Any]]:
     """A figure, its size in inches, and its axes `[lines, columns]`; written when all is drawn."""
     with plt.rc_context(STYLE):
-        figure, axes = plt.subplots(lines, columns, figsize=size, squeeze=False,
-                                    layout="constrained", **options)  # fmt: skip
+        figure, axes = plt.subplots(
+            lines, columns, figsize=size, squeeze=False, layout="constrained", **options
+        )
         yield figure, axes
         with atomic_path(path) as temporary:
             figure.savefig(temporary, dpi=200)

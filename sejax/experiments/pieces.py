@@ -16,7 +16,7 @@ import numpy as np
 import pandas as pd
 
 from sejax.errors import ConfigError
-from sejax.files import atomic_path, write_text
+from sejax.ops.files import atomic_path, write_text
 from sejax.serialize import flatten
 
 
@@ -92,14 +92,17 @@ def by_pattern(made_with: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str
     found: dict[str, dict[str, Any]] = {}
     for key in sorted({key for settings in flat.values() for key in settings}):
         values = {name: settings.get(key, _ABSENT) for name, settings in flat.items()}
-        level = next(level for level in levels if all(
-            values[name] == values[names[0]] for names in level.values() for name in names
-        ))  # fmt: skip
+        level = next(
+            level
+            for level in levels
+            if all(values[name] == values[names[0]] for names in level.values() for name in names)
+        )
         for pattern, names in sorted(level.items()):
             if values[names[0]] is not _ABSENT:
                 found.setdefault(pattern, {})[key] = values[names[0]]
-    return {pattern: found[pattern] for level in levels for pattern in sorted(level)
-            if pattern in found}  # fmt: skip
+    return {
+        pattern: found[pattern] for level in levels for pattern in sorted(level) if pattern in found
+    }
 
 
 def _subsets(size: int) -> Iterator[tuple[int, ...]]:

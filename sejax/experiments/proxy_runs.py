@@ -45,15 +45,15 @@ def configs_of_runs(config: Any, num_runs: int, folder: Path, at_once: int = 1) 
     for seed in range(config.seed, config.seed + num_runs, at_once):
         num_seeds = min(at_once, config.seed + num_runs - seed)
         name = f"seed{seed}" if num_seeds == 1 else f"seeds{seed}-{seed + num_seeds - 1}"
-        configs.append(dataclasses.replace(
-            config, seed=seed, num_seeds=num_seeds, run_dir=str(folder / name)
-        ))  # fmt: skip
+        configs.append(
+            dataclasses.replace(config, seed=seed, num_seeds=num_seeds, run_dir=str(folder / name))
+        )
     return configs
 
 
 def run_to_end(config: Any, directory: Any, chunks: Any) -> pd.DataFrame:
     """Learns a run, or what is left of it, in its folder; its curve."""
-    from sejax.app import session
+    from sejax.cli import session
 
     session.run(config, directory, chunks)
     return pd.read_csv(directory.metrics)
@@ -73,8 +73,8 @@ def learn_all(
       ConfigError: if a folder, below that which `option` names, holds a run of other settings or
         of more generations than are asked for, or is in use.
     """
-    from sejax.app import run_directory, session
-    from sejax.app.progress import Tally
+    from sejax.cli import run_directory, session
+    from sejax.cli.progress import Tally
 
     chunks = session.make_chunks(configs[0])
     curves = []
@@ -91,9 +91,14 @@ def learn_all(
 
 def _require_no_more(config: Any, curve: pd.DataFrame) -> None:
     there = int(curve["generation"].max()) + 1 if len(curve) else 0
-    require(there <= config.generations, "generations", f"be at least {there}", "a run in "
-            f"{config.run_dir} has so many, and its proxy is the best of all", config.generations,
-            f"generations={there}, or another folder")  # fmt: skip
+    require(
+        there <= config.generations,
+        "generations",
+        f"be at least {there}",
+        f"a run in {config.run_dir} has so many, and its proxy is the best of all",
+        config.generations,
+        f"generations={there}, or another folder",
+    )
 
 
 def _said(curve: pd.DataFrame, solved_score: float | None) -> str:
@@ -108,7 +113,7 @@ def _said(curve: pd.DataFrame, solved_score: float | None) -> str:
 
 def collect(configs: list[Any], path: Path, before: Any = None) -> None:
     """Writes the best proxy of each seed into one file, after those of the set `before`."""
-    from sejax.app import build
+    from sejax.cli import build
 
     sources: list[Path] = []
     for config in configs:

@@ -20,11 +20,15 @@ from sejax.experiments.settings import count, each_of, setting
 from sejax.experiments.tables import as_texts, iqm_columns, iqm_note, iqm_text
 from sejax.experiments.worlds import World
 from sejax.options import counts
-from sejax.plugins import name_of
+from sejax.registry import name_of
 from sejax.training import TrainingConfig
 
-ROWS = {"default": "default hyperparameters", "varied": "varied hyperparameters",
-        "transfer": "unseen agent", "tuned": "tuned for few steps"}  # fmt: skip
+ROWS = {
+    "default": "default hyperparameters",
+    "varied": "varied hyperparameters",
+    "transfer": "unseen agent",
+    "tuned": "tuned for few steps",
+}
 GRID_POINTS = 200
 WITHOUT_RN = ("real", "count_based", "icm")  # worlds whose groups of agents have nothing in common
 
@@ -41,15 +45,20 @@ class CurveSettings(RnSettings):
         "that the RNs never saw), tuned (on the real task for few steps: DDQN on cartpole, PPO on "
         "mountain_car_continuous)",
     )
-    bonuses: tuple[str, ...] = setting((), about="exploration bonuses on the real task to compare "
-                                       "with: count_based on cliff_walking, elsewhere icm; or "
-                                       "none")  # fmt: skip
+    bonuses: tuple[str, ...] = setting(
+        (),
+        about="exploration bonuses on the real task to compare "
+        "with: count_based on cliff_walking, elsewhere icm; or "
+        "none",
+    )
     rns: int = count(10, "RNs", about="RNs of each variant that agents are trained on, the best")
-    bonus_groups: int = count(10, "groups", about="groups of agents with a bonus, which are dear; "
-                              "as many as RNs are used")  # fmt: skip
+    bonus_groups: int = count(
+        10, "groups", about="groups of agents with a bonus, which are dear; as many as RNs are used"
+    )
     num_agents: int = count(10, "agents", about="on each RN, in each row")
-    max_steps: int = setting(5000, counts("an agent must train"), about="training steps; as the "
-                             "paper's figure")  # fmt: skip
+    max_steps: int = setting(
+        5000, counts("an agent must train"), about="training steps; as the paper's figure"
+    )
 
     @classmethod
     def defaults(cls, given: Mapping[str, Any]) -> dict[str, Any]:
@@ -61,8 +70,14 @@ class CurveSettings(RnSettings):
         super().__post_init__()
         errors.each_of("rows", self.rows, self.study.rows)
         errors.each_of("bonuses", self.bonuses, (*self.study.bonuses, "none"))
-        require(self.rns <= self.learned, "rns", f"be at most {self.learned}", "so many are "
-                "learned", self.rns, f"learned={self.rns}")  # fmt: skip
+        require(
+            self.rns <= self.learned,
+            "rns",
+            f"be at most {self.learned}",
+            "so many are learned",
+            self.rns,
+            f"learned={self.rns}",
+        )
 
     def agent(self, row: str) -> Any:
         """The agent that is trained in a row."""
@@ -77,9 +92,13 @@ class CurveSettings(RnSettings):
 
         At the task's time limit tuned agents bootstrap, as they were tuned; the paper's do not.
         """
-        return TrainingConfig(max_episodes=self.study.max_episodes, max_steps=self.max_steps,
-                              stop_rule="never", tests_between=1,
-                              time_limit_is_terminal=row != "tuned")  # fmt: skip
+        return TrainingConfig(
+            max_episodes=self.study.max_episodes,
+            max_steps=self.max_steps,
+            stop_rule="never",
+            tests_between=1,
+            time_limit_is_terminal=row != "tuned",
+        )
 
 
 def real_curves(settings: CurveSettings) -> Iterator[pd.DataFrame]:
@@ -105,9 +124,14 @@ def curves_in(
     `make(group names, ...)` makes a world; the prefix tells apart the pieces of worlds of one name.
     """
     for row in settings.rows:
-        world = make([f"{i:02d}" for i in range(groups)], name=f"{prefix}{row}-{name}",
-                     agent=settings.agent(row), training=settings.training(row),
-                     hparams="varied" if row == "varied" else "default", **more)  # fmt: skip
+        world = make(
+            [f"{i:02d}" for i in range(groups)],
+            name=f"{prefix}{row}-{name}",
+            agent=settings.agent(row),
+            training=settings.training(row),
+            hparams="varied" if row == "varied" else "default",
+            **more,
+        )
         curves = worlds.train_groups(world, settings, settings.num_agents, worlds.CURVES)
         group = curves["group"].astype(int)
         number = curves["agent"] + group * settings.num_agents
@@ -126,18 +150,34 @@ def require_rows(settings: CurveSettings, curves: pd.DataFrame) -> None:
       ConfigError: if they are not, as where other settings made them.
     """
     there, asked = list(curves["row"].drop_duplicates()), list(settings.rows)
-    require(sorted(there) == sorted(asked), "rows", f"be {', '.join(there)}", "these are in "
-            f"{settings.rows_file}", ", ".join(asked),
-            f"rows=[{','.join(there)}], or from_rows=false")  # fmt: skip
+    require(
+        sorted(there) == sorted(asked),
+        "rows",
+        f"be {', '.join(there)}",
+        f"these are in {settings.rows_file}",
+        ", ".join(asked),
+        f"rows=[{','.join(there)}], or from_rows=false",
+    )
     for (_, world), mine in curves.groupby(["row", "world"], sort=False):
         agents = mine["agent"].nunique() // mine["group"].nunique()
-        require(agents == settings.num_agents, "num_agents", f"be {agents}",
-                f"{settings.rows_file} has so many in a group", settings.num_agents,
-                f"num_agents={agents}, or from_rows=false")  # fmt: skip
+        require(
+            agents == settings.num_agents,
+            "num_agents",
+            f"be {agents}",
+            f"{settings.rows_file} has so many in a group",
+            settings.num_agents,
+            f"num_agents={agents}, or from_rows=false",
+        )
         name = "bonus_groups" if world in settings.study.bonuses else "rns"
         there, asked = mine["group"].nunique(), getattr(settings, name)
-        require(there == asked, name, f"be {there}", f"{settings.rows_file} has so many groups of "
-                f"{world}", asked, f"{name}={there}, or from_rows=false")  # fmt: skip
+        require(
+            there == asked,
+            name,
+            f"be {there}",
+            f"{settings.rows_file} has so many groups of {world}",
+            asked,
+            f"{name}={there}, or from_rows=false",
+        )
 
 
 def summarise(curves: pd.DataFrame, solved_reward: float, max_steps: int) -> pd.DataFrame:
@@ -157,16 +197,25 @@ def summarise(curves: pd.DataFrame, solved_reward: float, max_steps: int) -> pd.
         mean_return = pd.Series(np.nanmean(held, axis=1), index=steps.index)
         counted = steps.clip(upper=max_steps)
         solved[row, world] = counted, groups
-        out.append({
-            "row": row, "world": world, "groups": groups.nunique(), "agents": len(steps),
-            "solved": float(np.isfinite(steps).mean()), "steps_to_solve": counted.mean(),
-            **interval(counted, groups, str(world), "steps"), "mean_return": mean_return.mean(),
-            **interval(mean_return, groups, str(world), "return"),
-            **iqm_columns(mean_return, "return", None if world in WITHOUT_RN else groups),
-            "last_return": return_curves.last_returns(mine).mean(),
-        })  # fmt: skip
-    shares = [share_of_bare(*mine, *solved[row, "real"]) if (row, "real") in solved else np.nan
-              for (row, _), mine in solved.items()]  # fmt: skip
+        out.append(
+            {
+                "row": row,
+                "world": world,
+                "groups": groups.nunique(),
+                "agents": len(steps),
+                "solved": float(np.isfinite(steps).mean()),
+                "steps_to_solve": counted.mean(),
+                **interval(counted, groups, str(world), "steps"),
+                "mean_return": mean_return.mean(),
+                **interval(mean_return, groups, str(world), "return"),
+                **iqm_columns(mean_return, "return", None if world in WITHOUT_RN else groups),
+                "last_return": return_curves.last_returns(mine).mean(),
+            }
+        )
+    shares = [
+        share_of_bare(*mine, *solved[row, "real"]) if (row, "real") in solved else np.nan
+        for (row, _), mine in solved.items()
+    ]
     return pd.DataFrame(out).assign(share_of_bare=shares)
 
 
@@ -193,20 +242,26 @@ def step_grid(max_steps: int) -> np.ndarray:
 
 def make_table(summary: pd.DataFrame) -> pd.DataFrame:
     """The summary as texts."""
-    return as_texts(summary, {
-        "agents": lambda row: ROWS[row.row],
-        "trained with": "{world}",
-        "groups, agents": "{groups}, {agents}",
-        "steps to solve":
-            lambda row: with_interval(row.steps_to_solve, row.steps_low, row.steps_high, 0),
-        "of the bare agent's":
-            lambda row: f"{row.share_of_bare:.0%}" if np.isfinite(row.share_of_bare) else "",
-        "solved": "{solved:.0%}",
-        "mean return over training":
-            lambda row: with_interval(row.mean_return, row.return_low, row.return_high, 1),
-        "IQM": iqm_text("return"),
-        "last tests": "{last_return:.1f}",
-    })  # fmt: skip
+    return as_texts(
+        summary,
+        {
+            "agents": lambda row: ROWS[row.row],
+            "trained with": "{world}",
+            "groups, agents": "{groups}, {agents}",
+            "steps to solve": lambda row: with_interval(
+                row.steps_to_solve, row.steps_low, row.steps_high, 0
+            ),
+            "of the bare agent's": lambda row: (
+                f"{row.share_of_bare:.0%}" if np.isfinite(row.share_of_bare) else ""
+            ),
+            "solved": "{solved:.0%}",
+            "mean return over training": lambda row: with_interval(
+                row.mean_return, row.return_low, row.return_high, 1
+            ),
+            "IQM": iqm_text("return"),
+            "last tests": "{last_return:.1f}",
+        },
+    )
 
 
 def with_interval(mean: float, low: float, high: float, digits: int) -> str:
@@ -266,8 +321,16 @@ def panel(axis: Any, curves: pd.DataFrame, max_steps: int, solved_reward: float)
         dashed = name in WITHOUT_RN and name != "real"
         style = "--" if dashed else ":" if rn_studies.AUGMENTED in name else "-"
         color, _ = rn_studies.SHOWN[name.removesuffix(rn_studies.AUGMENTED)]
-        figures.band(axis, grid, return_curves.on_grid(mine, grid, window=1), standard_errors,
-                     color, ls=style, lw=1.6, label=rn_studies.label(name))  # fmt: skip
+        figures.band(
+            axis,
+            grid,
+            return_curves.on_grid(mine, grid, window=1),
+            standard_errors,
+            color,
+            ls=style,
+            lw=1.6,
+            label=rn_studies.label(name),
+        )
     axis.axhline(solved_reward, color="#7a7a7a", ls=":", lw=1)
 
 

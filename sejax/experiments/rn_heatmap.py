@@ -25,8 +25,12 @@ from sejax.experiments.tables import publish
 IGNORED_BELOW = -50.0  # the right column leaves out rewards of at most this
 # Corners of the triangle of each action in a cell whose middle is (0, 0), y downwards: the middle
 # and two corners of the cell. Actions as in `envs.dynamics.gridworld`: RIGHT, LEFT, DOWN, UP.
-_CORNERS = {0: ((0.5, -0.5), (0.5, 0.5)), 1: ((-0.5, -0.5), (-0.5, 0.5)),
-            2: ((-0.5, 0.5), (0.5, 0.5)), 3: ((-0.5, -0.5), (0.5, -0.5))}  # fmt: skip
+_CORNERS = {
+    0: ((0.5, -0.5), (0.5, 0.5)),
+    1: ((-0.5, -0.5), (-0.5, 0.5)),
+    2: ((-0.5, 0.5), (0.5, 0.5)),
+    3: ((-0.5, -0.5), (0.5, -0.5)),
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,8 +41,14 @@ class RnHeatmap(RnSettings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require(self.env == "cliff_walking", "env", "be cliff_walking", "the picture is its map",
-                self.env, "env=cliff_walking")  # fmt: skip
+        require(
+            self.env == "cliff_walking",
+            "env",
+            "be cliff_walking",
+            "the picture is its map",
+            self.env,
+            "env=cliff_walking",
+        )
 
 
 def compute(settings: RnHeatmap) -> pd.DataFrame:
@@ -75,8 +85,10 @@ def rewards_of_moves(rns: Any) -> np.ndarray:
 def by_variant(settings: RnHeatmap, rows: pd.DataFrame) -> dict[str, np.ndarray]:
     """The rewards of each variant, `[rn, state, action]`, from the rows."""
     shape = settings.learned, np.array([list(line) for line in MAP]).size, len(_CORNERS)
-    return {variant: rows[rows["variant"] == variant]["reward"].to_numpy().reshape(shape)
-            for variant in settings.variants}  # fmt: skip
+    return {
+        variant: rows[rows["variant"] == variant]["reward"].to_numpy().reshape(shape)
+        for variant in settings.variants
+    }
 
 
 def kinds_of_moves() -> dict[str, np.ndarray]:
@@ -119,8 +131,15 @@ def summarise(rewards: dict[str, np.ndarray]) -> pd.DataFrame:
     for variant, mine in rewards.items():
         for kind, mask in kinds_of_moves().items():
             of_rns = mine[:, mask].mean(axis=1)
-            out.append({"variant": variant, "move": kind, "rns": len(mine),
-                        "mean": of_rns.mean(), "std": of_rns.std()})  # fmt: skip
+            out.append(
+                {
+                    "variant": variant,
+                    "move": kind,
+                    "rns": len(mine),
+                    "mean": of_rns.mean(),
+                    "std": of_rns.std(),
+                }
+            )
     return pd.DataFrame(out)
 
 
@@ -172,13 +191,25 @@ def draw_map(axis: Any, values: np.ndarray) -> Any:
                     colors.append(values[state, action])
             if cell in "GO":
                 color = "#d9d9d9" if cell == "O" else "#ffffff"
-                axis.fill(*(middle[:, None] + [[-0.5, 0.5, 0.5, -0.5], [-0.5, -0.5, 0.5, 0.5]]),
-                          color=color, lw=0)  # fmt: skip
+                axis.fill(
+                    *(middle[:, None] + [[-0.5, 0.5, 0.5, -0.5], [-0.5, -0.5, 0.5, 0.5]]),
+                    color=color,
+                    lw=0,
+                )
             if cell != " ":
-                axis.text(*middle, {"O": "cliff"}.get(cell, cell), ha="center", va="center",
-                          fontsize=6 if cell == "O" else 10, weight="bold")  # fmt: skip
-    shown = axis.add_collection(PolyCollection(triangles, array=colors, cmap="RdYlGn", clim=(0, 1),
-                                               edgecolors="#555555", lw=0.25))  # fmt: skip
+                axis.text(
+                    *middle,
+                    {"O": "cliff"}.get(cell, cell),
+                    ha="center",
+                    va="center",
+                    fontsize=6 if cell == "O" else 10,
+                    weight="bold",
+                )
+    shown = axis.add_collection(
+        PolyCollection(
+            triangles, array=colors, cmap="RdYlGn", clim=(0, 1), edgecolors="#555555", lw=0.25
+        )
+    )
     axis.set(xlim=(-0.5, 11.5), ylim=(3.5, -0.5), aspect="equal", xticks=[], yticks=[])
     axis.spines[:].set_visible(True)
     return shown

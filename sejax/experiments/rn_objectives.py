@@ -27,8 +27,12 @@ from sejax.experiments.tables import publish
 
 PICKS = ("best", "worst")
 QUICK_LEARNED = 4
-OBJECTIVE_NAMES = {"reward_threshold": "reward threshold", "auc": "area under the curve",
-                   "max_reward": "final return", "auc_sum": "area, not by steps"}  # fmt: skip
+OBJECTIVE_NAMES = {
+    "reward_threshold": "reward threshold",
+    "auc": "area under the curve",
+    "max_reward": "final return",
+    "auc_sum": "area, not by steps",
+}
 DEFAULT_OBJECTIVES = ("reward_threshold", "auc", "max_reward")
 
 
@@ -36,11 +40,16 @@ DEFAULT_OBJECTIVES = ("reward_threshold", "auc", "max_reward")
 class RnObjectives(CurveSettings):
     name = "rn_objectives"
 
-    objectives: tuple[str, ...] = setting(DEFAULT_OBJECTIVES, each_of(OBJECTIVE_NAMES),
-                                          about=f"of {', '.join(OBJECTIVE_NAMES)}")  # fmt: skip
-    picks: tuple[str, ...] = setting(PICKS, each_of(PICKS), about="RNs that train agents: best, "
-                                     "worst (as the authors' scripts picked for two "
-                                     "objectives)")  # fmt: skip
+    objectives: tuple[str, ...] = setting(
+        DEFAULT_OBJECTIVES, each_of(OBJECTIVE_NAMES), about=f"of {', '.join(OBJECTIVE_NAMES)}"
+    )
+    picks: tuple[str, ...] = setting(
+        PICKS,
+        each_of(PICKS),
+        about="RNs that train agents: best, "
+        "worst (as the authors' scripts picked for two "
+        "objectives)",
+    )
 
     @classmethod
     def defaults(cls, given: Mapping[str, Any]) -> dict[str, Any]:
@@ -53,9 +62,14 @@ class RnObjectives(CurveSettings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require(len(self.picks) == 1 or 2 * self.rns <= self.learned, "learned",
-                f"be at least {2 * self.rns}", "the best and the worst are picked from them",
-                self.learned, f"learned={2 * self.rns} or picks=best")  # fmt: skip
+        require(
+            len(self.picks) == 1 or 2 * self.rns <= self.learned,
+            "learned",
+            f"be at least {2 * self.rns}",
+            "the best and the worst are picked from them",
+            self.learned,
+            f"learned={2 * self.rns} or picks=best",
+        )
 
 
 def compute(settings: RnObjectives) -> pd.DataFrame:
@@ -63,14 +77,17 @@ def compute(settings: RnObjectives) -> pd.DataFrame:
     rn_studies.check_stored(settings, settings.objectives)
     tables = [table.assign(objective="", pick="") for table in rn_curves.real_curves(settings)]
     for objective in settings.objectives:
-        learned = {variant: rn_studies.learn(settings, variant, objective)
-                   for variant in settings.variants}  # fmt: skip
+        learned = {
+            variant: rn_studies.learn(settings, variant, objective) for variant in settings.variants
+        }
         for pick in settings.picks:
             for variant, rns in learned.items():
                 picked = rns.ranked(settings.rns, worst=pick == "worst")
                 prefix = f"{objective}-{pick}-"
-                tables += [table.assign(objective=objective, pick=pick) for table
-                           in rn_curves.rn_curves(settings, variant, picked, prefix)]  # fmt: skip
+                tables += [
+                    table.assign(objective=objective, pick=pick)
+                    for table in rn_curves.rn_curves(settings, variant, picked, prefix)
+                ]
     return pd.concat(tables, ignore_index=True)
 
 
@@ -89,13 +106,16 @@ def report(settings: RnObjectives, rows: pd.DataFrame) -> pd.DataFrame:
         tables.append(table[has_rn].assign(objective=OBJECTIVE_NAMES[objective], RNs=pick))
         summaries.append(summary.assign(objective=objective, pick=pick))
     for pick in settings.picks:
-        curves = {f"{OBJECTIVE_NAMES[name]}\ntest return": beside(settings, rows, name, pick)
-                  for name in settings.objectives}  # fmt: skip
+        curves = {
+            f"{OBJECTIVE_NAMES[name]}\ntest return": beside(settings, rows, name, pick)
+            for name in settings.objectives
+        }
         rn_curves.draw(settings, curves, 2.7, f"{pick}.png")
     table = pd.concat(tables, ignore_index=True)
     table = table[["objective", "RNs", *table.columns.drop(["objective", "RNs"])]]
-    ends = " and with the ".join({"best": "highest", "worst": "lowest"}[pick]
-                                 for pick in settings.picks)  # fmt: skip
+    ends = " and with the ".join(
+        {"best": "highest", "worst": "lowest"}[pick] for pick in settings.picks
+    )
     note = (
         f"{settings.learned} RNs of each variant were learned by each objective. Of these the "
         f"{settings.rns} with the {ends} scores ({', '.join(settings.picks)}) train "

@@ -23,8 +23,8 @@ from typing import Any
 import pandas as pd
 
 import sejax
-from sejax import ICMConfig, errors, plugins, serialize
-from sejax.app import build, run_directory
+from sejax import ICMConfig, errors, registry, serialize
+from sejax.cli import build, run_directory
 from sejax.errors import ConfigError
 from sejax.experiments import figures, pieces, proxy_runs, worlds
 from sejax.experiments.proxy_runs import RunSettings
@@ -33,18 +33,24 @@ from sejax.options import counts, one_of
 
 # Paper, table "Overview of Reward Network variants".
 VARIANTS = (
-    "additive_potential", "exclusive_potential", "additive_non_potential",
+    "additive_potential",
+    "exclusive_potential",
+    "additive_non_potential",
     "exclusive_non_potential",
-)  # fmt: skip
+)
 AUGMENTED = "+augm"  # of a variant's name: the network sees the task's observation vector as well
 WEIGHTED_INFO = ("additive_weighted_info", "exclusive_weighted_info")
 ROWS = ("default", "varied", "transfer")  # agents that are trained, as in the paper's figure
-OBJECTIVES = tuple(plugins.GROUPS["objective"].built_in)
+OBJECTIVES = tuple(registry.GROUPS["objective"].built_in)
 # With quick=true; a task's own come on top.
 QUICK: dict[str, Any] = {
-    "learned": 2, "generations": 4, "rns": 2, "num_agents": 4, "max_steps": 1500,
+    "learned": 2,
+    "generations": 4,
+    "rns": 2,
+    "num_agents": 4,
+    "max_steps": 1500,
     "run": ("es.population_size=8",),
-}  # fmt: skip
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,9 +76,15 @@ class Study:
 
 # Paper, appendix "Reward Network Hyperparameters": the tables of default hyperparameters.
 _CARTPOLE: dict[str, Any] = {
-    "init_episodes": 1, "batch_size": 32, "learning_rate": 2.5e-4, "target_update_rate": 0.01,
-    "epsilon_min": 0.1, "hidden_size": 64, "num_layers": 1, "buffer_size": 1_000_000,
-}  # fmt: skip
+    "warmup_episodes": 1,
+    "batch_size": 32,
+    "learning_rate": 2.5e-4,
+    "tau": 0.01,
+    "epsilon_min": 0.1,
+    "hidden_size": 64,
+    "num_layers": 1,
+    "buffer_size": 1_000_000,
+}
 _FEW: dict[str, Any] = {"variants": ("additive_potential",), "rows": ("default",)}  # when quick
 STUDIES = {
     "cliff_walking": Study(
@@ -81,14 +93,19 @@ STUDIES = {
         agent=sejax.QLearningConfig(),
         transfer_agent=sejax.SARSAConfig(epsilon_init=0.01, epsilon_min=0.01),
         bonuses={"count_based": sejax.CountBasedConfig()},
-        max_episodes=500, max_steps=5000, learned=50, runs_at_once=50,
+        max_episodes=500,
+        max_steps=5000,
+        learned=50,
+        runs_at_once=50,
     ),
     "cartpole": Study(
-        agent=sejax.DDQNConfig(**_CARTPOLE), transfer_agent=sejax.DuelingDDQNConfig(**_CARTPOLE),
+        agent=sejax.DDQNConfig(**_CARTPOLE),
+        transfer_agent=sejax.DuelingDDQNConfig(**_CARTPOLE),
         tuned_agent=functools.partial(worlds.tuned_agent, "cartpole", "ddqn"),
         rows=(*ROWS, "tuned"),
         bonuses={"icm": ICMConfig()},
-        max_episodes=1000, max_steps=50_000,
+        max_episodes=1000,
+        max_steps=50_000,
         when_quick=_FEW | {"rows": ("default", "transfer"), "generations": 2},
     ),
     "mountain_car_continuous": Study(
@@ -96,30 +113,60 @@ STUDIES = {
         transfer_agent=sejax.PPOConfig.paper(action_repeat=5),
         # docs/agents.md, "PPO in few steps"
         tuned_agent=functools.partial(
-            sejax.PPOConfig.paper, action_repeat=5, rollout_steps=256, learning_rate=0.0015,
+            sejax.PPOConfig.paper,
+            action_repeat=5,
+            rollout_steps=256,
+            learning_rate=0.0015,
             init_action_std=1.0,
         ),
         rows=(*ROWS, "tuned"),
         bonuses={"icm": ICMConfig(forward_weight=0.1, reward_scale=0.01, learning_rate=5e-4)},
-        max_episodes=3000, max_steps=250_000,
-        when_quick=_FEW | {"generations": 2, "run": (
-            "es.population_size=4", "es.num_incumbent_evals=4", "training.max_episodes=4",
-            "agent.init_episodes=1")},
+        max_episodes=3000,
+        max_steps=250_000,
+        when_quick=_FEW
+        | {
+            "generations": 2,
+            "run": (
+                "es.population_size=4",
+                "es.num_incumbent_evals=4",
+                "training.max_episodes=4",
+                "agent.warmup_episodes=1",
+            ),
+        },
     ),
     "halfcheetah": Study(
         agent=None,
         transfer_agent=sejax.PPOConfig.paper(
-            hidden_size=128, activation="tanh", learning_rate=1e-5, update_episodes=1, epochs=10,
-            entropy_weight=0.001, init_action_std=0.1,
+            hidden_size=128,
+            activation="tanh",
+            learning_rate=1e-5,
+            update_episodes=1,
+            epochs=10,
+            entropy_weight=0.001,
+            init_action_std=0.1,
         ),
         bonuses={"icm": ICMConfig(forward_weight=0.001, reward_scale=0.1, learning_rate=1e-5)},
         variants=(*VARIANTS, *(v + AUGMENTED for v in VARIANTS), *WEIGHTED_INFO),
-        max_episodes=1000, max_steps=500_000, learned=5, rns=5, num_agents=5,
-        when_quick=_FEW | {"generations": 1, "learned": 1, "num_agents": 2, "bonuses": (), "run": (
-            "es.population_size=2", "es.num_incumbent_evals=2", "training.max_episodes=2",
-            "agent.init_episodes=1")},
+        max_episodes=1000,
+        max_steps=500_000,
+        learned=5,
+        rns=5,
+        num_agents=5,
+        when_quick=_FEW
+        | {
+            "generations": 1,
+            "learned": 1,
+            "num_agents": 2,
+            "bonuses": (),
+            "run": (
+                "es.population_size=2",
+                "es.num_incumbent_evals=2",
+                "training.max_episodes=2",
+                "agent.warmup_episodes=1",
+            ),
+        },
     ),
-}  # fmt: skip
+}
 SHOWN = {  # colour of a world, and the reward that agents get there
     "real": (figures.BEST, "real reward"),
     "icm": ("#7a7a7a", "real reward + ICM"),
@@ -144,11 +191,13 @@ class RnSettings(RunSettings):
     """Settings about the task and the RNs that are learned; defaults are those of the study."""
 
     env: str = setting("cliff_walking", one_of(STUDIES), about=f"task: {', '.join(STUDIES)}")
-    variants: tuple[str, ...] = setting(VARIANTS, about=f"of the RNs: those, with {AUGMENTED}, "
-                                        f"{', '.join(WEIGHTED_INFO)}")  # fmt: skip
+    variants: tuple[str, ...] = setting(
+        VARIANTS, about=f"of the RNs: those, with {AUGMENTED}, {', '.join(WEIGHTED_INFO)}"
+    )
     learned: int = setting(10, counts("RNs are learned"), about="RNs to learn of each variant")
-    rns_dir: str | None = setting(None, about="where RNs are kept; results/reward_networks, quick "
-                                  "rns/ in `out`")  # fmt: skip
+    rns_dir: str | None = setting(
+        None, about="where RNs are kept; results/reward_networks, quick rns/ in `out`"
+    )
 
     @classmethod
     def defaults(cls, given: Mapping[str, Any]) -> dict[str, Any]:
@@ -188,8 +237,11 @@ class RnSettings(RunSettings):
 
 def objective_setting() -> Any:
     """The setting of experiments that use the RNs of one objective."""
-    return setting("reward_threshold", one_of(OBJECTIVES), about=f"that RNs are learned by: "
-                   f"{', '.join(OBJECTIVES)}")  # fmt: skip
+    return setting(
+        "reward_threshold",
+        one_of(OBJECTIVES),
+        about=f"that RNs are learned by: {', '.join(OBJECTIVES)}",
+    )
 
 
 def learn(settings: RnSettings, variant: str, objective: str) -> Any:
@@ -203,8 +255,11 @@ def learn(settings: RnSettings, variant: str, objective: str) -> Any:
         runs = work_beside(settings.rns_folder, "runs")
         folder = runs / path.relative_to(settings.rns_folder).with_suffix("")
         configs = proxy_runs.configs_of_runs(config, count, folder, settings.study.runs_at_once)
-        print(f"{variant}: learns {count} RNs, {config.generations} generations each; may be "
-              "stopped and started again", flush=True)  # fmt: skip
+        print(
+            f"{variant}: learns {count} RNs, {config.generations} generations each; may be "
+            "stopped and started again",
+            flush=True,
+        )
         curves = [proxy_runs.learn_all(configs, "rns_dir")]
         if there:
             before = pieces.read_rows(curves_file(path))  # with those beyond, if stopped right here
@@ -238,8 +293,9 @@ def stored(settings: RnSettings, variant: str, objective: str) -> Any:
     there = sejax.load_set(path, option="rns_dir", kind="rn")
     made_with = _what_counts(build.learn_config(there.config))
     asked = _what_counts(learning_config(settings, variant, objective))
-    differing = [name for name in sorted({*made_with, *asked})
-                 if made_with.get(name) != asked.get(name)]  # fmt: skip
+    differing = [
+        name for name in sorted({*made_with, *asked}) if made_with.get(name) != asked.get(name)
+    ]
     if differing == ["generations"] and made_with["generations"] < asked["generations"]:
         return None
     if differing:
@@ -253,7 +309,7 @@ def stored(settings: RnSettings, variant: str, objective: str) -> Any:
 
 def _what_counts(config: Any) -> dict[str, Any]:
     """What a run depends on; not how it is computed, with which others, or where it is kept."""
-    free = run_directory.FREE_FIELDS - {"generations"} | {"lanes", "num_seeds"}
+    free = run_directory.FREE_FIELDS - {"generations"} | {"num_parallel", "num_seeds"}
     flat = serialize.flatten(build.to_plain(config))
     return {name: value for name, value in flat.items() if name.partition(".")[0] not in free}
 
@@ -273,7 +329,12 @@ def learning_config(settings: RnSettings, variant: str, objective: str) -> Any:
     plain = variant.removesuffix(AUGMENTED)
     usual = settings.learn_config(["proxy=rn"]).proxy
     scale = usual.output_scale if plain == usual.variant else 1.0
-    return settings.learn_config([
-        "proxy=rn", f"proxy.variant={plain}", f"proxy.augmented={plain != variant}",
-        f"proxy.output_scale={scale}", f"objective={objective}",
-    ])  # fmt: skip
+    return settings.learn_config(
+        [
+            "proxy=rn",
+            f"proxy.variant={plain}",
+            f"proxy.augmented={plain != variant}",
+            f"proxy.output_scale={scale}",
+            f"objective={objective}",
+        ]
+    )

@@ -29,9 +29,9 @@ import pandas as pd
 from flax import struct
 
 import sejax
+from sejax.es.base import Strategy
 from sejax.es.nes import NESConfig, NESState, make_nes
 from sejax.es.score_transforms import TRANSFORMS
-from sejax.es.strategy import Strategy
 from sejax.experiments import figures
 from sejax.experiments.experiment import Experiment
 from sejax.experiments.settings import Settings, count, setting
@@ -42,19 +42,40 @@ from sejax.statistics import NUM_RESAMPLES, bootstrap_interval
 SCORE_TRANSFORMS = tuple(TRANSFORMS)
 
 # docs/reference.md 6.2: default_config_gridworld.yaml as the published runs used it.
-SETTINGS = ["env=gridworld_2x2", "agent=q_learning", "agent.learning_rate=0.5",
-            "agent.discount=0.9", "agent.epsilon_init=0.5", "agent.epsilon_min=0.01",
-            "agent.epsilon_decay=0.95", "agent.init_episodes=5", "proxy.hidden_size=32",
-            "proxy.num_layers=1", "proxy.activation=leaky_relu", "proxy.done=threshold",
-            "training.max_episodes=100", "training.max_steps=null", "training.stop_rule=plateau",
-            "training.test_episodes=10", "es.noise_std=0.1", "es.num_incumbent_evals=null",
-            "es.noise_std_decay=1"]  # fmt: skip
+SETTINGS = [
+    "env=gridworld_2x2",
+    "agent=q_learning",
+    "agent.learning_rate=0.5",
+    "agent.discount=0.9",
+    "agent.epsilon_init=0.5",
+    "agent.epsilon_min=0.01",
+    "agent.epsilon_decay=0.95",
+    "agent.warmup_episodes=5",
+    "proxy.hidden_size=32",
+    "proxy.num_layers=1",
+    "proxy.activation=leaky_relu",
+    "proxy.done=threshold",
+    "training.max_episodes=100",
+    "training.max_steps=null",
+    "training.stop_rule=plateau",
+    "training.test_episodes=10",
+    "es.noise_std=0.1",
+    "es.num_incumbent_evals=null",
+    "es.noise_std_decay=1",
+]
 # Agents in lockstep on a CPU core: those of a few runs, which cost nothing once these are over.
 CPU_LANES = 384
 STEP_SIZES = (0.01, 10.0)  # the range that the paper's figure shows
-LABELS = {"linear": "linear", "rank": "rank", "nes": "NES", "nes_unnormalized": "NES unnormalized",
-          "single_best": "single best", "single_better": "single better",
-          "all_better_1": "all better 1", "all_better_2": "all better 2"}  # fmt: skip
+LABELS = {
+    "linear": "linear",
+    "rank": "rank",
+    "nes": "NES",
+    "nes_unnormalized": "NES unnormalized",
+    "single_best": "single best",
+    "single_better": "single better",
+    "all_better_1": "all better 1",
+    "all_better_2": "all better 2",
+}
 
 # Paper, the same appendix: of the eight, 'the "all better" score transformation seems to perform
 # best', and none fails completely; the figure gives no numbers.
@@ -65,11 +86,19 @@ PAPER = {"all_better_1": "among the best", "all_better_2": "among the best"}
 class ScoreTransforms(Settings):
     name = "score_transforms"
 
-    runs: int = count(220, "runs", quick=12, about="of each score transform, with mirrored "
-                      "sampling and as many without")  # fmt: skip
+    runs: int = count(
+        220,
+        "runs",
+        quick=12,
+        about="of each score transform, with mirrored sampling and as many without",
+    )
     generations: int = count(50, "generations", quick=10, about="of a run at most")
-    population: int = setting(16, counts("scores are compared within a generation", least=2),
-                              quick=8, about="members of a generation")  # fmt: skip
+    population: int = setting(
+        16,
+        counts("scores are compared within a generation", least=2),
+        quick=8,
+        about="members of a generation",
+    )
     bins: int = count(9, "bins", quick=3, about="of step sizes")
 
 
@@ -82,8 +111,11 @@ def compute(settings: ScoreTransforms) -> pd.DataFrame:
         made_with |= settings.values("runs", "generations", "population", "seed")
         make = functools.partial(compute_cell, settings, transform, mirrored)
         cell = settings.pieces.compute(name, made_with, make)
-        print(f"{name}: {cell['updates'].mean():.1f} updates of the SE on average, "
-              f"{cell['solved'].mean():.0%} solved", flush=True)  # fmt: skip
+        print(
+            f"{name}: {cell['updates'].mean():.1f} updates of the SE on average, "
+            f"{cell['solved'].mean():.0%} solved",
+            flush=True,
+        )
         tables.append(cell)
     return pd.concat(tables, ignore_index=True)
 
@@ -100,10 +132,17 @@ def compute_cell(settings: ScoreTransforms, transform: str, mirrored: bool) -> p
             break
     solved = np.asarray(state.finished)
     updates = np.where(solved, np.asarray(state.generation) - 1, settings.generations)
-    return pd.DataFrame({"transform": transform, "mirrored": mirrored,
-                         "run": range(settings.runs), "step_size": step_sizes,
-                         "updates": updates, "solved": solved,
-                         "last_score": np.asarray(state.incumbent_score)})  # fmt: skip
+    return pd.DataFrame(
+        {
+            "transform": transform,
+            "mirrored": mirrored,
+            "run": range(settings.runs),
+            "step_size": step_sizes,
+            "updates": updates,
+            "solved": solved,
+            "last_score": np.asarray(state.incumbent_score),
+        }
+    )
 
 
 def draw_step_sizes(count: int, seed: int) -> np.ndarray:
@@ -131,22 +170,34 @@ class AnyNES(Options):
 
     def make(self, num_dims: int) -> Strategy:
         """The strategy; its state begins with the first transform and the usual step size."""
-        each = [make_nes(dataclasses.replace(self.nes, score_transform=name), num_dims)
-                for name in SCORE_TRANSFORMS]  # fmt: skip
+        each = [
+            make_nes(dataclasses.replace(self.nes, score_transform=name), num_dims)
+            for name in SCORE_TRANSFORMS
+        ]
 
         def ask(key: Any, state: AnyNESState) -> tuple[Any, AnyNESState]:
             members, nes = each[0].ask(key, state.nes)
             return members, state.replace(nes=nes)
 
         def tell(key: Any, members: Any, scores: Any, incumbent: Any, state: AnyNESState) -> Any:
-            told = jax.lax.switch(state.transform, [strategy.tell for strategy in each], key,
-                                  members, scores, incumbent, state.nes)  # fmt: skip
+            told = jax.lax.switch(
+                state.transform,
+                [strategy.tell for strategy in each],
+                key,
+                members,
+                scores,
+                incumbent,
+                state.nes,
+            )
             return state.replace(nes=told)
 
         return dataclasses.replace(
-            each[0], ask=ask, tell=tell, incumbent=lambda state: each[0].incumbent(state.nes),
+            each[0],
+            ask=ask,
+            tell=tell,
+            incumbent=lambda state: each[0].incumbent(state.nes),
             init=lambda key, mean: AnyNESState(each[0].init(key, mean), jnp.int32(0)),
-        )  # fmt: skip
+        )
 
 
 class Search(NamedTuple):
@@ -164,8 +215,10 @@ def make_search(mirrored: bool, population: int, devices: int | None) -> Search:
     overrides = [f"es.mirrored={mirrored}", f"es.population_size={population}"]
     config = sejax.config([*SETTINGS, *overrides, "stop_when_solved=true"])
     config = dataclasses.replace(config, devices=devices)
-    lanes = CPU_LANES if jax.default_backend() == "cpu" else None
-    program = make_program(**config.parts() | {"lanes": lanes, "es": AnyNES(nes=config.es)})
+    num_parallel = CPU_LANES if jax.default_backend() == "cpu" else None
+    program = make_program(
+        **config.parts() | {"num_parallel": num_parallel, "es": AnyNES(nes=config.es)}
+    )
 
     def init(keys: Any, step_sizes: Any, transform: Any) -> Any:
         state = program.init(keys)
@@ -186,8 +239,9 @@ def binned(runs: pd.DataFrame, bins: int) -> pd.DataFrame:
     place = np.searchsorted(edges_of(bins), runs["step_size"], side="right") - 1
     place = np.clip(place, 0, bins - 1)
     grouped = runs.assign(bin=place).groupby(["transform", "mirrored", "bin"], sort=False)
-    return grouped.agg(updates=("updates", "mean"), solved=("solved", "mean"),
-                       runs=("run", "size")).reset_index()  # fmt: skip
+    return grouped.agg(
+        updates=("updates", "mean"), solved=("solved", "mean"), runs=("run", "size")
+    ).reset_index()
 
 
 def summarise(runs: pd.DataFrame, bins: int) -> pd.DataFrame:
@@ -207,13 +261,24 @@ def summarise(runs: pd.DataFrame, bins: int) -> pd.DataFrame:
         others = by_run[mirrored]
         behind = (others[transform] - others[others.mean().idxmin()]).to_numpy()
         behind_low, behind_high = bootstrap_interval(behind)
-        rows.append({
-            "transform": transform, "mirrored": mirrored, "runs": len(mine),
-            "best_low": edges[0], "best_high": edges[1], "best_updates": best["updates"],
-            "best_solved": best["solved"], "updates": mine["updates"].mean(),
-            "updates_low": low, "updates_high": high, "behind": behind.mean(),
-            "behind_low": behind_low, "behind_high": behind_high, "solved": mine["solved"].mean(),
-        })  # fmt: skip
+        rows.append(
+            {
+                "transform": transform,
+                "mirrored": mirrored,
+                "runs": len(mine),
+                "best_low": edges[0],
+                "best_high": edges[1],
+                "best_updates": best["updates"],
+                "best_solved": best["solved"],
+                "updates": mine["updates"].mean(),
+                "updates_low": low,
+                "updates_high": high,
+                "behind": behind.mean(),
+                "behind_low": behind_low,
+                "behind_high": behind_high,
+                "solved": mine["solved"].mean(),
+            }
+        )
     return pd.DataFrame(rows).sort_values(["updates", "transform"], ignore_index=True)
 
 
@@ -232,19 +297,25 @@ def share_of_best(runs: pd.DataFrame) -> dict[bool, float]:
 def make_table(summary: pd.DataFrame) -> pd.DataFrame:
     """The summary as texts, with the rank of the cell among those of the same sampling."""
     ranks = summary.groupby("mirrored")[["updates", "best_updates"]].rank(method="min")
-    return as_texts(summary.join(ranks.add_suffix("_rank")), {
-        "score transform": lambda row: LABELS[row.transform],
-        "mirrored": lambda row: "yes" if row.mirrored else "no",
-        "rank": "{updates_rank:.0f}",
-        "updates, all step sizes": "{updates:.1f} [{updates_low:.1f}, {updates_high:.1f}]",
-        "more than the best": lambda row:
-            f"{row.behind:.1f} [{row.behind_low:.1f}, {row.behind_high:.1f}]" if row.behind else "",
-        "solved": "{solved:.0%}",
-        "best step sizes": "{best_low:.2g} to {best_high:.2g}",
-        "updates there": "{best_updates:.1f}",
-        "rank there": "{best_updates_rank:.0f}",
-        "paper": lambda row: PAPER.get(row.transform, ""),
-    })  # fmt: skip
+    return as_texts(
+        summary.join(ranks.add_suffix("_rank")),
+        {
+            "score transform": lambda row: LABELS[row.transform],
+            "mirrored": lambda row: "yes" if row.mirrored else "no",
+            "rank": "{updates_rank:.0f}",
+            "updates, all step sizes": "{updates:.1f} [{updates_low:.1f}, {updates_high:.1f}]",
+            "more than the best": lambda row: (
+                f"{row.behind:.1f} [{row.behind_low:.1f}, {row.behind_high:.1f}]"
+                if row.behind
+                else ""
+            ),
+            "solved": "{solved:.0%}",
+            "best step sizes": "{best_low:.2g} to {best_high:.2g}",
+            "updates there": "{best_updates:.1f}",
+            "rank there": "{best_updates_rank:.0f}",
+            "paper": lambda row: PAPER.get(row.transform, ""),
+        },
+    )
 
 
 def report(settings: ScoreTransforms, rows: pd.DataFrame) -> pd.DataFrame:
@@ -252,8 +323,10 @@ def report(settings: ScoreTransforms, rows: pd.DataFrame) -> pd.DataFrame:
     summary = summarise(rows, bins)
     draw(rows, bins, generations, settings.folder / "score_transforms.png")
     both = rows.groupby("mirrored")["updates"].mean()
-    stays = ", ".join(f"{share:.0%} {'with' if mirrored else 'without'} mirrored sampling"
-                      for mirrored, share in share_of_best(rows).items())  # fmt: skip
+    stays = ", ".join(
+        f"{share:.0%} {'with' if mirrored else 'without'} mirrored sampling"
+        for mirrored, share in share_of_best(rows).items()
+    )
     failing = rows.groupby("transform")["solved"].mean().min()
     note = (
         f"Means over {rows['run'].nunique()} runs with step sizes from {STEP_SIZES[0]} to "
@@ -301,14 +374,28 @@ def _dots(axis: Any, runs: pd.DataFrame, scale: Any) -> None:
 def _heat_map(axis: Any, cells: pd.DataFrame, bins: int, scale: Any) -> None:
     means = cells.pivot(index="transform", columns="bin", values="updates")
     means = means.reindex(index=list(LABELS), columns=range(bins))
-    axis.pcolormesh(edges_of(bins), np.arange(len(LABELS) + 1) - 0.5, means, cmap=_COLORS,
-                    norm=scale, edgecolors="white", lw=1)  # fmt: skip
+    axis.pcolormesh(
+        edges_of(bins),
+        np.arange(len(LABELS) + 1) - 0.5,
+        means,
+        cmap=_COLORS,
+        norm=scale,
+        edgecolors="white",
+        lw=1,
+    )
     middles = np.sqrt(edges_of(bins)[1:] * edges_of(bins)[:-1])
     for row, column in itertools.product(range(len(LABELS)), range(bins)):
         value = means.iloc[row, column]
         if np.isfinite(value):
-            axis.text(middles[column], row, f"{value:.0f}", ha="center", va="center", fontsize=8,
-                      color="white" if scale(value) > 0.45 else "black")  # fmt: skip
+            axis.text(
+                middles[column],
+                row,
+                f"{value:.0f}",
+                ha="center",
+                va="center",
+                fontsize=8,
+                color="white" if scale(value) > 0.45 else "black",
+            )
 
 
 EXPERIMENT = Experiment(settings=ScoreTransforms, compute=compute, report=report, about=__doc__)

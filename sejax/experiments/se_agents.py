@@ -6,7 +6,7 @@ from typing import Any
 
 import pandas as pd
 
-from sejax import plugins
+from sejax import registry
 from sejax.experiments.settings import Settings, count, each_of, setting
 from sejax.experiments.worlds import World, groups_at_once, train_groups, training_as_learned
 from sejax.options import counts
@@ -14,7 +14,7 @@ from sejax.options import counts
 AGENTS = ("ddqn", "dueling_ddqn", "td3_discrete")
 
 # Hidden sizes up to 6: one network has room for all of them, and little is compiled.
-QUICK_AGENT: Any = {"hidden_size": 2, "batch_size": 16, "num_layers": 1, "init_episodes": 1}
+QUICK_AGENT: Any = {"hidden_size": 2, "batch_size": 16, "num_layers": 1, "warmup_episodes": 1}
 QUICK_STEPS = 1500
 
 SOFT_SE = "results/soft_ses/cartpole.safetensors"  # with dynamics to look into, as the paper's
@@ -29,14 +29,17 @@ class SeAgents(Settings):
     num_ses: int = count(40, "SEs", quick=3, about="SEs of a set at most")
     test_episodes: int = count(10, "episodes", about="of each agent")
     max_steps: int | None = setting(
-        None, counts("an agent must train"), quick=4000,
-        about="training steps at most; as the SEs' own configuration says")  # fmt: skip
+        None,
+        counts("an agent must train"),
+        quick=4000,
+        about="training steps at most; as the SEs' own configuration says",
+    )
 
 
 def agent_config(settings: Settings, kind: str) -> Any:
     """The configuration of a kind of agent."""
     changes = QUICK_AGENT if settings.quick else {}
-    return plugins.configure("agent", {"name": kind, **changes})
+    return registry.configure("agent", {"name": kind, **changes})
 
 
 def se_world(settings: SeAgents, ses: Any, kind: str) -> World:
@@ -55,6 +58,7 @@ def se_world(settings: SeAgents, ses: Any, kind: str) -> World:
 
 def train(settings: SeAgents, world: World) -> pd.DataFrame:
     """All agents of a world, a row each."""
-    rows = train_groups(world, settings, settings.num_agents,
-                        at_once=groups_at_once(settings.devices))  # fmt: skip
+    rows = train_groups(
+        world, settings, settings.num_agents, at_once=groups_at_once(settings.devices)
+    )
     return rows.assign(kind=world.name)

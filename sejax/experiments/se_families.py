@@ -24,8 +24,15 @@ from sejax.experiments.pieces import stack, unstack
 from sejax.experiments.settings import setting
 from sejax.experiments.tables import brackets, iqm_note, iqm_text, publish
 
-SETS = ("ddqn", "ppo", "td3_discrete", "ddqn+ppo", "ddqn+td3_discrete", "ppo+td3_discrete",
-        "ddqn+ppo+td3_discrete")  # fmt: skip
+SETS = (
+    "ddqn",
+    "ppo",
+    "td3_discrete",
+    "ddqn+ppo",
+    "ddqn+td3_discrete",
+    "ppo+td3_discrete",
+    "ddqn+ppo+td3_discrete",
+)
 LEFT_OUT = "°"  # after what families reach that took no part
 IQM_AND_SOLVED = f"IQM {iqm_text('test_return')}; {{solved:.0%}}"
 
@@ -34,17 +41,28 @@ IQM_AND_SOLVED = f"IQM {iqm_text('test_return')}; {{solved:.0%}}"
 class SeFamilies(FamilyRuns):
     name = "se_families"
 
-    sets: tuple[str, ...] = setting(SETS, quick=("ddqn", "ddqn+ppo"), about="families of agents "
-                                    "that SEs are learned with, joined by +")  # fmt: skip
+    sets: tuple[str, ...] = setting(
+        SETS,
+        quick=("ddqn", "ddqn+ppo"),
+        about="families of agents that SEs are learned with, joined by +",
+    )
     tested: tuple[str, ...] = setting(
-        ("ddqn", "dueling_ddqn", "ppo", "td3_discrete", "sac"), quick=("ddqn", "dueling_ddqn"),
-        about="families that they are tested with")  # fmt: skip
+        ("ddqn", "dueling_ddqn", "ppo", "td3_discrete", "sac"),
+        quick=("ddqn", "dueling_ddqn"),
+        about="families that they are tested with",
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
         for name in ("sets", "tested"):
-            require(getattr(self, name), name, "name a family", "agents learn or are tested",
-                    "none", f"{name}=[ddqn]")  # fmt: skip
+            require(
+                getattr(self, name),
+                name,
+                "name a family",
+                "agents learn or are tested",
+                "none",
+                f"{name}=[ddqn]",
+            )
 
 
 def compute(settings: SeFamilies) -> pd.DataFrame:
@@ -56,8 +74,10 @@ def compute(settings: SeFamilies) -> pd.DataFrame:
     for name, config in learners.items():
         curve, ses = family_runs.learn(settings, name, config)
         curves.append(curve.assign(learned_with=name))
-        agents += [family_runs.evaluate(settings, name, ses, tester).assign(learned_with=name)
-                   for tester in testers]  # fmt: skip
+        agents += [
+            family_runs.evaluate(settings, name, ses, tester).assign(learned_with=name)
+            for tester in testers
+        ]
     return stack({"curves": pd.concat(curves), "agents": pd.concat(agents)})
 
 
@@ -66,12 +86,16 @@ def summarise(curves: pd.DataFrame, agents: pd.DataFrame, solved_reward: float) 
     summary = family_runs.summarise(agents, ["learned_with", "hparams", "kind"], solved_reward)
     took_part = [row.kind in families_in(row.learned_with) for row in summary.itertuples()]
     runs = curves.groupby(["learned_with", "seed"])
-    each = pd.DataFrame({
-        "cpu_s": runs["cpu_s"].sum(), "env_steps": runs["env_steps_total"].last(),
-        "solved_runs": runs["incumbent_mean"].max() >= solved_reward,
-    })  # fmt: skip
+    each = pd.DataFrame(
+        {
+            "cpu_s": runs["cpu_s"].sum(),
+            "env_steps": runs["env_steps_total"].last(),
+            "solved_runs": runs["incumbent_mean"].max() >= solved_reward,
+        }
+    )
     costs = each.groupby("learned_with").agg(
-        {"cpu_s": "mean", "env_steps": "mean", "solved_runs": "mean"})  # fmt: skip
+        {"cpu_s": "mean", "env_steps": "mean", "solved_runs": "mean"}
+    )
     return summary.assign(took_part=took_part).join(costs, on="learned_with")
 
 
@@ -80,11 +104,15 @@ def make_table(summary: pd.DataFrame) -> pd.DataFrame:
     rows = []
     for (name, hparams), mine in summary.groupby(["learned_with", "hparams"], sort=False):
         set_ = mine.iloc[0]
-        rows.append({
-            "learned with": shown(name), "CPU s a run": f"{set_['cpu_s']:,.0f}",
-            "runs solved": f"{set_['solved_runs']:.0%}", "hyperparameters": hparams,
-            **{shown(row.kind): cell(row) for row in mine.itertuples()},
-        })  # fmt: skip
+        rows.append(
+            {
+                "learned with": shown(name),
+                "CPU s a run": f"{set_['cpu_s']:,.0f}",
+                "runs solved": f"{set_['solved_runs']:.0%}",
+                "hyperparameters": hparams,
+                **{shown(row.kind): cell(row) for row in mine.itertuples()},
+            }
+        )
     return pd.DataFrame(rows)
 
 
@@ -114,8 +142,14 @@ def left_out(summary: pd.DataFrame) -> pd.DataFrame:
     for (name, hparams, kind), mean in means.items():  # type: ignore[misc]
         others = sets.get(largest - {kind})
         if name == sets[largest] and kind in largest and others is not None:
-            rows.append({"hparams": hparams, "kind": kind, "included": mean,
-                         "left_out": means[others, hparams, kind]})  # fmt: skip
+            rows.append(
+                {
+                    "hparams": hparams,
+                    "kind": kind,
+                    "included": mean,
+                    "left_out": means[others, hparams, kind],
+                }
+            )
     return pd.DataFrame(rows)
 
 
@@ -167,8 +201,10 @@ def report(settings: SeFamilies, rows: pd.DataFrame) -> pd.DataFrame:
 def draw(summary: pd.DataFrame, task: Any, path: Any) -> None:
     """Draws mean returns as a map for each kind of hyperparameters, and what each set cost."""
     hparams = list(summary["hparams"].unique())
-    cells = {name: mine.pivot(index="learned_with", columns="kind")
-             for name, mine in summary.groupby("hparams")}  # fmt: skip
+    cells = {
+        name: mine.pivot(index="learned_with", columns="kind")
+        for name, mine in summary.groupby("hparams")
+    }
     sets, kinds = (list(summary[x].unique()) for x in ("learned_with", "kind"))
     low = summary["test_return_mean"].min()
     high = max(summary["test_return_mean"].max(), low + 1)
@@ -179,20 +215,29 @@ def draw(summary: pd.DataFrame, task: Any, path: Any) -> None:
             of_sets = cells[name].reindex(sets)
             means = of_sets["test_return_mean"][kinds].to_numpy()
             parts = of_sets["took_part"][kinds].to_numpy()
-            image = axis.imshow(means, vmin=low, vmax=high, cmap="viridis",
-                                aspect="auto")  # fmt: skip
+            image = axis.imshow(means, vmin=low, vmax=high, cmap="viridis", aspect="auto")
             for (i, j), mean in np.ndenumerate(means):
                 dark = mean < (low + high) / 2
-                axis.text(j, i, f"{mean:.0f}{'' if parts[i, j] else LEFT_OUT}", ha="center",
-                          va="center", fontsize=9, color="white" if dark else "black")  # fmt: skip
-            axis.set_xticks(range(len(kinds)), map(shown, kinds), rotation=35, ha="right",
-                            fontsize=8)  # fmt: skip
-            axis.set_yticks(range(len(sets)), map(shown, sets) if axis is axes[0, 0] else [],
-                            fontsize=8)  # fmt: skip
+                axis.text(
+                    j,
+                    i,
+                    f"{mean:.0f}{'' if parts[i, j] else LEFT_OUT}",
+                    ha="center",
+                    va="center",
+                    fontsize=9,
+                    color="white" if dark else "black",
+                )
+            axis.set_xticks(
+                range(len(kinds)), map(shown, kinds), rotation=35, ha="right", fontsize=8
+            )
+            axis.set_yticks(
+                range(len(sets)), map(shown, sets) if axis is axes[0, 0] else [], fontsize=8
+            )
             axis.set_title(f"{name} hyperparameters", fontsize=10)
         axes[0, 0].set_ylabel("SEs learned with")
-        figure.colorbar(image, ax=list(axes[0, :-1]), shrink=0.8,
-                        label=f"mean return on {task.name}")  # fmt: skip
+        figure.colorbar(
+            image, ax=list(axes[0, :-1]), shrink=0.8, label=f"mean return on {task.name}"
+        )
         costs = summary.groupby("learned_with")["cpu_s"].first()[sets]
         axes[0, -1].barh(range(len(sets)), costs, color=figures.REAL, alpha=0.85)
         axes[0, -1].set(ylim=(len(sets) - 0.5, -0.5), xlabel="CPU s a run")

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from sejax.app.build import AGENT_HPARAMS
+from sejax.cli.build import AGENT_HPARAMS
 from sejax.experiments import figures, proxy_runs
 from sejax.experiments.experiment import Experiment
 from sejax.experiments.proxy_runs import RunSettings
@@ -26,16 +26,27 @@ from sejax.statistics import bootstrap_interval
 NUM_RUNS = {"cartpole": 10}
 
 # A little world and agents that learn enough to be seen moving.
-QUICK = ["generations=8", "es.population_size=12", "es.num_incumbent_evals=8",
-         "agent.hidden_size=32", "agent.batch_size=32", "agent.init_episodes=1",
-         "training.max_steps=1500", "proxy.hidden_size=32"]  # fmt: skip
+QUICK = [
+    "generations=8",
+    "es.population_size=12",
+    "es.num_incumbent_evals=8",
+    "agent.hidden_size=32",
+    "agent.batch_size=32",
+    "agent.warmup_episodes=1",
+    "training.max_steps=1500",
+    "proxy.hidden_size=32",
+]
 
 # Paper, paragraph "Feasibility": "50 NES iterations are often sufficient to find SEs that teach
 # agents to solve a task"; appendix "Discussion on the Feasibility": 40 runs of 200 iterations with
 # 16 workers. It gives no share of solved runs.
 PAPER_TASKS = ("cartpole", "acrobot")
-PAPER = {"runs": "40", "generations run": "200", "population": "16",
-         "generations to solve": "often about 50"}  # fmt: skip
+PAPER = {
+    "runs": "40",
+    "generations run": "200",
+    "population": "16",
+    "generations to solve": "often about 50",
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,8 +56,10 @@ class SeFeasibility(RunSettings):
     runs: int = count(5, "runs", quick=3, about="independent NES runs; cartpole 10")
     agent: str | None = setting(None, about="that the SEs are learned with; the task's choice")
     agent_hparams: str = setting(
-        "default", one_of(AGENT_HPARAMS), about="its hyperparameters; varied: drawn for each "
-        "training")  # fmt: skip
+        "default",
+        one_of(AGENT_HPARAMS),
+        about="its hyperparameters; varied: drawn for each training",
+    )
 
     @classmethod
     def defaults(cls, given: Mapping[str, Any]) -> dict[str, Any]:
@@ -78,14 +91,18 @@ def summarise(curves: pd.DataFrame, solved_reward: float) -> pd.DataFrame:
     for seed, curve in curves.groupby("seed"):
         to_solve = proxy_runs.generations_to_solve(curve, solved_reward)
         at_solving = curve[curve["generation"] + 1 == to_solve]
-        rows.append({
-            "seed": seed, "generations": len(curve), "generations_to_solve": to_solve,
-            "env_steps_to_solve": at_solving["env_steps_total"].max(),
-            "best_incumbent_mean": curve["incumbent_mean"].max(),
-            "last_incumbent_mean": curve["incumbent_mean"].iloc[-1],
-            "env_steps": curve["env_steps_total"].iloc[-1],
-            "wall_min": curve["wall_s"].iloc[-1] / 60,
-        })  # fmt: skip
+        rows.append(
+            {
+                "seed": seed,
+                "generations": len(curve),
+                "generations_to_solve": to_solve,
+                "env_steps_to_solve": at_solving["env_steps_total"].max(),
+                "best_incumbent_mean": curve["incumbent_mean"].max(),
+                "last_incumbent_mean": curve["incumbent_mean"].iloc[-1],
+                "env_steps": curve["env_steps_total"].iloc[-1],
+                "wall_min": curve["wall_s"].iloc[-1] / 60,
+            }
+        )
     return pd.DataFrame(rows)
 
 
@@ -125,12 +142,14 @@ def make_table(config: Any, runs: pd.DataFrame) -> pd.DataFrame:
         "last incumbent mean": f"{last.mean():.1f} [{low:.1f}, {high:.1f}]",
         "last incumbent mean, IQM": iqm_text("last").format_map(iqm_columns(last, "last")),
         "wall minutes of a run, mean": f"{runs['wall_min'].mean():.1f}",
-    }  # fmt: skip
+    }
     paper = PAPER if config.name("env") in PAPER_TASKS else {}
-    return pd.DataFrame([
-        {"of the NES runs": name, "sejax": value, "paper": paper.get(name, "")}
-        for name, value in ours.items()
-    ])  # fmt: skip
+    return pd.DataFrame(
+        [
+            {"of the NES runs": name, "sejax": value, "paper": paper.get(name, "")}
+            for name, value in ours.items()
+        ]
+    )
 
 
 def report(settings: SeFeasibility, rows: pd.DataFrame) -> pd.DataFrame:

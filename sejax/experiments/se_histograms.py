@@ -30,7 +30,7 @@ import pandas as pd
 from scipy.stats import wasserstein_distance
 
 import sejax
-from sejax import plugins
+from sejax import registry
 from sejax.agents import replay
 from sejax.agents.memory import Memory, MemoryMaker
 from sejax.experiments import figures, se_agents
@@ -41,15 +41,27 @@ from sejax.experiments.tables import as_texts, publish
 from sejax.experiments.worlds import Measure, World, train_groups, training_as_learned
 from sejax.training import TrainingConfig
 
-SOURCES = {"train": (figures.REAL, "SE, in training"),
-           "test": (figures.VARIED, "real task, in tests"),
-           "response": (figures.FIXED, "SE, from the tests' states and actions")}  # fmt: skip
+SOURCES = {
+    "train": (figures.REAL, "SE, in training"),
+    "test": (figures.VARIED, "real task, in tests"),
+    "response": (figures.FIXED, "SE, from the tests' states and actions"),
+}
 DIMENSIONS = {
-    "cartpole": ("cart position (m)", "cart velocity (m/s)", "pole angle (rad)",
-                 "pole angular velocity (rad/s)"),
-    "acrobot": ("cos of angle 1", "sin of angle 1", "cos of angle 2", "sin of angle 2",
-                "angular velocity 1 (rad/s)", "angular velocity 2 (rad/s)"),
-}  # fmt: skip
+    "cartpole": (
+        "cart position (m)",
+        "cart velocity (m/s)",
+        "pole angle (rad)",
+        "pole angular velocity (rad/s)",
+    ),
+    "acrobot": (
+        "cos of angle 1",
+        "sin of angle 1",
+        "cos of angle 2",
+        "sin of angle 2",
+        "angular velocity 1 (rad/s)",
+        "angular velocity 2 (rad/s)",
+    ),
+}
 
 # Paper, the same appendix: mean test returns of the agents shown; section "Analyzing SE Behavior":
 # 199.3 for CartPole and DDQN.
@@ -67,8 +79,9 @@ class SeHistograms(Settings):
     agents: tuple[str, ...] = setting(AGENTS, each_of(AGENTS), about="kinds of agents, a row each")
     num_agents: int = count(10, "agents", quick=3, about="of each kind")
     test_episodes: int = count(10, "episodes", about="of each agent")
-    max_rows: int = count(10_000, "transitions", about="training transitions of an agent that are "
-                          "kept, the last ones")  # fmt: skip
+    max_rows: int = count(
+        10_000, "transitions", about="training transitions of an agent that are kept, the last ones"
+    )
 
     @property
     def rows_file(self) -> Path:
@@ -83,10 +96,15 @@ def compute(settings: SeHistograms) -> pd.DataFrame:
     for kind in settings.agents:
         agent = se_agents.agent_config(settings, kind)
         world = World.of_set(
-            ses, ["all"], name=kind, agent=agent, training=training_of(settings, ses, agent),
-            exploration=plugins.configure("exploration", ses.config["exploration"]),
-            settings={"max_rows": settings.max_rows}, is_single=True,
-        )  # fmt: skip
+            ses,
+            ["all"],
+            name=kind,
+            agent=agent,
+            training=training_of(settings, ses, agent),
+            exploration=registry.configure("exploration", ses.config["exploration"]),
+            settings={"max_rows": settings.max_rows},
+            is_single=True,
+        )
         rows = train_groups(world, settings, settings.num_agents, transitions(settings.max_rows))
         tables.append(rows.assign(kind=kind))
     return pd.concat(tables, ignore_index=True).drop(columns="group")
@@ -133,16 +151,22 @@ def make_recorded_run(
         steps = test(key_test, trained.agent_state)
         predict = jax.vmap(lambda s, a: env.predict(env_params.weights, s, a)[:2])
         next_obs, reward = predict(steps.obs, steps.action)
-        tested = {"episode": jnp.arange(steps.reward.shape[0]) // task.max_steps,
-                  "valid": steps.valid}  # fmt: skip
+        tested = {
+            "episode": jnp.arange(steps.reward.shape[0]) // task.max_steps,
+            "valid": steps.valid,
+        }
         met = trained.recorded.rows
         valid = jnp.arange(capacity) < trained.train_steps
         return {
-            "train": {"next_obs": met[:, 2:], "reward": met[:, 1], "episode": jnp.int32(met[:, 0]),
-                      "valid": valid},
+            "train": {
+                "next_obs": met[:, 2:],
+                "reward": met[:, 1],
+                "episode": jnp.int32(met[:, 0]),
+                "valid": valid,
+            },
             "test": {"next_obs": steps.next_obs, "reward": steps.reward} | tested,
             "response": {"next_obs": next_obs, "reward": reward} | tested,
-        }  # fmt: skip
+        }
 
     return run
 
@@ -167,8 +191,10 @@ def last_steps(capacity: int) -> MemoryMaker:
         def store(kept: LastSteps, step: Any, made: Any, ended: Any, active: Any) -> LastSteps:
             first = jnp.stack([jnp.float32(kept.episode), jnp.float32(made.reward)])
             row = jnp.concatenate([first, made.next_obs])
-            return LastSteps(rows=replay.write_row(kept.rows, step, row, active),
-                             episode=kept.episode + (ended & active))  # fmt: skip
+            return LastSteps(
+                rows=replay.write_row(kept.rows, step, row, active),
+                episode=kept.episode + (ended & active),
+            )
 
         return Memory(init=init, store=store, batch=lambda *_: None)
 
@@ -215,11 +241,17 @@ def summarise(rows: pd.DataFrame) -> pd.DataFrame:
         for column in columns_of(rows):
             samples = {name: mine[mine["source"] == name][column] for name in SOURCES}
             pairs = ("response", "train"), ("response", "test"), ("train", "test")
-            out.append({
-                "kind": kind, "dimension": column,
-                **{f"std_{name}": x.std(ddof=0) for name, x in samples.items()},
-                **{f"{a}_to_{b}": wasserstein_distance(samples[a], samples[b]) for a, b in pairs},
-            })  # fmt: skip
+            out.append(
+                {
+                    "kind": kind,
+                    "dimension": column,
+                    **{f"std_{name}": x.std(ddof=0) for name, x in samples.items()},
+                    **{
+                        f"{a}_to_{b}": wasserstein_distance(samples[a], samples[b])
+                        for a, b in pairs
+                    },
+                }
+            )
     return pd.DataFrame(out)
 
 
@@ -234,17 +266,21 @@ def make_table(task: Any, rows: pd.DataFrame, summary: pd.DataFrame) -> pd.DataF
         returns = test_returns(rows[rows["kind"] == kind])
         return f"{returns.mean():.2f} ± {returns.std():.2f}"
 
-    return as_texts(summary, {
-        "agent": first(str),
-        "return": first(returned),
-        "paper's": first(lambda kind: PAPER_RETURNS.get(task.name, {}).get(kind, "")),
-        "next": lambda row: names[row.dimension],
-        **{f"std, {name}": f"{{std_{name}:.3g}}" for name in SOURCES},
-        "response to train": "{response_to_train:.3g}",
-        "response to test": "{response_to_test:.3g}",
-        "response is closer to":
-            lambda row: "train" if row.response_to_train < row.response_to_test else "test",
-    })  # fmt: skip
+    return as_texts(
+        summary,
+        {
+            "agent": first(str),
+            "return": first(returned),
+            "paper's": first(lambda kind: PAPER_RETURNS.get(task.name, {}).get(kind, "")),
+            "next": lambda row: names[row.dimension],
+            **{f"std, {name}": f"{{std_{name}:.3g}}" for name in SOURCES},
+            "response to train": "{response_to_train:.3g}",
+            "response to test": "{response_to_test:.3g}",
+            "response is closer to": lambda row: (
+                "train" if row.response_to_train < row.response_to_test else "test"
+            ),
+        },
+    )
 
 
 def report(settings: SeHistograms, rows: pd.DataFrame) -> pd.DataFrame:

@@ -59,18 +59,24 @@ class SeHorizons(FamilyRuns):
     name = "se_horizons"
 
     horizons: tuple[int | None, ...] = setting(
-        (1, 2, 5, 20, None), quick=(1, None), about="steps of an SE's episodes; null: the task's "
-        "limit")  # fmt: skip
+        (1, 2, 5, 20, None),
+        quick=(1, None),
+        about="steps of an SE's episodes; null: the task's limit",
+    )
     starts: tuple[str, ...] = setting(
         ("real", "learned"), each_of(INITIAL_STATES), about="initial states of the SEs"
     )
     ends: tuple[str, ...] = setting(
-        ("threshold",), each_of(DONE_MODES), about="how episodes of several steps end; the figure "
-        "shows the first")  # fmt: skip
+        ("threshold",),
+        each_of(DONE_MODES),
+        about="how episodes of several steps end; the figure shows the first",
+    )
     agents: tuple[str, ...] = setting(("ddqn",), about="families that SEs are learned with")
-    tested: tuple[str, ...] = setting(("dueling_ddqn", "ppo", "td3_discrete"),
-                                      quick=("dueling_ddqn",), about="families that the best SE "
-                                      "of each kind is tested with")  # fmt: skip
+    tested: tuple[str, ...] = setting(
+        ("dueling_ddqn", "ppo", "td3_discrete"),
+        quick=("dueling_ddqn",),
+        about="families that the best SE of each kind is tested with",
+    )
 
     tested_hparams: tuple[str, ...] = setting(
         ("default",), each_of(HPARAMS), about="their hyperparameters; the first are shown"
@@ -84,23 +90,33 @@ class SeHorizons(FamilyRuns):
         """What is compared; a single step has one kind of end."""
         kinds = [
             Kind(str(horizon or "limit"), starts, NO_END if horizon == 1 else end)
-            for end in self.ends for horizon in self.horizons for starts in self.starts
-        ]  # fmt: skip
+            for end in self.ends
+            for horizon in self.horizons
+            for starts in self.starts
+        ]
         return list(dict.fromkeys(kinds))
 
 
 def compute(settings: SeHorizons) -> pd.DataFrame:
     """Learns and trains what is missing; rows of the runs' generations and of the tested agents."""
     every = [*settings.agents, *settings.tested]
-    configs = {kind: [settings.config_with(names, every, kind.words)
-                      for names in (settings.agents, *([x] for x in settings.tested))]
-               for kind in settings.kinds}  # fmt: skip
+    configs = {
+        kind: [
+            settings.config_with(names, every, kind.words)
+            for names in (settings.agents, *([x] for x in settings.tested))
+        ]
+        for kind in settings.kinds
+    }
     curves, agents = [], []
     for kind, (learner, *testers) in configs.items():
         curve, ses = family_runs.learn(settings, kind.name, learner)
         curves.append(curve.assign(**kind._asdict()))
-        agents += [family_runs.evaluate(settings, kind.name, ses.ranked(1), tester)
-                   .assign(**kind._asdict()) for tester in testers]  # fmt: skip
+        agents += [
+            family_runs.evaluate(settings, kind.name, ses.ranked(1), tester).assign(
+                **kind._asdict()
+            )
+            for tester in testers
+        ]
     return stack({"curves": pd.concat(curves), "agents": pd.concat(agents)})
 
 
@@ -118,15 +134,20 @@ def summarise_runs(
         to_solve = proxy_runs.generations_to_solve(curve, solved_reward)
         is_solved = np.isfinite(to_solve)
         later = curve["incumbent_mean"][curve["generation"] >= to_solve]
-        rows.append(dict(zip([*BY, "seed"], values, strict=True)) | {
-            "generations": len(curve), "best": curve["incumbent_mean"].max(),
-            "to_solve": to_solve,
-            "cpu_s_to_solve": curve["cpu_s"].cumsum()[to_solve - 1] if is_solved else np.inf,
-            "stays_solved": (later >= solved_reward).mean(),
-            "cpu_s": curve["cpu_s"].mean(), "cpu_s_in_all": curve["cpu_s"].sum(),
-            "train_steps": curve["train_steps_mean"].mean(),
-            "env_steps": curve["env_steps_total"].iloc[-1],
-        })  # fmt: skip
+        rows.append(
+            dict(zip([*BY, "seed"], values, strict=True))
+            | {
+                "generations": len(curve),
+                "best": curve["incumbent_mean"].max(),
+                "to_solve": to_solve,
+                "cpu_s_to_solve": curve["cpu_s"].cumsum()[to_solve - 1] if is_solved else np.inf,
+                "stays_solved": (later >= solved_reward).mean(),
+                "cpu_s": curve["cpu_s"].mean(),
+                "cpu_s_in_all": curve["cpu_s"].sum(),
+                "train_steps": curve["train_steps_mean"].mean(),
+                "env_steps": curve["env_steps_total"].iloc[-1],
+            }
+        )
     return pd.DataFrame(rows)
 
 
@@ -135,14 +156,20 @@ def summarise(runs: pd.DataFrame, transfer: pd.DataFrame) -> pd.DataFrame:
     rows = []
     for values, mine in runs.groupby(BY, sort=False):
         low, high = bootstrap_interval(mine["best"])
-        rows.append(dict(zip(BY, values, strict=True)) | {
-            "runs": len(mine), "solved": int(np.isfinite(mine["to_solve"]).sum()),
-            "best": mine["best"].mean(), "best_low": low, "best_high": high,
-            "to_solve": mine["to_solve"].median(),
-            "cpu_s_to_solve": mine["cpu_s_to_solve"].median(),
-            "stays_solved": mine["stays_solved"].mean(),
-            **mine[["generations", "cpu_s", "train_steps", "env_steps"]].mean(),
-        })  # fmt: skip
+        rows.append(
+            dict(zip(BY, values, strict=True))
+            | {
+                "runs": len(mine),
+                "solved": int(np.isfinite(mine["to_solve"]).sum()),
+                "best": mine["best"].mean(),
+                "best_low": low,
+                "best_high": high,
+                "to_solve": mine["to_solve"].median(),
+                "cpu_s_to_solve": mine["cpu_s_to_solve"].median(),
+                "stays_solved": mine["stays_solved"].mean(),
+                **mine[["generations", "cpu_s", "train_steps", "env_steps"]].mean(),
+            }
+        )
     transferred = transfer[transfer["hparams"] == transfer["hparams"].iloc[0]]
     means = transferred.pivot(index=BY, columns="kind", values="test_return_mean").add_prefix("on_")
     return pd.DataFrame(rows).join(means, on=BY)
@@ -152,18 +179,27 @@ def make_table(summary: pd.DataFrame) -> pd.DataFrame:
     """The summary as texts."""
     tested = {name.removeprefix("on_"): name for name in summary if name.startswith("on_")}
 
-    return as_texts(summary, {
-        "steps": "{horizon}", "starts": "{starts}", "end": "{end}",
-        "best incumbent": "{best:.1f} [{best_low:.1f}, {best_high:.1f}]",
-        "runs solved": "{solved} of {runs}",
-        "generations to solve": lambda row: _finite(row.to_solve, 0),
-        "CPU s to solve": lambda row: _finite(row.cpu_s_to_solve, 1),
-        "stay solved": lambda row: f"{row.stays_solved:.0%}" if row.solved else "-",
-        "generations": "{generations:.0f}", "CPU s each": "{cpu_s:.2f}",
-        "steps of an agent": "{train_steps:,.0f}", "real steps": "{env_steps:,.0f}",
-        **{f"tested: {figures.AGENT_NAMES.get(kind, kind)}": f"{{{column}:.1f}}"
-           for kind, column in tested.items()},
-    })  # fmt: skip
+    return as_texts(
+        summary,
+        {
+            "steps": "{horizon}",
+            "starts": "{starts}",
+            "end": "{end}",
+            "best incumbent": "{best:.1f} [{best_low:.1f}, {best_high:.1f}]",
+            "runs solved": "{solved} of {runs}",
+            "generations to solve": lambda row: _finite(row.to_solve, 0),
+            "CPU s to solve": lambda row: _finite(row.cpu_s_to_solve, 1),
+            "stay solved": lambda row: f"{row.stays_solved:.0%}" if row.solved else "-",
+            "generations": "{generations:.0f}",
+            "CPU s each": "{cpu_s:.2f}",
+            "steps of an agent": "{train_steps:,.0f}",
+            "real steps": "{env_steps:,.0f}",
+            **{
+                f"tested: {figures.AGENT_NAMES.get(kind, kind)}": f"{{{column}:.1f}}"
+                for kind, column in tested.items()
+            },
+        },
+    )
 
 
 def findings(runs: pd.DataFrame, summary: pd.DataFrame, end: str) -> str:
@@ -171,10 +207,15 @@ def findings(runs: pd.DataFrame, summary: pd.DataFrame, end: str) -> str:
     texts = []
     shown = summary[summary["end"].isin([NO_END, end])]
     for starts, mine in shown.groupby("starts", sort=False):
-        each = [f"{row.horizon}: {row.best:.1f}, {row.solved} of {row.runs}, "
-                f"{_finite(row.cpu_s_to_solve, 0)}" for row in mine.itertuples()]  # fmt: skip
-        texts.append(f"With {starts} starts (horizon: best incumbent, runs solved, median CPU s to "
-                     f"solve): {'; '.join(each)}.")  # fmt: skip
+        each = [
+            f"{row.horizon}: {row.best:.1f}, {row.solved} of {row.runs}, "
+            f"{_finite(row.cpu_s_to_solve, 0)}"
+            for row in mine.itertuples()
+        ]
+        texts.append(
+            f"With {starts} starts (horizon: best incumbent, runs solved, median CPU s to "
+            f"solve): {'; '.join(each)}."
+        )
         if len(mine) > 1:
             texts.append(_compared(runs, mine.iloc[0], mine.iloc[-1], "horizon"))
     for _, mine in shown.groupby("horizon", sort=False):
@@ -183,8 +224,10 @@ def findings(runs: pd.DataFrame, summary: pd.DataFrame, end: str) -> str:
     of_ends = summary[summary["end"] != NO_END].groupby("end", sort=False)
     if of_ends.ngroups > 1:
         means = of_ends.agg({"best": "mean", "solved": "sum", "runs": "sum"})
-        each = [f"{row.Index} {row.best:.1f} ({row.solved} of {row.runs} runs solved)"
-                for row in means.itertuples()]  # fmt: skip
+        each = [
+            f"{row.Index} {row.best:.1f} ({row.solved} of {row.runs} runs solved)"
+            for row in means.itertuples()
+        ]
         texts.append(f"Ends of several steps, over horizons and starts: {', '.join(each)}.")
     return " ".join(texts)
 
@@ -211,8 +254,9 @@ def report(settings: SeHorizons, rows: pd.DataFrame) -> pd.DataFrame:
     task = envs.make(settings.env)
     rows = rows.astype({"horizon": str})
     runs = summarise_runs(unstack(rows, "curves"), settings.cpu_budget_s, task.solved_reward)
-    transfer = family_runs.summarise(unstack(rows, "agents"), [*BY, "hparams", "kind"],
-                                     task.solved_reward)  # fmt: skip
+    transfer = family_runs.summarise(
+        unstack(rows, "agents"), [*BY, "hparams", "kind"], task.solved_reward
+    )
     summary = summarise(runs, transfer)
     draw(task, runs, summary, settings.ends[0], settings.folder / "horizons.png")
     note = (
@@ -246,17 +290,37 @@ def draw(task: Any, runs: pd.DataFrame, summary: pd.DataFrame, end: str, path: A
             color, shift = COLORS[str(starts)], 0.12 * (index - 0.5)
             places = mine["horizon"].map(horizons.index) + shift
             errors = np.abs(mine[["best_low", "best_high"]].to_numpy().T - mine["best"].to_numpy())
-            left.errorbar(places, mine["best"], yerr=errors, fmt="o-", ms=5, capsize=3, color=color,
-                          label=f"{starts} starts")  # fmt: skip
-            left.plot(places, mine[tested].mean(axis=1), "D:", ms=4, color=color, mfc="none",
-                      label=f"{starts} starts, tested families")  # fmt: skip
+            left.errorbar(
+                places,
+                mine["best"],
+                yerr=errors,
+                fmt="o-",
+                ms=5,
+                capsize=3,
+                color=color,
+                label=f"{starts} starts",
+            )
+            left.plot(
+                places,
+                mine[tested].mean(axis=1),
+                "D:",
+                ms=4,
+                color=color,
+                mfc="none",
+                label=f"{starts} starts, tested families",
+            )
             own = runs[runs["end"].isin(ends) & (runs["starts"] == starts)]
             solved = np.isfinite(own["cpu_s_to_solve"])
             x = own["horizon"].map(horizons.index) + shift
             right.plot(x[solved], own["cpu_s_to_solve"][solved], "o", ms=5, color=color, alpha=0.7)
             right.plot(x[~solved], own["cpu_s_in_all"][~solved], "x", ms=6, color=color, alpha=0.7)
-        left.axhline(task.solved_reward, color=figures.SOLVED, ls="--", lw=1.2,
-                     label=f"solved ({task.solved_reward:g})")  # fmt: skip
+        left.axhline(
+            task.solved_reward,
+            color=figures.SOLVED,
+            ls="--",
+            lw=1.2,
+            label=f"solved ({task.solved_reward:g})",
+        )
         left.set(ylabel=f"mean return on {task.name}")
         right.set(ylabel="CPU s to solve (x: not solved)")
         right.set_ylim(bottom=0)

@@ -50,8 +50,10 @@ def compute(settings: SeModels) -> pd.DataFrame:
 def load(settings: SeModels) -> Any:
     """The SEs that are tested."""
     if settings.ses is None:
-        raise ConfigError("ses must be given, because agents are trained on its SEs; got none. "
-                          "Set ses=results/se_feasibility/cartpole/ses.safetensors.")  # fmt: skip
+        raise ConfigError(
+            "ses must be given, because agents are trained on its SEs; got none. "
+            "Set ses=results/se_feasibility/cartpole/ses.safetensors."
+        )
     return sejax.load_set(settings.ses, option="ses", kind="se").first(settings.num_ses)
 
 
@@ -59,8 +61,10 @@ def summarise(agents: pd.DataFrame, solved_reward: float) -> pd.DataFrame:
     """One row for each kind of agent and SE, the best SE of each kind first."""
     grouped = agents.groupby(["kind", "se"], sort=False)
     summary = grouped["test_return"].agg(
-        return_mean="mean", return_std=lambda x: x.std(ddof=0),
-        solved=lambda x: (x >= solved_reward).mean())  # fmt: skip
+        return_mean="mean",
+        return_std=lambda x: x.std(ddof=0),
+        solved=lambda x: (x >= solved_reward).mean(),
+    )
     iqms = [iqm_columns(returns, "return") for _, returns in grouped["test_return"]]
     summary = summary.assign(**pd.DataFrame(iqms, index=summary.index))
     summary["train_steps"] = grouped["train_steps"].mean()
@@ -109,8 +113,12 @@ def correlations_text(summary: pd.DataFrame) -> str:
         return ""
     matrix = rank_correlations(summary)
     kinds = list(matrix)
-    texts = [f"{a} and {b} {matrix.loc[a, b]:.2f}" for i, a in enumerate(kinds)
-             for b in kinds[i + 1 :] if np.isfinite(matrix.loc[a, b])]  # fmt: skip
+    texts = [
+        f"{a} and {b} {matrix.loc[a, b]:.2f}"
+        for i, a in enumerate(kinds)
+        for b in kinds[i + 1 :]
+        if np.isfinite(matrix.loc[a, b])
+    ]
     return f" Rank correlation of the SEs' mean returns: {', '.join(texts)}." if texts else ""
 
 
@@ -124,8 +132,10 @@ def draw(task: Any, agents: pd.DataFrame, path: Path) -> None:
     size = (max(5.0, 1.8 + 0.35 * num_ses), 0.6 + 2.6 * len(kinds))
     with figures.panels(path, len(kinds), 1, size) as (figure, axes):
         for axis, (kind, of_kind) in zip(axes[:, 0], kinds, strict=True):
-            pooled = {se: mine[return_columns(mine)].to_numpy().ravel()
-                      for se, mine in of_kind.groupby("se")}  # fmt: skip
+            pooled = {
+                se: mine[return_columns(mine)].to_numpy().ravel()
+                for se, mine in of_kind.groupby("se")
+            }
             order = sorted(pooled, key=lambda se: -pooled[se].mean())
             parts = axis.violinplot([pooled[se] for se in order], widths=0.85, showextrema=False)
             for body in parts["bodies"]:
@@ -138,8 +148,9 @@ def draw(task: Any, agents: pd.DataFrame, path: Path) -> None:
             axis.set(xlim=(0.4, len(order) + 0.6), ylabel=f"test return\non {task.name}")
         axes[-1, 0].set_xlabel("SE, by its place in the set; diamonds: means")
         line = plt.Line2D([], [], color=figures.SOLVED, ls="--")
-        figure.legend([line], [f"solved ({task.solved_reward:g})"], loc="outside upper right",
-                      fontsize=9)  # fmt: skip
+        figure.legend(
+            [line], [f"solved ({task.solved_reward:g})"], loc="outside upper right", fontsize=9
+        )
 
 
 EXPERIMENT = Experiment(settings=SeModels, compute=compute, report=report, about=__doc__)

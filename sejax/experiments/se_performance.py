@@ -47,23 +47,33 @@ from sejax.training import SOLVED_BY, TrainingConfig
 NUM_BEST = 5
 BEST_FOR = "td3_discrete"
 ON_REAL = ("real", "tuned")
-SHOWN = {"real": (figures.REAL, "real"), "tuned": (figures.TUNED, "real, tuned agent"),
-         "varied": (figures.VARIED, "synth., HPs varied"),
-         "fixed": (figures.FIXED, "synth., HPs fixed"),
-         "best": (figures.BEST, "synth., best SEs")}  # fmt: skip
+SHOWN = {
+    "real": (figures.REAL, "real"),
+    "tuned": (figures.TUNED, "real, tuned agent"),
+    "varied": (figures.VARIED, "synth., HPs varied"),
+    "fixed": (figures.FIXED, "synth., HPs fixed"),
+    "best": (figures.BEST, "synth., best SEs"),
+}
 
 # Training steps, "mean ± std", in CartPole: docs/reference.md 7.1, the values in the scripts of
 # the authors' bar plot; best: the same and paper, section "Transferability of SEs", which also has
 # the returns of TD3. Acrobot: paper, the same section.
 PAPER_STEPS = {
     ("cartpole", "ddqn"): {
-        "real": "16887.7 ± 24925", "varied": "6818.6 ± 2339.5", "fixed": "6379.5 ± 3163"},
+        "real": "16887.7 ± 24925",
+        "varied": "6818.6 ± 2339.5",
+        "fixed": "6379.5 ± 3163",
+    },
     ("cartpole", "dueling_ddqn"): {"real": "12745.3", "varied": "6781.0", "fixed": "6502.5"},
     ("cartpole", "td3_discrete"): {
-        "real": "17874.9", "varied": "5832.1", "fixed": "5371.0", "best": "6287.5"},
+        "real": "17874.9",
+        "varied": "5832.1",
+        "fixed": "5371.0",
+        "best": "6287.5",
+    },
     ("acrobot", "dueling_ddqn"): {"real": "29531", "varied": "18376"},
     ("acrobot", "td3_discrete"): {"real": "80837", "best": "14408"},
-}  # fmt: skip
+}
 PAPER_RETURNS = {
     ("cartpole", "td3_discrete"): {"real": "152", "best": "187"},
     ("acrobot", "dueling_ddqn"): {"varied": "-111"},
@@ -76,17 +86,31 @@ class SePerformance(SeAgents):
     name = "se_performance"
 
     varied: str | None = setting(None, about="file of SEs learned with drawn hyperparameters")
-    fixed: str | None = setting(None, about="file of SEs learned with one agent's; with quick=true "
-                                "and no file, the shipped cartpole SE")  # fmt: skip
+    fixed: str | None = setting(
+        None,
+        about="file of SEs learned with one agent's; with quick=true "
+        "and no file, the shipped cartpole SE",
+    )
     env: str | None = setting(None, about="task, where no file is given; cartpole")
-    tuned: bool = setting(True, quick=False, about="whether agents that were tuned for it train on "
-                          "the real task too")  # fmt: skip
-    real_groups: int | None = count(None, "groups", about="groups of agents on the real task, "
-                                    "which takes longest; as many as SEs")  # fmt: skip
-    real_episodes: int | None = count(None, "episodes", quick=100, about="at most, on the real "
-                                      "task; 1000 (500 for discrete TD3 in Acrobot)")  # fmt: skip
-    solved_by: str = setting("train", one_of(SOLVED_BY), about="whose last returns end training "
-                             "on the real task; train, as in the paper's code")  # fmt: skip
+    tuned: bool = setting(
+        True, quick=False, about="whether agents that were tuned for it train on the real task too"
+    )
+    real_groups: int | None = count(
+        None,
+        "groups",
+        about="groups of agents on the real task, which takes longest; as many as SEs",
+    )
+    real_episodes: int | None = count(
+        None,
+        "episodes",
+        quick=100,
+        about="at most, on the real task; 1000 (500 for discrete TD3 in Acrobot)",
+    )
+    solved_by: str = setting(
+        "train",
+        one_of(SOLVED_BY),
+        about="whose last returns end training on the real task; train, as in the paper's code",
+    )
 
 
 def compute(settings: SePerformance) -> pd.DataFrame:
@@ -101,8 +125,10 @@ def compute(settings: SePerformance) -> pd.DataFrame:
         if settings.tuned:
             worlds["tuned"] = tuned_world(settings, worlds["real"], kind)
         worlds |= {name: se_agents.se_world(settings, ses, kind) for name, ses in sets.items()}
-        tables += [se_agents.train(settings, world).assign(kind=kind, setting=name)
-                   for name, world in worlds.items()]  # fmt: skip
+        tables += [
+            se_agents.train(settings, world).assign(kind=kind, setting=name)
+            for name, world in worlds.items()
+        ]
     return pd.concat(tables, ignore_index=True)
 
 
@@ -116,9 +142,14 @@ def load_sets(settings: SePerformance) -> dict[str, Any]:
     for name, file in files.items():
         ses = sejax.load_set(file, option=name, kind="se")
         learned_with = "varied" if ses.config["agent_hparams"] == "varied" else "fixed"
-        require(learned_with == name, name, f"be SEs learned with {name} hyperparameters",
-                "it is what is compared", f"{ses.path} with {learned_with} ones",
-                f"{learned_with}={ses.path}")  # fmt: skip
+        require(
+            learned_with == name,
+            name,
+            f"be SEs learned with {name} hyperparameters",
+            "it is what is compared",
+            f"{ses.path} with {learned_with} ones",
+            f"{learned_with}={ses.path}",
+        )
         solved = ses.solved()
         sets[name] = (solved if solved.size else ses).first(settings.num_ses)
     return sets
@@ -128,8 +159,14 @@ def task_name(settings: SePerformance, sets: dict[str, Any]) -> str:
     """The one task of all sets."""
     asked = {settings.env} if settings.env else set()
     names = sorted({str(ses.task.name) for ses in sets.values()} | asked)
-    require(len(names) <= 1, "varied, fixed and env", "be of one task",
-            "agents are tested on it", ", ".join(names), "files of the same task")  # fmt: skip
+    require(
+        len(names) <= 1,
+        "varied, fixed and env",
+        "be of one task",
+        "agents are tested on it",
+        ", ".join(names),
+        "files of the same task",
+    )
     return names[0] if names else "cartpole"
 
 
@@ -140,23 +177,34 @@ def real_world(settings: SePerformance, task: Any, sets: dict[str, Any], kind: s
     # docs/reference.md 7.1: discrete TD3 trains 500 episodes on Acrobot, all others 1000.
     usual = 500 if task.name == "acrobot" and kind == "td3_discrete" else 1000
     training = TrainingConfig(
-        max_episodes=settings.real_episodes or usual, stop_rule="solved",
-        time_limit_is_terminal=True, max_steps=settings.max_steps, solved_by=settings.solved_by,
+        max_episodes=settings.real_episodes or usual,
+        stop_rule="solved",
+        time_limit_is_terminal=True,
+        max_steps=settings.max_steps,
+        solved_by=settings.solved_by,
         test_episodes=settings.test_episodes,
-    )  # fmt: skip
-    return World.real(task, [f"real-{index:02d}" for index in range(count)], name=kind,
-                      agent=se_agents.agent_config(settings, kind), training=training,
-                      hparams="varied")  # fmt: skip
+    )
+    return World.real(
+        task,
+        [f"real-{index:02d}" for index in range(count)],
+        name=kind,
+        agent=se_agents.agent_config(settings, kind),
+        training=training,
+        hparams="varied",
+    )
 
 
 def tuned_world(settings: SePerformance, real: World, kind: str) -> World:
     """The real task for agents of the settings that were found there, not drawn."""
     return dataclasses.replace(
-        real, name=f"{kind}-tuned", hparams="default",
-        agent=se_agents.agent_config(settings, kind) if settings.quick
+        real,
+        name=f"{kind}-tuned",
+        hparams="default",
+        agent=se_agents.agent_config(settings, kind)
+        if settings.quick
         else tuned_agent(real.task.name, kind),
         training=dataclasses.replace(real.training, time_limit_is_terminal=False),
-    )  # fmt: skip
+    )
 
 
 def select_best(agents: pd.DataFrame, count: int = NUM_BEST) -> pd.DataFrame:
@@ -190,8 +238,13 @@ def summarise(agents: pd.DataFrame) -> pd.DataFrame:
     """
     rows = []
     for (kind, name), mine in agents.groupby(["kind", "setting"], sort=False):
-        row = {"kind": kind, "setting": name, "num_ses": mine["group"].nunique(),
-               "num_agents": len(mine), "num_nonfinite": int(mine["nonfinite"].sum())}  # fmt: skip
+        row = {
+            "kind": kind,
+            "setting": name,
+            "num_ses": mine["group"].nunique(),
+            "num_agents": len(mine),
+            "num_nonfinite": int(mine["nonfinite"].sum()),
+        }
         for column in ("train_steps", "train_episodes", "test_return"):
             of_ses = mine.groupby("group")[column].mean()
             row |= spread(mine[column], mine[column] if name in ON_REAL else of_ses, column)
@@ -207,12 +260,15 @@ def strata(agents: pd.DataFrame, name: str) -> pd.Series | None:
 
 def make_table(env_name: str, summary: pd.DataFrame) -> pd.DataFrame:
     """The summary as texts, with the paper's numbers."""
-    steps = {name: summary[summary["setting"] == name].set_index("kind")["train_steps_mean"]
-             for name in ON_REAL}  # fmt: skip
+    steps = {
+        name: summary[summary["setting"] == name].set_index("kind")["train_steps_mean"]
+        for name in ON_REAL
+    }
 
     def measured(row: Any, column: str, digits: int) -> str:
-        mean, std, low, high = (getattr(row, f"{column}_{x}")
-                                for x in ("mean", "std", "low", "high"))  # fmt: skip
+        mean, std, low, high = (
+            getattr(row, f"{column}_{x}") for x in ("mean", "std", "low", "high")
+        )
         return f"{mean:,.{digits}f} ± {std:,.{digits}f}{brackets(low, high, digits)}"
 
     def fewer(row: Any, than: str) -> str:
@@ -220,20 +276,24 @@ def make_table(env_name: str, summary: pd.DataFrame) -> pd.DataFrame:
             return ""
         return f"{1 - row.train_steps_mean / steps[than][row.kind]:.0%}"
 
-    return as_texts(summary, {
-        "agent": "{kind}",
-        "trained on": lambda row: SHOWN[row.setting][1],
-        "SEs, agents": "{num_ses}, {num_agents}",
-        "training steps": lambda row: measured(row, "train_steps", 0),
-        "paper's": lambda row: PAPER_STEPS.get((env_name, row.kind), {}).get(row.setting, ""),
-        "fewer": lambda row: fewer(row, "real"),
-        **({"than tuned": lambda row: fewer(row, "tuned")} if has_tuned(summary) else {}),
-        "episodes": lambda row: measured(row, "train_episodes", 1),
-        "return": lambda row: measured(row, "test_return", 1),
-        "IQM": iqm_text("test_return"),
-        "paper's return":
-            lambda row: PAPER_RETURNS.get((env_name, row.kind), {}).get(row.setting, ""),
-    })  # fmt: skip
+    return as_texts(
+        summary,
+        {
+            "agent": "{kind}",
+            "trained on": lambda row: SHOWN[row.setting][1],
+            "SEs, agents": "{num_ses}, {num_agents}",
+            "training steps": lambda row: measured(row, "train_steps", 0),
+            "paper's": lambda row: PAPER_STEPS.get((env_name, row.kind), {}).get(row.setting, ""),
+            "fewer": lambda row: fewer(row, "real"),
+            **({"than tuned": lambda row: fewer(row, "tuned")} if has_tuned(summary) else {}),
+            "episodes": lambda row: measured(row, "train_episodes", 1),
+            "return": lambda row: measured(row, "test_return", 1),
+            "IQM": iqm_text("test_return"),
+            "paper's return": lambda row: PAPER_RETURNS.get((env_name, row.kind), {}).get(
+                row.setting, ""
+            ),
+        },
+    )
 
 
 AND_TUNED = ", and against agents there with fixed settings that were tuned for it"
@@ -282,8 +342,10 @@ def draw(task: Any, agents: pd.DataFrame, path: Any) -> None:
         for (kind, mine), (top, *lower) in zip(kinds.items(), axes.T, strict=True):
             met = colored(mine, returns)
             figures.densities(top, met, low, high)
-            top.set(title=figures.AGENT_NAMES.get(kind, kind),
-                    xlabel=f"return of a test episode on {task.name}")  # fmt: skip
+            top.set(
+                title=figures.AGENT_NAMES.get(kind, kind),
+                xlabel=f"return of a test episode on {task.name}",
+            )
             below = [f"{values.mean():.1f}" for _, values in met]
             for axis, name in zip(lower, ("train_steps", "train_episodes"), strict=True):
                 figures.bars(axis, colored(mine, name), below)
@@ -293,9 +355,12 @@ def draw(task: Any, agents: pd.DataFrame, path: Any) -> None:
         longest = max((mine["setting"].unique() for mine in kinds.values()), key=len)
         handles = [plt.Line2D([], [], color=SHOWN[name][0], lw=3) for name in longest]
         # Side by side the labels are as wide as two columns.
-        figure.legend(handles, [f"train: {SHOWN[name][1]}" for name in longest],
-                      ncols=len(longest) if len(kinds) > 1 else 1,
-                      loc="outside upper center")  # fmt: skip
+        figure.legend(
+            handles,
+            [f"train: {SHOWN[name][1]}" for name in longest],
+            ncols=len(longest) if len(kinds) > 1 else 1,
+            loc="outside upper center",
+        )
 
 
 def draw_profiles(task: Any, agents: pd.DataFrame, path: Any) -> None:
@@ -310,16 +375,20 @@ def draw_profiles(task: Any, agents: pd.DataFrame, path: Any) -> None:
                 runs = in_strata(mine["test_return"], strata(mine, str(name)))
                 figures.profile(axis, runs, low, high, color, f"train: {label}")
             axis.axvline(task.solved_reward, color=figures.SOLVED, ls="--", lw=1.1)
-            axis.set(title=figures.AGENT_NAMES.get(str(kind), kind),
-                     xlabel=f"return of an agent on {task.name}")  # fmt: skip
+            axis.set(
+                title=figures.AGENT_NAMES.get(str(kind), kind),
+                xlabel=f"return of an agent on {task.name}",
+            )
         axes[0, 0].set_ylabel("share of agents with more")
         figures.legend_above(figure, max(axes[0], key=lambda axis: len(axis.lines)), 2)
 
 
 def colored(agents: pd.DataFrame, names: str | list[str]) -> list[tuple[str, np.ndarray]]:
     """Colour and values of these columns for each setting."""
-    return [(SHOWN[str(setting)][0], mine[names].to_numpy(float).ravel())
-            for setting, mine in agents.groupby("setting", sort=False)]  # fmt: skip
+    return [
+        (SHOWN[str(setting)][0], mine[names].to_numpy(float).ravel())
+        for setting, mine in agents.groupby("setting", sort=False)
+    ]
 
 
 EXPERIMENT = Experiment(settings=SePerformance, compute=compute, report=report, about=__doc__)

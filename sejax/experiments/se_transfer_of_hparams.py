@@ -35,7 +35,7 @@ from sejax.options import counts
 from sejax.training import TrainingConfig
 
 BUDGETS = {"same": "as many steps", "long": "until the stop rule"}
-QUICK_AGENT = {"hidden_size": 8, "batch_size": 16, "num_layers": 1, "init_episodes": 1}
+QUICK_AGENT = {"hidden_size": 8, "batch_size": 16, "num_layers": 1, "warmup_episodes": 1}
 NUM_RESAMPLES = 2000
 
 
@@ -44,21 +44,29 @@ class SeTransferOfHparams(Settings):
     name = "se_transfer_of_hparams"
 
     env: str = setting("cartpole", about="task: cartpole, acrobot, ...")
-    ses: str | None = setting(None, about="SE, or set of SEs of which the one with the best score "
-                              "is taken; the shipped one of the task")  # fmt: skip
+    ses: str | None = setting(
+        None,
+        about="SE, or set of SEs of which the one with the best score "
+        "is taken; the shipped one of the task",
+    )
     agent: str = setting(
         "ddqn", about="that is tuned; configurations are drawn around the preset's"
     )
     preset: str = setting("best", about="of the agent")
     run: tuple[str, ...] = setting((), about="overrides of the agent, as run.agent.discount=0.9")
     num_configs: int = count(64, "configurations", quick=16, about="that are drawn")
-    num_agents: int = setting(4, counts("half of them judge what the others choose", least=2),
-                              about="seeds of each, on the SE and on the real task")  # fmt: skip
+    num_agents: int = setting(
+        4,
+        counts("half of them judge what the others choose", least=2),
+        about="seeds of each, on the SE and on the real task",
+    )
     test_episodes: int = count(10, "episodes", about="of each agent")
-    budgets: tuple[str, ...] = setting(tuple(BUDGETS), each_of(BUDGETS), quick=("same",), about=
-                                       "on the real task: same, long")  # fmt: skip
-    max_steps: int | None = count(None, "steps", quick=1000, about="of an agent on the SE; as it "
-                                  "was learned")  # fmt: skip
+    budgets: tuple[str, ...] = setting(
+        tuple(BUDGETS), each_of(BUDGETS), quick=("same",), about="on the real task: same, long"
+    )
+    max_steps: int | None = count(
+        None, "steps", quick=1000, about="of an agent on the SE; as it was learned"
+    )
     real_episodes: int = count(1000, "episodes", about="of budget long, at most")
     real_steps: int | None = count(100_000, "steps", about="of budget long, at most")
 
@@ -75,27 +83,54 @@ class Parts:
 def parts_of(settings: SeTransferOfHparams) -> Parts:
     """Reads the SE and configures agents and trainings."""
     ses = sejax.load_set(settings.ses or settings.env, option="ses", kind="se").ranked(1)
-    require(ses.task.name == settings.env, "ses", f"be of {settings.env}", "agents are tested on "
-            "it", f"one of {ses.task.name}", f"env={ses.task.name}")  # fmt: skip
+    require(
+        ses.task.name == settings.env,
+        "ses",
+        f"be of {settings.env}",
+        "agents are tested on it",
+        f"one of {ses.task.name}",
+        f"env={ses.task.name}",
+    )
     words = [f"env={settings.env}", f"preset={settings.preset}", f"agent={settings.agent}"]
     if settings.quick:
         words += [f"agent.{name}={value}" for name, value in QUICK_AGENT.items()]
     config = sejax.config([*words, *settings.run])
     learned = training_as_learned(ses, config.agent)
     on_se = dataclasses.replace(
-        learned, max_steps=settings.max_steps or learned.max_steps,
+        learned,
+        max_steps=settings.max_steps or learned.max_steps,
         max_episodes=max(learned.max_episodes, settings.max_steps or 0),
-        test_episodes=settings.test_episodes)  # fmt: skip
-    require(on_se.max_steps is not None, "max_steps", "be given with this SE", "agents on the real "
-            "task train as long, and its own trained until a rule stopped them", "null",
-            "max_steps=5000")  # fmt: skip
-    real = TrainingConfig(stop_rule="never", max_steps=on_se.max_steps, max_episodes=100_000,
-                          test_episodes=settings.test_episodes)  # fmt: skip
-    trainings = {"same": real, "long": dataclasses.replace(
-        real, stop_rule="solved", solved_by="train", max_episodes=settings.real_episodes,
-        max_steps=settings.real_steps)}  # fmt: skip
-    return Parts(ses=ses, agent=config.agent,
-                 trainings={"se": on_se} | {x: trainings[x] for x in settings.budgets})  # fmt: skip
+        test_episodes=settings.test_episodes,
+    )
+    require(
+        on_se.max_steps is not None,
+        "max_steps",
+        "be given with this SE",
+        "agents on the real task train as long, and its own trained until a rule stopped them",
+        "null",
+        "max_steps=5000",
+    )
+    real = TrainingConfig(
+        stop_rule="never",
+        max_steps=on_se.max_steps,
+        max_episodes=100_000,
+        test_episodes=settings.test_episodes,
+    )
+    trainings = {
+        "same": real,
+        "long": dataclasses.replace(
+            real,
+            stop_rule="solved",
+            solved_by="train",
+            max_episodes=settings.real_episodes,
+            max_steps=settings.real_steps,
+        ),
+    }
+    return Parts(
+        ses=ses,
+        agent=config.agent,
+        trainings={"se": on_se} | {x: trainings[x] for x in settings.budgets},
+    )
 
 
 def compute(settings: SeTransferOfHparams) -> pd.DataFrame:
@@ -103,8 +138,10 @@ def compute(settings: SeTransferOfHparams) -> pd.DataFrame:
     parts = parts_of(settings)
     task = parts.ses.task
     key = jax.random.key(settings.seed)
-    keys = [np.asarray(jax.random.key_data(jax.random.fold_in(key, i)))
-            for i in range(settings.num_configs)]  # fmt: skip
+    keys = [
+        np.asarray(jax.random.key_data(jax.random.fold_in(key, i)))
+        for i in range(settings.num_configs)
+    ]
     tables = []
     for name, training in parts.trainings.items():
         on_se = name == "se"
@@ -112,12 +149,18 @@ def compute(settings: SeTransferOfHparams) -> pd.DataFrame:
         weights = parts.ses.fingerprint(0) if on_se else ""
         groups = tuple(Group(f"{i:02d}", (params, key), weights) for i, key in enumerate(keys))
         world = World(
-            name=name, env=parts.ses.env if on_se else task.env, task=task, groups=groups,
-            agent=parts.agent, training=training, hparams="varied",
+            name=name,
+            env=parts.ses.env if on_se else task.env,
+            task=task,
+            groups=groups,
+            agent=parts.agent,
+            training=training,
+            hparams="varied",
             settings={"proxy": parts.ses.config["proxy"]} if on_se else {},
-        )  # fmt: skip
-        rows = train_groups(world, settings, settings.num_agents, SHARED_DRAWS,
-                            groups_at_once(settings.devices))  # fmt: skip
+        )
+        rows = train_groups(
+            world, settings, settings.num_agents, SHARED_DRAWS, groups_at_once(settings.devices)
+        )
         tables.append(rows.assign(world=name))
     return pd.concat(tables, ignore_index=True).rename(columns={"group": "config"})
 
@@ -149,9 +192,11 @@ def make_shared_draws(
 
 
 SHARED_DRAWS = Measure(
-    make_run=make_shared_draws, to_table=lambda results, _: outcome_rows(*results),
-    say=lambda rows: f"mean return {rows['test_return'].mean():.1f}", is_timed=True,
-)  # fmt: skip
+    make_run=make_shared_draws,
+    to_table=lambda results, _: outcome_rows(*results),
+    say=lambda rows: f"mean return {rows['test_return'].mean():.1f}",
+    is_timed=True,
+)
 
 
 def returns_by_half(rows: pd.DataFrame, world: str) -> np.ndarray:
@@ -187,8 +232,12 @@ def quality(chooser: np.ndarray, target: np.ndarray) -> dict[str, float]:
         return float(np.mean([judges[i, by[i] == by[i].max()].mean() for i in (0, 1)]))
 
     best = judged(target)
-    return {"rho": rank_correlation(*pair), "chosen": judged(chooser),
-            "regret": best - judged(chooser), "regret_random": best - target.mean()}  # fmt: skip
+    return {
+        "rho": rank_correlation(*pair),
+        "chosen": judged(chooser),
+        "regret": best - judged(chooser),
+        "regret_random": best - target.mean(),
+    }
 
 
 def rank_correlation(a: np.ndarray, b: np.ndarray) -> float:
@@ -238,15 +287,22 @@ def make_table(summary: pd.DataFrame) -> pd.DataFrame:
 
     def interval(name: str, digits: int) -> Callable[[Any], str]:
         return lambda row: "{:.{d}f} [{:.{d}f}, {:.{d}f}]".format(
-            *(getattr(row, f"{name}{end}") for end in ("", "_low", "_high")), d=digits)  # fmt: skip
+            *(getattr(row, f"{name}{end}") for end in ("", "_low", "_high")), d=digits
+        )
 
-    return as_texts(summary, {
-        "trained on the real task": lambda row: BUDGETS[row.target],
-        "tuned on": lambda row: _chooser(row.chosen_by),
-        "Spearman's rho": interval("rho", 2), "return of the choice": interval("chosen", 1),
-        "regret": interval("regret", 1), "regret of a random one": interval("regret_random", 1),
-        "steps": "{train_steps:,.0f}", "CPU s": "{cpu_s:,.1f}",
-    })  # fmt: skip
+    return as_texts(
+        summary,
+        {
+            "trained on the real task": lambda row: BUDGETS[row.target],
+            "tuned on": lambda row: _chooser(row.chosen_by),
+            "Spearman's rho": interval("rho", 2),
+            "return of the choice": interval("chosen", 1),
+            "regret": interval("regret", 1),
+            "regret of a random one": interval("regret_random", 1),
+            "steps": "{train_steps:,.0f}",
+            "CPU s": "{cpu_s:,.1f}",
+        },
+    )
 
 
 def _chooser(name: str) -> str:
@@ -296,15 +352,27 @@ def draw(task: Any, rows: pd.DataFrame, path: Any) -> None:
     with figures.panels(path, 1, len(targets), (0.6 + 3.6 * len(targets), 3.8)) as (_, axes):
         for axis, target in zip(axes[0], targets, strict=True):
             axis.plot(means["se"], means[target], "o", ms=5, color=figures.REAL, alpha=0.6)
-            choices = ((means["se"], figures.VARIED, "best on the SE"),
-                       (means[target], figures.BEST, "best on the real task"))  # fmt: skip
+            choices = (
+                (means["se"], figures.VARIED, "best on the SE"),
+                (means[target], figures.BEST, "best on the real task"),
+            )
             for chosen_by, color, label in choices:
                 choice = means.loc[chosen_by.idxmax()]
-                axis.plot(choice["se"], choice[target], "o", ms=10, mfc="none", mew=1.8,
-                          color=color, label=label)  # fmt: skip
+                axis.plot(
+                    choice["se"],
+                    choice[target],
+                    "o",
+                    ms=10,
+                    mfc="none",
+                    mew=1.8,
+                    color=color,
+                    label=label,
+                )
             axis.axhline(task.solved_reward, color=figures.SOLVED, ls="--", lw=1.2)
-            axis.set(xlabel="mean return, trained on the SE",
-                     ylabel=f"the same, on the real task\n{BUDGETS[target]}")  # fmt: skip
+            axis.set(
+                xlabel="mean return, trained on the SE",
+                ylabel=f"the same, on the real task\n{BUDGETS[target]}",
+            )
         axes[0, 0].legend(fontsize=8, loc="best")
 
 

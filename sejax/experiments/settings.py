@@ -51,10 +51,16 @@ class Settings(Options):
 
     quick: bool = setting(False, about="a small version, in minutes")
     from_rows: bool = setting(False, about="remake tables and pictures from the rows in `out`")
-    out: str | None = setting(None, about="folder of the results; results/NAME[/TASK], quick "
-                              "runs/experiments/NAME-quick[/TASK]")  # fmt: skip
-    work: str | None = setting(None, about="folder of what is not kept; runs/experiments/... for "
-                               "results/..., else work/ in `out`")  # fmt: skip
+    out: str | None = setting(
+        None,
+        about="folder of the results; results/NAME[/TASK], quick "
+        "runs/experiments/NAME-quick[/TASK]",
+    )
+    work: str | None = setting(
+        None,
+        about="folder of what is not kept; runs/experiments/... for "
+        "results/..., else work/ in `out`",
+    )
     seed: int = setting(
         0, lambda name, value, _: errors.require_seed(name, value), about="first random seed"
     )
@@ -73,8 +79,10 @@ class Settings(Options):
     @classmethod
     def defaults(cls, given: Mapping[str, Any]) -> dict[str, Any]:
         """Values of the fields; they may depend on those that are given, as on `quick`."""
-        return {field.name: field.metadata["quick"] if given.get("quick") else field.default
-                for field in dataclasses.fields(cls)}  # fmt: skip
+        return {
+            field.name: field.metadata["quick"] if given.get("quick") else field.default
+            for field in dataclasses.fields(cls)
+        }
 
     @property
     def folder(self) -> Path:

@@ -39,11 +39,18 @@ from sejax.experiments.worlds import HPARAMS, World, return_columns
 from sejax.statistics import bootstrap_interval
 
 BEST = 2  # models in the paper's second figure
-LABELS = {"authors": "model, as the authors", "authors_best": f"model, as the authors, best {BEST}",
-          "fair": "model, fair", "se": "SE"}  # fmt: skip
+LABELS = {
+    "authors": "model, as the authors",
+    "authors_best": f"model, as the authors, best {BEST}",
+    "fair": "model, fair",
+    "se": "SE",
+}
 # Paper, the same subsection, "Result": mean test returns of DDQN agents with drawn hyperparameters.
-PAPER = {("authors", "ddqn", "varied"): "15.01", ("authors_best", "ddqn", "varied"): "17.73",
-         ("se", "ddqn", "varied"): "190.7"}  # fmt: skip
+PAPER = {
+    ("authors", "ddqn", "varied"): "15.01",
+    ("authors_best", "ddqn", "varied"): "17.73",
+    ("se", "ddqn", "varied"): "190.7",
+}
 DRAWN = {"varied": "drawn"}  # what tables and pictures call it
 
 
@@ -57,42 +64,69 @@ def compute(settings: SupervisedBaseline) -> pd.DataFrame:
         for name, world in make_worlds(settings, ses, kind, hparams).items():
             rows = worlds.train_groups(world, settings, settings.num_agents)
             tables.append(rows.assign(world=name, kind=kind, hparams=hparams))
-    return stack({"agents": pd.concat(tables), "fits": fits,
-                  "transitions": supervised_models.summary_of(data)})  # fmt: skip
+    return stack(
+        {
+            "agents": pd.concat(tables),
+            "fits": fits,
+            "transitions": supervised_models.summary_of(data),
+        }
+    )
 
 
 def load(settings: SupervisedBaseline) -> Any:
     """The SE, if agents can be trained on it, and the tests of its NES run recorded."""
     ses = sejax.load_set(settings.proxy, option="proxy", kind="se").first(1)
-    require(ses.task.num_states is None and ses.task.num_actions is not None, "proxy",
-            "be an SE with vector states and discrete actions", "the agents are made for these",
-            f"one of {ses.task.name}", f"proxy={SOFT_SE}")  # fmt: skip
-    require(ses.env.config.horizon != 1, "proxy", "be an SE whose episodes have several steps",
-            "a supervised model predicts next states", "a bandit", f"proxy={SOFT_SE}")  # fmt: skip
+    require(
+        ses.task.num_states is None and ses.task.num_actions is not None,
+        "proxy",
+        "be an SE with vector states and discrete actions",
+        "the agents are made for these",
+        f"one of {ses.task.name}",
+        f"proxy={SOFT_SE}",
+    )
+    require(
+        ses.env.config.horizon != 1,
+        "proxy",
+        "be an SE whose episodes have several steps",
+        "a supervised model predicts next states",
+        "a bandit",
+        f"proxy={SOFT_SE}",
+    )
     learned_with = ses.config["agent"] or {"name": "several agents"}
-    require(learned_with["name"] in AGENTS and learned_with.get("action_repeat", 1) == 1,
-            "proxy", f"be an SE learned with {', '.join(AGENTS)}, without action repeat", "the "
-            "recorded NES runs have its agent, and their every step is a row",
-            f"one learned with {learned_with['name']}", f"proxy={SOFT_SE}")  # fmt: skip
+    require(
+        learned_with["name"] in AGENTS and learned_with.get("action_repeat", 1) == 1,
+        "proxy",
+        f"be an SE learned with {', '.join(AGENTS)}, without action repeat",
+        "the recorded NES runs have its agent, and their every step is a row",
+        f"one learned with {learned_with['name']}",
+        f"proxy={SOFT_SE}",
+    )
     return ses
 
 
 def make_worlds(settings: Any, ses: Any, kind: str, hparams: str) -> dict[str, World]:
     """The models of both variants and the SE, with as many agents on the SE as on all models."""
-    sets = {name: sejax.load_set(supervised_models.model_file(settings, name), option="out")
-            for name in ("authors", "fair")}  # fmt: skip
+    sets = {
+        name: sejax.load_set(supervised_models.model_file(settings, name), option="out")
+        for name in ("authors", "fair")
+    }
     agent = se_agents.agent_config(settings, kind)
     made = {}
     for name, proxies in (sets | {"se": ses}).items():
         training = worlds.training_as_learned(proxies, agent)
         own = settings.max_steps if name != "se" else None
         max_steps = own or (se_agents.QUICK_STEPS if settings.quick else training.max_steps)
-        training = dataclasses.replace(training, max_steps=max_steps,
-                                       test_episodes=settings.test_episodes)  # fmt: skip
+        training = dataclasses.replace(
+            training, max_steps=max_steps, test_episodes=settings.test_episodes
+        )
         made[name] = World.of_set(
-            proxies, map(str, range(settings.models)), name=f"{kind}-{hparams}-{name}",
-            agent=agent, training=training, hparams=hparams,
-        )  # fmt: skip
+            proxies,
+            map(str, range(settings.models)),
+            name=f"{kind}-{hparams}-{name}",
+            agent=agent,
+            training=training,
+            hparams=hparams,
+        )
     return made
 
 
@@ -119,17 +153,25 @@ def summarise(agents: pd.DataFrame, solved_reward: float) -> pd.DataFrame:
     for (kind, hparams, name), mine in agents.groupby(["kind", "hparams", "world"]):
         draws = mine["test_return"] if name == "se" else mine.groupby("group")["test_return"].mean()
         low, high = bootstrap_interval(draws)
-        rows.append({
-            "kind": kind, "hparams": hparams, "world": name, "num_agents": len(mine),
-            "return_mean": mine["test_return"].mean(),
-            "return_std": mine[return_columns(mine)].to_numpy().std(),
-            "return_low": low, "return_high": high,
-            **iqm_columns(mine["test_return"], "return", None if name == "se" else mine["group"]),
-            "solved": (mine["test_return"] >= solved_reward).mean(),
-            "train_steps": mine["train_steps"].mean(),
-            "train_episodes": mine["train_episodes"].mean(),
-            "num_nonfinite": int(mine["nonfinite"].sum()),
-        })  # fmt: skip
+        rows.append(
+            {
+                "kind": kind,
+                "hparams": hparams,
+                "world": name,
+                "num_agents": len(mine),
+                "return_mean": mine["test_return"].mean(),
+                "return_std": mine[return_columns(mine)].to_numpy().std(),
+                "return_low": low,
+                "return_high": high,
+                **iqm_columns(
+                    mine["test_return"], "return", None if name == "se" else mine["group"]
+                ),
+                "solved": (mine["test_return"] >= solved_reward).mean(),
+                "train_steps": mine["train_steps"].mean(),
+                "train_episodes": mine["train_episodes"].mean(),
+                "num_nonfinite": int(mine["nonfinite"].sum()),
+            }
+        )
     order = [*AGENTS, *HPARAMS, *LABELS]
     return pd.DataFrame(rows).sort_values(
         ["kind", "hparams", "world"], key=lambda names: names.map(order.index), ignore_index=True
@@ -138,18 +180,21 @@ def summarise(agents: pd.DataFrame, solved_reward: float) -> pd.DataFrame:
 
 def make_table(summary: pd.DataFrame) -> pd.DataFrame:
     """The summary as texts, with the paper's numbers."""
-    return as_texts(summary, {
-        "agent": "{kind}",
-        "hyperparameters": lambda row: DRAWN.get(row.hparams, row.hparams),
-        "trained on": lambda row: LABELS[row.world],
-        "agents": "{num_agents}",
-        "return": "{return_mean:.1f} ± {return_std:.1f} [{return_low:.1f}, {return_high:.1f}]",
-        "IQM": iqm_text("return"),
-        "paper's": lambda row: PAPER.get((row.world, row.kind, row.hparams), ""),
-        "solved": "{solved:.0%}",
-        "training steps": "{train_steps:,.0f}",
-        "episodes": "{train_episodes:.1f}",
-    })  # fmt: skip
+    return as_texts(
+        summary,
+        {
+            "agent": "{kind}",
+            "hyperparameters": lambda row: DRAWN.get(row.hparams, row.hparams),
+            "trained on": lambda row: LABELS[row.world],
+            "agents": "{num_agents}",
+            "return": "{return_mean:.1f} ± {return_std:.1f} [{return_low:.1f}, {return_high:.1f}]",
+            "IQM": iqm_text("return"),
+            "paper's": lambda row: PAPER.get((row.world, row.kind, row.hparams), ""),
+            "solved": "{solved:.0%}",
+            "training steps": "{train_steps:,.0f}",
+            "episodes": "{train_episodes:.1f}",
+        },
+    )
 
 
 def report(settings: SupervisedBaseline, rows: pd.DataFrame) -> pd.DataFrame:
@@ -180,8 +225,11 @@ def diverged_text(agents: pd.DataFrame) -> str:
     """How many agents diverged, world by world; the best models' are among the authors'."""
     own = agents[agents["world"] != "authors_best"]
     counts = own.groupby("world", sort=False)["nonfinite"].sum()
-    texts = [f"{int(count)} of {(own['world'] == world).sum()} ({LABELS[str(world)]})"
-             for world, count in counts.items() if count]  # fmt: skip
+    texts = [
+        f"{int(count)} of {(own['world'] == world).sum()} ({LABELS[str(world)]})"
+        for world, count in counts.items()
+        if count
+    ]
     return ", ".join(texts) or "none"
 
 
@@ -200,14 +248,23 @@ def draw(task: Any, agents: pd.DataFrame, path: Path) -> None:
         for axis, ((kind, hparams), mine) in zip(axes[0], panels, strict=True):
             for name, color in colors.items():
                 met = mine[mine["world"] == name][return_columns(agents)].to_numpy().ravel()
-                figures.histogram(axis, met, 0.2, 1.4, f"{LABELS[name]} (dashed: mean)",
-                                  bins=edges, color=color,
-                                  weights=np.full(met.size, 1 / met.size))  # fmt: skip
+                figures.histogram(
+                    axis,
+                    met,
+                    0.2,
+                    1.4,
+                    f"{LABELS[name]} (dashed: mean)",
+                    bins=edges,
+                    color=color,
+                    weights=np.full(met.size, 1 / met.size),
+                )
                 axis.axvline(met.mean(), color=color, ls="--", lw=1.2)
             agent = figures.AGENT_NAMES.get(kind, kind)
-            axis.set(title=f"{agent}, {DRAWN.get(hparams, hparams)} hyperparameters",
-                     xlabel=f"return of a test episode on {task.name}",
-                     ylim=(0.5 / num_episodes, 1.1))  # fmt: skip
+            axis.set(
+                title=f"{agent}, {DRAWN.get(hparams, hparams)} hyperparameters",
+                xlabel=f"return of a test episode on {task.name}",
+                ylim=(0.5 / num_episodes, 1.1),
+            )
         axes[0, 0].set_ylabel("share of test episodes")
         figures.legend_above(figure, axes[0, 0], 3, fontsize=None)
 

@@ -18,14 +18,14 @@ import optax
 import pandas as pd
 
 import sejax
-from sejax import plugins
-from sejax.app import build
+from sejax import registry
+from sejax.cli import build
 from sejax.experiments import se_agents
 from sejax.experiments.se_agents import AGENTS, SOFT_SE
 from sejax.experiments.settings import Settings, count, each_of, setting
 from sejax.experiments.worlds import HPARAMS
+from sejax.ops.parallel import spread_over_devices
 from sejax.options import counts
-from sejax.parallel import spread_over_devices
 
 LEARNING_RATE, BATCH_SIZE = 1e-4, 1024  # paper and docs/reference.md 7.5
 
@@ -36,21 +36,31 @@ class SupervisedBaseline(Settings):
 
     name = "supervised_baseline"
 
-    proxy: str = setting(SOFT_SE, about="SE to compare with, whose settings the NES runs have; "
-                         "run directory, file or name")  # fmt: skip
+    proxy: str = setting(
+        SOFT_SE,
+        about="SE to compare with, whose settings the NES runs have; run directory, file or name",
+    )
     models: int = count(5, "models", quick=2, about="NES runs, and a model for each")
     generations: int = count(25, "generations", quick=3, about="of an NES run")
-    population: int = setting(16, counts("scores are compared within a generation", least=2),
-                              quick=3, about="members of a generation")  # fmt: skip
+    population: int = setting(
+        16,
+        counts("scores are compared within a generation", least=2),
+        quick=3,
+        about="members of a generation",
+    )
     max_rows: int = count(100_000, "transitions", quick=3000, about="transitions for a model")
     epochs: int = count(100, "epochs", quick=20, about="of a fit")
     agents: tuple[str, ...] = setting(("ddqn",), each_of(AGENTS), about=f"of {', '.join(AGENTS)}")
-    hparams: tuple[str, ...] = setting(HPARAMS, each_of(HPARAMS), about="of the agents; varied: "
-                                       "drawn for each")  # fmt: skip
+    hparams: tuple[str, ...] = setting(
+        HPARAMS, each_of(HPARAMS), about="of the agents; varied: drawn for each"
+    )
     num_agents: int = count(20, "agents", quick=2, about="for each model")
     test_episodes: int = count(10, "episodes", about="of each agent")
-    max_steps: int | None = setting(None, counts("an agent must train"), about="training steps of "
-                                    "an agent on a model; as on the SE")  # fmt: skip
+    max_steps: int | None = setting(
+        None,
+        counts("an agent must train"),
+        about="training steps of an agent on a model; as on the SE",
+    )
 
 
 def learning_config(settings: SupervisedBaseline, ses: Any) -> Any:
@@ -61,12 +71,20 @@ def learning_config(settings: SupervisedBaseline, ses: Any) -> Any:
     if settings.quick:
         agent = dataclasses.replace(agent, **se_agents.QUICK_AGENT)
         training = dataclasses.replace(training, max_steps=se_agents.QUICK_STEPS)
-    es = dataclasses.replace(config.es, population_size=settings.population,
-                             num_incumbent_evals=settings.population)  # fmt: skip
+    es = dataclasses.replace(
+        config.es, population_size=settings.population, num_incumbent_evals=settings.population
+    )
     return dataclasses.replace(
-        config, agent=agent, training=training, es=es, generations=settings.generations,
-        seed=settings.seed, num_seeds=1, devices=settings.devices, run_dir=None,
-    )  # fmt: skip
+        config,
+        agent=agent,
+        training=training,
+        es=es,
+        generations=settings.generations,
+        seed=settings.seed,
+        num_seeds=1,
+        devices=settings.devices,
+        run_dir=None,
+    )
 
 
 def collect_all(settings: SupervisedBaseline, ses: Any) -> list[pd.DataFrame]:
@@ -78,8 +96,11 @@ def collect_all(settings: SupervisedBaseline, ses: Any) -> list[pd.DataFrame]:
         seed = settings.seed + index
         make = functools.partial(collect, config, seed, settings.max_rows)
         rows = settings.pieces.compute(f"transitions-{index}", made_with | {"seed": seed}, make)
-        print(f"NES run {index}: {len(rows):,} transitions of episodes with mean return "
-              f"{rows['return'].mean():.1f}", flush=True)  # fmt: skip
+        print(
+            f"NES run {index}: {len(rows):,} transitions of episodes with mean return "
+            f"{rows['return'].mean():.1f}",
+            flush=True,
+        )
         tables.append(rows)
     return tables
 
@@ -107,7 +128,7 @@ class RecordedRun(NamedTuple):
 def make_recorded_run(config: Any) -> RecordedRun:
     """The NES run of a configuration, from any seed: compiled once for all of them."""
     from sejax.bilevel import make_program
-    from sejax.evaluation import lanes_on_cpu, make_evaluator, tested_throughout
+    from sejax.evaluation import make_evaluator, num_parallel_on_cpu, tested_throughout
 
     program = make_program(**config.parts())
     agent, proxy, training = program.agent, program.proxy, config.training
@@ -116,8 +137,10 @@ def make_recorded_run(config: Any) -> RecordedRun:
     evaluate = make_evaluator(agent, proxy, proxy.task, training, record=True)
     evaluate_all = spread_over_devices(
         lambda key, candidate: evaluate(key, proxy.params(program.unravel(candidate))),
-        config.devices, config.lanes, lanes_on_cpu(agent, training),
-    )  # fmt: skip
+        config.devices,
+        config.num_parallel,
+        num_parallel_on_cpu(agent, training),
+    )
 
     def generation(state: Any) -> Any:
         asked = program.ask(state)
@@ -137,12 +160,17 @@ def table_of(steps: Any, num_episodes: int, generation: int) -> pd.DataFrame:
     rewards = np.where(valid, steps.reward, 0).reshape(len(valid), num_episodes, -1)
     returns = np.broadcast_to(rewards.sum(axis=2, keepdims=True), rewards.shape)
     obs, next_obs = steps.obs[valid], steps.next_obs[valid]
-    return pd.DataFrame({
-        **{f"state_{i}": x for i, x in enumerate(obs.T)}, "action": steps.action[valid],
-        **{f"next_state_{i}": x for i, x in enumerate(next_obs.T)},
-        "reward": steps.reward[valid], "terminated": steps.terminated[valid].astype(int),
-        "return": returns.reshape(valid.shape)[valid], "generation": generation,
-    })  # fmt: skip
+    return pd.DataFrame(
+        {
+            **{f"state_{i}": x for i, x in enumerate(obs.T)},
+            "action": steps.action[valid],
+            **{f"next_state_{i}": x for i, x in enumerate(next_obs.T)},
+            "reward": steps.reward[valid],
+            "terminated": steps.terminated[valid].astype(int),
+            "return": returns.reshape(valid.shape)[valid],
+            "generation": generation,
+        }
+    )
 
 
 class Sample:
@@ -170,11 +198,14 @@ def summary_of(data: list[pd.DataFrame]) -> pd.DataFrame:
 
     Long episodes, which have many, count more in the mean.
     """
-    return pd.DataFrame({
-        "model": range(len(data)), "transitions": [len(rows) for rows in data],
-        "episode_return": [rows["return"].mean() for rows in data],
-        "ends": [rows["terminated"].mean() for rows in data],
-    })  # fmt: skip
+    return pd.DataFrame(
+        {
+            "model": range(len(data)),
+            "transitions": [len(rows) for rows in data],
+            "episode_return": [rows["return"].mean() for rows in data],
+            "ends": [rows["terminated"].mean() for rows in data],
+        }
+    )
 
 
 def model_file(settings: SupervisedBaseline, variant: str) -> Path:
@@ -185,13 +216,20 @@ def model_file(settings: SupervisedBaseline, variant: str) -> Path:
 def fit_piece(settings: SupervisedBaseline, ses: Any, data: list[pd.DataFrame]) -> pd.DataFrame:
     """Fits all models, stores both variants of them, and returns the errors of each epoch."""
     num_rows = min(len(rows) for rows in data)
-    made_with = {"proxy": ses.config["proxy"], "num_rows": num_rows,
-                 "learning_rate": LEARNING_RATE, "batch_size": BATCH_SIZE}  # fmt: skip
+    made_with = {
+        "proxy": ses.config["proxy"],
+        "num_rows": num_rows,
+        "learning_rate": LEARNING_RATE,
+        "batch_size": BATCH_SIZE,
+    }
     made_with |= settings.values("models", "epochs", "generations", "population", "seed")
     fits = settings.pieces.compute("fit", made_with, lambda: fit_all(settings, ses, data, num_rows))
     last = fits[fits["epoch"] == settings.epochs - 1].mean()
-    print(f"Models: mean squared error {last['error']:.2g} of [s', r], "
-          f"{last['done_error']:.2g} of the end", flush=True)  # fmt: skip
+    print(
+        f"Models: mean squared error {last['error']:.2g} of [s', r], "
+        f"{last['done_error']:.2g} of the end",
+        flush=True,
+    )
     return fits
 
 
@@ -205,11 +243,19 @@ def fit_all(settings: Any, ses: Any, data: list[pd.DataFrame], num_rows: int) ->
     initial, fitted, errors = jax.device_get(program(keys, *stacked))
     save_models(settings, ses, {**fitted, "done": initial["done"]}, "authors", "soft")
     save_models(settings, ses, fitted, "fair", "threshold")
-    return pd.concat([
-        pd.DataFrame({"model": i, "epoch": range(settings.epochs), "error": errors[i, :, 0],
-                      "done_error": errors[i, :, 1]})
-        for i in range(settings.models)
-    ])  # fmt: skip
+    return pd.concat(
+        [
+            pd.DataFrame(
+                {
+                    "model": i,
+                    "epoch": range(settings.epochs),
+                    "error": errors[i, :, 0],
+                    "done_error": errors[i, :, 1],
+                }
+            )
+            for i in range(settings.models)
+        ]
+    )
 
 
 def arrays_of(rows: pd.DataFrame) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -262,9 +308,11 @@ def make_fit(env: Any, num_rows: int, epochs: int) -> Callable[..., Any]:
 
 def save_models(settings: Any, ses: Any, weights: Any, variant: str, done: str) -> None:
     """Stores the models of a variant, as SEs with their use of the done output."""
-    env = plugins.make("proxy", dataclasses.replace(ses.env.config, done=done), ses.task)
+    env = registry.make("proxy", dataclasses.replace(ses.env.config, done=done), ses.task)
     each = [jax.tree.map(lambda x, i=i: x[i], weights) for i in range(settings.models)]
-    records = [{"generation": settings.generations, "seed": settings.seed + i}
-               for i in range(settings.models)]  # fmt: skip
-    config = ses.config | {"proxy": plugins.describe("proxy", env.config)}
+    records = [
+        {"generation": settings.generations, "seed": settings.seed + i}
+        for i in range(settings.models)
+    ]
+    config = ses.config | {"proxy": registry.describe("proxy", env.config)}
     sejax.save_set(model_file(settings, variant), env, each, records, config, ses.discount)

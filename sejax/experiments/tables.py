@@ -9,7 +9,7 @@ from rich.console import Console
 from rich.table import Table
 
 from sejax.experiments.settings import Settings
-from sejax.files import write_text
+from sejax.ops.files import write_text
 from sejax.statistics import bootstrap_interval, interquartile_mean
 
 LEAST_FOR_INTERVAL = 5  # independent values: two bracket the truth half of the time
@@ -54,19 +54,25 @@ def iqm_text(name: str) -> str:
 
 def iqm_note(where: str = "", of: str = "agents") -> str:
     """What is to be known of such columns, and within what is drawn."""
-    return (f" IQM: the interquartile mean over {of}, in brackets a stratified bootstrap 95% "
-            f"interval, which draws {' '.join(filter(None, (of, where)))}.")  # fmt: skip
+    return (
+        f" IQM: the interquartile mean over {of}, in brackets a stratified bootstrap 95% "
+        f"interval, which draws {' '.join(filter(None, (of, where)))}."
+    )
 
 
 def as_texts(
     summary: pd.DataFrame, columns: Mapping[str, str | Callable[[Any], Any]]
 ) -> pd.DataFrame:
     """A table of texts: each column is a format of the summary's, or a function of its row."""
-    return pd.DataFrame([
-        {name: how(row) if callable(how) else how.format_map(row._asdict())
-         for name, how in columns.items()}
-        for row in summary.itertuples(index=False)
-    ])  # fmt: skip
+    return pd.DataFrame(
+        [
+            {
+                name: how(row) if callable(how) else how.format_map(row._asdict())
+                for name, how in columns.items()
+            }
+            for row in summary.itertuples(index=False)
+        ]
+    )
 
 
 def publish(

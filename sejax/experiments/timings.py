@@ -20,7 +20,7 @@ import numpy as np
 import pandas as pd
 
 import sejax
-from sejax.app.runtime import available_cores
+from sejax.cli.runtime import available_cores
 from sejax.experiments import figures
 from sejax.experiments.experiment import Experiment
 from sejax.experiments.settings import Settings, count, each_of, setting
@@ -48,8 +48,12 @@ ROWS = {
     "halfcheetah-rn": Row("halfcheetah", "rn", 2000),
 }
 # Agents, episodes and batches that take seconds.
-QUICK = ["es.population_size=2", "es.num_incumbent_evals=2", "training.max_episodes=4",
-         "agent.init_episodes=1"]  # fmt: skip
+QUICK = [
+    "es.population_size=2",
+    "es.num_incumbent_evals=2",
+    "training.max_episodes=4",
+    "agent.warmup_episodes=1",
+]
 SETTINGS = {"paper": "the paper's", "best": "our default"}
 
 
@@ -83,15 +87,16 @@ def config_of(settings: Timings, row: Row, preset: str) -> Any:
     if row.proxy == "rn":  # the paper does not say which variant; this one needs two potentials
         overrides.append("proxy.variant=additive_potential")
     if settings.quick:
-        overrides += [word for word in QUICK
-                      if row.env != "cliff_walking" or "init_episodes" not in word]  # fmt: skip
+        overrides += [
+            word for word in QUICK if row.env != "cliff_walking" or "warmup_episodes" not in word
+        ]
     config = sejax.config(overrides)
     return dataclasses.replace(config, devices=settings.devices, seed=settings.seed)
 
 
 def time_generations(settings: Timings, row: Row, preset: str) -> pd.DataFrame:
     """Mean wall-clock of the first outer iterations, compiled before."""
-    from sejax.app import session
+    from sejax.cli import session
 
     chunks = session.make_chunks(config_of(settings, row, preset))
     program = chunks.program
@@ -105,10 +110,16 @@ def time_generations(settings: Timings, row: Row, preset: str) -> pd.DataFrame:
         wall.append(time.perf_counter() - started)
         cpu.append(time.process_time() - cpu_started)
         steps.append(int(jax.device_get(info).train_steps_total.item()))
-    return pd.DataFrame([{
-        "seconds": np.mean(wall), "cpu_seconds": np.mean(cpu),
-        "agents": program.strategy.num_candidates, "train_steps": np.mean(steps),
-    }])  # fmt: skip
+    return pd.DataFrame(
+        [
+            {
+                "seconds": np.mean(wall),
+                "cpu_seconds": np.mean(cpu),
+                "agents": program.strategy.num_candidates,
+                "train_steps": np.mean(steps),
+            }
+        ]
+    )
 
 
 def report(settings: Timings, timed: pd.DataFrame) -> pd.DataFrame:
@@ -120,20 +131,21 @@ def report(settings: Timings, timed: pd.DataFrame) -> pd.DataFrame:
         "settings": lambda row: SETTINGS[row.preset],
         f"paper, {PAPER_CORES} cores": lambda row: f"{ROWS[row.row].seconds:g} s",
         f"sejax, {cores} cores": lambda row: (
-            f"{row.seconds:{',.0f' if row.seconds >= 10 else '.2g'}} s"),
+            f"{row.seconds:{',.0f' if row.seconds >= 10 else '.2g'}} s"
+        ),
         "agents": "{agents}",
         "training steps": "{train_steps:,.0f}",
-        "CPU µs for a training step":
-            lambda row: f"{row.cpu_seconds / row.train_steps * 1e6:,.1f}",
-    }  # fmt: skip
+        "CPU µs for a training step": lambda row: f"{row.cpu_seconds / row.train_steps * 1e6:,.1f}",
+    }
     note = (
         f"The first {settings.generations} iterations of a run, compiled before. All tests on the "
         "real task are in them. For RNs of Cliff Walking and CartPole our default has the paper's "
         "agents and sizes. "
     )
     if settings.quick:
-        note += ("quick=true: a few agents with short trainings, not to be compared with the "
-                 "paper's. ")  # fmt: skip
+        note += (
+            "quick=true: a few agents with short trainings, not to be compared with the paper's. "
+        )
     title = "Seconds for one outer iteration of NES"
     return publish(settings, title, as_texts(timed, columns), timed, note.strip())
 
@@ -141,17 +153,25 @@ def report(settings: Timings, timed: pd.DataFrame) -> pd.DataFrame:
 def draw(settings: Timings, timed: pd.DataFrame) -> None:
     """Draws the seconds of each row beside the paper's."""
     rows = [ROWS[name] for name in timed["row"]]
-    names = [f"{row.env}\n{row.proxy.upper()}, {SETTINGS[preset]} settings"
-             for row, preset in zip(rows, timed["preset"], strict=True)]  # fmt: skip
+    names = [
+        f"{row.env}\n{row.proxy.upper()}, {SETTINGS[preset]} settings"
+        for row, preset in zip(rows, timed["preset"], strict=True)
+    ]
     places, cores = np.arange(len(names)), int(timed["cores"].iloc[0])
     path, size = settings.folder / "timings.png", (7, 0.9 + 0.55 * len(names))
     with figures.panels(path, 1, 1, size) as (figure, axes):
         axis = axes[0, 0]
         if not settings.quick:  # whose trainings are much shorter
-            axis.barh(places - 0.19, [row.seconds for row in rows], 0.36, color=figures.VARIED,
-                      label=f"paper, {PAPER_CORES} cores")  # fmt: skip
-        axis.barh(places + 0.19, timed["seconds"], 0.36, color=figures.REAL,
-                  label=f"sejax, {cores} cores")  # fmt: skip
+            axis.barh(
+                places - 0.19,
+                [row.seconds for row in rows],
+                0.36,
+                color=figures.VARIED,
+                label=f"paper, {PAPER_CORES} cores",
+            )
+        axis.barh(
+            places + 0.19, timed["seconds"], 0.36, color=figures.REAL, label=f"sejax, {cores} cores"
+        )
         axis.set(xscale="log", xlabel="seconds for an outer iteration")
         axis.set_yticks(places, names, fontsize=8)
         axis.invert_yaxis()

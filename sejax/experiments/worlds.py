@@ -16,12 +16,12 @@ import numpy as np
 import pandas as pd
 
 import sejax
-from sejax import plugins, serialize
+from sejax import registry, serialize
 from sejax.agents import NoExploration
-from sejax.app.progress import Tally
+from sejax.cli.progress import Tally
 from sejax.experiments import return_curves
 from sejax.experiments.settings import Settings
-from sejax.parallel import spread_over_devices
+from sejax.ops.parallel import spread_over_devices
 from sejax.training import TrainingConfig
 
 HPARAMS = ("varied", "default")
@@ -68,11 +68,15 @@ class World:
     def settings_of(self, group: Group) -> dict[str, Any]:
         """What a group's results depend on, beside the random numbers."""
         return {
-            "task": self.task.origin, "agent": plugins.describe("agent", self.agent),
-            "exploration": plugins.describe("exploration", self.exploration),
-            "training": serialize.to_plain(self.training), "hparams": self.hparams,
-            "group": group.name, "weights": group.fingerprint, **self.settings,
-        }  # fmt: skip
+            "task": self.task.origin,
+            "agent": registry.describe("agent", self.agent),
+            "exploration": registry.describe("exploration", self.exploration),
+            "training": serialize.to_plain(self.training),
+            "hparams": self.hparams,
+            "group": group.name,
+            "weights": group.fingerprint,
+            **self.settings,
+        }
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,9 +92,12 @@ class Measure:
 
 
 def train_groups(
-    world: World, settings: Settings, num_agents: int, measure: Measure | None = None,
+    world: World,
+    settings: Settings,
+    num_agents: int,
+    measure: Measure | None = None,
     at_once: int = 1,
-) -> pd.DataFrame:  # fmt: skip
+) -> pd.DataFrame:
     """Rows of all agents of a world, with a column `group`; trains the groups that are missing.
 
     The agents of the i-th group have the same seeds in every world: where hyperparameters are
@@ -119,13 +126,24 @@ def train_groups(
 
 
 def train(
-    world: World, settings: Settings, num_agents: int, measure: Measure, places: list[int],
+    world: World,
+    settings: Settings,
+    num_agents: int,
+    measure: Measure,
+    places: list[int],
     at_once: int,
-) -> list[pd.DataFrame]:  # fmt: skip
+) -> list[pd.DataFrame]:
     """The rows of the groups at these places; a program is compiled once for `at_once` of them."""
     program = make_program(
-        measure, world.agent, world.exploration, world.hparams, world.env, world.task,
-        world.training, settings.devices)  # fmt: skip
+        measure,
+        world.agent,
+        world.exploration,
+        world.hparams,
+        world.env,
+        world.task,
+        world.training,
+        settings.devices,
+    )
     padded = [*places, *[places[-1]] * (at_once - len(places))]
     key = jax.random.key(settings.seed)
     own_keys = [key if world.is_single else jax.random.fold_in(key, i) for i in padded]
@@ -146,15 +164,21 @@ def train(
 
 @functools.cache
 def make_program(
-    measure: Measure, agent: Any, exploration: Any, hparams: str, env: Any, task: Any,
-    training: TrainingConfig, devices: int | None,
-) -> Callable[..., Any]:  # fmt: skip
+    measure: Measure,
+    agent: Any,
+    exploration: Any,
+    hparams: str,
+    env: Any,
+    task: Any,
+    training: TrainingConfig,
+    devices: int | None,
+) -> Callable[..., Any]:
     """Builds `program(keys [agent], params, active [agent]) -> (results, drawn)`, `[agent, ...]`.
 
     The leaves of `params` are `[group, ...]`; the agents of a group follow one another. Nothing is
     computed for an agent that is not active.
     """
-    from sejax.evaluation import lanes_on_cpu
+    from sejax.evaluation import num_parallel_on_cpu
 
     made = sejax.make_agent(agent, task, exploration, hparams == "varied")
     run = measure.make_run(made, env, task, training)
@@ -168,7 +192,9 @@ def make_program(
             return run(key, mine, active), made.drawn_values(key)
 
         groups = np.repeat(np.arange(num_groups), keys.shape[0] // num_groups)
-        spread = spread_over_devices(one, devices, cpu_lanes=lanes_on_cpu(made, training))
+        spread = spread_over_devices(
+            one, devices, cpu_num_parallel=num_parallel_on_cpu(made, training)
+        )
         return spread(keys, jax.numpy.asarray(groups), active)
 
     return jax.jit(program)
@@ -197,14 +223,17 @@ def training_as_learned(proxies: Any, agent: Any) -> TrainingConfig:
 def outcome_rows(outcome: Any, drawn: dict[str, np.ndarray]) -> pd.DataFrame:
     """A row for each agent, with a column for each test episode and each drawn hyperparameter."""
     returns = outcome.test_returns.astype(float)
-    return pd.DataFrame({
-        "agent": range(len(returns)), "test_return": returns.mean(axis=1),
-        "nonfinite": outcome.nonfinite | ~np.isfinite(returns).all(axis=1),
-        "train_episodes": outcome.train_episodes.astype(float),
-        "train_steps": outcome.train_steps.astype(float),
-        **{f"return_{i}": x for i, x in enumerate(returns.T)},
-        **{name: x.astype(float) for name, x in drawn.items()},
-    })  # fmt: skip
+    return pd.DataFrame(
+        {
+            "agent": range(len(returns)),
+            "test_return": returns.mean(axis=1),
+            "nonfinite": outcome.nonfinite | ~np.isfinite(returns).all(axis=1),
+            "train_episodes": outcome.train_episodes.astype(float),
+            "train_steps": outcome.train_steps.astype(float),
+            **{f"return_{i}": x for i, x in enumerate(returns.T)},
+            **{name: x.astype(float) for name, x in drawn.items()},
+        }
+    )
 
 
 def worst_for_diverged(rows: pd.DataFrame, name: str) -> pd.DataFrame:
@@ -217,8 +246,11 @@ def worst_for_diverged(rows: pd.DataFrame, name: str) -> pd.DataFrame:
     returns = ["test_return", *return_columns(rows)]
     worst = float(rows[returns].min(axis=None))
     count = len(rows[lost].groupby([key for key in ("group", "agent") if key in rows]))
-    print(f"{name}: {count} agents diverged; their tests count as the worst return seen there, "
-          f"{worst:.1f}.", flush=True)  # fmt: skip
+    print(
+        f"{name}: {count} agents diverged; their tests count as the worst return seen there, "
+        f"{worst:.1f}.",
+        flush=True,
+    )
     return rows.fillna(dict.fromkeys(returns, worst))
 
 
@@ -263,11 +295,15 @@ def curve_rows(curves: tuple[np.ndarray, np.ndarray], drawn: Any = None) -> pd.D
 
 
 OUTCOMES = Measure(
-    make_run=lambda *args: sejax.make_evaluator(*args), to_table=outcome_rows,
-    say=lambda rows: (f"mean return {rows['test_return'].mean():.1f} after "
-                      f"{rows['train_steps'].mean():,.0f} steps"),
-)  # fmt: skip
+    make_run=lambda *args: sejax.make_evaluator(*args),
+    to_table=outcome_rows,
+    say=lambda rows: (
+        f"mean return {rows['test_return'].mean():.1f} after "
+        f"{rows['train_steps'].mean():,.0f} steps"
+    ),
+)
 CURVES = Measure(
-    make_run=make_curves, to_table=curve_rows,
+    make_run=make_curves,
+    to_table=curve_rows,
     say=lambda rows: f"last test returns {return_curves.last_returns(rows).mean():.1f}",
-)  # fmt: skip
+)

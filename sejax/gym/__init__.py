@@ -24,8 +24,18 @@ from sejax.gym.tasks import GYMNASIUM_IDS, RealTask
 from sejax.gym.vector import SyntheticVectorEnv
 
 __all__ = [
-    "GYMNASIUM_IDS", "GridWorld", "RealTask", "RewardNetwork", "SyntheticEnv",
-    "SyntheticVectorEnv", "SyntheticWorld", "gymnasium", "make", "make_sb3", "make_vec", "register",
-]  # fmt: skip
+    "GYMNASIUM_IDS",
+    "GridWorld",
+    "RealTask",
+    "RewardNetwork",
+    "SyntheticEnv",
+    "SyntheticVectorEnv",
+    "SyntheticWorld",
+    "gymnasium",
+    "make",
+    "make_sb3",
+    "make_vec",
+    "register",
+]
 
 register()

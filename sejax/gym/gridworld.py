@@ -50,9 +50,10 @@ class GridWorld(gymnasium.Env[int, int]):
         self.observation_space = spaces.Discrete(len("".join(self._rows)))
         self.action_space = spaces.Discrete(len(MOVES))
         self.spec = EnvSpec(
-            id=name, entry_point=f"{__name__}:GridWorld",
+            id=name,
+            entry_point=f"{__name__}:GridWorld",
             kwargs={"name": name, "goal_reward": goal_reward},
-        )  # fmt: skip
+        )
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None

@@ -96,8 +96,10 @@ def check(weights: Mapping[str, np.ndarray], shapes: Shapes) -> None:
     Raises:
       ConfigError: if they are not, not float32, or not finite.
     """
-    there = {name: x.shape if x.dtype == np.float32 else (x.dtype, x.shape)
-             for name, x in weights.items()}  # fmt: skip
+    there = {
+        name: x.shape if x.dtype == np.float32 else (x.dtype, x.shape)
+        for name, x in weights.items()
+    }
     if there != shapes or not all(np.isfinite(x).all() for x in weights.values()):
         what = "numbers that are not finite" if there == shapes else shortened(there)
         raise ConfigError(

@@ -10,7 +10,7 @@ import numpy as np
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
 
-from sejax import plugins
+from sejax import registry
 from sejax.errors import ConfigError, as_python, require, whole
 from sejax.gym.reward import RewardNetwork
 from sejax.gym.source import Source, read
@@ -157,9 +157,11 @@ def register() -> list[str]:
 def _spec(name: str, **kwargs: Any) -> EnvSpec:
     """How Gymnasium makes it; without `max_episode_steps`, a second time limit by a wrapper."""
     return EnvSpec(
-        id=f"{NAMESPACE}/{name}", entry_point="sejax.gym:make",
-        vector_entry_point="sejax.gym:make_vec", kwargs=kwargs,
-    )  # fmt: skip
+        id=f"{NAMESPACE}/{name}",
+        entry_point="sejax.gym:make",
+        vector_entry_point="sejax.gym:make_vec",
+        kwargs=kwargs,
+    )
 
 
 def _count(num_envs: Any) -> int:
@@ -170,8 +172,14 @@ def _count(num_envs: Any) -> int:
 
 def _require_no_picture(render_mode: str | None) -> None:
     # Stable-Baselines3's make_vec_env asks for rgb_array, whether anybody will look or not.
-    require(render_mode in (None, "rgb_array"), "render_mode", "be None for an SE", "its states "
-            "have no picture", render_mode, "render_mode=None")  # fmt: skip
+    require(
+        render_mode in (None, "rgb_array"),
+        "render_mode",
+        "be None for an SE",
+        "its states have no picture",
+        render_mode,
+        "render_mode=None",
+    )
 
 
 def _is_rn(header: Mapping[str, Any]) -> bool:
@@ -182,25 +190,40 @@ def _world(
     weights: Mapping[str, np.ndarray], header: Mapping[str, Any], task: RealTask | str | None
 ) -> SyntheticWorld:
     """What a file of an SE holds."""
-    config = plugins.configure("proxy", header["config"]["proxy"])
+    config = registry.configure("proxy", header["config"]["proxy"])
     limit = step_limit(header)
     if isinstance(task, str):
         task = RealTask.of_gymnasium(task, limit)
-    require(task is None or isinstance(task, RealTask), "task", "be a sejax.gym.RealTask, or an id "
-            "of Gymnasium", "an SE takes its spaces from there", type(task).__name__,
-            "task=sejax.gym.RealTask.of_env(env)")  # fmt: skip
+    require(
+        task is None or isinstance(task, RealTask),
+        "task",
+        "be a sejax.gym.RealTask, or an id of Gymnasium",
+        "an SE takes its spaces from there",
+        type(task).__name__,
+        "task=sejax.gym.RealTask.of_env(env)",
+    )
     if task is None:
         task = real_task(header, needs_starts=config.needs_task)
     elif "interface" in header:
         learned = RealTask.of_interface(header["interface"]).action_space
-        require(is_close(task.action_space, learned), "task", f"have the actions that the SE was "
-                f"learned with, {learned}", "others mean something else to its networks",
-                task.action_space, "task to one with these, as gymnasium.wrappers.RescaleAction "
-                "makes of the real environment")  # fmt: skip
+        require(
+            is_close(task.action_space, learned),
+            "task",
+            f"have the actions that the SE was learned with, {learned}",
+            "others mean something else to its networks",
+            task.action_space,
+            "task to one with these, as gymnasium.wrappers.RescaleAction "
+            "makes of the real environment",
+        )
     own = task.max_steps if limit is None else limit
-    require(config.max_steps(task.max_steps) == config.max_steps(own), "task", f"have the "
-            f"max_steps that the SE was learned with, {own}", "its episodes end there",
-            task.max_steps, f"task=dataclasses.replace(task, max_steps={own})")  # fmt: skip
+    require(
+        config.max_steps(task.max_steps) == config.max_steps(own),
+        "task",
+        f"have the max_steps that the SE was learned with, {own}",
+        "its episodes end there",
+        task.max_steps,
+        f"task=dataclasses.replace(task, max_steps={own})",
+    )
     return SyntheticWorld(weights, config, task)
 
 
@@ -208,9 +231,14 @@ def _real_env(
     header: Mapping[str, Any], task: RealTask | str | None, render_mode: str | None
 ) -> gymnasium.Env[Any, Any]:
     """The task of an RN."""
-    require(not isinstance(task, RealTask), "task", "be an id of Gymnasium for a reward network",
-            "its dynamics are the real task's", task,
-            "sejax.gym.RewardNetwork(env, source)")  # fmt: skip
+    require(
+        not isinstance(task, RealTask),
+        "task",
+        "be an id of Gymnasium for a reward network",
+        "its dynamics are the real task's",
+        task,
+        "sejax.gym.RewardNetwork(env, source)",
+    )
     if isinstance(task, str):
         return make_gymnasium(task, render_mode=render_mode)
     env = real_env(header["config"]["env"], render_mode)

@@ -10,7 +10,7 @@ from gymnasium.envs.toy_text.cliffwalking import CliffWalkingEnv
 from gymnasium.utils import RecordConstructorArgs
 from gymnasium.wrappers import DtypeObservation, FlattenObservation
 
-from sejax import plugins
+from sejax import registry
 from sejax.errors import ConfigError, as_python, fraction, require
 from sejax.gym import networks
 from sejax.gym.source import Source, read
@@ -18,10 +18,23 @@ from sejax.gym.tasks import RealTask, num_categories, vector_size
 from sejax.proxies import ABSURD
 from sejax.proxies.configs import RewardConfig
 
-_PLANE = ("x_position", "y_position", "distance_from_origin", "x_velocity", "y_velocity",
-          "reward_forward", "reward_ctrl")  # fmt: skip
-_LEG = ("x_position", "x_velocity", "z_distance_from_origin", "reward_forward", "reward_ctrl",
-        "reward_survive")  # fmt: skip
+_PLANE = (
+    "x_position",
+    "y_position",
+    "distance_from_origin",
+    "x_velocity",
+    "y_velocity",
+    "reward_forward",
+    "reward_ctrl",
+)
+_LEG = (
+    "x_position",
+    "x_velocity",
+    "z_distance_from_origin",
+    "reward_forward",
+    "reward_ctrl",
+    "reward_survive",
+)
 SAME_NUMBERS = (DtypeObservation, FlattenObservation)  # wrappers that change no number
 # `sejax.Task.info_keys` and `augmented_keys` by the names that Gymnasium has for them.
 INFO_KEYS: dict[str, tuple[str, ...]] = {
@@ -86,21 +99,29 @@ class RewardNetwork(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
         limit_is_terminal: bool = False,
     ):
         RecordConstructorArgs.__init__(
-            self, source=str(source), discount=discount, info_keys=info_keys,
+            self,
+            source=str(source),
+            discount=discount,
+            info_keys=info_keys,
             limit_is_terminal=limit_is_terminal,
-        )  # fmt: skip
+        )
         super().__init__(env)
         weights, header = read(source, "rn")
-        self.config: RewardConfig = plugins.configure("proxy", header["config"]["proxy"])
+        self.config: RewardConfig = registry.configure("proxy", header["config"]["proxy"])
         discount = as_python(discount)
         if discount is not None:
             fraction("discount", discount, header["discount"])
         self.discount = float(header["discount"] if discount is None else discount)
         self.limit_is_terminal = limit_is_terminal
-        require(not isinstance(env.unwrapped, CliffWalkingEnv), "env", "be sejax's Cliff Walking",
-                "in Gymnasium's, falling off the cliff ends no episode and actions are numbered "
-                "otherwise", env,
-                f"env=sejax.gym.make({str(source)!r}), which is whole")  # fmt: skip
+        require(
+            not isinstance(env.unwrapped, CliffWalkingEnv),
+            "env",
+            "be sejax's Cliff Walking",
+            "in Gymnasium's, falling off the cliff ends no episode and actions are numbered "
+            "otherwise",
+            env,
+            f"env=sejax.gym.make({str(source)!r}), which is whole",
+        )
         self._info_keys = self._keys(header["task"], info_keys)
         obs_dim = vector_size(env.observation_space, "env.observation_space")
         self._num_states = num_categories(env.observation_space)
@@ -202,22 +223,40 @@ class RewardNetwork(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
 def _require_task(env: gymnasium.Env[Any, Any], learned: RealTask, name: str) -> None:
     """Checks that an environment is of a task, as far as its spaces and wrappers tell."""
     wanted, fix = learned.observation_space, f"env to an environment of {name}"
-    require(_kind(env.observation_space) == _kind(wanted), "env",
-            f"have observations such as those of {name}, {wanted}", "the network sees them",
-            env.observation_space, fix)  # fmt: skip
+    require(
+        _kind(env.observation_space) == _kind(wanted),
+        "env",
+        f"have observations such as those of {name}, {wanted}",
+        "the network sees them",
+        env.observation_space,
+        fix,
+    )
     layers = list(_layers(env))
     # Wrappers may make actions of one kind of another: some layer has the task's.
     acts = {_kind(layer.action_space) for layer in layers}
-    require(not acts.isdisjoint({_kind(learned.action_space), None}), "env",
-            f"have actions such as those of {name}, {learned.action_space}", "it is another task "
-            "otherwise", env.action_space, fix)  # fmt: skip
+    require(
+        not acts.isdisjoint({_kind(learned.action_space), None}),
+        "env",
+        f"have actions such as those of {name}, {learned.action_space}",
+        "it is another task otherwise",
+        env.action_space,
+        fix,
+    )
     if _kind(layers[-1].observation_space) != _kind(wanted):
         return  # a wrapper makes them what the network sees
-    odd = [each for each in layers if isinstance(each, gymnasium.ObservationWrapper)
-           and not isinstance(each, SAME_NUMBERS)]  # fmt: skip
-    require(not odd, "env", f"have the observations of {name} as they are", "the network has seen "
-            "no others", odd[0] if odd else env, "gymnasium.wrappers that change observations "
-            "around RewardNetwork, not below it")  # fmt: skip
+    odd = [
+        each
+        for each in layers
+        if isinstance(each, gymnasium.ObservationWrapper) and not isinstance(each, SAME_NUMBERS)
+    ]
+    require(
+        not odd,
+        "env",
+        f"have the observations of {name} as they are",
+        "the network has seen no others",
+        odd[0] if odd else env,
+        "gymnasium.wrappers that change observations around RewardNetwork, not below it",
+    )
 
 
 def _layers(env: gymnasium.Env[Any, Any]) -> Iterator[gymnasium.Env[Any, Any]]:

@@ -25,11 +25,21 @@ def read(source: Source, kind: str | None = None) -> tuple[dict[str, np.ndarray]
     """
     path = stored.find(source)
     weights, header = stored.read(path, "source")
-    require(not header["is_set"], "source", "be a single proxy", "an agent trains in one world",
-            f"{path}, a set", "source to a run directory")  # fmt: skip
+    require(
+        not header["is_set"],
+        "source",
+        "be a single proxy",
+        "an agent trains in one world",
+        f"{path}, a set",
+        "source to a run directory",
+    )
     there, wanted = header["config"]["proxy"].get("name"), [kind] if kind else list(KINDS)
-    require(there in wanted, "source", f"be {' or '.join(KINDS[each] for each in wanted)}",
-            "this takes its networks" if kind else "other proxies are JAX code",
-            f"proxy={shortened(there)} in {path}",
-            "source to such a proxy; sejax.load reads all proxies")  # fmt: skip
+    require(
+        there in wanted,
+        "source",
+        f"be {' or '.join(KINDS[each] for each in wanted)}",
+        "this takes its networks" if kind else "other proxies are JAX code",
+        f"proxy={shortened(there)} in {path}",
+        "source to such a proxy; sejax.load reads all proxies",
+    )
     return weights, header

@@ -70,9 +70,14 @@ class SyntheticWorld:
             space = task.observation_space
             self._units = units_of(space.low.ravel(), space.high.ravel(), self.obs_dim)
         self._starts = task.starts
-        require(self._starts or config.initial_state != "real", "task.starts", "be given for an SE "
-                "whose initial states are the real task's", "episodes begin there", None,
-                "RealTask(starts=...)")  # fmt: skip
+        require(
+            self._starts or config.initial_state != "real",
+            "task.starts",
+            "be given for an SE whose initial states are the real task's",
+            "episodes begin there",
+            None,
+            "RealTask(starts=...)",
+        )
         self._one_hot = np.eye(action_dim, dtype=np.float32)
 
     @property

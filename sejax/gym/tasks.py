@@ -9,7 +9,7 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.wrappers import TimeLimit
 
-from sejax import plugins, serialize
+from sejax import registry, serialize
 from sejax.errors import ConfigError, require, shortened, told
 from sejax.gym.gridworld import MAPS, GridWorld
 
@@ -69,9 +69,11 @@ class RealTask:
     @classmethod
     def of_interface(cls, interface: Mapping[str, Any]) -> "RealTask":
         """What a proxy's file says of its task, `sejax.Task.interface`; it has no `starts`."""
-        return cls(observation_space=_space(interface["observation"]),
-                   action_space=_space(interface["action"]),
-                   max_steps=interface["max_steps"])  # fmt: skip
+        return cls(
+            observation_space=_space(interface["observation"]),
+            action_space=_space(interface["action"]),
+            max_steps=interface["max_steps"],
+        )
 
     @classmethod
     def of_env(cls, env: gymnasium.Env[Any, Any]) -> "RealTask":
@@ -81,12 +83,20 @@ class RealTask:
           ConfigError: if it has no such limit.
         """
         limit = env.spec.max_episode_steps if env.spec else None
-        require(limit, "task", "have a step limit", "an episode of an SE may never end by itself",
-                env, "max_steps")  # fmt: skip
+        require(
+            limit,
+            "task",
+            "have a step limit",
+            "an episode of an SE may never end by itself",
+            env,
+            "max_steps",
+        )
         return cls(
-            observation_space=env.observation_space, action_space=env.action_space,
-            max_steps=int(limit or 0), starts=_EnvStarts(env),
-        )  # fmt: skip
+            observation_space=env.observation_space,
+            action_space=env.action_space,
+            max_steps=int(limit or 0),
+            starts=_EnvStarts(env),
+        )
 
 
 class _EnvStarts:
@@ -141,7 +151,7 @@ def real_env(
         return None
     # Gymnasium takes more options, such as the path of a model: what a file says is read as
     # everywhere, by the fields that the task has here.
-    spec = plugins.configure("env", config)
+    spec = registry.configure("env", config)
     options = serialize.to_plain(spec)
     if options.pop("backend", "mujoco") not in GYMNASIUM_BACKENDS:
         return None
@@ -168,7 +178,7 @@ def real_task(header: Mapping[str, Any], needs_starts: bool) -> RealTask:
         return RealTask.of_env(env)
     gymnax_id = str(config.get("name")).removeprefix(PREFIX)
     if gymnax_id != config.get("name") and gymnax_id in gymnasium.registry:
-        return RealTask.of_gymnasium(gymnax_id, plugins.configure("env", config).max_steps)
+        return RealTask.of_gymnasium(gymnax_id, registry.configure("env", config).max_steps)
     raise unknown_task(config, "sejax.gym.make(source, task=sejax.gym.RealTask(...))")
 
 
@@ -179,7 +189,7 @@ def step_limit(header: Mapping[str, Any]) -> int | None:
     config = header["config"]["env"]
     if config.get("name") not in (*GYMNASIUM_IDS, *MAPS):
         return None
-    return int(plugins.configure("env", config).facts.max_steps)
+    return int(registry.configure("env", config).facts.max_steps)
 
 
 def unknown_task(config: Mapping[str, Any], fix: str) -> ConfigError:
@@ -228,6 +238,12 @@ def vector_size(space: spaces.Space[Any], name: str) -> int:
     """
     is_index = isinstance(space, spaces.Discrete) and space.start == 0
     is_vector = isinstance(space, spaces.Box) and len(space.shape) == 1
-    require(is_index or is_vector, name, "be a Box of vectors or a Discrete from 0", "networks "
-            "take vectors", space, f"{name} to what `sejax.Task` has")  # fmt: skip
+    require(
+        is_index or is_vector,
+        name,
+        "be a Box of vectors or a Discrete from 0",
+        "networks take vectors",
+        space,
+        f"{name} to what `sejax.Task` has",
+    )
     return num_categories(space) or int(space.shape[0])  # type: ignore[index]

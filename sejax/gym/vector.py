@@ -84,11 +84,22 @@ class SyntheticVectorEnv(VectorEnv[Any, Any, np.ndarray]):
         """
         seeds = self._listed(seed)
         mask = np.asarray((options or {}).get("reset_mask", np.ones(self.num_envs, np.bool_)))
-        require(len(seeds) == self.num_envs, "seed", "have an entry for each lane", "each has a "
-                "generator of its own", f"{len(seeds)} for {self.num_envs}", "seed=0")  # fmt: skip
-        require(mask.shape == (self.num_envs,) and mask.dtype == np.bool_, "options.reset_mask",
-                "be a bool for each lane", "it says which begin anew", f"{mask.dtype} {mask.shape} "
-                f"for {self.num_envs}", "options={'reset_mask': ended}")  # fmt: skip
+        require(
+            len(seeds) == self.num_envs,
+            "seed",
+            "have an entry for each lane",
+            "each has a generator of its own",
+            f"{len(seeds)} for {self.num_envs}",
+            "seed=0",
+        )
+        require(
+            mask.shape == (self.num_envs,) and mask.dtype == np.bool_,
+            "options.reset_mask",
+            "be a bool for each lane",
+            "it says which begin anew",
+            f"{mask.dtype} {mask.shape} for {self.num_envs}",
+            "options={'reset_mask': ended}",
+        )
         lanes = np.flatnonzero(mask)
         for lane in lanes:
             if self._rngs[lane] is None or seeds[lane] is not None:
@@ -138,10 +149,12 @@ class SyntheticVectorEnv(VectorEnv[Any, Any, np.ndarray]):
         for lane in np.flatnonzero(ended):
             final_obs[lane] = obs[lane]
         return {
-            "final_obs": final_obs, "_final_obs": ended,
-            "final_info": _told(discounts, ended), "_final_info": ended.copy(),
+            "final_obs": final_obs,
+            "_final_obs": ended,
+            "final_info": _told(discounts, ended),
+            "_final_info": ended.copy(),
             **_told(discounts, ~ended),
-        }  # fmt: skip
+        }
 
     def _begin(self, lanes: np.ndarray) -> None:
         """Puts lanes at the beginning of an episode."""

@@ -7,7 +7,7 @@ it, how often, or in which order: the numbers are those of a single process.
 
 ================== ================================================================================
 `configs.py`       what `machines=` chooses: `local` or `ray`
-`chunks.py`        generations of a run whose trainings are elsewhere, for `sejax.app.session`
+`chunks.py`        generations of a run whose trainings are elsewhere, for `sejax.cli.session`
 `handout.py`       who gets which share; workers that die, hang, lie, come and go
 `scorer.py`        a worker: the compiled trainings
 `ray_crew.py`      workers as Ray's actors

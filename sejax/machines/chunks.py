@@ -12,13 +12,13 @@ from sejax.machines.handout import HandOut, Share
 from sejax.machines.ledger import Ledger
 from sejax.machines.scorer import Work
 from sejax.objectives import Outcome
-from sejax.parallel import compiler_options
+from sejax.ops.parallel import compiler_options
 
 CAPACITY = 16  # trials in a share at most: on a CPU core they follow one another
 
 
 class RemoteChunks:
-    """In the place of `sejax.app.session.Chunks`: a generation's trainings are handed out.
+    """In the place of `sejax.cli.session.Chunks`: a generation's trainings are handed out.
 
     The strategy and its state stay here. A generation gives the numbers of `Program.generation` to
     the last bit, where the workers' CPUs are of this one's kind.
@@ -101,9 +101,12 @@ class RemoteChunks:
         def work_of(share: Share) -> Work:
             seeds, trials = np.divmod(share.places, num_trials)
             return Work(
-                share.family, keys[seeds, trials], candidates[seeds, trials], active[seeds],
+                share.family,
+                keys[seeds, trials],
+                candidates[seeds, trials],
+                active[seeds],
                 None if test_steps is None else test_steps[seeds],
-            )  # fmt: skip
+            )
 
         def problem_of(share: Share, scored: Any) -> str | None:
             return problem(scored, shapes, len(share.places))
@@ -139,9 +142,12 @@ class RemoteChunks:
         keys = jax.random.split(jax.random.key(0), 1)
         test_steps = jax.eval_shape(program.test_steps, state)
         one: Outcome = jax.eval_shape(
-            program.share_of(0), keys, jnp.zeros((1, program.num_dims)), jnp.ones(1, bool),
+            program.share_of(0),
+            keys,
+            jnp.zeros((1, program.num_dims)),
+            jnp.ones(1, bool),
             test_steps and jax.ShapeDtypeStruct((1,), test_steps.dtype),
-        )  # fmt: skip
+        )
         return jax.tree.map(
             lambda x: jax.ShapeDtypeStruct((num_seeds, num_trials, *x.shape[1:]), x.dtype), one
         )

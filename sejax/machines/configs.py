@@ -19,8 +19,8 @@ class LocalConfig(Options):
     def make(
         self, config: Any, folder: Path, say: Callable[[str], None]
     ) -> contextlib.AbstractContextManager[Any]:
-        """The generations of a run, as `sejax.app.session.Chunks`."""
-        from sejax.app import session
+        """The generations of a run, as `sejax.cli.session.Chunks`."""
+        from sejax.cli import session
 
         return contextlib.nullcontext(session.make_chunks(config))
 
@@ -43,7 +43,7 @@ class RayConfig(Options):
     def make(
         self, config: Any, folder: Path, say: Callable[[str], None]
     ) -> contextlib.AbstractContextManager[Any]:
-        """The generations of a run, as `sejax.app.session.Chunks`."""
+        """The generations of a run, as `sejax.cli.session.Chunks`."""
         from sejax.machines import ray_crew
 
         return ray_crew.chunks_of(self, config, folder, say)

@@ -107,7 +107,7 @@ class HandOut:
         self,
         crew: Crew,
         capacities: Sequence[int],
-        lanes: Sequence[int],
+        num_parallel: Sequence[int],
         patience_s: float = 3600.0,
         say: Callable[[str], None] = lambda text: None,
         clock: Callable[[], float] = time.monotonic,
@@ -117,12 +117,12 @@ class HandOut:
         Args:
           crew: the workers.
           capacities: most trials in a share, by family.
-          lanes: trials in lockstep, by family; so many take as long as a single one.
+          num_parallel: trials in lockstep, by family; so many take as long as a single one.
           patience_s: seconds that a worker may take while nobody has shown how long it takes.
           say: told what a person should know.
           clock: seconds.
         """
-        self._crew, self._capacities, self._lanes = crew, capacities, lanes
+        self._crew, self._capacities, self._lanes = crew, capacities, num_parallel
         self._patience_s, self._say, self._clock = patience_s, say, clock
         self._hands: dict[Hashable, _Hand] = {}
         self._known: dict[Hashable, About] = {}
@@ -238,8 +238,11 @@ class HandOut:
         is_anyone_idle = any(h.about and h.share is None for h in self._hands.values())
         came = self._crew.wait(LOOK_S / 10 if is_anyone_idle else LOOK_S)
         now = self._clock()
-        came += [(worker, TimeoutError("it does not answer")) for worker in self._hanging(now)
-                 if worker not in dict(came)]  # fmt: skip
+        came += [
+            (worker, TimeoutError("it does not answer"))
+            for worker in self._hanging(now)
+            if worker not in dict(came)
+        ]
         ended = []
         for worker, what in came:
             hand = self._hands.get(worker)
@@ -259,8 +262,9 @@ class HandOut:
         return ended
 
     def _hanging(self, now: float) -> list[Hashable]:
-        return [worker for worker, hand in self._hands.items()
-                if now - hand.since > self._limit(hand)]  # fmt: skip
+        return [
+            worker for worker, hand in self._hands.items() if now - hand.since > self._limit(hand)
+        ]
 
     def _limit(self, hand: _Hand) -> float:
         """Seconds that a worker may take for what it does."""
@@ -285,8 +289,9 @@ class HandOut:
             self._say(
                 f"None of {len(self._hands)} workers is ready yet: they compile, or other jobs "
                 f"hold what they need (ray status). Waiting for one."
-                if self._hands else "No machine has room for a worker; waiting for one."
-            )  # fmt: skip
+                if self._hands
+                else "No machine has room for a worker; waiting for one."
+            )
 
     def _start_failed(self, hand: _Hand, error: Exception, now: float) -> None:
         if hand.since >= self._start_failed_at:  # those before may have gone with one node
@@ -301,8 +306,10 @@ class HandOut:
                 f"{MOST_FAILURES} did not: {told(error)}. Install what the driver has on each."
             ) from error
         if self._failed_starts == MOST_FAILURES and self._start_failed_at == now:
-            self._say(f"No more workers are started, as the last {MOST_FAILURES} did not get ready "
-                      f"({told(error)}).")  # fmt: skip
+            self._say(
+                f"No more workers are started, as the last {MOST_FAILURES} did not get ready "
+                f"({told(error)})."
+            )
 
     def _dismiss(self, worker: Hashable) -> None:
         if self._hands.pop(worker, None) is not None:
@@ -313,11 +320,11 @@ class _Plan:
     """The shares of a generation: not cut yet, given to workers, to be given again, done."""
 
     def __init__(
-        self, families: Sequence[np.ndarray], capacities: Sequence[int], lanes: Sequence[int]
+        self, families: Sequence[np.ndarray], capacities: Sequence[int], num_parallel: Sequence[int]
     ):
         self.outcomes: list[tuple[Share, Any]] = []
         self._left = [np.asarray(places) for places in families]
-        self._capacities, self._lanes = capacities, lanes
+        self._capacities, self._lanes = capacities, num_parallel
         self._again: deque[Share] = deque()
         self._holders: dict[Share, int] = {}  # workers that have a share which is not done
 
@@ -371,6 +378,6 @@ class _Plan:
             self._again.append(share)
 
 
-def _whole(num_trials: int, lanes: int) -> int:
+def _whole(num_trials: int, num_parallel: int) -> int:
     """As many trials in whole groups of lanes."""
-    return lanes * -(-num_trials // lanes)
+    return num_parallel * -(-num_trials // num_parallel)

@@ -39,10 +39,15 @@ class Ledger:
           OSError: if the file cannot be written.
         """
         rows = [
-            (generation, f"{wall_s:.3f}", about[worker].node, about[worker].pid,
-             *(f"{x:.3f}" if isinstance(x, float) else x for x in dataclasses.astuple(each)))
+            (
+                generation,
+                f"{wall_s:.3f}",
+                about[worker].node,
+                about[worker].pid,
+                *(f"{x:.3f}" if isinstance(x, float) else x for x in dataclasses.astuple(each)),
+            )
             for worker, each in done.items()
-        ]  # fmt: skip
+        ]
         with self._path.open("a", encoding="utf-8") as file:
             if file.tell() == 0:
                 file.write(",".join(COLUMNS) + "\n")

@@ -33,7 +33,7 @@ def chunks_of(
     Raises:
       ConfigError: if the cluster cannot be reached, or has nothing to compute on.
     """
-    from sejax.app import build, runtime
+    from sejax.cli import build, runtime
 
     runtime.take_share_of_gpu(0)  # all of them are the workers'
     from sejax.bilevel import make_program
@@ -41,9 +41,9 @@ def chunks_of(
     program = make_program(**config.parts() | {"devices": 1})
     with connected():
         num_workers = require_workers(machines)
-        capacities, lanes = shares_of(config, program, machines, num_workers)
+        capacities, num_parallel = shares_of(config, program, machines, num_workers)
         crew = RayCrew(machines, build.to_plain(config), capacities)
-        hand_out = HandOut(crew, capacities, lanes, machines.patience_s, say)
+        hand_out = HandOut(crew, capacities, num_parallel, machines.patience_s, say)
         with RemoteChunks(program, hand_out, Ledger(folder)) as chunks:
             yield chunks
 
@@ -102,12 +102,12 @@ def shares_of(
     there are. A worker with a GPU takes its part of a generation at once.
     """
     capacities, widths = [], []
-    for family, cpu_lanes in enumerate(program.cpu_lanes):
-        lanes, capacity = config.lanes or cpu_lanes, CAPACITY
+    for family, cpu_num_parallel in enumerate(program.cpu_num_parallel):
+        num_parallel, capacity = config.num_parallel or cpu_num_parallel, CAPACITY
         if machines.gpus_per_worker:
             num_trials = config.num_seeds * int((program.family_of_trial == family).sum())
-            lanes, capacity = config.lanes, -(-num_trials // num_workers)
-        width = lanes or capacity
+            num_parallel, capacity = config.num_parallel, -(-num_trials // num_workers)
+        width = num_parallel or capacity
         capacities.append(width * -(-capacity // width))
         widths.append(width)
     return tuple(capacities), tuple(widths)

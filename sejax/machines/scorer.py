@@ -66,9 +66,12 @@ class Scorer:
     """The compiled trainings of a run; one to a process."""
 
     def __init__(
-        self, config: dict[str, Any], capacities: tuple[int, ...], versions: dict[str, str],
+        self,
+        config: dict[str, Any],
+        capacities: tuple[int, ...],
+        versions: dict[str, str],
         gpu_share: float,
-    ):  # fmt: skip
+    ):
         """Of a run's plain configuration, most trials in a share by family, and the driver's.
 
         `gpu_share` is the part of a GPU that this process has; 0 for a CPU core.
@@ -83,12 +86,12 @@ class Scorer:
         Raises:
           ConfigError: if this machine has other versions of what decides the numbers.
         """
-        from sejax.app import runtime
+        from sejax.cli import runtime
 
         runtime.configure_xla(1)
         runtime.take_share_of_gpu(self._gpu_share)
-        from sejax.app import build
         from sejax.bilevel import make_program
+        from sejax.cli import build
 
         own = versions()
         differing = [f"{name} {own[name]}" for name in own if own[name] != self._versions[name]]
@@ -130,7 +133,7 @@ def compile_share(program: Any, family: int, capacity: int) -> Any:
     import jax
     import jax.numpy as jnp
 
-    from sejax.parallel import compiler_options
+    from sejax.ops.parallel import compiler_options
 
     evaluate = program.share_of(family)
 

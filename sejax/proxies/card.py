@@ -5,7 +5,8 @@ Shipped files carry theirs, of which `docs/zoo.md` is made; `sejax.push` puts on
 
 from collections.abc import Sequence
 
-from sejax import hub, plugins
+from sejax import registry
+from sejax.proxies import hub
 from sejax.proxies.zoo import Evaluation, Learning, PretrainedProxy
 
 KINDS = {"se": "synthetic environment (SE)", "rn": "reward network (RN)"}
@@ -14,15 +15,15 @@ ENDS = {
     "bernoulli": "an episode terminates with the probability that the done output is",
     "sigmoid": "an episode terminates with the probability that the done output's sigmoid is",
     "soft": 'agents must bootstrap with `info["discount"]`, through which it teaches: '
-            "`terminated` alone tells them nothing",
-}  # fmt: skip
+    "`terminated` alone tells them nothing",
+}
 
 
 SHIPPED_LICENCE = "Apache-2.0, as sejax, which made it: no data of anybody's is in it."
 _SCORES = {  # what a score says, where it is no return
     "reward_threshold": " (minus the training steps until the task was solved, and a penalty where "
-                        "it was not)",
-}  # fmt: skip
+    "it was not)",
+}
 _WORDS = {"task": "env", "proxy": "proxy_kind"}  # what arguments of `sejax.load` are in commands
 
 
@@ -44,8 +45,10 @@ def card_of(
     if proxy.evaluations:
         parts += ["## What it teaches", _lesson(proxy)]
     if proxy.scores and proxy.learning:
-        parts += ["## How it was learned, and what that cost",
-                  f"{_origin(proxy)}\n\n{_cost(proxy, proxy.learning)}"]  # fmt: skip
+        parts += [
+            "## How it was learned, and what that cost",
+            f"{_origin(proxy)}\n\n{_cost(proxy, proxy.learning)}",
+        ]
     elif proxy.scores:
         parts += ["## How it was learned", _origin(proxy)]
     usage = _usage(proxy, source or proxy.name, needs)
@@ -54,15 +57,22 @@ def card_of(
 
 def _about(proxy: PretrainedProxy) -> str:
     if proxy.kind not in KINDS:
-        return (f"A proxy for the task `{proxy.task}`, of the kind `{proxy.kind}`, which is its "
-                f"author's own.")  # fmt: skip
+        return (
+            f"A proxy for the task `{proxy.task}`, of the kind `{proxy.kind}`, which is its "
+            f"author's own."
+        )
     if proxy.kind == "rn":
-        return (f"A {KINDS['rn']} for the task `{proxy.task}`: the dynamics are the real task's, "
-                f"the reward is made by a small learned network, so that agents like those it was "
-                f"learned with need fewer steps for the real task, where they are tested. To "
-                f"others it may do nothing, or harm.")  # fmt: skip
-    starts = {"real": "the real task's", "learned": "made by a network from noise",
-              "noise": "standard normal noise"}  # fmt: skip
+        return (
+            f"A {KINDS['rn']} for the task `{proxy.task}`: the dynamics are the real task's, "
+            f"the reward is made by a small learned network, so that agents like those it was "
+            f"learned with need fewer steps for the real task, where they are tested. To "
+            f"others it may do nothing, or harm."
+        )
+    starts = {
+        "real": "the real task's",
+        "learned": "made by a network from noise",
+        "noise": "standard normal noise",
+    }
     return (
         f"A {KINDS['se']} that stands in for the task `{proxy.task}`: small networks make the "
         f"rewards and states of a world of its own. Agents train on it alone, without a step of "
@@ -80,9 +90,11 @@ def _episodes(proxy: PretrainedProxy) -> str:
         length = f"Episodes have at most {most}; {ENDS[proxy.ends]}."
     if proxy.ends == "soft":
         return length
-    return (f"{length} It is a Markov decision process like any other: observation, reward, "
-            f"`terminated` and `truncated` say all that there is to know, so that any agent may "
-            f"learn on it.")  # fmt: skip
+    return (
+        f"{length} It is a Markov decision process like any other: observation, reward, "
+        f"`terminated` and `truncated` say all that there is to know, so that any agent may "
+        f"learn on it."
+    )
 
 
 def _lesson(proxy: PretrainedProxy) -> str:
@@ -99,9 +111,11 @@ def _lesson(proxy: PretrainedProxy) -> str:
 def _row(each: Evaluation) -> str:
     hparams = {"default": "default", "varied": "drawn for each", "as_learned": "as it was learned"}
     world = {"proxy": "this proxy", "real": "the real task"}
-    return (f"| {each.agent} | {hparams[each.hparams]} | {world[each.world]} | "
-            f"{each.return_mean:.1f} ± {each.return_std:.1f} | {each.train_steps:,.0f} | "
-            f"{each.num_agents} |")  # fmt: skip
+    return (
+        f"| {each.agent} | {hparams[each.hparams]} | {world[each.world]} | "
+        f"{each.return_mean:.1f} ± {each.return_std:.1f} | {each.train_steps:,.0f} | "
+        f"{each.num_agents} |"
+    )
 
 
 def _origin(proxy: PretrainedProxy) -> str:
@@ -135,8 +149,11 @@ def _words_of_best(proxy: PretrainedProxy) -> str:
         return f" agent={best.agent}" + (
             " agent_hparams=varied" if best.hparams == "varied" else ""
         )
-    of_sejax = [plugins.find("agent", name) for name in proxy.agents
-                if plugins.is_registered("agent", name)]  # fmt: skip
+    of_sejax = [
+        registry.find("agent", name)
+        for name in proxy.agents
+        if registry.is_registered("agent", name)
+    ]
     # Who is solved for on an SE cannot train on the real task beside it.
     alone = any(getattr(agent, "is_solved_for", False) for agent in of_sejax)
     return " agent_hparams=as_learned" + (" baseline=false" if alone else "")

@@ -7,15 +7,19 @@ from sejax.errors import require
 from sejax.options import ACTIVATIONS, MOST_LAYERS, Options, counts, one_of, option, positive
 
 if TYPE_CHECKING:
-    from sejax.proxies.proxy import ProxyEnv
+    from sejax.proxies.base import ProxyEnv
 
 DONE_MODES = ("soft", "threshold", "bernoulli", "sigmoid")
 INITIAL_STATES = ("real", "learned", "noise")
 STATE_UNITS = ("raw", "bounds")
 VARIANTS = (
-    "additive_potential", "exclusive_potential", "additive_non_potential",
-    "exclusive_non_potential", "additive_weighted_info", "exclusive_weighted_info",
-)  # fmt: skip
+    "additive_potential",
+    "exclusive_potential",
+    "additive_non_potential",
+    "exclusive_non_potential",
+    "additive_weighted_info",
+    "exclusive_weighted_info",
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,9 +55,14 @@ class SyntheticConfig(Options):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require(self.horizon != 1 or self.horizon_is_terminal, "proxy.horizon_is_terminal",
-                "be true with proxy.horizon=1", "there is no next state to bootstrap with", "false",
-                "proxy.horizon_is_terminal=true")  # fmt: skip
+        require(
+            self.horizon != 1 or self.horizon_is_terminal,
+            "proxy.horizon_is_terminal",
+            "be true with proxy.horizon=1",
+            "there is no next state to bootstrap with",
+            "false",
+            "proxy.horizon_is_terminal=true",
+        )
 
     @property
     def lasts_to_the_limit(self) -> bool:
@@ -96,12 +105,22 @@ class RewardConfig(Options):
     def __post_init__(self) -> None:
         super().__post_init__()
         for name in ("augmented", "zero_at_terminal"):
-            require(not (self.weighs_info and getattr(self, name)), f"proxy.{name}",
-                    "be false with weighted info", f"{self.variant} has no network",
-                    "true", f"proxy.{name}=false")  # fmt: skip
-        require(self.output_scale == 1 or not self.weighs_info, "proxy.output_scale",
-                "be 1 with weighted info", f"{self.variant} has no network", self.output_scale,
-                "proxy.output_scale=1")  # fmt: skip
+            require(
+                not (self.weighs_info and getattr(self, name)),
+                f"proxy.{name}",
+                "be false with weighted info",
+                f"{self.variant} has no network",
+                "true",
+                f"proxy.{name}=false",
+            )
+        require(
+            self.output_scale == 1 or not self.weighs_info,
+            "proxy.output_scale",
+            "be 1 with weighted info",
+            f"{self.variant} has no network",
+            self.output_scale,
+            "proxy.output_scale=1",
+        )
 
     def require_task(self, facts: Any, task_name: str) -> None:
         """Checks that the task tells what this variant needs.
@@ -110,14 +129,20 @@ class RewardConfig(Options):
           ConfigError: if it does not.
         """
         has_vector = facts.has_info if facts.has_vector is None else facts.has_vector
-        fields = (("variant", self.weighs_info, facts.has_info, "additive_potential"),
-                  ("augmented", self.augmented, has_vector, "false"))  # fmt: skip
+        fields = (
+            ("variant", self.weighs_info, facts.has_info, "additive_potential"),
+            ("augmented", self.augmented, has_vector, "false"),
+        )
         for name, is_needed, is_there, fix in fields:
             value = getattr(self, name)
-            require(is_there or not is_needed, f"proxy.{name}",
-                    f"do without {value} in {task_name}",
-                    "its steps tell nothing of the state beside the observation", value,
-                    f"proxy.{name}={fix}")  # fmt: skip
+            require(
+                is_there or not is_needed,
+                f"proxy.{name}",
+                f"do without {value} in {task_name}",
+                "its steps tell nothing of the state beside the observation",
+                value,
+                f"proxy.{name}={fix}",
+            )
 
     def make(self, task: Any) -> "ProxyEnv":
         """The RN of a task.

@@ -18,13 +18,14 @@ import jax
 import numpy as np
 from flax.traverse_util import flatten_dict, unflatten_dict
 
-from sejax import envs, plugins
+from sejax import envs, registry
 from sejax.envs import absent
 from sejax.envs.absent import require_present
-from sejax.envs.task import Task
+from sejax.envs.base import Task
 from sejax.errors import ConfigError, require, shortened, told
-from sejax.files import write_bytes
-from sejax.proxies.proxy import ProxyEnv
+from sejax.ops.files import write_bytes
+from sejax.ops.sealed import seal
+from sejax.proxies.base import ProxyEnv
 from sejax.proxies.stored import (
     FORMAT_VERSION,
     KEY,
@@ -36,14 +37,24 @@ from sejax.proxies.stored import (
     read,
     read_config,
 )
-from sejax.sealed import seal
 from sejax.serialize import from_plain
 from sejax.training import TrainingConfig, budget_for
 
 __all__ = [
-    "FORMAT_VERSION", "PRETRAINED_DIR", "Proxy", "ProxySet", "find", "load", "load_proxy",
-    "load_set", "pretrained_names", "read_config", "register_gymnax", "save", "save_set",
-]  # fmt: skip
+    "FORMAT_VERSION",
+    "PRETRAINED_DIR",
+    "Proxy",
+    "ProxySet",
+    "find",
+    "load",
+    "load_proxy",
+    "load_set",
+    "pretrained_names",
+    "read_config",
+    "register_gymnax",
+    "save",
+    "save_set",
+]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -109,12 +120,15 @@ class Proxy:
         Raises:
           ConfigError: as `learned_with`.
         """
-        known = [plugins.configure("agent", values)
-                 for values in learned_agents(self.config).values()
-                 if _is_registered("agent", values)]  # fmt: skip
+        known = [
+            registry.configure("agent", values)
+            for values in learned_agents(self.config).values()
+            if _is_registered("agent", values)
+        ]
         limit = self.env.task.max_steps
-        return budget_for(self.learned_with("training"), agent, known,
-                          self.env.world.max_steps or limit, limit)  # fmt: skip
+        return budget_for(
+            self.learned_with("training"), agent, known, self.env.world.max_steps or limit, limit
+        )
 
     def _configured(self, group: str, stored: Any) -> Any:
         where = f"{group} that {self.path.name} was learned with"
@@ -125,7 +139,7 @@ class Proxy:
                 f"The {where} must be a registered one, because what a file names is never "
                 f"imported; it is {shortened(stored.get('name'))!r}. Give {group}= yourself."
             )
-        return plugins.configure(group, stored)
+        return registry.configure(group, stored)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -195,15 +209,21 @@ class ProxySet:
     def proxy(self, index: int) -> Proxy:
         """One of them; its `env` is a copy that has its params as default ones."""
         params = self.one(index)
-        return Proxy(env=self.env.with_default_params(params), params=params,
-                     record=self.records[index], config=self.config, discount=self.discount,
-                     path=self.path)  # fmt: skip
+        return Proxy(
+            env=self.env.with_default_params(params),
+            params=params,
+            record=self.records[index],
+            config=self.config,
+            discount=self.discount,
+            path=self.path,
+        )
 
     def fingerprint(self, index: int) -> str:
         """Eight letters that tell one's weights from another's."""
         flat = flatten_dict(self.weights, sep="/")
-        content = b"".join(np.ascontiguousarray(flat[name][index]).tobytes()
-                           for name in sorted(flat))  # fmt: skip
+        content = b"".join(
+            np.ascontiguousarray(flat[name][index]).tobytes() for name in sorted(flat)
+        )
         return hashlib.sha256(content).hexdigest()[:8]
 
     def first(self, count: int | None) -> "ProxySet":
@@ -281,9 +301,14 @@ def save_set(
       ConfigError: as `save`, or if there are not as many records as proxies.
       OSError: if it cannot be written; an older file stays as it was.
     """
-    require(len(weights) == len(records) > 0, "records", "be one for each proxy", "they say which "
-            "is which", f"{len(records)} for {len(weights)}", "records=[{}] * len(weights)"
-            )  # fmt: skip
+    require(
+        len(weights) == len(records) > 0,
+        "records",
+        "be one for each proxy",
+        "they say which is which",
+        f"{len(records)} for {len(weights)}",
+        "records=[{}] * len(weights)",
+    )
     each = [_tensors_of(env, one) for one in weights]
     tensors = {name: np.stack([one[name] for one in each]) for name in each[0]}
     _write(Path(path), env, tensors, config, discount, records, is_set=True)
@@ -291,34 +316,67 @@ def save_set(
 
 def _tensors_of(env: ProxyEnv, weights: Any) -> dict[str, np.ndarray]:
     """The weights of one proxy by `network/layer/parameter`, checked."""
-    require(isinstance(weights, Mapping), "weights", "be nested dictionaries as env.init_weights "
-            "returns", "they are kept by their names", type(weights).__name__,
-            "weights to params.weights")  # fmt: skip
-    tensors = {name: np.asarray(x, np.float32)
-               for name, x in flatten_dict(weights, sep="/").items()}  # fmt: skip
+    require(
+        isinstance(weights, Mapping),
+        "weights",
+        "be nested dictionaries as env.init_weights returns",
+        "they are kept by their names",
+        type(weights).__name__,
+        "weights to params.weights",
+    )
+    tensors = {
+        name: np.asarray(x, np.float32) for name, x in flatten_dict(weights, sep="/").items()
+    }
     wanted = {name: x.shape for name, x in _shapes_of(env).items()}
     there = {name: x.shape for name, x in tensors.items()}
-    require(there == wanted, "weights", f"have the shapes {shortened(wanted)}", f"they are those "
-            f"of {env.name}", there, "weights to those of this env")  # fmt: skip
+    require(
+        there == wanted,
+        "weights",
+        f"have the shapes {shortened(wanted)}",
+        f"they are those of {env.name}",
+        there,
+        "weights to those of this env",
+    )
     odd = [name for name, x in tensors.items() if not np.isfinite(x).all()]
-    require(not odd, "weights", "be finite", "no agent could train on others", f"others in "
-            f"{', '.join(odd)}", "weights to ones that were scored")  # fmt: skip
+    require(
+        not odd,
+        "weights",
+        "be finite",
+        "no agent could train on others",
+        f"others in {', '.join(odd)}",
+        "weights to ones that were scored",
+    )
     return tensors
 
 
 def _write(
-    path: Path, env: ProxyEnv, tensors: dict[str, np.ndarray], config: Mapping[str, Any] | None,
-    discount: float | None, records: Sequence[Mapping[str, Any]], is_set: bool,
-) -> None:  # fmt: skip
-    require(discount is not None or not getattr(env.config, "is_potential_based", False),
-            "discount", "be given for a potential-based reward network", "its reward is made with "
-            "it", discount, "discount=params.discount, that of the agent")  # fmt: skip
-    require(isinstance(config, Mapping | None), "config", "be nested plain values", "they are kept "
-            "beside the weights", type(config).__name__,
-            "config=sejax.config(...).plain()")  # fmt: skip
+    path: Path,
+    env: ProxyEnv,
+    tensors: dict[str, np.ndarray],
+    config: Mapping[str, Any] | None,
+    discount: float | None,
+    records: Sequence[Mapping[str, Any]],
+    is_set: bool,
+) -> None:
+    require(
+        discount is not None or not getattr(env.config, "is_potential_based", False),
+        "discount",
+        "be given for a potential-based reward network",
+        "its reward is made with it",
+        discount,
+        "discount=params.discount, that of the agent",
+    )
+    require(
+        isinstance(config, Mapping | None),
+        "config",
+        "be nested plain values",
+        "they are kept beside the weights",
+        type(config).__name__,
+        "config=sejax.config(...).plain()",
+    )
     known = {
         "env": env.task.origin or {"name": env.task.name},
-        "proxy": plugins.describe("proxy", env.config),
+        "proxy": registry.describe("proxy", env.config),
     }
     header: dict[str, Any] = {
         "format_version": FORMAT_VERSION,
@@ -357,7 +415,7 @@ def load(source: str | Path, task: Task | None = None, proxy: Any = None) -> tup
 
     Args:
       source: a run directory, a safetensors file, the name of a proxy that ships with the package
-        (`pretrained_names()`), or one on the Hugging Face Hub: `hf://user/repo` (`sejax.hub`).
+        (`pretrained_names()`), or one on the Hugging Face Hub: `hf://user/repo`.
       task: of the proxy; needed if it is none that a registered name makes, as a file's names are
         never imported. An SE whose initial states are not the real task's can do without, or
         without the package that its task needs: what agents see is in the file, and only what would
@@ -394,9 +452,14 @@ def load_proxy(
       option: what messages call `source`.
     """
     proxies = load_set(source, task, proxy, option)
-    require(proxies.size == 1, option, "be a single proxy", "an agent trains in one world",
-            f"{proxies.path}, a set of {proxies.size}", f"{option} to a run directory; "
-            "sejax.load_set reads sets")  # fmt: skip
+    require(
+        proxies.size == 1,
+        option,
+        "be a single proxy",
+        "an agent trains in one world",
+        f"{proxies.path}, a set of {proxies.size}",
+        f"{option} to a run directory; sejax.load_set reads sets",
+    )
     return proxies.proxy(0)
 
 
@@ -429,16 +492,27 @@ def load_set(
     tensors, header = read(path, option)
     config = header["config"]
     name = config["proxy"].get("name")
-    require(kind in (None, name), option, f"hold proxies learned with proxy={kind}",
-            "these are what is studied", f"proxy={name}",
-            f"{option} to a file of those")  # fmt: skip
+    require(
+        kind in (None, name),
+        option,
+        f"hold proxies learned with proxy={kind}",
+        "these are what is studied",
+        f"proxy={name}",
+        f"{option} to a file of those",
+    )
     env = _env_of(path, header, task, proxy, option)
     if not header["is_set"]:
         tensors = {name: x[None] for name, x in tensors.items()}
     _check_tensors(path, option, env, tensors, len(header["proxies"]))
     weights = unflatten_dict({tuple(name.split("/")): x for name, x in tensors.items()})
-    return ProxySet(env=env, weights=weights, records=tuple(header["proxies"]), config=config,
-                    discount=header["discount"], path=path)  # fmt: skip
+    return ProxySet(
+        env=env,
+        weights=weights,
+        records=tuple(header["proxies"]),
+        config=config,
+        discount=header["discount"],
+        path=path,
+    )
 
 
 def _env_of(
@@ -456,16 +530,22 @@ def _env_of(
             if "interface" not in header or getattr(proxy, "needs_task", True):
                 raise
             task = absent.make(header["task"], header["interface"], config["env"], str(error))
-    require(header["task"] == task.name, option, f"be a proxy of {task.name}", "that is the task "
-            "given", f"one of {shortened(header['task'])} in {path}",
-            f"{option} to a proxy of {task.name}, or another task")  # fmt: skip
+    require(
+        header["task"] == task.name,
+        option,
+        f"be a proxy of {task.name}",
+        "that is the task given",
+        f"one of {shortened(header['task'])} in {path}",
+        f"{option} to a proxy of {task.name}, or another task",
+    )
     if given and "interface" in header:
         _require_same(header["interface"], task.interface, proxy, path)
-    return plugins.make("proxy", proxy, task)
+    return registry.make("proxy", proxy, task)
 
 
-def _require_same(learned: Mapping[str, Any], given: Mapping[str, Any], proxy: Any, path: Path
-                  ) -> None:  # fmt: skip
+def _require_same(
+    learned: Mapping[str, Any], given: Mapping[str, Any], proxy: Any, path: Path
+) -> None:
     """Checks that a task given is that of the proxy, as far as the proxy depends on it.
 
     An RN is for the same dynamics with another step limit too, and an SE in the task's raw units
@@ -479,9 +559,14 @@ def _require_same(learned: Mapping[str, Any], given: Mapping[str, Any], proxy: A
             same = _is_same_space(wanted, there, with_bounds[what])
         else:
             same = there == wanted or not is_se
-        require(same, "task", f"have the {what} of the task that the proxy was learned for, "
-                f"{shortened(wanted)}", f"{path} is a proxy of that one", there,
-                f"task to a sejax.Task with that {what}")  # fmt: skip
+        require(
+            same,
+            "task",
+            f"have the {what} of the task that the proxy was learned for, {shortened(wanted)}",
+            f"{path} is a proxy of that one",
+            there,
+            f"task to a sejax.Task with that {what}",
+        )
 
 
 def _is_same_space(one: Mapping[str, Any], other: Mapping[str, Any], with_bounds: bool) -> bool:
@@ -509,12 +594,12 @@ def _registered(
             f"what a file names is never imported; {path} is one of {name!r}. Give it: "
             f"sejax.load(path, {argument}=...), or {word}={named} on the command line."
         )
-    return plugins.configure(group, config[group])
+    return registry.configure(group, config[group])
 
 
 def _is_registered(group: str, stored: Any) -> bool:
     """Whether plain values name what sejax or a package has registered."""
-    return isinstance(stored, Mapping) and plugins.is_registered(group, str(stored.get("name")))
+    return isinstance(stored, Mapping) and registry.is_registered(group, str(stored.get("name")))
 
 
 def _check_tensors(

@@ -12,11 +12,11 @@ from flax import struct
 from gymnax.environments import environment
 from jaxtyping import Array, Float
 
-from sejax.envs.task import Task
+from sejax.envs.base import Task
 from sejax.errors import require
-from sejax.networks import MLP, uniform_fan_in
+from sejax.ops.networks import MLP, uniform_fan_in
 from sejax.proxies import ABSURD
-from sejax.proxies.proxy import ProxyEnv
+from sejax.proxies.base import ProxyEnv
 
 if TYPE_CHECKING:  # which makes it
     from sejax.proxies.configs import RewardConfig
@@ -110,9 +110,14 @@ class RewardEnv(ProxyEnv):
         Raises:
           ConfigError: if the reward needs a discount and the agent has none.
         """
-        require(discount is not None or not self.config.is_potential_based, "agent", "say its "
-                "discount", f"{self.config.variant} pays with it", "none",
-                "Agent(discount=lambda hparams: ...)")  # fmt: skip
+        require(
+            discount is not None or not self.config.is_potential_based,
+            "agent",
+            "say its discount",
+            f"{self.config.variant} pays with it",
+            "none",
+            "Agent(discount=lambda hparams: ...)",
+        )
         potentials = None
         if self.task.num_states is not None and not self.config.weighs_info:
             states = jnp.arange(self.task.num_states)
@@ -139,9 +144,13 @@ class RewardEnv(ProxyEnv):
         return self.config.output_scale * outputs[0]
 
     def bonus(
-        self, params: RewardParams, state: RewardState, next_state: RewardState, info: Any,
+        self,
+        params: RewardParams,
+        state: RewardState,
+        next_state: RewardState,
+        info: Any,
         terminated: Any,
-    ) -> Float[Array, ""]:  # fmt: skip
+    ) -> Float[Array, ""]:
         """What a transition is worth beside the real reward.
 
         Args:

@@ -5,9 +5,9 @@ from typing import Any
 
 import yaml
 
-from sejax import hub, plugins
+from sejax import registry
 from sejax.errors import require
-from sejax.proxies import card, stored, zoo
+from sejax.proxies import card, hub, stored, zoo
 
 TAGS = {"se": "synthetic-environment", "rn": "reward-network"}
 
@@ -40,8 +40,14 @@ def push(
     """
     path = stored.find(source)
     _, header = stored.read(path, "source")
-    require(not header["is_set"], "source", "be a single proxy", "a card is of one",
-            f"{path}, a set", "source to a run directory or a file of one")  # fmt: skip
+    require(
+        not header["is_set"],
+        "source",
+        "be a single proxy",
+        "a card is of one",
+        f"{path}, a set",
+        "source to a run directory or a file of one",
+    )
     proxy = zoo.describe(path, name=repo.rpartition("/")[2])
     address = f"{hub.SCHEME}{repo}"
     text = card.card_of(proxy, address, _needs(header["config"]), license)
@@ -53,8 +59,11 @@ def push(
 def _needs(config: dict[str, Any]) -> list[str]:
     """The arguments that `sejax.load` needs for a file: its names are never imported."""
     arguments = {"env": "task", "proxy": "proxy"}
-    return [argument for group, argument in arguments.items()
-            if not plugins.is_registered(group, str(config[group].get("name")))]  # fmt: skip
+    return [
+        argument
+        for group, argument in arguments.items()
+        if not registry.is_registered(group, str(config[group].get("name")))
+    ]
 
 
 def _front(proxy: zoo.PretrainedProxy, license: str) -> str:

@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 from safetensors import SafetensorError, safe_open
 
-from sejax import hub
 from sejax.errors import LARGEST, ConfigError, require, shortened, unknown_name
-from sejax.sealed import DamagedError, unseal
+from sejax.ops.sealed import DamagedError, unseal
+from sejax.proxies import hub
 
 FORMAT_VERSION = 2
 PRETRAINED_DIR = Path(__file__).parents[1] / "pretrained"
@@ -54,10 +54,18 @@ def find(source: str | Path, option: str = "source", also: Sequence[str] = ()) -
     if is_dir:
         path = path / "proxy.safetensors"
         is_run = (path.parent / "config.yaml").exists()
-        require(path.exists(), option, "be a run directory with a proxy.safetensors", "the run has "
-                "not finished a generation yet" if is_run else "this is a folder of another sort",
-                str(path.parent), f"{option} to a file, or finish the run first" if is_run else
-                f"{option} to a run directory or a file")  # fmt: skip
+        require(
+            path.exists(),
+            option,
+            "be a run directory with a proxy.safetensors",
+            "the run has not finished a generation yet"
+            if is_run
+            else "this is a folder of another sort",
+            str(path.parent),
+            f"{option} to a file, or finish the run first"
+            if is_run
+            else f"{option} to a run directory or a file",
+        )
         return path
     if is_file:
         return path
@@ -84,8 +92,11 @@ def learned_agents(config: Mapping[str, Any]) -> dict[str, Any]:
     if not isinstance(families, Mapping):
         agent = config.get("agent")
         return {str(agent.get("name")) if isinstance(agent, Mapping) else "": agent}
-    return {key: {name: x for name, x in values.items() if name != "weight"}
-            for key, values in families.items() if isinstance(values, Mapping)}  # fmt: skip
+    return {
+        key: {name: x for name, x in values.items() if name != "weight"}
+        for key, values in families.items()
+        if isinstance(values, Mapping)
+    }
 
 
 def read(path: Path, option: str) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
@@ -104,16 +115,27 @@ def read(path: Path, option: str) -> tuple[dict[str, np.ndarray], dict[str, Any]
             stored = _from_version_1(stored, is_set=KEY not in metadata)
         if is_known:
             check_header(stored)
-    except (LookupError, ValueError, TypeError, AttributeError, ArithmeticError,
-            RecursionError) as error:  # fmt: skip
+    except (
+        LookupError,
+        ValueError,
+        TypeError,
+        AttributeError,
+        ArithmeticError,
+        RecursionError,
+    ) as error:
         raise ConfigError(
             f"{option} must be a file that sejax has written, because the network is rebuilt from "
             f"its metadata; {path} has none that is valid ({type(error).__name__}: "
             f"{shortened(error)}). Learn it again."
         ) from error
-    require(is_known, option, f"be of format {FORMAT_VERSION} or 1",
-            "this version of sejax reads no other", f"{shortened(version)} in {path}",
-            f"{option} to a file of this version")  # fmt: skip
+    require(
+        is_known,
+        option,
+        f"be of format {FORMAT_VERSION} or 1",
+        "this version of sejax reads no other",
+        f"{shortened(version)} in {path}",
+        f"{option} to a file of this version",
+    )
     if version == FORMAT_VERSION:
         try:
             tensors, _ = unseal(path.read_bytes(), KEY)
@@ -180,9 +202,14 @@ def _from_version_1(stored: Any, is_set: bool) -> dict[str, Any]:
     else:
         records = [{k: v for k, v in stored.items() if k not in ("format_version", "config")}]
     agent = config.get("agent") or {}
-    return {"format_version": FORMAT_VERSION, "task": config["env"]["name"], "config": config,
-            "discount": agent.get("discount", 1.0), "is_set": is_set,
-            "proxies": records}  # fmt: skip
+    return {
+        "format_version": FORMAT_VERSION,
+        "task": config["env"]["name"],
+        "config": config,
+        "discount": agent.get("discount", 1.0),
+        "is_set": is_set,
+        "proxies": records,
+    }
 
 
 def _upgraded(config: Any) -> dict[str, Any]:

@@ -13,10 +13,10 @@ from flax import struct
 from gymnax.environments import environment
 from jaxtyping import Array, Bool, Float
 
-from sejax.envs.task import Task
-from sejax.networks import MLP
+from sejax.envs.base import Task
+from sejax.ops.networks import MLP
 from sejax.proxies import ABSURD
-from sejax.proxies.proxy import ProxyEnv, ProxyParams, World
+from sejax.proxies.base import ProxyEnv, ProxyParams, World
 from sejax.proxies.units import units_of
 
 if TYPE_CHECKING:  # which makes it
@@ -58,9 +58,15 @@ class SyntheticEnv(ProxyEnv):
 
     def __init__(self, task: Task, config: "SyntheticConfig"):
         super().__init__(task, config)
-        outputs = {"reward": 1} if config.horizon == 1 else {
-            "state": task.obs_dim, "reward": 1, "done": 1,
-        }  # fmt: skip
+        outputs = (
+            {"reward": 1}
+            if config.horizon == 1
+            else {
+                "state": task.obs_dim,
+                "reward": 1,
+                "done": 1,
+            }
+        )
         self._nets = {
             head: MLP(size, config.hidden_size, config.num_layers, config.activation)
             for head, size in outputs.items()

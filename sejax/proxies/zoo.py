@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from sejax import plugins, serialize
+from sejax import registry, serialize
 from sejax.proxies import stored
 
 
@@ -112,8 +112,10 @@ class Zoo(tuple[PretrainedProxy, ...]):
     def __repr__(self) -> str:
         rows = [_HEAD, *(_row(proxy) for proxy in self)]
         widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-        lines = ["  ".join(cell.ljust(n) for cell, n in zip(row, widths, strict=True)).rstrip()
-                 for row in rows]  # fmt: skip
+        lines = [
+            "  ".join(cell.ljust(n) for cell, n in zip(row, widths, strict=True)).rstrip()
+            for row in rows
+        ]
         return "\n".join(lines)
 
 
@@ -151,21 +153,24 @@ def describe(path: Path, name: str | None = None) -> PretrainedProxy:
         objective=str((config.get("objective") or {}).get("name", "")),
         generation=record.get("generation"),
         seed=record.get("seed"),
-        evaluations=tuple(serialize.from_plain(Evaluation, each, "evaluation")
-                          for each in record.get("evaluations", ())),
+        evaluations=tuple(
+            serialize.from_plain(Evaluation, each, "evaluation")
+            for each in record.get("evaluations", ())
+        ),
         learning=serialize.from_plain(Learning, record["learning"], "learning")
-        if "learning" in record else None,
+        if "learning" in record
+        else None,
         size_kb=path.stat().st_size / 1000,
         card=record.get("card", ""),
         **_world(config["proxy"]),
-    )  # fmt: skip
+    )
 
 
 def _world(config: Mapping[str, Any]) -> dict[str, Any]:
     """Of which kind the episodes are."""
     if config.get("name") != "se":
         return {"horizon": None, "initial_state": "real", "ends": "real"}
-    se = plugins.configure("proxy", config)
+    se = registry.configure("proxy", config)
     ends = "horizon" if se.horizon == 1 else se.done
     return {"horizon": se.horizon, "initial_state": se.initial_state, "ends": ends}
 
@@ -178,12 +183,16 @@ _HEAD = ("name", "kind", "task", "learned with", "tested with", "return", "steps
 def _row(proxy: PretrainedProxy) -> tuple[str, ...]:
     tested = dict.fromkeys(each.agent for each in proxy.on_proxy)
     return (
-        proxy.name, proxy.kind, proxy.task, " ".join(proxy.agents), " ".join(tested),
+        proxy.name,
+        proxy.kind,
+        proxy.task,
+        " ".join(proxy.agents),
+        " ".join(tested),
         spread([each.return_mean for each in proxy.on_proxy], ".1f"),
         spread([each.train_steps for each in proxy.on_proxy], ",.0f"),
         f"{proxy.learning.cpu_s:,.0f}" if proxy.learning else "",
         f"{proxy.size_kb:.1f}",
-    )  # fmt: skip
+    )
 
 
 def spread(values: list[float], spec: str) -> str:

@@ -4,8 +4,8 @@ from collections.abc import Sequence
 from importlib.util import find_spec
 from typing import Any
 
-from sejax.app import commands, runtime
-from sejax.app.run_lock import acquire
+from sejax.cli import commands, runtime
+from sejax.cli.run_lock import acquire
 from sejax.errors import ConfigError
 from sejax.search import settings
 from sejax.search.settings import Search
@@ -20,8 +20,10 @@ def main(words: Sequence[str]) -> None:
     """
     search = settings.read(words)
     if find_spec("optuna") is None:
-        raise ConfigError("sejax.search needs Optuna, because it decides what is tried. Install it "
-                          "with pip install 'sejax[search]'.")  # fmt: skip
+        raise ConfigError(
+            "sejax.search needs Optuna, because it decides what is tried. Install it "
+            "with pip install 'sejax[search]'."
+        )
     from sejax.search import results, study
 
     usual = None
@@ -41,8 +43,10 @@ def main(words: Sequence[str]) -> None:
         else:
             study.work(found, search, runner, _say)
     except KeyboardInterrupt:
-        print(f"Interrupted. What has ended is saved in {search.folder}, and the trial at hand is "
-              f"queued again; the same command goes on from there.")  # fmt: skip
+        print(
+            f"Interrupted. What has ended is saved in {search.folder}, and the trial at hand is "
+            f"queued again; the same command goes on from there."
+        )
         commands.leave(commands.INTERRUPTED)
     best = results.write(found, search, runner.command)
     results.print_table(found, search)
@@ -75,8 +79,10 @@ def _verified(found: Any, search: Search, runner: Any) -> list[str]:
     try:
         table = verification.verify(found, search, runner)
     except KeyboardInterrupt:
-        print(f"Interrupted. Those of the best that were tried again are in {search.folder}; the "
-              f"same command goes on with the others.")  # fmt: skip
+        print(
+            f"Interrupted. Those of the best that were tried again are in {search.folder}; the "
+            f"same command goes on with the others."
+        )
         commands.leave(commands.INTERRUPTED)
     finally:
         lock.release()

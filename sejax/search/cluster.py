@@ -13,7 +13,7 @@ import optuna
 import ray
 from optuna.trial import TrialState
 
-from sejax.app import runtime
+from sejax.cli import runtime
 from sejax.errors import require, told
 from sejax.machines import ray_crew
 from sejax.machines.handout import LOOK_S, MOST_FAILURES
@@ -115,9 +115,14 @@ def _attend(
                 workers.failures = 0
         for error in (each for each in came if isinstance(each, Exception)):
             say(f"A worker was lost ({told(error)}).")
-            require(is_over or workers.failures < MOST_FAILURES, "machines", "have workers that "
-                    "stay", "they make the trials", f"{workers.failures} lost in a row, the last "
-                    f"by {told(error)}", "machines=local to see why")  # fmt: skip
+            require(
+                is_over or workers.failures < MOST_FAILURES,
+                "machines",
+                "have workers that stay",
+                "they make the trials",
+                f"{workers.failures} lost in a row, the last by {told(error)}",
+                "machines=local to see why",
+            )
         if not is_over and (is_late or any(not isinstance(each, Exception) for each in came)):
             is_over = True  # or the time is, and trials that others have begun go on
             begin_heartbeats(study)
@@ -126,17 +131,23 @@ def _attend(
             is_anyone_busy = study.get_trials(deepcopy=False, states=(TrialState.RUNNING,))
             last_looks = 0 if is_anyone_busy else last_looks + (not came)
         if last_looks == LAST_LOOKS:
-            say(f"The study is over; workers that have not noticed in {LAST_LOOKS * LOOK_S:.0f} s "
-                f"are ended: {len(workers)}.")  # fmt: skip
+            say(
+                f"The study is over; workers that have not noticed in {LAST_LOOKS * LOOK_S:.0f} s "
+                f"are ended: {len(workers)}."
+            )
             return
 
 
 def _words(search: Search, timeout: float | None) -> list[str]:
     """The words by which a worker joins, and has what may differ between workers."""
     folder = search.folder.resolve()
-    own = {"study": search.study, "search_dir": folder,
-           "storage": search.config.storage or f"sqlite:///{folder / 'study.db'}",
-           "trials": search.config.trials, "timeout": timeout}  # fmt: skip
+    own = {
+        "study": search.study,
+        "search_dir": folder,
+        "storage": search.config.storage or f"sqlite:///{folder / 'study.db'}",
+        "trials": search.config.trials,
+        "timeout": timeout,
+    }
     return [f"{name}={value}" for name, value in own.items() if value is not None]
 
 

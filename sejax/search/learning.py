@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from sejax.app import build, compose, session
-from sejax.app.run_directory import RunDirectory, open_for
-from sejax.app.words import word
+from sejax.cli import build, compose, session
+from sejax.cli.run_directory import RunDirectory, open_for
+from sejax.cli.words import word
 from sejax.errors import ConfigError
 from sejax.search.programs import Programs
 from sejax.search.settings import Search
@@ -34,9 +34,11 @@ class Learning:
         Raises:
           ConfigError: if it is none that can run.
         """
-        own = [f"generations={self._search.config.max_generations}",
-               f"num_seeds={num_seeds or self._search.config.seeds}",
-               "checkpoint_every=1"]  # fmt: skip
+        own = [
+            f"generations={self._search.config.max_generations}",
+            f"num_seeds={num_seeds or self._search.config.seeds}",
+            "checkpoint_every=1",
+        ]
         where = [f"run_dir={word(str(folder))}"] if folder is not None else []
         return compose.config([*self._search.fixed, *words, *own, *where])
 
@@ -80,11 +82,14 @@ class Learning:
             chunks = self._programs.chunks(config)
             session.run(config, directory, chunks)
             progress = progress_of(directory, chunks.program.strategy.num_candidates)
-            lengths = [sum(int(row["seed"]) == seed for row in directory.rows)
-                       for seed in directory.seeds]  # fmt: skip
+            lengths = [
+                sum(int(row["seed"]) == seed for row in directory.rows) for seed in directory.seeds
+            ]
         generations = search.config.max_generations
-        return {**worth(whole(progress, generations), generations, search),
-                "generations": float(np.mean(lengths))}  # fmt: skip
+        return {
+            **worth(whole(progress, generations), generations, search),
+            "generations": float(np.mean(lengths)),
+        }
 
     def order(self, row: dict[str, float]) -> tuple[float, float]:
         """By which the best rows of `verify` come first, and those that are not finite last."""
@@ -105,9 +110,12 @@ class _Report(session.Quiet):
     """Hears of each generation after its files are written, so that to end there loses nothing."""
 
     def __init__(
-        self, directory: RunDirectory, follower: Follower, num_candidates: int,
+        self,
+        directory: RunDirectory,
+        follower: Follower,
+        num_candidates: int,
         over_at: float | None,
-    ):  # fmt: skip
+    ):
         self._directory, self._follower = directory, follower
         self._num_candidates, self._over_at = num_candidates, over_at
 
@@ -120,8 +128,10 @@ class _Report(session.Quiet):
 def progress_of(directory: RunDirectory, num_candidates: int) -> Progress:
     """What a run's rows say."""
     rows, seeds = directory.rows, directory.seeds
-    of_seeds = {seed: [float(row["incumbent_mean"]) for row in rows if int(row["seed"]) == seed]
-                for seed in seeds}  # fmt: skip
+    of_seeds = {
+        seed: [float(row["incumbent_mean"]) for row in rows if int(row["seed"]) == seed]
+        for seed in seeds
+    }
     length = max(map(len, of_seeds.values()))
     scores = np.array([own + own[-1:] * (length - len(own)) for own in of_seeds.values()]).T
     steps = sum(float(row["train_steps_mean"]) for row in rows)

@@ -15,17 +15,25 @@ from typing import Any
 
 import jax
 
-from sejax.app import build
-from sejax.app.families import families_of
-from sejax.app.session import Chunks
+from sejax.agents.mixture import Families, FamiliesConfig
 from sejax.bilevel import Program, make_program
-from sejax.families import Families, FamiliesConfig
+from sejax.cli import build
+from sejax.cli.families import families_of
+from sejax.cli.session import Chunks
 from sejax.options import marks, traced_options
 from sejax.serialize import to_plain
 
 # Fields of a run that shape no program; a chunk's length and seeds are counted by themselves.
-_FREE = ("preset", "seed", "num_seeds", "generations", "checkpoint_every", "run_dir", "tracker",
-         "machines")  # fmt: skip
+_FREE = (
+    "preset",
+    "seed",
+    "num_seeds",
+    "generations",
+    "checkpoint_every",
+    "run_dir",
+    "tracker",
+    "machines",
+)
 KEPT = 16  # shapes whose programs stay in memory
 
 
@@ -92,8 +100,10 @@ def _with_numbers(config: build.LearnConfig, num_dims: int, numbers: dict[str, A
     parts = config.parts()
     if numbers["agents"]:
         families = Families.of(parts["agent"])
-        learners = tuple(dataclasses.replace(agent, hparams=hparams) for agent, hparams in
-                         zip(families.agents, numbers["agents"], strict=True))  # fmt: skip
+        learners = tuple(
+            dataclasses.replace(agent, hparams=hparams)
+            for agent, hparams in zip(families.agents, numbers["agents"], strict=True)
+        )
         parts["agent"] = dataclasses.replace(families, agents=learners)
     if numbers["es"]:
         es = copy.copy(config.es)  # not checked again: a traced number is none

@@ -9,13 +9,18 @@ from typing import Any
 import optuna
 from optuna.trial import FrozenTrial, TrialState
 
-from sejax.app.words import file_text, word
-from sejax.files import atomic_path, write_text
+from sejax.cli.words import file_text, word
+from sejax.ops.files import atomic_path, write_text
 from sejax.search.settings import Search
 
 SHOWN = 10
 NEEDED = 10  # completed trials, before importances say anything
-HOW = ("seed", "devices", "lanes", "tracker")  # fields of how trials ran, which are no settings
+HOW = (
+    "seed",
+    "devices",
+    "num_parallel",
+    "tracker",
+)  # fields of how trials ran, which are no settings
 NUMBER = (24, 12)  # pixels of a number in the picture
 ENDED = (TrialState.COMPLETE, TrialState.PRUNED)
 
@@ -59,13 +64,21 @@ def table(study: optuna.Study, search: Search) -> Any:
     for trial in study.get_trials(deepcopy=False):
         if trial.state in ENDED:
             kept = trial.user_attrs
-            rows.append({
-                "trial": trial.number, "state": trial.state.name.lower(),
-                **{name: kept.get(name) for name in
-                   ("mean", "worst", "generations", "cost", "seconds")},
-                **{name: x.of(trial.params) for name, x in search.space.items()
-                   if x.parameter in trial.params},
-            })  # fmt: skip
+            rows.append(
+                {
+                    "trial": trial.number,
+                    "state": trial.state.name.lower(),
+                    **{
+                        name: kept.get(name)
+                        for name in ("mean", "worst", "generations", "cost", "seconds")
+                    },
+                    **{
+                        name: x.of(trial.params)
+                        for name, x in search.space.items()
+                        if x.parameter in trial.params
+                    },
+                }
+            )
     return pd.DataFrame(rows)
 
 
@@ -76,17 +89,21 @@ def saved_by_pruning(rows: Any, search: Search) -> str:
     saved, all_of_them = len(pruned) * most - pruned["generations"].sum(), len(begun) * most
     num_refused = len(rows) - len(begun)
     refused = f" Refused: {num_refused}." if num_refused else ""
-    return (f"{len(pruned)} of {len(begun)} trials were pruned, which saved {saved:,.0f} of "
-            f"{all_of_them:,} generations "
-            f"({saved / max(all_of_them, 1):.0%}).{refused}")  # fmt: skip
+    return (
+        f"{len(pruned)} of {len(begun)} trials were pruned, which saved {saved:,.0f} of "
+        f"{all_of_them:,} generations "
+        f"({saved / max(all_of_them, 1):.0%}).{refused}"
+    )
 
 
 def equally_good(trials: Sequence[FrozenTrial], search: Search) -> str:
     """A sentence on ranked trials that share the best score, and what may tell them apart."""
     sentence = f"{num_best(trials)} of {len(trials)} share the best score."
     if search.is_of_agent:
-        return (f"{sentence} Agents that train for less on the proxy may differ: training_from="
-                f"config training.stop_rule=never training.max_steps=1000")  # fmt: skip
+        return (
+            f"{sentence} Agents that train for less on the proxy may differ: training_from="
+            f"config training.stop_rule=never training.max_steps=1000"
+        )
     hint = " To reward learning early: measure=mean" if search.measure != "mean" else ""
     return sentence + hint
 
@@ -123,7 +140,7 @@ def draw_pareto(rows: Any, search: Search, path: Path) -> None:
     mpl.use("Agg")
     import matplotlib.pyplot as plt
 
-    from sejax.app.plots import INCUMBENT, POPULATION
+    from sejax.cli.plots import INCUMBENT, POPULATION
 
     score = search.config.score
     front = pareto_front(rows, score)
@@ -131,18 +148,37 @@ def draw_pareto(rows: Any, search: Search, path: Path) -> None:
         figure, axis = plt.subplots(figsize=(7, 4.2), layout="constrained")
         for state, color in (("pruned", "0.6"), ("complete", INCUMBENT)):
             some = rows[(rows["state"] == state) & rows[score].notna()]
-            axis.plot(some["cost"], some[score], "o", ms=5, mew=0, alpha=0.75, color=color,
-                      label=f"{state} ({len(some)})")  # fmt: skip
-        axis.step(front["cost"], front[score], where="post", color=POPULATION, lw=1.4,
-                  label="best for its cost, with numbers")  # fmt: skip
+            axis.plot(
+                some["cost"],
+                some[score],
+                "o",
+                ms=5,
+                mew=0,
+                alpha=0.75,
+                color=color,
+                label=f"{state} ({len(some)})",
+            )
+        axis.step(
+            front["cost"],
+            front[score],
+            where="post",
+            color=POPULATION,
+            lw=1.4,
+            label="best for its cost, with numbers",
+        )
         axis.set_xscale("log")
         figure.draw_without_rendering()  # which lays the axes out
         places = axis.transData.transform(front[["cost", score]])
         named: list[Any] = []
         for place, (_, row) in reversed(list(zip(places, front.iterrows(), strict=True))):
             if all((abs(place - other) > NUMBER).any() for other in named):
-                axis.annotate(f"{row['trial']:.0f}", (row["cost"], row[score]), fontsize=8,
-                              textcoords="offset points", xytext=(4, -10))  # fmt: skip
+                axis.annotate(
+                    f"{row['trial']:.0f}",
+                    (row["cost"], row[score]),
+                    fontsize=8,
+                    textcoords="offset points",
+                    xytext=(4, -10),
+                )
                 named.append(place)
         axis.set_xlabel("training steps of all agents of the trial")
         many = f", {score} of {search.config.seeds} seeds" if search.config.seeds > 1 else ""
@@ -177,8 +213,11 @@ def write_best(words: Sequence[str], search: Search, command: str) -> None:
     """Writes the settings as a command and as a preset."""
     line = override_line(words, search, command)
     write_text(search.folder / "best.txt", line + "\n")
-    settings = [word for word in [*search.fixed, *words]
-                if word.partition("=")[0].partition(".")[0] not in HOW]  # fmt: skip
+    settings = [
+        word
+        for word in [*search.fixed, *words]
+        if word.partition("=")[0].partition(".")[0] not in HOW
+    ]
     write_text(preset_file(search), f"# {line}\n{file_text(settings)}")
 
 
@@ -188,18 +227,23 @@ def print_table(study: optuna.Study, search: Search) -> None:
     from rich.table import Table
 
     console, done = Console(highlight=False), ranked(study)
-    shown = Table(title=f"{search.study}: the best {min(SHOWN, len(done))} of {len(done)} trials "
-                  "that were not pruned")  # fmt: skip
+    shown = Table(
+        title=f"{search.study}: the best {min(SHOWN, len(done))} of {len(done)} trials "
+        "that were not pruned"
+    )
     scores = ("mean", "worst") if search.config.seeds > 1 else ("mean",)
     for column in ("trial", *scores, "genera-\ntions", "training\nsteps"):
         shown.add_column(column, justify="right")
     shown.add_column("settings", no_wrap=True)
     for trial in done[:SHOWN]:
         kept = trial.user_attrs
-        shown.add_row(str(trial.number), *(f"{kept[name]:.4g}" for name in scores),
-                      str(kept["generations"]), f"{kept['cost']:,}",
-                      "\n".join(f"{name}={x.shown(trial.params)}"
-                                for name, x in search.space.items()))  # fmt: skip
+        shown.add_row(
+            str(trial.number),
+            *(f"{kept[name]:.4g}" for name in scores),
+            str(kept["generations"]),
+            f"{kept['cost']:,}",
+            "\n".join(f"{name}={x.shown(trial.params)}" for name, x in search.space.items()),
+        )
     console.print(shown)
     if done and num_best(done) > 1:
         console.print(equally_good(done, search), soft_wrap=True)

@@ -11,10 +11,10 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException
 
-from sejax import plugins, serialize
-from sejax.app import build, compose
+from sejax import registry, serialize
+from sejax.cli import build, compose
 from sejax.errors import ConfigError, nearest, require
-from sejax.files import as_file_name
+from sejax.ops.files import as_file_name
 from sejax.options import Options, counts, one_of, option, positive
 from sejax.search import spaces
 
@@ -26,9 +26,12 @@ MEASURES = ("last", "best", "mean")
 TEXTS = ("study", "storage", "search_dir", "space")
 # Fields of the command that are the search's, and which of its own to set in their place.
 TAKEN = {
-    "generations": "max_generations=27", "num_seeds": "seeds=3", "run_dir": "search_dir=FOLDER",
-    "out_dir": "search_dir=FOLDER", "checkpoint_every": "min_generations=3",
-}  # fmt: skip
+    "generations": "max_generations=27",
+    "num_seeds": "seeds=3",
+    "run_dir": "search_dir=FOLDER",
+    "out_dir": "search_dir=FOLDER",
+    "checkpoint_every": "min_generations=3",
+}
 # Fields that may differ between the workers of a study, and between its sessions.
 FREE_FIELDS = (
     "trials",
@@ -76,9 +79,14 @@ class SearchConfig(Options):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require(self.max_generations >= self.min_generations, "max_generations",
-                f"be at least min_generations={self.min_generations}", "none is pruned before",
-                self.max_generations, f"max_generations={9 * self.min_generations}")  # fmt: skip
+        require(
+            self.max_generations >= self.min_generations,
+            "max_generations",
+            f"be at least min_generations={self.min_generations}",
+            "none is pruned before",
+            self.max_generations,
+            f"max_generations={9 * self.min_generations}",
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -101,7 +109,7 @@ class Search:
     def is_of_agent(self) -> bool:
         """Whether agents are tuned on a proxy that exists, in the place of how to learn one."""
         name = self.choice("proxy", "se")
-        return name not in plugins.names("proxy") and ":" not in name
+        return name not in registry.names("proxy") and ":" not in name
 
     @property
     def num_verified(self) -> int:
@@ -124,7 +132,7 @@ class Search:
         said = self.choice("agent", "")
         choices = [word for word in self.fixed if "." not in word.partition("=")[0]]
         if self.is_of_agent and not said:
-            return plugins.name_of("agent", compose.evaluate_config(choices).agent)
+            return registry.name_of("agent", compose.evaluate_config(choices).agent)
         return said or compose.config(choices).name("agent")
 
     @property
@@ -214,17 +222,28 @@ def read(words: Sequence[str]) -> Search:
             machines[name.partition(".")[2] or "name"] = compose.parsed(text)
             continue
         override = _parsed(word)
-        require(name not in TAKEN, name, "be left out", "the search sets it for each trial", text,
-                TAKEN.get(name, ""))  # fmt: skip
+        require(
+            name not in TAKEN,
+            name,
+            "be left out",
+            "the search sets it for each trial",
+            text,
+            TAKEN.get(name, ""),
+        )
         if override.is_sweep_override():
             swept[override.get_key_element()] = spaces.parse(override.get_key_element(), text)
         else:
             fixed.append(word)
     config = serialize.from_plain(SearchConfig, values, "")
     search = Search(config=config, fixed=tuple(fixed), space=swept, machines=_machines(machines))
-    require(search.choice("proxy", "se") != "real", "proxy", "be learned, or be one to tune agents "
-            "on", "trials on the real task cost what a proxy saves", "real",
-            "proxy=cartpole, or env=cartpole proxy=se")  # fmt: skip
+    require(
+        search.choice("proxy", "se") != "real",
+        "proxy",
+        "be learned, or be one to tune agents on",
+        "trials on the real task cost what a proxy saves",
+        "real",
+        "proxy=cartpole, or env=cartpole proxy=se",
+    )
     if config.space is None:
         return search
     preset = spaces.preset(config.space, search.agent, search.is_of_agent)
@@ -235,8 +254,8 @@ def read(words: Sequence[str]) -> Search:
 
 def _machines(values: dict[str, Any]) -> Any:
     one_of(("local", "ray"))("machines", values["name"], "local")
-    machines = plugins.configure("machines", values)
-    plugins.require_package("machines", machines, "trials are made there")
+    machines = registry.configure("machines", values)
+    registry.require_package("machines", machines, "trials are made there")
     return machines
 
 
@@ -285,8 +304,13 @@ def require_fields(search: Search, config: Any) -> None:
 
 def help_text() -> str:
     """What `--help` prints."""
-    about = {"sampler": SAMPLERS, "pruner": PRUNERS, "score": SCORES, "measure": MEASURES,
-             "space": (*spaces.names(), "FILE.yaml")}  # fmt: skip
+    about = {
+        "sampler": SAMPLERS,
+        "pruner": PRUNERS,
+        "score": SCORES,
+        "measure": MEASURES,
+        "space": (*spaces.names(), "FILE.yaml"),
+    }
     fields = "\n".join(
         f"  {name}: {'null' if value is None else value}"
         + (f"  ({', '.join(about[name])})" if name in about else "")

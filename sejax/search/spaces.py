@@ -18,8 +18,8 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import ChoiceSweep, IntervalSweep, QuotedString, RangeSweep
 from hydra.errors import HydraException
 
-from sejax.app import families
-from sejax.app.words import word
+from sejax.cli import families
+from sejax.cli.words import word
 from sejax.errors import ConfigError, is_number, nearest, require, shortened
 
 FOLDER = Path(__file__).parents[1] / "conf" / "spaces"
@@ -65,8 +65,11 @@ class Dimension:
             value = trial.suggest_float(self.parameter, low, high, log=True)
             return self._written(1 - value)
         if self.step is not None:
-            return str(trial.suggest_int(self.name, int(self.low), int(self.high),
-                                         step=self.step, log=self.log))  # fmt: skip
+            return str(
+                trial.suggest_int(
+                    self.name, int(self.low), int(self.high), step=self.step, log=self.log
+                )
+            )
         value = trial.suggest_float(self.name, self.low, self.high, log=self.log)
         return self._written(value)
 
@@ -128,21 +131,50 @@ def parse(name: str, text: str) -> Dimension:
     tags = set(getattr(sweep, "tags", ()))
     log, inverse = "log" in tags, "inverse" in tags
     example = f"{name}='tag(log, inverse, interval(0.9, 0.999))'"
-    require(tags <= {"log", "inverse"} and (log or not inverse), name, "have the tags log, or log "
-            "and inverse", "nothing else is known", ", ".join(sorted(tags)), example)  # fmt: skip
+    require(
+        tags <= {"log", "inverse"} and (log or not inverse),
+        name,
+        "have the tags log, or log and inverse",
+        "nothing else is known",
+        ", ".join(sorted(tags)),
+        example,
+    )
     if isinstance(sweep, ChoiceSweep):
         plain = [x.text if isinstance(x, QuotedString) else x for x in sweep.list]
         return Dimension(name=name, text=text, values=tuple(map(word, plain)))
     low, high, step = _range(name, text, sweep)
-    require(math.isfinite(low) and math.isfinite(high), name, "have finite bounds", "all between "
-            "them is drawn", shortened(text), f"{name}='{EXAMPLE}'")  # fmt: skip
-    require(low <= high, name, "be a range that grows", "there is nothing in it otherwise",
-            shortened(text), f"{name}='{EXAMPLE}'")  # fmt: skip
-    require(not log or inverse or (low > 0 and step in (None, 1)), name, "begin above 0 and have "
-            "steps of 1 with log", "it is drawn in its logarithm", shortened(text),
-            f"{name}='{EXAMPLE}'")  # fmt: skip
-    require(not inverse or high < 1, name, "end below 1 with inverse", "it is drawn in the "
-            "logarithm of the distance", shortened(text), example)  # fmt: skip
+    require(
+        math.isfinite(low) and math.isfinite(high),
+        name,
+        "have finite bounds",
+        "all between them is drawn",
+        shortened(text),
+        f"{name}='{EXAMPLE}'",
+    )
+    require(
+        low <= high,
+        name,
+        "be a range that grows",
+        "there is nothing in it otherwise",
+        shortened(text),
+        f"{name}='{EXAMPLE}'",
+    )
+    require(
+        not log or inverse or (low > 0 and step in (None, 1)),
+        name,
+        "begin above 0 and have steps of 1 with log",
+        "it is drawn in its logarithm",
+        shortened(text),
+        f"{name}='{EXAMPLE}'",
+    )
+    require(
+        not inverse or high < 1,
+        name,
+        "end below 1 with inverse",
+        "it is drawn in the logarithm of the distance",
+        shortened(text),
+        example,
+    )
     return Dimension(name=name, text=text, low=low, high=high, step=step, log=log, inverse=inverse)
 
 
@@ -195,17 +227,33 @@ def preset(name: str, agent: str, of_agent: bool) -> dict[str, Dimension]:
             f"space must be one of {', '.join(ranked)}, or a YAML file; got {shortened(name)} "
             f"({' '.join(str(error).split())[:100]}). Set space={ranked[0]}."
         ) from error
-    require(isinstance(content, dict), "space", "map fields to sweeps", "they are searched",
-            f"{path} with a {type(content).__name__}", "space=paper_se")  # fmt: skip
+    require(
+        isinstance(content, dict),
+        "space",
+        "map fields to sweeps",
+        "they are searched",
+        f"{path} with a {type(content).__name__}",
+        "space=paper_se",
+    )
     of_agents = content.pop("with_agent", None) or {}
-    require(isinstance(of_agents, dict) and all(isinstance(x, dict) for x in of_agents.values()),
-            "space", "map agents to their sweeps under with_agent", "each has its own",
-            f"{path} with {shortened(of_agents)} there", "space=paper_se")  # fmt: skip
+    require(
+        isinstance(of_agents, dict) and all(isinstance(x, dict) for x in of_agents.values()),
+        "space",
+        "map agents to their sweeps under with_agent",
+        "each has its own",
+        f"{path} with {shortened(of_agents)} there",
+        "space=paper_se",
+    )
     has_others, are_several = bool(content), families.JOINT in agent
     for each in families.members(agent):
-        require(has_others or each in of_agents, "agent", f"be one of {', '.join(of_agents)} with "
-                f"space={name}", "it has no ranges for others", each,
-                f"agent={next(iter(of_agents), 'ddqn')}")  # fmt: skip
+        require(
+            has_others or each in of_agents,
+            "agent",
+            f"be one of {', '.join(of_agents)} with space={name}",
+            "it has no ranges for others",
+            each,
+            f"agent={next(iter(of_agents), 'ddqn')}",
+        )
         ranges = of_agents.get(each, {})
         content |= _of_family(families.key_of(each), ranges) if are_several else ranges
     chosen = {k: v for k, v in content.items() if not of_agent or k.startswith("agent.")}
@@ -214,5 +262,8 @@ def preset(name: str, agent: str, of_agent: bool) -> dict[str, Dimension]:
 
 def _of_family(key: str, ranges: Mapping[str, Any]) -> dict[str, Any]:
     """An agent's own ranges where it is one of several; what all share has no place in them."""
-    return {f"agents.{key}.{field.removeprefix('agent.')}": text
-            for field, text in ranges.items() if field.startswith("agent.")}  # fmt: skip
+    return {
+        f"agents.{key}.{field.removeprefix('agent.')}": text
+        for field, text in ranges.items()
+        if field.startswith("agent.")
+    }

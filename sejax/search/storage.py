@@ -78,9 +78,12 @@ def open_storage(
         try:
             with quietly():
                 storage = Storage(
-                    url, engine_kwargs=options, heartbeat_interval=heartbeat,
-                    grace_period=GRACE * heartbeat, heartbeat_stale_trial_callback=on_stale,
-                )  # fmt: skip
+                    url,
+                    engine_kwargs=options,
+                    heartbeat_interval=heartbeat,
+                    grace_period=GRACE * heartbeat,
+                    heartbeat_stale_trial_callback=on_stale,
+                )
             if url.startswith("sqlite"):
                 with storage.engine.connect() as connection:  # shorter locks, and none for readers
                     connection.exec_driver_sql("PRAGMA journal_mode=WAL")

@@ -72,18 +72,27 @@ def open_study(
     optuna.logging.set_verbosity(optuna.logging.ERROR)
     logging.getLogger("alembic").setLevel(logging.WARNING)
     if not search.names_study_alone:
-        require(search.space, "space", "be given, or sweeps of fields", "there is nothing to "
-                "search otherwise", "none", "space=paper_se, or es.noise_std='tag(log, "
-                "interval(0.01, 0.3))'")  # fmt: skip
+        require(
+            search.space,
+            "space",
+            "be given, or sweeps of fields",
+            "there is nothing to search otherwise",
+            "none",
+            "space=paper_se, or es.noise_std='tag(log, interval(0.01, 0.3))'",
+        )
     storage = open_storage(search, queue_again)
     try:
         with quietly():
             if search.names_study_alone:
                 _require_study(search, storage)
             study = optuna.create_study(
-                study_name=search.study, storage=storage, direction="maximize",
-                sampler=_sampler(search), pruner=_pruner(search), load_if_exists=True,
-            )  # fmt: skip
+                study_name=search.study,
+                storage=storage,
+                direction="maximize",
+                sampler=_sampler(search),
+                pruner=_pruner(search),
+                load_if_exists=True,
+            )
         stored = study.user_attrs.get(STORED)
         if stored is not None:
             joined = _joined(search, completed(stored))
@@ -93,8 +102,11 @@ def open_study(
             study.sampler, study.pruner = _sampler(search, study), _pruner(search)
         else:
             study.set_user_attr(STORED, search.stored())
-            first = {x.parameter: x.parameter_of(usual.get(name))
-                     for name, x in search.space.items()} if usual else {}  # fmt: skip
+            first = (
+                {x.parameter: x.parameter_of(usual.get(name)) for name, x in search.space.items()}
+                if usual
+                else {}
+            )
             if first and None not in first.values():
                 with quietly():
                     study.enqueue_trial(first, skip_if_exists=True)
@@ -148,8 +160,10 @@ def work(
             _run_one(study, objective)
         else:
             if not waits:
-                say(f"Waiting for {count[TrialState.RUNNING]} trials of other workers, or for "
-                    f"their heartbeats to end ({GRACE * config.heartbeat} s).")  # fmt: skip
+                say(
+                    f"Waiting for {count[TrialState.RUNNING]} trials of other workers, or for "
+                    f"their heartbeats to end ({GRACE * config.heartbeat} s)."
+                )
                 begin_heartbeats(study)
             waits = True
             time.sleep(min(1.0, config.heartbeat))
@@ -227,8 +241,10 @@ def sentence(trial: optuna.Trial | optuna.trial.FrozenTrial, how: str, search: S
     score = kept.get(search.config.score)
     worth = "not finite" if score is None else f"{score:.4g}"
     words = " ".join(f"{name}={x.of(trial.params)}" for name, x in search.space.items())
-    return (f"trial {trial.number}: {worth}, {how} at generation "
-            f"{kept['generations']}/{search.config.max_generations}: {words}")  # fmt: skip
+    return (
+        f"trial {trial.number}: {worth}, {how} at generation "
+        f"{kept['generations']}/{search.config.max_generations}: {words}"
+    )
 
 
 def trial_folder(search: Search, number: int) -> Path:
@@ -247,10 +263,12 @@ def queue_again(study: optuna.Study, trial: optuna.Trial | optuna.trial.FrozenTr
         return  # given up, or another worker has queued it
     study.add_trial(
         optuna.create_trial(
-            state=TrialState.WAITING, params=trial.params, distributions=trial.distributions,
+            state=TrialState.WAITING,
+            params=trial.params,
+            distributions=trial.distributions,
             user_attrs={HISTORY: history},
         )
-    )  # fmt: skip
+    )
 
 
 def _run_one(study: optuna.Study, objective: Objective) -> None:
@@ -270,8 +288,9 @@ def _run_one(study: optuna.Study, objective: Objective) -> None:
                 raise KeyboardInterrupt from error
             if not (has_failed and objective.is_done):
                 raise
-            objective.say(f"trial {objective.trial.number}: was taken for dead and is another "
-                          f"worker's now")  # fmt: skip
+            objective.say(
+                f"trial {objective.trial.number}: was taken for dead and is another worker's now"
+            )
 
 
 def _has_failed(study: optuna.Study, trial: optuna.Trial | None) -> bool:
@@ -322,8 +341,12 @@ def _joined(search: Search, stored: dict[str, Any]) -> Search:
         ]
         if sorted(stored["fixed"]) != sorted(asked["fixed"]):
             differing.append(f"{' '.join(stored['fixed'])} there, {' '.join(asked['fixed'])} here")
-        require(not differing, "study", "be new or of the same search",
-                "its trials are compared with each other",
-                f"{search.study}, which differs in {', '.join(differing)}",
-                "study=NAME, or give study and storage alone to join")  # fmt: skip
+        require(
+            not differing,
+            "study",
+            "be new or of the same search",
+            "its trials are compared with each other",
+            f"{search.study}, which differs in {', '.join(differing)}",
+            "study=NAME, or give study and storage alone to join",
+        )
     return Search.from_stored(stored, search.config, search.machines)

@@ -137,8 +137,12 @@ def take_over(folder: Path, predecessors: Sequence[Path]) -> bool:
         if name == "sejax.lock" or name.startswith("."):
             continue
         if source.is_dir():
-            shutil.copytree(source, partial / name, ignore=shutil.ignore_patterns(".*"),
-                            copy_function=_copy_if_there)  # fmt: skip
+            shutil.copytree(
+                source,
+                partial / name,
+                ignore=shutil.ignore_patterns(".*"),
+                copy_function=_copy_if_there,
+            )
         else:
             _copy_if_there(source, partial / name)
     partial.rename(folder)

@@ -16,10 +16,10 @@ from typing import Any
 import numpy as np
 
 from sejax import serialize
-from sejax.app import build, compose
-from sejax.app.words import word
+from sejax.cli import build, compose
+from sejax.cli.words import word
 from sejax.errors import ConfigError, require
-from sejax.files import write_text
+from sejax.ops.files import write_text
 from sejax.search.programs import kept, static_of, structure_of
 from sejax.search.settings import Search
 from sejax.search.trials import Follower, Progress
@@ -56,11 +56,22 @@ class Tuning:
 
         where = [f"out_dir={word(str(folder))}"] if folder is not None else []
         config = compose.evaluate_config([*self._search.fixed, *words, *where])
-        require(config.agents is None, "agent", "be one", "its settings are searched", "several",
-                "agent=ppo")  # fmt: skip
-        require(config.agent_hparams == "default", "agent_hparams", "be default",
-                "the trial's settings are those that are tried", config.agent_hparams,
-                "agent_hparams=default")  # fmt: skip
+        require(
+            config.agents is None,
+            "agent",
+            "be one",
+            "its settings are searched",
+            "several",
+            "agent=ppo",
+        )
+        require(
+            config.agent_hparams == "default",
+            "agent_hparams",
+            "be default",
+            "the trial's settings are those that are tried",
+            config.agent_hparams,
+            "agent_hparams=default",
+        )
         proxy_study(config)  # which checks what is asked of the proxy
         return config
 
@@ -79,9 +90,13 @@ class Tuning:
                 follower.tell(_progress_of(rounds))
             started = time.time()
             outcome = self.outcome(config, "the proxy", len(rounds), self._search.config.seeds)
-            rounds.append({"returns": outcome.test_return.tolist(),
-                           "cost": int(np.sum(outcome.train_steps, dtype=np.int64)),
-                           "seconds": time.time() - started})  # fmt: skip
+            rounds.append(
+                {
+                    "returns": outcome.test_return.tolist(),
+                    "cost": int(np.sum(outcome.train_steps, dtype=np.int64)),
+                    "seconds": time.time() - started,
+                }
+            )
             write_text(path, json.dumps({"settings": settings, "rounds": rounds}))
         return _progress_of(rounds)
 
@@ -107,9 +122,15 @@ class Tuning:
         agent = make_agent(family.agent, study.task, study.exploration)
         training = study.worlds[world][2][family.key]
         key = json.dumps(
-            [world, static_of(family.agent), static_of(study.exploration),
-             serialize.to_plain(training), structure_of(agent.hparams), num_agents]
-        )  # fmt: skip
+            [
+                world,
+                static_of(family.agent),
+                static_of(study.exploration),
+                serialize.to_plain(training),
+                structure_of(agent.hparams),
+                num_agents,
+            ]
+        )
         rounds = kept(
             self._compiled, key, lambda: _make_rounds(agent, study, world, training, config)
         )
@@ -166,8 +187,8 @@ def _make_rounds(agent: Any, study: Any, world: str, training: Any, config: Any)
     import jax
     import jax.numpy as jnp
 
-    from sejax.evaluation import lanes_on_cpu, make_evaluator
-    from sejax.parallel import compiler_options, spread_over_devices
+    from sejax.evaluation import make_evaluator, num_parallel_on_cpu
+    from sejax.ops.parallel import compiler_options, spread_over_devices
 
     env, env_params, _ = study.worlds[world]
 
@@ -175,7 +196,9 @@ def _make_rounds(agent: Any, study: Any, world: str, training: Any, config: Any)
         tried = dataclasses.replace(agent, hparams=hparams)
         return make_evaluator(tried, env, study.task, training)(key, env_params)
 
-    spread = spread_over_devices(one, config.devices, config.lanes, lanes_on_cpu(agent, training))
+    spread = spread_over_devices(
+        one, config.devices, config.num_parallel, num_parallel_on_cpu(agent, training)
+    )
 
     def rounds(keys: Any, hparams: Any) -> Any:
         of_each = jax.tree.map(lambda x: jnp.broadcast_to(x, keys.shape), hparams)

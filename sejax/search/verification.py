@@ -6,7 +6,7 @@ from typing import Any
 
 import optuna
 
-from sejax.files import write_text
+from sejax.ops.files import write_text
 from sejax.search import results
 from sejax.search.settings import Search
 from sejax.search.study import Runner
@@ -30,8 +30,11 @@ def verify(study: optuna.Study, search: Search, runner: Runner) -> Any:
     rows: list[dict[str, Any]] = []
     for rank, trial in enumerate(best, 1):
         words = results.words_of(trial, search)
-        of = {"trial": trial.number, "num_fresh": runner.num_fresh(),
-              "settings": _settings_of(words, search)}  # fmt: skip
+        of = {
+            "trial": trial.number,
+            "num_fresh": runner.num_fresh(),
+            "settings": _settings_of(words, search),
+        }
         same = [row for row in known if all(row.get(name) == x for name, x in of.items())]
         known = [row for row in known if row not in same]
         values = same[0] if same else runner.verify(words, trial.number)
@@ -53,8 +56,11 @@ def print_table(table: Any, search: Search) -> None:
 def _settings_of(words: Sequence[str], search: Search) -> str:
     """All words of a search that a row depends on."""
     config = search.config
-    own = [f"max_generations={config.max_generations}", f"measure={search.measure}",
-           f"seeds={config.seeds}"]  # fmt: skip
+    own = [
+        f"max_generations={config.max_generations}",
+        f"measure={search.measure}",
+        f"seeds={config.seeds}",
+    ]
     return " ".join([*search.fixed, *words, *own])
 
 
@@ -72,8 +78,14 @@ def _print_proxies(table: Any) -> None:
     for column in ("trial", "rank before", "score before", "mean", "worst", "generations"):
         shown.add_column(column, justify="right")
     for row in table.itertuples():
-        shown.add_row(str(row.trial), str(row.rank), f"{row.score:.4g}", f"{row.mean:.4g}",
-                      f"{row.worst:.4g}", f"{row.generations:.1f}")  # fmt: skip
+        shown.add_row(
+            str(row.trial),
+            str(row.rank),
+            f"{row.score:.4g}",
+            f"{row.mean:.4g}",
+            f"{row.worst:.4g}",
+            f"{row.generations:.1f}",
+        )
     Console(highlight=False).print(shown)
 
 
@@ -82,17 +94,22 @@ def _print_agents(table: Any) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    shown = Table(title=f"the best {len(table)} with {table['num_fresh'][0]} fresh agents each, "
-                  "tested on the real task")  # fmt: skip
+    shown = Table(
+        title=f"the best {len(table)} with {table['num_fresh'][0]} fresh agents each, "
+        "tested on the real task"
+    )
     worlds = {"proxy": "trained on the proxy", "real": "trained on the real task"}
     if "real_return" not in table:
         del worlds["real"]  # baseline=false
     for column in ("trial", "rank on the proxy", *worlds.values(), "steps there"):
         shown.add_column(column, justify="right")
     for row in table.to_dict("records"):
-        shown.add_row(str(row["trial"]), str(row["rank"]),
-                      *(f"{row[f'{x}_return']:.1f} ± {row[f'{x}_std']:.1f}" for x in worlds),
-                      f"{row[f'{list(worlds)[-1]}_steps']:,.0f}")  # fmt: skip
+        shown.add_row(
+            str(row["trial"]),
+            str(row["rank"]),
+            *(f"{row[f'{x}_return']:.1f} ± {row[f'{x}_std']:.1f}" for x in worlds),
+            f"{row[f'{list(worlds)[-1]}_steps']:,.0f}",
+        )
     console = Console(highlight=False)
     console.print(shown)
     columns = [f"{x}_return" for x in worlds]

@@ -8,7 +8,7 @@ extra `mujoco`, a C++ compiler when they are first used, and the CPU.
 import importlib
 from typing import Any
 
-from sejax.envs.task import Task
+from sejax.envs.base import Task
 from sejax.errors import ConfigError, require
 
 
@@ -37,9 +37,14 @@ def make_task(name: str, config: Any, solved_reward: float, otherwise: str = "")
 
     from sejax.envs.mujoco import library
 
-    require(jax.default_backend() == "cpu", f"env={name}", "run on the CPU",
-            "MuJoCo's C library does", jax.default_backend(),
-            f"JAX_PLATFORMS=cpu{otherwise}")  # fmt: skip
+    require(
+        jax.default_backend() == "cpu",
+        f"env={name}",
+        "run on the CPU",
+        "MuJoCo's C library does",
+        jax.default_backend(),
+        f"JAX_PLATFORMS=cpu{otherwise}",
+    )
     try:
         library.load()
     except library.BuildError as error:
@@ -48,5 +53,11 @@ def make_task(name: str, config: Any, solved_reward: float, otherwise: str = "")
             f"{error}{otherwise}."
         ) from error
     env = importlib.import_module(f"{__name__}.{name}").Env(config)
-    return Task(name=name, env=env, max_steps=config.facts.max_steps, solved_reward=solved_reward,
-                info_keys=env.info_keys, augmented_keys=env.augmented_keys)  # fmt: skip
+    return Task(
+        name=name,
+        env=env,
+        max_steps=config.facts.max_steps,
+        solved_reward=solved_reward,
+        info_keys=env.info_keys,
+        augmented_keys=env.augmented_keys,
+    )

@@ -26,8 +26,17 @@ class Env(MujocoEnv):
     file = "ant.xml"
     frame_skip = 5
     with_forces = True
-    info_keys = ("x_position", "y_position", "distance_from_origin", "x_velocity", "y_velocity",
-                 "reward_forward", "reward_ctrl", "reward_contact", "reward_survive")  # fmt: skip
+    info_keys = (
+        "x_position",
+        "y_position",
+        "distance_from_origin",
+        "x_velocity",
+        "y_velocity",
+        "reward_forward",
+        "reward_ctrl",
+        "reward_contact",
+        "reward_survive",
+    )
     augmented_keys = ("x_position", "y_position", "x_velocity", "y_velocity")
 
     def draw_start(self, key: Array) -> tuple[Float[Array, "15"], Float[Array, "14"]]:

@@ -22,8 +22,14 @@ class Env(MujocoEnv):
     gymnasium_id = "Hopper-v5"
     file = "hopper.xml"
     frame_skip = 4
-    info_keys = ("x_position", "x_velocity", "z_distance_from_origin", "reward_forward",
-                 "reward_ctrl", "reward_survive")  # fmt: skip
+    info_keys = (
+        "x_position",
+        "x_velocity",
+        "z_distance_from_origin",
+        "reward_forward",
+        "reward_ctrl",
+        "reward_survive",
+    )
     augmented_keys = ("x_position", "x_velocity")
 
     def draw_start(self, key: Array) -> tuple[Float[Array, " nq"], Float[Array, " nv"]]:

@@ -17,8 +17,8 @@ from pathlib import Path
 import jax
 import mujoco
 
-from sejax import files
 from sejax.errors import ConfigError, shortened, told
+from sejax.ops import files
 
 SOURCE = Path(__file__).with_name("step.cc")
 FLAGS = ("-O2", "-std=c++17", "-shared", "-fPIC")
@@ -34,7 +34,7 @@ class BuildError(ConfigError):
 def load() -> ctypes.CDLL:
     """The library of this process, whose handlers XLA then knows as `TARGETS`.
 
-    It is built if it is not in the cache folder (`sejax.files.cache_folder`), which takes some
+    It is built if it is not in the cache folder (`sejax.ops.files.cache_folder`), which takes some
     seconds. Processes that build it at the same time do not disturb each other. With the cache
     switched off, or where it cannot be written or what lies there not be loaded, each process
     builds its own.
@@ -72,9 +72,16 @@ def _load() -> ctypes.CDLL:
 
 def file_name() -> str:
     """What the library is called: there is one for each version of all that it is made of."""
-    parts = (SOURCE.read_text(), " ".join(FLAGS), version("mujoco"), version("jaxlib"),
-             platform.system(), platform.machine(), *platform.libc_ver(),
-             *_given_compiler()[1:])  # fmt: skip
+    parts = (
+        SOURCE.read_text(),
+        " ".join(FLAGS),
+        version("mujoco"),
+        version("jaxlib"),
+        platform.system(),
+        platform.machine(),
+        *platform.libc_ver(),
+        *_given_compiler()[1:],
+    )
     digest = hashlib.sha256("\0".join(parts).encode()).hexdigest()[:16]
     return f"mujoco-{version('mujoco')}-jaxlib-{version('jaxlib')}-{platform.machine()}-{digest}.so"
 
@@ -89,12 +96,21 @@ def build(path: Path) -> None:
       BuildError: if there is no compiler, or it fails.
     """
     package = Path(mujoco.__file__).parent
-    libraries = sorted(x for x in package.glob("libmujoco*")
-                       if x.suffix == ".dylib" or ".so" in x.name)  # fmt: skip
+    libraries = sorted(
+        x for x in package.glob("libmujoco*") if x.suffix == ".dylib" or ".so" in x.name
+    )
     if not libraries:
         raise BuildError(f"{package} has no libmujoco. Install MuJoCo with pip install mujoco")
-    command = [*_compiler(), *FLAGS, f"-I{package / 'include'}", f"-I{jax.ffi.include_dir()}",
-               str(SOURCE), str(libraries[0]), "-o", str(path)]  # fmt: skip
+    command = [
+        *_compiler(),
+        *FLAGS,
+        f"-I{package / 'include'}",
+        f"-I{jax.ffi.include_dir()}",
+        str(SOURCE),
+        str(libraries[0]),
+        "-o",
+        str(path),
+    ]
     try:
         subprocess.run(command, check=True, capture_output=True, text=True)
     except (OSError, subprocess.CalledProcessError) as error:

@@ -66,9 +66,13 @@ class Physics:
         self.num_words = 2 * handlers.SejaxMujocoLength(self.model._address)
         nq, nv, nbody = self.model.nq, self.model.nv, self.model.nbody
         self._shapes = {
-            "qpos": (nq,), "qvel": (nv,), "qpos_change": (nq,), "xpos": (nbody, 3),
-            "xpos_change": (nbody, 3), "cfrc_ext": (nbody if with_forces else 0, 6),
-        }  # as step.cc reports them, one after the other  # fmt: skip
+            "qpos": (nq,),
+            "qvel": (nv,),
+            "qpos_change": (nq,),
+            "xpos": (nbody, 3),
+            "xpos_change": (nbody, 3),
+            "cfrc_ext": (nbody if with_forces else 0, 6),
+        }  # as step.cc reports them, one after the other
 
     @property
     def dt(self) -> float:
@@ -99,8 +103,10 @@ class Physics:
             if array.shape != shape:
                 raise ValueError(f"{target} must get arrays of shape {shape}; got {array.shape}")
         sizes = [int(np.prod(shape)) for shape in self._shapes.values()]
-        results = (jax.ShapeDtypeStruct((self.num_words,), jnp.uint32),
-                   jax.ShapeDtypeStruct((sum(sizes),), jnp.float32))  # fmt: skip
+        results = (
+            jax.ShapeDtypeStruct((self.num_words,), jnp.uint32),
+            jax.ShapeDtypeStruct((sum(sizes),), jnp.float32),
+        )
         call = jax.ffi.ffi_call(target, results, vmap_method="broadcast_all")
         state, numbers = call(*(array for array, _ in arguments), model=self._id, **attributes)
         parts = jnp.split(numbers, np.cumsum(sizes)[:-1])

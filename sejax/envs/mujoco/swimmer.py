@@ -21,8 +21,15 @@ class Env(MujocoEnv):
     gymnasium_id = "Swimmer-v5"
     file = "swimmer.xml"
     frame_skip = 4
-    info_keys = ("x_position", "y_position", "distance_from_origin", "x_velocity", "y_velocity",
-                 "reward_forward", "reward_ctrl")  # fmt: skip
+    info_keys = (
+        "x_position",
+        "y_position",
+        "distance_from_origin",
+        "x_velocity",
+        "y_velocity",
+        "reward_forward",
+        "reward_ctrl",
+    )
     augmented_keys = ("x_position", "y_position", "x_velocity", "y_velocity")
 
     def draw_start(self, key: Array) -> tuple[Float[Array, "5"], Float[Array, "5"]]:

@@ -1,0 +1,304 @@
+"""Double DQN with soft target updates and Adam, with a plain or a dueling network; DQN.
+
+Source: van Hasselt et al., "Deep RL with Double Q-learning" (2016); Mnih et al., "Human-level
+control through deep reinforcement learning" (2015); the paper's hyperparameter tables;
+`docs/reference.md` 4.1 and 4.2.
+"""
+
+import functools
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import optax
+from flax import linen as nn
+from flax import struct
+from jaxtyping import Array, Float, Int
+
+from sejax.agents.base import Agent, AgentOptions, traced
+from sejax.agents.epsilon_greedy import decayed_epsilon, epsilon_greedy
+from sejax.agents.memory import replay_memory
+from sejax.agents.partial_batch import sum_over_batch
+from sejax.agents.policies import select_action
+from sejax.agents.replay import Transition, num_columns
+from sejax.ops import flat
+from sejax.ops.networks import MLP, DuelingMLP, init_narrowed
+from sejax.options import (
+    ACTIVATIONS,
+    MOST_LAYERS,
+    MOVES,
+    counts,
+    fraction,
+    one_of,
+    option,
+    positive,
+)
+
+# Small agents train in lockstep on a core: measured, 2.3 times as fast as alone. Twice as many gain
+# another 3%, and a population is filled up to whole groups.
+SMALL_LANES = 8
+LOSSES = {"squared": jnp.square, "huber": optax.losses.huber_loss}
+
+
+@dataclass(frozen=True, kw_only=True)
+class DDQNConfig(AgentOptions):
+    """DDQN's hyperparameters; the defaults are the paper's "default agent hyperparameters"."""
+
+    batch_size: int = option(128, counts(), varied="triple")  # transitions
+    buffer_size: int = option(100_000, counts())  # steps that are remembered
+    hidden_size: int = option(128, counts(), varied="triple")  # units of each hidden layer
+    num_layers: int = option(2, counts(most=MOST_LAYERS), varied="one_more_or_less")
+    activation: str = option("relu", one_of(ACTIVATIONS))
+    learning_rate: float = option(1e-3, positive(MOVES), traced=True, varied="triple")  # of Adam
+    # tau: weight of the online network in the target's update
+    tau: float = option(0.01, fraction(), traced=True)
+    discount: float = option(0.99, fraction(), traced=True)  # gamma
+    epsilon_init: float = option(1.0, fraction(), traced=True)  # share of random actions
+    epsilon_min: float = option(0.01, fraction(), traced=True)
+    epsilon_decay: float = option(0.9, fraction(), traced=True)  # factor for each episode
+    # If given, epsilon falls linearly in so many steps from when the agent first learns, whatever
+    # the episodes: for worlds where those have a step or two.
+    exploration_steps: int | None = option(None, counts("it counts steps"), traced=True)
+    double: bool = True  # the online network chooses a target's action; else the target network
+    loss: str = option("squared", one_of(LOSSES))  # of the error; huber: its gradient is clipped
+    target_update_every: int = option(1, counts())  # learning steps for each update of the target
+    train_every: int = option(1, counts())  # agent steps for each time that it learns, ...
+    gradient_steps: int = option(1, counts())  # ... in so many learning steps
+
+    def make(self, task: Any) -> Agent:
+        """The agent for a task's observations and actions."""
+        return make_ddqn(self, task.obs_dim, task.num_actions)
+
+    @property
+    def is_small(self) -> bool:
+        """Whether what surrounds the products of a learning step takes longer than they do."""
+        return self.num_layers == 1 and self.hidden_size * self.batch_size <= 64 * 64
+
+    def network(self, num_actions: int) -> nn.Module:
+        """Maps observations `[obs_dim, *batch]` to Q values `[num_actions, *batch]`."""
+        return MLP(
+            num_actions,
+            self.hidden_size,
+            self.num_layers,
+            self.activation,
+            learn_prelu_slope=True,
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class DuelingDDQNConfig(DDQNConfig):
+    """DDQN with a dueling network (paper, appendix, tables of DDQN and Dueling DDQN)."""
+
+    is_small = False  # products of its streams: in lockstep a learning step takes 1.5 times as long
+
+    feature_dim: int = option(128, counts())  # outputs of the part that both streams share
+    # Hidden layers of the value and of the advantage stream.
+    stream_num_layers: int = option(1, counts("it counts layers", 0, MOST_LAYERS))
+    stream_hidden_size: int = option(128, counts())
+
+    def network(self, num_actions: int) -> nn.Module:
+        return DuelingMLP(
+            num_actions,
+            self.feature_dim,
+            self.hidden_size,
+            self.num_layers,
+            self.stream_hidden_size,
+            self.stream_num_layers,
+            self.activation,
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class DQNConfig(DDQNConfig):
+    """DQN: without double Q-learning, and with an epsilon that falls by steps."""
+
+    double: bool = False
+    epsilon_min: float = 0.05
+    exploration_steps: int | None = 1000
+
+
+@struct.dataclass
+class DDQNState:
+    """One agent."""
+
+    params: Float[Array, " num_params"]
+    target_params: Float[Array, " num_params"]
+    opt_state: optax.OptState
+    epsilon: Array
+    num_steps: Int[Array, ""]  # agent steps since it first learned
+    hparams: Any  # traced options, and hidden_size and batch_size in use or None
+
+
+@functools.cache
+def make_ddqn(config: DDQNConfig, obs_dim: int, num_actions: int) -> Agent:
+    """Builds the agent for observations `[obs_dim]` and actions `0..num_actions-1`.
+
+    A `DuelingDDQNConfig` makes its network a dueling one.
+
+    Example:
+      >>> agent = make_ddqn(DDQNConfig(), obs_dim=4, num_actions=2)
+      >>> state = agent.init(jax.random.key(0), agent.hparams)
+      >>> int(agent.act(jax.random.key(1), state, jnp.zeros(4), explore=False)) in (0, 1)
+      True
+    """
+    network = config.network(num_actions)
+    unflatten = flat.unflattener(network.init, jnp.zeros(obs_dim))
+    learn = make_learning_step(config, network, unflatten)
+
+    def init(key: Array, hparams: Any) -> DDQNState:
+        params = flat.flatten(init_narrowed(network, key, obs_dim, hparams.hidden_size))
+        hparams = jax.tree.map(jnp.float32, hparams)
+        return DDQNState(
+            params=params,
+            target_params=params,
+            opt_state=flat.ADAM.init(params),
+            epsilon=jnp.float32(hparams.epsilon_init),
+            num_steps=jnp.int32(0),
+            hparams=hparams,
+        )
+
+    def act(key: Array, state: DDQNState, obs: Float[Array, " obs_dim"], explore: bool) -> Array:
+        q_values: Any = network.apply(unflatten(state.params), obs)
+        if not explore:
+            return jnp.argmax(q_values).astype(jnp.int32)
+        return epsilon_greedy(key, q_values, state.epsilon)
+
+    def batch_size(state: DDQNState) -> Array | None:
+        in_use = state.hparams.batch_size
+        return None if in_use is None else in_use * config.gradient_steps
+
+    return Agent(
+        init=init,
+        begin_episode=begin_episode,
+        act=act,
+        update=make_update(config, learn),
+        hparams=traced(config, hidden_size=None, batch_size=None),
+        memory=replay_memory(config.batch_size * config.gradient_steps, config.buffer_size),
+        warmup_episodes=config.warmup_episodes,
+        learns_from=config.warmup_episodes,
+        batch_size=batch_size,
+        cpu_num_parallel=SMALL_LANES if config.is_small else 1,
+    )
+
+
+def begin_episode(state: DDQNState, episode: Array) -> DDQNState:
+    """The share of random actions in the episode, unless it falls with steps."""
+    hp = state.hparams
+    if hp.exploration_steps is not None:
+        return state
+    epsilon = decayed_epsilon(hp.epsilon_init, hp.epsilon_min, hp.epsilon_decay, episode)
+    return state.replace(epsilon=epsilon)
+
+
+def linear_epsilon(hparams: Any, num_steps: Array) -> Array:
+    """The share of random actions `num_steps` after the agent first learned, `[]`.
+
+    It falls from `hparams.epsilon_init` to its `epsilon_min` in `exploration_steps` and stays.
+
+    Source: Mnih et al. (2015), extended data table 1 (final exploration frame).
+    """
+    progress = jnp.minimum(num_steps / hparams.exploration_steps, 1.0)
+    return hparams.epsilon_init + progress * (hparams.epsilon_min - hparams.epsilon_init)
+
+
+def make_update(
+    config: DDQNConfig, learn: Callable[[DDQNState, Transition], DDQNState]
+) -> Callable[[Array, DDQNState, Transition], DDQNState]:
+    """Builds `update(key, state, batch) -> state`: when to learn, how often, and epsilon."""
+
+    def learn_all(state: DDQNState, batch: Transition) -> DDQNState:
+        if config.gradient_steps == 1:
+            return learn(state, batch)
+        batches = split_batch(batch, config.gradient_steps)
+        return jax.lax.scan(lambda state, batch: (learn(state, batch), None), state, batches)[0]
+
+    def update(key: Array, state: DDQNState, batch: Transition) -> DDQNState:
+        state = state.replace(num_steps=state.num_steps + 1)
+        if state.hparams.exploration_steps is not None:
+            state = state.replace(epsilon=linear_epsilon(state.hparams, state.num_steps))
+        if config.train_every == 1:
+            return learn_all(state, batch)
+        is_due = state.num_steps % config.train_every == 0
+        return jax.lax.cond(is_due, learn_all, lambda state, _: state, state, batch)
+
+    return update
+
+
+def split_batch(batch: Transition, num_parts: int) -> Transition:
+    """A batch as `num_parts` of them, leaves `[part, *feature, column]`.
+
+    They take turns in columns, so that each has its share of those that count.
+    """
+    batch = batch._replace(weight=jnp.broadcast_to(batch.weight, batch.reward.shape))
+
+    def split(x: Array) -> Array:
+        missing = -x.shape[-1] % num_parts
+        padded = jnp.pad(x, [(0, 0)] * (x.ndim - 1) + [(0, missing)])
+        return jnp.moveaxis(padded.reshape(*x.shape[:-1], -1, num_parts), -1, 0)
+
+    return jax.tree.map(split, batch)
+
+
+def make_learning_step(
+    config: DDQNConfig, network: nn.Module, unflatten: Callable[[Array], Any]
+) -> Callable[[DDQNState, Transition], DDQNState]:
+    """Builds `learn(state, batch) -> state`: Adam on the loss of the error to double-Q targets.
+
+    Source: van Hasselt et al. (2016), eq. 4; `docs/reference.md` 4.1.
+    """
+    loss_fn = LOSSES[config.loss]
+
+    def sum_of_losses(params, target_params, discount, batch: Transition) -> Array:
+        q_values = network.apply(params, batch.obs)  # [actions, batch]
+        target_next_q: Any = network.apply(target_params, batch.next_obs)
+        targets = double_q_targets(
+            network.apply(params, batch.next_obs) if config.double else target_next_q,
+            target_next_q,
+            batch.reward,
+            discount * batch.discount,
+        )
+        error = select_action(q_values, batch.action) - jax.lax.stop_gradient(targets)
+        return jnp.sum(batch.weight * loss_fn(error))
+
+    def learn(state: DDQNState, batch: Transition) -> DDQNState:
+        hp = state.hparams
+        params, target_params = unflatten(state.params), unflatten(state.target_params)
+
+        def sum_of_gradients(batch: Transition) -> Array:
+            return flat.flatten(jax.grad(sum_of_losses)(params, target_params, hp.discount, batch))
+
+        gradient = sum_over_batch(sum_of_gradients, batch, hp.batch_size) / num_columns(batch)
+        moved, opt_state = flat.adam_step(state.params, state.opt_state, gradient, hp.learning_rate)
+        tau = hp.tau
+        if config.target_update_every > 1:
+            tau = jnp.where(opt_state.count % config.target_update_every == 0, tau, 0.0)
+        return state.replace(
+            params=moved,
+            target_params=tau * moved + (1 - tau) * state.target_params,
+            opt_state=opt_state,
+        )
+
+    return learn
+
+
+def double_q_targets(
+    online_next_q: Float[Array, "actions batch"],
+    target_next_q: Float[Array, "actions batch"],
+    reward: Float[Array, " batch"],
+    discount: Float[Array, " batch"],
+) -> Float[Array, " batch"]:
+    r"""Targets :math:`r + \gamma\, Q'(s', \arg\max_a Q(s', a))`.
+
+    Args:
+      online_next_q: Q of the online network at the next states, by which actions are chosen. With
+        Q' in its place the targets are DQN's.
+      target_next_q: Q' of the target network at the next states.
+      reward: in the task's units.
+      discount: gamma times the transition's own discount.
+
+    Source: van Hasselt et al. (2016), eq. 4.
+    """
+    best = jnp.argmax(online_next_q, axis=0)
+    return reward + discount * select_action(target_next_q, best)

@@ -1,0 +1,139 @@
+"""How the commands start XLA. Libraries that import sejax keep their own settings."""
+
+import contextlib
+import hashlib
+import math
+import os
+import platform
+import sys
+from pathlib import Path
+from typing import Any
+
+from sejax.ops import files
+
+CGROUPS = Path("/sys/fs/cgroup")
+_NEVER_SECONDS = 1_000_000
+
+
+def available_cores() -> int:
+    """CPU cores that this process may use: those it may run on, or fewer of a container's quota."""
+    affine = hasattr(os, "sched_getaffinity")
+    cores = len(os.sched_getaffinity(0)) if affine else os.cpu_count() or 1
+    return max(1, int(min(cores, _quota(CGROUPS))))
+
+
+def _quota(cgroups: Path) -> float:
+    """CPUs that a container may use, as in `docker run --cpus=2`; inf where nothing is said."""
+    with contextlib.suppress(OSError, ValueError):  # version 2: "200000 100000", or "max 100000"
+        quota, period = (cgroups / "cpu.max").read_text().split()
+        return int(quota) / int(period)
+    with contextlib.suppress(OSError, ValueError):
+        quota, period = (
+            (cgroups / "cpu" / f"cpu.cfs_{name}_us").read_text() for name in ("quota", "period")
+        )
+        return int(quota) / int(period) if int(quota) > 0 else math.inf
+    return math.inf
+
+
+def is_started() -> bool:
+    """Whether jax has its devices already."""
+    if "jax" not in sys.modules:
+        return False
+    from jax._src import xla_bridge
+
+    return bool(xla_bridge.backends_are_initialized())
+
+
+def configure_xla(num_devices: int | None = None) -> None:
+    """Sets XLA up for one CPU device per core; must run before jax first computes.
+
+    A flag that the user has set in `XLA_FLAGS` stays. The time limits of collectives are lifted:
+    devices reach the gather at the end of a generation at very different times, and XLA would
+    abort the process after a minute of waiting.
+
+    Args:
+      num_devices: CPU devices; None for one per core.
+
+    Once jax has computed, the flags would have no effect: then nothing is done.
+    """
+    if is_started():
+        return
+    count = num_devices or available_cores()
+    flags = {
+        "--xla_force_host_platform_device_count": count,
+        "--xla_cpu_multi_thread_eigen": "false",
+        "--xla_cpu_collective_call_warn_stuck_timeout_seconds": _NEVER_SECONDS,
+        "--xla_cpu_collective_call_terminate_timeout_seconds": _NEVER_SECONDS,
+    }
+    given = os.environ.get("XLA_FLAGS", "")
+    added = [f"{flag}={value}" for flag, value in flags.items() if flag not in given]
+    os.environ["XLA_FLAGS"] = " ".join([given, *added]).strip()
+    if count == 1:
+        # With one device XLA would hand pieces of the step to a second thread, which doubles the
+        # CPU time for no gain: the pieces are smaller than the handing over.
+        os.environ.setdefault("NPROC", "1")
+
+
+def take_share_of_gpu(share: float) -> None:
+    """Keeps this process on its CPU core, or to its part of the GPU's memory.
+
+    Must run before jax first computes; after that nothing is done.
+
+    Args:
+      share: of one GPU, in [0, 1]; 0 for the CPU, whatever `JAX_PLATFORMS` says, so that other
+        processes have the GPUs.
+    """
+    if is_started():
+        return
+    if share == 0:
+        import jax
+
+        jax.config.update("jax_platforms", "cpu")
+    elif share < 1 and "XLA_PYTHON_CLIENT_MEM_FRACTION" not in os.environ:  # its older name
+        os.environ.setdefault("XLA_CLIENT_MEM_FRACTION", f"{0.9 * share:.3f}")  # 0.75 is usual
+
+
+def configure_jax() -> None:
+    """What the commands ask of jax; what the user has set stays.
+
+    Matrices are multiplied in single precision on GPUs too, as on CPUs and in `sejax.gym`: recent
+    ones round factors to ten bits otherwise, and a proxy is another one there.
+
+    Compiled programs are kept between runs, in a folder for this kind of CPU: code compiled for
+    another one is rejected or unsafe, so that the folder's name depends on the CPU's model and
+    features. `SEJAX_CACHE_DIR` moves it; set to nothing it switches the cache off.
+    """
+    import jax
+
+    if jax.config.jax_default_matmul_precision is None:
+        jax.config.update("jax_default_matmul_precision", "highest")
+    root = files.cache_folder()
+    if root is None or jax.config.jax_compilation_cache_dir:
+        return
+    jax.config.update("jax_compilation_cache_dir", str(root / cpu_fingerprint()))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
+
+
+def machine() -> dict[str, Any]:
+    """What kind of machine this is; not which."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        models = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    except OSError:
+        models = []
+    return {
+        "system": f"{platform.system()} {platform.release()}",
+        "processor": models[0] if models else platform.processor() or platform.machine(),
+        "cores": available_cores(),
+    }
+
+
+def cpu_fingerprint() -> str:
+    """Short name of the host's kind of CPU: its architecture and a hash of model and features."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        described = sorted({x for x in lines if x.startswith(("model name", "flags", "Features"))})
+    except OSError:
+        described = [platform.processor()]
+    digest = hashlib.sha256("\n".join(described).encode()).hexdigest()[:12]
+    return f"{platform.machine()}-{digest}"
