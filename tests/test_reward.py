@@ -15,7 +15,7 @@ from sejax.agents import Agent, make_agent
 from sejax.agents.tabular import QLearningConfig
 from sejax.cli import build
 from sejax.errors import ConfigError
-from sejax.evaluation import make_evaluator, area_under_curve
+from sejax.evaluation import area_under_curve, make_evaluator
 from sejax.proxies import ABSURD
 from sejax.proxies.base import World, world_of
 from sejax.proxies.configs import RewardConfig

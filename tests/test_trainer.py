@@ -19,8 +19,8 @@ from sejax.agents.dqn import DDQNConfig, make_ddqn
 from sejax.agents.memory import Memory, rollout_memory
 from sejax.agents.tabular import QLearningConfig
 from sejax.errors import ConfigError
-from sejax.proxies.configs import SyntheticConfig
 from sejax.evaluation import _Greedy, make_recorder, make_tester
+from sejax.proxies.configs import SyntheticConfig
 from sejax.training import TrainingConfig, is_plateau, is_solved, make_trainer
 
 WINDOW, TOLERANCE, SOLVED, INIT_EPISODES = 2, 0.25, 1.5, 2
