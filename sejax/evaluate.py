@@ -14,7 +14,7 @@ from sejax import registry
 from sejax.cli import build, commands, compose, runtime
 from sejax.cli.build import EvaluateConfig
 from sejax.cli.families import AgentFamily, families_of, named
-from sejax.errors import ConfigError, require, told
+from sejax.errors import ConfigError, require
 from sejax.proxies import hub
 from sejax.training import TrainingConfig, require_reachable
 

@@ -1,7 +1,7 @@
 """A run's folder, of which one file counts: `checkpoint.safetensors`.
 
-It holds the configuration, the state of the learner, and all rows of `metrics.csv`. It is written to
-a temporary file, put on the disk, and renamed over the one before, so that a kill at any moment
+It holds the configuration, the state of the learner, and all rows of `metrics.csv`. It is written
+to a temporary file, put on the disk, and renamed over the one before, so that a kill at any moment
 leaves a whole checkpoint. All other files are remade from it when the run goes on. A run that is
 refused changes nothing.
 
@@ -22,7 +22,7 @@ import yaml
 
 from sejax.errors import ConfigError
 from sejax.ops import checksummed
-from sejax.ops.files import remove_leftovers, require_writable, write_bytes, write_text
+from sejax.ops.files import remove_leftovers, write_bytes, write_text
 from sejax.serialize import differences
 
 COLUMNS = (
@@ -45,7 +45,7 @@ AGENT_COLUMNS = ("incumbent_mean", "population_mean", "train_steps_mean", "num_n
 # Fields and groups that say how or how long to compute, not what: they may change between two
 # sessions of a run.
 FREE_FIELDS = {"generations", "devices", "checkpoint_every", "run_dir", "tracker", "machines"}
-FIX = "run_dir=FOLDER"
+HINT = "Set run_dir=FOLDER."
 
 _CHECKPOINT, _METRICS, _CONFIG, _LOCK = (
     "checkpoint.safetensors",
@@ -86,7 +86,7 @@ class RunDirectory:
         path: str | Path,
         config: dict[str, Any],
         agents: Sequence[str] = (),
-        fix: str = FIX,
+        hint: str = HINT,
         completed: Callable[[dict[str, Any]], dict[str, Any]] = dict,
     ):
         """Makes the folder, or opens that of an earlier session of the same run.
@@ -95,7 +95,7 @@ class RunDirectory:
           path: the folder.
           config: the configuration, plain values in nested mappings; `seed` is read.
           agents: names of the agents; each of several has columns of its own.
-          fix: how messages say to choose another folder.
+          hint: last sentence of messages: how to choose another folder.
           completed: adds to a stored configuration the fields that an older version did not write.
 
         Raises:
@@ -107,7 +107,7 @@ class RunDirectory:
         self.columns = columns_of(agents)
         self.rows: list[dict[str, str]] = []
         self.id, self.cpu_s = secrets.token_hex(4), 0.0
-        self._agents, self._fix = agents if len(agents) > 1 else (), fix
+        self._agents, self._hint = agents if len(agents) > 1 else (), hint
         self._csv = _as_csv([self.columns])
         self._state: dict[str, np.ndarray] | None = None
         self._made = [x for x in (self.path, *self.path.parents) if not os.path.exists(x)]
@@ -119,10 +119,10 @@ class RunDirectory:
             raise
 
     def close(self) -> None:
-        """Lets other processes use the folder; removes it if it was made here and is empty."""
+        """Lets other processes use the folder; without a run there, leaves nothing behind."""
         if not self._lock.is_locked:
             return
-        if self._made and not (self.path / _CHECKPOINT).exists():
+        if not (self.path / _CHECKPOINT).exists():
             (self.path / _LOCK).unlink(missing_ok=True)
             for folder in self._made:
                 with contextlib.suppress(OSError):  # it is not empty
@@ -140,7 +140,7 @@ class RunDirectory:
         return self.path / _METRICS
 
     @property
-    def num_generations(self) -> int:
+    def finished_generations(self) -> int:
         """Generations that are saved."""
         return len(self.rows)
 
@@ -218,9 +218,9 @@ class RunDirectory:
 
     def _locked(self) -> filelock.BaseFileLock:
         """Makes the folder and locks it; the lock ends with the process, however that ends."""
-        require_writable("run_dir", self.path, self._fix)
         lock = filelock.FileLock(self.path / _LOCK, timeout=0, thread_local=False)
         try:
+            self.path.mkdir(parents=True, exist_ok=True)
             lock.acquire()
         except filelock.Timeout:
             self._refuse(
@@ -228,8 +228,9 @@ class RunDirectory:
                 "two would mix their files",
                 f"{self.path}, which another process uses",
             )
-        except (OSError, NotImplementedError) as error:
-            self._refuse("be a folder that can be locked", "one process at a time writes", error)
+        except (OSError, ValueError, NotImplementedError) as error:
+            reason = "the run's files go there"
+            self._refuse("be a folder that can be written", reason, f"{self.path} ({error})")
         return lock
 
     def _open(self, completed: Callable[[dict[str, Any]], dict[str, Any]]) -> None:
@@ -300,7 +301,7 @@ class RunDirectory:
                 write_text(path, text)
 
     def _refuse_files_without_checkpoint(self) -> None:
-        """Refuses to replace the files of a run whose checkpoint is lost, or of an older version."""
+        """Refuses to replace the files of a run without its checkpoint, or of an older sejax."""
         for name in _SIGNS_OF_A_RUN:
             if (self.path / name).exists():
                 self._refuse(
@@ -314,18 +315,18 @@ class RunDirectory:
         self._refuse("hold a whole checkpoint", "the run goes on from it", f"{path}: {error}")
 
     def _refuse(self, rule: str, reason: str, got: object) -> NoReturn:
-        message = f"run_dir must {rule}, because {reason}; got {got}. Set {self._fix}."
+        message = f"run_dir must {rule}, because {reason}; got {got}. {self._hint}"
         raise ConfigError(message, "run_dir")
 
 
-def open_for(config: Any, fix: str = FIX) -> RunDirectory:
+def open_for(config: Any, hint: str = HINT) -> RunDirectory:
     """The folder of a run; made, or opened to go on.
 
     What it stores is compared as plain values: nothing that only the folder names is imported.
 
     Args:
       config: a `LearnConfig`.
-      fix: how messages say to choose another folder.
+      hint: last sentence of messages: how to choose another folder.
 
     Raises:
       ConfigError: as of `RunDirectory`.
@@ -334,7 +335,13 @@ def open_for(config: Any, fix: str = FIX) -> RunDirectory:
     from sejax.cli.families import families_of
 
     agents = [family.key for family in families_of(config)]
-    return RunDirectory(config.resolved_run_dir, build.to_plain(config), agents, fix)
+    return RunDirectory(
+        config.resolved_run_dir,
+        build.to_plain(config),
+        agents,
+        hint,
+        completed=lambda stored: build.completed(stored, config),
+    )
 
 
 def columns_of(agents: Sequence[str] = ()) -> tuple[str, ...]:

@@ -132,18 +132,20 @@ def run(
     restored = directory.restore(state)
     if restored is not None:
         state = restored
-        report.say(f"Going on at generation {directory.num_generations} of {directory.path}.")
+        report.say(f"Going on at generation {directory.finished_generations} of {directory.path}.")
         proxies.save(jax.device_get(state))
     state = jax.tree.map(lambda x: x.copy(), state)  # own buffers, so that they can be donated
 
     def is_over() -> bool:
-        return directory.num_generations >= config.generations or bool(state.finished)
+        return directory.finished_generations >= config.generations or bool(state.finished)
 
     tracker = _tracker(config, directory, report) if not is_over() else None
     drawn = time.monotonic()
     try:
         while not is_over():
-            length = min(config.checkpoint_every, config.generations - directory.num_generations)
+            length = min(
+                config.checkpoint_every, config.generations - directory.finished_generations
+            )
             if not chunks.is_ready(length):
                 report.status("compiling")
                 chunks.compile(length)
@@ -168,7 +170,7 @@ def run(
     directory.write_summary(
         ended=ended,
         best_score=float(state.best_score),
-        generations=directory.num_generations,
+        generations=directory.finished_generations,
         solved_score=chunks.learner.solved_score,
         wall_s=round(clock.wall_s(), 1),
         cpu_s=round(clock.cpu_s(), 1),
@@ -256,7 +258,7 @@ def _tracker(
     run = TrackedRun(
         folder=directory.path.resolve(),
         id=directory.id,
-        generation=directory.num_generations,
+        generation=directory.finished_generations,
         config=directory.config,
     )
     return GuardedTracker(config.tracker, run, report.say)
@@ -278,7 +280,7 @@ def _cost(directory: RunDirectory, num_candidates: int) -> dict[str, int]:
     """The cost of all generations in agents and steps."""
     steps_of_agents = sum(float(row["train_steps_mean"]) for row in directory.rows)
     return {
-        "agents": directory.num_generations * num_candidates,
+        "agents": directory.finished_generations * num_candidates,
         "train_steps": round(steps_of_agents * num_candidates),
         "real_steps": directory.real_steps,
     }

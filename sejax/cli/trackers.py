@@ -123,8 +123,8 @@ class TensorBoard:
         from tensorboardX import SummaryWriter
 
         self._picture, self._next = run.picture, run.generation
-        # A killed session may have written later generations, which are purged. The suffix keeps its
-        # file from being replaced by one that begins in the same second.
+        # Later generations of a killed session are purged. The suffix keeps its file from being
+        # replaced by one that begins in the same second.
         self._writer = SummaryWriter(
             str(run.folder / "tensorboard"),
             purge_step=run.generation,

@@ -1,7 +1,7 @@
 """Safetensors files with a checksum, so that a change of any bit is noticed.
 
-The metadata has one entry, a JSON object. Its `sha256` is the digest of the whole file as it is with
-64 zeros in the digest's place.
+The metadata has one entry, a JSON object. Its `sha256` is the digest of the whole file as it is
+with 64 zeros in the digest's place.
 """
 
 import hashlib

@@ -27,13 +27,8 @@ def cache_folder() -> Path | None:
         return None
 
 
-def require_writable(field: str, folder: Path, fix: str | None = None) -> None:
+def require_writable(field: str, folder: Path) -> None:
     """Makes a folder and checks that files can be written there.
-
-    Args:
-      field: the option that names the folder.
-      folder: the folder.
-      fix: how the message says to choose another one; default: by the field.
 
     Raises:
       ConfigError: of this field, if they cannot.
@@ -44,7 +39,7 @@ def require_writable(field: str, folder: Path, fix: str | None = None) -> None:
             pass
     except (OSError, ValueError) as error:
         rule = "be a folder that can be written"
-        require(False, field, rule, "files go there", error, fix or f"{field}=FOLDER")
+        require(False, field, rule, "files go there", error, f"{field}=FOLDER")
 
 
 @contextlib.contextmanager

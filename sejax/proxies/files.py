@@ -23,8 +23,8 @@ from sejax.envs import absent
 from sejax.envs.absent import require_present
 from sejax.envs.base import Task
 from sejax.errors import ConfigError, require, shortened, told
-from sejax.ops.files import write_bytes
 from sejax.ops.checksummed import pack
+from sejax.ops.files import write_bytes
 from sejax.proxies.base import ProxyEnv
 from sejax.proxies.stored import (
     FORMAT_VERSION,
