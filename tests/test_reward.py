@@ -283,7 +283,7 @@ def test_steps_on_a_reward_network_are_real_and_scored():
     config = sejax.config([*LEARN, "es.num_incumbent_evals=2", "devices=1"])
     result = jax.jit(sejax.make_learner(config))(jax.random.key(0))
     info = jax.device_get(result.info)
-    steps, real = info.train_steps_total[0], info.env_steps_total[0]
+    steps, real = info.train_steps.sum(), info.real_steps.sum()
     assert real > steps  # those of the tests between and after the training episodes as well
     # -(n_tr + 100 max(0, C_sol - C_fin)), at most 12 episodes of 50 steps, a return of at least
     # -149 where the task is solved at -20.
@@ -315,7 +315,7 @@ def test_the_area_under_the_curve_is_of_trainings_that_go_on_when_solved(objecti
     asked = []
     monkeypatch.setattr(bilevel, "make_population_evaluator",
                         lambda agent, proxy, training, *_: asked.append(training))  # fmt: skip
-    bilevel.make_program(**config.parts())
+    bilevel.make_bilevel(**config.parts())
     changes = {"stop_rule": "never", "tests_between": 1}
     assert asked == [dataclasses.replace(config.training, **changes)]
 
