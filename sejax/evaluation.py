@@ -17,7 +17,7 @@ from sejax.envs.base import Task
 from sejax.errors import require
 from sejax.objectives import Outcome
 from sejax.ops.parallel import compiler_options, spread_over_devices
-from sejax.proxies.base import world_of
+from sejax.proxies.base import is_real
 from sejax.rollout import Steps, make_recorder, make_tester
 from sejax.training import TrainingConfig, TrainResult, make_trainer
 
@@ -89,7 +89,7 @@ def make_evaluator(
                 train_episodes=result.episodes,
                 return_area=return_area(result, tests.returns.mean()),
                 nonfinite=result.nonfinite | ~jnp.isfinite(tests.returns).all(),
-                real_steps=real_steps + result.train_steps if world_of(env).is_real else real_steps,
+                real_steps=real_steps + result.train_steps if is_real(env) else real_steps,
             )
             return (outcome, recorded(key_test, result.agent_state)) if recorded else outcome
 
