@@ -13,7 +13,7 @@ ROOT = Path(__file__).parents[1] / "sejax"
 # when somebody asks for what they stand for: they do not count.
 LAYERS = [
     {"search"},
-    {"run", "evaluate", "report", "experiments"},
+    {"run", "evaluate", "report"},
     {"machines"},
     {"cli"},
     {"bilevel"},
@@ -24,11 +24,11 @@ LAYERS = [
     {"envs", "es", "objectives"},
     {"registry"},
     {"ops", "serialize"},
-    {"options", "statistics"},
+    {"options"},
     {"errors"},
     {"", "conf"},
 ]
-COMMANDS = ("cli", "run", "evaluate", "report", "search", "machines", "experiments")
+COMMANDS = ("cli", "run", "evaluate", "report", "search", "machines")
 
 
 def name_of(path):
