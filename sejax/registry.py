@@ -51,12 +51,14 @@ class Group:
       arguments: what `make` is given, for messages and for functions in a dataclass's place.
       built_in: name to `module:attribute`.
       families: beginning of a name to `module:attribute` of a dataclass with a field `name`.
+      base: `module:attribute` of the class from which a plugin's dataclass must derive; any if "".
     """
 
     entry_points: str
     arguments: tuple[str, ...]
     built_in: dict[str, str]
     families: dict[str, str] = dataclasses.field(default_factory=dict)
+    base: str = ""
 
 
 _EVOSAX = (
@@ -141,6 +143,7 @@ GROUPS = {
             "se": "sejax.proxies.configs:SyntheticConfig",
             "rn": "sejax.proxies.configs:RewardConfig",
         },
+        base="sejax.proxies:ProxyConfig",
     ),
     "objective": Group(
         "sejax.objectives",
@@ -542,6 +545,15 @@ def _as_dataclass(group: str, name: str, found: Any) -> Any:
     arguments = GROUPS[group].arguments
     if isinstance(found, type) and dataclasses.is_dataclass(found) and hasattr(found, "make"):
         cls: Any = found
+        base = GROUPS[group].base
+        require(
+            not base or issubclass(cls, _attribute(base)),
+            group,
+            f"derive from {base.replace(':', '.')}",
+            "that declares what is asked of it",
+            name,
+            f"{cls.__name__}({base.partition(':')[2]}) as its class",
+        )
     elif inspect.isfunction(found) or isinstance(found, functools.partial):
         cls = _from_function(group, name, found)
     else:
@@ -585,6 +597,7 @@ def _from_function(group: str, name: str, function: Callable[..., Any]) -> type:
     cls = dataclasses.make_dataclass(
         written.__name__,
         fields,
+        bases=(_attribute(GROUPS[group].base),) if GROUPS[group].base else (),
         namespace={"make": make, "__doc__": written.__doc__},
         frozen=True,
         kw_only=True,

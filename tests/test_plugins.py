@@ -337,7 +337,7 @@ WHOLE = '''
 """A line of places, a table of two numbers, a guessed reward, a search."""
 
 import dataclasses
-from typing import Any, ClassVar
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -449,9 +449,7 @@ class GuessParams(environment.EnvParams):
 
 
 @dataclasses.dataclass(frozen=True)
-class Guess:
-    default_objective: ClassVar[str] = "max_reward"
-
+class Guess(sejax.ProxyConfig):
     def make(self, task):
         return GuessEnv(task, self)
 

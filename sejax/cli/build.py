@@ -86,15 +86,14 @@ class LearnConfig:
             "stop_when_solved=false",
         )
         facts, task_name = envs.facts_of(self.env), self.name("env")
-        if hasattr(self.proxy, "require_task"):
-            self.proxy.require_task(facts, task_name)
+        self.proxy.require_task(facts, task_name)
         train = not all(getattr(x.agent, "is_solved_for", False) for x in families_of(self))
-        if train and hasattr(self.proxy, "lasts_to_the_limit"):  # an SE
+        if train and not self.proxy.has_real_dynamics:
             require_reachable("training", self.training, self.proxy.max_steps(facts.max_steps))
         for family in families_of(self):
             with families.named(family.field):
                 agents.require_fit(family.agent, self.exploration, facts, task_name)
-                if getattr(self.proxy, "lasts_to_the_limit", False):
+                if self.proxy.reaches_step_limit:
                     require_learning(
                         "training",
                         self.training,

@@ -286,7 +286,7 @@ def _register_choice(group: str, choice: str, is_chosen: bool, overrides: Sequen
         agent = _agent_for(choice, is_own, node, overrides)
         changes = {"agent": agent} if agent != _DEFAULT_AGENT else {}
     elif group == "proxy":
-        wanted = getattr(registry.find(group, choice), "default_objective", _DEFAULT_OBJECTIVE)
+        wanted = registry.find(group, choice).default_objective
         changes = {"objective": wanted} if wanted != _DEFAULT_OBJECTIVE else {}
     if changes:  # chooses of another group too, where that is left open
         defaults = [{f"override /{other}": value} for other, value in changes.items()]
