@@ -103,11 +103,8 @@ def make_evaluator(
 
 def num_parallel_on_cpu(agent: Agent, training: TrainingConfig) -> int | None:
     """Agents in lockstep on a CPU core: 1 where they would wait for the one that trains longest."""
-    return (
-        1
-        if agent.cpu_num_parallel is not None and not training.is_fixed_length
-        else agent.cpu_num_parallel
-    )
+    num_parallel = agent.spec.cpu_num_parallel
+    return 1 if num_parallel is not None and not training.is_fixed_length else num_parallel
 
 
 def make_tested_trainer(

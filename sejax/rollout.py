@@ -61,7 +61,7 @@ class _Greedy:
         from sejax.envs.wrappers import repeat_actions
 
         self.agent, self.params = agent, task.params
-        self.env = repeat_actions(task.env, agent.action_repeat)
+        self.env = repeat_actions(task.env, agent.spec.action_repeat)
 
     def begin(self, key: Array, active: Array | bool) -> _Episode:
         obs, env_state = self.env.reset_env(key, self.params)
@@ -160,7 +160,7 @@ def make_recorder(agent: Agent, task: Any, num_episodes: int) -> Callable[[Array
             return after.replace(active=state.active & after.active), made
 
         start = greedy.begin(key_reset, True)
-        return jax.lax.scan(step, start, length=-(-task.max_steps // agent.action_repeat))[1]
+        return jax.lax.scan(step, start, length=-(-task.max_steps // agent.spec.action_repeat))[1]
 
     def record(key: Array, agent_state: Any) -> Steps:
         keys = jax.random.split(key, num_episodes)

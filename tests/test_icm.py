@@ -15,9 +15,9 @@ from sejax import envs
 from sejax.agents import make_agent
 from sejax.agents.base import Agent
 from sejax.agents.dqn import DDQNConfig, make_ddqn
-from sejax.agents.icm import ICM, ICMConfig, ICMOutputs, icm_loss, with_icm
-from sejax.agents.memory import Rollout, replay_memory
-from sejax.agents.replay import Transition, pack
+from sejax.agents.exploration import ICM, ICMConfig, ICMOutputs, icm_loss, with_icm
+from sejax.agents.buffers import Rollout, replay_buffer
+from sejax.agents.buffers import Transition, pack
 from sejax.errors import ConfigError
 
 OBS_DIM, WIDTH, BATCH = 3, 2, 7  # WIDTH: actions to choose from, or length of an action
@@ -69,10 +69,9 @@ def stub_agent(kind):
         begin_episode=lambda state, episode: state,
         act=lambda key, state, obs, explore: jnp.int32(0),
         update=update,
-        memory=replay_memory(BATCH, 10),
+        buffer=replay_buffer(BATCH, 10),
         hparams=(),
-        warmup_episodes=3,
-        learns_from=2,
+        spec=AgentSpec(warmup_episodes=3, learns_from=2),
         env_action=jnp.negative,
         action_repeat=2,
     )
@@ -437,5 +436,5 @@ def test_an_agent_that_does_not_learn_once_at_each_step_is_refused(field):
 def test_a_curious_agent_trains_alone_on_a_core():
     # In lockstep the bonus' networks take 1.4 times as long, however small the agent's own are.
     task, small = envs.make("cartpole"), DDQNConfig(hidden_size=64, num_layers=1, batch_size=32)
-    assert make_agent(small, task).cpu_num_parallel > 1
-    assert make_agent(small, task, ICMConfig()).cpu_num_parallel == 1
+    assert make_agent(small, task).spec.cpu_num_parallel > 1
+    assert make_agent(small, task, ICMConfig()).spec.cpu_num_parallel == 1

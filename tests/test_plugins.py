@@ -330,7 +330,7 @@ from flax import struct
 from gymnax.environments import environment, spaces
 
 import sejax
-from sejax.agents.memory import no_memory
+from sejax.agents import AgentConfig, no_buffer
 from sejax.es.nes import NESConfig, make_nes
 
 
@@ -383,7 +383,7 @@ class LineTask:
 
 
 @dataclasses.dataclass(frozen=True)
-class Table:
+class Table(AgentConfig):
     """Remembers what each action paid, whatever the place."""
 
     rate: float = 0.5
@@ -401,7 +401,7 @@ class Table:
         return sejax.Agent(
             init=lambda key, hparams: {"paid": jnp.zeros(task.num_actions),
                                        "rate": jnp.float32(hparams["rate"])},
-            act=act, update=update, memory=no_memory(), hparams={"rate": self.rate},
+            act=act, update=update, buffer=no_buffer(), hparams={"rate": self.rate},
             discount=lambda hparams: 1.0,
         )
 

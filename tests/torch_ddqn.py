@@ -10,7 +10,7 @@ import torch
 from test_ddqn import CASES, GOLDEN, NUM_ACTIONS, OBS_DIM, q_network, random_batch
 
 from sejax.agents.dqn import make_ddqn
-from sejax.agents.replay import Transition
+from sejax.agents.buffers import Transition
 
 NUM_UPDATES = 5
 

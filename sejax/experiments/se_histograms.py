@@ -31,8 +31,7 @@ from scipy.stats import wasserstein_distance
 
 import sejax
 from sejax import registry
-from sejax.agents import replay
-from sejax.agents.memory import Memory, MemoryMaker
+from sejax.agents.buffers import Buffer, BufferMaker, write_row
 from sejax.experiments import figures, se_agents
 from sejax.experiments.experiment import Experiment
 from sejax.experiments.se_agents import AGENTS, SOFT_SE
@@ -180,10 +179,10 @@ class LastSteps:
     episode: Any  # that goes on, `[]`
 
 
-def last_steps(capacity: int) -> MemoryMaker:
+def last_steps(capacity: int) -> BufferMaker:
     """A recorder of the last `capacity` steps of a training."""
 
-    def make(example: Any, max_steps: int) -> Memory:
+    def make(example: Any, max_steps: int) -> Buffer:
         def init() -> LastSteps:
             rows = jnp.zeros((capacity, 2 + example.next_obs.shape[0]))
             return LastSteps(rows=rows, episode=jnp.int32(0))
@@ -192,11 +191,11 @@ def last_steps(capacity: int) -> MemoryMaker:
             first = jnp.stack([jnp.float32(kept.episode), jnp.float32(made.reward)])
             row = jnp.concatenate([first, made.next_obs])
             return LastSteps(
-                rows=replay.write_row(kept.rows, step, row, active),
+                rows=write_row(kept.rows, step, row, active),
                 episode=kept.episode + (ended & active),
             )
 
-        return Memory(init=init, store=store, batch=lambda *_: None)
+        return Buffer(init=init, store=store, batch=lambda *_: None)
 
     return make
 
