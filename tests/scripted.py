@@ -13,8 +13,7 @@ from flax import struct
 from gymnax.environments import environment, spaces
 
 from sejax.agents.base import Agent, AgentSpec
-from sejax.agents.buffers import replay_buffer
-from sejax.agents.buffers import Transition
+from sejax.agents.buffers import Transition, replay_buffer
 
 MAX_EPISODES = 12
 MAX_STEPS = 4  # the world's step limit

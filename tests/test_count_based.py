@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from sejax import envs
-from sejax.agents.exploration import CountBasedConfig, with_count_bonus
 from sejax.agents.buffers import Transition
+from sejax.agents.exploration import CountBasedConfig, with_count_bonus
 from sejax.agents.tabular import QLearningConfig, SARSAConfig, make_q_learning, make_sarsa
 from sejax.rollout import make_tester
 from sejax.training import TrainingConfig, make_trainer

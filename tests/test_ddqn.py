@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from support import numpy_forward, shapes_of, unraveled
 
+from sejax.agents.buffers import Transition
 from sejax.agents.dqn import DDQNConfig, double_q_targets, make_ddqn
 from sejax.agents.policies import select_action
-from sejax.agents.buffers import Transition
 from sejax.ops.networks import MLP
 from sejax.options import ACTIVATIONS
 

@@ -11,9 +11,8 @@ import pytest
 
 from sejax import options
 from sejax.agents.base import NoExploration, traced
-from sejax.agents.exploration import CountBasedConfig
 from sejax.agents.dqn import DDQNConfig, DQNConfig, DuelingDDQNConfig
-from sejax.agents.exploration import ICMConfig
+from sejax.agents.exploration import CountBasedConfig, ICMConfig
 from sejax.agents.ppo import PPOConfig
 from sejax.agents.sac import SACConfig
 from sejax.agents.tabular import QLearningConfig, SARSAConfig

@@ -14,6 +14,7 @@ from flax import linen as nn
 
 import sejax
 from sejax import envs, registry
+from sejax.agents import AgentConfig
 from sejax.cli import build
 from sejax.errors import ConfigError
 from sejax.es.evosax import ALGORITHMS
@@ -548,7 +549,7 @@ class Residual(nn.Module):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Torso:
+class Torso(AgentConfig):
     """An agent's configuration that holds another dataclass, a number, a list and a function."""
 
     torso: nn.Module = Plain()  # noqa: RUF009 (frozen)

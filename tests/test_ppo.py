@@ -19,7 +19,7 @@ import sejax
 from sejax import envs
 from sejax.agents import buffers
 from sejax.agents.base import traced
-from sejax.agents.buffers import Rollout
+from sejax.agents.buffers import Rollout, Transition
 from sejax.agents.policies import SOFTMAX, gaussian
 from sejax.agents.ppo import (
     MIN_STD,
@@ -31,7 +31,6 @@ from sejax.agents.ppo import (
     ppo_loss,
     shuffled,
 )
-from sejax.agents.buffers import Transition
 from sejax.errors import ConfigError
 from sejax.ops.networks import MLP
 from sejax.rollout import make_tester
@@ -514,7 +513,11 @@ def test_the_agent_says_what_was_configured(agent):
         "gae_lambda": 0.8 if agent is ppo("gae") else 0.95, "entropy_weight": 0.05,
         "hidden_size": None,  # all of it
     }  # fmt: skip
-    assert (agent.spec.warmup_episodes, agent.spec.learns_from, agent.spec.action_repeat) == (1, 0, 1)
+    assert (agent.spec.warmup_episodes, agent.spec.learns_from, agent.spec.action_repeat) == (
+        1,
+        0,
+        1,
+    )
 
 
 # --- probes --------------------------------------------------------------------------------------

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from sejax import envs
-from sejax.agents.policies import decayed_epsilon
 from sejax.agents.buffers import Transition
+from sejax.agents.policies import decayed_epsilon
 from sejax.agents.tabular import (
     QLearningConfig,
     SARSAConfig,

@@ -572,7 +572,11 @@ def test_the_agent_holds_the_configured_numbers():
         "action_noise_std": 0.3, "target_noise_std": 0.4, "target_noise_clip": 0.5,
         "hidden_size": None, "batch_size": None,  # all of them
     }  # fmt: skip
-    assert (agent.spec.action_repeat, agent.spec.warmup_episodes, agent.spec.learns_from) == (4, 6, 6)
+    assert (agent.spec.action_repeat, agent.spec.warmup_episodes, agent.spec.learns_from) == (
+        4,
+        6,
+        6,
+    )
     assert agent_of(DISCRETE).hparams._asdict() == {
         "learning_rate": 0.01, "tau": 0.1, "discount": 0.9,
         "action_noise_std": 0.1, "target_noise_std": 0.4, "target_noise_clip": 0.5,

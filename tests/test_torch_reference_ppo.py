@@ -10,9 +10,8 @@ import pytest
 from jax.flatten_util import ravel_pytree
 
 from sejax.agents import buffers
-from sejax.agents.buffers import Rollout
+from sejax.agents.buffers import Rollout, Transition
 from sejax.agents.ppo import PPOConfig, make_ppo
-from sejax.agents.buffers import Transition
 from sejax.ops.networks import MLP
 from sejax.proxies.configs import SyntheticConfig
 from sejax.training import TrainingConfig

@@ -15,8 +15,8 @@ from scripted import MAX_EPISODES, MAX_STEPS, WHO, ScriptedEnv, script, scripted
 from support import numpy_forward
 
 from sejax import envs, evaluation, registry
-from sejax.agents.dqn import DDQNConfig, make_ddqn
 from sejax.agents.buffers import Buffer, rollout_buffer
+from sejax.agents.dqn import DDQNConfig, make_ddqn
 from sejax.agents.tabular import QLearningConfig
 from sejax.errors import ConfigError
 from sejax.proxies.configs import SyntheticConfig

@@ -13,12 +13,10 @@ from jax.flatten_util import ravel_pytree
 
 from sejax import envs
 from sejax.agents import make_agent
-from sejax.agents.base import Agent, Draw, NoExploration, drawing_key
-from sejax.agents.exploration import CountBasedConfig
+from sejax.agents.base import Agent, AgentConfig, Draw, NoExploration, Varied, drawing_key
+from sejax.agents.buffers import Transition, block_size, no_buffer, sum_over_batch
 from sejax.agents.dqn import DDQNConfig, DuelingDDQNConfig, make_ddqn
-from sejax.agents.buffers import no_buffer
-from sejax.agents.buffers import block_size, sum_over_batch
-from sejax.agents.buffers import Transition
+from sejax.agents.exploration import CountBasedConfig
 from sejax.agents.tabular import QLearningConfig
 from sejax.agents.varied import Range, draw_value, hidden_sizes, ranges_of
 from sejax.errors import ConfigError
@@ -252,9 +250,9 @@ def test_what_is_drawn_is_what_the_agent_learns_with_and_comes_from_the_training
     config = DDQNConfig(hidden_size=2, num_layers=1, batch_size=16, discount=0.9)
     varied = make_agent(config, envs.make("cartpole"), varied=True)
     key = jax.random.key(3)
-    drawn, values = jax.jit(lambda key: (varied.varied.draw(drawing_key(key)), varied.drawn_values(key)))(
-        key
-    )
+    drawn, values = jax.jit(
+        lambda key: (varied.varied.draw(drawing_key(key)), varied.drawn_values(key))
+    )(key)
     assert drawn.values == values
     hparams = drawn.hparams._asdict()
     for name in ("learning_rate", "batch_size", "hidden_size"):
@@ -283,7 +281,7 @@ def test_a_varied_agent_is_made_once():
 
 
 @dataclasses.dataclass(frozen=True)
-class ForeignConfig:
+class ForeignConfig(AgentConfig):
     """Of an agent that knows nothing of sejax's options."""
 
     learning_rate: float = 0.5

@@ -310,9 +310,7 @@ def make_learning_step(
             return flat.flatten(jax.grad(sum_of_losses)(params, target_critics, hp, batch, noise))
 
         gradient = mean_over_batch(sum_of_gradients, (batch, noise), hp.batch_size)
-        moved, opt_state = flat.adam_step(
-            state.params, state.opt_state, gradient, hp.learning_rate
-        )
+        moved, opt_state = flat.adam_step(state.params, state.opt_state, gradient, hp.learning_rate)
         tau = hp.tau
         return state.replace(
             params=moved,
