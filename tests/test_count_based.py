@@ -1,4 +1,4 @@
-"""sejax.agents.count_based: the bonus by hand and by a plain loop, and in a training."""
+"""sejax.agents.exploration: the bonus by hand and by a plain loop, and in a training."""
 
 import functools
 
@@ -11,7 +11,7 @@ from sejax import envs
 from sejax.agents.buffers import Transition
 from sejax.agents.exploration import CountBasedConfig, with_count_bonus
 from sejax.agents.tabular import QLearningConfig, SARSAConfig, make_q_learning, make_sarsa
-from sejax.rollout import make_tester
+from sejax.evaluation import make_tester
 from sejax.training import TrainingConfig, make_trainer
 
 NUM_STATES, NUM_ACTIONS, BETA = 3, 2, 0.5

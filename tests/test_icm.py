@@ -1,4 +1,4 @@
-"""sejax.agents.icm: models and loss by hand, updates against torch, and what the agent sees."""
+"""sejax.agents.exploration: models and loss by hand, updates against torch, and what the agent sees."""
 
 import dataclasses
 import functools

@@ -1,6 +1,6 @@
 """What an experiment is: settings, rows that are computed, and a report that is made of them.
 
-The command `python -m sejax.experiments.NAME` has the grammar of `python -m sejax.run`: words
+The command `python -m experiments.NAME` has the grammar of `python -m sejax.run`: words
 `field=value`, read by Hydra. Nothing that takes long is imported before they are checked.
 """
 
@@ -13,10 +13,10 @@ from typing import Any
 
 import pandas as pd
 
+from experiments.pieces import by_pattern, read_rows, write_rows
+from experiments.settings import RUN_PREFIX, Settings, as_word
 from sejax.cli import commands, runtime
 from sejax.errors import ConfigError, nearest, require, shortened
-from sejax.experiments.pieces import by_pattern, read_rows, write_rows
-from sejax.experiments.settings import RUN_PREFIX, Settings, as_word
 from sejax.ops.files import write_text
 
 
@@ -78,7 +78,7 @@ class Experiment:
         if "run" in full:
             rows[f"{RUN_PREFIX}FIELD=VALUE"] = "override of the NES runs, as of sejax.run"
         lines = [f"  {shown:{width}}  {about}" for shown, about in rows.items()]
-        usage = f"python -m sejax.experiments.{self.settings.name} [FIELD=VALUE ...]"
+        usage = f"python -m experiments.{self.settings.name} [FIELD=VALUE ...]"
         return "\n".join([usage, "", (self.about or "").strip(), "", "Fields:", *lines])
 
 
