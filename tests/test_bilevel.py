@@ -164,14 +164,14 @@ def test_common_random_numbers_are_common_to_the_members_alone():
 
 def test_members_are_compared_by_tests_as_long_as_the_curriculum_says():
     """A generation is ask, the trials one by one with tests of one step, and tell."""
-    config = tiny("devices=1", "objective.first_test_steps=1", words=ROOM)
+    config = tiny("devices=1", "objective.first_eval_steps=1", words=ROOM)
     parts = config.parts()
     program, task = make_program(**parts), parts["task"]
     proxy = registry.make("proxy", config.proxy, task)
     agent = sejax.make_agent(config.agent, task)
     evaluate = sejax.make_evaluator(agent, proxy, task, config.training)
     state = program.init(KEYS[:1])
-    assert program.test_steps(state) == 1 < task.max_steps
+    assert program.eval_steps(state) == 1 < task.max_steps
     asked = program.ask(state)
 
     def one(trial):
@@ -209,7 +209,7 @@ def test_the_programs_loops_neither_copy_nor_select_a_buffer(one_device):
 
 
 def test_a_curriculum_compares_members_by_a_part_and_incumbents_by_whole_tests():
-    program = program_of("objective.first_test_steps=1", words=ROOM)
+    program = program_of("objective.first_eval_steps=1", words=ROOM)
     state = program.init(KEYS[:1])
     # Of 8 members and 4 incumbents all whole tests are alike; the fourth member's part is best.
     whole, part = np.full((1, 12, 2), 0.5, np.float32), np.zeros((1, 12, 2), np.float32)
@@ -217,7 +217,7 @@ def test_a_curriculum_compares_members_by_a_part_and_incumbents_by_whole_tests()
     counts = np.full((1, 12), 3, np.int32)
     outcome = sejax.Outcome(
         test_returns=whole, scored_returns=part, train_steps=counts, train_episodes=counts,
-        return_area=part[..., 0], nonfinite=counts < 0, real_steps=counts,
+        auc=part[..., 0], nonfinite=counts < 0, real_steps=counts,
     )  # fmt: skip
     asked, after, info = jax.jit(lambda s: (a := program.ask(s), *program.tell(s, a, outcome)))(
         state

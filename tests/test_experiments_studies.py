@@ -24,7 +24,7 @@ from sejax.experiments import (
     supervised_models,
     worlds,
 )
-from sejax.rollout import make_recorder, make_tester
+from sejax.evaluation import make_recorder, make_tester
 from sejax.statistics import bootstrap_interval
 from sejax.training import make_trainer
 

@@ -247,7 +247,7 @@ def two():
         return picked.reshape(2, len(family), *picked.shape[1:])
 
     # Each family makes something else of most candidates.
-    assert np.mean(by_agent[0].return_area != by_agent[1].return_area) > 0.5
+    assert np.mean(by_agent[0].auc != by_agent[1].auc) > 0.5
     return SimpleNamespace(
         program=program, before=state, asked=asked, after=after, info=info, family=family,
         outcome=jax.tree.map(chosen, *by_agent),
@@ -338,7 +338,7 @@ def told(scores, incumbents, state=None, stop_when_solved=True, **config):
     counts = np.full(returns.shape, 3, np.int32)
     outcome = Outcome(
         test_returns=returns[..., None], scored_returns=returns[..., None], train_steps=counts,
-        train_episodes=counts, return_area=returns, nonfinite=~np.isfinite(returns),
+        train_episodes=counts, auc=returns, nonfinite=~np.isfinite(returns),
         real_steps=counts,
     )  # fmt: skip
     state = program.init(KEYS) if state is None else state

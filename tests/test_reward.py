@@ -15,7 +15,7 @@ from sejax.agents import Agent, make_agent
 from sejax.agents.tabular import QLearningConfig
 from sejax.cli import build
 from sejax.errors import ConfigError
-from sejax.evaluation import make_evaluator, return_area
+from sejax.evaluation import make_evaluator, area_under_curve
 from sejax.proxies import ABSURD
 from sejax.proxies.base import World, world_of
 from sejax.proxies.configs import RewardConfig
@@ -332,8 +332,8 @@ def test_the_area_under_the_curve_is_that_of_tests_over_training_steps():
         jax.random.key(3), env.default_params
     )
     ends = np.asarray(result.episode_ends)
-    assert result.test_steps == 21
-    area = return_area(result, jnp.float32(99.0))
+    assert result.eval_steps == 21
+    area = area_under_curve(result, jnp.float32(99.0))
     np.testing.assert_allclose(area, np.diff(ends, prepend=0) @ result.test_returns)
     np.testing.assert_allclose(area, (2.0 + 0.1) * ends[-1], rtol=1e-6)
 
@@ -343,13 +343,13 @@ def test_the_area_counts_an_episode_that_the_budget_cut_off_with_the_test_after_
         agent_state=None, train_steps=jnp.int32(17), episodes=jnp.int32(2),
         returns=jnp.array([-5.0, -3.0, jnp.nan]), test_returns=None,
         episode_ends=jnp.array([4, 10, 0]), nonfinite=jnp.bool_(False),
-        test_steps=jnp.int32(0), recorded=None,
+        eval_steps=jnp.int32(0), recorded=None,
     )  # fmt: skip
-    assert return_area(result, jnp.float32(-2.0)) == -5 * 4 - 3 * 6 - 2 * 7
+    assert area_under_curve(result, jnp.float32(-2.0)) == -5 * 4 - 3 * 6 - 2 * 7
     tested = result.replace(test_returns=jnp.array([-1.0, -4.0, jnp.nan]))  # where there are some
-    assert return_area(tested, jnp.float32(-2.0)) == -1 * 4 - 4 * 6 - 2 * 7
+    assert area_under_curve(tested, jnp.float32(-2.0)) == -1 * 4 - 4 * 6 - 2 * 7
     nothing = result.replace(episodes=jnp.int32(0), episode_ends=jnp.zeros(3, jnp.int32))
-    assert return_area(nothing, jnp.float32(-2.0)) == -2 * 17
+    assert area_under_curve(nothing, jnp.float32(-2.0)) == -2 * 17
 
 
 def test_a_stored_reward_network_comes_back(tmp_path):

@@ -149,7 +149,8 @@ def named(field: str) -> Iterator[None]:
         if field == "agent":
             raise
         said = re.sub(r"\bagent(?=\.\w| must )", field, str(error))
-        raise ConfigError(re.sub(r"\bagent=", "agents=", said)) from error
+        at_fault = re.sub(r"^agent\b", field, error.field)
+        raise ConfigError(re.sub(r"\bagent=", "agents=", said), at_fault) from error
 
 
 # --- words ---------------------------------------------------------------------------------------

@@ -138,8 +138,7 @@ def make_recorded_run(
     max_rows: int, agent: Any, env: Any, task: Any, training: TrainingConfig
 ) -> Callable[..., Any]:
     """Builds `run(key, env_params, active)` that trains, tests and records one agent."""
-    from sejax.evaluation import make_tested_trainer
-    from sejax.rollout import make_recorder
+    from sejax.evaluation import make_recorder, make_tested_trainer
 
     capacity = min(max_rows, training.max_steps or max_rows)
     train = make_tested_trainer(agent, env, task, training, recorder=last_steps(capacity))
