@@ -14,7 +14,7 @@ group         entry points            `make(...)` gives
 `objective`   `sejax.objectives`      `(task)` a `sejax.Objective`
 `es`          `sejax.strategies`      `(num_dims)` a `sejax.Strategy`
 `tracker`     `sejax.trackers`        `(run)` a `sejax.cli.trackers.Tracker`
-`machines`    `sejax.machines`        `(config, folder, say)`: see `sejax.machines.configs`
+`machines`    `sejax.cli`             `(config, folder, say)`: see `sejax.cli.workers`
 ============= ======================= ==============================================
 
 A name is one that comes with sejax, one that an installed package offers as an entry point, or
@@ -176,11 +176,11 @@ GROUPS = {
         },
     ),
     "machines": Group(
-        "sejax.machines",
+        "sejax.cli",
         ("config", "folder", "say"),
         {
-            "local": "sejax.machines.configs:LocalConfig",
-            "ray": "sejax.machines.configs:RayConfig",
+            "local": "sejax.cli.workers:LocalConfig",
+            "ray": "sejax.cli.workers:RayConfig",
         },
     ),
 }
