@@ -317,7 +317,7 @@ def files_of(config: Any, folder: Path, chunks: Any) -> Iterator[Callable[[Any, 
 
     config = dataclasses.replace(config, run_dir=str(folder / "run"))
     with open_for(config) as directory:
-        directory.resume(initial(config, chunks))
+        directory.restore(initial(config, chunks))
         proxies = session.Proxies(config, directory.path, chunks.learner)
 
         def save(state: Any, info: Any) -> None:

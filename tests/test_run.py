@@ -170,7 +170,6 @@ def test_a_population_that_diverges_finishes_and_is_counted(tmp_path):
 
 TRACKER = """
 import json
-from sejax.cli.trackers import Tracker
 
 class Lines:
     def __init__(self, run, fail_at):
@@ -187,7 +186,7 @@ class Lines:
     def close(self):
         self.write("close")
 
-def make(run, fail_at: int | None = None) -> Tracker:
+def make(run, fail_at: int | None = None) -> Lines:
     return Lines(run, fail_at)
 """
 

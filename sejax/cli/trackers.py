@@ -8,7 +8,7 @@ import contextlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar, Protocol, runtime_checkable
 
 import numpy as np
 import yaml
@@ -57,6 +57,7 @@ class FinishedGeneration:
     train_steps: int
 
 
+@runtime_checkable
 class Tracker(Protocol):
     """The methods of a tracker, which its configuration makes by `make(run: TrackedRun)`."""
 
