@@ -426,10 +426,10 @@ def test_bad_input_ends_with_one_message_and_status_2(
 
 
 def test_the_command_says_how_it_ended_and_what_to_do_next(uninterrupted, capsys):
-    best = run.learn(sejax.config([*TINY, "generations=6", f"run_dir={uninterrupted}"]))
+    (best,) = run.learn(sejax.config([*TINY, "generations=6", f"run_dir={uninterrupted}"]))
     said = capsys.readouterr().out
     scores = [float(row["incumbent_mean"]) for row in rows(uninterrupted)]
-    assert best == [pytest.approx(max(scores))]
+    assert best == pytest.approx(max(scores))
     assert f"best incumbent mean {best:.1f}, solved at 0.8" in said
     assert f"python -m sejax.evaluate proxy={uninterrupted} agent=q_learning" in said
 
