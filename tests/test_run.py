@@ -25,6 +25,7 @@ from sejax import run
 from sejax.cli import build, commands, run_directory, session
 from sejax.cli.progress import RunProgress
 from sejax.cli.run_directory import AGENT_COLUMNS, COLUMNS
+from sejax.cli.trackers import Reporter
 from sejax.errors import ConfigError
 from sejax.proxies import files
 
@@ -45,7 +46,7 @@ def chunks(*words):
     return session.make_chunks(sejax.config([*TINY, *words]))
 
 
-class Report(session.Reporter):
+class Report(Reporter):
     """Keeps the messages."""
 
     def __init__(self):

@@ -18,7 +18,7 @@ from sejax import registry
 from sejax.cli import next_steps, presets
 from sejax.cli.build import LearnConfig
 from sejax.cli.families import families_of
-from sejax.cli.trackers import FinishedGeneration
+from sejax.cli.trackers import FinishedGeneration, Reporter
 
 if TYPE_CHECKING:  # the first line is shown before jax is imported
     from sejax.bilevel import Bilevel
@@ -66,7 +66,7 @@ class Tally:
             self._progress.update(self._task, completed=self._total)
 
 
-class RunProgress:
+class RunProgress(Reporter):
     """One live line on a terminal; one line for each generation elsewhere."""
 
     def __init__(self, config: LearnConfig):

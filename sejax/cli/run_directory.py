@@ -390,7 +390,7 @@ def _as_state(tensors: dict[str, np.ndarray], like: Any) -> Any:
                 f"version"
             )
     leaves = [_as_leaf(tensors[_name(path)], leaf) for path, leaf in flat]
-    return tree.unflatten(leaves)
+    return jax.tree.unflatten(tree, leaves)
 
 
 def _name(path: Any) -> str:

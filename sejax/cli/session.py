@@ -14,24 +14,17 @@ from sejax import __version__
 from sejax.bilevel import Bilevel, make_bilevel
 from sejax.cli import build, runtime
 from sejax.cli.run_directory import RunDirectory
-from sejax.cli.trackers import FinishedGeneration, GuardedTracker, NoTracker, TrackedRun
+from sejax.cli.trackers import (
+    FinishedGeneration,
+    GuardedTracker,
+    NoTracker,
+    Reporter,
+    TrackedRun,
+)
 from sejax.ops.parallel import compiler_options
 from sejax.proxies import files
 
 DRAW_EVERY_S = 30.0
-
-
-class Reporter:
-    """Hears how a run goes on; this one tells nobody. See `sejax.cli.progress`."""
-
-    def status(self, text: str) -> None:
-        """Hears what is being done now."""
-
-    def say(self, text: str) -> None:
-        """Hears a message that is worth keeping."""
-
-    def on_generation(self, info: FinishedGeneration) -> None:
-        """Hears of a generation after it was saved. What this raises ends the session."""
 
 
 class Chunks:

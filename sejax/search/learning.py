@@ -10,6 +10,7 @@ import numpy as np
 
 from sejax.cli import build, compose, session
 from sejax.cli.run_directory import RunDirectory, open_for
+from sejax.cli.trackers import Reporter
 from sejax.cli.words import word
 from sejax.errors import ConfigError
 from sejax.search.programs import Programs
@@ -103,7 +104,7 @@ class Learning:
             return progress_of(directory, num_candidates)
 
 
-class _Report(session.Reporter):
+class _Report(Reporter):
     """Hears of each generation after its files are written, so that to end there loses nothing."""
 
     def __init__(
