@@ -145,9 +145,9 @@ def run(
                 report.status("first generation")
             state, info = chunks.advance(state, length)
             _wait(state)
-            host_state, info = jax.device_get((state, info))
-            rows = directory.save(state, info, clock.wall_s(), clock.cpu_s())
-            proxies.save(host_state)
+            saved, info = jax.device_get((state, info))
+            rows = directory.save(saved, info, clock.wall_s(), clock.cpu_s())
+            proxies.save(saved)
             for generation in _finished(rows, info):
                 report.on_generation(generation)
                 if tracker is not None:
@@ -181,7 +181,7 @@ class _Clock:
     def __init__(self, directory: RunDirectory, chunks: Chunks):
         self._chunks = chunks
         self._wall_s = directory.wall_s - time.monotonic()
-        self._cpu_s = directory.cpu_s - time.process_time()
+        self._cpu_s = directory.cpu_s - time.process_time() - chunks.cpu_s
 
     def wall_s(self) -> float:
         return self._wall_s + time.monotonic()
