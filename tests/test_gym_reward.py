@@ -1,6 +1,5 @@
 """Reward networks around Gymnasium's environments: each reward, worked by hand."""
 
-import importlib
 import json
 import pickle
 
@@ -266,12 +265,12 @@ def test_the_spec_of_a_wrapper_makes_the_wrapper_again(tmp_path):
 def test_numbers_of_info_have_gymnasiums_names():
     """Those of sejax's tasks; v5's halfcheetah has another name for one."""
     renamed = {"reward_run": "reward_forward"}
-    told = {name for name in registry.names("env") if registry.find("env", name).facts.has_info}
-    assert told == set(INFO_KEYS)
-    for name in told:
-        world = importlib.import_module(f"sejax.envs.mujoco.{name}").Env
-        assert tuple(renamed.get(key, key) for key in world.info_keys) == INFO_KEYS[name]
-        assert world.augmented_keys == AUGMENTED_KEYS.get(name, ())
+    specs = {name: registry.configure("env", {"name": name}).spec for name in registry.names("env")}
+    told = {name: spec for name, spec in specs.items() if spec.info_keys}
+    assert told.keys() == set(INFO_KEYS)
+    for name, spec in told.items():
+        assert tuple(renamed.get(key, key) for key in spec.info_keys) == INFO_KEYS[name]
+        assert spec.augmented_keys == AUGMENTED_KEYS.get(name, ())
 
 
 # --- what cannot be ------------------------------------------------------------------------------

@@ -11,6 +11,7 @@ from sejax import registry
 from sejax.agents.base import Agent, AgentOptions, NoExploration, traced
 from sejax.agents.memory import Memory, Rollout, no_memory, replay_memory, rollout_memory
 from sejax.agents.replay import Transition
+from sejax.envs.spec import TaskSpec
 from sejax.errors import require
 
 __all__ = [
@@ -63,7 +64,7 @@ def make_agent(
       10
     """
     require(
-        hasattr(task, "facts"),
+        isinstance(task, TaskSpec),
         "task",
         "be a sejax.Task",
         "an agent is made for its spaces",
@@ -78,7 +79,7 @@ def make_agent(
         config,
         "config to such as sejax.DDQNConfig()",
     )
-    require_fit(config, exploration, task.facts, task.name)
+    require_fit(config, exploration, task, task.name)
     return _make_agent(registry.Same(config, exploration), task, varied)
 
 
@@ -97,25 +98,25 @@ def _make_agent(key: registry.Same, task: Any, varied: bool) -> Agent:
     return make_varied(config, make)
 
 
-def require_fit(agent: Any, exploration: Any, facts: Any, task_name: str) -> None:
+def require_fit(agent: Any, exploration: Any, spec: TaskSpec, task_name: str) -> None:
     """Checks that an agent can act in a task, and that it can be made to explore so.
 
     Args:
       agent: its configuration; one without `states` and `actions` suits every task.
       exploration: that of its intrinsic reward.
-      facts: of the task (`sejax.envs.Facts`).
+      spec: of the task.
       task_name: for messages.
 
     Raises:
       ConfigError: if it cannot.
     """
-    if not _suits(agent, facts):
-        fitting = [name for name in names() if _suits(registry.find("agent", name), facts)]
+    if not _suits(agent, spec):
+        fitting = [name for name in names() if _suits(registry.find("agent", name), spec)]
         require(
             False,
             "agent",
             f"be one of {', '.join(fitting)} in {task_name}",
-            f"its states are {facts.states} and its actions {facts.actions}",
+            f"its states are {spec.states} and its actions {spec.actions}",
             registry.name_of("agent", agent),
             f"agent={fitting[0]}",
         )
@@ -145,12 +146,12 @@ def _learns_each_step(exploration: Any) -> bool:
     return getattr(exploration, "learns_each_step", False)
 
 
-def default_for(facts: Any) -> str:
+def default_for(spec: TaskSpec) -> str:
     """The agent that is chosen for a task where none is asked for: the first that suits it."""
-    fitting = (name for name in DEFAULTS if _suits(registry.find("agent", name), facts))
+    fitting = (name for name in DEFAULTS if _suits(registry.find("agent", name), spec))
     return next(fitting, DEFAULTS[0])  # which will be refused, if none does
 
 
-def _suits(agent: Any, facts: Any) -> bool:
+def _suits(agent: Any, spec: TaskSpec) -> bool:
     states, actions = getattr(agent, "states", None), getattr(agent, "actions", None)
-    return states in (None, facts.states) and (actions is None or facts.actions in actions)
+    return states in (None, spec.states) and (actions is None or spec.actions in actions)

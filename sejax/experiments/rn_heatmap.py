@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 
-from sejax.envs.cliff_walking import MAP
+from sejax.envs.gridworld import CLIFF_WALKING as MAP
 from sejax.errors import require
 from sejax.experiments import figures, rn_studies
 from sejax.experiments.experiment import Experiment

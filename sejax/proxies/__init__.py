@@ -1,9 +1,5 @@
 """Learned stand-ins for real tasks, as gymnax environments whose params are weights."""
 
-from sejax.envs import light_gymnax
-
-light_gymnax.install()
-
 # A state or reward beyond this is no world that an agent could learn from: the episode ends. It is
 # far outside every task's range and small enough for its square to stay finite in float32.
 ABSURD = 1e6

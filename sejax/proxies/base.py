@@ -1,6 +1,6 @@
 """The contract of a proxy: a world with weights that stands in for a real task.
 
-A proxy is a gymnax 1.x `Environment` whose `EnvParams` hold the weights, so that an agent never
+A proxy is an `Environment` whose `EnvParams` hold the weights, so that an agent never
 knows which world it is in. What the inner loop must know of a world beside that is a `World`, which
 a proxy states and any other environment has by default.
 """
@@ -10,10 +10,10 @@ from typing import Any, NamedTuple
 
 import jax
 from flax import struct
-from gymnax.environments import environment
 from jaxtyping import Array
 
 from sejax.envs.base import Task
+from sejax.envs.environment import Environment, EnvParams
 
 
 class World(NamedTuple):
@@ -30,14 +30,14 @@ class World(NamedTuple):
 
 
 @struct.dataclass
-class ProxyParams(environment.EnvParams):
+class ProxyParams(EnvParams):
     """Weights of a proxy, as from its `init_weights`, and the real task's step limit."""
 
     weights: Any = None
     max_steps_in_episode: int = 1
 
 
-class ProxyEnv(environment.Environment[Any, Any]):
+class ProxyEnv(Environment):
     """A proxy of a task; subclasses add the dynamics (`reset_env`, `step_env`).
 
     A subclass must give `init_weights`, `reset_env` and `step_env`. The latter may put
@@ -54,7 +54,6 @@ class ProxyEnv(environment.Environment[Any, Any]):
     is_real = False
 
     def __init__(self, task: Task, config: Any):
-        super().__init__()
         self.task = task
         self.config = config
         self._default_params: Any = None

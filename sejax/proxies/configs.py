@@ -122,16 +122,15 @@ class RewardConfig(Options):
             "proxy.output_scale=1",
         )
 
-    def require_task(self, facts: Any, task_name: str) -> None:
+    def require_task(self, spec: Any, task_name: str) -> None:
         """Checks that the task tells what this variant needs.
 
         Raises:
           ConfigError: if it does not.
         """
-        has_vector = facts.has_info if facts.has_vector is None else facts.has_vector
         fields = (
-            ("variant", self.weighs_info, facts.has_info, "additive_potential"),
-            ("augmented", self.augmented, has_vector, "false"),
+            ("variant", self.weighs_info, spec.info_keys, "additive_potential"),
+            ("augmented", self.augmented, spec.augmented_keys, "false"),
         )
         for name, is_needed, is_there, fix in fields:
             value = getattr(self, name)
@@ -152,7 +151,7 @@ class RewardConfig(Options):
         """
         from sejax.proxies.reward import RewardEnv
 
-        self.require_task(task.facts, task.name)
+        self.require_task(task, task.name)
         return RewardEnv(task, self)
 
     @property

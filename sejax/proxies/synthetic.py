@@ -10,10 +10,11 @@ from typing import TYPE_CHECKING, Any
 import jax
 import jax.numpy as jnp
 from flax import struct
-from gymnax.environments import environment
 from jaxtyping import Array, Bool, Float
 
 from sejax.envs.base import Task
+from sejax.envs.environment import EnvState
+from sejax.envs.spec import Box
 from sejax.ops.networks import MLP
 from sejax.proxies import ABSURD
 from sejax.proxies.base import ProxyEnv, ProxyParams, World
@@ -26,7 +27,7 @@ START_HIDDEN_SIZE = 32  # of the network that makes initial states
 
 
 @struct.dataclass
-class SyntheticState(environment.EnvState):
+class SyntheticState(EnvState):
     vector: Array  # [obs_dim]: what the networks see and predict
     time: Array | int
 
@@ -72,9 +73,8 @@ class SyntheticEnv(ProxyEnv):
             for head, size in outputs.items()
         }
         self._units = None
-        if config.state_units == "bounds" and task.num_states is None:
-            space = task.env.observation_space(task.params)
-            self._units = units_of(space.low, space.high, task.obs_dim)
+        if config.state_units == "bounds" and isinstance(task.observation, Box):
+            self._units = units_of(task.observation.low, task.observation.high, task.obs_dim)
         self._start = None
         if config.initial_state == "learned":
             self._start = MLP(task.obs_dim, START_HIDDEN_SIZE, 1, config.activation)
