@@ -18,10 +18,12 @@ from sejax.agents.base import Agent
 from sejax.agents.memory import Memory, MemoryMaker
 from sejax.agents.replay import Transition
 from sejax.envs.base import require_own_steps
+from sejax.envs.wrappers import repeat_actions
 from sejax.errors import LARGEST, require
 from sejax.ops.keys import step_keys
 from sejax.ops.loops import while_any_active
 from sejax.options import Options, counts, not_negative, one_of, option
+from sejax.proxies.base import episode_limit, is_real, prepare
 
 STOP_RULES = ("plateau", "solved", "never")
 SOLVED_BY = ("test", "train")
@@ -150,7 +152,7 @@ class TrainResult:
       episode_ends: training steps at the end of each training episode, `[max_episodes]` int32; 0
         after the last.
       nonfinite: whether a number that is not finite was met: an output of the world or a weight.
-      test_steps: real steps spent on tests between training episodes, `[]` int32.
+      eval_steps: real steps spent on tests between training episodes, `[]` int32.
       recorded: what the recorder has kept of the training's steps, if there was one.
     """
 
@@ -161,7 +163,7 @@ class TrainResult:
     test_returns: Float[Array, " max_episodes"] | None
     episode_ends: Int[Array, " max_episodes"]
     nonfinite: Array
-    test_steps: Array
+    eval_steps: Array
     recorded: Any
 
 
@@ -203,7 +205,7 @@ class _LoopState:
     agent_state: Any
     recent: Array  # [2 * window]: the last returns that the stop rule judges, newest last
     nonfinite: Array
-    test_steps: Array
+    eval_steps: Array
     tested: Array  # mean return of the last tests
 
 
@@ -286,7 +288,7 @@ def make_trainer(
             test_returns=curve.test_returns,
             episode_ends=curve.ends,
             nonfinite=state.nonfinite | ~_all_finite(state.agent_state),
-            test_steps=state.test_steps,
+            eval_steps=state.eval_steps,
             recorded=remembered[1] if recorder is not None else None,
         )
 
@@ -357,7 +359,7 @@ def _make_solver(
             test_returns=None,
             episode_ends=jnp.zeros(training.max_episodes, jnp.int32),
             nonfinite=~_all_finite(state),
-            test_steps=jnp.int32(0),
+            eval_steps=jnp.int32(0),
             recorded=None,
         )
 
@@ -376,19 +378,16 @@ class _Loop:
         test_fn: TestFn | None,
         recorder: MemoryMaker | None,
     ):
-        from sejax.envs.wrappers import repeat_actions
-        from sejax.proxies.base import prepare, world_of
-
-        world = world_of(env)
-        limit_is_terminal = training.time_limit_is_terminal and world.is_real
+        episode_steps = episode_limit(env)
+        limit_is_terminal = training.time_limit_is_terminal and is_real(env)
         self.agent, self.training, self.solved_reward = agent, training, solved_reward
         self.limit_is_terminal = limit_is_terminal
         self.test_fn = test_fn if training.num_tests_between else None
         self.env = repeat_actions(env, agent.action_repeat)
         self.max_steps = self.memory_steps = training.max_steps or LARGEST
-        if world.max_steps is not None:
-            require_reachable("training", training, world.max_steps)
-            self.memory_steps = min(self.max_steps, training.max_episodes * world.max_steps)
+        if episode_steps is not None:
+            require_reachable("training", training, episode_steps)
+            self.memory_steps = min(self.max_steps, training.max_episodes * episode_steps)
         self.memory_makers = (agent.memory, *([] if recorder is None else [recorder]))
         self.prepare = lambda params, hparams: prepare(
             env, params, agent.discount(hparams), limit_is_terminal
@@ -409,7 +408,7 @@ class _Loop:
             agent_state=self.agent.begin_episode(agent_state, jnp.int32(0)),
             recent=jnp.zeros(2 * self.training.window),
             nonfinite=jnp.bool_(False),
-            test_steps=jnp.int32(0),
+            eval_steps=jnp.int32(0),
             tested=jnp.float32(0),
         )
 
@@ -501,7 +500,7 @@ class _Loop:
         judged = state.episode_return
         if self.test_fn is not None:
             tested, num_steps = self.test_fn(key_test, state.agent_state, finished)
-            state = state.replace(tested=tested, test_steps=state.test_steps + num_steps)
+            state = state.replace(tested=tested, eval_steps=state.eval_steps + num_steps)
             judged = tested if self.training.stops_by_tests else judged
         recent = jnp.concatenate([state.recent[1:], judged[None]])
         stop = self.stops(state, recent)

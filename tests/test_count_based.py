@@ -11,7 +11,7 @@ from sejax import envs
 from sejax.agents.count_based import CountBasedConfig, with_count_bonus
 from sejax.agents.replay import Transition
 from sejax.agents.tabular import QLearningConfig, SARSAConfig, make_q_learning, make_sarsa
-from sejax.rollout import make_tester
+from sejax.evaluation import make_tester
 from sejax.training import TrainingConfig, make_trainer
 
 NUM_STATES, NUM_ACTIONS, BETA = 3, 2, 0.5

@@ -24,7 +24,7 @@ from support import numpy_forward, random_like, shapes_of
 
 import sejax
 from sejax import envs, registry
-from sejax.envs import cliff_walking, gridworld_2x2
+from sejax.envs.gridworld import CLIFF_WALKING, ROOM_2X2
 from sejax.errors import ConfigError
 from sejax.gym import GridWorld, RewardNetwork, make
 from sejax.gym.reward import AUGMENTED_KEYS, INFO_KEYS
@@ -64,13 +64,13 @@ def stored_rn(tmp_path, num_inputs, task="cartpole", discount=0.9, scale=0.5, **
     """An RN's file of random weights, written by hand in the format of version 1; the weights."""
     config = RewardConfig(hidden_size=5, **config)
     units = [("Dense_0", 5, num_inputs), ("Dense_1", 1, 5)]
-    sizes = {} if config.weighs_info else {
+    sizes = {} if config.shaping.weighs_info else {
         name: {"kernel": np.zeros((rows, columns)), "bias": np.zeros(rows)}
         for name, rows, columns in units
     }  # fmt: skip
     weights = random_like(sizes, 2, scale)
     flat = {f"potential/{layer}/{k}": x for layer, both in weights.items() for k, x in both.items()}
-    if config.weighs_info:
+    if config.shaping.weighs_info:
         weights = flat["info_weights"] = random_like(np.zeros(num_inputs), 3, scale)
     header = {"format_version": 1, "score": 1.0, "config": {
         "env": {"name": task}, "proxy": {"name": "rn", **vars(config)},
@@ -191,8 +191,8 @@ def test_rewards_are_those_of_the_rn_in_jax():
 # --- tasks ---------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("name", "rows"), [("cliff_walking", cliff_walking.MAP),
-                                            ("gridworld_2x2", gridworld_2x2.MAP)])  # fmt: skip
+@pytest.mark.parametrize(("name", "rows"), [("cliff_walking", CLIFF_WALKING),
+                                            ("gridworld_2x2", ROOM_2X2)])  # fmt: skip
 def test_grid_worlds_are_those_in_jax(name, rows):
     """Every step from every state, by the tables of the one in JAX, which has tests of its own."""
     task, env = envs.make(name), GridWorld(name)

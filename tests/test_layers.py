@@ -13,22 +13,22 @@ ROOT = Path(__file__).parents[1] / "sejax"
 # when somebody asks for what they stand for: they do not count.
 LAYERS = [
     {"search"},
-    {"run", "evaluate", "report", "experiments"},
+    {"run", "evaluate", "report"},
     {"machines"},
     {"cli"},
     {"bilevel"},
-    {"evaluation"},
-    {"training", "rollout", "gym"},
+    {"evaluation", "scores"},
+    {"training", "objectives", "gym"},
     {"proxies"},
     {"agents"},
-    {"envs", "es", "objectives"},
+    {"envs", "es"},
     {"registry"},
     {"ops", "serialize"},
-    {"options", "statistics"},
+    {"options"},
     {"errors"},
     {"", "conf"},
 ]
-COMMANDS = ("cli", "run", "evaluate", "report", "search", "machines", "experiments")
+COMMANDS = ("cli", "run", "evaluate", "report", "search", "machines")
 
 
 def name_of(path):

@@ -33,8 +33,8 @@ from sejax.agents.ppo import (
 )
 from sejax.agents.replay import Transition
 from sejax.errors import ConfigError
+from sejax.evaluation import make_tester
 from sejax.ops.networks import MLP
-from sejax.rollout import make_tester
 from sejax.training import TrainingConfig, make_trainer
 
 OBS_DIM, NUM_ACTIONS, ACTION_DIM, MAX_ACTION, MAX_STEPS = 3, 4, 2, 2.0, 6

@@ -18,7 +18,7 @@ from sejax.agents.tabular import (
     make_sarsa,
     mask_of,
 )
-from sejax.rollout import make_tester
+from sejax.evaluation import make_tester
 from sejax.training import TrainingConfig, make_trainer
 
 NUM_STATES, NUM_ACTIONS = 5, 3

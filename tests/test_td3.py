@@ -27,8 +27,8 @@ from sejax.agents.td3 import (
     smoothed_target_action,
     tanh_policy,
 )
+from sejax.evaluation import make_tester
 from sejax.ops.networks import MLP
-from sejax.rollout import make_tester
 from sejax.training import TrainingConfig, make_trainer
 
 OBS_DIM, ACTION_DIM, BATCH, MAX_ACTION = 3, 2, 7, 2.0

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Self, get_origin, get_type_hints
 
+from experiments.pieces import Pieces
 from sejax import errors, serialize
-from sejax.experiments.pieces import Pieces
 from sejax.options import Options, Rule, counts
 
 RUN_PREFIX = "run."  # of a word about the NES runs: run.es.population_size=8
@@ -125,7 +125,7 @@ class Settings(Options):
         apart = {"work", "devices", "from_rows", "run"}
         if self.folder.parts[:1] != ("results",) or self.folder == self._usual_folder:
             apart |= {"out"}  # a folder of somebody's own is no part of what is done
-        words = ["python", "-m", f"sejax.experiments.{self.name}"]
+        words = ["python", "-m", f"experiments.{self.name}"]
         for name, value in mine.items():
             if name not in apart and value != (usual[name] if name != "quick" else False):
                 words.append(f"{name}={as_word(value)}")

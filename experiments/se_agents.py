@@ -6,9 +6,9 @@ from typing import Any
 
 import pandas as pd
 
+from experiments.settings import Settings, count, each_of, setting
+from experiments.worlds import World, groups_at_once, train_groups, training_as_learned
 from sejax import registry
-from sejax.experiments.settings import Settings, count, each_of, setting
-from sejax.experiments.worlds import World, groups_at_once, train_groups, training_as_learned
 from sejax.options import counts
 
 AGENTS = ("ddqn", "dueling_ddqn", "td3_discrete")

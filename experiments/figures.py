@@ -14,8 +14,8 @@ import pandas as pd
 from matplotlib.ticker import MaxNLocator
 from PIL import Image
 
+from experiments.statistics import performance_profile
 from sejax.ops.files import atomic_path
-from sejax.statistics import performance_profile
 
 # Okabe and Ito's palette, which those with any kind of colour blindness can tell apart.
 REAL, VARIED, FIXED, BEST, SOLVED = "#0072B2", "#E69F00", "#009E73", "#000000", "#B03A73"

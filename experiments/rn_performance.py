@@ -16,10 +16,10 @@ from dataclasses import dataclass
 
 import pandas as pd
 
-from sejax.experiments import rn_curves, rn_studies
-from sejax.experiments.experiment import Experiment
-from sejax.experiments.rn_curves import CurveSettings
-from sejax.experiments.tables import publish
+from experiments import rn_curves, rn_studies
+from experiments.experiment import Experiment
+from experiments.rn_curves import CurveSettings
+from experiments.tables import publish
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -12,13 +12,13 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from experiments import figures, return_curves, rn_studies, tables, worlds
+from experiments.rn_studies import RnSettings
+from experiments.settings import count, each_of, setting
+from experiments.tables import as_texts, iqm_columns, iqm_note, iqm_text
+from experiments.worlds import World
 from sejax import errors
 from sejax.errors import require
-from sejax.experiments import figures, return_curves, rn_studies, tables, worlds
-from sejax.experiments.rn_studies import RnSettings
-from sejax.experiments.settings import count, each_of, setting
-from sejax.experiments.tables import as_texts, iqm_columns, iqm_note, iqm_text
-from sejax.experiments.worlds import World
 from sejax.options import counts
 from sejax.registry import name_of
 from sejax.training import TrainingConfig

@@ -15,17 +15,17 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 
+from experiments import budgets, family_runs, figures, proxy_runs
+from experiments.experiment import Experiment
+from experiments.family_runs import FamilyRuns
+from experiments.pieces import stack, unstack
+from experiments.settings import each_of, setting
+from experiments.statistics import bootstrap_interval
+from experiments.tables import as_texts, publish
+from experiments.worlds import HPARAMS
 from sejax import envs
-from sejax.experiments import budgets, family_runs, figures, proxy_runs
-from sejax.experiments.experiment import Experiment
-from sejax.experiments.family_runs import FamilyRuns
-from sejax.experiments.pieces import stack, unstack
-from sejax.experiments.settings import each_of, setting
-from sejax.experiments.tables import as_texts, publish
-from sejax.experiments.worlds import HPARAMS
 from sejax.options import positive
 from sejax.proxies.configs import DONE_MODES, INITIAL_STATES
-from sejax.statistics import bootstrap_interval
 
 COLORS = {"real": figures.REAL, "learned": figures.VARIED}
 NO_END = "-"  # of SEs whose episodes are one step

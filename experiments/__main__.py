@@ -1,15 +1,15 @@
-"""`python -m sejax.experiments`: what there is to run, a line each."""
+"""`python -m experiments`: what there is to run, a line each."""
 
 import ast
 import pkgutil
 from pathlib import Path
 
-from sejax import experiments
+import experiments
 
 
 def main() -> None:
     """Prints each experiment's name and what it shows."""
-    print("python -m sejax.experiments.NAME [quick=true] [FIELD=VALUE ...] [--help]\n")
+    print("python -m experiments.NAME [quick=true] [FIELD=VALUE ...] [--help]\n")
     for module in sorted(pkgutil.iter_modules(experiments.__path__), key=lambda m: m.name):
         source = Path(experiments.__path__[0], f"{module.name}.py").read_text()
         if "\nEXPERIMENT = " in source:

@@ -16,11 +16,11 @@ import numpy as np
 import pandas as pd
 
 import sejax
+from experiments import return_curves
+from experiments.settings import Settings
 from sejax import registry, serialize
 from sejax.agents import NoExploration
 from sejax.cli.progress import Tally
-from sejax.experiments import return_curves
-from sejax.experiments.settings import Settings
 from sejax.ops.parallel import spread_over_devices
 from sejax.training import TrainingConfig
 

@@ -14,14 +14,14 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from experiments import figures, proxy_runs
+from experiments.experiment import Experiment
+from experiments.proxy_runs import RunSettings
+from experiments.settings import count, setting
+from experiments.statistics import bootstrap_interval
+from experiments.tables import iqm_columns, iqm_note, iqm_text, publish
 from sejax.cli.build import AGENT_HPARAMS
-from sejax.experiments import figures, proxy_runs
-from sejax.experiments.experiment import Experiment
-from sejax.experiments.proxy_runs import RunSettings
-from sejax.experiments.settings import count, setting
-from sejax.experiments.tables import iqm_columns, iqm_note, iqm_text, publish
 from sejax.options import one_of
-from sejax.statistics import bootstrap_interval
 
 NUM_RUNS = {"cartpole": 10}
 

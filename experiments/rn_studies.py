@@ -23,12 +23,12 @@ from typing import Any
 import pandas as pd
 
 import sejax
+from experiments import figures, pieces, proxy_runs, worlds
+from experiments.proxy_runs import RunSettings
+from experiments.settings import setting, work_beside
 from sejax import ICMConfig, errors, registry, serialize
 from sejax.cli import build, run_directory
 from sejax.errors import ConfigError
-from sejax.experiments import figures, pieces, proxy_runs, worlds
-from sejax.experiments.proxy_runs import RunSettings
-from sejax.experiments.settings import setting, work_beside
 from sejax.options import counts, one_of
 
 # Paper, table "Overview of Reward Network variants".

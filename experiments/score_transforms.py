@@ -29,15 +29,15 @@ import pandas as pd
 from flax import struct
 
 import sejax
+from experiments import figures
+from experiments.experiment import Experiment
+from experiments.settings import Settings, count, setting
+from experiments.statistics import NUM_RESAMPLES, bootstrap_interval
+from experiments.tables import as_texts, publish
 from sejax.es.base import Strategy
 from sejax.es.nes import NESConfig, NESState, make_nes
 from sejax.es.score_transforms import TRANSFORMS
-from sejax.experiments import figures
-from sejax.experiments.experiment import Experiment
-from sejax.experiments.settings import Settings, count, setting
-from sejax.experiments.tables import as_texts, publish
 from sejax.options import Options, counts
-from sejax.statistics import NUM_RESAMPLES, bootstrap_interval
 
 SCORE_TRANSFORMS = tuple(TRANSFORMS)
 

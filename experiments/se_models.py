@@ -16,13 +16,13 @@ import numpy as np
 import pandas as pd
 
 import sejax
+from experiments import figures, se_agents
+from experiments.experiment import Experiment
+from experiments.se_agents import SeAgents
+from experiments.settings import setting
+from experiments.tables import as_texts, iqm_columns, iqm_note, iqm_text, publish
+from experiments.worlds import return_columns
 from sejax.errors import ConfigError
-from sejax.experiments import figures, se_agents
-from sejax.experiments.experiment import Experiment
-from sejax.experiments.se_agents import SeAgents
-from sejax.experiments.settings import setting
-from sejax.experiments.tables import as_texts, iqm_columns, iqm_note, iqm_text, publish
-from sejax.experiments.worlds import return_columns
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -14,8 +14,8 @@ import numpy as np
 import pandas as pd
 
 import sejax
+from experiments.settings import Settings, count, setting
 from sejax.errors import require
-from sejax.experiments.settings import Settings, count, setting
 
 
 @dataclass(frozen=True, kw_only=True)

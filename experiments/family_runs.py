@@ -12,13 +12,13 @@ from typing import Any
 import pandas as pd
 
 import sejax
+from experiments import budgets, proxy_runs
+from experiments.proxy_runs import RunSettings
+from experiments.settings import count, each_of, setting
+from experiments.tables import iqm_columns, spread
+from experiments.worlds import HPARAMS, World, groups_at_once, train_groups
 from sejax import registry
 from sejax.cli.families import JOINT, key_of
-from sejax.experiments import budgets, proxy_runs
-from sejax.experiments.proxy_runs import RunSettings
-from sejax.experiments.settings import count, each_of, setting
-from sejax.experiments.tables import iqm_columns, spread
-from sejax.experiments.worlds import HPARAMS, World, groups_at_once, train_groups
 from sejax.options import positive
 
 # A little world and agents that learn enough to be seen moving.

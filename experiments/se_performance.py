@@ -24,13 +24,11 @@ import numpy as np
 import pandas as pd
 
 import sejax
-from sejax import envs
-from sejax.errors import require
-from sejax.experiments import figures, se_agents
-from sejax.experiments.experiment import Experiment
-from sejax.experiments.se_agents import SeAgents
-from sejax.experiments.settings import count, setting
-from sejax.experiments.tables import (
+from experiments import figures, se_agents
+from experiments.experiment import Experiment
+from experiments.se_agents import SeAgents
+from experiments.settings import count, setting
+from experiments.tables import (
     as_texts,
     brackets,
     in_strata,
@@ -40,7 +38,9 @@ from sejax.experiments.tables import (
     publish,
     spread,
 )
-from sejax.experiments.worlds import World, return_columns, tuned_agent
+from experiments.worlds import World, return_columns, tuned_agent
+from sejax import envs
+from sejax.errors import require
 from sejax.options import one_of
 from sejax.training import SOLVED_BY, TrainingConfig
 

@@ -18,12 +18,12 @@ import optax
 import pandas as pd
 
 import sejax
+from experiments import se_agents
+from experiments.se_agents import AGENTS, SOFT_SE
+from experiments.settings import Settings, count, each_of, setting
+from experiments.worlds import HPARAMS
 from sejax import registry
 from sejax.cli import build
-from sejax.experiments import se_agents
-from sejax.experiments.se_agents import AGENTS, SOFT_SE
-from sejax.experiments.settings import Settings, count, each_of, setting
-from sejax.experiments.worlds import HPARAMS
 from sejax.ops.parallel import spread_over_devices
 from sejax.options import counts
 

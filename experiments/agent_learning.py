@@ -16,14 +16,14 @@ import numpy as np
 import pandas as pd
 
 import sejax
+from experiments import figures, return_curves
+from experiments.experiment import Experiment
+from experiments.return_curves import WINDOW
+from experiments.settings import Settings, count, each_of, setting
+from experiments.statistics import bootstrap_interval
+from experiments.tables import as_texts, iqm_columns, iqm_note, iqm_text, publish
+from experiments.worlds import CURVES, World, train_groups
 from sejax import registry, serialize
-from sejax.experiments import figures, return_curves
-from sejax.experiments.experiment import Experiment
-from sejax.experiments.return_curves import WINDOW
-from sejax.experiments.settings import Settings, count, each_of, setting
-from sejax.experiments.tables import as_texts, iqm_columns, iqm_note, iqm_text, publish
-from sejax.experiments.worlds import CURVES, World, train_groups
-from sejax.statistics import bootstrap_interval
 from sejax.training import TrainingConfig
 
 QUICK_STEPS = 2000

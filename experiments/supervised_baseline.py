@@ -28,15 +28,15 @@ import numpy as np
 import pandas as pd
 
 import sejax
+from experiments import figures, se_agents, supervised_models, worlds
+from experiments.experiment import Experiment
+from experiments.pieces import stack, unstack
+from experiments.se_agents import AGENTS, SOFT_SE
+from experiments.statistics import bootstrap_interval
+from experiments.supervised_models import SupervisedBaseline
+from experiments.tables import as_texts, iqm_columns, iqm_note, iqm_text, publish
+from experiments.worlds import HPARAMS, World, return_columns
 from sejax.errors import require
-from sejax.experiments import figures, se_agents, supervised_models, worlds
-from sejax.experiments.experiment import Experiment
-from sejax.experiments.pieces import stack, unstack
-from sejax.experiments.se_agents import AGENTS, SOFT_SE
-from sejax.experiments.supervised_models import SupervisedBaseline
-from sejax.experiments.tables import as_texts, iqm_columns, iqm_note, iqm_text, publish
-from sejax.experiments.worlds import HPARAMS, World, return_columns
-from sejax.statistics import bootstrap_interval
 
 BEST = 2  # models in the paper's second figure
 LABELS = {

@@ -18,12 +18,12 @@ from typing import Any
 
 import pandas as pd
 
+from experiments import rn_curves, rn_studies
+from experiments.experiment import Experiment
+from experiments.rn_curves import CurveSettings
+from experiments.settings import each_of, setting
+from experiments.tables import publish
 from sejax.errors import require
-from sejax.experiments import rn_curves, rn_studies
-from sejax.experiments.experiment import Experiment
-from sejax.experiments.rn_curves import CurveSettings
-from sejax.experiments.settings import each_of, setting
-from sejax.experiments.tables import publish
 
 PICKS = ("best", "worst")
 QUICK_LEARNED = 4

@@ -17,12 +17,11 @@ import numpy as np
 import pandas as pd
 
 import sejax
-from sejax.errors import require
-from sejax.experiments import figures
-from sejax.experiments.experiment import Experiment
-from sejax.experiments.settings import Settings, count, each_of, setting
-from sejax.experiments.tables import as_texts, publish
-from sejax.experiments.worlds import (
+from experiments import figures
+from experiments.experiment import Experiment
+from experiments.settings import Settings, count, each_of, setting
+from experiments.tables import as_texts, publish
+from experiments.worlds import (
     Group,
     Measure,
     World,
@@ -31,6 +30,7 @@ from sejax.experiments.worlds import (
     train_groups,
     training_as_learned,
 )
+from sejax.errors import require
 from sejax.options import counts
 from sejax.training import TrainingConfig
 

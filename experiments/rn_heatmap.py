@@ -15,12 +15,12 @@ import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 
+from experiments import figures, rn_studies
+from experiments.experiment import Experiment
+from experiments.rn_studies import RnSettings
+from experiments.tables import publish
 from sejax.envs.gridworld import CLIFF_WALKING as MAP
 from sejax.errors import require
-from sejax.experiments import figures, rn_studies
-from sejax.experiments.experiment import Experiment
-from sejax.experiments.rn_studies import RnSettings
-from sejax.experiments.tables import publish
 
 IGNORED_BELOW = -50.0  # the right column leaves out rewards of at most this
 # Corners of the triangle of each action in a cell whose middle is (0, 0), y downwards: the middle

@@ -8,9 +8,9 @@ import pandas as pd
 from rich.console import Console
 from rich.table import Table
 
-from sejax.experiments.settings import Settings
+from experiments.settings import Settings
+from experiments.statistics import bootstrap_interval, interquartile_mean
 from sejax.ops.files import write_text
-from sejax.statistics import bootstrap_interval, interquartile_mean
 
 LEAST_FOR_INTERVAL = 5  # independent values: two bracket the truth half of the time
 

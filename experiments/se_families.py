@@ -15,14 +15,14 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from experiments import family_runs, figures
+from experiments.experiment import Experiment
+from experiments.family_runs import FamilyRuns, families_in, known_families
+from experiments.pieces import stack, unstack
+from experiments.settings import setting
+from experiments.tables import brackets, iqm_note, iqm_text, publish
 from sejax import envs
 from sejax.errors import require
-from sejax.experiments import family_runs, figures
-from sejax.experiments.experiment import Experiment
-from sejax.experiments.family_runs import FamilyRuns, families_in, known_families
-from sejax.experiments.pieces import stack, unstack
-from sejax.experiments.settings import setting
-from sejax.experiments.tables import brackets, iqm_note, iqm_text, publish
 
 SETS = (
     "ddqn",

@@ -20,11 +20,11 @@ import numpy as np
 import pandas as pd
 
 import sejax
+from experiments import figures
+from experiments.experiment import Experiment
+from experiments.settings import Settings, count, each_of, setting
+from experiments.tables import as_texts, publish
 from sejax.cli.runtime import available_cores
-from sejax.experiments import figures
-from sejax.experiments.experiment import Experiment
-from sejax.experiments.settings import Settings, count, each_of, setting
-from sejax.experiments.tables import as_texts, publish
 
 PAPER_CORES = 16
 

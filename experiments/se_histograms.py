@@ -30,15 +30,15 @@ import pandas as pd
 from scipy.stats import wasserstein_distance
 
 import sejax
+from experiments import figures, se_agents
+from experiments.experiment import Experiment
+from experiments.se_agents import AGENTS, SOFT_SE
+from experiments.settings import Settings, count, each_of, setting
+from experiments.tables import as_texts, publish
+from experiments.worlds import Measure, World, train_groups, training_as_learned
 from sejax import registry
 from sejax.agents import replay
 from sejax.agents.memory import Memory, MemoryMaker
-from sejax.experiments import figures, se_agents
-from sejax.experiments.experiment import Experiment
-from sejax.experiments.se_agents import AGENTS, SOFT_SE
-from sejax.experiments.settings import Settings, count, each_of, setting
-from sejax.experiments.tables import as_texts, publish
-from sejax.experiments.worlds import Measure, World, train_groups, training_as_learned
 from sejax.training import TrainingConfig
 
 SOURCES = {
@@ -138,8 +138,7 @@ def make_recorded_run(
     max_rows: int, agent: Any, env: Any, task: Any, training: TrainingConfig
 ) -> Callable[..., Any]:
     """Builds `run(key, env_params, active)` that trains, tests and records one agent."""
-    from sejax.evaluation import make_tested_trainer
-    from sejax.rollout import make_recorder
+    from sejax.evaluation import make_recorder, make_tested_trainer
 
     capacity = min(max_rows, training.max_steps or max_rows)
     train = make_tested_trainer(agent, env, task, training, recorder=last_steps(capacity))
