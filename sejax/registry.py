@@ -14,7 +14,7 @@ group         entry points            `make(...)` gives
 `objective`   `sejax.objectives`      `(task)` a `sejax.Objective`
 `es`          `sejax.strategies`      `(num_dims)` a `sejax.Strategy`
 `tracker`     `sejax.trackers`        `(run)` a `sejax.cli.trackers.Tracker`
-`machines`    `sejax.machines`        `(config, folder, say)`: see `sejax.machines.configs`
+`machines`    `sejax.cli`             `(config, folder, say)`: see `sejax.cli.workers`
 ============= ======================= ==============================================
 
 A name is one that comes with sejax, one that an installed package offers as an entry point, or
@@ -51,14 +51,14 @@ class Group:
       arguments: what `make` is given, for messages and for functions in a dataclass's place.
       built_in: name to `module:attribute`.
       families: beginning of a name to `module:attribute` of a dataclass with a field `name`.
-      base: `module:attribute` of the class from which a plugin's dataclass must derive; any if "".
+      base: `module:attribute` of the class that each plugin's dataclass is a subclass of.
     """
 
     entry_points: str
     arguments: tuple[str, ...]
     built_in: dict[str, str]
     families: dict[str, str] = dataclasses.field(default_factory=dict)
-    base: str = ""
+    base: str = "builtins:object"
 
 
 _EVOSAX = (
@@ -126,15 +126,17 @@ GROUPS = {
             "sarsa": "sejax.agents.tabular:SARSAConfig",
             "boltzmann": "sejax.agents.boltzmann:BoltzmannConfig",
         },
+        base="sejax.agents.base:AgentConfig",
     ),
     "exploration": Group(
         "sejax.explorations",
         ("agent", "task"),
         {
             "none": "sejax.agents.base:NoExploration",
-            "icm": "sejax.agents.icm:ICMConfig",
-            "count_based": "sejax.agents.count_based:CountBasedConfig",
+            "icm": "sejax.agents.exploration:ICMConfig",
+            "count_based": "sejax.agents.exploration:CountBasedConfig",
         },
+        base="sejax.agents.base:ExplorationConfig",
     ),
     "proxy": Group(
         "sejax.proxies",
@@ -174,11 +176,11 @@ GROUPS = {
         },
     ),
     "machines": Group(
-        "sejax.machines",
+        "sejax.cli",
         ("config", "folder", "say"),
         {
-            "local": "sejax.machines.configs:LocalConfig",
-            "ray": "sejax.machines.configs:RayConfig",
+            "local": "sejax.cli.workers:LocalConfig",
+            "ray": "sejax.cli.workers:RayConfig",
         },
     ),
 }
@@ -545,15 +547,6 @@ def _as_dataclass(group: str, name: str, found: Any) -> Any:
     arguments = GROUPS[group].arguments
     if isinstance(found, type) and dataclasses.is_dataclass(found) and hasattr(found, "make"):
         cls: Any = found
-        base = GROUPS[group].base
-        require(
-            not base or issubclass(cls, _attribute(base)),
-            group,
-            f"derive from {base.replace(':', '.')}",
-            "that declares what is asked of it",
-            name,
-            f"{cls.__name__}({base.partition(':')[2]}) as its class",
-        )
     elif inspect.isfunction(found) or isinstance(found, functools.partial):
         cls = _from_function(group, name, found)
     else:
@@ -562,6 +555,15 @@ def _as_dataclass(group: str, name: str, found: Any) -> Any:
             f"takes ({', '.join((*arguments, 'option=default, ...'))}), because its fields are the "
             f'options; {name} is {shortened(found)}. See the README, "Adding to it".'
         )
+    base = _attribute(GROUPS[group].base)
+    require(
+        issubclass(cls, base),
+        group,
+        f"be a subclass of {base.__module__}.{base.__name__}",
+        "that says what it fits",
+        name,
+        f"class {cls.__name__}({base.__name__})",
+    )
     if f"{cls.__module__}:{cls.__qualname__}" != name:
         _NAMES[cls] = name
     return cls
@@ -597,7 +599,7 @@ def _from_function(group: str, name: str, function: Callable[..., Any]) -> type:
     cls = dataclasses.make_dataclass(
         written.__name__,
         fields,
-        bases=(_attribute(GROUPS[group].base),) if GROUPS[group].base else (),
+        bases=(_attribute(GROUPS[group].base),),
         namespace={"make": make, "__doc__": written.__doc__},
         frozen=True,
         kw_only=True,

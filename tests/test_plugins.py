@@ -14,6 +14,7 @@ from flax import linen as nn
 
 import sejax
 from sejax import envs, registry
+from sejax.agents import AgentConfig
 from sejax.cli import build
 from sejax.errors import ConfigError
 from sejax.es.evosax import ALGORITHMS
@@ -345,7 +346,7 @@ from flax import struct
 from gymnax.environments import environment, spaces
 
 import sejax
-from sejax.agents.memory import no_memory
+from sejax.agents import AgentConfig, no_buffer
 from sejax.es.nes import NESConfig, make_nes
 
 
@@ -398,7 +399,7 @@ class LineTask:
 
 
 @dataclasses.dataclass(frozen=True)
-class Table:
+class Table(AgentConfig):
     """Remembers what each action paid, whatever the place."""
 
     rate: float = 0.5
@@ -416,7 +417,7 @@ class Table:
         return sejax.Agent(
             init=lambda key, hparams: {"paid": jnp.zeros(task.num_actions),
                                        "rate": jnp.float32(hparams["rate"])},
-            act=act, update=update, memory=no_memory(), hparams={"rate": self.rate},
+            act=act, update=update, buffer=no_buffer(), hparams={"rate": self.rate},
             discount=lambda hparams: 1.0,
         )
 
@@ -562,7 +563,7 @@ class Residual(nn.Module):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Torso:
+class Torso(AgentConfig):
     """An agent's configuration that holds another dataclass, a number, a list and a function."""
 
     torso: nn.Module = Plain()  # noqa: RUF009 (frozen)

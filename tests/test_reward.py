@@ -247,7 +247,7 @@ def test_the_discount_is_the_agents():
 
 
 def test_an_agent_without_a_discount_is_told_where_one_is_needed():
-    agent = Agent(init=None, act=None, update=None, memory=None, hparams={"rate": 0.1})
+    agent = Agent(init=None, act=None, update=None, buffer=None, hparams={"rate": 0.1})
     env = make_env("cliff_walking")
     with pytest.raises(
         ConfigError, match=r"^agent must say its discount, because additive_potential"
@@ -299,7 +299,7 @@ def test_training_on_a_reward_network_stops_when_tests_on_the_real_task_solve_it
         evaluate = make_evaluator(agent, env, task, config.training)
         return evaluate(jax.random.key(0), params).train_episodes
 
-    first_that_counts = agent.warmup_episodes + 1
+    first_that_counts = agent.spec.warmup_episodes + 1
     assert episodes(-1000.0) == first_that_counts
     assert episodes(0.0) == config.training.max_episodes == 12
 

@@ -12,7 +12,7 @@ from sejax.cli import families
 from sejax.cli.families import AgentsConfig, families_of
 from sejax.errors import one_of, require, require_seed, shortened, whole
 from sejax.ops.files import as_file_name
-from sejax.training import TrainingConfig, require_reachable, steps_before_learning
+from sejax.training import TrainingConfig, require_reachable
 
 AGENT_HPARAMS = ("default", "varied")
 EVALUATION_HPARAMS = (*AGENT_HPARAMS, "as_learned")
@@ -87,7 +87,7 @@ class LearnConfig:
         )
         spec, task_name = envs.spec_of(self.env), self.name("env")
         self.proxy.require_task(spec, task_name)
-        train = not all(getattr(x.agent, "is_solved_for", False) for x in families_of(self))
+        train = not all(x.agent.is_solved_for for x in families_of(self))
         if train and not self.proxy.has_real_dynamics:
             require_reachable("training", self.training, self.proxy.max_steps(spec.max_steps))
         for family in families_of(self):
@@ -363,17 +363,14 @@ def require_learning(
     Raises:
       ConfigError: if it does not.
     """
-    before = steps_before_learning(agent, max_episode_steps, task_max_steps)
-    names = ("rollout_steps", "update_episodes", "warmup_episodes")
-    waits = next((name for name in names if getattr(agent, name, None) is not None), names[-1])
+    before = agent.steps_before_learning(max_episode_steps, task_max_steps)
     require(
         training.max_steps is None or training.max_steps > before,
         f"{name}.max_steps",
         f"exceed {before}",
-        f"{registry.name_of('agent', agent)} learns nothing before with "
-        f"agent.{waits}={getattr(agent, waits, None)}",
+        f"{registry.name_of('agent', agent)} learns nothing before",
         training.max_steps,
-        f"{name}.max_steps={4 * before}, or agent.{waits} lower",
+        f"{name}.max_steps={4 * before}",
     )
 
 

@@ -10,10 +10,13 @@ import functools
 from typing import Any
 
 import jax
+import jax.numpy as jnp
+import numpy as np
 from flax import struct
 from jaxtyping import Array
 
 from sejax.envs.spec import Box, Discrete, Space
+from sejax.errors import ConfigError
 
 
 @struct.dataclass
@@ -108,9 +111,24 @@ class Environment:
         return type(self).__name__
 
 
+def spaces_of(env: Any) -> tuple[Space, Space]:
+    """Spaces of the observations and actions of any environment.
+
+    Raises:
+      ConfigError: if one is neither a box nor discrete.
+    """
+    if isinstance(env, Environment) and env.spaces is not None:
+        return env.spaces
+    with jax.ensure_compile_time_eval():  # gymnax computes some spaces
+        params = env.default_params
+        return (
+            space_of_gymnax(env.observation_space(params), "observations", type(env).__name__),
+            space_of_gymnax(env.action_space(params), "actions", type(env).__name__),
+        )
+
+
 def _of_gymnax(space: Space) -> Any:
     """A space as one of gymnax."""
-    import jax.numpy as jnp
     from gymnax.environments import spaces
 
     if isinstance(space, Discrete):
@@ -119,16 +137,26 @@ def _of_gymnax(space: Space) -> Any:
     return spaces.Box(low, high, low.shape, jnp.float32)
 
 
-def space_of_gymnax(space: Any) -> Space | None:
-    """A space of gymnax as ours, a box of any shape flattened; None for other kinds."""
-    import numpy as np
+def space_of_gymnax(space: Any, what: str, name: str) -> Space:
+    """A space of gymnax as ours, a box of any shape flattened.
+
+    Args:
+      space: of gymnax.
+      what: it is a space of, for the message.
+      name: of the environment, for the message.
+
+    Raises:
+      ConfigError: if it is neither a box nor discrete.
+    """
     from gymnax.environments import spaces
 
     if isinstance(space, spaces.Discrete):
         return Discrete(int(space.n))
     if isinstance(space, spaces.Box):
-        bounds = (
-            np.broadcast_to(np.asarray(x, np.float32), space.shape) for x in (space.low, space.high)
-        )
+        bounds = (np.broadcast_to(np.float32(x), space.shape) for x in (space.low, space.high))
         return Box(*(tuple(bound.ravel().tolist()) for bound in bounds))
-    return None
+    raise ConfigError(
+        f"env must have {what} in a gymnax Box or Discrete space, because networks take vectors and "
+        f"tables take indices; got {space!r} in {name}. Make them one array in a subclass of "
+        f"sejax.envs.wrappers.Wrapper."
+    )

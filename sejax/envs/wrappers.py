@@ -152,8 +152,8 @@ def as_vectors(env: Any, params: Any, name: str) -> tuple[Any, Space, Space]:
     if isinstance(env, Environment) and env.spaces is not None:
         return env, *env.spaces
     raw = env.observation_space(params), env.action_space(params)
-    spaces = _known(raw[0], "observations", name), _known(raw[1], "actions", name)
-    observation, action = spaces
+    observation = space_of_gymnax(raw[0], "observations", name)
+    action = space_of_gymnax(raw[1], "actions", name)
     plain_obs = isinstance(observation, Discrete)
     if not plain_obs:  # what comes, as a space may say otherwise (gymnax's FourRooms)
         came = jax.eval_shape(lambda: env.reset_env(jax.random.key(0), params)[0])
@@ -162,19 +162,8 @@ def as_vectors(env: Any, params: Any, name: str) -> tuple[Any, Space, Space]:
         _require_bounds(action, raw[1], name)
     if plain_obs and (isinstance(action, Discrete) or _is_symmetric(action, raw[1].shape)):
         return env, observation, action
-    vectors = AsVectors(env, spaces, raw[1].shape)
+    vectors = AsVectors(env, (observation, action), raw[1].shape)
     return vectors, *vectors.spaces
-
-
-def _known(space: Any, what: str, name: str) -> Space:
-    known = space_of_gymnax(space)
-    if known is None:
-        raise ConfigError(
-            f"env must have {what} in a gymnax Box or Discrete space, because networks take "
-            f"vectors and tables take indices; got {space!r} in {name}. Make them "
-            f"one array in a subclass of sejax.envs.wrappers.Wrapper."
-        )
-    return known
 
 
 def _require_bounds(box: Box, space: Any, name: str) -> None:
