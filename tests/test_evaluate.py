@@ -21,7 +21,7 @@ from sejax.cli import build, commands, compose, progress
 from sejax.cli.families import families_of
 from sejax.errors import ConfigError
 from sejax.evaluate import evaluate, proxy_study
-from sejax.ops.sealed import seal, unseal
+from sejax.ops.checksummed import pack, unpack
 from sejax.proxies import files
 from sejax.training import TrainingConfig, budget_for
 
@@ -353,9 +353,9 @@ def test_where_no_agent_is_named_it_is_the_tasks_own(room, tmp_path):
         assert config.agent == registry.configure("agent", {"name": kind})
     # An older file, which lacks that: its task's name is not imported, nor made.
     path = tmp_path / "theirs.safetensors"
-    tensors, header = unseal(path.read_bytes(), "sejax")
+    tensors, header = unpack(path.read_bytes(), "sejax")
     header.pop("interface")
-    path.write_bytes(seal(tensors, "sejax", header))
+    path.write_bytes(pack(tensors, "sejax", header))
     assert registry.name_of("agent", evaluate_config(f"proxy={path}", words=[]).agent) == "ddqn"
     assert "their" not in sys.modules
 
