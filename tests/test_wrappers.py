@@ -9,6 +9,7 @@ import pytest
 from scripted import MAX_EPISODES, MAX_STEPS, ScriptedEnv, script, scripted_agent
 
 from sejax import envs
+from sejax.agents import AgentSpec
 from sejax.envs.wrappers import repeat_actions
 from sejax.training import TrainingConfig, make_trainer
 
@@ -49,7 +50,7 @@ def test_one_repeat_is_the_world_itself():
 
 
 def test_a_trainer_counts_steps_of_the_world():
-    agent = dataclasses.replace(scripted_agent(), action_repeat=3)
+    agent = dataclasses.replace(scripted_agent(), spec=AgentSpec(action_repeat=3))
     training = TrainingConfig(max_episodes=MAX_EPISODES, stop_rule="never")
     train = jax.jit(make_trainer(agent, ScriptedEnv(), training))
     result = train(KEY, script([1.0] * MAX_EPISODES, [99] * MAX_EPISODES))

@@ -212,7 +212,7 @@ def run(
         solved_score=program.solved_score,
         wall_s=round(wall_before + time.time() - started, 1),
         cpu_s=round(cpu_s(), 1),
-        **_cost(directory, program.strategy.num_candidates),
+        **_cost(directory, program.strategy.num_evaluations),
         devices=[str(device) for device in jax.devices()],
         machine=runtime.machine(),
         versions=_versions(),

@@ -81,7 +81,7 @@ class Learning:
         with open_for(config, "Set search_dir=FOLDER.") as directory:
             chunks = self._programs.chunks(config)
             session.run(config, directory, chunks)
-            progress = progress_of(directory, chunks.program.strategy.num_candidates)
+            progress = progress_of(directory, chunks.program.strategy.num_evaluations)
             lengths = [
                 sum(int(row["seed"]) == seed for row in directory.rows) for seed in directory.seeds
             ]
@@ -99,7 +99,7 @@ class Learning:
     def _run(self, config: build.LearnConfig, follower: Follower) -> Progress:
         with open_for(config, "Set search_dir=FOLDER.") as directory:
             chunks = self._programs.chunks(config)
-            num_candidates = chunks.program.strategy.num_candidates
+            num_candidates = chunks.program.strategy.num_evaluations
             over_at = chunks.program.solved_score if config.stop_when_solved else None
             report = _Report(directory, follower, num_candidates, over_at)
             session.run(config, directory, chunks, report)
