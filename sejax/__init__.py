@@ -37,6 +37,7 @@ _EXPORTS = {
     "PPOConfig": "sejax.agents.ppo",
     "PretrainedProxy": "sejax.proxies.zoo",
     "Proxy": "sejax.proxies.files",
+    "ProxyConfig": "sejax.proxies",
     "ProxyEnv": "sejax.proxies.base",
     "ProxyParams": "sejax.proxies.base",
     "ProxySet": "sejax.proxies.files",
@@ -92,6 +93,7 @@ if TYPE_CHECKING:  # what a type checker and an editor see
     from sejax.evaluation import evaluate_agents, make_evaluator
     from sejax.objectives import AUC, AUCSum, MaxReward, Objective, Outcome, RewardThreshold
     from sejax.ops.parallel import spread_over_devices
+    from sejax.proxies import ProxyConfig
     from sejax.proxies.base import ProxyEnv, ProxyParams
     from sejax.proxies.configs import RewardConfig, SyntheticConfig
     from sejax.proxies.files import (
@@ -131,6 +133,7 @@ __all__ = [
     "PPOConfig",
     "PretrainedProxy",
     "Proxy",
+    "ProxyConfig",
     "ProxyEnv",
     "ProxyParams",
     "ProxySet",

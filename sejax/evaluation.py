@@ -27,7 +27,7 @@ from sejax.ops.parallel import (
     spread_groups_over_devices,
     spread_over_devices,
 )
-from sejax.proxies.base import ProxyEnv, world_of
+from sejax.proxies.base import ProxyEnv, is_real
 from sejax.training import TrainingConfig, TrainResult, make_trainer
 
 # --- greedy episodes ------------------------------------------------------------------------------
@@ -265,7 +265,7 @@ def make_evaluator(
                 train_episodes=result.episodes,
                 auc=area_under_curve(result, tests.returns.mean()),
                 nonfinite=result.nonfinite | ~jnp.isfinite(tests.returns).all(),
-                real_steps=real_steps + result.train_steps if world_of(env).is_real else real_steps,
+                real_steps=real_steps + result.train_steps if is_real(env) else real_steps,
             )
             return (outcome, recorder(key_test, result.agent_state)) if recorder else outcome
 

@@ -22,7 +22,7 @@ from sejax.errors import LARGEST, require
 from sejax.ops.keys import step_keys
 from sejax.ops.loops import while_any_active
 from sejax.options import Options, counts, not_negative, one_of, option
-from sejax.proxies.base import prepare, world_of
+from sejax.proxies.base import episode_limit, is_real, prepare
 
 STOP_RULES = ("plateau", "solved", "never")
 SOLVED_BY = ("test", "train")
@@ -380,16 +380,16 @@ class _Loop:
         test_fn: TestFn | None,
         recorder: BufferMaker | None,
     ):
-        world = world_of(env)
-        limit_is_terminal = training.time_limit_is_terminal and world.is_real
+        episode_steps = episode_limit(env)
+        limit_is_terminal = training.time_limit_is_terminal and is_real(env)
         self.agent, self.training, self.solved_reward = agent, training, solved_reward
         self.limit_is_terminal = limit_is_terminal
         self.test_fn = test_fn if training.num_tests_between else None
         self.env = repeat_actions(env, agent.spec.action_repeat)
         self.max_steps = self.buffer_steps = training.max_steps or LARGEST
-        if world.max_steps is not None:
-            require_reachable("training", training, world.max_steps)
-            self.buffer_steps = min(self.max_steps, training.max_episodes * world.max_steps)
+        if episode_steps is not None:
+            require_reachable("training", training, episode_steps)
+            self.buffer_steps = min(self.max_steps, training.max_episodes * episode_steps)
         self.buffer_makers = (agent.buffer, *([] if recorder is None else [recorder]))
         self.prepare = lambda params, hparams: prepare(
             env, params, agent.discount(hparams), limit_is_terminal

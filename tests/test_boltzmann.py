@@ -101,7 +101,7 @@ def program_of(agent, **parts):
 
 
 def test_the_outer_loop_learns_a_bandit_without_a_step_of_training():
-    """And an agent of weight 0 trains on incumbents alone."""
+    """And a family of weight 0 trains on incumbents alone."""
     boltzmann = sejax.make_agent(BoltzmannConfig(), CARTPOLE)
     ddqn = sejax.make_agent(
         sejax.DDQNConfig(hidden_size=8, num_layers=1, batch_size=8, warmup_episodes=1), CARTPOLE

@@ -86,15 +86,14 @@ class LearnConfig:
             "stop_when_solved=false",
         )
         facts, task_name = envs.facts_of(self.env), self.name("env")
-        if hasattr(self.proxy, "require_task"):
-            self.proxy.require_task(facts, task_name)
+        self.proxy.require_task(facts, task_name)
         train = not all(x.agent.is_solved_for for x in families_of(self))
-        if train and hasattr(self.proxy, "lasts_to_the_limit"):  # an SE
+        if train and not self.proxy.has_real_dynamics:
             require_reachable("training", self.training, self.proxy.max_steps(facts.max_steps))
         for family in families_of(self):
             with families.named(family.field):
                 agents.require_fit(family.agent, self.exploration, facts, task_name)
-                if getattr(self.proxy, "lasts_to_the_limit", False):
+                if self.proxy.reaches_step_limit:
                     require_learning(
                         "training",
                         self.training,
@@ -272,6 +271,38 @@ def to_plain(config: LearnConfig | EvaluateConfig) -> dict[str, Any]:
         for field in dataclasses.fields(config)
         for value in [getattr(config, field.name)]
     }
+
+
+def completed(stored: Mapping[str, Any], config: LearnConfig) -> dict[str, Any]:
+    """A stored run's values with the fields that a former version did not write; plain values.
+
+    New fields have a default that changes no number. Those of a choice are taken from the choice of
+    the same name in `config`: what only `stored` names is neither imported nor made.
+    """
+    whole = {"agent": None, "agents": None} | dict(stored)
+    usual = {
+        group: registry.defaults(group, config.name(group))
+        for group in LEARN_GROUPS
+        if getattr(config, group) is not None
+    }
+    usual["training"] = serialize.to_plain(TrainingConfig())
+    if config.agents is not None:
+        usual["agents"] = families.defaults(config.agents)
+    return whole | {
+        name: _filled(whole[name], fields) for name, fields in usual.items() if name in whole
+    }
+
+
+def _filled(there: Any, usual: Mapping[str, Any]) -> Any:
+    """A group's fields with those that are missing, if it is of the same name."""
+    if not isinstance(there, Mapping) or there.get("name") != usual.get("name"):
+        return there
+    nested = {
+        name: _filled(value, usual[name])
+        for name, value in there.items()
+        if isinstance(usual.get(name), Mapping)
+    }
+    return {name: x for name, x in usual.items() if x != "???"} | dict(there) | nested
 
 
 def _from_plain(schema: Any, groups: tuple[str, ...], values: Mapping[str, Any]) -> Any:
