@@ -43,6 +43,7 @@ EXPLORING = [
     ("ppo", "cartpole", "icm"),
     ("sarsa", "gridworld_2x2", "count_based"),
 ]
+JITTED = [("ddqn", "cartpole", "none"), ("ppo", "pendulum", "none"), EXPLORING[3]]
 every_agent = pytest.mark.parametrize("case", [*PLAIN, *EXPLORING], ids="-".join)
 OFF_POLICY = [case for case in PLAIN if case[0] not in ("ppo", "q_learning", "sarsa")]
 every_off_policy_agent = pytest.mark.parametrize("case", OFF_POLICY, ids="-".join)
@@ -53,7 +54,9 @@ def parts(case):
     """An agent, and `start(key, hparams) -> (state, batch)` after some steps of random outcome."""
     name, task_name, exploration = case
     task = envs.make(task_name)
-    exploration = registry.configure("exploration", {"name": exploration})
+    small = {"hidden_size": 4, "num_layers": 1, "num_residual_blocks": 1, "feature_dim": 3}
+    fields = {"name": exploration} | (small if exploration == "icm" else {})
+    exploration = registry.configure("exploration", fields)
     agent = agents.make_agent(config_of(name), task, exploration)
 
     def start(key, hparams):
@@ -130,7 +133,7 @@ def test_a_state_keeps_its_types_and_an_action_fits_its_space(case):
     obs = jnp.int32(0) if task.num_states else jnp.zeros(task.obs_dim)
     for explore in (True, False):
         act = functools.partial(agent.act, explore=explore)
-        action = jax.eval_shape(lambda *args: agent.env_action(act(*args)), key, state, obs)
+        action = jax.eval_shape(agent.env_action, jax.eval_shape(act, key, state, obs))
         shape = () if task.num_actions else (task.action_dim,)
         assert action.shape == shape
         assert action.dtype == (jnp.int32 if task.num_actions else jnp.float32)
@@ -157,23 +160,18 @@ def test_agents_of_other_hyperparameters_learn_in_one_program_as_each_would_alon
     varied = [hparams._replace(learning_rate=rate) for rate in (0.01, 0.3)]
     if case[2] != "none":
         varied = [agent.hparams._replace(agent=each) for each in varied]
-    keys = jax.random.split(jax.random.key(2), 2)
-
-    @jax.jit
-    def learned(key, hparams):
-        state, batch = start(key, hparams)
-        return agent.update(key, state, batch)
-
-    stacked = jax.tree.map(lambda *x: jnp.float32(jnp.stack(x)), *varied)
-    together = jax.jit(jax.vmap(learned))(keys, stacked)
-    for i, (key, hparams) in enumerate(zip(keys, varied, strict=True)):
-        alone = learned(key, jax.tree.map(jnp.float32, hparams))
-        assert_close(jax.tree.map(lambda x, i=i: x[i], together), alone, rtol=1e-3, atol=1e-4)
-    same_key = [learned(keys[0], jax.tree.map(jnp.float32, each)) for each in varied]
-    assert moved(*same_key)
+    key = jax.random.key(2)
+    started_with = [start(key, jax.tree.map(jnp.float32, each)) for each in varied]
+    states, batches = zip(*started_with, strict=True)
+    stacked = jax.tree.map(lambda *x: jnp.stack(x), *states)
+    together = jax.jit(jax.vmap(agent.update, (None, 0, None)))(key, stacked, batches[0])
+    alone = [update_of(case)(key, state, batches[0]) for state in states]
+    for i, each in enumerate(alone):
+        assert_close(jax.tree.map(lambda x, i=i: x[i], together), each, rtol=1e-3, atol=1e-4)
+    assert moved(*alone)
 
 
-@every_agent
+@pytest.mark.parametrize("case", JITTED, ids="-".join)
 def test_an_update_that_is_jitted_is_the_same_as_one_that_is_not(case):
     _, agent, _ = parts(case)
     state, batch = started(case)
@@ -188,8 +186,8 @@ def test_a_masked_batch_leaves_a_rollout_unlearned_and_others_as_they_are(case):
     task, agent, _ = parts(case)
     state, batch = started(case)
     obs = jnp.int32(0) if task.num_states else jnp.zeros(task.obs_dim)
-    action = jax.eval_shape(functools.partial(agent.act, explore=True), jax.random.key(0), state, obs)
-    scalar = jnp.float32(0)
+    act = functools.partial(agent.act, explore=True)
+    action, scalar = jax.eval_shape(act, jax.random.key(0), state, obs), jnp.float32(0)
     buffer = agent.buffer(Transition(obs, action, scalar, scalar, obs), NUM_STEPS)
     assert_equal(buffer.mask(batch, True), batch)
     masked = buffer.mask(batch, False)
