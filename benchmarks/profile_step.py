@@ -196,7 +196,7 @@ def generation_side(args: argparse.Namespace) -> None:
         (state, info), times = common.measure(lambda: jax.block_until_ready(generation(state)))
         return {
             "wall_s": times["wall_s"],
-            "trainings": program.strategy.num_candidates,
+            "trainings": program.strategy.num_evaluations,
             "agent_steps": int(info.train_steps_total.item()),
             "peak_memory_mib": common.peak_memory_mib(),
         }

@@ -115,7 +115,7 @@ def time_generations(settings: Timings, row: Row, preset: str) -> pd.DataFrame:
             {
                 "seconds": np.mean(wall),
                 "cpu_seconds": np.mean(cpu),
-                "agents": program.strategy.num_candidates,
+                "agents": program.strategy.num_evaluations,
                 "train_steps": np.mean(steps),
             }
         ]

@@ -1,4 +1,4 @@
-"""sejax.agents.exploration: models and loss by hand, updates against torch, and what the agent sees."""
+"""ICM: models and loss by hand, updates against torch, and what the agent sees."""
 
 import dataclasses
 import functools
