@@ -16,12 +16,11 @@ import numpy as np
 import pandas as pd
 
 import sejax
-from experiments import figures, se_agents
-from experiments.experiment import Experiment
-from experiments.se_agents import SeAgents
-from experiments.settings import setting
-from experiments.tables import as_texts, iqm_columns, iqm_note, iqm_text, publish
-from experiments.worlds import return_columns
+from experiments.common import agents as groups
+from experiments.common import figures
+from experiments.common.agents import SeAgents, return_columns
+from experiments.common.experiment import Experiment, setting
+from experiments.common.tables import as_texts, iqm_columns, iqm_note, iqm_text, publish
 from sejax.errors import ConfigError
 
 
@@ -40,9 +39,9 @@ def compute(settings: SeModels) -> pd.DataFrame:
     ses = load(settings)
     tables = []
     for kind in settings.agents:
-        world = se_agents.se_world(settings, ses, kind)
-        places = {group.name: place for place, group in enumerate(world.groups)}
-        rows = se_agents.train(settings, world)
+        condition = groups.on_ses(settings, ses, kind)
+        places = {group.name: place for place, group in enumerate(condition.groups)}
+        rows = groups.train_kind(settings, condition)
         tables.append(rows.assign(se=rows["group"].map(places)))
     return pd.concat(tables, ignore_index=True)
 
@@ -142,15 +141,16 @@ def draw(task: Any, agents: pd.DataFrame, path: Path) -> None:
                 body.set(facecolor=figures.REAL, edgecolor=figures.REAL, alpha=0.45)
             places, means = range(1, len(order) + 1), [pooled[se].mean() for se in order]
             axis.plot(places, means, "D", ms=4, color=figures.BEST, ls="none")
-            axis.axhline(task.solved_reward, color=figures.SOLVED, ls="--", lw=1.2)
+            figures.threshold(axis, task.solved_reward)
             axis.set_xticks(places, order, fontsize=8)
             axis.set_title(figures.AGENT_NAMES.get(kind, kind), fontsize=10)
             axis.set(xlim=(0.4, len(order) + 0.6), ylabel=f"test return\non {task.name}")
         axes[-1, 0].set_xlabel("SE, by its place in the set; diamonds: means")
-        line = plt.Line2D([], [], color=figures.SOLVED, ls="--")
-        figure.legend(
-            [line], [f"solved ({task.solved_reward:g})"], loc="outside upper right", fontsize=9
+        line, label = (
+            plt.Line2D([], [], color=figures.SOLVED, ls="--"),
+            f"solved ({task.solved_reward:g})",
         )
+        figure.legend([line], [label], loc="outside upper right", fontsize=9)
 
 
 EXPERIMENT = Experiment(settings=SeModels, compute=compute, report=report, about=__doc__)

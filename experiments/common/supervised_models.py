@@ -18,14 +18,12 @@ import optax
 import pandas as pd
 
 import sejax
-from experiments import se_agents
-from experiments.se_agents import AGENTS, SOFT_SE
-from experiments.settings import Settings, count, each_of, setting
-from experiments.worlds import HPARAMS
+from experiments.common import agents
+from experiments.common.agents import HPARAMS, SE_AGENTS, SOFT_SE
+from experiments.common.experiment import Settings, count, each_of, setting
 from sejax import registry
 from sejax.cli import build
 from sejax.ops.parallel import spread_over_devices
-from sejax.options import counts
 
 LEARNING_RATE, BATCH_SIZE = 1e-4, 1024  # paper and docs/reference.md 7.5
 
@@ -36,31 +34,21 @@ class SupervisedBaseline(Settings):
 
     name = "supervised_baseline"
 
-    proxy: str = setting(
-        SOFT_SE,
-        about="SE to compare with, whose settings the NES runs have; run directory, file or name",
-    )
+    proxy: str = setting(SOFT_SE, about="SE to compare with; run directory, file or shipped name")
     models: int = count(5, "models", quick=2, about="NES runs, and a model for each")
     generations: int = count(25, "generations", quick=3, about="of an NES run")
-    population: int = setting(
-        16,
-        counts("scores are compared within a generation", least=2),
-        quick=3,
-        about="members of a generation",
-    )
+    population: int = count(16, "candidates", least=2, quick=3, about="of a generation")
     max_rows: int = count(100_000, "transitions", quick=3000, about="transitions for a model")
     epochs: int = count(100, "epochs", quick=20, about="of a fit")
-    agents: tuple[str, ...] = setting(("ddqn",), each_of(AGENTS), about=f"of {', '.join(AGENTS)}")
+    agents: tuple[str, ...] = setting(
+        ("ddqn",), each_of(SE_AGENTS), about=f"of {', '.join(SE_AGENTS)}"
+    )
     hparams: tuple[str, ...] = setting(
         HPARAMS, each_of(HPARAMS), about="of the agents; varied: drawn for each"
     )
     num_agents: int = count(20, "agents", quick=2, about="for each model")
     test_episodes: int = count(10, "episodes", about="of each agent")
-    max_steps: int | None = setting(
-        None,
-        counts("an agent must train"),
-        about="training steps of an agent on a model; as on the SE",
-    )
+    max_steps: int | None = count(None, "steps", about="of an agent on a model; as on the SE")
 
 
 def learning_config(settings: SupervisedBaseline, ses: Any) -> Any:
@@ -69,8 +57,8 @@ def learning_config(settings: SupervisedBaseline, ses: Any) -> Any:
     agent, training = config.agent, config.training
     training = dataclasses.replace(training, test_episodes=settings.test_episodes)
     if settings.quick:
-        agent = dataclasses.replace(agent, **se_agents.QUICK_AGENT)
-        training = dataclasses.replace(training, max_steps=se_agents.QUICK_STEPS)
+        agent = dataclasses.replace(agent, **agents.QUICK_AGENT)
+        training = dataclasses.replace(training, max_steps=agents.QUICK_STEPS)
     es = dataclasses.replace(
         config.es, population_size=settings.population, num_incumbent_evals=settings.population
     )
@@ -88,14 +76,14 @@ def learning_config(settings: SupervisedBaseline, ses: Any) -> Any:
 
 
 def collect_all(settings: SupervisedBaseline, ses: Any) -> list[pd.DataFrame]:
-    """The transitions of each NES run; every run is a piece."""
+    """The transitions of each NES run; every run is a shard."""
     config = learning_config(settings, ses)
     made_with = build.to_plain(config) | {"max_rows": settings.max_rows, "devices": None}
     tables = []
     for index in range(settings.models):
         seed = settings.seed + index
         make = functools.partial(collect, config, seed, settings.max_rows)
-        rows = settings.pieces.compute(f"transitions-{index}", made_with | {"seed": seed}, make)
+        rows = settings.shards.compute(f"transitions-{index}", made_with | {"seed": seed}, make)
         print(
             f"NES run {index}: {len(rows):,} transitions of episodes with mean return "
             f"{rows['return'].mean():.1f}",
@@ -213,7 +201,7 @@ def model_file(settings: SupervisedBaseline, variant: str) -> Path:
     return settings.folder / f"models-{variant}.safetensors"
 
 
-def fit_piece(settings: SupervisedBaseline, ses: Any, data: list[pd.DataFrame]) -> pd.DataFrame:
+def fit_shard(settings: SupervisedBaseline, ses: Any, data: list[pd.DataFrame]) -> pd.DataFrame:
     """Fits all models, stores both variants of them, and returns the errors of each epoch."""
     num_rows = min(len(rows) for rows in data)
     made_with = {
@@ -223,7 +211,7 @@ def fit_piece(settings: SupervisedBaseline, ses: Any, data: list[pd.DataFrame]) 
         "batch_size": BATCH_SIZE,
     }
     made_with |= settings.values("models", "epochs", "generations", "population", "seed")
-    fits = settings.pieces.compute("fit", made_with, lambda: fit_all(settings, ses, data, num_rows))
+    fits = settings.shards.compute("fit", made_with, lambda: fit_all(settings, ses, data, num_rows))
     last = fits[fits["epoch"] == settings.epochs - 1].mean()
     print(
         f"Models: mean squared error {last['error']:.2g} of [s', r], "
@@ -243,19 +231,9 @@ def fit_all(settings: Any, ses: Any, data: list[pd.DataFrame], num_rows: int) ->
     initial, fitted, errors = jax.device_get(program(keys, *stacked))
     save_models(settings, ses, {**fitted, "done": initial["done"]}, "authors", "soft")
     save_models(settings, ses, fitted, "fair", "threshold")
-    return pd.concat(
-        [
-            pd.DataFrame(
-                {
-                    "model": i,
-                    "epoch": range(settings.epochs),
-                    "error": errors[i, :, 0],
-                    "done_error": errors[i, :, 1],
-                }
-            )
-            for i in range(settings.models)
-        ]
-    )
+    model, epoch = (place.ravel() for place in np.indices(errors.shape[:2]))
+    each = {"error": errors[..., 0].ravel(), "done_error": errors[..., 1].ravel()}
+    return pd.DataFrame({"model": model, "epoch": epoch, **each})
 
 
 def arrays_of(rows: pd.DataFrame) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
