@@ -36,8 +36,7 @@ from experiments.common.agents import SE_AGENTS, SOFT_SE, Condition, Measure
 from experiments.common.experiment import Experiment, Settings, count, each_of, setting
 from experiments.common.tables import as_texts, publish
 from sejax import registry
-from sejax.agents import replay
-from sejax.agents.memory import Memory, MemoryMaker
+from sejax.agents.buffers import Buffer, BufferMaker, write_row
 from sejax.training import TrainingConfig
 
 SOURCES = {
@@ -138,8 +137,7 @@ def make_recorded_run(
     max_rows: int, agent: Any, env: Any, task: Any, training: TrainingConfig
 ) -> Callable[..., Any]:
     """Builds `run(key, env_params, active)` that trains, tests and records one agent."""
-    from sejax.evaluation import make_tested_trainer
-    from sejax.rollout import make_recorder
+    from sejax.evaluation import make_recorder, make_tested_trainer
 
     capacity = min(max_rows, training.max_steps or max_rows)
     train = make_tested_trainer(agent, env, task, training, recorder=last_steps(capacity))
@@ -176,10 +174,10 @@ class LastSteps:
     episode: Any  # that goes on, `[]`
 
 
-def last_steps(capacity: int) -> MemoryMaker:
+def last_steps(capacity: int) -> BufferMaker:
     """A recorder of the last `capacity` steps of a training."""
 
-    def make(example: Any, max_steps: int) -> Memory:
+    def make(example: Any, max_steps: int) -> Buffer:
         def init() -> LastSteps:
             rows = jnp.zeros((capacity, 2 + example.next_obs.shape[0]))
             return LastSteps(rows=rows, episode=jnp.int32(0))
@@ -188,11 +186,11 @@ def last_steps(capacity: int) -> MemoryMaker:
             first = jnp.stack([jnp.float32(kept.episode), jnp.float32(made.reward)])
             row = jnp.concatenate([first, made.next_obs])
             return LastSteps(
-                rows=replay.write_row(kept.rows, step, row, active),
+                rows=write_row(kept.rows, step, row, active),
                 episode=kept.episode + (ended & active),
             )
 
-        return Memory(init=init, store=store, batch=lambda *_: None)
+        return Buffer(init=init, store=store, batch=lambda *_: None)
 
     return make
 

@@ -1,18 +1,19 @@
-"""The bilevel loop: NES outside, whole agent trainings inside, in one compiled program.
+"""Algorithm 1: an evolution strategy outside, agent trainings inside, in one compiled program.
 
-Assembles a proxy, an agent, a strategy and an objective; owns no maths of its own.
+    for each generation:
+      ask       the strategy for a population around the incumbent proxy
+      evaluate  train one fresh agent on each candidate, test it on the real task
+      tell      the strategy the scores, which moves the incumbent
 
 Source: paper, Algorithm 1.
 """
 
 import dataclasses
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from flax import struct
 from jaxtyping import Array, Float
 
@@ -20,74 +21,59 @@ from sejax import registry
 from sejax.agents.base import Agent
 from sejax.agents.mixture import Families
 from sejax.envs.base import Task
-from sejax.errors import require
-from sejax.es.base import Strategy, Trials, finite_mean
-from sejax.evaluation import make_evaluator, num_parallel_on_cpu, tested_throughout
+from sejax.errors import require, whole
+from sejax.es.base import Strategy
+from sejax.es.nes import NESConfig
+from sejax.evaluation import make_population_evaluator, tested_throughout
 from sejax.objectives import MaxReward, Objective, Outcome
 from sejax.ops import flat
-from sejax.ops.counters import exact, wide_add, wide_sum, wide_zeros
-from sejax.ops.parallel import copy_to_devices, spread_groups_over_devices, spread_over_devices
+from sejax.ops.parallel import copy_to_devices
 from sejax.proxies.base import ProxyEnv
+from sejax.proxies.configs import SyntheticConfig
+from sejax.scores import GenerationInfo, Scores, Scoring, generation_info
 from sejax.training import TrainingConfig
 
 
 @struct.dataclass
 class LearnState:
-    """Everything the next generation needs, and the best proxy so far. Leaves are `[seed, ...]`."""
+    """What the next generation needs, and the best proxy so far."""
 
     key: Array
     es_state: Any
     generation: Array
-    incumbent: Float[Array, "seed dims"]  # as measured in the last generation, before its update
+    incumbent: Float[Array, " dims"]  # as the last generation measured it, before its update
     incumbent_score: Array
-    incumbent_scores: Float[Array, "seed family"]  # of which it is made
-    best: Float[Array, "seed dims"]
+    incumbent_scores: Float[Array, " agent"]  # one for each agent of a mixture
+    best: Float[Array, " dims"]
     best_score: Array
-    best_scores: Float[Array, "seed family"]
+    best_scores: Float[Array, " agent"]
     best_generation: Array
-    env_steps: Array  # a wide count, see `sejax.ops.counters`
     finished: Array  # stop_when_solved: the run is over and its generations cost nothing
 
 
 @struct.dataclass
-class GenerationInfo:
-    """What a person wants to see of a generation: the columns of `metrics.csv`, `[seed]` each."""
+class Candidates:
+    """What a generation evaluates.
 
-    generation: Array
-    incumbent_mean: Array
-    incumbent_std: Array
-    population_mean: Array
-    population_max: Array
-    best_so_far: Array
-    train_steps_mean: Array
-    train_steps_max: Array
-    train_episodes_mean: Array
-    num_nonfinite: Array
-    member_scores: Float[Array, "seed tried"]  # of each of the members' trials; no column
-    families: "FamilyInfo"
-    env_steps_wide: Array  # `[seed, 2]`; see `env_steps_total`
-    train_steps_wide: Array  # `[seed, 2]`; see `train_steps_total`
+    Attributes:
+      population: vectors of the strategy, `[pop, dims]`.
+      incumbent: `[dims]`.
+      params: one vector for each evaluation, first those of the population, `[evaluation, dims]`.
+      keys: of the trainings, `[evaluation]`.
+      active: whether anything is to be computed, `[]`.
+      eval_steps: length of the test episodes that are scored, `[]`; None for the task's limit.
+      key_tell: for the strategy.
+      es_state: the strategy's state after `ask`.
+    """
+
+    population: Float[Array, "pop dims"]
+    incumbent: Float[Array, " dims"]
+    params: Float[Array, "evaluation dims"]
+    keys: Array
     active: Array
-
-    @property
-    def env_steps_total(self) -> Any:
-        """Steps on the real task so far, NumPy int64; for an info on the host."""
-        return exact(self.env_steps_wide)
-
-    @property
-    def train_steps_total(self) -> Any:
-        """Steps of all agents in this generation, NumPy int64; for an info on the host."""
-        return exact(self.train_steps_wide)
-
-
-@struct.dataclass
-class FamilyInfo:
-    """The same for each family of agents, `[seed, family]`."""
-
-    incumbent_mean: Array
-    population_mean: Array
-    train_steps_mean: Array
-    num_nonfinite: Array
+    eval_steps: Array | None
+    key_tell: Array
+    es_state: Any
 
 
 @struct.dataclass
@@ -99,7 +85,7 @@ class LearnResult:
       score: its incumbent mean, `[]`.
       generation: the generation that measured it, `[]` int32.
       last_weights: the last proxy that was measured.
-      info: history, leaves `[generation]`.
+      info: history, leaves `[generation, ...]`.
     """
 
     weights: Any
@@ -109,98 +95,57 @@ class LearnResult:
     info: GenerationInfo
 
 
-@dataclass(frozen=True, kw_only=True)
-class Program:
-    """The pure functions of a bilevel loop over `[seed]` independent runs.
+class Bilevel(NamedTuple):
+    """The pure functions of Algorithm 1, and the parts that they are made of.
 
     Attributes:
-      init: `(keys [seed]) -> LearnState`.
-      ask: `(LearnState) -> Asked`, what a generation tries.
-      tell: `(LearnState, Asked, Outcome) -> (LearnState, GenerationInfo)`, the outcome of each
-        trial with leaves `[seed, trials, ...]`.
-      generation: `(LearnState) -> (LearnState, GenerationInfo)`: `ask`, a training for each trial,
-        `tell`; a scan body over all seeds.
-      test_steps: `(LearnState) -> [seed]`, how much of the test episodes is scored; None: all.
-      share_of: `(family) -> evaluate`, where `evaluate(keys [n], candidates [n, dims], active [n],
-        test_steps [n])` is the outcome of n trials of a family on one device, leaves `[n, ...]`:
-        for processes that divide a generation's trials among themselves.
-      unravel: flat parameters `[dims]` to the proxy's weights.
-      proxy: what is learned.
-      families: of agents that learn on it; one, if there is a single agent.
-      family_of_trial: index of the family of each trial, `[trials]`.
-      cpu_num_parallel: agents of each family that train in lockstep on a CPU core; None for all.
-      strategy: that learns it.
-      objective: that it is learned by.
-      num_dims: length of a parameter vector.
+      init: `key -> LearnState`.
+      ask: `LearnState -> Candidates`.
+      evaluate: `Candidates -> Outcome`, leaves `[evaluation, ...]`.
+      tell: `(LearnState, Candidates, Outcome) -> (LearnState, GenerationInfo)`.
+      generation: `LearnState -> (LearnState, GenerationInfo)`, the three of them; a scan body.
+      unravel: a flat vector `[dims]` to the proxy's weights.
+      num_dims: length of that vector.
+      proxy, mixture, training, strategy, objective: as they are used.
     """
 
     init: Callable[[Array], LearnState]
-    ask: Callable[[LearnState], "Asked"]
-    tell: Callable[[LearnState, "Asked", Outcome], tuple[LearnState, GenerationInfo]]
+    ask: Callable[[LearnState], Candidates]
+    evaluate: Callable[[Candidates], Outcome]
+    tell: Callable[[LearnState, Candidates, Outcome], tuple[LearnState, GenerationInfo]]
     generation: Callable[[LearnState], tuple[LearnState, GenerationInfo]]
-    test_steps: Callable[[LearnState], Array | None]
-    share_of: Callable[[int], Callable[..., Outcome]]
     unravel: Callable[[Array], Any]
+    num_dims: int
     proxy: ProxyEnv
-    families: Families
-    family_of_trial: np.ndarray
-    cpu_num_parallel: tuple[int | None, ...]
+    mixture: Families
+    training: TrainingConfig
     strategy: Strategy
     objective: Objective
-    num_dims: int
 
     @property
     def task(self) -> Task:
         return self.proxy.task
 
     @property
-    def agent(self) -> Agent:
-        """The agent, or that of the first family."""
-        return self.families.agents[0]
-
-    @property
     def solved_score(self) -> float | None:
         """Incumbent mean at which the task counts as solved; None if no score says so."""
-        if not (self.objective.scores_are_returns and self.task.is_solvable):
-            return None
-        return self.task.solved_reward
+        can_be_solved = self.objective.scores_are_returns and self.task.is_solvable
+        return self.task.solved_reward if can_be_solved else None
 
 
 def make_learner(
-    config: Any = None,
-    *,
-    task: Task | None = None,
-    agent: Agent | Families | None = None,
-    proxy: Any = None,
-    es: Any = None,
-    objective: Any = None,
-    training: TrainingConfig | None = None,
-    generations: int = 50,
-    stop_when_solved: bool = False,
-    devices: int | None = None,
-    num_parallel: int | None = None,
+    config: Any = None, *, generations: int = 50, **parts: Any
 ) -> Callable[[Array], LearnResult]:
     """Builds `learn(key) -> LearnResult`: all of Algorithm 1 as one pure function.
 
-    Jitted it is a single executable with the scan over generations inside; `vmap` it over keys for
+    Jitted it is a single executable with the scan over generations inside. `vmap` it over keys for
     several runs at once.
 
     Args:
-      config: from `sejax.config`, in the place of all others. Its `seed`, `num_seeds`, `run_dir`
-        and `checkpoint_every` are the command's and play no part here.
-      task: the real task.
-      agent: that learns on the proxies, from `sejax.make_agent` or one of your own; or several of
-        them (`sejax.Families`), among which the members of a generation take turns.
-      proxy: a `ProxyEnv` of the task, or a configuration that makes one; an SE if not given.
-      es: a `Strategy` over the proxy's weights, or a configuration with `make(num_dims) ->
-        Strategy`; the paper's NES if not given.
-      objective: an `Objective`, or a configuration that makes one; the mean test return if not
-        given.
-      training: how long each agent trains, and how it is tested.
+      config: from `sejax.config`, in the place of all others. Its `seed`, `run_dir` and
+        `checkpoint_every` are the command's and play no part here.
       generations: n_o of Algorithm 1.
-      stop_when_solved: whether a run ends at its first incumbent mean above the threshold.
-      devices: to spread the population over; None for all.
-      num_parallel: agents in lockstep on one device; None for what suits agent and device.
+      **parts: of `make_bilevel`: `task` and `agent`, and what differs from the defaults.
 
     Raises:
       ConfigError: if the parts do not fit each other, or there are not so many devices.
@@ -219,40 +164,30 @@ def make_learner(
       (2,)
     """
     if config is not None:
+        if not hasattr(config, "parts"):
+            raise TypeError(f"config must come from sejax.config([...]); got {config!r:.60}.")
         return make_learner(**config.parts(), generations=config.generations)
-    if task is None or agent is None:
+    if "task" not in parts or "agent" not in parts:
         raise TypeError("make_learner needs a configuration, or a task and an agent.")
-    program = make_program(
-        task=task,
-        agent=agent,
-        proxy=proxy,
-        es=es,
-        objective=objective,
-        training=training,
-        stop_when_solved=stop_when_solved,
-        devices=devices,
-        num_parallel=num_parallel,
-    )
+    whole(1, "generations", generations, "a run has at least one", 50)
+    bilevel = make_bilevel(**parts)
 
     def learn(key: Array) -> LearnResult:
         state, info = jax.lax.scan(
-            lambda state, _: program.generation(state),
-            program.init(key[None]),
-            length=generations,
+            lambda state, _: bilevel.generation(state), bilevel.init(key), length=generations
         )
-        state, info = jax.tree.map(lambda x: x[0], state), jax.tree.map(lambda x: x[:, 0], info)
         return LearnResult(
-            weights=program.unravel(state.best),
+            weights=bilevel.unravel(state.best),
             score=state.best_score,
             generation=state.best_generation,
-            last_weights=program.unravel(state.incumbent),
+            last_weights=bilevel.unravel(state.incumbent),
             info=info,
         )
 
     return learn
 
 
-def make_program(
+def make_bilevel(
     *,
     task: Task,
     agent: Agent | Families,
@@ -263,346 +198,160 @@ def make_program(
     stop_when_solved: bool = False,
     devices: int | None = None,
     num_parallel: int | None = None,
-) -> Program:
-    """Assembles the bilevel loop for `[seed]` independent runs; arguments as of `make_learner`."""
-    proxy, objective = _proxy_of(proxy, task), _objective_of(objective, task)
+) -> Bilevel:
+    """Builds the pure functions of Algorithm 1.
+
+    Args:
+      task: the real task.
+      agent: the agent that learns on the proxies, from `sejax.make_agent` or one of your own; or a
+        mixture of agents (`sejax.Families`), among which the candidates are divided.
+      proxy: a `ProxyEnv` of the task, or a configuration that makes one; default: an SE.
+      es: a `Strategy` over the proxy's weights, or a configuration with `make(num_dims) ->
+        Strategy`; default: the paper's NES.
+      objective: an `Objective`, or a configuration that makes one; default: the mean test return.
+      training: how long each agent trains, and how it is tested.
+      stop_when_solved: whether a run ends at its first incumbent mean above the threshold.
+      devices: devices to spread the candidates over; None for all.
+      num_parallel: agents that train in one vmapped batch on a device; None for what suits both.
+
+    Raises:
+      ConfigError: if the parts do not fit each other, or there are not so many devices.
+
+    Source: paper, Algorithm 1.
+    """
+    proxy = _proxy_of(proxy, task)
+    objective = _made("objective", MaxReward() if objective is None else objective, task)
+    shapes = jax.eval_shape(proxy.init_weights, jax.random.key(0))
+    num_dims = sum(x.size for x in jax.tree.leaves(shapes))
+    unravel = flat.inverse_of_flatten(shapes)
+    strategy = _made("es", NESConfig() if es is None else es, num_dims)
+    mixture = Families.of(agent)
     training = training or TrainingConfig()
-    num_dims, unravel = _flat_weights(proxy)
-    families, strategy = Families.of(agent), _strategy_of(es, num_dims)
     if objective.needs_tests:
         training = tested_throughout(training)
-    trials = dataclasses.replace(
-        strategy.trials,
-        num_incumbent_evals=families.num_evals(strategy.trials.num_incumbent_evals),
+    scoring = Scoring.of(objective, strategy, mixture)
+    evaluations = scoring.evaluations
+    strategy = dataclasses.replace(strategy, trials=evaluations)
+    evaluate_candidates = make_population_evaluator(
+        mixture, proxy, training, unravel, scoring.agent_of_evaluation, devices, num_parallel
     )
-    strategy = dataclasses.replace(strategy, trials=trials)
-    family_of_member = families.of_members(strategy.num_members, strategy.num_signs)
-    family_of_trial = trials.families(family_of_member, families.size)
-    evaluate_all = make_population_evaluator(
-        families, proxy, training, unravel, family_of_trial, devices, num_parallel
-    )
-    cpu_num_parallel = tuple(num_parallel_on_cpu(agent, training) for agent in families.agents)
-    seed_ids = jnp.asarray(trials.seed_ids(strategy.num_members))
-    one_unit = families.size == 1 and objective.test_steps is None
-    require(
-        one_unit or not strategy.remembers_scores,
-        "es",
-        "be one that compares the members of a generation alone",
-        "several families, or a curriculum, give each generation's scores a unit of its own",
-        "one that remembers scores",
-        "es=nes",
-    )
+    seed_ids = jnp.asarray(evaluations.seed_ids(strategy.num_members))
     require(
         not stop_when_solved or (objective.scores_are_returns and task.is_solvable),
         "stop_when_solved",
         "be false with this objective and task",
-        "nobody says which score solves it",
+        "no score is known to solve it",
         "true",
         "stop_when_solved=false",
     )
 
-    def init(keys: Array) -> LearnState:
-        num_seeds = keys.shape[0]
-        key_weights, key_es, key_run = (
-            k for k in jax.vmap(lambda k: jax.random.split(k, 3))(keys).T
-        )
-        mean = jax.vmap(lambda key: flat.flatten(proxy.init_weights(key)))(key_weights)
+    def init(key: Array) -> LearnState:
+        key_weights, key_es, key_run = jax.random.split(key, 3)
+        mean = flat.flatten(proxy.init_weights(key_weights))
+        unknown = jnp.full(mixture.size, -jnp.inf)
         state = LearnState(
             key=key_run,
-            es_state=jax.vmap(strategy.init)(key_es, mean),
-            generation=jnp.zeros(num_seeds, jnp.int32),
+            es_state=strategy.init(key_es, mean),
+            generation=jnp.int32(0),
             incumbent=mean,
-            incumbent_score=jnp.full(num_seeds, -jnp.inf),
-            incumbent_scores=jnp.full((num_seeds, families.size), -jnp.inf),
+            incumbent_score=jnp.float32(-jnp.inf),
+            incumbent_scores=unknown,
             best=mean,
-            best_score=jnp.full(num_seeds, -jnp.inf),
-            best_scores=jnp.full((num_seeds, families.size), -jnp.inf),
-            best_generation=jnp.full(num_seeds, -1, jnp.int32),
-            env_steps=wide_zeros(num_seeds),
-            finished=jnp.zeros(num_seeds, bool),
+            best_score=jnp.float32(-jnp.inf),
+            best_scores=unknown,
+            best_generation=jnp.int32(-1),
+            finished=jnp.bool_(False),
         )
         return copy_to_devices(jax.tree.map(_strongly_typed, state), devices)
 
-    def ask(state: LearnState) -> Asked:
-        keys = jax.vmap(jax.random.fold_in)(state.key, state.generation)
-        key_ask, key_inner, key_tell = (
-            k for k in jax.vmap(lambda k: jax.random.split(k, 3))(keys).T
-        )
-        members, es_state = jax.vmap(strategy.ask)(key_ask, state.es_state)
-        incumbent = jax.vmap(strategy.incumbent)(es_state)
-        fold = jax.vmap(jax.vmap(jax.random.fold_in, (None, 0)), (0, None))
-        return Asked(
-            members=members,
+    def ask(state: LearnState) -> Candidates:
+        key = jax.random.fold_in(state.key, state.generation)
+        key_ask, key_inner, key_tell = jax.random.split(key, 3)
+        population, es_state = strategy.ask(key_ask, state.es_state)
+        incumbent = strategy.incumbent(es_state)
+        return Candidates(
+            population=population,
             incumbent=incumbent,
-            candidates=jax.vmap(trials.candidates)(members, incumbent),
-            keys=fold(key_inner, seed_ids),
+            params=evaluations.candidates(population, incumbent),
+            keys=jax.vmap(jax.random.fold_in, (None, 0))(key_inner, seed_ids),
+            active=~state.finished,
+            eval_steps=objective.eval_steps(state.generation) if objective.eval_steps else None,
             key_tell=key_tell,
             es_state=es_state,
         )
 
-    def tell(
-        state: LearnState, asked: Asked, outcome: Outcome
-    ) -> tuple[LearnState, GenerationInfo]:
-        scores = Scores.of(objective(outcome), trials, families, family_of_trial)
-        worth = scores
-        if objective.test_steps is not None:  # which members are compared by
-            worth = Scores.of(objective.of_whole_tests(outcome), trials, families, family_of_trial)
-        members, incumbent = jax.vmap(
-            lambda tried, means: families.comparable(
-                trials.of_members(tried), family_of_member, means
-            )
-        )(scores.tried, scores.family_means)
-        told = jax.vmap(strategy.tell)(
-            asked.key_tell, asked.members, members, incumbent, asked.es_state
+    def evaluate(candidates: Candidates) -> Outcome:
+        return evaluate_candidates(
+            candidates.keys, candidates.params, candidates.active, candidates.eval_steps
         )
-        stepped = _advance(state, told, asked.incumbent, worth, outcome)
+
+    def tell(
+        state: LearnState, candidates: Candidates, outcome: Outcome
+    ) -> tuple[LearnState, GenerationInfo]:
+        # The same sums whatever the outcome was computed by: XLA must not fuse them into it.
+        outcome = jax.lax.optimization_barrier(outcome)
+        population_scores, incumbent_score = scoring.for_strategy(outcome)
+        es_state = strategy.tell(
+            candidates.key_tell,
+            candidates.population,
+            population_scores,
+            incumbent_score,
+            candidates.es_state,
+        )
+        scores = scoring.of_whole_tests(outcome)
+        after = _record(state, es_state, candidates.incumbent, scores)
         if stop_when_solved:
-            stepped = stepped.replace(finished=stepped.incumbent_score >= task.solved_reward)
-        stepped = jax.tree.map(lambda new, old: _where(state.finished, old, new), stepped, state)
-        return stepped, _summarise(state, stepped, worth, outcome, families, family_of_trial)
+            after = after.replace(finished=after.incumbent_score >= task.solved_reward)
+        after = _select(state.finished, state, after)
+        info = generation_info(
+            scoring, scores, outcome, state.generation, after.best_score, ~state.finished
+        )
+        return after, info
 
     def generation(state: LearnState) -> tuple[LearnState, GenerationInfo]:
-        """One pass of Algorithm 1's outer loop for every seed; a scan body."""
-        asked = ask(state)
-        outcome = evaluate_all(asked.keys, asked.candidates, ~state.finished, test_steps(state))
-        return tell(state, asked, outcome)
+        """One pass of Algorithm 1's outer loop."""
+        candidates = ask(state)
+        return tell(state, candidates, evaluate(candidates))
 
-    def test_steps(state: LearnState) -> Array | None:
-        return objective.test_steps and objective.test_steps(state.generation)
-
-    def share_of(family: int) -> Callable[..., Outcome]:
-        trial = make_trial(families.agents[family], proxy, training, unravel)
-        return spread_over_devices(trial, 1, num_parallel, cpu_num_parallel[family])
-
-    return Program(
+    return Bilevel(
         init=init,
         ask=ask,
+        evaluate=evaluate,
         tell=tell,
         generation=generation,
-        test_steps=test_steps,
-        share_of=share_of,
         unravel=unravel,
+        num_dims=num_dims,
         proxy=proxy,
-        families=families,
-        family_of_trial=family_of_trial,
-        cpu_num_parallel=cpu_num_parallel,
+        mixture=mixture,
+        training=training,
         strategy=strategy,
         objective=objective,
-        num_dims=num_dims,
     )
 
 
-@struct.dataclass
-class Asked:
-    """What a generation tries, leaves `[seed, ...]`.
+def _record(state: LearnState, es_state: Any, incumbent: Array, scores: Scores) -> LearnState:
+    """The next state: what this generation measured of its incumbent, and the best one so far.
 
-    Attributes:
-      members: of the strategy, `[seed, members, dims]`.
-      incumbent: `[seed, dims]`.
-      candidates: what is tried, members and incumbent as often as they are, `[seed, trials, dims]`.
-      keys: of the trainings, `[seed, trials]`.
-      key_tell: `[seed]`.
-      es_state: of the strategy.
+    Of equally good incumbents the last one is kept: where the task's highest return ends the
+    comparison, the search goes on to weights that teach under perturbation too.
     """
-
-    members: Array
-    incumbent: Array
-    candidates: Array
-    keys: Array
-    key_tell: Array
-    es_state: Any
-
-
-@struct.dataclass
-class Scores:
-    """What a generation's trainings are worth, leaves `[seed, ...]`.
-
-    Attributes:
-      all: of all trials, in the task's unit or the objective's, `[seed, trials]`; not finite for
-        agents that diverged.
-      tried: of the members' trials, `[seed, tried]`.
-      incumbent: of the incumbent's, with agents that diverged ranked last.
-      family_means: means of these for each family, `[seed, family]`; nan where none survived.
-      incumbent_mean: what the incumbent is worth, `[seed]`; nan if none survived of a family.
-    """
-
-    all: Array
-    tried: Array
-    incumbent: Array
-    family_means: Array
-    incumbent_mean: Array
-
-    @classmethod
-    def of(
-        cls,
-        scores: Float[Array, "seed trials"],
-        trials: Trials,
-        families: Families,
-        family_of_trial: np.ndarray,
-    ) -> "Scores":
-        tried, incumbent = jax.vmap(trials.split)(scores)
-        family_tried, family_incumbent = (
-            family_of_trial[: tried.shape[1]],
-            family_of_trial[tried.shape[1] :],
-        )
-        means = []
-        for i in range(families.size):
-            places = np.flatnonzero(family_incumbent == i)
-            repaired, mean = jax.vmap(trials.of_incumbent)(
-                incumbent[:, places], tried[:, family_tried == i]
-            )
-            incumbent = incumbent.at[:, places].set(repaired)
-            means.append(mean)
-        family_means = jnp.stack(means, axis=1)
-        return cls(
-            all=scores,
-            tried=tried,
-            incumbent=incumbent,
-            family_means=family_means,
-            incumbent_mean=jax.vmap(families.aggregated)(family_means),
-        )
-
-
-def _advance(
-    state: LearnState, told: Any, incumbent: Array, scores: Scores, outcome: Outcome
-) -> LearnState:
-    """Records what this generation measured of its incumbent and keeps the best one.
-
-    Of equally good incumbents the last stays: where the task's highest return ends the comparison,
-    the search goes on to weights that teach under perturbation too.
-    """
-    score = scores.incumbent_mean
-    score = jnp.where(jnp.isfinite(score), score, -jnp.inf)
-    family_means = jnp.where(jnp.isfinite(scores.family_means), scores.family_means, -jnp.inf)
+    score, by_agent = _or_lowest(scores.incumbent_mean), _or_lowest(scores.agent_means)
     better = (score >= state.best_score) & jnp.isfinite(score)
     return state.replace(
-        es_state=told,
+        es_state=es_state,
         generation=state.generation + 1,
         incumbent=incumbent,
         incumbent_score=score,
-        incumbent_scores=family_means,
-        best=_where(better, incumbent, state.best),
+        incumbent_scores=by_agent,
+        best=jnp.where(better, incumbent, state.best),
         best_score=jnp.where(better, score, state.best_score),
-        best_scores=_where(better, family_means, state.best_scores),
+        best_scores=jnp.where(better, by_agent, state.best_scores),
         best_generation=jnp.where(better, state.generation, state.best_generation),
-        env_steps=wide_add(state.env_steps, wide_sum(outcome.real_steps)),
     )
-
-
-def _summarise(
-    before: LearnState,
-    after: LearnState,
-    scores: Scores,
-    outcome: Outcome,
-    families: Families,
-    family_of_trial: np.ndarray,
-) -> GenerationInfo:
-    diverged = ~jnp.isfinite(scores.all)
-    num_tried = scores.tried.shape[1]
-
-    def of_families(of_one: Callable[[np.ndarray], Array]) -> Array:
-        return jnp.stack([of_one(family_of_trial == i) for i in range(families.size)], axis=1)
-
-    return GenerationInfo(
-        generation=before.generation,
-        incumbent_mean=scores.incumbent_mean,
-        incumbent_std=jnp.nanstd(scores.incumbent, axis=1),
-        population_mean=jax.vmap(finite_mean)(scores.tried),
-        population_max=jnp.nanmax(scores.tried, axis=1),
-        best_so_far=after.best_score,
-        train_steps_mean=outcome.train_steps.mean(axis=1),
-        train_steps_max=outcome.train_steps.max(axis=1),
-        train_episodes_mean=outcome.train_episodes.mean(axis=1),
-        num_nonfinite=diverged.sum(axis=1),
-        member_scores=scores.tried,
-        families=FamilyInfo(
-            incumbent_mean=scores.family_means,
-            population_mean=of_families(
-                lambda own: jax.vmap(finite_mean)(scores.tried[:, own[:num_tried]])
-            ),
-            train_steps_mean=of_families(lambda own: outcome.train_steps[:, own].mean(axis=1)),
-            num_nonfinite=of_families(lambda own: diverged[:, own].sum(axis=1)),
-        ),
-        env_steps_wide=after.env_steps,
-        train_steps_wide=wide_sum(outcome.train_steps),
-        active=~before.finished,
-    )
-
-
-def make_population_evaluator(
-    families: Families,
-    proxy: ProxyEnv,
-    training: TrainingConfig,
-    unravel: Callable[[Array], Any],
-    family_of_trial: np.ndarray,
-    devices: int | None = None,
-    num_parallel: int | None = None,
-) -> Callable[..., Outcome]:
-    """Builds `evaluate(keys, candidates, active, test_steps=None) -> Outcome`.
-
-    Of `keys [seed, n]`, `candidates [seed, n, dims]`, `active [seed]` and how much of the test
-    episodes is scored, `[seed]`. It trains one fresh agent on each candidate and tests it on the
-    real task; leaves `[seed, n, ...]`. The trainings are spread over the devices, each device's
-    family by family, as it is known when the program is built which family trains on which
-    candidate: no training pays for another family's. Batches of `num_parallel` follow one another.
-    """
-
-    places = [np.flatnonzero(family_of_trial == i) for i in range(families.size)]
-    order = np.argsort(np.concatenate(places))
-    evaluate_groups = spread_groups_over_devices(
-        [make_trial(agent, proxy, training, unravel) for agent in families.agents],
-        devices,
-        num_parallel,
-        [num_parallel_on_cpu(agent, training) for agent in families.agents],
-    )
-
-    def evaluate_all(
-        keys: Array, candidates: Array, active: Array, test_steps: Array | None = None
-    ) -> Outcome:
-        num_seeds, _, num_dims = candidates.shape
-        of_seeds = (active, test_steps)
-        outcomes = evaluate_groups(
-            [
-                (
-                    keys[:, own].reshape(-1),
-                    candidates[:, own].reshape(-1, num_dims),
-                    *jax.tree.map(lambda x, n=own.size: jnp.repeat(x, n), of_seeds),
-                )
-                for own in places
-            ]
-        )
-
-        def merged(*parts: Array) -> Array:
-            by_seed = [x.reshape(num_seeds, -1, *x.shape[1:]) for x in parts]
-            return jnp.concatenate(by_seed, axis=1)[:, order] if len(parts) > 1 else by_seed[0]
-
-        return jax.tree.map(merged, *outcomes)
-
-    return evaluate_all
-
-
-def make_trial(
-    agent: Agent, proxy: ProxyEnv, training: TrainingConfig, unravel: Callable[[Array], Any]
-) -> Callable[..., Outcome]:
-    """Builds `trial(key, candidate [dims], active, test_steps) -> Outcome`: one fresh agent's."""
-    evaluate = make_evaluator(agent, proxy, proxy.task, training)
-    return lambda key, candidate, active, test_steps: evaluate(
-        key, proxy.params(unravel(candidate)), active, test_steps
-    )
-
-
-def _flat_weights(proxy: ProxyEnv) -> tuple[int, Callable[[Array], Any]]:
-    """Length of a proxy's flat parameters, and what makes weights of them."""
-    shapes = jax.eval_shape(proxy.init_weights, jax.random.key(0))
-    return sum(x.size for x in jax.tree.leaves(shapes)), flat.inverse_of_flatten(shapes)
 
 
 def _proxy_of(proxy: Any, task: Task) -> ProxyEnv:
-    if proxy is None:
-        from sejax.proxies.configs import SyntheticConfig
-
-        proxy = SyntheticConfig()
-    made = registry.make("proxy", proxy, task) if hasattr(proxy, "make") else proxy
+    made: ProxyEnv = _made("proxy", SyntheticConfig() if proxy is None else proxy, task)
     require(
         made.task is task,
         "proxy",
@@ -614,25 +363,20 @@ def _proxy_of(proxy: Any, task: Task) -> ProxyEnv:
     return made
 
 
-def _objective_of(objective: Any, task: Task) -> Objective:
-    objective = MaxReward() if objective is None else objective
-    return registry.make("objective", objective, task) if hasattr(objective, "make") else objective
+def _made(group: str, part: Any, *arguments: Any) -> Any:
+    """A part that is given as it is, or as a configuration that makes it."""
+    return registry.make(group, part, *arguments) if hasattr(part, "make") else part
 
 
-def _strategy_of(es: Any, num_dims: int) -> Strategy:
-    if es is None:
-        from sejax.es.nes import NESConfig
+def _or_lowest(scores: Array) -> Array:
+    return jnp.where(jnp.isfinite(scores), scores, -jnp.inf)
 
-        es = NESConfig()
-    return es if isinstance(es, Strategy) else registry.make("es", es, num_dims)
+
+def _select(condition: Array, a: LearnState, b: LearnState) -> LearnState:
+    return jax.tree.map(lambda x, y: jnp.where(condition, x, y), a, b)
 
 
 def _strongly_typed(x: Array) -> Array:
     """As a generation returns it: a weak type would be another signature and compile anew."""
     is_key = jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
     return x if is_key else jax.lax.convert_element_type(x, x.dtype)
-
-
-def _where(mask: Array, a: Array, b: Array) -> Array:
-    """Selects along the leading axis; keys too."""
-    return jax.vmap(jnp.where)(mask, a, b)

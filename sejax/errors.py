@@ -13,7 +13,15 @@ LARGEST = 2**31 - 1  # steps, episodes and sizes are counted in 32 bits
 
 
 class ConfigError(ValueError):
-    """Input that cannot work. Commands print its message and exit with status 2."""
+    """Input that cannot work. Commands print its message and exit with status 2.
+
+    Attributes:
+      field: the field or group at fault, such as `agent.batch_size`; empty where it is none.
+    """
+
+    def __init__(self, message: str, field: str = ""):
+        super().__init__(message)
+        self.field = field
 
 
 class FailedError(RuntimeError):
@@ -25,7 +33,8 @@ def unknown_name(field: str, got: object, known: Iterable[str]) -> ConfigError:
     ranked = nearest(got, known)
     return ConfigError(
         f"{field} must be one of {', '.join(ranked)}; got {shortened(got)!r}. "
-        f"Did you mean {field}={ranked[0]}?"
+        f"Did you mean {field}={ranked[0]}?",
+        field,
     )
 
 
@@ -50,7 +59,7 @@ def require(holds: Any, field: str, rule: str, reason: str, got: object, fix: st
     """Raises `ConfigError` in the project's one form of message unless `holds`."""
     if not holds:
         raise ConfigError(
-            f"{field} must {rule}, because {reason}; got {shortened(got)}. Set {fix}."
+            f"{field} must {rule}, because {reason}; got {shortened(got)}. Set {fix}.", field
         )
 
 

@@ -1,4 +1,4 @@
-"""Training fresh agents in a world and testing them on the real task.
+"""Greedy episodes on the real task, and fresh agents that are trained and then tested there.
 
 Source: paper, Algorithm 1 (TrainAgent, EvaluateAgent) and section "Performance of SE-trained
 Agents".
@@ -6,47 +6,216 @@ Agents".
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any, Literal, overload
+from typing import Any, Literal, NamedTuple, overload
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array
+import numpy as np
+from flax import struct
+from jaxtyping import Array, Bool, Float, Int
 
 from sejax.agents.base import Agent
+from sejax.agents.mixture import Families
 from sejax.envs.base import Task
+from sejax.envs.wrappers import repeat_actions
 from sejax.errors import require
 from sejax.objectives import Outcome
-from sejax.ops.parallel import compiler_options, spread_over_devices
-from sejax.proxies.base import world_of
-from sejax.rollout import Steps, make_recorder, make_tester
+from sejax.ops.keys import step_keys
+from sejax.ops.loops import while_any_active
+from sejax.ops.parallel import (
+    compiler_options,
+    spread_groups_over_devices,
+    spread_over_devices,
+)
+from sejax.proxies.base import ProxyEnv, is_real
 from sejax.training import TrainingConfig, TrainResult, make_trainer
+
+# --- greedy episodes ------------------------------------------------------------------------------
+
+
+class Steps(NamedTuple):
+    """Steps of greedy episodes, leaves `[step, ...]`; rows after an episode's end are not valid."""
+
+    obs: Array
+    action: Array
+    next_obs: Array
+    reward: Float[Array, " step"]
+    terminated: Bool[Array, " step"]
+    valid: Bool[Array, " step"]
+
+
+class Tests(NamedTuple):
+    """Results of greedy episodes.
+
+    Attributes:
+      returns: return of each episode within the task's step limit.
+      num_steps: steps of each.
+      scored: return of the first `eval_steps` steps, which may be fewer or more than the task's
+        limit; equal to `returns` if `eval_steps` was not given.
+    """
+
+    returns: Float[Array, " episode"]
+    num_steps: Int[Array, " episode"]
+    scored: Float[Array, " episode"]
+
+
+@struct.dataclass
+class _Episode:
+    """Carry of an episode."""
+
+    active: Array
+    num_steps: Array  # of the task
+    total: Array
+    scored: Array  # return of the steps that count for the objective
+    obs: Array
+    env_state: Any
+
+
+class _Greedy:
+    """One greedy episode of an agent on a task: its beginning, and each step."""
+
+    def __init__(self, agent: Agent, task: Task):
+        self.agent, self.params = agent, task.params
+        self.env = repeat_actions(task.env, agent.spec.action_repeat)
+
+    def begin(self, key: Array, active: Array | bool) -> _Episode:
+        obs, env_state = self.env.reset_env(key, self.params)
+        return _Episode(
+            active=jnp.asarray(active),
+            num_steps=jnp.int32(0),
+            total=jnp.float32(0),
+            scored=jnp.float32(0),
+            obs=obs,
+            env_state=env_state,
+        )
+
+    def step(
+        self, key: Array, agent_state: Any, before: _Episode, eval_steps: Array | None = None
+    ) -> tuple[_Episode, Steps]:
+        """The episode after a decision, and the decision; `key` is that of the whole episode.
+
+        With `eval_steps` the episode may last that long, beyond the task's limit too.
+        """
+        key_act, key_env = step_keys(key, before.num_steps, 2)
+        action = self.agent.act(key_act, agent_state, before.obs, explore=False)
+        action = self.agent.env_action(action)
+        params = longest = self.params
+        is_within: Any = True  # the task's limit, where a repeated action ends too
+        if eval_steps is not None:
+            limit = self.params.max_steps_in_episode
+            is_within, most = before.num_steps < limit, jnp.maximum(limit, eval_steps)
+            longest = self.params.replace(max_steps_in_episode=most)
+            params = self.params.replace(max_steps_in_episode=jnp.where(is_within, limit, most))
+        obs, env_state, reward, terminated, info = self.env.step_env(
+            key_env, before.env_state, action, params
+        )
+        truncated = self.env.is_truncated(env_state, longest)
+        total = scored = before.scored + reward
+        if eval_steps is not None:
+            total = jnp.where(is_within, before.total + reward, before.total)
+            scored = jnp.where(before.num_steps < eval_steps, scored, before.scored)
+        after = _Episode(
+            active=~(terminated | truncated),
+            num_steps=before.num_steps + info.get("num_steps", 1),
+            total=total,
+            scored=scored,
+            obs=obs,
+            env_state=env_state,
+        )
+        made = Steps(before.obs, action, obs, jnp.float32(reward), terminated, before.active)
+        return after, made
+
+
+def make_tester(agent: Agent, task: Task, num_episodes: int) -> Callable[..., Tests]:
+    """Builds `test(key, agent_state, active=True, eval_steps=None) -> Tests`.
+
+    Episodes on the real task without exploration, each from a fresh initial state. With
+    `active=False` nothing is played and all results are 0.
+    """
+    greedy = _Greedy(agent, task)
+
+    def step(nothing: Array, state: _Episode, consts: Any, masked: bool) -> tuple[Array, _Episode]:
+        key, agent_state, eval_steps = consts
+        after, _ = greedy.step(key, agent_state, state, eval_steps)
+        return nothing, after
+
+    def episode(key: Array, agent_state: Any, active: Array | bool, eval_steps: Any) -> Tests:
+        key_reset, key_steps = jax.random.split(key)
+        state = greedy.begin(key_reset, active)
+        consts = (key_steps, agent_state, eval_steps)
+        _, state = while_any_active(step, jnp.zeros(0), state, consts)
+        return Tests(state.total, state.num_steps, state.scored)
+
+    def test(
+        key: Array,
+        agent_state: Any,
+        active: Array | bool = True,
+        eval_steps: Array | None = None,
+    ) -> Tests:
+        keys = jax.random.split(key, num_episodes)
+        in_axes = (0, None, None, None)
+        return jax.vmap(episode, in_axes)(keys, agent_state, active, eval_steps)
+
+    return test
+
+
+def make_recorder(agent: Agent, task: Task, num_episodes: int) -> Callable[[Array, Any], Steps]:
+    """Builds `record(key, agent_state) -> Steps`, leaves `[num_episodes * max_steps, ...]`.
+
+    The episodes are those of `make_tester` with the same key. A decision that an agent repeats is
+    one step here.
+    """
+    greedy = _Greedy(agent, task)
+
+    def episode(key: Array, agent_state: Any) -> Steps:
+        key_reset, key_steps = jax.random.split(key)
+
+        def step(state: _Episode, _: None) -> tuple[_Episode, Steps]:
+            after, made = greedy.step(key_steps, agent_state, state)
+            return after.replace(active=state.active & after.active), made
+
+        start = greedy.begin(key_reset, True)
+        return jax.lax.scan(step, start, length=-(-task.max_steps // agent.spec.action_repeat))[1]
+
+    def record(key: Array, agent_state: Any) -> Steps:
+        keys = jax.random.split(key, num_episodes)
+        steps = jax.vmap(episode, in_axes=(0, None))(keys, agent_state)
+        return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), steps)
+
+    return record
+
+
+# --- one fresh agent ------------------------------------------------------------------------------
 
 
 @overload
 def make_evaluator(
-    agent: Agent, env: Any, task: Any, training: TrainingConfig, record: Literal[False] = False
+    agent: Agent, env: Any, task: Task, training: TrainingConfig, record: Literal[False] = False
 ) -> Callable[..., Outcome]: ...
 @overload
 def make_evaluator(
-    agent: Agent, env: Any, task: Any, training: TrainingConfig, record: Literal[True]
+    agent: Agent, env: Any, task: Task, training: TrainingConfig, record: Literal[True]
 ) -> Callable[..., tuple[Outcome, Steps]]: ...
 def make_evaluator(
-    agent: Agent, env: Any, task: Any, training: TrainingConfig, record: bool = False
+    agent: Agent, env: Any, task: Task, training: TrainingConfig, record: bool = False
 ) -> Callable[..., Any]:
-    """Builds `evaluate(key, env_params, active=True, score_steps=None) -> Outcome`.
+    """Builds `evaluate(key, env_params, active=True, eval_steps=None) -> Outcome`.
 
     A fresh agent trains in `env`, which may be a proxy or the task itself, and is tested over
     `training.test_episodes` episodes on the task. With `active=False` nothing is computed. If the
-    agent's hyperparameters are drawn, they are drawn from the same key first. `score_steps` is the
-    length of the test episodes that the objective scores, the task's limit if not given.
+    agent's hyperparameters are drawn, they are drawn from the same key first. `eval_steps` is the
+    length of the test episodes that the objective scores; default: the task's limit.
 
     Args:
       agent: from `sejax.make_agent`, or one of your own.
       env: gymnax environment to train in.
       task: the real task.
       training: stopping rule and limits.
-      record: whether it returns `(Outcome, Steps)`, with every step of the tests
-        (`sejax.rollout.Steps`); the outcome is the same.
+      record: whether it returns `(Outcome, Steps)`, with every step of the tests; the outcome is
+        the same.
+
+    Raises:
+      ConfigError: for arguments of other kinds.
 
     Source: paper, Algorithm 1, TrainAgent and EvaluateAgent.
 
@@ -60,7 +229,6 @@ def make_evaluator(
       >>> outcome.test_returns.shape
       (10,)
     """
-
     require(
         isinstance(task, Task),
         "task",
@@ -69,49 +237,48 @@ def make_evaluator(
         type(task).__name__,
         "task=env.task of a proxy, or sejax.envs.make(name)",
     )
+    require(
+        isinstance(training, TrainingConfig),
+        "training",
+        "be a sejax.TrainingConfig",
+        "it says how long agents train",
+        type(training).__name__,
+        "training=sejax.TrainingConfig(max_episodes=100)",
+    )
 
     def make_run(agent: Agent) -> Callable[..., Any]:
         test = make_tester(agent, task, training.test_episodes)
-        recorded = make_recorder(agent, task, training.test_episodes) if record else None
+        recorder = make_recorder(agent, task, training.test_episodes) if record else None
         train = make_tested_trainer(agent, env, task, training)
 
         def run(
-            key: Array, env_params: Any, active: Array | bool, score_steps: Any, hparams: Any
+            key: Array, env_params: Any, active: Array | bool, eval_steps: Any, hparams: Any
         ) -> Any:
             key_train, key_test = jax.random.split(key)
             result = train(key_train, env_params, hparams, active)
-            tests = test(key_test, result.agent_state, active, score_steps)
-            real_steps = tests.num_steps.sum() + result.test_steps
+            tests = test(key_test, result.agent_state, active, eval_steps)
+            real_steps = tests.num_steps.sum() + result.eval_steps
             outcome = Outcome(
                 test_returns=tests.returns,
                 scored_returns=tests.scored,
                 train_steps=result.train_steps,
                 train_episodes=result.episodes,
-                return_area=return_area(result, tests.returns.mean()),
+                auc=area_under_curve(result, tests.returns.mean()),
                 nonfinite=result.nonfinite | ~jnp.isfinite(tests.returns).all(),
-                real_steps=real_steps + result.train_steps if world_of(env).is_real else real_steps,
+                real_steps=real_steps + result.train_steps if is_real(env) else real_steps,
             )
-            return (outcome, recorded(key_test, result.agent_state)) if recorded else outcome
+            return (outcome, recorder(key_test, result.agent_state)) if recorder else outcome
 
         return run
 
     run = agent.fresh(make_run)
-    return lambda key, env_params, active=True, score_steps=None: run(
-        key, env_params, active, score_steps
-    )
-
-
-def num_parallel_on_cpu(agent: Agent, training: TrainingConfig) -> int | None:
-    """Agents in lockstep on a CPU core: 1 where they would wait for the one that trains longest."""
-    return (
-        1
-        if agent.cpu_num_parallel is not None and not training.is_fixed_length
-        else agent.cpu_num_parallel
+    return lambda key, env_params, active=True, eval_steps=None: run(
+        key, env_params, active, eval_steps
     )
 
 
 def make_tested_trainer(
-    agent: Agent, env: Any, task: Any, training: TrainingConfig, **options: Any
+    agent: Agent, env: Any, task: Task, training: TrainingConfig, **options: Any
 ) -> Callable[..., TrainResult]:
     """A `make_trainer` whose tests between episodes, if `training` asks for any, are on the task.
 
@@ -143,7 +310,7 @@ def tested_throughout(training: TrainingConfig) -> TrainingConfig:
     return dataclasses.replace(training, stop_rule=stop_rule, tests_between=tests_between)
 
 
-def return_area(result: TrainResult, final_return: Array) -> Array:
+def area_under_curve(result: TrainResult, final_return: Array) -> Array:
     """Sum over training episodes of return times length: the area under the learning curve.
 
     Args:
@@ -160,11 +327,20 @@ def return_area(result: TrainResult, final_return: Array) -> Array:
     return jnp.sum(jnp.where(finished, returns * lengths, 0.0)) + final_return * rest
 
 
+# --- many fresh agents ----------------------------------------------------------------------------
+
+
+def num_parallel_on_cpu(agent: Agent, training: TrainingConfig) -> int | None:
+    """Agents in a vmapped batch on a CPU core; 1 where all would wait for the longest training."""
+    num_parallel = agent.spec.cpu_num_parallel
+    return num_parallel if num_parallel is None or training.is_fixed_length else 1
+
+
 def evaluate_agents(
     agent: Agent,
     env: Any,
     env_params: Any,
-    task: Any,
+    task: Task,
     training: TrainingConfig,
     keys: Array,
     num_parallel: int | None = None,
@@ -176,8 +352,8 @@ def evaluate_agents(
     `env, env_params` are what `sejax.load` returns, `task` the real one.
 
     It compiles at every call: in a loop, jit `make_evaluator` yourself. `on_done` is called from
-    the program's threads as each agent ends, also for copies that fill up the last lanes. The
-    numbers are the same with it, but jax keeps no compiled program that calls back.
+    the program's threads as each agent ends, also for copies that fill up the last batch. The
+    numbers are the same with it, but jax does not cache a compiled program that calls back.
     """
     evaluate = make_evaluator(agent, env, task, training)
 
@@ -189,3 +365,56 @@ def evaluate_agents(
 
     program = spread_over_devices(one, devices, num_parallel, num_parallel_on_cpu(agent, training))
     return jax.jit(program, compiler_options=compiler_options())(keys)
+
+
+def make_candidate_evaluator(
+    agent: Agent, proxy: ProxyEnv, training: TrainingConfig, unravel: Callable[[Array], Any]
+) -> Callable[..., Outcome]:
+    """Builds `evaluate(key, params [dims], active, eval_steps) -> Outcome` for one candidate."""
+    evaluate = make_evaluator(agent, proxy, proxy.task, training)
+    return lambda key, params, active, eval_steps: evaluate(
+        key, proxy.params(unravel(params)), active, eval_steps
+    )
+
+
+def make_population_evaluator(
+    mixture: Families,
+    proxy: ProxyEnv,
+    training: TrainingConfig,
+    unravel: Callable[[Array], Any],
+    agent_of_evaluation: np.ndarray,
+    devices: int | None = None,
+    num_parallel: int | None = None,
+) -> Callable[..., Outcome]:
+    """Builds `evaluate(keys, params, active, eval_steps=None) -> Outcome`, leaves `[evaluation]`.
+
+    Trains one fresh agent on each candidate, `keys [evaluation]` and `params [evaluation, dims]`,
+    and tests it on the real task. Evaluations are grouped by agent when the program is built, so
+    that no training executes another agent's branch; each group is spread over the devices, and
+    on each of them batches of `num_parallel` follow one another.
+
+    Raises:
+      ConfigError: if there are fewer than `devices` devices.
+    """
+    groups = [np.flatnonzero(agent_of_evaluation == i) for i in range(mixture.size)]
+    order = np.argsort(np.concatenate(groups))
+    evaluate_groups = spread_groups_over_devices(
+        [make_candidate_evaluator(agent, proxy, training, unravel) for agent in mixture.agents],
+        devices,
+        num_parallel,
+        [num_parallel_on_cpu(agent, training) for agent in mixture.agents],
+    )
+
+    def evaluate(
+        keys: Array, params: Array, active: Array, eval_steps: Array | None = None
+    ) -> Outcome:
+        def arguments(group: np.ndarray) -> tuple[Any, ...]:
+            shared = jax.tree.map(lambda x: jnp.repeat(x, group.size), (active, eval_steps))
+            return keys[group], params[group], *shared
+
+        outcomes = evaluate_groups([arguments(group) for group in groups])
+        if len(outcomes) == 1:
+            return outcomes[0]
+        return jax.tree.map(lambda *parts: jnp.concatenate(parts)[order], *outcomes)
+
+    return evaluate

@@ -21,7 +21,7 @@ class Outcome:
       scored_returns: the same for the steps of each that the objective has asked for.
       train_steps: steps in the training world.
       train_episodes: episodes there.
-      return_area: sum over those episodes of their return times their length; the returns are those
+      auc: sum over those episodes of their return times their length; the returns are those
         of the tests after each, where there are such tests. An episode that the step limit cut off
         counts with the test return.
       nonfinite: whether a number that is not finite was met in training; the score is then nan.
@@ -32,7 +32,7 @@ class Outcome:
     scored_returns: Float[Array, "*agent episode"]
     train_steps: Int[Array, "*agent"]
     train_episodes: Int[Array, "*agent"]
-    return_area: Float[Array, "*agent"]
+    auc: Float[Array, "*agent"]
     nonfinite: Bool[Array, "*agent"]
     real_steps: Int[Array, "*agent"]
 
@@ -53,7 +53,7 @@ class Objective:
         each of them, and none stops because it has solved the task.
       scores_are_returns: whether scores are mean returns, which the task's threshold can be held
         against.
-      test_steps: `generation -> steps`, how much of the test episodes it scores, if not all: a
+      eval_steps: `generation -> steps`, how much of the test episodes it scores, if not all: a
         curriculum. Only the members are scored by it; what an incumbent is worth is said by whole
         episodes.
       meaning: of a score, for people.
@@ -62,7 +62,7 @@ class Objective:
     score: Callable[[Outcome], Float[Array, "*agent"]]
     needs_tests: bool = False
     scores_are_returns: bool = False
-    test_steps: Callable[[Array], Array] | None = None
+    eval_steps: Callable[[Array], Array] | None = None
     meaning: str = ""
 
     def __call__(self, outcome: Outcome) -> Float[Array, "*agent"]:
@@ -89,24 +89,24 @@ class MaxReward(Options):
     scores_are_returns: ClassVar[bool] = True
 
     # Steps of a test episode that are scored in the first generation; null: the task's limit.
-    first_test_steps: int | None = option(None, counts("there is nothing to score otherwise"))
+    first_eval_steps: int | None = option(None, counts("there is nothing to score otherwise"))
     # Generation from which on the task's limit counts; before, the steps change linearly.
     curriculum_generations: int = option(50, counts("it is the length of a curriculum"))
 
     def make(self, task: Any) -> Objective:
         """The objective on a task."""
-        if self.first_test_steps is None:
+        if self.first_eval_steps is None:
             return Objective(score=lambda outcome: outcome.test_return, scores_are_returns=True)
-        first, last = self.first_test_steps, task.max_steps
+        first, last = self.first_eval_steps, task.max_steps
 
-        def test_steps(generation: Array) -> Array:
+        def eval_steps(generation: Array) -> Array:
             done = jnp.minimum(generation / self.curriculum_generations, 1.0)
             return jnp.round(first + done * (last - first)).astype(jnp.int32)
 
         return Objective(
             score=lambda outcome: outcome.scored_returns.mean(axis=-1),
             scores_are_returns=True,
-            test_steps=test_steps,
+            eval_steps=eval_steps,
         )
 
 
@@ -165,7 +165,7 @@ class AUC(Options):
     def make(self, task: Any) -> Objective:
         """The objective on a task."""
         return Objective(
-            score=lambda outcome: outcome.return_area / jnp.maximum(outcome.train_steps, 1),
+            score=lambda outcome: outcome.auc / jnp.maximum(outcome.train_steps, 1),
             needs_tests=True,
             meaning="the mean of its agents' test returns over their training",
         )
@@ -187,7 +187,7 @@ class AUCSum(Options):
     def make(self, task: Any) -> Objective:
         """The objective on a task."""
         return Objective(
-            score=lambda outcome: outcome.return_area,
+            score=lambda outcome: outcome.auc,
             needs_tests=True,
             meaning="the sum of its agents' test returns times the steps between them",
         )

@@ -3,7 +3,12 @@
 Running the same command on an existing run directory goes on where it stopped.
 """
 
+import contextlib
 import dataclasses
+import functools
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
 import hydra
 from omegaconf import DictConfig
@@ -22,20 +27,59 @@ def main(cfg: DictConfig) -> float:
     if own:  # or all jobs of a sweep would have one folder
         folder = f"{config.resolved_run_dir}_{own}" if given is None else f"{given}/{own}"
         config = dataclasses.replace(config, run_dir=folder)
-    return learn(config)
+    return max(learn(config))
 
 
-def learn(config: LearnConfig) -> float:
-    """Learns a proxy in its run directory, with a live line of progress and last words.
+def learn(config: LearnConfig) -> list[float]:
+    """Learns a proxy for each of `num_seeds` seeds, one after the other on the same executable.
 
-    Ctrl-C leaves at once, with exit code 130: what is finished has been saved.
+    Each seed has a run directory of its own: where `run_dir` is given, `seed0` and so on in it.
 
     Returns:
-      The best incumbent mean of all seeds.
+      The best incumbent mean of each seed.
 
     Raises:
-      ConfigError: if the run directory cannot be used.
+      ConfigError: if a run directory cannot be used.
       OSError: if a file cannot be written; everything saved before is whole.
+    """
+    with contextlib.ExitStack() as stack:
+
+        @functools.cache
+        def chunks() -> Any:
+            runtime.configure_jax()
+            made = config.machines.make(config, Path(config.resolved_run_dir), print)
+            return stack.enter_context(made)
+
+        runs = runs_of(config)
+        scores = [_learn(each, chunks) for each in runs]
+    if len(runs) > 1:
+        for each, score in zip(runs, scores, strict=True):
+            print(f"seed {each.seed}: best incumbent score {score:.1f}, {each.resolved_run_dir}")
+    return scores
+
+
+def runs_of(config: LearnConfig) -> list[LearnConfig]:
+    """A configuration of each seed."""
+    if config.num_seeds == 1:
+        return [config]
+    return [
+        dataclasses.replace(
+            config,
+            seed=seed,
+            num_seeds=1,
+            run_dir=config.run_dir and f"{config.run_dir}/seed{seed}",
+        )
+        for seed in range(config.seed, config.seed + config.num_seeds)
+    ]
+
+
+def _learn(config: LearnConfig, make_chunks: Callable[[], Any]) -> float:
+    """Learns a proxy in its run directory, with a live line of progress and a summary.
+
+    Ctrl-C leaves at once, with exit code 130: finished generations are saved.
+
+    Returns:
+      The best incumbent mean.
     """
     from sejax.cli.progress import RunProgress
 
@@ -47,9 +91,8 @@ def learn(config: LearnConfig) -> float:
             progress.say("importing jax and the task")
             from sejax.cli import session
 
-            runtime.configure_jax()
-            with config.machines.make(config, directory.path, progress.print) as chunks:
-                ended = session.run(config, directory, chunks, progress)
+            chunks = make_chunks()
+            ended = session.run(config, directory, chunks, progress)
         except KeyboardInterrupt:
             progress.stop()
             print(

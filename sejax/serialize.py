@@ -17,7 +17,12 @@ _WORDS = {bool: "true or false", int: "a whole number", float: "a number", str: 
 
 
 # Fields that had another name in files of older versions.
-RENAMED = {"init_episodes": "warmup_episodes", "target_update_rate": "tau", "lanes": "num_parallel"}
+RENAMED = {
+    "init_episodes": "warmup_episodes",
+    "target_update_rate": "tau",
+    "lanes": "num_parallel",
+    "first_test_steps": "first_eval_steps",
+}
 
 
 def to_plain(config: Any) -> dict[str, Any]:

@@ -27,7 +27,7 @@ def test_tests_between_are_as_many_as_asked_and_the_area_is_over_all_steps():
     # The state of the agent says the episode that begins; the last tests are after its last step.
     assert outcome.real_steps == 31 + 10 * 2 * MAX_STEPS + 3 * MAX_STEPS
     assert outcome.test_return == 10
-    assert outcome.return_area == 3 * sum(range(10)) + 1 * 10
+    assert outcome.auc == 3 * sum(range(10)) + 1 * 10
 
 
 def test_returns_that_are_no_numbers_make_an_outcome_of_an_agent_that_diverged():

@@ -234,7 +234,7 @@ def test_risk_is_a_deviation_between_an_agents_episodes(examples):
     returns = jnp.array([[1.0, 3.0], [2.0, 2.0], [5.0, 5.0]])
     outcome = sejax.Outcome(
         test_returns=returns, scored_returns=returns, train_steps=jnp.ones(3, int),
-        train_episodes=jnp.ones(3, int), return_area=jnp.zeros(3), real_steps=jnp.ones(3, int),
+        train_episodes=jnp.ones(3, int), auc=jnp.zeros(3), real_steps=jnp.ones(3, int),
         nonfinite=jnp.array([False, False, True]),
     )  # fmt: skip
     np.testing.assert_allclose(objective(outcome), [2.0 - 2.0, 2.0, jnp.nan])  # mean 2, std 1

@@ -16,7 +16,7 @@ from experiments.common import supervised_models
 from experiments.common.statistics import bootstrap_interval
 from sejax.bilevel import make_program
 from sejax.errors import ConfigError
-from sejax.rollout import make_recorder, make_tester
+from sejax.evaluation import make_recorder, make_tester
 from sejax.training import make_trainer
 
 

@@ -36,7 +36,7 @@ def outcome_of(places):
     returns = np.float32(places[:, None] + np.array([0.25, 0.5]))
     return vars(Outcome(
         test_returns=returns, scored_returns=returns + 1, train_steps=counts + 100,
-        train_episodes=counts + 1, return_area=returns[:, 0], nonfinite=places % 7 == 3,
+        train_episodes=counts + 1, auc=returns[:, 0], nonfinite=places % 7 == 3,
         real_steps=counts,
     ))  # fmt: skip
 
@@ -186,7 +186,7 @@ FAULTS = {
     "no outcome": lambda answer: Scored({}, 1.0, 1.0),
     "too few": changed(train_steps=lambda x: x[:-1]),
     "other type": changed(train_steps=lambda x: x.astype(np.int64)),
-    "no array": changed(return_area=list),
+    "no array": changed(auc=list),
     "negative counts": changed(real_steps=lambda x: x - 1000),
     "nan of a sound agent": changed(
         test_returns=lambda x: x + np.float32(np.nan), nonfinite=np.zeros_like

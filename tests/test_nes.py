@@ -356,7 +356,7 @@ def test_step_size_and_decay_of_the_noise_reach_an_algorithm():
 def test_algorithms_that_remember_scores_want_them_in_one_unit():
     words = ["env=gridworld_2x2", "es=hill_climbing"]
     assert sejax.make_learner(sejax.config(words))
-    for more in (["agents=[q_learning,sarsa]"], ["objective.first_test_steps=2"]):
+    for more in (["agents=[q_learning,sarsa]"], ["objective.first_eval_steps=2"]):
         with pytest.raises(
             ConfigError, match=r"^es must be one that compares the members of a gen"
         ):

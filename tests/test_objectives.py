@@ -20,7 +20,7 @@ def outcome(test_return, train_steps, nonfinite):
         scored_returns=jnp.array([[2 * x - 1, 2 * x + 1] for x in test_return], jnp.float32),
         train_steps=jnp.array(train_steps, jnp.int32),
         train_episodes=jnp.ones(count, jnp.int32),
-        return_area=jnp.arange(count, dtype=jnp.float32),
+        auc=jnp.arange(count, dtype=jnp.float32),
         nonfinite=jnp.array(nonfinite),
         real_steps=jnp.ones(count, jnp.int32),
     )
@@ -38,18 +38,18 @@ def test_max_reward_is_the_test_return():
 
 def test_a_curriculum_scores_other_lengths_until_it_is_over():
     # From 20 steps in generation 0 to the task's 200 in generation 40: 4.5 more in each.
-    objective = MaxReward(first_test_steps=20, curriculum_generations=40).make(task())
+    objective = MaxReward(first_eval_steps=20, curriculum_generations=40).make(task())
     generations = jnp.array([0, 1, 2, 20, 39, 40, 1000])
-    steps = objective.test_steps(generations)
+    steps = objective.eval_steps(generations)
     np.testing.assert_array_equal(steps, [20, 24, 29, 110, 196, 200, 200])  # halves to even
     assert steps.dtype == jnp.int32
-    long = MaxReward(first_test_steps=1000, curriculum_generations=8).make(task())
-    np.testing.assert_array_equal(long.test_steps(generations[:3]), [1000, 900, 800])
+    long = MaxReward(first_eval_steps=1000, curriculum_generations=8).make(task())
+    np.testing.assert_array_equal(long.eval_steps(generations[:3]), [1000, 900, 800])
     # Members are worth the part that is scored, incumbents whole episodes.
     ended = outcome([10.0, 200.0, -3.0], [1, 2, 3], [False, False, True])
     np.testing.assert_array_equal(objective(ended), [20.0, 400.0, np.nan])
     np.testing.assert_array_equal(objective.of_whole_tests(ended), [10.0, 200.0, np.nan])
-    assert MaxReward().make(task()).test_steps is None
+    assert MaxReward().make(task()).eval_steps is None
 
 
 def test_reward_threshold_charges_steps_and_the_shortfall():

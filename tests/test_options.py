@@ -1,6 +1,7 @@
 """sejax.options: a field written once checks itself, and says whether it is traced or varied."""
 
 import dataclasses
+import pickle
 from fractions import Fraction
 from typing import Any, ClassVar
 
@@ -9,11 +10,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import sejax
 from sejax import options
 from sejax.agents.base import NoExploration, traced
-from sejax.agents.count_based import CountBasedConfig
 from sejax.agents.dqn import DDQNConfig, DQNConfig, DuelingDDQNConfig
-from sejax.agents.icm import ICMConfig
+from sejax.agents.exploration import CountBasedConfig, ICMConfig
 from sejax.agents.ppo import PPOConfig
 from sejax.agents.sac import SACConfig
 from sejax.agents.tabular import QLearningConfig, SARSAConfig
@@ -247,3 +248,10 @@ def test_numbers_of_numpy_and_jax_become_pythons():
     assert "got 3" in message(size=Fraction(3))
     key = jax.random.key(0)
     assert Config(free=key).free is key and Config(free=np.float32).free is np.float32
+
+
+def test_errors_name_the_field_and_survive_pickling():  # workers on other machines send them
+    with pytest.raises(ConfigError) as raised:
+        sejax.DDQNConfig(batch_size=0)
+    assert raised.value.field == "agent.batch_size"
+    assert pickle.loads(pickle.dumps(raised.value)).field == "agent.batch_size"

@@ -15,12 +15,12 @@ from scripted import MAX_EPISODES, MAX_STEPS, WHO, ScriptedEnv, script, scripted
 from support import numpy_forward
 
 from sejax import envs, evaluation, registry
+from sejax.agents.buffers import Buffer, rollout_buffer
 from sejax.agents.dqn import DDQNConfig, make_ddqn
-from sejax.agents.memory import Memory, rollout_memory
 from sejax.agents.tabular import QLearningConfig
 from sejax.errors import ConfigError
+from sejax.evaluation import _Greedy, make_recorder, make_tester
 from sejax.proxies.configs import SyntheticConfig
-from sejax.rollout import _Greedy, make_recorder, make_tester
 from sejax.training import TrainingConfig, is_plateau, is_solved, make_trainer
 
 WINDOW, TOLERANCE, SOLVED, INIT_EPISODES = 2, 0.25, 1.5, 2
@@ -119,7 +119,7 @@ def test_training_equals_a_plain_python_loop(trainers, variant, scripted):
     np.testing.assert_array_equal(result.returns, expected)
     assert result.agent_state.num_updates == updates
     assert not result.nonfinite
-    assert result.test_steps == 0
+    assert result.eval_steps == 0
 
 
 def test_a_plateau_stops_at_the_first_episode_that_the_rule_allows(trainers):
@@ -144,7 +144,7 @@ def test_tests_between_episodes_decide_and_are_recorded(trainers):
     assert result.episodes == 4
     np.testing.assert_array_equal(result.test_returns, [-1, 0, 1, 2] + [np.nan] * 8)
     np.testing.assert_array_equal(result.returns, [3] * 4 + [np.nan] * 8)  # as they were trained
-    assert result.test_steps == 4 * 3
+    assert result.eval_steps == 4 * 3
 
 
 def test_tests_between_episodes_stop_nothing_if_the_rule_does_not_ask_for_them(trainers):
@@ -152,7 +152,7 @@ def test_tests_between_episodes_stop_nothing_if_the_rule_does_not_ask_for_them(t
     assert result.episodes == 5  # flat from the first on: the training's own returns are judged
     np.testing.assert_array_equal(result.test_returns, [-1, 0, 1, 2, 3] + [np.nan] * 7)
     np.testing.assert_array_equal(result.returns, [3] * 5 + [np.nan] * 7)
-    assert result.test_steps == 5 * 3
+    assert result.eval_steps == 5 * 3
     assert trainers["plateau"](KEY, script([3] * 12, [1] * 12)).test_returns is None
 
 
@@ -293,7 +293,7 @@ def test_weights_that_are_not_finite_are_flagged(trainers):
 
 def test_an_inactive_training_does_nothing(trainers):
     result = trainers["never"](KEY, script([5] * 12, [3] * 12), active=False)
-    assert result.train_steps == 0 and result.episodes == 0 and result.test_steps == 0
+    assert result.train_steps == 0 and result.episodes == 0 and result.eval_steps == 0
     assert np.isnan(result.returns).all()
     assert result.agent_state.num_updates == 0
 
@@ -387,14 +387,14 @@ def test_the_world_sees_what_the_agent_means_and_the_memory_what_it_did():
 
 def test_a_memory_is_asked_when_it_has_the_step_just_made():
     def counting(example, max_steps):
-        return Memory(init=lambda: jnp.int32(0), store=lambda count, *_: count + 1,
+        return Buffer(init=lambda: jnp.int32(0), store=lambda count, *_: count + 1,
                       batch=lambda key, count, num_steps, *_: (count, num_steps))  # fmt: skip
 
     def update(key, state, batch):
         count, num_steps = batch
         return state.replace(min_discount=jnp.minimum(state.min_discount, count == num_steps))
 
-    agent = dataclasses.replace(scripted_agent(warmup_episodes=0), memory=counting, update=update)
+    agent = dataclasses.replace(scripted_agent(warmup_episodes=0), buffer=counting, update=update)
     result = make_trainer(agent, ENV, training(stop_rule="never"))(KEY, script([0] * 12, [3] * 12))
     assert result.agent_state.min_discount == 1
 
@@ -417,7 +417,7 @@ def assert_same(many, index, alone):
     lane = jax.tree.map(lambda x: x[index], many)
     assert lane.train_steps == alone.train_steps
     assert lane.episodes == alone.episodes
-    assert lane.test_steps == alone.test_steps
+    assert lane.eval_steps == alone.eval_steps
     assert lane.nonfinite == alone.nonfinite
     for a, b in zip(jax.tree.leaves(lane), jax.tree.leaves(alone), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-4)
@@ -490,7 +490,7 @@ def test_a_lane_that_has_stopped_has_nobody_wait_for_its_tests_and_phases():
         return state
 
     agent = dataclasses.replace(
-        scripted_agent(warmup_episodes=0), update=update, memory=rollout_memory(13)
+        scripted_agent(warmup_episodes=0), update=update, buffer=rollout_buffer(13)
     )
     config = training(stop_rule="never", max_steps=24, tests_between=1)
     train = make_trainer(agent, ENV, config, test_fn=tested)
@@ -604,7 +604,7 @@ def row_recorder(example, max_steps):
         row = jnp.stack([transition.action // WHO, transition.obs[0].astype(int), ended])
         return rows.at[step].set(jnp.where(active, row, rows[step]))
 
-    return Memory(init=lambda: jnp.full((max_steps, 3), -1), store=store, batch=None)
+    return Buffer(init=lambda: jnp.full((max_steps, 3), -1), store=store, batch=None)
 
 
 @pytest.fixture(scope="module")
@@ -646,8 +646,8 @@ def test_a_part_of_a_test_or_more_than_all_of_it_may_be_scored():
     agent = scripted_agent()
     state = agent.begin_episode(agent.init(KEY, 0.0), 0)
     test = jax.jit(make_tester(agent, task, 2))
-    for score_steps, scored, played in ((3, 0.0, 4), (4, 2.5, 4), (6, 5.0, 6)):
-        tests = test(KEY, state, True, jnp.int32(score_steps))
+    for eval_steps, scored, played in ((3, 0.0, 4), (4, 2.5, 4), (6, 5.0, 6)):
+        tests = test(KEY, state, True, jnp.int32(eval_steps))
         np.testing.assert_array_equal(tests.scored, [scored] * 2)
         np.testing.assert_array_equal(tests.returns, [2.5] * 2)  # of the task's own 4 steps
         np.testing.assert_array_equal(tests.num_steps, [played] * 2)

@@ -19,7 +19,7 @@ import pandas as pd
 import yaml
 
 from experiments.common.shards import Shards, read_rows, write_rows
-from sejax import errors, serialize
+from sejax import errors, registry, serialize
 from sejax.cli import commands, runtime
 from sejax.errors import ConfigError, nearest, shortened
 from sejax.ops.files import write_text
@@ -216,6 +216,11 @@ class Experiment:
         Raises:
           ConfigError: for settings or files that cannot work, or a folder of other settings.
         """
+        fields = serialize.to_plain(settings).items()
+        with registry.only_typed(f"{name}={value}" for name, value in fields):
+            return self._run(settings)
+
+    def _run(self, settings: Settings) -> pd.DataFrame:
         if not settings.from_rows:
             write_rows(settings.rows_file, self.compute(settings))
             made_with = json.dumps(settings.shards.made_with, indent=1)
@@ -229,7 +234,8 @@ class Experiment:
             print(self.help())
             return
         try:
-            settings = self.settings.of(**parse(self.settings, words))
+            with registry.only_typed(words):
+                settings = self.settings.of(**parse(self.settings, words))
         except ConfigError as error:
             commands.fail(str(error), commands.BAD_INPUT)
         runtime.configure_xla(settings.devices)

@@ -112,35 +112,30 @@ class RunProgress:
         self._last = time.time()
 
     def update(self, generation: int, info: Any) -> None:
-        """Shows what the last generation of a chunk, leaves `[generation, seed]`, came to.
-
-        Of each seed the last one that it ran: afterwards nothing is trained, and numbers mean
-        nothing.
-        """
+        """Shows the last generation of a chunk, whose info has leaves `[generation, ...]`."""
         now = time.time()
-        last = _last_rows(info)
-        steps_per_s = np.sum(info.train_steps_total) / max(now - self._last, 1e-9)
+        last = max(np.flatnonzero(info.active), default=-1)
+        steps_per_s = np.sum(info.train_steps, dtype=np.int64) / max(now - self._last, 1e-9)
         self._last = now
         text = (
-            f"incumbent {np.nanmean(last.incumbent_mean):.1f} ± "
-            f"{np.nanmean(last.incumbent_std):.1f}{self._of_families(last)}, "
-            f"best {np.max(info.best_so_far[-1]):.1f}, "
-            f"{np.mean(last.train_steps_mean):,.0f} steps an agent, {steps_per_s:,.0f} steps/s"
+            f"incumbent {info.incumbent_mean[last]:.1f} ± {info.incumbent_std[last]:.1f}"
+            f"{self._of_agents(info.by_agent.incumbent_mean[last])}, "
+            f"best {info.best_so_far[last]:.1f}, "
+            f"{info.train_steps_mean[last]:,.0f} steps an agent, {steps_per_s:,.0f} steps/s"
         )
         num_nonfinite = int(np.sum(info.num_nonfinite))
         if num_nonfinite:
             text += f", {num_nonfinite} diverged"
-        if self._config.num_seeds > 1:
-            text += f", {int(np.sum(info.active[-1]))} of {self._config.num_seeds} seeds running"
         self._progress.update(self._task, completed=generation, description=text)
         if not self._live:
             self.print(f"generation {generation}/{self._config.generations}: {text}")
 
-    def _of_families(self, last: Any) -> str:
-        """The incumbent of each of several families of agents."""
-        families = families_of(self._config)
-        means = np.nanmean(last.families.incumbent_mean, axis=0)  # [seed, family] -> [family]
-        each = [f"{family.key} {mean:.1f}" for family, mean in zip(families, means, strict=True)]
+    def _of_agents(self, means: np.ndarray) -> str:
+        """The incumbent's score with each agent of a mixture."""
+        each = [
+            f"{family.key} {mean:.1f}"
+            for family, mean in zip(families_of(self._config), means, strict=True)
+        ]
         return f" ({', '.join(each)})" if len(each) > 1 else ""
 
     def time_to_draw(self) -> bool:
@@ -183,13 +178,3 @@ class RunProgress:
         """What `sejax.load` must be given beside the proxy."""
         task = ", task=my_task" if ":" in self._config.name("env") else ""
         return task + (", proxy=my_proxy_config" if ":" in self._config.name("proxy") else "")
-
-
-def _last_rows(info: Any) -> Any:
-    """Of each seed that ran in a chunk the last generation that it ran, leaves `[seed, ...]`."""
-    import jax
-
-    ran = np.asarray(info.active)  # [generation, seed]
-    seeds = np.flatnonzero(ran.any(axis=0))
-    last = len(ran) - 1 - np.argmax(ran[::-1, seeds], axis=0)
-    return jax.tree.map(lambda x: x[last, seeds], info)

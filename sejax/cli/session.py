@@ -5,17 +5,17 @@ import platform
 import time
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, Protocol
 
 import jax
 import numpy as np
 
 from sejax import __version__
-from sejax.bilevel import Program, make_program
+from sejax.bilevel import Bilevel, make_bilevel
 from sejax.cli import build, commands, runtime
 from sejax.cli.follower import Follower
 from sejax.cli.run_directory import RunDirectory
-from sejax.ops.counters import exact
 from sejax.ops.parallel import compiler_options
 from sejax.proxies import files
 
@@ -49,14 +49,14 @@ class Quiet:
 
 
 class Chunks:
-    """A program's generations in chunks of one length, compiled once for a number of seeds.
+    """A learner's generations in chunks of one length, compiled ahead of time.
 
-    Left to `jax.jit` a chunk would be compiled anew for the state's every placement on the devices:
-    new, restored, or as the chunk before returned it.
+    `jax.jit` alone would recompile whenever the state's sharding differs: fresh, restored, or
+    returned by the previous chunk.
 
     Args:
-      program: what a run is told by; its generations are what is compiled, if there is no `make`.
-      make: `make(*arguments) -> Program`, traced, of a program whose numbers are arguments of what
+      program: the learner. Its generations are what is compiled, unless `make` is given.
+      make: `make(*arguments) -> Bilevel`, traced, of a learner whose numbers are arguments of what
         is compiled.
       arguments: pytrees with which `make` gives `program`.
 
@@ -68,56 +68,72 @@ class Chunks:
 
     def __init__(
         self,
-        program: Program,
-        make: Callable[..., Program] | None = None,
+        program: Bilevel,
+        make: Callable[..., Bilevel] | None = None,
         arguments: tuple[Any, ...] = (),
     ):
         self.program = program
         self._make, self._arguments = make or (lambda: program), arguments
-        self._init = jax.jit(lambda keys, *arguments: self._make(*arguments).init(keys))
-        self._compiled: dict[tuple[int, int], Any] = {}
+        self._init = jax.jit(lambda key, *arguments: self._make(*arguments).init(key))
+        self._compiled: dict[int, Any] = {}
 
-    def sharing(self, program: Program, arguments: tuple[Any, ...]) -> "Chunks":
-        """The chunks of a program of other arguments, by the same executables."""
+    def sharing(self, program: Bilevel, arguments: tuple[Any, ...]) -> "Chunks":
+        """The chunks of a learner of other arguments, by the same executables."""
         chunks = copy.copy(self)
         chunks.program, chunks._arguments = program, arguments
         return chunks
 
-    def init(self, keys: Any) -> Any:
-        """The state before the first generation, for keys `[seed]`."""
-        return self._init(keys, *self._arguments)
+    def init(self, key: Any) -> Any:
+        """The state before the first generation."""
+        return self._init(key, *self._arguments)
 
-    def is_ready(self, num_seeds: int, length: int) -> bool:
+    def is_ready(self, length: int) -> bool:
         """Whether such a chunk has been compiled."""
-        return (num_seeds, length) in self._compiled
+        return length in self._compiled
 
     def advance(self, state: Any, length: int) -> tuple[Any, Any]:
-        """Runs `length` generations; the state's buffers are used up.
+        """Runs `length` generations; the state's buffers are donated.
 
         Returns:
-          The state, and an info with leaves `[length, seed]`.
+          The state, and an info with leaves `[length, ...]`.
         """
-        num_seeds = state.generation.shape[0]
-        if not self.is_ready(num_seeds, length):
-            self.compile(num_seeds, length)
-        return self._compiled[num_seeds, length](state, *self._arguments)
+        if not self.is_ready(length):
+            self.compile(length)
+        return self._compiled[length](state, *self._arguments)
 
-    def compile(self, num_seeds: int, length: int) -> None:
+    def compile(self, length: int) -> None:
         """Compiles a chunk."""
 
         def chunk(state: Any, *arguments: Any) -> Any:
             program = self._make(*arguments)
             return jax.lax.scan(lambda state, _: program.generation(state), state, length=length)
 
-        keys = jax.random.split(jax.random.key(0), num_seeds)
-        state = jax.eval_shape(self._init, keys, *self._arguments)
+        state = jax.eval_shape(self._init, jax.random.key(0), *self._arguments)
         program = jax.jit(chunk, donate_argnums=0, compiler_options=compiler_options())
-        self._compiled[num_seeds, length] = program.lower(state, *self._arguments).compile()
+        self._compiled[length] = program.lower(state, *self._arguments).compile()
 
 
 def make_chunks(config: build.LearnConfig) -> Chunks:
     """The compiled program of a configuration, which runs that differ in their seeds share."""
-    return Chunks(make_program(**config.parts()))
+    return Chunks(make_bilevel(**config.parts()))
+
+
+def rows_of(info: Any, real_steps_before: int) -> Any:
+    """The info of a chunk as the run directory takes it, leaves `[generation, 1, ...]`.
+
+    Args:
+      info: of a chunk, on the host, leaves `[generation, ...]`.
+      real_steps_before: steps on the real task of all generations before.
+    """
+    real_steps = info.real_steps.astype(np.int64).sum(axis=1)
+    columns = {name: x for name, x in vars(info).items() if isinstance(x, np.ndarray)}
+    columns |= {
+        "env_steps_total": real_steps_before + np.cumsum(real_steps * info.active),
+        "train_steps_total": info.train_steps.astype(np.int64).sum(axis=1),
+        "member_scores": info.population_scores,
+    }
+    families = SimpleNamespace(**{name: x[:, None] for name, x in vars(info.by_agent).items()})
+    return SimpleNamespace(**{name: x[:, None] for name, x in columns.items()}, families=families)
 
 
 def run(
@@ -147,8 +163,7 @@ def run(
     report = report or Quiet()
     program = chunks.program
     started, cpu_started = time.time(), time.process_time()
-    seeds = config.seed + jax.numpy.arange(config.num_seeds)
-    state = chunks.init(jax.vmap(jax.random.key)(seeds))
+    state = chunks.init(jax.random.key(config.seed))
     state, generation, problems = directory.resume(state)
     for problem in problems:
         report.print(problem)
@@ -164,38 +179,40 @@ def run(
 
     state = jax.tree.map(lambda x: x.copy(), state)  # own buffers, so that they can be donated
     with Follower(config, directory, report) as follower:
-        if generation < config.generations and not bool(state.finished.all()):
+        if generation < config.generations and not bool(state.finished):
             follower.open()
         follower.tell()  # what it has missed
-        while generation < config.generations and not bool(state.finished.all()):
+        while generation < config.generations and not bool(state.finished):
             length = min(config.checkpoint_every, config.generations - generation)
-            if not chunks.is_ready(config.num_seeds, length):
+            if not chunks.is_ready(length):
                 report.say("compiling")
-                chunks.compile(config.num_seeds, length)
+                chunks.compile(length)
                 report.compiled()
             state, info = chunks.advance(state, length)
             _wait(state)
             generation += length
             host_state, info = jax.device_get((state, info))
+            real_steps = int(directory.rows[-1]["env_steps_total"]) if directory.rows else 0
+            rows = rows_of(info, real_steps)
             with commands.interrupts_held():
-                directory.append(info, wall_before + time.time() - started)
+                directory.append(rows, wall_before + time.time() - started)
                 proxies.save(host_state)
                 directory.commit(generation, state, cpu_s())
             report.update(generation, info)
             with commands.interrupts_held():
-                follower.tell(info)
+                follower.tell(rows)
             if report.time_to_draw():
                 draw(directory, program)
-        ended = "solved" if bool(state.finished.all()) else "finished"
+        ended = "solved" if bool(state.finished) else "finished"
         draw(directory, program)
     directory.write_summary(
         ended=ended,
-        best_score=float(state.best_score.max()),
+        best_score=float(state.best_score),
         generations=directory.finished_generations,  # fewer than advanced, if it was solved
         solved_score=program.solved_score,
         wall_s=round(wall_before + time.time() - started, 1),
         cpu_s=round(cpu_s(), 1),
-        **_cost(state, directory, program.strategy.num_candidates),
+        **_cost(directory, program.strategy.num_candidates),
         devices=[str(device) for device in jax.devices()],
         machine=runtime.machine(),
         versions=_versions(),
@@ -206,60 +223,49 @@ def run(
 class Proxies:
     """The proxy files of a run."""
 
-    def __init__(self, config: build.LearnConfig, folder: Path, program: Program):
+    def __init__(self, config: build.LearnConfig, folder: Path, program: Bilevel):
         self.config, self.folder, self.program = config, folder, program
         # Who followed the run and where it was computed are no part of what was learned.
         plain = build.to_plain(config)
         self._plain = {k: v for k, v in plain.items() if k not in ("tracker", "machines")}
-        discount = program.agent.discount(program.agent.hparams)
+        agent = program.mixture.agents[0]
+        discount = agent.discount(agent.hparams)
         self._discount = None if discount is None else float(discount)
-        self._stored: dict[int, int] = {}  # generation of each seed's best one that is on the disk
 
     def save(self, state: Any) -> None:
-        """Writes the best proxy and the last one; with several seeds also the best of each.
+        """Writes the best proxy and the last one.
 
         Raises:
           OSError: if a file cannot be written.
         """
-        best, last = int(np.argmax(state.best_score)), int(np.argmax(state.incumbent_score))
-        best_ones = (state.best, state.best_score, state.best_scores, state.best_generation)
-        self._save("proxy", best, *best_ones)
+        self._save("proxy", state.best, state.best_score, state.best_scores, state.best_generation)
         self._save(
             "proxy_last",
-            last,
             state.incumbent,
             state.incumbent_score,
             state.incumbent_scores,
             state.generation - 1,
         )
-        for i in range(self.config.num_seeds) if self.config.num_seeds > 1 else ():
-            generation = int(state.best_generation[i])
-            if self._stored.get(i) != generation:  # few are new
-                name = f"proxies/seed{self.config.seed + i}"
-                self._save(name, i, *best_ones)
-                self._stored[i] = generation
 
-    def _save(
-        self, name: str, index: int, flat: Any, score: Any, scores: Any, generation: Any
-    ) -> None:
-        names = self.program.families.names
-        if not np.isfinite(flat[index]).all():  # a mean that is lost; the file before it stays
+    def _save(self, name: str, flat: Any, score: Any, scores: Any, generation: Any) -> None:
+        if not np.isfinite(flat).all():  # a mean that is lost; the file before it stays
             return
-        of_families = dict(zip(names, map(float, scores[index]), strict=True))
+        names = self.program.mixture.names
+        by_agent = dict(zip(names, map(float, scores), strict=True))
         files.save(
             self.folder / f"{name}.safetensors",
             self.program.proxy,
-            self.program.unravel(flat[index]),
+            self.program.unravel(flat),
             self._plain,
             self._discount,
-            score=float(score[index]),
-            generation=int(generation[index]),
-            seed=self.config.seed + index,
-            **({"scores": of_families} if len(names) > 1 else {}),
+            score=float(score),
+            generation=int(generation),
+            seed=self.config.seed,
+            **({"scores": by_agent} if len(names) > 1 else {}),
         )
 
 
-def draw(directory: RunDirectory, program: Program) -> None:
+def draw(directory: RunDirectory, program: Bilevel) -> None:
     """Draws the learning curve of what there is."""
     from sejax.cli import plots
 
@@ -268,13 +274,13 @@ def draw(directory: RunDirectory, program: Program) -> None:
         plots.learning_curve(directory.rows, program.solved_score, path)
 
 
-def _cost(state: Any, directory: RunDirectory, num_candidates: int) -> dict[str, int]:
-    """What the generations of all seeds took, in agents and steps."""
+def _cost(directory: RunDirectory, num_candidates: int) -> dict[str, int]:
+    """What the generations took, in agents and steps."""
     steps_of_agents = sum(float(row["train_steps_mean"]) for row in directory.rows)
     return {
         "agents": len(directory.rows) * num_candidates,
         "train_steps": round(steps_of_agents * num_candidates),
-        "real_steps": int(exact(state.env_steps).sum()),
+        "real_steps": int(directory.rows[-1]["env_steps_total"]) if directory.rows else 0,
     }
 
 

@@ -58,7 +58,7 @@ class RemoteChunks:
 
         def generation(state: Any, outcome: Outcome) -> tuple[Any, ...]:
             asked = program.ask(state)
-            trials = jax.random.key_data(asked.keys), asked.candidates, program.test_steps(state)
+            trials = jax.random.key_data(asked.keys), asked.candidates, program.eval_steps(state)
             return program.tell(state, asked, outcome), trials
 
         keys = jax.random.split(jax.random.key(0), num_seeds)
@@ -94,7 +94,7 @@ class RemoteChunks:
         shapes = self._shapes[num_seeds]
         nothing = jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), shapes)
         _, trials = self._compiled[num_seeds](state, nothing)
-        keys, candidates, test_steps = jax.device_get(trials)
+        keys, candidates, eval_steps = jax.device_get(trials)
         active = ~np.asarray(state.finished)
         num_trials = keys.shape[1]
 
@@ -105,7 +105,7 @@ class RemoteChunks:
                 keys[seeds, trials],
                 candidates[seeds, trials],
                 active[seeds],
-                None if test_steps is None else test_steps[seeds],
+                None if eval_steps is None else eval_steps[seeds],
             )
 
         def problem_of(share: Share, scored: Any) -> str | None:
@@ -140,13 +140,13 @@ class RemoteChunks:
         program = self.program
         num_trials = len(program.family_of_trial)
         keys = jax.random.split(jax.random.key(0), 1)
-        test_steps = jax.eval_shape(program.test_steps, state)
+        eval_steps = jax.eval_shape(program.eval_steps, state)
         one: Outcome = jax.eval_shape(
             program.share_of(0),
             keys,
             jnp.zeros((1, program.num_dims)),
             jnp.ones(1, bool),
-            test_steps and jax.ShapeDtypeStruct((1,), test_steps.dtype),
+            eval_steps and jax.ShapeDtypeStruct((1,), eval_steps.dtype),
         )
         return jax.tree.map(
             lambda x: jax.ShapeDtypeStruct((num_seeds, num_trials, *x.shape[1:]), x.dtype), one

@@ -23,18 +23,18 @@ class Work:
       keys: raw data of the trials' keys, `[n, ...]` uint32.
       candidates: `[n, dims]` float32.
       active: `[n]` bool; where not, nothing is trained.
-      test_steps: how much of the test episodes is scored, `[n]`, or None for all.
+      eval_steps: how much of the test episodes is scored, `[n]`, or None for all.
     """
 
     family: int
     keys: np.ndarray
     candidates: np.ndarray
     active: np.ndarray
-    test_steps: np.ndarray | None
+    eval_steps: np.ndarray | None
 
     @property
     def nbytes(self) -> int:
-        arrays = (self.keys, self.candidates, self.active, self.test_steps)
+        arrays = (self.keys, self.candidates, self.active, self.eval_steps)
         return sum(x.nbytes for x in arrays if x is not None)
 
 
@@ -137,20 +137,20 @@ def compile_share(program: Any, family: int, capacity: int) -> Any:
 
     evaluate = program.share_of(family)
 
-    def share(key_data: Any, candidates: Any, active: Any, test_steps: Any) -> Any:
-        return evaluate(jax.random.wrap_key_data(key_data), candidates, active, test_steps)
+    def share(key_data: Any, candidates: Any, active: Any, eval_steps: Any) -> Any:
+        return evaluate(jax.random.wrap_key_data(key_data), candidates, active, eval_steps)
 
     def shape(one: Any) -> Any:
         return jax.ShapeDtypeStruct((capacity, *one.shape), one.dtype)
 
     key = jax.eval_shape(lambda: jax.random.key_data(jax.random.key(0)))
     state = jax.eval_shape(program.init, jax.random.split(jax.random.key(0), 1))
-    test_steps = jax.eval_shape(program.test_steps, state)
+    eval_steps = jax.eval_shape(program.eval_steps, state)
     shapes = (
         shape(key),
         jax.ShapeDtypeStruct((capacity, program.num_dims), jnp.float32),
         jax.ShapeDtypeStruct((capacity,), jnp.bool_),
-        test_steps and jax.ShapeDtypeStruct((capacity,), test_steps.dtype),
+        eval_steps and jax.ShapeDtypeStruct((capacity,), eval_steps.dtype),
     )
     return jax.jit(share, compiler_options=compiler_options()).lower(*shapes).compile()
 
@@ -162,7 +162,7 @@ def score(compiled: Any, capacity: int, work: Work) -> dict[str, np.ndarray]:
     n = len(work.active)
     places = np.minimum(np.arange(capacity), n - 1)  # filled up with copies that are not trained
     active = work.active[places] & (np.arange(capacity) < n)
-    test_steps = None if work.test_steps is None else work.test_steps[places]
-    outcome = compiled(work.keys[places], work.candidates[places], active, test_steps)
+    eval_steps = None if work.eval_steps is None else work.eval_steps[places]
+    outcome = compiled(work.keys[places], work.candidates[places], active, eval_steps)
     host = jax.device_get(outcome)
     return {name: np.asarray(x)[:n] for name, x in vars(host).items()}
