@@ -97,7 +97,7 @@ def time_generations(settings: Timings, row: Row, preset: str) -> pd.DataFrame:
 
     chunks = session.make_chunks(config_of(settings, row, preset))
     program = chunks.program
-    state = jax.jit(program.init)(jax.random.key(settings.seed)[None])
+    state = chunks.init(jax.random.key(settings.seed))
     idle = jax.tree.map(lambda x: x.copy(), state.replace(finished=~state.finished))
     jax.block_until_ready(chunks.advance(idle, 1))  # compiled, and run with nothing to do
     wall, cpu, steps = [], [], []
@@ -106,7 +106,7 @@ def time_generations(settings: Timings, row: Row, preset: str) -> pd.DataFrame:
         state, info = jax.block_until_ready(chunks.advance(state, 1))
         wall.append(time.perf_counter() - started)
         cpu.append(time.process_time() - cpu_started)
-        steps.append(int(jax.device_get(info).train_steps_total.item()))
+        steps.append(int(jax.device_get(info).train_steps.sum()))
     means = {"seconds": np.mean(wall), "cpu_seconds": np.mean(cpu), "train_steps": np.mean(steps)}
     return pd.DataFrame([means | {"agents": program.strategy.num_candidates}])
 

@@ -101,7 +101,7 @@ def tiny(monkeypatch):
     monkeypatch.setattr(agents, "QUICK_AGENT", TINY_AGENT)
     monkeypatch.setattr(agents, "QUICK_STEPS", 60)
     monkeypatch.setattr(agent_learning, "QUICK_STEPS", 400)
-    monkeypatch.setattr(score_transforms, "NUM_PARALLEL", 8)
+    monkeypatch.setattr(score_transforms, "RUNS_AT_ONCE", 2)
 
 
 def refuse_to_compute(monkeypatch):

@@ -14,7 +14,7 @@ import sejax
 from experiments import score_transforms, se_histograms, supervised_baseline
 from experiments.common import supervised_models
 from experiments.common.statistics import bootstrap_interval
-from sejax.bilevel import make_program
+from sejax.bilevel import make_bilevel
 from sejax.errors import ConfigError
 from sejax.evaluation import make_recorder, make_tester
 from sejax.training import make_trainer
@@ -77,21 +77,21 @@ def test_a_run_counts_the_updates_before_the_incumbent_that_solves_the_task(
 
 @pytest.mark.slow
 def test_the_search_is_the_bilevel_loop(monkeypatch):
-    monkeypatch.setattr(score_transforms, "NUM_PARALLEL", 8)
+    monkeypatch.setattr(score_transforms, "RUNS_AT_ONCE", 2)
     search = score_transforms.make_search(True, 2, None)
     keys, sizes = jax.random.split(jax.random.key(0), 3), np.float32([0.1, 1.0, 5.0])
     transform = score_transforms.SCORE_TRANSFORMS.index("single_best")
     state = start = search.init(keys, sizes, transform)
     config = sejax.config([*score_transforms.SETTINGS, "es.score_transform=single_best",
                            "es.mirrored=true", "es.population_size=2"])  # fmt: skip
-    program = make_program(**config.parts())
+    program = make_bilevel(**config.parts())
 
     @jax.jit
     def init(keys):
-        state = program.init(keys)
+        state = jax.vmap(program.init)(keys)
         return state.replace(es_state=state.es_state.replace(step_size=jnp.asarray(sizes)))
 
-    expected, generation = init(keys), jax.jit(program.generation)
+    expected, generation = init(keys), jax.jit(jax.vmap(program.generation))
     for _ in range(2):
         state = search.advance(state)
         expected, _ = generation(expected)
@@ -286,13 +286,13 @@ def test_a_recorded_run_is_the_bilevel_loop():
                            "es.population_size=2", "es.num_incumbent_evals=1",
                            "es.mirrored=false"])  # fmt: skip
     recorded = supervised_models.make_recorded_run(config)
-    program = make_program(**config.parts())
+    program = make_bilevel(**config.parts())
     key = jax.random.key(7)
-    state, steps = recorded.generation(recorded.init(key[None]))
-    expected, info = jax.jit(program.generation)(jax.jit(program.init)(key[None]))
+    state, steps = recorded.generation(recorded.init(key))
+    expected, info = jax.jit(program.generation)(jax.jit(program.init)(key))
     np.testing.assert_allclose(state.es_state.mean, expected.es_state.mean, rtol=1e-4, atol=1e-6)
     # Those tests between episodes count as real steps, but are not recorded.
-    assert int(info.env_steps_wide[0, 1]) > int(steps.valid.sum()) > 0
+    assert int(info.real_steps.sum()) > int(steps.valid.sum()) > 0
 
 
 @pytest.mark.parametrize("overrides", [["agent=ppo"], ["agent=td3_discrete",

@@ -165,7 +165,7 @@ class TimedChunks(session.Chunks):
         Raises:
           BudgetSpent: if the generations so far have used it up.
         """
-        before = read_costs(self._path, int(state.generation[0]))
+        before = read_costs(self._path, int(state.generation))
         if before.sum() >= self._budget_s:
             raise BudgetSpent
         started = time.process_time()

@@ -96,7 +96,7 @@ def collect_all(settings: SupervisedBaseline, ses: Any) -> list[pd.DataFrame]:
 def collect(config: Any, seed: int, max_rows: int) -> pd.DataFrame:
     """Runs NES and draws transitions, all equally likely, from its agents' real test episodes."""
     run = make_recorded_run(config)
-    state = run.init(jax.random.key(seed)[None])
+    state = run.init(jax.random.key(seed))
     sample = Sample(max_rows, np.random.default_rng(seed))
     for number in range(config.generations):
         state, steps = run.generation(state)
@@ -107,36 +107,35 @@ def collect(config: Any, seed: int, max_rows: int) -> pd.DataFrame:
 class RecordedRun(NamedTuple):
     """An NES run whose agents' tests are recorded; compiled functions."""
 
-    init: Callable[[Any], Any]  # keys [1] -> LearnState
-    # state -> (state, Steps): `Program.generation` with the steps of all tests, [agent, step, ...]
+    init: Callable[[Any], Any]  # key -> LearnState
+    # state -> (state, Steps): a generation, and the steps of all tests, [evaluation, step, ...]
     generation: Callable[[Any], Any]
 
 
 @functools.cache
 def make_recorded_run(config: Any) -> RecordedRun:
     """The NES run of a configuration, from any seed: compiled once for all of them."""
-    from sejax.bilevel import make_program
-    from sejax.evaluation import make_evaluator, num_parallel_on_cpu, tested_throughout
+    from sejax.bilevel import make_bilevel
+    from sejax.evaluation import make_evaluator, num_parallel_on_cpu
 
-    program = make_program(**config.parts())
-    agent, proxy, training = program.agent, program.proxy, config.training
-    if program.objective.needs_tests:
-        training = tested_throughout(training)
+    bilevel = make_bilevel(**config.parts())
+    proxy, training = bilevel.proxy, bilevel.training
+    (agent,) = bilevel.mixture.agents
     evaluate = make_evaluator(agent, proxy, proxy.task, training, record=True)
     evaluate_all = spread_over_devices(
-        lambda key, candidate: evaluate(key, proxy.params(program.unravel(candidate))),
+        lambda key, candidate: evaluate(key, proxy.params(bilevel.unravel(candidate))),
         config.devices,
         config.num_parallel,
         num_parallel_on_cpu(agent, training),
     )
 
     def generation(state: Any) -> Any:
-        asked = program.ask(state)
-        outcome, steps = evaluate_all(asked.keys[0], asked.candidates[0])
-        state, _ = program.tell(state, asked, jax.tree.map(lambda x: x[None], outcome))
+        candidates = bilevel.ask(state)
+        outcome, steps = evaluate_all(candidates.keys, candidates.params)
+        state, _ = bilevel.tell(state, candidates, outcome)
         return state, steps
 
-    return RecordedRun(init=jax.jit(program.init), generation=jax.jit(generation))
+    return RecordedRun(init=jax.jit(bilevel.init), generation=jax.jit(generation))
 
 
 def table_of(steps: Any, num_episodes: int, generation: int) -> pd.DataFrame:
