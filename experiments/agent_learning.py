@@ -16,19 +16,11 @@ import numpy as np
 import pandas as pd
 
 import sejax
-from experiments.common import curves, figures
+from experiments.common import curves, figures, tables
 from experiments.common.agents import Condition, train_groups
 from experiments.common.curves import CURVES, WINDOW
 from experiments.common.experiment import Experiment, Settings, count, each_of, setting
 from experiments.common.statistics import bootstrap_interval
-from experiments.common.tables import (
-    as_texts,
-    iqm_columns,
-    iqm_note,
-    iqm_text,
-    mean_columns,
-    publish,
-)
 from sejax import registry, serialize
 from sejax.training import TrainingConfig
 
@@ -162,7 +154,7 @@ class AgentLearning(Settings):
 
 def compute(settings: AgentLearning) -> pd.DataFrame:
     """Trains what is missing; a row for each training episode of each agent and study."""
-    tables = []
+    parts = []
     for number, study in enumerate(STUDIES):
         if study.env not in settings.envs:
             continue
@@ -176,8 +168,8 @@ def compute(settings: AgentLearning) -> pd.DataFrame:
             is_single=True,
         )
         rows = train_groups(condition, settings, settings.num_agents, CURVES)
-        tables.append(rows.drop(columns="group").assign(study=number, max_steps=training.max_steps))
-    return pd.concat(tables, ignore_index=True)
+        parts.append(rows.drop(columns="group").assign(study=number, max_steps=training.max_steps))
+    return pd.concat(parts, ignore_index=True)
 
 
 def summarise(rows: pd.DataFrame) -> pd.DataFrame:
@@ -200,7 +192,9 @@ def summarise(rows: pd.DataFrame) -> pd.DataFrame:
             "num_solved_at_the_end": int((last >= threshold).sum()),
             "median_steps_to_solve": np.median(to_solve),
         }
-        summary.append(row | mean_columns(last, "last", least=1) | iqm_columns(last, "last"))
+        summary.append(
+            row | tables.mean_columns(last, "last", least=1) | tables.iqm_columns(last, "last")
+        )
     return pd.DataFrame(summary)
 
 
@@ -223,7 +217,7 @@ COLUMNS: dict[str, Any] = {
     "steps, at most": "{max_steps:,}",
     "made": "{made_steps:,.0f}",
     f"last {WINDOW} tests": "{last_mean:.1f} [{last_low:.1f}, {last_high:.1f}]",
-    "IQM": iqm_text("last"),
+    "IQM": tables.iqm_text("last"),
     "others": lambda row: STUDIES[row.study].peers,
 }
 
@@ -238,10 +232,10 @@ def report(settings: AgentLearning, rows: pd.DataFrame) -> pd.DataFrame:
         "Made: steps until the last episode that ended, on average; some are limited by their "
         f"number of episodes. The last {WINDOW} tests: mean over seeds, bootstrap 95% interval. "
         "CartPole here is v0, "
-        f"of 200 steps.{iqm_note()}"
+        f"of 200 steps.{tables.iqm_note()}"
     )
     title = "Agents that learn the real tasks"
-    return publish(settings, title, as_texts(summary, COLUMNS), summary, note)
+    return tables.publish(settings, title, tables.as_texts(summary, COLUMNS), summary, note)
 
 
 def draw(settings: AgentLearning, rows: pd.DataFrame, points: int = 100) -> None:

@@ -22,23 +22,15 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
-from flax import struct
 
 import sejax
 from experiments.common import figures
-from experiments.common.experiment import Experiment, Settings, count
+from experiments.common.experiment import Experiment, Settings, count, each_of, setting
 from experiments.common.statistics import NUM_RESAMPLES
 from experiments.common.tables import as_texts, mean_columns, publish
-from sejax.es.base import Strategy
-from sejax.es.nes import NESConfig, NESState, make_nes
-from sejax.es.score_transforms import TRANSFORMS
-from sejax.options import Options
-
-SCORE_TRANSFORMS = tuple(TRANSFORMS)
 
 # docs/reference.md 6.2: default_config_gridworld.yaml as the published runs used it.
 SETTINGS = [
@@ -89,13 +81,14 @@ class ScoreTransforms(Settings):
     )
     generations: int = count(50, "generations", quick=10, about="of a run at most")
     population: int = count(16, "candidates", least=2, quick=8, about="of a generation")
+    transforms: tuple[str, ...] = setting(tuple(LABELS), each_of(LABELS), about="to compare")
     bins: int = count(9, "bins", quick=3, about="of step sizes")
 
 
 def compute(settings: ScoreTransforms) -> pd.DataFrame:
     """Computes what is missing; a row for each run."""
     tables = []
-    for mirrored, transform in itertools.product((True, False), SCORE_TRANSFORMS):
+    for mirrored, transform in itertools.product((True, False), settings.transforms):
         name = f"{transform}-{'mirrored' if mirrored else 'plain'}"
         made_with = {"transform": transform, "mirrored": mirrored, "settings": SETTINGS}
         made_with |= settings.values("runs", "generations", "population", "seed")
@@ -114,8 +107,8 @@ def compute_cell(settings: ScoreTransforms, transform: str, mirrored: bool) -> p
     """Runs of one score transform, a row each."""
     keys = jax.random.split(jax.random.key(settings.seed), settings.runs)
     step_sizes = draw_step_sizes(settings.runs, settings.seed)
-    search = make_search(mirrored, settings.population, settings.devices)
-    state = search.init(keys, np.float32(step_sizes), SCORE_TRANSFORMS.index(transform))
+    search = make_search(transform, mirrored, settings.population, settings.devices)
+    state = search.init(keys, np.float32(step_sizes))
     for _ in range(settings.generations):
         state = search.advance(state)  # runs that have solved the task stay as they are
         if state.finished.all():
@@ -146,73 +139,31 @@ def draw_step_sizes(count: int, seed: int) -> np.ndarray:
     return np.exp(low + places * (high - low))
 
 
-@struct.dataclass
-class AnyNESState:
-    nes: NESState
-    transform: Any  # number of its score transform, `[]`
-
-
-@dataclass(frozen=True, kw_only=True)
-class AnyNES(Options):
-    """NES for any score transform: one program serves all of them, and all step sizes."""
-
-    nes: NESConfig
-
-    def make(self, num_dims: int) -> Strategy:
-        """The strategy; its state begins with the first transform and the usual step size."""
-        each = [
-            make_nes(dataclasses.replace(self.nes, score_transform=name), num_dims)
-            for name in SCORE_TRANSFORMS
-        ]
-
-        def ask(key: Any, state: AnyNESState) -> tuple[Any, AnyNESState]:
-            members, nes = each[0].ask(key, state.nes)
-            return members, state.replace(nes=nes)
-
-        def tell(key: Any, members: Any, scores: Any, incumbent: Any, state: AnyNESState) -> Any:
-            branches = [strategy.tell for strategy in each]
-            arguments = key, members, scores, incumbent, state.nes
-            return state.replace(nes=jax.lax.switch(state.transform, branches, *arguments))
-
-        return dataclasses.replace(
-            each[0],
-            ask=ask,
-            tell=tell,
-            incumbent=lambda state: each[0].incumbent(state.nes),
-            init=lambda key, mean: AnyNESState(each[0].init(key, mean), jnp.int32(0)),
-        )
-
-
 class Search(NamedTuple):
     """Compiled functions over NES runs."""
 
-    init: Callable[..., Any]  # (keys [run], step_sizes [run], number of a transform) -> state
+    init: Callable[..., Any]  # (keys [run], step_sizes [run]) -> state
     advance: Callable[[Any], Any]  # a generation of every run that has not solved the task
 
 
-@functools.cache
-def make_search(mirrored: bool, population: int, devices: int | None) -> Search:
-    """Builds the bilevel loop for all step sizes and score transforms."""
+def make_search(transform: str, mirrored: bool, population: int, devices: int | None) -> Search:
+    """Builds Algorithm 1 for runs of a cell, which differ in their step sizes."""
     from sejax.bilevel import make_bilevel
 
-    overrides = [f"es.mirrored={mirrored}", f"es.population_size={population}"]
-    config = sejax.config([*SETTINGS, *overrides, "stop_when_solved=true"])
-    config = dataclasses.replace(config, devices=devices)
-    bilevel = make_bilevel(**config.parts() | {"es": AnyNES(nes=config.es)})
+    own = [f"es.score_transform={transform}", f"es.mirrored={mirrored}"]
+    own += [f"es.population_size={population}", "stop_when_solved=true"]
+    config = dataclasses.replace(sejax.config([*SETTINGS, *own]), devices=devices)
+    bilevel = make_bilevel(**config.parts())
 
-    def init(keys: Any, step_sizes: Any, transform: Any) -> Any:
+    def init(keys: Any, step_sizes: Any) -> Any:
         state = jax.vmap(bilevel.init)(keys)
-        nes = state.es_state.nes.replace(step_size=step_sizes)
-        transforms = jnp.full(len(keys), transform)
-        return state.replace(es_state=state.es_state.replace(nes=nes, transform=transforms))
+        return state.replace(es_state=state.es_state.replace(step_size=step_sizes))
 
-    def advance(state: Any) -> Any:
-        def one(state: Any) -> Any:
-            return bilevel.generation(state)[0]
+    def generation(state: Any) -> Any:
+        return bilevel.generation(state)[0]
 
-        return jax.lax.map(one, state, batch_size=RUNS_AT_ONCE)
-
-    return Search(init=jax.jit(init), advance=jax.jit(advance))
+    advance = jax.jit(lambda state: jax.lax.map(generation, state, batch_size=RUNS_AT_ONCE))
+    return Search(init=jax.jit(init), advance=advance)
 
 
 def edges_of(bins: int) -> np.ndarray:

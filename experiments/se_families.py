@@ -17,11 +17,10 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from experiments.common import figures, runs
+from experiments.common import figures, runs, tables
 from experiments.common.experiment import Experiment, setting
 from experiments.common.runs import MixtureRuns, kinds_in
 from experiments.common.shards import stack, unstack
-from experiments.common.tables import iqm_note, iqm_text, mean_text, publish
 from sejax import envs
 from sejax.errors import require
 
@@ -35,7 +34,7 @@ SETS = (
     "ddqn+ppo+td3_discrete",
 )
 LEFT_OUT = "°"  # after the return of a kind that took no part
-IQM_AND_SOLVED = f"IQM {iqm_text('test_return')}; {{solved:.0%}}"
+IQM_AND_SOLVED = f"IQM {tables.iqm_text('test_return')}; {{solved:.0%}}"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -105,7 +104,7 @@ def make_table(summary: pd.DataFrame) -> pd.DataFrame:
 def cell(row: Any) -> str:
     """What a kind of agent reaches on the SEs of a mixture."""
     mark = "" if row.took_part else LEFT_OUT
-    mean = mean_text("test_return", 1)(row)
+    mean = tables.mean_text("test_return", 1)(row)
     return f"{mean}; {IQM_AND_SOLVED.format_map(row._asdict())}{mark}"
 
 
@@ -172,10 +171,10 @@ def report(settings: SeFamilies, rows: pd.DataFrame) -> pd.DataFrame:
         f"interquartile mean; share of the {summary['num_agents'].iloc[0]} agents that solve "
         f"the task ({task.solved_reward:g}); {LEFT_OUT} a family that took no part in learning. "
         "CPU s are those of the generations, "
-        f"without compilation. {findings(summary)}{iqm_note('within each SE')}"
+        f"without compilation. {findings(summary)}{tables.iqm_note('within each SE')}"
     )
     title = f"Agents tested on {task.name}, trained on SEs learned with other families of agents"
-    return publish(settings, title, make_table(summary), summary, note)
+    return tables.publish(settings, title, make_table(summary), summary, note)
 
 
 def draw(summary: pd.DataFrame, task: Any, path: Path) -> None:

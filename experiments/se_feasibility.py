@@ -16,16 +16,9 @@ import numpy as np
 import pandas as pd
 from matplotlib.ticker import MaxNLocator
 
-from experiments.common import figures, runs
+from experiments.common import figures, runs, tables
 from experiments.common.experiment import Experiment, count, setting
 from experiments.common.runs import RunSettings
-from experiments.common.tables import (
-    iqm_columns,
-    iqm_note,
-    iqm_text,
-    mean_columns,
-    publish,
-)
 from sejax.cli.build import AGENT_HPARAMS
 from sejax.errors import require
 from sejax.options import one_of
@@ -136,7 +129,7 @@ def make_table(config: Any, summary: pd.DataFrame) -> pd.DataFrame:
     best, last = summary["best_incumbent_mean"], summary["last_incumbent_mean"]
     to_solve = summary["generations_to_solve"]
     # With an interval for any number of runs, as they are as many as there are.
-    columns = mean_columns(last, "last", least=1) | iqm_columns(last, "last")
+    columns = tables.mean_columns(last, "last", least=1) | tables.iqm_columns(last, "last")
     mean = "{last_mean:.1f} [{last_low:.1f}, {last_high:.1f}]"
     ours = {
         "runs": str(len(summary)),
@@ -147,7 +140,7 @@ def make_table(config: Any, summary: pd.DataFrame) -> pd.DataFrame:
         "real steps to solve, median": median_steps(summary),
         "best incumbent mean": f"{best.median():.1f} ({best.min():.1f} to {best.max():.1f})",
         "last incumbent mean": mean.format_map(columns),
-        "last incumbent mean, IQM": iqm_text("last").format_map(columns),
+        "last incumbent mean, IQM": tables.iqm_text("last").format_map(columns),
         "wall minutes of a run, mean": f"{summary['wall_min'].mean():.1f}",
     }
     paper = PAPER if config.name("env") in PAPER_TASKS else {}
@@ -169,10 +162,10 @@ def report(settings: SeFeasibility, rows: pd.DataFrame) -> pd.DataFrame:
         "runs; a run that did not solve the task counts as longer than all. The last incumbent "
         "mean is that over runs, with a bootstrap 95% interval; the best is a maximum of noisy "
         "means and hence too high: se_performance tests the stored SEs with other agents."
-        f"{iqm_note(of='runs')}"
+        f"{tables.iqm_note(of='runs')}"
     )
     title = f"Learning SEs of {settings.env} for {config.name('agent')} agents{varied}"
-    return publish(settings, title, make_table(config, summary), summary, note)
+    return tables.publish(settings, title, make_table(config, summary), summary, note)
 
 
 def draw(curves: pd.DataFrame, solved_reward: float, path: Path) -> None:

@@ -17,10 +17,9 @@ import pandas as pd
 
 import sejax
 from experiments.common import agents as groups
-from experiments.common import figures
+from experiments.common import figures, tables
 from experiments.common.agents import SeAgents, return_columns
 from experiments.common.experiment import Experiment, setting
-from experiments.common.tables import as_texts, iqm_columns, iqm_note, iqm_text, publish
 from sejax.errors import ConfigError
 
 
@@ -37,13 +36,13 @@ class SeModels(SeAgents):
 def compute(settings: SeModels) -> pd.DataFrame:
     """Trains what is missing; a row for each agent."""
     ses = load(settings)
-    tables = []
+    parts = []
     for kind in settings.agents:
         condition = groups.on_ses(settings, ses, kind)
         places = {group.name: place for place, group in enumerate(condition.groups)}
         rows = groups.train_kind(settings, condition)
-        tables.append(rows.assign(se=rows["group"].map(places)))
-    return pd.concat(tables, ignore_index=True)
+        parts.append(rows.assign(se=rows["group"].map(places)))
+    return pd.concat(parts, ignore_index=True)
 
 
 def load(settings: SeModels) -> Any:
@@ -64,7 +63,7 @@ def summarise(agents: pd.DataFrame, solved_reward: float) -> pd.DataFrame:
         return_std=lambda x: x.std(ddof=0),
         solved=lambda x: (x >= solved_reward).mean(),
     )
-    iqms = [iqm_columns(returns, "return") for _, returns in grouped["test_return"]]
+    iqms = [tables.iqm_columns(returns, "return") for _, returns in grouped["test_return"]]
     summary = summary.assign(**pd.DataFrame(iqms, index=summary.index))
     summary["train_steps"] = grouped["train_steps"].mean()
     kinds = list(dict.fromkeys(agents["kind"]))
@@ -91,7 +90,7 @@ def report(settings: SeModels, rows: pd.DataFrame) -> pd.DataFrame:
         "run's seed": lambda row: ses.seeds[row.se],
         "score when learned": lambda row: f"{ses.scores[row.se]:.1f}",
         "return": "{return_mean:.1f} ± {return_std:.1f}",
-        "IQM": iqm_text("return"),
+        "IQM": tables.iqm_text("return"),
         "agents that solve the task": "{solved:.0%}",
         "training steps": "{train_steps:,.0f}",
     }
@@ -100,10 +99,10 @@ def report(settings: SeModels, rows: pd.DataFrame) -> pd.DataFrame:
     note = (
         f"Return: mean ± std over {rows['agent'].nunique()} agents with drawn hyperparameters and "
         f"{len(return_columns(rows))} test episodes each. The paper has 1000 agents on each of 40 "
-        f"SEs and shows violins only, no numbers.{correlations_text(summary)}{iqm_note()}"
+        f"SEs and shows violins only, no numbers.{correlations_text(summary)}{tables.iqm_note()}"
     )
     title = f"Single SEs of {task.name} (solved at {task.solved_reward:g})"
-    return publish(settings, title, as_texts(summary, columns), summary, note)
+    return tables.publish(settings, title, tables.as_texts(summary, columns), summary, note)
 
 
 def correlations_text(summary: pd.DataFrame) -> str:

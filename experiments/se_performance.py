@@ -27,19 +27,9 @@ import pandas as pd
 
 import sejax
 from experiments.common import agents as groups
-from experiments.common import figures
+from experiments.common import figures, tables
 from experiments.common.agents import Condition, SeAgents, return_columns, tuned_agent
 from experiments.common.experiment import Experiment, count, setting
-from experiments.common.tables import (
-    as_texts,
-    in_strata,
-    iqm_columns,
-    iqm_note,
-    iqm_text,
-    mean_columns,
-    mean_text,
-    publish,
-)
 from sejax import envs
 from sejax.errors import require
 from sejax.options import one_of
@@ -111,17 +101,17 @@ def compute(settings: SePerformance) -> pd.DataFrame:
     for name, ses in sets.items():
         print(f"{name}: {ses.size} SEs, {ses.solved().size} of which reached the threshold")
     task = envs.make(task_name(settings, sets))
-    tables = []
+    parts = []
     for kind in settings.agents:
         conditions = {"real": on_real(settings, task, sets, kind)}
         if settings.tuned:
             conditions["tuned"] = on_real_tuned(settings, conditions["real"], kind)
         conditions |= {name: groups.on_ses(settings, ses, kind) for name, ses in sets.items()}
-        tables += [
+        parts += [
             groups.train_kind(settings, condition).assign(kind=kind, setting=name)
             for name, condition in conditions.items()
         ]
-    return pd.concat(tables, ignore_index=True)
+    return pd.concat(parts, ignore_index=True)
 
 
 def load_sets(settings: SePerformance) -> dict[str, Any]:
@@ -214,8 +204,10 @@ def summarise(agents: pd.DataFrame) -> pd.DataFrame:
         row |= {"num_agents": len(mine), "num_nonfinite": int(mine["nonfinite"].sum())}
         for column in ("train_steps", "train_episodes", "test_return"):
             of_ses = mine.groupby("group")[column].mean()
-            row |= mean_columns(mine[column], column, mine[column] if name in ON_REAL else of_ses)
-        row |= iqm_columns(mine["test_return"], "test_return", strata(mine, str(name)))
+            row |= tables.mean_columns(
+                mine[column], column, mine[column] if name in ON_REAL else of_ses
+            )
+        row |= tables.iqm_columns(mine["test_return"], "test_return", strata(mine, str(name)))
         rows.append(row)
     return pd.DataFrame(rows)
 
@@ -241,18 +233,18 @@ def make_table(env_name: str, summary: pd.DataFrame) -> pd.DataFrame:
         "agent": "{kind}",
         "trained on": lambda row: SHOWN[row.setting][1],
         "SEs, agents": "{num_ses}, {num_agents}",
-        "training steps": mean_text("train_steps", 0, std=True),
+        "training steps": tables.mean_text("train_steps", 0, std=True),
         "paper's": paper(PAPER_STEPS),
         "fewer": lambda row: fewer(row, "real"),
         "than tuned": lambda row: fewer(row, "tuned"),
-        "episodes": mean_text("train_episodes", 1, std=True),
-        "return": mean_text("test_return", 1, std=True),
-        "IQM": iqm_text("test_return"),
+        "episodes": tables.mean_text("train_episodes", 1, std=True),
+        "return": tables.mean_text("test_return", 1, std=True),
+        "IQM": tables.iqm_text("test_return"),
         "paper's return": paper(PAPER_RETURNS),
     }
     if not has_tuned(summary):
         del columns["than tuned"]
-    return as_texts(summary, columns)
+    return tables.as_texts(summary, columns)
 
 
 AND_TUNED = ", and against agents there with fixed settings that were tuned for it"
@@ -280,10 +272,10 @@ def report(settings: SePerformance, rows: pd.DataFrame) -> pd.DataFrame:
         "empty it gives no number here, but for DDQN in CartPole a mean return on SEs of 190.7, in "
         "another section. "
         f"Agents that met a number that is not finite: {int(rows['nonfinite'].sum())}."
-        f"{iqm_note('within each SE')}"
+        f"{tables.iqm_note('within each SE')}"
     )
     title = f"Agents trained on SEs and tested on {task.name} (solved at {task.solved_reward:g})"
-    return publish(settings, title, make_table(task.name, summary), summary, note)
+    return tables.publish(settings, title, make_table(task.name, summary), summary, note)
 
 
 def draw(task: Any, agents: pd.DataFrame, path: Path) -> None:
@@ -325,7 +317,7 @@ def draw_profiles(task: Any, agents: pd.DataFrame, path: Path) -> None:
         for axis, (kind, of_kind) in zip(axes[0], kinds, strict=True):
             for name, mine in of_kind.groupby("setting", sort=False):
                 color, label = SHOWN[str(name)]
-                runs = in_strata(mine["test_return"], strata(mine, str(name)))
+                runs = tables.in_strata(mine["test_return"], strata(mine, str(name)))
                 figures.profile(axis, runs, low, high, color, f"train: {label}")
             axis.axvline(task.solved_reward, color=figures.SOLVED, ls="--", lw=1.1)
             title, label = figures.AGENT_NAMES.get(str(kind), kind), "return of an agent on"

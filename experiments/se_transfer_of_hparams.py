@@ -17,16 +17,8 @@ import numpy as np
 import pandas as pd
 
 import sejax
-from experiments.common import figures
-from experiments.common.agents import (
-    Condition,
-    Group,
-    Measure,
-    groups_at_once,
-    outcome_rows,
-    train_groups,
-    training_as_learned,
-)
+from experiments.common import agents, figures
+from experiments.common.agents import Condition, Group, Measure
 from experiments.common.experiment import Experiment, Settings, count, each_of, setting
 from experiments.common.statistics import NUM_RESAMPLES
 from experiments.common.tables import as_texts, publish
@@ -79,7 +71,7 @@ def parts_of(settings: SeTransferOfHparams) -> Parts:
     if settings.quick:
         words += [f"agent.{name}={value}" for name, value in QUICK_AGENT.items()]
     config = sejax.config([*words, *settings.run])
-    learned = training_as_learned(ses, config.agent)
+    learned = agents.training_as_learned(ses, config.agent)
     on_se = dataclasses.replace(
         learned,
         max_steps=settings.max_steps or learned.max_steps,
@@ -109,7 +101,7 @@ def compute(settings: SeTransferOfHparams) -> pd.DataFrame:
     """Trains what is missing; a row for each agent, with what its configuration has drawn."""
     parts = parts_of(settings)
     ses, task = parts.ses, parts.ses.task
-    key, at_once = jax.random.key(settings.seed), groups_at_once(settings.devices)
+    key, at_once = jax.random.key(settings.seed), agents.groups_at_once(settings.devices)
     keys = [jax.random.key_data(jax.random.fold_in(key, i)) for i in range(settings.num_configs)]
     places = {
         "se": (ses.env, ses.one(0), ses.fingerprint(0), {"proxy": ses.config["proxy"]}),
@@ -131,7 +123,7 @@ def compute(settings: SeTransferOfHparams) -> pd.DataFrame:
             hparams="varied",
             settings=plain,
         )
-        rows = train_groups(condition, settings, settings.num_agents, SHARED_DRAWS, at_once)
+        rows = agents.train_groups(condition, settings, settings.num_agents, SHARED_DRAWS, at_once)
         tables.append(rows.assign(world=name))
     return pd.concat(tables, ignore_index=True).rename(columns={"group": "config"})
 
@@ -164,7 +156,7 @@ def make_shared_draws(
 
 SHARED_DRAWS = Measure(
     make_run=make_shared_draws,
-    to_table=lambda results, _: outcome_rows(*results),
+    to_table=lambda results, _: agents.outcome_rows(*results),
     log=lambda rows: f"mean return {rows['test_return'].mean():.1f}",
     is_timed=True,
 )

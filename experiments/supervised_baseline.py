@@ -29,20 +29,11 @@ import pandas as pd
 
 import sejax
 from experiments.common import agents as groups
-from experiments.common import figures, supervised_models
+from experiments.common import figures, supervised_models, tables
 from experiments.common.agents import HPARAMS, SE_AGENTS, SOFT_SE, Condition, return_columns
 from experiments.common.experiment import Experiment
 from experiments.common.shards import stack, unstack
 from experiments.common.supervised_models import SupervisedBaseline
-from experiments.common.tables import (
-    as_texts,
-    iqm_columns,
-    iqm_note,
-    iqm_text,
-    mean_columns,
-    mean_text,
-    publish,
-)
 from sejax.errors import require
 
 BEST = 2  # models in the paper's second figure
@@ -66,13 +57,13 @@ def compute(settings: SupervisedBaseline) -> pd.DataFrame:
     ses = load(settings)
     data = supervised_models.collect_all(settings, ses)
     fits = supervised_models.fit_shard(settings, ses, data)
-    tables = []
+    parts = []
     for kind, hparams in itertools.product(settings.agents, settings.hparams):
         for name, condition in make_conditions(settings, ses, kind, hparams).items():
             rows = groups.train_groups(condition, settings, settings.num_agents)
-            tables.append(rows.assign(world=name, kind=kind, hparams=hparams))
+            parts.append(rows.assign(world=name, kind=kind, hparams=hparams))
     transitions = supervised_models.summary_of(data)
-    return stack({"agents": pd.concat(tables), "fits": fits, "transitions": transitions})
+    return stack({"agents": pd.concat(parts), "fits": fits, "transitions": transitions})
 
 
 def load(settings: SupervisedBaseline) -> Any:
@@ -154,9 +145,9 @@ def summarise(agents: pd.DataFrame, solved_reward: float) -> pd.DataFrame:
         draws = returns if model is None else returns.groupby(model).mean()
         rows.append(
             {"kind": kind, "hparams": hparams, "world": name, "num_agents": len(mine)}
-            | mean_columns(returns, "return", draws, least=1)
+            | tables.mean_columns(returns, "return", draws, least=1)
             | {"return_std": mine[return_columns(mine)].to_numpy().std()}
-            | iqm_columns(returns, "return", model)
+            | tables.iqm_columns(returns, "return", model)
             | {"solved": (returns >= solved_reward).mean()}
             | dict(mine[["train_steps", "train_episodes"]].mean())
             | {"num_nonfinite": int(mine["nonfinite"].sum())}
@@ -169,15 +160,15 @@ def summarise(agents: pd.DataFrame, solved_reward: float) -> pd.DataFrame:
 
 def make_table(summary: pd.DataFrame) -> pd.DataFrame:
     """The summary as texts, with the paper's numbers."""
-    return as_texts(
+    return tables.as_texts(
         summary,
         {
             "agent": "{kind}",
             "hyperparameters": lambda row: DRAWN.get(row.hparams, row.hparams),
             "trained on": lambda row: LABELS[row.world],
             "agents": "{num_agents}",
-            "return": mean_text("return", 1, std=True),
-            "IQM": iqm_text("return"),
+            "return": tables.mean_text("return", 1, std=True),
+            "IQM": tables.iqm_text("return"),
             "paper's": lambda row: PAPER.get((row.world, row.kind, row.hparams), ""),
             "solved": "{solved:.0%}",
             "training steps": "{train_steps:,.0f}",
@@ -204,10 +195,10 @@ def report(settings: SupervisedBaseline, rows: pd.DataFrame) -> pd.DataFrame:
         f"{last['done_error']:.2g} of the end. As the authors: the network for the end "
         "keeps its random weights. Fair: it is fitted too, and used. The best models are those of "
         "the runs with the best episodes. Agents that met a number that is not finite: "
-        f"{diverged_text(agents)}.{iqm_note('within each model')}"
+        f"{diverged_text(agents)}.{tables.iqm_note('within each model')}"
     )
     title = f"Agents trained on supervised models of {task.name} and on an SE"
-    return publish(settings, title, make_table(summary), summary, note)
+    return tables.publish(settings, title, make_table(summary), summary, note)
 
 
 def diverged_text(agents: pd.DataFrame) -> str:

@@ -51,7 +51,7 @@ TINY = {
     "rn_heatmap": RNS,
     "rn_objectives": CURVES | {"objectives": ("reward_threshold", "auc")},
     "rn_performance": CURVES,
-    "score_transforms": {"runs": 3, "generations": 2, "population": 2},
+    "score_transforms": {"runs": 3, "generations": 2, "population": 2, "transforms": "rank"},
     "se_families": {"sets": "ddqn", "tested": "ddqn", "runs": 1, "generations": 2, "num_agents": 2,
                     "test_episodes": 1, "run": [*TINY_SE, *tiny_agents("ddqn")]},
     "se_feasibility": {"runs": 2, "generations": 2,
