@@ -18,9 +18,9 @@ from typing import Any
 
 import pandas as pd
 
-from experiments.common import reward_networks as rn
+from experiments.common import reward_networks, rn_curves
 from experiments.common.experiment import Experiment, each_of, setting
-from experiments.common.reward_networks import CurveSettings
+from experiments.common.rn_curves import CurveSettings
 from experiments.common.tables import publish
 from sejax.errors import require
 
@@ -69,13 +69,15 @@ class RnObjectives(CurveSettings):
 
 def compute(settings: RnObjectives) -> pd.DataFrame:
     """As of rn_performance; agents without an RN are there once for all objectives."""
-    rn.check_stored(settings, settings.objectives)
-    tables = [table.assign(objective="", pick="") for table in rn.real_curves(settings)]
+    reward_networks.check_stored(settings, settings.objectives)
+    tables = [table.assign(objective="", pick="") for table in rn_curves.real_curves(settings)]
     for objective in settings.objectives:
-        learned = {name: rn.learn(settings, name, objective) for name in settings.variants}
+        learned = {
+            name: reward_networks.learn(settings, name, objective) for name in settings.variants
+        }
         for pick, (variant, rns) in itertools.product(settings.picks, learned.items()):
             picked = rns.ranked(settings.rns, worst=pick == "worst")
-            made = rn.rn_curves(settings, variant, picked, f"{objective}-{pick}-")
+            made = rn_curves.rn_curves(settings, variant, picked, f"{objective}-{pick}-")
             tables += [table.assign(objective=objective, pick=pick) for table in made]
     return pd.concat(tables, ignore_index=True)
 
@@ -86,10 +88,10 @@ def report(settings: RnObjectives, rows: pd.DataFrame) -> pd.DataFrame:
     tables: list[pd.DataFrame] = []
     for objective, pick in itertools.product(settings.objectives, settings.picks):
         mine = beside(settings, rows, objective, pick)
-        rn.require_rows(settings, mine)
-        summary = rn.summarise(mine, solved_reward, settings.max_steps)
-        table = rn.make_table(summary)
-        has_rn = ~table["trained with"].isin(rn.WITHOUT_RN)
+        rn_curves.require_rows(settings, mine)
+        summary = rn_curves.summarise(mine, solved_reward, settings.max_steps)
+        table = rn_curves.make_table(summary)
+        has_rn = ~table["trained with"].isin(rn_curves.WITHOUT_RN)
         if not tables:
             tables.append(table[~has_rn].assign(objective="", RNs=""))
         tables.append(table[has_rn].assign(objective=OBJECTIVE_NAMES[objective], RNs=pick))
@@ -99,14 +101,14 @@ def report(settings: RnObjectives, rows: pd.DataFrame) -> pd.DataFrame:
             f"{OBJECTIVE_NAMES[name]}\ntest return": beside(settings, rows, name, pick)
             for name in settings.objectives
         }
-        rn.draw(settings, curves, 2.7, f"{pick}.png")
+        rn_curves.draw(settings, curves, 2.7, f"{pick}.png")
     table = pd.concat(tables, ignore_index=True)
     table = table[["objective", "RNs", *table.columns.drop(["objective", "RNs"])]]
     ends = " and with the ".join(PICKS[pick] for pick in settings.picks)
     note = (
         f"{settings.learned} RNs of each variant were learned by each objective. Of these the "
         f"{settings.rns} with the {ends} scores ({', '.join(settings.picks)}) train "
-        f"{settings.num_agents} agents each, for {rn.common_note(settings, solved_reward)} "
+        f"{settings.num_agents} agents each, for {rn_curves.common_note(settings, solved_reward)} "
         "The area is by training steps, where the authors' code has the sum. The paper shows "
         "curves and gives no numbers; those for the area and the final return are, by a slip in "
         "the authors' scripts, of the worst ten. It concludes that the area does about as well as "
@@ -120,7 +122,7 @@ def report(settings: RnObjectives, rows: pd.DataFrame) -> pd.DataFrame:
 def beside(settings: RnObjectives, rows: pd.DataFrame, objective: str, pick: str) -> pd.DataFrame:
     """Curves of the agents without an RN, which come first, and of the RNs picked."""
     mine = (rows["objective"] == objective) & (rows["pick"] == pick)
-    return rn.by_row(settings, rows[mine | rows["world"].isin(rn.WITHOUT_RN)])
+    return rn_curves.by_row(settings, rows[mine | rows["world"].isin(rn_curves.WITHOUT_RN)])
 
 
 EXPERIMENT = Experiment(settings=RnObjectives, compute=compute, report=report, about=__doc__)

@@ -16,9 +16,9 @@ from dataclasses import dataclass
 
 import pandas as pd
 
-from experiments.common import reward_networks as rn
+from experiments.common import reward_networks, rn_curves
 from experiments.common.experiment import Experiment
-from experiments.common.reward_networks import CurveSettings
+from experiments.common.rn_curves import CurveSettings
 from experiments.common.tables import publish
 
 
@@ -26,35 +26,35 @@ from experiments.common.tables import publish
 class RnPerformance(CurveSettings):
     name = "rn_performance"
 
-    objective: str = rn.objective_setting()
+    objective: str = reward_networks.objective_setting()
 
 
 def compute(settings: RnPerformance) -> pd.DataFrame:
     """Learns and trains what is missing; a row for each training episode of each agent."""
-    rn.check_stored(settings, [settings.objective])
-    tables = [*rn.real_curves(settings)]
+    reward_networks.check_stored(settings, [settings.objective])
+    tables = [*rn_curves.real_curves(settings)]
     for variant in settings.variants:
-        rns = rn.learn(settings, variant, settings.objective).ranked(settings.rns)
-        tables += rn.rn_curves(settings, variant, rns)
-    return rn.by_row(settings, pd.concat(tables))
+        rns = reward_networks.learn(settings, variant, settings.objective).ranked(settings.rns)
+        tables += rn_curves.rn_curves(settings, variant, rns)
+    return rn_curves.by_row(settings, pd.concat(tables))
 
 
 def report(settings: RnPerformance, curves: pd.DataFrame) -> pd.DataFrame:
     solved_reward = settings.task.solved_reward
-    rn.require_rows(settings, curves)
-    rn.draw(settings, {f"test return on {settings.env}": curves}, 3.1, "performance.png")
-    summary = rn.summarise(curves, solved_reward, settings.max_steps)
+    rn_curves.require_rows(settings, curves)
+    rn_curves.draw(settings, {f"test return on {settings.env}": curves}, 3.1, "performance.png")
+    summary = rn_curves.summarise(curves, solved_reward, settings.max_steps)
     bonuses = set(settings.bonuses) - {"none"}
     with_bonus = f" (with a bonus: {settings.bonus_groups})" if bonuses else ""
     note = (
         f"The best {settings.rns} of {settings.learned} RNs of each variant, learned by "
         f"{settings.objective}, with {settings.num_agents} agents each, and as many groups on the "
-        f"real task{with_bonus}; {rn.common_note(settings, solved_reward)} The paper shows "
+        f"real task{with_bonus}; {rn_curves.common_note(settings, solved_reward)} The paper shows "
         "curves and gives no numbers: on each of these tasks some variant learns faster than all "
         "agents without an RN, the additive ones most reliably."
     )
     title = f"Agents trained with reward networks and tested on {settings.env}"
-    return publish(settings, title, rn.make_table(summary), summary, note)
+    return publish(settings, title, rn_curves.make_table(summary), summary, note)
 
 
 EXPERIMENT = Experiment(settings=RnPerformance, compute=compute, report=report, about=__doc__)

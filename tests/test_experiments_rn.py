@@ -11,7 +11,7 @@ from test_experiments import CURVES, RNS, refuse_to_compute
 import sejax
 from experiments import rn_heatmap, rn_objectives, rn_performance
 from experiments.common import reward_networks as rn
-from experiments.common import runs, shards
+from experiments.common import rn_curves, runs, shards
 from experiments.common.reward_networks import STUDIES
 from experiments.common.statistics import bootstrap_interval
 from experiments.rn_heatmap import RnHeatmap
@@ -187,24 +187,24 @@ def curves_of(world, num_groups):
 
 def test_the_summary_is_over_agents():
     curves = curves_of("real", 2)
-    (row,) = rn.summarise(curves, -12.0, max_steps=300).itertuples()
+    (row,) = rn_curves.summarise(curves, -12.0, max_steps=300).itertuples()
     # Ten tests in a row: solved at episodes 14, 15, 16 and 17.
     assert row.steps_mean == np.mean([140, 150, 160, 170]) and row.solved == 1.0
     assert row.last_return == -12.0 and -50 < row.return_mean < -12
-    never = rn.summarise(curves, 0.0, max_steps=300).iloc[0]
+    never = rn_curves.summarise(curves, 0.0, max_steps=300).iloc[0]
     assert never["steps_mean"] == 300 and never["solved"] == 0.0
 
 
 def test_shares_are_of_the_groups_of_the_same_seeds():
     # Steps to solve of group g: 140 + 20 g and 150 + 20 g.
     curves = pd.concat([curves_of("real", 5), curves_of("icm", 2), curves_of("real_rn", 5)])
-    summary = rn.summarise(curves, -12.0, max_steps=300).set_index("world")
+    summary = rn_curves.summarise(curves, -12.0, max_steps=300).set_index("world")
     assert summary["steps_mean"].tolist() == [185, 155, 185]
     assert summary["share_of_bare"].tolist() == [1, 1, 1]
     turned = pd.concat([curves_of("icm", 1), curves_of("real", 5)])  # in whatever order
-    assert rn.summarise(turned, -12.0, max_steps=300)["share_of_bare"].tolist() == [1, 1]
-    alone = rn.summarise(curves_of("icm", 2), -12.0, max_steps=300)
-    assert np.isnan(alone["share_of_bare"][0]) and not rn.make_table(alone).iat[0, 4]
+    assert rn_curves.summarise(turned, -12.0, max_steps=300)["share_of_bare"].tolist() == [1, 1]
+    alone = rn_curves.summarise(curves_of("icm", 2), -12.0, max_steps=300)
+    assert np.isnan(alone["share_of_bare"][0]) and not rn_curves.make_table(alone).iat[0, 4]
 
 
 def test_rows_of_other_settings_are_refused():
@@ -213,13 +213,13 @@ def test_rows_of_other_settings_are_refused():
     rows = pd.concat(
         [curves_of("real", 5), curves_of("icm", 2), curves_of("additive_potential", 5)]
     )
-    rn.require_rows(settings, rows)
+    rn_curves.require_rows(settings, rows)
     for wrong, said in (({"rns": 4}, r"^rns must be 5, .*got 4\. Set rns=5, or from_rows=false"),
                         ({"bonus_groups": 5}, r"^bonus_groups must be 2, .*got 5"),
                         ({"rows": ("default", "tuned")}, r"^rows must be \[default\], .*tuned"),
                         ({"num_agents": 10}, r"^num_agents must be 2, .*got 10")):  # fmt: skip
         with pytest.raises(ConfigError, match=said):
-            rn.require_rows(dataclasses.replace(settings, **wrong), rows)
+            rn_curves.require_rows(dataclasses.replace(settings, **wrong), rows)
 
 
 def test_intervals_draw_rns_or_agents_and_need_five_of_them():
@@ -227,12 +227,12 @@ def test_intervals_draw_rns_or_agents_and_need_five_of_them():
         ("additive_potential", 145 + 20 * np.arange(5)),  # the groups' means
         ("real", 140 + 10 * np.arange(10)),
     ):
-        (row,) = rn.summarise(curves_of(world, 5), -12.0, max_steps=300).itertuples()
+        (row,) = rn_curves.summarise(curves_of(world, 5), -12.0, max_steps=300).itertuples()
         assert (row.steps_low, row.steps_high) == bootstrap_interval(independent)
         assert row.return_low < row.return_mean < row.return_high
-    few = rn.summarise(curves_of("additive_potential", 4), -12.0, max_steps=300)
+    few = rn_curves.summarise(curves_of("additive_potential", 4), -12.0, max_steps=300)
     assert few[["steps_low", "return_high"]].isna().all(axis=None)
-    shown = rn.make_table(few).iloc[0]
+    shown = rn_curves.make_table(few).iloc[0]
     assert shown["steps to solve"] == "175" and "[" not in shown["mean return over training"]
 
 

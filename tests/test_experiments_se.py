@@ -285,7 +285,7 @@ def evaluated(env, params, task, training, keys):
     All depths would be compiled otherwise.
     """
     varied = sejax.make_agent(sejax.DDQNConfig(**TINY_AGENT), task, varied=True)
-    draws = jax.vmap(lambda key: varied.draw(drawing_key(key)))(keys)
+    draws = jax.vmap(lambda key: varied.varied.draw(drawing_key(key)))(keys)
     chosen = np.flatnonzero(draws.variant == draws.variant[0])
     agent = varied.varied.agents[int(draws.variant[0])]
 
