@@ -23,7 +23,7 @@ from sejax import envs, registry
 from sejax.errors import ConfigError
 from sejax.gym import GYMNASIUM_IDS, RealTask, SyntheticEnv, SyntheticWorld, make
 from sejax.gym.tasks import real_task
-from sejax.ops.sealed import seal, unseal
+from sejax.ops.checksummed import pack, unpack
 from sejax.proxies import MAX_ABS_VALUE
 from sejax.proxies.configs import SyntheticConfig
 from sejax.proxies.stored import find, pretrained_names
@@ -525,9 +525,9 @@ def test_what_is_no_single_se_is_one_message(tmp_path, stored):
     with pytest.raises(ConfigError, match=r"^source must be one of .*got 'carpole'"):
         make("carpole")
     path = stored(env)
-    tensors, header = unseal(path.read_bytes(), "sejax")
+    tensors, header = unpack(path.read_bytes(), "sejax")
     tensors = {name: np.full_like(x, np.nan) for name, x in tensors.items()}
-    path.write_bytes(seal(tensors, "sejax", header))
+    path.write_bytes(pack(tensors, "sejax", header))
     with pytest.raises(ConfigError, match=r"^weights must be .* numbers that are not finite"):
         make(path)
 
@@ -539,21 +539,21 @@ def test_what_is_no_single_se_is_one_message(tmp_path, stored):
      ("cliff_walking-rn", {"bogus": 1})],
 )  # fmt: skip
 def test_a_strangers_file_sets_no_options_that_the_task_does_not_have_here(tmp_path, name, given):
-    tensors, header = unseal(find(name).read_bytes(), "sejax")
+    tensors, header = unpack(find(name).read_bytes(), "sejax")
     header["config"]["env"] |= given
     path = tmp_path / "strangers.safetensors"
-    path.write_bytes(seal(tensors, "sejax", header))
+    path.write_bytes(pack(tensors, "sejax", header))
     with pytest.raises(ConfigError, match=rf"^env\.{next(iter(given))} must be"):
         make(path)
 
 
 def test_weights_of_another_type_are_refused_as_in_jax(tmp_path):
-    tensors, header = unseal(find("cartpole").read_bytes(), "sejax")
+    tensors, header = unpack(find("cartpole").read_bytes(), "sejax")
     path = tmp_path / "double.safetensors"
-    path.write_bytes(seal({k: x.astype(float) for k, x in tensors.items()}, "sejax", header))
+    path.write_bytes(pack({k: x.astype(float) for k, x in tensors.items()}, "sejax", header))
     with pytest.raises(ConfigError, match=r"^weights must be those of .* got .*float64"):
         make(path)
-    path.write_bytes(seal(tensors | {"start/Dense_0/bias": np.float32([1])[0]}, "sejax", header))
+    path.write_bytes(pack(tensors | {"start/Dense_0/bias": np.float32([1])[0]}, "sejax", header))
     with pytest.raises(ConfigError, match=r"^weights must be those of"):
         make(path)
 

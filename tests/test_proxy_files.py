@@ -17,7 +17,7 @@ import sejax
 from sejax import envs, registry
 from sejax.envs import absent
 from sejax.errors import ConfigError
-from sejax.ops.sealed import seal, unseal
+from sejax.ops.checksummed import pack, unpack
 from sejax.proxies import files, stored
 from sejax.proxies.configs import RewardConfig, SyntheticConfig
 
@@ -58,13 +58,13 @@ def flat(weights):
 
 
 def header_of(path):
-    return unseal(path.read_bytes(), "sejax")
+    return unpack(path.read_bytes(), "sejax")
 
 
 def rewrite(path, change):
-    """The same file, whole and sealed, with other metadata or tensors."""
+    """The same file, whole and checksummed, with other metadata or tensors."""
     tensors, header = header_of(path)
-    path.write_bytes(seal(*change(tensors, header)))
+    path.write_bytes(pack(*change(tensors, header)))
 
 
 # --- round trips ---------------------------------------------------------------------------------
@@ -283,7 +283,7 @@ def without(*names):
     ],
 )  # fmt: skip
 def test_metadata_of_another_shape_is_one_message(path, change):
-    """Whole files, sealed by somebody who has another idea of what stands in them."""
+    """Whole files, written by somebody who has another idea of what stands in them."""
     rewrite(path, lambda tensors, header: (tensors, "sejax", change(header)))
     with pytest.raises(ConfigError) as error:
         sejax.load(path)
@@ -382,7 +382,7 @@ def test_doubles_and_arrays_of_one_number_are_saved_as_floats_and_numbers(path, 
 
 def test_tensors_of_types_that_numpy_lacks_are_refused(path):
     tensors, header = header_of(path)
-    data = seal({name: x.astype(np.uint8) for name, x in tensors.items()}, "sejax", header)
+    data = pack({name: x.astype(np.uint8) for name, x in tensors.items()}, "sejax", header)
     data = data.replace(b'"U8"', b'"F8_E5M2"', 1)  # longer by 5: taken from the padding's count
     size = int.from_bytes(data[:8], "little") + 5
     path.write_bytes(size.to_bytes(8, "little") + data[8:])

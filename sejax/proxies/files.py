@@ -23,8 +23,8 @@ from sejax.envs import absent
 from sejax.envs.absent import require_present
 from sejax.envs.base import Task
 from sejax.errors import ConfigError, require, shortened, told
+from sejax.ops.checksummed import pack
 from sejax.ops.files import write_bytes
-from sejax.ops.sealed import seal
 from sejax.proxies.base import ProxyEnv
 from sejax.proxies.stored import (
     FORMAT_VERSION,
@@ -387,14 +387,14 @@ def _write(
     }
     try:
         check_header(header)
-        sealed = seal(tensors, KEY, header)
+        packed = pack(tensors, KEY, header)
     except (LookupError, ValueError, TypeError) as error:
         raise ConfigError(
             f"config, discount and record must be plain values that sejax.load takes, because they "
             f"are kept beside the weights; got {told(error)}. Give score, generation and seed as "
             f"numbers, and config as sejax.config(...).plain() has it."
         ) from error
-    write_bytes(path, sealed)
+    write_bytes(path, packed)
 
 
 def _plain(value: Any) -> Any:

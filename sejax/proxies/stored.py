@@ -13,7 +13,7 @@ import numpy as np
 from safetensors import SafetensorError, safe_open
 
 from sejax.errors import LARGEST, ConfigError, require, shortened, unknown_name
-from sejax.ops.sealed import DamagedError, unseal
+from sejax.ops.checksummed import DamagedError, unpack
 from sejax.proxies import hub
 
 FORMAT_VERSION = 2
@@ -138,7 +138,7 @@ def read(path: Path, option: str) -> tuple[dict[str, np.ndarray], dict[str, Any]
     )
     if version == FORMAT_VERSION:
         try:
-            tensors, _ = unseal(path.read_bytes(), KEY)
+            tensors, _ = unpack(path.read_bytes(), KEY)
         except DamagedError as error:
             raise _damaged(path, option, str(error)) from error
     return tensors, stored
