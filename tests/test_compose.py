@@ -15,7 +15,7 @@ import sejax
 from sejax import envs, registry
 from sejax.cli import commands, compose, families, presets, runtime
 from sejax.cli.build import LearnConfig
-from sejax.envs.cliff_walking import CliffWalking
+from sejax.envs.gridworld import CliffWalking
 from sejax.errors import ConfigError
 from sejax.es.evosax import ALGORITHMS, EvosaxConfig
 
@@ -244,9 +244,9 @@ def test_several_agents_are_in_the_help():
         ("agents=[ddqn,ppo] agents.ddqn.name=ddqnn", "agents.ddqn must be one of ddqn"),
         ("agents=[ddqn,td3]", "agents.td3 must be one of .* in cartpole"),
         ("env=cliff_walking agents=[sarsa,q_learning] exploration=icm",
-         "exploration must suit q_learning"),
+         "exploration must fit q_learning"),
         ("proxy.done=soft proxy.horizon=null agents=[ddqn,ppo] agents.ppo.rollout_steps=3000",
-         "training.max_steps must exceed 3000, .* or agents.ppo.rollout_steps lower"),
+         "training.max_steps must exceed 3000, "),
     ],
 )  # fmt: skip
 def test_several_agents_that_cannot_be_are_one_message(words, said):
@@ -266,7 +266,7 @@ def test_a_population_of_one_is_refused_with_the_whole_message():
 
 def test_a_value_that_is_no_number_is_refused_with_the_whole_message():
     assert message("es.noise_std=nan") == (
-        "es.noise_std must be above 0 and finite, because members must differ; got nan. "
+        "es.noise_std must be above 0 and finite, because candidates must differ; got nan. "
         "Set es.noise_std=0.05."
     )
 
@@ -352,14 +352,12 @@ SOFT = ("proxy.done=soft", "proxy.horizon=null")
     ("overrides", "said"),
     [
         ((*SOFT, "env=acrobot", "agent=dueling_ddqn", "agent.warmup_episodes=10"),
-         "training.max_steps must exceed 5000, because dueling_ddqn learns nothing before with "
-         "agent.warmup_episodes=10; got 2000."),
+         "training.max_steps must exceed 5000, because dueling_ddqn learns nothing before; "
+         "got 2000."),
         ((*SOFT, "agent=ppo", "agent.rollout_steps=null", "agent.update_episodes=20"),
-         "training.max_steps must exceed 4001, because ppo learns nothing before with "
-         "agent.update_episodes=20; got 2000."),
+         "training.max_steps must exceed 4001, because ppo learns nothing before; got 2000."),
         ((*SOFT, "agent=ppo", "agent.rollout_steps=3000"),
-         "training.max_steps must exceed 3000, because ppo learns nothing before with "
-         "agent.rollout_steps=3000; got 2000."),
+         "training.max_steps must exceed 3000, because ppo learns nothing before; got 2000."),
         (("training.stop_rule=solved", "training.solved_by=train"),
          "training.solved_by must be test with stop_rule=solved"),
         (("env=cliff_walking", "proxy=rn", "training.solved_by=train"),
@@ -377,13 +375,13 @@ def test_episodes_that_may_end_early_need_no_long_budget():
 
 @pytest.mark.parametrize("env", presets.tuned("se"))
 def test_agents_learn_within_the_default_budget_of_an_se(env):
-    facts = envs.facts_of(registry.configure("env", {"name": env}))
+    spec = envs.spec_of(registry.configure("env", {"name": env}))
     for name in registry.names("agent"):
         agent = registry.find("agent", name)
-        if agent.states == facts.states and facts.actions in agent.actions:
+        if agent.states == spec.states and spec.actions in agent.actions:
             config = sejax.config([f"env={env}", f"agent={name}"])
-            longest = config.proxy.max_steps(facts.max_steps)
-            before = config.agent.steps_before_learning(longest, facts.max_steps)
+            longest = config.proxy.max_steps(spec.max_steps)
+            before = config.agent.steps_before_learning(longest, spec.max_steps)
             budget = config.training.max_episodes * longest
             budget = min(budget, config.training.max_steps or budget)
             assert budget >= 2 * before, name

@@ -1,6 +1,5 @@
 """Reward networks around Gymnasium's environments: each reward, worked by hand."""
 
-import importlib
 import json
 import pickle
 
@@ -25,7 +24,7 @@ from support import numpy_forward, random_like, shapes_of
 
 import sejax
 from sejax import envs, registry
-from sejax.envs import cliff_walking, gridworld_2x2
+from sejax.envs.gridworld import CLIFF_WALKING, ROOM_2X2
 from sejax.errors import ConfigError
 from sejax.gym import GridWorld, RewardNetwork, make
 from sejax.gym.reward import AUGMENTED_KEYS, INFO_KEYS
@@ -192,8 +191,8 @@ def test_rewards_are_those_of_the_rn_in_jax():
 # --- tasks ---------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("name", "rows"), [("cliff_walking", cliff_walking.MAP),
-                                            ("gridworld_2x2", gridworld_2x2.MAP)])  # fmt: skip
+@pytest.mark.parametrize(("name", "rows"), [("cliff_walking", CLIFF_WALKING),
+                                            ("gridworld_2x2", ROOM_2X2)])  # fmt: skip
 def test_grid_worlds_are_those_in_jax(name, rows):
     """Every step from every state, by the tables of the one in JAX, which has tests of its own."""
     task, env = envs.make(name), GridWorld(name)
@@ -266,12 +265,12 @@ def test_the_spec_of_a_wrapper_makes_the_wrapper_again(tmp_path):
 def test_numbers_of_info_have_gymnasiums_names():
     """Those of sejax's tasks; v5's halfcheetah has another name for one."""
     renamed = {"reward_run": "reward_forward"}
-    told = {name for name in registry.names("env") if registry.find("env", name).facts.has_info}
-    assert told == set(INFO_KEYS)
-    for name in told:
-        world = importlib.import_module(f"sejax.envs.mujoco.{name}").Env
-        assert tuple(renamed.get(key, key) for key in world.info_keys) == INFO_KEYS[name]
-        assert world.augmented_keys == AUGMENTED_KEYS.get(name, ())
+    specs = {name: registry.configure("env", {"name": name}).spec for name in registry.names("env")}
+    told = {name: spec for name, spec in specs.items() if spec.info_keys}
+    assert told.keys() == set(INFO_KEYS)
+    for name, spec in told.items():
+        assert tuple(renamed.get(key, key) for key in spec.info_keys) == INFO_KEYS[name]
+        assert spec.augmented_keys == AUGMENTED_KEYS.get(name, ())
 
 
 # --- what cannot be ------------------------------------------------------------------------------

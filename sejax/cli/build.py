@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from sejax import agents, envs, registry, serialize
-from sejax.agents.mixture import Families
+from sejax.agents.mixture import Mixture
 from sejax.cli import families
 from sejax.cli.families import AgentsConfig, families_of
 from sejax.errors import one_of, require, require_seed, shortened, whole
@@ -85,21 +85,21 @@ class LearnConfig:
             f"true with objective={self.name('objective')}",
             "stop_when_solved=false",
         )
-        facts, task_name = envs.facts_of(self.env), self.name("env")
-        self.proxy.require_task(facts, task_name)
+        spec, task_name = envs.spec_of(self.env), self.name("env")
+        self.proxy.require_task(spec, task_name)
         train = not all(x.agent.is_solved_for for x in families_of(self))
         if train and not self.proxy.has_real_dynamics:
-            require_reachable("training", self.training, self.proxy.max_steps(facts.max_steps))
+            require_reachable("training", self.training, self.proxy.max_steps(spec.max_steps))
         for family in families_of(self):
             with families.named(family.field):
-                agents.require_fit(family.agent, self.exploration, facts, task_name)
+                agents.require_fit(family.agent, self.exploration, spec, task_name)
                 if self.proxy.reaches_step_limit:
                     require_learning(
                         "training",
                         self.training,
                         family.agent,
-                        self.proxy.max_steps(facts.max_steps),
-                        facts.max_steps,
+                        self.proxy.max_steps(spec.max_steps),
+                        spec.max_steps,
                     )
 
     def name(self, group: str) -> str:
@@ -137,7 +137,7 @@ class LearnConfig:
         made = tuple(agents.make_agent(x.agent, task, self.exploration, varied) for x in each)
         if self.agents is None:
             return made[0]
-        return Families(
+        return Mixture(
             agents=made,
             names=tuple(x.key for x in each),
             weights=tuple(x.weight for x in each),

@@ -162,7 +162,7 @@ def run(
         solved_score=chunks.learner.solved_score,
         wall_s=round(clock.wall_s(), 1),
         cpu_s=round(clock.cpu_s(), 1),
-        **_cost(directory, chunks.learner.strategy.num_candidates),
+        **_cost(directory, chunks.learner.strategy.num_evaluations),
         devices=[str(device) for device in jax.devices()],
         machine=runtime.machine(),
         versions=_versions(),

@@ -1,40 +1,29 @@
-"""A task that cannot be had here, of which a proxy's file says what agents see.
+"""A task that cannot be made here, of which a proxy's file says what agents see.
 
 A synthetic environment that takes no initial states from its task needs no more: it can be loaded
-without the package that the task needs, on a device that it does not run on, or by a stranger.
+without the package that the task needs, or on a device that the task does not run on.
 """
 
 import functools
 import json
 from typing import Any, NoReturn
 
-import jax.numpy as jnp
-from gymnax.environments import environment, spaces
-
 from sejax.envs.base import Task
+from sejax.envs.environment import Environment
+from sejax.envs.spec import TaskSpec
 from sejax.errors import ConfigError
 
 
-class AbsentEnv(environment.Environment[Any, Any]):
-    """Spaces alone: whoever wants to reset or step it is told why there is no more.
+class AbsentEnv(Environment):
+    """Spaces alone; `reset_env` and `step_env` raise the reason why there is no more."""
 
-    Attributes:
-      reason: the message of the error that says why.
-      observes_vectors: that `as_vectors` need not reset it to see what it observes.
-    """
-
-    observes_vectors = True
-
-    def __init__(self, task_name: str, interface: dict[str, Any], reason: str):
-        super().__init__()
-        self.reason = reason
-        self._task_name = task_name
-        self._observation = _space(interface["observation"])
-        self._action = _space(interface["action"])
+    def __init__(self, task_name: str, spec: TaskSpec, reason: str):
+        self._task_name, self._reason = task_name, reason
+        self.spaces = spec.observation, spec.action
 
     def fail(self) -> NoReturn:
         """Raises the reason as a `ConfigError`."""
-        raise ConfigError(self.reason)
+        raise ConfigError(self._reason)
 
     def reset_env(self, key: Any, params: Any) -> NoReturn:
         self.fail()
@@ -46,27 +35,15 @@ class AbsentEnv(environment.Environment[Any, Any]):
     def name(self) -> str:
         return self._task_name
 
-    @property
-    def num_actions(self) -> int:
-        return (
-            self._action.n if isinstance(self._action, spaces.Discrete) else self._action.shape[0]
-        )
-
-    def action_space(self, params: Any = None) -> Any:
-        return self._action
-
-    def observation_space(self, params: Any = None) -> Any:
-        return self._observation
-
 
 def make(name: str, interface: dict[str, Any], origin: dict[str, Any], reason: str) -> Task:
     """The task of that name, built once; what needs more than its interface raises `reason`.
 
     Args:
       name: of the task.
-      interface: as of `Task.interface`.
-      origin: as of `Task.origin`, for files that are written of it.
-      reason: why the task itself cannot be had.
+      interface: as of `TaskSpec.interface`.
+      origin: as of `Task`, for files that are written of it.
+      reason: why the task itself cannot be made.
     """
     return _make(name, json.dumps([interface, origin], sort_keys=True), reason)
 
@@ -74,12 +51,9 @@ def make(name: str, interface: dict[str, Any], origin: dict[str, Any], reason: s
 @functools.cache
 def _make(name: str, known: str, reason: str) -> Task:
     interface, origin = json.loads(known)
-    return Task(
-        name=name,
-        env=AbsentEnv(name, interface, reason),
-        max_steps=interface["max_steps"],
-        origin=origin,
-    )
+    spec = TaskSpec.of_interface(interface)
+    env = AbsentEnv(name, spec, reason)
+    return Task(name=name, env=env, max_steps=spec.max_steps, origin=origin)
 
 
 def require_present(task: Task) -> Task:
@@ -91,13 +65,3 @@ def require_present(task: Task) -> Task:
     if isinstance(task.env, AbsentEnv):
         task.env.fail()
     return task
-
-
-def _space(plain: dict[str, Any]) -> Any:
-    if "n" in plain:
-        return spaces.Discrete(plain["n"])
-    low, high = (
-        jnp.array([end if x is None else x for x in plain[name]], jnp.float32)
-        for name, end in (("low", -jnp.inf), ("high", jnp.inf))
-    )
-    return spaces.Box(low, high, low.shape, jnp.float32)

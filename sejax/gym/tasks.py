@@ -68,7 +68,7 @@ class RealTask:
 
     @classmethod
     def of_interface(cls, interface: Mapping[str, Any]) -> "RealTask":
-        """What a proxy's file says of its task, `sejax.Task.interface`; it has no `starts`."""
+        """What a proxy's file says of its task (`TaskSpec.interface`); it has no `starts`."""
         return cls(
             observation_space=_space(interface["observation"]),
             action_space=_space(interface["action"]),
@@ -155,7 +155,7 @@ def real_env(
     options = serialize.to_plain(spec)
     if options.pop("backend", "mujoco") not in GYMNASIUM_BACKENDS:
         return None
-    max_steps = spec.facts.max_steps
+    max_steps = spec.spec.max_steps
     if name in MAPS:
         return TimeLimit(GridWorld(name, **options), max_steps)
     return make_gymnasium(GYMNASIUM_IDS[name], max_steps, render_mode=render_mode, **options)
@@ -189,7 +189,7 @@ def step_limit(header: Mapping[str, Any]) -> int | None:
     config = header["config"]["env"]
     if config.get("name") not in (*GYMNASIUM_IDS, *MAPS):
         return None
-    return int(registry.configure("env", config).facts.max_steps)
+    return int(registry.configure("env", config).spec.max_steps)
 
 
 def unknown_task(config: Mapping[str, Any], fix: str) -> ConfigError:
@@ -207,7 +207,7 @@ def unknown_task(config: Mapping[str, Any], fix: str) -> ConfigError:
 
 
 def _space(plain: Mapping[str, Any]) -> spaces.Space[Any]:
-    """A space of `sejax.Task.interface`."""
+    """A space of `sejax.envs.TaskSpec.interface`."""
     if "n" in plain:
         return spaces.Discrete(plain["n"])
     low, high = (

@@ -1,6 +1,6 @@
 """The contract of a proxy: an environment with weights that stands in for a real task.
 
-A proxy is a gymnax 1.x `Environment` whose `EnvParams` hold the weights, so that an agent trains in
+A proxy is an `Environment` whose `EnvParams` hold the weights, so that an agent trains in
 it as in any other environment. What the inner loop must know beside that is told by `is_real`,
 `episode_limit` and `prepare`, of a proxy and of any other environment.
 """
@@ -11,23 +11,23 @@ from typing import Any
 
 import jax
 from flax import struct
-from gymnax.environments import environment
 from jaxtyping import Array
 
 from sejax.envs.base import Task
+from sejax.envs.environment import Environment, EnvParams
 from sejax.errors import require
 from sejax.proxies import ProxyConfig
 
 
 @struct.dataclass
-class ProxyParams(environment.EnvParams):
+class ProxyParams(EnvParams):
     """Weights of a proxy, as from its `init_weights`, and the step limit of its episodes."""
 
     weights: Any = None
     max_steps_in_episode: int = 1
 
 
-class ProxyEnv(environment.Environment[Any, Any], ABC):
+class ProxyEnv(Environment, ABC):
     """A proxy of a task; subclasses add `init_weights`, `reset_env` and `step_env`.
 
     `step_env` may put two entries into its `info`: "discount", what a target bootstraps with before
@@ -43,7 +43,6 @@ class ProxyEnv(environment.Environment[Any, Any], ABC):
     """
 
     def __init__(self, task: Task, config: Any):
-        super().__init__()
         require(
             isinstance(config, ProxyConfig),
             "proxy",
@@ -52,6 +51,7 @@ class ProxyEnv(environment.Environment[Any, Any], ABC):
             type(config).__name__,
             f"class {type(config).__name__}(sejax.ProxyConfig)",
         )
+        self.spaces = task.observation, task.action
         self.task = task
         self.config = config
         self._default_params: Any = None
@@ -105,16 +105,6 @@ class ProxyEnv(environment.Environment[Any, Any], ABC):
     @property
     def name(self) -> str:
         return f"{type(self).__name__.removesuffix('Env')}-{self.task.name}"
-
-    @property
-    def num_actions(self) -> int:
-        return self.task.env.num_actions
-
-    def action_space(self, params: Any = None) -> Any:
-        return self.task.env.action_space(self.task.params)
-
-    def observation_space(self, params: Any = None) -> Any:
-        return self.task.env.observation_space(self.task.params)
 
 
 def is_real(env: Any) -> bool:
