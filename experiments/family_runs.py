@@ -98,7 +98,7 @@ def evaluate(settings: FamilyRuns, name: str, ses: Any, config: Any) -> pd.DataF
     """
     (family,) = config.agents.families
     training = dataclasses.replace(config.training, test_episodes=settings.test_episodes)
-    seeds = {f"{name}-{seed:02d}-{ses.fingerprint(i)}": seed for i, seed in enumerate(ses.seeds)}
+    seeds = {f"{name}-{seed:02d}-{ses[i].fingerprint}": seed for i, seed in enumerate(ses.seeds)}
     tables = []
     for hparams in settings.tested_hparams:
         world = World.of_set(

@@ -122,12 +122,12 @@ def collect(configs: list[Any], path: Path, before: Any = None) -> None:
         several = [folder / "proxies" / f"seed{seed}.safetensors" for seed in seeds]
         sources += several if config.num_seeds > 1 else [folder]
     sets = [*([before] if before else []), *map(sejax.load_set, sources)]
-    places = [(each, i) for each in sets for i in range(each.size)]
+    proxies = [proxy for each in sets for proxy in each]
     sejax.save_set(
         path,
         sets[0].env,
-        [each.one(i).weights for each, i in places],
-        [each.records[i] for each, i in places],
+        [proxy.params.weights for proxy in proxies],
+        [proxy.record for proxy in proxies],
         before.config if before else build.to_plain(configs[0]),
         sets[0].discount,
     )

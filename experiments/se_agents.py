@@ -52,7 +52,7 @@ def se_world(settings: SeAgents, ses: Any, kind: str) -> World:
     )
     # The weights' hash is in the name, so that sets can share a folder: se_models then finds those
     # of se_performance.
-    names = [f"se-{seed:02d}-{ses.fingerprint(i)}" for i, seed in enumerate(ses.seeds)]
+    names = [f"se-{seed:02d}-{ses[i].fingerprint}" for i, seed in enumerate(ses.seeds)]
     return World.of_set(ses, names, name=kind, agent=agent, training=training, hparams="varied")
 
 

@@ -117,7 +117,7 @@ def compute(settings: SePerformance) -> pd.DataFrame:
     """Trains what is missing; a row for each agent."""
     sets = load_sets(settings)
     for name, ses in sets.items():
-        print(f"{name}: {ses.size} SEs, {ses.solved().size} of which reached the threshold")
+        print(f"{name}: {len(ses)} SEs, {len(solved_ones(ses))} of which reached the threshold")
     task = envs.make(task_name(settings, sets))
     tables = []
     for kind in settings.agents:
@@ -130,6 +130,11 @@ def compute(settings: SePerformance) -> pd.DataFrame:
             for name, world in worlds.items()
         ]
     return pd.concat(tables, ignore_index=True)
+
+
+def solved_ones(ses: Any) -> Any:
+    """The SEs whose score, a mean return, reached the task's threshold."""
+    return ses[ses.scores >= ses.task.solved_reward]
 
 
 def load_sets(settings: SePerformance) -> dict[str, Any]:
@@ -150,8 +155,8 @@ def load_sets(settings: SePerformance) -> dict[str, Any]:
             f"{ses.path} with {learned_with} ones",
             f"{learned_with}={ses.path}",
         )
-        solved = ses.solved()
-        sets[name] = (solved if solved.size else ses).first(settings.num_ses)
+        solved = solved_ones(ses)
+        sets[name] = (solved if len(solved) else ses)[: settings.num_ses]
     return sets
 
 
@@ -172,7 +177,7 @@ def task_name(settings: SePerformance, sets: dict[str, Any]) -> str:
 
 def real_world(settings: SePerformance, task: Any, sets: dict[str, Any], kind: str) -> World:
     """The real task for a number of groups of agents; training ends by the solved rule."""
-    as_ses = max((ses.size for ses in sets.values()), default=settings.num_ses)
+    as_ses = max((len(ses) for ses in sets.values()), default=settings.num_ses)
     count = settings.real_groups or as_ses
     # docs/reference.md 7.1: discrete TD3 trains 500 episodes on Acrobot, all others 1000.
     usual = 500 if task.name == "acrobot" and kind == "td3_discrete" else 1000

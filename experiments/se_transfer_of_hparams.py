@@ -145,8 +145,8 @@ def compute(settings: SeTransferOfHparams) -> pd.DataFrame:
     tables = []
     for name, training in parts.trainings.items():
         on_se = name == "se"
-        params = parts.ses.one(0) if on_se else task.params
-        weights = parts.ses.fingerprint(0) if on_se else ""
+        params = parts.ses[0].params if on_se else task.params
+        weights = parts.ses[0].fingerprint if on_se else ""
         groups = tuple(Group(f"{i:02d}", (params, key), weights) for i, key in enumerate(keys))
         world = World(
             name=name,

@@ -75,7 +75,7 @@ def compute(settings: SupervisedBaseline) -> pd.DataFrame:
 
 def load(settings: SupervisedBaseline) -> Any:
     """The SE, if agents can be trained on it, and the tests of its NES run recorded."""
-    ses = sejax.load_set(settings.proxy, option="proxy", kind="se").first(1)
+    ses = sejax.load_set(settings.proxy, option="proxy", kind="se")[:1]
     require(
         ses.task.num_states is None and ses.task.num_actions is not None,
         "proxy",

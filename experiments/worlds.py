@@ -60,8 +60,10 @@ class World:
     @classmethod
     def of_set(cls, proxies: Any, names: Iterable[str], **rest: Any) -> Self:
         """The proxies of a `ProxySet`, one for each group; the first ones again for more groups."""
-        places = [(name, i % proxies.size) for i, name in enumerate(names)]
-        groups = tuple(Group(name, proxies.one(i), proxies.fingerprint(i)) for name, i in places)
+        ones = [proxies[i % len(proxies)] for i in range(len(names))]
+        groups = tuple(
+            Group(name, one.params, one.fingerprint) for name, one in zip(names, ones, strict=True)
+        )
         settings = {"proxy": proxies.config["proxy"], **rest.pop("settings", {})}
         return cls(env=proxies.env, task=proxies.task, groups=groups, settings=settings, **rest)
 
@@ -217,7 +219,7 @@ def tuned_agent(env: str, kind: str) -> Any:
 
 def training_as_learned(proxies: Any, agent: Any) -> TrainingConfig:
     """How long an agent trains on a set of SEs: as those that they were learned with."""
-    return proxies.proxy(0).training_for(agent)
+    return sejax.training_of(proxies, agent)
 
 
 def outcome_rows(outcome: Any, drawn: dict[str, np.ndarray]) -> pd.DataFrame:

@@ -308,7 +308,7 @@ def test_agents_of_a_configuration_share_what_is_drawn():
 def test_a_tuned_agent_trains_on_the_real_task_as_long_as_on_the_se():
     of = se_transfer_of_hparams.SeTransferOfHparams.of
     parts = se_transfer_of_hparams.parts_of(of(run=["agent.batch_size=7"]))
-    assert parts.agent.batch_size == 7 and parts.ses.size == 1
+    assert parts.agent.batch_size == 7 and len(parts.ses) == 1
     trainings = parts.trainings
     assert list(trainings) == ["se", "same", "long"]
     assert trainings["same"].max_steps == trainings["se"].max_steps == 2000

@@ -72,8 +72,8 @@ def test_rns_are_learned_stored_and_used_once(options, rns_dir, tmp_path, monkey
     assert is_drawn(tmp_path / "performance.png")
     folder = rns_dir / "cliff_walking" / "reward_threshold"
     rns = sejax.load_set(folder / "additive_potential.safetensors", kind="rn")
-    assert rns.size == 3 and rns.config["objective"]["name"] == "reward_threshold"
-    assert len({rns.fingerprint(i) for i in range(3)}) == 3
+    assert len(rns) == 3 and rns.config["objective"]["name"] == "reward_threshold"
+    assert len({rns[i].fingerprint for i in range(3)}) == 3
     assert list(rns.seeds) == [3, 4, 5]
     with pytest.raises(ConfigError, match="proxy=se"):
         sejax.load_set(folder / "additive_potential.safetensors", kind="se")
@@ -85,7 +85,7 @@ def test_rns_are_learned_stored_and_used_once(options, rns_dir, tmp_path, monkey
     assert list(best.scores) == sorted(rns.scores)[:0:-1]
     assert list(worst.scores) == sorted(rns.scores)[:2]
     used = {one["weights"] for one in pieces_of(tmp_path, "default-additive_potential")}
-    assert used == {best.fingerprint(0), best.fingerprint(1)}
+    assert used == {best[0].fingerprint, best[1].fingerprint}
 
     refuse_to_compute(monkeypatch)
     pd.testing.assert_frame_equal(run(settings), table)
@@ -121,8 +121,8 @@ def test_a_set_grows_by_the_rns_that_it_lacks(rns_dir, options, monkeypatch, tmp
     four = rn_studies.learn(more, "additive_potential", "reward_threshold")
     assert learned == [6] and list(four.seeds) == [3, 4, 5, 6]
     assert list(four.scores[:3]) == list(three.scores)
-    assert [four.fingerprint(i) for i in range(3)] == [three.fingerprint(i) for i in range(3)]
-    assert four.fingerprint(3) not in [three.fingerprint(i) for i in range(3)]
+    assert [four[i].fingerprint for i in range(3)] == [three[i].fingerprint for i in range(3)]
+    assert four[3].fingerprint not in [three[i].fingerprint for i in range(3)]
     curves = pieces.read_rows(rn_studies.curves_file(four.path))
     assert list(curves["seed"]) == [3, 4, 5, 6]
     three.path.write_bytes(before)  # as if killed before the set was written
@@ -160,7 +160,7 @@ def test_several_runs_in_one_program_are_those_runs(options, tmp_path):
     proxy_runs.collect(alone[1:2], tmp_path / "alone.safetensors")
     one = sejax.load_set(tmp_path / "alone.safetensors", kind="rn")
     assert one.seeds[0] == 4 and one.scores[0] == rns.scores[1]
-    assert one.fingerprint(0) == rns.fingerprint(1)
+    assert one[0].fingerprint == rns[1].fingerprint
 
 
 def test_objectives_are_compared_with_the_best_and_the_worst(options, tmp_path):
@@ -196,7 +196,7 @@ def test_the_heat_map_shows_what_the_rns_pay(options, tmp_path):
     rns = rn_studies.learn(settings, "exclusive_non_potential", "reward_threshold")
     rewards = rn_heatmap.rewards_of_moves(rns)
     assert rewards.shape == (3, 48, 4) and np.isnan(rewards[:, 37:]).all()
-    potential = [float(rns.env.potential(rns.one(1), np.int32(s))) for s in (24, 0)]
+    potential = [float(rns.env.potential(rns[1].params, np.int32(s))) for s in (24, 0)]
     # From the start (row 3) UP leads to state 24, and UP from state 0 stays there.
     np.testing.assert_allclose(rewards[1, [36, 0], 3], potential, rtol=1e-5)
     stored = rn_heatmap.by_variant(settings, pieces.read_rows(settings.rows_file))

@@ -210,15 +210,14 @@ def assert_equal_trees(a, b):
 def test_a_set_that_is_saved_and_loaded_is_the_same(ses):
     path, weights = ses
     loaded = sejax.load_set(path)
-    assert loaded.size == 3 and loaded.task.name == "cartpole"
+    assert len(loaded) == 3 and loaded.task.name == "cartpole"
     for i in range(3):
-        assert_equal_trees(loaded.one(i).weights, weights[i])
+        assert_equal_trees(loaded[i].params.weights, weights[i])
     np.testing.assert_array_equal(loaded.scores, [1, 2, 3])
     assert [record["generation"] for record in loaded.records] == [4, 5, 6]
     np.testing.assert_array_equal(loaded.seeds, [7, 8, 9])
-    assert len({loaded.fingerprint(i) for i in range(3)}) == 3
-    assert_equal_trees(loaded.first(2).weights, jax.tree.map(lambda x: x[:2], loaded.weights))
-    assert loaded.first(None).size == 3
+    assert len({loaded[i].fingerprint for i in range(3)}) == 3
+    assert_equal_trees(loaded[:2].weights, jax.tree.map(lambda x: x[:2], loaded.weights))
 
 
 @pytest.mark.parametrize(("scores", "solved"), [((195.0, 194.9, 200.0), [7, 9]), ((0, 0, 0), [])])
@@ -226,7 +225,8 @@ def test_the_solved_ones_of_a_set_reached_the_threshold(ses, tmp_path, scores, s
     records = [{"score": x, "seed": 7 + i} for i, x in enumerate(scores)]
     env = sejax.load_set(ses[0]).env
     sejax.save_set(tmp_path / "s.safetensors", env, ses[1], records)
-    assert list(sejax.load_set(tmp_path / "s.safetensors").solved().seeds) == solved
+    loaded = sejax.load_set(tmp_path / "s.safetensors")
+    assert list(loaded[loaded.scores >= loaded.task.solved_reward].seeds) == solved
 
 
 def test_all_ses_of_a_set_step_at_once(ses):
@@ -234,13 +234,13 @@ def test_all_ses_of_a_set_step_at_once(ses):
     env, params = loaded.env, loaded.params
     axes = params.replace(weights=0, max_steps_in_episode=None)
     key = jax.random.key(0)
-    obs, state = env.reset_env(key, loaded.one(0))
+    obs, state = env.reset_env(key, loaded[0].params)
 
     def reward(params):
         return env.step_env(key, state, jax.numpy.int32(1), params)[2]
 
     rewards = jax.vmap(reward, in_axes=(axes,))(params)
-    np.testing.assert_allclose(rewards, [reward(loaded.one(i)) for i in range(3)], rtol=1e-6)
+    np.testing.assert_allclose(rewards, [reward(loaded[i].params) for i in range(3)], rtol=1e-6)
     assert obs.shape == (4,) and len(set(np.asarray(rewards).tolist())) == 3
 
 
@@ -248,9 +248,9 @@ def test_a_single_proxy_is_a_set_of_one(ses, tmp_path):
     env, weights = sejax.load_set(ses[0]).env, ses[1][0]
     sejax.save(tmp_path / "p.safetensors", env, weights, score=12.5, generation=7, seed=2)
     loaded = sejax.load_set(tmp_path / "p.safetensors")
-    assert (loaded.size, loaded.scores[0], loaded.seeds[0]) == (1, 12.5, 2)
-    assert_equal_trees(loaded.one(0).weights, weights)
-    assert loaded.fingerprint(0) == sejax.load_set(ses[0]).fingerprint(0)
+    assert (len(loaded), loaded.scores[0], loaded.seeds[0]) == (1, 12.5, 2)
+    assert_equal_trees(loaded[0].params.weights, weights)
+    assert loaded[0].fingerprint == sejax.load_set(ses[0])[0].fingerprint
 
 
 def test_files_that_are_no_set_are_refused(ses, tmp_path):
@@ -330,7 +330,7 @@ def test_feasibility_learns_as_sejax_run_does_and_is_not_done_twice(two_runs, mo
     mine = made[made["seed"] == 4]
     np.testing.assert_allclose(mine["incumbent_mean"], result.info.incumbent_mean, rtol=1e-6)
     assert stored.seeds.tolist() == [3, 4]
-    assert_equal_trees(stored.one(1).weights, result.weights)
+    assert_equal_trees(stored[1].params.weights, result.weights)
     assert stored.scores[1] == pytest.approx(float(result.score))
 
     monkeypatch.setattr(session.Chunks, "advance", refuse)
@@ -525,9 +525,9 @@ def check_as_evaluation(ses, agents):
     loaded, task = sejax.load_set(ses[0]), envs.make("cartpole")
     key = jax.random.fold_in(jax.random.key(3), 1)
     keys = jax.numpy.stack([jax.random.fold_in(key, i) for i in range(3)])
-    mine = agents[agents["group"] == f"se-{loaded.seeds[1]:02d}-{loaded.fingerprint(1)}"]
+    mine = agents[agents["group"] == f"se-{loaded.seeds[1]:02d}-{loaded[1].fingerprint}"]
     training = sejax.TrainingConfig(max_steps=40, stop_rule="never", test_episodes=2)
-    chosen, expected = evaluated(loaded.env, loaded.one(1), task, training, keys)
+    chosen, expected = evaluated(loaded.env, loaded[1].params, task, training, keys)
     np.testing.assert_allclose(mine["test_return"].iloc[chosen], expected.test_return, rtol=1e-6)
     np.testing.assert_allclose(mine["return_0"] + mine["return_1"], 2 * mine["test_return"])
     assert (mine["train_steps"] == 40).all() and mine["hidden_size"].between(1, 6).all()

@@ -194,7 +194,7 @@ def test_a_recorded_training_is_the_training(se_file, capacity):
     agent = sejax.make_agent(sejax.DDQNConfig(**TINY_AGENT), ses.task)
     training = sejax.TrainingConfig(max_steps=90, max_episodes=12, stop_rule="never")
     recorder = se_histograms.last_steps(capacity)
-    key, params = jax.random.key(1), ses.one(0)
+    key, params = jax.random.key(1), ses[0].params
     short = params.replace(max_steps_in_episode=9)
     plain = jax.jit(make_trainer(agent, ses.env, training))(key, short)
     result = jax.jit(make_trainer(agent, ses.env, training, recorder=recorder))(key, short)
@@ -281,7 +281,7 @@ def check_responses(ses, test, response):
         if min(np.abs(move - came).max() for move in moves) > 1e-4:
             continue  # another episode begins
         action = int(np.argmin([np.abs(move - came).max() for move in moves]))
-        vector, reward, _ = ses.env.predict(ses.one(0).weights, jnp.float32(state), action)
+        vector, reward, _ = ses.env.predict(ses[0].params.weights, jnp.float32(state), action)
         said = response[[*states, "reward"]].iloc[row].to_numpy(float)
         np.testing.assert_allclose(np.append(vector, reward), said, atol=1e-4)
         actions.add(action)

@@ -29,7 +29,7 @@ from sejax.envs import cliff_walking, gridworld_2x2
 from sejax.errors import ConfigError
 from sejax.gym import GridWorld, RewardNetwork, make
 from sejax.gym.reward import AUGMENTED_KEYS, INFO_KEYS
-from sejax.proxies import stored
+from sejax.proxies import header
 from sejax.proxies.configs import VARIANTS, RewardConfig
 
 KEY = jax.random.key(0)
@@ -232,7 +232,7 @@ def test_the_time_limit_is_the_tasks_and_there_once():
     assert [env.step(3)[3] for _ in range(50)] == [False] * 49 + [True]
 
 
-@pytest.mark.parametrize("name", [x for x in stored.pretrained_names() if x.endswith("-rn")])
+@pytest.mark.parametrize("name", [x for x in header.pretrained_names() if x.endswith("-rn")])
 @pytest.mark.filterwarnings("ignore:.*different from the unwrapped version:UserWarning",
                             "ignore:.*m.*imum value is -?infinity:UserWarning",
                             "ignore:.*Not able to test alternative:UserWarning")  # fmt: skip

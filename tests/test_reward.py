@@ -367,7 +367,7 @@ def test_a_loaded_potential_pays_with_the_discount_of_its_agent(tmp_path):
     assert discount == 0.7
     sejax.save(tmp_path / "rn.safetensors", env, weights, build.to_plain(config), discount)
     for params in (sejax.load(tmp_path / "rn.safetensors")[1],
-                   sejax.load_set(tmp_path / "rn.safetensors").one(0)):  # fmt: skip
+                   sejax.load_set(tmp_path / "rn.safetensors")[0].params):  # fmt: skip
         _, state = env.reset(jax.random.key(0), params)
         _, _, reward, *_ = env.step(jax.random.key(1), state, 3, params)  # up, from 36 to 24
         expected = 0.7 * phi(env, weights, 24) - phi(env, weights, 36)

@@ -29,7 +29,6 @@ from sejax.cli import build, checkpoints, commands, progress, run_directory, ses
 from sejax.cli.metrics import COLUMNS, FAMILY_COLUMNS
 from sejax.cli.progress import RunProgress
 from sejax.errors import ConfigError
-from sejax.proxies import files
 
 # A room of 2 x 2 cells for tables: what takes time is importing and compiling.
 TINY = [
@@ -97,11 +96,11 @@ def test_a_run_writes_the_files_of_the_design(uninterrupted):
 
 def test_the_stored_proxy_is_the_one_of_the_best_generation(uninterrupted):
     scores = [float(row["incumbent_mean"]) for row in rows(uninterrupted)]
-    record = files.load_proxy(uninterrupted).record
+    record = sejax.load_proxy(uninterrupted).record
     assert record["score"] == pytest.approx(max(scores))
     best = max(range(6), key=lambda generation: (scores[generation], generation))
     assert record["generation"] == best not in (0, 5)
-    last = files.load_proxy(uninterrupted / "proxy_last.safetensors").record
+    last = sejax.load_proxy(uninterrupted / "proxy_last.safetensors").record
     assert last["generation"] == 5 and last["score"] == pytest.approx(scores[-1])
 
 
@@ -159,10 +158,10 @@ def test_several_seeds_write_a_proxy_each(two_seeds):
     assert {path.name for path in (two_seeds / "proxies").iterdir()} == names
     best = []
     for i, seed in enumerate((12, 13)):
-        record = files.load_proxy(two_seeds / "proxies" / f"seed{seed}.safetensors").record
+        record = sejax.load_proxy(two_seeds / "proxies" / f"seed{seed}.safetensors").record
         best.append(max(float(row["incumbent_mean"]) for row in rows(two_seeds)[i::2]))
         assert record["seed"] == seed and record["score"] == pytest.approx(best[i])
-    assert files.load_proxy(two_seeds).record["score"] == pytest.approx(max(best))
+    assert sejax.load_proxy(two_seeds).record["score"] == pytest.approx(max(best))
 
 
 def test_a_population_that_diverges_finishes_and_is_counted(tmp_path):
@@ -267,7 +266,7 @@ def test_metrics_and_proxies_tell_of_each_family(two_families):
         assert float(row["incumbent_mean"]) == pytest.approx(mean, abs=1e-6)
         assert all(row[f"num_nonfinite_{key}"] == "0" for key in keys)
     for name, of in (("proxy", None), ("proxy_last", -1)):
-        record = files.load_proxy(two_families / f"{name}.safetensors").record
+        record = sejax.load_proxy(two_families / f"{name}.safetensors").record
         row = made[record["generation"] if of is None else of]
         scores = {key: pytest.approx(float(row[f"incumbent_mean_{key}"])) for key in keys}
         assert record["scores"] == scores

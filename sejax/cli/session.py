@@ -17,7 +17,7 @@ from sejax.cli import build, commands, runtime
 from sejax.cli.follower import Follower
 from sejax.cli.run_directory import RunDirectory
 from sejax.ops.parallel import compiler_options
-from sejax.proxies import files
+from sejax.proxies.io import save
 
 
 class Reporter(Protocol):
@@ -252,7 +252,7 @@ class Proxies:
             return
         names = self.program.mixture.names
         by_agent = dict(zip(names, map(float, scores), strict=True))
-        files.save(
+        save(
             self.folder / f"{name}.safetensors",
             self.program.proxy,
             self.program.unravel(flat),

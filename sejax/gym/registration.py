@@ -21,11 +21,10 @@ from sejax.gym.tasks import (
     make_gymnasium,
     real_env,
     real_task,
-    step_limit,
     unknown_task,
 )
 from sejax.gym.vector import SyntheticVectorEnv
-from sejax.proxies import stored
+from sejax.proxies.header import Header, pretrained_names
 
 if TYPE_CHECKING:
     from stable_baselines3.common.vec_env import VecEnv
@@ -59,7 +58,7 @@ def make(
     """
     weights, header = read(source)
     env: SyntheticEnv | RewardNetwork
-    name = re.sub(r"[^\w.:-]+", "-", header["task"]) or "proxy"  # as Gymnasium's ids must be
+    name = re.sub(r"[^\w.:-]+", "-", header.task) or "proxy"  # as Gymnasium's ids must be
     if _is_rn(header):
         env, name = RewardNetwork(_real_env(header, task, render_mode), source), f"{name}-rn"
     else:
@@ -148,7 +147,7 @@ def register() -> list[str]:
       >>> register()[0], gymnasium.make("sejax/acrobot").action_space
       ('sejax/acrobot', Discrete(3))
     """
-    specs = [_spec(name, source=name) for name in stored.pretrained_names()]
+    specs = [_spec(name, source=name) for name in pretrained_names()]
     for spec in specs:
         gymnasium.registry.setdefault(spec.id, spec)
     return [spec.id for spec in specs]
@@ -182,16 +181,16 @@ def _require_no_picture(render_mode: str | None) -> None:
     )
 
 
-def _is_rn(header: Mapping[str, Any]) -> bool:
-    return header["config"]["proxy"]["name"] == "rn"
+def _is_rn(header: Header) -> bool:
+    return header.kind == "rn"
 
 
 def _world(
-    weights: Mapping[str, np.ndarray], header: Mapping[str, Any], task: RealTask | str | None
+    weights: Mapping[str, np.ndarray], header: Header, task: RealTask | str | None
 ) -> SyntheticWorld:
     """What a file of an SE holds."""
-    config = registry.configure("proxy", header["config"]["proxy"])
-    limit = step_limit(header)
+    config = registry.configure("proxy", header.config["proxy"])
+    limit = header.interface["max_steps"]
     if isinstance(task, str):
         task = RealTask.of_gymnasium(task, limit)
     require(
@@ -204,8 +203,8 @@ def _world(
     )
     if task is None:
         task = real_task(header, needs_starts=config.needs_task)
-    elif "interface" in header:
-        learned = RealTask.of_interface(header["interface"]).action_space
+    else:
+        learned = RealTask.of_interface(header.interface).action_space
         require(
             is_close(task.action_space, learned),
             "task",
@@ -215,20 +214,19 @@ def _world(
             "task to one with these, as gymnasium.wrappers.RescaleAction "
             "makes of the real environment",
         )
-    own = task.max_steps if limit is None else limit
     require(
-        config.max_steps(task.max_steps) == config.max_steps(own),
+        config.max_steps(task.max_steps) == config.max_steps(limit),
         "task",
-        f"have the max_steps that the SE was learned with, {own}",
+        f"have the max_steps that the SE was learned with, {limit}",
         "its episodes end there",
         task.max_steps,
-        f"task=dataclasses.replace(task, max_steps={own})",
+        f"task=dataclasses.replace(task, max_steps={limit})",
     )
     return SyntheticWorld(weights, config, task)
 
 
 def _real_env(
-    header: Mapping[str, Any], task: RealTask | str | None, render_mode: str | None
+    header: Header, task: RealTask | str | None, render_mode: str | None
 ) -> gymnasium.Env[Any, Any]:
     """The task of an RN."""
     require(
@@ -241,7 +239,7 @@ def _real_env(
     )
     if isinstance(task, str):
         return make_gymnasium(task, render_mode=render_mode)
-    env = real_env(header["config"]["env"], render_mode)
+    env = real_env(header.config["env"], render_mode)
     if env is None:
-        raise unknown_task(header["config"]["env"], "sejax.gym.RewardNetwork(env, source)")
+        raise unknown_task(header.config["env"], "sejax.gym.RewardNetwork(env, source)")
     return env

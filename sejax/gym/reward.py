@@ -107,11 +107,11 @@ class RewardNetwork(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
         )
         super().__init__(env)
         weights, header = read(source, "rn")
-        self.config: RewardConfig = registry.configure("proxy", header["config"]["proxy"])
+        self.config: RewardConfig = registry.configure("proxy", header.config["proxy"])
         discount = as_python(discount)
         if discount is not None:
-            fraction("discount", discount, header["discount"])
-        self.discount = float(header["discount"] if discount is None else discount)
+            fraction("discount", discount, header.discount)
+        self.discount = float(header.discount if discount is None else discount)
         self.limit_is_terminal = limit_is_terminal
         require(
             not isinstance(env.unwrapped, CliffWalkingEnv),
@@ -122,11 +122,10 @@ class RewardNetwork(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
             env,
             f"env=sejax.gym.make({str(source)!r}), which is whole",
         )
-        self._info_keys = self._keys(header["task"], info_keys)
+        self._info_keys = self._keys(header.task, info_keys)
         obs_dim = vector_size(env.observation_space, "env.observation_space")
         self._num_states = num_categories(env.observation_space)
-        if "interface" in header:
-            _require_task(env, RealTask.of_interface(header["interface"]), header["task"])
+        _require_task(env, RealTask.of_interface(header.interface), header.task)
         networks.check(weights, _shapes(self.config, obs_dim, len(self._info_keys)))
         self._weights = weights.get("info_weights")  # [info_keys]
         self._layers = networks.layers_of(weights, "potential")

@@ -12,6 +12,7 @@ from gymnasium.wrappers import TimeLimit
 from sejax import registry, serialize
 from sejax.errors import ConfigError, require, shortened, told
 from sejax.gym.gridworld import MAPS, GridWorld
+from sejax.proxies.header import Header
 
 # The tasks that Gymnasium has too, with the same spaces, dynamics and initial states.
 GYMNASIUM_IDS = {
@@ -161,7 +162,7 @@ def real_env(
     return make_gymnasium(GYMNASIUM_IDS[name], max_steps, render_mode=render_mode, **options)
 
 
-def real_task(header: Mapping[str, Any], needs_starts: bool) -> RealTask:
+def real_task(header: Header, needs_starts: bool) -> RealTask:
     """What an SE takes from the task that its file is of: from the file itself, if that will do.
 
     Args:
@@ -171,25 +172,15 @@ def real_task(header: Mapping[str, Any], needs_starts: bool) -> RealTask:
     Raises:
       ConfigError: if it is one that must be given.
     """
-    if "interface" in header and not needs_starts:
-        return RealTask.of_interface(header["interface"])
-    config = header["config"]["env"]
+    if not needs_starts:
+        return RealTask.of_interface(header.interface)
+    config = header.config["env"]
     if (env := real_env(config)) is not None:
         return RealTask.of_env(env)
     gymnax_id = str(config.get("name")).removeprefix(PREFIX)
     if gymnax_id != config.get("name") and gymnax_id in gymnasium.registry:
         return RealTask.of_gymnasium(gymnax_id, registry.configure("env", config).max_steps)
     raise unknown_task(config, "sejax.gym.make(source, task=sejax.gym.RealTask(...))")
-
-
-def step_limit(header: Mapping[str, Any]) -> int | None:
-    """Steps of an episode of the task that a file is of; None if neither file nor task says."""
-    if "interface" in header:
-        return int(header["interface"]["max_steps"])
-    config = header["config"]["env"]
-    if config.get("name") not in (*GYMNASIUM_IDS, *MAPS):
-        return None
-    return int(registry.configure("env", config).facts.max_steps)
 
 
 def unknown_task(config: Mapping[str, Any], fix: str) -> ConfigError:

@@ -6,16 +6,19 @@ it as in any other environment. What the inner loop must know beside that is tol
 """
 
 import copy
+import functools
+import json
 from abc import ABC, abstractmethod
-from typing import Any
+from typing import Any, NoReturn
 
 import jax
+import jax.numpy as jnp
 from flax import struct
-from gymnax.environments import environment
+from gymnax.environments import environment, spaces
 from jaxtyping import Array
 
 from sejax.envs.base import Task
-from sejax.errors import require
+from sejax.errors import ConfigError, require
 from sejax.proxies import ProxyConfig
 
 
@@ -132,3 +135,92 @@ def prepare(env: Any, params: Any, discount: Array | float | None, limit_is_term
     if not isinstance(env, ProxyEnv):
         return params
     return env.prepare(params, discount, limit_is_terminal)
+
+
+# --- a task that cannot be made here --------------------------------------------------------------
+
+
+class AbsentEnv(environment.Environment[Any, Any]):
+    """The spaces of a task that cannot be made here, for an SE that needs no more of it.
+
+    Such an SE can be loaded without the package that its task needs, on a device that the task does
+    not run on, or by a stranger. `reset_env` and `step_env` raise the reason as a `ConfigError`.
+
+    Attributes:
+      reason: message of the error that says why the task is absent.
+      observes_vectors: that `as_vectors` need not reset it to see what it observes.
+    """
+
+    observes_vectors = True
+
+    def __init__(self, task_name: str, interface: dict[str, Any], reason: str):
+        super().__init__()
+        self.reason = reason
+        self._task_name = task_name
+        self._observation = _space(interface["observation"])
+        self._action = _space(interface["action"])
+
+    def fail(self) -> NoReturn:
+        raise ConfigError(self.reason, "task")
+
+    def reset_env(self, key: Any, params: Any) -> NoReturn:
+        self.fail()
+
+    def step_env(self, key: Any, state: Any, action: Any, params: Any) -> NoReturn:
+        self.fail()
+
+    @property
+    def name(self) -> str:
+        return self._task_name
+
+    @property
+    def num_actions(self) -> int:
+        is_discrete = isinstance(self._action, spaces.Discrete)
+        return self._action.n if is_discrete else self._action.shape[0]
+
+    def action_space(self, params: Any = None) -> Any:
+        return self._action
+
+    def observation_space(self, params: Any = None) -> Any:
+        return self._observation
+
+
+def absent_task(name: str, interface: dict[str, Any], origin: dict[str, Any], reason: str) -> Task:
+    """A task of which no more is known than what a proxy's file says; built once.
+
+    Args:
+      name: of the task.
+      interface: see `Task.interface`.
+      origin: see `Task.origin`, for files that are written of it.
+      reason: why the task itself cannot be made.
+    """
+    return _absent_task(name, json.dumps([interface, origin], sort_keys=True), reason)
+
+
+@functools.cache
+def _absent_task(name: str, known: str, reason: str) -> Task:
+    interface, origin = json.loads(known)
+    env = AbsentEnv(name, interface, reason)
+    return Task(name=name, env=env, max_steps=interface["max_steps"], origin=origin)
+
+
+def require_present(task: Task) -> Task:
+    """The task, if it can be run.
+
+    Raises:
+      ConfigError: for one of `absent_task`: why it cannot.
+    """
+    if isinstance(task.env, AbsentEnv):
+        task.env.fail()
+    return task
+
+
+def _space(plain: dict[str, Any]) -> Any:
+    """A space of `Task.interface`."""
+    if "n" in plain:
+        return spaces.Discrete(plain["n"])
+    low, high = (
+        jnp.array([end if x is None else x for x in plain[name]], jnp.float32)
+        for name, end in (("low", -jnp.inf), ("high", jnp.inf))
+    )
+    return spaces.Box(low, high, low.shape, jnp.float32)
