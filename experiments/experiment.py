@@ -15,6 +15,7 @@ import pandas as pd
 
 from experiments.pieces import by_pattern, read_rows, write_rows
 from experiments.settings import RUN_PREFIX, Settings, as_word
+from sejax import registry, serialize
 from sejax.cli import commands, runtime
 from sejax.errors import ConfigError, nearest, require, shortened
 from sejax.ops.files import write_text
@@ -38,6 +39,11 @@ class Experiment:
         Raises:
           ConfigError: for settings or files that cannot work, or a folder of other settings.
         """
+        fields = serialize.to_plain(settings).items()
+        with registry.only_typed(f"{name}={value}" for name, value in fields):
+            return self._run(settings)
+
+    def _run(self, settings: Settings) -> pd.DataFrame:
         if not settings.from_rows:
             write_rows(settings.rows_file, self.compute(settings))
             if settings.pieces.made_with:
@@ -52,7 +58,8 @@ class Experiment:
             print(self.help())
             return
         try:
-            settings = self.settings.of(**parse(self.settings, words))
+            with registry.only_typed(words):
+                settings = self.settings.of(**parse(self.settings, words))
         except ConfigError as error:
             commands.fail(str(error), commands.BAD_INPUT)
         runtime.configure_xla(settings.devices)

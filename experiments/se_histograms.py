@@ -37,8 +37,7 @@ from experiments.settings import Settings, count, each_of, setting
 from experiments.tables import as_texts, publish
 from experiments.worlds import Measure, World, train_groups, training_as_learned
 from sejax import registry
-from sejax.agents import replay
-from sejax.agents.memory import Memory, MemoryMaker
+from sejax.agents.buffers import Buffer, BufferMaker, write_row
 from sejax.training import TrainingConfig
 
 SOURCES = {
@@ -179,10 +178,10 @@ class LastSteps:
     episode: Any  # that goes on, `[]`
 
 
-def last_steps(capacity: int) -> MemoryMaker:
+def last_steps(capacity: int) -> BufferMaker:
     """A recorder of the last `capacity` steps of a training."""
 
-    def make(example: Any, max_steps: int) -> Memory:
+    def make(example: Any, max_steps: int) -> Buffer:
         def init() -> LastSteps:
             rows = jnp.zeros((capacity, 2 + example.next_obs.shape[0]))
             return LastSteps(rows=rows, episode=jnp.int32(0))
@@ -191,11 +190,11 @@ def last_steps(capacity: int) -> MemoryMaker:
             first = jnp.stack([jnp.float32(kept.episode), jnp.float32(made.reward)])
             row = jnp.concatenate([first, made.next_obs])
             return LastSteps(
-                rows=replay.write_row(kept.rows, step, row, active),
+                rows=write_row(kept.rows, step, row, active),
                 episode=kept.episode + (ended & active),
             )
 
-        return Memory(init=init, store=store, batch=lambda *_: None)
+        return Buffer(init=init, store=store, batch=lambda *_: None)
 
     return make
 

@@ -19,7 +19,7 @@ _EXPORTS = {
     "AUCSum": "sejax.objectives",
     "Agent": "sejax.agents.base",
     "ConfigError": "sejax.errors",
-    "CountBasedConfig": "sejax.agents.count_based",
+    "CountBasedConfig": "sejax.agents.exploration",
     "DDQNConfig": "sejax.agents.dqn",
     "DQNConfig": "sejax.agents.dqn",
     "DiscreteTD3Config": "sejax.agents.td3",
@@ -27,7 +27,7 @@ _EXPORTS = {
     "EvosaxConfig": "sejax.es.evosax",
     "Families": "sejax.agents.mixture",
     "FamiliesConfig": "sejax.agents.mixture",
-    "ICMConfig": "sejax.agents.icm",
+    "ICMConfig": "sejax.agents.exploration",
     "LearnResult": "sejax.bilevel",
     "MaxReward": "sejax.objectives",
     "NESConfig": "sejax.es.nes",
@@ -76,9 +76,8 @@ if TYPE_CHECKING:  # what a type checker and an editor see
     from sejax import agents, envs, es, gym, options, proxies
     from sejax.agents import make_agent
     from sejax.agents.base import Agent
-    from sejax.agents.count_based import CountBasedConfig
     from sejax.agents.dqn import DDQNConfig, DQNConfig, DuelingDDQNConfig
-    from sejax.agents.icm import ICMConfig
+    from sejax.agents.exploration import CountBasedConfig, ICMConfig
     from sejax.agents.mixture import Families, FamiliesConfig
     from sejax.agents.ppo import PPOConfig
     from sejax.agents.sac import SACConfig

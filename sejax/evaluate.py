@@ -164,8 +164,7 @@ def proxy_study(config: EvaluateConfig) -> Study:
             agents.require_fit(family.agent, exploration, task.facts, task.name)
             group, training = _training_on(proxy, config, family.agent)
             build.require_real_returns(group, training)
-            trains = not getattr(family.agent, "is_solved_for", False)
-            if trains:
+            if not family.agent.is_solved_for:
                 require_reachable(group, training, proxy.env.max_steps)
             if proxy.env.config.reaches_step_limit:
                 build.require_learning(
@@ -176,7 +175,7 @@ def proxy_study(config: EvaluateConfig) -> Study:
     if config.baseline:
         for family in families:
             require(
-                not getattr(family.agent, "is_solved_for", False),
+                not family.agent.is_solved_for,
                 "baseline",
                 f"be false with {family.field}={family.key}",
                 "only a one-step SE can be solved for",

@@ -547,7 +547,7 @@ def evaluated(env, params, task, training, keys):
     varied = sejax.make_agent(sejax.DDQNConfig(**TINY_AGENT), task, varied=True)
     draws = jax.vmap(lambda key: varied.draw(drawing_key(key)))(keys)
     chosen = np.flatnonzero(draws.variant == draws.variant[0])
-    agent = varied.variants[int(draws.variant[0])]
+    agent = varied.varied.agents[int(draws.variant[0])]
 
     @jax.jit
     def evaluate(key, hparams):

@@ -57,7 +57,8 @@ def test_an_address_names_repository_revision_and_file(address, parts):
     "hf://", "hf://me", "hf://me/", "hf://me/se/", "hf://me/se/pytorch_model.bin",
     "hf://me/se/proxy.pkl", "hf://me/se/../../x.safetensors", "hf://../se", "hf://me/se@",
     "hf://" + "/" * 100,
-    "hf://me/se/" + "a/" * 100 + "x.safetensors", "hf://me/se/.hidden.safetensors", "hf://me/se/proxy.safetensors\n", "hf://datasets/me/se",
+    "hf://me/se/" + "a/" * 100 + "x.safetensors", "hf://me/se/.hidden.safetensors",
+    "hf://me/se/proxy.safetensors\n", "hf://datasets/me/se",
 ])  # fmt: skip
 def test_what_is_no_address_or_no_safetensors_file_is_refused(address):
     with pytest.raises(ConfigError) as error:

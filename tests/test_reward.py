@@ -247,7 +247,7 @@ def test_the_discount_is_the_agents():
 
 
 def test_an_agent_without_a_discount_is_told_where_one_is_needed():
-    agent = Agent(init=None, act=None, update=None, memory=None, hparams={"rate": 0.1})
+    agent = Agent(init=None, act=None, update=None, buffer=None, hparams={"rate": 0.1})
     env = make_env("cliff_walking")
     with pytest.raises(
         ConfigError, match=r"^agent must say its discount, because additive_potential"
@@ -280,7 +280,7 @@ def test_steps_on_a_reward_network_are_real_and_scored():
     config = sejax.config([*LEARN, "es.num_incumbent_evals=2", "devices=1"])
     result = jax.jit(sejax.make_learner(config))(jax.random.key(0))
     info = jax.device_get(result.info)
-    steps, real = info.train_steps_total[0], info.env_steps_total[0]
+    steps, real = info.train_steps.sum(), info.real_steps.sum()
     assert real > steps  # those of the tests between and after the training episodes as well
     # -(n_tr + 100 max(0, C_sol - C_fin)), at most 12 episodes of 50 steps, a return of at least
     # -149 where the task is solved at -20.
@@ -299,7 +299,7 @@ def test_training_on_a_reward_network_stops_when_tests_on_the_real_task_solve_it
         evaluate = make_evaluator(agent, env, task, config.training)
         return evaluate(jax.random.key(0), params).train_episodes
 
-    first_that_counts = agent.warmup_episodes + 1
+    first_that_counts = agent.spec.warmup_episodes + 1
     assert episodes(-1000.0) == first_that_counts
     assert episodes(0.0) == config.training.max_episodes == 12
 
@@ -312,7 +312,7 @@ def test_the_area_under_the_curve_is_of_trainings_that_go_on_when_solved(objecti
     asked = []
     monkeypatch.setattr(bilevel, "make_population_evaluator",
                         lambda agent, proxy, training, *_: asked.append(training))  # fmt: skip
-    bilevel.make_program(**config.parts())
+    bilevel.make_bilevel(**config.parts())
     changes = {"stop_rule": "never", "tests_between": 1}
     assert asked == [dataclasses.replace(config.training, **changes)]
 

@@ -90,7 +90,7 @@ class Cluster:
         assert options == {"num_cpus": 1, "num_gpus": 0.5, "max_retries": 0}
         return lambda function: SimpleNamespace(remote=self._start)
 
-    def _start(self, words, gpu_share):
+    def _start(self, words, gpu_share, typed):
         assert "study=some" in words and gpu_share == 0.5
         self.timeouts += [word for word in words if word.startswith("timeout=")]
         worker, self.started = self.started, self.started + 1
@@ -256,7 +256,7 @@ def test_workers_keep_to_their_share_of_a_gpu_and_the_driver_to_the_cpu(search, 
     search(cluster)
     assert taken == [0]  # of the search's driver
     with pytest.raises(Told):
-        importlib.import_module("sejax.search.cluster")._work(["study=some"], 0.5)
+        importlib.import_module("sejax.search.cluster")._work(["study=some"], 0.5, [])
     cluster.remote = remote
     crew = importlib.import_module("sejax.machines.ray_crew").RayCrew(
         SimpleNamespace(workers=1, gpus_per_worker=0.5), {}, (4,)

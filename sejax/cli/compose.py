@@ -55,12 +55,14 @@ def config(overrides: Sequence[str] = ()) -> build.LearnConfig:
       >>> config(["env=acrobot", "generations=7"]).generations
       7
     """
-    return learn_config(_compose("run", overrides))
+    with registry.only_typed(overrides):
+        return learn_config(_compose("run", overrides))
 
 
 def evaluate_config(overrides: Sequence[str] = ()) -> build.EvaluateConfig:
     """As `config`, for the words after `python -m sejax.evaluate`."""
-    return evaluate_config_of(_compose("evaluate", overrides))
+    with registry.only_typed(overrides):
+        return evaluate_config_of(_compose("evaluate", overrides))
 
 
 def learn_config(cfg: DictConfig) -> build.LearnConfig:

@@ -13,6 +13,7 @@ import optuna
 import ray
 from optuna.trial import TrialState
 
+from sejax import registry
 from sejax.cli import runtime
 from sejax.errors import require, told
 from sejax.machines import ray_crew
@@ -66,9 +67,10 @@ class _Workers:
 
     def recruit(self) -> None:
         """Starts workers where there is room."""
-        words = _words(self._search, self.timeout)
+        words, search = _words(self._search, self.timeout), self._search
+        typed = [*search.fixed, *(x.text for x in search.space.values())]
         for _ in range(ray_crew.num_workers(self._search.machines) - len(self)):
-            started = self._start.remote(words, self._search.machines.gpus_per_worker)
+            started = self._start.remote(words, search.machines.gpus_per_worker, typed)
             self._running[started] = self._losses
 
     def wait(self) -> list[Any]:
@@ -151,12 +153,19 @@ def _words(search: Search, timeout: float | None) -> list[str]:
     return [f"{name}={value}" for name, value in own.items() if value is not None]
 
 
-def _work(words: list[str], gpu_share: float) -> None:
-    """A worker: joins the study and takes trials until there are none."""
+def _work(words: list[str], gpu_share: float, typed: list[str]) -> None:
+    """A worker: joins the study and takes trials until there are none.
+
+    Args:
+      words: of its command.
+      gpu_share: of a GPU.
+      typed: words of the search, as the driver has read them: what they name may be imported.
+    """
     runtime.configure_xla(1)
     runtime.take_share_of_gpu(gpu_share)
     from sejax.search import settings, study
 
     runtime.configure_jax()
-    found, search = study.open_study(settings.read(words))
-    study.work(found, search, study.runner_of(search), lambda text: None)
+    with registry.only_typed(typed):
+        found, search = study.open_study(settings.read(words))
+        study.work(found, search, study.runner_of(search), lambda text: None)

@@ -1,8 +1,13 @@
-"""Intrinsic curiosity: a bonus for steps whose outcome the agent cannot yet predict.
+"""Intrinsic rewards: an agent that learns from rewards with a bonus for what is new to it.
 
-Source: Pathak et al., "Curiosity-driven Exploration by Self-supervised Prediction" (2017); paper,
-appendix, tables of ICM; `docs/reference.md` 4.8. The forward model's residual blocks are those
-of Burda et al., "Large-Scale Study of Curiosity-Driven Learning" (2019).
+Curiosity (ICM) pays for steps whose outcome the agent cannot yet predict, count-based exploration
+for actions that a tabular agent has rarely learned from.
+
+Source: Pathak et al., "Curiosity-driven Exploration by Self-supervised Prediction" (2017); Burda
+et al., "Large-Scale Study of Curiosity-Driven Learning" (2019), for the forward model's residual
+blocks; Strehl and Littman, "An Analysis of Model-Based Interval Estimation for Markov Decision
+Processes" (2008); paper, appendix, tables of ICM and of count-based Q-learning, and section
+"Experiments with Reward Networks", paragraph "Baselines"; `docs/reference.md` 4.7 and 4.8.
 """
 
 import dataclasses
@@ -15,27 +20,51 @@ import jax.numpy as jnp
 import optax
 from flax import linen as nn
 from flax import struct
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
-from sejax.agents.base import Agent, traced
-from sejax.agents.memory import Rollout
-from sejax.agents.replay import Transition
+from sejax.agents.base import Agent, AgentState, ExplorationConfig, Hparams, traced
+from sejax.agents.buffers import Rollout, Transition
+from sejax.agents.tabular import entry_of, mask_of
 from sejax.ops import flat
 from sejax.ops.networks import MLP, Dense
-from sejax.options import MOST_LAYERS, Options, counts, fraction, not_negative, option, positive
+from sejax.options import MOST_LAYERS, counts, fraction, not_negative, option, positive
+
+
+def _with_bonus(agent: Agent, **changes: Any) -> Agent:
+    """An agent with these changes, whose state and hyperparameters hold those of the one inside.
+
+    They are the state's `agent_state` and the hyperparameters' `agent`.
+    """
+
+    def begin_episode(state: Any, episode: Array) -> Any:
+        return state.replace(agent_state=agent.begin_episode(state.agent_state, episode))
+
+    def act(key: Array, state: Any, obs: Array, explore: bool) -> Array:
+        return agent.act(key, state.agent_state, obs, explore)
+
+    return dataclasses.replace(
+        agent,
+        begin_episode=begin_episode,
+        act=act,
+        discount=lambda hparams: agent.discount(hparams.agent),
+        batch_size=lambda state: agent.batch_size(state.agent_state),
+        **changes,
+    )
+
+
+# --- curiosity -----------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, kw_only=True)
-class ICMConfig(Options):
+class ICMConfig(ExplorationConfig):
     """Intrinsic curiosity module (paper, appendix, tables of ICM).
 
     The defaults are the paper's values optimized for CartPole, as in the authors' scripts. Its text
     says that all experiments have its defaults: 1e-4, 0.2, 0.5 and 64 features.
     """
 
-    group: ClassVar[str] = "exploration"
-    states: ClassVar[str] = "vector"  # of the agents that it is made for
-    learns_each_step: ClassVar[bool] = True  # and so must the agent
+    states: ClassVar[str | None] = "vector"
+    needs_each_step: ClassVar[bool] = True  # its module learns once at each step
 
     learning_rate: float = option(1e-5, positive("Adam would not move"), traced=True)
     # beta: the forward model's share of the loss
@@ -55,17 +84,17 @@ class ICMConfig(Options):
 class CuriousHparams(NamedTuple):
     """Traced hyperparameters of a curious agent: those of the agent inside, and the module's."""
 
-    agent: Any
-    icm: Any
+    agent: Hparams
+    icm: Hparams
 
 
 class CuriousState(struct.PyTreeNode):
     """One curious agent: the state of the agent inside, and the module's."""
 
-    agent_state: Any
+    agent_state: AgentState
     params: Float[Array, " num_params"]
     opt_state: optax.OptState
-    hparams: Any  # the module's traced options
+    hparams: Hparams  # the module's traced options
 
 
 class ICMOutputs(NamedTuple):
@@ -192,12 +221,6 @@ def with_icm(
             hparams=jax.tree.map(jnp.float32, hparams.icm),
         )
 
-    def begin_episode(state: CuriousState, episode: Array) -> CuriousState:
-        return state.replace(agent_state=agent.begin_episode(state.agent_state, episode))
-
-    def act(key: Array, state: CuriousState, obs: Array, explore: bool) -> Array:
-        return agent.act(key, state.agent_state, obs, explore)
-
     def outputs(params: Any, batch: Transition) -> ICMOutputs:
         action = as_vectors(batch.action, action_width)
         made: Any = model.apply(params, batch.obs, action, batch.next_obs)
@@ -242,16 +265,13 @@ def with_icm(
         _, state = jax.lax.while_loop(lambda carry: carry[0], learn, (rollout.is_full, state))
         return state
 
-    return dataclasses.replace(
+    return _with_bonus(
         agent,
         init=init,
-        begin_episode=begin_episode,
-        act=act,
         update=update,
         hparams=CuriousHparams(agent=agent.hparams, icm=traced(config)),
-        cpu_num_parallel=1,  # its networks are no small ones, whatever the agent's
-        discount=lambda hparams: agent.discount(hparams.agent),
-        batch_size=lambda state: agent.batch_size(state.agent_state),
+        # The module's networks keep a core busy, whatever the agent's.
+        spec=dataclasses.replace(agent.spec, cpu_num_parallel=1),
     )
 
 
@@ -306,3 +326,90 @@ def as_vectors(action: Array, width: int) -> Float[Array, "width batch"]:
 def _is_index(action: Array) -> bool:
     """Whether a feature-major batch of actions holds indices."""
     return action.ndim == 1
+
+
+# --- counts --------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, kw_only=True)
+class CountBasedConfig(ExplorationConfig):
+    r"""A bonus :math:`\beta / n(s, a)^p` for rarely taken actions."""
+
+    states: ClassVar[str | None] = "discrete"
+
+    reward_scale: float = option(0.1, not_negative("it scales a bonus"))  # beta
+    # p: 1 in the paper's text, 0.5 in the authors' code
+    count_power: float = option(1.0, positive("the bonus would not fade"))
+
+    def make(self, agent: Agent, task: Any) -> Agent:
+        """The agent with the bonus."""
+        return with_count_bonus(agent, self, task.num_states, task.num_actions)
+
+
+class CountingHparams(NamedTuple):
+    """Traced hyperparameters of a counting agent: those of the agent inside, and the bonus's."""
+
+    agent: Hparams
+    reward_scale: Array | float  # beta
+
+
+@struct.dataclass
+class CountingState:
+    """One counting agent: the state of the agent inside, and the learning steps on each pair."""
+
+    agent_state: AgentState
+    counts: Int[Array, "num_states num_actions"]
+    reward_scale: Array
+
+
+@functools.cache
+def with_count_bonus(
+    agent: Agent, config: CountBasedConfig, num_states: int, num_actions: int
+) -> Agent:
+    r"""The same agent, learning from rewards with a bonus for rare pairs of state and action.
+
+    .. math:: n(s, a) \leftarrow n(s, a) + 1, \quad r \leftarrow r + \beta / n(s, a)^p
+
+    for the step at hand, before the learning step of the agent inside. The power p is 1 in the
+    paper's text and 1/2 in the authors' code.
+
+    Args:
+      agent: one that learns from single steps with indices as observations and actions, from
+        `sejax.agents.tabular`.
+      config: beta, in reward units, and the power.
+      num_states: number of different observations.
+      num_actions: number of different actions.
+
+    Example:
+      >>> from sejax.agents.tabular import QLearningConfig, make_q_learning
+      >>> plain = make_q_learning(QLearningConfig(), num_states=48, num_actions=4)
+      >>> agent = with_count_bonus(plain, CountBasedConfig(), num_states=48, num_actions=4)
+      >>> state = agent.init(jax.random.key(0), agent.hparams)
+      >>> int(agent.act(jax.random.key(1), state, jnp.int32(36), explore=False))
+      0
+    """
+
+    def init(key: Array, hparams: CountingHparams) -> CountingState:
+        return CountingState(
+            agent_state=agent.init(key, hparams.agent),
+            counts=jnp.zeros((num_states, num_actions), jnp.int32),
+            reward_scale=jnp.float32(hparams.reward_scale),
+        )
+
+    def update(key: Array, state: CountingState, transition: Transition) -> CountingState:
+        obs, action = transition.obs, transition.action
+        count = entry_of(state.counts, obs, action) + 1
+        is_visited = mask_of(obs, action, (num_states, num_actions))
+        bonus = state.reward_scale * count.astype(jnp.float32) ** -config.count_power
+        transition = transition._replace(reward=transition.reward + bonus)
+        return state.replace(
+            agent_state=agent.update(key, state.agent_state, transition),
+            counts=jnp.where(is_visited, count, state.counts),
+        )
+
+    return _with_bonus(
+        agent,
+        init=init,
+        update=update,
+        hparams=CountingHparams(agent=agent.hparams, reward_scale=config.reward_scale),
+    )

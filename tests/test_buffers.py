@@ -1,4 +1,4 @@
-"""sejax.agents.replay: what is stored, what gives way, and what is drawn."""
+"""sejax.agents.buffers: what is stored, what gives way, and what is drawn."""
 
 import jax
 import jax.numpy as jnp
@@ -7,19 +7,25 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sejax.agents import replay
+from sejax.agents import buffers
 
 OBS_DIM = 3
 CAPACITY = 5
 
-store = jax.jit(replay.store)
-sample = jax.jit(replay.sample, static_argnums=(3, 4))
-sample_indices = jax.jit(replay.sample_indices, static_argnums=2)
+
+
+@jax.jit
+def store(rows, step, transition, active=True):
+    return buffers.write_row(rows, step, buffers.pack(transition), active)
+
+
+sample = jax.jit(buffers.sample, static_argnums=(3, 4))
+sample_indices = jax.jit(buffers.sample_indices, static_argnums=2)
 
 
 def transition(number):
     """A transition all of whose entries tell its number apart from every other's."""
-    return replay.Transition(
+    return buffers.Transition(
         obs=np.arange(OBS_DIM, dtype=np.float32) + 10 * number,
         action=np.int32(number),
         reward=np.float32(number + 0.5),
@@ -29,7 +35,7 @@ def transition(number):
 
 
 def filled(num_steps):
-    rows = np.asarray(replay.init(CAPACITY, OBS_DIM))
+    rows = np.zeros((CAPACITY, buffers.row_width(OBS_DIM)), np.float32)
     for number in range(num_steps):
         rows = store(rows, np.int32(number), transition(number))
     return np.asarray(rows)
@@ -116,7 +122,7 @@ def test_indices_are_uniform_within_a_batch_and_over_batches():
     size, batch = 50, 200
     seeds = jax.random.bits(jax.random.key(0), (500,))
     indices = np.asarray(
-        jax.jit(jax.vmap(lambda s: replay.sample_indices(s, np.int32(size), batch)))(seeds)
+        jax.jit(jax.vmap(lambda s: buffers.sample_indices(s, np.int32(size), batch)))(seeds)
     )
     assert abs(chi_square_z(np.bincount(indices.ravel(), minlength=size))) < 5
     for position in (0, 1, batch - 1):  # each place in the batch by itself
@@ -136,7 +142,7 @@ def test_consecutive_seeds_draw_unrelated_batches():
 def test_buffers_of_several_lanes_are_independent():
     rows = np.stack([filled(4), filled(2)])
     steps, active = np.int32([4, 2]), np.array([True, False])
-    many = jax.jit(jax.vmap(replay.store, (0, 0, None, 0)))(rows, steps, transition(9), active)
+    many = jax.jit(jax.vmap(store, (0, 0, None, 0)))(rows, steps, transition(9), active)
     np.testing.assert_array_equal(many[0], store(rows[0], steps[0], transition(9)))
     np.testing.assert_array_equal(many[1], rows[1])
 

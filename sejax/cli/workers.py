@@ -1,0 +1,366 @@
+"""`machines=`: whether this process computes the trainings of a run, or workers on a Ray cluster.
+
+The driver, this process, keeps the strategy, its state and all files. In each generation it sends
+candidates to the workers in shares, and outcomes come back. An outcome depends on its key and its
+candidate alone, so that the numbers are those of a single process whichever worker computes it. A
+worker has no state: a share whose worker is lost is sent to another one.
+
+Shares shrink towards the end of a generation (guided self-scheduling, Polychronopoulos and Kuck,
+1987), so that no worker waits long for the last one.
+"""
+
+import contextlib
+import socket
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+
+from sejax.cli.cluster import Pool, connected, num_workers
+from sejax.errors import require
+from sejax.options import Options, counts, fraction, option
+
+if TYPE_CHECKING:  # jax must not be imported before a worker has chosen its devices
+    from sejax.bilevel import Bilevel, Candidates
+    from sejax.cli.session import Chunks
+    from sejax.objectives import Outcome
+
+CAPACITY = 16  # most evaluations in a share on a CPU core, where batches follow one another
+
+
+@dataclass(frozen=True, kw_only=True)
+class LocalConfig(Options):
+    """This process computes everything: one compiled program over its devices."""
+
+    group: ClassVar[str] = "machines"
+    is_elsewhere: ClassVar[bool] = False
+
+    def make(
+        self, config: Any, folder: Path, say: Callable[[str], None]
+    ) -> contextlib.AbstractContextManager["Chunks"]:
+        """The compiled generations of a run."""
+        from sejax.cli import session  # which imports jax
+
+        return contextlib.nullcontext(session.make_chunks(config))
+
+
+@dataclass(frozen=True, kw_only=True)
+class RayConfig(Options):
+    """Worker processes on a Ray cluster."""
+
+    group: ClassVar[str] = "machines"
+    is_elsewhere: ClassVar[bool] = True
+    package: ClassVar[str] = "ray"
+
+    # HOST:PORT of the cluster; local: one on this machine; null: that of RAY_ADDRESS, or local
+    address: str | None = None
+    # worker processes; null: one for each CPU core of the cluster, or for each GPU
+    workers: int | None = option(None, counts("somebody must compute"))
+    # 0: a worker computes on a CPU core; 0.5: two workers share a GPU
+    gpus_per_worker: float = option(0.0, fraction())
+
+    def make(
+        self, config: Any, folder: Path, say: Callable[[str], None]
+    ) -> contextlib.AbstractContextManager["RemoteChunks"]:
+        """The generations of a run, computed by workers while the context is open.
+
+        Raises:
+          ConfigError: if the cluster cannot be reached, or has nothing to compute on.
+        """
+        return _remote_chunks(self, config, say)
+
+
+@contextlib.contextmanager
+def _remote_chunks(
+    machines: RayConfig, config: Any, say: Callable[[str], None]
+) -> Iterator["RemoteChunks"]:
+    from sejax.cli import build, runtime
+
+    runtime.take_share_of_gpu(0)  # GPUs are the workers'
+    from sejax.bilevel import make_bilevel
+
+    learner = make_bilevel(**config.parts() | {"devices": 1})
+    with connected(machines) as ray:
+        batches = batches_of(config, learner, machines, max(1, num_workers(machines)))
+        # A worker need not have what it has no use for.
+        plain = {
+            k: v for k, v in build.to_plain(config).items() if k not in ("tracker", "machines")
+        }
+        arguments = plain, [batch.capacity for batch in batches], machines.gpus_per_worker
+        actor = ray.remote(num_cpus=1, num_gpus=machines.gpus_per_worker)(Worker)
+        pool = Pool(
+            ray, lambda: actor.remote(*arguments, versions()), lambda: num_workers(machines), say
+        )
+        with contextlib.closing(pool):
+            yield RemoteChunks(learner, pool, batches)
+
+
+@dataclass(frozen=True)
+class Batch:
+    """How the evaluations of one agent of a mixture are computed.
+
+    Attributes:
+      capacity: most evaluations in a share.
+      width: evaluations that are computed together, so that one takes as long as all of them.
+    """
+
+    capacity: int
+    width: int
+
+
+def batches_of(
+    config: Any, learner: "Bilevel", machines: RayConfig, num_first: int
+) -> list[Batch]:
+    """The batches of each agent.
+
+    On a CPU they are the same for any number of workers, because sums over batches of other widths
+    round otherwise. A worker with a GPU computes its part of a generation at once.
+    """
+    from sejax.evaluation import num_parallel_on_cpu
+
+    batches = []
+    for agent, places in zip(learner.mixture.agents, _places(learner), strict=True):
+        if machines.gpus_per_worker:
+            capacity, width = -(-len(places) // num_first), config.num_parallel
+        else:
+            capacity = CAPACITY
+            width = config.num_parallel or num_parallel_on_cpu(agent, learner.training)
+        width = width or capacity
+        batches.append(Batch(width * -(-capacity // width), width))
+    return batches
+
+
+def cut(places: np.ndarray, batch: Batch, num_workers: int) -> Iterator[np.ndarray]:
+    """Shares of the places, each half of what is left to each worker, in whole batches."""
+    while len(places):
+        size = batch.width * -(-len(places) // (2 * num_workers * batch.width))
+        size = min(size, batch.capacity)
+        yield places[:size]
+        places = places[size:]
+
+
+def _places(learner: "Bilevel") -> list[np.ndarray]:
+    """The indices of each agent's evaluations in a generation."""
+    agents = learner.scoring.agent_of_evaluation
+    return [np.flatnonzero(agents == i) for i in range(learner.mixture.size)]
+
+
+@dataclass(frozen=True)
+class Share:
+    """Evaluations of one agent of the mixture.
+
+    Attributes:
+      agent: its index.
+      arguments: data of their keys `[n, ...]`, candidates `[n, dims]`, whether anything is computed
+        `[n]`, and the length of the test episodes that are scored, `[n]` or None.
+    """
+
+    agent: int
+    arguments: tuple[Any, ...]
+
+
+class RemoteChunks:
+    """In the place of `sejax.cli.session.Chunks`: the trainings are sent to workers.
+
+    `ask` and `tell` stay here. The state after a generation equals that of `Bilevel.generation` to
+    the last bit, if the workers' CPUs are of this one's kind.
+
+    Attributes:
+      learner: the functions of Algorithm 1.
+      cpu_s: CPU seconds of the workers in trainings.
+    """
+
+    def __init__(self, learner: "Bilevel", pool: Pool, batches: Sequence[Batch]):
+        self.learner, self.cpu_s = learner, 0.0
+        self._pool, self._batches = pool, batches
+        self._places = _places(learner)
+        self._compiled: Any = None
+
+    def init(self, key: Any) -> Any:
+        """The state before the first generation."""
+        import jax
+
+        return jax.jit(self.learner.init)(key)
+
+    def is_ready(self, length: int) -> bool:
+        """Whether this process's part is compiled, which it is for chunks of any length."""
+        return self._compiled is not None
+
+    def compile(self, length: int) -> None:
+        """Compiles `ask` and `tell`, while workers compile their part.
+
+        Both are one program that runs twice in a generation: in a program of its own XLA would
+        round the candidates of `ask` otherwise than in `Bilevel.generation`.
+        """
+        import jax
+        import jax.numpy as jnp
+
+        from sejax.ops.parallel import compiler_options
+
+        def generation(state: Any, outcome: "Outcome") -> tuple[Any, ...]:
+            asked = self.learner.ask(state)
+            return self.learner.tell(state, asked, outcome), _arguments(asked)
+
+        def evaluate(key: Any) -> "Outcome":
+            return self.learner.evaluate(self.learner.ask(self.learner.init(key)))
+
+        key = jax.random.key(0)
+        shapes = jax.eval_shape(evaluate, key)
+        self._no_outcome = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
+        jitted = jax.jit(generation, compiler_options=compiler_options())
+        state = jax.eval_shape(self.learner.init, key)
+        self._compiled = jitted.lower(state, self._no_outcome).compile()
+
+    def advance(self, state: Any, length: int) -> tuple[Any, Any]:
+        """Runs `length` generations.
+
+        Returns:
+          The state, and an info with leaves `[length, ...]`.
+
+        Raises:
+          FailedError: as of `Pool.map`.
+        """
+        import jax
+        import jax.numpy as jnp
+
+        if not self.is_ready(length):
+            self.compile(length)
+        infos = []
+        for _ in range(length):
+            _, arguments = self._compiled(state, self._no_outcome)
+            outcome = self._evaluate(jax.device_get(arguments))
+            (state, info), _ = self._compiled(state, outcome)
+            infos.append(info)
+        return state, jax.tree.map(lambda *each: jnp.stack(each), *infos)
+
+    def _evaluate(self, arguments: tuple[Any, ...]) -> "Outcome":
+        """The outcome of a generation, leaves `[evaluation, ...]`."""
+        import jax
+
+        places, shares = [], []
+        for agent, (own, batch) in enumerate(zip(self._places, self._batches, strict=True)):
+            for some in cut(own, batch, max(1, self._pool.size)):
+                places.append(some)
+                shares.append(Share(agent, _at(arguments, some)))
+        outcomes, cpu_s = zip(*self._pool.map(shares), strict=True)
+        self.cpu_s += sum(cpu_s)
+        order = np.argsort(np.concatenate(places))
+        merged: Outcome = jax.tree.map(lambda *parts: np.concatenate(parts)[order], *outcomes)
+        return merged
+
+
+def _arguments(asked: "Candidates") -> tuple[Any, ...]:
+    """What a generation's trainings need, leaves `[evaluation, ...]`; see `Share`."""
+    import jax
+    import jax.numpy as jnp
+
+    shared = asked.active, asked.eval_steps
+    of_each = jax.tree.map(lambda x: jnp.repeat(x, len(asked.params)), shared)
+    return jax.random.key_data(asked.keys), asked.params, *of_each
+
+
+def _at(arguments: tuple[Any, ...], places: np.ndarray) -> tuple[Any, ...]:
+    return tuple(x if x is None else x[places] for x in arguments)
+
+
+# --- a worker -------------------------------------------------------------------------------------
+
+
+class Worker:
+    """The compiled trainings of a run, for shares of a generation; one to a process.
+
+    Args:
+      config: of the run, plain.
+      capacities: most evaluations in a share, for each agent.
+      gpu_share: the part of a GPU that this process has; 0 for a CPU core.
+      expected: versions of the driver's packages.
+    """
+
+    def __init__(
+        self,
+        config: dict[str, Any],
+        capacities: Sequence[int],
+        gpu_share: float,
+        expected: dict[str, str],
+    ):
+        self._config, self._capacities = config, capacities
+        self._gpu_share, self._expected = gpu_share, expected
+        self._programs: list[Any] = []
+
+    def prepare(self) -> None:
+        """Compiles.
+
+        Raises:
+          ConfigError: if this machine has other versions of what decides the numbers.
+        """
+        from sejax.cli import runtime
+
+        runtime.configure_xla(1)
+        runtime.take_share_of_gpu(self._gpu_share)
+        require(
+            versions() == self._expected,
+            "machines",
+            "have the same versions everywhere",
+            "numbers differ otherwise",
+            f"{versions()} on {socket.gethostname()} and {self._expected} here",
+            "the same versions up there",
+        )
+        runtime.configure_jax()
+        from sejax.bilevel import make_bilevel
+        from sejax.cli import build
+
+        config = build.learn_config(self._config)
+        learner = make_bilevel(**config.parts() | {"devices": 1})
+        self._programs = [
+            _compiled_share(learner, agent, capacity, config.num_parallel)
+            for agent, capacity in enumerate(self._capacities)
+        ]
+
+    def evaluate(self, share: Share) -> tuple["Outcome", float]:
+        """The outcomes of a share, leaves `[n, ...]`, and the CPU seconds that they took."""
+        import jax
+
+        started = time.process_time()
+        n, capacity = len(share.arguments[0]), self._capacities[share.agent]
+        # Filled up with copies, for which nothing is computed.
+        places, is_own = np.minimum(np.arange(capacity), n - 1), np.arange(capacity) < n
+        keys, params, active, eval_steps = _at(share.arguments, places)
+        outcome = self._programs[share.agent](keys, params, active & is_own, eval_steps)
+        outcome = jax.tree.map(lambda x: x[:n], jax.device_get(outcome))
+        return outcome, time.process_time() - started
+
+
+def _compiled_share(learner: "Bilevel", agent: int, capacity: int, num_parallel: int | None) -> Any:
+    """The program that trains and tests an agent on up to `capacity` candidates."""
+    import jax
+
+    from sejax.evaluation import make_candidate_evaluator, num_parallel_on_cpu
+    from sejax.ops.parallel import compiler_options, spread_over_devices
+
+    own, training = learner.mixture.agents[agent], learner.training
+    spread = spread_over_devices(
+        make_candidate_evaluator(own, learner.proxy, training, learner.unravel),
+        1,
+        num_parallel,
+        num_parallel_on_cpu(own, training),
+    )
+
+    def evaluate(key_data: Any, *arguments: Any) -> "Outcome":
+        return spread(jax.random.wrap_key_data(key_data), *arguments)
+
+    def arguments(key: Any) -> tuple[Any, ...]:
+        asked = learner.ask(learner.init(key))
+        return _at(_arguments(asked), np.zeros(capacity, int))
+
+    shapes = jax.eval_shape(arguments, jax.random.key(0))
+    return jax.jit(evaluate, compiler_options=compiler_options()).lower(*shapes).compile()
+
+
+def versions() -> dict[str, str]:
+    """Of the packages that decide a run's numbers."""
+    from importlib.metadata import version
+
+    return {name: version(name) for name in ("sejax", "jax", "jaxlib")}

@@ -1,0 +1,177 @@
+"""Workers that die, hang, come and go, on a clock of the test's own and without Ray."""
+
+import itertools
+import random
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sejax.cli import cluster
+from sejax.cli.cluster import Pool
+from sejax.cli.workers import Batch, cut
+from sejax.errors import FailedError
+
+FOREVER = 1e9
+
+
+class Ray:
+    """The three functions of Ray that a pool uses, and workers whose answers are planned.
+
+    `fate(worker, turn)` says how many seconds what a worker does takes and how it ends: None for
+    an answer, or an exception. Turn 0 is the preparation.
+    """
+
+    def __init__(self, room=2, fate=lambda worker, turn: (1.0, None)):
+        self.room, self.fate, self.now = room, fate, 0.0
+        self.started, self.killed, self.said = 0, [], []
+        self.due = {}
+        self.references = itertools.count()
+
+    def pool(self):
+        return Pool(self, lambda: Worker(self), lambda: self.room, self.said.append, self.clock)
+
+    def clock(self):
+        return self.now
+
+    def wait(self, references, num_returns, timeout):
+        ends = sorted(self.due[reference][0] for reference in references)
+        self.now = max(self.now, min(ends[num_returns - 1], self.now + timeout))
+        done = [each for each in references if self.due[each][0] <= self.now]
+        return done[:num_returns], [each for each in references if each not in done]
+
+    def get(self, reference):
+        _, answer = self.due.pop(reference)
+        if isinstance(answer, Exception):
+            raise answer
+        return answer
+
+    def kill(self, worker):
+        self.killed.append(worker.number)
+
+
+class Worker:
+    """An actor's handle."""
+
+    def __init__(self, ray):
+        ray.started += 1
+        self.ray, self.number, self.turns = ray, ray.started, itertools.count()
+        self.prepare = self.evaluate = self
+
+    def remote(self, share=None):
+        seconds, error = self.ray.fate(self.number, next(self.turns))
+        reference = next(self.ray.references)
+        self.ray.due[reference] = self.ray.now + seconds, error or (share, self.number)
+        return reference
+
+
+def evaluated(pool, num_shares):
+    """The workers that evaluated a generation, which must be whole and in order."""
+    answers = pool.map(list(range(num_shares)))
+    assert [share for share, _ in answers] == list(range(num_shares))
+    return [worker for _, worker in answers]
+
+
+def test_shares_make_up_all_places_in_whole_batches_and_shrink():
+    shares = list(cut(np.arange(100), Batch(capacity=16, width=4), num_workers=2))
+    assert list(np.concatenate(shares)) == list(range(100))
+    assert [len(share) for share in shares] == [16, 16, 16, 16, 12, 8, 4, 4, 4, 4]
+
+
+def test_a_generation_is_divided_among_all_workers():
+    ray = Ray(room=3)
+    assert sorted(evaluated(ray.pool(), 6)) == [1, 1, 2, 2, 3, 3]
+    assert ray.now == pytest.approx(3.0)  # the start and two shares each
+
+
+@pytest.mark.parametrize("error", [ValueError("bad instruction"), RuntimeError("killed")])
+def test_the_share_of_a_lost_worker_goes_to_another_and_it_is_replaced(error):
+    ray = Ray(fate=lambda *turn: (1.0, error if turn == (1, 2) else None))
+    pool = ray.pool()
+    assert evaluated(pool, 20).count(1) == 1
+    assert ray.killed == [1]
+    assert set(evaluated(pool, 20)) == {2, 3}
+
+
+def test_a_worker_that_hangs_is_given_up_and_its_share_sent_to_another():
+    ray = Ray(fate=lambda *turn: (FOREVER if turn == (1, 2) else 1.0, None))
+    evaluated(ray.pool(), 4)
+    assert ray.killed == [1]
+    assert cluster.LEAST_S < ray.now < cluster.LEAST_S + 10
+
+
+def test_a_training_that_takes_far_longer_than_all_before_ends_in_the_end():
+    ray = Ray(room=1, fate=lambda worker, turn: (100.0 if turn == 2 or worker > 1 else 1.0, None))
+    evaluated(ray.pool(), 2)
+    assert 1 <= len(ray.killed) < cluster.MOST_LOSSES
+
+
+def test_the_first_share_may_take_long():
+    ray = Ray(room=1, fate=lambda worker, turn: (3000.0 if turn == 1 else 1.0, None))
+    evaluated(ray.pool(), 2)
+    assert not ray.killed
+
+
+def test_a_share_that_kills_every_worker_ends_the_run():
+    ray = Ray(fate=lambda worker, turn: (1.0, OSError("no space") if turn else None))
+    with pytest.raises(FailedError, match="no space"):
+        evaluated(ray.pool(), 2)
+
+
+def test_workers_that_never_start_end_the_run():
+    ray = Ray(fate=lambda worker, turn: (1.0, ImportError("no jax")))
+    with pytest.raises(FailedError, match="no jax"):
+        evaluated(ray.pool(), 2)
+
+
+def test_many_workers_may_go_with_their_node():
+    ray = Ray(room=40, fate=lambda worker, turn: (1.0, OSError("gone") if worker > 3 else None))
+    pool = ray.pool()
+    ray.room = 3
+    assert set(evaluated(pool, 50)) == {1, 2, 3}
+
+
+def test_machines_join_while_a_generation_runs():
+    ray = Ray(room=1)
+
+    def fate(worker, turn):
+        ray.room = 3 if ray.now > 5 else 1
+        return 1.0, None
+
+    ray.fate = fate
+    assert set(evaluated(ray.pool(), 20)) == {1, 2, 3}
+    assert ray.now < 15
+
+
+def test_the_user_is_told_once_while_no_worker_is_ready():
+    ray = Ray(fate=lambda worker, turn: (70.0, None))
+    evaluated(ray.pool(), 2)
+    assert len(ray.said) == 1 and "None of 2 workers" in ray.said[0]
+
+
+def test_a_pool_ends_its_workers():
+    ray = Ray(room=3)
+    pool = ray.pool()
+    evaluated(pool, 1)
+    pool.close()
+    assert sorted(ray.killed) == [1, 2, 3]
+
+
+@settings(max_examples=20)
+@given(st.integers(0, 2**32))
+def test_generations_are_whole_whatever_workers_do(seed):
+    rng = random.Random(seed)
+
+    def fate(worker, turn):
+        if rng.random() < 0.8:
+            return rng.choice([0.5, 1.0, 3.0]), None
+        if turn and rng.random() < 0.5:
+            return FOREVER, None
+        return 1.0, OSError("gone")
+
+    ray = Ray(room=rng.randint(1, 6), fate=fate)
+    pool = ray.pool()
+    for _ in range(3):
+        evaluated(pool, rng.randint(1, 40))
+        ray.room = rng.randint(1, 6)
