@@ -15,8 +15,7 @@ from typing import Any
 import numpy as np
 
 from sejax import registry, serialize
-from sejax.errors import LARGEST, ConfigError, require, shortened, told, unknown_name
-from sejax.ops.files import write_bytes
+from sejax.errors import LARGEST, ConfigError, require, shortened, unknown_name
 from sejax.ops.sealed import DamagedError, seal, unseal
 from sejax.proxies import hub
 
@@ -78,6 +77,17 @@ class Header:
     def agents(self) -> dict[str, Any]:
         """Plain values of the agents that the proxies were learned with, by their keys."""
         return agents_of(self.config)
+
+    def with_tensors(self, tensors: dict[str, np.ndarray]) -> bytes:
+        """The content of a file with this header.
+
+        Args:
+          tensors: float32 arrays by `network/layer/parameter`.
+
+        Raises:
+          TypeError or ValueError: if the header's values are not plain.
+        """
+        return seal(tensors, _KEY, vars(self))
 
 
 def agents_of(config: Mapping[str, Any]) -> dict[str, Any]:
@@ -212,6 +222,19 @@ def read(
     return tensors, header
 
 
+def read_single(
+    source: str | Path, kinds: Sequence[str] = ()
+) -> tuple[dict[str, np.ndarray], Header]:
+    """As `read`, of a file that must hold one proxy.
+
+    Raises:
+      ConfigError: as `read`, or if it holds a set.
+    """
+    tensors, header = read(source, kinds=kinds)
+    require_single(len(header.proxies), source)
+    return tensors, header
+
+
 def require_single(count: int, source: Any, option: str = "source") -> None:
     """Checks that a file holds one proxy.
 
@@ -237,28 +260,34 @@ def read_config(source: str | Path, option: str = "source") -> dict[str, Any]:
     return read(source, option)[1].config
 
 
-def write(path: Path, tensors: dict[str, np.ndarray], values: Mapping[str, Any]) -> None:
-    """Writes a file atomically.
+def check_tensors(
+    field: str,
+    tensors: Mapping[str, np.ndarray],
+    shapes: Mapping[str, tuple[int, ...]],
+    fix: str,
+) -> None:
+    """Checks that tensors are those of the networks that a configuration describes.
 
     Args:
-      path: the file.
-      tensors: float32 arrays by `network/layer/parameter`.
-      values: the fields of `Header`, without the version.
+      field: name of the argument, for messages.
+      tensors: arrays by `network/layer/parameter`.
+      shapes: shapes of the networks' parameters.
+      fix: what to set the argument to, for messages.
 
     Raises:
-      ConfigError: for values that `read` would refuse.
-      OSError: if it cannot be written; an older file stays as it was.
+      ConfigError: for other names, shapes or types, or numbers that are not finite.
     """
-    try:
-        header = serialize.from_plain(
-            Header, {"format_version": FORMAT_VERSION, **values}, "header"
-        )
-        data = seal(tensors, _KEY, vars(header))
-    except (LookupError, ValueError, TypeError) as error:
-        raise ConfigError(
-            f"config, discount and record must be plain values that sejax.load takes, because they "
-            f"are kept beside the weights; got {shortened(told(error), 80)}. Give numbers for "
-            f"score, generation and seed, and sejax.config(...).plain() for config.",
-            "config",
-        ) from error
-    write_bytes(path, data)
+    there = {name: x.shape for name, x in tensors.items()}
+    odd = [
+        f"numbers that are not finite float32 in {name}"
+        for name, x in tensors.items()
+        if x.dtype != np.float32 or not np.isfinite(x).all()
+    ]
+    require(
+        there == shapes and not odd,
+        field,
+        f"hold finite float32 tensors of the shapes {shortened(shapes, 60)}",
+        "the proxy's configuration describes such networks",
+        shortened(odd[0] if odd and there == shapes else there, 60),
+        f"{field} to {fix}",
+    )

@@ -2,8 +2,7 @@
 
 import dataclasses
 import hashlib
-import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, overload
@@ -14,19 +13,21 @@ from flax.traverse_util import flatten_dict, unflatten_dict
 
 from sejax import envs, registry
 from sejax.envs.base import Task
-from sejax.errors import ConfigError, require, shortened
+from sejax.errors import ConfigError, require, shortened, told
+from sejax.ops.files import write_bytes
 from sejax.proxies import ProxyConfig
 from sejax.proxies.base import ProxyEnv, absent_task, require_present
 from sejax.proxies.header import (
+    FORMAT_VERSION,
     Header,
     agents_of,
+    check_tensors,
+    find,
     is_registered,
     pretrained_names,
     read,
     require_single,
-    write,
 )
-from sejax.proxies.header import find as find_file
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -164,9 +165,6 @@ class ProxySet(_Stored):
             path=self.path,
         )
 
-    def __iter__(self) -> Iterator[Proxy]:
-        return (self[i] for i in range(len(self)))
-
     @property
     def scores(self) -> np.ndarray:
         """`[proxy]` float64; nan where a score is not known."""
@@ -259,33 +257,9 @@ def _checked_tensors(env: ProxyEnv, weights: Any) -> dict[str, np.ndarray]:
         type(env).__name__,
         "env to the first of the pair that sejax.load returns",
     )
-    require(
-        isinstance(weights, Mapping),
-        "weights",
-        "be nested dictionaries as env.init_weights returns",
-        "they are kept by their names",
-        type(weights).__name__,
-        "weights to params.weights",
-    )
-    tensors = {name: np.asarray(x, np.float32) for name, x in _flatten(weights).items()}
-    wanted, there = _shapes_of(env), {name: x.shape for name, x in tensors.items()}
-    require(
-        there == wanted,
-        "weights",
-        f"have the shapes {shortened(wanted, 80)}",
-        f"they are those of {env.name}",
-        shortened(there, 80),
-        "weights to those of this env",
-    )
-    odd = [name for name, x in tensors.items() if not np.isfinite(x).all()]
-    require(
-        not odd,
-        "weights",
-        "be finite",
-        "no agent could train on others",
-        f"others in {shortened(', '.join(odd), 80)}",
-        "weights to ones that were scored",
-    )
+    flat = _flatten(weights) if isinstance(weights, Mapping) else {"": np.zeros(0)}
+    tensors = {name: np.asarray(x, np.float32) for name, x in flat.items()}
+    check_tensors("weights", tensors, _shapes_of(env), "params.weights")
     return tensors
 
 
@@ -306,27 +280,29 @@ def _write(
         discount,
         "discount=params.discount, that of the agent",
     )
-    require(
-        isinstance(config, Mapping | None),
-        "config",
-        "be nested plain values",
-        "they are kept beside the weights",
-        type(config).__name__,
-        "config=sejax.config(...).plain()",
-    )
     known = {
         "env": env.task.origin or {"name": env.task.name},
         "proxy": registry.describe("proxy", env.config),
     }
-    values = {
-        "task": env.task.name,
-        "interface": env.task.interface,
-        "config": known | dict(config or {}) | {"run_dir": None},  # no path of a machine
-        "discount": 1.0 if discount is None else float(discount),
-        "is_set": is_set,
-        "proxies": [{name: _plain(x) for name, x in record.items()} for record in records],
-    }
-    write(Path(path), tensors, values)
+    try:
+        header = Header(
+            format_version=FORMAT_VERSION,
+            task=env.task.name,
+            interface=env.task.interface,
+            config={**known, **(config or {}), "run_dir": None},  # no path of a machine
+            discount=1.0 if discount is None else float(discount),
+            is_set=is_set,
+            proxies=[{name: _plain(x) for name, x in record.items()} for record in records],
+        )
+        data = header.with_tensors(tensors)
+    except (LookupError, ValueError, TypeError) as error:
+        raise ConfigError(
+            f"config, discount and record must be plain values that sejax.load takes, because they "
+            f"are kept beside the weights; got {shortened(told(error), 80)}. Give numbers for "
+            f"score, generation and seed, and sejax.config(...).plain() for config.",
+            "config",
+        ) from error
+    write_bytes(Path(path), data)
 
 
 def _plain(value: Any) -> Any:
@@ -411,22 +387,13 @@ def load_set(
       >>> len(rns), rns[0].params.discount
       (1, 0.8)
     """
-    path = find_file(source, option)
+    path = find(source, option)
     tensors, header = read(path, option, () if kind is None else (kind,))
     env = _env_of(path, header, task, proxy, option)
     if not header.is_set:
         tensors = {name: x[None] for name, x in tensors.items()}
-    wanted = {name: (len(header.proxies), *shape) for name, shape in _shapes_of(env).items()}
-    there = {name: x.shape for name, x in tensors.items()}
-    are_finite = all(x.dtype == np.float32 and np.isfinite(x).all() for x in tensors.values())
-    require(
-        there == wanted and are_finite,
-        option,
-        f"hold finite float32 tensors of the shapes {shortened(wanted, 60)}",
-        "its metadata describes such networks",
-        f"{shortened(there, 60)} in {shortened(path, 60)}",
-        f"{option} to a file that sejax has written",
-    )
+    shapes = {name: (len(header.proxies), *shape) for name, shape in _shapes_of(env).items()}
+    check_tensors(option, tensors, shapes, "a file that sejax has written")
     return ProxySet(
         env=env,
         weights=unflatten_dict(tensors, sep="/"),
@@ -500,10 +467,8 @@ def _require_same(
     does not know the bounds of observations.
     """
     same = {
-        "observation": _is_same_space(
-            learned["observation"], given["observation"], proxy.sees_bounds
-        ),
-        "action": _is_same_space(learned["action"], given["action"], with_bounds=True),
+        "observation": _is_same_space(learned, given, "observation", proxy.sees_bounds),
+        "action": _is_same_space(learned, given, "action", with_bounds=True),
         "max_steps": learned["max_steps"] == given["max_steps"] or proxy.has_real_dynamics,
     }
     for name, is_same in same.items():
@@ -517,17 +482,16 @@ def _require_same(
         )
 
 
-def _is_same_space(one: Mapping[str, Any], other: Mapping[str, Any], with_bounds: bool) -> bool:
-    """Whether two spaces of `Task.interface` are equal up to rounding."""
-    if "n" in one or "n" in other:
-        return one == other
-    if len(one["low"]) != len(other["low"]):
-        return False
-    ends = [(a, b) for end in ("low", "high") for a, b in zip(one[end], other[end], strict=True)]
-    return not with_bounds or all(
-        a == b if a is None or b is None else math.isclose(a, b, rel_tol=1e-5, abs_tol=1e-8)
-        for a, b in ends
-    )
+def _is_same_space(
+    learned: Mapping[str, Any], given: Mapping[str, Any], name: str, with_bounds: bool
+) -> bool:
+    """Whether a space of two `Task.interface` is the same up to rounding."""
+    one, other = (
+        np.array([space["n"]] if "n" in space else [space["low"], space["high"]], float)
+        for space in (learned[name], given[name])
+    )  # None is nan: no bound
+    matters = with_bounds or one.ndim == 1
+    return one.shape == other.shape and (not matters or np.allclose(one, other, equal_nan=True))
 
 
 def _flatten(weights: Any) -> dict[str, Any]:

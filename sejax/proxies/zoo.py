@@ -161,8 +161,7 @@ def describe(path: Path, name: str | None = None) -> PretrainedProxy:
     Raises:
       ConfigError: if it is damaged, of another format, or a set.
     """
-    _, stored = header.read(path)
-    header.require_single(len(stored.proxies), path)
+    _, stored = header.read_single(path)
     record = stored.proxies[0]
     scores = record.get("scores")
     if scores is None:
