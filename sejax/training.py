@@ -124,7 +124,7 @@ def training_of(proxy: Proxy | ProxySet, agent: AgentConfig | None = None) -> Tr
       >>> training_of(sejax.load_proxy("cartpole")).stop_rule
       'never'
     """
-    stored = proxy.config.get("training")
+    stored: Any = proxy.config.get("training")
     require(
         isinstance(stored, Mapping),
         "training",

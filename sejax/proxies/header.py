@@ -146,7 +146,7 @@ def find(source: str | Path, option: str = "source", also: Sequence[str] = ()) -
     """
     if hub.is_address(source):
         return hub.fetch(str(source), option)
-    text = shortened(source, 80)
+    text = shortened(source, 120)
     try:
         path = Path(source)
         is_dir, is_file = path.is_dir(), path.is_file()
