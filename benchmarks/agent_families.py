@@ -70,7 +70,7 @@ class Family:
         else:
             agent = registry.configure("agent", {"name": self.agent})
         agent = replace(agent, warmup_episodes=0)
-        limit = registry.find("env", self.env).facts.max_steps
+        limit = registry.configure("env", {"name": self.env}).spec.max_steps
         phase = agent.steps_before_learning(limit, limit)  # 0 but for PPO
         steps = max(2, -(-steps // phase)) * phase if phase else steps
         training = TrainingConfig(stop_rule="never", max_steps=steps, max_episodes=steps)

@@ -14,7 +14,7 @@ from typing import Any
 import common
 import numpy as np
 
-from sejax.envs.halfcheetah import BACKENDS
+from sejax.envs.mujoco.tasks import BACKENDS
 
 BRAX = BACKENDS[1:]  # the first is MuJoCo itself
 GAIT_STEPS = 200
@@ -143,7 +143,7 @@ def at_rest_state(env: Any) -> Any:
     """The cheetah in its model's own pose, without the noise of a reset."""
     import jax.numpy as jnp
 
-    from sejax.envs.dynamics.halfcheetah import CheetahState
+    from sejax.envs.mujoco.brax import CheetahState
 
     system = env._brax.sys
     physics = env._brax.pipeline_init(system.init_q, jnp.zeros(system.qd_size()))

@@ -19,7 +19,7 @@ from experiments import figures, rn_studies
 from experiments.experiment import Experiment
 from experiments.rn_studies import RnSettings
 from experiments.tables import publish
-from sejax.envs.cliff_walking import MAP
+from sejax.envs.gridworld import CLIFF_WALKING as MAP
 from sejax.errors import require
 
 IGNORED_BELOW = -50.0  # the right column leaves out rewards of at most this

@@ -129,7 +129,7 @@ def _real_study(config: EvaluateConfig) -> Study:
     families = families_of(config)
     for family in families:
         with named(family.field):
-            agents.require_fit(family.agent, config.exploration, envs.facts_of(spec), config.env)
+            agents.require_fit(family.agent, config.exploration, envs.spec_of(spec), config.env)
     task = envs.make_from(spec)
     training = {family.key: config.real_training for family in families}
     worlds = {"the real task": (task.env, task.params, training)}
@@ -161,7 +161,7 @@ def proxy_study(config: EvaluateConfig) -> Study:
     trainings = {}
     for family in families:
         with named(family.field):
-            agents.require_fit(family.agent, exploration, task.facts, task.name)
+            agents.require_fit(family.agent, exploration, task, task.name)
             group, training = _training_on(proxy, config, family.agent)
             build.require_real_returns(group, training)
             if not family.agent.is_solved_for:

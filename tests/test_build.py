@@ -218,7 +218,7 @@ def test_several_agents_are_families_each_made_as_it_is_alone():
     assert all(agent.varied is not None for agent in varied.parts()["agent"].agents)
 
 
-def test_a_configuration_that_says_facts_is_judged_without_making_the_task(monkeypatch):
-    monkeypatch.setattr(plugins, "make", None)
+def test_a_configuration_that_states_its_spec_is_judged_without_making_the_task(monkeypatch):
+    monkeypatch.setattr("sejax.registry.make", None)
     with pytest.raises(ConfigError, match=r"^agent must be one of .*ddqn.* in cartpole"):
         build.learn_config(build.to_plain(config()) | {"agent": {"name": "q_learning"}})

@@ -15,7 +15,7 @@ import sejax
 from sejax import envs, registry
 from sejax.cli import commands, compose, families, presets, runtime
 from sejax.cli.build import LearnConfig
-from sejax.envs.cliff_walking import CliffWalking
+from sejax.envs.gridworld import CliffWalking
 from sejax.errors import ConfigError
 from sejax.es.evosax import ALGORITHMS, EvosaxConfig
 
@@ -377,13 +377,13 @@ def test_episodes_that_may_end_early_need_no_long_budget():
 
 @pytest.mark.parametrize("env", presets.tuned("se"))
 def test_agents_learn_within_the_default_budget_of_an_se(env):
-    facts = envs.facts_of(registry.configure("env", {"name": env}))
+    spec = envs.spec_of(registry.configure("env", {"name": env}))
     for name in registry.names("agent"):
         agent = registry.find("agent", name)
-        if agent.states == facts.states and facts.actions in agent.actions:
+        if agent.states == spec.states and spec.actions in agent.actions:
             config = sejax.config([f"env={env}", f"agent={name}"])
-            longest = config.proxy.max_steps(facts.max_steps)
-            before = config.agent.steps_before_learning(longest, facts.max_steps)
+            longest = config.proxy.max_steps(spec.max_steps)
+            before = config.agent.steps_before_learning(longest, spec.max_steps)
             budget = config.training.max_episodes * longest
             budget = min(budget, config.training.max_steps or budget)
             assert budget >= 2 * before, name

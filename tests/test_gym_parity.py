@@ -5,10 +5,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode
-from gymnax.environments.classic_control import cartpole
 
 import sejax
-from sejax.envs.dynamics import gridworld, mountain_car_continuous
+from sejax.envs.dynamics.classic import CarState, CartPoleState
+from sejax.envs.dynamics.gridworld import GridState
 from sejax.gym import make, make_vec
 from sejax.proxies.reward import RewardState
 
@@ -19,11 +19,11 @@ KINDS = {kind: [proxy.name for proxy in sejax.pretrained() if proxy.kind == kind
 # What a world is in, by what is seen of it; HalfCheetah's states hold more, and its steps are held
 # against Gymnasium's in test_mujoco.py.
 WORLDS = {
-    "cartpole": lambda obs, time: cartpole.EnvState(
+    "cartpole": lambda obs, time: CartPoleState(
         x=obs[0], x_dot=obs[1], theta=obs[2], theta_dot=obs[3], time=time),
-    "mountain_car_continuous": lambda obs, time: mountain_car_continuous.EnvState(
+    "mountain_car_continuous": lambda obs, time: CarState(
         position=obs[0], velocity=obs[1], time=time),
-    "cliff_walking": lambda obs, time: gridworld.GridState(index=obs, time=time),
+    "cliff_walking": lambda obs, time: GridState(index=obs, time=time),
 }  # fmt: skip
 
 

@@ -49,7 +49,8 @@ def test_one_repeat_is_the_world_itself():
 
 
 def test_a_trainer_counts_steps_of_the_world():
-    agent = dataclasses.replace(scripted_agent(), action_repeat=3)
+    agent = scripted_agent()
+    agent = dataclasses.replace(agent, spec=dataclasses.replace(agent.spec, action_repeat=3))
     training = TrainingConfig(max_episodes=MAX_EPISODES, stop_rule="never")
     train = jax.jit(make_trainer(agent, ScriptedEnv(), training))
     result = train(KEY, script([1.0] * MAX_EPISODES, [99] * MAX_EPISODES))

@@ -27,6 +27,7 @@ from sejax.agents.buffers import (
     replay_buffer,
     rollout_buffer,
 )
+from sejax.envs.spec import TaskSpec
 from sejax.errors import require
 
 __all__ = [
@@ -82,14 +83,14 @@ def make_agent(
       10
     """
     require(
-        hasattr(task, "facts"),
+        isinstance(task, TaskSpec),
         "task",
         "be a sejax.Task",
         "an agent is made for its spaces",
         type(task).__name__,
         "task to env.task, or sejax.Task(name=..., env=env)",
     )
-    require_fit(config, exploration, task.facts, task.name)
+    require_fit(config, exploration, task, task.name)
     return _make_agent(registry.Same(config, exploration), task, varied)
 
 
@@ -111,14 +112,14 @@ def _make_agent(key: registry.Same, task: Any, varied: bool) -> Agent:
 
 
 def require_fit(
-    agent: AgentConfig, exploration: ExplorationConfig, facts: Any, task_name: str
+    agent: AgentConfig, exploration: ExplorationConfig, spec: TaskSpec, task_name: str
 ) -> None:
     """Checks that an agent can act in a task, and that it can explore so.
 
     Args:
       agent: its configuration.
       exploration: that of its intrinsic reward.
-      facts: of the task (`sejax.envs.Facts`).
+      spec: of the task.
       task_name: for messages.
 
     Raises:
@@ -133,13 +134,13 @@ def require_fit(
             value,
             f"{kind.group} to an instance of a subclass",
         )
-    if not _fits(agent, facts):
-        fitting = [name for name in names() if _fits(registry.find("agent", name), facts)]
+    if not _fits(agent, spec):
+        fitting = [name for name in names() if _fits(registry.find("agent", name), spec)]
         require(
             False,
             "agent",
             f"be one of {', '.join(fitting)} in {task_name}",
-            f"its states are {facts.states} and its actions {facts.actions}",
+            f"its states are {spec.states} and its actions {spec.actions}",
             registry.name_of("agent", agent),
             f"agent={fitting[0]}",
         )
@@ -161,11 +162,11 @@ def require_fit(
     )
 
 
-def default_for(facts: Any) -> str:
+def default_for(spec: TaskSpec) -> str:
     """The default agent of a task: the first that fits it."""
-    fitting = (name for name in DEFAULTS if _fits(registry.find("agent", name), facts))
+    fitting = (name for name in DEFAULTS if _fits(registry.find("agent", name), spec))
     return next(fitting, DEFAULTS[0])  # which `require_fit` refuses, if none does
 
 
-def _fits(agent: AgentConfig | type[AgentConfig], facts: Any) -> bool:
-    return agent.states in (None, facts.states) and facts.actions in agent.actions
+def _fits(agent: AgentConfig | type[AgentConfig], spec: TaskSpec) -> bool:
+    return agent.states in (None, spec.states) and spec.actions in agent.actions

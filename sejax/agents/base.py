@@ -10,6 +10,8 @@ import jax
 from jaxtyping import Array, Int
 
 from sejax.agents.buffers import BufferMaker
+from sejax.envs.environment import spaces_of
+from sejax.envs.spec import Discrete, Space
 from sejax.options import Options, counts, option, traced_options
 
 # A pytree of whatever the agent needs; nobody else looks into it.
@@ -53,19 +55,17 @@ class Spaces(NamedTuple):
 
     @classmethod
     def of_env(cls, env: Any) -> "Spaces":
-        """Those of a gymnax environment, or of a proxy."""
-        with jax.ensure_compile_time_eval():  # gymnax computes some spaces
-            params = env.default_params
-            observations, actions = env.observation_space(params), env.action_space(params)
-            num_states, num_actions = (
-                int(space.n) if hasattr(space, "n") else None for space in (observations, actions)
-            )
-            return cls(
-                num_states=num_states,
-                obs_dim=num_states or int(observations.shape[0]),
-                num_actions=num_actions,
-                action_dim=num_actions or int(actions.shape[0]),
-            )
+        """Those of an environment, or of a proxy."""
+        return cls.of_spaces(*spaces_of(env))
+
+    @classmethod
+    def of_spaces(cls, observation: Space, action: Space) -> "Spaces":
+        return cls(
+            num_states=observation.n if isinstance(observation, Discrete) else None,
+            obs_dim=observation.size,
+            num_actions=action.n if isinstance(action, Discrete) else None,
+            action_dim=action.size,
+        )
 
 
 @dataclass(frozen=True, kw_only=True)

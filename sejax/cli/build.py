@@ -85,21 +85,21 @@ class LearnConfig:
             f"true with objective={self.name('objective')}",
             "stop_when_solved=false",
         )
-        facts, task_name = envs.facts_of(self.env), self.name("env")
-        self.proxy.require_task(facts, task_name)
+        spec, task_name = envs.spec_of(self.env), self.name("env")
+        self.proxy.require_task(spec, task_name)
         train = not all(x.agent.is_solved_for for x in families_of(self))
         if train and not self.proxy.has_real_dynamics:
-            require_reachable("training", self.training, self.proxy.max_steps(facts.max_steps))
+            require_reachable("training", self.training, self.proxy.max_steps(spec.max_steps))
         for family in families_of(self):
             with families.named(family.field):
-                agents.require_fit(family.agent, self.exploration, facts, task_name)
+                agents.require_fit(family.agent, self.exploration, spec, task_name)
                 if self.proxy.reaches_step_limit:
                     require_learning(
                         "training",
                         self.training,
                         family.agent,
-                        self.proxy.max_steps(facts.max_steps),
-                        facts.max_steps,
+                        self.proxy.max_steps(spec.max_steps),
+                        spec.max_steps,
                     )
 
     def name(self, group: str) -> str:

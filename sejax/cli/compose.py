@@ -10,7 +10,7 @@ import functools
 import itertools
 import re
 import textwrap
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -297,20 +297,20 @@ def _register_choice(group: str, choice: str, is_chosen: bool, overrides: Sequen
 
 def _agent_for(choice: str, is_own: bool, node: dict[str, Any], overrides: Sequence[str]) -> str:
     """The agent that learns in a task where the command line names none."""
-    facts = getattr(registry.find("env", choice), "facts", None)
-    if facts is None and (not is_own or "agent" in _choices(overrides)):
+    states_spec = hasattr(registry.find("env", choice), "spec")
+    if not states_spec and (not is_own or "agent" in _choices(overrides)):
         return _DEFAULT_AGENT
-    if facts is None:  # the task must be made to know: with the fields that are asked for
+    fields: dict[str, Any] = {}
+    if not states_spec:  # the task must be made to know: with the fields that are asked for
         given = {word.partition("=")[0]: word.partition("=")[2] for word in overrides}
         fields = {
             name.removeprefix("env."): to_plain(OmegaConf.create({"x": parsed(value)}))["x"]
             for name, value in given.items()
             if name.startswith("env.")
         }
-        if "???" in {**node, **fields}.values():
-            return _DEFAULT_AGENT  # what is missing is said later
-        facts = envs.facts_of(registry.configure("env", {**node, **fields}))
-    return agents.default_for(facts)
+    if "???" in {**node, **fields}.values():
+        return _DEFAULT_AGENT  # what is missing is said later
+    return agents.default_for(envs.spec_of(registry.configure("env", {**node, **fields})))
 
 
 def _agent_of_proxy(overrides: Sequence[str]) -> str:
@@ -358,19 +358,10 @@ def _agent_on(source: str, env: Any) -> str:
     try:
         if source not in ("", "real"):
             _, stored = header.read(source, "proxy")
-            return agents.default_for(_facts_of(stored.interface))
-        return agents.default_for(envs.facts_of(registry.configure("env", given or {})))
+            return agents.default_for(envs.TaskSpec.of_interface(stored.interface))
+        return agents.default_for(envs.spec_of(registry.configure("env", given or {})))
     except ConfigError:
         return _DEFAULT_AGENT  # what is wrong is said later
-
-
-def _facts_of(interface: Mapping[str, Any]) -> envs.Facts:
-    """What a proxy's file says of its task, `sejax.Task.interface`."""
-    return envs.Facts(
-        states="discrete" if "n" in interface["observation"] else "vector",
-        actions="discrete" if "n" in interface["action"] else "continuous",
-        max_steps=interface["max_steps"],
-    )
 
 
 def parsed(text: str) -> Any:

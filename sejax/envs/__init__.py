@@ -1,17 +1,16 @@
-"""The real tasks: gymnax environments with the paper's step limits and solved thresholds.
+"""The real tasks: environments with the paper's step limits and solved thresholds.
 
-A task is a file here, with its facts on top and what takes seconds to import inside `make`.
+The tables `classic`, `gridworld` and `mujoco.tasks` say what each task is (a `TaskSpec`) and make
+it; they import neither JAX nor gymnax. The dynamics are in `dynamics` and `mujoco`.
 """
 
 from typing import Any
 
 from sejax import registry
-from sejax.envs import light_gymnax
-from sejax.envs.base import Facts, Task
+from sejax.envs.base import Task
+from sejax.envs.spec import Box, Discrete, TaskSpec
 
-light_gymnax.install()
-
-__all__ = ["Facts", "Task", "facts_of", "make", "make_from", "names"]
+__all__ = ["Box", "Discrete", "Task", "TaskSpec", "make", "make_from", "names", "spec_of"]
 
 
 def names() -> list[str]:
@@ -41,11 +40,11 @@ def make_from(config: Any) -> Task:
     """The task that a configuration describes, built once; it knows where it came from."""
     task = registry.make("env", config)
     if task.origin is None:
-        object.__setattr__(task, "origin", registry.describe("env", config))
+        vars(task)["origin"] = registry.describe("env", config)
     return task
 
 
-def facts_of(config: Any) -> Facts:
-    """What a task's configuration says of it, or else the task itself."""
-    stated = getattr(config, "facts", None)
-    return stated if isinstance(stated, Facts) else make_from(config).facts
+def spec_of(config: Any) -> TaskSpec:
+    """The spec that a task's configuration states, or else the task itself."""
+    stated = getattr(config, "spec", None)
+    return stated if isinstance(stated, TaskSpec) else make_from(config)

@@ -1,4 +1,7 @@
-"""Any environment that gymnax knows, by its id: `env=gymnax/MountainCar-v0`."""
+"""Any environment that gymnax knows, by its id: `env=gymnax/MountainCar-v0`.
+
+What agents see is known when it is made: there is no `spec`.
+"""
 
 import math
 from dataclasses import dataclass
@@ -9,7 +12,7 @@ from sejax.envs.base import Task
 from sejax.options import Options, counts, option
 
 PREFIX = "gymnax/"
-# Gymnasium's registry defines when these count as solved; nobody does for the others.
+# Gymnasium's registry defines when these count as solved; it has no threshold for the others.
 SOLVED_REWARD = {
     "CartPole-v1": 475.0,
     "Acrobot-v1": -100.0,

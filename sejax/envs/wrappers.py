@@ -1,4 +1,4 @@
-"""Worlds seen through a frame: each action repeated, or everything as vectors."""
+"""Environments around another one: each action repeated, or everything as vectors."""
 
 import functools
 from typing import Any
@@ -6,17 +6,17 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from gymnax.environments import environment, spaces
 from jaxtyping import Array, Float
 
+from sejax.envs.environment import Environment, space_of_gymnax
+from sejax.envs.spec import Box, Discrete, Space
 from sejax.errors import ConfigError
 
 
-class Wrapper(environment.Environment[Any, Any]):
-    """A world that is another one but for what a subclass changes."""
+class Wrapper(Environment):
+    """An environment that is another one but for what a subclass changes."""
 
     def __init__(self, env: Any):
-        super().__init__()
         self.env = env
 
     @property
@@ -54,10 +54,10 @@ class Wrapper(environment.Environment[Any, Any]):
 
 
 class ActionRepeat(Wrapper):
-    """A world in which each decision lasts for `num_repeats` steps or until the episode ends.
+    """An environment in which each decision lasts `num_repeats` steps, or to the episode's end.
 
     Rewards add up undiscounted, and `info["num_steps"]` says how many steps were made. State,
-    parameters and spaces are the wrapped world's.
+    parameters and spaces are the wrapped environment's.
 
     Source: paper, appendix "MountainCarContinuous-v0 and HalfCheetah-v3" (number of action
     repeats); `docs/reference.md` 1.8. There an SE is stepped on after its episode has ended; here
@@ -89,46 +89,41 @@ def _select(condition: Any, a: Any, b: Any) -> Any:
 
 @functools.cache
 def repeat_actions(env: Any, num_repeats: int) -> Any:
-    """The world in which actions last for `num_repeats` steps; itself for 1."""
+    """The environment in which actions last for `num_repeats` steps; itself for 1."""
     return env if num_repeats == 1 else ActionRepeat(env, num_repeats)
 
 
 class AsVectors(Wrapper):
-    """A world whose observations are float32 vectors and whose continuous actions are in [-1, 1].
+    """An environment with float32 vectors as observations and continuous actions in [-1, 1].
 
     Observations of any shape are flattened, row by row; an action `[n]` is scaled linearly to the
-    bounds of the wrapped world's box and takes its shape. Discrete ones stay as they are.
+    bounds of the wrapped environment's box and takes its shape. Discrete ones stay as they are.
 
     Args:
-      env: the world.
-      params: its params, which its spaces are taken from, once: gymnax computes some of them.
+      env: the environment.
+      spaces: its spaces of observations and actions.
+      action_shape: shape of its actions.
     """
 
-    def __init__(self, env: Any, params: Any):
+    def __init__(self, env: Any, spaces: tuple[Space, Space], action_shape: tuple[int, ...]):
         super().__init__(env)
-        self._raw_action = env.action_space(params)
-        self._action = self._raw_action
-        if isinstance(self._raw_action, spaces.Box):
-            size = int(np.prod(self._raw_action.shape))
-            self._action = spaces.Box(-1.0, 1.0, (size,), jnp.float32)
-        self._obs = env.observation_space(params)
-        self._is_index = isinstance(self._obs, spaces.Discrete)
-        if not self._is_index:
-            size = int(np.prod(self._obs.shape))
-            bounds = (
-                _full(x, self._obs.shape).reshape(size) for x in (self._obs.low, self._obs.high)
-            )
-            self._obs = spaces.Box(*bounds, (size,), jnp.float32)
+        observation, action = spaces
+        self._raw_action, self._action_shape = action, action_shape
+        if isinstance(action, Box):
+            action = Box.symmetric(*[1.0] * action.size)
+        self.spaces = observation, action
 
     def reset_env(self, key: Any, params: Any) -> tuple[Any, Any]:
         obs, state = self.env.reset_env(key, params)
         return self._vector(obs), state
 
     def step_env(self, key: Any, state: Any, action: Any, params: Any) -> tuple[Any, ...]:
-        space = self._raw_action
-        if isinstance(space, spaces.Box):
-            low, high = (_full(x, space.shape) for x in (space.low, space.high))
-            action = low + (jnp.reshape(action, space.shape) + 1) / 2 * (high - low)
+        if isinstance(self._raw_action, Box):
+            low, high = (
+                np.reshape(np.float32(x), self._action_shape)
+                for x in (self._raw_action.low, self._raw_action.high)
+            )
+            action = low + (jnp.reshape(action, self._action_shape) + 1) / 2 * (high - low)
             action = jnp.clip(action, low, high)
         obs, *rest = self.env.step_env(key, state, action, params)
         return self._vector(obs), *rest
@@ -137,48 +132,49 @@ class AsVectors(Wrapper):
         return self._vector(self.env.get_obs(state, params, key))
 
     def action_space(self, params: Any = None) -> Any:
-        return self._action
+        return Environment.action_space(self, params)
 
     def observation_space(self, params: Any = None) -> Any:
-        return self._obs
+        return Environment.observation_space(self, params)
 
     def _vector(self, obs: Any) -> Float[Array, " obs_dim"] | Array:
-        return obs if self._is_index else jnp.ravel(obs).astype(jnp.float32)
+        if self.spaces is not None and isinstance(self.spaces[0], Discrete):
+            return obs
+        return jnp.ravel(obs).astype(jnp.float32)
 
 
-def _full(bound: Any, shape: tuple[int, ...]) -> np.ndarray:
-    """A space's bound for each of its numbers."""
-    return np.broadcast_to(np.asarray(bound, np.float32), shape)
-
-
-def as_vectors(env: Any, params: Any, name: str) -> Any:
-    """The world itself if agents can take it as it is, else `AsVectors` of it.
+def as_vectors(env: Any, params: Any, name: str) -> tuple[Any, Space, Space]:
+    """An environment as agents can take it, itself or in `AsVectors`, and its spaces.
 
     Raises:
-      ConfigError: for spaces that no vector or index stands for, or actions without bounds.
+      ConfigError: for spaces other than boxes and discrete ones, or actions without bounds.
     """
-    obs, action = env.observation_space(params), env.action_space(params)
-    for what, space in (("observations", obs), ("actions", action)):
-        if not isinstance(space, spaces.Box | spaces.Discrete):
-            raise ConfigError(
-                f"env must have {what} in a gymnax Box or Discrete space, because networks take "
-                f"vectors and tables take indices; got {space!r} in {name}. Make them "
-                f"one array in a subclass of sejax.envs.wrappers.Wrapper."
-            )
-    plain_obs = isinstance(obs, spaces.Discrete) or getattr(env, "observes_vectors", False)
+    if isinstance(env, Environment) and env.spaces is not None:
+        return env, *env.spaces
+    raw = env.observation_space(params), env.action_space(params)
+    observation = space_of_gymnax(raw[0], "observations", name)
+    action = space_of_gymnax(raw[1], "actions", name)
+    plain_obs = isinstance(observation, Discrete)
     if not plain_obs:  # what comes, as a space may say otherwise (gymnax's FourRooms)
         came = jax.eval_shape(lambda: env.reset_env(jax.random.key(0), params)[0])
         plain_obs = came.ndim == 1 and came.dtype == jnp.float32
-    plain_action = isinstance(action, spaces.Discrete) or _is_symmetric(action, name)
-    return env if plain_obs and plain_action else AsVectors(env, params)
+    if isinstance(action, Box):
+        _require_bounds(action, raw[1], name)
+    if plain_obs and (isinstance(action, Discrete) or _is_symmetric(action, raw[1].shape)):
+        return env, observation, action
+    vectors = AsVectors(env, (observation, action), raw[1].shape)
+    return vectors, *vectors.spaces
 
 
-def _is_symmetric(space: Any, name: str) -> bool:
-    """Whether a box is a vector between the same -x and x in each dimension."""
-    low, high = np.asarray(space.low), np.asarray(space.high)
+def _require_bounds(box: Box, space: Any, name: str) -> None:
+    low, high = np.array(box.low), np.array(box.high)
     if not (np.isfinite(low).all() and np.isfinite(high).all() and (low < high).all()):
         raise ConfigError(
             f"env must have bounded actions, because agents draw and squash them within bounds; "
             f"got {space!r} in {name}. Give its action space a low and a high."
         )
-    return len(space.shape) == 1 and bool((high == high.flat[0]).all() and (low == -high).all())
+
+
+def _is_symmetric(box: Box, shape: tuple[int, ...]) -> bool:
+    """Whether a box is a vector between the same -x and x in each dimension."""
+    return len(shape) == 1 and {-x for x in box.low} == set(box.high) and len({*box.high}) == 1

@@ -7,9 +7,9 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.envs.registration import EnvSpec
 
-from sejax.envs import cliff_walking, gridworld_2x2
+from sejax.envs import gridworld
 
-MAPS = {"cliff_walking": cliff_walking.MAP, "gridworld_2x2": gridworld_2x2.MAP}
+MAPS = {"cliff_walking": gridworld.CLIFF_WALKING, "gridworld_2x2": gridworld.ROOM_2X2}
 # Reward of a step into the floor, the goal and a hole.
 REWARDS = {"cliff_walking": (-1.0, 0.0, -100.0), "gridworld_2x2": (-0.01, 1.0, -1.0)}
 MOVES = ((0, 1), (0, -1), (1, 0), (-1, 0))  # actions RIGHT, LEFT, DOWN, UP: (rows, columns)

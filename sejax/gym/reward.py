@@ -14,45 +14,13 @@ from gymnasium.wrappers import DtypeObservation, FlattenObservation
 from sejax import registry
 from sejax.errors import ConfigError, as_python, fraction, require
 from sejax.gym import networks
-from sejax.gym.tasks import RealTask, num_categories, vector_size
+from sejax.gym.tasks import GYMNASIUM_IDS, RealTask, num_categories, vector_size
 from sejax.proxies import MAX_ABS_VALUE
 from sejax.proxies.configs import RewardConfig
 from sejax.proxies.header import check_tensors, read_single
 
-_PLANE = (
-    "x_position",
-    "y_position",
-    "distance_from_origin",
-    "x_velocity",
-    "y_velocity",
-    "reward_forward",
-    "reward_ctrl",
-)
-_LEG = (
-    "x_position",
-    "x_velocity",
-    "z_distance_from_origin",
-    "reward_forward",
-    "reward_ctrl",
-    "reward_survive",
-)
 SAME_NUMBERS = (DtypeObservation, FlattenObservation)  # wrappers that change no number
-# `sejax.Task.info_keys` and `augmented_keys` by the names that Gymnasium has for them.
-INFO_KEYS: dict[str, tuple[str, ...]] = {
-    "halfcheetah": ("x_position", "x_velocity", "reward_forward", "reward_ctrl"),
-    "hopper": _LEG,
-    "walker2d": _LEG,
-    "swimmer": _PLANE,
-    "ant": (*_PLANE, "reward_contact", "reward_survive"),
-    "reacher": ("reward_dist", "reward_ctrl"),
-}
-AUGMENTED_KEYS: dict[str, tuple[str, ...]] = {
-    "halfcheetah": ("x_position", "x_velocity"),
-    "hopper": ("x_position", "x_velocity"),
-    "walker2d": ("x_position", "x_velocity"),
-    "swimmer": ("x_position", "y_position", "x_velocity", "y_velocity"),
-    "ant": ("x_position", "y_position", "x_velocity", "y_velocity"),
-}
+GYMNASIUM_NAMES = {"reward_run": "reward_forward"}  # entries of `info` that it calls otherwise
 
 
 class RewardNetwork(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
@@ -214,8 +182,11 @@ class RewardNetwork(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
         weighs_info = self.config.shaping.weighs_info
         if not (weighs_info or self.config.augmented):
             return ()
-        keys = given or (INFO_KEYS if weighs_info else AUGMENTED_KEYS).get(task)
         name = "info_keys" if weighs_info else "augmented_keys"
+        keys: Sequence[str] = given or ()
+        if not given and task in GYMNASIUM_IDS:
+            spec = registry.configure("env", {"name": task}).spec
+            keys = [GYMNASIUM_NAMES.get(key, key) for key in getattr(spec, name)]
         require(
             keys,
             "info_keys",
@@ -224,7 +195,7 @@ class RewardNetwork(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
             "none",
             f"sejax.gym.RewardNetwork(env, source, info_keys=[...]) to `sejax.Task.{name}`",
         )
-        return tuple(keys or ())
+        return tuple(keys)
 
 
 def _require_task(env: gymnasium.Env[Any, Any], learned: RealTask, name: str) -> None:

@@ -69,7 +69,7 @@ class RealTask:
 
     @classmethod
     def of_interface(cls, interface: Mapping[str, Any]) -> "RealTask":
-        """The task of a proxy's file (`Header.interface`), without `starts`."""
+        """The task of a proxy's file (`TaskSpec.interface`), without `starts`."""
         return cls(
             observation_space=_space(interface["observation"]),
             action_space=_space(interface["action"]),
@@ -155,7 +155,7 @@ def same_env(config: Mapping[str, Any], **options: Any) -> gymnasium.Env[Any, An
     fields = serialize.to_plain(task)
     if fields.pop("backend", "mujoco") not in GYMNASIUM_BACKENDS:
         return None
-    max_steps = task.facts.max_steps
+    max_steps = task.spec.max_steps
     if name in MAPS:
         return TimeLimit(GridWorld(name, **fields), max_steps)
     return make_gymnasium(GYMNASIUM_IDS[name], max_steps, **options, **fields)
@@ -246,7 +246,7 @@ def _unknown_task(header: Header, fix: str) -> ConfigError:
 
 
 def _space(plain: Mapping[str, Any]) -> spaces.Space[Any]:
-    """A space of `sejax.Task.interface`."""
+    """A space of `sejax.envs.TaskSpec.interface`."""
     if "n" in plain:
         return spaces.Discrete(plain["n"])
     low, high = (

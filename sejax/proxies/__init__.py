@@ -7,14 +7,12 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
 
-from sejax.envs import light_gymnax
-from sejax.envs.base import Facts, Task
+from sejax.envs.base import Task
+from sejax.envs.spec import TaskSpec
 from sejax.options import Options
 
 if TYPE_CHECKING:
     from sejax.proxies.base import ProxyEnv
-
-light_gymnax.install()
 
 # A reward or an entry of a state beyond this ends the episode. It is far outside every task's range
 # and small enough for its square to stay finite in float32.
@@ -62,7 +60,7 @@ class ProxyConfig(Options, ABC):
         """Maximum number of steps of an episode, given the real task's."""
         return task_max_steps
 
-    def require_task(self, facts: Facts, task_name: str) -> None:
+    def require_task(self, spec: TaskSpec, task_name: str) -> None:
         """Checks that a proxy of this kind is possible for a task.
 
         Raises:

@@ -1,6 +1,6 @@
 """The contract of a proxy: an environment with weights that stands in for a real task.
 
-A proxy is a gymnax 1.x `Environment` whose `EnvParams` hold the weights, so that an agent trains in
+A proxy is an `Environment` whose `EnvParams` hold the weights, so that an agent trains in
 it as in any other environment. What the inner loop must know beside that is told by `is_real`,
 `episode_limit` and `prepare`, of a proxy and of any other environment.
 """
@@ -12,25 +12,25 @@ from abc import ABC, abstractmethod
 from typing import Any, NoReturn
 
 import jax
-import jax.numpy as jnp
 from flax import struct
-from gymnax.environments import environment, spaces
 from jaxtyping import Array
 
 from sejax.envs.base import Task
+from sejax.envs.environment import Environment, EnvParams
+from sejax.envs.spec import TaskSpec
 from sejax.errors import ConfigError, require
 from sejax.proxies import ProxyConfig
 
 
 @struct.dataclass
-class ProxyParams(environment.EnvParams):
+class ProxyParams(EnvParams):
     """Weights of a proxy, as from its `init_weights`, and the step limit of its episodes."""
 
     weights: Any = None
     max_steps_in_episode: int = 1
 
 
-class ProxyEnv(environment.Environment[Any, Any], ABC):
+class ProxyEnv(Environment, ABC):
     """A proxy of a task; subclasses add `init_weights`, `reset_env` and `step_env`.
 
     `step_env` may put two entries into its `info`: "discount", what a target bootstraps with before
@@ -46,7 +46,6 @@ class ProxyEnv(environment.Environment[Any, Any], ABC):
     """
 
     def __init__(self, task: Task, config: Any):
-        super().__init__()
         require(
             isinstance(config, ProxyConfig),
             "proxy",
@@ -55,6 +54,7 @@ class ProxyEnv(environment.Environment[Any, Any], ABC):
             type(config).__name__,
             f"class {type(config).__name__}(sejax.ProxyConfig)",
         )
+        self.spaces = task.observation, task.action
         self.task = task
         self.config = config
         self._default_params: Any = None
@@ -109,16 +109,6 @@ class ProxyEnv(environment.Environment[Any, Any], ABC):
     def name(self) -> str:
         return f"{type(self).__name__.removesuffix('Env')}-{self.task.name}"
 
-    @property
-    def num_actions(self) -> int:
-        return self.task.env.num_actions
-
-    def action_space(self, params: Any = None) -> Any:
-        return self.task.env.action_space(self.task.params)
-
-    def observation_space(self, params: Any = None) -> Any:
-        return self.task.env.observation_space(self.task.params)
-
 
 def is_real(env: Any) -> bool:
     """Whether steps in an environment are steps of a real task."""
@@ -140,28 +130,20 @@ def prepare(env: Any, params: Any, discount: Array | float | None, limit_is_term
 # --- a task that cannot be made here --------------------------------------------------------------
 
 
-class AbsentEnv(environment.Environment[Any, Any]):
+class AbsentEnv(Environment):
     """The spaces of a task that cannot be made here, for an SE that needs no more of it.
 
-    Such an SE can be loaded without the package that its task needs, on a device that the task does
-    not run on, or by a stranger. `reset_env` and `step_env` raise the reason as a `ConfigError`.
-
-    Attributes:
-      reason: message of the error that says why the task is absent.
-      observes_vectors: that `as_vectors` need not reset it to see what it observes.
+    Such an SE can be loaded without the package that its task needs, or on a device that the task
+    does not run on. `reset_env` and `step_env` raise the reason as a `ConfigError`.
     """
 
-    observes_vectors = True
-
-    def __init__(self, task_name: str, interface: dict[str, Any], reason: str):
-        super().__init__()
-        self.reason = reason
-        self._task_name = task_name
-        self._observation = _space(interface["observation"])
-        self._action = _space(interface["action"])
+    def __init__(self, task_name: str, spec: TaskSpec, reason: str):
+        self._task_name, self._reason = task_name, reason
+        self.spaces = spec.observation, spec.action
 
     def fail(self) -> NoReturn:
-        raise ConfigError(self.reason, "task")
+        """Raises the reason as a `ConfigError`."""
+        raise ConfigError(self._reason, "task")
 
     def reset_env(self, key: Any, params: Any) -> NoReturn:
         self.fail()
@@ -173,25 +155,14 @@ class AbsentEnv(environment.Environment[Any, Any]):
     def name(self) -> str:
         return self._task_name
 
-    @property
-    def num_actions(self) -> int:
-        is_discrete = isinstance(self._action, spaces.Discrete)
-        return self._action.n if is_discrete else self._action.shape[0]
-
-    def action_space(self, params: Any = None) -> Any:
-        return self._action
-
-    def observation_space(self, params: Any = None) -> Any:
-        return self._observation
-
 
 def absent_task(name: str, interface: dict[str, Any], origin: dict[str, Any], reason: str) -> Task:
     """A task of which no more is known than what a proxy's file says; built once.
 
     Args:
       name: of the task.
-      interface: see `Task.interface`.
-      origin: see `Task.origin`, for files that are written of it.
+      interface: see `TaskSpec.interface`.
+      origin: see `Task`, for files that are written of it.
       reason: why the task itself cannot be made.
     """
     return _absent_task(name, json.dumps([interface, origin], sort_keys=True), reason)
@@ -200,8 +171,9 @@ def absent_task(name: str, interface: dict[str, Any], origin: dict[str, Any], re
 @functools.cache
 def _absent_task(name: str, known: str, reason: str) -> Task:
     interface, origin = json.loads(known)
-    env = AbsentEnv(name, interface, reason)
-    return Task(name=name, env=env, max_steps=interface["max_steps"], origin=origin)
+    spec = TaskSpec.of_interface(interface)
+    env = AbsentEnv(name, spec, reason)
+    return Task(name=name, env=env, max_steps=spec.max_steps, origin=origin)
 
 
 def require_present(task: Task) -> Task:
@@ -213,14 +185,3 @@ def require_present(task: Task) -> Task:
     if isinstance(task.env, AbsentEnv):
         task.env.fail()
     return task
-
-
-def _space(plain: dict[str, Any]) -> Any:
-    """A space of `Task.interface`."""
-    if "n" in plain:
-        return spaces.Discrete(plain["n"])
-    low, high = (
-        jnp.array([end if x is None else x for x in plain[name]], jnp.float32)
-        for name, end in (("low", -jnp.inf), ("high", jnp.inf))
-    )
-    return spaces.Box(low, high, low.shape, jnp.float32)

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from sejax.envs.base import Facts, Task
+from sejax.envs.base import Task
+from sejax.envs.spec import TaskSpec
 from sejax.errors import require
 from sejax.options import ACTIVATIONS, MOST_LAYERS, counts, one_of, option, positive
 from sejax.proxies import MAX_ABS_VALUE, ProxyConfig
@@ -223,16 +224,15 @@ class RewardConfig(ProxyConfig):
     def needs_discount(self) -> bool:
         return self.shaping.is_potential_based
 
-    def require_task(self, facts: Facts, task_name: str) -> None:
+    def require_task(self, spec: TaskSpec, task_name: str) -> None:
         """Checks that the steps of the task tell what this variant needs.
 
         Raises:
           ConfigError: if they do not.
         """
-        has_vector = facts.has_info if facts.has_vector is None else facts.has_vector
         fields = (
-            ("variant", self.shaping.weighs_info, facts.has_info, "additive_potential"),
-            ("augmented", self.augmented, has_vector, "false"),
+            ("variant", self.shaping.weighs_info, spec.info_keys, "additive_potential"),
+            ("augmented", self.augmented, spec.augmented_keys, "false"),
         )
         for name, is_needed, is_there, fix in fields:
             value = getattr(self, name)
@@ -253,5 +253,5 @@ class RewardConfig(ProxyConfig):
         """
         from sejax.proxies.reward import RewardEnv  # imports JAX
 
-        self.require_task(task.facts, task.name)
+        self.require_task(task, task.name)
         return RewardEnv(task, self)

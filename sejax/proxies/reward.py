@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any
 import jax
 import jax.numpy as jnp
 from flax import struct
-from gymnax.environments import environment
 from jaxtyping import Array, Float
 
 from sejax.envs.base import Task
+from sejax.envs.environment import EnvParams, EnvState
 from sejax.errors import require
 from sejax.ops.networks import MLP, uniform_fan_in
 from sejax.proxies import MAX_ABS_VALUE
@@ -23,7 +23,7 @@ if TYPE_CHECKING:  # whose `make` imports this
 
 
 @struct.dataclass
-class RewardState(environment.EnvState):
+class RewardState(EnvState):
     world: Any  # the real task's state
     obs: Array  # what the agent saw last
     augmentation: Float[Array, " keys"]  # v of that state; zeros before the first step
@@ -31,7 +31,7 @@ class RewardState(environment.EnvState):
 
 
 @struct.dataclass
-class RewardParams(environment.EnvParams):
+class RewardParams(EnvParams):
     weights: Any = None  # as from `init_weights`
     potentials: Array | None = None  # [num_states], if `prepare` found discrete states
     discount: Array | float = 1.0  # gamma; `prepare` puts the agent's here

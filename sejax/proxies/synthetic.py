@@ -10,10 +10,11 @@ from typing import TYPE_CHECKING, Any
 import jax
 import jax.numpy as jnp
 from flax import struct
-from gymnax.environments import environment, spaces
 from jaxtyping import Array, Bool, Float
 
 from sejax.envs.base import Task
+from sejax.envs.environment import EnvState
+from sejax.envs.spec import Box
 from sejax.ops.networks import MLP
 from sejax.proxies import MAX_ABS_VALUE
 from sejax.proxies.base import ProxyEnv, ProxyParams
@@ -23,7 +24,7 @@ if TYPE_CHECKING:  # whose `make` imports this
 
 
 @struct.dataclass
-class SyntheticState(environment.EnvState):
+class SyntheticState(EnvState):
     vector: Array  # [obs_dim]: what the networks see and predict
     time: Array | int
 
@@ -63,8 +64,10 @@ class SyntheticEnv(ProxyEnv):
         }
         self._start = self._nets.pop("start", None)
         self._units = None
-        if task.num_states is None:
-            self._units = config.units(task.env.observation_space(task.params))
+        if isinstance(task.observation, Box):
+            self._units = config.units(task.observation)
+            # Without the task's bounds: a learned state need not respect them.
+            self.spaces = Box.symmetric(*[MAX_ABS_VALUE] * task.obs_dim), task.action
 
     def init_weights(self, key: Array) -> dict[str, Any]:
         """Random weights of each network: "state", "reward", "done", and "start" if learned."""
@@ -152,12 +155,6 @@ class SyntheticEnv(ProxyEnv):
         if self.task.num_states is not None:
             return jnp.argmax(state.vector).astype(jnp.int32)
         return state.vector
-
-    def observation_space(self, params: ProxyParams | None = None) -> Any:
-        """The real task's, a box without its bounds: a learned state need not respect them."""
-        if self.task.num_states is not None:
-            return spaces.Discrete(self.task.num_states)
-        return spaces.Box(-MAX_ABS_VALUE, MAX_ABS_VALUE, (self.task.obs_dim,), jnp.float32)
 
 
 class BanditEnv(SyntheticEnv):

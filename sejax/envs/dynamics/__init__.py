@@ -1,1 +1,1 @@
-"""Environments that are our own; what gymnax has is taken from there."""
+"""Environments that need JAX alone."""

@@ -9,22 +9,24 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
-from gymnax.environments import environment, spaces
 from jaxtyping import Array, Int
+
+from sejax.envs.environment import Environment, EnvParams, EnvState
+from sejax.envs.spec import Discrete
 
 CELLS = "S GO#"  # start, floor, goal, hole, wall
 MOVES = ((0, 1), (0, -1), (1, 0), (-1, 0))  # actions RIGHT, LEFT, DOWN, UP: (rows, columns)
 
 
 @struct.dataclass
-class GridState(environment.EnvState):
+class GridState(EnvState):
     """Where the agent is: `index` = row * number of columns + column, `[]` int32."""
 
     index: Array
 
 
 @struct.dataclass
-class GridParams(environment.EnvParams):
+class GridParams(EnvParams):
     """Reward of a step, by the cell in which it ends; the defaults are the 2x2 room's."""
 
     step_reward: float = -0.01
@@ -33,8 +35,8 @@ class GridParams(environment.EnvParams):
     max_steps_in_episode: int = 10
 
 
-class GridWorld(environment.Environment[GridState, GridParams]):
-    """A deterministic world of cells; a gymnax 1.x `Environment`.
+class GridWorld(Environment):
+    """A deterministic world of cells.
 
     A move into a wall or off the map stays in place and is paid like the cell it stays in.
     Entering the goal or a hole terminates. Observations are the cell's index, `[]` int32.
@@ -58,11 +60,9 @@ class GridWorld(environment.Environment[GridState, GridParams]):
         Raises:
           ValueError: if the map is no rectangle of these characters with one S.
         """
-        super().__init__()
         _check(rows)
         cells = np.array([list(row) for row in rows])
-        self.rows = tuple(rows)
-        self.num_states = cells.size
+        self.spaces = Discrete(cells.size), Discrete(len(MOVES))
         self._params = params
         self._start = int(np.flatnonzero(cells == "S")[0])
         self._goal = (cells == "G").ravel()  # [num_states]
@@ -97,16 +97,6 @@ class GridWorld(environment.Environment[GridState, GridParams]):
 
     def is_terminated(self, state: GridState, params: GridParams) -> Array:
         return jnp.asarray(self._goal | self._hole)[state.index]
-
-    @property
-    def num_actions(self) -> int:
-        return len(MOVES)
-
-    def action_space(self, params: GridParams | None = None) -> spaces.Discrete:
-        return spaces.Discrete(len(MOVES))
-
-    def observation_space(self, params: GridParams | None = None) -> spaces.Discrete:
-        return spaces.Discrete(self.num_states)
 
 
 def _check(rows: Sequence[str]) -> None:

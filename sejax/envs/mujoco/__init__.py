@@ -1,25 +1,26 @@
-"""Tasks on MuJoCo's own C library, with Gymnasium's semantics, as pure gymnax environments.
+"""Tasks on MuJoCo's own C library, with Gymnasium's semantics, as pure environments.
 
-`step.cc` calls MuJoCo from within compiled programs, `library` builds it, `physics` is a model's
-reset and step in JAX, `environment` a task on them; the other modules are the tasks. They need the
-extra `mujoco`, a C++ compiler when they are first used, and the CPU.
+`tasks` is the table of tasks and `models` their environments, which `environment` has the common
+part of. `physics` is a model's reset and step in JAX; `step.cc` calls MuJoCo from within compiled
+programs, and `library` builds it. They need the extra `mujoco`, a C++ compiler when they are first
+used, and the CPU. `brax` has other physics for halfcheetah.
 """
 
-import importlib
-from typing import Any
+from typing import TYPE_CHECKING
 
-from sejax.envs.base import Task
 from sejax.errors import ConfigError, require
 
+if TYPE_CHECKING:
+    from sejax.envs.mujoco.environment import MujocoEnv
+    from sejax.envs.mujoco.tasks import MujocoTask
 
-def make_task(name: str, config: Any, solved_reward: float, otherwise: str = "") -> Task:
-    """The task whose environment is the class `Env` of the module of that name.
+
+def make_env(config: "MujocoTask", otherwise: str = "") -> "MujocoEnv":
+    """The environment of a task.
 
     Args:
-      name: of the task.
-      config: its configuration.
-      solved_reward: as of `Task`.
-      otherwise: what else can be done where MuJoCo cannot be had, for messages.
+      config: of the task.
+      otherwise: what else can be done where MuJoCo cannot be used, for messages.
 
     Raises:
       ConfigError: without the extra `mujoco`, a C++ compiler that works or a CPU as jax's default
@@ -30,16 +31,16 @@ def make_task(name: str, config: Any, solved_reward: float, otherwise: str = "")
         import mujoco  # noqa: F401
     except ImportError as error:
         raise ConfigError(
-            f"env={name} needs MuJoCo and Gymnasium, because its physics and its model are theirs; "
-            f"got {error}. Install them with pip install 'sejax[mujoco]'{otherwise}."
+            f"env={config.name} needs MuJoCo and Gymnasium, because its physics and its model are "
+            f"theirs; got {error}. Install them with pip install 'sejax[mujoco]'{otherwise}."
         ) from error
     import jax
 
-    from sejax.envs.mujoco import library
+    from sejax.envs.mujoco import library, models
 
     require(
         jax.default_backend() == "cpu",
-        f"env={name}",
+        f"env={config.name}",
         "run on the CPU",
         "MuJoCo's C library does",
         jax.default_backend(),
@@ -49,15 +50,8 @@ def make_task(name: str, config: Any, solved_reward: float, otherwise: str = "")
         library.load()
     except library.BuildError as error:
         raise ConfigError(
-            f"env={name} needs the code between XLA and MuJoCo, which is compiled on first use; "
-            f"{error}{otherwise}."
+            f"env={config.name} needs the code between XLA and MuJoCo, which is compiled on first "
+            f"use; {error}{otherwise}."
         ) from error
-    env = importlib.import_module(f"{__name__}.{name}").Env(config)
-    return Task(
-        name=name,
-        env=env,
-        max_steps=config.facts.max_steps,
-        solved_reward=solved_reward,
-        info_keys=env.info_keys,
-        augmented_keys=env.augmented_keys,
-    )
+    env: MujocoEnv = getattr(models, config.model)(config)
+    return env

@@ -1,30 +1,33 @@
 """What the MuJoCo tasks have in common: a gymnax environment on `Physics`."""
 
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
-from gymnax.environments import environment, spaces
 from jaxtyping import Array, Bool, Float, UInt32
 
+from sejax.envs.environment import Environment, EnvParams, EnvState
 from sejax.envs.mujoco import physics
 from sejax.envs.mujoco.physics import Report
 
+if TYPE_CHECKING:
+    from sejax.envs.mujoco.tasks import MujocoTask
+
 
 @struct.dataclass
-class MujocoState(environment.EnvState):
+class MujocoState(EnvState):
     physics: UInt32[Array, " num_words"]  # as of `Physics`
     time: Array | int
 
 
 @struct.dataclass
-class MujocoParams(environment.EnvParams):
+class MujocoParams(EnvParams):
     max_steps_in_episode: int = 1000
 
 
-class MujocoEnv(environment.Environment[MujocoState, MujocoParams]):
+class MujocoEnv(Environment):
     """A task of Gymnasium, equal to it step by step but for rounding to single precision.
 
     A subclass says what is in the class attributes and in the methods `draw_start`, `observe`,
@@ -40,16 +43,12 @@ class MujocoEnv(environment.Environment[MujocoState, MujocoParams]):
     file: ClassVar[str]  # of the model, among Gymnasium's
     frame_skip: ClassVar[int]
     with_forces: ClassVar[bool] = False  # whether external forces are needed
-    info_keys: ClassVar[tuple[str, ...]] = ()  # as of `Task`
-    augmented_keys: ClassVar[tuple[str, ...]] = ()
 
-    def __init__(self, config: Any):
-        super().__init__()
-        self.config = config
+    def __init__(self, config: "MujocoTask"):
+        self.config: Any = config  # a subclass reads its own options
+        self.spaces = config.spec.observation, config.spec.action
         self.physics = physics.of_gymnasium(self.file, self.frame_skip, self.with_forces)
-        model = self.physics.model
-        self._qpos0 = np.asarray(model.qpos0, np.float32)
-        self._high = np.asarray(model.actuator_ctrlrange[:, 1], np.float32)
+        self._qpos0 = np.asarray(self.physics.model.qpos0, np.float32)
 
     def draw_start(self, key: Array) -> tuple[Float[Array, " nq"], Float[Array, " nv"]]:
         """Positions and velocities of a reset."""
@@ -105,7 +104,7 @@ class MujocoEnv(environment.Environment[MujocoState, MujocoParams]):
         action = jnp.asarray(action, jnp.float32)
         after, now = self.physics.step(state.physics, action)
         healthy = self.is_healthy(now)
-        terminated = ~healthy & getattr(self.config, "terminate_when_unhealthy", True)
+        terminated = ~healthy & self.config.terminates
         rewards = self.rewards(now, action, healthy)
         discount = jnp.where(terminated, 0.0, 1.0)
         info = {**self.tells(now), **rewards, "discount": discount}
@@ -120,17 +119,6 @@ class MujocoEnv(environment.Environment[MujocoState, MujocoParams]):
     @property
     def name(self) -> str:
         return self.gymnasium_id
-
-    @property
-    def num_actions(self) -> int:
-        return len(self._high)
-
-    def action_space(self, params: MujocoParams | None = None) -> spaces.Box:
-        return spaces.Box(-self._high, self._high, self._high.shape)
-
-    def observation_space(self, params: MujocoParams | None = None) -> spaces.Box:
-        obs, _ = jax.eval_shape(self.reset_env, jax.random.key(0), self.default_params)
-        return spaces.Box(-jnp.inf, jnp.inf, obs.shape)
 
 
 def control_cost(action: Float[Array, " nu"], weight: float) -> Float[Array, ""]:

@@ -1,36 +1,35 @@
-"""HalfCheetah on brax, as a gymnax environment."""
+"""HalfCheetah on brax."""
 
-import functools
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import jax
 import jax.numpy as jnp
-import numpy as np
 from brax.envs.base import State
 from brax.envs.half_cheetah import Halfcheetah
 from flax import struct
-from gymnax.environments import environment, spaces
 from jaxtyping import Array, Float
 
-INFO_KEYS = ("x_position", "x_velocity", "reward_run", "reward_ctrl")
+from sejax.envs.environment import Environment, EnvParams, EnvState
 
-# Of mjx's line search, where MuJoCo has 50: lanes all wait for the one that searches longest. With
-# 10 gaits are worth as much as with 50, with 8 no longer (docs/halfcheetah.md).
+if TYPE_CHECKING:
+    from sejax.envs.mujoco.tasks import HalfCheetah
+
+# Of mjx's line search, where MuJoCo has 50: under vmap all wait for the longest search. With 10
+# gaits are worth as much as with 50, with 8 no longer (docs/halfcheetah.md).
 LS_ITERATIONS = 10
 
 
 @struct.dataclass
-class CheetahState(environment.EnvState):
+class CheetahState(EnvState):
     physics: Any  # brax's pipeline state
     time: Array | int
 
 
 @struct.dataclass
-class CheetahParams(environment.EnvParams):
+class CheetahParams(EnvParams):
     max_steps_in_episode: int = 1000
 
 
-class HalfCheetahEnv(environment.Environment[CheetahState, CheetahParams]):
+class BraxHalfCheetahEnv(Environment):
     r"""A planar cheetah with six joints that is paid for running forward.
 
     .. math:: r = v_x - 0.1 \lVert a \rVert^2
@@ -45,11 +44,12 @@ class HalfCheetahEnv(environment.Environment[CheetahState, CheetahParams]):
     Source: brax 0.14, `brax.envs.half_cheetah`; Gymnasium's HalfCheetah.
     """
 
-    def __init__(self, backend: str):
-        super().__init__()
-        self.backend = backend
-        self._brax = Halfcheetah(backend=backend)
-        if backend == "mjx":
+    def __init__(self, config: "HalfCheetah"):
+        self.backend = config.backend
+        self.spaces = config.spec.observation, config.spec.action
+        self._info_keys = config.spec.info_keys
+        self._brax = Halfcheetah(backend=self.backend)
+        if self.backend == "mjx":
             self._brax.sys = self._brax.sys.tree_replace({"opt.ls_iterations": LS_ITERATIONS})
 
     @property
@@ -67,7 +67,9 @@ class HalfCheetahEnv(environment.Environment[CheetahState, CheetahParams]):
     ) -> tuple[Float[Array, "17"], CheetahState, Array, Array, dict[Any, Any]]:
         """One control step of 0.05 s; the key has no effect."""
         nothing = jnp.float32(0)
-        before = State(state.physics, None, nothing, nothing, dict.fromkeys(INFO_KEYS, nothing))
+        before = State(
+            state.physics, None, nothing, nothing, dict.fromkeys(self._info_keys, nothing)
+        )
         after = self._brax.step(before, action)
         info = {**after.metrics, "discount": jnp.float32(1)}
         state = CheetahState(physics=after.pipeline_state, time=state.time + 1)
@@ -79,19 +81,3 @@ class HalfCheetahEnv(environment.Environment[CheetahState, CheetahParams]):
     @property
     def name(self) -> str:
         return f"HalfCheetah-{self.backend}"
-
-    @property
-    def num_actions(self) -> int:
-        return self._brax.action_size
-
-    def action_space(self, params: CheetahParams | None = None) -> spaces.Box:
-        limits = np.ones(self._brax.action_size, np.float32)
-        return spaces.Box(-limits, limits, limits.shape)
-
-    @functools.cached_property
-    def _obs_shape(self) -> tuple[int, ...]:
-        # brax's `observation_size` plays a reset, op by op.
-        return jax.eval_shape(lambda: self.reset(jax.random.key(0), self.default_params)[0]).shape
-
-    def observation_space(self, params: CheetahParams | None = None) -> spaces.Box:
-        return spaces.Box(-jnp.inf, jnp.inf, self._obs_shape)

@@ -1,0 +1,250 @@
+"""Gymnasium's MuJoCo tasks, v5. Their environments are `sejax.envs.mujoco.models`.
+
+Step limits and solved rewards are those of Gymnasium's registry where nothing else is said; options
+are Gymnasium's keyword arguments. MuJoCo, its extra `mujoco` and a C++ compiler are needed when a
+task is made.
+"""
+
+import io
+import warnings
+from contextlib import redirect_stdout
+from dataclasses import dataclass
+from typing import ClassVar
+
+from sejax.envs import mujoco
+from sejax.envs.base import Task
+from sejax.envs.spec import Box, TaskSpec
+from sejax.errors import ConfigError
+from sejax.options import Options, finite, not_negative, one_of, option
+
+# Physics of halfcheetah, the default first. The others are brax's, of which only mjx moves like
+# MuJoCo, at ten times its cost on a CPU (docs/halfcheetah.md).
+BACKENDS = ("mujoco", "mjx", "spring", "positional", "generalized")
+
+_ON_A_LINE = ("x_position", "x_velocity")
+_IN_A_PLANE = ("x_position", "y_position", "x_velocity", "y_velocity")
+_TOLD_IN_A_PLANE = (
+    "x_position",
+    "y_position",
+    "distance_from_origin",
+    "x_velocity",
+    "y_velocity",
+    "reward_forward",
+    "reward_ctrl",
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class MujocoTask(Options):
+    """What the tasks have in common.
+
+    Attributes:
+      name: of the task.
+      model: class of `sejax.envs.mujoco.models`.
+    """
+
+    group: ClassVar[str] = "env"
+    name: ClassVar[str]
+    model: ClassVar[str]
+
+    @property
+    def spec(self) -> TaskSpec:
+        """What is known of the task."""
+        raise NotImplementedError
+
+    @property
+    def terminates(self) -> bool:
+        """Whether an unhealthy state ends the episode."""
+        return True
+
+    def make(self) -> Task:
+        return Task.of(self.spec, name=self.name, env=mujoco.make_env(self))
+
+
+@dataclass(frozen=True, kw_only=True)
+class HalfCheetah(MujocoTask):
+    """A planar cheetah that is paid for running and charged for torque.
+
+    Source: paper, appendix, fixed hyperparameters (episode length and solved reward).
+    """
+
+    name = "halfcheetah"
+    model = "HalfCheetahEnv"
+
+    backend: str = option(BACKENDS[0], one_of(BACKENDS))  # physics
+
+    @property
+    def spec(self) -> TaskSpec:
+        return TaskSpec(
+            observation=Box.unbounded(17),
+            action=Box.symmetric(*[1.0] * 6),
+            max_steps=1000,
+            solved_reward=3000.0,
+            info_keys=(*_ON_A_LINE, "reward_run", "reward_ctrl"),
+            augmented_keys=_ON_A_LINE,
+        )
+
+    def make(self) -> Task:
+        if self.backend == "mujoco":
+            env = mujoco.make_env(self, ", or set env.backend=mjx")
+            return Task.of(self.spec, name=self.name, env=env)
+        try:
+            # On import brax prints notes on other physics and warns of its own envs.
+            with warnings.catch_warnings(action="ignore"), redirect_stdout(io.StringIO()):
+                from sejax.envs.mujoco.brax import BraxHalfCheetahEnv
+
+                brax_env = BraxHalfCheetahEnv(self)
+        except ImportError as error:
+            raise ConfigError(
+                f"env.backend={self.backend} needs brax, because its physics are brax's; it is not "
+                f"installed ({error}). Install it with pip install 'sejax[brax]'."
+            ) from error
+        return Task.of(self.spec, name=self.name, env=brax_env)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Hopper(MujocoTask):
+    """A planar leg that is paid for hopping forward without falling."""
+
+    name = "hopper"
+    model = "HopperEnv"
+
+    forward_reward_weight: float = option(1.0, finite("it weighs a reward"))
+    ctrl_cost_weight: float = option(1e-3, not_negative("it weighs a cost"))
+    healthy_reward: float = option(1.0, finite("it is a reward"))
+    terminate_when_unhealthy: bool = True
+    reset_noise_scale: float = option(5e-3, not_negative("it is a range"))
+
+    @property
+    def spec(self) -> TaskSpec:
+        return _walker(obs_dim=11, num_joints=3, solved_reward=3800.0)
+
+    @property
+    def terminates(self) -> bool:
+        return self.terminate_when_unhealthy
+
+
+class Walker2d(Hopper):
+    """A planar body on two legs that is paid for walking forward without falling.
+
+    Gymnasium has no reward threshold for it. The solved reward is our choice, below the 4,683 that
+    TD3's authors report after 1e6 steps (Fujimoto et al., 2018, table 1).
+    """
+
+    name = "walker2d"
+    model = "Walker2dEnv"
+
+    @property
+    def spec(self) -> TaskSpec:
+        return _walker(obs_dim=17, num_joints=6, solved_reward=4000.0)
+
+
+def _walker(obs_dim: int, num_joints: int, solved_reward: float) -> TaskSpec:
+    return TaskSpec(
+        observation=Box.unbounded(obs_dim),
+        action=Box.symmetric(*[1.0] * num_joints),
+        max_steps=1000,
+        solved_reward=solved_reward,
+        info_keys=(
+            *_ON_A_LINE,
+            "z_distance_from_origin",
+            "reward_forward",
+            "reward_ctrl",
+            "reward_survive",
+        ),
+        augmented_keys=_ON_A_LINE,
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Swimmer(MujocoTask):
+    """Three links in a viscous plane that are paid for swimming in one direction."""
+
+    name = "swimmer"
+    model = "SwimmerEnv"
+
+    forward_reward_weight: float = option(1.0, finite("it weighs a reward"))
+    ctrl_cost_weight: float = option(1e-4, not_negative("it weighs a cost"))
+    reset_noise_scale: float = option(0.1, not_negative("it is a range"))
+
+    @property
+    def spec(self) -> TaskSpec:
+        return TaskSpec(
+            observation=Box.unbounded(8),
+            action=Box.symmetric(1.0, 1.0),
+            max_steps=1000,
+            solved_reward=360.0,
+            info_keys=_TOLD_IN_A_PLANE,
+            augmented_keys=_IN_A_PLANE,
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class InvertedPendulum(MujocoTask):
+    """A pole on a cart, pushed by a force, that is paid 1 for each step after which it stands."""
+
+    name = "inverted_pendulum"
+    model = "InvertedPendulumEnv"
+
+    reset_noise_scale: float = option(0.01, not_negative("it is a range"))
+
+    @property
+    def spec(self) -> TaskSpec:
+        return TaskSpec(
+            observation=Box.unbounded(4),
+            action=Box.symmetric(3.0),
+            max_steps=1000,
+            solved_reward=950.0,
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Ant(MujocoTask):
+    """A body on four legs that is paid for walking in one direction and for its health."""
+
+    name = "ant"
+    model = "AntEnv"
+
+    forward_reward_weight: float = option(1.0, finite("it weighs a reward"))
+    ctrl_cost_weight: float = option(0.5, not_negative("it weighs a cost"))
+    contact_cost_weight: float = option(5e-4, not_negative("it weighs a cost"))
+    healthy_reward: float = option(1.0, finite("it is a reward"))
+    terminate_when_unhealthy: bool = True
+    include_cfrc_ext_in_observation: bool = True  # external forces on each body
+    reset_noise_scale: float = option(0.1, not_negative("it is a range"))
+
+    @property
+    def spec(self) -> TaskSpec:
+        return TaskSpec(
+            observation=Box.unbounded(105 if self.include_cfrc_ext_in_observation else 27),
+            action=Box.symmetric(*[1.0] * 8),
+            max_steps=1000,
+            solved_reward=6000.0,
+            info_keys=(*_TOLD_IN_A_PLANE, "reward_contact", "reward_survive"),
+            augmented_keys=_IN_A_PLANE,
+        )
+
+    @property
+    def terminates(self) -> bool:
+        return self.terminate_when_unhealthy
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reacher(MujocoTask):
+    """An arm of two links whose tip must reach a target; its distance and torque are charged."""
+
+    name = "reacher"
+    model = "ReacherEnv"
+
+    reward_dist_weight: float = option(1.0, not_negative("it weighs a cost"))
+    reward_control_weight: float = option(1.0, not_negative("it weighs a cost"))
+
+    @property
+    def spec(self) -> TaskSpec:
+        return TaskSpec(
+            observation=Box.unbounded(10),
+            action=Box.symmetric(1.0, 1.0),
+            max_steps=50,
+            solved_reward=-3.75,
+            info_keys=("reward_dist", "reward_ctrl"),
+        )
