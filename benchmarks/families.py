@@ -65,7 +65,7 @@ def serve(args: argparse.Namespace) -> None:
     programs: dict[str, Any] = {}
     for name, word in chosen.items():
         chunks = session.make_chunks(sejax.config([*words, word]))
-        state = jax.jit(chunks.program.init)(jax.random.split(jax.random.key(args.seed), 1))
+        state = jax.jit(chunks.learner.init)(jax.random.split(jax.random.key(args.seed), 1))
         programs[name] = [chunks, jax.block_until_ready(chunks.advance(state, 1)[0])]
 
     def measure(request: dict[str, Any]) -> dict[str, Any]:

@@ -158,7 +158,7 @@ def serve(args: argparse.Namespace) -> None:
         side: Measured = stack.enter_context(make(config, path, len(cores)))
         save = stack.enter_context(files_of(config, path, side.chunks))
         state = initial(config, side.chunks)
-        program = side.chunks.program
+        program = side.chunks.learner
         about = {"trials": len(program.family_of_trial), "dims": program.num_dims,
                  "num_parallel": config.num_parallel
                  or program.cpu_num_parallel[0] or 1}  # fmt: skip
@@ -317,8 +317,8 @@ def files_of(config: Any, folder: Path, chunks: Any) -> Iterator[Callable[[Any, 
 
     config = dataclasses.replace(config, run_dir=str(folder / "run"))
     with open_for(config) as directory:
-        directory.resume(initial(config, chunks))
-        proxies = session.Proxies(config, directory.path, chunks.program)
+        directory.restore(initial(config, chunks))
+        proxies = session.Proxies(config, directory.path, chunks.learner)
 
         def save(state: Any, info: Any) -> None:
             host_state, info = jax.device_get((state, info))

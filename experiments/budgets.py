@@ -35,7 +35,7 @@ class TimedChunks(session.Chunks):
     """
 
     def __init__(self, chunks: session.Chunks, path: Path, budget_s: float):
-        super().__init__(chunks.program)
+        super().__init__(chunks.learner)
         self._compiled = chunks._compiled  # shared by all runs
         self._path, self._budget_s = path, budget_s
 

@@ -83,7 +83,7 @@ def learn_all(
             with run_directory.open_for(config, f"Set {option}=DIR.") as directory:
                 curve = learn(config, directory, chunks)
             _require_no_more(config, curve)
-            print(f"{config.run_dir}: {_said(curve, chunks.program.solved_score)}", flush=True)
+            print(f"{config.run_dir}: {_said(curve, chunks.learner.solved_score)}", flush=True)
             curves.append(curve)
             tally.add(config.num_seeds)
     return pd.concat(curves, ignore_index=True)

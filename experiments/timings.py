@@ -99,7 +99,7 @@ def time_generations(settings: Timings, row: Row, preset: str) -> pd.DataFrame:
     from sejax.cli import session
 
     chunks = session.make_chunks(config_of(settings, row, preset))
-    program = chunks.program
+    program = chunks.learner
     state = jax.jit(program.init)(jax.random.key(settings.seed)[None])
     idle = jax.tree.map(lambda x: x.copy(), state.replace(finished=~state.finished))
     jax.block_until_ready(chunks.advance(idle, 1))  # compiled, and run with nothing to do

@@ -14,7 +14,7 @@ from sejax import registry
 from sejax.cli import build, commands, compose, runtime
 from sejax.cli.build import EvaluateConfig
 from sejax.cli.families import AgentFamily, families_of, named
-from sejax.errors import ConfigError, require, told
+from sejax.errors import ConfigError, require
 from sejax.proxies import header, hub
 from sejax.training import TrainingConfig, require_reachable, training_of
 
@@ -49,13 +49,7 @@ def evaluate(config: EvaluateConfig) -> float:
 
     study = _real_study(config) if config.proxy == "real" else proxy_study(config)
     out_dir, solved_reward = study.out_dir, study.task.solved_reward
-    try:
-        require_writable(out_dir)  # before agents train for nothing
-    except OSError as error:
-        raise ConfigError(
-            f"out_dir must be a folder that files can be written to, because what agents return is "
-            f"kept there; got {out_dir} ({told(error)}). Set out_dir=DIR."
-        ) from error
+    require_writable("out_dir", out_dir)  # before agents train for nothing
     tables = {
         (world, family.key): _train_and_test(config, study, world, family)
         for world in study.worlds

@@ -88,7 +88,7 @@ def _learn(config: LearnConfig, make_chunks: Callable[[], Any]) -> float:
 
     with open_for(config) as directory, RunProgress(config) as progress:
         try:
-            progress.say("importing jax and the task")
+            progress.status("importing jax and the task")
             from sejax.cli import session
 
             chunks = make_chunks()
@@ -101,7 +101,7 @@ def _learn(config: LearnConfig, make_chunks: Callable[[], Any]) -> float:
             )
             commands.leave(commands.INTERRUPTED)
         best = max(float(row["best_so_far"]) for row in directory.rows)
-        progress.finish(directory, chunks.program, best, ended)
+        progress.finish(directory, chunks.learner, best, ended)
     return best
 
 

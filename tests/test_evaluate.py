@@ -21,7 +21,7 @@ from sejax.cli import build, commands, compose, progress
 from sejax.cli.families import families_of
 from sejax.errors import ConfigError
 from sejax.evaluate import evaluate, proxy_study
-from sejax.ops.sealed import seal, unseal
+from sejax.ops.checksummed import pack, unpack
 from sejax.training import TrainingConfig, budget_for
 
 TINY = ["agent.hidden_size=4", "agent.batch_size=4", "agent.warmup_episodes=0", "num_agents=3",
@@ -141,7 +141,7 @@ def test_a_live_line_counts_the_agents_and_changes_no_number(room, tmp_path, mon
 def test_a_folder_that_cannot_be_written_is_said_before_agents_train(room, tmp_path, monkeypatch):
     (tmp_path / "file").write_text("")
     monkeypatch.setattr("sejax.evaluate._train_and_test", None)
-    with pytest.raises(ConfigError, match=r"^out_dir must be a folder that .* Set out_dir=DIR\."):
+    with pytest.raises(ConfigError, match=r"^out_dir must be a folder that can be written"):
         evaluate(evaluate_config(f"proxy={room}", f"out_dir={tmp_path}/file/x", words=ROOM))
 
 
@@ -351,9 +351,9 @@ def test_where_no_agent_is_named_it_is_the_tasks_own(room, tmp_path):
         assert config.agent == registry.configure("agent", {"name": kind})
     # An older file, which lacks that: its task's name is not imported, nor made.
     path = tmp_path / "theirs.safetensors"
-    tensors, header = unseal(path.read_bytes(), "sejax")
+    tensors, header = unpack(path.read_bytes(), "sejax")
     header.pop("interface")
-    path.write_bytes(seal(tensors, "sejax", header))
+    path.write_bytes(pack(tensors, "sejax", header))
     assert registry.name_of("agent", evaluate_config(f"proxy={path}", words=[]).agent) == "ddqn"
     assert "their" not in sys.modules
 

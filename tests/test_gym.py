@@ -20,7 +20,7 @@ from sejax import envs, registry
 from sejax.errors import ConfigError
 from sejax.gym import GYMNASIUM_IDS, RealTask, SyntheticEnv, SyntheticWorld, make
 from sejax.gym.tasks import se_task
-from sejax.ops.sealed import seal, unseal
+from sejax.ops.checksummed import pack, unpack
 from sejax.proxies import MAX_ABS_VALUE
 from sejax.proxies.configs import SyntheticConfig
 from sejax.proxies.header import find, pretrained_names, read
@@ -507,10 +507,10 @@ def test_what_is_no_single_se_is_one_message(tmp_path, stored):
      ("cliff_walking-rn", {"bogus": 1})],
 )  # fmt: skip
 def test_a_strangers_file_sets_no_options_that_the_task_does_not_have_here(tmp_path, name, given):
-    tensors, header = unseal(find(name).read_bytes(), "sejax")
+    tensors, header = unpack(find(name).read_bytes(), "sejax")
     header["config"]["env"] |= given
     path = tmp_path / "strangers.safetensors"
-    path.write_bytes(seal(tensors, "sejax", header))
+    path.write_bytes(pack(tensors, "sejax", header))
     with pytest.raises(ConfigError, match=rf"^env\.{next(iter(given))} must be"):
         make(path)
 
@@ -520,9 +520,9 @@ def test_a_strangers_file_sets_no_options_that_the_task_does_not_have_here(tmp_p
     lambda name, x: np.float32([1])[0] if name == "start/Dense_0/bias" else x,
 ])  # fmt: skip
 def test_weights_that_are_not_the_networks_are_refused_as_in_jax(tmp_path, change):
-    tensors, values = unseal(find("cartpole").read_bytes(), "sejax")
+    tensors, values = unpack(find("cartpole").read_bytes(), "sejax")
     path = tmp_path / "odd.safetensors"
-    path.write_bytes(seal({k: change(k, x) for k, x in tensors.items()}, "sejax", values))
+    path.write_bytes(pack({k: change(k, x) for k, x in tensors.items()}, "sejax", values))
     assert refused(make, path) == "weights"
 
 

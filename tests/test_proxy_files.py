@@ -18,7 +18,7 @@ from safetensors.numpy import save_file
 import sejax
 from sejax import envs, registry
 from sejax.errors import ConfigError
-from sejax.ops.sealed import seal, unseal
+from sejax.ops.checksummed import pack, unpack
 from sejax.proxies import header
 from sejax.proxies.base import absent_task
 from sejax.proxies.configs import RewardConfig, SyntheticConfig
@@ -55,8 +55,8 @@ def assert_same_weights(a, b):
 
 def rewrite(path, change):
     """The same file, whole and with a right checksum, with other tensors or metadata."""
-    tensors, values = unseal(path.read_bytes(), "sejax")
-    path.write_bytes(seal(*change(tensors, values)))
+    tensors, values = unpack(path.read_bytes(), "sejax")
+    path.write_bytes(pack(*change(tensors, values)))
 
 
 def refusal(load, *args, **kwargs):
@@ -235,7 +235,7 @@ ODD_VALUES = {  # of entries of the metadata, by their place
 
 def test_metadata_of_another_shape_is_one_message(path):
     """Whole files, written by somebody who has another idea of what stands in them."""
-    tensors, whole = unseal(path.read_bytes(), "sejax")
+    tensors, whole = unpack(path.read_bytes(), "sejax")
     for place, odd_values in ODD_VALUES.items():
         for value in odd_values:
             values = copy.deepcopy(whole)
@@ -244,7 +244,7 @@ def test_metadata_of_another_shape_is_one_message(path):
             entry[name] = value
             if value is MISSING:
                 del entry[name]
-            path.write_bytes(seal(tensors, "sejax", values))
+            path.write_bytes(pack(tensors, "sejax", values))
             refusal(sejax.load, path)
 
 
@@ -304,8 +304,8 @@ def test_doubles_and_arrays_of_one_number_are_saved_as_floats_and_numbers(path, 
 
 
 def test_tensors_of_types_that_numpy_lacks_are_refused(path):
-    tensors, values = unseal(path.read_bytes(), "sejax")
-    data = seal({name: x.astype(np.uint8) for name, x in tensors.items()}, "sejax", values)
+    tensors, values = unpack(path.read_bytes(), "sejax")
+    data = pack({name: x.astype(np.uint8) for name, x in tensors.items()}, "sejax", values)
     data = data.replace(b'"U8"', b'"F8_E5M2"', 1)  # longer by 5: taken from the padding's count
     size = int.from_bytes(data[:8], "little") + 5
     path.write_bytes(size.to_bytes(8, "little") + data[8:])
@@ -319,7 +319,7 @@ def test_a_full_disk_is_an_oserror_and_the_older_file_stays(path, env, weights, 
         raise OSError(errno.ENOSPC, "No space left on device")
 
     with monkeypatch.context() as patch:
-        patch.setattr("sejax.ops.files.os.write", full)
+        patch.setattr("sejax.ops.files.os.fsync", full)
         with pytest.raises(OSError, match="No space left"):
             sejax.save(path, env, weights[1], discount=0.7)
         with pytest.raises(OSError, match="No space left"):

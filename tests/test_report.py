@@ -11,7 +11,7 @@ import sejax
 from sejax import report
 from sejax.cli import build, commands, next_steps
 from sejax.cli import report as pages
-from sejax.cli.metrics import columns_of
+from sejax.cli.run_directory import columns_of
 
 HOSTILE = "<script>alert(1)</script>$\\frac{"
 

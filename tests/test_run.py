@@ -1,7 +1,6 @@
 """`python -m sejax.run` as a user meets it: files, resume, kills, damage, bad input."""
 
 import csv
-import dataclasses
 import functools
 import json
 import math
@@ -13,10 +12,8 @@ import subprocess
 import sys
 import types
 from pathlib import Path
-from typing import Any, NamedTuple
 
 import jax
-import numpy as np
 import pytest
 import yaml
 from hydra.core.hydra_config import HydraConfig
@@ -25,9 +22,10 @@ from support import is_drawn
 
 import sejax
 from sejax import run
-from sejax.cli import build, checkpoints, commands, progress, run_directory, session
-from sejax.cli.metrics import COLUMNS, FAMILY_COLUMNS
+from sejax.cli import build, commands, run_directory, session
 from sejax.cli.progress import RunProgress
+from sejax.cli.run_directory import AGENT_COLUMNS, COLUMNS
+from sejax.cli.trackers import Reporter
 from sejax.errors import ConfigError
 
 # A room of 2 x 2 cells for tables: what takes time is importing and compiling.
@@ -37,7 +35,7 @@ TINY = [
     "training.test_episodes=1", "generations=3", "seed=12",
 ]  # fmt: skip
 FILES = {"config.yaml", "metrics.csv", "proxy.safetensors", "proxy_last.safetensors",
-         "checkpoint", "learning_curve.png", "run.json"}  # fmt: skip
+         "checkpoint.safetensors", "learning_curve.png", "run.json", "sejax.lock"}  # fmt: skip
 RUN = [sys.executable, "-m", "sejax.run"]
 
 
@@ -47,18 +45,18 @@ def chunks(*words):
     return session.make_chunks(sejax.config([*TINY, *words]))
 
 
-class Report(session.Quiet):
-    """Keeps what is told."""
+class Report(Reporter):
+    """Keeps the messages."""
 
     def __init__(self):
         self.said = []
 
-    def print(self, text):
+    def say(self, text):
         self.said.append(text)
 
 
 def learn(path, *words, program=()):
-    """A session of a run, as `sejax.run` has it; returns what it told."""
+    """A session of a run, as `sejax.run` has it; returns its messages."""
     config = sejax.config([*TINY, *program, *words, f"run_dir={path}"])
     report = Report()
     with run_directory.open_for(config) as directory:
@@ -119,10 +117,9 @@ def test_what_a_run_cost_adds_up_over_its_sessions(uninterrupted, tmp_path):
 
     learn(tmp_path, "generations=4")
     first = costs(tmp_path)
-    _, saved = checkpoints.newest_record(tmp_path / "checkpoint")  # drawn afterwards is forgotten
     learn(tmp_path, "generations=6")
     both, whole = costs(tmp_path), costs(uninterrupted)
-    assert both.pop("cpu_s") >= round(saved["cpu_s"], 1) and whole.pop("cpu_s") > 0
+    assert both.pop("cpu_s") > 0 and whole.pop("cpu_s") > 0
     assert both == whole
     assert whole["real_steps"] == int(rows(uninterrupted)[-1]["env_steps_total"])
     assert whole["agents"] % 6 == 0 and whole["train_steps"] > first["train_steps"] > 0
@@ -134,45 +131,33 @@ def test_a_finished_run_is_left_as_it_is(uninterrupted):
     assert (uninterrupted / "metrics.csv").read_bytes() == before
 
 
-def test_only_two_checkpoints_are_kept(uninterrupted):
-    names = {path.name for path in (uninterrupted / "checkpoint").iterdir()}
-    assert names == {f"sejax-generation-{n}.safetensors" for n in (5, 6)}
-
-
-@pytest.fixture(scope="module")
-def two_seeds(tmp_path_factory) -> Path:
-    """Two runs of six generations in one program, in chunks of two."""
-    path = tmp_path_factory.mktemp("two")
-    learn(path, "generations=6", "checkpoint_every=2", program=("num_seeds=2",))
-    return path
-
-
-def test_chunks_of_two_generations_and_seeds_give_the_same_metrics(uninterrupted, two_seeds):
-    assert [row["seed"] for row in rows(two_seeds)] == ["12", "13"] * 6
-    assert rows(two_seeds)[::2] == rows(uninterrupted)
-
-
-def test_several_seeds_write_a_proxy_each(two_seeds):
-    assert {path.name for path in two_seeds.iterdir()} == FILES | {"proxies"}
-    names = {f"seed{seed}.safetensors" for seed in (12, 13)}
-    assert {path.name for path in (two_seeds / "proxies").iterdir()} == names
-    best = []
-    for i, seed in enumerate((12, 13)):
-        record = sejax.load_proxy(two_seeds / "proxies" / f"seed{seed}.safetensors").record
-        best.append(max(float(row["incumbent_mean"]) for row in rows(two_seeds)[i::2]))
-        assert record["seed"] == seed and record["score"] == pytest.approx(best[i])
-    assert sejax.load_proxy(two_seeds).record["score"] == pytest.approx(max(best))
+def test_seeds_run_one_after_the_other_on_one_executable(uninterrupted, tmp_path, monkeypatch):
+    compiled, compile_ = [], session.Chunks.compile
+    monkeypatch.setattr(
+        session.Chunks, "compile", lambda self, n: (compiled.append(n), compile_(self, n))
+    )
+    words = ["generations=6", "checkpoint_every=2", "num_seeds=2", f"run_dir={tmp_path}"]
+    best = run.learn(sejax.config([*TINY, *words]))
+    assert compiled == [2]
+    assert {path.name for path in tmp_path.iterdir()} == {"seed12", "seed13"}
+    for seed, score in zip((12, 13), best, strict=True):
+        folder = tmp_path / f"seed{seed}"
+        assert {path.name for path in folder.iterdir()} == FILES
+        assert {row["seed"] for row in rows(folder)} == {str(seed)}
+        record = sejax.load_proxy(folder).record
+        assert record["seed"] == seed and record["score"] == pytest.approx(score)
+    assert rows(tmp_path / "seed12") == rows(uninterrupted)
 
 
 def test_a_population_that_diverges_finishes_and_is_counted(tmp_path):
     shared = chunks()
 
-    def wild_init(keys):
-        state = shared.program.init(keys)
+    def wild_init(key):
+        state = shared.learner.init(key)
         noise_std = state.es_state.noise_std * 1e30
         return state.replace(es_state=state.es_state.replace(noise_std=noise_std))
 
-    wild = session.Chunks(dataclasses.replace(shared.program, init=wild_init))
+    wild = session.Chunks(shared.learner._replace(init=wild_init))
     wild._compiled = shared._compiled
     config = sejax.config([*TINY, "generations=2", f"run_dir={tmp_path}"])
     with run_directory.open_for(config) as directory:
@@ -185,48 +170,50 @@ def test_a_population_that_diverges_finishes_and_is_counted(tmp_path):
 
 TRACKER = """
 import json
-from pathlib import Path
 
 class Lines:
     def __init__(self, run, fail_at):
         self.path, self.fail_at = run.folder.parent / "lines", fail_at
-    def log(self, generation, values, scores):
-        if generation == self.fail_at:
-            raise RuntimeError("out of paper")
-        members = scores.get("member_scores", [])
-        line = [generation, values["incumbent_mean"], list(map(float, members))]
+        self.write("open", run.id, run.generation)
+    def write(self, *values):
         with self.path.open("a") as file:
-            file.write(json.dumps(line) + chr(10))
-    def show(self, name, picture, generations):
-        assert picture.exists()
+            file.write(json.dumps(values) + chr(10))
+    def on_generation(self, info):
+        if info.generation == self.fail_at:
+            raise RuntimeError("out of paper")
+        scores = list(map(float, info.scores))
+        self.write(info.generation, info.values["incumbent_mean"], scores, info.train_steps)
     def close(self):
-        pass
+        self.write("close")
 
 def make(run, fail_at: int | None = None) -> Lines:
     return Lines(run, fail_at)
 """
 
 
-def test_a_tracker_of_ones_own_is_told_what_the_files_have(uninterrupted, tmp_path, monkeypatch):
+def test_a_tracker_of_ones_own_hears_what_the_files_have(uninterrupted, tmp_path, monkeypatch):
     (tmp_path / "my_tracker.py").write_text(TRACKER)
     monkeypatch.syspath_prepend(str(tmp_path))
-    learn(tmp_path / "run", "generations=4", "tracker=my_tracker:make")
-    said = learn(tmp_path / "run", "generations=6", "tracker=my_tracker:make", "tracker.fail_at=5")
+    folder, word = tmp_path / "run", "tracker=my_tracker:make"
+    learn(folder, "generations=3", "checkpoint_every=3", word)
+    said = learn(folder, "generations=6", word, "tracker.fail_at=5")
     assert "tracker=my_tracker:make has failed" in said and "RuntimeError: out of paper" in said
-    made = rows(tmp_path / "run")
+    learn(folder, "generations=6", word)  # nothing is left to do: not even opened
+    made = rows(folder)
     assert made == rows(uninterrupted)
-    proxies = [(path / "proxy.safetensors").read_bytes() for path in (tmp_path / "run",
-                                                                      uninterrupted)]  # fmt: skip
+    proxies = [(path / "proxy.safetensors").read_bytes() for path in (folder, uninterrupted)]
     assert proxies[0] == proxies[1]
     lines = [json.loads(line) for line in (tmp_path / "lines").read_text().splitlines()]
-    assert [line[0] for line in lines] == [0, 1, 2, 3, 4]
-    for (_, mean, scores), row in zip(lines, made, strict=False):
+    opened = [line for line in lines if line[0] == "open"]
+    assert [line[2] for line in opened] == [0, 3] and opened[0][1] == opened[1][1]
+    heard = [line for line in lines if line[0] not in ("open", "close")]
+    assert [line[0] for line in heard] == [0, 1, 2, 3, 4]
+    assert lines[4] == lines[-1] == ["close"]
+    for (_, mean, scores, steps), row in zip(heard, made, strict=False):
         assert mean == float(row["incumbent_mean"])
         assert max(scores) == pytest.approx(float(row["population_max"]))
         assert sum(scores) / len(scores) == pytest.approx(float(row["population_mean"]))
-    learn(tmp_path / "run", "generations=6", "tracker=my_tracker:make")  # what it has missed
-    last = json.loads((tmp_path / "lines").read_text().splitlines()[-1])
-    assert last == [5, float(made[5]["incumbent_mean"]), []]
+        assert steps % float(row["train_steps_mean"]) == 0
 
 
 # --- families of agents --------------------------------------------------------------------------
@@ -259,7 +246,7 @@ def test_metrics_and_proxies_tell_of_each_family(two_families):
     made = rows(two_families)
     assert list(made[0]) == [
         *(name for name in COLUMNS if name != "wall_s"),
-        *(f"{name}_{key}" for key in keys for name in FAMILY_COLUMNS),
+        *(f"{name}_{key}" for key in keys for name in AGENT_COLUMNS),
     ]
     for row in made:
         mean = sum(float(row[f"incumbent_mean_{key}"]) for key in keys) / 2
@@ -299,101 +286,100 @@ def test_the_command_names_all_families_for_the_evaluation(two_families, capsys)
 # --- damage --------------------------------------------------------------------------------------
 
 
-def test_a_damaged_checkpoint_is_named_and_the_one_before_is_used(uninterrupted, tmp_path):
-    learn(tmp_path, "generations=4")
-    newest = tmp_path / "checkpoint" / "sejax-generation-4.safetensors"
-    newest.write_bytes(newest.read_bytes()[:-10])
-    said = learn(tmp_path, "generations=6")
-    assert f"{newest} is passed over" in said and "Going on at generation 3" in said
-    assert rows(tmp_path) == rows(uninterrupted)
-
-
-def test_a_run_that_lost_its_checkpoints_is_not_replaced(uninterrupted, tmp_path):
-    shutil.copytree(uninterrupted, tmp_path, dirs_exist_ok=True)
-    shutil.rmtree(tmp_path / "checkpoint")
-    files = [tmp_path / name for name in ("metrics.csv", "config.yaml", "proxy.safetensors")]
-    before = [file.read_bytes() for file in files]
-    with pytest.raises(ConfigError, match=r"keep the checkpoints of a run.*run_dir=FOLDER"):
-        learn(tmp_path, "generations=9")
-    assert [file.read_bytes() for file in files] == before
-
-
-def test_another_configuration_in_the_same_directory_is_refused(uninterrupted):
-    with pytest.raises(ConfigError, match=r"differs in es\.population_size \(2 there, 3 here\)"):
-        learn(uninterrupted, "es.population_size=3")
-
-
-def test_an_unwritable_directory_is_a_clear_error(tmp_path):
-    blocked = tmp_path / "file"
-    blocked.write_text("")
-    with pytest.raises(ConfigError, match=r"run_dir must be a folder that can be written.*Set run"):
-        learn(blocked / "run")
+def test_a_damaged_checkpoint_is_refused_and_files_that_lack_are_made_again(
+    uninterrupted, tmp_path
+):
+    folder = Path(shutil.copytree(uninterrupted, tmp_path / "run"))
+    for name in FILES - {"checkpoint.safetensors"}:
+        (folder / name).unlink()
+    (folder / "proxy.safetensors").write_text("damaged")
+    learn(folder, "generations=6")
+    assert {path.name for path in folder.iterdir()} == FILES
+    assert rows(folder) == rows(uninterrupted)
+    for name in ("proxy.safetensors", "proxy_last.safetensors"):
+        assert (folder / name).read_bytes() == (uninterrupted / name).read_bytes()
+    checkpoint = folder / "checkpoint.safetensors"
+    checkpoint.write_bytes(checkpoint.read_bytes()[:-10])
+    with pytest.raises(ConfigError, match="must hold a whole checkpoint"):
+        learn(folder, "generations=6")
 
 
 def test_a_full_disk_loses_nothing_that_was_written(uninterrupted, tmp_path, monkeypatch):
     learn(tmp_path, "generations=2")
-    before = (tmp_path / "metrics.csv").read_bytes()
-
-    fsync = os.fsync
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
 
     def full(descriptor):
-        if "metrics" in os.readlink(f"/proc/self/fd/{descriptor}"):
-            raise OSError(28, "No space left on device")
-        fsync(descriptor)
+        raise OSError(28, "No space left on device")
 
     with monkeypatch.context() as patch:
         patch.setattr("sejax.ops.files.os.fsync", full)
         with pytest.raises(OSError, match="No space left"):
-            learn(tmp_path, "generations=6")
-    assert (tmp_path / "metrics.csv").read_bytes() == before
-    assert not list(tmp_path.glob(".metrics*")), "temporary files are removed"
+            learn(tmp_path, "generations=6", "devices=1")
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
     learn(tmp_path, "generations=6")
     assert rows(tmp_path) == rows(uninterrupted)
 
 
+def test_seconds_do_not_follow_the_machines_clock(uninterrupted, tmp_path, monkeypatch):
+    monkeypatch.setattr("time.time", lambda: 0.0)
+    learn(tmp_path, "generations=2")
+    monkeypatch.setattr("time.time", lambda: -1e9)
+    learn(tmp_path, "generations=4")
+    with (tmp_path / "metrics.csv").open(newline="") as file:
+        seconds = [float(row["wall_s"]) for row in csv.DictReader(file)]
+    assert seconds == sorted(seconds) and seconds[0] > 0 and seconds[-1] < 3600
+
+
 # --- processes -----------------------------------------------------------------------------------
 
-# `sejax.run` whose process gets a signal when it has told of its second generation. A kill comes at
-# once; Ctrl-C comes from another thread, at whatever the run is doing then. A shell's background
-# jobs, such as a test run may be, ignore Ctrl-C, and what they start does too.
+# `sejax.run` whose process gets a signal after its second generation. A kill comes at once; Ctrl-C
+# comes from another thread, at whatever the run is doing then. A shell's background jobs, such as a
+# test run may be, ignore Ctrl-C, and the processes that they start do too.
 DRIVER = """
 import os, runpy, signal, sys, threading
 from sejax.cli import progress
 
 number = signal.Signals[sys.argv.pop(1)]
 signal.signal(signal.SIGINT, signal.default_int_handler)
-update = progress.RunProgress.update
+on_generation = progress.RunProgress.on_generation
 
-def told(self, generation, info):
-    update(self, generation, info)
-    if generation == 2 and number == signal.SIGKILL:
+def heard(self, info):
+    on_generation(self, info)
+    if info.generation == 1 and number == signal.SIGKILL:
         os.kill(os.getpid(), number)
-    if generation == 2:
+    if info.generation == 1:
         threading.Timer(0.05, os.kill, (os.getpid(), number)).start()
 
-progress.RunProgress.update = told
+progress.RunProgress.on_generation = heard
 runpy.run_module("sejax.run", run_name="__main__", alter_sys=True)
 """
 
 
-def process(*words: str, timeout: float = 1800) -> subprocess.CompletedProcess[str]:
-    """A process of its own, which finds what has been compiled here."""
+def process(*words: str, flags: str | None = None) -> subprocess.CompletedProcess[str]:
+    """A process of its own, with other XLA flags if they are given."""
     cache = {"JAX_COMPILATION_CACHE_DIR": str(jax.config.jax_compilation_cache_dir),
              "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.05"}  # fmt: skip
-    return subprocess.run(words, capture_output=True, text=True, timeout=timeout,
-                          env=os.environ | cache)  # fmt: skip
+    xla = {} if flags is None else {"XLA_FLAGS": flags}
+    return subprocess.run(words, capture_output=True, text=True, timeout=1800,
+                          env=os.environ | cache | xla)  # fmt: skip
 
 
-def test_a_killed_run_goes_on_to_the_same_metrics(uninterrupted, tmp_path):
-    words = [*TINY, "generations=6", f"run_dir={tmp_path}"]
-    killed = process(sys.executable, "-c", DRIVER, "SIGKILL", *words)
-    assert killed.returncode == -signal.SIGKILL, killed.stderr
-    assert len(rows(tmp_path)) == 2
-    finished = process(*RUN, *words)
+def test_a_killed_run_goes_on_to_the_same_numbers_with_the_flags_that_users_have(tmp_path):
+    words = [*TINY, "generations=4"]
+    whole, killed = tmp_path / "whole", tmp_path / "killed"
+    ended = process(*RUN, *words, f"run_dir={whole}", flags="")
+    assert ended.returncode == 0, ended.stderr
+    driven = sys.executable, "-c", DRIVER, "SIGKILL", *words, f"run_dir={killed}"
+    ended = process(*driven, flags="")
+    assert ended.returncode == -signal.SIGKILL, ended.stderr
+    assert len(rows(killed)) == 2
+    finished = process(*RUN, *words, f"run_dir={killed}", flags="")
     assert finished.returncode == 0, finished.stderr
     assert "Going on at generation 2" in finished.stdout and "learned" in finished.stdout
-    assert rows(tmp_path) == rows(uninterrupted)
-    assert {path.name for path in tmp_path.iterdir()} == FILES
+    assert rows(killed) == rows(whole)
+    for name in ("proxy.safetensors", "proxy_last.safetensors"):
+        assert (killed / name).read_bytes() == (whole / name).read_bytes()
+    assert {path.name for path in killed.iterdir()} == FILES
 
 
 def test_ctrl_c_saves_and_exits_130(tmp_path):
@@ -401,21 +387,8 @@ def test_ctrl_c_saves_and_exits_130(tmp_path):
     ended = process(sys.executable, "-c", DRIVER, "SIGINT", *words)
     assert ended.returncode == 130, ended.stderr
     saved = next(line for line in ended.stdout.splitlines() if "are saved in" in line)
-    assert 2 <= int(saved.split()[1]) <= len(rows(tmp_path))
+    assert int(saved.split()[1]) >= 2 and len(rows(tmp_path)) >= 2
     assert (tmp_path / "proxy.safetensors").exists()
-
-
-def test_an_interrupt_waits_until_files_are_written():
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    written = []
-    try:
-        with pytest.raises(KeyboardInterrupt), commands.interrupts_held():
-            signal.raise_signal(signal.SIGINT)
-            written.append("all")
-        assert written == ["all"]
-        assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
-    finally:
-        signal.signal(signal.SIGINT, before)
 
 
 def test_bad_input_ends_a_process_with_one_message_and_status_2(tmp_path):
@@ -453,7 +426,7 @@ def test_bad_input_ends_with_one_message_and_status_2(
 
 
 def test_the_command_says_how_it_ended_and_what_to_do_next(uninterrupted, capsys):
-    best = run.learn(sejax.config([*TINY, "generations=6", f"run_dir={uninterrupted}"]))
+    (best,) = run.learn(sejax.config([*TINY, "generations=6", f"run_dir={uninterrupted}"]))
     said = capsys.readouterr().out
     scores = [float(row["incumbent_mean"]) for row in rows(uninterrupted)]
     assert best == pytest.approx(max(scores))
@@ -478,14 +451,3 @@ def test_a_job_of_a_sweep_has_a_folder_of_its_own(monkeypatch, mode, words, name
     assert commands.name_in_sweep(build.IN_RUN_DIR) == name
     job.overrides.task = [f"agent.x={'9' * 500}"]
     assert len(commands.name_in_sweep(build.IN_RUN_DIR)) <= 120
-
-
-def test_a_progress_line_is_of_the_generations_that_ran():
-    active = np.array([[True, True, False], [True, False, False]])
-    last = progress._last_rows(Rows(active=active, values=np.arange(6.0).reshape(2, 3)))
-    np.testing.assert_array_equal(last.values, [3.0, 1.0])  # of the third seed none
-
-
-class Rows(NamedTuple):
-    active: Any
-    values: Any

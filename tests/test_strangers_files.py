@@ -7,6 +7,7 @@ imported, or a function of Python's own that runs a shell command.
 import sys
 
 import jax
+import numpy as np
 import optuna
 import pytest
 import yaml
@@ -14,8 +15,9 @@ import yaml
 import sejax
 from experiments import supervised_baseline
 from sejax import evaluate, registry, report, run
-from sejax.cli import build, checkpoints, commands
-from sejax.cli.metrics import columns_of
+from sejax.cli import build, commands
+from sejax.cli.run_directory import columns_of
+from sejax.ops import checksummed
 from sejax.search import __main__ as search
 from sejax.search import settings, study
 
@@ -106,10 +108,12 @@ def test_a_run_directory_is_compared_as_text(folder, refused, foreign):
 
 
 @pytest.mark.parametrize("foreign", FOREIGN, ids=NAMES)
-def test_a_checkpoints_record_is_compared_as_text(folder, refused, foreign):
-    metrics = {"bytes": 0, "sha256": "", "generations": {}}
-    record = {"config": stored(**foreign), "metrics": metrics, "cpu_s": 1.0}
-    checkpoints.save(folder / "run" / "checkpoint", 1, {}, record)
+def test_a_checkpoints_configuration_is_compared_as_text(folder, refused, foreign):
+    (folder / "run").mkdir()
+    rows = {"metrics": np.frombuffer(f"{','.join(columns_of())}\n".encode(), np.uint8)}
+    manifest = {"format_version": 1, "config": stored(**foreign), "id": "0", "cpu_s": 1.0}
+    data = checksummed.pack(rows, "sejax_run", manifest)
+    (folder / "run" / "checkpoint.safetensors").write_bytes(data)
     assert "run_dir must be new or hold" in refused(run_command, *TASK, "run_dir=run")
 
 

@@ -6,9 +6,7 @@ import hashlib
 import io
 import os
 import re
-import signal
 import sys
-import threading
 from collections.abc import Callable, Collection, Iterator, Sequence
 from pathlib import Path
 from typing import NoReturn, TypeVar
@@ -162,23 +160,6 @@ def fail(message: str, status: int) -> NoReturn:
     """Prints the message and ends the process."""
     print(f"error: {message}", file=sys.stderr)
     sys.exit(status)
-
-
-@contextlib.contextmanager
-def interrupts_held() -> Iterator[None]:
-    """Ctrl-C is heard at the end of the block, so that what it writes is finished first."""
-    is_main = threading.current_thread() is threading.main_thread()
-    if not is_main or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
-        yield
-        return
-    heard: list[int] = []
-    signal.signal(signal.SIGINT, lambda number, frame: heard.append(number))
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, signal.default_int_handler)
-    if heard:
-        raise KeyboardInterrupt
 
 
 def leave(status: int) -> NoReturn:

@@ -1,9 +1,9 @@
 """Live lines of progress on a terminal, and the last words of `sejax.run`."""
 
 import time
-from typing import Any
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
 
-import numpy as np
 from rich.console import Console
 from rich.progress import (
     BarColumn,
@@ -18,8 +18,11 @@ from sejax import registry
 from sejax.cli import next_steps, presets
 from sejax.cli.build import LearnConfig
 from sejax.cli.families import families_of
+from sejax.cli.trackers import FinishedGeneration, Reporter
 
-DRAW_EVERY_S = 30.0
+if TYPE_CHECKING:  # the first line is shown before jax is imported
+    from sejax.bilevel import Bilevel
+    from sejax.cli.run_directory import RunDirectory
 
 
 class Tally:
@@ -63,7 +66,7 @@ class Tally:
             self._progress.update(self._task, completed=self._total)
 
 
-class RunProgress:
+class RunProgress(Reporter):
     """One live line on a terminal; one line for each generation elsewhere."""
 
     def __init__(self, config: LearnConfig):
@@ -81,89 +84,77 @@ class RunProgress:
             disable=not self._live,
         )
         self._task = self._progress.add_task("", total=config.generations)
-        self._last = self._drawn = time.time()
+        self._started, self._steps = time.monotonic(), 0
 
     def __enter__(self) -> "RunProgress":
         self._progress.start()
         pair = self._config.name("env"), self._config.name("proxy")
         if not presets.is_tuned(*pair):
-            self.print(
+            self.say(
                 f"There are no tuned settings for env={pair[0]} with proxy={pair[1]}: these are "
                 f"general ones, not tuned (docs/defaults.md)."
             )
         return self
 
     def __exit__(self, *_: Any) -> None:
-        self._progress.stop()
+        self.stop()
 
     def stop(self) -> None:
         self._progress.stop()
 
-    def say(self, text: str) -> None:
+    def status(self, text: str) -> None:
         """Shows what is being done before the first generation."""
         self._progress.update(self._task, description=text)
+        self._started = time.monotonic()
 
-    def print(self, text: str) -> None:
+    def say(self, text: str) -> None:
         """Prints a line that stays."""
         self._console.print(text, soft_wrap=True)
 
-    def compiled(self) -> None:
-        self.say("first generation")
-        self._last = time.time()
-
-    def update(self, generation: int, info: Any) -> None:
-        """Shows the last generation of a chunk, whose info has leaves `[generation, ...]`."""
-        now = time.time()
-        last = max(np.flatnonzero(info.active), default=-1)
-        steps_per_s = np.sum(info.train_steps, dtype=np.int64) / max(now - self._last, 1e-9)
-        self._last = now
+    def on_generation(self, info: FinishedGeneration) -> None:
+        """Shows the numbers of a generation; steps per second are the session's so far."""
+        self._steps += info.train_steps
+        steps_per_s = self._steps / max(time.monotonic() - self._started, 1e-9)
+        values = info.values
         text = (
-            f"incumbent {info.incumbent_mean[last]:.1f} ± {info.incumbent_std[last]:.1f}"
-            f"{self._of_agents(info.by_agent.incumbent_mean[last])}, "
-            f"best {info.best_so_far[last]:.1f}, "
-            f"{info.train_steps_mean[last]:,.0f} steps an agent, {steps_per_s:,.0f} steps/s"
+            f"incumbent {values['incumbent_mean']:.1f} ± {values['incumbent_std']:.1f}"
+            f"{self._of_agents(values)}, best {values['best_so_far']:.1f}, "
+            f"{values['train_steps_mean']:,.0f} steps an agent, {steps_per_s:,.0f} steps/s"
         )
-        num_nonfinite = int(np.sum(info.num_nonfinite))
-        if num_nonfinite:
-            text += f", {num_nonfinite} diverged"
-        self._progress.update(self._task, completed=generation, description=text)
+        if values["num_nonfinite"]:
+            text += f", {values['num_nonfinite']:.0f} diverged"
+        done = info.generation + 1
+        self._progress.update(self._task, completed=done, description=text)
         if not self._live:
-            self.print(f"generation {generation}/{self._config.generations}: {text}")
+            self.say(f"generation {done}/{self._config.generations}: {text}")
 
-    def _of_agents(self, means: np.ndarray) -> str:
-        """The incumbent's score with each agent of a mixture."""
-        each = [
-            f"{family.key} {mean:.1f}"
-            for family, mean in zip(families_of(self._config), means, strict=True)
-        ]
-        return f" ({', '.join(each)})" if len(each) > 1 else ""
+    def _of_agents(self, values: Mapping[str, float]) -> str:
+        """The incumbent's mean for each of several agents."""
+        keys = [family.key for family in families_of(self._config)]
+        each = [f"{key} {values[f'incumbent_mean_{key}']:.1f}" for key in keys if len(keys) > 1]
+        return f" ({', '.join(each)})" if each else ""
 
-    def time_to_draw(self) -> bool:
-        """Whether the picture is old enough to be drawn again."""
-        if time.time() - self._drawn < DRAW_EVERY_S:
-            return False
-        self._drawn = time.time()
-        return True
-
-    def finish(self, directory: Any, program: Any, best: float, ended: str) -> None:
+    def finish(
+        self, directory: "RunDirectory", learner: "Bilevel", best: float, ended: str
+    ) -> None:
         """Says how it ended, where everything is, and what to do next."""
         self.stop()
         verdict = f"best incumbent score {best:.1f}"
-        if program.objective.meaning:
-            verdict += f": {program.objective.meaning}"
-        if program.solved_score is not None:
-            solved = "solved" if best >= program.solved_score else "not solved"
+        if learner.objective.meaning:
+            verdict += f": {learner.objective.meaning}"
+        if learner.solved_score is not None:
+            solved = "solved" if best >= learner.solved_score else "not solved"
             verdict = (
-                f"{solved}: best incumbent mean {best:.1f}, solved at {program.solved_score:g}"
+                f"{solved}: best incumbent mean {best:.1f}, solved at {learner.solved_score:g}"
             )
         path, config = directory.path, self._config
         agents = [registry.name_of("agent", each.agent) for each in families_of(config)]
         words = next_steps.evaluate_words(
-            path, config.name("env"), config.name("proxy"), agents, program.proxy.is_real
+            path, config.name("env"), config.name("proxy"), agents, learner.proxy.is_real
         )
         title = "learned" if ended == "finished" else ended
-        self._console.rule(f"{program.task.name}: {title}", align="left")
-        self.print(
+        self._console.rule(f"{learner.task.name}: {title}", align="left")
+        self.say(
             f"{verdict}\n\n"
             f"  {path}/proxy.safetensors    the best proxy\n"
             f"  {path}/learning_curve.png   how it was learned\n"

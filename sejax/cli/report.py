@@ -16,7 +16,7 @@ import pandas as pd
 import yaml
 
 from sejax.cli import next_steps
-from sejax.cli.metrics import COLUMNS
+from sejax.cli.run_directory import COLUMNS
 from sejax.errors import ConfigError, told
 from sejax.serialize import flatten
 

@@ -1,108 +1,132 @@
-"""The files of a run: configuration, metrics, proxies, checkpoints, summary.
+"""A run's folder, of which one file counts: `checkpoint.safetensors`.
 
-They are written in an order that a kill at any moment leaves consistent: metrics and proxies
-first, the checkpoint last, which vouches for the metrics. A run that is refused keeps all its
-files as they are. Nothing here imports jax before a state is restored: a refusal is quick.
+It holds the configuration, the state of the learner, and all rows of `metrics.csv`. It is written
+to a temporary file, put on the disk, and renamed over the one before, so that a kill at any moment
+leaves a whole checkpoint. All other files are remade from it when the run goes on. A run that is
+refused changes nothing.
+
+Nothing here imports jax before a state is restored or saved, so that a refusal is quick.
 """
 
+import contextlib
 import json
-import math
-from collections.abc import Callable, Sequence
+import os
+import secrets
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import Any, TypeGuard
+from typing import Any, NoReturn
 
+import filelock
+import numpy as np
 import yaml
 
-from sejax.cli import checkpoints
-from sejax.cli.metrics import Metrics, MetricsError
-from sejax.cli.run_lock import RunLock, acquire
 from sejax.errors import ConfigError
-from sejax.ops.files import remove_leftovers, write_text
+from sejax.ops import checksummed
+from sejax.ops.files import remove_leftovers, write_bytes, write_text
 from sejax.serialize import differences
 
-__all__ = ["FREE_FIELDS", "RunDirectory", "open_for"]
-
-# Fields, and groups of them, that say how or how long to compute, not what: they may change between
-# two sessions.
+COLUMNS = (
+    "generation",
+    "seed",
+    "incumbent_mean",
+    "incumbent_std",
+    "population_mean",
+    "population_max",
+    "best_so_far",
+    "train_steps_mean",
+    "train_steps_max",
+    "train_episodes_mean",
+    "num_nonfinite",
+    "env_steps_total",
+    "wall_s",
+)
+# Columns that each agent of a mixture has too, with its name at the end.
+AGENT_COLUMNS = ("incumbent_mean", "population_mean", "train_steps_mean", "num_nonfinite")
+# Fields and groups that say how or how long to compute, not what: they may change between two
+# sessions of a run.
 FREE_FIELDS = {"generations", "devices", "checkpoint_every", "run_dir", "tracker", "machines"}
 HINT = "Set run_dir=FOLDER."
+
+_CHECKPOINT, _METRICS, _CONFIG, _LOCK = (
+    "checkpoint.safetensors",
+    "metrics.csv",
+    "config.yaml",
+    "sejax.lock",
+)
+_KIND, _FORMAT_VERSION, _STATE, _ROWS = "sejax_run", 1, "state", "metrics"
+# Files whose temporaries a killed session leaves.
+_WRITTEN = (
+    _CHECKPOINT,
+    _METRICS,
+    _CONFIG,
+    "proxy.safetensors",
+    "proxy_last.safetensors",
+    "learning_curve.png",
+    "run.json",
+)
+# Files that only a run leaves; without its checkpoint they come from an older sejax, or it is lost.
+_SIGNS_OF_A_RUN = (_METRICS, "proxy.safetensors", "checkpoint")
 
 
 class RunDirectory:
     """One run's folder, which this process alone uses until `close`.
 
-    Call `resume` once, then for each chunk `append`, the proxies, and `commit`.
+    Call `restore` once, then `save` after each block of generations.
+
+    Attributes:
+      path: the folder.
+      config: the configuration, plain values in nested mappings.
+      rows: the rows of `metrics.csv`, each as text by column.
+      id: 8 hexadecimal digits, drawn when the run began.
+      cpu_s: CPU seconds of all sessions up to the checkpoint.
     """
 
     def __init__(
         self,
-        path: Path,
-        config: dict[str, Any],
-        seeds: list[int],
-        hint: str,
-        lock: RunLock,
-        families: Sequence[str] = (),
-        completed: Callable[[dict[str, Any]], dict[str, Any]] = dict,
-    ):
-        self.path = path
-        self._completed = completed
-        self.config = json.loads(json.dumps(config))  # as it reads back: tuples are lists
-        self.seeds = seeds
-        self._hint = hint
-        self._lock = lock
-        self._table = Metrics(self.metrics, seeds, families)
-        self._stored = self._stored_config()
-        newest = checkpoints.newest_record(self.checkpoints)
-        self._record = newest[1] if newest else None
-
-    @classmethod
-    def open(
-        cls,
         path: str | Path,
         config: dict[str, Any],
-        seeds: list[int],
+        agents: Sequence[str] = (),
         hint: str = HINT,
-        families: Sequence[str] = (),
         completed: Callable[[dict[str, Any]], dict[str, Any]] = dict,
-    ) -> "RunDirectory":
+    ):
         """Makes the folder, or opens that of an earlier session of the same run.
 
         Args:
           path: the folder.
-          config: the configuration, plain values in nested mappings; `checkpoint_every` is read.
-          seeds: the `seed` column of the metrics.
-          hint: last sentence of a refusal: how to choose another folder.
-          families: of agents, as the metrics call them; several have columns of their own.
-          completed: a stored configuration with the fields that a former version did not write;
-            new ones have a default that changes no number.
+          config: the configuration, plain values in nested mappings; `seed` is read.
+          agents: names of the agents; each of several has columns of its own.
+          hint: last sentence of messages: how to choose another folder.
+          completed: adds to a stored configuration the fields that an older version did not write.
 
         Raises:
-          ConfigError: if it holds a run of another configuration, is in use by another process, or
-            cannot be written.
+          ConfigError: if the folder holds another run or a damaged one, is in use by another
+            process, or cannot be written.
         """
-        path = Path(path)
+        self.path = Path(path)
+        self.config: dict[str, Any] = json.loads(json.dumps(config))  # tuples as lists, as stored
+        self.columns = columns_of(agents)
+        self.rows: list[dict[str, str]] = []
+        self.id, self.cpu_s = secrets.token_hex(4), 0.0
+        self._agents, self._hint = agents if len(agents) > 1 else (), hint
+        self._csv = _as_csv([self.columns])
+        self._state: dict[str, np.ndarray] | None = None
+        self._made = [x for x in (self.path, *self.path.parents) if not os.path.exists(x)]
+        self._lock = self._locked()
         try:
-            path.mkdir(parents=True, exist_ok=True)
-            lock = acquire(path / "sejax.lock", hint)
-        except OSError as error:
-            raise ConfigError(
-                f"run_dir must be a folder that can be written, because the run's files go there; "
-                f"got {path} ({error}). {hint}"
-            ) from error
-        try:
-            directory = cls(
-                path, config, [int(seed) for seed in seeds], hint, lock, families, completed
-            )
-            directory._refuse_another_run()
-            for folder in (path, path / "proxies", directory.checkpoints):
-                remove_leftovers(folder)
+            self._open(completed)
         except BaseException:
-            lock.release()
+            self.close()
             raise
-        return directory
 
     def close(self) -> None:
-        """Lets other processes use the folder."""
+        """Lets other processes use the folder; without a run there, leaves nothing behind."""
+        if not self._lock.is_locked:
+            return
+        if not (self.path / _CHECKPOINT).exists():
+            (self.path / _LOCK).unlink(missing_ok=True)
+            for folder in self._made:
+                with contextlib.suppress(OSError):  # it is not empty
+                    folder.rmdir()
         self._lock.release()
 
     def __enter__(self) -> "RunDirectory":
@@ -113,202 +137,186 @@ class RunDirectory:
 
     @property
     def metrics(self) -> Path:
-        return self.path / "metrics.csv"
-
-    @property
-    def checkpoints(self) -> Path:
-        return self.path / "checkpoint"
-
-    @property
-    def proxy(self) -> Path:
-        return self.path / "proxy.safetensors"
-
-    @property
-    def rows(self) -> list[dict[str, str]]:
-        """Rows of the metrics as text; after `resume`, those of the run as it goes on."""
-        return self._table.rows
+        return self.path / _METRICS
 
     @property
     def finished_generations(self) -> int:
-        """Generations with rows that the newest checkpoint has: what a kill would leave."""
-        metrics = self._record["metrics"] if _is_record(self._record) else {"generations": {}}
-        return max(metrics["generations"].values(), default=0)
+        """Generations that are saved."""
+        return len(self.rows)
 
     @property
-    def cpu_s(self) -> float:
-        """CPU seconds of the sessions up to the newest checkpoint; nan if it does not say."""
-        return self._record.get("cpu_s", math.nan) if _is_record(self._record) else 0.0
+    def wall_s(self) -> float:
+        """Seconds of all sessions up to the checkpoint."""
+        return float(self.rows[-1]["wall_s"]) if self.rows else 0.0
 
-    def resume(self, template: Any) -> tuple[Any, int, list[str]]:
-        """Restores the newest whole checkpoint and drops metrics that it does not include.
+    @property
+    def real_steps(self) -> int:
+        """Steps on the real task up to the checkpoint."""
+        return int(self.rows[-1]["env_steps_total"]) if self.rows else 0
 
-        All checks come first. Then the metrics are cut, and the configuration is written, as its
-        free fields may differ from those stored.
+    def restore(self, like: Any) -> Any:
+        """The state of the checkpoint, and the files beside it remade; None for a new run.
 
         Args:
-          template: a state of the run before its first generation.
-
-        Returns:
-          The state to go on from, the generations it has finished, and a sentence for each
-          checkpoint that was passed over.
+          like: a state of the run, or its shapes.
 
         Raises:
-          ConfigError: if the metrics are not those that the checkpoint vouches for, or there is no
-            whole checkpoint of a run that had one: it would start anew and replace what is there.
+          ConfigError: if the checkpoint's state has another structure.
           OSError: if a file cannot be written.
         """
-        state, generation, record, problems = checkpoints.restore_newest(self.checkpoints, template)
-        vouched = None
-        if generation or record is not None:
-            vouched = self._vouched(generation, record)
-            self._record = record
-        else:
-            self._refuse_to_start_anew(problems)
-        self._table.go_on_from(vouched)  # first: what may be there without a checkpoint goes by the
-        if self._stored != self.config:  # `checkpoint_every` that is stored
-            write_text(self.path / "config.yaml", yaml.safe_dump(self.config, sort_keys=False))
-            self._stored = self.config
-        return state, generation, problems
+        if self._state is None:
+            return None
+        try:
+            state = _as_state(self._state, like)
+        except checksummed.DamagedError as error:
+            self._refuse_checkpoint(error)
+        self._state = None
+        self._remake()
+        return state
 
-    def append(self, info: Any, wall_s: float) -> None:
-        """Adds the rows of a chunk to the metrics, in a time that does not grow with their number.
+    def save(self, state: Any, info: Any, wall_s: float, cpu_s: float) -> list[dict[str, str]]:
+        """Writes the checkpoint after a block of generations, then the files remade from it.
 
         Args:
-          info: leaves `[generation, seed]`; rows that are not `active` are left out.
-          wall_s: seconds since the start of the run.
-
-        Raises:
-          ValueError: if a generation does not follow on its seed's last.
-          OSError: if the file cannot be written; it is then as it was.
-        """
-        self._table.append(info, wall_s)
-
-    def commit(self, generation: int, state: Any, cpu_s: float = 0.0) -> None:
-        """Writes the checkpoint of what was appended: the chunk now counts.
-
-        Args:
-          generation: generations finished.
           state: pytree of arrays.
-          cpu_s: CPU seconds since the start of the run, of all sessions.
+          info: of the block, leaves `[generation, ...]`; generations that are not `active` do not
+            count.
+          wall_s: seconds of all sessions.
+          cpu_s: CPU seconds of all sessions.
+
+        Returns:
+          The new rows.
 
         Raises:
-          OSError: if it cannot be written; the run goes on from the checkpoint before.
+          OSError: if a file cannot be written; the checkpoint is then whole, this one or the one
+            before.
         """
-        record = {"config": self.config, "metrics": self._table.vouch(), "cpu_s": cpu_s}
-        checkpoints.save(self.checkpoints, generation, state, record)
-        self._record = record
+        if not (self.path / _LOCK).exists():
+            raise FileNotFoundError(f"{self.path} was removed while its run went on")
+        rows = self._rows_of(info, wall_s)
+        csv = self._csv + _as_csv([row.values() for row in rows])
+        tensors = _as_tensors(state) | {_ROWS: np.frombuffer(csv.encode(), np.uint8)}
+        manifest = {
+            "format_version": _FORMAT_VERSION,
+            "config": self.config,
+            "id": self.id,
+            "cpu_s": cpu_s,
+        }
+        is_first = not self.rows
+        write_bytes(self.path / _CHECKPOINT, checksummed.pack(tensors, _KIND, manifest))
+        self.rows += rows
+        self._csv, self.cpu_s = csv, cpu_s
+        if is_first:
+            self._remake()
+        else:
+            write_text(self.metrics, csv)
+        return rows
 
     def write_summary(self, **values: Any) -> None:
         """Writes `run.json`."""
         write_text(self.path / "run.json", json.dumps(values, indent=2) + "\n")
 
-    def _stored_config(self) -> dict[str, Any] | None:
-        """`config.yaml`, or None if there is none.
-
-        Raises:
-          ConfigError: if it is not what a run writes there.
-        """
-        path = self.path / "config.yaml"
+    def _locked(self) -> filelock.BaseFileLock:
+        """Makes the folder and locks it; the lock ends with the process, however that ends."""
+        lock = filelock.FileLock(self.path / _LOCK, timeout=0, thread_local=False)
         try:
-            stored = yaml.safe_load(path.read_text(encoding="utf-8"))
+            self.path.mkdir(parents=True, exist_ok=True)
+            lock.acquire()
+        except filelock.Timeout:
+            self._refuse(
+                "be used by one process at a time",
+                "two would mix their files",
+                f"{self.path}, which another process uses",
+            )
+        except (OSError, ValueError, NotImplementedError) as error:
+            reason = "the run's files go there"
+            self._refuse("be a folder that can be written", reason, f"{self.path} ({error})")
+        return lock
+
+    def _open(self, completed: Callable[[dict[str, Any]], dict[str, Any]]) -> None:
+        """Reads the checkpoint, if there is one, and compares the configuration with its own."""
+        try:
+            tensors, manifest = checksummed.read(self.path / _CHECKPOINT, _KIND)
+            stored = self._read(tensors, manifest)
         except FileNotFoundError:
-            return None
-        except UnicodeDecodeError:
-            problem = "is not UTF-8 text"
-        except (OSError, yaml.YAMLError, RecursionError, ValueError) as error:
-            problem = f"cannot be read ({' '.join(str(error).split())})"
-        else:
-            if isinstance(stored, dict):
-                return stored
-            problem = "is empty" if stored is None else f"holds a {type(stored).__name__}"
-        has_copy = checkpoints.newest_record(self.checkpoints) is not None
-        fix = (
-            "Remove it, as the newest checkpoint has it too, or put it back"
-            if has_copy
-            else ("Put it back")
-        )
-        raise ConfigError(
-            f"run_dir must hold the configuration of its run, because a run goes on only with the "
-            f"same; got {path}, which {problem}. {fix}; for a new run take a new folder. "
-            f"{self._hint}"
-        )
-
-    def _refuse_another_run(self) -> None:
-        """Compares the configuration with those stored.
-
-        Raises:
-          ConfigError: if one differs, or files of a run are there and no configuration.
-        """
-        known = [self._stored] if self._stored is not None else []
-        known += [self._record["config"]] if _is_record(self._record) else []
-        lost = [file.name for file in (self.metrics, self.proxy) if file.exists()]
-        lost += ["checkpoints"] if checkpoints.generations(self.checkpoints) else []
-        if not lost:
-            return  # a run that failed before its first generation is in nobody's way
-        for stored in known:
-            self._refuse_other_config(stored)
-        if not known:
-            raise ConfigError(
-                f"run_dir must be new or hold a run with its configuration, because what is there "
-                f"would be replaced; got {self.path} with {lost[0]} and without config.yaml. Put "
-                f"it back, or take a new folder. {self._hint}"
+            self._refuse_files_without_checkpoint()
+            return
+        except (checksummed.DamagedError, OSError) as error:
+            self._refuse_checkpoint(error)
+        differing = differences(stored, self.config, FREE_FIELDS, most=3)
+        if differing:
+            differing = differences(completed(stored), self.config, FREE_FIELDS, most=3)
+        if differing:
+            self._refuse(
+                "be new or hold a run of the same configuration",
+                "a run goes on where it stopped",
+                f"{self.path}, which differs in {differing}",
             )
 
-    def _refuse_other_config(self, stored: dict[str, Any]) -> None:
-        if differences(stored, self.config, FREE_FIELDS):
-            differing = differences(self._completed(stored), self.config, FREE_FIELDS)
-            if differing:
-                raise ConfigError(
-                    f"run_dir must be new or hold a run of the same configuration, because a run "
-                    f"goes on where it stopped; {self.path} differs in {differing}. Take a new "
-                    f"folder, or use the values there. {self._hint}"
+    def _read(self, tensors: dict[str, np.ndarray], manifest: dict[str, Any]) -> dict[str, Any]:
+        """Takes over what a checkpoint holds, and returns its configuration.
+
+        Raises:
+          DamagedError: if this is no checkpoint that this version writes.
+        """
+        try:
+            if manifest["format_version"] != _FORMAT_VERSION:
+                raise ValueError(f"its format is {manifest['format_version']}")
+            csv = tensors.pop(_ROWS).tobytes().decode()
+            header, *lines = [line.split(",") for line in csv.splitlines()]
+            # A column that an older version did not write is nan.
+            rows = [dict(zip(header, line, strict=True)) for line in lines]
+            self.rows = [{name: row.get(name, "nan") for name in self.columns} for row in rows]
+            self._csv = _as_csv([self.columns, *(row.values() for row in self.rows)])
+            self.id, self.cpu_s = str(manifest["id"]), float(manifest["cpu_s"])
+            self._state, stored = tensors, dict(manifest["config"])
+            _ = self.wall_s, self.real_steps
+        except (KeyError, TypeError, ValueError) as error:
+            raise checksummed.DamagedError(f"it is none of this version ({error})") from error
+        return stored
+
+    def _rows_of(self, info: Any, wall_s: float) -> list[dict[str, str]]:
+        """The rows of the active generations of a block."""
+        real_steps = np.asarray(info.real_steps, np.int64).sum(axis=1).cumsum() + self.real_steps
+        own = {"seed", "env_steps_total", "wall_s"}
+        values = {name: np.asarray(getattr(info, name)) for name in COLUMNS if name not in own}
+        values["env_steps_total"] = real_steps
+        for i, agent in enumerate(self._agents):
+            for name in AGENT_COLUMNS:
+                values[f"{name}_{agent}"] = np.asarray(getattr(info.by_agent, name))[:, i]
+        fixed = {"seed": str(self.config["seed"]), "wall_s": f"{wall_s:.3f}"}
+        cells = [
+            fixed | {name: _as_text(column[i]) for name, column in values.items()}
+            for i in np.flatnonzero(info.active)
+        ]
+        return [{name: row[name] for name in self.columns} for row in cells]
+
+    def _remake(self) -> None:
+        """Writes the text files that are not as the checkpoint has them."""
+        remove_leftovers(self.path, _WRITTEN)
+        config = yaml.safe_dump(self.config, sort_keys=False)
+        for name, text in ((_CONFIG, config), (_METRICS, self._csv)):
+            path = self.path / name
+            if not path.exists() or path.read_bytes() != text.encode():
+                write_text(path, text)
+
+    def _refuse_files_without_checkpoint(self) -> None:
+        """Refuses to replace the files of a run without its checkpoint, or of an older sejax."""
+        for name in _SIGNS_OF_A_RUN:
+            if (self.path / name).exists():
+                self._refuse(
+                    f"be new or hold the {_CHECKPOINT} of its run",
+                    "other files there would be replaced",
+                    f"{self.path}, where an older sejax or a lost checkpoint left {name}",
                 )
 
-    def _vouched(self, generation: int, record: Any) -> dict[str, Any]:
-        """What the checkpoint keeps of the metrics, which were compared with it.
+    def _refuse_checkpoint(self, error: object) -> NoReturn:
+        path = self.path / _CHECKPOINT
+        self._refuse("hold a whole checkpoint", "the run goes on from it", f"{path}: {error}")
 
-        Raises:
-          ConfigError: if they differ.
-        """
-        if not _is_record(record) or not self._table.fits(record["metrics"]):
-            raise ConfigError(
-                f"run_dir must hold checkpoints of its own run, because a run goes on from them; "
-                f"got {checkpoints.path_of(self.checkpoints, generation)}, which is of another. "
-                f"Remove it, or take a new folder. {self._hint}"
-            )
-        try:
-            self._table.check(record["metrics"])
-        except (MetricsError, OSError) as error:
-            raise ConfigError(
-                f"run_dir must keep the metrics.csv that its checkpoint of generation {generation} "
-                f"vouches for, because the run goes on from both; got {self.metrics}, where "
-                f"{error}. Put it back as it was, or take a new folder. {self._hint}"
-            ) from error
-        return record["metrics"]
-
-    def _refuse_to_start_anew(self, problems: list[str]) -> None:
-        """Allows a start without a checkpoint only where a kill can have left the files so.
-
-        Raises:
-          ConfigError: if more was made than what comes before a first checkpoint.
-        """
-        stored = (self._stored or {}).get("checkpoint_every")
-        first = stored if isinstance(stored, int) else self.config.get("checkpoint_every", 1)
-        try:
-            made = max([self._table.begun(), *checkpoints.generations(self.checkpoints)])
-        except (MetricsError, OSError) as error:
-            found = f"{self.metrics}, where {error},"
-        else:
-            found = f"{self.path} with {made} generations"
-            if self.proxy.exists() and not self.metrics.exists():
-                found = f"{self.path} with {self.proxy.name}, without {self.metrics.name}"
-            elif made <= first:
-                return
-        raise ConfigError(
-            f"run_dir must keep the checkpoints of a run that is to go on, because it would start "
-            f"anew and replace what is there; got {found} and no whole checkpoint. "
-            f"{' '.join([*problems, self._hint])}"
-        )
+    def _refuse(self, rule: str, reason: str, got: object) -> NoReturn:
+        message = f"run_dir must {rule}, because {reason}; got {got}. {self._hint}"
+        raise ConfigError(message, "run_dir")
 
 
 def open_for(config: Any, hint: str = HINT) -> RunDirectory:
@@ -318,33 +326,95 @@ def open_for(config: Any, hint: str = HINT) -> RunDirectory:
 
     Args:
       config: a `LearnConfig`.
-      hint: last sentence of a refusal: how to choose another folder.
+      hint: last sentence of messages: how to choose another folder.
 
     Raises:
-      ConfigError: if it holds another run, is in use, or cannot be written.
+      ConfigError: as of `RunDirectory`.
     """
     from sejax.cli import build  # which imports jax
     from sejax.cli.families import families_of
 
-    seeds = [config.seed + i for i in range(config.num_seeds)]
-    keys = [family.key for family in families_of(config)]
-
-    return RunDirectory.open(
+    agents = [family.key for family in families_of(config)]
+    return RunDirectory(
         config.resolved_run_dir,
         build.to_plain(config),
-        seeds,
+        agents,
         hint,
-        keys,
         completed=lambda stored: build.completed(stored, config),
     )
 
 
-def _is_record(record: Any) -> TypeGuard[dict[str, Any]]:
-    """Whether a checkpoint's record is one of `commit`."""
-    match record:
-        case {
-            "config": dict(),
-            "metrics": {"bytes": int(), "sha256": str(), "generations": dict(generations)},
-        }:
-            return all(type(count) is int for count in generations.values())
-    return False
+def columns_of(agents: Sequence[str] = ()) -> tuple[str, ...]:
+    """The columns of `metrics.csv`: with several agents, four more for each of them."""
+    several = agents if len(agents) > 1 else ()
+    return COLUMNS + tuple(f"{name}_{agent}" for agent in several for name in AGENT_COLUMNS)
+
+
+def _as_csv(rows: Iterable[Iterable[str]]) -> str:
+    return "".join(",".join(row) + "\n" for row in rows)
+
+
+def _as_text(value: Any) -> str:
+    """Shortest text that reads back as the same float32, or the integer, however large."""
+    return str(value) if value.dtype.kind in "iu" else f"{value:.9g}"
+
+
+def _as_tensors(state: Any) -> dict[str, np.ndarray]:
+    """The leaves of a pytree by their paths, as arrays that safetensors can store."""
+    import jax
+
+    flat, _ = jax.tree_util.tree_flatten_with_path(state)
+    arrays = jax.device_get([_bare(leaf) for _, leaf in flat])  # all at once
+    return {_name(path): array for (path, _), array in zip(flat, arrays, strict=True)}
+
+
+def _as_state(tensors: dict[str, np.ndarray], like: Any) -> Any:
+    """The inverse of `_as_tensors`; leaves of their own memory, tied to no device.
+
+    Args:
+      tensors: leaves by path.
+      like: a pytree of the same structure; its shapes are enough.
+
+    Raises:
+      DamagedError: if the structure is another one.
+    """
+    import jax
+
+    flat, tree = jax.tree_util.tree_flatten_with_path(like)
+    bare = {_name(path): jax.eval_shape(_bare, leaf) for path, leaf in flat}
+    there, here = ({name: _describe(x) for name, x in each.items()} for each in (tensors, bare))
+    for name in [*here, *there]:
+        if there.get(name) != here.get(name):
+            raise checksummed.DamagedError(
+                f"{name} is {there.get(name, 'missing')}, and {here.get(name, 'missing')} in this "
+                f"version"
+            )
+    leaves = [_as_leaf(tensors[_name(path)], leaf) for path, leaf in flat]
+    return jax.tree.unflatten(tree, leaves)
+
+
+def _name(path: Any) -> str:
+    import jax
+
+    return f"{_STATE}{jax.tree_util.keystr(path)}"
+
+
+def _describe(array: Any) -> str:
+    return f"{array.dtype}{list(array.shape)}"
+
+
+def _bare(leaf: Any) -> Any:
+    """The data of a PRNG key, the bits of a dtype that only jax has, or the leaf itself."""
+    import jax
+
+    if jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.prng_key):
+        return jax.random.key_data(leaf)
+    return leaf.view(f"uint{8 * leaf.dtype.itemsize}") if leaf.dtype.kind == "V" else leaf
+
+
+def _as_leaf(array: np.ndarray, like: Any) -> Any:
+    import jax
+
+    if jax.dtypes.issubdtype(like.dtype, jax.dtypes.prng_key):
+        return jax.random.wrap_key_data(jax.numpy.array(array))
+    return jax.numpy.array(array).view(like.dtype)

@@ -1,66 +1,45 @@
-"""The one driver of a run: chunks of generations, each saved before the next one starts."""
+"""The driver of a run: blocks of generations, each saved before the next one starts."""
 
 import copy
 import platform
 import time
-from collections.abc import Callable
-from pathlib import Path
-from types import SimpleNamespace
-from typing import Any, Protocol
+from collections.abc import Callable, Iterator
+from importlib.metadata import version
+from typing import Any
 
 import jax
 import numpy as np
 
 from sejax import __version__
 from sejax.bilevel import Bilevel, make_bilevel
-from sejax.cli import build, commands, runtime
-from sejax.cli.follower import Follower
+from sejax.cli import build, runtime
 from sejax.cli.run_directory import RunDirectory
+from sejax.cli.trackers import (
+    FinishedGeneration,
+    GuardedTracker,
+    NoTracker,
+    Reporter,
+    TrackedRun,
+)
 from sejax.ops.parallel import compiler_options
 from sejax.proxies.io import save
 
-
-class Reporter(Protocol):
-    """What a run tells while it goes on; see `sejax.cli.progress`."""
-
-    def say(self, text: str) -> None: ...
-    def print(self, text: str) -> None: ...
-    def compiled(self) -> None: ...
-    def update(self, generation: int, info: Any) -> None: ...
-    def time_to_draw(self) -> bool: ...
-
-
-class Quiet:
-    """Tells nothing and draws nothing."""
-
-    def say(self, text: str) -> None:
-        pass
-
-    print = say
-
-    def compiled(self) -> None:
-        pass
-
-    def update(self, generation: int, info: Any) -> None:
-        pass
-
-    def time_to_draw(self) -> bool:
-        return False
+DRAW_EVERY_S = 30.0
 
 
 class Chunks:
-    """A learner's generations in chunks of one length, compiled ahead of time.
+    """The generations of a learner in chunks, each length compiled once, ahead of time.
 
-    `jax.jit` alone would recompile whenever the state's sharding differs: fresh, restored, or
-    returned by the previous chunk.
+    `jax.jit` would compile again whenever the placement of the state differs: new, restored, or as
+    the chunk before returned it.
 
     Args:
-      program: the learner. Its generations are what is compiled, unless `make` is given.
-      make: `make(*arguments) -> Bilevel`, traced, of a learner whose numbers are arguments of what
-        is compiled.
-      arguments: pytrees with which `make` gives `program`.
+      learner: the functions of Algorithm 1. Compiled as they are unless `make` is given.
+      make: `make(*arguments) -> Bilevel`, traced, whose numbers are arguments of the executable.
+      arguments: pytrees with which `make` gives `learner`.
 
     Attributes:
+      learner: the functions of Algorithm 1.
       cpu_s: CPU seconds of other processes than this one.
     """
 
@@ -68,31 +47,42 @@ class Chunks:
 
     def __init__(
         self,
-        program: Bilevel,
+        learner: Bilevel,
         make: Callable[..., Bilevel] | None = None,
         arguments: tuple[Any, ...] = (),
     ):
-        self.program = program
-        self._make, self._arguments = make or (lambda: program), arguments
+        self.learner = learner
+        self._make, self._arguments = make or (lambda: learner), arguments
         self._init = jax.jit(lambda key, *arguments: self._make(*arguments).init(key))
-        self._compiled: dict[int, Any] = {}
+        self._compiled: dict[int, Any] = {}  # by the length
 
-    def sharing(self, program: Bilevel, arguments: tuple[Any, ...]) -> "Chunks":
-        """The chunks of a learner of other arguments, by the same executables."""
+    def sharing(self, learner: Bilevel, arguments: tuple[Any, ...]) -> "Chunks":
+        """The chunks of a learner with other arguments, by the same executables."""
         chunks = copy.copy(self)
-        chunks.program, chunks._arguments = program, arguments
+        chunks.learner, chunks._arguments = learner, arguments
         return chunks
 
-    def init(self, key: Any) -> Any:
+    def init(self, key: jax.Array) -> Any:
         """The state before the first generation."""
         return self._init(key, *self._arguments)
 
     def is_ready(self, length: int) -> bool:
-        """Whether such a chunk has been compiled."""
+        """Whether a chunk of this length has been compiled."""
         return length in self._compiled
 
+    def compile(self, length: int) -> None:
+        """Compiles a chunk of this length."""
+
+        def chunk(state: Any, *arguments: Any) -> Any:
+            learner = self._make(*arguments)
+            return jax.lax.scan(lambda state, _: learner.generation(state), state, length=length)
+
+        state = jax.eval_shape(self._init, jax.random.key(0), *self._arguments)
+        jitted = jax.jit(chunk, donate_argnums=0, compiler_options=compiler_options())
+        self._compiled[length] = jitted.lower(state, *self._arguments).compile()
+
     def advance(self, state: Any, length: int) -> tuple[Any, Any]:
-        """Runs `length` generations; the state's buffers are donated.
+        """Runs `length` generations; the buffers of the state are donated.
 
         Returns:
           The state, and an info with leaves `[length, ...]`.
@@ -101,39 +91,10 @@ class Chunks:
             self.compile(length)
         return self._compiled[length](state, *self._arguments)
 
-    def compile(self, length: int) -> None:
-        """Compiles a chunk."""
-
-        def chunk(state: Any, *arguments: Any) -> Any:
-            program = self._make(*arguments)
-            return jax.lax.scan(lambda state, _: program.generation(state), state, length=length)
-
-        state = jax.eval_shape(self._init, jax.random.key(0), *self._arguments)
-        program = jax.jit(chunk, donate_argnums=0, compiler_options=compiler_options())
-        self._compiled[length] = program.lower(state, *self._arguments).compile()
-
 
 def make_chunks(config: build.LearnConfig) -> Chunks:
-    """The compiled program of a configuration, which runs that differ in their seeds share."""
+    """The generations of a configuration, for all runs that differ from it in the seed."""
     return Chunks(make_bilevel(**config.parts()))
-
-
-def rows_of(info: Any, real_steps_before: int) -> Any:
-    """The info of a chunk as the run directory takes it, leaves `[generation, 1, ...]`.
-
-    Args:
-      info: of a chunk, on the host, leaves `[generation, ...]`.
-      real_steps_before: steps on the real task of all generations before.
-    """
-    real_steps = info.real_steps.astype(np.int64).sum(axis=1)
-    columns = {name: x for name, x in vars(info).items() if isinstance(x, np.ndarray)}
-    columns |= {
-        "env_steps_total": real_steps_before + np.cumsum(real_steps * info.active),
-        "train_steps_total": info.train_steps.astype(np.int64).sum(axis=1),
-        "member_scores": info.population_scores,
-    }
-    families = SimpleNamespace(**{name: x[:, None] for name, x in vars(info.by_agent).items()})
-    return SimpleNamespace(**{name: x[:, None] for name, x in columns.items()}, families=families)
 
 
 def run(
@@ -142,77 +103,71 @@ def run(
     chunks: Chunks,
     report: Reporter | None = None,
 ) -> str:
-    """Runs the bilevel loop, or what is left of it, in chunks of `checkpoint_every` generations.
-
-    Every chunk is the same executable. After each, the metrics, the proxies and a checkpoint are
-    written.
+    """Runs Algorithm 1, or what is left of it, in chunks of `checkpoint_every` generations.
 
     Args:
-      config: of the run.
+      config: the configuration.
       directory: its folder.
-      chunks: of a program of this configuration.
-      report: told how it goes; nobody is if not given.
+      chunks: the generations of this configuration.
+      report: hears how it goes on.
 
     Returns:
       How it ended: finished or solved.
 
     Raises:
-      ConfigError: if the folder's files do not fit each other.
+      ConfigError: if the folder's state is that of another version.
       OSError: if a file cannot be written; everything saved before is whole.
     """
-    report = report or Quiet()
-    program = chunks.program
-    started, cpu_started = time.time(), time.process_time()
+    report = report or Reporter()
+    clock = _Clock(directory, chunks)
+    proxies = _Proxies(config, directory, chunks.learner)
     state = chunks.init(jax.random.key(config.seed))
-    state, generation, problems = directory.resume(state)
-    for problem in problems:
-        report.print(problem)
-    proxies = Proxies(config, directory.path, program)
-    if generation:
-        report.print(f"Going on at generation {generation} of {directory.path}.")
-        proxies.save(jax.device_get(state))  # again, as somebody may have damaged them
-    wall_before = float(directory.rows[-1]["wall_s"]) if directory.rows else 0.0
-    cpu_before = directory.cpu_s
-
-    def cpu_s() -> float:
-        return cpu_before + time.process_time() - cpu_started + chunks.cpu_s
-
+    restored = directory.restore(state)
+    if restored is not None:
+        state = restored
+        report.say(f"Going on at generation {directory.finished_generations} of {directory.path}.")
+        proxies.save(jax.device_get(state))
     state = jax.tree.map(lambda x: x.copy(), state)  # own buffers, so that they can be donated
-    with Follower(config, directory, report) as follower:
-        if generation < config.generations and not bool(state.finished):
-            follower.open()
-        follower.tell()  # what it has missed
-        while generation < config.generations and not bool(state.finished):
-            length = min(config.checkpoint_every, config.generations - generation)
+
+    def is_over() -> bool:
+        return directory.finished_generations >= config.generations or bool(state.finished)
+
+    tracker = _tracker(config, directory, report) if not is_over() else None
+    drawn = time.monotonic()
+    try:
+        while not is_over():
+            length = min(
+                config.checkpoint_every, config.generations - directory.finished_generations
+            )
             if not chunks.is_ready(length):
-                report.say("compiling")
+                report.status("compiling")
                 chunks.compile(length)
-                report.compiled()
+                report.status("first generation")
             state, info = chunks.advance(state, length)
             _wait(state)
-            generation += length
             host_state, info = jax.device_get((state, info))
-            real_steps = int(directory.rows[-1]["env_steps_total"]) if directory.rows else 0
-            rows = rows_of(info, real_steps)
-            with commands.interrupts_held():
-                directory.append(rows, wall_before + time.time() - started)
-                proxies.save(host_state)
-                directory.commit(generation, state, cpu_s())
-            report.update(generation, info)
-            with commands.interrupts_held():
-                follower.tell(rows)
-            if report.time_to_draw():
-                draw(directory, program)
-        ended = "solved" if bool(state.finished) else "finished"
-        draw(directory, program)
+            rows = directory.save(state, info, clock.wall_s(), clock.cpu_s())
+            proxies.save(host_state)
+            for generation in _finished(rows, info):
+                report.on_generation(generation)
+                if tracker is not None:
+                    tracker.on_generation(generation)
+            if time.monotonic() - drawn > DRAW_EVERY_S:
+                draw(directory, chunks.learner)
+                drawn = time.monotonic()
+        draw(directory, chunks.learner)
+    finally:
+        if tracker is not None:
+            tracker.close()
+    ended = "solved" if bool(state.finished) else "finished"
     directory.write_summary(
         ended=ended,
         best_score=float(state.best_score),
-        generations=directory.finished_generations,  # fewer than advanced, if it was solved
-        solved_score=program.solved_score,
-        wall_s=round(wall_before + time.time() - started, 1),
-        cpu_s=round(cpu_s(), 1),
-        **_cost(directory, program.strategy.num_candidates),
+        generations=directory.finished_generations,
+        solved_score=chunks.learner.solved_score,
+        wall_s=round(clock.wall_s(), 1),
+        cpu_s=round(clock.cpu_s(), 1),
+        **_cost(directory, chunks.learner.strategy.num_candidates),
         devices=[str(device) for device in jax.devices()],
         machine=runtime.machine(),
         versions=_versions(),
@@ -220,67 +175,107 @@ def run(
     return ended
 
 
-class Proxies:
+class _Clock:
+    """Seconds of all sessions of a run; no change of the machine's time moves them."""
+
+    def __init__(self, directory: RunDirectory, chunks: Chunks):
+        self._chunks = chunks
+        self._wall_s = directory.wall_s - time.monotonic()
+        self._cpu_s = directory.cpu_s - time.process_time()
+
+    def wall_s(self) -> float:
+        return self._wall_s + time.monotonic()
+
+    def cpu_s(self) -> float:
+        return self._cpu_s + time.process_time() + self._chunks.cpu_s
+
+
+class _Proxies:
     """The proxy files of a run."""
 
-    def __init__(self, config: build.LearnConfig, folder: Path, program: Bilevel):
-        self.config, self.folder, self.program = config, folder, program
-        # Who followed the run and where it was computed are no part of what was learned.
-        plain = build.to_plain(config)
-        self._plain = {k: v for k, v in plain.items() if k not in ("tracker", "machines")}
-        agent = program.mixture.agents[0]
+    def __init__(self, config: build.LearnConfig, directory: RunDirectory, learner: Bilevel):
+        self._folder, self._learner, self._seed = directory.path, learner, config.seed
+        # What was learned does not depend on the tracker, nor on where it was computed.
+        plain = directory.config.items()
+        self._plain = {k: v for k, v in plain if k not in ("tracker", "machines")}
+        agent = learner.mixture.agents[0]
         discount = agent.discount(agent.hparams)
         self._discount = None if discount is None else float(discount)
+        self._best: int | None = None  # the generation of the best proxy that is on the disk
 
     def save(self, state: Any) -> None:
-        """Writes the best proxy and the last one.
+        """Writes the best proxy, if it is new, and the last one.
 
         Raises:
           OSError: if a file cannot be written.
         """
-        self._save("proxy", state.best, state.best_score, state.best_scores, state.best_generation)
-        self._save(
-            "proxy_last",
-            state.incumbent,
-            state.incumbent_score,
-            state.incumbent_scores,
-            state.generation - 1,
-        )
+        if self._best != state.best_generation:
+            best = state.best, state.best_score, state.best_scores, state.best_generation
+            self._save("proxy", *best)
+            self._best = int(state.best_generation)
+        last = state.incumbent, state.incumbent_score, state.incumbent_scores
+        self._save("proxy_last", *last, state.generation - 1)
 
     def _save(self, name: str, flat: Any, score: Any, scores: Any, generation: Any) -> None:
-        if not np.isfinite(flat).all():  # a mean that is lost; the file before it stays
+        if not np.isfinite(flat).all():  # the mean has diverged; the file before it stays
             return
-        names = self.program.mixture.names
+        names = self._learner.mixture.names
         by_agent = dict(zip(names, map(float, scores), strict=True))
         save(
-            self.folder / f"{name}.safetensors",
-            self.program.proxy,
-            self.program.unravel(flat),
+            self._folder / f"{name}.safetensors",
+            self._learner.proxy,
+            self._learner.unravel(flat),
             self._plain,
             self._discount,
             score=float(score),
             generation=int(generation),
-            seed=self.config.seed,
+            seed=self._seed,
             **({"scores": by_agent} if len(names) > 1 else {}),
         )
 
 
-def draw(directory: RunDirectory, program: Bilevel) -> None:
-    """Draws the learning curve of what there is."""
-    from sejax.cli import plots
+def draw(directory: RunDirectory, learner: Bilevel) -> None:
+    """Draws the learning curve of the rows so far."""
+    from sejax.cli import plots  # matplotlib and pandas take half a second to import
 
     if directory.rows:
         path = directory.path / "learning_curve.png"
-        plots.learning_curve(directory.rows, program.solved_score, path)
+        plots.learning_curve(directory.rows, learner.solved_score, path)
+
+
+def _tracker(
+    config: build.LearnConfig, directory: RunDirectory, report: Reporter
+) -> GuardedTracker | None:
+    if isinstance(config.tracker, NoTracker):
+        return None
+    run = TrackedRun(
+        folder=directory.path.resolve(),
+        id=directory.id,
+        generation=directory.finished_generations,
+        config=directory.config,
+    )
+    return GuardedTracker(config.tracker, run, report.say)
+
+
+def _finished(rows: list[dict[str, str]], info: Any) -> Iterator[FinishedGeneration]:
+    """The generations of a chunk for the callbacks, of its rows and its info on the host."""
+    for i, row in enumerate(rows):
+        scores = info.population_scores[i]
+        yield FinishedGeneration(
+            generation=int(row["generation"]),
+            values={k: float(v) for k, v in row.items() if k not in ("generation", "seed")},
+            scores=scores[np.isfinite(scores)],
+            train_steps=int(info.train_steps[i].sum(dtype=np.int64)),
+        )
 
 
 def _cost(directory: RunDirectory, num_candidates: int) -> dict[str, int]:
-    """What the generations took, in agents and steps."""
+    """The cost of all generations in agents and steps."""
     steps_of_agents = sum(float(row["train_steps_mean"]) for row in directory.rows)
     return {
-        "agents": len(directory.rows) * num_candidates,
+        "agents": directory.finished_generations * num_candidates,
         "train_steps": round(steps_of_agents * num_candidates),
-        "real_steps": int(directory.rows[-1]["env_steps_total"]) if directory.rows else 0,
+        "real_steps": directory.real_steps,
     }
 
 
@@ -291,8 +286,6 @@ def _wait(state: Any) -> None:
 
 
 def _versions() -> dict[str, str]:
-    from importlib.metadata import version
-
     packages = ("jax", "jaxlib", "flax", "optax", "evosax", "gymnax", "numpy")
     return {
         "python": platform.python_version(),

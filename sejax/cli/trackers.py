@@ -1,9 +1,11 @@
 """Following a run with other tools: TensorBoard, Weights & Biases, trackio, or one of your own.
 
-Each is told what the run directory has; by whom and when, see `sejax.cli.follower`.
+A tracker hears of each generation after the run directory has it. It adds nothing to a run and
+cannot stop it.
 """
 
-from collections.abc import Mapping
+import contextlib
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Protocol, runtime_checkable
@@ -11,56 +13,110 @@ from typing import Any, ClassVar, Protocol, runtime_checkable
 import numpy as np
 import yaml
 
+from sejax import registry
 from sejax.errors import told
 from sejax.serialize import flatten
 
 
-@runtime_checkable
-class Tracker(Protocol):
-    """What a tracker must do; whatever it raises drops it, and the run goes on."""
-
-    def log(
-        self, generation: int, values: Mapping[str, float], scores: Mapping[str, np.ndarray]
-    ) -> None:
-        """Takes a generation.
-
-        Args:
-          generation: from 0 on; each comes once, in order.
-          values: columns of `metrics.csv`; with several seeds `seed0/incumbent_mean` and so on.
-          scores: likewise, the finite scores of all that the members trained, `[tried]`: for a
-            histogram. Empty for a generation of an earlier session.
-        """
-
-    def show(self, name: str, picture: Path, generations: int) -> None:
-        """Takes a PNG, when the run ends or is left after so many generations."""
-
-    def close(self) -> None:
-        """Is called once, when nothing more comes."""
-
-
 @dataclass(frozen=True, kw_only=True)
 class TrackedRun:
-    """What a tracker is made for.
+    """The run that a tracker is made for.
 
     Attributes:
-      folder: the run directory.
-      id: of the run at the tracker, 8 hexadecimal digits; the same when a run goes on.
-      generations: that the tracker has been told of in earlier sessions.
-      config: of the run, plain values in nested mappings.
+      folder: the run directory; at the end it holds `learning_curve.png`.
+      id: 8 hexadecimal digits, the same when the run goes on.
+      generation: the first generation that the tracker will hear of; 0 for a new run.
+      config: the configuration, plain values in nested mappings.
     """
 
     folder: Path
     id: str
-    generations: int
+    generation: int
     config: dict[str, Any]
 
+    @property
+    def picture(self) -> Path:
+        """The learning curve."""
+        return self.folder / "learning_curve.png"
 
-# --- those that come with sejax ------------------------------------------------------------------
+
+@dataclass(frozen=True, kw_only=True)
+class FinishedGeneration:
+    """A generation as the callbacks of a run hear of it.
+
+    Attributes:
+      generation: its number, from 0 on.
+      values: the columns of `metrics.csv`.
+      scores: scores of the population's evaluations that are finite, `[evaluation]`.
+      train_steps: steps of all trainings.
+    """
+
+    generation: int
+    values: Mapping[str, float]
+    scores: np.ndarray
+    train_steps: int
+
+
+class Reporter:
+    """Hears how a run goes on; this one tells nobody. See `sejax.cli.progress`."""
+
+    def status(self, text: str) -> None:
+        """Hears what is being done now."""
+
+    def say(self, text: str) -> None:
+        """Hears a message that is worth keeping."""
+
+    def on_generation(self, info: FinishedGeneration) -> None:
+        """Hears of a generation after it was saved. What this raises ends the session."""
+
+
+@runtime_checkable
+class Tracker(Protocol):
+    """The methods of a tracker, which its configuration makes by `make(run: TrackedRun)`."""
+
+    def on_generation(self, info: FinishedGeneration) -> None:
+        """Hears of a generation; each comes in order, and once a session."""
+
+    def close(self) -> None:
+        """Is called once, when the run ends or is left."""
+
+
+class GuardedTracker:
+    """The tracker of a run, dropped with one message as soon as it raises."""
+
+    def __init__(self, config: Any, run: TrackedRun, say: Callable[[str], None]):
+        """Makes the tracker of a configuration; `say` takes the message."""
+        self._name, self._say = registry.name_of("tracker", config), say
+        self._tracker: Tracker | None = None
+        with self._guarded():
+            self._tracker = config.make(run)
+
+    def on_generation(self, info: FinishedGeneration) -> None:
+        if self._tracker is not None:
+            with self._guarded():
+                self._tracker.on_generation(info)
+
+    def close(self) -> None:
+        tracker, self._tracker = self._tracker, None
+        if tracker is not None:
+            with self._guarded():
+                tracker.close()
+
+    @contextlib.contextmanager
+    def _guarded(self) -> Any:
+        try:
+            yield
+        except (Exception, SystemExit) as error:  # foreign code may raise anything
+            failed, self._tracker = self._tracker, None
+            self._say(f"tracker={self._name} has failed; the run goes on without. {told(error)}")
+            with contextlib.suppress(Exception, SystemExit):
+                if failed is not None:
+                    failed.close()
 
 
 @dataclass(frozen=True, kw_only=True)
 class NoTracker:
-    """Nobody is told."""
+    """No tracker."""
 
     def make(self, run: TrackedRun) -> None:
         return None
@@ -80,32 +136,31 @@ class TensorBoard:
     def __init__(self, run: TrackedRun):
         from tensorboardX import SummaryWriter
 
-        # What an earlier session wrote of later generations does not count. Its file would be
-        # replaced, if it began in the same second, but for the suffix.
+        self._picture, self._next = run.picture, run.generation
+        # Later generations of a killed session are purged. The suffix keeps its file from being
+        # replaced by one that begins in the same second.
         self._writer = SummaryWriter(
             str(run.folder / "tensorboard"),
-            purge_step=run.generations,
-            filename_suffix=f".{run.generations}",
+            purge_step=run.generation,
+            filename_suffix=f".{run.generation}",
         )
         text = yaml.safe_dump(run.config, sort_keys=False)
-        self._writer.add_text("config", f"```\n{text}```", run.generations)
+        self._writer.add_text("config", f"```\n{text}```", run.generation)
 
-    def log(
-        self, generation: int, values: Mapping[str, float], scores: Mapping[str, np.ndarray]
-    ) -> None:
-        for name, value in values.items():
-            self._writer.add_scalar(name, value, generation)
-        for name, each in scores.items():
-            self._writer.add_histogram(name, each, generation)
+    def on_generation(self, info: FinishedGeneration) -> None:
+        for name, value in info.values.items():
+            self._writer.add_scalar(name, value, info.generation)
+        if info.scores.size:
+            self._writer.add_histogram("population_scores", info.scores, info.generation)
         self._writer.flush()
-
-    def show(self, name: str, picture: Path, generations: int) -> None:
-        from PIL import Image
-
-        pixels = np.asarray(Image.open(picture).convert("RGB"))
-        self._writer.add_image(name, pixels, generations, dataformats="HWC")
+        self._next = info.generation + 1
 
     def close(self) -> None:
+        from PIL import Image
+
+        if self._picture.exists():
+            pixels = np.asarray(Image.open(self._picture).convert("RGB"))
+            self._writer.add_image("learning_curve", pixels, self._next, dataformats="HWC")
         self._writer.close()
 
 
@@ -119,7 +174,7 @@ class WandbConfig:
     def make(self, run: TrackedRun) -> "Wandb":
         import wandb
 
-        # The console is the progress line's, and a minute and a half is long to wait for a network.
+        # The console belongs to the progress line; by default wandb waits 90 s for a network.
         settings = wandb.Settings(console="off", init_timeout=20)
         options: Any = {
             "project": self.project,
@@ -131,31 +186,33 @@ class WandbConfig:
             "settings": settings,
         }
         try:
-            return Wandb(wandb, wandb.init(**options))
+            return Wandb(run, wandb, wandb.init(**options))
         except wandb.errors.Error as error:
             wandb.termwarn(f"{told(error)}: the run is kept offline, for `wandb sync`.")
             wandb.teardown()
-            return Wandb(wandb, wandb.init(mode="offline", **options))
+            return Wandb(run, wandb, wandb.init(mode="offline", **options))
 
 
 class Wandb:
-    """Also of trackio, which has the same functions."""
+    """A run of Weights & Biases, or of trackio, which has the same functions."""
 
-    def __init__(self, module: Any, run: Any):
-        self._module, self._run = module, run
+    def __init__(self, run: TrackedRun, module: Any, logged: Any):
+        self._picture, self._module, self._run = run.picture, module, logged
+        self._last = max(run.generation - 1, 0)
 
-    def log(
-        self, generation: int, values: Mapping[str, float], scores: Mapping[str, np.ndarray]
-    ) -> None:
-        histograms = {name: self._module.Histogram(each) for name, each in scores.items()}
-        self._run.log({"generation": generation, **values, **histograms}, step=generation)
-
-    def show(self, name: str, picture: Path, generations: int) -> None:
-        # With the last row, which is open still: a step of its own would be the next row's, which
-        # a run that goes on could not log any more.
-        self._run.log({name: self._module.Image(str(picture))}, step=max(generations - 1, 0))
+    def on_generation(self, info: FinishedGeneration) -> None:
+        values: dict[str, Any] = {"generation": info.generation, **info.values}
+        if info.scores.size:
+            values["population_scores"] = self._module.Histogram(info.scores)
+        self._run.log(values, step=info.generation)
+        self._last = info.generation
 
     def close(self) -> None:
+        if self._picture.exists():
+            # With the last generation: wandb drops what comes with a lower step than the last one,
+            # and a step of its own would be that of the generation where the run goes on.
+            picture = self._module.Image(str(self._picture))
+            self._run.log({"learning_curve": picture}, step=self._last)
         self._run.finish()
 
 
@@ -169,7 +226,8 @@ class TrackioConfig:
     def make(self, run: TrackedRun) -> Wandb:
         import trackio
 
-        # Runs are found again by their names, which must differ between folders.
+        # trackio finds runs again by their names, which must differ between folders.
         name = f"{run.folder.name}-{run.id}"
         config = flatten(run.config)
-        return Wandb(trackio, trackio.init(self.project, name, config=config, resume="allow"))
+        made = trackio.init(self.project, name, config=config, resume="allow")
+        return Wandb(run, trackio, made)

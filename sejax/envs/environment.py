@@ -156,7 +156,7 @@ def space_of_gymnax(space: Any, what: str, name: str) -> Space:
         bounds = (np.broadcast_to(np.float32(x), space.shape) for x in (space.low, space.high))
         return Box(*(tuple(bound.ravel().tolist()) for bound in bounds))
     raise ConfigError(
-        f"env must have {what} in a gymnax Box or Discrete space, because networks take vectors and "
-        f"tables take indices; got {space!r} in {name}. Make them one array in a subclass of "
+        f"env must have {what} in a gymnax Box or Discrete space, because networks take vectors "
+        f"and tables take indices; got {space!r} in {name}. Make them one array in a subclass of "
         f"sejax.envs.wrappers.Wrapper."
     )

@@ -16,7 +16,7 @@ import numpy as np
 
 from sejax import registry, serialize
 from sejax.errors import LARGEST, ConfigError, require, shortened, unknown_name
-from sejax.ops.sealed import DamagedError, seal, unseal
+from sejax.ops.checksummed import DamagedError, pack, unpack
 from sejax.proxies import hub
 
 FORMAT_VERSION = 2
@@ -87,7 +87,7 @@ class Header:
         Raises:
           TypeError or ValueError: if the header's values are not plain.
         """
-        return seal(tensors, _KEY, vars(self))
+        return pack(tensors, _KEY, vars(self))
 
 
 def agents_of(config: Mapping[str, Any]) -> dict[str, Any]:
@@ -202,7 +202,7 @@ def read(
         size = path.stat().st_size
         if size > hub.MAX_BYTES:
             raise DamagedError(f"it has {size:,} bytes, and the largest proxies have fewer")
-        tensors, stored = unseal(path.read_bytes(), _KEY)
+        tensors, stored = unpack(path.read_bytes(), _KEY)
         header = serialize.from_plain(Header, stored, "header")
     except (OSError, LookupError, ValueError, TypeError, ArithmeticError) as error:
         raise ConfigError(

@@ -4,8 +4,9 @@ from collections.abc import Sequence
 from importlib.util import find_spec
 from typing import Any
 
+import filelock
+
 from sejax.cli import commands, runtime
-from sejax.cli.run_lock import acquire
 from sejax.errors import ConfigError
 from sejax.search import settings
 from sejax.search.settings import Search
@@ -71,9 +72,10 @@ def _verified(found: Any, search: Search, runner: Any) -> list[str]:
     """
     from sejax.search import results, verification
 
+    lock = filelock.FileLock(search.folder / "verification.lock", timeout=0)
     try:
-        lock = acquire(search.folder / "verification.lock", "Wait for it.")
-    except ConfigError:
+        lock.acquire()
+    except filelock.Timeout:
         print("Another worker is at it to try the best ones again.")
         return []
     try:

@@ -10,6 +10,7 @@ import numpy as np
 
 from sejax.cli import build, compose, session
 from sejax.cli.run_directory import RunDirectory, open_for
+from sejax.cli.trackers import Reporter
 from sejax.cli.words import word
 from sejax.errors import ConfigError
 from sejax.search.programs import Programs
@@ -81,14 +82,11 @@ class Learning:
         with open_for(config, "Set search_dir=FOLDER.") as directory:
             chunks = self._programs.chunks(config)
             session.run(config, directory, chunks)
-            progress = progress_of(directory, chunks.program.strategy.num_candidates)
-            lengths = [
-                sum(int(row["seed"]) == seed for row in directory.rows) for seed in directory.seeds
-            ]
+            progress = progress_of(directory, chunks.learner.strategy.num_candidates)
         generations = search.config.max_generations
         return {
             **worth(whole(progress, generations), generations, search),
-            "generations": float(np.mean(lengths)),
+            "generations": float(directory.finished_generations),
         }
 
     def order(self, row: dict[str, float]) -> tuple[float, float]:
@@ -99,14 +97,14 @@ class Learning:
     def _run(self, config: build.LearnConfig, follower: Follower) -> Progress:
         with open_for(config, "Set search_dir=FOLDER.") as directory:
             chunks = self._programs.chunks(config)
-            num_candidates = chunks.program.strategy.num_candidates
-            over_at = chunks.program.solved_score if config.stop_when_solved else None
+            num_candidates = chunks.learner.strategy.num_candidates
+            over_at = chunks.learner.solved_score if config.stop_when_solved else None
             report = _Report(directory, follower, num_candidates, over_at)
             session.run(config, directory, chunks, report)
             return progress_of(directory, num_candidates)
 
 
-class _Report(session.Quiet):
+class _Report(Reporter):
     """Hears of each generation after its files are written, so that to end there loses nothing."""
 
     def __init__(
@@ -119,7 +117,7 @@ class _Report(session.Quiet):
         self._directory, self._follower = directory, follower
         self._num_candidates, self._over_at = num_candidates, over_at
 
-    def update(self, generation: int, info: Any) -> None:
+    def on_generation(self, info: Any) -> None:
         progress = progress_of(self._directory, self._num_candidates)
         if self._over_at is None or not (progress.scores[-1] >= self._over_at).all():
             self._follower.tell(progress)  # what is over by itself is not pruned
@@ -127,13 +125,8 @@ class _Report(session.Quiet):
 
 def progress_of(directory: RunDirectory, num_candidates: int) -> Progress:
     """What a run's rows say."""
-    rows, seeds = directory.rows, directory.seeds
-    of_seeds = {
-        seed: [float(row["incumbent_mean"]) for row in rows if int(row["seed"]) == seed]
-        for seed in seeds
-    }
-    length = max(map(len, of_seeds.values()))
-    scores = np.array([own + own[-1:] * (length - len(own)) for own in of_seeds.values()]).T
+    rows = directory.rows
+    scores = np.array([[float(row["incumbent_mean"])] for row in rows])
     steps = sum(float(row["train_steps_mean"]) for row in rows)
     return Progress(
         scores=np.where(np.isfinite(scores), scores, np.nan),

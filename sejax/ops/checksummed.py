@@ -1,0 +1,92 @@
+"""Safetensors files with a checksum, so that a change of any bit is noticed.
+
+The metadata has one entry, a JSON object. Its `sha256` is the digest of the whole file as it is
+with 64 zeros in the digest's place.
+"""
+
+import hashlib
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from safetensors import SafetensorError, safe_open
+from safetensors.numpy import load, save
+
+_BLANK = "0" * 64
+
+
+class DamagedError(ValueError):
+    """The bytes are not those of a checksummed file; the message is a clause that says why."""
+
+
+def pack(tensors: dict[str, np.ndarray], kind: str, manifest: dict[str, Any]) -> bytes:
+    """The content of a checksummed file.
+
+    Args:
+      tensors: arrays by name, of dtypes that safetensors knows under NumPy.
+      kind: name of the metadata's entry, which says what sort of file it is.
+      manifest: plain values.
+
+    Raises:
+      TypeError: if the manifest is not plain.
+
+    Example:
+      >>> data = pack({"x": np.zeros(2, np.float32)}, "note", {"text": "two zeros"})
+      >>> tensors, manifest = unpack(data, "note")
+      >>> tensors["x"].tolist(), manifest
+      ([0.0, 0.0], {'text': 'two zeros'})
+    """
+    text = json.dumps({"sha256": _BLANK, **manifest})
+    tensors = {name: np.asarray(x, order="C") for name, x in tensors.items()}
+    # One entry, because safetensors writes several in random order.
+    data = save(tensors, metadata={kind: text})
+    return data.replace(_BLANK.encode(), hashlib.sha256(data).hexdigest().encode(), 1)
+
+
+def unpack(data: bytes, kind: str) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """Inverse of `pack`: tensors and manifest, after the checksum was verified.
+
+    Raises:
+      DamagedError: if a byte has changed, or it is another kind of file.
+    """
+    manifest = _manifest(data, kind)
+    digest = manifest.pop("sha256", None)
+    if not isinstance(digest, str) or len(digest) != len(_BLANK):
+        raise DamagedError("its manifest has no digest")
+    blank = data.replace(digest.encode("ascii", "replace"), _BLANK.encode(), 1)
+    if hashlib.sha256(blank).hexdigest() != digest:
+        raise DamagedError("its content does not match its digest")
+    try:
+        return load(data), manifest
+    except (SafetensorError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise DamagedError(f"its tensors cannot be read: {error}") from error
+
+
+def read(path: Path, kind: str) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """As `unpack`, of a file.
+
+    Raises:
+      DamagedError: as `unpack`; for a file that is longer than its header says without reading it.
+      OSError: if it cannot be read.
+    """
+    with path.open("rb"):  # safe_open has no OSError for a folder, or for one that may not be read
+        pass
+    try:
+        with safe_open(path, "np"):
+            pass
+    except (SafetensorError, OSError) as error:
+        raise DamagedError("it has no header that fits its size") from error
+    return unpack(path.read_bytes(), kind)
+
+
+def _manifest(data: bytes, kind: str) -> dict[str, Any]:
+    """The manifest, unverified; parsed by hand, as the bytes may be anything."""
+    size = int.from_bytes(data[:8], "little")
+    try:
+        manifest = json.loads(json.loads(data[8 : 8 + size])["__metadata__"][kind])
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
+        raise DamagedError("it has no manifest that can be read") from error
+    if not isinstance(manifest, dict):
+        raise DamagedError("its manifest is not a mapping")
+    return manifest
