@@ -147,22 +147,20 @@ def sejax_side(args: argparse.Namespace) -> None:
     import numpy as np
 
     import sejax
-    from sejax.bilevel import make_program
+    from sejax.bilevel import make_bilevel
     from sejax.ops.parallel import compiler_options
 
-    program = make_program(**sejax.config(overrides(args)).parts())
-    init = jax.jit(program.init)
-    keys = jax.random.key(args.seed)[None]
-    state = init(keys)
-    generation = jax.jit(program.generation, compiler_options=compiler_options())
+    bilevel = make_bilevel(**sejax.config(overrides(args)).parts())
+    state = jax.jit(bilevel.init)(jax.random.key(args.seed))
+    generation = jax.jit(bilevel.generation, compiler_options=compiler_options())
     compiled, start = common.measure(lambda: generation.lower(state).compile())
-    weights = jax.tree.map(lambda x: np.asarray(x).tolist(), program.unravel(state.incumbent[0]))
+    weights = jax.tree.map(lambda x: np.asarray(x).tolist(), bilevel.unravel(state.incumbent))
 
     def handle(request: dict[str, Any]) -> dict[str, Any]:
         (_, info), times = common.measure(lambda: jax.block_until_ready(compiled(state)))
         scores = (info.incumbent_mean, info.population_mean, info.population_max)
         return {
-            "steps": int(info.train_steps_total.item()),
+            "steps": int(info.train_steps.sum()),
             "incumbent_mean": info.incumbent_mean.item(),
             "scores": [score.item() for score in scores],
             **times,

@@ -36,7 +36,7 @@ extensions = [
 highlight_language = "text"
 root_doc = "docs/index"
 include_patterns = [
-    "README.md", "CHANGELOG.md", "CONTRIBUTING.md", "docs/**.md", "results/**.md",
+    "README.md", "CHANGELOG.md", "CONTRIBUTING.md", "SECURITY.md", "docs/**.md", "results/**.md",
 ]  # fmt: skip
 exclude_patterns = ["docs/_build"]
 

@@ -1,1 +1,1 @@
-"""The paper's figures and tables, one module for each: `python -m experiments.NAME`."""
+"""The figures and tables of the paper, and our own studies: a page each. `common` is shared."""

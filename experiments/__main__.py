@@ -1,4 +1,4 @@
-"""`python -m experiments`: what there is to run, a line each."""
+"""`python -m experiments`: the list of all experiments."""
 
 import ast
 import pkgutil
@@ -8,11 +8,11 @@ import experiments
 
 
 def main() -> None:
-    """Prints each experiment's name and what it shows."""
+    """Prints each experiment's name and the first line of its docstring."""
     print("python -m experiments.NAME [quick=true] [FIELD=VALUE ...] [--help]\n")
-    for module in sorted(pkgutil.iter_modules(experiments.__path__), key=lambda m: m.name):
-        source = Path(experiments.__path__[0], f"{module.name}.py").read_text()
-        if "\nEXPERIMENT = " in source:
+    for module in pkgutil.iter_modules(experiments.__path__):
+        if not module.ispkg and module.name != "__main__":
+            source = Path(experiments.__path__[0], f"{module.name}.py").read_text()
             about = ast.get_docstring(ast.parse(source)) or ""
             print(f"  {module.name:22} {about.partition(chr(10))[0]}")
 

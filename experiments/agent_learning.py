@@ -16,13 +16,11 @@ import numpy as np
 import pandas as pd
 
 import sejax
-from experiments import figures, return_curves
-from experiments.experiment import Experiment
-from experiments.return_curves import WINDOW
-from experiments.settings import Settings, count, each_of, setting
-from experiments.statistics import bootstrap_interval
-from experiments.tables import as_texts, iqm_columns, iqm_note, iqm_text, publish
-from experiments.worlds import CURVES, World, train_groups
+from experiments.common import curves, figures, tables
+from experiments.common.agents import Condition, train_groups
+from experiments.common.curves import CURVES, WINDOW
+from experiments.common.experiment import Experiment, Settings, count, each_of, setting
+from experiments.common.statistics import bootstrap_interval
 from sejax import registry, serialize
 from sejax.training import TrainingConfig
 
@@ -34,15 +32,15 @@ ZOO = "RL Baselines3 Zoo"
 PAPER_DDQN = "16,888 steps to solve, agents with drawn hyperparameters (the paper)"
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Study:
     """An agent on a task."""
 
     env: str
     agent: str
     max_steps: int  # of training
+    peers: str  # what others report
     hparams: dict[str, Any] = field(default_factory=dict)  # others than the paper's
-    peers: str = ""  # what others report
 
     def configuration(self) -> Any:
         """The paper's agent, which is the default but for PPO, with `hparams`."""
@@ -70,7 +68,7 @@ class Study:
         )
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class PresetStudy(Study):
     """The agent that reward networks of a task are learned with, trained as there.
 
@@ -103,76 +101,43 @@ class PresetStudy(Study):
         return sejax.config([f"env={self.env}", "proxy=rn", f"agent={self.agent}"])
 
 
+def _ppo(**hparams: Any) -> dict[str, Any]:
+    return {"activation": "tanh", **hparams}
+
+
+_GREEDY_SARSA = {"discount": 1.0, "epsilon_init": 0.01, "epsilon_min": 0.0, "epsilon_decay": 0.9}
 STUDIES = (
-    Study(env="cartpole", agent="ddqn", max_steps=20_000, peers=PAPER_DDQN),
+    Study("cartpole", "ddqn", 20_000, PAPER_DDQN),
+    Study("cartpole", "dueling_ddqn", 20_000, "12,745 steps to solve, likewise"),
+    Study("cartpole", "td3_discrete", 20_000, "17,875 steps and a return of 152, likewise"),
     Study(
-        env="cartpole",
-        agent="dueling_ddqn",
-        max_steps=20_000,
-        peers="12,745 steps to solve, likewise",
+        "cartpole",
+        "ppo",
+        100_000,
+        f"500.0 of 500 on CartPole-v1 after 100,000 steps ({ZOO})",
+        _ppo(learning_rate=1e-3, discount=0.98, update_episodes=4, epochs=20),
     ),
     Study(
-        env="cartpole",
-        agent="td3_discrete",
-        max_steps=20_000,
-        peers="17,875 steps and a return of 152, likewise",
+        "pendulum",
+        "td3",
+        20_000,
+        f"-151.9 after 20,000 steps ({ZOO})",
+        {"learning_rate": 1e-3, "discount": 0.98, "warmup_episodes": 10},
     ),
     Study(
-        env="cartpole",
-        agent="ppo",
-        max_steps=100_000,
-        hparams={
-            "activation": "tanh",
-            "learning_rate": 1e-3,
-            "discount": 0.98,
-            "update_episodes": 4,
-            "epochs": 20,
-        },
-        peers=f"500.0 of 500 on CartPole-v1 after 100,000 steps ({ZOO})",
+        "pendulum",
+        "ppo",
+        200_000,
+        f"-172.2 after 100,000 steps ({ZOO})",
+        _ppo(learning_rate=5e-4, discount=0.95, entropy_weight=0.0, init_action_std=1.0),
     ),
-    Study(
-        env="pendulum",
-        agent="td3",
-        max_steps=20_000,
-        hparams={"learning_rate": 1e-3, "discount": 0.98, "warmup_episodes": 10},
-        peers=f"-151.9 after 20,000 steps ({ZOO})",
-    ),
-    Study(
-        env="pendulum",
-        agent="ppo",
-        max_steps=200_000,
-        hparams={
-            "activation": "tanh",
-            "learning_rate": 5e-4,
-            "discount": 0.95,
-            "entropy_weight": 0.0,
-            "init_action_std": 1.0,
-        },
-        peers=f"-172.2 after 100,000 steps ({ZOO})",
-    ),
-    Study(env="cliff_walking", agent="q_learning", max_steps=2_000, peers="optimal: -12"),
-    Study(env="cliff_walking", agent="sarsa", max_steps=2_000, peers="optimal: -12"),
-    Study(
-        env="cliff_walking",
-        agent="sarsa",
-        max_steps=5_000,
-        hparams={"discount": 1.0, "epsilon_init": 0.01, "epsilon_min": 0.0, "epsilon_decay": 0.9},
-        peers="optimal: -12",
-    ),
+    Study("cliff_walking", "q_learning", 2_000, "optimal: -12"),
+    Study("cliff_walking", "sarsa", 2_000, "optimal: -12"),
+    Study("cliff_walking", "sarsa", 5_000, "optimal: -12", _GREEDY_SARSA),
+    PresetStudy("pendulum", "td3", 20_000, f"-151.9 after 20,000 steps ({ZOO})"),
+    PresetStudy("mountain_car_continuous", "td3", 99_900, f"93.5 after 300,000 steps ({ZOO})"),
     PresetStudy(
-        env="pendulum", agent="td3", max_steps=20_000, peers=f"-151.9 after 20,000 steps ({ZOO})"
-    ),
-    PresetStudy(
-        env="mountain_car_continuous",
-        agent="td3",
-        max_steps=99_900,
-        peers=f"93.5 after 300,000 steps ({ZOO})",
-    ),
-    PresetStudy(
-        env="halfcheetah",
-        agent="td3",
-        max_steps=100_000,
-        peers=f"9,656 on HalfCheetah-v3 after 1,000,000 steps ({ZOO})",
+        "halfcheetah", "td3", 100_000, f"9,656 on HalfCheetah-v3 after 1,000,000 steps ({ZOO})"
     ),
 )
 ENVS = tuple(dict.fromkeys(study.env for study in STUDIES))
@@ -189,12 +154,12 @@ class AgentLearning(Settings):
 
 def compute(settings: AgentLearning) -> pd.DataFrame:
     """Trains what is missing; a row for each training episode of each agent and study."""
-    tables = []
+    parts = []
     for number, study in enumerate(STUDIES):
         if study.env not in settings.envs:
             continue
         training = study.training(settings.quick, settings.test_episodes)
-        world = World.real(
+        condition = Condition.real(
             sejax.envs.make(study.env),
             ["all"],
             name=f"{number:02d}-{study.env}-{study.agent}",
@@ -202,63 +167,64 @@ def compute(settings: AgentLearning) -> pd.DataFrame:
             training=training,
             is_single=True,
         )
-        curves = train_groups(world, settings, settings.num_agents, CURVES).drop(columns="group")
-        tables.append(curves.assign(study=number, max_steps=training.max_steps))
-    return pd.concat(tables, ignore_index=True)
+        rows = train_groups(condition, settings, settings.num_agents, CURVES)
+        parts.append(rows.drop(columns="group").assign(study=number, max_steps=training.max_steps))
+    return pd.concat(parts, ignore_index=True)
 
 
-def summarise(curves: pd.DataFrame) -> pd.DataFrame:
+def summarise(rows: pd.DataFrame) -> pd.DataFrame:
     """One row for each study."""
-    rows = []
-    for number, mine in curves.groupby("study"):
+    summary = []
+    for number, mine in rows.groupby("study"):
         study = STUDIES[int(number)]
         threshold = sejax.envs.make(study.env).solved_reward
-        to_solve = return_curves.all_steps_to_solve(mine, threshold)
-        last = return_curves.last_returns(mine)
-        low, high = bootstrap_interval(last)
-        rows.append(
-            {
-                "study": number,
-                "env": study.env,
-                "agent": study.agent,
-                "num_agents": len(last),
-                "max_steps": mine["max_steps"].iloc[0],
-                "made_steps": mine.groupby("agent")["steps"].max().mean(),
-                "threshold": threshold,
-                "num_solved": int(np.isfinite(to_solve).sum()),
-                "num_solved_at_the_end": int((last >= threshold).sum()),
-                "median_steps_to_solve": np.median(to_solve),
-                "last_return": last.mean(),
-                "last_low": low,
-                "last_high": high,
-                **iqm_columns(last, "last"),
-            }
+        to_solve = curves.all_steps_to_solve(mine, threshold)
+        last = curves.last_returns(mine)
+        row = {
+            "study": number,
+            "env": study.env,
+            "agent": study.agent,
+            "num_agents": len(last),
+            "max_steps": mine["max_steps"].iloc[0],
+            "made_steps": mine.groupby("agent")["steps"].max().mean(),
+            "threshold": threshold,
+            "num_solved": int(np.isfinite(to_solve).sum()),
+            "num_solved_at_the_end": int((last >= threshold).sum()),
+            "median_steps_to_solve": np.median(to_solve),
+        }
+        summary.append(
+            row | tables.mean_columns(last, "last", least=1) | tables.iqm_columns(last, "last")
         )
-    return pd.DataFrame(rows)
+    return pd.DataFrame(summary)
+
+
+def _changes(row: Any) -> str:
+    return ", ".join(f"{name} {value}" for name, value in STUDIES[row.study].changes().items())
+
+
+def _median_steps(row: Any) -> str:
+    steps = row.median_steps_to_solve
+    return f"{steps:,.0f}" if np.isfinite(steps) else "-"
 
 
 COLUMNS: dict[str, Any] = {
     "task": "{env}",
     "agent": "{agent}",
-    "other than the paper's": lambda row: ", ".join(
-        f"{name} {value}" for name, value in STUDIES[row.study].changes().items()
-    ),
+    "other than the paper's": _changes,
     "solved": "{num_solved} of {num_agents} at {threshold:g}",
     "still at the end": "{num_solved_at_the_end}",
-    "median steps to solve": lambda row: (
-        f"{row.median_steps_to_solve:,.0f}" if np.isfinite(row.median_steps_to_solve) else "-"
-    ),
+    "median steps to solve": _median_steps,
     "steps, at most": "{max_steps:,}",
     "made": "{made_steps:,.0f}",
-    f"last {WINDOW} tests": "{last_return:.1f} [{last_low:.1f}, {last_high:.1f}]",
-    "IQM": iqm_text("last"),
+    f"last {WINDOW} tests": "{last_mean:.1f} [{last_low:.1f}, {last_high:.1f}]",
+    "IQM": tables.iqm_text("last"),
     "others": lambda row: STUDIES[row.study].peers,
 }
 
 
-def report(settings: AgentLearning, curves: pd.DataFrame) -> pd.DataFrame:
-    draw(settings, curves)
-    summary = summarise(curves)
+def report(settings: AgentLearning, rows: pd.DataFrame) -> pd.DataFrame:
+    draw(settings, rows)
+    summary = summarise(rows)
     note = (
         f"{settings.num_agents} seeds of each; after each training episode "
         f"{settings.test_episodes} greedy test episode. Solved: the mean of {WINDOW} tests in a "
@@ -266,15 +232,15 @@ def report(settings: AgentLearning, curves: pd.DataFrame) -> pd.DataFrame:
         "Made: steps until the last episode that ended, on average; some are limited by their "
         f"number of episodes. The last {WINDOW} tests: mean over seeds, bootstrap 95% interval. "
         "CartPole here is v0, "
-        f"of 200 steps.{iqm_note()}"
+        f"of 200 steps.{tables.iqm_note()}"
     )
     title = "Agents that learn the real tasks"
-    return publish(settings, title, as_texts(summary, COLUMNS), summary, note)
+    return tables.publish(settings, title, tables.as_texts(summary, COLUMNS), summary, note)
 
 
-def draw(settings: AgentLearning, curves: pd.DataFrame, points: int = 100) -> None:
+def draw(settings: AgentLearning, rows: pd.DataFrame, points: int = 100) -> None:
     """Draws a panel for each task: mean and 95% interval of each agent."""
-    tasks = list(curves.groupby(curves["study"].map(lambda i: STUDIES[i].env), sort=False))
+    tasks = list(rows.groupby(rows["study"].map(lambda i: STUDIES[i].env), sort=False))
     palette = (figures.REAL, figures.VARIED, figures.FIXED, figures.SOLVED)
     columns = min(3, len(tasks))
     lines = -(-len(tasks) // columns)
@@ -283,24 +249,22 @@ def draw(settings: AgentLearning, curves: pd.DataFrame, points: int = 100) -> No
         for axis in axes.ravel()[len(tasks) :]:
             axis.set_visible(False)
         for axis, (env, mine) in zip(axes.ravel(), tasks, strict=False):
-            for color, (number, study_curves) in zip(palette, mine.groupby("study"), strict=False):
-                last_step = study_curves["steps"].max()
+            for color, (number, study_rows) in zip(palette, mine.groupby("study"), strict=False):
+                last_step = study_rows["steps"].max()
                 grid = np.geomspace(last_step / 200, last_step, points)
-                figures.band(
-                    axis,
-                    grid,
-                    return_curves.on_grid(study_curves, grid),
-                    lambda values: np.transpose([bootstrap_interval(v) for v in values.T]),
-                    color,
-                    lw=1.8,
-                    label=STUDIES[int(number)].label,
-                )
+                values, label = curves.on_grid(study_rows, grid), STUDIES[int(number)].label
+                figures.band(axis, grid, values, _intervals, color, lw=1.8, label=label)
             axis.axhline(sejax.envs.make(env).solved_reward, color="#7a7a7a", ls="--", lw=1)
             axis.set_title(env, fontsize=10)
             axis.set(xscale="log", xlabel="training steps (*: hyperparameters in the table)")
             axis.legend(fontsize=8, loc="best")
         for axis in axes[:, 0]:
             axis.set_ylabel(f"test return, mean of {WINDOW}")
+
+
+def _intervals(values: np.ndarray) -> np.ndarray:
+    """Ends of the means' intervals, `[2, points]`, of `[agent, points]`."""
+    return np.transpose([bootstrap_interval(each) for each in values.T])
 
 
 EXPERIMENT = Experiment(settings=AgentLearning, compute=compute, report=report, about=__doc__)

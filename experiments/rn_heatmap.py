@@ -14,14 +14,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pandas as pd
+from matplotlib.collections import PolyCollection
 
-from experiments import figures, rn_studies
-from experiments.experiment import Experiment
-from experiments.rn_studies import RnSettings
-from experiments.tables import publish
+from experiments.common import figures
+from experiments.common import reward_networks as rn
+from experiments.common.experiment import Experiment
+from experiments.common.reward_networks import RnSettings
+from experiments.common.tables import publish
+from sejax import errors
 from sejax.envs.gridworld import CLIFF_WALKING as MAP
-from sejax.errors import require
 
+CELLS = np.array([list(line) for line in MAP])  # [row, column]
+_COLORS = {"G": "#ffffff", "O": "#d9d9d9"}  # of cells without moves: goal and cliff
 IGNORED_BELOW = -50.0  # the right column leaves out rewards of at most this
 # Corners of the triangle of each action in a cell whose middle is (0, 0), y downwards: the middle
 # and two corners of the cell. Actions as in `envs.dynamics.gridworld`: RIGHT, LEFT, DOWN, UP.
@@ -37,26 +41,19 @@ _CORNERS = {
 class RnHeatmap(RnSettings):
     name = "rn_heatmap"
 
-    objective: str = rn_studies.objective_setting()
+    objective: str = rn.objective_setting()
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require(
-            self.env == "cliff_walking",
-            "env",
-            "be cliff_walking",
-            "the picture is its map",
-            self.env,
-            "env=cliff_walking",
-        )
+        errors.one_of("env", self.env, ("cliff_walking",))  # the figure is its map
 
 
 def compute(settings: RnHeatmap) -> pd.DataFrame:
     """Learns what is missing; a row for each RN and move."""
-    rn_studies.check_stored(settings, [settings.objective])
+    rn.check_stored(settings, [settings.objective])
     tables = []
     for variant in settings.variants:
-        rewards = rewards_of_moves(rn_studies.learn(settings, variant, settings.objective))
+        rewards = rewards_of_moves(rn.learn(settings, variant, settings.objective))
         places = zip(("rn", "state", "action"), np.indices(rewards.shape), strict=True)
         table = pd.DataFrame({name: place.ravel() for name, place in places})
         tables.append(table.assign(variant=variant, reward=rewards.ravel().astype(float)))
@@ -84,7 +81,7 @@ def rewards_of_moves(rns: Any) -> np.ndarray:
 
 def by_variant(settings: RnHeatmap, rows: pd.DataFrame) -> dict[str, np.ndarray]:
     """The rewards of each variant, `[rn, state, action]`, from the rows."""
-    shape = settings.learned, np.array([list(line) for line in MAP]).size, len(_CORNERS)
+    shape = settings.learned, CELLS.size, len(_CORNERS)
     return {
         variant: rows[rows["variant"] == variant]["reward"].to_numpy().reshape(shape)
         for variant in settings.variants
@@ -131,15 +128,8 @@ def summarise(rewards: dict[str, np.ndarray]) -> pd.DataFrame:
     for variant, mine in rewards.items():
         for kind, mask in kinds_of_moves().items():
             of_rns = mine[:, mask].mean(axis=1)
-            out.append(
-                {
-                    "variant": variant,
-                    "move": kind,
-                    "rns": len(mine),
-                    "mean": of_rns.mean(),
-                    "std": of_rns.std(),
-                }
-            )
+            row = {"variant": variant, "move": kind, "rns": len(mine)}
+            out.append(row | {"mean": of_rns.mean(), "std": of_rns.std()})
     return pd.DataFrame(out)
 
 
@@ -171,45 +161,29 @@ def draw(settings: RnHeatmap, rewards: dict[str, np.ndarray]) -> None:
         for line, (variant, mine) in zip(axes, rewards.items(), strict=True):
             for axis, title, ignore in zip(line, titles, (False, True), strict=True):
                 shown = draw_map(axis, mean_rewards(mine, ignore))
-                axis.set_title(f"{rn_studies.label(variant)}: {title}", fontsize=10)
+                axis.set_title(f"{rn.label(variant)}: {title}", fontsize=10)
         bar = figure.colorbar(shown, ax=axes, shrink=0.5, pad=0.02)
         bar.set_label("mean reward, from the lowest to the highest")
 
 
 def draw_map(axis: Any, values: np.ndarray) -> Any:
     """Draws the map with a triangle for each move, coloured by `values [state, action]`."""
-    from matplotlib.collections import PolyCollection
-
+    square = np.array([[-0.5, 0.5, 0.5, -0.5], [-0.5, -0.5, 0.5, 0.5]])
     triangles, colors = [], []
-    for row, cells in enumerate(MAP):
-        for column, cell in enumerate(cells):
-            state = row * len(cells) + column
-            middle = np.array([column, row])
-            for action, corners in _CORNERS.items():
-                if cell not in "GO" and np.isfinite(values[state, action]):
-                    triangles.append([middle, *(middle + corner for corner in corners)])
-                    colors.append(values[state, action])
-            if cell in "GO":
-                color = "#d9d9d9" if cell == "O" else "#ffffff"
-                axis.fill(
-                    *(middle[:, None] + [[-0.5, 0.5, 0.5, -0.5], [-0.5, -0.5, 0.5, 0.5]]),
-                    color=color,
-                    lw=0,
-                )
-            if cell != " ":
-                axis.text(
-                    *middle,
-                    {"O": "cliff"}.get(cell, cell),
-                    ha="center",
-                    va="center",
-                    fontsize=6 if cell == "O" else 10,
-                    weight="bold",
-                )
-    shown = axis.add_collection(
-        PolyCollection(
-            triangles, array=colors, cmap="RdYlGn", clim=(0, 1), edgecolors="#555555", lw=0.25
-        )
-    )
+    for (row, column), cell in np.ndenumerate(CELLS):
+        middle = np.array([column, row])
+        for action, corners in _CORNERS.items():
+            value = values[row * CELLS.shape[1] + column, action]
+            if cell not in "GO" and np.isfinite(value):
+                triangles.append([middle, *(middle + corner for corner in corners)])
+                colors.append(value)
+        if cell in "GO":
+            axis.fill(*(middle[:, None] + square), color=_COLORS[cell], lw=0)
+        text, size = ("cliff", 6) if cell == "O" else (cell, 10)
+        if cell != " ":
+            axis.text(*middle, text, ha="center", va="center", fontsize=size, weight="bold")
+    how: Any = {"cmap": "RdYlGn", "clim": (0, 1), "edgecolors": "#555555", "lw": 0.25}
+    shown = axis.add_collection(PolyCollection(triangles, array=colors, **how))
     axis.set(xlim=(-0.5, 11.5), ylim=(3.5, -0.5), aspect="equal", xticks=[], yticks=[])
     axis.spines[:].set_visible(True)
     return shown

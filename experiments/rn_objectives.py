@@ -18,14 +18,13 @@ from typing import Any
 
 import pandas as pd
 
-from experiments import rn_curves, rn_studies
-from experiments.experiment import Experiment
-from experiments.rn_curves import CurveSettings
-from experiments.settings import each_of, setting
-from experiments.tables import publish
+from experiments.common import reward_networks, rn_curves
+from experiments.common.experiment import Experiment, each_of, setting
+from experiments.common.rn_curves import CurveSettings
+from experiments.common.tables import publish
 from sejax.errors import require
 
-PICKS = ("best", "worst")
+PICKS = {"best": "highest", "worst": "lowest"}  # scores
 QUICK_LEARNED = 4
 OBJECTIVE_NAMES = {
     "reward_threshold": "reward threshold",
@@ -44,50 +43,42 @@ class RnObjectives(CurveSettings):
         DEFAULT_OBJECTIVES, each_of(OBJECTIVE_NAMES), about=f"of {', '.join(OBJECTIVE_NAMES)}"
     )
     picks: tuple[str, ...] = setting(
-        PICKS,
+        tuple(PICKS),
         each_of(PICKS),
-        about="RNs that train agents: best, "
-        "worst (as the authors' scripts picked for two "
-        "objectives)",
+        about="RNs that train agents: best, worst (as the authors' scripts for two objectives)",
     )
 
     @classmethod
     def defaults(cls, given: Mapping[str, Any]) -> dict[str, Any]:
         learned = {"learned": QUICK_LEARNED} if given.get("quick") else {}
-        usual = super().defaults(learned | dict(given)) | learned
+        default = super().defaults(learned | dict(given)) | learned
         if len(given.get("picks", PICKS)) > 1:  # as few as leave picks apart
-            half = given.get("learned", usual["learned"]) // 2
-            usual["rns"] = max(1, min(usual["rns"], half))
-        return usual | {"bonus_groups": given.get("rns", usual["rns"])}
+            half = given.get("learned", default["learned"]) // 2
+            default["rns"] = max(1, min(default["rns"], half))
+        return default | {"bonus_groups": given.get("rns", default["rns"])}
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require(
-            len(self.picks) == 1 or 2 * self.rns <= self.learned,
-            "learned",
-            f"be at least {2 * self.rns}",
-            "the best and the worst are picked from them",
-            self.learned,
-            f"learned={2 * self.rns} or picks=best",
+        least, reason = 2 * self.rns, "the best and the worst are picked from them"
+        enough, fix = (
+            len(self.picks) == 1 or self.learned >= least,
+            f"learned={least} or picks=best",
         )
+        require(enough, "learned", f"be at least {least}", reason, self.learned, fix)
 
 
 def compute(settings: RnObjectives) -> pd.DataFrame:
     """As of rn_performance; agents without an RN are there once for all objectives."""
-    rn_studies.check_stored(settings, settings.objectives)
+    reward_networks.check_stored(settings, settings.objectives)
     tables = [table.assign(objective="", pick="") for table in rn_curves.real_curves(settings)]
     for objective in settings.objectives:
         learned = {
-            variant: rn_studies.learn(settings, variant, objective) for variant in settings.variants
+            name: reward_networks.learn(settings, name, objective) for name in settings.variants
         }
-        for pick in settings.picks:
-            for variant, rns in learned.items():
-                picked = rns.ranked(settings.rns, worst=pick == "worst")
-                prefix = f"{objective}-{pick}-"
-                tables += [
-                    table.assign(objective=objective, pick=pick)
-                    for table in rn_curves.rn_curves(settings, variant, picked, prefix)
-                ]
+        for pick, (variant, rns) in itertools.product(settings.picks, learned.items()):
+            picked = rns.ranked(settings.rns, worst=pick == "worst")
+            made = rn_curves.rn_curves(settings, variant, picked, f"{objective}-{pick}-")
+            tables += [table.assign(objective=objective, pick=pick) for table in made]
     return pd.concat(tables, ignore_index=True)
 
 
@@ -113,9 +104,7 @@ def report(settings: RnObjectives, rows: pd.DataFrame) -> pd.DataFrame:
         rn_curves.draw(settings, curves, 2.7, f"{pick}.png")
     table = pd.concat(tables, ignore_index=True)
     table = table[["objective", "RNs", *table.columns.drop(["objective", "RNs"])]]
-    ends = " and with the ".join(
-        {"best": "highest", "worst": "lowest"}[pick] for pick in settings.picks
-    )
+    ends = " and with the ".join(PICKS[pick] for pick in settings.picks)
     note = (
         f"{settings.learned} RNs of each variant were learned by each objective. Of these the "
         f"{settings.rns} with the {ends} scores ({', '.join(settings.picks)}) train "

@@ -16,25 +16,25 @@ from dataclasses import dataclass
 
 import pandas as pd
 
-from experiments import rn_curves, rn_studies
-from experiments.experiment import Experiment
-from experiments.rn_curves import CurveSettings
-from experiments.tables import publish
+from experiments.common import reward_networks, rn_curves
+from experiments.common.experiment import Experiment
+from experiments.common.rn_curves import CurveSettings
+from experiments.common.tables import publish
 
 
 @dataclass(frozen=True, kw_only=True)
 class RnPerformance(CurveSettings):
     name = "rn_performance"
 
-    objective: str = rn_studies.objective_setting()
+    objective: str = reward_networks.objective_setting()
 
 
 def compute(settings: RnPerformance) -> pd.DataFrame:
     """Learns and trains what is missing; a row for each training episode of each agent."""
-    rn_studies.check_stored(settings, [settings.objective])
+    reward_networks.check_stored(settings, [settings.objective])
     tables = [*rn_curves.real_curves(settings)]
     for variant in settings.variants:
-        rns = rn_studies.learn(settings, variant, settings.objective).ranked(settings.rns)
+        rns = reward_networks.learn(settings, variant, settings.objective).ranked(settings.rns)
         tables += rn_curves.rn_curves(settings, variant, rns)
     return rn_curves.by_row(settings, pd.concat(tables))
 

@@ -22,24 +22,15 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
-from flax import struct
 
 import sejax
-from experiments import figures
-from experiments.experiment import Experiment
-from experiments.settings import Settings, count, setting
-from experiments.statistics import NUM_RESAMPLES, bootstrap_interval
-from experiments.tables import as_texts, publish
-from sejax.es.base import Strategy
-from sejax.es.nes import NESConfig, NESState, make_nes
-from sejax.es.score_transforms import TRANSFORMS
-from sejax.options import Options, counts
-
-SCORE_TRANSFORMS = tuple(TRANSFORMS)
+from experiments.common import figures
+from experiments.common.experiment import Experiment, Settings, count, each_of, setting
+from experiments.common.statistics import NUM_RESAMPLES
+from experiments.common.tables import as_texts, mean_columns, publish
 
 # docs/reference.md 6.2: default_config_gridworld.yaml as the published runs used it.
 SETTINGS = [
@@ -63,8 +54,7 @@ SETTINGS = [
     "es.num_incumbent_evals=null",
     "es.noise_std_decay=1",
 ]
-# Agents in lockstep on a CPU core: those of a few runs, which cost nothing once these are over.
-CPU_LANES = 384
+RUNS_AT_ONCE = 16  # in one vmapped batch; it costs nothing once all of these have ended
 STEP_SIZES = (0.01, 10.0)  # the range that the paper's figure shows
 LABELS = {
     "linear": "linear",
@@ -87,30 +77,23 @@ class ScoreTransforms(Settings):
     name = "score_transforms"
 
     runs: int = count(
-        220,
-        "runs",
-        quick=12,
-        about="of each score transform, with mirrored sampling and as many without",
+        220, "runs", quick=12, about="of each transform, with mirrored sampling and without"
     )
     generations: int = count(50, "generations", quick=10, about="of a run at most")
-    population: int = setting(
-        16,
-        counts("scores are compared within a generation", least=2),
-        quick=8,
-        about="members of a generation",
-    )
+    population: int = count(16, "candidates", least=2, quick=8, about="of a generation")
+    transforms: tuple[str, ...] = setting(tuple(LABELS), each_of(LABELS), about="to compare")
     bins: int = count(9, "bins", quick=3, about="of step sizes")
 
 
 def compute(settings: ScoreTransforms) -> pd.DataFrame:
     """Computes what is missing; a row for each run."""
     tables = []
-    for mirrored, transform in itertools.product((True, False), SCORE_TRANSFORMS):
+    for mirrored, transform in itertools.product((True, False), settings.transforms):
         name = f"{transform}-{'mirrored' if mirrored else 'plain'}"
         made_with = {"transform": transform, "mirrored": mirrored, "settings": SETTINGS}
         made_with |= settings.values("runs", "generations", "population", "seed")
         make = functools.partial(compute_cell, settings, transform, mirrored)
-        cell = settings.pieces.compute(name, made_with, make)
+        cell = settings.shards.compute(name, made_with, make)
         print(
             f"{name}: {cell['updates'].mean():.1f} updates of the SE on average, "
             f"{cell['solved'].mean():.0%} solved",
@@ -124,8 +107,8 @@ def compute_cell(settings: ScoreTransforms, transform: str, mirrored: bool) -> p
     """Runs of one score transform, a row each."""
     keys = jax.random.split(jax.random.key(settings.seed), settings.runs)
     step_sizes = draw_step_sizes(settings.runs, settings.seed)
-    search = make_search(mirrored, settings.population, settings.devices)
-    state = search.init(keys, np.float32(step_sizes), SCORE_TRANSFORMS.index(transform))
+    search = make_search(transform, mirrored, settings.population, settings.devices)
+    state = search.init(keys, np.float32(step_sizes))
     for _ in range(settings.generations):
         state = search.advance(state)  # runs that have solved the task stay as they are
         if state.finished.all():
@@ -156,77 +139,31 @@ def draw_step_sizes(count: int, seed: int) -> np.ndarray:
     return np.exp(low + places * (high - low))
 
 
-@struct.dataclass
-class AnyNESState:
-    nes: NESState
-    transform: Any  # number of its score transform, `[]`
-
-
-@dataclass(frozen=True, kw_only=True)
-class AnyNES(Options):
-    """NES for any score transform: one program serves all of them, and all step sizes."""
-
-    nes: NESConfig
-
-    def make(self, num_dims: int) -> Strategy:
-        """The strategy; its state begins with the first transform and the usual step size."""
-        each = [
-            make_nes(dataclasses.replace(self.nes, score_transform=name), num_dims)
-            for name in SCORE_TRANSFORMS
-        ]
-
-        def ask(key: Any, state: AnyNESState) -> tuple[Any, AnyNESState]:
-            members, nes = each[0].ask(key, state.nes)
-            return members, state.replace(nes=nes)
-
-        def tell(key: Any, members: Any, scores: Any, incumbent: Any, state: AnyNESState) -> Any:
-            told = jax.lax.switch(
-                state.transform,
-                [strategy.tell for strategy in each],
-                key,
-                members,
-                scores,
-                incumbent,
-                state.nes,
-            )
-            return state.replace(nes=told)
-
-        return dataclasses.replace(
-            each[0],
-            ask=ask,
-            tell=tell,
-            incumbent=lambda state: each[0].incumbent(state.nes),
-            init=lambda key, mean: AnyNESState(each[0].init(key, mean), jnp.int32(0)),
-        )
-
-
 class Search(NamedTuple):
     """Compiled functions over NES runs."""
 
-    init: Callable[..., Any]  # (keys [run], step_sizes [run], number of a transform) -> state
+    init: Callable[..., Any]  # (keys [run], step_sizes [run]) -> state
     advance: Callable[[Any], Any]  # a generation of every run that has not solved the task
 
 
-@functools.cache
-def make_search(mirrored: bool, population: int, devices: int | None) -> Search:
-    """Builds the bilevel loop for all step sizes and score transforms."""
-    from sejax.bilevel import make_program
+def make_search(transform: str, mirrored: bool, population: int, devices: int | None) -> Search:
+    """Builds Algorithm 1 for runs of a cell, which differ in their step sizes."""
+    from sejax.bilevel import make_bilevel
 
-    overrides = [f"es.mirrored={mirrored}", f"es.population_size={population}"]
-    config = sejax.config([*SETTINGS, *overrides, "stop_when_solved=true"])
-    config = dataclasses.replace(config, devices=devices)
-    num_parallel = CPU_LANES if jax.default_backend() == "cpu" else None
-    program = make_program(
-        **config.parts() | {"num_parallel": num_parallel, "es": AnyNES(nes=config.es)}
-    )
+    own = [f"es.score_transform={transform}", f"es.mirrored={mirrored}"]
+    own += [f"es.population_size={population}", "stop_when_solved=true"]
+    config = dataclasses.replace(sejax.config([*SETTINGS, *own]), devices=devices)
+    bilevel = make_bilevel(**config.parts())
 
-    def init(keys: Any, step_sizes: Any, transform: Any) -> Any:
-        state = program.init(keys)
-        nes = state.es_state.nes.replace(step_size=step_sizes)
-        transforms = jnp.full(len(keys), transform)
-        return state.replace(es_state=state.es_state.replace(nes=nes, transform=transforms))
+    def init(keys: Any, step_sizes: Any) -> Any:
+        state = jax.vmap(bilevel.init)(keys)
+        return state.replace(es_state=state.es_state.replace(step_size=step_sizes))
 
-    return Search(init=jax.jit(init), advance=jax.jit(lambda state: program.generation(state)[0]))
+    def generation(state: Any) -> Any:
+        return bilevel.generation(state)[0]
+
+    advance = jax.jit(lambda state: jax.lax.map(generation, state, batch_size=RUNS_AT_ONCE))
+    return Search(init=jax.jit(init), advance=advance)
 
 
 def edges_of(bins: int) -> np.ndarray:
@@ -256,30 +193,23 @@ def summarise(runs: pd.DataFrame, bins: int) -> pd.DataFrame:
     for (transform, mirrored), cells in binned(runs, bins).groupby(["transform", "mirrored"]):
         mine = runs[(runs["transform"] == transform) & (runs["mirrored"] == mirrored)]
         best = cells.loc[cells["updates"].idxmin()]
-        low, high = bootstrap_interval(mine["updates"])
         edges = edges_of(bins)[int(best["bin"]) :]
         others = by_run[mirrored]
-        behind = (others[transform] - others[others.mean().idxmin()]).to_numpy()
-        behind_low, behind_high = bootstrap_interval(behind)
+        behind = others[transform] - others[others.mean().idxmin()]
         rows.append(
             {
                 "transform": transform,
                 "mirrored": mirrored,
                 "runs": len(mine),
-                "best_low": edges[0],
-                "best_high": edges[1],
+                "best_from": edges[0],
+                "best_to": edges[1],
                 "best_updates": best["updates"],
-                "best_solved": best["solved"],
-                "updates": mine["updates"].mean(),
-                "updates_low": low,
-                "updates_high": high,
-                "behind": behind.mean(),
-                "behind_low": behind_low,
-                "behind_high": behind_high,
                 "solved": mine["solved"].mean(),
             }
+            | mean_columns(mine["updates"], "updates", least=1)
+            | mean_columns(behind, "behind", least=1)
         )
-    return pd.DataFrame(rows).sort_values(["updates", "transform"], ignore_index=True)
+    return pd.DataFrame(rows).sort_values(["updates_mean", "transform"], ignore_index=True)
 
 
 def share_of_best(runs: pd.DataFrame) -> dict[bool, float]:
@@ -296,21 +226,20 @@ def share_of_best(runs: pd.DataFrame) -> dict[bool, float]:
 
 def make_table(summary: pd.DataFrame) -> pd.DataFrame:
     """The summary as texts, with the rank of the cell among those of the same sampling."""
-    ranks = summary.groupby("mirrored")[["updates", "best_updates"]].rank(method="min")
+    ranks = summary.groupby("mirrored")[["updates_mean", "best_updates"]].rank(method="min")
+    behind = "{behind_mean:.1f} [{behind_low:.1f}, {behind_high:.1f}]"
     return as_texts(
         summary.join(ranks.add_suffix("_rank")),
         {
             "score transform": lambda row: LABELS[row.transform],
             "mirrored": lambda row: "yes" if row.mirrored else "no",
-            "rank": "{updates_rank:.0f}",
-            "updates, all step sizes": "{updates:.1f} [{updates_low:.1f}, {updates_high:.1f}]",
+            "rank": "{updates_mean_rank:.0f}",
+            "updates, all step sizes": "{updates_mean:.1f} [{updates_low:.1f}, {updates_high:.1f}]",
             "more than the best": lambda row: (
-                f"{row.behind:.1f} [{row.behind_low:.1f}, {row.behind_high:.1f}]"
-                if row.behind
-                else ""
+                behind.format_map(row._asdict()) if row.behind_mean else ""
             ),
             "solved": "{solved:.0%}",
-            "best step sizes": "{best_low:.2g} to {best_high:.2g}",
+            "best step sizes": "{best_from:.2g} to {best_to:.2g}",
             "updates there": "{best_updates:.1f}",
             "rank there": "{best_updates_rank:.0f}",
             "paper": lambda row: PAPER.get(row.transform, ""),
@@ -374,28 +303,14 @@ def _dots(axis: Any, runs: pd.DataFrame, scale: Any) -> None:
 def _heat_map(axis: Any, cells: pd.DataFrame, bins: int, scale: Any) -> None:
     means = cells.pivot(index="transform", columns="bin", values="updates")
     means = means.reindex(index=list(LABELS), columns=range(bins))
-    axis.pcolormesh(
-        edges_of(bins),
-        np.arange(len(LABELS) + 1) - 0.5,
-        means,
-        cmap=_COLORS,
-        norm=scale,
-        edgecolors="white",
-        lw=1,
-    )
+    how: Any = {"cmap": _COLORS, "norm": scale, "edgecolors": "white", "lw": 1}
+    axis.pcolormesh(edges_of(bins), np.arange(len(LABELS) + 1) - 0.5, means, **how)
     middles = np.sqrt(edges_of(bins)[1:] * edges_of(bins)[:-1])
     for row, column in itertools.product(range(len(LABELS)), range(bins)):
         value = means.iloc[row, column]
         if np.isfinite(value):
-            axis.text(
-                middles[column],
-                row,
-                f"{value:.0f}",
-                ha="center",
-                va="center",
-                fontsize=8,
-                color="white" if scale(value) > 0.45 else "black",
-            )
+            is_dark = scale(value) > 0.45
+            figures.cell_text(axis, middles[column], row, f"{value:.0f}", is_dark, fontsize=8)
 
 
 EXPERIMENT = Experiment(settings=ScoreTransforms, compute=compute, report=report, about=__doc__)

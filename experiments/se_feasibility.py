@@ -9,23 +9,23 @@ into `ses.safetensors`, which the other experiments read (`ses`, `varied`, `fixe
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
+from matplotlib.ticker import MaxNLocator
 
-from experiments import figures, proxy_runs
-from experiments.experiment import Experiment
-from experiments.proxy_runs import RunSettings
-from experiments.settings import count, setting
-from experiments.statistics import bootstrap_interval
-from experiments.tables import iqm_columns, iqm_note, iqm_text, publish
+from experiments.common import figures, runs, tables
+from experiments.common.experiment import Experiment, count, setting
+from experiments.common.runs import RunSettings
 from sejax.cli.build import AGENT_HPARAMS
+from sejax.errors import require
 from sejax.options import one_of
 
 NUM_RUNS = {"cartpole": 10}
 
-# A little world and agents that learn enough to be seen moving.
+# A small proxy and agents that learn enough to be seen moving.
 QUICK = [
     "generations=8",
     "es.population_size=12",
@@ -56,25 +56,23 @@ class SeFeasibility(RunSettings):
     runs: int = count(5, "runs", quick=3, about="independent NES runs; cartpole 10")
     agent: str | None = setting(None, about="that the SEs are learned with; the task's choice")
     agent_hparams: str = setting(
-        "default",
-        one_of(AGENT_HPARAMS),
-        about="its hyperparameters; varied: drawn for each training",
+        "default", one_of(AGENT_HPARAMS), about="its hyperparameters; varied: drawn for each agent"
     )
 
     @classmethod
     def defaults(cls, given: Mapping[str, Any]) -> dict[str, Any]:
-        usual = super().defaults(given)
+        default = super().defaults(given)
         if not given.get("quick"):
-            usual["runs"] = NUM_RUNS.get(given.get("env", usual["env"]), usual["runs"])
-        return usual
+            default["runs"] = NUM_RUNS.get(given.get("env", default["env"]), default["runs"])
+        return default
 
 
 def compute(settings: SeFeasibility) -> pd.DataFrame:
     """Learns what is missing; a row for each generation of each run."""
     config, folder = learning_config(settings), settings.work_folder / "runs"
-    runs = proxy_runs.configs_of_runs(config, settings.runs, folder)
-    curves = proxy_runs.learn_all(runs)
-    proxy_runs.collect(runs, settings.folder / "ses.safetensors")
+    configs = runs.configs_of(config, settings.runs, folder)
+    curves = runs.learn(configs)
+    runs.collect(configs, settings.folder / "ses.safetensors")
     return curves
 
 
@@ -82,14 +80,17 @@ def learning_config(settings: SeFeasibility) -> Any:
     """The configuration of the NES runs."""
     words = [f"agent_hparams={settings.agent_hparams}"]
     words += [f"agent={settings.agent}"] if settings.agent else []
-    return settings.learn_config(words + (QUICK if settings.quick else []))
+    config = settings.learn_config(words + (QUICK if settings.quick else []))
+    proxy, reason = config.name("proxy"), "rn_performance learns reward networks"
+    require(proxy != "rn", "run.proxy", "be se", reason, proxy, "run.proxy=se")
+    return config
 
 
 def summarise(curves: pd.DataFrame, solved_reward: float) -> pd.DataFrame:
     """One row for each run: what it took to solve the task and how far it came."""
     rows = []
     for seed, curve in curves.groupby("seed"):
-        to_solve = proxy_runs.generations_to_solve(curve, solved_reward)
+        to_solve = runs.generations_to_solve(curve, solved_reward)
         at_solving = curve[curve["generation"] + 1 == to_solve]
         rows.append(
             {
@@ -109,54 +110,49 @@ def summarise(curves: pd.DataFrame, solved_reward: float) -> pd.DataFrame:
 def median_and_range(values: Any, limit: int) -> str:
     """`median (lowest to highest)` of counts, where inf is "more than the limit"."""
     values = np.sort(np.asarray(values, float))
-    middle = float(np.median(values))
-
-    def text(x: float) -> str:
-        return f"{x:g}" if np.isfinite(x) else f"> {limit}"
-
-    if values[0] == values[-1]:
-        return text(middle)
-    return f"{text(middle)} ({text(values[0])} to {text(values[-1])})"
+    middle, low, high = (
+        f"{x:g}" if np.isfinite(x) else f"> {limit}"
+        for x in (np.median(values), values[0], values[-1])
+    )
+    return middle if low == high else f"{middle} ({low} to {high})"
 
 
-def median_steps(runs: pd.DataFrame) -> str:
+def median_steps(summary: pd.DataFrame) -> str:
     """Of real steps to solve; a run that did not solve the task took more than all its steps."""
-    steps = runs["env_steps_to_solve"].where(np.isfinite(runs["generations_to_solve"]), np.inf)
-    middle = float(np.median(steps))
-    return f"{middle:,.0f}" if np.isfinite(middle) else f"> {runs['env_steps'].min():,.0f}"
+    is_solved = np.isfinite(summary["generations_to_solve"])
+    middle = float(np.median(summary["env_steps_to_solve"].where(is_solved, np.inf)))
+    return f"{middle:,.0f}" if np.isfinite(middle) else f"> {summary['env_steps'].min():,.0f}"
 
 
-def make_table(config: Any, runs: pd.DataFrame) -> pd.DataFrame:
+def make_table(config: Any, summary: pd.DataFrame) -> pd.DataFrame:
     """The statistics of all runs, beside what the paper says of its own."""
-    solved = runs[np.isfinite(runs["generations_to_solve"])]
-    best, last = runs["best_incumbent_mean"], runs["last_incumbent_mean"]
-    low, high = bootstrap_interval(last)
+    best, last = summary["best_incumbent_mean"], summary["last_incumbent_mean"]
+    to_solve = summary["generations_to_solve"]
+    # With an interval for any number of runs, as they are as many as there are.
+    columns = tables.mean_columns(last, "last", least=1) | tables.iqm_columns(last, "last")
+    mean = "{last_mean:.1f} [{last_low:.1f}, {last_high:.1f}]"
     ours = {
-        "runs": str(len(runs)),
-        "generations run": f"{runs['generations'].max()}",
+        "runs": str(len(summary)),
+        "generations run": f"{summary['generations'].max()}",
         "population": str(config.es.population_size),
-        "runs solved": f"{len(solved)} of {len(runs)}",
-        "generations to solve": median_and_range(runs["generations_to_solve"], config.generations),
-        "real steps to solve, median": median_steps(runs),
+        "runs solved": f"{np.isfinite(to_solve).sum()} of {len(summary)}",
+        "generations to solve": median_and_range(to_solve, config.generations),
+        "real steps to solve, median": median_steps(summary),
         "best incumbent mean": f"{best.median():.1f} ({best.min():.1f} to {best.max():.1f})",
-        "last incumbent mean": f"{last.mean():.1f} [{low:.1f}, {high:.1f}]",
-        "last incumbent mean, IQM": iqm_text("last").format_map(iqm_columns(last, "last")),
-        "wall minutes of a run, mean": f"{runs['wall_min'].mean():.1f}",
+        "last incumbent mean": mean.format_map(columns),
+        "last incumbent mean, IQM": tables.iqm_text("last").format_map(columns),
+        "wall minutes of a run, mean": f"{summary['wall_min'].mean():.1f}",
     }
     paper = PAPER if config.name("env") in PAPER_TASKS else {}
-    return pd.DataFrame(
-        [
-            {"of the NES runs": name, "sejax": value, "paper": paper.get(name, "")}
-            for name, value in ours.items()
-        ]
-    )
+    beside = [paper.get(name, "") for name in ours]
+    return pd.DataFrame({"of the NES runs": ours.keys(), "sejax": ours.values(), "paper": beside})
 
 
 def report(settings: SeFeasibility, rows: pd.DataFrame) -> pd.DataFrame:
     config = learning_config(settings)
     solved_reward = config.task().solved_reward
     summary = summarise(rows, solved_reward)
-    figures.learning_curves(rows, solved_reward, settings.folder / "learning_curves.png")
+    draw(rows, solved_reward, settings.folder / "learning_curves.png")
     varied = " with varied hyperparameters" if config.agent_hparams == "varied" else ""
     note = (
         f"Preset {config.preset}. An incumbent mean is over "
@@ -166,10 +162,37 @@ def report(settings: SeFeasibility, rows: pd.DataFrame) -> pd.DataFrame:
         "runs; a run that did not solve the task counts as longer than all. The last incumbent "
         "mean is that over runs, with a bootstrap 95% interval; the best is a maximum of noisy "
         "means and hence too high: se_performance tests the stored SEs with other agents."
-        f"{iqm_note(of='runs')}"
+        f"{tables.iqm_note(of='runs')}"
     )
     title = f"Learning SEs of {settings.env} for {config.name('agent')} agents{varied}"
-    return publish(settings, title, make_table(config, summary), summary, note)
+    return tables.publish(settings, title, make_table(config, summary), summary, note)
+
+
+def draw(curves: pd.DataFrame, solved_reward: float, path: Path) -> None:
+    """Draws each run's incumbent mean as a thin line, and their mean with one std.
+
+    Source: paper, figure "Multiple NES runs of Alg. 1".
+    """
+    lines = curves.pivot(index="generation", columns="seed", values="incumbent_mean")
+    lines = lines.ffill()  # a run that stopped when it solved the task stays where it was
+    iterations = lines.index.to_numpy() + 1
+    mean, std = lines.mean(axis=1), lines.std(axis=1, ddof=0)
+    with figures.panels(path, 1, 1, (6, 3.6)) as (_, axes):
+        axis = axes[0, 0]
+        for index, seed in enumerate(lines.columns):
+            label = None if index else f"NES run ({lines.shape[1]} in all)"
+            axis.plot(iterations, lines[seed], color=figures.REAL, lw=0.7, alpha=0.5, label=label)
+        shade: Any = {"color": figures.REAL, "alpha": 0.15, "lw": 0}
+        axis.fill_between(
+            iterations, mean - std, mean + std, label="mean ± std of the runs", **shade
+        )
+        axis.plot(iterations, mean, color=figures.REAL, lw=2.4)
+        figures.threshold(axis, solved_reward, f"solved ({solved_reward:g})")
+        label = "mean return of the incumbent's\nagents on the real task"
+        limits = (1, max(iterations[-1], 2))
+        axis.set(xlabel="NES outer iteration", xlim=limits, ylabel=label)
+        axis.xaxis.set_major_locator(MaxNLocator(integer=True))
+        axis.legend(fontsize=9, loc="best")
 
 
 EXPERIMENT = Experiment(settings=SeFeasibility, compute=compute, report=report, about=__doc__)

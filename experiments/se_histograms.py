@@ -30,12 +30,11 @@ import pandas as pd
 from scipy.stats import wasserstein_distance
 
 import sejax
-from experiments import figures, se_agents
-from experiments.experiment import Experiment
-from experiments.se_agents import AGENTS, SOFT_SE
-from experiments.settings import Settings, count, each_of, setting
-from experiments.tables import as_texts, publish
-from experiments.worlds import Measure, World, train_groups, training_as_learned
+from experiments.common import agents as groups
+from experiments.common import figures
+from experiments.common.agents import SE_AGENTS, SOFT_SE, Condition, Measure
+from experiments.common.experiment import Experiment, Settings, count, each_of, setting
+from experiments.common.tables import as_texts, publish
 from sejax import registry
 from sejax.agents.buffers import Buffer, BufferMaker, write_row
 from sejax.training import TrainingConfig
@@ -75,12 +74,12 @@ class SeHistograms(Settings):
     name = "se_histograms"
 
     proxy: str = setting(SOFT_SE, about="SE: a run directory, a file or a shipped name")
-    agents: tuple[str, ...] = setting(AGENTS, each_of(AGENTS), about="kinds of agents, a row each")
+    agents: tuple[str, ...] = setting(
+        SE_AGENTS, each_of(SE_AGENTS), about="kinds of agents, a row each"
+    )
     num_agents: int = count(10, "agents", quick=3, about="of each kind")
     test_episodes: int = count(10, "episodes", about="of each agent")
-    max_rows: int = count(
-        10_000, "transitions", about="training transitions of an agent that are kept, the last ones"
-    )
+    max_rows: int = count(10_000, "transitions", about="of training, the last ones of an agent")
 
     @property
     def rows_file(self) -> Path:
@@ -93,18 +92,19 @@ def compute(settings: SeHistograms) -> pd.DataFrame:
     ses = load(settings)
     tables = []
     for kind in settings.agents:
-        agent = se_agents.agent_config(settings, kind)
-        world = World.of_set(
+        agent = groups.agent_config(settings, kind)
+        condition = Condition.of_set(
             ses,
             ["all"],
             name=kind,
             agent=agent,
             training=training_of(settings, ses, agent),
             exploration=registry.configure("exploration", ses.config["exploration"]),
-            settings={"max_rows": settings.max_rows},
+            settings=settings.values("max_rows"),
             is_single=True,
         )
-        rows = train_groups(world, settings, settings.num_agents, transitions(settings.max_rows))
+        measure = transitions(settings.max_rows)
+        rows = groups.train_groups(condition, settings, settings.num_agents, measure)
         tables.append(rows.assign(kind=kind))
     return pd.concat(tables, ignore_index=True).drop(columns="group")
 
@@ -116,9 +116,9 @@ def load(settings: SeHistograms) -> Any:
 
 def training_of(settings: SeHistograms, ses: Any, agent: Any) -> TrainingConfig:
     """How long an agent trains: as those that the SE was learned with."""
-    training = training_as_learned(ses, agent)
+    training = groups.training_as_learned(ses, agent)
     if settings.quick:
-        most = min(training.max_steps or se_agents.QUICK_STEPS, se_agents.QUICK_STEPS)
+        most = min(training.max_steps or groups.QUICK_STEPS, groups.QUICK_STEPS)
         training = dataclasses.replace(training, max_steps=most)
     return dataclasses.replace(training, test_episodes=settings.test_episodes)
 
@@ -129,7 +129,7 @@ def transitions(max_rows: int) -> Measure:
     return Measure(
         make_run=functools.partial(make_recorded_run, max_rows),
         to_table=lambda recorded, drawn: rows_of(recorded),
-        say=lambda rows: f"mean return {test_returns(rows).mean():.1f}, {len(rows):,} transitions",
+        log=lambda rows: f"mean return {test_returns(rows).mean():.1f}, {len(rows):,} transitions",
     )
 
 
@@ -149,21 +149,17 @@ def make_recorded_run(
         steps = test(key_test, trained.agent_state)
         predict = jax.vmap(lambda s, a: env.predict(env_params.weights, s, a)[:2])
         next_obs, reward = predict(steps.obs, steps.action)
-        tested = {
-            "episode": jnp.arange(steps.reward.shape[0]) // task.max_steps,
-            "valid": steps.valid,
-        }
+        episode = jnp.arange(steps.reward.shape[0]) // task.max_steps
         met = trained.recorded.rows
-        valid = jnp.arange(capacity) < trained.train_steps
+
+        def source(next_obs: Any, reward: Any, episode: Any, valid: Any) -> dict[str, Any]:
+            return {"next_obs": next_obs, "reward": reward, "episode": episode, "valid": valid}
+
+        is_made = jnp.arange(capacity) < trained.train_steps
         return {
-            "train": {
-                "next_obs": met[:, 2:],
-                "reward": met[:, 1],
-                "episode": jnp.int32(met[:, 0]),
-                "valid": valid,
-            },
-            "test": {"next_obs": steps.next_obs, "reward": steps.reward} | tested,
-            "response": {"next_obs": next_obs, "reward": reward} | tested,
+            "train": source(met[:, 2:], met[:, 1], jnp.int32(met[:, 0]), is_made),
+            "test": source(steps.next_obs, steps.reward, episode, steps.valid),
+            "response": source(next_obs, reward, episode, steps.valid),
         }
 
     return run
@@ -238,18 +234,11 @@ def summarise(rows: pd.DataFrame) -> pd.DataFrame:
     for kind, mine in rows.groupby("kind", sort=False):
         for column in columns_of(rows):
             samples = {name: mine[mine["source"] == name][column] for name in SOURCES}
-            pairs = ("response", "train"), ("response", "test"), ("train", "test")
-            out.append(
-                {
-                    "kind": kind,
-                    "dimension": column,
-                    **{f"std_{name}": x.std(ddof=0) for name, x in samples.items()},
-                    **{
-                        f"{a}_to_{b}": wasserstein_distance(samples[a], samples[b])
-                        for a, b in pairs
-                    },
-                }
-            )
+            row = {"kind": kind, "dimension": column}
+            row |= {f"std_{name}": x.std(ddof=0) for name, x in samples.items()}
+            for a, b in (("response", "train"), ("response", "test"), ("train", "test")):
+                row[f"{a}_to_{b}"] = wasserstein_distance(samples[a], samples[b])
+            out.append(row)
     return pd.DataFrame(out)
 
 
@@ -259,6 +248,9 @@ def make_table(task: Any, rows: pd.DataFrame, summary: pd.DataFrame) -> pd.DataF
 
     def first(text: Callable[[str], str]) -> Callable[[Any], str]:
         return lambda row: text(row.kind) if row.dimension == next(iter(names)) else ""
+
+    def closer(row: Any) -> str:
+        return "train" if row.response_to_train < row.response_to_test else "test"
 
     def returned(kind: str) -> str:
         returns = test_returns(rows[rows["kind"] == kind])
@@ -274,9 +266,7 @@ def make_table(task: Any, rows: pd.DataFrame, summary: pd.DataFrame) -> pd.DataF
             **{f"std, {name}": f"{{std_{name}:.3g}}" for name in SOURCES},
             "response to train": "{response_to_train:.3g}",
             "response to test": "{response_to_test:.3g}",
-            "response is closer to": lambda row: (
-                "train" if row.response_to_train < row.response_to_test else "test"
-            ),
+            "response is closer to": closer,
         },
     )
 

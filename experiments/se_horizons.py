@@ -2,27 +2,26 @@
 
 From the contextual bandit, whose episodes end after one step, to the task's limit, with the task's
 initial states and with learned ones: what they reach within equal CPU seconds, what it takes, and
-what fresh agents of other families learn on the best SE. Episodes of several steps end as `ends`
-says, in all of these ways one after the other; the figure shows the first.
+what fresh agents of other kinds learn on the best SE. Episodes of several steps end as `ends` says,
+in all of these ways one after the other; the figure shows the first.
 
 Source: the paper's SE (the task's limit and initial states) and that of Liesen et al., "Discovering
 Minimal Reinforcement Learning Environments" (2024), a bandit with learned ones.
 """
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
 
-from experiments import budgets, family_runs, figures, proxy_runs
-from experiments.experiment import Experiment
-from experiments.family_runs import FamilyRuns
-from experiments.pieces import stack, unstack
-from experiments.settings import each_of, setting
-from experiments.statistics import bootstrap_interval
-from experiments.tables import as_texts, publish
-from experiments.worlds import HPARAMS
+from experiments.common import figures, runs
+from experiments.common.agents import HPARAMS
+from experiments.common.experiment import Experiment, each_of, setting
+from experiments.common.runs import MixtureRuns
+from experiments.common.shards import stack, unstack
+from experiments.common.tables import as_texts, interval, mean_columns, publish
 from sejax import envs
 from sejax.options import positive
 from sejax.proxies.configs import DONE_MODES, INITIAL_STATES
@@ -55,13 +54,11 @@ BY = list(Kind._fields)
 
 
 @dataclass(frozen=True, kw_only=True)
-class SeHorizons(FamilyRuns):
+class SeHorizons(MixtureRuns):
     name = "se_horizons"
 
     horizons: tuple[int | None, ...] = setting(
-        (1, 2, 5, 20, None),
-        quick=(1, None),
-        about="steps of an SE's episodes; null: the task's limit",
+        (1, 2, 5, 20, None), quick=(1, None), about="steps of an SE's episodes; null: the task's"
     )
     starts: tuple[str, ...] = setting(
         ("real", "learned"), each_of(INITIAL_STATES), about="initial states of the SEs"
@@ -71,11 +68,11 @@ class SeHorizons(FamilyRuns):
         each_of(DONE_MODES),
         about="how episodes of several steps end; the figure shows the first",
     )
-    agents: tuple[str, ...] = setting(("ddqn",), about="families that SEs are learned with")
+    agents: tuple[str, ...] = setting(("ddqn",), about="agents that SEs are learned with")
     tested: tuple[str, ...] = setting(
         ("dueling_ddqn", "ppo", "td3_discrete"),
         quick=("dueling_ddqn",),
-        about="families that the best SE of each kind is tested with",
+        about="kinds of agents that the best SE of each kind is tested with",
     )
 
     tested_hparams: tuple[str, ...] = setting(
@@ -100,23 +97,17 @@ class SeHorizons(FamilyRuns):
 def compute(settings: SeHorizons) -> pd.DataFrame:
     """Learns and trains what is missing; rows of the runs' generations and of the tested agents."""
     every = [*settings.agents, *settings.tested]
+    mixtures = [settings.agents, *([kind] for kind in settings.tested)]
     configs = {
-        kind: [
-            settings.config_with(names, every, kind.words)
-            for names in (settings.agents, *([x] for x in settings.tested))
-        ]
+        kind: [settings.config_with(names, every, kind.words) for names in mixtures]
         for kind in settings.kinds
     }
     curves, agents = [], []
     for kind, (learner, *testers) in configs.items():
-        curve, ses = family_runs.learn(settings, kind.name, learner)
+        curve, ses = settings.learn(kind.name, learner)
+        tested = [settings.evaluate(kind.name, ses.ranked(1), tester) for tester in testers]
         curves.append(curve.assign(**kind._asdict()))
-        agents += [
-            family_runs.evaluate(settings, kind.name, ses.ranked(1), tester).assign(
-                **kind._asdict()
-            )
-            for tester in testers
-        ]
+        agents.append(pd.concat(tested).assign(**kind._asdict()))
     return stack({"curves": pd.concat(curves), "agents": pd.concat(agents)})
 
 
@@ -130,8 +121,8 @@ def summarise_runs(
     """
     rows = []
     for values, whole in curves.groupby([*BY, "seed"], sort=False):
-        curve = budgets.within(whole, budget_s).reset_index(drop=True)
-        to_solve = proxy_runs.generations_to_solve(curve, solved_reward)
+        curve = runs.within(whole, budget_s).reset_index(drop=True)
+        to_solve = runs.generations_to_solve(curve, solved_reward)
         is_solved = np.isfinite(to_solve)
         later = curve["incumbent_mean"][curve["generation"] >= to_solve]
         rows.append(
@@ -151,92 +142,80 @@ def summarise_runs(
     return pd.DataFrame(rows)
 
 
-def summarise(runs: pd.DataFrame, transfer: pd.DataFrame) -> pd.DataFrame:
-    """A row for each kind of SE, with a column for the mean return of each tested family."""
+def summarise(each: pd.DataFrame, transfer: pd.DataFrame) -> pd.DataFrame:
+    """A row for each kind of SE, with a column for the mean return of each tested kind of agent."""
     rows = []
-    for values, mine in runs.groupby(BY, sort=False):
-        low, high = bootstrap_interval(mine["best"])
+    means = ["stays_solved", "generations", "cpu_s", "train_steps", "env_steps"]
+    for values, mine in each.groupby(BY, sort=False):
+        solved = int(np.isfinite(mine["to_solve"]).sum())
         rows.append(
-            dict(zip(BY, values, strict=True))
-            | {
-                "runs": len(mine),
-                "solved": int(np.isfinite(mine["to_solve"]).sum()),
-                "best": mine["best"].mean(),
-                "best_low": low,
-                "best_high": high,
-                "to_solve": mine["to_solve"].median(),
-                "cpu_s_to_solve": mine["cpu_s_to_solve"].median(),
-                "stays_solved": mine["stays_solved"].mean(),
-                **mine[["generations", "cpu_s", "train_steps", "env_steps"]].mean(),
-            }
+            {**dict(zip(BY, values, strict=True)), "runs": len(mine), "solved": solved}
+            | mean_columns(mine["best"], "best", least=1)
+            | dict(mine[["to_solve", "cpu_s_to_solve"]].median())
+            | dict(mine[means].mean())
         )
     transferred = transfer[transfer["hparams"] == transfer["hparams"].iloc[0]]
-    means = transferred.pivot(index=BY, columns="kind", values="test_return_mean").add_prefix("on_")
-    return pd.DataFrame(rows).join(means, on=BY)
+    returns = transferred.pivot(index=BY, columns="kind", values="test_return_mean")
+    return pd.DataFrame(rows).join(returns.add_prefix("on_"), on=BY)
 
 
 def make_table(summary: pd.DataFrame) -> pd.DataFrame:
     """The summary as texts."""
-    tested = {name.removeprefix("on_"): name for name in summary if name.startswith("on_")}
-
-    return as_texts(
-        summary,
-        {
-            "steps": "{horizon}",
-            "starts": "{starts}",
-            "end": "{end}",
-            "best incumbent": "{best:.1f} [{best_low:.1f}, {best_high:.1f}]",
-            "runs solved": "{solved} of {runs}",
-            "generations to solve": lambda row: _finite(row.to_solve, 0),
-            "CPU s to solve": lambda row: _finite(row.cpu_s_to_solve, 1),
-            "stay solved": lambda row: f"{row.stays_solved:.0%}" if row.solved else "-",
-            "generations": "{generations:.0f}",
-            "CPU s each": "{cpu_s:.2f}",
-            "steps of an agent": "{train_steps:,.0f}",
-            "real steps": "{env_steps:,.0f}",
-            **{
-                f"tested: {figures.AGENT_NAMES.get(kind, kind)}": f"{{{column}:.1f}}"
-                for kind, column in tested.items()
-            },
-        },
-    )
+    columns: dict[str, Any] = {
+        "steps": "{horizon}",
+        "starts": "{starts}",
+        "end": "{end}",
+        "best incumbent": "{best_mean:.1f} [{best_low:.1f}, {best_high:.1f}]",
+        "runs solved": "{solved} of {runs}",
+        "generations to solve": lambda row: _finite(row.to_solve, 0),
+        "CPU s to solve": lambda row: _finite(row.cpu_s_to_solve, 1),
+        "stay solved": lambda row: f"{row.stays_solved:.0%}" if row.solved else "-",
+        "generations": "{generations:.0f}",
+        "CPU s each": "{cpu_s:.2f}",
+        "steps of an agent": "{train_steps:,.0f}",
+        "real steps": "{env_steps:,.0f}",
+    }
+    for name in (name for name in summary if name.startswith("on_")):
+        kind = name.removeprefix("on_")
+        columns[f"tested: {figures.AGENT_NAMES.get(kind, kind)}"] = f"{{{name}:.1f}}"
+    return as_texts(summary, columns)
 
 
-def findings(runs: pd.DataFrame, summary: pd.DataFrame, end: str) -> str:
+def findings(each: pd.DataFrame, summary: pd.DataFrame, end: str) -> str:
     """Sentences on what was measured; horizons and starts are compared where SEs end like this."""
     texts = []
     shown = summary[summary["end"].isin([NO_END, end])]
     for starts, mine in shown.groupby("starts", sort=False):
-        each = [
-            f"{row.horizon}: {row.best:.1f}, {row.solved} of {row.runs}, "
+        said = [
+            f"{row.horizon}: {row.best_mean:.1f}, {row.solved} of {row.runs}, "
             f"{_finite(row.cpu_s_to_solve, 0)}"
             for row in mine.itertuples()
         ]
         texts.append(
             f"With {starts} starts (horizon: best incumbent, runs solved, median CPU s to "
-            f"solve): {'; '.join(each)}."
+            f"solve): {'; '.join(said)}."
         )
         if len(mine) > 1:
-            texts.append(_compared(runs, mine.iloc[0], mine.iloc[-1], "horizon"))
+            texts.append(_compared(each, mine.iloc[0], mine.iloc[-1], "horizon"))
     for _, mine in shown.groupby("horizon", sort=False):
         if len(mine) > 1:
-            texts.append(_compared(runs, mine.iloc[0], mine.iloc[-1], "starts"))
+            texts.append(_compared(each, mine.iloc[0], mine.iloc[-1], "starts"))
     of_ends = summary[summary["end"] != NO_END].groupby("end", sort=False)
     if of_ends.ngroups > 1:
-        means = of_ends.agg({"best": "mean", "solved": "sum", "runs": "sum"})
-        each = [
-            f"{row.Index} {row.best:.1f} ({row.solved} of {row.runs} runs solved)"
+        means = of_ends.agg({"best_mean": "mean", "solved": "sum", "runs": "sum"})
+        said = [
+            f"{row.Index} {row.best_mean:.1f} ({row.solved} of {row.runs} runs solved)"
             for row in means.itertuples()
         ]
-        texts.append(f"Ends of several steps, over horizons and starts: {', '.join(each)}.")
+        texts.append(f"Ends of several steps, over horizons and starts: {', '.join(said)}.")
     return " ".join(texts)
 
 
-def _compared(runs: pd.DataFrame, a: pd.Series, b: pd.Series, what: str) -> str:
+def _compared(each: pd.DataFrame, a: pd.Series, b: pd.Series, what: str) -> str:
     """The difference between two kinds of SE that differ in this, over pairs of equal seeds."""
-    bests = runs.set_index([*BY, "seed"])["best"]
+    bests = each.set_index([*BY, "seed"])["best"]
     differences = bests.loc[tuple(a[BY])] - bests.loc[tuple(b[BY])]
-    low, high = bootstrap_interval(differences)
+    low, high = interval(differences, least=1)
     tested = [name for name in a.index if name.startswith("on_")]
     same = f"starts {a['starts']}" if what == "horizon" else f"horizon {a['horizon']}"
     return (
@@ -253,12 +232,10 @@ def _finite(value: float, digits: int) -> str:
 def report(settings: SeHorizons, rows: pd.DataFrame) -> pd.DataFrame:
     task = envs.make(settings.env)
     rows = rows.astype({"horizon": str})
-    runs = summarise_runs(unstack(rows, "curves"), settings.cpu_budget_s, task.solved_reward)
-    transfer = family_runs.summarise(
-        unstack(rows, "agents"), [*BY, "hparams", "kind"], task.solved_reward
-    )
-    summary = summarise(runs, transfer)
-    draw(task, runs, summary, settings.ends[0], settings.folder / "horizons.png")
+    each = summarise_runs(unstack(rows, "curves"), settings.cpu_budget_s, task.solved_reward)
+    by = [*BY, "hparams", "kind"]
+    summary = summarise(each, runs.summarise_tests(unstack(rows, "agents"), by, task.solved_reward))
+    draw(task, each, summary, settings.ends[0], settings.folder / "horizons.png")
     note = (
         f"SEs learned with {' + '.join(settings.agents)}, {settings.runs} runs of "
         f"{settings.cpu_budget_s:g} CPU s each (generations that began before these were spent; "
@@ -269,13 +246,13 @@ def report(settings: SeHorizons, rows: pd.DataFrame) -> pd.DataFrame:
         "of the later generations, over the runs that did. Real steps are those of the whole run. "
         f"Tested: mean return of {settings.num_agents} fresh agents with "
         f"{settings.tested_hparams[0]} hyperparameters on the SE with the best score of each "
-        f"kind. {findings(runs, summary, settings.ends[0])}"
+        f"kind. {findings(each, summary, settings.ends[0])}"
     )
     title = f"Horizons and starts of SEs of {task.name}, at equal cost"
     return publish(settings, title, make_table(summary), summary, note)
 
 
-def draw(task: Any, runs: pd.DataFrame, summary: pd.DataFrame, end: str, path: Any) -> None:
+def draw(task: Any, each: pd.DataFrame, summary: pd.DataFrame, end: str, path: Path) -> None:
     """Draws returns against horizons of SEs that end like this, and CPU seconds to solve the task.
 
     A cross is a run that has not solved it, where its budget was spent.
@@ -288,39 +265,18 @@ def draw(task: Any, runs: pd.DataFrame, summary: pd.DataFrame, end: str, path: A
         left, right = axes[0]
         for index, (starts, mine) in enumerate(shown):
             color, shift = COLORS[str(starts)], 0.12 * (index - 0.5)
-            places = mine["horizon"].map(horizons.index) + shift
-            errors = np.abs(mine[["best_low", "best_high"]].to_numpy().T - mine["best"].to_numpy())
-            left.errorbar(
-                places,
-                mine["best"],
-                yerr=errors,
-                fmt="o-",
-                ms=5,
-                capsize=3,
-                color=color,
-                label=f"{starts} starts",
-            )
-            left.plot(
-                places,
-                mine[tested].mean(axis=1),
-                "D:",
-                ms=4,
-                color=color,
-                mfc="none",
-                label=f"{starts} starts, tested families",
-            )
-            own = runs[runs["end"].isin(ends) & (runs["starts"] == starts)]
+            places, best = mine["horizon"].map(horizons.index) + shift, mine["best_mean"]
+            errors = np.abs(mine[["best_low", "best_high"]].to_numpy().T - best.to_numpy())
+            line: Any = {"fmt": "o-", "ms": 5, "capsize": 3, "color": color}
+            left.errorbar(places, best, yerr=errors, label=f"{starts} starts", **line)
+            means, label = mine[tested].mean(axis=1), f"{starts} starts, tested families"
+            left.plot(places, means, "D:", ms=4, color=color, mfc="none", label=label)
+            own = each[each["end"].isin(ends) & (each["starts"] == starts)]
             solved = np.isfinite(own["cpu_s_to_solve"])
             x = own["horizon"].map(horizons.index) + shift
             right.plot(x[solved], own["cpu_s_to_solve"][solved], "o", ms=5, color=color, alpha=0.7)
             right.plot(x[~solved], own["cpu_s_in_all"][~solved], "x", ms=6, color=color, alpha=0.7)
-        left.axhline(
-            task.solved_reward,
-            color=figures.SOLVED,
-            ls="--",
-            lw=1.2,
-            label=f"solved ({task.solved_reward:g})",
-        )
+        figures.threshold(left, task.solved_reward, f"solved ({task.solved_reward:g})")
         left.set(ylabel=f"mean return on {task.name}")
         right.set(ylabel="CPU s to solve (x: not solved)")
         right.set_ylim(bottom=0)

@@ -16,12 +16,10 @@ import numpy as np
 import pandas as pd
 
 import sejax
-from experiments import figures, se_agents
-from experiments.experiment import Experiment
-from experiments.se_agents import SeAgents
-from experiments.settings import setting
-from experiments.tables import as_texts, iqm_columns, iqm_note, iqm_text, publish
-from experiments.worlds import return_columns
+from experiments.common import agents as groups
+from experiments.common import figures, tables
+from experiments.common.agents import SeAgents, return_columns
+from experiments.common.experiment import Experiment, setting
 from sejax.errors import ConfigError
 
 
@@ -38,13 +36,13 @@ class SeModels(SeAgents):
 def compute(settings: SeModels) -> pd.DataFrame:
     """Trains what is missing; a row for each agent."""
     ses = load(settings)
-    tables = []
+    parts = []
     for kind in settings.agents:
-        world = se_agents.se_world(settings, ses, kind)
-        places = {group.name: place for place, group in enumerate(world.groups)}
-        rows = se_agents.train(settings, world)
-        tables.append(rows.assign(se=rows["group"].map(places)))
-    return pd.concat(tables, ignore_index=True)
+        condition = groups.on_ses(settings, ses, kind)
+        places = {group.name: place for place, group in enumerate(condition.groups)}
+        rows = groups.train_kind(settings, condition)
+        parts.append(rows.assign(se=rows["group"].map(places)))
+    return pd.concat(parts, ignore_index=True)
 
 
 def load(settings: SeModels) -> Any:
@@ -65,7 +63,7 @@ def summarise(agents: pd.DataFrame, solved_reward: float) -> pd.DataFrame:
         return_std=lambda x: x.std(ddof=0),
         solved=lambda x: (x >= solved_reward).mean(),
     )
-    iqms = [iqm_columns(returns, "return") for _, returns in grouped["test_return"]]
+    iqms = [tables.iqm_columns(returns, "return") for _, returns in grouped["test_return"]]
     summary = summary.assign(**pd.DataFrame(iqms, index=summary.index))
     summary["train_steps"] = grouped["train_steps"].mean()
     kinds = list(dict.fromkeys(agents["kind"]))
@@ -92,7 +90,7 @@ def report(settings: SeModels, rows: pd.DataFrame) -> pd.DataFrame:
         "run's seed": lambda row: ses.seeds[row.se],
         "score when learned": lambda row: f"{ses.scores[row.se]:.1f}",
         "return": "{return_mean:.1f} ± {return_std:.1f}",
-        "IQM": iqm_text("return"),
+        "IQM": tables.iqm_text("return"),
         "agents that solve the task": "{solved:.0%}",
         "training steps": "{train_steps:,.0f}",
     }
@@ -101,10 +99,10 @@ def report(settings: SeModels, rows: pd.DataFrame) -> pd.DataFrame:
     note = (
         f"Return: mean ± std over {rows['agent'].nunique()} agents with drawn hyperparameters and "
         f"{len(return_columns(rows))} test episodes each. The paper has 1000 agents on each of 40 "
-        f"SEs and shows violins only, no numbers.{correlations_text(summary)}{iqm_note()}"
+        f"SEs and shows violins only, no numbers.{correlations_text(summary)}{tables.iqm_note()}"
     )
     title = f"Single SEs of {task.name} (solved at {task.solved_reward:g})"
-    return publish(settings, title, as_texts(summary, columns), summary, note)
+    return tables.publish(settings, title, tables.as_texts(summary, columns), summary, note)
 
 
 def correlations_text(summary: pd.DataFrame) -> str:
@@ -142,15 +140,16 @@ def draw(task: Any, agents: pd.DataFrame, path: Path) -> None:
                 body.set(facecolor=figures.REAL, edgecolor=figures.REAL, alpha=0.45)
             places, means = range(1, len(order) + 1), [pooled[se].mean() for se in order]
             axis.plot(places, means, "D", ms=4, color=figures.BEST, ls="none")
-            axis.axhline(task.solved_reward, color=figures.SOLVED, ls="--", lw=1.2)
+            figures.threshold(axis, task.solved_reward)
             axis.set_xticks(places, order, fontsize=8)
             axis.set_title(figures.AGENT_NAMES.get(kind, kind), fontsize=10)
             axis.set(xlim=(0.4, len(order) + 0.6), ylabel=f"test return\non {task.name}")
         axes[-1, 0].set_xlabel("SE, by its place in the set; diamonds: means")
-        line = plt.Line2D([], [], color=figures.SOLVED, ls="--")
-        figure.legend(
-            [line], [f"solved ({task.solved_reward:g})"], loc="outside upper right", fontsize=9
+        line, label = (
+            plt.Line2D([], [], color=figures.SOLVED, ls="--"),
+            f"solved ({task.solved_reward:g})",
         )
+        figure.legend([line], [label], loc="outside upper right", fontsize=9)
 
 
 EXPERIMENT = Experiment(settings=SeModels, compute=compute, report=report, about=__doc__)

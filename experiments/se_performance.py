@@ -16,7 +16,9 @@ that go on at the time limit: what an SE saves is to be measured against these t
 """
 
 import dataclasses
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import matplotlib.pyplot as plt
@@ -24,21 +26,10 @@ import numpy as np
 import pandas as pd
 
 import sejax
-from experiments import figures, se_agents
-from experiments.experiment import Experiment
-from experiments.se_agents import SeAgents
-from experiments.settings import count, setting
-from experiments.tables import (
-    as_texts,
-    brackets,
-    in_strata,
-    iqm_columns,
-    iqm_note,
-    iqm_text,
-    publish,
-    spread,
-)
-from experiments.worlds import World, return_columns, tuned_agent
+from experiments.common import agents as groups
+from experiments.common import figures, tables
+from experiments.common.agents import Condition, SeAgents, return_columns, tuned_agent
+from experiments.common.experiment import Experiment, count, setting
 from sejax import envs
 from sejax.errors import require
 from sejax.options import one_of
@@ -86,25 +77,16 @@ class SePerformance(SeAgents):
     name = "se_performance"
 
     varied: str | None = setting(None, about="file of SEs learned with drawn hyperparameters")
-    fixed: str | None = setting(
-        None,
-        about="file of SEs learned with one agent's; with quick=true "
-        "and no file, the shipped cartpole SE",
-    )
+    fixed: str | None = setting(None, about="file of SEs learned with one agent's; quick: cartpole")
     env: str | None = setting(None, about="task, where no file is given; cartpole")
     tuned: bool = setting(
-        True, quick=False, about="whether agents that were tuned for it train on the real task too"
+        True, quick=False, about="whether agents tuned for it train on the real task too"
     )
     real_groups: int | None = count(
-        None,
-        "groups",
-        about="groups of agents on the real task, which takes longest; as many as SEs",
+        None, "groups", about="groups of agents on the real task, which is slow; as many as SEs"
     )
     real_episodes: int | None = count(
-        None,
-        "episodes",
-        quick=100,
-        about="at most, on the real task; 1000 (500 for discrete TD3 in Acrobot)",
+        None, "episodes", quick=100, about="on the real task; 1000 (discrete TD3 in Acrobot 500)"
     )
     solved_by: str = setting(
         "train",
@@ -119,17 +101,17 @@ def compute(settings: SePerformance) -> pd.DataFrame:
     for name, ses in sets.items():
         print(f"{name}: {len(ses)} SEs, {len(solved_ones(ses))} of which reached the threshold")
     task = envs.make(task_name(settings, sets))
-    tables = []
+    parts = []
     for kind in settings.agents:
-        worlds = {"real": real_world(settings, task, sets, kind)}
+        conditions = {"real": on_real(settings, task, sets, kind)}
         if settings.tuned:
-            worlds["tuned"] = tuned_world(settings, worlds["real"], kind)
-        worlds |= {name: se_agents.se_world(settings, ses, kind) for name, ses in sets.items()}
-        tables += [
-            se_agents.train(settings, world).assign(kind=kind, setting=name)
-            for name, world in worlds.items()
+            conditions["tuned"] = on_real_tuned(settings, conditions["real"], kind)
+        conditions |= {name: groups.on_ses(settings, ses, kind) for name, ses in sets.items()}
+        parts += [
+            groups.train_kind(settings, condition).assign(kind=kind, setting=name)
+            for name, condition in conditions.items()
         ]
-    return pd.concat(tables, ignore_index=True)
+    return pd.concat(parts, ignore_index=True)
 
 
 def solved_ones(ses: Any) -> Any:
@@ -139,22 +121,16 @@ def solved_ones(ses: Any) -> Any:
 
 def load_sets(settings: SePerformance) -> dict[str, Any]:
     """The sets of SEs that are compared, by how they were learned; those with a file."""
-    given = {"varied": settings.varied, "fixed": settings.fixed}
-    files = {name: file for name, file in given.items() if file is not None}
+    files = {name: x for name, x in settings.values("varied", "fixed").items() if x is not None}
     if settings.quick and not files:
         files["fixed"] = settings.env or "cartpole"
     sets = {}
     for name, file in files.items():
         ses = sejax.load_set(file, option=name, kind="se")
         learned_with = "varied" if ses.config["agent_hparams"] == "varied" else "fixed"
-        require(
-            learned_with == name,
-            name,
-            f"be SEs learned with {name} hyperparameters",
-            "it is what is compared",
-            f"{ses.path} with {learned_with} ones",
-            f"{learned_with}={ses.path}",
-        )
+        rule, got = f"be SEs learned with {name} hyperparameters", f"{ses.path} with {learned_with}"
+        fix = f"{learned_with}={ses.path}"
+        require(learned_with == name, name, rule, "it is what is compared", got, fix)
         solved = solved_ones(ses)
         sets[name] = (solved if len(solved) else ses)[: settings.num_ses]
     return sets
@@ -164,50 +140,36 @@ def task_name(settings: SePerformance, sets: dict[str, Any]) -> str:
     """The one task of all sets."""
     asked = {settings.env} if settings.env else set()
     names = sorted({str(ses.task.name) for ses in sets.values()} | asked)
-    require(
-        len(names) <= 1,
-        "varied, fixed and env",
-        "be of one task",
-        "agents are tested on it",
-        ", ".join(names),
-        "files of the same task",
-    )
+    rule, fix = f"be {names[0] if names else ''} as the other files", "files of the same task"
+    require(len(names) <= 1, "env", rule, "agents are tested on it", ", ".join(names), fix)
     return names[0] if names else "cartpole"
 
 
-def real_world(settings: SePerformance, task: Any, sets: dict[str, Any], kind: str) -> World:
+def on_real(settings: SePerformance, task: Any, sets: dict[str, Any], kind: str) -> Condition:
     """The real task for a number of groups of agents; training ends by the solved rule."""
     as_ses = max((len(ses) for ses in sets.values()), default=settings.num_ses)
-    count = settings.real_groups or as_ses
     # docs/reference.md 7.1: discrete TD3 trains 500 episodes on Acrobot, all others 1000.
-    usual = 500 if task.name == "acrobot" and kind == "td3_discrete" else 1000
+    most = 500 if task.name == "acrobot" and kind == "td3_discrete" else 1000
     training = TrainingConfig(
-        max_episodes=settings.real_episodes or usual,
+        max_episodes=settings.real_episodes or most,
         stop_rule="solved",
         time_limit_is_terminal=True,
         max_steps=settings.max_steps,
         solved_by=settings.solved_by,
         test_episodes=settings.test_episodes,
     )
-    return World.real(
-        task,
-        [f"real-{index:02d}" for index in range(count)],
-        name=kind,
-        agent=se_agents.agent_config(settings, kind),
-        training=training,
-        hparams="varied",
-    )
+    names = [f"real-{index:02d}" for index in range(settings.real_groups or as_ses)]
+    agent = groups.agent_config(settings, kind)
+    return Condition.real(task, names, name=kind, agent=agent, training=training, hparams="varied")
 
 
-def tuned_world(settings: SePerformance, real: World, kind: str) -> World:
+def on_real_tuned(settings: SePerformance, real: Condition, kind: str) -> Condition:
     """The real task for agents of the settings that were found there, not drawn."""
     return dataclasses.replace(
         real,
         name=f"{kind}-tuned",
         hparams="default",
-        agent=se_agents.agent_config(settings, kind)
-        if settings.quick
-        else tuned_agent(real.task.name, kind),
+        agent=real.agent if settings.quick else tuned_agent(real.task.name, kind),
         training=dataclasses.replace(real.training, time_limit_is_terminal=False),
     )
 
@@ -243,17 +205,14 @@ def summarise(agents: pd.DataFrame) -> pd.DataFrame:
     """
     rows = []
     for (kind, name), mine in agents.groupby(["kind", "setting"], sort=False):
-        row = {
-            "kind": kind,
-            "setting": name,
-            "num_ses": mine["group"].nunique(),
-            "num_agents": len(mine),
-            "num_nonfinite": int(mine["nonfinite"].sum()),
-        }
+        row = {"kind": kind, "setting": name, "num_ses": mine["group"].nunique()}
+        row |= {"num_agents": len(mine), "num_nonfinite": int(mine["nonfinite"].sum())}
         for column in ("train_steps", "train_episodes", "test_return"):
             of_ses = mine.groupby("group")[column].mean()
-            row |= spread(mine[column], mine[column] if name in ON_REAL else of_ses, column)
-        row |= iqm_columns(mine["test_return"], "test_return", strata(mine, str(name)))
+            row |= tables.mean_columns(
+                mine[column], column, mine[column] if name in ON_REAL else of_ses
+            )
+        row |= tables.iqm_columns(mine["test_return"], "test_return", strata(mine, str(name)))
         rows.append(row)
     return pd.DataFrame(rows)
 
@@ -265,40 +224,32 @@ def strata(agents: pd.DataFrame, name: str) -> pd.Series | None:
 
 def make_table(env_name: str, summary: pd.DataFrame) -> pd.DataFrame:
     """The summary as texts, with the paper's numbers."""
-    steps = {
-        name: summary[summary["setting"] == name].set_index("kind")["train_steps_mean"]
-        for name in ON_REAL
-    }
-
-    def measured(row: Any, column: str, digits: int) -> str:
-        mean, std, low, high = (
-            getattr(row, f"{column}_{x}") for x in ("mean", "std", "low", "high")
-        )
-        return f"{mean:,.{digits}f} ± {std:,.{digits}f}{brackets(low, high, digits)}"
+    steps = summary.set_index(["setting", "kind"])["train_steps_mean"]
 
     def fewer(row: Any, than: str) -> str:
-        if row.setting in ON_REAL[: ON_REAL.index(than) + 1] or row.kind not in steps[than]:
+        if row.setting in ON_REAL[: ON_REAL.index(than) + 1] or (than, row.kind) not in steps:
             return ""
-        return f"{1 - row.train_steps_mean / steps[than][row.kind]:.0%}"
+        return f"{1 - row.train_steps_mean / steps[than, row.kind]:.0%}"
 
-    return as_texts(
-        summary,
-        {
-            "agent": "{kind}",
-            "trained on": lambda row: SHOWN[row.setting][1],
-            "SEs, agents": "{num_ses}, {num_agents}",
-            "training steps": lambda row: measured(row, "train_steps", 0),
-            "paper's": lambda row: PAPER_STEPS.get((env_name, row.kind), {}).get(row.setting, ""),
-            "fewer": lambda row: fewer(row, "real"),
-            **({"than tuned": lambda row: fewer(row, "tuned")} if has_tuned(summary) else {}),
-            "episodes": lambda row: measured(row, "train_episodes", 1),
-            "return": lambda row: measured(row, "test_return", 1),
-            "IQM": iqm_text("test_return"),
-            "paper's return": lambda row: PAPER_RETURNS.get((env_name, row.kind), {}).get(
-                row.setting, ""
-            ),
-        },
-    )
+    def paper(numbers: Mapping[Any, Mapping[str, str]]) -> Callable[[Any], str]:
+        return lambda row: numbers.get((env_name, row.kind), {}).get(row.setting, "")
+
+    columns: dict[str, Any] = {
+        "agent": "{kind}",
+        "trained on": lambda row: SHOWN[row.setting][1],
+        "SEs, agents": "{num_ses}, {num_agents}",
+        "training steps": tables.mean_text("train_steps", 0, std=True),
+        "paper's": paper(PAPER_STEPS),
+        "fewer": lambda row: fewer(row, "real"),
+        "than tuned": lambda row: fewer(row, "tuned"),
+        "episodes": tables.mean_text("train_episodes", 1, std=True),
+        "return": tables.mean_text("test_return", 1, std=True),
+        "IQM": tables.iqm_text("test_return"),
+        "paper's return": paper(PAPER_RETURNS),
+    }
+    if not has_tuned(summary):
+        del columns["than tuned"]
+    return tables.as_texts(summary, columns)
 
 
 AND_TUNED = ", and against agents there with fixed settings that were tuned for it"
@@ -326,13 +277,13 @@ def report(settings: SePerformance, rows: pd.DataFrame) -> pd.DataFrame:
         "empty it gives no number here, but for DDQN in CartPole a mean return on SEs of 190.7, in "
         "another section. "
         f"Agents that met a number that is not finite: {int(rows['nonfinite'].sum())}."
-        f"{iqm_note('within each SE')}"
+        f"{tables.iqm_note('within each SE')}"
     )
     title = f"Agents trained on SEs and tested on {task.name} (solved at {task.solved_reward:g})"
-    return publish(settings, title, make_table(task.name, summary), summary, note)
+    return tables.publish(settings, title, make_table(task.name, summary), summary, note)
 
 
-def draw(task: Any, agents: pd.DataFrame, path: Any) -> None:
+def draw(task: Any, agents: pd.DataFrame, path: Path) -> None:
     """Draws densities of the test returns above and bars of steps and episodes below.
 
     Source: paper, figures "Densities based on each 4000 cumulative test rewards".
@@ -347,10 +298,8 @@ def draw(task: Any, agents: pd.DataFrame, path: Any) -> None:
         for (kind, mine), (top, *lower) in zip(kinds.items(), axes.T, strict=True):
             met = colored(mine, returns)
             figures.densities(top, met, low, high)
-            top.set(
-                title=figures.AGENT_NAMES.get(kind, kind),
-                xlabel=f"return of a test episode on {task.name}",
-            )
+            title, label = figures.AGENT_NAMES.get(kind, kind), "return of a test episode on"
+            top.set(title=title, xlabel=f"{label} {task.name}")
             below = [f"{values.mean():.1f}" for _, values in met]
             for axis, name in zip(lower, ("train_steps", "train_episodes"), strict=True):
                 figures.bars(axis, colored(mine, name), below)
@@ -359,16 +308,12 @@ def draw(task: Any, agents: pd.DataFrame, path: Any) -> None:
             axis.set_ylabel(label)
         longest = max((mine["setting"].unique() for mine in kinds.values()), key=len)
         handles = [plt.Line2D([], [], color=SHOWN[name][0], lw=3) for name in longest]
-        # Side by side the labels are as wide as two columns.
-        figure.legend(
-            handles,
-            [f"train: {SHOWN[name][1]}" for name in longest],
-            ncols=len(longest) if len(kinds) > 1 else 1,
-            loc="outside upper center",
-        )
+        texts = [f"train: {SHOWN[name][1]}" for name in longest]
+        columns = len(longest) if len(kinds) > 1 else 1  # labels are as wide as two panels
+        figure.legend(handles, texts, ncols=columns, loc="outside upper center")
 
 
-def draw_profiles(task: Any, agents: pd.DataFrame, path: Any) -> None:
+def draw_profiles(task: Any, agents: pd.DataFrame, path: Path) -> None:
     """Draws performance profiles of the agents' mean test returns, a panel for each kind."""
     kinds = list(agents.groupby("kind", sort=False))
     low, high = agents["test_return"].min(), agents["test_return"].max()
@@ -377,13 +322,11 @@ def draw_profiles(task: Any, agents: pd.DataFrame, path: Any) -> None:
         for axis, (kind, of_kind) in zip(axes[0], kinds, strict=True):
             for name, mine in of_kind.groupby("setting", sort=False):
                 color, label = SHOWN[str(name)]
-                runs = in_strata(mine["test_return"], strata(mine, str(name)))
+                runs = tables.in_strata(mine["test_return"], strata(mine, str(name)))
                 figures.profile(axis, runs, low, high, color, f"train: {label}")
             axis.axvline(task.solved_reward, color=figures.SOLVED, ls="--", lw=1.1)
-            axis.set(
-                title=figures.AGENT_NAMES.get(str(kind), kind),
-                xlabel=f"return of an agent on {task.name}",
-            )
+            title, label = figures.AGENT_NAMES.get(str(kind), kind), "return of an agent on"
+            axis.set(title=title, xlabel=f"{label} {task.name}")
         axes[0, 0].set_ylabel("share of agents with more")
         figures.legend_above(figure, max(axes[0], key=lambda axis: len(axis.lines)), 2)
 

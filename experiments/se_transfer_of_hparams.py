@@ -17,26 +17,16 @@ import numpy as np
 import pandas as pd
 
 import sejax
-from experiments import figures
-from experiments.experiment import Experiment
-from experiments.settings import Settings, count, each_of, setting
-from experiments.tables import as_texts, publish
-from experiments.worlds import (
-    Group,
-    Measure,
-    World,
-    groups_at_once,
-    outcome_rows,
-    train_groups,
-    training_as_learned,
-)
+from experiments.common import agents, figures
+from experiments.common.agents import Condition, Group, Measure
+from experiments.common.experiment import Experiment, Settings, count, each_of, setting
+from experiments.common.statistics import NUM_RESAMPLES
+from experiments.common.tables import as_texts, publish
 from sejax.errors import require
-from sejax.options import counts
 from sejax.training import TrainingConfig
 
 BUDGETS = {"same": "as many steps", "long": "until the stop rule"}
 QUICK_AGENT = {"hidden_size": 8, "batch_size": 16, "num_layers": 1, "warmup_episodes": 1}
-NUM_RESAMPLES = 2000
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,21 +35,13 @@ class SeTransferOfHparams(Settings):
 
     env: str = setting("cartpole", about="task: cartpole, acrobot, ...")
     ses: str | None = setting(
-        None,
-        about="SE, or set of SEs of which the one with the best score "
-        "is taken; the shipped one of the task",
+        None, about="SE, or set of SEs of which the best is taken; the shipped one of the task"
     )
-    agent: str = setting(
-        "ddqn", about="that is tuned; configurations are drawn around the preset's"
-    )
+    agent: str = setting("ddqn", about="that is tuned, with draws around the preset's settings")
     preset: str = setting("best", about="of the agent")
     run: tuple[str, ...] = setting((), about="overrides of the agent, as run.agent.discount=0.9")
     num_configs: int = count(64, "configurations", quick=16, about="that are drawn")
-    num_agents: int = setting(
-        4,
-        counts("half of them judge what the others choose", least=2),
-        about="seeds of each, on the SE and on the real task",
-    )
+    num_agents: int = count(4, "agents", least=2, about="seeds of each; half of them are judges")
     test_episodes: int = count(10, "episodes", about="of each agent")
     budgets: tuple[str, ...] = setting(
         tuple(BUDGETS), each_of(BUDGETS), quick=("same",), about="on the real task: same, long"
@@ -83,84 +65,65 @@ class Parts:
 def parts_of(settings: SeTransferOfHparams) -> Parts:
     """Reads the SE and configures agents and trainings."""
     ses = sejax.load_set(settings.ses or settings.env, option="ses", kind="se").ranked(1)
-    require(
-        ses.task.name == settings.env,
-        "ses",
-        f"be of {settings.env}",
-        "agents are tested on it",
-        f"one of {ses.task.name}",
-        f"env={ses.task.name}",
-    )
+    rule, reason, there = f"be of {settings.env}", "agents are tested on it", ses.task.name
+    require(there == settings.env, "ses", rule, reason, f"one of {there}", f"env={there}")
     words = [f"env={settings.env}", f"preset={settings.preset}", f"agent={settings.agent}"]
     if settings.quick:
         words += [f"agent.{name}={value}" for name, value in QUICK_AGENT.items()]
     config = sejax.config([*words, *settings.run])
-    learned = training_as_learned(ses, config.agent)
+    learned = agents.training_as_learned(ses, config.agent)
     on_se = dataclasses.replace(
         learned,
         max_steps=settings.max_steps or learned.max_steps,
         max_episodes=max(learned.max_episodes, settings.max_steps or 0),
         test_episodes=settings.test_episodes,
     )
-    require(
-        on_se.max_steps is not None,
-        "max_steps",
-        "be given with this SE",
-        "agents on the real task train as long, and its own trained until a rule stopped them",
-        "null",
-        "max_steps=5000",
-    )
+    rule, reason = "be given with this SE", "its agents trained until a rule stopped them"
+    require(on_se.max_steps is not None, "max_steps", rule, reason, "null", "max_steps=5000")
     real = TrainingConfig(
         stop_rule="never",
         max_steps=on_se.max_steps,
         max_episodes=100_000,
         test_episodes=settings.test_episodes,
     )
-    trainings = {
-        "same": real,
-        "long": dataclasses.replace(
-            real,
-            stop_rule="solved",
-            solved_by="train",
-            max_episodes=settings.real_episodes,
-            max_steps=settings.real_steps,
-        ),
-    }
-    return Parts(
-        ses=ses,
-        agent=config.agent,
-        trainings={"se": on_se} | {x: trainings[x] for x in settings.budgets},
+    long = dataclasses.replace(
+        real,
+        stop_rule="solved",
+        solved_by="train",
+        max_episodes=settings.real_episodes,
+        max_steps=settings.real_steps,
     )
+    budgets = {name: {"same": real, "long": long}[name] for name in settings.budgets}
+    return Parts(ses=ses, agent=config.agent, trainings={"se": on_se} | budgets)
 
 
 def compute(settings: SeTransferOfHparams) -> pd.DataFrame:
     """Trains what is missing; a row for each agent, with what its configuration has drawn."""
     parts = parts_of(settings)
-    task = parts.ses.task
-    key = jax.random.key(settings.seed)
-    keys = [
-        np.asarray(jax.random.key_data(jax.random.fold_in(key, i)))
-        for i in range(settings.num_configs)
-    ]
+    ses, task = parts.ses, parts.ses.task
+    key, at_once = jax.random.key(settings.seed), agents.groups_at_once(settings.devices)
+    keys = [jax.random.key_data(jax.random.fold_in(key, i)) for i in range(settings.num_configs)]
+    places = {
+        "se": (ses.env, ses[0].params, ses[0].fingerprint, {"proxy": ses.config["proxy"]}),
+        "real": (task.env, task.params, "", {}),
+    }
     tables = []
     for name, training in parts.trainings.items():
-        on_se = name == "se"
-        params = parts.ses[0].params if on_se else task.params
-        weights = parts.ses[0].fingerprint if on_se else ""
-        groups = tuple(Group(f"{i:02d}", (params, key), weights) for i, key in enumerate(keys))
-        world = World(
+        env, params, weights, plain = places["se" if name == "se" else "real"]
+        groups = [
+            Group(f"{i:02d}", (params, np.asarray(key)), weights) for i, key in enumerate(keys)
+        ]
+        condition = Condition(
             name=name,
-            env=parts.ses.env if on_se else task.env,
+            env=env,
             task=task,
-            groups=groups,
+            groups=tuple(groups),
             agent=parts.agent,
             training=training,
             hparams="varied",
-            settings={"proxy": parts.ses.config["proxy"]} if on_se else {},
+            settings=plain,
         )
-        rows = train_groups(
-            world, settings, settings.num_agents, SHARED_DRAWS, groups_at_once(settings.devices)
-        )
+        rows = agents.train_groups(condition, settings, settings.num_agents, SHARED_DRAWS, at_once)
         tables.append(rows.assign(world=name))
     return pd.concat(tables, ignore_index=True).rename(columns={"group": "config"})
 
@@ -193,8 +156,8 @@ def make_shared_draws(
 
 SHARED_DRAWS = Measure(
     make_run=make_shared_draws,
-    to_table=lambda results, _: outcome_rows(*results),
-    say=lambda rows: f"mean return {rows['test_return'].mean():.1f}",
+    to_table=lambda results, _: agents.outcome_rows(*results),
+    log=lambda rows: f"mean return {rows['test_return'].mean():.1f}",
     is_timed=True,
 )
 
@@ -285,16 +248,15 @@ def summarise(rows: pd.DataFrame) -> pd.DataFrame:
 def make_table(summary: pd.DataFrame) -> pd.DataFrame:
     """The summary as texts."""
 
-    def interval(name: str, digits: int) -> Callable[[Any], str]:
-        return lambda row: "{:.{d}f} [{:.{d}f}, {:.{d}f}]".format(
-            *(getattr(row, f"{name}{end}") for end in ("", "_low", "_high")), d=digits
-        )
+    def interval(name: str, digits: int) -> str:
+        return f"{{{name}:.{digits}f}} [{{{name}_low:.{digits}f}}, {{{name}_high:.{digits}f}}]"
 
+    names = {"se": "the SE"} | {name: f"the real task, {text}" for name, text in BUDGETS.items()}
     return as_texts(
         summary,
         {
             "trained on the real task": lambda row: BUDGETS[row.target],
-            "tuned on": lambda row: _chooser(row.chosen_by),
+            "tuned on": lambda row: names[row.chosen_by],
             "Spearman's rho": interval("rho", 2),
             "return of the choice": interval("chosen", 1),
             "regret": interval("regret", 1),
@@ -303,10 +265,6 @@ def make_table(summary: pd.DataFrame) -> pd.DataFrame:
             "CPU s": "{cpu_s:,.1f}",
         },
     )
-
-
-def _chooser(name: str) -> str:
-    return "the SE" if name == "se" else f"the real task, {BUDGETS[name]}"
 
 
 def findings(summary: pd.DataFrame) -> str:
@@ -352,27 +310,17 @@ def draw(task: Any, rows: pd.DataFrame, path: Any) -> None:
     with figures.panels(path, 1, len(targets), (0.6 + 3.6 * len(targets), 3.8)) as (_, axes):
         for axis, target in zip(axes[0], targets, strict=True):
             axis.plot(means["se"], means[target], "o", ms=5, color=figures.REAL, alpha=0.6)
-            choices = (
-                (means["se"], figures.VARIED, "best on the SE"),
-                (means[target], figures.BEST, "best on the real task"),
-            )
-            for chosen_by, color, label in choices:
+            choices = {
+                "best on the SE": (means["se"], figures.VARIED),
+                "best on the real task": (means[target], figures.BEST),
+            }
+            for label, (chosen_by, color) in choices.items():
                 choice = means.loc[chosen_by.idxmax()]
-                axis.plot(
-                    choice["se"],
-                    choice[target],
-                    "o",
-                    ms=10,
-                    mfc="none",
-                    mew=1.8,
-                    color=color,
-                    label=label,
-                )
-            axis.axhline(task.solved_reward, color=figures.SOLVED, ls="--", lw=1.2)
-            axis.set(
-                xlabel="mean return, trained on the SE",
-                ylabel=f"the same, on the real task\n{BUDGETS[target]}",
-            )
+                ring: Any = {"ms": 10, "mfc": "none", "mew": 1.8, "color": color, "label": label}
+                axis.plot(choice["se"], choice[target], "o", **ring)
+            figures.threshold(axis, task.solved_reward)
+            label = f"the same, on the real task\n{BUDGETS[target]}"
+            axis.set(xlabel="mean return, trained on the SE", ylabel=label)
         axes[0, 0].legend(fontsize=8, loc="best")
 
 

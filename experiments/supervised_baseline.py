@@ -28,14 +28,12 @@ import numpy as np
 import pandas as pd
 
 import sejax
-from experiments import figures, se_agents, supervised_models, worlds
-from experiments.experiment import Experiment
-from experiments.pieces import stack, unstack
-from experiments.se_agents import AGENTS, SOFT_SE
-from experiments.statistics import bootstrap_interval
-from experiments.supervised_models import SupervisedBaseline
-from experiments.tables import as_texts, iqm_columns, iqm_note, iqm_text, publish
-from experiments.worlds import HPARAMS, World, return_columns
+from experiments.common import agents as groups
+from experiments.common import figures, supervised_models, tables
+from experiments.common.agents import HPARAMS, SE_AGENTS, SOFT_SE, Condition, return_columns
+from experiments.common.experiment import Experiment
+from experiments.common.shards import stack, unstack
+from experiments.common.supervised_models import SupervisedBaseline
 from sejax.errors import require
 
 BEST = 2  # models in the paper's second figure
@@ -58,73 +56,65 @@ def compute(settings: SupervisedBaseline) -> pd.DataFrame:
     """Computes what is missing: tables of the agents, of the fits and of the transitions."""
     ses = load(settings)
     data = supervised_models.collect_all(settings, ses)
-    fits = supervised_models.fit_piece(settings, ses, data)
-    tables = []
+    fits = supervised_models.fit_shard(settings, ses, data)
+    parts = []
     for kind, hparams in itertools.product(settings.agents, settings.hparams):
-        for name, world in make_worlds(settings, ses, kind, hparams).items():
-            rows = worlds.train_groups(world, settings, settings.num_agents)
-            tables.append(rows.assign(world=name, kind=kind, hparams=hparams))
-    return stack(
-        {
-            "agents": pd.concat(tables),
-            "fits": fits,
-            "transitions": supervised_models.summary_of(data),
-        }
-    )
+        for name, condition in make_conditions(settings, ses, kind, hparams).items():
+            rows = groups.train_groups(condition, settings, settings.num_agents)
+            parts.append(rows.assign(world=name, kind=kind, hparams=hparams))
+    transitions = supervised_models.summary_of(data)
+    return stack({"agents": pd.concat(parts), "fits": fits, "transitions": transitions})
 
 
 def load(settings: SupervisedBaseline) -> Any:
     """The SE, if agents can be trained on it, and the tests of its NES run recorded."""
     ses = sejax.load_set(settings.proxy, option="proxy", kind="se")[:1]
-    require(
+
+    def require_se(holds: bool, rule: str, reason: str, got: str) -> None:
+        require(holds, "proxy", f"be an SE {rule}", reason, got, f"proxy={SOFT_SE}")
+
+    learned_with = ses.config["agent"] or {"name": "several agents"}
+    require_se(
         ses.task.num_states is None and ses.task.num_actions is not None,
-        "proxy",
-        "be an SE with vector states and discrete actions",
+        "with vector states and discrete actions",
         "the agents are made for these",
         f"one of {ses.task.name}",
-        f"proxy={SOFT_SE}",
     )
-    require(
+    require_se(
         ses.env.config.horizon != 1,
-        "proxy",
-        "be an SE whose episodes have several steps",
+        "whose episodes have several steps",
         "a supervised model predicts next states",
         "a bandit",
-        f"proxy={SOFT_SE}",
     )
-    learned_with = ses.config["agent"] or {"name": "several agents"}
-    require(
-        learned_with["name"] in AGENTS and learned_with.get("action_repeat", 1) == 1,
-        "proxy",
-        f"be an SE learned with {', '.join(AGENTS)}, without action repeat",
+    require_se(
+        learned_with["name"] in SE_AGENTS and learned_with.get("action_repeat", 1) == 1,
+        f"learned with {', '.join(SE_AGENTS)}, without action repeat",
         "the recorded NES runs have its agent, and their every step is a row",
         f"one learned with {learned_with['name']}",
-        f"proxy={SOFT_SE}",
     )
     return ses
 
 
-def make_worlds(settings: Any, ses: Any, kind: str, hparams: str) -> dict[str, World]:
+def make_conditions(settings: Any, ses: Any, kind: str, hparams: str) -> dict[str, Condition]:
     """The models of both variants and the SE, with as many agents on the SE as on all models."""
     sets = {
         name: sejax.load_set(supervised_models.model_file(settings, name), option="out")
         for name in ("authors", "fair")
     }
-    agent = se_agents.agent_config(settings, kind)
+    agent = groups.agent_config(settings, kind)
     made = {}
     for name, proxies in (sets | {"se": ses}).items():
-        training = worlds.training_as_learned(proxies, agent)
+        training = groups.training_as_learned(proxies, agent)
         own = settings.max_steps if name != "se" else None
-        max_steps = own or (se_agents.QUICK_STEPS if settings.quick else training.max_steps)
-        training = dataclasses.replace(
-            training, max_steps=max_steps, test_episodes=settings.test_episodes
-        )
-        made[name] = World.of_set(
+        max_steps = own or (groups.QUICK_STEPS if settings.quick else training.max_steps)
+        made[name] = Condition.of_set(
             proxies,
             map(str, range(settings.models)),
             name=f"{kind}-{hparams}-{name}",
             agent=agent,
-            training=training,
+            training=dataclasses.replace(
+                training, max_steps=max_steps, test_episodes=settings.test_episodes
+            ),
             hparams=hparams,
         )
     return made
@@ -151,28 +141,18 @@ def summarise(agents: pd.DataFrame, solved_reward: float) -> pd.DataFrame:
     """
     rows = []
     for (kind, hparams, name), mine in agents.groupby(["kind", "hparams", "world"]):
-        draws = mine["test_return"] if name == "se" else mine.groupby("group")["test_return"].mean()
-        low, high = bootstrap_interval(draws)
+        returns, model = mine["test_return"], None if name == "se" else mine["group"]
+        draws = returns if model is None else returns.groupby(model).mean()
         rows.append(
-            {
-                "kind": kind,
-                "hparams": hparams,
-                "world": name,
-                "num_agents": len(mine),
-                "return_mean": mine["test_return"].mean(),
-                "return_std": mine[return_columns(mine)].to_numpy().std(),
-                "return_low": low,
-                "return_high": high,
-                **iqm_columns(
-                    mine["test_return"], "return", None if name == "se" else mine["group"]
-                ),
-                "solved": (mine["test_return"] >= solved_reward).mean(),
-                "train_steps": mine["train_steps"].mean(),
-                "train_episodes": mine["train_episodes"].mean(),
-                "num_nonfinite": int(mine["nonfinite"].sum()),
-            }
+            {"kind": kind, "hparams": hparams, "world": name, "num_agents": len(mine)}
+            | tables.mean_columns(returns, "return", draws, least=1)
+            | {"return_std": mine[return_columns(mine)].to_numpy().std()}
+            | tables.iqm_columns(returns, "return", model)
+            | {"solved": (returns >= solved_reward).mean()}
+            | dict(mine[["train_steps", "train_episodes"]].mean())
+            | {"num_nonfinite": int(mine["nonfinite"].sum())}
         )
-    order = [*AGENTS, *HPARAMS, *LABELS]
+    order = [*SE_AGENTS, *HPARAMS, *LABELS]
     return pd.DataFrame(rows).sort_values(
         ["kind", "hparams", "world"], key=lambda names: names.map(order.index), ignore_index=True
     )
@@ -180,15 +160,15 @@ def summarise(agents: pd.DataFrame, solved_reward: float) -> pd.DataFrame:
 
 def make_table(summary: pd.DataFrame) -> pd.DataFrame:
     """The summary as texts, with the paper's numbers."""
-    return as_texts(
+    return tables.as_texts(
         summary,
         {
             "agent": "{kind}",
             "hyperparameters": lambda row: DRAWN.get(row.hparams, row.hparams),
             "trained on": lambda row: LABELS[row.world],
             "agents": "{num_agents}",
-            "return": "{return_mean:.1f} ± {return_std:.1f} [{return_low:.1f}, {return_high:.1f}]",
-            "IQM": iqm_text("return"),
+            "return": tables.mean_text("return", 1, std=True),
+            "IQM": tables.iqm_text("return"),
             "paper's": lambda row: PAPER.get((row.world, row.kind, row.hparams), ""),
             "solved": "{solved:.0%}",
             "training steps": "{train_steps:,.0f}",
@@ -215,10 +195,10 @@ def report(settings: SupervisedBaseline, rows: pd.DataFrame) -> pd.DataFrame:
         f"{last['done_error']:.2g} of the end. As the authors: the network for the end "
         "keeps its random weights. Fair: it is fitted too, and used. The best models are those of "
         "the runs with the best episodes. Agents that met a number that is not finite: "
-        f"{diverged_text(agents)}.{iqm_note('within each model')}"
+        f"{diverged_text(agents)}.{tables.iqm_note('within each model')}"
     )
     title = f"Agents trained on supervised models of {task.name} and on an SE"
-    return publish(settings, title, make_table(summary), summary, note)
+    return tables.publish(settings, title, make_table(summary), summary, note)
 
 
 def diverged_text(agents: pd.DataFrame) -> str:
@@ -248,23 +228,13 @@ def draw(task: Any, agents: pd.DataFrame, path: Path) -> None:
         for axis, ((kind, hparams), mine) in zip(axes[0], panels, strict=True):
             for name, color in colors.items():
                 met = mine[mine["world"] == name][return_columns(agents)].to_numpy().ravel()
-                figures.histogram(
-                    axis,
-                    met,
-                    0.2,
-                    1.4,
-                    f"{LABELS[name]} (dashed: mean)",
-                    bins=edges,
-                    color=color,
-                    weights=np.full(met.size, 1 / met.size),
-                )
+                how = {"bins": edges, "color": color, "weights": np.full(met.size, 1 / met.size)}
+                figures.histogram(axis, met, 0.2, 1.4, f"{LABELS[name]} (dashed: mean)", **how)
                 axis.axvline(met.mean(), color=color, ls="--", lw=1.2)
             agent = figures.AGENT_NAMES.get(kind, kind)
-            axis.set(
-                title=f"{agent}, {DRAWN.get(hparams, hparams)} hyperparameters",
-                xlabel=f"return of a test episode on {task.name}",
-                ylim=(0.5 / num_episodes, 1.1),
-            )
+            axis.set_title(f"{agent}, {DRAWN.get(hparams, hparams)} hyperparameters")
+            axis.set_xlabel(f"return of a test episode on {task.name}")
+            axis.set_ylim(0.5 / num_episodes, 1.1)
         axes[0, 0].set_ylabel("share of test episodes")
         figures.legend_above(figure, axes[0, 0], 3, fontsize=None)
 

@@ -20,10 +20,9 @@ import numpy as np
 import pandas as pd
 
 import sejax
-from experiments import figures
-from experiments.experiment import Experiment
-from experiments.settings import Settings, count, each_of, setting
-from experiments.tables import as_texts, publish
+from experiments.common import figures
+from experiments.common.experiment import Experiment, Settings, count, each_of, setting
+from experiments.common.tables import as_texts, publish
 from sejax.cli.runtime import available_cores
 
 PAPER_CORES = 16
@@ -75,7 +74,7 @@ def compute(settings: Timings) -> pd.DataFrame:
             made_with = {"row": name, "preset": preset, "cores": cores}
             made_with |= settings.values("quick", "generations", "seed")
             run = functools.partial(time_generations, settings, row, preset)
-            timed = settings.pieces.compute(f"{name}-{preset}-{cores}", made_with, run)
+            timed = settings.shards.compute(f"{name}-{preset}-{cores}", made_with, run)
             tables.append(timed.assign(row=name, preset=preset, cores=cores))
             print(f"{name}, {preset}: {timed['seconds'].iloc[0]:,.1f} s", flush=True)
     return pd.concat(tables, ignore_index=True)
@@ -86,10 +85,8 @@ def config_of(settings: Timings, row: Row, preset: str) -> Any:
     overrides = [f"env={row.env}", f"proxy={row.proxy}", f"preset={preset}"]
     if row.proxy == "rn":  # the paper does not say which variant; this one needs two potentials
         overrides.append("proxy.variant=additive_potential")
-    if settings.quick:
-        overrides += [
-            word for word in QUICK if row.env != "cliff_walking" or "warmup_episodes" not in word
-        ]
+    if settings.quick:  # a table's agent has no warm-up
+        overrides += QUICK[:-1] if row.env == "cliff_walking" else QUICK
     config = sejax.config(overrides)
     return dataclasses.replace(config, devices=settings.devices, seed=settings.seed)
 
@@ -100,7 +97,7 @@ def time_generations(settings: Timings, row: Row, preset: str) -> pd.DataFrame:
 
     chunks = session.make_chunks(config_of(settings, row, preset))
     program = chunks.learner
-    state = jax.jit(program.init)(jax.random.key(settings.seed)[None])
+    state = chunks.init(jax.random.key(settings.seed))
     idle = jax.tree.map(lambda x: x.copy(), state.replace(finished=~state.finished))
     jax.block_until_ready(chunks.advance(idle, 1))  # compiled, and run with nothing to do
     wall, cpu, steps = [], [], []
@@ -109,17 +106,9 @@ def time_generations(settings: Timings, row: Row, preset: str) -> pd.DataFrame:
         state, info = jax.block_until_ready(chunks.advance(state, 1))
         wall.append(time.perf_counter() - started)
         cpu.append(time.process_time() - cpu_started)
-        steps.append(int(jax.device_get(info).train_steps_total.item()))
-    return pd.DataFrame(
-        [
-            {
-                "seconds": np.mean(wall),
-                "cpu_seconds": np.mean(cpu),
-                "agents": program.strategy.num_candidates,
-                "train_steps": np.mean(steps),
-            }
-        ]
-    )
+        steps.append(int(jax.device_get(info).train_steps.sum()))
+    means = {"seconds": np.mean(wall), "cpu_seconds": np.mean(cpu), "train_steps": np.mean(steps)}
+    return pd.DataFrame([means | {"agents": program.strategy.num_evaluations}])
 
 
 def report(settings: Timings, timed: pd.DataFrame) -> pd.DataFrame:
@@ -130,9 +119,7 @@ def report(settings: Timings, timed: pd.DataFrame) -> pd.DataFrame:
         "proxy": lambda row: ROWS[row.row].proxy.upper(),
         "settings": lambda row: SETTINGS[row.preset],
         f"paper, {PAPER_CORES} cores": lambda row: f"{ROWS[row.row].seconds:g} s",
-        f"sejax, {cores} cores": lambda row: (
-            f"{row.seconds:{',.0f' if row.seconds >= 10 else '.2g'}} s"
-        ),
+        f"sejax, {cores} cores": lambda row: f"{row.seconds:{_digits(row.seconds)}} s",
         "agents": "{agents}",
         "training steps": "{train_steps:,.0f}",
         "CPU µs for a training step": lambda row: f"{row.cpu_seconds / row.train_steps * 1e6:,.1f}",
@@ -143,35 +130,31 @@ def report(settings: Timings, timed: pd.DataFrame) -> pd.DataFrame:
         "agents and sizes. "
     )
     if settings.quick:
-        note += (
-            "quick=true: a few agents with short trainings, not to be compared with the paper's. "
-        )
+        note += "quick=true: few agents, short trainings, not to be compared with the paper's. "
     title = "Seconds for one outer iteration of NES"
     return publish(settings, title, as_texts(timed, columns), timed, note.strip())
 
 
+def _digits(seconds: float) -> str:
+    return ",.0f" if seconds >= 10 else ".2g"
+
+
 def draw(settings: Timings, timed: pd.DataFrame) -> None:
     """Draws the seconds of each row beside the paper's."""
-    rows = [ROWS[name] for name in timed["row"]]
+    rows, cores = [ROWS[name] for name in timed["row"]], int(timed["cores"].iloc[0])
     names = [
         f"{row.env}\n{row.proxy.upper()}, {SETTINGS[preset]} settings"
         for row, preset in zip(rows, timed["preset"], strict=True)
     ]
-    places, cores = np.arange(len(names)), int(timed["cores"].iloc[0])
-    path, size = settings.folder / "timings.png", (7, 0.9 + 0.55 * len(names))
-    with figures.panels(path, 1, 1, size) as (figure, axes):
+    bars = {f"sejax, {cores} cores": (0.19, timed["seconds"], figures.REAL)}
+    if not settings.quick:  # whose trainings are much shorter
+        papers = [row.seconds for row in rows]
+        bars = {f"paper, {PAPER_CORES} cores": (-0.19, papers, figures.VARIED)} | bars
+    places, path = np.arange(len(names)), settings.folder / "timings.png"
+    with figures.panels(path, 1, 1, (7, 0.9 + 0.55 * len(names))) as (figure, axes):
         axis = axes[0, 0]
-        if not settings.quick:  # whose trainings are much shorter
-            axis.barh(
-                places - 0.19,
-                [row.seconds for row in rows],
-                0.36,
-                color=figures.VARIED,
-                label=f"paper, {PAPER_CORES} cores",
-            )
-        axis.barh(
-            places + 0.19, timed["seconds"], 0.36, color=figures.REAL, label=f"sejax, {cores} cores"
-        )
+        for label, (shift, seconds, color) in bars.items():
+            axis.barh(places + shift, seconds, 0.36, color=color, label=label)
         axis.set(xscale="log", xlabel="seconds for an outer iteration")
         axis.set_yticks(places, names, fontsize=8)
         axis.invert_yaxis()

@@ -24,12 +24,13 @@ _EXPORTS = {
     "DQNConfig": "sejax.agents.dqn",
     "DiscreteTD3Config": "sejax.agents.td3",
     "DuelingDDQNConfig": "sejax.agents.dqn",
+    "Evaluations": "sejax.es.base",
     "EvosaxConfig": "sejax.es.evosax",
-    "Families": "sejax.agents.mixture",
-    "FamiliesConfig": "sejax.agents.mixture",
     "ICMConfig": "sejax.agents.exploration",
     "LearnResult": "sejax.bilevel",
     "MaxReward": "sejax.objectives",
+    "Mixture": "sejax.agents.mixture",
+    "MixtureConfig": "sejax.agents.mixture",
     "NESConfig": "sejax.es.nes",
     "Objective": "sejax.objectives",
     "Outcome": "sejax.objectives",
@@ -51,7 +52,6 @@ _EXPORTS = {
     "Task": "sejax.envs.base",
     "TrainResult": "sejax.training",
     "TrainingConfig": "sejax.training",
-    "Trials": "sejax.es.base",
     "config": "sejax.cli.compose",
     "configure_xla": "sejax.cli.runtime",
     "evaluate_agents": "sejax.evaluation",
@@ -78,7 +78,7 @@ if TYPE_CHECKING:  # what a type checker and an editor see
     from sejax.agents.base import Agent
     from sejax.agents.dqn import DDQNConfig, DQNConfig, DuelingDDQNConfig
     from sejax.agents.exploration import CountBasedConfig, ICMConfig
-    from sejax.agents.mixture import Families, FamiliesConfig
+    from sejax.agents.mixture import Mixture, MixtureConfig
     from sejax.agents.ppo import PPOConfig
     from sejax.agents.sac import SACConfig
     from sejax.agents.tabular import QLearningConfig, SARSAConfig
@@ -88,7 +88,7 @@ if TYPE_CHECKING:  # what a type checker and an editor see
     from sejax.cli.runtime import configure_xla
     from sejax.envs.base import Task
     from sejax.errors import ConfigError
-    from sejax.es.base import Strategy, Trials
+    from sejax.es.base import Evaluations, Strategy
     from sejax.es.evosax import EvosaxConfig
     from sejax.es.nes import NESConfig
     from sejax.evaluation import evaluate_agents, make_evaluator
@@ -120,12 +120,13 @@ __all__ = [
     "DQNConfig",
     "DiscreteTD3Config",
     "DuelingDDQNConfig",
+    "Evaluations",
     "EvosaxConfig",
-    "Families",
-    "FamiliesConfig",
     "ICMConfig",
     "LearnResult",
     "MaxReward",
+    "Mixture",
+    "MixtureConfig",
     "NESConfig",
     "Objective",
     "Outcome",
@@ -147,7 +148,6 @@ __all__ = [
     "Task",
     "TrainResult",
     "TrainingConfig",
-    "Trials",
     "agents",
     "config",
     "configure_xla",

@@ -19,7 +19,7 @@ from jaxtyping import Array, Float
 
 from sejax import registry
 from sejax.agents.base import Agent
-from sejax.agents.mixture import Families
+from sejax.agents.mixture import Mixture
 from sejax.envs.base import Task
 from sejax.errors import require, whole
 from sejax.es.base import Strategy
@@ -117,7 +117,7 @@ class Bilevel(NamedTuple):
     unravel: Callable[[Array], Any]
     num_dims: int
     proxy: ProxyEnv
-    mixture: Families
+    mixture: Mixture
     training: TrainingConfig
     strategy: Strategy
     objective: Objective
@@ -190,7 +190,7 @@ def make_learner(
 def make_bilevel(
     *,
     task: Task,
-    agent: Agent | Families,
+    agent: Agent | Mixture,
     proxy: Any = None,
     es: Any = None,
     objective: Any = None,
@@ -204,7 +204,7 @@ def make_bilevel(
     Args:
       task: the real task.
       agent: the agent that learns on the proxies, from `sejax.make_agent` or one of your own; or a
-        mixture of agents (`sejax.Families`), among which the candidates are divided.
+        mixture of agents (`sejax.Mixture`), among which the candidates are divided.
       proxy: a `ProxyEnv` of the task, or a configuration that makes one; default: an SE.
       es: a `Strategy` over the proxy's weights, or a configuration with `make(num_dims) ->
         Strategy`; default: the paper's NES.
@@ -225,17 +225,17 @@ def make_bilevel(
     num_dims = sum(x.size for x in jax.tree.leaves(shapes))
     unravel = flat.inverse_of_flatten(shapes)
     strategy = _made("es", NESConfig() if es is None else es, num_dims)
-    mixture = Families.of(agent)
+    mixture = Mixture.of(agent)
     training = training or TrainingConfig()
     if objective.needs_tests:
         training = tested_throughout(training)
     scoring = Scoring.of(objective, strategy, mixture)
     evaluations = scoring.evaluations
-    strategy = dataclasses.replace(strategy, trials=evaluations)
+    strategy = dataclasses.replace(strategy, evaluations=evaluations)
     evaluate_candidates = make_population_evaluator(
         mixture, proxy, training, unravel, scoring.agent_of_evaluation, devices, num_parallel
     )
-    seed_ids = jnp.asarray(evaluations.seed_ids(strategy.num_members))
+    seed_ids = jnp.asarray(evaluations.seed_ids(strategy.population_size))
     require(
         not stop_when_solved or (objective.scores_are_returns and task.is_solvable),
         "stop_when_solved",
@@ -272,7 +272,7 @@ def make_bilevel(
         return Candidates(
             population=population,
             incumbent=incumbent,
-            params=evaluations.candidates(population, incumbent),
+            params=evaluations.params(population, incumbent),
             keys=jax.vmap(jax.random.fold_in, (None, 0))(key_inner, seed_ids),
             active=~state.finished,
             eval_steps=objective.eval_steps(state.generation) if objective.eval_steps else None,

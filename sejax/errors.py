@@ -9,6 +9,7 @@ import numbers
 from collections.abc import Collection, Iterable
 from typing import Any
 
+SMALLEST_FLOAT, LARGEST_FLOAT = 1e-30, 1e30  # far within those of 32 bits
 LARGEST = 2**31 - 1  # steps, episodes and sizes are counted in 32 bits
 
 

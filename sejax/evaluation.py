@@ -15,7 +15,7 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
 from sejax.agents.base import Agent
-from sejax.agents.mixture import Families
+from sejax.agents.mixture import Mixture
 from sejax.envs.base import Task
 from sejax.envs.wrappers import repeat_actions
 from sejax.errors import require
@@ -378,7 +378,7 @@ def make_candidate_evaluator(
 
 
 def make_population_evaluator(
-    mixture: Families,
+    mixture: Mixture,
     proxy: ProxyEnv,
     training: TrainingConfig,
     unravel: Callable[[Array], Any],

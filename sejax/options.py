@@ -15,6 +15,7 @@ learn from or with otherwise; got 0. Set agent.batch_size=128.
 """
 
 import dataclasses
+import math
 from collections.abc import Callable, Collection
 from typing import Any, ClassVar
 
@@ -65,9 +66,21 @@ def check(config: Any, group: str) -> None:
         value = errors.as_python(given)
         if value is not given:
             object.__setattr__(config, field.name, value)
+        name = f"{group}.{field.name}" if group else field.name
         rule = marks(type(config), field.name).get("rule")
         if rule is not None and not (value is None and field.default is None):
-            rule(f"{group}.{field.name}" if group else field.name, value, field.default)
+            rule(name, value, field.default)
+        errors.require(
+            not isinstance(value, float)
+            or value == 0
+            or not math.isfinite(value)  # a matter of the rule
+            or errors.SMALLEST_FLOAT <= abs(value) <= errors.LARGEST_FLOAT,
+            name,
+            f"be 0 or lie between {errors.SMALLEST_FLOAT:g} and {errors.LARGEST_FLOAT:g} in size",
+            "numbers are 32-bit floats",
+            value,
+            f"{name}={field.default}",
+        )
 
 
 def traced_options(config: Any) -> dict[str, Any]:

@@ -61,33 +61,7 @@ class Group:
     base: str = "builtins:object"
 
 
-_EVOSAX = (
-    "ars",
-    "asebo",
-    "cma_anchored_les",
-    "cma_es",
-    "cr_fm_nes",
-    "des",
-    "esmc",
-    "evotf_es",
-    "gradientless_descent",
-    "hill_climbing",
-    "iamalgam_full",
-    "iamalgam_univariate",
-    "les",
-    "lm_ma_es",
-    "ma_es",
-    "noise_reuse_es",
-    "open_es",
-    "persistent_es",
-    "pgpe",
-    "rm_es",
-    "sep_cma_es",
-    "simple_es",
-    "simulated_annealing",
-    "snes",
-    "xnes",
-)
+_EVOSAX = ("cma_es", "cr_fm_nes", "open_es", "pgpe", "sep_cma_es", "snes", "xnes")
 GROUPS = {
     "env": Group(
         "sejax.envs",

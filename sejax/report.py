@@ -47,11 +47,11 @@ def report(folders: Sequence[Path], out: Path | None = None) -> Path:
       The file.
 
     Raises:
-      ConfigError: if there is no run, or one that cannot be read.
+      ConfigError: if there is no run, or one that cannot be read, or no place for the file.
       OSError: if the file cannot be written.
     """
     from sejax.cli import report as pages
-    from sejax.ops.files import write_text
+    from sejax.ops.files import require_writable, write_text
 
     require(
         folders,
@@ -71,6 +71,7 @@ def report(folders: Sequence[Path], out: Path | None = None) -> Path:
         f"the folder {out}",
         f"out={out / 'report.html'}",
     )
+    require_writable("out", out.parent)
     with registry.only_typed(()):  # nothing that a run directory names is imported
         write_text(out, pages.page(pages.read(folders)))
     return out

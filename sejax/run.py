@@ -5,8 +5,7 @@ Running the same command on an existing run directory goes on where it stopped.
 
 import contextlib
 import dataclasses
-import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -31,35 +30,46 @@ def main(cfg: DictConfig) -> float:
 
 
 def learn(config: LearnConfig) -> list[float]:
-    """Learns a proxy for each of `num_seeds` seeds, one after the other on the same executable.
+    """Learns a proxy for each of `num_seeds` seeds; see `learn_all`."""
+    return learn_all(runs_of(config))
 
-    Each seed has a run directory of its own: where `run_dir` is given, `seed0` and so on in it.
+
+def learn_all(configs: Sequence[LearnConfig]) -> list[float]:
+    """Learns a proxy for each configuration, one after the other.
+
+    Each has a run directory of its own. Those that differ from the one before in the seed alone run
+    on its executable.
 
     Returns:
-      The best incumbent mean of each seed.
+      The best incumbent score of each.
 
     Raises:
       ConfigError: if a run directory cannot be used.
       OSError: if a file cannot be written; everything saved before is whole.
     """
     with contextlib.ExitStack() as stack:
+        before: dict[str, Any] = {}
 
-        @functools.cache
-        def chunks() -> Any:
-            runtime.configure_jax()
-            made = config.machines.make(config, Path(config.resolved_run_dir), print)
-            return stack.enter_context(made)
+        def chunks_of(config: LearnConfig) -> Any:
+            program = dataclasses.replace(config, seed=0, run_dir=None)
+            if before.get("program") != program:
+                stack.close()
+                runtime.configure_jax()
+                made = config.machines.make(config, Path(config.resolved_run_dir), print)
+                before.update(program=program, chunks=stack.enter_context(made))
+            return before["chunks"]
 
-        runs = runs_of(config)
-        scores = [_learn(each, chunks) for each in runs]
-    if len(runs) > 1:
-        for each, score in zip(runs, scores, strict=True):
-            print(f"seed {each.seed}: best incumbent score {score:.1f}, {each.resolved_run_dir}")
+        several = len(configs) > 1
+        scores = [_learn(config, chunks_of, says_more=not several) for config in configs]
+    if several:
+        print("Best incumbent scores:")
+        for config, score in zip(configs, scores, strict=True):
+            print(f"{score:10.1f}  {config.resolved_run_dir}")
     return scores
 
 
 def runs_of(config: LearnConfig) -> list[LearnConfig]:
-    """A configuration of each seed."""
+    """The configuration of each seed; where `run_dir` is given, with `seed0` and so on in it."""
     if config.num_seeds == 1:
         return [config]
     return [
@@ -73,13 +83,18 @@ def runs_of(config: LearnConfig) -> list[LearnConfig]:
     ]
 
 
-def _learn(config: LearnConfig, make_chunks: Callable[[], Any]) -> float:
-    """Learns a proxy in its run directory, with a live line of progress and a summary.
+def _learn(config: LearnConfig, chunks_of: Callable[[LearnConfig], Any], says_more: bool) -> float:
+    """Learns a proxy in its run directory, with a live line of progress.
 
     Ctrl-C leaves at once, with exit code 130: finished generations are saved.
 
+    Args:
+      config: the configuration.
+      chunks_of: gives its compiled generations.
+      says_more: whether it prints at the end where everything is, and what to do next.
+
     Returns:
-      The best incumbent mean.
+      The best incumbent score.
     """
     from sejax.cli.progress import RunProgress
 
@@ -91,7 +106,7 @@ def _learn(config: LearnConfig, make_chunks: Callable[[], Any]) -> float:
             progress.status("importing jax and the task")
             from sejax.cli import session
 
-            chunks = make_chunks()
+            chunks = chunks_of(config)
             ended = session.run(config, directory, chunks, progress)
         except KeyboardInterrupt:
             progress.stop()
@@ -101,7 +116,8 @@ def _learn(config: LearnConfig, make_chunks: Callable[[], Any]) -> float:
             )
             commands.leave(commands.INTERRUPTED)
         best = max(float(row["best_so_far"]) for row in directory.rows)
-        progress.finish(directory, chunks.learner, best, ended)
+        if says_more:
+            progress.finish(directory, chunks.learner, best, ended)
     return best
 
 

@@ -10,9 +10,9 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float
 
-from sejax.agents.mixture import Families
+from sejax.agents.mixture import Mixture
 from sejax.errors import require
-from sejax.es.base import Strategy, Trials, finite_mean
+from sejax.es.base import Evaluations, Strategy, finite_mean
 from sejax.objectives import Objective, Outcome
 
 
@@ -45,18 +45,18 @@ class Scoring:
       objective: the score of one outcome.
       mixture: the agents.
       evaluations: how often each candidate is evaluated.
-      agent_of_member: index of the agent that trains on each member of the population, `[pop]`.
+      agent_of_candidate: index of the agent that trains on each candidate, `[pop]`.
       agent_of_evaluation: the same for each evaluation, `[evaluation]`.
     """
 
     objective: Objective
-    mixture: Families
-    evaluations: Trials
-    agent_of_member: np.ndarray
+    mixture: Mixture
+    evaluations: Evaluations
+    agent_of_candidate: np.ndarray
     agent_of_evaluation: np.ndarray
 
     @classmethod
-    def of(cls, objective: Objective, strategy: Strategy, mixture: Families) -> "Scoring":
+    def of(cls, objective: Objective, strategy: Strategy, mixture: Mixture) -> "Scoring":
         """The scoring of a strategy's population.
 
         Raises:
@@ -73,24 +73,26 @@ class Scoring:
             "a strategy that remembers scores",
             "es=nes",
         )
-        trials = strategy.trials
+        asked = strategy.evaluations
         evaluations = dataclasses.replace(
-            trials, num_incumbent_evals=mixture.num_evals(trials.num_incumbent_evals)
+            asked, num_incumbent_evals=mixture.num_evals(asked.num_incumbent_evals)
         )
-        agent_of_member = mixture.of_members(strategy.num_members, strategy.num_signs)
+        agent_of_candidate = mixture.agent_of_candidate(
+            strategy.population_size, strategy.antithetic
+        )
         return cls(
             objective=objective,
             mixture=mixture,
             evaluations=evaluations,
-            agent_of_member=agent_of_member,
-            agent_of_evaluation=evaluations.families(agent_of_member, mixture.size),
+            agent_of_candidate=agent_of_candidate,
+            agent_of_evaluation=evaluations.agents(agent_of_candidate, mixture.size),
         )
 
     def for_strategy(self, outcome: Outcome) -> tuple[Float[Array, " pop"], Float[Array, ""]]:
         """Scores of the population and of the incumbent in one unit, for `Strategy.tell`."""
         scores = self._scores(self.objective(outcome))
-        population = self.evaluations.of_members(scores.population)
-        return self.mixture.comparable(population, self.agent_of_member, scores.agent_means)
+        population = self.evaluations.population_scores(scores.population)
+        return self.mixture.comparable(population, self.agent_of_candidate, scores.agent_means)
 
     def of_whole_tests(self, outcome: Outcome) -> Scores:
         """The scores that people see; with a curriculum, those of whole test episodes."""
@@ -111,7 +113,7 @@ class Scoring:
         means = []
         for i in range(self.mixture.size):
             places = np.flatnonzero(of_incumbent == i)
-            repaired, mean = self.evaluations.of_incumbent(
+            repaired, mean = self.evaluations.incumbent_scores(
                 incumbent[places], population[of_population == i]
             )
             incumbent = incumbent.at[places].set(repaired)

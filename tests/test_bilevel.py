@@ -13,7 +13,7 @@ import sejax
 from sejax import registry
 from sejax.bilevel import make_bilevel, make_learner
 from sejax.errors import ConfigError
-from sejax.es.base import Trials
+from sejax.es.base import Evaluations
 
 # 40 steps for each of 12 agents: short enough for rounding not to grow into other actions.
 TINY = [
@@ -120,7 +120,7 @@ def test_the_best_proxy_is_the_one_with_the_highest_incumbent_mean(one_device):
 
 def test_infos_count_generations_and_steps(one_device):
     program, _, ((_, infos), _) = one_device
-    assert program.strategy.num_candidates == 12  # 4 members with two signs, 4 incumbents
+    assert program.strategy.num_evaluations == 12  # 4 members with two signs, 4 incumbents
     for number, info in enumerate(infos):
         assert info.generation == number and info.active
         assert info.train_steps.shape == info.real_steps.shape == (12,)
@@ -140,7 +140,7 @@ def test_no_two_trials_generations_or_seeds_have_a_key_in_common(one_device):
     program, _, ((states, _), (others, _)) = one_device
     asked = [program.ask(state).keys for state in (states[0], states[1], others[0])]
     data = np.concatenate([np.asarray(jax.random.key_data(keys)).reshape(-1, 2) for keys in asked])
-    assert len(data) == 3 * program.strategy.num_candidates
+    assert len(data) == 3 * program.strategy.num_evaluations
     assert len(np.unique(data, axis=0)) == len(data)
 
 
@@ -154,7 +154,7 @@ def test_perturbations_are_drawn_anew_in_each_generation(one_device):
 def test_common_random_numbers_are_common_to_the_members_alone():
     program = program_of("es.common_random_numbers=true", "es.num_evals=2", words=ROOM)
     keys = np.asarray(jax.random.key_data(program.ask(program.init(KEYS[0])).keys))
-    ids = program.strategy.trials.seed_ids(program.strategy.num_members)
+    ids = program.strategy.evaluations.seed_ids(program.strategy.population_size)
     same = (keys[:, None] == keys[None]).all(axis=-1)
     np.testing.assert_array_equal(same, np.equal.outer(ids, ids))
     assert 1 < len(np.unique(ids)) < len(ids)
@@ -306,14 +306,14 @@ def test_an_incumbent_that_diverges_is_never_the_best(one_device):
 
 def test_incumbent_agents_that_diverge_count_as_the_worst_of_the_generation():
     nan, inf = np.nan, np.inf
-    trials = Trials(num_incumbent_evals=4)
+    trials = Evaluations(num_incumbent_evals=4)
     scores = jnp.array([-9.0, nan, 3.0, 5.0, nan, 7.0, inf])  # the last four are the incumbent's
     members, incumbent = trials.split(scores)
     np.testing.assert_array_equal(members, [-9.0, nan, 3.0])
-    got, mean = trials.of_incumbent(incumbent, members)
+    got, mean = trials.incumbent_scores(incumbent, members)
     np.testing.assert_array_equal(got, [5.0, -9.0, 7.0, -9.0])
     assert mean == (5 - 9 + 7 - 9) / 4
-    got, mean = trials.of_incumbent(jnp.array([nan, nan]), jnp.array([198.0, 199.0]))
+    got, mean = trials.incumbent_scores(jnp.array([nan, nan]), jnp.array([198.0, 199.0]))
     np.testing.assert_array_equal(got, [nan, nan])
     assert np.isnan(mean)
 
@@ -348,9 +348,9 @@ def test_every_kind_of_configuration_makes_a_scan_body(words, overrides):
     assert kind(after) == kind(state)
     columns = dict(vars(info))
     assert {x.shape for x in jax.tree.leaves(columns.pop("by_agent"))} == {(1,)}
-    num_population = program.strategy.num_members * program.strategy.trials.num_evals
+    num_population = program.strategy.population_size * program.strategy.evaluations.num_evals
     assert columns.pop("population_scores").shape == (num_population,)
-    num_candidates = program.strategy.num_candidates
+    num_candidates = program.strategy.num_evaluations
     assert {columns.pop(name).shape for name in ("train_steps", "real_steps")} == {
         (num_candidates,)
     }

@@ -8,7 +8,7 @@ import pytest
 import sejax
 from sejax import envs
 from sejax.agents.boltzmann import BoltzmannConfig
-from sejax.agents.mixture import Families
+from sejax.agents.mixture import Mixture
 from sejax.bilevel import make_bilevel
 from sejax.cli import compose
 from sejax.errors import ConfigError
@@ -107,7 +107,7 @@ def test_the_outer_loop_learns_a_bandit_without_a_step_of_training():
         sejax.DDQNConfig(hidden_size=8, num_layers=1, batch_size=8, warmup_episodes=1), CARTPOLE
     )
     program = program_of(
-        Families(agents=(boltzmann, ddqn), names=("boltzmann", "ddqn"), weights=(1.0, 0.0))
+        Mixture(agents=(boltzmann, ddqn), names=("boltzmann", "ddqn"), weights=(1.0, 0.0))
     )
     state = jax.jit(program.init)(jax.random.key(0))
     generation = jax.jit(program.generation)

@@ -140,31 +140,6 @@ def test_the_target_network_starts_as_a_copy_and_follows_softly(state, update):
     np.testing.assert_allclose(after.target_params, expected, rtol=1e-6)
 
 
-def test_a_transition_with_discount_zero_ignores_its_next_state(state, update):
-    def gradient(batch):  # Adam's first mean: 0.1 g
-        return np.asarray(update(jax.random.key(0), state, batch).opt_state.mu)
-
-    batch = random_batch(0, discount=0.0)
-    elsewhere = batch._replace(next_obs=batch.next_obs + 3.0)
-    np.testing.assert_array_equal(gradient(batch), gradient(elsewhere))
-    bootstrapping = np.ones(BATCH, np.float32)
-    a, b = (gradient(x._replace(discount=bootstrapping)) for x in (batch, elsewhere))
-    assert np.abs(a - b).max() > 1e-3
-
-
-def test_hyperparameters_are_traced_so_that_a_population_may_vary_them(agent):
-    key, batch = jax.random.key(1), random_batch(0)
-    rates = jnp.array([0.0, 0.01, 0.1])
-
-    def after(rate):
-        state = agent.init(key, agent.hparams._replace(learning_rate=rate))
-        return agent.update(key, state, batch).params - state.params
-
-    moved = jax.jit(jax.vmap(after))(rates)
-    np.testing.assert_array_equal(moved[0], 0.0)
-    np.testing.assert_allclose(moved[2], 10 * moved[1], rtol=1e-3, atol=1e-6)
-
-
 # --- when it learns ------------------------------------------------------------------------------
 
 
@@ -254,21 +229,6 @@ def test_epsilon_decays_by_a_factor_each_episode_down_to_its_minimum(epsilon_in)
     np.testing.assert_allclose(got, [0.8, 0.4, 0.2, 0.15, 0.15, 0.15], rtol=1e-6)
 
 
-def test_epsilon_with_decay_zero_is_initial_once_and_minimal_ever_after(epsilon_in):
-    got = epsilon_in(range(4), epsilon_init=0.8, epsilon_decay=0.0, epsilon_min=0.1)
-    np.testing.assert_allclose(got, [0.8, 0.1, 0.1, 0.1], rtol=1e-6)
-
-
-def test_the_first_episode_uses_the_initial_epsilon_even_below_the_minimum(epsilon_in):
-    got = epsilon_in(range(3), epsilon_init=0.05, epsilon_decay=0.9, epsilon_min=0.1)
-    np.testing.assert_allclose(got, [0.05, 0.1, 0.1], rtol=1e-6)
-
-
-def test_epsilon_after_a_thousand_episodes_is_minimal(epsilon_in):
-    got = epsilon_in([1000], epsilon_init=1.0, epsilon_decay=0.9, epsilon_min=0.01)
-    np.testing.assert_allclose(got, [0.01], rtol=1e-6)
-
-
 @pytest.fixture(scope="module")
 def draw_actions():
     """Exploring actions of 4000 keys and the greedy one, by epsilon; three actions."""
@@ -339,25 +299,3 @@ def test_a_two_step_probe_learns_gamma_and_one():
     for state, value in ((a, gamma), (b, 1.0)):
         q_values = numpy_forward(params, state, "tanh", 1)
         np.testing.assert_allclose(q_values, [value, value], atol=0.02)
-
-
-def test_hparams_hold_the_configured_numbers(agent):
-    assert agent.hparams._asdict() == {
-        "learning_rate": 0.01, "tau": 0.1, "discount": 0.9,
-        "epsilon_init": 1.0, "epsilon_min": 0.01, "epsilon_decay": 0.9, "exploration_steps": None,
-        "hidden_size": None, "batch_size": None,  # all of them
-    }  # fmt: skip
-    assert (agent.spec.warmup_episodes, agent.spec.learns_from) == (10, 10)
-
-
-def test_columns_of_no_weight_change_nothing(state, update):
-    batch = random_batch(5)
-    other = random_batch(6)
-    joined = jax.tree.map(
-        lambda a, b: np.concatenate([a, b], axis=-1),
-        batch._replace(weight=np.ones(BATCH, np.float32)),
-        other._replace(weight=np.zeros(BATCH, np.float32)),
-    )
-    alone = update(jax.random.key(0), state, batch)
-    padded = update(jax.random.key(0), state, joined)
-    np.testing.assert_allclose(padded.params, alone.params, rtol=1e-5, atol=1e-7)

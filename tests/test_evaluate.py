@@ -20,7 +20,7 @@ from sejax.agents.tabular import QLearningConfig
 from sejax.cli import build, commands, compose, progress
 from sejax.cli.families import families_of
 from sejax.errors import ConfigError
-from sejax.evaluate import evaluate, proxy_study
+from sejax.evaluate import evaluate, proxy_study, summarise
 from sejax.ops.checksummed import pack, unpack
 from sejax.training import TrainingConfig, budget_for
 
@@ -399,3 +399,10 @@ def test_the_command_ends_bad_input_with_one_message_and_status_2(words, said, m
     printed = capsys.readouterr()
     assert ended.value.code == 2 and not printed.out
     assert said in printed.err and printed.err.count("\n") == 1 and len(printed.err) < 1500
+
+
+def test_an_evaluations_mean_leaves_no_agent_out():
+    agents = pd.DataFrame({"world": "w", "test_return": [10.0, float("nan"), -20.0], "nonfinite": [
+        False, True, False], "train_steps": 5, "train_episodes": 1})  # fmt: skip
+    row = summarise(agents, ["world"]).loc["w"]
+    assert (row["test_return_mean"], row["num_nonfinite"]) == (-10.0, 1)

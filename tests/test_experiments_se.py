@@ -1,259 +1,51 @@
-"""The experiments with SEs: the framework, sets of SEs, feasibility, performance, single SEs."""
+"""The experiments with SEs: what their tables say, worked out by hand, and what they train."""
 
 import dataclasses
-import fnmatch
-import json
-import os
-import shutil
-import subprocess
-import sys
-from dataclasses import dataclass
 
 import jax
 import numpy as np
 import pandas as pd
 import pytest
 import yaml
+from scipy.stats import spearmanr
 from support import refuse
+from test_experiments import TINY, TINY_AGENT, save_ses
 
 import sejax
 from experiments import (
-    experiment,
-    figures,
-    pieces,
-    se_agents,
+    se_families,
     se_feasibility,
+    se_horizons,
     se_models,
     se_performance,
-    settings,
-    worlds,
-)  # fmt: skip
-from experiments.statistics import bootstrap_interval, interquartile_mean
+    se_transfer_of_hparams,
+)
+from experiments.common import agents, figures, runs, shards
+from experiments.common.statistics import bootstrap_interval, interquartile_mean
 from sejax import envs
 from sejax.agents.base import drawing_key
-from sejax.cli import session
+from sejax.cli import build
 from sejax.errors import ConfigError
-from sejax.options import counts
-from sejax.serialize import flatten
-
-TINY_RUN = ["es.population_size=2", "es.num_incumbent_evals=2", "agent.hidden_size=4",
-            "agent.batch_size=4", "agent.warmup_episodes=0", "proxy.hidden_size=4",
-            "training.max_steps=30", "training.test_episodes=1"]  # fmt: skip
-TINY_AGENT = {"hidden_size": 2, "batch_size": 4, "num_layers": 1, "warmup_episodes": 0}
-
-
-# What experiments are told.
-
-
-@dataclass(frozen=True, kw_only=True)
-class Example(settings.Settings):
-    name = "example"
-
-    env: str = settings.setting("cartpole", about="task")
-    agents: tuple[str, ...] = settings.setting(
-        ("ddqn", "ppo"), settings.each_of(("ddqn", "ppo")), about="kinds"
-    )
-    num_agents: int = settings.setting(10, counts("it counts agents"), quick=4, about="of each")
-    run: tuple[str, ...] = settings.setting((), about="overrides")
-
-
-def given(*words):
-    return Example.of(**experiment.parse(Example, words))
-
-
-def test_settings_are_complete_and_say_which_command_makes_them():
-    assert (given().num_agents, given("quick=true").num_agents) == (10, 4)
-    made = given("quick=true", "agents=[ppo]", "num_agents=null", "run.es.noise_std=0.1", "seed=7",
-                 "run.agent.hidden_size=4")  # fmt: skip
-    assert made.run == ("es.noise_std=0.1", "agent.hidden_size=4")
-    assert made == Example.of(quick=True, agents="ppo", seed=7, run=made.run)
-    words = made.command().removeprefix("python -m experiments.example ").split()
-    assert given(*(word.strip("'") for word in words)) == made and len(words) == 5
-    assert given().command() == "python -m experiments.example"
-
-
-def test_results_are_apart_from_what_may_be_thrown_away():
-    assert str(given().folder) == "results/example/cartpole"
-    assert str(given().work_folder) == "runs/experiments/example/cartpole"
-    assert str(given("quick=true").folder) == "runs/experiments/example-quick/cartpole"
-    assert str(given("out=results/example/mine").work_folder) == "runs/experiments/example/mine"
-    assert str(given("out=/tmp/mine").work_folder) == "/tmp/mine/work"
-    assert str(given("out=/tmp/mine", "work=/tmp/other").work_folder) == "/tmp/other"
-
-
-@pytest.mark.parametrize(
-    ("word", "message"),
-    [("agents=[dqn]", "agents must be one of ddqn, ppo; got 'dqn'"),
-     ("agents=ddqn,ppo", r"agents must be one value or a list.*Set agents=\[ddqn,ppo\]"),
-     ("num_agents=0", "num_agents must be at least 1, because it counts agents; got 0"),
-     ("num_agents=many", "num_agents must be a whole number"),
-     ("numagents=3", "Did you mean num_agents="), ("--quick", "Did you mean quick="),
-     ("seed=-1", "seed must lie in"), ("devices=0", "devices must be at least 1"),
-     ("seed=[1", "no viable alternative|mismatched input")],
-)  # fmt: skip
-def test_words_that_cannot_work_are_refused(word, message):
-    with pytest.raises(ConfigError, match=message):
-        given(word)
-
-
-def test_help_lists_all_fields_with_their_values():
-    example = experiment.Experiment(settings=Example, compute=refuse, report=refuse, about="What.")
-    text = example.help()
-    assert "What." in text and "num_agents=10" in text and "of each (quick: 4)" in text
-    assert "run.FIELD=VALUE" in text and "agents=[ddqn,ppo]" in text
-
-
-def test_tables_are_remade_from_the_stored_rows(tmp_path):
-    reported = []
-    rows = {"a": pd.DataFrame({"x": [0.1, 1 / 3]}), "b": pd.DataFrame({"flag": [True], "n": [3]})}
-    example = experiment.Experiment(
-        settings=Example, compute=lambda _: pieces.stack(rows), about="",
-        report=lambda _, rows: reported.append(rows) or rows,
-    )  # fmt: skip
-    example.run(Example.of(out=str(tmp_path)))
-    with_rows = Example.of(out=str(tmp_path), from_rows=True)
-    pd.testing.assert_frame_equal(example.run(with_rows), reported[0])
-    pd.testing.assert_frame_equal(pieces.unstack(reported[1], "a"), rows["a"])
-    assert pieces.unstack(reported[1], "b").to_dict("list") == {"flag": [True], "n": [3]}
-    with pytest.raises(ConfigError, match=r"from_rows must be false.*no .*rows\.csv\.xz"):
-        example.run(Example.of(out=str(tmp_path / "none"), from_rows=True))
-
-
-def test_results_say_what_each_piece_was_made_with(tmp_path):
-    settings = Example.of(out=str(tmp_path))
-    agents = {
-        "quick": {"name": "td3", "noise": {"std": 0.1}},
-        "slow": {"name": "ppo", "epochs": 80},
-    }
-    made_with = {  # names have three parts or four; slow is a row and a world
-        f"{prefix}{row}-{world}-{group}": {
-            "agent": agents[row], "seed": 0, "weights": f"{world}{group}", "prefix": prefix,
-            "odd": (row, group) == ("quick", "1") and world == "rn",
-        }
-        for prefix in ("", "auc-") for row in agents for world in ("rn", "slow") for group in "01"
-    }  # fmt: skip
-    rows = pd.DataFrame({"x": [0.0]})
-
-    def compute(settings):
-        for name, mine in made_with.items():
-            settings.pieces.compute(name, mine, lambda: rows)
-        return rows
-
-    def report(settings, rows):
-        return rows
-
-    example = experiment.Experiment(settings=Example, compute=compute, report=report, about="")
-    for _ in ("computed", "read"):
-        example.run(Example.of(out=str(tmp_path)))
-        stored = json.loads(settings.made_with_file.read_text())
-        assert stored["*"] == {"seed": 0} and stored["*-rn-1"] == {"weights": "rn1"}
-        for name, mine in made_with.items():
-            found = [stored[pattern] for pattern in stored if fnmatch.fnmatchcase(name, pattern)]
-            assert {key: x for each in found for key, x in each.items()} == flatten(mine)
-            assert all(each.items() <= flatten(mine).items() for each in found)  # none disagree
-        settings.made_with_file.unlink()
-    example.run(Example.of(out=str(tmp_path), from_rows=True))
-    assert not settings.made_with_file.exists()
-
-
-def test_a_kill_while_a_piece_is_written_loses_nothing(tmp_path, monkeypatch):
-    made, done = pieces.Pieces(tmp_path), []
-
-    def compute(count):
-        table = pd.DataFrame({"row": range(count)})
-        return made.compute("p", {"count": count}, lambda: done.append(count) or table)
-
-    written = pieces.write_text
-
-    def killed(path, text):
-        if path.suffix == ".json":
-            raise KeyboardInterrupt
-        written(path, text)
-
-    monkeypatch.setattr(pieces, "write_text", killed)
-    with pytest.raises(KeyboardInterrupt):
-        compute(2)
-    monkeypatch.setattr(pieces, "write_text", written)
-    assert len(compute(2)) == len(compute(2)) == 2 and done == [2, 2]
-    with pytest.raises(ConfigError, match="with another count"):
-        compute(3)
-
-
-# Sets of SEs.
 
 
 @pytest.fixture(scope="module")
 def ses(tmp_path_factory):
-    """A file with three SEs of random weights: its path and the weights."""
-    path = tmp_path_factory.mktemp("ses") / "ses.safetensors"
-    config = sejax.config(
-        ["proxy.hidden_size=4", "training.max_steps=40", "agent.warmup_episodes=0"]
-    )
-    env = config.parts()["proxy"]
-    weights = [env.init_weights(jax.random.key(i)) for i in range(3)]
-    records = [{"score": 1.0 + i, "generation": 4 + i, "seed": 7 + i} for i in range(3)]
-    sejax.save_set(path, env, weights, records, plain(config))
-    return path, weights
+    """A file with three SEs of random weights."""
+    return save_ses(tmp_path_factory.mktemp("s") / "s.safetensors", 3, "training.max_steps=40")
 
 
-def plain(config):
-    from sejax.cli import build
-
-    return build.to_plain(config)
-
-
-def assert_equal_trees(a, b):
-    for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
-        np.testing.assert_array_equal(x, y)
+@pytest.fixture
+def tiny_agents(monkeypatch):
+    monkeypatch.setattr(agents, "QUICK_AGENT", TINY_AGENT)
 
 
-def test_a_set_that_is_saved_and_loaded_is_the_same(ses):
-    path, weights = ses
-    loaded = sejax.load_set(path)
-    assert len(loaded) == 3 and loaded.task.name == "cartpole"
-    for i in range(3):
-        assert_equal_trees(loaded[i].params.weights, weights[i])
-    np.testing.assert_array_equal(loaded.scores, [1, 2, 3])
-    assert [record["generation"] for record in loaded.records] == [4, 5, 6]
-    np.testing.assert_array_equal(loaded.seeds, [7, 8, 9])
-    assert len({loaded[i].fingerprint for i in range(3)}) == 3
-    assert_equal_trees(loaded[:2].weights, jax.tree.map(lambda x: x[:2], loaded.weights))
+def run(name, module, out, **given):
+    """The table of an experiment with tiny settings."""
+    options = TINY[name] | {"quick": True, "seed": 3, "out": str(out)} | given
+    return module.EXPERIMENT.run(module.EXPERIMENT.settings.of(**options))
 
 
-@pytest.mark.parametrize(("scores", "solved"), [((195.0, 194.9, 200.0), [7, 9]), ((0, 0, 0), [])])
-def test_the_solved_ones_of_a_set_reached_the_threshold(ses, tmp_path, scores, solved):
-    records = [{"score": x, "seed": 7 + i} for i, x in enumerate(scores)]
-    env = sejax.load_set(ses[0]).env
-    sejax.save_set(tmp_path / "s.safetensors", env, ses[1], records)
-    loaded = sejax.load_set(tmp_path / "s.safetensors")
-    assert list(loaded[loaded.scores >= loaded.task.solved_reward].seeds) == solved
-
-
-def test_all_ses_of_a_set_step_at_once(ses):
-    loaded = sejax.load_set(ses[0])
-    env, params = loaded.env, loaded.env.params(loaded.weights)
-    axes = params.replace(weights=0, max_steps_in_episode=None)
-    key = jax.random.key(0)
-    obs, state = env.reset_env(key, loaded[0].params)
-
-    def reward(params):
-        return env.step_env(key, state, jax.numpy.int32(1), params)[2]
-
-    rewards = jax.vmap(reward, in_axes=(axes,))(params)
-    np.testing.assert_allclose(rewards, [reward(loaded[i].params) for i in range(3)], rtol=1e-6)
-    assert obs.shape == (4,) and len(set(np.asarray(rewards).tolist())) == 3
-
-
-def test_a_single_proxy_is_a_set_of_one(ses, tmp_path):
-    env, weights = sejax.load_set(ses[0]).env, ses[1][0]
-    sejax.save(tmp_path / "p.safetensors", env, weights, score=12.5, generation=7, seed=2)
-    loaded = sejax.load_set(tmp_path / "p.safetensors")
-    assert (len(loaded), loaded.scores[0], loaded.seeds[0]) == (1, 12.5, 2)
-    assert_equal_trees(loaded[0].params.weights, weights)
-    assert loaded[0].fingerprint == sejax.load_set(ses[0])[0].fingerprint
-
-
-# Feasibility.
+# --- feasibility, and runs with a budget ----------------------------------------------------------
 
 
 def curves(*means):
@@ -282,6 +74,18 @@ def test_runs_that_do_not_solve_the_task_count_as_longer_than_all(values, text):
     assert se_feasibility.median_and_range(values, 50) == text
 
 
+@pytest.mark.parametrize("solved, text", [
+    ([100, 300, 200], "200"), ([100, 200, None], "200"), ([100, None, None], "> 900"),
+])  # fmt: skip
+def test_a_run_that_did_not_solve_the_task_took_more_steps_than_all(solved, text):
+    each = pd.DataFrame({
+        "generations_to_solve": [np.inf if x is None else 1 for x in solved],
+        "env_steps_to_solve": [np.nan if x is None else x for x in solved],
+        "env_steps": [900, 950, 1000],
+    })  # fmt: skip
+    assert se_feasibility.median_steps(each) == text
+
+
 @pytest.mark.parametrize(("env", "agent", "has_paper"),
                          [("pendulum", "td3", False), ("acrobot", "ddqn", True)])  # fmt: skip
 def test_runs_have_the_tasks_agent_and_the_papers_numbers_where_it_has_some(env, agent, has_paper):
@@ -291,58 +95,29 @@ def test_runs_have_the_tasks_agent_and_the_papers_numbers_where_it_has_some(env,
     assert any(table["paper"]) == has_paper
 
 
-def learned(out, *run, **given):
-    options = {"runs": 2, "generations": 3, "run": [*TINY_RUN, *run]} | given
-    asked = se_feasibility.SeFeasibility.of(quick=True, seed=3, out=str(out), **options)
-    return se_feasibility.EXPERIMENT.run(asked)
+def test_feasibility_learns_as_sejax_run_does_and_goes_on(tmp_path):
+    def learned(**given):
+        run("se_feasibility", se_feasibility, tmp_path, **given)
+        return shards.read_rows(tmp_path / "rows.csv.xz").drop(columns=["wall_s", "cpu_s"])
 
-
-@pytest.fixture(scope="module")
-def two_runs(tmp_path_factory):
-    """Two NES runs of three generations: the folder and the table."""
-    out = tmp_path_factory.mktemp("feasibility")
-    return out, learned(out)
-
-
-def test_feasibility_learns_as_sejax_run_does_and_is_not_done_twice(two_runs, monkeypatch):
-    out, table = two_runs
-    made = pieces.read_rows(out / "rows.csv.xz")
+    first = learned(generations=1)
+    made = learned(generations=3)
     assert made.groupby("seed").size().to_dict() == {3: 3, 4: 3}
-    stored = sejax.load_set(out / "ses.safetensors")
-    config = yaml.safe_load((out / "work/runs/seed4/config.yaml").read_text())
+    pd.testing.assert_frame_equal(made[made["generation"] == 0].reset_index(drop=True), first)
+    stored = sejax.load_set(tmp_path / "ses.safetensors")
+    config = yaml.safe_load((tmp_path / "work/runs/seed4/config.yaml").read_text())
     assert config["seed"] == 4 and config["proxy"]["hidden_size"] == 4
-    result = jax.jit(sejax.make_learner(session.build.learn_config(config)))(jax.random.key(4))
+    result = jax.jit(sejax.make_learner(build.learn_config(config)))(jax.random.key(4))
     mine = made[made["seed"] == 4]
     np.testing.assert_allclose(mine["incumbent_mean"], result.info.incumbent_mean, rtol=1e-6)
     assert stored.seeds.tolist() == [3, 4]
-    assert_equal_trees(stored[1].params.weights, result.weights)
+    weights = stored[1].params.weights
+    assert all(jax.tree.leaves(jax.tree.map(np.array_equal, weights, result.weights)))
     assert stored.scores[1] == pytest.approx(float(result.score))
-
-    monkeypatch.setattr(session.Chunks, "advance", refuse)
-    pd.testing.assert_frame_equal(learned(out), table)
-    pd.testing.assert_frame_equal(learned(out, from_rows=True), table)
     with pytest.raises(ConfigError, match=r"differs in agent_hparams.*Set work=DIR"):
-        learned(out, agent_hparams="varied")
-
-
-def test_a_run_that_was_stopped_goes_on_at_its_last_generation(two_runs, tmp_path):
-    """Learns one generation, then three: the same as three at once."""
-    for generations in (1, 3):
-        learned(tmp_path, runs=1, generations=generations)
-    at_once = pieces.read_rows(two_runs[0] / "rows.csv.xz").query("seed == 3")
-    gone_on = pieces.read_rows(tmp_path / "rows.csv.xz")
-    pd.testing.assert_frame_equal(gone_on.drop(columns="wall_s"), at_once.drop(columns="wall_s"))
-
-
-def test_a_run_without_its_checkpoint_is_not_replaced(two_runs, tmp_path):
-    shutil.copytree(two_runs[0] / "work", tmp_path / "work")
-    for folder in (tmp_path / "work/runs").glob("*/checkpoint"):
-        shutil.rmtree(folder)
-    metrics = tmp_path / "work/runs/seed3/metrics.csv"
-    before = metrics.read_text()
-    with pytest.raises(ConfigError, match=r"checkpoints of a run.*with 3 generations"):
-        learned(tmp_path, generations=4)
-    assert metrics.read_text() == before
+        learned(agent_hparams="varied")
+    with pytest.raises(ConfigError, match=r"^run.proxy must be se"):
+        learned(run=["proxy=rn"])
 
 
 @pytest.mark.parametrize("preset", ["best", "paper", "paper_performance"])
@@ -350,6 +125,16 @@ def test_a_run_without_its_checkpoint_is_not_replaced(two_runs, tmp_path):
 def test_quick_runs_are_long_enough_to_learn(env, preset):
     config = sejax.config([f"env={env}", f"preset={preset}", *se_feasibility.QUICK])
     assert config.agent.warmup_episodes == 1
+
+
+def test_a_cost_whose_generation_was_lost_is_written_again(tmp_path):
+    path = tmp_path / "cpu_s.txt"
+    assert runs.read_costs(path, 3).tolist() == []
+    path.write_text("0.500\n0.250\n7.000\n")
+    assert runs.read_costs(path, 2).tolist() == [0.5, 0.25]
+
+
+# --- performance, and single SEs ------------------------------------------------------------------
 
 
 def made_up_agents(num_ses=4, num_agents=6):
@@ -402,8 +187,8 @@ def test_intervals_of_interquartile_means_draw_agents_within_ses():
 def test_a_tuned_agent_is_a_baseline_of_its_own():
     settings = se_performance.SePerformance.of(max_steps=700, real_groups=2)
     task = envs.make("cartpole")
-    real = se_performance.real_world(settings, task, {}, "ddqn")
-    tuned = se_performance.tuned_world(settings, real, "ddqn")
+    real = se_performance.on_real(settings, task, {}, "ddqn")
+    tuned = se_performance.on_real_tuned(settings, real, "ddqn")
     assert (real.hparams, tuned.hparams) == ("varied", "default")
     assert (real.agent.hidden_size, tuned.agent.hidden_size) == (128, 64)
     assert real.training.time_limit_is_terminal and not tuned.training.time_limit_is_terminal
@@ -459,64 +244,35 @@ def test_single_ses_are_sorted_and_their_ranks_correlated():
     assert "td3_discrete and ddqn -1.00" in se_models.correlations_text(summary)
 
 
-def trained(module, out, **given):
-    """A table of `se_performance` or `se_models` for two SEs and little agents."""
-    options = {"agents": "ddqn", "num_agents": 3, "num_ses": 2, "test_episodes": 2} | given
-    cls = module.EXPERIMENT.settings
-    return module.EXPERIMENT.run(cls.of(quick=True, seed=3, out=str(out), **options))
-
-
-@pytest.fixture
-def tiny_agents(monkeypatch):
-    monkeypatch.setattr(se_agents, "QUICK_AGENT", TINY_AGENT)
-
-
-def performance(ses, out, **given):
-    return trained(se_performance, out, fixed=str(ses[0]), real_episodes=3, **given)
-
-
 @pytest.mark.slow
-def test_performance_trains_as_evaluation_does_and_goes_on(ses, tmp_path, monkeypatch, tiny_agents):
-    table = performance(ses, tmp_path)
-    agents = pieces.read_rows(tmp_path / "rows.csv.xz")
-    assert agents.groupby("setting").size().to_dict() == {"real": 6, "fixed": 6}
-    check_as_evaluation(ses, agents)
+def test_performance_trains_as_evaluation_does(ses, tmp_path, tiny_agents):
+    given = {"num_agents": 3, "num_ses": 2}
+    table = run("se_performance", se_performance, tmp_path, fixed=ses, **given)
+    rows = shards.read_rows(tmp_path / "rows.csv.xz")
+    assert rows.groupby("setting").size().to_dict() == {"real": 6, "fixed": 6}
     assert table["trained on"].tolist() == ["real", "synth., HPs fixed"]
-    assert (tmp_path / "performance.png").stat().st_size > 10_000
-    assert "16887.7" in (tmp_path / "table.md").read_text()
+    check_as_evaluation(ses, rows)
     # Agents of equal number draw equal hyperparameters in all settings.
-    real, fixed = (agents[agents["setting"] == name] for name in ("real", "fixed"))
+    real, fixed = (rows[rows["setting"] == name] for name in ("real", "fixed"))
     for name in ("learning_rate", "batch_size", "hidden_size", "num_layers"):
         np.testing.assert_array_equal(real[name], fixed[name])
         assert real[name].nunique() > 1
-
-    monkeypatch.setattr(worlds, "train", refuse)
-    monkeypatch.setattr(se_performance, "draw", lambda *_: None)
-    pd.testing.assert_frame_equal(performance(ses, tmp_path), table)
-    pd.testing.assert_frame_equal(performance(ses, tmp_path, from_rows=True), table)
-    with pytest.raises(ConfigError, match=r"with another training\.test_episodes"):
-        performance(ses, tmp_path, test_episodes=4)
-
-    fewer = performance(ses, tmp_path, real_groups=1)
-    assert fewer["SEs, agents"].tolist() == ["1, 3", "2, 6"]
-
-    single = trained(se_models, tmp_path, ses=str(ses[0]))  # finds what was trained
+    single = run("se_models", se_models, tmp_path, ses=ses, **given)  # finds what was trained
     assert set(single["SE"]) == {0, 1} and set(single["run's seed"]) == {7, 8}
-    assert (tmp_path / "models.png").stat().st_size > 10_000
 
 
-def check_as_evaluation(ses, agents):
+def check_as_evaluation(ses, rows):
     """Agents of the second groups are those of `make_evaluator` with the same keys and draws."""
-    loaded, task = sejax.load_set(ses[0]), envs.make("cartpole")
+    loaded, task = sejax.load_set(ses), envs.make("cartpole")
     key = jax.random.fold_in(jax.random.key(3), 1)
     keys = jax.numpy.stack([jax.random.fold_in(key, i) for i in range(3)])
-    mine = agents[agents["group"] == f"se-{loaded.seeds[1]:02d}-{loaded[1].fingerprint}"]
+    mine = rows[rows["group"] == f"se-{loaded.seeds[1]:02d}-{loaded[1].fingerprint}"]
     training = sejax.TrainingConfig(max_steps=40, stop_rule="never", test_episodes=2)
     chosen, expected = evaluated(loaded.env, loaded[1].params, task, training, keys)
     np.testing.assert_allclose(mine["test_return"].iloc[chosen], expected.test_return, rtol=1e-6)
     np.testing.assert_allclose(mine["return_0"] + mine["return_1"], 2 * mine["test_return"])
     assert (mine["train_steps"] == 40).all() and mine["hidden_size"].between(1, 6).all()
-    mine = agents[agents["group"] == "real-01"]
+    mine = rows[rows["group"] == "real-01"]
     training = sejax.TrainingConfig(max_episodes=3, max_steps=4000, stop_rule="solved",
                                     solved_by="train", test_episodes=2)  # fmt: skip
     chosen, expected = evaluated(task.env, task.params, task, training, keys)
@@ -530,7 +286,7 @@ def evaluated(env, params, task, training, keys):
     All depths would be compiled otherwise.
     """
     varied = sejax.make_agent(sejax.DDQNConfig(**TINY_AGENT), task, varied=True)
-    draws = jax.vmap(lambda key: varied.draw(drawing_key(key)))(keys)
+    draws = jax.vmap(lambda key: varied.varied.draw(drawing_key(key)))(keys)
     chosen = np.flatnonzero(draws.variant == draws.variant[0])
     agent = varied.varied.agents[int(draws.variant[0])]
 
@@ -543,47 +299,229 @@ def evaluated(env, params, task, training, keys):
     return chosen, jax.tree.map(lambda *x: np.stack(x), *each)
 
 
-def test_ses_learned_otherwise_than_the_option_says_are_refused(ses, tmp_path):
+def test_ses_learned_otherwise_or_of_another_task_are_refused(ses, tmp_path):
     with pytest.raises(ConfigError, match=r"varied must be SEs learned with varied.*fixed="):
-        trained(se_performance, tmp_path, varied=str(ses[0]))
+        run("se_performance", se_performance, tmp_path, varied=ses, fixed=None)
+    with pytest.raises(ConfigError, match="env must be acrobot as the other files"):
+        run("se_performance", se_performance, tmp_path, fixed=ses, env="acrobot")
 
 
-def test_ses_of_another_task_are_refused(ses, tmp_path):
-    with pytest.raises(ConfigError, match="must be of one task"):
-        performance(ses, tmp_path, env="acrobot")
+# --- mixtures and horizons ------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("name", "words", "message"),
-    [("se_feasibility", ["env=cartpol"], "Did you mean env=cartpole"),
-     ("se_performance", ["fixed=none.safetensors"], "does not exist"),
-     ("se_performance", ["agents=[dqn]"], "agents must be one of ddqn"),
-     ("se_models", [], "ses must be given")],
-)  # fmt: skip
-def test_commands_end_bad_input_with_one_message_and_status_2(
-    name, words, message, tmp_path, capsys, monkeypatch
-):
-    module = __import__(f"experiments.{name}", fromlist=["EXPERIMENT"])
-    monkeypatch.setattr(experiment.runtime, "configure_jax", lambda: None)
-    with pytest.raises(SystemExit) as ended:
-        module.EXPERIMENT.main([f"out={tmp_path}", *words])
-    error = capsys.readouterr().err
-    assert ended.value.code == 2 and message in error
-    assert error.startswith("error: ") and error.count("\n") == 1
+def config_with(names, others=(), **given):
+    settings = se_families.SeFamilies.of(quick=True, **given)
+    return settings.config_with(names, others)
 
 
-def test_a_command_refuses_before_it_imports_gymnax(tmp_path):
-    code = ("import runpy, sys; sys.argv[1:] = ['seed=-1']\n"
-            "try: runpy.run_module('experiments.se_models', run_name='__main__')\n"
-            "finally: print('gymnax.environments.environment' in sys.modules)")  # fmt: skip
-    environment = {key: value for key, value in os.environ.items() if key != "XLA_FLAGS"}
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True,
-                          timeout=120, env=environment)  # fmt: skip
-    assert done.returncode == 2 and "seed must lie in" in done.stderr and done.stdout == "False\n"
+def test_words_on_a_family_reach_the_sets_that_have_it():
+    run = ["agents.ppo.epochs=3", "es.noise_std=0.5"]
+    both = config_with(["ddqn", "ppo"], ["ddqn", "ppo"], run=run)
+    assert [(x.key, x.weight) for x in both.agents.families] == [("ddqn", 1), ("ppo", 1)]
+    assert both.agents.families[1].agent.epochs == 3 and both.es.noise_std == 0.5
+    alone = config_with(["ddqn"], ["ddqn", "ppo"], run=run)
+    assert [x.key for x in alone.agents.families] == ["ddqn"] and alone.es.noise_std == 0.5
+    with pytest.raises(ConfigError, match="agents"):
+        config_with(["ddqn"], ["ddqn"], run=["agents.ppo.epochs=3"])
+    assert config_with(["ddqn"], cpu_budget_s=5.0).generations == runs.UNLIMITED
+    assert config_with(["ddqn"], cpu_budget_s=5.0, generations=7).generations == 7
 
 
-def test_all_experiments_are_listed():
-    done = subprocess.run([sys.executable, "-m", "experiments"], capture_output=True,
-                          text=True, timeout=120, check=True)  # fmt: skip
-    for module in (se_feasibility, se_models, se_performance):
-        assert f"  {module.EXPERIMENT.settings.name} " in done.stdout
+def agents_tested(means):
+    """Two agents on each of two SEs; `means` by (set, tested family), SEs 10 apart."""
+    return pd.DataFrame([
+        {"learned_with": name, "kind": kind, "hparams": "default", "seed": seed, "agent": agent,
+         "test_return": mean + 10 * (seed - 0.5) + 2 * (agent - 0.5)}
+        for (name, kind), mean in means.items() for seed in (0, 1) for agent in (0, 1)
+    ])  # fmt: skip
+
+
+MEANS = {("ddqn", "ddqn"): 100.0, ("ddqn", "ppo"): 20.0, ("ddqn+ppo", "ddqn"): 90.0,
+         ("ddqn+ppo", "ppo"): 80.0}  # fmt: skip
+
+
+def family_summary():
+    curves = pd.DataFrame([
+        {"learned_with": name, "seed": seed, "generation": g, "cpu_s": cost,
+         "incumbent_mean": 50.0 + 30 * g * seed, "env_steps_total": 100 * (g + 1)}
+        for name, cost in (("ddqn", 1.0), ("ddqn+ppo", 2.5)) for seed in (0, 1) for g in range(3)
+    ])  # fmt: skip
+    return se_families.summarise(curves, agents_tested(MEANS), solved_reward=96.0)
+
+
+def test_the_matrix_has_means_costs_and_marks_families_that_took_no_part():
+    summary = family_summary()
+    row = summary.iloc[0]  # returns 94, 96, 104, 106
+    assert (row["test_return_mean"], row["solved"], row["num_ses"]) == (100, 0.75, 2)
+    assert np.isnan(row["test_return_low"])  # of two SEs
+    assert row["test_return_iqm"] == 100  # of 96 and 104
+    assert summary["took_part"].tolist() == [True, False, True, True]
+    assert summary["cpu_s"].tolist() == [3, 3, 7.5, 7.5]
+    assert summary["solved_runs"].tolist() == [0.5] * 4 and summary["env_steps"].eq(300).all()
+    table = se_families.make_table(summary)
+    assert table["learned with"].tolist() == ["DDQN", "DDQN + PPO"]
+    assert [text.endswith(se_families.LEFT_OUT) for text in table["PPO"]] == [True, False]
+    assert table["DDQN"][0].startswith("100.0; IQM 100.0 [")
+    with_ends = summary.assign(test_return_low=95.0, test_return_high=105.0)
+    assert se_families.make_table(with_ends)["DDQN"][0].startswith("100.0 [95.0, 105.0]; IQM 100.0")
+
+
+def test_what_is_said_of_families_follows_from_the_rows():
+    summary = family_summary()
+    left_out = se_families.left_out(summary)  # without DDQN there is no set
+    assert left_out.to_dict("list") == {
+        "hparams": ["default"], "kind": ["ppo"], "included": [80], "left_out": [20]
+    }  # fmt: skip
+    text = se_families.findings(summary)
+    assert "mean return is 90.0 on SEs that were learned with it and 20.0 on others" in text
+    assert "reaches most, 80.0, where SEs were learned with DDQN + PPO, for 8 CPU s" in text
+    assert "PPO (default) reaches 20.0 where it alone is left out, and 80.0" in text
+    single = se_families.findings(summary[:1])
+    assert single == "With default hyperparameters a family's mean return is 100.0 on SEs that " \
+        "were learned with it."  # fmt: skip
+
+
+def test_an_unknown_family_is_refused_before_anything_is_learned(tmp_path, monkeypatch):
+    monkeypatch.setattr(runs, "learn", refuse)
+    for given in ({"sets": "ddqn+pppo"}, {"tested": "pppo"}, {"run": ["agents.ddqn.x=1"]}):
+        options = {"sets": "ddqn", "tested": "ddqn", "out": str(tmp_path)} | given
+        with pytest.raises(ConfigError, match=r"^agents must be one of|agents\.ddqn\.x"):
+            se_families.EXPERIMENT.run(se_families.SeFamilies.of(**options))
+
+
+def test_kinds_of_ses_are_told_by_what_they_override():
+    settings = se_horizons.SeHorizons.of(horizons=[1, 5, None], ends=["threshold", "sigmoid"])
+    assert len(settings.kinds) == 2 * (1 + 2 * 2)
+    named = {kind.name: kind.words for kind in settings.kinds}
+    assert named["1-learned"] == ["proxy.horizon=1", "proxy.initial_state=learned"]
+    assert named["limit-real-sigmoid"] == [
+        "proxy.horizon=null", "proxy.initial_state=real", "proxy.done=sigmoid"]  # fmt: skip
+    assert "'horizons=[1,5,null]'" in settings.command()
+
+
+def horizon_rows():
+    """Two kinds with two runs of four generations of 2 CPU s each."""
+    incumbents = {("1", "real", "-"): ([10, 196, 100, 197], [0, 1, 2, 199]),
+                  ("limit", "real", "threshold"): ([5, 5, 5, 300], [5, 5, 5, 5])}  # fmt: skip
+    curves = pd.DataFrame([
+        {"horizon": horizon, "starts": starts, "end": end, "seed": seed, "generation": g,
+         "incumbent_mean": float(score), "cpu_s": 2.0, "train_steps_mean": 30.0,
+         "env_steps_total": 100 * (g + 1)}
+        for (horizon, starts, end), runs in incumbents.items() for seed, scores in enumerate(runs)
+        for g, score in enumerate(scores)
+    ])  # fmt: skip
+    transfer = pd.DataFrame([
+        {"horizon": "1", "starts": "real", "end": "-", "kind": "ppo", "test_return_mean": 180.0},
+        {"horizon": "limit", "starts": "real", "end": "threshold", "kind": "ppo",
+         "test_return_mean": 20.0},
+    ])  # fmt: skip
+    return curves, transfer.assign(hparams="default")
+
+
+def test_runs_are_compared_within_equal_cpu_seconds():
+    curves, transfer = horizon_rows()
+    each = se_horizons.summarise_runs(curves, 5.0, solved_reward=195)
+    assert each["generations"].tolist() == [3] * 4  # begun at 0, 2 and 4 s
+    assert each["best"].tolist() == [196, 2, 5, 5]
+    assert each["to_solve"].tolist() == each["cpu_s_to_solve"].div(2).tolist()
+    assert each["cpu_s_to_solve"].tolist() == [4, np.inf, np.inf, np.inf]
+    assert each["stays_solved"][0] == 0 and each["stays_solved"][1:].isna().all()
+    whole = se_horizons.summarise_runs(curves, None, solved_reward=195)
+    assert whole["stays_solved"][0] == 0.5 and whole["best"].tolist() == [197, 199, 300, 5]
+    assert np.isnan(whole["stays_solved"][1])  # no later generation
+
+    summary = se_horizons.summarise(each, transfer)
+    assert summary["best_mean"].tolist() == [99, 5] and summary["on_ppo"].tolist() == [180, 20]
+    assert (summary["best_low"][0], summary["best_high"][0]) == (2, 196)
+    table = se_horizons.make_table(summary)
+    assert table["runs solved"].tolist() == ["1 of 2", "0 of 2"]
+    assert table["CPU s to solve"].tolist() == ["-", "-"]
+    assert table["stay solved"].tolist() == ["0%", "-"]
+    text = se_horizons.findings(each, summary, "threshold")
+    assert "horizon 1 less horizon limit: +94.0 [-3.0, 191.0]" in text
+    assert "the tested families reach 180.0 and 20.0" in text
+
+
+# --- tuning ---------------------------------------------------------------------------------------
+
+
+def test_rank_correlations_are_those_of_scipy():
+    rng = np.random.default_rng(0)
+    a, b = rng.integers(0, 5, 30), rng.normal(size=30)  # with ties
+    expected = spearmanr(a, b).statistic
+    assert se_transfer_of_hparams.rank_correlation(a, b) == pytest.approx(expected)
+    assert np.isnan(se_transfer_of_hparams.rank_correlation(np.ones(4), b[:4]))
+
+
+def tuning_rows():
+    """Three configurations with two agents each; on the SE the last is best, in truth the first."""
+    returns = {"se": [[10, 10], [20, 20], [30, 30]], "same": [[90, 80], [50, 100], [40, 30]]}
+    return pd.DataFrame([
+        {"world": world, "config": config, "agent": agent, "test_return": float(x),
+         "train_steps": 100, "cpu_s": 0.5}
+        for world, configs in returns.items() for config, agents in enumerate(configs)
+        for agent, x in enumerate(agents)
+    ])  # fmt: skip
+
+
+def test_one_half_of_the_real_agents_judges_what_the_other_chose():
+    rows = tuning_rows()
+    se, same = (se_transfer_of_hparams.returns_by_half(rows, x) for x in ("se", "same"))
+    np.testing.assert_array_equal(se, [[10, 20, 30]] * 2)
+    np.testing.assert_array_equal(same, [[90, 50, 40], [80, 100, 30]])
+    # Even agents choose the first, worth 80 to the odd ones; these the second, worth 50 to those.
+    # The SE chooses the last, worth 30 and 40; a random one is worth 65. Ranks of the means 85, 75
+    # and 35 are those of the SE turned round; the halves rank 3 2 1 and 2 3 1.
+    own = se_transfer_of_hparams.quality(same, same)
+    assert own == pytest.approx({"rho": 0.5, "chosen": 65, "regret": 0, "regret_random": 0})
+    by_se = se_transfer_of_hparams.quality(se, same)
+    assert by_se == pytest.approx({"rho": -1, "chosen": 35, "regret": 30, "regret_random": 0})
+
+    summary = se_transfer_of_hparams.summarise(rows)
+    assert summary["chosen_by"].tolist() == ["se", "same"]
+    assert summary["train_steps"].tolist() == [600, 300]
+    assert summary["cpu_s"].tolist() == [3, 1.5]
+    assert summary["regret_high"][0] >= 30 >= summary["regret_low"][0]
+    assert (summary["regret_low"][1], summary["regret_high"][1]) == (0, 0)
+    text = se_transfer_of_hparams.findings(summary)
+    assert "loses 30.0 [" in text and "took 2.00 times the steps" in text
+
+
+def test_agents_of_a_configuration_share_what_is_drawn():
+    """Stands in for training: an agent's "return" is its learning rate, and a number of its own."""
+    config = sejax.DDQNConfig(hidden_size=2, num_layers=1)
+    agent = sejax.make_agent(config, envs.make("cartpole"), varied=True)
+    hparams = {"learning_rate": 0.0}
+
+    def evaluator(agent, env, task, training):
+        hparams["learning_rate"] = agent.hparams.learning_rate
+        return lambda key, env_params, active: (
+            agent.hparams.learning_rate, jax.random.uniform(key)
+        )  # fmt: skip
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sejax, "make_evaluator", evaluator)
+        run = se_transfer_of_hparams.make_shared_draws(agent, None, None, None)
+        places = [np.asarray(jax.random.key_data(jax.random.key(i))) for i in (0, 1)]
+        made = {(i, seed): run(jax.random.key(seed), (None, places[i]), True)
+                for i in (0, 1) for seed in (0, 1)}  # fmt: skip
+    rates = {place: float(result[0]) for place, (result, _) in made.items()}
+    assert rates[0, 0] == rates[0, 1] != rates[1, 0] == rates[1, 1]
+    assert rates[0, 0] == float(made[0, 0][1]["learning_rate"])
+    assert rates[0, 0] == float(agent.drawn_values(jax.random.key(0))["learning_rate"])
+    assert made[0, 0][0][1] != made[0, 1][0][1]
+
+
+def test_a_tuned_agent_trains_on_the_real_task_as_long_as_on_the_se():
+    of = se_transfer_of_hparams.SeTransferOfHparams.of
+    parts = se_transfer_of_hparams.parts_of(of(run=["agent.batch_size=7"]))
+    assert parts.agent.batch_size == 7 and len(parts.ses) == 1
+    trainings = parts.trainings
+    assert list(trainings) == ["se", "same", "long"]
+    assert trainings["same"].max_steps == trainings["se"].max_steps == 2000
+    assert trainings["same"].stop_rule == "never" and trainings["long"].stop_rule == "solved"
+    assert dataclasses.asdict(trainings["long"])["max_steps"] == 100_000
+    with pytest.raises(ConfigError, match=r"ses must be of acrobot.*env=cartpole"):
+        se_transfer_of_hparams.parts_of(of(env="acrobot", ses="cartpole"))
+    with pytest.raises(ConfigError, match="num_agents must be at least 2"):
+        of(num_agents=1)

@@ -1,6 +1,5 @@
 """The experiments on score transforms, on histograms of SEs and on supervised models."""
 
-import re
 from types import SimpleNamespace
 
 import jax
@@ -8,68 +7,26 @@ import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 import pytest
-from support import numpy_forward, refuse
+from support import numpy_forward
+from test_experiments import TINY_AGENT, save_ses
 
 import sejax
-from experiments import (
-    pieces,
-    score_transforms,
-    se_agents,
-    se_histograms,
-    supervised_baseline,
-    supervised_models,
-    worlds,
-)
-from experiments.statistics import bootstrap_interval
-from sejax import envs
-from sejax.bilevel import make_program
-from sejax.cli import build
+from experiments import score_transforms, se_histograms, supervised_baseline
+from experiments.common import supervised_models
+from experiments.common.statistics import bootstrap_interval
+from sejax.bilevel import make_bilevel
 from sejax.errors import ConfigError
 from sejax.evaluation import make_recorder, make_tester
 from sejax.training import make_trainer
-
-TINY_AGENT = {"hidden_size": 2, "num_layers": 1, "batch_size": 4, "warmup_episodes": 0}
-TINY_TRANSFORMS = {"runs": 3, "generations": 2, "population": 2}
-TINY_HISTOGRAMS = {"agents": "ddqn", "num_agents": 2, "test_episodes": 2, "max_rows": 50}
-TINY_MODELS = {"models": 3, "generations": 2, "population": 2, "max_rows": 30, "epochs": 2,
-               "num_agents": 2, "test_episodes": 2}  # fmt: skip
-
-
-def run(module, out, **given):
-    """The table of an experiment with `quick=true` and these settings."""
-    asked = module.EXPERIMENT.settings.of(quick=True, seed=3, out=str(out), **given)
-    return module.EXPERIMENT.run(asked)
-
-
-def save_se(path, *overrides):
-    """Writes an SE of random weights that was learned with these settings."""
-    config = sejax.config(["proxy.hidden_size=4", *overrides])
-    env = config.parts()["proxy"]
-    weights = env.init_weights(jax.random.key(5))
-    sejax.save(path, env, weights, build.to_plain(config), score=1.0, seed=0)
-    return str(path)
 
 
 @pytest.fixture(scope="module")
 def se_file(tmp_path_factory):
     path = tmp_path_factory.mktemp("se") / "se.safetensors"
-    return save_se(path, "preset=soft", "training.max_steps=60", "agent.warmup_episodes=0")
+    return save_ses(path, 1, "preset=soft", "training.max_steps=60")
 
 
-@pytest.fixture
-def small(monkeypatch):
-    """Agents and budgets that cost nothing."""
-    monkeypatch.setattr(se_agents, "QUICK_AGENT", TINY_AGENT)
-    monkeypatch.setattr(se_agents, "QUICK_STEPS", 60)
-
-
-# Score transforms.
-
-
-@pytest.fixture
-def few_lanes(monkeypatch):
-    """Lanes that these few runs fill."""
-    monkeypatch.setattr(score_transforms, "CPU_LANES", 8)
+# --- score transforms -----------------------------------------------------------------------------
 
 
 def test_step_sizes_are_spread_evenly_over_the_logarithm():
@@ -87,8 +44,7 @@ class ScriptedSearch:
         self.solved_at = np.asarray(solved_at)
         self.advanced = 0
 
-    def init(self, keys, sizes, transform):
-        assert transform == score_transforms.SCORE_TRANSFORMS.index("nes")
+    def init(self, keys, sizes):
         np.testing.assert_allclose(sizes, score_transforms.draw_step_sizes(len(keys), 3), rtol=1e-6)
         none = np.zeros(len(keys), int)
         return SimpleNamespace(generation=none, finished=none > 0, incumbent_score=none)
@@ -119,28 +75,28 @@ def test_a_run_counts_the_updates_before_the_incumbent_that_solves_the_task(
 
 
 @pytest.mark.slow
-def test_the_search_is_the_bilevel_loop(few_lanes):
-    search = score_transforms.make_search(True, 2, None)
+def test_the_search_is_the_bilevel_loop(monkeypatch):
+    monkeypatch.setattr(score_transforms, "RUNS_AT_ONCE", 2)
+    search = score_transforms.make_search("single_best", True, 2, None)
     keys, sizes = jax.random.split(jax.random.key(0), 3), np.float32([0.1, 1.0, 5.0])
-    transform = score_transforms.SCORE_TRANSFORMS.index("single_best")
-    state = start = search.init(keys, sizes, transform)
+    state = start = search.init(keys, sizes)
     config = sejax.config([*score_transforms.SETTINGS, "es.score_transform=single_best",
                            "es.mirrored=true", "es.population_size=2"])  # fmt: skip
-    program = make_program(**config.parts())
+    program = make_bilevel(**config.parts())
 
     @jax.jit
     def init(keys):
-        state = program.init(keys)
+        state = jax.vmap(program.init)(keys)
         return state.replace(es_state=state.es_state.replace(step_size=jnp.asarray(sizes)))
 
-    expected, generation = init(keys), jax.jit(program.generation)
+    expected, generation = init(keys), jax.jit(jax.vmap(program.generation))
     for _ in range(2):
         state = search.advance(state)
         expected, _ = generation(expected)
     for new, old in zip(jax.tree.leaves(state), jax.tree.leaves(start), strict=True):
         assert new.sharding.is_equivalent_to(old.sharding, old.ndim), "else it is compiled twice"
     np.testing.assert_allclose(state.incumbent_score, expected.incumbent_score, rtol=1e-5)
-    np.testing.assert_allclose(state.es_state.nes.mean, expected.es_state.mean, rtol=1e-4,
+    np.testing.assert_allclose(state.es_state.mean, expected.es_state.mean, rtol=1e-4,
                                atol=1e-6)  # fmt: skip
 
 
@@ -152,10 +108,13 @@ def test_the_best_bin_and_the_ranks_are_those_of_the_means():
     })  # fmt: skip
     summary = score_transforms.summarise(runs, bins=3)  # edges 0.01, 0.1, 1, 10
     first, second = summary.itertuples()
-    assert (first.transform, first.updates, first.solved) == ("nes", 6.0, 1.0)
-    assert (second.transform, second.updates, second.solved) == ("rank", 16.0, 0.75)
-    assert second.best_updates == 4 and second.best_low == pytest.approx(0.1)
-    assert (first.behind, second.behind) == (0.0, 10.0)  # runs are 5, 15, -1 and 21 behind
+    assert (first.transform, first.updates_mean, first.solved) == ("nes", 6.0, 1.0)
+    assert (second.transform, second.updates_mean) == ("rank", 16.0) and second.solved == 0.75
+    assert second.best_updates == 4 and second.best_from == pytest.approx(0.1)
+    assert (first.behind_mean, second.behind_mean) == (
+        0.0,
+        10.0,
+    )  # by 5, 15, -1, 21
     ends = bootstrap_interval([5, 15, -1, 21])
     assert (second.behind_low, second.behind_high) == pytest.approx(ends)
     assert score_transforms.share_of_best(runs) == {True: pytest.approx(1 - (1 / 4) ** 4, abs=0.01)}
@@ -165,27 +124,7 @@ def test_the_best_bin_and_the_ranks_are_those_of_the_means():
     assert list(table["rank"]) == ["1", "2"] and list(table["rank there"]) == ["2", "1"]
 
 
-@pytest.mark.slow
-def test_score_transforms_run_and_go_on_where_they_stopped(tmp_path, monkeypatch, few_lanes):
-    table = run(score_transforms, tmp_path, **TINY_TRANSFORMS)
-    assert len(table) == 16 and (tmp_path / "score_transforms.png").stat().st_size > 10_000
-    runs = pieces.read_rows(tmp_path / "rows.csv.xz")
-    assert len(runs) == 16 * 3 and runs["updates"].between(0, 2).all()
-    assert (runs["solved"] == (runs["last_score"] >= 0.8)).all()
-    sizes = runs.pivot(index=["transform", "mirrored"], columns="run", values="step_size")
-    assert (sizes.nunique() == 1).all(), "all cells have the same step sizes"
-    (tmp_path / "work" / "pieces" / "rank-plain.csv").unlink()
-    compute = score_transforms.compute_cell
-    made = []
-    monkeypatch.setattr(score_transforms, "compute_cell",
-                        lambda *args: made.append(args[1:]) or compute(*args))  # fmt: skip
-    assert run(score_transforms, tmp_path, **TINY_TRANSFORMS).equals(table)
-    assert made == [("rank", False)]
-    with pytest.raises(ConfigError, match="another generations"):
-        run(score_transforms, tmp_path, **TINY_TRANSFORMS | {"generations": 3})
-
-
-# Histograms.
+# --- histograms -----------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("capacity", [200, 25])
@@ -249,46 +188,7 @@ def test_the_table_says_which_distribution_the_response_is_closer_to():
     assert table["return"][0] == "1.50 ± 0.71", "of the two test episodes"
 
 
-def test_histograms_run_and_go_on_where_they_stopped(se_file, tmp_path, monkeypatch, small):
-    options = TINY_HISTOGRAMS | {"proxy": se_file}
-    table = run(se_histograms, tmp_path, **options)
-    assert len(table) == 5 and (tmp_path / "histograms.png").stat().st_size > 10_000
-    rows = pieces.read_rows(tmp_path / "work" / "rows.csv.xz")
-    by_source = rows.groupby("source").size()
-    assert by_source["train"] == 2 * 50 and by_source["test"] == by_source["response"]
-    test, response = (rows[rows["source"] == name] for name in ("test", "response"))
-    assert (test["reward"] == 1).all() and (test.groupby(["agent", "episode"]).size() > 5).all()
-    check_responses(sejax.load_set(se_file), test, response)
-    monkeypatch.setattr(worlds, "train", refuse)
-    assert run(se_histograms, tmp_path, **options).equals(table)
-    with pytest.raises(ConfigError, match="another max_rows"):
-        run(se_histograms, tmp_path, **options | {"max_rows": 40})
-
-
-def check_responses(ses, test, response):
-    """What the SE says to a real state, which is the next one of the row before."""
-    states = [f"state_{i}" for i in range(4)]
-    task = ses.task
-    _, template = task.env.reset_env(jax.random.key(0), task.params)
-    actions = set()
-    for row in range(1, 9):
-        state, came = (np.float32(test[states].iloc[i]) for i in (row - 1, row))
-        values = dict(zip(("x", "x_dot", "theta", "theta_dot"), state, strict=True))
-        moves = [
-            task.env.step_env(jax.random.key(0), template.replace(**values), a, task.params)[0]
-            for a in (0, 1)
-        ]
-        if min(np.abs(move - came).max() for move in moves) > 1e-4:
-            continue  # another episode begins
-        action = int(np.argmin([np.abs(move - came).max() for move in moves]))
-        vector, reward, _ = ses.env.predict(ses[0].params.weights, jnp.float32(state), action)
-        said = response[[*states, "reward"]].iloc[row].to_numpy(float)
-        np.testing.assert_allclose(np.append(vector, reward), said, atol=1e-4)
-        actions.add(action)
-    assert actions
-
-
-# Supervised models.
+# --- supervised models ----------------------------------------------------------------------------
 
 
 def test_a_sample_is_uniform_over_all_that_was_added():
@@ -375,31 +275,6 @@ def test_intervals_draw_models_and_the_best_ones_are_those_of_the_best_episodes(
     assert supervised_baseline.with_best(few, [1.0, 2.0]) is few
 
 
-@pytest.mark.slow
-def test_the_supervised_baseline_runs_and_goes_on(se_file, tmp_path, monkeypatch, small):
-    options = TINY_MODELS | {"proxy": se_file, "hparams": "default"}
-    table = run(supervised_baseline, tmp_path, **options)
-    labels = list(supervised_baseline.LABELS.values())
-    assert list(table["trained on"]) == labels
-    assert (tmp_path / "supervised_baseline.png").stat().st_size > 10_000
-    check_real_transitions(pd.read_csv(tmp_path / "work" / "pieces" / "transitions-0.csv"))
-    check_models(tmp_path)
-    monkeypatch.setattr(supervised_models, "collect", refuse)
-    monkeypatch.setattr(supervised_baseline, "draw", lambda *_: None)
-    monkeypatch.setattr(supervised_models, "fit_all", refuse)
-    monkeypatch.setattr(worlds, "train", refuse)
-    assert run(supervised_baseline, tmp_path, **options).equals(table)
-    with pytest.raises(ConfigError, match="another num_agents"):
-        run(supervised_baseline, tmp_path, **options | {"num_agents": 3})
-    # Agents with drawn hyperparameters are rows of the same table.
-    rows = pieces.read_rows(tmp_path / "rows.csv.xz")
-    drawn = rows[rows["table"] == "agents"].assign(hparams="varied")
-    pieces.write_rows(tmp_path / "rows.csv.xz", pd.concat([rows, drawn]))
-    both = run(supervised_baseline, tmp_path, **options, from_rows=True)
-    assert list(both["trained on"]) == labels * 2
-    pd.testing.assert_frame_equal(both[4:].reset_index(drop=True), table)
-
-
 def test_a_recorded_run_is_the_bilevel_loop():
     """With the solved rule, whose agents are tested between episodes."""
     config = sejax.config(["proxy.hidden_size=4", "training.stop_rule=solved",
@@ -409,66 +284,20 @@ def test_a_recorded_run_is_the_bilevel_loop():
                            "es.population_size=2", "es.num_incumbent_evals=1",
                            "es.mirrored=false"])  # fmt: skip
     recorded = supervised_models.make_recorded_run(config)
-    program = make_program(**config.parts())
+    program = make_bilevel(**config.parts())
     key = jax.random.key(7)
-    state, steps = recorded.generation(recorded.init(key[None]))
-    expected, info = jax.jit(program.generation)(jax.jit(program.init)(key[None]))
+    state, steps = recorded.generation(recorded.init(key))
+    expected, info = jax.jit(program.generation)(jax.jit(program.init)(key))
     np.testing.assert_allclose(state.es_state.mean, expected.es_state.mean, rtol=1e-4, atol=1e-6)
     # Those tests between episodes count as real steps, but are not recorded.
-    assert int(info.env_steps_wide[0, 1]) > int(steps.valid.sum()) > 0
+    assert int(info.real_steps.sum()) > int(steps.valid.sum()) > 0
 
 
 @pytest.mark.parametrize("overrides", [["agent=ppo"], ["agent=td3_discrete",
                                                         "agent.action_repeat=2"]])  # fmt: skip
 def test_ses_whose_tests_cannot_be_recorded_are_refused(overrides, tmp_path):
     words = ("preset=soft", "training.max_steps=9000", *overrides)
-    path = save_se(tmp_path / "se.safetensors", *words)
+    path = save_ses(tmp_path / "se.safetensors", 1, *words)
+    settings = supervised_baseline.SupervisedBaseline.of(quick=True, out=str(tmp_path), proxy=path)
     with pytest.raises(ConfigError, match="without action repeat"):
-        run(supervised_baseline, tmp_path, proxy=path)
-
-
-def check_real_transitions(rows):
-    """Each row is one step of the real task."""
-    assert len(rows) == 30 and set(rows["generation"]) == {0, 1} and (rows["reward"] == 1).all()
-    task = envs.make("cartpole")
-    names = ("x", "x_dot", "theta", "theta_dot")
-    _, start = task.env.reset_env(jax.random.key(0), task.params)
-    for _, row in rows.iterrows():
-        state = start.replace(**{x: jnp.float32(row[f"state_{i}"]) for i, x in enumerate(names)})
-        obs, _, _, terminated, _ = task.env.step_env(
-            jax.random.key(0), state, jnp.int32(row["action"]), task.params
-        )
-        np.testing.assert_allclose(obs, [row[f"next_state_{i}"] for i in range(4)], atol=1e-5)
-        assert bool(terminated) == bool(row["terminated"])
-
-
-def check_models(folder):
-    """The variants differ in the network for the end and in what is made of it only."""
-    authors, fair = (
-        sejax.load_set(folder / f"models-{name}.safetensors") for name in ("authors", "fair")
-    )
-    assert authors.size == fair.size == 3
-    assert [x.config["proxy"]["done"] for x in (authors, fair)] == ["soft", "threshold"]
-    for head, same in (("state", True), ("reward", True), ("done", False)):
-        pairs = zip(jax.tree.leaves(authors.weights[head]), jax.tree.leaves(fair.weights[head]),
-                    strict=True)  # fmt: skip
-        assert all(np.array_equal(a, b) for a, b in pairs) == same, head
-
-
-@pytest.mark.parametrize(
-    ("module", "words", "message"),
-    [
-        (score_transforms, ["runs=0"], "runs must be at least 1.*got 0.*Set runs="),
-        (score_transforms, ["population=1"], "population must be at least 2"),
-        (se_histograms, ["agents=[ddqm]"], "agents must be one of ddqn.*got .ddqm"),
-        (se_histograms, ["proxy=nowhere"], "cartpole.*got .nowhere"),
-        (supervised_baseline, ["epochs=0"], "epochs must be at least 1.*Set epochs=100"),
-        (supervised_baseline, ["agents=ppo"], "agents must be one of.*got .ppo"),
-    ],
-)
-def test_bad_input_ends_with_one_message_and_status_2(module, words, message, tmp_path, capsys):
-    with pytest.raises(SystemExit) as ended:
-        module.EXPERIMENT.main([f"out={tmp_path}", *words])
-    assert ended.value.code == 2
-    error = capsys.readouterr().err
-    assert re.search(message, error) and error.count("error:") == 1
+        supervised_baseline.EXPERIMENT.run(settings)

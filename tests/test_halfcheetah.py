@@ -118,26 +118,11 @@ def test_it_is_paid_for_running_and_pays_for_its_torques(real):
     assert (info["discount"] == 1.0).all()
 
 
-def test_limits_and_sizes_are_the_papers(task):
-    assert (task.max_steps, task.solved_reward) == (1000, 3000.0)
-    assert (task.obs_dim, task.action_dim, task.max_action) == (17, 6, 1.0)
-    assert task.num_states is None and task.num_actions is None
-
-
 def test_each_reset_draws_another_state_and_the_limit_truncates(task, real_walk):
     obs = [real_walk(key)[1] for key in jax.random.split(jax.random.key(0), 2)]
     assert np.abs(obs[0] - obs[1]).max() > 1e-3
     late = CheetahTime(time=jnp.array([999, 1000]))
     assert list(task.env.is_truncated(late, task.params)) == [False, True]
-
-
-def test_reward_networks_keep_what_the_physics_carry(task):
-    env = RewardConfig(augmented=True, hidden_size=4).make(task)
-    obs, state = jax.eval_shape(env.reset_env, jax.random.key(0), env.default_params)
-    after, next_state, reward, *_ = jax.eval_shape(
-        env.step_env, jax.random.key(0), state, jnp.zeros(6), env.default_params
-    )
-    assert (after, next_state) == (obs, state) and reward.shape == ()
 
 
 def test_augmented_potentials_see_position_and_velocity_of_either_state(replayed, walk, real):
@@ -169,29 +154,30 @@ def test_weighted_info_is_a_linear_reward(replayed, walk):
 def test_the_papers_settings_are_its_own():
     config = sejax.config(["env=halfcheetah", "proxy=rn", "preset=paper", "proxy.augmented=true"])
     agent = config.agent
-    assert (config.name("agent"), agent.warmup_episodes, agent.discount, agent.activation) == (
-        "td3", 20, 0.98, "relu",
-    )  # fmt: skip
+    assert config.name("agent") == "td3" and config.name("objective") == "reward_threshold"
+    assert (agent.warmup_episodes, agent.discount, agent.activation) == (20, 0.98, "relu")
     assert (config.proxy.hidden_size, config.proxy.activation) == (128, "prelu")
-    assert config.name("objective") == "reward_threshold" and config.generations == 50
+    assert config.generations == 50
+
+
+ENV, RN = "env=halfcheetah", "proxy=rn"
+WEIGHTED = "proxy.variant=exclusive_weighted_info"
 
 
 @pytest.mark.parametrize(
     ("overrides", "said"),
     [
-        (["env=halfcheetah", "proxy=rn", "env.backend=sprung"], "spring"),
+        ([ENV, RN, "env.backend=sprung"], "spring"),
         (["env=cartpole", "+env.backend=mjx"], r"env\.backend must be a field of CartPole"),
-        (["env=halfcheetah", "preset=paper"], "preset=paper for halfcheetah with proxy=se"),
-        (["env=cartpole", "proxy=rn", "proxy.augmented=true"], "proxy.augmented=false"),
-        (["env=reacher", "proxy=rn", "proxy.augmented=true"], "proxy.augmented=false"),  # has no v
-        (["env=cartpole", "proxy=rn", "proxy.variant=additive_weighted_info"], "potential"),
-        (["env=halfcheetah", "proxy=rn", "proxy.variant=exclusive_weighted_info",
-          "proxy.augmented=true"], "has no network"),
-        (["env=halfcheetah", "proxy=rn", "proxy.variant=exclusive_weighted_info",
-          "proxy.zero_at_terminal=true"], "has no network"),
-        (["env=halfcheetah", "proxy=rn", "agent=ddqn"], "td3"),
+        ([ENV, "preset=paper"], "preset=paper for halfcheetah with proxy=se"),
+        (["env=cartpole", RN, "proxy.augmented=true"], "proxy.augmented=false"),
+        (["env=reacher", RN, "proxy.augmented=true"], "proxy.augmented=false"),  # has no v
+        (["env=cartpole", RN, "proxy.variant=additive_weighted_info"], "potential"),
+        ([ENV, RN, WEIGHTED, "proxy.augmented=true"], "has no network"),
+        ([ENV, RN, WEIGHTED, "proxy.zero_at_terminal=true"], "has no network"),
+        ([ENV, RN, "agent=ddqn"], "td3"),
     ],
-)  # fmt: skip
+)
 def test_what_makes_no_sense_is_refused(overrides, said):
     with pytest.raises(ConfigError, match=said):
         sejax.config(overrides)

@@ -598,8 +598,8 @@ def test_what_is_no_dataclass_is_the_same_as_itself_alone():
         make = Torso.make
 
     task, one = envs.make("cliff_walking"), Mine()
-    assert sejax.make_agent(one, task) is sejax.make_agent(one, task)
-    assert sejax.make_agent(one, task) is not sejax.make_agent(Mine(), task)
+    assert registry.make("agent", one, task) is registry.make("agent", one, task)
+    assert registry.make("agent", one, task) is not registry.make("agent", Mine(), task)
 
 
 def test_a_tasks_lists_and_what_may_be_none_are_options_of_the_command_line(module):

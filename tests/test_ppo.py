@@ -343,14 +343,6 @@ def test_a_step_without_a_phase_does_none_of_its_work(kind, epochs):
     assert long and all(" parameter(" in line for line in long), "\n".join(long)
 
 
-def test_a_state_keeps_its_types_so_that_loops_may_carry_it(kind, agent, state):
-    for full in (True, False):
-        after = jax.eval_shape(agent.update, KEY, state, rollout(kind, is_full=full))
-        before = jax.eval_shape(lambda: state)
-        assert jax.tree.leaves(after) == jax.tree.leaves(before)  # shape, dtype and weak type
-    assert agent.begin_episode(state, jnp.int32(3)) is state
-
-
 def test_the_std_stops_at_its_floor_and_can_grow_again():
     agent = ppo("continuous")
     update = jax.jit(agent.update)
@@ -499,25 +491,6 @@ def test_log_probabilities_and_entropies_by_hand():
     log_prob, entropy = evaluate(np.zeros((2, 1), np.float32), std, action)
     np.testing.assert_allclose(np.exp(log_prob), np.exp(-2.5) / (2 * np.pi), rtol=1e-6)
     np.testing.assert_allclose(entropy, [np.log(2 * np.pi) + 1], rtol=1e-6)
-
-
-def test_an_agent_has_either_discrete_or_continuous_actions():
-    for num_actions, action_dim in ((None, None), (2, 1)):
-        with pytest.raises(ValueError, match=r"either num_actions .* or action_dim .*; got num_a"):
-            make_ppo(CONFIG, OBS_DIM, num_actions, action_dim, MAX_ACTION, MAX_STEPS)
-
-
-def test_the_agent_says_what_was_configured(agent):
-    assert agent.hparams._asdict() == {
-        "learning_rate": 0.01, "discount": 0.9, "clip_ratio": 0.05, "value_weight": 0.7,
-        "gae_lambda": 0.8 if agent is ppo("gae") else 0.95, "entropy_weight": 0.05,
-        "hidden_size": None,  # all of it
-    }  # fmt: skip
-    assert (agent.spec.warmup_episodes, agent.spec.learns_from, agent.spec.action_repeat) == (
-        1,
-        0,
-        1,
-    )
 
 
 # --- probes --------------------------------------------------------------------------------------

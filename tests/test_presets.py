@@ -6,7 +6,7 @@ import functools
 import pytest
 
 import sejax
-from experiments.rn_studies import STUDIES
+from experiments.common.reward_networks import STUDIES
 from sejax import registry
 from sejax.agents.dqn import DDQNConfig
 from sejax.agents.ppo import PPOConfig
@@ -205,7 +205,7 @@ def test_the_best_preset_has_a_quick_td3_for_continuous_tasks(env):
 def test_ppo_on_rns_is_the_papers_and_trains_for_more_episodes(env, preset):
     composed = composed_with(f"env={env}", "proxy=rn", f"preset={preset}", "agent=ppo")
     assert composed.training.max_episodes == 1000
-    assert composed.agent == STUDIES[env].transfer_agent  # see test_experiments_tables.py
+    assert composed.agent == STUDIES[env].transfer_agent  # see test_experiments_rn.py
 
 
 def test_the_best_preset_has_a_quick_ppo_for_mountain_car_continuous():

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import sejax
-from experiments.rn_studies import OBJECTIVES
+from experiments.common.reward_networks import OBJECTIVES
 from sejax import registry
 from sejax.bilevel import make_learner
 from sejax.proxies.configs import VARIANTS

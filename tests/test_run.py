@@ -131,7 +131,9 @@ def test_a_finished_run_is_left_as_it_is(uninterrupted):
     assert (uninterrupted / "metrics.csv").read_bytes() == before
 
 
-def test_seeds_run_one_after_the_other_on_one_executable(uninterrupted, tmp_path, monkeypatch):
+def test_seeds_run_one_after_the_other_on_one_executable(
+    uninterrupted, tmp_path, monkeypatch, capsys
+):
     compiled, compile_ = [], session.Chunks.compile
     monkeypatch.setattr(
         session.Chunks, "compile", lambda self, n: (compiled.append(n), compile_(self, n))
@@ -139,6 +141,10 @@ def test_seeds_run_one_after_the_other_on_one_executable(uninterrupted, tmp_path
     words = ["generations=6", "checkpoint_every=2", "num_seeds=2", f"run_dir={tmp_path}"]
     best = run.learn(sejax.config([*TINY, *words]))
     assert compiled == [2]
+    said = capsys.readouterr().out
+    assert all(
+        f"{tmp_path}/seed{seed}" in said.split("Best incumbent scores:")[1] for seed in (12, 13)
+    )
     assert {path.name for path in tmp_path.iterdir()} == {"seed12", "seed13"}
     for seed, score in zip((12, 13), best, strict=True):
         folder = tmp_path / f"seed{seed}"

@@ -128,49 +128,6 @@ def test_updates_equal_torchs_on_the_same_batches_and_noise(case):
                 )
 
 
-@KINDS
-def test_updates_are_learning_steps_on_noise_drawn_from_the_key_alone_and_in_lanes(case):
-    base, batch = state_of(case), case_batch(case, 0)
-    num_parallel = [base.replace(hparams=base.hparams._replace(learning_rate=np.float32(rate)))
-             for rate in (0.01, 0.1)]  # fmt: skip
-    stacked = jax.tree.map(lambda *x: np.stack(x), *num_parallel)
-
-    @jax.jit
-    def run(key):
-        noise = policy_of(case).draw(key, BATCH)
-        return noise, jax.vmap(agent_of(case).update, (None, 0, None))(key, stacked, batch)
-
-    noise, together = run(jax.random.key(3))
-    for i, lane in enumerate(num_parallel):
-        alone = learn_of(case)(lane, batch, noise)
-        assert_close(jax.tree.map(lambda x, i=i: x[i], together), alone, rtol=1e-5, atol=1e-7)
-
-
-@KINDS
-def test_columns_of_no_weight_change_nothing(case):
-    batch, noise = case_batch(case, 0), case_noise(case, 0)
-    is_padding = batch.weight == 0
-    other = batch._replace(reward=batch.reward + 3 * is_padding, obs=batch.obs + 3 * is_padding)
-    a, b = (learn_of(case)(state_of(case), x, noise) for x in (batch, other))
-    assert_close(a, b, rtol=1e-6, atol=1e-8)
-    counted = batch._replace(weight=np.ones(BATCH, np.float32))
-    all_count = learn_of(case)(state_of(case), counted, noise)
-    assert not np.allclose(a.opt_state.mu, all_count.opt_state.mu, rtol=1e-3)
-
-
-@KINDS
-def test_a_transition_with_discount_zero_ignores_its_next_state(case):
-    def gradient(batch):  # Adam's first mean: 0.1 g
-        return learn_of(case)(state_of(case), batch, case_noise(case, 0)).opt_state.mu
-
-    batch = case_batch(case, 0, discount=np.zeros(BATCH))
-    elsewhere = batch._replace(next_obs=batch.next_obs + 3.0)
-    np.testing.assert_array_equal(gradient(batch), gradient(elsewhere))
-    ones = np.ones(BATCH, np.float32)
-    a, b = (gradient(x._replace(discount=ones)) for x in (batch, elsewhere))
-    assert np.abs(a - b).max() > 1e-3
-
-
 # --- by hand -------------------------------------------------------------------------------------
 
 
@@ -334,33 +291,16 @@ def test_the_world_takes_continuous_actions_in_its_own_units():
 # --- the agent as a whole ------------------------------------------------------------------------
 
 
-@KINDS
-def test_the_state_keeps_its_types(case):
-    agent = agent_of(case)
-
-    def types(fn, *args):
-        return jax.tree.map(lambda x: (x.shape, x.dtype, x.weak_type), jax.eval_shape(fn, *args))
-
-    kept = types(agent.init, jax.random.key(0), agent.hparams)
-    assert types(lambda x: x, state_of(case)) == kept
-    assert types(agent.begin_episode, state_of(case), jnp.int32(1)) == kept
-    assert types(agent.update, jax.random.key(0), state_of(case), case_batch(case, 0)) == kept
-    acting = [
-        types(functools.partial(agent.act, explore=explore), jax.random.key(0), state_of(case), OBS)
-        for explore in (True, False)
-    ]
-    action = ((), jnp.int32, False) if CASES[case][0] else ((ACTION_DIM,), jnp.float32, False)
-    assert acting == [action] * 2
-
-
 def test_one_configuration_serves_both_kinds_of_actions():
     assert set(SACConfig.actions) == {"discrete", "continuous"}
-    discrete = SimpleNamespace(obs_dim=OBS_DIM, num_actions=ACTION_DIM)
+    discrete = SimpleNamespace(name="task", obs_dim=OBS_DIM, num_actions=ACTION_DIM)
     continuous = SimpleNamespace(
-        obs_dim=OBS_DIM, num_actions=None, action_dim=ACTION_DIM, max_action=MAX_ACTION
+        name="task", obs_dim=OBS_DIM, num_actions=None, action_dim=ACTION_DIM,
+        max_action=MAX_ACTION,
     )
-    assert CONFIG.make(discrete) is agent_of("discrete")
-    assert CONFIG.make(continuous) is agent_of("continuous")
+    config = SACConfig()
+    assert config.make(discrete) is make_sac_discrete(config, OBS_DIM, ACTION_DIM)
+    assert config.make(continuous) is make_sac(config, OBS_DIM, ACTION_DIM, MAX_ACTION)
 
 
 def test_an_agent_with_units_and_columns_out_of_use_learns_as_a_smaller_one():

@@ -192,21 +192,6 @@ def test_an_infinite_entry_elsewhere_does_no_harm():
 # --- hyperparameters -----------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("make", [q_learning, sarsa])
-def test_hyperparameters_are_traced_so_that_a_population_may_vary_them(make):
-    agent = make()
-    rates, gammas = jnp.array([0.0, 0.1, 1.0]), jnp.array([0.9, 0.9, 0.5])
-
-    def after(rate, gamma):
-        hparams = agent.hparams._replace(learning_rate=rate, discount=gamma)
-        state = agent.init(KEY, hparams).replace(q_values=jnp.ones((5, 3)))
-        return agent.update(KEY, state, step(0, 0, 2.0, 1.0, 1)).q_values[0, 0]
-
-    # 1, 1 + 0.1 (2 + 0.9 - 1), 2 + 0.5
-    got = jax.jit(jax.vmap(after))(rates, gammas)
-    np.testing.assert_allclose(got, [1.0, 1.19, 2.5], rtol=1e-6)
-
-
 @pytest.mark.parametrize("make", [make_q_learning, make_sarsa])
 def test_the_defaults_are_the_papers_and_an_agent_is_made_once(make):
     config = QLearningConfig() if make is make_q_learning else SARSAConfig()
@@ -217,11 +202,6 @@ def test_the_defaults_are_the_papers_and_an_agent_is_made_once(make):
         "epsilon_init": 0.1, "epsilon_min": 0.1, "epsilon_decay": 0.0,
     }  # fmt: skip
     assert (agent.spec.warmup_episodes, agent.spec.learns_from) == (0, 0)
-
-
-def test_learning_starts_after_the_initial_episodes():
-    agent = q_learning(warmup_episodes=4)
-    assert (agent.spec.warmup_episodes, agent.spec.learns_from) == (4, 4)
 
 
 # --- exploration ---------------------------------------------------------------------------------

@@ -187,36 +187,6 @@ def test_updates_equal_torchs_on_the_same_batches_and_noise(case):
                 )
 
 
-@pytest.mark.parametrize("config", [CONFIG, DISCRETE], ids=["continuous", "discrete"])
-def test_updates_are_learning_steps_on_noise_drawn_from_the_key_alone_and_in_a_population(config):
-    # Members have their own numbers and counters: lane 0 comes to an actor update, lane 1 does not.
-    base, batch = state_of(config), case_batch(config, 0)
-    num_parallel = [
-        base.replace(num_updates=np.int32(n),
-                     hparams=base.hparams._replace(learning_rate=np.float32(rate)))
-        for n, rate in ((1, 0.01), (2, 0.1))
-    ]  # fmt: skip
-    stacked = jax.tree.map(lambda *x: np.stack(x), *num_parallel)
-    policy, update = policy_of(config), agent_of(config).update
-
-    @jax.jit
-    def run(key):
-        noise = draw_learning_noise(key, policy, batch.action.shape)
-        many = jax.vmap(update, (None, 0, None))(key, stacked, batch)
-        return noise, many
-
-    key = jax.random.key(3)
-    noise, together = run(key)
-    _, other = run(jax.random.key(4))
-    for i, lane in enumerate(num_parallel):
-        expected = learn_of(config)(lane, batch, noise)
-        for name in NAMES:
-            np.testing.assert_allclose(
-                getattr(together, name)[i], getattr(expected, name), rtol=1e-5, atol=1e-7
-            )
-    assert not np.allclose(together.critic_opt_state.mu, other.critic_opt_state.mu)
-
-
 def test_noise_is_normal_and_gumbel_and_drawn_independently():
     n = 20_000
     noise = draw_learning_noise(jax.random.key(0), policy_of(DISCRETE), (1, n))
@@ -252,34 +222,6 @@ def test_the_actor_and_all_targets_move_in_every_second_step_the_critics_in_all(
                 np.testing.assert_allclose(
                     getattr(after, f"target_{name}"), expected, rtol=1e-5, atol=1e-7
                 )
-
-
-@pytest.mark.parametrize("config", [CONFIG, DISCRETE], ids=["continuous", "discrete"])
-def test_columns_of_no_weight_change_nothing(config):
-    state = state_of(config).replace(num_updates=np.int32(1))  # the next step moves everything
-    batch, noise, learn = case_batch(config, 0), case_noise(config, 0), learn_of(config)
-    is_padding = batch.weight == 0
-    other = jax.tree.map(lambda x: np.where(is_padding, x + 3.0, x), batch)
-    other = other._replace(weight=batch.weight)
-    a, b = (learn(state, x, noise) for x in (batch, other))
-    for name in NAMES:
-        np.testing.assert_allclose(getattr(a, name), getattr(b, name), rtol=1e-6, atol=1e-8)
-    counted = batch._replace(weight=np.ones(BATCH, np.float32))
-    all_count = learn(state, counted, noise)
-    assert not np.allclose(a.critic_opt_state.mu, all_count.critic_opt_state.mu, rtol=1e-3)
-
-
-def test_a_transition_with_discount_zero_ignores_its_next_state():
-    def gradient(batch):  # Adam's first mean: 0.1 g
-        state = learn_of(CONFIG)(state_of(CONFIG), batch, case_noise(CONFIG, 0))
-        return np.asarray(state.critic_opt_state.mu)
-
-    batch = case_batch(CONFIG, 0, discount=np.zeros(BATCH))
-    elsewhere = batch._replace(next_obs=batch.next_obs + 3.0)
-    np.testing.assert_array_equal(gradient(batch), gradient(elsewhere))
-    ones = np.ones(BATCH, np.float32)
-    a, b = (gradient(x._replace(discount=ones)) for x in (batch, elsewhere))
-    assert np.abs(a - b).max() > 1e-3
 
 
 def test_the_critics_losses_are_means_over_the_columns_and_added():
@@ -335,23 +277,6 @@ def test_an_agent_with_units_and_columns_out_of_use_learns_as_a_smaller_one():
     for name in NAMES:
         num_idle = np.count_nonzero(getattr(state, name)) - np.count_nonzero(getattr(small, name))
         assert num_idle == 2 * np.atleast_2d(getattr(state, name)).shape[0]
-
-
-@pytest.mark.parametrize("config", [CONFIG, DISCRETE], ids=["continuous", "discrete"])
-def test_the_state_keeps_its_types(config):
-    agent, state = agent_of(config), state_of(config)
-
-    def types(fn, *args):
-        return jax.tree.map(lambda x: (x.shape, x.dtype, x.weak_type), jax.eval_shape(fn, *args))
-
-    kept = types(lambda x: x, state)
-    assert types(agent.begin_episode, state, jnp.int32(1)) == kept
-    assert types(agent.update, jax.random.key(0), state, case_batch(config, 0)) == kept
-    acting = [
-        types(functools.partial(agent.act, explore=explore), jax.random.key(0), state, jnp.zeros(3))
-        for explore in (True, False)
-    ]
-    assert acting == [((ACTION_DIM,), jnp.float32, False)] * 2
 
 
 # --- target policy, by hand ----------------------------------------------------------------------
@@ -482,14 +407,6 @@ def drawn_actions(config, explore, warming_up=False, action_noise_std=0.01):
     return np.asarray(acting(config, explore)(state.replace(hparams=hparams), episode))
 
 
-@pytest.mark.parametrize("config", [CONFIG, DISCRETE], ids=["continuous", "discrete"])
-def test_the_first_episodes_are_for_warming_up(config):
-    begin = agent_of(config).begin_episode
-    got = [bool(begin(state_of(config), jnp.int32(n)).is_warming_up) for n in range(5)]
-    assert got == [True, True, True, False, False]
-    assert (agent_of(config).spec.warmup_episodes, agent_of(config).spec.learns_from) == (3, 3)
-
-
 def test_warm_up_actions_are_uniform_in_the_range():
     drawn = drawn_actions(CONFIG, explore=True, warming_up=True)
     assert np.abs(drawn).max() <= MAX_ACTION
@@ -563,42 +480,6 @@ def test_noisy_tests_act_as_in_training_but_never_warm_up(config):
 
 
 # --- the agent as a whole ------------------------------------------------------------------------
-
-
-def test_the_agent_holds_the_configured_numbers():
-    agent = agent_of(replace(CONFIG, action_repeat=4, action_noise_std=0.3, warmup_episodes=6))
-    assert agent.hparams._asdict() == {
-        "learning_rate": 0.01, "tau": 0.1, "discount": 0.9,
-        "action_noise_std": 0.3, "target_noise_std": 0.4, "target_noise_clip": 0.5,
-        "hidden_size": None, "batch_size": None,  # all of them
-    }  # fmt: skip
-    assert (agent.spec.action_repeat, agent.spec.warmup_episodes, agent.spec.learns_from) == (
-        4,
-        6,
-        6,
-    )
-    assert agent_of(DISCRETE).hparams._asdict() == {
-        "learning_rate": 0.01, "tau": 0.1, "discount": 0.9,
-        "action_noise_std": 0.1, "target_noise_std": 0.4, "target_noise_clip": 0.5,
-        "temperature": 2.0, "final_temperature": 0.25,
-        "hidden_size": None, "batch_size": None,
-    }  # fmt: skip
-
-
-def test_the_memory_hands_out_action_vectors():
-    action = np.float32([0.25, -1.5])
-    one = Transition(np.ones(3, np.float32), action, np.float32(2.0), np.float32(0.5),
-                     np.zeros(3, np.float32))  # fmt: skip
-    buffer = agent_of(CONFIG).buffer(jax.eval_shape(lambda: one), 10)
-
-    @jax.jit
-    def draw(key):
-        kept = buffer.store(buffer.init(), jnp.int32(0), one, False, True)
-        return buffer.batch(key, kept, jnp.int32(1), one, None)
-
-    batch = draw(jax.random.key(0))
-    np.testing.assert_array_equal(batch.action, np.tile(action[:, None], batch.obs.shape[1]))
-    assert np.sum(batch.weight) == BATCH
 
 
 def test_layer_norm_comes_after_each_hidden_layer_but_the_first_and_is_shared():

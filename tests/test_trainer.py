@@ -15,6 +15,7 @@ from scripted import MAX_EPISODES, MAX_STEPS, WHO, ScriptedEnv, script, scripted
 from support import numpy_forward
 
 from sejax import envs, evaluation, registry
+from sejax.agents import AgentSpec
 from sejax.agents.buffers import Buffer, rollout_buffer
 from sejax.agents.dqn import DDQNConfig, make_ddqn
 from sejax.agents.tabular import QLearningConfig
@@ -656,7 +657,7 @@ def test_a_part_of_a_test_or_more_than_all_of_it_may_be_scored():
 def test_actions_are_repeated_beyond_the_tasks_limit_too():
     # Limit 4: decisions of 3 and 1 steps, then of 3 and 2 up to the 9 that are scored.
     task = envs.Task(name="script", env=ENV, params=script([2.5] * 12, [99] * 12))
-    agent = dataclasses.replace(scripted_agent(), action_repeat=3)
+    agent = dataclasses.replace(scripted_agent(), spec=AgentSpec(action_repeat=3))
     state = agent.begin_episode(agent.init(KEY, 0.0), 0)
     step = jax.jit(_Greedy(agent, task).step)
     episode, made = _Greedy(agent, task).begin(KEY, True), []

@@ -15,7 +15,7 @@ from typing import Any
 
 from sphinx.application import Sphinx
 
-from experiments.settings import Settings
+from experiments.common.experiment import Settings
 
 
 def comments_of_fields(cls: type) -> dict[str, str]:

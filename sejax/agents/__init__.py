@@ -125,14 +125,17 @@ def require_fit(
     Raises:
       ConfigError: if it cannot.
     """
-    for value, kind in ((agent, AgentConfig), (exploration, ExplorationConfig)):
+    for value, kind, example in (
+        (agent, AgentConfig, "DDQNConfig"),
+        (exploration, ExplorationConfig, "ICMConfig"),
+    ):
         require(
             isinstance(value, kind),
             kind.group,
             f"be a sejax.agents.{kind.__name__}",
             "it says what it fits and makes",
             value,
-            f"{kind.group} to an instance of a subclass",
+            f"{kind.group} to such as sejax.{example}()",
         )
     if not _fits(agent, spec):
         fitting = [name for name in names() if _fits(registry.find("agent", name), spec)]

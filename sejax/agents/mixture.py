@@ -1,8 +1,8 @@
-"""Several families of agents, one of which each member of a generation trains.
+"""A mixture of agents, one of which trains on each candidate of a generation.
 
-A proxy learned with one agent teaches that agent; what others make of it is left to chance. Here
-the members of a generation take turns among agents, so that a step of the outer loop helps all of
-them, at the price of one training a member as before.
+A proxy that is learned with one agent teaches that agent; whether it teaches others is left to
+chance. Here the candidates of a generation are divided among several agents, so that a step of the
+outer loop helps all of them, at the same number of trainings.
 """
 
 from dataclasses import dataclass
@@ -22,28 +22,29 @@ COMPARED_BY = ("advantage", "rank")
 
 
 @dataclass(frozen=True, kw_only=True)
-class FamiliesConfig(Options):
-    """How families of agents share a generation; `agents=[ddqn,ppo]` on the command line."""
+class MixtureConfig(Options):
+    """How a mixture of agents shares a generation; `agents=[ddqn,ppo]` on the command line."""
 
     group: ClassVar[str] = "agents"
 
-    # What the incumbent is worth, given its mean score with each family: their mean, or the worst.
+    # The incumbent's score, given its mean with each agent: the mean of those, or the worst.
     aggregate: str = option("mean", one_of(AGGREGATES))
-    # What makes scores of several families comparable. advantage: a member's score less the
-    # incumbent's mean with its family; rank: its rank within its family, less the incumbent's.
+    # How scores of several agents become comparable. advantage: a candidate's score less the
+    # incumbent's mean with the same agent; rank: its rank among that agent's candidates, less the
+    # incumbent's.
     compared_by: str = option("advantage", one_of(COMPARED_BY))
 
 
 @dataclass(frozen=True, kw_only=True)
-class Families:
-    """Agents among which the members of a generation take turns.
+class Mixture:
+    """Agents among which the candidates of a generation are divided.
 
     Attributes:
-      agents: from `sejax.make_agent`, or of one's own.
-      names: of the families, for tables; their numbers if not given.
-      weights: shares of the members that train each; equal if not given. A family of weight 0
-        judges the incumbent alone.
-      config: how their scores are put together.
+      agents: from `sejax.make_agent`, or your own.
+      names: of the agents, for tables; their numbers if not given.
+      weights: shares of the candidates that each agent trains on; equal if not given. An agent of
+        weight 0 trains on the incumbent alone.
+      config: how the agents' scores are combined.
 
     Raises:
       ConfigError: for no agents, other numbers of names and weights, negative weights, or none
@@ -54,135 +55,116 @@ class Families:
       >>> task = sejax.envs.make("cartpole")
       >>> ddqn, ppo = (sejax.make_agent(config, task)
       ...              for config in (sejax.DDQNConfig(), sejax.PPOConfig()))
-      >>> families = Families(agents=(ddqn, ppo), names=("ddqn", "ppo"), weights=(2.0, 1.0))
-      >>> families.of_members(6).tolist()
+      >>> mixture = Mixture(agents=(ddqn, ppo), names=("ddqn", "ppo"), weights=(2.0, 1.0))
+      >>> mixture.agent_of_candidate(6).tolist()
       [0, 1, 0, 0, 1, 0]
     """
 
     agents: tuple[Agent, ...]
     names: tuple[str, ...] = ()
     weights: tuple[float, ...] = ()
-    config: FamiliesConfig = FamiliesConfig()
+    config: MixtureConfig = MixtureConfig()
 
     def __post_init__(self) -> None:
         size = len(self.agents)
-        require(
-            size > 0,
-            "agents",
-            "hold an agent",
-            "proxies are told by what agents learn on them",
-            "none",
-            "agent=ddqn",
-        )
         object.__setattr__(self, "names", self.names or tuple(str(i) for i in range(size)))
         object.__setattr__(self, "weights", self.weights or (1.0,) * size)
-        for what in (self.names, self.weights):
-            require(
-                len(what) == size,
-                "agents",
-                f"have {size} names and weights",
-                "each agent is a family",
-                what,
-                "names=() and weights=()",
-            )
+        require(
+            size > 0 and len(self.names) == len(self.weights) == size,
+            "agents",
+            "hold an agent, and as many names and weights as agents",
+            "each agent has one of both",
+            f"{size} agents, names={self.names} and weights={self.weights}",
+            "names=() and weights=()",
+        )
         require(
             min(self.weights) >= 0 and max(self.weights) > 0,
             "agents",
             "have weights of at least 0, and one above",
-            "the members of a generation take turns among them",
+            "the candidates are divided by them",
             self.weights,
             "weights=()",
         )
 
     @classmethod
-    def of(cls, agent: "Agent | Families") -> "Families":
-        """One agent as a family."""
-        return agent if isinstance(agent, Families) else cls(agents=(agent,))
+    def of(cls, agent: "Agent | Mixture") -> "Mixture":
+        """A mixture of one agent; a mixture stays as it is."""
+        return agent if isinstance(agent, Mixture) else cls(agents=(agent,))
 
     @property
     def size(self) -> int:
         return len(self.agents)
 
-    def of_members(self, num_members: int, num_signs: int = 1) -> np.ndarray:
-        """The family that each member trains, `[num_members]`.
+    def agent_of_candidate(self, population_size: int, antithetic: bool = False) -> np.ndarray:
+        """Index of the agent that trains on each candidate, `[pop]`.
 
-        Places are dealt by the weights, each to the family that is furthest behind its share; a
-        family of weight 0 gets none.
-        Members that are the signs of one perturbation train the same family, as they are compared
-        with each other.
+        One candidate after the other goes to the agent that is furthest behind its share; an agent
+        of weight 0 gets none. Both candidates of an antithetic pair have the same agent, as they
+        are compared with each other.
 
         Raises:
-          ConfigError: if there are more families than there are perturbations.
+          ConfigError: if an agent with a weight gets no candidate.
         """
-        num_places = num_members // num_signs
+        num_places = population_size // 2 if antithetic else population_size
         shares = np.array(self.weights) / sum(self.weights)
-        num_trained = np.count_nonzero(shares)
-        require(
-            num_places >= num_trained,
-            "es.population_size",
-            f"be at least {num_trained}",
-            "each family needs a member",
-            num_places,
-            f"es.population_size={num_trained}",
-        )
         counts = np.zeros(self.size)
-        places = []
+        dealt = []
         for place in range(num_places):
-            family = int(np.argmax(shares * (place + 1) - counts))
-            counts[family] += 1
-            places.append(family)
+            agent = int(np.argmax(shares * (place + 1) - counts))
+            counts[agent] += 1
+            dealt.append(agent)
         require(
             counts[shares > 0].all(),
-            "agents",
-            "have weights that leave each family a member",
-            f"the proxy must be told by all of them; there are {num_places} perturbations",
-            self.weights,
-            "es.population_size larger",
+            "es.population_size",
+            "leave each agent of the mixture a candidate",
+            "the proxy must be scored by all of them",
+            f"{num_places} perturbations for weights {self.weights}",
+            f"es.population_size={2 * max(num_places, self.size)}",
         )
-        return np.tile(places, num_signs)
+        return np.tile(dealt, 2 if antithetic else 1)
 
     def num_evals(self, num_incumbent_evals: int) -> int:
-        """Agents on the incumbent, as many of each family, at least as many as asked for."""
+        """Evaluations of the incumbent, equally many with each agent, at least those asked for."""
         return -(-num_incumbent_evals // self.size) * self.size
 
-    def aggregated(self, means: Float[Array, " family"]) -> Float[Array, ""]:
-        """What the incumbent is worth, given its means with each family; nan if one is."""
+    def aggregated(self, means: Float[Array, " agent"]) -> Float[Array, ""]:
+        """The incumbent's score, given its mean with each agent; nan if one is."""
         return means.mean() if self.config.aggregate == "mean" else means.min()
 
     def comparable(
         self,
-        scores: Float[Array, " members"],
-        family: np.ndarray,
-        incumbent_means: Float[Array, " family"],
-    ) -> tuple[Float[Array, " members"], Float[Array, ""]]:
-        """Scores of members of different families in one unit, and the incumbent's.
+        scores: Float[Array, " pop"],
+        agent_of_candidate: np.ndarray,
+        incumbent_means: Float[Array, " agent"],
+    ) -> tuple[Float[Array, " pop"], Float[Array, ""]]:
+        """Scores of candidates with different agents in one unit, and the incumbent's.
 
-        Those of a single family stay as they are.
+        Those of a single agent stay as they are.
 
         Args:
-          scores: of the members; not finite for those that diverged, which they stay.
-          family: of each.
-          incumbent_means: nan for a family none of whose agents on the incumbent survived; its
-            members are then compared with their own mean.
+          scores: of the candidates; not finite where training diverged, and then they stay so.
+          agent_of_candidate: index of the agent that trained on each.
+          incumbent_means: nan for an agent that no evaluation of the incumbent survived with; its
+            candidates are then compared with their own mean.
         """
         if self.size == 1:
             return scores, incumbent_means[0]
         compare = _ranks if self.config.compared_by == "rank" else _advantages
         compared = scores
-        for i in np.unique(family):
-            places = np.flatnonzero(family == i)
+        for i in np.unique(agent_of_candidate):
+            places = np.flatnonzero(agent_of_candidate == i)
             own = scores[places]
             mean = jnp.where(jnp.isfinite(incumbent_means[i]), incumbent_means[i], finite_mean(own))
             compared = compared.at[places].set(compare(own, mean))
         return compared, jnp.float32(0)
 
 
-def _advantages(scores: Float[Array, " members"], incumbent: Array) -> Float[Array, " members"]:
+def _advantages(scores: Float[Array, " n"], incumbent: Array) -> Float[Array, " n"]:
     return jnp.where(is_tie(scores, incumbent), 0.0, scores - incumbent)
 
 
-def _ranks(scores: Float[Array, " members"], incumbent: Array) -> Float[Array, " members"]:
-    """Shares of the members that are worse, less that of the incumbent."""
+def _ranks(scores: Float[Array, " n"], incumbent: Array) -> Float[Array, " n"]:
+    """Shares of the candidates that are worse, less that of the incumbent."""
 
     def share_below(score: Array, same: Array) -> Array:
         worse = (scores < score) & ~same  # False where either is not a number

@@ -9,6 +9,7 @@ from jaxtyping import Array
 
 from sejax.agents.base import Agent, AgentOptions, AgentSpec, traced
 from sejax.agents.buffers import num_columns, replay_buffer, sum_over_batch
+from sejax.errors import require
 from sejax.ops.networks import MLP
 from sejax.options import (
     ACTIVATIONS,
@@ -35,6 +36,17 @@ class OffPolicyOptions(AgentOptions):
     # Weight of the online network in the target's update.
     tau: float = option(0.01, fraction(), traced=True)
     discount: float = option(0.99, fraction(), traced=True)  # gamma
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require(
+            self.batch_size <= self.buffer_size,
+            "agent.batch_size",
+            "be at most agent.buffer_size",
+            "batches are drawn from the buffer",
+            f"{self.batch_size} with agent.buffer_size={self.buffer_size}",
+            f"agent.batch_size={self.buffer_size}",
+        )
 
     def mlp(self, num_outputs: int, **more: Any) -> MLP:
         """A network with these hidden layers."""

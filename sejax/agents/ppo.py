@@ -1,7 +1,8 @@
 """PPO with a clipped ratio, for discrete and for continuous actions.
 
-With generalised advantages and shuffled minibatches, as everybody has it, or with Monte-Carlo
-returns and all of the rollout in each Adam step, as the paper's code has it.
+There are two ways to prepare a rollout (`ADVANTAGES`): `gae`, the usual generalised advantages, and
+`monte_carlo`, the returns of the paper's code, which learns from the whole rollout in each Adam
+step (`PPOConfig.paper`). All else is the same.
 
 Source: Schulman et al., "Proximal Policy Optimization Algorithms" (2017); Schulman et al.,
 "High-Dimensional Continuous Control Using Generalized Advantage Estimation" (2016); the paper's
@@ -20,7 +21,7 @@ from flax import struct
 from jaxtyping import Array, Float, Int
 
 from sejax.agents.base import Agent, AgentOptions, traced
-from sejax.agents.buffers import Rollout, rollout_buffer
+from sejax.agents.buffers import Rollout, Transition, rollout_buffer
 from sejax.agents.policies import SOFTMAX, Distribution, gaussian
 from sejax.errors import require
 from sejax.ops import flat
@@ -39,23 +40,8 @@ from sejax.options import (
     positive,
 )
 
-ADVANTAGES = ("monte_carlo", "gae")
 MIN_STD = 0.01  # of the Gaussian policy, in units of the action
 _MAX_LOG_RATIO = 20.0  # exp(20) is beyond any clip, and finite
-_PAPER: dict[str, Any] = {  # where it differs from the defaults
-    "advantages": "monte_carlo",
-    "normalize_rewards": False,
-    "rollout_steps": None,
-    "num_minibatches": 1,
-    "epochs": 80,
-    "activation": "relu",
-    "learning_rate": 3e-4,
-    "clip_ratio": 0.2,
-    "value_weight": 1.0,
-    "max_grad_norm": None,
-    "adam_eps": 1e-8,
-    "gae_lambda": 0.95,
-}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,8 +54,7 @@ class PPOConfig(AgentOptions):
 
     actions: ClassVar[tuple[str, ...]] = ("discrete", "continuous")
 
-    # PPO learns from the start; this only holds back the stop rule.
-    warmup_episodes: int = option(1, counts("it counts episodes", least=0))
+    warmup_episodes: int = 1  # PPO learns from the start; this only holds back the stop rule
     hidden_size: int = option(64, counts(), varied="triple")
     num_layers: int = option(2, counts(most=MOST_LAYERS), varied="one_more_or_less")
     activation: str = option("tanh", one_of(ACTIVATIONS))
@@ -80,14 +65,14 @@ class PPOConfig(AgentOptions):
     update_episodes: int = option(10, counts())  # of full length, between two learning phases
     epochs: int = option(10, counts())  # passes over the rollout in a learning phase
     num_minibatches: int = option(4, counts())  # Adam steps in an epoch, each on its part of it
-    advantages: str = option("gae", one_of(ADVANTAGES))
+    advantages: str = option("gae", one_of(("monte_carlo", "gae")))
     gae_lambda: float = option(0.9, fraction(), traced=True)  # of advantages=gae
     clip_ratio: float = option(0.1, positive(MOVES), traced=True)
     value_weight: float = option(0.5, not_negative(), traced=True)
     entropy_weight: float = option(0.01, not_negative(), traced=True)
     # Divides rewards by the running std of returns, with advantages=gae.
     normalize_rewards: bool = True
-    # Longest gradient, which a longer one is shortened to.
+    # Norm that a longer gradient is scaled down to.
     max_grad_norm: float | None = option(0.5, or_none(positive(MOVES)))
     adam_eps: float = option(1e-5, positive("it keeps Adam from dividing by 0"))
     # Of the Gaussian policy; learned.
@@ -106,13 +91,27 @@ class PPOConfig(AgentOptions):
           >>> PPOConfig.paper(epochs=20).advantages
           'monte_carlo'
         """
-        return cls(**(_PAPER | changes))
+        paper: dict[str, Any] = {
+            "advantages": "monte_carlo",
+            "normalize_rewards": False,
+            "rollout_steps": None,
+            "num_minibatches": 1,
+            "epochs": 80,
+            "activation": "relu",
+            "learning_rate": 3e-4,
+            "clip_ratio": 0.2,
+            "value_weight": 1.0,
+            "max_grad_norm": None,
+            "adam_eps": 1e-8,
+            "gae_lambda": 0.95,
+        }
+        return cls(**(paper | changes))
 
     def make(self, task: Any) -> Agent:
         """The agent for a task's observations and actions."""
-        action_dim = task.action_dim if task.num_actions is None else None
+        num_actions, action_dim = task.num_actions, task.action_dim
         return make_ppo(
-            self, task.obs_dim, task.num_actions, action_dim, task.max_action, task.max_steps
+            self, task.obs_dim, num_actions, action_dim, task.max_action, task.max_steps
         )
 
     def rollout_length(self, task_max_steps: int) -> int:
@@ -171,13 +170,12 @@ def make_ppo(
       config: hyperparameters.
       obs_dim: length of an observation.
       num_actions: for actions `0..num_actions-1`; None if they are vectors.
-      action_dim: length of an action; None if it is an index.
+      action_dim: length of an action; not used if it is an index.
       max_action: continuous actions reach the world clipped to [-max_action, max_action], and are
         remembered as drawn.
       max_steps: the task's step limit for an episode, in steps of the world.
 
     Raises:
-      ValueError: unless exactly one of `num_actions` and `action_dim` is given.
       ConfigError: if a rollout has fewer than two steps for each minibatch.
 
     Example:
@@ -187,12 +185,8 @@ def make_ppo(
       >>> int(agent.act(jax.random.key(1), state, jnp.zeros(4), explore=True)) in (0, 1)
       True
     """
-    if (num_actions is None) == (action_dim is None):
-        raise ValueError(
-            "make_ppo needs either num_actions (discrete) or action_dim (continuous); got "
-            f"num_actions={num_actions} and action_dim={action_dim}. Set the other one to None."
-        )
-    policy = SOFTMAX if action_dim is None else gaussian(max_action)
+    is_discrete = num_actions is not None
+    policy = SOFTMAX if is_discrete else gaussian(max_action)
     networks = make_networks(config, obs_dim, policy, num_actions, action_dim)
     length = config.rollout_length(max_steps)
     require(
@@ -204,7 +198,7 @@ def make_ppo(
         f"agent.num_minibatches={max(1, length // 2)}",
     )
     optimizer = config.optimizer()
-    learn = make_learning_phase(config, networks, optimizer, obs_dim, action_dim is None)
+    learn = make_learning_phase(config, networks, optimizer, obs_dim, is_discrete)
 
     def init(key: Array, hparams: Any) -> PPOState:
         params = networks.init(key, hparams.hidden_size)
@@ -277,7 +271,7 @@ def make_networks(
     action_dim: int | None,
 ) -> Networks:
     """An actor `s -> outputs` and a critic `s -> V` of the same hidden layers, and the std."""
-    std_dim = action_dim or 0  # a softmax has no std
+    std_dim = 0 if num_actions else action_dim or 0  # a softmax has no std
     shape = (config.hidden_size, config.num_layers, config.activation)
     mlps = {
         "actor": MLP(num_actions or std_dim, *shape, learn_prelu_slope=True),
@@ -323,7 +317,7 @@ class Batch(NamedTuple):
 
     Attributes:
       old_log_prob: of the actions when the rollout was made, in nats.
-      advantage: of the actions; None where it is to be `returns` less the critic's present value.
+      advantage: of the actions; None for `returns` less the critic's present value.
       returns: what the critic is to predict.
     """
 
@@ -332,6 +326,52 @@ class Batch(NamedTuple):
     old_log_prob: Float[Array, " steps"]
     advantage: Float[Array, " steps"] | None
     returns: Float[Array, " steps"]
+
+
+def monte_carlo(
+    config: PPOConfig,
+    networks: Networks,
+    state: PPOState,
+    steps: Transition,
+    ended: Float[Array, " steps"],
+) -> tuple[Batch, Float[Array, "3"]]:
+    """A rollout with normalised returns, and the agent's sums over returns, as they are.
+
+    The advantage is that over the value which the critic has in each Adam step.
+
+    Source: `docs/reference.md` 4.5.
+    """
+    old_log_prob, _, _ = networks.evaluate(
+        networks.unflatten(state.params), steps.obs, steps.action
+    )
+    returns = normalized(discounted_returns(steps.reward, ended, state.hparams.discount))
+    return Batch(steps.obs, steps.action, old_log_prob, None, returns), state.return_sums
+
+
+def gae(
+    config: PPOConfig,
+    networks: Networks,
+    state: PPOState,
+    steps: Transition,
+    ended: Float[Array, " steps"],
+) -> tuple[Batch, Float[Array, "3"]]:
+    """A rollout with generalised advantages, and the agent's sums over all returns so far.
+
+    Rewards are divided by the std of these returns with `config.normalize_rewards`.
+    """
+    hp, tree, sums = state.hparams, networks.unflatten(state.params), state.return_sums
+    old_log_prob, _, value = networks.evaluate(tree, steps.obs, steps.action)
+    decay, reward = hp.discount * steps.discount, steps.reward
+    if config.normalize_rewards:
+        sums = sums + power_sums(discounted_sums(reward, decay, ended))
+        reward = reward / std_of(sums)
+    next_value = networks.critic(tree, steps.next_obs)
+    advantage = generalized_advantages(reward, decay, ended, value, next_value, hp.gae_lambda)
+    return Batch(steps.obs, steps.action, old_log_prob, advantage, advantage + value), sums
+
+
+# How a rollout is prepared by the parameters that made it.
+ADVANTAGES = {"monte_carlo": monte_carlo, "gae": gae}
 
 
 def make_learning_phase(
@@ -346,25 +386,7 @@ def make_learning_phase(
     It passes `config.epochs` times over the rollout, each time in `config.num_minibatches` Adam
     steps. A rollout that these do not divide leaves some steps out of each pass.
     """
-    unflatten = networks.unflatten
-
-    def prepared(state: PPOState, rollout: Rollout) -> tuple[Batch, Array]:
-        """The rollout as it is learned from, and the sums over all returns so far."""
-        hp, tree, sums = state.hparams, unflatten(state.params), state.return_sums
-        steps, ended = rollout.transitions(obs_dim, is_discrete), rollout.ended
-        # These parameters have made the whole rollout.
-        old_log_prob, _, value = networks.evaluate(tree, steps.obs, steps.action)
-        if config.advantages == "monte_carlo":
-            returns = normalized(discounted_returns(steps.reward, ended, hp.discount))
-            return Batch(steps.obs, steps.action, old_log_prob, None, returns), sums
-        decay = hp.discount * steps.discount
-        reward = steps.reward
-        if config.normalize_rewards:
-            sums = sums + power_sums(discounted_sums(reward, decay, ended))
-            reward = reward / std_of(sums)
-        next_value = networks.critic(tree, steps.next_obs)
-        advantage = generalized_advantages(reward, decay, ended, value, next_value, hp.gae_lambda)
-        return Batch(steps.obs, steps.action, old_log_prob, advantage, advantage + value), sums
+    prepare = ADVANTAGES[config.advantages]
 
     def loss_fn(tree: Any, batch: Batch, hp: Any) -> Array:
         log_prob, entropy, value = networks.evaluate(tree, batch.obs, batch.action)
@@ -376,7 +398,8 @@ def make_learning_phase(
 
     def learn(key: Array, state: PPOState, rollout: Rollout) -> PPOState:
         hp = state.hparams
-        batch, return_sums = prepared(state, rollout)
+        steps = rollout.transitions(obs_dim, is_discrete)
+        batch, return_sums = prepare(config, networks, state, steps, rollout.ended)
         order = shuffled(key, config.epochs, config.num_minibatches, batch.returns.size)
 
         def adam_step(number: Array, carry: tuple[Array, Any]) -> tuple[Array, Any]:
@@ -384,9 +407,9 @@ def make_learning_phase(
             minibatch = batch
             if config.num_minibatches > 1:
                 minibatch = jax.tree.map(lambda x: x[..., order[number]], batch)
-            gradient = flat.flatten(jax.grad(loss_fn)(unflatten(params), minibatch, hp))
+            gradient = jax.grad(loss_fn)(networks.unflatten(params), minibatch, hp)
             direction: Any
-            direction, opt_state = optimizer.update(gradient, opt_state)
+            direction, opt_state = optimizer.update(flat.flatten(gradient), opt_state)
             moved = params - hp.learning_rate * direction
             return jnp.maximum(moved, networks.least_params), opt_state
 

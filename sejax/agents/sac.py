@@ -28,6 +28,7 @@ from sejax.agents.off_policy import (
     warming_up,
 )
 from sejax.agents.policies import select_action
+from sejax.errors import require
 from sejax.ops import flat
 from sejax.ops.networks import init_narrowed
 from sejax.options import counts, finite, fraction, not_negative, option, positive
@@ -61,7 +62,22 @@ class SACConfig(OffPolicyOptions):
     target_entropy_fraction: float = option(0.2, fraction(), traced=True)
 
     def make(self, task: Any) -> Agent:
-        """The agent for a task's observations and actions."""
+        """The agent for a task's observations and actions.
+
+        Raises:
+          ConfigError: if the target entropy of the other kind of actions is set.
+        """
+        kinds = ("target_entropy", "target_entropy_fraction")
+        used, unused = kinds if task.num_actions is None else kinds[::-1]
+        default = type(self).__dataclass_fields__[unused].default
+        require(
+            getattr(self, unused) == default,
+            f"agent.{unused}",
+            f"stay {default} in {task.name}",
+            f"agent.{used} holds for its actions",
+            getattr(self, unused),
+            f"agent.{used} in its place",
+        )
         if task.num_actions is None:
             return make_sac(self, task.obs_dim, task.action_dim, task.max_action)
         return make_sac_discrete(self, task.obs_dim, task.num_actions)

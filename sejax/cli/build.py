@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from sejax import agents, envs, registry, serialize
-from sejax.agents.mixture import Families
+from sejax.agents.mixture import Mixture
 from sejax.cli import families
 from sejax.cli.families import AgentsConfig, families_of
 from sejax.errors import one_of, require, require_seed, shortened, whole
@@ -137,7 +137,7 @@ class LearnConfig:
         made = tuple(agents.make_agent(x.agent, task, self.exploration, varied) for x in each)
         if self.agents is None:
             return made[0]
-        return Families(
+        return Mixture(
             agents=made,
             names=tuple(x.key for x in each),
             weights=tuple(x.weight for x in each),

@@ -17,11 +17,11 @@ from hydra.core.override_parser.types import ChoiceSweep, QuotedString
 from hydra.errors import HydraException
 
 from sejax import registry, serialize
-from sejax.agents.mixture import FamiliesConfig
+from sejax.agents.mixture import MixtureConfig
 from sejax.errors import ConfigError, is_number, require, shortened, unknown_name
 
 JOINT = "+"  # between the agents of a choice, and after a single one
-_SHARED = tuple(serialize.to_plain(FamiliesConfig()))
+_SHARED = tuple(serialize.to_plain(MixtureConfig()))
 _CHOICE = re.compile(r"agents?=")
 _KEY = re.compile(r"\w[\w-]*")
 
@@ -44,7 +44,7 @@ class AgentFamily:
 
 
 @dataclass(frozen=True, kw_only=True)
-class AgentsConfig(FamiliesConfig):
+class AgentsConfig(MixtureConfig):
     """Agents that share generations, in the order of their keys whichever way they were named."""
 
     families: tuple[AgentFamily, ...]
@@ -57,7 +57,7 @@ def from_plain(values: Any) -> AgentsConfig | None:
     """The agents that plain values describe; None if there are none.
 
     Args:
-      values: the fields of `FamiliesConfig`, and under each other key an agent's `name`, fields and
+      values: the fields of `MixtureConfig`, and under each other key an agent's `name`, fields and
         `weight`.
 
     Raises:
@@ -74,7 +74,7 @@ def from_plain(values: Any) -> AgentsConfig | None:
         "agents=[ddqn,ppo]",
     )
     shared = serialize.from_plain(
-        FamiliesConfig, {k: v for k, v in values.items() if k in _SHARED}, "agents"
+        MixtureConfig, {k: v for k, v in values.items() if k in _SHARED}, "agents"
     )
     families = [_family(key, values[key]) for key in sorted(values.keys() - set(_SHARED))]
     require(
@@ -134,7 +134,7 @@ def to_plain(agents: AgentsConfig | None) -> dict[str, Any] | None:
 
 def defaults(agents: AgentsConfig) -> dict[str, Any]:
     """What `to_plain` gives for these agents with their defaults."""
-    return serialize.to_plain(FamiliesConfig()) | {
+    return serialize.to_plain(MixtureConfig()) | {
         each.key: {"weight": 1.0}
         | registry.defaults("agent", registry.name_of("agent", each.agent))
         for each in agents.families
@@ -263,7 +263,7 @@ def node(choice: str, shares: bool) -> dict[str, Any]:
       choice: `ddqn+ppo`.
       shares: whether they share generations, so that there is something to weigh and compare.
     """
-    agents: dict[str, Any] = serialize.to_plain(FamiliesConfig()) if shares else {}
+    agents: dict[str, Any] = serialize.to_plain(MixtureConfig()) if shares else {}
     for name in members(choice):
         fields = registry.defaults("agent", name)
         require(

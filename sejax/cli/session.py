@@ -1,5 +1,6 @@
 """The driver of a run: blocks of generations, each saved before the next one starts."""
 
+import contextlib
 import copy
 import platform
 import time
@@ -17,7 +18,6 @@ from sejax.cli.run_directory import RunDirectory
 from sejax.cli.trackers import (
     FinishedGeneration,
     GuardedTracker,
-    NoTracker,
     Reporter,
     TrackedRun,
 )
@@ -132,33 +132,28 @@ def run(
     def is_over() -> bool:
         return directory.finished_generations >= config.generations or bool(state.finished)
 
-    tracker = _tracker(config, directory, report) if not is_over() else None
+    tracker = _tracker(config, directory, report)
     drawn = time.monotonic()
-    try:
+    with contextlib.closing(tracker):
         while not is_over():
-            length = min(
-                config.checkpoint_every, config.generations - directory.finished_generations
-            )
+            left = config.generations - directory.finished_generations
+            length = min(config.checkpoint_every, left)
             if not chunks.is_ready(length):
                 report.status("compiling")
                 chunks.compile(length)
                 report.status("first generation")
             state, info = chunks.advance(state, length)
             _wait(state)
-            host_state, info = jax.device_get((state, info))
-            rows = directory.save(state, info, clock.wall_s(), clock.cpu_s())
-            proxies.save(host_state)
+            saved, info = jax.device_get((state, info))
+            rows = directory.save(saved, info, clock.wall_s(), clock.cpu_s())
+            proxies.save(saved)
             for generation in _finished(rows, info):
                 report.on_generation(generation)
-                if tracker is not None:
-                    tracker.on_generation(generation)
+                tracker.on_generation(generation)
             if time.monotonic() - drawn > DRAW_EVERY_S:
                 draw(directory, chunks.learner)
                 drawn = time.monotonic()
         draw(directory, chunks.learner)
-    finally:
-        if tracker is not None:
-            tracker.close()
     ended = "solved" if bool(state.finished) else "finished"
     directory.write_summary(
         ended=ended,
@@ -167,7 +162,7 @@ def run(
         solved_score=chunks.learner.solved_score,
         wall_s=round(clock.wall_s(), 1),
         cpu_s=round(clock.cpu_s(), 1),
-        **_cost(directory, chunks.learner.strategy.num_candidates),
+        **_cost(directory, chunks.learner.strategy.num_evaluations),
         devices=[str(device) for device in jax.devices()],
         machine=runtime.machine(),
         versions=_versions(),
@@ -181,7 +176,7 @@ class _Clock:
     def __init__(self, directory: RunDirectory, chunks: Chunks):
         self._chunks = chunks
         self._wall_s = directory.wall_s - time.monotonic()
-        self._cpu_s = directory.cpu_s - time.process_time()
+        self._cpu_s = directory.cpu_s - time.process_time() - chunks.cpu_s
 
     def wall_s(self) -> float:
         return self._wall_s + time.monotonic()
@@ -245,9 +240,7 @@ def draw(directory: RunDirectory, learner: Bilevel) -> None:
 
 def _tracker(
     config: build.LearnConfig, directory: RunDirectory, report: Reporter
-) -> GuardedTracker | None:
-    if isinstance(config.tracker, NoTracker):
-        return None
+) -> GuardedTracker:
     run = TrackedRun(
         folder=directory.path.resolve(),
         id=directory.id,

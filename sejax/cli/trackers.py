@@ -5,7 +5,7 @@ cannot stop it.
 """
 
 import contextlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Protocol, runtime_checkable
@@ -82,44 +82,52 @@ class Tracker(Protocol):
 
 
 class GuardedTracker:
-    """The tracker of a run, dropped with one message as soon as it raises."""
+    """The tracker of a run, made at its first generation, dropped with one message if it raises."""
 
     def __init__(self, config: Any, run: TrackedRun, say: Callable[[str], None]):
-        """Makes the tracker of a configuration; `say` takes the message."""
-        self._name, self._say = registry.name_of("tracker", config), say
+        """The tracker of a configuration; `say` takes the message."""
+        self._config, self._run, self._say = config, run, say
         self._tracker: Tracker | None = None
-        with self._guarded():
-            self._tracker = config.make(run)
+        self._is_dropped = False
 
     def on_generation(self, info: FinishedGeneration) -> None:
-        if self._tracker is not None:
-            with self._guarded():
-                self._tracker.on_generation(info)
+        if self._is_dropped:
+            return
+        with self._guarded():
+            self._tracker = self._tracker or self._config.make(self._run)
+            self._tracker.on_generation(info)
 
     def close(self) -> None:
         tracker, self._tracker = self._tracker, None
-        if tracker is not None:
+        if tracker is not None and not self._is_dropped:
             with self._guarded():
                 tracker.close()
 
     @contextlib.contextmanager
-    def _guarded(self) -> Any:
+    def _guarded(self) -> Iterator[None]:
         try:
             yield
         except (Exception, SystemExit) as error:  # foreign code may raise anything
-            failed, self._tracker = self._tracker, None
-            self._say(f"tracker={self._name} has failed; the run goes on without. {told(error)}")
+            self._is_dropped = True
+            name = registry.name_of("tracker", self._config)
+            self._say(f"tracker={name} has failed; the run goes on without. {told(error)}")
             with contextlib.suppress(Exception, SystemExit):
-                if failed is not None:
-                    failed.close()
+                if self._tracker is not None:
+                    self._tracker.close()
 
 
 @dataclass(frozen=True, kw_only=True)
 class NoTracker:
     """No tracker."""
 
-    def make(self, run: TrackedRun) -> None:
-        return None
+    def make(self, run: TrackedRun) -> "NoTracker":
+        return self
+
+    def on_generation(self, info: FinishedGeneration) -> None:
+        pass
+
+    def close(self) -> None:
+        pass
 
 
 @dataclass(frozen=True, kw_only=True)

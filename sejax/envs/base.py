@@ -1,6 +1,7 @@
 """A task: a real environment that agents are tested on, and its spec."""
 
 import contextlib
+import functools
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -135,17 +136,9 @@ def _require_threshold(solved_reward: Any) -> None:
 def _params_of(env: Any, params: Any, name: str) -> Any:
     """The params given, or the environment's; checks that both are what they are called."""
     with _says_what_it_must_be(name):
-        is_env = hasattr(env, "default_params")
-        params = env.default_params if is_env and params is None else params
-    errors.require(
-        is_env,
-        "env",
-        "be a gymnax environment",
-        "its default_params are used",
-        type(env).__name__,
-        "env to the first of the pair that gymnax.make returns",
-    )
+        default = env.default_params
     require_own_steps(env)
+    params = default if params is None else params
     errors.require(
         hasattr(params, "max_steps_in_episode"),
         "params",
@@ -184,9 +177,9 @@ def _says_what_it_must_be(name: str) -> Iterator[None]:
         raise
     except Exception as error:
         raise errors.ConfigError(
-            f"env must be a gymnax 1.x environment with default_params, spaces, reset_env, "
+            f"env must be a gymnax 1.x environment, with default_params, spaces, reset_env, "
             f"step_env (five values) and is_truncated; {name} raised {errors.told(error)}. Derive "
-            f"it from gymnax's Environment."
+            f"it from gymnax's Environment, of whose make env is the first result."
         ) from error
 
 
@@ -194,7 +187,8 @@ def _try(env: Any, params: Any, name: str) -> None:
     """Traces a step, so that faults of an environment are met before an agent trains there.
 
     Raises:
-      ConfigError: if it cannot be made, or returns something else than five values.
+      ConfigError: if it cannot be made, or returns something else than five values whose shapes and
+        dtypes are those of the spaces and of `reset_env`.
     """
     import jax
 
@@ -203,52 +197,35 @@ def _try(env: Any, params: Any, name: str) -> None:
         action = env.action_space(params).sample(key)
         next_obs, next_state, reward, terminated, _ = env.step_env(key, state, action, params)
         env.is_truncated(next_state, params)
-        return obs, state, next_obs, next_state, reward, terminated
+        begin, after = {"obs": obs, "state": state}, {"obs": next_obs, "state": next_state}
+        return begin, after, reward, terminated
+
+    def kinds(tree: Any) -> dict[str, tuple[tuple[int, ...], str]]:
+        leaves = jax.tree_util.tree_leaves_with_path(tree)
+        name_of = functools.partial(jax.tree_util.keystr, simple=True, separator=".")
+        return {name_of(path): (x.shape, str(x.dtype)) for path, x in leaves}
 
     with _says_what_it_must_be(name):
-        obs, state, next_obs, next_state, reward, terminated = jax.eval_shape(
-            step, jax.random.key(0)
-        )
-    shape = tuple(env.observation_space(params).shape)
-    for what, got, wanted in (
-        ("reset_env's observation", obs, shape),
-        ("step_env's observation", next_obs, shape),
-        ("step_env's reward", reward, ()),
-        ("step_env's terminated", terminated, ()),
-    ):
-        errors.require(
-            got.shape == wanted,
-            "env",
-            f"have {wanted} as the shape of {what}",
-            "its space, or an episode at a time, says so",
-            f"{got.shape} in {name}",
-            "env to one that returns that",
-        )
-    errors.require(
-        terminated.dtype == bool,
-        "env",
-        "return a bool as step_env's terminated",
-        "a loop is compiled that ends by it",
-        f"{terminated.dtype} in {name}",
-        "env to one that returns such as terminated > 0",
-    )
-    began, went_on = (
-        {
-            jax.tree_util.keystr(path, simple=True, separator="."): (x.shape, str(x.dtype))
-            for path, x in jax.tree_util.tree_leaves_with_path(each)
-        }
-        for each in ({"state": state, "obs": obs}, {"state": next_state, "obs": next_obs})
-    )
-    changed = [
-        f"{key} {began.get(key)} and then {went_on.get(key)}"
+        begin, after, reward, terminated = jax.eval_shape(step, jax.random.key(0))
+        shape = tuple(env.observation_space(params).shape)
+    began, went_on = kinds(begin), kinds(after)
+    faults = [
+        f"{key} is {began.get(key)} after reset_env and {went_on.get(key)} after step_env"
         for key in {**began, **went_on}
         if began.get(key) != went_on.get(key)
     ]
+    for what, is_right, x in (
+        ("obs", begin["obs"].shape == shape, begin["obs"]),
+        ("reward", reward.shape == (), reward),
+        ("terminated", terminated.shape == () and terminated.dtype == bool, terminated),
+    ):
+        if not is_right:
+            faults.append(f"{what} is {x.shape} {x.dtype}")
     errors.require(
-        not changed,
+        not faults,
         "env",
-        "keep the shapes and dtypes that reset_env returns",
+        f"keep its shapes and dtypes: obs {shape}, reward a scalar, terminated a bool",
         "an episode is one compiled loop",
-        f"{', '.join(changed)} in {name}",
-        "env to one whose step_env returns the same",
+        f"{name}, where {'; '.join(faults)}",
+        "env to one that returns that",
     )

@@ -47,10 +47,10 @@ class Wrapper(Environment):
         return self.env.is_terminated(state, params)
 
     def action_space(self, params: Any = None) -> Any:
-        return self.env.action_space(params)
+        return super().action_space() if self.spaces else self.env.action_space(params)
 
     def observation_space(self, params: Any = None) -> Any:
-        return self.env.observation_space(params)
+        return super().observation_space() if self.spaces else self.env.observation_space(params)
 
 
 class ActionRepeat(Wrapper):
@@ -130,12 +130,6 @@ class AsVectors(Wrapper):
 
     def get_obs(self, state: Any, params: Any = None, key: Any = None) -> Any:
         return self._vector(self.env.get_obs(state, params, key))
-
-    def action_space(self, params: Any = None) -> Any:
-        return Environment.action_space(self, params)
-
-    def observation_space(self, params: Any = None) -> Any:
-        return Environment.observation_space(self, params)
 
     def _vector(self, obs: Any) -> Float[Array, " obs_dim"] | Array:
         if self.spaces is not None and isinstance(self.spaces[0], Discrete):

@@ -1,27 +1,31 @@
-"""The contract of an outer optimiser: ask for members, tell their scores, which are maximised."""
+"""The contract of an outer optimiser: ask for a population, tell its scores; higher is better."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from sejax.options import MOST_MEMBERS, Options, counts, one_of, option
+
 AGGREGATES = ("mean", "min")
 LARGEST = 1e6  # larger steps or noise lead to weights whose products are not finite
 _TIE = 1e-6  # of the incumbent's score, or of 1 where that is smaller
 
+StrategyState = Any  # a pytree that nobody else looks into
+
 
 @dataclass(frozen=True, kw_only=True)
-class Trials:
-    """How often the proxies of a generation are tried, each time by a fresh agent.
+class Evaluations:
+    """How often the candidates of a generation are evaluated, each time with a fresh agent.
 
     Attributes:
-      num_evals: agents on each member.
-      aggregate: what their scores make: mean or min.
-      num_incumbent_evals: agents on the incumbent.
-      common_random_numbers: the r-th agent of every member has the same seed.
+      num_evals: evaluations for each candidate of the population.
+      aggregate: what a candidate's score is, given those of its evaluations: mean or min.
+      num_incumbent_evals: evaluations of the incumbent.
+      common_random_numbers: whether the r-th evaluation of every candidate has the same seed.
     """
 
     num_evals: int = 1
@@ -29,68 +33,56 @@ class Trials:
     num_incumbent_evals: int = 16
     common_random_numbers: bool = False
 
-    def seed_ids(self, num_members: int) -> np.ndarray:
-        """Numbers of the trials of members and incumbent, `[num_trials]`; equal ones share a seed.
+    def seed_ids(self, population_size: int) -> np.ndarray:
+        """Numbers of the evaluations, `[evaluation]`; those with equal numbers share a seed.
 
-        The trials of a member follow one another; those of the incumbent come last.
+        The evaluations of a candidate follow one another; those of the incumbent come last.
         """
-        num_tried = num_members * self.num_evals
+        num_evaluations = population_size * self.num_evals
         if not self.common_random_numbers:
-            return np.arange(num_tried + self.num_incumbent_evals)
-        return np.concatenate(
-            [np.arange(num_tried) % self.num_evals, np.arange(self.num_incumbent_evals)]
-        )
+            return np.arange(num_evaluations + self.num_incumbent_evals)
+        of_population = np.arange(num_evaluations) % self.num_evals
+        return np.concatenate([of_population, np.arange(self.num_incumbent_evals)])
 
-    def families(self, of_members: np.ndarray, num_families: int) -> np.ndarray:
-        """The family of agents of each trial, `[num_trials]`; the incumbent's take turns."""
-        of_incumbent = np.arange(self.num_incumbent_evals) % num_families
-        return np.concatenate([np.repeat(of_members, self.num_evals), of_incumbent])
+    def agents(self, agent_of_candidate: np.ndarray, num_agents: int) -> np.ndarray:
+        """Index of the agent in each evaluation, `[evaluation]`; the incumbent's take turns."""
+        of_incumbent = np.arange(self.num_incumbent_evals) % num_agents
+        return np.concatenate([np.repeat(agent_of_candidate, self.num_evals), of_incumbent])
 
-    def candidates(
-        self, members: Float[Array, "members dims"], incumbent: Float[Array, " dims"]
-    ) -> Float[Array, "trials dims"]:
-        """What is tried, in the order of `seed_ids`."""
-        tried = jnp.repeat(members, self.num_evals, axis=0)
+    def params(
+        self, population: Float[Array, "pop dims"], incumbent: Float[Array, " dims"]
+    ) -> Float[Array, "evaluation dims"]:
+        """The vector of each evaluation, in the order of `seed_ids`."""
+        repeated = jnp.repeat(population, self.num_evals, axis=0)
         shape = (self.num_incumbent_evals, incumbent.shape[0])
-        return jnp.concatenate([tried, jnp.broadcast_to(incumbent, shape)])
+        return jnp.concatenate([repeated, jnp.broadcast_to(incumbent, shape)])
 
     def split(
-        self, scores: Float[Array, " trials"]
-    ) -> tuple[Float[Array, " tried"], Float[Array, " incumbent"]]:
-        """Scores of the members' trials, and of the incumbent's."""
-        num_tried = scores.shape[0] - self.num_incumbent_evals
-        return scores[:num_tried], scores[num_tried:]
+        self, scores: Float[Array, " evaluation"]
+    ) -> tuple[Float[Array, " of_population"], Float[Array, " of_incumbent"]]:
+        """Scores of the population's evaluations, and of the incumbent's."""
+        num_evaluations = scores.shape[0] - self.num_incumbent_evals
+        return scores[:num_evaluations], scores[num_evaluations:]
 
-    def of_members(self, scores: Float[Array, " tried"]) -> Float[Array, " members"]:
-        """A score for each member; not finite if one of its trials is not."""
+    def population_scores(self, scores: Float[Array, " of_population"]) -> Float[Array, " pop"]:
+        """A score for each candidate; not finite if that of an evaluation is not."""
         scores = scores.reshape(-1, self.num_evals)
         scores = jnp.where(jnp.isfinite(scores), scores, jnp.nan)
         return scores.mean(axis=1) if self.aggregate == "mean" else scores.min(axis=1)
 
-    def of_incumbent(
-        self, scores: Float[Array, " incumbent"], members: Float[Array, " tried"]
-    ) -> tuple[Float[Array, " incumbent"], Float[Array, ""]]:
+    def incumbent_scores(
+        self, scores: Float[Array, " of_incumbent"], population: Float[Array, " of_population"]
+    ) -> tuple[Float[Array, " of_incumbent"], Float[Array, ""]]:
         """The incumbent's scores, with agents that diverged ranked last, and their mean.
 
         Agents that diverged get the lowest finite score of the generation: a mean without them
-        would rank an incumbent by the agents that survived it. One that none survived has no score:
-        nan.
+        would rank an incumbent by the agents that survived it. If none survived, the mean is nan.
         """
-        everyone = jnp.concatenate([members, scores])
-        lowest = jnp.nanmin(jnp.where(jnp.isfinite(everyone), everyone, jnp.nan))
+        all_scores = jnp.concatenate([population, scores])
+        lowest = jnp.nanmin(jnp.where(jnp.isfinite(all_scores), all_scores, jnp.nan))
         finite = jnp.isfinite(scores)
         repaired = jnp.where(~finite & finite.any(), lowest, scores)
         return repaired, finite_mean(repaired)
-
-
-def trials_of(config: Any, num_incumbent_evals: int) -> Trials:
-    """How often the proxies of a generation are tried, as a strategy's configuration says."""
-    return Trials(
-        num_evals=config.num_evals,
-        aggregate=config.eval_aggregate,
-        num_incumbent_evals=num_incumbent_evals,
-        common_random_numbers=config.common_random_numbers,
-    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -99,30 +91,55 @@ class Strategy:
 
     Attributes:
       init: `(key, mean [dims]) -> state`.
-      ask: `(key, state) -> (members [num_members, dims], state)`.
-      tell: `(key, members, scores [num_members], incumbent_score [], state) -> state`; higher
-        scores are better, and scores that are not finite rank worst.
-      incumbent: `(state) -> [dims]`, the proxy that the strategy stands for.
-      num_members: proxies in a generation beside the incumbent.
-      num_signs: blocks of members, at the same place of which stand the signs of one perturbation.
-      remembers_scores: whether scores are held against those of earlier generations, so that they
+      ask: `(key, state) -> (population [pop, dims], state)`.
+      tell: `(key, population, scores [pop], incumbent_score [], state) -> state`; higher scores are
+        better, and those that are not finite rank worst.
+      incumbent: `(state) -> [dims]`, the proxy at the centre of the population.
+      population_size: vectors that `ask` returns.
+      antithetic: whether the second half of the population is the first mirrored at the incumbent.
+      remembers_scores: whether scores are compared with those of earlier generations, so that they
         must be in one unit.
-      trials: how often each is tried.
+      evaluations: how often each candidate is evaluated.
     """
 
-    init: Callable[..., Any]
-    ask: Callable[..., tuple[Array, Any]]
-    tell: Callable[..., Any]
-    incumbent: Callable[[Any], Array]
-    num_members: int
-    num_signs: int = 1
+    init: Callable[[Array, Float[Array, " dims"]], StrategyState]
+    ask: Callable[[Array, StrategyState], tuple[Float[Array, "pop dims"], StrategyState]]
+    tell: Callable[[Array, Array, Array, Array, StrategyState], StrategyState]
+    incumbent: Callable[[StrategyState], Float[Array, " dims"]]
+    population_size: int
+    antithetic: bool = False
     remembers_scores: bool = False
-    trials: Trials = Trials()
+    evaluations: Evaluations = Evaluations()
 
     @property
-    def num_candidates(self) -> int:
+    def num_evaluations(self) -> int:
         """Trainings in a generation."""
-        return self.num_members * self.trials.num_evals + self.trials.num_incumbent_evals
+        evaluations = self.evaluations
+        return self.population_size * evaluations.num_evals + evaluations.num_incumbent_evals
+
+
+@dataclass(frozen=True, kw_only=True)
+class StrategyOptions(Options):
+    """What the configurations of sejax's strategies share."""
+
+    group: ClassVar[str] = "es"
+
+    # n_p: perturbations in a generation
+    population_size: int = option(
+        16, counts("scores are compared within a generation", 2, MOST_MEMBERS)
+    )
+    num_evals: int = option(1, counts("a candidate needs a score"))  # agents on each candidate
+    eval_aggregate: str = option("mean", one_of(AGGREGATES))  # what their scores make
+    common_random_numbers: bool = False  # the same inner seeds for all candidates of a generation
+
+    def evaluations(self, num_incumbent_evals: int) -> Evaluations:
+        """How often each candidate is evaluated."""
+        return Evaluations(
+            num_evals=self.num_evals,
+            aggregate=self.eval_aggregate,
+            num_incumbent_evals=num_incumbent_evals,
+            common_random_numbers=self.common_random_numbers,
+        )
 
 
 def is_tie(scores: Float[Array, "*n"], incumbent: Float[Array, ""]) -> Bool[Array, "*n"]:

@@ -4,51 +4,41 @@ Source: paper, Algorithm 1 and appendix "NES Score Transformation"; `docs/refere
 """
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Float
 
-from sejax.es.base import AGGREGATES, LARGEST, Strategy, trials_of
+from sejax.es.base import LARGEST, Strategy, StrategyOptions
 from sejax.es.score_transforms import TRANSFORMS
-from sejax.options import MOST_MEMBERS, Options, counts, fraction, one_of, option, positive, shrinks
+from sejax.options import counts, fraction, one_of, option, positive, shrinks
 
 UPDATE_RULES = ("authors", "paper")
 
 
 @dataclass(frozen=True, kw_only=True)
-class NESConfig(Options):
+class NESConfig(StrategyOptions):
     """NES with mirrored sampling and evaluation of the incumbent (Algorithm 1)."""
 
-    group: ClassVar[str] = "es"
-
-    # n_p: members in a generation
-    population_size: int = option(
-        16, counts("scores are compared within a generation", 2, MOST_MEMBERS)
-    )
-    # Agents on the incumbent; null: one for each member, as in the paper.
+    # Agents on the incumbent; null: one for each perturbation, as in the paper.
     num_incumbent_evals: int | None = option(
         None, counts("the incumbent's score selects the proxy")
     )
     # sigma: std of the weight perturbation
-    noise_std: float = option(0.05, positive("members must differ", LARGEST), traced=True)
+    noise_std: float = option(0.05, positive("candidates must differ", LARGEST), traced=True)
     # factor on sigma after each generation
     noise_std_decay: float = option(1.0, shrinks(), traced=True)
     # alpha
     step_size: float = option(1.0, positive("the proxy would not move", LARGEST), traced=True)
     # factor on alpha after each generation
     step_size_decay: float = option(1.0, shrinks(), traced=True)
-    mirrored: bool = True  # each member tries +eps and -eps and keeps the better sign
+    mirrored: bool = True  # each perturbation is tried as +eps and -eps and keeps its better sign
     score_transform: str = option("all_better_2", one_of(TRANSFORMS))
     # authors: psi += alpha sum F eps; paper: that divided by n_p sigma
     update_rule: str = option("authors", one_of(UPDATE_RULES))
     # psi shrinks by this before each update
     weight_decay: float = option(0.0, fraction(), traced=True)
-    num_evals: int = option(1, counts("a member needs a score"))  # agents on each perturbed proxy
-    eval_aggregate: str = option("mean", one_of(AGGREGATES))  # what their scores make
-    common_random_numbers: bool = False  # the same inner seeds for all members of a generation
 
     def make(self, num_dims: int) -> Strategy:
         """NES over vectors of `num_dims` numbers."""
@@ -65,9 +55,9 @@ class NESState:
 def make_nes(config: NESConfig, num_dims: int) -> Strategy:
     r"""Builds NES over vectors `[num_dims]`.
 
-    Members are psi + eps_i for each of `config.population_size`, then psi - eps_i if sampling is
-    mirrored. A mirrored pair's score is that of its better sign, and its eps has that sign; a tie
-    keeps the plus.
+    The population is psi + eps_i for each of `config.population_size`, then psi - eps_i if
+    sampling is mirrored. A mirrored pair's score is that of its better sign, and its eps has that
+    sign; a tie keeps the plus.
 
     .. math:: \psi \leftarrow (1 - \lambda) \psi + \alpha \sum_i F_i \epsilon_i
 
@@ -82,7 +72,7 @@ def make_nes(config: NESConfig, num_dims: int) -> Strategy:
       >>> strategy.ask(jax.random.key(1), state)[0].shape  # +eps and -eps
       (8, 3)
     """
-    num_pairs, num_signs = config.population_size, 2 if config.mirrored else 1
+    num_noises = config.population_size
     transform = TRANSFORMS[config.score_transform]
 
     def init(key: Array, mean: Float[Array, " dims"]) -> NESState:
@@ -92,21 +82,21 @@ def make_nes(config: NESConfig, num_dims: int) -> Strategy:
             step_size=jnp.float32(config.step_size),
         )
 
-    def ask(key: Array, state: NESState) -> tuple[Float[Array, "members dims"], NESState]:
-        noise = state.noise_std * jax.random.normal(key, (num_pairs, num_dims))
+    def ask(key: Array, state: NESState) -> tuple[Float[Array, "pop dims"], NESState]:
+        noise = state.noise_std * jax.random.normal(key, (num_noises, num_dims))
         signed = jnp.concatenate([noise, -noise]) if config.mirrored else noise
         return state.mean + signed, state
 
     def tell(
-        key: Array, members: Array, scores: Array, incumbent_score: Array, state: NESState
+        key: Array, population: Array, scores: Array, incumbent_score: Array, state: NESState
     ) -> NESState:
-        noise = members - state.mean
+        noise = population - state.mean
         if config.mirrored:
             scores, noise = better_signs(scores, noise)
         weights = transform(scores, incumbent_score)
         step = state.step_size * weights @ noise
         if config.update_rule == "paper":
-            step = step / (num_pairs * state.noise_std)
+            step = step / (num_noises * state.noise_std)
         return state.replace(
             mean=(1 - config.weight_decay) * state.mean + step,
             noise_std=state.noise_std * config.noise_std_decay,
@@ -118,16 +108,16 @@ def make_nes(config: NESConfig, num_dims: int) -> Strategy:
         ask=ask,
         tell=tell,
         incumbent=lambda state: state.mean,
-        num_members=num_pairs * num_signs,
-        num_signs=num_signs,
-        trials=trials_of(config, config.num_incumbent_evals or num_pairs),
+        population_size=2 * num_noises if config.mirrored else num_noises,
+        antithetic=config.mirrored,
+        evaluations=config.evaluations(config.num_incumbent_evals or num_noises),
     )
 
 
 def better_signs(
-    scores: Float[Array, " signed"], noise: Float[Array, "signed dims"]
-) -> tuple[Float[Array, " pop"], Float[Array, "pop dims"]]:
-    """Score and signed noise of each member's better sign; the plus signs are the first half."""
+    scores: Float[Array, " pop"], noise: Float[Array, "pop dims"]
+) -> tuple[Float[Array, " half"], Float[Array, "half dims"]]:
+    """Score and noise of each perturbation's better sign; the plus signs are the first half."""
     plus, minus = scores.reshape(2, -1)
     use_minus = jnp.where(jnp.isfinite(minus), minus, -jnp.inf) > jnp.where(
         jnp.isfinite(plus), plus, -jnp.inf

@@ -1,1 +1,16 @@
-"""What makes sejax fast on CPUs, and the helpers that everything above shares."""
+"""What makes programs fast on CPUs, and files that survive a kill.
+
+Each trick stands beside the plain form that it equals, and its docstring names the test of that.
+Gains were measured on one core of a shared AMD EPYC, as CPU time of whole trainings of the default
+DDQN in a CartPole SE, in turns with the plain form.
+
+=================== ======================================== ================================
+fast                plain                                    gain
+=================== ======================================== ================================
+`while_any_active`  `jax.lax.while_loop` under `vmap`        9 times, 8 agents, 20,000 rows
+`networks.affine`   `kernel @ x + bias`                      1.3 times
+`networks.tanh`     `jnp.tanh`                               1.1 times (paper's DDQN)
+`keys.step_keys`    `jax.random.split(fold_in(key, step))`   1.06 times
+`flat.adam_step`    `optax.adam` on a pytree of four arrays  3 times, Adam alone
+=================== ======================================== ================================
+"""

@@ -1,7 +1,7 @@
 """Multilayer perceptrons, initialised and shaped as the paper's.
 
-Activations are *feature-major*, `[feature, batch]`: `kernel @ x` with the batch last runs 1.5 to
-1.7 times faster on CPU than rows-major for layers this small. A single input is `[feature]`.
+Activations are *feature-major*, `[feature, batch]`: for layers this small, `kernel @ x` with the
+batch last runs 1.5 to 1.7 times as fast on a CPU as `x @ kernel.T`. A single input is `[feature]`.
 """
 
 import functools
@@ -19,9 +19,10 @@ PRELU_SLOPE = 0.25
 def _rational_tanh(
     numerator: tuple[float, ...], denominator: tuple[float, ...], cut: float
 ) -> Callable[[Array], Array]:
-    """An odd rational function in the place of tanh, whose input is cut at +-`cut`.
+    """An odd rational function in the place of tanh, whose input is clipped to +-`cut`.
 
-    XLA's own tanh has degree 13 over 6, and selects for small and for large inputs.
+    Plain form: `jnp.tanh`, equal up to the error below (`tests/test_networks.py`). XLA's has degree
+    13 over 6, and selects for small and for large inputs.
 
     Args:
       numerator: coefficients of x times powers of x^2, the lowest first.
@@ -54,7 +55,7 @@ def _polynomial(coefficients: tuple[float, ...], x: Any) -> Any:
 # but for rounding, and stay within [-1, 1].
 #
 # Exact to rounding: off by at most 3.3e-7, 6 units in the last place, as XLA's is by 2.7e-7 and 5.
-# A hidden layer of `preset=paper`'s DDQN takes 0.78 of the time with it, a step 0.90.
+# A hidden layer of `preset=paper`'s DDQN takes 0.78 of the time with it, a learning step 0.90.
 tanh = _rational_tanh(
     (1.0, 0.134394869, 3.56568652e-3, 2.17972718e-5, 1.50901975e-8),
     (1.0, 0.467728108, 2.61418652e-2, 3.4016461e-4, 8.46649471e-7),
@@ -105,7 +106,12 @@ _MAX_UNROLLED = 8
 def affine(
     kernel: Float[Array, "out in"], bias: Float[Array, " out"], x: Float[Array, "in batch"]
 ) -> Float[Array, "out batch"]:
-    """`kernel @ x + bias`, with products over few terms unrolled in both passes."""
+    """`kernel @ x + bias`, with products over few terms unrolled in both passes.
+
+    Plain form: `kernel @ x + bias[:, None]`, equal up to rounding (`tests/test_networks.py`,
+    `test_affine_and_its_gradient_equal_the_plain_product`). A training of DDQN in CartPole takes
+    0.78 of the time.
+    """
     return _product(kernel, x) + bias[:, None]
 
 

@@ -1,4 +1,8 @@
-"""Spreading independent pieces of work over devices and lanes."""
+"""Spreading independent elements of work over devices, and over vmapped batches on each.
+
+Plain form: `jax.lax.map(fn, args)`, one element after the other on one device; equal to the bit for
+any number of devices (`tests/test_parallel.py`).
+"""
 
 import functools
 from collections.abc import Callable, Sequence
@@ -15,10 +19,10 @@ from sejax.errors import require
 
 @functools.cache
 def compiler_options() -> dict[str, Any] | None:
-    """What XLA should be told when it compiles whole trainings; None where nothing.
+    """XLA's options for whole trainings; None for the defaults.
 
-    On a CPU, to use vectors of 512 bits where the CPU has them: its default are 256. On an AMD EPYC
-    a generation takes 0.71 of the time with the paper's DDQN and 0.88 with the default one. Sums of
+    On a CPU, vectors of 512 bits, where the CPU has them; the default is 256. On an AMD EPYC a
+    generation takes 0.71 of the time with the paper's DDQN and 0.88 with the default one. Sums of
     wider vectors round otherwise, so that numbers differ in their last bits.
     """
     options = {"xla_cpu_prefer_vector_width": 512}
@@ -37,19 +41,20 @@ def spread_over_devices(
     num_parallel: int | None = None,
     cpu_num_parallel: int | None = 1,
 ) -> Callable[..., Any]:
-    """Maps `fn` over the leading axis of its arguments, over devices and in lanes.
+    """Maps `fn` over the leading axis of its arguments, on several devices.
 
     Args:
       fn: a function of one element.
       num_devices: None for all.
-      num_parallel: elements that run in lockstep on one device; fewer are filled up with copies.
-        None for `cpu_num_parallel` on a CPU and for all elsewhere.
-      cpu_num_parallel: None for all; 1 where a lane would only wait for the others.
+      num_parallel: elements in one vmapped batch of a device; a batch is filled up with copies.
+        None for `cpu_num_parallel` on a CPU and for all elements elsewhere.
+      cpu_num_parallel: None for all elements; 1 where those of a batch would wait for each other.
 
-    Devices take the elements in turn (0, 1, 0, 1, ...), so that each gets its share of long and
-    short ones. The result does not depend on the number of devices: to the bit where lanes are 1 or
-    a power of two, up to rounding otherwise, as lanes that do not fill a CPU's vectors are not all
-    computed alike.
+    Returns:
+      A function of the arguments, with a leading axis each. Devices take the elements in turn (0,
+      1, 0, 1, ...), so that each gets its share of long and short ones. The result does not depend
+      on the number of devices: to the bit where `num_parallel` is 1 or a power of two, up to
+      rounding otherwise, as elements that do not fill a CPU's vectors are not all computed alike.
 
     Raises:
       ConfigError: if there are fewer than `num_devices` devices.
@@ -59,7 +64,7 @@ def spread_over_devices(
 
 
 def copy_to_devices(tree: Any, num_devices: int | None = None) -> Any:
-    """The arrays of a pytree with a copy on each device, as what is spread returns them.
+    """The arrays of a pytree with a copy on each device, as results of spread functions have.
 
     A jitted loop is compiled anew if its state comes back from devices on which it did not start.
     """
@@ -87,8 +92,8 @@ def spread_groups_over_devices(
     Args:
       fns: a function of one element of each group.
       num_devices: as of `spread_over_devices`.
-      num_parallel: likewise.
-      cpu_num_parallel: likewise, of each group.
+      num_parallel: as of `spread_over_devices`.
+      cpu_num_parallel: as of `spread_over_devices`, for each group.
 
     Returns:
       A function of the groups' arguments, a tuple each, with a leading axis over the elements.
@@ -104,51 +109,54 @@ def spread_groups_over_devices(
     )
     mesh = _mesh(num_devices)
     on_cpu = available[0].platform == "cpu"
+    widths = [num_parallel or (width if on_cpu else None) for width in cpu_num_parallel]
 
-    def map_group(fn: Callable[..., Any], lockstep: int | None, args: tuple[Any, ...]) -> Any:
-        def one(args: Any) -> Any:
-            return fn(*args)
+    def map_groups(groups: Sequence[tuple[Any, ...]]) -> list[Any]:
+        return [_map_in_batches(*each) for each in zip(fns, widths, groups, strict=True)]
 
-        size = jax.tree.leaves(args)[0].shape[0]
-        width = num_parallel or (lockstep if on_cpu else None) or size
-        if width == 1:
-            return jax.lax.map(one, args)
-        # The last batch is filled up with copies: products of another width round otherwise, and
-        # a result must not depend on how many elements a device has.
-        num_batches = -(-size // width)
-        places = np.arange(num_batches * width) % size
-        batches = jax.tree.map(lambda x: x[places].reshape(-1, width, *x.shape[1:]), args)
-        out = jax.lax.map(jax.vmap(one), batches)
-        return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[:size], out)
-
-    def map_here(groups: Sequence[tuple[Any, ...]]) -> list[Any]:
-        return [map_group(*each) for each in zip(fns, cpu_num_parallel, groups, strict=True)]
-
-    count = mesh.size
-    if count == 1:
-        return map_here
+    if mesh.size == 1:
+        return map_groups
     axis = PartitionSpec("device")
-    mapped = jax.shard_map(map_here, mesh=mesh, in_specs=axis, out_specs=axis, check_vma=False)
+    mapped = jax.shard_map(map_groups, mesh=mesh, in_specs=axis, out_specs=axis, check_vma=False)
 
     def map_spread(groups: Sequence[tuple[Any, ...]]) -> list[Any]:
-        groups = list(groups)
-        sizes = [jax.tree.leaves(args)[0].shape[0] for args in groups]
-
-        def deal(x: Array, padded: int) -> Array:
-            x = x[jnp.arange(padded) % x.shape[0]] if padded > x.shape[0] else x
-            return x.reshape(-1, count, *x.shape[1:]).swapaxes(0, 1).reshape(padded, *x.shape[1:])
-
-        def gather(x: Array, size: int) -> Array:
-            x = x.reshape(count, -1, *x.shape[1:]).swapaxes(0, 1).reshape(x.shape)
-            return x[:size]
-
-        dealt = [
-            jax.tree.map(lambda x, n=-(-size // count) * count: deal(x, n), args)
-            for args, size in zip(groups, sizes, strict=True)
-        ]
+        deal = functools.partial(_deal, num_devices=mesh.size)
+        dealt = [jax.tree.map(deal, args) for args in groups]
         return [
-            jax.tree.map(lambda x, n=size: gather(x, n), out)
-            for out, size in zip(mapped(dealt), sizes, strict=True)
+            jax.tree.map(functools.partial(_gather, num_devices=mesh.size, size=_size(args)), out)
+            for args, out in zip(groups, mapped(dealt), strict=True)
         ]
 
     return map_spread
+
+
+def _size(args: Any) -> int:
+    """Number of elements."""
+    return jax.tree.leaves(args)[0].shape[0]
+
+
+def _map_in_batches(fn: Callable[..., Any], width: int | None, args: tuple[Any, ...]) -> Any:
+    """Maps a function of one element on one device; `width` None puts all into one batch."""
+    size = _size(args)
+    width = width or size
+    if width == 1:
+        return jax.lax.map(lambda args: fn(*args), args)
+    # The last batch is filled up with copies: products of another width round otherwise, and a
+    # result must not depend on how many elements a device has.
+    num_batches = -(-size // width)
+    places = np.arange(num_batches * width) % size
+    batches = jax.tree.map(lambda x: x[places].reshape(-1, width, *x.shape[1:]), args)
+    out = jax.lax.map(jax.vmap(lambda args: fn(*args)), batches)
+    return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[:size], out)
+
+
+def _deal(x: Array, num_devices: int) -> Array:
+    """Elements in the order of their devices, 0, 2, ..., 1, 3, ..., filled up with copies."""
+    size = -(-x.shape[0] // num_devices) * num_devices
+    x = x[jnp.arange(size) % x.shape[0]] if size > x.shape[0] else x
+    return x.reshape(-1, num_devices, *x.shape[1:]).swapaxes(0, 1).reshape(size, *x.shape[1:])
+
+
+def _gather(x: Array, num_devices: int, size: int) -> Array:
+    """Inverse of `_deal`."""
+    return x.reshape(num_devices, -1, *x.shape[1:]).swapaxes(0, 1).reshape(x.shape)[:size]

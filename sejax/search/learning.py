@@ -82,7 +82,7 @@ class Learning:
         with open_for(config, "Set search_dir=FOLDER.") as directory:
             chunks = self._programs.chunks(config)
             session.run(config, directory, chunks)
-            progress = progress_of(directory, chunks.learner.strategy.num_candidates)
+            progress = progress_of(directory, chunks.learner.strategy.num_evaluations)
         generations = search.config.max_generations
         return {
             **worth(whole(progress, generations), generations, search),
@@ -97,7 +97,7 @@ class Learning:
     def _run(self, config: build.LearnConfig, follower: Follower) -> Progress:
         with open_for(config, "Set search_dir=FOLDER.") as directory:
             chunks = self._programs.chunks(config)
-            num_candidates = chunks.learner.strategy.num_candidates
+            num_candidates = chunks.learner.strategy.num_evaluations
             over_at = chunks.learner.solved_score if config.stop_when_solved else None
             report = _Report(directory, follower, num_candidates, over_at)
             session.run(config, directory, chunks, report)

@@ -15,7 +15,7 @@ from typing import Any
 
 import jax
 
-from sejax.agents.mixture import Families, FamiliesConfig
+from sejax.agents.mixture import Mixture, MixtureConfig
 from sejax.bilevel import Program, make_program
 from sejax.cli import build
 from sejax.cli.families import families_of
@@ -70,7 +70,7 @@ def numbers_of(config: build.LearnConfig) -> dict[str, Any]:
     Where an agent's hyperparameters are drawn for each training, its own are no arguments.
     """
     varied = config.agent_hparams == "varied"
-    learners = () if varied else Families.of(config.parts()["agent"]).agents
+    learners = () if varied else Mixture.of(config.parts()["agent"]).agents
     return {"agents": tuple(x.hparams for x in learners), "es": traced_options(config.es)}
 
 
@@ -79,10 +79,10 @@ def shape_of(config: build.LearnConfig, numbers: dict[str, Any]) -> str:
     plain = {k: v for k, v in build.to_plain(config).items() if k not in _FREE}
     plain["es"] = _without(plain["es"], numbers["es"])
     if numbers["agents"]:
-        learners = Families.of(config.parts()["agent"])
+        learners = Mixture.of(config.parts()["agent"])
         plain["agent"] = [static_of(family.agent) for family in families_of(config)]
         shared = {
-            f.name: getattr(learners.config, f.name) for f in dataclasses.fields(FamiliesConfig)
+            f.name: getattr(learners.config, f.name) for f in dataclasses.fields(MixtureConfig)
         }
         plain["agents"] = [learners.names, learners.weights, shared]
         plain["exploration"] = static_of(config.exploration)
@@ -99,7 +99,7 @@ def _with_numbers(config: build.LearnConfig, num_dims: int, numbers: dict[str, A
     """The program of a configuration with other numbers, which may be traced."""
     parts = config.parts()
     if numbers["agents"]:
-        families = Families.of(parts["agent"])
+        families = Mixture.of(parts["agent"])
         learners = tuple(
             dataclasses.replace(agent, hparams=hparams)
             for agent, hparams in zip(families.agents, numbers["agents"], strict=True)

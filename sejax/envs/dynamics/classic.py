@@ -8,7 +8,7 @@ Source: Gymnasium 1.3, `gymnasium.envs.classic_control`; gymnax 1.0,
 `gymnax.environments.classic_control`.
 """
 
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -24,8 +24,14 @@ Step = tuple[Array, Any, Array, Array, dict[str, Array]]  # obs, state, reward, 
 class ClassicEnv(Environment):
     """What the tasks have in common: a subclass adds `reset_env`, `step_env` and `get_obs`."""
 
+    params_class: ClassVar[type[EnvParams]]
+
     def __init__(self, spaces: tuple[Space, Space]):
         self.spaces = spaces
+
+    @property
+    def default_params(self) -> Any:
+        return self.params_class()
 
     def after(self, state: Any, reward: Array, params: Any) -> Step:
         """What a step returns that leads to this state."""
@@ -60,13 +66,9 @@ class CartPoleParams(EnvParams):
 class CartPoleEnv(ClassicEnv):
     """A pole on a cart that is pushed left (action 0) or right (1)."""
 
-    @property
-    def default_params(self) -> CartPoleParams:
-        return CartPoleParams()
+    params_class = CartPoleParams
 
-    def reset_env(
-        self, key: Array, params: CartPoleParams
-    ) -> tuple[Float[Array, "4"], CartPoleState]:
+    def reset_env(self, key: Array, params: CartPoleParams) -> tuple[Array, CartPoleState]:
         start = jax.random.uniform(key, minval=-0.05, maxval=0.05, shape=(4,))
         state = CartPoleState(
             x=start[0], x_dot=start[1], theta=start[2], theta_dot=start[3], time=0
@@ -129,13 +131,9 @@ class AcrobotParams(EnvParams):
 class AcrobotEnv(ClassicEnv):
     """Two links of which the second joint is turned by a torque of -1, 0 or 1."""
 
-    @property
-    def default_params(self) -> AcrobotParams:
-        return AcrobotParams()
+    params_class = AcrobotParams
 
-    def reset_env(
-        self, key: Array, params: AcrobotParams
-    ) -> tuple[Float[Array, "6"], AcrobotState]:
+    def reset_env(self, key: Array, params: AcrobotParams) -> tuple[Array, AcrobotState]:
         start = jax.random.uniform(key, shape=(4,), minval=-0.1, maxval=0.1)
         state = AcrobotState(
             joint_angle1=start[0],
@@ -150,16 +148,8 @@ class AcrobotEnv(ClassicEnv):
         noise = params.torque_noise_max
         torque = params.available_torque[action]
         torque = torque + jax.random.uniform(key, shape=(), minval=-noise, maxval=noise)
-        before = jnp.array(
-            [
-                state.joint_angle1,
-                state.joint_angle2,
-                state.velocity_1,
-                state.velocity_2,
-                torque,
-            ]
-        )
-        after = _runge_kutta(before, params)
+        angles, velocities = self._angles(state), (state.velocity_1, state.velocity_2)
+        after = _runge_kutta(jnp.array([*angles, *velocities, torque]), params)
         state = AcrobotState(
             joint_angle1=_wrap(after[0], -jnp.pi, jnp.pi),
             joint_angle2=_wrap(after[1], -jnp.pi, jnp.pi),
@@ -170,20 +160,15 @@ class AcrobotEnv(ClassicEnv):
         return self.after(state, -1.0 * (1 - self.is_terminated(state, params)), params)
 
     def get_obs(self, state: AcrobotState, params: Any = None, key: Any = None) -> Array:
-        return jnp.array(
-            [
-                jnp.cos(state.joint_angle1),
-                jnp.sin(state.joint_angle1),
-                jnp.cos(state.joint_angle2),
-                jnp.sin(state.joint_angle2),
-                state.velocity_1,
-                state.velocity_2,
-            ]
-        )
+        angles = [f(angle) for angle in self._angles(state) for f in (jnp.cos, jnp.sin)]
+        return jnp.array([*angles, state.velocity_1, state.velocity_2])
 
     def is_terminated(self, state: AcrobotState, params: AcrobotParams) -> Bool[Array, ""]:
-        height = -jnp.cos(state.joint_angle1) - jnp.cos(state.joint_angle2 + state.joint_angle1)
-        return height > 1.0
+        angle1, angle2 = self._angles(state)
+        return -jnp.cos(angle1) - jnp.cos(angle2 + angle1) > 1.0
+
+    def _angles(self, state: AcrobotState) -> tuple[Array, Array]:
+        return state.joint_angle1, state.joint_angle2
 
 
 def _runge_kutta(y: Float[Array, "5"], params: AcrobotParams) -> Float[Array, "5"]:
@@ -268,9 +253,7 @@ class MountainCarParams(EnvParams):
 class MountainCarEnv(CarEnv):
     """A car that is pushed left (0), not at all (1) or right (2)."""
 
-    @property
-    def default_params(self) -> MountainCarParams:
-        return MountainCarParams()
+    params_class = MountainCarParams
 
     def step_env(self, key: Any, state: CarState, action: Any, params: MountainCarParams) -> Step:
         velocity = (
@@ -313,9 +296,7 @@ class MountainCarContinuousEnv(CarEnv):
     Differs: gymnax's has no stop at that wall, and stops a car that rolls back over the goal.
     """
 
-    @property
-    def default_params(self) -> MountainCarContinuousParams:
-        return MountainCarContinuousParams()
+    params_class = MountainCarContinuousParams
 
     def step_env(
         self, key: Any, state: CarState, action: Any, params: MountainCarContinuousParams
@@ -355,13 +336,9 @@ class PendulumParams(EnvParams):
 class PendulumEnv(ClassicEnv):
     """A pendulum that is turned by a torque, `[1]` or `[]`; it never terminates."""
 
-    @property
-    def default_params(self) -> PendulumParams:
-        return PendulumParams()
+    params_class = PendulumParams
 
-    def reset_env(
-        self, key: Array, params: PendulumParams
-    ) -> tuple[Float[Array, "3"], PendulumState]:
+    def reset_env(self, key: Array, params: PendulumParams) -> tuple[Array, PendulumState]:
         high = jnp.array([jnp.pi, 1])
         start = jax.random.uniform(key, shape=(2,), minval=-high, maxval=high)
         state = PendulumState(theta=start[0], theta_dot=start[1], time=0)

@@ -1,4 +1,4 @@
-"""What the MuJoCo tasks have in common: a gymnax environment on `Physics`."""
+"""What the MuJoCo tasks have in common: an environment on `Physics`."""
 
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -14,6 +14,8 @@ from sejax.envs.mujoco.physics import Report
 
 if TYPE_CHECKING:
     from sejax.envs.mujoco.tasks import MujocoTask
+
+Rewards = dict[str, Float[Array, ""]]
 
 
 @struct.dataclass
@@ -62,10 +64,8 @@ class MujocoEnv(Environment):
         """Whether the episode can go on, for tasks that terminate."""
         return jnp.bool_(True)
 
-    def rewards(
-        self, now: Report, action: Float[Array, " nu"], healthy: Bool[Array, ""]
-    ) -> dict[str, Float[Array, ""]]:
-        """The parts of the reward, by Gymnasium's names."""
+    def rewards(self, now: Report, action: Array, healthy: Array) -> Rewards:
+        """The parts of the reward of an action `[nu]`, by Gymnasium's names."""
         raise NotImplementedError
 
     def tells(self, now: Report) -> dict[str, Float[Array, ""]]:
@@ -104,7 +104,7 @@ class MujocoEnv(Environment):
         action = jnp.asarray(action, jnp.float32)
         after, now = self.physics.step(state.physics, action)
         healthy = self.is_healthy(now)
-        terminated = ~healthy & self.config.terminates
+        terminated = ~healthy & self.config.terminate_when_unhealthy
         rewards = self.rewards(now, action, healthy)
         discount = jnp.where(terminated, 0.0, 1.0)
         info = {**self.tells(now), **rewards, "discount": discount}

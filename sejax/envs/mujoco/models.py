@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from sejax.envs.mujoco.environment import MujocoEnv, control_cost, plane
+from sejax.envs.mujoco.environment import MujocoEnv, Rewards, control_cost, plane
 from sejax.envs.mujoco.physics import Report
 
 
@@ -32,9 +32,7 @@ class HalfCheetahEnv(MujocoEnv):
     def observe(self, now: Report) -> Float[Array, "17"]:
         return jnp.concatenate([now.qpos[1:], now.qvel])
 
-    def rewards(
-        self, now: Report, action: Float[Array, "6"], healthy: Bool[Array, ""]
-    ) -> dict[str, Float[Array, ""]]:
+    def rewards(self, now: Report, action: Array, healthy: Array) -> Rewards:
         run = self.velocity(now.qpos_change[0])
         return {"reward_run": run, "reward_ctrl": control_cost(action, 0.1)}
 
@@ -67,9 +65,7 @@ class HopperEnv(MujocoEnv):
         others = jnp.concatenate([now.qpos[2:], now.qvel])
         return (height > 0.7) & (jnp.abs(angle) < 0.2) & jnp.all(jnp.abs(others) < 100)
 
-    def rewards(
-        self, now: Report, action: Float[Array, " nu"], healthy: Bool[Array, ""]
-    ) -> dict[str, Float[Array, ""]]:
+    def rewards(self, now: Report, action: Array, healthy: Array) -> Rewards:
         config = self.config
         return {
             "reward_forward": config.forward_reward_weight * self.velocity(now.qpos_change[0]),
@@ -121,9 +117,7 @@ class SwimmerEnv(MujocoEnv):
     def observe(self, now: Report) -> Float[Array, "8"]:
         return jnp.concatenate([now.qpos[2:], now.qvel])
 
-    def rewards(
-        self, now: Report, action: Float[Array, "2"], healthy: Bool[Array, ""]
-    ) -> dict[str, Float[Array, ""]]:
+    def rewards(self, now: Report, action: Array, healthy: Array) -> Rewards:
         config = self.config
         return {
             "reward_forward": config.forward_reward_weight * self.velocity(now.qpos_change[0]),
@@ -154,9 +148,7 @@ class InvertedPendulumEnv(MujocoEnv):
     def is_healthy(self, now: Report) -> Bool[Array, ""]:
         return jnp.isfinite(self.observe(now)).all() & (jnp.abs(now.qpos[1]) <= 0.2)
 
-    def rewards(
-        self, now: Report, action: Float[Array, "1"], healthy: Bool[Array, ""]
-    ) -> dict[str, Float[Array, ""]]:
+    def rewards(self, now: Report, action: Array, healthy: Array) -> Rewards:
         return {"reward_survive": healthy.astype(jnp.float32)}
 
 
@@ -192,9 +184,7 @@ class AntEnv(MujocoEnv):
         finite = jnp.isfinite(now.qpos).all() & jnp.isfinite(now.qvel).all()
         return finite & (now.qpos[2] >= 0.2) & (now.qpos[2] <= 1.0)
 
-    def rewards(
-        self, now: Report, action: Float[Array, "8"], healthy: Bool[Array, ""]
-    ) -> dict[str, Float[Array, ""]]:
+    def rewards(self, now: Report, action: Array, healthy: Array) -> Rewards:
         config = self.config
         return {
             "reward_forward": config.forward_reward_weight * self._velocity(now)[0],
@@ -249,9 +239,7 @@ class ReacherEnv(MujocoEnv):
         parts = [jnp.cos(angles), jnp.sin(angles), target, now.qvel[:2], self._miss(now)[:2]]
         return jnp.concatenate(parts)
 
-    def rewards(
-        self, now: Report, action: Float[Array, "2"], healthy: Bool[Array, ""]
-    ) -> dict[str, Float[Array, ""]]:
+    def rewards(self, now: Report, action: Array, healthy: Array) -> Rewards:
         config = self.config
         return {
             "reward_dist": -config.reward_dist_weight * jnp.linalg.norm(self._miss(now)),

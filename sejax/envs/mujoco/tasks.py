@@ -9,7 +9,7 @@ import io
 import warnings
 from contextlib import redirect_stdout
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 from sejax.envs import mujoco
 from sejax.envs.base import Task
@@ -22,6 +22,13 @@ from sejax.options import Options, finite, not_negative, one_of, option
 BACKENDS = ("mujoco", "mjx", "spring", "positional", "generalized")
 
 _ON_A_LINE = ("x_position", "x_velocity")
+_TOLD_OF_WALKERS = (
+    *_ON_A_LINE,
+    "z_distance_from_origin",
+    "reward_forward",
+    "reward_ctrl",
+    "reward_survive",
+)
 _IN_A_PLANE = ("x_position", "y_position", "x_velocity", "y_velocity")
 _TOLD_IN_A_PLANE = (
     "x_position",
@@ -34,6 +41,14 @@ _TOLD_IN_A_PLANE = (
 )
 
 
+def _spec(obs_dim: int, num_actions: int, max_action: float = 1.0, **rest: Any) -> TaskSpec:
+    return TaskSpec(
+        observation=Box.unbounded(obs_dim),
+        action=Box.symmetric(*[max_action] * num_actions),
+        **{"max_steps": 1000, **rest},
+    )
+
+
 @dataclass(frozen=True, kw_only=True)
 class MujocoTask(Options):
     """What the tasks have in common.
@@ -41,21 +56,18 @@ class MujocoTask(Options):
     Attributes:
       name: of the task.
       model: class of `sejax.envs.mujoco.models`.
+      terminate_when_unhealthy: whether an unhealthy state ends the episode; an option of some.
     """
 
     group: ClassVar[str] = "env"
     name: ClassVar[str]
     model: ClassVar[str]
+    terminate_when_unhealthy = True
 
     @property
     def spec(self) -> TaskSpec:
         """What is known of the task."""
         raise NotImplementedError
-
-    @property
-    def terminates(self) -> bool:
-        """Whether an unhealthy state ends the episode."""
-        return True
 
     def make(self) -> Task:
         return Task.of(self.spec, name=self.name, env=mujoco.make_env(self))
@@ -70,19 +82,15 @@ class HalfCheetah(MujocoTask):
 
     name = "halfcheetah"
     model = "HalfCheetahEnv"
+    spec = _spec(
+        obs_dim=17,
+        num_actions=6,
+        solved_reward=3000.0,
+        info_keys=(*_ON_A_LINE, "reward_run", "reward_ctrl"),
+        augmented_keys=_ON_A_LINE,
+    )
 
     backend: str = option(BACKENDS[0], one_of(BACKENDS))  # physics
-
-    @property
-    def spec(self) -> TaskSpec:
-        return TaskSpec(
-            observation=Box.unbounded(17),
-            action=Box.symmetric(*[1.0] * 6),
-            max_steps=1000,
-            solved_reward=3000.0,
-            info_keys=(*_ON_A_LINE, "reward_run", "reward_ctrl"),
-            augmented_keys=_ON_A_LINE,
-        )
 
     def make(self) -> Task:
         if self.backend == "mujoco":
@@ -108,20 +116,19 @@ class Hopper(MujocoTask):
 
     name = "hopper"
     model = "HopperEnv"
+    spec = _spec(
+        obs_dim=11,
+        num_actions=3,
+        solved_reward=3800.0,
+        info_keys=_TOLD_OF_WALKERS,
+        augmented_keys=_ON_A_LINE,
+    )
 
     forward_reward_weight: float = option(1.0, finite("it weighs a reward"))
     ctrl_cost_weight: float = option(1e-3, not_negative("it weighs a cost"))
     healthy_reward: float = option(1.0, finite("it is a reward"))
     terminate_when_unhealthy: bool = True
     reset_noise_scale: float = option(5e-3, not_negative("it is a range"))
-
-    @property
-    def spec(self) -> TaskSpec:
-        return _walker(obs_dim=11, num_joints=3, solved_reward=3800.0)
-
-    @property
-    def terminates(self) -> bool:
-        return self.terminate_when_unhealthy
 
 
 class Walker2d(Hopper):
@@ -133,25 +140,11 @@ class Walker2d(Hopper):
 
     name = "walker2d"
     model = "Walker2dEnv"
-
-    @property
-    def spec(self) -> TaskSpec:
-        return _walker(obs_dim=17, num_joints=6, solved_reward=4000.0)
-
-
-def _walker(obs_dim: int, num_joints: int, solved_reward: float) -> TaskSpec:
-    return TaskSpec(
-        observation=Box.unbounded(obs_dim),
-        action=Box.symmetric(*[1.0] * num_joints),
-        max_steps=1000,
-        solved_reward=solved_reward,
-        info_keys=(
-            *_ON_A_LINE,
-            "z_distance_from_origin",
-            "reward_forward",
-            "reward_ctrl",
-            "reward_survive",
-        ),
+    spec = _spec(
+        obs_dim=17,
+        num_actions=6,
+        solved_reward=4000.0,
+        info_keys=_TOLD_OF_WALKERS,
         augmented_keys=_ON_A_LINE,
     )
 
@@ -162,21 +155,17 @@ class Swimmer(MujocoTask):
 
     name = "swimmer"
     model = "SwimmerEnv"
+    spec = _spec(
+        obs_dim=8,
+        num_actions=2,
+        solved_reward=360.0,
+        info_keys=_TOLD_IN_A_PLANE,
+        augmented_keys=_IN_A_PLANE,
+    )
 
     forward_reward_weight: float = option(1.0, finite("it weighs a reward"))
     ctrl_cost_weight: float = option(1e-4, not_negative("it weighs a cost"))
     reset_noise_scale: float = option(0.1, not_negative("it is a range"))
-
-    @property
-    def spec(self) -> TaskSpec:
-        return TaskSpec(
-            observation=Box.unbounded(8),
-            action=Box.symmetric(1.0, 1.0),
-            max_steps=1000,
-            solved_reward=360.0,
-            info_keys=_TOLD_IN_A_PLANE,
-            augmented_keys=_IN_A_PLANE,
-        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -185,17 +174,9 @@ class InvertedPendulum(MujocoTask):
 
     name = "inverted_pendulum"
     model = "InvertedPendulumEnv"
+    spec = _spec(obs_dim=4, num_actions=1, max_action=3.0, solved_reward=950.0)
 
     reset_noise_scale: float = option(0.01, not_negative("it is a range"))
-
-    @property
-    def spec(self) -> TaskSpec:
-        return TaskSpec(
-            observation=Box.unbounded(4),
-            action=Box.symmetric(3.0),
-            max_steps=1000,
-            solved_reward=950.0,
-        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -215,18 +196,13 @@ class Ant(MujocoTask):
 
     @property
     def spec(self) -> TaskSpec:
-        return TaskSpec(
-            observation=Box.unbounded(105 if self.include_cfrc_ext_in_observation else 27),
-            action=Box.symmetric(*[1.0] * 8),
-            max_steps=1000,
+        return _spec(
+            obs_dim=105 if self.include_cfrc_ext_in_observation else 27,
+            num_actions=8,
             solved_reward=6000.0,
             info_keys=(*_TOLD_IN_A_PLANE, "reward_contact", "reward_survive"),
             augmented_keys=_IN_A_PLANE,
         )
-
-    @property
-    def terminates(self) -> bool:
-        return self.terminate_when_unhealthy
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -235,16 +211,13 @@ class Reacher(MujocoTask):
 
     name = "reacher"
     model = "ReacherEnv"
+    spec = _spec(
+        obs_dim=10,
+        num_actions=2,
+        max_steps=50,
+        solved_reward=-3.75,
+        info_keys=("reward_dist", "reward_ctrl"),
+    )
 
     reward_dist_weight: float = option(1.0, not_negative("it weighs a cost"))
     reward_control_weight: float = option(1.0, not_negative("it weighs a cost"))
-
-    @property
-    def spec(self) -> TaskSpec:
-        return TaskSpec(
-            observation=Box.unbounded(10),
-            action=Box.symmetric(1.0, 1.0),
-            max_steps=50,
-            solved_reward=-3.75,
-            info_keys=("reward_dist", "reward_ctrl"),
-        )

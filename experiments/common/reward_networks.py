@@ -23,13 +23,14 @@ from typing import Any
 import pandas as pd
 
 import sejax
-from experiments import figures, pieces, proxy_runs, worlds
-from experiments.proxy_runs import RunSettings
-from experiments.settings import setting, work_beside
+from experiments.common import agents, figures, runs
+from experiments.common.experiment import count, setting, work_beside
+from experiments.common.runs import RunSettings
+from experiments.common.shards import read_rows, write_rows
 from sejax import ICMConfig, errors, registry, serialize
 from sejax.cli import build, run_directory
 from sejax.errors import ConfigError
-from sejax.options import counts, one_of
+from sejax.options import one_of
 
 # Paper, table "Overview of Reward Network variants".
 VARIANTS = (
@@ -40,7 +41,7 @@ VARIANTS = (
 )
 AUGMENTED = "+augm"  # of a variant's name: the network sees the task's observation vector as well
 WEIGHTED_INFO = ("additive_weighted_info", "exclusive_weighted_info")
-ROWS = ("default", "varied", "transfer")  # agents that are trained, as in the paper's figure
+PAPER_ROWS = ("default", "varied", "transfer")
 OBJECTIVES = tuple(registry.GROUPS["objective"].built_in)
 # With quick=true; a task's own come on top.
 QUICK: dict[str, Any] = {
@@ -61,13 +62,12 @@ class Study:
     transfer_agent: Any  # of the row with an unseen agent
     # Makes the one that was tuned on the real task for few steps, if it is another one.
     tuned_agent: Callable[[], Any] | None = None
-    rows: tuple[str, ...] = ROWS  # of the figure: `rn_curves.ROWS`
+    rows: tuple[str, ...] = PAPER_ROWS  # of the figure
     bonuses: dict[str, Any]  # exploration bonuses that are compared on the real task
     variants: tuple[str, ...] = VARIANTS
     max_episodes: int  # that the paper trains
     max_steps: int  # training steps that its figure shows
     learned: int = 10  # RNs of each variant
-    runs_at_once: int = 1  # of them in one program; a run is saved after each generation of all
     rns: int = 10  # the best ones of them, that agents are trained on
     num_agents: int = 10  # on each of these
     # Where trainings of the task, or compiling its physics, would take too long with quick=true.
@@ -96,13 +96,12 @@ STUDIES = {
         max_episodes=500,
         max_steps=5000,
         learned=50,
-        runs_at_once=50,
     ),
     "cartpole": Study(
         agent=sejax.DDQNConfig(**_CARTPOLE),
         transfer_agent=sejax.DuelingDDQNConfig(**_CARTPOLE),
-        tuned_agent=functools.partial(worlds.tuned_agent, "cartpole", "ddqn"),
-        rows=(*ROWS, "tuned"),
+        tuned_agent=functools.partial(agents.tuned_agent, "cartpole", "ddqn"),
+        rows=(*PAPER_ROWS, "tuned"),
         bonuses={"icm": ICMConfig()},
         max_episodes=1000,
         max_steps=50_000,
@@ -119,7 +118,7 @@ STUDIES = {
             learning_rate=0.0015,
             init_action_std=1.0,
         ),
-        rows=(*ROWS, "tuned"),
+        rows=(*PAPER_ROWS, "tuned"),
         bonuses={"icm": ICMConfig(forward_weight=0.1, reward_scale=0.01, learning_rate=5e-4)},
         max_episodes=3000,
         max_steps=250_000,
@@ -167,7 +166,7 @@ STUDIES = {
         },
     ),
 }
-SHOWN = {  # colour of a world, and the reward that agents get there
+SHOWN = {  # colour of a condition, and the reward that agents get there
     "real": (figures.BEST, "real reward"),
     "icm": ("#7a7a7a", "real reward + ICM"),
     "count_based": ("#7a7a7a", "real reward + count-based"),
@@ -181,7 +180,7 @@ SHOWN = {  # colour of a world, and the reward that agents get there
 
 
 def label(name: str) -> str:
-    """Name of a world in pictures: the reward that agents get there."""
+    """Name of a condition in figures: the reward that agents get there."""
     _, text = SHOWN[name.removesuffix(AUGMENTED)]
     return text if AUGMENTED not in name else re.sub(r"\(s('?)\)", r"(s\1, v\1)", text)
 
@@ -194,20 +193,20 @@ class RnSettings(RunSettings):
     variants: tuple[str, ...] = setting(
         VARIANTS, about=f"of the RNs: those, with {AUGMENTED}, {', '.join(WEIGHTED_INFO)}"
     )
-    learned: int = setting(10, counts("RNs are learned"), about="RNs to learn of each variant")
+    learned: int = count(10, "RNs", about="RNs to learn of each variant")
     rns_dir: str | None = setting(
         None, about="where RNs are kept; results/reward_networks, quick rns/ in `out`"
     )
 
     @classmethod
     def defaults(cls, given: Mapping[str, Any]) -> dict[str, Any]:
-        usual = super().defaults(given)
-        env = given.get("env", usual["env"])
+        default = super().defaults(given)
+        env = given.get("env", default["env"])
         errors.one_of("env", env, STUDIES)
         study = STUDIES[env]
         values = vars(study) | {"bonuses": tuple(study.bonuses)}
         values |= QUICK | study.when_quick if given.get("quick") else {}
-        return usual | {name: values[name] for name in usual.keys() & values.keys()}
+        return default | {name: values[name] for name in default.keys() & values.keys()}
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -251,21 +250,17 @@ def learn(settings: RnSettings, variant: str, objective: str) -> Any:
     if known < settings.learned:
         config = learning_config(settings, variant, objective)
         config = dataclasses.replace(config, seed=settings.seed + known)
-        path, count = file_of(settings, variant, objective), settings.learned - known
-        runs = work_beside(settings.rns_folder, "runs")
-        folder = runs / path.relative_to(settings.rns_folder).with_suffix("")
-        configs = proxy_runs.configs_of_runs(config, count, folder, settings.study.runs_at_once)
-        print(
-            f"{variant}: learns {count} RNs, {config.generations} generations each; may be "
-            "stopped and started again",
-            flush=True,
-        )
-        curves = [proxy_runs.learn_all(configs, "rns_dir")]
+        path, missing = file_of(settings, variant, objective), settings.learned - known
+        folder = work_beside(settings.rns_folder, "runs")
+        folder /= path.relative_to(settings.rns_folder).with_suffix("")
+        configs = runs.configs_of(config, missing, folder)
+        print(f"{variant}: learns {missing} RNs, {config.generations} generations each", flush=True)
+        curve = runs.learn(configs, option="rns_dir")
         if there:
-            before = pieces.read_rows(curves_file(path))  # with those beyond, if stopped right here
-            curves.insert(0, before[before["seed"] < config.seed])
-        pieces.write_rows(curves_file(path), pd.concat(curves, ignore_index=True))
-        proxy_runs.collect(configs, path, there)
+            before = read_rows(curves_file(path))  # with those beyond, if stopped right here
+            curve = pd.concat([before[before["seed"] < config.seed], curve], ignore_index=True)
+        write_rows(curves_file(path), curve)
+        runs.collect(configs, path, there)
         there = sejax.load_set(path, option="rns_dir", kind="rn")
     return there[: settings.learned]
 
@@ -293,9 +288,8 @@ def stored(settings: RnSettings, variant: str, objective: str) -> Any:
     there = sejax.load_set(path, option="rns_dir", kind="rn")
     made_with = _what_counts(build.learn_config(there.config))
     asked = _what_counts(learning_config(settings, variant, objective))
-    differing = [
-        name for name in sorted({*made_with, *asked}) if made_with.get(name) != asked.get(name)
-    ]
+    names = sorted(made_with.keys() | asked.keys())
+    differing = [name for name in names if made_with.get(name) != asked.get(name)]
     if differing == ["generations"] and made_with["generations"] < asked["generations"]:
         return None
     if differing:
@@ -308,7 +302,7 @@ def stored(settings: RnSettings, variant: str, objective: str) -> Any:
 
 
 def _what_counts(config: Any) -> dict[str, Any]:
-    """What a run depends on; not how it is computed, with which others, or where it is kept."""
+    """The fields that a run's numbers depend on."""
     free = run_directory.FREE_FIELDS - {"generations"} | {"num_parallel", "num_seeds"}
     flat = serialize.flatten(build.to_plain(config))
     return {name: value for name, value in flat.items() if name.partition(".")[0] not in free}
@@ -322,13 +316,13 @@ def check_stored(settings: RnSettings, objectives: Sequence[str]) -> None:
 
 @functools.cache
 def learning_config(settings: RnSettings, variant: str, objective: str) -> Any:
-    """Settings of the NES runs for a variant and objective.
+    """The configuration of the NES runs for a variant and objective.
 
     The scale of a network's output is the preset's for the preset's own variant, and 1 for others.
     """
     plain = variant.removesuffix(AUGMENTED)
-    usual = settings.learn_config(["proxy=rn"]).proxy
-    scale = usual.output_scale if plain == usual.variant else 1.0
+    preset = settings.learn_config(["proxy=rn"]).proxy
+    scale = preset.output_scale if plain == preset.variant else 1.0
     return settings.learn_config(
         [
             "proxy=rn",

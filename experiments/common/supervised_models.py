@@ -18,14 +18,12 @@ import optax
 import pandas as pd
 
 import sejax
-from experiments import se_agents
-from experiments.se_agents import AGENTS, SOFT_SE
-from experiments.settings import Settings, count, each_of, setting
-from experiments.worlds import HPARAMS
+from experiments.common import agents
+from experiments.common.agents import HPARAMS, SE_AGENTS, SOFT_SE
+from experiments.common.experiment import Settings, count, each_of, setting
 from sejax import registry
 from sejax.cli import build
 from sejax.ops.parallel import spread_over_devices
-from sejax.options import counts
 
 LEARNING_RATE, BATCH_SIZE = 1e-4, 1024  # paper and docs/reference.md 7.5
 
@@ -36,31 +34,21 @@ class SupervisedBaseline(Settings):
 
     name = "supervised_baseline"
 
-    proxy: str = setting(
-        SOFT_SE,
-        about="SE to compare with, whose settings the NES runs have; run directory, file or name",
-    )
+    proxy: str = setting(SOFT_SE, about="SE to compare with; run directory, file or shipped name")
     models: int = count(5, "models", quick=2, about="NES runs, and a model for each")
     generations: int = count(25, "generations", quick=3, about="of an NES run")
-    population: int = setting(
-        16,
-        counts("scores are compared within a generation", least=2),
-        quick=3,
-        about="members of a generation",
-    )
+    population: int = count(16, "candidates", least=2, quick=3, about="of a generation")
     max_rows: int = count(100_000, "transitions", quick=3000, about="transitions for a model")
     epochs: int = count(100, "epochs", quick=20, about="of a fit")
-    agents: tuple[str, ...] = setting(("ddqn",), each_of(AGENTS), about=f"of {', '.join(AGENTS)}")
+    agents: tuple[str, ...] = setting(
+        ("ddqn",), each_of(SE_AGENTS), about=f"of {', '.join(SE_AGENTS)}"
+    )
     hparams: tuple[str, ...] = setting(
         HPARAMS, each_of(HPARAMS), about="of the agents; varied: drawn for each"
     )
     num_agents: int = count(20, "agents", quick=2, about="for each model")
     test_episodes: int = count(10, "episodes", about="of each agent")
-    max_steps: int | None = setting(
-        None,
-        counts("an agent must train"),
-        about="training steps of an agent on a model; as on the SE",
-    )
+    max_steps: int | None = count(None, "steps", about="of an agent on a model; as on the SE")
 
 
 def learning_config(settings: SupervisedBaseline, ses: Any) -> Any:
@@ -69,8 +57,8 @@ def learning_config(settings: SupervisedBaseline, ses: Any) -> Any:
     agent, training = config.agent, config.training
     training = dataclasses.replace(training, test_episodes=settings.test_episodes)
     if settings.quick:
-        agent = dataclasses.replace(agent, **se_agents.QUICK_AGENT)
-        training = dataclasses.replace(training, max_steps=se_agents.QUICK_STEPS)
+        agent = dataclasses.replace(agent, **agents.QUICK_AGENT)
+        training = dataclasses.replace(training, max_steps=agents.QUICK_STEPS)
     es = dataclasses.replace(
         config.es, population_size=settings.population, num_incumbent_evals=settings.population
     )
@@ -88,14 +76,14 @@ def learning_config(settings: SupervisedBaseline, ses: Any) -> Any:
 
 
 def collect_all(settings: SupervisedBaseline, ses: Any) -> list[pd.DataFrame]:
-    """The transitions of each NES run; every run is a piece."""
+    """The transitions of each NES run; every run is a shard."""
     config = learning_config(settings, ses)
     made_with = build.to_plain(config) | {"max_rows": settings.max_rows, "devices": None}
     tables = []
     for index in range(settings.models):
         seed = settings.seed + index
         make = functools.partial(collect, config, seed, settings.max_rows)
-        rows = settings.pieces.compute(f"transitions-{index}", made_with | {"seed": seed}, make)
+        rows = settings.shards.compute(f"transitions-{index}", made_with | {"seed": seed}, make)
         print(
             f"NES run {index}: {len(rows):,} transitions of episodes with mean return "
             f"{rows['return'].mean():.1f}",
@@ -108,7 +96,7 @@ def collect_all(settings: SupervisedBaseline, ses: Any) -> list[pd.DataFrame]:
 def collect(config: Any, seed: int, max_rows: int) -> pd.DataFrame:
     """Runs NES and draws transitions, all equally likely, from its agents' real test episodes."""
     run = make_recorded_run(config)
-    state = run.init(jax.random.key(seed)[None])
+    state = run.init(jax.random.key(seed))
     sample = Sample(max_rows, np.random.default_rng(seed))
     for number in range(config.generations):
         state, steps = run.generation(state)
@@ -119,36 +107,35 @@ def collect(config: Any, seed: int, max_rows: int) -> pd.DataFrame:
 class RecordedRun(NamedTuple):
     """An NES run whose agents' tests are recorded; compiled functions."""
 
-    init: Callable[[Any], Any]  # keys [1] -> LearnState
-    # state -> (state, Steps): `Program.generation` with the steps of all tests, [agent, step, ...]
+    init: Callable[[Any], Any]  # key -> LearnState
+    # state -> (state, Steps): a generation, and the steps of all tests, [evaluation, step, ...]
     generation: Callable[[Any], Any]
 
 
 @functools.cache
 def make_recorded_run(config: Any) -> RecordedRun:
     """The NES run of a configuration, from any seed: compiled once for all of them."""
-    from sejax.bilevel import make_program
-    from sejax.evaluation import make_evaluator, num_parallel_on_cpu, tested_throughout
+    from sejax.bilevel import make_bilevel
+    from sejax.evaluation import make_evaluator, num_parallel_on_cpu
 
-    program = make_program(**config.parts())
-    agent, proxy, training = program.agent, program.proxy, config.training
-    if program.objective.needs_tests:
-        training = tested_throughout(training)
+    bilevel = make_bilevel(**config.parts())
+    proxy, training = bilevel.proxy, bilevel.training
+    (agent,) = bilevel.mixture.agents
     evaluate = make_evaluator(agent, proxy, proxy.task, training, record=True)
     evaluate_all = spread_over_devices(
-        lambda key, candidate: evaluate(key, proxy.params(program.unravel(candidate))),
+        lambda key, candidate: evaluate(key, proxy.params(bilevel.unravel(candidate))),
         config.devices,
         config.num_parallel,
         num_parallel_on_cpu(agent, training),
     )
 
     def generation(state: Any) -> Any:
-        asked = program.ask(state)
-        outcome, steps = evaluate_all(asked.keys[0], asked.candidates[0])
-        state, _ = program.tell(state, asked, jax.tree.map(lambda x: x[None], outcome))
+        candidates = bilevel.ask(state)
+        outcome, steps = evaluate_all(candidates.keys, candidates.params)
+        state, _ = bilevel.tell(state, candidates, outcome)
         return state, steps
 
-    return RecordedRun(init=jax.jit(program.init), generation=jax.jit(generation))
+    return RecordedRun(init=jax.jit(bilevel.init), generation=jax.jit(generation))
 
 
 def table_of(steps: Any, num_episodes: int, generation: int) -> pd.DataFrame:
@@ -213,7 +200,7 @@ def model_file(settings: SupervisedBaseline, variant: str) -> Path:
     return settings.folder / f"models-{variant}.safetensors"
 
 
-def fit_piece(settings: SupervisedBaseline, ses: Any, data: list[pd.DataFrame]) -> pd.DataFrame:
+def fit_shard(settings: SupervisedBaseline, ses: Any, data: list[pd.DataFrame]) -> pd.DataFrame:
     """Fits all models, stores both variants of them, and returns the errors of each epoch."""
     num_rows = min(len(rows) for rows in data)
     made_with = {
@@ -223,7 +210,7 @@ def fit_piece(settings: SupervisedBaseline, ses: Any, data: list[pd.DataFrame]) 
         "batch_size": BATCH_SIZE,
     }
     made_with |= settings.values("models", "epochs", "generations", "population", "seed")
-    fits = settings.pieces.compute("fit", made_with, lambda: fit_all(settings, ses, data, num_rows))
+    fits = settings.shards.compute("fit", made_with, lambda: fit_all(settings, ses, data, num_rows))
     last = fits[fits["epoch"] == settings.epochs - 1].mean()
     print(
         f"Models: mean squared error {last['error']:.2g} of [s', r], "
@@ -243,19 +230,9 @@ def fit_all(settings: Any, ses: Any, data: list[pd.DataFrame], num_rows: int) ->
     initial, fitted, errors = jax.device_get(program(keys, *stacked))
     save_models(settings, ses, {**fitted, "done": initial["done"]}, "authors", "soft")
     save_models(settings, ses, fitted, "fair", "threshold")
-    return pd.concat(
-        [
-            pd.DataFrame(
-                {
-                    "model": i,
-                    "epoch": range(settings.epochs),
-                    "error": errors[i, :, 0],
-                    "done_error": errors[i, :, 1],
-                }
-            )
-            for i in range(settings.models)
-        ]
-    )
+    model, epoch = (place.ravel() for place in np.indices(errors.shape[:2]))
+    each = {"error": errors[..., 0].ravel(), "done_error": errors[..., 1].ravel()}
+    return pd.DataFrame({"model": model, "epoch": epoch, **each})
 
 
 def arrays_of(rows: pd.DataFrame) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:

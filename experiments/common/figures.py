@@ -1,4 +1,4 @@
-"""Pictures that the experiments share."""
+"""Parts of figures that the experiments share."""
 
 import contextlib
 from collections.abc import Iterator, Sequence
@@ -10,11 +10,9 @@ import matplotlib as mpl
 mpl.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
-import pandas as pd
-from matplotlib.ticker import MaxNLocator
 from PIL import Image
 
-from experiments.statistics import performance_profile
+from experiments.common.statistics import performance_profile
 from sejax.ops.files import atomic_path
 
 # Okabe and Ito's palette, which those with any kind of colour blindness can tell apart.
@@ -38,50 +36,6 @@ STYLE: Any = {
     "axes.spines.right": False,
     "legend.frameon": False,
 }
-
-
-def learning_curves(curves: pd.DataFrame, solved_reward: float, path: Path) -> None:
-    """Draws each run's incumbent mean as a thin line, and their mean with one std.
-
-    The curves have the columns of `metrics.csv`; the task's threshold is a line.
-
-    Source: paper, figure "Multiple NES runs of Alg. 1".
-    """
-    lines = curves.pivot(index="generation", columns="seed", values="incumbent_mean")
-    lines = lines.ffill()  # a run that stopped when it solved the task stays where it was
-    iterations = lines.index.to_numpy() + 1
-    mean, std = lines.mean(axis=1), lines.std(axis=1, ddof=0)
-    with panels(path, 1, 1, (6, 3.6)) as (_, axes):
-        axis = axes[0, 0]
-        for index, seed in enumerate(lines.columns):
-            axis.plot(
-                iterations,
-                lines[seed],
-                color=REAL,
-                lw=0.7,
-                alpha=0.5,
-                label=None if index else f"NES run ({lines.shape[1]} in all)",
-            )
-        axis.fill_between(
-            iterations,
-            mean - std,
-            mean + std,
-            color=REAL,
-            alpha=0.15,
-            lw=0,
-            label="mean ± std of the runs",
-        )
-        axis.plot(iterations, mean, color=REAL, lw=2.4)
-        axis.axhline(
-            solved_reward, color=SOLVED, ls="--", lw=1.2, label=f"solved ({solved_reward:g})"
-        )
-        axis.set(
-            xlabel="NES outer iteration",
-            xlim=(1, max(iterations[-1], 2)),
-            ylabel="mean return of the incumbent's\nagents on the real task",
-        )
-        axis.xaxis.set_major_locator(MaxNLocator(integer=True))
-        axis.legend(fontsize=9, loc="best")
 
 
 def density(values: Any, grid: Any, low: float, high: float) -> np.ndarray:
@@ -152,17 +106,22 @@ def profile(
     axis.set(xlim=(low, high), ylim=(0, 1.02))
 
 
+def threshold(axis: Any, solved_reward: float, label: str | None = None) -> None:
+    """Draws the return at which the task is solved, a dashed line."""
+    axis.axhline(solved_reward, color=SOLVED, ls="--", lw=1.2, label=label)
+
+
+def cell_text(axis: Any, x: float, y: float, text: str, is_dark: bool, fontsize: int) -> None:
+    """Writes into a cell of a coloured map, in white on a dark one."""
+    color = "white" if is_dark else "black"
+    axis.text(x, y, text, ha="center", va="center", fontsize=fontsize, color=color)
+
+
 def legend_above(figure: Any, axis: Any, columns: int = 4, fontsize: int | None = 9) -> None:
     """Puts the legend of one panel above all, in so many columns, if the figure is wide enough."""
     handles, labels = axis.get_legend_handles_labels()
-    room = max(1, int(figure.get_figwidth() / LEGEND_COLUMN))
-    figure.legend(
-        handles,
-        labels,
-        ncols=min(len(labels), columns, room),
-        loc="outside upper center",
-        fontsize=fontsize,
-    )
+    columns = min(len(labels), columns, max(1, int(figure.get_figwidth() / LEGEND_COLUMN)))
+    figure.legend(handles, labels, ncols=columns, loc="outside upper center", fontsize=fontsize)
 
 
 @contextlib.contextmanager
@@ -170,10 +129,9 @@ def panels(
     path: Path, lines: int, columns: int, size: tuple[float, float], **options: Any
 ) -> Iterator[tuple[Any, Any]]:
     """A figure, its size in inches, and its axes `[lines, columns]`; written when all is drawn."""
+    options |= {"figsize": size, "squeeze": False, "layout": "constrained"}
     with plt.rc_context(STYLE):
-        figure, axes = plt.subplots(
-            lines, columns, figsize=size, squeeze=False, layout="constrained", **options
-        )
+        figure, axes = plt.subplots(lines, columns, **options)
         yield figure, axes
         with atomic_path(path) as temporary:
             figure.savefig(temporary, dpi=200)

@@ -1,4 +1,4 @@
-"""What the experiments' tables share: intervals, columns of texts, and how a table is published."""
+"""Tables: means with intervals as columns, columns as texts, and writing a table."""
 
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -8,27 +8,32 @@ import pandas as pd
 from rich.console import Console
 from rich.table import Table
 
-from experiments.settings import Settings
-from experiments.statistics import bootstrap_interval, interquartile_mean
+from experiments.common.experiment import Settings
+from experiments.common.statistics import bootstrap_interval, interquartile_mean
 from sejax.ops.files import write_text
 
 LEAST_FOR_INTERVAL = 5  # independent values: two bracket the truth half of the time
 
 
-def interval(draws: Any) -> tuple[float, float]:
-    """95% bootstrap interval of the mean of what is drawn again; nan for fewer than five."""
-    return bootstrap_interval(draws) if len(draws) >= LEAST_FOR_INTERVAL else (np.nan, np.nan)
+def interval(draws: Any, least: int = LEAST_FOR_INTERVAL) -> tuple[float, float]:
+    """95% bootstrap interval of the mean of what is drawn again; nan for fewer than `least`."""
+    return bootstrap_interval(draws) if len(draws) >= least else (np.nan, np.nan)
 
 
-def brackets(low: float, high: float, digits: int) -> str:
-    """An interval as it stands behind a mean; empty if there is none."""
-    return f" [{low:,.{digits}f}, {high:,.{digits}f}]" if np.isfinite(low) else ""
+def mean_columns(
+    values: Any, name: str, draws: Any = None, least: int = LEAST_FOR_INTERVAL
+) -> dict[str, float]:
+    """Mean, std and `interval` as columns `NAME_mean`, `NAME_std`, `NAME_low`, `NAME_high`.
 
-
-def spread(values: pd.Series, draws: Any, name: str) -> dict[str, float]:
-    """Mean, std and `interval` of values as columns `NAME_mean`, ...; `draws` are drawn again."""
-    low, high = interval(draws)
-    columns = {"mean": values.mean(), "std": values.std(ddof=0), "low": low, "high": high}
+    Args:
+      values: `[n]`.
+      name: of the columns.
+      draws: what the interval draws again, such as the means of groups; the values if not given.
+      least: how many of them give an interval.
+    """
+    values = np.asarray(values, float)
+    low, high = interval(values if draws is None else draws, least)
+    columns = {"mean": values.mean(), "std": values.std(), "low": low, "high": high}
     return {f"{name}_{statistic}": value for statistic, value in columns.items()}
 
 
@@ -47,13 +52,29 @@ def iqm_columns(values: pd.Series, name: str, strata: pd.Series | None = None) -
     return {f"{name}_{statistic}": value for statistic, value in columns.items()}
 
 
+def brackets(low: float, high: float, digits: int) -> str:
+    """An interval as it stands behind a mean; empty if there is none."""
+    return f" [{low:,.{digits}f}, {high:,.{digits}f}]" if np.isfinite(low) else ""
+
+
+def mean_text(name: str, digits: int, std: bool = False) -> Callable[[Any], str]:
+    """Makes `mean ± std [low, high]` of a row with the columns of `mean_columns`."""
+
+    def text(row: Any) -> str:
+        mean, low, high = (getattr(row, f"{name}_{end}") for end in ("mean", "low", "high"))
+        spread = f" ± {getattr(row, f'{name}_std'):,.{digits}f}" if std else ""
+        return f"{mean:,.{digits}f}{spread}{brackets(low, high, digits)}"
+
+    return text
+
+
 def iqm_text(name: str) -> str:
-    """The format of these columns for `as_texts`."""
+    """The format of the columns of `iqm_columns` for `as_texts`."""
     return f"{{{name}_iqm:,.1f}} [{{{name}_iqm_low:,.1f}}, {{{name}_iqm_high:,.1f}}]"
 
 
 def iqm_note(where: str = "", of: str = "agents") -> str:
-    """What is to be known of such columns, and within what is drawn."""
+    """What a reader must know of such columns, and within what is drawn."""
     return (
         f" IQM: the interquartile mean over {of}, in brackets a stratified bootstrap 95% "
         f"interval, which draws {' '.join(filter(None, (of, where)))}."
@@ -64,14 +85,12 @@ def as_texts(
     summary: pd.DataFrame, columns: Mapping[str, str | Callable[[Any], Any]]
 ) -> pd.DataFrame:
     """A table of texts: each column is a format of the summary's, or a function of its row."""
+    rows = list(summary.itertuples(index=False))
     return pd.DataFrame(
-        [
-            {
-                name: how(row) if callable(how) else how.format_map(row._asdict())
-                for name, how in columns.items()
-            }
-            for row in summary.itertuples(index=False)
-        ]
+        {
+            name: [how(row) if callable(how) else how.format_map(row._asdict()) for row in rows]
+            for name, how in columns.items()
+        }
     )
 
 

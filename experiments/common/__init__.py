@@ -1,0 +1,1 @@
+"""What the experiments share. None of these modules is a command."""

@@ -1,0 +1,325 @@
+"""Groups of fresh agents that train under a condition, and what is measured of them.
+
+A condition is an agent with an environment: the real task, or a set of SEs or RNs, of which each
+group of agents has one. Every group is a cached shard.
+"""
+
+import dataclasses
+import functools
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple, Self
+
+import jax
+import numpy as np
+import pandas as pd
+
+import sejax
+from experiments.common.experiment import Settings, count, each_of, setting
+from sejax import registry, serialize
+from sejax.agents import NoExploration
+from sejax.cli.progress import Tally
+from sejax.ops.parallel import spread_over_devices
+from sejax.training import TrainingConfig
+
+HPARAMS = ("varied", "default")
+GROUPS_AT_ONCE = 5  # groups of agents in one program, but for one CPU device
+
+
+class Group(NamedTuple):
+    """The environment of a group of agents."""
+
+    name: str  # in the names of files, and in the rows' column `group`
+    params: Any  # `EnvParams`
+    fingerprint: str = ""  # of the proxy's weights
+
+
+@dataclass(frozen=True, kw_only=True)
+class Condition:
+    """Which agents are trained, in which environment, and how long."""
+
+    name: str  # in the names of files
+    env: Any  # gymnax environment; its groups differ in the `params`
+    task: Any  # the real one, that agents are tested on
+    groups: tuple[Group, ...]
+    agent: Any  # configuration of all
+    training: TrainingConfig
+    exploration: Any = field(default_factory=NoExploration)
+    hparams: str = "default"  # or "varied": drawn for each agent
+    settings: dict[str, Any] = field(default_factory=dict)  # what else results depend on; plain
+    is_single: bool = False  # whether its one group takes its keys from the seed itself
+
+    @classmethod
+    def real(cls, task: Any, names: Iterable[str], **rest: Any) -> Self:
+        """The real task for groups of these names."""
+        groups = tuple(Group(name, task.params) for name in names)
+        return cls(env=task.env, task=task, groups=groups, **rest)
+
+    @classmethod
+    def of_set(cls, proxies: Any, names: Iterable[str], **rest: Any) -> Self:
+        """The proxies of a `ProxySet`, one for each group; the first ones again for more groups."""
+        ones = [proxies[i % len(proxies)] for i in range(len(names))]
+        groups = tuple(
+            Group(name, one.params, one.fingerprint) for name, one in zip(names, ones, strict=True)
+        )
+        settings = {"proxy": proxies.config["proxy"], **rest.pop("settings", {})}
+        return cls(env=proxies.env, task=proxies.task, groups=groups, settings=settings, **rest)
+
+    def plain(self) -> dict[str, Any]:
+        """What the results of all groups depend on, beside seeds and weights."""
+        return {
+            "task": self.task.origin,
+            "agent": registry.describe("agent", self.agent),
+            "exploration": registry.describe("exploration", self.exploration),
+            "training": serialize.to_plain(self.training),
+            "hparams": self.hparams,
+            **self.settings,
+        }
+
+
+@dataclass(frozen=True, kw_only=True)
+class Measure:
+    """What is kept of an agent's training."""
+
+    # (agent, env, task, training) -> run(key, env_params, active), with leaves `[]` and `[episode]`
+    make_run: Callable[[Any, Any, Any, TrainingConfig], Callable[..., Any]]
+    # (results [agent, ...], drawn hyperparameters [agent]) -> rows, with a column `agent`
+    to_table: Callable[[Any, dict[str, np.ndarray]], pd.DataFrame]
+    log: Callable[[pd.DataFrame], str]  # a line about the rows of a group
+    is_timed: bool = False  # whether rows have a column `cpu_s`, the cost of an agent
+
+
+def outcome_rows(outcome: Any, drawn: dict[str, np.ndarray]) -> pd.DataFrame:
+    """A row for each agent, with a column for each test episode and each drawn hyperparameter."""
+    returns = outcome.test_returns.astype(float)
+    return pd.DataFrame(
+        {
+            "agent": range(len(returns)),
+            "test_return": returns.mean(axis=1),
+            "nonfinite": outcome.nonfinite | ~np.isfinite(returns).all(axis=1),
+            "train_episodes": outcome.train_episodes.astype(float),
+            "train_steps": outcome.train_steps.astype(float),
+            **{f"return_{i}": x for i, x in enumerate(returns.T)},
+            **{name: x.astype(float) for name, x in drawn.items()},
+        }
+    )
+
+
+def outcome_log(rows: pd.DataFrame) -> str:
+    """A line about `outcome_rows`."""
+    mean = rows[["test_return", "train_steps"]].mean()
+    return f"mean return {mean['test_return']:.1f} after {mean['train_steps']:,.0f} steps"
+
+
+OUTCOMES = Measure(
+    make_run=lambda *args: sejax.make_evaluator(*args), to_table=outcome_rows, log=outcome_log
+)
+
+
+def train_groups(
+    condition: Condition,
+    settings: Settings,
+    num_agents: int,
+    measure: Measure = OUTCOMES,
+    at_once: int = 1,
+) -> pd.DataFrame:
+    """Rows of all agents of a condition, with a column `group`; trains the missing groups.
+
+    The agents of the i-th group have the same seeds under every condition: where hyperparameters
+    are drawn, conditions are compared on equal draws.
+
+    Args:
+      condition: what is trained.
+      settings: of the experiment.
+      num_agents: of each group.
+      measure: what is kept of an agent.
+      at_once: groups that are one program and finished together; see `groups_at_once`.
+    """
+    shared = condition.plain() | {"num_agents": num_agents, "seed": settings.seed}
+    groups = {f"{condition.name}-{group.name}": group for group in condition.groups}
+    names = list(groups)
+    tables = []
+    with Tally(len(groups) * num_agents, f"agents: {condition.name}") as tally:
+        for first in range(0, len(groups), at_once):
+            chosen = names[first : first + at_once]
+            own = {
+                name: {"group": groups[name].name, "weights": groups[name].fingerprint}
+                for name in chosen
+            }
+
+            def compute(missing: list[str]) -> list[pd.DataFrame]:
+                places = [names.index(name) for name in missing]
+                return train(condition, settings, num_agents, measure, places, at_once)
+
+            made = settings.shards.compute_all({n: shared | own[n] for n in chosen}, compute)
+            for name, table in zip(chosen, made, strict=True):
+                print(f"{name}: {measure.log(table)}", flush=True)
+                tables.append(table.assign(group=groups[name].name))
+                tally.add(num_agents)
+    weights = {group.name: group.fingerprint for group in condition.groups}
+    settings.shards.made_with[condition.name] = shared | {"weights": weights}
+    return worst_for_diverged(pd.concat(tables, ignore_index=True), condition.name)
+
+
+def train(
+    condition: Condition,
+    settings: Settings,
+    num_agents: int,
+    measure: Measure,
+    places: list[int],
+    at_once: int,
+) -> list[pd.DataFrame]:
+    """The rows of the groups at these places; a program is compiled once for `at_once` of them."""
+    program = make_program(
+        measure,
+        condition.agent,
+        condition.exploration,
+        condition.hparams,
+        condition.env,
+        condition.task,
+        condition.training,
+        settings.devices,
+    )
+    padded = [*places, *[places[-1]] * (at_once - len(places))]
+    key = jax.random.key(settings.seed)
+    own_keys = [key if condition.is_single else jax.random.fold_in(key, i) for i in padded]
+    # Of a group's agents, the first ones have the same keys for any number of them.
+    keys = jax.numpy.concatenate([jax.random.split(key, num_agents) for key in own_keys])
+    each = [condition.groups[i].params for i in padded]
+    params = jax.tree.map(lambda *leaves: np.stack(leaves), *each)
+    active = np.repeat(np.arange(at_once) < len(places), num_agents)
+    if measure.is_timed:  # without compilation
+        jax.block_until_ready(program(keys, params, np.zeros_like(active)))
+    started = time.process_time()
+    result = jax.device_get(program(keys, params, active))
+    cost = {"cpu_s": (time.process_time() - started) / active.sum()} if measure.is_timed else {}
+    return [
+        measure.to_table(*jax.tree.map(lambda x, i=i: x[i : i + num_agents], result)).assign(**cost)
+        for i in range(0, len(places) * num_agents, num_agents)
+    ]
+
+
+@functools.cache
+def make_program(
+    measure: Measure,
+    agent: Any,
+    exploration: Any,
+    hparams: str,
+    env: Any,
+    task: Any,
+    training: TrainingConfig,
+    devices: int | None,
+) -> Callable[..., Any]:
+    """Builds `program(keys [agent], params, active [agent]) -> (results, drawn)`, `[agent, ...]`.
+
+    The leaves of `params` are `[group, ...]`; the agents of a group follow one another. Nothing is
+    computed for an agent that is not active.
+    """
+    from sejax.evaluation import num_parallel_on_cpu
+
+    made = sejax.make_agent(agent, task, exploration, hparams == "varied")
+    run = measure.make_run(made, env, task, training)
+
+    def program(keys: Any, params: Any, active: Any) -> Any:
+        num_groups = jax.tree.leaves(params)[0].shape[0]
+
+        def one(key: Any, group: Any, active: Any) -> Any:
+            place = 0 if num_groups == 1 else group  # else each agent has a copy of the weights
+            mine = jax.tree.map(lambda x: x[place], params)
+            return run(key, mine, active), made.drawn_values(key)
+
+        groups = np.repeat(np.arange(num_groups), keys.shape[0] // num_groups)
+        num_parallel = num_parallel_on_cpu(made, training)
+        spread = spread_over_devices(one, devices, cpu_num_parallel=num_parallel)
+        return spread(keys, jax.numpy.asarray(groups), active)
+
+    return jax.jit(program)
+
+
+def groups_at_once(devices: int | None) -> int:
+    """Groups in one program: some agents train a hundred times as long as others.
+
+    Several groups keep all devices, or an accelerator, busy; with one CPU device, a group is saved
+    as soon as it is done.
+    """
+    alone = (devices or jax.device_count()) == 1 and jax.default_backend() == "cpu"
+    return 1 if alone else GROUPS_AT_ONCE
+
+
+def worst_for_diverged(rows: pd.DataFrame, name: str) -> pd.DataFrame:
+    """Rows in which tests of agents that diverged return the worst that others did.
+
+    A mean would leave them out, and so be better for each of them.
+    """
+    if "test_return" not in rows or not (lost := rows["test_return"].isna()).any():
+        return rows
+    returns = ["test_return", *return_columns(rows)]
+    worst = float(rows[returns].min(axis=None))
+    count = len(rows[lost].groupby([key for key in ("group", "agent") if key in rows]))
+    said = f"{count} agents diverged; their tests count as the worst return there, {worst:.1f}."
+    print(f"{name}: {said}", flush=True)
+    return rows.fillna(dict.fromkeys(returns, worst))
+
+
+def return_columns(agents: pd.DataFrame) -> list[str]:
+    """Names of the columns that hold the return of one test episode."""
+    return [name for name in agents if name.startswith("return_")]
+
+
+def tuned_agent(env: str, kind: str) -> Any:
+    """The agent of that kind with what was found on real tasks for few steps (docs/agents.md)."""
+    return sejax.config([f"env={env}", f"agent={kind}"]).agent
+
+
+# --- agents on SEs -------------------------------------------------------------------------------
+
+SE_AGENTS = ("ddqn", "dueling_ddqn", "td3_discrete")
+# With quick=true. Hidden sizes up to 6: one network has room for all of them.
+QUICK_AGENT: Any = {"hidden_size": 2, "batch_size": 16, "num_layers": 1, "warmup_episodes": 1}
+QUICK_STEPS = 1500
+SOFT_SE = "results/soft_ses/cartpole.safetensors"  # with dynamics to look into, as the paper's
+
+
+@dataclass(frozen=True, kw_only=True)
+class SeAgents(Settings):
+    """Settings about agents with drawn hyperparameters that are trained on the SEs of a set."""
+
+    agents: tuple[str, ...] = setting(SE_AGENTS, each_of(SE_AGENTS), about="kinds of agents")
+    num_agents: int = count(10, "agents", quick=4, about="for each SE")
+    num_ses: int = count(40, "SEs", quick=3, about="SEs of a set at most")
+    test_episodes: int = count(10, "episodes", about="of each agent")
+    max_steps: int | None = count(
+        None, "steps", quick=4000, about="training steps at most; as the SEs' configuration says"
+    )
+
+
+def agent_config(settings: Settings, kind: str) -> Any:
+    """The configuration of a kind of agent."""
+    return registry.configure("agent", {"name": kind, **(QUICK_AGENT if settings.quick else {})})
+
+
+def training_as_learned(proxies: Any, agent: Any) -> TrainingConfig:
+    """How long an agent trains on a set of SEs: as those that they were learned with."""
+    return sejax.training_of(proxies, agent)
+
+
+def on_ses(settings: SeAgents, ses: Any, kind: str) -> Condition:
+    """The SEs of a set; agents train as long as those that the SEs were learned with."""
+    agent = agent_config(settings, kind)
+    learned = training_as_learned(ses, agent)
+    limits = [x for x in (learned.max_steps, settings.max_steps) if x is not None]
+    training = dataclasses.replace(
+        learned, max_steps=min(limits, default=None), test_episodes=settings.test_episodes
+    )
+    # The weights' hash is in the name, so that sets can share a folder: se_models then finds those
+    # of se_performance.
+    names = [f"se-{seed:02d}-{ses[i].fingerprint}" for i, seed in enumerate(ses.seeds)]
+    return Condition.of_set(ses, names, name=kind, agent=agent, training=training, hparams="varied")
+
+
+def train_kind(settings: SeAgents, condition: Condition) -> pd.DataFrame:
+    """All agents of a condition, a row each."""
+    at_once = groups_at_once(settings.devices)
+    rows = train_groups(condition, settings, settings.num_agents, at_once=at_once)
+    return rows.assign(kind=condition.name)

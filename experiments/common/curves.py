@@ -1,0 +1,87 @@
+"""Learning curves: test returns against training steps.
+
+A curve is a table with a row for each training episode of an agent: `agent`, `steps` (training
+steps at its end) and `test_return`, the mean of the greedy episodes after it on the real task.
+"""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from experiments.common.agents import Measure
+from sejax.training import TrainingConfig
+
+WINDOW = 10  # test episodes that a point of a smoothed curve is the mean of
+
+
+def make_curve_run(agent: Any, env: Any, task: Any, training: TrainingConfig) -> Callable[..., Any]:
+    """Builds `run(key, env_params, active) -> (test returns, training steps)`, `[episode]` each.
+
+    Entries after an agent's last episode are nan and 0. Only the limits of `training` end it.
+    """
+    from sejax.evaluation import make_tested_trainer
+
+    between = max(1, training.tests_between)
+    training = dataclasses.replace(training, stop_rule="never", tests_between=between)
+
+    def make_run(agent: Any) -> Callable[..., Any]:
+        train = make_tested_trainer(agent, env, task, training)
+
+        def run(key: Any, env_params: Any, active: Any, hparams: Any) -> Any:
+            result = train(key, env_params, hparams, active)
+            return result.test_returns, result.episode_ends
+
+        return run
+
+    return agent.fresh(make_run)
+
+
+def curve_rows(curves: tuple[np.ndarray, np.ndarray], drawn: Any = None) -> pd.DataFrame:
+    """A row for each training episode, of test returns and training steps `[agent, episode]`."""
+    tables = []
+    for agent, (returns, ends) in enumerate(zip(*curves, strict=True)):
+        count = int((ends > 0).sum())
+        columns = {"steps": ends[:count], "test_return": returns[:count].astype(float)}
+        tables.append(pd.DataFrame({"agent": agent} | columns))
+    return pd.concat(tables, ignore_index=True)
+
+
+def on_grid(curves: pd.DataFrame, grid: np.ndarray, window: int = WINDOW) -> np.ndarray:
+    """Each agent's mean of its last `window` test returns (of all, if fewer), `[agent, points]`.
+
+    The value at a step of the grid is that of the last finished episode; nan before the first.
+    """
+    rows = []
+    for _, curve in curves.groupby("agent"):
+        place = np.searchsorted(curve["steps"], grid, side="right") - 1
+        smoothed = curve["test_return"].rolling(window, min_periods=1).mean().to_numpy()
+        rows.append(np.where(place >= 0, smoothed[place], np.nan))
+    return np.stack(rows)
+
+
+def steps_to_solve(curve: pd.DataFrame, solved_reward: float, window: int = WINDOW) -> float:
+    """Training steps of an agent until `window` tests have a mean high enough; inf if never."""
+    full = curve["test_return"].rolling(window).mean().to_numpy()
+    solved = np.flatnonzero(full >= solved_reward)
+    return float(curve["steps"].iloc[solved[0]]) if len(solved) else np.inf
+
+
+def all_steps_to_solve(curves: pd.DataFrame, solved_reward: float) -> pd.Series:
+    """The same of each agent, by agent."""
+    columns = curves.groupby("agent")[["steps", "test_return"]]
+    return columns.apply(steps_to_solve, solved_reward=solved_reward)
+
+
+def last_returns(curves: pd.DataFrame, window: int = WINDOW) -> pd.Series:
+    """Mean of each agent's last `window` test returns, by agent."""
+    return curves.groupby("agent")["test_return"].apply(lambda x: x.tail(window).mean())
+
+
+CURVES = Measure(
+    make_run=make_curve_run,
+    to_table=curve_rows,
+    log=lambda rows: f"last test returns {last_returns(rows).mean():.1f}",
+)

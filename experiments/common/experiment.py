@@ -1,0 +1,261 @@
+"""The frame of an experiment: settings, rows that are computed, and a report made of the rows.
+
+A new experiment is one page in `experiments/`: a subclass of `Settings`, the functions `compute`
+and `report`, and an `Experiment` of the three. The command `python -m experiments.NAME` reads
+overrides `field=value`, and everything is checked before anything that takes long is imported.
+"""
+
+import dataclasses
+import functools
+import json
+import shlex
+import sys
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar, Self, get_origin, get_type_hints
+
+import pandas as pd
+import yaml
+
+from experiments.common.shards import Shards, read_rows, write_rows
+from sejax import errors, registry, serialize
+from sejax.cli import commands, runtime
+from sejax.errors import ConfigError, nearest, shortened
+from sejax.ops.files import write_text
+from sejax.options import Options, Rule, counts
+
+RUN_PREFIX = "run."  # of an override for the NES runs: run.es.population_size=8
+NOT_SHOWN = {"work", "devices", "from_rows", "run"}  # fields that no result depends on, and `run`
+_SAME = object()
+
+
+def setting(default: Any, rule: Rule | None = None, *, about: str, quick: Any = _SAME) -> Any:
+    """A field of `Settings`.
+
+    Args:
+      default: its default; None where it may be left open.
+      rule: what must hold, as in `sejax.options`.
+      about: its line in `--help`.
+      quick: its default with `quick=true`.
+    """
+    metadata = {"rule": rule, "about": about, "quick": default if quick is _SAME else quick}
+    return dataclasses.field(default=default, metadata=metadata)
+
+
+def count(default: int | None, things: str, least: int = 1, **rest: Any) -> Any:
+    """A field that counts things."""
+    return setting(default, counts(f"it counts {things}", least), **rest)
+
+
+def each_of(known: Collection[str]) -> Rule:
+    """A list of these names."""
+    return lambda name, values, default: errors.each_of(name, values, known)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Settings(Options):
+    """The fields that every experiment has. `of` makes them; a subclass adds its own.
+
+    The folder of the results holds what is kept: table, figures, learned proxies and rows. The
+    folder `work` holds what a stopped experiment goes on from, and may be deleted.
+    """
+
+    name: ClassVar[str]  # of the experiment's module
+    files: ClassVar[str] = ""  # prefix of its files in `out`
+
+    quick: bool = setting(False, about="a small version, in minutes")
+    from_rows: bool = setting(False, about="make table and figures again from the stored rows")
+    out: str | None = setting(
+        None, about="folder of the results; results/NAME[/TASK], quick: runs/experiments/NAME-quick"
+    )
+    work: str | None = setting(
+        None, about="folder of what is not kept; runs/experiments/... for results/..., or out/work"
+    )
+    seed: int = setting(0, lambda n, value, _: errors.require_seed(n, value), about="first seed")
+    devices: int | None = setting(None, counts("something must compute"), about="to use; all")
+
+    @classmethod
+    def of(cls, **given: Any) -> Self:
+        """Settings from the given fields; a field that is None or left out has its default.
+
+        An override of the NES runs that is a field here, such as `run.env=acrobot`, sets the field.
+
+        Raises:
+          ConfigError: for an unknown field or a value that breaks its rule.
+        """
+        given = {name: value for name, value in given.items() if value is not None}
+        if "run" in given:
+            names = {field.name for field in dataclasses.fields(cls)}
+            words = given["run"] if not isinstance(given["run"], str) else [given["run"]]
+            own = [word for word in words if word.partition("=")[0] in names]
+            given |= parse(cls, own) | {"run": [word for word in words if word not in own]}
+        for name, kind in get_type_hints(cls).items():
+            if get_origin(kind) is tuple and isinstance(given.get(name), str):
+                given[name] = [given[name]]
+        return serialize.from_plain(cls, cls.defaults(given) | given, "")
+
+    @classmethod
+    def defaults(cls, given: Mapping[str, Any]) -> dict[str, Any]:
+        """The defaults of all fields; they may depend on what is given, as on `quick`."""
+        return {
+            field.name: field.metadata["quick"] if given.get("quick") else field.default
+            for field in dataclasses.fields(cls)
+        }
+
+    @property
+    def folder(self) -> Path:
+        """Where the results go."""
+        return self._default_folder if self.out is None else Path(self.out)
+
+    @property
+    def _default_folder(self) -> Path:
+        root = f"runs/experiments/{self.name}-quick" if self.quick else f"results/{self.name}"
+        task = vars(self).get("env") or ""  # so that tasks do not replace each other's results
+        return Path(root, task)
+
+    @property
+    def work_folder(self) -> Path:
+        """Where shards and NES runs are kept until the experiment is done."""
+        return work_beside(self.folder, "work") if self.work is None else Path(self.work)
+
+    @functools.cached_property
+    def shards(self) -> Shards:
+        """The cached shards of this experiment."""
+        return Shards(self.work_folder / "shards")
+
+    @property
+    def rows_file(self) -> Path:
+        """The rows, from which table and figures are made."""
+        return self.folder / f"{self.files}rows.csv.xz"
+
+    @property
+    def settings_file(self) -> Path:
+        """What the rows were computed with."""
+        return self.folder / f"{self.files}settings.json"
+
+    def values(self, *names: str) -> dict[str, Any]:
+        """These fields."""
+        return {name: getattr(self, name) for name in names}
+
+    def command(self) -> str:
+        """The command that makes these results: the fields that differ from their defaults."""
+        mine = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+        default = self.defaults(mine) | {"quick": False}
+        hidden = NOT_SHOWN
+        if self.folder.parts[:1] != ("results",) or self.folder == self._default_folder:
+            hidden = hidden | {"out"}
+        words = ["python", "-m", f"experiments.{self.name}"]
+        for name, value in mine.items():
+            if name not in hidden and value != default[name]:
+                words.append(f"{name}={as_word(value)}")
+        return shlex.join([*words, *(RUN_PREFIX + word for word in mine.get("run", ()))])
+
+
+def work_beside(folder: Path, name: str) -> Path:
+    """A folder for what may be deleted: within `folder`, but not within results/."""
+    if folder.parts[:1] == ("results",):
+        return Path("runs/experiments", *folder.parts[1:])
+    return folder / name
+
+
+def as_word(value: Any) -> str:
+    """A value as the command line takes it."""
+    if isinstance(value, tuple | list):
+        return f"[{','.join(map(as_word, value))}]"
+    return {"None": "null", "True": "true", "False": "false"}.get(str(value), str(value))
+
+
+def parse(settings: type[Settings], words: Iterable[str]) -> dict[str, Any]:
+    """The fields that overrides `field=value` set; a list is `[a,b]`, and the last one counts.
+
+    Overrides `run.FIELD=VALUE` become the list `run`, which configures the NES runs.
+
+    Raises:
+      ConfigError: for anything else.
+    """
+    fields = [field.name for field in dataclasses.fields(settings)]
+    given: dict[str, Any] = {}
+    runs = []
+    for word in words:
+        name, equals, text = word.partition("=")
+        if name.startswith(RUN_PREFIX) and "run" in fields:
+            runs.append(word.removeprefix(RUN_PREFIX))
+        elif equals and name in fields:
+            given[name] = _value(text)
+        else:
+            ranked = nearest(name.lstrip("-").replace("-", "_"), fields)
+            raise ConfigError(
+                f"{settings.name} reads overrides field=value; got {shortened(word, 60)}. "
+                f"Did you mean {ranked[0]}=...? See --help."
+            )
+    if runs:
+        given["run"] = [*(given.get("run") or []), *runs]
+    return given
+
+
+def _value(text: str) -> Any:
+    try:
+        return yaml.safe_load(text)
+    except yaml.YAMLError:
+        return text
+
+
+@dataclass(frozen=True, kw_only=True)
+class Experiment:
+    """A table or figure, of the paper or of ours."""
+
+    settings: type[Settings]
+    compute: Callable[[Any], pd.DataFrame]  # settings -> rows; computes the shards that are missing
+    report: Callable[[Any, pd.DataFrame], pd.DataFrame]  # (settings, rows) -> table; writes it
+    about: str | None  # the module's docstring
+
+    def run(self, settings: Settings) -> pd.DataFrame:
+        """Computes what is missing, writes rows, table and figures, and returns the table.
+
+        Raises:
+          ConfigError: for settings or files that cannot work, or a folder of other settings.
+        """
+        fields = serialize.to_plain(settings).items()
+        with registry.only_typed(f"{name}={value}" for name, value in fields):
+            return self._run(settings)
+
+    def _run(self, settings: Settings) -> pd.DataFrame:
+        if not settings.from_rows:
+            write_rows(settings.rows_file, self.compute(settings))
+            made_with = json.dumps(settings.shards.made_with, indent=1)
+            write_text(settings.settings_file, f"{made_with}\n")
+        return self.report(settings, read_rows(settings.rows_file))
+
+    def main(self, words: Sequence[str] | None = None) -> None:
+        """The command; bad input ends it with one message."""
+        words = sys.argv[1:] if words is None else words
+        if {"--help", "-h"} & {*words}:
+            print(self.help())
+            return
+        try:
+            with registry.only_typed(words):
+                settings = self.settings.of(**parse(self.settings, words))
+        except ConfigError as error:
+            commands.fail(str(error), commands.BAD_INPUT)
+        runtime.configure_xla(settings.devices)
+        runtime.configure_jax()
+        try:
+            commands.guarded(self.run)(settings)
+        except KeyboardInterrupt:
+            print(f"Interrupted. The same command goes on from {settings.work_folder}.")
+            commands.leave(commands.INTERRUPTED)
+
+    def help(self) -> str:
+        """The text of `--help`: all fields with their defaults."""
+        full, quick = (self.settings.defaults({"quick": quick}) for quick in (False, True))
+        lines = []
+        for field in dataclasses.fields(self.settings):
+            default, other = as_word(full[field.name]), as_word(quick[field.name])
+            differs = f" (quick: {other})" if default != other else ""
+            about = field.metadata["about"]
+            lines.append(f"  {f'{field.name}={default}':34}  {about}{differs}")
+        if "run" in full:
+            lines.append(f"  {RUN_PREFIX + 'FIELD=VALUE':34}  override of the NES runs")
+        usage = f"python -m experiments.{self.settings.name} [FIELD=VALUE ...]"
+        return "\n".join([usage, "", (self.about or "").strip(), "", "Fields:", *lines])

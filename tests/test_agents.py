@@ -1,0 +1,303 @@
+"""The contract of every registered agent, and what those with a replay buffer have in common."""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import sejax
+from sejax import agents, envs, registry
+from sejax.agents import AgentConfig, Rollout, Transition
+from sejax.errors import ConfigError
+from sejax.options import traced_options
+
+NUM_STEPS, BATCH = 16, 7  # a batch has one column of padding
+SMALL = {
+    "hidden_size": 4, "num_layers": 1, "batch_size": BATCH, "warmup_episodes": 3,
+    "feature_dim": 4, "stream_hidden_size": 4,
+    "rollout_steps": NUM_STEPS, "epochs": 2, "num_minibatches": 2,
+    "learning_rate": 0.01, "discount": 0.9,
+}  # fmt: skip
+TASKS = ("cartpole", "pendulum", "gridworld_2x2")  # discrete, continuous, and an index to observe
+
+
+def config_of(name):
+    """A small configuration of a registered agent."""
+    fields = {field.name for field in dataclasses.fields(registry.find("agent", name))}
+    return registry.configure("agent", {"name": name} | {k: SMALL[k] for k in SMALL if k in fields})
+
+
+def fits(name, task):
+    facts, config = registry.find("env", task).facts, registry.find("agent", name)
+    return config.states in (None, facts.states) and facts.actions in config.actions
+
+
+LEARNING = [name for name in agents.names() if not registry.find("agent", name).is_solved_for]
+PLAIN = [(name, task, "none") for name in LEARNING for task in TASKS if fits(name, task)]
+EXPLORING = [
+    ("ddqn", "cartpole", "icm"),
+    ("td3", "pendulum", "icm"),
+    ("ppo", "cartpole", "icm"),
+    ("sarsa", "gridworld_2x2", "count_based"),
+]
+JITTED = [("ddqn", "cartpole", "none"), ("ppo", "pendulum", "none"), EXPLORING[3]]
+every_agent = pytest.mark.parametrize("case", [*PLAIN, *EXPLORING], ids="-".join)
+OFF_POLICY = [case for case in PLAIN if case[0] not in ("ppo", "q_learning", "sarsa")]
+every_off_policy_agent = pytest.mark.parametrize("case", OFF_POLICY, ids="-".join)
+
+
+@functools.cache
+def parts(case):
+    """An agent, and `start(key, hparams) -> (state, batch)` after some steps of random outcome."""
+    name, task_name, exploration = case
+    task = envs.make(task_name)
+    small = {"hidden_size": 4, "num_layers": 1, "num_residual_blocks": 1, "feature_dim": 3}
+    fields = {"name": exploration} | (small if exploration == "icm" else {})
+    exploration = registry.configure("exploration", fields)
+    agent = agents.make_agent(config_of(name), task, exploration)
+
+    def start(key, hparams):
+        state = agent.begin_episode(agent.init(key, hparams), jnp.int32(3))
+
+        def transition(key):
+            key_obs, key_next, key_act, key_reward = jax.random.split(key, 4)
+            obs, next_obs = (
+                jax.random.randint(k, (), 0, task.num_states)
+                if task.num_states
+                else jax.random.normal(k, (task.obs_dim,))
+                for k in (key_obs, key_next)
+            )
+            action = agent.act(key_act, state, obs, explore=True)
+            reward = jax.random.normal(key_reward)
+            return Transition(obs, action, reward, jnp.float32(0.7), next_obs)
+
+        buffer = agent.buffer(jax.eval_shape(transition, key), NUM_STEPS)
+
+        def store(arrays, number):
+            step = transition(jax.random.fold_in(key, number))
+            return buffer.store(arrays, number, step, number % 5 == 4, True), None
+
+        arrays, _ = jax.lax.scan(store, buffer.init(), jnp.arange(NUM_STEPS))
+        last = transition(jax.random.fold_in(key, NUM_STEPS - 1))
+        batch = buffer.batch(key, arrays, jnp.int32(NUM_STEPS), last, agent.batch_size(state))
+        return state, batch
+
+    return task, agent, jax.jit(start)
+
+
+@functools.cache
+def started(case):
+    _, agent, start = parts(case)
+    return start(jax.random.key(1), agent.hparams)
+
+
+@functools.cache
+def update_of(case):
+    return jax.jit(parts(case)[1].update)
+
+
+def assert_close(a, b, **tolerance):
+    for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
+        np.testing.assert_allclose(x, y, **tolerance)
+
+
+def assert_equal(a, b):
+    for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
+        np.testing.assert_array_equal(x, y)
+
+
+def moved(a, b):
+    """Whether a number of two states differs by more than rounding."""
+    pairs = zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True)
+    return any(not np.allclose(x, y, rtol=1e-4, atol=1e-6) for x, y in pairs)
+
+
+# --- every agent ---------------------------------------------------------------------------------
+
+
+@every_agent
+def test_a_state_keeps_its_types_and_an_action_fits_its_space(case):
+    task, agent, start = parts(case)
+    key = jax.random.key(0)
+    state, batch = jax.eval_shape(start, key, agent.hparams)
+
+    def types(fn, *args):
+        return jax.tree.map(lambda x: (x.shape, x.dtype, x.weak_type), jax.eval_shape(fn, *args))
+
+    kept = types(agent.init, key, agent.hparams)
+    assert types(agent.begin_episode, state, jnp.int32(1)) == kept
+    assert types(agent.update, key, state, batch) == kept
+    obs = jnp.int32(0) if task.num_states else jnp.zeros(task.obs_dim)
+    for explore in (True, False):
+        act = functools.partial(agent.act, explore=explore)
+        action = jax.eval_shape(agent.env_action, jax.eval_shape(act, key, state, obs))
+        shape = () if task.num_actions else (task.action_dim,)
+        assert action.shape == shape
+        assert action.dtype == (jnp.int32 if task.num_actions else jnp.float32)
+
+
+@every_agent
+def test_the_default_hyperparameters_are_the_traced_options_of_the_configuration(case):
+    _, agent, _ = parts(case)
+    config = config_of(case[0])
+    hparams = agent.hparams if case[2] == "none" else agent.hparams.agent
+    options = traced_options(config)
+    assert options.items() <= hparams._asdict().items()
+    assert {"learning_rate", "discount"} <= set(options)
+    assert agent.discount(agent.hparams) == 0.9
+    learns_from = 0 if case[0] == "ppo" else 3
+    assert (agent.spec.warmup_episodes, agent.spec.learns_from) == (3, learns_from)
+    assert agent.spec.spaces is not None
+
+
+@every_agent
+def test_agents_of_other_hyperparameters_learn_in_one_program_as_each_would_alone(case):
+    _, agent, start = parts(case)
+    hparams = agent.hparams if case[2] == "none" else agent.hparams.agent
+    varied = [hparams._replace(learning_rate=rate) for rate in (0.01, 0.3)]
+    if case[2] != "none":
+        varied = [agent.hparams._replace(agent=each) for each in varied]
+    key = jax.random.key(2)
+    started_with = [start(key, jax.tree.map(jnp.float32, each)) for each in varied]
+    states, batches = zip(*started_with, strict=True)
+    stacked = jax.tree.map(lambda *x: jnp.stack(x), *states)
+    together = jax.jit(jax.vmap(agent.update, (None, 0, None)))(key, stacked, batches[0])
+    alone = [update_of(case)(key, state, batches[0]) for state in states]
+    for i, each in enumerate(alone):
+        assert_close(jax.tree.map(lambda x, i=i: x[i], together), each, rtol=1e-3, atol=1e-4)
+    assert moved(*alone)
+
+
+@pytest.mark.parametrize("case", JITTED, ids="-".join)
+def test_an_update_that_is_jitted_is_the_same_as_one_that_is_not(case):
+    _, agent, _ = parts(case)
+    state, batch = started(case)
+    key = jax.random.key(3)
+    jitted = update_of(case)(key, state, batch)
+    assert moved(jitted, state)
+    assert_close(jitted, agent.update(key, state, batch), rtol=1e-3, atol=1e-5)
+
+
+@every_agent
+def test_a_masked_batch_leaves_a_rollout_unlearned_and_others_as_they_are(case):
+    task, agent, _ = parts(case)
+    state, batch = started(case)
+    obs = jnp.int32(0) if task.num_states else jnp.zeros(task.obs_dim)
+    act = functools.partial(agent.act, explore=True)
+    action, scalar = jax.eval_shape(act, jax.random.key(0), state, obs), jnp.float32(0)
+    buffer = agent.buffer(Transition(obs, action, scalar, scalar, obs), NUM_STEPS)
+    assert_equal(buffer.mask(batch, True), batch)
+    masked = buffer.mask(batch, False)
+    if isinstance(batch, Rollout):
+        assert_equal(update_of(case)(jax.random.key(0), state, masked), state)
+    else:  # thrown away by the trainer, and no cheaper for being masked
+        assert_equal(masked, batch)
+
+
+@pytest.mark.parametrize("name", LEARNING)
+def test_an_agent_is_made_once_for_equal_configurations(name):
+    task = envs.make(next(task for task in TASKS if fits(name, task)))
+    agent = agents.make_agent(config_of(name), task)
+    assert agent is agents.make_agent(config_of(name), task)
+
+
+# --- agents with a replay buffer -----------------------------------------------------------------
+
+
+@every_off_policy_agent
+def test_columns_of_no_weight_change_nothing(case):
+    state, batch = started(case)
+    update, key = update_of(case), jax.random.key(0)
+    assert batch.weight.sum() == BATCH
+    is_padding = 1 - batch.weight
+    other = batch._replace(
+        reward=batch.reward + 3 * is_padding,
+        obs=batch.obs + 3 * is_padding,
+        next_obs=batch.next_obs - is_padding,
+    )
+    assert_close(update(key, state, batch), update(key, state, other), rtol=1e-5, atol=1e-7)
+    all_count = batch._replace(weight=jnp.ones_like(batch.weight))
+    assert moved(update(key, state, batch), update(key, state, all_count))
+
+
+@every_off_policy_agent
+def test_a_transition_with_discount_zero_ignores_its_next_state(case):
+    state, batch = started(case)
+    update, key = update_of(case), jax.random.key(0)
+    elsewhere = batch._replace(next_obs=batch.next_obs + 3.0)
+    assert moved(update(key, state, batch), update(key, state, elsewhere))
+    last, last_elsewhere = (
+        x._replace(discount=jnp.zeros_like(x.discount)) for x in (batch, elsewhere)
+    )
+    assert_equal(update(key, state, last), update(key, state, last_elsewhere))
+
+
+@pytest.mark.parametrize(
+    "case", [case for case in OFF_POLICY if case[0] in ("td3", "td3_discrete", "sac")], ids="-".join
+)
+def test_an_actor_critic_warms_up_in_its_first_episodes(case):
+    _, agent, _ = parts(case)
+    state, _ = started(case)
+    got = [bool(agent.begin_episode(state, jnp.int32(n)).is_warming_up) for n in range(5)]
+    assert got == [True, True, True, False, False]
+
+
+# --- what is refused -----------------------------------------------------------------------------
+
+CARTPOLE, ROOM, CLIFF = (envs.make(n) for n in ("cartpole", "gridworld_2x2", "cliff_walking"))
+
+
+@dataclasses.dataclass(frozen=True)
+class Unrelated:
+    def make(self, task):
+        return parts(PLAIN[0])[1]
+
+
+@pytest.mark.parametrize(
+    ("make", "field"),
+    [
+        (lambda: sejax.DDQNConfig(learning_rate=1e300), "agent.learning_rate"),
+        (lambda: sejax.DDQNConfig(learning_rate=5e-324), "agent.learning_rate"),
+        (lambda: sejax.DDQNConfig(batch_size=65, buffer_size=64), "agent.batch_size"),
+        (
+            lambda: sejax.make_agent(sejax.SACConfig(target_entropy=-5.0), CARTPOLE),
+            "agent.target_entropy",
+        ),
+        (lambda: sejax.make_agent(Unrelated(), CARTPOLE), "agent"),
+        (lambda: sejax.make_agent(sejax.DDQNConfig, CARTPOLE), "agent"),
+        (lambda: sejax.make_agent(sejax.DDQNConfig(), CARTPOLE, Unrelated()), "exploration"),
+        (lambda: sejax.make_agent(sejax.QLearningConfig(), CARTPOLE), "agent"),
+        (
+            lambda: sejax.make_agent(sejax.DDQNConfig(), CARTPOLE, sejax.CountBasedConfig()),
+            "exploration",
+        ),
+        (
+            lambda: sejax.make_trainer(sejax.make_agent(sejax.QLearningConfig(), ROOM), CLIFF.env),
+            "agent",
+        ),
+        (
+            lambda: sejax.make_trainer(
+                sejax.make_agent(sejax.DDQNConfig(), envs.make("acrobot")), CARTPOLE.env
+            ),
+            "agent",
+        ),
+    ],
+)
+def test_an_agent_that_cannot_work_is_refused(make, field):
+    with pytest.raises(ConfigError) as error:
+        make()
+    assert error.value.field == field
+
+
+def test_an_agent_may_fit_every_task():
+    @dataclasses.dataclass(frozen=True)
+    class Fixed(AgentConfig):
+        def make(self, task):
+            return parts(PLAIN[0])[1]
+
+    assert Fixed().steps_before_learning(200, 200) == 0
+    for task in (CARTPOLE, ROOM, envs.make("pendulum")):
+        assert isinstance(sejax.make_agent(Fixed(), task), sejax.Agent)

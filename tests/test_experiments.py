@@ -1,0 +1,447 @@
+"""What all experiments have in common: settings, shards, rows, and that each runs and resumes."""
+
+import dataclasses
+import importlib
+import io
+import json
+import pkgutil
+import re
+import shlex
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pandas as pd
+import pytest
+from support import is_drawn, refuse
+
+import experiments
+import sejax
+from experiments import agent_learning, score_transforms
+from experiments.common import agents, curves, experiment, runs, shards, supervised_models
+from experiments.common.experiment import parse
+from experiments.common.reward_networks import RnSettings
+from sejax import envs
+from sejax.cli import build, session
+from sejax.errors import ConfigError
+from sejax.options import counts
+
+NAMES = [module.name for module in pkgutil.iter_modules(experiments.__path__)
+         if module.name not in ("__main__", "common")]  # fmt: skip
+TINY_AGENT = {"hidden_size": 2, "batch_size": 4, "num_layers": 1, "warmup_episodes": 0}
+TINY_SE = ["es.population_size=2", "es.num_incumbent_evals=2", "proxy.hidden_size=4",
+           "training.max_steps=30", "training.test_episodes=1"]  # fmt: skip
+
+
+def tiny_agents(*kinds, group="agents."):
+    fields = ("hidden_size=4", "batch_size=4", "warmup_episodes=0")
+    return [f"{group}{kind}.{field}" for kind in kinds for field in fields]
+
+
+RNS = {"variants": ("additive_potential", "exclusive_non_potential"), "learned": 2,
+       "generations": 1, "run": ("training.max_episodes=5", "es.population_size=2")}  # fmt: skip
+CURVES = RNS | {"num_agents": 2, "max_steps": 150, "rows": "default"}
+# Settings with which an experiment takes seconds; `se` stands for the file of a random SE.
+TINY = {
+    "agent_learning": {"envs": "cliff_walking"},
+    "rn_heatmap": RNS,
+    "rn_objectives": CURVES | {"objectives": ("reward_threshold", "auc")},
+    "rn_performance": CURVES,
+    "score_transforms": {"runs": 3, "generations": 2, "population": 2, "transforms": "rank"},
+    "se_families": {"sets": "ddqn", "tested": "ddqn", "runs": 1, "generations": 2, "num_agents": 2,
+                    "test_episodes": 1, "run": [*TINY_SE, *tiny_agents("ddqn")]},
+    "se_feasibility": {"runs": 2, "generations": 2,
+                       "run": [*TINY_SE, *tiny_agents("agent", group="")]},
+    "se_histograms": {"proxy": "se", "agents": "ddqn", "num_agents": 2, "test_episodes": 2,
+                      "max_rows": 50},
+    "se_horizons": {"horizons": [1], "starts": "real", "runs": 1, "generations": 2,
+                    "num_agents": 2, "test_episodes": 1,
+                    "run": [*TINY_SE, *tiny_agents("ddqn", "dueling_ddqn")]},
+    "se_models": {"ses": "se", "agents": "ddqn", "num_agents": 2, "test_episodes": 2},
+    "se_performance": {"fixed": "se", "agents": "ddqn", "num_agents": 2, "test_episodes": 2,
+                       "real_episodes": 3},
+    "se_transfer_of_hparams": {"ses": "se", "num_configs": 3, "num_agents": 2, "max_steps": 40,
+                               "test_episodes": 1},
+    "supervised_baseline": {"proxy": "se", "hparams": "default", "models": 3, "generations": 2,
+                            "population": 2, "max_rows": 30, "epochs": 2, "num_agents": 2,
+                            "test_episodes": 2},
+    "timings": {"rows": "cliff_walking-rn", "generations": 1},
+}  # fmt: skip
+SLOW = {"rn_performance", "score_transforms", "se_families", "se_horizons", "se_performance",
+        "se_transfer_of_hparams", "supervised_baseline"}  # fmt: skip
+
+
+def module_of(name):
+    return importlib.import_module(f"experiments.{name}")
+
+
+def save_ses(path, num, *overrides):
+    """Writes SEs of random weights that were learned with these settings."""
+    config = sejax.config(["proxy.hidden_size=4", "agent.warmup_episodes=0", *overrides])
+    env = config.parts()["proxy"]
+    weights = [env.init_weights(jax.random.key(5 + i)) for i in range(num)]
+    records = [{"score": 1.0 + i, "generation": 4, "seed": 7 + i} for i in range(num)]
+    sejax.save_set(path, env, weights, records, build.to_plain(config))
+    return str(path)
+
+
+@pytest.fixture(scope="module")
+def se_file(tmp_path_factory):
+    path = tmp_path_factory.mktemp("se") / "se.safetensors"
+    return save_ses(path, 1, "preset=soft", "training.max_steps=60")
+
+
+@pytest.fixture
+def tiny(monkeypatch):
+    """Agents and steps that cost nothing."""
+    monkeypatch.setattr(agents, "QUICK_AGENT", TINY_AGENT)
+    monkeypatch.setattr(agents, "QUICK_STEPS", 60)
+    monkeypatch.setattr(agent_learning, "QUICK_STEPS", 400)
+    monkeypatch.setattr(score_transforms, "RUNS_AT_ONCE", 2)
+
+
+def refuse_to_compute(monkeypatch):
+    places = {agents: "train", session.Chunks: "advance", score_transforms: "compute_cell"}
+    for place, name in (*places.items(), *((supervised_models, x) for x in ("collect", "fit_all"))):
+        monkeypatch.setattr(place, name, refuse)
+
+
+def check_responses(settings, rows):
+    """What the SE says to a real state, which is the next one of the row before."""
+    by_source = rows.groupby("source").size()
+    assert by_source["train"] == 2 * 50 and by_source["test"] == by_source["response"]
+    test, response = (rows[rows["source"] == name] for name in ("test", "response"))
+    assert (test["reward"] == 1).all()
+    ses = sejax.load_set(settings.proxy)
+    states = [f"state_{i}" for i in range(4)]
+    task = ses.task
+    _, template = task.env.reset_env(jax.random.key(0), task.params)
+    actions = set()
+    for row in range(1, 9):
+        state, came = (np.float32(test[states].iloc[i]) for i in (row - 1, row))
+        values = dict(zip(("x", "x_dot", "theta", "theta_dot"), state, strict=True))
+        moves = [
+            task.env.step_env(jax.random.key(0), template.replace(**values), a, task.params)[0]
+            for a in (0, 1)
+        ]
+        if min(np.abs(move - came).max() for move in moves) > 1e-4:
+            continue  # another episode begins
+        action = int(np.argmin([np.abs(move - came).max() for move in moves]))
+        vector, reward, _ = ses.env.predict(ses[0].params.weights, jnp.float32(state), action)
+        said = response[[*states, "reward"]].iloc[row].to_numpy(float)
+        np.testing.assert_allclose(np.append(vector, reward), said, atol=1e-4)
+        actions.add(action)
+    assert actions
+
+
+def check_transitions(settings, _):
+    """Each row is one step of the real task."""
+    text = (settings.shards.folder / "transitions-0.csv").read_text()
+    rows = pd.read_csv(io.StringIO(text.partition("\n")[2]))
+    assert len(rows) == 30 and set(rows["generation"]) == {0, 1} and (rows["reward"] == 1).all()
+    task = envs.make("cartpole")
+    names = ("x", "x_dot", "theta", "theta_dot")
+    _, start = task.env.reset_env(jax.random.key(0), task.params)
+    for _, row in rows.iterrows():
+        state = start.replace(**{x: jnp.float32(row[f"state_{i}"]) for i, x in enumerate(names)})
+        obs, _, _, terminated, _ = task.env.step_env(
+            jax.random.key(0), state, jnp.int32(row["action"]), task.params
+        )
+        np.testing.assert_allclose(obs, [row[f"next_state_{i}"] for i in range(4)], atol=1e-5)
+        assert bool(terminated) == bool(row["terminated"])
+
+
+def check_models(settings, rows):
+    """The variants differ in the network for the end and in what is made of it only."""
+    check_transitions(settings, rows)
+    authors, fair = (
+        sejax.load_set(settings.folder / f"models-{name}.safetensors")
+        for name in ("authors", "fair")
+    )
+    assert len(authors) == len(fair) == 3
+    assert [x.config["proxy"]["done"] for x in (authors, fair)] == ["soft", "threshold"]
+    for head, same in (("state", True), ("reward", True), ("done", False)):
+        pairs = zip(jax.tree.leaves(authors.weights[head]), jax.tree.leaves(fair.weights[head]),
+                    strict=True)  # fmt: skip
+        assert all(np.array_equal(a, b) for a, b in pairs) == same, head
+
+
+CHECKS = {"se_histograms": check_responses, "supervised_baseline": check_models}  # of the rows
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(x, marks=pytest.mark.slow) if x in SLOW else x for x in NAMES]
+)
+def test_an_experiment_runs_and_resumes_and_remakes_its_report(
+    name, se_file, tmp_path, monkeypatch, tiny
+):
+    """Each has a row in `TINY`; what is finished is not computed again."""
+    page = module_of(name).EXPERIMENT
+    options = {key: se_file if value == "se" else value for key, value in TINY[name].items()}
+    options |= {"quick": True, "seed": 3, "out": str(tmp_path)}
+    settings = page.settings.of(**options)
+    table = page.run(settings)
+    files = {path.name for path in tmp_path.iterdir()}
+    prefix = settings.files
+    assert {f"{prefix}table.md", f"{prefix}summary.csv", f"{prefix}settings.json"} <= files
+    assert settings.rows_file.exists()
+    figures = list(tmp_path.glob("*.png"))
+    assert figures and all(map(is_drawn, figures))
+    text = (tmp_path / f"{prefix}table.md").read_text()
+    assert f"`python -m experiments.{name} quick=true" in text and str(table.iloc[0, 0]) in text
+
+    rows = shards.read_rows(settings.rows_file)
+    CHECKS.get(name, lambda *_: None)(settings, rows)
+    refuse_to_compute(monkeypatch)
+    pd.testing.assert_frame_equal(page.run(page.settings.of(**options)), table)
+    pd.testing.assert_frame_equal(shards.read_rows(settings.rows_file), rows)
+    again = page.settings.of(**options, from_rows=True)
+    pd.testing.assert_frame_equal(page.run(again), table)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_an_experiment_says_what_it_is_and_refuses_other_words(name, tmp_path, capsys):
+    page = module_of(name).EXPERIMENT
+    assert name == page.settings.name
+    page.main(["--help"])
+    assert "quick=false" in capsys.readouterr().out
+    for word in ("nothing", "sed=1", "--quick", "seed=-1", "seed=[1", "devices=0", "out=[1]"):
+        with pytest.raises(SystemExit) as ended:
+            page.main([f"out={tmp_path}", word])
+        error = capsys.readouterr().err
+        assert ended.value.code == 2 and error.startswith("error: ") and error.count("\n") == 1
+        assert len(error) < 310
+
+
+def test_all_experiments_are_listed_and_nothing_else_is_a_command():
+    run = [sys.executable, "-m"]
+    done = subprocess.run([*run, "experiments"], capture_output=True, text=True, check=True)
+    assert re.findall(r"^  (\w+)", done.stdout, re.MULTILINE) == NAMES
+    assert set(TINY) == set(NAMES)
+    code = ("import runpy, sys; sys.argv[1:] = ['seed=-1']\n"
+            "try: runpy.run_module('experiments.se_models', run_name='__main__')\n"
+            "finally: print('gymnax.environments.environment' in sys.modules)")  # fmt: skip
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 2 and "seed must lie in" in done.stderr and done.stdout == "False\n"
+
+
+def test_commands_in_the_docs_are_accepted():
+    root = Path(__file__).parents[1]
+    pages = [root / "README.md", *(root / "docs").rglob("*.md")]
+    text = "\n".join(page.read_text() for page in pages)
+    commands = set(re.findall(r"python -m experiments\.([a-z]\w+)([^`\n#|]*)", text))
+    assert len(commands) > 20
+    for name, words in (each for each in commands if "--help" not in each[1]):
+        settings = module_of(name).EXPERIMENT.settings
+        made = settings.of(**parse(settings, shlex.split(words)))
+        again = settings.of(**parse(settings, shlex.split(made.command())[3:]))
+        assert dataclasses.replace(made, out=again.out, work=None) == again
+        if made.folder.parts[0] == "results":  # and it replaces no other results
+            assert again.folder == made.folder
+        if isinstance(made, runs.RunSettings):  # and so are the overrides of its runs
+            made.learn_config(["proxy=rn"] if isinstance(made, RnSettings) else [])
+
+
+# --- settings ------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, kw_only=True)
+class Example(experiment.Settings):
+    name = "example"
+
+    env: str = experiment.setting("cartpole", about="task")
+    agents: tuple[str, ...] = experiment.setting(
+        ("ddqn", "ppo"), experiment.each_of(("ddqn", "ppo")), about="kinds"
+    )
+    num_agents: int = experiment.setting(10, counts("it counts agents"), quick=4, about="of each")
+    run: tuple[str, ...] = experiment.setting((), about="overrides")
+
+
+def given(*words):
+    return Example.of(**parse(Example, words))
+
+
+def example(compute=refuse, report=refuse):
+    return experiment.Experiment(settings=Example, compute=compute, report=report, about="What.")
+
+
+def test_settings_are_complete_and_say_which_command_makes_them():
+    assert (given().num_agents, given("quick=true").num_agents) == (10, 4)
+    made = given("quick=true", "agents=[ppo]", "num_agents=null", "run.es.noise_std=0.1", "seed=7",
+                 "run.agent.hidden_size=4")  # fmt: skip
+    assert made.run == ("es.noise_std=0.1", "agent.hidden_size=4")
+    assert made == Example.of(quick=True, agents="ppo", seed=7, run=made.run)
+    words = shlex.split(made.command())
+    assert words[:3] == ["python", "-m", "experiments.example"]
+    assert given(*words[3:]) == made and len(words) == 3 + 5
+    assert given().command() == "python -m experiments.example"
+    text = example().help()
+    assert "num_agents=10" in text and "of each (quick: 4)" in text and "run.FIELD=VALUE" in text
+
+
+def test_an_override_of_the_runs_that_is_a_field_sets_the_field():
+    """So that Acrobot's numbers are not filed as CartPole's."""
+    made = given("run.env=acrobot", "run.seed=3", "run.es.noise_std=0.1")
+    assert (made.env, made.seed, made.run) == ("acrobot", 3, ("es.noise_std=0.1",))
+    assert made == Example.of(run=["env=acrobot", "es.noise_std=0.1", "seed=3"])
+    assert str(made.folder) == "results/example/acrobot"
+
+
+def test_results_are_apart_from_what_may_be_deleted():
+    assert str(given().folder) == "results/example/cartpole"
+    assert str(given().work_folder) == "runs/experiments/example/cartpole"
+    assert str(given("quick=true").folder) == "runs/experiments/example-quick/cartpole"
+    assert str(given("out=results/example/mine").work_folder) == "runs/experiments/example/mine"
+    assert str(given("out=/tmp/mine").work_folder) == "/tmp/mine/work"
+    assert str(given("out=/tmp/mine", "work=/tmp/other").work_folder) == "/tmp/other"
+
+
+@pytest.mark.parametrize(
+    ("word", "message"),
+    [("agents=[dqn]", "agents must be one of ddqn, ppo"), ("agents=ddqn,ppo", "agents must be one"),
+     ("num_agents=0", "num_agents must be at least 1"), ("num_agents=many", "a whole number"),
+     ("numagents=3", "Did you mean num_agents="), ("--quick", "Did you mean quick=")],
+)  # fmt: skip
+def test_words_that_cannot_work_are_refused(word, message):
+    with pytest.raises(ConfigError, match=message):
+        given(word)
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "field"),
+    [
+        ("agent_learning", {"envs": "cartpol"}, "envs"),
+        ("rn_performance", {"env": "acrobot"}, "env"),
+        ("rn_performance", {"env": "cartpole", "variants": "additive_potential+augm"}, "variants"),
+        ("rn_performance", {"rows": ("varied", "transfers")}, "rows"),
+        ("rn_performance", {"rows": "tuned"}, "rows"),  # there is none on Cliff Walking
+        ("rn_performance", {"bonuses": "icm"}, "bonuses"),
+        ("rn_performance", {"rns": 3, "learned": 2}, "rns"),
+        ("rn_performance", {"objective": "steps"}, "objective"),
+        ("rn_objectives", {"picks": "top"}, "picks"),
+        ("rn_objectives", {"rns": 2, "learned": 3}, "learned"),
+        ("rn_heatmap", {"env": "cartpole"}, "env"),
+        ("score_transforms", {"population": 1}, "population"),
+        ("se_families", {"sets": []}, "sets"),
+        ("se_transfer_of_hparams", {"num_agents": 1}, "num_agents"),
+        ("timings", {"rows": "pendulum-rn"}, "rows"),
+    ],
+)
+def test_settings_that_cannot_work_are_refused_at_once(name, options, field):
+    with pytest.raises(ConfigError, match=rf"^{field} must "):
+        module_of(name).EXPERIMENT.settings.of(quick=True, **options)
+
+
+# --- shards and rows -----------------------------------------------------------------------------
+
+
+def test_a_shard_is_computed_once_and_again_if_it_is_damaged(tmp_path, capsys):
+    computed = []
+
+    def compute(**settings):
+        def make():
+            computed.append(settings)
+            return pd.DataFrame({"x": [0.1, 1 / 3], "name": ["a", "b"]})
+
+        return shards.Shards(tmp_path).compute("one", settings, make)
+
+    first = compute(count=2, odd=float("nan"))
+    pd.testing.assert_frame_equal(compute(count=2, odd=float("nan")), first)
+    assert len(computed) == 1
+    with pytest.raises(ConfigError, match=r"differs in count \(2 there, 3 here\).*Set work=DIR"):
+        compute(count=3, odd=float("nan"))
+    path = tmp_path / "one.csv"
+    whole = path.read_bytes()
+    for damaged in (whole[:-4], whole.replace(b"0.1", b"0.2"), b"", b"\xff" + whole, b"{}\nx\n1\n",
+                    whole.replace(b'"count": 2', b'"count": 3'), b"[]"):  # fmt: skip
+        path.write_bytes(damaged)
+        pd.testing.assert_frame_equal(compute(count=2, odd=float("nan")), first)
+        assert path.read_bytes() == whole and "one.csv is damaged" in capsys.readouterr().out
+    assert len(computed) == 1 + 7
+
+
+def test_damaged_or_missing_rows_are_refused(tmp_path):
+    settings = Example.of(out=str(tmp_path))
+    rows = pd.DataFrame({"steps": [3, 9, 2], "name": ["a", "b", "c"]})
+    reported = []
+    page = example(lambda _: rows, lambda _, rows: reported.append(rows) or rows)
+    with pytest.raises(ConfigError, match=r"no .*rows\.csv\.xz"):
+        page.run(dataclasses.replace(settings, from_rows=True))
+    page.run(settings)
+    page.run(dataclasses.replace(settings, from_rows=True))
+    for each in reported:
+        pd.testing.assert_frame_equal(each, rows)
+    whole = settings.rows_file.read_bytes()
+    middle = len(whole) // 2
+    flipped = whole[:middle] + bytes([whole[middle] ^ 1]) + whole[middle + 1 :]
+    for damaged in (whole[:-9], flipped, b"", b"steps,name\n"):
+        settings.rows_file.write_bytes(damaged)
+        with pytest.raises(ConfigError, match=r"rows\.csv\.xz is damaged"):
+            page.run(dataclasses.replace(settings, from_rows=True))
+
+
+def test_results_say_what_they_were_made_with(tmp_path):
+    settings = Example.of(out=str(tmp_path))
+
+    def compute(settings):
+        return settings.shards.compute("one", {"seed": 3}, lambda: pd.DataFrame({"x": [1]}))
+
+    example(compute, lambda _, rows: rows).run(settings)
+    assert json.loads(settings.settings_file.read_text()) == {"one": {"seed": 3}}
+
+
+def test_tables_of_several_kinds_are_one_and_come_apart_again():
+    tables = {"a": pd.DataFrame({"x": [0.1, 1 / 3]}), "b": pd.DataFrame({"flag": [True], "n": [3]})}
+    for name, table in tables.items():
+        apart = shards.unstack(shards.stack(tables), name)
+        pd.testing.assert_frame_equal(apart, table, check_dtype=False)
+
+
+# --- agents and curves ---------------------------------------------------------------------------
+
+
+def test_agents_that_diverged_count_as_the_worst(capsys):
+    nan = float("nan")
+    rows = pd.DataFrame({
+        "group": "00", "agent": [0, 1, 2], "test_return": [1.0, nan, -3.0],
+        "return_0": [2.0, nan, -5.0], "return_1": [0.0, 4.0, -1.0],
+    })  # fmt: skip
+    told = agents.worst_for_diverged(rows, "default-real")
+    assert told["test_return"].tolist() == [1.0, -5.0, -3.0]
+    assert told["return_0"].tolist() == [2.0, -5.0, -5.0]
+    assert "default-real: 1 agents diverged" in capsys.readouterr().out
+    pd.testing.assert_frame_equal(agents.worst_for_diverged(told, "again"), told)
+
+
+def curve(steps, returns, agent=0):
+    returns = np.array(returns, float)
+    return pd.DataFrame({"agent": agent, "steps": steps, "test_return": returns})
+
+
+def test_a_task_is_solved_when_ten_tests_in_a_row_are_good_on_average():
+    good_late = curve(range(10, 310, 10), [0] * 10 + [10] * 20)
+    # Ten in a row have mean 9 once nine of them are 10: the window ends at the 19th episode.
+    assert curves.steps_to_solve(good_late, 9.0) == 190
+    assert curves.steps_to_solve(good_late, 10.1) == np.inf
+    assert curves.steps_to_solve(good_late.head(9), 0.0) == np.inf  # too few tests
+
+
+def test_curves_hold_the_value_of_the_last_finished_episode():
+    two = pd.concat([curve([10, 20], [1, 3]), curve([15], [5], agent=1)])
+    values = curves.on_grid(two, np.array([5, 10, 19, 20]))
+    np.testing.assert_array_equal(values, [[np.nan, 1, 1, 2], [np.nan, np.nan, 5, 5]])
+
+
+def test_the_agents_of_reward_networks_train_as_there_but_to_the_end():
+    study = agent_learning.PresetStudy("pendulum", "td3", 20_000, "")
+    preset = sejax.config(["env=pendulum", "proxy=rn"])
+    assert study.configuration() == preset.agent != sejax.TD3Config()
+    assert dataclasses.replace(sejax.TD3Config(), **study.changes()) == preset.agent
+    training = study.training(quick=False, test_episodes=2)
+    assert (preset.training.stop_rule, training.stop_rule) == ("solved", "never")
+    assert (training.max_episodes, training.max_steps) == (100, 20_000)
+    assert (training.tests_between, training.time_limit_is_terminal) == (2, False)

@@ -1,0 +1,353 @@
+"""sejax.agents.mixture: candidates that are divided among agents, and how their scores combine."""
+
+import dataclasses
+import re
+from types import SimpleNamespace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import sejax
+from sejax import envs, registry
+from sejax.agents.mixture import COMPARED_BY, Mixture, MixtureConfig
+from sejax.bilevel import make_bilevel
+from sejax.errors import ConfigError
+from sejax.es.base import Evaluations
+from sejax.es.nes import NESConfig
+from sejax.evaluation import make_evaluator
+from sejax.objectives import Outcome
+from sejax.proxies.configs import SyntheticConfig
+from sejax.training import TrainingConfig
+
+NAN, INF = np.nan, np.inf
+TASK = envs.make("gridworld_2x2")
+AGENTS = tuple(
+    sejax.make_agent(config, TASK)
+    for config in (
+        sejax.QLearningConfig(learning_rate=0.5),
+        sejax.SARSAConfig(learning_rate=0.3, epsilon_init=0.7, epsilon_min=0.7),
+    )
+)
+
+
+def mixture(num=2, weights=(), **config):
+    """A mixture of which nobody looks at the agents."""
+    return Mixture(agents=AGENTS[:1] * num, weights=weights, config=MixtureConfig(**config))
+
+
+# --- which agent trains where --------------------------------------------------------------------
+
+
+def test_candidates_go_to_the_agent_that_is_furthest_behind_its_share():
+    # Shares 1/2, 1/3 and 1/6; after each place, share times places less places had:
+    # 1: 3/6 2/6 1/6 -> 0.  2: 0 4/6 2/6 -> 1.  3: 3/6 0 3/6 -> 0 (a tie goes to the first).
+    # 4: 0 2/6 4/6 -> 2.  5: 3/6 4/6 -1/6 -> 1.  6: 6/6 0 0 -> 0.  Then all over again.
+    dealt = mixture(3, weights=(3.0, 2.0, 1.0)).agent_of_candidate(12)
+    np.testing.assert_array_equal(dealt, [0, 1, 0, 2, 1, 0] * 2)
+    np.testing.assert_array_equal(mixture(2).agent_of_candidate(5), [0, 1, 0, 1, 0])
+    np.testing.assert_array_equal(mixture(1).agent_of_candidate(3), [0, 0, 0])
+    # An agent of weight 0 trains on incumbents alone, and needs no candidate.
+    np.testing.assert_array_equal(mixture(2, weights=(0.0, 3.0)).agent_of_candidate(3), [1, 1, 1])
+    np.testing.assert_array_equal(mixture(2, weights=(0.0, 3.0)).agent_of_candidate(1), [1])
+
+
+def test_both_signs_of_a_perturbation_train_the_same_agent():
+    strategy = NESConfig(population_size=3).make(4)
+    assert (strategy.population_size, strategy.antithetic) == (6, True)
+    dealt = mixture(2).agent_of_candidate(strategy.population_size, strategy.antithetic)
+    np.testing.assert_array_equal(dealt, [0, 1, 0] * 2)
+
+
+def test_each_evaluation_has_its_candidates_agent_and_the_incumbents_take_turns():
+    evaluations = Evaluations(num_evals=2, num_incumbent_evals=4)
+    np.testing.assert_array_equal(
+        evaluations.agents(np.array([0, 1, 0]), 2), [0, 0, 1, 1, 0, 0, 0, 1, 0, 1]
+    )
+
+
+@pytest.mark.parametrize(("asked", "num", "evals"), [(16, 2, 16), (5, 2, 6), (1, 3, 3), (4, 1, 4)])
+def test_the_incumbent_is_evaluated_equally_often_with_each_agent(asked, num, evals):
+    assert mixture(num).num_evals(asked) == evals
+
+
+@pytest.mark.parametrize(
+    ("make", "field"),
+    [
+        (lambda: Mixture(agents=()), "agents"),
+        (lambda: Mixture(agents=AGENTS, names=("a",)), "agents"),
+        (lambda: Mixture(agents=AGENTS, weights=(1.0, 2.0, 3.0)), "agents"),
+        (lambda: mixture(2, weights=(0.0, 0.0)), "agents"),
+        (lambda: mixture(3).agent_of_candidate(4, antithetic=True), "es.population_size"),
+        (lambda: mixture(2, weights=(10.0, 1.0)).agent_of_candidate(4), "es.population_size"),
+        (lambda: MixtureConfig(aggregate="max"), "agents.aggregate"),
+        (lambda: MixtureConfig(compared_by="x"), "agents.compared_by"),
+    ],
+)
+def test_a_mixture_that_cannot_be_is_refused(make, field):
+    with pytest.raises(ConfigError) as error:
+        make()
+    assert error.value.field == field
+
+
+# --- how scores combine --------------------------------------------------------------------------
+
+SCORES = np.array([200, -500, 150, NAN, 190, -80, NAN, -500, 10, -90, 180, -100], np.float32)
+AGENT = np.array([0, 1] * 6)
+
+
+def plain_comparable(scores, agent, incumbents, compared_by):
+    """The same in plain Python, one candidate at a time."""
+    out = []
+    for score, own_index in zip(scores, agent, strict=True):
+        own = [float(s) for s, f in zip(scores, agent, strict=True) if f == own_index]
+        alive = [s for s in own if np.isfinite(s)]
+        incumbent = incumbents[own_index]
+        if not np.isfinite(incumbent):
+            incumbent = sum(alive) / len(alive) if alive else NAN
+
+        def share_below(x, own=own):
+            return sum(1.0 if s < x else 0.5 if s == x else 0.0 for s in own) / len(own)
+
+        if not np.isfinite(score):
+            out.append(NAN)
+        elif compared_by == "advantage":
+            out.append(float(score) - incumbent)
+        else:
+            out.append(share_below(float(score)) - share_below(incumbent))
+    return out
+
+
+def compare(scores, agent, incumbents, by):
+    """`comparable` of as many agents as there are incumbents' means, in NumPy."""
+    comparable = mixture(len(incumbents), compared_by=by).comparable
+    jitted = jax.jit(lambda scores, means: comparable(scores, np.array(agent), means))
+    return jax.device_get(jitted(np.float32(scores), np.float32(incumbents)))
+
+
+@pytest.mark.parametrize("by", COMPARED_BY)
+@pytest.mark.parametrize("incumbents", [(160.0, -95.0), (190.0, NAN), (NAN, NAN)])
+def test_scores_are_compared_within_their_agent(by, incumbents):
+    got, incumbent = compare(SCORES, AGENT, incumbents, by)
+    expected = plain_comparable(SCORES, AGENT, incumbents, by)
+    np.testing.assert_allclose(got, expected, rtol=1e-5, atol=1e-6)
+    assert incumbent == 0.0
+
+
+@pytest.mark.parametrize("by", COMPARED_BY)
+def test_what_ties_with_the_incumbent_but_for_rounding_moves_nothing(by):
+    mean = np.float32(-93.3) - np.float32(2e-5)  # as a mean of equal scores may be off
+    got, _ = compare([-93.3, 0.0, -93.3, 1.0], [0, 1, 0, 1], [mean, 0.5], by)
+    assert got[0] == got[2] == 0 and got[1] < 0 < got[3]
+
+
+def test_comparison_by_hand():
+    scores, agent, incumbents = [190, -80, 200, -100, 170, NAN], [0, 1, 0, 1, 0, 1], [185, -90]
+    got, _ = compare(scores, agent, incumbents, "advantage")
+    np.testing.assert_array_equal(got, [5, 10, 15, -10, -15, NAN])
+    # 190, 200, 170 beat 1, 2 and 0 of 3, and count half of themselves; the incumbent's 185 beats 1.
+    # -80 and -100 beat 1 and 0 of 3, and half of themselves; the incumbent's -90 beats 1.
+    got, _ = compare(scores, agent, incumbents, "rank")
+    np.testing.assert_allclose(got, np.array([0.5, 0.5, 1.5, -0.5, -0.5, NAN]) / 3, rtol=1e-5)
+
+
+@pytest.mark.parametrize("by", COMPARED_BY)
+def test_an_agent_that_never_survived_on_the_incumbent_moves_nothing(by):
+    got, _ = compare([3, NAN, 5, NAN], [0, 1, 0, 1], [4, NAN], by)
+    np.testing.assert_array_equal(np.sign(got), [-1, NAN, 1, NAN])
+
+
+@pytest.mark.parametrize("by", COMPARED_BY)
+def test_scores_of_one_agent_stay_as_they_are(by):
+    got, incumbent = compare(SCORES, np.zeros(12, int), [7.5], by)
+    np.testing.assert_array_equal(got, SCORES)
+    assert incumbent == 7.5
+
+
+@pytest.mark.parametrize(
+    ("means", "mean", "worst"),
+    [((200.0, 140.0), 170.0, 140.0), ((-90.0, NAN), NAN, NAN), ((3.0,), 3.0, 3.0)],
+)
+def test_an_incumbent_is_worth_its_mean_or_its_worst_agent(means, mean, worst):
+    for aggregate, expected in (("mean", mean), ("min", worst)):
+        got = mixture(len(means), aggregate=aggregate).aggregated(jnp.array(means))
+        np.testing.assert_array_equal(got, expected)
+
+
+# --- Algorithm 1 ---------------------------------------------------------------------------------
+
+PROXY = registry.make("proxy", SyntheticConfig(hidden_size=4, done="threshold"), TASK)
+TRAINING = TrainingConfig(max_episodes=5, max_steps=30, stop_rule="never", test_episodes=2)
+ES = NESConfig(population_size=3, noise_std=1.0, num_evals=2, num_incumbent_evals=3)
+KEY = jax.random.key(0)
+
+
+def bilevel_of(agent, **fields):
+    return make_bilevel(
+        **{"task": TASK, "agent": agent, "proxy": PROXY, "es": ES, "training": TRAINING,
+           "num_parallel": 1, "devices": 2, **fields}
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def two():
+    """A generation of a mixture of two agents, and the outcome of its evaluations by hand.
+
+    The outcome is that of one training after another, each with a single agent's evaluator.
+    """
+    bilevel = bilevel_of(Mixture(agents=AGENTS, names=("q", "sarsa"), weights=(2.0, 1.0)))
+    state = bilevel.init(KEY)
+
+    @jax.jit
+    def generation(state):
+        candidates = bilevel.ask(state)
+        outcome = bilevel.evaluate(candidates)
+        return candidates, outcome, *bilevel.tell(state, candidates, outcome)
+
+    candidates, outcome, after, info = generation(state)
+    # Candidates 0 1 0 of each sign, two evaluations each; four of the incumbent, 3 rounded up.
+    agent = np.array([0, 0, 1, 1, 0, 0] * 2 + [0, 1, 0, 1])
+    by_agent = []
+    for each in AGENTS:
+        evaluate = make_evaluator(each, PROXY, TASK, TRAINING)
+
+        def one(evaluation, evaluate=evaluate):
+            key, params = evaluation
+            return evaluate(key, PROXY.params(bilevel.unravel(params)))
+
+        evaluations = (candidates.keys, candidates.params)
+        run = jax.jit(lambda x, one=one: jax.lax.map(one, x))
+        by_agent.append(jax.device_get(run(evaluations)))
+    assert np.mean(by_agent[0].auc != by_agent[1].auc) > 0.5  # the agents differ on most
+    expected = jax.tree.map(lambda *x: np.stack([x[a][i] for i, a in enumerate(agent)]), *by_agent)
+    return SimpleNamespace(
+        bilevel=bilevel, before=state, candidates=candidates, outcome=outcome, after=after,
+        info=info, agent=agent, expected=expected,
+    )  # fmt: skip
+
+
+def test_each_candidate_is_trained_by_its_agent_and_no_other(two):
+    jax.tree.map(np.testing.assert_array_equal, jax.device_get(two.outcome), two.expected)
+
+
+def test_a_generation_tells_the_advantages_over_each_agents_incumbent(two):
+    scores, agent = two.expected.test_return, two.agent
+    candidates, after = two.candidates, two.after
+    assert np.isfinite(scores).all()
+    assert (np.asarray(after.es_state.mean) != two.before.es_state.mean).any()
+    means = [scores[12:][agent[12:] == i].mean() for i in range(2)]
+    advantage = scores[:12].reshape(6, 2).mean(axis=1) - np.array(means)[[0, 1, 0, 0, 1, 0]]
+    told = two.bilevel.strategy.tell(
+        candidates.key_tell, candidates.population, jnp.float32(advantage), jnp.float32(0),
+        candidates.es_state,
+    )  # fmt: skip
+    np.testing.assert_allclose(after.es_state.mean, told.mean, rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(two.info.incumbent_mean, np.mean(means), rtol=1e-6)
+    np.testing.assert_allclose(after.best_scores, means, rtol=1e-6)
+    np.testing.assert_allclose(after.incumbent_scores, means, rtol=1e-6)
+
+
+def test_the_columns_of_each_agent_are_means_over_its_trainings(two):
+    info, outcome, agent = two.info, two.expected, two.agent
+    scores, is_candidate = outcome.test_return, np.arange(16) < 12
+    for i in range(2):
+        own = agent == i
+        for name, expected in {
+            "incumbent_mean": scores[own & ~is_candidate].mean(),
+            "population_mean": scores[own & is_candidate].mean(),
+            "train_steps_mean": outcome.train_steps[own].mean(),
+            "num_nonfinite": 0,
+        }.items():
+            got = getattr(info.by_agent, name)
+            assert got.shape == (2,)
+            np.testing.assert_allclose(got[i], expected, rtol=1e-5, err_msg=name)
+    np.testing.assert_allclose(info.population_mean, scores[:12].mean(), rtol=1e-6)
+    np.testing.assert_allclose(info.population_max, scores[:12].max(), rtol=1e-6)
+    np.testing.assert_allclose(info.incumbent_std, scores[12:].std(), rtol=1e-5)
+    np.testing.assert_array_equal(info.train_steps, outcome.train_steps)
+    np.testing.assert_array_equal(info.real_steps, outcome.real_steps)
+
+
+def program_text(bilevel):
+    state = jax.eval_shape(bilevel.init, KEY)
+    return re.sub("0x[0-9a-f]+", "", str(jax.make_jaxpr(bilevel.generation)(state)))
+
+
+def test_a_mixture_of_one_agent_is_the_program_of_that_agent():
+    alone = program_text(bilevel_of(AGENTS[0]))
+    config = MixtureConfig(compared_by="rank")
+    one = Mixture(agents=AGENTS[:1], names=("q",), weights=(3.0,), config=config)
+    assert program_text(bilevel_of(one)) == alone
+    assert program_text(bilevel_of(AGENTS[1])) != alone
+
+
+def told(incumbents, state=None, stop_when_solved=True, **config):
+    """State and info after a generation whose candidates returned 0, and the incumbent these."""
+    bilevel = bilevel_of(
+        Mixture(agents=AGENTS, config=MixtureConfig(**config)), stop_when_solved=stop_when_solved,
+        es=NESConfig(population_size=2, mirrored=False, num_incumbent_evals=len(incumbents)),
+    )  # fmt: skip
+    returns = np.float32([0, 0, *incumbents])
+    counts = np.full(returns.shape, 3, np.int32)
+    outcome = Outcome(
+        test_returns=returns[..., None], scored_returns=returns[..., None], train_steps=counts,
+        train_episodes=counts, auc=returns, nonfinite=~np.isfinite(returns),
+        real_steps=counts,
+    )  # fmt: skip
+    state = bilevel.init(KEY) if state is None else state
+    return jax.jit(lambda s: bilevel.tell(s, bilevel.ask(s), outcome))(state)
+
+
+@pytest.mark.parametrize(("aggregate", "score"), [("mean", 0.25), ("min", -0.25)])
+def test_a_run_stops_when_the_incumbents_score_solves_the_task(aggregate, score):
+    # The mean of both agents is above the threshold, the second agent's is below it.
+    incumbents = TASK.solved_reward + np.array([0.75, -0.25])
+    after, info = told(incumbents, aggregate=aggregate)
+    assert bool(after.finished) == (aggregate == "mean")
+    np.testing.assert_allclose(after.best_score, TASK.solved_reward + score, rtol=1e-6)
+    np.testing.assert_allclose(info.by_agent.incumbent_mean, incumbents, rtol=1e-6)
+    after, _ = told(incumbents + 1, stop_when_solved=False)
+    assert not after.finished and after.best_score > TASK.solved_reward
+
+
+def test_the_incumbents_agents_that_diverged_rank_last_within_their_agent():
+    # Both agents' candidates returned 0. The lowest of the first agent is -3, of the second 0.
+    _, info = told([4, 5, NAN, NAN, -3, 7])
+    np.testing.assert_allclose(info.by_agent.incumbent_mean, [(4 - 3 - 3) / 3, (5 + 0 + 7) / 3])
+    np.testing.assert_array_equal(info.by_agent.num_nonfinite, [1, 1])
+
+
+def test_an_incumbent_that_one_agent_never_survived_is_never_the_best():
+    after, info = told([1e6, NAN])
+    assert (after.best_generation, after.best_score, after.finished) == (-1, -INF, False)
+    np.testing.assert_array_equal(after.incumbent_scores, [1e6, -INF])
+    np.testing.assert_array_equal(info.by_agent.num_nonfinite, [0, 1])
+
+
+# --- what the compiler makes ---------------------------------------------------------------------
+
+
+def test_two_agents_are_one_program_with_a_training_loop_for_each():
+    task = envs.make("cartpole")
+    config = sejax.DDQNConfig(hidden_size=4, num_layers=1, batch_size=4, warmup_episodes=1)
+    sizes = (31, 37)  # rows of the replay buffers, which tell the loops apart
+    agents = tuple(
+        sejax.make_agent(dataclasses.replace(config, buffer_size=size), task) for size in sizes
+    )
+    bilevel = make_bilevel(
+        task=task, agent=Mixture(agents=agents), proxy=SyntheticConfig(hidden_size=4),
+        es=NESConfig(population_size=23), training=dataclasses.replace(TRAINING, max_steps=40),
+        devices=2, num_parallel=1,
+    )  # fmt: skip
+    lowered = jax.jit(bilevel.generation).lower(jax.eval_shape(bilevel.init, KEY))
+    hlo = lowered.compile().as_text()
+    assert "num_partitions=2" in hlo.splitlines()[0]
+    loops = [line for line in hlo.splitlines() if re.search(r"\) while\(", line)]
+    for size in sizes:
+        assert sum(f"f32[{size},11]" in line for line in loops) == 1
+    assert not any(all(f"f32[{size},11]" in line for size in sizes) for line in loops)
+    # No training pays for another agent's: a device runs half of 24 candidates and 12 incumbents
+    # of the first, and of 22 and 12 of the second. Shorter loops draw random numbers.
+    trips = [int(n) for line in loops for n in re.findall(r'known_trip_count.*?"n":"(\d+)"', line)]
+    assert {17, 18} <= set(trips) and 35 not in trips
