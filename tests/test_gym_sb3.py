@@ -92,7 +92,7 @@ def test_lanes_share_their_attributes():
     with pytest.raises(NotImplementedError, match="indices=None"):
         envs.set_attr("tag", 7, indices=[1])
     assert envs.env_method("get_wrapper_attr", "tag", indices=[0]) == [7]
-    with pytest.raises(NotImplementedError, match="lanes reset together"):
+    with pytest.raises(NotImplementedError, match="reset together"):
         envs.env_method("reset")
     assert envs.env_is_wrapped(gymnasium.Wrapper) == [False] * 3
     envs.close()

@@ -126,10 +126,10 @@ def test_an_ended_lane_must_be_reset_where_nothing_does_it():
 
 def test_seeds_and_masks_are_one_for_each_lane():
     envs = SyntheticVectorEnv(world_of(), 2)
-    with pytest.raises(ConfigError, match=r"^seed must have an entry for each .* got 3 for 2\."):
+    with pytest.raises(ConfigError, match=r"^seed must have an entry for each"):
         envs.reset(seed=[1, 2, 3])
     for mask in (np.array([True]), np.array([1, 0])):
-        with pytest.raises(ConfigError, match=r"^options.reset_mask must be a bool for each lane"):
+        with pytest.raises(ConfigError, match=r"^options.reset_mask must be a bool"):
             envs.reset(options={"reset_mask": mask})
 
 

@@ -59,10 +59,8 @@ class Condition:
     @classmethod
     def of_set(cls, proxies: Any, names: Iterable[str], **rest: Any) -> Self:
         """The proxies of a `ProxySet`, one for each group; the first ones again for more groups."""
-        ones = [proxies[i % len(proxies)] for i in range(len(names))]
-        groups = tuple(
-            Group(name, one.params, one.fingerprint) for name, one in zip(names, ones, strict=True)
-        )
+        ones = [(name, proxies[i % len(proxies)]) for i, name in enumerate(names)]
+        groups = tuple(Group(name, one.params, one.fingerprint) for name, one in ones)
         settings = {"proxy": proxies.config["proxy"], **rest.pop("settings", {})}
         return cls(env=proxies.env, task=proxies.task, groups=groups, settings=settings, **rest)
 

@@ -17,9 +17,9 @@ from sejax.proxies.header import check_tensors
 
 
 class Step(NamedTuple):
-    """What a step comes to: of one episode numbers, of several arrays `[lanes]`."""
+    """What a step comes to: of one episode numbers, of several arrays `[batch]`."""
 
-    vector: np.ndarray  # [*lanes, obs_dim]
+    vector: np.ndarray  # [*batch, obs_dim]
     reward: Any
     terminated: Any
     truncated: Any
@@ -30,7 +30,7 @@ class SyntheticWorld:
     """The networks of an SE, and what it has of its task; it has no state.
 
     It is `sejax.proxies.synthetic.SyntheticEnv` in NumPy. Its functions take one episode, or
-    several at once along a first axis, lanes.
+    a batch of them along a first axis.
 
     Args:
       weights: by `network/layer/parameter`, kernels `[out, in]` and biases `[out]`, float32.
@@ -89,7 +89,7 @@ class SyntheticWorld:
         return np.array(starts, np.float32)
 
     def first(self, drawn: np.ndarray) -> np.ndarray:
-        """First states `[*lanes, obs_dim]`, of what `draw` has drawn."""
+        """First states `[*batch, obs_dim]`, of what `draw` has drawn."""
         if not self.draws_noise:
             return drawn
         vector = drawn
@@ -99,7 +99,7 @@ class SyntheticWorld:
         return np.minimum(np.maximum(vector, np.float32(-MAX_ABS_VALUE)), np.float32(MAX_ABS_VALUE))
 
     def encode(self, action: Any, space: spaces.Space[Any]) -> np.ndarray:
-        """Actions as the networks see them, `[*lanes, action_dim]`: one-hot if they are discrete.
+        """Actions as the networks see them, `[*batch, action_dim]`: one-hot if they are discrete.
 
         Args:
           action: of `space`; continuous ones are clipped to its bounds, as in Gymnasium's own
@@ -122,12 +122,12 @@ class SyntheticWorld:
         """One step of each episode.
 
         Args:
-          vector: the state, `[*lanes, obs_dim]`.
-          action: from `encode`, `[*lanes, action_dim]`.
-          time: steps of the episode with this one, `[*lanes]`.
-          chance: uniform in [0, 1), `[*lanes]`, if `draws_ends`.
+          vector: the state, `[*batch, obs_dim]`.
+          action: from `encode`, `[*batch, action_dim]`.
+          time: steps of the episode with this one, `[*batch]`.
+          chance: uniform in [0, 1), `[*batch]`, if `draws_ends`.
         """
-        outputs = self._predict(action, vector)  # [*lanes, obs_dim + 2]
+        outputs = self._predict(action, vector)  # [*batch, obs_dim + 2]
         absurd: Any = False
         if not np.abs(outputs).max() < MAX_ABS_VALUE:  # nan is not either
             absurd = ~(np.abs(outputs).max(axis=-1) < MAX_ABS_VALUE)
@@ -147,7 +147,7 @@ class SyntheticWorld:
         return Step(outputs[..., :-2], reward, terminated, truncated, discount)
 
     def observe(self, vector: np.ndarray) -> np.ndarray:
-        """What agents see of a state, a copy: `[*lanes, obs_dim]`, or an index `[*lanes]`."""
+        """What agents see of a state, a copy: `[*batch, obs_dim]`, or an index `[*batch]`."""
         return np.argmax(vector, axis=-1) if self._num_states else vector.copy()
 
     def _predict(self, action: np.ndarray, vector: np.ndarray) -> np.ndarray:
