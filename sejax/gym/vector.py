@@ -19,8 +19,8 @@ class SyntheticVectorEnv(VectorEnv[Any, Any, np.ndarray]):
     """Episodes of an SE as a Gymnasium vector environment.
 
     Environment i equals `SyntheticEnv` after `reset(seed=seed + i)` up to rounding, whatever
-    happens in the others: each has a generator of its own, which draws its starts and ends. Infos, and
-    what is done where an episode ends, are those of `gymnasium.vector.SyncVectorEnv`.
+    happens in the others: each has a generator of its own, which draws its starts and ends. Infos,
+    and what is done where an episode ends, are those of `gymnasium.vector.SyncVectorEnv`.
 
     Args:
       world: of the SE.
