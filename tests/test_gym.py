@@ -265,22 +265,18 @@ CHECKED = [("cartpole", {"done": "threshold"}), ("cartpole", BANDIT),
            ("pendulum", {"done": "bernoulli"}), ("gridworld_2x2", {"done": "sigmoid"})]  # fmt: skip
 
 
-@pytest.mark.parametrize(("task", "config"), CHECKED, ids=str)
+@pytest.mark.parametrize("source", [
+    *CHECKED, *(name for name in pretrained_names() if not name.endswith("-rn")),
+], ids=str)  # fmt: skip
 @pytest.mark.filterwarnings(
     "ignore:.*Box observation space m.*imum value is -?infinity:UserWarning",
     "ignore:.*recommend using a symmetric and normalized space:UserWarning",  # Pendulum's torque
 )
-def test_gymnasiums_checker_passes(stored, task, config):
-    check_env(make(stored(jax_se(task, **config))))
-
-
-@pytest.mark.parametrize("name", [x for x in pretrained_names() if not x.endswith("-rn")])
-@pytest.mark.filterwarnings(
-    "ignore:.*Box observation space m.*imum value is -?infinity:UserWarning",
-    "ignore:.*recommend using a symmetric and normalized space:UserWarning",  # Pendulum's torque
-)
-def test_gymnasiums_checker_passes_for_what_ships(name):
-    check_env(make(name))
+def test_gymnasiums_checker_passes(stored, source):
+    if isinstance(source, tuple):
+        task, config = source
+        source = stored(jax_se(task, **config))
+    check_env(make(source))
 
 
 def test_spaces_are_the_tasks_without_bounds_of_the_observations(stored):

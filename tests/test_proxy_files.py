@@ -94,6 +94,7 @@ def test_a_proxy_needs_no_configuration_and_no_record(tmp_path, env, weights):
     assert np.isnan(proxies.scores) and proxies.seeds == [-1]
     assert refusal(proxy.learned_with, "agent").field == "agent"
     assert refusal(sejax.training_of, proxy).field == "training"
+    assert refusal(proxy.learned_with, "training").field == "group"
 
 
 def test_a_loaded_proxy_steps_as_a_gymnax_environment():

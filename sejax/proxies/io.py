@@ -13,7 +13,7 @@ from flax.traverse_util import flatten_dict, unflatten_dict
 
 from sejax import envs, registry
 from sejax.envs.base import Task
-from sejax.errors import ConfigError, require, shortened, told
+from sejax.errors import ConfigError, one_of, require, shortened, told
 from sejax.ops.files import write_bytes
 from sejax.proxies import ProxyConfig
 from sejax.proxies.base import ProxyEnv, absent_task, require_present
@@ -61,13 +61,14 @@ class _Stored:
         `sejax.training_of` reads its training.
 
         Raises:
-          ConfigError: if the file does not tell it, or names one that is not registered: a file's
-            names are never imported.
+          ConfigError: for a group of another name; or if the file does not tell it, or names one
+            that is not registered, because a file's names are never imported.
 
         Example:
           >>> load_proxy("cliff_walking-rn").learned_with("agent").discount
           0.8
         """
+        one_of("group", group, registry.GROUPS)
         return self._configured(group, self.config.get(group))
 
     def learned_agents(self) -> dict[str, Any]:
@@ -89,7 +90,7 @@ class _Stored:
             group,
             f"be given for {shortened(self.path.name, 60)}",
             f"the file names no registered {group}, and what a file names is never imported",
-            shortened(stored["name"], 60) if isinstance(stored, Mapping) else "none",
+            shortened(stored.get("name"), 60) if isinstance(stored, Mapping) else "none",
             f"{group} to one of your own",
         )
         return registry.configure(group, stored)
