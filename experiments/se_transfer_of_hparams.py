@@ -104,7 +104,7 @@ def compute(settings: SeTransferOfHparams) -> pd.DataFrame:
     key, at_once = jax.random.key(settings.seed), agents.groups_at_once(settings.devices)
     keys = [jax.random.key_data(jax.random.fold_in(key, i)) for i in range(settings.num_configs)]
     places = {
-        "se": (ses.env, ses.one(0), ses.fingerprint(0), {"proxy": ses.config["proxy"]}),
+        "se": (ses.env, ses[0].params, ses[0].fingerprint, {"proxy": ses.config["proxy"]}),
         "real": (task.env, task.params, "", {}),
     }
     tables = []

@@ -122,12 +122,12 @@ def _log(curve: pd.DataFrame, solved_score: float | None) -> str:
 def collect(configs: list[Any], path: Path, before: Any = None) -> None:
     """Writes the best proxy of each run into one file, after those of the set `before`."""
     sets = [*([before] if before else []), *(sejax.load_set(Path(x.run_dir)) for x in configs)]
-    places = [(each, i) for each in sets for i in range(each.size)]
+    proxies = [proxy for each in sets for proxy in each]
     sejax.save_set(
         path,
         sets[0].env,
-        [each.one(i).weights for each, i in places],
-        [each.records[i] for each, i in places],
+        [proxy.params.weights for proxy in proxies],
+        [proxy.record for proxy in proxies],
         before.config if before else build.to_plain(configs[0]),
         sets[0].discount,
     )
@@ -262,7 +262,7 @@ class MixtureRuns(RunSettings):
         (family,) = config.agents.families
         training = dataclasses.replace(config.training, test_episodes=self.test_episodes)
         seeds = {
-            f"{name}-{seed:02d}-{ses.fingerprint(i)}": seed for i, seed in enumerate(ses.seeds)
+            f"{name}-{seed:02d}-{ses[i].fingerprint}": seed for i, seed in enumerate(ses.seeds)
         }
         at_once, tables = groups_at_once(self.devices), []
         for hparams in self.tested_hparams:

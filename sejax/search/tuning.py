@@ -20,6 +20,7 @@ from sejax.cli import build, compose
 from sejax.cli.words import word
 from sejax.errors import ConfigError, require
 from sejax.ops.files import write_text
+from sejax.proxies.header import find
 from sejax.search.programs import kept, static_of, structure_of
 from sejax.search.settings import Search
 from sejax.search.trials import Follower, Progress
@@ -39,11 +40,9 @@ class Tuning:
     command = "sejax.evaluate"
 
     def __init__(self, search: Search):
-        from sejax.proxies import files
-
         self._search = search
         self._usual = compose.evaluate_config(search.fixed)
-        files.find(self._usual.proxy, "proxy")
+        find(self._usual.proxy, "proxy")
         self._compiled: dict[str, Any] = {}
 
     def config(self, words: Sequence[str], folder: Path | None = None) -> build.EvaluateConfig:
