@@ -85,9 +85,7 @@ def curious(kind, agent=None):
 
 
 def model_of(config):
-    model = ICM(
-        WIDTH, config.feature_dim, config.hidden_size, config.num_layers, config.num_residual_blocks
-    )
+    model = ICM(config, WIDTH)
     example = (np.zeros(OBS_DIM), np.zeros(WIDTH), np.zeros(OBS_DIM))
     variables = shapes_of(model.init, jax.random.key(1), *example)
     return model, random_like(variables), lambda flat: unraveled(flat, variables)

@@ -493,12 +493,6 @@ def test_log_probabilities_and_entropies_by_hand():
     np.testing.assert_allclose(entropy, [np.log(2 * np.pi) + 1], rtol=1e-6)
 
 
-def test_an_agent_has_either_discrete_or_continuous_actions():
-    for num_actions, action_dim in ((None, None), (2, 1)):
-        with pytest.raises(ValueError, match=r"either num_actions .* or action_dim .*; got num_a"):
-            make_ppo(CONFIG, OBS_DIM, num_actions, action_dim, MAX_ACTION, MAX_STEPS)
-
-
 # --- probes --------------------------------------------------------------------------------------
 
 

@@ -20,22 +20,10 @@ AgentState = Any
 Hparams = Any
 
 
-class InitFn(Protocol):
-    """The state of a fresh agent, which keeps its hyperparameters."""
-
-    def __call__(self, key: Array, hparams: Hparams, /) -> AgentState: ...
-
-
 class ActFn(Protocol):
     """The action for one observation; `explore` is a Python bool."""
 
     def __call__(self, key: Array, state: AgentState, obs: Array, /, explore: bool) -> Array: ...
-
-
-class UpdateFn(Protocol):
-    """One learning step on a batch from the agent's buffer."""
-
-    def __call__(self, key: Array, state: AgentState, batch: Any, /) -> AgentState: ...
 
 
 class Spaces(NamedTuple):
@@ -112,9 +100,9 @@ class Agent:
         optimum is known; then nothing is trained. None for agents that learn.
     """
 
-    init: InitFn
+    init: Callable[[Array, Hparams], AgentState]
     act: ActFn
-    update: UpdateFn
+    update: Callable[[Array, AgentState, Any], AgentState]
     buffer: BufferMaker
     hparams: Hparams
     spec: AgentSpec = AgentSpec()

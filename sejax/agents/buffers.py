@@ -5,7 +5,7 @@ A transition is one float32 row, so that storing is a single write and sampling 
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -75,54 +75,25 @@ class Rollout(NamedTuple):
         return self._replace(rows=self.rows.at[:, _REWARD - 1].add(bonus))  # before `ended`
 
 
-class StoreFn(Protocol):
-    """Writes the `step`-th step, and nothing if `active` is False."""
-
-    def __call__(
-        self,
-        arrays: Any,
-        step: Int[Array, ""],
-        transition: Transition,
-        ended: Array,
-        active: Array | bool,
-        /,
-    ) -> Any: ...
-
-
-class BatchFn(Protocol):
-    """The batch for `Agent.update` after `num_steps` steps, the last of which was `transition`.
-
-    Columns from `batch_size` on, if that is given, have weight 0.
-    """
-
-    def __call__(
-        self,
-        key: Array,
-        arrays: Any,
-        num_steps: Int[Array, ""],
-        transition: Transition,
-        batch_size: Array | None = None,
-        /,
-    ) -> Any: ...
-
-
 @dataclass(frozen=True, kw_only=True)
 class Buffer:
     """Pure functions over an agent's large arrays, which are updated in place.
 
     Attributes:
       init: `() -> arrays`.
-      store: `(arrays, step, transition, ended, active) -> arrays`; `ended` says whether the episode
-        ended with this step.
-      batch: `(key, arrays, num_steps, transition, batch_size) -> batch`.
+      store: `(arrays, step, transition, ended, active) -> arrays`; writes the `step`-th step, and
+        nothing if `active` is False. `ended` says whether the episode ended with it.
+      batch: `(key, arrays, num_steps, transition, batch_size) -> batch` for `Agent.update`, after
+        `num_steps` steps, the last of which was `transition`. Columns from `batch_size` on, if that
+        is not None, have weight 0.
       mask: `(batch, active) -> batch`, a batch on which the update of an agent that has finished is
         cheap. Under `vmap` that update still runs, until all agents have finished, and is thrown
         away. By default the batch stays as it is, since most updates always take as long.
     """
 
     init: Callable[[], Any]
-    store: StoreFn
-    batch: BatchFn
+    store: Callable[[Any, Array, Transition, Array, Array | bool], Any]
+    batch: Callable[[Array, Any, Array, Transition, Array | None], Any]
     mask: Callable[[Any, Array | bool], Any] = lambda batch, active: batch
 
 
@@ -137,22 +108,15 @@ def replay_buffer(batch_size: int, buffer_size: int) -> BufferMaker:
     def make(example: Transition, max_steps: int) -> Buffer:
         obs_dim, action_dim = _dims(example)
         shape = (min(buffer_size, max_steps), row_width(obs_dim, action_dim))
-
-        def store(
-            rows: Rows, step: Array, transition: Transition, ended: Array, active: Array | bool
-        ) -> Rows:
-            return write_row(rows, step, pack(transition), active)
-
-        def batch(
-            key: Array,
-            rows: Rows,
-            num_steps: Array,
-            transition: Transition,
-            in_use: Array | None = None,
-        ) -> Transition:
-            return sample(rows, words(key)[0], num_steps, batch_size, action_dim, in_use)
-
-        return Buffer(init=lambda: jnp.zeros(shape, jnp.float32), store=store, batch=batch)
+        return Buffer(
+            init=lambda: jnp.zeros(shape, jnp.float32),
+            store=lambda rows, step, transition, ended, active: write_row(
+                rows, step, pack(transition), active
+            ),
+            batch=lambda key, rows, num_steps, transition, in_use: sample(
+                rows, words(key)[0], num_steps, batch_size, action_dim, in_use
+            ),
+        )
 
     return make
 
@@ -162,26 +126,14 @@ def rollout_buffer(length: int) -> BufferMaker:
 
     def make(example: Transition, max_steps: int) -> Buffer:
         shape = (length, row_width(*_dims(example)) + 1)
-
-        def store(
-            rows: Rows, step: Array, transition: Transition, ended: Array, active: Array | bool
-        ) -> Rows:
-            row = jnp.append(pack(transition), jnp.float32(ended))
-            return write_row(rows, step, row, active)
-
-        def batch(
-            key: Array,
-            rows: Rows,
-            num_steps: Array,
-            transition: Transition,
-            in_use: Array | None = None,
-        ) -> Rollout:
-            return Rollout(rows=rows, is_full=num_steps % length == 0)
-
         return Buffer(
-            init=lambda: jnp.zeros(shape),
-            store=store,
-            batch=batch,
+            init=lambda: jnp.zeros(shape, jnp.float32),
+            store=lambda rows, step, transition, ended, active: write_row(
+                rows, step, jnp.append(pack(transition), jnp.float32(ended)), active
+            ),
+            batch=lambda key, rows, num_steps, transition, in_use: Rollout(
+                rows=rows, is_full=num_steps % length == 0
+            ),
             mask=lambda rollout, active: rollout._replace(is_full=rollout.is_full & active),
         )
 
@@ -195,7 +147,7 @@ def no_buffer() -> BufferMaker:
         return Buffer(
             init=lambda: jnp.zeros(0),
             store=lambda arrays, step, transition, ended, active: arrays,
-            batch=lambda key, arrays, num_steps, transition, in_use=None: transition,
+            batch=lambda key, arrays, num_steps, transition, in_use: transition,
         )
 
     return make

@@ -111,25 +111,24 @@ class ForwardModel(nn.Module):
     An MLP on both, residual blocks that see the action twice, and an MLP with one hidden layer.
     """
 
-    feature_dim: int
-    hidden_size: int
-    num_layers: int
-    num_residual_blocks: int
+    config: ICMConfig
 
     @nn.compact
     def __call__(
         self, features: Float[Array, "feature *batch"], action: Float[Array, "action *batch"]
     ) -> Float[Array, "feature *batch"]:
+        config = self.config
+
         def with_action(x: Array) -> Array:
             return jnp.concatenate([x, action])
 
         def mlp(num_layers: int) -> MLP:
-            return MLP(self.feature_dim, self.hidden_size, num_layers, "leaky_relu")
+            return MLP(config.feature_dim, config.hidden_size, num_layers, "leaky_relu")
 
-        x = mlp(self.num_layers)(with_action(features))
-        for _ in range(self.num_residual_blocks):
-            hidden = nn.leaky_relu(Dense(self.feature_dim)(with_action(x)))
-            x = x + Dense(self.feature_dim)(with_action(hidden))
+        x = mlp(config.num_layers)(with_action(features))
+        for _ in range(config.num_residual_blocks):
+            hidden = nn.leaky_relu(Dense(config.feature_dim)(with_action(x)))
+            x = x + Dense(config.feature_dim)(with_action(hidden))
         return mlp(1)(x)
 
 
@@ -139,11 +138,8 @@ class ICM(nn.Module):
     `action_width` is the length of an action vector, or the number of actions that are one-hot.
     """
 
+    config: ICMConfig
     action_width: int
-    feature_dim: int
-    hidden_size: int
-    num_layers: int
-    num_residual_blocks: int
 
     @nn.compact
     def __call__(
@@ -152,11 +148,12 @@ class ICM(nn.Module):
         action: Float[Array, "action *batch"],
         next_obs: Float[Array, "obs_dim *batch"],
     ) -> ICMOutputs:
-        size = (self.hidden_size, self.num_layers)
-        encode = MLP(self.feature_dim, *size, "leaky_relu", name="features")
+        config = self.config
+        size = (config.hidden_size, config.num_layers)
+        encode = MLP(config.feature_dim, *size, "leaky_relu", name="features")
         features, next_features = encode(obs), encode(next_obs)
         inverse = MLP(self.action_width, *size, "relu", name="inverse")
-        forward = ForwardModel(self.feature_dim, *size, self.num_residual_blocks, name="forward")
+        forward = ForwardModel(config, name="forward")
         return ICMOutputs(
             next_features=next_features,
             predicted_next_features=forward(features, action),
@@ -201,13 +198,7 @@ def with_icm(
     """
     action_width = num_actions or action_dim
     assert action_width is not None, "an action has a number of choices or a length"
-    model = ICM(
-        action_width,
-        config.feature_dim,
-        config.hidden_size,
-        config.num_layers,
-        config.num_residual_blocks,
-    )
+    model = ICM(config, action_width)
     example = (jnp.zeros(obs_dim), jnp.zeros(action_width), jnp.zeros(obs_dim))
     unflatten = flat.unflattener(model.init, *example)
 
@@ -353,8 +344,7 @@ class CountingHparams(NamedTuple):
     reward_scale: Array | float  # beta
 
 
-@struct.dataclass
-class CountingState:
+class CountingState(struct.PyTreeNode):
     """One counting agent: the state of the agent inside, and the learning steps on each pair."""
 
     agent_state: AgentState

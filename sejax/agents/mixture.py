@@ -67,25 +67,16 @@ class Mixture:
 
     def __post_init__(self) -> None:
         size = len(self.agents)
-        require(
-            size > 0,
-            "agents",
-            "hold an agent",
-            "proxies are scored by what agents learn on them",
-            "none",
-            "agent=ddqn",
-        )
         object.__setattr__(self, "names", self.names or tuple(str(i) for i in range(size)))
         object.__setattr__(self, "weights", self.weights or (1.0,) * size)
-        for what in (self.names, self.weights):
-            require(
-                len(what) == size,
-                "agents",
-                f"have {size} names and weights",
-                "each agent has one of both",
-                what,
-                "names=() and weights=()",
-            )
+        require(
+            size > 0 and len(self.names) == len(self.weights) == size,
+            "agents",
+            "hold an agent, and as many names and weights as agents",
+            "each agent has one of both",
+            f"{size} agents, names={self.names} and weights={self.weights}",
+            "names=() and weights=()",
+        )
         require(
             min(self.weights) >= 0 and max(self.weights) > 0,
             "agents",
@@ -112,19 +103,10 @@ class Mixture:
         are compared with each other.
 
         Raises:
-          ConfigError: if there are more agents than candidates, or than antithetic pairs.
+          ConfigError: if an agent with a weight gets no candidate.
         """
         num_places = population_size // 2 if antithetic else population_size
         shares = np.array(self.weights) / sum(self.weights)
-        num_trained = np.count_nonzero(shares)
-        require(
-            num_places >= num_trained,
-            "es.population_size",
-            f"be at least {num_trained}",
-            "each agent of the mixture needs a candidate",
-            num_places,
-            f"es.population_size={num_trained}",
-        )
         counts = np.zeros(self.size)
         dealt = []
         for place in range(num_places):
@@ -133,11 +115,11 @@ class Mixture:
             dealt.append(agent)
         require(
             counts[shares > 0].all(),
-            "agents",
-            "have weights that leave each agent a candidate",
-            f"the proxy must be scored by all of them; there are {num_places} perturbations",
-            self.weights,
-            "es.population_size larger",
+            "es.population_size",
+            "leave each agent of the mixture a candidate",
+            "the proxy must be scored by all of them",
+            f"{num_places} perturbations for weights {self.weights}",
+            f"es.population_size={2 * max(num_places, self.size)}",
         )
         return np.tile(dealt, 2 if antithetic else 1)
 

@@ -91,7 +91,7 @@ class PPOConfig(AgentOptions):
           >>> PPOConfig.paper(epochs=20).advantages
           'monte_carlo'
         """
-        paper = {
+        paper: dict[str, Any] = {
             "advantages": "monte_carlo",
             "normalize_rewards": False,
             "rollout_steps": None,
@@ -109,9 +109,9 @@ class PPOConfig(AgentOptions):
 
     def make(self, task: Any) -> Agent:
         """The agent for a task's observations and actions."""
-        action_dim = task.action_dim if task.num_actions is None else None
+        num_actions, action_dim = task.num_actions, task.action_dim
         return make_ppo(
-            self, task.obs_dim, task.num_actions, action_dim, task.max_action, task.max_steps
+            self, task.obs_dim, num_actions, action_dim, task.max_action, task.max_steps
         )
 
     def rollout_length(self, task_max_steps: int) -> int:
@@ -170,13 +170,12 @@ def make_ppo(
       config: hyperparameters.
       obs_dim: length of an observation.
       num_actions: for actions `0..num_actions-1`; None if they are vectors.
-      action_dim: length of an action; None if it is an index.
+      action_dim: length of an action; not used if it is an index.
       max_action: continuous actions reach the world clipped to [-max_action, max_action], and are
         remembered as drawn.
       max_steps: the task's step limit for an episode, in steps of the world.
 
     Raises:
-      ValueError: unless exactly one of `num_actions` and `action_dim` is given.
       ConfigError: if a rollout has fewer than two steps for each minibatch.
 
     Example:
@@ -186,12 +185,8 @@ def make_ppo(
       >>> int(agent.act(jax.random.key(1), state, jnp.zeros(4), explore=True)) in (0, 1)
       True
     """
-    if (num_actions is None) == (action_dim is None):
-        raise ValueError(
-            "make_ppo needs either num_actions (discrete) or action_dim (continuous); got "
-            f"num_actions={num_actions} and action_dim={action_dim}. Set the other one to None."
-        )
-    policy = SOFTMAX if action_dim is None else gaussian(max_action)
+    is_discrete = num_actions is not None
+    policy = SOFTMAX if is_discrete else gaussian(max_action)
     networks = make_networks(config, obs_dim, policy, num_actions, action_dim)
     length = config.rollout_length(max_steps)
     require(
@@ -203,7 +198,7 @@ def make_ppo(
         f"agent.num_minibatches={max(1, length // 2)}",
     )
     optimizer = config.optimizer()
-    learn = make_learning_phase(config, networks, optimizer, obs_dim, action_dim is None)
+    learn = make_learning_phase(config, networks, optimizer, obs_dim, is_discrete)
 
     def init(key: Array, hparams: Any) -> PPOState:
         params = networks.init(key, hparams.hidden_size)
@@ -276,7 +271,7 @@ def make_networks(
     action_dim: int | None,
 ) -> Networks:
     """An actor `s -> outputs` and a critic `s -> V` of the same hidden layers, and the std."""
-    std_dim = action_dim or 0  # a softmax has no std
+    std_dim = 0 if num_actions else action_dim or 0  # a softmax has no std
     shape = (config.hidden_size, config.num_layers, config.activation)
     mlps = {
         "actor": MLP(num_actions or std_dim, *shape, learn_prelu_slope=True),

@@ -12,10 +12,7 @@ from sejax.envs.base import Task
 from sejax.envs.spec import Box, Discrete, TaskSpec
 
 _NONE = 3.4028234663852886e38  # how CartPole writes that a number has no bound
-_CARTPOLE = {
-    "observation": Box.symmetric(4.8, _NONE, math.radians(24), _NONE),
-    "action": Discrete(2),
-}
+_CARTPOLE = Box.symmetric(4.8, _NONE, math.radians(24), _NONE)
 _CAR = Box(low=(-1.2, -0.07), high=(0.6, 0.07))  # position and velocity
 
 
@@ -45,7 +42,7 @@ class CartPole(ClassicTask):
 
     name = "cartpole"
     dynamics = "CartPoleEnv"
-    spec = TaskSpec(**_CARTPOLE, max_steps=200, solved_reward=195.0)
+    spec = TaskSpec(observation=_CARTPOLE, action=Discrete(2), max_steps=200, solved_reward=195.0)
 
 
 class CartPoleV1(ClassicTask):
@@ -53,7 +50,7 @@ class CartPoleV1(ClassicTask):
 
     name = "cartpole_v1"
     dynamics = "CartPoleEnv"
-    spec = TaskSpec(**_CARTPOLE, max_steps=500, solved_reward=475.0)
+    spec = TaskSpec(observation=_CARTPOLE, action=Discrete(2), max_steps=500, solved_reward=475.0)
 
 
 class Acrobot(ClassicTask):

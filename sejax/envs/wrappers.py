@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from sejax.envs.environment import Environment, space_of_gymnax
+from sejax.envs.environment import Environment, space_of_gymnax, spaces_of
 from sejax.envs.spec import Box, Discrete, Space
 from sejax.errors import ConfigError
 
@@ -120,7 +120,7 @@ class AsVectors(Wrapper):
     def step_env(self, key: Any, state: Any, action: Any, params: Any) -> tuple[Any, ...]:
         if isinstance(self._raw_action, Box):
             low, high = (
-                np.reshape(np.float32(x), self._action_shape)
+                np.reshape(np.asarray(x, np.float32), self._action_shape)
                 for x in (self._raw_action.low, self._raw_action.high)
             )
             action = low + (jnp.reshape(action, self._action_shape) + 1) / 2 * (high - low)
@@ -157,7 +157,7 @@ def as_vectors(env: Any, params: Any, name: str) -> tuple[Any, Space, Space]:
     if plain_obs and (isinstance(action, Discrete) or _is_symmetric(action, raw[1].shape)):
         return env, observation, action
     vectors = AsVectors(env, (observation, action), raw[1].shape)
-    return vectors, *vectors.spaces
+    return vectors, *spaces_of(vectors)
 
 
 def _require_bounds(box: Box, space: Any, name: str) -> None:

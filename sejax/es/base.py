@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar
 
 import jax.numpy as jnp
 import numpy as np
@@ -85,28 +85,6 @@ class Evaluations:
         return repaired, finite_mean(repaired)
 
 
-class AskFn(Protocol):
-    """Draws a population `[pop, dims]`."""
-
-    def __call__(
-        self, key: Array, state: StrategyState, /
-    ) -> tuple[Float[Array, "pop dims"], StrategyState]: ...
-
-
-class TellFn(Protocol):
-    """The next state; scores that are not finite rank worst."""
-
-    def __call__(
-        self,
-        key: Array,
-        population: Float[Array, "pop dims"],
-        scores: Float[Array, " pop"],
-        incumbent_score: Float[Array, ""],
-        state: StrategyState,
-        /,
-    ) -> StrategyState: ...
-
-
 @dataclass(frozen=True, kw_only=True)
 class Strategy:
     """An outer optimiser over flat parameter vectors `[dims]`; pure functions.
@@ -115,7 +93,7 @@ class Strategy:
       init: `(key, mean [dims]) -> state`.
       ask: `(key, state) -> (population [pop, dims], state)`.
       tell: `(key, population, scores [pop], incumbent_score [], state) -> state`; higher scores are
-        better.
+        better, and those that are not finite rank worst.
       incumbent: `(state) -> [dims]`, the proxy at the centre of the population.
       population_size: vectors that `ask` returns.
       antithetic: whether the second half of the population is the first mirrored at the incumbent.
@@ -125,8 +103,8 @@ class Strategy:
     """
 
     init: Callable[[Array, Float[Array, " dims"]], StrategyState]
-    ask: AskFn
-    tell: TellFn
+    ask: Callable[[Array, StrategyState], tuple[Float[Array, "pop dims"], StrategyState]]
+    tell: Callable[[Array, Array, Array, Array, StrategyState], StrategyState]
     incumbent: Callable[[StrategyState], Float[Array, " dims"]]
     population_size: int
     antithetic: bool = False

@@ -3,12 +3,17 @@
 Source: Gymnasium 1.3, `gymnasium.envs.mujoco`, of each the version 5.
 """
 
+from typing import TYPE_CHECKING
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from sejax.envs.mujoco.environment import MujocoEnv, Rewards, control_cost, plane
 from sejax.envs.mujoco.physics import Report
+
+if TYPE_CHECKING:
+    from sejax.envs.mujoco.tasks import MujocoTask
 
 
 class HalfCheetahEnv(MujocoEnv):
@@ -220,7 +225,7 @@ class ReacherEnv(MujocoEnv):
     file = "reacher.xml"
     frame_skip = 2
 
-    def __init__(self, config: object):
+    def __init__(self, config: "MujocoTask"):
         super().__init__(config)
         self._tip, self._target = (self.physics.model.body(x).id for x in ("fingertip", "target"))
 
