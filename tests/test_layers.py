@@ -14,7 +14,6 @@ ROOT = Path(__file__).parents[1] / "sejax"
 LAYERS = [
     {"search"},
     {"run", "evaluate", "report", "experiments"},
-    {"machines"},
     {"cli"},
     {"bilevel"},
     {"evaluation"},
@@ -28,7 +27,7 @@ LAYERS = [
     {"errors"},
     {"", "conf"},
 ]
-COMMANDS = ("cli", "run", "evaluate", "report", "search", "machines", "experiments")
+COMMANDS = ("cli", "run", "evaluate", "report", "search", "experiments")
 
 
 def name_of(path):
