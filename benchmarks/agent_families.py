@@ -232,7 +232,7 @@ def sejax_side(args: argparse.Namespace) -> None:
 
         def train_all(keys: jax.Array, params: Any) -> Any:
             one = functools.partial(train, env_params=params)
-            return spread_over_devices(one, cpu_num_parallel=agent.cpu_num_parallel)(keys)
+            return spread_over_devices(one, cpu_num_parallel=agent.spec.cpu_num_parallel)(keys)
 
         params = env.params(weights)
         programs[family] = jax.jit(train_all).lower(keys(0), params).compile(), params

@@ -229,7 +229,7 @@ class Batch(NamedTuple):
 
 
 def batch_from_sejax(transition: Any) -> Batch:
-    """A batch from a feature-major `sejax.agents.replay.Transition`, to compare updates with."""
+    """A batch from a feature-major `sejax.agents.buffers.Transition`, to compare updates with."""
 
     def rows(name: str) -> Tensor:
         array = np.asarray(getattr(transition, name), np.float32)

@@ -73,17 +73,17 @@ def serve(args: argparse.Namespace) -> None:
         return lambda key, hparams: train(key, params, hparams).train_steps
 
     def train_varied(key: Any, drawn: Any) -> Any:
-        runs = [make_run(agent) for agent in varied.variants]
+        runs = [make_run(agent) for agent in varied.varied.agents]
         return jax.lax.switch(drawn.variant, runs, key, drawn.hparams)
 
     key = jax.random.key(args.seed)
     started = time.time()
-    program = jax.jit(train_varied).lower(key, varied.draw(key)).compile()
+    program = jax.jit(train_varied).lower(key, varied.varied.draw(key)).compile()
     compile_s = time.time() - started
 
     def handle(request: dict[str, Any]) -> dict[str, Any]:
         key = jax.random.fold_in(jax.random.key(args.seed), request["number"])
-        drawn = varied.draw(key)
+        drawn = varied.varied.draw(key)
         plain = {name: float(x) for name, x in drawn.values.items()}
         sizes = {name: round(x) for name, x in plain.items() if name != "learning_rate"}
         changes: dict[str, Any] = {**sizes, "learning_rate": plain["learning_rate"]}

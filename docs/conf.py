@@ -4,12 +4,14 @@ The source directory is the repository: README, changelog and the tables in `res
 they stand, and a link that leads somewhere in the repository leads there on the site too.
 """
 
+import os
 import sys
 import typing
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 sys.path[:0] = [str(ROOT), str(ROOT / "docs" / "_ext")]
+os.environ["PYTHONPATH"] = str(ROOT)  # notebooks import experiments/, which is not installed
 
 typing.GENERATING_DOCUMENTATION = "sejax"  # type: ignore[attr-defined] # jaxtyping then names `Array` plainly
 

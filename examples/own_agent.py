@@ -30,7 +30,7 @@ from flax import struct
 from jax import Array
 
 import sejax
-from sejax.agents import AgentOptions, Transition, replay_memory, traced
+from sejax.agents import AgentOptions, Transition, replay_buffer, traced
 from sejax.options import counts, fraction, option, positive
 
 MIN_LOG_STD, MAX_LOG_STD = -20.0, 2.0
@@ -81,8 +81,8 @@ class SAC(AgentOptions):
 
         return sejax.Agent(
             init=init, begin_episode=begin_episode, act=act, update=update, hparams=traced(self),
-            memory=replay_memory(self.batch_size, self.buffer_size),
-            warmup_episodes=self.warmup_episodes, learns_from=self.warmup_episodes,
+            buffer=replay_buffer(self.batch_size, self.buffer_size), spec=self.spec(),
+            discount=lambda hparams: hparams.discount,
             env_action=lambda action: task.max_action * action,  # remembered in [-1, 1]
         )  # fmt: skip
 

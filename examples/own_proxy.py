@@ -14,7 +14,7 @@ A proxy is a gymnax environment whose params hold the weights that are learned.
 import argparse
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -23,14 +23,12 @@ from gymnax.environments import environment
 from jax import Array
 
 import sejax
-from sejax.options import Options, option, positive
+from sejax.options import option, positive
 
 
 @dataclass(frozen=True, kw_only=True)
-class LinearSE(Options):
+class LinearSE(sejax.ProxyConfig):
     """A linear world for any task whose observations are vectors."""
-
-    group: ClassVar[str] = "proxy"
 
     init_std: float = option(0.3, positive("it must have weights"))
 

@@ -57,7 +57,8 @@ def main() -> None:
     number = np.repeat(np.arange(proxies.size), args.agents)  # of each agent's proxy
     keys = jax.random.split(jax.random.key(1), number.size)
     weights = jax.tree.map(lambda x: x[number], proxies.weights)
-    program = sejax.spread_over_devices(train_and_test, cpu_num_parallel=agent.cpu_num_parallel)
+    num_parallel = agent.spec.cpu_num_parallel
+    program = sejax.spread_over_devices(train_and_test, cpu_num_parallel=num_parallel)
     outcome = jax.jit(program)(keys, weights)
     returns = np.asarray(outcome.test_return).reshape(proxies.size, args.agents)
     for record, mine in zip(proxies.records, returns, strict=True):

@@ -19,7 +19,7 @@ _EXPORTS = {
     "AUCSum": "sejax.objectives",
     "Agent": "sejax.agents.base",
     "ConfigError": "sejax.errors",
-    "CountBasedConfig": "sejax.agents.count_based",
+    "CountBasedConfig": "sejax.agents.exploration",
     "DDQNConfig": "sejax.agents.dqn",
     "DQNConfig": "sejax.agents.dqn",
     "DiscreteTD3Config": "sejax.agents.td3",
@@ -27,7 +27,7 @@ _EXPORTS = {
     "EvosaxConfig": "sejax.es.evosax",
     "Families": "sejax.agents.mixture",
     "FamiliesConfig": "sejax.agents.mixture",
-    "ICMConfig": "sejax.agents.icm",
+    "ICMConfig": "sejax.agents.exploration",
     "LearnResult": "sejax.bilevel",
     "MaxReward": "sejax.objectives",
     "NESConfig": "sejax.es.nes",
@@ -36,6 +36,7 @@ _EXPORTS = {
     "PPOConfig": "sejax.agents.ppo",
     "PretrainedProxy": "sejax.proxies.zoo",
     "Proxy": "sejax.proxies.files",
+    "ProxyConfig": "sejax.proxies",
     "ProxyEnv": "sejax.proxies.base",
     "ProxyParams": "sejax.proxies.base",
     "ProxySet": "sejax.proxies.files",
@@ -74,9 +75,8 @@ if TYPE_CHECKING:  # what a type checker and an editor see
     from sejax import agents, envs, es, gym, options, proxies
     from sejax.agents import make_agent
     from sejax.agents.base import Agent
-    from sejax.agents.count_based import CountBasedConfig
     from sejax.agents.dqn import DDQNConfig, DQNConfig, DuelingDDQNConfig
-    from sejax.agents.icm import ICMConfig
+    from sejax.agents.exploration import CountBasedConfig, ICMConfig
     from sejax.agents.mixture import Families, FamiliesConfig
     from sejax.agents.ppo import PPOConfig
     from sejax.agents.sac import SACConfig
@@ -93,6 +93,7 @@ if TYPE_CHECKING:  # what a type checker and an editor see
     from sejax.evaluation import evaluate_agents, make_evaluator
     from sejax.objectives import AUC, AUCSum, MaxReward, Objective, Outcome, RewardThreshold
     from sejax.ops.parallel import spread_over_devices
+    from sejax.proxies import ProxyConfig
     from sejax.proxies.base import ProxyEnv, ProxyParams
     from sejax.proxies.configs import RewardConfig, SyntheticConfig
     from sejax.proxies.files import (
@@ -131,6 +132,7 @@ __all__ = [
     "PPOConfig",
     "PretrainedProxy",
     "Proxy",
+    "ProxyConfig",
     "ProxyEnv",
     "ProxyParams",
     "ProxySet",

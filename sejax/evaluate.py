@@ -165,19 +165,18 @@ def proxy_study(config: EvaluateConfig) -> Study:
             agents.require_fit(family.agent, exploration, task.facts, task.name)
             group, training = _training_on(proxy, config, family.agent)
             build.require_real_returns(group, training)
-            trains = not getattr(family.agent, "is_solved_for", False)
-            if trains and proxy.env.world.max_steps is not None:
-                require_reachable(group, training, proxy.env.world.max_steps)
-            if getattr(proxy.env.config, "lasts_to_the_limit", False):
+            if not family.agent.is_solved_for:
+                require_reachable(group, training, proxy.env.max_steps)
+            if proxy.env.config.reaches_step_limit:
                 build.require_learning(
-                    group, training, family.agent, proxy.env.world.max_steps, task.max_steps
+                    group, training, family.agent, proxy.env.max_steps, task.max_steps
                 )
         trainings[family.key] = training
     worlds = {"the proxy": (proxy.env, proxy.params, trainings)}
     if config.baseline:
         for family in families:
             require(
-                not getattr(family.agent, "is_solved_for", False),
+                not family.agent.is_solved_for,
                 "baseline",
                 f"be false with {family.field}={family.key}",
                 "only a one-step SE can be solved for",

@@ -27,7 +27,7 @@ from sejax.ops.parallel import (
     spread_groups_over_devices,
     spread_over_devices,
 )
-from sejax.proxies.base import ProxyEnv, world_of
+from sejax.proxies.base import ProxyEnv, is_real
 from sejax.training import TrainingConfig, TrainResult, make_trainer
 
 # --- greedy episodes ------------------------------------------------------------------------------
@@ -76,7 +76,7 @@ class _Greedy:
 
     def __init__(self, agent: Agent, task: Task):
         self.agent, self.params = agent, task.params
-        self.env = repeat_actions(task.env, agent.action_repeat)
+        self.env = repeat_actions(task.env, agent.spec.action_repeat)
 
     def begin(self, key: Array, active: Array | bool) -> _Episode:
         obs, env_state = self.env.reset_env(key, self.params)
@@ -175,7 +175,7 @@ def make_recorder(agent: Agent, task: Task, num_episodes: int) -> Callable[[Arra
             return after.replace(active=state.active & after.active), made
 
         start = greedy.begin(key_reset, True)
-        return jax.lax.scan(step, start, length=-(-task.max_steps // agent.action_repeat))[1]
+        return jax.lax.scan(step, start, length=-(-task.max_steps // agent.spec.action_repeat))[1]
 
     def record(key: Array, agent_state: Any) -> Steps:
         keys = jax.random.split(key, num_episodes)
@@ -265,7 +265,7 @@ def make_evaluator(
                 train_episodes=result.episodes,
                 auc=area_under_curve(result, tests.returns.mean()),
                 nonfinite=result.nonfinite | ~jnp.isfinite(tests.returns).all(),
-                real_steps=real_steps + result.train_steps if world_of(env).is_real else real_steps,
+                real_steps=real_steps + result.train_steps if is_real(env) else real_steps,
             )
             return (outcome, recorder(key_test, result.agent_state)) if recorder else outcome
 
@@ -332,9 +332,8 @@ def area_under_curve(result: TrainResult, final_return: Array) -> Array:
 
 def num_parallel_on_cpu(agent: Agent, training: TrainingConfig) -> int | None:
     """Agents in a vmapped batch on a CPU core; 1 where all would wait for the longest training."""
-    if agent.cpu_num_parallel is None or training.is_fixed_length:
-        return agent.cpu_num_parallel
-    return 1
+    num_parallel = agent.spec.cpu_num_parallel
+    return num_parallel if num_parallel is None or training.is_fixed_length else 1
 
 
 def evaluate_agents(

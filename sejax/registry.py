@@ -18,9 +18,11 @@ group         entry points            `make(...)` gives
 ============= ======================= ==============================================
 
 A name is one that comes with sejax, one that an installed package offers as an entry point, or
-`module:attribute`, which imports the module.
+`module:attribute`, which imports the module. Within `only_typed`, as in every command, that is done
+only for a `module:attribute` that the user has typed: one that a file holds is refused.
 """
 
+import contextlib
 import copy
 import dataclasses
 import functools
@@ -28,7 +30,11 @@ import importlib
 import importlib.metadata
 import importlib.util
 import inspect
-from collections.abc import Callable, Mapping
+import re
+import types
+import typing
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextvars import ContextVar
 from dataclasses import dataclass
 from typing import Any, Optional
 
@@ -45,12 +51,14 @@ class Group:
       arguments: what `make` is given, for messages and for functions in a dataclass's place.
       built_in: name to `module:attribute`.
       families: beginning of a name to `module:attribute` of a dataclass with a field `name`.
+      base: `module:attribute` of the class that each plugin's dataclass is a subclass of.
     """
 
     entry_points: str
     arguments: tuple[str, ...]
     built_in: dict[str, str]
     families: dict[str, str] = dataclasses.field(default_factory=dict)
+    base: str = "builtins:object"
 
 
 _EVOSAX = (
@@ -118,15 +126,17 @@ GROUPS = {
             "sarsa": "sejax.agents.tabular:SARSAConfig",
             "boltzmann": "sejax.agents.boltzmann:BoltzmannConfig",
         },
+        base="sejax.agents.base:AgentConfig",
     ),
     "exploration": Group(
         "sejax.explorations",
         ("agent", "task"),
         {
             "none": "sejax.agents.base:NoExploration",
-            "icm": "sejax.agents.icm:ICMConfig",
-            "count_based": "sejax.agents.count_based:CountBasedConfig",
+            "icm": "sejax.agents.exploration:ICMConfig",
+            "count_based": "sejax.agents.exploration:CountBasedConfig",
         },
+        base="sejax.agents.base:ExplorationConfig",
     ),
     "proxy": Group(
         "sejax.proxies",
@@ -135,6 +145,7 @@ GROUPS = {
             "se": "sejax.proxies.configs:SyntheticConfig",
             "rn": "sejax.proxies.configs:RewardConfig",
         },
+        base="sejax.proxies:ProxyConfig",
     ),
     "objective": Group(
         "sejax.objectives",
@@ -175,6 +186,56 @@ GROUPS = {
 }
 
 
+# What plugins of a group make.
+KINDS = {
+    "env": "sejax.envs.base:Task",
+    "agent": "sejax.agents.base:Agent",
+    "exploration": "sejax.agents.base:Agent",
+    "proxy": "sejax.proxies.base:ProxyEnv",
+    "objective": "sejax.objectives:Objective",
+    "es": "sejax.es.base:Strategy",
+    "tracker": "sejax.cli.trackers:Tracker",
+    "machines": "contextlib:AbstractContextManager",
+}
+
+# What may be imported by its name; None outside of commands, where Python code says it itself.
+_TYPED: ContextVar[frozenset[str] | None] = ContextVar("typed", default=None)
+_PATH = re.compile(r"(?<![^=\[,+(\s'\"])[\w.]+:[\w.]+(?![^\],+)\s'\"])")
+
+
+@contextlib.contextmanager
+def only_typed(words: Iterable[str]) -> Iterator[None]:
+    """Within it, `module:attribute` is imported only if one of these words has it.
+
+    For commands and all that reads files of unknown origin. The outermost one decides: what reads a
+    file on behalf of a command allows nothing more.
+    """
+    if _TYPED.get() is not None:
+        yield
+        return
+    before = _TYPED.set(frozenset(paths_in(words)))
+    try:
+        yield
+    finally:
+        _TYPED.reset(before)
+
+
+def paths_in(words: Iterable[str]) -> list[str]:
+    """Each `module:attribute` in words.
+
+    Example:
+      >>> paths_in(["env=mine:Room", "agents=[ddqn,mine:A]", "proxy=hf://me/se", "storage=x://a:b@c"])
+      ['mine:Room', 'mine:A']
+    """
+    return [path for word in words for path in _PATH.findall(word)]
+
+
+def untyped(words: Iterable[str]) -> list[str]:
+    """Each `module:attribute` in words that is not imported here, as the user has not typed it."""
+    typed = _TYPED.get()
+    return [] if typed is None else [path for path in paths_in(words) if path not in typed]
+
+
 def names(group: str) -> list[str]:
     """The registered names: those that come with sejax, then those of installed packages."""
     return [*GROUPS[group].built_in, *_offered(group)]
@@ -190,11 +251,11 @@ def find(group: str, name: str) -> Any:
 
     Args:
       group: one of `GROUPS`.
-      name: see the module. `module:attribute` is imported.
+      name: see the module. `module:attribute` is imported, if `only_typed` does not forbid it.
 
     Raises:
-      ConfigError: for an unknown name, a module that cannot be imported, or an attribute that is
-        no plugin.
+      ConfigError: for an unknown name, a module that cannot be imported or that the user has not
+        typed, or an attribute that is no plugin.
     """
     kind = GROUPS[group]
     if not isinstance(name, str):
@@ -215,7 +276,9 @@ def find(group: str, name: str) -> Any:
     if family is not None:
         return _attribute(family)
     if ":" in name:
-        return _as_dataclass(group, name, _import(group, name))
+        found = _import(group, name)
+        _require_maker(group, name, found)
+        return _as_dataclass(group, name, found)
     raise unknown_name(group, name, names(group))
 
 
@@ -357,15 +420,7 @@ def _make(group: str, key: Same, *arguments: Any) -> Any:
 
 def _checked(group: str, config: Any, made: Any) -> Any:
     """What was made, if it is of the group's kind."""
-    wanted = {
-        "env": "sejax.envs.base:Task",
-        "agent": "sejax.agents.base:Agent",
-        "exploration": "sejax.agents.base:Agent",
-        "proxy": "sejax.proxies.base:ProxyEnv",
-        "objective": "sejax.objectives:Objective",
-        "es": "sejax.es.base:Strategy",
-    }[group]
-    kind = _attribute(wanted)
+    kind = _attribute(KINDS[group])
     require(
         isinstance(made, kind),
         group,
@@ -413,6 +468,15 @@ def _import(group: str, path: str) -> Any:
         path,
         f"{group}=my_module:MyClass",
     )
+    typed = _TYPED.get()
+    require(
+        typed is None or path in typed,
+        group,
+        "be typed on the command line if it is of a module of your own",
+        "what a file names is never imported",
+        path,
+        f"{group}={path}, if you trust that module",
+    )
     try:
         found: Any = importlib.import_module(module)
     except Exception as error:
@@ -439,6 +503,45 @@ def _import(group: str, path: str) -> Any:
     return found
 
 
+def _require_maker(group: str, name: str, found: Any) -> None:
+    """Checks that a function says that it makes what the group is of; nothing is called.
+
+    Any function of any module could else be called by a command's word.
+
+    Raises:
+      ConfigError: if its return annotation does not say so.
+    """
+    if not (inspect.isfunction(found) or isinstance(found, functools.partial)):
+        return  # a class says so by being a dataclass with `make`
+    function: Any = getattr(found, "func", found)  # of a partial, what it is one of
+    try:
+        says = typing.get_type_hints(function).get("return")
+    except Exception:  # a name that only type checkers import
+        says = getattr(function, "__annotations__", {}).get("return")
+    kind = _attribute(KINDS[group])
+    said = [typing.get_origin(x) or x for x in (*_of_union(says), says)]
+    makes = any(
+        issubclass(x, kind)
+        if isinstance(x, type)
+        else isinstance(x, str) and re.search(rf"\b{kind.__name__}\b", x)
+        for x in said
+    )
+    require(
+        makes,
+        group,
+        f"be a function that says what it makes, -> {kind.__name__}",
+        "not any function is called",
+        f"{name} -> {says}" if says else f"{name} without",
+        f"{group} to a dataclass with make, or annotate the function",
+    )
+
+
+def _of_union(hint: Any) -> tuple[Any, ...]:
+    """The parts of `X | None`; empty for what is no union."""
+    is_union = typing.get_origin(hint) in (typing.Union, types.UnionType)
+    return typing.get_args(hint) if is_union else ()
+
+
 def _as_dataclass(group: str, name: str, found: Any) -> Any:
     """The dataclass that a plugin is, or that a function stands for."""
     arguments = GROUPS[group].arguments
@@ -452,6 +555,15 @@ def _as_dataclass(group: str, name: str, found: Any) -> Any:
             f"takes ({', '.join((*arguments, 'option=default, ...'))}), because its fields are the "
             f'options; {name} is {shortened(found)}. See the README, "Adding to it".'
         )
+    base = _attribute(GROUPS[group].base)
+    require(
+        issubclass(cls, base),
+        group,
+        f"be a subclass of {base.__module__}.{base.__name__}",
+        "that says what it fits",
+        name,
+        f"class {cls.__name__}({base.__name__})",
+    )
     if f"{cls.__module__}:{cls.__qualname__}" != name:
         _NAMES[cls] = name
     return cls
@@ -487,6 +599,7 @@ def _from_function(group: str, name: str, function: Callable[..., Any]) -> type:
     cls = dataclasses.make_dataclass(
         written.__name__,
         fields,
+        bases=(_attribute(GROUPS[group].base),),
         namespace={"make": make, "__doc__": written.__doc__},
         frozen=True,
         kw_only=True,

@@ -8,6 +8,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from sejax import registry
 from sejax.cli import commands
 from sejax.errors import require
 
@@ -70,7 +71,8 @@ def report(folders: Sequence[Path], out: Path | None = None) -> Path:
         f"the folder {out}",
         f"out={out / 'report.html'}",
     )
-    write_text(out, pages.page(pages.read(folders)))
+    with registry.only_typed(()):  # nothing that a run directory names is imported
+        write_text(out, pages.page(pages.read(folders)))
     return out
 
 

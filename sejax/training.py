@@ -14,16 +14,15 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Float, Int
 
-from sejax.agents.base import Agent
-from sejax.agents.memory import Memory, MemoryMaker
-from sejax.agents.replay import Transition
+from sejax.agents.base import Agent, AgentConfig, Spaces
+from sejax.agents.buffers import Buffer, BufferMaker, Transition
 from sejax.envs.base import require_own_steps
 from sejax.envs.wrappers import repeat_actions
 from sejax.errors import LARGEST, require
 from sejax.ops.keys import step_keys
 from sejax.ops.loops import while_any_active
 from sejax.options import Options, counts, not_negative, one_of, option
-from sejax.proxies.base import prepare, world_of
+from sejax.proxies.base import episode_limit, is_real, prepare
 
 STOP_RULES = ("plateau", "solved", "never")
 SOLVED_BY = ("test", "train")
@@ -72,8 +71,8 @@ class TrainingConfig(Options):
 
 def budget_for(
     training: TrainingConfig,
-    agent: Any,
-    learned_with: Iterable[Any],
+    agent: AgentConfig,
+    learned_with: Iterable[AgentConfig],
     max_episode_steps: int,
     task_max_steps: int,
 ) -> TrainingConfig:
@@ -96,7 +95,7 @@ def budget_for(
     if training.is_fixed_length:  # as long as the episodes allowed, in files of older versions
         max_steps = min(max_steps, training.max_episodes * max_episode_steps)
     waits, *waited = (
-        steps_before_learning(each, max_episode_steps, task_max_steps)
+        each.steps_before_learning(max_episode_steps, task_max_steps)
         for each in (agent, *learned_with)
     )
     longer = max(0, waits - max(waited, default=0))
@@ -129,12 +128,6 @@ def require_reachable(name: str, training: TrainingConfig, max_episode_steps: in
         training.max_episodes,
         f"{name}.max_episodes={episodes}",
     )
-
-
-def steps_before_learning(agent: Any, max_episode_steps: int, task_max_steps: int) -> int:
-    """Training steps before an agent first learns, as its configuration says; 0 if it does not."""
-    steps = getattr(agent, "steps_before_learning", None)
-    return 0 if steps is None else steps(max_episode_steps, task_max_steps)
 
 
 @struct.dataclass
@@ -219,7 +212,7 @@ def make_trainer(
     training: TrainingConfig = TrainingConfig(),
     solved_reward: float = jnp.inf,
     test_fn: TestFn | None = None,
-    recorder: MemoryMaker | None = None,
+    recorder: BufferMaker | None = None,
 ) -> Callable[..., TrainResult]:
     """Builds `train(key, env_params, hparams, active=True) -> TrainResult` for one agent.
 
@@ -240,7 +233,7 @@ def make_trainer(
       solved_reward: for `stop_rule="solved"`.
       test_fn: plays tests on the real task; called after each training episode if
         `training.num_tests_between` is not 0.
-      recorder: keeps steps for whoever looks at the training, as an agent's `memory` does for the
+      recorder: keeps steps for whoever looks at the training, as an agent's `buffer` does for the
         agent; what it kept is `TrainResult.recorded`.
 
     Raises:
@@ -276,7 +269,7 @@ def make_trainer(
         env_params = loop.prepare(env_params, hparams)
         key_begin, key_steps = jax.random.split(key)
         state = loop.begin(key_begin, env_params, hparams, active)
-        remembered = tuple(memory.init() for memory in loop.memories(state))
+        remembered = tuple(buffer.init() for buffer in loop.buffers(state))
         (remembered, curve), state = while_any_active(
             loop.step, (remembered, loop.empty_curve()), state, (key_steps, env_params)
         )
@@ -298,7 +291,7 @@ def make_trainer(
 def _require_parts(agent: Any, env: Any, training: Any) -> None:
     """Checks that the arguments are what they are called, in their order."""
     require(
-        hasattr(agent, "learns_from"),
+        isinstance(agent, Agent),
         "agent",
         "be a sejax.Agent",
         "it acts and learns",
@@ -314,6 +307,15 @@ def _require_parts(agent: Any, env: Any, training: Any) -> None:
         "env to the first of the pair that sejax.load returns, or to task.env",
     )
     require_own_steps(env)
+    spaces = None if agent.spec.spaces is None else Spaces.of_env(env)
+    require(
+        agent.spec.spaces == spaces,
+        "agent",
+        f"be made for the environment's {spaces}",
+        "it acts on what it was made for",
+        agent.spec.spaces,
+        "agent=sejax.make_agent(config, task) with that task",
+    )
     require(
         isinstance(training, TrainingConfig),
         "training",
@@ -333,7 +335,7 @@ def _require_parts(agent: Any, env: Any, training: Any) -> None:
 
 
 def _make_solver(
-    agent: Agent, env: Any, training: TrainingConfig, recorder: MemoryMaker | None
+    agent: Agent, env: Any, training: TrainingConfig, recorder: BufferMaker | None
 ) -> Callable[..., TrainResult]:
     """The `train` of an agent that knows its world's optimum: no steps, and an empty curve."""
     require(
@@ -376,19 +378,19 @@ class _Loop:
         training: TrainingConfig,
         solved_reward: float,
         test_fn: TestFn | None,
-        recorder: MemoryMaker | None,
+        recorder: BufferMaker | None,
     ):
-        world = world_of(env)
-        limit_is_terminal = training.time_limit_is_terminal and world.is_real
+        episode_steps = episode_limit(env)
+        limit_is_terminal = training.time_limit_is_terminal and is_real(env)
         self.agent, self.training, self.solved_reward = agent, training, solved_reward
         self.limit_is_terminal = limit_is_terminal
         self.test_fn = test_fn if training.num_tests_between else None
-        self.env = repeat_actions(env, agent.action_repeat)
-        self.max_steps = self.memory_steps = training.max_steps or LARGEST
-        if world.max_steps is not None:
-            require_reachable("training", training, world.max_steps)
-            self.memory_steps = min(self.max_steps, training.max_episodes * world.max_steps)
-        self.memory_makers = (agent.memory, *([] if recorder is None else [recorder]))
+        self.env = repeat_actions(env, agent.spec.action_repeat)
+        self.max_steps = self.buffer_steps = training.max_steps or LARGEST
+        if episode_steps is not None:
+            require_reachable("training", training, episode_steps)
+            self.buffer_steps = min(self.max_steps, training.max_episodes * episode_steps)
+        self.buffer_makers = (agent.buffer, *([] if recorder is None else [recorder]))
         self.prepare = lambda params, hparams: prepare(
             env, params, agent.discount(hparams), limit_is_terminal
         )
@@ -420,7 +422,7 @@ class _Loop:
             test_returns=None if self.test_fn is None else no_returns,
         )
 
-    def memories(self, state: _LoopState) -> list[Memory]:
+    def buffers(self, state: _LoopState) -> list[Buffer]:
         """What the agent keeps of its steps, and what the recorder does."""
 
         def example() -> Transition:
@@ -429,14 +431,14 @@ class _Loop:
             return Transition(state.obs, action, jnp.float32(0), jnp.float32(0), state.obs)
 
         shapes = jax.eval_shape(example)
-        return [make(shapes, self.memory_steps) for make in self.memory_makers]
+        return [make(shapes, self.buffer_steps) for make in self.buffer_makers]
 
     def step(
         self, large: Any, state: _LoopState, consts: Any, masked: bool
     ) -> tuple[Any, _LoopState]:
         """One agent step: act, step the world, store, learn, and close the episode if it ended."""
         (remembered, curve), (key, env_params) = large, consts
-        memories = self.memories(state)
+        buffers = self.buffers(state)
         key_act, key_env, key_sample, key_update, *keys_end = step_keys(key, state.step, 6)
         action = self.agent.act(key_act, state.agent_state, state.obs, explore=True)
         next_obs, env_state, reward, terminated, info = self.env.step_env(
@@ -451,18 +453,18 @@ class _Loop:
         active = state.active if masked else True
         finished = ended & active  # an episode that counts
         remembered = tuple(
-            memory.store(arrays, state.step, transition, ended, active)
-            for memory, arrays in zip(memories, remembered, strict=True)
+            buffer.store(arrays, state.step, transition, ended, active)
+            for buffer, arrays in zip(buffers, remembered, strict=True)
         )
 
         def learn(agent_state: Any) -> Any:
             size = self.agent.batch_size(agent_state)
-            batch = memories[0].batch(key_sample, remembered[0], state.step + 1, transition, size)
-            batch = memories[0].rest(batch, active) if masked else batch
+            batch = buffers[0].batch(key_sample, remembered[0], state.step + 1, transition, size)
+            batch = buffers[0].mask(batch, active) if masked else batch
             return self.agent.update(key_update, agent_state, batch)
 
         agent_state = jax.lax.cond(
-            state.episode >= self.agent.learns_from, learn, lambda s: s, state.agent_state
+            state.episode >= self.agent.spec.learns_from, learn, lambda s: s, state.agent_state
         )
         train_steps = state.train_steps + info.get("num_steps", 1)
         state = state.replace(
@@ -518,7 +520,7 @@ class _Loop:
 
     def stops(self, state: _LoopState, recent: Array) -> Array:
         """Whether training ends with the episode that has just ended."""
-        training, first = self.training, self.agent.warmup_episodes
+        training, first = self.training, self.agent.spec.warmup_episodes
         num_episodes = state.episode + 1
         stop = (num_episodes >= training.max_episodes) | state.nonfinite
         may_stop = (state.episode >= first) & (state.train_steps >= training.min_steps)

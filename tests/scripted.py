@@ -12,9 +12,8 @@ import jax.numpy as jnp
 from flax import struct
 from gymnax.environments import environment, spaces
 
-from sejax.agents.base import Agent
-from sejax.agents.memory import replay_memory
-from sejax.agents.replay import Transition
+from sejax.agents.base import Agent, AgentSpec
+from sejax.agents.buffers import Transition, replay_buffer
 
 MAX_EPISODES = 12
 MAX_STEPS = 4  # the world's step limit
@@ -111,8 +110,7 @@ def scripted_agent(warmup_episodes=2, buffer_size=1000, batch_size=64):
         act=lambda key, state, obs, explore: WHO * state.episode + obs[0].astype(jnp.int32),
         update=update,
         hparams=0.0,
-        memory=replay_memory(batch_size, buffer_size),
-        warmup_episodes=warmup_episodes,
-        learns_from=warmup_episodes,
+        buffer=replay_buffer(batch_size, buffer_size),
+        spec=AgentSpec(warmup_episodes=warmup_episodes, learns_from=warmup_episodes),
         discount=lambda hparams: 1.0,
     )

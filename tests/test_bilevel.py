@@ -11,10 +11,9 @@ from support import large_ops_in_loops
 
 import sejax
 from sejax import registry
-from sejax.bilevel import make_learner, make_program
+from sejax.bilevel import make_bilevel, make_learner
 from sejax.errors import ConfigError
 from sejax.es.base import Trials
-from sejax.ops.counters import exact
 
 # 40 steps for each of 12 agents: short enough for rounding not to grow into other actions.
 TINY = [
@@ -38,12 +37,12 @@ def tiny(*overrides, words=TINY):
 
 
 def program_of(*overrides, words=TINY):
-    return make_program(**tiny(*overrides, words=words).parts())
+    return make_bilevel(**tiny(*overrides, words=words).parts())
 
 
-def compiled(program, keys):
-    """The generation as an executable, and the initial state for these keys."""
-    state = jax.jit(program.init)(keys)
+def compiled(program, key):
+    """The generation as an executable, and the initial state for this key."""
+    state = jax.jit(program.init)(key)
     return jax.jit(program.generation).lower(state).compile(), state
 
 
@@ -61,8 +60,8 @@ def run(generation, state, generations):
 def one_device():
     """Program on one device, its compiled generation, and a run of three generations per key."""
     program = program_of("devices=1")
-    generation, state = compiled(program, KEYS[:1])
-    runs = [run(generation, state, 3), run(generation, program.init(KEYS[1:]), 3)]
+    generation, state = compiled(program, KEYS[0])
+    runs = [run(generation, state, 3), run(generation, program.init(KEYS[1]), 3)]
     return program, generation, runs
 
 
@@ -70,8 +69,8 @@ def one_device():
 def room():
     """The same of tables."""
     program = program_of("devices=1", words=ROOM)
-    generation, state = compiled(program, KEYS[:1])
-    runs = [run(generation, state, 3), run(generation, program.init(KEYS[1:]), 3)]
+    generation, state = compiled(program, KEYS[0])
+    runs = [run(generation, state, 3), run(generation, program.init(KEYS[1]), 3)]
     return program, generation, runs
 
 
@@ -103,16 +102,16 @@ def test_a_generation_measures_the_incumbent_and_then_moves_it(one_device):
         np.testing.assert_array_equal(after.incumbent_score, info.incumbent_mean)
         # All Better 2 moves the mean exactly if a member beats the incumbents' mean.
         moves.append(bool((after.es_state.mean != before.es_state.mean).any()))
-        assert moves[-1] == bool(info.population_max[0] > info.incumbent_mean[0])
+        assert moves[-1] == bool(info.population_max > info.incumbent_mean)
     assert any(moves)
 
 
 def test_the_best_proxy_is_the_one_with_the_highest_incumbent_mean(one_device):
     _, _, runs = one_device
     for states, infos in runs:
-        means = [float(info.incumbent_mean[0]) for info in infos]
+        means = [float(info.incumbent_mean) for info in infos]
         np.testing.assert_allclose(
-            [float(info.best_so_far[0]) for info in infos], np.maximum.accumulate(means)
+            [float(info.best_so_far) for info in infos], np.maximum.accumulate(means)
         )
         best = max(range(len(means)), key=lambda i: (means[i], i))
         assert states[-1].best_generation == best and states[-1].best_score == means[best]
@@ -120,22 +119,21 @@ def test_the_best_proxy_is_the_one_with_the_highest_incumbent_mean(one_device):
 
 
 def test_infos_count_generations_and_steps(one_device):
-    program, _, ((states, infos), _) = one_device
+    program, _, ((_, infos), _) = one_device
     assert program.strategy.num_candidates == 12  # 4 members with two signs, 4 incumbents
     for number, info in enumerate(infos):
         assert info.generation == number and info.active
-        np.testing.assert_allclose(info.train_steps_total, 12 * info.train_steps_mean, rtol=1e-6)
-        assert 0 < info.train_steps_max[0] <= 40
+        assert info.train_steps.shape == info.real_steps.shape == (12,)
+        np.testing.assert_allclose(info.train_steps.sum(), 12 * info.train_steps_mean, rtol=1e-6)
+        assert 0 < info.train_steps_max <= 40
         assert info.num_nonfinite == 0
-    real_steps = np.diff([0] + [int(info.env_steps_total[0]) for info in infos])
-    assert (real_steps >= 12 * 2 * 5).all()  # 12 agents, 2 tests of at least 5 steps each
-    assert exact(states[-1].env_steps) == infos[-1].env_steps_total
+        assert (info.real_steps >= 2 * 5).all()  # 2 tests of at least 5 steps each
 
 
 def test_generations_of_one_seed_differ_and_so_do_seeds(one_device):
     _, _, ((states, infos), (others, _)) = one_device
     assert (states[0].incumbent != others[0].incumbent).any()
-    assert len({float(info.population_mean[0]) for info in infos}) == 3
+    assert len({float(info.population_mean) for info in infos}) == 3
 
 
 def test_no_two_trials_generations_or_seeds_have_a_key_in_common(one_device):
@@ -149,13 +147,13 @@ def test_no_two_trials_generations_or_seeds_have_a_key_in_common(one_device):
 def test_perturbations_are_drawn_anew_in_each_generation(one_device):
     program, _, ((states, _), _) = one_device
     first, second = (program.ask(state) for state in states[:2])
-    drawn = [np.asarray(asked.members - asked.incumbent[:, None]) for asked in (first, second)]
+    drawn = [np.asarray(asked.population - asked.incumbent) for asked in (first, second)]
     assert np.abs(np.corrcoef(*(x.ravel() for x in drawn))[0, 1]) < 0.5
 
 
 def test_common_random_numbers_are_common_to_the_members_alone():
     program = program_of("es.common_random_numbers=true", "es.num_evals=2", words=ROOM)
-    keys = np.asarray(jax.random.key_data(program.ask(program.init(KEYS[:1])).keys))[0]
+    keys = np.asarray(jax.random.key_data(program.ask(program.init(KEYS[0])).keys))
     ids = program.strategy.trials.seed_ids(program.strategy.num_members)
     same = (keys[:, None] == keys[None]).all(axis=-1)
     np.testing.assert_array_equal(same, np.equal.outer(ids, ids))
@@ -166,26 +164,26 @@ def test_members_are_compared_by_tests_as_long_as_the_curriculum_says():
     """A generation is ask, the trials one by one with tests of one step, and tell."""
     config = tiny("devices=1", "objective.first_eval_steps=1", words=ROOM)
     parts = config.parts()
-    program, task = make_program(**parts), parts["task"]
+    program, task = make_bilevel(**parts), parts["task"]
     proxy = registry.make("proxy", config.proxy, task)
     agent = sejax.make_agent(config.agent, task)
     evaluate = sejax.make_evaluator(agent, proxy, task, config.training)
-    state = program.init(KEYS[:1])
-    assert program.eval_steps(state) == 1 < task.max_steps
+    state = program.init(KEYS[0])
     asked = program.ask(state)
+    assert asked.eval_steps == 1 < task.max_steps
 
     def one(trial):
         key, candidate = trial
         return evaluate(key, proxy.params(program.unravel(candidate)), True, jnp.int32(1))
 
-    outcome = jax.jit(lambda: jax.lax.map(one, (asked.keys[0], asked.candidates[0])))()
+    outcome = jax.jit(lambda: jax.lax.map(one, (asked.keys, asked.params)))()
     assert (outcome.scored_returns != outcome.test_returns).any()
     after, info = jax.jit(program.generation)(state)
-    told, wanted = program.tell(state, asked, jax.tree.map(lambda x: x[None], outcome))
+    told, wanted = program.tell(state, asked, outcome)
     np.testing.assert_allclose(after.es_state.mean, told.es_state.mean, rtol=1e-5, atol=1e-6)
     np.testing.assert_allclose(info.incumbent_mean, wanted.incumbent_mean, rtol=1e-6)
     whole = outcome.replace(scored_returns=outcome.test_returns)
-    other, _ = program.tell(state, asked, jax.tree.map(lambda x: x[None], whole))
+    other, _ = program.tell(state, asked, whole)
     assert not np.allclose(other.es_state.mean, told.es_state.mean, rtol=1e-3)
 
 
@@ -193,7 +191,7 @@ def test_all_generations_run_in_one_executable(one_device):
     program, _, ((states, _), _) = one_device
     weak = lambda tree: jax.tree.map(lambda x: x.weak_type, tree)  # noqa: E731
     after, _ = jax.eval_shape(program.generation, states[0])
-    assert weak(after) == weak(jax.eval_shape(program.init, KEYS[:1]))
+    assert weak(after) == weak(jax.eval_shape(program.init, KEYS[0]))
 
 
 def test_the_programs_loops_neither_copy_nor_select_a_buffer(one_device):
@@ -210,11 +208,11 @@ def test_the_programs_loops_neither_copy_nor_select_a_buffer(one_device):
 
 def test_a_curriculum_compares_members_by_a_part_and_incumbents_by_whole_tests():
     program = program_of("objective.first_eval_steps=1", words=ROOM)
-    state = program.init(KEYS[:1])
+    state = program.init(KEYS[0])
     # Of 8 members and 4 incumbents all whole tests are alike; the fourth member's part is best.
-    whole, part = np.full((1, 12, 2), 0.5, np.float32), np.zeros((1, 12, 2), np.float32)
-    part[0, 3] = 0.25
-    counts = np.full((1, 12), 3, np.int32)
+    whole, part = np.full((12, 2), 0.5, np.float32), np.zeros((12, 2), np.float32)
+    part[3] = 0.25
+    counts = np.full(12, 3, np.int32)
     outcome = sejax.Outcome(
         test_returns=whole, scored_returns=part, train_steps=counts, train_episodes=counts,
         auc=part[..., 0], nonfinite=counts < 0, real_steps=counts,
@@ -223,7 +221,7 @@ def test_a_curriculum_compares_members_by_a_part_and_incumbents_by_whole_tests()
         state
     )
     # All Better 2 with one member that is better: the mean moves to it.
-    np.testing.assert_allclose(after.es_state.mean[0], asked.members[0, 3], rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(after.es_state.mean, asked.population[3], rtol=1e-5, atol=1e-6)
     assert info.incumbent_mean == info.population_mean == after.best_score == 0.5
 
 
@@ -231,12 +229,12 @@ def test_a_curriculum_compares_members_by_a_part_and_incumbents_by_whole_tests()
 
 
 def assert_result_equals_run(result, program, states, infos, **tolerance):
-    assert_equal(result.weights, program.unravel(states[-1].best[0]), **tolerance)
-    assert_equal(result.last_weights, program.unravel(states[-1].incumbent[0]), **tolerance)
-    history = jax.tree.map(lambda *x: jnp.concatenate(x), *infos)
+    assert_equal(result.weights, program.unravel(states[-1].best), **tolerance)
+    assert_equal(result.last_weights, program.unravel(states[-1].incumbent), **tolerance)
+    history = jax.tree.map(lambda *x: jnp.stack(x), *infos)
     assert_equal(result.info, history, **tolerance)
-    assert result.generation == states[-1].best_generation[0]
-    assert_equal(result.score, states[-1].best_score[0], **tolerance)
+    assert result.generation == states[-1].best_generation
+    assert_equal(result.score, states[-1].best_score, **tolerance)
 
 
 def test_a_jitted_learner_on_two_devices_equals_driving_one_by_hand_to_the_bit(one_device):
@@ -257,46 +255,27 @@ def test_a_learner_vmapped_over_keys_equals_separate_runs(room):
 def test_four_lanes_give_the_same_numbers_as_one(room):
     _, _, ((states, infos), _) = room
     program = program_of("devices=1", "num_parallel=4", words=ROOM)
-    lane_states, lane_infos = run(*compiled(program, KEYS[:1]), 2)
+    lane_states, lane_infos = run(*compiled(program, KEYS[0]), 2)
     assert_equal(lane_states[2], states[2], rtol=1e-4, atol=1e-5)
     assert_equal(lane_infos, infos[:2], rtol=1e-4, atol=1e-5)
 
 
-# --- several seeds, and stopping -----------------------------------------------------------------
+# --- stopping ------------------------------------------------------------------------------------
 
 
-def test_seeds_of_one_program_equal_separate_runs_and_stop_when_solved(room):
-    _, _, runs = room
-    first, second = (float(infos[0].incumbent_mean[0]) for _, infos in runs)
-    # A threshold that the better seed alone reaches in its first generation.
-    assert first != second
-    parts = tiny("devices=1", "num_seeds=2", "stop_when_solved=true", words=ROOM).parts()
-    task = dataclasses.replace(parts["task"], solved_reward=(first + second) / 2)
+def test_a_run_that_has_solved_its_task_stays_as_it_is_at_no_cost(room):
+    _, _, ((alone, alone_infos), _) = room
+    parts = tiny("devices=1", "stop_when_solved=true", words=ROOM).parts()
+    task = dataclasses.replace(parts["task"], solved_reward=float(alone_infos[0].incumbent_mean))
     proxy = registry.make("proxy", parts["proxy"].config, task)
-    program = make_program(**parts | {"task": task, "proxy": proxy})
+    program = make_bilevel(**parts | {"task": task, "proxy": proxy})
     assert program.solved_score == task.solved_reward
-    states, infos = run(*compiled(program, KEYS), 3)
-
-    solved = int(second > first)
-    alone, alone_infos = runs[solved]
-    np.testing.assert_array_equal(states[1].finished, [i == solved for i in range(2)])
-    # Up to its solution the seed runs as it does alone; then it stays as it is, at no cost.
-    seed_of = lambda tree, i: jax.tree.map(lambda x: x[i], tree)  # noqa: E731
-    assert_equal(states[1].best[solved], alone[1].best[0])
+    states, infos = run(*compiled(program, KEYS[0]), 3)
+    assert states[1].finished and infos[0].active
+    assert_equal(states[1].best, alone[1].best)
     for state, info in zip(states[2:], infos[1:], strict=True):
-        assert_equal(seed_of(state, solved), seed_of(states[1], solved))
-        assert not info.active[solved] and info.train_steps_total[solved] == 0
-        assert info.env_steps_total[solved] == alone_infos[0].env_steps_total[0]
-
-    # The other seed goes on as it would alone, as long as it is not solved itself.
-    other = 1 - solved
-    alone, alone_infos = runs[other]
-    for number in range(3):
-        assert infos[number].active[other]
-        assert_equal(seed_of(infos[number], other), seed_of(alone_infos[number], 0))
-        if states[number + 1].finished[other]:
-            break
-        assert_equal(states[number + 1].best[other], alone[number + 1].best[0])
+        assert_equal(state, states[1])
+        assert not info.active and info.train_steps.sum() == info.real_steps.sum() == 0
 
 
 # --- trouble -------------------------------------------------------------------------------------
@@ -304,16 +283,14 @@ def test_seeds_of_one_program_equal_separate_runs_and_stop_when_solved(room):
 
 def test_a_population_of_proxies_that_diverge_is_counted_and_leaves_no_trace(one_device):
     _, generation, ((states, _), _) = one_device
-    wild = states[1].replace(
-        es_state=states[1].es_state.replace(noise_std=jnp.full(1, 1e30, jnp.float32))
-    )
+    wild = states[1].replace(es_state=states[1].es_state.replace(noise_std=jnp.float32(1e30)))
     after, info = generation(wild)
     # All 8 perturbed proxies give numbers that are none; the 4 incumbents are as good as ever.
     assert info.num_nonfinite == 8
     assert np.isnan(info.population_mean) and np.isnan(info.population_max)
     assert np.isfinite(info.incumbent_mean) and np.isfinite(info.incumbent_std)
     np.testing.assert_array_equal(after.es_state.mean, wild.es_state.mean)
-    assert 0 < info.train_steps_max[0] <= 40
+    assert 0 < info.train_steps_max <= 40
 
 
 def test_an_incumbent_that_diverges_is_never_the_best(one_device):
@@ -365,13 +342,16 @@ def test_every_kind_of_configuration_makes_a_scan_body(words, overrides):
     # Tracing only: the state that comes out has the types of the one that goes in.
     assert {"open_es", "cma_es", "snes"} <= set(registry.names("es"))
     program = program_of(*overrides, words=words)
-    state = jax.eval_shape(program.init, KEYS)
+    state = jax.eval_shape(program.init, KEYS[0])
     after, info = jax.eval_shape(program.generation, state)
     kind = lambda tree: jax.tree.map(lambda x: (x.shape, x.dtype), tree)  # noqa: E731
     assert kind(after) == kind(state)
-    columns, wide = dict(vars(info)), ("env_steps_wide", "train_steps_wide")
-    assert {x.shape for x in jax.tree.leaves(columns.pop("families"))} == {(2, 1)}  # one family
-    assert {columns.pop(name).shape for name in wide} == {(2, 2)}
-    num_tried = program.strategy.num_members * program.strategy.trials.num_evals
-    assert columns.pop("member_scores").shape == (2, num_tried)
-    assert {x.shape for x in columns.values()} == {(2,)}
+    columns = dict(vars(info))
+    assert {x.shape for x in jax.tree.leaves(columns.pop("by_agent"))} == {(1,)}
+    num_population = program.strategy.num_members * program.strategy.trials.num_evals
+    assert columns.pop("population_scores").shape == (num_population,)
+    num_candidates = program.strategy.num_candidates
+    assert {columns.pop(name).shape for name in ("train_steps", "real_steps")} == {
+        (num_candidates,)
+    }
+    assert {x.shape for x in columns.values()} == {()}

@@ -9,7 +9,7 @@ import sejax
 from sejax import envs
 from sejax.agents.boltzmann import BoltzmannConfig
 from sejax.agents.mixture import Families
-from sejax.bilevel import make_program
+from sejax.bilevel import make_bilevel
 from sejax.cli import compose
 from sejax.errors import ConfigError
 from sejax.evaluate import evaluate
@@ -93,7 +93,7 @@ def test_two_numbers_of_an_action_make_a_grid():
 
 
 def program_of(agent, **parts):
-    return make_program(**{
+    return make_bilevel(**{
         "task": CARTPOLE, "agent": agent, "proxy": BANDIT, "devices": 1,
         "es": sejax.NESConfig(population_size=16, noise_std=0.1, num_incumbent_evals=4),
         "training": sejax.TrainingConfig(max_steps=64, max_episodes=64, stop_rule="never"), **parts,
@@ -109,18 +109,18 @@ def test_the_outer_loop_learns_a_bandit_without_a_step_of_training():
     program = program_of(
         Families(agents=(boltzmann, ddqn), names=("boltzmann", "ddqn"), weights=(1.0, 0.0))
     )
-    state = jax.jit(program.init)(jax.random.key(0)[None])
+    state = jax.jit(program.init)(jax.random.key(0))
     generation = jax.jit(program.generation)
     infos = []
     for _ in range(12):
         state, info = generation(state)
         infos.append(jax.device_get(info))
-    first, last = (infos[i].families.incumbent_mean[0, 0] for i in (0, -1))
+    first, last = (infos[i].by_agent.incumbent_mean[0] for i in (0, -1))
     assert first < 40 and last > 60, (first, last)
-    assert all(info.train_steps_total == 2 * 64 for info in infos)  # of two incumbents
-    np.testing.assert_array_equal(infos[0].families.train_steps_mean, [[0, 64]])
-    assert np.isnan(infos[0].families.population_mean[0, 1])
-    assert np.isfinite(infos[0].families.population_mean[0, 0])
+    assert all(info.train_steps.sum() == 2 * 64 for info in infos)  # of two incumbents
+    np.testing.assert_array_equal(infos[0].by_agent.train_steps_mean, [0, 64])
+    assert np.isnan(infos[0].by_agent.population_mean[1])
+    assert np.isfinite(infos[0].by_agent.population_mean[0])
 
 
 def test_where_it_cannot_be_solved_for_it_says_so():
@@ -128,7 +128,7 @@ def test_where_it_cannot_be_solved_for_it_says_so():
     message = r"^agent must be one that learns, or the proxy an SE whose episodes are one step, .*"
     with pytest.raises(ConfigError, match=message + r"proxy\.horizon=1\."):
         program = program_of(agent, proxy=SyntheticConfig(hidden_size=8))
-        jax.eval_shape(program.generation, jax.eval_shape(program.init, jax.random.key(0)[None]))
+        jax.eval_shape(program.generation, jax.eval_shape(program.init, jax.random.key(0)))
     train = sejax.make_trainer(agent, CARTPOLE.env)
     with pytest.raises(ConfigError, match=message):
         jax.eval_shape(train, jax.random.key(0), CARTPOLE.params)

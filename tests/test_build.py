@@ -202,8 +202,8 @@ def test_a_varied_agent_is_drawn_anew_for_each_training():
     fixed = config("env=gridworld_2x2")
     varied = build.learn_config(build.to_plain(fixed) | {"agent_hparams": "varied"})
     agent = varied.parts()["agent"]
-    assert agent.variants and agent.draw is not None
-    assert fixed.parts()["agent"].variants == ()
+    assert agent.varied is not None
+    assert fixed.parts()["agent"].varied is None
 
 
 def test_several_agents_are_families_each_made_as_it_is_alone():
@@ -215,7 +215,7 @@ def test_several_agents_are_families_each_made_as_it_is_alone():
     assert (made.config.compared_by, made.config.aggregate) == ("rank", "mean")
     assert made.agents == tuple(sejax.make_agent(x.agent, task) for x in families_of(several))
     varied = build.learn_config(build.to_plain(several) | {"agent_hparams": "varied"})
-    assert all(agent.draw is not None for agent in varied.parts()["agent"].agents)
+    assert all(agent.varied is not None for agent in varied.parts()["agent"].agents)
 
 
 def test_a_configuration_that_says_facts_is_judged_without_making_the_task(monkeypatch):

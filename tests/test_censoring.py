@@ -7,8 +7,8 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
+from experiments import se_feasibility, worlds
 from sejax.evaluate import summarise
-from sejax.experiments import se_feasibility, worlds
 
 sys.path.append(str(Path(__file__).parents[1] / "benchmarks"))
 

@@ -18,7 +18,6 @@ from sejax.cli.build import LearnConfig
 from sejax.envs.cliff_walking import CliffWalking
 from sejax.errors import ConfigError
 from sejax.es.evosax import ALGORITHMS, EvosaxConfig
-from sejax.training import steps_before_learning
 
 composed_with = functools.cache(lambda *overrides: sejax.config(overrides))
 ENVS = ("cartpole", "acrobot")
@@ -384,7 +383,7 @@ def test_agents_learn_within_the_default_budget_of_an_se(env):
         if agent.states == facts.states and facts.actions in agent.actions:
             config = sejax.config([f"env={env}", f"agent={name}"])
             longest = config.proxy.max_steps(facts.max_steps)
-            before = steps_before_learning(config.agent, longest, facts.max_steps)
+            before = config.agent.steps_before_learning(longest, facts.max_steps)
             budget = config.training.max_episodes * longest
             budget = min(budget, config.training.max_steps or budget)
             assert budget >= 2 * before, name

@@ -1,4 +1,4 @@
-"""sejax.agents.count_based: the bonus by hand and by a plain loop, and in a training."""
+"""sejax.agents.exploration: the bonus by hand and by a plain loop, and in a training."""
 
 import functools
 
@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from sejax import envs
-from sejax.agents.count_based import CountBasedConfig, with_count_bonus
-from sejax.agents.replay import Transition
+from sejax.agents.buffers import Transition
+from sejax.agents.exploration import CountBasedConfig, with_count_bonus
 from sejax.agents.tabular import QLearningConfig, SARSAConfig, make_q_learning, make_sarsa
 from sejax.evaluation import make_tester
 from sejax.training import TrainingConfig, make_trainer
@@ -109,8 +109,8 @@ def test_an_agent_is_made_once_and_keeps_the_rest_of_the_contract():
     plain = make_q_learning(QLearningConfig(warmup_episodes=3), NUM_STATES, NUM_ACTIONS)
     agent = counting(plain)
     assert agent is counting(plain)
-    assert (agent.warmup_episodes, agent.learns_from) == (3, 3)
-    assert agent.memory is plain.memory
+    assert (agent.spec.warmup_episodes, agent.spec.learns_from) == (3, 3)
+    assert agent.buffer is plain.buffer
 
 
 # --- in a training -------------------------------------------------------------------------------

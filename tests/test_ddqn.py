@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from support import numpy_forward, shapes_of, unraveled
 
+from sejax.agents.buffers import Transition
 from sejax.agents.dqn import DDQNConfig, double_q_targets, make_ddqn
 from sejax.agents.policies import select_action
-from sejax.agents.replay import Transition
 from sejax.ops.networks import MLP
 from sejax.options import ACTIVATIONS
 
@@ -211,9 +211,9 @@ def test_the_memory_draws_a_batch_for_each_gradient_step(rarely):
     assert agent.batch_size(state.replace(hparams=numbers)) == 6
     one = Transition(np.zeros(3, np.float32), np.int32(0), np.float32(0), np.float32(0),
                      np.zeros(3, np.float32))  # fmt: skip
-    memory = agent.memory(one, 10)
+    buffer = agent.buffer(one, 10)
     batch = jax.eval_shape(
-        lambda key: memory.batch(key, memory.init(), jnp.int32(1), one), jax.random.key(0)
+        lambda key: buffer.batch(key, buffer.init(), jnp.int32(1), one), jax.random.key(0)
     )
     assert batch.reward.shape == (16,)  # 2 * 7, in whole vectors
 
@@ -347,7 +347,7 @@ def test_hparams_hold_the_configured_numbers(agent):
         "epsilon_init": 1.0, "epsilon_min": 0.01, "epsilon_decay": 0.9, "exploration_steps": None,
         "hidden_size": None, "batch_size": None,  # all of them
     }  # fmt: skip
-    assert (agent.warmup_episodes, agent.learns_from) == (10, 10)
+    assert (agent.spec.warmup_episodes, agent.spec.learns_from) == (10, 10)
 
 
 def test_columns_of_no_weight_change_nothing(state, update):

@@ -90,9 +90,9 @@ def test_every_public_name_is_in_the_api_reference(name):
 
 def test_every_experiment_is_in_the_api_reference():
     page = (ROOT / "docs/api/experiments.md").read_text()
-    for module in (ROOT / "sejax/experiments").glob("*.py"):
+    for module in (ROOT / "experiments").glob("*.py"):
         if "\nEXPERIMENT = " in module.read_text():
-            assert f".. automodule:: sejax.experiments.{module.stem}\n" in page
+            assert f".. automodule:: experiments.{module.stem}\n" in page
 
 
 @pytest.mark.parametrize("name", sorted(sejax.__all__))

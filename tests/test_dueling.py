@@ -129,5 +129,5 @@ def test_it_solves_cartpole():
 def test_one_trains_alone_on_a_core():
     # In lockstep its streams' products take longer; DDQN of the same size gains by it.
     small = {"hidden_size": 64, "num_layers": 1, "batch_size": 32}
-    assert make_ddqn(DuelingDDQNConfig(**small), 4, 2).cpu_num_parallel == 1
-    assert make_ddqn(DDQNConfig(**small), 4, 2).cpu_num_parallel > 1
+    assert make_ddqn(DuelingDDQNConfig(**small), 4, 2).spec.cpu_num_parallel == 1
+    assert make_ddqn(DDQNConfig(**small), 4, 2).spec.cpu_num_parallel > 1

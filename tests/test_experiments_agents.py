@@ -8,8 +8,8 @@ import pytest
 from support import refuse
 
 import sejax
+from experiments import agent_learning, pieces, return_curves, worlds
 from sejax.errors import ConfigError
-from sejax.experiments import agent_learning, pieces, return_curves, worlds
 
 
 def curve(steps, returns):
@@ -39,7 +39,7 @@ def test_every_agent_learns_and_nothing_is_computed_twice(tmp_path, monkeypatch)
     assert list(table["agent"]) == ["q_learning", "sarsa", "sarsa"]
     assert (tmp_path / "learning_curves.png").stat().st_size > 10_000
     text = (tmp_path / "table.md").read_text()
-    assert "python -m sejax.experiments.agent_learning quick=true" in text
+    assert "python -m experiments.agent_learning quick=true" in text
     rows = pieces.read_rows(settings.rows_file)
     assert set(rows["study"]) == {6, 7, 8} and set(rows["max_steps"]) == {400}
     curves = rows[rows["study"] == 6]

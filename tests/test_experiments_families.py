@@ -11,10 +11,7 @@ from scipy.stats import spearmanr
 from support import is_drawn, refuse
 
 import sejax
-from sejax import envs
-from sejax.cli import session
-from sejax.errors import ConfigError
-from sejax.experiments import (
+from experiments import (
     budgets,
     family_runs,
     pieces,
@@ -22,6 +19,9 @@ from sejax.experiments import (
     se_horizons,
     se_transfer_of_hparams,
 )  # fmt: skip
+from sejax import envs
+from sejax.cli import session
+from sejax.errors import ConfigError
 
 TINY_RUN = ["es.population_size=2", "es.num_incumbent_evals=2", "proxy.hidden_size=4",
             "training.max_steps=30", "training.test_episodes=1",

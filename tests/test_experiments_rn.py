@@ -12,9 +12,7 @@ import pytest
 from support import is_drawn, refuse
 
 import sejax
-from sejax.cli import build, session
-from sejax.errors import ConfigError
-from sejax.experiments import (
+from experiments import (
     pieces,
     proxy_runs,
     rn_curves,
@@ -25,13 +23,15 @@ from sejax.experiments import (
     timings,
     worlds,
 )
-from sejax.experiments.experiment import parse
-from sejax.experiments.proxy_runs import RunSettings
-from sejax.experiments.rn_heatmap import RnHeatmap
-from sejax.experiments.rn_objectives import RnObjectives
-from sejax.experiments.rn_performance import RnPerformance
-from sejax.experiments.rn_studies import RnSettings
-from sejax.statistics import bootstrap_interval
+from experiments.experiment import parse
+from experiments.proxy_runs import RunSettings
+from experiments.rn_heatmap import RnHeatmap
+from experiments.rn_objectives import RnObjectives
+from experiments.rn_performance import RnPerformance
+from experiments.rn_studies import RnSettings
+from experiments.statistics import bootstrap_interval
+from sejax.cli import build, session
+from sejax.errors import ConfigError
 
 LEARN = {"variants": ("additive_potential", "exclusive_non_potential"), "learned": 3,
          "generations": 1, "run": ("training.max_episodes=5", "es.population_size=2")}  # fmt: skip
@@ -381,7 +381,7 @@ def test_commands_in_the_docs_are_accepted():
     commands = set(re.findall(r"python -m sejax\.experiments\.([a-z]\w+)([^`\n#|]*)", text))
     assert len(commands) > 20
     for name, words in (each for each in commands if "--help" not in each[1]):
-        settings = importlib.import_module(f"sejax.experiments.{name}").EXPERIMENT.settings
+        settings = importlib.import_module(f"experiments.{name}").EXPERIMENT.settings
         made = settings.of(**parse(settings, shlex.split(words)))
         again = settings.of(**parse(settings, shlex.split(made.command())[3:]))
         assert dataclasses.replace(made, out=again.out, work=None) == again

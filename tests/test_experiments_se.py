@@ -17,11 +17,7 @@ import yaml
 from support import refuse
 
 import sejax
-from sejax import envs
-from sejax.agents.base import drawing_key
-from sejax.cli import session
-from sejax.errors import ConfigError
-from sejax.experiments import (
+from experiments import (
     experiment,
     figures,
     pieces,
@@ -32,9 +28,13 @@ from sejax.experiments import (
     settings,
     worlds,
 )  # fmt: skip
+from experiments.statistics import bootstrap_interval, interquartile_mean
+from sejax import envs
+from sejax.agents.base import drawing_key
+from sejax.cli import session
+from sejax.errors import ConfigError
 from sejax.options import counts
 from sejax.serialize import flatten
-from sejax.statistics import bootstrap_interval, interquartile_mean
 
 TINY_RUN = ["es.population_size=2", "es.num_incumbent_evals=2", "agent.hidden_size=4",
             "agent.batch_size=4", "agent.warmup_episodes=0", "proxy.hidden_size=4",
@@ -67,9 +67,9 @@ def test_settings_are_complete_and_say_which_command_makes_them():
                  "run.agent.hidden_size=4")  # fmt: skip
     assert made.run == ("es.noise_std=0.1", "agent.hidden_size=4")
     assert made == Example.of(quick=True, agents="ppo", seed=7, run=made.run)
-    words = made.command().removeprefix("python -m sejax.experiments.example ").split()
+    words = made.command().removeprefix("python -m experiments.example ").split()
     assert given(*(word.strip("'") for word in words)) == made and len(words) == 5
-    assert given().command() == "python -m sejax.experiments.example"
+    assert given().command() == "python -m experiments.example"
 
 
 def test_results_are_apart_from_what_may_be_thrown_away():
@@ -547,7 +547,7 @@ def evaluated(env, params, task, training, keys):
     varied = sejax.make_agent(sejax.DDQNConfig(**TINY_AGENT), task, varied=True)
     draws = jax.vmap(lambda key: varied.draw(drawing_key(key)))(keys)
     chosen = np.flatnonzero(draws.variant == draws.variant[0])
-    agent = varied.variants[int(draws.variant[0])]
+    agent = varied.varied.agents[int(draws.variant[0])]
 
     @jax.jit
     def evaluate(key, hparams):
@@ -578,7 +578,7 @@ def test_ses_of_another_task_are_refused(ses, tmp_path):
 def test_commands_end_bad_input_with_one_message_and_status_2(
     name, words, message, tmp_path, capsys, monkeypatch
 ):
-    module = __import__(f"sejax.experiments.{name}", fromlist=["EXPERIMENT"])
+    module = __import__(f"experiments.{name}", fromlist=["EXPERIMENT"])
     monkeypatch.setattr(experiment.runtime, "configure_jax", lambda: None)
     with pytest.raises(SystemExit) as ended:
         module.EXPERIMENT.main([f"out={tmp_path}", *words])
@@ -589,7 +589,7 @@ def test_commands_end_bad_input_with_one_message_and_status_2(
 
 def test_a_command_refuses_before_it_imports_gymnax(tmp_path):
     code = ("import runpy, sys; sys.argv[1:] = ['seed=-1']\n"
-            "try: runpy.run_module('sejax.experiments.se_models', run_name='__main__')\n"
+            "try: runpy.run_module('experiments.se_models', run_name='__main__')\n"
             "finally: print('gymnax.environments.environment' in sys.modules)")  # fmt: skip
     environment = {key: value for key, value in os.environ.items() if key != "XLA_FLAGS"}
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True,
@@ -598,7 +598,7 @@ def test_a_command_refuses_before_it_imports_gymnax(tmp_path):
 
 
 def test_all_experiments_are_listed():
-    done = subprocess.run([sys.executable, "-m", "sejax.experiments"], capture_output=True,
+    done = subprocess.run([sys.executable, "-m", "experiments"], capture_output=True,
                           text=True, timeout=120, check=True)  # fmt: skip
     for module in (se_feasibility, se_models, se_performance):
         assert f"  {module.EXPERIMENT.settings.name} " in done.stdout

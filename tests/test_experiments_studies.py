@@ -11,11 +11,7 @@ import pytest
 from support import numpy_forward, refuse
 
 import sejax
-from sejax import envs
-from sejax.bilevel import make_program
-from sejax.cli import build
-from sejax.errors import ConfigError
-from sejax.experiments import (
+from experiments import (
     pieces,
     score_transforms,
     se_agents,
@@ -24,8 +20,12 @@ from sejax.experiments import (
     supervised_models,
     worlds,
 )
+from experiments.statistics import bootstrap_interval
+from sejax import envs
+from sejax.bilevel import make_program
+from sejax.cli import build
+from sejax.errors import ConfigError
 from sejax.evaluation import make_recorder, make_tester
-from sejax.statistics import bootstrap_interval
 from sejax.training import make_trainer
 
 TINY_AGENT = {"hidden_size": 2, "num_layers": 1, "batch_size": 4, "warmup_episodes": 0}

@@ -1,8 +1,8 @@
-"""sejax.experiments.rn_studies: agents and bonuses are those of the paper's tables."""
+"""experiments.rn_studies: agents and bonuses are those of the paper's tables."""
 
 import pytest
 
-from sejax.experiments.rn_studies import STUDIES
+from experiments.rn_studies import STUDIES
 
 # The tables of default hyperparameters, for agents that are trained on learned RNs. SARSA and TD3
 # are not here: see `STUDIES`.

@@ -24,7 +24,7 @@ from sejax.errors import ConfigError
 from sejax.gym import GYMNASIUM_IDS, RealTask, SyntheticEnv, SyntheticWorld, make
 from sejax.gym.tasks import real_task
 from sejax.ops.sealed import seal, unseal
-from sejax.proxies import ABSURD
+from sejax.proxies import MAX_ABS_VALUE
 from sejax.proxies.configs import SyntheticConfig
 from sejax.proxies.stored import find, pretrained_names
 
@@ -152,7 +152,7 @@ def test_learned_initial_states_are_the_same_function_of_the_noise(stored, scale
 
     env.np_random = SameNoise(np.random.PCG64(0))
     np.testing.assert_allclose(env.reset()[0], expected, rtol=1e-5, atol=1e-5)
-    assert (np.abs(expected).max() == ABSURD) == (scale > 1)
+    assert (np.abs(expected).max() == MAX_ABS_VALUE) == (scale > 1)
 
 
 @pytest.mark.parametrize("initial_state", ["learned", "noise"])

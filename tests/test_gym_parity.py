@@ -113,7 +113,7 @@ def test_steps_of_an_rn(name):
                   for x in (before, after)]  # fmt: skip
         return rn.bonus(proxy.params, *states, {}, terminated)
 
-    expected = bonus(before, after, terminated) + (real if rn.config.is_additive else 0)
+    expected = bonus(before, after, terminated) + (real if rn.config.shaping.is_additive else 0)
     close(reward, expected)
     assert truncated.any() or terminated.any()
     if task.name not in WORLDS:

@@ -65,13 +65,13 @@ def stored_rn(tmp_path, num_inputs, task="cartpole", discount=0.9, scale=0.5, **
     """An RN's file of random weights, written by hand in the format of version 1; the weights."""
     config = RewardConfig(hidden_size=5, **config)
     units = [("Dense_0", 5, num_inputs), ("Dense_1", 1, 5)]
-    sizes = {} if config.weighs_info else {
+    sizes = {} if config.shaping.weighs_info else {
         name: {"kernel": np.zeros((rows, columns)), "bias": np.zeros(rows)}
         for name, rows, columns in units
     }  # fmt: skip
     weights = random_like(sizes, 2, scale)
     flat = {f"potential/{layer}/{k}": x for layer, both in weights.items() for k, x in both.items()}
-    if config.weighs_info:
+    if config.shaping.weighs_info:
         weights = flat["info_weights"] = random_like(np.zeros(num_inputs), 3, scale)
     header = {"format_version": 1, "score": 1.0, "config": {
         "env": {"name": task}, "proxy": {"name": "rn", **vars(config)},

@@ -1,4 +1,4 @@
-"""sejax.agents.icm: models and loss by hand, updates against torch, and what the agent sees."""
+"""sejax.agents.exploration: models and loss by hand, updates against torch, and what the agent sees."""
 
 import dataclasses
 import functools
@@ -13,11 +13,10 @@ from support import numpy_forward, random_like, shapes_of, unraveled
 
 from sejax import envs
 from sejax.agents import make_agent
-from sejax.agents.base import Agent
+from sejax.agents.base import Agent, AgentSpec
+from sejax.agents.buffers import Rollout, Transition, pack, replay_buffer
 from sejax.agents.dqn import DDQNConfig, make_ddqn
-from sejax.agents.icm import ICM, ICMConfig, ICMOutputs, icm_loss, with_icm
-from sejax.agents.memory import Rollout, replay_memory
-from sejax.agents.replay import Transition, pack
+from sejax.agents.exploration import ICM, ICMConfig, ICMOutputs, icm_loss, with_icm
 from sejax.errors import ConfigError
 
 OBS_DIM, WIDTH, BATCH = 3, 2, 7  # WIDTH: actions to choose from, or length of an action
@@ -69,12 +68,10 @@ def stub_agent(kind):
         begin_episode=lambda state, episode: state,
         act=lambda key, state, obs, explore: jnp.int32(0),
         update=update,
-        memory=replay_memory(BATCH, 10),
+        buffer=replay_buffer(BATCH, 10),
         hparams=(),
-        warmup_episodes=3,
-        learns_from=2,
+        spec=AgentSpec(warmup_episodes=3, learns_from=2, action_repeat=2),
         env_action=jnp.negative,
-        action_repeat=2,
     )
 
 
@@ -395,8 +392,8 @@ def test_an_agents_hyperparameters_may_be_any_pytree():
 
 def test_everything_else_is_the_wrapped_agents():
     agent = curious("index")
-    for name in ("memory", "warmup_episodes", "learns_from", "env_action", "action_repeat"):
-        assert getattr(agent, name) is getattr(STUBS["index"], name)
+    for name in ("buffer", "spec", "env_action"):
+        assert getattr(agent, name) == getattr(STUBS["index"], name)
     assert agent.hparams == ((), (0.01, 0.3, 0.5))
     assert agent.hparams.icm._fields == ("learning_rate", "forward_weight", "reward_scale")
     state = jax.jit(agent.init)(jax.random.key(1), agent.hparams)
@@ -425,9 +422,7 @@ def test_everything_else_is_the_wrapped_agents():
 @pytest.mark.parametrize("field", ["train_every", "gradient_steps"])
 def test_an_agent_that_does_not_learn_once_at_each_step_is_refused(field):
     task = envs.make("cartpole")
-    with pytest.raises(
-        ConfigError, match=rf"^agent\.{field} must be 1 with exploration=icm, .*got 4"
-    ):
+    with pytest.raises(ConfigError, match=r"^exploration must be none with this agent's"):
         make_agent(DDQNConfig(**{field: 4}), task, ICMConfig())
     assert make_agent(DDQNConfig(), task, ICMConfig()) and make_agent(
         DDQNConfig(**{field: 4}), task
@@ -437,5 +432,5 @@ def test_an_agent_that_does_not_learn_once_at_each_step_is_refused(field):
 def test_a_curious_agent_trains_alone_on_a_core():
     # In lockstep the bonus' networks take 1.4 times as long, however small the agent's own are.
     task, small = envs.make("cartpole"), DDQNConfig(hidden_size=64, num_layers=1, batch_size=32)
-    assert make_agent(small, task).cpu_num_parallel > 1
-    assert make_agent(small, task, ICMConfig()).cpu_num_parallel == 1
+    assert make_agent(small, task).spec.cpu_num_parallel > 1
+    assert make_agent(small, task, ICMConfig()).spec.cpu_num_parallel == 1

@@ -13,9 +13,8 @@ import pytest
 import sejax
 from sejax import options
 from sejax.agents.base import NoExploration, traced
-from sejax.agents.count_based import CountBasedConfig
 from sejax.agents.dqn import DDQNConfig, DQNConfig, DuelingDDQNConfig
-from sejax.agents.icm import ICMConfig
+from sejax.agents.exploration import CountBasedConfig, ICMConfig
 from sejax.agents.ppo import PPOConfig
 from sejax.agents.sac import SACConfig
 from sejax.agents.tabular import QLearningConfig, SARSAConfig

@@ -14,6 +14,7 @@ from flax import linen as nn
 
 import sejax
 from sejax import envs, registry
+from sejax.agents import AgentConfig
 from sejax.cli import build
 from sejax.errors import ConfigError
 from sejax.es.evosax import ALGORITHMS
@@ -173,19 +174,21 @@ class Scaled:
 class Outer:
     Inner = Scaled
 
-def scaled(task, scale: float, offset: float = 0.0, steps: tuple[int, ...] = (1, 2), also=[3]):
+def scaled(
+    task, scale: float, offset: float = 0.0, steps: tuple[int, ...] = (1, 2), also=[3]
+) -> sejax.Objective:
     "Scaled returns."
     return sejax.Objective(score=lambda outcome: scale * outcome.test_return + offset)
 
 doubled = functools.partial(scaled, scale=2.0)
 
-def wrong(task):
+def wrong(task) -> sejax.Objective:
     return 3
 
-def too_few():
+def too_few() -> sejax.Objective:
     return 3
 
-def of_any(task, *values, **more):
+def of_any(task, *values, **more) -> sejax.Objective:
     return 3
 
 @dataclasses.dataclass(frozen=True)
@@ -287,6 +290,19 @@ def test_a_module_that_is_not_there_or_raises_is_one_message(module):
     assert "raised RuntimeError: x" in said
 
 
+@pytest.mark.parametrize("annotation", ["", " -> int", " -> 'Unknown'", " -> sejax.Agent"])
+def test_a_function_that_does_not_say_what_it_makes_is_not_called(module, annotation):
+    name = module(f"import sejax\ndef f(task){annotation}:\n    raise SystemExit('called')\n")
+    assert "-> Objective" in refused("objective", f"{name}:f")
+
+
+@pytest.mark.parametrize("annotation", ["sejax.Objective", "'Unknown | Objective'", "Mine | None"])
+def test_a_function_may_say_what_it_makes_in_several_ways(module, annotation):
+    name = module("import sejax\nclass Mine(sejax.Objective):\n    pass\n"
+                  f"def f(task) -> {annotation}:\n    return None\n")  # fmt: skip
+    assert registry.configure("objective", {"name": f"{name}:f"})
+
+
 def test_a_missing_attribute_lists_what_the_module_has(module):
     said = refused("objective", f"{module(SEVERAL)}:scled")
     assert "must name a class or function of mine_" in said and "got scled" in said
@@ -322,7 +338,7 @@ WHOLE = '''
 """A line of places, a table of two numbers, a guessed reward, a search."""
 
 import dataclasses
-from typing import Any, ClassVar
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -330,7 +346,7 @@ from flax import struct
 from gymnax.environments import environment, spaces
 
 import sejax
-from sejax.agents.memory import no_memory
+from sejax.agents import AgentConfig, no_buffer
 from sejax.es.nes import NESConfig, make_nes
 
 
@@ -383,7 +399,7 @@ class LineTask:
 
 
 @dataclasses.dataclass(frozen=True)
-class Table:
+class Table(AgentConfig):
     """Remembers what each action paid, whatever the place."""
 
     rate: float = 0.5
@@ -401,7 +417,7 @@ class Table:
         return sejax.Agent(
             init=lambda key, hparams: {"paid": jnp.zeros(task.num_actions),
                                        "rate": jnp.float32(hparams["rate"])},
-            act=act, update=update, memory=no_memory(), hparams={"rate": self.rate},
+            act=act, update=update, buffer=no_buffer(), hparams={"rate": self.rate},
             discount=lambda hparams: 1.0,
         )
 
@@ -434,19 +450,17 @@ class GuessParams(environment.EnvParams):
 
 
 @dataclasses.dataclass(frozen=True)
-class Guess:
-    default_objective: ClassVar[str] = "max_reward"
-
+class Guess(sejax.ProxyConfig):
     def make(self, task):
         return GuessEnv(task, self)
 
 
-def scaled(task, scale: float = 10.0):
+def scaled(task, scale: float = 10.0) -> sejax.Objective:
     return sejax.Objective(score=lambda outcome: scale * outcome.test_return,
                            meaning="ten times the return")
 
 
-def search(num_dims, pairs: int = 2):
+def search(num_dims, pairs: int = 2) -> sejax.Strategy:
     return make_nes(NESConfig(population_size=pairs, num_incumbent_evals=1), num_dims)
 '''
 
@@ -530,7 +544,8 @@ def test_an_agent_of_ones_own_that_cannot_be_varied_says_so(own):
 
 def test_options_that_words_cannot_say_are_one_message(module):
     name = module(
-        "import sejax\ndef f(task, score=print):\n    return sejax.Objective(score=score)\n"
+        "import sejax\ndef f(task, score=print) -> sejax.Objective:\n"
+        "    return sejax.Objective(score=score)\n"
     )
     with pytest.raises(ConfigError) as error:
         sejax.config([f"objective={name}:f"])
@@ -548,7 +563,7 @@ class Residual(nn.Module):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Torso:
+class Torso(AgentConfig):
     """An agent's configuration that holds another dataclass, a number, a list and a function."""
 
     torso: nn.Module = Plain()  # noqa: RUF009 (frozen)
@@ -590,7 +605,7 @@ def test_what_is_no_dataclass_is_the_same_as_itself_alone():
 def test_a_tasks_lists_and_what_may_be_none_are_options_of_the_command_line(module):
     name = module(
         "import sejax\n"
-        "def make(sizes: list[int] = [1, 2], length: float = None):\n"
+        "def make(sizes: list[int] = [1, 2], length: float = None) -> 'sejax.Task':\n"
         "    task = sejax.envs.make('cartpole')\n"
         "    return sejax.Task(name=f'of_{sizes}_{length}', env=task.env, params=task.params)\n"
     )

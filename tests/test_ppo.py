@@ -17,9 +17,9 @@ from support import numpy_forward, raveled, shapes_of, unraveled
 
 import sejax
 from sejax import envs
-from sejax.agents import replay
+from sejax.agents import buffers
 from sejax.agents.base import traced
-from sejax.agents.memory import Rollout
+from sejax.agents.buffers import Rollout, Transition
 from sejax.agents.policies import SOFTMAX, gaussian
 from sejax.agents.ppo import (
     MIN_STD,
@@ -31,10 +31,9 @@ from sejax.agents.ppo import (
     ppo_loss,
     shuffled,
 )
-from sejax.agents.replay import Transition
 from sejax.errors import ConfigError
-from sejax.ops.networks import MLP
 from sejax.evaluation import make_tester
+from sejax.ops.networks import MLP
 from sejax.training import TrainingConfig, make_trainer
 
 OBS_DIM, NUM_ACTIONS, ACTION_DIM, MAX_ACTION, MAX_STEPS = 3, 4, 2, 2.0, 6
@@ -99,7 +98,7 @@ def random_steps(kind, seed):
 def pack(steps, ended):
     """Rows as a rollout keeps them."""
     steps = steps._replace(weight=jnp.ones_like(ended))
-    return jnp.concatenate([jax.vmap(replay.pack)(steps), ended[:, None]], axis=1)
+    return jnp.concatenate([jax.vmap(buffers.pack)(steps), ended[:, None]], axis=1)
 
 
 jit_pack = jax.jit(pack)
@@ -375,20 +374,20 @@ def test_a_phase_starts_with_the_step_that_fills_the_rollout(agent):
     state, obs, zero = state_of(agent), np.zeros(OBS_DIM, np.float32), np.float32(0)
     action = jax.eval_shape(functools.partial(agent.act, explore=True), KEY, state, obs)
     example = Transition(obs, np.zeros(action.shape, action.dtype), zero, zero, obs)
-    memory = agent.memory(example, 10_000)
-    assert jax.eval_shape(memory.init).shape[0] == STEPS
+    buffer = agent.buffer(example, 10_000)
+    assert jax.eval_shape(buffer.init).shape[0] == STEPS
 
     def step(carry, number):
         rows, state = carry
         key, key_reward = jax.random.split(jax.random.fold_in(KEY, number))
         action = agent.act(key, state, obs, True)
         transition = example._replace(action=action, reward=jax.random.normal(key_reward))
-        rows = memory.store(rows, number, transition, number % 5 == 4, True)
-        batch = memory.batch(key, rows, number + 1, transition, None)
+        rows = buffer.store(rows, number, transition, number % 5 == 4, True)
+        batch = buffer.batch(key, rows, number + 1, transition, None)
         state = agent.update(key, state, batch)
         return (rows, state), adam_steps(state)
 
-    run = jax.jit(lambda state: jax.lax.scan(step, (memory.init(), state),
+    run = jax.jit(lambda state: jax.lax.scan(step, (buffer.init(), state),
                                              np.arange(2 * STEPS + 3))[1])  # fmt: skip
     counts = run(state)
     phase = CONFIG.epochs * (3 if agent is ppo("gae") else 1)
@@ -514,7 +513,11 @@ def test_the_agent_says_what_was_configured(agent):
         "gae_lambda": 0.8 if agent is ppo("gae") else 0.95, "entropy_weight": 0.05,
         "hidden_size": None,  # all of it
     }  # fmt: skip
-    assert (agent.warmup_episodes, agent.learns_from, agent.action_repeat) == (1, 0, 1)
+    assert (agent.spec.warmup_episodes, agent.spec.learns_from, agent.spec.action_repeat) == (
+        1,
+        0,
+        1,
+    )
 
 
 # --- probes --------------------------------------------------------------------------------------

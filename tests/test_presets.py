@@ -6,12 +6,12 @@ import functools
 import pytest
 
 import sejax
+from experiments.rn_studies import STUDIES
 from sejax import registry
 from sejax.agents.dqn import DDQNConfig
 from sejax.agents.ppo import PPOConfig
 from sejax.cli import presets
 from sejax.errors import ConfigError
-from sejax.experiments.rn_studies import STUDIES
 from sejax.training import TrainingConfig
 
 composed_with = functools.cache(lambda *overrides: sejax.config(overrides))

@@ -15,9 +15,9 @@ from sejax.agents import Agent, make_agent
 from sejax.agents.tabular import QLearningConfig
 from sejax.cli import build
 from sejax.errors import ConfigError
-from sejax.evaluation import make_evaluator, area_under_curve
-from sejax.proxies import ABSURD
-from sejax.proxies.base import World, world_of
+from sejax.evaluation import area_under_curve, make_evaluator
+from sejax.proxies import MAX_ABS_VALUE
+from sejax.proxies.base import episode_limit, is_real
 from sejax.proxies.configs import RewardConfig
 from sejax.proxies.reward import RewardEnv
 from sejax.training import TrainingConfig, TrainResult, make_trainer
@@ -149,7 +149,7 @@ def test_zero_at_terminal_drops_the_potential_there_and_nowhere_else():
 def test_zero_at_terminal_counts_the_step_limit_if_agents_do(limit_is_terminal):
     env = make_env("cartpole", "exclusive_potential", zero_at_terminal=True)
     weights = env.init_weights(jax.random.key(7))
-    params = env.prepared(env.params(weights), GAMMA, limit_is_terminal)
+    params = env.prepare(env.params(weights), GAMMA, limit_is_terminal)
     obs, state = env.reset_env(jax.random.key(8), params)
     for time, ends in ((198, False), (199, True)):  # the next step is the 199th or the 200th
         after, _, reward, terminated, _ = env.step_env(
@@ -164,7 +164,7 @@ def test_zero_at_terminal_counts_the_step_limit_if_agents_do(limit_is_terminal):
 def test_a_training_says_whether_the_limit_is_terminal(limit_is_terminal, monkeypatch):
     seen = []
     monkeypatch.setattr(
-        RewardEnv, "prepared", lambda self, params, discount, limit: seen.append(limit) or params
+        RewardEnv, "prepare", lambda self, params, discount, limit: seen.append(limit) or params
     )
     env = make_env("cliff_walking", zero_at_terminal=True)
     training = TrainingConfig(
@@ -221,7 +221,7 @@ def test_an_absurd_reward_ends_the_episode_instead_of_poisoning_the_agent(value,
     env = make_env("cartpole", "additive_non_potential")
     weights = jax.tree.map(jnp.zeros_like, env.init_weights(jax.random.key(0)))
     weights["potential"]["Dense_1"]["bias"] = jnp.full(1, value)
-    assert abs(value) > ABSURD or np.isnan(value)
+    assert abs(value) > MAX_ABS_VALUE or np.isnan(value)
     params = env.params(weights)
     _, state = env.reset_env(jax.random.key(0), params)
     _, _, reward, terminated, info = env.step_env(jax.random.key(1), state, 0, params)
@@ -247,32 +247,29 @@ def test_the_discount_is_the_agents():
 
 
 def test_an_agent_without_a_discount_is_told_where_one_is_needed():
-    agent = Agent(init=None, act=None, update=None, memory=None, hparams={"rate": 0.1})
+    agent = Agent(init=None, act=None, update=None, buffer=None, hparams={"rate": 0.1})
     env = make_env("cliff_walking")
     with pytest.raises(
         ConfigError, match=r"^agent must say its discount, because additive_potential"
     ):
-        env.prepared(env.default_params, agent.discount(agent.hparams))
+        env.prepare(env.default_params, agent.discount(agent.hparams))
     env = make_env("cliff_walking", "exclusive_non_potential")
-    assert env.prepared(env.default_params, agent.discount(agent.hparams)).discount == 1
+    assert env.prepare(env.default_params, agent.discount(agent.hparams)).discount == 1
 
 
 def test_prepared_params_look_up_what_the_network_says():
     env = make_env("cliff_walking", "exclusive_potential")
     params = env.params(env.init_weights(jax.random.key(1)))
-    prepared = env.prepared(params, GAMMA)
+    prepared = env.prepare(params, GAMMA)
     assert params.potentials is None and prepared.potentials.shape == (48,)
     for state in (0, 36, 47):
         expected = phi(env, params.weights, state)
         for one in (params, prepared):
             np.testing.assert_allclose(env.potential(one, jnp.int32(state)), expected, rtol=1e-5)
     assert prepared.discount == np.float32(GAMMA)
-    assert (
-        world_of(env)
-        == World(is_real=True, max_steps=50)
-        == world_of(env.task.env)._replace(max_steps=50)
-    )
-    assert make_env("cartpole").prepared(params, GAMMA).potentials is None
+    assert is_real(env) and episode_limit(env) == 50
+    assert is_real(env.task.env) and episode_limit(env.task.env) is None
+    assert make_env("cartpole").prepare(params, GAMMA).potentials is None
 
 
 LEARN = ["env=cliff_walking", "proxy=rn", "generations=1", "es.population_size=2",
@@ -283,7 +280,7 @@ def test_steps_on_a_reward_network_are_real_and_scored():
     config = sejax.config([*LEARN, "es.num_incumbent_evals=2", "devices=1"])
     result = jax.jit(sejax.make_learner(config))(jax.random.key(0))
     info = jax.device_get(result.info)
-    steps, real = info.train_steps_total[0], info.env_steps_total[0]
+    steps, real = info.train_steps.sum(), info.real_steps.sum()
     assert real > steps  # those of the tests between and after the training episodes as well
     # -(n_tr + 100 max(0, C_sol - C_fin)), at most 12 episodes of 50 steps, a return of at least
     # -149 where the task is solved at -20.
@@ -302,7 +299,7 @@ def test_training_on_a_reward_network_stops_when_tests_on_the_real_task_solve_it
         evaluate = make_evaluator(agent, env, task, config.training)
         return evaluate(jax.random.key(0), params).train_episodes
 
-    first_that_counts = agent.warmup_episodes + 1
+    first_that_counts = agent.spec.warmup_episodes + 1
     assert episodes(-1000.0) == first_that_counts
     assert episodes(0.0) == config.training.max_episodes == 12
 
@@ -315,7 +312,7 @@ def test_the_area_under_the_curve_is_of_trainings_that_go_on_when_solved(objecti
     asked = []
     monkeypatch.setattr(bilevel, "make_population_evaluator",
                         lambda agent, proxy, training, *_: asked.append(training))  # fmt: skip
-    bilevel.make_program(**config.parts())
+    bilevel.make_bilevel(**config.parts())
     changes = {"stop_rule": "never", "tests_between": 1}
     assert asked == [dataclasses.replace(config.training, **changes)]
 
@@ -399,7 +396,7 @@ def test_an_episode_ends_where_the_tasks_own_does():
     task = sejax.Task(name="early", env=Early())
     config = RewardConfig(variant="exclusive_potential", hidden_size=5, zero_at_terminal=True)
     env = registry.make("proxy", config, task)
-    params = env.prepared(env.params(env.init_weights(KEY)), GAMMA, limit_is_terminal=True)
+    params = env.prepare(env.params(env.init_weights(KEY)), GAMMA, limit_is_terminal=True)
     obs, state = env.reset_env(KEY, params)
     for cut in (False, False, True):
         before = env.potential(params, obs)

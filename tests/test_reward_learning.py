@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 
 import sejax
+from experiments.rn_studies import OBJECTIVES
 from sejax import registry
 from sejax.bilevel import make_learner
-from sejax.experiments.rn_studies import OBJECTIVES
 from sejax.proxies.configs import VARIANTS
 
 pytestmark = [

@@ -203,7 +203,7 @@ class Lines:
     def close(self):
         pass
 
-def make(run, fail_at: int | None = None):
+def make(run, fail_at: int | None = None) -> Lines:
     return Lines(run, fail_at)
 """
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from support import numpy_forward, raveled, shapes_of, unraveled
 
-from sejax.agents.replay import Transition
+from sejax.agents.buffers import Transition
 from sejax.agents.sac import (
     LearningNoise,
     SACConfig,
@@ -323,7 +323,7 @@ def test_the_first_episodes_are_for_warming_up_uniformly(case):
     begin = agent_of(case).begin_episode
     got = [bool(begin(state_of(case), jnp.int32(n)).is_warming_up) for n in range(5)]
     assert got == [True, True, True, False, False]
-    assert (agent_of(case).warmup_episodes, agent_of(case).learns_from) == (3, 3)
+    assert (agent_of(case).spec.warmup_episodes, agent_of(case).spec.learns_from) == (3, 3)
 
 
 def test_the_world_takes_continuous_actions_in_its_own_units():

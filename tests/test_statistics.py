@@ -1,4 +1,4 @@
-"""sejax.statistics: against rliable, scipy, and what can be worked out by hand."""
+"""experiments.statistics: against rliable, scipy, and what can be worked out by hand."""
 
 import itertools
 
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import scipy.stats
 
-from sejax.statistics import (
+from experiments.statistics import (
     bootstrap_interval,
     interquartile_mean,
     mean,

@@ -10,8 +10,8 @@ from support import numpy_forward
 
 from sejax import envs, registry
 from sejax.errors import ConfigError
-from sejax.proxies import ABSURD
-from sejax.proxies.base import World, world_of
+from sejax.proxies import MAX_ABS_VALUE
+from sejax.proxies.base import episode_limit, is_real
 from sejax.proxies.configs import SyntheticConfig
 
 CONFIG = SyntheticConfig(hidden_size=5, num_layers=2, activation="leaky_relu")
@@ -136,7 +136,7 @@ def test_an_episode_terminates_where_the_done_output_exceeds_one_half(step, mode
     [
         {"state": np.nan}, {"state": np.inf}, {"reward": np.nan}, {"reward": -np.inf},
         {"done": np.nan}, {"done": -np.inf},
-        {"state": 2 * ABSURD}, {"reward": -2 * ABSURD}, {"done": -2 * ABSURD},
+        {"state": 2 * MAX_ABS_VALUE}, {"reward": -2 * MAX_ABS_VALUE}, {"done": -2 * MAX_ABS_VALUE},
     ],
     ids=str,
 )  # fmt: skip
@@ -154,10 +154,10 @@ def test_an_absurd_or_nonfinite_output_ends_the_episode_where_it_was(step, mode,
 
 
 def test_outputs_just_below_absurd_are_a_world(step):
-    weights = constant_weights(0.99 * ABSURD, 0.99 * ABSURD, 0.0)
+    weights = constant_weights(0.99 * MAX_ABS_VALUE, 0.99 * MAX_ABS_VALUE, 0.0)
     obs, _, reward, terminated, info = step["soft"](weights)
-    np.testing.assert_allclose(obs, 0.99 * ABSURD)
-    np.testing.assert_allclose(reward, 0.99 * ABSURD)
+    np.testing.assert_allclose(obs, 0.99 * MAX_ABS_VALUE)
+    np.testing.assert_allclose(reward, 0.99 * MAX_ABS_VALUE)
     assert not terminated and not info["nonfinite"]
 
 
@@ -204,7 +204,7 @@ def test_an_output_that_is_no_number_ends_an_episode_whatever_is_drawn(mode):
     env = make_env(done=mode)
     step = jax.jit(lambda key, w: env.step_env(key, state, 1, env.params(w))[2:])
     _, state = env.reset_env(jax.random.key(0), env.default_params)
-    for outputs in ({"done": np.nan}, {"reward": 2 * ABSURD}):
+    for outputs in ({"done": np.nan}, {"reward": 2 * MAX_ABS_VALUE}):
         weights = constant_heads(env, **{"done": -5.0, **outputs})
         reward, terminated, info = step(jax.random.key(1), weights)
         assert terminated and reward == 0.0 and info["discount"] == 0.0
@@ -275,12 +275,12 @@ def test_a_discrete_task_goes_on_from_the_vector_and_not_from_what_is_seen():
     assert obs == np.argmax(after.vector) and env.observation_space().contains(obs)
 
 
-@pytest.mark.parametrize("start", [2 * ABSURD, -np.inf, np.nan])
+@pytest.mark.parametrize("start", [2 * MAX_ABS_VALUE, -np.inf, np.nan])
 def test_an_absurd_start_is_an_episode_of_one_step_that_pays_nothing(start):
     env = make_env(initial_state="learned", horizon=1)
     params = env.params(constant_heads(env, start=start, reward=1.0))
     obs, state = env.reset_env(jax.random.key(0), params)
-    np.testing.assert_array_equal(obs, np.clip(start, -ABSURD, ABSURD) + np.zeros(4))
+    np.testing.assert_array_equal(obs, np.clip(start, -MAX_ABS_VALUE, MAX_ABS_VALUE) + np.zeros(4))
     _, _, reward, terminated, info = env.step_env(jax.random.key(1), state, 0, params)
     assert terminated and reward == 0.0 and info["discount"] == 0.0
     assert info["nonfinite"] == np.isnan(start)
@@ -317,7 +317,7 @@ def test_a_horizon_terminates_an_episode_or_cuts_it(done, is_terminal, discounts
     np.testing.assert_array_equal(terminated, [False, False, is_terminal])
     np.testing.assert_array_equal(truncated, [False, False, not is_terminal])  # as in sejax.gym
     np.testing.assert_allclose(discount, discounts)
-    assert world_of(env) == World(is_real=False, max_steps=3)
+    assert not is_real(env) and episode_limit(env) == 3
     assert env.default_params.max_steps_in_episode == 3
 
 
@@ -353,7 +353,7 @@ def test_a_bandit_has_a_reward_and_nothing_else(done):
     expected = numpy_forward(weights["reward"], x, CONFIG.activation, CONFIG.num_layers)
     np.testing.assert_allclose(reward, expected[0], rtol=1e-5)
     assert terminated and info["discount"] == 0.0 and not info["nonfinite"]
-    assert world_of(env).max_steps == 1
+    assert episode_limit(env) == 1
 
 
 def test_a_bandit_with_learned_starts_has_two_networks():
@@ -447,4 +447,4 @@ def test_spaces_and_names_are_those_of_the_task():
     assert env.observation_space().shape == (6,)
     assert env.name == "Synthetic-acrobot"
     assert make_env("acrobot") is env  # one instance for each configuration
-    assert world_of(env) == World(is_real=False, max_steps=500)
+    assert not is_real(env) and episode_limit(env) == 500

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from sejax import envs
-from sejax.agents.epsilon_greedy import decayed_epsilon
-from sejax.agents.replay import Transition
+from sejax.agents.buffers import Transition
+from sejax.agents.policies import decayed_epsilon
 from sejax.agents.tabular import (
     QLearningConfig,
     SARSAConfig,
@@ -216,12 +216,12 @@ def test_the_defaults_are_the_papers_and_an_agent_is_made_once(make):
         "learning_rate": 1.0, "discount": 0.8,
         "epsilon_init": 0.1, "epsilon_min": 0.1, "epsilon_decay": 0.0,
     }  # fmt: skip
-    assert (agent.warmup_episodes, agent.learns_from) == (0, 0)
+    assert (agent.spec.warmup_episodes, agent.spec.learns_from) == (0, 0)
 
 
 def test_learning_starts_after_the_initial_episodes():
     agent = q_learning(warmup_episodes=4)
-    assert (agent.warmup_episodes, agent.learns_from) == (4, 4)
+    assert (agent.spec.warmup_episodes, agent.spec.learns_from) == (4, 4)
 
 
 # --- exploration ---------------------------------------------------------------------------------

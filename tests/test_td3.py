@@ -11,7 +11,7 @@ import pytest
 from support import numpy_forward, raveled, shapes_of, unraveled
 
 from sejax import envs
-from sejax.agents.replay import Transition
+from sejax.agents.buffers import Transition
 from sejax.agents.td3 import (
     DiscreteTD3Config,
     LearningNoise,
@@ -27,8 +27,8 @@ from sejax.agents.td3 import (
     smoothed_target_action,
     tanh_policy,
 )
-from sejax.ops.networks import MLP
 from sejax.evaluation import make_tester
+from sejax.ops.networks import MLP
 from sejax.training import TrainingConfig, make_trainer
 
 OBS_DIM, ACTION_DIM, BATCH, MAX_ACTION = 3, 2, 7, 2.0
@@ -487,7 +487,7 @@ def test_the_first_episodes_are_for_warming_up(config):
     begin = agent_of(config).begin_episode
     got = [bool(begin(state_of(config), jnp.int32(n)).is_warming_up) for n in range(5)]
     assert got == [True, True, True, False, False]
-    assert (agent_of(config).warmup_episodes, agent_of(config).learns_from) == (3, 3)
+    assert (agent_of(config).spec.warmup_episodes, agent_of(config).spec.learns_from) == (3, 3)
 
 
 def test_warm_up_actions_are_uniform_in_the_range():
@@ -572,7 +572,11 @@ def test_the_agent_holds_the_configured_numbers():
         "action_noise_std": 0.3, "target_noise_std": 0.4, "target_noise_clip": 0.5,
         "hidden_size": None, "batch_size": None,  # all of them
     }  # fmt: skip
-    assert (agent.action_repeat, agent.warmup_episodes, agent.learns_from) == (4, 6, 6)
+    assert (agent.spec.action_repeat, agent.spec.warmup_episodes, agent.spec.learns_from) == (
+        4,
+        6,
+        6,
+    )
     assert agent_of(DISCRETE).hparams._asdict() == {
         "learning_rate": 0.01, "tau": 0.1, "discount": 0.9,
         "action_noise_std": 0.1, "target_noise_std": 0.4, "target_noise_clip": 0.5,
@@ -585,12 +589,12 @@ def test_the_memory_hands_out_action_vectors():
     action = np.float32([0.25, -1.5])
     one = Transition(np.ones(3, np.float32), action, np.float32(2.0), np.float32(0.5),
                      np.zeros(3, np.float32))  # fmt: skip
-    memory = agent_of(CONFIG).memory(jax.eval_shape(lambda: one), 10)
+    buffer = agent_of(CONFIG).buffer(jax.eval_shape(lambda: one), 10)
 
     @jax.jit
     def draw(key):
-        kept = memory.store(memory.init(), jnp.int32(0), one, False, True)
-        return memory.batch(key, kept, jnp.int32(1), one, None)
+        kept = buffer.store(buffer.init(), jnp.int32(0), one, False, True)
+        return buffer.batch(key, kept, jnp.int32(1), one, None)
 
     batch = draw(jax.random.key(0))
     np.testing.assert_array_equal(batch.action, np.tile(action[:, None], batch.obs.shape[1]))

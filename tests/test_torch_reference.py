@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from jax.flatten_util import ravel_pytree
 
+from sejax.agents.buffers import Transition
 from sejax.agents.dqn import DDQNConfig, make_ddqn
-from sejax.agents.replay import Transition
 from sejax.ops.networks import MLP
 from sejax.proxies.configs import SyntheticConfig
 from sejax.training import TrainingConfig

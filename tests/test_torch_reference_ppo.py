@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 from jax.flatten_util import ravel_pytree
 
-from sejax.agents import replay
-from sejax.agents.memory import Rollout
+from sejax.agents import buffers
+from sejax.agents.buffers import Rollout, Transition
 from sejax.agents.ppo import PPOConfig, make_ppo
-from sejax.agents.replay import Transition
 from sejax.ops.networks import MLP
 from sejax.proxies.configs import SyntheticConfig
 from sejax.training import TrainingConfig
@@ -61,7 +60,7 @@ def test_a_learning_phase_equals_sejaxs_on_the_same_rollout():
         weight=jnp.ones(STEPS),
     )
     ended = np.isin(np.arange(STEPS), (3, 9))
-    rows = jnp.concatenate([jax.vmap(replay.pack)(steps), jnp.float32(ended)[:, None]], axis=1)
+    rows = jnp.concatenate([jax.vmap(buffers.pack)(steps), jnp.float32(ended)[:, None]], axis=1)
     rollout = Rollout(rows=rows, is_full=jnp.bool_(True))
     state = jax.jit(agent.update)(jax.random.key(0), state, rollout)
     torch_ppo.ppo_phase(

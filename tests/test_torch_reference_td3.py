@@ -10,7 +10,7 @@ import pytest
 from jax.flatten_util import ravel_pytree
 
 from sejax import envs
-from sejax.agents.replay import Transition
+from sejax.agents.buffers import Transition
 from sejax.agents.td3 import (
     LearningNoise,
     TD3Config,

@@ -15,12 +15,12 @@ from scripted import MAX_EPISODES, MAX_STEPS, WHO, ScriptedEnv, script, scripted
 from support import numpy_forward
 
 from sejax import envs, evaluation, registry
+from sejax.agents.buffers import Buffer, rollout_buffer
 from sejax.agents.dqn import DDQNConfig, make_ddqn
-from sejax.agents.memory import Memory, rollout_memory
 from sejax.agents.tabular import QLearningConfig
 from sejax.errors import ConfigError
-from sejax.proxies.configs import SyntheticConfig
 from sejax.evaluation import _Greedy, make_recorder, make_tester
+from sejax.proxies.configs import SyntheticConfig
 from sejax.training import TrainingConfig, is_plateau, is_solved, make_trainer
 
 WINDOW, TOLERANCE, SOLVED, INIT_EPISODES = 2, 0.25, 1.5, 2
@@ -387,14 +387,14 @@ def test_the_world_sees_what_the_agent_means_and_the_memory_what_it_did():
 
 def test_a_memory_is_asked_when_it_has_the_step_just_made():
     def counting(example, max_steps):
-        return Memory(init=lambda: jnp.int32(0), store=lambda count, *_: count + 1,
+        return Buffer(init=lambda: jnp.int32(0), store=lambda count, *_: count + 1,
                       batch=lambda key, count, num_steps, *_: (count, num_steps))  # fmt: skip
 
     def update(key, state, batch):
         count, num_steps = batch
         return state.replace(min_discount=jnp.minimum(state.min_discount, count == num_steps))
 
-    agent = dataclasses.replace(scripted_agent(warmup_episodes=0), memory=counting, update=update)
+    agent = dataclasses.replace(scripted_agent(warmup_episodes=0), buffer=counting, update=update)
     result = make_trainer(agent, ENV, training(stop_rule="never"))(KEY, script([0] * 12, [3] * 12))
     assert result.agent_state.min_discount == 1
 
@@ -490,7 +490,7 @@ def test_a_lane_that_has_stopped_has_nobody_wait_for_its_tests_and_phases():
         return state
 
     agent = dataclasses.replace(
-        scripted_agent(warmup_episodes=0), update=update, memory=rollout_memory(13)
+        scripted_agent(warmup_episodes=0), update=update, buffer=rollout_buffer(13)
     )
     config = training(stop_rule="never", max_steps=24, tests_between=1)
     train = make_trainer(agent, ENV, config, test_fn=tested)
@@ -604,7 +604,7 @@ def row_recorder(example, max_steps):
         row = jnp.stack([transition.action // WHO, transition.obs[0].astype(int), ended])
         return rows.at[step].set(jnp.where(active, row, rows[step]))
 
-    return Memory(init=lambda: jnp.full((max_steps, 3), -1), store=store, batch=None)
+    return Buffer(init=lambda: jnp.full((max_steps, 3), -1), store=store, batch=None)
 
 
 @pytest.fixture(scope="module")

@@ -13,12 +13,10 @@ from jax.flatten_util import ravel_pytree
 
 from sejax import envs
 from sejax.agents import make_agent
-from sejax.agents.base import Agent, Draw, NoExploration, drawing_key
-from sejax.agents.count_based import CountBasedConfig
+from sejax.agents.base import Agent, AgentConfig, Draw, NoExploration, Varied, drawing_key
+from sejax.agents.buffers import Transition, block_size, no_buffer, sum_over_batch
 from sejax.agents.dqn import DDQNConfig, DuelingDDQNConfig, make_ddqn
-from sejax.agents.memory import no_memory
-from sejax.agents.partial_batch import block_size, sum_over_batch
-from sejax.agents.replay import Transition
+from sejax.agents.exploration import CountBasedConfig
 from sejax.agents.tabular import QLearningConfig
 from sejax.agents.varied import Range, draw_value, hidden_sizes, ranges_of
 from sejax.errors import ConfigError
@@ -228,16 +226,16 @@ def test_every_drawn_agent_finds_a_network_with_room():
     task = envs.make("cartpole")
     config = DDQNConfig(hidden_size=8, num_layers=2, batch_size=16)
     varied = make_agent(config, task, varied=True)
-    draws = jax.jit(jax.vmap(varied.draw))(jax.random.split(jax.random.key(0), 200))
+    draws = jax.jit(jax.vmap(varied.varied.draw))(jax.random.split(jax.random.key(0), 200))
     values = {name: np.asarray(x) for name, x in draws.values.items()}
     bounds = ranges_of(config)
     assert set(values) == set(bounds)
     sizes = {depth: hidden_sizes(bounds["hidden_size"], depth) for depth in (1, 2, 3)}
-    assert len(varied.variants) == sum(map(len, sizes.values()))
+    assert len(varied.varied.agents) == sum(map(len, sizes.values()))
 
     @functools.cache
     def num_params(index):
-        agent = varied.variants[index]
+        agent = varied.varied.agents[index]
         return jax.eval_shape(agent.init, jax.random.key(0), agent.hparams).params.shape[0]
 
     for index, hidden, depth in zip(draws.variant.tolist(), values["hidden_size"],
@@ -245,16 +243,16 @@ def test_every_drawn_agent_finds_a_network_with_room():
         room = min(size for size in sizes[int(depth)] if size >= hidden)
         inner = (int(depth) - 1) * room * (room + 1)
         assert num_params(index) == room * 5 + inner + 2 * (room + 1)
-    assert len(set(draws.variant.tolist())) == len(varied.variants)
+    assert len(set(draws.variant.tolist())) == len(varied.varied.agents)
 
 
 def test_what_is_drawn_is_what_the_agent_learns_with_and_comes_from_the_trainings_key():
     config = DDQNConfig(hidden_size=2, num_layers=1, batch_size=16, discount=0.9)
     varied = make_agent(config, envs.make("cartpole"), varied=True)
     key = jax.random.key(3)
-    drawn, values = jax.jit(lambda key: (varied.draw(drawing_key(key)), varied.drawn_values(key)))(
-        key
-    )
+    drawn, values = jax.jit(
+        lambda key: (varied.varied.draw(drawing_key(key)), varied.drawn_values(key))
+    )(key)
     assert drawn.values == values
     hparams = drawn.hparams._asdict()
     for name in ("learning_rate", "batch_size", "hidden_size"):
@@ -263,13 +261,13 @@ def test_what_is_drawn_is_what_the_agent_learns_with_and_comes_from_the_training
     # Room for the largest batch is in all variants; the agent itself is the configured one.
     plain = make_agent(config, envs.make("cartpole"))
     assert varied.hparams == plain.hparams and plain.drawn_values(key) == {}
-    assert plain.variants == () and plain.draw is None
+    assert plain.varied is None
 
 
 def test_the_agent_inside_an_exploring_one_is_varied():
     varied = make_agent(QLearningConfig(), envs.make("gridworld_2x2"), CountBasedConfig(), True)
-    (variant,) = varied.variants
-    drawn = jax.jit(varied.draw)(jax.random.key(0))
+    (variant,) = varied.varied.agents
+    drawn = jax.jit(varied.varied.draw)(jax.random.key(0))
     assert drawn.variant == 0
     expected = variant.hparams.agent._replace(**drawn.values)
     assert drawn.hparams == variant.hparams._replace(agent=expected)
@@ -283,7 +281,7 @@ def test_a_varied_agent_is_made_once():
 
 
 @dataclasses.dataclass(frozen=True)
-class ForeignConfig:
+class ForeignConfig(AgentConfig):
     """Of an agent that knows nothing of sejax's options."""
 
     learning_rate: float = 0.5
@@ -299,7 +297,7 @@ class Numbers(NamedTuple):
 def agent_that(name, **fields):
     """An agent of which nothing but its identity matters."""
     return Agent(
-        init=lambda key, hparams: name, act=None, update=None, memory=no_memory(),
+        init=lambda key, hparams: name, act=None, update=None, buffer=no_buffer(),
         hparams=Numbers(rate=1.0), **fields,
     )  # fmt: skip
 
@@ -329,7 +327,7 @@ def test_a_fresh_agent_is_the_variant_that_was_drawn_with_what_was_drawn_for_it(
         rate = values["rate"][index]
         return Draw(variant=index, hparams=Numbers(rate), values={"rate": rate})
 
-    varied = dataclasses.replace(plain, variants=variants, draw=draw)
+    varied = dataclasses.replace(plain, varied=Varied(agents=variants, draw=draw))
     built = []
 
     def make_run(agent):
@@ -364,19 +362,19 @@ def test_trainings_with_drawn_hyperparameters_equal_those_with_the_same_given():
     # Two networks, of one and of two layers; hidden sizes from 1 to 6, batches from 1 to 12.
     config = DDQNConfig(hidden_size=2, num_layers=1, batch_size=4, warmup_episodes=0)
     varied = make_agent(config, task, varied=True)
-    assert len(varied.variants) == 2
+    assert len(varied.varied.agents) == 2
     keys = jax.random.split(jax.random.key(5), 3)
     outcome = evaluate_agents(varied, env, env.default_params, task, training, keys, devices=1)
 
     @functools.cache
     def alone(variant):
         def train(key, hparams):
-            agent = dataclasses.replace(varied.variants[variant], hparams=hparams)
+            agent = dataclasses.replace(varied.varied.agents[variant], hparams=hparams)
             return make_evaluator(agent, env, task, training)(key, env.default_params)
 
         return jax.jit(train)
 
-    draw = jax.jit(lambda key: varied.draw(drawing_key(key)))
+    draw = jax.jit(lambda key: varied.varied.draw(drawing_key(key)))
     draws = [draw(key) for key in keys]
     assert {int(drawn.variant) for drawn in draws} == {0, 1}
     for i, (key, drawn) in enumerate(zip(keys, draws, strict=True)):

@@ -9,8 +9,8 @@ import numpy as np
 import torch
 from test_ddqn import CASES, GOLDEN, NUM_ACTIONS, OBS_DIM, q_network, random_batch
 
+from sejax.agents.buffers import Transition
 from sejax.agents.dqn import make_ddqn
-from sejax.agents.replay import Transition
 
 NUM_UPDATES = 5
 

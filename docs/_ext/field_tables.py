@@ -15,7 +15,7 @@ from typing import Any
 
 from sphinx.application import Sphinx
 
-from sejax.experiments.settings import Settings
+from experiments.settings import Settings
 
 
 def comments_of_fields(cls: type) -> dict[str, str]:

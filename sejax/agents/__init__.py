@@ -1,35 +1,54 @@
 """Agents: bundles of pure functions, a file each with configuration and learning.
 
-What one's own agent is made of is here too: `AgentOptions` for its configuration, `traced` for the
-hyperparameters that compiled programs take as arguments, and the memories.
+Parts of your own agent are here too: `AgentOptions` for its configuration, `traced` for the
+hyperparameters that compiled programs take as arguments, and the buffers.
 """
 
+import dataclasses
 import functools
 from typing import Any
 
 from sejax import registry
-from sejax.agents.base import Agent, AgentOptions, NoExploration, traced
-from sejax.agents.memory import Memory, Rollout, no_memory, replay_memory, rollout_memory
-from sejax.agents.replay import Transition
+from sejax.agents.base import (
+    Agent,
+    AgentConfig,
+    AgentOptions,
+    AgentSpec,
+    ExplorationConfig,
+    NoExploration,
+    Spaces,
+    traced,
+)
+from sejax.agents.buffers import (
+    Buffer,
+    Rollout,
+    Transition,
+    no_buffer,
+    replay_buffer,
+    rollout_buffer,
+)
 from sejax.errors import require
 
 __all__ = [
     "Agent",
+    "AgentConfig",
     "AgentOptions",
-    "Memory",
+    "AgentSpec",
+    "Buffer",
+    "ExplorationConfig",
     "NoExploration",
     "Rollout",
     "Transition",
     "make_agent",
     "names",
-    "no_memory",
-    "replay_memory",
+    "no_buffer",
+    "replay_buffer",
     "require_fit",
-    "rollout_memory",
+    "rollout_buffer",
     "traced",
 ]
 
-DEFAULTS = ("ddqn", "td3", "q_learning")  # of which the first that suits a task is its own
+DEFAULTS = ("ddqn", "td3", "q_learning")  # the default for a task is the first that fits it
 
 
 def names() -> list[str]:
@@ -38,28 +57,28 @@ def names() -> list[str]:
 
 
 def make_agent(
-    config: Any,
+    config: AgentConfig,
     task: Any,
-    exploration: Any = NoExploration(),  # noqa: B008 (frozen)
+    exploration: ExplorationConfig = NoExploration(),  # noqa: B008 (frozen)
     varied: bool = False,
 ) -> Agent:
     """The agent for a task's observations and actions; the same object for the same arguments.
 
     Args:
-      config: of the agent, such as `DDQNConfig()`; anything with `make(task) -> Agent`.
-      task: the real task.
+      config: of the agent, such as `DDQNConfig()`.
+      task: the real task, a `sejax.Task`.
       exploration: intrinsic reward, such as `ICMConfig()`.
       varied: whether hyperparameters are drawn anew for each training (paper, appendix "Varied
         Agent Hyperparameters").
 
     Raises:
-      ConfigError: if the agent does not suit the task's states or actions, or the exploration the
-        agent; or if none of a varied agent's options says how it is drawn.
+      ConfigError: if the agent does not fit the task's observations or actions, or the exploration
+        the agent; or if none of a varied agent's options says how it is drawn.
 
     Example:
       >>> import sejax
       >>> agent = make_agent(sejax.DDQNConfig(hidden_size=64), sejax.envs.make("cartpole"))
-      >>> agent.warmup_episodes
+      >>> agent.spec.warmup_episodes
       10
     """
     require(
@@ -70,14 +89,6 @@ def make_agent(
         type(task).__name__,
         "task to env.task, or sejax.Task(name=..., env=env)",
     )
-    require(
-        hasattr(config, "make") and not isinstance(config, type),
-        "config",
-        "be an agent's configuration",
-        "the agent is made by it",
-        config,
-        "config to such as sejax.DDQNConfig()",
-    )
     require_fit(config, exploration, task.facts, task.name)
     return _make_agent(registry.Same(config, exploration), task, varied)
 
@@ -86,10 +97,12 @@ def make_agent(
 def _make_agent(key: registry.Same, task: Any, varied: bool) -> Agent:
     config, exploration = key.configs
 
-    def make(config: Any) -> Agent:
+    def make(config: AgentConfig) -> Agent:
         agent = registry.make("agent", config, task)
-        return registry.make("exploration", exploration, agent, task)
+        agent = registry.make("exploration", exploration, agent, task)
+        return dataclasses.replace(agent, spec=dataclasses.replace(agent.spec, spaces=spaces))
 
+    spaces = Spaces(task.num_states, task.obs_dim, task.num_actions, task.action_dim)
     if not varied:
         return make(config)
     from sejax.agents.varied import make_varied
@@ -97,11 +110,13 @@ def _make_agent(key: registry.Same, task: Any, varied: bool) -> Agent:
     return make_varied(config, make)
 
 
-def require_fit(agent: Any, exploration: Any, facts: Any, task_name: str) -> None:
-    """Checks that an agent can act in a task, and that it can be made to explore so.
+def require_fit(
+    agent: AgentConfig, exploration: ExplorationConfig, facts: Any, task_name: str
+) -> None:
+    """Checks that an agent can act in a task, and that it can explore so.
 
     Args:
-      agent: its configuration; one without `states` and `actions` suits every task.
+      agent: its configuration.
       exploration: that of its intrinsic reward.
       facts: of the task (`sejax.envs.Facts`).
       task_name: for messages.
@@ -109,8 +124,17 @@ def require_fit(agent: Any, exploration: Any, facts: Any, task_name: str) -> Non
     Raises:
       ConfigError: if it cannot.
     """
-    if not _suits(agent, facts):
-        fitting = [name for name in names() if _suits(registry.find("agent", name), facts)]
+    for value, kind in ((agent, AgentConfig), (exploration, ExplorationConfig)):
+        require(
+            isinstance(value, kind),
+            kind.group,
+            f"be a sejax.agents.{kind.__name__}",
+            "it says what it fits and makes",
+            value,
+            f"{kind.group} to an instance of a subclass",
+        )
+    if not _fits(agent, facts):
+        fitting = [name for name in names() if _fits(registry.find("agent", name), facts)]
         require(
             False,
             "agent",
@@ -119,38 +143,29 @@ def require_fit(agent: Any, exploration: Any, facts: Any, task_name: str) -> Non
             registry.name_of("agent", agent),
             f"agent={fitting[0]}",
         )
-    for field in ("train_every", "gradient_steps") if _learns_each_step(exploration) else ():
-        value = getattr(agent, field, 1)
-        require(
-            value == 1,
-            f"agent.{field}",
-            f"be 1 with exploration={registry.name_of('exploration', exploration)}",
-            "its module learns once at each step, and so must the agent",
-            value,
-            f"agent.{field}=1",
-        )
-    wanted = getattr(exploration, "states", None)
-    name = registry.name_of("agent", agent)
     require(
-        wanted in (None, getattr(agent, "states", wanted)),
+        agent.learns_each_step or not exploration.needs_each_step,
         "exploration",
-        f"suit {name}",
-        f"{registry.name_of('exploration', exploration)} is made for agents with {wanted} states",
+        "be none with this agent's train_every and gradient_steps",
+        "its module learns once at each step, and so must the agent",
+        registry.name_of("exploration", exploration),
+        "exploration=none, or both of these to 1",
+    )
+    require(
+        exploration.states is None or agent.states in (None, exploration.states),
+        "exploration",
+        f"fit {registry.name_of('agent', agent)}",
+        f"it is made for agents with {exploration.states} states",
         registry.name_of("exploration", exploration),
         "exploration=none",
     )
 
 
-def _learns_each_step(exploration: Any) -> bool:
-    return getattr(exploration, "learns_each_step", False)
-
-
 def default_for(facts: Any) -> str:
-    """The agent that is chosen for a task where none is asked for: the first that suits it."""
-    fitting = (name for name in DEFAULTS if _suits(registry.find("agent", name), facts))
-    return next(fitting, DEFAULTS[0])  # which will be refused, if none does
+    """The default agent of a task: the first that fits it."""
+    fitting = (name for name in DEFAULTS if _fits(registry.find("agent", name), facts))
+    return next(fitting, DEFAULTS[0])  # which `require_fit` refuses, if none does
 
 
-def _suits(agent: Any, facts: Any) -> bool:
-    states, actions = getattr(agent, "states", None), getattr(agent, "actions", None)
-    return states in (None, facts.states) and (actions is None or facts.actions in actions)
+def _fits(agent: AgentConfig | type[AgentConfig], facts: Any) -> bool:
+    return agent.states in (None, facts.states) and facts.actions in agent.actions

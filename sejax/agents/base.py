@@ -4,13 +4,89 @@ import collections
 import functools
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple, Protocol
 
 import jax
-from jaxtyping import Array
+from jaxtyping import Array, Int
 
-from sejax.agents.memory import MemoryMaker
+from sejax.agents.buffers import BufferMaker
 from sejax.options import Options, counts, option, traced_options
+
+# A pytree of whatever the agent needs; nobody else looks into it.
+AgentState = Any
+# Traced hyperparameters of an agent: a pytree of floats, see `traced`.
+Hparams = Any
+
+
+class InitFn(Protocol):
+    """The state of a fresh agent, which keeps its hyperparameters."""
+
+    def __call__(self, key: Array, hparams: Hparams, /) -> AgentState: ...
+
+
+class ActFn(Protocol):
+    """The action for one observation; `explore` is a Python bool."""
+
+    def __call__(self, key: Array, state: AgentState, obs: Array, /, explore: bool) -> Array: ...
+
+
+class UpdateFn(Protocol):
+    """One learning step on a batch from the agent's buffer."""
+
+    def __call__(self, key: Array, state: AgentState, batch: Any, /) -> AgentState: ...
+
+
+class Spaces(NamedTuple):
+    """The observations and actions that an agent is made for.
+
+    Attributes:
+      num_states: number of states, if an observation is an index; else None.
+      obs_dim: length of an observation as networks see it.
+      num_actions: number of discrete actions; None for continuous ones.
+      action_dim: length of an action as networks see it.
+    """
+
+    num_states: int | None
+    obs_dim: int
+    num_actions: int | None
+    action_dim: int
+
+    @classmethod
+    def of_env(cls, env: Any) -> "Spaces":
+        """Those of a gymnax environment, or of a proxy."""
+        with jax.ensure_compile_time_eval():  # gymnax computes some spaces
+            params = env.default_params
+            observations, actions = env.observation_space(params), env.action_space(params)
+            num_states, num_actions = (
+                int(space.n) if hasattr(space, "n") else None for space in (observations, actions)
+            )
+            return cls(
+                num_states=num_states,
+                obs_dim=num_states or int(observations.shape[0]),
+                num_actions=num_actions,
+                action_dim=num_actions or int(actions.shape[0]),
+            )
+
+
+@dataclass(frozen=True, kw_only=True)
+class AgentSpec:
+    """What is known of an agent before it is compiled.
+
+    Attributes:
+      warmup_episodes: episodes at the start of which no stop rule may judge.
+      learns_from: first episode, counted from 0, in which the agent learns.
+      action_repeat: environment steps for each decision.
+      cpu_num_parallel: `vmap` width on one CPU core; None for all agents. A network keeps a core
+        busy alone, a table does not.
+      spaces: observations and actions that it is made for, as `sejax.make_agent` says; None if
+        nobody says.
+    """
+
+    warmup_episodes: int = 0
+    learns_from: int = 0
+    action_repeat: int = 1
+    cpu_num_parallel: int | None = 1
+    spaces: Spaces | None = None
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -20,44 +96,34 @@ class Agent:
     Build an agent once: what is compiled for it is kept by identity.
 
     Attributes:
-      init: `(key, hparams) -> state`. `hparams` are the agent's traced numbers, kept in its state.
-      begin_episode: `(state, episode) -> state`; applies schedules that move with episodes.
-      act: `(key, state, obs, explore) -> action`, as the agent remembers it; `explore` is a Python
-        bool.
-      update: `(key, state, batch) -> state`; one learning step on what `memory` hands out.
-      memory: how steps are kept, from `sejax.agents.memory`.
+      init: `(key, hparams) -> state`.
+      act: `(key, state, obs, explore) -> action`, as the buffer keeps it.
+      update: `(key, state, batch) -> state`; one learning step on what `buffer` hands out.
+      buffer: how steps are kept, from `sejax.agents.buffers`.
       hparams: the default traced hyperparameters, a pytree of floats.
-      warmup_episodes: episodes at the start of which no stop rule may judge.
-      learns_from: first episode, counted from 0, in which the agent learns.
-      env_action: `action -> action` as the world takes it.
-      action_repeat: steps of the world for each decision.
-      discount: `hparams -> []`, gamma, which a potential-based reward needs; None if there is none.
-      batch_size: `state -> []` or None: columns of a batch in use, where hyperparameters vary.
-      cpu_num_parallel: agents that best train in lockstep on a CPU core; None for all of them.
-        A network keeps a core busy alone, a table does not.
-      variants: agents of other sizes, of which each training takes one, if hyperparameters are
-        drawn for each (`sejax.agents.varied`); empty if they are not.
-      draw: `key -> Draw`, which one and with which hyperparameters.
-      solve: `(env, env_params, hparams) -> state`, the trained agent, where a world's optimum is
-        known; then nothing is trained. None for agents that learn.
+      spec: what is known before it is compiled.
+      begin_episode: `(state, episode) -> state`; applies schedules that move with episodes.
+      env_action: `action -> action` as the environment takes it.
+      discount: `hparams -> []`, gamma, which a potential-based reward needs; None if the agent has
+        none.
+      batch_size: `state -> []`, columns of a batch in use where hyperparameters vary; None for all.
+      varied: how hyperparameters are drawn for each training; None if they are not.
+      solve: `(env, env_params, hparams) -> state`, the trained agent, where an environment's
+        optimum is known; then nothing is trained. None for agents that learn.
     """
 
-    init: Callable[..., Any]
-    begin_episode: Callable[..., Any] = lambda state, episode: state
-    act: Callable[..., Any]
-    update: Callable[..., Any]
-    memory: MemoryMaker
-    hparams: Any
-    warmup_episodes: int = 0
-    learns_from: int = 0
-    env_action: Callable[[Any], Any] = lambda action: action
-    action_repeat: int = 1
-    discount: Callable[[Any], Any] = lambda hparams: getattr(hparams, "discount", None)
-    batch_size: Callable[[Any], Any] = lambda state: None
-    cpu_num_parallel: int | None = 1
-    variants: tuple["Agent", ...] = ()
-    draw: Callable[[Array], "Draw"] | None = None
-    solve: Callable[[Any, Any, Any], Any] | None = None
+    init: InitFn
+    act: ActFn
+    update: UpdateFn
+    buffer: BufferMaker
+    hparams: Hparams
+    spec: AgentSpec = AgentSpec()
+    begin_episode: Callable[[AgentState, Int[Array, ""]], AgentState] = lambda state, episode: state
+    env_action: Callable[[Array], Array] = lambda action: action
+    discount: Callable[[Hparams], Array | float | None] = lambda hparams: None
+    batch_size: Callable[[AgentState], Array | None] = lambda state: None
+    varied: "Varied | None" = None
+    solve: Callable[[Any, Any, Hparams], AgentState] | None = None
 
     def fresh(self, make_run: Callable[["Agent"], Callable[..., Any]]) -> Callable[..., Any]:
         """Builds `run(key, *args)` for a fresh agent, whose hyperparameters may be drawn first.
@@ -69,10 +135,10 @@ class Agent:
           The run of this agent with its own hyperparameters; or, if they are drawn, of the variant
           that has room for those drawn from `key`.
         """
-        if self.draw is None:
+        if self.varied is None:
             run_self = make_run(self)
             return lambda key, *args: run_self(key, *args, self.hparams)
-        draw, runs = self.draw, [make_run(agent) for agent in self.variants]
+        draw, runs = self.varied.draw, [make_run(agent) for agent in self.varied.agents]
 
         def run(key: Array, *args: Any) -> Any:
             drawn = draw(drawing_key(key))
@@ -82,7 +148,7 @@ class Agent:
 
     def drawn_values(self, key: Array) -> dict[str, Array]:
         """The hyperparameters that `fresh` draws for a training with this key, by name."""
-        return {} if self.draw is None else self.draw(drawing_key(key)).values
+        return {} if self.varied is None else self.varied.draw(drawing_key(key)).values
 
 
 @jax.tree_util.register_dataclass
@@ -91,14 +157,27 @@ class Draw:
     """Hyperparameters of one training.
 
     Attributes:
-      variant: index of the agent in `Agent.variants`, `[]` int32.
+      variant: index of the agent in `Varied.agents`, `[]` int32.
       hparams: its traced hyperparameters.
       values: what was drawn, `[]` each, by the names of the configuration's fields.
     """
 
     variant: Array
-    hparams: Any
+    hparams: Hparams
     values: dict[str, Array]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Varied:
+    """Hyperparameters that are drawn for each training; see `sejax.agents.varied`.
+
+    Attributes:
+      agents: agents of several sizes, of which each training takes one.
+      draw: `key -> Draw`, which agent and which hyperparameters.
+    """
+
+    agents: tuple[Agent, ...]
+    draw: Callable[[Array], Draw]
 
 
 def drawing_key(key: Array) -> Array:
@@ -107,28 +186,83 @@ def drawing_key(key: Array) -> Array:
 
 
 @dataclass(frozen=True, kw_only=True)
-class AgentOptions(Options):
-    """What the configurations of sejax's agents share.
+class AgentConfig(Options):
+    """An agent's configuration: what it fits, and what it makes. Every agent's is a subclass.
 
-    Class attributes say which tasks an agent fits: `states` is "vector" or "discrete", `actions`
-    lists "discrete" and "continuous". A configuration without them fits all.
+    Attributes:
+      states: the observations that it fits, "vector" or "discrete"; None for both.
+      actions: the actions that it fits, of "discrete" and "continuous".
+      is_solved_for: whether its agents have `Agent.solve`, so that they cannot train on a real
+        task.
     """
 
     group: ClassVar[str] = "agent"
-    states: ClassVar[str] = "vector"
+    states: ClassVar[str | None] = None
+    actions: ClassVar[tuple[str, ...]] = ("discrete", "continuous")
+    is_solved_for: ClassVar[bool] = False
+
+    @property
+    def learns_each_step(self) -> bool:
+        """Whether each step has one learning step, as ICM needs it."""
+        return True
+
+    def make(self, task: Any) -> Agent:
+        """The agent for a task's observations and actions."""
+        raise NotImplementedError
+
+    def steps_before_learning(self, max_episode_steps: int, task_max_steps: int) -> int:
+        """Training steps before the agent first learns.
+
+        Args:
+          max_episode_steps: limit of the episodes that it trains on, which may all last so long.
+          task_max_steps: limit of the task that it was made for.
+        """
+        return 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class AgentOptions(AgentConfig):
+    """What the configurations of sejax's learning agents share."""
+
+    states: ClassVar[str | None] = "vector"
     actions: ClassVar[tuple[str, ...]] = ("discrete",)
 
     # Episodes before learning starts and before a stop rule may judge.
     warmup_episodes: int = option(10, counts("it counts episodes", least=0))
 
     def steps_before_learning(self, max_episode_steps: int, task_max_steps: int) -> int:
-        """Training steps before the agent first learns.
-
-        Args:
-          max_episode_steps: of the episodes that it trains on, which last so long.
-          task_max_steps: limit of the task that it was made for.
-        """
         return self.warmup_episodes * max_episode_steps
+
+    def spec(self, **more: Any) -> AgentSpec:
+        """The spec of an agent that learns once it has warmed up, with further fields."""
+        warmup = self.warmup_episodes
+        return AgentSpec(**({"warmup_episodes": warmup, "learns_from": warmup} | more))
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExplorationConfig(Options):
+    """The configuration of an intrinsic reward: what it fits, and what it makes.
+
+    Attributes:
+      states: the observations of the agents that it fits, "vector" or "discrete"; None for both.
+      needs_each_step: whether the agent must learn once at each step.
+    """
+
+    group: ClassVar[str] = "exploration"
+    states: ClassVar[str | None] = None
+    needs_each_step: ClassVar[bool] = False
+
+    def make(self, agent: Agent, task: Any) -> Agent:
+        """The agent with the intrinsic reward."""
+        raise NotImplementedError
+
+
+@dataclass(frozen=True, kw_only=True)
+class NoExploration(ExplorationConfig):
+    """No intrinsic reward."""
+
+    def make(self, agent: Agent, task: Any) -> Agent:
+        return agent
 
 
 def traced(config: Any, **more: Any) -> Any:
@@ -151,16 +285,6 @@ def traced(config: Any, **more: Any) -> Any:
 @functools.cache
 def _hparams_type(name: str, fields: tuple[str, ...]) -> Any:
     return collections.namedtuple(name, fields)
-
-
-@dataclass(frozen=True, kw_only=True)
-class NoExploration(Options):
-    """No intrinsic reward."""
-
-    group: ClassVar[str] = "exploration"
-
-    def make(self, agent: Agent, task: Any) -> Agent:
-        return agent
 
 
 def with_hparams(hparams: Any, values: dict[str, Array]) -> Any:

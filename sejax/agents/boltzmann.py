@@ -23,22 +23,20 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Float
 
-from sejax.agents.base import Agent, traced
-from sejax.agents.memory import no_memory
+from sejax.agents.base import Agent, AgentConfig, traced
+from sejax.agents.buffers import no_buffer
 from sejax.errors import require
-from sejax.options import Options, counts, option, positive
+from sejax.options import counts, option, positive
 
 MOST_DIMS = 2  # of continuous actions: there are num_points to the power of these
 
 
 @dataclass(frozen=True, kw_only=True)
-class BoltzmannConfig(Options):
+class BoltzmannConfig(AgentConfig):
     """The Boltzmann policy of a one-step SE's rewards."""
 
-    group: ClassVar[str] = "agent"
-    states: ClassVar[str] = "vector"
-    actions: ClassVar[tuple[str, ...]] = ("discrete", "continuous")
-    is_solved_for: ClassVar[bool] = True  # and cannot train on the real task
+    states: ClassVar[str | None] = "vector"
+    is_solved_for: ClassVar[bool] = True
 
     # What a nat of entropy is worth, in the SE's rewards.
     temperature: float = option(
@@ -111,7 +109,7 @@ def make_boltzmann(config: BoltzmannConfig, actions: Array) -> Agent:
         init=_needs_no_training,
         act=act,
         update=_needs_no_training,
-        memory=no_memory(),
+        buffer=no_buffer(),
         hparams=traced(config),
         discount=lambda hparams: 1.0,
         solve=solve,

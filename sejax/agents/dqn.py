@@ -17,44 +17,21 @@ from flax import linen as nn
 from flax import struct
 from jaxtyping import Array, Float, Int
 
-from sejax.agents.base import Agent, AgentOptions, traced
-from sejax.agents.epsilon_greedy import decayed_epsilon, epsilon_greedy
-from sejax.agents.memory import replay_memory
-from sejax.agents.partial_batch import sum_over_batch
-from sejax.agents.policies import select_action
-from sejax.agents.replay import Transition, num_columns
-from sejax.ops import flat
-from sejax.ops.networks import MLP, DuelingMLP, init_narrowed
-from sejax.options import (
-    ACTIVATIONS,
-    MOST_LAYERS,
-    MOVES,
-    counts,
-    fraction,
-    one_of,
-    option,
-    positive,
-)
+from sejax.agents.base import Agent
+from sejax.agents.buffers import Transition
+from sejax.agents.off_policy import OffPolicyOptions, mean_over_batch, off_policy_agent
+from sejax.agents.policies import decayed_epsilon, epsilon_greedy, select_action
+from sejax.ops import cpu, flat
+from sejax.ops.networks import DuelingMLP, init_narrowed
+from sejax.options import MOST_LAYERS, counts, fraction, one_of, option
 
-# Small agents train in lockstep on a core: measured, 2.3 times as fast as alone. Twice as many gain
-# another 3%, and a population is filled up to whole groups.
-SMALL_LANES = 8
 LOSSES = {"squared": jnp.square, "huber": optax.losses.huber_loss}
 
 
 @dataclass(frozen=True, kw_only=True)
-class DDQNConfig(AgentOptions):
+class DDQNConfig(OffPolicyOptions):
     """DDQN's hyperparameters; the defaults are the paper's "default agent hyperparameters"."""
 
-    batch_size: int = option(128, counts(), varied="triple")  # transitions
-    buffer_size: int = option(100_000, counts())  # steps that are remembered
-    hidden_size: int = option(128, counts(), varied="triple")  # units of each hidden layer
-    num_layers: int = option(2, counts(most=MOST_LAYERS), varied="one_more_or_less")
-    activation: str = option("relu", one_of(ACTIVATIONS))
-    learning_rate: float = option(1e-3, positive(MOVES), traced=True, varied="triple")  # of Adam
-    # tau: weight of the online network in the target's update
-    tau: float = option(0.01, fraction(), traced=True)
-    discount: float = option(0.99, fraction(), traced=True)  # gamma
     epsilon_init: float = option(1.0, fraction(), traced=True)  # share of random actions
     epsilon_min: float = option(0.01, fraction(), traced=True)
     epsilon_decay: float = option(0.9, fraction(), traced=True)  # factor for each episode
@@ -67,31 +44,30 @@ class DDQNConfig(AgentOptions):
     train_every: int = option(1, counts())  # agent steps for each time that it learns, ...
     gradient_steps: int = option(1, counts())  # ... in so many learning steps
 
+    @property
+    def learns_each_step(self) -> bool:
+        return self.train_every == 1 and self.gradient_steps == 1
+
+    @property
+    def cpu_num_parallel(self) -> int:
+        """Agents that best train in lockstep on a CPU core."""
+        is_small = self.num_layers == 1 and self.hidden_size * self.batch_size <= cpu.SMALL_PRODUCT
+        return cpu.SMALL_NUM_PARALLEL if is_small else 1
+
     def make(self, task: Any) -> Agent:
         """The agent for a task's observations and actions."""
         return make_ddqn(self, task.obs_dim, task.num_actions)
 
-    @property
-    def is_small(self) -> bool:
-        """Whether what surrounds the products of a learning step takes longer than they do."""
-        return self.num_layers == 1 and self.hidden_size * self.batch_size <= 64 * 64
-
     def network(self, num_actions: int) -> nn.Module:
         """Maps observations `[obs_dim, *batch]` to Q values `[num_actions, *batch]`."""
-        return MLP(
-            num_actions,
-            self.hidden_size,
-            self.num_layers,
-            self.activation,
-            learn_prelu_slope=True,
-        )
+        return self.mlp(num_actions)
 
 
 @dataclass(frozen=True, kw_only=True)
 class DuelingDDQNConfig(DDQNConfig):
     """DDQN with a dueling network (paper, appendix, tables of DDQN and Dueling DDQN)."""
 
-    is_small = False  # products of its streams: in lockstep a learning step takes 1.5 times as long
+    cpu_num_parallel = 1  # in lockstep its two streams make a step 1.5 times as long
 
     feature_dim: int = option(128, counts())  # outputs of the part that both streams share
     # Hidden layers of the value and of the advantage stream.
@@ -165,21 +141,14 @@ def make_ddqn(config: DDQNConfig, obs_dim: int, num_actions: int) -> Agent:
             return jnp.argmax(q_values).astype(jnp.int32)
         return epsilon_greedy(key, q_values, state.epsilon)
 
-    def batch_size(state: DDQNState) -> Array | None:
-        in_use = state.hparams.batch_size
-        return None if in_use is None else in_use * config.gradient_steps
-
-    return Agent(
+    return off_policy_agent(
+        config,
+        spec=config.spec(cpu_num_parallel=config.cpu_num_parallel),
+        batches=config.gradient_steps,
         init=init,
         begin_episode=begin_episode,
         act=act,
         update=make_update(config, learn),
-        hparams=traced(config, hidden_size=None, batch_size=None),
-        memory=replay_memory(config.batch_size * config.gradient_steps, config.buffer_size),
-        warmup_episodes=config.warmup_episodes,
-        learns_from=config.warmup_episodes,
-        batch_size=batch_size,
-        cpu_num_parallel=SMALL_LANES if config.is_small else 1,
     )
 
 
@@ -269,7 +238,7 @@ def make_learning_step(
         def sum_of_gradients(batch: Transition) -> Array:
             return flat.flatten(jax.grad(sum_of_losses)(params, target_params, hp.discount, batch))
 
-        gradient = sum_over_batch(sum_of_gradients, batch, hp.batch_size) / num_columns(batch)
+        gradient = mean_over_batch(sum_of_gradients, (batch,), hp.batch_size)
         moved, opt_state = flat.adam_step(state.params, state.opt_state, gradient, hp.learning_rate)
         tau = hp.tau
         if config.target_update_every > 1:

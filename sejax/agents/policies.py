@@ -1,7 +1,4 @@
-"""Distributions of actions that a network's outputs stand for: a softmax, and a Gaussian.
-
-Source: `docs/reference.md` 4.5.
-"""
+"""How actions come of a network's outputs: distributions, and epsilon-greedy ones."""
 
 import math
 from collections.abc import Callable
@@ -10,6 +7,8 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
+
+from sejax.ops.keys import words
 
 
 class Distribution(NamedTuple):
@@ -82,7 +81,37 @@ def gaussian(max_action: float) -> Distribution:
     return Distribution(sample=sample, mode=mode, evaluate=evaluate, env_action=env_action)
 
 
+# --- values of actions ---------------------------------------------------------------------------
+
+
 def select_action(q_values: Float[Array, "actions batch"], action: Array) -> Float[Array, " batch"]:
     """Q of each column's action, by mask: gathers and their gradients are slow on CPU."""
     mask = jnp.arange(q_values.shape[0])[:, None] == action[None, :]
     return jnp.sum(jnp.where(mask, q_values, 0.0), axis=0)
+
+
+def decayed_epsilon(
+    init: Array | float, minimum: Array | float, decay: Array | float, episode: Array
+) -> Array:
+    """Share of random actions in an episode, counted from 0, `[]` float32.
+
+    It is `init` in episode 0, even where that is less than `minimum`, and
+    `max(init * decay**episode, minimum)` afterwards.
+
+    Source: `docs/reference.md` 3.4.
+    """
+    epsilon = jnp.maximum(init * decay**episode, minimum)
+    return jnp.where(episode == 0, init, epsilon)
+
+
+def epsilon_greedy(
+    key: Array, q_row: Float[Array, " num_actions"], epsilon: Array
+) -> Int[Array, ""]:
+    """A uniform action with probability epsilon, else the first of the best.
+
+    The key's own words decide; it must not be used for anything else.
+    """
+    bits = words(key)
+    random_action = (bits[0] % jnp.uint32(q_row.shape[0])).astype(jnp.int32)
+    uniform = (bits[1] >> 8).astype(jnp.float32) * jnp.float32(2**-24)
+    return jnp.where(uniform < epsilon, random_action, jnp.argmax(q_row).astype(jnp.int32))

@@ -20,7 +20,7 @@ from flax import struct
 from jaxtyping import Array, Float, Int
 
 from sejax.agents.base import Agent, AgentOptions, traced
-from sejax.agents.memory import Rollout, rollout_memory
+from sejax.agents.buffers import Rollout, rollout_buffer
 from sejax.agents.policies import SOFTMAX, Distribution, gaussian
 from sejax.errors import require
 from sejax.ops import flat
@@ -240,12 +240,11 @@ def make_ppo(
         init=init,
         act=act,
         update=update,
-        memory=rollout_memory(length),
+        buffer=rollout_buffer(length),
         hparams=traced(config, hidden_size=None),
-        warmup_episodes=config.warmup_episodes,
-        learns_from=0,
+        spec=config.spec(learns_from=0, action_repeat=config.action_repeat),
         env_action=policy.env_action,
-        action_repeat=config.action_repeat,
+        discount=lambda hparams: hparams.discount,
     )
 
 

@@ -19,50 +19,37 @@ import optax
 from flax import struct
 from jaxtyping import Array, Bool, Float
 
-from sejax.agents.base import Agent, AgentOptions, traced
-from sejax.agents.memory import replay_memory
-from sejax.agents.partial_batch import sum_over_batch
-from sejax.agents.policies import select_action
-from sejax.agents.replay import Transition, num_columns
-from sejax.ops import flat
-from sejax.ops.networks import MLP, init_narrowed
-from sejax.options import (
-    ACTIVATIONS,
-    MOST_LAYERS,
-    MOVES,
-    counts,
-    finite,
-    fraction,
-    not_negative,
-    one_of,
-    option,
-    positive,
+from sejax.agents.base import Agent
+from sejax.agents.buffers import Transition
+from sejax.agents.off_policy import (
+    OffPolicyOptions,
+    mean_over_batch,
+    off_policy_agent,
+    warming_up,
 )
+from sejax.agents.policies import select_action
+from sejax.ops import flat
+from sejax.ops.networks import init_narrowed
+from sejax.options import counts, finite, fraction, not_negative, option, positive
 
 _MIN_LOG_STD, _MAX_LOG_STD = -20.0, 2.0  # of the Gaussian, as in the authors' code
 
 
 @dataclass(frozen=True, kw_only=True)
-class SACConfig(AgentOptions):
+class SACConfig(OffPolicyOptions):
     """SAC's hyperparameters; the defaults are those of Haarnoja et al. (2018), table 1.
 
     Differs: the buffer holds 100,000 steps where the authors' holds a million. Christodoulou (2019)
-    has a target entropy of 0.98 of the largest, with which SAC does not learn CartPole.
+    has a target entropy of 0.98 of the largest, with which SAC does not learn CartPole. Actions are
+    uniformly random in the warm-up.
     """
 
     actions: ClassVar[tuple[str, ...]] = ("discrete", "continuous")
 
-    # With uniformly random actions.
-    warmup_episodes: int = option(10, counts("it counts episodes", least=0))
-    batch_size: int = option(256, counts(), varied="triple")
-    buffer_size: int = option(100_000, counts())
-    hidden_size: int = option(256, counts(), varied="triple")
-    num_layers: int = option(2, counts(most=MOST_LAYERS), varied="one_more_or_less")
-    activation: str = option("relu", one_of(ACTIVATIONS))
-    # Of the actor, the critics and the temperature.
-    learning_rate: float = option(3e-4, positive(MOVES), traced=True, varied="triple")
-    tau: float = option(0.005, fraction(), traced=True)  # tau
-    discount: float = option(0.99, fraction(), traced=True)  # gamma
+    batch_size: int = 256
+    hidden_size: int = 256
+    learning_rate: float = 3e-4  # of the actor, the critics and the temperature
+    tau: float = 0.005
     action_repeat: int = option(1, counts())  # steps of the world for each decision
     # Temperature: what a nat of entropy is worth, in reward units. None: learned, as the authors do
     # to meet a target entropy.
@@ -179,9 +166,6 @@ def _make_agent(config: SACConfig, obs_dim: int, policy: Policy) -> Agent:
             hparams=jax.tree.map(jnp.float32, hparams),
         )
 
-    def begin_episode(state: SACState, episode: Array) -> SACState:
-        return state.replace(is_warming_up=jnp.asarray(episode < config.warmup_episodes))
-
     def act(key: Array, state: SACState, obs: Float[Array, " obs_dim"], explore: bool) -> Array:
         outputs = networks.actor(networks.unflatten(state.params), obs)
         if not explore:
@@ -191,18 +175,14 @@ def _make_agent(config: SACConfig, obs_dim: int, policy: Policy) -> Agent:
     def update(key: Array, state: SACState, batch: Transition) -> SACState:
         return learn(state, batch, policy.draw(key, batch.reward.size))
 
-    return Agent(
+    return off_policy_agent(
+        config,
+        spec=config.spec(action_repeat=config.action_repeat),
         init=init,
-        begin_episode=begin_episode,
+        begin_episode=warming_up(config),
         act=act,
         update=update,
-        memory=replay_memory(config.batch_size, config.buffer_size),
-        hparams=traced(config, hidden_size=None, batch_size=None),
-        warmup_episodes=config.warmup_episodes,
-        learns_from=config.warmup_episodes,
         env_action=policy.env_action,
-        action_repeat=config.action_repeat,
-        batch_size=lambda state: state.hparams.batch_size,
     )
 
 
@@ -240,16 +220,7 @@ class Networks(NamedTuple):
 def make_networks(config: SACConfig, obs_dim: int, policy: Policy) -> Networks:
     """An actor and two critics of the same hidden layers."""
 
-    def network(num_outputs: int) -> MLP:
-        return MLP(
-            num_outputs,
-            config.hidden_size,
-            config.num_layers,
-            config.activation,
-            learn_prelu_slope=True,
-        )
-
-    actor, critic = network(policy.num_outputs), network(policy.critic_outputs)
+    actor, critic = config.mlp(policy.num_outputs), config.mlp(policy.critic_outputs)
 
     def init_critics(key: Array, hidden_size: Array | None = None) -> Any:
         num_inputs = obs_dim + policy.critic_inputs
@@ -335,13 +306,11 @@ def make_learning_step(
         params = networks.unflatten(state.params)
         target_critics = networks.unflatten_critics(state.target_critics)
 
-        def sum_of_gradients(columns: tuple[Transition, LearningNoise]) -> Array:
-            return flat.flatten(jax.grad(sum_of_losses)(params, target_critics, hp, *columns))
+        def sum_of_gradients(batch: Transition, noise: LearningNoise) -> Array:
+            return flat.flatten(jax.grad(sum_of_losses)(params, target_critics, hp, batch, noise))
 
-        gradient = sum_over_batch(sum_of_gradients, (batch, noise), hp.batch_size)
-        moved, opt_state = flat.adam_step(
-            state.params, state.opt_state, gradient / num_columns(batch), hp.learning_rate
-        )
+        gradient = mean_over_batch(sum_of_gradients, (batch, noise), hp.batch_size)
+        moved, opt_state = flat.adam_step(state.params, state.opt_state, gradient, hp.learning_rate)
         tau = hp.tau
         return state.replace(
             params=moved,

@@ -16,10 +16,9 @@ from flax import struct
 from jaxtyping import Array, Float, Int
 
 from sejax.agents.base import Agent, AgentOptions, traced
-from sejax.agents.epsilon_greedy import decayed_epsilon, epsilon_greedy
-from sejax.agents.memory import no_memory
-from sejax.agents.replay import Transition
-from sejax.options import MOVES, counts, fraction, option, positive
+from sejax.agents.buffers import Transition, no_buffer
+from sejax.agents.policies import decayed_epsilon, epsilon_greedy
+from sejax.options import MOVES, fraction, option, positive
 
 # `(key, q_row [num_actions], epsilon) -> []`: what the next state is worth to the target.
 NextValue = Callable[[Array, Array, Array], Array]
@@ -29,9 +28,9 @@ NextValue = Callable[[Array, Array, Array], Array]
 class QLearningConfig(AgentOptions):
     """Tabular Q-learning (paper, appendix "Cliff Walking")."""
 
-    states: ClassVar[str] = "discrete"
+    states: ClassVar[str | None] = "discrete"
 
-    warmup_episodes: int = option(0, counts("it counts episodes", least=0))
+    warmup_episodes: int = 0
     learning_rate: float = option(1.0, positive(MOVES), traced=True, varied="tenth_to_one")
     discount: float = option(0.8, fraction(), traced=True, varied="tenth_to_one")
     epsilon_init: float = option(0.1, fraction(), traced=True)
@@ -147,11 +146,10 @@ def _make_tabular(
         begin_episode=begin_episode,
         act=act,
         update=update,
+        buffer=no_buffer(),
         hparams=traced(config),
-        memory=no_memory(),
-        warmup_episodes=config.warmup_episodes,
-        learns_from=config.warmup_episodes,
-        cpu_num_parallel=None,
+        spec=config.spec(cpu_num_parallel=None),
+        discount=lambda hparams: hparams.discount,
     )
 
 

@@ -18,48 +18,35 @@ import optax
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
-from sejax.agents.base import Agent, AgentOptions, traced
-from sejax.agents.memory import replay_memory
-from sejax.agents.partial_batch import sum_over_batch
-from sejax.agents.replay import Transition, num_columns
-from sejax.ops import flat
-from sejax.ops.networks import MLP, init_narrowed
-from sejax.options import (
-    ACTIVATIONS,
-    MOST_LAYERS,
-    MOVES,
-    counts,
-    fraction,
-    not_negative,
-    one_of,
-    option,
-    positive,
+from sejax.agents.base import Agent
+from sejax.agents.buffers import Transition
+from sejax.agents.off_policy import (
+    OffPolicyOptions,
+    mean_over_batch,
+    off_policy_agent,
+    warming_up,
 )
+from sejax.ops import flat
+from sejax.ops.networks import init_narrowed
+from sejax.options import MOVES, counts, fraction, not_negative, option, positive
 
 _MIN_TEMPERATURE = 1e-6
 
 
 @dataclass(frozen=True, kw_only=True)
-class TD3Config(AgentOptions):
+class TD3Config(OffPolicyOptions):
     """TD3's hyperparameters (paper, appendix "MountainCarContinuous-v0 and HalfCheetah-v3").
 
     The defaults are the paper's for HalfCheetah; for MountainCarContinuous it has
-    `warmup_episodes=50 action_repeat=2`.
+    `warmup_episodes=50 action_repeat=2`. Actions are uniformly random in the warm-up.
     """
 
     actions: ClassVar[tuple[str, ...]] = ("continuous",)
 
-    # With uniformly random actions.
-    warmup_episodes: int = option(20, counts("it counts episodes", least=0))
-    batch_size: int = option(256, counts(), varied="triple")
-    buffer_size: int = option(100_000, counts())
-    hidden_size: int = option(128, counts(), varied="triple")
-    num_layers: int = option(2, counts(most=MOST_LAYERS), varied="one_more_or_less")
-    activation: str = option("relu", one_of(ACTIVATIONS))
-    # Of the actor and the critics.
-    learning_rate: float = option(3e-4, positive(MOVES), traced=True, varied="triple")
-    tau: float = option(0.005, fraction(), traced=True)
-    discount: float = option(0.99, fraction(), traced=True)
+    warmup_episodes: int = 20
+    batch_size: int = 256
+    learning_rate: float = 3e-4  # of the actor and the critics
+    tau: float = 0.005
     policy_delay: int = option(2, counts())  # learning steps for each one of actor and targets
     action_repeat: int = option(1, counts())  # steps of the world for each decision
     # Exploration, in units of the largest action.
@@ -80,11 +67,11 @@ class DiscreteTD3Config(TD3Config):
 
     actions: ClassVar[tuple[str, ...]] = ("discrete",)
 
-    warmup_episodes: int = option(10, counts("it counts episodes", least=0))
-    batch_size: int = option(128, counts(), varied="triple")
-    activation: str = option("tanh", one_of(ACTIVATIONS))
-    learning_rate: float = option(5e-4, positive(MOVES), traced=True, varied="triple")
-    tau: float = option(0.01, fraction(), traced=True)
+    warmup_episodes: int = 10
+    batch_size: int = 128
+    activation: str = "tanh"
+    learning_rate: float = 5e-4
+    tau: float = 0.01
     layer_norm: bool = True  # after each hidden layer but the first, as in the authors' code
     # Of the Gumbel-Softmax at the start.
     temperature: float = option(1.0, positive(MOVES), traced=True)
@@ -209,9 +196,6 @@ def _make_agent(config: TD3Config, obs_dim: int, policy: Policy) -> Agent:
             hparams=jax.tree.map(jnp.float32, hparams),
         )
 
-    def begin_episode(state: TD3State, episode: Array) -> TD3State:
-        return state.replace(is_warming_up=jnp.asarray(episode < config.warmup_episodes))
-
     def act(key: Array, state: TD3State, obs: Float[Array, " obs_dim"], explore: bool) -> Array:
         outputs = networks.actor(state.actor, obs)
         if not explore and not config.noisy_tests:
@@ -227,18 +211,14 @@ def _make_agent(config: TD3Config, obs_dim: int, policy: Policy) -> Agent:
     def update(key: Array, state: TD3State, batch: Transition) -> TD3State:
         return learn(state, batch, draw_learning_noise(key, policy, batch.action.shape))
 
-    return Agent(
+    return off_policy_agent(
+        config,
+        spec=config.spec(action_repeat=config.action_repeat),
         init=init,
-        begin_episode=begin_episode,
+        begin_episode=warming_up(config),
         act=act,
         update=update,
-        memory=replay_memory(config.batch_size, config.buffer_size),
-        hparams=traced(config, hidden_size=None, batch_size=None),
-        warmup_episodes=config.warmup_episodes,
-        learns_from=config.warmup_episodes,
         env_action=policy.env_action,
-        action_repeat=config.action_repeat,
-        batch_size=lambda state: state.hparams.batch_size,
     )
 
 
@@ -265,15 +245,7 @@ def make_networks(config: TD3Config, obs_dim: int, action_dim: int) -> Networks:
     layer_norm = isinstance(config, DiscreteTD3Config) and config.layer_norm
 
     def network(num_inputs: int, num_outputs: int) -> tuple[Callable, Callable]:
-        mlp = MLP(
-            num_outputs,
-            config.hidden_size,
-            config.num_layers,
-            config.activation,
-            learn_prelu_slope=True,
-            layer_norm=layer_norm,
-            may_narrow=True,
-        )
+        mlp = config.mlp(num_outputs, layer_norm=layer_norm, may_narrow=True)
         unflatten = flat.unflattener(mlp.init, jnp.zeros(num_inputs))
 
         def init(key: Array, hidden_size: Array | None) -> Array:
@@ -325,7 +297,11 @@ def make_learning_step(
             errors = both_q(critics, batch.obs, batch.action) - targets[None]
             return jnp.sum(batch.weight * jnp.sum(errors**2, axis=0))
 
-        gradient = mean_gradient(sum_of_losses, state.critics, batch, noise, hp.batch_size)
+        gradient = mean_over_batch(
+            functools.partial(jax.grad(sum_of_losses), state.critics),
+            (batch, noise),
+            hp.batch_size,
+        )
         critics, opt_state = flat.adam_step(
             state.critics, state.critic_opt_state, gradient, hp.learning_rate
         )
@@ -338,7 +314,9 @@ def make_learning_step(
             action = policy.action(networks.actor(actor, batch.obs), noise.policy, state)
             return -jnp.sum(batch.weight * networks.critic(state.critics[0], batch.obs, action))
 
-        gradient = mean_gradient(sum_of_losses, state.actor, batch, noise, hp.batch_size)
+        gradient = mean_over_batch(
+            functools.partial(jax.grad(sum_of_losses), state.actor), (batch, noise), hp.batch_size
+        )
         actor, opt_state = flat.adam_step(
             state.actor, state.actor_opt_state, gradient, hp.learning_rate
         )
@@ -363,21 +341,6 @@ def make_learning_step(
         )
 
     return learn
-
-
-def mean_gradient(
-    sum_of_losses: Callable[[Array, Transition, LearningNoise], Array],
-    params: Array,
-    batch: Transition,
-    noise: LearningNoise,
-    batch_size: Array | None,
-) -> Array:
-    """Gradient of the mean loss over the columns that count, at the cost of those alone."""
-
-    def sum_of_gradients(columns: tuple[Transition, LearningNoise]) -> Array:
-        return jax.grad(sum_of_losses)(params, *columns)
-
-    return sum_over_batch(sum_of_gradients, (batch, noise), batch_size) / num_columns(batch)
 
 
 def draw_learning_noise(key: Array, policy: Policy, shape: tuple[int, ...]) -> LearningNoise:

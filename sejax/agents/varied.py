@@ -18,14 +18,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from sejax.agents.base import Agent, Draw, with_hparams
+from sejax.agents.base import Agent, Draw, Varied, with_hparams
 from sejax.errors import require
+from sejax.ops import cpu
 from sejax.options import marks
-
-# Networks of a depth: evenly spaced sizes, since what room to spare costs matters for large ones.
-# With one hidden layer the cost grows with the size, with more of them with its square.
-_NUM_SIZES, _NUM_SIZES_DEEP = 6, 12
-_MULTIPLE = 8  # vector width of a CPU
 
 
 class Range(NamedTuple):
@@ -98,9 +94,9 @@ def draw_value(key: Array, bounds: Range) -> Array:
 
 
 def hidden_sizes(bounds: Range, num_layers: int) -> tuple[int, ...]:
-    """Sizes of networks, growing, the last of which has room for all in the range."""
-    parts = _NUM_SIZES if num_layers == 1 else _NUM_SIZES_DEEP
-    step = -(-math.ceil(bounds.high) // (parts * _MULTIPLE)) * _MULTIPLE
+    """Sizes of networks, evenly spaced, the last of which has room for all in the range."""
+    parts = cpu.NUM_SIZES if num_layers == 1 else cpu.NUM_SIZES_DEEP
+    step = cpu.whole_vectors(-(-math.ceil(bounds.high) // parts))
     smallest = math.ceil(bounds.low / step) * step
     return tuple(range(smallest, math.ceil(bounds.high) + step, step))
 
@@ -148,11 +144,10 @@ def make_varied(config: Any, make: Callable[[Any], Agent]) -> Agent:
             values=values,
         )
 
-    # In lockstep all branches would run.
-    num_parallel = agent.cpu_num_parallel if len(variants) == 1 else 1
-    return dataclasses.replace(
-        agent, variants=tuple(variants), draw=draw, cpu_num_parallel=num_parallel
-    )
+    spec = agent.spec
+    if len(variants) > 1:  # in lockstep all branches would run
+        spec = dataclasses.replace(spec, cpu_num_parallel=1)
+    return dataclasses.replace(agent, spec=spec, varied=Varied(agents=tuple(variants), draw=draw))
 
 
 def smallest_with_room(shapes: list[tuple[int, int]], values: dict[str, Array]) -> Array:

@@ -12,7 +12,7 @@ from sejax.cli import families
 from sejax.cli.families import AgentsConfig, families_of
 from sejax.errors import one_of, require, require_seed, shortened, whole
 from sejax.ops.files import as_file_name
-from sejax.training import TrainingConfig, require_reachable, steps_before_learning
+from sejax.training import TrainingConfig, require_reachable
 
 AGENT_HPARAMS = ("default", "varied")
 EVALUATION_HPARAMS = (*AGENT_HPARAMS, "as_learned")
@@ -86,15 +86,14 @@ class LearnConfig:
             "stop_when_solved=false",
         )
         facts, task_name = envs.facts_of(self.env), self.name("env")
-        if hasattr(self.proxy, "require_task"):
-            self.proxy.require_task(facts, task_name)
-        train = not all(getattr(x.agent, "is_solved_for", False) for x in families_of(self))
-        if train and hasattr(self.proxy, "lasts_to_the_limit"):  # an SE
+        self.proxy.require_task(facts, task_name)
+        train = not all(x.agent.is_solved_for for x in families_of(self))
+        if train and not self.proxy.has_real_dynamics:
             require_reachable("training", self.training, self.proxy.max_steps(facts.max_steps))
         for family in families_of(self):
             with families.named(family.field):
                 agents.require_fit(family.agent, self.exploration, facts, task_name)
-                if getattr(self.proxy, "lasts_to_the_limit", False):
+                if self.proxy.reaches_step_limit:
                     require_learning(
                         "training",
                         self.training,
@@ -274,6 +273,38 @@ def to_plain(config: LearnConfig | EvaluateConfig) -> dict[str, Any]:
     }
 
 
+def completed(stored: Mapping[str, Any], config: LearnConfig) -> dict[str, Any]:
+    """A stored run's values with the fields that a former version did not write; plain values.
+
+    New fields have a default that changes no number. Those of a choice are taken from the choice of
+    the same name in `config`: what only `stored` names is neither imported nor made.
+    """
+    whole = {"agent": None, "agents": None} | dict(stored)
+    usual = {
+        group: registry.defaults(group, config.name(group))
+        for group in LEARN_GROUPS
+        if getattr(config, group) is not None
+    }
+    usual["training"] = serialize.to_plain(TrainingConfig())
+    if config.agents is not None:
+        usual["agents"] = families.defaults(config.agents)
+    return whole | {
+        name: _filled(whole[name], fields) for name, fields in usual.items() if name in whole
+    }
+
+
+def _filled(there: Any, usual: Mapping[str, Any]) -> Any:
+    """A group's fields with those that are missing, if it is of the same name."""
+    if not isinstance(there, Mapping) or there.get("name") != usual.get("name"):
+        return there
+    nested = {
+        name: _filled(value, usual[name])
+        for name, value in there.items()
+        if isinstance(usual.get(name), Mapping)
+    }
+    return {name: x for name, x in usual.items() if x != "???"} | dict(there) | nested
+
+
 def _from_plain(schema: Any, groups: tuple[str, ...], values: Mapping[str, Any]) -> Any:
     typed: dict[str, Any] = dict(values)
     typed["agents"] = families.from_plain(values.get("agents"))
@@ -332,17 +363,14 @@ def require_learning(
     Raises:
       ConfigError: if it does not.
     """
-    before = steps_before_learning(agent, max_episode_steps, task_max_steps)
-    names = ("rollout_steps", "update_episodes", "warmup_episodes")
-    waits = next((name for name in names if getattr(agent, name, None) is not None), names[-1])
+    before = agent.steps_before_learning(max_episode_steps, task_max_steps)
     require(
         training.max_steps is None or training.max_steps > before,
         f"{name}.max_steps",
         f"exceed {before}",
-        f"{registry.name_of('agent', agent)} learns nothing before with "
-        f"agent.{waits}={getattr(agent, waits, None)}",
+        f"{registry.name_of('agent', agent)} learns nothing before",
         training.max_steps,
-        f"{name}.max_steps={4 * before}, or agent.{waits} lower",
+        f"{name}.max_steps={4 * before}",
     )
 
 

@@ -18,6 +18,7 @@ from hydra.errors import HydraException
 from hydra.types import RunMode
 from omegaconf.errors import OmegaConfBaseException
 
+from sejax import registry
 from sejax.cli import compose, runtime
 from sejax.errors import ConfigError, FailedError
 from sejax.ops.files import as_file_name
@@ -86,10 +87,14 @@ def _prepared() -> list[str]:
 
 @contextlib.contextmanager
 def _messages() -> Iterator[list[str]]:
-    """Ends the process with one message for what was refused; yields a list for the words."""
+    """Ends the process with one message for what was refused; yields a list for the words.
+
+    Within it, of what is nobody's plugin only what the command line names is imported.
+    """
     words: list[str] = []
     try:
-        yield words
+        with registry.only_typed(sys.argv[1:]):
+            yield words
     except (HydraException, OmegaConfBaseException) as error:
         fail(str(compose.translate_hydra_error(error, words)), BAD_INPUT)
     except ConfigError as error:

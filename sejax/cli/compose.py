@@ -55,12 +55,14 @@ def config(overrides: Sequence[str] = ()) -> build.LearnConfig:
       >>> config(["env=acrobot", "generations=7"]).generations
       7
     """
-    return learn_config(_compose("run", overrides))
+    with registry.only_typed(overrides):
+        return learn_config(_compose("run", overrides))
 
 
 def evaluate_config(overrides: Sequence[str] = ()) -> build.EvaluateConfig:
     """As `config`, for the words after `python -m sejax.evaluate`."""
-    return evaluate_config_of(_compose("evaluate", overrides))
+    with registry.only_typed(overrides):
+        return evaluate_config_of(_compose("evaluate", overrides))
 
 
 def learn_config(cfg: DictConfig) -> build.LearnConfig:
@@ -284,7 +286,7 @@ def _register_choice(group: str, choice: str, is_chosen: bool, overrides: Sequen
         agent = _agent_for(choice, is_own, node, overrides)
         changes = {"agent": agent} if agent != _DEFAULT_AGENT else {}
     elif group == "proxy":
-        wanted = getattr(registry.find(group, choice), "default_objective", _DEFAULT_OBJECTIVE)
+        wanted = registry.find(group, choice).default_objective
         changes = {"objective": wanted} if wanted != _DEFAULT_OBJECTIVE else {}
     if changes:  # chooses of another group too, where that is left open
         defaults = [{f"override /{other}": value} for other, value in changes.items()]

@@ -132,6 +132,15 @@ def to_plain(agents: AgentsConfig | None) -> dict[str, Any] | None:
     }
 
 
+def defaults(agents: AgentsConfig) -> dict[str, Any]:
+    """What `to_plain` gives for these agents with their defaults."""
+    return serialize.to_plain(FamiliesConfig()) | {
+        each.key: {"weight": 1.0}
+        | registry.defaults("agent", registry.name_of("agent", each.agent))
+        for each in agents.families
+    }
+
+
 def families_of(config: Any) -> tuple[AgentFamily, ...]:
     """The agents of a command's configuration: several, or the one."""
     if config.agents is not None:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from sejax import registry
-from sejax.cli import build, compose
+from sejax.cli import build, compose, presets
 from sejax.cli.words import word
 from sejax.errors import ConfigError
 from sejax.serialize import flatten
@@ -94,7 +94,9 @@ def run_words(stored: dict[str, Any]) -> list[str] | None:
     several = agent_names(stored) if stored.get("agents") else []
     groups = [x for x in build.LEARN_GROUPS if x != "agent" or not several]
     names = {group: str(stored.get(group, {}).get("name", "none")) for group in groups}
-    if not all(registry.is_registered(group, name) for group, name in names.items()):
+    named = [*names.items(), *(("agent", name) for name in several)]
+    is_known = all(registry.is_registered(group, name) for group, name in named)
+    if not is_known or stored.get("preset") not in presets.names():  # a run stores no file's name
         return None
     chosen = [f"{group}={names[group]}" for group in ("env", "proxy")]
     chosen += [f"preset={stored['preset']}"] if stored.get("preset") != "best" else []

@@ -314,6 +314,8 @@ class RunDirectory:
 def open_for(config: Any, hint: str = HINT) -> RunDirectory:
     """The folder of a run; made, or opened to go on.
 
+    What it stores is compared as plain values: nothing that only the folder names is imported.
+
     Args:
       config: a `LearnConfig`.
       hint: last sentence of a refusal: how to choose another folder.
@@ -327,14 +329,13 @@ def open_for(config: Any, hint: str = HINT) -> RunDirectory:
     seeds = [config.seed + i for i in range(config.num_seeds)]
     keys = [family.key for family in families_of(config)]
 
-    def completed(stored: dict[str, Any]) -> dict[str, Any]:
-        try:
-            return build.to_plain(build.learn_config(stored))
-        except ConfigError:  # of another version that had other fields
-            return stored
-
     return RunDirectory.open(
-        config.resolved_run_dir, build.to_plain(config), seeds, hint, keys, completed
+        config.resolved_run_dir,
+        build.to_plain(config),
+        seeds,
+        hint,
+        keys,
+        completed=lambda stored: build.completed(stored, config),
     )
 
 

@@ -6,7 +6,7 @@ Each is told what the run directory has; by whom and when, see `sejax.cli.follow
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar, Protocol, runtime_checkable
 
 import numpy as np
 import yaml
@@ -15,6 +15,7 @@ from sejax.errors import told
 from sejax.serialize import flatten
 
 
+@runtime_checkable
 class Tracker(Protocol):
     """What a tracker must do; whatever it raises drops it, and the run goes on."""
 

@@ -10,12 +10,15 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import ChoiceSweep, QuotedString
 from hydra.errors import HydraException
 
+from sejax import registry
 from sejax.cli import presets
 from sejax.errors import ConfigError, require, shortened
 from sejax.serialize import flatten
 
 ENDING = ".yaml"  # of a preset that is a file
-_FIELD = re.compile(r"(?!hydra\b)[A-Za-z_][\w.-]*")  # Hydra's own are no settings
+# Fields whose value may be a module's: those of choices.
+IMPORTING = {*registry.GROUPS, "agents", "name", "proxy_kind"}
+FIELD = re.compile(r"(?!hydra\b)[A-Za-z_][\w.-]*")  # Hydra's own are no settings
 
 
 def word(value: Any) -> str:
@@ -37,7 +40,7 @@ def without_files(words: Sequence[str]) -> list[str]:
     them names what it builds on. A word beside it goes over the file's of the same name.
 
     Raises:
-      ConfigError: for a file that cannot be read, or holds something else.
+      ConfigError: for a file that cannot be read, holds something else, or names a module.
     """
     files = {text: path for text in words if (path := _file_of(text)) is not None}
     given = {_name(text) for text in words if text not in files}
@@ -111,7 +114,7 @@ def _words_of(path: Path, given: set[str]) -> list[str]:
         "preset=best, or write `es.noise_std: 0.1` there",
     )
     values = flatten(content)
-    odd = [name for name in values if not _FIELD.fullmatch(name)]
+    odd = [name for name in values if not FIELD.fullmatch(name)]
     require(
         not odd,
         "preset",
@@ -129,4 +132,18 @@ def _words_of(path: Path, given: set[str]) -> list[str]:
         f"{base} in {path}",
         "`preset: best` there",
     )
-    return [f"{name}={word(value)}" for name, value in values.items() if name not in given]
+    found = [f"{name}={word(value)}" for name, value in values.items() if name not in given]
+    foreign = [
+        text
+        for text in found
+        if _name(text).rpartition(".")[2] in IMPORTING and registry.paths_in([text])
+    ]
+    require(
+        not foreign,
+        "preset",
+        "name no module",
+        "only what you type is imported",
+        f"{', '.join(foreign)} in {path}",
+        "these words on the command line too, if you trust the module",
+    )
+    return found

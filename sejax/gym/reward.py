@@ -15,7 +15,7 @@ from sejax.errors import ConfigError, as_python, fraction, require
 from sejax.gym import networks
 from sejax.gym.source import Source, read
 from sejax.gym.tasks import RealTask, num_categories, vector_size
-from sejax.proxies import ABSURD
+from sejax.proxies import MAX_ABS_VALUE
 from sejax.proxies.configs import RewardConfig
 
 _PLANE = (
@@ -155,9 +155,9 @@ class RewardNetwork(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
         real_reward, terminated, truncated = float(real_reward), bool(terminated), bool(truncated)
         ends = terminated or (truncated and self.limit_is_terminal)
         reward = self._bonus(obs, self._told(info), ends)
-        if self.config.is_additive:
+        if self.config.shaping.is_additive:
             reward += real_reward
-        if not abs(reward) < ABSURD:  # nan is not either
+        if not abs(reward) < MAX_ABS_VALUE:  # nan is not either
             reward, terminated = 0.0, True
         info = {**info, "discount": float(not terminated), "real_reward": real_reward}
         return obs, reward, terminated, truncated, info
@@ -186,7 +186,7 @@ class RewardNetwork(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
             return float(self._weights @ told)
         before, self._potential = self._potential, self.potential(obs, told)
         after = 0.0 if ends and self.config.zero_at_terminal else self._potential
-        return self.discount * after - before if self.config.is_potential_based else after
+        return self.discount * after - before if self.config.shaping.is_potential_based else after
 
     def _apply(self, inputs: np.ndarray) -> np.ndarray:
         outputs = networks.forward(self._layers, self.config.activation, inputs)
@@ -199,23 +199,23 @@ class RewardNetwork(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
         except KeyError as error:
             raise ConfigError(
                 f"env must tell {', '.join(self._info_keys)} in a step's info, because this RN "
-                f"{'weighs' if self.config.weighs_info else 'sees'} it; got "
+                f"{'weighs' if self.config.shaping.weighs_info else 'sees'} it; got "
                 f"{', '.join(info) or 'none'}. Set sejax.gym.RewardNetwork(..., info_keys=[...]) "
                 f"to what it is called there."
             ) from error
 
     def _keys(self, task: str, given: Sequence[str] | None) -> tuple[str, ...]:
         """Entries of `info` that the RN needs."""
-        if not (self.config.weighs_info or self.config.augmented):
+        if not (self.config.shaping.weighs_info or self.config.augmented):
             return ()
-        known = INFO_KEYS if self.config.weighs_info else AUGMENTED_KEYS
+        known = INFO_KEYS if self.config.shaping.weighs_info else AUGMENTED_KEYS
         keys = known.get(task) if given is None else tuple(given)
         if keys is None:
             raise ConfigError(
                 f"info_keys must be given for {task}, because this RN needs numbers of a step's "
                 f"info and only those of {', '.join(known)} are known here; got none. "
                 f"Set sejax.gym.RewardNetwork(env, source, info_keys=[...]) to "
-                f"`sejax.Task.{'info' if self.config.weighs_info else 'augmented'}_keys`."
+                f"`sejax.Task.{'info' if self.config.shaping.weighs_info else 'augmented'}_keys`."
             )
         return keys
 
@@ -275,7 +275,7 @@ def _kind(space: Any) -> tuple[str, Any] | None:
 
 
 def _shapes(config: RewardConfig, obs_dim: int, num_keys: int) -> networks.Shapes:
-    if config.weighs_info:
+    if config.shaping.weighs_info:
         return {"info_weights": (num_keys,)}
     hidden = [config.hidden_size] * config.num_layers
     return networks.shapes_of("potential", [obs_dim + num_keys, *hidden, 1])

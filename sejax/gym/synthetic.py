@@ -11,9 +11,8 @@ from gymnasium import spaces
 from sejax.errors import require
 from sejax.gym import networks
 from sejax.gym.tasks import RealTask, num_categories, vector_size
-from sejax.proxies import ABSURD
+from sejax.proxies import MAX_ABS_VALUE
 from sejax.proxies.configs import SyntheticConfig
-from sejax.proxies.units import units_of
 
 
 class Step(NamedTuple):
@@ -66,9 +65,8 @@ class SyntheticWorld:
         self._start_layers = networks.layers_of(weights, "start")
         self._limit_is_terminal = config.horizon is not None and config.horizon_is_terminal
         self._units = None
-        if config.state_units == "bounds" and isinstance(task.observation_space, spaces.Box):
-            space = task.observation_space
-            self._units = units_of(space.low.ravel(), space.high.ravel(), self.obs_dim)
+        if isinstance(task.observation_space, spaces.Box):
+            self._units = config.units(task.observation_space)
         self._starts = task.starts
         require(
             self._starts or config.initial_state != "real",
@@ -103,7 +101,7 @@ class SyntheticWorld:
         if self._start_layers:
             vector = drawn + networks.forward(self._start_layers, self.config.activation, drawn)
         vector = vector if self._units is None else self._units.decode(vector)
-        return np.minimum(np.maximum(vector, np.float32(-ABSURD)), np.float32(ABSURD))
+        return np.minimum(np.maximum(vector, np.float32(-MAX_ABS_VALUE)), np.float32(MAX_ABS_VALUE))
 
     def encode(self, action: Any, space: spaces.Space[Any]) -> np.ndarray:
         """Actions as the networks see them, `[*lanes, action_dim]`: one-hot if they are discrete.
@@ -136,8 +134,8 @@ class SyntheticWorld:
         """
         outputs = self._predict(action, vector)  # [*lanes, obs_dim + 2]
         absurd: Any = False
-        if not np.abs(outputs).max() < ABSURD:  # nan is not either
-            absurd = ~(np.abs(outputs).max(axis=-1) < ABSURD)
+        if not np.abs(outputs).max() < MAX_ABS_VALUE:  # nan is not either
+            absurd = ~(np.abs(outputs).max(axis=-1) < MAX_ABS_VALUE)
             stays = np.zeros_like(outputs)  # where it was, without a reward
             stays[..., :-2], stays[..., -1] = vector, 1
             outputs = np.where(absurd[..., None], stays, outputs)

@@ -1,12 +1,13 @@
-"""The contract of a proxy: a world with weights that stands in for a real task.
+"""The contract of a proxy: an environment with weights that stands in for a real task.
 
-A proxy is a gymnax 1.x `Environment` whose `EnvParams` hold the weights, so that an agent never
-knows which world it is in. What the inner loop must know of a world beside that is a `World`, which
-a proxy states and any other environment has by default.
+A proxy is a gymnax 1.x `Environment` whose `EnvParams` hold the weights, so that an agent trains in
+it as in any other environment. What the inner loop must know beside that is told by `is_real`,
+`episode_limit` and `prepare`, of a proxy and of any other environment.
 """
 
 import copy
-from typing import Any, NamedTuple
+from abc import ABC, abstractmethod
+from typing import Any
 
 import jax
 from flax import struct
@@ -14,87 +15,88 @@ from gymnax.environments import environment
 from jaxtyping import Array
 
 from sejax.envs.base import Task
-
-
-class World(NamedTuple):
-    """What the inner loop must know of a world.
-
-    Attributes:
-      is_real: whether its steps are steps of the real task: they are counted as such, and its time
-        limit is one that agents may treat as terminal.
-      max_steps: steps that an episode cannot exceed; None if params may say anything.
-    """
-
-    is_real: bool = True
-    max_steps: int | None = None
+from sejax.errors import require
+from sejax.proxies import ProxyConfig
 
 
 @struct.dataclass
 class ProxyParams(environment.EnvParams):
-    """Weights of a proxy, as from its `init_weights`, and the real task's step limit."""
+    """Weights of a proxy, as from its `init_weights`, and the step limit of its episodes."""
 
     weights: Any = None
     max_steps_in_episode: int = 1
 
 
-class ProxyEnv(environment.Environment[Any, Any]):
-    """A proxy of a task; subclasses add the dynamics (`reset_env`, `step_env`).
+class ProxyEnv(environment.Environment[Any, Any], ABC):
+    """A proxy of a task; subclasses add `init_weights`, `reset_env` and `step_env`.
 
-    A subclass must give `init_weights`, `reset_env` and `step_env`. The latter may put
-    into its `info` under "discount" what a target bootstraps with before the agent's gamma (1 minus
-    terminated if it is not there), and under "nonfinite" whether a number was met that is not
-    finite, which ends the training.
+    `step_env` may put two entries into its `info`: "discount", what a target bootstraps with before
+    the agent's gamma (1 minus terminated if it is not there), and "nonfinite", whether a number was
+    met that is not finite, which ends the training.
 
     Attributes:
-      task: the real task.
-      config: that it was made from, a dataclass.
-      is_real: whether its dynamics are the real task's.
-    """
+      task: the real task, whose spaces the proxy has.
+      config: the configuration that it was made from.
 
-    is_real = False
+    Raises:
+      ConfigError: for a configuration that does not derive from `ProxyConfig`.
+    """
 
     def __init__(self, task: Task, config: Any):
         super().__init__()
+        require(
+            isinstance(config, ProxyConfig),
+            "proxy",
+            "be a dataclass that derives from sejax.ProxyConfig",
+            "that declares what is asked of a proxy",
+            type(config).__name__,
+            f"class {type(config).__name__}(sejax.ProxyConfig)",
+        )
         self.task = task
         self.config = config
         self._default_params: Any = None
 
+    @abstractmethod
     def init_weights(self, key: Array) -> Any:
         """Random weights, a nested dictionary of float32 arrays."""
-        raise NotImplementedError
 
     def params(self, weights: Any, discount: Array | float = 1.0) -> Any:
-        """`EnvParams` of the proxy with these weights and the real task's step limit.
+        """`EnvParams` of the proxy with these weights.
 
         Args:
           weights: as from `init_weights`.
-          discount: gamma of the agent that it is for; most proxies have no use for it.
+          discount: gamma of the agent that trains on it; most proxies have no use for it.
         """
-        return ProxyParams(weights=weights, max_steps_in_episode=self.task.max_steps)
+        return ProxyParams(weights=weights, max_steps_in_episode=self.max_steps)
 
-    def prepared(
+    def prepare(
         self, params: Any, discount: Array | float | None, limit_is_terminal: Array | bool = False
     ) -> Any:
-        """The same params for a whole training of an agent.
+        """The same params for the whole training of one agent.
 
         Args:
           params: of the proxy.
-          discount: the agent's; None if it has none.
+          discount: the agent's gamma; None if it has none.
           limit_is_terminal: whether the agent does not bootstrap at the step limit.
         """
         return params
 
     @property
-    def world(self) -> World:
-        """What the inner loop must know."""
-        return World(is_real=self.is_real, max_steps=self.task.max_steps)
+    def is_real(self) -> bool:
+        """Whether its dynamics are the real task's."""
+        return self.config.has_real_dynamics
+
+    @property
+    def max_steps(self) -> int:
+        """Maximum number of steps of an episode."""
+        return self.config.max_steps(self.task.max_steps)
 
     @property
     def default_params(self) -> Any:
         """Random weights, or those given to `with_default_params`."""
         return self._default_params or self.params(self.init_weights(jax.random.key(0)))
 
-    def with_default_params(self, params: Any) -> Any:
+    def with_default_params(self, params: Any) -> "ProxyEnv":
         """A copy for callers that rely on `default_params`, such as `gymnax.make`."""
         env = copy.copy(self)
         env._default_params = params
@@ -115,12 +117,18 @@ class ProxyEnv(environment.Environment[Any, Any]):
         return self.task.env.observation_space(self.task.params)
 
 
-def world_of(env: Any) -> World:
-    """What the inner loop must know of an environment, a proxy or any other."""
-    return getattr(env, "world", World())
+def is_real(env: Any) -> bool:
+    """Whether steps in an environment are steps of a real task."""
+    return not isinstance(env, ProxyEnv) or env.is_real
+
+
+def episode_limit(env: Any) -> int | None:
+    """Steps that an episode cannot exceed; None where only the params tell."""
+    return env.max_steps if isinstance(env, ProxyEnv) else None
 
 
 def prepare(env: Any, params: Any, discount: Array | float | None, limit_is_terminal: bool) -> Any:
-    """A world's params for a whole training: `ProxyEnv.prepared` if there is one."""
-    prepared = getattr(env, "prepared", None)
-    return params if prepared is None else prepared(params, discount, limit_is_terminal)
+    """An environment's params for the whole training of one agent; see `ProxyEnv.prepare`."""
+    if not isinstance(env, ProxyEnv):
+        return params
+    return env.prepare(params, discount, limit_is_terminal)

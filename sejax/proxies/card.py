@@ -155,7 +155,7 @@ def _words_of_best(proxy: PretrainedProxy) -> str:
         if registry.is_registered("agent", name)
     ]
     # Who is solved for on an SE cannot train on the real task beside it.
-    alone = any(getattr(agent, "is_solved_for", False) for agent in of_sejax)
+    alone = any(agent.is_solved_for for agent in of_sejax)
     return " agent_hparams=as_learned" + (" baseline=false" if alone else "")
 
 

@@ -1,10 +1,19 @@
-"""Configurations of the proxies. Importing this imports neither JAX nor gymnax."""
+"""Configurations of the proxies, and what else of them needs no JAX.
+
+They lie apart from the environments that they make, because importing this module imports neither
+JAX nor gymnax: `sejax.gym` runs proxies in NumPy alone, and the commands refuse bad settings before
+they load JAX.
+"""
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
+import numpy as np
+
+from sejax.envs.base import Facts, Task
 from sejax.errors import require
-from sejax.options import ACTIVATIONS, MOST_LAYERS, Options, counts, one_of, option, positive
+from sejax.options import ACTIVATIONS, MOST_LAYERS, counts, one_of, option, positive
+from sejax.proxies import MAX_ABS_VALUE, ProxyConfig
 
 if TYPE_CHECKING:
     from sejax.proxies.base import ProxyEnv
@@ -12,45 +21,55 @@ if TYPE_CHECKING:
 DONE_MODES = ("soft", "threshold", "bernoulli", "sigmoid")
 INITIAL_STATES = ("real", "learned", "noise")
 STATE_UNITS = ("raw", "bounds")
-VARIANTS = (
-    "additive_potential",
-    "exclusive_potential",
-    "additive_non_potential",
-    "exclusive_non_potential",
-    "additive_weighted_info",
-    "exclusive_weighted_info",
-)
+
+
+class Units(NamedTuple):
+    """Units in which an SE's networks see and make states.
+
+    Attributes:
+      middle: `[obs_dim]` float32, the state that is 0 for the networks.
+      one: `[obs_dim]` float32, the difference that is 1 for them.
+    """
+
+    middle: np.ndarray
+    one: np.ndarray
+
+    def encode(self, vector: Any) -> Any:
+        """States `[*batch, obs_dim]` in these units; of NumPy or JAX."""
+        return (vector - self.middle) / self.one
+
+    def decode(self, vector: Any) -> Any:
+        """Inverse of `encode`."""
+        return vector * self.one + self.middle
 
 
 @dataclass(frozen=True, kw_only=True)
-class SyntheticConfig(Options):
+class SyntheticConfig(ProxyConfig):
     """The SE's networks, where its episodes begin, and how they end.
 
     The paper's SE is `initial_state=real horizon=null done=soft`; the contextual bandit of Liesen
     et al. (2024) is `initial_state=learned horizon=1`.
     """
 
-    group: ClassVar[str] = "proxy"
-
     hidden_size: int = option(128, counts("a layer needs a unit"))
     num_layers: int = option(1, counts("there is a hidden layer", most=MOST_LAYERS))
     activation: str = option("leaky_relu", one_of(ACTIVATIONS))
     # How the done output d ends an episode. soft: at d > 0.5, but targets bootstrap with 1 - d
     # (the authors'); threshold: at d > 0.5; bernoulli: with probability clip(d, 0, 1); sigmoid:
-    # with probability sigmoid(d). All but the first are ends that every agent sees.
+    # with probability sigmoid(d). Agents see all ends but the first.
     done: str = option("soft", one_of(DONE_MODES))
-    # real: the task's initial states; learned: standard normal noise, moved by a network; noise:
-    # that alone, in the units of `state_units`, where nothing would tell the network what to learn.
+    # real: the task's initial states; learned: standard normal noise plus a network's output for
+    # it; noise: noise alone, in the units of `state_units`.
     initial_state: str = option("real", one_of(INITIAL_STATES))
-    # Units in which the networks see and make states. raw: the task's own; bounds: half the way
-    # from the middle of its observation space to the bounds, where it has such, is 1. A car's
-    # velocity lies in [-0.07, 0.07]: noise of 1, or a weight, is no measure for it.
+    # Units in which the networks see and make states. raw: the task's own; bounds: 0 is the middle
+    # of a bounded observation and 1 is half of the way to its bound. A car's velocity lies in
+    # [-0.07, 0.07], where noise of 1 would be no measure.
     state_units: str = option("raw", one_of(STATE_UNITS))
     # Steps of an episode; null: the task's limit. 1: a contextual bandit, which has neither a
     # next-state nor a done network.
     horizon: int | None = option(None, counts("an episode has steps"))
-    # Whether the horizon terminates an episode, so that nothing is bootstrapped there, or cuts it,
-    # as the task's limit does.
+    # Whether the horizon terminates an episode, so that nothing is bootstrapped there, or truncates
+    # it, as the task's limit does.
     horizon_is_terminal: bool = True
 
     def __post_init__(self) -> None:
@@ -65,32 +84,92 @@ class SyntheticConfig(Options):
         )
 
     @property
-    def lasts_to_the_limit(self) -> bool:
-        """Whether the episodes of most of what it may become take all steps that they may."""
-        return self.horizon == 1 or (self.done == "soft" and self.horizon is None)
+    def is_bandit(self) -> bool:
+        """Whether an episode is one step: a contextual bandit."""
+        return self.horizon == 1
+
+    @property
+    def ends_at_horizon(self) -> bool:
+        """Whether the step limit terminates an episode in place of truncating it."""
+        return self.horizon is not None and self.horizon_is_terminal
 
     @property
     def needs_task(self) -> bool:
-        """Whether its task must run where it is used; what agents see of it is in a file."""
         return self.initial_state == "real"
 
+    @property
+    def sees_bounds(self) -> bool:
+        return self.state_units == "bounds"
+
+    @property
+    def reaches_step_limit(self) -> bool:
+        return self.is_bandit or (self.done == "soft" and self.horizon is None)
+
     def max_steps(self, task_max_steps: int) -> int:
-        """Steps of an episode at most."""
         return task_max_steps if self.horizon is None else self.horizon
 
-    def make(self, task: Any) -> "ProxyEnv":
-        """The SE of a task."""
-        from sejax.proxies.synthetic import SyntheticEnv
+    def units(self, space: Any) -> Units | None:
+        """Units of states in a box, gymnax's or Gymnasium's; None for the task's own.
 
-        return SyntheticEnv(task, self)
+        An entry without bounds keeps its own unit; some spaces write "none" as a huge number.
+
+        Example:
+          >>> from gymnasium.spaces import Box
+          >>> space = Box(np.float32([-1.5, -np.inf]), np.float32([0.5, np.inf]))
+          >>> SyntheticConfig(state_units="bounds").units(space)
+          Units(middle=array([-0.5,  0. ], dtype=float32), one=array([0.5, 1. ], dtype=float32))
+        """
+        if self.state_units == "raw":
+            return None
+        low, high = (
+            np.broadcast_to(np.asarray(x, np.float32), space.shape) for x in (space.low, space.high)
+        )
+        bounded = (np.abs(low) < MAX_ABS_VALUE) & (np.abs(high) < MAX_ABS_VALUE)
+        low, high = np.where(bounded, low, -2), np.where(bounded, high, 2)
+        return Units(
+            middle=((low + high) / 2).astype(np.float32), one=((high - low) / 4).astype(np.float32)
+        )
+
+    def make(self, task: Task) -> "ProxyEnv":
+        """The SE of a task."""
+        from sejax.proxies.synthetic import BanditEnv, SyntheticEnv  # imports JAX
+
+        return (BanditEnv if self.is_bandit else SyntheticEnv)(task, self)
+
+
+class Shaping(NamedTuple):
+    r"""How a reward network makes a reward: a row of the paper's table of variants.
+
+    Attributes:
+      is_additive: whether the real reward r is added.
+      is_potential_based: whether a step is worth :math:`\gamma \Phi(s') - \Phi(s)`, and not
+        :math:`\Phi(s')`.
+      weighs_info: whether there is no network, but a weight for each number i' in the step's `info`
+        (`Task.info_keys`).
+    """
+
+    is_additive: bool
+    is_potential_based: bool = False
+    weighs_info: bool = False
+
+
+# Source: paper, table "Overview of Reward Network variants".
+VARIANTS = {
+    "additive_potential": Shaping(is_additive=True, is_potential_based=True),
+    "exclusive_potential": Shaping(is_additive=False, is_potential_based=True),
+    "additive_non_potential": Shaping(is_additive=True),
+    "exclusive_non_potential": Shaping(is_additive=False),
+    "additive_weighted_info": Shaping(is_additive=True, weighs_info=True),
+    "exclusive_weighted_info": Shaping(is_additive=False, weighs_info=True),
+}
 
 
 @dataclass(frozen=True, kw_only=True)
-class RewardConfig(Options):
+class RewardConfig(ProxyConfig):
     """The RN's network, and how its output makes a reward."""
 
-    group: ClassVar[str] = "proxy"
-    default_objective: ClassVar[str] = "reward_threshold"  # of `python -m sejax.run proxy=rn`
+    default_objective: ClassVar[str] = "reward_threshold"
+    has_real_dynamics: ClassVar[bool] = True
 
     hidden_size: int = option(128, counts("a layer needs a unit"))
     num_layers: int = option(1, counts("there is a hidden layer", most=MOST_LAYERS))
@@ -99,38 +178,44 @@ class RewardConfig(Options):
     # Phi is this times the network's output. Some agents learn only from small rewards
     # (docs/results.md, MountainCarContinuous).
     output_scale: float = option(1.0, positive("a reward of 0 teaches nothing", 1e6))
-    augmented: bool = False  # the network sees the task's observation vector v as well
+    augmented: bool = False  # the network sees the task's vector v as well
     zero_at_terminal: bool = False  # Phi is 0 where episodes end for the agent; see RewardEnv
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name in ("augmented", "zero_at_terminal"):
+        for name, default in (
+            ("output_scale", 1),
+            ("augmented", False),
+            ("zero_at_terminal", False),
+        ):
+            value = getattr(self, name)
             require(
-                not (self.weighs_info and getattr(self, name)),
+                value == default or not self.shaping.weighs_info,
                 f"proxy.{name}",
-                "be false with weighted info",
+                f"be {str(default).lower()} with weighted info",
                 f"{self.variant} has no network",
-                "true",
-                f"proxy.{name}=false",
+                str(value).lower(),
+                f"proxy.{name}={str(default).lower()}",
             )
-        require(
-            self.output_scale == 1 or not self.weighs_info,
-            "proxy.output_scale",
-            "be 1 with weighted info",
-            f"{self.variant} has no network",
-            self.output_scale,
-            "proxy.output_scale=1",
-        )
 
-    def require_task(self, facts: Any, task_name: str) -> None:
-        """Checks that the task tells what this variant needs.
+    @property
+    def shaping(self) -> Shaping:
+        """How the network's output makes a reward."""
+        return VARIANTS[self.variant]
+
+    @property
+    def needs_discount(self) -> bool:
+        return self.shaping.is_potential_based
+
+    def require_task(self, facts: Facts, task_name: str) -> None:
+        """Checks that the steps of the task tell what this variant needs.
 
         Raises:
-          ConfigError: if it does not.
+          ConfigError: if they do not.
         """
         has_vector = facts.has_info if facts.has_vector is None else facts.has_vector
         fields = (
-            ("variant", self.weighs_info, facts.has_info, "additive_potential"),
+            ("variant", self.shaping.weighs_info, facts.has_info, "additive_potential"),
             ("augmented", self.augmented, has_vector, "false"),
         )
         for name, is_needed, is_there, fix in fields:
@@ -144,25 +229,13 @@ class RewardConfig(Options):
                 f"proxy.{name}={fix}",
             )
 
-    def make(self, task: Any) -> "ProxyEnv":
+    def make(self, task: Task) -> "ProxyEnv":
         """The RN of a task.
 
         Raises:
           ConfigError: if the task does not tell what this variant needs.
         """
-        from sejax.proxies.reward import RewardEnv
+        from sejax.proxies.reward import RewardEnv  # imports JAX
 
         self.require_task(task.facts, task.name)
         return RewardEnv(task, self)
-
-    @property
-    def weighs_info(self) -> bool:
-        return self.variant.endswith("weighted_info")
-
-    @property
-    def is_additive(self) -> bool:
-        return self.variant.startswith("additive")
-
-    @property
-    def is_potential_based(self) -> bool:
-        return self.variant in ("additive_potential", "exclusive_potential")

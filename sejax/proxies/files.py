@@ -126,9 +126,7 @@ class Proxy:
             if _is_registered("agent", values)
         ]
         limit = self.env.task.max_steps
-        return budget_for(
-            self.learned_with("training"), agent, known, self.env.world.max_steps or limit, limit
-        )
+        return budget_for(self.learned_with("training"), agent, known, self.env.max_steps, limit)
 
     def _configured(self, group: str, stored: Any) -> Any:
         where = f"{group} that {self.path.name} was learned with"
@@ -359,7 +357,7 @@ def _write(
     is_set: bool,
 ) -> None:
     require(
-        discount is not None or not getattr(env.config, "is_potential_based", False),
+        discount is not None or not env.config.needs_discount,
         "discount",
         "be given for a potential-based reward network",
         "its reward is made with it",
@@ -527,7 +525,7 @@ def _env_of(
         try:
             task = envs.make_from(_registered("env", "task", "env", path, config, option))
         except ConfigError as error:
-            if "interface" not in header or getattr(proxy, "needs_task", True):
+            if "interface" not in header or proxy.needs_task:
                 raise
             task = absent.make(header["task"], header["interface"], config["env"], str(error))
     require(
@@ -551,14 +549,13 @@ def _require_same(
     An RN is for the same dynamics with another step limit too, and an SE in the task's raw units
     does not know the bounds of observations.
     """
-    is_se = hasattr(proxy, "lasts_to_the_limit")
-    with_bounds = {"observation": getattr(proxy, "state_units", "raw") == "bounds", "action": True}
+    with_bounds = {"observation": proxy.sees_bounds, "action": True}
     for what, wanted in learned.items():
         there = given[what]
         if what in with_bounds:
             same = _is_same_space(wanted, there, with_bounds[what])
         else:
-            same = there == wanted or not is_se
+            same = there == wanted or proxy.has_real_dynamics
         require(
             same,
             "task",

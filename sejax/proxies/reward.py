@@ -1,4 +1,4 @@
-"""The reward network (RN): the real task with a learned reward in the place of its own.
+"""The reward network (RN): the real task with a learned reward in place of its own.
 
 Source: paper, section "Learning Reward Networks" (table "Overview of Reward Network variants");
 `docs/reference.md` 5.
@@ -15,10 +15,10 @@ from jaxtyping import Array, Float
 from sejax.envs.base import Task
 from sejax.errors import require
 from sejax.ops.networks import MLP, uniform_fan_in
-from sejax.proxies import ABSURD
+from sejax.proxies import MAX_ABS_VALUE
 from sejax.proxies.base import ProxyEnv
 
-if TYPE_CHECKING:  # which makes it
+if TYPE_CHECKING:  # whose `make` imports this
     from sejax.proxies.configs import RewardConfig
 
 
@@ -33,8 +33,8 @@ class RewardState(environment.EnvState):
 @struct.dataclass
 class RewardParams(environment.EnvParams):
     weights: Any = None  # as from `init_weights`
-    potentials: Array | None = None  # of every state, if `prepared` for one where they are counted
-    discount: Array | float = 1.0  # gamma; `prepared` puts the agent's here
+    potentials: Array | None = None  # [num_states], if `prepare` found discrete states
+    discount: Array | float = 1.0  # gamma; `prepare` puts the agent's here
     limit_is_terminal: Array | bool = False  # whether episodes end for the agent at the step limit
     max_steps_in_episode: int = 1
 
@@ -72,11 +72,11 @@ class RewardEnv(ProxyEnv):
     variants, baselines of the authors' code, weigh the numbers i' in the step's `info`
     (`Task.info_keys`) and have no network.
 
-    `info["real_reward"]` is r. A reward that is not finite, or absurd, is 0 and ends the episode;
-    `info["nonfinite"]` says whether it was not even a number.
+    `info["real_reward"]` is r. A reward that is not finite, or beyond `MAX_ABS_VALUE`, is 0 and
+    ends the episode; `info["nonfinite"]` says whether it was not finite.
     """
 
-    is_real = True
+    config: "RewardConfig"
 
     def __init__(self, task: Task, config: "RewardConfig"):
         super().__init__(task, config)
@@ -85,33 +85,31 @@ class RewardEnv(ProxyEnv):
 
     def init_weights(self, key: Array) -> Any:
         """Random weights: `{"potential"}` of the network, or `{"info_weights": [info_keys]}`."""
-        if self.config.weighs_info:
+        if self.config.shaping.weighs_info:
             num_keys = len(self.task.info_keys)
             return {"info_weights": uniform_fan_in(num_keys)(key, (num_keys,))}
         num_inputs = self.task.obs_dim + len(self._augmented_keys)
         return {"potential": self._net.init(key, jnp.zeros(num_inputs))["params"]}
 
     def params(self, weights: Any, discount: Array | float = 1.0) -> RewardParams:
-        return RewardParams(
-            weights=weights, discount=discount, max_steps_in_episode=self.task.max_steps
-        )
+        return RewardParams(weights=weights, discount=discount, max_steps_in_episode=self.max_steps)
 
-    def prepared(
+    def prepare(
         self,
         params: RewardParams,
         discount: Array | float | None,
         limit_is_terminal: Array | bool = False,
     ) -> RewardParams:
-        """The same for a whole training of an agent.
+        """The same params for the whole training of one agent, with its discount.
 
-        Where states are counted, all potentials are computed at once: a step then looks its two up.
-        They are these weights': with other weights prepare again.
+        Where states are discrete, all potentials are computed at once, and a step looks its two up.
+        They belong to these weights: with other weights call it again.
 
         Raises:
           ConfigError: if the reward needs a discount and the agent has none.
         """
         require(
-            discount is not None or not self.config.is_potential_based,
+            discount is not None or not self.config.shaping.is_potential_based,
             "agent",
             "say its discount",
             f"{self.config.variant} pays with it",
@@ -119,7 +117,7 @@ class RewardEnv(ProxyEnv):
             "Agent(discount=lambda hparams: ...)",
         )
         potentials = None
-        if self.task.num_states is not None and not self.config.weighs_info:
+        if self.task.num_states is not None and not self.config.shaping.weighs_info:
             states = jnp.arange(self.task.num_states)
             potentials = self._apply(params.weights, jax.nn.one_hot(states, states.size))
         return params.replace(
@@ -151,7 +149,7 @@ class RewardEnv(ProxyEnv):
         info: Any,
         terminated: Any,
     ) -> Float[Array, ""]:
-        """What a transition is worth beside the real reward.
+        """The learned part of a transition's reward.
 
         Args:
           params: weights and discount.
@@ -160,13 +158,13 @@ class RewardEnv(ProxyEnv):
           info: of the real task's step.
           terminated: whether the task ended by it.
         """
-        if self.config.weighs_info:
+        if self.config.shaping.weighs_info:
             return params.weights["info_weights"] @ _select(info, self.task.info_keys)
         after = self.potential(params, next_state.obs, next_state.augmentation)
         if self.config.zero_at_terminal:
             is_cut = self.is_truncated(next_state, params)
             after = jnp.where(terminated | (params.limit_is_terminal & is_cut), 0.0, after)
-        if not self.config.is_potential_based:
+        if not self.config.shaping.is_potential_based:
             return after
         before = self.potential(params, state.obs, state.augmentation)
         return params.discount * after - before
@@ -189,17 +187,17 @@ class RewardEnv(ProxyEnv):
             time=state.time + 1,
         )
         reward = self.bonus(params, state, next_state, info, terminated)
-        if self.config.is_additive:
+        if self.config.shaping.is_additive:
             reward = real_reward + reward
-        sane = jnp.abs(reward) < ABSURD  # False for nan
+        is_sane = jnp.abs(reward) < MAX_ABS_VALUE  # False for nan
         discount = info.get("discount", jnp.where(terminated, 0.0, 1.0))
         info = {
             **info,
-            "discount": jnp.where(sane, discount, 0.0),
+            "discount": jnp.where(is_sane, discount, 0.0),
             "real_reward": jnp.float32(real_reward),
             "nonfinite": ~jnp.isfinite(reward),
         }
-        return obs, next_state, jnp.where(sane, reward, 0.0), terminated | ~sane, info
+        return obs, next_state, jnp.where(is_sane, reward, 0.0), terminated | ~is_sane, info
 
     def is_truncated(self, state: RewardState, params: RewardParams) -> Array:
         at_limit = state.time >= params.max_steps_in_episode

@@ -1,4 +1,4 @@
-"""The synthetic environment (SE): small networks in the place of a real task.
+"""The synthetic environment (SE): small networks in place of a real task.
 
 Source: paper, section "Learning Synthetic Environments"; `docs/reference.md` 1. One-step episodes
 and learned initial states: Liesen et al., "Discovering Minimal Reinforcement Learning Environments"
@@ -10,16 +10,15 @@ from typing import TYPE_CHECKING, Any
 import jax
 import jax.numpy as jnp
 from flax import struct
-from gymnax.environments import environment
+from gymnax.environments import environment, spaces
 from jaxtyping import Array, Bool, Float
 
 from sejax.envs.base import Task
 from sejax.ops.networks import MLP
-from sejax.proxies import ABSURD
-from sejax.proxies.base import ProxyEnv, ProxyParams, World
-from sejax.proxies.units import units_of
+from sejax.proxies import MAX_ABS_VALUE
+from sejax.proxies.base import ProxyEnv, ProxyParams
 
-if TYPE_CHECKING:  # which makes it
+if TYPE_CHECKING:  # whose `make` imports this
     from sejax.proxies.configs import SyntheticConfig
 
 START_HIDDEN_SIZE = 32  # of the network that makes initial states
@@ -36,54 +35,50 @@ class SyntheticEnv(ProxyEnv):
 
     Each network maps the action (one-hot if discrete) and the state to the next state, the reward
     or the done output d. Where states are discrete, the networks' state is a vector with an entry
-    for each of them, one-hot at first and then whatever the network makes of it; the agent observes
+    for each of them, one-hot at first and then the next-state network's output; the agent observes
     the index of its largest entry.
 
-    What the configuration says of beginnings and ends:
+    The configuration chooses how episodes begin and end:
 
-    - `initial_state`: the real task's; or standard normal noise; or learned: noise plus what a
-      network makes of it, so that a fresh SE's starts surround the origin.
-    - `done`: how d terminates an episode. `info["discount"]` is what a target should bootstrap
-      with: 1 - d itself if it is "soft" (a learned discount, not confined to [0, 1], which no agent
-      outside sees), else 1 - terminated.
-    - `horizon`: steps of an episode, whose last one terminates it if `horizon_is_terminal`. With
-      one step there are no networks of state and end, and the state stays as it is. At the task's
-      own limit, with no horizon, the episode is truncated.
+    - `initial_state`: the real task's; or standard normal noise; or learned: noise plus a network's
+      output for it, so that the initial states of a fresh SE surround the origin.
+    - `done`: how d terminates an episode. `info["discount"]` is what a target bootstraps with: with
+      "soft" 1 - d itself (a learned discount, not confined to [0, 1], which agents outside of sejax
+      do not see), else 1 - terminated.
+    - `horizon`: steps of an episode. The last one terminates it if `horizon_is_terminal`. At the
+      task's own limit, with no horizon, the episode is truncated.
 
     Continuous actions are clipped to the task's bounds, as by the task itself.
 
-    An output that is not finite, or absurd, ends the episode: the state stays where it was, the
-    reward is 0, and `info["nonfinite"]` says whether it was not even a number.
+    An output that is not finite, or beyond `MAX_ABS_VALUE`, ends the episode: the state stays where
+    it was, the reward is 0, and `info["nonfinite"]` says whether it was not finite.
     """
+
+    config: "SyntheticConfig"
+    is_bandit = False
 
     def __init__(self, task: Task, config: "SyntheticConfig"):
         super().__init__(task, config)
-        outputs = (
-            {"reward": 1}
-            if config.horizon == 1
-            else {
-                "state": task.obs_dim,
-                "reward": 1,
-                "done": 1,
-            }
-        )
         self._nets = {
             head: MLP(size, config.hidden_size, config.num_layers, config.activation)
-            for head, size in outputs.items()
+            for head, size in self._output_sizes().items()
         }
         self._units = None
-        if config.state_units == "bounds" and task.num_states is None:
-            space = task.env.observation_space(task.params)
-            self._units = units_of(space.low, space.high, task.obs_dim)
+        if task.num_states is None:
+            self._units = config.units(task.env.observation_space(task.params))
         self._start = None
         if config.initial_state == "learned":
             self._start = MLP(task.obs_dim, START_HIDDEN_SIZE, 1, config.activation)
 
-    def init_weights(self, key: Array) -> Any:
-        """Random weights, `{"state", "reward", "done", "start"}` as far as there are networks."""
+    def _output_sizes(self) -> dict[str, int]:
+        """Number of outputs of each network."""
+        return {"state": self.task.obs_dim, "reward": 1, "done": 1}
+
+    def init_weights(self, key: Array) -> dict[str, Any]:
+        """Random weights of each network: "state", "reward", "done", and "start" if learned."""
         example = jnp.zeros(self.task.action_dim + self.task.obs_dim)
         *keys, key_start = jax.random.split(key, len(self._nets) + 1)
-        weights = {
+        weights: dict[str, Any] = {
             head: net.init(k, example)["params"]
             for k, (head, net) in zip(keys, self._nets.items(), strict=True)
         }
@@ -92,55 +87,37 @@ class SyntheticEnv(ProxyEnv):
             weights["start"] = self._start.init(key_start, noise)["params"]
         return weights
 
-    def params(self, weights: Any, discount: Array | float = 1.0) -> ProxyParams:
-        return ProxyParams(
-            weights=weights, max_steps_in_episode=self.config.max_steps(self.task.max_steps)
-        )
-
-    @property
-    def world(self) -> World:
-        return World(is_real=False, max_steps=self.config.max_steps(self.task.max_steps))
-
     def predict(
         self, weights: Any, vector: Float[Array, " obs_dim"], action: Array
     ) -> tuple[Float[Array, " obs_dim"], Float[Array, ""], Float[Array, ""]]:
-        """The networks' raw outputs: next state, reward and done output d.
+        """The networks' raw outputs: next state, reward and done output d."""
+        out = self._outputs(weights, vector, action)
+        state = out["state"] if self._units is None else self._units.decode(out["state"])
+        return state, out["reward"][0], out["done"][0]
 
-        In a bandit the first is `vector`, and the last 1.
-        """
+    def _outputs(
+        self, weights: Any, vector: Float[Array, " obs_dim"], action: Array
+    ) -> dict[str, Any]:
+        """The output of each network, `[size]`, in the networks' own units."""
         if self.task.num_actions is not None:
             action = jax.nn.one_hot(action, self.task.num_actions)
         seen = vector if self._units is None else self._units.encode(vector)
         x = jnp.concatenate([action, seen])
-        out = {head: net.apply({"params": weights[head]}, x) for head, net in self._nets.items()}
-        if self.config.horizon == 1:
-            return vector, out["reward"][0], jnp.float32(1)
-        state = out["state"] if self._units is None else self._units.decode(out["state"])
-        return state, out["reward"][0], out["done"][0]
-
-    @property
-    def is_bandit(self) -> bool:
-        """Whether every episode is one step, so that its reward is all there is to gain."""
-        return self.config.horizon == 1
-
-    def bandit_reward(
-        self, weights: Any, obs: Float[Array, " obs_dim"], action: Array
-    ) -> Float[Array, ""]:
-        """The reward of an action, where states are what agents observe."""
-        return self.predict(weights, obs, action)[1]
+        return {head: net.apply({"params": weights[head]}, x) for head, net in self._nets.items()}
 
     def reset_env(self, key: Array, params: ProxyParams) -> tuple[Array, SyntheticState]:
-        if self.config.initial_state != "real":
+        if self.config.initial_state == "real":
+            vector, _ = self.task.env.reset_env(key, self.task.params)
+            if self.task.num_states is not None:
+                vector = jax.nn.one_hot(vector, self.task.num_states)
+        else:
             vector = noise = jax.random.normal(key, (self.task.obs_dim,))
             if self._start is not None:
                 moved: Any = self._start.apply({"params": params.weights["start"]}, noise)
                 vector = noise + moved
             vector = vector if self._units is None else self._units.decode(vector)
-            vector = jnp.clip(vector, -ABSURD, ABSURD)  # what steps from there call absurd
-        else:
-            vector, _ = self.task.env.reset_env(key, self.task.params)
-            if self.task.num_states is not None:
-                vector = jax.nn.one_hot(vector, self.task.num_states)
+            # At the limit, and not beyond it: the first step from there ends the episode.
+            vector = jnp.clip(vector, -MAX_ABS_VALUE, MAX_ABS_VALUE)
         state = SyntheticState(vector=vector, time=jnp.int32(0))
         return self.get_obs(state), state
 
@@ -151,19 +128,19 @@ class SyntheticEnv(ProxyEnv):
             action = jnp.clip(action, -self.task.max_action, self.task.max_action)
         vector, reward, done = self.predict(params.weights, state.vector, action)
         size = jnp.maximum(jnp.max(jnp.abs(vector)), jnp.maximum(jnp.abs(reward), jnp.abs(done)))
-        sane = size < ABSURD  # False for nan
-        state = SyntheticState(vector=jnp.where(sane, vector, state.vector), time=state.time + 1)
-        ends = self.ends(key, done) | ~sane
+        is_sane = size < MAX_ABS_VALUE  # False for nan
+        state = SyntheticState(vector=jnp.where(is_sane, vector, state.vector), time=state.time + 1)
+        ends = self.ends(key, done) | ~is_sane
         at_horizon = jnp.bool_(False)
-        if self.config.horizon is not None and self.config.horizon_is_terminal:
+        if self.config.ends_at_horizon:
             at_horizon = state.time >= params.max_steps_in_episode
         terminated = ends | at_horizon
         discount = 1.0 - done if self.config.done == "soft" else 1.0 - ends
         info = {
-            "discount": jnp.where(sane & ~at_horizon, discount, 0.0),
+            "discount": jnp.where(is_sane & ~at_horizon, discount, 0.0),
             "nonfinite": ~jnp.isfinite(size),
         }
-        return self.get_obs(state), state, jnp.where(sane, reward, 0.0), terminated, info
+        return self.get_obs(state), state, jnp.where(is_sane, reward, 0.0), terminated, info
 
     def ends(self, key: Array, done: Float[Array, ""]) -> Bool[Array, ""]:
         """Whether the done output ends the episode."""
@@ -174,8 +151,8 @@ class SyntheticEnv(ProxyEnv):
         return done > 0.5
 
     def is_truncated(self, state: SyntheticState, params: ProxyParams) -> Any:
-        """At the limit, but for a horizon that terminates the episode."""
-        if self.config.horizon is not None and self.config.horizon_is_terminal:
+        """Whether the episode is at its limit, unless that terminates it."""
+        if self.config.ends_at_horizon:
             return jnp.bool_(False)
         return super().is_truncated(state, params)
 
@@ -185,9 +162,31 @@ class SyntheticEnv(ProxyEnv):
         return state.vector
 
     def observation_space(self, params: ProxyParams | None = None) -> Any:
-        """The real task's, a box without its bounds: a learned world need not respect them."""
-        from gymnax.environments import spaces
-
+        """The real task's, a box without its bounds: a learned state need not respect them."""
         if self.task.num_states is not None:
             return spaces.Discrete(self.task.num_states)
-        return spaces.Box(-ABSURD, ABSURD, (self.task.obs_dim,), jnp.float32)
+        return spaces.Box(-MAX_ABS_VALUE, MAX_ABS_VALUE, (self.task.obs_dim,), jnp.float32)
+
+
+class BanditEnv(SyntheticEnv):
+    """An SE with `horizon=1`, a contextual bandit: its one network makes the reward.
+
+    Its only step terminates the episode and leaves the state as it is.
+    """
+
+    is_bandit = True
+
+    def _output_sizes(self) -> dict[str, int]:
+        return {"reward": 1}
+
+    def predict(
+        self, weights: Any, vector: Float[Array, " obs_dim"], action: Array
+    ) -> tuple[Float[Array, " obs_dim"], Float[Array, ""], Float[Array, ""]]:
+        """The state as it is, the network's reward, and 1."""
+        return vector, self._outputs(weights, vector, action)["reward"][0], jnp.float32(1)
+
+    def bandit_reward(
+        self, weights: Any, obs: Float[Array, " obs_dim"], action: Array
+    ) -> Float[Array, ""]:
+        """The reward of an action, where states are what agents observe."""
+        return self.predict(weights, obs, action)[1]

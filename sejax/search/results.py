@@ -9,6 +9,7 @@ from typing import Any
 import optuna
 from optuna.trial import FrozenTrial, TrialState
 
+from sejax import registry
 from sejax.cli.words import file_text, word
 from sejax.ops.files import atomic_path, write_text
 from sejax.search.settings import Search
@@ -53,7 +54,11 @@ def override_line(words: Sequence[str], search: Search, command: str) -> str:
 
 def preset_line(search: Search, command: str) -> str:
     """The command that reads these settings from their file."""
-    return shlex.join(["python", "-m", command, f"preset={word(str(preset_file(search)))}"])
+    preset = f"preset={word(str(preset_file(search)))}"
+    own = [
+        text for text in search.fixed if registry.paths_in([text])
+    ]  # no file is believed in these
+    return shlex.join(["python", "-m", command, preset, *own])
 
 
 def table(study: optuna.Study, search: Search) -> Any:

@@ -2,7 +2,7 @@
 
 import dataclasses
 import functools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
@@ -13,6 +13,7 @@ from hydra.errors import HydraException
 
 from sejax import registry, serialize
 from sejax.cli import build, compose
+from sejax.cli.words import ENDING, FIELD
 from sejax.errors import ConfigError, nearest, require
 from sejax.ops.files import as_file_name
 from sejax.options import Options, counts, one_of, option, positive
@@ -21,6 +22,7 @@ from sejax.search import spaces
 SAMPLERS = ("tpe", "random")
 PRUNERS = ("hyperband", "median", "none")
 SCORES = ("mean", "worst")
+SQLITE = "sqlite:///"  # of a URL, before a file's path
 MEASURES = ("last", "best", "mean")
 # Fields that are text, whatever YAML takes it for: study=2024-01-01.
 TEXTS = ("study", "storage", "search_dir", "space")
@@ -147,7 +149,7 @@ class Search:
     @property
     def storage(self) -> str:
         """URL of the database."""
-        return self.config.storage or f"sqlite:///{self.folder / 'study.db'}"
+        return self.config.storage or f"{SQLITE}{self.folder / 'study.db'}"
 
     def stored(self) -> dict[str, Any]:
         """What the workers of a study must have in common, as plain values."""
@@ -162,10 +164,18 @@ class Search:
     def from_stored(cls, stored: dict[str, Any], config: SearchConfig, machines: Any) -> "Search":
         """Inverse of `stored`, with the free fields of a worker's own configuration.
 
-        Its folder is that of the study's maker, if that is there and no other is asked for.
+        Its folder is that of the study's maker only where the worker's storage is a file in it.
+        Else a study could name any folder to be written to.
+
+        Raises:
+          ConfigError: if the study holds words that a search does not take, or that would import
+            what the user has not typed.
         """
-        folder = stored["folder"] if Path(stored["folder"]).is_dir() else None
-        search_dir = config.search_dir or folder
+        _require_plain_words(stored)
+        search_dir, url = config.search_dir, config.storage or ""
+        beside = str(Path(url.removeprefix(SQLITE)).parent.resolve())
+        if search_dir is None and url.startswith(SQLITE) and stored["folder"] == beside:
+            search_dir = beside
         return cls(
             config=dataclasses.replace(config, **stored["search"], search_dir=search_dir),
             fixed=tuple(stored["fixed"]),
@@ -188,10 +198,53 @@ class Search:
         return "-".join([self.choice("env", "cartpole"), self.choice("proxy", "se"), self.agent])
 
 
-def completed(stored: dict[str, Any]) -> dict[str, Any]:
-    """What a former version stored of a search, with the fields of today."""
-    usual = serialize.to_plain(SearchConfig())
-    return stored | {"search": _common(usual | stored["search"])}
+def completed(stored: Any) -> dict[str, Any]:
+    """What a former version stored of a search, with the fields of today.
+
+    Raises:
+      ConfigError: if it is not what a search stores.
+    """
+    match stored:
+        case {"search": dict(own), "fixed": list(fixed), "space": dict(space), "folder": str()}:
+            texts = [*own, *fixed, *space, *space.values()]
+            if all(isinstance(text, str) for text in texts):
+                usual = _common(serialize.to_plain(SearchConfig()))
+                return stored | {"search": usual | {k: v for k, v in own.items() if k in usual}}
+    raise ConfigError(
+        "study must be one that sejax.search has made, because its words are read; "
+        "got another. Set study=NAME, a new one."
+    )
+
+
+def _require_plain_words(stored: Mapping[str, Any]) -> None:
+    """Checks the words that a study holds, which somebody else may have written.
+
+    Raises:
+      ConfigError: for one that sets what a search sets itself, is Hydra's own, or names a module
+        that the user has not typed.
+    """
+    words = [*stored["fixed"], *(f"{name}={text}" for name, text in stored["space"].items())]
+    for word in words:
+        name = word.partition("=")[0].lstrip("+")
+        is_field = FIELD.fullmatch(name) and name.partition(".")[0] not in (*TAKEN, "machines")
+        is_field = is_field and not (name == "preset" and ENDING in word)  # stored are its words
+        require(
+            is_field,
+            "study",
+            "hold choices and fields alone",
+            "its words are read as if you had typed them",
+            word,
+            "study=NAME, another one",
+        )
+    foreign = registry.untyped(words)
+    require(
+        not foreign,
+        "study",
+        "name no module that you have not typed",
+        "what a study names is never imported",
+        ", ".join(foreign),
+        "all words of the search on the command line again, if you trust the module",
+    )
 
 
 def _common(fields: dict[str, Any]) -> dict[str, Any]:
@@ -249,6 +302,15 @@ def read(words: Sequence[str]) -> Search:
     preset = spaces.preset(config.space, search.agent, search.is_of_agent)
     given = {word.partition("=")[0] for word in fixed} | set(swept)
     offered = {name: x for name, x in preset.items() if name not in given}
+    foreign = registry.untyped(x.text for x in offered.values())
+    require(
+        not foreign,
+        "space",
+        "name no module",
+        "only what you type is imported",
+        ", ".join(foreign),
+        "agent='choice(...)' on the command line",
+    )
     return dataclasses.replace(search, space={**offered, **swept})
 
 

@@ -1,0 +1,309 @@
+"""How every agent learns its task: test returns against training steps, over many seeds.
+
+Source: paper, Algorithm 1, TrainAgent and EvaluateAgent, with the real task in the SE's place.
+
+After each training episode an agent plays `test_episodes` greedy ones on the task, and nothing ends
+its training but its limits. A study is an agent on a task; its hyperparameters are the paper's
+where `STUDIES` names no others, or those that reward networks of the task are learned with; its
+peers are what others report for the same task.
+"""
+
+import dataclasses
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+import sejax
+from experiments import figures, return_curves
+from experiments.experiment import Experiment
+from experiments.return_curves import WINDOW
+from experiments.settings import Settings, count, each_of, setting
+from experiments.statistics import bootstrap_interval
+from experiments.tables import as_texts, iqm_columns, iqm_note, iqm_text, publish
+from experiments.worlds import CURVES, World, train_groups
+from sejax import registry, serialize
+from sejax.training import TrainingConfig
+
+QUICK_STEPS = 2000
+SHORTEST_EPISODE = 8  # CartPole cannot be lost sooner
+
+# RL Baselines3 Zoo, benchmark.md: the final return of one agent, with the steps it was trained for.
+ZOO = "RL Baselines3 Zoo"
+PAPER_DDQN = "16,888 steps to solve, agents with drawn hyperparameters (the paper)"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Study:
+    """An agent on a task."""
+
+    env: str
+    agent: str
+    max_steps: int  # of training
+    hparams: dict[str, Any] = field(default_factory=dict)  # others than the paper's
+    peers: str = ""  # what others report
+
+    def configuration(self) -> Any:
+        """The paper's agent, which is the default but for PPO, with `hparams`."""
+        cls = registry.find("agent", self.agent)
+        return (sejax.PPOConfig.paper if cls is sejax.PPOConfig else cls)(**self.hparams)
+
+    def changes(self) -> dict[str, Any]:
+        """The hyperparameters that are not the paper's."""
+        return self.hparams
+
+    @property
+    def label(self) -> str:
+        """Its name in pictures."""
+        return figures.AGENT_NAMES[self.agent] + "*" * bool(self.hparams)
+
+    def training(self, quick: bool, test_episodes: int) -> TrainingConfig:
+        """Episodes of training and of tests alternate until the step limit."""
+        max_steps = min(self.max_steps, QUICK_STEPS) if quick else self.max_steps
+        return TrainingConfig(
+            max_episodes=max_steps // SHORTEST_EPISODE,
+            max_steps=max_steps,
+            stop_rule="never",
+            tests_between=test_episodes,
+            time_limit_is_terminal=False,  # as in the literature; the paper's code ends there
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class PresetStudy(Study):
+    """The agent that reward networks of a task are learned with, trained as there.
+
+    Its hyperparameters and the limit of episodes are those of `preset=best`; `max_steps` is what so
+    many episodes take if none ends early.
+    """
+
+    def configuration(self) -> Any:
+        return self._preset().agent
+
+    def changes(self) -> dict[str, Any]:
+        papers = serialize.to_plain(super().configuration())
+        ours = serialize.to_plain(self.configuration())
+        return {name: value for name, value in ours.items() if value != papers[name]}
+
+    def training(self, quick: bool, test_episodes: int) -> TrainingConfig:
+        max_steps = min(self.max_steps, QUICK_STEPS) if quick else self.max_steps
+        return dataclasses.replace(
+            self._preset().training,
+            max_steps=max_steps,
+            stop_rule="never",
+            tests_between=test_episodes,
+        )
+
+    @property
+    def label(self) -> str:
+        return f"quick {figures.AGENT_NAMES[self.agent]}*"
+
+    def _preset(self) -> Any:
+        return sejax.config([f"env={self.env}", "proxy=rn", f"agent={self.agent}"])
+
+
+STUDIES = (
+    Study(env="cartpole", agent="ddqn", max_steps=20_000, peers=PAPER_DDQN),
+    Study(
+        env="cartpole",
+        agent="dueling_ddqn",
+        max_steps=20_000,
+        peers="12,745 steps to solve, likewise",
+    ),
+    Study(
+        env="cartpole",
+        agent="td3_discrete",
+        max_steps=20_000,
+        peers="17,875 steps and a return of 152, likewise",
+    ),
+    Study(
+        env="cartpole",
+        agent="ppo",
+        max_steps=100_000,
+        hparams={
+            "activation": "tanh",
+            "learning_rate": 1e-3,
+            "discount": 0.98,
+            "update_episodes": 4,
+            "epochs": 20,
+        },
+        peers=f"500.0 of 500 on CartPole-v1 after 100,000 steps ({ZOO})",
+    ),
+    Study(
+        env="pendulum",
+        agent="td3",
+        max_steps=20_000,
+        hparams={"learning_rate": 1e-3, "discount": 0.98, "warmup_episodes": 10},
+        peers=f"-151.9 after 20,000 steps ({ZOO})",
+    ),
+    Study(
+        env="pendulum",
+        agent="ppo",
+        max_steps=200_000,
+        hparams={
+            "activation": "tanh",
+            "learning_rate": 5e-4,
+            "discount": 0.95,
+            "entropy_weight": 0.0,
+            "init_action_std": 1.0,
+        },
+        peers=f"-172.2 after 100,000 steps ({ZOO})",
+    ),
+    Study(env="cliff_walking", agent="q_learning", max_steps=2_000, peers="optimal: -12"),
+    Study(env="cliff_walking", agent="sarsa", max_steps=2_000, peers="optimal: -12"),
+    Study(
+        env="cliff_walking",
+        agent="sarsa",
+        max_steps=5_000,
+        hparams={"discount": 1.0, "epsilon_init": 0.01, "epsilon_min": 0.0, "epsilon_decay": 0.9},
+        peers="optimal: -12",
+    ),
+    PresetStudy(
+        env="pendulum", agent="td3", max_steps=20_000, peers=f"-151.9 after 20,000 steps ({ZOO})"
+    ),
+    PresetStudy(
+        env="mountain_car_continuous",
+        agent="td3",
+        max_steps=99_900,
+        peers=f"93.5 after 300,000 steps ({ZOO})",
+    ),
+    PresetStudy(
+        env="halfcheetah",
+        agent="td3",
+        max_steps=100_000,
+        peers=f"9,656 on HalfCheetah-v3 after 1,000,000 steps ({ZOO})",
+    ),
+)
+ENVS = tuple(dict.fromkeys(study.env for study in STUDIES))
+
+
+@dataclass(frozen=True, kw_only=True)
+class AgentLearning(Settings):
+    name = "agent_learning"
+
+    envs: tuple[str, ...] = setting(ENVS, each_of(ENVS), about="tasks whose agents are trained")
+    num_agents: int = count(10, "agents", quick=2, about="seeds of each agent")
+    test_episodes: int = count(1, "episodes", about="after each training episode")
+
+
+def compute(settings: AgentLearning) -> pd.DataFrame:
+    """Trains what is missing; a row for each training episode of each agent and study."""
+    tables = []
+    for number, study in enumerate(STUDIES):
+        if study.env not in settings.envs:
+            continue
+        training = study.training(settings.quick, settings.test_episodes)
+        world = World.real(
+            sejax.envs.make(study.env),
+            ["all"],
+            name=f"{number:02d}-{study.env}-{study.agent}",
+            agent=study.configuration(),
+            training=training,
+            is_single=True,
+        )
+        curves = train_groups(world, settings, settings.num_agents, CURVES).drop(columns="group")
+        tables.append(curves.assign(study=number, max_steps=training.max_steps))
+    return pd.concat(tables, ignore_index=True)
+
+
+def summarise(curves: pd.DataFrame) -> pd.DataFrame:
+    """One row for each study."""
+    rows = []
+    for number, mine in curves.groupby("study"):
+        study = STUDIES[int(number)]
+        threshold = sejax.envs.make(study.env).solved_reward
+        to_solve = return_curves.all_steps_to_solve(mine, threshold)
+        last = return_curves.last_returns(mine)
+        low, high = bootstrap_interval(last)
+        rows.append(
+            {
+                "study": number,
+                "env": study.env,
+                "agent": study.agent,
+                "num_agents": len(last),
+                "max_steps": mine["max_steps"].iloc[0],
+                "made_steps": mine.groupby("agent")["steps"].max().mean(),
+                "threshold": threshold,
+                "num_solved": int(np.isfinite(to_solve).sum()),
+                "num_solved_at_the_end": int((last >= threshold).sum()),
+                "median_steps_to_solve": np.median(to_solve),
+                "last_return": last.mean(),
+                "last_low": low,
+                "last_high": high,
+                **iqm_columns(last, "last"),
+            }
+        )
+    return pd.DataFrame(rows)
+
+
+COLUMNS: dict[str, Any] = {
+    "task": "{env}",
+    "agent": "{agent}",
+    "other than the paper's": lambda row: ", ".join(
+        f"{name} {value}" for name, value in STUDIES[row.study].changes().items()
+    ),
+    "solved": "{num_solved} of {num_agents} at {threshold:g}",
+    "still at the end": "{num_solved_at_the_end}",
+    "median steps to solve": lambda row: (
+        f"{row.median_steps_to_solve:,.0f}" if np.isfinite(row.median_steps_to_solve) else "-"
+    ),
+    "steps, at most": "{max_steps:,}",
+    "made": "{made_steps:,.0f}",
+    f"last {WINDOW} tests": "{last_return:.1f} [{last_low:.1f}, {last_high:.1f}]",
+    "IQM": iqm_text("last"),
+    "others": lambda row: STUDIES[row.study].peers,
+}
+
+
+def report(settings: AgentLearning, curves: pd.DataFrame) -> pd.DataFrame:
+    draw(settings, curves)
+    summary = summarise(curves)
+    note = (
+        f"{settings.num_agents} seeds of each; after each training episode "
+        f"{settings.test_episodes} greedy test episode. Solved: the mean of {WINDOW} tests in a "
+        f"row reaches the threshold at some time, at the end if that of the last {WINDOW} does. "
+        "Made: steps until the last episode that ended, on average; some are limited by their "
+        f"number of episodes. The last {WINDOW} tests: mean over seeds, bootstrap 95% interval. "
+        "CartPole here is v0, "
+        f"of 200 steps.{iqm_note()}"
+    )
+    title = "Agents that learn the real tasks"
+    return publish(settings, title, as_texts(summary, COLUMNS), summary, note)
+
+
+def draw(settings: AgentLearning, curves: pd.DataFrame, points: int = 100) -> None:
+    """Draws a panel for each task: mean and 95% interval of each agent."""
+    tasks = list(curves.groupby(curves["study"].map(lambda i: STUDIES[i].env), sort=False))
+    palette = (figures.REAL, figures.VARIED, figures.FIXED, figures.SOLVED)
+    columns = min(3, len(tasks))
+    lines = -(-len(tasks) // columns)
+    path = settings.folder / "learning_curves.png"
+    with figures.panels(path, lines, columns, (4.6 * columns, 3.6 * lines)) as (_, axes):
+        for axis in axes.ravel()[len(tasks) :]:
+            axis.set_visible(False)
+        for axis, (env, mine) in zip(axes.ravel(), tasks, strict=False):
+            for color, (number, study_curves) in zip(palette, mine.groupby("study"), strict=False):
+                last_step = study_curves["steps"].max()
+                grid = np.geomspace(last_step / 200, last_step, points)
+                figures.band(
+                    axis,
+                    grid,
+                    return_curves.on_grid(study_curves, grid),
+                    lambda values: np.transpose([bootstrap_interval(v) for v in values.T]),
+                    color,
+                    lw=1.8,
+                    label=STUDIES[int(number)].label,
+                )
+            axis.axhline(sejax.envs.make(env).solved_reward, color="#7a7a7a", ls="--", lw=1)
+            axis.set_title(env, fontsize=10)
+            axis.set(xscale="log", xlabel="training steps (*: hyperparameters in the table)")
+            axis.legend(fontsize=8, loc="best")
+        for axis in axes[:, 0]:
+            axis.set_ylabel(f"test return, mean of {WINDOW}")
+
+
+EXPERIMENT = Experiment(settings=AgentLearning, compute=compute, report=report, about=__doc__)
+
+if __name__ == "__main__":
+    EXPERIMENT.main()

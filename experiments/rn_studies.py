@@ -1,0 +1,340 @@
+"""What the paper studies about reward networks, task by task, and the sets of RNs it needs.
+
+RNs are learned once and shared by all experiments: those of a task, variant and objective are one
+file, `<rns_dir>/<env>/<objective>/<variant>.safetensors`, and the curves of their NES runs lie
+beside it. Runs that were interrupted go on, and where more RNs are asked for than a file holds only
+the further ones are learned.
+
+Differs: on HalfCheetah the unseen agent, PPO, has the ICM and the number of episodes of TD3; the
+authors' scripts have others for it (`docs/reference.md` 4.8 and 7.3). TD3 is the quick one of
+`preset=best` (docs/agents.md): the paper's takes 250 CPU seconds for each of some hundred trainings
+on MountainCarContinuous, and five times that on HalfCheetah.
+"""
+
+import dataclasses
+import functools
+import itertools
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+import sejax
+from experiments import figures, pieces, proxy_runs, worlds
+from experiments.proxy_runs import RunSettings
+from experiments.settings import setting, work_beside
+from sejax import ICMConfig, errors, registry, serialize
+from sejax.cli import build, run_directory
+from sejax.errors import ConfigError
+from sejax.options import counts, one_of
+
+# Paper, table "Overview of Reward Network variants".
+VARIANTS = (
+    "additive_potential",
+    "exclusive_potential",
+    "additive_non_potential",
+    "exclusive_non_potential",
+)
+AUGMENTED = "+augm"  # of a variant's name: the network sees the task's observation vector as well
+WEIGHTED_INFO = ("additive_weighted_info", "exclusive_weighted_info")
+ROWS = ("default", "varied", "transfer")  # agents that are trained, as in the paper's figure
+OBJECTIVES = tuple(registry.GROUPS["objective"].built_in)
+# With quick=true; a task's own come on top.
+QUICK: dict[str, Any] = {
+    "learned": 2,
+    "generations": 4,
+    "rns": 2,
+    "num_agents": 4,
+    "max_steps": 1500,
+    "run": ("es.population_size=8",),
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Study:
+    """What the paper trains on the RNs of a task."""
+
+    agent: Any  # of the rows with default and varied hyperparameters; None: that of `preset=best`
+    transfer_agent: Any  # of the row with an unseen agent
+    # Makes the one that was tuned on the real task for few steps, if it is another one.
+    tuned_agent: Callable[[], Any] | None = None
+    rows: tuple[str, ...] = ROWS  # of the figure: `rn_curves.ROWS`
+    bonuses: dict[str, Any]  # exploration bonuses that are compared on the real task
+    variants: tuple[str, ...] = VARIANTS
+    max_episodes: int  # that the paper trains
+    max_steps: int  # training steps that its figure shows
+    learned: int = 10  # RNs of each variant
+    runs_at_once: int = 1  # of them in one program; a run is saved after each generation of all
+    rns: int = 10  # the best ones of them, that agents are trained on
+    num_agents: int = 10  # on each of these
+    # Where trainings of the task, or compiling its physics, would take too long with quick=true.
+    when_quick: dict[str, Any] = field(default_factory=dict)
+
+
+# Paper, appendix "Reward Network Hyperparameters": the tables of default hyperparameters.
+_CARTPOLE: dict[str, Any] = {
+    "warmup_episodes": 1,
+    "batch_size": 32,
+    "learning_rate": 2.5e-4,
+    "tau": 0.01,
+    "epsilon_min": 0.1,
+    "hidden_size": 64,
+    "num_layers": 1,
+    "buffer_size": 1_000_000,
+}
+_FEW: dict[str, Any] = {"variants": ("additive_potential",), "rows": ("default",)}  # when quick
+STUDIES = {
+    "cliff_walking": Study(
+        # SARSA explores less than the paper's table says, as in the authors' scripts: with an
+        # epsilon of 0.1 and a learning rate of 1 it does not learn the task.
+        agent=sejax.QLearningConfig(),
+        transfer_agent=sejax.SARSAConfig(epsilon_init=0.01, epsilon_min=0.01),
+        bonuses={"count_based": sejax.CountBasedConfig()},
+        max_episodes=500,
+        max_steps=5000,
+        learned=50,
+        runs_at_once=50,
+    ),
+    "cartpole": Study(
+        agent=sejax.DDQNConfig(**_CARTPOLE),
+        transfer_agent=sejax.DuelingDDQNConfig(**_CARTPOLE),
+        tuned_agent=functools.partial(worlds.tuned_agent, "cartpole", "ddqn"),
+        rows=(*ROWS, "tuned"),
+        bonuses={"icm": ICMConfig()},
+        max_episodes=1000,
+        max_steps=50_000,
+        when_quick=_FEW | {"rows": ("default", "transfer"), "generations": 2},
+    ),
+    "mountain_car_continuous": Study(
+        agent=None,
+        transfer_agent=sejax.PPOConfig.paper(action_repeat=5),
+        # docs/agents.md, "PPO in few steps"
+        tuned_agent=functools.partial(
+            sejax.PPOConfig.paper,
+            action_repeat=5,
+            rollout_steps=256,
+            learning_rate=0.0015,
+            init_action_std=1.0,
+        ),
+        rows=(*ROWS, "tuned"),
+        bonuses={"icm": ICMConfig(forward_weight=0.1, reward_scale=0.01, learning_rate=5e-4)},
+        max_episodes=3000,
+        max_steps=250_000,
+        when_quick=_FEW
+        | {
+            "generations": 2,
+            "run": (
+                "es.population_size=4",
+                "es.num_incumbent_evals=4",
+                "training.max_episodes=4",
+                "agent.warmup_episodes=1",
+            ),
+        },
+    ),
+    "halfcheetah": Study(
+        agent=None,
+        transfer_agent=sejax.PPOConfig.paper(
+            hidden_size=128,
+            activation="tanh",
+            learning_rate=1e-5,
+            update_episodes=1,
+            epochs=10,
+            entropy_weight=0.001,
+            init_action_std=0.1,
+        ),
+        bonuses={"icm": ICMConfig(forward_weight=0.001, reward_scale=0.1, learning_rate=1e-5)},
+        variants=(*VARIANTS, *(v + AUGMENTED for v in VARIANTS), *WEIGHTED_INFO),
+        max_episodes=1000,
+        max_steps=500_000,
+        learned=5,
+        rns=5,
+        num_agents=5,
+        when_quick=_FEW
+        | {
+            "generations": 1,
+            "learned": 1,
+            "num_agents": 2,
+            "bonuses": (),
+            "run": (
+                "es.population_size=2",
+                "es.num_incumbent_evals=2",
+                "training.max_episodes=2",
+                "agent.warmup_episodes=1",
+            ),
+        },
+    ),
+}
+SHOWN = {  # colour of a world, and the reward that agents get there
+    "real": (figures.BEST, "real reward"),
+    "icm": ("#7a7a7a", "real reward + ICM"),
+    "count_based": ("#7a7a7a", "real reward + count-based"),
+    "additive_potential": (figures.REAL, r"$r + \gamma\Phi(s') - \Phi(s)$"),
+    "exclusive_potential": ("#56B4E9", r"$\gamma\Phi(s') - \Phi(s)$"),
+    "additive_non_potential": (figures.VARIED, r"$r + \Phi(s')$"),
+    "exclusive_non_potential": (figures.FIXED, r"$\Phi(s')$"),
+    "additive_weighted_info": (figures.SOLVED, r"$r + w^\top i'$"),
+    "exclusive_weighted_info": ("#CC79A7", r"$w^\top i'$"),
+}
+
+
+def label(name: str) -> str:
+    """Name of a world in pictures: the reward that agents get there."""
+    _, text = SHOWN[name.removesuffix(AUGMENTED)]
+    return text if AUGMENTED not in name else re.sub(r"\(s('?)\)", r"(s\1, v\1)", text)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RnSettings(RunSettings):
+    """Settings about the task and the RNs that are learned; defaults are those of the study."""
+
+    env: str = setting("cliff_walking", one_of(STUDIES), about=f"task: {', '.join(STUDIES)}")
+    variants: tuple[str, ...] = setting(
+        VARIANTS, about=f"of the RNs: those, with {AUGMENTED}, {', '.join(WEIGHTED_INFO)}"
+    )
+    learned: int = setting(10, counts("RNs are learned"), about="RNs to learn of each variant")
+    rns_dir: str | None = setting(
+        None, about="where RNs are kept; results/reward_networks, quick rns/ in `out`"
+    )
+
+    @classmethod
+    def defaults(cls, given: Mapping[str, Any]) -> dict[str, Any]:
+        usual = super().defaults(given)
+        env = given.get("env", usual["env"])
+        errors.one_of("env", env, STUDIES)
+        study = STUDIES[env]
+        values = vars(study) | {"bonuses": tuple(study.bonuses)}
+        values |= QUICK | study.when_quick if given.get("quick") else {}
+        return usual | {name: values[name] for name in usual.keys() & values.keys()}
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        errors.each_of("variants", self.variants, self.study.variants)
+
+    @property
+    def study(self) -> Study:
+        return STUDIES[self.env]
+
+    @property
+    def task(self) -> Any:
+        """The real task, with the physics and rewards that RNs are learned with."""
+        return learning_config(self, self.variants[0], OBJECTIVES[0]).task()
+
+    @property
+    def learning_agent(self) -> Any:
+        """The agent that RNs are learned with."""
+        return learning_config(self, self.variants[0], OBJECTIVES[0]).agent
+
+    @property
+    def rns_folder(self) -> Path:
+        """Where all RNs are kept."""
+        if self.rns_dir is not None:
+            return Path(self.rns_dir)
+        return self.folder / "rns" if self.quick else Path("results/reward_networks")
+
+
+def objective_setting() -> Any:
+    """The setting of experiments that use the RNs of one objective."""
+    return setting(
+        "reward_threshold",
+        one_of(OBJECTIVES),
+        about=f"that RNs are learned by: {', '.join(OBJECTIVES)}",
+    )
+
+
+def learn(settings: RnSettings, variant: str, objective: str) -> Any:
+    """The RNs of a variant, learned by an objective: a `ProxySet` in the order of their seeds."""
+    there = stored(settings, variant, objective)
+    known = there.size if there else 0
+    if known < settings.learned:
+        config = learning_config(settings, variant, objective)
+        config = dataclasses.replace(config, seed=settings.seed + known)
+        path, count = file_of(settings, variant, objective), settings.learned - known
+        runs = work_beside(settings.rns_folder, "runs")
+        folder = runs / path.relative_to(settings.rns_folder).with_suffix("")
+        configs = proxy_runs.configs_of_runs(config, count, folder, settings.study.runs_at_once)
+        print(
+            f"{variant}: learns {count} RNs, {config.generations} generations each; may be "
+            "stopped and started again",
+            flush=True,
+        )
+        curves = [proxy_runs.learn_all(configs, "rns_dir")]
+        if there:
+            before = pieces.read_rows(curves_file(path))  # with those beyond, if stopped right here
+            curves.insert(0, before[before["seed"] < config.seed])
+        pieces.write_rows(curves_file(path), pd.concat(curves, ignore_index=True))
+        proxy_runs.collect(configs, path, there)
+        there = sejax.load_set(path, option="rns_dir", kind="rn")
+    return there.first(settings.learned)
+
+
+def file_of(settings: RnSettings, variant: str, objective: str) -> Path:
+    """Where the RNs of a variant and objective are kept."""
+    return settings.rns_folder / settings.env / objective / f"{variant}.safetensors"
+
+
+def curves_file(path: Path) -> Path:
+    """Where the curves of the NES runs of a set are kept."""
+    return path.with_suffix(".csv.xz")
+
+
+def stored(settings: RnSettings, variant: str, objective: str) -> Any:
+    """The RNs that are there already, a `ProxySet`; None if they are to be learned.
+
+    Raises:
+      ConfigError: if they were learned with other settings. Fewer generations are no such settings:
+        their runs go on.
+    """
+    path = file_of(settings, variant, objective)
+    if not path.exists():
+        return None
+    there = sejax.load_set(path, option="rns_dir", kind="rn")
+    made_with = _what_counts(build.learn_config(there.config))
+    asked = _what_counts(learning_config(settings, variant, objective))
+    differing = [
+        name for name in sorted({*made_with, *asked}) if made_with.get(name) != asked.get(name)
+    ]
+    if differing == ["generations"] and made_with["generations"] < asked["generations"]:
+        return None
+    if differing:
+        raise ConfigError(
+            f"rns_dir must be a new folder or hold RNs of the same settings, because they are "
+            f"learned once for all experiments; got {path} with another {', '.join(differing)}. "
+            f"Set rns_dir=DIR, or the settings that they were learned with."
+        )
+    return there
+
+
+def _what_counts(config: Any) -> dict[str, Any]:
+    """What a run depends on; not how it is computed, with which others, or where it is kept."""
+    free = run_directory.FREE_FIELDS - {"generations"} | {"num_parallel", "num_seeds"}
+    flat = serialize.flatten(build.to_plain(config))
+    return {name: value for name, value in flat.items() if name.partition(".")[0] not in free}
+
+
+def check_stored(settings: RnSettings, objectives: Sequence[str]) -> None:
+    """Checks all RNs that are there (see `stored`) before any are learned, which may take days."""
+    for objective, variant in itertools.product(objectives, settings.variants):
+        stored(settings, variant, objective)
+
+
+@functools.cache
+def learning_config(settings: RnSettings, variant: str, objective: str) -> Any:
+    """Settings of the NES runs for a variant and objective.
+
+    The scale of a network's output is the preset's for the preset's own variant, and 1 for others.
+    """
+    plain = variant.removesuffix(AUGMENTED)
+    usual = settings.learn_config(["proxy=rn"]).proxy
+    scale = usual.output_scale if plain == usual.variant else 1.0
+    return settings.learn_config(
+        [
+            "proxy=rn",
+            f"proxy.variant={plain}",
+            f"proxy.augmented={plain != variant}",
+            f"proxy.output_scale={scale}",
+            f"objective={objective}",
+        ]
+    )

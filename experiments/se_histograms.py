@@ -1,0 +1,340 @@
+"""What an SE shows its agents: histograms of next states and rewards, beside the real task's.
+
+Source: paper, section "Analyzing SE Behavior" (figure "Histograms of next state s' and reward r")
+and appendix "Qualitative Study of Synthetic Environments for the CartPole and Acrobot Tasks";
+`docs/reference.md` 7.2.
+
+Agents with default hyperparameters are trained on one SE and tested on the real task. Shown are
+
+- `train`: the SE's transitions in training itself, in the initial episodes and with exploration;
+  of each agent the last `max_rows` ones,
+- `test`: the real transitions of its greedy test episodes,
+- `response`: what the SE's networks say in one step from the states and actions of `test`.
+
+If `response` is closer to `train` than to `test`, it is the SE that shifts the distributions and
+not what the agents do in it.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import matplotlib.pyplot as plt
+import numpy as np
+import pandas as pd
+from scipy.stats import wasserstein_distance
+
+import sejax
+from experiments import figures, se_agents
+from experiments.experiment import Experiment
+from experiments.se_agents import AGENTS, SOFT_SE
+from experiments.settings import Settings, count, each_of, setting
+from experiments.tables import as_texts, publish
+from experiments.worlds import Measure, World, train_groups, training_as_learned
+from sejax import registry
+from sejax.agents.buffers import Buffer, BufferMaker, write_row
+from sejax.training import TrainingConfig
+
+SOURCES = {
+    "train": (figures.REAL, "SE, in training"),
+    "test": (figures.VARIED, "real task, in tests"),
+    "response": (figures.FIXED, "SE, from the tests' states and actions"),
+}
+DIMENSIONS = {
+    "cartpole": (
+        "cart position (m)",
+        "cart velocity (m/s)",
+        "pole angle (rad)",
+        "pole angular velocity (rad/s)",
+    ),
+    "acrobot": (
+        "cos of angle 1",
+        "sin of angle 1",
+        "cos of angle 2",
+        "sin of angle 2",
+        "angular velocity 1 (rad/s)",
+        "angular velocity 2 (rad/s)",
+    ),
+}
+
+# Paper, the same appendix: mean test returns of the agents shown; section "Analyzing SE Behavior":
+# 199.3 for CartPole and DDQN.
+PAPER_RETURNS = {
+    "cartpole": {"ddqn": "199.3", "dueling_ddqn": "193.75", "td3_discrete": "197.26"},
+    "acrobot": {"ddqn": "-91.62", "dueling_ddqn": "-88.56", "td3_discrete": "-93.17"},
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class SeHistograms(Settings):
+    name = "se_histograms"
+
+    proxy: str = setting(SOFT_SE, about="SE: a run directory, a file or a shipped name")
+    agents: tuple[str, ...] = setting(AGENTS, each_of(AGENTS), about="kinds of agents, a row each")
+    num_agents: int = count(10, "agents", quick=3, about="of each kind")
+    test_episodes: int = count(10, "episodes", about="of each agent")
+    max_rows: int = count(
+        10_000, "transitions", about="training transitions of an agent that are kept, the last ones"
+    )
+
+    @property
+    def rows_file(self) -> Path:
+        """Every transition: too many to keep."""
+        return self.work_folder / "rows.csv.xz"
+
+
+def compute(settings: SeHistograms) -> pd.DataFrame:
+    """Trains what is missing; a row for each transition."""
+    ses = load(settings)
+    tables = []
+    for kind in settings.agents:
+        agent = se_agents.agent_config(settings, kind)
+        world = World.of_set(
+            ses,
+            ["all"],
+            name=kind,
+            agent=agent,
+            training=training_of(settings, ses, agent),
+            exploration=registry.configure("exploration", ses.config["exploration"]),
+            settings={"max_rows": settings.max_rows},
+            is_single=True,
+        )
+        rows = train_groups(world, settings, settings.num_agents, transitions(settings.max_rows))
+        tables.append(rows.assign(kind=kind))
+    return pd.concat(tables, ignore_index=True).drop(columns="group")
+
+
+def load(settings: SeHistograms) -> Any:
+    """The SE."""
+    return sejax.load_set(settings.proxy, option="proxy", kind="se").first(1)
+
+
+def training_of(settings: SeHistograms, ses: Any, agent: Any) -> TrainingConfig:
+    """How long an agent trains: as those that the SE was learned with."""
+    training = training_as_learned(ses, agent)
+    if settings.quick:
+        most = min(training.max_steps or se_agents.QUICK_STEPS, se_agents.QUICK_STEPS)
+        training = dataclasses.replace(training, max_steps=most)
+    return dataclasses.replace(training, test_episodes=settings.test_episodes)
+
+
+@functools.cache
+def transitions(max_rows: int) -> Measure:
+    """What is kept of an agent: the last transitions of its training, and its tests'."""
+    return Measure(
+        make_run=functools.partial(make_recorded_run, max_rows),
+        to_table=lambda recorded, drawn: rows_of(recorded),
+        say=lambda rows: f"mean return {test_returns(rows).mean():.1f}, {len(rows):,} transitions",
+    )
+
+
+def make_recorded_run(
+    max_rows: int, agent: Any, env: Any, task: Any, training: TrainingConfig
+) -> Callable[..., Any]:
+    """Builds `run(key, env_params, active)` that trains, tests and records one agent."""
+    from sejax.evaluation import make_recorder, make_tested_trainer
+
+    capacity = min(max_rows, training.max_steps or max_rows)
+    train = make_tested_trainer(agent, env, task, training, recorder=last_steps(capacity))
+    test = make_recorder(agent, task, training.test_episodes)
+
+    def run(key: Any, env_params: Any, active: Any) -> dict[str, dict[str, Any]]:
+        key_train, key_test = jax.random.split(key)
+        trained = train(key_train, env_params, agent.hparams, active)
+        steps = test(key_test, trained.agent_state)
+        predict = jax.vmap(lambda s, a: env.predict(env_params.weights, s, a)[:2])
+        next_obs, reward = predict(steps.obs, steps.action)
+        tested = {
+            "episode": jnp.arange(steps.reward.shape[0]) // task.max_steps,
+            "valid": steps.valid,
+        }
+        met = trained.recorded.rows
+        valid = jnp.arange(capacity) < trained.train_steps
+        return {
+            "train": {
+                "next_obs": met[:, 2:],
+                "reward": met[:, 1],
+                "episode": jnp.int32(met[:, 0]),
+                "valid": valid,
+            },
+            "test": {"next_obs": steps.next_obs, "reward": steps.reward} | tested,
+            "response": {"next_obs": next_obs, "reward": reward} | tested,
+        }
+
+    return run
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class LastSteps:
+    """What a recorder keeps."""
+
+    rows: Any  # `[capacity, 2 + obs_dim]` of episode, reward and next state, in no order
+    episode: Any  # that goes on, `[]`
+
+
+def last_steps(capacity: int) -> BufferMaker:
+    """A recorder of the last `capacity` steps of a training."""
+
+    def make(example: Any, max_steps: int) -> Buffer:
+        def init() -> LastSteps:
+            rows = jnp.zeros((capacity, 2 + example.next_obs.shape[0]))
+            return LastSteps(rows=rows, episode=jnp.int32(0))
+
+        def store(kept: LastSteps, step: Any, made: Any, ended: Any, active: Any) -> LastSteps:
+            first = jnp.stack([jnp.float32(kept.episode), jnp.float32(made.reward)])
+            row = jnp.concatenate([first, made.next_obs])
+            return LastSteps(
+                rows=write_row(kept.rows, step, row, active),
+                episode=kept.episode + (ended & active),
+            )
+
+        return Buffer(init=init, store=store, batch=lambda *_: None)
+
+    return make
+
+
+def rows_of(recorded: dict[str, dict[str, np.ndarray]]) -> pd.DataFrame:
+    """The valid transitions of all agents as a table.
+
+    Each source has `next_obs [agent, rows, obs_dim]`, and `reward`, `episode` and `valid`,
+    `[agent, rows]`.
+    """
+    tables = []
+    for agent in range(recorded["test"]["valid"].shape[0]):
+        for source, every in recorded.items():
+            mine = {name: x[agent][every["valid"][agent]] for name, x in every.items()}
+            states = {f"state_{i}": x.astype(float) for i, x in enumerate(mine["next_obs"].T)}
+            columns = {"episode": mine["episode"], "reward": mine["reward"].astype(float)}
+            tables.append(pd.DataFrame({"source": source, "agent": agent} | columns | states))
+    return pd.concat(tables, ignore_index=True)
+
+
+def test_returns(rows: pd.DataFrame) -> pd.Series:
+    """Return of each agent's test episodes, by agent and episode."""
+    tests = rows[rows["source"] == "test"]
+    return tests.groupby(["agent", "episode"])["reward"].sum()
+
+
+def columns_of(rows: pd.DataFrame) -> list[str]:
+    """The columns that are shown: those of the next state, then the reward."""
+    return [*[name for name in rows if name.startswith("state_")], "reward"]
+
+
+def names_of(task: Any, rows: pd.DataFrame) -> dict[str, str]:
+    """What people call these columns."""
+    usual = {name: name.replace("_", " ") for name in columns_of(rows)}
+    return usual | dict(zip(usual, DIMENSIONS.get(task.name, ()), strict=False))
+
+
+def summarise(rows: pd.DataFrame) -> pd.DataFrame:
+    """Widths and distances of the distributions, a row for each kind of agent and dimension."""
+    out = []
+    for kind, mine in rows.groupby("kind", sort=False):
+        for column in columns_of(rows):
+            samples = {name: mine[mine["source"] == name][column] for name in SOURCES}
+            pairs = ("response", "train"), ("response", "test"), ("train", "test")
+            out.append(
+                {
+                    "kind": kind,
+                    "dimension": column,
+                    **{f"std_{name}": x.std(ddof=0) for name, x in samples.items()},
+                    **{
+                        f"{a}_to_{b}": wasserstein_distance(samples[a], samples[b])
+                        for a, b in pairs
+                    },
+                }
+            )
+    return pd.DataFrame(out)
+
+
+def make_table(task: Any, rows: pd.DataFrame, summary: pd.DataFrame) -> pd.DataFrame:
+    """The summary as texts; the return stands in each kind's first row."""
+    names = names_of(task, rows)
+
+    def first(text: Callable[[str], str]) -> Callable[[Any], str]:
+        return lambda row: text(row.kind) if row.dimension == next(iter(names)) else ""
+
+    def returned(kind: str) -> str:
+        returns = test_returns(rows[rows["kind"] == kind])
+        return f"{returns.mean():.2f} ± {returns.std():.2f}"
+
+    return as_texts(
+        summary,
+        {
+            "agent": first(str),
+            "return": first(returned),
+            "paper's": first(lambda kind: PAPER_RETURNS.get(task.name, {}).get(kind, "")),
+            "next": lambda row: names[row.dimension],
+            **{f"std, {name}": f"{{std_{name}:.3g}}" for name in SOURCES},
+            "response to train": "{response_to_train:.3g}",
+            "response to test": "{response_to_test:.3g}",
+            "response is closer to": lambda row: (
+                "train" if row.response_to_train < row.response_to_test else "test"
+            ),
+        },
+    )
+
+
+def report(settings: SeHistograms, rows: pd.DataFrame) -> pd.DataFrame:
+    task = load(settings).task
+    summary = summarise(rows)
+    draw(task, rows, settings.folder / "histograms.png")
+    closer = int((summary["response_to_train"] < summary["response_to_test"]).sum())
+    note = (
+        f"{rows['agent'].nunique()} agents a row with {settings.test_episodes} test episodes each; "
+        "the return is mean ± std over test episodes. Train: the SE's transitions met in training; "
+        "test: the real task's in greedy tests; response: the SE's from the states and actions of "
+        "those tests. Distances are Wasserstein's, in the unit of the dimension. The response is "
+        f"closer to training than to the tests in {closer} of {len(summary)} distributions "
+        "(paper: it aligns better with training, so that the SE makes the shift and not its "
+        "agents)."
+    )
+    title = f"Transitions of agents trained on an SE of {task.name}"
+    return publish(settings, title, make_table(task, rows, summary), summary, note)
+
+
+def bin_edges(samples: dict[str, np.ndarray], num_bins: int = 80) -> np.ndarray:
+    """Bins `[num_bins + 1]` over what is common to look at: a thousandth at each end is left out.
+
+    Of each sample, not of all: a narrow one would else be lost in one bin of a wide one.
+    """
+    quantiles = [np.quantile(x, (0.001, 0.999)) for x in samples.values() if x.size]
+    low, high = min(q[0] for q in quantiles), max(q[1] for q in quantiles)
+    room = 0.03 * (high - low) or 0.5
+    return np.linspace(low - room, high + room, num_bins + 1)
+
+
+def draw(task: Any, rows: pd.DataFrame, path: Path) -> None:
+    """Draws a row for each kind of agent and a column for each state dimension and the reward.
+
+    Source: paper, figure "Histograms of next state s' and reward r".
+    """
+    kinds, names = list(rows["kind"].unique()), names_of(task, rows)
+    size = 2.5 * len(names), 0.8 + 2.2 * len(kinds)
+    with figures.panels(path, len(kinds), len(names), size, sharey="row") as (figure, axes):
+        for line, kind in zip(axes, kinds, strict=True):
+            mine = rows[rows["kind"] == kind]
+            for axis, (column, name) in zip(line, names.items(), strict=True):
+                samples = {s: mine[mine["source"] == s][column].to_numpy() for s in SOURCES}
+                edges = bin_edges(samples)
+                for source, values in samples.items():
+                    color, _ = SOURCES[source]
+                    figures.histogram(axis, values, 0.3, 1.1, bins=edges, color=color)
+                axis.set_xlim(edges[0], edges[-1])
+                axis.set_xlabel(f"next {name}" if name != "reward" else name, fontsize=9)
+            line[0].set_ylabel(f"{figures.AGENT_NAMES.get(kind, kind)}\ntransitions")
+        colors, labels = zip(*SOURCES.values(), strict=True)
+        handles = [plt.Rectangle((0, 0), 1, 1, color=color, alpha=0.6) for color in colors]
+        figure.legend(handles, labels, ncols=3, loc="outside upper center")
+
+
+EXPERIMENT = Experiment(settings=SeHistograms, compute=compute, report=report, about=__doc__)
+
+if __name__ == "__main__":
+    EXPERIMENT.main()

@@ -1,0 +1,159 @@
+"""How well each single SE of a set trains agents: violins of the test returns, the best SE first.
+
+Source: paper, appendix "Evaluation of Individual SE Models" for CartPole and for Acrobot: 40 SEs,
+1000 agents with drawn hyperparameters on each, 10 test episodes.
+
+Agents are trained as in se_performance; with its `out` folder, those that it trained on the same
+SEs are used again.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import matplotlib.pyplot as plt
+import numpy as np
+import pandas as pd
+
+import sejax
+from experiments import figures, se_agents
+from experiments.experiment import Experiment
+from experiments.se_agents import SeAgents
+from experiments.settings import setting
+from experiments.tables import as_texts, iqm_columns, iqm_note, iqm_text, publish
+from experiments.worlds import return_columns
+from sejax.errors import ConfigError
+
+
+@dataclass(frozen=True, kw_only=True)
+class SeModels(SeAgents):
+    name = "se_models"
+    files = "models_"
+
+    ses: str | None = setting(
+        None, quick="cartpole", about="file of SEs, from se_feasibility, or a shipped name"
+    )
+
+
+def compute(settings: SeModels) -> pd.DataFrame:
+    """Trains what is missing; a row for each agent."""
+    ses = load(settings)
+    tables = []
+    for kind in settings.agents:
+        world = se_agents.se_world(settings, ses, kind)
+        places = {group.name: place for place, group in enumerate(world.groups)}
+        rows = se_agents.train(settings, world)
+        tables.append(rows.assign(se=rows["group"].map(places)))
+    return pd.concat(tables, ignore_index=True)
+
+
+def load(settings: SeModels) -> Any:
+    """The SEs that are tested."""
+    if settings.ses is None:
+        raise ConfigError(
+            "ses must be given, because agents are trained on its SEs; got none. "
+            "Set ses=results/se_feasibility/cartpole/ses.safetensors."
+        )
+    return sejax.load_set(settings.ses, option="ses", kind="se").first(settings.num_ses)
+
+
+def summarise(agents: pd.DataFrame, solved_reward: float) -> pd.DataFrame:
+    """One row for each kind of agent and SE, the best SE of each kind first."""
+    grouped = agents.groupby(["kind", "se"], sort=False)
+    summary = grouped["test_return"].agg(
+        return_mean="mean",
+        return_std=lambda x: x.std(ddof=0),
+        solved=lambda x: (x >= solved_reward).mean(),
+    )
+    iqms = [iqm_columns(returns, "return") for _, returns in grouped["test_return"]]
+    summary = summary.assign(**pd.DataFrame(iqms, index=summary.index))
+    summary["train_steps"] = grouped["train_steps"].mean()
+    kinds = list(dict.fromkeys(agents["kind"]))
+    rank = summary.reset_index().assign(order=lambda t: t["kind"].map(kinds.index))
+    rank = rank.sort_values(["order", "return_mean"], ascending=[True, False], kind="stable")
+    return rank.drop(columns="order").reset_index(drop=True)
+
+
+def rank_correlations(summary: pd.DataFrame) -> pd.DataFrame:
+    """Spearman's correlation of the SEs' mean returns between each two kinds of agents.
+
+    It says whether an SE that suits one kind of agent suits another; nan where all SEs are equal.
+    """
+    means = summary.pivot(index="se", columns="kind", values="return_mean")
+    return means[list(dict.fromkeys(summary["kind"]))].rank().corr()
+
+
+def report(settings: SeModels, rows: pd.DataFrame) -> pd.DataFrame:
+    ses = load(settings)
+    task = ses.task
+    columns: dict[str, Any] = {
+        "agent": "{kind}",
+        "SE": lambda row: row.se,
+        "run's seed": lambda row: ses.seeds[row.se],
+        "score when learned": lambda row: f"{ses.scores[row.se]:.1f}",
+        "return": "{return_mean:.1f} ± {return_std:.1f}",
+        "IQM": iqm_text("return"),
+        "agents that solve the task": "{solved:.0%}",
+        "training steps": "{train_steps:,.0f}",
+    }
+    summary = summarise(rows, task.solved_reward)
+    draw(task, rows, settings.folder / "models.png")
+    note = (
+        f"Return: mean ± std over {rows['agent'].nunique()} agents with drawn hyperparameters and "
+        f"{len(return_columns(rows))} test episodes each. The paper has 1000 agents on each of 40 "
+        f"SEs and shows violins only, no numbers.{correlations_text(summary)}{iqm_note()}"
+    )
+    title = f"Single SEs of {task.name} (solved at {task.solved_reward:g})"
+    return publish(settings, title, as_texts(summary, columns), summary, note)
+
+
+def correlations_text(summary: pd.DataFrame) -> str:
+    """A sentence on the rank correlations; nothing for fewer than three SEs or two kinds."""
+    if summary["se"].nunique() < 3:
+        return ""
+    matrix = rank_correlations(summary)
+    kinds = list(matrix)
+    texts = [
+        f"{a} and {b} {matrix.loc[a, b]:.2f}"
+        for i, a in enumerate(kinds)
+        for b in kinds[i + 1 :]
+        if np.isfinite(matrix.loc[a, b])
+    ]
+    return f" Rank correlation of the SEs' mean returns: {', '.join(texts)}." if texts else ""
+
+
+def draw(task: Any, agents: pd.DataFrame, path: Path) -> None:
+    """Draws a violin of the returns for each SE, the best first, in a row for each kind of agent.
+
+    Source: paper, appendix "Evaluation of Individual SE Models".
+    """
+    kinds = list(agents.groupby("kind", sort=False))
+    num_ses = max(mine["se"].nunique() for _, mine in kinds)
+    size = (max(5.0, 1.8 + 0.35 * num_ses), 0.6 + 2.6 * len(kinds))
+    with figures.panels(path, len(kinds), 1, size) as (figure, axes):
+        for axis, (kind, of_kind) in zip(axes[:, 0], kinds, strict=True):
+            pooled = {
+                se: mine[return_columns(mine)].to_numpy().ravel()
+                for se, mine in of_kind.groupby("se")
+            }
+            order = sorted(pooled, key=lambda se: -pooled[se].mean())
+            parts = axis.violinplot([pooled[se] for se in order], widths=0.85, showextrema=False)
+            for body in parts["bodies"]:
+                body.set(facecolor=figures.REAL, edgecolor=figures.REAL, alpha=0.45)
+            places, means = range(1, len(order) + 1), [pooled[se].mean() for se in order]
+            axis.plot(places, means, "D", ms=4, color=figures.BEST, ls="none")
+            axis.axhline(task.solved_reward, color=figures.SOLVED, ls="--", lw=1.2)
+            axis.set_xticks(places, order, fontsize=8)
+            axis.set_title(figures.AGENT_NAMES.get(kind, kind), fontsize=10)
+            axis.set(xlim=(0.4, len(order) + 0.6), ylabel=f"test return\non {task.name}")
+        axes[-1, 0].set_xlabel("SE, by its place in the set; diamonds: means")
+        line = plt.Line2D([], [], color=figures.SOLVED, ls="--")
+        figure.legend(
+            [line], [f"solved ({task.solved_reward:g})"], loc="outside upper right", fontsize=9
+        )
+
+
+EXPERIMENT = Experiment(settings=SeModels, compute=compute, report=report, about=__doc__)
+
+if __name__ == "__main__":
+    EXPERIMENT.main()

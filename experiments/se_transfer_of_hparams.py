@@ -1,0 +1,382 @@
+"""Is a proxy good for tuning: do the hyperparameters that are best on it suit the real task?
+
+Configurations are drawn from the ranges of `agent_hparams=varied`. Agents with each of them, of
+several seeds, train on the SE and on the real task, there for as many steps as on the SE (`same`)
+and until the stop rule of the paper (`long`), and all are tested on the real task. What is asked is
+how the mean returns of the configurations agree in rank, and what somebody loses who tunes on the
+SE and then trains on the real task.
+"""
+
+import dataclasses
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import numpy as np
+import pandas as pd
+
+import sejax
+from experiments import figures
+from experiments.experiment import Experiment
+from experiments.settings import Settings, count, each_of, setting
+from experiments.tables import as_texts, publish
+from experiments.worlds import (
+    Group,
+    Measure,
+    World,
+    groups_at_once,
+    outcome_rows,
+    train_groups,
+    training_as_learned,
+)
+from sejax.errors import require
+from sejax.options import counts
+from sejax.training import TrainingConfig
+
+BUDGETS = {"same": "as many steps", "long": "until the stop rule"}
+QUICK_AGENT = {"hidden_size": 8, "batch_size": 16, "num_layers": 1, "warmup_episodes": 1}
+NUM_RESAMPLES = 2000
+
+
+@dataclass(frozen=True, kw_only=True)
+class SeTransferOfHparams(Settings):
+    name = "se_transfer_of_hparams"
+
+    env: str = setting("cartpole", about="task: cartpole, acrobot, ...")
+    ses: str | None = setting(
+        None,
+        about="SE, or set of SEs of which the one with the best score "
+        "is taken; the shipped one of the task",
+    )
+    agent: str = setting(
+        "ddqn", about="that is tuned; configurations are drawn around the preset's"
+    )
+    preset: str = setting("best", about="of the agent")
+    run: tuple[str, ...] = setting((), about="overrides of the agent, as run.agent.discount=0.9")
+    num_configs: int = count(64, "configurations", quick=16, about="that are drawn")
+    num_agents: int = setting(
+        4,
+        counts("half of them judge what the others choose", least=2),
+        about="seeds of each, on the SE and on the real task",
+    )
+    test_episodes: int = count(10, "episodes", about="of each agent")
+    budgets: tuple[str, ...] = setting(
+        tuple(BUDGETS), each_of(BUDGETS), quick=("same",), about="on the real task: same, long"
+    )
+    max_steps: int | None = count(
+        None, "steps", quick=1000, about="of an agent on the SE; as it was learned"
+    )
+    real_episodes: int = count(1000, "episodes", about="of budget long, at most")
+    real_steps: int | None = count(100_000, "steps", about="of budget long, at most")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Parts:
+    """What is trained where."""
+
+    ses: Any  # `ProxySet` of one
+    agent: Any  # configuration
+    trainings: dict[str, TrainingConfig]  # by world: se, and the budgets on the real task
+
+
+def parts_of(settings: SeTransferOfHparams) -> Parts:
+    """Reads the SE and configures agents and trainings."""
+    ses = sejax.load_set(settings.ses or settings.env, option="ses", kind="se").ranked(1)
+    require(
+        ses.task.name == settings.env,
+        "ses",
+        f"be of {settings.env}",
+        "agents are tested on it",
+        f"one of {ses.task.name}",
+        f"env={ses.task.name}",
+    )
+    words = [f"env={settings.env}", f"preset={settings.preset}", f"agent={settings.agent}"]
+    if settings.quick:
+        words += [f"agent.{name}={value}" for name, value in QUICK_AGENT.items()]
+    config = sejax.config([*words, *settings.run])
+    learned = training_as_learned(ses, config.agent)
+    on_se = dataclasses.replace(
+        learned,
+        max_steps=settings.max_steps or learned.max_steps,
+        max_episodes=max(learned.max_episodes, settings.max_steps or 0),
+        test_episodes=settings.test_episodes,
+    )
+    require(
+        on_se.max_steps is not None,
+        "max_steps",
+        "be given with this SE",
+        "agents on the real task train as long, and its own trained until a rule stopped them",
+        "null",
+        "max_steps=5000",
+    )
+    real = TrainingConfig(
+        stop_rule="never",
+        max_steps=on_se.max_steps,
+        max_episodes=100_000,
+        test_episodes=settings.test_episodes,
+    )
+    trainings = {
+        "same": real,
+        "long": dataclasses.replace(
+            real,
+            stop_rule="solved",
+            solved_by="train",
+            max_episodes=settings.real_episodes,
+            max_steps=settings.real_steps,
+        ),
+    }
+    return Parts(
+        ses=ses,
+        agent=config.agent,
+        trainings={"se": on_se} | {x: trainings[x] for x in settings.budgets},
+    )
+
+
+def compute(settings: SeTransferOfHparams) -> pd.DataFrame:
+    """Trains what is missing; a row for each agent, with what its configuration has drawn."""
+    parts = parts_of(settings)
+    task = parts.ses.task
+    key = jax.random.key(settings.seed)
+    keys = [
+        np.asarray(jax.random.key_data(jax.random.fold_in(key, i)))
+        for i in range(settings.num_configs)
+    ]
+    tables = []
+    for name, training in parts.trainings.items():
+        on_se = name == "se"
+        params = parts.ses.one(0) if on_se else task.params
+        weights = parts.ses.fingerprint(0) if on_se else ""
+        groups = tuple(Group(f"{i:02d}", (params, key), weights) for i, key in enumerate(keys))
+        world = World(
+            name=name,
+            env=parts.ses.env if on_se else task.env,
+            task=task,
+            groups=groups,
+            agent=parts.agent,
+            training=training,
+            hparams="varied",
+            settings={"proxy": parts.ses.config["proxy"]} if on_se else {},
+        )
+        rows = train_groups(
+            world, settings, settings.num_agents, SHARED_DRAWS, groups_at_once(settings.devices)
+        )
+        tables.append(rows.assign(world=name))
+    return pd.concat(tables, ignore_index=True).rename(columns={"group": "config"})
+
+
+def make_shared_draws(
+    agent: Any, env: Any, task: Any, training: TrainingConfig
+) -> Callable[..., Any]:
+    """Builds `run(key, (env_params, config_key), active) -> (Outcome, drawn values)`.
+
+    Hyperparameters are drawn from `config_key`, raw key data, and everything else from `key`: the
+    agents of a configuration share them. An agent draws both from one key otherwise.
+    """
+
+    def make_run(agent: Any) -> Callable[..., Any]:
+        def run(_: Any, key: Any, env_params: Any, active: Any, hparams: Any) -> Any:
+            fixed = dataclasses.replace(agent, hparams=hparams)
+            return sejax.make_evaluator(fixed, env, task, training)(key, env_params, active)
+
+        return run
+
+    train = agent.fresh(make_run)
+
+    def run(key: Any, place: Any, active: Any) -> Any:
+        env_params, key_data = place
+        config_key = jax.random.wrap_key_data(key_data)
+        return train(config_key, key, env_params, active), agent.drawn_values(config_key)
+
+    return run
+
+
+SHARED_DRAWS = Measure(
+    make_run=make_shared_draws,
+    to_table=lambda results, _: outcome_rows(*results),
+    say=lambda rows: f"mean return {rows['test_return'].mean():.1f}",
+    is_timed=True,
+)
+
+
+def returns_by_half(rows: pd.DataFrame, world: str) -> np.ndarray:
+    """Mean return of each configuration in a world, `[2, config]`.
+
+    On the real task of the agents of even and of odd number: the best of noisy means looks better
+    than it is, so that one half judges what the other has chosen. On the SE of all, twice.
+    """
+    mine = rows[rows["world"] == world].sort_values("config")
+    halves = [mine, mine] if world == "se" else [mine[mine["agent"] % 2 == i] for i in (0, 1)]
+    return np.stack([half.groupby("config")["test_return"].mean() for half in halves])
+
+
+def quality(chooser: np.ndarray, target: np.ndarray) -> dict[str, float]:
+    """How good one set of returns is for choosing a configuration for the real task.
+
+    Args:
+      chooser: `[2, config]`, by which one is chosen twice; of equally good ones any, so that
+        the mean over them is what a choice is worth.
+      target: `[2, config]`, independent halves of the returns there; each judges the choice that
+        the other half of the target's, or of the chooser's, has made.
+
+    Returns:
+      `rho`, Spearman's correlation of the two, or of the halves for a target that chooses itself;
+      the judged return of the choice, `chosen`; what that loses to the target's own, `regret`; and
+      what a random choice loses, `regret_random`.
+    """
+    is_own = chooser is target
+    pair = target if is_own else (chooser.mean(axis=0), target.mean(axis=0))
+    judges = target[::-1]
+
+    def judged(by: np.ndarray) -> float:
+        return float(np.mean([judges[i, by[i] == by[i].max()].mean() for i in (0, 1)]))
+
+    best = judged(target)
+    return {
+        "rho": rank_correlation(*pair),
+        "chosen": judged(chooser),
+        "regret": best - judged(chooser),
+        "regret_random": best - target.mean(),
+    }
+
+
+def rank_correlation(a: np.ndarray, b: np.ndarray) -> float:
+    """Spearman's rho of `[n]` and `[n]`, with mean ranks for ties; nan where all are equal."""
+    if np.ptp(a) == 0 or np.ptp(b) == 0:
+        return np.nan
+    return float(np.corrcoef(_ranks(a), _ranks(b))[0, 1])
+
+
+def _ranks(values: np.ndarray) -> np.ndarray:
+    _, places, counts = np.unique(values, return_inverse=True, return_counts=True)
+    return (counts.cumsum() - (counts - 1) / 2)[places]
+
+
+def with_intervals(
+    chooser: np.ndarray, target: np.ndarray, num_resamples: int = NUM_RESAMPLES
+) -> dict[str, float]:
+    """`quality` with the ends of bootstrap 95% intervals, `..._low` and `..._high`.
+
+    Configurations are drawn again.
+    """
+    size = target.shape[1]
+    draws = np.random.default_rng(0).integers(0, size, (num_resamples, size))
+    drawn = []
+    for places in draws:
+        own = target[:, places]
+        drawn.append(quality(own if chooser is target else chooser[:, places], own))
+    low, high = (pd.DataFrame(drawn).quantile(end) for end in (0.025, 0.975))
+    return {**quality(chooser, target), **low.add_suffix("_low"), **high.add_suffix("_high")}
+
+
+def summarise(rows: pd.DataFrame) -> pd.DataFrame:
+    """A row for each budget on the real task (`target`) and each way to choose for it."""
+    costs = rows.groupby("world", sort=False).agg({"train_steps": "sum", "cpu_s": "sum"})
+    returns = {world: returns_by_half(rows, world) for world in costs.index}
+    summary = []
+    for target in (world for world in costs.index if world != "se"):
+        for chooser in costs.index:
+            cost = costs.loc[chooser] / (1 if chooser == "se" else 2)  # half of the agents choose
+            found = with_intervals(returns[chooser], returns[target])
+            summary.append({"target": target, "chosen_by": chooser, **found, **cost})
+    return pd.DataFrame(summary)
+
+
+def make_table(summary: pd.DataFrame) -> pd.DataFrame:
+    """The summary as texts."""
+
+    def interval(name: str, digits: int) -> Callable[[Any], str]:
+        return lambda row: "{:.{d}f} [{:.{d}f}, {:.{d}f}]".format(
+            *(getattr(row, f"{name}{end}") for end in ("", "_low", "_high")), d=digits
+        )
+
+    return as_texts(
+        summary,
+        {
+            "trained on the real task": lambda row: BUDGETS[row.target],
+            "tuned on": lambda row: _chooser(row.chosen_by),
+            "Spearman's rho": interval("rho", 2),
+            "return of the choice": interval("chosen", 1),
+            "regret": interval("regret", 1),
+            "regret of a random one": interval("regret_random", 1),
+            "steps": "{train_steps:,.0f}",
+            "CPU s": "{cpu_s:,.1f}",
+        },
+    )
+
+
+def _chooser(name: str) -> str:
+    return "the SE" if name == "se" else f"the real task, {BUDGETS[name]}"
+
+
+def findings(summary: pd.DataFrame) -> str:
+    """Sentences on what was measured."""
+    texts = []
+    for target, mine in summary.groupby("target", sort=False):
+        by = mine.set_index("chosen_by")
+        se, real = by.loc["se"], by.loc[target]
+        texts.append(
+            f"Trained on the real task {BUDGETS[str(target)]}, the configuration that is best on "
+            f"the SE loses {se.regret:.1f} [{se.regret_low:.1f}, {se.regret_high:.1f}] of return "
+            f"to the one chosen there, and a random one {se.regret_random:.1f} "
+            f"[{se.regret_random_low:.1f}, {se.regret_random_high:.1f}]; ranks agree with "
+            f"rho = {se.rho:.2f} [{se.rho_low:.2f}, {se.rho_high:.2f}], between two halves of the "
+            f"real agents with {real.rho:.2f} [{real.rho_low:.2f}, {real.rho_high:.2f}]. Tuning on "
+            f"the SE took {se.train_steps / real.train_steps:.2f} times the steps and "
+            f"{se.cpu_s / real.cpu_s:.2f} times the CPU seconds."
+        )
+    return " ".join(texts)
+
+
+def report(settings: SeTransferOfHparams, rows: pd.DataFrame) -> pd.DataFrame:
+    task = sejax.load_set(settings.ses or settings.env, option="ses", kind="se").task
+    summary = summarise(rows)
+    draw(task, rows, settings.folder / "hparams.png")
+    note = (
+        f"{rows['config'].nunique()} drawn configurations of {settings.agent}, each trained "
+        f"with {settings.num_agents} seeds in each world. On the real task one half of the seeds "
+        "judges what the other has chosen, and the other way round; regret is the judged return of "
+        "the choice by the same training on the real task, less that of the choice. Rho is that "
+        "of all seeds, or of the two halves where the real task chooses for itself. Intervals: "
+        "bootstrap 95%, drawing configurations. Steps and CPU seconds (without compilation) are "
+        f"those of the agents that choose: half of the real ones. {findings(summary)}"
+    )
+    title = f"Tuning {settings.agent} on an SE of {task.name} (solved at {task.solved_reward:g})"
+    return publish(settings, title, make_table(summary), summary, note)
+
+
+def draw(task: Any, rows: pd.DataFrame, path: Any) -> None:
+    """Draws the configurations' mean returns on the real task against those on the SE."""
+    means = rows.groupby(["world", "config"])["test_return"].mean().unstack("world")
+    targets = [name for name in BUDGETS if name in means]
+    with figures.panels(path, 1, len(targets), (0.6 + 3.6 * len(targets), 3.8)) as (_, axes):
+        for axis, target in zip(axes[0], targets, strict=True):
+            axis.plot(means["se"], means[target], "o", ms=5, color=figures.REAL, alpha=0.6)
+            choices = (
+                (means["se"], figures.VARIED, "best on the SE"),
+                (means[target], figures.BEST, "best on the real task"),
+            )
+            for chosen_by, color, label in choices:
+                choice = means.loc[chosen_by.idxmax()]
+                axis.plot(
+                    choice["se"],
+                    choice[target],
+                    "o",
+                    ms=10,
+                    mfc="none",
+                    mew=1.8,
+                    color=color,
+                    label=label,
+                )
+            axis.axhline(task.solved_reward, color=figures.SOLVED, ls="--", lw=1.2)
+            axis.set(
+                xlabel="mean return, trained on the SE",
+                ylabel=f"the same, on the real task\n{BUDGETS[target]}",
+            )
+        axes[0, 0].legend(fontsize=8, loc="best")
+
+
+EXPERIMENT = Experiment(settings=SeTransferOfHparams, compute=compute, report=report, about=__doc__)
+
+if __name__ == "__main__":
+    EXPERIMENT.main()

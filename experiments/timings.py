@@ -1,0 +1,184 @@
+"""Seconds for an outer iteration of NES on every task, beside the paper's.
+
+Source: paper, appendix "Computational Complexity for Training Synthetic Environments and Reward
+Networks" (table "Approximate timings for one NES outer loop").
+
+The first outer iterations of a run are timed, once compiled, with our default and, where that has
+other agents, with the paper's settings too; not on HalfCheetah, where an iteration of these takes
+an hour. Most of their agents are far from solving the task and train for as long as they may: later
+ones are faster.
+"""
+
+import dataclasses
+import functools
+import time
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+import pandas as pd
+
+import sejax
+from experiments import figures
+from experiments.experiment import Experiment
+from experiments.settings import Settings, count, each_of, setting
+from experiments.tables import as_texts, publish
+from sejax.cli.runtime import available_cores
+
+PAPER_CORES = 16
+
+
+class Row(NamedTuple):
+    """A cell of the paper's table: `seconds` for one outer iteration."""
+
+    env: str
+    proxy: str
+    seconds: float
+    presets: tuple[str, ...] = ("best",)
+
+
+_BOTH = ("paper", "best")
+ROWS = {
+    "cliff_walking-rn": Row("cliff_walking", "rn", 10),
+    "acrobot-se": Row("acrobot", "se", 100, _BOTH),
+    "cartpole-se": Row("cartpole", "se", 100, _BOTH),
+    "cartpole-rn": Row("cartpole", "rn", 100),
+    "mountain_car_continuous-rn": Row("mountain_car_continuous", "rn", 500, _BOTH),
+    "halfcheetah-rn": Row("halfcheetah", "rn", 2000),
+}
+# Agents, episodes and batches that take seconds.
+QUICK = [
+    "es.population_size=2",
+    "es.num_incumbent_evals=2",
+    "training.max_episodes=4",
+    "agent.warmup_episodes=1",
+]
+SETTINGS = {"paper": "the paper's", "best": "our default"}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Timings(Settings):
+    name = "timings"
+
+    rows: tuple[str, ...] = setting(tuple(ROWS), each_of(ROWS), about="tasks and proxies")
+    generations: int = count(2, "iterations", about="outer iterations to time")
+
+
+def compute(settings: Timings) -> pd.DataFrame:
+    """Times what is missing; a row for each task, proxy and preset."""
+    cores = settings.devices or available_cores()
+    tables = []
+    for name in settings.rows:
+        row = ROWS[name]
+        for preset in row.presets:
+            made_with = {"row": name, "preset": preset, "cores": cores}
+            made_with |= settings.values("quick", "generations", "seed")
+            run = functools.partial(time_generations, settings, row, preset)
+            timed = settings.pieces.compute(f"{name}-{preset}-{cores}", made_with, run)
+            tables.append(timed.assign(row=name, preset=preset, cores=cores))
+            print(f"{name}, {preset}: {timed['seconds'].iloc[0]:,.1f} s", flush=True)
+    return pd.concat(tables, ignore_index=True)
+
+
+def config_of(settings: Timings, row: Row, preset: str) -> Any:
+    """The configuration that is timed."""
+    overrides = [f"env={row.env}", f"proxy={row.proxy}", f"preset={preset}"]
+    if row.proxy == "rn":  # the paper does not say which variant; this one needs two potentials
+        overrides.append("proxy.variant=additive_potential")
+    if settings.quick:
+        overrides += [
+            word for word in QUICK if row.env != "cliff_walking" or "warmup_episodes" not in word
+        ]
+    config = sejax.config(overrides)
+    return dataclasses.replace(config, devices=settings.devices, seed=settings.seed)
+
+
+def time_generations(settings: Timings, row: Row, preset: str) -> pd.DataFrame:
+    """Mean wall-clock of the first outer iterations, compiled before."""
+    from sejax.cli import session
+
+    chunks = session.make_chunks(config_of(settings, row, preset))
+    program = chunks.program
+    state = jax.jit(program.init)(jax.random.key(settings.seed)[None])
+    idle = jax.tree.map(lambda x: x.copy(), state.replace(finished=~state.finished))
+    jax.block_until_ready(chunks.advance(idle, 1))  # compiled, and run with nothing to do
+    wall, cpu, steps = [], [], []
+    for _ in range(settings.generations):
+        started, cpu_started = time.perf_counter(), time.process_time()
+        state, info = jax.block_until_ready(chunks.advance(state, 1))
+        wall.append(time.perf_counter() - started)
+        cpu.append(time.process_time() - cpu_started)
+        steps.append(int(jax.device_get(info).train_steps_total.item()))
+    return pd.DataFrame(
+        [
+            {
+                "seconds": np.mean(wall),
+                "cpu_seconds": np.mean(cpu),
+                "agents": program.strategy.num_candidates,
+                "train_steps": np.mean(steps),
+            }
+        ]
+    )
+
+
+def report(settings: Timings, timed: pd.DataFrame) -> pd.DataFrame:
+    draw(settings, timed)
+    cores = int(timed["cores"].iloc[0])
+    columns: dict[str, Any] = {
+        "task": lambda row: ROWS[row.row].env,
+        "proxy": lambda row: ROWS[row.row].proxy.upper(),
+        "settings": lambda row: SETTINGS[row.preset],
+        f"paper, {PAPER_CORES} cores": lambda row: f"{ROWS[row.row].seconds:g} s",
+        f"sejax, {cores} cores": lambda row: (
+            f"{row.seconds:{',.0f' if row.seconds >= 10 else '.2g'}} s"
+        ),
+        "agents": "{agents}",
+        "training steps": "{train_steps:,.0f}",
+        "CPU µs for a training step": lambda row: f"{row.cpu_seconds / row.train_steps * 1e6:,.1f}",
+    }
+    note = (
+        f"The first {settings.generations} iterations of a run, compiled before. All tests on the "
+        "real task are in them. For RNs of Cliff Walking and CartPole our default has the paper's "
+        "agents and sizes. "
+    )
+    if settings.quick:
+        note += (
+            "quick=true: a few agents with short trainings, not to be compared with the paper's. "
+        )
+    title = "Seconds for one outer iteration of NES"
+    return publish(settings, title, as_texts(timed, columns), timed, note.strip())
+
+
+def draw(settings: Timings, timed: pd.DataFrame) -> None:
+    """Draws the seconds of each row beside the paper's."""
+    rows = [ROWS[name] for name in timed["row"]]
+    names = [
+        f"{row.env}\n{row.proxy.upper()}, {SETTINGS[preset]} settings"
+        for row, preset in zip(rows, timed["preset"], strict=True)
+    ]
+    places, cores = np.arange(len(names)), int(timed["cores"].iloc[0])
+    path, size = settings.folder / "timings.png", (7, 0.9 + 0.55 * len(names))
+    with figures.panels(path, 1, 1, size) as (figure, axes):
+        axis = axes[0, 0]
+        if not settings.quick:  # whose trainings are much shorter
+            axis.barh(
+                places - 0.19,
+                [row.seconds for row in rows],
+                0.36,
+                color=figures.VARIED,
+                label=f"paper, {PAPER_CORES} cores",
+            )
+        axis.barh(
+            places + 0.19, timed["seconds"], 0.36, color=figures.REAL, label=f"sejax, {cores} cores"
+        )
+        axis.set(xscale="log", xlabel="seconds for an outer iteration")
+        axis.set_yticks(places, names, fontsize=8)
+        axis.invert_yaxis()
+        figures.legend_above(figure, axis, 2)
+
+
+EXPERIMENT = Experiment(settings=Timings, compute=compute, report=report, about=__doc__)
+
+if __name__ == "__main__":
+    EXPERIMENT.main()

@@ -1,0 +1,392 @@
+"""What an agent keeps of its steps, and what of it each learning step sees.
+
+A transition is one float32 row, so that storing is a single write and sampling a single gather.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, NamedTuple, Protocol
+
+import jax
+import jax.numpy as jnp
+from jax.experimental.xla_metadata import set_xla_metadata
+from jaxtyping import Array, Bool, Float, Int, UInt32
+
+from sejax.ops import cpu
+from sejax.ops.keys import murmur, words
+
+Rows = Float[Array, "capacity width"]  # packed transitions, see `pack`
+
+# Columns of the reward and the discount in a packed transition.
+_REWARD, _DISCOUNT = -2, -1
+
+
+class Transition(NamedTuple):
+    """One step, or a feature-major batch of them (`[obs_dim, batch]`, `[batch]`).
+
+    `action` is an index or, where actions are vectors, `[action_dim]` or `[action_dim, batch]`.
+    `discount` is what the target bootstraps with before the agent's gamma: 0 where the episode
+    terminated, 1 elsewhere, anything in an SE with a soft done. `weight` is 0 in columns that only
+    fill a batch up.
+    """
+
+    obs: Array
+    action: Array
+    reward: Array
+    discount: Array
+    next_obs: Array
+    weight: Array | float = 1.0
+
+    @property
+    def rows(self) -> "Transition":
+        """A feature-major batch turned: `[batch, obs_dim]`, with a weight `[batch]` for each row.
+
+        Under `jax.vmap` a function of one transition then takes a batch.
+        """
+        weight = jnp.broadcast_to(self.weight, self.reward.shape)
+        return jax.tree.map(jnp.transpose, self._replace(weight=weight))
+
+
+class Rollout(NamedTuple):
+    """All steps since the last learning phase, in order.
+
+    Attributes:
+      rows: packed transitions with one more column, which is 1 where the episode ended.
+      is_full: whether the rollout has its whole length, so that the agent learns from it now.
+    """
+
+    rows: Float[Array, "steps width"]
+    is_full: Bool[Array, ""]
+
+    @property
+    def ended(self) -> Float[Array, " steps"]:
+        """1 at the last step of an episode, else 0."""
+        return self.rows[:, -1]
+
+    def transitions(self, obs_dim: int, is_discrete: bool) -> Transition:
+        """The steps, feature-major. Discrete actions in one column are indices."""
+        steps = self.rows[:, :-1].T  # without `ended`
+        action_dim = steps.shape[0] - 2 * obs_dim - 2
+        is_index = is_discrete and action_dim == 1
+        return unpack(steps, None if is_index else action_dim)
+
+    def with_bonus(self, bonus: Float[Array, " steps"]) -> "Rollout":
+        """The same steps with a bonus added to each reward."""
+        return self._replace(rows=self.rows.at[:, _REWARD - 1].add(bonus))  # before `ended`
+
+
+class StoreFn(Protocol):
+    """Writes the `step`-th step, and nothing if `active` is False."""
+
+    def __call__(
+        self,
+        arrays: Any,
+        step: Int[Array, ""],
+        transition: Transition,
+        ended: Array,
+        active: Array | bool,
+        /,
+    ) -> Any: ...
+
+
+class BatchFn(Protocol):
+    """The batch for `Agent.update` after `num_steps` steps, the last of which was `transition`.
+
+    Columns from `batch_size` on, if that is given, have weight 0.
+    """
+
+    def __call__(
+        self,
+        key: Array,
+        arrays: Any,
+        num_steps: Int[Array, ""],
+        transition: Transition,
+        batch_size: Array | None = None,
+        /,
+    ) -> Any: ...
+
+
+@dataclass(frozen=True, kw_only=True)
+class Buffer:
+    """Pure functions over an agent's large arrays, which are updated in place.
+
+    Attributes:
+      init: `() -> arrays`.
+      store: `(arrays, step, transition, ended, active) -> arrays`; `ended` says whether the episode
+        ended with this step.
+      batch: `(key, arrays, num_steps, transition, batch_size) -> batch`.
+      mask: `(batch, active) -> batch`, a batch on which the update of an agent that has finished is
+        cheap. Under `vmap` that update still runs, until all agents have finished, and is thrown
+        away. By default the batch stays as it is, since most updates always take as long.
+    """
+
+    init: Callable[[], Any]
+    store: StoreFn
+    batch: BatchFn
+    mask: Callable[[Any, Array | bool], Any] = lambda batch, active: batch
+
+
+# `(example, max_steps) -> Buffer`: for transitions like `example`, of which there are at most
+# `max_steps`.
+BufferMaker = Callable[[Transition, int], Buffer]
+
+
+def replay_buffer(batch_size: int, buffer_size: int) -> BufferMaker:
+    """A ring of the last `buffer_size` steps, from which batches are drawn uniformly."""
+
+    def make(example: Transition, max_steps: int) -> Buffer:
+        obs_dim, action_dim = _dims(example)
+        shape = (min(buffer_size, max_steps), row_width(obs_dim, action_dim))
+
+        def store(
+            rows: Rows, step: Array, transition: Transition, ended: Array, active: Array | bool
+        ) -> Rows:
+            return write_row(rows, step, pack(transition), active)
+
+        def batch(
+            key: Array,
+            rows: Rows,
+            num_steps: Array,
+            transition: Transition,
+            in_use: Array | None = None,
+        ) -> Transition:
+            return sample(rows, words(key)[0], num_steps, batch_size, action_dim, in_use)
+
+        return Buffer(init=lambda: jnp.zeros(shape, jnp.float32), store=store, batch=batch)
+
+    return make
+
+
+def rollout_buffer(length: int) -> BufferMaker:
+    """The last `length` steps in order, overwritten when they have been learned from."""
+
+    def make(example: Transition, max_steps: int) -> Buffer:
+        shape = (length, row_width(*_dims(example)) + 1)
+
+        def store(
+            rows: Rows, step: Array, transition: Transition, ended: Array, active: Array | bool
+        ) -> Rows:
+            row = jnp.append(pack(transition), jnp.float32(ended))
+            return write_row(rows, step, row, active)
+
+        def batch(
+            key: Array,
+            rows: Rows,
+            num_steps: Array,
+            transition: Transition,
+            in_use: Array | None = None,
+        ) -> Rollout:
+            return Rollout(rows=rows, is_full=num_steps % length == 0)
+
+        return Buffer(
+            init=lambda: jnp.zeros(shape),
+            store=store,
+            batch=batch,
+            mask=lambda rollout, active: rollout._replace(is_full=rollout.is_full & active),
+        )
+
+    return make
+
+
+def no_buffer() -> BufferMaker:
+    """Keeps nothing: each learning step sees the step just made."""
+
+    def make(example: Transition, max_steps: int) -> Buffer:
+        return Buffer(
+            init=lambda: jnp.zeros(0),
+            store=lambda arrays, step, transition, ended, active: arrays,
+            batch=lambda key, arrays, num_steps, transition, in_use=None: transition,
+        )
+
+    return make
+
+
+def _dims(example: Transition) -> tuple[int, int | None]:
+    """Length of an observation, and of an action unless it is an index."""
+    return example.obs.shape[0], example.action.shape[0] if example.action.ndim else None
+
+
+# --- packed rows ---------------------------------------------------------------------------------
+
+
+def row_width(obs_dim: int, action_dim: int | None = None) -> int:
+    """Number of floats in a packed transition; `action_dim` is None for an action's index."""
+    return 2 * obs_dim + (action_dim or 1) + 2
+
+
+def pack(transition: Transition) -> Float[Array, " width"]:
+    """One transition as a row."""
+    parts = (
+        transition.obs,
+        transition.next_obs,
+        transition.action,
+        transition.reward,
+        transition.discount,
+    )
+    return jnp.concatenate([jnp.atleast_1d(x).astype(jnp.float32) for x in parts])
+
+
+def unpack(rows: Float[Array, "width batch"], action_dim: int | None = None) -> Transition:
+    """Packed transitions, feature-major, as a batch."""
+    obs_dim = (rows.shape[0] - 2 - (action_dim or 1)) // 2
+    action = rows[2 * obs_dim : _REWARD]
+    return Transition(
+        obs=rows[:obs_dim],
+        next_obs=rows[obs_dim : 2 * obs_dim],
+        action=action[0].astype(jnp.int32) if action_dim is None else action,
+        reward=rows[_REWARD],
+        discount=rows[_DISCOUNT],
+    )
+
+
+def write_row(
+    rows: Rows, step: Int[Array, ""], row: Float[Array, " width"], active: Array | bool = True
+) -> Rows:
+    """Writes the row of the agent's `step`-th step into the ring, over the oldest when it is full.
+
+    The write is dropped where `active` is False: an index out of range costs nothing, where a
+    select would copy the buffer.
+    """
+    capacity = rows.shape[0]
+    if active is True:
+        return jax.lax.dynamic_update_slice(rows, row[None], (step % capacity, 0))
+    index = jnp.where(active, step % capacity, capacity)
+    return rows.at[index].set(row, mode="drop")
+
+
+# --- sampling ------------------------------------------------------------------------------------
+
+
+def sample(
+    rows: Rows,
+    seed: UInt32[Array, ""],
+    num_stored: Int[Array, ""],
+    batch_size: int,
+    action_dim: int | None = None,
+    in_use: Array | None = None,
+) -> Transition:
+    """Draws a feature-major batch, uniformly with replacement, from the first `num_stored` rows.
+
+    Args:
+      rows: the buffer.
+      seed: 32 random bits for this draw.
+      num_stored: rows written so far, at least 1; more than the capacity counts as the capacity.
+      batch_size: number of rows to draw (static).
+      action_dim: length of an action, or None if it is an index.
+      in_use: draw only the first so many of the columns, `[]`; None for all of them.
+
+    Returns:
+      A batch whose width is `batch_size` rounded up to whole vectors of the CPU, or with `in_use`
+      to whole blocks of a batch; the columns beyond what was asked for have weight 0.
+
+    Source: `docs/reference.md` 3.5 (with replacement, from the first stored transition on).
+    """
+    size = jnp.minimum(num_stored, rows.shape[0])
+    width = rows.shape[1]
+
+    def columns(first: Array | int, count: int) -> Float[Array, "width count"]:
+        index = sample_indices(seed, size, count, first)[None, :] * width
+        return jax.lax.platform_dependent(
+            rows.reshape(-1),
+            index + jnp.arange(width)[:, None],
+            cpu=_gather_outlined,
+            default=_gather,
+        )
+
+    if in_use is None:
+        padded_size = cpu.whole_vectors(batch_size)
+        batch = columns(0, padded_size)
+        is_padding = jnp.arange(padded_size) >= batch_size
+        weight = 1.0 if padded_size == batch_size else 1.0 - is_padding
+    else:
+        step = block_size(batch_size)
+        padded_size = -(-batch_size // step) * step
+
+        def draw_block(i: Array, batch: Array) -> Array:
+            return jax.lax.dynamic_update_slice(batch, columns(i * step, step), (0, i * step))
+
+        num_blocks = jnp.ceil(in_use / step).astype(jnp.int32)
+        empty = jnp.zeros((width, padded_size), rows.dtype)
+        batch = jax.lax.fori_loop(0, num_blocks, draw_block, empty)
+        weight = jnp.float32(jnp.arange(padded_size) < in_use)
+    return unpack(batch, action_dim)._replace(weight=weight)
+
+
+def _gather(flat: Float[Array, " n"], index: Int[Array, "width batch"]) -> Array:
+    return flat.at[index].get(mode="promise_in_bounds")
+
+
+def _gather_outlined(flat: Array, index: Array) -> Array:
+    """The gather as a computation of its own.
+
+    XLA would fuse it with what makes the indices and hash each row's index anew for each of its
+    numbers; with several devices in a process it would then also hand half of that to another core.
+    """
+    with set_xla_metadata(inlineable="false"):
+        return jax.jit(_gather)(flat, index)
+
+
+def sample_indices(
+    seed: UInt32[Array, ""], size: Int[Array, ""], batch_size: int, first: Array | int = 0
+) -> Int[Array, " batch"]:
+    """Uniform indices in [0, size) of the columns from `first` on: a hash of `seed` and column.
+
+    threefry takes half as long as the learning step at these sizes. The hash is the finaliser
+    of MurmurHash3 on a Weyl sequence; 24 of its bits choose the index, so that the bias is below
+    size / 2**24.
+    """
+    counter = jnp.uint32(first) + jnp.arange(batch_size, dtype=jnp.uint32)
+    x = murmur(seed + counter * jnp.uint32(0x9E3779B9))
+    fraction = (x >> 8).astype(jnp.float32) * jnp.float32(2**-24)  # [0, 1)
+    index = (fraction * size.astype(jnp.float32)).astype(jnp.int32)
+    return jnp.minimum(index, size - 1)  # rounding may reach size
+
+
+# --- batches of which only the first columns are in use ------------------------------------------
+
+
+def num_columns(batch: Transition) -> Array | float:
+    """Columns of a batch that count, i.e. do not only fill it up."""
+    return jnp.sum(jnp.broadcast_to(batch.weight, batch.reward.shape))
+
+
+def block_size(width: int) -> int:
+    """Columns in a block of a batch that has room for `width`."""
+    return max(cpu.MIN_BLOCK, cpu.whole_vectors(-(-width // cpu.NUM_BLOCKS)))
+
+
+def sum_over_batch(fn: Callable[[Any], Array], batch: Any, batch_size: Array | None) -> Array:
+    """Sum of `fn` over the columns of a batch, at the cost of those that are in use.
+
+    Args:
+      fn: `batch -> Array`, a sum over the batch's columns in which those of weight 0 count nothing.
+      batch: pytree of arrays whose last axis are the columns; scalars belong to all of them.
+      batch_size: columns that count, from the first on, `[]`; the others must have weight 0. None
+        for all, in one go.
+
+    Returns:
+      What `fn(batch)` returns, up to the order of summation.
+    """
+    if batch_size is None:
+        return fn(batch)
+    width = max(x.shape[-1] for x in jax.tree.leaves(batch) if jnp.ndim(x))
+    size = block_size(width)
+    padded = -(-width // size) * size
+
+    def pad(x: Array) -> Array:
+        missing = [(0, 0)] * (jnp.ndim(x) - 1) + [(0, padded - width)]
+        return jnp.pad(x, missing) if jnp.ndim(x) and padded > width else x
+
+    batch = jax.tree.map(pad, batch)
+
+    def block(index: Array) -> Any:
+        def cut(x: Array) -> Array:
+            if not jnp.ndim(x):
+                return x
+            return jax.lax.dynamic_slice_in_dim(x, index * size, size, axis=-1)
+
+        return fn(jax.tree.map(cut, batch))
+
+    num_blocks = jnp.ceil(batch_size / size).astype(jnp.int32)
+    zero = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(block, num_blocks))
+    return jax.lax.fori_loop(0, num_blocks, lambda i, total: total + block(i), zero)

@@ -1,0 +1,415 @@
+"""Intrinsic rewards: an agent that learns from rewards with a bonus for what is new to it.
+
+Curiosity (ICM) pays for steps whose outcome the agent cannot yet predict, count-based exploration
+for actions that a tabular agent has rarely learned from.
+
+Source: Pathak et al., "Curiosity-driven Exploration by Self-supervised Prediction" (2017); Burda
+et al., "Large-Scale Study of Curiosity-Driven Learning" (2019), for the forward model's residual
+blocks; Strehl and Littman, "An Analysis of Model-Based Interval Estimation for Markov Decision
+Processes" (2008); paper, appendix, tables of ICM and of count-based Q-learning, and section
+"Experiments with Reward Networks", paragraph "Baselines"; `docs/reference.md` 4.7 and 4.8.
+"""
+
+import dataclasses
+import functools
+from dataclasses import dataclass
+from typing import Any, ClassVar, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import optax
+from flax import linen as nn
+from flax import struct
+from jaxtyping import Array, Float, Int
+
+from sejax.agents.base import Agent, AgentState, ExplorationConfig, Hparams, traced
+from sejax.agents.buffers import Rollout, Transition
+from sejax.agents.tabular import entry_of, mask_of
+from sejax.ops import flat
+from sejax.ops.networks import MLP, Dense
+from sejax.options import MOST_LAYERS, counts, fraction, not_negative, option, positive
+
+
+def _with_bonus(agent: Agent, **changes: Any) -> Agent:
+    """An agent with these changes, whose state and hyperparameters hold those of the one inside.
+
+    They are the state's `agent_state` and the hyperparameters' `agent`.
+    """
+
+    def begin_episode(state: Any, episode: Array) -> Any:
+        return state.replace(agent_state=agent.begin_episode(state.agent_state, episode))
+
+    def act(key: Array, state: Any, obs: Array, explore: bool) -> Array:
+        return agent.act(key, state.agent_state, obs, explore)
+
+    return dataclasses.replace(
+        agent,
+        begin_episode=begin_episode,
+        act=act,
+        discount=lambda hparams: agent.discount(hparams.agent),
+        batch_size=lambda state: agent.batch_size(state.agent_state),
+        **changes,
+    )
+
+
+# --- curiosity -----------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, kw_only=True)
+class ICMConfig(ExplorationConfig):
+    """Intrinsic curiosity module (paper, appendix, tables of ICM).
+
+    The defaults are the paper's values optimized for CartPole, as in the authors' scripts. Its text
+    says that all experiments have its defaults: 1e-4, 0.2, 0.5 and 64 features.
+    """
+
+    states: ClassVar[str | None] = "vector"
+    needs_each_step: ClassVar[bool] = True  # its module learns once at each step
+
+    learning_rate: float = option(1e-5, positive("Adam would not move"), traced=True)
+    # beta: the forward model's share of the loss
+    forward_weight: float = option(0.05, fraction(), traced=True)
+    # eta: intrinsic reward for each unit of prediction error
+    reward_scale: float = option(0.03, not_negative("it scales a bonus"), traced=True)
+    feature_dim: int = option(32, counts("the models need units"))
+    hidden_size: int = option(128, counts("the models need units"))
+    num_layers: int = option(2, counts("the models need units", most=MOST_LAYERS))
+    num_residual_blocks: int = option(4, counts("it counts", 0, MOST_LAYERS))
+
+    def make(self, agent: Agent, task: Any) -> Agent:
+        """The agent with the bonus."""
+        return with_icm(agent, self, task.obs_dim, task.num_actions, task.action_dim)
+
+
+class CuriousHparams(NamedTuple):
+    """Traced hyperparameters of a curious agent: those of the agent inside, and the module's."""
+
+    agent: Hparams
+    icm: Hparams
+
+
+class CuriousState(struct.PyTreeNode):
+    """One curious agent: the state of the agent inside, and the module's."""
+
+    agent_state: AgentState
+    params: Float[Array, " num_params"]
+    opt_state: optax.OptState
+    hparams: Hparams  # the module's traced options
+
+
+class ICMOutputs(NamedTuple):
+    """What the module makes of a batch of transitions, feature-major."""
+
+    next_features: Float[Array, "feature batch"]
+    predicted_next_features: Float[Array, "feature batch"]
+    predicted_action: Float[Array, "action batch"]  # logits where actions are indices
+
+
+class ForwardModel(nn.Module):
+    """Predicts the next state's features from the state's features and the action.
+
+    An MLP on both, residual blocks that see the action twice, and an MLP with one hidden layer.
+    """
+
+    feature_dim: int
+    hidden_size: int
+    num_layers: int
+    num_residual_blocks: int
+
+    @nn.compact
+    def __call__(
+        self, features: Float[Array, "feature *batch"], action: Float[Array, "action *batch"]
+    ) -> Float[Array, "feature *batch"]:
+        def with_action(x: Array) -> Array:
+            return jnp.concatenate([x, action])
+
+        def mlp(num_layers: int) -> MLP:
+            return MLP(self.feature_dim, self.hidden_size, num_layers, "leaky_relu")
+
+        x = mlp(self.num_layers)(with_action(features))
+        for _ in range(self.num_residual_blocks):
+            hidden = nn.leaky_relu(Dense(self.feature_dim)(with_action(x)))
+            x = x + Dense(self.feature_dim)(with_action(hidden))
+        return mlp(1)(x)
+
+
+class ICM(nn.Module):
+    """The three models on feature-major batches.
+
+    `action_width` is the length of an action vector, or the number of actions that are one-hot.
+    """
+
+    action_width: int
+    feature_dim: int
+    hidden_size: int
+    num_layers: int
+    num_residual_blocks: int
+
+    @nn.compact
+    def __call__(
+        self,
+        obs: Float[Array, "obs_dim *batch"],
+        action: Float[Array, "action *batch"],
+        next_obs: Float[Array, "obs_dim *batch"],
+    ) -> ICMOutputs:
+        size = (self.hidden_size, self.num_layers)
+        encode = MLP(self.feature_dim, *size, "leaky_relu", name="features")
+        features, next_features = encode(obs), encode(next_obs)
+        inverse = MLP(self.action_width, *size, "relu", name="inverse")
+        forward = ForwardModel(self.feature_dim, *size, self.num_residual_blocks, name="forward")
+        return ICMOutputs(
+            next_features=next_features,
+            predicted_next_features=forward(features, action),
+            predicted_action=inverse(jnp.concatenate([features, next_features])),
+        )
+
+
+@functools.cache
+def with_icm(
+    agent: Agent, config: ICMConfig, obs_dim: int, num_actions: int | None, action_dim: int | None
+) -> Agent:
+    """The same agent, learning from rewards with an intrinsic bonus.
+
+    Before each learning step on `Transition`s the module takes one step of Adam on the batch; then
+    its bonus for that batch, by the models as updated, is added to the rewards that the agent sees.
+    On a `Rollout`, where it is full, the bonus comes first and the module's one step after it; the
+    agent inside must leave its state as it is at all other times. What is remembered stays without
+    a bonus, so that it is made anew whenever a step is learned from.
+
+    Args:
+      agent: one that learns from batches of `Transition`s, or from a `Rollout`.
+      config: the module's sizes and numbers.
+      obs_dim: length of an observation.
+      num_actions: number of discrete actions, or None if they are continuous. Actions that are
+        indices enter the models as one-hot vectors; an agent's own vectors of that length, as those
+        of discrete TD3, enter as they are.
+      action_dim: length of a continuous action; not used where there is `num_actions`.
+
+    Differs: two discrete actions are treated as any other number of them, with two logits and a
+    softmax, where the authors' have the number 0 or 1 and one logit. Vectors of discrete actions
+    are not one-hot, so that the inverse model learns them by their squared error.
+
+    Source: `docs/reference.md` 4.8.
+
+    Example:
+      >>> from sejax.agents.dqn import DDQNConfig, make_ddqn
+      >>> plain = make_ddqn(DDQNConfig(), obs_dim=4, num_actions=2)
+      >>> agent = with_icm(plain, ICMConfig(), obs_dim=4, num_actions=2, action_dim=None)
+      >>> state = agent.init(jax.random.key(0), agent.hparams)
+      >>> int(agent.act(jax.random.key(1), state, jnp.zeros(4), explore=False)) in (0, 1)
+      True
+    """
+    action_width = num_actions or action_dim
+    assert action_width is not None, "an action has a number of choices or a length"
+    model = ICM(
+        action_width,
+        config.feature_dim,
+        config.hidden_size,
+        config.num_layers,
+        config.num_residual_blocks,
+    )
+    example = (jnp.zeros(obs_dim), jnp.zeros(action_width), jnp.zeros(obs_dim))
+    unflatten = flat.unflattener(model.init, *example)
+
+    def init(key: Array, hparams: CuriousHparams) -> CuriousState:
+        key_agent, key_icm = jax.random.split(key)
+        params = flat.flatten(model.init(key_icm, *example))
+        return CuriousState(
+            agent_state=agent.init(key_agent, hparams.agent),
+            params=params,
+            opt_state=flat.ADAM.init(params),
+            hparams=jax.tree.map(jnp.float32, hparams.icm),
+        )
+
+    def outputs(params: Any, batch: Transition) -> ICMOutputs:
+        action = as_vectors(batch.action, action_width)
+        made: Any = model.apply(params, batch.obs, action, batch.next_obs)
+        return made
+
+    def train_models(state: CuriousState, batch: Transition) -> CuriousState:
+        def loss_fn(params: Any) -> Array:
+            beta = state.hparams.forward_weight
+            return icm_loss(outputs(params, batch), batch.action, beta, batch.weight)
+
+        gradient = flat.flatten(jax.grad(loss_fn)(unflatten(state.params)))
+        params, opt_state = flat.adam_step(
+            state.params, state.opt_state, gradient, state.hparams.learning_rate
+        )
+        return state.replace(params=params, opt_state=opt_state)
+
+    def bonus(state: CuriousState, batch: Transition) -> Float[Array, " batch"]:
+        error = prediction_error(outputs(unflatten(state.params), batch))
+        return state.hparams.reward_scale * jax.lax.stop_gradient(error)
+
+    def update(key: Array, state: CuriousState, batch: Transition | Rollout) -> CuriousState:
+        if isinstance(batch, Rollout):
+            return update_from_rollout(key, state, batch)
+        state = train_models(state, batch)
+        batch = batch._replace(reward=batch.reward + bonus(state, batch))
+        return state.replace(agent_state=agent.update(key, state.agent_state, batch))
+
+    def update_from_rollout(key: Array, state: CuriousState, rollout: Rollout) -> CuriousState:
+        """A loop of one or no turns is skipped under `vmap` too, where a `cond` takes both sides.
+
+        The agent's update is inside, as its rows with the bonus would otherwise be made each step.
+        """
+
+        def learn(carry: tuple[Array, CuriousState]) -> tuple[Array, CuriousState]:
+            _, state = carry
+            batch = rollout.transitions(obs_dim, num_actions is not None)
+            augmented = rollout.with_bonus(bonus(state, batch))
+            state = train_models(state, batch)
+            state = state.replace(agent_state=agent.update(key, state.agent_state, augmented))
+            return jnp.bool_(False), state
+
+        _, state = jax.lax.while_loop(lambda carry: carry[0], learn, (rollout.is_full, state))
+        return state
+
+    return _with_bonus(
+        agent,
+        init=init,
+        update=update,
+        hparams=CuriousHparams(agent=agent.hparams, icm=traced(config)),
+        # The module's networks keep a core busy, whatever the agent's.
+        spec=dataclasses.replace(agent.spec, cpu_num_parallel=1),
+    )
+
+
+def icm_loss(
+    outputs: ICMOutputs,
+    action: Array,
+    forward_weight: Array | float,
+    weight: Array | float = 1.0,
+) -> Array:
+    r"""What the three models minimise together.
+
+    .. math:: (1 - \beta) L_I + \beta \, \overline{(\hat\phi(s') - \phi(s'))^2}
+
+    with the inverse model's loss :math:`L_I`: softmax cross-entropy where actions are indices, the
+    mean squared error where they are vectors. The gradient reaches the features through the target
+    of the forward model too, as in the authors' code.
+
+    Args:
+      outputs: of the models.
+      action: `[batch]` int32 indices or `[action, batch]` vectors.
+      forward_weight: beta in [0, 1].
+      weight: `[batch]`; 0 in columns that do not count.
+
+    Returns:
+      `[]`, the mean over the columns that count.
+
+    Source: Pathak et al. (2017), eq. 2 to 7; `docs/reference.md` 4.8.
+    """
+    predicted = outputs.predicted_action
+    if _is_index(action):
+        chosen = as_vectors(action, predicted.shape[0])
+        inverse = jax.nn.logsumexp(predicted, axis=0) - jnp.sum(chosen * predicted, axis=0)
+    else:
+        inverse = jnp.mean((predicted - action) ** 2, axis=0)
+    losses = (1 - forward_weight) * inverse + forward_weight * prediction_error(outputs)
+    return jnp.mean(weight * losses) / jnp.mean(weight)
+
+
+def prediction_error(outputs: ICMOutputs) -> Float[Array, " batch"]:
+    """Mean over the features of the forward model's squared error, for each column."""
+    error = outputs.predicted_next_features - outputs.next_features
+    return jnp.mean(error**2, axis=0)
+
+
+def as_vectors(action: Array, width: int) -> Float[Array, "width batch"]:
+    """Actions as the models take them: indices `[batch]` become one-hot, vectors stay."""
+    if not _is_index(action):
+        return action
+    return (jnp.arange(width)[:, None] == action[None, :]).astype(jnp.float32)
+
+
+def _is_index(action: Array) -> bool:
+    """Whether a feature-major batch of actions holds indices."""
+    return action.ndim == 1
+
+
+# --- counts --------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, kw_only=True)
+class CountBasedConfig(ExplorationConfig):
+    r"""A bonus :math:`\beta / n(s, a)^p` for rarely taken actions."""
+
+    states: ClassVar[str | None] = "discrete"
+
+    reward_scale: float = option(0.1, not_negative("it scales a bonus"))  # beta
+    # p: 1 in the paper's text, 0.5 in the authors' code
+    count_power: float = option(1.0, positive("the bonus would not fade"))
+
+    def make(self, agent: Agent, task: Any) -> Agent:
+        """The agent with the bonus."""
+        return with_count_bonus(agent, self, task.num_states, task.num_actions)
+
+
+class CountingHparams(NamedTuple):
+    """Traced hyperparameters of a counting agent: those of the agent inside, and the bonus's."""
+
+    agent: Hparams
+    reward_scale: Array | float  # beta
+
+
+@struct.dataclass
+class CountingState:
+    """One counting agent: the state of the agent inside, and the learning steps on each pair."""
+
+    agent_state: AgentState
+    counts: Int[Array, "num_states num_actions"]
+    reward_scale: Array
+
+
+@functools.cache
+def with_count_bonus(
+    agent: Agent, config: CountBasedConfig, num_states: int, num_actions: int
+) -> Agent:
+    r"""The same agent, learning from rewards with a bonus for rare pairs of state and action.
+
+    .. math:: n(s, a) \leftarrow n(s, a) + 1, \quad r \leftarrow r + \beta / n(s, a)^p
+
+    for the step at hand, before the learning step of the agent inside. The power p is 1 in the
+    paper's text and 1/2 in the authors' code.
+
+    Args:
+      agent: one that learns from single steps with indices as observations and actions, from
+        `sejax.agents.tabular`.
+      config: beta, in reward units, and the power.
+      num_states: number of different observations.
+      num_actions: number of different actions.
+
+    Example:
+      >>> from sejax.agents.tabular import QLearningConfig, make_q_learning
+      >>> plain = make_q_learning(QLearningConfig(), num_states=48, num_actions=4)
+      >>> agent = with_count_bonus(plain, CountBasedConfig(), num_states=48, num_actions=4)
+      >>> state = agent.init(jax.random.key(0), agent.hparams)
+      >>> int(agent.act(jax.random.key(1), state, jnp.int32(36), explore=False))
+      0
+    """
+
+    def init(key: Array, hparams: CountingHparams) -> CountingState:
+        return CountingState(
+            agent_state=agent.init(key, hparams.agent),
+            counts=jnp.zeros((num_states, num_actions), jnp.int32),
+            reward_scale=jnp.float32(hparams.reward_scale),
+        )
+
+    def update(key: Array, state: CountingState, transition: Transition) -> CountingState:
+        obs, action = transition.obs, transition.action
+        count = entry_of(state.counts, obs, action) + 1
+        is_visited = mask_of(obs, action, (num_states, num_actions))
+        bonus = state.reward_scale * count.astype(jnp.float32) ** -config.count_power
+        transition = transition._replace(reward=transition.reward + bonus)
+        return state.replace(
+            agent_state=agent.update(key, state.agent_state, transition),
+            counts=jnp.where(is_visited, count, state.counts),
+        )
+
+    return _with_bonus(
+        agent,
+        init=init,
+        update=update,
+        hparams=CountingHparams(agent=agent.hparams, reward_scale=config.reward_scale),
+    )

@@ -1,1 +1,0 @@
-"""The paper's figures and tables, one module for each: `python -m sejax.experiments.NAME`."""

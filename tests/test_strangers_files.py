@@ -1,0 +1,243 @@
+"""What a stranger's file names is shown as text: only what the command line names is imported.
+
+Every command reads one file of each kind that names code: a module that leaves a file when it is
+imported, or a function of Python's own that runs a shell command.
+"""
+
+import sys
+
+import jax
+import optuna
+import pytest
+import yaml
+
+import sejax
+from experiments import supervised_baseline
+from sejax import evaluate, registry, report, run
+from sejax.cli import build, checkpoints, commands
+from sejax.cli.metrics import columns_of
+from sejax.search import __main__ as search
+from sejax.search import settings, study
+
+IMPORTED, SHELL = "strangers_module:make", {"name": "subprocess:getoutput", "cmd": "touch PWNED"}
+TASK = ["env=gridworld_2x2", "agent=q_learning"]
+MODULE = """
+from pathlib import Path
+import sejax
+Path("PWNED").touch()
+def make() -> sejax.Task:
+    return sejax.envs.make("gridworld_2x2")
+"""
+SPACE = "es.noise_std=interval(0.1, 0.9)"
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """The current folder, where nobody may leave a file PWNED, and a module that does."""
+    (tmp_path / "strangers_module.py").write_text(MODULE)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
+    yield tmp_path
+    was_imported = sys.modules.pop("strangers_module", None) is not None
+    assert not was_imported and not (tmp_path / "PWNED").exists()
+
+
+@pytest.fixture
+def refused(monkeypatch, capsys):
+    """Runs a command that must end with one message and exit code 2; returns the message."""
+
+    def refuse(command, *words):
+        monkeypatch.setattr(sys, "argv", ["command", *map(str, words)])
+        monkeypatch.setattr(sys, "path", list(sys.path))
+        with pytest.raises(SystemExit) as ended:
+            command()
+        said = capsys.readouterr().err
+        assert ended.value.code == commands.BAD_INPUT, said
+        assert said.startswith("error: ") and said.count("\n") == 1
+        return said
+
+    return refuse
+
+
+def run_command():
+    commands.start("run", run.main)
+
+
+def evaluate_command():
+    commands.start("evaluate", evaluate.main)
+
+
+def search_command():
+    commands.start_with_words(search.main, "")
+
+
+def stored(*words, **changes):
+    """A run's configuration as plain values, with some of somebody else's."""
+    return build.to_plain(sejax.config([*TASK, *words])) | changes
+
+
+def write_run(path, config):
+    """A run directory with rows of one generation."""
+    path.mkdir()
+    (path / "config.yaml").write_text(yaml.safe_dump(config))
+    row = "0,0,1.0,0.0,0.0,1.0,1.0,20,20,2.0,0,10,0.5"
+    (path / "metrics.csv").write_text(f"{','.join(columns_of())}\n{row}\n")
+    return path
+
+
+FOREIGN = [
+    {"env": SHELL},
+    {"env": {"name": IMPORTED}},
+    {"agent": {"name": IMPORTED}},
+    {"proxy": {"name": IMPORTED}},
+    {"es": {"name": IMPORTED}},
+    {"objective": {"name": IMPORTED}},
+    {"exploration": {"name": IMPORTED}},
+    {"agent": None, "agents": {"ddqn": {"name": IMPORTED, "weight": 1.0}}},
+]
+NAMES = [f"{next(iter(x))}-{i}" for i, x in enumerate(FOREIGN)]
+
+
+@pytest.mark.parametrize("foreign", FOREIGN, ids=NAMES)
+def test_a_run_directory_is_compared_as_text(folder, refused, foreign):
+    path = write_run(folder / "run", stored(**foreign))
+    assert "run_dir must be new or hold" in refused(run_command, *TASK, f"run_dir={path}")
+
+
+@pytest.mark.parametrize("foreign", FOREIGN, ids=NAMES)
+def test_a_checkpoints_record_is_compared_as_text(folder, refused, foreign):
+    metrics = {"bytes": 0, "sha256": "", "generations": {}}
+    record = {"config": stored(**foreign), "metrics": metrics, "cpu_s": 1.0}
+    checkpoints.save(folder / "run" / "checkpoint", 1, {}, record)
+    assert "run_dir must be new or hold" in refused(run_command, *TASK, "run_dir=run")
+
+
+@pytest.mark.parametrize("foreign", FOREIGN, ids=NAMES)
+def test_a_report_shows_text(folder, foreign):
+    report.main([str(write_run(folder / "run", stored(**foreign)))])
+    assert (folder / "run" / "report.html").stat().st_size > 1000
+
+
+@pytest.mark.parametrize("text", [f"agent: {IMPORTED}", "agents.ddqn.name: subprocess:getoutput"])
+def test_a_report_reads_no_preset_file(folder, text):
+    (folder / "p.yaml").write_text(f"{text}\n")
+    report.main([str(write_run(folder / "run", stored(preset="p.yaml")))])
+    assert (folder / "run" / "report.html").exists()
+
+
+PRESETS = [
+    {"env": SHELL["name"], "env.cmd": SHELL["cmd"]},
+    {"env": {"name": IMPORTED}},
+    {"env": IMPORTED},
+    {"agent": IMPORTED},
+    {"agents": ["ddqn", IMPORTED]},
+    {"agents": ["ddqn", "ppo"], "agents.ddqn.name": IMPORTED},
+    {"agents": {"ppo": {"name": IMPORTED}}},
+    {"agents.ppo": {"name": "${oc.decode:strangers_module}:make"}, "agents": ["ddqn", "ppo"]},
+    {"tracker": IMPORTED},
+]
+
+
+@pytest.mark.parametrize("preset", PRESETS, ids=range(len(PRESETS)))
+def test_a_preset_file_names_no_module(folder, refused, preset):
+    (folder / "p.yaml").write_text(yaml.safe_dump(preset))
+    refused(run_command, "preset=p.yaml")
+    refused(evaluate_command, "preset=p.yaml", "proxy=cartpole")
+    refused(search_command, "preset=p.yaml", SPACE)
+
+
+def test_what_is_typed_beside_a_preset_file_is_imported(folder):
+    (folder / "p.yaml").write_text("env: mine_beside:make\nes.noise_std: 0.3\n")
+    (folder / "mine_beside.py").write_text(MODULE.replace("PWNED", "typed"))
+    config = sejax.config(["preset=p.yaml", "env=mine_beside:make"])
+    assert config.name("env") == "mine_beside:make" and config.es.noise_std == 0.3
+    assert (folder / "typed").exists()
+
+
+def test_no_function_is_called_that_does_not_say_what_it_makes(folder, refused):
+    words = [f"env={SHELL['name']}", f"env.cmd='{SHELL['cmd']}'"]
+    assert "-> Task" in refused(run_command, *words)
+
+
+STUDIES = [
+    {"fixed": ["env=subprocess:getoutput", "env.cmd='touch PWNED'"]},
+    {"fixed": [f"env={IMPORTED}"]},
+    {"fixed": [f"agents=[ddqn,{IMPORTED}]"]},
+    {"fixed": ["hydra.searchpath=[pkg://strangers_module]"]},
+    {"fixed": [*TASK, "run_dir=victim"]},
+    {"fixed": ["preset=p.yaml"]},
+    {"fixed": TASK, "space": {"agent": f"choice(q_learning,{IMPORTED})"}},
+    {"fixed": TASK, "space": {"hydra.searchpath": "choice([pkg://strangers_module])"}},
+    {"fixed": TASK, "space": {"run_dir": "choice(victim)"}},
+    {"fixed": 3},
+    {"search": {"seeds": "strangers_module:make"}},
+]
+
+
+def write_study(folder, changes):
+    """A stranger's study, named `theirs`, in `theirs/study.db`; its URL."""
+    words = [*TASK, SPACE, "study=theirs", f"search_dir={folder / 'theirs'}"]
+    mine = settings.read(words)
+    made, _ = study.open_study(mine)
+    made.set_user_attr(study.STORED, mine.stored() | changes)
+    return f"sqlite:///{folder / 'theirs' / 'study.db'}"
+
+
+@pytest.mark.filterwarnings("ignore::ResourceWarning")
+@pytest.mark.parametrize("changes", STUDIES, ids=range(len(STUDIES)))
+def test_a_study_names_no_module_and_no_folder(folder, refused, changes):
+    (folder / "p.yaml").write_text(f"env: {IMPORTED}\n")
+    url = write_study(folder, changes)
+    refused(search_command, "study=theirs", f"storage={url}", "trials=1")
+    if changes.keys() == {"fixed"}:
+        refused(search_command, "study=theirs", f"storage={url}", "trials=1", *TASK, SPACE)
+    assert not (folder / "victim").exists()
+
+
+@pytest.mark.filterwarnings("ignore::ResourceWarning")
+def test_a_study_does_not_choose_where_a_worker_writes(folder):
+    victim = folder / "victim"
+    victim.mkdir()
+    url = write_study(folder, {"folder": str(victim)})
+    (folder / "elsewhere").mkdir()
+    for words in (["study=theirs", f"storage={url}"], [*TASK, SPACE, f"storage={url}",
+                                                      "study=theirs"]):  # fmt: skip
+        _, joined = study.open_study(settings.read(words))
+        assert joined.folder.resolve() == folder / "runs" / "search-theirs"
+    made = optuna.load_study(study_name="theirs", storage=url)
+    own = made.user_attrs[study.STORED]
+    hidden = {"search_dir": str(victim), "storage": f"sqlite:///{victim}/x.db"}
+    made.set_user_attr(study.STORED, own | {"search": own["search"] | hidden})
+    _, joined = study.open_study(settings.read(["study=theirs", f"storage={url}"]))
+    assert joined.storage == url and joined.folder != victim
+
+
+PROXIES = [x for x in FOREIGN if next(iter(x)) in ("env", "proxy", "agent")]
+
+
+def write_proxy(config):
+    """An SE of several steps with random weights that was learned with somebody else's parts."""
+    task = sejax.envs.make("cartpole")
+    env = registry.make("proxy", sejax.SyntheticConfig(hidden_size=2), task)
+    usual = {**build.to_plain(sejax.config()), "proxy": registry.describe("proxy", env.config)}
+    weights = env.init_weights(jax.random.key(0))
+    sejax.save("evil.safetensors", env, weights, config=usual | config)
+
+
+@pytest.mark.parametrize("foreign", PROXIES, ids=range(len(PROXIES)))
+def test_a_proxys_file_names_no_module(folder, refused, foreign):
+    write_proxy(foreign)
+    refused(evaluate_command, "proxy=evil.safetensors", "agent_hparams=as_learned", "out_dir=out")
+    if "agent" not in foreign:  # of which nothing is read there
+        refused(search_command, "proxy=evil.safetensors", "agent.learning_rate=interval(0.1, 0.2)")
+
+
+@pytest.mark.parametrize("foreign", [*PROXIES, {"es": {"name": IMPORTED}}])
+def test_an_experiment_imports_nothing_that_a_set_names(folder, foreign, capsys):
+    write_proxy(foreign)
+    words = ["quick=true", "proxy=evil.safetensors", "out=out"]
+    with pytest.raises(SystemExit) as ended:
+        supervised_baseline.EXPERIMENT.main(words)
+    said = capsys.readouterr().err
+    assert ended.value.code == commands.BAD_INPUT and said.count("\n") == 1
