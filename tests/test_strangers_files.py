@@ -13,11 +13,10 @@ import yaml
 
 import sejax
 from experiments import supervised_baseline
-from sejax import evaluate, registry, report, run
-from sejax.cli import build, checkpoints, commands
+from sejax import evaluate, registry, report, run, search
+from sejax.cli import build, checkpoints, commands, study
+from sejax.cli import search_config as settings
 from sejax.cli.metrics import columns_of
-from sejax.search import __main__ as search
-from sejax.search import settings, study
 
 IMPORTED, SHELL = "strangers_module:make", {"name": "subprocess:getoutput", "cmd": "touch PWNED"}
 TASK = ["env=gridworld_2x2", "agent=q_learning"]

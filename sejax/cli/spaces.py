@@ -59,10 +59,10 @@ class Dimension:
 
     def value(self, params: Mapping[str, Any]) -> str:
         """The field's value of stored parameters, as in an override."""
-        value = params[self.parameter]
-        if not isinstance(value, float):
+        value, drawn = params[self.parameter], self.distribution
+        if not isinstance(drawn, FloatDistribution):
             return str(value)
-        low, high = self.distribution.low, self.distribution.high  # which rounding may leave
+        low, high = drawn.low, drawn.high  # which rounding may leave
         if self.is_inverse:
             value, low, high = 1 - value, 1 - high, 1 - low
         return f"{min(max(float(f'{value:.{DIGITS}g}'), low), high):.12g}"
@@ -139,8 +139,8 @@ def _distribution(text: str, tags: set[str]) -> Any:
         return CategoricalDistribution(choices)
     kind, inner = call[1], _CALL.fullmatch(call[2])
     if kind == "int" and inner and inner[1] == "interval":
-        low, high = map(int, _split(inner[2]))
-        return IntDistribution(low, high, log=log)
+        first, last = map(int, _split(inner[2]))
+        return IntDistribution(first, last, log=log)
     if kind == "range":
         start, stop, *rest = map(int, _split(call[2]))
         step = rest[0] if rest else 1
@@ -196,19 +196,22 @@ def preset(name: str, agent: str, of_agent: bool) -> dict[str, Dimension]:
             f"({told(error)}). Set space={ranked[0]}.",
             "space",
         ) from error
-    of_agents = content.pop("with_agent", None) or {} if isinstance(content, dict) else None
+    ranges = dict(content) if isinstance(content, dict) else {}
+    of_agents = ranges.pop("with_agent", None) or {}
+    has_own = bool(ranges)
     require(
-        isinstance(of_agents, dict) and all(isinstance(x, dict) for x in of_agents.values()),
+        isinstance(of_agents, dict)
+        and all(isinstance(x, dict) for x in of_agents.values())
+        and (ranges or of_agents),
         "space",
         "map fields to ranges, and agents to such maps under with_agent",
         "they are searched",
         f"{path} with other content",
         "space=paper_se",
     )
-    ranges = dict(content)
     for each in families.members(agent):
         require(
-            content or each in of_agents,
+            has_own or each in of_agents,
             "agent",
             f"be one of {', '.join(of_agents)} with space={name}",
             "it has no ranges for others",
