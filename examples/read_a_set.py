@@ -54,7 +54,7 @@ def main() -> None:
     def train_and_test(key: jax.Array, weights: object) -> sejax.Outcome:
         return evaluate(key, proxies.env.params(weights, proxies.discount))
 
-    number = np.repeat(np.arange(proxies.size), args.agents)  # of each agent's proxy
+    number = np.repeat(np.arange(len(proxies)), args.agents)  # of each agent's proxy
     keys = jax.random.split(jax.random.key(1), number.size)
     weights = jax.tree.map(lambda x: x[number], proxies.weights)
     num_parallel = agent.spec.cpu_num_parallel

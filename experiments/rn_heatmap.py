@@ -66,7 +66,7 @@ def rewards_of_moves(rns: Any) -> np.ndarray:
     grid = task.env
 
     def reward(weights: Any, index: Any, action: Any) -> Any:
-        params = rns.params.replace(weights=weights)
+        params = env.params(weights, rns.discount)
         _, state = env.reset_env(None, params)
         state = state.replace(world=state.world.replace(index=index), obs=index)
         _, _, reward, _, _ = env.step_env(None, state, action, params)

@@ -36,11 +36,11 @@ _EXPORTS = {
     "Outcome": "sejax.objectives",
     "PPOConfig": "sejax.agents.ppo",
     "PretrainedProxy": "sejax.proxies.zoo",
-    "Proxy": "sejax.proxies.files",
+    "Proxy": "sejax.proxies.io",
     "ProxyConfig": "sejax.proxies",
     "ProxyEnv": "sejax.proxies.base",
     "ProxyParams": "sejax.proxies.base",
-    "ProxySet": "sejax.proxies.files",
+    "ProxySet": "sejax.proxies.io",
     "QLearningConfig": "sejax.agents.tabular",
     "RewardConfig": "sejax.proxies.configs",
     "RewardThreshold": "sejax.objectives",
@@ -55,19 +55,20 @@ _EXPORTS = {
     "config": "sejax.cli.compose",
     "configure_xla": "sejax.cli.runtime",
     "evaluate_agents": "sejax.evaluation",
-    "load": "sejax.proxies.files",
-    "load_proxy": "sejax.proxies.files",
-    "load_set": "sejax.proxies.files",
+    "load": "sejax.proxies.io",
+    "load_proxy": "sejax.proxies.io",
+    "load_set": "sejax.proxies.io",
     "make_agent": "sejax.agents",
     "make_evaluator": "sejax.evaluation",
     "make_learner": "sejax.bilevel",
     "make_trainer": "sejax.training",
     "pretrained": "sejax.proxies.zoo",
-    "push": "sejax.proxies.sharing",
-    "register_gymnax": "sejax.proxies.files",
-    "save": "sejax.proxies.files",
-    "save_set": "sejax.proxies.files",
+    "push": "sejax.proxies.zoo",
+    "register_gymnax": "sejax.proxies.io",
+    "save": "sejax.proxies.io",
+    "save_set": "sejax.proxies.io",
     "spread_over_devices": "sejax.ops.parallel",
+    "training_of": "sejax.training",
 }
 _MODULES = ("agents", "envs", "es", "gym", "options", "proxies")
 
@@ -96,7 +97,7 @@ if TYPE_CHECKING:  # what a type checker and an editor see
     from sejax.proxies import ProxyConfig
     from sejax.proxies.base import ProxyEnv, ProxyParams
     from sejax.proxies.configs import RewardConfig, SyntheticConfig
-    from sejax.proxies.files import (
+    from sejax.proxies.io import (
         Proxy,
         ProxySet,
         load,
@@ -106,9 +107,8 @@ if TYPE_CHECKING:  # what a type checker and an editor see
         save,
         save_set,
     )
-    from sejax.proxies.sharing import push
-    from sejax.proxies.zoo import PretrainedProxy, pretrained
-    from sejax.training import TrainingConfig, TrainResult, make_trainer
+    from sejax.proxies.zoo import PretrainedProxy, pretrained, push
+    from sejax.training import TrainingConfig, TrainResult, make_trainer, training_of
 
 __all__ = [
     "AUC",
@@ -170,6 +170,7 @@ __all__ = [
     "save",
     "save_set",
     "spread_over_devices",
+    "training_of",
 ]
 
 

@@ -15,8 +15,8 @@ from sejax.cli import build, commands, compose, runtime
 from sejax.cli.build import EvaluateConfig
 from sejax.cli.families import AgentFamily, families_of, named
 from sejax.errors import ConfigError, require
-from sejax.proxies import hub
-from sejax.training import TrainingConfig, require_reachable
+from sejax.proxies import header, hub
+from sejax.training import TrainingConfig, require_reachable, training_of
 
 
 @hydra.main(config_path="conf", config_name="evaluate", version_base="1.3")
@@ -136,7 +136,6 @@ def _real_study(config: EvaluateConfig) -> Study:
 def proxy_study(config: EvaluateConfig) -> Study:
     """Agents on a proxy, and on its real task beside them."""
     from sejax import agents
-    from sejax.proxies import files
 
     proxy = _load(config)
     task = proxy.task
@@ -180,7 +179,7 @@ def proxy_study(config: EvaluateConfig) -> Study:
         real_training = dict.fromkeys(trainings, _real_training(config, proxy))
         worlds["the real task"] = (task.env, task.params, real_training)
     beside = proxy.path.parent
-    if beside == files.PRETRAINED_DIR:
+    if beside == header.PRETRAINED_DIR:
         beside = Path("runs", f"evaluate-{proxy.path.stem}")
     elif hub.is_address(config.proxy):
         beside = Path("runs", f"evaluate-{_as_file_name(config.proxy.removeprefix(hub.SCHEME))}")
@@ -196,10 +195,10 @@ def proxy_study(config: EvaluateConfig) -> Study:
 def _load(config: EvaluateConfig) -> Any:
     """The proxy; modules are imported if the command line names them, never because a file does."""
     from sejax import envs
-    from sejax.proxies import files
+    from sejax.proxies.io import load_proxy
 
-    path = files.find(config.proxy, "proxy", also=("real",))
-    stored = files.read_config(path, "proxy")
+    path = header.find(config.proxy, "proxy", also=("real",))
+    stored = header.read_config(path, "proxy")
     task = proxy = None
     if config.env is not None and not registry.is_registered("env", config.env):
         fields = stored["env"] if stored["env"].get("name") == config.env else {}
@@ -207,7 +206,7 @@ def _load(config: EvaluateConfig) -> Any:
     if config.proxy_kind is not None:
         fields = {**stored["proxy"], "name": config.proxy_kind}
         proxy = registry.configure("proxy", fields)
-    return files.load_proxy(path, task, proxy, "proxy")
+    return load_proxy(path, task, proxy, "proxy")
 
 
 def _training_on(proxy: Any, config: EvaluateConfig, agent: Any) -> tuple[str, Any]:
@@ -226,7 +225,7 @@ def _training_on(proxy: Any, config: EvaluateConfig, agent: Any) -> tuple[str, A
         "training.max_steps=2000 training.max_episodes=2000",
     )
     test_episodes = config.real_training.test_episodes
-    training = dataclasses.replace(proxy.training_for(agent), test_episodes=test_episodes)
+    training = dataclasses.replace(training_of(proxy, agent), test_episodes=test_episodes)
     return "real_training", training
 
 
@@ -235,7 +234,7 @@ def _real_training(config: EvaluateConfig, proxy: Any) -> TrainingConfig:
     as_learned = config.agent_hparams == "as_learned" and "training" in proxy.config
     if not (as_learned and proxy.env.is_real):
         return config.real_training
-    is_terminal = proxy.learned_with("training").time_limit_is_terminal
+    is_terminal = training_of(proxy).time_limit_is_terminal
     usual = TrainingConfig().time_limit_is_terminal
     require(
         config.real_training.time_limit_is_terminal in (usual, is_terminal),

@@ -22,7 +22,6 @@ from sejax.cli.families import families_of
 from sejax.errors import ConfigError
 from sejax.evaluate import evaluate, proxy_study, summarise
 from sejax.ops.checksummed import pack, unpack
-from sejax.proxies import files
 from sejax.training import TrainingConfig, budget_for
 
 TINY = ["agent.hidden_size=4", "agent.batch_size=4", "agent.warmup_episodes=0", "num_agents=3",
@@ -142,7 +141,7 @@ def test_a_live_line_counts_the_agents_and_changes_no_number(room, tmp_path, mon
 def test_a_folder_that_cannot_be_written_is_said_before_agents_train(room, tmp_path, monkeypatch):
     (tmp_path / "file").write_text("")
     monkeypatch.setattr("sejax.evaluate._train_and_test", None)
-    with pytest.raises(ConfigError, match=r"^out_dir must be a folder that .* Set out_dir=DIR\."):
+    with pytest.raises(ConfigError, match=r"^out_dir must be a folder that can be written"):
         evaluate(evaluate_config(f"proxy={room}", f"out_dir={tmp_path}/file/x", words=ROOM))
 
 
@@ -159,8 +158,8 @@ def test_agents_train_as_configured_if_asked(room, tmp_path):
 
 
 def test_initial_episodes_beyond_the_proxys_own_extend_its_step_budget(stored):
-    proxy = files.load_proxy(stored)  # learned with no initial episode and 50 steps
-    then, training = proxy.learned_with("agent"), proxy.learned_with("training")
+    proxy = sejax.load_proxy(stored)  # learned with no initial episode and 50 steps
+    then, training = proxy.learned_with("agent"), sejax.training_of(proxy)
     assert (then.warmup_episodes, training.max_steps) == (0, 50)
 
     def budget(agent, *then):
@@ -190,9 +189,9 @@ def test_initial_episodes_beyond_the_proxys_own_extend_its_step_budget(stored):
 def test_episodes_of_one_step_extend_a_step_budget_by_as_little(tmp_path):
     words = ("proxy.hidden_size=4", "training.max_steps=50", "agent.warmup_episodes=0",
              "proxy.horizon=1")  # fmt: skip
-    proxy = files.load_proxy(save(tmp_path / "proxy.safetensors", *words))
+    proxy = sejax.load_proxy(save(tmp_path / "proxy.safetensors", *words))
     later = dataclasses.replace(proxy.learned_with("agent"), warmup_episodes=3)
-    assert proxy.training_for(later).max_steps == 53
+    assert sejax.training_of(proxy, later).max_steps == 53
 
 
 def test_each_of_several_agents_trains_as_long_as_it_must(tmp_path):
@@ -214,10 +213,8 @@ def test_each_of_several_agents_trains_as_long_as_it_must(tmp_path):
         dataclasses.replace(x, field="agent", weight=1.0) for x in families_of(learned(*words)[0])
     )
     assert as_learned.worlds["the proxy"][2]["ppo"].max_steps == 4000
-    with pytest.raises(
-        ConfigError, match=r"^The agent that proxy\.safetensors was learned with mu"
-    ):
-        files.load_proxy(path).learned_with("agent")
+    with pytest.raises(ConfigError, match=r"^agent must be given for proxy\.safetensors"):
+        sejax.load_proxy(path).learned_with("agent")
 
 
 @pytest.mark.parametrize(
@@ -285,9 +282,9 @@ def test_agents_of_an_rn_take_the_time_limit_as_they_learned_it(tmp_path):
 
 def test_an_se_that_does_not_say_how_long_agents_trained_needs_the_config(room, tmp_path):
     """Tests on the real task, by which agents there stop, are not for an SE."""
-    proxies = files.load_set(room)
+    proxies = sejax.load_set(room)
     bare = tmp_path / "bare.safetensors"
-    sejax.save(bare, proxies.env, proxies.proxy(0).params.weights)
+    sejax.save(bare, proxies.env, proxies[0].params.weights)
     words = [f"proxy={bare}", "num_agents=1", "baseline=false", f"out_dir={tmp_path}"]
     with pytest.raises(ConfigError, match=r"^training_from must be config for an SE whose file do"):
         proxy_study(evaluate_config(*words, words=ROOM))
@@ -314,16 +311,17 @@ def test_agents_like_those_of_the_run_bring_their_exploration(tmp_path, capsys):
 
 def test_a_proxy_knows_what_it_was_learned_with(room, tmp_path):
     config = learned("env=gridworld_2x2", "proxy.hidden_size=4", "training.max_steps=50")[0]
-    proxies = files.load_set(room)
-    for group in ("agent", "exploration", "es", "objective", "training"):
+    proxies = sejax.load_set(room)
+    for group in ("agent", "exploration", "es", "objective"):
         assert proxies.learned_with(group) == getattr(config, group)
+    assert sejax.training_of(proxies) == config.training
     bare = tmp_path / "bare.safetensors"
-    sejax.save(bare, proxies.env, proxies.proxy(0).params.weights)
-    with pytest.raises(ConfigError, match=r"^The agent that bare\.safetensors was learned with mu"):
-        files.load_proxy(bare).learned_with("agent")
-    sejax.save(bare, proxies.env, proxies.proxy(0).params.weights, {"agent": {"name": "my:Agent"}})
-    with pytest.raises(ConfigError, match=r"registered one.*it is 'my:Agent'\. Give agent= yours"):
-        files.load_proxy(bare).learned_with("agent")
+    sejax.save(bare, proxies.env, proxies[0].params.weights)
+    with pytest.raises(ConfigError, match=r"^agent must be given for bare\.safetensors"):
+        sejax.load_proxy(bare).learned_with("agent")
+    sejax.save(bare, proxies.env, proxies[0].params.weights, {"agent": {"name": "my:Agent"}})
+    with pytest.raises(ConfigError, match=r"^agent must be given .*got my:Agent"):
+        sejax.load_proxy(bare).learned_with("agent")
     assert "my" not in sys.modules
 
 

@@ -131,7 +131,7 @@ def check_responses(settings, rows):
         if min(np.abs(move - came).max() for move in moves) > 1e-4:
             continue  # another episode begins
         action = int(np.argmin([np.abs(move - came).max() for move in moves]))
-        vector, reward, _ = ses.env.predict(ses.one(0).weights, jnp.float32(state), action)
+        vector, reward, _ = ses.env.predict(ses[0].params.weights, jnp.float32(state), action)
         said = response[[*states, "reward"]].iloc[row].to_numpy(float)
         np.testing.assert_allclose(np.append(vector, reward), said, atol=1e-4)
         actions.add(action)
@@ -162,7 +162,7 @@ def check_models(settings, rows):
         sejax.load_set(settings.folder / f"models-{name}.safetensors")
         for name in ("authors", "fair")
     )
-    assert authors.size == fair.size == 3
+    assert len(authors) == len(fair) == 3
     assert [x.config["proxy"]["done"] for x in (authors, fair)] == ["soft", "threshold"]
     for head, same in (("state", True), ("reward", True), ("done", False)):
         pairs = zip(jax.tree.leaves(authors.weights[head]), jax.tree.leaves(fair.weights[head]),

@@ -1,13 +1,14 @@
 """The experiments with SEs: what their tables say, worked out by hand, and what they train."""
 
 import dataclasses
+import itertools
+from types import SimpleNamespace
 
 import jax
 import numpy as np
 import pandas as pd
 import pytest
 import yaml
-from scipy.stats import spearmanr
 from support import refuse
 from test_experiments import TINY, TINY_AGENT, save_ses
 
@@ -111,7 +112,8 @@ def test_feasibility_learns_as_sejax_run_does_and_goes_on(tmp_path):
     mine = made[made["seed"] == 4]
     np.testing.assert_allclose(mine["incumbent_mean"], result.info.incumbent_mean, rtol=1e-6)
     assert stored.seeds.tolist() == [3, 4]
-    assert all(jax.tree.leaves(jax.tree.map(np.array_equal, stored.one(1).weights, result.weights)))
+    weights = stored[1].params.weights
+    assert all(jax.tree.leaves(jax.tree.map(np.array_equal, weights, result.weights)))
     assert stored.scores[1] == pytest.approx(float(result.score))
     with pytest.raises(ConfigError, match=r"differs in agent_hparams.*Set work=DIR"):
         learned(agent_hparams="varied")
@@ -131,6 +133,9 @@ def test_a_cost_whose_generation_was_lost_is_written_again(tmp_path):
     assert runs.read_costs(path, 3).tolist() == []
     path.write_text("0.500\n0.250\n7.000\n")
     assert runs.read_costs(path, 2).tolist() == [0.5, 0.25]
+    path.write_text("0.500\nx")
+    with pytest.raises(ConfigError, match=r"cpu_s\.txt is damaged"):
+        runs.read_costs(path, 2)
 
 
 # --- performance, and single SEs ------------------------------------------------------------------
@@ -265,9 +270,9 @@ def check_as_evaluation(ses, rows):
     loaded, task = sejax.load_set(ses), envs.make("cartpole")
     key = jax.random.fold_in(jax.random.key(3), 1)
     keys = jax.numpy.stack([jax.random.fold_in(key, i) for i in range(3)])
-    mine = rows[rows["group"] == f"se-{loaded.seeds[1]:02d}-{loaded.fingerprint(1)}"]
+    mine = rows[rows["group"] == f"se-{loaded.seeds[1]:02d}-{loaded[1].fingerprint}"]
     training = sejax.TrainingConfig(max_steps=40, stop_rule="never", test_episodes=2)
-    chosen, expected = evaluated(loaded.env, loaded.one(1), task, training, keys)
+    chosen, expected = evaluated(loaded.env, loaded[1].params, task, training, keys)
     np.testing.assert_allclose(mine["test_return"].iloc[chosen], expected.test_return, rtol=1e-6)
     np.testing.assert_allclose(mine["return_0"] + mine["return_1"], 2 * mine["test_return"])
     assert (mine["train_steps"] == 40).all() and mine["hidden_size"].between(1, 6).all()
@@ -380,6 +385,21 @@ def test_what_is_said_of_families_follows_from_the_rows():
         "were learned with it."  # fmt: skip
 
 
+@pytest.mark.slow
+def test_a_run_ends_with_its_budget_and_goes_on_with_a_larger_one(tmp_path, monkeypatch):
+    ticks = itertools.count()  # a clock that is a second later at each look
+    monkeypatch.setattr(runs, "time", SimpleNamespace(process_time=lambda: float(next(ticks))))
+
+    def costs(budget):
+        given = {"cpu_budget_s": budget, "generations": 4}
+        run("se_horizons", se_horizons, tmp_path, **given)
+        rows = shards.read_rows(tmp_path / "rows.csv.xz")
+        return shards.unstack(rows, "curves")["cpu_s"].tolist()
+
+    assert costs(1.5) == [1, 1]  # the second began before 1.5 s were spent
+    assert costs(100.0) == [1, 1, 1, 1]  # `generations` ends it
+
+
 def test_an_unknown_family_is_refused_before_anything_is_learned(tmp_path, monkeypatch):
     monkeypatch.setattr(runs, "learn", refuse)
     for given in ({"sets": "ddqn+pppo"}, {"tested": "pppo"}, {"run": ["agents.ddqn.x=1"]}):
@@ -444,14 +464,6 @@ def test_runs_are_compared_within_equal_cpu_seconds():
 # --- tuning ---------------------------------------------------------------------------------------
 
 
-def test_rank_correlations_are_those_of_scipy():
-    rng = np.random.default_rng(0)
-    a, b = rng.integers(0, 5, 30), rng.normal(size=30)  # with ties
-    expected = spearmanr(a, b).statistic
-    assert se_transfer_of_hparams.rank_correlation(a, b) == pytest.approx(expected)
-    assert np.isnan(se_transfer_of_hparams.rank_correlation(np.ones(4), b[:4]))
-
-
 def tuning_rows():
     """Three configurations with two agents each; on the SE the last is best, in truth the first."""
     returns = {"se": [[10, 10], [20, 20], [30, 30]], "same": [[90, 80], [50, 100], [40, 30]]}
@@ -514,7 +526,7 @@ def test_agents_of_a_configuration_share_what_is_drawn():
 def test_a_tuned_agent_trains_on_the_real_task_as_long_as_on_the_se():
     of = se_transfer_of_hparams.SeTransferOfHparams.of
     parts = se_transfer_of_hparams.parts_of(of(run=["agent.batch_size=7"]))
-    assert parts.agent.batch_size == 7 and parts.ses.size == 1
+    assert parts.agent.batch_size == 7 and len(parts.ses) == 1
     trainings = parts.trainings
     assert list(trainings) == ["se", "same", "long"]
     assert trainings["same"].max_steps == trainings["se"].max_steps == 2000

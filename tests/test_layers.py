@@ -14,7 +14,6 @@ ROOT = Path(__file__).parents[1] / "sejax"
 LAYERS = [
     {"search"},
     {"run", "evaluate", "report"},
-    {"machines"},
     {"cli"},
     {"bilevel"},
     {"evaluation", "scores"},
@@ -28,7 +27,7 @@ LAYERS = [
     {"errors"},
     {"", "conf"},
 ]
-COMMANDS = ("cli", "run", "evaluate", "report", "search", "machines")
+COMMANDS = ("cli", "run", "evaluate", "report", "search")
 
 
 def name_of(path):
@@ -83,7 +82,6 @@ def test_arrows_point_down():
         for name, others in GRAPH.items()
         for other in sorted(others)
         if part_of(other) != part_of(name)
-        and (name, other) != ("sejax.proxies.files", "sejax.training")  # to go
         and height[part_of(other)] >= height[part_of(name)]
     ]
     assert not wrong, "\n".join(wrong)
@@ -115,7 +113,7 @@ def test_hydra_is_known_to_the_commands_alone():
 def test_the_library_imports_no_hydra():
     program = (
         "import sys\n"
-        "import sejax.training, sejax.bilevel, sejax.proxies.files\n"
+        "import sejax.training, sejax.bilevel, sejax.proxies.io\n"
         "print({'hydra', 'omegaconf'} & set(sys.modules))\n"
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)

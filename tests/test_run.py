@@ -27,7 +27,6 @@ from sejax.cli.progress import RunProgress
 from sejax.cli.run_directory import AGENT_COLUMNS, COLUMNS
 from sejax.cli.trackers import Reporter
 from sejax.errors import ConfigError
-from sejax.proxies import files
 
 # A room of 2 x 2 cells for tables: what takes time is importing and compiling.
 TINY = [
@@ -95,11 +94,11 @@ def test_a_run_writes_the_files_of_the_design(uninterrupted):
 
 def test_the_stored_proxy_is_the_one_of_the_best_generation(uninterrupted):
     scores = [float(row["incumbent_mean"]) for row in rows(uninterrupted)]
-    record = files.load_proxy(uninterrupted).record
+    record = sejax.load_proxy(uninterrupted).record
     assert record["score"] == pytest.approx(max(scores))
     best = max(range(6), key=lambda generation: (scores[generation], generation))
     assert record["generation"] == best not in (0, 5)
-    last = files.load_proxy(uninterrupted / "proxy_last.safetensors").record
+    last = sejax.load_proxy(uninterrupted / "proxy_last.safetensors").record
     assert last["generation"] == 5 and last["score"] == pytest.approx(scores[-1])
 
 
@@ -151,7 +150,7 @@ def test_seeds_run_one_after_the_other_on_one_executable(
         folder = tmp_path / f"seed{seed}"
         assert {path.name for path in folder.iterdir()} == FILES
         assert {row["seed"] for row in rows(folder)} == {str(seed)}
-        record = files.load_proxy(folder).record
+        record = sejax.load_proxy(folder).record
         assert record["seed"] == seed and record["score"] == pytest.approx(score)
     assert rows(tmp_path / "seed12") == rows(uninterrupted)
 
@@ -260,7 +259,7 @@ def test_metrics_and_proxies_tell_of_each_family(two_families):
         assert float(row["incumbent_mean"]) == pytest.approx(mean, abs=1e-6)
         assert all(row[f"num_nonfinite_{key}"] == "0" for key in keys)
     for name, of in (("proxy", None), ("proxy_last", -1)):
-        record = files.load_proxy(two_families / f"{name}.safetensors").record
+        record = sejax.load_proxy(two_families / f"{name}.safetensors").record
         row = made[record["generation"] if of is None else of]
         scores = {key: pytest.approx(float(row[f"incumbent_mean_{key}"])) for key in keys}
         assert record["scores"] == scores
@@ -309,22 +308,6 @@ def test_a_damaged_checkpoint_is_refused_and_files_that_lack_are_made_again(
     checkpoint.write_bytes(checkpoint.read_bytes()[:-10])
     with pytest.raises(ConfigError, match="must hold a whole checkpoint"):
         learn(folder, "generations=6")
-
-
-def test_a_full_disk_loses_nothing_that_was_written(uninterrupted, tmp_path, monkeypatch):
-    learn(tmp_path, "generations=2")
-    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
-
-    def full(descriptor):
-        raise OSError(28, "No space left on device")
-
-    with monkeypatch.context() as patch:
-        patch.setattr("sejax.ops.files.os.fsync", full)
-        with pytest.raises(OSError, match="No space left"):
-            learn(tmp_path, "generations=6", "devices=1")
-    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
-    learn(tmp_path, "generations=6")
-    assert rows(tmp_path) == rows(uninterrupted)
 
 
 def test_seconds_do_not_follow_the_machines_clock(uninterrupted, tmp_path, monkeypatch):

@@ -59,8 +59,8 @@ class Condition:
     @classmethod
     def of_set(cls, proxies: Any, names: Iterable[str], **rest: Any) -> Self:
         """The proxies of a `ProxySet`, one for each group; the first ones again for more groups."""
-        places = [(name, i % proxies.size) for i, name in enumerate(names)]
-        groups = tuple(Group(name, proxies.one(i), proxies.fingerprint(i)) for name, i in places)
+        ones = [(name, proxies[i % len(proxies)]) for i, name in enumerate(names)]
+        groups = tuple(Group(name, one.params, one.fingerprint) for name, one in ones)
         settings = {"proxy": proxies.config["proxy"], **rest.pop("settings", {})}
         return cls(env=proxies.env, task=proxies.task, groups=groups, settings=settings, **rest)
 
@@ -299,7 +299,7 @@ def agent_config(settings: Settings, kind: str) -> Any:
 
 def training_as_learned(proxies: Any, agent: Any) -> TrainingConfig:
     """How long an agent trains on a set of SEs: as those that they were learned with."""
-    return proxies.proxy(0).training_for(agent)
+    return sejax.training_of(proxies, agent)
 
 
 def on_ses(settings: SeAgents, ses: Any, kind: str) -> Condition:
@@ -312,7 +312,7 @@ def on_ses(settings: SeAgents, ses: Any, kind: str) -> Condition:
     )
     # The weights' hash is in the name, so that sets can share a folder: se_models then finds those
     # of se_performance.
-    names = [f"se-{seed:02d}-{ses.fingerprint(i)}" for i, seed in enumerate(ses.seeds)]
+    names = [f"se-{seed:02d}-{ses[i].fingerprint}" for i, seed in enumerate(ses.seeds)]
     return Condition.of_set(ses, names, name=kind, agent=agent, training=training, hparams="varied")
 
 

@@ -246,7 +246,7 @@ def objective_setting() -> Any:
 def learn(settings: RnSettings, variant: str, objective: str) -> Any:
     """The RNs of a variant, learned by an objective: a `ProxySet` in the order of their seeds."""
     there = stored(settings, variant, objective)
-    known = there.size if there else 0
+    known = len(there) if there else 0
     if known < settings.learned:
         config = learning_config(settings, variant, objective)
         config = dataclasses.replace(config, seed=settings.seed + known)
@@ -262,7 +262,7 @@ def learn(settings: RnSettings, variant: str, objective: str) -> Any:
         write_rows(curves_file(path), curve)
         runs.collect(configs, path, there)
         there = sejax.load_set(path, option="rns_dir", kind="rn")
-    return there.first(settings.learned)
+    return there[: settings.learned]
 
 
 def file_of(settings: RnSettings, variant: str, objective: str) -> Path:

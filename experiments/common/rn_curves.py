@@ -108,7 +108,7 @@ def real_curves(settings: CurveSettings) -> Iterator[pd.DataFrame]:
 def rn_curves(settings: CurveSettings, variant: str, rns: Any, prefix: str = "") -> Any:
     """Curves of all agents on the RNs of a set, of which each group of agents has one."""
     make = functools.partial(Condition.of_set, rns)
-    return curves_in(settings, variant, rns.size, make, prefix)
+    return curves_in(settings, variant, len(rns), make, prefix)
 
 
 def curves_in(

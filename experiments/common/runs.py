@@ -24,7 +24,7 @@ from sejax import registry
 from sejax.cli import build, run_directory, session
 from sejax.cli.families import JOINT, key_of
 from sejax.cli.progress import Tally
-from sejax.errors import require
+from sejax.errors import ConfigError, require
 from sejax.ops.files import write_text
 from sejax.options import positive
 
@@ -122,12 +122,12 @@ def _log(curve: pd.DataFrame, solved_score: float | None) -> str:
 def collect(configs: list[Any], path: Path, before: Any = None) -> None:
     """Writes the best proxy of each run into one file, after those of the set `before`."""
     sets = [*([before] if before else []), *(sejax.load_set(Path(x.run_dir)) for x in configs)]
-    places = [(each, i) for each in sets for i in range(each.size)]
+    proxies = [proxy for each in sets for proxy in each]
     sejax.save_set(
         path,
         sets[0].env,
-        [each.one(i).weights for each, i in places],
-        [each.records[i] for each, i in places],
+        [proxy.params.weights for proxy in proxies],
+        [proxy.record for proxy in proxies],
         before.config if before else build.to_plain(configs[0]),
         sets[0].discount,
     )
@@ -177,9 +177,19 @@ class TimedChunks(session.Chunks):
 
 
 def read_costs(path: Path, generations: int) -> np.ndarray:
-    """CPU seconds of the first generations, `[generation]`; of fewer, if no more are known."""
-    lines = path.read_text().split() if path.exists() else []
-    return np.array(lines[:generations], float)
+    """CPU seconds of the first generations, `[generation]`; of fewer, if no more are known.
+
+    Raises:
+      ConfigError: if the file is damaged.
+    """
+    try:
+        return np.array(path.read_text().split()[:generations], float)
+    except FileNotFoundError:
+        return np.array([])
+    except ValueError as error:
+        raise ConfigError(
+            f"work must hold whole files; {path} is damaged. Set work=DIR."
+        ) from error
 
 
 def within(curve: pd.DataFrame, budget_s: float | None) -> pd.DataFrame:
@@ -262,7 +272,7 @@ class MixtureRuns(RunSettings):
         (family,) = config.agents.families
         training = dataclasses.replace(config.training, test_episodes=self.test_episodes)
         seeds = {
-            f"{name}-{seed:02d}-{ses.fingerprint(i)}": seed for i, seed in enumerate(ses.seeds)
+            f"{name}-{seed:02d}-{ses[i].fingerprint}": seed for i, seed in enumerate(ses.seeds)
         }
         at_once, tables = groups_at_once(self.devices), []
         for hparams in self.tested_hparams:

@@ -27,7 +27,7 @@ from sejax import agents, envs, registry, serialize
 from sejax.cli import build, families, presets
 from sejax.cli.words import ENDING, without_files
 from sejax.errors import ConfigError, nearest, require, shortened, unknown_name
-from sejax.proxies import stored
+from sejax.proxies import header
 from sejax.training import TrainingConfig
 
 CONF_DIR = Path(__file__).parents[1] / "conf"
@@ -357,11 +357,8 @@ def _agent_on(source: str, env: Any) -> str:
     given = {"name": env} if isinstance(env, str) else None
     try:
         if source not in ("", "real"):
-            _, header = stored.read(stored.find(source), "proxy")
-            if "interface" in header:
-                return agents.default_for(envs.TaskSpec.of_interface(header["interface"]))
-            known = registry.is_registered("env", str(header["config"]["env"].get("name")))
-            given = given or (header["config"]["env"] if known else None)
+            _, stored = header.read(source, "proxy")
+            return agents.default_for(envs.TaskSpec.of_interface(stored.interface))
         return agents.default_for(envs.spec_of(registry.configure("env", given or {})))
     except ConfigError:
         return _DEFAULT_AGENT  # what is wrong is said later

@@ -22,7 +22,7 @@ from sejax.cli.trackers import (
     TrackedRun,
 )
 from sejax.ops.parallel import compiler_options
-from sejax.proxies import files
+from sejax.proxies.io import save
 
 DRAW_EVERY_S = 30.0
 
@@ -216,7 +216,7 @@ class _Proxies:
             return
         names = self._learner.mixture.names
         by_agent = dict(zip(names, map(float, scores), strict=True))
-        files.save(
+        save(
             self._folder / f"{name}.safetensors",
             self._learner.proxy,
             self._learner.unravel(flat),
