@@ -8,10 +8,10 @@ import pytest
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from support import random_like
 
-from sejax.errors import ConfigError
 from sejax.gym import RealTask, SyntheticEnv, SyntheticVectorEnv, SyntheticWorld, make, make_vec
 from sejax.gym.networks import shapes_of
 from sejax.gym.vector import PREFETCHED
+from sejax.options import ConfigError
 from sejax.proxies.configs import SyntheticConfig
 
 TASKS = {"cartpole": RealTask.of_gymnasium("CartPole-v1", 4),

@@ -17,8 +17,8 @@ from safetensors.numpy import save_file
 
 import sejax
 from sejax import envs, registry
-from sejax.errors import ConfigError
 from sejax.ops.checksummed import pack, unpack
+from sejax.options import ConfigError
 from sejax.proxies import header
 from sejax.proxies.base import absent_task
 from sejax.proxies.configs import RewardConfig, SyntheticConfig
