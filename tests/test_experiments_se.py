@@ -1,13 +1,14 @@
 """The experiments with SEs: what their tables say, worked out by hand, and what they train."""
 
 import dataclasses
+import itertools
+from types import SimpleNamespace
 
 import jax
 import numpy as np
 import pandas as pd
 import pytest
 import yaml
-from scipy.stats import spearmanr
 from support import refuse
 from test_experiments import TINY, TINY_AGENT, save_ses
 
@@ -132,6 +133,9 @@ def test_a_cost_whose_generation_was_lost_is_written_again(tmp_path):
     assert runs.read_costs(path, 3).tolist() == []
     path.write_text("0.500\n0.250\n7.000\n")
     assert runs.read_costs(path, 2).tolist() == [0.5, 0.25]
+    path.write_text("0.500\nx")
+    with pytest.raises(ConfigError, match=r"cpu_s\.txt is damaged"):
+        runs.read_costs(path, 2)
 
 
 # --- performance, and single SEs ------------------------------------------------------------------
@@ -381,6 +385,21 @@ def test_what_is_said_of_families_follows_from_the_rows():
         "were learned with it."  # fmt: skip
 
 
+@pytest.mark.slow
+def test_a_run_ends_with_its_budget_and_goes_on_with_a_larger_one(tmp_path, monkeypatch):
+    ticks = itertools.count()  # a clock that is a second later at each look
+    monkeypatch.setattr(runs, "time", SimpleNamespace(process_time=lambda: float(next(ticks))))
+
+    def costs(budget):
+        given = {"cpu_budget_s": budget, "generations": 4}
+        run("se_horizons", se_horizons, tmp_path, **given)
+        rows = shards.read_rows(tmp_path / "rows.csv.xz")
+        return shards.unstack(rows, "curves")["cpu_s"].tolist()
+
+    assert costs(1.5) == [1, 1]  # the second began before 1.5 s were spent
+    assert costs(100.0) == [1, 1, 1, 1]  # `generations` ends it
+
+
 def test_an_unknown_family_is_refused_before_anything_is_learned(tmp_path, monkeypatch):
     monkeypatch.setattr(runs, "learn", refuse)
     for given in ({"sets": "ddqn+pppo"}, {"tested": "pppo"}, {"run": ["agents.ddqn.x=1"]}):
@@ -443,14 +462,6 @@ def test_runs_are_compared_within_equal_cpu_seconds():
 
 
 # --- tuning ---------------------------------------------------------------------------------------
-
-
-def test_rank_correlations_are_those_of_scipy():
-    rng = np.random.default_rng(0)
-    a, b = rng.integers(0, 5, 30), rng.normal(size=30)  # with ties
-    expected = spearmanr(a, b).statistic
-    assert se_transfer_of_hparams.rank_correlation(a, b) == pytest.approx(expected)
-    assert np.isnan(se_transfer_of_hparams.rank_correlation(np.ones(4), b[:4]))
 
 
 def tuning_rows():

@@ -14,7 +14,6 @@ ROOT = Path(__file__).parents[1] / "sejax"
 LAYERS = [
     {"search"},
     {"run", "evaluate", "report"},
-    {"machines"},
     {"cli"},
     {"bilevel"},
     {"evaluation", "scores"},
@@ -28,7 +27,7 @@ LAYERS = [
     {"errors"},
     {"", "conf"},
 ]
-COMMANDS = ("cli", "run", "evaluate", "report", "search", "machines")
+COMMANDS = ("cli", "run", "evaluate", "report", "search")
 
 
 def name_of(path):

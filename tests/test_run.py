@@ -310,22 +310,6 @@ def test_a_damaged_checkpoint_is_refused_and_files_that_lack_are_made_again(
         learn(folder, "generations=6")
 
 
-def test_a_full_disk_loses_nothing_that_was_written(uninterrupted, tmp_path, monkeypatch):
-    learn(tmp_path, "generations=2")
-    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
-
-    def full(descriptor):
-        raise OSError(28, "No space left on device")
-
-    with monkeypatch.context() as patch:
-        patch.setattr("sejax.ops.files.os.fsync", full)
-        with pytest.raises(OSError, match="No space left"):
-            learn(tmp_path, "generations=6", "devices=1")
-    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
-    learn(tmp_path, "generations=6")
-    assert rows(tmp_path) == rows(uninterrupted)
-
-
 def test_seconds_do_not_follow_the_machines_clock(uninterrupted, tmp_path, monkeypatch):
     monkeypatch.setattr("time.time", lambda: 0.0)
     learn(tmp_path, "generations=2")

@@ -14,12 +14,11 @@ import yaml
 
 import sejax
 from experiments import supervised_baseline
-from sejax import evaluate, registry, report, run
-from sejax.cli import build, commands
+from sejax import evaluate, registry, report, run, search
+from sejax.cli import build, commands, study
+from sejax.cli import search_config as settings
 from sejax.cli.run_directory import columns_of
 from sejax.ops import checksummed
-from sejax.search import __main__ as search
-from sejax.search import settings, study
 
 IMPORTED, SHELL = "strangers_module:make", {"name": "subprocess:getoutput", "cmd": "touch PWNED"}
 TASK = ["env=gridworld_2x2", "agent=q_learning"]

@@ -24,7 +24,7 @@ from sejax import registry
 from sejax.cli import build, run_directory, session
 from sejax.cli.families import JOINT, key_of
 from sejax.cli.progress import Tally
-from sejax.errors import require
+from sejax.errors import ConfigError, require
 from sejax.ops.files import write_text
 from sejax.options import positive
 
@@ -177,9 +177,19 @@ class TimedChunks(session.Chunks):
 
 
 def read_costs(path: Path, generations: int) -> np.ndarray:
-    """CPU seconds of the first generations, `[generation]`; of fewer, if no more are known."""
-    lines = path.read_text().split() if path.exists() else []
-    return np.array(lines[:generations], float)
+    """CPU seconds of the first generations, `[generation]`; of fewer, if no more are known.
+
+    Raises:
+      ConfigError: if the file is damaged.
+    """
+    try:
+        return np.array(path.read_text().split()[:generations], float)
+    except FileNotFoundError:
+        return np.array([])
+    except ValueError as error:
+        raise ConfigError(
+            f"work must hold whole files; {path} is damaged. Set work=DIR."
+        ) from error
 
 
 def within(curve: pd.DataFrame, budget_s: float | None) -> pd.DataFrame:

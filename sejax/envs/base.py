@@ -81,15 +81,15 @@ class Task(TaskSpec):
             info_keys=info_keys,
             augmented_keys=augmented_keys,
         )
+        # As the generated `__init__` of a frozen dataclass does, but all at once.
         vars(self).update(name=name, env=vectors, params=params, origin=origin)
 
     @classmethod
-    def of(cls, spec: TaskSpec, *, name: str, env: Any, params: Any = None) -> "Task":
+    def of(cls, spec: TaskSpec, *, name: str, env: Any) -> "Task":
         """The task of an environment that has the spec's spaces."""
         return cls(
             name=name,
             env=env,
-            params=params,
             max_steps=spec.max_steps,
             solved_reward=spec.solved_reward,
             info_keys=spec.info_keys,

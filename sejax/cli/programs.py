@@ -16,7 +16,7 @@ from typing import Any
 import jax
 
 from sejax.agents.mixture import Mixture, MixtureConfig
-from sejax.bilevel import Program, make_program
+from sejax.bilevel import Bilevel, make_bilevel
 from sejax.cli import build
 from sejax.cli.families import families_of
 from sejax.cli.session import Chunks
@@ -49,7 +49,7 @@ class Programs:
 
     def chunks(self, config: build.LearnConfig) -> Chunks:
         """The chunks of a run, compiled if none of its shape was."""
-        program, numbers = make_program(**config.parts()), numbers_of(config)
+        program, numbers = make_bilevel(**config.parts()), numbers_of(config)
         key, make = shape_of(config, numbers), partial(_with_numbers, config, program.num_dims)
         chunks = kept(self.shapes, key, lambda: Chunks(program, make, (numbers,)))
         return chunks.sharing(program, (numbers,))
@@ -95,7 +95,7 @@ def structure_of(numbers: Any) -> list[Any]:
     return [str(structure), [type(leaf).__name__ for leaf in leaves]]
 
 
-def _with_numbers(config: build.LearnConfig, num_dims: int, numbers: dict[str, Any]) -> Program:
+def _with_numbers(config: build.LearnConfig, num_dims: int, numbers: dict[str, Any]) -> Bilevel:
     """The program of a configuration with other numbers, which may be traced."""
     parts = config.parts()
     if numbers["agents"]:
@@ -110,7 +110,7 @@ def _with_numbers(config: build.LearnConfig, num_dims: int, numbers: dict[str, A
         for name, number in numbers["es"].items():
             object.__setattr__(es, name, number)
         parts["es"] = es.make(num_dims)
-    return make_program(**parts)
+    return make_bilevel(**parts)
 
 
 def static_of(config: Any) -> dict[str, Any]:
