@@ -19,14 +19,13 @@ from sejax.agents.base import Agent, AgentConfig, Spaces
 from sejax.agents.buffers import Buffer, BufferMaker, Transition
 from sejax.envs.base import require_own_steps
 from sejax.envs.wrappers import repeat_actions
-from sejax.errors import LARGEST, require
 from sejax.ops.keys import step_keys
 from sejax.ops.loops import while_any_active
-from sejax.options import Options, counts, not_negative, one_of, option
+from sejax.options import LARGEST, Options, counts, not_negative, one_of, option, require
 from sejax.proxies.base import episode_limit, is_real, prepare
 from sejax.proxies.header import agents_of, is_registered
 from sejax.proxies.io import Proxy, ProxySet, stored_config
-from sejax.serialize import from_plain
+from sejax.registry import from_plain
 
 STOP_RULES = ("plateau", "solved", "never")
 SOLVED_BY = ("test", "train")

@@ -11,11 +11,10 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 import sejax
 from sejax import envs
 from sejax.agents.dqn import DDQNConfig
-from sejax.cli import build
-from sejax.cli.build import LearnConfig
-from sejax.cli.families import families_of
-from sejax.errors import ConfigError, require, unknown_name
+from sejax.cli import config as configuration
+from sejax.cli.config import LearnConfig, families_of
 from sejax.es.nes import NESConfig
+from sejax.options import ConfigError, require, unknown_name
 from sejax.training import TrainingConfig
 
 config = functools.cache(lambda *overrides: sejax.config(overrides))
@@ -57,11 +56,11 @@ def refusal(word):
     """What is said of a word as typed, and the fix that it ends with."""
     field, _, typed = word.partition("=")
     group, _, name = field.rpartition(".")
-    plain = copy.deepcopy(build.to_plain(config("objective=reward_threshold")))
+    plain = copy.deepcopy(configuration.plain(config("objective=reward_threshold")))
     value = OverridesParser.create().parse_override(word).value()
     (plain[group] if group else plain)[name] = value
     with pytest.raises(ConfigError) as error:
-        build.learn_config(plain)
+        configuration.learn_config(plain)
     said = str(error.value)
     form = rf"^{re.escape(field)} must .*, because .+; got (.+)\. Set (.+)\.$"
     match = re.match(form, said)
@@ -83,7 +82,7 @@ def test_the_fixes_that_messages_name_are_accepted():
 
 def test_seeds_must_end_within_the_range_too():
     with pytest.raises(ConfigError, match=r"^seed \+ num_seeds - 1 must lie in \[0, 2\*\*31\)"):
-        build.learn_config(build.to_plain(config()) | {"seed": 2**31 - 2, "num_seeds": 3})
+        configuration.learn_config(configuration.plain(config()) | {"seed": 2**31 - 2, "num_seeds": 3})
 
 
 def test_dataclasses_refuse_what_the_command_line_does():
@@ -118,15 +117,15 @@ def test_a_config_error_is_a_value_error_with_the_projects_form():
 )
 def test_a_configuration_survives_being_written_and_read(overrides):
     composed = config(*overrides)
-    values = build.to_plain(composed)
-    assert build.learn_config(values) == composed
-    assert build.learn_config(yaml.safe_load(yaml.safe_dump(values))) == composed
+    values = configuration.plain(composed)
+    assert configuration.learn_config(values) == composed
+    assert configuration.learn_config(yaml.safe_load(yaml.safe_dump(values))) == composed
 
 
 def test_plain_values_are_a_copy():
     composed = config()
     population = composed.es.population_size
-    build.to_plain(composed)["es"]["population_size"] = 99
+    configuration.plain(composed)["es"]["population_size"] = 99
     assert composed.es.population_size == population != 99
 
 
@@ -143,41 +142,41 @@ def test_plain_values_are_a_copy():
 )
 def test_plain_values_that_are_no_configuration_are_refused(change, said):
     with pytest.raises(ConfigError, match=said):
-        build.learn_config(build.to_plain(config()) | change)
+        configuration.learn_config(configuration.plain(config()) | change)
 
 
 @pytest.mark.parametrize("missing", ["env", "es", "training", "seed"])
 def test_plain_values_that_lack_something_are_refused(missing):
-    plain = {k: v for k, v in build.to_plain(config()).items() if k != missing}
+    plain = {k: v for k, v in configuration.plain(config()).items() if k != missing}
     said = {"env": r"^env must be chosen", "es": r"^es must be chosen"}
     with pytest.raises(ConfigError, match=said.get(missing, rf"^{missing} must be given, because")):
-        build.learn_config(plain)
+        configuration.learn_config(plain)
 
 
 def test_values_of_before_there_were_families_are_read():
-    plain = build.to_plain(config())
+    plain = configuration.plain(config())
     assert plain.pop("agents") is None
-    assert build.learn_config(plain) == config()
+    assert configuration.learn_config(plain) == config()
 
 
 def test_one_agent_or_several_are_given_not_both():
-    several = build.to_plain(config("agents=[ppo,ddqn]"))
+    several = configuration.plain(config("agents=[ppo,ddqn]"))
     assert several["agent"] is None
     with pytest.raises(ConfigError, match=r"^agent must be left out with agents, .*'ddqn'"):
-        build.learn_config(several | {"agent": {"name": "ddqn"}})
+        configuration.learn_config(several | {"agent": {"name": "ddqn"}})
     with pytest.raises(ConfigError, match=r"^agents must hold an agent"):
-        build.learn_config(several | {"agents": {"aggregate": "min"}})
+        configuration.learn_config(several | {"agents": {"aggregate": "min"}})
 
 
 def test_agents_are_the_same_in_whichever_order_they_stand():
-    plain = build.to_plain(config("agents=[ppo,ddqn]"))
+    plain = configuration.plain(config("agents=[ppo,ddqn]"))
     turned = plain | {"agents": dict(reversed(plain["agents"].items()))}
-    assert build.learn_config(turned) == build.learn_config(plain)
-    assert [x.key for x in families_of(build.learn_config(turned))] == ["ddqn", "ppo"]
+    assert configuration.learn_config(turned) == configuration.learn_config(plain)
+    assert [x.key for x in families_of(configuration.learn_config(turned))] == ["ddqn", "ppo"]
 
 
 def test_configurations_are_hashable_so_that_what_they_build_is_cached():
-    first, second = (build.learn_config(build.to_plain(config())) for _ in range(2))
+    first, second = (configuration.learn_config(configuration.plain(config())) for _ in range(2))
     assert first.agent is not second.agent and first == second
     assert hash(first.agent) == hash(second.agent)
 
@@ -186,7 +185,7 @@ def test_configurations_are_hashable_so_that_what_they_build_is_cached():
 
 
 def test_parts_are_what_make_learner_takes_and_are_built_once():
-    first, second = (build.learn_config(build.to_plain(config())).parts() for _ in range(2))
+    first, second = (configuration.learn_config(configuration.plain(config())).parts() for _ in range(2))
     assert first.keys() == second.keys() == {
         "task", "agent", "proxy", "es", "objective", "training", "stop_when_solved", "devices",
         "num_parallel",
@@ -200,7 +199,7 @@ def test_parts_are_what_make_learner_takes_and_are_built_once():
 
 def test_a_varied_agent_is_drawn_anew_for_each_training():
     fixed = config("env=gridworld_2x2")
-    varied = build.learn_config(build.to_plain(fixed) | {"agent_hparams": "varied"})
+    varied = configuration.learn_config(configuration.plain(fixed) | {"agent_hparams": "varied"})
     agent = varied.parts()["agent"]
     assert agent.varied is not None
     assert fixed.parts()["agent"].varied is None
@@ -214,11 +213,11 @@ def test_several_agents_are_families_each_made_as_it_is_alone():
     assert (made.names, made.weights) == (("q_learning", "sarsa"), (1.0, 3.0))
     assert (made.config.compared_by, made.config.aggregate) == ("rank", "mean")
     assert made.agents == tuple(sejax.make_agent(x.agent, task) for x in families_of(several))
-    varied = build.learn_config(build.to_plain(several) | {"agent_hparams": "varied"})
+    varied = configuration.learn_config(configuration.plain(several) | {"agent_hparams": "varied"})
     assert all(agent.varied is not None for agent in varied.parts()["agent"].agents)
 
 
 def test_a_configuration_that_states_its_spec_is_judged_without_making_the_task(monkeypatch):
     monkeypatch.setattr("sejax.registry.make", None)
     with pytest.raises(ConfigError, match=r"^agent must be one of .*ddqn.* in cartpole"):
-        build.learn_config(build.to_plain(config()) | {"agent": {"name": "q_learning"}})
+        configuration.learn_config(configuration.plain(config()) | {"agent": {"name": "q_learning"}})

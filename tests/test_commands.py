@@ -8,14 +8,15 @@ import sys
 import jax
 import pytest
 
-from sejax.cli import commands, compose, runtime
-from sejax.errors import FailedError
+from sejax.cli import commands, runtime
+from sejax.cli import config as configuration
+from sejax.options import FailedError
 
 
 @pytest.mark.parametrize("value", ["/tmp/ünï-☃", "it's ☃", "back\\slash ☃"])
 def test_a_word_of_letters_outside_of_ascii_reads_back_as_it_was_typed(value):
     word = commands._quoted(f"run_dir={value}")
-    assert compose.config([word]).run_dir == value
+    assert configuration.config([word]).run_dir == value
 
 
 def test_other_words_stay_as_they_are():

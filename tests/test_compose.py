@@ -13,11 +13,11 @@ from hydra.core.config_store import ConfigStore
 
 import sejax
 from sejax import envs, registry
-from sejax.cli import commands, compose, families, presets, runtime
-from sejax.cli.build import LearnConfig
+from sejax.cli import commands, runtime
+from sejax.cli.config import LearnConfig
 from sejax.envs.gridworld import CliffWalking
-from sejax.errors import ConfigError
 from sejax.es.evosax import ALGORITHMS, EvosaxConfig
+from sejax.options import ConfigError
 
 composed_with = functools.cache(lambda *overrides: sejax.config(overrides))
 ENVS = ("cartpole", "acrobot")

@@ -14,7 +14,7 @@ from sejax import envs, registry
 from sejax.envs.dynamics.gridworld import GridParams, GridWorld
 from sejax.envs.environment import spaces_of
 from sejax.envs.gridworld import CLIFF_WALKING, ROOM_2X2
-from sejax.errors import ConfigError
+from sejax.options import ConfigError
 
 KEY = jax.random.key(0)
 GYMNASIUM_IDS = {

@@ -13,7 +13,7 @@ import sejax
 from sejax import envs
 from sejax.envs.environment import EnvState
 from sejax.envs.wrappers import Wrapper
-from sejax.errors import ConfigError
+from sejax.options import ConfigError
 from sejax.proxies.configs import RewardConfig
 
 # brax calls parts of MuJoCo XLA that have been given other names.

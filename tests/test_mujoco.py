@@ -17,8 +17,8 @@ from scipy import stats
 
 from sejax import envs
 from sejax.envs.mujoco.tasks import HalfCheetah, Hopper
-from sejax.errors import ConfigError
 from sejax.ops.parallel import spread_over_devices
+from sejax.options import ConfigError
 
 gymnasium = pytest.importorskip("gymnasium")
 mujoco = pytest.importorskip("mujoco")

@@ -20,8 +20,7 @@ from sejax.agents.sac import SACConfig
 from sejax.agents.tabular import QLearningConfig, SARSAConfig
 from sejax.agents.td3 import DiscreteTD3Config, TD3Config
 from sejax.agents.varied import ranges_of
-from sejax.errors import ConfigError
-from sejax.options import Options, option, traced_options
+from sejax.options import ConfigError, Options, option, traced_options
 
 NAN, INF = float("nan"), float("inf")
 

@@ -15,9 +15,9 @@ from flax import linen as nn
 import sejax
 from sejax import envs, registry
 from sejax.agents import AgentConfig
-from sejax.cli import build
-from sejax.errors import ConfigError
+from sejax.cli import config as configuration
 from sejax.es.evosax import ALGORITHMS
+from sejax.options import ConfigError
 
 EVERY = [(group, name) for group in registry.GROUPS for name in registry.GROUPS[group].built_in]
 
@@ -141,7 +141,7 @@ def test_a_packages_plugin_is_known_by_its_name_and_imported_when_it_is_chosen(o
     config = sejax.config(words)
     assert (config.agent.extra, config.agent.discount) == (3, 0.5)
     assert config.name("agent") == "mine"
-    assert build.learn_config(build.to_plain(config)) == config
+    assert configuration.learn_config(configuration.plain(config)) == config
     assert str(config.resolved_run_dir) == "runs/gridworld_2x2-se-mine-s0"
 
 
@@ -488,7 +488,7 @@ def test_parts_of_ones_own_are_chosen_by_words(own):
     assert config.env == mine.LineTask(length=3) and config.agent == mine.Table()
     assert config.proxy == mine.Guess() and config.name("es") == "my_whole:search"
     assert (config.es.pairs, config.objective.scale) == (2, 10.0)
-    assert build.learn_config(build.to_plain(config)) == config
+    assert configuration.learn_config(configuration.plain(config)) == config
     assert str(config.resolved_run_dir) == "runs/my_whole_LineTask-my_whole_Guess-my_whole_Table-s0"
     assert config.task().obs_dim == 2 and config.task().max_steps == 6
 

@@ -3,8 +3,8 @@
 import pytest
 
 import sejax
-from sejax.cli import compose, words
-from sejax.errors import ConfigError
+from sejax.cli import config as configuration
+from sejax.options import ConfigError
 
 
 def test_a_files_words_stand_in_its_place_and_those_beside_it_go_over_them(tmp_path):
@@ -36,7 +36,7 @@ def test_values_of_a_file_are_in_the_configuration_and_its_place_is_not(tmp_path
 def test_a_file_serves_sejax_evaluate(tmp_path):
     file = tmp_path / "x.yaml"
     file.write_text("proxy: cartpole\nagent: ppo\nagent.epochs: 3\n")
-    made = compose.evaluate_config([f"preset={file}"])
+    made = configuration.evaluate_config([f"preset={file}"])
     assert (made.proxy, made.agent.epochs) == ("cartpole", 3)
 
 

@@ -10,8 +10,8 @@ from experiments.common.reward_networks import STUDIES
 from sejax import registry
 from sejax.agents.dqn import DDQNConfig
 from sejax.agents.ppo import PPOConfig
-from sejax.cli import presets
-from sejax.errors import ConfigError
+from sejax.cli import config as configuration
+from sejax.options import ConfigError
 from sejax.training import TrainingConfig
 
 composed_with = functools.cache(lambda *overrides: sejax.config(overrides))
@@ -228,12 +228,12 @@ def test_ppo_on_ses_is_the_default(env):
 
 
 def test_what_is_tuned_is_known():
-    assert presets.names() == ["best", "paper", "paper_performance", "soft"]
+    assert configuration.names() == ["best", "paper", "paper_performance", "soft"]
     assert presets.tuned("rn") == [
         "cartpole", "cliff_walking", "halfcheetah", "mountain_car_continuous", "pendulum",
     ]  # fmt: skip
     assert presets.tuned("se", "paper") == ["acrobot", "cartpole"]
-    assert presets.is_tuned("acrobot", "se") and not presets.is_tuned("acrobot", "rn")
+    assert configuration.is_tuned("acrobot", "se") and not configuration.is_tuned("acrobot", "rn")
 
 
 def test_every_file_is_of_a_task_and_proxy_and_has_settings_of_known_choices():
@@ -243,7 +243,7 @@ def test_every_file_is_of_a_task_and_proxy_and_has_settings_of_known_choices():
         assert env in (presets.GENERAL, *registry.names("env"))
         kinds = {"tuned_agent": "agent", "tuned_es": "es", "tuned_objective": "objective"}
         for preset, kind, choice, values in presets.settings(env, proxy):
-            assert preset in presets.names() and isinstance(values, dict)
+            assert preset in configuration.names() and isinstance(values, dict)
             assert choice in registry.names(kinds[kind]) if kind in kinds else choice == ""
 
 

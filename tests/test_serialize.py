@@ -1,4 +1,4 @@
-"""sejax.serialize: dataclasses as plain values and back; what does not fit is one message."""
+"""sejax.registry: dataclasses as plain values and back; what does not fit is one message."""
 
 import dataclasses
 import json
@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sejax.errors import ConfigError
-from sejax.serialize import flatten, from_plain, to_plain
+from sejax.options import ConfigError
+from sejax.registry import flatten, from_plain, to_plain
 
 
 @dataclass(frozen=True)

@@ -25,8 +25,7 @@ from jaxtyping import Array, Float
 
 from sejax.agents.base import Agent, AgentConfig, traced
 from sejax.agents.buffers import no_buffer
-from sejax.errors import require
-from sejax.options import counts, option, positive
+from sejax.options import counts, option, positive, require
 
 MOST_DIMS = 2  # of continuous actions: there are num_points to the power of these
 

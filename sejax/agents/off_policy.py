@@ -9,7 +9,6 @@ from jaxtyping import Array
 
 from sejax.agents.base import Agent, AgentOptions, AgentSpec, traced
 from sejax.agents.buffers import num_columns, replay_buffer, sum_over_batch
-from sejax.errors import require
 from sejax.ops.networks import MLP
 from sejax.options import (
     ACTIVATIONS,
@@ -20,6 +19,7 @@ from sejax.options import (
     one_of,
     option,
     positive,
+    require,
 )
 
 

@@ -23,7 +23,6 @@ from jaxtyping import Array, Float, Int
 from sejax.agents.base import Agent, AgentOptions, traced
 from sejax.agents.buffers import Rollout, Transition, rollout_buffer
 from sejax.agents.policies import SOFTMAX, Distribution, gaussian
-from sejax.errors import require
 from sejax.ops import flat
 from sejax.ops.keys import murmur
 from sejax.ops.networks import MLP, init_narrowed
@@ -38,6 +37,7 @@ from sejax.options import (
     option,
     or_none,
     positive,
+    require,
 )
 
 MIN_STD = 0.01  # of the Gaussian policy, in units of the action

@@ -28,10 +28,9 @@ from sejax.agents.off_policy import (
     warming_up,
 )
 from sejax.agents.policies import select_action
-from sejax.errors import require
 from sejax.ops import flat
 from sejax.ops.networks import init_narrowed
-from sejax.options import counts, finite, fraction, not_negative, option, positive
+from sejax.options import counts, finite, fraction, not_negative, option, positive, require
 
 _MIN_LOG_STD, _MAX_LOG_STD = -20.0, 2.0  # of the Gaussian, as in the authors' code
 

@@ -19,9 +19,8 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from sejax.agents.base import Agent, Draw, Varied, with_hparams
-from sejax.errors import require
 from sejax.ops import cpu
-from sejax.options import marks
+from sejax.options import marks, require
 
 
 class Range(NamedTuple):

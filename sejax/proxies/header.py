@@ -14,9 +14,9 @@ from typing import Any
 
 import numpy as np
 
-from sejax import registry, serialize
-from sejax.errors import LARGEST, ConfigError, require, shortened, unknown_name
+from sejax import registry
 from sejax.ops.checksummed import DamagedError, pack, unpack
+from sejax.options import LARGEST, ConfigError, require, shortened, unknown_name
 from sejax.proxies import hub
 
 FORMAT_VERSION = 2
@@ -203,7 +203,7 @@ def read(
         if size > hub.MAX_BYTES:
             raise DamagedError(f"it has {size:,} bytes, and the largest proxies have fewer")
         tensors, stored = unpack(path.read_bytes(), _KEY)
-        header = serialize.from_plain(Header, stored, "header")
+        header = registry.from_plain(Header, stored, "header")
     except (OSError, LookupError, ValueError, TypeError, ArithmeticError) as error:
         raise ConfigError(
             f"{option} must be a proxy's file as sejax writes it; got {shortened(path, 80)}, which "

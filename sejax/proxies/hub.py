@@ -12,7 +12,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from sejax.errors import ConfigError, require, shortened, told
+from sejax.options import ConfigError, require, shortened, told
 
 SCHEME = "hf://"
 FILE = "proxy.safetensors"

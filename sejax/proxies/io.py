@@ -13,8 +13,8 @@ from flax.traverse_util import flatten_dict, unflatten_dict
 
 from sejax import envs, registry
 from sejax.envs.base import Task
-from sejax.errors import ConfigError, one_of, require, shortened, told
 from sejax.ops.files import write_bytes
+from sejax.options import ConfigError, one_of, require, shortened, told
 from sejax.proxies import ProxyConfig
 from sejax.proxies.base import ProxyEnv, absent_task, require_present
 from sejax.proxies.header import (
@@ -68,7 +68,7 @@ class _Stored:
           >>> load_proxy("cliff_walking-rn").learned_with("agent").discount
           0.8
         """
-        one_of("group", str(group), registry.GROUPS)
+        one_of(registry.GROUPS)("group", str(group), None)
         return self._configured(group, self.config.get(group))
 
     def learned_agents(self) -> dict[str, Any]:
