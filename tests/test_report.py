@@ -20,7 +20,8 @@ HOSTILE = "<script>alert(1)</script>$\\frac{"
 @functools.cache
 def stored(*words):
     """A run's configuration as its file has it."""
-    return yaml.safe_dump(configuration.plain(sejax.config([*words, "generations=3"])), sort_keys=False)
+    plain = configuration.plain(sejax.config([*words, "generations=3"]))
+    return yaml.safe_dump(plain, sort_keys=False)
 
 
 def write_run(path, *words, means=(10.0, 196.0, 150.0), ended=True, **changes):
