@@ -566,13 +566,18 @@ def _join(where: str, name: str) -> str:
 def make(group: str, config: Any, *arguments: Any) -> Any:
     """What a configuration configures, built once for equal configurations and arguments.
 
-    Compiled programs are kept by the identity of what they were built from, so that a new instance
-    would compile anew. A configuration that cannot be hashed is built anew.
+    Compiled programs are cached by the identity of what they were built from, so that a new
+    instance would compile again. A configuration that cannot be hashed is equal to itself alone.
 
     Raises:
       ConfigError: if it makes something of another kind, or cannot be made.
     """
-    return (_made_once if is_hashable(config) else _made)(group, config, *arguments)
+    if is_hashable(config):
+        return _made_once(group, config, *arguments)
+    key = (group, id(config), *arguments)
+    if key not in _MADE:
+        _MADE[key] = config, _made(group, config, *arguments)  # with config, its id stays its own
+    return _MADE[key][1]
 
 
 def is_hashable(config: Any) -> bool:
@@ -599,6 +604,7 @@ def _made(group: str, config: Any, *arguments: Any) -> Any:
 
 
 _made_once = functools.cache(_made)
+_MADE: dict[tuple[Any, ...], tuple[Any, Any]] = {}
 
 
 def require_package(group: str, config: Any, reason: str) -> None:
@@ -777,7 +783,9 @@ def _from_function(group: str, name: str, function: Callable[..., Any]) -> type:
     )
 
     def make(self: Any, *given: Any) -> Any:
-        return function(*given, **{p.name: getattr(self, p.name) for p in options})
+        values = {p.name: getattr(self, p.name) for p in options}
+        as_lists = [p.name for p in options if isinstance(p.default, list)]
+        return function(*given, **values | {name: list(values[name]) for name in as_lists})
 
     written = getattr(function, "func", function)  # of a partial, what it is one of
     base = _attribute(GROUPS[group].base)
@@ -802,6 +810,8 @@ def _as_field(parameter: inspect.Parameter) -> tuple[str, Any, Any]:
         kind = typing.Optional[kind]  # noqa: UP045 (it may be a string)
     if default is inspect.Parameter.empty:
         return parameter.name, kind, dataclasses.field()
-    if isinstance(default, list):  # hashable, so that what it configures is built once
+    if isinstance(default, list):  # a tuple is hashable, so that what it configures is built once
         default = tuple(default)
+        kinds = typing.get_args(kind)
+        kind = tuple[(kinds[0] if kinds else Any), ...]  # type: ignore[misc]
     return parameter.name, kind, dataclasses.field(default=default)
