@@ -220,7 +220,7 @@ def rn_env(header: Header, env_id: Any, render_mode: str | None) -> gymnasium.En
         "task",
         "be an id of Gymnasium for a reward network",
         "its dynamics are the real task's",
-        env_id,
+        shortened(env_id, 80),
         fix,
     )
     if env_id is not None:

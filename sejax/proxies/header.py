@@ -207,14 +207,13 @@ def read(
     except (OSError, LookupError, ValueError, TypeError, ArithmeticError) as error:
         raise ConfigError(
             f"{option} must be a proxy's file as sejax writes it; got {shortened(path, 80)}, which "
-            f"is damaged or of another format ({shortened(error, 90)}). Write it anew: the same "
-            f"sejax.run goes on from its checkpoint.",
+            f"is damaged or of another format ({shortened(error, 60)}). The run writes it again.",
             option,
         ) from error
     require(
         not kinds or header.kind in kinds,
         option,
-        f"be a proxy of the kind {' or '.join(kinds)}",
+        f"be a proxy of the kind {shortened(' or '.join(map(str, kinds)), 40)}",
         "others are not read here",
         f"proxy={shortened(header.kind, 40)} in {shortened(path, 80)}",
         f"{option} to such a proxy",

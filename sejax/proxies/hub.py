@@ -104,7 +104,7 @@ def require_repo(repo: Any) -> None:
         "repo",
         "be USER/REPO",
         "that is how the Hub names repositories",
-        repo,
+        shortened(repo, 80),
         "repo='USER/REPO'",
     )
 
