@@ -6,7 +6,6 @@ hyperparameters that compiled programs take as arguments, and the buffers.
 
 import dataclasses
 import functools
-from typing import Any
 
 from sejax import registry
 from sejax.agents.base import (

@@ -10,8 +10,8 @@ import jax
 from jaxtyping import Array, Int
 
 from sejax.agents.buffers import BufferMaker
-from sejax.envs.environment import spaces_of
 from sejax.envs.base import Task
+from sejax.envs.environment import spaces_of
 from sejax.envs.spec import Discrete, Space
 from sejax.options import Options, counts, option, traced_options
 
