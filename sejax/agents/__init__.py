@@ -27,6 +27,7 @@ from sejax.agents.buffers import (
     replay_buffer,
     rollout_buffer,
 )
+from sejax.envs.base import Task
 from sejax.envs.spec import TaskSpec
 from sejax.options import require
 
@@ -59,7 +60,7 @@ def names() -> list[str]:
 
 def make_agent(
     config: AgentConfig,
-    task: Any,
+    task: Task,
     exploration: ExplorationConfig = NoExploration(),  # noqa: B008 (frozen)
     varied: bool = False,
 ) -> Agent:
@@ -96,7 +97,7 @@ def make_agent(
 
 
 def _make_agent(
-    config: AgentConfig, exploration: ExplorationConfig, task: Any, varied: bool
+    config: AgentConfig, exploration: ExplorationConfig, task: Task, varied: bool
 ) -> Agent:
     def make(config: AgentConfig) -> Agent:
         agent = registry.make("agent", config, task)

@@ -11,6 +11,7 @@ from jaxtyping import Array, Int
 
 from sejax.agents.buffers import BufferMaker
 from sejax.envs.environment import spaces_of
+from sejax.envs.base import Task
 from sejax.envs.spec import Discrete, Space
 from sejax.options import Options, counts, option, traced_options
 
@@ -194,7 +195,7 @@ class AgentConfig(Options):
         """Whether each step has one learning step, as ICM needs it."""
         return True
 
-    def make(self, task: Any) -> Agent:
+    def make(self, task: Task) -> Agent:
         """The agent for a task's observations and actions."""
         raise NotImplementedError
 
@@ -240,7 +241,7 @@ class ExplorationConfig(Options):
     states: ClassVar[str | None] = None
     needs_each_step: ClassVar[bool] = False
 
-    def make(self, agent: Agent, task: Any) -> Agent:
+    def make(self, agent: Agent, task: Task) -> Agent:
         """The agent with the intrinsic reward."""
         raise NotImplementedError
 
@@ -249,7 +250,7 @@ class ExplorationConfig(Options):
 class NoExploration(ExplorationConfig):
     """No intrinsic reward."""
 
-    def make(self, agent: Agent, task: Any) -> Agent:
+    def make(self, agent: Agent, task: Task) -> Agent:
         return agent
 
 
@@ -275,7 +276,7 @@ def _hparams_type(name: str, fields: tuple[str, ...]) -> Any:
     return collections.namedtuple(name, fields)
 
 
-def with_hparams(hparams: Any, values: dict[str, Array]) -> Any:
+def with_hparams(hparams: Hparams, values: dict[str, Array]) -> Hparams:
     """Traced hyperparameters with these values; those of a wrapped agent are its field `agent`."""
     if "agent" in hparams._fields:
         return hparams._replace(agent=with_hparams(hparams.agent, values))

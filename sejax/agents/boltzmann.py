@@ -23,7 +23,7 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Float
 
-from sejax.agents.base import Agent, AgentConfig, traced
+from sejax.agents.base import Agent, AgentConfig, Hparams, traced
 from sejax.agents.buffers import no_buffer
 from sejax.options import counts, option, positive, require
 
@@ -71,7 +71,7 @@ class BoltzmannState(struct.PyTreeNode):
     """One agent: the rewards of its environment, and how it weighs them."""
 
     reward: Any  # `(obs, action) -> []`, a pytree
-    hparams: Any
+    hparams: Hparams
 
 
 def make_boltzmann(config: BoltzmannConfig, actions: Array) -> Agent:
@@ -89,7 +89,7 @@ def make_boltzmann(config: BoltzmannConfig, actions: Array) -> Agent:
       True
     """
 
-    def solve(env: Any, env_params: Any, hparams: Any) -> BoltzmannState:
+    def solve(env: Any, env_params: Any, hparams: Hparams) -> BoltzmannState:
         require(
             getattr(env, "is_bandit", False),
             "agent",

@@ -17,7 +17,7 @@ from flax import linen as nn
 from flax import struct
 from jaxtyping import Array, Float, Int
 
-from sejax.agents.base import Agent
+from sejax.agents.base import Agent, Hparams
 from sejax.agents.buffers import Transition
 from sejax.agents.off_policy import OffPolicyOptions, mean_over_batch, off_policy_agent
 from sejax.agents.policies import decayed_epsilon, epsilon_greedy, select_action
@@ -104,7 +104,7 @@ class DDQNState:
     opt_state: optax.OptState
     epsilon: Array
     num_steps: Int[Array, ""]  # agent steps since it first learned
-    hparams: Any  # traced options, and hidden_size and batch_size in use or None
+    hparams: Hparams  # traced options, and hidden_size and batch_size in use or None
 
 
 @functools.cache
@@ -123,7 +123,7 @@ def make_ddqn(config: DDQNConfig, obs_dim: int, num_actions: int) -> Agent:
     unflatten = flat.unflattener(network.init, jnp.zeros(obs_dim))
     learn = make_learning_step(config, network, unflatten)
 
-    def init(key: Array, hparams: Any) -> DDQNState:
+    def init(key: Array, hparams: Hparams) -> DDQNState:
         params = flat.flatten(init_narrowed(network, key, obs_dim, hparams.hidden_size))
         hparams = jax.tree.map(jnp.float32, hparams)
         return DDQNState(
@@ -161,7 +161,7 @@ def begin_episode(state: DDQNState, episode: Array) -> DDQNState:
     return state.replace(epsilon=epsilon)
 
 
-def linear_epsilon(hparams: Any, num_steps: Array) -> Array:
+def linear_epsilon(hparams: Hparams, num_steps: Array) -> Array:
     """The share of random actions `num_steps` after the agent first learned, `[]`.
 
     It falls from `hparams.epsilon_init` to its `epsilon_min` in `exploration_steps` and stays.

@@ -20,7 +20,7 @@ import optax
 from flax import struct
 from jaxtyping import Array, Float, Int
 
-from sejax.agents.base import Agent, AgentOptions, traced
+from sejax.agents.base import Agent, AgentOptions, Hparams, traced
 from sejax.agents.buffers import Rollout, Transition, rollout_buffer
 from sejax.agents.policies import SOFTMAX, Distribution, gaussian
 from sejax.ops import flat
@@ -147,7 +147,7 @@ class PPOState(struct.PyTreeNode):
     params: Float[Array, " num_params"]
     opt_state: optax.OptState
     return_sums: Float[Array, "3"]  # of 1, returns and their squares; 0 if unused
-    hparams: Any  # traced options, and hidden_size in use or None
+    hparams: Hparams  # traced options, and hidden_size in use or None
 
 
 @functools.cache
@@ -202,7 +202,7 @@ def make_ppo(
     optimizer = config.optimizer()
     learn = make_learning_phase(config, networks, optimizer, obs_dim, is_discrete)
 
-    def init(key: Array, hparams: Any) -> PPOState:
+    def init(key: Array, hparams: Hparams) -> PPOState:
         params = networks.init(key, hparams.hidden_size)
         return PPOState(
             params=params,
@@ -382,7 +382,7 @@ def make_learning_phase(
     """
     prepare = ADVANTAGES[config.advantages]
 
-    def loss_fn(tree: Any, batch: Batch, hp: Any) -> Array:
+    def loss_fn(tree: Any, batch: Batch, hp: Hparams) -> Array:
         log_prob, entropy, value = networks.evaluate(tree, batch.obs, batch.action)
         if batch.advantage is None:
             advantage = jax.lax.stop_gradient(batch.returns - value)
@@ -515,7 +515,7 @@ def ppo_loss(
     old_log_prob: Steps,
     advantage: Steps,
     returns: Steps,
-    hp: Any,
+    hp: Hparams,
 ) -> Float[Array, ""]:
     r"""What a learning phase minimises.
 

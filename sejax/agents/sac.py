@@ -19,7 +19,7 @@ import optax
 from flax import struct
 from jaxtyping import Array, Bool, Float
 
-from sejax.agents.base import Agent
+from sejax.agents.base import Agent, Hparams
 from sejax.agents.buffers import Transition
 from sejax.agents.off_policy import (
     OffPolicyOptions,
@@ -89,7 +89,7 @@ class SACState(struct.PyTreeNode):
     target_critics: Float[Array, " num_critic_params"]
     opt_state: optax.OptState
     is_warming_up: Bool[Array, ""]
-    hparams: Any  # traced options, and hidden_size and batch_size in use or None
+    hparams: Hparams  # traced options, and hidden_size and batch_size in use or None
 
 
 class LearningNoise(NamedTuple):
@@ -171,7 +171,7 @@ def _make_agent(config: SACConfig, obs_dim: int, policy: Policy) -> Agent:
     networks = make_networks(config, obs_dim, policy)
     learn = make_learning_step(networks, policy)
 
-    def init(key: Array, hparams: Any) -> SACState:
+    def init(key: Array, hparams: Hparams) -> SACState:
         params = networks.init(key, hparams)
         return SACState(
             params=params,
@@ -251,7 +251,7 @@ def make_networks(config: SACConfig, obs_dim: int, policy: Policy) -> Networks:
             log_alpha=jnp.zeros(()),
         )
 
-    def init(key: Array, hparams: Any) -> Array:
+    def init(key: Array, hparams: Hparams) -> Array:
         params = init_all(key, hparams.hidden_size)
         return flat.flatten(params._replace(log_alpha=jnp.log(jnp.float32(hparams.init_alpha))))
 
@@ -294,7 +294,7 @@ def make_learning_step(
     """
 
     def sum_of_losses(
-        params: Params, target_critics: Any, hp: Any, batch: Transition, noise: LearningNoise
+        params: Params, target_critics: Any, hp: Hparams, batch: Transition, noise: LearningNoise
     ) -> Array:
         fixed = jax.lax.stop_gradient(params)
         online, online_fixed, target = (

@@ -18,7 +18,7 @@ import optax
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
-from sejax.agents.base import Agent
+from sejax.agents.base import Agent, Hparams
 from sejax.agents.buffers import Transition
 from sejax.agents.off_policy import (
     OffPolicyOptions,
@@ -94,7 +94,7 @@ class TD3State(struct.PyTreeNode):
     critic_opt_state: optax.OptState
     num_updates: Int[Array, ""]
     is_warming_up: Bool[Array, ""]
-    hparams: Any  # traced options, and hidden_size and batch_size in use or None
+    hparams: Hparams  # traced options, and hidden_size and batch_size in use or None
 
 
 class LearningNoise(NamedTuple):
@@ -182,7 +182,7 @@ def _make_agent(config: TD3Config, obs_dim: int, policy: Policy) -> Agent:
     networks = make_networks(config, obs_dim, policy.action_dim)
     learn = make_learning_step(config, networks, policy)
 
-    def init(key: Array, hparams: Any) -> TD3State:
+    def init(key: Array, hparams: Hparams) -> TD3State:
         actor, critics = networks.init(key, hparams.hidden_size)
         return TD3State(
             actor=actor,
@@ -443,7 +443,7 @@ def gumbel_softmax(
     return _one_hot_of_largest(perturbed) + (soft - jax.lax.stop_gradient(soft))
 
 
-def annealed_temperature(hparams: Any, num_updates: Array, num_steps: int) -> Array:
+def annealed_temperature(hparams: Hparams, num_updates: Array, num_steps: int) -> Array:
     """Temperature in the `num_updates`-th learning step and until the next one.
 
     It falls linearly from `hparams.temperature` to its `hparams.final_temperature`-fold in
