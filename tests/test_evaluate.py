@@ -230,9 +230,8 @@ def test_each_of_several_agents_trains_as_long_as_it_must(tmp_path):
         (["proxy=real", "env=cartpole", "training.max_steps=9"], r"training must.*Set real_train"),
         (["seed=-1"], r"seed must lie in \[0, 2\*\*31\)"),
         (["num_agents=0"], "num_agents must be"),
-        (["env=[1]"], "env must be a word"),
         (["agent=2"], "agent must be one of"),
-        (["agents=[q_learning,sarsa]", "agents.sarsa.weight=2"], "got agents.sarsa.weight"),
+        (["agents=[q_learning,sarsa]", "agents.sarsa.weight=2"], "agents.sarsa.weight must be"),
         (["agents=[ddqn,ppo]", "agent_hparams=as_learned"],
          r"agents must be left out with agent_hparams=as_learned.*got ddqn\+ppo"),
     ],
@@ -359,18 +358,6 @@ def test_where_no_agent_is_named_it_is_the_tasks_own(room, tmp_path):
     assert "their" not in sys.modules
 
 
-def test_of_several_proxies_the_last_word_counts_and_a_sweep_needs_an_agent():
-    def agent_of(*words):
-        compose.register("evaluate", words)
-        return compose.ConfigStore.instance().repo["agent"]["of_task.yaml"].node["name"]
-
-    assert agent_of("proxy=cartpole", "proxy=pendulum") == "td3"
-    assert agent_of("proxy=cartpole,acrobot") == "ddqn"
-    with pytest.raises(ConfigError, match=r"^agent must be given, .*got none, with ddqn, td3 for"):
-        compose.register("evaluate", ["proxy=cartpole,pendulum"])
-    compose.register("evaluate", ["proxy=cartpole,pendulum", "agent=ppo"])
-
-
 def test_a_missing_proxy_or_task_says_what_to_set():
     with pytest.raises(ConfigError, match="proxy must be given"):
         evaluate_config()
@@ -384,8 +371,8 @@ def test_a_missing_proxy_or_task_says_what_to_set():
         ([], "proxy must be given"),
         (["proxy=nope"], "proxy must be one of "),
         (["proxy=nope/proxy.safetensors"], "does not exist"),
-        (["proxy=cartpole", "agents=[1,2]"], "agent must be one of"),
-        (["proxy=cartpole", "+new=1"], "new must be a field of EvaluateConfig"),
+        (["proxy=cartpole", "agents=[1,2]"], "agents must be one of"),
+        (["proxy=cartpole", "new=1"], "new must be a field"),
         (["proxy=" + "d" * 10_000], "proxy must be "),
     ],
 )
@@ -394,12 +381,11 @@ def test_the_command_ends_bad_input_with_one_message_and_status_2(words, said, m
 
     monkeypatch.setattr(sys, "argv", ["sejax.evaluate", *words])
     monkeypatch.setattr(sys, "path", list(sys.path))
-    monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
     with pytest.raises(SystemExit) as ended:
         commands.start(command.main, command.help_text)
     printed = capsys.readouterr()
     assert ended.value.code == 2 and not printed.out
-    assert said in printed.err and printed.err.count("\n") == 1 and len(printed.err) < 1500
+    assert said in printed.err and printed.err.count("\n") == 1 and len(printed.err) < 500
 
 
 def test_an_evaluations_mean_leaves_no_agent_out():

@@ -528,7 +528,16 @@ def config(overrides: Sequence[str] = ()) -> LearnConfig:
 def evaluate_config(overrides: Sequence[str] = ()) -> EvaluateConfig:
     """As `config`, for the overrides after `python -m sejax.evaluate`."""
     with registry.only_typed(overrides):
-        made: EvaluateConfig = _from_plain(EvaluateConfig, compose(EvaluateConfig, overrides))
+        values = compose(EvaluateConfig, overrides)
+        require(
+            "proxy" in values,
+            "proxy",
+            "be given",
+            "agents are trained on it",
+            "none",
+            "proxy=RUN_DIR, proxy=FILE, proxy=cartpole (a shipped one) or proxy=real env=cartpole",
+        )
+        made: EvaluateConfig = _from_plain(EvaluateConfig, values)
     return made
 
 
