@@ -381,6 +381,19 @@ def test_ctrl_c_saves_and_exits_130(tmp_path):
     assert (tmp_path / "proxy.safetensors").exists()
 
 
+def test_an_interrupt_waits_until_files_are_written():
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    written = []
+    try:
+        with pytest.raises(KeyboardInterrupt), session.interrupts_held():
+            signal.raise_signal(signal.SIGINT)
+            written.append("all")
+        assert written == ["all"]
+        assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
 def test_bad_input_ends_a_process_with_one_message_and_status_2(tmp_path):
     for word, message in [
         ("env=cartpol", "Did you mean env=cartpole?"),
