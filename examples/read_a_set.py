@@ -60,7 +60,7 @@ def main() -> None:
     num_parallel = agent.spec.cpu_num_parallel
     program = sejax.spread_over_devices(train_and_test, cpu_num_parallel=num_parallel)
     outcome = jax.jit(program)(keys, weights)
-    returns = np.asarray(outcome.test_return).reshape(proxies.size, args.agents)
+    returns = np.asarray(outcome.test_return).reshape(len(proxies), args.agents)
     for record, mine in zip(proxies.records, returns, strict=True):
         print(f"seed {record['seed']}, learned with {record['score']:.2f}: {args.agents} fresh "
               f"agents return {mine.mean():.2f}, deviation {mine.std():.2f}")  # fmt: skip

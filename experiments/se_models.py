@@ -20,7 +20,7 @@ from experiments.common import agents as groups
 from experiments.common import figures, tables
 from experiments.common.agents import SeAgents, return_columns
 from experiments.common.experiment import Experiment, setting
-from sejax.errors import ConfigError
+from sejax.options import ConfigError
 
 
 @dataclass(frozen=True, kw_only=True)

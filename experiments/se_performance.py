@@ -31,8 +31,7 @@ from experiments.common import figures, tables
 from experiments.common.agents import Condition, SeAgents, return_columns, tuned_agent
 from experiments.common.experiment import Experiment, count, setting
 from sejax import envs
-from sejax.errors import require
-from sejax.options import one_of
+from sejax.options import one_of, require
 from sejax.training import SOLVED_BY, TrainingConfig
 
 NUM_BEST = 5

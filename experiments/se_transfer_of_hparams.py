@@ -23,7 +23,7 @@ from experiments.common.agents import Condition, Group, Measure
 from experiments.common.experiment import Experiment, Settings, count, each_of, setting
 from experiments.common.statistics import NUM_RESAMPLES
 from experiments.common.tables import as_texts, publish
-from sejax.errors import require
+from sejax.options import require
 from sejax.training import TrainingConfig
 
 BUDGETS = {"same": "as many steps", "long": "until the stop rule"}

@@ -34,7 +34,7 @@ from experiments.common.agents import HPARAMS, SE_AGENTS, SOFT_SE, Condition, re
 from experiments.common.experiment import Experiment
 from experiments.common.shards import stack, unstack
 from experiments.common.supervised_models import SupervisedBaseline
-from sejax.errors import require
+from sejax.options import require
 
 BEST = 2  # models in the paper's second figure
 LABELS = {

@@ -18,7 +18,7 @@ _EXPORTS = {
     "AUC": "sejax.objectives",
     "AUCSum": "sejax.objectives",
     "Agent": "sejax.agents.base",
-    "ConfigError": "sejax.errors",
+    "ConfigError": "sejax.options",
     "CountBasedConfig": "sejax.agents.exploration",
     "DDQNConfig": "sejax.agents.dqn",
     "DQNConfig": "sejax.agents.dqn",
@@ -52,7 +52,7 @@ _EXPORTS = {
     "Task": "sejax.envs.base",
     "TrainResult": "sejax.training",
     "TrainingConfig": "sejax.training",
-    "config": "sejax.cli.compose",
+    "config": "sejax.cli.config",
     "configure_xla": "sejax.cli.runtime",
     "evaluate_agents": "sejax.evaluation",
     "load": "sejax.proxies.io",
@@ -84,16 +84,16 @@ if TYPE_CHECKING:  # what a type checker and an editor see
     from sejax.agents.tabular import QLearningConfig, SARSAConfig
     from sejax.agents.td3 import DiscreteTD3Config, TD3Config
     from sejax.bilevel import LearnResult, make_learner
-    from sejax.cli.compose import config
+    from sejax.cli.config import config
     from sejax.cli.runtime import configure_xla
     from sejax.envs.base import Task
-    from sejax.errors import ConfigError
     from sejax.es.base import Evaluations, Strategy
     from sejax.es.evosax import EvosaxConfig
     from sejax.es.nes import NESConfig
     from sejax.evaluation import evaluate_agents, make_evaluator
     from sejax.objectives import AUC, AUCSum, MaxReward, Objective, Outcome, RewardThreshold
     from sejax.ops.parallel import spread_over_devices
+    from sejax.options import ConfigError
     from sejax.proxies import ProxyConfig
     from sejax.proxies.base import ProxyEnv, ProxyParams
     from sejax.proxies.configs import RewardConfig, SyntheticConfig

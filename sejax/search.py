@@ -8,7 +8,7 @@ from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
 from sejax.cli import commands, runtime
-from sejax.errors import ConfigError
+from sejax.options import ConfigError
 
 if TYPE_CHECKING:  # they need the extra `search`
     from sejax.cli.search_config import Search
@@ -100,7 +100,8 @@ def _say(text: str) -> None:
     print(text, flush=True)
 
 
-def _help() -> str:
+def help_text(overrides: Sequence[str]) -> str:
+    """What `--help` prints."""
     if find_spec("optuna") is None:
         return f"{__doc__}\nIt needs pip install 'sejax[search]'."
     from sejax.cli import search_config
@@ -109,4 +110,4 @@ def _help() -> str:
 
 
 if __name__ == "__main__":
-    commands.start_with_words(main, _help())
+    commands.start(main, help_text)

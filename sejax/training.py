@@ -19,14 +19,13 @@ from sejax.agents.base import Agent, AgentConfig, Spaces
 from sejax.agents.buffers import Buffer, BufferMaker, Transition
 from sejax.envs.base import require_own_steps
 from sejax.envs.wrappers import repeat_actions
-from sejax.errors import LARGEST, require
 from sejax.ops.keys import step_keys
 from sejax.ops.loops import while_any_active
-from sejax.options import Options, counts, not_negative, one_of, option
+from sejax.options import LARGEST, Options, counts, not_negative, one_of, option, require
 from sejax.proxies.base import episode_limit, is_real, prepare
 from sejax.proxies.header import agents_of, is_registered
-from sejax.proxies.io import Proxy, ProxySet
-from sejax.serialize import from_plain
+from sejax.proxies.io import Proxy, ProxySet, stored_config
+from sejax.registry import from_plain
 
 STOP_RULES = ("plateau", "solved", "never")
 SOLVED_BY = ("test", "train")
@@ -117,14 +116,15 @@ def training_of(proxy: Proxy | ProxySet, agent: AgentConfig | None = None) -> Tr
         `budget_for`; None for the training as it was.
 
     Raises:
-      ConfigError: if the file does not tell it.
+      ConfigError: for a proxy that is not stored, or if its file does not tell it.
 
     Example:
       >>> import sejax
       >>> training_of(sejax.load_proxy("cartpole")).stop_rule
       'never'
     """
-    stored: Any = proxy.config.get("training")
+    config = stored_config(proxy)
+    stored: Any = config.get("training")
     require(
         isinstance(stored, Mapping),
         "training",
@@ -138,7 +138,7 @@ def training_of(proxy: Proxy | ProxySet, agent: AgentConfig | None = None) -> Tr
         return training
     known = [
         registry.configure("agent", values)
-        for values in agents_of(proxy.config).values()
+        for values in agents_of(config).values()
         if is_registered("agent", values)
     ]
     return budget_for(training, agent, known, proxy.env.max_steps, proxy.env.task.max_steps)

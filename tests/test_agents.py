@@ -11,8 +11,7 @@ import pytest
 import sejax
 from sejax import agents, envs, registry
 from sejax.agents import AgentConfig, Rollout, Transition
-from sejax.errors import ConfigError
-from sejax.options import traced_options
+from sejax.options import ConfigError, traced_options
 
 NUM_STEPS, BATCH = 16, 7  # a batch has one column of padding
 SMALL = {

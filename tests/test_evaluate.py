@@ -17,11 +17,12 @@ import sejax
 from sejax import envs, registry
 from sejax.agents.ppo import PPOConfig
 from sejax.agents.tabular import QLearningConfig
-from sejax.cli import build, commands, compose, progress
-from sejax.cli.families import families_of
-from sejax.errors import ConfigError
+from sejax.cli import commands, progress
+from sejax.cli import config as configuration
+from sejax.cli.config import families_of
 from sejax.evaluate import evaluate, proxy_study, summarise
 from sejax.ops.checksummed import pack, unpack
+from sejax.options import ConfigError
 from sejax.training import TrainingConfig, budget_for
 
 TINY = ["agent.hidden_size=4", "agent.batch_size=4", "agent.warmup_episodes=0", "num_agents=3",
@@ -39,7 +40,7 @@ ROOM = [
 
 
 def evaluate_config(*overrides, words=TINY):
-    return compose.evaluate_config([*words, *overrides])
+    return configuration.evaluate_config([*words, *overrides])
 
 
 @functools.cache
@@ -53,7 +54,7 @@ def learned(*words):
 def save(path, *words):
     config, env, weights = learned(*words)
     discount = families_of(config)[0].agent.discount
-    sejax.save(path, env, weights, build.to_plain(config), discount, score=1.0, seed=0)
+    sejax.save(path, env, weights, configuration.plain(config), discount, score=1.0, seed=0)
     return path
 
 

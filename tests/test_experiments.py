@@ -26,9 +26,9 @@ from experiments.common import agents, curves, experiment, runs, shards, supervi
 from experiments.common.experiment import parse
 from experiments.common.reward_networks import RnSettings
 from sejax import envs
-from sejax.cli import build, session
-from sejax.errors import ConfigError
-from sejax.options import counts
+from sejax.cli import config as configuration
+from sejax.cli import session
+from sejax.options import ConfigError, counts
 
 NAMES = [module.name for module in pkgutil.iter_modules(experiments.__path__)
          if module.name not in ("__main__", "common")]  # fmt: skip
@@ -85,7 +85,7 @@ def save_ses(path, num, *overrides):
     env = config.parts()["proxy"]
     weights = [env.init_weights(jax.random.key(5 + i)) for i in range(num)]
     records = [{"score": 1.0 + i, "generation": 4, "seed": 7 + i} for i in range(num)]
-    sejax.save_set(path, env, weights, records, build.to_plain(config))
+    sejax.save_set(path, env, weights, records, configuration.plain(config))
     return str(path)
 
 

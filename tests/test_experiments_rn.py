@@ -18,7 +18,7 @@ from experiments.rn_heatmap import RnHeatmap
 from experiments.rn_objectives import RnObjectives
 from experiments.rn_performance import RnPerformance
 from sejax.cli import session
-from sejax.errors import ConfigError
+from sejax.options import ConfigError
 
 
 @pytest.fixture(scope="module")

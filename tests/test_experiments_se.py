@@ -25,8 +25,8 @@ from experiments.common import agents, figures, runs, shards
 from experiments.common.statistics import bootstrap_interval, interquartile_mean
 from sejax import envs
 from sejax.agents.base import drawing_key
-from sejax.cli import build
-from sejax.errors import ConfigError
+from sejax.cli import config as configuration
+from sejax.options import ConfigError
 
 
 @pytest.fixture(scope="module")
@@ -108,7 +108,7 @@ def test_feasibility_learns_as_sejax_run_does_and_goes_on(tmp_path):
     stored = sejax.load_set(tmp_path / "ses.safetensors")
     config = yaml.safe_load((tmp_path / "work/runs/seed4/config.yaml").read_text())
     assert config["seed"] == 4 and config["proxy"]["hidden_size"] == 4
-    result = jax.jit(sejax.make_learner(build.learn_config(config)))(jax.random.key(4))
+    result = jax.jit(sejax.make_learner(configuration.learn_config(config)))(jax.random.key(4))
     mine = made[made["seed"] == 4]
     np.testing.assert_allclose(mine["incumbent_mean"], result.info.incumbent_mean, rtol=1e-6)
     assert stored.seeds.tolist() == [3, 4]

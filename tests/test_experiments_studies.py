@@ -15,8 +15,8 @@ from experiments import score_transforms, se_histograms, supervised_baseline
 from experiments.common import supervised_models
 from experiments.common.statistics import bootstrap_interval
 from sejax.bilevel import make_bilevel
-from sejax.errors import ConfigError
 from sejax.evaluation import make_recorder, make_tester
+from sejax.options import ConfigError
 from sejax.training import make_trainer
 
 

@@ -23,8 +23,8 @@ from support import numpy_forward, random_like, shapes_of
 import sejax
 from sejax import envs, registry
 from sejax.envs.gridworld import CLIFF_WALKING, ROOM_2X2
-from sejax.errors import ConfigError
 from sejax.gym import GridWorld, RewardNetwork, make, networks
+from sejax.options import ConfigError
 from sejax.proxies import header
 from sejax.proxies.configs import VARIANTS, RewardConfig
 

@@ -16,8 +16,8 @@ from gymnasium.wrappers import TransformObservation
 from test_gym_vector import SES, world_of
 
 import sejax.gym
-from sejax.errors import ConfigError
 from sejax.gym import SyntheticEnv
+from sejax.options import ConfigError
 from sejax.proxies import header
 
 try:

@@ -9,7 +9,7 @@ import yaml
 from fake_hub import oid, serving
 
 import sejax
-from sejax.errors import ConfigError
+from sejax.options import ConfigError
 from sejax.proxies import header, hub
 
 SHIPPED = header.PRETRAINED_DIR / "cartpole.safetensors"
@@ -257,11 +257,11 @@ def test_a_repository_has_an_owner_and_a_name():
 
 @needs_the_extra
 def test_the_command_evaluates_what_is_there_and_writes_in_the_working_folder(the_hub):
-    from sejax.cli import compose
+    from sejax.cli import config as configuration
     from sejax.evaluate import proxy_study
 
     sejax.push("cartpole", "me/se")
-    config = compose.evaluate_config([f"proxy=hf://me/se@{oid('me/se', 0)}"])
+    config = configuration.evaluate_config([f"proxy=hf://me/se@{oid('me/se', 0)}"])
     study = proxy_study(config)
     assert study.task.name == "cartpole"
     assert str(study.out_dir) == f"runs/evaluate-me_se@{oid('me/se', 0)}"

@@ -9,10 +9,10 @@ import pytest
 
 import sejax
 from sejax import registry
-from sejax.errors import ConfigError
 from sejax.es.base import Evaluations
 from sejax.es.evosax import ALGORITHMS, EvosaxConfig, finite_fitness, from_evosax
 from sejax.es.nes import NESConfig
+from sejax.options import ConfigError
 
 NAN, INF = np.nan, np.inf
 DIMS = 6

@@ -10,9 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sejax.errors import ConfigError
 from sejax.ops.networks import MLP
 from sejax.ops.parallel import spread_groups_over_devices, spread_over_devices
+from sejax.options import ConfigError
 
 
 def work(key, x):

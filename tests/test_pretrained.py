@@ -14,7 +14,7 @@ from plain_agents import agent_for, learn, mean_return
 
 import sejax
 from sejax import envs
-from sejax.cli.compose import evaluate_config
+from sejax.cli.config import evaluate_config
 from sejax.evaluate import proxy_study
 from sejax.gym import GYMNASIUM_IDS, make
 from sejax.proxies import zoo

@@ -17,8 +17,8 @@ from safetensors.numpy import save_file
 
 import sejax
 from sejax import envs, registry
-from sejax.errors import ConfigError
 from sejax.ops.checksummed import pack, unpack
+from sejax.options import ConfigError
 from sejax.proxies import header
 from sejax.proxies.base import absent_task
 from sejax.proxies.configs import RewardConfig, SyntheticConfig
@@ -216,7 +216,7 @@ ODD_VALUES = {  # of entries of the metadata, by their place
     ("config",): [MISSING, None, [], 3],
     ("config", "env"): [MISSING, None, [], "cartpole", {}, {"name": 3}, {"name": None},
                         {"name": ["x"]}, {"name": "gridworld_2x2", "new": 1}],
-    ("config", "proxy"): [MISSING, None, {"name": "rn", "hidden_size": "2"},
+    ("config", "proxy"): [MISSING, None, {"name": "rn", "hidden_size": "x"},
                           {"name": "rn", "new": 1}],
     ("task",): [MISSING, None, [], "t" * 10_000],
     ("is_set",): [MISSING, None, "yes", 2],

@@ -13,9 +13,9 @@ import sejax
 from sejax import bilevel, envs, registry
 from sejax.agents import Agent, make_agent
 from sejax.agents.tabular import QLearningConfig
-from sejax.cli import build
-from sejax.errors import ConfigError
+from sejax.cli import config as configuration
 from sejax.evaluation import area_under_curve, make_evaluator
+from sejax.options import ConfigError
 from sejax.proxies import MAX_ABS_VALUE
 from sejax.proxies.base import episode_limit, is_real
 from sejax.proxies.configs import RewardConfig
@@ -360,7 +360,7 @@ def test_a_loaded_potential_pays_with_the_discount_of_its_agent(tmp_path):
     weights = env.init_weights(jax.random.key(9))
     discount = float(agent.discount(agent.hparams))
     assert discount == 0.7
-    sejax.save(tmp_path / "rn.safetensors", env, weights, build.to_plain(config), discount)
+    sejax.save(tmp_path / "rn.safetensors", env, weights, configuration.plain(config), discount)
     for params in (sejax.load(tmp_path / "rn.safetensors")[1],
                    sejax.load_set(tmp_path / "rn.safetensors")[0].params):  # fmt: skip
         _, state = env.reset(jax.random.key(0), params)

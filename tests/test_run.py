@@ -22,11 +22,12 @@ from support import is_drawn
 
 import sejax
 from sejax import run
-from sejax.cli import build, commands, run_directory, session
+from sejax.cli import commands, run_directory, session
+from sejax.cli import config as configuration
 from sejax.cli.progress import RunProgress
 from sejax.cli.run_directory import AGENT_COLUMNS, COLUMNS
 from sejax.cli.trackers import Reporter
-from sejax.errors import ConfigError
+from sejax.options import ConfigError
 
 # A room of 2 x 2 cells for tables: what takes time is importing and compiling.
 TINY = [
@@ -89,7 +90,7 @@ def test_a_run_writes_the_files_of_the_design(uninterrupted):
     stored = yaml.safe_load((uninterrupted / "config.yaml").read_text())
     assert stored["es"]["population_size"] == 2
     words = ["generations=6", f"run_dir={uninterrupted}"]
-    assert build.learn_config(stored) == sejax.config([*TINY, *words])
+    assert configuration.learn_config(stored) == sejax.config([*TINY, *words])
 
 
 def test_the_stored_proxy_is_the_one_of_the_best_generation(uninterrupted):
@@ -451,6 +452,6 @@ def test_a_job_of_a_sweep_has_a_folder_of_its_own(monkeypatch, mode, words, name
                                 overrides=types.SimpleNamespace(task=words))  # fmt: skip
     monkeypatch.setattr(HydraConfig, "initialized", lambda: True)
     monkeypatch.setattr(HydraConfig, "get", lambda: job)
-    assert commands.name_in_sweep(build.IN_RUN_DIR) == name
+    assert commands.name_in_sweep(configuration.LearnConfig.in_run_dir) == name
     job.overrides.task = [f"agent.x={'9' * 500}"]
-    assert len(commands.name_in_sweep(build.IN_RUN_DIR)) <= 120
+    assert len(commands.name_in_sweep(configuration.LearnConfig.in_run_dir)) <= 120

@@ -19,9 +19,9 @@ import yaml
 
 import sejax
 from sejax.cli.run_directory import AGENT_COLUMNS, COLUMNS, RunDirectory, columns_of, open_for
-from sejax.errors import ConfigError
 from sejax.ops import checksummed
 from sejax.ops.files import atomic_path
+from sejax.options import ConfigError
 
 CONFIG = {
     "seed": 7,

@@ -23,8 +23,8 @@ optuna = pytest.importorskip("optuna", reason="needs Optuna: pip install 'sejax[
 from optuna.trial import TrialState  # noqa: E402
 
 from sejax import search as command  # noqa: E402
-from sejax.cli import compose, search_config, search_results, study, trials  # noqa: E402
-from sejax.errors import ConfigError  # noqa: E402
+from sejax.cli import search_config, search_results, study, trials  # noqa: E402
+from sejax.options import ConfigError  # noqa: E402
 
 SPACE = "es.noise_std=interval(0.1, 0.9)"
 ONE = ("min_generations=1", "max_generations=1", "pruner=none")
@@ -295,9 +295,9 @@ def test_the_preset_file_makes_the_settings_of_the_command(tmp_path):
     search = search_config.read([SPACE, f"search_dir={tmp_path}", *fixed, "agent.batch_size=16,32"])
     search_results.write_best(["es.noise_std=0.25", "agent.batch_size=16"], search, "sejax.run")
     (line,) = (tmp_path / "best.txt").read_text().splitlines()
-    asked = compose.config(shlex.split(line)[3:])
+    asked = configuration.config(shlex.split(line)[3:])
     preset = search_results.preset_line(search, "sejax.run").partition(" sejax.run ")[2]
-    assert compose.config([preset, "devices=1"]) == asked
+    assert configuration.config([preset, "devices=1"]) == asked
     assert asked.es.noise_std == 0.25 and asked.preset == "paper"
 
 
@@ -365,7 +365,7 @@ def test_trials_are_runs_and_those_of_a_shape_share_one_program(tmp_path):
     from sejax.run import learn
 
     plain = [*GRID, *overrides, "generations=3", "checkpoint_every=1", f"run_dir={tmp_path}/run"]
-    learn(compose.config([*plain, "seed=1"]))
+    learn(configuration.config([*plain, "seed=1"]))
     np.testing.assert_allclose(rows_of(tmp_path / "trial" / "seed1"), rows_of(tmp_path / "run"))
     values = runner.verify(overrides, tmp_path / "again")
     assert sorted(x.name for x in (tmp_path / "again").iterdir()) == [
@@ -485,7 +485,7 @@ def test_a_killed_and_a_stopped_worker_cost_the_study_no_trial(tmp_path):
         for number in history:
             before = found.trials[number].intermediate_values
             assert before.items() <= again.intermediate_values.items()
-    made = compose.config([f"preset={path / 'preset.yaml'}"])
+    made = configuration.config([f"preset={path / 'preset.yaml'}"])
     assert made.name("agent") == "q_learning" and "The best:" in third.stdout
 
 

@@ -14,8 +14,9 @@ from optuna.distributions import (
 )
 
 import sejax
-from sejax.cli import compose, search_config, spaces
-from sejax.errors import ConfigError
+from sejax.cli import config as configuration
+from sejax.cli import search_config, spaces
+from sejax.options import ConfigError
 
 
 @pytest.mark.parametrize(
@@ -133,7 +134,7 @@ COMMANDS = {
 def test_every_preset_names_fields_with_bounds_that_are_accepted(name):
     for words in COMMANDS[name]:
         search = search_config.read([*words, f"space={name}"])
-        config = compose.evaluate_config if search.is_of_agent else compose.config
+        config = configuration.evaluate_config if search.is_of_agent else configuration.config
         search_config.require_fields(search, config(search.fixed))
         for dimension in search.space.values():
             drawn = dimension.distribution

@@ -15,7 +15,8 @@ import yaml
 import sejax
 from experiments import supervised_baseline
 from sejax import evaluate, registry, report, run, search
-from sejax.cli import build, commands, study
+from sejax.cli import commands, study
+from sejax.cli import config as configuration
 from sejax.cli import search_config as settings
 from sejax.cli.run_directory import columns_of
 from sejax.ops import checksummed
@@ -75,7 +76,7 @@ def search_command():
 
 def stored(*words, **changes):
     """A run's configuration as plain values, with some of somebody else's."""
-    return build.to_plain(sejax.config([*TASK, *words])) | changes
+    return configuration.plain(sejax.config([*TASK, *words])) | changes
 
 
 def write_run(path, config):
@@ -223,7 +224,7 @@ def write_proxy(config):
     """An SE of several steps with random weights that was learned with somebody else's parts."""
     task = sejax.envs.make("cartpole")
     env = registry.make("proxy", sejax.SyntheticConfig(hidden_size=2), task)
-    usual = {**build.to_plain(sejax.config()), "proxy": registry.describe("proxy", env.config)}
+    usual = {**configuration.plain(sejax.config()), "proxy": registry.describe("proxy", env.config)}
     weights = env.init_weights(jax.random.key(0))
     sejax.save("evil.safetensors", env, weights, config=usual | config)
 

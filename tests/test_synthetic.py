@@ -9,7 +9,7 @@ import pytest
 from support import numpy_forward
 
 from sejax import envs, registry
-from sejax.errors import ConfigError
+from sejax.options import ConfigError
 from sejax.proxies import MAX_ABS_VALUE
 from sejax.proxies.base import episode_limit, is_real
 from sejax.proxies.configs import SyntheticConfig

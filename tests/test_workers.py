@@ -15,10 +15,11 @@ from hypothesis import strategies as st
 
 import sejax
 from sejax.bilevel import make_bilevel
-from sejax.cli import build, cluster, session, workers
+from sejax.cli import cluster, session, workers
+from sejax.cli import config as configuration
 from sejax.cli.cluster import Pool
 from sejax.cli.workers import Batch, RemoteChunks, cut
-from sejax.errors import ConfigError, FailedError
+from sejax.options import ConfigError, FailedError
 
 FOREVER = 1e9
 
@@ -205,7 +206,7 @@ def require_equal_numbers(words, generations):
     config = sejax.config(words)
     program = make_bilevel(**config.parts() | {"devices": 1})
     batches = [Batch(capacity=5, width=1)] * program.mixture.size
-    arguments = build.to_plain(config), [5] * program.mixture.size, 0.0, workers.versions()
+    arguments = configuration.plain(config), [5] * program.mixture.size, 0.0, workers.versions()
     ray = Ray(fate=lambda *turn: (1.0, OSError("gone") if turn == (1, 2) else None))
     local = session.Chunks(program)
     remote = RemoteChunks(program, ray.pool(lambda: workers.Worker(*arguments)), batches)
@@ -271,7 +272,7 @@ def test_a_worker_with_other_versions_is_refused():
     config = sejax.config(TINY)
     expected = workers.versions() | {"jax": "0.1"}
     with pytest.raises(ConfigError, match=r"0\.1") as error:
-        workers.Worker(build.to_plain(config), [5], 0.0, expected).prepare()
+        workers.Worker(configuration.plain(config), [5], 0.0, expected).prepare()
     assert error.value.field == "machines"
 
 

@@ -23,9 +23,9 @@ from typing import Any
 import yaml
 
 import sejax
-from sejax.cli import build
+from sejax.cli import config as configuration
 from sejax.proxies import header, zoo
-from sejax.serialize import flatten
+from sejax.registry import flatten
 
 FREE_FIELDS = ("run_dir", "devices", "checkpoint_every")  # how to compute, not what
 WORLDS = {"the proxy": "proxy", "the real task": "real"}
@@ -100,7 +100,7 @@ def words_of(config: Mapping[str, Any]) -> list[str]:
 def differing(words: list[str], config: Mapping[str, Any]) -> list[str]:
     """The fields, as overrides, in which what these words compose is another run."""
     try:
-        composed = flatten(json.loads(json.dumps(build.to_plain(sejax.config(words)))))
+        composed = flatten(json.loads(json.dumps(configuration.plain(sejax.config(words)))))
     except sejax.ConfigError as error:  # without the word that a field belongs to
         return [str(error)]
     return [

@@ -17,7 +17,7 @@ import pandas as pd
 
 import sejax
 from experiments.common.experiment import Settings, count, each_of, setting
-from sejax import registry, serialize
+from sejax import registry
 from sejax.agents import NoExploration
 from sejax.cli.progress import Tally
 from sejax.ops.parallel import spread_over_devices
@@ -70,7 +70,7 @@ class Condition:
             "task": self.task.origin,
             "agent": registry.describe("agent", self.agent),
             "exploration": registry.describe("exploration", self.exploration),
-            "training": serialize.to_plain(self.training),
+            "training": registry.to_plain(self.training),
             "hparams": self.hparams,
             **self.settings,
         }

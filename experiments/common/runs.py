@@ -21,12 +21,12 @@ from experiments.common.agents import HPARAMS, Condition, groups_at_once, train_
 from experiments.common.experiment import Settings, count, each_of, setting
 from experiments.common.tables import iqm_columns, mean_columns
 from sejax import registry
-from sejax.cli import build, run_directory, session
-from sejax.cli.families import JOINT, key_of
+from sejax.cli import config as configuration
+from sejax.cli import run_directory, session
+from sejax.cli.config import JOINT, key_of
 from sejax.cli.progress import Tally
-from sejax.errors import ConfigError, require
 from sejax.ops.files import write_text
-from sejax.options import positive
+from sejax.options import ConfigError, positive, require
 
 UNLIMITED = 100_000  # generations of a run that its budget ends
 
@@ -128,7 +128,7 @@ def collect(configs: list[Any], path: Path, before: Any = None) -> None:
         sets[0].env,
         [proxy.params.weights for proxy in proxies],
         [proxy.record for proxy in proxies],
-        before.config if before else build.to_plain(configs[0]),
+        before.config if before else configuration.plain(configs[0]),
         sets[0].discount,
     )
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
-from sejax.errors import ConfigError, FailedError, told
+from sejax.options import ConfigError, FailedError, told
 
 if TYPE_CHECKING:
     from sejax.cli.workers import RayConfig

@@ -7,12 +7,22 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
-from sejax import registry, serialize
-from sejax.cli import build, compose, spaces
-from sejax.cli.words import ENDING, FIELD
-from sejax.errors import ConfigError, nearest, require
+from sejax import registry
+from sejax.cli import config as configuration
+from sejax.cli import spaces
+from sejax.cli.config import EvaluateConfig, LearnConfig
 from sejax.ops.files import as_file_name
-from sejax.options import Options, counts, one_of, option, positive
+from sejax.options import (
+    ConfigError,
+    Options,
+    as_text,
+    counts,
+    nearest,
+    one_of,
+    option,
+    positive,
+    require,
+)
 
 SAMPLERS = ("tpe", "random")
 PRUNERS = ("hyperband", "median", "none")
@@ -129,8 +139,8 @@ class Search:
         given = self.choice("agent", "")
         choices = [x for x in self.fixed if "." not in x.partition("=")[0]]
         if self.is_of_agent and not given:
-            return registry.name_of("agent", compose.evaluate_config(choices).agent)
-        return given or compose.config(choices).name("agent")
+            return registry.name_of("agent", configuration.evaluate_config(choices).agent)
+        return given or configuration.config(choices).name("agent")
 
     @functools.cached_property
     def study(self) -> str:
@@ -154,14 +164,14 @@ class Search:
     @property
     def joins(self) -> bool:
         """Whether the overrides only name a study that exists."""
-        given, default = serialize.to_plain(self.config), serialize.to_plain(SearchConfig())
+        given, default = registry.to_plain(self.config), registry.to_plain(SearchConfig())
         changed = {k for k, v in given.items() if v != default[k]} - OWN - {"study"}
         return self.config.study is not None and not (changed or self.fixed or self.space)
 
     def stored(self) -> dict[str, Any]:
         """What the workers of a study must have in common, as plain values."""
         return {
-            "search": _common(serialize.to_plain(self.config)),
+            "search": _common(registry.to_plain(self.config)),
             "fixed": list(self.fixed),
             "space": {name: x.text for name, x in self.space.items()},
             "folder": str(self.folder.resolve()),
@@ -210,9 +220,9 @@ def _checked(stored: Any) -> dict[str, Any]:
     overrides = [*fixed, *(f"{name}={text}" for name, text in space.items())]
     for override in overrides:
         name, _, text = str(override).partition("=")
-        is_known = isinstance(override, str) and FIELD.fullmatch(name)
+        is_known = isinstance(override, str) and configuration.NAME.fullmatch(name)
         writes = name.partition(".")[0] in (*TAKEN, "machines")
-        reads = name == "preset" and ENDING in text
+        reads = name == "preset" and configuration.ENDING in text
         require(
             is_known and not (writes or reads) and not registry.untyped([override]),
             "study",
@@ -221,7 +231,7 @@ def _checked(stored: Any) -> dict[str, Any]:
             override,
             "study=NAME, another one, or repeat its overrides if you trust it",
         )
-    default = _common(serialize.to_plain(SearchConfig()))
+    default = _common(registry.to_plain(SearchConfig()))
     return stored | {"search": default | {k: v for k, v in own.items() if k in default}}
 
 
@@ -257,12 +267,12 @@ def read(overrides: Sequence[str]) -> Search:
     own = {field.name for field in dataclasses.fields(SearchConfig)}
     values, fixed, space = {}, [], {}
     machines = {"name": "local"}
-    for override in compose.hydra_words(overrides):
-        name, equals, text = override.partition("=")
-        value = compose.parsed(text)
+    for name, given in configuration.read(overrides).items():
+        text = given if isinstance(given, str) else as_text(given)
+        override, value = f"{name}={text}", registry.parsed(text)
         is_text = name in TEXTS and value is not None and not isinstance(value, str)
         require(
-            equals and name not in TAKEN,
+            name not in TAKEN,
             name,
             "be left out",
             "the search sets it for each trial",
@@ -277,7 +287,7 @@ def read(overrides: Sequence[str]) -> Search:
             space[name] = spaces.parse(name, text)
         else:
             fixed.append(override)
-    config = serialize.from_plain(SearchConfig, values, "")
+    config = registry.from_plain(SearchConfig, values, "")
     where = registry.configure("machines", machines)
     registry.require_package("machines", where, "trials are run there")
     search = Search(config=config, fixed=tuple(fixed), space=space, machines=where)
@@ -327,8 +337,8 @@ def require_fields(search: Search, config: Any) -> dict[str, Any]:
         "none",
         "space=paper_se, or es.noise_std='tag(log, interval(0.01, 0.3))'",
     )
-    groups = build.EVALUATE_GROUPS if search.is_of_agent else build.LEARN_GROUPS
-    values = serialize.flatten(build.to_plain(config))
+    groups = EvaluateConfig.groups if search.is_of_agent else LearnConfig.groups
+    values = registry.flatten(configuration.plain(config))
     values |= {group: values.get(f"{group}.name") for group in groups}
     for name in search.space:
         if name not in values:
@@ -353,7 +363,7 @@ def help_text() -> str:
     fields = "\n".join(
         f"  {name}: {'null' if default is None else default}"
         + (f"  ({', '.join(values[name])})" if name in values else "")
-        for name, default in serialize.to_plain(SearchConfig()).items()
+        for name, default in registry.to_plain(SearchConfig()).items()
     )
     return f"""Search hyperparameters with Optuna; a trial is a run, its generations the budget.
 With proxy=RUN_DIR, a file or a shipped name: those of an agent that is trained on that proxy.

@@ -13,11 +13,12 @@ from rich.console import Console
 from rich.table import Table
 
 from sejax import registry
+from sejax.cli.config import file_text
 from sejax.cli.search_config import Search
 from sejax.cli.study import ENDED
 from sejax.cli.trials import Runner
-from sejax.cli.words import file_text, word
 from sejax.ops.files import write_text
+from sejax.options import as_text
 
 SHOWN = 10
 NEEDED = 10  # completed trials, before importances say anything
@@ -46,7 +47,7 @@ def preset_line(search: Search, command: str) -> str:
 
     Modules are typed beside it, as those that a file names are not imported.
     """
-    preset = f"preset={word(str(preset_file(search)))}"
+    preset = f"preset={as_text(str(preset_file(search)))}"
     typed = [override for override in search.fixed if registry.paths_in([override])]
     return shlex.join(["python", "-m", command, preset, *typed])
 

@@ -15,7 +15,8 @@ import numpy as np
 
 from sejax import __version__
 from sejax.bilevel import Bilevel, make_bilevel
-from sejax.cli import build, runtime
+from sejax.cli import runtime
+from sejax.cli.config import LearnConfig
 from sejax.cli.run_directory import RunDirectory
 from sejax.cli.trackers import (
     FinishedGeneration,
@@ -94,13 +95,13 @@ class Chunks:
         return self._compiled[length](state, *self._arguments)
 
 
-def make_chunks(config: build.LearnConfig) -> Chunks:
+def make_chunks(config: LearnConfig) -> Chunks:
     """The generations of a configuration, for all runs that differ from it in the seed."""
     return Chunks(make_bilevel(**config.parts()))
 
 
 def run(
-    config: build.LearnConfig,
+    config: LearnConfig,
     directory: RunDirectory,
     chunks: Chunks,
     report: Reporter | None = None,
@@ -212,7 +213,7 @@ class _Clock:
 class _Proxies:
     """The proxy files of a run."""
 
-    def __init__(self, config: build.LearnConfig, directory: RunDirectory, learner: Bilevel):
+    def __init__(self, config: LearnConfig, directory: RunDirectory, learner: Bilevel):
         self._folder, self._learner, self._seed = directory.path, learner, config.seed
         # What was learned does not depend on the tracker, nor on where it was computed.
         plain = directory.config.items()
@@ -262,9 +263,7 @@ def draw(directory: RunDirectory, learner: Bilevel) -> None:
         plots.learning_curve(directory.rows, learner.solved_score, path)
 
 
-def _tracker(
-    config: build.LearnConfig, directory: RunDirectory, report: Reporter
-) -> GuardedTracker:
+def _tracker(config: LearnConfig, directory: RunDirectory, report: Reporter) -> GuardedTracker:
     run = TrackedRun(
         folder=directory.path.resolve(),
         id=directory.id,

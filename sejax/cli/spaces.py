@@ -23,8 +23,8 @@ import yaml
 from optuna.distributions import CategoricalDistribution, FloatDistribution, IntDistribution
 from optuna.trial import Trial
 
-from sejax.cli import families
-from sejax.errors import ConfigError, is_number, nearest, require, shortened, told
+from sejax.cli import config as configuration
+from sejax.options import ConfigError, is_number, nearest, require, shortened, told
 
 FOLDER = Path(__file__).parent / "spaces"
 DIGITS = 6  # of a number: the override says exactly what was tried
@@ -209,7 +209,7 @@ def preset(name: str, agent: str, of_agent: bool) -> dict[str, Dimension]:
         f"{path} with other content",
         "space=paper_se",
     )
-    for each in families.members(agent):
+    for each in agent.split(configuration.JOINT):
         require(
             has_own or each in of_agents,
             "agent",
@@ -219,8 +219,8 @@ def preset(name: str, agent: str, of_agent: bool) -> dict[str, Dimension]:
             f"agent={next(iter(of_agents), 'ddqn')}",
         )
         own = of_agents.get(each, {})
-        if families.JOINT in agent:  # what a mixture shares has no place in an agent's ranges
-            prefix = f"agents.{families.key_of(each)}."
+        if configuration.JOINT in agent:  # what a mixture shares has no place in an agent's ranges
+            prefix = f"agents.{configuration.key_of(each)}."
             own = {
                 field.replace("agent.", prefix, 1): text
                 for field, text in own.items()

@@ -24,7 +24,7 @@ from optuna.trial import FrozenTrial, Trial, TrialState
 
 from sejax.cli.search_config import REDUCTION_FACTOR, SQLITE, Search
 from sejax.cli.trials import Progress, Runner, worth
-from sejax.errors import ConfigError, shortened, told
+from sejax.options import ConfigError, shortened, told
 
 STORED = "sejax"  # the study's attribute that holds what is searched
 RETRIES = 3  # of a trial whose worker was lost

@@ -15,12 +15,13 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from sejax import serialize
-from sejax.cli import build, compose
+from sejax import registry
+from sejax.cli import config as configuration
+from sejax.cli.config import EvaluateConfig, LearnConfig
 from sejax.cli.programs import Programs, kept, static_of, structure_of
 from sejax.cli.search_config import Search
-from sejax.errors import ConfigError, require
 from sejax.ops.files import write_text
+from sejax.options import ConfigError, require
 
 ROUNDS = "rounds.json"
 WORLDS = {"the proxy": "proxy", "the real task": "real"}  # and what columns call them
@@ -100,12 +101,12 @@ class Learning:
         self._search = search
         self._programs = Programs()
 
-    def config(self, overrides: Sequence[str]) -> build.LearnConfig:
+    def config(self, overrides: Sequence[str]) -> LearnConfig:
         """See `Runner`."""
         own = f"generations={self._search.config.max_generations}", "checkpoint_every=1"
-        return compose.config([*self._search.fixed, *overrides, *own])
+        return configuration.config([*self._search.fixed, *overrides, *own])
 
-    def run(self, config: build.LearnConfig, folder: Path, generations: int) -> Progress:
+    def run(self, config: LearnConfig, folder: Path, generations: int) -> Progress:
         """See `Runner`."""
         return self._run(config, range(self._search.config.seeds), folder, generations)
 
@@ -125,7 +126,11 @@ class Learning:
         return (-score, row["generations"]) if math.isfinite(score) else (math.inf, 0.0)
 
     def _run(
-        self, config: build.LearnConfig, seeds: Sequence[int], folder: Path, generations: int
+        self,
+        config: LearnConfig,
+        seeds: Sequence[int],
+        folder: Path,
+        generations: int,
     ) -> Progress:
         """Runs with seeds that are counted from the configuration's own."""
         from sejax.cli import session
@@ -174,17 +179,17 @@ class Tuning:
 
     command = "sejax.evaluate"
 
-    def __init__(self, search: Search, study_of: Callable[[build.EvaluateConfig], Any]):
+    def __init__(self, search: Search, study_of: Callable[[EvaluateConfig], Any]):
         from sejax.proxies import header
 
         self._search, self._study_of = search, study_of
-        self._default = compose.evaluate_config(search.fixed)
+        self._default = configuration.evaluate_config(search.fixed)
         header.find(self._default.proxy, "proxy")
         self._compiled: dict[str, Any] = {}
 
-    def config(self, overrides: Sequence[str]) -> build.EvaluateConfig:
+    def config(self, overrides: Sequence[str]) -> EvaluateConfig:
         """See `Runner`; also refused are agents that would not learn on the proxy."""
-        config = compose.evaluate_config([*self._search.fixed, *overrides])
+        config = configuration.evaluate_config([*self._search.fixed, *overrides])
         require(
             config.agents is None,
             "agent",
@@ -204,7 +209,7 @@ class Tuning:
         self._study_of(config)  # which checks what is asked of the proxy
         return config
 
-    def run(self, config: build.EvaluateConfig, folder: Path, generations: int) -> Progress:
+    def run(self, config: EvaluateConfig, folder: Path, generations: int) -> Progress:
         """See `Runner`."""
         settings = self._settings_of(config)
         rounds: list[dict[str, Any]] = _stored(folder / ROUNDS, settings, [])[:generations]
@@ -254,17 +259,15 @@ class Tuning:
         solved = float(self._study_of(self._default).task.solved_reward)
         return -min(score, solved), row[f"{where}_steps"]
 
-    def _settings_of(self, config: build.EvaluateConfig) -> dict[str, Any]:
+    def _settings_of(self, config: EvaluateConfig) -> dict[str, Any]:
         """What a trial's rounds are of, by field, as it reads back from JSON."""
-        fields = serialize.flatten(build.to_plain(dataclasses.replace(config, out_dir=None)))
+        fields = registry.flatten(configuration.plain(dataclasses.replace(config, out_dir=None)))
         read_back: dict[str, Any] = json.loads(
             json.dumps({**fields, "seeds": self._search.config.seeds})
         )
         return read_back
 
-    def _outcome(
-        self, config: build.EvaluateConfig, world: str, generation: int, num_agents: int
-    ) -> Any:
+    def _outcome(self, config: EvaluateConfig, world: str, generation: int, num_agents: int) -> Any:
         """The outcome of fresh agents in a world of `sejax.evaluate`, leaves `[agent]`, NumPy."""
         import jax
 
@@ -279,7 +282,7 @@ class Tuning:
                 world,
                 static_of(family.agent),
                 static_of(study.exploration),
-                serialize.to_plain(training),
+                registry.to_plain(training),
                 structure_of(agent.hparams),
                 num_agents,
             ]

@@ -10,11 +10,11 @@ from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
 
 from sejax import registry
-from sejax.errors import ConfigError, as_python, require, whole
 from sejax.gym.reward import RewardNetwork
 from sejax.gym.synthetic import SyntheticEnv, SyntheticWorld
 from sejax.gym.tasks import RealTask, rn_env, se_task
 from sejax.gym.vector import SyntheticVectorEnv
+from sejax.options import ConfigError, as_python, counts, require
 from sejax.proxies.header import Header, pretrained_names, read_single
 
 if TYPE_CHECKING:
@@ -156,7 +156,7 @@ def _spec(name: str, **kwargs: Any) -> EnvSpec:
 
 def _count(num_envs: Any) -> int:
     num_envs = as_python(num_envs)
-    whole(1, "num_envs", num_envs, "each is an episode at a time", 8)
+    counts("each is an episode at a time")("num_envs", num_envs, 8)
     return int(num_envs)
 
 

@@ -12,9 +12,9 @@ from gymnasium.utils import RecordConstructorArgs
 from gymnasium.wrappers import DtypeObservation, FlattenObservation
 
 from sejax import registry
-from sejax.errors import ConfigError, as_python, fraction, require
 from sejax.gym import networks
 from sejax.gym.tasks import GYMNASIUM_IDS, RealTask, num_categories, vector_size
+from sejax.options import ConfigError, as_python, fraction, require
 from sejax.proxies import MAX_ABS_VALUE
 from sejax.proxies.configs import RewardConfig
 from sejax.proxies.header import check_tensors, read_single
@@ -79,7 +79,7 @@ class RewardNetwork(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
         self.config: RewardConfig = registry.configure("proxy", header.config["proxy"])
         discount = as_python(discount)
         if discount is not None:
-            fraction("discount", discount, header.discount)
+            fraction()("discount", discount, header.discount)
         self.discount = float(header.discount if discount is None else discount)
         self.limit_is_terminal = limit_is_terminal
         require(

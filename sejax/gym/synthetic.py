@@ -8,9 +8,9 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces
 
-from sejax.errors import require
 from sejax.gym import networks
 from sejax.gym.tasks import RealTask, num_categories, vector_size
+from sejax.options import require
 from sejax.proxies import MAX_ABS_VALUE
 from sejax.proxies.configs import SyntheticConfig
 from sejax.proxies.header import check_tensors

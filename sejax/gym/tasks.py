@@ -9,9 +9,9 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.wrappers import TimeLimit
 
-from sejax import registry, serialize
-from sejax.errors import ConfigError, require, shortened, told
+from sejax import registry
 from sejax.gym.gridworld import MAPS, GridWorld
+from sejax.options import ConfigError, require, shortened, told
 from sejax.proxies.header import Header
 
 # The tasks that Gymnasium has too, with the same spaces, dynamics and initial states.
@@ -152,7 +152,7 @@ def same_env(config: Mapping[str, Any], **options: Any) -> gymnasium.Env[Any, An
     # Gymnasium takes more options, such as the path of a model: what a file says is read by the
     # fields that the task has here.
     task = registry.configure("env", config)
-    fields = serialize.to_plain(task)
+    fields = registry.to_plain(task)
     if fields.pop("backend", "mujoco") not in GYMNASIUM_BACKENDS:
         return None
     max_steps = task.spec.max_steps
@@ -220,7 +220,7 @@ def rn_env(header: Header, env_id: Any, render_mode: str | None) -> gymnasium.En
         "task",
         "be an id of Gymnasium for a reward network",
         "its dynamics are the real task's",
-        env_id,
+        shortened(env_id, 80),
         fix,
     )
     if env_id is not None:

@@ -9,8 +9,8 @@ from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from sejax.errors import one_of, require
 from sejax.gym.synthetic import SyntheticWorld
+from sejax.options import one_of, require
 
 PREFETCHED = 32  # starts that an environment draws at once, if its generator draws nothing else
 
@@ -40,7 +40,7 @@ class SyntheticVectorEnv(VectorEnv[Any, Any, np.ndarray]):
         self.num_envs = num_envs
         modes = [mode.value for mode in AutoresetMode]
         mode: Any = getattr(autoreset_mode, "value", autoreset_mode)
-        one_of("autoreset_mode", mode, modes)
+        one_of(modes)("autoreset_mode", mode, modes[0])
         self.autoreset_mode = AutoresetMode(mode)
         self.metadata = {"render_modes": [], "autoreset_mode": self.autoreset_mode}
         self.single_observation_space = world.observation_space

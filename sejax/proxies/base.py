@@ -18,7 +18,7 @@ from jaxtyping import Array
 from sejax.envs.base import Task
 from sejax.envs.environment import Environment, EnvParams
 from sejax.envs.spec import TaskSpec
-from sejax.errors import ConfigError, require
+from sejax.options import ConfigError, require
 from sejax.proxies import ProxyConfig
 
 

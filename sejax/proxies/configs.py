@@ -12,8 +12,7 @@ import numpy as np
 
 from sejax.envs.base import Task
 from sejax.envs.spec import TaskSpec
-from sejax.errors import require
-from sejax.options import ACTIVATIONS, MOST_LAYERS, counts, one_of, option, positive
+from sejax.options import ACTIVATIONS, MOST_LAYERS, counts, one_of, option, positive, require
 from sejax.proxies import MAX_ABS_VALUE, ProxyConfig
 
 if TYPE_CHECKING:

@@ -14,9 +14,9 @@ from typing import Any
 
 import numpy as np
 
-from sejax import registry, serialize
-from sejax.errors import LARGEST, ConfigError, require, shortened, unknown_name
+from sejax import registry
 from sejax.ops.checksummed import DamagedError, pack, unpack
+from sejax.options import LARGEST, ConfigError, require, shortened, unknown_name
 from sejax.proxies import hub
 
 FORMAT_VERSION = 2
@@ -203,18 +203,17 @@ def read(
         if size > hub.MAX_BYTES:
             raise DamagedError(f"it has {size:,} bytes, and the largest proxies have fewer")
         tensors, stored = unpack(path.read_bytes(), _KEY)
-        header = serialize.from_plain(Header, stored, "header")
+        header = registry.from_plain(Header, stored, "header")
     except (OSError, LookupError, ValueError, TypeError, ArithmeticError) as error:
         raise ConfigError(
             f"{option} must be a proxy's file as sejax writes it; got {shortened(path, 80)}, which "
-            f"is damaged or of another format ({shortened(error, 90)}). Write it anew: the same "
-            f"sejax.run goes on from its checkpoint.",
+            f"is damaged or of another format ({shortened(error, 60)}). The run writes it again.",
             option,
         ) from error
     require(
         not kinds or header.kind in kinds,
         option,
-        f"be a proxy of the kind {' or '.join(kinds)}",
+        f"be a proxy of the kind {shortened(' or '.join(map(str, kinds)), 40)}",
         "others are not read here",
         f"proxy={shortened(header.kind, 40)} in {shortened(path, 80)}",
         f"{option} to such a proxy",

@@ -12,7 +12,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from sejax.errors import ConfigError, require, shortened, told
+from sejax.options import ConfigError, require, shortened, told
 
 SCHEME = "hf://"
 FILE = "proxy.safetensors"
@@ -104,7 +104,7 @@ def require_repo(repo: Any) -> None:
         "repo",
         "be USER/REPO",
         "that is how the Hub names repositories",
-        repo,
+        shortened(repo, 80),
         "repo='USER/REPO'",
     )
 

@@ -13,8 +13,8 @@ from flax.traverse_util import flatten_dict, unflatten_dict
 
 from sejax import envs, registry
 from sejax.envs.base import Task
-from sejax.errors import ConfigError, one_of, require, shortened, told
 from sejax.ops.files import write_bytes
+from sejax.options import ConfigError, one_of, require, shortened, told
 from sejax.proxies import ProxyConfig
 from sejax.proxies.base import ProxyEnv, absent_task, require_present
 from sejax.proxies.header import (
@@ -68,7 +68,7 @@ class _Stored:
           >>> load_proxy("cliff_walking-rn").learned_with("agent").discount
           0.8
         """
-        one_of("group", group, registry.GROUPS)
+        one_of(registry.GROUPS)("group", str(group), None)
         return self._configured(group, self.config.get(group))
 
     def learned_agents(self) -> dict[str, Any]:
@@ -182,6 +182,23 @@ class ProxySet(_Stored):
         return self[(order if worst else order[::-1])[:count]]
 
 
+def stored_config(proxy: Proxy | ProxySet) -> dict[str, Any]:
+    """The configuration that a stored proxy was learned with, nested plain values.
+
+    Raises:
+      ConfigError: for an argument of another type.
+    """
+    require(
+        isinstance(proxy, _Stored),
+        "proxy",
+        "be a stored one",
+        "its file tells what it was learned with",
+        type(proxy).__name__,
+        "proxy=sejax.load_proxy(source)",
+    )
+    return proxy.config
+
+
 # --- writing --------------------------------------------------------------------------------------
 
 
@@ -235,12 +252,13 @@ def save_set(
       ConfigError: as `save`, or if there are not as many records as proxies.
       OSError: if it cannot be written; an older file stays as it was.
     """
+    are_lists = isinstance(weights, Sequence) and isinstance(records, Sequence)
     require(
-        len(weights) == len(records) > 0,
+        are_lists and len(weights) == len(records) > 0,
         "records",
         "be one for each proxy",
         "they say which is which",
-        f"{len(records)} for {len(weights)}",
+        f"{len(records)} for {len(weights)}" if are_lists else "others than lists",
         "records=[{}] * len(weights)",
     )
     each = [_checked_tensors(env, one) for one in weights]
@@ -296,10 +314,10 @@ def _write(
             proxies=[{name: _plain(x) for name, x in record.items()} for record in records],
         )
         data = header.with_tensors(tensors)
-    except (LookupError, ValueError, TypeError) as error:
+    except (LookupError, ValueError, TypeError, AttributeError) as error:
         raise ConfigError(
             f"config, discount and record must be plain values that sejax.load takes, because they "
-            f"are kept beside the weights; got {shortened(told(error), 80)}. Give numbers for "
+            f"are kept beside the weights; got {shortened(told(error), 60)}. Give numbers for "
             f"score, generation and seed, and sejax.config(...).plain() for config.",
             "config",
         ) from error
@@ -416,7 +434,7 @@ def _env_of(path: Path, header: Header, task: Any, proxy: Any, option: str) -> P
             name,
             f"be a sejax.{kind.__name__}",
             "a file's names are never imported",
-            repr(given),
+            shortened(repr(given), 80),
             fix,
         )
     if proxy is None:

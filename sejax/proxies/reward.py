@@ -14,8 +14,8 @@ from jaxtyping import Array, Float
 
 from sejax.envs.base import Task
 from sejax.envs.environment import EnvParams, EnvState
-from sejax.errors import require
 from sejax.ops.networks import MLP, uniform_fan_in
+from sejax.options import require
 from sejax.proxies import MAX_ABS_VALUE
 from sejax.proxies.base import ProxyEnv
 

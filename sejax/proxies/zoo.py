@@ -12,7 +12,7 @@ from typing import Any
 
 import yaml
 
-from sejax import registry, serialize
+from sejax import registry
 from sejax.proxies import header, hub
 from sejax.proxies.configs import SyntheticConfig
 
@@ -177,10 +177,10 @@ def describe(path: Path, name: str | None = None) -> PretrainedProxy:
         generation=record.get("generation"),
         seed=record.get("seed"),
         evaluations=tuple(
-            serialize.from_plain(Evaluation, each, "evaluation")
+            registry.from_plain(Evaluation, each, "evaluation")
             for each in record.get("evaluations", ())
         ),
-        learning=serialize.from_plain(Learning, learning, "learning") if learning else None,
+        learning=registry.from_plain(Learning, learning, "learning") if learning else None,
         size_kb=path.stat().st_size / 1000,
     )
 
