@@ -35,6 +35,7 @@ def main(overrides: Sequence[str]) -> None:
         current = search_config.require_fields(search, runner_of(search).config([]))
     found, search = study.open_study(search, current)
     runner = runner_of(search)
+    search_config.require_fields(search, runner.config([]))  # of a study that is joined
     runtime.configure_jax()
     _say(f"Study {search.study} in {search.folder}: {', '.join(search.space)}.")
     try:

@@ -9,7 +9,6 @@ import jax
 import pytest
 
 from sejax.cli import commands, runtime
-from sejax.cli import config as configuration
 from sejax.options import FailedError
 
 

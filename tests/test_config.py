@@ -320,14 +320,13 @@ def test_what_evaluate_cannot_use_is_refused(override, field):
 def test_hundreds_of_random_overrides_are_a_configuration_or_one_message():
     """No traceback, and nothing silent: what was composed has the values that were asked for."""
     rng = random.Random(0)
-    names = [*LearnConfig.groups, *"preset seed generations devices agents".split()]
-    fields = "batch_size noise_std hidden_size max_steps activation learning_rate done nope".split()
+    names = [*LearnConfig.groups, "preset", "seed", "generations", "devices", "agents"]
+    fields = ("batch_size", "noise_std", "hidden_size", "max_steps", "activation", "learning_rate")
     for group in ("agent", "es", "proxy", "training", "objective"):
-        names += [f"{group}.{field}" for field in fields]
-    texts = (
-        "0 1 -1 2.5 1e-3 nan inf null true [] [1] [ddqn] x ddqn ppo acrobot pendulum rn paper relu "
-        "threshold ' ☃ a:b ${x} {a:1} [ 0x10 1_000 9999999999999999999999 ~ ??? 64 0.5"
-    ).split()
+        names += [f"{group}.{field}" for field in (*fields, "done", "nope")]
+    texts = ["0", "1", "-1", "2.5", "1e-3", "64", "nan", "inf", "null", "true", "[]", "[1]", "["]
+    texts += ["[ddqn]", "x", "ddqn", "ppo", "acrobot", "rn", "relu", "paper", "threshold", "'", "☃"]
+    texts += ["a:b", "${x}", "{a:1}", "0x10", "1_000", "9" * 20, "~", "???"]
     composed = 0
     for _ in range(600):
         overrides = [f"{rng.choice(names)}={rng.choice(texts)}" for _ in range(rng.randint(1, 2))]

@@ -96,7 +96,7 @@ def test_evaluation_writes_a_row_for_each_agent_and_their_means(evaluated):
 
 
 def test_several_agents_are_in_one_table(room, tmp_path, capsys):
-    words = ["agent=[sarsa,q_learning]", "agents.sarsa.learning_rate=0.5", *ROOM[1:]]
+    words = ["agents=[sarsa,q_learning]", "agents.sarsa.learning_rate=0.5", *ROOM[1:]]
     mean = evaluate(evaluate_config(f"proxy={room}", f"out_dir={tmp_path}", words=words))
     table = pd.read_csv(tmp_path / "evaluation.csv")
     counts = table.groupby(["world", "agent"]).size().to_dict()
@@ -200,7 +200,7 @@ def test_each_of_several_agents_trains_as_long_as_it_must(tmp_path):
     words = ("agents=[ddqn,ppo]", "proxy.hidden_size=4", "agents.ddqn.warmup_episodes=2",
              "agents.ppo.rollout_steps=100", "training.max_steps=4000", *SOFT)  # fmt: skip
     path = save(tmp_path / "proxy.safetensors", *words)
-    composed = evaluate_config(f"proxy={path}", "agent=[ddqn,dueling_ddqn,ppo]",
+    composed = evaluate_config(f"proxy={path}", "agents=[ddqn,dueling_ddqn,ppo]",
                                "agents.ppo.rollout_steps=null", words=[])  # fmt: skip
     budgets = {
         key: training.max_steps
@@ -229,16 +229,16 @@ def test_each_of_several_agents_trains_as_long_as_it_must(tmp_path):
          "agent must be left out with agent_hparams=as_learned.*batch_size=4"),
         (["proxy=real", "env=cartpole", "training.max_steps=9"], r"training must.*Set real_train"),
         (["seed=-1"], r"seed must lie in \[0, 2\*\*31\)"),
-        (["num_agents=0"], "num_agents must be at least 1"),
+        (["num_agents=0"], "num_agents must be"),
         (["env=[1]"], "env must be a word"),
         (["agent=2"], "agent must be one of"),
-        (["agent=[q_learning,sarsa]", "agents.sarsa.weight=2"], "got agents.sarsa.weight"),
-        (["agent=[ddqn,ppo]", "agent_hparams=as_learned"],
+        (["agents=[q_learning,sarsa]", "agents.sarsa.weight=2"], "got agents.sarsa.weight"),
+        (["agents=[ddqn,ppo]", "agent_hparams=as_learned"],
          r"agents must be left out with agent_hparams=as_learned.*got ddqn\+ppo"),
     ],
 )  # fmt: skip
 def test_settings_that_cannot_be_or_have_no_effect_are_refused(given, message, stored):
-    words = [] if given[0].startswith("agent=[") else TINY
+    words = [] if given[0].startswith("agents=[") else TINY
     with pytest.raises(ConfigError, match=message):
         evaluate_config(f"proxy={stored}", *given, words=words)
 
@@ -384,7 +384,7 @@ def test_a_missing_proxy_or_task_says_what_to_set():
         ([], "proxy must be given"),
         (["proxy=nope"], "proxy must be one of "),
         (["proxy=nope/proxy.safetensors"], "does not exist"),
-        (["proxy=cartpole", "agent=[1,2]"], "agent must be one of"),
+        (["proxy=cartpole", "agents=[1,2]"], "agent must be one of"),
         (["proxy=cartpole", "+new=1"], "new must be a field of EvaluateConfig"),
         (["proxy=" + "d" * 10_000], "proxy must be "),
     ],
@@ -396,7 +396,7 @@ def test_the_command_ends_bad_input_with_one_message_and_status_2(words, said, m
     monkeypatch.setattr(sys, "path", list(sys.path))
     monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
     with pytest.raises(SystemExit) as ended:
-        commands.start("evaluate", command.main)
+        commands.start(command.main, command.help_text)
     printed = capsys.readouterr()
     assert ended.value.code == 2 and not printed.out
     assert said in printed.err and printed.err.count("\n") == 1 and len(printed.err) < 1500

@@ -77,8 +77,7 @@ def test_arrows_point_down():
         f"{name} imports {other}"
         for name, others in GRAPH.items()
         for other in sorted(others)
-        if part_of(other) != part_of(name)
-        and height[part_of(other)] >= height[part_of(name)]
+        if part_of(other) != part_of(name) and height[part_of(other)] >= height[part_of(name)]
     ]
     assert not wrong, "\n".join(wrong)
 

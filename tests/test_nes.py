@@ -270,6 +270,7 @@ def test_the_mean_step_on_a_linear_score_points_along_its_gradient(score_transfo
 
 # --- contract of every strategy ------------------------------------------------------------------
 
+
 def evosax_strategy(name, **fields):
     config = EvosaxConfig(
         name=name, population_size=16, num_incumbent_evals=2, noise_std=0.1, **fields

@@ -242,7 +242,7 @@ def test_a_functions_parameters_are_its_options(module):
     made = registry.make("objective", config, task)
     assert isinstance(made, sejax.Objective) and made is registry.make("objective", config, task)
     assert "objective.scale must be a number" in refused("objective", name, scale="x")
-    assert "objective.scal must be a field of scaled" in refused("objective", name, scal=1)
+    assert "objective.scal must be a field" in refused("objective", name, scal=1)
 
 
 def test_a_partial_function_is_a_plugin_too(module):

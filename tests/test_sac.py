@@ -295,7 +295,10 @@ def test_one_configuration_serves_both_kinds_of_actions():
     assert set(SACConfig.actions) == {"discrete", "continuous"}
     discrete = SimpleNamespace(name="task", obs_dim=OBS_DIM, num_actions=ACTION_DIM)
     continuous = SimpleNamespace(
-        name="task", obs_dim=OBS_DIM, num_actions=None, action_dim=ACTION_DIM,
+        name="task",
+        obs_dim=OBS_DIM,
+        num_actions=None,
+        action_dim=ACTION_DIM,
         max_action=MAX_ACTION,
     )
     config = SACConfig()

@@ -23,6 +23,7 @@ optuna = pytest.importorskip("optuna", reason="needs Optuna: pip install 'sejax[
 from optuna.trial import TrialState  # noqa: E402
 
 from sejax import search as command  # noqa: E402
+from sejax.cli import config as configuration  # noqa: E402
 from sejax.cli import search_config, search_results, study, trials  # noqa: E402
 from sejax.options import ConfigError  # noqa: E402
 

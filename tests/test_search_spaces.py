@@ -110,7 +110,7 @@ def test_what_is_fixed_or_has_a_range_of_its_own_is_left_out_of_the_preset(tmp_p
     overrides = ["space=paper_se", "es.step_size=1", "es.noise_std=0.1,0.2"]
     search = search_config.read([*overrides, f"preset={tmp_path}/p.yaml"])
     assert not {"es.step_size", "proxy.num_layers"} & set(search.space)
-    assert search.space["es.noise_std"].text == "0.1,0.2"
+    assert search.space["es.noise_std"].text == "choice(0.1,0.2)"
     assert "agent.batch_size" in search.space  # of the agent that the task chooses
 
 

@@ -63,15 +63,15 @@ def refused(monkeypatch, capsys):
 
 
 def run_command():
-    commands.start("run", run.main)
+    commands.start(run.main, run.help_text)
 
 
 def evaluate_command():
-    commands.start("evaluate", evaluate.main)
+    commands.start(evaluate.main, evaluate.help_text)
 
 
 def search_command():
-    commands.start_with_words(search.main, "")
+    commands.start(search.main, search.help_text)
 
 
 def stored(*words, **changes):

@@ -298,3 +298,20 @@ def test_settings_that_no_worker_can_have_are_refused(words, field, monkeypatch)
     with pytest.raises(ConfigError) as error:
         sejax.config(["machines=ray", *words])
     assert error.value.field == field
+
+
+def test_a_run_by_workers_has_the_files_of_one_process(tmp_path):
+    from sejax.cli.run_directory import open_for
+
+    found = []
+    for name in ("local", "remote"):
+        config = sejax.config([*TINY, "generations=2", f"run_dir={tmp_path / name}"])
+        program = make_bilevel(**config.parts() | {"devices": 1})
+        arguments = configuration.plain(config), [5], 0.0, workers.versions()
+        pool = Ray().pool(lambda arguments=arguments: workers.Worker(*arguments))
+        remote = RemoteChunks(program, pool, [Batch(capacity=5, width=1)])
+        chunks = session.Chunks(program) if name == "local" else remote
+        with open_for(config) as directory:
+            session.run(config, directory, chunks)
+            found.append([row | {"wall_s": ""} for row in directory.rows])
+    assert found[0] == found[1]

@@ -267,7 +267,11 @@ def read(overrides: Sequence[str]) -> Search:
     own = {field.name for field in dataclasses.fields(SearchConfig)}
     values, fixed, space = {}, [], {}
     machines = {"name": "local"}
-    for name, given in configuration.read(overrides).items():
+    choices = [  # a comma makes a sweep elsewhere
+        f"{name}=choice({text})" if len(registry.split(text)) > 1 else f"{name}{equals}{text}"
+        for name, equals, text in (override.partition("=") for override in overrides)
+    ]
+    for name, given in configuration.read(choices).items():
         text = given if isinstance(given, str) else as_text(given)
         override, value = f"{name}={text}", registry.parsed(text)
         is_text = name in TEXTS and value is not None and not isinstance(value, str)

@@ -25,6 +25,7 @@ from optuna.trial import Trial
 
 from sejax.cli import config as configuration
 from sejax.options import ConfigError, is_number, nearest, require, shortened, told
+from sejax.registry import split
 
 FOLDER = Path(__file__).parent / "spaces"
 DIGITS = 6  # of a number: the override says exactly what was tried
@@ -94,7 +95,7 @@ class Dimension:
 
 def is_range(text: str) -> bool:
     """Whether the value of an override is searched."""
-    return _CALL.fullmatch(text) is not None or len(_split(text)) > 1
+    return _CALL.fullmatch(text) is not None or len(split(text)) > 1
 
 
 def parse(name: str, text: str) -> Dimension:
@@ -109,7 +110,7 @@ def parse(name: str, text: str) -> Dimension:
     """
     call, tags = text.strip(), set()
     if (tagged := _CALL.fullmatch(call)) and tagged[1] == "tag":
-        *given, call = _split(tagged[2])
+        *given, call = split(tagged[2])
         tags = set(given)
     try:
         if not tags <= {"log", "inverse"} or tags == {"inverse"}:
@@ -133,41 +134,26 @@ def _distribution(text: str, tags: set[str]) -> Any:
     log, is_inverse = "log" in tags, "inverse" in tags
     call = _CALL.fullmatch(text)
     if call is None or call[1] == "choice":
-        choices = _split(text if call is None else call[2])
+        choices = split(text if call is None else call[2])
         if tags or (call is None and len(choices) < 2) or "" in choices:
             raise ValueError("a choice has values, and no tags")
         return CategoricalDistribution(choices)
     kind, inner = call[1], _CALL.fullmatch(call[2])
     if kind == "int" and inner and inner[1] == "interval":
-        first, last = map(int, _split(inner[2]))
+        first, last = map(int, split(inner[2]))
         return IntDistribution(first, last, log=log)
     if kind == "range":
-        start, stop, *rest = map(int, _split(call[2]))
+        start, stop, *rest = map(int, split(call[2]))
         step = rest[0] if rest else 1
         return IntDistribution(start, stop - 1 - (stop - 1 - start) % step, log=log, step=step)
     if kind != "interval":
         raise ValueError(f"{kind} takes another range")
-    low, high = map(float, _split(call[2]))
+    low, high = map(float, split(call[2]))
     if is_inverse:
         low, high = round(1 - high, 12), round(1 - low, 12)
     if not float("-inf") < low <= high < float("inf"):
         raise ValueError("bounds are finite and grow")
     return FloatDistribution(low, high, log=log)
-
-
-def _split(text: str) -> list[str]:
-    """The parts between commas that are outside of brackets and quotes."""
-    parts, depth, quote = [""], 0, ""
-    for letter in text:
-        if quote or letter in "'\"":
-            quote = "" if letter == quote else quote or letter
-        elif letter in "([{)]}":
-            depth += 1 if letter in "([{" else -1
-        if letter == "," and not depth and not quote:
-            parts.append("")
-        else:
-            parts[-1] += letter
-    return [part.strip() for part in parts]
 
 
 def names() -> list[str]:

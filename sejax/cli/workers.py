@@ -170,12 +170,12 @@ class RemoteChunks:
     the last bit, if the workers' CPUs are of this one's kind.
 
     Attributes:
-      program: the functions of Algorithm 1.
+      learner: the functions of Algorithm 1.
       cpu_s: CPU seconds of the workers in trainings.
     """
 
     def __init__(self, learner: "Bilevel", pool: Pool, batches: Sequence[Batch]):
-        self.program, self.cpu_s = learner, 0.0
+        self.learner, self.cpu_s = learner, 0.0
         self._pool, self._batches = pool, batches
         self._places = _places(learner)
         self._compiled: Any = None
@@ -184,7 +184,7 @@ class RemoteChunks:
         """The state before the first generation."""
         import jax
 
-        return jax.jit(self.program.init)(key)
+        return jax.jit(self.learner.init)(key)
 
     def is_ready(self, length: int) -> bool:
         """Whether this process's part is compiled, which it is for chunks of any length."""
@@ -202,17 +202,17 @@ class RemoteChunks:
         from sejax.ops.parallel import compiler_options
 
         def generation(state: Any, outcome: "Outcome") -> tuple[Any, ...]:
-            asked = self.program.ask(state)
-            return self.program.tell(state, asked, outcome), _arguments(asked)
+            asked = self.learner.ask(state)
+            return self.learner.tell(state, asked, outcome), _arguments(asked)
 
         def evaluate(key: Any) -> "Outcome":
-            return self.program.evaluate(self.program.ask(self.program.init(key)))
+            return self.learner.evaluate(self.learner.ask(self.learner.init(key)))
 
         key = jax.random.key(0)
         shapes = jax.eval_shape(evaluate, key)
         self._no_outcome = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
         jitted = jax.jit(generation, compiler_options=compiler_options())
-        state = jax.eval_shape(self.program.init, key)
+        state = jax.eval_shape(self.learner.init, key)
         self._compiled = jitted.lower(state, self._no_outcome).compile()
 
     def advance(self, state: Any, length: int) -> tuple[Any, Any]:
