@@ -284,7 +284,7 @@ def test_other_families_in_the_same_directory_are_refused(two_families):
 def test_the_command_names_all_families_for_the_evaluation(two_families, capsys):
     run.learn(sejax.config([*OWN, *FAMILIES, "generations=5", f"run_dir={two_families}"]))
     said = capsys.readouterr().out
-    assert f"sejax.evaluate proxy={two_families}" in said and "agent=[q_learning,sarsa]" in said
+    assert f"sejax.evaluate proxy={two_families}" in said and "agents=[q_learning,sarsa]" in said
 
 
 # --- damage --------------------------------------------------------------------------------------
