@@ -284,7 +284,7 @@ def test_other_families_in_the_same_directory_are_refused(two_families):
 def test_the_command_names_all_families_for_the_evaluation(two_families, capsys):
     run.learn(sejax.config([*OWN, *FAMILIES, "generations=5", f"run_dir={two_families}"]))
     said = capsys.readouterr().out
-    assert f"sejax.evaluate proxy={two_families} agent=[q_learning,sarsa] num_agents=20" in said
+    assert f"sejax.evaluate proxy={two_families}" in said and "agents=[q_learning,sarsa]" in said
 
 
 # --- damage --------------------------------------------------------------------------------------
@@ -377,6 +377,19 @@ def test_ctrl_c_saves_and_exits_130(tmp_path):
     saved = next(line for line in ended.stdout.splitlines() if "are saved in" in line)
     assert int(saved.split()[1]) >= 2 and len(rows(tmp_path)) >= 2
     assert (tmp_path / "proxy.safetensors").exists()
+
+
+def test_an_interrupt_waits_until_files_are_written():
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    written = []
+    try:
+        with pytest.raises(KeyboardInterrupt), session.interrupts_held():
+            signal.raise_signal(signal.SIGINT)
+            written.append("all")
+        assert written == ["all"]
+        assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def test_bad_input_ends_a_process_with_one_message_and_status_2(tmp_path):

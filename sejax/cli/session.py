@@ -3,6 +3,8 @@
 import contextlib
 import copy
 import platform
+import signal
+import threading
 import time
 from collections.abc import Callable, Iterator
 from importlib.metadata import version
@@ -145,12 +147,13 @@ def run(
                 report.status("first generation")
             state, info = chunks.advance(state, length)
             _wait(state)
-            saved, info = jax.device_get((state, info))
-            rows = directory.save(saved, info, clock.wall_s(), clock.cpu_s())
-            proxies.save(saved)
-            for generation in _finished(rows, info):
-                report.on_generation(generation)
-                tracker.on_generation(generation)
+            with interrupts_held():
+                saved, info = jax.device_get((state, info))
+                rows = directory.save(saved, info, clock.wall_s(), clock.cpu_s())
+                proxies.save(saved)
+                for generation in _finished(rows, info):
+                    report.on_generation(generation)
+                    tracker.on_generation(generation)
             if time.monotonic() - drawn > DRAW_EVERY_S:
                 draw(directory, chunks.learner)
                 drawn = time.monotonic()
@@ -169,6 +172,27 @@ def run(
         versions=_versions(),
     )
     return ended
+
+
+@contextlib.contextmanager
+def interrupts_held() -> Iterator[None]:
+    """Ctrl-C is heard at the end of the block.
+
+    Within, files are being written, and jax's caches call back from weak references, where Python
+    prints an exception and forgets it: the run would go on.
+    """
+    is_main = threading.current_thread() is threading.main_thread()
+    if not is_main or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
+        yield
+        return
+    heard: list[int] = []
+    signal.signal(signal.SIGINT, lambda number, frame: heard.append(number))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+    if heard:
+        raise KeyboardInterrupt
 
 
 class _Clock:
