@@ -35,7 +35,7 @@ test-trackers: PACKAGES := --editable '.[tensorboard,trackio,wandb]'
 test-trackers: TESTS := trackers
 
 # A Ray cluster of two nodes on this machine, whose processes are killed and stopped: half an hour.
-test-ray: PACKAGES := --constraint constraints.txt --editable '.[ray]'
+test-ray: PACKAGES := --constraint constraints.txt --editable '.[ray,search]'
 test-ray: TESTS := ray
 test-ray: OPTIONS := -m slow
 

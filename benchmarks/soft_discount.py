@@ -53,7 +53,7 @@ def returns_on(task: str, num_agents: int, seed: int) -> dict[str, list[float]]:
     keys = jax.random.split(jax.random.key(seed), num_agents)
 
     def test(env: Any) -> list[float]:
-        evaluate = sejax.make_evaluator(agent, env, proxy.task, proxy.learned_with("training"))
+        evaluate = sejax.make_evaluator(agent, env, proxy.task, sejax.training_of(proxy))
         one_by_one = jax.jit(
             lambda keys: jax.lax.map(lambda key: evaluate(key, proxy.params), keys)
         )

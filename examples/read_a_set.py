@@ -54,13 +54,13 @@ def main() -> None:
     def train_and_test(key: jax.Array, weights: object) -> sejax.Outcome:
         return evaluate(key, proxies.env.params(weights, proxies.discount))
 
-    number = np.repeat(np.arange(proxies.size), args.agents)  # of each agent's proxy
+    number = np.repeat(np.arange(len(proxies)), args.agents)  # of each agent's proxy
     keys = jax.random.split(jax.random.key(1), number.size)
     weights = jax.tree.map(lambda x: x[number], proxies.weights)
     num_parallel = agent.spec.cpu_num_parallel
     program = sejax.spread_over_devices(train_and_test, cpu_num_parallel=num_parallel)
     outcome = jax.jit(program)(keys, weights)
-    returns = np.asarray(outcome.test_return).reshape(proxies.size, args.agents)
+    returns = np.asarray(outcome.test_return).reshape(len(proxies), args.agents)
     for record, mine in zip(proxies.records, returns, strict=True):
         print(f"seed {record['seed']}, learned with {record['score']:.2f}: {args.agents} fresh "
               f"agents return {mine.mean():.2f}, deviation {mine.std():.2f}")  # fmt: skip

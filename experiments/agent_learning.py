@@ -21,7 +21,7 @@ from experiments.common.agents import Condition, train_groups
 from experiments.common.curves import CURVES, WINDOW
 from experiments.common.experiment import Experiment, Settings, count, each_of, setting
 from experiments.common.statistics import bootstrap_interval
-from sejax import registry, serialize
+from sejax import registry
 from sejax.training import TrainingConfig
 
 QUICK_STEPS = 2000
@@ -80,8 +80,8 @@ class PresetStudy(Study):
         return self._preset().agent
 
     def changes(self) -> dict[str, Any]:
-        papers = serialize.to_plain(super().configuration())
-        ours = serialize.to_plain(self.configuration())
+        papers = registry.to_plain(super().configuration())
+        ours = registry.to_plain(self.configuration())
         return {name: value for name, value in ours.items() if value != papers[name]}
 
     def training(self, quick: bool, test_episodes: int) -> TrainingConfig:

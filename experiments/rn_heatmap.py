@@ -21,7 +21,7 @@ from experiments.common import reward_networks as rn
 from experiments.common.experiment import Experiment
 from experiments.common.reward_networks import RnSettings
 from experiments.common.tables import publish
-from sejax import errors
+from sejax import options
 from sejax.envs.gridworld import CLIFF_WALKING as MAP
 
 CELLS = np.array([list(line) for line in MAP])  # [row, column]
@@ -45,7 +45,9 @@ class RnHeatmap(RnSettings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        errors.one_of("env", self.env, ("cliff_walking",))  # the figure is its map
+        options.one_of(("cliff_walking",))(
+            "env", self.env, "cliff_walking"
+        )  # the figure is its map
 
 
 def compute(settings: RnHeatmap) -> pd.DataFrame:
@@ -66,7 +68,7 @@ def rewards_of_moves(rns: Any) -> np.ndarray:
     grid = task.env
 
     def reward(weights: Any, index: Any, action: Any) -> Any:
-        params = rns.params.replace(weights=weights)
+        params = env.params(weights, rns.discount)
         _, state = env.reset_env(None, params)
         state = state.replace(world=state.world.replace(index=index), obs=index)
         _, _, reward, _, _ = env.step_env(None, state, action, params)

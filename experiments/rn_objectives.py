@@ -22,7 +22,7 @@ from experiments.common import reward_networks, rn_curves
 from experiments.common.experiment import Experiment, each_of, setting
 from experiments.common.rn_curves import CurveSettings
 from experiments.common.tables import publish
-from sejax.errors import require
+from sejax.options import require
 
 PICKS = {"best": "highest", "worst": "lowest"}  # scores
 QUICK_LEARNED = 4

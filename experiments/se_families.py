@@ -22,7 +22,7 @@ from experiments.common.experiment import Experiment, setting
 from experiments.common.runs import MixtureRuns, kinds_in
 from experiments.common.shards import stack, unstack
 from sejax import envs
-from sejax.errors import require
+from sejax.options import require
 
 SETS = (
     "ddqn",

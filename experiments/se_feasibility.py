@@ -19,9 +19,8 @@ from matplotlib.ticker import MaxNLocator
 from experiments.common import figures, runs, tables
 from experiments.common.experiment import Experiment, count, setting
 from experiments.common.runs import RunSettings
-from sejax.cli.build import AGENT_HPARAMS
-from sejax.errors import require
-from sejax.options import one_of
+from sejax.cli.config import AGENT_HPARAMS
+from sejax.options import one_of, require
 
 NUM_RUNS = {"cartpole": 10}
 

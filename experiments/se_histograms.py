@@ -110,7 +110,7 @@ def compute(settings: SeHistograms) -> pd.DataFrame:
 
 def load(settings: SeHistograms) -> Any:
     """The SE."""
-    return sejax.load_set(settings.proxy, option="proxy", kind="se").first(1)
+    return sejax.load_set(settings.proxy, option="proxy", kind="se")[:1]
 
 
 @functools.cache

@@ -20,7 +20,7 @@ from experiments.common import agents as groups
 from experiments.common import figures, tables
 from experiments.common.agents import SeAgents, return_columns
 from experiments.common.experiment import Experiment, setting
-from sejax.errors import ConfigError
+from sejax.options import ConfigError
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,7 +52,7 @@ def load(settings: SeModels) -> Any:
             "ses must be given, because agents are trained on its SEs; got none. "
             "Set ses=results/se_feasibility/cartpole/ses.safetensors."
         )
-    return sejax.load_set(settings.ses, option="ses", kind="se").first(settings.num_ses)
+    return sejax.load_set(settings.ses, option="ses", kind="se")[: settings.num_ses]
 
 
 def summarise(agents: pd.DataFrame, solved_reward: float) -> pd.DataFrame:

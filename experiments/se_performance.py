@@ -31,8 +31,7 @@ from experiments.common import figures, tables
 from experiments.common.agents import Condition, SeAgents, return_columns, tuned_agent
 from experiments.common.experiment import Experiment, count, setting
 from sejax import envs
-from sejax.errors import require
-from sejax.options import one_of
+from sejax.options import one_of, require
 from sejax.training import SOLVED_BY, TrainingConfig
 
 NUM_BEST = 5
@@ -99,7 +98,7 @@ def compute(settings: SePerformance) -> pd.DataFrame:
     """Trains what is missing; a row for each agent."""
     sets = load_sets(settings)
     for name, ses in sets.items():
-        print(f"{name}: {ses.size} SEs, {ses.solved().size} of which reached the threshold")
+        print(f"{name}: {len(ses)} SEs, {len(solved_ones(ses))} of which reached the threshold")
     task = envs.make(task_name(settings, sets))
     parts = []
     for kind in settings.agents:
@@ -114,6 +113,11 @@ def compute(settings: SePerformance) -> pd.DataFrame:
     return pd.concat(parts, ignore_index=True)
 
 
+def solved_ones(ses: Any) -> Any:
+    """The SEs whose score, a mean return, reached the task's threshold."""
+    return ses[ses.scores >= ses.task.solved_reward]
+
+
 def load_sets(settings: SePerformance) -> dict[str, Any]:
     """The sets of SEs that are compared, by how they were learned; those with a file."""
     files = {name: x for name, x in settings.values("varied", "fixed").items() if x is not None}
@@ -126,8 +130,8 @@ def load_sets(settings: SePerformance) -> dict[str, Any]:
         rule, got = f"be SEs learned with {name} hyperparameters", f"{ses.path} with {learned_with}"
         fix = f"{learned_with}={ses.path}"
         require(learned_with == name, name, rule, "it is what is compared", got, fix)
-        solved = ses.solved()
-        sets[name] = (solved if solved.size else ses).first(settings.num_ses)
+        solved = solved_ones(ses)
+        sets[name] = (solved if len(solved) else ses)[: settings.num_ses]
     return sets
 
 
@@ -142,7 +146,7 @@ def task_name(settings: SePerformance, sets: dict[str, Any]) -> str:
 
 def on_real(settings: SePerformance, task: Any, sets: dict[str, Any], kind: str) -> Condition:
     """The real task for a number of groups of agents; training ends by the solved rule."""
-    as_ses = max((ses.size for ses in sets.values()), default=settings.num_ses)
+    as_ses = max((len(ses) for ses in sets.values()), default=settings.num_ses)
     # docs/reference.md 7.1: discrete TD3 trains 500 episodes on Acrobot, all others 1000.
     most = 500 if task.name == "acrobot" and kind == "td3_discrete" else 1000
     training = TrainingConfig(

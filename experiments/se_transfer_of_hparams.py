@@ -23,7 +23,7 @@ from experiments.common.agents import Condition, Group, Measure
 from experiments.common.experiment import Experiment, Settings, count, each_of, setting
 from experiments.common.statistics import NUM_RESAMPLES
 from experiments.common.tables import as_texts, publish
-from sejax.errors import require
+from sejax.options import require
 from sejax.training import TrainingConfig
 
 BUDGETS = {"same": "as many steps", "long": "until the stop rule"}
@@ -104,7 +104,7 @@ def compute(settings: SeTransferOfHparams) -> pd.DataFrame:
     key, at_once = jax.random.key(settings.seed), agents.groups_at_once(settings.devices)
     keys = [jax.random.key_data(jax.random.fold_in(key, i)) for i in range(settings.num_configs)]
     places = {
-        "se": (ses.env, ses.one(0), ses.fingerprint(0), {"proxy": ses.config["proxy"]}),
+        "se": (ses.env, ses[0].params, ses[0].fingerprint, {"proxy": ses.config["proxy"]}),
         "real": (task.env, task.params, "", {}),
     }
     tables = []

@@ -34,7 +34,7 @@ from experiments.common.agents import HPARAMS, SE_AGENTS, SOFT_SE, Condition, re
 from experiments.common.experiment import Experiment
 from experiments.common.shards import stack, unstack
 from experiments.common.supervised_models import SupervisedBaseline
-from sejax.errors import require
+from sejax.options import require
 
 BEST = 2  # models in the paper's second figure
 LABELS = {
@@ -68,7 +68,7 @@ def compute(settings: SupervisedBaseline) -> pd.DataFrame:
 
 def load(settings: SupervisedBaseline) -> Any:
     """The SE, if agents can be trained on it, and the tests of its NES run recorded."""
-    ses = sejax.load_set(settings.proxy, option="proxy", kind="se").first(1)
+    ses = sejax.load_set(settings.proxy, option="proxy", kind="se")[:1]
 
     def require_se(holds: bool, rule: str, reason: str, got: str) -> None:
         require(holds, "proxy", f"be an SE {rule}", reason, got, f"proxy={SOFT_SE}")

@@ -18,7 +18,7 @@ _EXPORTS = {
     "AUC": "sejax.objectives",
     "AUCSum": "sejax.objectives",
     "Agent": "sejax.agents.base",
-    "ConfigError": "sejax.errors",
+    "ConfigError": "sejax.options",
     "CountBasedConfig": "sejax.agents.exploration",
     "DDQNConfig": "sejax.agents.dqn",
     "DQNConfig": "sejax.agents.dqn",
@@ -36,11 +36,11 @@ _EXPORTS = {
     "Outcome": "sejax.objectives",
     "PPOConfig": "sejax.agents.ppo",
     "PretrainedProxy": "sejax.proxies.zoo",
-    "Proxy": "sejax.proxies.files",
+    "Proxy": "sejax.proxies.io",
     "ProxyConfig": "sejax.proxies",
     "ProxyEnv": "sejax.proxies.base",
     "ProxyParams": "sejax.proxies.base",
-    "ProxySet": "sejax.proxies.files",
+    "ProxySet": "sejax.proxies.io",
     "QLearningConfig": "sejax.agents.tabular",
     "RewardConfig": "sejax.proxies.configs",
     "RewardThreshold": "sejax.objectives",
@@ -52,22 +52,23 @@ _EXPORTS = {
     "Task": "sejax.envs.base",
     "TrainResult": "sejax.training",
     "TrainingConfig": "sejax.training",
-    "config": "sejax.cli.compose",
+    "config": "sejax.cli.config",
     "configure_xla": "sejax.cli.runtime",
     "evaluate_agents": "sejax.evaluation",
-    "load": "sejax.proxies.files",
-    "load_proxy": "sejax.proxies.files",
-    "load_set": "sejax.proxies.files",
+    "load": "sejax.proxies.io",
+    "load_proxy": "sejax.proxies.io",
+    "load_set": "sejax.proxies.io",
     "make_agent": "sejax.agents",
     "make_evaluator": "sejax.evaluation",
     "make_learner": "sejax.bilevel",
     "make_trainer": "sejax.training",
     "pretrained": "sejax.proxies.zoo",
-    "push": "sejax.proxies.sharing",
-    "register_gymnax": "sejax.proxies.files",
-    "save": "sejax.proxies.files",
-    "save_set": "sejax.proxies.files",
+    "push": "sejax.proxies.zoo",
+    "register_gymnax": "sejax.proxies.io",
+    "save": "sejax.proxies.io",
+    "save_set": "sejax.proxies.io",
     "spread_over_devices": "sejax.ops.parallel",
+    "training_of": "sejax.training",
 }
 _MODULES = ("agents", "envs", "es", "gym", "options", "proxies")
 
@@ -83,20 +84,20 @@ if TYPE_CHECKING:  # what a type checker and an editor see
     from sejax.agents.tabular import QLearningConfig, SARSAConfig
     from sejax.agents.td3 import DiscreteTD3Config, TD3Config
     from sejax.bilevel import LearnResult, make_learner
-    from sejax.cli.compose import config
+    from sejax.cli.config import config
     from sejax.cli.runtime import configure_xla
     from sejax.envs.base import Task
-    from sejax.errors import ConfigError
     from sejax.es.base import Evaluations, Strategy
     from sejax.es.evosax import EvosaxConfig
     from sejax.es.nes import NESConfig
     from sejax.evaluation import evaluate_agents, make_evaluator
     from sejax.objectives import AUC, AUCSum, MaxReward, Objective, Outcome, RewardThreshold
     from sejax.ops.parallel import spread_over_devices
+    from sejax.options import ConfigError
     from sejax.proxies import ProxyConfig
     from sejax.proxies.base import ProxyEnv, ProxyParams
     from sejax.proxies.configs import RewardConfig, SyntheticConfig
-    from sejax.proxies.files import (
+    from sejax.proxies.io import (
         Proxy,
         ProxySet,
         load,
@@ -106,9 +107,8 @@ if TYPE_CHECKING:  # what a type checker and an editor see
         save,
         save_set,
     )
-    from sejax.proxies.sharing import push
-    from sejax.proxies.zoo import PretrainedProxy, pretrained
-    from sejax.training import TrainingConfig, TrainResult, make_trainer
+    from sejax.proxies.zoo import PretrainedProxy, pretrained, push
+    from sejax.training import TrainingConfig, TrainResult, make_trainer, training_of
 
 __all__ = [
     "AUC",
@@ -170,6 +170,7 @@ __all__ = [
     "save",
     "save_set",
     "spread_over_devices",
+    "training_of",
 ]
 
 

@@ -21,13 +21,13 @@ from sejax import registry
 from sejax.agents.base import Agent
 from sejax.agents.mixture import Mixture
 from sejax.envs.base import Task
-from sejax.errors import require, whole
 from sejax.es.base import Strategy
 from sejax.es.nes import NESConfig
 from sejax.evaluation import make_population_evaluator, tested_throughout
 from sejax.objectives import MaxReward, Objective, Outcome
 from sejax.ops import flat
 from sejax.ops.parallel import copy_to_devices
+from sejax.options import counts, require
 from sejax.proxies.base import ProxyEnv
 from sejax.proxies.configs import SyntheticConfig
 from sejax.scores import GenerationInfo, Scores, Scoring, generation_info
@@ -169,7 +169,7 @@ def make_learner(
         return make_learner(**config.parts(), generations=config.generations)
     if "task" not in parts or "agent" not in parts:
         raise TypeError("make_learner needs a configuration, or a task and an agent.")
-    whole(1, "generations", generations, "a run has at least one", 50)
+    counts("a run has at least one", most=1_000_000)("generations", generations, 50)
     bilevel = make_bilevel(**parts)
 
     def learn(key: Array) -> LearnResult:

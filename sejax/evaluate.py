@@ -3,33 +3,51 @@
 import dataclasses
 import json
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import hydra
-from omegaconf import DictConfig
-
 from sejax import registry
-from sejax.cli import build, commands, compose, runtime
-from sejax.cli.build import EvaluateConfig
-from sejax.cli.families import AgentFamily, families_of, named
-from sejax.errors import ConfigError, require
-from sejax.proxies import hub
-from sejax.training import TrainingConfig, require_reachable
+from sejax.cli import commands, runtime
+from sejax.cli import config as configuration
+from sejax.cli.config import AgentFamily, EvaluateConfig, families_of, named
+from sejax.options import ConfigError, require
+from sejax.proxies import header, hub
+from sejax.training import TrainingConfig, require_reachable, training_of
+
+ABOUT = """Train fresh agents on a stored proxy, and on the real task beside them; test all there.
+
+  python -m sejax.evaluate proxy=RUN_DIR num_agents=20
+  python -m sejax.evaluate proxy=cartpole agents=[ddqn,ppo] agents.ppo.epochs=10
+
+Writes evaluation.csv, .json and .png into out_dir.
+"""
 
 
-@hydra.main(config_path="conf", config_name="evaluate", version_base="1.3")
-@commands.guarded
-def main(cfg: DictConfig) -> float:
-    """Evaluates as configured and returns the mean test return (for Hydra's sweepers)."""
-    config = compose.evaluate_config_of(cfg)
-    own = commands.name_in_sweep(known=("out_dir",))
-    if own:  # or all jobs of a sweep would have one folder
-        folder = f"runs/evaluate-{own}" if config.out_dir is None else f"{config.out_dir}/{own}"
-        config = dataclasses.replace(config, out_dir=folder)
+def main(overrides: Sequence[str]) -> None:
+    """Evaluates each configuration that the overrides describe.
+
+    Raises:
+      ConfigError: for overrides that cannot be, or a proxy that cannot be loaded.
+      OSError: if a file cannot be written.
+    """
+    configs = []
+    for of_run in configuration.expand(overrides):
+        config = configuration.evaluate_config(of_run)
+        own = configuration.name_in_sweep(overrides, of_run, ("out_dir",))
+        if own:  # or all runs of a sweep would have one folder
+            folder = f"{config.out_dir}/{own}" if config.out_dir else f"runs/evaluate-{own}"
+            config = dataclasses.replace(config, out_dir=folder)
+        configs.append(config)
     runtime.configure_jax()
-    return evaluate(config)
+    for config in configs:
+        evaluate(config)
+
+
+def help_text(overrides: Sequence[str]) -> str:
+    """What `--help` prints."""
+    return f"{ABOUT}\n{configuration.help_text(EvaluateConfig, overrides)}"
 
 
 def evaluate(config: EvaluateConfig) -> float:
@@ -136,7 +154,6 @@ def _real_study(config: EvaluateConfig) -> Study:
 def proxy_study(config: EvaluateConfig) -> Study:
     """Agents on a proxy, and on its real task beside them."""
     from sejax import agents
-    from sejax.proxies import files
 
     proxy = _load(config)
     task = proxy.task
@@ -158,11 +175,11 @@ def proxy_study(config: EvaluateConfig) -> Study:
         with named(family.field):
             agents.require_fit(family.agent, exploration, task, task.name)
             group, training = _training_on(proxy, config, family.agent)
-            build.require_real_returns(group, training)
+            configuration.require_real_returns(group, training)
             if not family.agent.is_solved_for:
                 require_reachable(group, training, proxy.env.max_steps)
             if proxy.env.config.reaches_step_limit:
-                build.require_learning(
+                configuration.require_learning(
                     group, training, family.agent, proxy.env.max_steps, task.max_steps
                 )
         trainings[family.key] = training
@@ -180,7 +197,7 @@ def proxy_study(config: EvaluateConfig) -> Study:
         real_training = dict.fromkeys(trainings, _real_training(config, proxy))
         worlds["the real task"] = (task.env, task.params, real_training)
     beside = proxy.path.parent
-    if beside == files.PRETRAINED_DIR:
+    if beside == header.PRETRAINED_DIR:
         beside = Path("runs", f"evaluate-{proxy.path.stem}")
     elif hub.is_address(config.proxy):
         beside = Path("runs", f"evaluate-{_as_file_name(config.proxy.removeprefix(hub.SCHEME))}")
@@ -196,10 +213,10 @@ def proxy_study(config: EvaluateConfig) -> Study:
 def _load(config: EvaluateConfig) -> Any:
     """The proxy; modules are imported if the command line names them, never because a file does."""
     from sejax import envs
-    from sejax.proxies import files
+    from sejax.proxies.io import load_proxy
 
-    path = files.find(config.proxy, "proxy", also=("real",))
-    stored = files.read_config(path, "proxy")
+    path = header.find(config.proxy, "proxy", also=("real",))
+    stored = header.read_config(path, "proxy")
     task = proxy = None
     if config.env is not None and not registry.is_registered("env", config.env):
         fields = stored["env"] if stored["env"].get("name") == config.env else {}
@@ -207,7 +224,7 @@ def _load(config: EvaluateConfig) -> Any:
     if config.proxy_kind is not None:
         fields = {**stored["proxy"], "name": config.proxy_kind}
         proxy = registry.configure("proxy", fields)
-    return files.load_proxy(path, task, proxy, "proxy")
+    return load_proxy(path, task, proxy, "proxy")
 
 
 def _training_on(proxy: Any, config: EvaluateConfig, agent: Any) -> tuple[str, Any]:
@@ -226,7 +243,7 @@ def _training_on(proxy: Any, config: EvaluateConfig, agent: Any) -> tuple[str, A
         "training.max_steps=2000 training.max_episodes=2000",
     )
     test_episodes = config.real_training.test_episodes
-    training = dataclasses.replace(proxy.training_for(agent), test_episodes=test_episodes)
+    training = dataclasses.replace(training_of(proxy, agent), test_episodes=test_episodes)
     return "real_training", training
 
 
@@ -235,7 +252,7 @@ def _real_training(config: EvaluateConfig, proxy: Any) -> TrainingConfig:
     as_learned = config.agent_hparams == "as_learned" and "training" in proxy.config
     if not (as_learned and proxy.env.is_real):
         return config.real_training
-    is_terminal = proxy.learned_with("training").time_limit_is_terminal
+    is_terminal = training_of(proxy).time_limit_is_terminal
     usual = TrainingConfig().time_limit_is_terminal
     require(
         config.real_training.time_limit_is_terminal in (usual, is_terminal),
@@ -323,4 +340,4 @@ def _as_file_name(name: str) -> str:
 
 
 if __name__ == "__main__":
-    commands.start("evaluate", main)
+    commands.start(main, help_text)

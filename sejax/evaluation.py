@@ -18,7 +18,6 @@ from sejax.agents.base import Agent
 from sejax.agents.mixture import Mixture
 from sejax.envs.base import Task
 from sejax.envs.wrappers import repeat_actions
-from sejax.errors import require
 from sejax.objectives import Outcome
 from sejax.ops.keys import step_keys
 from sejax.ops.loops import while_any_active
@@ -27,6 +26,7 @@ from sejax.ops.parallel import (
     spread_groups_over_devices,
     spread_over_devices,
 )
+from sejax.options import require
 from sejax.proxies.base import ProxyEnv, is_real
 from sejax.training import TrainingConfig, TrainResult, make_trainer
 

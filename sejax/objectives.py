@@ -8,8 +8,7 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
-from sejax.errors import require
-from sejax.options import Options, counts, not_negative, option
+from sejax.options import Options, counts, not_negative, option, require
 
 
 @struct.dataclass

@@ -1,32 +1,105 @@
-"""Options: the fields of a dataclass that say for themselves what they may be.
+"""Options: the fields of a configuration, their checks, and the errors that bad input raises.
 
-A configuration is a frozen dataclass that knows how to make what it configures. Each of its fields
-is written once: name, type, default, and what must hold.
+A configuration is a frozen dataclass that can make what it configures. Each of its fields is
+written once: name, type, default, and the rule that a value must obey. The comment above or beside
+a field is its help text, which `--help` shows.
+
+Every message has one form: the field, what must hold, why, what came, and how to fix it.
 
 Example:
   >>> @dataclasses.dataclass(frozen=True, kw_only=True)
   ... class Config(Options):
   ...     group: ClassVar[str] = "agent"
+  ...     # Transitions of an update.
   ...     batch_size: int = option(128, counts())
   >>> Config(batch_size=0)
   Traceback (most recent call last):
-  sejax.errors.ConfigError: agent.batch_size must be at least 1, because there is nothing to \
-learn from or with otherwise; got 0. Set agent.batch_size=128.
+  sejax.options.ConfigError: agent.batch_size must be a whole number from 1 to 2147483647, because \
+there is nothing to learn from or with otherwise; got 0. Set agent.batch_size=128.
 """
 
+import ast
+import contextlib
 import dataclasses
-import math
-from collections.abc import Callable, Collection
+import difflib
+import inspect
+import io
+import numbers
+import textwrap
+import tokenize
+from collections.abc import Callable, Collection, Iterable
 from typing import Any, ClassVar
-
-from sejax import errors
 
 ACTIVATIONS = ("tanh", "fast_tanh", "relu", "leaky_relu", "prelu")  # of `sejax.ops.networks`
 MOVES = "the agent would not move"  # otherwise: why learning rates are above 0
 MOST_MEMBERS = 100_000  # of a population, each with the weights of a proxy
 MOST_LAYERS = 100  # layers and blocks of a network are traced one by one
+LARGEST = 2**31 - 1  # steps, episodes and sizes are counted in 32 bits
+MOST, LEAST = 1e30, 1e-30  # of numbers that programs compute with in 32 bits
 
 Rule = Callable[[str, Any, Any], None]  # (name, value, default) -> None, or raises ConfigError
+
+
+# --- errors --------------------------------------------------------------------------------------
+
+
+class ConfigError(ValueError):
+    """Input that cannot work. Commands print its message and exit with status 2.
+
+    Attributes:
+      field: the field or group at fault, such as `agent.batch_size`; empty where it is none.
+    """
+
+    def __init__(self, message: str, field: str = ""):
+        super().__init__(message)
+        self.field = field
+
+
+class FailedError(RuntimeError):
+    """Computing that cannot go on. Commands print its message and exit with status 1."""
+
+
+def require(holds: Any, field: str, rule: str, reason: str, got: object, fix: str) -> None:
+    """Raises `ConfigError` in the project's one form of message unless `holds`."""
+    if not holds:
+        raise ConfigError(
+            f"{field} must {rule}, because {reason}; got {shortened(got)}. Set {fix}.", field
+        )
+
+
+def unknown_name(field: str, got: object, known: Iterable[str]) -> ConfigError:
+    """Error for an unknown choice; lists known ones, nearest first, and names the override."""
+    ranked = nearest(got, known)
+    return ConfigError(
+        f"{field} must be one of {listed(ranked)}; got {shortened(got)!r}. "
+        f"Did you mean {field}={ranked[0]}?",
+        field,
+    )
+
+
+def nearest(got: object, known: Iterable[str]) -> list[str]:
+    """The known names, the most similar first."""
+    start = str(got)[:200]  # comparing takes time that grows with the square of the length
+    return sorted(known, key=lambda name: -difflib.SequenceMatcher(None, start, name).ratio())
+
+
+def listed(names: Collection[str], most: int = 120) -> str:
+    """Names with commas between, as many as fit into `most` characters."""
+    return textwrap.shorten(", ".join(names), most, placeholder=" and more") if names else "none"
+
+
+def shortened(value: object, length: int = 80) -> str:
+    """A value as text that leaves room for the rest of a message."""
+    text = str(value)
+    return text if len(text) <= length else f"{text[:length]}... ({len(text)} characters)"
+
+
+def told(error: BaseException) -> str:
+    """Kind and message of an error of other code, on one line."""
+    return f"{type(error).__name__}: {shortened(' '.join(str(error).split()), 120)}"
+
+
+# --- fields --------------------------------------------------------------------------------------
 
 
 def option(
@@ -56,31 +129,24 @@ class Options:
 
 
 def check(config: Any, group: str) -> None:
-    """Checks all fields of a dataclass that have a rule; makes numbers of NumPy or jax Python's.
+    """Checks all fields of a dataclass that have a rule.
+
+    Numbers of NumPy and jax become Python's, and whole numbers floats where the default is one, so
+    that equal configurations are the same program.
 
     Raises:
       ConfigError: for the first one that does not hold.
     """
     for field in dataclasses.fields(config):
         given = getattr(config, field.name)
-        value = errors.as_python(given)
+        value = as_python(given)
+        if type(field.default) is float and type(value) is int and abs(value) < LARGEST:
+            value = float(value)
         if value is not given:
             object.__setattr__(config, field.name, value)
-        name = f"{group}.{field.name}" if group else field.name
         rule = marks(type(config), field.name).get("rule")
         if rule is not None and not (value is None and field.default is None):
-            rule(name, value, field.default)
-        errors.require(
-            not isinstance(value, float)
-            or value == 0
-            or not math.isfinite(value)  # a matter of the rule
-            or errors.SMALLEST_FLOAT <= abs(value) <= errors.LARGEST_FLOAT,
-            name,
-            f"be 0 or lie between {errors.SMALLEST_FLOAT:g} and {errors.LARGEST_FLOAT:g} in size",
-            "numbers are 32-bit floats",
-            value,
-            f"{name}={field.default}",
-        )
+            rule(f"{group}.{field.name}" if group else field.name, value, field.default)
 
 
 def traced_options(config: Any) -> dict[str, Any]:
@@ -93,7 +159,7 @@ def traced_options(config: Any) -> dict[str, Any]:
 
 
 def marks(cls: type, name: str) -> dict[str, Any]:
-    """What `option` says of a field: its own, else that of the class which a subclass overrides.
+    """The metadata of a field: its own, else that of the class which a subclass overrides.
 
     So that `warmup_episodes: int = 5` in a subclass changes the default alone.
     """
@@ -104,71 +170,161 @@ def marks(cls: type, name: str) -> dict[str, Any]:
     return found
 
 
+def help_texts(cls: type) -> dict[str, str]:
+    """The comments above and beside a class's fields, by their names; as `tyro` reads them."""
+    texts: dict[str, str] = {}
+    for base in reversed(cls.__mro__):
+        with contextlib.suppress(OSError, TypeError, SyntaxError):  # without its source
+            texts |= _comments(textwrap.dedent(inspect.getsource(base)))
+    return texts
+
+
+def _comments(source: str) -> dict[str, str]:
+    comments = {
+        token.start[0]: (token.string.lstrip("# "), not token.line[: token.start[1]].strip())
+        for token in tokenize.generate_tokens(io.StringIO(source).readline)
+        if token.type == tokenize.COMMENT
+    }
+    found: dict[str, str] = {}
+    (definition,) = ast.parse(source).body
+    for node in getattr(definition, "body", ()):
+        if not (isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name)):
+            continue
+        first = node.lineno
+        while comments.get(first - 1, ("", False))[1]:
+            first -= 1
+        last = node.end_lineno or node.lineno
+        lines = [comments[line][0] for line in range(first, last + 1) if line in comments]
+        found |= {node.target.id: " ".join(lines)} if lines else {}
+    return found
+
+
+def is_number(value: Any) -> bool:
+    """Whether it is an int or a float, which a bool is not here; see `as_python`."""
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def as_python(value: Any) -> Any:
+    """A number or bool of NumPy or jax as Python's; all else, traced ones too, as it is."""
+    is_one = getattr(value, "shape", None) == () and hasattr(value, "item")
+    if not is_one or isinstance(value, type):
+        return value
+    try:
+        number = value.item()
+    except (TypeError, NotImplementedError):  # a traced one has no value yet, a key has none
+        return value
+    return (
+        float(number)
+        if isinstance(number, numbers.Real) and not isinstance(number, bool | int | float)
+        else number
+    )
+
+
+# --- rules ---------------------------------------------------------------------------------------
+
+
+def rule(holds: Callable[[Any], bool], must: str, reason: str) -> Rule:
+    """The rule that a predicate holds; see `require`."""
+
+    def apply(name: str, value: Any, default: Any) -> None:
+        require(holds(value), name, must, reason, value, f"{name}={as_text(default)}")
+
+    return apply
+
+
+def as_text(value: Any) -> str:
+    """A value as the command line takes it.
+
+    Example:
+      >>> as_text([None, True, 0.5, "ddqn", "a b, c"])
+      "[null,true,0.5,ddqn,'a b, c']"
+    """
+    if isinstance(value, list | tuple):
+        return f"[{','.join(map(as_text, value))}]"
+    if value is None or isinstance(value, bool):
+        return {None: "null", True: "true", False: "false"}[value]
+    text = str(value)
+    return f"'{text}'" if any(character in text for character in ",[]'\" ") else text
+
+
 def counts(
     reason: str = "there is nothing to learn from or with otherwise",
     least: int = 1,
-    most: int = errors.LARGEST,
+    most: int = LARGEST,
 ) -> Rule:
     """A whole number from `least` to `most`."""
-    return lambda name, value, default: errors.whole(
-        least, name, value, reason, "null" if default is None else default, most
+    return rule(
+        lambda x: is_number(x) and least <= x <= most and x == x // 1,
+        f"be a whole number from {least} to {most}",
+        reason,
     )
 
 
 def not_negative(reason: str = "it is a size") -> Rule:
     """A finite number from 0 on."""
-
-    def rule(name: str, value: Any, default: Any) -> None:
-        errors.at_least(0, name, value, reason, default)
-        errors.require(value < float("inf"), name, "be finite", reason, value, f"{name}={default}")
-
-    return rule
+    return rule(lambda x: is_number(x) and 0 <= x <= MOST, f"lie between 0 and {MOST:g}", reason)
 
 
 def finite(reason: str) -> Rule:
     """A finite number, of either sign."""
-    return lambda name, value, default: errors.require(
-        errors.is_number(value) and abs(value) < float("inf"),
-        name,
-        "be finite",
-        reason,
-        value,
-        f"{name}={default}",
+    return rule(
+        lambda x: is_number(x) and abs(x) <= MOST, f"lie between {-MOST:g} and {MOST:g}", reason
     )
 
 
-def positive(reason: str, at_most: float = float("inf")) -> Rule:
-    """A number above 0."""
-    return lambda name, value, default: errors.positive(name, value, reason, default, at_most)
+def positive(reason: str, at_most: float = MOST) -> Rule:
+    """A finite number above 0 with which programs can compute in 32 bits."""
+    return rule(
+        lambda x: is_number(x) and LEAST <= x <= at_most,
+        f"lie between {LEAST:g} and {at_most:g}",
+        reason,
+    )
 
 
 def fraction() -> Rule:
     """A number in [0, 1]."""
-    return lambda name, value, default: errors.fraction(name, value, default)
+    return rule(lambda x: is_number(x) and 0 <= x <= 1, "lie in [0, 1]", "it is a fraction")
 
 
 def shrinks() -> Rule:
     """A factor in (0, 1]."""
-    return lambda name, value, default: errors.require(
-        errors.is_number(value) and 0 < value <= 1,
-        name,
-        "lie in (0, 1]",
-        "it shrinks each generation",
-        value,
-        f"{name}={default:g}",
+    return rule(
+        lambda x: is_number(x) and LEAST <= x <= 1, "lie in (0, 1]", "it shrinks each generation"
     )
 
 
-def or_none(rule: Rule) -> Rule:
+def or_none(inner: Rule) -> Rule:
     """None, or what another rule says; for an option that may be left open, but has a default."""
 
     def either(name: str, value: Any, default: Any) -> None:
         if value is not None:
-            rule(name, value, default)
+            inner(name, value, default)
 
     return either
 
 
 def one_of(known: Collection[str]) -> Rule:
     """One of these names."""
-    return lambda name, value, default: errors.one_of(name, value, known)
+
+    def apply(name: str, value: Any, default: Any) -> None:
+        if value not in known:
+            raise unknown_name(name, value, known)
+
+    return apply
+
+
+def each_of(known: Collection[str]) -> Rule:
+    """A list of these names."""
+
+    def apply(name: str, values: Iterable[Any], default: Any) -> None:
+        for value in values:
+            one_of(known)(name, value, default)
+
+    return apply
+
+
+def seed() -> Rule:
+    """A seed that `jax.random.key` takes as it is."""
+    return rule(
+        lambda x: is_number(x) and 0 <= x < 2**31, "lie in [0, 2**31)", "it is a 32-bit number"
+    )

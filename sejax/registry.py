@@ -20,10 +20,13 @@ group         entry points            `make(...)` gives
 A name is one that comes with sejax, one that an installed package offers as an entry point, or
 `module:attribute`, which imports the module. Within `only_typed`, as in every command, that is done
 only for a `module:attribute` that the user has typed: one that a file holds is refused.
+
+A configuration is written as plain values (`describe`) and read back (`configure`). A value is
+taken as its field's type means it (`1` for a float, a list for a tuple, the text of an override for
+a number) and never guessed: nothing in it is resolved, imported or executed.
 """
 
 import contextlib
-import copy
 import dataclasses
 import functools
 import importlib
@@ -33,13 +36,31 @@ import inspect
 import re
 import types
 import typing
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextvars import ContextVar
 from dataclasses import dataclass
-from typing import Any, Optional
+from typing import Any
 
-from sejax import serialize
-from sejax.errors import ConfigError, nearest, require, shortened, told, unknown_name
+from sejax.options import (
+    ConfigError,
+    Options,
+    as_text,
+    listed,
+    nearest,
+    require,
+    shortened,
+    told,
+    unknown_name,
+)
+
+# Fields that had another name in files of older versions.
+RENAMED = {
+    "init_episodes": "warmup_episodes",
+    "target_update_rate": "tau",
+    "lanes": "num_parallel",
+    "first_test_steps": "first_eval_steps",
+}
+_MISSING = dataclasses.MISSING
 
 
 @dataclass(frozen=True)
@@ -48,6 +69,7 @@ class Group:
 
     Attributes:
       entry_points: group of entry points where packages offer more of it.
+      makes: `module:attribute` of the class of what `make` returns.
       arguments: what `make` is given, for messages and for functions in a dataclass's place.
       built_in: name to `module:attribute`.
       families: beginning of a name to `module:attribute` of a dataclass with a field `name`.
@@ -55,6 +77,7 @@ class Group:
     """
 
     entry_points: str
+    makes: str
     arguments: tuple[str, ...]
     built_in: dict[str, str]
     families: dict[str, str] = dataclasses.field(default_factory=dict)
@@ -65,6 +88,7 @@ _EVOSAX = ("cma_es", "cr_fm_nes", "open_es", "pgpe", "sep_cma_es", "snes", "xnes
 GROUPS = {
     "env": Group(
         "sejax.envs",
+        "sejax.envs.base:Task",
         (),
         {
             "cartpole": "sejax.envs.classic:CartPole",
@@ -87,6 +111,7 @@ GROUPS = {
     ),
     "agent": Group(
         "sejax.agents",
+        "sejax.agents.base:Agent",
         ("task",),
         {
             "ddqn": "sejax.agents.dqn:DDQNConfig",
@@ -104,6 +129,7 @@ GROUPS = {
     ),
     "exploration": Group(
         "sejax.explorations",
+        "sejax.agents.base:Agent",
         ("agent", "task"),
         {
             "none": "sejax.agents.base:NoExploration",
@@ -114,6 +140,7 @@ GROUPS = {
     ),
     "proxy": Group(
         "sejax.proxies",
+        "sejax.proxies.base:ProxyEnv",
         ("task",),
         {
             "se": "sejax.proxies.configs:SyntheticConfig",
@@ -123,6 +150,7 @@ GROUPS = {
     ),
     "objective": Group(
         "sejax.objectives",
+        "sejax.objectives:Objective",
         ("task",),
         {
             "max_reward": "sejax.objectives:MaxReward",
@@ -133,6 +161,7 @@ GROUPS = {
     ),
     "es": Group(
         "sejax.strategies",
+        "sejax.es.base:Strategy",
         ("num_dims",),
         {
             "nes": "sejax.es.nes:NESConfig",
@@ -141,6 +170,7 @@ GROUPS = {
     ),
     "tracker": Group(
         "sejax.trackers",
+        "sejax.cli.trackers:Tracker",
         ("run",),
         {
             "none": "sejax.cli.trackers:NoTracker",
@@ -151,6 +181,7 @@ GROUPS = {
     ),
     "machines": Group(
         "sejax.cli",
+        "contextlib:AbstractContextManager",
         ("config", "folder", "say"),
         {
             "local": "sejax.cli.workers:LocalConfig",
@@ -159,18 +190,6 @@ GROUPS = {
     ),
 }
 
-
-# What plugins of a group make.
-KINDS = {
-    "env": "sejax.envs.base:Task",
-    "agent": "sejax.agents.base:Agent",
-    "exploration": "sejax.agents.base:Agent",
-    "proxy": "sejax.proxies.base:ProxyEnv",
-    "objective": "sejax.objectives:Objective",
-    "es": "sejax.es.base:Strategy",
-    "tracker": "sejax.cli.trackers:Tracker",
-    "machines": "contextlib:AbstractContextManager",
-}
 
 # What may be imported by its name; None outside of commands, where Python code says it itself.
 _TYPED: ContextVar[frozenset[str] | None] = ContextVar("typed", default=None)
@@ -233,19 +252,11 @@ def find(group: str, name: str) -> Any:
     """
     kind = GROUPS[group]
     if not isinstance(name, str):
-        raise unknown_name(group, shortened(name), names(group))
+        raise unknown_name(group, name, names(group))
     if name in kind.built_in:
         return _attribute(kind.built_in[name])
-    offered = _offered(group)
-    if name in offered:
-        try:
-            found = offered[name].load()
-        except Exception as error:
-            raise ConfigError(
-                f"{group} must be a plugin that can be imported; {name!r} of "
-                f"{offered[name].value} raised {told(error)}."
-            ) from error
-        return _as_dataclass(group, name, found)
+    if name in _offered(group):
+        return _as_dataclass(group, name, _load(group, _offered(group)[name]))
     family = _family(group, name)
     if family is not None:
         return _attribute(family)
@@ -254,6 +265,9 @@ def find(group: str, name: str) -> Any:
         _require_maker(group, name, found)
         return _as_dataclass(group, name, found)
     raise unknown_name(group, name, names(group))
+
+
+# --- plain values --------------------------------------------------------------------------------
 
 
 def configure(group: str, values: Mapping[str, Any]) -> Any:
@@ -271,35 +285,27 @@ def configure(group: str, values: Mapping[str, Any]) -> Any:
         group,
         "be a choice with its fields",
         "one is made by name",
-        shortened(values),
+        values,
         f"{group}=NAME",
     )
-    name = values["name"]
-    cls = find(group, name)
+    cls = find(group, values["name"])
     is_one_of_many = "name" in {field.name for field in dataclasses.fields(cls)}
     fields = values if is_one_of_many else {k: v for k, v in values.items() if k != "name"}
-    return serialize.from_plain(cls, fields, group)
+    return from_plain(cls, fields, group)
 
 
 def describe(group: str, config: Any) -> dict[str, Any]:
     """Inverse of `configure`."""
-    return {"name": name_of(group, config), **serialize.to_plain(config)}
+    return {"name": name_of(group, config), **to_plain(config)}
 
 
 def defaults(group: str, name: str) -> dict[str, Any]:
     """What `describe` gives for a choice with its defaults; "???" for a field without one."""
-    cls = find(group, name)
-    plain: dict[str, Any] = {"name": name}
-    for field in dataclasses.fields(cls):
-        if not field.init or field.name == "name":
-            continue
-        if field.default_factory is not dataclasses.MISSING:
-            plain[field.name] = serialize.plain(field.default_factory())
-        elif field.default is not dataclasses.MISSING:
-            plain[field.name] = serialize.plain(field.default)
-        else:
-            plain[field.name] = "???"
-    return plain
+    plain_values: dict[str, Any] = {"name": name}
+    for field in dataclasses.fields(find(group, name)):
+        if field.init and field.name != "name":
+            plain_values[field.name] = "???" if _is_needed(field) else plain(_default(field))
+    return plain_values
 
 
 def name_of(group: str, config: Any) -> str:
@@ -307,24 +313,298 @@ def name_of(group: str, config: Any) -> str:
     if "name" in getattr(type(config), "__dataclass_fields__", {}):
         return str(config.name)
     cls = type(config)
-    return _NAMES.get(cls) or _built_in_name(group, cls) or f"{cls.__module__}:{cls.__qualname__}"
+    own = f"{cls.__module__}:{cls.__qualname__}"
+    built_in = (name for name, path in GROUPS[group].built_in.items() if path == own)
+    return _NAMES.get(cls) or next(built_in, own)
+
+
+def to_plain(config: Any) -> dict[str, Any]:
+    """The fields of a dataclass as plain values: numbers, words, None, lists and dictionaries."""
+    fields = [field.name for field in dataclasses.fields(config) if field.init]
+    return {name: plain(getattr(config, name)) for name in fields}
+
+
+def plain(value: Any) -> Any:
+    """One value as `to_plain` has it."""
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return to_plain(value)
+    if isinstance(value, tuple | list):
+        return [plain(x) for x in value]
+    if isinstance(value, Mapping):
+        return {str(key): plain(x) for key, x in value.items()}
+    is_array = hasattr(value, "tolist") and not isinstance(value, type)  # NumPy's and jax's
+    return value.tolist() if is_array else value
+
+
+def from_plain(cls: Any, values: Mapping[str, Any], where: str) -> Any:
+    """Inverse of `to_plain`.
+
+    Args:
+      cls: a dataclass.
+      values: by the names of its fields, today's or those of `RENAMED`; those left out have their
+        defaults.
+      where: what messages call it, as `agent` in `agent.batch_size`; may be empty.
+
+    Raises:
+      ConfigError: for a field that is not there, is missing, or has a value of another type.
+    """
+    fields = {field.name: field for field in dataclasses.fields(cls) if field.init}
+    try:
+        hints = typing.get_type_hints(cls)
+    except NameError as error:
+        raise ConfigError(
+            f"{where or cls.__name__} must have fields of known types, because values are read by "
+            f"them; got {cls.__name__}, where {error}. Import it where the class is defined.",
+            where,
+        ) from error
+    read = {}
+    for stored, value in values.items():
+        name = stored if stored in fields else RENAMED.get(stored, stored)
+        if name not in fields:
+            raise unknown_field(_join(where, name), [_join(where, field) for field in fields])
+        full = _join(where, name)
+        read[name] = _converted(value, hints[name], full, _default(fields[name]))
+    for name in fields.keys() - read.keys():
+        full = _join(where, name)
+        is_there = not _is_needed(fields[name])
+        require(is_there, full, "be given", "it has no default", "none", f"{full}=VALUE")
+    return cls(**read)
+
+
+def unknown_field(field: str, known: Collection[str]) -> ConfigError:
+    """Error for a field that is not there, with the nearest of those that are."""
+    field, last = shortened(field), field.rpartition(".")[2]
+    ranked = [name for name in known if name.rpartition(".")[2] == last] or nearest(field, known)
+    fix = f"Did you mean {ranked[0]}? " if ranked else ""
+    return ConfigError(
+        f"{field} must be a field, because nothing else is read; got one that is not there. "
+        f"{fix}Fields: {listed(ranked)}.",
+        field,
+    )
+
+
+def flatten(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Nested settings as `{"group.field": value}`."""
+    flat: dict[str, Any] = {}
+    for key, value in values.items():
+        if isinstance(value, Mapping):
+            flat |= flatten(value, f"{prefix}{key}.")
+        else:
+            flat[f"{prefix}{key}"] = value
+    return flat
+
+
+def differences(
+    there: Mapping[str, Any], here: Mapping[str, Any], free: Collection[str] = (), most: int = 10
+) -> str:
+    """The fields in which two nested settings differ, for a message; empty if in none.
+
+    Args:
+      there: settings that were stored.
+      here: those that are asked for.
+      free: groups and fields of the first level that may differ.
+      most: fields that are named.
+
+    Example:
+      >>> differences({"es": {"noise_std": 0.1}, "seed": 0}, {"es": {"noise_std": 0.2}, "seed": 0})
+      'es.noise_std (0.1 there, 0.2 here)'
+    """
+    old, asked = flatten(there), flatten(here)
+    differing = [
+        f"{name} ({shortened(old.get(name), 60)} there, {shortened(asked.get(name), 60)} here)"
+        for name in sorted(old.keys() | asked.keys())
+        if name.partition(".")[0] not in free
+        # In the second way nan is nan.
+        and old.get(name) != asked.get(name)
+        and repr(old.get(name)) != repr(asked.get(name))
+    ]
+    more = f" and {len(differing) - most} more" if len(differing) > most else ""
+    return ", ".join(differing[:most]) + more
+
+
+def split(text: str, separator: str = ",") -> list[str]:
+    """The parts of a text between separators that are outside of brackets and quotes.
+
+    Example:
+      >>> split("0.1,[1,2],'a,b'")
+      ['0.1', '[1,2]', "'a,b'"]
+    """
+    parts, depth, quote = [""], 0, ""
+    for character in text:
+        if quote:
+            quote = "" if character == quote else quote
+        elif character in "'\"" and not parts[-1].strip():
+            quote = character
+        depth += (character in "[(" and not quote) - (character in "])" and not quote)
+        if character == separator and depth <= 0 and not quote:
+            parts.append("")
+        else:
+            parts[-1] += character
+    return [part.strip() for part in parts] if len(parts) > 1 else parts
+
+
+def unquoted(text: str) -> str:
+    """A text without the quotes around it."""
+    is_quoted = len(text) > 1 and text[0] == text[-1] and text[0] in "'\""
+    return text[1:-1] if is_quoted else text
+
+
+def parsed(text: str) -> Any:
+    """What the text of an override says by itself: null, true, a number, a list, or the text.
+
+    Example:
+      >>> parsed("[1e-3,2,true,ddqn]")
+      [0.001, 2, True, 'ddqn']
+    """
+    if text in _CONSTANTS:
+        return _CONSTANTS[text]
+    if text[:1] == "[" and text[-1:] == "]":
+        return [parsed(part) for part in split(text[1:-1])] if text[1:-1].strip() else []
+    for kind in (int, float):
+        try:
+            return kind(text)
+        except ValueError:
+            continue
+    return unquoted(text)
+
+
+_CONSTANTS = {"null": None, "true": True, "True": True, "false": False, "False": False}
+_TYPES = {bool: "true or false", int: "a whole number", float: "a number", str: "text"}
+_NO = object()  # what a value of another type is converted to
+
+
+def _converted(value: Any, hint: Any, name: str, default: Any) -> Any:
+    """A value as its field's type, or an error that says which that is."""
+    if hint is Any:
+        return parsed(value) if isinstance(value, str) else value
+    kinds = typing.get_args(hint) if _is_union(hint) else (hint,)
+    if type(None) in kinds and (value is None or value == "null"):
+        return None
+    kinds = tuple(kind for kind in kinds if kind is not type(None))
+    if type(value) in kinds and not isinstance(value, str):
+        return value
+    for kind in kinds[:-1]:
+        try:
+            return _as(kind, value, name, default)
+        except ConfigError:
+            continue
+    return _as(kinds[-1], value, name, default)
+
+
+def _as(kind: Any, value: Any, name: str, default: Any) -> Any:
+    origin, arguments = typing.get_origin(kind) or kind, typing.get_args(kind)
+    fix = f"{name}={'VALUE' if default is _MISSING else as_text(plain(default))}"
+    if origin is typing.Literal:
+        read = parsed(value) if isinstance(value, str) and value not in arguments else value
+        if read not in arguments:
+            raise unknown_name(name, value, map(str, arguments))
+        return read
+    if origin in (tuple, list):
+        items = parsed(value) if isinstance(value, str) else value
+        require(isinstance(items, list | tuple), name, "be a list", "it is several", value, fix)
+        if isinstance(value, str):  # each is read by its own type
+            items = split(value[1:-1]) if items else []
+        return origin(_elements(items, origin, arguments, name, default))
+    if isinstance(kind, type) and dataclasses.is_dataclass(kind):
+        if isinstance(value, kind):
+            return value
+        first = next(iter(dataclasses.fields(kind))).name
+        is_nested = isinstance(value, Mapping)
+        require(is_nested, name, "have fields", "it is several", value, f"{name}.{first}=VALUE")
+        return from_plain(kind, value, name)
+    if kind not in _TYPES:
+        return value
+    read = _scalar(value, kind)
+    require(read is not _NO, name, f"be {_TYPES[kind]}", "that is its type", repr(value), fix)
+    return read
+
+
+def _elements(items: Any, origin: Any, kinds: tuple[Any, ...], name: str, default: Any) -> Any:
+    """The elements of a list or tuple, each as its type."""
+    if origin is tuple and kinds and kinds[-1] is not Ellipsis:
+        must, fix = f"have {len(kinds)} values", f"{name}={as_text(plain(default))}"
+        require(len(items) == len(kinds), name, must, "that is its type", items, fix)
+    else:
+        kinds = (kinds[0] if kinds else Any,) * len(items)
+    return (_converted(x, kind, name, default) for x, kind in zip(items, kinds, strict=True))
+
+
+def _scalar(value: Any, kind: type) -> Any:
+    """A value as a bool, int, float or str; `_NO` if it is none."""
+    if kind is str:
+        is_name = type(value) in (int, float)  # a name of digits, as of a folder
+        return value if isinstance(value, str) else str(value) if is_name else _NO
+    if isinstance(value, str):
+        value = parsed(value)
+    if kind is float and type(value) is int and abs(value) < 2**1000:
+        return float(value)
+    if kind is int and type(value) is float and value.is_integer() and abs(value) < 2**53:
+        return int(value)
+    return value if type(value) is kind else _NO
+
+
+def _is_union(hint: Any) -> bool:
+    return typing.get_origin(hint) in (types.UnionType, typing.Union)
+
+
+def _is_needed(field: Any) -> bool:
+    return _default(field) is _MISSING
+
+
+def _default(field: Any) -> Any:
+    has_factory = field.default_factory is not _MISSING
+    return field.default_factory() if has_factory else field.default
+
+
+def _join(where: str, name: str) -> str:
+    return f"{where}.{shortened(name)}" if where else shortened(name)
+
+
+# --- objects -------------------------------------------------------------------------------------
 
 
 def make(group: str, config: Any, *arguments: Any) -> Any:
     """What a configuration configures, built once for equal configurations and arguments.
 
-    Compiled programs are kept by the identity of what they were built from, so that a new instance
-    would compile anew.
+    Compiled programs are cached by the identity of what they were built from, so that a new
+    instance would compile again. A configuration that cannot be hashed is equal to itself alone.
 
     Raises:
       ConfigError: if it makes something of another kind, or cannot be made.
     """
+    if is_hashable(config):
+        return _made_once(group, config, *arguments)
+    key = (group, id(config), *arguments)
+    if key not in _MADE:
+        _MADE[key] = config, _made(group, config, *arguments)  # with config, its id stays its own
+    return _MADE[key][1]
+
+
+def is_hashable(config: Any) -> bool:
+    """Whether a configuration serves as a key: a frozen dataclass of hashable values does."""
     try:
-        return _make(group, Same(config), *arguments)
-    except TypeError as error:
-        if "unhashable" not in str(error):
-            raise
-        return _checked(group, config, config.make(*arguments))
+        hash(config)
+    except TypeError:
+        return False
+    return True
+
+
+def _made(group: str, config: Any, *arguments: Any) -> Any:
+    made = config.make(*arguments)
+    kind = _attribute(GROUPS[group].makes)
+    require(
+        isinstance(made, kind),
+        group,
+        f"make a sejax.{kind.__name__}",
+        "that is what is used",
+        f"{type(made).__name__} from {name_of(group, config)}",
+        f"{group} to a plugin that returns a sejax.{kind.__name__}",
+    )
+    return made
+
+
+_made_once = functools.cache(_made)
+_MADE: dict[tuple[Any, ...], tuple[Any, Any]] = {}
 
 
 def require_package(group: str, config: Any, reason: str) -> None:
@@ -339,79 +619,12 @@ def require_package(group: str, config: Any, reason: str) -> None:
         raise ConfigError(
             f"{group} must be one that is installed, because {reason}; got {name} without the "
             f"package {package}. Install it with pip install 'sejax[{name}]', or set "
-            f"{group}={usual}."
+            f"{group}={usual}.",
+            group,
         )
-
-
-class Same:
-    """Configurations as a key that is equal if all their fields are, hashable or not.
-
-    What is no dataclass is equal to what it says, by default to itself alone.
-    """
-
-    def __init__(self, *configs: Any):
-        self.configs = configs  # also keeps alive what the key knows by its address
-        self._key = tuple(map(_content, configs))
-
-    def __hash__(self) -> int:
-        return hash(self._key)
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, Same) and self._key == other._key
-
-
-def _content(value: Any) -> Any:
-    """What makes two values the same, hashable: of dataclasses at any depth class and fields."""
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        # A flax module that is nobody's part may have no parent.
-        return type(value), tuple(
-            _content(getattr(value, field.name, None))
-            for field in dataclasses.fields(value)
-            if field.init
-        )
-    if isinstance(value, tuple | list):
-        return type(value), tuple(map(_content, value))
-    if isinstance(value, Mapping):
-        return type(value), tuple((repr(name), _content(x)) for name, x in value.items())
-    if isinstance(value, bool | int | float | str | None):
-        return repr(value)  # by which 1, 1.0 and True are not the same, and nan is
-    if isinstance(value, set | frozenset):
-        return type(value), frozenset(map(_content, value))
-    if hasattr(value, "tolist") and hasattr(value, "dtype") and not isinstance(value, type):
-        return type(value), str(value.dtype), repr(value.tolist())  # NumPy's and jax's
-    try:
-        hash(value)
-    except TypeError:
-        return type(value), id(value)
-    return type(value), value
-
-
-@functools.cache
-def _make(group: str, key: Same, *arguments: Any) -> Any:
-    (config,) = key.configs
-    return _checked(group, config, config.make(*arguments))
-
-
-def _checked(group: str, config: Any, made: Any) -> Any:
-    """What was made, if it is of the group's kind."""
-    kind = _attribute(KINDS[group])
-    require(
-        isinstance(made, kind),
-        group,
-        f"make a sejax.{kind.__name__}",
-        "that is what is used",
-        f"{type(made).__name__} from {name_of(group, config)}",
-        f"{group} to a plugin that returns a sejax.{kind.__name__}",
-    )
-    return made
 
 
 _NAMES: dict[type, str] = {}  # of classes that were found by another name than their own
-
-
-def _built_in_name(group: str, cls: type) -> str | None:
-    own = f"{cls.__module__}:{cls.__qualname__}"
-    return next((name for name, path in GROUPS[group].built_in.items() if path == own), None)
 
 
 def _family(group: str, name: str) -> str | None:
@@ -424,6 +637,17 @@ def _offered(group: str) -> dict[str, Any]:
     """Entry points of installed packages; a name of sejax's own cannot be taken over."""
     points = importlib.metadata.entry_points(group=GROUPS[group].entry_points)
     return {point.name: point for point in points if point.name not in GROUPS[group].built_in}
+
+
+def _load(group: str, point: Any) -> Any:
+    try:
+        return point.load()
+    except Exception as error:
+        raise ConfigError(
+            f"{group} must be a plugin that can be imported; {point.name!r} of {point.value} "
+            f"raised {told(error)}. Mend or remove that package.",
+            group,
+        ) from error
 
 
 def _attribute(path: str) -> Any:
@@ -455,9 +679,10 @@ def _import(group: str, path: str) -> Any:
         found: Any = importlib.import_module(module)
     except Exception as error:
         raise ConfigError(
-            f"{group} must name a module that can be imported; importing {shortened(module)!r} for "
-            f"{group}={shortened(path)} raised {told(error)}. Run the command in the module's "
-            f"folder, or add that folder to PYTHONPATH."
+            f"{group} must name a module that can be imported; {shortened(path)} raised "
+            f"{told(error)}. Run the command in the module's folder, or add that folder to "
+            f"PYTHONPATH.",
+            group,
         ) from error
     for part in attribute.split("."):
         if not hasattr(found, part):
@@ -466,12 +691,12 @@ def _import(group: str, path: str) -> Any:
                 for name, value in vars(found).items()
                 if callable(value) and getattr(value, "__module__", None) == module
             }
-            near = nearest(part, sorted(own))
+            near = nearest(part, own)
+            fix = f" Did you mean {group}={module}:{near[0]}?" if near else ""
             raise ConfigError(
-                f"{group} must name a class or function of {module}, because that is what makes "
-                f"it; got {shortened(part)}, which is not there. There are: "
-                f"{', '.join(near) or 'none'}."
-                + (f" Did you mean {group}={module}:{near[0]}?" if near else "")
+                f"{group} must name a class or function of {module}; got {shortened(part)}. "
+                f"There are: {listed(near)}.{fix}",
+                group,
             )
         found = getattr(found, part)
     return found
@@ -492,8 +717,11 @@ def _require_maker(group: str, name: str, found: Any) -> None:
         says = typing.get_type_hints(function).get("return")
     except Exception:  # a name that only type checkers import
         says = getattr(function, "__annotations__", {}).get("return")
-    kind = _attribute(KINDS[group])
-    said = [typing.get_origin(x) or x for x in (*_of_union(says), says)]
+    kind = _attribute(GROUPS[group].makes)
+    said = [
+        typing.get_origin(x) or x
+        for x in (*(typing.get_args(says) if _is_union(says) else ()), says)
+    ]
     makes = any(
         issubclass(x, kind)
         if isinstance(x, type)
@@ -510,12 +738,6 @@ def _require_maker(group: str, name: str, found: Any) -> None:
     )
 
 
-def _of_union(hint: Any) -> tuple[Any, ...]:
-    """The parts of `X | None`; empty for what is no union."""
-    is_union = typing.get_origin(hint) in (typing.Union, types.UnionType)
-    return typing.get_args(hint) if is_union else ()
-
-
 def _as_dataclass(group: str, name: str, found: Any) -> Any:
     """The dataclass that a plugin is, or that a function stands for."""
     arguments = GROUPS[group].arguments
@@ -525,9 +747,10 @@ def _as_dataclass(group: str, name: str, found: Any) -> Any:
         cls = _from_function(group, name, found)
     else:
         raise ConfigError(
-            f"{group} must name a dataclass with make({', '.join(arguments)}), or a function that "
-            f"takes ({', '.join((*arguments, 'option=default, ...'))}), because its fields are the "
-            f'options; {name} is {shortened(found)}. See the README, "Adding to it".'
+            f"{group} must name a dataclass with make({', '.join(arguments)}), or a function of "
+            f"({', '.join((*arguments, 'option=default, ...'))}); {name} is {shortened(found)}. "
+            f"See docs/howto/own_pieces.md.",
+            group,
         )
     base = _attribute(GROUPS[group].base)
     require(
@@ -548,32 +771,28 @@ def _from_function(group: str, name: str, function: Callable[..., Any]) -> type:
     """A dataclass whose fields are a function's parameters beyond those that `make` is given."""
     parameters = list(inspect.signature(function).parameters.values())
     arguments = GROUPS[group].arguments
-    taken, options = parameters[: len(arguments)], parameters[len(arguments) :]
-    bad = [p.name for p in parameters if p.kind in (p.VAR_POSITIONAL, p.VAR_KEYWORD)]
+    options = parameters[len(arguments) :]
+    is_open = any(p.kind in (p.VAR_POSITIONAL, p.VAR_KEYWORD) for p in parameters)
     require(
-        len(taken) == len(arguments) and not bad,
+        len(parameters) >= len(arguments) and not is_open,
         group,
         f"take ({', '.join((*arguments, 'option=default, ...'))})",
         "each option is a field",
         f"{name}{inspect.signature(function)}",
         f"{group} to such a function",
     )
-    written = getattr(function, "func", function)  # of a partial, what it is one of
-    fields: list[Any] = []
-    for parameter in options:
-        unknown = parameter.annotation is inspect.Parameter.empty
-        kind = Any if unknown else parameter.annotation
-        if parameter.default is None:  # which `length: float = None` may be too
-            kind = Optional[kind]  # noqa: UP045 (it may be a string)
-        fields.append((parameter.name, kind, _field(parameter.default)))
 
     def make(self: Any, *given: Any) -> Any:
-        return function(*given, **{p.name: getattr(self, p.name) for p in options})
+        values = {p.name: getattr(self, p.name) for p in options}
+        as_lists = [p.name for p in options if isinstance(p.default, list)]
+        return function(*given, **values | {name: list(values[name]) for name in as_lists})
 
+    written = getattr(function, "func", function)  # of a partial, what it is one of
+    base = _attribute(GROUPS[group].base)
     cls = dataclasses.make_dataclass(
         written.__name__,
-        fields,
-        bases=(_attribute(GROUPS[group].base),),
+        [_as_field(parameter) for parameter in options],
+        bases=(Options if GROUPS[group].base == "builtins:object" else base,),
         namespace={"make": make, "__doc__": written.__doc__},
         frozen=True,
         kw_only=True,
@@ -582,10 +801,17 @@ def _from_function(group: str, name: str, function: Callable[..., Any]) -> type:
     return cls
 
 
-def _field(default: Any) -> Any:
-    """The field of a parameter with this default."""
+def _as_field(parameter: inspect.Parameter) -> tuple[str, Any, Any]:
+    """A parameter as name, type and field of a dataclass."""
+    unknown = parameter.annotation is inspect.Parameter.empty
+    kind = Any if unknown else parameter.annotation
+    default = parameter.default
+    if default is None:  # which `length: float = None` may be too
+        kind = typing.Optional[kind]  # noqa: UP045 (it may be a string)
     if default is inspect.Parameter.empty:
-        return dataclasses.field()
-    if type(default).__hash__ is None:  # a list: each configuration has one of its own
-        return dataclasses.field(default_factory=lambda: copy.deepcopy(default))
-    return dataclasses.field(default=default)
+        return parameter.name, kind, dataclasses.field()
+    if isinstance(default, list):  # a tuple is hashable, so that what it configures is built once
+        default = tuple(default)
+        kinds = typing.get_args(kind)
+        kind = tuple[(kinds[0] if kinds else Any), ...]  # type: ignore[misc]
+    return parameter.name, kind, dataclasses.field(default=default)

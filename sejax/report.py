@@ -10,7 +10,7 @@ from pathlib import Path
 
 from sejax import registry
 from sejax.cli import commands
-from sejax.errors import require
+from sejax.options import require
 
 USAGE = """python -m sejax.report RUN_DIR... [out=FILE]
 
@@ -27,7 +27,8 @@ def main(words: Sequence[str] | None = None) -> None:
     if {"--help", "-h"} & {*words}:
         print(USAGE)
         return
-    commands.guarded(_main)(words)
+    with commands.messages():
+        _main(words)
 
 
 def _main(words: Sequence[str]) -> None:

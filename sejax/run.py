@@ -9,24 +9,46 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-import hydra
-from omegaconf import DictConfig
+from sejax.cli import commands, runtime
+from sejax.cli import config as configuration
+from sejax.cli.config import LearnConfig
 
-from sejax.cli import commands, compose, runtime
-from sejax.cli.build import IN_RUN_DIR, LearnConfig
+ABOUT = """Learn a small network that stands in for an RL task (proxy=se), or for its reward on the
+real dynamics (proxy=rn), from agents trained on nothing else.
+
+  python -m sejax.run env=acrobot es.population_size=32 run_dir=runs/mine
+  python -m sejax.run agents=[ddqn,ppo] agents.ddqn.weight=2 agents.aggregate=min
+  python -m sejax.run env=gymnax/MountainCar-v0 agent=my_module:MyAgent
+  python -m sejax.run seed=0,1,2 es.noise_std=0.03,0.06      a run for each combination
+
+The same command on the same run_dir goes on where it stopped.
+Then: python -m sejax.evaluate proxy=RUN_DIR
+"""
 
 
-@hydra.main(config_path="conf", config_name="run", version_base="1.3")
-@commands.guarded
-def main(cfg: DictConfig) -> float:
-    """Learns a proxy as configured and returns the best incumbent mean (for Hydra's sweepers)."""
-    config = compose.learn_config(cfg)
-    given = config.run_dir
-    own = commands.name_in_sweep(IN_RUN_DIR if given is None else ("run_dir",))
-    if own:  # or all jobs of a sweep would have one folder
-        folder = f"{config.resolved_run_dir}_{own}" if given is None else f"{given}/{own}"
-        config = dataclasses.replace(config, run_dir=folder)
-    return max(learn(config))
+def main(overrides: Sequence[str]) -> None:
+    """Learns a proxy for each configuration that the overrides describe.
+
+    Raises:
+      ConfigError: for overrides that cannot be, or a run directory that cannot be used.
+      OSError: if a file cannot be written; everything saved before is whole.
+    """
+    configs = []
+    for of_run in configuration.expand(overrides):
+        config = configuration.config(of_run)
+        given = config.run_dir
+        known = LearnConfig.in_run_dir if given is None else ("run_dir",)
+        own = configuration.name_in_sweep(overrides, of_run, known)
+        if own:  # or all runs of a sweep would have one folder
+            folder = f"{config.resolved_run_dir}_{own}" if given is None else f"{given}/{own}"
+            config = dataclasses.replace(config, run_dir=folder)
+        configs += runs_of(config)
+    learn_all(configs)
+
+
+def help_text(overrides: Sequence[str]) -> str:
+    """What `--help` prints."""
+    return f"{ABOUT}\n{configuration.help_text(LearnConfig, overrides)}"
 
 
 def learn(config: LearnConfig) -> list[float]:
@@ -122,4 +144,4 @@ def _learn(config: LearnConfig, chunks_of: Callable[[LearnConfig], Any], says_mo
 
 
 if __name__ == "__main__":
-    commands.start("run", main)
+    commands.start(main, help_text)

@@ -11,9 +11,9 @@ from flax import struct
 from jaxtyping import Array, Bool, Float
 
 from sejax.agents.mixture import Mixture
-from sejax.errors import require
 from sejax.es.base import Evaluations, Strategy, finite_mean
 from sejax.objectives import Objective, Outcome
+from sejax.options import require
 
 
 @struct.dataclass

@@ -5,7 +5,7 @@ Source: paper, Algorithm 1 (TrainAgent) and appendix "Heuristics for Agent Train
 """
 
 import dataclasses
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -14,15 +14,18 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Float, Int
 
+from sejax import registry
 from sejax.agents.base import Agent, AgentConfig, Spaces
 from sejax.agents.buffers import Buffer, BufferMaker, Transition
 from sejax.envs.base import require_own_steps
 from sejax.envs.wrappers import repeat_actions
-from sejax.errors import LARGEST, require
 from sejax.ops.keys import step_keys
 from sejax.ops.loops import while_any_active
-from sejax.options import Options, counts, not_negative, one_of, option
+from sejax.options import LARGEST, Options, counts, not_negative, one_of, option, require
 from sejax.proxies.base import episode_limit, is_real, prepare
+from sejax.proxies.header import agents_of, is_registered
+from sejax.proxies.io import Proxy, ProxySet, stored_config
+from sejax.registry import from_plain
 
 STOP_RULES = ("plateau", "solved", "never")
 SOLVED_BY = ("test", "train")
@@ -102,6 +105,43 @@ def budget_for(
     return dataclasses.replace(
         training, max_steps=max_steps + longer, max_episodes=training.max_episodes + longer
     )
+
+
+def training_of(proxy: Proxy | ProxySet, agent: AgentConfig | None = None) -> TrainingConfig:
+    """How long agents trained on a stored proxy when it was learned.
+
+    Args:
+      proxy: from `sejax.load_proxy` or `sejax.load_set`.
+      agent: configuration of another agent that is to train on it, whose budget is then that of
+        `budget_for`; None for the training as it was.
+
+    Raises:
+      ConfigError: for a proxy that is not stored, or if its file does not tell it.
+
+    Example:
+      >>> import sejax
+      >>> training_of(sejax.load_proxy("cartpole")).stop_rule
+      'never'
+    """
+    config = stored_config(proxy)
+    stored: Any = config.get("training")
+    require(
+        isinstance(stored, Mapping),
+        "training",
+        f"be given for {proxy.path.name}",
+        "the file does not tell how long agents trained on it",
+        "none",
+        "training=sejax.TrainingConfig(...)",
+    )
+    training: TrainingConfig = from_plain(TrainingConfig, stored, "training")
+    if agent is None:
+        return training
+    known = [
+        registry.configure("agent", values)
+        for values in agents_of(config).values()
+        if is_registered("agent", values)
+    ]
+    return budget_for(training, agent, known, proxy.env.max_steps, proxy.env.task.max_steps)
 
 
 def require_reachable(name: str, training: TrainingConfig, max_episode_steps: int) -> None:

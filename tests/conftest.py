@@ -27,7 +27,6 @@ os.environ.setdefault("JAX_PLATFORMS", "cpu")
 import hypothesis  # noqa: E402
 import jax  # noqa: E402
 import pytest  # noqa: E402
-from hydra.core.config_store import ConfigStore  # noqa: E402
 
 
 def _cpu_model() -> str:
@@ -55,10 +54,6 @@ hypothesis.settings.register_profile(
 )
 hypothesis.settings.load_profile("sejax")
 
-
-# Hydra copies all that can be chosen for each configuration, and again what it takes of that: the
-# second copy is enough, and a fifth of the time.
-ConfigStore.__deepcopy__ = lambda self, memo: self
 
 # What is imported stays, and tracing makes many objects that reference counts free: looking
 # through all of them at Python's usual pace takes a tenth of the time.

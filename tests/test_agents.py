@@ -11,15 +11,14 @@ import pytest
 import sejax
 from sejax import agents, envs, registry
 from sejax.agents import AgentConfig, Rollout, Transition
-from sejax.errors import ConfigError
-from sejax.options import traced_options
+from sejax.options import ConfigError, traced_options
 
 NUM_STEPS, BATCH = 16, 7  # a batch has one column of padding
 SMALL = {
     "hidden_size": 4, "num_layers": 1, "batch_size": BATCH, "warmup_episodes": 3,
     "feature_dim": 4, "stream_hidden_size": 4,
     "rollout_steps": NUM_STEPS, "epochs": 2, "num_minibatches": 2,
-    "learning_rate": 0.01, "discount": 0.9,
+    "learning_rate": 0.01, "discount": 0.9, "init_alpha": 0.5,
 }  # fmt: skip
 TASKS = ("cartpole", "pendulum", "gridworld_2x2")  # discrete, continuous, and an index to observe
 
@@ -31,8 +30,9 @@ def config_of(name):
 
 
 def fits(name, task):
-    facts, config = registry.find("env", task).facts, registry.find("agent", name)
-    return config.states in (None, facts.states) and facts.actions in config.actions
+    spec = envs.spec_of(registry.configure("env", {"name": task}))
+    config = registry.find("agent", name)
+    return config.states in (None, spec.states) and spec.actions in config.actions
 
 
 LEARNING = [name for name in agents.names() if not registry.find("agent", name).is_solved_for]
@@ -243,6 +243,24 @@ def test_an_actor_critic_warms_up_in_its_first_episodes(case):
     state, _ = started(case)
     got = [bool(agent.begin_episode(state, jnp.int32(n)).is_warming_up) for n in range(5)]
     assert got == [True, True, True, False, False]
+
+
+@every_off_policy_agent
+def test_units_and_columns_out_of_use_take_no_part(case):
+    _, agent, start = parts(case)
+    hparams = agent.hparams._replace(hidden_size=jnp.float32(2), batch_size=jnp.float32(5))
+    state, batch = start(jax.random.key(1), hparams)
+    assert agent.batch_size(state) == 5 and batch.weight.sum() == 5
+    # Parameters that init narrowed to 0, in whichever of the state's vectors.
+    leaves = [x for x in jax.tree.leaves(state) if x.ndim]
+    update = jax.jit(agent.update)
+    after = update(jax.random.key(3), state, batch)
+    for before, then in zip(leaves, [x for x in jax.tree.leaves(after) if x.ndim], strict=True):
+        kept = (before == 0) & np.any(before != 0)  # not Adam's moments, which begin at 0
+        np.testing.assert_array_equal(np.asarray(then)[kept], 0.0)
+    assert sum(int((x == 0).sum()) for x in leaves) > 10 and moved(after, state)
+    other = batch._replace(reward=batch.reward + 3 * (1 - batch.weight))
+    assert_close(update(jax.random.key(3), state, other), after, rtol=1e-5, atol=1e-7)
 
 
 # --- what is refused -----------------------------------------------------------------------------

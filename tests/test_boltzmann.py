@@ -10,10 +10,10 @@ from sejax import envs
 from sejax.agents.boltzmann import BoltzmannConfig
 from sejax.agents.mixture import Mixture
 from sejax.bilevel import make_bilevel
-from sejax.cli import compose
-from sejax.errors import ConfigError
+from sejax.cli import config as configuration
 from sejax.evaluate import evaluate
 from sejax.objectives import AUC
+from sejax.options import ConfigError
 from sejax.proxies.configs import SyntheticConfig
 
 CARTPOLE, PENDULUM = envs.make("cartpole"), envs.make("pendulum")
@@ -141,6 +141,6 @@ def test_where_it_cannot_be_solved_for_it_says_so():
 
 
 def test_the_command_asks_for_no_baseline_before_it_trains_anything():
-    config = compose.evaluate_config(["proxy=cartpole", "agent=boltzmann"])
+    config = configuration.evaluate_config(["proxy=cartpole", "agent=boltzmann"])
     with pytest.raises(ConfigError, match=r"^baseline must be false with agent=boltzmann, "):
         evaluate(config)

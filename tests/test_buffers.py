@@ -13,7 +13,6 @@ OBS_DIM = 3
 CAPACITY = 5
 
 
-
 @jax.jit
 def store(rows, step, transition, active=True):
     return buffers.write_row(rows, step, buffers.pack(transition), active)

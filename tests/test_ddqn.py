@@ -179,7 +179,7 @@ def test_every_second_step_learns_twice_from_a_batch_of_twice_the_columns(rarely
     assert int(second.opt_state.count) == 2
 
 
-def test_the_memory_draws_a_batch_for_each_gradient_step(rarely):
+def test_the_buffer_draws_a_batch_for_each_gradient_step(rarely):
     agent, _ = rarely
     numbers = agent.hparams._replace(batch_size=np.float32(3))
     state = shapes_of(agent.init, jax.random.key(1), numbers)
@@ -188,7 +188,7 @@ def test_the_memory_draws_a_batch_for_each_gradient_step(rarely):
                      np.zeros(3, np.float32))  # fmt: skip
     buffer = agent.buffer(one, 10)
     batch = jax.eval_shape(
-        lambda key: buffer.batch(key, buffer.init(), jnp.int32(1), one), jax.random.key(0)
+        lambda key: buffer.batch(key, buffer.init(), jnp.int32(1), one, None), jax.random.key(0)
     )
     assert batch.reward.shape == (16,)  # 2 * 7, in whole vectors
 

@@ -12,8 +12,9 @@ from gymnax.environments import spaces
 
 from sejax import envs, registry
 from sejax.envs.dynamics.gridworld import GridParams, GridWorld
+from sejax.envs.environment import spaces_of
 from sejax.envs.gridworld import CLIFF_WALKING, ROOM_2X2
-from sejax.errors import ConfigError
+from sejax.options import ConfigError
 
 KEY = jax.random.key(0)
 GYMNASIUM_IDS = {
@@ -230,6 +231,10 @@ def test_resets_and_steps_equal_gymnaxs_to_the_bit(name, step_from):
         return [jax.vmap(env.reset_env, (0, None))(keys, params)[0] for env in (task.env, theirs)]
 
     np.testing.assert_array_equal(*reset(jax.random.split(KEY, 50)))
+    observation, action = spaces_of(theirs)
+    assert envs.TaskSpec(observation=observation, action=action, max_steps=1).interface == (
+        task.interface | {"max_steps": 1}
+    )
     if name == "mountain_car_continuous":  # whose walls are others there
         return
     steps = [
@@ -365,8 +370,9 @@ def test_the_move_into_the_goal_can_be_paid():
     assert task.origin == {"name": "cliff_walking", "goal_reward": -1.0}
     _, reward, _ = step_everywhere(task.env, task.params)
     assert reward[35, DOWN] == reward[24, RIGHT] == -1.0
-    with pytest.raises(ConfigError, match=r"^env\.goal_reward must be finite"):
+    with pytest.raises(ConfigError) as error:
         envs.make("cliff_walking", goal_reward=float("nan"))
+    assert error.value.field == "env.goal_reward"
 
 
 @pytest.mark.parametrize(

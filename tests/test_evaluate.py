@@ -17,12 +17,12 @@ import sejax
 from sejax import envs, registry
 from sejax.agents.ppo import PPOConfig
 from sejax.agents.tabular import QLearningConfig
-from sejax.cli import build, commands, compose, progress
-from sejax.cli.families import families_of
-from sejax.errors import ConfigError
+from sejax.cli import commands, progress
+from sejax.cli import config as configuration
+from sejax.cli.config import families_of
 from sejax.evaluate import evaluate, proxy_study, summarise
 from sejax.ops.checksummed import pack, unpack
-from sejax.proxies import files
+from sejax.options import ConfigError
 from sejax.training import TrainingConfig, budget_for
 
 TINY = ["agent.hidden_size=4", "agent.batch_size=4", "agent.warmup_episodes=0", "num_agents=3",
@@ -40,7 +40,7 @@ ROOM = [
 
 
 def evaluate_config(*overrides, words=TINY):
-    return compose.evaluate_config([*words, *overrides])
+    return configuration.evaluate_config([*words, *overrides])
 
 
 @functools.cache
@@ -54,7 +54,7 @@ def learned(*words):
 def save(path, *words):
     config, env, weights = learned(*words)
     discount = families_of(config)[0].agent.discount
-    sejax.save(path, env, weights, build.to_plain(config), discount, score=1.0, seed=0)
+    sejax.save(path, env, weights, configuration.plain(config), discount, score=1.0, seed=0)
     return path
 
 
@@ -96,7 +96,7 @@ def test_evaluation_writes_a_row_for_each_agent_and_their_means(evaluated):
 
 
 def test_several_agents_are_in_one_table(room, tmp_path, capsys):
-    words = ["agent=[sarsa,q_learning]", "agents.sarsa.learning_rate=0.5", *ROOM[1:]]
+    words = ["agents=[sarsa,q_learning]", "agents.sarsa.learning_rate=0.5", *ROOM[1:]]
     mean = evaluate(evaluate_config(f"proxy={room}", f"out_dir={tmp_path}", words=words))
     table = pd.read_csv(tmp_path / "evaluation.csv")
     counts = table.groupby(["world", "agent"]).size().to_dict()
@@ -142,7 +142,7 @@ def test_a_live_line_counts_the_agents_and_changes_no_number(room, tmp_path, mon
 def test_a_folder_that_cannot_be_written_is_said_before_agents_train(room, tmp_path, monkeypatch):
     (tmp_path / "file").write_text("")
     monkeypatch.setattr("sejax.evaluate._train_and_test", None)
-    with pytest.raises(ConfigError, match=r"^out_dir must be a folder that .* Set out_dir=DIR\."):
+    with pytest.raises(ConfigError, match=r"^out_dir must be a folder that can be written"):
         evaluate(evaluate_config(f"proxy={room}", f"out_dir={tmp_path}/file/x", words=ROOM))
 
 
@@ -159,8 +159,8 @@ def test_agents_train_as_configured_if_asked(room, tmp_path):
 
 
 def test_initial_episodes_beyond_the_proxys_own_extend_its_step_budget(stored):
-    proxy = files.load_proxy(stored)  # learned with no initial episode and 50 steps
-    then, training = proxy.learned_with("agent"), proxy.learned_with("training")
+    proxy = sejax.load_proxy(stored)  # learned with no initial episode and 50 steps
+    then, training = proxy.learned_with("agent"), sejax.training_of(proxy)
     assert (then.warmup_episodes, training.max_steps) == (0, 50)
 
     def budget(agent, *then):
@@ -190,9 +190,9 @@ def test_initial_episodes_beyond_the_proxys_own_extend_its_step_budget(stored):
 def test_episodes_of_one_step_extend_a_step_budget_by_as_little(tmp_path):
     words = ("proxy.hidden_size=4", "training.max_steps=50", "agent.warmup_episodes=0",
              "proxy.horizon=1")  # fmt: skip
-    proxy = files.load_proxy(save(tmp_path / "proxy.safetensors", *words))
+    proxy = sejax.load_proxy(save(tmp_path / "proxy.safetensors", *words))
     later = dataclasses.replace(proxy.learned_with("agent"), warmup_episodes=3)
-    assert proxy.training_for(later).max_steps == 53
+    assert sejax.training_of(proxy, later).max_steps == 53
 
 
 def test_each_of_several_agents_trains_as_long_as_it_must(tmp_path):
@@ -200,7 +200,7 @@ def test_each_of_several_agents_trains_as_long_as_it_must(tmp_path):
     words = ("agents=[ddqn,ppo]", "proxy.hidden_size=4", "agents.ddqn.warmup_episodes=2",
              "agents.ppo.rollout_steps=100", "training.max_steps=4000", *SOFT)  # fmt: skip
     path = save(tmp_path / "proxy.safetensors", *words)
-    composed = evaluate_config(f"proxy={path}", "agent=[ddqn,dueling_ddqn,ppo]",
+    composed = evaluate_config(f"proxy={path}", "agents=[ddqn,dueling_ddqn,ppo]",
                                "agents.ppo.rollout_steps=null", words=[])  # fmt: skip
     budgets = {
         key: training.max_steps
@@ -214,10 +214,8 @@ def test_each_of_several_agents_trains_as_long_as_it_must(tmp_path):
         dataclasses.replace(x, field="agent", weight=1.0) for x in families_of(learned(*words)[0])
     )
     assert as_learned.worlds["the proxy"][2]["ppo"].max_steps == 4000
-    with pytest.raises(
-        ConfigError, match=r"^The agent that proxy\.safetensors was learned with mu"
-    ):
-        files.load_proxy(path).learned_with("agent")
+    with pytest.raises(ConfigError, match=r"^agent must be given for proxy\.safetensors"):
+        sejax.load_proxy(path).learned_with("agent")
 
 
 @pytest.mark.parametrize(
@@ -231,16 +229,15 @@ def test_each_of_several_agents_trains_as_long_as_it_must(tmp_path):
          "agent must be left out with agent_hparams=as_learned.*batch_size=4"),
         (["proxy=real", "env=cartpole", "training.max_steps=9"], r"training must.*Set real_train"),
         (["seed=-1"], r"seed must lie in \[0, 2\*\*31\)"),
-        (["num_agents=0"], "num_agents must be at least 1"),
-        (["env=[1]"], "env must be a word"),
+        (["num_agents=0"], "num_agents must be"),
         (["agent=2"], "agent must be one of"),
-        (["agent=[q_learning,sarsa]", "agents.sarsa.weight=2"], "got agents.sarsa.weight"),
-        (["agent=[ddqn,ppo]", "agent_hparams=as_learned"],
+        (["agents=[q_learning,sarsa]", "agents.sarsa.weight=2"], "agents.sarsa.weight must be"),
+        (["agents=[ddqn,ppo]", "agent_hparams=as_learned"],
          r"agents must be left out with agent_hparams=as_learned.*got ddqn\+ppo"),
     ],
 )  # fmt: skip
 def test_settings_that_cannot_be_or_have_no_effect_are_refused(given, message, stored):
-    words = [] if given[0].startswith("agent=[") else TINY
+    words = [] if given[0].startswith("agents=[") else TINY
     with pytest.raises(ConfigError, match=message):
         evaluate_config(f"proxy={stored}", *given, words=words)
 
@@ -285,9 +282,9 @@ def test_agents_of_an_rn_take_the_time_limit_as_they_learned_it(tmp_path):
 
 def test_an_se_that_does_not_say_how_long_agents_trained_needs_the_config(room, tmp_path):
     """Tests on the real task, by which agents there stop, are not for an SE."""
-    proxies = files.load_set(room)
+    proxies = sejax.load_set(room)
     bare = tmp_path / "bare.safetensors"
-    sejax.save(bare, proxies.env, proxies.proxy(0).params.weights)
+    sejax.save(bare, proxies.env, proxies[0].params.weights)
     words = [f"proxy={bare}", "num_agents=1", "baseline=false", f"out_dir={tmp_path}"]
     with pytest.raises(ConfigError, match=r"^training_from must be config for an SE whose file do"):
         proxy_study(evaluate_config(*words, words=ROOM))
@@ -314,16 +311,17 @@ def test_agents_like_those_of_the_run_bring_their_exploration(tmp_path, capsys):
 
 def test_a_proxy_knows_what_it_was_learned_with(room, tmp_path):
     config = learned("env=gridworld_2x2", "proxy.hidden_size=4", "training.max_steps=50")[0]
-    proxies = files.load_set(room)
-    for group in ("agent", "exploration", "es", "objective", "training"):
+    proxies = sejax.load_set(room)
+    for group in ("agent", "exploration", "es", "objective"):
         assert proxies.learned_with(group) == getattr(config, group)
+    assert sejax.training_of(proxies) == config.training
     bare = tmp_path / "bare.safetensors"
-    sejax.save(bare, proxies.env, proxies.proxy(0).params.weights)
-    with pytest.raises(ConfigError, match=r"^The agent that bare\.safetensors was learned with mu"):
-        files.load_proxy(bare).learned_with("agent")
-    sejax.save(bare, proxies.env, proxies.proxy(0).params.weights, {"agent": {"name": "my:Agent"}})
-    with pytest.raises(ConfigError, match=r"registered one.*it is 'my:Agent'\. Give agent= yours"):
-        files.load_proxy(bare).learned_with("agent")
+    sejax.save(bare, proxies.env, proxies[0].params.weights)
+    with pytest.raises(ConfigError, match=r"^agent must be given for bare\.safetensors"):
+        sejax.load_proxy(bare).learned_with("agent")
+    sejax.save(bare, proxies.env, proxies[0].params.weights, {"agent": {"name": "my:Agent"}})
+    with pytest.raises(ConfigError, match=r"^agent must be given .*got my:Agent"):
+        sejax.load_proxy(bare).learned_with("agent")
     assert "my" not in sys.modules
 
 
@@ -360,18 +358,6 @@ def test_where_no_agent_is_named_it_is_the_tasks_own(room, tmp_path):
     assert "their" not in sys.modules
 
 
-def test_of_several_proxies_the_last_word_counts_and_a_sweep_needs_an_agent():
-    def agent_of(*words):
-        compose.register("evaluate", words)
-        return compose.ConfigStore.instance().repo["agent"]["of_task.yaml"].node["name"]
-
-    assert agent_of("proxy=cartpole", "proxy=pendulum") == "td3"
-    assert agent_of("proxy=cartpole,acrobot") == "ddqn"
-    with pytest.raises(ConfigError, match=r"^agent must be given, .*got none, with ddqn, td3 for"):
-        compose.register("evaluate", ["proxy=cartpole,pendulum"])
-    compose.register("evaluate", ["proxy=cartpole,pendulum", "agent=ppo"])
-
-
 def test_a_missing_proxy_or_task_says_what_to_set():
     with pytest.raises(ConfigError, match="proxy must be given"):
         evaluate_config()
@@ -385,8 +371,8 @@ def test_a_missing_proxy_or_task_says_what_to_set():
         ([], "proxy must be given"),
         (["proxy=nope"], "proxy must be one of "),
         (["proxy=nope/proxy.safetensors"], "does not exist"),
-        (["proxy=cartpole", "agent=[1,2]"], "agent must be one of"),
-        (["proxy=cartpole", "+new=1"], "new must be a field of EvaluateConfig"),
+        (["proxy=cartpole", "agents=[1,2]"], "agents must be one of"),
+        (["proxy=cartpole", "new=1"], "new must be a field"),
         (["proxy=" + "d" * 10_000], "proxy must be "),
     ],
 )
@@ -395,12 +381,11 @@ def test_the_command_ends_bad_input_with_one_message_and_status_2(words, said, m
 
     monkeypatch.setattr(sys, "argv", ["sejax.evaluate", *words])
     monkeypatch.setattr(sys, "path", list(sys.path))
-    monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
     with pytest.raises(SystemExit) as ended:
-        commands.start("evaluate", command.main)
+        commands.start(command.main, command.help_text)
     printed = capsys.readouterr()
     assert ended.value.code == 2 and not printed.out
-    assert said in printed.err and printed.err.count("\n") == 1 and len(printed.err) < 1500
+    assert said in printed.err and printed.err.count("\n") == 1 and len(printed.err) < 500
 
 
 def test_an_evaluations_mean_leaves_no_agent_out():

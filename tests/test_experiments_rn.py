@@ -18,7 +18,7 @@ from experiments.rn_heatmap import RnHeatmap
 from experiments.rn_objectives import RnObjectives
 from experiments.rn_performance import RnPerformance
 from sejax.cli import session
-from sejax.errors import ConfigError
+from sejax.options import ConfigError
 
 
 @pytest.fixture(scope="module")
@@ -53,7 +53,7 @@ def test_rns_are_learned_stored_and_used_once(options, rns_dir, monkeypatch):
     assert set(table["groups, agents"]) == {"2, 4"}
     folder = rns_dir / "cliff_walking" / "reward_threshold"
     rns = sejax.load_set(folder / "additive_potential.safetensors", kind="rn")
-    assert rns.size == 3 and rns.config["objective"]["name"] == "reward_threshold"
+    assert len(rns) == 3 and rns.config["objective"]["name"] == "reward_threshold"
     assert list(rns.seeds) == [3, 4, 5]
 
     # The best two of three, by the scores of the runs' incumbents.
@@ -62,7 +62,7 @@ def test_rns_are_learned_stored_and_used_once(options, rns_dir, monkeypatch):
     best = rns.ranked(2)
     assert list(best.scores) == sorted(rns.scores)[:0:-1]
     used = weights_of(settings, "default-additive_potential")
-    assert used == {best.fingerprint(0), best.fingerprint(1)}
+    assert used == {best[0].fingerprint, best[1].fingerprint}
 
     refuse_to_compute(monkeypatch)
     fewer = dataclasses.replace(settings, bonus_groups=1)
@@ -90,8 +90,8 @@ def test_a_set_grows_by_the_rns_that_it_lacks(options, monkeypatch, tmp_path):
     four = rn.learn(more, "additive_potential", "reward_threshold")
     assert learned == [6] and list(four.seeds) == [3, 4, 5, 6]
     assert list(four.scores[:3]) == list(three.scores)
-    assert [four.fingerprint(i) for i in range(3)] == [three.fingerprint(i) for i in range(3)]
-    assert four.fingerprint(3) not in [three.fingerprint(i) for i in range(3)]
+    assert [four[i].fingerprint for i in range(3)] == [three[i].fingerprint for i in range(3)]
+    assert four[3].fingerprint not in [three[i].fingerprint for i in range(3)]
     curves = shards.read_rows(rn.curves_file(four.path))
     assert list(curves["seed"]) == [3, 4, 5, 6]
     three.path.write_bytes(before)  # as if killed before the set was written
@@ -144,7 +144,7 @@ def test_the_heat_map_shows_what_the_rns_pay(options):
     rns = rn.learn(settings, "exclusive_non_potential", "reward_threshold")
     rewards = rn_heatmap.rewards_of_moves(rns)
     assert rewards.shape == (3, 48, 4) and np.isnan(rewards[:, 37:]).all()
-    potential = [float(rns.env.potential(rns.one(1), np.int32(s))) for s in (24, 0)]
+    potential = [float(rns.env.potential(rns[1].params, np.int32(s))) for s in (24, 0)]
     # From the start (row 3) UP leads to state 24, and UP from state 0 stays there.
     np.testing.assert_allclose(rewards[1, [36, 0], 3], potential, rtol=1e-5)
     stored = rn_heatmap.by_variant(settings, shards.read_rows(settings.rows_file))

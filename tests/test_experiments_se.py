@@ -25,8 +25,8 @@ from experiments.common import agents, figures, runs, shards
 from experiments.common.statistics import bootstrap_interval, interquartile_mean
 from sejax import envs
 from sejax.agents.base import drawing_key
-from sejax.cli import build
-from sejax.errors import ConfigError
+from sejax.cli import config as configuration
+from sejax.options import ConfigError
 
 
 @pytest.fixture(scope="module")
@@ -108,11 +108,12 @@ def test_feasibility_learns_as_sejax_run_does_and_goes_on(tmp_path):
     stored = sejax.load_set(tmp_path / "ses.safetensors")
     config = yaml.safe_load((tmp_path / "work/runs/seed4/config.yaml").read_text())
     assert config["seed"] == 4 and config["proxy"]["hidden_size"] == 4
-    result = jax.jit(sejax.make_learner(build.learn_config(config)))(jax.random.key(4))
+    result = jax.jit(sejax.make_learner(configuration.learn_config(config)))(jax.random.key(4))
     mine = made[made["seed"] == 4]
     np.testing.assert_allclose(mine["incumbent_mean"], result.info.incumbent_mean, rtol=1e-6)
     assert stored.seeds.tolist() == [3, 4]
-    assert all(jax.tree.leaves(jax.tree.map(np.array_equal, stored.one(1).weights, result.weights)))
+    weights = stored[1].params.weights
+    assert all(jax.tree.leaves(jax.tree.map(np.array_equal, weights, result.weights)))
     assert stored.scores[1] == pytest.approx(float(result.score))
     with pytest.raises(ConfigError, match=r"differs in agent_hparams.*Set work=DIR"):
         learned(agent_hparams="varied")
@@ -269,9 +270,9 @@ def check_as_evaluation(ses, rows):
     loaded, task = sejax.load_set(ses), envs.make("cartpole")
     key = jax.random.fold_in(jax.random.key(3), 1)
     keys = jax.numpy.stack([jax.random.fold_in(key, i) for i in range(3)])
-    mine = rows[rows["group"] == f"se-{loaded.seeds[1]:02d}-{loaded.fingerprint(1)}"]
+    mine = rows[rows["group"] == f"se-{loaded.seeds[1]:02d}-{loaded[1].fingerprint}"]
     training = sejax.TrainingConfig(max_steps=40, stop_rule="never", test_episodes=2)
-    chosen, expected = evaluated(loaded.env, loaded.one(1), task, training, keys)
+    chosen, expected = evaluated(loaded.env, loaded[1].params, task, training, keys)
     np.testing.assert_allclose(mine["test_return"].iloc[chosen], expected.test_return, rtol=1e-6)
     np.testing.assert_allclose(mine["return_0"] + mine["return_1"], 2 * mine["test_return"])
     assert (mine["train_steps"] == 40).all() and mine["hidden_size"].between(1, 6).all()
@@ -525,7 +526,7 @@ def test_agents_of_a_configuration_share_what_is_drawn():
 def test_a_tuned_agent_trains_on_the_real_task_as_long_as_on_the_se():
     of = se_transfer_of_hparams.SeTransferOfHparams.of
     parts = se_transfer_of_hparams.parts_of(of(run=["agent.batch_size=7"]))
-    assert parts.agent.batch_size == 7 and parts.ses.size == 1
+    assert parts.agent.batch_size == 7 and len(parts.ses) == 1
     trainings = parts.trainings
     assert list(trainings) == ["se", "same", "long"]
     assert trainings["same"].max_steps == trainings["se"].max_steps == 2000
@@ -533,5 +534,5 @@ def test_a_tuned_agent_trains_on_the_real_task_as_long_as_on_the_se():
     assert dataclasses.asdict(trainings["long"])["max_steps"] == 100_000
     with pytest.raises(ConfigError, match=r"ses must be of acrobot.*env=cartpole"):
         se_transfer_of_hparams.parts_of(of(env="acrobot", ses="cartpole"))
-    with pytest.raises(ConfigError, match="num_agents must be at least 2"):
+    with pytest.raises(ConfigError, match="num_agents must be "):
         of(num_agents=1)

@@ -15,8 +15,8 @@ from experiments import score_transforms, se_histograms, supervised_baseline
 from experiments.common import supervised_models
 from experiments.common.statistics import bootstrap_interval
 from sejax.bilevel import make_bilevel
-from sejax.errors import ConfigError
 from sejax.evaluation import make_recorder, make_tester
+from sejax.options import ConfigError
 from sejax.training import make_trainer
 
 
@@ -133,7 +133,7 @@ def test_a_recorded_training_is_the_training(se_file, capacity):
     agent = sejax.make_agent(sejax.DDQNConfig(**TINY_AGENT), ses.task)
     training = sejax.TrainingConfig(max_steps=90, max_episodes=12, stop_rule="never")
     recorder = se_histograms.last_steps(capacity)
-    key, params = jax.random.key(1), ses.one(0)
+    key, params = jax.random.key(1), ses[0].params
     short = params.replace(max_steps_in_episode=9)
     plain = jax.jit(make_trainer(agent, ses.env, training))(key, short)
     result = jax.jit(make_trainer(agent, ses.env, training, recorder=recorder))(key, short)

@@ -16,9 +16,9 @@ from gymnasium.wrappers import TransformObservation
 from test_gym_vector import SES, world_of
 
 import sejax.gym
-from sejax.errors import ConfigError
 from sejax.gym import SyntheticEnv
-from sejax.proxies import stored
+from sejax.options import ConfigError
+from sejax.proxies import header
 
 try:
     from stable_baselines3 import PPO
@@ -92,14 +92,14 @@ def test_lanes_share_their_attributes():
     with pytest.raises(NotImplementedError, match="indices=None"):
         envs.set_attr("tag", 7, indices=[1])
     assert envs.env_method("get_wrapper_attr", "tag", indices=[0]) == [7]
-    with pytest.raises(NotImplementedError, match="lanes reset together"):
+    with pytest.raises(NotImplementedError, match="reset together"):
         envs.env_method("reset")
     assert envs.env_is_wrapped(gymnasium.Wrapper) == [False] * 3
     envs.close()
 
 
 @needs_sb3
-@pytest.mark.parametrize("name", stored.pretrained_names())
+@pytest.mark.parametrize("name", header.pretrained_names())
 @pytest.mark.filterwarnings("ignore:We recommend you to use a symmetric:UserWarning")
 def test_its_checker_passes_for_what_ships(name):
     check_env(sejax.gym.make(name))

@@ -18,7 +18,7 @@ from sejax import envs, registry
 from sejax.envs.base import Task
 from sejax.envs.gymnax import PREFIX, SOLVED_REWARD, GymnaxTask
 from sejax.envs.wrappers import AsVectors, Wrapper
-from sejax.errors import ConfigError
+from sejax.options import ConfigError
 
 DOWNLOADS = {"MNISTBandit-bsuite"}  # what it plays with
 # Not those that a test beside this one may have registered (`sejax.register_gymnax`).

@@ -13,7 +13,7 @@ import sejax
 from sejax import envs
 from sejax.envs.environment import EnvState
 from sejax.envs.wrappers import Wrapper
-from sejax.errors import ConfigError
+from sejax.options import ConfigError
 from sejax.proxies.configs import RewardConfig
 
 # brax calls parts of MuJoCo XLA that have been given other names.
@@ -165,19 +165,20 @@ WEIGHTED = "proxy.variant=exclusive_weighted_info"
 
 
 @pytest.mark.parametrize(
-    ("overrides", "said"),
+    ("overrides", "field"),
     [
-        ([ENV, RN, "env.backend=sprung"], "spring"),
-        (["env=cartpole", "+env.backend=mjx"], r"env\.backend must be a field of CartPole"),
-        ([ENV, "preset=paper"], "preset=paper for halfcheetah with proxy=se"),
-        (["env=cartpole", RN, "proxy.augmented=true"], "proxy.augmented=false"),
-        (["env=reacher", RN, "proxy.augmented=true"], "proxy.augmented=false"),  # has no v
-        (["env=cartpole", RN, "proxy.variant=additive_weighted_info"], "potential"),
-        ([ENV, RN, WEIGHTED, "proxy.augmented=true"], "has no network"),
-        ([ENV, RN, WEIGHTED, "proxy.zero_at_terminal=true"], "has no network"),
-        ([ENV, RN, "agent=ddqn"], "td3"),
+        ([ENV, RN, "env.backend=sprung"], "env.backend"),
+        (["env=cartpole", "env.backend=mjx"], "env.backend"),
+        ([ENV, "preset=paper"], "preset"),
+        (["env=cartpole", RN, "proxy.augmented=true"], "proxy.augmented"),
+        (["env=reacher", RN, "proxy.augmented=true"], "proxy.augmented"),  # has no v
+        (["env=cartpole", RN, "proxy.variant=additive_weighted_info"], "proxy.variant"),
+        ([ENV, RN, WEIGHTED, "proxy.augmented=true"], "proxy.augmented"),
+        ([ENV, RN, WEIGHTED, "proxy.zero_at_terminal=true"], "proxy.zero_at_terminal"),
+        ([ENV, RN, "agent=ddqn"], "agent"),
     ],
 )
-def test_what_makes_no_sense_is_refused(overrides, said):
-    with pytest.raises(ConfigError, match=said):
+def test_what_makes_no_sense_is_refused(overrides, field):
+    with pytest.raises(ConfigError) as error:
         sejax.config(overrides)
+    assert error.value.field == field

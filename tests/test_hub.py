@@ -9,10 +9,10 @@ import yaml
 from fake_hub import oid, serving
 
 import sejax
-from sejax.errors import ConfigError
-from sejax.proxies import hub, stored
+from sejax.options import ConfigError
+from sejax.proxies import header, hub
 
-SHIPPED = stored.PRETRAINED_DIR / "cartpole.safetensors"
+SHIPPED = header.PRETRAINED_DIR / "cartpole.safetensors"
 needs_the_extra = pytest.mark.skipif(
     importlib.util.find_spec("huggingface_hub") is None, reason="needs pip install 'sejax[hub]'"
 )
@@ -56,11 +56,14 @@ def test_an_address_names_repository_revision_and_file(address, parts):
 @pytest.mark.parametrize("address", [
     "hf://", "hf://me", "hf://me/", "hf://me/se/", "hf://me/se/pytorch_model.bin",
     "hf://me/se/proxy.pkl", "hf://me/se/../../x.safetensors", "hf://../se", "hf://me/se@",
-    "hf://me/se/.hidden.safetensors", "hf://me/se/proxy.safetensors\n", "hf://datasets/me/se",
+    "hf://" + "/" * 100,
+    "hf://me/se/" + "a/" * 100 + "x.safetensors", "hf://me/se/.hidden.safetensors",
+    "hf://me/se/proxy.safetensors\n", "hf://datasets/me/se",
 ])  # fmt: skip
 def test_what_is_no_address_or_no_safetensors_file_is_refused(address):
-    with pytest.raises(ConfigError, match=r"(?s)^proxy must be hf://USER/REPO, .*Set proxy=hf://"):
+    with pytest.raises(ConfigError) as error:
         hub.parse(address, "proxy")
+    assert error.value.field == "proxy" and len(str(error.value)) < 300
 
 
 def test_a_missing_extra_is_one_line_that_says_what_to_install(monkeypatch):
@@ -73,7 +76,7 @@ def test_a_missing_extra_is_one_line_that_says_what_to_install(monkeypatch):
 
     monkeypatch.setattr(builtins, "__import__", without_the_hub)
     for use in (lambda: sejax.load("hf://me/se"), lambda: sejax.push("cartpole", "me/se")):
-        with pytest.raises(ConfigError, match=r"got .*me/se .*pip install 'sejax\[hub\]'\.$"):
+        with pytest.raises(ConfigError, match=r"pip install 'sejax\[hub\]'\.$"):
             use()
 
 
@@ -91,9 +94,9 @@ def test_a_proxy_that_is_pushed_is_loaded_everywhere_as_it_was(the_hub):
     shipped_env, shipped = sejax.load("cartpole")
     assert env.config == shipped_env.config and env.task is shipped_env.task
     assert_same_weights(params.weights, shipped.weights)
-    assert_same_weights(sejax.load_set(address).one(0).weights, shipped.weights)
+    assert_same_weights(sejax.load_set(address)[0].params.weights, shipped.weights)
     assert sejax.load_proxy(address).task.name == "cartpole"
-    assert stored.read_config(address) == stored.read_config("cartpole")
+    assert header.read_config(address) == header.read_config("cartpole")
 
 
 @needs_the_extra
@@ -125,8 +128,8 @@ def test_a_run_directory_is_pushed_and_a_card_says_what_is_known_of_it(the_hub, 
         "library_name": "sejax", "license": "mit", "pipeline_tag": "reinforcement-learning",
         "tags": ["reinforcement-learning", "jax", "synthetic-environment", "pendulum"],
     }  # fmt: skip
-    assert card.startswith("# swing-up\n") and card.endswith("## Licence\n\nmit")
-    for said in ("generation 7 of seed 2, when it scored sac -150.0", "sejax[hub]",
+    assert card.startswith("# swing-up\n") and card.endswith("## License\n\nmit")
+    for said in ("| generation | 7 |", "| seed | 2 |", "| score | sac -150.0 |", "sejax[hub]",
                  'sejax.load("hf://me/swing-up")', 'sejax.gym.make("hf://me/swing-up")',
                  "proxy=hf://me/swing-up`"):  # fmt: skip
         assert said in card
@@ -138,8 +141,8 @@ def test_a_shipped_ones_card_keeps_what_it_teaches(the_hub):
     sejax.push("cliff_walking-rn", "me/rn")
     front, card = front_and_card(the_hub, "me/rn")
     assert "reward-network" in front["tags"] and front["license"] == "apache-2.0"
-    rows = [line for line in sejax.load_proxy("cliff_walking-rn").record["card"].splitlines()
-            if line.startswith("| q_learning")]  # fmt: skip
+    (shipped,) = (proxy for proxy in sejax.pretrained() if proxy.name == "cliff_walking-rn")
+    rows = [line for line in shipped.card.splitlines() if line.startswith("| q_learning")]
     assert rows and all(row in card for row in rows) and "sejax.gym.make" not in card
 
 
@@ -163,7 +166,7 @@ def test_ones_own_task_is_to_be_given(the_hub, tmp_path):
     address = sejax.push(path, "me/mine")
     _, card = front_and_card(the_hub, "me/mine")
     assert 'sejax.load("hf://me/mine", task=...)' in card and "env=..." in card
-    assert "it scored" not in card
+    assert "| score |" not in card
     assert sejax.load(address, task=task)[0].task is task
 
 
@@ -177,7 +180,7 @@ def shapes_of(env):
 def test_a_set_is_not_pushed(the_hub, tmp_path):
     env, params = sejax.load("cartpole")
     sejax.save_set(tmp_path / "set.safetensors", env, [params.weights] * 2, [{}, {}])
-    with pytest.raises(ConfigError, match=r"^source must be a single proxy, .* a set\."):
+    with pytest.raises(ConfigError, match=r"^source must be a single proxy"):
         sejax.push(tmp_path / "set.safetensors", "me/set")
     assert not the_hub.commits
 
@@ -216,8 +219,8 @@ def test_without_a_network_what_was_fetched_before_serves(the_hub, monkeypatch):
     ("hf://me/hidden", r"there is no such repository, or it is private\. .* hf auth login\.$"),
     ("hf://me/gated", r"its owner gives access on request\."),
     ("hf://me/large/large.safetensors", r"at most 100,000,000 bytes, .*got 100,000,001 bytes"),
-    ("hf://me/pickle", r"^source must be a whole safetensors file, .*damaged"),
-    ("hf://me/foreign", r"^source must be a file that sejax has written"),
+    ("hf://me/pickle", r"which is damaged or of another format"),
+    ("hf://me/foreign", r"which is damaged or of another format"),
 ])  # fmt: skip
 def test_each_failure_is_one_message(the_hub, tmp_path, address, message):
     from safetensors.numpy import save
@@ -229,7 +232,7 @@ def test_each_failure_is_one_message(the_hub, tmp_path, address, message):
         "me/foreign": [{"proxy.safetensors": save({"x": np.zeros(2, np.float32)})}],
     }
     the_hub.refused = {"me/hidden": (401, "RepoNotFound"), "me/gated": (403, "GatedRepo")}
-    the_hub.claimed_sizes = {"large.safetensors": hub.MOST_BYTES + 1}
+    the_hub.claimed_sizes = {"large.safetensors": hub.MAX_BYTES + 1}
     with pytest.raises(ConfigError, match=message):
         sejax.load(address)
     assert not list(tmp_path.rglob("large.safetensors")), "nothing of it is fetched"
@@ -246,18 +249,19 @@ def test_who_may_not_write_is_told(the_hub, monkeypatch):
 
 
 def test_a_repository_has_an_owner_and_a_name():
-    for repo in ("se", "me/se/x", "hf://me/se", "me/../se", ""):
-        with pytest.raises(ConfigError, match=r"^repo must be USER/REPO, "):
+    for repo in ("se", "me/se/x", "hf://me/se", "me/../se", "", None, 3):
+        with pytest.raises(ConfigError) as error:
             sejax.push("cartpole", repo)
+        assert error.value.field == "repo"
 
 
 @needs_the_extra
 def test_the_command_evaluates_what_is_there_and_writes_in_the_working_folder(the_hub):
-    from sejax.cli import compose
+    from sejax.cli import config as configuration
     from sejax.evaluate import proxy_study
 
     sejax.push("cartpole", "me/se")
-    config = compose.evaluate_config([f"proxy=hf://me/se@{oid('me/se', 0)}"])
+    config = configuration.evaluate_config([f"proxy=hf://me/se@{oid('me/se', 0)}"])
     study = proxy_study(config)
     assert study.task.name == "cartpole"
     assert str(study.out_dir) == f"runs/evaluate-me_se@{oid('me/se', 0)}"

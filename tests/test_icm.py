@@ -17,7 +17,7 @@ from sejax.agents.base import Agent, AgentSpec
 from sejax.agents.buffers import Rollout, Transition, pack, replay_buffer
 from sejax.agents.dqn import DDQNConfig, make_ddqn
 from sejax.agents.exploration import ICM, ICMConfig, ICMOutputs, icm_loss, with_icm
-from sejax.errors import ConfigError
+from sejax.options import ConfigError
 
 OBS_DIM, WIDTH, BATCH = 3, 2, 7  # WIDTH: actions to choose from, or length of an action
 GOLDEN = Path(__file__).parent / "golden" / "icm_updates.npz"

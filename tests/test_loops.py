@@ -1,4 +1,4 @@
-"""sejax.ops.loops: every lane gets what it would get alone, at any depth of vmap."""
+"""sejax.ops.loops: every element gets what it would get alone, at any depth of vmap."""
 
 import jax
 import jax.numpy as jnp
@@ -40,19 +40,19 @@ def test_a_single_loop_runs_until_it_is_inactive():
 
 
 @pytest.mark.parametrize("shape", [(4,), (2, 2), (1, 2, 2)])
-def test_lanes_that_stop_at_different_times_equal_single_loops(shape):
+def test_elements_that_stop_at_different_times_equal_single_loops(shape):
     loop = count_to
     for _ in shape:
         loop = jax.vmap(loop)
     limits = np.int32([3, 1, 6, 2])
     log, state = jax.jit(loop)(limits.reshape(shape))
     log, state = jax.tree.map(np.asarray, (log, state))
-    for lane, limit in enumerate([3, 1, 6, 2]):
-        index = np.unravel_index(lane, shape)
+    for element, limit in enumerate([3, 1, 6, 2]):
+        index = np.unravel_index(element, shape)
         assert_counted(log[index], state.number[index], limit)
 
 
-def test_arguments_that_all_lanes_share_need_no_axis():
+def test_arguments_that_all_elements_share_need_no_axis():
     loop = jax.jit(jax.vmap(count_to, in_axes=(None, 0)))
     log, state = jax.tree.map(np.asarray, loop(3, np.array([True, False, True])))
     assert_counted(log[0], state.number[0], 3)
@@ -60,7 +60,7 @@ def test_arguments_that_all_lanes_share_need_no_axis():
     assert_counted(log[2], state.number[2], 3)
 
 
-def test_lanes_in_a_cond_may_read_arrays_that_the_body_closes_over():
+def test_elements_in_a_cond_may_read_arrays_that_the_body_closes_over():
     squares = jnp.arange(7) ** 2
 
     def squaring(log, state, limit, masked):

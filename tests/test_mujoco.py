@@ -17,8 +17,8 @@ from scipy import stats
 
 from sejax import envs
 from sejax.envs.mujoco.tasks import HalfCheetah, Hopper
-from sejax.errors import ConfigError
 from sejax.ops.parallel import spread_over_devices
+from sejax.options import ConfigError
 
 gymnasium = pytest.importorskip("gymnasium")
 mujoco = pytest.importorskip("mujoco")
@@ -197,17 +197,18 @@ def test_resets_are_drawn_as_gymnasiums(name, in_gymnasium):
 
 
 @pytest.mark.parametrize(
-    ("options", "said"),
+    "options",
     [
-        ({"name": "hopper", "reset_noise_scale": -1.0}, r"env\.reset_noise_scale must be at least"),
-        ({"name": "ant", "ctrl_cost_weight": float("inf")}, r"env\.ctrl_cost_weight must be fin"),
-        ({"name": "halfcheetah", "backend": "mujocco"}, r"Did you mean env\.backend=mujoco"),
-        ({"name": "reacher", "backend": "mjx"}, r"env\.backend must be a field of Reacher"),
+        {"name": "hopper", "reset_noise_scale": -1.0},
+        {"name": "ant", "ctrl_cost_weight": float("inf")},
+        {"name": "halfcheetah", "backend": "mujocco"},
+        {"name": "reacher", "backend": "mjx"},
     ],
 )
-def test_options_that_make_no_sense_are_refused(options, said):
-    with pytest.raises(ConfigError, match=said):
+def test_options_that_make_no_sense_are_refused(options):
+    with pytest.raises(ConfigError) as error:
         envs.make(**options)
+    assert error.value.field == f"env.{list(options)[1]}"
 
 
 # --- pure, in every transformation ---------------------------------------------------------------

@@ -9,10 +9,10 @@ import pytest
 
 import sejax
 from sejax import registry
-from sejax.errors import ConfigError
 from sejax.es.base import Evaluations
 from sejax.es.evosax import ALGORITHMS, EvosaxConfig, finite_fitness, from_evosax
 from sejax.es.nes import NESConfig
+from sejax.options import ConfigError
 
 NAN, INF = np.nan, np.inf
 DIMS = 6
@@ -269,6 +269,7 @@ def test_the_mean_step_on_a_linear_score_points_along_its_gradient(score_transfo
 
 
 # --- contract of every strategy ------------------------------------------------------------------
+
 
 def evosax_strategy(name, **fields):
     config = EvosaxConfig(

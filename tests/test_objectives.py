@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from sejax import envs, registry
-from sejax.errors import ConfigError
 from sejax.objectives import AUC, AUCSum, MaxReward, Objective, Outcome, RewardThreshold
+from sejax.options import ConfigError
 
 
 def outcome(test_return, train_steps, nonfinite):

@@ -20,8 +20,7 @@ from sejax.agents.sac import SACConfig
 from sejax.agents.tabular import QLearningConfig, SARSAConfig
 from sejax.agents.td3 import DiscreteTD3Config, TD3Config
 from sejax.agents.varied import ranges_of
-from sejax.errors import ConfigError
-from sejax.options import Options, option, traced_options
+from sejax.options import ConfigError, Options, option, traced_options
 
 NAN, INF = float("nan"), float("inf")
 
@@ -56,42 +55,36 @@ def message(cls=Config, **fields):
 
 
 @pytest.mark.parametrize(
-    ("field", "value", "said"),
+    ("field", "values"),
     [
-        ("size", 0, "be at least 1, because it is a size; got 0. Set group.size=4."),
-        ("size", NAN, "be at least 1, because it is a size; got nan. Set group.size=4."),
-        ("size", True, "be at least 1, because it is a size; got True. Set group.size=4."),
-        ("size", "3", "be at least 1, because it is a size; got 3. Set group.size=4."),
-        ("size", None, "be at least 1, because it is a size; got None. Set group.size=4."),
-        ("size", 2**31, "be at most 2147483647, because it is counted in 32 bits; got 2147483648. "
-                        "Set group.size=4."),
-        ("episodes", -1, "be at least 0, because it counts episodes; got -1. "
-                         "Set group.episodes=2."),
-        ("limit", 0, "be at least 1, because something must happen; got 0. Set group.limit=null."),
-        ("window", 0, "be at least 1, because it is a length; got 0. Set group.window=8."),
-        ("weight", -0.1, "be at least 0, because it is a weight; got -0.1. Set group.weight=0.5."),
-        ("weight", NAN, "be at least 0, because it is a weight; got nan. Set group.weight=0.5."),
-        ("rate", 0, "be above 0 and finite, because nothing would move; got 0. "
-                    "Set group.rate=0.1."),
-        ("rate", INF, "be above 0 and finite, because nothing would move; got inf. "
-                      "Set group.rate=0.1."),
-        ("rate", 11, "be at most 10, because the numbers that come of it would not be finite; "
-                     "got 11. Set group.rate=0.1."),
-        ("share", 1.5, "lie in [0, 1], because it is a fraction; got 1.5. Set group.share=0.9."),
-        ("share", -0.5, "lie in [0, 1], because it is a fraction; got -0.5. Set group.share=0.9."),
-        ("share", NAN, "lie in [0, 1], because it is a fraction; got nan. Set group.share=0.9."),
-        ("goal", INF, "be finite, because it is aimed at; got inf. Set group.goal=-1.0."),
-        ("goal", NAN, "be finite, because it is aimed at; got nan. Set group.goal=-1.0."),
-        ("goal", "low", "be finite, because it is aimed at; got low. Set group.goal=-1.0."),
-        ("decay", 0, "lie in (0, 1], because it shrinks each generation; got 0. "
-                     "Set group.decay=1."),
-        ("decay", 1.5, "lie in (0, 1], because it shrinks each generation; got 1.5. "
-                       "Set group.decay=1."),
-        ("kind", "fency", "be one of fancy, plain; got 'fency'. Did you mean group.kind=fancy?"),
+        ("size", [0, NAN, True, "3", None, 2**31, 1.5]),
+        ("episodes", [-1, NAN]),
+        ("limit", [0, "x"]),
+        ("window", [0]),
+        ("weight", [-0.1, NAN, INF, 1e31]),
+        ("rate", [0, -1, INF, NAN, 11, 5e-324, "x"]),
+        ("share", [1.5, -0.5, NAN]),
+        ("goal", [INF, NAN, "low", -1e300]),
+        ("decay", [0, 1.5, NAN]),
+        ("kind", ["fency", None, 3]),
     ],
-)  # fmt: skip
-def test_a_value_that_breaks_its_rule_is_refused_with_the_whole_message(field, value, said):
-    assert message(**{field: value}) == f"group.{field} must {said}"
+)
+def test_a_value_that_breaks_its_rule_is_refused(field, values):
+    for value in values:
+        with pytest.raises(ConfigError) as error:
+            Config(**{field: value})
+        assert error.value.field == f"group.{field}"
+        assert f"group.{field}=" in str(error.value)  # how to mend it
+
+
+def test_a_whole_message():
+    assert message(size=0) == (
+        "group.size must be a whole number from 1 to 2147483647, because it is a size; got 0. "
+        "Set group.size=4."
+    )
+    assert message(kind="fency") == (
+        "group.kind must be one of fancy, plain; got 'fency'. Did you mean group.kind=fancy?"
+    )
 
 
 @pytest.mark.parametrize(
@@ -108,22 +101,7 @@ def test_a_value_that_breaks_its_rule_is_refused_with_the_whole_message(field, v
 def test_a_value_at_the_edge_of_its_rule_is_taken(fields):
     config = Config(**fields)
     for name, value in fields.items():
-        assert getattr(config, name) is value
-
-
-def test_a_rule_says_why_if_it_is_told_nothing_else():
-    @dataclasses.dataclass(frozen=True, kw_only=True)
-    class Plain(Options):
-        count: int = option(3, options.counts())
-        size: float = option(1.0, options.not_negative())
-
-    assert message(Plain, count=0) == (
-        "count must be at least 1, because there is nothing to learn from or with otherwise; "
-        "got 0. Set count=3."
-    )
-    assert message(Plain, size=-1) == (
-        "size must be at least 0, because it is a size; got -1. Set size=1.0."
-    )
+        assert getattr(config, name) == value or value != value
 
 
 def test_the_first_field_that_breaks_its_rule_is_named():
@@ -138,7 +116,7 @@ def test_a_dataclass_of_ones_own_can_be_checked_by_hand():
         anything: int = 0
 
     config = Foreign(size=0, anything=-5)  # it does not check itself
-    with pytest.raises(ConfigError, match=r"^mine\.size must be at least 1, because it is a size"):
+    with pytest.raises(ConfigError, match=r"^mine\.size must "):
         options.check(config, "mine")
     options.check(Foreign(), "mine")
 
@@ -231,7 +209,7 @@ def test_a_subclass_that_changes_a_default_keeps_rule_and_marks():
         learning_rate: float = 0.5
 
     assert traced_options(Mine())["learning_rate"] == 0.5
-    with pytest.raises(ConfigError, match=r"agent\.learning_rate must be above 0.*=0\.5\."):
+    with pytest.raises(ConfigError, match=r"agent\.learning_rate must .*=0\.5\."):
         Mine(learning_rate=0)
     assert list(ranges_of(Mine())) == ["learning_rate", "discount"]
 
@@ -255,3 +233,9 @@ def test_errors_name_the_field_and_survive_pickling():  # workers on other machi
         sejax.DDQNConfig(batch_size=0)
     assert raised.value.field == "agent.batch_size"
     assert pickle.loads(pickle.dumps(raised.value)).field == "agent.batch_size"
+
+
+def test_the_comments_of_fields_are_their_help_texts():
+    texts = options.help_texts(DDQNConfig)
+    assert texts["batch_size"] == "transitions"
+    assert set(texts) <= {field.name for field in dataclasses.fields(DDQNConfig)}

@@ -1,5 +1,6 @@
 """sejax.ops.parallel: the same results in the same order, however the work is spread."""
 
+import functools
 import os
 import subprocess
 import sys
@@ -9,9 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sejax.errors import ConfigError
 from sejax.ops.networks import MLP
 from sejax.ops.parallel import spread_groups_over_devices, spread_over_devices
+from sejax.options import ConfigError
 
 
 def work(key, x):
@@ -40,14 +41,6 @@ def test_results_come_back_in_order_for_every_size(num_devices, num_parallel):
                 np.testing.assert_allclose(got[name][i], value, rtol=1e-6)
 
 
-def test_the_number_of_devices_changes_no_bit():
-    keys = split(jax.random.key(0), 5)
-    xs = np.linspace(-3, 3, 10, dtype=np.float32).reshape(5, 2)
-    one, two = (jax.jit(spread_over_devices(work, n))(keys, xs) for n in (1, 2))
-    for name in one:
-        np.testing.assert_array_equal(one[name], two[name])
-
-
 NET = MLP(1, 8, 1, "tanh")
 INPUTS = np.random.default_rng(0).normal(size=(5, 16)).astype(np.float32)
 
@@ -71,21 +64,24 @@ def test_the_number_of_devices_changes_no_bit_of_a_trained_network(size, num_par
     keys = split(jax.random.key(0), size)
     one, two = (jax.jit(spread_over_devices(train_network, n, num_parallel))(keys) for n in (1, 2))
     jax.tree.map(np.testing.assert_array_equal, one, two)
-    # The lanes do what each does alone.
-    alone = jax.jit(train_network)(keys[-1])
-    jax.tree.map(lambda x, y: np.testing.assert_allclose(x[-1], y, rtol=1e-4, atol=1e-6),
-                 one, alone)  # fmt: skip
+    last = jax.tree.map(lambda x: x[-1], one)
+    by_itself = jax.jit(train_network)(keys[-1])
+    jax.tree.map(
+        functools.partial(np.testing.assert_allclose, rtol=1e-4, atol=1e-6), last, by_itself
+    )
 
 
 @pytest.mark.parametrize("num_devices", [1, 2])
 @pytest.mark.parametrize("num_parallel", [None, 2])
-def test_groups_have_a_function_a_size_and_lanes_each(num_devices, num_parallel):
+def test_groups_have_a_function_a_size_and_a_width_each(num_devices, num_parallel):
     def scaled(x):
         return {"scaled": 3 * x}
 
     sizes = (5, 1, 4)
-    groups = [(split(jax.random.key(i), n), np.arange(2.0 * n, dtype=np.float32).reshape(n, 2))
-              for i, n in enumerate(sizes)]  # fmt: skip
+    groups = [
+        (split(jax.random.key(i), n), np.arange(2.0 * n, dtype=np.float32).reshape(n, 2))
+        for i, n in enumerate(sizes)
+    ]
     spread = spread_groups_over_devices(
         [work, scaled, work], num_devices, num_parallel, [1, None, 3]
     )
@@ -105,11 +101,7 @@ def test_two_devices_share_the_work():
 
 def test_more_devices_than_there_are_is_refused():
     count = jax.device_count()
-    with pytest.raises(
-        ConfigError,
-        match=rf"^devices must be at most {count}, because that is how many there are; "
-        rf"got {count + 1}\. Set devices=null\.$",
-    ):
+    with pytest.raises(ConfigError, match=rf"^devices must be at most {count}, .*{count + 1}"):
         spread_over_devices(work, count + 1)
 
 

@@ -31,9 +31,9 @@ from sejax.agents.ppo import (
     ppo_loss,
     shuffled,
 )
-from sejax.errors import ConfigError
 from sejax.evaluation import make_tester
 from sejax.ops.networks import MLP
+from sejax.options import ConfigError
 from sejax.training import TrainingConfig, make_trainer
 
 OBS_DIM, NUM_ACTIONS, ACTION_DIM, MAX_ACTION, MAX_STEPS = 3, 4, 2, 2.0, 6

@@ -10,8 +10,8 @@ from experiments.common.reward_networks import STUDIES
 from sejax import registry
 from sejax.agents.dqn import DDQNConfig
 from sejax.agents.ppo import PPOConfig
-from sejax.cli import presets
-from sejax.errors import ConfigError
+from sejax.cli import config as configuration
+from sejax.options import ConfigError
 from sejax.training import TrainingConfig
 
 composed_with = functools.cache(lambda *overrides: sejax.config(overrides))
@@ -228,23 +228,23 @@ def test_ppo_on_ses_is_the_default(env):
 
 
 def test_what_is_tuned_is_known():
-    assert presets.names() == ["best", "paper", "paper_performance", "soft"]
-    assert presets.tuned("rn") == [
+    assert configuration.preset_names() == ["best", "paper", "paper_performance", "soft"]
+    assert configuration.tuned("rn") == [
         "cartpole", "cliff_walking", "halfcheetah", "mountain_car_continuous", "pendulum",
     ]  # fmt: skip
-    assert presets.tuned("se", "paper") == ["acrobot", "cartpole"]
-    assert presets.is_tuned("acrobot", "se") and not presets.is_tuned("acrobot", "rn")
+    assert configuration.tuned("se", "paper") == ["acrobot", "cartpole"]
+    assert configuration.is_tuned("acrobot", "se") and not configuration.is_tuned("acrobot", "rn")
 
 
 def test_every_file_is_of_a_task_and_proxy_and_has_settings_of_known_choices():
-    for path in presets.FOLDER.glob("*.yaml"):
+    for path in configuration.PRESETS.glob("*.yaml"):
         env, _, proxy = path.stem.rpartition("-")
         assert proxy in registry.names("proxy")
-        assert env in (presets.GENERAL, *registry.names("env"))
-        kinds = {"tuned_agent": "agent", "tuned_es": "es", "tuned_objective": "objective"}
-        for preset, kind, choice, values in presets.settings(env, proxy):
-            assert preset in presets.names() and isinstance(values, dict)
-            assert choice in registry.names(kinds[kind]) if kind in kinds else choice == ""
+        assert env in (configuration.GENERAL, *registry.names("env"))
+        for name, section in configuration.preset_sections(env, proxy).items():
+            assert name in configuration.preset_names()
+            for group in ("agent", "es", "objective"):
+                assert set(section.get(f"with_{group}", {})) <= set(registry.names(group))
 
 
 def test_a_section_has_the_settings_of_the_one_it_is_like_where_it_says_nothing():
@@ -260,12 +260,9 @@ def test_a_section_has_the_settings_of_the_one_it_is_like_where_it_says_nothing(
 @pytest.mark.parametrize("proxy", ["se", "rn"])
 def test_a_task_without_a_file_has_general_settings(proxy):
     composed = composed_with("env=gymnax/MountainCar-v0", f"proxy={proxy}")
-    (general,) = [
-        values for preset, kind, _, values in presets.settings("gymnax/MountainCar-v0", proxy)
-        if (preset, kind) == ("best", "tuned")
-    ]  # fmt: skip
+    general = configuration.preset_sections("general", proxy)["best"]
     assert composed.generations == general["generations"]
     for name, value in general["training"].items():
         assert getattr(composed.training, name) == value
-    with pytest.raises(ConfigError, match=r"preset must be one .*cartpole.* Set preset=best, or"):
+    with pytest.raises(ConfigError, match=r"preset must be one .*cartpole.* Set preset=best"):
         sejax.config(["env=gymnax/MountainCar-v0", f"proxy={proxy}", "preset=paper"])

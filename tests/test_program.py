@@ -59,11 +59,11 @@ def test_a_single_training_neither_copies_nor_selects_its_buffer_and_its_curve(c
     assert_in_place(once.lower(*arguments(case)).compile().as_text(), MAX_EPISODES)
 
 
-def test_trainings_in_lanes_neither_copy_nor_select_their_buffers_and_curves(case):
+def test_vmapped_trainings_neither_copy_nor_select_their_buffers_and_curves(case):
     train, _, params = case
-    num_parallel = jax.jit(jax.vmap(train, (0, None)))
+    vmapped = jax.jit(jax.vmap(train, (0, None)))
     keys = jax.random.split(jax.random.key(0), 3)
-    assert_in_place(num_parallel.lower(keys, params).compile().as_text(), MAX_EPISODES)
+    assert_in_place(vmapped.lower(keys, params).compile().as_text(), MAX_EPISODES)
 
 
 def test_the_checker_finds_the_select_of_a_plainly_vmapped_loop():

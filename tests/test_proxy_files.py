@@ -1,7 +1,9 @@
-"""sejax.proxies.files: proxies come back as they were, and what is no proxy is one message."""
+"""Stored proxies come back as they were, and what is not a proxy is one message."""
 
+import copy
 import dataclasses
 import errno
+import functools
 import json
 import math
 import sys
@@ -15,10 +17,10 @@ from safetensors.numpy import save_file
 
 import sejax
 from sejax import envs, registry
-from sejax.envs import absent
-from sejax.errors import ConfigError
 from sejax.ops.checksummed import pack, unpack
-from sejax.proxies import files, stored
+from sejax.options import ConfigError
+from sejax.proxies import header
+from sejax.proxies.base import absent_task
 from sejax.proxies.configs import RewardConfig, SyntheticConfig
 
 CONFIG = {"preset": "best", "agent": {"name": "q_learning", "discount": 0.7}, "run_dir": "/home/me"}
@@ -51,20 +53,19 @@ def assert_same_weights(a, b):
         np.testing.assert_array_equal(x, y)
 
 
-def flat(weights):
-    return {f"potential/{layer}/{name}": np.asarray(x)
-            for layer, leaves in weights["potential"].items()
-            for name, x in leaves.items()}  # fmt: skip
-
-
-def header_of(path):
-    return unpack(path.read_bytes(), "sejax")
-
-
 def rewrite(path, change):
-    """The same file, whole and checksummed, with other metadata or tensors."""
-    tensors, header = header_of(path)
-    path.write_bytes(pack(*change(tensors, header)))
+    """The same file, whole and with a right checksum, with other tensors or metadata."""
+    tensors, values = unpack(path.read_bytes(), "sejax")
+    path.write_bytes(pack(*change(tensors, values)))
+
+
+def refusal(load, *args, **kwargs):
+    """The error that a call raises: one short message that names a field."""
+    with pytest.raises(ConfigError) as caught:
+        load(*args, **kwargs)
+    message = str(caught.value)
+    assert "\n" not in message and len(message) < 450
+    return caught.value
 
 
 # --- round trips ---------------------------------------------------------------------------------
@@ -76,21 +77,24 @@ def test_a_proxy_that_is_saved_and_loaded_is_the_same(path, env, weights):
     assert loaded.config == env.config and loaded.default_params is params
     assert_same_weights(params.weights, weights[0])
     assert params.discount == 0.7
-    proxy = files.load_proxy(path.parent)  # a folder with it
+    proxy = sejax.load_proxy(path.parent)  # a folder with it
     assert proxy.record == {"score": 12.5, "generation": 7, "seed": 3}
     assert proxy.task is envs.make("gridworld_2x2") and proxy.path == path
     known = {"env": {"name": "gridworld_2x2"}, "proxy": registry.describe("proxy", env.config)}
     assert proxy.config == CONFIG | known | {"run_dir": None}  # no path of a machine
-    assert files.read_config(path) == proxy.config
+    assert header.read_config(path) == proxy.config
     assert proxy.learned_with("agent") == sejax.QLearningConfig(discount=0.7)
 
 
 def test_a_proxy_needs_no_configuration_and_no_record(tmp_path, env, weights):
-    sejax.save(tmp_path / "bare.safetensors", env, weights[1], discount=0.7)
-    proxy = files.load_proxy(tmp_path / "bare.safetensors")
+    path = tmp_path / "bare.safetensors"
+    sejax.save(path, env, weights[1], discount=0.7)
+    proxy, proxies = sejax.load_proxy(path), sejax.load_set(path)
     assert proxy.record == {} and proxy.params.discount == 0.7
-    proxies = sejax.load_set(tmp_path / "bare.safetensors")
     assert np.isnan(proxies.scores) and proxies.seeds == [-1]
+    assert refusal(proxy.learned_with, "agent").field == "agent"
+    assert refusal(sejax.training_of, proxy).field == "training"
+    assert refusal(proxy.learned_with, "training").field == "group"
 
 
 def test_a_loaded_proxy_steps_as_a_gymnax_environment():
@@ -108,37 +112,32 @@ def test_a_set_that_is_saved_and_loaded_is_the_same(tmp_path, env, weights):
                for i, score in enumerate((0.5, 0.9, -0.1))]  # fmt: skip
     sejax.save_set(path, env, weights, records, CONFIG, 0.7)
     proxies = sejax.load_set(path)
-    assert proxies.env is env and proxies.size == 3 and proxies.task is env.task
+    assert proxies.env is env and len(proxies) == 3 and proxies.task is env.task
     assert proxies.records == tuple(records) and proxies.discount == 0.7
     assert proxies.scores.tolist() == [0.5, 0.9, -0.1] and proxies.seeds.tolist() == [5, 6, 7]
-    for i in range(3):
-        assert_same_weights(proxies.one(i).weights, weights[i])
-        assert proxies.proxy(i).record == records[i] and proxies.one(i).discount == 0.7
-    assert proxies.params.weights["potential"]["Dense_0"]["kernel"].shape == (3, 2, 4)
-    with pytest.raises(ConfigError, match=r"source must be a single proxy, .* a set of 3\."):
-        sejax.load(path)
+    for proxy, expected, record in zip(proxies, weights, records, strict=True):
+        assert_same_weights(proxy.params.weights, expected)
+        assert proxy.record == record and proxy.params.discount == 0.7
+    assert refusal(sejax.load, path).field == "source"
 
 
 def test_parts_of_a_set_are_chosen_by_score_and_place(tmp_path, env, weights):
     path = tmp_path / "set.safetensors"
-    sejax.save_set(
-        path, env, weights, [{"score": s, "seed": i} for i, s in enumerate((0.5, 0.9, 0.8))],
-        discount=0.7,
-    )  # fmt: skip
+    records = [{"score": score, "seed": i} for i, score in enumerate((0.5, 0.9, 0.8))]
+    sejax.save_set(path, env, weights, records, discount=0.7)
     proxies = sejax.load_set(path)
     assert proxies.ranked(2).seeds.tolist() == [1, 2]
     assert proxies.ranked(2, worst=True).seeds.tolist() == [0, 2]
-    assert proxies.solved().seeds.tolist() == [1, 2]  # at 0.8
-    assert proxies.first(2).seeds.tolist() == [0, 1] and proxies.first(None).size == 3
-    chosen = proxies.select([2, 0])
-    assert_same_weights(chosen.one(0).weights, weights[2])
-    assert chosen.fingerprint(0) == proxies.fingerprint(2) != proxies.fingerprint(0)
+    assert proxies[proxies.scores >= 0.8].seeds.tolist() == [1, 2]
+    assert proxies[:2].seeds.tolist() == [0, 1]
+    chosen = proxies[[2, 0]]
+    assert_same_weights(chosen[0].params.weights, weights[2])
+    assert chosen[0].fingerprint == proxies[2].fingerprint != proxies[0].fingerprint
 
 
 def test_a_kind_may_be_asked_for(path):
-    assert files.load_set(path, kind="rn").size == 1
-    with pytest.raises(ConfigError, match=r"^--ses must hold proxies learned with proxy=se, .*=rn"):
-        files.load_set(path, option="--ses", kind="se")
+    assert len(sejax.load_set(path, kind="rn")) == 1
+    assert refusal(sejax.load_set, path, option="--ses", kind="se").field == "--ses"
 
 
 def test_registering_with_gymnax_is_idempotent():
@@ -152,53 +151,31 @@ def test_registering_with_gymnax_is_idempotent():
         assert jnp.array_equal(jax.tree.leaves(params)[0], jax.tree.leaves(shipped)[0])
 
 
-# --- files of version 1 --------------------------------------------------------------------------
-
-
-def version_1(**header):
-    env = {"name": "gridworld_2x2", "backend": None, "goal_reward": None}
-    proxy = {"name": "rn", "hidden_size": 2, "num_layers": 1, "activation": "prelu",
-             "variant": "exclusive_potential", "augmented": False,
-             "zero_at_terminal": False}  # fmt: skip
-    objective = {"name": "max_reward", "unsolved_weight": 100.0}
-    config = {"env": env, "proxy": proxy, "objective": objective,
-              "agent": {"name": "q_learning", "discount": 0.7}}  # fmt: skip
-    return {"format_version": 1, "config": config, **header}
-
-
-@pytest.mark.parametrize("name", files.pretrained_names())
+@pytest.mark.parametrize("name", header.pretrained_names())
 def test_shipped_proxies_load(name):
-    proxy = files.load_proxy(name)
-    assert proxy.path.parent == files.PRETRAINED_DIR
-    for group in ("exploration", "es", "objective", "training"):
+    proxy = sejax.load_proxy(name)
+    assert proxy.path.parent == header.PRETRAINED_DIR
+    for group in ("exploration", "es", "objective"):
         assert proxy.learned_with(group) is not None
+    assert sejax.training_of(proxy).max_episodes > 0
     agents = proxy.learned_agents()
-    # Of the first family; the Boltzmann policy, which looks no further than a step, has none.
+    # Of the first agent; the Boltzmann policy, which looks no further than a step, has none.
     assert proxy.discount == getattr(agents[next(iter(agents))], "discount", 1.0)
-    assert {"score", "generation", "seed", "evaluations", "card"} <= proxy.record.keys()
+    assert {"score", "generation", "seed", "evaluations"} <= proxy.record.keys()
 
 
-def test_a_proxy_of_version_1_loads(tmp_path, env, weights):
-    path = tmp_path / "old.safetensors"
-    header = version_1(score=0.5, generation=3, seed=8, note="kept")
-    save_file(flat(weights[0]), path, metadata={"sejax": json.dumps(header)})
-    proxy = files.load_proxy(path)
-    assert proxy.env.config == env.config and proxy.params.discount == 0.7
-    assert_same_weights(proxy.params.weights, weights[0])
-    assert proxy.record == {"score": 0.5, "generation": 3, "seed": 8, "note": "kept"}
-    assert proxy.learned_with("objective") == sejax.MaxReward()
-    assert registry.name_of("exploration", proxy.learned_with("exploration")) == "none"
+def test_fields_of_older_versions_are_read_by_their_new_names(path, env, weights):
+    agent = {"name": "ddqn", "target_update_rate": 0.25}
+    sejax.save(path, env, weights[0], {"agent": agent}, 0.7)
+    assert sejax.load_proxy(path).learned_with("agent").tau == 0.25
 
 
-def test_a_set_of_version_1_loads(tmp_path, env, weights):
-    path = tmp_path / "old.safetensors"
-    header = version_1(scores=[0.5, 0.9, 0.1], generations=[1, 2, 3], seeds=[0, 1, 2])
-    tensors = {name: np.stack([flat(one)[name] for one in weights]) for name in flat(weights[0])}
-    save_file(tensors, path, metadata={"sejax_set": json.dumps(header)})
-    proxies = sejax.load_set(path)
-    assert proxies.env is env and proxies.discount == 0.7
-    assert proxies.records[1] == {"score": 0.9, "generation": 2, "seed": 1}
-    assert_same_weights(proxies.one(2).weights, weights[2])
+@pytest.mark.slow
+def test_every_stored_result_loads():
+    files = sorted((header.PRETRAINED_DIR.parents[1] / "results").rglob("*.safetensors"))
+    assert len(files) > 50
+    for file in files:
+        assert len(sejax.load_set(file)) >= 1
 
 
 # --- damage --------------------------------------------------------------------------------------
@@ -207,7 +184,7 @@ def test_a_set_of_version_1_loads(tmp_path, env, weights):
 def test_every_flipped_bit_is_noticed(path):
     """Of the weights and of the version; of the rest one bit in each byte, to save time."""
     whole = path.read_bytes()
-    files.read_config(path)
+    header.read_config(path)
     weights = 8 + int.from_bytes(whole[:8], "little")
     version = whole.index(b"format_version")
     every = {*range(8), *range(version, version + 24), *range(weights, len(whole))}
@@ -217,105 +194,67 @@ def test_every_flipped_bit_is_noticed(path):
             damaged[position] ^= 1 << bit
             path.write_bytes(damaged)
             with pytest.raises(ConfigError, match=r"^source must be "):
-                files.read_config(path)
+                header.read_config(path)
 
 
-def test_a_file_that_is_cut_or_longer_is_refused_with_the_way_out(path):
+def test_a_file_that_is_damaged_or_foreign_is_refused(path, tmp_path):
     whole = path.read_bytes()
     for damaged in (whole[:-20], whole[:40], b"", whole + b"x"):
         path.write_bytes(damaged)
-        with pytest.raises(ConfigError, match=r"whole safetensors file.*which is damaged.*anew fr"):
-            sejax.load(path)
+        assert refusal(sejax.load, path).field == "source"
+    foreign = tmp_path / "x.safetensors"
+    save_file({"x": np.zeros(3)}, foreign)
+    assert "damaged or of another format" in str(refusal(sejax.load, foreign))
+    with path.open("wb") as sparse:  # which would not fit into memory
+        sparse.truncate(10**12)
+    assert "1,000,000,000,000 bytes" in str(refusal(sejax.load, path))
 
 
-def test_a_foreign_safetensors_file_is_refused(tmp_path):
-    save_file({"x": np.zeros(3)}, tmp_path / "x.safetensors")
-    with pytest.raises(ConfigError, match="a file that sejax has written"):
-        sejax.load(tmp_path / "x.safetensors")
-
-
-def nested(depth):
-    value = []
-    for _ in range(depth):
-        value = [value]
-    return value
-
-
-def without(*names):
-    return lambda header: {k: v for k, v in header.items() if k not in names}
-
-
-@pytest.mark.parametrize(
-    "change",
-    [
-        *(without(name) for name in
-          ("format_version", "config", "task", "is_set", "proxies", "discount")),
-        lambda header: header | {"config": without("env")(header["config"])},
-        lambda header: header | {"config": without("proxy")(header["config"])},
-        *(lambda header, value=value: header | {"config": value} for value in (None, [], 3)),
-        *(lambda header, value=value: header | {"config": header["config"] | {"env": value}}
-          for value in (None, [], "cartpole", {}, {"name": 3}, {"name": None}, {"name": ["x"]},
-                        {"name": "gridworld_2x2", "new": 1})),
-        *(lambda header, value=value: header | {"config": header["config"] | {"proxy": value}}
-          for value in (None, {"name": "rn", "hidden_size": "2"}, {"name": "rn", "new": 1})),
-        *(lambda header, value=value: header | {"proxies": value}
-          for value in (None, [], [None], [3], {}, 3, [{"score": None}], [{"score": "x"}],
-                        [{"seed": None}], [{"seed": []}])),
-        *(lambda header, value=value: header | {"discount": value}
-          for value in (None, "x", [], math.nan, -0.1, 1.5)),
-        *(lambda header, value=value: header | {"format_version": value}
-          for value in (None, 0, 3, "2", 2.5, [], True)),
-        *(lambda header, value=value: header | {"interface": header["interface"] | value}
-          for value in ({"max_steps": 0}, {"max_steps": "9"}, {"action": None},
-                        {"action": "n"}, {"action": {"n": 0}}, {"action": {"n": 2.0}},
-                        {"action": {"n": 2**40}}, {"action": {"low": [0], "high": []}},
-                        {"action": {"low": [], "high": []}}, {"action": {"low": [0]}},
-                        {"action": {"low": ["x"], "high": [1]}},
-                        {"action": {"low": [1], "high": [0]}},
-                        {"action": {"low": [math.nan], "high": [1]}},
-                        {"action": {"low": [10**400], "high": [1]}})),
-        lambda header: header | {"interface": None},
-        lambda header: header | {"format_version": "9" * 10_000},
-        lambda header: header | {"task": None},
-        lambda header: header | {"task": "t" * 10_000},
-        lambda header: header | {"is_set": "yes"},
-        lambda header: header | {"is_set": None},
+MISSING = object()
+ODD_VALUES = {  # of entries of the metadata, by their place
+    ("format_version",): [MISSING, None, 0, 1, 3, "x", 2.5, [], True, "9" * 10_000],
+    ("config",): [MISSING, None, [], 3],
+    ("config", "env"): [MISSING, None, [], "cartpole", {}, {"name": 3}, {"name": None},
+                        {"name": ["x"]}, {"name": "gridworld_2x2", "new": 1}],
+    ("config", "proxy"): [MISSING, None, {"name": "rn", "hidden_size": "x"},
+                          {"name": "rn", "new": 1}],
+    ("task",): [MISSING, None, [], "t" * 10_000],
+    ("is_set",): [MISSING, None, "yes", 2],
+    ("proxies",): [MISSING, None, [], [None], [3], {}, 3, [{"score": None}], [{"score": "x"}],
+                   [{"seed": None}], [{"seed": []}]],
+    ("discount",): [MISSING, None, "x", [], math.nan, -0.1, 1.5],
+    ("interface",): [MISSING, None, []],
+    ("interface", "max_steps"): [MISSING, 0, "9"],
+    ("interface", "action"): [
+        MISSING, None, "n", {"n": 0}, {"n": 2.0}, {"n": 2**40}, {"low": [0], "high": []},
+        {"low": [], "high": []}, {"low": [0]}, {"low": ["x"], "high": [1]},
+        {"low": [1], "high": [0]}, {"low": [math.nan], "high": [1]},
+        {"low": [10**400], "high": [1]},
     ],
-)  # fmt: skip
-def test_metadata_of_another_shape_is_one_message(path, change):
+}  # fmt: skip
+
+
+def test_metadata_of_another_shape_is_one_message(path):
     """Whole files, written by somebody who has another idea of what stands in them."""
-    rewrite(path, lambda tensors, header: (tensors, "sejax", change(header)))
-    with pytest.raises(ConfigError) as error:
-        sejax.load(path)
-    said = str(error.value)
-    assert "\n" not in said and len(said) < 2000
+    tensors, whole = unpack(path.read_bytes(), "sejax")
+    for place, odd_values in ODD_VALUES.items():
+        for value in odd_values:
+            values = copy.deepcopy(whole)
+            *groups, name = place
+            entry = functools.reduce(dict.__getitem__, groups, values)
+            entry[name] = value
+            if value is MISSING:
+                del entry[name]
+            path.write_bytes(pack(tensors, "sejax", values))
+            refusal(sejax.load, path)
 
 
-@pytest.mark.parametrize(
-    "text",
-    ["null", "[]", "3", '"x"', "{}", "", "{", "NaN", '{"format_version": 1}', "[" * 100_000,
-     json.dumps({"format_version": 1, "config": None}),
-     json.dumps(version_1(score=None)), json.dumps(version_1() | {"config": {"env": {}}})],
-    ids=lambda text: text[:30],
-)  # fmt: skip
-def test_metadata_that_is_something_else_is_one_message(tmp_path, weights, text):
+@pytest.mark.parametrize("text", ["null", "[]", "3", '"x"', "{}", "", "{", "NaN", "[" * 100_000],
+                         ids=lambda text: text[:30])  # fmt: skip
+def test_metadata_that_is_something_else_is_one_message(tmp_path, text):
     path = tmp_path / "proxy.safetensors"
-    save_file(flat(weights[0]), path, metadata={"sejax": text})
-    with pytest.raises(ConfigError, match=r"a file that sejax has written.*Learn it again\.$"):
-        sejax.load(path)
-
-
-@pytest.mark.parametrize("column", ["scores", "generations", "seeds"])
-@pytest.mark.parametrize("value", [None, 3, [1.0], [None] * 3, ["x"] * 3])
-def test_columns_of_a_set_of_version_1_that_are_none_are_one_message(
-    tmp_path, weights, column, value
-):
-    path = tmp_path / "set.safetensors"
-    header = version_1(scores=[0.5] * 3, generations=[1] * 3, seeds=[0, 1, 2]) | {column: value}
-    tensors = {name: np.stack([flat(one)[name] for one in weights]) for name in flat(weights[0])}
-    save_file(tensors, path, metadata={"sejax_set": json.dumps(header)})
-    with pytest.raises(ConfigError, match=r"a file that sejax has written"):
-        sejax.load_set(path)
+    save_file({"x": np.zeros(3)}, path, metadata={"sejax": text})
+    assert refusal(sejax.load, path).field == "source"
 
 
 @pytest.mark.parametrize(
@@ -333,42 +272,27 @@ def test_columns_of_a_set_of_version_1_that_are_none_are_one_message(
     ],
 )
 def test_tensors_that_are_not_the_networks_are_one_message(path, change):
-    rewrite(path, lambda tensors, header: (change(tensors), "sejax", header))
-    with pytest.raises(ConfigError, match=r"must hold the tensors of the network") as error:
-        sejax.load(path)
-    assert len(str(error.value)) < 2000
+    rewrite(path, lambda tensors, values: (change(tensors), "sejax", values))
+    assert "tensors" in str(refusal(sejax.load, path))
 
 
-def test_tensors_of_another_shape_are_refused(path):
-    def with_a_larger_network(tensors, header):
-        config = header["config"]
-        proxy = config["proxy"] | {"hidden_size": 3}
-        return tensors, "sejax", header | {"config": config | {"proxy": proxy}}
-
-    rewrite(path, with_a_larger_network)
-    with pytest.raises(ConfigError, match="must hold the tensors of the network"):
-        sejax.load(path)
-
-
-@pytest.mark.parametrize("given, said", [
-    ({"weights": {"potential": {}}}, r"^weights must have the shapes \{.*Reward-gridworld"),
-    ({"weights": RewardConfig}, r"^weights must be nested dict.*Set weights to params\.weights"),
-    ({"discount": None}, r"^discount must be given for a potential-based.*=params\.discount"),
-    ({"discount": 5.0}, r"^config, discount and record must be plain .*outside of \[0, 1"),
-    ({"score": "high"}, r"^config, discount and record must be plain values"),
-    ({"config": sejax.NESConfig()}, r"^config must be nested plain values.*\.plain\(\)"),
-    ({"config": {"es": sejax.NESConfig()}}, r"^config, discount and record must be plain values"),
+@pytest.mark.parametrize("given, field", [
+    ({"env": "cartpole"}, "env"),
+    ({"weights": {"potential": {}}}, "weights"),
+    ({"weights": RewardConfig}, "weights"),
+    ({"discount": None}, "discount"),
+    ({"discount": 5.0}, "config"),
+    ({"score": "high"}, "config"),
+    ({"config": sejax.NESConfig()}, "config"),
+    ({"config": {"es": sejax.NESConfig()}}, "config"),
 ])  # fmt: skip
-def test_what_could_not_be_loaded_is_not_saved_over_what_can(path, env, weights, given, said):
+def test_what_could_not_be_loaded_is_not_saved_over_what_can(path, env, weights, given, field):
     before = path.read_bytes()
-    given = {"weights": weights[1], "discount": 0.7} | given
-    with pytest.raises(ConfigError, match=said):
-        sejax.save(path, env, **given)
-    with pytest.raises(ConfigError, match=r"^records must be one for each proxy, .*1 for 2"):
-        sejax.save_set(path, env, weights[:2], [{}], discount=0.7)
-    given = jax.tree.map(lambda x: x.at[..., 0].set(jnp.nan), weights[1])
-    with pytest.raises(ConfigError, match=r"^weights must be finite, .*others in potential/Dense"):
-        sejax.save(path, env, given, discount=0.7)
+    given = {"env": env, "weights": weights[1], "discount": 0.7} | given
+    assert refusal(sejax.save, path, **given).field == field
+    assert refusal(sejax.save_set, path, env, weights[:2], [{}], discount=0.7).field == "records"
+    odd = jax.tree.map(lambda x: x.at[..., 0].set(jnp.nan), weights[1])
+    assert refusal(sejax.save, path, env, odd, discount=0.7).field == "weights"
     assert path.read_bytes() == before
 
 
@@ -376,18 +300,17 @@ def test_doubles_and_arrays_of_one_number_are_saved_as_floats_and_numbers(path, 
     doubles = jax.tree.map(lambda x: np.asarray(x, np.float64), weights[1])
     record = {"score": jnp.float32(0.5), "seed": np.int64(3)}
     sejax.save(path, env, doubles, discount=np.float32(0.5), **record)
-    assert files.load_proxy(path).record == {"score": 0.5, "seed": 3}
-    assert_same_weights(files.load_proxy(path).params.weights, weights[1])
+    assert sejax.load_proxy(path).record == {"score": 0.5, "seed": 3}
+    assert_same_weights(sejax.load_proxy(path).params.weights, weights[1])
 
 
 def test_tensors_of_types_that_numpy_lacks_are_refused(path):
-    tensors, header = header_of(path)
-    data = pack({name: x.astype(np.uint8) for name, x in tensors.items()}, "sejax", header)
+    tensors, values = unpack(path.read_bytes(), "sejax")
+    data = pack({name: x.astype(np.uint8) for name, x in tensors.items()}, "sejax", values)
     data = data.replace(b'"U8"', b'"F8_E5M2"', 1)  # longer by 5: taken from the padding's count
     size = int.from_bytes(data[:8], "little") + 5
     path.write_bytes(size.to_bytes(8, "little") + data[8:])
-    with pytest.raises(ConfigError, match="which is damaged"):
-        sejax.load(path)
+    assert "damaged" in str(refusal(sejax.load, path))
 
 
 def test_a_full_disk_is_an_oserror_and_the_older_file_stays(path, env, weights, monkeypatch):
@@ -397,7 +320,7 @@ def test_a_full_disk_is_an_oserror_and_the_older_file_stays(path, env, weights, 
         raise OSError(errno.ENOSPC, "No space left on device")
 
     with monkeypatch.context() as patch:
-        patch.setattr("sejax.ops.files.os.write", full)
+        patch.setattr("sejax.ops.files.os.fsync", full)
         with pytest.raises(OSError, match="No space left"):
             sejax.save(path, env, weights[1], discount=0.7)
         with pytest.raises(OSError, match="No space left"):
@@ -414,14 +337,13 @@ def test_interpolations_in_metadata_are_plain_text(path, tmp_path, env, weights,
     text = "${oc.env:SECRET}"
     config = CONFIG | {"preset": text, "agent": {"name": "q_learning", "note": text}}
     sejax.save(path, env, weights[0], config, 0.7, note=text)
-    proxy = files.load_proxy(path)
+    proxy = sejax.load_proxy(path)
     assert proxy.config["preset"] == proxy.record["note"] == text
     again = tmp_path / "again.safetensors"
     sejax.save(again, env, proxy.params.weights, proxy.config, proxy.discount, **proxy.record)
     assert b"hush" not in again.read_bytes() and text.encode() in again.read_bytes()
-    rewrite(path, lambda tensors, header: (tensors, "sejax", header | {"task": text}))
-    with pytest.raises(ConfigError, match=r"one of \$\{oc\.env:SECRET\} in"):
-        sejax.load(path)
+    rewrite(path, lambda tensors, values: (tensors, "sejax", values | {"task": text}))
+    assert text in str(refusal(sejax.load, path))
 
 
 MINE = """
@@ -461,19 +383,12 @@ def mine(tmp_path, monkeypatch):
 
 def test_a_foreign_task_or_kind_is_never_imported_and_loads_if_it_is_given(mine):
     path, task, config = mine
-    stored = files.read_config(path)
+    stored = header.read_config(path)
     assert stored["env"] == {"name": "my_file_worlds:Room", "size": 3}
     assert stored["proxy"]["name"] == "my_file_worlds:Mine"
     before = set(sys.modules)
-    for given in ({}, {"task": task}):
-        with pytest.raises(
-            ConfigError, match=r"registered proxy if no proxy is given.*proxy_kind=my_fi"
-        ):
-            sejax.load(path, **given)
-    with pytest.raises(
-        ConfigError, match=r"registered env if no task is given.*env=my_file_worlds:R"
-    ):
-        sejax.load(path, proxy=config)
+    for given, field in (({}, "proxy"), ({"task": task}, "proxy"), ({"proxy": config}, "task")):
+        assert refusal(sejax.load, path, **given).field == field
     assert set(sys.modules) == before
     env, _ = sejax.load(path, task=task, proxy=config)
     assert env.task is task and env.config == config
@@ -481,29 +396,36 @@ def test_a_foreign_task_or_kind_is_never_imported_and_loads_if_it_is_given(mine)
 
 
 def test_a_task_given_must_be_that_of_the_proxy(path, tmp_path):
-    with pytest.raises(ConfigError, match=r"be a proxy of cliff_walking, .* one of gridworld_2x2"):
-        sejax.load(path, task=envs.make("cliff_walking"))
+    assert refusal(sejax.load, path, task=envs.make("cliff_walking")).field == "source"
     task = dataclasses.replace(envs.make("gridworld_2x2"), solved_reward=0.5)
-    assert files.load_proxy(path, task=task).task is task
+    assert sejax.load_proxy(path, task=task).task is task
     longer = dataclasses.replace(task, max_steps=task.max_steps + 1)
     assert sejax.load(path, task=longer)[0].task is longer  # an RN: the same dynamics
     se = tmp_path / "se.safetensors"
     env, weights = an_se_of(dataclasses.replace(envs.make("pendulum"), name="theirs", origin=None))
     sejax.save(se, env, weights)
-    for change, said in (({"max_steps": 7}, "max_steps of"),
-                         ({"env": envs.make("acrobot").env}, "observation of")):  # fmt: skip
+    for change in ({"max_steps": 7}, {"env": envs.make("acrobot").env}):
         other = dataclasses.replace(env.task, **{"params": None, "max_steps": 200} | change)
-        with pytest.raises(ConfigError, match=f"^task must have the {said}"):
-            sejax.load(se, task=other)
+        assert refusal(sejax.load, se, task=other).field == "task"
 
 
 def test_a_task_made_by_hand_must_be_given(tmp_path, env, weights):
     task = dataclasses.replace(env.task, name="by hand", origin=None)
     mine = env.config.make(task)
     sejax.save(tmp_path / "p.safetensors", mine, weights[0], discount=0.7)
-    with pytest.raises(ConfigError, match=r"proxy of a registered env if no task is given"):
-        sejax.load(tmp_path / "p.safetensors")
+    assert refusal(sejax.load, tmp_path / "p.safetensors").field == "task"
     assert sejax.load(tmp_path / "p.safetensors", task=task)[0].task is task
+
+
+@pytest.mark.parametrize("given, field", [
+    ({"task": "cartpole"}, "task"),
+    ({"proxy": "se"}, "proxy"),
+    ({"source": None}, "source"),
+    ({"source": 3}, "source"),
+    ({"source": "hf://" + "/" * 100}, "source"),
+])  # fmt: skip
+def test_arguments_of_another_type_are_refused(given, field):
+    assert refusal(sejax.load, **({"source": "cartpole"} | given)).field == field
 
 
 # --- without the task ----------------------------------------------------------------------------
@@ -528,12 +450,11 @@ def test_an_se_with_its_own_starts_needs_no_task(tmp_path):
     assert sejax.make_agent(sejax.TD3Config(), there.task)
     again = tmp_path / "again.safetensors"
     sejax.save(again, there, params.weights)
-    assert files.read_config(again)["env"] == files.read_config(path)["env"]
-    for use in (lambda: files.load_proxy(path).task, lambda: files.load_set(path).solved(),
+    assert header.read_config(again)["env"] == header.read_config(path)["env"]
+    for use in (lambda: sejax.load_proxy(path).task, lambda: sejax.load_set(path).task,
                 lambda: rollout(there.task.env, there.task.params, jax.random.key(0))):  # fmt: skip
-        with pytest.raises(ConfigError, match=r"proxy of a registered env if no task is given"):
-            use()
-    assert files.load_proxy(path, task=task).task is task
+        assert refusal(use).field == "task"
+    assert sejax.load_proxy(path, task=task).task is task
 
 
 def rollout(env, params, key, num_steps=4):
@@ -554,8 +475,7 @@ def rollout(env, params, key, num_steps=4):
 def test_what_runs_its_task_needs_it(tmp_path, made):
     env, weights = made(dataclasses.replace(envs.make("pendulum"), name="by hand", origin=None))
     sejax.save(tmp_path / "p.safetensors", env, weights, discount=0.7)
-    with pytest.raises(ConfigError, match=r"proxy of a registered env if no task is given"):
-        sejax.load(tmp_path / "p.safetensors")
+    assert refusal(sejax.load, tmp_path / "p.safetensors").field == "task"
 
 
 def an_rn_of(task):
@@ -571,7 +491,7 @@ def test_the_shipped_cheetah_needs_no_mujoco(monkeypatch):
     env, params = sejax.load("halfcheetah")
     _, obs, reward = rollout(env, params, jax.random.key(0), num_steps=1)
     assert obs.shape == (17,) and jnp.isfinite(reward)
-    assert env.task.interface == stored.read(files.find("halfcheetah"), "source")[1]["interface"]
+    assert env.task.interface == header.read("halfcheetah")[1].interface
     with pytest.raises(ConfigError, match="needs MuJoCo"):
         sejax.load("halfcheetah-rn")
 
@@ -579,7 +499,7 @@ def test_the_shipped_cheetah_needs_no_mujoco(monkeypatch):
 @pytest.mark.parametrize("name", ["cartpole", "cliff_walking", "pendulum", "gymnax/Pong-misc"])
 def test_spaces_of_a_task_come_back_from_plain_values(name):
     task = envs.make(name)
-    again = absent.make(name, json.loads(json.dumps(task.interface)), task.origin, "")
+    again = absent_task(name, json.loads(json.dumps(task.interface)), task.origin, "")
     assert again.origin == task.origin
     assert again.interface == task.interface
     assert (again.obs_dim, again.action_dim) == (task.obs_dim, task.action_dim)
@@ -591,32 +511,16 @@ def test_spaces_of_a_task_come_back_from_plain_values(name):
 
 
 def test_an_unknown_name_lists_the_shipped_ones():
-    with pytest.raises(ConfigError) as error:
-        sejax.load("carpole")
-    said = str(error.value)
-    assert said.startswith("source must be one of cartpole, ") and "got 'carpole'" in said
-    assert "Did you mean source=cartpole?" in said
-
-
-def test_real_is_no_proxy_that_python_could_load():
-    with pytest.raises(ConfigError) as error:
-        sejax.load("real")
-    said = str(error.value)
-    assert said.startswith("source must be one of ") and "=real?" not in said
+    error = refusal(sejax.load, "carpole")
+    assert error.field == "source" and "Did you mean source=cartpole?" in str(error)
+    assert "=real?" not in str(refusal(sejax.load, "real"))  # a word of a command's
 
 
 def test_a_folder_without_a_proxy_says_what_it_is(tmp_path):
     for load in (sejax.load, sejax.load_set):
-        with pytest.raises(
-            ConfigError, match=r"this is a folder of another sort; got .*Set source"
-        ):
-            load(tmp_path)
+        assert "another folder" in str(refusal(load, tmp_path))
     (tmp_path / "config.yaml").write_text("{}")
-    for load in (sejax.load, sejax.load_set):
-        with pytest.raises(
-            ConfigError, match=r"run has not finished a generation yet; got .*finis"
-        ):
-            load(tmp_path)
+    assert "not finished a generation" in str(refusal(sejax.load, tmp_path))
 
 
 @pytest.mark.parametrize(
@@ -626,6 +530,4 @@ def test_a_folder_without_a_proxy_says_what_it_is(tmp_path):
     ids=lambda source: repr(source[:20]),
 )  # fmt: skip
 def test_a_path_that_leads_nowhere_is_one_short_message(source):
-    with pytest.raises(ConfigError, match=r"^source must be ") as error:
-        sejax.load(source)
-    assert len(str(error.value)) < 700
+    assert refusal(sejax.load, source).field == "source"

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 import sejax
-from sejax.cli import build
-from sejax.errors import ConfigError
+from sejax.cli import config as configuration
+from sejax.options import ConfigError
 
 
 @pytest.fixture(scope="module")
@@ -19,7 +19,7 @@ def ses(tmp_path_factory):
     env = config.parts()["proxy"]
     weights = [env.init_weights(jax.random.key(i)) for i in range(3)]
     records = [{"score": 1.0 + i, "generation": 4 + i, "seed": 7 + i} for i in range(3)]
-    sejax.save_set(path, env, weights, records, build.to_plain(config))
+    sejax.save_set(path, env, weights, records, configuration.plain(config))
     return path, weights
 
 

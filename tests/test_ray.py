@@ -99,7 +99,7 @@ class Node:
 
     def workers(self):
         mine = processes(self.process.pid)
-        return [pid for pid in mine if command_line(pid).startswith("ray::Scorer")]
+        return [pid for pid in mine if command_line(pid).startswith("ray::Worker")]
 
     def kill(self):
         end(self.process)
@@ -237,7 +237,7 @@ def stop_worker(cluster, driver, rng):
     os.kill(rng.choice(wait_for(cluster.workers)), signal.SIGSTOP)
 
 
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize("fault", [kill_worker, kill_node, kill_driver, stop_worker])
 def test_a_run_has_the_same_rows_whatever_is_killed_or_stopped_and_when(
     cluster, wanted, seconds, tmp_path, fault, seed
@@ -252,11 +252,7 @@ def test_a_run_has_the_same_rows_whatever_is_killed_or_stopped_and_when(
         with fault(cluster, driver, rng) or contextlib.nullcontext(driver) as last:
             last.wait()
     took = time.monotonic() - started
-    with (tmp_path / "run" / "machines.csv").open(newline="") as file:
-        rows = list(csv.DictReader(file))
-    print(f"{fault.__name__} after {moment:.2f} generations, {saved} saved; {took:.1f} s more, "
-          f"{len({row['pid'] for row in rows})} workers, {sum(int(x['lost']) for x in rows)} "
-          f"shares lost; {last.log.read_text().count(chr(10))} lines said")  # fmt: skip
+    print(f"{fault.__name__} after {moment:.2f} generations, {saved} saved; {took:.1f} s more")
     assert results(tmp_path) == wanted
     wait_for(lambda: not any(map(is_there, there)))
 
@@ -269,7 +265,7 @@ def test_a_run_goes_on_with_or_without_the_cluster(cluster, wanted, tmp_path):
     assert results(tmp_path) == wanted
 
 
-def test_a_stopped_worker_is_given_up_and_another_started(cluster, tmp_path):
+def test_a_stopped_worker_is_ended_and_another_started(cluster, tmp_path):
     words = "machines=ray", "generations=1000"
     with Driver(tmp_path, *words, environment=cluster.environment) as driver:
         wait_for(lambda: len(cluster.workers()) == 2 and driver.generations() > 2)
@@ -279,8 +275,38 @@ def test_a_stopped_worker_is_given_up_and_another_started(cluster, tmp_path):
         os.kill(stopped, signal.SIGSTOP)
         wait_for(lambda: not is_there(stopped), 300)
         print(f"gone after {time.monotonic() - started:.1f} s")
-        (new,) = wait_for(lambda: set(cluster.workers()) - there)
-        wait_for(lambda: f",{new}," in (tmp_path / "run" / "machines.csv").read_text())
+        wait_for(lambda: set(cluster.workers()) - there)
+
+
+def test_a_run_whose_own_cluster_dies_ends_with_one_message(folder, tmp_path):
+    environment = ENVIRONMENT | {"RAY_TMPDIR": str(folder)}
+    words = "machines=ray", "machines.address=local", "machines.workers=1", "generations=1000"
+    with Driver(tmp_path, *words, environment=environment) as driver:
+        wait_for(driver.generations)
+        (raylet,) = (
+            pid for pid in processes(driver.process.pid) if "raylet/raylet" in command_line(pid)
+        )
+        os.kill(raylet, signal.SIGKILL)
+        driver.wait(1)
+    assert "error: Ray has ended" in driver.log.read_text()
+
+
+def test_a_search_has_its_trials_made_by_workers(cluster, tmp_path):
+    done = subprocess.run(
+        [
+            *(sys.executable, "-m", "sejax.search", "env=gridworld_2x2", "agent=q_learning"),
+            *("es.noise_std=interval(0.1, 1)", "es.population_size=2", "trials=4", "verify=0"),
+            *("max_generations=3", "min_generations=1", "machines=ray", "search_dir=search"),
+        ],
+        cwd=tmp_path,
+        env=cluster.environment,
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
+    assert done.returncode == 0, done.stderr
+    rows = (tmp_path / "search" / "trials.csv").read_text().splitlines()
+    assert len(rows) - 1 >= 4
 
 
 def test_a_stopped_worker_of_a_killed_driver_makes_room(cluster, wanted, tmp_path):

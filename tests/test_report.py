@@ -9,7 +9,8 @@ import yaml
 
 import sejax
 from sejax import report
-from sejax.cli import build, commands, next_steps
+from sejax.cli import commands, next_steps
+from sejax.cli import config as configuration
 from sejax.cli import report as pages
 from sejax.cli.run_directory import columns_of
 
@@ -19,7 +20,8 @@ HOSTILE = "<script>alert(1)</script>$\\frac{"
 @functools.cache
 def stored(*words):
     """A run's configuration as its file has it."""
-    return yaml.safe_dump(build.to_plain(sejax.config([*words, "generations=3"])), sort_keys=False)
+    plain = configuration.plain(sejax.config([*words, "generations=3"]))
+    return yaml.safe_dump(plain, sort_keys=False)
 
 
 def write_run(path, *words, means=(10.0, 196.0, 150.0), ended=True, **changes):
@@ -157,7 +159,7 @@ def test_many_generations_are_thinned_to_the_last(tmp_path):
 def test_the_words_of_a_run_compose_its_configuration():
     words = ["agents=[ddqn,ppo]", "agents.ppo.weight=2", "es=snes", "run_dir='a b,c=é'"]
     config = sejax.config(words)
-    found = next_steps.run_words(build.to_plain(config))
+    found = next_steps.run_words(configuration.plain(config))
     assert found is not None and sejax.config(found) == config
 
 

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from support import numpy_forward, raveled, shapes_of, unraveled
+from support import numpy_forward, shapes_of, unraveled
 
 from sejax.agents.buffers import Transition
 from sejax.agents.sac import (
@@ -295,50 +295,15 @@ def test_one_configuration_serves_both_kinds_of_actions():
     assert set(SACConfig.actions) == {"discrete", "continuous"}
     discrete = SimpleNamespace(name="task", obs_dim=OBS_DIM, num_actions=ACTION_DIM)
     continuous = SimpleNamespace(
-        name="task", obs_dim=OBS_DIM, num_actions=None, action_dim=ACTION_DIM,
+        name="task",
+        obs_dim=OBS_DIM,
+        num_actions=None,
+        action_dim=ACTION_DIM,
         max_action=MAX_ACTION,
     )
     config = SACConfig()
     assert config.make(discrete) is make_sac_discrete(config, OBS_DIM, ACTION_DIM)
     assert config.make(continuous) is make_sac(config, OBS_DIM, ACTION_DIM, MAX_ACTION)
-
-
-def test_an_agent_with_units_and_columns_out_of_use_learns_as_a_smaller_one():
-    # Three of five units and four of seven columns.
-    case = "discrete"
-    small_config = replace(CONFIG, hidden_size=3)
-    large = agent_of(case)
-    numbers = large.hparams._replace(hidden_size=np.float32(3), batch_size=np.float32(4))
-    state = jax.jit(large.init)(jax.random.key(2), numbers)
-    assert float(large.batch_size(state)) == 4 and large.batch_size(state_of(case)) is None
-
-    def cut(params):
-        layers = {"Dense_0": {"kernel": params["Dense_0"]["kernel"][..., :3, :],
-                              "bias": params["Dense_0"]["bias"][..., :3]},
-                  "Dense_1": {"kernel": params["Dense_1"]["kernel"][..., :3],
-                              "bias": params["Dense_1"]["bias"]}}  # fmt: skip
-        return {"params": layers}
-
-    def cut_all(state):
-        params, target_critics = nested(case, state)
-        params = params._replace(
-            actor=cut(params.actor["params"]), critics=cut(params.critics["params"])
-        )
-        return {"params": raveled(params),
-                "target_critics": raveled(cut(target_critics["params"]))}  # fmt: skip
-
-    small_agent = make_sac_discrete(small_config, OBS_DIM, ACTION_DIM)
-    small = shapes_of(small_agent.init, jax.random.key(0), small_agent.hparams)
-    hparams = jax.tree.map(np.float32, small_agent.hparams)
-    small = small.replace(**cut_all(state), hparams=hparams)
-    networks = make_networks(small_config, OBS_DIM, policy_of(case))
-    learn_small = jax.jit(make_learning_step(networks, policy_of(case)))
-    for number in (1, 2):
-        batch = case_batch(case, number, weight=np.arange(BATCH) < 4)
-        state = learn_of(case)(state, batch, case_noise(case, 0))
-        small = learn_small(small, batch, case_noise(case, 0))
-    for name, got in cut_all(state).items():
-        np.testing.assert_allclose(got, getattr(small, name), rtol=1e-4, atol=1e-5)
 
 
 # --- probes --------------------------------------------------------------------------------------

@@ -1,240 +1,198 @@
-"""What a search's words say, and its spaces; without Optuna."""
+"""The overrides of a search: what is searched, what is fixed, and what is refused."""
 
-import math
+import dataclasses
 
 import pytest
-import yaml
 
-from sejax.cli import compose
-from sejax.errors import ConfigError
-from sejax.search import __main__ as command
-from sejax.search import settings, spaces
+pytest.importorskip("optuna", reason="needs Optuna: pip install 'sejax[search]'")
 
+import optuna
+from optuna.distributions import (
+    CategoricalDistribution,
+    FloatDistribution,
+    IntDistribution,
+)
 
-class Trial:
-    """Suggests the lowest value of each range and the last of each choice; keeps what was asked."""
-
-    def __init__(self):
-        self.asked = {}
-
-    def suggest_float(self, name, low, high, *, step=None, log=False):
-        self.asked[name] = ("float", low, high, step, log)
-        return low
-
-    def suggest_int(self, name, low, high, *, step=1, log=False):
-        self.asked[name] = ("int", low, high, step, log)
-        return low
-
-    def suggest_categorical(self, name, choices):
-        self.asked[name] = choices
-        return choices[-1]
+import sejax
+from sejax.cli import config as configuration
+from sejax.cli import search_config, spaces
+from sejax.options import ConfigError
 
 
 @pytest.mark.parametrize(
-    ("text", "asked", "word"),
+    ("text", "distribution"),
     [
-        ("tag(log, interval(0.01, 0.3))", ("float", 0.01, 0.3, None, True), "0.01"),
-        ("interval(1, 10)", ("float", 1.0, 10.0, None, False), "1"),
-        ("int(interval(1, 10))", ("int", 1, 10, 1, False), "1"),
-        ("tag(log, int(interval(48, 192)))", ("int", 48, 192, 1, True), "48"),
-        ("range(1, 9, 3)", ("int", 1, 7, 3, False), "1"),  # as Python's: 1, 4, 7
-        ("range(1, 10, 3)", ("int", 1, 7, 3, False), "1"),
-        ("true,false", ("true", "false"), "false"),
-        ("choice(tanh, 3, x y)", ("tanh", "3", "'x y'"), "'x y'"),
-        ("choice([1,2], [3])", ("[1,2]", "[3]"), "[3]"),
+        ("choice(tanh, relu)", CategoricalDistribution(("tanh", "relu"))),
+        ("tanh,relu", CategoricalDistribution(("tanh", "relu"))),
+        ("choice([32,32], [64])", CategoricalDistribution(("[32,32]", "[64]"))),
+        ("interval(0, 1)", FloatDistribution(0.0, 1.0)),
+        ("int(interval(1, 10))", IntDistribution(1, 10)),
+        ("range(1, 4)", IntDistribution(1, 3)),
+        ("range(16, 65, 16)", IntDistribution(16, 64, step=16)),
+        ("tag(log, interval(0.01, 0.3))", FloatDistribution(0.01, 0.3, log=True)),
+        ("tag(log, int(interval(48, 192)))", IntDistribution(48, 192, log=True)),
+        ("tag(log, inverse, interval(0.9, 0.999))", FloatDistribution(0.001, 0.1, log=True)),
     ],
 )
-def test_hydras_sweeps_become_optunas_distributions(text, asked, word):
-    trial = Trial()
-    assert spaces.parse("es.x", text).suggest(trial) == word
-    assert trial.asked == {"es.x": asked}
+def test_ranges_become_optunas_distributions(text, distribution):
+    assert spaces.is_range(text)
+    assert spaces.parse("es.noise_std", text).distribution == distribution
 
 
-def test_inverse_logarithms_are_drawn_in_the_distance_from_1():
-    trial = Trial()
+def test_inverse_ranges_are_drawn_in_the_distance_from_1():
     dimension = spaces.parse("agent.discount", "tag(log, inverse, interval(0.9, 0.999))")
-    assert dimension.suggest(trial) == "0.999"  # the least distance
-    kind, low, high, _, log = trial.asked["1 - agent.discount"]
-    assert (kind, log) == ("float", True)
-    assert math.isclose(low, 0.001) and math.isclose(high, 0.1)
-    assert dimension.of({"1 - agent.discount": 0.05}) == "0.95"
-    assert dimension.shown({"1 - agent.discount": 0.0013249}) == "0.99868"
+    trial = optuna.trial.FixedTrial({"1 - agent.discount": 0.0123456789})
+    assert dimension.suggest(trial) == "agent.discount=0.987654"
+    assert dimension.override({"1 - agent.discount": 0.1}) == "agent.discount=0.9"
+    assert dimension.parameter_of(0.99) == pytest.approx(0.01)
+    assert dimension.parameter_of(0.5) is None
 
 
 def test_written_values_stay_within_their_bounds():
-    dimension = spaces.parse("es.x", "interval(0.12345678, 0.23456789)")
-    assert dimension.of({"es.x": 0.12345678}) == "0.123457"
-    assert dimension.of({"es.x": 0.23456789}) == "0.23456789"
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("3", r"es\.x must be a sweep of Hydra's.*got 3\. Set es\.x="),
-        ("glob(*)", "must be a sweep"),
-        ("interval(0, 1", "must be a sweep"),
-        ("interval(0.1, inf)", r"have finite bounds.*got interval\(0.1, inf\)"),
-        ("interval(2, 1)", r"be a range that grows.*got interval\(2, 1\)"),
-        ("tag(log, interval(0, 1))", "begin above 0"),
-        ("tag(inverse, interval(0, 1))", "have the tags log, or log and inverse"),
-        ("tag(log, inverse, interval(0.5, 1))", "end below 1 with inverse"),
-        ("tag(lgo, interval(0.5, 1))", "have the tags log"),
-    ],
-)
-def test_what_cannot_be_searched_is_refused(text, message):
-    with pytest.raises(ConfigError, match=message):
-        spaces.parse("es.x", text)
-
-
-def test_words_are_the_searchs_own_the_space_or_fixed():
-    search = settings.read(
-        ["env=acrobot", "trials=7", "es.noise_std=interval(0.1,1)", "storage=postgresql://a:b@c/d?e=f",
-         "agent.batch_size=32,64", "timeout=null"]
-    )  # fmt: skip
-    assert search.config.trials == 7
-    assert search.storage == "postgresql://a:b@c/d?e=f"
-    assert search.fixed == ("env=acrobot",)
-    assert list(search.space) == ["es.noise_std", "agent.batch_size"]
-    assert search.study == "acrobot-se-ddqn"
-    assert not search.is_of_agent
-
-
-def test_a_proxy_that_exists_makes_it_a_search_of_an_agent():
-    search = settings.read(["proxy=cartpole", "agent=ppo", "space=agent"])
-    assert search.is_of_agent
-    assert search.study == "ppo-on-cartpole"
-    assert all(name.startswith("agent.") for name in search.space)
-    assert not settings.read(["proxy=rn", "env=cliff_walking"]).is_of_agent
-
-
-def test_what_is_fixed_or_has_a_space_of_its_own_is_left_out_of_the_preset():
-    search = settings.read(
-        ["space=paper_se", "agent.hidden_size=64", "es.noise_std=interval(0.1,0.2)"]
-    )
-    assert "agent.hidden_size" not in search.space
-    assert search.space["es.noise_std"].high == 0.2
-    assert search.space["proxy.hidden_size"].high == 192
-
-
-def test_a_preset_has_the_ranges_of_the_agent_that_the_task_chooses():
-    search = settings.read(["env=cliff_walking", "proxy=rn", "space=paper_rn"])
-    assert search.study == "cliff_walking-rn-q_learning"
-    assert "agent.epsilon_decay" in search.space and "agent.batch_size" not in search.space
-
-
-def test_machines_are_where_trials_are_made_and_no_setting():
-    search = settings.read(["env=acrobot", "machines=local", "es.noise_std=0.1,0.2"])
-    assert search.fixed == ("env=acrobot",) and not search.machines.is_elsewhere
-    assert "machines" not in search.stored()["fixed"]
-    with pytest.raises(ConfigError, match="machines"):
-        settings.read(["machines=slurm", "es.noise_std=0.1,0.2"])
+    dimension = spaces.parse("es.noise_std", "interval(0.12345612, 0.2)")
+    assert dimension.override({"es.noise_std": 0.12345612}) == "es.noise_std=0.12345612"
 
 
 @pytest.mark.parametrize(
     ("text", "value", "parameter"),
-    [("choice(tanh, relu)", "relu", "relu"), ("choice(true, false)", True, "true"),
-     ("choice(tanh, relu)", "prelu", None),
-     ("choice(1, 0.5)", 1.0, "1"), ("choice(1.0, 2.0)", 2, "2.0"), ("choice(0, 1)", True, None),
-     ("interval(0.1, 1)", 1, 1.0),
-     ("interval(0.1, 1)", 2.0, None), ("int(interval(1, 10))", 3, 3),
-     ("range(16, 65, 16)", 40, None), ("interval(0.1, 1)", "often", None),
-     ("tag(log, inverse, interval(0.9, 0.999))", 0.99, 0.01)],
-)  # fmt: skip
-def test_a_value_has_its_place_in_a_range_or_none(text, value, parameter):
-    dimension = spaces.parse("a.b", text)
-    assert dimension.parameter_of(value) == parameter
-    if parameter is not None:
-        found = dimension.of({dimension.parameter: parameter})
-        assert found == {True: "true"}.get(value, f"{value}") or float(found) == value
-
-
-def test_what_one_has_is_tried_first(tmp_path):
-    pytest.importorskip("optuna")
-    from sejax.search import study
-
-    words = ["env=cartpole", "space=paper_se", f"search_dir={tmp_path}"]
-    search = settings.read(words)
-    usual = settings.fields_of(search, compose.config(["env=cartpole"]))
-    found, search = study.open_study(search, usual)
-    study.open_study(search, usual)  # who joins adds none
-    (first,) = found.trials
-    asked = first.system_attrs["fixed_params"]
-    assert asked["es.noise_std"] == usual["es.noise_std"]
-    assert asked["1 - agent.discount"] == pytest.approx(0.01)
-
-
-def test_each_of_several_agents_has_the_ranges_of_its_own():
-    search = settings.read(["agents=[ddqn,ppo]", "space=agent", "agents.ppo.discount=0.9"])
-    assert search.fixed == ("agent=ddqn+ppo", "agents.ppo.discount=0.9")
-    assert {"agents.ddqn.learning_rate", "agents.ddqn.discount"} <= set(search.space)
-    assert "agents.ppo.clip_ratio" in search.space and "agents.ppo.discount" not in search.space
-    lows = [f"{name}={x.suggest(Trial())}" for name, x in search.space.items()]
-    config = compose.config([*search.fixed, *lows])
-    settings.require_fields(search, config)
-    ddqn, ppo = config.agents.families
-    assert (ddqn.agent.learning_rate, ppo.agent.clip_ratio) == (0.0001, 0.05)
-
-
-@pytest.mark.parametrize("name", spaces.names())
-def test_every_preset_names_fields_of_its_command_with_bounds_that_are_taken(name):
-    agents = yaml.safe_load((spaces.FOLDER / f"{name}.yaml").read_text())["with_agent"]
-    tasks = {"q_learning": "cliff_walking", "sarsa": "cliff_walking", "td3": "pendulum"}
-    for agent in ["ddqn", "q_learning", "td3"] if name == "paper_rn" else ["ddqn", "ppo"]:
-        if agent not in agents:
-            continue
-        dimensions = spaces.preset(name, agent, of_agent=False)
-        lows = [f"{field}={x.suggest(Trial())}" for field, x in dimensions.items()]
-        kind = "rn" if name == "paper_rn" else "se"
-        compose.config([f"env={tasks.get(agent, 'cartpole')}", f"proxy={kind}", f"agent={agent}",
-                        *lows])  # fmt: skip
+    [
+        ("choice(true, false)", True, "true"),
+        ("choice(1, 2)", 3, None),
+        ("int(interval(1, 3))", 2, 2),
+        ("range(16, 65, 16)", 17, None),
+        ("interval(0, 1)", 1, 1.0),
+        ("interval(0, 1)", None, None),
+    ],
+)
+def test_a_current_value_has_its_place_in_a_range_or_none(text, value, parameter):
+    assert spaces.parse("x.y", text).parameter_of(value) == parameter
 
 
 @pytest.mark.parametrize(
-    ("words", "message"),
+    "text",
     [
-        (["space=nothing"], r"space must be one of .*agent.*, or a YAML file; got nothing"),
-        (["space=agent", "agent=boltzmann"], "agent must be one of ddqn.*got boltzmann"),
-        (["space=agent", "agents=[ddqn,boltzmann]"], "agent must be one of ddqn.*got boltzmann"),
-        (["min_generations=9", "max_generations=3"], "max_generations must be at least"),
-        (["pruner=asha"], "pruner must be one of"),
-        (["es.noise_std=interval(1"], "must read name=value.*es.noise_std"),
-        (["sampler_seed=-1"], "sampler_seed must be at least 0"),
-        (["proxy=real"], r"proxy must be learned, .* got real\. Set proxy=cartpole"),
-        (["trials=many"], "trials must be a whole number"),
-        (["generations=9"], r"generations must be left out.*got 9\. Set max_generations=27"),
-        (["run_dir=a,b"], r"run_dir must be left out.*Set search_dir=FOLDER"),
+        "interval(1)",
+        "interval(0, inf)",
+        "interval(2, 1)",
+        "int(choice(1, 2))",
+        "range(1, 9, 0)",
+        "tag(log, interval(0, 1))",
+        "tag(log, inverse, interval(0.9, 1))",
+        "tag(inverse, interval(0.1, 0.2))",
+        "tag(log, choice(a, b))",
+        "tag(fast, interval(0, 1))",
+        "choice()",
     ],
 )
-def test_bad_words_get_one_sentence(words, message):
-    with pytest.raises(ConfigError, match=message):
-        settings.read(words)
+def test_what_cannot_be_searched_is_refused(text):
+    with pytest.raises(ConfigError) as error:
+        spaces.parse("es.noise_std", text)
+    assert error.value.field == "es.noise_std" and len(str(error.value)) <= 300
 
 
-@pytest.mark.parametrize("text", ["[ddqn]", "{ddqn: 3}"])
-def test_a_file_of_ranges_maps_agents_to_theirs(tmp_path, text):
-    (tmp_path / "mine.yaml").write_text(f"with_agent: {text}")
-    with pytest.raises(ConfigError, match="space must map agents to their sweeps"):
-        settings.read([f"space={tmp_path / 'mine.yaml'}"])
-    (tmp_path / "mine.yaml").write_text("es.noise_std: interval(0.1, 0.2)\nwith_agent:\n")
-    assert list(settings.read([f"space={tmp_path / 'mine.yaml'}"]).space) == ["es.noise_std"]
+def test_overrides_are_the_searchs_own_the_space_or_fixed():
+    search = search_config.read(
+        ["env=acrobot", "es.noise_std=interval(0.1, 1)", "trials=7", "study=2024-01-01"]
+    )
+    assert search.fixed == ("env=acrobot",) and list(search.space) == ["es.noise_std"]
+    assert (search.config.trials, search.study) == (7, "2024-01-01")
+    assert not search.is_of_agent and search.measure == "last"
+
+
+def test_a_stored_proxy_makes_it_a_search_of_an_agent():
+    search = search_config.read(["proxy=cartpole", "agent=ppo", "space=agent"])
+    assert search.is_of_agent and search.study == "ppo-on-cartpole" and search.measure == "mean"
+    assert all(name.startswith("agent.") for name in search.space)
+
+
+def test_what_is_fixed_or_has_a_range_of_its_own_is_left_out_of_the_preset(tmp_path):
+    (tmp_path / "p.yaml").write_text("proxy.num_layers: 1\n")
+    overrides = ["space=paper_se", "es.step_size=1", "es.noise_std=0.1,0.2"]
+    search = search_config.read([*overrides, f"preset={tmp_path}/p.yaml"])
+    assert not {"es.step_size", "proxy.num_layers"} & set(search.space)
+    assert search.space["es.noise_std"].text == "choice(0.1,0.2)"
+    assert "agent.batch_size" in search.space  # of the agent that the task chooses
+
+
+def test_each_agent_of_a_mixture_has_its_own_ranges():
+    search = search_config.read(["agents=[ddqn,ppo]", "space=agent"])
+    assert {"agents.ddqn.tau", "agents.ppo.clip_ratio"} <= set(search.space)
+
+
+COMMANDS = {
+    "paper_se": [["env=cartpole"]],
+    "paper_rn": [
+        ["env=cliff_walking", "proxy=rn"],
+        ["env=cartpole", "proxy=rn"],
+        ["env=mountain_car_continuous", "proxy=rn"],
+    ],
+    "agent": [["proxy=cartpole", "agent=ppo"], ["proxy=cartpole", "agent=ddqn"]],
+}
+
+
+@pytest.mark.parametrize("name", spaces.names())
+def test_every_preset_names_fields_with_bounds_that_are_accepted(name):
+    for words in COMMANDS[name]:
+        search = search_config.read([*words, f"space={name}"])
+        config = configuration.evaluate_config if search.is_of_agent else configuration.config
+        search_config.require_fields(search, config(search.fixed))
+        for dimension in search.space.values():
+            drawn = dimension.distribution
+            ends = getattr(drawn, "choices", None) or (drawn.low, drawn.high)
+            for end in ends:
+                config([*search.fixed, dimension.override({dimension.parameter: end})])
+
+
+@pytest.mark.parametrize(
+    ("overrides", "field"),
+    [
+        (["trials=0"], "trials"),
+        (["sampler=cmaes"], "sampler"),
+        (["max_generations=2"], "max_generations"),
+        (["generations=5"], "generations"),
+        (["space=papr_se"], "space"),
+        (["proxy=real", "es.noise_std=0.1,0.2"], "proxy"),
+    ],
+)
+def test_bad_overrides_are_refused(overrides, field):
+    with pytest.raises(ConfigError) as error:
+        search_config.read(overrides)
+    assert error.value.field == field and len(str(error.value)) <= 300
+
+
+@pytest.mark.parametrize("text", ["- a", "with_agent: [ddqn]", "es.noise_std: 3", "{"])
+def test_a_file_of_ranges_must_map_fields_to_ranges(tmp_path, text):
+    (tmp_path / "own.yaml").write_text(text)
+    with pytest.raises(ConfigError):
+        search_config.read([f"space={tmp_path}/own.yaml"])
 
 
 def test_a_field_that_does_not_exist_is_not_searched():
-    search = settings.read(["es.noise_stdd=interval(0.1,0.2)"])
-    with pytest.raises(ConfigError, match=r"es\.noise_stdd must be a field.*mean es\.noise_std\?"):
-        settings.require_fields(search, compose.config([]))
+    search = search_config.read(["es.noise_sdt=interval(0.1, 1)"])
+    with pytest.raises(ConfigError, match=r"es\.noise_std\?") as error:
+        search_config.require_fields(search, sejax.config())
+    assert error.value.field == "es.noise_sdt"
 
 
-def test_stored_searches_read_back():
-    search = settings.read(["env=acrobot", "space=paper_se", "seeds=3", "trials=5"])
-    joined = settings.Search.from_stored(
-        search.stored(), settings.SearchConfig(trials=9), search.machines
+def test_a_search_without_anything_to_search_is_refused():
+    with pytest.raises(ConfigError) as error:
+        search_config.require_fields(search_config.read(["env=acrobot"]), sejax.config())
+    assert error.value.field == "space"
+
+
+def test_a_stored_search_reads_back():
+    search = search_config.read(["env=acrobot", "seeds=2", "study=s", "es.noise_std=0.1,0.2"])
+    joining = search_config.read(["study=s", "trials=3"])
+    assert joining.joins and not search.joins
+    joined = joining.joined(search.stored())
+    assert joined == dataclasses.replace(
+        search, config=dataclasses.replace(search.config, trials=3)
     )
-    assert joined.stored() == search.stored()
-    assert (joined.config.seeds, joined.config.trials) == (3, 9)
 
 
-def test_without_optuna_one_line_says_what_to_install(monkeypatch):
-    monkeypatch.setattr(command, "find_spec", lambda name: None)
-    with pytest.raises(ConfigError, match=r"Install it with pip install 'sejax\[search\]'\.$"):
-        command.main(["space=agent"])
+def test_without_optuna_the_extra_is_named(monkeypatch):
+    from sejax import search
+
+    monkeypatch.setattr("sejax.search.find_spec", lambda name: None)
+    with pytest.raises(ConfigError, match=r"pip install 'sejax\[search\]'"):
+        search.main([])

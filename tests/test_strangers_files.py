@@ -14,12 +14,12 @@ import yaml
 
 import sejax
 from experiments import supervised_baseline
-from sejax import evaluate, registry, report, run
-from sejax.cli import build, commands
+from sejax import evaluate, registry, report, run, search
+from sejax.cli import commands, study
+from sejax.cli import config as configuration
+from sejax.cli import search_config as settings
 from sejax.cli.run_directory import columns_of
 from sejax.ops import checksummed
-from sejax.search import __main__ as search
-from sejax.search import settings, study
 
 IMPORTED, SHELL = "strangers_module:make", {"name": "subprocess:getoutput", "cmd": "touch PWNED"}
 TASK = ["env=gridworld_2x2", "agent=q_learning"]
@@ -63,20 +63,20 @@ def refused(monkeypatch, capsys):
 
 
 def run_command():
-    commands.start("run", run.main)
+    commands.start(run.main, run.help_text)
 
 
 def evaluate_command():
-    commands.start("evaluate", evaluate.main)
+    commands.start(evaluate.main, evaluate.help_text)
 
 
 def search_command():
-    commands.start_with_words(search.main, "")
+    commands.start(search.main, search.help_text)
 
 
 def stored(*words, **changes):
     """A run's configuration as plain values, with some of somebody else's."""
-    return build.to_plain(sejax.config([*TASK, *words])) | changes
+    return configuration.plain(sejax.config([*TASK, *words])) | changes
 
 
 def write_run(path, config):
@@ -224,7 +224,7 @@ def write_proxy(config):
     """An SE of several steps with random weights that was learned with somebody else's parts."""
     task = sejax.envs.make("cartpole")
     env = registry.make("proxy", sejax.SyntheticConfig(hidden_size=2), task)
-    usual = {**build.to_plain(sejax.config()), "proxy": registry.describe("proxy", env.config)}
+    usual = {**configuration.plain(sejax.config()), "proxy": registry.describe("proxy", env.config)}
     weights = env.init_weights(jax.random.key(0))
     sejax.save("evil.safetensors", env, weights, config=usual | config)
 

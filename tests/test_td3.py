@@ -240,45 +240,6 @@ def test_the_critics_losses_are_means_over_the_columns_and_added():
         np.testing.assert_allclose(mean["Dense_2"]["bias"], [expected], rtol=1e-4)
 
 
-def test_an_agent_with_units_and_columns_out_of_use_learns_as_a_smaller_one():
-    # Three of five units and four of seven columns.
-    small_config = replace(DISCRETE, hidden_size=3)
-    large = agent_of(DISCRETE)
-    numbers = large.hparams._replace(hidden_size=np.float32(3), batch_size=np.float32(4))
-    state = jax.jit(large.init)(jax.random.key(2), numbers)
-    assert float(large.batch_size(state)) == 4 and large.batch_size(state_of(DISCRETE)) is None
-
-    def cut(params):
-        """Parameters of the units in use, as those of the smaller network."""
-        out = {"width": np.float32(3)}
-        out["LayerNorm_0"] = {name: x[:3] for name, x in params["LayerNorm_0"].items()}
-        for i in range(4):
-            rows, columns = slice(3 if i < 3 else None), slice(3 if i > 0 else None)
-            layer = params[f"Dense_{i}"]
-            out[f"Dense_{i}"] = {
-                "kernel": layer["kernel"][rows, columns], "bias": layer["bias"][rows]
-            }  # fmt: skip
-        return raveled(out)
-
-    def cut_all(state):
-        nested = nested_params(DISCRETE, [getattr(state, name) for name in NAMES])
-        flat = [np.stack([cut(x) for x in n]) if isinstance(n, list) else cut(n) for n in nested]
-        return dict(zip(NAMES, flat, strict=True))
-
-    small = state_with(small_config, cut_all(state).values())
-    for number in range(1, 5):
-        batch = case_batch(DISCRETE, number, weight=np.arange(BATCH) < 4)
-        noise = case_noise(DISCRETE, number)
-        state = learn_of(DISCRETE)(state, batch, noise)
-        small = learn_of(small_config)(small, batch, noise)
-    for name, got in cut_all(state).items():
-        np.testing.assert_allclose(got, getattr(small, name), rtol=1e-4, atol=1e-5)
-    # Nothing but the cut part is there, apart from the layer norms' idle scales of 1.
-    for name in NAMES:
-        num_idle = np.count_nonzero(getattr(state, name)) - np.count_nonzero(getattr(small, name))
-        assert num_idle == 2 * np.atleast_2d(getattr(state, name)).shape[0]
-
-
 # --- target policy, by hand ----------------------------------------------------------------------
 
 

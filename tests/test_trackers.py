@@ -11,7 +11,7 @@ from PIL import Image
 import sejax
 from sejax.cli import trackers
 from sejax.cli.trackers import FinishedGeneration, GuardedTracker, TrackedRun
-from sejax.errors import ConfigError
+from sejax.options import ConfigError
 
 
 class Listener:

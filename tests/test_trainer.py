@@ -19,8 +19,8 @@ from sejax.agents import AgentSpec
 from sejax.agents.buffers import Buffer, rollout_buffer
 from sejax.agents.dqn import DDQNConfig, make_ddqn
 from sejax.agents.tabular import QLearningConfig
-from sejax.errors import ConfigError
 from sejax.evaluation import _Greedy, make_recorder, make_tester
+from sejax.options import ConfigError
 from sejax.proxies.configs import SyntheticConfig
 from sejax.training import TrainingConfig, is_plateau, is_solved, make_trainer
 

@@ -19,9 +19,9 @@ from sejax.agents.dqn import DDQNConfig, DuelingDDQNConfig, make_ddqn
 from sejax.agents.exploration import CountBasedConfig
 from sejax.agents.tabular import QLearningConfig
 from sejax.agents.varied import Range, draw_value, hidden_sizes, ranges_of
-from sejax.errors import ConfigError
 from sejax.evaluation import evaluate_agents, make_evaluator
 from sejax.ops.networks import MLP, narrow
+from sejax.options import ConfigError
 from sejax.proxies.configs import SyntheticConfig
 from sejax.training import TrainingConfig
 

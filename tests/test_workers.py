@@ -1,17 +1,25 @@
 """Workers that die, hang, come and go, on a clock of the test's own and without Ray."""
 
 import itertools
+import os
 import random
+import subprocess
+import sys
+from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sejax.cli import cluster
+import sejax
+from sejax.bilevel import make_bilevel
+from sejax.cli import cluster, session, workers
+from sejax.cli import config as configuration
 from sejax.cli.cluster import Pool
-from sejax.cli.workers import Batch, cut
-from sejax.errors import FailedError
+from sejax.cli.workers import Batch, RemoteChunks, cut
+from sejax.options import ConfigError, FailedError
 
 FOREVER = 1e9
 
@@ -29,8 +37,11 @@ class Ray:
         self.due = {}
         self.references = itertools.count()
 
-    def pool(self):
-        return Pool(self, lambda: Worker(self), lambda: self.room, self.said.append, self.clock)
+    def pool(self, make=lambda: None):
+        """A pool of workers that return what `make()` evaluates, or the share and their number."""
+        return Pool(
+            self, lambda: Worker(self, make()), lambda: self.room, self.said.append, self.clock
+        )
 
     def clock(self):
         return self.now
@@ -54,15 +65,19 @@ class Ray:
 class Worker:
     """An actor's handle."""
 
-    def __init__(self, ray):
+    def __init__(self, ray, real):
         ray.started += 1
-        self.ray, self.number, self.turns = ray, ray.started, itertools.count()
+        self.ray, self.real = ray, real
+        self.number, self.turns = ray.started, itertools.count()
         self.prepare = self.evaluate = self
 
     def remote(self, share=None):
         seconds, error = self.ray.fate(self.number, next(self.turns))
+        answer = share, self.number
+        if self.real is not None:
+            answer = self.real.prepare() if share is None else self.real.evaluate(share)
         reference = next(self.ray.references)
-        self.ray.due[reference] = self.ray.now + seconds, error or (share, self.number)
+        self.ray.due[reference] = self.ray.now + seconds, error or answer
         return reference
 
 
@@ -175,3 +190,128 @@ def test_generations_are_whole_whatever_workers_do(seed):
     for _ in range(3):
         evaluated(pool, rng.randint(1, 40))
         ray.room = rng.randint(1, 6)
+
+
+# --- the numbers of a single process -------------------------------------------------------------
+
+
+def numbers(tree):
+    """The leaves of a pytree in NumPy, keys as their data."""
+    is_key = lambda x: jax.numpy.issubdtype(x.dtype, jax.dtypes.prng_key)  # noqa: E731
+    return [np.asarray(jax.random.key_data(x) if is_key(x) else x) for x in jax.tree.leaves(tree)]
+
+
+def require_equal_numbers(words, generations):
+    """Runs generations in one program and by workers, the first of which is soon lost."""
+    config = sejax.config(words)
+    program = make_bilevel(**config.parts() | {"devices": 1})
+    batches = [Batch(capacity=5, width=1)] * program.mixture.size
+    arguments = configuration.plain(config), [5] * program.mixture.size, 0.0, workers.versions()
+    ray = Ray(fate=lambda *turn: (1.0, OSError("gone") if turn == (1, 2) else None))
+    local = session.Chunks(program)
+    remote = RemoteChunks(program, ray.pool(lambda: workers.Worker(*arguments)), batches)
+    key = jax.random.key(0)
+    state, other = local.init(key), remote.init(key)
+    for _ in range(generations):
+        state, info = local.advance(state, 1)
+        other, other_info = remote.advance(other, 1)
+        for x, y in zip(numbers((state, info)), numbers((other, other_info)), strict=True):
+            assert x.dtype == y.dtype
+            np.testing.assert_array_equal(x, y)
+    assert ray.killed == [1]
+    return state
+
+
+TINY = [
+    "env=gridworld_2x2",
+    "agent=q_learning",
+    "agent.learning_rate=0.5",
+    "proxy.hidden_size=4",
+    "es.population_size=4",
+    "es.num_incumbent_evals=2",
+    "es.noise_std=1.0",
+    "training.max_steps=30",
+    "training.test_episodes=1",
+    "stop_when_solved=true",
+]
+
+
+def test_workers_give_the_numbers_of_one_process_to_the_last_bit():
+    state = require_equal_numbers(TINY, 4)
+    assert bool(state.finished)  # so that nothing was computed in some of them
+
+
+CASES = {
+    "mixture": [*TINY[:1], "agents=[q_learning,sarsa]", *TINY[3:]],
+    "batches": ["env=cartpole", "es.population_size=4"],
+    "curriculum": ["env=pendulum", "es.population_size=4", "training.max_episodes=3"],
+    "evosax": ["env=cliff_walking", "proxy=rn", "es=cma_es", "es.population_size=8"],
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("case", CASES)
+def test_so_they_do_with_the_flags_of_a_command(case):
+    program = (
+        "from sejax.cli import runtime; runtime.configure_xla(1)\n"
+        "import sys, test_workers\n"
+        "test_workers.require_equal_numbers(sys.argv[1:], 3)"
+    )
+    environment = {name: x for name, x in os.environ.items() if name != "XLA_FLAGS"}
+    done = subprocess.run(
+        [sys.executable, "-c", program, *CASES[case]],
+        env=environment,
+        cwd=Path(__file__).parent,
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr
+
+
+def test_a_worker_with_other_versions_is_refused():
+    config = sejax.config(TINY)
+    expected = workers.versions() | {"jax": "0.1"}
+    with pytest.raises(ConfigError, match=r"0\.1") as error:
+        workers.Worker(configuration.plain(config), [5], 0.0, expected).prepare()
+    assert error.value.field == "machines"
+
+
+# --- the command ---------------------------------------------------------------------------------
+
+
+def test_without_ray_the_extra_is_named(monkeypatch):
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    with pytest.raises(ConfigError, match=r"pip install 'sejax\[ray\]'"):
+        sejax.config(["machines=ray"])
+
+
+@pytest.mark.parametrize(
+    ("words", "field"),
+    [
+        (["devices=2"], "devices"),
+        (["machines.workers=0"], "machines.workers"),
+        (["machines.gpus_per_worker=2"], "machines.gpus_per_worker"),
+    ],
+)
+def test_settings_that_no_worker_can_have_are_refused(words, field, monkeypatch):
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: "there")
+    with pytest.raises(ConfigError) as error:
+        sejax.config(["machines=ray", *words])
+    assert error.value.field == field
+
+
+def test_a_run_by_workers_has_the_files_of_one_process(tmp_path):
+    from sejax.cli.run_directory import open_for
+
+    found = []
+    for name in ("local", "remote"):
+        config = sejax.config([*TINY, "generations=2", f"run_dir={tmp_path / name}"])
+        program = make_bilevel(**config.parts() | {"devices": 1})
+        arguments = configuration.plain(config), [5], 0.0, workers.versions()
+        pool = Ray().pool(lambda arguments=arguments: workers.Worker(*arguments))
+        remote = RemoteChunks(program, pool, [Batch(capacity=5, width=1)])
+        chunks = session.Chunks(program) if name == "local" else remote
+        with open_for(config) as directory:
+            session.run(config, directory, chunks)
+            found.append([row | {"wall_s": ""} for row in directory.rows])
+    assert found[0] == found[1]

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import sejax
 from sejax.ops.files import write_text
-from sejax.proxies.zoo import PretrainedProxy, spread
+from sejax.proxies.zoo import table
 
 PAGE = Path(__file__).parents[1] / "docs" / "zoo.md"
 
@@ -23,29 +23,16 @@ lists them with all that stands here. `python tools/make_zoo.py` makes this page
 *Return* and *steps* are from the lowest to the highest of the kinds of agents that were trained on
 the proxy and tested on the real task: the mean return there, and how long an agent trained.
 
-| name | kind | task | learned with | tested with | return | steps | CPU seconds | real steps | kB |
-| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |
 """
 
 
 def page() -> str:
     """The text of the page."""
     proxies = sejax.pretrained()
+    rows = [proxy.row | {"name": f"[{proxy.name}](#{proxy.name})"} for proxy in proxies]
+    overview = table(list(rows[0]), [list(row.values()) for row in rows])
     cards = [re.sub(r"^#", "##", proxy.card, flags=re.MULTILINE) for proxy in proxies]
-    return HEAD + "\n".join(map(row, proxies)) + "\n\n" + "\n\n".join(cards) + "\n"
-
-
-def row(proxy: PretrainedProxy) -> str:
-    """A line of the table."""
-    tested = dict.fromkeys(each.agent for each in proxy.on_proxy)
-    cells = (
-        f"[{proxy.name}](#{proxy.name})", proxy.kind, proxy.task, ", ".join(proxy.agents),
-        ", ".join(tested), spread([each.return_mean for each in proxy.on_proxy], ".1f"),
-        spread([each.train_steps for each in proxy.on_proxy], ",.0f"),
-        f"{proxy.learning.cpu_s:,.0f}" if proxy.learning else "",
-        f"{proxy.learning.real_steps:,}" if proxy.learning else "", f"{proxy.size_kb:.1f}",
-    )  # fmt: skip
-    return f"| {' | '.join(cells)} |"
+    return HEAD + "\n\n".join([overview, *cards]) + "\n"
 
 
 if __name__ == "__main__":

@@ -17,7 +17,7 @@ import pandas as pd
 
 import sejax
 from experiments.common.experiment import Settings, count, each_of, setting
-from sejax import registry, serialize
+from sejax import registry
 from sejax.agents import NoExploration
 from sejax.cli.progress import Tally
 from sejax.ops.parallel import spread_over_devices
@@ -59,8 +59,8 @@ class Condition:
     @classmethod
     def of_set(cls, proxies: Any, names: Iterable[str], **rest: Any) -> Self:
         """The proxies of a `ProxySet`, one for each group; the first ones again for more groups."""
-        places = [(name, i % proxies.size) for i, name in enumerate(names)]
-        groups = tuple(Group(name, proxies.one(i), proxies.fingerprint(i)) for name, i in places)
+        ones = [(name, proxies[i % len(proxies)]) for i, name in enumerate(names)]
+        groups = tuple(Group(name, one.params, one.fingerprint) for name, one in ones)
         settings = {"proxy": proxies.config["proxy"], **rest.pop("settings", {})}
         return cls(env=proxies.env, task=proxies.task, groups=groups, settings=settings, **rest)
 
@@ -70,7 +70,7 @@ class Condition:
             "task": self.task.origin,
             "agent": registry.describe("agent", self.agent),
             "exploration": registry.describe("exploration", self.exploration),
-            "training": serialize.to_plain(self.training),
+            "training": registry.to_plain(self.training),
             "hparams": self.hparams,
             **self.settings,
         }
@@ -301,7 +301,7 @@ def training_as_learned(
     proxies: Any, agent: Any, test_episodes: int, max_steps: int | None = None
 ) -> TrainingConfig:
     """How long an agent trains on SEs: as those that these were learned with, or `max_steps`."""
-    learned = proxies.proxy(0).training_for(agent)
+    learned = sejax.training_of(proxies, agent)
     limits = [x for x in (learned.max_steps, max_steps) if x is not None]
     most = min(limits, default=None)
     return dataclasses.replace(learned, max_steps=most, test_episodes=test_episodes)
@@ -313,7 +313,7 @@ def on_ses(settings: SeAgents, ses: Any, kind: str) -> Condition:
     training = training_as_learned(ses, agent, settings.test_episodes, settings.max_steps)
     # The weights' hash is in the name, so that sets can share a folder: se_models then finds those
     # of se_performance.
-    names = [f"se-{seed:02d}-{ses.fingerprint(i)}" for i, seed in enumerate(ses.seeds)]
+    names = [f"se-{seed:02d}-{ses[i].fingerprint}" for i, seed in enumerate(ses.seeds)]
     return Condition.of_set(ses, names, name=kind, agent=agent, training=training, hparams="varied")
 
 

@@ -16,14 +16,12 @@ from pathlib import Path
 from typing import Any, ClassVar, Self, get_origin, get_type_hints
 
 import pandas as pd
-import yaml
 
 from experiments.common.shards import Shards, read_rows, write_rows
-from sejax import errors, registry, serialize
+from sejax import options, registry
 from sejax.cli import commands, runtime
-from sejax.errors import ConfigError, nearest, shortened
 from sejax.ops.files import write_text
-from sejax.options import Options, Rule, counts
+from sejax.options import ConfigError, Options, Rule, as_text, counts, nearest, shortened
 
 RUN_PREFIX = "run."  # of an override for the NES runs: run.es.population_size=8
 NOT_SHOWN = {"work", "devices", "from_rows", "run"}  # fields that no result depends on, and `run`
@@ -50,7 +48,7 @@ def count(default: int | None, things: str, least: int = 1, **rest: Any) -> Any:
 
 def each_of(known: Collection[str]) -> Rule:
     """A list of these names."""
-    return lambda name, values, default: errors.each_of(name, values, known)
+    return options.each_of(known)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,7 +70,7 @@ class Settings(Options):
     work: str | None = setting(
         None, about="folder of what is not kept; runs/experiments/... for results/..., or out/work"
     )
-    seed: int = setting(0, lambda n, value, _: errors.require_seed(n, value), about="first seed")
+    seed: int = setting(0, options.seed(), about="first seed")
     devices: int | None = setting(None, counts("something must compute"), about="to use; all")
 
     @classmethod
@@ -93,7 +91,7 @@ class Settings(Options):
         for name, kind in get_type_hints(cls).items():
             if get_origin(kind) is tuple and isinstance(given.get(name), str):
                 given[name] = [given[name]]
-        return serialize.from_plain(cls, cls.defaults(given) | given, "")
+        return registry.from_plain(cls, cls.defaults(given) | given, "")
 
     @classmethod
     def defaults(cls, given: Mapping[str, Any]) -> dict[str, Any]:
@@ -148,7 +146,7 @@ class Settings(Options):
         words = ["python", "-m", f"experiments.{self.name}"]
         for name, value in mine.items():
             if name not in hidden and value != default[name]:
-                words.append(f"{name}={as_word(value)}")
+                words.append(f"{name}={as_text(value)}")
         return shlex.join([*words, *(RUN_PREFIX + word for word in mine.get("run", ()))])
 
 
@@ -157,13 +155,6 @@ def work_beside(folder: Path, name: str) -> Path:
     if folder.parts[:1] == ("results",):
         return Path("runs/experiments", *folder.parts[1:])
     return folder / name
-
-
-def as_word(value: Any) -> str:
-    """A value as the command line takes it."""
-    if isinstance(value, tuple | list):
-        return f"[{','.join(map(as_word, value))}]"
-    return {"None": "null", "True": "true", "False": "false"}.get(str(value), str(value))
 
 
 def parse(settings: type[Settings], words: Iterable[str]) -> dict[str, Any]:
@@ -182,7 +173,7 @@ def parse(settings: type[Settings], words: Iterable[str]) -> dict[str, Any]:
         if name.startswith(RUN_PREFIX) and "run" in fields:
             runs.append(word.removeprefix(RUN_PREFIX))
         elif equals and name in fields:
-            given[name] = _value(text)
+            given[name] = registry.parsed(text)
         else:
             ranked = nearest(name.lstrip("-").replace("-", "_"), fields)
             raise ConfigError(
@@ -192,13 +183,6 @@ def parse(settings: type[Settings], words: Iterable[str]) -> dict[str, Any]:
     if runs:
         given["run"] = [*(given.get("run") or []), *runs]
     return given
-
-
-def _value(text: str) -> Any:
-    try:
-        return yaml.safe_load(text)
-    except yaml.YAMLError:
-        return text
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -216,7 +200,7 @@ class Experiment:
         Raises:
           ConfigError: for settings or files that cannot work, or a folder of other settings.
         """
-        fields = serialize.to_plain(settings).items()
+        fields = registry.to_plain(settings).items()
         with registry.only_typed(f"{name}={value}" for name, value in fields):
             return self._run(settings)
 
@@ -241,7 +225,8 @@ class Experiment:
         runtime.configure_xla(settings.devices)
         runtime.configure_jax()
         try:
-            commands.guarded(self.run)(settings)
+            with commands.messages():
+                self.run(settings)
         except KeyboardInterrupt:
             print(f"Interrupted. The same command goes on from {settings.work_folder}.")
             commands.leave(commands.INTERRUPTED)
@@ -251,7 +236,7 @@ class Experiment:
         full, quick = (self.settings.defaults({"quick": quick}) for quick in (False, True))
         lines = []
         for field in dataclasses.fields(self.settings):
-            default, other = as_word(full[field.name]), as_word(quick[field.name])
+            default, other = as_text(full[field.name]), as_text(quick[field.name])
             differs = f" (quick: {other})" if default != other else ""
             about = field.metadata["about"]
             lines.append(f"  {f'{field.name}={default}':34}  {about}{differs}")

@@ -27,10 +27,10 @@ from experiments.common import agents, figures, runs
 from experiments.common.experiment import count, setting, work_beside
 from experiments.common.runs import RunSettings
 from experiments.common.shards import read_rows, write_rows
-from sejax import ICMConfig, errors, registry, serialize
-from sejax.cli import build, run_directory
-from sejax.errors import ConfigError
-from sejax.options import one_of
+from sejax import ICMConfig, options, registry
+from sejax.cli import config as configuration
+from sejax.cli import run_directory
+from sejax.options import ConfigError, one_of
 
 # Paper, table "Overview of Reward Network variants".
 VARIANTS = (
@@ -202,7 +202,7 @@ class RnSettings(RunSettings):
     def defaults(cls, given: Mapping[str, Any]) -> dict[str, Any]:
         default = super().defaults(given)
         env = given.get("env", default["env"])
-        errors.one_of("env", env, STUDIES)
+        options.one_of(STUDIES)("env", env, "cliff_walking")
         study = STUDIES[env]
         values = vars(study) | {"bonuses": tuple(study.bonuses)}
         values |= QUICK | study.when_quick if given.get("quick") else {}
@@ -210,7 +210,7 @@ class RnSettings(RunSettings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        errors.each_of("variants", self.variants, self.study.variants)
+        options.each_of(self.study.variants)("variants", self.variants, None)
 
     @property
     def study(self) -> Study:
@@ -246,7 +246,7 @@ def objective_setting() -> Any:
 def learn(settings: RnSettings, variant: str, objective: str) -> Any:
     """The RNs of a variant, learned by an objective: a `ProxySet` in the order of their seeds."""
     there = stored(settings, variant, objective)
-    known = there.size if there else 0
+    known = len(there) if there else 0
     if known < settings.learned:
         config = learning_config(settings, variant, objective)
         config = dataclasses.replace(config, seed=settings.seed + known)
@@ -262,7 +262,7 @@ def learn(settings: RnSettings, variant: str, objective: str) -> Any:
         write_rows(curves_file(path), curve)
         runs.collect(configs, path, there)
         there = sejax.load_set(path, option="rns_dir", kind="rn")
-    return there.first(settings.learned)
+    return there[: settings.learned]
 
 
 def file_of(settings: RnSettings, variant: str, objective: str) -> Path:
@@ -286,7 +286,7 @@ def stored(settings: RnSettings, variant: str, objective: str) -> Any:
     if not path.exists():
         return None
     there = sejax.load_set(path, option="rns_dir", kind="rn")
-    made_with = _what_counts(build.learn_config(there.config))
+    made_with = _what_counts(configuration.learn_config(there.config))
     asked = _what_counts(learning_config(settings, variant, objective))
     names = sorted(made_with.keys() | asked.keys())
     differing = [name for name in names if made_with.get(name) != asked.get(name)]
@@ -304,7 +304,7 @@ def stored(settings: RnSettings, variant: str, objective: str) -> Any:
 def _what_counts(config: Any) -> dict[str, Any]:
     """The fields that a run's numbers depend on."""
     free = run_directory.FREE_FIELDS - {"generations"} | {"num_parallel", "num_seeds"}
-    flat = serialize.flatten(build.to_plain(config))
+    flat = registry.flatten(configuration.plain(config))
     return {name: value for name, value in flat.items() if name.partition(".")[0] not in free}
 
 

@@ -25,8 +25,8 @@ from experiments.common.tables import (
     mean_columns,
     mean_text,
 )
-from sejax import errors, registry
-from sejax.errors import require
+from sejax import options, registry
+from sejax.options import require
 from sejax.training import TrainingConfig
 
 ROWS = {  # agents that are trained: the rows of the paper's figure, and one of ours
@@ -69,8 +69,8 @@ class CurveSettings(RnSettings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        errors.each_of("rows", self.rows, self.study.rows)
-        errors.each_of("bonuses", self.bonuses, (*self.study.bonuses, "none"))
+        options.each_of(self.study.rows)("rows", self.rows, None)
+        options.each_of((*self.study.bonuses, "none"))("bonuses", self.bonuses, None)
         most, fix = f"be at most {self.learned}", f"learned={self.rns}"
         require(self.rns <= self.learned, "rns", most, "so many are learned", self.rns, fix)
 
@@ -108,7 +108,7 @@ def real_curves(settings: CurveSettings) -> Iterator[pd.DataFrame]:
 def rn_curves(settings: CurveSettings, variant: str, rns: Any, prefix: str = "") -> Any:
     """Curves of all agents on the RNs of a set, of which each group of agents has one."""
     make = functools.partial(Condition.of_set, rns)
-    return curves_in(settings, variant, rns.size, make, prefix)
+    return curves_in(settings, variant, len(rns), make, prefix)
 
 
 def curves_in(

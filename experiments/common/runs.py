@@ -21,12 +21,12 @@ from experiments.common.agents import HPARAMS, Condition, groups_at_once, train_
 from experiments.common.experiment import Settings, count, each_of, setting
 from experiments.common.tables import iqm_columns, mean_columns
 from sejax import registry
-from sejax.cli import build, run_directory, session
-from sejax.cli.families import JOINT, key_of
+from sejax.cli import config as configuration
+from sejax.cli import run_directory, session
+from sejax.cli.config import JOINT, key_of
 from sejax.cli.progress import Tally
-from sejax.errors import ConfigError, require
 from sejax.ops.files import write_text
-from sejax.options import positive
+from sejax.options import ConfigError, positive, require
 
 UNLIMITED = 100_000  # generations of a run that its budget ends
 
@@ -122,13 +122,13 @@ def _log(curve: pd.DataFrame, solved_score: float | None) -> str:
 def collect(configs: list[Any], path: Path, before: Any = None) -> None:
     """Writes the best proxy of each run into one file, after those of the set `before`."""
     sets = [*([before] if before else []), *(sejax.load_set(Path(x.run_dir)) for x in configs)]
-    places = [(each, i) for each in sets for i in range(each.size)]
+    proxies = [proxy for each in sets for proxy in each]
     sejax.save_set(
         path,
         sets[0].env,
-        [each.one(i).weights for each, i in places],
-        [each.records[i] for each, i in places],
-        before.config if before else build.to_plain(configs[0]),
+        [proxy.params.weights for proxy in proxies],
+        [proxy.record for proxy in proxies],
+        before.config if before else configuration.plain(configs[0]),
         sets[0].discount,
     )
 
@@ -272,7 +272,7 @@ class MixtureRuns(RunSettings):
         (family,) = config.agents.families
         training = dataclasses.replace(config.training, test_episodes=self.test_episodes)
         seeds = {
-            f"{name}-{seed:02d}-{ses.fingerprint(i)}": seed for i, seed in enumerate(ses.seeds)
+            f"{name}-{seed:02d}-{ses[i].fingerprint}": seed for i, seed in enumerate(ses.seeds)
         }
         at_once, tables = groups_at_once(self.devices), []
         for hparams in self.tested_hparams:

@@ -16,9 +16,9 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from sejax.errors import ConfigError
 from sejax.ops.files import atomic_path, write_text
-from sejax.serialize import differences
+from sejax.options import ConfigError
+from sejax.registry import differences
 
 # Training steps grow along each curve: kept as differences, a table takes two thirds of the room.
 _GROWING, _DIFFERENCES = "steps", "steps_since_the_row_before"

@@ -22,7 +22,7 @@ from experiments.common import agents
 from experiments.common.agents import HPARAMS, SE_AGENTS, SOFT_SE
 from experiments.common.experiment import Settings, count, each_of, setting
 from sejax import registry
-from sejax.cli import build
+from sejax.cli import config as configuration
 from sejax.ops.parallel import spread_over_devices
 
 LEARNING_RATE, BATCH_SIZE = 1e-4, 1024  # paper and docs/reference.md 7.5
@@ -53,7 +53,7 @@ class SupervisedBaseline(Settings):
 
 def learning_config(settings: SupervisedBaseline, ses: Any) -> Any:
     """Settings of the NES runs that the transitions come from."""
-    config = build.learn_config(ses.config)
+    config = configuration.learn_config(ses.config)
     agent, training = config.agent, config.training
     training = dataclasses.replace(training, test_episodes=settings.test_episodes)
     if settings.quick:
@@ -78,7 +78,7 @@ def learning_config(settings: SupervisedBaseline, ses: Any) -> Any:
 def collect_all(settings: SupervisedBaseline, ses: Any) -> list[pd.DataFrame]:
     """The transitions of each NES run; every run is a shard."""
     config = learning_config(settings, ses)
-    made_with = build.to_plain(config) | {"max_rows": settings.max_rows, "devices": None}
+    made_with = configuration.plain(config) | {"max_rows": settings.max_rows, "devices": None}
     tables = []
     for index in range(settings.models):
         seed = settings.seed + index

@@ -6,7 +6,6 @@ hyperparameters that compiled programs take as arguments, and the buffers.
 
 import dataclasses
 import functools
-from typing import Any
 
 from sejax import registry
 from sejax.agents.base import (
@@ -27,8 +26,9 @@ from sejax.agents.buffers import (
     replay_buffer,
     rollout_buffer,
 )
+from sejax.envs.base import Task
 from sejax.envs.spec import TaskSpec
-from sejax.errors import require
+from sejax.options import require
 
 __all__ = [
     "Agent",
@@ -59,7 +59,7 @@ def names() -> list[str]:
 
 def make_agent(
     config: AgentConfig,
-    task: Any,
+    task: Task,
     exploration: ExplorationConfig = NoExploration(),  # noqa: B008 (frozen)
     varied: bool = False,
 ) -> Agent:
@@ -91,13 +91,13 @@ def make_agent(
         "task to env.task, or sejax.Task(name=..., env=env)",
     )
     require_fit(config, exploration, task, task.name)
-    return _make_agent(registry.Same(config, exploration), task, varied)
+    is_key = registry.is_hashable(config) and registry.is_hashable(exploration)
+    return (_make_once if is_key else _make_agent)(config, exploration, task, varied)
 
 
-@functools.cache
-def _make_agent(key: registry.Same, task: Any, varied: bool) -> Agent:
-    config, exploration = key.configs
-
+def _make_agent(
+    config: AgentConfig, exploration: ExplorationConfig, task: Task, varied: bool
+) -> Agent:
     def make(config: AgentConfig) -> Agent:
         agent = registry.make("agent", config, task)
         agent = registry.make("exploration", exploration, agent, task)
@@ -109,6 +109,9 @@ def _make_agent(key: registry.Same, task: Any, varied: bool) -> Agent:
     from sejax.agents.varied import make_varied
 
     return make_varied(config, make)
+
+
+_make_once = functools.cache(_make_agent)
 
 
 def require_fit(

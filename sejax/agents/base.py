@@ -10,11 +10,12 @@ import jax
 from jaxtyping import Array, Int
 
 from sejax.agents.buffers import BufferMaker
+from sejax.envs.base import Task
 from sejax.envs.environment import spaces_of
 from sejax.envs.spec import Discrete, Space
 from sejax.options import Options, counts, option, traced_options
 
-# A pytree of whatever the agent needs; nobody else looks into it.
+# A pytree of what the agent needs; only the agent reads it.
 AgentState = Any
 # Traced hyperparameters of an agent: a pytree of floats, see `traced`.
 Hparams = Any
@@ -66,8 +67,8 @@ class AgentSpec:
       action_repeat: environment steps for each decision.
       cpu_num_parallel: `vmap` width on one CPU core; None for all agents. A network keeps a core
         busy alone, a table does not.
-      spaces: observations and actions that it is made for, as `sejax.make_agent` says; None if
-        nobody says.
+      spaces: observations and actions that it is made for, set by `sejax.make_agent`; None if
+        unknown.
     """
 
     warmup_episodes: int = 0
@@ -194,7 +195,7 @@ class AgentConfig(Options):
         """Whether each step has one learning step, as ICM needs it."""
         return True
 
-    def make(self, task: Any) -> Agent:
+    def make(self, task: Task) -> Agent:
         """The agent for a task's observations and actions."""
         raise NotImplementedError
 
@@ -240,7 +241,7 @@ class ExplorationConfig(Options):
     states: ClassVar[str | None] = None
     needs_each_step: ClassVar[bool] = False
 
-    def make(self, agent: Agent, task: Any) -> Agent:
+    def make(self, agent: Agent, task: Task) -> Agent:
         """The agent with the intrinsic reward."""
         raise NotImplementedError
 
@@ -249,7 +250,7 @@ class ExplorationConfig(Options):
 class NoExploration(ExplorationConfig):
     """No intrinsic reward."""
 
-    def make(self, agent: Agent, task: Any) -> Agent:
+    def make(self, agent: Agent, task: Task) -> Agent:
         return agent
 
 
@@ -275,7 +276,7 @@ def _hparams_type(name: str, fields: tuple[str, ...]) -> Any:
     return collections.namedtuple(name, fields)
 
 
-def with_hparams(hparams: Any, values: dict[str, Array]) -> Any:
+def with_hparams(hparams: Hparams, values: dict[str, Array]) -> Hparams:
     """Traced hyperparameters with these values; those of a wrapped agent are its field `agent`."""
     if "agent" in hparams._fields:
         return hparams._replace(agent=with_hparams(hparams.agent, values))

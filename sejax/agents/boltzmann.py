@@ -23,10 +23,9 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Float
 
-from sejax.agents.base import Agent, AgentConfig, traced
+from sejax.agents.base import Agent, AgentConfig, Hparams, traced
 from sejax.agents.buffers import no_buffer
-from sejax.errors import require
-from sejax.options import counts, option, positive
+from sejax.options import counts, option, positive, require
 
 MOST_DIMS = 2  # of continuous actions: there are num_points to the power of these
 
@@ -69,16 +68,16 @@ class BoltzmannConfig(AgentConfig):
 
 
 class BoltzmannState(struct.PyTreeNode):
-    """One agent: the rewards of its world, and how it weighs them."""
+    """One agent: the rewards of its environment, and how it weighs them."""
 
     reward: Any  # `(obs, action) -> []`, a pytree
-    hparams: Any
+    hparams: Hparams
 
 
 def make_boltzmann(config: BoltzmannConfig, actions: Array) -> Agent:
     """The policy over some actions, `[num_actions]` indices or `[num_actions, action_dim]`.
 
-    It takes no step of training: `Agent.solve` reads the rewards of the world, an SE with
+    It takes no step of training: `Agent.solve` reads the rewards of the environment, an SE with
     `proxy.horizon=1`. Tests play the policy as it is, at random.
 
     Example:
@@ -90,7 +89,7 @@ def make_boltzmann(config: BoltzmannConfig, actions: Array) -> Agent:
       True
     """
 
-    def solve(env: Any, env_params: Any, hparams: Any) -> BoltzmannState:
+    def solve(env: Any, env_params: Any, hparams: Hparams) -> BoltzmannState:
         require(
             getattr(env, "is_bandit", False),
             "agent",

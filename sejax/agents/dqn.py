@@ -17,7 +17,7 @@ from flax import linen as nn
 from flax import struct
 from jaxtyping import Array, Float, Int
 
-from sejax.agents.base import Agent
+from sejax.agents.base import Agent, Hparams
 from sejax.agents.buffers import Transition
 from sejax.agents.off_policy import OffPolicyOptions, mean_over_batch, off_policy_agent
 from sejax.agents.policies import decayed_epsilon, epsilon_greedy, select_action
@@ -36,7 +36,7 @@ class DDQNConfig(OffPolicyOptions):
     epsilon_min: float = option(0.01, fraction(), traced=True)
     epsilon_decay: float = option(0.9, fraction(), traced=True)  # factor for each episode
     # If given, epsilon falls linearly in so many steps from when the agent first learns, whatever
-    # the episodes: for worlds where those have a step or two.
+    # the episodes: for environments whose episodes have one or two steps.
     exploration_steps: int | None = option(None, counts("it counts steps"), traced=True)
     double: bool = True  # the online network chooses a target's action; else the target network
     loss: str = option("squared", one_of(LOSSES))  # of the error; huber: its gradient is clipped
@@ -50,7 +50,7 @@ class DDQNConfig(OffPolicyOptions):
 
     @property
     def cpu_num_parallel(self) -> int:
-        """Agents that best train in lockstep on a CPU core."""
+        """The fastest `vmap` width on one CPU core."""
         is_small = self.num_layers == 1 and self.hidden_size * self.batch_size <= cpu.SMALL_PRODUCT
         return cpu.SMALL_NUM_PARALLEL if is_small else 1
 
@@ -67,7 +67,7 @@ class DDQNConfig(OffPolicyOptions):
 class DuelingDDQNConfig(DDQNConfig):
     """DDQN with a dueling network (paper, appendix, tables of DDQN and Dueling DDQN)."""
 
-    cpu_num_parallel = 1  # in lockstep its two streams make a step 1.5 times as long
+    cpu_num_parallel = 1  # under vmap its two streams make a step 1.5 times as long
 
     feature_dim: int = option(128, counts())  # outputs of the part that both streams share
     # Hidden layers of the value and of the advantage stream.
@@ -104,7 +104,7 @@ class DDQNState:
     opt_state: optax.OptState
     epsilon: Array
     num_steps: Int[Array, ""]  # agent steps since it first learned
-    hparams: Any  # traced options, and hidden_size and batch_size in use or None
+    hparams: Hparams  # traced options, and hidden_size and batch_size in use or None
 
 
 @functools.cache
@@ -123,7 +123,7 @@ def make_ddqn(config: DDQNConfig, obs_dim: int, num_actions: int) -> Agent:
     unflatten = flat.unflattener(network.init, jnp.zeros(obs_dim))
     learn = make_learning_step(config, network, unflatten)
 
-    def init(key: Array, hparams: Any) -> DDQNState:
+    def init(key: Array, hparams: Hparams) -> DDQNState:
         params = flat.flatten(init_narrowed(network, key, obs_dim, hparams.hidden_size))
         hparams = jax.tree.map(jnp.float32, hparams)
         return DDQNState(
@@ -161,7 +161,7 @@ def begin_episode(state: DDQNState, episode: Array) -> DDQNState:
     return state.replace(epsilon=epsilon)
 
 
-def linear_epsilon(hparams: Any, num_steps: Array) -> Array:
+def linear_epsilon(hparams: Hparams, num_steps: Array) -> Array:
     """The share of random actions `num_steps` after the agent first learned, `[]`.
 
     It falls from `hparams.epsilon_init` to its `epsilon_min` in `exploration_steps` and stays.

@@ -14,9 +14,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from sejax.agents.base import Agent
-from sejax.errors import require
 from sejax.es.base import AGGREGATES, finite_mean, is_tie
-from sejax.options import Options, one_of, option
+from sejax.options import Options, one_of, option, require
 
 COMPARED_BY = ("advantage", "rank")
 

@@ -19,7 +19,7 @@ import optax
 from flax import struct
 from jaxtyping import Array, Bool, Float
 
-from sejax.agents.base import Agent
+from sejax.agents.base import Agent, Hparams
 from sejax.agents.buffers import Transition
 from sejax.agents.off_policy import (
     OffPolicyOptions,
@@ -28,10 +28,9 @@ from sejax.agents.off_policy import (
     warming_up,
 )
 from sejax.agents.policies import select_action
-from sejax.errors import require
 from sejax.ops import flat
 from sejax.ops.networks import init_narrowed
-from sejax.options import counts, finite, fraction, not_negative, option, positive
+from sejax.options import counts, finite, fraction, not_negative, option, positive, require
 
 _MIN_LOG_STD, _MAX_LOG_STD = -20.0, 2.0  # of the Gaussian, as in the authors' code
 
@@ -51,7 +50,7 @@ class SACConfig(OffPolicyOptions):
     hidden_size: int = 256
     learning_rate: float = 3e-4  # of the actor, the critics and the temperature
     tau: float = 0.005
-    action_repeat: int = option(1, counts())  # steps of the world for each decision
+    action_repeat: int = option(1, counts())  # environment steps for each decision
     # Temperature: what a nat of entropy is worth, in reward units. None: learned, as the authors do
     # to meet a target entropy.
     alpha: float | None = option(None, not_negative("it weighs the entropy"), traced=True)
@@ -90,7 +89,7 @@ class SACState(struct.PyTreeNode):
     target_critics: Float[Array, " num_critic_params"]
     opt_state: optax.OptState
     is_warming_up: Bool[Array, ""]
-    hparams: Any  # traced options, and hidden_size and batch_size in use or None
+    hparams: Hparams  # traced options, and hidden_size and batch_size in use or None
 
 
 class LearningNoise(NamedTuple):
@@ -125,7 +124,7 @@ class Policy:
       q_values: `(critics, obs, action) -> [2, batch]`, of actions that were taken.
       expected: `(critics, obs, outputs, noise) -> (q_value, entropy)`, `[batch]` each: the lesser
         critic's value and the entropy, in expectation over the policy or for a draw of it.
-      env_action: `action -> action` as the world takes it.
+      env_action: `action -> action` as the environment takes it.
     """
 
     num_outputs: int
@@ -144,7 +143,7 @@ class Policy:
 def make_sac(config: SACConfig, obs_dim: int, action_dim: int, max_action: float) -> Agent:
     """Builds the agent for observations `[obs_dim]` and actions `[action_dim]`.
 
-    It remembers actions in [-1, 1]; the world takes `max_action` times as much.
+    The buffer keeps actions in [-1, 1]; the environment takes `max_action` times as much.
 
     Example:
       >>> agent = make_sac(SACConfig(), obs_dim=3, action_dim=1, max_action=2.0)
@@ -172,7 +171,7 @@ def _make_agent(config: SACConfig, obs_dim: int, policy: Policy) -> Agent:
     networks = make_networks(config, obs_dim, policy)
     learn = make_learning_step(networks, policy)
 
-    def init(key: Array, hparams: Any) -> SACState:
+    def init(key: Array, hparams: Hparams) -> SACState:
         params = networks.init(key, hparams)
         return SACState(
             params=params,
@@ -252,7 +251,7 @@ def make_networks(config: SACConfig, obs_dim: int, policy: Policy) -> Networks:
             log_alpha=jnp.zeros(()),
         )
 
-    def init(key: Array, hparams: Any) -> Array:
+    def init(key: Array, hparams: Hparams) -> Array:
         params = init_all(key, hparams.hidden_size)
         return flat.flatten(params._replace(log_alpha=jnp.log(jnp.float32(hparams.init_alpha))))
 
@@ -295,7 +294,7 @@ def make_learning_step(
     """
 
     def sum_of_losses(
-        params: Params, target_critics: Any, hp: Any, batch: Transition, noise: LearningNoise
+        params: Params, target_critics: Any, hp: Hparams, batch: Transition, noise: LearningNoise
     ) -> Array:
         fixed = jax.lax.stop_gradient(params)
         online, online_fixed, target = (

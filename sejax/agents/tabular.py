@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Float, Int
 
-from sejax.agents.base import Agent, AgentOptions, traced
+from sejax.agents.base import Agent, AgentOptions, Hparams, traced
 from sejax.agents.buffers import Transition, no_buffer
 from sejax.agents.policies import decayed_epsilon, epsilon_greedy
 from sejax.options import MOVES, fraction, option, positive
@@ -56,7 +56,7 @@ class TabularState:
 
     q_values: Float[Array, "num_states num_actions"]
     epsilon: Array
-    hparams: Any  # traced options
+    hparams: Hparams  # traced options
 
 
 @functools.cache
@@ -114,7 +114,7 @@ def _make_tabular(
 ) -> Agent:
     """What both agents share: all but the value of the next state."""
 
-    def init(key: Array, hparams: Any) -> TabularState:
+    def init(key: Array, hparams: Hparams) -> TabularState:
         hparams = jax.tree.map(jnp.float32, hparams)
         return TabularState(
             q_values=jnp.zeros((num_states, num_actions), jnp.float32),
@@ -153,9 +153,9 @@ def _make_tabular(
     )
 
 
-# Tables are read by index and written by mask. In lanes on a CPU, reading by a mask over the whole
-# table makes a training step three times as long; writing by one joins the trainer's own selects
-# over the table, where a scatter is an operation more.
+# Tables are read by index and written by mask. Under `vmap` on a CPU, reading by a mask over the
+# whole table makes a training step three times as long; writing by a mask joins the trainer's own
+# selects over the table, where a scatter is one more operation.
 
 
 def row_of(table: Array, state: Int[Array, ""]) -> Array:

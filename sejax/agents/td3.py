@@ -18,7 +18,7 @@ import optax
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
-from sejax.agents.base import Agent
+from sejax.agents.base import Agent, Hparams
 from sejax.agents.buffers import Transition
 from sejax.agents.off_policy import (
     OffPolicyOptions,
@@ -48,7 +48,7 @@ class TD3Config(OffPolicyOptions):
     learning_rate: float = 3e-4  # of the actor and the critics
     tau: float = 0.005
     policy_delay: int = option(2, counts())  # learning steps for each one of actor and targets
-    action_repeat: int = option(1, counts())  # steps of the world for each decision
+    action_repeat: int = option(1, counts())  # environment steps for each decision
     # Exploration, in units of the largest action.
     action_noise_std: float = option(0.1, not_negative(), traced=True)
     # Smoothing of the target policy, likewise.
@@ -94,7 +94,7 @@ class TD3State(struct.PyTreeNode):
     critic_opt_state: optax.OptState
     num_updates: Int[Array, ""]
     is_warming_up: Bool[Array, ""]
-    hparams: Any  # traced options, and hidden_size and batch_size in use or None
+    hparams: Hparams  # traced options, and hidden_size and batch_size in use or None
 
 
 class LearningNoise(NamedTuple):
@@ -123,7 +123,7 @@ class Policy:
       restrict: `action -> action` as it is allowed to be once Gaussian noise was added.
       warm_up: `key -> action`, `[action_dim]`, uniformly random.
       best: `outputs -> action` without any randomness.
-      env_action: `action -> action` as the world takes it.
+      env_action: `action -> action` as the environment takes it.
     """
 
     action_dim: int
@@ -160,8 +160,8 @@ def make_td3(config: TD3Config, obs_dim: int, action_dim: int, max_action: float
 def make_td3_discrete(config: DiscreteTD3Config, obs_dim: int, num_actions: int) -> Agent:
     """Builds the agent for observations `[obs_dim]` and actions `0..num_actions-1`.
 
-    It remembers actions as vectors `[num_actions]`: what the Gumbel-Softmax gave, with exploration
-    noise. The world takes the index of the largest entry.
+    The buffer keeps actions as vectors `[num_actions]`: samples of the Gumbel-Softmax with
+    exploration noise. The environment takes the index of the largest entry.
 
     Differs: the temperature reaches its end after `config.temperature_steps` learning steps, in the
     authors' code after one less. Tests take the likeliest action unless `config.noisy_tests` is
@@ -182,7 +182,7 @@ def _make_agent(config: TD3Config, obs_dim: int, policy: Policy) -> Agent:
     networks = make_networks(config, obs_dim, policy.action_dim)
     learn = make_learning_step(config, networks, policy)
 
-    def init(key: Array, hparams: Any) -> TD3State:
+    def init(key: Array, hparams: Hparams) -> TD3State:
         actor, critics = networks.init(key, hparams.hidden_size)
         return TD3State(
             actor=actor,
@@ -443,7 +443,7 @@ def gumbel_softmax(
     return _one_hot_of_largest(perturbed) + (soft - jax.lax.stop_gradient(soft))
 
 
-def annealed_temperature(hparams: Any, num_updates: Array, num_steps: int) -> Array:
+def annealed_temperature(hparams: Hparams, num_updates: Array, num_steps: int) -> Array:
     """Temperature in the `num_updates`-th learning step and until the next one.
 
     It falls linearly from `hparams.temperature` to its `hparams.final_temperature`-fold in

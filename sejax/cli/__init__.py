@@ -1,5 +1,5 @@
-"""The application around the library: command line, run directories, progress, pictures.
+"""The commands' parts: configuration, run directories, progress, trackers, plots, reports, search.
 
-Nothing below imports it. A run goes `compose` (Hydra) -> `build` (objects) -> `session` (the one
-driver of a run).
+Nothing below imports it. A run goes `config` (overrides to a configuration) -> `session` (the
+driver of a run) -> `run_directory` (its one checkpoint).
 """

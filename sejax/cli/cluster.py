@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
-from sejax.errors import ConfigError, FailedError, told
+from sejax.options import ConfigError, FailedError, told
 
 if TYPE_CHECKING:
     from sejax.cli.workers import RayConfig
@@ -127,7 +127,7 @@ class Pool:
         Raises:
           FailedError: if workers are lost again and again, or the whole cluster is.
         """
-        waiting, results = deque(range(len(shares))), {}
+        waiting, results = deque(range(len(shares))), dict[int, Any]()
         while len(results) < len(shares):
             while waiting and self._idle:
                 worker, index = self._idle.pop(), waiting.popleft()

@@ -7,10 +7,9 @@ from pathlib import Path
 from typing import Any
 
 from sejax import registry
-from sejax.cli import build, compose, presets
-from sejax.cli.words import word
-from sejax.errors import ConfigError
-from sejax.serialize import flatten
+from sejax.cli import config as configuration
+from sejax.options import ConfigError, as_text
+from sejax.registry import flatten
 
 
 def evaluate_words(
@@ -32,7 +31,7 @@ def evaluate_words(
     if has_real_steps and not any(":" in name for name in agents):
         words.append("agent_hparams=as_learned")
     elif len(agents) > 1:
-        words.append(f"agent=[{','.join(agents)}]")
+        words.append(f"agents=[{','.join(agents)}]")
     elif list(agents) != ["ddqn"]:
         words.append(f"agent={agents[0]}")
     return [*words, "num_agents=20"]
@@ -92,31 +91,33 @@ def run_words(stored: dict[str, Any]) -> list[str] | None:
     That is so for what is not sejax's own: to know its fields, it would have to be imported.
     """
     several = agent_names(stored) if stored.get("agents") else []
-    groups = [x for x in build.LEARN_GROUPS if x != "agent" or not several]
+    groups = [x for x in configuration.LearnConfig.groups if x != "agent" or not several]
     names = {group: str(stored.get(group, {}).get("name", "none")) for group in groups}
     named = [*names.items(), *(("agent", name) for name in several)]
     is_known = all(registry.is_registered(group, name) for group, name in named)
-    if not is_known or stored.get("preset") not in presets.names():  # a run stores no file's name
+    if (
+        not is_known or stored.get("preset") not in configuration.preset_names()
+    ):  # a run stores no file's name
         return None
     chosen = [f"{group}={names[group]}" for group in ("env", "proxy")]
     chosen += [f"preset={stored['preset']}"] if stored.get("preset") != "best" else []
     chosen += [f"agents=[{','.join(several)}]"] if several else []
     try:
-        usual = build.to_plain(compose.config(chosen))
+        usual = configuration.plain(configuration.config(chosen))
         others = [
             f"{group}={name}"
             for group, name in names.items()
             if (usual[group] or {}).get("name") != name
         ]
         chosen += others
-        usual = flatten(build.to_plain(compose.config(chosen)) if others else usual)
+        usual = flatten(configuration.plain(configuration.config(chosen)) if others else usual)
         asked = flatten(stored)
         words = chosen + [
-            f"{name}={word(value)}"
+            f"{name}={as_text(value)}"
             for name, value in asked.items()
             if name in usual and usual[name] != value
         ]
-        composed = flatten(build.to_plain(compose.config(words)))
+        composed = flatten(configuration.plain(configuration.config(words)))
     except (ConfigError, LookupError, TypeError, AttributeError):
         return None
     return words if all(composed.get(name) == value for name, value in asked.items()) else None

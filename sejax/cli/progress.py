@@ -15,9 +15,9 @@ from rich.progress import (
 )
 
 from sejax import registry
-from sejax.cli import next_steps, presets
-from sejax.cli.build import LearnConfig
-from sejax.cli.families import families_of
+from sejax.cli import config as configuration
+from sejax.cli import next_steps
+from sejax.cli.config import LearnConfig, families_of
 from sejax.cli.trackers import FinishedGeneration, Reporter
 
 if TYPE_CHECKING:  # the first line is shown before jax is imported
@@ -89,7 +89,7 @@ class RunProgress(Reporter):
     def __enter__(self) -> "RunProgress":
         self._progress.start()
         pair = self._config.name("env"), self._config.name("proxy")
-        if not presets.is_tuned(*pair):
+        if not configuration.is_tuned(*pair):
             self.say(
                 f"There are no tuned settings for env={pair[0]} with proxy={pair[1]}: these are "
                 f"general ones, not tuned (docs/defaults.md)."

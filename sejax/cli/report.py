@@ -17,8 +17,8 @@ import yaml
 
 from sejax.cli import next_steps
 from sejax.cli.run_directory import COLUMNS
-from sejax.errors import ConfigError, told
-from sejax.serialize import flatten
+from sejax.options import ConfigError, told
+from sejax.registry import flatten
 
 MOST_ROWS = 60  # generations in a table
 COSTS = {

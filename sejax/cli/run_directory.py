@@ -20,10 +20,10 @@ import filelock
 import numpy as np
 import yaml
 
-from sejax.errors import ConfigError
 from sejax.ops import checksummed
 from sejax.ops.files import remove_leftovers, write_bytes, write_text
-from sejax.serialize import differences
+from sejax.options import ConfigError
+from sejax.registry import differences
 
 COLUMNS = (
     "generation",
@@ -331,16 +331,15 @@ def open_for(config: Any, hint: str = HINT) -> RunDirectory:
     Raises:
       ConfigError: as of `RunDirectory`.
     """
-    from sejax.cli import build  # which imports jax
-    from sejax.cli.families import families_of
+    from sejax.cli import config as configuration  # which imports jax
 
-    agents = [family.key for family in families_of(config)]
+    agents = [family.key for family in configuration.families_of(config)]
     return RunDirectory(
         config.resolved_run_dir,
-        build.to_plain(config),
+        configuration.plain(config),
         agents,
         hint,
-        completed=lambda stored: build.completed(stored, config),
+        completed=lambda stored: configuration.completed(stored, config),
     )
 
 

@@ -13,7 +13,8 @@ import numpy as np
 
 from sejax import __version__
 from sejax.bilevel import Bilevel, make_bilevel
-from sejax.cli import build, runtime
+from sejax.cli import runtime
+from sejax.cli.config import LearnConfig
 from sejax.cli.run_directory import RunDirectory
 from sejax.cli.trackers import (
     FinishedGeneration,
@@ -22,7 +23,7 @@ from sejax.cli.trackers import (
     TrackedRun,
 )
 from sejax.ops.parallel import compiler_options
-from sejax.proxies import files
+from sejax.proxies.io import save
 
 DRAW_EVERY_S = 30.0
 
@@ -92,13 +93,13 @@ class Chunks:
         return self._compiled[length](state, *self._arguments)
 
 
-def make_chunks(config: build.LearnConfig) -> Chunks:
+def make_chunks(config: LearnConfig) -> Chunks:
     """The generations of a configuration, for all runs that differ from it in the seed."""
     return Chunks(make_bilevel(**config.parts()))
 
 
 def run(
-    config: build.LearnConfig,
+    config: LearnConfig,
     directory: RunDirectory,
     chunks: Chunks,
     report: Reporter | None = None,
@@ -188,7 +189,7 @@ class _Clock:
 class _Proxies:
     """The proxy files of a run."""
 
-    def __init__(self, config: build.LearnConfig, directory: RunDirectory, learner: Bilevel):
+    def __init__(self, config: LearnConfig, directory: RunDirectory, learner: Bilevel):
         self._folder, self._learner, self._seed = directory.path, learner, config.seed
         # What was learned does not depend on the tracker, nor on where it was computed.
         plain = directory.config.items()
@@ -216,7 +217,7 @@ class _Proxies:
             return
         names = self._learner.mixture.names
         by_agent = dict(zip(names, map(float, scores), strict=True))
-        files.save(
+        save(
             self._folder / f"{name}.safetensors",
             self._learner.proxy,
             self._learner.unravel(flat),
@@ -238,9 +239,7 @@ def draw(directory: RunDirectory, learner: Bilevel) -> None:
         plots.learning_curve(directory.rows, learner.solved_score, path)
 
 
-def _tracker(
-    config: build.LearnConfig, directory: RunDirectory, report: Reporter
-) -> GuardedTracker:
+def _tracker(config: LearnConfig, directory: RunDirectory, report: Reporter) -> GuardedTracker:
     run = TrackedRun(
         folder=directory.path.resolve(),
         id=directory.id,

@@ -14,8 +14,8 @@ import numpy as np
 import yaml
 
 from sejax import registry
-from sejax.errors import told
-from sejax.serialize import flatten
+from sejax.options import told
+from sejax.registry import flatten
 
 
 @dataclass(frozen=True, kw_only=True)

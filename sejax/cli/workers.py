@@ -20,8 +20,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 
 from sejax.cli.cluster import Pool, connected, num_workers
-from sejax.errors import require
-from sejax.options import Options, counts, fraction, option
+from sejax.options import Options, counts, fraction, option, require
 
 if TYPE_CHECKING:  # jax must not be imported before a worker has chosen its devices
     from sejax.bilevel import Bilevel, Candidates
@@ -77,7 +76,8 @@ class RayConfig(Options):
 def _remote_chunks(
     machines: RayConfig, config: Any, say: Callable[[str], None]
 ) -> Iterator["RemoteChunks"]:
-    from sejax.cli import build, runtime
+    from sejax.cli import config as configuration
+    from sejax.cli import runtime
 
     runtime.take_share_of_gpu(0)  # GPUs are the workers'
     from sejax.bilevel import make_bilevel
@@ -87,7 +87,7 @@ def _remote_chunks(
         batches = batches_of(config, learner, machines, max(1, num_workers(machines)))
         # A worker need not have what it has no use for.
         plain = {
-            k: v for k, v in build.to_plain(config).items() if k not in ("tracker", "machines")
+            k: v for k, v in configuration.plain(config).items() if k not in ("tracker", "machines")
         }
         arguments = plain, [batch.capacity for batch in batches], machines.gpus_per_worker
         actor = ray.remote(num_cpus=1, num_gpus=machines.gpus_per_worker)(Worker)
@@ -111,9 +111,7 @@ class Batch:
     width: int
 
 
-def batches_of(
-    config: Any, learner: "Bilevel", machines: RayConfig, num_first: int
-) -> list[Batch]:
+def batches_of(config: Any, learner: "Bilevel", machines: RayConfig, num_first: int) -> list[Batch]:
     """The batches of each agent.
 
     On a CPU they are the same for any number of workers, because sums over batches of other widths
@@ -144,7 +142,10 @@ def cut(places: np.ndarray, batch: Batch, num_workers: int) -> Iterator[np.ndarr
 
 def _places(learner: "Bilevel") -> list[np.ndarray]:
     """The indices of each agent's evaluations in a generation."""
-    agents = learner.scoring.agent_of_evaluation
+    from sejax.scores import Scoring
+
+    scoring = Scoring.of(learner.objective, learner.strategy, learner.mixture)
+    agents = scoring.agent_of_evaluation
     return [np.flatnonzero(agents == i) for i in range(learner.mixture.size)]
 
 
@@ -310,9 +311,9 @@ class Worker:
         )
         runtime.configure_jax()
         from sejax.bilevel import make_bilevel
-        from sejax.cli import build
+        from sejax.cli import config as configuration
 
-        config = build.learn_config(self._config)
+        config = configuration.learn_config(self._config)
         learner = make_bilevel(**config.parts() | {"devices": 1})
         self._programs = [
             _compiled_share(learner, agent, capacity, config.num_parallel)

@@ -39,7 +39,7 @@ def make(name: str, **options: Any) -> Task:
 def make_from(config: Any) -> Task:
     """The task that a configuration describes, built once; it knows where it came from."""
     task = registry.make("env", config)
-    if task.origin is None:
+    if task.origin is None:  # set once, before anybody else has the task
         vars(task)["origin"] = registry.describe("env", config)
     return task
 

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
-from sejax import errors
+from sejax import options
 from sejax.envs.spec import Space, TaskSpec
 
 
@@ -81,15 +81,15 @@ class Task(TaskSpec):
             info_keys=info_keys,
             augmented_keys=augmented_keys,
         )
+        # As the generated `__init__` of a frozen dataclass does, but all at once.
         vars(self).update(name=name, env=vectors, params=params, origin=origin)
 
     @classmethod
-    def of(cls, spec: TaskSpec, *, name: str, env: Any, params: Any = None) -> "Task":
+    def of(cls, spec: TaskSpec, *, name: str, env: Any) -> "Task":
         """The task of an environment that has the spec's spaces."""
         return cls(
             name=name,
             env=env,
-            params=params,
             max_steps=spec.max_steps,
             solved_reward=spec.solved_reward,
             info_keys=spec.info_keys,
@@ -111,7 +111,7 @@ def require_own_steps(env: Any) -> None:
         for name in ("reset", "step")
         if hasattr(type(env), name) and not hasattr(type(env), f"{name}_env")
     ]
-    errors.require(
+    options.require(
         not left_out,
         "env",
         " and ".join(f"change {name}_env in place of {name}" for name in left_out),
@@ -123,7 +123,7 @@ def require_own_steps(env: Any) -> None:
 
 def _require_threshold(solved_reward: Any) -> None:
     is_nan = isinstance(solved_reward, float) and math.isnan(solved_reward)
-    errors.require(
+    options.require(
         not is_nan and not isinstance(solved_reward, str | None),  # a traced one is fine
         "env.solved_reward",
         "be a number",
@@ -139,7 +139,7 @@ def _params_of(env: Any, params: Any, name: str) -> Any:
         default = env.default_params
     require_own_steps(env)
     params = default if params is None else params
-    errors.require(
+    options.require(
         hasattr(params, "max_steps_in_episode"),
         "params",
         "have max_steps_in_episode",
@@ -153,10 +153,10 @@ def _params_of(env: Any, params: Any, name: str) -> Any:
 def _with_limit(params: Any, max_steps: int | None) -> tuple[Any, int]:
     """Params that have the step limit, and the limit."""
     limit = params.max_steps_in_episode if max_steps is None else max_steps
-    limit = errors.as_python(limit)
-    errors.whole(1, "env.max_steps", limit, "an episode has steps", 200)
+    limit = options.as_python(limit)
+    options.counts("an episode has steps")("env.max_steps", limit, 200)
     if max_steps is not None and params.max_steps_in_episode != limit:
-        errors.require(
+        options.require(
             hasattr(params, "replace"),
             "params",
             f"have a method replace, or max_steps_in_episode={limit}",
@@ -173,13 +173,13 @@ def _says_what_it_must_be(name: str) -> Iterator[None]:
     """Turns whatever an environment raises within into a `ConfigError`."""
     try:
         yield
-    except errors.ConfigError:
+    except options.ConfigError:
         raise
     except Exception as error:
-        raise errors.ConfigError(
-            f"env must be a gymnax 1.x environment, with default_params, spaces, reset_env, "
-            f"step_env (five values) and is_truncated; {name} raised {errors.told(error)}. Derive "
-            f"it from gymnax's Environment, of whose make env is the first result."
+        raise options.ConfigError(
+            f"env must be a gymnax 1.x environment (step_env returns five values); {name} raised "
+            f"{options.told(error)}. Derive it from gymnax's Environment, or set env to the first "
+            f"result of gymnax.make."
         ) from error
 
 
@@ -221,11 +221,11 @@ def _try(env: Any, params: Any, name: str) -> None:
     ):
         if not is_right:
             faults.append(f"{what} is {x.shape} {x.dtype}")
-    errors.require(
+    options.require(
         not faults,
         "env",
-        f"keep its shapes and dtypes: obs {shape}, reward a scalar, terminated a bool",
-        "an episode is one compiled loop",
+        f"keep its shapes: obs {shape}, reward a scalar, terminated a bool",
+        "an episode is one loop",
         f"{name}, where {'; '.join(faults)}",
-        "env to one that returns that",
+        "env to one that does",
     )

@@ -16,7 +16,7 @@ from flax import struct
 from jaxtyping import Array
 
 from sejax.envs.spec import Box, Discrete, Space
-from sejax.errors import ConfigError
+from sejax.options import ConfigError
 
 
 @struct.dataclass

@@ -7,7 +7,7 @@ import math
 from dataclasses import dataclass
 from typing import ClassVar
 
-from sejax import errors
+from sejax import options
 from sejax.envs.base import Task
 from sejax.options import Options, counts, option
 
@@ -42,13 +42,13 @@ class GymnaxTask(Options):
 
         gymnax_id = self.name.removeprefix(PREFIX)
         if gymnax_id not in registered_envs:
-            raise errors.unknown_name("env", self.name, [PREFIX + x for x in registered_envs])
+            raise options.unknown_name("env", self.name, [PREFIX + x for x in registered_envs])
         try:
             env, params = gymnax.make(gymnax_id)
         except Exception as error:  # such as a data set that cannot be fetched
-            raise errors.ConfigError(
+            raise options.ConfigError(
                 f"env must be an environment that gymnax can make here; {gymnax_id} raised "
-                f"{errors.told(error)}."
+                f"{options.told(error)}."
             ) from error
         solved = self.solved_reward
         if solved is None:

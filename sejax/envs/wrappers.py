@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from sejax.envs.environment import Environment, space_of_gymnax, spaces_of
 from sejax.envs.spec import Box, Discrete, Space
-from sejax.errors import ConfigError
+from sejax.options import ConfigError
 
 
 class Wrapper(Environment):

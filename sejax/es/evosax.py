@@ -11,9 +11,8 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Float
 
-from sejax.errors import require
 from sejax.es.base import LARGEST, Evaluations, Strategy, StrategyOptions
-from sejax.options import counts, one_of, option, positive, shrinks
+from sejax.options import counts, one_of, option, positive, require, shrinks
 
 
 class Algorithm(NamedTuple):

@@ -5,8 +5,6 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
-from sejax.errors import ConfigError, shortened
-
 Layers = list[tuple[np.ndarray, np.ndarray]]  # kernel [in, out] and bias [out] of each
 Shapes = dict[str, tuple[int, ...]]
 
@@ -76,33 +74,16 @@ def _block_diagonal(blocks: Sequence[np.ndarray]) -> np.ndarray:
     return whole
 
 
-def shapes_of(network: str, units: Sequence[int]) -> Shapes:
-    """Shapes of a network's tensors in a file; `units`: numbers of inputs, of each layer's units.
+def shapes_of(networks: Mapping[str, Sequence[int]]) -> Shapes:
+    """Shapes of networks' tensors in a file, by the numbers of inputs and of each layer's units.
 
     Example:
-      >>> shapes_of("reward", [6, 1])
+      >>> shapes_of({"reward": [6, 1]})
       {'reward/Dense_0/kernel': (1, 6), 'reward/Dense_0/bias': (1,)}
     """
     shapes: Shapes = {}
-    for i, (num_inputs, num_outputs) in enumerate(itertools.pairwise(units)):
-        shapes[f"{network}/Dense_{i}/kernel"] = (num_outputs, num_inputs)
-        shapes[f"{network}/Dense_{i}/bias"] = (num_outputs,)
+    for name, units in networks.items():
+        for i, (num_inputs, num_outputs) in enumerate(itertools.pairwise(units)):
+            shapes[f"{name}/Dense_{i}/kernel"] = (num_outputs, num_inputs)
+            shapes[f"{name}/Dense_{i}/bias"] = (num_outputs,)
     return shapes
-
-
-def check(weights: Mapping[str, np.ndarray], shapes: Shapes) -> None:
-    """Checks that a file's tensors are those of the networks that its metadata describes.
-
-    Raises:
-      ConfigError: if they are not, not float32, or not finite.
-    """
-    there = {
-        name: x.shape if x.dtype == np.float32 else (x.dtype, x.shape)
-        for name, x in weights.items()
-    }
-    if there != shapes or not all(np.isfinite(x).all() for x in weights.values()):
-        what = "numbers that are not finite" if there == shapes else shortened(there)
-        raise ConfigError(
-            f"weights must be those of the proxy's networks, because they are what it has learned; "
-            f"got {what} in place of {shortened(shapes)}. Learn it again, or give its own task."
-        )

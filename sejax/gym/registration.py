@@ -1,36 +1,28 @@
 """From the name or the file of a proxy to environments."""
 
 import re
-from collections.abc import Mapping
 from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import gymnasium
-import numpy as np
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
 
 from sejax import registry
-from sejax.errors import ConfigError, as_python, require, whole
 from sejax.gym.reward import RewardNetwork
-from sejax.gym.source import Source, read
 from sejax.gym.synthetic import SyntheticEnv, SyntheticWorld
-from sejax.gym.tasks import (
-    RealTask,
-    is_close,
-    make_gymnasium,
-    real_env,
-    real_task,
-    step_limit,
-    unknown_task,
-)
+from sejax.gym.tasks import RealTask, rn_env, se_task
 from sejax.gym.vector import SyntheticVectorEnv
-from sejax.proxies import stored
+from sejax.options import ConfigError, as_python, counts, require
+from sejax.proxies.header import Header, pretrained_names, read_single
 
 if TYPE_CHECKING:
     from stable_baselines3.common.vec_env import VecEnv
 
 NAMESPACE = "sejax"  # of the ids
+
+Source = str | Path
 
 
 def make(
@@ -57,14 +49,13 @@ def make(
       >>> make("cartpole-rn").spec.id
       'sejax/cartpole-rn'
     """
-    weights, header = read(source)
+    header, world = _read(source, task, render_mode)
     env: SyntheticEnv | RewardNetwork
-    name = re.sub(r"[^\w.:-]+", "-", header["task"]) or "proxy"  # as Gymnasium's ids must be
-    if _is_rn(header):
-        env, name = RewardNetwork(_real_env(header, task, render_mode), source), f"{name}-rn"
+    name = re.sub(r"[^\w.:-]+", "-", header.task) or "proxy"  # as Gymnasium's ids must be
+    if world is None:
+        env, name = RewardNetwork(rn_env(header, task, render_mode), source), f"{name}-rn"
     else:
-        _require_no_picture(render_mode)
-        env = SyntheticEnv(_world(weights, header, task))
+        env = SyntheticEnv(world)
     options = {"source": str(source), "task": task, "render_mode": render_mode}
     env.spec = _spec(name, **{key: x for key, x in options.items() if x is not None})
     return env
@@ -80,18 +71,18 @@ def make_vec(
 ) -> VectorEnv[Any, Any, Any]:
     """Makes a stored proxy a Gymnasium vector environment.
 
-    All lanes of an SE are one pass through its networks. An RN's are environments of the real task
-    one after the other, as Gymnasium has them.
+    The environments of an SE are stepped by one pass through its networks. Those of an RN are
+    environments of the real task, stepped one after the other.
 
     Args:
       source: as of `make`.
-      num_envs: lanes.
+      num_envs: number of environments.
       task: as of `make`.
       autoreset_mode: what happens where an episode ends; see `SyntheticVectorEnv`.
       render_mode: as of `make`.
 
     Raises:
-      ConfigError: as `make`, or for less than one lane.
+      ConfigError: as `make`, or for less than one environment.
 
     Example:
       >>> envs = make_vec("cartpole", num_envs=8)
@@ -100,23 +91,22 @@ def make_vec(
       ((8, 4), 'NextStep')
     """
     num_envs = _count(num_envs)
-    weights, header = read(source)
-    if _is_rn(header):
+    _, world = _read(source, task, render_mode)
+    if world is None:
         env_fns = [partial(make, source, task, render_mode=render_mode)] * num_envs
         return SyncVectorEnv(env_fns, autoreset_mode=autoreset_mode)
-    _require_no_picture(render_mode)
-    return SyntheticVectorEnv(_world(weights, header, task), num_envs, autoreset_mode)
+    return SyntheticVectorEnv(world, num_envs, autoreset_mode)
 
 
 def make_sb3(source: Source, num_envs: int = 1, task: RealTask | str | None = None) -> "VecEnv":
     """Makes a stored proxy a `VecEnv` of Stable-Baselines3.
 
-    All lanes of an SE are one pass through its networks. An RN's are environments of the real task
-    in a `DummyVecEnv`.
+    The environments of an SE are stepped by one pass through its networks. Those of an RN are
+    environments of the real task in a `DummyVecEnv`.
 
     Args:
       source: as of `make`.
-      num_envs: lanes.
+      num_envs: number of environments.
       task: as of `make`.
 
     Raises:
@@ -132,10 +122,10 @@ def make_sb3(source: Source, num_envs: int = 1, task: RealTask | str | None = No
             f"make_sb3 needs Stable-Baselines3, because it makes one of its VecEnvs; got {error}. "
             f"Install it with pip install 'sejax[sb3]'."
         ) from error
-    weights, header = read(source)
-    if _is_rn(header):
+    _, world = _read(source, task)
+    if world is None:
         return DummyVecEnv([partial(make, source, task)] * num_envs)
-    return SyntheticVecEnv(_world(weights, header, task), num_envs)
+    return SyntheticVecEnv(world, num_envs)
 
 
 def register() -> list[str]:
@@ -148,14 +138,14 @@ def register() -> list[str]:
       >>> register()[0], gymnasium.make("sejax/acrobot").action_space
       ('sejax/acrobot', Discrete(3))
     """
-    specs = [_spec(name, source=name) for name in stored.pretrained_names()]
+    specs = [_spec(name, source=name) for name in pretrained_names()]
     for spec in specs:
         gymnasium.registry.setdefault(spec.id, spec)
     return [spec.id for spec in specs]
 
 
 def _spec(name: str, **kwargs: Any) -> EnvSpec:
-    """How Gymnasium makes it; without `max_episode_steps`, a second time limit by a wrapper."""
+    """How Gymnasium makes it; with `max_episode_steps` it would add a second time limit."""
     return EnvSpec(
         id=f"{NAMESPACE}/{name}",
         entry_point="sejax.gym:make",
@@ -166,13 +156,22 @@ def _spec(name: str, **kwargs: Any) -> EnvSpec:
 
 def _count(num_envs: Any) -> int:
     num_envs = as_python(num_envs)
-    whole(1, "num_envs", num_envs, "each is an episode at a time", 8)
+    counts("each is an episode at a time")("num_envs", num_envs, 8)
     return int(num_envs)
 
 
-def _require_no_picture(render_mode: str | None) -> None:
-    # Stable-Baselines3's make_vec_env asks for rgb_array, whether anybody will look or not.
-    require(
+def _read(
+    source: Source, task: RealTask | str | None, render_mode: str | None = None
+) -> tuple[Header, SyntheticWorld | None]:
+    """The header of a file, and its SE; None if it is an RN.
+
+    Raises:
+      ConfigError: as `make`.
+    """
+    weights, header = read_single(source, ("se", "rn"))
+    if header.kind == "rn":
+        return header, None
+    require(  # Stable-Baselines3's make_vec_env asks for rgb_array, even if nobody looks at it
         render_mode in (None, "rgb_array"),
         "render_mode",
         "be None for an SE",
@@ -180,68 +179,15 @@ def _require_no_picture(render_mode: str | None) -> None:
         render_mode,
         "render_mode=None",
     )
-
-
-def _is_rn(header: Mapping[str, Any]) -> bool:
-    return header["config"]["proxy"]["name"] == "rn"
-
-
-def _world(
-    weights: Mapping[str, np.ndarray], header: Mapping[str, Any], task: RealTask | str | None
-) -> SyntheticWorld:
-    """What a file of an SE holds."""
-    config = registry.configure("proxy", header["config"]["proxy"])
-    limit = step_limit(header)
-    if isinstance(task, str):
-        task = RealTask.of_gymnasium(task, limit)
+    config = registry.configure("proxy", header.config["proxy"])
+    given = se_task(header, task, config.needs_task)
+    limit = header.interface["max_steps"]
     require(
-        task is None or isinstance(task, RealTask),
+        config.max_steps(given.max_steps) == config.max_steps(limit),
         "task",
-        "be a sejax.gym.RealTask, or an id of Gymnasium",
-        "an SE takes its spaces from there",
-        type(task).__name__,
-        "task=sejax.gym.RealTask.of_env(env)",
-    )
-    if task is None:
-        task = real_task(header, needs_starts=config.needs_task)
-    elif "interface" in header:
-        learned = RealTask.of_interface(header["interface"]).action_space
-        require(
-            is_close(task.action_space, learned),
-            "task",
-            f"have the actions that the SE was learned with, {learned}",
-            "others mean something else to its networks",
-            task.action_space,
-            "task to one with these, as gymnasium.wrappers.RescaleAction "
-            "makes of the real environment",
-        )
-    own = task.max_steps if limit is None else limit
-    require(
-        config.max_steps(task.max_steps) == config.max_steps(own),
-        "task",
-        f"have the max_steps that the SE was learned with, {own}",
+        f"have the max_steps that the SE was learned with, {limit}",
         "its episodes end there",
-        task.max_steps,
-        f"task=dataclasses.replace(task, max_steps={own})",
+        given.max_steps,
+        f"task=dataclasses.replace(task, max_steps={limit})",
     )
-    return SyntheticWorld(weights, config, task)
-
-
-def _real_env(
-    header: Mapping[str, Any], task: RealTask | str | None, render_mode: str | None
-) -> gymnasium.Env[Any, Any]:
-    """The task of an RN."""
-    require(
-        not isinstance(task, RealTask),
-        "task",
-        "be an id of Gymnasium for a reward network",
-        "its dynamics are the real task's",
-        task,
-        "sejax.gym.RewardNetwork(env, source)",
-    )
-    if isinstance(task, str):
-        return make_gymnasium(task, render_mode=render_mode)
-    env = real_env(header["config"]["env"], render_mode)
-    if env is None:
-        raise unknown_task(header["config"]["env"], "sejax.gym.RewardNetwork(env, source)")
-    return env
+    return header, SyntheticWorld(weights, config, given)

@@ -1,6 +1,7 @@
 """Reward networks (RNs) in NumPy, around a Gymnasium environment of their task."""
 
 from collections.abc import Iterator, Sequence
+from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -11,47 +12,15 @@ from gymnasium.utils import RecordConstructorArgs
 from gymnasium.wrappers import DtypeObservation, FlattenObservation
 
 from sejax import registry
-from sejax.errors import ConfigError, as_python, fraction, require
 from sejax.gym import networks
-from sejax.gym.source import Source, read
-from sejax.gym.tasks import RealTask, num_categories, vector_size
+from sejax.gym.tasks import GYMNASIUM_IDS, RealTask, num_categories, vector_size
+from sejax.options import ConfigError, as_python, fraction, require
 from sejax.proxies import MAX_ABS_VALUE
 from sejax.proxies.configs import RewardConfig
+from sejax.proxies.header import check_tensors, read_single
 
-_PLANE = (
-    "x_position",
-    "y_position",
-    "distance_from_origin",
-    "x_velocity",
-    "y_velocity",
-    "reward_forward",
-    "reward_ctrl",
-)
-_LEG = (
-    "x_position",
-    "x_velocity",
-    "z_distance_from_origin",
-    "reward_forward",
-    "reward_ctrl",
-    "reward_survive",
-)
 SAME_NUMBERS = (DtypeObservation, FlattenObservation)  # wrappers that change no number
-# `sejax.Task.info_keys` and `augmented_keys` by the names that Gymnasium has for them.
-INFO_KEYS: dict[str, tuple[str, ...]] = {
-    "halfcheetah": ("x_position", "x_velocity", "reward_forward", "reward_ctrl"),
-    "hopper": _LEG,
-    "walker2d": _LEG,
-    "swimmer": _PLANE,
-    "ant": (*_PLANE, "reward_contact", "reward_survive"),
-    "reacher": ("reward_dist", "reward_ctrl"),
-}
-AUGMENTED_KEYS: dict[str, tuple[str, ...]] = {
-    "halfcheetah": ("x_position", "x_velocity"),
-    "hopper": ("x_position", "x_velocity"),
-    "walker2d": ("x_position", "x_velocity"),
-    "swimmer": ("x_position", "y_position", "x_velocity", "y_velocity"),
-    "ant": ("x_position", "y_position", "x_velocity", "y_velocity"),
-}
+GYMNASIUM_NAMES = {"reward_run": "reward_forward"}  # entries of `info` that it calls otherwise
 
 
 class RewardNetwork(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
@@ -93,7 +62,7 @@ class RewardNetwork(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
     def __init__(
         self,
         env: gymnasium.Env[Any, Any],
-        source: Source,
+        source: str | Path,
         discount: float | None = None,
         info_keys: Sequence[str] | None = None,
         limit_is_terminal: bool = False,
@@ -106,12 +75,12 @@ class RewardNetwork(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
             limit_is_terminal=limit_is_terminal,
         )
         super().__init__(env)
-        weights, header = read(source, "rn")
-        self.config: RewardConfig = registry.configure("proxy", header["config"]["proxy"])
+        weights, header = read_single(source, ("rn",))
+        self.config: RewardConfig = registry.configure("proxy", header.config["proxy"])
         discount = as_python(discount)
         if discount is not None:
-            fraction("discount", discount, header["discount"])
-        self.discount = float(header["discount"] if discount is None else discount)
+            fraction()("discount", discount, header.discount)
+        self.discount = float(header.discount if discount is None else discount)
         self.limit_is_terminal = limit_is_terminal
         require(
             not isinstance(env.unwrapped, CliffWalkingEnv),
@@ -122,12 +91,16 @@ class RewardNetwork(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
             env,
             f"env=sejax.gym.make({str(source)!r}), which is whole",
         )
-        self._info_keys = self._keys(header["task"], info_keys)
+        self._info_keys = self._keys(header.task, info_keys)
         obs_dim = vector_size(env.observation_space, "env.observation_space")
         self._num_states = num_categories(env.observation_space)
-        if "interface" in header:
-            _require_task(env, RealTask.of_interface(header["interface"]), header["task"])
-        networks.check(weights, _shapes(self.config, obs_dim, len(self._info_keys)))
+        _require_task(env, RealTask.of_interface(header.interface), header.task)
+        num_keys = len(self._info_keys)
+        hidden = [self.config.hidden_size] * self.config.num_layers
+        shapes: networks.Shapes = {"info_weights": (num_keys,)}
+        if not self.config.shaping.weighs_info:
+            shapes = networks.shapes_of({"potential": [obs_dim + num_keys, *hidden, 1]})
+        check_tensors("weights", weights, shapes, "those of the environment's task")
         self._weights = weights.get("info_weights")  # [info_keys]
         self._layers = networks.layers_of(weights, "potential")
         self._table = None  # [num_states]: potentials, where states are counted
@@ -193,31 +166,36 @@ class RewardNetwork(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
         return self.config.output_scale * outputs[..., 0]
 
     def _told(self, info: dict[str, Any]) -> np.ndarray:
-        """What the RN weighs or sees of a step's `info`, `[info_keys]`."""
+        """The entries of a step's `info` that the RN weighs or sees, `[info_keys]`."""
         try:
             return np.array([info[key] for key in self._info_keys], np.float32)
         except KeyError as error:
             raise ConfigError(
                 f"env must tell {', '.join(self._info_keys)} in a step's info, because this RN "
-                f"{'weighs' if self.config.shaping.weighs_info else 'sees'} it; got "
-                f"{', '.join(info) or 'none'}. Set sejax.gym.RewardNetwork(..., info_keys=[...]) "
-                f"to what it is called there."
+                f"needs it; got {', '.join(info) or 'none'}. Set "
+                f"sejax.gym.RewardNetwork(..., info_keys=[...]) to what it is called there.",
+                "env",
             ) from error
 
     def _keys(self, task: str, given: Sequence[str] | None) -> tuple[str, ...]:
         """Entries of `info` that the RN needs."""
-        if not (self.config.shaping.weighs_info or self.config.augmented):
+        weighs_info = self.config.shaping.weighs_info
+        if not (weighs_info or self.config.augmented):
             return ()
-        known = INFO_KEYS if self.config.shaping.weighs_info else AUGMENTED_KEYS
-        keys = known.get(task) if given is None else tuple(given)
-        if keys is None:
-            raise ConfigError(
-                f"info_keys must be given for {task}, because this RN needs numbers of a step's "
-                f"info and only those of {', '.join(known)} are known here; got none. "
-                f"Set sejax.gym.RewardNetwork(env, source, info_keys=[...]) to "
-                f"`sejax.Task.{'info' if self.config.shaping.weighs_info else 'augmented'}_keys`."
-            )
-        return keys
+        name = "info_keys" if weighs_info else "augmented_keys"
+        keys: Sequence[str] = given or ()
+        if not given and task in GYMNASIUM_IDS:
+            spec = registry.configure("env", {"name": task}).spec
+            keys = [GYMNASIUM_NAMES.get(key, key) for key in getattr(spec, name)]
+        require(
+            keys,
+            "info_keys",
+            f"be given for {task}",
+            "this RN needs entries of a step's info that are not known here",
+            "none",
+            f"sejax.gym.RewardNetwork(env, source, info_keys=[...]) to `sejax.Task.{name}`",
+        )
+        return tuple(keys)
 
 
 def _require_task(env: gymnasium.Env[Any, Any], learned: RealTask, name: str) -> None:
@@ -272,10 +250,3 @@ def _kind(space: Any) -> tuple[str, Any] | None:
     if isinstance(space, gymnasium.spaces.Discrete):
         return "discrete", int(space.n)
     return ("box", int(np.prod(space.shape))) if isinstance(space, gymnasium.spaces.Box) else None
-
-
-def _shapes(config: RewardConfig, obs_dim: int, num_keys: int) -> networks.Shapes:
-    if config.shaping.weighs_info:
-        return {"info_weights": (num_keys,)}
-    hidden = [config.hidden_size] * config.num_layers
-    return networks.shapes_of("potential", [obs_dim + num_keys, *hidden, 1])

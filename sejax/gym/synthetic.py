@@ -8,17 +8,18 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces
 
-from sejax.errors import require
 from sejax.gym import networks
 from sejax.gym.tasks import RealTask, num_categories, vector_size
+from sejax.options import require
 from sejax.proxies import MAX_ABS_VALUE
 from sejax.proxies.configs import SyntheticConfig
+from sejax.proxies.header import check_tensors
 
 
 class Step(NamedTuple):
-    """What a step comes to: of one episode numbers, of several arrays `[lanes]`."""
+    """What a step comes to: of one episode numbers, of several arrays `[batch]`."""
 
-    vector: np.ndarray  # [*lanes, obs_dim]
+    vector: np.ndarray  # [*batch, obs_dim]
     reward: Any
     terminated: Any
     truncated: Any
@@ -29,7 +30,7 @@ class SyntheticWorld:
     """The networks of an SE, and what it has of its task; it has no state.
 
     It is `sejax.proxies.synthetic.SyntheticEnv` in NumPy. Its functions take one episode, or
-    several at once along a first axis, lanes.
+    a batch of them along a first axis.
 
     Args:
       weights: by `network/layer/parameter`, kernels `[out, in]` and biases `[out]`, float32.
@@ -40,7 +41,8 @@ class SyntheticWorld:
       observation_space: of one episode: a `Box` without bounds, or the task's own `Discrete`.
       action_space: the task's.
       max_steps: of an episode.
-      draws_ends: whether chance decides over ends.
+      draws_ends: whether ends of episodes are drawn at random.
+      draws_noise: whether initial states are made of noise, and not drawn from the real task.
 
     Raises:
       ConfigError: if the weights are not those of such networks.
@@ -50,26 +52,24 @@ class SyntheticWorld:
         self.config = config
         self.action_space = task.action_space
         self.max_steps = config.max_steps(task.max_steps)
-        self.draws_ends = config.done in ("bernoulli", "sigmoid") and config.horizon != 1
+        self.draws_ends = config.done in ("bernoulli", "sigmoid") and not config.is_bandit
+        self.draws_noise = config.initial_state != "real"
         self.obs_dim = vector_size(task.observation_space, "task.observation_space")
         self._num_states = num_categories(task.observation_space)
         self._num_actions = num_categories(task.action_space)
         action_dim = vector_size(task.action_space, "task.action_space")
-        if self._num_states:
-            self.observation_space = task.observation_space
-        else:
-            self.observation_space = spaces.Box(-np.inf, np.inf, (self.obs_dim,), np.float32)
-        networks.check(weights, _shapes(weights, config, self.obs_dim, action_dim))
-        heads = ["reward"] if config.horizon == 1 else ["state", "reward", "done"]
-        self._layers = networks.joined([networks.layers_of(weights, head) for head in heads])
-        self._start_layers = networks.layers_of(weights, "start")
-        self._limit_is_terminal = config.horizon is not None and config.horizon_is_terminal
-        self._units = None
+        self.observation_space, self._units = task.observation_space, None
         if isinstance(task.observation_space, spaces.Box):
             self._units = config.units(task.observation_space)
+            self.observation_space = spaces.Box(-np.inf, np.inf, (self.obs_dim,), np.float32)
+        units = config.networks(self.obs_dim, action_dim)
+        check_tensors("weights", weights, networks.shapes_of(units), "those of the proxy's task")
+        self._start_layers = networks.layers_of(weights, "start")
+        heads = [networks.layers_of(weights, name) for name in units if name != "start"]
+        self._layers = networks.joined(heads)
         self._starts = task.starts
         require(
-            self._starts or config.initial_state != "real",
+            self.draws_noise or self._starts,
             "task.starts",
             "be given for an SE whose initial states are the real task's",
             "episodes begin there",
@@ -77,11 +77,6 @@ class SyntheticWorld:
             "RealTask(starts=...)",
         )
         self._one_hot = np.eye(action_dim, dtype=np.float32)
-
-    @property
-    def draws_noise(self) -> bool:
-        """Whether initial states are made of noise, and not drawn from the real task."""
-        return self.config.initial_state != "real"
 
     def draw(self, rng: np.random.Generator, count: int) -> np.ndarray:
         """What the first states of `count` episodes are made of, `[count, obs_dim]` float32."""
@@ -94,7 +89,7 @@ class SyntheticWorld:
         return np.array(starts, np.float32)
 
     def first(self, drawn: np.ndarray) -> np.ndarray:
-        """First states `[*lanes, obs_dim]`, of what `draw` has drawn."""
+        """First states `[*batch, obs_dim]`, of what `draw` has drawn."""
         if not self.draws_noise:
             return drawn
         vector = drawn
@@ -104,7 +99,7 @@ class SyntheticWorld:
         return np.minimum(np.maximum(vector, np.float32(-MAX_ABS_VALUE)), np.float32(MAX_ABS_VALUE))
 
     def encode(self, action: Any, space: spaces.Space[Any]) -> np.ndarray:
-        """Actions as the networks see them, `[*lanes, action_dim]`: one-hot if they are discrete.
+        """Actions as the networks see them, `[*batch, action_dim]`: one-hot if they are discrete.
 
         Args:
           action: of `space`; continuous ones are clipped to its bounds, as in Gymnasium's own
@@ -127,12 +122,12 @@ class SyntheticWorld:
         """One step of each episode.
 
         Args:
-          vector: the state, `[*lanes, obs_dim]`.
-          action: from `encode`, `[*lanes, action_dim]`.
-          time: steps of the episode with this one, `[*lanes]`.
-          chance: uniform in [0, 1), `[*lanes]`, if `draws_ends`.
+          vector: the state, `[*batch, obs_dim]`.
+          action: from `encode`, `[*batch, action_dim]`.
+          time: steps of the episode with this one, `[*batch]`.
+          chance: uniform in [0, 1), `[*batch]`, if `draws_ends`.
         """
-        outputs = self._predict(action, vector)  # [*lanes, obs_dim + 2]
+        outputs = self._predict(action, vector)  # [*batch, obs_dim + 2]
         absurd: Any = False
         if not np.abs(outputs).max() < MAX_ABS_VALUE:  # nan is not either
             absurd = ~(np.abs(outputs).max(axis=-1) < MAX_ABS_VALUE)
@@ -146,13 +141,13 @@ class SyntheticWorld:
         terminated = self._ends(done, chance) | absurd
         discount = 1 - (done if self.config.done == "soft" else terminated)
         truncated = at_limit
-        if self._limit_is_terminal:
+        if self.config.ends_at_horizon:
             terminated, truncated = terminated | at_limit, at_limit & False
             discount = discount * (1 - at_limit)
         return Step(outputs[..., :-2], reward, terminated, truncated, discount)
 
     def observe(self, vector: np.ndarray) -> np.ndarray:
-        """What agents see of a state, a copy: `[*lanes, obs_dim]`, or an index `[*lanes]`."""
+        """What agents see of a state, a copy: `[*batch, obs_dim]`, or an index `[*batch]`."""
         return np.argmax(vector, axis=-1) if self._num_states else vector.copy()
 
     def _predict(self, action: np.ndarray, vector: np.ndarray) -> np.ndarray:
@@ -160,7 +155,7 @@ class SyntheticWorld:
         seen = vector if self._units is None else self._units.encode(vector)
         inputs = np.concatenate([action, seen], axis=-1)
         outputs = networks.forward(self._layers, self.config.activation, inputs)
-        if self.config.horizon == 1:
+        if self.config.is_bandit:
             whole = np.empty((*vector.shape[:-1], self.obs_dim + 2), np.float32)
             whole[..., :-2], whole[..., -2:-1], whole[..., -1] = vector, outputs, 1
             return whole
@@ -235,18 +230,3 @@ class SyntheticEnv(gymnasium.Env[Any, Any]):
     def _observe(self, vector: np.ndarray) -> Any:
         obs = self.world.observe(vector)
         return obs if obs.ndim else int(obs)
-
-
-def _shapes(
-    weights: Mapping[str, np.ndarray], config: SyntheticConfig, obs_dim: int, action_dim: int
-) -> networks.Shapes:
-    """Shape of each weight of an SE; how many units make initial states only the file knows."""
-    units = [action_dim + obs_dim, *[config.hidden_size] * config.num_layers]
-    shapes = networks.shapes_of("reward", [*units, 1])
-    if config.horizon != 1:
-        shapes |= networks.shapes_of("state", [*units, obs_dim])
-        shapes |= networks.shapes_of("done", [*units, 1])
-    if config.initial_state == "learned":
-        (start_size,) = np.shape(weights.get("start/Dense_0/bias", ()))[:1] or (0,)
-        shapes |= networks.shapes_of("start", [obs_dim, start_size, obs_dim])
-    return shapes

@@ -9,9 +9,10 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.wrappers import TimeLimit
 
-from sejax import registry, serialize
-from sejax.errors import ConfigError, require, shortened, told
+from sejax import registry
 from sejax.gym.gridworld import MAPS, GridWorld
+from sejax.options import ConfigError, require, shortened, told
+from sejax.proxies.header import Header
 
 # The tasks that Gymnasium has too, with the same spaces, dynamics and initial states.
 GYMNASIUM_IDS = {
@@ -29,8 +30,8 @@ GYMNASIUM_IDS = {
     "ant": "Ant-v5",
     "reacher": "Reacher-v5",
 }
-GYMNASIUM_BACKENDS = ("mujoco", "mjx")  # of halfcheetah: the others move otherwise
-PREFIX = "gymnax/"
+GYMNASIUM_BACKENDS = ("mujoco", "mjx")  # of halfcheetah: the others have other dynamics
+GYMNAX = "gymnax/"
 
 Starts = Callable[[np.random.Generator], Any]
 
@@ -40,11 +41,11 @@ class RealTask:
     """What an SE takes from the task that it stands in for.
 
     Attributes:
-      observation_space: a `Box` of vectors, whose bounds only matter to an SE that has its units by
-        them (`state_units=bounds`), or `Discrete`.
+      observation_space: a `Box` of vectors, or `Discrete`. An SE uses the bounds of a `Box` only
+        for its units (`state_units=bounds`).
       action_space: a `Discrete`, or a `Box` of vectors.
-      max_steps: steps after which an episode is cut, if the SE has no horizon of its own.
-      starts: the first observation of an episode, drawn with a generator; must be picklable for the
+      max_steps: steps after which an episode is truncated, if the SE has no horizon of its own.
+      starts: draws the first observation of an episode with a generator; must be picklable for the
         environment to be. None if the SE has learned its initial states.
     """
 
@@ -59,7 +60,7 @@ class RealTask:
 
         Args:
           env_id: such as `"CartPole-v1"`.
-          max_steps: in the place of Gymnasium's limit.
+          max_steps: replaces Gymnasium's limit.
 
         Raises:
           ConfigError: if Gymnasium cannot make it, or has no limit for it and none is given.
@@ -68,7 +69,7 @@ class RealTask:
 
     @classmethod
     def of_interface(cls, interface: Mapping[str, Any]) -> "RealTask":
-        """What a proxy's file says of its task (`TaskSpec.interface`); it has no `starts`."""
+        """The task of a proxy's file (`TaskSpec.interface`), without `starts`."""
         return cls(
             observation_space=_space(interface["observation"]),
             action_space=_space(interface["action"]),
@@ -117,7 +118,7 @@ def make_gymnasium(
 
     Args:
       env_id: such as `"CartPole-v1"`.
-      max_steps: in the place of Gymnasium's limit.
+      max_steps: replaces Gymnasium's limit.
       **options: of the environment.
 
     Raises:
@@ -130,80 +131,118 @@ def make_gymnasium(
     except (gymnasium.error.Error, ImportError) as error:
         raise ConfigError(
             f"task must be one that Gymnasium can make here, because initial states, actions and "
-            f"an RN's steps are those of the real task; {env_id} raised {told(error)}."
+            f"an RN's steps are those of the real task; {env_id} raised {told(error)}.",
+            "task",
         ) from error
 
 
-def real_env(
-    config: Mapping[str, Any], render_mode: str | None = None
-) -> gymnasium.Env[Any, Any] | None:
-    """The task that a file's metadata names, with its step limit; None if none here is the same.
+def same_env(config: Mapping[str, Any], **options: Any) -> gymnasium.Env[Any, Any] | None:
+    """The task that a file names, with its step limit, if Gymnasium or sejax.gym has the same.
 
     Args:
-      config: of the task, plain values with a `name`.
-      render_mode: as of `gymnasium.make`.
+      config: plain values of the task's configuration.
+      **options: of `gymnasium.make`, such as `render_mode`.
 
     Raises:
-      ConfigError: for an option that the task does not have here, or Gymnasium cannot make it.
+      ConfigError: for an option that the task does not have here, or if Gymnasium cannot make it.
     """
     name = str(config.get("name"))
     if name not in (*GYMNASIUM_IDS, *MAPS):
         return None
-    # Gymnasium takes more options, such as the path of a model: what a file says is read as
-    # everywhere, by the fields that the task has here.
-    spec = registry.configure("env", config)
-    options = serialize.to_plain(spec)
-    if options.pop("backend", "mujoco") not in GYMNASIUM_BACKENDS:
+    # Gymnasium takes more options, such as the path of a model: what a file says is read by the
+    # fields that the task has here.
+    task = registry.configure("env", config)
+    fields = registry.to_plain(task)
+    if fields.pop("backend", "mujoco") not in GYMNASIUM_BACKENDS:
         return None
-    max_steps = spec.spec.max_steps
+    max_steps = task.spec.max_steps
     if name in MAPS:
-        return TimeLimit(GridWorld(name, **options), max_steps)
-    return make_gymnasium(GYMNASIUM_IDS[name], max_steps, render_mode=render_mode, **options)
+        return TimeLimit(GridWorld(name, **fields), max_steps)
+    return make_gymnasium(GYMNASIUM_IDS[name], max_steps, **options, **fields)
 
 
-def real_task(header: Mapping[str, Any], needs_starts: bool) -> RealTask:
-    """What an SE takes from the task that its file is of: from the file itself, if that will do.
+def se_task(header: Header, task: RealTask | str | None, needs_starts: bool) -> RealTask:
+    """What an SE takes from its task: from its file if that is enough.
 
     Args:
       header: of the file.
-      needs_starts: whether its episodes begin where the real task's do.
+      task: one that is given, or its id in Gymnasium; None for the file's.
+      needs_starts: whether the SE's episodes begin where the real task's do.
 
     Raises:
-      ConfigError: if it is one that must be given.
+      ConfigError: if it must be given, or the one given has other actions than the file's.
     """
-    if "interface" in header and not needs_starts:
-        return RealTask.of_interface(header["interface"])
-    config = header["config"]["env"]
-    if (env := real_env(config)) is not None:
+    stored = RealTask.of_interface(header.interface)
+    if isinstance(task, str):
+        task = RealTask.of_gymnasium(task, stored.max_steps)
+    if task is None:
+        return _task_with_starts(header) if needs_starts else stored
+    require(
+        isinstance(task, RealTask),
+        "task",
+        "be a sejax.gym.RealTask, or an id of Gymnasium",
+        "an SE takes its spaces from there",
+        type(task).__name__,
+        "task=sejax.gym.RealTask.of_env(env)",
+    )
+    require(
+        is_close(task.action_space, stored.action_space),
+        "task",
+        f"have the actions that the SE was learned with, {stored.action_space}",
+        "others mean something else to its networks",
+        task.action_space,
+        "task to one with these, such as gymnasium.wrappers.RescaleAction makes",
+    )
+    return task
+
+
+def _task_with_starts(header: Header) -> RealTask:
+    """The task of a file from Gymnasium, which may simulate an id of gymnax differently."""
+    config = header.config["env"]
+    env = same_env(config)
+    if env is not None:
         return RealTask.of_env(env)
-    gymnax_id = str(config.get("name")).removeprefix(PREFIX)
-    if gymnax_id != config.get("name") and gymnax_id in gymnasium.registry:
+    gymnax_id = header.task_kind.removeprefix(GYMNAX)
+    if gymnax_id != header.task_kind and gymnax_id in gymnasium.registry:
         return RealTask.of_gymnasium(gymnax_id, registry.configure("env", config).max_steps)
-    raise unknown_task(config, "sejax.gym.make(source, task=sejax.gym.RealTask(...))")
+    raise _unknown_task(header, "sejax.gym.make(source, task=sejax.gym.RealTask(...))")
 
 
-def step_limit(header: Mapping[str, Any]) -> int | None:
-    """Steps of an episode of the task that a file is of; None if neither file nor task says."""
-    if "interface" in header:
-        return int(header["interface"]["max_steps"])
-    config = header["config"]["env"]
-    if config.get("name") not in (*GYMNASIUM_IDS, *MAPS):
-        return None
-    return int(registry.configure("env", config).spec.max_steps)
+def rn_env(header: Header, env_id: Any, render_mode: str | None) -> gymnasium.Env[Any, Any]:
+    """The task of an RN: one that is given by its id, or the file's.
+
+    Raises:
+      ConfigError: for an id that is not a string, or if the task must be given.
+    """
+    fix = "sejax.gym.RewardNetwork(env, source)"
+    require(
+        isinstance(env_id, str | None),
+        "task",
+        "be an id of Gymnasium for a reward network",
+        "its dynamics are the real task's",
+        shortened(env_id, 80),
+        fix,
+    )
+    if env_id is not None:
+        return make_gymnasium(env_id, render_mode=render_mode)
+    env = same_env(header.config["env"], render_mode=render_mode)
+    if env is None:
+        raise _unknown_task(header, fix)
+    return env
 
 
-def unknown_task(config: Mapping[str, Any], fix: str) -> ConfigError:
-    """Error for a task that only the caller can say."""
-    named = ", ".join(f"{key}={value}" for key, value in config.items() if key != "name")
-    name = shortened(str(config.get("name")) + (f" ({named})" if named else ""))
+def _unknown_task(header: Header, fix: str) -> ConfigError:
+    """Error for a task that only the caller can give."""
+    options = [f"{key}={x}" for key, x in header.config["env"].items() if key != "name"]
+    name = header.task_kind + (f" ({', '.join(options)})" if options else "")
     return ConfigError(
-        f"task must be given for {name}, because Gymnasium knows no environment that is the same; "
-        f"got none. Known: {', '.join([*GYMNASIUM_IDS, *MAPS])}. Set {fix}, or to an id of "
-        f"Gymnasium."
+        f"task must be given for {shortened(name, 80)}, because Gymnasium has no environment that "
+        f"is the same; got none. Set {fix}, or an id of Gymnasium.",
+        "task",
     )
 
 
-# --- spaces --------------------------------------------------------------------------------------
+# --- spaces ---------------------------------------------------------------------------------------
 
 
 def _space(plain: Mapping[str, Any]) -> spaces.Space[Any]:
@@ -236,14 +275,15 @@ def vector_size(space: spaces.Space[Any], name: str) -> int:
     Raises:
       ConfigError: for a space of another kind.
     """
+    if isinstance(space, spaces.Box) and len(space.shape) == 1:
+        return space.shape[0]
     is_index = isinstance(space, spaces.Discrete) and space.start == 0
-    is_vector = isinstance(space, spaces.Box) and len(space.shape) == 1
     require(
-        is_index or is_vector,
+        is_index,
         name,
         "be a Box of vectors or a Discrete from 0",
         "networks take vectors",
         space,
-        f"{name} to what `sejax.Task` has",
+        f"{name} to that of `sejax.Task`",
     )
-    return num_categories(space) or int(space.shape[0])  # type: ignore[index]
+    return int(space.n)  # type: ignore[attr-defined]

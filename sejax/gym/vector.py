@@ -9,22 +9,22 @@ from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from sejax.errors import one_of, require
 from sejax.gym.synthetic import SyntheticWorld
+from sejax.options import one_of, require
 
-PREFETCHED = 32  # starts that a lane draws at once, where nothing else draws from its generator
+PREFETCHED = 32  # starts that an environment draws at once, if its generator draws nothing else
 
 
 class SyntheticVectorEnv(VectorEnv[Any, Any, np.ndarray]):
-    """Episodes of an SE in lanes, as a Gymnasium vector environment.
+    """Episodes of an SE as a Gymnasium vector environment.
 
-    Lane i is what `SyntheticEnv` is after `reset(seed=seed + i)`, to rounding, whatever happens in
-    other lanes: each has a generator of its own, which draws its starts and ends. Infos, and what
-    is done where an episode ends, are those of `gymnasium.vector.SyncVectorEnv`.
+    Environment i equals `SyntheticEnv` after `reset(seed=seed + i)` up to rounding, whatever
+    happens in the others: each has a generator of its own, which draws its starts and ends. Infos,
+    and what is done where an episode ends, are those of `gymnasium.vector.SyncVectorEnv`.
 
     Args:
       world: of the SE.
-      num_envs: lanes.
+      num_envs: number of environments.
       autoreset_mode: NextStep (the step after an end ignores the action and begins an episode),
         SameStep (the end's step returns the next episode's first observation, and the last one's
         own as `infos["final_obs"]`), or Disabled (`reset(options={"reset_mask": ended})`).
@@ -40,7 +40,7 @@ class SyntheticVectorEnv(VectorEnv[Any, Any, np.ndarray]):
         self.num_envs = num_envs
         modes = [mode.value for mode in AutoresetMode]
         mode: Any = getattr(autoreset_mode, "value", autoreset_mode)
-        one_of("autoreset_mode", mode, modes)
+        one_of(modes)("autoreset_mode", mode, modes[0])
         self.autoreset_mode = AutoresetMode(mode)
         self.metadata = {"render_modes": [], "autoreset_mode": self.autoreset_mode}
         self.single_observation_space = world.observation_space
@@ -59,12 +59,12 @@ class SyntheticVectorEnv(VectorEnv[Any, Any, np.ndarray]):
 
     @property  # type: ignore[misc]
     def np_random(self) -> tuple[np.random.Generator | None, ...]:  # type: ignore[override]
-        """The generator of each lane; None before the first reset."""
+        """The generator of each environment; None before the first reset."""
         return tuple(self._rngs)
 
     @property
     def np_random_seed(self) -> tuple[int | None, ...]:  # type: ignore[override]
-        """The seed of each lane; None before the first reset."""
+        """The seed of each environment; None before the first reset."""
         return tuple(self._seeds)
 
     def reset(
@@ -73,11 +73,12 @@ class SyntheticVectorEnv(VectorEnv[Any, Any, np.ndarray]):
         seed: int | Sequence[int | None] | None = None,
         options: dict[str, Any] | None = None,
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Begins an episode in each lane.
+        """Begins an episode in each environment.
 
         Args:
-          seed: of the first lane, the next ones have the numbers that follow; or one for each.
-          options: `reset_mask`, `[num_envs]` of bool: only these lanes.
+          seed: of the first environment, and the next ones have the numbers that follow; or a seed
+            for each.
+          options: `reset_mask`, `[num_envs]` of bool: only these environments.
 
         Raises:
           ConfigError: for seeds or a mask of another length.
@@ -87,7 +88,7 @@ class SyntheticVectorEnv(VectorEnv[Any, Any, np.ndarray]):
         require(
             len(seeds) == self.num_envs,
             "seed",
-            "have an entry for each lane",
+            "have an entry for each environment",
             "each has a generator of its own",
             f"{len(seeds)} for {self.num_envs}",
             "seed=0",
@@ -95,44 +96,47 @@ class SyntheticVectorEnv(VectorEnv[Any, Any, np.ndarray]):
         require(
             mask.shape == (self.num_envs,) and mask.dtype == np.bool_,
             "options.reset_mask",
-            "be a bool for each lane",
+            "be a bool for each environment",
             "it says which begin anew",
             f"{mask.dtype} {mask.shape} for {self.num_envs}",
             "options={'reset_mask': ended}",
         )
-        lanes = np.flatnonzero(mask)
-        for lane in lanes:
-            if self._rngs[lane] is None or seeds[lane] is not None:
-                self._rngs[lane], self._seeds[lane] = seeding.np_random(seeds[lane])
-                self._num_used[lane] = self._drawn.shape[1]  # what it had drawn before is void
-        self._begin(lanes)
+        indices = np.flatnonzero(mask)
+        for i in indices:
+            if self._rngs[i] is None or seeds[i] is not None:
+                self._rngs[i], self._seeds[i] = seeding.np_random(seeds[i])
+                self._num_used[i] = self._drawn.shape[1]  # what it had drawn before is void
+        self._begin(indices)
         return self.world.observe(self._vectors), {}
 
     def step(
         self, actions: Any
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        """One step of each lane.
+        """One step of each environment.
 
         Raises:
-          gymnasium.error.ResetNeeded: if a lane has no episode that goes on.
+          gymnasium.error.ResetNeeded: if an environment has no episode that goes on.
           gymnasium.error.InvalidAction: for actions that are none of the space's.
         """
         is_next_step = self.autoreset_mode is AutoresetMode.NEXT_STEP
         if None in self._rngs or (self._ended.any() and not is_next_step):
-            raise gymnasium.error.ResetNeeded("call reset() first: a lane has no running episode")
+            raise gymnasium.error.ResetNeeded("call reset() first: no episode is running")
         encoded = self.world.encode(actions, self.action_space)
         goes_on = ~self._ended
-        waiting, lanes = np.flatnonzero(self._ended), np.flatnonzero(goes_on)
+        waiting, indices = np.flatnonzero(self._ended), np.flatnonzero(goes_on)
         rewards, discounts = np.zeros(self.num_envs), np.zeros(self.num_envs)
         terminated, truncated = np.zeros((2, self.num_envs), np.bool_)
-        if lanes.size:
-            self._times[lanes] += 1
+        if indices.size:
+            self._times[indices] += 1
             step = self.world.step(
-                self._vectors[lanes], encoded[lanes], self._times[lanes], self._chance(lanes)
+                self._vectors[indices],
+                encoded[indices],
+                self._times[indices],
+                self._chance(indices),
             )
-            self._vectors[lanes] = step.vector
-            rewards[lanes], discounts[lanes] = step.reward, step.discount
-            terminated[lanes], truncated[lanes] = step.terminated, step.truncated
+            self._vectors[indices] = step.vector
+            rewards[indices], discounts[indices] = step.reward, step.discount
+            terminated[indices], truncated[indices] = step.terminated, step.truncated
         self._begin(waiting)
         self._ended = terminated | truncated
         infos = _told(discounts, goes_on)
@@ -142,12 +146,12 @@ class SyntheticVectorEnv(VectorEnv[Any, Any, np.ndarray]):
         return self.world.observe(self._vectors), rewards, terminated, truncated, infos
 
     def _final(self, discounts: np.ndarray) -> dict[str, Any]:
-        """Infos of a step whose ended lanes will begin anew at once."""
+        """Infos of a step whose ended environments will begin anew at once."""
         ended = self._ended.copy()
         final_obs = np.full(self.num_envs, None, dtype=object)
         obs = self.world.observe(self._vectors)
-        for lane in np.flatnonzero(ended):
-            final_obs[lane] = obs[lane]
+        for i in np.flatnonzero(ended):
+            final_obs[i] = obs[i]
         return {
             "final_obs": final_obs,
             "_final_obs": ended,
@@ -156,35 +160,35 @@ class SyntheticVectorEnv(VectorEnv[Any, Any, np.ndarray]):
             **_told(discounts, ~ended),
         }
 
-    def _begin(self, lanes: np.ndarray) -> None:
-        """Puts lanes at the beginning of an episode."""
-        if not lanes.size:
+    def _begin(self, indices: np.ndarray) -> None:
+        """Puts environments at the beginning of an episode."""
+        if not indices.size:
             return
         num_drawn = self._drawn.shape[1]
-        for lane in lanes[self._num_used[lanes] == num_drawn]:
-            rng = self._rngs[lane]
+        for i in indices[self._num_used[indices] == num_drawn]:
+            rng = self._rngs[i]
             assert rng is not None
-            self._drawn[lane], self._num_used[lane] = self.world.draw(rng, num_drawn), 0
-        self._vectors[lanes] = self.world.first(self._drawn[lanes, self._num_used[lanes]])
-        self._num_used[lanes] += 1
-        self._times[lanes], self._ended[lanes] = 0, False
+            self._drawn[i], self._num_used[i] = self.world.draw(rng, num_drawn), 0
+        self._vectors[indices] = self.world.first(self._drawn[indices, self._num_used[indices]])
+        self._num_used[indices] += 1
+        self._times[indices], self._ended[indices] = 0, False
 
-    def _chance(self, lanes: np.ndarray) -> np.ndarray | None:
-        """What decides over ends, `[lanes]`, drawn with each lane's own generator."""
+    def _chance(self, indices: np.ndarray) -> np.ndarray | None:
+        """What decides over ends, `[indices]`, drawn with each environment's own generator."""
         if not self.world.draws_ends:
             return None
-        return np.array([self._rngs[lane].random() for lane in lanes])  # type: ignore[union-attr]
+        return np.array([self._rngs[i].random() for i in indices])  # type: ignore[union-attr]
 
     def _listed(self, seed: int | Sequence[int | None] | None) -> list[int | None]:
         if seed is None:
             return [None] * self.num_envs
         if isinstance(seed, int | np.integer):
-            return [int(seed) + lane for lane in range(self.num_envs)]
+            return [int(seed) + i for i in range(self.num_envs)]
         return list(seed)
 
 
-def _told(discounts: np.ndarray, lanes: np.ndarray) -> dict[str, np.ndarray]:
-    """Discounts of some lanes, in the form that Gymnasium has for infos; nothing if of none."""
-    if not lanes.any():
+def _told(discounts: np.ndarray, mask: np.ndarray) -> dict[str, np.ndarray]:
+    """Discounts of some environments in Gymnasium's form of infos; empty if of none."""
+    if not mask.any():
         return {}
-    return {"discount": np.where(lanes, discounts, 0.0), "_discount": lanes}
+    return {"discount": np.where(mask, discounts, 0.0), "_discount": mask}

@@ -8,7 +8,7 @@ import tempfile
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
-from sejax.errors import require
+from sejax.options import require
 
 
 def cache_folder() -> Path | None:

@@ -14,7 +14,7 @@ import numpy as np
 from jax import Array
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 
-from sejax.errors import require
+from sejax.options import require
 
 
 @functools.cache

@@ -6,8 +6,10 @@ it as in any other environment. What the inner loop must know beside that is tol
 """
 
 import copy
+import functools
+import json
 from abc import ABC, abstractmethod
-from typing import Any
+from typing import Any, NoReturn
 
 import jax
 from flax import struct
@@ -15,7 +17,8 @@ from jaxtyping import Array
 
 from sejax.envs.base import Task
 from sejax.envs.environment import Environment, EnvParams
-from sejax.errors import require
+from sejax.envs.spec import TaskSpec
+from sejax.options import ConfigError, require
 from sejax.proxies import ProxyConfig
 
 
@@ -122,3 +125,63 @@ def prepare(env: Any, params: Any, discount: Array | float | None, limit_is_term
     if not isinstance(env, ProxyEnv):
         return params
     return env.prepare(params, discount, limit_is_terminal)
+
+
+# --- a task that cannot be made here --------------------------------------------------------------
+
+
+class AbsentEnv(Environment):
+    """The spaces of a task that cannot be made here, for an SE that needs no more of it.
+
+    Such an SE can be loaded without the package that its task needs, or on a device that the task
+    does not run on. `reset_env` and `step_env` raise the reason as a `ConfigError`.
+    """
+
+    def __init__(self, task_name: str, spec: TaskSpec, reason: str):
+        self._task_name, self._reason = task_name, reason
+        self.spaces = spec.observation, spec.action
+
+    def fail(self) -> NoReturn:
+        """Raises the reason as a `ConfigError`."""
+        raise ConfigError(self._reason, "task")
+
+    def reset_env(self, key: Any, params: Any) -> NoReturn:
+        self.fail()
+
+    def step_env(self, key: Any, state: Any, action: Any, params: Any) -> NoReturn:
+        self.fail()
+
+    @property
+    def name(self) -> str:
+        return self._task_name
+
+
+def absent_task(name: str, interface: dict[str, Any], origin: dict[str, Any], reason: str) -> Task:
+    """A task of which no more is known than what a proxy's file says; built once.
+
+    Args:
+      name: of the task.
+      interface: see `TaskSpec.interface`.
+      origin: see `Task`, for files that are written of it.
+      reason: why the task itself cannot be made.
+    """
+    return _absent_task(name, json.dumps([interface, origin], sort_keys=True), reason)
+
+
+@functools.cache
+def _absent_task(name: str, known: str, reason: str) -> Task:
+    interface, origin = json.loads(known)
+    spec = TaskSpec.of_interface(interface)
+    env = AbsentEnv(name, spec, reason)
+    return Task(name=name, env=env, max_steps=spec.max_steps, origin=origin)
+
+
+def require_present(task: Task) -> Task:
+    """The task, if it can be run.
+
+    Raises:
+      ConfigError: for one of `absent_task`: why it cannot.
+    """
+    if isinstance(task.env, AbsentEnv):
+        task.env.fail()
+    return task

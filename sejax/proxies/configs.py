@@ -12,8 +12,7 @@ import numpy as np
 
 from sejax.envs.base import Task
 from sejax.envs.spec import TaskSpec
-from sejax.errors import require
-from sejax.options import ACTIVATIONS, MOST_LAYERS, counts, one_of, option, positive
+from sejax.options import ACTIVATIONS, MOST_LAYERS, counts, one_of, option, positive, require
 from sejax.proxies import MAX_ABS_VALUE, ProxyConfig
 
 if TYPE_CHECKING:
@@ -22,6 +21,7 @@ if TYPE_CHECKING:
 DONE_MODES = ("soft", "threshold", "bernoulli", "sigmoid")
 INITIAL_STATES = ("real", "learned", "noise")
 STATE_UNITS = ("raw", "bounds")
+START_HIDDEN_SIZE = 32  # of the network that makes initial states
 
 
 class Units(NamedTuple):
@@ -108,6 +108,21 @@ class SyntheticConfig(ProxyConfig):
 
     def max_steps(self, task_max_steps: int) -> int:
         return task_max_steps if self.horizon is None else self.horizon
+
+    def networks(self, obs_dim: int, action_dim: int) -> dict[str, list[int]]:
+        """Number of inputs and of each layer's units, by network.
+
+        Example:
+          >>> SyntheticConfig(horizon=1, hidden_size=8).networks(obs_dim=4, action_dim=2)
+          {'reward': [6, 8, 1]}
+        """
+        outputs = {"state": obs_dim, "reward": 1, "done": 1}
+        heads = ("reward",) if self.is_bandit else tuple(outputs)
+        hidden = [self.hidden_size] * self.num_layers
+        networks = {head: [action_dim + obs_dim, *hidden, outputs[head]] for head in heads}
+        if self.initial_state == "learned":
+            networks["start"] = [obs_dim, START_HIDDEN_SIZE, obs_dim]
+        return networks
 
     def units(self, space: Any) -> Units | None:
         """Units of states in a box, gymnax's or Gymnasium's; None for the task's own.

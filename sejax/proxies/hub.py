@@ -1,40 +1,38 @@
-"""Files on the Hugging Face Hub, through `huggingface_hub` (the extra `hub`), imported when used.
+"""Files on the Hugging Face Hub, by `huggingface_hub` (the extra `hub`), which is imported if used.
 
-An address is `hf://USER/REPO`, with a revision (branch, tag or commit) after `@` and the file's
-name at the end where it is not `proxy.safetensors`: `hf://USER/REPO@v1/cartpole.safetensors`. What
-is fetched is a safetensors file of bounded size, and is kept in the Hub's own cache, from which it
-comes when there is no network.
+An address is `hf://USER/REPO`, with a revision (branch, tag or commit) after `@`, and the file's
+path at the end unless it is `proxy.safetensors`: `hf://USER/REPO@v1/cartpole.safetensors`. A file
+is fetched if it is a safetensors file of bounded size, and kept in the Hub's own cache, which
+serves without a network.
 """
 
 import contextlib
 import re
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
-from sejax.errors import ConfigError, require, shortened, told
+from sejax.options import ConfigError, require, shortened, told
 
 SCHEME = "hf://"
 FILE = "proxy.safetensors"
-MOST_BYTES = 100_000_000  # of a file: a hundred times the largest set of proxies so far
+MAX_BYTES = 100_000_000  # of a file: a hundred times the largest set of proxies so far
 
 _REPO = r"[\w-][\w.-]*/[\w-][\w.-]*"
 _ADDRESS = re.compile(
     rf"{SCHEME}(?P<repo>{_REPO})(@(?P<revision>refs/pr/\d+|\w[\w.-]*))?"
-    r"(/(?P<file>(\w[\w.-]*/)*\w[\w.-]*\.safetensors))?",
+    r"(/(?P<file>(\w[\w.-]*/){0,8}\w[\w.-]*\.safetensors))?",
     re.ASCII,
 )
 
 
-@dataclass(frozen=True)
-class Address:
+class Address(NamedTuple):
     """A file on the Hub.
 
     Attributes:
-      repo: `USER/REPO`, of models.
+      repo: `USER/REPO`, a repository of models.
       revision: branch, tag or commit; None for the main branch.
-      file: its path there.
+      file: path of the file there.
     """
 
     repo: str
@@ -51,18 +49,18 @@ def parse(address: str, option: str = "source") -> Address:
     """The parts of an address.
 
     Raises:
-      ConfigError: if it is none.
+      ConfigError: for text that is not an address.
 
     Example:
       >>> parse("hf://user/repo@v1")
       Address(repo='user/repo', revision='v1', file='proxy.safetensors')
     """
-    found = _ADDRESS.fullmatch(address)
+    found = _ADDRESS.fullmatch(address) if len(address) < 500 else None
     if found is None:
         raise ConfigError(
-            f"{option} must be hf://USER/REPO, hf://USER/REPO@REVISION, or either with "
-            f"/FILE.safetensors, because these are what proxies on the Hub are called; got "
-            f"{shortened(address)}. Set {option}=hf://USER/REPO."
+            f"{option} must be hf://USER/REPO or hf://USER/REPO@REVISION, either with "
+            f"/FILE.safetensors; got {shortened(address, 80)}. Set {option}=hf://USER/REPO.",
+            option,
         )
     return Address(found["repo"], found["revision"], found["file"] or FILE)
 
@@ -72,11 +70,11 @@ def fetch(address: str, option: str = "source") -> Path:
 
     Args:
       address: of the file.
-      option: what messages call it.
+      option: name of the argument, for messages.
 
     Raises:
-      ConfigError: if it is no address, no such file can be seen, it is too large, the Hub cannot be
-        reached and no copy is there, or `huggingface_hub` is not installed.
+      ConfigError: for text that is not an address, or a file that is not there, is too large or
+        cannot be reached; or if `huggingface_hub` is not installed.
     """
     place = parse(address, option)
     with _explained(option, address):
@@ -84,38 +82,45 @@ def fetch(address: str, option: str = "source") -> Path:
 
         info = hf_hub_download(place.repo, place.file, revision=place.revision, dry_run=True)
         size: int | None = info.file_size
-        got = f"{'an unknown number of' if size is None else f'{size:,}'} bytes at {address}"
         require(
-            size is not None and size <= MOST_BYTES,
+            size is not None and size <= MAX_BYTES,
             option,
-            f"have at most {MOST_BYTES:,} bytes",
+            f"have at most {MAX_BYTES:,} bytes",
             "no proxy is larger",
-            got,
+            f"{'an unknown number of' if size is None else f'{size:,}'} bytes at {address}",
             f"{option} to a proxy",
         )
         return Path(hf_hub_download(place.repo, place.file, revision=place.revision))
 
 
+def require_repo(repo: Any) -> None:
+    """Checks the name of a repository.
+
+    Raises:
+      ConfigError: if it is not `USER/REPO`.
+    """
+    require(
+        isinstance(repo, str) and re.fullmatch(_REPO, repo, re.ASCII),
+        "repo",
+        "be USER/REPO",
+        "that is how the Hub names repositories",
+        shortened(repo, 80),
+        "repo='USER/REPO'",
+    )
+
+
 def upload(repo: str, files: Mapping[str, bytes], message: str, private: bool) -> None:
-    """Writes files to a repository in one commit, which is made if it is not there.
+    """Writes files to a repository in one commit, and makes the repository if it is not there.
 
     Args:
       repo: `USER/REPO`.
-      files: their contents by name.
+      files: contents by name.
       message: of the commit.
-      private: whether a new repository is.
+      private: whether a new repository is private.
 
     Raises:
       ConfigError: if it cannot be written, or `huggingface_hub` is not installed.
     """
-    require(
-        re.fullmatch(_REPO, repo, re.ASCII),
-        "repo",
-        "be USER/REPO",
-        "that is what the Hub calls repositories",
-        repo,
-        "repo='USER/REPO'",
-    )
     with _explained("repo", repo):
         from huggingface_hub import CommitOperationAdd, HfApi
 
@@ -127,47 +132,45 @@ def upload(repo: str, files: Mapping[str, bytes], message: str, private: bool) -
 
 @contextlib.contextmanager
 def _explained(option: str, place: str) -> Iterator[None]:
-    """Makes one message of whatever `huggingface_hub` raises."""
+    """Turns whatever `huggingface_hub` raises into one message."""
     try:
         yield
     except ConfigError:
         raise
     except ImportError as error:
         raise ConfigError(
-            f"{option} must not be on the Hugging Face Hub where huggingface_hub is not installed; "
-            f"got {place} ({error}). Install it with pip install 'sejax[hub]'."
+            f"{option} needs huggingface_hub, because it is on the Hugging Face Hub; got {place} "
+            f"({error}). Install it with pip install 'sejax[hub]'.",
+            option,
         ) from error
     except Exception as error:  # the HTTP library's too, which differs between its versions
-        what, fix = _reason(error)
         raise ConfigError(
-            f"{option} must be within reach on the Hugging Face Hub; got {place}: {what}. {fix}."
+            f"{option} must be within reach on the Hugging Face Hub; got {place}: "
+            f"{_reason(error)}.",
+            option,
         ) from error
 
 
-def _reason(error: Any) -> tuple[str, str]:
+def _reason(error: Any) -> str:
     """What is wrong, and what to do about it."""
     from huggingface_hub import errors
 
-    if isinstance(error, errors.GatedRepoError):
-        return "its owner gives access on request", "Ask on its page, then hf auth login"
-    if isinstance(error, errors.RepositoryNotFoundError):
-        return (
-            "there is no such repository, or it is private",
-            "Check its name, or log in with hf auth login",
-        )
-    if isinstance(error, errors.RevisionNotFoundError):
-        return "the repository has no such revision", "Leave it out for the newest"
-    if isinstance(error, errors.RemoteEntryNotFoundError):
-        return "the repository has no such file", "Name one: hf://USER/REPO/FILE.safetensors"
-    if isinstance(error, errors.LocalEntryNotFoundError):
-        return (
-            "the Hub cannot be reached, and no copy is here",
-            "Connect to the network, or load a file",
-        )
-    status = getattr(getattr(error, "response", None), "status_code", None)
+    reasons = {  # the first that fits: a gated repository is also one that is not found
+        errors.GatedRepoError: "its owner gives access on request. Ask there, then hf auth login",
+        errors.RepositoryNotFoundError: "there is no such repository, or it is private. Check its "
+        "name, or log in with hf auth login",
+        errors.RevisionNotFoundError: "the repository has no such revision. Leave it out for the "
+        "newest",
+        errors.RemoteEntryNotFoundError: "the repository has no such file. Name one: "
+        "hf://USER/REPO/FILE.safetensors",
+        errors.LocalEntryNotFoundError: "the Hub cannot be reached, and no copy is here. Connect "
+        "to the network, or load a file",
+    }
+    for kind, reason in reasons.items():
+        if isinstance(error, kind):
+            return reason
+    response = getattr(error, "response", None)  # only errors of HTTP have one
+    status = response.status_code if response is not None else None
     if status in (401, 403):
-        return (
-            f"you may not do that (HTTP {status})",
-            "Log in with hf auth login and a token that may",
-        )
-    return told(error), "Try again, or work with a local file"
+        return f"you may not do that (HTTP {status}). Log in with hf auth login and a write token"
+    return f"{told(error)}. Try again, or work with a local file"

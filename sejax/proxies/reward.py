@@ -4,6 +4,7 @@ Source: paper, section "Learning Reward Networks" (table "Overview of Reward Net
 `docs/reference.md` 5.
 """
 
+import dataclasses
 from typing import TYPE_CHECKING, Any
 
 import jax
@@ -13,8 +14,8 @@ from jaxtyping import Array, Float
 
 from sejax.envs.base import Task
 from sejax.envs.environment import EnvParams, EnvState
-from sejax.errors import require
 from sejax.ops.networks import MLP, uniform_fan_in
+from sejax.options import require
 from sejax.proxies import MAX_ABS_VALUE
 from sejax.proxies.base import ProxyEnv
 
@@ -120,7 +121,8 @@ class RewardEnv(ProxyEnv):
         if self.task.num_states is not None and not self.config.shaping.weighs_info:
             states = jnp.arange(self.task.num_states)
             potentials = self._apply(params.weights, jax.nn.one_hot(states, states.size))
-        return params.replace(
+        return dataclasses.replace(
+            params,
             discount=jnp.float32(1.0 if discount is None else discount),
             limit_is_terminal=jnp.bool_(limit_is_terminal),
             potentials=potentials,

@@ -22,8 +22,6 @@ from sejax.proxies.base import ProxyEnv, ProxyParams
 if TYPE_CHECKING:  # whose `make` imports this
     from sejax.proxies.configs import SyntheticConfig
 
-START_HIDDEN_SIZE = 32  # of the network that makes initial states
-
 
 @struct.dataclass
 class SyntheticState(EnvState):
@@ -61,21 +59,15 @@ class SyntheticEnv(ProxyEnv):
     def __init__(self, task: Task, config: "SyntheticConfig"):
         super().__init__(task, config)
         self._nets = {
-            head: MLP(size, config.hidden_size, config.num_layers, config.activation)
-            for head, size in self._output_sizes().items()
+            name: MLP(units[-1], units[1], len(units) - 2, config.activation)
+            for name, units in config.networks(task.obs_dim, task.action_dim).items()
         }
+        self._start = self._nets.pop("start", None)
         self._units = None
         if isinstance(task.observation, Box):
             self._units = config.units(task.observation)
-            # Without the task's bounds: a learned environment need not respect them.
+            # Without the task's bounds: a learned state need not respect them.
             self.spaces = Box.symmetric(*[MAX_ABS_VALUE] * task.obs_dim), task.action
-        self._start = None
-        if config.initial_state == "learned":
-            self._start = MLP(task.obs_dim, START_HIDDEN_SIZE, 1, config.activation)
-
-    def _output_sizes(self) -> dict[str, int]:
-        """Number of outputs of each network."""
-        return {"state": self.task.obs_dim, "reward": 1, "done": 1}
 
     def init_weights(self, key: Array) -> dict[str, Any]:
         """Random weights of each network: "state", "reward", "done", and "start" if learned."""
@@ -172,9 +164,6 @@ class BanditEnv(SyntheticEnv):
     """
 
     is_bandit = True
-
-    def _output_sizes(self) -> dict[str, int]:
-        return {"reward": 1}
 
     def predict(
         self, weights: Any, vector: Float[Array, " obs_dim"], action: Array

@@ -8,7 +8,7 @@ used, and the CPU. `brax` has other physics for halfcheetah.
 
 from typing import TYPE_CHECKING
 
-from sejax.errors import ConfigError, require
+from sejax.options import ConfigError, require
 
 if TYPE_CHECKING:
     from sejax.envs.mujoco.environment import MujocoEnv

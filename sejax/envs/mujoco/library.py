@@ -17,8 +17,8 @@ from pathlib import Path
 import jax
 import mujoco
 
-from sejax.errors import ConfigError, shortened, told
 from sejax.ops import files
+from sejax.options import ConfigError, shortened, told
 
 SOURCE = Path(__file__).with_name("step.cc")
 FLAGS = ("-O2", "-std=c++17", "-shared", "-fPIC")

@@ -14,8 +14,7 @@ from typing import Any, ClassVar
 from sejax.envs import mujoco
 from sejax.envs.base import Task
 from sejax.envs.spec import Box, TaskSpec
-from sejax.errors import ConfigError
-from sejax.options import Options, finite, not_negative, one_of, option
+from sejax.options import ConfigError, Options, finite, not_negative, one_of, option
 
 # Physics of halfcheetah, the default first. The others are brax's, of which only mjx moves like
 # MuJoCo, at ten times its cost on a CPU (docs/halfcheetah.md).

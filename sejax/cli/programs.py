@@ -16,12 +16,12 @@ from typing import Any
 import jax
 
 from sejax.agents.mixture import Mixture, MixtureConfig
-from sejax.bilevel import Program, make_program
-from sejax.cli import build
-from sejax.cli.families import families_of
+from sejax.bilevel import Bilevel, make_bilevel
+from sejax.cli import config as configuration
+from sejax.cli.config import LearnConfig, families_of
 from sejax.cli.session import Chunks
 from sejax.options import marks, traced_options
-from sejax.serialize import to_plain
+from sejax.registry import to_plain
 
 # Fields of a run that shape no program; a chunk's length and seeds are counted by themselves.
 _FREE = (
@@ -47,9 +47,9 @@ class Programs:
     def __init__(self) -> None:
         self.shapes: dict[str, Chunks] = {}
 
-    def chunks(self, config: build.LearnConfig) -> Chunks:
+    def chunks(self, config: LearnConfig) -> Chunks:
         """The chunks of a run, compiled if none of its shape was."""
-        program, numbers = make_program(**config.parts()), numbers_of(config)
+        program, numbers = make_bilevel(**config.parts()), numbers_of(config)
         key, make = shape_of(config, numbers), partial(_with_numbers, config, program.num_dims)
         chunks = kept(self.shapes, key, lambda: Chunks(program, make, (numbers,)))
         return chunks.sharing(program, (numbers,))
@@ -64,7 +64,7 @@ def kept(cache: dict[str, Any], key: str, make: Callable[[], Any]) -> Any:
     return value
 
 
-def numbers_of(config: build.LearnConfig) -> dict[str, Any]:
+def numbers_of(config: LearnConfig) -> dict[str, Any]:
     """What the program of a configuration takes as arguments, a pytree of Python numbers.
 
     Where an agent's hyperparameters are drawn for each training, its own are no arguments.
@@ -74,9 +74,9 @@ def numbers_of(config: build.LearnConfig) -> dict[str, Any]:
     return {"agents": tuple(x.hparams for x in learners), "es": traced_options(config.es)}
 
 
-def shape_of(config: build.LearnConfig, numbers: dict[str, Any]) -> str:
+def shape_of(config: LearnConfig, numbers: dict[str, Any]) -> str:
     """A key that is equal for configurations of one program."""
-    plain = {k: v for k, v in build.to_plain(config).items() if k not in _FREE}
+    plain = {k: v for k, v in configuration.plain(config).items() if k not in _FREE}
     plain["es"] = _without(plain["es"], numbers["es"])
     if numbers["agents"]:
         learners = Mixture.of(config.parts()["agent"])
@@ -95,7 +95,7 @@ def structure_of(numbers: Any) -> list[Any]:
     return [str(structure), [type(leaf).__name__ for leaf in leaves]]
 
 
-def _with_numbers(config: build.LearnConfig, num_dims: int, numbers: dict[str, Any]) -> Program:
+def _with_numbers(config: LearnConfig, num_dims: int, numbers: dict[str, Any]) -> Bilevel:
     """The program of a configuration with other numbers, which may be traced."""
     parts = config.parts()
     if numbers["agents"]:
@@ -110,7 +110,7 @@ def _with_numbers(config: build.LearnConfig, num_dims: int, numbers: dict[str, A
         for name, number in numbers["es"].items():
             object.__setattr__(es, name, number)
         parts["es"] = es.make(num_dims)
-    return make_program(**parts)
+    return make_bilevel(**parts)
 
 
 def static_of(config: Any) -> dict[str, Any]:

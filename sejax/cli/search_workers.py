@@ -1,0 +1,90 @@
+"""A study whose workers are processes on a Ray cluster.
+
+They share nothing but the study's database, as any workers do. Ray starts them where there is room,
+and anew where one is lost; trials that they leave behind are queued again by their heartbeats.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import optuna
+
+from sejax import registry
+from sejax.cli import cluster, runtime
+from sejax.cli.search_config import SQLITE, Search
+from sejax.cli.study import ENDED, sentence
+from sejax.options import FailedError, told
+
+RETRIES = 5  # of a worker that is lost
+LAST_S = 60.0  # for workers to notice that the study is over
+
+
+def work(
+    study: optuna.Study,
+    search: Search,
+    join: Callable[[Sequence[str]], None],
+    say: Callable[[str], None],
+) -> None:
+    """Has the trials of a study made by workers on the cluster, until it is over.
+
+    Args:
+      study: the study.
+      search: what is searched.
+      join: what a worker does, given the overrides that join the study.
+      say: tells the user.
+
+    Raises:
+      ConfigError: if the cluster cannot be reached.
+      FailedError: if it is lost, or workers are lost again and again.
+    """
+    runtime.take_share_of_gpu(0)  # GPUs are the workers'
+    machines, gpus = search.machines, search.machines.gpus_per_worker
+    typed = [*search.fixed, *(x.text for x in search.space.values())]
+    with cluster.connected(machines) as ray:
+        start = ray.remote(num_cpus=1, num_gpus=gpus, max_retries=RETRIES)(_work)
+        count = max(1, cluster.num_workers(machines))
+        running = [start.remote(join, _overrides(search), gpus, typed) for _ in range(count)]
+        known = {trial.number for trial in study.get_trials(deepcopy=False, states=ENDED)}
+        done: list[Any] = []
+        while not done:
+            done, _ = ray.wait(running, timeout=cluster.LOOK_S)
+            cluster.num_workers(machines)  # which raises if there is no cluster any more
+            for trial in study.get_trials(deepcopy=False, states=ENDED):
+                if trial.number not in known:
+                    known.add(trial.number)
+                    say(sentence(trial, search))
+        try:
+            ray.get(done)
+        except ray.exceptions.RayError as error:
+            raise FailedError(
+                f"A worker has failed: {told(error).splitlines()[-1]}. What has ended is saved; "
+                f"the same command goes on, with machines=local on this machine alone."
+            ) from error
+        ray.wait(running, num_returns=count, timeout=LAST_S)  # one that hangs is left behind
+
+
+def _overrides(search: Search) -> list[str]:
+    """The overrides by which a worker joins, and has what may differ between workers."""
+    folder = search.folder.resolve()
+    own = {
+        "study": search.study,
+        "search_dir": folder,
+        "storage": search.config.storage or f"{SQLITE}{folder / 'study.db'}",
+        "trials": search.config.trials,
+        "timeout": search.config.timeout,
+    }
+    return [f"{name}={value}" for name, value in own.items() if value is not None]
+
+
+def _work(
+    join: Callable[[Sequence[str]], None],
+    overrides: Sequence[str],
+    gpu_share: float,
+    typed: Sequence[str],
+) -> None:
+    """A worker; it may import what the overrides `typed` name."""
+    runtime.configure_xla(1)
+    runtime.take_share_of_gpu(gpu_share)
+    runtime.configure_jax()
+    with registry.only_typed(typed):
+        join(overrides)

@@ -1,0 +1,543 @@
+"""Proxies from and to files: `save`, `load`, and what is known of a stored proxy."""
+
+import dataclasses
+import hashlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, overload
+
+import jax
+import numpy as np
+from flax.traverse_util import flatten_dict, unflatten_dict
+
+from sejax import envs, registry
+from sejax.envs.base import Task
+from sejax.ops.files import write_bytes
+from sejax.options import ConfigError, one_of, require, shortened, told
+from sejax.proxies import ProxyConfig
+from sejax.proxies.base import ProxyEnv, absent_task, require_present
+from sejax.proxies.header import (
+    FORMAT_VERSION,
+    Header,
+    agents_of,
+    check_tensors,
+    find,
+    is_registered,
+    pretrained_names,
+    read,
+    require_single,
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Stored:
+    """What is common to a stored proxy and a set of them.
+
+    Attributes:
+      env: the SE or RN, a gymnax environment.
+      config: configuration that it was learned with, nested plain values.
+      discount: gamma of the agent that it was learned with.
+      path: the file.
+    """
+
+    env: ProxyEnv
+    config: dict[str, Any]
+    discount: float
+    path: Path
+
+    @property
+    def task(self) -> Task:
+        """The real task.
+
+        Raises:
+          ConfigError: if it cannot be made here, and the file told what the proxy needs of it.
+        """
+        return require_present(self.env.task)
+
+    def learned_with(self, group: str) -> Any:
+        """A part of the configuration that it was learned with, such as `agent` or `es`.
+
+        `sejax.training_of` reads its training.
+
+        Raises:
+          ConfigError: for a group of another name; or if the file does not tell it, or names one
+            that is not registered, because a file's names are never imported.
+
+        Example:
+          >>> load_proxy("cliff_walking-rn").learned_with("agent").discount
+          0.8
+        """
+        one_of(registry.GROUPS)("group", str(group), None)
+        return self._configured(group, self.config.get(group))
+
+    def learned_agents(self) -> dict[str, Any]:
+        """The agent that it was learned with, or the mixture of agents, by their keys.
+
+        Raises:
+          ConfigError: as `learned_with`.
+
+        Example:
+          >>> list(load_proxy("cliff_walking-rn").learned_agents())
+          ['q_learning']
+        """
+        stored = agents_of(self.config)
+        return {key: self._configured("agent", values) for key, values in stored.items()}
+
+    def _configured(self, group: str, stored: Any) -> Any:
+        require(
+            is_registered(group, stored),
+            group,
+            f"be given for {shortened(self.path.name, 60)}",
+            f"the file names no registered {group}, and what a file names is never imported",
+            shortened(stored.get("name"), 60) if isinstance(stored, Mapping) else "none",
+            f"{group} to one of your own",
+        )
+        return registry.configure(group, stored)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Proxy(_Stored):
+    """A stored proxy.
+
+    Attributes:
+      env: the SE or RN, a gymnax environment whose `default_params` are the params.
+      params: its `EnvParams`: the weights, and the discount of the agent it was learned with.
+      record: what is known of it: `score`, `generation` and `seed`, where they are.
+      config: configuration that it was learned with, nested plain values.
+      discount: gamma of the agent that it was learned with.
+      path: the file.
+    """
+
+    params: Any
+    record: dict[str, Any]
+
+    @property
+    def fingerprint(self) -> str:
+        """Eight hexadecimal digits that tell its weights from others."""
+        flat = _flatten(self.params.weights)
+        content = b"".join(np.ascontiguousarray(flat[name]).tobytes() for name in sorted(flat))
+        return hashlib.sha256(content).hexdigest()[:8]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ProxySet(_Stored):
+    """Proxies that share a configuration, and hence every compiled program.
+
+    `proxies[i]` is a `Proxy`; a slice, indices or a mask give a smaller set, as with NumPy.
+
+    Attributes:
+      env: the SE or RN that they share; its `default_params` are random.
+      weights: leaves `[proxy, ...]`, NumPy float32. To `vmap` over the proxies:
+        `vmap(lambda w: f(env.params(w, discount)))(weights)`.
+      records: of each proxy what is known of it: `score` (mean of the incumbent that it was chosen
+        for), `generation` (that measured it) and `seed` (of its run).
+      config: configuration that they were learned with, nested plain values, with the first seed.
+      discount: gamma of the agent that they were learned with.
+      path: the file.
+    """
+
+    weights: Any
+    records: tuple[dict[str, Any], ...]
+
+    def __len__(self) -> int:
+        return len(self.records)
+
+    @overload
+    def __getitem__(self, index: int) -> Proxy: ...
+    @overload
+    def __getitem__(self, index: slice | Sequence[int] | np.ndarray) -> "ProxySet": ...
+    def __getitem__(self, index: int | slice | Sequence[int] | np.ndarray) -> "Proxy | ProxySet":
+        places = np.arange(len(self))[index]
+        if places.ndim:
+            return dataclasses.replace(
+                self,
+                weights=jax.tree.map(lambda x: x[places], self.weights),
+                records=tuple(self.records[i] for i in places),
+            )
+        weights = jax.tree.map(lambda x: jax.numpy.asarray(x[places]), self.weights)
+        params = self.env.params(weights, self.discount)
+        return Proxy(
+            env=self.env.with_default_params(params),
+            params=params,
+            record=self.records[places],
+            config=self.config,
+            discount=self.discount,
+            path=self.path,
+        )
+
+    @property
+    def scores(self) -> np.ndarray:
+        """`[proxy]` float64; nan where a score is not known."""
+        return np.array([record.get("score") for record in self.records], float)
+
+    @property
+    def seeds(self) -> np.ndarray:
+        """`[proxy]` int; -1 where a seed is not known."""
+        return np.array([record.get("seed", -1) for record in self.records])
+
+    def ranked(self, count: int, worst: bool = False) -> "ProxySet":
+        """Those with the highest scores, the best first; or the lowest, the worst first."""
+        order = np.argsort(self.scores, kind="stable")
+        return self[(order if worst else order[::-1])[:count]]
+
+
+def stored_config(proxy: Proxy | ProxySet) -> dict[str, Any]:
+    """The configuration that a stored proxy was learned with, nested plain values.
+
+    Raises:
+      ConfigError: for an argument of another type.
+    """
+    require(
+        isinstance(proxy, _Stored),
+        "proxy",
+        "be a stored one",
+        "its file tells what it was learned with",
+        type(proxy).__name__,
+        "proxy=sejax.load_proxy(source)",
+    )
+    return proxy.config
+
+
+# --- writing --------------------------------------------------------------------------------------
+
+
+def save(
+    path: str | Path,
+    env: ProxyEnv,
+    weights: Any,
+    config: Mapping[str, Any] | None = None,
+    discount: float | None = None,
+    **record: Any,
+) -> None:
+    """Writes a proxy atomically.
+
+    Args:
+      path: the file, `*.safetensors`.
+      env: the proxy.
+      weights: as from its `init_weights`; kept as float32.
+      config: configuration that it was learned with, nested plain values; task and kind of proxy
+        are added.
+      discount: gamma of the agent that it was learned with, which a potential-based RN needs; 1 if
+        it is not given.
+      **record: plain values to keep with it, such as `score`, `generation` and `seed`.
+
+    Raises:
+      ConfigError: for weights that are not the proxy's or not finite, a potential-based RN without
+        a discount, or a configuration or record that `load` would refuse. An older file stays.
+      OSError: if it cannot be written; an older file stays as it was.
+
+    Example:
+      >>> import tempfile
+      >>> env, params = load("cartpole")
+      >>> path = Path(tempfile.mkdtemp(), "mine.safetensors")
+      >>> save(path, env, params.weights, score=195.0)
+      >>> load_proxy(path).record
+      {'score': 195.0}
+    """
+    _write(path, env, _checked_tensors(env, weights), config, discount, [record], is_set=False)
+
+
+def save_set(
+    path: str | Path,
+    env: ProxyEnv,
+    weights: Sequence[Any],
+    records: Sequence[Mapping[str, Any]],
+    config: Mapping[str, Any] | None = None,
+    discount: float | None = None,
+) -> None:
+    """Writes a set of proxies atomically; arguments as of `save`, with a record for each.
+
+    Raises:
+      ConfigError: as `save`, or if there are not as many records as proxies.
+      OSError: if it cannot be written; an older file stays as it was.
+    """
+    are_lists = isinstance(weights, Sequence) and isinstance(records, Sequence)
+    require(
+        are_lists and len(weights) == len(records) > 0,
+        "records",
+        "be one for each proxy",
+        "they say which is which",
+        f"{len(records)} for {len(weights)}" if are_lists else "others than lists",
+        "records=[{}] * len(weights)",
+    )
+    each = [_checked_tensors(env, one) for one in weights]
+    tensors = {name: np.stack([one[name] for one in each]) for name in each[0]}
+    _write(path, env, tensors, config, discount, records, is_set=True)
+
+
+def _checked_tensors(env: ProxyEnv, weights: Any) -> dict[str, np.ndarray]:
+    """The weights of one proxy by `network/layer/parameter`, float32."""
+    require(
+        isinstance(env, ProxyEnv),
+        "env",
+        "be a sejax.ProxyEnv",
+        "a file says how it is made again",
+        type(env).__name__,
+        "env to the first of the pair that sejax.load returns",
+    )
+    flat = _flatten(weights) if isinstance(weights, Mapping) else {"": np.zeros(0)}
+    tensors = {name: np.asarray(x, np.float32) for name, x in flat.items()}
+    check_tensors("weights", tensors, _shapes_of(env), "params.weights")
+    return tensors
+
+
+def _write(
+    path: str | Path,
+    env: ProxyEnv,
+    tensors: dict[str, np.ndarray],
+    config: Mapping[str, Any] | None,
+    discount: float | None,
+    records: Sequence[Mapping[str, Any]],
+    is_set: bool,
+) -> None:
+    require(
+        discount is not None or not env.config.needs_discount,
+        "discount",
+        "be given for a potential-based reward network",
+        "its reward is made with it",
+        discount,
+        "discount=params.discount, that of the agent",
+    )
+    known = {
+        "env": env.task.origin or {"name": env.task.name},
+        "proxy": registry.describe("proxy", env.config),
+    }
+    try:
+        header = Header(
+            format_version=FORMAT_VERSION,
+            task=env.task.name,
+            interface=env.task.interface,
+            config={**known, **(config or {}), "run_dir": None},  # no path of a machine
+            discount=1.0 if discount is None else float(discount),
+            is_set=is_set,
+            proxies=[{name: _plain(x) for name, x in record.items()} for record in records],
+        )
+        data = header.with_tensors(tensors)
+    except (LookupError, ValueError, TypeError, AttributeError) as error:
+        raise ConfigError(
+            f"config, discount and record must be plain values that sejax.load takes, because they "
+            f"are kept beside the weights; got {shortened(told(error), 60)}. Give numbers for "
+            f"score, generation and seed, and sejax.config(...).plain() for config.",
+            "config",
+        ) from error
+    write_bytes(Path(path), data)
+
+
+def _plain(value: Any) -> Any:
+    """A number for an array of one, such as a result's score."""
+    return value.item() if hasattr(value, "dtype") and np.ndim(value) == 0 else value
+
+
+# --- reading --------------------------------------------------------------------------------------
+
+
+def load(source: str | Path, task: Task | None = None, proxy: Any = None) -> tuple[ProxyEnv, Any]:
+    """Loads a proxy as a gymnax environment and its params (the weights).
+
+    The discount of a potential-based RN is that of the agent it was learned with. For another one
+    take `params.replace(discount=...)`; `make_trainer` does so by itself.
+
+    Args:
+      source: a run directory, a safetensors file, the name of a proxy that ships with the package
+        (`sejax.pretrained()`), or one on the Hugging Face Hub: `hf://USER/REPO`.
+      task: the real task; needed if no registered name makes it, because a file's names are never
+        imported. An SE whose initial states are not the real task's needs none, and not the package
+        of its task either: its file has the spaces, and only resetting or stepping the real task
+        fails.
+      proxy: the proxy's configuration; needed for a kind of proxy of your own.
+
+    Returns:
+      The environment, and its params. The environment's `default_params` are the same params, for
+      wrappers that leave them out.
+
+    Raises:
+      ConfigError: if there is no such proxy, the file is damaged or of another format, it holds
+        several, its task or kind is not known, or the task given differs from the file's in its
+        spaces or, for an SE, in its step limit.
+
+    Example:
+      >>> env, params = load("cartpole")
+      >>> obs, state = env.reset(jax.random.key(0), params)
+      >>> obs.shape
+      (4,)
+    """
+    loaded = load_proxy(source, task, proxy)
+    return loaded.env, loaded.params
+
+
+def load_proxy(
+    source: str | Path, task: Task | None = None, proxy: Any = None, option: str = "source"
+) -> Proxy:
+    """As `load`, with the real task, the configuration and the record.
+
+    Args:
+      source: as of `load`.
+      task: as of `load`.
+      proxy: as of `load`.
+      option: name of `source` in messages.
+    """
+    proxies = load_set(source, task, proxy, option)
+    require_single(len(proxies), proxies.path, option)
+    return proxies[0]
+
+
+def load_set(
+    source: str | Path,
+    task: Task | None = None,
+    proxy: Any = None,
+    option: str = "source",
+    kind: str | None = None,
+) -> ProxySet:
+    """Loads a set of proxies; a single stored one is a set of one.
+
+    Args:
+      source: a file of `save_set`, or whatever `load` takes.
+      task: as of `load`.
+      proxy: as of `load`.
+      option: name of `source` in messages.
+      kind: "se" or "rn", which the proxies must be; None for any.
+
+    Raises:
+      ConfigError: as `load`, or if its proxies are of another kind.
+
+    Example:
+      >>> rns = load_set("cliff_walking-rn")  # or a file in results/reward_networks
+      >>> len(rns), rns[0].params.discount
+      (1, 0.8)
+    """
+    path = find(source, option)
+    tensors, header = read(path, option, () if kind is None else (kind,))
+    env = _env_of(path, header, task, proxy, option)
+    if not header.is_set:
+        tensors = {name: x[None] for name, x in tensors.items()}
+    shapes = {name: (len(header.proxies), *shape) for name, shape in _shapes_of(env).items()}
+    check_tensors(option, tensors, shapes, "a file that sejax has written")
+    return ProxySet(
+        env=env,
+        weights=unflatten_dict(tensors, sep="/"),
+        records=tuple(header.proxies),
+        config=header.config,
+        discount=header.discount,
+        path=path,
+    )
+
+
+def _env_of(path: Path, header: Header, task: Any, proxy: Any, option: str) -> ProxyEnv:
+    """The environment that a file's metadata describes; task and configuration may be given."""
+    for name, given, kind, fix in (
+        ("task", task, Task, "task=sejax.envs.make(NAME)"),
+        ("proxy", proxy, ProxyConfig, "proxy=sejax.SyntheticConfig(...), or leave it out"),
+    ):
+        require(
+            given is None or isinstance(given, kind),
+            name,
+            f"be a sejax.{kind.__name__}",
+            "a file's names are never imported",
+            shortened(repr(given), 80),
+            fix,
+        )
+    if proxy is None:
+        proxy = _registered("proxy", "proxy", "proxy_kind", path, header, option)
+    is_given = task is not None
+    if not is_given:
+        try:
+            task = envs.make_from(_registered("env", "task", "env", path, header, option))
+        except ConfigError as error:
+            if proxy.needs_task:
+                raise
+            task = absent_task(header.task, header.interface, header.config["env"], str(error))
+    require(
+        header.task == task.name,
+        option,
+        f"be a proxy of {task.name}",
+        "that is the task given",
+        f"one of {shortened(header.task, 60)} in {shortened(path, 60)}",
+        f"{option} to a proxy of {task.name}, or another task",
+    )
+    if is_given:
+        _require_same(header.interface, task.interface, proxy, path)
+    return registry.make("proxy", proxy, task)
+
+
+def _registered(
+    group: str, argument: str, word: str, path: Path, header: Header, option: str
+) -> Any:
+    """The configuration of a group, if its name is one that sejax or a package has registered."""
+    stored = header.config[group]
+    if is_registered(group, stored):
+        return registry.configure(group, stored)
+    name = shortened(stored.get("name"), 60)
+    named = name if ":" in name else f"MODULE:{name}"
+    raise ConfigError(
+        f"{option} must be a proxy of a registered {group} if no {argument} is given, because what "
+        f"a file names is never imported; got {name} in {shortened(path, 60)}. Give it: "
+        f"sejax.load(path, {argument}=...), or {word}={named} in a command.",
+        argument,
+    )
+
+
+def _require_same(
+    learned: Mapping[str, Any], given: Mapping[str, Any], proxy: ProxyConfig, path: Path
+) -> None:
+    """Checks that a task given is that of the proxy, as far as the proxy depends on it.
+
+    An RN is for the same dynamics with another step limit too, and an SE in the task's raw units
+    does not know the bounds of observations.
+    """
+    same = {
+        "observation": _is_same_space(learned, given, "observation", proxy.sees_bounds),
+        "action": _is_same_space(learned, given, "action", with_bounds=True),
+        "max_steps": learned["max_steps"] == given["max_steps"] or proxy.has_real_dynamics,
+    }
+    for name, is_same in same.items():
+        require(
+            is_same,
+            "task",
+            f"have the {name} {shortened(learned[name], 60)}",
+            f"{shortened(path, 60)} is of such a task",
+            shortened(given[name], 60),
+            f"task to a sejax.Task with that {name}",
+        )
+
+
+def _is_same_space(
+    learned: Mapping[str, Any], given: Mapping[str, Any], name: str, with_bounds: bool
+) -> bool:
+    """Whether a space of two `Task.interface` is the same up to rounding."""
+    one, other = (
+        np.array([space["n"]] if "n" in space else [space["low"], space["high"]], float)
+        for space in (learned[name], given[name])
+    )  # None is nan: no bound
+    matters = with_bounds or one.ndim == 1
+    return one.shape == other.shape and (not matters or np.allclose(one, other, equal_nan=True))
+
+
+def _flatten(weights: Any) -> dict[str, Any]:
+    """Nested weights by `network/layer/parameter`."""
+    return flatten_dict(weights, sep="/")
+
+
+def _shapes_of(env: ProxyEnv) -> dict[str, tuple[int, ...]]:
+    """Shape of each of a proxy's weights."""
+    weights = jax.eval_shape(env.init_weights, jax.random.key(0))
+    return {name: x.shape for name, x in _flatten(weights).items()}
+
+
+# --- gymnax ---------------------------------------------------------------------------------------
+
+
+def register_gymnax() -> list[str]:
+    """Registers the shipped proxies with gymnax as `sejax/<name>`; may be called repeatedly.
+
+    Returns:
+      The ids, for `gymnax.make`. The environment's `default_params` are the learned weights.
+    """
+    import gymnax  # all of its environments, which takes a second
+    from gymnax.registration import registered_envs
+
+    names = pretrained_names()
+    for name in names:
+        if f"sejax/{name}" not in registered_envs:
+            gymnax.register(f"sejax/{name}", lambda name=name: load(name)[0])
+    return [f"sejax/{name}" for name in names]

@@ -1,0 +1,434 @@
+"""sejax.cli.config: overrides become a configuration; what cannot be is one short message."""
+
+import dataclasses
+import functools
+import os
+import random
+import subprocess
+import sys
+import typing
+
+import pytest
+
+import sejax
+from sejax import envs, registry
+from sejax.cli import commands
+from sejax.cli import config as configuration
+from sejax.cli.config import EvaluateConfig, LearnConfig, evaluate_config, expand, plain
+from sejax.envs.gridworld import CliffWalking
+from sejax.options import ConfigError
+
+composed_with = functools.cache(lambda *overrides: sejax.config(overrides))
+ENVS = ("cartpole", "acrobot")
+PRESETS = ("best", "paper", "paper_performance", "soft")
+
+
+def refused(*overrides, make=sejax.config):
+    """The error of overrides: one line, not too long, that says what to set."""
+    with pytest.raises(ConfigError) as caught:
+        make(overrides)
+    said = str(caught.value)
+    assert "\n" not in said and len(said) <= 400, (len(said), said)
+    assert caught.value.field
+    return caught.value
+
+
+# --- every choice composes ------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+@pytest.mark.parametrize("env", ENVS)
+def test_every_task_composes_with_every_preset(env, preset):
+    composed = composed_with(f"env={env}", f"preset={preset}")
+    assert isinstance(composed, LearnConfig)
+    assert (composed.name("env"), composed.preset) == (env, preset)
+    # An SE gives no sign of the agent's progress: its own returns level off, or a budget ends.
+    assert composed.training.stop_rule == "plateau" or composed.training.max_steps is not None
+    for group in (composed, composed.agent, composed.es, composed.training):
+        for name, kind in typing.get_type_hints(type(group)).items():
+            if kind in (int, float, bool, str):
+                assert type(getattr(group, name)) is kind, name
+
+
+@pytest.mark.parametrize("group", ["es", "objective", "exploration", "tracker"])
+def test_every_choice_of_a_group_composes(group):
+    for name in registry.GROUPS[group].built_in:
+        env = ["env=cliff_walking"] if name == "count_based" else []
+        if registry.GROUPS[group].entry_points != "sejax.trackers" or name in ("none",):
+            assert sejax.config([*env, f"{group}={name}"]).name(group) == name
+
+
+def test_a_task_chooses_its_agent_and_a_proxy_its_objective():
+    names = {env: composed_with(f"env={env}").name("agent") for env in envs.names()}
+    assert names == {
+        "cartpole": "ddqn", "cartpole_v1": "ddqn", "acrobot": "ddqn", "cliff_walking": "q_learning",
+        "gridworld_2x2": "q_learning", "mountain_car": "ddqn", "mountain_car_continuous": "td3",
+        "pendulum": "td3", "halfcheetah": "td3", "hopper": "td3", "walker2d": "td3",
+        "swimmer": "td3", "inverted_pendulum": "td3", "ant": "td3", "reacher": "td3",
+    }  # fmt: skip
+    assert sejax.config(["env=pendulum", "agent=ppo"]).name("agent") == "ppo"
+    assert composed_with("proxy=rn").name("objective") == "reward_threshold"
+    assert sejax.config(["proxy=rn", "objective=max_reward"]).name("objective") == "max_reward"
+
+
+def test_without_overrides_it_is_the_best_cartpole_se():
+    composed = composed_with()
+    names = [composed.name(group) for group in registry.GROUPS]
+    assert names == ["cartpole", "ddqn", "none", "se", "max_reward", "nes", "none", "local"]
+    assert composed.preset == "best"
+    assert str(composed.resolved_run_dir) == "runs/cartpole-se-ddqn-s0"
+
+
+def test_overrides_win_over_presets_and_the_last_one_counts():
+    composed = sejax.config(
+        ["preset=paper", "es.noise_std=0.7", "agent.batch_size=3", "generations=8", "generations=9"]
+    )
+    assert (composed.es.noise_std, composed.agent.batch_size, composed.generations) == (0.7, 3, 9)
+    assert composed.es.step_size == 0.148  # the preset's
+
+
+def test_the_run_directory_names_the_run():
+    for overrides, name in [
+        (["env=acrobot", "seed=7"], "runs/acrobot-se-ddqn-s7"),
+        (["run_dir=elsewhere"], "elsewhere"),
+        (["run_dir='with, commas ☃'"], "with, commas ☃"),
+        (["exploration=icm"], "runs/cartpole-se-ddqn_icm-s0"),
+        (["agent_hparams=varied"], "runs/cartpole-se-ddqn_varied-s0"),
+        (["env=gymnax/CartPole-v1"], "runs/gymnax_CartPole-v1-se-ddqn-s0"),
+    ]:
+        assert str(sejax.config(overrides).resolved_run_dir) == name
+
+
+def test_values_are_read_by_the_types_of_their_fields():
+    read = sejax.config(["es.noise_std=1e-2", "agent.learning_rate=1", "generations=3.0",
+                         "stop_when_solved=true", "training.max_steps=null",
+                         "training.stop_rule=plateau"])  # fmt: skip
+    assert read.es.noise_std == 0.01 and type(read.agent.learning_rate) is float
+    assert read.generations == 3 and type(read.generations) is int
+    assert read.stop_when_solved is True and read.training.max_steps is None
+    assert sejax.config(["run_dir=007"]).run_dir == "007"
+
+
+def test_a_configuration_is_read_back_from_its_plain_values():
+    for overrides in (
+        [],
+        ["env=pendulum", "agent=sac"],
+        ["agents=[ddqn,ppo]", "agents.ppo.epochs=3"],
+        ["env=cliff_walking", "proxy=rn"],
+        ["es=snes", "env=gymnax/Catch-bsuite"],
+    ):
+        config = sejax.config(overrides)
+        assert configuration.learn_config(plain(config)) == config
+        assert configuration.completed(plain(config), config) == plain(config)
+
+
+def test_fields_that_an_older_version_did_not_write_are_completed():
+    config = sejax.config(["agents=[ddqn,ppo]"])
+    stored = plain(config)
+    for fields in (stored["es"], stored["training"], stored["agents"]["ddqn"]):
+        fields.popitem()
+    assert configuration.completed(stored, config) == plain(config)
+    other = {"name": "mine:Proxy", "size": 3}  # of another name: left as it is
+    assert configuration.completed(plain(config) | {"proxy": other}, config)["proxy"] == other
+
+
+# --- several agents -------------------------------------------------------------------------------
+
+
+def test_a_mixture_has_fields_for_each_agent():
+    composed = sejax.config(["agents=[td3_discrete,ddqn]", "agents.ddqn.batch_size=32",
+                             "agents.td3_discrete.weight=2", "agents.aggregate=min",
+                             "agents.compared_by=rank"])  # fmt: skip
+    mixture = composed.agents
+    assert composed.agent is None and composed.name("agent") == "ddqn+td3_discrete"
+    assert (mixture.aggregate, mixture.compared_by) == ("min", "rank")
+    assert [(x.key, x.weight) for x in mixture.families] == [("ddqn", 1.0), ("td3_discrete", 2.0)]
+    assert mixture.families[0].agent.batch_size == 32
+    assert str(composed.resolved_run_dir) == "runs/cartpole-se-ddqn+td3_discrete-s0"
+    assert composed.parts()["agent"].weights == (1.0, 2.0)
+
+
+@pytest.mark.parametrize("preset", ["best", "paper"])
+def test_each_agent_of_a_mixture_has_the_settings_that_it_has_alone(preset):
+    words = ("env=acrobot", f"preset={preset}", "training.max_steps=null")
+    for family in composed_with(*words, "agents=[td3_discrete,ddqn]").agents.families:
+        assert family.agent == composed_with(*words, f"agent={family.key}").agent
+
+
+def test_evaluate_takes_a_mixture_and_the_agent_of_the_proxys_task():
+    config = evaluate_config(["proxy=cartpole", "agents=[ddqn,ppo]", "agents.ppo.epochs=3"])
+    assert [x.key for x in config.agents.families] == ["ddqn", "ppo"]
+    assert evaluate_config(["proxy=pendulum"]).agent == sejax.TD3Config()
+    assert evaluate_config(["proxy=cliff_walking-rn"]).agent == sejax.QLearningConfig()
+    assert evaluate_config(["proxy=real", "env=acrobot"]).real_training.stop_rule == "solved"
+
+
+# --- sweeps ---------------------------------------------------------------------------------------
+
+
+def test_commas_outside_of_brackets_and_quotes_make_a_sweep():
+    words = ["env=acrobot", "seed=0,1", "agents=[ddqn,ppo]", "run_dir='a,b'", "es.noise_std=1,2"]
+    runs = expand(words)
+    assert len(runs) == 4 and runs[1] == [
+        "env=acrobot", "seed=0", "agents=[ddqn,ppo]", "run_dir='a,b'", "es.noise_std=2",
+    ]  # fmt: skip
+    assert refused("seed=0,1").field == "seed"
+
+
+def test_the_runs_of_a_sweep_have_folders_of_their_own(monkeypatch):
+    from sejax import run
+
+    learned = []
+    monkeypatch.setattr(run, "learn_all", lambda configs: learned.extend(configs))
+    run.main(["seed=0,1", "es.noise_std=0.03,0.06", "num_seeds=2"])
+    folders = [str(config.resolved_run_dir) for config in learned]
+    assert len(set(folders)) == len(folders) == 8
+    assert all("noise_std" in folder for folder in folders)
+    learned.clear()
+    run.main(["env=cartpole,acrobot", "run_dir=here"])
+    assert [str(x.resolved_run_dir) for x in learned] == ["here/env_cartpole", "here/env_acrobot"]
+
+
+# --- preset files ---------------------------------------------------------------------------------
+
+
+def test_a_preset_file_stands_for_its_overrides(tmp_path):
+    file = tmp_path / "mine.yaml"
+    file.write_text("env: acrobot\npreset: paper\nes:\n  noise_std: 0.05\nagent.batch_size: 3\n")
+    composed = sejax.config([f"preset={file}", "agent.batch_size=7"])
+    assert composed == sejax.config(
+        ["env=acrobot", "preset=paper", "es.noise_std=0.05", "agent.batch_size=7"]
+    )
+    assert composed.preset == "paper"
+    file.write_text(configuration.file_text(["agents=[ddqn,ppo]", "agents.ppo.weight=2"]))
+    assert sejax.config([f"preset={file}"]).agents.families[1].weight == 2
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["", "[1, 2]", "just text", "a: [", "env: 3", "nope: 1", "env: nope", "preset: other.yaml",
+     "agent: {batch_size: {x: 1}}", "1: 2", "\x00", "- &a [*a]"],
+)  # fmt: skip
+def test_a_bad_preset_file_is_one_message(tmp_path, text):
+    (tmp_path / "bad.yaml").write_text(text)
+    refused(f"preset={tmp_path / 'bad.yaml'}")
+
+
+def test_a_preset_file_that_is_not_there_is_one_message(tmp_path):
+    assert refused(f"preset={tmp_path / 'nope.yaml'}").field == "preset"
+    assert refused(f"preset={tmp_path}.yaml").field == "preset"
+
+
+# --- bad input ------------------------------------------------------------------------------------
+
+
+def test_two_whole_messages():
+    assert str(refused("es.population_size=1")) == (
+        "es.population_size must be a whole number from 2 to 100000, because scores are compared "
+        "within a generation; got 1. Set es.population_size=16."
+    )
+    assert str(refused("lanes=2")) == (
+        "lanes must be called num_parallel, because it has a new name; got 2. Set num_parallel=2."
+    )
+
+
+@pytest.mark.parametrize(
+    ("override", "field", "suggested"),
+    [
+        ("env=cartpol", "env", "env=cartpole"),
+        ("agent=ddqnn", "agent", "agent=ddqn"),
+        ("es=open-es", "es", "es=open_es"),
+        ("preset=papers", "preset", "preset=paper"),
+        ("es.score_transform=all_beter_2", "es.score_transform", "all_better_2"),
+        ("training.stop_rule=plato", "training.stop_rule", "plateau"),
+        ("es.populaton_size=3", "es.populaton_size", "es.population_size"),
+        ("generation=3", "generation", "generations"),
+        ("agent.batchsize=3", "agent.batchsize", "agent.batch_size"),
+        ("batch_size=3", "batch_size", "agent.batch_size"),
+        ("agent.init_episodes=3", "agent.init_episodes", "agent.warmup_episodes=3"),
+        ("agent.target_update_rate=0.1", "agent.target_update_rate", "agent.tau=0.1"),
+        ("objective.first_test_steps=9", "objective.first_test_steps", "first_eval_steps=9"),
+        ("agent.rollout_steps=3", "agent.rollout_steps", "agent=ppo"),  # another agent has it
+        ("proxy.name=rn", "proxy.name", "proxy=rn"),
+        ("env=[cartpole]", "env", ""),
+        ("foo", "an override", "env=foo"),
+        ("=1", "an override", ""),
+        ("seed=x", "seed", ""),
+        ("seed=-1", "seed", ""),
+        ("es.population_size=1.5", "es.population_size", ""),
+        ("es.noise_std=nan", "es.noise_std", ""),
+        ("es.step_size=1e300", "es.step_size", ""),
+        ("es.step_size=5e-324", "es.step_size", ""),
+        ("agent.learning_rate=1e300", "agent.learning_rate", ""),
+        ("agent.hidden_size=[1,2]", "agent.hidden_size", ""),
+        ("training.max_episodes=null", "training.max_episodes", ""),
+        ("stop_when_solved=maybe", "stop_when_solved", ""),
+        ("generations=1000000000", "generations", ""),
+        ("generations=0", "generations", ""),
+        ("num_parallel=99999999999999999999", "num_parallel", ""),
+        (f"agent={'d' * 5000}", "agent", ""),
+        (f"agent=a:{'d' * 5000}", "agent", ""),
+        ("agent=no_module_of:mine", "agent", "PYTHONPATH"),
+        ("agents=[ddqn,td3_discret]", "agents", "td3_discrete"),
+        ("agents=[ddqn,ddqn]", "agents", ""),
+        ("agents=[]", "agents", "agents=[ddqn,ppo]"),
+        ("agents=3", "agents", ""),
+        ("agents=[ddqn,ppo] agent.batch_size=3", "agent.batch_size", "agents.ddqn.batch_size=3"),
+        ("agents=[ddqn,ppo] agent=sac", "agent", "agents=[ddqn,ppo,sac]"),
+        ("agents=[ddqn,ppo] agents.ddqn.batchsize=3", "agents.ddqn.batchsize", "batch_size"),
+        ("agents=[ddqn,ppo] agents.ddqn.weight=-1", "agents.ddqn.weight", ""),
+        ("agents=[ddqn,ppo] agents.ddqn.batch_size=0", "agents.ddqn.batch_size", ""),
+        ("agents.aggregate=min", "agents.aggregate", "agents=[ddqn,ppo]"),
+        ("agents=[ddqn,td3]", "agents.td3", ""),
+        ("env=pendulum agent=ddqn", "agent", ""),
+        ("env=cliff_walking agent=sarsa exploration=icm", "exploration", ""),
+        ("preset=paper env=mountain_car", "preset", "preset=best"),
+        ("training.stop_rule=solved training.solved_by=train", "training.solved_by", ""),
+        ("proxy=rn stop_when_solved=true", "stop_when_solved", ""),
+        ("training.max_episodes=3", "training.max_episodes", ""),
+        ("proxy.done=soft proxy.horizon=null agent=ppo agent.rollout_steps=3000",
+         "training.max_steps", ""),
+        ("es=open_es es.population_size=3", "es.population_size", ""),
+        ("machines=ray devices=2", "machines", ""),
+    ],
+)  # fmt: skip
+def test_bad_input_is_one_message_that_names_the_field(override, field, suggested, monkeypatch):
+    if override.startswith("machines"):  # with or without Ray
+        with pytest.raises(ConfigError):
+            sejax.config(override.split())
+        return
+    error = refused(*override.split(" "))
+    assert error.field == field, error
+    assert suggested in str(error), error
+
+
+@pytest.mark.parametrize(
+    ("override", "field"),
+    [
+        ("num_agents=3", "proxy"),
+        ("proxy=real agent_hparams=as_learned", "agent_hparams"),
+        ("proxy=real training_from=config", "training_from"),
+        ("proxy=cartpole agent_hparams=as_learned agent=ppo", "agent"),
+        ("proxy=cartpole training.max_steps=3", "training"),
+        ("proxy=cartpole generations=3", "generations"),
+    ],
+)
+def test_what_evaluate_cannot_use_is_refused(override, field):
+    assert refused(*override.split(), make=evaluate_config).field == field
+
+
+def test_hundreds_of_random_overrides_are_a_configuration_or_one_message():
+    """No traceback, and nothing silent: what was composed has the values that were asked for."""
+    rng = random.Random(0)
+    names = [*LearnConfig.groups, "preset", "seed", "generations", "devices", "agents"]
+    fields = ("batch_size", "noise_std", "hidden_size", "max_steps", "activation", "learning_rate")
+    for group in ("agent", "es", "proxy", "training", "objective"):
+        names += [f"{group}.{field}" for field in (*fields, "done", "nope")]
+    texts = ["0", "1", "-1", "2.5", "1e-3", "64", "nan", "inf", "null", "true", "[]", "[1]", "["]
+    texts += ["[ddqn]", "x", "ddqn", "ppo", "acrobot", "rn", "relu", "paper", "threshold", "'", "☃"]
+    texts += ["a:b", "${x}", "{a:1}", "0x10", "1_000", "9" * 20, "~", "???"]
+    composed = 0
+    for _ in range(600):
+        overrides = [f"{rng.choice(names)}={rng.choice(texts)}" for _ in range(rng.randint(1, 2))]
+        try:
+            config = sejax.config(overrides)
+        except ConfigError as error:
+            assert len(str(error)) <= 400 and error.field, (overrides, error)
+            continue
+        composed += 1
+        values = registry.flatten(plain(config))
+        for name, text in dict(x.split("=", 1) for x in overrides).items():
+            if "." in name:
+                asked = registry.parsed(text)
+                assert values[name] == asked or (asked != asked), (overrides, name)
+    assert composed > 5
+
+
+# --- the command line -----------------------------------------------------------------------------
+
+
+def start(words, monkeypatch, tmp_path, module="run"):
+    command = __import__(f"sejax.{module}", fromlist=["main"])
+    monkeypatch.setattr(sys, "argv", [f"sejax.{module}", *words])
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    monkeypatch.setattr(os, "environ", dict(os.environ))
+    monkeypatch.chdir(tmp_path)
+    commands.start(command.main, command.help_text)
+
+
+@pytest.mark.parametrize("words", [["env=2"], ["agent.batchsize=3"], ["--multirun", "seed=0,1"],
+                                   ["--package", "x"], ["-m"], ["--resolve"], ["a b"], ["env=ä"],
+                                   ["hydra/job_logging=3"], ["seed=0,x"]])  # fmt: skip
+def test_the_command_ends_bad_words_with_one_message_and_status_2(
+    words, monkeypatch, tmp_path, capsys
+):
+    with pytest.raises(SystemExit) as ended:
+        start(words, monkeypatch, tmp_path)
+    said = capsys.readouterr()
+    assert ended.value.code == 2 and not said.out
+    assert said.err.startswith("error: ") and said.err.count("\n") == 1 and len(said.err) < 420
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("module", "words", "expected"),
+    [
+        ("run", ["--help"], ["agent.batch_size=64  # transitions", "preset=best", "env: cartpole"]),
+        (
+            "run",
+            ["--help", "agents=[ddqn,ppo]"],
+            ["agents.ddqn.weight=1.0", "agents.aggregate=mean"],
+        ),
+        ("run", ["-h", "agent=ppo"], ["agent.epochs="]),
+        ("evaluate", ["--help"], ["num_agents=10", "real_training.stop_rule=solved"]),
+    ],
+)
+def test_help_shows_each_field_with_its_value_and_text(
+    module, words, expected, monkeypatch, tmp_path, capsys
+):
+    start(words, monkeypatch, tmp_path, module)
+    said = capsys.readouterr().out
+    for text in expected:
+        assert text in said
+    schema = LearnConfig if module == "run" else EvaluateConfig
+    for field in dataclasses.fields(schema):
+        assert field.name in said
+
+
+def test_only_cliff_walking_has_a_choice_of_goal_reward():
+    config = sejax.config(["env=cliff_walking", "env.goal_reward=-1"])
+    assert config.env == CliffWalking(goal_reward=-1.0)
+    assert config.task().params.goal_reward == -1
+    assert refused("env=cartpole", "env.goal_reward=-1").field == "env.goal_reward"
+
+
+@pytest.mark.parametrize("env", configuration.tuned("se"))
+def test_agents_learn_within_the_default_budget_of_an_se(env):
+    spec = envs.spec_of(registry.configure("env", {"name": env}))
+    for name in registry.names("agent"):
+        agent = registry.find("agent", name)
+        if agent.states == spec.states and spec.actions in agent.actions:
+            config = sejax.config([f"env={env}", f"agent={name}"])
+            longest = config.proxy.max_steps(spec.max_steps)
+            before = config.agent.steps_before_learning(longest, spec.max_steps)
+            budget = config.training.max_episodes * longest
+            budget = min(budget, config.training.max_steps or budget)
+            assert budget >= 2 * before, name
+
+
+def test_importing_sejax_imports_nothing_slow_and_touches_nothing():
+    program = (
+        "import os, sys\n"
+        "before = dict(os.environ)\n"
+        "import sejax\n"
+        "heavy = {'jax', 'jaxlib', 'flax', 'optax', 'numpy', 'gymnax', 'evosax', 'pandas', "
+        "'matplotlib'}\n"
+        "assert not heavy & set(sys.modules) and dict(os.environ) == before\n"
+        "sejax.config(['env=acrobot', 'es=cma_es'])\n"
+        "slow = {'gymnax.registration', 'evosax', 'torch', 'brax', 'pandas', 'matplotlib'}\n"
+        "assert not slow & set(sys.modules), slow & set(sys.modules)\n"
+        "from jax._src import xla_bridge\n"
+        "assert not xla_bridge.backends_are_initialized()\n"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
