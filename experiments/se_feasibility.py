@@ -108,11 +108,12 @@ def summarise(curves: pd.DataFrame, solved_reward: float) -> pd.DataFrame:
 
 def median_and_range(values: Any, limit: int) -> str:
     """`median (lowest to highest)` of counts, where inf is "more than the limit"."""
-    values = np.sort(np.asarray(values, float))
-    middle, low, high = (
-        f"{x:g}" if np.isfinite(x) else f"> {limit}"
-        for x in (np.median(values), values[0], values[-1])
-    )
+    values = np.asarray(values, float)
+
+    def text(x: float) -> str:
+        return f"{x:g}" if np.isfinite(x) else f"> {limit}"
+
+    middle, low, high = map(text, (np.median(values), values.min(), values.max()))
     return middle if low == high else f"{middle} ({low} to {high})"
 
 

@@ -15,7 +15,6 @@ If `response` is closer to `train` than to `test`, it is the SE that shifts the 
 not what the agents do in it.
 """
 
-import dataclasses
 import functools
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -89,7 +88,8 @@ class SeHistograms(Settings):
 
 def compute(settings: SeHistograms) -> pd.DataFrame:
     """Trains what is missing; a row for each transition."""
-    ses = load(settings)
+    ses, measure = load(settings), transitions(settings.max_rows)
+    most = groups.QUICK_STEPS if settings.quick else None
     tables = []
     for kind in settings.agents:
         agent = groups.agent_config(settings, kind)
@@ -98,12 +98,11 @@ def compute(settings: SeHistograms) -> pd.DataFrame:
             ["all"],
             name=kind,
             agent=agent,
-            training=training_of(settings, ses, agent),
+            training=groups.training_as_learned(ses, agent, settings.test_episodes, most),
             exploration=registry.configure("exploration", ses.config["exploration"]),
             settings=settings.values("max_rows"),
             is_single=True,
         )
-        measure = transitions(settings.max_rows)
         rows = groups.train_groups(condition, settings, settings.num_agents, measure)
         tables.append(rows.assign(kind=kind))
     return pd.concat(tables, ignore_index=True).drop(columns="group")
@@ -112,15 +111,6 @@ def compute(settings: SeHistograms) -> pd.DataFrame:
 def load(settings: SeHistograms) -> Any:
     """The SE."""
     return sejax.load_set(settings.proxy, option="proxy", kind="se")[:1]
-
-
-def training_of(settings: SeHistograms, ses: Any, agent: Any) -> TrainingConfig:
-    """How long an agent trains: as those that the SE was learned with."""
-    training = groups.training_as_learned(ses, agent)
-    if settings.quick:
-        most = min(training.max_steps or groups.QUICK_STEPS, groups.QUICK_STEPS)
-        training = dataclasses.replace(training, max_steps=most)
-    return dataclasses.replace(training, test_episodes=settings.test_episodes)
 
 
 @functools.cache

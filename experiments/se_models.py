@@ -145,10 +145,8 @@ def draw(task: Any, agents: pd.DataFrame, path: Path) -> None:
             axis.set_title(figures.AGENT_NAMES.get(kind, kind), fontsize=10)
             axis.set(xlim=(0.4, len(order) + 0.6), ylabel=f"test return\non {task.name}")
         axes[-1, 0].set_xlabel("SE, by its place in the set; diamonds: means")
-        line, label = (
-            plt.Line2D([], [], color=figures.SOLVED, ls="--"),
-            f"solved ({task.solved_reward:g})",
-        )
+        line = plt.Line2D([], [], color=figures.SOLVED, ls="--")
+        label = f"solved ({task.solved_reward:g})"
         figure.legend([line], [label], loc="outside upper right", fontsize=9)
 
 

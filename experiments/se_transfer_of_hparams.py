@@ -72,12 +72,11 @@ def parts_of(settings: SeTransferOfHparams) -> Parts:
     if settings.quick:
         words += [f"agent.{name}={value}" for name, value in QUICK_AGENT.items()]
     config = sejax.config([*words, *settings.run])
-    learned = agents.training_as_learned(ses, config.agent)
+    learned = agents.training_as_learned(ses, config.agent, settings.test_episodes)
     on_se = dataclasses.replace(
         learned,
         max_steps=settings.max_steps or learned.max_steps,
         max_episodes=max(learned.max_episodes, settings.max_steps or 0),
-        test_episodes=settings.test_episodes,
     )
     rule, reason = "be given with this SE", "its agents trained until a rule stopped them"
     require(on_se.max_steps is not None, "max_steps", rule, reason, "null", "max_steps=5000")

@@ -104,7 +104,7 @@ def make_conditions(settings: Any, ses: Any, kind: str, hparams: str) -> dict[st
     agent = groups.agent_config(settings, kind)
     made = {}
     for name, proxies in (sets | {"se": ses}).items():
-        training = groups.training_as_learned(proxies, agent)
+        training = groups.training_as_learned(proxies, agent, settings.test_episodes)
         own = settings.max_steps if name != "se" else None
         max_steps = own or (groups.QUICK_STEPS if settings.quick else training.max_steps)
         made[name] = Condition.of_set(
@@ -112,9 +112,7 @@ def make_conditions(settings: Any, ses: Any, kind: str, hparams: str) -> dict[st
             map(str, range(settings.models)),
             name=f"{kind}-{hparams}-{name}",
             agent=agent,
-            training=dataclasses.replace(
-                training, max_steps=max_steps, test_episodes=settings.test_episodes
-            ),
+            training=dataclasses.replace(training, max_steps=max_steps),
             hparams=hparams,
         )
     return made

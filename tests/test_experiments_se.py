@@ -534,5 +534,5 @@ def test_a_tuned_agent_trains_on_the_real_task_as_long_as_on_the_se():
     assert dataclasses.asdict(trainings["long"])["max_steps"] == 100_000
     with pytest.raises(ConfigError, match=r"ses must be of acrobot.*env=cartpole"):
         se_transfer_of_hparams.parts_of(of(env="acrobot", ses="cartpole"))
-    with pytest.raises(ConfigError, match="num_agents must be at least 2"):
+    with pytest.raises(ConfigError, match="num_agents must be "):
         of(num_agents=1)

@@ -297,19 +297,20 @@ def agent_config(settings: Settings, kind: str) -> Any:
     return registry.configure("agent", {"name": kind, **(QUICK_AGENT if settings.quick else {})})
 
 
-def training_as_learned(proxies: Any, agent: Any) -> TrainingConfig:
-    """How long an agent trains on a set of SEs: as those that they were learned with."""
-    return sejax.training_of(proxies, agent)
+def training_as_learned(
+    proxies: Any, agent: Any, test_episodes: int, max_steps: int | None = None
+) -> TrainingConfig:
+    """How long an agent trains on SEs: as those that these were learned with, or `max_steps`."""
+    learned = sejax.training_of(proxies, agent)
+    limits = [x for x in (learned.max_steps, max_steps) if x is not None]
+    most = min(limits, default=None)
+    return dataclasses.replace(learned, max_steps=most, test_episodes=test_episodes)
 
 
 def on_ses(settings: SeAgents, ses: Any, kind: str) -> Condition:
     """The SEs of a set; agents train as long as those that the SEs were learned with."""
     agent = agent_config(settings, kind)
-    learned = training_as_learned(ses, agent)
-    limits = [x for x in (learned.max_steps, settings.max_steps) if x is not None]
-    training = dataclasses.replace(
-        learned, max_steps=min(limits, default=None), test_episodes=settings.test_episodes
-    )
+    training = training_as_learned(ses, agent, settings.test_episodes, settings.max_steps)
     # The weights' hash is in the name, so that sets can share a folder: se_models then finds those
     # of se_performance.
     names = [f"se-{seed:02d}-{ses[i].fingerprint}" for i, seed in enumerate(ses.seeds)]

@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import Any, ClassVar, Self, get_origin, get_type_hints
 
 import pandas as pd
-import yaml
 
 from experiments.common.shards import Shards, read_rows, write_rows
 from sejax import options, registry
@@ -174,7 +173,7 @@ def parse(settings: type[Settings], words: Iterable[str]) -> dict[str, Any]:
         if name.startswith(RUN_PREFIX) and "run" in fields:
             runs.append(word.removeprefix(RUN_PREFIX))
         elif equals and name in fields:
-            given[name] = _value(text)
+            given[name] = registry.parsed(text)
         else:
             ranked = nearest(name.lstrip("-").replace("-", "_"), fields)
             raise ConfigError(
@@ -184,13 +183,6 @@ def parse(settings: type[Settings], words: Iterable[str]) -> dict[str, Any]:
     if runs:
         given["run"] = [*(given.get("run") or []), *runs]
     return given
-
-
-def _value(text: str) -> Any:
-    try:
-        return yaml.safe_load(text)
-    except yaml.YAMLError:
-        return text
 
 
 @dataclass(frozen=True, kw_only=True)
