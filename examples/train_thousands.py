@@ -23,7 +23,7 @@ import sejax
 def main() -> None:
     parser = argparse.ArgumentParser(description="Trains thousands of agents in one program.")
     parser.add_argument("--agents", type=int, default=4096)
-    parser.add_argument("--lanes", type=int, default=1024, help="agents in lockstep on a device")
+    parser.add_argument("--num_parallel", type=int, default=1024, help="agents in a batch")
     args = parser.parse_args()
     sejax.configure_xla()  # a device for each core
     proxy, params = sejax.load("cliff_walking-rn")  # the real grid with a learned reward

@@ -31,37 +31,30 @@ def assert_equal_trees(a, b):
 def test_a_set_that_is_saved_and_loaded_is_the_same(ses):
     path, weights = ses
     loaded = sejax.load_set(path)
-    assert loaded.size == 3 and loaded.task.name == "cartpole"
+    assert len(loaded) == 3 and loaded.task.name == "cartpole"
     for i in range(3):
-        assert_equal_trees(loaded.one(i).weights, weights[i])
+        assert_equal_trees(loaded[i].params.weights, weights[i])
     np.testing.assert_array_equal(loaded.scores, [1, 2, 3])
     assert [record["generation"] for record in loaded.records] == [4, 5, 6]
     np.testing.assert_array_equal(loaded.seeds, [7, 8, 9])
-    assert len({loaded.fingerprint(i) for i in range(3)}) == 3
-    assert_equal_trees(loaded.first(2).weights, jax.tree.map(lambda x: x[:2], loaded.weights))
-    assert loaded.first(None).size == 3
-
-
-@pytest.mark.parametrize(("scores", "solved"), [((195.0, 194.9, 200.0), [7, 9]), ((0, 0, 0), [])])
-def test_the_solved_ones_of_a_set_reached_the_threshold(ses, tmp_path, scores, solved):
-    records = [{"score": x, "seed": 7 + i} for i, x in enumerate(scores)]
-    env = sejax.load_set(ses[0]).env
-    sejax.save_set(tmp_path / "s.safetensors", env, ses[1], records)
-    assert list(sejax.load_set(tmp_path / "s.safetensors").solved().seeds) == solved
+    assert len({loaded[i].fingerprint for i in range(3)}) == 3
+    assert_equal_trees(loaded[:2].weights, jax.tree.map(lambda x: x[:2], loaded.weights))
+    assert list(loaded.ranked(2).seeds) == [9, 8]
+    assert list(loaded[loaded.scores >= 2].seeds) == [8, 9]
 
 
 def test_all_ses_of_a_set_step_at_once(ses):
     loaded = sejax.load_set(ses[0])
-    env, params = loaded.env, loaded.params
-    axes = params.replace(weights=0, max_steps_in_episode=None)
+    env = loaded.env
     key = jax.random.key(0)
-    obs, state = env.reset_env(key, loaded.one(0))
+    obs, state = env.reset_env(key, loaded[0].params)
 
-    def reward(params):
+    def reward(weights):
+        params = env.params(weights, loaded.discount)
         return env.step_env(key, state, jax.numpy.int32(1), params)[2]
 
-    rewards = jax.vmap(reward, in_axes=(axes,))(params)
-    np.testing.assert_allclose(rewards, [reward(loaded.one(i)) for i in range(3)], rtol=1e-6)
+    rewards = jax.vmap(reward)(loaded.weights)
+    np.testing.assert_allclose(rewards, [reward(x.params.weights) for x in loaded], rtol=1e-6)
     assert obs.shape == (4,) and len(set(np.asarray(rewards).tolist())) == 3
 
 
@@ -69,9 +62,9 @@ def test_a_single_proxy_is_a_set_of_one(ses, tmp_path):
     env, weights = sejax.load_set(ses[0]).env, ses[1][0]
     sejax.save(tmp_path / "p.safetensors", env, weights, score=12.5, generation=7, seed=2)
     loaded = sejax.load_set(tmp_path / "p.safetensors")
-    assert (loaded.size, loaded.scores[0], loaded.seeds[0]) == (1, 12.5, 2)
-    assert_equal_trees(loaded.one(0).weights, weights)
-    assert loaded.fingerprint(0) == sejax.load_set(ses[0]).fingerprint(0)
+    assert (len(loaded), loaded.scores[0], loaded.seeds[0]) == (1, 12.5, 2)
+    assert_equal_trees(loaded[0].params.weights, weights)
+    assert loaded[0].fingerprint == sejax.load_set(ses[0])[0].fingerprint
 
 
 def test_files_that_are_no_set_are_refused(ses, tmp_path):
@@ -80,10 +73,10 @@ def test_files_that_are_no_set_are_refused(ses, tmp_path):
     damaged.write_bytes(path.read_bytes()[:-20])
     with pytest.raises(ConfigError, match=r"source must be a single proxy.*load_set reads sets"):
         sejax.load(path)
-    with pytest.raises(ConfigError, match=r"fixed must be a whole safetensors file.*is damaged"):
+    with pytest.raises(ConfigError, match=r"fixed must be .*is damaged"):
         sejax.load_set(damaged, option="fixed")
     other = sejax.config(["proxy.hidden_size=5"]).parts()["proxy"]
-    with pytest.raises(ConfigError, match="weights must have the shapes"):
+    with pytest.raises(ConfigError, match="weights must "):
         sejax.save_set(tmp_path / "other.safetensors", other, weights, [{}] * 3)
     with pytest.raises(ConfigError, match="does not exist"):
         sejax.load_set(tmp_path / "none.safetensors")

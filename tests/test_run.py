@@ -395,7 +395,7 @@ def test_an_interrupt_waits_until_files_are_written():
 def test_bad_input_ends_a_process_with_one_message_and_status_2(tmp_path):
     for word, message in [
         ("env=cartpol", "Did you mean env=cartpole?"),
-        ("~env=[[1]]", "env must be chosen"),
+        ("~env=[[1]]", "an override must read"),
     ]:
         ended = process(*RUN, word, f"run_dir={tmp_path}/run")
         assert ended.returncode == 2

@@ -226,6 +226,9 @@ def test_a_worker_that_was_taken_for_dead_leaves_its_trial_to_others(tmp_path, m
     assert "another worker's" in said[0]
 
 
+# Python's filters of warnings are no thread's own.
+@pytest.mark.filterwarnings("ignore::optuna.exceptions.ExperimentalWarning")
+@pytest.mark.filterwarnings("ignore:The reported value is ignored:UserWarning")
 def test_a_trial_that_two_workers_draw_is_computed_once(tmp_path):
     overrides = "trials=1", "min_generations=1", "max_generations=2", "pruner=none"
     found, search = opened(tmp_path, *overrides)

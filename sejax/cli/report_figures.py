@@ -23,7 +23,7 @@ STYLE: Any = {
     "text.parse_math": False,
     "figure.constrained_layout.h_pad": 0.12,
 }
-COLORS = (plots.INCUMBENT, plots.POPULATION, *plots.FAMILIES)
+COLORS = (plots.INCUMBENT, plots.POPULATION, *plots.AGENTS)
 MARKERS = "osD^vP*X"
 
 
