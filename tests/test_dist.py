@@ -102,7 +102,7 @@ def test_the_wheel_is_the_package_as_git_has_it(wheel):
     package = {name: x for name, x in wheel.items() if ".dist-info/" not in name}
     assert set(package) == of_git("sejax")
     assert all((ROOT / name).read_bytes() == x for name, x in package.items())
-    assert {"sejax/envs/mujoco/step.cc", "sejax/conf/run.yaml", "sejax/py.typed",
+    assert {"sejax/envs/mujoco/step.cc", "sejax/cli/presets/cartpole-se.yaml", "sejax/py.typed",
             "sejax/pretrained/cartpole.safetensors"} < set(package)  # fmt: skip
 
 
@@ -110,7 +110,7 @@ def test_the_sdist_holds_the_package_and_what_builds_it_alone():
     with tarfile.open(one("*.tar.gz")) as sdist:
         names = {member.name.partition("/")[2] for member in sdist if member.isfile()}
     made = {name for name in names if ".egg-info/" in name} | {"PKG-INFO", "setup.cfg"}
-    beside = {"CHANGELOG.md", "CITATION.cff", "LICENSE", "MANIFEST.in", "README.md",
+    beside = {"CHANGELOG.md", "CITATION.cff", "LICENSE", "MANIFEST.in", "README.md", "SECURITY.md",
               "pyproject.toml"}  # fmt: skip
     assert names - made == of_git("sejax") | beside
 
