@@ -210,7 +210,7 @@ def make_bilevel(
         Strategy`; default: the paper's NES.
       objective: an `Objective`, or a configuration that makes one; default: the mean test return.
       training: how long each agent trains, and how it is tested.
-      stop_when_solved: whether a run ends at its first incumbent mean above the threshold.
+      stop_when_solved: whether a run ends at its first incumbent mean that reaches the threshold.
       devices: devices to spread the candidates over; None for all.
       num_parallel: agents that train in one vmapped batch on a device; None for what suits both.
 
@@ -219,12 +219,14 @@ def make_bilevel(
 
     Source: paper, Algorithm 1.
     """
+    _require_kind("task", task, Task)
+    _require_kind("agent", agent, Agent, Mixture)
     proxy = _proxy_of(proxy, task)
-    objective = _made("objective", MaxReward() if objective is None else objective, task)
+    objective = _made("objective", Objective, objective or MaxReward(), task)
     shapes = jax.eval_shape(proxy.init_weights, jax.random.key(0))
     num_dims = sum(x.size for x in jax.tree.leaves(shapes))
     unravel = flat.inverse_of_flatten(shapes)
-    strategy = _made("es", NESConfig() if es is None else es, num_dims)
+    strategy = _made("es", Strategy, es or NESConfig(), num_dims)
     mixture = Mixture.of(agent)
     training = training or TrainingConfig()
     if objective.needs_tests:
@@ -351,7 +353,7 @@ def _record(state: LearnState, es_state: Any, incumbent: Array, scores: Scores) 
 
 
 def _proxy_of(proxy: Any, task: Task) -> ProxyEnv:
-    made: ProxyEnv = _made("proxy", SyntheticConfig() if proxy is None else proxy, task)
+    made: ProxyEnv = _made("proxy", ProxyEnv, proxy or SyntheticConfig(), task)
     require(
         made.task is task,
         "proxy",
@@ -363,9 +365,24 @@ def _proxy_of(proxy: Any, task: Task) -> ProxyEnv:
     return made
 
 
-def _made(group: str, part: Any, *arguments: Any) -> Any:
+def _made(group: str, kind: type, part: Any, *arguments: Any) -> Any:
     """A part that is given as it is, or as a configuration that makes it."""
-    return registry.make(group, part, *arguments) if hasattr(part, "make") else part
+    if not isinstance(part, kind) and hasattr(part, "make"):
+        return registry.make(group, part, *arguments)
+    _require_kind(group, part, kind)
+    return part
+
+
+def _require_kind(name: str, part: Any, *kinds: type) -> None:
+    words = " or a ".join(f"sejax.{kind.__name__}" for kind in kinds)
+    require(
+        isinstance(part, kinds),
+        name,
+        f"be a {words}, or a configuration that makes one",
+        "it is an object here, not a name",
+        repr(part),
+        f"{name} to an object; sejax.config([...]) takes names",
+    )
 
 
 def _or_lowest(scores: Array) -> Array:

@@ -326,6 +326,21 @@ def test_more_devices_than_there_are_is_refused():
         make_learner(tiny(f"devices={count + 1}"))
 
 
+@pytest.mark.parametrize("part", ["task", "agent", "proxy", "es", "objective"])
+def test_a_name_in_the_place_of_an_object_is_refused(part):
+    parts = tiny(words=ROOM).parts()
+    with pytest.raises(ConfigError) as error:
+        make_learner(**parts | {part: "nes"})
+    assert error.value.field == part
+
+
+@pytest.mark.parametrize("generations", [-1, 0, 1.5, 10**9])
+def test_a_number_of_generations_that_cannot_be_is_refused(generations):
+    with pytest.raises(ConfigError) as error:
+        make_learner(**tiny(words=ROOM).parts(), generations=generations)
+    assert error.value.field == "generations"
+
+
 @pytest.mark.parametrize(
     ("words", "overrides"),
     [

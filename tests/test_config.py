@@ -432,3 +432,11 @@ def test_importing_sejax_imports_nothing_slow_and_touches_nothing():
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize("overrides", [None, "env=cartpole", [3], {"env": "cartpole"}])
+def test_overrides_are_a_list_of_text(overrides):
+    for make in (sejax.config, evaluate_config):
+        with pytest.raises(ConfigError) as error:
+            make(overrides)
+        assert error.value.field == "overrides"

@@ -204,7 +204,7 @@ class LearnConfig(Options):
     seed: int = option(0, seed())
     # Independent runs, with seeds seed, seed + 1, ...
     num_seeds: int = option(1, counts("it counts runs"))
-    # End a run at its first incumbent mean above the solved threshold.
+    # End a run at its first incumbent mean that reaches the solved threshold.
     stop_when_solved: bool = False
     # Agents that train side by side on one device; null: what suits the agent and the device.
     num_parallel: int | None = option(None, counts("something must compute"))
@@ -521,12 +521,14 @@ def config(overrides: Sequence[str] = ()) -> LearnConfig:
       >>> config(["env=acrobot", "generations=7"]).generations
       7
     """
+    _require_overrides(overrides)
     with registry.only_typed(overrides):
         return learn_config(compose(LearnConfig, overrides))
 
 
 def evaluate_config(overrides: Sequence[str] = ()) -> EvaluateConfig:
     """As `config`, for the overrides after `python -m sejax.evaluate`."""
+    _require_overrides(overrides)
     with registry.only_typed(overrides):
         values = compose(EvaluateConfig, overrides)
         require(
@@ -539,6 +541,12 @@ def evaluate_config(overrides: Sequence[str] = ()) -> EvaluateConfig:
         )
         made: EvaluateConfig = _from_plain(EvaluateConfig, values)
     return made
+
+
+def _require_overrides(overrides: Any) -> None:
+    is_list = isinstance(overrides, list | tuple) and all(isinstance(x, str) for x in overrides)
+    fix = 'overrides=["env=cartpole"]'
+    require(is_list, "overrides", "be a list of text", "each sets a field", repr(overrides), fix)
 
 
 def expand(overrides: Sequence[str]) -> list[list[str]]:
