@@ -22,12 +22,13 @@ import ast
 import contextlib
 import dataclasses
 import difflib
+import functools
 import inspect
 import io
 import numbers
 import textwrap
 import tokenize
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable, Collection, Iterable, Mapping
 from typing import Any, ClassVar
 
 ACTIVATIONS = ("tanh", "fast_tanh", "relu", "leaky_relu", "prelu")  # of `sejax.ops.networks`
@@ -170,7 +171,8 @@ def marks(cls: type, name: str) -> dict[str, Any]:
     return found
 
 
-def help_texts(cls: type) -> dict[str, str]:
+@functools.cache
+def help_texts(cls: type) -> Mapping[str, str]:
     """The comments above and beside a class's fields, by their names; as `tyro` reads them."""
     texts: dict[str, str] = {}
     for base in reversed(cls.__mro__):

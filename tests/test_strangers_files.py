@@ -39,7 +39,6 @@ def folder(tmp_path, monkeypatch):
     (tmp_path / "strangers_module.py").write_text(MODULE)
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(str(tmp_path))
-    monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
     yield tmp_path
     was_imported = sys.modules.pop("strangers_module", None) is not None
     assert not was_imported and not (tmp_path / "PWNED").exists()
