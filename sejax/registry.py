@@ -373,7 +373,7 @@ def from_plain(cls: Any, values: Mapping[str, Any], where: str) -> Any:
 
 def unknown_field(field: str, known: Collection[str]) -> ConfigError:
     """Error for a field that is not there, with the nearest of those that are."""
-    field, last = shortened(field), field.rpartition(".")[2]
+    field, last = shortened(field, 40), field.rpartition(".")[2]
     ranked = [name for name in known if name.rpartition(".")[2] == last] or nearest(field, known)
     fix = f"Did you mean {ranked[0]}? " if ranked else ""
     return ConfigError(

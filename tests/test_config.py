@@ -250,7 +250,9 @@ def test_two_whole_messages():
         ("objective.first_test_steps=9", "objective.first_test_steps", "first_eval_steps=9"),
         ("agent.rollout_steps=3", "agent.rollout_steps", "agent=ppo"),  # another agent has it
         ("proxy.name=rn", "proxy.name", "proxy=rn"),
-        ("env=[cartpole]", "env", ""),
+        ("env=[cartpole]", "env", "Set env=cartpole."),
+        ("agent=[ddqn,ppo]", "agent", "agents=[ddqn,ppo]"),
+        (f"{'a' * 5000}=1", f"{'a' * 40}... (5000 characters)", ""),
         ("foo", "an override", "env=foo"),
         ("=1", "an override", ""),
         ("seed=x", "seed", ""),

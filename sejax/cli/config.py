@@ -726,9 +726,11 @@ def _choices(schema: Any, given: Mapping[str, Any], mixture: Mapping[str, str]) 
     """The choice of every group; without the agent where there is a mixture."""
     chosen = {group: given.get(group, DEFAULTS[group]) for group in schema.groups}
     for group, choice in chosen.items():
-        is_list = isinstance(choice, list) or str(choice).startswith("[")
-        several = as_text(choice) if isinstance(choice, list) else choice
-        require(not is_list, group, "be one choice", "there is one", choice, f"agents={several}")
+        names = parsed(choice) if isinstance(choice, str) else choice
+        is_list = isinstance(names, list) or str(choice).startswith("[")
+        first = names[0] if isinstance(names, list) and names else DEFAULTS[group]
+        fix = f"agents={as_text(names)}" if group == "agent" else f"{group}={as_text(first)}"
+        require(not is_list, group, "be one choice", "there is one", choice, fix)
         registry.find(group, choice)
     for name in mixture.values():
         with named("agents"):
