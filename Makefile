@@ -42,7 +42,7 @@ test-ray: OPTIONS := -m slow
 # A part of the suite with the oldest versions that pyproject.toml allows, and with the newest.
 test-lowest: PACKAGES := --constraint constraints-lowest.txt --editable '.[gym,hub,mujoco]'
 test-latest: PACKAGES := --editable '.[gym,hub,mujoco]'
-test-lowest test-latest: TESTS := networks ddqn synthetic nes proxy_files gym hub mujoco compose plugins run
+test-lowest test-latest: TESTS := networks ddqn synthetic nes proxy_files gym hub mujoco config registry run
 
 # --- the code, its site, its packages ---------------------------------------------------------------
 
