@@ -105,14 +105,6 @@ def test_beta_and_the_numbers_inside_are_traced():
     np.testing.assert_allclose(got, [1.0, 1.2, 1.0], rtol=1e-6)
 
 
-def test_an_agent_is_made_once_and_keeps_the_rest_of_the_contract():
-    plain = make_q_learning(QLearningConfig(warmup_episodes=3), NUM_STATES, NUM_ACTIONS)
-    agent = counting(plain)
-    assert agent is counting(plain)
-    assert (agent.spec.warmup_episodes, agent.spec.learns_from) == (3, 3)
-    assert agent.buffer is plain.buffer
-
-
 # --- in a training -------------------------------------------------------------------------------
 
 

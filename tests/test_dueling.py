@@ -84,26 +84,6 @@ def test_streams_may_be_linear():
     np.testing.assert_allclose(apply(variables, np.float32(x)), expected, rtol=1e-5)
 
 
-def test_the_q_values_of_a_sample_do_not_depend_on_its_batch():
-    apply, variables = dueling()
-    rng = np.random.default_rng(3)
-    batch = np.float32(3 * rng.normal(size=(OBS_DIM, 7)))  # [feature, batch]
-    together = np.asarray(apply(variables, batch))
-    assert together.shape == (3, 7)
-    for column in range(7):
-        alone = apply(variables, batch[:, column])
-        np.testing.assert_allclose(together[:, column], alone, rtol=1e-5, atol=1e-6)
-
-
-def test_the_mean_of_a_samples_q_values_is_its_value():
-    apply, variables = dueling()
-    params = variables["params"]
-    x = np.array([1.0, -0.5, 2.0])
-    features = numpy_forward(params["features"], x, "tanh", 1)
-    value = numpy_forward(params["value"], features, "tanh", 2)
-    np.testing.assert_allclose(apply(variables, np.float32(x)).mean(), value[0], rtol=1e-5)
-
-
 # --- the agent -----------------------------------------------------------------------------------
 
 

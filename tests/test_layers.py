@@ -22,10 +22,9 @@ LAYERS = [
     {"agents"},
     {"envs", "es"},
     {"registry"},
-    {"ops", "serialize"},
+    {"ops"},
     {"options"},
-    {"errors"},
-    {"", "conf"},
+    {""},
 ]
 COMMANDS = ("cli", "run", "evaluate", "report", "search")
 

@@ -14,7 +14,7 @@ from sejax.envs.environment import spaces_of
 from sejax.envs.spec import Discrete, Space
 from sejax.options import Options, counts, option, traced_options
 
-# A pytree of whatever the agent needs; nobody else looks into it.
+# A pytree of what the agent needs; only the agent reads it.
 AgentState = Any
 # Traced hyperparameters of an agent: a pytree of floats, see `traced`.
 Hparams = Any
@@ -66,8 +66,8 @@ class AgentSpec:
       action_repeat: environment steps for each decision.
       cpu_num_parallel: `vmap` width on one CPU core; None for all agents. A network keeps a core
         busy alone, a table does not.
-      spaces: observations and actions that it is made for, as `sejax.make_agent` says; None if
-        nobody says.
+      spaces: observations and actions that it is made for, set by `sejax.make_agent`; None if
+        unknown.
     """
 
     warmup_episodes: int = 0

@@ -68,7 +68,7 @@ class BoltzmannConfig(AgentConfig):
 
 
 class BoltzmannState(struct.PyTreeNode):
-    """One agent: the rewards of its world, and how it weighs them."""
+    """One agent: the rewards of its environment, and how it weighs them."""
 
     reward: Any  # `(obs, action) -> []`, a pytree
     hparams: Any
@@ -77,7 +77,7 @@ class BoltzmannState(struct.PyTreeNode):
 def make_boltzmann(config: BoltzmannConfig, actions: Array) -> Agent:
     """The policy over some actions, `[num_actions]` indices or `[num_actions, action_dim]`.
 
-    It takes no step of training: `Agent.solve` reads the rewards of the world, an SE with
+    It takes no step of training: `Agent.solve` reads the rewards of the environment, an SE with
     `proxy.horizon=1`. Tests play the policy as it is, at random.
 
     Example:

@@ -36,7 +36,7 @@ class DDQNConfig(OffPolicyOptions):
     epsilon_min: float = option(0.01, fraction(), traced=True)
     epsilon_decay: float = option(0.9, fraction(), traced=True)  # factor for each episode
     # If given, epsilon falls linearly in so many steps from when the agent first learns, whatever
-    # the episodes: for worlds where those have a step or two.
+    # the episodes: for environments whose episodes have one or two steps.
     exploration_steps: int | None = option(None, counts("it counts steps"), traced=True)
     double: bool = True  # the online network chooses a target's action; else the target network
     loss: str = option("squared", one_of(LOSSES))  # of the error; huber: its gradient is clipped
@@ -50,7 +50,7 @@ class DDQNConfig(OffPolicyOptions):
 
     @property
     def cpu_num_parallel(self) -> int:
-        """Agents that best train in lockstep on a CPU core."""
+        """The fastest `vmap` width on one CPU core."""
         is_small = self.num_layers == 1 and self.hidden_size * self.batch_size <= cpu.SMALL_PRODUCT
         return cpu.SMALL_NUM_PARALLEL if is_small else 1
 
@@ -67,7 +67,7 @@ class DDQNConfig(OffPolicyOptions):
 class DuelingDDQNConfig(DDQNConfig):
     """DDQN with a dueling network (paper, appendix, tables of DDQN and Dueling DDQN)."""
 
-    cpu_num_parallel = 1  # in lockstep its two streams make a step 1.5 times as long
+    cpu_num_parallel = 1  # under vmap its two streams make a step 1.5 times as long
 
     feature_dim: int = option(128, counts())  # outputs of the part that both streams share
     # Hidden layers of the value and of the advantage stream.

@@ -28,7 +28,7 @@ class OffPolicyOptions(AgentOptions):
     """Hyperparameters of an agent that learns at each step from a batch of earlier ones."""
 
     batch_size: int = option(128, counts(), varied="triple")  # transitions
-    buffer_size: int = option(100_000, counts())  # steps that are remembered
+    buffer_size: int = option(100_000, counts())  # steps
     hidden_size: int = option(128, counts(), varied="triple")  # units of each hidden layer
     num_layers: int = option(2, counts(most=MOST_LAYERS), varied="one_more_or_less")
     activation: str = option("relu", one_of(ACTIVATIONS))

@@ -19,7 +19,7 @@ class Distribution(NamedTuple):
       mode: `outputs -> action`, for one observation.
       evaluate: `(outputs, std, action) -> (log_prob, entropy)`, for `[outputs, batch]` and a batch
         of actions; both `[batch]`, in nats.
-      env_action: `action -> action` as the world takes it.
+      env_action: `action -> action` as the environment takes it.
     """
 
     sample: Callable[[Array, Array, Array], Array]

@@ -40,6 +40,8 @@ from sejax.options import (
     require,
 )
 
+Steps = Float[Array, " steps"]  # of a rollout, or of a minibatch of it
+
 MIN_STD = 0.01  # of the Gaussian policy, in units of the action
 _MAX_LOG_RATIO = 20.0  # exp(20) is beyond any clip, and finite
 
@@ -144,7 +146,7 @@ class PPOState(struct.PyTreeNode):
 
     params: Float[Array, " num_params"]
     opt_state: optax.OptState
-    return_sums: Float[Array, "3"]  # of 1, returns and their squares; 0 if nobody needs them
+    return_sums: Float[Array, "3"]  # of 1, returns and their squares; 0 if unused
     hparams: Any  # traced options, and hidden_size in use or None
 
 
@@ -159,7 +161,7 @@ def make_ppo(
 ) -> Agent:
     """Builds the agent for observations `[obs_dim]`.
 
-    `update` learns once the rollout is full and costs next to nothing before, in lanes too.
+    `update` learns once the rollout is full and costs next to nothing before, under `vmap` too.
 
     Without exploration the agent takes its most probable action. Differs: the authors also test
     with sampled actions (`docs/reference.md` 3.7), and they do not clip actions, so that
@@ -171,9 +173,9 @@ def make_ppo(
       obs_dim: length of an observation.
       num_actions: for actions `0..num_actions-1`; None if they are vectors.
       action_dim: length of an action; not used if it is an index.
-      max_action: continuous actions reach the world clipped to [-max_action, max_action], and are
-        remembered as drawn.
-      max_steps: the task's step limit for an episode, in steps of the world.
+      max_action: continuous actions reach the environment clipped to [-max_action, max_action]; the
+        rollout keeps them as drawn.
+      max_steps: the task's step limit for an episode, in environment steps.
 
     Raises:
       ConfigError: if a rollout has fewer than two steps for each minibatch.
@@ -216,8 +218,8 @@ def make_ppo(
     def update(key: Array, state: PPOState, rollout: Rollout) -> PPOState:
         """Learns if the rollout is full.
 
-        A loop of one trip or none: in lanes `lax.cond` would learn in every step and throw it away,
-        whereas this loop runs only when some lane's rollout is full.
+        A loop of one trip or none: under `vmap` `lax.cond` would learn in every step and throw it
+        away, whereas this loop runs only when the rollout of some agent is full.
         """
 
         def phase(carry: tuple[Array, PPOState]) -> tuple[Array, PPOState]:
@@ -323,17 +325,13 @@ class Batch(NamedTuple):
 
     obs: Float[Array, "obs_dim steps"]
     action: Array
-    old_log_prob: Float[Array, " steps"]
-    advantage: Float[Array, " steps"] | None
-    returns: Float[Array, " steps"]
+    old_log_prob: Steps
+    advantage: Steps | None
+    returns: Steps
 
 
 def monte_carlo(
-    config: PPOConfig,
-    networks: Networks,
-    state: PPOState,
-    steps: Transition,
-    ended: Float[Array, " steps"],
+    config: PPOConfig, networks: Networks, state: PPOState, steps: Transition, ended: Steps
 ) -> tuple[Batch, Float[Array, "3"]]:
     """A rollout with normalised returns, and the agent's sums over returns, as they are.
 
@@ -349,11 +347,7 @@ def monte_carlo(
 
 
 def gae(
-    config: PPOConfig,
-    networks: Networks,
-    state: PPOState,
-    steps: Transition,
-    ended: Float[Array, " steps"],
+    config: PPOConfig, networks: Networks, state: PPOState, steps: Transition, ended: Steps
 ) -> tuple[Batch, Float[Array, "3"]]:
     """A rollout with generalised advantages, and the agent's sums over all returns so far.
 
@@ -441,13 +435,13 @@ def shuffled(
 
 
 def generalized_advantages(
-    reward: Float[Array, " steps"],
-    decay: Float[Array, " steps"],
-    ended: Float[Array, " steps"],
-    value: Float[Array, " steps"],
-    next_value: Float[Array, " steps"],
+    reward: Steps,
+    decay: Steps,
+    ended: Steps,
+    value: Steps,
+    next_value: Steps,
     gae_lambda: Array | float,
-) -> Float[Array, " steps"]:
+) -> Steps:
     r"""Advantages :math:`A_t = \delta_t + \gamma_t \lambda A_{t+1}` within each episode.
 
     .. math:: \delta_t = r_t + \gamma_t V(s'_t) - V(s_t)
@@ -469,7 +463,7 @@ def generalized_advantages(
     return discounted_sums(delta, gae_lambda * decay, ended)
 
 
-def power_sums(x: Float[Array, " steps"]) -> Float[Array, "3"]:
+def power_sums(x: Steps) -> Float[Array, "3"]:
     """How many numbers there are, their sum, and that of their squares."""
     return jnp.stack([jnp.float32(x.size), jnp.sum(x), jnp.sum(x**2)])
 
@@ -480,9 +474,7 @@ def std_of(power_sums: Float[Array, "3"]) -> Float[Array, ""]:
     return jnp.sqrt(jnp.maximum(squares / count - (total / count) ** 2, 1e-8))
 
 
-def discounted_returns(
-    reward: Float[Array, " steps"], ended: Float[Array, " steps"], discount: Array | float
-) -> Float[Array, " steps"]:
+def discounted_returns(reward: Steps, ended: Steps, discount: Array | float) -> Steps:
     r"""Monte-Carlo returns :math:`R_t = r_t + \gamma R_{t+1}` within each episode.
 
     Nothing is bootstrapped: an episode counts as over where it was cut, and where the rollout is.
@@ -499,9 +491,7 @@ def discounted_returns(
     return discounted_sums(reward, jnp.broadcast_to(discount, reward.shape), ended)
 
 
-def discounted_sums(
-    x: Float[Array, " steps"], decay: Float[Array, " steps"], ended: Float[Array, " steps"]
-) -> Float[Array, " steps"]:
+def discounted_sums(x: Steps, decay: Steps, ended: Steps) -> Steps:
     """Sums :math:`y_t = x_t + decay_t y_{t+1}` within each episode."""
 
     def step(later: Array, terms: tuple[Array, Array, Array]) -> tuple[Array, Array]:
@@ -512,19 +502,19 @@ def discounted_sums(
     return jax.lax.scan(step, jnp.float32(0), (x, decay, ended), reverse=True)[1]
 
 
-def normalized(x: Float[Array, " steps"]) -> Float[Array, " steps"]:
+def normalized(x: Steps) -> Steps:
     """Numbers with mean 0 and std 1, the std being the unbiased estimate plus 1e-5."""
     std = jnp.std(x, ddof=min(1, x.shape[0] - 1))
     return (x - jnp.mean(x)) / (std + 1e-5)
 
 
 def ppo_loss(
-    log_prob: Float[Array, " steps"],
-    entropy: Float[Array, " steps"],
-    value: Float[Array, " steps"],
-    old_log_prob: Float[Array, " steps"],
-    advantage: Float[Array, " steps"],
-    returns: Float[Array, " steps"],
+    log_prob: Steps,
+    entropy: Steps,
+    value: Steps,
+    old_log_prob: Steps,
+    advantage: Steps,
+    returns: Steps,
     hp: Any,
 ) -> Float[Array, ""]:
     r"""What a learning phase minimises.

@@ -50,7 +50,7 @@ class SACConfig(OffPolicyOptions):
     hidden_size: int = 256
     learning_rate: float = 3e-4  # of the actor, the critics and the temperature
     tau: float = 0.005
-    action_repeat: int = option(1, counts())  # steps of the world for each decision
+    action_repeat: int = option(1, counts())  # environment steps for each decision
     # Temperature: what a nat of entropy is worth, in reward units. None: learned, as the authors do
     # to meet a target entropy.
     alpha: float | None = option(None, not_negative("it weighs the entropy"), traced=True)
@@ -124,7 +124,7 @@ class Policy:
       q_values: `(critics, obs, action) -> [2, batch]`, of actions that were taken.
       expected: `(critics, obs, outputs, noise) -> (q_value, entropy)`, `[batch]` each: the lesser
         critic's value and the entropy, in expectation over the policy or for a draw of it.
-      env_action: `action -> action` as the world takes it.
+      env_action: `action -> action` as the environment takes it.
     """
 
     num_outputs: int
@@ -143,7 +143,7 @@ class Policy:
 def make_sac(config: SACConfig, obs_dim: int, action_dim: int, max_action: float) -> Agent:
     """Builds the agent for observations `[obs_dim]` and actions `[action_dim]`.
 
-    It remembers actions in [-1, 1]; the world takes `max_action` times as much.
+    The buffer keeps actions in [-1, 1]; the environment takes `max_action` times as much.
 
     Example:
       >>> agent = make_sac(SACConfig(), obs_dim=3, action_dim=1, max_action=2.0)

@@ -153,9 +153,9 @@ def _make_tabular(
     )
 
 
-# Tables are read by index and written by mask. In lanes on a CPU, reading by a mask over the whole
-# table makes a training step three times as long; writing by one joins the trainer's own selects
-# over the table, where a scatter is an operation more.
+# Tables are read by index and written by mask. Under `vmap` on a CPU, reading by a mask over the
+# whole table makes a training step three times as long; writing by a mask joins the trainer's own
+# selects over the table, where a scatter is one more operation.
 
 
 def row_of(table: Array, state: Int[Array, ""]) -> Array:

@@ -48,7 +48,7 @@ class TD3Config(OffPolicyOptions):
     learning_rate: float = 3e-4  # of the actor and the critics
     tau: float = 0.005
     policy_delay: int = option(2, counts())  # learning steps for each one of actor and targets
-    action_repeat: int = option(1, counts())  # steps of the world for each decision
+    action_repeat: int = option(1, counts())  # environment steps for each decision
     # Exploration, in units of the largest action.
     action_noise_std: float = option(0.1, not_negative(), traced=True)
     # Smoothing of the target policy, likewise.
@@ -123,7 +123,7 @@ class Policy:
       restrict: `action -> action` as it is allowed to be once Gaussian noise was added.
       warm_up: `key -> action`, `[action_dim]`, uniformly random.
       best: `outputs -> action` without any randomness.
-      env_action: `action -> action` as the world takes it.
+      env_action: `action -> action` as the environment takes it.
     """
 
     action_dim: int
@@ -160,8 +160,8 @@ def make_td3(config: TD3Config, obs_dim: int, action_dim: int, max_action: float
 def make_td3_discrete(config: DiscreteTD3Config, obs_dim: int, num_actions: int) -> Agent:
     """Builds the agent for observations `[obs_dim]` and actions `0..num_actions-1`.
 
-    It remembers actions as vectors `[num_actions]`: what the Gumbel-Softmax gave, with exploration
-    noise. The world takes the index of the largest entry.
+    The buffer keeps actions as vectors `[num_actions]`: samples of the Gumbel-Softmax with
+    exploration noise. The environment takes the index of the largest entry.
 
     Differs: the temperature reaches its end after `config.temperature_steps` learning steps, in the
     authors' code after one less. Tests take the likeliest action unless `config.noisy_tests` is

@@ -3,7 +3,7 @@
 All of them are one program. Learning rate and batch size are traced numbers; a hidden size is that
 of a network in which the other units are switched off (`networks.narrow`), in the smallest of a few
 networks that has room; for each of these, and for each depth, there is a branch. A branch is a real
-one where agents train one after another (`num_parallel=1`); in lanes all of them would run.
+one where agents train one after another (`num_parallel=1`); under `vmap` all of them would run.
 
 Source: paper, table "Agent hyperparameter ranges" and appendix "Varied Agent Hyperparameters";
 `docs/reference.md` 4.9.
@@ -47,8 +47,8 @@ def ranges_of(config: Any) -> dict[str, Range]:
     Source: paper, table "Agent hyperparameter ranges"; tabular agents: `docs/reference.md` 4.9.
     """
     hints = get_type_hints(type(config))
-    said = {field.name: marks(type(config), field.name) for field in dataclasses.fields(config)}
-    fields = [field for field in dataclasses.fields(config) if said[field.name].get("varied")]
+    metadata = {field.name: marks(type(config), field.name) for field in dataclasses.fields(config)}
+    fields = [field for field in dataclasses.fields(config) if metadata[field.name].get("varied")]
     require(
         fields,
         "agent_hparams",
@@ -58,10 +58,10 @@ def ranges_of(config: Any) -> dict[str, Range]:
         "agent_hparams=default",
     )
     # Traced ones first: which key draws what.
-    ordered = sorted(fields, key=lambda field: not said[field.name]["traced"])
+    ordered = sorted(fields, key=lambda field: not metadata[field.name]["traced"])
     return {
         field.name: _range(
-            said[field.name]["varied"], getattr(config, field.name), hints[field.name] is int
+            metadata[field.name]["varied"], getattr(config, field.name), hints[field.name] is int
         )
         for field in ordered
     }
@@ -144,7 +144,7 @@ def make_varied(config: Any, make: Callable[[Any], Agent]) -> Agent:
         )
 
     spec = agent.spec
-    if len(variants) > 1:  # in lockstep all branches would run
+    if len(variants) > 1:  # under vmap all branches would run
         spec = dataclasses.replace(spec, cpu_num_parallel=1)
     return dataclasses.replace(agent, spec=spec, varied=Varied(agents=tuple(variants), draw=draw))
 

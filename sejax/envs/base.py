@@ -177,9 +177,9 @@ def _says_what_it_must_be(name: str) -> Iterator[None]:
         raise
     except Exception as error:
         raise options.ConfigError(
-            f"env must be a gymnax 1.x environment, with default_params, spaces, reset_env, "
-            f"step_env (five values) and is_truncated; {name} raised {options.told(error)}. Derive "
-            f"it from gymnax's Environment, of whose make env is the first result."
+            f"env must be a gymnax 1.x environment (step_env returns five values); {name} raised "
+            f"{options.told(error)}. Derive it from gymnax's Environment, or set env to the first "
+            f"result of gymnax.make."
         ) from error
 
 
@@ -224,8 +224,8 @@ def _try(env: Any, params: Any, name: str) -> None:
     options.require(
         not faults,
         "env",
-        f"keep its shapes and dtypes: obs {shape}, reward a scalar, terminated a bool",
-        "an episode is one compiled loop",
+        f"keep its shapes: obs {shape}, reward a scalar, terminated a bool",
+        "an episode is one loop",
         f"{name}, where {'; '.join(faults)}",
-        "env to one that returns that",
+        "env to one that does",
     )

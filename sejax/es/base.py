@@ -14,7 +14,7 @@ AGGREGATES = ("mean", "min")
 LARGEST = 1e6  # larger steps or noise lead to weights whose products are not finite
 _TIE = 1e-6  # of the incumbent's score, or of 1 where that is smaller
 
-StrategyState = Any  # a pytree that nobody else looks into
+StrategyState = Any  # a pytree that only the strategy reads
 
 
 @dataclass(frozen=True, kw_only=True)

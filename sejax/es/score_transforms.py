@@ -1,8 +1,9 @@
-r"""The eight score transforms: from the members' scores K_i to their weights F_i.
+r"""The eight score transforms: from the candidates' scores K_i to their weights F_i.
 
 Scores are to be maximised. A score that is not finite ranks below every finite one and gets the
-weight of the worst. If no member is better than another (or than the incumbent, where the transform
-compares with it), all weights of a transform that needs a difference are 0 and the proxy stays.
+weight of the worst. If no candidate is better than another (or than the incumbent, where the
+transform compares with it), all weights of a transform that needs a difference are 0 and the proxy
+stays.
 
 Source: paper, appendix "NES Score Transformation". `K_psi` is the incumbent's mean score.
 """
@@ -22,7 +23,7 @@ def linear(scores: Scores, incumbent: Float[Array, ""]) -> Scores:
     r"""Maps scores linearly to [0, 1]: :math:`F_i = (K_i - \min K) / (\max K - \min K)`.
 
     Args:
-      scores: `[pop]` test return of each member, in reward units.
+      scores: `[pop]` test return of each candidate, in reward units.
       incumbent: not used.
 
     Returns:
@@ -35,7 +36,7 @@ def linear(scores: Scores, incumbent: Float[Array, ""]) -> Scores:
 def rank(scores: Scores, incumbent: Float[Array, ""]) -> Scores:
     r"""Maps ranks linearly to [0, 1]: :math:`F_i = (R_i - \min R) / (\max R - \min R)`.
 
-    :math:`R_i` counts the members with a lower score, so that ties share a rank.
+    :math:`R_i` counts the candidates with a lower score, so that ties share a rank.
     """
     scores = _ranked_last(scores)
     ranks = (scores[None, :] < scores[:, None]).sum(axis=1).astype(jnp.float32)
@@ -64,19 +65,19 @@ def nes_unnormalized(scores: Scores, incumbent: Float[Array, ""]) -> Scores:
 
 
 def single_best(scores: Scores, incumbent: Float[Array, ""]) -> Scores:
-    """1 for the member of the best rank (for each, if several share it), 0 for the others."""
+    """1 for the candidate of the best rank (for each, if several share it), 0 for the others."""
     scores = _ranked_last(scores)
     return jnp.where((scores == scores.max()) & jnp.isfinite(scores), 1.0, 0.0)
 
 
 def single_better(scores: Scores, incumbent: Float[Array, ""]) -> Scores:
-    """As `single_best`, but only if that member is better than the incumbent."""
+    """As `single_best`, but only if that candidate is better than the incumbent."""
     better = _advantage(scores, incumbent) > 0
     return jnp.where(better, single_best(scores, incumbent), 0.0)
 
 
 def all_better_1(scores: Scores, incumbent: Float[Array, ""]) -> Scores:
-    r"""Weighs the members that beat the incumbent by how much, the best with 1.
+    r"""Weighs the candidates that beat the incumbent by how much, the best with 1.
 
     .. math:: F_i = \max(0, K_i - K_\psi) / (\max K - K_\psi)
     """
@@ -106,9 +107,9 @@ TRANSFORMS: dict[str, ScoreTransform] = {
 
 
 def _advantage(scores: Scores, incumbent: Float[Array, ""]) -> Scores:
-    """Advantage over the incumbent, 0 for members that are not better by more than rounding.
+    """Advantage over the incumbent, 0 for candidates that are not better by more than rounding.
 
-    Every member with a finite score is better than an incumbent without one.
+    Every candidate with a finite score is better than an incumbent without one.
     """
     finite = _floor_nonfinite(scores)
     below_all = finite.min() - jnp.maximum(finite.max() - finite.min(), 1.0)
@@ -119,10 +120,10 @@ def _advantage(scores: Scores, incumbent: Float[Array, ""]) -> Scores:
 
 def _log_utilities(scores: Scores) -> Scores:
     """Utilities that sum to 1; 0 for a score that is not finite, whatever its rank."""
-    num_members = scores.shape[0]
+    num_candidates = scores.shape[0]
     ranked = _ranked_last(scores)
     best_is_one = 1 + (ranked[None, :] > ranked[:, None]).sum(axis=1)
-    utilities = jnp.maximum(0.0, jnp.log(num_members / 2 + 1) - jnp.log(best_is_one))
+    utilities = jnp.maximum(0.0, jnp.log(num_candidates / 2 + 1) - jnp.log(best_is_one))
     utilities = jnp.where(jnp.isfinite(scores), utilities, 0.0)
     return _safe_divide(utilities, utilities.sum())
 
