@@ -116,7 +116,7 @@ def differing(words: list[str], config: Mapping[str, Any]) -> list[str]:
 def evaluate(path: Path, hparams: str, args: argparse.Namespace) -> list[dict[str, Any]]:
     """Results of `python -m sejax.evaluate` on a proxy, as `zoo.Evaluation` has them."""
     agents = args.agents.split(",")
-    choice = [f"agent=[{args.agents}]"]
+    choice = [f"agents=[{args.agents}]" if "," in args.agents else f"agent={args.agents}"]
     if hparams == "as_learned":
         agents, choice = list(sejax.load_proxy(path).learned_agents()), []
     words = [
