@@ -28,7 +28,12 @@ from sejax.ops.parallel import (
 )
 from sejax.options import require
 from sejax.proxies.base import ProxyEnv, is_real
-from sejax.training import TrainingConfig, TrainResult, make_trainer
+from sejax.training import (
+    TrainingConfig,
+    TrainResult,
+    make_trainer,
+    require_training_config,
+)
 
 # --- greedy episodes ------------------------------------------------------------------------------
 
@@ -237,14 +242,7 @@ def make_evaluator(
         type(task).__name__,
         "task=env.task of a proxy, or sejax.envs.make(name)",
     )
-    require(
-        isinstance(training, TrainingConfig),
-        "training",
-        "be a sejax.TrainingConfig",
-        "it says how long agents train",
-        type(training).__name__,
-        "training=sejax.TrainingConfig(max_episodes=100)",
-    )
+    require_training_config(training)
 
     def make_run(agent: Agent) -> Callable[..., Any]:
         test = make_tester(agent, task, training.test_episodes)

@@ -144,6 +144,22 @@ def training_of(proxy: Proxy | ProxySet, agent: AgentConfig | None = None) -> Tr
     return budget_for(training, agent, known, proxy.env.max_steps, proxy.env.task.max_steps)
 
 
+def require_training_config(training: Any) -> None:
+    """Checks that it is a `TrainingConfig`.
+
+    Raises:
+      ConfigError: for anything else.
+    """
+    require(
+        isinstance(training, TrainingConfig),
+        "training",
+        "be a sejax.TrainingConfig",
+        "it says how long agents train",
+        type(training).__name__,
+        "training=sejax.TrainingConfig(max_episodes=100)",
+    )
+
+
 def require_reachable(name: str, training: TrainingConfig, max_episode_steps: int) -> None:
     """Checks that a training of fixed length does not run out of episodes before.
 
@@ -356,14 +372,7 @@ def _require_parts(agent: Any, env: Any, training: Any) -> None:
         agent.spec.spaces,
         "agent=sejax.make_agent(config, task) with that task",
     )
-    require(
-        isinstance(training, TrainingConfig),
-        "training",
-        "be a sejax.TrainingConfig",
-        "it says how long agents train",
-        type(training).__name__,
-        "training=sejax.TrainingConfig(max_episodes=100)",
-    )
+    require_training_config(training)
     require(
         not jax.config.jax_enable_x64,
         "jax_enable_x64",
