@@ -30,7 +30,7 @@ import common
 from rich.progress import track
 
 import sejax
-from sejax import registry
+from sejax.options import registry
 from sejax.proxies.configs import SyntheticConfig
 from sejax.training import TrainingConfig
 

@@ -16,7 +16,7 @@ import jax
 import numpy as np
 
 import sejax
-from sejax import registry
+from sejax.options import registry
 
 BUDGETS = (2000, 5000, 10_000, 20_000)
 SMALL = {"warmup_episodes": 1, "batch_size": 64, "hidden_size": 64, "num_layers": 1}

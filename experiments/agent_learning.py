@@ -21,7 +21,7 @@ from experiments.common.agents import Condition, train_groups
 from experiments.common.curves import CURVES, WINDOW
 from experiments.common.experiment import Experiment, Settings, count, each_of, setting
 from experiments.common.statistics import bootstrap_interval
-from sejax import registry
+from sejax.options import registry
 from sejax.training import TrainingConfig
 
 QUICK_STEPS = 2000

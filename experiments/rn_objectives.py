@@ -22,7 +22,7 @@ from experiments.common import reward_networks, rn_curves
 from experiments.common.experiment import Experiment, each_of, setting
 from experiments.common.rn_curves import CurveSettings
 from experiments.common.tables import publish
-from sejax.options import require
+from sejax.options import require, shortened
 
 PICKS = {"best": "highest", "worst": "lowest"}  # scores
 QUICK_LEARNED = 4
@@ -62,7 +62,11 @@ class RnObjectives(CurveSettings):
         if len(self.picks) > 1:
             least, reason = 2 * self.rns, "the best and the worst are picked from them"
             rule, fix = f"be at least {least}", f"learned={least} or picks=best"
-            require(self.learned >= least, "learned", rule, reason, self.learned, fix)
+            require(
+                self.learned >= least,
+                "learned",
+                f"must {rule}, because {reason}; got {shortened(self.learned)}. Set {fix}.",
+            )
 
 
 def compute(settings: RnObjectives) -> pd.DataFrame:

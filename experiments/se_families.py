@@ -54,7 +54,12 @@ class SeFamilies(MixtureRuns):
         super().__post_init__()
         for name, value in self.values("sets", "tested").items():
             fix = f"{name}=[ddqn]"
-            require(value, name, "name a kind of agent", "agents learn or are tested", "none", fix)
+            require(
+                value,
+                name,
+                "must name a kind of agent, because agents learn or are tested; got none. Set "
+                f"{fix}.",
+            )
 
 
 def compute(settings: SeFamilies) -> pd.DataFrame:

@@ -20,7 +20,7 @@ from experiments.common import figures, runs, tables
 from experiments.common.experiment import Experiment, count, setting
 from experiments.common.runs import RunSettings
 from sejax.cli.config import AGENT_HPARAMS
-from sejax.options import one_of, require
+from sejax.options import one_of, require, shortened
 
 NUM_RUNS = {"cartpole": 10}
 
@@ -81,7 +81,11 @@ def learning_config(settings: SeFeasibility) -> Any:
     words += [f"agent={settings.agent}"] if settings.agent else []
     config = settings.learn_config(words + (QUICK if settings.quick else []))
     proxy, reason = config.name("proxy"), "rn_performance learns reward networks"
-    require(proxy != "rn", "run.proxy", "be se", reason, proxy, "run.proxy=se")
+    require(
+        proxy != "rn",
+        "run.proxy",
+        f"must be se, because {reason}; got {shortened(proxy)}. Set run.proxy=se.",
+    )
     return config
 
 

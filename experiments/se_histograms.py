@@ -34,8 +34,8 @@ from experiments.common import figures
 from experiments.common.agents import SE_AGENTS, SOFT_SE, Condition, Measure
 from experiments.common.experiment import Experiment, Settings, count, each_of, setting
 from experiments.common.tables import as_texts, publish
-from sejax import registry
 from sejax.agents.buffers import Buffer, BufferMaker, write_row
+from sejax.options import registry
 from sejax.training import TrainingConfig
 
 SOURCES = {

@@ -31,7 +31,7 @@ from experiments.common import figures, tables
 from experiments.common.agents import Condition, SeAgents, return_columns, tuned_agent
 from experiments.common.experiment import Experiment, count, setting
 from sejax import envs
-from sejax.options import one_of, require
+from sejax.options import one_of, require, shortened
 from sejax.training import SOLVED_BY, TrainingConfig
 
 NUM_BEST = 5
@@ -129,7 +129,11 @@ def load_sets(settings: SePerformance) -> dict[str, Any]:
         learned_with = "varied" if ses.config["agent_hparams"] == "varied" else "fixed"
         rule, got = f"be SEs learned with {name} hyperparameters", f"{ses.path} with {learned_with}"
         fix = f"{learned_with}={ses.path}"
-        require(learned_with == name, name, rule, "it is what is compared", got, fix)
+        require(
+            learned_with == name,
+            name,
+            f"must {rule}, because it is what is compared; got {shortened(got)}. Set {fix}.",
+        )
         solved = solved_ones(ses)
         sets[name] = (solved if len(solved) else ses)[: settings.num_ses]
     return sets
@@ -140,7 +144,12 @@ def task_name(settings: SePerformance, sets: dict[str, Any]) -> str:
     asked = {settings.env} if settings.env else set()
     names = sorted({str(ses.task.name) for ses in sets.values()} | asked)
     rule, fix = f"be {names[0] if names else ''} as the other files", "files of the same task"
-    require(len(names) <= 1, "env", rule, "agents are tested on it", ", ".join(names), fix)
+    require(
+        len(names) <= 1,
+        "env",
+        f"must {rule}, because agents are tested on it; got {shortened(', '.join(names))}. Set "
+        f"{fix}.",
+    )
     return names[0] if names else "cartpole"
 
 

@@ -67,7 +67,11 @@ def parts_of(settings: SeTransferOfHparams) -> Parts:
     """Reads the SE and configures agents and trainings."""
     ses = sejax.load_set(settings.ses or settings.env, option="ses", kind="se").ranked(1)
     rule, reason, there = f"be of {settings.env}", "agents are tested on it", ses.task.name
-    require(there == settings.env, "ses", rule, reason, f"one of {there}", f"env={there}")
+    require(
+        there == settings.env,
+        "ses",
+        f"must {rule}, because {reason}; got one of {there}. Set env={there}.",
+    )
     words = [f"env={settings.env}", f"preset={settings.preset}", f"agent={settings.agent}"]
     if settings.quick:
         words += [f"agent.{name}={value}" for name, value in QUICK_AGENT.items()]
@@ -79,7 +83,11 @@ def parts_of(settings: SeTransferOfHparams) -> Parts:
         max_episodes=max(learned.max_episodes, settings.max_steps or 0),
     )
     rule, reason = "be given with this SE", "its agents trained until a rule stopped them"
-    require(on_se.max_steps is not None, "max_steps", rule, reason, "null", "max_steps=5000")
+    require(
+        on_se.max_steps is not None,
+        "max_steps",
+        f"must {rule}, because {reason}; got null. Set max_steps=5000.",
+    )
     real = TrainingConfig(
         stop_rule="never",
         max_steps=on_se.max_steps,

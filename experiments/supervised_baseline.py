@@ -34,7 +34,7 @@ from experiments.common.agents import HPARAMS, SE_AGENTS, SOFT_SE, Condition, re
 from experiments.common.experiment import Experiment
 from experiments.common.shards import stack, unstack
 from experiments.common.supervised_models import SupervisedBaseline
-from sejax.options import require
+from sejax.options import require, shortened
 
 BEST = 2  # models in the paper's second figure
 LABELS = {
@@ -71,7 +71,11 @@ def load(settings: SupervisedBaseline) -> Any:
     ses = sejax.load_set(settings.proxy, option="proxy", kind="se")[:1]
 
     def require_se(holds: bool, rule: str, reason: str, got: str) -> None:
-        require(holds, "proxy", f"be an SE {rule}", reason, got, f"proxy={SOFT_SE}")
+        require(
+            holds,
+            "proxy",
+            f"must be an SE {rule}, because {reason}; got {shortened(got)}. Set proxy={SOFT_SE}.",
+        )
 
     learned_with = ses.config["agent"] or {"name": "several agents"}
     require_se(

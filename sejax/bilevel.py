@@ -17,20 +17,26 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Float
 
-from sejax import registry
 from sejax.agents.base import Agent
 from sejax.agents.mixture import Mixture
 from sejax.envs.base import Task
 from sejax.es.base import Strategy
 from sejax.es.nes import NESConfig
 from sejax.evaluation import make_population_evaluator, tested_throughout
-from sejax.objectives import MaxReward, Objective, Outcome
+from sejax.objectives import (
+    GenerationInfo,
+    MaxReward,
+    Objective,
+    Outcome,
+    Scores,
+    Scoring,
+    generation_info,
+)
 from sejax.ops import flat
 from sejax.ops.parallel import copy_to_devices
-from sejax.options import counts, require
+from sejax.options import counts, registry, require, shortened
 from sejax.proxies.base import ProxyEnv
 from sejax.proxies.configs import SyntheticConfig
-from sejax.scores import GenerationInfo, Scores, Scoring, generation_info
 from sejax.training import TrainingConfig
 
 
@@ -241,10 +247,8 @@ def make_bilevel(
     require(
         not stop_when_solved or (objective.scores_are_returns and task.is_solvable),
         "stop_when_solved",
-        "be false with this objective and task",
-        "no score is known to solve it",
-        "true",
-        "stop_when_solved=false",
+        "must be false with this objective and task, because no score is known to solve it; got "
+        "true. Set stop_when_solved=false.",
     )
 
     def init(key: Array) -> LearnState:
@@ -357,10 +361,8 @@ def _proxy_of(proxy: Any, task: Task) -> ProxyEnv:
     require(
         made.task is task,
         "proxy",
-        "be one of the task given",
-        "agents are tested there",
-        f"one of another ({made.task.name})",
-        "proxy to a configuration, or task to the proxy's",
+        "must be one of the task given, because agents are tested there; got one of another "
+        f"({made.task.name}). Set proxy to a configuration, or task to the proxy's.",
     )
     return made
 
@@ -378,10 +380,9 @@ def _require_kind(name: str, part: Any, *kinds: type) -> None:
     require(
         isinstance(part, kinds),
         name,
-        f"be a {words}, or a configuration that makes one",
-        "it is an object here, not a name",
-        repr(part),
-        f"{name} to an object; sejax.config([...]) takes names",
+        f"must be a {words}, or a configuration that makes one, because it is an object here, not "
+        f"a name; got {shortened(repr(part))}. Set {name} to an object; sejax.config([...]) takes "
+        "names.",
     )
 
 

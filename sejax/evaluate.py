@@ -8,11 +8,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from sejax import registry
 from sejax.cli import commands, runtime
 from sejax.cli import config as configuration
 from sejax.cli.config import AgentFamily, EvaluateConfig, families_of, named
-from sejax.options import ConfigError, require
+from sejax.options import ConfigError, registry, require, shortened
 from sejax.proxies import header, hub
 from sejax.training import TrainingConfig, require_reachable, training_of
 
@@ -189,10 +188,8 @@ def proxy_study(config: EvaluateConfig) -> Study:
             require(
                 not family.agent.is_solved_for,
                 "baseline",
-                f"be false with {family.field}={family.key}",
-                "only a one-step SE can be solved for",
-                "true",
-                "baseline=false",
+                f"must be false with {family.field}={family.key}, because only a one-step SE can "
+                "be solved for; got true. Set baseline=false.",
             )
         real_training = dict.fromkeys(trainings, _real_training(config, proxy))
         worlds["the real task"] = (task.env, task.params, real_training)
@@ -236,11 +233,10 @@ def _training_on(proxy: Any, config: EvaluateConfig, agent: Any) -> tuple[str, A
     require(
         "training" in proxy.config,
         "training_from",
-        "be config for an SE whose file does not say how long agents trained on it",
-        "tests on the real task must not stop them",
-        config.training_from,
-        "training_from=config training.stop_rule=never "
-        "training.max_steps=2000 training.max_episodes=2000",
+        "must be config for an SE whose file does not say how long agents trained on it, because "
+        f"tests on the real task must not stop them; got {shortened(config.training_from)}. Set "
+        "training_from=config training.stop_rule=never training.max_steps=2000 "
+        "training.max_episodes=2000.",
     )
     test_episodes = config.real_training.test_episodes
     training = dataclasses.replace(training_of(proxy, agent), test_episodes=test_episodes)
@@ -257,10 +253,8 @@ def _real_training(config: EvaluateConfig, proxy: Any) -> TrainingConfig:
     require(
         config.real_training.time_limit_is_terminal in (usual, is_terminal),
         "real_training.time_limit_is_terminal",
-        "be left out with agent_hparams=as_learned",
-        "the proxy says how its agents took the limit",
-        "false",
-        "agent_hparams=default, or leave it out",
+        "must be left out with agent_hparams=as_learned, because the proxy says how its agents "
+        "took the limit; got false. Set agent_hparams=default, or leave it out.",
     )
     return dataclasses.replace(config.real_training, time_limit_is_terminal=is_terminal)
 

@@ -237,10 +237,9 @@ def make_evaluator(
     require(
         isinstance(task, Task),
         "task",
-        "be a sejax.Task",
-        "agents are tested on it",
-        type(task).__name__,
-        "task=env.task of a proxy, or sejax.envs.make(name)",
+        "must be a sejax.Task, because agents are tested on it; got "
+        f"{type(task).__name__}. Set task=env.task of a proxy, or "
+        "sejax.envs.make(name).",
     )
     require_training_config(training)
 

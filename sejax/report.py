@@ -8,9 +8,8 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from sejax import registry
 from sejax.cli import commands
-from sejax.options import require
+from sejax.options import registry, require
 
 USAGE = """python -m sejax.report RUN_DIR... [out=FILE]
 
@@ -57,20 +56,16 @@ def report(folders: Sequence[Path], out: Path | None = None) -> Path:
     require(
         folders,
         "RUN_DIR",
-        "be given",
-        "the report is about it",
-        "none",
-        "one or several: python -m sejax.report runs/cartpole-se-ddqn-s0",
+        "must be given, because the report is about it; got none. Set one or several: python -m "
+        "sejax.report runs/cartpole-se-ddqn-s0.",
     )
     if out is None:
         out = Path(folders[0] if len(folders) == 1 else ".", "report.html")
     require(
         not out.is_dir(),
         "out",
-        "be a file",
-        "the page is written there",
-        f"the folder {out}",
-        f"out={out / 'report.html'}",
+        f"must be a file, because the page is written there; got the folder {out}. Set "
+        f"out={out / 'report.html'}.",
     )
     require_writable("out", out.parent)
     with registry.only_typed(()):  # nothing that a run directory names is imported

@@ -14,18 +14,27 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Float, Int
 
-from sejax import registry
 from sejax.agents.base import Agent, AgentConfig, Spaces
 from sejax.agents.buffers import Buffer, BufferMaker, Transition
 from sejax.envs.base import require_own_steps
 from sejax.envs.wrappers import repeat_actions
 from sejax.ops.keys import step_keys
 from sejax.ops.loops import while_any_active
-from sejax.options import LARGEST, Options, counts, not_negative, one_of, option, require
+from sejax.options import (
+    LARGEST,
+    Options,
+    counts,
+    not_negative,
+    one_of,
+    option,
+    registry,
+    require,
+    shortened,
+)
+from sejax.options.registry import from_plain
 from sejax.proxies.base import episode_limit, is_real, prepare
 from sejax.proxies.header import agents_of, is_registered
 from sejax.proxies.io import Proxy, ProxySet, stored_config
-from sejax.registry import from_plain
 
 STOP_RULES = ("plateau", "solved", "never")
 SOLVED_BY = ("test", "train")
@@ -128,10 +137,8 @@ def training_of(proxy: Proxy | ProxySet, agent: AgentConfig | None = None) -> Tr
     require(
         isinstance(stored, Mapping),
         "training",
-        f"be given for {proxy.path.name}",
-        "the file does not tell how long agents trained on it",
-        "none",
-        "training=sejax.TrainingConfig(...)",
+        f"must be given for {proxy.path.name}, because the file does not tell how long agents "
+        "trained on it; got none. Set training=sejax.TrainingConfig(...).",
     )
     training: TrainingConfig = from_plain(TrainingConfig, stored, "training")
     if agent is None:
@@ -153,10 +160,9 @@ def require_training_config(training: Any) -> None:
     require(
         isinstance(training, TrainingConfig),
         "training",
-        "be a sejax.TrainingConfig",
-        "it says how long agents train",
-        type(training).__name__,
-        "training=sejax.TrainingConfig(max_episodes=100)",
+        "must be a sejax.TrainingConfig, because it says how long agents train; got "
+        f"{type(training).__name__}. Set "
+        "training=sejax.TrainingConfig(max_episodes=100).",
     )
 
 
@@ -178,11 +184,9 @@ def require_reachable(name: str, training: TrainingConfig, max_episode_steps: in
     require(
         training.max_episodes >= episodes,
         f"{name}.max_episodes",
-        f"be at least {episodes}",
-        f"{name}.max_steps={training.max_steps} takes as many episodes of at most "
-        f"{max_episode_steps} steps",
-        training.max_episodes,
-        f"{name}.max_episodes={episodes}",
+        f"must be at least {episodes}, because {name}.max_steps={training.max_steps} takes as many "
+        f"episodes of at most {max_episode_steps} steps; got {shortened(training.max_episodes)}. "
+        f"Set {name}.max_episodes={episodes}.",
     )
 
 
@@ -349,37 +353,31 @@ def _require_parts(agent: Any, env: Any, training: Any) -> None:
     require(
         isinstance(agent, Agent),
         "agent",
-        "be a sejax.Agent",
-        "it acts and learns",
-        type(agent).__name__,
-        "agent=sejax.make_agent(config, task)",
+        "must be a sejax.Agent, because it acts and learns; got "
+        f"{type(agent).__name__}. Set agent=sejax.make_agent(config, task).",
     )
     require(
         hasattr(env, "step_env"),
         "env",
-        "be a gymnax environment",
-        "the agent trains there",
-        type(env).__name__,
-        "env to the first of the pair that sejax.load returns, or to task.env",
+        "must be a gymnax environment, because the agent trains there; got "
+        f"{type(env).__name__}. Set env to the first of the pair that sejax.load "
+        "returns, or to task.env.",
     )
     require_own_steps(env)
     spaces = None if agent.spec.spaces is None else Spaces.of_env(env)
     require(
         agent.spec.spaces == spaces,
         "agent",
-        f"be made for the environment's {spaces}",
-        "it acts on what it was made for",
-        agent.spec.spaces,
-        "agent=sejax.make_agent(config, task) with that task",
+        f"must be made for the environment's {spaces}, because it acts on what it was made for; "
+        f"got {shortened(agent.spec.spaces)}. Set agent=sejax.make_agent(config, task) with that "
+        "task.",
     )
     require_training_config(training)
     require(
         not jax.config.jax_enable_x64,
         "jax_enable_x64",
-        "be off",
-        "sejax counts and computes in 32 bits",
-        "true",
-        "JAX_ENABLE_X64=0",
+        "must be off, because sejax counts and computes in 32 bits; got true. Set "
+        "JAX_ENABLE_X64=0.",
     )
 
 
@@ -390,10 +388,9 @@ def _make_solver(
     require(
         training.num_tests_between == 0 and recorder is None,
         "agent",
-        "be one that learns where its training is looked at",
-        "there is no learning curve without one",
-        "one that is solved for",
-        "agent=ddqn, or objective=max_reward training.tests_between=0",
+        "must be one that learns where its training is looked at, because there is no learning "
+        "curve without one; got one that is solved for. Set agent=ddqn, or objective=max_reward "
+        "training.tests_between=0.",
     )
     assert agent.solve is not None
     solve = agent.solve

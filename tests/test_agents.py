@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 import sejax
-from sejax import agents, envs, registry
+from sejax import agents, envs
 from sejax.agents import AgentConfig, Rollout, Transition
-from sejax.options import ConfigError, traced_options
+from sejax.options import ConfigError, registry, traced_options
 
 NUM_STEPS, BATCH = 16, 7  # a batch has one column of padding
 SMALL = {

@@ -10,10 +10,9 @@ import pytest
 from support import large_ops_in_loops
 
 import sejax
-from sejax import registry
 from sejax.bilevel import make_bilevel, make_learner
 from sejax.es.base import Evaluations
-from sejax.options import ConfigError
+from sejax.options import ConfigError, registry
 
 # 40 steps for each of 12 agents: short enough for rounding not to grow into other actions.
 TINY = [

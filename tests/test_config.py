@@ -11,12 +11,12 @@ import typing
 import pytest
 
 import sejax
-from sejax import envs, registry
+from sejax import envs
 from sejax.cli import commands
 from sejax.cli import config as configuration
 from sejax.cli.config import EvaluateConfig, LearnConfig, evaluate_config, expand, plain
 from sejax.envs.gridworld import CliffWalking
-from sejax.options import ConfigError
+from sejax.options import ConfigError, registry
 
 composed_with = functools.cache(lambda *overrides: sejax.config(overrides))
 ENVS = ("cartpole", "acrobot")

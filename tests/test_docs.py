@@ -15,7 +15,7 @@ import sejax
 
 ROOT = Path(__file__).parents[1]
 MODULES = [
-    ".".join(path.relative_to(ROOT).with_suffix("").parts)
+    ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
     for path in sorted((ROOT / "sejax").rglob("*.py"))
     if ">>>" in path.read_text()
 ]

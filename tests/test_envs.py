@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from gymnax.environments import spaces
 
-from sejax import envs, registry
+from sejax import envs
 from sejax.envs.dynamics.gridworld import GridParams, GridWorld
 from sejax.envs.environment import spaces_of
 from sejax.envs.gridworld import CLIFF_WALKING, ROOM_2X2
-from sejax.options import ConfigError
+from sejax.options import ConfigError, registry
 
 KEY = jax.random.key(0)
 GYMNASIUM_IDS = {

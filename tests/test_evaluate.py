@@ -14,7 +14,7 @@ from rich.console import Console
 from support import is_drawn
 
 import sejax
-from sejax import envs, registry
+from sejax import envs
 from sejax.agents.ppo import PPOConfig
 from sejax.agents.tabular import QLearningConfig
 from sejax.cli import commands, progress
@@ -22,7 +22,7 @@ from sejax.cli import config as configuration
 from sejax.cli.config import families_of
 from sejax.evaluate import evaluate, proxy_study, summarise
 from sejax.ops.checksummed import pack, unpack
-from sejax.options import ConfigError
+from sejax.options import ConfigError, registry
 from sejax.training import TrainingConfig, budget_for
 
 TINY = ["agent.hidden_size=4", "agent.batch_size=4", "agent.warmup_episodes=0", "num_agents=3",

@@ -8,7 +8,8 @@ import pytest
 from scripted import MAX_EPISODES, MAX_STEPS, ScriptedEnv, script, scripted_agent
 
 import sejax
-from sejax import envs, evaluation, registry
+from sejax import envs, evaluation
+from sejax.options import registry
 from sejax.proxies.configs import RewardConfig, SyntheticConfig
 from sejax.training import TrainingConfig
 

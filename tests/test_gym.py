@@ -16,11 +16,11 @@ from gymnasium.wrappers import TransformObservation
 from support import random_like, shapes_of
 
 import sejax
-from sejax import envs, registry
+from sejax import envs
 from sejax.gym import GYMNASIUM_IDS, RealTask, SyntheticEnv, SyntheticWorld, make
 from sejax.gym.tasks import se_task
 from sejax.ops.checksummed import pack, unpack
-from sejax.options import ConfigError
+from sejax.options import ConfigError, registry
 from sejax.proxies import MAX_ABS_VALUE
 from sejax.proxies.configs import SyntheticConfig
 from sejax.proxies.header import find, pretrained_names, read

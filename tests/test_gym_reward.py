@@ -21,10 +21,10 @@ from gymnasium.wrappers import (
 from support import numpy_forward, random_like, shapes_of
 
 import sejax
-from sejax import envs, registry
+from sejax import envs
 from sejax.envs.gridworld import CLIFF_WALKING, ROOM_2X2
 from sejax.gym import GridWorld, RewardNetwork, make, networks
-from sejax.options import ConfigError
+from sejax.options import ConfigError, registry
 from sejax.proxies import header
 from sejax.proxies.configs import VARIANTS, RewardConfig
 

@@ -14,11 +14,11 @@ from gymnax.registration import registered_envs
 from gymnax.wrappers.purerl import StickyActionWrapper
 
 import sejax
-from sejax import envs, registry
+from sejax import envs
 from sejax.envs.base import Task
 from sejax.envs.gymnax import PREFIX, SOLVED_REWARD, GymnaxTask
 from sejax.envs.wrappers import AsVectors, Wrapper
-from sejax.options import ConfigError
+from sejax.options import ConfigError, registry
 
 DOWNLOADS = {"MNISTBandit-bsuite"}  # what it plays with
 # Not those that a test beside this one may have registered (`sejax.register_gymnax`).
@@ -303,7 +303,7 @@ def test_limits_may_be_numbers_of_numpy_and_jax_but_must_be_replaceable():
 
 def test_a_wrapper_whose_step_would_never_be_called_is_refused():
     wrapped = StickyActionWrapper(cartpole.CartPole(), 1.0)
-    said = r"^env must change reset_env in place of reset and change step_env in place of step, "
+    said = r"^env must change reset_env in place of reset and step_env in place of step; "
     with pytest.raises(ConfigError, match=said):
         Task(name="sticky", env=wrapped)
     task = Task(name="plain", env=cartpole.CartPole())

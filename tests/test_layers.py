@@ -7,19 +7,18 @@ import pytest
 
 ROOT = Path(__file__).parents[1] / "sejax"
 # Modules and folders of sejax, the highest first. Each may import those below it, and its own
-# folder; not its neighbours. Names in strings (`sejax.registry`, `sejax.__getattr__`) are looked up
-# when somebody asks for what they stand for: they do not count.
+# folder; not its neighbours. Names in strings (`sejax.options.registry`, `sejax.__getattr__`) are
+# looked up when somebody asks for what they stand for: they do not count.
 LAYERS = [
     {"search"},
     {"run", "evaluate", "report"},
     {"cli"},
     {"bilevel"},
-    {"evaluation", "scores"},
+    {"evaluation"},
     {"training", "objectives", "gym"},
     {"proxies"},
     {"agents"},
     {"envs", "es"},
-    {"registry"},
     {"ops"},
     {"options"},
     {""},

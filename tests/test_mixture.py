@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 
 import sejax
-from sejax import envs, registry
+from sejax import envs
 from sejax.agents.mixture import COMPARED_BY, Mixture, MixtureConfig
 from sejax.bilevel import make_bilevel
 from sejax.es.base import Evaluations
 from sejax.es.nes import NESConfig
 from sejax.evaluation import make_evaluator
 from sejax.objectives import Outcome
-from sejax.options import ConfigError
+from sejax.options import ConfigError, registry
 from sejax.proxies.configs import SyntheticConfig
 from sejax.training import TrainingConfig
 

@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 
 import sejax
-from sejax import registry
 from sejax.es.base import Evaluations
 from sejax.es.evosax import ALGORITHMS, EvosaxConfig, finite_fitness, from_evosax
 from sejax.es.nes import NESConfig
-from sejax.options import ConfigError
+from sejax.options import ConfigError, registry
 
 NAN, INF = np.nan, np.inf
 DIMS = 6

@@ -7,9 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sejax import envs, registry
+from sejax import envs
 from sejax.objectives import AUC, AUCSum, MaxReward, Objective, Outcome, RewardThreshold
-from sejax.options import ConfigError
+from sejax.options import ConfigError, registry
 
 
 def outcome(test_return, train_steps, nonfinite):

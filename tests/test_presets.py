@@ -7,11 +7,10 @@ import pytest
 
 import sejax
 from experiments.common.reward_networks import STUDIES
-from sejax import registry
 from sejax.agents.dqn import DDQNConfig
 from sejax.agents.ppo import PPOConfig
 from sejax.cli import config as configuration
-from sejax.options import ConfigError
+from sejax.options import ConfigError, registry
 from sejax.training import TrainingConfig
 
 composed_with = functools.cache(lambda *overrides: sejax.config(overrides))

@@ -6,8 +6,9 @@ import jax.numpy as jnp
 import pytest
 from support import large_ops_in_loops
 
-from sejax import envs, registry
+from sejax import envs
 from sejax.agents.dqn import DDQNConfig, make_ddqn
+from sejax.options import registry
 from sejax.proxies.configs import RewardConfig, SyntheticConfig
 from sejax.training import TrainingConfig, make_trainer
 

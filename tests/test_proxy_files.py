@@ -16,9 +16,9 @@ import pytest
 from safetensors.numpy import save_file
 
 import sejax
-from sejax import envs, registry
+from sejax import envs
 from sejax.ops.checksummed import pack, unpack
-from sejax.options import ConfigError
+from sejax.options import ConfigError, registry
 from sejax.proxies import header
 from sejax.proxies.base import absent_task
 from sejax.proxies.configs import RewardConfig, SyntheticConfig
@@ -518,7 +518,7 @@ def test_an_unknown_name_lists_the_shipped_ones():
 
 def test_a_folder_without_a_proxy_says_what_it_is(tmp_path):
     for load in (sejax.load, sejax.load_set):
-        assert "another folder" in str(refusal(load, tmp_path))
+        assert "it is no run" in str(refusal(load, tmp_path))
     (tmp_path / "config.yaml").write_text("{}")
     assert "not finished a generation" in str(refusal(sejax.load, tmp_path))
 

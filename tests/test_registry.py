@@ -1,4 +1,4 @@
-"""sejax.registry: names become objects; one's own parts take part in everything."""
+"""sejax.options.registry: names become objects; one's own parts take part in everything."""
 
 import dataclasses
 import importlib.metadata
@@ -13,11 +13,11 @@ import pytest
 from flax import linen as nn
 
 import sejax
-from sejax import envs, registry
+from sejax import envs
 from sejax.agents import AgentConfig
 from sejax.cli import config as configuration
 from sejax.es.evosax import ALGORITHMS
-from sejax.options import ConfigError
+from sejax.options import ConfigError, registry
 
 EVERY = [(group, name) for group in registry.GROUPS for name in registry.GROUPS[group].built_in]
 

@@ -10,12 +10,12 @@ from gymnax.environments.classic_control import cartpole
 from support import numpy_forward
 
 import sejax
-from sejax import bilevel, envs, registry
+from sejax import bilevel, envs
 from sejax.agents import Agent, make_agent
 from sejax.agents.tabular import QLearningConfig
 from sejax.cli import config as configuration
 from sejax.evaluation import area_under_curve, make_evaluator
-from sejax.options import ConfigError
+from sejax.options import ConfigError, registry
 from sejax.proxies import MAX_ABS_VALUE
 from sejax.proxies.base import episode_limit, is_real
 from sejax.proxies.configs import RewardConfig

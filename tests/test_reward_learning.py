@@ -6,8 +6,8 @@ import pytest
 
 import sejax
 from experiments.common.reward_networks import OBJECTIVES
-from sejax import registry
 from sejax.bilevel import make_learner
+from sejax.options import registry
 from sejax.proxies.configs import VARIANTS
 
 pytestmark = [

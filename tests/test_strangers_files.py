@@ -14,12 +14,13 @@ import yaml
 
 import sejax
 from experiments import supervised_baseline
-from sejax import evaluate, registry, report, run, search
+from sejax import evaluate, report, run, search
 from sejax.cli import commands, study
 from sejax.cli import config as configuration
 from sejax.cli import search_config as settings
 from sejax.cli.run_directory import columns_of
 from sejax.ops import checksummed
+from sejax.options import registry
 
 IMPORTED, SHELL = "strangers_module:make", {"name": "subprocess:getoutput", "cmd": "touch PWNED"}
 TASK = ["env=gridworld_2x2", "agent=q_learning"]

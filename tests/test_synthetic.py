@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from support import numpy_forward
 
-from sejax import envs, registry
-from sejax.options import ConfigError
+from sejax import envs
+from sejax.options import ConfigError, registry
 from sejax.proxies import MAX_ABS_VALUE
 from sejax.proxies.base import episode_limit, is_real
 from sejax.proxies.configs import SyntheticConfig

@@ -14,13 +14,13 @@ from hypothesis import strategies as st
 from scripted import MAX_EPISODES, MAX_STEPS, WHO, ScriptedEnv, script, scripted_agent
 from support import numpy_forward
 
-from sejax import envs, evaluation, registry
+from sejax import envs, evaluation
 from sejax.agents import AgentSpec
 from sejax.agents.buffers import Buffer, rollout_buffer
 from sejax.agents.dqn import DDQNConfig, make_ddqn
 from sejax.agents.tabular import QLearningConfig
 from sejax.evaluation import _Greedy, make_recorder, make_tester
-from sejax.options import ConfigError
+from sejax.options import ConfigError, registry
 from sejax.proxies.configs import SyntheticConfig
 from sejax.training import TrainingConfig, is_plateau, is_solved, make_trainer
 

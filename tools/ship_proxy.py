@@ -24,8 +24,8 @@ import yaml
 
 import sejax
 from sejax.cli import config as configuration
+from sejax.options.registry import flatten
 from sejax.proxies import header, zoo
-from sejax.registry import flatten
 
 FREE_FIELDS = ("run_dir", "devices", "checkpoint_every")  # how to compute, not what
 WORLDS = {"the proxy": "proxy", "the real task": "real"}

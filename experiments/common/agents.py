@@ -17,10 +17,10 @@ import pandas as pd
 
 import sejax
 from experiments.common.experiment import Settings, count, each_of, setting
-from sejax import registry
 from sejax.agents import NoExploration
 from sejax.cli.progress import Tally
 from sejax.ops.parallel import spread_over_devices
+from sejax.options import registry
 from sejax.training import TrainingConfig
 
 HPARAMS = ("varied", "default")

@@ -18,10 +18,10 @@ from typing import Any, ClassVar, Self, get_origin, get_type_hints
 import pandas as pd
 
 from experiments.common.shards import Shards, read_rows, write_rows
-from sejax import options, registry
+from sejax import options
 from sejax.cli import commands, runtime
 from sejax.ops.files import write_text
-from sejax.options import ConfigError, Options, Rule, as_text, counts, nearest, shortened
+from sejax.options import ConfigError, Options, Rule, as_text, counts, nearest, registry, shortened
 
 RUN_PREFIX = "run."  # of an override for the NES runs: run.es.population_size=8
 NOT_SHOWN = {"work", "devices", "from_rows", "run"}  # fields that no result depends on, and `run`

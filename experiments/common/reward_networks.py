@@ -27,10 +27,10 @@ from experiments.common import agents, figures, runs
 from experiments.common.experiment import count, setting, work_beside
 from experiments.common.runs import RunSettings
 from experiments.common.shards import read_rows, write_rows
-from sejax import ICMConfig, options, registry
+from sejax import ICMConfig, options
 from sejax.cli import config as configuration
 from sejax.cli import run_directory
-from sejax.options import ConfigError, one_of
+from sejax.options import ConfigError, one_of, registry
 
 # Paper, table "Overview of Reward Network variants".
 VARIANTS = (

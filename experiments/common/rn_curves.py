@@ -25,8 +25,8 @@ from experiments.common.tables import (
     mean_columns,
     mean_text,
 )
-from sejax import options, registry
-from sejax.options import require
+from sejax import options
+from sejax.options import registry, require, shortened
 from sejax.training import TrainingConfig
 
 ROWS = {  # agents that are trained: the rows of the paper's figure, and one of ours
@@ -72,7 +72,11 @@ class CurveSettings(RnSettings):
         options.each_of(self.study.rows)("rows", self.rows, None)
         options.each_of((*self.study.bonuses, "none"))("bonuses", self.bonuses, None)
         most, fix = f"be at most {self.learned}", f"learned={self.rns}"
-        require(self.rns <= self.learned, "rns", most, "so many are learned", self.rns, fix)
+        require(
+            self.rns <= self.learned,
+            "rns",
+            f"must {most}, because so many are learned; got {shortened(self.rns)}. Set {fix}.",
+        )
 
     def agent(self, row: str) -> Any:
         """The agent that is trained in a row."""
@@ -147,7 +151,11 @@ def require_rows(settings: CurveSettings, rows: pd.DataFrame) -> None:
 
     def same(name: str, there: Any, asked: Any) -> None:
         reason, fix = f"{settings.rows_file} has these", f"{name}={there}, or from_rows=false"
-        require(there == asked, name, f"be {there}", reason, asked, fix)
+        require(
+            there == asked,
+            name,
+            f"must be {there}, because {reason}; got {shortened(asked)}. Set {fix}.",
+        )
 
     there = rows["row"].unique()
     same("rows", *(f"[{','.join(sorted(names))}]" for names in (there, settings.rows)))

@@ -20,13 +20,12 @@ import sejax
 from experiments.common.agents import HPARAMS, Condition, groups_at_once, train_groups
 from experiments.common.experiment import Settings, count, each_of, setting
 from experiments.common.tables import iqm_columns, mean_columns
-from sejax import registry
 from sejax.cli import config as configuration
 from sejax.cli import run_directory, session
 from sejax.cli.config import JOINT, key_of
 from sejax.cli.progress import Tally
 from sejax.ops.files import write_text
-from sejax.options import ConfigError, positive, require
+from sejax.options import ConfigError, positive, registry, require, shortened
 
 UNLIMITED = 100_000  # generations of a run that its budget ends
 
@@ -103,10 +102,8 @@ def _require_no_more(config: Any, curve: pd.DataFrame) -> None:
     require(
         there <= config.generations,
         "generations",
-        f"be at least {there}",
-        reason,
-        config.generations,
-        fix,
+        f"must be at least {there}, because {reason}; got {shortened(config.generations)}. Set "
+        f"{fix}.",
     )
 
 

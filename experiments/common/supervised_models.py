@@ -21,9 +21,9 @@ import sejax
 from experiments.common import agents
 from experiments.common.agents import HPARAMS, SE_AGENTS, SOFT_SE
 from experiments.common.experiment import Settings, count, each_of, setting
-from sejax import registry
 from sejax.cli import config as configuration
 from sejax.ops.parallel import spread_over_devices
+from sejax.options import registry
 
 LEARNING_RATE, BATCH_SIZE = 1e-4, 1024  # paper and docs/reference.md 7.5
 

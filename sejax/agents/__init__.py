@@ -7,7 +7,6 @@ hyperparameters that compiled programs take as arguments, and the buffers.
 import dataclasses
 import functools
 
-from sejax import registry
 from sejax.agents.base import (
     Agent,
     AgentConfig,
@@ -28,7 +27,7 @@ from sejax.agents.buffers import (
 )
 from sejax.envs.base import Task
 from sejax.envs.spec import TaskSpec
-from sejax.options import require
+from sejax.options import registry, require, shortened
 
 __all__ = [
     "Agent",
@@ -85,10 +84,9 @@ def make_agent(
     require(
         isinstance(task, TaskSpec),
         "task",
-        "be a sejax.Task",
-        "an agent is made for its spaces",
-        type(task).__name__,
-        "task to env.task, or sejax.Task(name=..., env=env)",
+        "must be a sejax.Task, because an agent is made for its spaces; got "
+        f"{type(task).__name__}. Set task to env.task, or sejax.Task(name=..., "
+        "env=env).",
     )
     require_fit(config, exploration, task, task.name)
     is_key = registry.is_hashable(config) and registry.is_hashable(exploration)
@@ -135,36 +133,32 @@ def require_fit(
         require(
             isinstance(value, kind),
             kind.group,
-            f"be a sejax.agents.{kind.__name__}",
-            "it says what it fits and makes",
-            value,
-            f"{kind.group} to such as sejax.{example}()",
+            f"must be a sejax.agents.{kind.__name__}, because it says what it fits and makes; got "
+            f"{shortened(value)}. Set {kind.group} to such as sejax.{example}().",
         )
     if not _fits(agent, spec):
         fitting = [name for name in names() if _fits(registry.find("agent", name), spec)]
         require(
             False,
             "agent",
-            f"be one of {', '.join(fitting)} in {task_name}",
-            f"its states are {spec.states} and its actions {spec.actions}",
-            registry.name_of("agent", agent),
-            f"agent={fitting[0]}",
+            f"must be one of {', '.join(fitting)} in {task_name}, because its states are "
+            f"{spec.states} and its actions {spec.actions}; got "
+            f"{shortened(registry.name_of('agent', agent))}. Set agent={fitting[0]}.",
         )
     require(
         agent.learns_each_step or not exploration.needs_each_step,
         "exploration",
-        "be none with this agent's train_every and gradient_steps",
-        "its module learns once at each step, and so must the agent",
-        registry.name_of("exploration", exploration),
-        "exploration=none, or both of these to 1",
+        "must be none with this agent's train_every and gradient_steps, because its module learns "
+        "once at each step, and so must the agent; got "
+        f"{shortened(registry.name_of('exploration', exploration))}. Set exploration=none, or both "
+        "of these to 1.",
     )
     require(
         exploration.states is None or agent.states in (None, exploration.states),
         "exploration",
-        f"fit {registry.name_of('agent', agent)}",
-        f"it is made for agents with {exploration.states} states",
-        registry.name_of("exploration", exploration),
-        "exploration=none",
+        f"must fit {registry.name_of('agent', agent)}, because it is made for agents with "
+        f"{exploration.states} states; got "
+        f"{shortened(registry.name_of('exploration', exploration))}. Set exploration=none.",
     )
 
 

@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 
 from sejax.agents.base import Agent
 from sejax.es.base import AGGREGATES, finite_mean, is_tie
-from sejax.options import Options, one_of, option, require
+from sejax.options import Options, one_of, option, require, shortened
 
 COMPARED_BY = ("advantage", "rank")
 
@@ -71,18 +71,15 @@ class Mixture:
         require(
             size > 0 and len(self.names) == len(self.weights) == size,
             "agents",
-            "hold an agent, and as many names and weights as agents",
-            "each agent has one of both",
-            f"{size} agents, names={self.names} and weights={self.weights}",
-            "names=() and weights=()",
+            "must hold an agent, and as many names and weights as agents, because each agent has "
+            f"one of both; got {size} agents, names={self.names} and weights={self.weights}. Set "
+            "names=() and weights=().",
         )
         require(
             min(self.weights) >= 0 and max(self.weights) > 0,
             "agents",
-            "have weights of at least 0, and one above",
-            "the candidates are divided by them",
-            self.weights,
-            "weights=()",
+            "must have weights of at least 0, and one above, because the candidates are divided "
+            f"by them; got {shortened(self.weights)}. Set weights=().",
         )
 
     @classmethod
@@ -115,10 +112,9 @@ class Mixture:
         require(
             counts[shares > 0].all(),
             "es.population_size",
-            "leave each agent of the mixture a candidate",
-            "the proxy must be scored by all of them",
-            f"{num_places} perturbations for weights {self.weights}",
-            f"es.population_size={2 * max(num_places, self.size)}",
+            "must leave each agent of the mixture a candidate, because the proxy must be scored "
+            f"by all of them; got {num_places} perturbations for weights {self.weights}. Set "
+            f"es.population_size={2 * max(num_places, self.size)}.",
         )
         return np.tile(dealt, 2 if antithetic else 1)
 

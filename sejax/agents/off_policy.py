@@ -42,10 +42,9 @@ class OffPolicyOptions(AgentOptions):
         require(
             self.batch_size <= self.buffer_size,
             "agent.batch_size",
-            "be at most agent.buffer_size",
-            "batches are drawn from the buffer",
-            f"{self.batch_size} with agent.buffer_size={self.buffer_size}",
-            f"agent.batch_size={self.buffer_size}",
+            "must be at most agent.buffer_size, because batches are drawn from the buffer; got "
+            f"{self.batch_size} with agent.buffer_size={self.buffer_size}. Set "
+            f"agent.batch_size={self.buffer_size}.",
         )
 
     def mlp(self, num_outputs: int, **more: Any) -> MLP:

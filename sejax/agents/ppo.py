@@ -38,6 +38,7 @@ from sejax.options import (
     or_none,
     positive,
     require,
+    shortened,
 )
 
 Steps = Float[Array, " steps"]  # of a rollout, or of a minibatch of it
@@ -194,10 +195,9 @@ def make_ppo(
     require(
         config.num_minibatches == 1 or 2 * config.num_minibatches <= length,
         "agent.num_minibatches",
-        f"be at most half of the rollout's {length} steps",
-        "advantages are compared within a minibatch",
-        config.num_minibatches,
-        f"agent.num_minibatches={max(1, length // 2)}",
+        f"must be at most half of the rollout's {length} steps, because advantages are compared "
+        f"within a minibatch; got {shortened(config.num_minibatches)}. Set "
+        f"agent.num_minibatches={max(1, length // 2)}.",
     )
     optimizer = config.optimizer()
     learn = make_learning_phase(config, networks, optimizer, obs_dim, is_discrete)

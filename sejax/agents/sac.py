@@ -30,7 +30,16 @@ from sejax.agents.off_policy import (
 from sejax.agents.policies import select_action
 from sejax.ops import flat
 from sejax.ops.networks import init_narrowed
-from sejax.options import counts, finite, fraction, not_negative, option, positive, require
+from sejax.options import (
+    counts,
+    finite,
+    fraction,
+    not_negative,
+    option,
+    positive,
+    require,
+    shortened,
+)
 
 _MIN_LOG_STD, _MAX_LOG_STD = -20.0, 2.0  # of the Gaussian, as in the authors' code
 
@@ -72,10 +81,8 @@ class SACConfig(OffPolicyOptions):
         require(
             getattr(self, unused) == default,
             f"agent.{unused}",
-            f"stay {default} in {task.name}",
-            f"agent.{used} holds for its actions",
-            getattr(self, unused),
-            f"agent.{used} in its place",
+            f"must stay {default} in {task.name}, because agent.{used} holds for its actions; got "
+            f"{shortened(getattr(self, unused))}. Set agent.{used} in its place.",
         )
         if task.num_actions is None:
             return make_sac(self, task.obs_dim, task.action_dim, task.max_action)

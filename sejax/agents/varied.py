@@ -52,10 +52,9 @@ def ranges_of(config: Any) -> dict[str, Range]:
     require(
         fields,
         "agent_hparams",
-        "be default with this agent",
-        "none of its options says how it is drawn (sejax.options.option(..., varied=...))",
-        type(config).__name__,
-        "agent_hparams=default",
+        "must be default with this agent, because none of its options says how it is drawn "
+        f"(sejax.options.option(..., varied=...)); got {type(config).__name__}. Set "
+        "agent_hparams=default.",
     )
     # Traced ones first: which key draws what.
     ordered = sorted(fields, key=lambda field: not metadata[field.name]["traced"])

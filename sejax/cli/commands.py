@@ -9,9 +9,8 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import NoReturn
 
-from sejax import registry
 from sejax.cli import runtime
-from sejax.options import ConfigError, FailedError, shortened
+from sejax.options import ConfigError, FailedError, registry, shortened
 
 BAD_INPUT, FAILED, INTERRUPTED = 2, 1, 130
 

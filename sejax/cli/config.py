@@ -7,8 +7,8 @@ four steps, the same for every command:
 2. The choice of every group is found: the given one, else what the task and the proxy suggest.
 3. `compose` merges the settings of the preset for these choices with the overrides, nested values
    that are still plain.
-4. `sejax.registry` makes dataclasses of them, each value read by its field's type; the dataclasses
-   check themselves.
+4. `sejax.options.registry` makes dataclasses of them, each value read by its field's type; the
+   dataclasses check themselves.
 
 Presets are files `presets/<env>-<proxy>.yaml` with a section for each preset: values, `with_agent`,
 `with_es` and `with_objective` for those that only hold with one of these, and `like` for a section
@@ -30,7 +30,7 @@ from typing import Any, ClassVar
 
 import yaml
 
-from sejax import agents, envs, registry
+from sejax import agents, envs
 from sejax.agents.mixture import Mixture, MixtureConfig
 from sejax.ops.files import as_file_name
 from sejax.options import (
@@ -43,13 +43,22 @@ from sejax.options import (
     listed,
     one_of,
     option,
+    registry,
     require,
     seed,
     shortened,
     told,
     unknown_name,
 )
-from sejax.registry import RENAMED, flatten, parsed, split, to_plain, unknown_field, unquoted
+from sejax.options.registry import (
+    RENAMED,
+    flatten,
+    parsed,
+    split,
+    to_plain,
+    unknown_field,
+    unquoted,
+)
 from sejax.training import TrainingConfig, require_reachable
 
 AGENT_HPARAMS = ("default", "varied")
@@ -111,10 +120,18 @@ def _agents_from_plain(values: Any) -> AgentsConfig | None:
     if values is None:
         return None
     one = "agents=[ddqn,ppo]"
-    require(isinstance(values, Mapping), "agents", "be a list", "it is a mixture", values, one)
+    require(
+        isinstance(values, Mapping),
+        "agents",
+        f"must be a list, because it is a mixture; got {shortened(values)}. Set {one}.",
+    )
     shared = {name: value for name, value in values.items() if name in _SHARED}
     keys = sorted(values.keys() - set(_SHARED))
-    require(keys, "agents", "hold an agent", "proxies are judged by agents", "none", one)
+    require(
+        keys,
+        "agents",
+        f"must hold an agent, because proxies are judged by agents; got none. Set {one}.",
+    )
     return AgentsConfig(
         families=tuple(_family(key, values[key]) for key in keys),
         **to_plain(registry.from_plain(MixtureConfig, shared, "agents")),
@@ -124,20 +141,27 @@ def _agents_from_plain(values: Any) -> AgentsConfig | None:
 def _family(key: str, values: Any) -> AgentFamily:
     field = f"agents.{key}"
     is_word = _KEY.fullmatch(key)
-    require(is_word, field, "be a word", "columns are named by it", key, "agents=[ddqn,ppo]")
+    require(
+        is_word,
+        field,
+        f"must be a word, because columns are named by it; got {shortened(key)}. Set "
+        "agents=[ddqn,ppo].",
+    )
     with named(field):
         is_agent = isinstance(values, Mapping)
-        require(is_agent, "agent", "have fields", "it is an agent", values, "agent=ddqn")
+        require(
+            is_agent,
+            "agent",
+            f"must have fields, because it is an agent; got {shortened(values)}. Set agent=ddqn.",
+        )
         fields = dict(values)
         weight = fields.pop("weight", 1.0)
         weight = parsed(weight) if isinstance(weight, str) else weight
         require(
             is_number(weight) and 0 <= weight <= 1e6,
             "agent.weight",
-            "lie in [0, 1e6]",
-            "it is a share of the candidates",
-            weight,
-            "agent.weight=1",
+            "must lie in [0, 1e6], because it is a share of the candidates; got "
+            f"{shortened(weight)}. Set agent.weight=1.",
         )
         agent = registry.configure("agent", fields)
     return AgentFamily(key=key, field=field, agent=agent, weight=float(weight))
@@ -221,20 +245,17 @@ class LearnConfig(Options):
         require(
             not elsewhere or self.devices is None,
             "devices",
-            "be left out with trainings on other machines",
-            "each worker has one",
-            self.devices,
-            "machines.workers=N in its place, or machines=local",
+            "must be left out with trainings on other machines, because each worker has one; got "
+            f"{shortened(self.devices)}. Set machines.workers=N in its place, or machines=local.",
         )
         require_real_returns("training", self.training)
         returns = getattr(self.objective, "scores_are_returns", None)
         require(
             not self.stop_when_solved or returns is not False,
             "stop_when_solved",
-            "be false with this objective",
-            "its scores are not returns, so that none says solved",
-            f"true with objective={self.name('objective')}",
-            "stop_when_solved=false",
+            "must be false with this objective, because its scores are not returns, so that none "
+            f"says solved; got true with objective={self.name('objective')}. Set "
+            "stop_when_solved=false.",
         )
         spec, task_name = envs.spec_of(self.env), self.name("env")
         self.proxy.require_task(spec, task_name)
@@ -345,10 +366,8 @@ class EvaluateConfig(Options):
             require(
                 self.proxy != "real" or getattr(self, name) != idle,
                 name,
-                f"be {usual} with proxy=real",
-                "there is no proxy",
-                idle,
-                f"{name}={usual}",
+                f"must be {usual} with proxy=real, because there is no proxy; got "
+                f"{shortened(idle)}. Set {name}={usual}.",
             )
         if self.agent_hparams == "as_learned":
             self._require_no_agent()
@@ -356,10 +375,10 @@ class EvaluateConfig(Options):
         require(
             self.training_from == "config" or self.training == TRAINING,
             "training",
-            "be left as it is",
-            "agents train on an SE as it was learned with, and else as real_training says",
-            _changes(to_plain(self.training), to_plain(TRAINING)),
-            f"{instead}real_training.*",
+            "must be left as it is, because agents train on an SE as it was learned with, and "
+            "else as real_training says; got "
+            f"{shortened(_changes(to_plain(self.training), to_plain(TRAINING)))}. Set "
+            f"{instead}real_training.*.",
         )
 
     def _require_no_agent(self) -> None:
@@ -375,10 +394,8 @@ class EvaluateConfig(Options):
             require(
                 not changed,
                 group,
-                "be left out with agent_hparams=as_learned",
-                "the proxy says which it was learned with",
-                changed,
-                "agent_hparams=default",
+                "must be left out with agent_hparams=as_learned, because the proxy says which it "
+                f"was learned with; got {shortened(changed)}. Set agent_hparams=default.",
             )
 
 
@@ -451,15 +468,17 @@ def _from_plain(schema: Any, values: Mapping[str, Any]) -> Any:
     require(
         typed["agents"] is None or one_agent is None,
         "agent",
-        "be left out with agents",
-        "all of them are named there",
-        one_agent,
-        "agents=[...] alone",
+        "must be left out with agents, because all of them are named there; got "
+        f"{shortened(one_agent)}. Set agents=[...] alone.",
     )
     for group in schema.groups:
         if group != "agent" or typed["agents"] is None:
             is_chosen = typed.get(group) is not None
-            require(is_chosen, group, "be chosen", "it is needed", "none", f"{group}=NAME")
+            require(
+                is_chosen,
+                group,
+                f"must be chosen, because it is needed; got none. Set {group}=NAME.",
+            )
             typed[group] = registry.configure(group, typed[group])
     return registry.from_plain(schema, typed, "")
 
@@ -473,10 +492,8 @@ def require_real_returns(name: str, training: TrainingConfig) -> None:
     require(
         training.stop_rule != "solved" or training.solved_by == "test",
         f"{name}.solved_by",
-        "be test with stop_rule=solved",
-        "returns on a proxy say nothing about the real task's threshold",
-        training.solved_by,
-        f"{name}.solved_by=test",
+        "must be test with stop_rule=solved, because returns on a proxy say nothing about the "
+        f"real task's threshold; got {shortened(training.solved_by)}. Set {name}.solved_by=test.",
     )
 
 
@@ -494,10 +511,8 @@ def require_learning(
     require(
         training.max_steps is None or training.max_steps > before,
         f"{name}.max_steps",
-        f"exceed {before}",
-        f"{registry.name_of('agent', agent)} learns nothing before",
-        training.max_steps,
-        f"{name}.max_steps={4 * before}",
+        f"must exceed {before}, because {registry.name_of('agent', agent)} learns nothing before; "
+        f"got {shortened(training.max_steps)}. Set {name}.max_steps={4 * before}.",
     )
 
 
@@ -534,10 +549,8 @@ def evaluate_config(overrides: Sequence[str] = ()) -> EvaluateConfig:
         require(
             "proxy" in values,
             "proxy",
-            "be given",
-            "agents are trained on it",
-            "none",
-            "proxy=RUN_DIR, proxy=FILE, proxy=cartpole (a shipped one) or proxy=real env=cartpole",
+            "must be given, because agents are trained on it; got none. Set proxy=RUN_DIR, "
+            "proxy=FILE, proxy=cartpole (a shipped one) or proxy=real env=cartpole.",
         )
         made: EvaluateConfig = _from_plain(EvaluateConfig, values)
     return made
@@ -546,7 +559,12 @@ def evaluate_config(overrides: Sequence[str] = ()) -> EvaluateConfig:
 def _require_overrides(overrides: Any) -> None:
     is_list = isinstance(overrides, list | tuple) and all(isinstance(x, str) for x in overrides)
     fix = 'overrides=["env=cartpole"]'
-    require(is_list, "overrides", "be a list of text", "each sets a field", repr(overrides), fix)
+    require(
+        is_list,
+        "overrides",
+        f"must be a list of text, because each sets a field; got {shortened(repr(overrides))}. Set "
+        f"{fix}.",
+    )
 
 
 def expand(overrides: Sequence[str]) -> list[list[str]]:
@@ -605,19 +623,15 @@ def read(overrides: Sequence[str]) -> dict[str, Any]:
         require(
             equals and NAME.fullmatch(name),
             "an override",
-            "read FIELD=VALUE",
-            "nothing else is read",
-            override,
-            f"env={shortened(override)} or proxy={shortened(override)}, if that is meant",
+            f"must read FIELD=VALUE, because nothing else is read; got {shortened(override)}. Set "
+            f"env={shortened(override)} or proxy={shortened(override)}, if that is meant.",
         )
         values = split(text)
         require(
             len(values) == 1,
             name,
-            "be one value here",
-            "a comma outside of brackets and quotes separates the runs of a sweep",
-            text,
-            f"{name}={values[0]}",
+            "must be one value here, because a comma outside of brackets and quotes separates the "
+            f"runs of a sweep; got {shortened(text)}. Set {name}={values[0]}.",
         )
         given[name] = unquoted(text)
     if str(given.get("preset", "")).endswith(ENDING):
@@ -638,15 +652,18 @@ def _of_file(path: Path) -> dict[str, Any]:
     require(
         content and isinstance(content, dict),
         "preset",
-        "be a file that maps fields to values",
-        "they are set",
-        f"{shortened(path)} with {shortened(content)}",
-        "preset=best, or write `es.noise_std: 0.1` there",
+        f"must be a file that maps fields to values, because they are set; got {shortened(path)} "
+        f"with {shortened(content)}. Set preset=best, or write `es.noise_std: 0.1` there.",
     )
     values = flatten(content)
     base = str(values.get("preset", ""))
     is_name = not base.endswith(ENDING)
-    require(is_name, "preset", "name no file in a file", "files do not nest", base, "preset: best")
+    require(
+        is_name,
+        "preset",
+        f"must name no file in a file, because files do not nest; got {shortened(base)}. Set "
+        "preset: best.",
+    )
     return values
 
 
@@ -706,19 +723,33 @@ def _agents_of(given: Mapping[str, Any]) -> dict[str, str]:
         return {}
     names = parsed(text) if isinstance(text, str) else text
     names = names if isinstance(names, list) else [names]
-    require(names, "agents", "hold an agent", "agents train on it", "none", "agents=[ddqn,ppo]")
+    require(
+        names,
+        "agents",
+        "must hold an agent, because agents train on it; got none. Set agents=[ddqn,ppo].",
+    )
     for name in names:
         if not isinstance(name, str):
             raise unknown_name("agents", name, registry.names("agent"))
     mixture = {key_of(name): name for name in names}
     once = ",".join(mixture.values())
     is_once = len(mixture) == len(names)
-    require(is_once, "agents", "name each agent once", "each has a key", text, f"agents=[{once}]")
+    require(
+        is_once,
+        "agents",
+        f"must name each agent once, because each has a key; got {shortened(text)}. Set "
+        f"agents=[{once}].",
+    )
     extra = next((name for name in given if re.fullmatch(r"agent(\..*)?", name)), "")
     fix = f"agents.{key_of(names[0])}{extra.removeprefix('agent')}={given.get(extra)}"
     fix = fix if "." in extra else f"agents=[{once},{given.get(extra)}]"
     must = f"be left out with agents=[{once}]"
-    require(not extra, extra, must, "each agent is named there", given.get(extra), fix)
+    require(
+        not extra,
+        extra,
+        f"must {must}, because each agent is named there; got {shortened(given.get(extra))}. Set "
+        f"{fix}.",
+    )
     return mixture
 
 
@@ -730,7 +761,11 @@ def _choices(schema: Any, given: Mapping[str, Any], mixture: Mapping[str, str]) 
         is_list = isinstance(names, list) or str(choice).startswith("[")
         first = names[0] if isinstance(names, list) and names else DEFAULTS[group]
         fix = f"agents={as_text(names)}" if group == "agent" else f"{group}={as_text(first)}"
-        require(not is_list, group, "be one choice", "there is one", choice, fix)
+        require(
+            not is_list,
+            group,
+            f"must be one choice, because there is one; got {shortened(choice)}. Set {fix}.",
+        )
         registry.find(group, choice)
     for name in mixture.values():
         with named("agents"):
@@ -854,17 +889,36 @@ def _require_fields(
         group, _, last = name.rpartition(".")
         today = f"{group}.{RENAMED.get(last, '')}".lstrip(".")
         is_old, fix = today in known, f"{today}={value}"
-        require(not is_old, name, f"be called {today}", "it has a new name", value, fix)
+        require(
+            not is_old,
+            name,
+            f"must be called {today}, because it has a new name; got {shortened(value)}. Set "
+            f"{fix}.",
+        )
         is_name = last == "name" and group in schema.groups
         fix = f"{group}={value}"
-        require(not is_name, name, "be left out", "a choice is more than a name", value, fix)
+        require(
+            not is_name,
+            name,
+            f"must be left out, because a choice is more than a name; got {shortened(value)}. Set "
+            f"{fix}.",
+        )
         is_agents = name.startswith("agents.") and not mixture
         fix = "agents=[ddqn,ppo]"
-        require(not is_agents, name, "come with agents", "it is one agent's", value, fix)
+        require(
+            not is_agents,
+            name,
+            f"must come with agents, because it is one agent's; got {shortened(value)}. Set {fix}.",
+        )
         others = [x for x in registry.GROUPS.get(group, _NO_GROUP).built_in if _has(group, x, last)]
         choice, fix = chosen.get(group), f"{group}={others[0]}" if others else ""
         why = f"{group}={choice} has no such field"
-        require(not others, name, f"be left out with {group}={choice}", why, value, fix)
+        require(
+            not others,
+            name,
+            f"must be left out with {group}={choice}, because {why}; got {shortened(value)}. Set "
+            f"{fix}.",
+        )
         raise unknown_field(name, list(known))
 
 
@@ -912,11 +966,9 @@ def _preset_values(
     require(
         preset in sections,
         "preset",
-        f"be one that env={shortened(env)} has with proxy={shortened(proxy)} "
-        f"({listed(list(sections))})",
-        f"it holds a task's own numbers, as for {listed(tuned(proxy, preset))}",
-        preset,
-        "preset=best",
+        f"must be one that env={shortened(env)} has with proxy={shortened(proxy)} "
+        f"({listed(list(sections))}), because it holds a task's own numbers, as for "
+        f"{listed(tuned(proxy, preset))}; got {shortened(preset)}. Set preset=best.",
     )
     section = sections[preset]
     values: dict[str, Any] = {k: v for k, v in section.items() if not k.startswith("with_")}

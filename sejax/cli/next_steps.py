@@ -6,10 +6,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from sejax import registry
 from sejax.cli import config as configuration
-from sejax.options import ConfigError, as_text
-from sejax.registry import flatten
+from sejax.options import ConfigError, as_text, registry
+from sejax.options.registry import flatten
 
 
 def evaluate_words(

@@ -14,11 +14,11 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
-from sejax import registry
 from sejax.cli import config as configuration
 from sejax.cli import next_steps
 from sejax.cli.config import LearnConfig, families_of
 from sejax.cli.trackers import FinishedGeneration, Reporter
+from sejax.options import registry
 
 if TYPE_CHECKING:  # the first line is shown before jax is imported
     from sejax.bilevel import Bilevel

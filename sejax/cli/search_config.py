@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
-from sejax import registry
 from sejax.cli import config as configuration
 from sejax.cli import spaces
 from sejax.cli.config import EvaluateConfig, LearnConfig
@@ -21,7 +20,9 @@ from sejax.options import (
     one_of,
     option,
     positive,
+    registry,
     require,
+    shortened,
 )
 
 SAMPLERS = ("tpe", "random")
@@ -81,10 +82,9 @@ class SearchConfig(Options):
         require(
             self.max_generations >= self.min_generations,
             "max_generations",
-            f"be at least min_generations={self.min_generations}",
-            "none is pruned before",
-            self.max_generations,
-            f"max_generations={9 * self.min_generations}",
+            f"must be at least min_generations={self.min_generations}, because none is pruned "
+            f"before; got {shortened(self.max_generations)}. Set "
+            f"max_generations={9 * self.min_generations}.",
         )
 
 
@@ -226,10 +226,9 @@ def _checked(stored: Any) -> dict[str, Any]:
         require(
             is_known and not (writes or reads) and not registry.untyped([override]),
             "study",
-            "hold choices and fields alone, without modules that you have not typed",
-            "its overrides are read as if you had typed them",
-            override,
-            "study=NAME, another one, or repeat its overrides if you trust it",
+            "must hold choices and fields alone, without modules that you have not typed, because "
+            f"its overrides are read as if you had typed them; got {shortened(override)}. Set "
+            "study=NAME, another one, or repeat its overrides if you trust it.",
         )
     default = _common(registry.to_plain(SearchConfig()))
     return stored | {"search": default | {k: v for k, v in own.items() if k in default}}
@@ -247,10 +246,9 @@ def _require_same(search: Search, stored: Mapping[str, Any]) -> None:
     require(
         not differing,
         "study",
-        "be new or of the same search",
-        "its trials are compared with each other",
-        f"{search.study}, which differs in {', '.join(differing)[:80]}",
-        "study=NAME, or give study and storage alone to join",
+        "must be new or of the same search, because its trials are compared with each other; got "
+        f"{search.study}, which differs in {', '.join(differing)[:80]}. Set study=NAME, or give "
+        "study and storage alone to join.",
     )
 
 
@@ -278,10 +276,8 @@ def read(overrides: Sequence[str]) -> Search:
         require(
             name not in TAKEN,
             name,
-            "be left out",
-            "the search sets it for each trial",
-            text,
-            TAKEN.get(name, f"{name}=VALUE"),
+            f"must be left out, because the search sets it for each trial; got {shortened(text)}. "
+            f"Set {TAKEN.get(name, f'{name}=VALUE')}.",
         )
         if name in own:
             values[name] = text if is_text else value
@@ -298,10 +294,8 @@ def read(overrides: Sequence[str]) -> Search:
     require(
         search.choice("proxy", "se") != "real",
         "proxy",
-        "be learned, or be one to tune agents on",
-        "trials on the real task cost what a proxy saves",
-        "real",
-        "proxy=cartpole, or env=cartpole proxy=se",
+        "must be learned, or be one to tune agents on, because trials on the real task cost what "
+        "a proxy saves; got real. Set proxy=cartpole, or env=cartpole proxy=se.",
     )
     if config.space is None:
         return search
@@ -312,10 +306,8 @@ def read(overrides: Sequence[str]) -> Search:
     require(
         not foreign,
         "space",
-        "name no module",
-        "only what you type is imported",
-        ", ".join(foreign),
-        "agent='choice(...)' on the command line",
+        "must name no module, because only what you type is imported; got "
+        f"{shortened(', '.join(foreign))}. Set agent='choice(...)' on the command line.",
     )
     return dataclasses.replace(search, space={**offered, **space})
 
@@ -336,10 +328,8 @@ def require_fields(search: Search, config: Any) -> dict[str, Any]:
     require(
         search.space,
         "space",
-        "be given, or ranges of fields",
-        "there is nothing to search otherwise",
-        "none",
-        "space=paper_se, or es.noise_std='tag(log, interval(0.01, 0.3))'",
+        "must be given, or ranges of fields, because there is nothing to search otherwise; got "
+        "none. Set space=paper_se, or es.noise_std='tag(log, interval(0.01, 0.3))'.",
     )
     groups = EvaluateConfig.groups if search.is_of_agent else LearnConfig.groups
     values = registry.flatten(configuration.plain(config))

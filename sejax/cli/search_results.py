@@ -12,13 +12,12 @@ from optuna.trial import FrozenTrial, TrialState
 from rich.console import Console
 from rich.table import Table
 
-from sejax import registry
 from sejax.cli.config import file_text
 from sejax.cli.search_config import Search
 from sejax.cli.study import ENDED
 from sejax.cli.trials import Runner
 from sejax.ops.files import write_text
-from sejax.options import as_text
+from sejax.options import as_text, registry
 
 SHOWN = 10
 NEEDED = 10  # completed trials, before importances say anything

@@ -9,11 +9,10 @@ from typing import Any
 
 import optuna
 
-from sejax import registry
 from sejax.cli import cluster, runtime
 from sejax.cli.search_config import SQLITE, Search
 from sejax.cli.study import ENDED, sentence
-from sejax.options import FailedError, told
+from sejax.options import FailedError, registry, told
 
 RETRIES = 5  # of a worker that is lost
 LAST_S = 60.0  # for workers to notice that the study is over

@@ -25,7 +25,7 @@ from optuna.trial import Trial
 
 from sejax.cli import config as configuration
 from sejax.options import ConfigError, is_number, nearest, require, shortened, told
-from sejax.registry import split
+from sejax.options.registry import split
 
 FOLDER = Path(__file__).parent / "spaces"
 DIGITS = 6  # of a number: the override says exactly what was tried
@@ -190,19 +190,15 @@ def preset(name: str, agent: str, of_agent: bool) -> dict[str, Dimension]:
         and all(isinstance(x, dict) for x in of_agents.values())
         and (ranges or of_agents),
         "space",
-        "map fields to ranges, and agents to such maps under with_agent",
-        "they are searched",
-        f"{path} with other content",
-        "space=paper_se",
+        "must map fields to ranges, and agents to such maps under with_agent, because they are "
+        f"searched; got {path} with other content. Set space=paper_se.",
     )
     for each in agent.split(configuration.JOINT):
         require(
             has_own or each in of_agents,
             "agent",
-            f"be one of {', '.join(of_agents)} with space={name}",
-            "it has no ranges for others",
-            each,
-            f"agent={next(iter(of_agents), 'ddqn')}",
+            f"must be one of {', '.join(of_agents)} with space={name}, because it has no ranges "
+            f"for others; got {shortened(each)}. Set agent={next(iter(of_agents), 'ddqn')}.",
         )
         own = of_agents.get(each, {})
         if configuration.JOINT in agent:  # what a mixture shares has no place in an agent's ranges

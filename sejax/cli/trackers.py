@@ -13,9 +13,8 @@ from typing import Any, ClassVar, Protocol, runtime_checkable
 import numpy as np
 import yaml
 
-from sejax import registry
-from sejax.options import told
-from sejax.registry import flatten
+from sejax.options import registry, told
+from sejax.options.registry import flatten
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -15,13 +15,12 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from sejax import registry
 from sejax.cli import config as configuration
 from sejax.cli.config import EvaluateConfig, LearnConfig
 from sejax.cli.programs import Programs, kept, static_of, structure_of
 from sejax.cli.search_config import Search
 from sejax.ops.files import write_text
-from sejax.options import ConfigError, require
+from sejax.options import ConfigError, registry, require, shortened
 
 ROUNDS = "rounds.json"
 WORLDS = {"the proxy": "proxy", "the real task": "real"}  # and what columns call them
@@ -193,18 +192,13 @@ class Tuning:
         require(
             config.agents is None,
             "agent",
-            "be one",
-            "its settings are searched",
-            "several",
-            "agent=ppo",
+            "must be one, because its settings are searched; got several. Set agent=ppo.",
         )
         require(
             config.agent_hparams == "default",
             "agent_hparams",
-            "be default",
-            "the trial's settings are those that are tried",
-            config.agent_hparams,
-            "agent_hparams=default",
+            "must be default, because the trial's settings are those that are tried; got "
+            f"{shortened(config.agent_hparams)}. Set agent_hparams=default.",
         )
         self._study_of(config)  # which checks what is asked of the proxy
         return config

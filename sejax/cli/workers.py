@@ -142,7 +142,7 @@ def cut(places: np.ndarray, batch: Batch, num_workers: int) -> Iterator[np.ndarr
 
 def _places(learner: "Bilevel") -> list[np.ndarray]:
     """The indices of each agent's evaluations in a generation."""
-    from sejax.scores import Scoring
+    from sejax.objectives import Scoring
 
     scoring = Scoring.of(learner.objective, learner.strategy, learner.mixture)
     agents = scoring.agent_of_evaluation
@@ -304,10 +304,9 @@ class Worker:
         require(
             versions() == self._expected,
             "machines",
-            "have the same versions everywhere",
-            "numbers differ otherwise",
-            f"{versions()} on {socket.gethostname()} and {self._expected} here",
-            "the same versions up there",
+            "must have the same versions everywhere, because numbers differ otherwise; got "
+            f"{versions()} on {socket.gethostname()} and {self._expected} here. Set the same "
+            "versions up there.",
         )
         runtime.configure_jax()
         from sejax.bilevel import make_bilevel

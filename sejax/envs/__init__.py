@@ -6,9 +6,9 @@ it; they import neither JAX nor gymnax. The dynamics are in `dynamics` and `mujo
 
 from typing import Any
 
-from sejax import registry
 from sejax.envs.base import Task
 from sejax.envs.spec import Box, Discrete, TaskSpec
+from sejax.options import registry
 
 __all__ = ["Box", "Discrete", "Task", "TaskSpec", "make", "make_from", "names", "spec_of"]
 

@@ -114,22 +114,18 @@ def require_own_steps(env: Any) -> None:
     options.require(
         not left_out,
         "env",
-        " and ".join(f"change {name}_env in place of {name}" for name in left_out),
-        "sejax calls reset_env and step_env alone",
-        type(env).__name__,
-        "env to a subclass of sejax.envs.wrappers.Wrapper",
+        f"must change {' and '.join(f'{name}_env in place of {name}' for name in left_out)}; got "
+        f"{type(env).__name__}. Set env to a subclass of sejax.envs.wrappers.Wrapper.",
     )
 
 
 def _require_threshold(solved_reward: Any) -> None:
     is_nan = isinstance(solved_reward, float) and math.isnan(solved_reward)
     options.require(
-        not is_nan and not isinstance(solved_reward, str | None),  # a traced one is fine
+        not is_nan and not isinstance(solved_reward, str | None),
         "env.solved_reward",
-        "be a number",
-        "returns are compared with it",
-        solved_reward,
-        "env.solved_reward=inf if it is undefined",
+        f"must be a number, because returns are compared with it; got "
+        f"{options.shortened(solved_reward)}. Set env.solved_reward=inf if it is undefined.",
     )
 
 
@@ -142,10 +138,8 @@ def _params_of(env: Any, params: Any, name: str) -> Any:
     options.require(
         hasattr(params, "max_steps_in_episode"),
         "params",
-        "have max_steps_in_episode",
-        "episodes are cut there",
-        type(params).__name__,
-        "params to a gymnax EnvParams",
+        "must have max_steps_in_episode, because episodes are cut there; got "
+        f"{type(params).__name__}. Set params to a gymnax EnvParams.",
     )
     return params
 
@@ -159,10 +153,9 @@ def _with_limit(params: Any, max_steps: int | None) -> tuple[Any, int]:
         options.require(
             hasattr(params, "replace"),
             "params",
-            f"have a method replace, or max_steps_in_episode={limit}",
-            "that is the task's max_steps",
-            params,
-            "params to a gymnax EnvParams, or max_steps=None",
+            f"must have a method replace, or max_steps_in_episode={limit}, because that is the "
+            f"task's max_steps; got {options.shortened(params)}. Set params to a gymnax EnvParams, "
+            "or max_steps=None.",
         )
         params = params.replace(max_steps_in_episode=limit)
     return params, int(limit)
@@ -224,8 +217,6 @@ def _try(env: Any, params: Any, name: str) -> None:
     options.require(
         not faults,
         "env",
-        f"keep its shapes: obs {shape}, reward a scalar, terminated a bool",
-        "an episode is one loop",
-        f"{name}, where {'; '.join(faults)}",
-        "env to one that does",
+        f"must keep its shapes: obs {shape}, reward a scalar, terminated a bool, because an "
+        f"episode is one loop; got {name}, where {'; '.join(faults)}. Set env to one that does.",
     )

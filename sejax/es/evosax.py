@@ -12,7 +12,7 @@ import optax
 from jaxtyping import Array, Float
 
 from sejax.es.base import LARGEST, Evaluations, Strategy, StrategyOptions
-from sejax.options import counts, one_of, option, positive, require, shrinks
+from sejax.options import counts, one_of, option, positive, require, shortened, shrinks
 
 
 class Algorithm(NamedTuple):
@@ -65,10 +65,9 @@ class EvosaxConfig(StrategyOptions):
         require(
             self.population_size % 2 == 0,
             "es.population_size",
-            "be even",
-            "evosax's algorithms pair opposite perturbations",
-            self.population_size,
-            f"es.population_size={self.population_size + 1}",
+            "must be even, because evosax's algorithms pair opposite perturbations; got "
+            f"{shortened(self.population_size)}. Set "
+            f"es.population_size={self.population_size + 1}.",
         )
 
     def make(self, num_dims: int) -> Strategy:

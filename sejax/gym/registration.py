@@ -9,12 +9,11 @@ import gymnasium
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
 
-from sejax import registry
 from sejax.gym.reward import RewardNetwork
 from sejax.gym.synthetic import SyntheticEnv, SyntheticWorld
 from sejax.gym.tasks import RealTask, rn_env, se_task
 from sejax.gym.vector import SyntheticVectorEnv
-from sejax.options import ConfigError, as_python, counts, require
+from sejax.options import ConfigError, as_python, counts, registry, require, shortened
 from sejax.proxies.header import Header, pretrained_names, read_single
 
 if TYPE_CHECKING:
@@ -171,13 +170,11 @@ def _read(
     weights, header = read_single(source, ("se", "rn"))
     if header.kind == "rn":
         return header, None
-    require(  # Stable-Baselines3's make_vec_env asks for rgb_array, even if nobody looks at it
+    require(
         render_mode in (None, "rgb_array"),
         "render_mode",
-        "be None for an SE",
-        "its states have no picture",
-        render_mode,
-        "render_mode=None",
+        "must be None for an SE, because its states have no picture; got "
+        f"{shortened(render_mode)}. Set render_mode=None.",
     )
     config = registry.configure("proxy", header.config["proxy"])
     given = se_task(header, task, config.needs_task)
@@ -185,9 +182,8 @@ def _read(
     require(
         config.max_steps(given.max_steps) == config.max_steps(limit),
         "task",
-        f"have the max_steps that the SE was learned with, {limit}",
-        "its episodes end there",
-        given.max_steps,
-        f"task=dataclasses.replace(task, max_steps={limit})",
+        f"must have the max_steps that the SE was learned with, {limit}, because its episodes end "
+        f"there; got {shortened(given.max_steps)}. Set task=dataclasses.replace(task, "
+        f"max_steps={limit}).",
     )
     return header, SyntheticWorld(weights, config, given)

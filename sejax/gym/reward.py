@@ -11,10 +11,9 @@ from gymnasium.envs.toy_text.cliffwalking import CliffWalkingEnv
 from gymnasium.utils import RecordConstructorArgs
 from gymnasium.wrappers import DtypeObservation, FlattenObservation
 
-from sejax import registry
 from sejax.gym import networks
 from sejax.gym.tasks import GYMNASIUM_IDS, RealTask, num_categories, vector_size
-from sejax.options import ConfigError, as_python, fraction, require
+from sejax.options import ConfigError, as_python, fraction, registry, require, shortened
 from sejax.proxies import MAX_ABS_VALUE
 from sejax.proxies.configs import RewardConfig
 from sejax.proxies.header import check_tensors, read_single
@@ -85,11 +84,9 @@ class RewardNetwork(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
         require(
             not isinstance(env.unwrapped, CliffWalkingEnv),
             "env",
-            "be sejax's Cliff Walking",
-            "in Gymnasium's, falling off the cliff ends no episode and actions are numbered "
-            "otherwise",
-            env,
-            f"env=sejax.gym.make({str(source)!r}), which is whole",
+            "must be sejax's Cliff Walking, because in Gymnasium's, falling off the cliff ends no "
+            f"episode and actions are numbered otherwise; got {shortened(env)}. Set "
+            f"env=sejax.gym.make({str(source)!r}), which is whole.",
         )
         self._info_keys = self._keys(header.task, info_keys)
         obs_dim = vector_size(env.observation_space, "env.observation_space")
@@ -190,10 +187,9 @@ class RewardNetwork(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
         require(
             keys,
             "info_keys",
-            f"be given for {task}",
-            "this RN needs entries of a step's info that are not known here",
-            "none",
-            f"sejax.gym.RewardNetwork(env, source, info_keys=[...]) to `sejax.Task.{name}`",
+            f"must be given for {task}, because this RN needs entries of a step's info that are "
+            "not known here; got none. Set sejax.gym.RewardNetwork(env, source, info_keys=[...]) "
+            f"to `sejax.Task.{name}`.",
         )
         return tuple(keys)
 
@@ -204,10 +200,8 @@ def _require_task(env: gymnasium.Env[Any, Any], learned: RealTask, name: str) ->
     require(
         _kind(env.observation_space) == _kind(wanted),
         "env",
-        f"have observations such as those of {name}, {wanted}",
-        "the network sees them",
-        env.observation_space,
-        fix,
+        f"must have observations such as those of {name}, {wanted}, because the network sees them; "
+        f"got {shortened(env.observation_space)}. Set {fix}.",
     )
     layers = list(_layers(env))
     # Wrappers may make actions of one kind of another: some layer has the task's.
@@ -215,10 +209,8 @@ def _require_task(env: gymnasium.Env[Any, Any], learned: RealTask, name: str) ->
     require(
         not acts.isdisjoint({_kind(learned.action_space), None}),
         "env",
-        f"have actions such as those of {name}, {learned.action_space}",
-        "it is another task otherwise",
-        env.action_space,
-        fix,
+        f"must have actions such as those of {name}, {learned.action_space}, because it is another "
+        f"task otherwise; got {shortened(env.action_space)}. Set {fix}.",
     )
     if _kind(layers[-1].observation_space) != _kind(wanted):
         return  # a wrapper makes them what the network sees
@@ -230,10 +222,9 @@ def _require_task(env: gymnasium.Env[Any, Any], learned: RealTask, name: str) ->
     require(
         not odd,
         "env",
-        f"have the observations of {name} as they are",
-        "the network has seen no others",
-        odd[0] if odd else env,
-        "gymnasium.wrappers that change observations around RewardNetwork, not below it",
+        f"must have the observations of {name} as they are, because the network has seen no "
+        f"others; got {shortened(odd[0] if odd else env)}. Set gymnasium.wrappers that change "
+        "observations around RewardNetwork, not below it.",
     )
 
 

@@ -71,10 +71,8 @@ class SyntheticWorld:
         require(
             self.draws_noise or self._starts,
             "task.starts",
-            "be given for an SE whose initial states are the real task's",
-            "episodes begin there",
-            None,
-            "RealTask(starts=...)",
+            "must be given for an SE whose initial states are the real task's, because episodes "
+            f"begin there; got {None}. Set RealTask(starts=...).",
         )
         self._one_hot = np.eye(action_dim, dtype=np.float32)
 

@@ -9,9 +9,8 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.wrappers import TimeLimit
 
-from sejax import registry
 from sejax.gym.gridworld import MAPS, GridWorld
-from sejax.options import ConfigError, require, shortened, told
+from sejax.options import ConfigError, registry, require, shortened, told
 from sejax.proxies.header import Header
 
 # The tasks that Gymnasium has too, with the same spaces, dynamics and initial states.
@@ -87,10 +86,8 @@ class RealTask:
         require(
             limit,
             "task",
-            "have a step limit",
-            "an episode of an SE may never end by itself",
-            env,
-            "max_steps",
+            "must have a step limit, because an episode of an SE may never end by itself; got "
+            f"{shortened(env)}. Set max_steps.",
         )
         return cls(
             observation_space=env.observation_space,
@@ -180,18 +177,15 @@ def se_task(header: Header, task: RealTask | str | None, needs_starts: bool) -> 
     require(
         isinstance(task, RealTask),
         "task",
-        "be a sejax.gym.RealTask, or an id of Gymnasium",
-        "an SE takes its spaces from there",
-        type(task).__name__,
-        "task=sejax.gym.RealTask.of_env(env)",
+        "must be a sejax.gym.RealTask, or an id of Gymnasium, because an SE takes its spaces from "
+        f"there; got {type(task).__name__}. Set task=sejax.gym.RealTask.of_env(env).",
     )
     require(
         is_close(task.action_space, stored.action_space),
         "task",
-        f"have the actions that the SE was learned with, {stored.action_space}",
-        "others mean something else to its networks",
-        task.action_space,
-        "task to one with these, such as gymnasium.wrappers.RescaleAction makes",
+        f"must have the actions that the SE was learned with, {stored.action_space}, because "
+        f"others mean something else to its networks; got {shortened(task.action_space)}. Set task "
+        "to one with these, such as gymnasium.wrappers.RescaleAction makes.",
     )
     return task
 
@@ -218,10 +212,8 @@ def rn_env(header: Header, env_id: Any, render_mode: str | None) -> gymnasium.En
     require(
         isinstance(env_id, str | None),
         "task",
-        "be an id of Gymnasium for a reward network",
-        "its dynamics are the real task's",
-        shortened(env_id, 80),
-        fix,
+        "must be an id of Gymnasium for a reward network, because its dynamics are the real "
+        f"task's; got {shortened(shortened(env_id, 80))}. Set {fix}.",
     )
     if env_id is not None:
         return make_gymnasium(env_id, render_mode=render_mode)
@@ -281,9 +273,7 @@ def vector_size(space: spaces.Space[Any], name: str) -> int:
     require(
         is_index,
         name,
-        "be a Box of vectors or a Discrete from 0",
-        "networks take vectors",
-        space,
-        f"{name} to that of `sejax.Task`",
+        "must be a Box of vectors or a Discrete from 0, because networks take vectors; got "
+        f"{shortened(space)}. Set {name} to that of `sejax.Task`.",
     )
     return int(space.n)  # type: ignore[attr-defined]

@@ -88,18 +88,14 @@ class SyntheticVectorEnv(VectorEnv[Any, Any, np.ndarray]):
         require(
             len(seeds) == self.num_envs,
             "seed",
-            "have an entry for each environment",
-            "each has a generator of its own",
-            f"{len(seeds)} for {self.num_envs}",
-            "seed=0",
+            "must have an entry for each environment, because each has a generator of its own; "
+            f"got {len(seeds)} for {self.num_envs}. Set seed=0.",
         )
         require(
             mask.shape == (self.num_envs,) and mask.dtype == np.bool_,
             "options.reset_mask",
-            "be a bool for each environment",
-            "it says which begin anew",
-            f"{mask.dtype} {mask.shape} for {self.num_envs}",
-            "options={'reset_mask': ended}",
+            "must be a bool for each environment, because it says which begin anew; got "
+            f"{mask.dtype} {mask.shape} for {self.num_envs}. Set options={{'reset_mask': ended}}.",
         )
         indices = np.flatnonzero(mask)
         for i in indices:

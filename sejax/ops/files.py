@@ -8,7 +8,7 @@ import tempfile
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
-from sejax.options import require
+from sejax.options import require, shortened
 
 
 def cache_folder() -> Path | None:
@@ -39,7 +39,11 @@ def require_writable(field: str, folder: Path) -> None:
             pass
     except (OSError, ValueError) as error:
         rule = "be a folder that can be written"
-        require(False, field, rule, "files go there", error, f"{field}=FOLDER")
+        require(
+            False,
+            field,
+            f"must {rule}, because files go there; got {shortened(error)}. Set {field}=FOLDER.",
+        )
 
 
 @contextlib.contextmanager

@@ -14,7 +14,7 @@ import numpy as np
 from jax import Array
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 
-from sejax.options import require
+from sejax.options import require, shortened
 
 
 @functools.cache
@@ -102,10 +102,8 @@ def spread_groups_over_devices(
     require(
         num_devices is None or num_devices <= len(available),
         "devices",
-        f"be at most {len(available)}",
-        "that is how many there are",
-        num_devices,
-        "devices=null",
+        f"must be at most {len(available)}, because that is how many there are; got "
+        f"{shortened(num_devices)}. Set devices=null.",
     )
     mesh = _mesh(num_devices)
     on_cpu = available[0].platform == "cpu"

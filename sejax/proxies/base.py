@@ -49,10 +49,9 @@ class ProxyEnv(Environment, ABC):
         require(
             isinstance(config, ProxyConfig),
             "proxy",
-            "be a dataclass that derives from sejax.ProxyConfig",
-            "that declares what is asked of a proxy",
-            type(config).__name__,
-            f"class {type(config).__name__}(sejax.ProxyConfig)",
+            "must be a dataclass that derives from sejax.ProxyConfig, because that declares what "
+            f"is asked of a proxy; got {type(config).__name__}. Set class "
+            f"{type(config).__name__}(sejax.ProxyConfig).",
         )
         self.spaces = task.observation, task.action
         self.task = task

@@ -12,7 +12,16 @@ import numpy as np
 
 from sejax.envs.base import Task
 from sejax.envs.spec import TaskSpec
-from sejax.options import ACTIVATIONS, MOST_LAYERS, counts, one_of, option, positive, require
+from sejax.options import (
+    ACTIVATIONS,
+    MOST_LAYERS,
+    counts,
+    one_of,
+    option,
+    positive,
+    require,
+    shortened,
+)
 from sejax.proxies import MAX_ABS_VALUE, ProxyConfig
 
 if TYPE_CHECKING:
@@ -78,10 +87,8 @@ class SyntheticConfig(ProxyConfig):
         require(
             self.horizon != 1 or self.horizon_is_terminal,
             "proxy.horizon_is_terminal",
-            "be true with proxy.horizon=1",
-            "there is no next state to bootstrap with",
-            "false",
-            "proxy.horizon_is_terminal=true",
+            "must be true with proxy.horizon=1, because there is no next state to bootstrap with; "
+            "got false. Set proxy.horizon_is_terminal=true.",
         )
 
     @property
@@ -208,10 +215,9 @@ class RewardConfig(ProxyConfig):
             require(
                 value == default or not self.shaping.weighs_info,
                 f"proxy.{name}",
-                f"be {str(default).lower()} with weighted info",
-                f"{self.variant} has no network",
-                str(value).lower(),
-                f"proxy.{name}={str(default).lower()}",
+                f"must be {str(default).lower()} with weighted info, because {self.variant} has no "
+                f"network; got {shortened(str(value).lower())}. Set "
+                f"proxy.{name}={str(default).lower()}.",
             )
 
     @property
@@ -238,10 +244,8 @@ class RewardConfig(ProxyConfig):
             require(
                 is_there or not is_needed,
                 f"proxy.{name}",
-                f"do without {value} in {task_name}",
-                "its steps tell nothing of the state beside the observation",
-                value,
-                f"proxy.{name}={fix}",
+                f"must do without {value} in {task_name}, because its steps tell nothing of the "
+                f"state beside the observation; got {shortened(value)}. Set proxy.{name}={fix}.",
             )
 
     def make(self, task: Task) -> "ProxyEnv":

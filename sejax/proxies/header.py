@@ -14,9 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from sejax import registry
 from sejax.ops.checksummed import DamagedError, pack, unpack
-from sejax.options import LARGEST, ConfigError, require, shortened, unknown_name
+from sejax.options import LARGEST, ConfigError, registry, require, shortened, unknown_name
 from sejax.proxies import hub
 
 FORMAT_VERSION = 2
@@ -160,10 +159,9 @@ def find(source: str | Path, option: str = "source", also: Sequence[str] = ()) -
         require(
             stored.exists(),
             option,
-            f"be a run directory with a {hub.FILE}",
-            "the run has not finished a generation yet" if is_run else "this is another folder",
-            text,
-            f"{option} to a run directory or a file",
+            f"must be a run directory with a {hub.FILE}, because "
+            f"{'the run has not finished a generation yet' if is_run else 'it is no run'}; "
+            f"got {shortened(text)}. Set {option} to a run directory or a file.",
         )
         return stored
     if is_file:
@@ -213,10 +211,9 @@ def read(
     require(
         not kinds or header.kind in kinds,
         option,
-        f"be a proxy of the kind {shortened(' or '.join(map(str, kinds)), 40)}",
-        "others are not read here",
-        f"proxy={shortened(header.kind, 40)} in {shortened(path, 80)}",
-        f"{option} to such a proxy",
+        f"must be a proxy of the kind {shortened(' or '.join(map(str, kinds)), 40)}, because "
+        f"others are not read here; got proxy={shortened(header.kind, 40)} in "
+        f"{shortened(path, 80)}. Set {option} to such a proxy.",
     )
     return tensors, header
 
@@ -243,10 +240,8 @@ def require_single(count: int, source: Any, option: str = "source") -> None:
     require(
         count == 1,
         option,
-        "be a single proxy",
-        "an agent trains in one environment",
-        f"a set of {count} in {shortened(source, 80)}",
-        f"{option} to a run directory; sejax.load_set reads sets",
+        f"must be a single proxy, because an agent trains in one environment; got a set of {count} "
+        f"in {shortened(source, 80)}. Set {option} to a run directory; sejax.load_set reads sets.",
     )
 
 
@@ -285,8 +280,8 @@ def check_tensors(
     require(
         there == shapes and not odd,
         field,
-        f"hold finite float32 tensors of the shapes {shortened(shapes, 60)}",
-        "the proxy's configuration describes such networks",
-        shortened(odd[0] if odd and there == shapes else there, 60),
-        f"{field} to {fix}",
+        f"must hold finite float32 tensors of the shapes {shortened(shapes, 60)}, because the "
+        "proxy's configuration describes such networks; got "
+        f"{shortened(shortened(odd[0] if odd and there == shapes else there, 60))}. Set {field} to "
+        f"{fix}.",
     )

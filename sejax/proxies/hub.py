@@ -85,10 +85,9 @@ def fetch(address: str, option: str = "source") -> Path:
         require(
             size is not None and size <= MAX_BYTES,
             option,
-            f"have at most {MAX_BYTES:,} bytes",
-            "no proxy is larger",
-            f"{'an unknown number of' if size is None else f'{size:,}'} bytes at {address}",
-            f"{option} to a proxy",
+            f"must have at most {MAX_BYTES:,} bytes, because no proxy is larger; got "
+            f"{'an unknown number of' if size is None else f'{size:,}'} bytes at {address}. Set "
+            f"{option} to a proxy.",
         )
         return Path(hf_hub_download(place.repo, place.file, revision=place.revision))
 
@@ -102,10 +101,8 @@ def require_repo(repo: Any) -> None:
     require(
         isinstance(repo, str) and re.fullmatch(_REPO, repo, re.ASCII),
         "repo",
-        "be USER/REPO",
-        "that is how the Hub names repositories",
-        shortened(repo, 80),
-        "repo='USER/REPO'",
+        "must be USER/REPO, because that is how the Hub names repositories; got "
+        f"{shortened(shortened(repo, 80))}. Set repo='USER/REPO'.",
     )
 
 

@@ -11,10 +11,10 @@ import jax
 import numpy as np
 from flax.traverse_util import flatten_dict, unflatten_dict
 
-from sejax import envs, registry
+from sejax import envs
 from sejax.envs.base import Task
 from sejax.ops.files import write_bytes
-from sejax.options import ConfigError, one_of, require, shortened, told
+from sejax.options import ConfigError, one_of, registry, require, shortened, told
 from sejax.proxies import ProxyConfig
 from sejax.proxies.base import ProxyEnv, absent_task, require_present
 from sejax.proxies.header import (
@@ -88,10 +88,10 @@ class _Stored:
         require(
             is_registered(group, stored),
             group,
-            f"be given for {shortened(self.path.name, 60)}",
-            f"the file names no registered {group}, and what a file names is never imported",
-            shortened(stored.get("name"), 60) if isinstance(stored, Mapping) else "none",
-            f"{group} to one of your own",
+            f"must be given for {shortened(self.path.name, 60)}, because the file names no "
+            f"registered {group}, and what a file names is never imported; got "
+            f"{shortened(stored.get('name'), 60) if isinstance(stored, Mapping) else 'none'}. "
+            f"Set {group} to one of your own.",
         )
         return registry.configure(group, stored)
 
@@ -191,10 +191,8 @@ def stored_config(proxy: Proxy | ProxySet) -> dict[str, Any]:
     require(
         isinstance(proxy, _Stored),
         "proxy",
-        "be a stored one",
-        "its file tells what it was learned with",
-        type(proxy).__name__,
-        "proxy=sejax.load_proxy(source)",
+        "must be a stored one, because its file tells what it was learned with; got "
+        f"{type(proxy).__name__}. Set proxy=sejax.load_proxy(source).",
     )
     return proxy.config
 
@@ -256,10 +254,9 @@ def save_set(
     require(
         are_lists and len(weights) == len(records) > 0,
         "records",
-        "be one for each proxy",
-        "they say which is which",
-        f"{len(records)} for {len(weights)}" if are_lists else "others than lists",
-        "records=[{}] * len(weights)",
+        f"must be one for each proxy, because they say which is which; got "
+        f"{f'{len(records)} for {len(weights)}' if are_lists else 'others than lists'}. "
+        f"Set records=[{{}}] * len(weights).",
     )
     each = [_checked_tensors(env, one) for one in weights]
     tensors = {name: np.stack([one[name] for one in each]) for name in each[0]}
@@ -271,10 +268,9 @@ def _checked_tensors(env: ProxyEnv, weights: Any) -> dict[str, np.ndarray]:
     require(
         isinstance(env, ProxyEnv),
         "env",
-        "be a sejax.ProxyEnv",
-        "a file says how it is made again",
-        type(env).__name__,
-        "env to the first of the pair that sejax.load returns",
+        "must be a sejax.ProxyEnv, because a file says how it is made again; got "
+        f"{type(env).__name__}. Set env to the first of the pair that sejax.load "
+        "returns.",
     )
     flat = _flatten(weights) if isinstance(weights, Mapping) else {"": np.zeros(0)}
     tensors = {name: np.asarray(x, np.float32) for name, x in flat.items()}
@@ -294,10 +290,8 @@ def _write(
     require(
         discount is not None or not env.config.needs_discount,
         "discount",
-        "be given for a potential-based reward network",
-        "its reward is made with it",
-        discount,
-        "discount=params.discount, that of the agent",
+        "must be given for a potential-based reward network, because its reward is made with it; "
+        f"got {shortened(discount)}. Set discount=params.discount, that of the agent.",
     )
     known = {
         "env": env.task.origin or {"name": env.task.name},
@@ -432,10 +426,8 @@ def _env_of(path: Path, header: Header, task: Any, proxy: Any, option: str) -> P
         require(
             given is None or isinstance(given, kind),
             name,
-            f"be a sejax.{kind.__name__}",
-            "a file's names are never imported",
-            shortened(repr(given), 80),
-            fix,
+            f"must be a sejax.{kind.__name__}, because a file's names are never imported; got "
+            f"{shortened(shortened(repr(given), 80))}. Set {fix}.",
         )
     if proxy is None:
         proxy = _registered("proxy", "proxy", "proxy_kind", path, header, option)
@@ -450,10 +442,9 @@ def _env_of(path: Path, header: Header, task: Any, proxy: Any, option: str) -> P
     require(
         header.task == task.name,
         option,
-        f"be a proxy of {task.name}",
-        "that is the task given",
-        f"one of {shortened(header.task, 60)} in {shortened(path, 60)}",
-        f"{option} to a proxy of {task.name}, or another task",
+        f"must be a proxy of {task.name}, because that is the task given; got one of "
+        f"{shortened(header.task, 60)} in {shortened(path, 60)}. Set {option} to a proxy of "
+        f"{task.name}, or another task.",
     )
     if is_given:
         _require_same(header.interface, task.interface, proxy, path)
@@ -494,10 +485,9 @@ def _require_same(
         require(
             is_same,
             "task",
-            f"have the {name} {shortened(learned[name], 60)}",
-            f"{shortened(path, 60)} is of such a task",
-            shortened(given[name], 60),
-            f"task to a sejax.Task with that {name}",
+            f"must have the {name} {shortened(learned[name], 60)}, because {shortened(path, 60)} "
+            f"is of such a task; got {shortened(shortened(given[name], 60))}. Set task to a "
+            f"sejax.Task with that {name}.",
         )
 
 

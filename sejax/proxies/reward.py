@@ -112,10 +112,8 @@ class RewardEnv(ProxyEnv):
         require(
             discount is not None or not self.config.shaping.is_potential_based,
             "agent",
-            "say its discount",
-            f"{self.config.variant} pays with it",
-            "none",
-            "Agent(discount=lambda hparams: ...)",
+            f"must say its discount, because {self.config.variant} pays with it; got none. Set "
+            "Agent(discount=lambda hparams: ...).",
         )
         potentials = None
         if self.task.num_states is not None and not self.config.shaping.weighs_info:

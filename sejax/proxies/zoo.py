@@ -12,7 +12,7 @@ from typing import Any
 
 import yaml
 
-from sejax import registry
+from sejax.options import registry
 from sejax.proxies import header, hub
 from sejax.proxies.configs import SyntheticConfig
 

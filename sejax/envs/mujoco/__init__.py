@@ -8,7 +8,7 @@ used, and the CPU. `brax` has other physics for halfcheetah.
 
 from typing import TYPE_CHECKING
 
-from sejax.options import ConfigError, require
+from sejax.options import ConfigError, require, shortened
 
 if TYPE_CHECKING:
     from sejax.envs.mujoco.environment import MujocoEnv
@@ -41,10 +41,8 @@ def make_env(config: "MujocoTask", otherwise: str = "") -> "MujocoEnv":
     require(
         jax.default_backend() == "cpu",
         f"env={config.name}",
-        "run on the CPU",
-        "MuJoCo's C library does",
-        jax.default_backend(),
-        f"JAX_PLATFORMS=cpu{otherwise}",
+        "must run on the CPU, because MuJoCo's C library does; got "
+        f"{shortened(jax.default_backend())}. Set JAX_PLATFORMS=cpu{otherwise}.",
     )
     try:
         library.load()

@@ -60,12 +60,16 @@ class FailedError(RuntimeError):
     """Computing that cannot go on. Commands print its message and exit with status 1."""
 
 
-def require(holds: Any, field: str, rule: str, reason: str, got: object, fix: str) -> None:
-    """Raises `ConfigError` in the project's one form of message unless `holds`."""
+def require(holds: Any, field: str, message: str) -> None:
+    """Raises `ConfigError` unless `holds`.
+
+    Args:
+      holds: what must be so.
+      field: the field at fault.
+      message: follows the field: what must hold, `; got` what came, and how to fix it.
+    """
     if not holds:
-        raise ConfigError(
-            f"{field} must {rule}, because {reason}; got {shortened(got)}. Set {fix}.", field
-        )
+        raise ConfigError(f"{field} {message}", field)
 
 
 def unknown_name(field: str, got: object, known: Iterable[str]) -> ConfigError:
@@ -229,7 +233,12 @@ def rule(holds: Callable[[Any], bool], must: str, reason: str) -> Rule:
     """The rule that a predicate holds; see `require`."""
 
     def apply(name: str, value: Any, default: Any) -> None:
-        require(holds(value), name, must, reason, value, f"{name}={as_text(default)}")
+        require(
+            holds(value),
+            name,
+            f"must {must}, because {reason}; got {shortened(value)}. Set "
+            f"{name}={as_text(default)}.",
+        )
 
     return apply
 

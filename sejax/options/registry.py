@@ -283,10 +283,8 @@ def configure(group: str, values: Mapping[str, Any]) -> Any:
     require(
         isinstance(values, Mapping) and "name" in values,
         group,
-        "be a choice with its fields",
-        "one is made by name",
-        values,
-        f"{group}=NAME",
+        f"must be a choice with its fields, because one is made by name; got {shortened(values)}. "
+        f"Set {group}=NAME.",
     )
     cls = find(group, values["name"])
     is_one_of_many = "name" in {field.name for field in dataclasses.fields(cls)}
@@ -367,7 +365,9 @@ def from_plain(cls: Any, values: Mapping[str, Any], where: str) -> Any:
     for name in fields.keys() - read.keys():
         full = _join(where, name)
         is_there = not _is_needed(fields[name])
-        require(is_there, full, "be given", "it has no default", "none", f"{full}=VALUE")
+        require(
+            is_there, full, f"must be given, because it has no default; got none. Set {full}=VALUE."
+        )
     return cls(**read)
 
 
@@ -501,7 +501,11 @@ def _as(kind: Any, value: Any, name: str, default: Any) -> Any:
         return read
     if origin in (tuple, list):
         items = parsed(value) if isinstance(value, str) else value
-        require(isinstance(items, list | tuple), name, "be a list", "it is several", value, fix)
+        require(
+            isinstance(items, list | tuple),
+            name,
+            f"must be a list, because it is several; got {shortened(value)}. Set {fix}.",
+        )
         if isinstance(value, str):  # each is read by its own type
             items = split(value[1:-1]) if items else []
         return origin(_elements(items, origin, arguments, name, default))
@@ -510,12 +514,22 @@ def _as(kind: Any, value: Any, name: str, default: Any) -> Any:
             return value
         first = next(iter(dataclasses.fields(kind))).name
         is_nested = isinstance(value, Mapping)
-        require(is_nested, name, "have fields", "it is several", value, f"{name}.{first}=VALUE")
+        require(
+            is_nested,
+            name,
+            f"must have fields, because it is several; got {shortened(value)}. Set "
+            f"{name}.{first}=VALUE.",
+        )
         return from_plain(kind, value, name)
     if kind not in _TYPES:
         return value
     read = _scalar(value, kind)
-    require(read is not _NO, name, f"be {_TYPES[kind]}", "that is its type", repr(value), fix)
+    require(
+        read is not _NO,
+        name,
+        f"must be {_TYPES[kind]}, because that is its type; got {shortened(repr(value))}. Set "
+        f"{fix}.",
+    )
     return read
 
 
@@ -523,7 +537,11 @@ def _elements(items: Any, origin: Any, kinds: tuple[Any, ...], name: str, defaul
     """The elements of a list or tuple, each as its type."""
     if origin is tuple and kinds and kinds[-1] is not Ellipsis:
         must, fix = f"have {len(kinds)} values", f"{name}={as_text(plain(default))}"
-        require(len(items) == len(kinds), name, must, "that is its type", items, fix)
+        require(
+            len(items) == len(kinds),
+            name,
+            f"must {must}, because that is its type; got {shortened(items)}. Set {fix}.",
+        )
     else:
         kinds = (kinds[0] if kinds else Any,) * len(items)
     return (_converted(x, kind, name, default) for x, kind in zip(items, kinds, strict=True))
@@ -595,10 +613,9 @@ def _made(group: str, config: Any, *arguments: Any) -> Any:
     require(
         isinstance(made, kind),
         group,
-        f"make a sejax.{kind.__name__}",
-        "that is what is used",
-        f"{type(made).__name__} from {name_of(group, config)}",
-        f"{group} to a plugin that returns a sejax.{kind.__name__}",
+        f"must make a sejax.{kind.__name__}, because that is what is used; got "
+        f"{type(made).__name__} from {name_of(group, config)}. Set {group} to a plugin that "
+        f"returns a sejax.{kind.__name__}.",
     )
     return made
 
@@ -661,19 +678,16 @@ def _import(group: str, path: str) -> Any:
     require(
         all(part.isidentifier() for part in (*module.split("."), *attribute.split("."))),
         group,
-        "be a name or module:attribute",
-        "a module is imported by it",
-        path,
-        f"{group}=my_module:MyClass",
+        "must be a name or module:attribute, because a module is imported by it; got "
+        f"{shortened(path)}. Set {group}=my_module:MyClass.",
     )
     typed = _TYPED.get()
     require(
         typed is None or path in typed,
         group,
-        "be typed on the command line if it is of a module of your own",
-        "what a file names is never imported",
-        path,
-        f"{group}={path}, if you trust that module",
+        "must be typed on the command line if it is of a module of your own, because what a file "
+        f"names is never imported; got {shortened(path)}. Set {group}={path}, if you trust that "
+        "module.",
     )
     try:
         found: Any = importlib.import_module(module)
@@ -731,10 +745,9 @@ def _require_maker(group: str, name: str, found: Any) -> None:
     require(
         makes,
         group,
-        f"be a function that says what it makes, -> {kind.__name__}",
-        "not any function is called",
-        f"{name} -> {says}" if says else f"{name} without",
-        f"{group} to a dataclass with make, or annotate the function",
+        f"must be a function that says what it makes, -> {kind.__name__}, because not any function "
+        f"is called; got {shortened(name)} {f'-> {says}' if says else 'without'}. Set {group} to a "
+        f"dataclass with make, or annotate the function.",
     )
 
 
@@ -756,10 +769,8 @@ def _as_dataclass(group: str, name: str, found: Any) -> Any:
     require(
         issubclass(cls, base),
         group,
-        f"be a subclass of {base.__module__}.{base.__name__}",
-        "that says what it fits",
-        name,
-        f"class {cls.__name__}({base.__name__})",
+        f"must be a subclass of {base.__module__}.{base.__name__}, because that says what it fits; "
+        f"got {shortened(name)}. Set class {cls.__name__}({base.__name__}).",
     )
     if f"{cls.__module__}:{cls.__qualname__}" != name:
         _NAMES[cls] = name
@@ -776,10 +787,8 @@ def _from_function(group: str, name: str, function: Callable[..., Any]) -> type:
     require(
         len(parameters) >= len(arguments) and not is_open,
         group,
-        f"take ({', '.join((*arguments, 'option=default, ...'))})",
-        "each option is a field",
-        f"{name}{inspect.signature(function)}",
-        f"{group} to such a function",
+        f"must take ({', '.join((*arguments, 'option=default, ...'))}), because each option is a "
+        f"field; got {name}{inspect.signature(function)}. Set {group} to such a function.",
     )
 
     def make(self: Any, *given: Any) -> Any:
