@@ -1,5 +1,7 @@
 """HalfCheetah on brax."""
 
+from typing import TYPE_CHECKING
+
 import jax.numpy as jnp
 from brax.base import State as BraxState
 from brax.envs.base import State
@@ -8,7 +10,9 @@ from flax import struct
 from jaxtyping import Array, Bool, Float
 
 from sejax.envs.environment import Environment, EnvParams, EnvState, Step
-from sejax.envs.mujoco.tasks import HalfCheetah
+
+if TYPE_CHECKING:
+    from sejax.envs.mujoco.tasks import HalfCheetah
 
 # Of mjx's line search, where MuJoCo has 50: under vmap all wait for the longest search. With 10
 # gaits are worth as much as with 50, with 8 no longer (docs/halfcheetah.md).
@@ -35,7 +39,7 @@ class BraxHalfCheetahEnv(Environment[CheetahState, EnvParams]):
     Source: brax 0.14, `brax.envs.half_cheetah`; Gymnasium's HalfCheetah.
     """
 
-    def __init__(self, config: HalfCheetah):
+    def __init__(self, config: "HalfCheetah"):
         super().__init__(config.spec)
         self.backend = config.backend
         self._info_keys = config.spec.info_keys

@@ -1,6 +1,6 @@
 """What the MuJoCo tasks have in common: an environment on `Physics`."""
 
-from typing import ClassVar, Generic, TypeVar
+from typing import TYPE_CHECKING, ClassVar, Generic, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -11,9 +11,11 @@ from jaxtyping import Array, Bool, Float, UInt32
 from sejax.envs.environment import Environment, EnvParams, EnvState, Step
 from sejax.envs.mujoco import physics
 from sejax.envs.mujoco.physics import Report
-from sejax.envs.mujoco.tasks import MujocoTask
 
-Config = TypeVar("Config", bound=MujocoTask)
+if TYPE_CHECKING:
+    from sejax.envs.mujoco.tasks import MujocoTask
+
+Config = TypeVar("Config", bound="MujocoTask")
 Scalars = dict[str, Float[Array, ""]]
 
 

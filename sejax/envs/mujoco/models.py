@@ -3,18 +3,20 @@
 Source: Gymnasium 1.3, `gymnasium.envs.mujoco`, of each the version 5.
 """
 
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from sejax.envs.mujoco import tasks
 from sejax.envs.mujoco.environment import MujocoEnv, Scalars, control_cost, plane
 from sejax.envs.mujoco.physics import Report
 
+if TYPE_CHECKING:
+    from sejax.envs.mujoco import tasks
 
-class HalfCheetahEnv(MujocoEnv[tasks.HalfCheetah]):
+
+class HalfCheetahEnv(MujocoEnv["tasks.HalfCheetah"]):
     r"""A planar cheetah with six joints that is paid for running forward and never terminates.
 
     .. math:: r = v_x - 0.1 \lVert a \rVert^2
@@ -40,7 +42,7 @@ class HalfCheetahEnv(MujocoEnv[tasks.HalfCheetah]):
         return {"x_position": now.qpos[0], "x_velocity": self.x_velocity(now)}
 
 
-Runner = TypeVar("Runner", bound=tasks.Runner)
+Runner = TypeVar("Runner", bound="tasks.Runner")
 
 
 class RunnerEnv(MujocoEnv[Runner]):
@@ -53,7 +55,7 @@ class RunnerEnv(MujocoEnv[Runner]):
         }
 
 
-class HopperEnv(RunnerEnv[tasks.Hopper]):
+class HopperEnv(RunnerEnv["tasks.Hopper"]):
     r"""A planar leg with three joints that is paid for hopping forward and for not falling.
 
     .. math:: r = v_x + 1 - 0.001 \lVert a \rVert^2
@@ -104,7 +106,7 @@ class Walker2dEnv(HopperEnv):
         return (height > 0.8) & (height < 2.0) & (jnp.abs(angle) < 1.0)
 
 
-class SwimmerEnv(RunnerEnv[tasks.Swimmer]):
+class SwimmerEnv(RunnerEnv["tasks.Swimmer"]):
     r"""Three links in a viscous plane that are paid for swimming along x and never terminate.
 
     .. math:: r = v_x - 10^{-4} \lVert a \rVert^2
@@ -124,7 +126,7 @@ class SwimmerEnv(RunnerEnv[tasks.Swimmer]):
         return plane(now.qpos[:2], now.qpos_change[:2] / self.physics.dt)
 
 
-class InvertedPendulumEnv(MujocoEnv[tasks.InvertedPendulum]):
+class InvertedPendulumEnv(MujocoEnv["tasks.InvertedPendulum"]):
     """A pole on a cart that is paid 1 for each step after which it stands.
 
     It has fallen, which terminates, at an angle beyond 0.2 rad. Observations are positions and
@@ -148,7 +150,7 @@ class InvertedPendulumEnv(MujocoEnv[tasks.InvertedPendulum]):
 _TORSO = 1
 
 
-class AntEnv(RunnerEnv[tasks.Ant]):
+class AntEnv(RunnerEnv["tasks.Ant"]):
     r"""A body on four legs with eight joints that is paid for walking along x and for its health.
 
     .. math:: r = v_x + 1 - 0.5 \lVert a \rVert^2 - 5 \cdot 10^{-4} \lVert F \rVert^2
@@ -200,7 +202,7 @@ def _forces(now: Report) -> Float[Array, "nbody 6"]:
 _RADIUS = 0.2  # m, of the disc that the target is in
 
 
-class ReacherEnv(MujocoEnv[tasks.Reacher]):
+class ReacherEnv(MujocoEnv["tasks.Reacher"]):
     r"""An arm with two joints that is charged for the distance of its tip x from a target.
 
     .. math:: r = -\lVert x - x_{target} \rVert - \lVert a \rVert^2
@@ -213,7 +215,7 @@ class ReacherEnv(MujocoEnv[tasks.Reacher]):
     file = "reacher.xml"
     frame_skip = 2
 
-    def __init__(self, config: tasks.Reacher):
+    def __init__(self, config: "tasks.Reacher"):
         super().__init__(config)
         self._tip, self._target = (self.physics.model.body(x).id for x in ("fingertip", "target"))
 
