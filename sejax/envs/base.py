@@ -73,8 +73,9 @@ class Task(TaskSpec):
         from sejax.envs.wrappers import as_vectors  # imports JAX
 
         solved_reward = options.as_python(solved_reward)
-        options.require(
-            options.is_number(solved_reward) and not math.isnan(solved_reward),
+        is_nan = options.is_number(solved_reward) and math.isnan(solved_reward)
+        options.require(  # it may be traced
+            not is_nan and not isinstance(solved_reward, str | None),
             "env.solved_reward",
             f"must be a number; got {options.shortened(solved_reward)}. Set env.solved_reward=inf "
             "if it is undefined.",
