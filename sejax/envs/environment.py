@@ -40,7 +40,7 @@ Step = tuple[Array, State, Array, Array, dict[str, Array]]  # obs, state, reward
 class Environment(Generic[State, Params]):
     """An environment whose `step_env` and `reset_env` act on one element.
 
-    A subclass adds `reset_env`, `step_env`, `is_terminated` and, for `get_obs`, `observe`.
+    A subclass adds `start` and `observe` (or `reset_env`), `step_env` and `is_terminated`.
 
     Args:
       spec: its spaces, and the step limit of `default_params`.
@@ -63,6 +63,11 @@ class Environment(Generic[State, Params]):
 
     def reset_env(self, key: Array, params: Params) -> tuple[Array, State]:
         """First observation and state of an episode."""
+        state = self.start(key)
+        return self.observe(state), state
+
+    def start(self, key: Array) -> State:
+        """First state of an episode."""
         raise NotImplementedError
 
     def step_env(self, key: Array, state: State, action: Array, params: Params) -> Step[State]:

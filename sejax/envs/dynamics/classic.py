@@ -46,12 +46,9 @@ class CartPoleEnv(Environment[CartPoleState, CartPoleParams]):
 
     params_class = CartPoleParams
 
-    def reset_env(self, key: Array, params: CartPoleParams) -> tuple[Array, CartPoleState]:
-        start = jax.random.uniform(key, minval=-0.05, maxval=0.05, shape=(4,))
-        state = CartPoleState(
-            x=start[0], x_dot=start[1], theta=start[2], theta_dot=start[3], time=0
-        )
-        return self.observe(state), state
+    def start(self, key: Array) -> CartPoleState:
+        x, x_dot, theta, theta_dot = jax.random.uniform(key, (4,), minval=-0.05, maxval=0.05)
+        return CartPoleState(x=x, x_dot=x_dot, theta=theta, theta_dot=theta_dot, time=0)
 
     def step_env(
         self, key: Array, state: CartPoleState, action: Array, params: CartPoleParams
@@ -113,16 +110,15 @@ class AcrobotEnv(Environment[AcrobotState, AcrobotParams]):
 
     params_class = AcrobotParams
 
-    def reset_env(self, key: Array, params: AcrobotParams) -> tuple[Array, AcrobotState]:
-        start = jax.random.uniform(key, shape=(4,), minval=-0.1, maxval=0.1)
-        state = AcrobotState(
-            joint_angle1=start[0],
-            joint_angle2=start[1],
-            velocity_1=start[2],
-            velocity_2=start[3],
+    def start(self, key: Array) -> AcrobotState:
+        angle1, angle2, *velocities = jax.random.uniform(key, (4,), minval=-0.1, maxval=0.1)
+        return AcrobotState(
+            joint_angle1=angle1,
+            joint_angle2=angle2,
+            velocity_1=velocities[0],
+            velocity_2=velocities[1],
             time=jnp.int32(0),
         )
-        return self.observe(state), state
 
     def step_env(
         self, key: Array, state: AcrobotState, action: Array, params: AcrobotParams
@@ -130,8 +126,9 @@ class AcrobotEnv(Environment[AcrobotState, AcrobotParams]):
         noise = params.torque_noise_max
         torque = params.available_torque[action]
         torque = torque + jax.random.uniform(key, shape=(), minval=-noise, maxval=noise)
-        angles, velocities = self._angles(state), (state.velocity_1, state.velocity_2)
-        after = _runge_kutta(jnp.array([*angles, *velocities, torque]), params)
+        angles = [state.joint_angle1, state.joint_angle2]
+        before = jnp.array([*angles, state.velocity_1, state.velocity_2, torque])
+        after = _runge_kutta(before, params)
         state = AcrobotState(
             joint_angle1=_wrap(after[0], -jnp.pi, jnp.pi),
             joint_angle2=_wrap(after[1], -jnp.pi, jnp.pi),
@@ -142,15 +139,13 @@ class AcrobotEnv(Environment[AcrobotState, AcrobotParams]):
         return self.after(state, -1.0 * (1 - self.is_terminated(state, params)), params)
 
     def observe(self, state: AcrobotState) -> Array:
-        angles = [f(angle) for angle in self._angles(state) for f in (jnp.cos, jnp.sin)]
-        return jnp.array([*angles, state.velocity_1, state.velocity_2])
+        angles = [state.joint_angle1, state.joint_angle2]
+        sides = [f(angle) for angle in angles for f in (jnp.cos, jnp.sin)]
+        return jnp.array([*sides, state.velocity_1, state.velocity_2])
 
     def is_terminated(self, state: AcrobotState, params: AcrobotParams) -> Bool[Array, ""]:
-        angle1, angle2 = self._angles(state)
-        return -jnp.cos(angle1) - jnp.cos(angle2 + angle1) > 1.0
-
-    def _angles(self, state: AcrobotState) -> tuple[Array, Array]:
-        return state.joint_angle1, state.joint_angle2
+        angle = state.joint_angle1
+        return -jnp.cos(angle) - jnp.cos(state.joint_angle2 + angle) > 1.0
 
 
 def _runge_kutta(y: Float[Array, "5"], params: AcrobotParams) -> Float[Array, "5"]:
@@ -221,10 +216,9 @@ Params = TypeVar("Params", bound=CarParams)
 class CarEnv(Environment[CarState, Params]):
     """What both cars have in common: an underpowered car in a valley, and a goal on a hill."""
 
-    def reset_env(self, key: Array, params: Params) -> tuple[Float[Array, "2"], CarState]:
-        position = jax.random.uniform(key, shape=(), minval=-0.6, maxval=-0.4)
-        state = CarState(position=position, velocity=jnp.array(0.0), time=0)
-        return self.observe(state), state
+    def start(self, key: Array) -> CarState:
+        position = jax.random.uniform(key, minval=-0.6, maxval=-0.4)
+        return CarState(position=position, velocity=jnp.array(0.0), time=0)
 
     def observe(self, state: CarState) -> Array:
         return jnp.array([state.position, state.velocity])
@@ -324,11 +318,10 @@ class PendulumEnv(Environment[PendulumState, PendulumParams]):
 
     params_class = PendulumParams
 
-    def reset_env(self, key: Array, params: PendulumParams) -> tuple[Array, PendulumState]:
+    def start(self, key: Array) -> PendulumState:
         high = jnp.array([jnp.pi, 1])
-        start = jax.random.uniform(key, shape=(2,), minval=-high, maxval=high)
-        state = PendulumState(theta=start[0], theta_dot=start[1], time=0)
-        return self.observe(state), state
+        theta, theta_dot = jax.random.uniform(key, (2,), minval=-high, maxval=high)
+        return PendulumState(theta=theta, theta_dot=theta_dot, time=0)
 
     def step_env(
         self, key: Array, state: PendulumState, action: Array, params: PendulumParams

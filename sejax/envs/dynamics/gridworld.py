@@ -68,10 +68,9 @@ class GridWorld(Environment[GridState, GridParams]):
         self._hole = (cells == "O").ravel()  # [num_states]
         self._next = _next_indices(cells)  # [num_states, 4]
 
-    def reset_env(self, key: Array, params: GridParams) -> tuple[Array, GridState]:
+    def start(self, key: Array) -> GridState:
         """Puts the agent on the map's S; the key has no effect."""
-        state = GridState(index=jnp.int32(self._start), time=0)
-        return self.observe(state), state
+        return GridState(index=jnp.int32(self._start), time=0)
 
     def step_env(
         self, key: Array, state: GridState, action: Array, params: GridParams

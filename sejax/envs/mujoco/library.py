@@ -116,7 +116,7 @@ def build(path: Path) -> None:
     except (OSError, subprocess.CalledProcessError) as error:
         said = error if isinstance(error, OSError) else error.stderr.strip()
         raise BuildError(
-            f"{command[0]} failed with: {shortened(said, 200)}. Mend that, or set CXX"
+            f"{command[0]} failed with: {shortened(said, 120)}. Mend that, or set CXX"
         ) from error
 
 
