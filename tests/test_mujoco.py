@@ -489,4 +489,4 @@ def test_sanitizers_find_nothing_in_walks_and_malformed_calls(tmp_path):
 
 @pytest.mark.slow
 def test_memory_does_not_grow_over_a_million_steps():
-    run_program("memory", "reacher", "200000")  # two lanes, three times
+    run_program("memory", "reacher", "200000")  # two walks, three times

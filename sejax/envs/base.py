@@ -6,7 +6,7 @@ import functools
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 from sejax import options
 from sejax.envs.spec import Space, TaskSpec
@@ -15,6 +15,12 @@ if TYPE_CHECKING:
     from jaxtyping import Array, PyTree
 
     from sejax.envs.environment import Environment, EnvParams
+
+
+class TaskConfig(Protocol):
+    """A dataclass whose fields are a task's options; its `spec`, if it has one, is the task's."""
+
+    def make(self) -> "Task": ...
 
 
 @dataclass(frozen=True, kw_only=True, eq=False, init=False)

@@ -58,8 +58,7 @@ def _load() -> ctypes.CDLL:
         build(built)
         with contextlib.suppress(OSError):
             if kept is not None:
-                with files.atomic_path(kept) as place:
-                    shutil.copyfile(built, place)
+                files.write_bytes(kept, built.read_bytes())
                 return _register(kept)
         try:
             return _register(built)
