@@ -9,7 +9,7 @@ import sejax
 from experiments.common.reward_networks import STUDIES
 from sejax.agents.dqn import DDQNConfig
 from sejax.agents.ppo import PPOConfig
-from sejax.cli import config as configuration
+from sejax.cli import preset_files
 from sejax.options import ConfigError, registry
 from sejax.training import TrainingConfig
 
@@ -227,21 +227,21 @@ def test_ppo_on_ses_is_the_default(env):
 
 
 def test_what_is_tuned_is_known():
-    assert configuration.preset_names() == ["best", "paper", "paper_performance", "soft"]
-    assert configuration.tuned("rn") == [
+    assert preset_files.names() == ["best", "paper", "paper_performance", "soft"]
+    assert preset_files.tuned("rn") == [
         "cartpole", "cliff_walking", "halfcheetah", "mountain_car_continuous", "pendulum",
     ]  # fmt: skip
-    assert configuration.tuned("se", "paper") == ["acrobot", "cartpole"]
-    assert configuration.is_tuned("acrobot", "se") and not configuration.is_tuned("acrobot", "rn")
+    assert preset_files.tuned("se", "paper") == ["acrobot", "cartpole"]
+    assert preset_files.is_tuned("acrobot", "se") and not preset_files.is_tuned("acrobot", "rn")
 
 
 def test_every_file_is_of_a_task_and_proxy_and_has_settings_of_known_choices():
-    for path in configuration.PRESETS.glob("*.yaml"):
+    for path in preset_files.PRESETS.glob("*.yaml"):
         env, _, proxy = path.stem.rpartition("-")
         assert proxy in registry.names("proxy")
-        assert env in (configuration.GENERAL, *registry.names("env"))
-        for name, section in configuration.preset_sections(env, proxy).items():
-            assert name in configuration.preset_names()
+        assert env in (preset_files.GENERAL, *registry.names("env"))
+        for name, section in preset_files.sections_of(env, proxy).items():
+            assert name in preset_files.names()
             for group in ("agent", "es", "objective"):
                 assert set(section.get(f"with_{group}", {})) <= set(registry.names(group))
 
@@ -259,7 +259,7 @@ def test_a_section_has_the_settings_of_the_one_it_is_like_where_it_says_nothing(
 @pytest.mark.parametrize("proxy", ["se", "rn"])
 def test_a_task_without_a_file_has_general_settings(proxy):
     composed = composed_with("env=gymnax/MountainCar-v0", f"proxy={proxy}")
-    general = configuration.preset_sections("general", proxy)["best"]
+    general = preset_files.sections_of("general", proxy)["best"]
     assert composed.generations == general["generations"]
     for name, value in general["training"].items():
         assert getattr(composed.training, name) == value
