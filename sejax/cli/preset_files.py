@@ -102,7 +102,7 @@ def read_file(path: Path) -> dict[str, Any]:
         content = yaml.safe_load(path.read_text(encoding="utf-8"))
     except (OSError, yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
         raise ConfigError(
-            f"preset must be a name or a YAML file that can be read; got {shortened(path, 60)} "
+            f"preset must be a name or a YAML file that can be read; got {shortened(path, 40)} "
             f"({told(error)}). Set preset=best.",
             "preset",
         ) from error

@@ -50,8 +50,9 @@ def to_plain(value: object) -> Any:
         return [to_plain(x) for x in value]
     if isinstance(value, Mapping):
         return {str(key): to_plain(x) for key, x in value.items()}
-    is_array = hasattr(value, "tolist") and not isinstance(value, type)  # NumPy's and jax's
-    return value.tolist() if is_array else value
+    if hasattr(value, "tolist") and not isinstance(value, type):  # arrays of NumPy and jax
+        return value.tolist()
+    return value
 
 
 def from_plain(cls: type[T], values: Mapping[str, Any], where: str) -> T:
