@@ -143,7 +143,7 @@ class LearnConfig(Options):
     # default: the agent's; varied: learning rate, batch and network drawn anew for each training.
     agent_hparams: str = option("default", one_of(AGENT_HPARAMS))
     # n_o: steps of the outer loop.
-    generations: int = option(50, counts("there is nothing to do otherwise", most=1_000_000))
+    generations: int = option(100, counts("there is nothing to do otherwise", most=1_000_000))
     seed: int = option(0, seed())
     # Independent runs, with seeds seed, seed + 1, ...
     num_seeds: int = option(1, counts("it counts runs"))
@@ -432,15 +432,15 @@ def evaluate_config(overrides: Sequence[str] = ()) -> EvaluateConfig:
             "must be given; got none. Set proxy=RUN_DIR, proxy=FILE, proxy=cartpole (shipped), or "
             "proxy=real env=cartpole.",
         )
+        groups = ("agents", *EvaluateConfig.groups)
+        own = [(k, x) for k, x in composed.given.items() if k.partition(".")[0] in groups]
         as_learned = composed.values.get("agent_hparams") == "as_learned"
-        for name, value in composed.given.items():
-            group = name.partition(".")[0]
-            require(
-                not as_learned or group not in ("agents", *EvaluateConfig.groups),
-                group,
-                f"must be left out with agent_hparams=as_learned; got {name}={shortened(value)}. "
-                "Set agent_hparams=default.",
-            )
+        require(
+            not own or not as_learned or composed.values["proxy"] == "real",
+            own[0][0].partition(".")[0] if own else "",
+            "must be left out with agent_hparams=as_learned; got "
+            f"{shortened(', '.join(f'{k}={x}' for k, x in own))}. Set agent_hparams=default.",
+        )
         return _from_plain(EvaluateConfig, composed.values)
 
 

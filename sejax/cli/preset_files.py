@@ -83,7 +83,7 @@ def values_of(preset: str, chosen: Mapping[str, str], mixture: Mapping[str, str]
     )
     section = sections[preset]
     values: dict[str, Any] = {k: v for k, v in section.items() if not k.startswith("with_")}
-    for group in ("agent", "es", "objective"):
+    for group in ("es", "objective", "agent"):
         values = merge(values, section.get(f"with_{group}", {}).get(chosen.get(group), {}))
     with_agent = section.get("with_agent", {})
     each = {key: with_agent.get(name, {}).get("agent", {}) for key, name in mixture.items()}
