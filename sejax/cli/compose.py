@@ -44,7 +44,7 @@ from sejax.options.plain import (
 from sejax.training import TrainingConfig
 
 if TYPE_CHECKING:
-    from sejax.cli.config import EvaluateConfig, LearnConfig
+    from sejax.cli.config import CommandConfig
 
 # Choices where neither an override nor the task or the proxy makes one.
 DEFAULTS = {
@@ -76,9 +76,7 @@ class Composed:
     values: dict[str, Any]
 
 
-def compose(
-    schema: "type[LearnConfig] | type[EvaluateConfig]", overrides: Sequence[str]
-) -> Composed:
+def compose(schema: "type[CommandConfig]", overrides: Sequence[str]) -> Composed:
     """Composes a command's overrides over its preset and its defaults.
 
     Args:
@@ -92,20 +90,15 @@ def compose(
     mixture = _mixture(given)
     chosen = _choices(schema, given, mixture)
     fields = _fields(schema, chosen, mixture)
-    for name, value in given.items():
-        if name not in (*schema.groups, "agents"):
-            _require_field(name, value, chosen, fields)
-    values: dict[str, Any] = {
-        field.name: to_plain(field.default)
-        for field in dataclasses.fields(schema)
-        if isinstance(field.default, TrainingConfig)
-    }
+    settings = {k: x for k, x in given.items() if k not in (*schema.groups, "agents")}
+    own = fields_of(schema).items()
+    values = {name: to_plain(x) for name, x in own if isinstance(x, TrainingConfig)}
     if schema.learns:
         preset = preset_files.values_of(given.get("preset", "best"), chosen, mixture)
         values = merge(values, preset)
-    for name, value in given.items():
-        if name not in (*schema.groups, "agents"):
-            values = merge(values, _nested(name, value))
+    for name, value in settings.items():
+        _require_field(name, value, chosen, fields)
+        values = merge(values, _nested(name, value))
     values = merge({group: {"name": name} for group, name in chosen.items()}, values)
     each = {key: {"name": name} for key, name in mixture.items()}
     return Composed(given, fields, merge({"agents": each}, values) if each else values)
@@ -224,7 +217,7 @@ def _mixture(given: Mapping[str, Any]) -> dict[str, str]:
 
 
 def _choices(
-    schema: "type[LearnConfig] | type[EvaluateConfig]",
+    schema: "type[CommandConfig]",
     given: Mapping[str, Any],
     mixture: Mapping[str, str],
 ) -> dict[str, str]:
@@ -252,7 +245,7 @@ def _choices(
 
 
 def _fields(
-    schema: "type[LearnConfig] | type[EvaluateConfig]",
+    schema: "type[CommandConfig]",
     chosen: Mapping[str, str],
     mixture: Mapping[str, str],
 ) -> dict[str, tuple[Any, str]]:
@@ -308,7 +301,7 @@ def _require_field(
 # --- help ----------------------------------------------------------------------------------------
 
 
-def help_text(schema: "type[LearnConfig] | type[EvaluateConfig]", overrides: Sequence[str]) -> str:
+def help_text(schema: "type[CommandConfig]", overrides: Sequence[str]) -> str:
     """What `--help` lists: the choices of each group, and the fields that these overrides compose.
 
     Args:

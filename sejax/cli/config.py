@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, ClassVar, TypeVar
 
 from sejax import agents, envs
-from sejax.agents.base import Agent, AgentConfig
+from sejax.agents.base import Agent, AgentConfig, ExplorationConfig
 from sejax.agents.mixture import Mixture, MixtureConfig
 from sejax.cli.compose import DEFAULTS, compose, key_of, named
 from sejax.envs.spec import TaskSpec
@@ -38,7 +38,7 @@ TRAINING_FROM = ("proxy", "config")
 TRAINING = TrainingConfig()  # on proxies
 REAL_TRAINING = TrainingConfig(stop_rule="solved")
 JOINT = "+"  # between the agents of a mixture, in names
-Schema = TypeVar("Schema", "LearnConfig", "EvaluateConfig")
+Schema = TypeVar("Schema", bound="CommandConfig")
 
 
 # --- the agents of a run -------------------------------------------------------------------------
@@ -103,7 +103,7 @@ def _family(key: str, values: object) -> AgentFamily:
         return from_plain(AgentFamily, family | {"agent": agent}, "agent")
 
 
-def families_of(config: "LearnConfig | EvaluateConfig") -> tuple[AgentFamily, ...]:
+def families_of(config: "CommandConfig") -> tuple[AgentFamily, ...]:
     """The agents of a command's configuration: several, or the one."""
     if config.agents is not None:
         return config.agents.families
@@ -115,7 +115,36 @@ def families_of(config: "LearnConfig | EvaluateConfig") -> tuple[AgentFamily, ..
 
 
 @dataclass(frozen=True, kw_only=True)
-class LearnConfig(Options):
+class CommandConfig(Options):
+    """What runs and evaluations share.
+
+    Attributes:
+      groups: the groups of plugins whose choices are fields.
+      learns: whether proxies are learned: presets have settings, a mixture's agents have shares.
+    """
+
+    groups: ClassVar[tuple[str, ...]] = ()
+    learns: ClassVar[bool] = False
+
+    agent: Any = None  # trains on the proxies; null with `agents`
+    agents: AgentsConfig | None = None  # several agents in place of one: agents=[ddqn,ppo]
+    exploration: ExplorationConfig  # intrinsic reward of the agents
+    training: TrainingConfig = TRAINING  # on proxies
+    seed: int = option(0, seed())
+    # Agents that train side by side on one device; null: what suits the agent and the device.
+    num_parallel: int | None = option(None, counts("something must compute"))
+    devices: int | None = option(None, counts("something must compute"))  # null: all
+
+    @staticmethod
+    def spec_for(given: Mapping[str, Any]) -> TaskSpec:
+        """The task of overrides, whose default agent is taken."""
+        fields = {name[4:]: value for name, value in given.items() if name.startswith("env.")}
+        name = given.get("env", DEFAULTS["env"])
+        return envs.spec_of(registry.configure("env", {**fields, "name": name}))
+
+
+@dataclass(frozen=True, kw_only=True)
+class LearnConfig(CommandConfig):
     """A whole bilevel optimisation: what `sejax.run` and `sejax.make_learner` take.
 
     Raises:
@@ -123,7 +152,7 @@ class LearnConfig(Options):
     """
 
     groups: ClassVar[tuple[str, ...]] = tuple(DEFAULTS)
-    learns: ClassVar[bool] = True  # a proxy: presets have settings, a mixture's agents shares
+    learns: ClassVar[bool] = True
     # Fields that the default run directory is named by.
     in_run_dir: ClassVar[tuple[str, ...]] = (
         *("env", "proxy", "agent", "agents", "exploration", "agent_hparams", "seed"),
@@ -132,35 +161,20 @@ class LearnConfig(Options):
     preset: str = "best"  # settings that were measured (best) or published (paper)
     env: Any  # the real task
     proxy: Any  # what is learned: a synthetic environment (se) or a reward network (rn)
-    agent: Any = None  # trains on the proxies; null with `agents`
-    agents: AgentsConfig | None = None  # several agents that take turns: agents=[ddqn,ppo]
-    exploration: Any  # intrinsic reward of the agents
     es: Any  # the evolution strategy of the outer loop
     objective: Any  # what the outer loop maximises
     tracker: Any  # follows the run beside its files
     machines: Any  # where agents train
-    training: TrainingConfig = TRAINING
     # default: the agent's; varied: learning rate, batch and network drawn anew for each training.
     agent_hparams: str = option("default", one_of(AGENT_HPARAMS))
     # n_o: steps of the outer loop.
     generations: int = option(100, counts("there is nothing to do otherwise", most=1_000_000))
-    seed: int = option(0, seed())
     # Independent runs, with seeds seed, seed + 1, ...
     num_seeds: int = option(1, counts("it counts runs"))
     # End a run at its first incumbent mean that reaches the solved threshold.
     stop_when_solved: bool = False
-    # Agents that train side by side on one device; null: what suits the agent and the device.
-    num_parallel: int | None = option(None, counts("something must compute"))
-    devices: int | None = option(None, counts("something must compute"))  # null: all
     checkpoint_every: int = option(1, counts("it counts generations"))  # generations
     run_dir: str | None = None  # null: runs/<env>-<proxy>-<agent>[_<exploration>][_varied]-s<seed>
-
-    @staticmethod
-    def spec_for(given: Mapping[str, Any]) -> TaskSpec:
-        """The task of overrides, whose default agent is taken."""
-        fields = {name[4:]: value for name, value in given.items() if name.startswith("env.")}
-        name = given.get("env", DEFAULTS["env"])
-        return envs.spec_of(registry.configure("env", {**fields, "name": name}))
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -243,18 +257,14 @@ class LearnConfig(Options):
 
 
 @dataclass(frozen=True, kw_only=True)
-class EvaluateConfig(Options):
+class EvaluateConfig(CommandConfig):
     """What `sejax.evaluate` takes."""
 
     groups: ClassVar[tuple[str, ...]] = ("agent", "exploration")
-    learns: ClassVar[bool] = False
 
     proxy: str  # a run directory, a safetensors file, a shipped name (cartpole), or real
     env: str | None = None  # the task, where proxy=real or the proxy's is your own
     proxy_kind: str | None = None  # my_module:MyProxy, where the proxy is of a kind of your own
-    agent: Any = None  # null with `agents`
-    agents: AgentsConfig | None = None  # several agents in one table: agents=[ddqn,ppo]
-    exploration: Any  # intrinsic reward of the agents
     # default: the agent's; varied: drawn around them for each agent; as_learned: agent and
     # exploration that the proxy was learned with.
     agent_hparams: str = option("default", one_of(EVALUATION_HPARAMS))
@@ -264,12 +274,7 @@ class EvaluateConfig(Options):
     training_from: str = option("proxy", one_of(TRAINING_FROM))
     num_agents: int = option(10, counts("there is nothing to average otherwise"))
     baseline: bool = True  # as many agents trained on the real task, beside them
-    seed: int = option(0, seed())
-    # Agents that train side by side on one device; null: what suits the agent and the device.
-    num_parallel: int | None = option(None, counts("something must compute"))
-    devices: int | None = option(None, counts("something must compute"))  # null: all
     out_dir: str | None = None  # null: beside the proxy (runs/evaluate-<name> without a folder)
-    training: TrainingConfig = TRAINING  # on the proxy, with training_from=config
     # On the real task, and how all agents are tested unless training_from=config.
     real_training: TrainingConfig = REAL_TRAINING
 
@@ -280,7 +285,7 @@ class EvaluateConfig(Options):
 
         source = str(given.get("proxy", ""))
         if source in ("", "real"):
-            return LearnConfig.spec_for(given)
+            return CommandConfig.spec_for(given)
         return TaskSpec.of_interface(header.read(source, "proxy")[1].interface)
 
     def __post_init__(self) -> None:
@@ -316,7 +321,7 @@ def learn_config(values: Mapping[str, Any]) -> LearnConfig:
     return _from_plain(LearnConfig, unsaid | dict(values))
 
 
-def plain(config: LearnConfig | EvaluateConfig) -> dict[str, Any]:
+def plain(config: CommandConfig) -> dict[str, Any]:
     """A command's configuration as plain values; inverse of `learn_config`."""
     values = {field.name: getattr(config, field.name) for field in dataclasses.fields(config)}
     for group in config.groups:
