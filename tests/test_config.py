@@ -221,7 +221,7 @@ def test_a_runs_configuration_is_a_preset_file(tmp_path, overrides):
 @pytest.mark.parametrize(
     "text",
     ["", "[1, 2]", "just text", "a: [", "env: 3", "nope: 1", "env: nope", "preset: other.yaml",
-     "agent: {batch_size: {x: 1}}", "1: 2", "\x00", "- &a [*a]"],
+     "agent: {batch_size: {x: 1}}", "1: 2", "\x00", "- &a [*a]", "env: &a {x: *a}"],
 )  # fmt: skip
 def test_a_bad_preset_file_is_one_message(tmp_path, text):
     (tmp_path / "bad.yaml").write_text(text)

@@ -100,6 +100,7 @@ def read_file(path: Path) -> dict[str, Any]:
     """
     try:
         content = yaml.safe_load(path.read_text(encoding="utf-8"))
+        values = flatten(content) if isinstance(content, dict) else {}
     except (OSError, yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
         raise ConfigError(
             f"preset must be a name or a YAML file that can be read; got {shortened(path, 40)} "
@@ -107,12 +108,11 @@ def read_file(path: Path) -> dict[str, Any]:
             "preset",
         ) from error
     require(
-        content and isinstance(content, dict),
+        values,
         "preset",
         f"must be a file that maps fields to values; got {shortened(path)} with "
         f"{shortened(content)}. Write `es.noise_std: 0.1` there, or set preset=best.",
     )
-    values = flatten(content)
     base = str(values.get("preset", ""))
     require(
         not base.endswith(ENDING),

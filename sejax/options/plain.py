@@ -123,7 +123,8 @@ def _read(value: Any, hint: Any, name: str, default: Any) -> Any:
 def _as(kind: Any, value: Any, name: str, default: Any) -> Any:
     """A value as one type."""
     origin, arguments = typing.get_origin(kind) or kind, typing.get_args(kind)
-    fix = "VALUE" if default is MISSING else as_text(to_plain(default))
+    is_open = default is MISSING or dataclasses.is_dataclass(default)
+    fix = "VALUE" if is_open else as_text(to_plain(default))
 
     def needs(holds: bool, must: str) -> None:
         require(holds, name, f"must {must}; got {shortened(repr(value))}. Set {name}={fix}.")
