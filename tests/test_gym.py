@@ -406,7 +406,7 @@ def test_a_task_of_gymnax_is_gymnasiums_of_that_id(tmp_path, given, limit):
     path = tmp_path / "se.safetensors"
     jax_env = SyntheticConfig(**SMALL).make(jax_task)
     sejax.save(path, jax_env, random_weights(jax_env))
-    task = se_task(read(path)[1], None, needs_starts=True)
+    task = se_task(read(path).header, None, needs_starts=True)
     assert task.action_space == spaces.Discrete(3) and task.max_steps == limit
     position, velocity = task.starts(np.random.default_rng(0))
     assert -0.6 <= position <= -0.4 and velocity == 0.0

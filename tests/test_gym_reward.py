@@ -74,7 +74,7 @@ def stored_rn(tmp_path, num_inputs, task="walk", discount=0.9, interface=WALK, *
         proxies=[{}],
     )  # fmt: skip
     path = tmp_path / "rn.safetensors"
-    path.write_bytes(stored.with_tensors(tensors))
+    path.write_bytes(header.packed(tensors, stored))
     if config.shaping.weighs_info:
         return path, tensors["info_weights"]
     layers = {layer: {k: tensors[f"potential/{layer}/{k}"] for k in ("kernel", "bias")}

@@ -17,10 +17,10 @@ from safetensors.numpy import save_file
 
 import sejax
 from sejax import envs
+from sejax.envs import TaskSpec
 from sejax.ops.checksummed import pack, unpack
 from sejax.options import ConfigError, registry
 from sejax.proxies import header
-from sejax.proxies.base import absent_task
 from sejax.proxies.configs import RewardConfig, SyntheticConfig
 
 CONFIG = {"preset": "best", "agent": {"name": "q_learning", "discount": 0.7}, "run_dir": "/home/me"}
@@ -491,7 +491,7 @@ def test_the_shipped_cheetah_needs_no_mujoco(monkeypatch):
     env, params = sejax.load("halfcheetah")
     _, obs, reward = rollout(env, params, jax.random.key(0), num_steps=1)
     assert obs.shape == (17,) and jnp.isfinite(reward)
-    assert env.task.interface == header.read("halfcheetah")[1].interface
+    assert env.task.interface == header.read("halfcheetah").header.interface
     with pytest.raises(ConfigError, match="needs MuJoCo"):
         sejax.load("halfcheetah-rn")
 
@@ -499,8 +499,7 @@ def test_the_shipped_cheetah_needs_no_mujoco(monkeypatch):
 @pytest.mark.parametrize("name", ["cartpole", "cliff_walking", "pendulum", "gymnax/Pong-misc"])
 def test_spaces_of_a_task_come_back_from_plain_values(name):
     task = envs.make(name)
-    again = absent_task(name, json.loads(json.dumps(task.interface)), task.origin, "")
-    assert again.origin == task.origin
+    again = TaskSpec.of_interface(json.loads(json.dumps(task.interface)))
     assert again.interface == task.interface
     assert (again.obs_dim, again.action_dim) == (task.obs_dim, task.action_dim)
     assert (again.num_states, again.num_actions) == (task.num_states, task.num_actions)
@@ -520,7 +519,7 @@ def test_a_folder_without_a_proxy_says_what_it_is(tmp_path):
     for load in (sejax.load, sejax.load_set):
         assert "it is no run" in str(refusal(load, tmp_path))
     (tmp_path / "config.yaml").write_text("{}")
-    assert "not finished a generation" in str(refusal(sejax.load, tmp_path))
+    assert "no generation" in str(refusal(sejax.load, tmp_path))
 
 
 @pytest.mark.parametrize(

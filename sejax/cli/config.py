@@ -789,8 +789,8 @@ def _agent_on(source: str, env: str | None) -> str:
 
     try:
         if source not in ("", "real"):
-            _, stored = header.read(source, "proxy")
-            return agents.default_for(envs.TaskSpec.of_interface(stored.interface))
+            spec = header.read(source, "proxy").header.spec
+            return agents.default_for(spec)
         task = {"name": env} if env is not None else {}
         return agents.default_for(envs.spec_of(registry.configure("env", task)))
     except ConfigError:

@@ -14,7 +14,7 @@ from sejax.gym.synthetic import SyntheticEnv, SyntheticWorld
 from sejax.gym.tasks import RealTask, rn_env, se_task
 from sejax.gym.vector import SyntheticVectorEnv
 from sejax.options import ConfigError, as_python, counts, registry, require, shortened
-from sejax.proxies.header import Header, pretrained_names, read_single
+from sejax.proxies.header import Header, pretrained_names, read
 
 if TYPE_CHECKING:
     from stable_baselines3.common.vec_env import VecEnv
@@ -167,7 +167,7 @@ def _read(
     Raises:
       ConfigError: as `make`.
     """
-    weights, header = read_single(source, ("se", "rn"))
+    _, weights, header = read(source, kinds=("se", "rn"), single=True)
     if header.kind == "rn":
         return header, None
     require(

@@ -16,7 +16,7 @@ from sejax.gym.tasks import GYMNASIUM_IDS, RealTask, num_categories, vector_size
 from sejax.options import ConfigError, as_python, fraction, registry, require, shortened
 from sejax.proxies import MAX_ABS_VALUE
 from sejax.proxies.configs import RewardConfig
-from sejax.proxies.header import check_tensors, read_single
+from sejax.proxies.header import check_tensors, read
 
 SAME_NUMBERS = (DtypeObservation, FlattenObservation)  # wrappers that change no number
 GYMNASIUM_NAMES = {"reward_run": "reward_forward"}  # entries of `info` that it calls otherwise
@@ -74,7 +74,7 @@ class RewardNetwork(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
             limit_is_terminal=limit_is_terminal,
         )
         super().__init__(env)
-        weights, header = read_single(source, ("rn",))
+        _, weights, header = read(source, kinds=("rn",), single=True)
         self.config: RewardConfig = registry.configure("proxy", header.config["proxy"])
         discount = as_python(discount)
         if discount is not None:

@@ -196,8 +196,9 @@ def _task_with_starts(header: Header) -> RealTask:
     env = same_env(config)
     if env is not None:
         return RealTask.of_env(env)
-    gymnax_id = header.task_kind.removeprefix(GYMNAX)
-    if gymnax_id != header.task_kind and gymnax_id in gymnasium.registry:
+    kind = str(config.get("name"))
+    gymnax_id = kind.removeprefix(GYMNAX)
+    if gymnax_id != kind and gymnax_id in gymnasium.registry:
         return RealTask.of_gymnasium(gymnax_id, registry.configure("env", config).max_steps)
     raise _unknown_task(header, "sejax.gym.make(source, task=sejax.gym.RealTask(...))")
 
@@ -226,7 +227,7 @@ def rn_env(header: Header, env_id: Any, render_mode: str | None) -> gymnasium.En
 def _unknown_task(header: Header, fix: str) -> ConfigError:
     """Error for a task that only the caller can give."""
     options = [f"{key}={x}" for key, x in header.config["env"].items() if key != "name"]
-    name = header.task_kind + (f" ({', '.join(options)})" if options else "")
+    name = str(header.config["env"].get("name")) + (f" ({', '.join(options)})" if options else "")
     return ConfigError(
         f"task must be given for {shortened(name, 80)}, because Gymnasium has no environment that "
         f"is the same; got none. Set {fix}, or an id of Gymnasium.",

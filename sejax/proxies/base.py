@@ -20,6 +20,7 @@ from sejax.envs.environment import Environment, EnvParams
 from sejax.envs.spec import TaskSpec
 from sejax.options import ConfigError, require
 from sejax.proxies import ProxyConfig
+from sejax.proxies.header import Header
 
 
 @struct.dataclass
@@ -45,13 +46,12 @@ class ProxyEnv(Environment, ABC):
       ConfigError: for a configuration that does not derive from `ProxyConfig`.
     """
 
-    def __init__(self, task: Task, config: Any):
+    def __init__(self, task: Task, config: ProxyConfig):
+        name = type(config).__name__
         require(
             isinstance(config, ProxyConfig),
             "proxy",
-            "must be a dataclass that derives from sejax.ProxyConfig, because that declares what "
-            f"is asked of a proxy; got {type(config).__name__}. Set class "
-            f"{type(config).__name__}(sejax.ProxyConfig).",
+            f"must derive from sejax.ProxyConfig; got {name}. Set class {name}(sejax.ProxyConfig).",
         )
         self.spaces = task.observation, task.action
         self.task = task
@@ -155,16 +155,15 @@ class AbsentEnv(Environment):
         return self._task_name
 
 
-def absent_task(name: str, interface: dict[str, Any], origin: dict[str, Any], reason: str) -> Task:
+def absent_task(header: Header, reason: str) -> Task:
     """A task of which no more is known than what a proxy's file says; built once.
 
     Args:
-      name: of the task.
-      interface: see `TaskSpec.interface`.
-      origin: see `Task`, for files that are written of it.
+      header: of the file.
       reason: why the task itself cannot be made.
     """
-    return _absent_task(name, json.dumps([interface, origin], sort_keys=True), reason)
+    known = json.dumps([header.interface, header.config["env"]], sort_keys=True)
+    return _absent_task(header.task, known, reason)
 
 
 @functools.cache

@@ -6,7 +6,7 @@ All of it reads a file's header without JAX. `tools/ship_proxy.py` writes the sh
 
 import itertools
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -72,6 +72,7 @@ class PretrainedProxy:
       kind: se, rn, or the name of another configuration.
       task: name of the task that it stands in for.
       settings: the proxy's configuration, plain values.
+      size_kb: size of the file in units of 1,000 bytes.
       scores: mean score of the incumbent with each agent that it was learned with, in the
         generation that the proxy is of; for an SE a test return. Empty if it was not recorded.
       objective: name of the objective that the scores are of; "" if it was not recorded.
@@ -79,20 +80,19 @@ class PretrainedProxy:
       seed: seed of its run; None if it was not recorded.
       evaluations: results of fresh agents.
       learning: its run; None if it was not recorded.
-      size_kb: size of the file in units of 1,000 bytes.
     """
 
     name: str
     kind: str
     task: str
     settings: dict[str, Any]
-    scores: dict[str, float]
-    objective: str
-    generation: int | None
-    seed: int | None
-    evaluations: tuple[Evaluation, ...]
-    learning: Learning | None
     size_kb: float
+    scores: dict[str, float] = field(default_factory=dict)
+    objective: str = ""
+    generation: int | None = None
+    seed: int | None = None
+    evaluations: tuple[Evaluation, ...] = ()
+    learning: Learning | None = None
 
     @property
     def agents(self) -> tuple[str, ...]:
@@ -147,42 +147,41 @@ def pretrained() -> Zoo:
       >>> [proxy.name for proxy in pretrained() if proxy.kind == "se"][:2]
       ['acrobot', 'cartpole']
     """
-    names = header.pretrained_names()
-    return Zoo(describe(header.PRETRAINED_DIR / f"{name}.safetensors") for name in names)
+    files = (header.PRETRAINED_DIR / f"{name}.safetensors" for name in header.pretrained_names())
+    return Zoo(describe(header.read(file, single=True)) for file in files)
 
 
-def describe(path: Path, name: str | None = None) -> PretrainedProxy:
+def describe(stored: header.Stored, name: str | None = None) -> PretrainedProxy:
     """What a file of one proxy tells about it.
 
     Args:
-      path: the file.
+      stored: the file.
       name: name of the proxy; the file's if None.
 
     Raises:
-      ConfigError: if it is damaged, of another format, or a set.
+      ConfigError: for an evaluation or a learning of another shape.
     """
-    _, stored = header.read_single(path)
-    record = stored.proxies[0]
-    scores = record.get("scores")
-    if scores is None:
-        scores = dict.fromkeys(stored.agents, record["score"]) if "score" in record else {}
-    learning = record.get("learning")
-    return PretrainedProxy(
-        name=name or path.stem,
-        kind=stored.kind,
-        task=stored.task,
-        settings=stored.config["proxy"],
-        scores=scores,
-        objective=str((stored.config.get("objective") or {}).get("name", "")),
-        generation=record.get("generation"),
-        seed=record.get("seed"),
-        evaluations=tuple(
-            registry.from_plain(Evaluation, each, "evaluation")
-            for each in record.get("evaluations", ())
-        ),
-        learning=registry.from_plain(Learning, learning, "learning") if learning else None,
-        size_kb=path.stat().st_size / 1000,
+    path, _, told = stored
+    record, objective = told.proxies[0], told.config.get("objective")
+    names = ("scores", "generation", "seed", "evaluations", "learning")
+    known = {name: record[name] for name in names if record.get(name) is not None}
+    if "score" in record:
+        agents = header.agents_of(told.config)
+        known.setdefault("scores", dict.fromkeys(agents, float(record["score"])))
+    described: PretrainedProxy = registry.from_plain(
+        PretrainedProxy,
+        {
+            "name": name or path.stem,
+            "kind": told.kind,
+            "task": told.task,
+            "settings": told.config["proxy"],
+            "objective": objective.get("name", "") if isinstance(objective, Mapping) else "",
+            "size_kb": path.stat().st_size / 1000,
+            **known,
+        },
+        "record",
     )
+    return described
 
 
 def spread(values: Sequence[float], spec: str) -> str:
@@ -223,6 +222,12 @@ _HPARAMS = {"default": "default", "varied": "drawn for each", "as_learned": "as 
 _WORLDS = {"proxy": "this proxy", "real": "the real task"}
 
 
+_TEACHES = (
+    "Fresh agents, trained for the steps given and then tested on the real task (mean and standard "
+    "deviation of the agents' mean returns):"
+)
+
+
 def card_of(proxy: PretrainedProxy, source: str, needs: Sequence[str], license_text: str) -> str:
     """A proxy's model card, in Markdown; it leaves out what is not known.
 
@@ -234,37 +239,34 @@ def card_of(proxy: PretrainedProxy, source: str, needs: Sequence[str], license_t
       license_text: a sentence, or the license's name.
     """
     about = _ABOUT.get(proxy.kind, _ABOUT_OTHER).format(task=proxy.task, kind=proxy.kind)
-    facts = table(["property", "value"], list(_facts(proxy).items()))
-    parts = [f"# {proxy.name}", about, facts]
+    facts = [{"property": name, "value": text} for name, text in _facts(proxy).items()]
+    parts = [f"# {proxy.name}", about, table(facts)]
     if proxy.evaluations:
-        rows = [
-            (
-                each.agent,
-                _HPARAMS[each.hparams],
-                _WORLDS[each.world],
-                f"{each.return_mean:.1f} ± {each.return_std:.1f}",
-                f"{each.train_steps:,.0f}",
-                str(each.num_agents),
-            )
-            for each in proxy.evaluations
-        ]
-        columns = ["agent", "hyperparameters", "trained on", "return", "training steps", "agents"]
-        parts += [
-            "## What it teaches",
-            "Fresh agents, trained for the steps given and then tested on the real task (mean and "
-            "standard deviation of the agents' mean returns):",
-            table(columns, rows),
-        ]
+        parts += ["## What it teaches", _TEACHES, table([*map(_cells, proxy.evaluations)])]
     if proxy.learning:
         parts += ["## How it was learned", f"    {proxy.learning.command}"]
-    usage = _usage(proxy, source, needs)
-    return "\n\n".join([*parts, "## How to use it", usage, "## License", license_text])
+    parts += ["## How to use it", _usage(proxy, source, needs), "## License", license_text]
+    return "\n\n".join(filter(None, parts))
 
 
-def table(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A table in Markdown."""
-    lines = [columns, ["---"] * len(columns), *rows]
+def table(rows: Sequence[Mapping[str, str]]) -> str:
+    """A table in Markdown, of rows by the names of their columns; empty without rows."""
+    if not rows:
+        return ""
+    lines = [rows[0].keys(), ["---"] * len(rows[0]), *(row.values() for row in rows)]
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+def _cells(each: Evaluation) -> dict[str, str]:
+    """An evaluation's row in a card."""
+    return {
+        "agent": each.agent,
+        "hyperparameters": _HPARAMS[each.hparams],
+        "trained on": _WORLDS[each.world],
+        "return": f"{each.return_mean:.1f} ± {each.return_std:.1f}",
+        "training steps": f"{each.train_steps:,.0f}",
+        "agents": str(each.num_agents),
+    }
 
 
 def _facts(proxy: PretrainedProxy) -> dict[str, str]:
@@ -356,17 +358,17 @@ def push(
       ConfigError: if there is no such proxy, it is a set, or the repository cannot be written.
     """
     hub.require_repo(repo)
-    path = header.find(source)
-    proxy = describe(path, name=repo.rpartition("/")[2])
-    config = header.read_config(path)
+    stored = header.read(source, single=True)
+    proxy = describe(stored, name=repo.rpartition("/")[2])
     needs = [
         argument
         for group, argument in (("env", "task"), ("proxy", "proxy"))
-        if not header.is_registered(group, config[group])
+        if not header.is_registered(group, stored.header.config[group])
     ]
     address = f"{hub.SCHEME}{repo}"
     card = _front_matter(proxy, license) + card_of(proxy, address, needs, license)
-    hub.upload(repo, {hub.FILE: path.read_bytes(), "README.md": card.encode()}, message, private)
+    files = {hub.FILE: stored.path.read_bytes(), "README.md": card.encode()}
+    hub.upload(repo, files, message, private)
     return address
 
 
