@@ -35,7 +35,7 @@ needs_sb3 = pytest.mark.skipif(PPO is None, reason="needs the extra sb3: make te
 def test_without_it_one_message_says_what_to_install(monkeypatch):
     for module in ("stable_baselines3", "stable_baselines3.common.vec_env"):
         monkeypatch.setitem(sys.modules, module, None)
-    with pytest.raises(ConfigError, match=r"^make_sb3 needs Stable-Baselines3, .*sejax\[sb3\]'\.$"):
+    with pytest.raises(ConfigError, match=r"^make_sb3 needs Stable-Baselines3; .*sejax\[sb3\]'\.$"):
         sejax.gym.make_sb3("cartpole")
 
 
