@@ -13,6 +13,7 @@ from gymnasium.wrappers import DtypeObservation, FlattenObservation
 
 from sejax.envs.spec import Discrete
 from sejax.gym import networks
+from sejax.gym.gridworld import Info
 from sejax.gym.tasks import GYMNASIUM_IDS, RealTask, space_of
 from sejax.options import ConfigError, as_python, fraction, registry, require, shortened
 from sejax.proxies import MAX_ABS_VALUE
@@ -99,16 +100,14 @@ class RewardNetwork(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
         self._potential = 0.0  # of the state that the agent is in
         self._made_as: EnvSpec | None = None
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Any, dict[str, Any]]:
+    def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Any, Info]:
         """Begins an episode of the environment."""
         obs, info = self.env.reset(seed=seed, options=options)
         nothing = np.zeros(len(self._info_keys), np.float32)  # v before the first step, as in JAX
         self._potential = self.potential(obs, nothing)
         return obs, info
 
-    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, Info]:
         """One step of the environment, with the RN's reward.
 
         Raises:
@@ -155,7 +154,7 @@ class RewardNetwork(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
         outputs = networks.forward(self._layers, self.config.activation, inputs)
         return self.config.output_scale * outputs[..., 0]
 
-    def _told(self, info: dict[str, Any]) -> np.ndarray:
+    def _told(self, info: Info) -> np.ndarray:
         """The entries of a step's `info` that the RN weighs or sees, `[info_keys]`."""
         try:
             return np.array([info[key] for key in self._info_keys], np.float32)

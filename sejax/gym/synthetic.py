@@ -9,6 +9,7 @@ import numpy as np
 from gymnasium import spaces
 
 from sejax.gym import networks
+from sejax.gym.gridworld import Info
 from sejax.gym.tasks import RealTask
 from sejax.options import require
 from sejax.proxies import MAX_ABS_VALUE
@@ -196,16 +197,14 @@ class SyntheticEnv(gymnasium.Env[Any, Any]):
         self._vector: np.ndarray | None = None  # [obs_dim]: what the networks see and predict
         self._time = 0
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Any, dict[str, Any]]:
+    def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Any, Info]:
         """Begins an episode; `options` has no effect."""
         super().reset(seed=seed)
         self._time = 0
         self._vector = self.world.first(self.world.draw(self.np_random, 1)[0])
         return self._observe(self._vector), {}
 
-    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, Info]:
         """One step.
 
         Raises:

@@ -9,6 +9,7 @@ from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
+from sejax.gym.gridworld import Info
 from sejax.gym.synthetic import SyntheticWorld
 from sejax.options import one_of, require
 
@@ -38,10 +39,9 @@ class SyntheticVectorEnv(VectorEnv[Any, Any, np.ndarray]):
     ):
         self.world = world
         self.num_envs = num_envs
-        modes = [mode.value for mode in AutoresetMode]
-        mode: Any = getattr(autoreset_mode, "value", autoreset_mode)
-        one_of(modes)("autoreset_mode", mode, modes[0])
-        self.autoreset_mode = AutoresetMode(mode)
+        if not isinstance(autoreset_mode, AutoresetMode):
+            one_of([mode.value for mode in AutoresetMode])("autoreset_mode", autoreset_mode, None)
+        self.autoreset_mode = AutoresetMode(autoreset_mode)
         self.metadata = {"render_modes": [], "autoreset_mode": self.autoreset_mode}
         self.single_observation_space = world.observation_space
         self.single_action_space = world.action_space
@@ -59,11 +59,8 @@ class SyntheticVectorEnv(VectorEnv[Any, Any, np.ndarray]):
         self._num_used = np.full(num_envs, num_drawn)  # of those
 
     def reset(
-        self,
-        *,
-        seed: int | Sequence[int | None] | None = None,
-        options: dict[str, Any] | None = None,
-    ) -> tuple[np.ndarray, dict[str, Any]]:
+        self, *, seed: int | Sequence[int | None] | None = None, options: Info | None = None
+    ) -> tuple[np.ndarray, Info]:
         """Begins an episode in each environment.
 
         Args:
@@ -94,9 +91,7 @@ class SyntheticVectorEnv(VectorEnv[Any, Any, np.ndarray]):
         self._begin(indices)
         return self.world.observe(self._vectors), {}
 
-    def step(
-        self, actions: Any
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+    def step(self, actions: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, Info]:
         """One step of each environment.
 
         Raises:
@@ -130,7 +125,7 @@ class SyntheticVectorEnv(VectorEnv[Any, Any, np.ndarray]):
             self._begin(np.flatnonzero(self._ended))
         return self.world.observe(self._vectors), rewards, terminated, truncated, infos
 
-    def _final(self, discounts: np.ndarray) -> dict[str, Any]:
+    def _final(self, discounts: np.ndarray) -> Info:
         """Infos of a step whose ended environments will begin anew at once."""
         ended = self._ended.copy()
         final_obs = np.full(self.num_envs, None, dtype=object)

@@ -15,6 +15,7 @@ from sejax.envs.spec import TaskSpec
 from sejax.options import (
     ACTIVATIONS,
     MOST_LAYERS,
+    as_text,
     counts,
     one_of,
     option,
@@ -87,8 +88,8 @@ class SyntheticConfig(ProxyConfig):
         require(
             self.horizon != 1 or self.horizon_is_terminal,
             "proxy.horizon_is_terminal",
-            "must be true with proxy.horizon=1, because there is no next state to bootstrap with; "
-            "got false. Set proxy.horizon_is_terminal=true.",
+            "must be true with proxy.horizon=1, which has no next state; got false. Set "
+            "proxy.horizon_is_terminal=true.",
         )
 
     @property
@@ -206,18 +207,14 @@ class RewardConfig(ProxyConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name, default in (
-            ("output_scale", 1),
-            ("augmented", False),
-            ("zero_at_terminal", False),
-        ):
+        defaults = {"output_scale": 1.0, "augmented": False, "zero_at_terminal": False}
+        for name, default in defaults.items():
             value = getattr(self, name)
             require(
                 value == default or not self.shaping.weighs_info,
                 f"proxy.{name}",
-                f"must be {str(default).lower()} with weighted info, because {self.variant} has no "
-                f"network; got {shortened(str(value).lower())}. Set "
-                f"proxy.{name}={str(default).lower()}.",
+                f"must be {as_text(default)}, as {self.variant} has no network; got "
+                f"{shortened(value)}. Set proxy.{name}={as_text(default)}.",
             )
 
     @property
@@ -244,8 +241,8 @@ class RewardConfig(ProxyConfig):
             require(
                 is_there or not is_needed,
                 f"proxy.{name}",
-                f"must do without {value} in {task_name}, because its steps tell nothing of the "
-                f"state beside the observation; got {shortened(value)}. Set proxy.{name}={fix}.",
+                f"must do without a step's info in {shortened(task_name)}, which tells nothing of "
+                f"the state; got {value}. Set proxy.{name}={fix}.",
             )
 
     def make(self, task: Task) -> "ProxyEnv":

@@ -140,26 +140,20 @@ _REASONS = {
 @contextlib.contextmanager
 def _explained(option: str, place: str) -> Iterator[None]:
     """Turns whatever `huggingface_hub` raises into one message."""
+    place = shortened(place, 60)
     try:
         yield
     except ConfigError:
         raise
-    except ImportError as error:
-        raise ConfigError(
-            f"{option} needs huggingface_hub for {place}; got {error}. Install it with pip install "
-            "'sejax[hub]'.",
-            option,
-        ) from error
     except Exception as error:  # the HTTP library's too, which differs between its versions
-        raise ConfigError(
-            f"{option} must be within reach on the Hugging Face Hub; got {place}: "
-            f"{_reason(error)}.",
-            option,
-        ) from error
+        message = f"{option} must be within reach on the Hub; got {place}: {_reason(error)}."
+        raise ConfigError(message, option) from error
 
 
 def _reason(error: Exception) -> str:
     """What is wrong, and what to do about it."""
+    if isinstance(error, ImportError):
+        return f"{error}. Install it with pip install 'sejax[hub]'"
     from huggingface_hub.errors import HfHubHTTPError
 
     for kind in type(error).__mro__:
@@ -168,4 +162,4 @@ def _reason(error: Exception) -> str:
     status = error.response.status_code if isinstance(error, HfHubHTTPError) else None
     if status in (401, 403):
         return f"you may not do that (HTTP {status}). Log in with hf auth login and a write token"
-    return f"{told(error)}. Try again, or work with a local file"
+    return f"{shortened(told(error), 100)}. Try again, or work with a local file"
