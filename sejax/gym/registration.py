@@ -153,7 +153,7 @@ def _spec(name: str, **kwargs: Any) -> EnvSpec:
     )
 
 
-def _count(num_envs: Any) -> int:
+def _count(num_envs: float) -> int:
     num_envs = as_python(num_envs)
     counts("each is an episode at a time")("num_envs", num_envs, 8)
     return int(num_envs)

@@ -10,6 +10,7 @@ from gymnasium.envs.registration import EnvSpec
 from gymnasium.envs.toy_text.cliffwalking import CliffWalkingEnv
 from gymnasium.utils import RecordConstructorArgs
 from gymnasium.wrappers import DtypeObservation, FlattenObservation
+from numpy.typing import ArrayLike
 
 from sejax.envs.spec import Discrete
 from sejax.gym import networks
@@ -107,7 +108,7 @@ class RewardNetwork(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
         self._potential = self.potential(obs, nothing)
         return obs, info
 
-    def step(self, action: Any) -> tuple[Any, float, bool, bool, Info]:
+    def step(self, action: ArrayLike) -> tuple[Any, float, bool, bool, Info]:
         """One step of the environment, with the RN's reward.
 
         Raises:
@@ -124,7 +125,7 @@ class RewardNetwork(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
         info = {**info, "discount": float(not terminated), "real_reward": real_reward}
         return obs, reward, terminated, truncated, info
 
-    def potential(self, obs: Any, told: Any = ()) -> float:
+    def potential(self, obs: Any, told: np.ndarray | tuple[()] = ()) -> float:
         """Phi of an observation, and of what `info` told of it if it sees that."""
         if self._table is not None:
             return self._table[obs]

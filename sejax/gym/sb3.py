@@ -34,7 +34,7 @@ class SyntheticVecEnv(VecEnv):
     def __init__(self, world: SyntheticWorld, num_envs: int):
         self._env = SyntheticEnv(world)  # what each environment is
         self._envs = SyntheticVectorEnv(world, num_envs, AutoresetMode.DISABLED)
-        self._actions: np.ndarray | None = None
+        self._actions = np.zeros(0)  # which no space has
         super().__init__(num_envs, self._env.observation_space, self._env.action_space)
 
     def reset(self) -> np.ndarray:

@@ -7,7 +7,9 @@ from typing import Any, NamedTuple
 import gymnasium
 import numpy as np
 from gymnasium import spaces
+from numpy.typing import ArrayLike
 
+from sejax.envs.spec import Box
 from sejax.gym import networks
 from sejax.gym.gridworld import Info
 from sejax.gym.tasks import RealTask
@@ -15,6 +17,8 @@ from sejax.options import require
 from sejax.proxies import MAX_ABS_VALUE
 from sejax.proxies.configs import SyntheticConfig
 from sejax.proxies.header import check_tensors
+
+Numbers = np.ndarray | float
 
 
 class Step(NamedTuple):
@@ -59,7 +63,7 @@ class SyntheticWorld:
         self.obs_dim = spec.obs_dim
         self._num_states, self._num_actions = spec.num_states, spec.num_actions
         self.observation_space, self._units = task.observation_space, None
-        if not self._num_states:
+        if isinstance(spec.observation, Box):
             self._units = config.units(spec.observation)
             self.observation_space = spaces.Box(-np.inf, np.inf, (self.obs_dim,), np.float32)
         units = config.networks(self.obs_dim, spec.action_dim)
@@ -116,7 +120,9 @@ class SyntheticWorld:
             return np.minimum(np.maximum(np.asarray(action, np.float32), low), high)
         raise gymnasium.error.InvalidAction(f"{action!r} is none of {space}")
 
-    def step(self, vector: np.ndarray, action: np.ndarray, time: Any, chance: Any = None) -> Step:
+    def step(
+        self, vector: np.ndarray, action: np.ndarray, time: Numbers, chance: Any = None
+    ) -> Step:
         """One step of each episode.
 
         Args:
@@ -204,7 +210,7 @@ class SyntheticEnv(gymnasium.Env[Any, Any]):
         self._vector = self.world.first(self.world.draw(self.np_random, 1)[0])
         return self._observe(self._vector), {}
 
-    def step(self, action: Any) -> tuple[Any, float, bool, bool, Info]:
+    def step(self, action: ArrayLike) -> tuple[Any, float, bool, bool, Info]:
         """One step.
 
         Raises:

@@ -244,7 +244,8 @@ def _unknown_task(header: Header, fix: str) -> ConfigError:
 def _gymnasium_space(space: Space) -> spaces.Space[Any]:
     if isinstance(space, Discrete):
         return spaces.Discrete(space.n)
-    return spaces.Box(np.float32(space.low), np.float32(space.high), dtype=np.float32)
+    low, high = (np.array(bound, np.float32) for bound in (space.low, space.high))
+    return spaces.Box(low, high, dtype=np.float32)
 
 
 def space_of(space: spaces.Space[Any], name: str) -> Space:

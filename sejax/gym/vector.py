@@ -8,6 +8,7 @@ import numpy as np
 from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
+from numpy.typing import ArrayLike
 
 from sejax.gym.gridworld import Info
 from sejax.gym.synthetic import SyntheticWorld
@@ -51,8 +52,8 @@ class SyntheticVectorEnv(VectorEnv[Any, Any, np.ndarray]):
         self._times = np.zeros(num_envs, np.int64)
         self._ended = np.zeros(num_envs, np.bool_)
         # Of each environment, as in Gymnasium's own; None before the first reset.
-        self._np_random: list[Any] = [None] * num_envs
-        self._np_random_seed: list[int | None] = [None] * num_envs
+        self._np_random: list[Any] = [None] * num_envs  # type: ignore[assignment]
+        self._np_random_seed: list[int | None] = [None] * num_envs  # type: ignore[assignment]
         # A generator gives the same numbers one by one and all at once, which is quicker.
         num_drawn = PREFETCHED if world.draws_noise and not world.draws_ends else 1
         self._drawn = np.zeros((num_envs, num_drawn, world.obs_dim), np.float32)
@@ -91,7 +92,9 @@ class SyntheticVectorEnv(VectorEnv[Any, Any, np.ndarray]):
         self._begin(indices)
         return self.world.observe(self._vectors), {}
 
-    def step(self, actions: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, Info]:
+    def step(
+        self, actions: ArrayLike
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, Info]:
         """One step of each environment.
 
         Raises:

@@ -10,6 +10,7 @@ from typing import Any, overload
 import jax
 import numpy as np
 from flax.traverse_util import flatten_dict, unflatten_dict
+from jaxtyping import PyTree
 
 from sejax import envs
 from sejax.envs.base import Task
@@ -191,7 +192,7 @@ def stored_config(proxy: Proxy | ProxySet) -> dict[str, Any]:
 def save(
     path: str | Path,
     env: ProxyEnv,
-    weights: Any,
+    weights: PyTree,
     config: Mapping[str, Any] | None = None,
     discount: float | None = None,
     **record: Any,
@@ -296,7 +297,7 @@ def _write(
     write_bytes(Path(path), data)
 
 
-def _tensors_of(env: ProxyEnv, weights: Any) -> dict[str, np.ndarray]:
+def _tensors_of(env: ProxyEnv, weights: PyTree) -> dict[str, np.ndarray]:
     """The weights of one proxy by `network/layer/parameter`, float32."""
     flat = _flatten(weights) if isinstance(weights, Mapping) else {}
     tensors = {name: np.asarray(x, np.float32) for name, x in flat.items()}
@@ -304,7 +305,7 @@ def _tensors_of(env: ProxyEnv, weights: Any) -> dict[str, np.ndarray]:
     return tensors
 
 
-def _flatten(weights: Any) -> dict[str, Any]:
+def _flatten(weights: PyTree) -> dict[str, Any]:
     """Nested weights by `network/layer/parameter`."""
     return flatten_dict(weights, sep="/")
 
