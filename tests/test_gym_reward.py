@@ -281,7 +281,7 @@ def refused(call, *args, **kwargs):
     """The field that a refused call names."""
     with pytest.raises(ConfigError) as error:
         call(*args, **kwargs)
-    assert len(str(error.value)) < 500
+    assert len(str(error.value)) <= 300
     return error.value.field
 
 

@@ -17,7 +17,6 @@ from sejax import envs
 from sejax.cli.config import evaluate_config
 from sejax.evaluate import proxy_study
 from sejax.gym import GYMNASIUM_IDS, make
-from sejax.proxies import zoo
 from sejax.proxies.header import PRETRAINED_DIR
 
 PROXIES = {proxy.name: proxy for proxy in sejax.pretrained()}
@@ -84,10 +83,6 @@ def test_the_page_is_what_the_tool_makes(monkeypatch):
     import make_zoo
 
     assert make_zoo.PAGE.read_text(encoding="utf-8") == make_zoo.page()
-
-
-def test_ranges_are_from_the_lowest_to_the_highest():
-    assert zoo.spread([], ".0f") == "" and zoo.spread([2.0, 1.0, 3.0], ".0f") == "1 to 3"
 
 
 # --- what they teach -----------------------------------------------------------------------------
