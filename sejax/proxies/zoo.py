@@ -16,6 +16,7 @@ from sejax.options import registry
 from sejax.proxies import header, hub
 from sejax.proxies.configs import SyntheticConfig
 
+CARD = Path(__file__).with_name("card.md")
 SHIPPED_LICENSE = "Apache-2.0, like sejax, which made it; it contains no data of others."
 
 
@@ -222,14 +223,8 @@ _HPARAMS = {"default": "default", "varied": "drawn for each", "as_learned": "as 
 _WORLDS = {"proxy": "this proxy", "real": "the real task"}
 
 
-_TEACHES = (
-    "Fresh agents, trained for the steps given and then tested on the real task (mean and standard "
-    "deviation of the agents' mean returns):"
-)
-
-
 def card_of(proxy: PretrainedProxy, source: str, needs: Sequence[str], license_text: str) -> str:
-    """A proxy's model card, in Markdown; it leaves out what is not known.
+    """A proxy's model card, `card.md` with its values; sections of what is not known are left out.
 
     Args:
       proxy: what its file tells.
@@ -238,15 +233,26 @@ def card_of(proxy: PretrainedProxy, source: str, needs: Sequence[str], license_t
         names are never imported.
       license_text: a sentence, or the license's name.
     """
-    about = _ABOUT.get(proxy.kind, _ABOUT_OTHER).format(task=proxy.task, kind=proxy.kind)
-    facts = [{"property": name, "value": text} for name, text in _facts(proxy).items()]
-    parts = [f"# {proxy.name}", about, table(facts)]
-    if proxy.evaluations:
-        parts += ["## What it teaches", _TEACHES, table([*map(_cells, proxy.evaluations)])]
-    if proxy.learning:
-        parts += ["## How it was learned", f"    {proxy.learning.command}"]
-    parts += ["## How to use it", _usage(proxy, source, needs), "## License", license_text]
-    return "\n\n".join(filter(None, parts))
+    options = {"task": "env", "proxy": "proxy_kind"}  # of commands, for arguments of `sejax.load`
+    call = f'("{source}"' + "".join(f", {name}=..." for name in needs) + ")"
+    gym = f"env = sejax.gym.make{call}  # a gymnasium.Env, in NumPy: any agent, no JAX\n"
+    values = {
+        "name": proxy.name,
+        "about": _ABOUT.get(proxy.kind, _ABOUT_OTHER).format(task=proxy.task, kind=proxy.kind),
+        "facts": table([{"property": key, "value": x} for key, x in _facts(proxy).items()]),
+        "evaluations": table([*map(_cells, proxy.evaluations)]) or None,
+        "command": proxy.learning.command if proxy.learning else None,
+        "install": "With `pip install 'sejax[hub]'`:\n\n" if hub.is_address(source) else "",
+        "gym": gym if proxy.kind == "se" else "",
+        "call": call,
+        "source": source,
+        "overrides": "".join(f" {options[name]}=..." for name in needs) + _words_of_best(proxy),
+        "license": license_text,
+    }
+    unknown = [f"{{{name}}}" for name, value in values.items() if value is None]
+    sections = CARD.read_text(encoding="utf-8").rstrip().split("\n\n## ")
+    told = [text for text in sections if not any(field in text for field in unknown)]
+    return "\n\n## ".join(told).format(**values)
 
 
 def table(rows: Sequence[Mapping[str, str]]) -> str:
@@ -295,21 +301,6 @@ def _facts(proxy: PretrainedProxy) -> dict[str, str]:
         only = " (all of them tests)" if proxy.kind == "se" else ""
         facts["steps on the real task"] = f"{learning.real_steps:,}{only}"
     return facts
-
-
-def _usage(proxy: PretrainedProxy, source: str, needs: Sequence[str]) -> str:
-    """Calls and the command that use a proxy."""
-    options = {"task": "env", "proxy": "proxy_kind"}  # of commands, for arguments of `sejax.load`
-    call = f'("{source}"' + "".join(f", {name}=..." for name in needs) + ")"
-    words = "".join(f" {options[name]}=..." for name in needs) + _words_of_best(proxy)
-    install = "With `pip install 'sejax[hub]'`:\n\n" if hub.is_address(source) else ""
-    gym = f"env = sejax.gym.make{call}  # a gymnasium.Env, in NumPy: any agent, no JAX\n"
-    return (
-        f"{install}```python\nimport sejax\n\n{gym if proxy.kind == 'se' else ''}"
-        f"env, params = sejax.load{call}  # a gymnax environment, in JAX\n```\n\n"
-        f"`python -m sejax.evaluate proxy={source}{words}` trains agents on it and tests them on "
-        f"the real task."
-    )
 
 
 def _words_of_best(proxy: PretrainedProxy) -> str:
