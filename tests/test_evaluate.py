@@ -320,7 +320,7 @@ def test_a_proxy_knows_what_it_was_learned_with(room, tmp_path):
     with pytest.raises(ConfigError, match=r"^agent must be a registered"):
         sejax.load_proxy(bare).learned_with("agent")
     sejax.save(bare, proxies.env, proxies[0].params.weights, {"agent": {"name": "my:Agent"}})
-    with pytest.raises(ConfigError, match=r"^agent must be given .*got my:Agent"):
+    with pytest.raises(ConfigError, match=r"^agent must be .*got my:Agent"):
         sejax.load_proxy(bare).learned_with("agent")
     assert "my" not in sys.modules
 
