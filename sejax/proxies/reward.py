@@ -113,7 +113,7 @@ class RewardEnv(ProxyEnv):
         require(
             discount is not None or not self.config.shaping.is_potential_based,
             "agent",
-            f"must say its discount, because {self.config.variant} pays with it; got none. Set "
+            f"must have a discount for {self.config.variant}; got none. Set "
             "Agent(discount=lambda hparams: ...).",
         )
         potentials = None
