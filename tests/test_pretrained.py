@@ -1,5 +1,6 @@
 """The proxies that ship: what is said of them, and that anybody's agents learn on them."""
 
+import dataclasses
 import math
 import re
 import shlex
@@ -17,6 +18,7 @@ from sejax import envs
 from sejax.cli.config import evaluate_config
 from sejax.evaluate import proxy_study
 from sejax.gym import GYMNASIUM_IDS, make
+from sejax.proxies import header, zoo
 from sejax.proxies.header import PRETRAINED_DIR
 
 PROXIES = {proxy.name: proxy for proxy in sejax.pretrained()}
@@ -83,6 +85,19 @@ def test_the_page_is_what_the_tool_makes(monkeypatch):
     import make_zoo
 
     assert make_zoo.PAGE.read_text(encoding="utf-8") == make_zoo.page()
+
+
+def test_a_proxy_is_shipped_with_what_it_teaches(tmp_path, monkeypatch, capsys):
+    monkeypatch.syspath_prepend(TOOLS)
+    import ship_proxy
+
+    (each, *_) = PROXIES["cartpole"].evaluations
+    monkeypatch.setattr(ship_proxy, "evaluate", lambda *_: [dataclasses.asdict(each)])
+    monkeypatch.setattr(sys, "argv", ["ship_proxy.py", "cartpole", "mine", "--out", str(tmp_path)])
+    ship_proxy.main()
+    assert "# mine" in capsys.readouterr().out
+    shipped = zoo.describe(header.read(tmp_path / "mine.safetensors"))
+    assert shipped.evaluations == (each,) and shipped.scores == PROXIES["cartpole"].scores
 
 
 # --- what they teach -----------------------------------------------------------------------------

@@ -56,7 +56,7 @@ def main() -> None:
         ]
     target = args.out / f"{args.name}.safetensors"
     save(target, proxy, **more)
-    shipped = zoo.describe(target)
+    shipped = zoo.describe(header.read(target))
     print(f"{shipped.card}\n{zoo.Zoo([shipped])}\n\n{target}")
 
 
