@@ -13,6 +13,7 @@ from typing import Any
 import yaml
 
 from sejax.options import registry
+from sejax.options.plain import from_plain
 from sejax.proxies import header, hub
 from sejax.proxies.configs import SyntheticConfig
 
@@ -169,7 +170,7 @@ def describe(stored: header.Stored, name: str | None = None) -> PretrainedProxy:
     if "score" in record:
         agents = header.agents_of(told.config)
         known.setdefault("scores", dict.fromkeys(agents, float(record["score"])))
-    described: PretrainedProxy = registry.from_plain(
+    described: PretrainedProxy = from_plain(
         PretrainedProxy,
         {
             "name": name or path.stem,
