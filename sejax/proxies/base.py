@@ -152,7 +152,7 @@ class AbsentEnv(Environment):
     def reset_env(self, key: Array, params: PyTree) -> NoReturn:
         self.fail()
 
-    def step_env(self, key: Array, state: PyTree, action: Array | int, params: PyTree) -> NoReturn:
+    def step_env(self, key: Array, state: PyTree, action: Array, params: PyTree) -> NoReturn:
         self.fail()
 
     @property

@@ -176,7 +176,7 @@ class RewardEnv(ProxyEnv):
         return obs, RewardState(world=world, obs=obs, augmentation=nothing, time=jnp.int32(0))
 
     def step_env(
-        self, key: Array, state: RewardState, action: Array | int, params: RewardParams
+        self, key: Array, state: RewardState, action: Array, params: RewardParams
     ) -> tuple[Array, RewardState, Array, Array, dict[Any, Any]]:
         obs, world, real_reward, terminated, info = self.task.env.step_env(
             key, state.world, action, self.task.params
