@@ -100,6 +100,20 @@ def test_a_proxy_is_shipped_with_what_it_teaches(tmp_path, monkeypatch, capsys):
     assert shipped.evaluations == (each,) and shipped.scores == PROXIES["cartpole"].scores
 
 
+@pytest.mark.parametrize(
+    ("name", "value"), [("hparams", "other"), ("world", "moon"), ("return_mean", []), ("agent", {})]
+)
+def test_an_evaluation_of_another_shape_is_refused(tmp_path, name, value):
+    proxy = sejax.load_proxy("cartpole")
+    evaluation = dataclasses.asdict(PROXIES["cartpole"].evaluations[0])
+    record = {"evaluations": [evaluation | {name: value}]}
+    path = tmp_path / "odd.safetensors"
+    sejax.save(path, proxy.env, proxy.params.weights, **record)
+    with pytest.raises(sejax.ConfigError) as error:
+        zoo.describe(header.read(path))
+    assert error.value.field == f"record.evaluations.{name}"
+
+
 # --- what they teach -----------------------------------------------------------------------------
 
 

@@ -233,7 +233,8 @@ ODD_VALUES = {  # of entries of the metadata, by their place
     ("task",): [MISSING, None, [], "t" * 10_000],
     ("is_set",): [MISSING, None, "yes", 2],
     ("proxies",): [MISSING, None, [], [None], [3], {}, 3, [{"score": None}], [{"score": "x"}],
-                   [{"seed": None}], [{"seed": []}]],
+                   [{"seed": None}], [{"seed": []}], [{"scores": {"ddqn": []}}],
+                   [{"scores": 3}], [{"score": 10**400}]],
     ("discount",): [MISSING, None, "x", [], math.nan, -0.1, 1.5],
     ("interface",): [MISSING, None, []],
     ("interface", "max_steps"): [MISSING, 0, "9"],
@@ -241,7 +242,7 @@ ODD_VALUES = {  # of entries of the metadata, by their place
         MISSING, None, "n", {"n": 0}, {"n": 2.0}, {"n": 2**40}, {"low": [0], "high": []},
         {"low": [], "high": []}, {"low": [0]}, {"low": ["x"], "high": [1]},
         {"low": [1], "high": [0]}, {"low": [math.nan], "high": [1]},
-        {"low": [10**400], "high": [1]},
+        {"low": [10**400], "high": [1]}, {"low": [-1e300], "high": [1]},
     ],
 }  # fmt: skip
 

@@ -16,13 +16,22 @@ import numpy as np
 
 from sejax.envs.spec import Box, Space, TaskSpec
 from sejax.ops.checksummed import DamagedError, pack, unpack
-from sejax.options import LARGEST, ConfigError, registry, require, shortened, unknown_name
+from sejax.options import (
+    LARGEST,
+    ConfigError,
+    is_number,
+    registry,
+    require,
+    shortened,
+    unknown_name,
+)
 from sejax.options.plain import from_plain
 from sejax.proxies import hub
 
 FORMAT_VERSION = 2
 PRETRAINED_DIR = Path(__file__).parents[1] / "pretrained"
 _KEY = "sejax"  # of the metadata's entry
+_LARGEST_FLOAT = float(np.finfo(np.float32).max)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,8 +67,11 @@ class Header:
         if not self.proxies or not all(isinstance(record, Mapping) for record in self.proxies):
             raise ValueError("no records")
         for record in self.proxies:
-            for name in ("score", "generation", "seed"):
-                float(record.get(name, 0))
+            numbers = [record[name] for name in ("score", "generation", "seed") if name in record]
+            numbers += dict(record.get("scores", {})).values()
+            if not all(map(is_number, numbers)):
+                raise ValueError("a record without numbers")
+            np.array(numbers, float)  # OverflowError for one that is too large
         if not 0 <= self.discount <= 1:
             raise ValueError("a discount outside of [0, 1]")
         spec = self.spec
@@ -98,13 +110,13 @@ def _is_count(number: object) -> bool:
 
 
 def _is_space(space: Space) -> bool:
-    """Whether a space has entries, and bounds in their order."""
+    """Whether a space has entries, and bounds of single precision in their order."""
     if not isinstance(space, Box):
         return _is_count(space.n)
     pairs = list(zip(space.low, space.high, strict=True))
-    return bool(pairs) and all(
-        low <= high and low < math.inf and high > -math.inf for low, high in pairs
-    )
+    are_floats = all(math.isinf(x) or abs(x) <= _LARGEST_FLOAT for pair in pairs for x in pair)
+    are_ordered = all(low <= high and low < math.inf and high > -math.inf for low, high in pairs)
+    return bool(pairs) and are_floats and are_ordered
 
 
 def is_same_space(one: Space, other: Space, with_bounds: bool = True) -> bool:

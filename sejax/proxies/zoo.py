@@ -8,7 +8,7 @@ import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import yaml
 
@@ -36,8 +36,8 @@ class Evaluation:
     """
 
     agent: str
-    hparams: str
-    world: str
+    hparams: Literal["default", "varied", "as_learned"]
+    world: Literal["proxy", "real"]
     num_agents: int
     return_mean: float
     return_std: float
