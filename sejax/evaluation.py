@@ -12,12 +12,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from sejax.agents.base import Agent
 from sejax.agents.mixture import Mixture
 from sejax.envs.base import Task
 from sejax.envs.wrappers import repeat_actions
+from sejax.es.base import StrategyState
 from sejax.objectives import Outcome
 from sejax.ops.keys import step_keys
 from sejax.ops.loops import while_any_active
@@ -374,6 +375,20 @@ def make_candidate_evaluator(
     )
 
 
+@struct.dataclass
+class Candidates:
+    """What a generation evaluates."""
+
+    population: Float[Array, "pop dims"]  # as the strategy asks for it
+    incumbent: Float[Array, " dims"]
+    params: Float[Array, "evaluation dims"]  # first those of the population, then the incumbent's
+    keys: Array  # of the trainings, [evaluation]
+    active: Array  # whether anything is to be computed
+    eval_steps: Array | None  # length of the test episodes that are scored; None: the task's limit
+    key_tell: Array  # for `Strategy.tell`
+    es_state: StrategyState  # after `Strategy.ask`
+
+
 def make_population_evaluator(
     mixture: Mixture,
     proxy: ProxyEnv,
@@ -382,13 +397,13 @@ def make_population_evaluator(
     agent_of_evaluation: np.ndarray,
     devices: int | None = None,
     num_parallel: int | None = None,
-) -> Callable[..., Outcome]:
-    """Builds `evaluate(keys, params, active, eval_steps=None) -> Outcome`, leaves `[evaluation]`.
+) -> Callable[[Candidates], Outcome]:
+    """Builds `evaluate(candidates) -> Outcome`, leaves `[evaluation]`.
 
-    Trains one fresh agent on each candidate, `keys [evaluation]` and `params [evaluation, dims]`,
-    and tests it on the real task. Evaluations are grouped by agent when the program is built, so
-    that no training executes another agent's branch; each group is spread over the devices, and
-    on each of them batches of `num_parallel` follow one another.
+    Trains one fresh agent for each evaluation and tests it on the real task. Evaluations are
+    grouped by agent when the program is built, so that no training executes another agent's
+    branch; each group is spread over the devices, and on each of them batches of `num_parallel`
+    follow one another.
 
     Raises:
       ConfigError: if there are fewer than `devices` devices.
@@ -402,12 +417,11 @@ def make_population_evaluator(
         [num_parallel_on_cpu(agent, training) for agent in mixture.agents],
     )
 
-    def evaluate(
-        keys: Array, params: Array, active: Array, eval_steps: Array | None = None
-    ) -> Outcome:
-        def arguments(group: np.ndarray) -> tuple[Any, ...]:
-            shared = jax.tree.map(lambda x: jnp.repeat(x, group.size), (active, eval_steps))
-            return keys[group], params[group], *shared
+    def evaluate(candidates: Candidates) -> Outcome:
+        def arguments(group: np.ndarray) -> tuple[PyTree, ...]:
+            shared = candidates.active, candidates.eval_steps
+            shared = jax.tree.map(lambda x: jnp.repeat(x, group.size), shared)
+            return candidates.keys[group], candidates.params[group], *shared
 
         outcomes = evaluate_groups([arguments(group) for group in groups])
         if len(outcomes) == 1:

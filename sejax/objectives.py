@@ -222,6 +222,37 @@ class Scores:
     diverged: Bool[Array, " all"]
 
 
+@struct.dataclass
+class AgentInfo:
+    """Statistics for each agent of a mixture, `[agent]`."""
+
+    incumbent_mean: Array
+    population_mean: Array
+    train_steps_mean: Array
+    num_nonfinite: Array
+
+
+@struct.dataclass
+class GenerationInfo:
+    """Statistics of a generation: the columns of `metrics.csv`, and what they are made of."""
+
+    generation: Array
+    incumbent_mean: Array
+    incumbent_std: Array
+    population_mean: Array
+    population_max: Array
+    best_so_far: Array
+    train_steps_mean: Array
+    train_steps_max: Array
+    train_episodes_mean: Array
+    num_nonfinite: Array
+    by_agent: AgentInfo
+    population_scores: Float[Array, " evaluation"]
+    train_steps: Array  # `[evaluation]` int32; sums may exceed 32 bits and are made on the host
+    real_steps: Array  # likewise: steps on the real task
+    active: Array  # False for a generation of a run that was over
+
+
 @dataclass(frozen=True, kw_only=True)
 class Scoring:
     """How outcomes become scores, with one agent or a mixture, with or without a curriculum.
@@ -283,6 +314,33 @@ class Scoring:
             return self._scores(self.objective(outcome))
         return self._scores(self.objective.of_whole_tests(outcome))
 
+    def info(
+        self, scores: Scores, outcome: Outcome, generation: Array, best: Array, active: Array
+    ) -> GenerationInfo:
+        """The statistics of a generation."""
+        return GenerationInfo(
+            generation=generation,
+            incumbent_mean=scores.incumbent_mean,
+            incumbent_std=jnp.nanstd(scores.incumbent),
+            population_mean=finite_mean(scores.population),
+            population_max=jnp.nanmax(scores.population),
+            best_so_far=best,
+            train_steps_mean=outcome.train_steps.mean(),
+            train_steps_max=outcome.train_steps.max(),
+            train_episodes_mean=outcome.train_episodes.mean(),
+            num_nonfinite=scores.diverged.sum(),
+            by_agent=AgentInfo(
+                incumbent_mean=scores.agent_means,
+                population_mean=self.by_agent(finite_mean, scores.population),
+                train_steps_mean=self.by_agent(jnp.mean, outcome.train_steps),
+                num_nonfinite=self.by_agent(jnp.sum, scores.diverged),
+            ),
+            population_scores=scores.population,
+            train_steps=outcome.train_steps,
+            real_steps=outcome.real_steps,
+            active=active,
+        )
+
     def by_agent(self, statistic: Callable[[Array], Array], values: Array) -> Array:
         """A statistic of the evaluations `[evaluation]` of each agent, `[agent]`."""
         agents = self.agent_of_evaluation[: values.shape[0]]
@@ -309,62 +367,3 @@ class Scoring:
             incumbent_mean=self.mixture.aggregated(agent_means),
             diverged=~jnp.isfinite(scores),
         )
-
-
-@struct.dataclass
-class AgentInfo:
-    """Statistics for each agent of a mixture, `[agent]`."""
-
-    incumbent_mean: Array
-    population_mean: Array
-    train_steps_mean: Array
-    num_nonfinite: Array
-
-
-@struct.dataclass
-class GenerationInfo:
-    """Statistics of a generation: the columns of `metrics.csv`, and what they are made of."""
-
-    generation: Array
-    incumbent_mean: Array
-    incumbent_std: Array
-    population_mean: Array
-    population_max: Array
-    best_so_far: Array
-    train_steps_mean: Array
-    train_steps_max: Array
-    train_episodes_mean: Array
-    num_nonfinite: Array
-    by_agent: AgentInfo
-    population_scores: Float[Array, " evaluation"]
-    train_steps: Array  # `[evaluation]` int32; sums may exceed 32 bits and are made on the host
-    real_steps: Array  # likewise: steps on the real task
-    active: Array  # False for a generation of a run that was over
-
-
-def generation_info(
-    scoring: Scoring, scores: Scores, outcome: Outcome, generation: Any, best: Any, active: Any
-) -> GenerationInfo:
-    """The statistics of `scores` and `outcome`."""
-    return GenerationInfo(
-        generation=generation,
-        incumbent_mean=scores.incumbent_mean,
-        incumbent_std=jnp.nanstd(scores.incumbent),
-        population_mean=finite_mean(scores.population),
-        population_max=jnp.nanmax(scores.population),
-        best_so_far=best,
-        train_steps_mean=outcome.train_steps.mean(),
-        train_steps_max=outcome.train_steps.max(),
-        train_episodes_mean=outcome.train_episodes.mean(),
-        num_nonfinite=scores.diverged.sum(),
-        by_agent=AgentInfo(
-            incumbent_mean=scores.agent_means,
-            population_mean=scoring.by_agent(finite_mean, scores.population),
-            train_steps_mean=scoring.by_agent(jnp.mean, outcome.train_steps),
-            num_nonfinite=scoring.by_agent(jnp.sum, scores.diverged),
-        ),
-        population_scores=scores.population,
-        train_steps=outcome.train_steps,
-        real_steps=outcome.real_steps,
-        active=active,
-    )

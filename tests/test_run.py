@@ -19,6 +19,7 @@ from support import is_drawn
 
 import sejax
 from sejax import run
+from sejax.bilevel import Bilevel
 from sejax.cli import commands, run_directory, session
 from sejax.cli import config as configuration
 from sejax.cli.progress import RunProgress
@@ -156,12 +157,13 @@ def test_seeds_run_one_after_the_other_on_one_executable(
 def test_a_population_that_diverges_finishes_and_is_counted(tmp_path):
     shared = chunks()
 
-    def wild_init(key):
-        state = shared.learner.init(key)
-        noise_std = state.es_state.noise_std * 1e30
-        return state.replace(es_state=state.es_state.replace(noise_std=noise_std))
+    class Wild(Bilevel):
+        def init(self, key):
+            state = super().init(key)
+            noise_std = state.es_state.noise_std * 1e30
+            return state.replace(es_state=state.es_state.replace(noise_std=noise_std))
 
-    wild = session.Chunks(shared.learner._replace(init=wild_init))
+    wild = session.Chunks(Wild(**vars(shared.learner)))
     wild._compiled = shared._compiled
     config = sejax.config([*TINY, "generations=2", f"run_dir={tmp_path}"])
     with run_directory.open_for(config) as directory:
