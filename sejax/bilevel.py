@@ -251,8 +251,8 @@ def make_bilevel(
     """
     _made("task", Task, task)
     proxy = _made("proxy", ProxyEnv, proxy or SyntheticConfig(), task)  # type: ignore[type-abstract]
-    fix = "Set task to the proxy's."
-    require(proxy.task is task, "proxy", f"must be of that task; got {proxy.task.name}'s. {fix}")
+    must = f"must be one of the task given; got one of {proxy.task.name}. Set task to the proxy's."
+    require(proxy.task is task, "proxy", must)
     objective = _made("objective", Objective, objective or MaxReward(), task)
     shapes = jax.eval_shape(proxy.init_weights, jax.random.key(0))
     num_dims = sum(x.size for x in jax.tree.leaves(shapes))
