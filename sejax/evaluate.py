@@ -8,6 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import yaml
+
 from sejax.cli import commands, runtime
 from sejax.cli import config as configuration
 from sejax.cli.config import AgentFamily, EvaluateConfig, families_of, named
@@ -31,14 +33,7 @@ def main(overrides: Sequence[str]) -> None:
       ConfigError: for overrides that cannot be, or a proxy that cannot be loaded.
       OSError: if a file cannot be written.
     """
-    configs = []
-    for of_run in configuration.expand(overrides):
-        config = configuration.evaluate_config(of_run)
-        own = configuration.name_in_sweep(overrides, of_run, ("out_dir",))
-        if own:  # or all runs of a sweep would have one folder
-            folder = f"{config.out_dir}/{own}" if config.out_dir else f"runs/evaluate-{own}"
-            config = dataclasses.replace(config, out_dir=folder)
-        configs.append(config)
+    configs = configs_of(overrides)
     runtime.configure_jax()
     for config in configs:
         evaluate(config)
@@ -47,6 +42,25 @@ def main(overrides: Sequence[str]) -> None:
 def help_text(overrides: Sequence[str]) -> str:
     """What `--help` prints."""
     return f"{ABOUT}\n{configuration.help_text(EvaluateConfig, overrides)}"
+
+
+def config_text(overrides: Sequence[str]) -> str:
+    """What `--print-config` prints: the fields of each evaluation."""
+    plain = [configuration.plain(config) for config in configs_of(overrides)]
+    return yaml.safe_dump_all(plain, sort_keys=False)
+
+
+def configs_of(overrides: Sequence[str]) -> list[EvaluateConfig]:
+    """The configurations that the overrides describe, with folders of their own."""
+    configs = []
+    for of_run in configuration.expand(overrides):
+        config = configuration.evaluate_config(of_run)
+        own = configuration.name_in_sweep(overrides, of_run, ("out_dir",))
+        if own:  # or all runs of a sweep would have one folder
+            folder = f"{config.out_dir}/{own}" if config.out_dir else f"runs/evaluate-{own}"
+            config = dataclasses.replace(config, out_dir=folder)
+        configs.append(config)
+    return configs
 
 
 def evaluate(config: EvaluateConfig) -> float:
@@ -334,4 +348,4 @@ def _as_file_name(name: str) -> str:
 
 
 if __name__ == "__main__":
-    commands.start(main, help_text)
+    commands.start(main, help_text, config_text)

@@ -138,7 +138,7 @@ def test_seeds_run_one_after_the_other_on_one_executable(
         session.Chunks, "compile", lambda self, n: (compiled.append(n), compile_(self, n))
     )
     words = ["generations=6", "checkpoint_every=2", "num_seeds=2", f"run_dir={tmp_path}"]
-    best = run.learn(sejax.config([*TINY, *words]))
+    best = run.learn_all(run.configs_of([*TINY, *words]))
     assert compiled == [2]
     said = capsys.readouterr().out
     assert all(
@@ -284,7 +284,8 @@ def test_other_families_in_the_same_directory_are_refused(two_families):
 
 
 def test_the_command_names_all_families_for_the_evaluation(two_families, capsys):
-    run.learn(sejax.config([*OWN, *FAMILIES, "generations=5", f"run_dir={two_families}"]))
+    words = [*OWN, *FAMILIES, "generations=5", f"run_dir={two_families}"]
+    run.learn_all([sejax.config(words)])
     said = capsys.readouterr().out
     assert f"sejax.evaluate proxy={two_families}" in said and "agents=[q_learning,sarsa]" in said
 
@@ -394,15 +395,15 @@ def test_an_interrupt_waits_until_files_are_written():
         signal.signal(signal.SIGINT, before)
 
 
-def test_bad_input_ends_a_process_with_one_message_and_status_2(tmp_path):
-    for word, message in [
-        ("env=cartpol", "Did you mean env=cartpole?"),
-        ("~env=[[1]]", "an override must read"),
-    ]:
-        ended = process(*RUN, word, f"run_dir={tmp_path}/run")
-        assert ended.returncode == 2
-        assert message in ended.stderr and len(ended.stderr.strip().splitlines()) == 1
-        assert not (tmp_path / "run").exists()
+def command(monkeypatch, *words):
+    """Runs the command in this process; returns its exit status."""
+    monkeypatch.setattr(sys, "argv", ["sejax.run", *words])
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    try:
+        commands.start(run.main, run.help_text, run.config_text)
+    except SystemExit as ended:
+        return ended.code
+    return 0
 
 
 @pytest.mark.parametrize(
@@ -412,23 +413,28 @@ def test_bad_input_ends_a_process_with_one_message_and_status_2(tmp_path):
         ("es.population_size=1", "es.population_size must be"),
         ("es.noise_sdt=1", "Did you mean es.noise_std?"),
         ("devices=x", "devices must be a whole number"),
+        ("~env=[[1]]", "an override must read"),
+        ("--resolve", "Options are --help, -h, --print-config."),
     ],
 )
 def test_bad_input_ends_with_one_message_and_status_2(
     override, message, tmp_path, monkeypatch, capsys
 ):
-    monkeypatch.setattr(sys, "argv", ["sejax.run", override, f"run_dir={tmp_path}/run"])
-    monkeypatch.setattr(sys, "path", list(sys.path))
-    with pytest.raises(SystemExit) as ended:
-        commands.start(run.main, run.help_text)
+    assert command(monkeypatch, override, f"run_dir={tmp_path}/run") == 2
     said = capsys.readouterr().err
-    assert ended.value.code == 2
     assert message in said and len(said.strip().splitlines()) == 1
     assert not (tmp_path / "run").exists()
 
 
+def test_print_config_prints_what_would_run_and_runs_nothing(tmp_path, monkeypatch, capsys):
+    words = [*TINY, f"run_dir={tmp_path}/run", "seed=1,2"]
+    assert command(monkeypatch, *words, "--print-config") == 0
+    printed = [configuration.learn_config(x) for x in yaml.safe_load_all(capsys.readouterr().out)]
+    assert printed == run.configs_of(words) and not (tmp_path / "run").exists()
+
+
 def test_the_command_says_how_it_ended_and_what_to_do_next(uninterrupted, capsys):
-    (best,) = run.learn(sejax.config([*TINY, "generations=6", f"run_dir={uninterrupted}"]))
+    (best,) = run.learn_all([sejax.config([*TINY, "generations=6", f"run_dir={uninterrupted}"])])
     said = capsys.readouterr().out
     scores = [float(row["incumbent_mean"]) for row in rows(uninterrupted)]
     assert best == pytest.approx(max(scores))

@@ -366,10 +366,10 @@ def test_trials_are_runs_and_those_of_a_shape_share_one_program(tmp_path):
     runner.run(runner.config(["es.noise_std=0.1"]), tmp_path / "other", 3)
     assert len(runner._programs.shapes) == 1
 
-    from sejax.run import learn
+    from sejax.run import learn_all
 
     plain = [*GRID, *overrides, "generations=3", "checkpoint_every=1", f"run_dir={tmp_path}/run"]
-    learn(configuration.config([*plain, "seed=1"]))
+    learn_all([configuration.config([*plain, "seed=1"])])
     np.testing.assert_allclose(rows_of(tmp_path / "trial" / "seed1"), rows_of(tmp_path / "run"))
     values = runner.verify(overrides, tmp_path / "again")
     assert sorted(x.name for x in (tmp_path / "again").iterdir()) == [

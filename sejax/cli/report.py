@@ -103,8 +103,8 @@ def read(paths: Sequence[Path]) -> list[Run]:
 def _read(path: Path, name: str, place: int) -> Run:
     stored = yaml.safe_load((path / "config.yaml").read_text(encoding="utf-8"))
     next_steps.require_run(stored)
-    ended = path / "run.json"
-    ended = dict(json.loads(ended.read_text(encoding="utf-8"))) if ended.exists() else {}
+    summary = path / "run.json"
+    ended = dict(json.loads(summary.read_text(encoding="utf-8"))) if summary.exists() else {}
     rows = _table(path / "metrics.csv")
     if not rows:
         raise ValueError("metrics.csv has no rows")
