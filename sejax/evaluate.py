@@ -6,16 +6,23 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import yaml
 
+from sejax import agents, envs
+from sejax.agents.base import AgentConfig
 from sejax.cli import commands, runtime
 from sejax.cli import config as configuration
 from sejax.cli.config import AgentFamily, EvaluateConfig, families_of, named
-from sejax.options import ConfigError, registry, require, shortened
+from sejax.ops.files import as_file_name, require_writable, write_text
+from sejax.options import registry, require, shortened
 from sejax.proxies import header, hub
+from sejax.proxies.io import Proxy, load_proxy
 from sejax.training import TrainingConfig, require_reachable, training_of
+
+if TYPE_CHECKING:  # which takes 0.3 s to import
+    import pandas as pd
 
 ABOUT = """Train fresh agents on a stored proxy, and on the real task beside them; test all there.
 
@@ -76,10 +83,9 @@ def evaluate(config: EvaluateConfig) -> float:
     import pandas as pd
 
     from sejax.cli import plots
-    from sejax.ops.files import require_writable, write_text
 
-    study = _real_study(config) if config.proxy == "real" else proxy_study(config)
-    out_dir, solved_reward = study.out_dir, study.task.solved_reward
+    study = real_study(config) if config.proxy == "real" else proxy_study(config)
+    out_dir = study.out_dir
     require_writable("out_dir", out_dir)  # before agents train for nothing
     tables = {
         (world, family.key): _train_and_test(config, study, world, family)
@@ -91,30 +97,20 @@ def evaluate(config: EvaluateConfig) -> float:
     _print_table(summary, study, config)
     write_text(out_dir / "evaluation.csv", table.to_csv(index=False))
     write_text(out_dir / "evaluation.json", _as_json(summary))
-    plots.evaluation(tables, solved_reward, out_dir / "evaluation.png")
+    plots.evaluation(tables, study.task.solved_reward, out_dir / "evaluation.png")
     first = table[table["world"] == next(iter(study.worlds))]
     return float(first["test_return"].mean())
 
 
-def summarise(table: Any, by: list[str]) -> Any:
-    """Mean and standard deviation of each column for each group, as a data frame.
-
-    A test return that is not a number counts as the worst of all.
-    """
-    table = table.fillna({"test_return": table["test_return"].min()})
-    grouped = table.groupby(by, sort=False)
-    summary = grouped[["test_return", "train_steps", "train_episodes"]].agg(["mean", "std"])
-    summary.columns = [f"{name}_{statistic}" for name, statistic in summary.columns]
-    return summary.assign(num_agents=grouped.size(), num_nonfinite=grouped["nonfinite"].sum())
+# --- which agents train where --------------------------------------------------------------------
 
 
-def _as_json(summary: Any) -> str:
-    """An object for each world; with several agents, in it one for each of them."""
-    if summary.index.nlevels == 1:
-        return str(summary.to_json(orient="index", indent=2))
-    worlds = summary.index.get_level_values("world").unique()
-    nested = {world: json.loads(summary.loc[world].to_json(orient="index")) for world in worlds}
-    return json.dumps(nested, indent=2)
+class World(NamedTuple):
+    """Where agents train, and how long each of them by its key."""
+
+    env: Any
+    params: Any
+    trainings: dict[str, TrainingConfig]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -123,15 +119,14 @@ class Study:
 
     Attributes:
       task: the real task, on which all are tested.
-      worlds: name to `(env, env_params, training)`, how long each of the agents trains there by its
-        key.
+      worlds: by name, the first one first in tables.
       families: the agents.
       exploration: of all of them.
       out_dir: where the files go.
     """
 
-    task: Any
-    worlds: dict[str, tuple[Any, Any, dict[str, TrainingConfig]]]
+    task: envs.Task
+    worlds: dict[str, World]
     families: tuple[AgentFamily, ...]
     exploration: Any
     out_dir: Path
@@ -141,77 +136,70 @@ class Study:
         return len(self.families) > 1
 
 
-def _real_study(config: EvaluateConfig) -> Study:
+def real_study(config: EvaluateConfig) -> Study:
     """Agents on the real task alone."""
-    from sejax import agents, envs
-
-    if config.env is None:
-        raise ConfigError(
-            "env must be given with proxy=real, because the task cannot be read "
-            "from a proxy; got none. Set env=cartpole."
-        )
-    spec = registry.configure("env", {"name": config.env})
+    require(config.env, "env", "must be given with proxy=real; got none. Set env=cartpole.")
+    task_config = registry.configure("env", {"name": config.env})
     families = families_of(config)
     for family in families:
         with named(family.field):
-            agents.require_fit(family.agent, config.exploration, envs.spec_of(spec), config.env)
-    task = envs.make_from(spec)
-    training = {family.key: config.real_training for family in families}
-    worlds = {"the real task": (task.env, task.params, training)}
-    out_dir = Path(config.out_dir or Path("runs", f"evaluate-{_as_file_name(task.name)}"))
+            spec = envs.spec_of(task_config)
+            agents.require_fit(family.agent, config.exploration, spec, str(config.env))
+    task = envs.make_from(task_config)
+    trainings = dict.fromkeys((family.key for family in families), config.real_training)
     return Study(
-        task=task, worlds=worlds, families=families, exploration=config.exploration, out_dir=out_dir
+        task=task,
+        worlds={"the real task": World(task.env, task.params, trainings)},
+        families=families,
+        exploration=config.exploration,
+        out_dir=Path(config.out_dir or Path("runs", f"evaluate-{as_file_name(task.name)}")),
     )
 
 
 def proxy_study(config: EvaluateConfig) -> Study:
     """Agents on a proxy, and on its real task beside them."""
-    from sejax import agents
-
     proxy = _load(config)
-    task = proxy.task
-    if config.env not in (None, task.name, proxy.config["env"].get("name")):
-        raise ConfigError(
-            f"env must be the proxy's own task, because agents trained on it are "
-            f"tested there; got {config.env} for a proxy of {task.name}. Set "
-            f"env={task.name}."
-        )
+    env, task = proxy.env, proxy.task
+    require(
+        config.env in (None, task.name, proxy.config["env"].get("name")),
+        "env",
+        f"must be the proxy's own task; got {config.env} for a proxy of {task.name}. Set "
+        f"env={task.name}.",
+    )
     families, exploration = families_of(config), config.exploration
     if config.agent_hparams == "as_learned":
-        families = tuple(
-            AgentFamily(key=key, field="agent", agent=agent)
-            for key, agent in proxy.learned_agents().items()
-        )
+        learned = proxy.learned_agents().items()
+        families = tuple(AgentFamily(key=key, field="agent", agent=agent) for key, agent in learned)
         exploration = proxy.learned_with("exploration")
     trainings = {}
     for family in families:
+        agent = family.agent
         with named(family.field):
-            agents.require_fit(family.agent, exploration, task, task.name)
-            group, training = _training_on(proxy, config, family.agent)
+            agents.require_fit(agent, exploration, task, task.name)
+            group, training = _training_on(proxy, config, agent)
             configuration.require_real_returns(group, training)
-            if not family.agent.is_solved_for:
-                require_reachable(group, training, proxy.env.max_steps)
-            if proxy.env.config.reaches_step_limit:
+            if not agent.is_solved_for:
+                require_reachable(group, training, env.max_steps)
+            if env.config.reaches_step_limit:
                 configuration.require_learning(
-                    group, training, family.agent, proxy.env.max_steps, task.max_steps
+                    group, training, agent, env.max_steps, task.max_steps
                 )
+        require(
+            not (config.baseline and agent.is_solved_for),
+            "baseline",
+            f"must be false with {family.field}={family.key}, which can only solve a one-step SE; "
+            "got true. Set baseline=false.",
+        )
         trainings[family.key] = training
-    worlds = {"the proxy": (proxy.env, proxy.params, trainings)}
+    worlds = {"the proxy": World(env, proxy.params, trainings)}
     if config.baseline:
-        for family in families:
-            require(
-                not family.agent.is_solved_for,
-                "baseline",
-                f"must be false with {family.field}={family.key}, because only a one-step SE can "
-                "be solved for; got true. Set baseline=false.",
-            )
-        real_training = dict.fromkeys(trainings, _real_training(config, proxy))
-        worlds["the real task"] = (task.env, task.params, real_training)
+        real_trainings = dict.fromkeys(trainings, _real_training(config, proxy))
+        worlds["the real task"] = World(task.env, task.params, real_trainings)
     beside = proxy.path.parent
     if beside == header.PRETRAINED_DIR:
         beside = Path("runs", f"evaluate-{proxy.path.stem}")
     elif hub.is_address(config.proxy):
-        beside = Path("runs", f"evaluate-{_as_file_name(config.proxy.removeprefix(hub.SCHEME))}")
+        beside = Path("runs", f"evaluate-{as_file_name(config.proxy.removeprefix(hub.SCHEME))}")
     return Study(
         task=task,
         worlds=worlds,
@@ -221,11 +209,8 @@ def proxy_study(config: EvaluateConfig) -> Study:
     )
 
 
-def _load(config: EvaluateConfig) -> Any:
+def _load(config: EvaluateConfig) -> Proxy:
     """The proxy; modules are imported if the command line names them, never because a file does."""
-    from sejax import envs
-    from sejax.proxies.io import load_proxy
-
     path = header.find(config.proxy, "proxy", also=("real",))
     stored = header.read_config(path, "proxy")
     task = proxy = None
@@ -238,8 +223,10 @@ def _load(config: EvaluateConfig) -> Any:
     return load_proxy(path, task, proxy, "proxy")
 
 
-def _training_on(proxy: Any, config: EvaluateConfig, agent: Any) -> tuple[str, Any]:
-    """How long agents train on the proxy, and the group of fields that says so."""
+def _training_on(
+    proxy: Proxy, config: EvaluateConfig, agent: AgentConfig
+) -> tuple[str, TrainingConfig]:
+    """The group of fields that says how long agents train on the proxy, and how long that is."""
     if config.training_from == "config":
         return "training", config.training
     if proxy.env.is_real:  # agents train and stop as on the real task
@@ -247,61 +234,65 @@ def _training_on(proxy: Any, config: EvaluateConfig, agent: Any) -> tuple[str, A
     require(
         "training" in proxy.config,
         "training_from",
-        "must be config for an SE whose file does not say how long agents trained on it, because "
-        f"tests on the real task must not stop them; got {shortened(config.training_from)}. Set "
-        "training_from=config training.stop_rule=never training.max_steps=2000 "
-        "training.max_episodes=2000.",
+        "must be config for an SE whose file does not say how long agents trained on it; got "
+        f"{shortened(config.training_from)}. Set training_from=config training.stop_rule=never "
+        "training.max_steps=2000 training.max_episodes=2000.",
     )
     test_episodes = config.real_training.test_episodes
     training = dataclasses.replace(training_of(proxy, agent), test_episodes=test_episodes)
     return "real_training", training
 
 
-def _real_training(config: EvaluateConfig, proxy: Any) -> TrainingConfig:
+def _real_training(config: EvaluateConfig, proxy: Proxy) -> TrainingConfig:
     """How agents train on real dynamics; those of an RN's run take its limit as they did there."""
     as_learned = config.agent_hparams == "as_learned" and "training" in proxy.config
     if not (as_learned and proxy.env.is_real):
         return config.real_training
     is_terminal = training_of(proxy).time_limit_is_terminal
-    usual = TrainingConfig().time_limit_is_terminal
+    default = TrainingConfig().time_limit_is_terminal
     require(
-        config.real_training.time_limit_is_terminal in (usual, is_terminal),
+        config.real_training.time_limit_is_terminal in (default, is_terminal),
         "real_training.time_limit_is_terminal",
-        "must be left out with agent_hparams=as_learned, because the proxy says how its agents "
-        "took the limit; got false. Set agent_hparams=default, or leave it out.",
+        f"must be what the proxy's agents learned with; got {not default}. Leave it out, or set "
+        "agent_hparams=default.",
     )
     return dataclasses.replace(config.real_training, time_limit_is_terminal=is_terminal)
 
 
-def _train_and_test(config: EvaluateConfig, study: Study, world: str, family: AgentFamily) -> Any:
-    """A row for each agent of a family, as a data frame."""
+# --- training, and the table ---------------------------------------------------------------------
+
+
+def _train_and_test(
+    config: EvaluateConfig, study: Study, world: str, family: AgentFamily
+) -> "pd.DataFrame":
+    """A row for each agent of a family."""
     import jax
     import numpy as np
     import pandas as pd
 
-    from sejax.agents import make_agent
     from sejax.cli.progress import Tally
     from sejax.evaluation import evaluate_agents
 
     env, env_params, trainings = study.worlds[world]
     varied = config.agent_hparams == "varied"
-    agent = make_agent(family.agent, study.task, study.exploration, varied)
+    agent = agents.make_agent(family.agent, study.task, study.exploration, varied)
     keys = jax.random.split(jax.random.key(config.seed), config.num_agents)
     who = f"{family.key} agents" if study.has_several else "agents"
     started = time.time()
     with Tally(config.num_agents, f"{who} on {world}") as tally:
-        outcome = evaluate_agents(
-            agent,
-            env,
-            env_params,
-            study.task,
-            trainings[family.key],
-            keys,
-            config.num_parallel,
-            config.devices,
-            tally.add if tally.is_live else None,
+        outcome = jax.device_get(
+            evaluate_agents(
+                agent,
+                env,
+                env_params,
+                study.task,
+                trainings[family.key],
+                keys,
+                config.num_parallel,
+                config.devices,
+                tally.add if tally.is_live else None,
+            )
         )
-        outcome = jax.device_get(outcome)
     drawn = jax.device_get(jax.vmap(agent.drawn_values)(keys))
     print(f"{world}: {config.num_agents} {who} in {time.time() - started:.1f} s", flush=True)
     numbers: dict[str, Any] = {"agent": range(config.num_agents)}
@@ -313,16 +304,37 @@ def _train_and_test(config: EvaluateConfig, study: Study, world: str, family: Ag
     return pd.DataFrame({**numbers, "test_return": outcome.test_return, **of_agents, **drawn})
 
 
-def _print_table(summary: Any, study: Study, config: EvaluateConfig) -> None:
+def summarise(table: "pd.DataFrame", by: list[str]) -> "pd.DataFrame":
+    """Mean and standard deviation of each column for each group.
+
+    A test return that is not a number counts as the worst of all.
+    """
+    table = table.fillna({"test_return": table["test_return"].min()})
+    grouped = table.groupby(by, sort=False)
+    summary = grouped[["test_return", "train_steps", "train_episodes"]].agg(["mean", "std"])
+    summary.columns = [f"{name}_{statistic}" for name, statistic in summary.columns]
+    return summary.assign(num_agents=grouped.size(), num_nonfinite=grouped["nonfinite"].sum())
+
+
+def _as_json(summary: "pd.DataFrame") -> str:
+    """An object for each world; with several agents, in it one for each of them."""
+    if summary.index.nlevels == 1:
+        return str(summary.to_json(orient="index", indent=2))
+    worlds = summary.index.get_level_values("world").unique()
+    nested = {world: json.loads(summary.loc[world].to_json(orient="index")) for world in worlds}
+    return json.dumps(nested, indent=2)
+
+
+def _print_table(summary: "pd.DataFrame", study: Study, config: EvaluateConfig) -> None:
     from rich.console import Console
     from rich.table import Table
 
     from sejax.cli.report import spread
 
-    agents = "agents of each family" if study.has_several else f"{study.families[0].key} agents"
-    solved_at = study.task.solved_reward
-    solved = f" (solved at {solved_at:g})" if study.task.is_solvable else ""
-    table = Table(title=f"{config.num_agents} fresh {agents}, tested on {study.task.name}{solved}")
+    task = study.task
+    who = "agents of each family" if study.has_several else f"{study.families[0].key} agents"
+    solved = f" (solved at {task.solved_reward:g})" if task.is_solvable else ""
+    table = Table(title=f"{config.num_agents} fresh {who}, tested on {task.name}{solved}")
     labels = ["trained on", "agent"][: summary.index.nlevels]
     for column in (*labels, "return", "training steps", "training episodes"):
         table.add_column(column, justify="left" if column in labels else "right")
@@ -338,13 +350,8 @@ def _print_table(summary: Any, study: Study, config: EvaluateConfig) -> None:
     diverged = int(summary["num_nonfinite"].sum())
     if diverged:
         console.print(f"{diverged} agents met a number that is not finite.")
-    console.print(
-        f"{study.out_dir}/evaluation.csv, .json and .png hold every agent.", soft_wrap=True
-    )
-
-
-def _as_file_name(name: str) -> str:
-    return name.replace("/", "_").replace(":", "_")
+    files = f"{study.out_dir}/evaluation.csv, .json and .png"
+    console.print(f"{files} hold every agent.", soft_wrap=True)
 
 
 if __name__ == "__main__":
