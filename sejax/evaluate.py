@@ -4,22 +4,16 @@ import dataclasses
 import json
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import yaml
 
-from sejax import agents, envs
-from sejax.agents.base import AgentConfig
+from sejax.agents import make_agent
 from sejax.cli import commands, runtime
 from sejax.cli import config as configuration
-from sejax.cli.config import AgentFamily, EvaluateConfig, families_of, named
-from sejax.ops.files import as_file_name, require_writable, write_text
-from sejax.options import registry, require, shortened
-from sejax.proxies import header, hub
-from sejax.proxies.io import Proxy, load_proxy
-from sejax.training import TrainingConfig, require_reachable, training_of
+from sejax.cli.config import AgentFamily, EvaluateConfig
+from sejax.cli.worlds import Setup, proxy_setup, real_setup
+from sejax.ops.files import require_writable, write_text
 
 if TYPE_CHECKING:  # which takes 0.3 s to import
     import pandas as pd
@@ -84,186 +78,26 @@ def evaluate(config: EvaluateConfig) -> float:
 
     from sejax.cli import plots
 
-    study = real_study(config) if config.proxy == "real" else proxy_study(config)
-    out_dir = study.out_dir
+    setup = real_setup(config) if config.proxy == "real" else proxy_setup(config)
+    out_dir = setup.out_dir
     require_writable("out_dir", out_dir)  # before agents train for nothing
     tables = {
-        (world, family.key): _train_and_test(config, study, world, family)
-        for world in study.worlds
-        for family in study.families
+        (world, family.key): _train_and_test(config, setup, world, family)
+        for world in setup.worlds
+        for family in setup.families
     }
     table = pd.concat([t.assign(world=world) for (world, _), t in tables.items()])
-    summary = summarise(table, ["world", "agent"] if study.has_several else ["world"])
-    _print_table(summary, study, config)
+    summary = summarise(table, ["world", "agent"] if setup.has_several else ["world"])
+    _print_table(summary, setup, config)
     write_text(out_dir / "evaluation.csv", table.to_csv(index=False))
     write_text(out_dir / "evaluation.json", _as_json(summary))
-    plots.evaluation(tables, study.task.solved_reward, out_dir / "evaluation.png")
-    first = table[table["world"] == next(iter(study.worlds))]
+    plots.evaluation(tables, setup.task.solved_reward, out_dir / "evaluation.png")
+    first = table[table["world"] == next(iter(setup.worlds))]
     return float(first["test_return"].mean())
 
 
-# --- which agents train where --------------------------------------------------------------------
-
-
-class World(NamedTuple):
-    """Where agents train, and how long each of them by its key."""
-
-    env: Any
-    params: Any
-    trainings: dict[str, TrainingConfig]
-
-
-@dataclass(frozen=True, kw_only=True)
-class Study:
-    """Which agents train where.
-
-    Attributes:
-      task: the real task, on which all are tested.
-      worlds: by name, the first one first in tables.
-      families: the agents.
-      exploration: of all of them.
-      out_dir: where the files go.
-    """
-
-    task: envs.Task
-    worlds: dict[str, World]
-    families: tuple[AgentFamily, ...]
-    exploration: Any
-    out_dir: Path
-
-    @property
-    def has_several(self) -> bool:
-        return len(self.families) > 1
-
-
-def real_study(config: EvaluateConfig) -> Study:
-    """Agents on the real task alone."""
-    require(config.env, "env", "must be given with proxy=real; got none. Set env=cartpole.")
-    task_config = registry.configure("env", {"name": config.env})
-    families = families_of(config)
-    for family in families:
-        with named(family.field):
-            spec = envs.spec_of(task_config)
-            agents.require_fit(family.agent, config.exploration, spec, str(config.env))
-    task = envs.make_from(task_config)
-    trainings = dict.fromkeys((family.key for family in families), config.real_training)
-    return Study(
-        task=task,
-        worlds={"the real task": World(task.env, task.params, trainings)},
-        families=families,
-        exploration=config.exploration,
-        out_dir=Path(config.out_dir or Path("runs", f"evaluate-{as_file_name(task.name)}")),
-    )
-
-
-def proxy_study(config: EvaluateConfig) -> Study:
-    """Agents on a proxy, and on its real task beside them."""
-    proxy = _load(config)
-    env, task = proxy.env, proxy.task
-    require(
-        config.env in (None, task.name, proxy.config["env"].get("name")),
-        "env",
-        f"must be the proxy's own task; got {config.env} for a proxy of {task.name}. Set "
-        f"env={task.name}.",
-    )
-    families, exploration = families_of(config), config.exploration
-    if config.agent_hparams == "as_learned":
-        learned = proxy.learned_agents().items()
-        families = tuple(AgentFamily(key=key, field="agent", agent=agent) for key, agent in learned)
-        exploration = proxy.learned_with("exploration")
-    trainings = {}
-    for family in families:
-        agent = family.agent
-        with named(family.field):
-            agents.require_fit(agent, exploration, task, task.name)
-            group, training = _training_on(proxy, config, agent)
-            configuration.require_real_returns(group, training)
-            if not agent.is_solved_for:
-                require_reachable(group, training, env.max_steps)
-            if env.config.reaches_step_limit:
-                configuration.require_learning(
-                    group, training, agent, env.max_steps, task.max_steps
-                )
-        require(
-            not (config.baseline and agent.is_solved_for),
-            "baseline",
-            f"must be false with {family.field}={family.key}, which can only solve a one-step SE; "
-            "got true. Set baseline=false.",
-        )
-        trainings[family.key] = training
-    worlds = {"the proxy": World(env, proxy.params, trainings)}
-    if config.baseline:
-        real_trainings = dict.fromkeys(trainings, _real_training(config, proxy))
-        worlds["the real task"] = World(task.env, task.params, real_trainings)
-    beside = proxy.path.parent
-    if beside == header.PRETRAINED_DIR:
-        beside = Path("runs", f"evaluate-{proxy.path.stem}")
-    elif hub.is_address(config.proxy):
-        beside = Path("runs", f"evaluate-{as_file_name(config.proxy.removeprefix(hub.SCHEME))}")
-    return Study(
-        task=task,
-        worlds=worlds,
-        families=families,
-        exploration=exploration,
-        out_dir=Path(config.out_dir or beside),
-    )
-
-
-def _load(config: EvaluateConfig) -> Proxy:
-    """The proxy; modules are imported if the command line names them, never because a file does."""
-    path = header.find(config.proxy, "proxy", also=("real",))
-    stored = header.read_config(path, "proxy")
-    task = proxy = None
-    if config.env is not None and not registry.is_registered("env", config.env):
-        fields = stored["env"] if stored["env"].get("name") == config.env else {}
-        task = envs.make_from(registry.configure("env", {**fields, "name": config.env}))
-    if config.proxy_kind is not None:
-        fields = {**stored["proxy"], "name": config.proxy_kind}
-        proxy = registry.configure("proxy", fields)
-    return load_proxy(path, task, proxy, "proxy")
-
-
-def _training_on(
-    proxy: Proxy, config: EvaluateConfig, agent: AgentConfig
-) -> tuple[str, TrainingConfig]:
-    """The group of fields that says how long agents train on the proxy, and how long that is."""
-    if config.training_from == "config":
-        return "training", config.training
-    if proxy.env.is_real:  # agents train and stop as on the real task
-        return "real_training", _real_training(config, proxy)
-    require(
-        "training" in proxy.config,
-        "training_from",
-        "must be config for an SE whose file does not say how long agents trained on it; got "
-        f"{shortened(config.training_from)}. Set training_from=config training.stop_rule=never "
-        "training.max_steps=2000 training.max_episodes=2000.",
-    )
-    test_episodes = config.real_training.test_episodes
-    training = dataclasses.replace(training_of(proxy, agent), test_episodes=test_episodes)
-    return "real_training", training
-
-
-def _real_training(config: EvaluateConfig, proxy: Proxy) -> TrainingConfig:
-    """How agents train on real dynamics; those of an RN's run take its limit as they did there."""
-    as_learned = config.agent_hparams == "as_learned" and "training" in proxy.config
-    if not (as_learned and proxy.env.is_real):
-        return config.real_training
-    is_terminal = training_of(proxy).time_limit_is_terminal
-    default = TrainingConfig().time_limit_is_terminal
-    require(
-        config.real_training.time_limit_is_terminal in (default, is_terminal),
-        "real_training.time_limit_is_terminal",
-        f"must be what the proxy's agents learned with; got {not default}. Leave it out, or set "
-        "agent_hparams=default.",
-    )
-    return dataclasses.replace(config.real_training, time_limit_is_terminal=is_terminal)
-
-
-# --- training, and the table ---------------------------------------------------------------------
-
-
 def _train_and_test(
-    config: EvaluateConfig, study: Study, world: str, family: AgentFamily
+    config: EvaluateConfig, setup: Setup, world: str, family: AgentFamily
 ) -> "pd.DataFrame":
     """A row for each agent of a family."""
     import jax
@@ -273,11 +107,11 @@ def _train_and_test(
     from sejax.cli.progress import Tally
     from sejax.evaluation import evaluate_agents
 
-    env, env_params, trainings = study.worlds[world]
+    env, env_params, trainings = setup.worlds[world]
     varied = config.agent_hparams == "varied"
-    agent = agents.make_agent(family.agent, study.task, study.exploration, varied)
+    agent = make_agent(family.agent, setup.task, setup.exploration, varied)
     keys = jax.random.split(jax.random.key(config.seed), config.num_agents)
-    who = f"{family.key} agents" if study.has_several else "agents"
+    who = f"{family.key} agents" if setup.has_several else "agents"
     started = time.time()
     with Tally(config.num_agents, f"{who} on {world}") as tally:
         outcome = jax.device_get(
@@ -285,7 +119,7 @@ def _train_and_test(
                 agent,
                 env,
                 env_params,
-                study.task,
+                setup.task,
                 trainings[family.key],
                 keys,
                 config.num_parallel,
@@ -296,7 +130,7 @@ def _train_and_test(
     drawn = jax.device_get(jax.vmap(agent.drawn_values)(keys))
     print(f"{world}: {config.num_agents} {who} in {time.time() - started:.1f} s", flush=True)
     numbers: dict[str, Any] = {"agent": range(config.num_agents)}
-    if study.has_several:
+    if setup.has_several:
         numbers = {"agent": family.key, "number": range(config.num_agents)}
     of_agents = {name: x for name, x in vars(outcome).items() if x.ndim == 1}  # not of episodes
     # The real task does not tell of numbers that are none.
@@ -325,14 +159,14 @@ def _as_json(summary: "pd.DataFrame") -> str:
     return json.dumps(nested, indent=2)
 
 
-def _print_table(summary: "pd.DataFrame", study: Study, config: EvaluateConfig) -> None:
+def _print_table(summary: "pd.DataFrame", setup: Setup, config: EvaluateConfig) -> None:
     from rich.console import Console
     from rich.table import Table
 
     from sejax.cli.report import spread
 
-    task = study.task
-    who = "agents of each family" if study.has_several else f"{study.families[0].key} agents"
+    task = setup.task
+    who = "agents of each family" if setup.has_several else f"{setup.families[0].key} agents"
     solved = f" (solved at {task.solved_reward:g})" if task.is_solvable else ""
     table = Table(title=f"{config.num_agents} fresh {who}, tested on {task.name}{solved}")
     labels = ["trained on", "agent"][: summary.index.nlevels]
@@ -350,7 +184,7 @@ def _print_table(summary: "pd.DataFrame", study: Study, config: EvaluateConfig) 
     diverged = int(summary["num_nonfinite"].sum())
     if diverged:
         console.print(f"{diverged} agents met a number that is not finite.")
-    files = f"{study.out_dir}/evaluation.csv, .json and .png"
+    files = f"{setup.out_dir}/evaluation.csv, .json and .png"
     console.print(f"{files} hold every agent.", soft_wrap=True)
 
 

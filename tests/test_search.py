@@ -388,10 +388,10 @@ class Tuning(trials.Tuning):
     """Trains nobody: an agent's return is 10 for each letter of its world, plus the generation."""
 
     def __init__(self, path, *overrides):
-        from sejax.evaluate import proxy_study
+        from sejax.cli.worlds import proxy_setup
 
         super().__init__(search_config.read([*ON_PROXY, f"search_dir={path}", *overrides]),
-                         proxy_study)  # fmt: skip
+                         proxy_setup)  # fmt: skip
         self.made = []
 
     def _outcome(self, config, world, generation, num_agents):
