@@ -238,8 +238,7 @@ def make_evaluator(
     require(
         isinstance(task, Task),
         "task",
-        "must be a sejax.Task, because agents are tested on it; got "
-        f"{type(task).__name__}. Set task=env.task of a proxy, or "
+        f"must be a sejax.Task; got {type(task).__name__}. Set task=env.task of a proxy, or "
         "sejax.envs.make(name).",
     )
     require_training_config(training)

@@ -141,8 +141,8 @@ class RewardThreshold(Options):
         require(
             task.is_solvable,
             "objective",
-            "must be one that needs no threshold in this task, because nobody says which return "
-            "solves it; got reward_threshold. Set env.solved_reward, or objective=max_reward.",
+            "must need no threshold where the task has none; got reward_threshold. Set "
+            "env.solved_reward, or objective=max_reward.",
         )
 
         def score(outcome: Outcome) -> Array:
@@ -283,9 +283,8 @@ class Scoring:
         require(
             one_unit or not strategy.remembers_scores,
             "es",
-            "must compare scores within a generation only, because with several agents or a "
-            "curriculum, scores of different generations are not comparable; got a strategy that "
-            "remembers scores. Set es=nes.",
+            "must compare scores within a generation with several agents or a curriculum; got one "
+            "that remembers scores. Set es=nes.",
         )
         asked = strategy.evaluations
         evaluations = dataclasses.replace(

@@ -137,8 +137,8 @@ def training_of(proxy: Proxy | ProxySet, agent: AgentConfig | None = None) -> Tr
     require(
         isinstance(stored, Mapping),
         "training",
-        f"must be given for {proxy.path.name}, because the file does not tell how long agents "
-        "trained on it; got none. Set training=sejax.TrainingConfig(...).",
+        f"must be given for {shortened(proxy.path.name)}, which does not say how long its agents "
+        "trained; got none. Set training=sejax.TrainingConfig(...).",
     )
     training: TrainingConfig = from_plain(TrainingConfig, stored, "training")
     if agent is None:
@@ -160,8 +160,7 @@ def require_training_config(training: Any) -> None:
     require(
         isinstance(training, TrainingConfig),
         "training",
-        "must be a sejax.TrainingConfig, because it says how long agents train; got "
-        f"{type(training).__name__}. Set "
+        f"must be a sejax.TrainingConfig; got {type(training).__name__}. Set "
         "training=sejax.TrainingConfig(max_episodes=100).",
     )
 
@@ -184,9 +183,9 @@ def require_reachable(name: str, training: TrainingConfig, max_episode_steps: in
     require(
         training.max_episodes >= episodes,
         f"{name}.max_episodes",
-        f"must be at least {episodes}, because {name}.max_steps={training.max_steps} takes as many "
-        f"episodes of at most {max_episode_steps} steps; got {shortened(training.max_episodes)}. "
-        f"Set {name}.max_episodes={episodes}.",
+        f"must be at least {episodes} for {name}.max_steps={training.max_steps} in episodes of at "
+        f"most {max_episode_steps} steps; got {shortened(training.max_episodes)}. Set "
+        f"{name}.max_episodes={episodes}.",
     )
 
 
@@ -234,13 +233,11 @@ class _Curve:
         """The episode's row is written if it has ended: an index out of range is dropped."""
         row = jnp.where(ended, episode, self.ends.shape[0])
 
-        def written(column: Array, value: Array) -> Array:
-            return column.at[row].set(value, mode="drop")
-
+        tests = self.test_returns
         return _Curve(
-            returns=written(self.returns, episode_return),
-            ends=written(self.ends, end),
-            test_returns=None if self.test_returns is None else written(self.test_returns, tested),
+            returns=self.returns.at[row].set(episode_return, mode="drop"),
+            ends=self.ends.at[row].set(end, mode="drop"),
+            test_returns=None if tests is None else tests.at[row].set(tested, mode="drop"),
         )
 
 
@@ -330,8 +327,14 @@ def make_trainer(
         key_begin, key_steps = jax.random.split(key)
         state = loop.begin(key_begin, env_params, hparams, active)
         remembered = tuple(buffer.init() for buffer in loop.buffers(state))
+        no_returns = jnp.full(training.max_episodes, jnp.nan)
+        curve = _Curve(
+            returns=no_returns,
+            ends=jnp.zeros(training.max_episodes, jnp.int32),
+            test_returns=None if loop.test_fn is None else no_returns,
+        )
         (remembered, curve), state = while_any_active(
-            loop.step, (remembered, loop.empty_curve()), state, (key_steps, env_params)
+            loop.step, (remembered, curve), state, (key_steps, env_params)
         )
         return TrainResult(
             agent_state=state.agent_state,
@@ -350,34 +353,28 @@ def make_trainer(
 
 def _require_parts(agent: Any, env: Any, training: Any) -> None:
     """Checks that the arguments are what they are called, in their order."""
-    require(
-        isinstance(agent, Agent),
-        "agent",
-        "must be a sejax.Agent, because it acts and learns; got "
-        f"{type(agent).__name__}. Set agent=sejax.make_agent(config, task).",
-    )
+    kind = type(agent).__name__
+    fix = "Set agent=sejax.make_agent(config, task)."
+    require(isinstance(agent, Agent), "agent", f"must be a sejax.Agent; got {kind}. {fix}")
     require(
         hasattr(env, "step_env"),
         "env",
-        "must be a gymnax environment, because the agent trains there; got "
-        f"{type(env).__name__}. Set env to the first of the pair that sejax.load "
-        "returns, or to task.env.",
+        f"must be a gymnax environment; got {type(env).__name__}. Set env to the first of the pair "
+        "that sejax.load returns, or to task.env.",
     )
     require_own_steps(env)
     spaces = None if agent.spec.spaces is None else Spaces.of_env(env)
     require(
         agent.spec.spaces == spaces,
         "agent",
-        f"must be made for the environment's {spaces}, because it acts on what it was made for; "
-        f"got {shortened(agent.spec.spaces)}. Set agent=sejax.make_agent(config, task) with that "
-        "task.",
+        f"must be made for the environment's {spaces}; got one for {shortened(agent.spec.spaces)}. "
+        "Set agent=sejax.make_agent(config, task) with that task.",
     )
     require_training_config(training)
     require(
         not jax.config.jax_enable_x64,
         "jax_enable_x64",
-        "must be off, because sejax counts and computes in 32 bits; got true. Set "
-        "JAX_ENABLE_X64=0.",
+        "must be off: sejax computes in 32 bits; got true. Set JAX_ENABLE_X64=0.",
     )
 
 
@@ -388,9 +385,8 @@ def _make_solver(
     require(
         training.num_tests_between == 0 and recorder is None,
         "agent",
-        "must be one that learns where its training is looked at, because there is no learning "
-        "curve without one; got one that is solved for. Set agent=ddqn, or objective=max_reward "
-        "training.tests_between=0.",
+        "must learn where its training is looked at; got one that is solved for. Set agent=ddqn, "
+        "or objective=max_reward training.tests_between=0.",
     )
     assert agent.solve is not None
     solve = agent.solve
@@ -460,14 +456,6 @@ class _Loop:
             tested=jnp.float32(0),
         )
 
-    def empty_curve(self) -> _Curve:
-        no_returns = jnp.full(self.training.max_episodes, jnp.nan)
-        return _Curve(
-            returns=no_returns,
-            ends=jnp.zeros(self.training.max_episodes, jnp.int32),
-            test_returns=None if self.test_fn is None else no_returns,
-        )
-
     def buffers(self, state: _LoopState) -> list[Buffer]:
         """What the agent keeps of its steps, and what the recorder does."""
 
@@ -493,9 +481,10 @@ class _Loop:
         truncated = self.env.is_truncated(env_state, env_params)
         nonfinite = state.nonfinite | info.get("nonfinite", False)
         ended = terminated | truncated | nonfinite
-        transition = Transition(
-            state.obs, action, reward, self.discount(terminated, truncated, info), next_obs
-        )
+        # What a target bootstraps with, before gamma.
+        discount = jnp.float32(info.get("discount", jnp.where(terminated, 0.0, 1.0)))
+        discount = jnp.where(truncated, 0.0, discount) if self.limit_is_terminal else discount
+        transition = Transition(state.obs, action, reward, discount, next_obs)
         active = state.active if masked else True
         finished = ended & active  # an episode that counts
         remembered = tuple(
@@ -531,11 +520,6 @@ class _Loop:
             before.episode, before.episode_return, train_steps, state.tested, finished
         )
         return (remembered, curve), state
-
-    def discount(self, terminated: Array, truncated: Array, info: Any) -> Array:
-        """What a target bootstraps with, before gamma."""
-        discount = jnp.float32(info.get("discount", jnp.where(terminated, 0.0, 1.0)))
-        return jnp.where(truncated, 0.0, discount) if self.limit_is_terminal else discount
 
     def end_episode(
         self, keys: list[Array], state: _LoopState, env_params: Any, finished: Array
