@@ -14,7 +14,7 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from sejax.agents.base import Agent
+from sejax.agents.base import Agent, AgentState, Hparams
 from sejax.agents.mixture import Mixture
 from sejax.envs.base import Task
 from sejax.envs.wrappers import repeat_actions
@@ -74,7 +74,7 @@ class _Episode:
     total: Array
     scored: Array  # return of the steps that count for the objective
     obs: Array
-    env_state: Any
+    env_state: PyTree
 
 
 class _Greedy:
@@ -96,7 +96,7 @@ class _Greedy:
         )
 
     def step(
-        self, key: Array, agent_state: Any, before: _Episode, eval_steps: Array | None = None
+        self, key: Array, agent_state: AgentState, before: _Episode, eval_steps: Array | None = None
     ) -> tuple[_Episode, Steps]:
         """The episode after a decision, and the decision; `key` is that of the whole episode.
 
@@ -140,12 +140,16 @@ def make_tester(agent: Agent, task: Task, num_episodes: int) -> Callable[..., Te
     """
     greedy = _Greedy(agent, task)
 
-    def step(nothing: Array, state: _Episode, consts: Any, masked: bool) -> tuple[Array, _Episode]:
+    def step(
+        nothing: Array, state: _Episode, consts: PyTree, masked: bool
+    ) -> tuple[Array, _Episode]:
         key, agent_state, eval_steps = consts
         after, _ = greedy.step(key, agent_state, state, eval_steps)
         return nothing, after
 
-    def episode(key: Array, agent_state: Any, active: Array | bool, eval_steps: Any) -> Tests:
+    def episode(
+        key: Array, agent_state: AgentState, active: Array | bool, eval_steps: Array | None
+    ) -> Tests:
         key_reset, key_steps = jax.random.split(key)
         state = greedy.begin(key_reset, active)
         consts = (key_steps, agent_state, eval_steps)
@@ -154,7 +158,7 @@ def make_tester(agent: Agent, task: Task, num_episodes: int) -> Callable[..., Te
 
     def test(
         key: Array,
-        agent_state: Any,
+        agent_state: AgentState,
         active: Array | bool = True,
         eval_steps: Array | None = None,
     ) -> Tests:
@@ -165,7 +169,9 @@ def make_tester(agent: Agent, task: Task, num_episodes: int) -> Callable[..., Te
     return test
 
 
-def make_recorder(agent: Agent, task: Task, num_episodes: int) -> Callable[[Array, Any], Steps]:
+def make_recorder(
+    agent: Agent, task: Task, num_episodes: int
+) -> Callable[[Array, AgentState], Steps]:
     """Builds `record(key, agent_state) -> Steps`, leaves `[num_episodes * max_steps, ...]`.
 
     The episodes are those of `make_tester` with the same key. A decision that an agent repeats is
@@ -173,7 +179,7 @@ def make_recorder(agent: Agent, task: Task, num_episodes: int) -> Callable[[Arra
     """
     greedy = _Greedy(agent, task)
 
-    def episode(key: Array, agent_state: Any) -> Steps:
+    def episode(key: Array, agent_state: AgentState) -> Steps:
         key_reset, key_steps = jax.random.split(key)
 
         def step(state: _Episode, _: None) -> tuple[_Episode, Steps]:
@@ -183,7 +189,7 @@ def make_recorder(agent: Agent, task: Task, num_episodes: int) -> Callable[[Arra
         start = greedy.begin(key_reset, True)
         return jax.lax.scan(step, start, length=-(-task.max_steps // agent.spec.action_repeat))[1]
 
-    def record(key: Array, agent_state: Any) -> Steps:
+    def record(key: Array, agent_state: AgentState) -> Steps:
         keys = jax.random.split(key, num_episodes)
         steps = jax.vmap(episode, in_axes=(0, None))(keys, agent_state)
         return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), steps)
@@ -249,7 +255,11 @@ def make_evaluator(
         train = make_tested_trainer(agent, env, task, training)
 
         def run(
-            key: Array, env_params: Any, active: Array | bool, eval_steps: Any, hparams: Any
+            key: Array,
+            env_params: PyTree,
+            active: Array | bool,
+            eval_steps: Array | None,
+            hparams: Hparams,
         ) -> Any:
             key_train, key_test = jax.random.split(key)
             result = train(key_train, env_params, hparams, active)
@@ -290,7 +300,7 @@ def make_tested_trainer(
     """
     test = make_tester(agent, task, max(1, training.num_tests_between))
 
-    def test_between(key: Array, agent_state: Any, active: Array) -> tuple[Array, Array]:
+    def test_between(key: Array, agent_state: AgentState, active: Array) -> tuple[Array, Array]:
         tests = test(key, agent_state, active)
         return tests.returns.mean(), tests.num_steps.sum()
 
@@ -336,7 +346,7 @@ def num_parallel_on_cpu(agent: Agent, training: TrainingConfig) -> int | None:
 def evaluate_agents(
     agent: Agent,
     env: Any,
-    env_params: Any,
+    env_params: PyTree,
     task: Task,
     training: TrainingConfig,
     keys: Array,

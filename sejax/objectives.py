@@ -7,7 +7,7 @@ number. `Scoring` applies it to a generation: what the strategy compares, and wh
 import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import jax.numpy as jnp
 import numpy as np
@@ -15,6 +15,7 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
 from sejax.agents.mixture import Mixture
+from sejax.envs.base import Task
 from sejax.es.base import Evaluations, Strategy, finite_mean
 from sejax.options import Options, counts, not_negative, option, require
 
@@ -100,7 +101,7 @@ class MaxReward(Options):
     # Generation from which on the task's limit counts; before, the steps change linearly.
     curriculum_generations: int = option(50, counts("it is the length of a curriculum"))
 
-    def make(self, task: Any) -> Objective:
+    def make(self, task: Task) -> Objective:
         """The objective on a task."""
         if self.first_eval_steps is None:
             return Objective(score=lambda outcome: outcome.test_return, scores_are_returns=True)
@@ -132,7 +133,7 @@ class RewardThreshold(Options):
     # w_sol: training steps that a unit of missing return is worth
     unsolved_weight: float = option(100.0, not_negative("a shortfall must not be rewarded"))
 
-    def make(self, task: Any) -> Objective:
+    def make(self, task: Task) -> Objective:
         """The objective on a task.
 
         Raises:
@@ -167,7 +168,7 @@ class AUC(Options):
     group: ClassVar[str] = "objective"
     scores_are_returns: ClassVar[bool] = False
 
-    def make(self, task: Any) -> Objective:
+    def make(self, task: Task) -> Objective:
         """The objective on a task."""
         return Objective(
             score=lambda outcome: outcome.auc / jnp.maximum(outcome.train_steps, 1),
@@ -189,7 +190,7 @@ class AUCSum(Options):
     group: ClassVar[str] = "objective"
     scores_are_returns: ClassVar[bool] = False
 
-    def make(self, task: Any) -> Objective:
+    def make(self, task: Task) -> Objective:
         """The objective on a task."""
         return Objective(
             score=lambda outcome: outcome.auc,

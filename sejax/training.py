@@ -12,9 +12,9 @@ from typing import Any, ClassVar
 import jax
 import jax.numpy as jnp
 from flax import struct
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Int, PyTree
 
-from sejax.agents.base import Agent, AgentConfig, Spaces
+from sejax.agents.base import Agent, AgentConfig, AgentState, Hparams, Spaces
 from sejax.agents.buffers import Buffer, BufferMaker, Transition
 from sejax.envs.base import require_own_steps
 from sejax.envs.wrappers import repeat_actions
@@ -208,7 +208,7 @@ class TrainResult:
       recorded: what the recorder has kept of the training's steps, if there was one.
     """
 
-    agent_state: Any
+    agent_state: AgentState
     train_steps: Array
     episodes: Array
     returns: Float[Array, " max_episodes"]
@@ -216,7 +216,7 @@ class TrainResult:
     episode_ends: Int[Array, " max_episodes"]
     nonfinite: Array
     eval_steps: Array
-    recorded: Any
+    recorded: PyTree
 
 
 @struct.dataclass
@@ -251,8 +251,8 @@ class _LoopState:
     episode: Array
     episode_return: Array
     obs: Array
-    env_state: Any
-    agent_state: Any
+    env_state: PyTree
+    agent_state: AgentState
     recent: Array  # [2 * window]: the last returns that the stop rule judges, newest last
     nonfinite: Array
     eval_steps: Array
@@ -260,7 +260,7 @@ class _LoopState:
 
 
 # `(key, agent_state, active) -> (mean return, steps)`, on the real task.
-TestFn = Callable[[Array, Any, Array], tuple[Array, Array]]
+TestFn = Callable[[Array, AgentState, Array], tuple[Array, Array]]
 
 
 def make_trainer(
@@ -321,7 +321,10 @@ def make_trainer(
     loop = _Loop(agent, env, training, solved_reward, test_fn, recorder)
 
     def train(
-        key: Array, env_params: Any, hparams: Any = agent.hparams, active: Array | bool = True
+        key: Array,
+        env_params: PyTree,
+        hparams: Hparams = agent.hparams,
+        active: Array | bool = True,
     ) -> TrainResult:
         env_params = loop.prepare(env_params, hparams)
         key_begin, key_steps = jax.random.split(key)
@@ -392,7 +395,10 @@ def _make_solver(
     solve = agent.solve
 
     def train(
-        key: Array, env_params: Any, hparams: Any = agent.hparams, active: Array | bool = True
+        key: Array,
+        env_params: PyTree,
+        hparams: Hparams = agent.hparams,
+        active: Array | bool = True,
     ) -> TrainResult:
         state = solve(env, env_params, hparams)
         return TrainResult(
@@ -437,7 +443,9 @@ class _Loop:
             env, params, agent.discount(hparams), limit_is_terminal
         )
 
-    def begin(self, key: Array, env_params: Any, hparams: Any, active: Array | bool) -> _LoopState:
+    def begin(
+        self, key: Array, env_params: PyTree, hparams: Hparams, active: Array | bool
+    ) -> _LoopState:
         key_agent, key_reset = jax.random.split(key)
         obs, env_state = self.env.reset_env(key_reset, env_params)
         agent_state = self.agent.init(key_agent, hparams)
@@ -468,8 +476,8 @@ class _Loop:
         return [make(shapes, self.buffer_steps) for make in self.buffer_makers]
 
     def step(
-        self, large: Any, state: _LoopState, consts: Any, masked: bool
-    ) -> tuple[Any, _LoopState]:
+        self, large: PyTree, state: _LoopState, consts: PyTree, masked: bool
+    ) -> tuple[PyTree, _LoopState]:
         """One agent step: act, step the world, store, learn, and close the episode if it ended."""
         (remembered, curve), (key, env_params) = large, consts
         buffers = self.buffers(state)
@@ -492,7 +500,7 @@ class _Loop:
             for buffer, arrays in zip(buffers, remembered, strict=True)
         )
 
-        def learn(agent_state: Any) -> Any:
+        def learn(agent_state: AgentState) -> Any:
             size = self.agent.batch_size(agent_state)
             batch = buffers[0].batch(key_sample, remembered[0], state.step + 1, transition, size)
             batch = buffers[0].mask(batch, active) if masked else batch
@@ -522,7 +530,7 @@ class _Loop:
         return (remembered, curve), state
 
     def end_episode(
-        self, keys: list[Array], state: _LoopState, env_params: Any, finished: Array
+        self, keys: list[Array], state: _LoopState, env_params: PyTree, finished: Array
     ) -> _LoopState:
         """Records the episode, decides whether training goes on, and starts the next one.
 
@@ -591,6 +599,6 @@ def is_solved(
     return recent[window:].sum() / jnp.clip(num_episodes, 1, window) >= solved_reward
 
 
-def _all_finite(tree: Any) -> Array:
+def _all_finite(tree: PyTree) -> Array:
     leaves = [x for x in jax.tree.leaves(tree) if jnp.issubdtype(x.dtype, jnp.floating)]
     return jnp.array([jnp.all(jnp.isfinite(x)) for x in leaves], bool).all()
