@@ -315,13 +315,10 @@ def test_a_checksummed_file_that_says_something_else_is_refused(run, change):
     assert "whole checkpoint" in refused(run)
 
 
-def test_a_sparse_file_of_30_gb_is_refused_without_being_read(run):
+def test_a_folder_or_a_sparse_file_of_30_gb_is_refused_without_being_read(run):
     os.truncate(run / CHECKPOINT, 30 << 30)
     with pytest.raises(ConfigError, match="header"):
         open_run(run)
-
-
-def test_a_checkpoint_that_is_a_folder_is_refused(run):
     (run / CHECKPOINT).unlink()
     (run / CHECKPOINT).mkdir()
     assert "Is a directory" in refused(run)
@@ -368,11 +365,6 @@ def test_a_refusal_does_not_import_jax(run):
     said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
     assert said.returncode == 0, said.stderr
     assert "seed (7 there, 3 here)" in said.stdout
-
-
-def test_the_hint_ends_each_refusal(run):
-    with pytest.raises(ConfigError, match=r"differs in.*Choose another --out\.$"):
-        RunDirectory(run, {"seed": 3}, hint="Choose another --out.")
 
 
 @pytest.mark.parametrize("name", ["file/run", "a\0b", "/proc/run"])
