@@ -174,7 +174,7 @@ class RunConfig(Protocol):
 
 
 def make_learner(
-    config: RunConfig | None = None, *, generations: int = 50, **parts: Any
+    config: RunConfig | None = None, *, generations: int = 100, **parts: Any
 ) -> Callable[[Array], LearnResult]:
     """Builds `learn(key) -> LearnResult`: all of Algorithm 1 as one pure function.
 
@@ -204,7 +204,7 @@ def make_learner(
         if not isinstance(config, RunConfig):
             raise TypeError(f"config must come from sejax.config([...]); got {config!r:.60}.")
         generations, parts = config.generations, config.parts()
-    counts("a run has at least one", most=1_000_000)("generations", generations, 50)
+    counts("a run has at least one", most=1_000_000)("generations", generations, 100)
     bilevel = make_bilevel(**parts)
 
     def learn(key: Array) -> LearnResult:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import yaml
 
 from sejax.agents import make_agent
-from sejax.cli import commands, runtime
+from sejax.cli import commands, compose, runtime
 from sejax.cli import config as configuration
 from sejax.cli.config import AgentFamily, EvaluateConfig
 from sejax.cli.worlds import Setup, proxy_setup, real_setup
@@ -42,7 +42,7 @@ def main(overrides: Sequence[str]) -> None:
 
 def help_text(overrides: Sequence[str]) -> str:
     """What `--help` prints."""
-    return f"{ABOUT}\n{configuration.help_text(EvaluateConfig, overrides)}"
+    return f"{ABOUT}\n{compose.help_text(EvaluateConfig, overrides)}"
 
 
 def config_text(overrides: Sequence[str]) -> str:
@@ -54,9 +54,9 @@ def config_text(overrides: Sequence[str]) -> str:
 def configs_of(overrides: Sequence[str]) -> list[EvaluateConfig]:
     """The configurations that the overrides describe, with folders of their own."""
     configs = []
-    for of_run in configuration.expand(overrides):
+    for of_run in compose.expand(overrides):
         config = configuration.evaluate_config(of_run)
-        own = configuration.name_in_sweep(overrides, of_run, ("out_dir",))
+        own = compose.name_in_sweep(overrides, of_run, ("out_dir",))
         if own:  # or all runs of a sweep would have one folder
             folder = f"{config.out_dir}/{own}" if config.out_dir else f"runs/evaluate-{own}"
             config = dataclasses.replace(config, out_dir=folder)

@@ -402,7 +402,7 @@ def command(monkeypatch, *words):
         ("es.noise_sdt=1", "Did you mean es.noise_std?"),
         ("devices=x", "devices must be a whole number"),
         ("~env=[[1]]", "an override must read"),
-        ("--resolve", "Options are --help, -h, --print-config."),
+        ("--resolve", "Options: --help, -h, --print-config."),
     ],
 )
 def test_bad_input_ends_with_one_message_and_status_2(

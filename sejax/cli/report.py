@@ -20,7 +20,7 @@ from jinja2 import Environment, FileSystemLoader
 from sejax.cli import next_steps, report_figures
 from sejax.cli.report_figures import Figure
 from sejax.options import ConfigError, shortened, told
-from sejax.options.registry import flatten
+from sejax.options.plain import flatten
 
 MOST_ROWS = 60  # generations in a table
 COSTS = {

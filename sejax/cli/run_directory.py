@@ -23,7 +23,7 @@ import yaml
 from sejax.ops import checksummed
 from sejax.ops.files import remove_leftovers, write_bytes, write_text
 from sejax.options import ConfigError, shortened
-from sejax.options.registry import differences
+from sejax.options.plain import differences
 
 if TYPE_CHECKING:  # which import jax
     from jax import Array

@@ -8,7 +8,8 @@ from typing import Any, NamedTuple
 from sejax import agents, envs
 from sejax.agents.base import AgentConfig
 from sejax.cli import config as configuration
-from sejax.cli.config import AgentFamily, EvaluateConfig, families_of, named
+from sejax.cli.compose import named
+from sejax.cli.config import AgentFamily, EvaluateConfig, families_of
 from sejax.ops.files import as_file_name
 from sejax.options import registry, require, shortened
 from sejax.proxies import header, hub
