@@ -56,9 +56,9 @@ def configs_of(overrides: Sequence[str]) -> list[EvaluateConfig]:
     configs = []
     for of_run in compose.expand(overrides):
         config = configuration.evaluate_config(of_run)
-        own = compose.name_in_sweep(overrides, of_run, ("out_dir",))
-        if own:  # or all runs of a sweep would have one folder
-            folder = f"{config.out_dir}/{own}" if config.out_dir else f"runs/evaluate-{own}"
+        swept = compose.name_in_sweep(overrides, of_run, ("out_dir",))
+        if swept:  # or all runs of a sweep would have one folder
+            folder = f"{config.out_dir}/{swept}" if config.out_dir else f"runs/evaluate-{swept}"
             config = dataclasses.replace(config, out_dir=folder)
         configs.append(config)
     return configs
@@ -166,7 +166,7 @@ def _print_table(summary: "pd.DataFrame", setup: Setup, config: EvaluateConfig) 
     from sejax.cli.report import spread
 
     task = setup.task
-    who = "agents of each family" if setup.has_several else f"{setup.families[0].key} agents"
+    who = "agents of each kind" if setup.has_several else f"{setup.families[0].key} agents"
     solved = f" (solved at {task.solved_reward:g})" if task.is_solvable else ""
     table = Table(title=f"{config.num_agents} fresh {who}, tested on {task.name}{solved}")
     labels = ["trained on", "agent"][: summary.index.nlevels]

@@ -62,8 +62,8 @@ class Objective:
       scores_are_returns: whether scores are mean returns, which the task's threshold can be held
         against.
       eval_steps: `generation -> steps`, how much of the test episodes it scores, if not all: a
-        curriculum. Only the members are scored by it; what an incumbent is worth is said by whole
-        episodes.
+        curriculum. It scores the population alone; incumbents are
+        scored by whole episodes.
       meaning: of a score, for people.
     """
 

@@ -57,9 +57,9 @@ def configs_of(overrides: Sequence[str]) -> list[LearnConfig]:
         config = configuration.config(of_run)
         given = config.run_dir
         known = LearnConfig.in_run_dir if given is None else ("run_dir",)
-        own = compose.name_in_sweep(overrides, of_run, known)
-        if own:  # or all runs of a sweep would have one folder
-            folder = f"{config.resolved_run_dir}_{own}" if given is None else f"{given}/{own}"
+        swept = compose.name_in_sweep(overrides, of_run, known)
+        if swept:  # or all runs of a sweep would have one folder
+            folder = f"{config.resolved_run_dir}_{swept}" if given is None else f"{given}/{swept}"
             config = dataclasses.replace(config, run_dir=folder)
         configs += runs_of(config)
     return configs

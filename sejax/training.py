@@ -243,7 +243,7 @@ class _Curve:
 
 @struct.dataclass
 class _LoopState:
-    """Carry of the step loop. What the agent remembers, and the curve, are carried beside it."""
+    """Carry of the step loop. Buffers and the curve are carried beside it."""
 
     active: Array
     step: Array  # decisions
@@ -273,8 +273,8 @@ def make_trainer(
 ) -> Callable[..., TrainResult]:
     """Builds `train(key, env_params, hparams, active=True) -> TrainResult` for one agent.
 
-    The result is pure; `vmap` it over keys, parameters and hyperparameters. Under `vmap` the lanes
-    run in lockstep until the last one has stopped, without copies of replay buffers. With
+    The result is pure; `vmap` it over keys, parameters and hyperparameters. Under `vmap` a batch of
+    agents takes as many steps as its longest training, without copies of replay buffers. With
     `active=False` nothing is computed.
 
     Args:
@@ -329,15 +329,15 @@ def make_trainer(
         env_params = loop.prepare(env_params, hparams)
         key_begin, key_steps = jax.random.split(key)
         state = loop.begin(key_begin, env_params, hparams, active)
-        remembered = tuple(buffer.init() for buffer in loop.buffers(state))
+        stored = tuple(buffer.init() for buffer in loop.buffers(state))
         no_returns = jnp.full(training.max_episodes, jnp.nan)
         curve = _Curve(
             returns=no_returns,
             ends=jnp.zeros(training.max_episodes, jnp.int32),
             test_returns=None if loop.test_fn is None else no_returns,
         )
-        (remembered, curve), state = while_any_active(
-            loop.step, (remembered, curve), state, (key_steps, env_params)
+        (stored, curve), state = while_any_active(
+            loop.step, (stored, curve), state, (key_steps, env_params)
         )
         return TrainResult(
             agent_state=state.agent_state,
@@ -348,7 +348,7 @@ def make_trainer(
             episode_ends=curve.ends,
             nonfinite=state.nonfinite | ~_all_finite(state.agent_state),
             eval_steps=state.eval_steps,
-            recorded=remembered[1] if recorder is not None else None,
+            recorded=stored[1] if recorder is not None else None,
         )
 
     return train
@@ -479,7 +479,7 @@ class _Loop:
         self, large: PyTree, state: _LoopState, consts: PyTree, masked: bool
     ) -> tuple[PyTree, _LoopState]:
         """One agent step: act, step the world, store, learn, and close the episode if it ended."""
-        (remembered, curve), (key, env_params) = large, consts
+        (stored, curve), (key, env_params) = large, consts
         buffers = self.buffers(state)
         key_act, key_env, key_sample, key_update, *keys_end = step_keys(key, state.step, 6)
         action = self.agent.act(key_act, state.agent_state, state.obs, explore=True)
@@ -495,14 +495,14 @@ class _Loop:
         transition = Transition(state.obs, action, reward, discount, next_obs)
         active = state.active if masked else True
         finished = ended & active  # an episode that counts
-        remembered = tuple(
+        stored = tuple(
             buffer.store(arrays, state.step, transition, ended, active)
-            for buffer, arrays in zip(buffers, remembered, strict=True)
+            for buffer, arrays in zip(buffers, stored, strict=True)
         )
 
         def learn(agent_state: AgentState) -> Any:
             size = self.agent.batch_size(agent_state)
-            batch = buffers[0].batch(key_sample, remembered[0], state.step + 1, transition, size)
+            batch = buffers[0].batch(key_sample, stored[0], state.step + 1, transition, size)
             batch = buffers[0].mask(batch, active) if masked else batch
             return self.agent.update(key_update, agent_state, batch)
 
@@ -527,14 +527,15 @@ class _Loop:
         curve = curve.with_episode(
             before.episode, before.episode_return, train_steps, state.tested, finished
         )
-        return (remembered, curve), state
+        return (stored, curve), state
 
     def end_episode(
         self, keys: list[Array], state: _LoopState, env_params: PyTree, finished: Array
     ) -> _LoopState:
         """Records the episode, decides whether training goes on, and starts the next one.
 
-        In lanes this runs for all if it runs for one; `finished` spares the others the test.
+        Under `vmap` this runs for all agents if it runs for one; `finished` spares the others the
+        test.
         """
         key_reset, key_test = keys
         judged = state.episode_return

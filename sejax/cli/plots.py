@@ -63,7 +63,7 @@ def evaluation(
 ) -> None:
     """Draws what agents trained in each world reached and what it took.
 
-    One column for each world, in it one for each family of agents, with a colour of its own.
+    A column for each world, in it one for each agent of several, each with its colour.
 
     Args:
       tables: by world and agent, columns `test_return`, `train_steps` and `train_episodes`, each

@@ -100,12 +100,12 @@ def _with_numbers(config: LearnConfig, num_dims: int, numbers: dict[str, Any]) -
     """The program of a configuration with other numbers, which may be traced."""
     parts = config.parts()
     if numbers["agents"]:
-        families = Mixture.of(parts["agent"])
+        mixture = Mixture.of(parts["agent"])
         learners = tuple(
             dataclasses.replace(agent, hparams=hparams)
-            for agent, hparams in zip(families.agents, numbers["agents"], strict=True)
+            for agent, hparams in zip(mixture.agents, numbers["agents"], strict=True)
         )
-        parts["agent"] = dataclasses.replace(families, agents=learners)
+        parts["agent"] = dataclasses.replace(mixture, agents=learners)
     if numbers["es"]:
         es = copy.copy(config.es)  # not checked again: a traced number is none
         for name, number in numbers["es"].items():
