@@ -23,7 +23,7 @@ ABOUT = """Train fresh agents on a stored proxy, and on the real task beside the
   python -m sejax.evaluate proxy=RUN_DIR num_agents=20
   python -m sejax.evaluate proxy=cartpole agents=[ddqn,ppo] agents.ppo.epochs=10
 
-Writes evaluation.csv, .json and .png into out_dir.
+Writes evaluation.csv, .json and .png into out_dir. --print-config prints the configuration alone.
 """
 
 

@@ -24,7 +24,8 @@ real dynamics (proxy=rn), from agents trained on nothing else.
   python -m sejax.run env=gymnax/MountainCar-v0 agent=my_module:MyAgent
   python -m sejax.run seed=0,1,2 es.noise_std=0.03,0.06      a run for each combination
 
-The same command on the same run_dir goes on where it stopped.
+The same command on the same run_dir goes on where it stopped. --print-config prints the
+configuration of each run, and runs nothing.
 Then: python -m sejax.evaluate proxy=RUN_DIR
 """
 

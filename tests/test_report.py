@@ -43,10 +43,12 @@ def write_run(path, *words, means=(10.0, 196.0, 150.0), ended=True, **changes):
 
 
 def evaluate(path, worlds=("the proxy", "the real task")):
-    rows = [f"{world},{i},{190 + i},{2000 * (place + 1)},20"
+    rows = [f"{world},{i},{190 + i},{2000 * (place + 1)},20,False,word"
             for place, world in enumerate(worlds) for i in range(3)]  # fmt: skip
     (path / "evaluation.csv").write_text(
-        "\n".join(["world,agent,test_return,train_steps,train_episodes", *rows, ""])
+        "\n".join(
+            ["world,agent,test_return,train_steps,train_episodes,nonfinite,activation", *rows, ""]
+        )
     )
 
 

@@ -108,33 +108,15 @@ def _read(path: Path, name: str, place: int) -> Run:
     rows = _table(path / "metrics.csv")
     if not rows:
         raise ValueError("metrics.csv has no rows")
-    agents = _table(path / "evaluation.csv") if (path / "evaluation.csv").exists() else []
-    return Run(path=path, name=name, **_described(path, name, place, stored, ended, rows, agents))
-
-
-def _described(
-    path: Path,
-    name: str,
-    place: int,
-    stored: dict[str, Any],
-    ended: dict[str, Any],
-    rows: list[Row],
-    agents: list[Row],
-) -> dict[str, Any]:
-    """The fields of a `Run`, of what its files hold."""
+    evaluated = path / "evaluation.csv"
+    agents = _table(evaluated, report_figures.MEASURES) if evaluated.exists() else []
     solved_score = None if ended.get("solved_score") is None else float(ended["solved_score"])
     finished, asked = int(rows[-1]["generation"]) + 1, int(stored["generations"])
     is_over = ended.get("generations") == finished
     better = [row for row in rows if math.isfinite(row["incumbent_mean"])]
     best = max(better, key=lambda row: (row["incumbent_mean"], row["generation"]), default=None)
     incumbent = MISSING if best is None else spread(best["incumbent_mean"], best["incumbent_std"])
-    if not is_over:
-        title = f"not ended: {finished} of {asked} generations are there"
-    elif best is None or solved_score is None:
-        title = f"ended after {finished} of {asked} generations"
-    else:
-        verdict = "solved" if best["incumbent_mean"] >= solved_score else "not solved"
-        title = f"{verdict}, after {finished} of {asked} generations"
+    title = _title(is_over, finished, asked, best, solved_score)
     task = str(stored["env"]["name"])
     facts = {
         "task": task,
@@ -152,27 +134,39 @@ def _described(
     more = None if ended.get("ended") == "solved" else 2 * asked
     groups = _by_world_and_agent(agents)
     evaluation = [_summary(key, group) for key, group in groups.items()]
-    return {
-        "task": task,
-        "title": title,
-        "facts": facts,
-        "config": {field: text(value) for field, value in flatten(stored).items()},
-        "environment": {k: text(v) for k, v in environment.items() if v is not None},
-        "rows": rows,
-        "solved_score": solved_score,
-        "curve": report_figures.learning_curve(place, name, rows, solved_score, incumbent),
-        "evaluation": evaluation,
-        "agents": report_figures.evaluation(place, name, groups, solved_score, evaluation),
-        "commands": next_steps.of_stored(stored, path, more if is_over else asked),
-    }
+    return Run(
+        path=path,
+        name=name,
+        task=task,
+        title=title,
+        facts=facts,
+        config={field: text(value) for field, value in flatten(stored).items()},
+        environment={k: text(v) for k, v in environment.items() if v is not None},
+        rows=rows,
+        solved_score=solved_score,
+        curve=report_figures.learning_curve(place, name, rows, solved_score, incumbent),
+        evaluation=evaluation,
+        agents=report_figures.evaluation(place, name, groups, solved_score, evaluation),
+        commands=next_steps.of_stored(stored, path, more if is_over else asked),
+    )
 
 
-def _table(path: Path) -> list[Row]:
+def _title(
+    is_over: bool, finished: int, asked: int, best: Row | None, solved_score: float | None
+) -> str:
+    if not is_over:
+        return f"not ended: {finished} of {asked} generations are there"
+    if best is None or solved_score is None:
+        return f"ended after {finished} of {asked} generations"
+    verdict = "solved" if best["incumbent_mean"] >= solved_score else "not solved"
+    return f"{verdict}, after {finished} of {asked} generations"
+
+
+def _table(path: Path, columns: Sequence[str] = ()) -> list[Row]:
+    """The rows of a CSV file, with numbers in these columns, or in all."""
     with path.open(newline="", encoding="utf-8") as file:
-        return [
-            {name: x if name in ("world", "agent") else float(x) for name, x in row.items()}
-            for row in csv.DictReader(file, strict=True)
-        ]
+        rows = list(csv.DictReader(file, strict=True))
+    return [row | {name: float(row[name]) for name in columns or row} for row in rows]
 
 
 def _by_world_and_agent(rows: list[Row]) -> dict[tuple[str, str], list[Row]]:

@@ -26,6 +26,7 @@ STYLE: Any = {
 }
 COLORS = (plots.INCUMBENT, plots.POPULATION, *plots.AGENTS)
 MARKERS = "osD^vP*X"
+MEASURES = ("test_return", "train_steps", "train_episodes")  # of an evaluation, in its figure
 
 Rows = Sequence[Mapping[str, Any]]
 
@@ -59,9 +60,7 @@ def evaluation(
     if not groups:
         return None
     tables = {
-        (_label(world), _label(agent)): {
-            column: [row[column] for row in rows] for column in rows[0]
-        }
+        (_label(world), _label(agent)): {name: [row[name] for row in rows] for name in MEASURES}
         for (world, agent), rows in groups.items()
     }
     about = "; ".join(
