@@ -233,10 +233,10 @@ def test_a_repository_has_an_owner_and_a_name(repo):
 @needs_the_extra
 def test_the_command_evaluates_what_is_there_and_writes_in_the_working_folder(the_hub):
     from sejax.cli import config as configuration
-    from sejax.evaluate import proxy_study
+    from sejax.cli.worlds import proxy_setup
 
     sejax.push("cartpole", "me/se")
     config = configuration.evaluate_config([f"proxy=hf://me/se@{oid('me/se', 0)}"])
-    study = proxy_study(config)
+    study = proxy_setup(config)
     assert study.task.name == "cartpole"
     assert str(study.out_dir) == f"runs/evaluate-me_se@{oid('me/se', 0)}"

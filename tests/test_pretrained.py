@@ -16,7 +16,7 @@ from plain_agents import agent_for, learn, mean_return
 import sejax
 from sejax import envs
 from sejax.cli.config import evaluate_config
-from sejax.evaluate import proxy_study
+from sejax.cli.worlds import proxy_setup
 from sejax.gym import GYMNASIUM_IDS, make
 from sejax.proxies import header, zoo
 from sejax.proxies.header import PRETRAINED_DIR
@@ -52,7 +52,7 @@ def test_each_has_a_card_that_says_what_it_teaches(name):
     for each in proxy.evaluations:
         assert f"{each.return_mean:.1f} ± {each.return_std:.1f}" in proxy.card
     (words,) = re.findall(r"`python -m sejax\.evaluate (.*)` trains agents", proxy.card)
-    study = proxy_study(evaluate_config(words.split()))
+    study = proxy_setup(evaluate_config(words.split()))
     best = max(proxy.on_proxy, key=lambda each: each.return_mean)
     assert best.agent in study.worlds["the proxy"][2], "the command trains what did best"
 

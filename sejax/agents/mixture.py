@@ -84,8 +84,20 @@ class Mixture:
 
     @classmethod
     def of(cls, agent: "Agent | Mixture") -> "Mixture":
-        """A mixture of one agent; a mixture stays as it is."""
-        return agent if isinstance(agent, Mixture) else cls(agents=(agent,))
+        """A mixture of one agent; a mixture stays as it is.
+
+        Raises:
+          ConfigError: for anything else.
+        """
+        if isinstance(agent, Mixture):
+            return agent
+        require(
+            isinstance(agent, Agent),
+            "agent",
+            f"must be a sejax.Agent or a sejax.Mixture; got {shortened(repr(agent))}. Pass an "
+            "object; sejax.config([...]) takes names.",
+        )
+        return cls(agents=(agent,))
 
     @property
     def size(self) -> int:
