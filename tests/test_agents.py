@@ -207,7 +207,7 @@ def test_an_agent_is_made_once_for_equal_configurations(name):
 # --- agents with a replay buffer -----------------------------------------------------------------
 
 
-@every_off_policy_agent
+@pytest.mark.parametrize("case", [*OFF_POLICY, *EXPLORING[:2]], ids="-".join)
 def test_columns_of_no_weight_change_nothing(case):
     state, batch = started(case)
     update, key = update_of(case), jax.random.key(0)

@@ -57,9 +57,8 @@ class BoltzmannConfig(AgentConfig):
         require(
             task.action_dim <= MOST_DIMS,
             "agent",
-            f"must be one that learns where actions have more than {MOST_DIMS} numbers, because "
-            "the Boltzmann policy tries every action of a grid; got boltzmann for "
-            f"{task.action_dim} of them. Set agent=sac.",
+            f"must be one that learns where actions have more than {MOST_DIMS} numbers; got "
+            f"boltzmann for {task.action_dim} of them. Set agent=sac.",
         )
         points = np.linspace(-task.max_action, task.max_action, self.num_points, dtype=np.float32)
         grid = np.meshgrid(*[points] * task.action_dim, indexing="ij")
@@ -92,9 +91,8 @@ def make_boltzmann(config: BoltzmannConfig, actions: Array) -> Agent:
         require(
             getattr(env, "is_bandit", False),
             "agent",
-            "must be one that learns, or the proxy an SE whose episodes are one step, because the "
-            f"Boltzmann policy is known there alone; got boltzmann in {env.name}. Set agent=ddqn, "
-            "or proxy.horizon=1.",
+            "must be one that learns, or the proxy an SE whose episodes are one step; got "
+            f"boltzmann in {env.name}. Set agent=ddqn, or proxy.horizon=1.",
         )
         reward = jax.tree_util.Partial(env.bandit_reward, env_params.weights)
         return BoltzmannState(reward=reward, hparams=jax.tree.map(jnp.float32, hparams))
