@@ -52,15 +52,18 @@ class Bandit(environment.Environment):
 
 SMALL = {"hidden_size": 16, "num_layers": 1, "learning_rate": 0.01}
 OFF_POLICY = SMALL | {"batch_size": 32, "tau": 0.05}
+ACTOR_CRITIC = OFF_POLICY | {
+    "num_layers": 2, "learning_rate": 3e-3, "batch_size": 64, "warmup_episodes": 500,
+}  # fmt: skip
 AGENTS = {
     "ddqn": sejax.DDQNConfig(**OFF_POLICY),
     "dueling_ddqn": sejax.DuelingDDQNConfig(**OFF_POLICY, feature_dim=16, stream_hidden_size=16),
     "dqn": sejax.DQNConfig(**OFF_POLICY, train_every=2, gradient_steps=2),
-    "td3": sejax.TD3Config(**OFF_POLICY, warmup_episodes=200, activation="tanh"),
+    "td3": sejax.TD3Config(**ACTOR_CRITIC),
     "td3_discrete": sejax.DiscreteTD3Config(
         **OFF_POLICY, target_noise_std=0.0, final_temperature=1.0
     ),
-    "sac": sejax.SACConfig(**OFF_POLICY, warmup_episodes=200, alpha=0.01),
+    "sac": sejax.SACConfig(**ACTOR_CRITIC, alpha=0.05),
     "ppo": sejax.PPOConfig(hidden_size=16, num_layers=1),
     "paper_ppo": sejax.PPOConfig.paper(**SMALL, rollout_steps=64, epochs=5),
 }
