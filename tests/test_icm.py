@@ -79,8 +79,7 @@ STUBS = {kind: stub_agent(kind) for kind in KINDS}
 
 def curious(kind, agent=None):
     """The wrapped agent; discrete actions are indices, vectors are continuous."""
-    num_actions, action_dim = (WIDTH, None) if kind == "index" else (None, WIDTH)
-    return with_icm(agent or STUBS[kind], CONFIG, OBS_DIM, num_actions, action_dim)
+    return with_icm(agent or STUBS[kind], CONFIG, OBS_DIM, WIDTH, is_discrete=kind == "index")
 
 
 def model_of(config):

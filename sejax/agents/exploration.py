@@ -78,7 +78,8 @@ class ICMConfig(ExplorationConfig):
 
     def make(self, agent: Agent, task: Task) -> Agent:
         """The agent with the bonus."""
-        return with_icm(agent, self, task.obs_dim, task.num_actions, task.action_dim)
+        is_discrete = task.num_actions is not None
+        return with_icm(agent, self, task.obs_dim, task.action_dim, is_discrete)
 
 
 class CuriousHparams(NamedTuple):
@@ -162,7 +163,7 @@ class ICM(nn.Module):
 
 
 def with_icm(
-    agent: Agent, config: ICMConfig, obs_dim: int, num_actions: int | None, action_dim: int | None
+    agent: Agent, config: ICMConfig, obs_dim: int, action_width: int, is_discrete: bool
 ) -> Agent:
     """The same agent, learning from rewards with an intrinsic bonus.
 
@@ -176,10 +177,9 @@ def with_icm(
       agent: one that learns from batches of `Transition`s, or from a `Rollout`.
       config: the module's sizes and numbers.
       obs_dim: length of an observation.
-      num_actions: number of discrete actions, or None if they are continuous. Actions that are
-        indices enter the models as one-hot vectors; an agent's own vectors of that length, as those
-        of discrete TD3, enter as they are.
-      action_dim: length of a continuous action; not used where there is `num_actions`.
+      action_width: length of an action, or number of discrete actions.
+      is_discrete: whether actions are indices, which enter the models as one-hot vectors. An
+        agent's own vectors for discrete actions, as those of discrete TD3, enter as they are.
 
     Differs: two discrete actions are treated as any other number of them, with two logits and a
     softmax, where the authors' have the number 0 or 1 and one logit. Vectors of discrete actions
@@ -190,13 +190,11 @@ def with_icm(
     Example:
       >>> from sejax.agents.dqn import DDQNConfig, make_ddqn
       >>> plain = make_ddqn(DDQNConfig(), obs_dim=4, num_actions=2)
-      >>> agent = with_icm(plain, ICMConfig(), obs_dim=4, num_actions=2, action_dim=None)
+      >>> agent = with_icm(plain, ICMConfig(), obs_dim=4, action_width=2, is_discrete=True)
       >>> state = agent.init(jax.random.key(0), agent.hparams)
       >>> int(agent.act(jax.random.key(1), state, jnp.zeros(4), explore=False)) in (0, 1)
       True
     """
-    action_width = num_actions or action_dim
-    assert action_width is not None, "an action has a number of choices or a length"
     model = ICM(config, action_width)
     example = (jnp.zeros(obs_dim), jnp.zeros(action_width), jnp.zeros(obs_dim))
     unflatten = flat.unflattener(model.init, *example)
@@ -241,7 +239,7 @@ def with_icm(
     def update_from_rollout(key: Array, state: CuriousState, rollout: Rollout) -> CuriousState:
         # The agent's update is inside: its rows with the bonus would else be made in each step.
         def learn(state: CuriousState) -> CuriousState:
-            batch = rollout.transitions(obs_dim, num_actions is not None)
+            batch = rollout.transitions(obs_dim, is_discrete)
             augmented = rollout.with_bonus(bonus(state, batch))
             state = train_models(state, batch)
             return state.replace(agent_state=agent.update(key, state.agent_state, augmented))
