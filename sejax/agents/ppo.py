@@ -37,7 +37,6 @@ from sejax.options import (
     not_negative,
     one_of,
     option,
-    or_none,
     positive,
     require,
     shortened,
@@ -67,7 +66,7 @@ class PPOConfig(AgentOptions):
     learning_rate: float = option(2e-3, positive(MOVES), traced=True, varied="triple")
     discount: float = option(0.99, fraction(), traced=True)
     # Decisions between two learning phases; null: as `update_episodes` says.
-    rollout_steps: int | None = option(128, or_none(counts()))
+    rollout_steps: int | None = option(128, counts())
     update_episodes: int = option(10, counts())  # of full length, between two learning phases
     epochs: int = option(10, counts())  # passes over the rollout in a learning phase
     num_minibatches: int = option(4, counts())  # Adam steps in an epoch, each on its part of it
@@ -79,7 +78,7 @@ class PPOConfig(AgentOptions):
     # Divides rewards by the running std of returns, with advantages=gae.
     normalize_rewards: bool = True
     # Norm that a longer gradient is scaled down to.
-    max_grad_norm: float | None = option(0.5, or_none(positive(MOVES)))
+    max_grad_norm: float | None = option(0.5, positive(MOVES))
     adam_eps: float = option(1e-5, positive("it keeps Adam from dividing by 0"))
     # Of the Gaussian policy; learned.
     init_action_std: float = option(0.5, positive(MOVES))

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 
 from sejax.es.base import LARGEST, Strategy, StrategyOptions
 from sejax.es.score_transforms import TRANSFORMS
-from sejax.options import counts, fraction, one_of, option, or_none, positive, shrinks
+from sejax.options import counts, fraction, one_of, option, positive, shrinks
 
 UPDATE_RULES = ("authors", "paper")
 
@@ -27,9 +27,7 @@ class NESConfig(StrategyOptions):
 
     population_size: int = 64  # n_p: perturbations of a generation
     # Agents on the incumbent; null: one for each perturbation, as in the paper.
-    num_incumbent_evals: int | None = option(
-        16, or_none(counts("the incumbent's score selects the proxy"))
-    )
+    num_incumbent_evals: int | None = option(16, counts("the incumbent's score selects the proxy"))
     # sigma: std of the weight perturbation
     noise_std: float = option(0.06, positive("candidates must differ", LARGEST), traced=True)
     # factor on sigma after each generation
