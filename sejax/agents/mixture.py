@@ -71,15 +71,15 @@ class Mixture:
         require(
             size > 0 and len(self.names) == len(self.weights) == size,
             "agents",
-            "must hold an agent, and as many names and weights as agents, because each agent has "
-            f"one of both; got {size} agents, names={self.names} and weights={self.weights}. Set "
-            "names=() and weights=().",
+            "must hold an agent, and as many names and weights as agents; got "
+            f"{size} agents, names={shortened(self.names)} and weights={shortened(self.weights)}. "
+            "Set names=() and weights=().",
         )
         require(
             min(self.weights) >= 0 and max(self.weights) > 0,
             "agents",
-            "must have weights of at least 0, and one above, because the candidates are divided "
-            f"by them; got {shortened(self.weights)}. Set weights=().",
+            "must have weights of at least 0, and one above; got "
+            f"{shortened(self.weights)}. Set weights=().",
         )
 
     @classmethod
@@ -124,8 +124,8 @@ class Mixture:
         require(
             counts[shares > 0].all(),
             "es.population_size",
-            "must leave each agent of the mixture a candidate, because the proxy must be scored "
-            f"by all of them; got {num_places} perturbations for weights {self.weights}. Set "
+            f"must leave each agent a candidate; got {num_places} perturbations for weights "
+            f"{shortened(self.weights)}. Set "
             f"es.population_size={2 * max(num_places, self.size)}.",
         )
         return np.tile(dealt, 2 if antithetic else 1)
