@@ -40,30 +40,18 @@ def main() -> None:
         return
     repeats = min(args.repeats, 3) if args.quick else args.repeats
     where = common.machine(("jax", "gymnasium", "gymnax", "numpy", "sejax"))
-    sides = {name: common.Side(__file__, name, "--core", args.core, "--seed", args.seed)
-             for name in SIDES}  # fmt: skip
-    times: dict[str, list[float]] = {name: [] for name in SIDES}
-    for repeat in range(repeats + 1):
-        for name, side in sides.items():
-            used = side.ask()["us"]
-            if repeat:  # the first one warms up
-                times[name].append(used)
-    for side in sides.values():
-        side.close()
-    result = {"us": {name: common.spread(times[name]) for name in SIDES}, "machine": where}
-    show(result)
-    common.finish("gym_step", args, result)
+    with common.sides_of(__file__, [*SIDES], core=args.core, seed=args.seed) as sides:
+        answers = common.in_turns(sides, [{}] * repeats)
+    us = {name: common.spread([each["us"] for each in mine]) for name, mine in answers.items()}
+    rows = [[SIDES[name], common.show_spread(values, 2)] for name, values in us.items()]
+    title = "CPU time of a step of one environment, median (min to max)"
+    common.print_table(title, ["side", "µs"], rows)
+    common.finish("gym_step", args, {"us": us, "machine": where})
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--repeats", type=int, default=15)
-    parser.add_argument("--core", type=int, default=common.available_cores()[-1])
-
-
-def show(result: dict[str, Any]) -> None:
-    rows = [[SIDES[name], common.show_spread(us, 2)] for name, us in result["us"].items()]
-    common.print_table("CPU time of a step of one environment, median (min to max)",
-                       ["side", "µs"], rows)  # fmt: skip
+    common.add_core(parser)
 
 
 def serve(args: argparse.Namespace) -> None:

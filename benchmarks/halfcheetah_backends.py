@@ -36,8 +36,9 @@ def main() -> None:
     mujoco = {"step_us": mujoco_us, "lanes_us": None, "compile_s": None}
     rows = [{"physics": "MuJoCo", **mujoco, **compare(expected, expected)}]
     for backend in args.backends:
-        with common.Side(__file__, backend, "--gaits", args.gaits, "--seed", args.seed) as side:
-            measured = side.ask()
+        options = {"gaits": args.gaits, "seed": args.seed}
+        with common.sides_of(__file__, [backend], **options) as sides:
+            measured = sides[backend].ask()
         returns = np.array(measured.pop("returns"))
         rows.append({"physics": backend, **measured, **compare(returns, expected)})
     columns = ["physics", "µs a step", f"in {LANES} lanes", "compile s", "mean return",

@@ -28,9 +28,10 @@ import pandas as pd
 
 import sejax
 from experiments.common import figures
-from experiments.common.experiment import Experiment, Settings, count, each_of, setting
+from experiments.common.experiment import Experiment, Settings, count, setting
 from experiments.common.statistics import NUM_RESAMPLES
 from experiments.common.tables import as_texts, mean_columns, publish
+from sejax.options import each_of
 
 # docs/reference.md 6.2: default_config_gridworld.yaml as the published runs used it.
 SETTINGS = [
@@ -76,13 +77,11 @@ PAPER = {"all_better_1": "among the best", "all_better_2": "among the best"}
 class ScoreTransforms(Settings):
     name = "score_transforms"
 
-    runs: int = count(
-        220, "runs", quick=12, about="of each transform, with mirrored sampling and without"
-    )
-    generations: int = count(50, "generations", quick=10, about="of a run at most")
-    population: int = count(16, "candidates", least=2, quick=8, about="of a generation")
-    transforms: tuple[str, ...] = setting(tuple(LABELS), each_of(LABELS), about="to compare")
-    bins: int = count(9, "bins", quick=3, about="of step sizes")
+    runs: int = count(220, quick=12)  # of each transform, with mirrored sampling and without
+    generations: int = count(50, quick=10)  # of a run at most
+    population: int = count(16, least=2, quick=8)  # candidates of a generation
+    transforms: tuple[str, ...] = setting(tuple(LABELS), each_of(LABELS))  # to compare
+    bins: int = count(9, quick=3)  # of step sizes
 
 
 def compute(settings: ScoreTransforms) -> pd.DataFrame:

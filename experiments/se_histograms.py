@@ -32,10 +32,10 @@ import sejax
 from experiments.common import agents as groups
 from experiments.common import figures
 from experiments.common.agents import SE_AGENTS, SOFT_SE, Condition, Measure
-from experiments.common.experiment import Experiment, Settings, count, each_of, setting
-from experiments.common.tables import as_texts, publish
+from experiments.common.experiment import Experiment, Settings, count, setting
+from experiments.common.tables import as_texts, publish, summary_by
 from sejax.agents.buffers import Buffer, BufferMaker, write_row
-from sejax.options import registry
+from sejax.options import each_of, registry
 from sejax.training import TrainingConfig
 
 SOURCES = {
@@ -72,13 +72,11 @@ PAPER_RETURNS = {
 class SeHistograms(Settings):
     name = "se_histograms"
 
-    proxy: str = setting(SOFT_SE, about="SE: a run directory, a file or a shipped name")
-    agents: tuple[str, ...] = setting(
-        SE_AGENTS, each_of(SE_AGENTS), about="kinds of agents, a row each"
-    )
-    num_agents: int = count(10, "agents", quick=3, about="of each kind")
-    test_episodes: int = count(10, "episodes", about="of each agent")
-    max_rows: int = count(10_000, "transitions", about="of training, the last ones of an agent")
+    proxy: str = setting(SOFT_SE)  # SE: a run directory, a file or a shipped name
+    agents: tuple[str, ...] = setting(SE_AGENTS, each_of(SE_AGENTS))  # kinds of agents, a row each
+    num_agents: int = count(10, quick=3)  # of each kind
+    test_episodes: int = count(10)  # of each agent
+    max_rows: int = count(10_000)  # transitions of training, the last ones of an agent
 
     @property
     def rows_file(self) -> Path:
@@ -220,16 +218,19 @@ def names_of(task: Any, rows: pd.DataFrame) -> dict[str, str]:
 
 def summarise(rows: pd.DataFrame) -> pd.DataFrame:
     """Widths and distances of the distributions, a row for each kind of agent and dimension."""
-    out = []
-    for kind, mine in rows.groupby("kind", sort=False):
-        for column in columns_of(rows):
-            samples = {name: mine[mine["source"] == name][column] for name in SOURCES}
-            row = {"kind": kind, "dimension": column}
-            row |= {f"std_{name}": x.std(ddof=0) for name, x in samples.items()}
-            for a, b in (("response", "train"), ("response", "test"), ("train", "test")):
-                row[f"{a}_to_{b}"] = wasserstein_distance(samples[a], samples[b])
-            out.append(row)
-    return pd.DataFrame(out)
+    columns = columns_of(rows)
+    of_source = rows.melt(["kind", "source"], columns, var_name="dimension")
+
+    def statistics(mine: pd.DataFrame) -> dict[str, float]:
+        samples = {name: mine[mine["source"] == name]["value"] for name in SOURCES}
+        pairs = (("response", "train"), ("response", "test"), ("train", "test"))
+        return {f"std_{name}": x.std(ddof=0) for name, x in samples.items()} | {
+            f"{a}_to_{b}": wasserstein_distance(samples[a], samples[b]) for a, b in pairs
+        }
+
+    summary = summary_by(of_source, ["kind", "dimension"], statistics)
+    kinds = list(rows["kind"].unique())
+    return summary.sort_values("kind", key=lambda x: x.map(kinds.index), kind="stable")
 
 
 def make_table(task: Any, rows: pd.DataFrame, summary: pd.DataFrame) -> pd.DataFrame:

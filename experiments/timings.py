@@ -21,9 +21,10 @@ import pandas as pd
 
 import sejax
 from experiments.common import figures
-from experiments.common.experiment import Experiment, Settings, count, each_of, setting
+from experiments.common.experiment import Experiment, Settings, count, setting
 from experiments.common.tables import as_texts, publish
 from sejax.cli.runtime import available_cores
+from sejax.options import each_of
 
 PAPER_CORES = 16
 
@@ -60,8 +61,8 @@ SETTINGS = {"paper": "the paper's", "best": "our default"}
 class Timings(Settings):
     name = "timings"
 
-    rows: tuple[str, ...] = setting(tuple(ROWS), each_of(ROWS), about="tasks and proxies")
-    generations: int = count(2, "iterations", about="outer iterations to time")
+    rows: tuple[str, ...] = setting(tuple(ROWS), each_of(ROWS))  # tasks and proxies
+    generations: int = count(2)  # outer iterations to time
 
 
 def compute(settings: Timings) -> pd.DataFrame:

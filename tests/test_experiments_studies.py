@@ -299,5 +299,6 @@ def test_ses_whose_tests_cannot_be_recorded_are_refused(overrides, tmp_path):
     words = ("preset=soft", "training.max_steps=9000", *overrides)
     path = save_ses(tmp_path / "se.safetensors", 1, *words)
     settings = supervised_baseline.SupervisedBaseline.of(quick=True, out=str(tmp_path), proxy=path)
-    with pytest.raises(ConfigError, match="without action repeat"):
+    with pytest.raises(ConfigError) as refused:
         supervised_baseline.EXPERIMENT.run(settings)
+    assert refused.value.field == "proxy"

@@ -16,11 +16,11 @@ import numpy as np
 import pandas as pd
 
 import sejax
-from experiments.common.experiment import Settings, count, each_of, setting
+from experiments.common.experiment import Settings, count, setting
 from sejax.agents import NoExploration
 from sejax.cli.progress import Tally
 from sejax.ops.parallel import spread_over_devices
-from sejax.options import registry
+from sejax.options import each_of, registry
 from sejax.training import TrainingConfig
 
 HPARAMS = ("varied", "default")
@@ -283,13 +283,11 @@ SOFT_SE = "results/soft_ses/cartpole.safetensors"  # with dynamics to look into,
 class SeAgents(Settings):
     """Settings about agents with drawn hyperparameters that are trained on the SEs of a set."""
 
-    agents: tuple[str, ...] = setting(SE_AGENTS, each_of(SE_AGENTS), about="kinds of agents")
-    num_agents: int = count(10, "agents", quick=4, about="for each SE")
-    num_ses: int = count(40, "SEs", quick=3, about="SEs of a set at most")
-    test_episodes: int = count(10, "episodes", about="of each agent")
-    max_steps: int | None = count(
-        None, "steps", quick=4000, about="training steps at most; as the SEs' configuration says"
-    )
+    agents: tuple[str, ...] = setting(SE_AGENTS, each_of(SE_AGENTS))  # kinds of agents
+    num_agents: int = count(10, quick=4)  # for each SE
+    num_ses: int = count(40, quick=3)  # SEs of a set at most
+    test_episodes: int = count(10)  # of each agent
+    max_steps: int | None = count(None, quick=4000)  # of training; as the SEs' configuration says
 
 
 def agent_config(settings: Settings, kind: str) -> Any:

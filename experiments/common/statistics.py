@@ -82,41 +82,6 @@ def performance_profile(
     return fractions(np.concatenate(strata)), low, high
 
 
-def probability_of_improvement(
-    strata: Sequence[Any],
-    others: Sequence[Any],
-    *,
-    level: float = LEVEL,
-    num_resamples: int = NUM_RESAMPLES,
-    seed: int = 0,
-) -> tuple[float, float, float]:
-    """Probability that a run beats one of the others, averaged over strata, and its interval.
-
-    A tie counts half: Mann and Whitney's statistic as a share of all pairs.
-
-    Args:
-      strata: runs of each, `[run]`.
-      others: those that they are compared with, of the same strata.
-      level, num_resamples, seed: as of `bootstrap_interval`.
-
-    Returns:
-      Probability, lower and upper end.
-    """
-    rng = np.random.default_rng(seed)
-    estimates, drawn = [], []
-    for runs, other_runs in zip(strata, others, strict=True):
-        estimates.append(_share_won(np.asarray(runs), np.asarray(other_runs)))
-        both = (_resamples(rng, [each], num_resamples) for each in (runs, other_runs))
-        drawn.append([_share_won(*pair) for pair in zip(*both, strict=True)])
-    low, high = _ends(np.mean(drawn, axis=0), level)
-    return float(np.mean(estimates)), float(low), float(high)
-
-
-def _share_won(runs: np.ndarray, others: np.ndarray) -> float:
-    """Share of the pairs of `[run]` and `[run]` in which the first is higher; a tie is a half."""
-    return float((1 + np.sign(runs[:, None] - others)).mean() / 2)
-
-
 def _resamples(rng: np.random.Generator, strata: Sequence[Any], count: int) -> np.ndarray:
     """All runs, drawn again within their strata: `[resample, run]`."""
     arrays = [np.asarray(runs, float) for runs in strata]

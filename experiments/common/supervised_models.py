@@ -20,10 +20,10 @@ import pandas as pd
 import sejax
 from experiments.common import agents
 from experiments.common.agents import HPARAMS, SE_AGENTS, SOFT_SE
-from experiments.common.experiment import Settings, count, each_of, setting
+from experiments.common.experiment import Settings, count, setting
 from sejax.cli import config as configuration
 from sejax.ops.parallel import spread_over_devices
-from sejax.options import registry
+from sejax.options import each_of, registry
 
 LEARNING_RATE, BATCH_SIZE = 1e-4, 1024  # paper and docs/reference.md 7.5
 
@@ -34,21 +34,17 @@ class SupervisedBaseline(Settings):
 
     name = "supervised_baseline"
 
-    proxy: str = setting(SOFT_SE, about="SE to compare with; run directory, file or shipped name")
-    models: int = count(5, "models", quick=2, about="NES runs, and a model for each")
-    generations: int = count(25, "generations", quick=3, about="of an NES run")
-    population: int = count(16, "candidates", least=2, quick=3, about="of a generation")
-    max_rows: int = count(100_000, "transitions", quick=3000, about="transitions for a model")
-    epochs: int = count(100, "epochs", quick=20, about="of a fit")
-    agents: tuple[str, ...] = setting(
-        ("ddqn",), each_of(SE_AGENTS), about=f"of {', '.join(SE_AGENTS)}"
-    )
-    hparams: tuple[str, ...] = setting(
-        HPARAMS, each_of(HPARAMS), about="of the agents; varied: drawn for each"
-    )
-    num_agents: int = count(20, "agents", quick=2, about="for each model")
-    test_episodes: int = count(10, "episodes", about="of each agent")
-    max_steps: int | None = count(None, "steps", about="of an agent on a model; as on the SE")
+    proxy: str = setting(SOFT_SE)  # SE to compare with; run directory, file or shipped name
+    models: int = count(5, quick=2)  # NES runs, and a model for each
+    generations: int = count(25, quick=3)  # of an NES run
+    population: int = count(16, least=2, quick=3)  # candidates of a generation
+    max_rows: int = count(100_000, quick=3000)  # transitions for a model
+    epochs: int = count(100, quick=20)  # of a fit
+    agents: tuple[str, ...] = setting(("ddqn",), each_of(SE_AGENTS))  # ddqn, dueling_ddqn, ...
+    hparams: tuple[str, ...] = setting(HPARAMS, each_of(HPARAMS))  # varied: drawn for each agent
+    num_agents: int = count(20, quick=2)  # for each model
+    test_episodes: int = count(10)  # of each agent
+    max_steps: int | None = count(None)  # of an agent on a model; as on the SE
 
 
 def learning_config(settings: SupervisedBaseline, ses: Any) -> Any:

@@ -1,6 +1,6 @@
 """Tables: means with intervals as columns, columns as texts, and writing a table."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -35,6 +35,22 @@ def mean_columns(
     low, high = interval(values if draws is None else draws, least)
     columns = {"mean": values.mean(), "std": values.std(), "low": low, "high": high}
     return {f"{name}_{statistic}": value for statistic, value in columns.items()}
+
+
+def summary_by(
+    rows: pd.DataFrame, by: Sequence[str], statistics: Callable[[pd.DataFrame], Mapping[str, Any]]
+) -> pd.DataFrame:
+    """A row for each combination of values of the columns `by`, in the order of the rows.
+
+    Args:
+      rows: the table.
+      by: names of columns, which the summary has too.
+      statistics: further columns of a row, of the rows with its values.
+    """
+    groups = rows.groupby(list(by), sort=False)
+    return pd.DataFrame(
+        [dict(zip(by, values, strict=True)) | {**statistics(mine)} for values, mine in groups]
+    )
 
 
 def in_strata(values: pd.Series, labels: pd.Series | None) -> list[pd.Series]:
