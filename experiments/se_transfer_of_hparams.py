@@ -15,7 +15,7 @@ from typing import Any
 import jax
 import numpy as np
 import pandas as pd
-from scipy.stats import spearmanr
+from scipy.stats import rankdata
 
 import sejax
 from experiments.common import agents, figures
@@ -211,7 +211,7 @@ def rank_correlation(a: np.ndarray, b: np.ndarray) -> float:
     """Spearman's rho of `[n]` and `[n]`, with mean ranks for ties; nan where all are equal."""
     if np.ptp(a) == 0 or np.ptp(b) == 0:
         return np.nan
-    return float(spearmanr(a, b).statistic)
+    return float(np.corrcoef(rankdata(a), rankdata(b))[0, 1])
 
 
 def with_intervals(

@@ -224,8 +224,9 @@ class Experiment:
 
     def help(self) -> str:
         """The text of `--help`: all fields with their defaults."""
-        full, quick = (self.settings.defaults({"quick": quick}) for quick in (False, True))
-        texts, lines = help_texts(self.settings), []
+        settings: Any = self.settings
+        full, quick = (settings.defaults({"quick": quick}) for quick in (False, True))
+        texts, lines = help_texts(settings), []
         for name, value in full.items():
             default, other = as_text(value), as_text(quick[name])
             differs = f" (quick: {other})" if default != other else ""
