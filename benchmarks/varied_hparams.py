@@ -90,12 +90,11 @@ def serve(args: argparse.Namespace) -> None:
         agent = sejax.make_agent(dataclasses.replace(config.agent, **changes), task)
         alone = jax.jit(agent.fresh(make_run)).lower(key).compile()
         jax.block_until_ready((program(key, drawn), alone(key)))
-        runs = {"varied_s": lambda: program(key, drawn), "alone_s": lambda: alone(key)}
-        seconds = {
-            name: common.measure(lambda run=run: jax.block_until_ready(run()))[1]["cpu_s"]
-            for name, run in runs.items()
-        }
-        return {**plain, **seconds}
+
+        def cpu_s(run: Any, *inputs: Any) -> float:
+            return common.measure(lambda: jax.block_until_ready(run(*inputs)))[1]["cpu_s"]
+
+        return {**plain, "varied_s": cpu_s(program, key, drawn), "alone_s": cpu_s(alone, key)}
 
     common.serve({"compile_s": compile_s}, handle)
 

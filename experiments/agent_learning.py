@@ -85,10 +85,10 @@ class PresetStudy(Study):
         return {name: value for name, value in ours.items() if value != papers[name]}
 
     def training(self, quick: bool, test_episodes: int) -> TrainingConfig:
-        max_steps = min(self.max_steps, QUICK_STEPS) if quick else self.max_steps
+        limits = super().training(quick, test_episodes)
         return dataclasses.replace(
             self._preset().training,
-            max_steps=max_steps,
+            max_steps=limits.max_steps,
             stop_rule="never",
             tests_between=test_episodes,
         )

@@ -15,7 +15,6 @@ from experiments import score_transforms, se_histograms, supervised_baseline
 from experiments.common import supervised_models
 from experiments.common.statistics import bootstrap_interval
 from sejax.bilevel import make_bilevel
-from sejax.evaluation import make_recorder, make_tester
 from sejax.options import ConfigError
 from sejax.training import make_trainer
 
@@ -152,24 +151,6 @@ def test_a_recorded_training_is_the_training(se_file, capacity):
         np.testing.assert_allclose(rewards.sum(), plain.returns[int(episode)], rtol=1e-4)
 
 
-def test_recorded_tests_are_the_tests(se_file):
-    task = sejax.load_set(se_file).task
-    agent = sejax.make_agent(sejax.DDQNConfig(**TINY_AGENT), task)
-    state = agent.init(jax.random.key(0), agent.hparams)
-    key = jax.random.key(4)
-    returns, lengths, _ = jax.jit(make_tester(agent, task, 3))(key, state)
-    steps = jax.jit(make_recorder(agent, task, 3))(key, state)
-    valid = np.asarray(steps.valid).reshape(3, -1)
-    np.testing.assert_array_equal(valid.sum(axis=1), lengths)
-    rewards = np.where(valid, np.asarray(steps.reward).reshape(3, -1), 0)
-    np.testing.assert_allclose(rewards.sum(axis=1), returns)
-    terminated = np.asarray(steps.terminated).reshape(3, -1)
-    assert all(row[length - 1] for row, length in zip(terminated, lengths, strict=True))
-    obs, next_obs = np.asarray(steps.obs), np.asarray(steps.next_obs)
-    within = valid[0, 1:]
-    np.testing.assert_array_equal(obs[1 : valid.shape[1]][within], next_obs[: within.size][within])
-
-
 def test_the_table_says_which_distribution_the_response_is_closer_to():
     states = {"train": [0.0, 0.2], "test": [3.0, 4.0], "response": [0.1, 0.5]}
     rows = pd.DataFrame([
@@ -194,17 +175,16 @@ def test_the_table_says_which_distribution_the_response_is_closer_to():
 def test_a_sample_is_uniform_over_all_that_was_added():
     counts = np.zeros(20)
     for seed in range(400):
-        sample = supervised_models.Sample(5, np.random.default_rng(seed))
+        rng, kept = np.random.default_rng(seed), None
         for start, stop in ((0, 3), (3, 4), (4, 20)):
-            sample.add(pd.DataFrame({"row": range(start, stop)}))
-        drawn = sample.table["row"]
+            rows = pd.DataFrame({"row": range(start, stop)})
+            kept = supervised_models.sampled(kept, rows, 5, rng)
+            assert len(kept) == min(stop, 5)
+        drawn = kept["row"]
         assert drawn.nunique() == 5
         counts[drawn] += 1
     error = np.sqrt(400 * 0.25 * 0.75)  # each row is drawn with probability 5 / 20
     assert np.abs(counts - 100).max() < 5 * error
-    small = supervised_models.Sample(5, np.random.default_rng(0))
-    small.add(pd.DataFrame({"row": [7, 8]}))
-    assert sorted(small.table["row"]) == [7, 8] and list(small.table) == ["row"]
 
 
 def random_data(num_rows):
@@ -283,10 +263,10 @@ def test_a_recorded_run_is_the_bilevel_loop():
                            "agent.hidden_size=4", "agent.batch_size=4", "devices=1",
                            "es.population_size=2", "es.num_incumbent_evals=1",
                            "es.mirrored=false"])  # fmt: skip
-    recorded = supervised_models.make_recorded_run(config)
+    init, generation = supervised_models.make_recorded_run(config)
     program = make_bilevel(**config.parts())
     key = jax.random.key(7)
-    state, steps = recorded.generation(recorded.init(key))
+    state, steps = generation(init(key))
     expected, info = jax.jit(program.generation)(jax.jit(program.init)(key))
     np.testing.assert_allclose(state.es_state.mean, expected.es_state.mean, rtol=1e-4, atol=1e-6)
     # Those tests between episodes count as real steps, but are not recorded.

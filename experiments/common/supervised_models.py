@@ -9,7 +9,7 @@ import functools
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -26,6 +26,7 @@ from sejax.ops.parallel import spread_over_devices
 from sejax.options import each_of, registry
 
 LEARNING_RATE, BATCH_SIZE = 1e-4, 1024  # paper and docs/reference.md 7.5
+DRAWN = "_drawn"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -91,26 +92,24 @@ def collect_all(settings: SupervisedBaseline, ses: Any) -> list[pd.DataFrame]:
 
 def collect(config: Any, seed: int, max_rows: int) -> pd.DataFrame:
     """Runs NES and draws transitions, all equally likely, from its agents' real test episodes."""
-    run = make_recorded_run(config)
-    state = run.init(jax.random.key(seed))
-    sample = Sample(max_rows, np.random.default_rng(seed))
+    init, generation = make_recorded_run(config)
+    state, rng = init(jax.random.key(seed)), np.random.default_rng(seed)
+    kept = None
     for number in range(config.generations):
-        state, steps = run.generation(state)
-        sample.add(table_of(jax.device_get(steps), config.training.test_episodes, number))
-    return sample.table
-
-
-class RecordedRun(NamedTuple):
-    """An NES run whose agents' tests are recorded; compiled functions."""
-
-    init: Callable[[Any], Any]  # key -> LearnState
-    # state -> (state, Steps): a generation, and the steps of all tests, [evaluation, step, ...]
-    generation: Callable[[Any], Any]
+        state, steps = generation(state)
+        rows = table_of(jax.device_get(steps), config.training.test_episodes, number)
+        kept = sampled(kept, rows, max_rows, rng)
+    return pd.DataFrame() if kept is None else kept.drop(columns=DRAWN)
 
 
 @functools.cache
-def make_recorded_run(config: Any) -> RecordedRun:
-    """The NES run of a configuration, from any seed: compiled once for all of them."""
+def make_recorded_run(config: Any) -> tuple[Callable[[Any], Any], Callable[[Any], Any]]:
+    """The NES run of a configuration, whose agents' tests are recorded, compiled for any seed.
+
+    Returns:
+      `init(key) -> state`, and `generation(state) -> (state, Steps)`, which makes a generation; the
+      steps are those of all tests, `[evaluation, step, ...]`.
+    """
     from sejax.bilevel import make_bilevel
     from sejax.evaluation import make_evaluator, num_parallel_on_cpu
 
@@ -131,7 +130,7 @@ def make_recorded_run(config: Any) -> RecordedRun:
         state, _ = bilevel.tell(state, candidates, outcome)
         return state, steps
 
-    return RecordedRun(init=jax.jit(bilevel.init), generation=jax.jit(generation))
+    return jax.jit(bilevel.init), jax.jit(generation)
 
 
 def table_of(steps: Any, num_episodes: int, generation: int) -> pd.DataFrame:
@@ -156,24 +155,22 @@ def table_of(steps: Any, num_episodes: int, generation: int) -> pd.DataFrame:
     )
 
 
-class Sample:
-    """A uniform sample without replacement of all rows that were ever added."""
+def sampled(
+    kept: pd.DataFrame | None, rows: pd.DataFrame, size: int, rng: np.random.Generator
+) -> pd.DataFrame:
+    """A uniform sample without replacement of all rows so far, in random order.
 
-    def __init__(self, size: int, rng: np.random.Generator):
-        self.size = size
-        self._rng = rng
-        self._rows: pd.DataFrame | None = None
+    Every row draws a number, the column `DRAWN`, and those with the lowest numbers stay.
 
-    def add(self, rows: pd.DataFrame) -> None:
-        """Every row draws a number, and those with the lowest numbers stay."""
-        rows = rows.assign(_drawn=self._rng.uniform(size=len(rows)))
-        rows = rows if self._rows is None else pd.concat([self._rows, rows], ignore_index=True)
-        self._rows = rows.nsmallest(self.size, "_drawn").reset_index(drop=True)
-
-    @property
-    def table(self) -> pd.DataFrame:
-        """The sample, in random order."""
-        return pd.DataFrame() if self._rows is None else self._rows.drop(columns="_drawn")
+    Args:
+      kept: the sample of the rows before; None if there are none.
+      rows: new ones.
+      size: of the sample, at most.
+      rng: draws the numbers.
+    """
+    rows = rows.assign(**{DRAWN: rng.uniform(size=len(rows))})
+    rows = rows if kept is None else pd.concat([kept, rows], ignore_index=True)
+    return rows.nsmallest(size, DRAWN).reset_index(drop=True)
 
 
 def summary_of(data: list[pd.DataFrame]) -> pd.DataFrame:
