@@ -20,7 +20,7 @@ from experiments.common import curves, figures, tables
 from experiments.common.agents import Condition, train_groups
 from experiments.common.curves import CURVES, WINDOW
 from experiments.common.experiment import Experiment, Settings, count, setting
-from experiments.common.statistics import bootstrap_interval
+from experiments.common.statistics import mean_interval
 from sejax.options import each_of, registry
 from sejax.training import TrainingConfig
 
@@ -191,7 +191,7 @@ def summarise(rows: pd.DataFrame) -> pd.DataFrame:
             "num_solved_at_the_end": int((last >= threshold).sum()),
             "median_steps_to_solve": np.median(to_solve),
         }
-        return row | tables.mean_columns(last, "last", least=1) | tables.iqm_columns(last, "last")
+        return row | tables.mean_columns(last, "last") | tables.iqm_columns(last, "last")
 
     return tables.summary_by(rows, ["study"], statistics)
 
@@ -214,7 +214,7 @@ COLUMNS: dict[str, Any] = {
     "median steps to solve": _median_steps,
     "steps, at most": "{max_steps:,}",
     "made": "{made_steps:,.0f}",
-    f"last {WINDOW} tests": "{last_mean:.1f} [{last_low:.1f}, {last_high:.1f}]",
+    f"last {WINDOW} tests": tables.mean_text("last", 1),
     "IQM": tables.iqm_text("last"),
     "others": lambda row: STUDIES[row.study].peers,
 }
@@ -227,8 +227,8 @@ def report(settings: AgentLearning, rows: pd.DataFrame) -> pd.DataFrame:
         f"{settings.num_agents} seeds of each; after each training episode "
         f"{settings.test_episodes} greedy test episode. Solved: the mean of {WINDOW} tests in a "
         f"row reaches the threshold; at the end: that of the last {WINDOW}. Made: mean steps until "
-        f"the last episode that ended. The last {WINDOW} tests: mean over seeds, bootstrap 95% "
-        f"interval. CartPole is v0, of 200 steps.{tables.iqm_note()}"
+        f"the last episode that ended. The last {WINDOW} tests: mean over seeds. "
+        f"{tables.interval_note('seeds')} CartPole is v0, of 200 steps.{tables.iqm_note()}"
     )
     title = "Agents that learn the real tasks"
     return tables.publish(settings, title, tables.as_texts(summary, COLUMNS), summary, note)
@@ -260,7 +260,7 @@ def draw(settings: AgentLearning, rows: pd.DataFrame, points: int = 100) -> None
 
 def _intervals(values: np.ndarray) -> np.ndarray:
     """Ends of the means' intervals, `[2, points]`, of `[agent, points]`."""
-    return np.transpose([bootstrap_interval(each) for each in values.T])
+    return np.transpose([mean_interval(each) for each in values.T])
 
 
 EXPERIMENT = Experiment(settings=AgentLearning, compute=compute, report=report, about=__doc__)

@@ -34,7 +34,6 @@ SETS = (
 )
 TESTED = ("ddqn", "dueling_ddqn", "ppo", "td3_discrete", "sac")
 LEFT_OUT = "°"  # after the return of a kind that took no part
-IQM_AND_SOLVED = f"IQM {tables.iqm_text('test_return')}; {{solved:.0%}}"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -99,8 +98,8 @@ def make_table(summary: pd.DataFrame) -> pd.DataFrame:
 def cell(row: Any) -> str:
     """What a kind of agent reaches on the SEs of a mixture."""
     mark = "" if row.took_part else LEFT_OUT
-    mean = tables.mean_text("test_return", 1)(row)
-    return f"{mean}; {IQM_AND_SOLVED.format_map(row._asdict())}{mark}"
+    mean, iqm = tables.mean_text("test_return", 1)(row), tables.iqm_text("test_return")(row)
+    return f"{mean}; IQM {iqm}; {row.solved:.0%}{mark}"
 
 
 def shown(name: str) -> str:
@@ -114,11 +113,12 @@ def report(settings: SeFamilies, rows: pd.DataFrame) -> pd.DataFrame:
     draw(summary, task, settings.folder / "families.png")
     note = (
         f"{settings.runs} NES runs with each mixture; the best SE of each trains "
-        f"{settings.num_agents} fresh agents of each kind. Cells: mean return, with a bootstrap "
-        "95% interval for at least five SEs, which it draws (agents, where there is one SE); "
+        f"{settings.num_agents} fresh agents of each kind. Cells: mean return; "
         f"interquartile mean; share of the {summary['num_agents'].iloc[0]} agents that solve the "
         f"task ({task.solved_reward:g}); {LEFT_OUT} a kind that took no part in learning. CPU s: "
-        f"of the generations, without compilation.{tables.iqm_note('within each SE')}"
+        "of the generations, without compilation. "
+        f"{tables.interval_note('SEs, agents where there is one SE')}"
+        f"{tables.iqm_note('within each SE')}"
     )
     title = f"Agents tested on {task.name}, trained on SEs learned with other families of agents"
     return tables.publish(settings, title, make_table(summary), summary, note)

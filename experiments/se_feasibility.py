@@ -127,9 +127,7 @@ def make_table(config: Any, summary: pd.DataFrame) -> pd.DataFrame:
     """The statistics of all runs, beside what the paper says of its own."""
     best, last = summary["best_incumbent_mean"], summary["last_incumbent_mean"]
     to_solve = summary["generations_to_solve"]
-    # With an interval for any number of runs, as they are as many as there are.
-    columns = tables.mean_columns(last, "last", least=1) | tables.iqm_columns(last, "last")
-    mean = "{last_mean:.1f} [{last_low:.1f}, {last_high:.1f}]"
+    row = pd.Series(tables.mean_columns(last, "last") | tables.iqm_columns(last, "last"))
     ours = {
         "runs": str(len(summary)),
         "generations run": f"{summary['generations'].max()}",
@@ -138,8 +136,8 @@ def make_table(config: Any, summary: pd.DataFrame) -> pd.DataFrame:
         "generations to solve": median_and_range(to_solve, config.generations),
         "real steps to solve, median": median_steps(summary),
         "best incumbent mean": f"{best.median():.1f} ({best.min():.1f} to {best.max():.1f})",
-        "last incumbent mean": mean.format_map(columns),
-        "last incumbent mean, IQM": tables.iqm_text("last").format_map(columns),
+        "last incumbent mean": tables.mean_text("last", 1)(row),
+        "last incumbent mean, IQM": tables.iqm_text("last")(row),
         "wall minutes of a run, mean": f"{summary['wall_min'].mean():.1f}",
     }
     paper = PAPER if config.name("env") in PAPER_TASKS else {}
@@ -158,9 +156,9 @@ def report(settings: SeFeasibility, rows: pd.DataFrame) -> pd.DataFrame:
         f"{config.es.num_incumbent_evals or config.es.population_size} fresh agents with "
         f"{config.training.test_episodes} test episodes each; a run counts as solved from the "
         f"first that reaches {solved_reward:g}. Median and range over runs; one that did not solve "
-        "the task took longer than all. The last incumbent mean: over runs, with a bootstrap 95% "
-        "interval; the best is a maximum of noisy means and hence too high: se_performance tests "
-        f"the stored SEs with other agents.{tables.iqm_note(of='runs')}"
+        "the task took longer than all. The last incumbent mean: over runs. "
+        f"{tables.interval_note('runs')} The best is a maximum of noisy means and hence too high: "
+        f"se_performance tests the stored SEs with other agents.{tables.iqm_note(of='runs')}"
     )
     title = f"Learning SEs of {settings.env} for {config.name('agent')} agents{varied}"
     return tables.publish(settings, title, make_table(config, summary), summary, note)

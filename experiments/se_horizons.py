@@ -21,7 +21,16 @@ from experiments.common.agents import HPARAMS
 from experiments.common.experiment import Experiment, setting
 from experiments.common.runs import MixtureRuns
 from experiments.common.shards import stack, unstack
-from experiments.common.tables import as_texts, interval, mean_columns, publish, summary_by
+from experiments.common.statistics import mean_interval
+from experiments.common.tables import (
+    as_texts,
+    brackets,
+    interval_note,
+    mean_columns,
+    mean_text,
+    publish,
+    summary_by,
+)
 from sejax import envs
 from sejax.options import each_of, positive
 from sejax.proxies.configs import DONE_MODES, INITIAL_STATES
@@ -137,7 +146,7 @@ def summarise(each: pd.DataFrame, transfer: pd.DataFrame) -> pd.DataFrame:
     def statistics(mine: pd.DataFrame) -> dict[str, float]:
         return (
             {"runs": len(mine), "solved": int(np.isfinite(mine["to_solve"]).sum())}
-            | mean_columns(mine["best"], "best", least=1)
+            | mean_columns(mine["best"], "best")
             | dict(mine[["to_solve", "cpu_s_to_solve"]].median())
             | dict(mine[means].mean())
         )
@@ -153,7 +162,7 @@ def make_table(summary: pd.DataFrame) -> pd.DataFrame:
         "steps": "{horizon}",
         "starts": "{starts}",
         "end": "{end}",
-        "best incumbent": "{best_mean:.1f} [{best_low:.1f}, {best_high:.1f}]",
+        "best incumbent": mean_text("best", 1),
         "runs solved": "{solved} of {runs}",
         "generations to solve": lambda row: _finite(row.to_solve, 0),
         "CPU s to solve": lambda row: _finite(row.cpu_s_to_solve, 1),
@@ -182,9 +191,8 @@ def differences(each: pd.DataFrame, summary: pd.DataFrame, end: str) -> str:
             first, last = (Kind(*mine[BY].iloc[place]) for place in (0, -1))
             if first != last:
                 less = bests.loc[first] - bests.loc[last]
-                low, high = interval(less, least=1)
-                ends = f"{less.mean():+.1f} [{low:.1f}, {high:.1f}]"
-                texts.append(f"{first.name} less {last.name}: {ends}")
+                ends = brackets(*mean_interval(less), 1)
+                texts.append(f"{first.name} less {last.name}: {less.mean():+.1f}{ends}")
     return "; ".join(texts)
 
 
@@ -202,8 +210,8 @@ def report(settings: SeHorizons, rows: pd.DataFrame) -> pd.DataFrame:
     note = (
         f"SEs learned with {' + '.join(settings.agents)}, {settings.runs} runs of "
         f"{settings.cpu_budget_s:g} CPU s each (generations that began before these were spent, "
-        "without compilation). Best incumbent: mean over runs with a bootstrap 95% interval; of "
-        "each run it is a maximum of noisy means and hence too high. Solved: an incumbent mean of "
+        f"without compilation). Best incumbent: mean over runs. {interval_note('runs')} Of each "
+        "run it is a maximum of noisy means and hence too high. Solved: an incumbent mean of "
         f"{task.solved_reward:g}; generations and CPU s until then are medians, - if half of the "
         "runs did not solve it; stay solved: share of the later generations. Real steps: of the "
         f"whole run. Tested: mean return of {settings.num_agents} fresh agents with "

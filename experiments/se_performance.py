@@ -197,10 +197,10 @@ def with_best(agents: pd.DataFrame) -> pd.DataFrame:
 def summarise(agents: pd.DataFrame) -> pd.DataFrame:
     """Means, deviations and intervals for each kind of agent and setting.
 
-    Deviations are over agents; intervals of means come from drawing SEs (groups) again, since
-    agents of the same SE have much in common, or agents on the real task, where groups have
-    nothing in common; of fewer than five there is none (nan). Those of interquartile means come
-    from drawing agents within their SE.
+    Deviations are over agents; intervals of means are of the means of SEs (groups), since agents of
+    the same SE have much in common, or of agents on the real task, where groups have nothing in
+    common; of fewer than five there is none (nan). Those of interquartile means come from drawing
+    agents within their SE.
     """
 
     def statistics(mine: pd.DataFrame) -> dict[str, float]:
@@ -209,8 +209,8 @@ def summarise(agents: pd.DataFrame) -> pd.DataFrame:
         row |= {"num_nonfinite": int(mine["nonfinite"].sum())}
         for column in ("train_steps", "train_episodes", "test_return"):
             of_ses = mine.groupby("group")[column].mean()
-            draws = mine[column] if name in ON_REAL else of_ses
-            row |= tables.mean_columns(mine[column], column, draws)
+            independent = mine[column] if name in ON_REAL else of_ses
+            row |= tables.mean_columns(mine[column], column, independent)
         return row | tables.iqm_columns(mine["test_return"], "test_return", strata(mine, name))
 
     return tables.summary_by(agents, ["kind", "setting"], statistics)
@@ -259,8 +259,8 @@ def report(settings: SePerformance, rows: pd.DataFrame) -> pd.DataFrame:
     draw_profiles(task, agents, settings.folder / "profiles.png")
     note = (
         f"Mean ± std over agents with drawn hyperparameters, {len(return_columns(rows))} test "
-        "episodes each; in brackets a bootstrap 95% interval, for at least five SEs: it draws SEs, "
-        'and agents on the real task. "Fewer" are training steps saved against the real task. '
+        f"episodes each. {tables.interval_note('SEs, over agents on the real task')} "
+        '"Fewer" are training steps saved against the real task. '
         f"The best SEs of all sets, {NUM_BEST} at most, are chosen by half of their agents and "
         "shown by the other half. SEs are those of a set that reached the threshold, all where "
         "none did. The paper has 40 SEs with 10 agents each, and for DDQN in CartPole a mean "

@@ -21,8 +21,8 @@ import sejax
 from experiments.common import agents, figures
 from experiments.common.agents import Condition, Group, Measure
 from experiments.common.experiment import Experiment, Settings, count, setting
-from experiments.common.statistics import NUM_RESAMPLES
-from experiments.common.tables import as_texts, publish
+from experiments.common.statistics import LEAST, NUM_RESAMPLES
+from experiments.common.tables import as_texts, publish, with_interval
 from sejax.options import each_of, require
 from sejax.training import TrainingConfig
 
@@ -219,7 +219,7 @@ def with_intervals(
 ) -> dict[str, float]:
     """`quality` with the ends of bootstrap 95% intervals, `..._low` and `..._high`.
 
-    Configurations are drawn again.
+    Configurations are drawn again; of fewer than `LEAST` there is no interval (nan).
     """
     size = target.shape[1]
     draws = np.random.default_rng(0).integers(0, size, (num_resamples, size))
@@ -227,8 +227,11 @@ def with_intervals(
     for places in draws:
         own = target[:, places]
         drawn.append(quality(own if chooser is target else chooser[:, places], own))
-    low, high = (pd.DataFrame(drawn).quantile(end) for end in (0.025, 0.975))
-    return {**quality(chooser, target), **low.add_suffix("_low"), **high.add_suffix("_high")}
+    ends = pd.DataFrame(drawn).quantile([0.025, 0.975])
+    if size < LEAST:
+        ends[:] = np.nan
+    low, high = ends.iloc[0].add_suffix("_low"), ends.iloc[1].add_suffix("_high")
+    return {**quality(chooser, target), **low, **high}
 
 
 def summarise(rows: pd.DataFrame) -> pd.DataFrame:
@@ -246,20 +249,16 @@ def summarise(rows: pd.DataFrame) -> pd.DataFrame:
 
 def make_table(summary: pd.DataFrame) -> pd.DataFrame:
     """The summary as texts."""
-
-    def interval(name: str, digits: int) -> str:
-        return f"{{{name}:.{digits}f}} [{{{name}_low:.{digits}f}}, {{{name}_high:.{digits}f}}]"
-
     names = {"se": "the SE"} | {name: f"the real task, {text}" for name, text in BUDGETS.items()}
     return as_texts(
         summary,
         {
             "trained on the real task": lambda row: BUDGETS[row.target],
             "tuned on": lambda row: names[row.chosen_by],
-            "Spearman's rho": interval("rho", 2),
-            "return of the choice": interval("chosen", 1),
-            "regret": interval("regret", 1),
-            "regret of a random one": interval("regret_random", 1),
+            "Spearman's rho": with_interval("rho", "rho", 2),
+            "return of the choice": with_interval("chosen", "chosen", 1),
+            "regret": with_interval("regret", "regret", 1),
+            "regret of a random one": with_interval("regret_random", "regret_random", 1),
             "steps": "{train_steps:,.0f}",
             "CPU s": "{cpu_s:,.1f}",
         },

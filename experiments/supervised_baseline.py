@@ -132,7 +132,7 @@ def summarise(agents: pd.DataFrame, solved_reward: float) -> pd.DataFrame:
         draws = returns if model is None else returns.groupby(model).mean()
         return (
             {"num_agents": len(mine)}
-            | tables.mean_columns(returns, "return", draws, least=1)
+            | tables.mean_columns(returns, "return", draws)
             | {"return_std": mine[return_columns(mine)].to_numpy().std()}
             | tables.iqm_columns(returns, "return", model)
             | {"solved": (returns >= solved_reward).mean()}
@@ -172,8 +172,8 @@ def report(settings: SupervisedBaseline, rows: pd.DataFrame) -> pd.DataFrame:
     draw(task, agents, settings.folder / "supervised_baseline.png")
     last = fits[fits["epoch"] == fits["epoch"].max()].mean()
     note = (
-        f"Mean ± std over test episodes and a bootstrap 95% interval that draws models, for the SE "
-        f"agents; solved: agents with a mean return of {task.solved_reward:g} at least. "
+        f"Mean ± std over test episodes. {tables.interval_note('models, for the SE over agents')} "
+        f"Solved: agents with a mean return of {task.solved_reward:g} at least. "
         f"{len(data)} models, each fitted for {fits['epoch'].max() + 1:.0f} epochs to "
         f"{data['transitions'].min():,.0f} transitions of one NES run, from episodes with a mean "
         f"return of {data['episode_return'].mean():.1f}; {data['ends'].mean():.2%} end an episode. "

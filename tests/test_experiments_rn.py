@@ -13,7 +13,7 @@ from experiments import rn_heatmap, rn_objectives, rn_performance
 from experiments.common import reward_networks as rn
 from experiments.common import rn_curves, runs, shards
 from experiments.common.reward_networks import STUDIES
-from experiments.common.statistics import bootstrap_interval
+from experiments.common.statistics import mean_interval
 from experiments.rn_heatmap import RnHeatmap
 from experiments.rn_objectives import RnObjectives
 from experiments.rn_performance import RnPerformance
@@ -212,13 +212,13 @@ def test_rows_of_other_settings_are_refused():
         assert refused.value.field == field
 
 
-def test_intervals_draw_rns_or_agents_and_need_five_of_them():
+def test_intervals_are_over_rns_or_agents_and_need_five_of_them():
     for world, independent in (
         ("additive_potential", 145 + 20 * np.arange(5)),  # the groups' means
         ("real", 140 + 10 * np.arange(10)),
     ):
         (row,) = rn_curves.summarise(curves_of(world, 5), -12.0, max_steps=300).itertuples()
-        assert (row.steps_low, row.steps_high) == bootstrap_interval(independent)
+        assert (row.steps_low, row.steps_high) == mean_interval(independent)
         assert row.return_low < row.return_mean < row.return_high
     few = rn_curves.summarise(curves_of("additive_potential", 4), -12.0, max_steps=300)
     assert few[["steps_low", "return_high"]].isna().all(axis=None)

@@ -19,6 +19,7 @@ from experiments.common.experiment import count, setting
 from experiments.common.reward_networks import AUGMENTED, PAPER_ROWS, SHOWN, RnSettings, label
 from experiments.common.tables import (
     as_texts,
+    interval_note,
     iqm_columns,
     iqm_note,
     iqm_text,
@@ -163,8 +164,8 @@ def require_rows(settings: CurveSettings, rows: pd.DataFrame) -> None:
 def summarise(rows: pd.DataFrame, solved_reward: float, max_steps: int) -> pd.DataFrame:
     """One row for each row of the figure and condition.
 
-    An agent that did not solve the task counts `max_steps`. Intervals come from drawing RNs again,
-    since agents of one RN have much in common, and agents where there are no RNs; of fewer than
+    An agent that did not solve the task counts `max_steps`. Intervals are of the means of the RNs,
+    since agents of one RN have much in common, and of agents where there are no RNs; of fewer than
     five there is none (nan).
     """
     grid = step_grid(max_steps)
@@ -182,8 +183,8 @@ def summarise(rows: pd.DataFrame, solved_reward: float, max_steps: int) -> pd.Da
         return (
             {"groups": groups.nunique(), "agents": len(steps)}
             | {"solved": np.isfinite(to_solve).mean()}
-            | mean_columns(steps, "steps", _draws(steps, labels))
-            | mean_columns(mean_return, "return", _draws(mean_return, labels))
+            | mean_columns(steps, "steps", _independent(steps, labels))
+            | mean_columns(mean_return, "return", _independent(mean_return, labels))
             | iqm_columns(mean_return, "return", labels)
             | {"last_return": curves.last_returns(mine).mean()}
         )
@@ -196,8 +197,8 @@ def summarise(rows: pd.DataFrame, solved_reward: float, max_steps: int) -> pd.Da
     return summary.assign(share_of_bare=shares)
 
 
-def _draws(values: pd.Series, labels: pd.Series | None) -> pd.Series:
-    """What an interval draws again: the means of the RNs, or agents where there are none."""
+def _independent(values: pd.Series, labels: pd.Series | None) -> pd.Series:
+    """What is independent: the means of the RNs, or agents where there are none."""
     return values if labels is None else values.groupby(labels).mean()
 
 
@@ -246,8 +247,8 @@ def common_note(settings: CurveSettings, solved_reward: float) -> str:
         "one greedy test episode after each. Steps to solve: until the mean of "
         f"{curves.WINDOW} tests in a row reaches {solved_reward:g}; an agent that never "
         f"does counts {settings.max_steps:,}. The bare agent's are of as many groups, of the same "
-        "seeds. Curves that end early go on as the last test. In brackets bootstrap 95% intervals, "
-        "for at least five RNs: they draw RNs, and agents on the real task."
+        "seeds. Curves that end early go on as the last test. "
+        f"{interval_note('RNs, over agents on the real task')}"
         f"{iqm_note('within each RN')}{'' if settings.study.agent else learned_with}"
     )
 
