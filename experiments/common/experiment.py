@@ -31,6 +31,7 @@ from sejax.options import (
     require,
     shortened,
 )
+from sejax.options.plain import from_plain, parsed, to_plain
 
 RUN_PREFIX = "run."  # of an override for the NES runs: run.es.population_size=8
 NOT_SHOWN = {"work", "devices", "from_rows", "run"}  # fields that no result depends on, and `run`
@@ -97,7 +98,7 @@ class Settings(Options):
         for name, kind in get_type_hints(cls).items():
             if get_origin(kind) is tuple and isinstance(given.get(name), str):
                 given[name] = [given[name]]
-        return registry.from_plain(cls, cls.defaults(given) | given, "")
+        return from_plain(cls, cls.defaults(given) | given, "")
 
     @classmethod
     def defaults(cls, given: Mapping[str, Any]) -> dict[str, Any]:
@@ -180,7 +181,7 @@ def parse(words: Iterable[str]) -> dict[str, Any]:
         if name.startswith(RUN_PREFIX):
             runs.append(word.removeprefix(RUN_PREFIX))
         else:
-            given[name] = registry.parsed(text)
+            given[name] = parsed(text)
     if runs:
         given["run"] = [*(given.get("run") or []), *runs]
     return given
@@ -201,7 +202,7 @@ class Experiment:
         Raises:
           ConfigError: for settings or files that cannot work, or a folder of other settings.
         """
-        fields = registry.to_plain(settings).items()
+        fields = to_plain(settings).items()
         with registry.only_typed(f"{name}={value}" for name, value in fields):
             if not settings.from_rows:
                 write_rows(settings.rows_file, self.compute(settings))

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
+from sejax.cli import compose, preset_files, spaces
 from sejax.cli import config as configuration
-from sejax.cli import spaces
 from sejax.cli.config import EvaluateConfig, LearnConfig
 from sejax.ops.files import as_file_name
 from sejax.options import (
@@ -24,6 +24,7 @@ from sejax.options import (
     require,
     shortened,
 )
+from sejax.options.plain import flatten, from_plain, parsed, split, to_plain
 
 SAMPLERS = ("tpe", "random")
 PRUNERS = ("hyperband", "median", "none")
@@ -164,14 +165,14 @@ class Search:
     @property
     def joins(self) -> bool:
         """Whether the overrides only name a study that exists."""
-        given, default = registry.to_plain(self.config), registry.to_plain(SearchConfig())
+        given, default = to_plain(self.config), to_plain(SearchConfig())
         changed = {k for k, v in given.items() if v != default[k]} - OWN - {"study"}
         return self.config.study is not None and not (changed or self.fixed or self.space)
 
     def stored(self) -> dict[str, Any]:
         """What the workers of a study must have in common, as plain values."""
         return {
-            "search": _common(registry.to_plain(self.config)),
+            "search": _common(to_plain(self.config)),
             "fixed": list(self.fixed),
             "space": {name: x.text for name, x in self.space.items()},
             "folder": str(self.folder.resolve()),
@@ -220,9 +221,9 @@ def _checked(stored: Any) -> dict[str, Any]:
     overrides = [*fixed, *(f"{name}={text}" for name, text in space.items())]
     for override in overrides:
         name, _, text = str(override).partition("=")
-        is_known = isinstance(override, str) and configuration.NAME.fullmatch(name)
+        is_known = isinstance(override, str) and compose.NAME.fullmatch(name)
         writes = name.partition(".")[0] in (*TAKEN, "machines")
-        reads = name == "preset" and configuration.ENDING in text
+        reads = name == "preset" and preset_files.ENDING in text
         require(
             is_known and not (writes or reads) and not registry.untyped([override]),
             "study",
@@ -230,7 +231,7 @@ def _checked(stored: Any) -> dict[str, Any]:
             f"its overrides are read as if you had typed them; got {shortened(override)}. Set "
             "study=NAME, another one, or repeat its overrides if you trust it.",
         )
-    default = _common(registry.to_plain(SearchConfig()))
+    default = _common(to_plain(SearchConfig()))
     return stored | {"search": default | {k: v for k, v in own.items() if k in default}}
 
 
@@ -266,12 +267,12 @@ def read(overrides: Sequence[str]) -> Search:
     values, fixed, space = {}, [], {}
     machines = {"name": "local"}
     choices = [  # a comma makes a sweep elsewhere
-        f"{name}=choice({text})" if len(registry.split(text)) > 1 else f"{name}{equals}{text}"
+        f"{name}=choice({text})" if len(split(text)) > 1 else f"{name}{equals}{text}"
         for name, equals, text in (override.partition("=") for override in overrides)
     ]
-    for name, given in configuration.read(choices).items():
+    for name, given in compose.read(choices).items():
         text = given if isinstance(given, str) else as_text(given)
-        override, value = f"{name}={text}", registry.parsed(text)
+        override, value = f"{name}={text}", parsed(text)
         is_text = name in TEXTS and value is not None and not isinstance(value, str)
         require(
             name not in TAKEN,
@@ -287,9 +288,9 @@ def read(overrides: Sequence[str]) -> Search:
             space[name] = spaces.parse(name, text)
         else:
             fixed.append(override)
-    config = registry.from_plain(SearchConfig, values, "")
+    config = from_plain(SearchConfig, values, "")
     where = registry.configure("machines", machines)
-    registry.require_package("machines", where, "trials are run there")
+    registry.require_package("machines", where)
     search = Search(config=config, fixed=tuple(fixed), space=space, machines=where)
     require(
         search.choice("proxy", "se") != "real",
@@ -332,7 +333,7 @@ def require_fields(search: Search, config: Any) -> dict[str, Any]:
         "none. Set space=paper_se, or es.noise_std='tag(log, interval(0.01, 0.3))'.",
     )
     groups = EvaluateConfig.groups if search.is_of_agent else LearnConfig.groups
-    values = registry.flatten(configuration.plain(config))
+    values = flatten(configuration.plain(config))
     values |= {group: values.get(f"{group}.name") for group in groups}
     for name in search.space:
         if name not in values:
@@ -357,7 +358,7 @@ def help_text() -> str:
     fields = "\n".join(
         f"  {name}: {'null' if default is None else default}"
         + (f"  ({', '.join(values[name])})" if name in values else "")
-        for name, default in registry.to_plain(SearchConfig()).items()
+        for name, default in to_plain(SearchConfig()).items()
     )
     return f"""Search hyperparameters with Optuna; a trial is a run, its generations the budget.
 With proxy=RUN_DIR, a file or a shipped name: those of an agent that is trained on that proxy.

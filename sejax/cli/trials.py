@@ -20,7 +20,8 @@ from sejax.cli.config import EvaluateConfig, LearnConfig
 from sejax.cli.programs import Programs, kept, static_of, structure_of
 from sejax.cli.search_config import Search
 from sejax.ops.files import write_text
-from sejax.options import ConfigError, registry, require, shortened
+from sejax.options import ConfigError, require, shortened
+from sejax.options.plain import flatten, to_plain
 
 ROUNDS = "rounds.json"
 WORLDS = {"the proxy": "proxy", "the real task": "real"}  # and what columns call them
@@ -255,7 +256,7 @@ class Tuning:
 
     def _settings_of(self, config: EvaluateConfig) -> dict[str, Any]:
         """What a trial's rounds are of, by field, as it reads back from JSON."""
-        fields = registry.flatten(configuration.plain(dataclasses.replace(config, out_dir=None)))
+        fields = flatten(configuration.plain(dataclasses.replace(config, out_dir=None)))
         read_back: dict[str, Any] = json.loads(
             json.dumps({**fields, "seeds": self._search.config.seeds})
         )
@@ -276,7 +277,7 @@ class Tuning:
                 world,
                 static_of(family.agent),
                 static_of(study.exploration),
-                registry.to_plain(training),
+                to_plain(training),
                 structure_of(agent.hparams),
                 num_agents,
             ]
