@@ -204,14 +204,12 @@ def summarise(agents: pd.DataFrame) -> pd.DataFrame:
     """
 
     def statistics(mine: pd.DataFrame) -> dict[str, float]:
-        name = mine["setting"].iloc[0]
+        ses = strata(mine, mine["setting"].iloc[0])
         row = {"num_ses": mine["group"].nunique(), "num_agents": len(mine)}
         row |= {"num_nonfinite": int(mine["nonfinite"].sum())}
         for column in ("train_steps", "train_episodes", "test_return"):
-            of_ses = mine.groupby("group")[column].mean()
-            independent = mine[column] if name in ON_REAL else of_ses
-            row |= tables.mean_columns(mine[column], column, independent)
-        return row | tables.iqm_columns(mine["test_return"], "test_return", strata(mine, name))
+            row |= tables.mean_columns(mine[column], column, ses)
+        return row | tables.iqm_columns(mine["test_return"], "test_return", ses)
 
     return tables.summary_by(agents, ["kind", "setting"], statistics)
 

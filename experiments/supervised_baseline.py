@@ -129,10 +129,9 @@ def summarise(agents: pd.DataFrame, solved_reward: float) -> pd.DataFrame:
     def statistics(mine: pd.DataFrame) -> dict[str, float]:
         returns = mine["test_return"]
         model = None if mine["world"].iloc[0] == "se" else mine["group"]
-        draws = returns if model is None else returns.groupby(model).mean()
         return (
             {"num_agents": len(mine)}
-            | tables.mean_columns(returns, "return", draws)
+            | tables.mean_columns(returns, "return", model)
             | {"return_std": mine[return_columns(mine)].to_numpy().std()}
             | tables.iqm_columns(returns, "return", model)
             | {"solved": (returns >= solved_reward).mean()}

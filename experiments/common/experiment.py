@@ -52,7 +52,7 @@ def setting(default: Any, rule: Rule | None = None, *, quick: Any = _SAME) -> An
 
 def count(default: int | None, least: int = 1, *, quick: Any = _SAME) -> Any:
     """A field that counts something, `least` of them at least."""
-    return setting(default, counts("it is a number of things", least), quick=quick)
+    return setting(default, counts("nothing is computed otherwise", least), quick=quick)
 
 
 @dataclass(frozen=True, kw_only=True)

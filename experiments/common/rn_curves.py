@@ -183,8 +183,8 @@ def summarise(rows: pd.DataFrame, solved_reward: float, max_steps: int) -> pd.Da
         return (
             {"groups": groups.nunique(), "agents": len(steps)}
             | {"solved": np.isfinite(to_solve).mean()}
-            | mean_columns(steps, "steps", _independent(steps, labels))
-            | mean_columns(mean_return, "return", _independent(mean_return, labels))
+            | mean_columns(steps, "steps", labels)
+            | mean_columns(mean_return, "return", labels)
             | iqm_columns(mean_return, "return", labels)
             | {"last_return": curves.last_returns(mine).mean()}
         )
@@ -195,11 +195,6 @@ def summarise(rows: pd.DataFrame, solved_reward: float, max_steps: int) -> pd.Da
         for (row, _), mine in counted.items()
     ]
     return summary.assign(share_of_bare=shares)
-
-
-def _independent(values: pd.Series, labels: pd.Series | None) -> pd.Series:
-    """What is independent: the means of the RNs, or agents where there are none."""
-    return values if labels is None else values.groupby(labels).mean()
 
 
 def share_of_bare(

@@ -289,11 +289,10 @@ def summarise_tests(agents: pd.DataFrame, by: list[str], solved_reward: float) -
     """
 
     def statistics(mine: pd.DataFrame) -> dict[str, float]:
-        returns = mine["test_return"]
-        of_ses = returns.groupby(mine["seed"]).mean()
+        returns, num_ses = mine["test_return"], mine["seed"].nunique()
         return (
-            {"num_ses": len(of_ses), "num_agents": len(mine)}
-            | mean_columns(returns, "test_return", of_ses if len(of_ses) > 1 else returns)
+            {"num_ses": num_ses, "num_agents": len(mine)}
+            | mean_columns(returns, "test_return", mine["seed"] if num_ses > 1 else None)
             | iqm_columns(returns, "test_return", mine["seed"])
             | {"solved": (returns >= solved_reward).mean()}
         )

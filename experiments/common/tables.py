@@ -19,17 +19,18 @@ from experiments.common.statistics import (
 from sejax.ops.files import write_text
 
 
-def mean_columns(values: Any, name: str, independent: Any = None) -> dict[str, float]:
+def mean_columns(values: pd.Series, name: str, groups: pd.Series | None = None) -> dict[str, float]:
     """Mean, std and `mean_interval` as columns `NAME_mean`, `NAME_std`, `NAME_low`, `NAME_high`.
 
     Args:
       values: `[n]`.
       name: of the columns.
-      independent: what the interval is of, such as the means of groups; the values if not given.
+      groups: labels of the values, such as the proxies of agents. Values of one group are not
+        independent: the interval is that of the groups' means.
     """
-    values = np.asarray(values, float)
-    low, high = mean_interval(values if independent is None else independent)
-    columns = {"mean": values.mean(), "std": values.std(), "low": low, "high": high}
+    low, high = mean_interval(values if groups is None else values.groupby(groups).mean())
+    each = values.to_numpy(float)
+    columns = {"mean": each.mean(), "std": each.std(), "low": low, "high": high}
     return {f"{name}_{statistic}": value for statistic, value in columns.items()}
 
 
@@ -49,18 +50,18 @@ def summary_by(
     )
 
 
-def in_strata(values: pd.Series, labels: pd.Series | None) -> list[pd.Series]:
+def in_strata(values: pd.Series, groups: pd.Series | None) -> list[pd.Series]:
     """Values apart by their labels; all together where there are none."""
-    return [values] if labels is None else [mine for _, mine in values.groupby(labels)]
+    return [values] if groups is None else [mine for _, mine in values.groupby(groups)]
 
 
-def iqm_columns(values: pd.Series, name: str, strata: pd.Series | None = None) -> dict[str, float]:
+def iqm_columns(values: pd.Series, name: str, groups: pd.Series | None = None) -> dict[str, float]:
     """Interquartile mean and its interval as columns `NAME_iqm`, `NAME_iqm_low`, `NAME_iqm_high`.
 
-    Values with labels, `strata`, are drawn again within these; without, they are independent.
+    Values with labels are drawn again within their groups; without, they are independent.
     """
-    groups = in_strata(values, strata)
-    low, high = iqm_interval(values) if strata is None else bootstrap_interval(*groups)
+    strata = in_strata(values, groups)
+    low, high = iqm_interval(values) if groups is None else bootstrap_interval(*strata)
     columns = {"iqm": interquartile_mean(values), "iqm_low": low, "iqm_high": high}
     return {f"{name}_{statistic}": value for statistic, value in columns.items()}
 
