@@ -9,8 +9,8 @@ hardly ever ends an episode. PPO learns when its rollout is full: it trains for 
 many steps, at least two, so that acting and learning have their usual shares.
 
 sejax trains the agents as the commands do, through `spread_over_devices` and with the agent's own
-number of lanes, but on one device. PyTorch trains `--torch-agents` of them one after the other, for
-as many steps each: what a step costs there does not depend on how many agents there are.
+number of agents in parallel, but on one device. PyTorch trains `--torch-agents` of them one after
+the other, for as many steps each: what a step costs there does not depend on how many there are.
 
 Both sides are kept to the same core and take turns, so that a disturbance meets both. Compilation
 is not counted, nor is a short training by PyTorch before the first. CPU time, unlike wall-clock,

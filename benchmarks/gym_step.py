@@ -24,10 +24,10 @@ SIDES = {
     "numpy": "sejax.gym.make, an SE of one step",
     "numpy-soft": "sejax.gym.make, the soft SE",
     "numpy-rn": "sejax.gym.make, cartpole-rn",
-    "numpy-batch": f"sejax.gym.make_vec, {NUM_ENVS} lanes, an SE of one step",
-    "numpy-batch-soft": f"sejax.gym.make_vec, {NUM_ENVS} lanes, the soft SE",
+    "numpy-batch": f"sejax.gym.make_vec, {NUM_ENVS} environments, an SE of one step",
+    "numpy-batch-soft": f"sejax.gym.make_vec, {NUM_ENVS} environments, the soft SE",
     "gymnax": "gymnax's wrapper, an SE of one step",
-    "gymnax-batch": f"gymnax's vector wrapper, {NUM_ENVS} lanes, an SE of one step",
+    "gymnax-batch": f"gymnax's vector wrapper, {NUM_ENVS} environments, an SE of one step",
     "CartPole-v1": "Gymnasium's CartPole-v1",
     "Acrobot-v1": "Gymnasium's Acrobot-v1",
 }
@@ -57,7 +57,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def serve(args: argparse.Namespace) -> None:
     """A side."""
     os.sched_setaffinity(0, {args.core})
-    walk, num_steps = (walk_in_lanes if "batch" in args.side else walk_alone)(args.side, args.seed)
+    walk, num_steps = (walk_many if "batch" in args.side else walk_alone)(args.side, args.seed)
 
     def handle(_: dict[str, Any]) -> dict[str, Any]:
         return {"us": common.measure(walk)[1]["cpu_s"] / num_steps * 1e6}
@@ -83,8 +83,8 @@ def walk_alone(side: str, seed: int) -> tuple[Callable[[], None], int]:
     return walk, num_steps
 
 
-def walk_in_lanes(side: str, seed: int) -> tuple[Callable[[], None], int]:
-    """Likewise in lanes, which begin their episodes by themselves; steps of all lanes."""
+def walk_many(side: str, seed: int) -> tuple[Callable[[], None], int]:
+    """Likewise in many, which begin their episodes by themselves; steps of all of them."""
     envs: Any
     if side == "gymnax-batch":
         envs, num_steps = make_gymnax(NUM_ENVS), NUM_STEPS["jax batch"]

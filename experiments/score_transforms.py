@@ -31,6 +31,7 @@ from experiments.common import figures
 from experiments.common.experiment import Experiment, Settings, count, setting
 from experiments.common.statistics import NUM_RESAMPLES
 from experiments.common.tables import as_texts, mean_columns, mean_text, publish
+from sejax.bilevel import make_bilevel
 from sejax.options import each_of
 
 # docs/reference.md 6.2: default_config_gridworld.yaml as the published runs used it.
@@ -147,8 +148,6 @@ class Search(NamedTuple):
 
 def make_search(transform: str, mirrored: bool, population: int, devices: int | None) -> Search:
     """Builds Algorithm 1 for runs of a cell, which differ in their step sizes."""
-    from sejax.bilevel import make_bilevel
-
     own = [f"es.score_transform={transform}", f"es.mirrored={mirrored}"]
     own += [f"es.population_size={population}", "stop_when_solved=true"]
     config = dataclasses.replace(sejax.config([*SETTINGS, *own]), devices=devices)

@@ -35,6 +35,7 @@ from experiments.common.agents import SE_AGENTS, SOFT_SE, Condition, Measure
 from experiments.common.experiment import Experiment, Settings, count, setting
 from experiments.common.tables import as_texts, publish, summary_by
 from sejax.agents.buffers import Buffer, BufferMaker, write_row
+from sejax.evaluation import make_recorder, make_tested_trainer
 from sejax.options import each_of, registry
 from sejax.training import TrainingConfig
 
@@ -125,8 +126,6 @@ def make_recorded_run(
     max_rows: int, agent: Any, env: Any, task: Any, training: TrainingConfig
 ) -> Callable[..., Any]:
     """Builds `run(key, env_params, active)` that trains, tests and records one agent."""
-    from sejax.evaluation import make_recorder, make_tested_trainer
-
     capacity = min(max_rows, training.max_steps or max_rows)
     train = make_tested_trainer(agent, env, task, training, recorder=last_steps(capacity))
     test = make_recorder(agent, task, training.test_episodes)

@@ -23,6 +23,7 @@ import sejax
 from experiments.common import figures
 from experiments.common.experiment import Experiment, Settings, count, setting
 from experiments.common.tables import as_texts, publish
+from sejax.cli import session
 from sejax.cli.runtime import available_cores
 from sejax.options import each_of
 
@@ -94,8 +95,6 @@ def config_of(settings: Timings, row: Row, preset: str) -> Any:
 
 def time_generations(settings: Timings, row: Row, preset: str) -> pd.DataFrame:
     """Mean wall-clock of the first outer iterations, compiled before."""
-    from sejax.cli import session
-
     chunks = session.make_chunks(config_of(settings, row, preset))
     program = chunks.learner
     state = chunks.init(jax.random.key(settings.seed))

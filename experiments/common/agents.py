@@ -19,6 +19,7 @@ import sejax
 from experiments.common.experiment import Settings, count, setting
 from sejax.agents import NoExploration
 from sejax.cli.progress import Tally
+from sejax.evaluation import num_parallel_on_cpu
 from sejax.ops.parallel import spread_over_devices
 from sejax.options import each_of, registry
 from sejax.options.plain import to_plain
@@ -215,8 +216,6 @@ def make_program(
     The leaves of `params` are `[group, ...]`; the agents of a group follow one another. Nothing is
     computed for an agent that is not active.
     """
-    from sejax.evaluation import num_parallel_on_cpu
-
     made = sejax.make_agent(agent, task, exploration, hparams == "varied")
     run = measure.make_run(made, env, task, training)
 

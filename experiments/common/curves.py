@@ -12,6 +12,7 @@ import numpy as np
 import pandas as pd
 
 from experiments.common.agents import Measure
+from sejax.evaluation import make_tested_trainer
 from sejax.training import TrainingConfig
 
 WINDOW = 10  # test episodes that a point of a smoothed curve is the mean of
@@ -22,8 +23,6 @@ def make_curve_run(agent: Any, env: Any, task: Any, training: TrainingConfig) ->
 
     Entries after an agent's last episode are nan and 0. Only the limits of `training` end it.
     """
-    from sejax.evaluation import make_tested_trainer
-
     between = max(1, training.tests_between)
     training = dataclasses.replace(training, stop_rule="never", tests_between=between)
 

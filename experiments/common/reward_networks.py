@@ -290,7 +290,8 @@ def stored(settings: RnSettings, variant: str, objective: str) -> Any:
     if differing:
         raise ConfigError(
             f"rns_dir must be a new folder or hold RNs of the same settings; got {path} with "
-            f"another {listed(differing)}. Set rns_dir=DIR, or these settings."
+            f"another {listed(differing)}. Set rns_dir=DIR, or these settings.",
+            "rns_dir",
         )
     return there
 

@@ -184,7 +184,7 @@ def read_costs(path: Path, generations: int) -> np.ndarray:
         return np.array([])
     except ValueError as error:
         raise ConfigError(
-            f"work must hold whole files; {path} is damaged. Set work=DIR."
+            f"work must hold whole files; {path} is damaged. Set work=DIR.", "work"
         ) from error
 
 

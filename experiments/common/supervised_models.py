@@ -21,7 +21,9 @@ import sejax
 from experiments.common import agents
 from experiments.common.agents import HPARAMS, SE_AGENTS, SOFT_SE
 from experiments.common.experiment import Settings, count, setting
+from sejax.bilevel import make_bilevel
 from sejax.cli import config as configuration
+from sejax.evaluation import make_evaluator, num_parallel_on_cpu
 from sejax.ops.parallel import spread_over_devices
 from sejax.options import each_of, registry
 
@@ -110,9 +112,6 @@ def make_recorded_run(config: Any) -> tuple[Callable[[Any], Any], Callable[[Any]
       `init(key) -> state`, and `generation(state) -> (state, Steps)`, which makes a generation; the
       steps are those of all tests, `[evaluation, step, ...]`.
     """
-    from sejax.bilevel import make_bilevel
-    from sejax.evaluation import make_evaluator, num_parallel_on_cpu
-
     bilevel = make_bilevel(**config.parts())
     proxy, training = bilevel.proxy, bilevel.training
     (agent,) = bilevel.mixture.agents
