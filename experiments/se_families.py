@@ -120,7 +120,7 @@ def report(settings: SeFamilies, rows: pd.DataFrame) -> pd.DataFrame:
         f"{tables.interval_note('SEs, agents where there is one SE')}"
         f"{tables.iqm_note('within each SE')}"
     )
-    title = f"Agents tested on {task.name}, trained on SEs learned with other families of agents"
+    title = f"Agents tested on {task.name}, trained on SEs learned with other mixtures of agents"
     return tables.publish(settings, title, make_table(summary), summary, note)
 
 

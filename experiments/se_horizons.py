@@ -239,7 +239,7 @@ def draw(task: Any, each: pd.DataFrame, summary: pd.DataFrame, end: str, path: P
             errors = np.abs(mine[["best_low", "best_high"]].to_numpy().T - best.to_numpy())
             line: Any = {"fmt": "o-", "ms": 5, "capsize": 3, "color": color}
             left.errorbar(places, best, yerr=errors, label=f"{starts} starts", **line)
-            means, label = mine[tested].mean(axis=1), f"{starts} starts, tested families"
+            means, label = mine[tested].mean(axis=1), f"{starts} starts, tested agents"
             left.plot(places, means, "D:", ms=4, color=color, mfc="none", label=label)
             own = each[each["end"].isin(ends) & (each["starts"] == starts)]
             solved = np.isfinite(own["cpu_s_to_solve"])
