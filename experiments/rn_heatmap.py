@@ -27,6 +27,7 @@ from experiments.common import reward_networks as rn
 from experiments.common.experiment import Experiment
 from experiments.common.reward_networks import RnSettings
 from experiments.common.tables import publish
+from sejax import ProxySet
 from sejax.envs.gridworld import CLIFF_WALKING as MAP
 from sejax.options import one_of
 
@@ -66,16 +67,16 @@ def compute(settings: RnHeatmap) -> pd.DataFrame:
     return pd.concat(tables, ignore_index=True)
 
 
-def rewards_of_moves(rns: Any) -> np.ndarray:
+def rewards_of_moves(rns: ProxySet) -> np.ndarray:
     """What each RN pays for each move, `[rn, state, action]`; nan out of terminal states."""
     env, task = rns.env, rns.task
-    grid = task.env
+    grid, key = task.env, jax.random.key(0)  # nothing is random here
 
     def reward(weights: Any, index: Any, action: Any) -> Any:
         params = env.params(weights, rns.discount)
-        _, state = env.reset_env(None, params)
+        _, state = env.reset_env(key, params)
         state = state.replace(world=state.world.replace(index=index), obs=index)
-        _, _, reward, _, _ = env.step_env(None, state, action, params)
+        _, _, reward, _, _ = env.step_env(key, state, action, params)
         terminal = grid.is_terminated(state.world, task.params)
         return jnp.where(terminal, jnp.nan, reward)
 

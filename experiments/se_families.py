@@ -20,7 +20,7 @@ from experiments.common import figures, runs, tables
 from experiments.common.experiment import Experiment, setting
 from experiments.common.runs import MixtureRuns, kinds_in
 from experiments.common.shards import stack, unstack
-from sejax import envs
+from sejax import Task, envs
 from sejax.options import require
 
 SETS = (
@@ -124,7 +124,7 @@ def report(settings: SeFamilies, rows: pd.DataFrame) -> pd.DataFrame:
     return tables.publish(settings, title, make_table(summary), summary, note)
 
 
-def draw(summary: pd.DataFrame, task: Any, path: Path) -> None:
+def draw(summary: pd.DataFrame, task: Task, path: Path) -> None:
     """Draws mean returns as a map for each kind of hyperparameters, and what each mixture cost."""
     hparams, sets, kinds = (list(summary[x].unique()) for x in ("hparams", "learned_with", "kind"))
     low = summary["test_return_mean"].min()

@@ -34,6 +34,7 @@ from experiments.common import figures
 from experiments.common.agents import SE_AGENTS, SOFT_SE, Condition, Measure
 from experiments.common.experiment import Experiment, Settings, count, setting
 from experiments.common.tables import as_texts, publish, summary_by
+from sejax import ProxySet, Task
 from sejax.agents.buffers import Buffer, BufferMaker, write_row
 from sejax.evaluation import make_recorder, make_tested_trainer
 from sejax.options import each_of, registry
@@ -107,7 +108,7 @@ def compute(settings: SeHistograms) -> pd.DataFrame:
     return pd.concat(tables, ignore_index=True).drop(columns="group")
 
 
-def load(settings: SeHistograms) -> Any:
+def load(settings: SeHistograms) -> ProxySet:
     """The SE."""
     return sejax.load_set(settings.proxy, option="proxy", kind="se")[:1]
 
@@ -123,7 +124,7 @@ def transitions(max_rows: int) -> Measure:
 
 
 def make_recorded_run(
-    max_rows: int, agent: Any, env: Any, task: Any, training: TrainingConfig
+    max_rows: int, agent: Any, env: Any, task: Task, training: TrainingConfig
 ) -> Callable[..., Any]:
     """Builds `run(key, env_params, active)` that trains, tests and records one agent."""
     capacity = min(max_rows, training.max_steps or max_rows)
@@ -209,7 +210,7 @@ def columns_of(rows: pd.DataFrame) -> list[str]:
     return [*[name for name in rows if name.startswith("state_")], "reward"]
 
 
-def names_of(task: Any, rows: pd.DataFrame) -> dict[str, str]:
+def names_of(task: Task, rows: pd.DataFrame) -> dict[str, str]:
     """What people call these columns."""
     usual = {name: name.replace("_", " ") for name in columns_of(rows)}
     return usual | dict(zip(usual, DIMENSIONS.get(task.name, ()), strict=False))
@@ -232,7 +233,7 @@ def summarise(rows: pd.DataFrame) -> pd.DataFrame:
     return summary.sort_values("kind", key=lambda x: x.map(kinds.index), kind="stable")
 
 
-def make_table(task: Any, rows: pd.DataFrame, summary: pd.DataFrame) -> pd.DataFrame:
+def make_table(task: Task, rows: pd.DataFrame, summary: pd.DataFrame) -> pd.DataFrame:
     """The summary as texts; the return stands in each kind's first row."""
     names = names_of(task, rows)
 
@@ -290,7 +291,7 @@ def bin_edges(samples: dict[str, np.ndarray], num_bins: int = 80) -> np.ndarray:
     return np.linspace(low - room, high + room, num_bins + 1)
 
 
-def draw(task: Any, rows: pd.DataFrame, path: Path) -> None:
+def draw(task: Task, rows: pd.DataFrame, path: Path) -> None:
     """Draws a row for each kind of agent and a column for each state dimension and the reward.
 
     Source: paper, figure "Histograms of next state s' and reward r".

@@ -31,7 +31,7 @@ from experiments.common.tables import (
     publish,
     summary_by,
 )
-from sejax import envs
+from sejax import Task, envs
 from sejax.options import each_of, positive
 from sejax.proxies.configs import DONE_MODES, INITIAL_STATES
 
@@ -222,7 +222,7 @@ def report(settings: SeHorizons, rows: pd.DataFrame) -> pd.DataFrame:
     return publish(settings, title, make_table(summary), summary, note)
 
 
-def draw(task: Any, each: pd.DataFrame, summary: pd.DataFrame, end: str, path: Path) -> None:
+def draw(task: Task, each: pd.DataFrame, summary: pd.DataFrame, end: str, path: Path) -> None:
     """Draws returns against horizons of SEs that end like this, and CPU seconds to solve the task.
 
     A cross is a run that has not solved it, where its budget was spent.

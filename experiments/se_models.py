@@ -20,6 +20,7 @@ from experiments.common import agents as groups
 from experiments.common import figures, tables
 from experiments.common.agents import SeAgents, return_columns
 from experiments.common.experiment import Experiment, setting
+from sejax import ProxySet, Task
 from sejax.options import ConfigError
 
 
@@ -43,7 +44,7 @@ def compute(settings: SeModels) -> pd.DataFrame:
     return pd.concat(parts, ignore_index=True)
 
 
-def load(settings: SeModels) -> Any:
+def load(settings: SeModels) -> ProxySet:
     """The SEs that are tested."""
     if settings.ses is None:
         raise ConfigError(
@@ -118,7 +119,7 @@ def correlations_text(summary: pd.DataFrame) -> str:
     return f" Rank correlation of the SEs' mean returns: {', '.join(texts)}." if texts else ""
 
 
-def draw(task: Any, agents: pd.DataFrame, path: Path) -> None:
+def draw(task: Task, agents: pd.DataFrame, path: Path) -> None:
     """Draws a violin of the returns for each SE, the best first, in a row for each kind of agent.
 
     Source: paper, appendix "Evaluation of Individual SE Models".

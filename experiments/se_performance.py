@@ -30,7 +30,7 @@ from experiments.common import agents as groups
 from experiments.common import figures, tables
 from experiments.common.agents import Condition, SeAgents, return_columns, tuned_agent
 from experiments.common.experiment import Experiment, count, setting
-from sejax import envs
+from sejax import ProxySet, Task, envs
 from sejax.options import one_of, require, shortened
 from sejax.training import SOLVED_BY, TrainingConfig
 
@@ -107,7 +107,7 @@ def compute(settings: SePerformance) -> pd.DataFrame:
     return pd.concat(parts, ignore_index=True)
 
 
-def solved_ones(ses: Any) -> Any:
+def solved_ones(ses: ProxySet) -> Any:
     """The SEs whose score, a mean return, reached the task's threshold."""
     return ses[ses.scores >= ses.task.solved_reward]
 
@@ -144,7 +144,7 @@ def task_name(settings: SePerformance, sets: dict[str, Any]) -> str:
     return names[0] if names else "cartpole"
 
 
-def on_real(settings: SePerformance, task: Any, sets: dict[str, Any], kind: str) -> Condition:
+def on_real(settings: SePerformance, task: Task, sets: dict[str, Any], kind: str) -> Condition:
     """The real task for a number of groups of agents; training ends by the solved rule."""
     as_ses = max((len(ses) for ses in sets.values()), default=settings.num_ses)
     # docs/reference.md 7.1: discrete TD3 trains 500 episodes on Acrobot, all others 1000.
@@ -269,7 +269,7 @@ def report(settings: SePerformance, rows: pd.DataFrame) -> pd.DataFrame:
     return tables.publish(settings, title, make_table(task.name, summary), summary, note)
 
 
-def draw(task: Any, agents: pd.DataFrame, path: Path) -> None:
+def draw(task: Task, agents: pd.DataFrame, path: Path) -> None:
     """Draws densities of the test returns above and bars of steps and episodes below.
 
     Source: paper, figures "Densities based on each 4000 cumulative test rewards".
@@ -299,7 +299,7 @@ def draw(task: Any, agents: pd.DataFrame, path: Path) -> None:
         figure.legend(handles, texts, ncols=columns, loc="outside upper center")
 
 
-def draw_profiles(task: Any, agents: pd.DataFrame, path: Path) -> None:
+def draw_profiles(task: Task, agents: pd.DataFrame, path: Path) -> None:
     """Draws performance profiles of the agents' mean test returns, a panel for each kind."""
     kinds = list(agents.groupby("kind", sort=False))
     low, high = agents["test_return"].min(), agents["test_return"].max()

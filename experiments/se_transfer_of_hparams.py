@@ -23,6 +23,7 @@ from experiments.common.agents import Condition, Group, Measure
 from experiments.common.experiment import Experiment, Settings, count, setting
 from experiments.common.statistics import LEAST, NUM_RESAMPLES
 from experiments.common.tables import as_texts, publish, with_interval
+from sejax import ProxySet, Task
 from sejax.options import each_of, require
 from sejax.training import TrainingConfig
 
@@ -55,7 +56,7 @@ class SeTransferOfHparams(Settings):
 class Parts:
     """What is trained where."""
 
-    ses: Any  # `ProxySet` of one
+    ses: ProxySet  # `ProxySet` of one
     agent: Any  # configuration
     trainings: dict[str, TrainingConfig]  # by world: se, and the budgets on the real task
 
@@ -133,7 +134,7 @@ def compute(settings: SeTransferOfHparams) -> pd.DataFrame:
 
 
 def make_shared_draws(
-    agent: Any, env: Any, task: Any, training: TrainingConfig
+    agent: Any, env: Any, task: Task, training: TrainingConfig
 ) -> Callable[..., Any]:
     """Builds `run(key, (env_params, config_key), active) -> (Outcome, drawn values)`.
 
@@ -281,7 +282,7 @@ def report(settings: SeTransferOfHparams, rows: pd.DataFrame) -> pd.DataFrame:
     return publish(settings, title, make_table(summary), summary, note)
 
 
-def draw(task: Any, rows: pd.DataFrame, path: Any) -> None:
+def draw(task: Task, rows: pd.DataFrame, path: Any) -> None:
     """Draws the configurations' mean returns on the real task against those on the SE."""
     means = rows.groupby(["world", "config"])["test_return"].mean().unstack("world")
     targets = [name for name in BUDGETS if name in means]

@@ -34,6 +34,7 @@ from experiments.common.agents import HPARAMS, SE_AGENTS, SOFT_SE, Condition, re
 from experiments.common.experiment import Experiment
 from experiments.common.shards import stack, unstack
 from experiments.common.supervised_models import SupervisedBaseline
+from sejax import ProxySet, Task
 from sejax.options import require, shortened
 
 BEST = 2  # models in the paper's second figure
@@ -66,7 +67,7 @@ def compute(settings: SupervisedBaseline) -> pd.DataFrame:
     return stack({"agents": pd.concat(parts), "fits": fits, "transitions": transitions})
 
 
-def load(settings: SupervisedBaseline) -> Any:
+def load(settings: SupervisedBaseline) -> ProxySet:
     """The SE, if agents can be trained on it, and the tests of its NES run recorded."""
     ses = sejax.load_set(settings.proxy, option="proxy", kind="se")[:1]
 
@@ -83,7 +84,7 @@ def load(settings: SupervisedBaseline) -> Any:
     return ses
 
 
-def make_conditions(settings: Any, ses: Any, kind: str, hparams: str) -> dict[str, Condition]:
+def make_conditions(settings: Any, ses: ProxySet, kind: str, hparams: str) -> dict[str, Condition]:
     """The models of both variants and the SE, with as many agents on the SE as on all models."""
     sets = {
         name: sejax.load_set(supervised_models.model_file(settings, name), option="out")
@@ -197,7 +198,7 @@ def diverged_text(agents: pd.DataFrame) -> str:
     return ", ".join(texts) or "none"
 
 
-def draw(task: Any, agents: pd.DataFrame, path: Path) -> None:
+def draw(task: Task, agents: pd.DataFrame, path: Path) -> None:
     """Draws histograms of the test returns, a panel for each agent and choice of hyperparameters.
 
     Source: paper, figure "Comparing the cumulative test reward densities", top.

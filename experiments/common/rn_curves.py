@@ -27,6 +27,7 @@ from experiments.common.tables import (
     mean_text,
     summary_by,
 )
+from sejax import ProxySet
 from sejax.options import each_of, registry, require
 from sejax.training import TrainingConfig
 
@@ -104,7 +105,7 @@ def real_curves(settings: CurveSettings) -> Iterator[pd.DataFrame]:
             yield from curves_in(settings, name, settings.bonus_groups, make, exploration=bonus)
 
 
-def rn_curves(settings: CurveSettings, variant: str, rns: Any, prefix: str = "") -> Any:
+def rn_curves(settings: CurveSettings, variant: str, rns: ProxySet, prefix: str = "") -> Any:
     """Curves of all agents on the RNs of a set, of which each group of agents has one."""
     make = functools.partial(Condition.of_set, rns)
     return curves_in(settings, variant, len(rns), make, prefix)

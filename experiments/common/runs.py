@@ -20,6 +20,7 @@ import sejax
 from experiments.common.agents import HPARAMS, Condition, groups_at_once, train_groups
 from experiments.common.experiment import Settings, count, setting
 from experiments.common.tables import iqm_columns, mean_columns, summary_by
+from sejax import ProxySet
 from sejax.cli import config as configuration
 from sejax.cli import run_directory, session
 from sejax.cli.compose import key_of
@@ -249,7 +250,7 @@ class MixtureRuns(RunSettings):
         collect(configs, path)
         return curves, sejax.load_set(path)
 
-    def evaluate(self, name: str, ses: Any, config: Any) -> pd.DataFrame:
+    def evaluate(self, name: str, ses: ProxySet, config: Any) -> pd.DataFrame:
         """Agents of one kind on each SE of a set, a row each.
 
         Args:

@@ -21,6 +21,7 @@ import sejax
 from experiments.common import agents
 from experiments.common.agents import HPARAMS, SE_AGENTS, SOFT_SE
 from experiments.common.experiment import Settings, count, setting
+from sejax import ProxySet
 from sejax.bilevel import make_bilevel
 from sejax.cli import config as configuration
 from sejax.evaluation import make_evaluator, num_parallel_on_cpu
@@ -50,7 +51,7 @@ class SupervisedBaseline(Settings):
     max_steps: int | None = count(None)  # of an agent on a model; as on the SE
 
 
-def learning_config(settings: SupervisedBaseline, ses: Any) -> Any:
+def learning_config(settings: SupervisedBaseline, ses: ProxySet) -> Any:
     """Settings of the NES runs that the transitions come from."""
     config = configuration.learn_config(ses.config)
     agent, training = config.agent, config.training
@@ -74,7 +75,7 @@ def learning_config(settings: SupervisedBaseline, ses: Any) -> Any:
     )
 
 
-def collect_all(settings: SupervisedBaseline, ses: Any) -> list[pd.DataFrame]:
+def collect_all(settings: SupervisedBaseline, ses: ProxySet) -> list[pd.DataFrame]:
     """The transitions of each NES run; every run is a shard."""
     config = learning_config(settings, ses)
     made_with = configuration.plain(config) | {"max_rows": settings.max_rows, "devices": None}
@@ -192,7 +193,9 @@ def model_file(settings: SupervisedBaseline, variant: str) -> Path:
     return settings.folder / f"models-{variant}.safetensors"
 
 
-def fit_shard(settings: SupervisedBaseline, ses: Any, data: list[pd.DataFrame]) -> pd.DataFrame:
+def fit_shard(
+    settings: SupervisedBaseline, ses: ProxySet, data: list[pd.DataFrame]
+) -> pd.DataFrame:
     """Fits all models, stores both variants of them, and returns the errors of each epoch."""
     num_rows = min(len(rows) for rows in data)
     made_with = {
@@ -212,7 +215,7 @@ def fit_shard(settings: SupervisedBaseline, ses: Any, data: list[pd.DataFrame]) 
     return fits
 
 
-def fit_all(settings: Any, ses: Any, data: list[pd.DataFrame], num_rows: int) -> pd.DataFrame:
+def fit_all(settings: Any, ses: ProxySet, data: list[pd.DataFrame], num_rows: int) -> pd.DataFrame:
     """Fits a model to each run's transitions and writes the models; a row for each epoch."""
     arrays = [arrays_of(rows.iloc[:num_rows]) for rows in data]
     stacked = tuple(np.stack(parts) for parts in zip(*arrays, strict=True))
@@ -275,7 +278,7 @@ def make_fit(env: Any, num_rows: int, epochs: int) -> Callable[..., Any]:
     return fit
 
 
-def save_models(settings: Any, ses: Any, weights: Any, variant: str, done: str) -> None:
+def save_models(settings: Any, ses: ProxySet, weights: Any, variant: str, done: str) -> None:
     """Stores the models of a variant, as SEs with their use of the done output."""
     env = registry.make("proxy", dataclasses.replace(ses.env.config, done=done), ses.task)
     each = [jax.tree.map(lambda x, i=i: x[i], weights) for i in range(settings.models)]
