@@ -77,9 +77,9 @@ def runner_of(search: "Search") -> "Runner":
 
     if not search.is_of_agent:
         return Learning(search)
-    from sejax.evaluate import proxy_study
+    from sejax.cli.worlds import proxy_setup
 
-    return Tuning(search, proxy_study)
+    return Tuning(search, proxy_setup)
 
 
 def _verified(found: Any, search: "Search", runner: "Runner") -> list[str]:

@@ -171,7 +171,7 @@ class Tuning:
 
     Args:
       search: of an agent.
-      study_of: `sejax.evaluate.proxy_study`, which stands above this module.
+      study_of: `sejax.cli.worlds.proxy_setup`.
 
     Raises:
       ConfigError: if the proxy is not to be found here, which is no fault of a trial's settings.
