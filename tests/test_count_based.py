@@ -1,6 +1,5 @@
 """sejax.agents.exploration: the bonus by hand and by a plain loop, and in a training."""
 
-
 import jax
 import jax.numpy as jnp
 import numpy as np
