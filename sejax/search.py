@@ -30,12 +30,9 @@ def main(overrides: Sequence[str]) -> None:
     from sejax.cli import search_config, search_results, search_workers, study
 
     search = search_config.read(overrides)
-    current = None
-    if not search.joins:  # all is checked before a study is made
-        current = search_config.require_fields(search, runner_of(search).config([]))
-    found, search = study.open_study(search, current)
     runner = runner_of(search)
-    search_config.require_fields(search, runner.config([]))  # of a study that is joined
+    current = search_config.require_fields(search, runner.config([]))
+    found = study.open_study(search, current)
     runtime.configure_jax()
     _say(f"Study {search.study} in {search.folder}: {', '.join(search.space)}.")
     try:
@@ -64,11 +61,11 @@ def main(overrides: Sequence[str]) -> None:
 
 
 def join(overrides: Sequence[str]) -> None:
-    """Works on a study that exists until it is over, as one more worker."""
+    """Works on a study until it is over, as one of several workers."""
     from sejax.cli import search_config, study
 
-    found, search = study.open_study(search_config.read(overrides))
-    study.work(found, search, runner_of(search), lambda text: None)
+    search = search_config.read(overrides)
+    study.work(study.open_study(search), search, runner_of(search), lambda text: None)
 
 
 def runner_of(search: "Search") -> "Runner":

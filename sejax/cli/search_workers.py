@@ -10,7 +10,7 @@ from typing import Any
 import optuna
 
 from sejax.cli import cluster, runtime
-from sejax.cli.search_config import SQLITE, Search
+from sejax.cli.search_config import Search
 from sejax.cli.study import ENDED, sentence
 from sejax.options import FailedError, registry, told
 
@@ -38,11 +38,10 @@ def work(
     """
     runtime.take_share_of_gpu(0)  # GPUs are the workers'
     machines, gpus = search.machines, search.machines.gpus_per_worker
-    typed = [*search.fixed, *(x.text for x in search.space.values())]
     with cluster.connected(machines) as ray:
         start = ray.remote(num_cpus=1, num_gpus=gpus, max_retries=RETRIES)(_work)
         count = max(1, cluster.num_workers(machines))
-        running = [start.remote(join, _overrides(search), gpus, typed) for _ in range(count)]
+        running = [start.remote(join, search.overrides(), gpus) for _ in range(count)]
         known = {trial.number for trial in study.get_trials(deepcopy=False, states=ENDED)}
         done: list[Any] = []
         while not done:
@@ -62,28 +61,10 @@ def work(
         ray.wait(running, num_returns=count, timeout=LAST_S)  # one that hangs is left behind
 
 
-def _overrides(search: Search) -> list[str]:
-    """The overrides by which a worker joins, and has what may differ between workers."""
-    folder = search.folder.resolve()
-    own = {
-        "study": search.study,
-        "search_dir": folder,
-        "storage": search.config.storage or f"{SQLITE}{folder / 'study.db'}",
-        "trials": search.config.trials,
-        "timeout": search.config.timeout,
-    }
-    return [f"{name}={value}" for name, value in own.items() if value is not None]
-
-
-def _work(
-    join: Callable[[Sequence[str]], None],
-    overrides: Sequence[str],
-    gpu_share: float,
-    typed: Sequence[str],
-) -> None:
-    """A worker; it may import what the overrides `typed` name."""
+def _work(join: Callable[[Sequence[str]], None], overrides: Sequence[str], gpu: float) -> None:
+    """A worker, which has this part of a GPU."""
     runtime.configure_xla(1)
-    runtime.take_share_of_gpu(gpu_share)
+    runtime.take_share_of_gpu(gpu)
     runtime.configure_jax()
-    with registry.only_typed(typed):
+    with registry.only_typed(overrides):
         join(overrides)

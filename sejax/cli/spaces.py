@@ -39,7 +39,7 @@ class Dimension:
 
     Attributes:
       name: of the field, such as `es.noise_std`.
-      text: the range or choice as it was given.
+      text: the range or choice, as an override has it.
       distribution: Optuna's.
       is_inverse: whether 1 - value is drawn in the place of the value.
     """
@@ -109,6 +109,7 @@ def parse(name: str, text: str) -> Dimension:
       IntDistribution(high=2, log=False, low=1, step=1)
     """
     call, tags = text.strip(), set()
+    text = call if _CALL.fullmatch(call) else f"choice({call})"
     if (tagged := _CALL.fullmatch(call)) and tagged[1] == "tag":
         *given, call = split(tagged[2])
         tags = set(given)
@@ -118,8 +119,8 @@ def parse(name: str, text: str) -> Dimension:
         distribution = _distribution(call, tags)
     except (ValueError, ZeroDivisionError) as error:  # also of Optuna
         raise ConfigError(
-            f"{name} must be a choice, a range or an interval, because it is searched; got "
-            f"{shortened(text)} ({told(error)}). Set {name}='{EXAMPLE}'.",
+            f"{name} must be a choice, a range or an interval; got {shortened(text)} "
+            f"({told(error)}). Set {name}='{EXAMPLE}'.",
             name,
         ) from error
     return Dimension(name=name, text=text, distribution=distribution, is_inverse="inverse" in tags)
@@ -190,15 +191,15 @@ def preset(name: str, agent: str, of_agent: bool) -> dict[str, Dimension]:
         and all(isinstance(x, dict) for x in of_agents.values())
         and (ranges or of_agents),
         "space",
-        "must map fields to ranges, and agents to such maps under with_agent, because they are "
-        f"searched; got {path} with other content. Set space=paper_se.",
+        "must map fields to ranges, and agents to such maps under with_agent; got other content in "
+        f"{path}. Set space=paper_se.",
     )
     for each in agent.split(configuration.JOINT):
         require(
             has_own or each in of_agents,
             "agent",
-            f"must be one of {', '.join(of_agents)} with space={name}, because it has no ranges "
-            f"for others; got {shortened(each)}. Set agent={next(iter(of_agents), 'ddqn')}.",
+            f"must be one of {', '.join(of_agents)} with space={name}; got {shortened(each)}. Set "
+            f"agent={next(iter(of_agents), 'ddqn')}.",
         )
         own = of_agents.get(each, {})
         if configuration.JOINT in agent:  # what a mixture shares has no place in an agent's ranges
