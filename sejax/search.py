@@ -5,7 +5,7 @@ A trial is a run, whose generations are the budget; the same command goes on whe
 
 from collections.abc import Sequence
 from importlib.util import find_spec
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from sejax.cli import commands, runtime
 from sejax.options import ConfigError
@@ -23,10 +23,7 @@ def main(overrides: Sequence[str]) -> None:
       OSError: if a file cannot be written.
     """
     if find_spec("optuna") is None:
-        raise ConfigError(
-            "sejax.search needs Optuna, because it decides what is tried. Install it with "
-            "pip install 'sejax[search]'."
-        )
+        raise ConfigError("sejax.search needs Optuna. Install it with pip install 'sejax[search]'.")
     from sejax.cli import search_config, search_results, search_workers, study
 
     search = search_config.read(overrides)
@@ -48,7 +45,7 @@ def main(overrides: Sequence[str]) -> None:
             return
         settings = search_results.overrides_of(best[0], search)
         if search.num_verified:
-            settings = _verified(found, search, runner)
+            settings = search_results.verified(found, search, runner)
     except KeyboardInterrupt:
         _say(
             f"Interrupted. What has ended is saved in {search.folder}; the same command goes on "
@@ -77,21 +74,6 @@ def runner_of(search: "Search") -> "Runner":
     from sejax.evaluate import proxy_study
 
     return Tuning(search, proxy_study)
-
-
-def _verified(found: Any, search: "Search", runner: "Runner") -> list[str]:
-    """The overrides of the settings that were best when they were tried again."""
-    import filelock
-
-    from sejax.cli import search_results
-
-    with filelock.FileLock(search.folder / "verification.lock"):  # another worker may be at it
-        rows = search_results.verify(found, search, runner)
-    search_results.print_verified(rows, search)
-    best = found.get_trials(deepcopy=False)[int(rows["trial"].iloc[0])]
-    settings = search_results.overrides_of(best, search)
-    search_results.write_best(settings, search, runner.command)
-    return settings
 
 
 def _say(text: str) -> None:

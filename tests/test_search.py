@@ -22,7 +22,6 @@ optuna = pytest.importorskip("optuna", reason="needs Optuna: pip install 'sejax[
 
 from optuna.trial import TrialState  # noqa: E402
 
-from sejax import search as command  # noqa: E402
 from sejax.cli import config as configuration  # noqa: E402
 from sejax.cli import search_config, search_results, study, trials  # noqa: E402
 from sejax.options import ConfigError  # noqa: E402
@@ -290,7 +289,7 @@ def test_what_was_found_is_written(tmp_path, capsys):
     assert "0 of 25 trials were pruned" in capsys.readouterr().out
 
 
-def test_the_best_of_the_verified_come_first_and_what_is_not_finite_last(tmp_path, capsys):
+def test_the_best_of_the_verified_come_first_and_what_is_not_finite_last(tmp_path):
     found, search = opened(tmp_path, *ONE, "trials=3", "verify=3")
     runner, _ = worked(found, search)
     first, second, third = (x.number for x in search_results.ranked(found))
@@ -300,13 +299,12 @@ def test_the_best_of_the_verified_come_first_and_what_is_not_finite_last(tmp_pat
         "generations": 1.0,
     }
     runner.order = trials.Learning(search).order
-    rows = search_results.verify(found, search, runner)
+    best = search_results.verified(found, search, runner)
+    assert best == search_results.overrides_of(found.trials[third], search)
+    rows = pd.read_csv(tmp_path / "verification.csv")
     assert rows["trial"].tolist() == [third, second, first]
-    assert pd.read_csv(tmp_path / "verification.csv")["rank"].tolist() == [3, 2, 1]
-    search_results.print_verified(rows, search)
-    assert command._verified(found, search, runner) == search_results.overrides_of(
-        found.trials[third], search
-    )
+    assert rows["rank"].tolist() == [3, 2, 1]
+    assert (tmp_path / "best.txt").read_text().endswith(f"{best[0]}\n")
 
 
 # --- real trials ---------------------------------------------------------------------------------

@@ -232,8 +232,6 @@ def read(overrides: Sequence[str]) -> Search:
     ]
     for name, given in configuration.read(choices).items():
         text = given if isinstance(given, str) else as_text(given)
-        override, value = f"{name}={text}", registry.parsed(text)
-        is_text = name in TEXTS and value is not None and not isinstance(value, str)
         require(
             name not in TAKEN,
             name,
@@ -241,13 +239,14 @@ def read(overrides: Sequence[str]) -> Search:
             f"Set {TAKEN.get(name)}.",
         )
         if name in own:
-            values[name] = text if is_text else value
+            is_text = name in TEXTS and text != "null"
+            values[name] = text if is_text else registry.parsed(text)
         elif name.partition(".")[0] == "machines":
-            machines[name.partition(".")[2] or "name"] = value
+            machines[name.partition(".")[2] or "name"] = registry.parsed(text)
         elif spaces.is_range(text):
             space[name] = spaces.parse(name, text)
         else:
-            fixed.append(override)
+            fixed.append(f"{name}={text}")
     config = registry.from_plain(SearchConfig, values, "")
     where = registry.configure("machines", machines)
     registry.require_package("machines", where, "trials are run there")
@@ -267,8 +266,8 @@ def read(overrides: Sequence[str]) -> Search:
     require(
         not foreign,
         "space",
-        "must name no module, because only what you type is imported; got "
-        f"{shortened(', '.join(foreign))}. Set agent='choice(...)' on the command line.",
+        f"must name no module that you have not typed; got {shortened(', '.join(foreign))}. Set "
+        "agent='choice(...)' on the command line.",
     )
     return dataclasses.replace(search, space={**offered, **space})
 

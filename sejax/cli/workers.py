@@ -3,7 +3,7 @@
 The driver, this process, keeps the strategy, its state and all files. In each generation it sends
 candidates to the workers in shares, and outcomes come back. An outcome depends on its key and its
 candidate alone, so that the numbers are those of a single process whichever worker computes it. A
-worker has no state: a share whose worker is lost is sent to another one.
+worker has no state: any other one can compute its share again.
 
 Shares shrink towards the end of a generation (guided self-scheduling, Polychronopoulos and Kuck,
 1987), so that no worker waits long for the last one.
@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from sejax.cli.cluster import Pool, connected, num_workers
+from sejax.cli.cluster import RESTARTS, RETRIES, Pool, connected, num_workers
 from sejax.options import Options, counts, fraction, option, require
 
 if TYPE_CHECKING:  # jax must not be imported before a worker has chosen its devices
@@ -90,7 +90,12 @@ def _remote_chunks(
             k: v for k, v in configuration.plain(config).items() if k not in ("tracker", "machines")
         }
         arguments = plain, [batch.capacity for batch in batches], machines.gpus_per_worker
-        actor = ray.remote(num_cpus=1, num_gpus=machines.gpus_per_worker)(Worker)
+        actor = ray.remote(
+            num_cpus=1,
+            num_gpus=machines.gpus_per_worker,
+            max_restarts=RESTARTS,
+            max_task_retries=RETRIES,
+        )(Worker)
         pool = Pool(
             ray, lambda: actor.remote(*arguments, versions()), lambda: num_workers(machines), say
         )
@@ -278,6 +283,9 @@ class Worker:
       capacities: most evaluations in a share, for each agent.
       gpu_share: the part of a GPU that this process has; 0 for a CPU core.
       expected: versions of the driver's packages.
+
+    Raises:
+      ConfigError: if this machine has other versions of what decides the numbers.
     """
 
     def __init__(
@@ -287,37 +295,30 @@ class Worker:
         gpu_share: float,
         expected: dict[str, str],
     ):
-        self._config, self._capacities = config, capacities
-        self._gpu_share, self._expected = gpu_share, expected
-        self._programs: list[Any] = []
-
-    def prepare(self) -> None:
-        """Compiles.
-
-        Raises:
-          ConfigError: if this machine has other versions of what decides the numbers.
-        """
         from sejax.cli import runtime
 
         runtime.configure_xla(1)
-        runtime.take_share_of_gpu(self._gpu_share)
+        runtime.take_share_of_gpu(gpu_share)
         require(
-            versions() == self._expected,
+            versions() == expected,
             "machines",
-            "must have the same versions everywhere, because numbers differ otherwise; got "
-            f"{versions()} on {socket.gethostname()} and {self._expected} here. Set the same "
-            "versions up there.",
+            f"must have the same versions everywhere; got {versions()} on {socket.gethostname()} "
+            f"and {expected} here. Set the same versions up there.",
         )
         runtime.configure_jax()
         from sejax.bilevel import make_bilevel
         from sejax.cli import config as configuration
 
-        config = configuration.learn_config(self._config)
-        learner = make_bilevel(**config.parts() | {"devices": 1})
+        of_run = configuration.learn_config(config)
+        learner = make_bilevel(**of_run.parts() | {"devices": 1})
+        self._capacities = capacities
         self._programs = [
-            _compiled_share(learner, agent, capacity, config.num_parallel)
-            for agent, capacity in enumerate(self._capacities)
+            _compiled_share(learner, agent, capacity, of_run.num_parallel)
+            for agent, capacity in enumerate(capacities)
         ]
+
+    def ready(self) -> None:
+        """Answers as soon as everything is compiled."""
 
     def evaluate(self, share: Share) -> tuple["Outcome", float]:
         """The outcomes of a share, leaves `[n, ...]`, and the CPU seconds that they took."""
