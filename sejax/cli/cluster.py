@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from sejax.cli.workers import RayConfig
 
 RESTARTS = 20  # by Ray, of a worker that dies
-RETRIES = 5  # by Ray, of a share whose worker dies
+RETRIES = -1  # by Ray, of a share; any number, as many fail at once until Ray knows a node is gone
 LOOK_S = 1.0  # between looks for machines that have come, and workers that hang
 FIRST_S = 3600.0  # a worker may take to start, compilation included, and for the first share
 LEAST_S = 20.0  # a share may always take
