@@ -22,6 +22,7 @@ from experiments.common.curves import CURVES, WINDOW
 from experiments.common.experiment import Experiment, Settings, count, each_of, setting
 from experiments.common.statistics import bootstrap_interval
 from sejax.options import registry
+from sejax.options.plain import to_plain
 from sejax.training import TrainingConfig
 
 QUICK_STEPS = 2000
@@ -80,8 +81,8 @@ class PresetStudy(Study):
         return self._preset().agent
 
     def changes(self) -> dict[str, Any]:
-        papers = registry.to_plain(super().configuration())
-        ours = registry.to_plain(self.configuration())
+        papers = to_plain(super().configuration())
+        ours = to_plain(self.configuration())
         return {name: value for name, value in ours.items() if value != papers[name]}
 
     def training(self, quick: bool, test_episodes: int) -> TrainingConfig:

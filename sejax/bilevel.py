@@ -140,7 +140,7 @@ class Bilevel(NamedTuple):
 
 
 def make_learner(
-    config: Any = None, *, generations: int = 50, **parts: Any
+    config: Any = None, *, generations: int = 100, **parts: Any
 ) -> Callable[[Array], LearnResult]:
     """Builds `learn(key) -> LearnResult`: all of Algorithm 1 as one pure function.
 
@@ -175,7 +175,7 @@ def make_learner(
         return make_learner(**config.parts(), generations=config.generations)
     if "task" not in parts or "agent" not in parts:
         raise TypeError("make_learner needs a configuration, or a task and an agent.")
-    counts("a run has at least one", most=1_000_000)("generations", generations, 50)
+    counts("a run has at least one", most=1_000_000)("generations", generations, 100)
     bilevel = make_bilevel(**parts)
 
     def learn(key: Array) -> LearnResult:

@@ -8,9 +8,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from sejax.cli import commands, runtime
+from sejax.cli import commands, compose, runtime
 from sejax.cli import config as configuration
-from sejax.cli.config import AgentFamily, EvaluateConfig, families_of, named
+from sejax.cli.compose import named
+from sejax.cli.config import AgentFamily, EvaluateConfig, families_of
 from sejax.options import ConfigError, registry, require, shortened
 from sejax.proxies import header, hub
 from sejax.training import TrainingConfig, require_reachable, training_of
@@ -32,9 +33,9 @@ def main(overrides: Sequence[str]) -> None:
       OSError: if a file cannot be written.
     """
     configs = []
-    for of_run in configuration.expand(overrides):
+    for of_run in compose.expand(overrides):
         config = configuration.evaluate_config(of_run)
-        own = configuration.name_in_sweep(overrides, of_run, ("out_dir",))
+        own = compose.name_in_sweep(overrides, of_run, ("out_dir",))
         if own:  # or all runs of a sweep would have one folder
             folder = f"{config.out_dir}/{own}" if config.out_dir else f"runs/evaluate-{own}"
             config = dataclasses.replace(config, out_dir=folder)
@@ -46,7 +47,7 @@ def main(overrides: Sequence[str]) -> None:
 
 def help_text(overrides: Sequence[str]) -> str:
     """What `--help` prints."""
-    return f"{ABOUT}\n{configuration.help_text(EvaluateConfig, overrides)}"
+    return f"{ABOUT}\n{compose.help_text(EvaluateConfig, overrides)}"
 
 
 def evaluate(config: EvaluateConfig) -> float:

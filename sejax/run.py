@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from sejax.cli import commands, runtime
+from sejax.cli import commands, compose, runtime
 from sejax.cli import config as configuration
 from sejax.cli.config import LearnConfig
 
@@ -34,11 +34,11 @@ def main(overrides: Sequence[str]) -> None:
       OSError: if a file cannot be written; everything saved before is whole.
     """
     configs = []
-    for of_run in configuration.expand(overrides):
+    for of_run in compose.expand(overrides):
         config = configuration.config(of_run)
         given = config.run_dir
         known = LearnConfig.in_run_dir if given is None else ("run_dir",)
-        own = configuration.name_in_sweep(overrides, of_run, known)
+        own = compose.name_in_sweep(overrides, of_run, known)
         if own:  # or all runs of a sweep would have one folder
             folder = f"{config.resolved_run_dir}_{own}" if given is None else f"{given}/{own}"
             config = dataclasses.replace(config, run_dir=folder)
@@ -48,7 +48,7 @@ def main(overrides: Sequence[str]) -> None:
 
 def help_text(overrides: Sequence[str]) -> str:
     """What `--help` prints."""
-    return f"{ABOUT}\n{configuration.help_text(LearnConfig, overrides)}"
+    return f"{ABOUT}\n{compose.help_text(LearnConfig, overrides)}"
 
 
 def learn(config: LearnConfig) -> list[float]:

@@ -31,7 +31,7 @@ from sejax.options import (
     require,
     shortened,
 )
-from sejax.options.registry import from_plain
+from sejax.options.plain import from_plain
 from sejax.proxies.base import episode_limit, is_real, prepare
 from sejax.proxies.header import agents_of, is_registered
 from sejax.proxies.io import Proxy, ProxySet, stored_config

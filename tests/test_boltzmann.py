@@ -95,7 +95,9 @@ def test_two_numbers_of_an_action_make_a_grid():
 def program_of(agent, **parts):
     return make_bilevel(**{
         "task": CARTPOLE, "agent": agent, "proxy": BANDIT, "devices": 1,
-        "es": sejax.NESConfig(population_size=16, noise_std=0.1, num_incumbent_evals=4),
+        "es": sejax.NESConfig(
+            population_size=16, noise_std=0.1, noise_std_decay=1.0, num_incumbent_evals=4
+        ),
         "training": sejax.TrainingConfig(max_steps=64, max_episodes=64, stop_rule="never"), **parts,
     })  # fmt: skip
 

@@ -42,7 +42,8 @@ def whole_generations(strategy):
 @functools.cache
 def nes(**fields):
     """Strategy with jitted `ask` and `tell`, by config fields; population 3 unless told."""
-    strategy = NESConfig(**{"population_size": 3, **fields}).make(DIMS)
+    paper = {"num_incumbent_evals": None, "noise_std": 0.05, "noise_std_decay": 1.0}
+    strategy = NESConfig(**{"population_size": 3, **paper, **fields}).make(DIMS)
     return strategy, *map(jax.jit, whole_generations(strategy))
 
 
@@ -89,9 +90,9 @@ def test_without_mirroring_there_is_no_minus_half():
 
 
 def test_a_generation_of_the_paper_trains_48_agents():
-    strategy = NESConfig().make(DIMS)
+    strategy = NESConfig(population_size=16, num_incumbent_evals=None).make(DIMS)
     assert (strategy.num_evaluations, strategy.evaluations.num_incumbent_evals) == (48, 16)
-    fewer = NESConfig(num_incumbent_evals=5).make(DIMS)
+    fewer = NESConfig(population_size=16, num_incumbent_evals=5).make(DIMS)
     assert (fewer.num_evaluations, fewer.evaluations.num_incumbent_evals) == (37, 5)
 
 
@@ -161,6 +162,7 @@ def numpy_generation(mean, candidates, scores, config, noise_std, step_size):
 def test_generations_equal_a_numpy_loop(update_rule, aggregate_by):
     config = NESConfig(
         population_size=4, num_evals=3, eval_aggregate=aggregate_by, update_rule=update_rule,
+        num_incumbent_evals=None,
         noise_std=0.2, noise_std_decay=0.9, step_size=0.5, step_size_decay=0.8, weight_decay=0.1,
     )  # fmt: skip
     strategy = config.make(DIMS)
@@ -247,8 +249,9 @@ def test_the_mean_step_on_a_linear_score_points_along_its_gradient(score_transfo
     gradient = np.array([3.0, -1.0, 0.5, 0.0, 2.0, -0.2])
     direction = gradient / np.linalg.norm(gradient)
     config = NESConfig(
-        population_size=8, noise_std=0.1, score_transform=score_transform, mirrored=mirrored
-    )
+        population_size=8, noise_std=0.1, score_transform=score_transform, mirrored=mirrored,
+        num_incumbent_evals=None,
+    )  # fmt: skip
     strategy = config.make(DIMS)
     ask, tell = whole_generations(strategy)
     start = strategy.init(jax.random.key(0), jnp.array(MEAN))
@@ -404,7 +407,8 @@ def test_every_algorithm_maximises_scores_though_some_trainings_diverge(name):
     ids=str,
 )
 def test_the_papers_nes_maximises_scores_though_some_trainings_diverge(fields):
-    scores = climb(NESConfig(population_size=16, **fields).make(DIMS), 40)
+    paper = {"population_size": 16, "num_incumbent_evals": None, "noise_std_decay": 1.0}
+    scores = climb(NESConfig(**paper, **fields).make(DIMS), 40)
     assert scores[0] < -1.1 and scores[-1] > -0.1
 
 

@@ -9,7 +9,7 @@ import yaml
 
 import sejax
 from sejax import report
-from sejax.cli import commands, next_steps
+from sejax.cli import commands
 from sejax.cli import config as configuration
 from sejax.cli import report as pages
 from sejax.cli.run_directory import columns_of
@@ -91,14 +91,8 @@ def test_the_page_of_a_run_says_what_its_files_say(whole):
                  "0.2", "agent.learning_rate", "the real task", "191.0 ± 1.0"):  # fmt: skip
         assert any(text in x for x in page.texts), text
     assert f"python -m sejax.evaluate proxy={run} num_agents=20" in page.texts
-    again = f"python -m sejax.run env=cartpole proxy=se generations=6 seed=3 run_dir={run}"
+    again = f"python -m sejax.run preset={run}/config.yaml run_dir={run} generations=6"
     assert again in page.texts
-
-
-@pytest.fixture
-def no_words(monkeypatch):
-    """Leaves the command that goes on out of a page: to compose its words takes a second."""
-    monkeypatch.setattr(next_steps, "run_words", lambda stored: None)
 
 
 def test_the_page_needs_nothing_else_and_says_what_figures_show(whole):
@@ -123,7 +117,7 @@ def test_what_differs_between_runs_comes_first(tmp_path):
     assert not any(differs for _, _, differs in rows[1:])
 
 
-def test_what_comes_from_files_is_text(tmp_path, monkeypatch, no_words):
+def test_what_comes_from_files_is_text(tmp_path, monkeypatch):
     run = write_run(tmp_path / f"_{HOSTILE.replace('/', '')}", preset=HOSTILE)
     evaluate(run, worlds=(HOSTILE, f"_{HOSTILE}"))
     summary = json.loads((run / "run.json").read_text())
@@ -156,13 +150,6 @@ def test_many_generations_are_thinned_to_the_last(tmp_path):
     assert read.thinned[-1]["generation"] == "999"
 
 
-def test_the_words_of_a_run_compose_its_configuration():
-    words = ["agents=[ddqn,ppo]", "agents.ppo.weight=2", "es=snes", "run_dir='a b,c=é'"]
-    config = sejax.config(words)
-    found = next_steps.run_words(configuration.plain(config))
-    assert found is not None and sejax.config(found) == config
-
-
 def test_nothing_that_a_file_names_is_imported(tmp_path, monkeypatch):
     (tmp_path / "mine_for_reports.py").write_text("raise SystemExit('imported')")
     monkeypatch.syspath_prepend(str(tmp_path))
@@ -171,7 +158,7 @@ def test_nothing_that_a_file_names_is_imported(tmp_path, monkeypatch):
     assert "env=mine_for_reports:make" in command
 
 
-def test_folders_that_are_no_runs_are_refused(tmp_path, capsys, no_words):
+def test_folders_that_are_no_runs_are_refused(tmp_path, capsys):
     broken = write_run(tmp_path / "broken")
     (broken / "run.json").write_text("[")
     half = write_run(tmp_path / "half", agent="ddqn")

@@ -14,7 +14,8 @@ from optuna.distributions import (
 import sejax
 from sejax.cli import config as configuration
 from sejax.cli import search_config, spaces
-from sejax.options import ConfigError, registry
+from sejax.options import ConfigError
+from sejax.options.plain import to_plain
 
 
 @pytest.mark.parametrize(
@@ -195,7 +196,7 @@ def test_a_worker_on_another_machine_has_the_same_search(tmp_path, monkeypatch):
 
 def test_help_says_what_each_field_is():
     said = search_config.help_text()
-    assert all(f"  {name}=" in said for name in registry.to_plain(search_config.SearchConfig()))
+    assert all(f"  {name}=" in said for name in to_plain(search_config.SearchConfig()))
 
 
 def test_without_optuna_the_extra_is_named(monkeypatch):

@@ -24,7 +24,7 @@ import yaml
 
 import sejax
 from sejax.cli import config as configuration
-from sejax.options.registry import flatten
+from sejax.options.plain import flatten
 from sejax.proxies import header, zoo
 
 FREE_FIELDS = ("run_dir", "devices", "checkpoint_every")  # how to compute, not what

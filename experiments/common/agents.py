@@ -21,6 +21,7 @@ from sejax.agents import NoExploration
 from sejax.cli.progress import Tally
 from sejax.ops.parallel import spread_over_devices
 from sejax.options import registry
+from sejax.options.plain import to_plain
 from sejax.training import TrainingConfig
 
 HPARAMS = ("varied", "default")
@@ -70,7 +71,7 @@ class Condition:
             "task": self.task.origin,
             "agent": registry.describe("agent", self.agent),
             "exploration": registry.describe("exploration", self.exploration),
-            "training": registry.to_plain(self.training),
+            "training": to_plain(self.training),
             "hparams": self.hparams,
             **self.settings,
         }

@@ -22,6 +22,7 @@ from sejax import options
 from sejax.cli import commands, runtime
 from sejax.ops.files import write_text
 from sejax.options import ConfigError, Options, Rule, as_text, counts, nearest, registry, shortened
+from sejax.options.plain import from_plain, parsed, to_plain
 
 RUN_PREFIX = "run."  # of an override for the NES runs: run.es.population_size=8
 NOT_SHOWN = {"work", "devices", "from_rows", "run"}  # fields that no result depends on, and `run`
@@ -91,7 +92,7 @@ class Settings(Options):
         for name, kind in get_type_hints(cls).items():
             if get_origin(kind) is tuple and isinstance(given.get(name), str):
                 given[name] = [given[name]]
-        return registry.from_plain(cls, cls.defaults(given) | given, "")
+        return from_plain(cls, cls.defaults(given) | given, "")
 
     @classmethod
     def defaults(cls, given: Mapping[str, Any]) -> dict[str, Any]:
@@ -173,7 +174,7 @@ def parse(settings: type[Settings], words: Iterable[str]) -> dict[str, Any]:
         if name.startswith(RUN_PREFIX) and "run" in fields:
             runs.append(word.removeprefix(RUN_PREFIX))
         elif equals and name in fields:
-            given[name] = registry.parsed(text)
+            given[name] = parsed(text)
         else:
             ranked = nearest(name.lstrip("-").replace("-", "_"), fields)
             raise ConfigError(
@@ -200,7 +201,7 @@ class Experiment:
         Raises:
           ConfigError: for settings or files that cannot work, or a folder of other settings.
         """
-        fields = registry.to_plain(settings).items()
+        fields = to_plain(settings).items()
         with registry.only_typed(f"{name}={value}" for name, value in fields):
             return self._run(settings)
 

@@ -31,6 +31,7 @@ from sejax import ICMConfig, options
 from sejax.cli import config as configuration
 from sejax.cli import run_directory
 from sejax.options import ConfigError, one_of, registry
+from sejax.options.plain import flatten
 
 # Paper, table "Overview of Reward Network variants".
 VARIANTS = (
@@ -304,7 +305,7 @@ def stored(settings: RnSettings, variant: str, objective: str) -> Any:
 def _what_counts(config: Any) -> dict[str, Any]:
     """The fields that a run's numbers depend on."""
     free = run_directory.FREE_FIELDS - {"generations"} | {"num_parallel", "num_seeds"}
-    flat = registry.flatten(configuration.plain(config))
+    flat = flatten(configuration.plain(config))
     return {name: value for name, value in flat.items() if name.partition(".")[0] not in free}
 
 

@@ -22,7 +22,8 @@ from experiments.common.experiment import Settings, count, each_of, setting
 from experiments.common.tables import iqm_columns, mean_columns
 from sejax.cli import config as configuration
 from sejax.cli import run_directory, session
-from sejax.cli.config import JOINT, key_of
+from sejax.cli.compose import key_of
+from sejax.cli.config import JOINT
 from sejax.cli.progress import Tally
 from sejax.ops.files import write_text
 from sejax.options import ConfigError, positive, registry, require, shortened

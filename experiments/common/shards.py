@@ -18,7 +18,7 @@ import pandas as pd
 
 from sejax.ops.files import atomic_path, write_text
 from sejax.options import ConfigError
-from sejax.options.registry import differences
+from sejax.options.plain import differences
 
 # Training steps grow along each curve: kept as differences, a table takes two thirds of the room.
 _GROWING, _DIFFERENCES = "steps", "steps_since_the_row_before"

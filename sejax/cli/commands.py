@@ -46,11 +46,8 @@ def _prepared(words: Sequence[str]) -> list[str]:
             stream.reconfigure(errors="backslashreplace")  # terminals without Unicode
     options = [word for word in words if word.startswith("-") and word not in ("--help", "-h")]
     if options:
-        raise ConfigError(
-            f"An override must read FIELD=VALUE; got {shortened(options[0])}. The only option "
-            f"is --help.",
-            "an override",
-        )
+        message = f"must read FIELD=VALUE; got {shortened(options[0])}. The only option is --help."
+        raise ConfigError(f"An override {message}", "an override")
     if sys.path[0] != "":  # `python -m` has put the current folder there, if it still exists
         sys.path.insert(0, "")
     Path.cwd()
@@ -77,22 +74,16 @@ def messages() -> Iterator[None]:
         fail(str(error), BAD_INPUT)
     except BrokenPipeError:  # the reader has seen enough
         leave(0)
-    except OSError as error:
-        fail(
-            f"A file could not be written or read: {error}. All that was written before is "
-            f"whole; run the same command again to go on from there.",
-            FAILED,
-        )
     except FailedError as error:
         fail(str(error), FAILED)
+    except OSError as error:
+        message = f"A file could not be written or read: {error}. What was written before is whole"
+        fail(f"{message}; run the same command again to go on from there.", FAILED)
     except RuntimeError as error:
         if "RESOURCE_EXHAUSTED" not in str(error) and "Out of memory" not in str(error):
             raise
-        fail(
-            f"There is not enough memory: {str(error).splitlines()[0]} Smaller networks, "
-            f"buffers or populations need less.",
-            FAILED,
-        )
+        message = f"There is not enough memory: {str(error).splitlines()[0]}"
+        fail(f"{message} Smaller networks, buffers or populations need less.", FAILED)
 
 
 def fail(message: str, status: int) -> NoReturn:

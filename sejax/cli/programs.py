@@ -21,7 +21,7 @@ from sejax.cli import config as configuration
 from sejax.cli.config import LearnConfig, families_of
 from sejax.cli.session import Chunks
 from sejax.options import marks, traced_options
-from sejax.options.registry import to_plain
+from sejax.options.plain import to_plain
 
 # Fields of a run that shape no program; a chunk's length and seeds are counted by themselves.
 _FREE = (

@@ -18,7 +18,7 @@ import yaml
 from sejax.cli import next_steps
 from sejax.cli.run_directory import COLUMNS
 from sejax.options import ConfigError, told
-from sejax.options.registry import flatten
+from sejax.options.plain import flatten
 
 MOST_ROWS = 60  # generations in a table
 COSTS = {

@@ -23,7 +23,7 @@ import yaml
 from sejax.ops import checksummed
 from sejax.ops.files import remove_leftovers, write_bytes, write_text
 from sejax.options import ConfigError
-from sejax.options.registry import differences
+from sejax.options.plain import differences
 
 COLUMNS = (
     "generation",

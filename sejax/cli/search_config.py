@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
+from sejax.cli import compose, spaces
 from sejax.cli import config as configuration
-from sejax.cli import spaces
 from sejax.cli.config import EvaluateConfig, LearnConfig
 from sejax.ops.files import as_file_name
 from sejax.options import (
@@ -26,6 +26,7 @@ from sejax.options import (
     require,
     shortened,
 )
+from sejax.options.plain import flatten, from_plain, parsed, split, to_plain
 
 if TYPE_CHECKING:  # which nobody needs who searches on one machine
     from sejax.cli.workers import LocalConfig, RayConfig
@@ -173,7 +174,7 @@ class Search:
 
     def stored(self) -> dict[str, object]:
         """What all workers of a study have in common, by field."""
-        own = registry.to_plain(self.config).items()
+        own = to_plain(self.config).items()
         return {
             **{name: value for name, value in own if name not in OWN | NAMES},
             **dict(override.split("=", 1) for override in self.fixed),
@@ -199,7 +200,7 @@ class Search:
 
     def overrides(self) -> list[str]:
         """The overrides of a worker that runs in any folder of any machine."""
-        own = registry.to_plain(self.config) | {
+        own = to_plain(self.config) | {
             "study": self.study,
             "search_dir": str(self.folder.resolve()),
             "storage": self.config.storage or f"{SQLITE}{self.folder.resolve() / 'study.db'}",
@@ -227,10 +228,10 @@ def read(overrides: Sequence[str]) -> Search:
     values, fixed, space = {}, [], {}
     machines = {"name": "local"}
     choices = [  # a comma makes a sweep elsewhere
-        f"{name}=choice({text})" if len(registry.split(text)) > 1 else f"{name}{equals}{text}"
+        f"{name}=choice({text})" if len(split(text)) > 1 else f"{name}{equals}{text}"
         for name, equals, text in (override.partition("=") for override in overrides)
     ]
-    for name, given in configuration.read(choices).items():
+    for name, given in compose.read(choices).items():
         text = given if isinstance(given, str) else as_text(given)
         require(
             name not in TAKEN,
@@ -240,16 +241,16 @@ def read(overrides: Sequence[str]) -> Search:
         )
         if name in own:
             is_text = name in TEXTS and text != "null"
-            values[name] = text if is_text else registry.parsed(text)
+            values[name] = text if is_text else parsed(text)
         elif name.partition(".")[0] == "machines":
-            machines[name.partition(".")[2] or "name"] = registry.parsed(text)
+            machines[name.partition(".")[2] or "name"] = parsed(text)
         elif spaces.is_range(text):
             space[name] = spaces.parse(name, text)
         else:
             fixed.append(f"{name}={text}")
-    config = registry.from_plain(SearchConfig, values, "")
+    config = from_plain(SearchConfig, values, "")
     where = registry.configure("machines", machines)
-    registry.require_package("machines", where, "trials are run there")
+    registry.require_package("machines", where)
     search = Search(config=config, fixed=tuple(fixed), space=space, machines=where)
     require(
         search.choice("proxy", "se") != "real",
@@ -291,7 +292,7 @@ def require_fields(search: Search, config: LearnConfig | EvaluateConfig) -> dict
         "must be given, or ranges of fields; got none. Set space=paper_se, or "
         f"es.noise_std='{spaces.EXAMPLE}'.",
     )
-    values = registry.flatten(configuration.plain(config))
+    values = flatten(configuration.plain(config))
     values |= {group: values.get(f"{group}.name") for group in config.groups}
     for name in search.space:
         if name not in values:
@@ -308,7 +309,7 @@ def help_text() -> str:
     texts = help_texts(SearchConfig)
     fields = "\n".join(
         textwrap.fill(f"  {name}={as_text(value)}  # {texts[name]}", 98, subsequent_indent=" " * 6)
-        for name, value in registry.to_plain(SearchConfig()).items()
+        for name, value in to_plain(SearchConfig()).items()
     )
     return f"""Search hyperparameters with Optuna; a trial is a run, its generations the budget.
 With proxy=RUN_DIR, a file or a shipped name: those of an agent that is trained on that proxy.

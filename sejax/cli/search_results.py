@@ -13,7 +13,7 @@ from optuna.trial import FrozenTrial, TrialState
 from rich.console import Console
 from rich.table import Table
 
-from sejax.cli.config import file_text
+from sejax.cli.preset_files import file_text
 from sejax.cli.search_config import Search
 from sejax.cli.study import ENDED
 from sejax.cli.trials import Runner

@@ -23,9 +23,10 @@ import yaml
 from optuna.distributions import CategoricalDistribution, FloatDistribution, IntDistribution
 from optuna.trial import Trial
 
+from sejax.cli import compose
 from sejax.cli import config as configuration
 from sejax.options import ConfigError, is_number, nearest, require, shortened, told
-from sejax.options.registry import split
+from sejax.options.plain import split
 
 FOLDER = Path(__file__).parent / "spaces"
 DIGITS = 6  # of a number: the override says exactly what was tried
@@ -203,7 +204,7 @@ def preset(name: str, agent: str, of_agent: bool) -> dict[str, Dimension]:
         )
         own = of_agents.get(each, {})
         if configuration.JOINT in agent:  # what a mixture shares has no place in an agent's ranges
-            prefix = f"agents.{configuration.key_of(each)}."
+            prefix = f"agents.{compose.key_of(each)}."
             own = {
                 field.replace("agent.", prefix, 1): text
                 for field, text in own.items()

@@ -30,7 +30,8 @@ from sejax.evaluation import make_evaluator, num_parallel_on_cpu
 from sejax.objectives import Outcome
 from sejax.ops.files import write_text
 from sejax.ops.parallel import compiler_options, spread_over_devices
-from sejax.options import registry, require, shortened
+from sejax.options import require, shortened
+from sejax.options.plain import flatten, to_plain
 from sejax.proxies import header
 
 if TYPE_CHECKING:  # which stands above this module
@@ -267,7 +268,7 @@ class Tuning:
 
     def _settings_of(self, config: EvaluateConfig) -> str:
         """What a trial's rounds are of."""
-        fields = registry.flatten(configuration.plain(dataclasses.replace(config, out_dir=None)))
+        fields = flatten(configuration.plain(dataclasses.replace(config, out_dir=None)))
         return json.dumps({**fields, "seeds": self._search.config.seeds})
 
     def _outcome(
@@ -299,7 +300,7 @@ class Tuning:
                 world,
                 static_of(family.agent),
                 static_of(study.exploration),
-                registry.to_plain(training),
+                to_plain(training),
                 structure_of(agent.hparams),
                 num_agents,
             ]

@@ -11,6 +11,7 @@ from gymnasium.wrappers import TimeLimit
 
 from sejax.gym.gridworld import MAPS, GridWorld
 from sejax.options import ConfigError, registry, require, shortened, told
+from sejax.options.plain import to_plain
 from sejax.proxies.header import Header
 
 # The tasks that Gymnasium has too, with the same spaces, dynamics and initial states.
@@ -149,7 +150,7 @@ def same_env(config: Mapping[str, Any], **options: Any) -> gymnasium.Env[Any, An
     # Gymnasium takes more options, such as the path of a model: what a file says is read by the
     # fields that the task has here.
     task = registry.configure("env", config)
-    fields = registry.to_plain(task)
+    fields = to_plain(task)
     if fields.pop("backend", "mujoco") not in GYMNASIUM_BACKENDS:
         return None
     max_steps = task.spec.max_steps

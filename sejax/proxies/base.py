@@ -137,8 +137,8 @@ class AbsentEnv(Environment):
     """
 
     def __init__(self, task_name: str, spec: TaskSpec, reason: str):
+        super().__init__(spec)
         self._task_name, self._reason = task_name, reason
-        self.spaces = spec.observation, spec.action
 
     def fail(self) -> NoReturn:
         """Raises the reason as a `ConfigError`."""

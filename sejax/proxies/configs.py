@@ -194,7 +194,7 @@ class RewardConfig(ProxyConfig):
     default_objective: ClassVar[str] = "reward_threshold"
     has_real_dynamics: ClassVar[bool] = True
 
-    hidden_size: int = option(128, counts("a layer needs a unit"))
+    hidden_size: int = option(64, counts("a layer needs a unit"))
     num_layers: int = option(1, counts("there is a hidden layer", most=MOST_LAYERS))
     activation: str = option("prelu", one_of(ACTIVATIONS))
     variant: str = option("additive_potential", one_of(VARIANTS))

@@ -16,6 +16,7 @@ import numpy as np
 
 from sejax.ops.checksummed import DamagedError, pack, unpack
 from sejax.options import LARGEST, ConfigError, registry, require, shortened, unknown_name
+from sejax.options.plain import from_plain
 from sejax.proxies import hub
 
 FORMAT_VERSION = 2
@@ -201,7 +202,7 @@ def read(
         if size > hub.MAX_BYTES:
             raise DamagedError(f"it has {size:,} bytes, and the largest proxies have fewer")
         tensors, stored = unpack(path.read_bytes(), _KEY)
-        header = registry.from_plain(Header, stored, "header")
+        header = from_plain(Header, stored, "header")
     except (OSError, LookupError, ValueError, TypeError, ArithmeticError) as error:
         raise ConfigError(
             f"{option} must be a proxy's file as sejax writes it; got {shortened(path, 80)}, which "

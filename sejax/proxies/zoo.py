@@ -13,6 +13,7 @@ from typing import Any
 import yaml
 
 from sejax.options import registry
+from sejax.options.plain import from_plain
 from sejax.proxies import header, hub
 from sejax.proxies.configs import SyntheticConfig
 
@@ -177,10 +178,9 @@ def describe(path: Path, name: str | None = None) -> PretrainedProxy:
         generation=record.get("generation"),
         seed=record.get("seed"),
         evaluations=tuple(
-            registry.from_plain(Evaluation, each, "evaluation")
-            for each in record.get("evaluations", ())
+            from_plain(Evaluation, each, "evaluation") for each in record.get("evaluations", ())
         ),
-        learning=registry.from_plain(Learning, learning, "learning") if learning else None,
+        learning=from_plain(Learning, learning, "learning") if learning else None,
         size_kb=path.stat().st_size / 1000,
     )
 
