@@ -25,6 +25,7 @@ def main(overrides: Sequence[str]) -> None:
     if find_spec("optuna") is None:
         raise ConfigError("sejax.search needs Optuna. Install it with pip install 'sejax[search]'.")
     from sejax.cli import search_config, search_results, search_workers, study
+    from sejax.cli.workers import RayConfig
 
     search = search_config.read(overrides)
     runner = runner_of(search)
@@ -33,8 +34,8 @@ def main(overrides: Sequence[str]) -> None:
     runtime.configure_jax()
     _say(f"Study {search.study} in {search.folder}: {', '.join(search.space)}.")
     try:
-        if search.machines.is_elsewhere:
-            search_workers.work(found, search, join, _say)
+        if isinstance(search.machines, RayConfig):
+            search_workers.work(found, search, search.machines, join, _say)
         else:
             study.work(found, search, runner, _say)
         search_results.write(found, search, runner.command)

@@ -121,8 +121,9 @@ def test_the_first_share_may_take_long():
 
 @pytest.mark.parametrize("turn", [0, 1])
 def test_a_worker_that_fails_ends_the_run(turn):
-    ray = Ray(fate=lambda worker, now: (1.0, OSError("no space") if now == turn else None))
-    with pytest.raises(FailedError, match="no space"):
+    told = OSError("ray::Worker.evaluate()\n  File worker.py\nOSError: no space\n")
+    ray = Ray(fate=lambda worker, now: (1.0, told if now == turn else None))
+    with pytest.raises(FailedError, match="failed: OSError: no space"):
         evaluated(ray.pool(), 2)
 
 

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
-from sejax.options import ConfigError, FailedError, told
+from sejax.options import ConfigError, FailedError, shortened, told
 
 if TYPE_CHECKING:
     from sejax.cli.workers import RayConfig
@@ -84,6 +84,11 @@ def num_workers(machines: "RayConfig") -> int:
     if machines.gpus_per_worker:
         room = min(room, resources.get("GPU", 0.0) / machines.gpus_per_worker)
     return int(room)
+
+
+def reason(error: Exception) -> str:
+    """The last line of an error, where Ray's errors have what the worker raised."""
+    return shortened(str(error).strip().splitlines()[-1].strip(), 160)
 
 
 @dataclass(frozen=True)
@@ -194,8 +199,8 @@ class Pool:
             return [(self._busy.pop(reference), self._ray.get(reference)) for reference in done]
         except Exception as error:  # that the worker raised, or of Ray, if it died too often
             raise FailedError(
-                f"A worker has failed: {told(error).splitlines()[-1].strip()}. The generations "
-                f"before are saved; the same command with machines=local goes on here."
+                f"A worker has failed: {reason(error)}. The generations before are saved; the same "
+                f"command with machines=local goes on here."
             ) from error
 
     def _end_late(self) -> list[int]:

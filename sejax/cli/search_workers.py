@@ -12,7 +12,8 @@ import optuna
 from sejax.cli import cluster, runtime
 from sejax.cli.search_config import Search
 from sejax.cli.study import ENDED, sentence
-from sejax.options import FailedError, registry, told
+from sejax.cli.workers import RayConfig
+from sejax.options import FailedError, registry
 
 RETRIES = 5  # of a worker that is lost
 LAST_S = 60.0  # for workers to notice that the study is over
@@ -21,6 +22,7 @@ LAST_S = 60.0  # for workers to notice that the study is over
 def work(
     study: optuna.Study,
     search: Search,
+    machines: RayConfig,
     join: Callable[[Sequence[str]], None],
     say: Callable[[str], None],
 ) -> None:
@@ -29,7 +31,8 @@ def work(
     Args:
       study: the study.
       search: what is searched.
-      join: what a worker does, given the overrides that join the study.
+      machines: the cluster.
+      join: what a worker does, given its overrides.
       say: tells the user.
 
     Raises:
@@ -37,7 +40,7 @@ def work(
       FailedError: if it is lost, or workers are lost again and again.
     """
     runtime.take_share_of_gpu(0)  # GPUs are the workers'
-    machines, gpus = search.machines, search.machines.gpus_per_worker
+    gpus = machines.gpus_per_worker
     with cluster.connected(machines) as ray:
         start = ray.remote(num_cpus=1, num_gpus=gpus, max_retries=RETRIES)(_work)
         count = max(1, cluster.num_workers(machines))
@@ -55,7 +58,7 @@ def work(
             ray.get(done)
         except ray.exceptions.RayError as error:
             raise FailedError(
-                f"A worker has failed: {told(error).splitlines()[-1]}. What has ended is saved; "
+                f"A worker has failed: {cluster.reason(error)}. What has ended is saved; "
                 f"the same command goes on, with machines=local on this machine alone."
             ) from error
         ray.wait(running, num_returns=count, timeout=LAST_S)  # one that hangs is left behind
