@@ -25,9 +25,10 @@ from optuna.trial import Trial
 
 from sejax.cli import compose
 from sejax.cli import config as configuration
-from sejax.options import ConfigError, is_number, nearest, require, shortened, told
+from sejax.options import ConfigError, nearest, require, shortened, told
 from sejax.options.plain import split
 
+Distribution = CategoricalDistribution | FloatDistribution | IntDistribution
 FOLDER = Path(__file__).parent / "spaces"
 DIGITS = 6  # of a number: the override says exactly what was tried
 EXAMPLE = "tag(log, interval(0.01, 0.3))"
@@ -47,7 +48,7 @@ class Dimension:
 
     name: str
     text: str
-    distribution: CategoricalDistribution | FloatDistribution | IntDistribution
+    distribution: Distribution
     is_inverse: bool = False
 
     @property
@@ -80,18 +81,20 @@ class Dimension:
                 trial.suggest_float(self.parameter, low, high, log=log)
         return self.override(trial.params)
 
-    def parameter_of(self, value: Any) -> Any:
+    def parameter_of(self, value: object) -> object:
         """The stored parameter that stands for a field's value; None if it is not drawn from."""
         drawn = self.distribution
         if isinstance(drawn, CategoricalDistribution):
             return next((x for x in drawn.choices if yaml.safe_load(str(x)) == value), None)
-        value = round(1 - value, 12) if self.is_inverse and is_number(value) else value
-        if not is_number(value) or not drawn.low <= value <= drawn.high:
+        if isinstance(value, bool) or not isinstance(value, int | float):
             return None
-        if isinstance(drawn, IntDistribution):
-            is_step = isinstance(value, int) and (value - drawn.low) % drawn.step == 0
-            return value if is_step else None
-        return float(value)
+        number = round(1 - value, 12) if self.is_inverse else value
+        if not drawn.low <= number <= drawn.high:
+            return None
+        if isinstance(drawn, FloatDistribution):
+            return float(number)
+        is_step = isinstance(number, int) and (number - drawn.low) % drawn.step == 0
+        return number if is_step else None
 
 
 def is_range(text: str) -> bool:
@@ -127,7 +130,7 @@ def parse(name: str, text: str) -> Dimension:
     return Dimension(name=name, text=text, distribution=distribution, is_inverse="inverse" in tags)
 
 
-def _distribution(text: str, tags: set[str]) -> Any:
+def _distribution(text: str, tags: set[str]) -> Distribution:
     """Optuna's distribution of a range without tags.
 
     Raises:

@@ -23,9 +23,12 @@ from sejax.cli.cluster import RESTARTS, RETRIES, Pool, connected, num_workers
 from sejax.options import Options, counts, fraction, option, require
 
 if TYPE_CHECKING:  # jax must not be imported before a worker has chosen its devices
-    from sejax.bilevel import Bilevel, Candidates
+    from jax import Array
+
+    from sejax.bilevel import Bilevel, Candidates, LearnState
+    from sejax.cli.config import LearnConfig
     from sejax.cli.session import Chunks
-    from sejax.objectives import Outcome
+    from sejax.objectives import GenerationInfo, Outcome
 
 CAPACITY = 16  # most evaluations in a share on a CPU core, where batches follow one another
 
@@ -38,7 +41,7 @@ class LocalConfig(Options):
     is_elsewhere: ClassVar[bool] = False
 
     def make(
-        self, config: Any, folder: Path, say: Callable[[str], None]
+        self, config: "LearnConfig", folder: Path, say: Callable[[str], None]
     ) -> contextlib.AbstractContextManager["Chunks"]:
         """The compiled generations of a run."""
         from sejax.cli import session  # which imports jax
@@ -62,7 +65,7 @@ class RayConfig(Options):
     gpus_per_worker: float = option(0.0, fraction())
 
     def make(
-        self, config: Any, folder: Path, say: Callable[[str], None]
+        self, config: "LearnConfig", folder: Path, say: Callable[[str], None]
     ) -> contextlib.AbstractContextManager["RemoteChunks"]:
         """The generations of a run, computed by workers while the context is open.
 
@@ -74,7 +77,7 @@ class RayConfig(Options):
 
 @contextlib.contextmanager
 def _remote_chunks(
-    machines: RayConfig, config: Any, say: Callable[[str], None]
+    machines: RayConfig, config: "LearnConfig", say: Callable[[str], None]
 ) -> Iterator["RemoteChunks"]:
     from sejax.cli import config as configuration
     from sejax.cli import runtime
@@ -116,7 +119,9 @@ class Batch:
     width: int
 
 
-def batches_of(config: Any, learner: "Bilevel", machines: RayConfig, num_first: int) -> list[Batch]:
+def batches_of(
+    config: "LearnConfig", learner: "Bilevel", machines: RayConfig, num_first: int
+) -> list[Batch]:
     """The batches of each agent.
 
     On a CPU they are the same for any number of workers, because sums over batches of other widths
@@ -185,11 +190,12 @@ class RemoteChunks:
         self._places = _places(learner)
         self._compiled: Any = None
 
-    def init(self, key: Any) -> Any:
+    def init(self, key: "Array") -> "LearnState":
         """The state before the first generation."""
         import jax
 
-        return jax.jit(self.learner.init)(key)
+        state: LearnState = jax.jit(self.learner.init)(key)
+        return state
 
     def is_ready(self, length: int) -> bool:
         """Whether this process's part is compiled, which it is for chunks of any length."""
@@ -206,11 +212,11 @@ class RemoteChunks:
 
         from sejax.ops.parallel import compiler_options
 
-        def generation(state: Any, outcome: "Outcome") -> tuple[Any, ...]:
+        def generation(state: "LearnState", outcome: "Outcome") -> tuple[Any, ...]:
             asked = self.learner.ask(state)
             return self.learner.tell(state, asked, outcome), _arguments(asked)
 
-        def evaluate(key: Any) -> "Outcome":
+        def evaluate(key: "Array") -> "Outcome":
             return self.learner.evaluate(self.learner.ask(self.learner.init(key)))
 
         key = jax.random.key(0)
@@ -220,7 +226,7 @@ class RemoteChunks:
         state = jax.eval_shape(self.learner.init, key)
         self._compiled = jitted.lower(state, self._no_outcome).compile()
 
-    def advance(self, state: Any, length: int) -> tuple[Any, Any]:
+    def advance(self, state: "LearnState", length: int) -> tuple["LearnState", "GenerationInfo"]:
         """Runs `length` generations.
 
         Returns:
@@ -349,10 +355,10 @@ def _compiled_share(learner: "Bilevel", agent: int, capacity: int, num_parallel:
         num_parallel_on_cpu(own, training),
     )
 
-    def evaluate(key_data: Any, *arguments: Any) -> "Outcome":
+    def evaluate(key_data: "Array", *arguments: "Array | None") -> "Outcome":
         return spread(jax.random.wrap_key_data(key_data), *arguments)
 
-    def arguments(key: Any) -> tuple[Any, ...]:
+    def arguments(key: "Array") -> tuple[Any, ...]:
         asked = learner.ask(learner.init(key))
         return _at(_arguments(asked), np.zeros(capacity, int))
 
