@@ -182,15 +182,20 @@ def numbers(tree):
     return [np.asarray(jax.random.key_data(x) if is_key(x) else x) for x in jax.tree.leaves(tree)]
 
 
+def remote_chunks(config, ray):
+    """The generations of a run on workers of a planned cluster."""
+    learner = make_bilevel(**config.parts() | {"devices": 1})
+    size = learner.mixture.size
+    arguments = configuration.plain(config), [5] * size, 0.0, workers.versions()
+    pool = ray.pool(lambda: workers.Worker(*arguments))
+    return RemoteChunks(learner, pool, [Batch(capacity=5, width=1)] * size)
+
+
 def require_equal_numbers(words, generations):
     """Runs generations in one program and by workers, the first of which soon hangs."""
-    config = sejax.config(words)
-    program = make_bilevel(**config.parts() | {"devices": 1})
-    batches = [Batch(capacity=5, width=1)] * program.mixture.size
-    arguments = configuration.plain(config), [5] * program.mixture.size, 0.0, workers.versions()
     ray = Ray(fate=lambda *turn: (FOREVER if turn == (1, 2) else 1.0, None))
-    local = session.Chunks(program)
-    remote = RemoteChunks(program, ray.pool(lambda: workers.Worker(*arguments)), batches)
+    remote = remote_chunks(sejax.config(words), ray)
+    local = session.Chunks(remote.learner)
     key = jax.random.key(0)
     state, other = local.init(key), remote.init(key)
     for _ in range(generations):
@@ -287,11 +292,8 @@ def test_a_run_by_workers_has_the_files_of_one_process(tmp_path):
     found = []
     for name in ("local", "remote"):
         config = sejax.config([*TINY, "generations=2", f"run_dir={tmp_path / name}"])
-        program = make_bilevel(**config.parts() | {"devices": 1})
-        arguments = configuration.plain(config), [5], 0.0, workers.versions()
-        pool = Ray().pool(lambda arguments=arguments: workers.Worker(*arguments))
-        remote = RemoteChunks(program, pool, [Batch(capacity=5, width=1)])
-        chunks = session.Chunks(program) if name == "local" else remote
+        remote = remote_chunks(config, Ray())
+        chunks = session.Chunks(remote.learner) if name == "local" else remote
         with open_for(config) as directory:
             session.run(config, directory, chunks)
             found.append([row | {"wall_s": ""} for row in directory.rows])

@@ -136,10 +136,7 @@ def print_table(study: optuna.Study, search: Search) -> None:
     console.print(shown)
     num_best = sum(trial.value == done[0].value for trial in done)
     if num_best > 1:
-        hint = " To reward learning early: measure=mean." if search.measure != "mean" else ""
-        if search.is_of_agent:
-            hint = " Agents that train for less on the proxy may differ: see docs/search.md."
-        console.print(f"{num_best} of {len(done)} share the best score.{hint}", soft_wrap=True)
+        console.print(f"{num_best} of {len(done)} share the best score: see docs/search.md.")
     begun = rows.dropna(subset=["generations"])  # those that were refused have none
     computed, most = begun["generations"].sum(), len(begun) * search.config.max_generations
     console.print(
