@@ -116,11 +116,11 @@ def serve_backend(args: argparse.Namespace) -> None:
     task = envs.make("halfcheetah", backend=args.side)
     actions = jnp.asarray(gaits(args.gaits, args.seed))
     num_parallel = jnp.resize(actions, (LANES, *actions.shape[1:]))
-    state = at_rest_state(task.env)
+    state, key = at_rest_state(task.env), jax.random.key(0)  # which has no effect
 
     def play(gait: Any) -> Any:
         def step(state: Any, torques: Any) -> Any:
-            _, state, reward, _, _ = task.env.step_env(None, state, torques, task.params)
+            _, state, reward, _, _ = task.env.step_env(key, state, torques, task.params)
             return state, reward
 
         return jax.lax.scan(step, state, gait)[1].sum()

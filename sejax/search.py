@@ -5,14 +5,9 @@ A trial is a run, whose generations are the budget; the same command goes on whe
 
 from collections.abc import Sequence
 from importlib.util import find_spec
-from typing import TYPE_CHECKING
 
 from sejax.cli import commands, runtime
 from sejax.options import ConfigError
-
-if TYPE_CHECKING:  # they need the extra `search`
-    from sejax.cli.search_config import Search
-    from sejax.cli.trials import Runner
 
 
 def main(overrides: Sequence[str]) -> None:
@@ -25,6 +20,7 @@ def main(overrides: Sequence[str]) -> None:
     if find_spec("optuna") is None:
         raise ConfigError("sejax.search needs Optuna. Install it with pip install 'sejax[search]'.")
     from sejax.cli import search_config, search_results, search_workers, study
+    from sejax.cli.trials import runner_of
     from sejax.cli.workers import RayConfig
 
     search = search_config.read(overrides)
@@ -35,7 +31,7 @@ def main(overrides: Sequence[str]) -> None:
     _say(f"Study {search.study} in {search.folder}: {', '.join(search.space)}.")
     try:
         if isinstance(search.machines, RayConfig):
-            search_workers.work(found, search, search.machines, join, _say)
+            search_workers.work(found, search, search.machines, _say)
         else:
             study.work(found, search, runner, _say)
         search_results.write(found, search, runner.command)
@@ -56,25 +52,6 @@ def main(overrides: Sequence[str]) -> None:
     _say(f"\nThe best:\n  {search_results.command_line(settings, search, runner.command)}")
     _say(f"The same:\n  {search_results.preset_line(search, runner.command)}")
     _say(f"{search.folder} holds trials.csv, best.txt and preset.yaml.")
-
-
-def join(overrides: Sequence[str]) -> None:
-    """Works on a study until it is over, as one of several workers."""
-    from sejax.cli import search_config, study
-
-    search = search_config.read(overrides)
-    study.work(study.open_study(search), search, runner_of(search), lambda text: None)
-
-
-def runner_of(search: "Search") -> "Runner":
-    """What makes the trials of a search."""
-    from sejax.cli.trials import Learning, Tuning
-
-    if not search.is_of_agent:
-        return Learning(search)
-    from sejax.evaluate import proxy_study
-
-    return Tuning(search, proxy_study)
 
 
 def _say(text: str) -> None:

@@ -382,6 +382,7 @@ def test_where_mujoco_cannot_run_one_message_says_what_can_be_done(
     with pytest.raises(ConfigError) as error:
         config.make()
     message = str(error.value)
+    assert error.value.field == "env"
     assert message.startswith(f"env={config.name} ") and said in message and len(message) <= 300
     assert message.endswith(", or set env.backend=mjx.") == (config.name == "halfcheetah")
     assert unloadable_library is without or not list(tmp_path.iterdir())

@@ -63,13 +63,6 @@ def told(scores, seed=1, **fields):
 # --- candidates ----------------------------------------------------------------------------------
 
 
-def test_mirrored_members_use_opposite_noise():
-    candidates, _, _ = asked()
-    plus, minus = candidates[:3] - MEAN, candidates[3:6] - MEAN
-    np.testing.assert_allclose(plus, -minus, atol=1e-7)
-    assert np.abs(plus).min() > 0
-
-
 def test_candidates_are_plus_then_minus_then_the_incumbents():
     candidates, _, _ = asked(num_evals=2)
     strategy, _, _ = nes(num_evals=2)
@@ -79,6 +72,7 @@ def test_candidates_are_plus_then_minus_then_the_incumbents():
     assert strategy.evaluations.num_incumbent_evals == 3
     np.testing.assert_array_equal(candidates[:12:2], candidates[1:12:2])
     np.testing.assert_allclose(candidates[:6] - MEAN, MEAN - candidates[6:12], atol=1e-7)
+    assert np.abs(candidates[:6] - MEAN).min() > 0
     np.testing.assert_array_equal(candidates[12:], np.tile(MEAN, (3, 1)))
     assert len(np.unique(candidates[:6:2], axis=0)) == 3
 
@@ -182,33 +176,6 @@ def test_generations_equal_a_numpy_loop(update_rule, aggregate_by):
         np.testing.assert_allclose(strategy.incumbent(state), mean, rtol=1e-4, atol=1e-5)
 
 
-def test_noise_and_step_shrink_by_their_factors_after_each_generation():
-    fields = {"noise_std_decay": 0.9, "step_size_decay": 0.5, "noise_std": 0.2, "step_size": 3.0}
-    strategy, ask, tell = nes(**fields)
-    state = strategy.init(jax.random.key(0), jnp.array(MEAN))
-    noises = []
-    for _ in range(3):
-        candidates, state = ask(jax.random.key(5), state)
-        noises.append(candidates[:3] - state.mean)
-        state = tell(jax.random.key(0), candidates, jnp.zeros(9), state)
-    # The same key draws the same normals, times sigma: 0.2, 0.18, 0.162.
-    np.testing.assert_allclose(noises[1], 0.9 * noises[0], rtol=1e-4, atol=1e-6)
-    np.testing.assert_allclose(noises[2], 0.81 * noises[0], rtol=1e-4, atol=1e-6)
-    np.testing.assert_allclose(state.step_size, 3.0 * 0.5**3, rtol=1e-6)
-
-
-def test_weight_decay_shrinks_the_mean_before_the_step():
-    scores = [0, 0, 0, 0, 0, 0, 1, 1, 1]  # no member beats the incumbent: no step
-    state, _ = told(scores, weight_decay=0.25)
-    np.testing.assert_allclose(state.mean, 0.75 * MEAN, rtol=1e-6)
-
-
-def test_the_proxy_stays_if_no_member_beats_the_incumbents_mean():
-    # Incumbents 1, 2, 6: mean 3; the best member has 3, which is not better.
-    state, _ = told([3, 0, 1, 2, 3, 0, 1, 2, 6])
-    np.testing.assert_array_equal(state.mean, MEAN)
-
-
 def test_diverged_scores_never_reach_the_mean():
     # Member 0 diverged with both signs; members 1 and 2 score 5 and 3 by their plus. The lowest
     # score of all is 1, which the incumbent's agent that diverged gets: mean (1 + 1 + 4) / 3 = 2,
@@ -218,11 +185,6 @@ def test_diverged_scores_never_reach_the_mean():
     noise = candidates[:3] - MEAN
     expected = MEAN + 0.75 * noise[1] + 0.25 * noise[2]
     np.testing.assert_allclose(state.mean, expected, rtol=1e-5, atol=1e-6)
-
-
-def test_a_generation_that_diverged_as_a_whole_leaves_the_proxy_as_it_was():
-    state, _ = told([NAN] * 9)
-    np.testing.assert_array_equal(state.mean, MEAN)
 
 
 def test_enormous_noise_that_diverged_leaves_no_trace():

@@ -34,7 +34,7 @@ class Config(Options):
     size: int = option(4, options.counts("it is a size"))
     episodes: int = option(2, options.counts("it counts episodes", least=0))
     limit: int | None = option(None, options.counts("something must happen"))
-    window: int | None = option(8, options.or_none(options.counts("it is a length")))
+    window: int | None = option(8, options.counts("it is a length"))
     weight: float = option(0.5, options.not_negative("it is a weight"), traced=True)
     rate: float = option(0.1, options.positive("nothing would move", 10.0), varied="triple")
     share: float = option(0.9, options.fraction(), traced=True, varied="tenth_to_one")

@@ -333,10 +333,10 @@ def test_trials_are_runs_and_those_of_a_shape_share_one_program(tmp_path):
     runner.run(runner.config(["es.noise_std=0.1"]), tmp_path / "other", 3)
     assert len(runner._programs.shapes) == 1
 
-    from sejax.run import learn
+    from sejax.run import learn_all
 
     plain = [*GRID, *overrides, "generations=3", "checkpoint_every=1", f"run_dir={tmp_path}/run"]
-    learn(configuration.config([*plain, "seed=1"]))
+    learn_all([configuration.config([*plain, "seed=1"])])
     np.testing.assert_allclose(rows_of(tmp_path / "trial" / "seed1"), rows_of(tmp_path / "run"))
     values = runner.verify(overrides, tmp_path / "again")
     assert sorted(x.name for x in (tmp_path / "again").iterdir()) == [
@@ -355,10 +355,7 @@ class Tuning(trials.Tuning):
     """Trains nobody: an agent's return is 10 for each letter of its world, plus the generation."""
 
     def __init__(self, path, *overrides):
-        from sejax.evaluate import proxy_study
-
-        super().__init__(search_config.read([*ON_PROXY, f"search_dir={path}", *overrides]),
-                         proxy_study)  # fmt: skip
+        super().__init__(search_config.read([*ON_PROXY, f"search_dir={path}", *overrides]))
         self.made = []
 
     def _outcome(self, config, world, generation, num_agents):

@@ -30,9 +30,8 @@ def page() -> str:
     """The text of the page."""
     proxies = sejax.pretrained()
     rows = [proxy.row | {"name": f"[{proxy.name}](#{proxy.name})"} for proxy in proxies]
-    overview = table(list(rows[0]), [list(row.values()) for row in rows])
     cards = [re.sub(r"^#", "##", proxy.card, flags=re.MULTILINE) for proxy in proxies]
-    return HEAD + "\n\n".join([overview, *cards]) + "\n"
+    return HEAD + "\n\n".join([table(rows), *cards]) + "\n"
 
 
 if __name__ == "__main__":

@@ -217,9 +217,7 @@ def _mixture(given: Mapping[str, Any]) -> dict[str, str]:
 
 
 def _choices(
-    schema: "type[CommandConfig]",
-    given: Mapping[str, Any],
-    mixture: Mapping[str, str],
+    schema: "type[CommandConfig]", given: Mapping[str, Any], mixture: Mapping[str, str]
 ) -> dict[str, str]:
     """The choice of every group; without the agent where there is a mixture."""
     chosen = {group: given.get(group, DEFAULTS[group]) for group in schema.groups}
@@ -245,9 +243,7 @@ def _choices(
 
 
 def _fields(
-    schema: "type[CommandConfig]",
-    chosen: Mapping[str, str],
-    mixture: Mapping[str, str],
+    schema: "type[CommandConfig]", chosen: Mapping[str, str], mixture: Mapping[str, str]
 ) -> dict[str, tuple[Any, str]]:
     """Defaults and help texts of the fields that these choices have, by their full names."""
     groups = {group: registry.find(group, name) for group, name in chosen.items()}

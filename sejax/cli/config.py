@@ -286,7 +286,7 @@ class EvaluateConfig(CommandConfig):
         source = str(given.get("proxy", ""))
         if source in ("", "real"):
             return CommandConfig.spec_for(given)
-        return TaskSpec.of_interface(header.read(source, "proxy")[1].interface)
+        return header.read(source, "proxy").header.spec
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -152,7 +152,7 @@ class RunProgress(Reporter):
             path, config.name("env"), config.name("proxy"), agents, learner.proxy.is_real
         )
         title = "learned" if ended == "finished" else ended
-        self._console.rule(f"{learner.task.name}: {title}", align="left")
+        self._console.rule(f"{learner.proxy.task.name}: {title}", align="left")
         self.say(
             f"{verdict}\n\n"
             f"  {path}/proxy.safetensors    the best proxy\n"

@@ -9,9 +9,11 @@ from typing import Any
 
 import optuna
 
-from sejax.cli import cluster, runtime
+from sejax.cli import cluster, runtime, search_config
 from sejax.cli.search_config import Search
-from sejax.cli.study import ENDED, sentence
+from sejax.cli.study import ENDED, open_study, sentence
+from sejax.cli.study import work as take_trials
+from sejax.cli.trials import runner_of
 from sejax.cli.workers import RayConfig
 from sejax.options import FailedError, registry
 
@@ -23,7 +25,6 @@ def work(
     study: optuna.Study,
     search: Search,
     machines: RayConfig,
-    join: Callable[[Sequence[str]], None],
     say: Callable[[str], None],
 ) -> None:
     """Has the trials of a study made by workers on the cluster, until it is over.
@@ -32,7 +33,6 @@ def work(
       study: the study.
       search: what is searched.
       machines: the cluster.
-      join: what a worker does, given its overrides.
       say: tells the user.
 
     Raises:
@@ -44,7 +44,7 @@ def work(
     with cluster.connected(machines) as ray:
         start = ray.remote(num_cpus=1, num_gpus=gpus, max_retries=RETRIES)(_work)
         count = max(1, cluster.num_workers(machines))
-        running = [start.remote(join, search.overrides(), gpus) for _ in range(count)]
+        running = [start.remote(search.overrides(), gpus) for _ in range(count)]
         known = {trial.number for trial in study.get_trials(deepcopy=False, states=ENDED)}
         done: list[Any] = []
         while not done:
@@ -64,10 +64,11 @@ def work(
         ray.wait(running, num_returns=count, timeout=LAST_S)  # one that hangs is left behind
 
 
-def _work(join: Callable[[Sequence[str]], None], overrides: Sequence[str], gpu: float) -> None:
+def _work(overrides: Sequence[str], gpu: float) -> None:
     """A worker, which has this part of a GPU."""
     runtime.configure_xla(1)
     runtime.take_share_of_gpu(gpu)
     runtime.configure_jax()
     with registry.only_typed(overrides):
-        join(overrides)
+        search = search_config.read(overrides)
+        take_trials(open_study(search), search, runner_of(search), lambda text: None)

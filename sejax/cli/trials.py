@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol, TypeVar
+from typing import Any, Protocol, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -26,6 +26,7 @@ from sejax.cli.config import EvaluateConfig, LearnConfig
 from sejax.cli.programs import Programs, kept, static_of, structure_of
 from sejax.cli.run_directory import open_for
 from sejax.cli.search_config import Search
+from sejax.cli.worlds import proxy_setup
 from sejax.evaluation import make_evaluator, num_parallel_on_cpu
 from sejax.objectives import Outcome
 from sejax.ops.files import write_text
@@ -33,9 +34,6 @@ from sejax.ops.parallel import compiler_options, spread_over_devices
 from sejax.options import require, shortened
 from sejax.options.plain import flatten, to_plain
 from sejax.proxies import header
-
-if TYPE_CHECKING:  # which stands above this module
-    from sejax.evaluate import Study
 
 Config = TypeVar("Config", LearnConfig, EvaluateConfig)
 T = TypeVar("T", list[dict[str, Any]], dict[str, float])
@@ -185,7 +183,6 @@ class Tuning:
 
     Args:
       search: of an agent.
-      study_of: `sejax.evaluate.proxy_study`.
 
     Raises:
       ConfigError: if the proxy is not to be found here, which is no fault of a trial's settings.
@@ -193,8 +190,8 @@ class Tuning:
 
     command = "sejax.evaluate"
 
-    def __init__(self, search: Search, study_of: Callable[[EvaluateConfig], "Study"]):
-        self._search, self._study_of = search, study_of
+    def __init__(self, search: Search):
+        self._search = search
         self._default = configuration.evaluate_config(search.fixed)
         header.find(self._default.proxy, "proxy")
         self._compiled: dict[str, Any] = {}
@@ -213,7 +210,7 @@ class Tuning:
             f"must be default where settings are searched; got {config.agent_hparams}. Set "
             "agent_hparams=default.",
         )
-        self._study_of(config)  # which checks what is asked of the proxy
+        proxy_setup(config)  # which checks what is asked of the proxy
         return config
 
     def run(self, config: EvaluateConfig, folder: Path, generations: int) -> Progress:
@@ -248,7 +245,7 @@ class Tuning:
         values = _stored(path, settings, dict[str, float]())
         if values:
             return values
-        for world in self._study_of(config).worlds:
+        for world in proxy_setup(config).worlds:
             fresh, name = self._search.config.max_generations, WORLDS[world]
             outcome = self._outcome(config, world, fresh, config.num_agents)
             values[f"{name}_return"] = float(np.mean(outcome.test_return))
@@ -263,7 +260,7 @@ class Tuning:
         score = row[f"{where}_return"]
         if not math.isfinite(score):
             return math.inf, 0.0
-        solved = float(self._study_of(self._default).task.solved_reward)
+        solved = float(proxy_setup(self._default).task.solved_reward)
         return -min(score, solved), row[f"{where}_steps"]
 
     def _settings_of(self, config: EvaluateConfig) -> str:
@@ -275,15 +272,15 @@ class Tuning:
         self, config: EvaluateConfig, world: str, generation: int, num_agents: int
     ) -> Outcome:
         """The outcome of fresh agents in a world of `sejax.evaluate`, leaves `[agent]`, NumPy."""
-        study = self._study_of(config)
-        (family,) = study.families
-        agent = make_agent(family.agent, study.task, study.exploration)
-        env, env_params, trainings = study.worlds[world]
+        setup = proxy_setup(config)
+        (family,) = setup.families
+        agent = make_agent(family.agent, setup.task, setup.exploration)
+        env, env_params, trainings = setup.worlds[world]
         training = trainings[family.key]
 
         def one(key: Array, hparams: Any) -> Outcome:
             tried = dataclasses.replace(agent, hparams=hparams)
-            return make_evaluator(tried, env, study.task, training)(key, env_params)
+            return make_evaluator(tried, env, setup.task, training)(key, env_params)
 
         def make() -> Callable[..., Outcome]:
             width = num_parallel_on_cpu(agent, training)
@@ -299,7 +296,7 @@ class Tuning:
             [
                 world,
                 static_of(family.agent),
-                static_of(study.exploration),
+                static_of(setup.exploration),
                 to_plain(training),
                 structure_of(agent.hparams),
                 num_agents,
@@ -309,6 +306,11 @@ class Tuning:
         seed = jax.random.fold_in(jax.random.key(config.seed), generation)
         outcome: Outcome = jax.device_get(rounds(jax.random.split(seed, num_agents), agent.hparams))
         return outcome
+
+
+def runner_of(search: Search) -> Learning | Tuning:
+    """What makes the trials of a search."""
+    return Tuning(search) if search.is_of_agent else Learning(search)
 
 
 def _finite(scores: np.ndarray) -> np.ndarray:

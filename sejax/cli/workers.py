@@ -25,9 +25,10 @@ from sejax.options import Options, counts, fraction, option, require
 if TYPE_CHECKING:  # jax must not be imported before a worker has chosen its devices
     from jax import Array
 
-    from sejax.bilevel import Bilevel, Candidates, LearnState
+    from sejax.bilevel import Bilevel, LearnState
     from sejax.cli.config import LearnConfig
     from sejax.cli.session import Chunks
+    from sejax.evaluation import Candidates
     from sejax.objectives import GenerationInfo, Outcome
 
 CAPACITY = 16  # most evaluations in a share on a CPU core, where batches follow one another
@@ -152,10 +153,7 @@ def cut(places: np.ndarray, batch: Batch, num_workers: int) -> Iterator[np.ndarr
 
 def _places(learner: "Bilevel") -> list[np.ndarray]:
     """The indices of each agent's evaluations in a generation."""
-    from sejax.objectives import Scoring
-
-    scoring = Scoring.of(learner.objective, learner.strategy, learner.mixture)
-    agents = scoring.agent_of_evaluation
+    agents = learner.scoring.agent_of_evaluation
     return [np.flatnonzero(agents == i) for i in range(learner.mixture.size)]
 
 

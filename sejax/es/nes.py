@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 
 from sejax.es.base import LARGEST, Strategy, StrategyOptions
 from sejax.es.score_transforms import TRANSFORMS
-from sejax.options import counts, fraction, one_of, option, or_none, positive, shrinks
+from sejax.options import counts, fraction, one_of, option, positive, shrinks
 
 UPDATE_RULES = ("authors", "paper")
 
@@ -27,9 +27,7 @@ class NESConfig(StrategyOptions):
 
     population_size: int = 64  # n_p: perturbations of a generation
     # Agents on the incumbent; null: one for each perturbation, as in the paper.
-    num_incumbent_evals: int | None = option(
-        16, or_none(counts("the incumbent's score selects the proxy"))
-    )
+    num_incumbent_evals: int | None = option(16, counts("the incumbent's score selects the proxy"))
     # sigma: std of the weight perturbation
     noise_std: float = option(0.06, positive("candidates must differ", LARGEST), traced=True)
     # factor on sigma after each generation
@@ -124,8 +122,7 @@ def better_signs(
 ) -> tuple[Float[Array, " half"], Float[Array, "half dims"]]:
     """Score and noise of each perturbation's better sign; the plus signs are the first half."""
     plus, minus = scores.reshape(2, -1)
-    use_minus = jnp.where(jnp.isfinite(minus), minus, -jnp.inf) > jnp.where(
-        jnp.isfinite(plus), plus, -jnp.inf
-    )
+    rank_plus, rank_minus = (jnp.where(jnp.isfinite(x), x, -jnp.inf) for x in (plus, minus))
+    use_minus = rank_minus > rank_plus
     sign = jnp.where(use_minus, -1.0, 1.0)
     return jnp.where(use_minus, minus, plus), sign[:, None] * noise[: plus.shape[0]]

@@ -66,12 +66,19 @@ def spread_over_devices(
 def copy_to_devices(tree: PyTree, num_devices: int | None = None) -> PyTree:
     """The arrays of a pytree with a copy on each device, as results of spread functions have.
 
-    A jitted loop is compiled anew if its state comes back from devices on which it did not start.
+    A jitted loop is compiled anew if its state comes back from devices on which it did not start,
+    or strongly typed where it was weakly typed.
     """
+    tree = jax.tree.map(_strongly_typed, tree)
     mesh = _mesh(num_devices)
     if mesh.size == 1:
         return tree
     return jax.lax.with_sharding_constraint(tree, NamedSharding(mesh, PartitionSpec()))
+
+
+def _strongly_typed(x: Array) -> Array:
+    is_key = jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
+    return x if is_key else jax.lax.convert_element_type(x, x.dtype)
 
 
 def _mesh(num_devices: int | None) -> Mesh:

@@ -28,6 +28,8 @@ import io
 import numbers
 import textwrap
 import tokenize
+import types
+import typing
 from collections.abc import Callable, Collection, Iterable, Mapping
 from typing import Any, ClassVar
 
@@ -113,8 +115,8 @@ def option(
     """A dataclass field.
 
     Args:
-      default: its default; None where it may be left open, which passes any rule.
-      rule: what must hold.
+      default: its default.
+      rule: what must hold; None passes it where that is the default or `... | None` the type.
       traced: whether it is a number that the compiled program takes as an argument, so that a
         population may vary it without compiling anew. See `traced_options`.
       varied: how `agent_hparams=varied` draws it; see `sejax.agents.varied`.
@@ -150,7 +152,8 @@ def check(config: Options, group: str) -> None:
         if value is not given:
             object.__setattr__(config, field.name, value)
         rule = marks(type(config), field.name).get("rule")
-        if rule is not None and not (value is None and field.default is None):
+        may_be_none = field.default is None or types.NoneType in typing.get_args(field.type)
+        if rule is not None and not (value is None and may_be_none):
             rule(f"{group}.{field.name}" if group else field.name, value, field.default)
 
 
@@ -297,16 +300,6 @@ def shrinks() -> Rule:
 def seed() -> Rule:
     """A seed that `jax.random.key` takes as it is."""
     return between(0, LARGEST, "it is a 32-bit number", "lie in [0, 2**31)")
-
-
-def or_none(inner: Rule) -> Rule:
-    """None, or what another rule says; for an option that may be left open, but has a default."""
-
-    def either(name: str, value: Any, default: Any) -> None:
-        if value is not None:
-            inner(name, value, default)
-
-    return either
 
 
 def one_of(known: Collection[str]) -> Rule:

@@ -35,7 +35,7 @@ import inspect
 import operator
 import re
 import typing
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextvars import ContextVar
 from dataclasses import dataclass
 from typing import Any
@@ -253,14 +253,7 @@ def find(group: str, name: object) -> Any:
         return _as_dataclass(group, name, _imported(group, _offered(group)[name]))
     if ":" not in name:
         raise unknown_name(group, name, names(group))
-    typed = _TYPED.get()
-    require(
-        typed is None or name in typed,
-        group,
-        "must be typed on the command line if it is of a module of your own: what a file names is "
-        f"never imported; got {shortened(name)}. Set {group}={shortened(name)}, if you trust it.",
-    )
-    return _as_dataclass(group, name, _imported(group, name))
+    return _as_dataclass(group, name, _imported(group, name, _TYPED.get()))
 
 
 def name_of(group: str, config: object) -> str:
@@ -383,13 +376,20 @@ def _attribute(path: str) -> Any:
     return getattr(importlib.import_module(module), attribute)
 
 
-def _imported(group: str, path: str) -> Any:
-    """What `module:attribute` names, of a user or a package."""
+def _imported(group: str, path: str, typed: Collection[str] | None = None) -> Any:
+    """What `module:attribute` names; it is imported if `typed` has it, or is None."""
     module, _, attribute = path.partition(":")
+    got = shortened(path, 60)
     require(
         all(part.isidentifier() for part in (*module.split("."), *attribute.split("."))),
         group,
-        f"must be a name or module:attribute; got {shortened(path)}. Set {group}=module:MyClass.",
+        f"must be a name or module:attribute; got {got}. Set {group}=my_module:MyClass.",
+    )
+    require(
+        typed is None or path in typed,
+        group,
+        "must be typed on the command line if it is of a module of your own: what a file names is "
+        f"never imported; got {got}. Set {group}={got}, if you trust it.",
     )
     try:
         found = importlib.import_module(module)

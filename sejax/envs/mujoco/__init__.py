@@ -8,7 +8,7 @@ used, and the CPU. `brax` has other physics for halfcheetah.
 
 from typing import TYPE_CHECKING
 
-from sejax.options import ConfigError, require
+from sejax.options import ConfigError
 
 if TYPE_CHECKING:
     from sejax.envs.mujoco.environment import MujocoEnv
@@ -40,9 +40,9 @@ def make_env(config: "MujocoTask", otherwise: str = "") -> "MujocoEnv[MujocoTask
 
     from sejax.envs.mujoco import library, models
 
-    backend = jax.default_backend()
-    fix = f"Set JAX_PLATFORMS=cpu{otherwise}."
-    require(backend == "cpu", field, f"must run on the CPU; got {backend}. {fix}")
+    if (backend := jax.default_backend()) != "cpu":
+        fix = f"Set JAX_PLATFORMS=cpu{otherwise}."
+        raise ConfigError(f"{field} must run on the CPU; got {backend}. {fix}", "env")
     try:
         library.load()
     except library.BuildError as error:
