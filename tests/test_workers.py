@@ -230,7 +230,10 @@ def test_workers_give_the_numbers_of_one_process_to_the_last_bit():
 CASES = {
     "mixture": [*TINY[:1], "agents=[q_learning,sarsa]", *TINY[3:]],
     "batches": ["env=cartpole", "es.population_size=4"],
-    "curriculum": ["env=pendulum", "es.population_size=4", "training.max_episodes=3"],
+    "curriculum": [
+        *("env=pendulum", "es.population_size=4", "training.max_steps=200"),
+        *("training.max_episodes=200", "objective.first_eval_steps=50"),
+    ],
     "evosax": ["env=cliff_walking", "proxy=rn", "es=cma_es", "es.population_size=8"],
 }
 
