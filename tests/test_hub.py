@@ -239,4 +239,4 @@ def test_the_command_evaluates_what_is_there_and_writes_in_the_working_folder(th
     config = configuration.evaluate_config([f"proxy=hf://me/se@{oid('me/se', 0)}"])
     study = proxy_setup(config)
     assert study.task.name == "cartpole"
-    assert str(study.out_dir) == f"runs/evaluate-me_se@{oid('me/se', 0)}"
+    assert str(study.out_dir) == f"runs/evaluate-me_se_{oid('me/se', 0)}"
