@@ -189,10 +189,11 @@ def test_a_proxys_file_names_no_module(folder, refused, foreign):
 
 
 @pytest.mark.parametrize("foreign", [*PROXIES, {"es": {"name": IMPORTED}}])
-def test_an_experiment_imports_nothing_that_a_set_names(folder, foreign, capsys):
+def test_an_experiment_imports_nothing_that_a_set_names(folder, foreign, capsys, monkeypatch):
     write_proxy(foreign)
     words = ["quick=true", "proxy=evil.safetensors", "out=out"]
+    monkeypatch.setattr(sys, "argv", ["supervised_baseline", *words])
     with pytest.raises(SystemExit) as ended:
-        supervised_baseline.EXPERIMENT.main(words)
+        supervised_baseline.EXPERIMENT.main()
     said = capsys.readouterr().err
     assert ended.value.code == commands.BAD_INPUT and said.count("\n") == 1

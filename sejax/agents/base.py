@@ -7,12 +7,11 @@ from dataclasses import dataclass
 from typing import ClassVar, NamedTuple, Protocol, TypeAlias, TypeVar
 
 import jax
-from gymnax.environments.environment import Environment
 from jaxtyping import Array, Int, PyTree
 
 from sejax.agents.buffers import BufferMaker
 from sejax.envs.base import Task
-from sejax.envs.environment import spaces_of
+from sejax.envs.environment import Environment, spaces_of
 from sejax.envs.spec import Discrete, Space
 from sejax.options import Options, counts, option, traced_options
 

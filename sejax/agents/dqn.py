@@ -8,22 +8,22 @@ control through deep reinforcement learning" (2015); the paper's hyperparameter 
 import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import optax
 from flax import linen as nn
 from flax import struct
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Int, PyTree
 
 from sejax.agents.base import Agent, AgentSpec, Hparams
 from sejax.agents.buffers import Transition
-from sejax.agents.networks import FlatNetwork, flat_network
 from sejax.agents.off_policy import OffPolicyOptions, adam_step, off_policy_agent, soft_update
 from sejax.agents.policies import decayed_epsilon, epsilon_greedy, select_action
 from sejax.envs.base import Task
 from sejax.ops import cpu, flat
-from sejax.ops.networks import DuelingMLP
+from sejax.ops.networks import DuelingMLP, init_narrowed
 from sejax.options import MOST_LAYERS, counts, fraction, one_of, option
 
 LOSSES = {"squared": jnp.square, "huber": optax.losses.huber_loss}
@@ -123,10 +123,11 @@ def make_ddqn(config: DDQNConfig, obs_dim: int, num_actions: int) -> Agent:
       >>> int(agent.act(jax.random.key(1), state, jnp.zeros(4), explore=False)) in (0, 1)
       True
     """
-    network = flat_network(config.network(num_actions), obs_dim)
+    network = config.network(num_actions)
+    unflatten = flat.unflattener(network.init, jnp.zeros(obs_dim))
 
     def init(key: Array, hparams: Hparams) -> DDQNState:
-        params = network.init(key, hparams.hidden_size)
+        params = flat.flatten(init_narrowed(network, key, obs_dim, hparams.hidden_size))
         hparams = jax.tree.map(jnp.float32, hparams)
         return DDQNState(
             params=params,
@@ -138,7 +139,7 @@ def make_ddqn(config: DDQNConfig, obs_dim: int, num_actions: int) -> Agent:
         )
 
     def act(key: Array, state: DDQNState, obs: Float[Array, " obs_dim"], explore: bool) -> Array:
-        q_values = network.apply(state.params, obs)
+        q_values: Any = network.apply(unflatten(state.params), obs)
         if not explore:
             return jnp.argmax(q_values).astype(jnp.int32)
         return epsilon_greedy(key, q_values, state.epsilon)
@@ -149,7 +150,7 @@ def make_ddqn(config: DDQNConfig, obs_dim: int, num_actions: int) -> Agent:
         init=init,
         begin_episode=begin_episode,
         act=act,
-        update=make_update(config, make_learning_step(config, network)),
+        update=make_update(config, make_learning_step(config, network, unflatten)),
     )
 
 
@@ -212,7 +213,7 @@ def split_batch(batch: Transition, num_parts: int) -> Transition:
 
 
 def make_learning_step(
-    config: DDQNConfig, network: FlatNetwork
+    config: DDQNConfig, network: nn.Module, unflatten: Callable[[Array], PyTree]
 ) -> Callable[[DDQNState, Transition], DDQNState]:
     """Builds `learn(state, batch) -> state`: Adam on the loss of the error to double-Q targets.
 
@@ -223,19 +224,20 @@ def make_learning_step(
     def learn(state: DDQNState, batch: Transition) -> DDQNState:
         hp = state.hparams
 
-        def sum_of_losses(params: Array, batch: Transition) -> Array:
-            target_next_q = network.apply(state.target_params, batch.next_obs)
-            targets = double_q_targets(
-                network.apply(params, batch.next_obs) if config.double else target_next_q,
-                target_next_q,
-                batch.reward,
-                hp.discount * batch.discount,
-            )
-            q_values = network.apply(params, batch.obs)  # [actions, batch]
+        target_params = unflatten(state.target_params)
+
+        def sum_of_losses(params: PyTree, batch: Transition) -> Array:
+            q_values: Any = network.apply(params, batch.obs)  # [actions, batch]
+            target_next_q: Any = network.apply(target_params, batch.next_obs)
+            next_q: Any = network.apply(params, batch.next_obs) if config.double else target_next_q
+            discount = hp.discount * batch.discount
+            targets = double_q_targets(next_q, target_next_q, batch.reward, discount)
             error = select_action(q_values, batch.action) - jax.lax.stop_gradient(targets)
             return jnp.sum(batch.weight * loss_fn(error))
 
-        params, opt_state = adam_step(sum_of_losses, state.params, state.opt_state, (batch,), hp)
+        params, opt_state = adam_step(
+            sum_of_losses, state.params, state.opt_state, (batch,), hp, unflatten
+        )
         tau = hp.tau
         if config.target_update_every > 1:
             tau = jnp.where(opt_state.count % config.target_update_every == 0, tau, 0.0)

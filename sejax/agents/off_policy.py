@@ -113,6 +113,7 @@ def adam_step(
     opt_state: optax.OptState,
     columns: tuple[Transition, *tuple[PyTree, ...]],
     hparams: Hparams,
+    unflatten: Callable[[Array], PyTree] | None = None,
 ) -> tuple[Float[Array, "*params"], optax.OptState]:
     """One step of Adam on a batch's mean loss, at the cost of the columns in use.
 
@@ -122,9 +123,15 @@ def adam_step(
       opt_state: of `flat.ADAM`.
       columns: a batch, and what else has its columns, such as noise.
       hparams: `learning_rate`, and `batch_size` in use or None.
+      unflatten: if given, `sum_of_losses` takes `unflatten(params)`.
     """
-    gradient = jax.grad(sum_of_losses)
-    total = sum_over_batch(lambda columns: gradient(params, *columns), columns, hparams.batch_size)
+    tree = params if unflatten is None else unflatten(params)
+
+    def gradient(columns: PyTree) -> Array:
+        by_tree = jax.grad(sum_of_losses)(tree, *columns)
+        return by_tree if unflatten is None else flat.flatten(by_tree)
+
+    total = sum_over_batch(gradient, columns, hparams.batch_size)
     mean = total / num_columns(columns[0])
     return flat.adam_step(params, opt_state, mean, hparams.learning_rate)
 

@@ -18,16 +18,15 @@ import jax
 import jax.numpy as jnp
 import optax
 from flax import struct
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Int, PyTree
 
 from sejax.agents.base import Agent, AgentOptions, AgentSpec, Hparams, traced
 from sejax.agents.buffers import Rollout, Transition, rollout_buffer
-from sejax.agents.networks import flat_network
 from sejax.agents.policies import Distribution, gaussian, softmax
 from sejax.envs.base import Task
 from sejax.ops import flat
 from sejax.ops.keys import murmur
-from sejax.ops.networks import MLP
+from sejax.ops.networks import MLP, init_narrowed
 from sejax.options import (
     ACTIVATIONS,
     MOST_LAYERS,
@@ -228,70 +227,66 @@ def make_ppo(config: PPOConfig, obs_dim: int, policy: Distribution, max_steps: i
     )
 
 
-class Params(NamedTuple):
-    """Parameters by what they belong to, each a vector."""
-
-    actor: Float[Array, " num_actor_params"]
-    critic: Float[Array, " num_critic_params"]
-    std: Float[Array, " std_dim"]
-
-
 class Networks(NamedTuple):
-    """The actor and the critic as functions of parameters.
+    """The actor, the critic and the std as functions of one tree of parameters.
 
     Attributes:
-      init: `(key, hidden_size) -> params`, `[num_params]`; `hidden_size` is the number of units in
-        use, or None for all.
-      unflatten: `params [num_params] -> Params`.
-      actor: `(Params, obs) -> (outputs, std)`.
-      critic: `(Params, obs) -> value`, `[steps]`.
-      evaluate: `(Params, obs, action) -> (log_prob, entropy, value)`, `[steps]` each.
-      least_params: lower bounds of all parameters: only the std has one.
+      init: `(key, hidden_size) -> params`, flat; `hidden_size` is the number of units in use, or
+        None for all.
+      unflatten: of flat parameters to the tree.
+      actor: `(tree, obs) -> (outputs, std)`.
+      critic: `(tree, obs) -> value`, `[steps]`.
+      evaluate: `(tree, obs, action) -> (log_prob, entropy, value)`, `[steps]` each.
+      least_params: lower bounds of flat parameters: only the std has one.
     """
 
     init: Callable[[Array, Array | None], Array]
-    unflatten: Callable[[Array], Params]
-    actor: Callable[[Params, Array], tuple[Array, Array]]
-    critic: Callable[[Params, Array], Array]
-    evaluate: Callable[[Params, Array, Array], tuple[Array, Array, Array]]
+    unflatten: Callable[[Array], PyTree]
+    actor: Callable[[PyTree, Array], tuple[Array, Array]]
+    critic: Callable[[PyTree, Array], Array]
+    evaluate: Callable[[PyTree, Array, Array], tuple[Array, Array, Array]]
     least_params: Float[Array, " num_params"]
 
 
 def make_networks(config: PPOConfig, obs_dim: int, policy: Distribution) -> Networks:
     """An actor `s -> outputs` and a critic `s -> V` of the same hidden layers, and the std."""
     shape = (config.hidden_size, config.num_layers, config.activation)
-    actor_net, critic_net = (
-        flat_network(MLP(size, *shape, learn_prelu_slope=True), obs_dim)
-        for size in (policy.num_outputs, 1)
-    )
+    mlps = {
+        "actor": MLP(policy.num_outputs, *shape, learn_prelu_slope=True),
+        "critic": MLP(1, *shape, learn_prelu_slope=True),
+    }
 
-    def init_params(key: Array, hidden_size: Array | None = None) -> Params:
-        key_actor, key_critic = jax.random.split(key)
-        return Params(
-            actor=actor_net.init(key_actor, hidden_size),
-            critic=critic_net.init(key_critic, hidden_size),
-            std=jnp.full(policy.std_dim, config.init_action_std, jnp.float32),
-        )
+    def init_tree(key: Array, hidden_size: Array | None = None) -> dict[str, PyTree]:
+        keys = dict(zip(mlps, jax.random.split(key), strict=True))
+        weights = {
+            name: init_narrowed(mlp, keys[name], obs_dim, hidden_size) for name, mlp in mlps.items()
+        }
+        return {**weights, "std": jnp.full(policy.std_dim, config.init_action_std, jnp.float32)}
 
-    def actor(params: Params, obs: Array) -> tuple[Array, Array]:
-        return actor_net.apply(params.actor, obs), params.std
+    def init(key: Array, hidden_size: Array | None) -> Array:
+        return flat.flatten(init_tree(key, hidden_size))
 
-    def critic(params: Params, obs: Array) -> Array:
-        return critic_net.apply(params.critic, obs)[0]
+    def actor(tree: PyTree, obs: Array) -> tuple[Array, Array]:
+        outputs: Any = mlps["actor"].apply(tree["actor"], obs)
+        return outputs, tree["std"]
 
-    def evaluate(params: Params, obs: Array, action: Array) -> tuple[Array, Array, Array]:
-        log_prob, entropy = policy.evaluate(*actor(params, obs), action)
-        return log_prob, entropy, critic(params, obs)
+    def critic(tree: PyTree, obs: Array) -> Array:
+        value: Any = mlps["critic"].apply(tree["critic"], obs)
+        return value[0]
 
-    template = jax.eval_shape(init_params, jax.random.key(0))
-    unbounded: Params = jax.tree.map(lambda x: jnp.full(x.shape, -jnp.inf), template)
+    def evaluate(tree: PyTree, obs: Array, action: Array) -> tuple[Array, Array, Array]:
+        log_prob, entropy = policy.evaluate(*actor(tree, obs), action)
+        return log_prob, entropy, critic(tree, obs)
+
+    template = jax.eval_shape(init_tree, jax.random.key(0))
+    unbounded = jax.tree.map(lambda x: jnp.full(x.shape, -jnp.inf), template)
     return Networks(
-        init=lambda key, hidden_size: flat.flatten(init_params(key, hidden_size)),
-        unflatten=flat.inverse_of_flatten(template),
+        init=init,
+        unflatten=flat.unflattener(init_tree),
         actor=actor,
         critic=critic,
         evaluate=evaluate,
-        least_params=flat.flatten(unbounded._replace(std=jnp.full(policy.std_dim, MIN_STD))),
+        least_params=flat.flatten({**unbounded, "std": jnp.full(policy.std_dim, MIN_STD)}),
     )
 
 
@@ -320,8 +315,8 @@ def prepared(
     which the critic has in each Adam step (`docs/reference.md` 4.5). With `"gae"` the advantages
     are generalised ones, of rewards that `normalize_rewards` divides by the std of returns.
     """
-    hp, params, sums = state.hparams, networks.unflatten(state.params), state.return_sums
-    old_log_prob, _, value = networks.evaluate(params, steps.obs, steps.action)
+    hp, tree, sums = state.hparams, networks.unflatten(state.params), state.return_sums
+    old_log_prob, _, value = networks.evaluate(tree, steps.obs, steps.action)
     if config.advantages == "monte_carlo":
         returns = normalized(discounted_returns(steps.reward, ended, hp.discount))
         return Batch(steps.obs, steps.action, old_log_prob, None, returns), sums
@@ -329,7 +324,7 @@ def prepared(
     if config.normalize_rewards:
         sums = sums + power_sums(discounted_sums(reward, decay, ended))
         reward = reward / std_of(sums)
-    next_value = networks.critic(params, steps.next_obs)
+    next_value = networks.critic(tree, steps.next_obs)
     advantage = generalized_advantages(reward, decay, ended, value, next_value, hp.gae_lambda)
     return Batch(steps.obs, steps.action, old_log_prob, advantage, advantage + value), sums
 
@@ -347,8 +342,8 @@ def make_learning_phase(
     steps. A rollout that these do not divide leaves some steps out of each pass.
     """
 
-    def loss_fn(params: Params, batch: Batch, hp: Hparams) -> Array:
-        log_prob, entropy, value = networks.evaluate(params, batch.obs, batch.action)
+    def loss_fn(tree: PyTree, batch: Batch, hp: Hparams) -> Array:
+        log_prob, entropy, value = networks.evaluate(tree, batch.obs, batch.action)
         if batch.advantage is None:
             advantage = jax.lax.stop_gradient(batch.returns - value)
         else:

@@ -188,6 +188,7 @@ class Networks(NamedTuple):
     Attributes:
       init: `(key, hparams) -> params`, `[num_params]`.
       unflatten: `params [num_params] -> Params`.
+      critics_of: `params [num_params] -> critics [num_critic_params]`.
       unflatten_critics: `critics [num_critic_params] -> Params.critics`.
       actor: `(Params, obs) -> outputs`, `[num_outputs, *batch]`.
       critics: `(Params.critics, inputs) -> outputs`, `[2, critic_outputs, batch]`.
@@ -195,13 +196,10 @@ class Networks(NamedTuple):
 
     init: Callable[[Array, Hparams], Array]
     unflatten: Callable[[Array], Params]
+    critics_of: Callable[[Array], Array]
     unflatten_critics: Callable[[Array], PyTree]
     actor: Callable[[Params, Array], Array]
     critics: Callable[[PyTree, Array], Array]
-
-    def critics_of(self, params: Float[Array, " num_params"]) -> Float[Array, " num_critic_params"]:
-        """The critics' part of all parameters."""
-        return flat.flatten(self.unflatten(params).critics)
 
 
 def make_networks(config: SACConfig, obs_dim: int, policy: Policy) -> Networks:
@@ -223,10 +221,13 @@ def make_networks(config: SACConfig, obs_dim: int, policy: Policy) -> Networks:
         params = init_params(key, hparams.hidden_size)
         return flat.flatten(params._replace(log_alpha=jnp.log(jnp.float32(hparams.init_alpha))))
 
+    template = jax.eval_shape(init_params, jax.random.key(0))
+    start, size = (sum(x.size for x in jax.tree.leaves(part)) for part in template[:2])
     return Networks(
         init=init,
-        unflatten=flat.unflattener(init_params),
-        unflatten_critics=flat.unflattener(lambda key: init_params(key).critics),
+        unflatten=flat.inverse_of_flatten(template),
+        critics_of=lambda params: params[start : start + size],
+        unflatten_critics=flat.inverse_of_flatten(template.critics),
         actor=lambda params, obs: actor.apply(params.actor, obs),
         critics=jax.vmap(critic.apply, (0, None)),
     )
@@ -282,12 +283,11 @@ def make_learning_step(
         hp = state.hparams
         target_critics = networks.unflatten_critics(state.target_critics)
 
-        def sum_of_losses(params: Array, batch: Transition, noise: LearningNoise) -> Array:
-            tree = networks.unflatten(params)
-            return jnp.sum(batch.weight * losses(tree, target_critics, hp, batch, noise))
+        def sum_of_losses(params: Params, batch: Transition, noise: LearningNoise) -> Array:
+            return jnp.sum(batch.weight * losses(params, target_critics, hp, batch, noise))
 
         params, opt_state = adam_step(
-            sum_of_losses, state.params, state.opt_state, (batch, noise), hp
+            sum_of_losses, state.params, state.opt_state, (batch, noise), hp, networks.unflatten
         )
         critics = networks.critics_of(params)
         return state.replace(

@@ -122,7 +122,7 @@ def better_signs(
 ) -> tuple[Float[Array, " half"], Float[Array, "half dims"]]:
     """Score and noise of each perturbation's better sign; the plus signs are the first half."""
     plus, minus = scores.reshape(2, -1)
-    rank_plus, rank_minus = (jnp.where(jnp.isfinite(x), x, -jnp.inf) for x in (plus, minus))
+    rank_minus, rank_plus = (jnp.where(jnp.isfinite(x), x, -jnp.inf) for x in (minus, plus))
     use_minus = rank_minus > rank_plus
     sign = jnp.where(use_minus, -1.0, 1.0)
     return jnp.where(use_minus, minus, plus), sign[:, None] * noise[: plus.shape[0]]
