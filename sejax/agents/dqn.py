@@ -224,7 +224,7 @@ def make_learning_step(
     def learn(state: DDQNState, batch: Transition) -> DDQNState:
         hp = state.hparams
 
-        target_params = unflatten(state.target_params)
+        tree, target_params = unflatten(state.params), unflatten(state.target_params)
 
         def sum_of_losses(params: PyTree, batch: Transition) -> Array:
             q_values: Any = network.apply(params, batch.obs)  # [actions, batch]
@@ -236,7 +236,7 @@ def make_learning_step(
             return jnp.sum(batch.weight * loss_fn(error))
 
         params, opt_state = adam_step(
-            sum_of_losses, state.params, state.opt_state, (batch,), hp, unflatten
+            sum_of_losses, state.params, state.opt_state, (batch,), hp, tree
         )
         tau = hp.tau
         if config.target_update_every > 1:

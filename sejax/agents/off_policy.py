@@ -113,7 +113,7 @@ def adam_step(
     opt_state: optax.OptState,
     columns: tuple[Transition, *tuple[PyTree, ...]],
     hparams: Hparams,
-    unflatten: Callable[[Array], PyTree] | None = None,
+    tree: PyTree = None,
 ) -> tuple[Float[Array, "*params"], optax.OptState]:
     """One step of Adam on a batch's mean loss, at the cost of the columns in use.
 
@@ -123,13 +123,13 @@ def adam_step(
       opt_state: of `flat.ADAM`.
       columns: a batch, and what else has its columns, such as noise.
       hparams: `learning_rate`, and `batch_size` in use or None.
-      unflatten: if given, `sum_of_losses` takes `unflatten(params)`.
+      tree: the same parameters as a pytree, if `sum_of_losses` takes them so.
     """
-    tree = params if unflatten is None else unflatten(params)
 
     def gradient(columns: PyTree) -> Array:
-        by_tree = jax.grad(sum_of_losses)(tree, *columns)
-        return by_tree if unflatten is None else flat.flatten(by_tree)
+        if tree is None:
+            return jax.grad(sum_of_losses)(params, *columns)
+        return flat.flatten(jax.grad(sum_of_losses)(tree, *columns))
 
     total = sum_over_batch(gradient, columns, hparams.batch_size)
     mean = total / num_columns(columns[0])

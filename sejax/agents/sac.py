@@ -281,13 +281,14 @@ def make_learning_step(
 
     def learn(state: SACState, batch: Transition, noise: LearningNoise) -> SACState:
         hp = state.hparams
+        tree = networks.unflatten(state.params)
         target_critics = networks.unflatten_critics(state.target_critics)
 
         def sum_of_losses(params: Params, batch: Transition, noise: LearningNoise) -> Array:
             return jnp.sum(batch.weight * losses(params, target_critics, hp, batch, noise))
 
         params, opt_state = adam_step(
-            sum_of_losses, state.params, state.opt_state, (batch, noise), hp, networks.unflatten
+            sum_of_losses, state.params, state.opt_state, (batch, noise), hp, tree
         )
         critics = networks.critics_of(params)
         return state.replace(
