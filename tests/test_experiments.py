@@ -221,10 +221,14 @@ def test_all_experiments_are_listed_and_nothing_else_is_a_command():
     done = subprocess.run([*run, "experiments"], capture_output=True, text=True, check=True)
     assert re.findall(r"^  (\w+)", done.stdout, re.MULTILINE) == NAMES
     assert set(TINY) == set(NAMES)
-    done = subprocess.run(
-        [*run, "experiments.se_models", "seed=-1"], capture_output=True, text=True
+    refused = (
+        "import runpy, sys; sys.argv[1:] = ['seed=-1']\n"
+        "try: runpy.run_module('experiments.se_models', run_name='__main__')\n"
+        "finally: print('gymnax' in sys.modules)"
     )
+    done = subprocess.run([sys.executable, "-c", refused], capture_output=True, text=True)
     assert done.returncode == 2 and done.stderr.startswith("error: seed ")
+    assert done.stdout == "False\n", "a refusal imports nothing that takes long"
 
 
 def test_commands_in_the_docs_are_accepted():

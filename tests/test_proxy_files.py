@@ -101,7 +101,8 @@ def test_a_loaded_proxy_steps_as_a_gymnax_environment():
     key, action = jax.random.key(1), jnp.int32(1)
     obs, _, reward, terminated, *_ = env.step(key, state, action, params)
     assert obs.shape == (4,) and reward.shape == () and terminated  # after its only step
-    assert env.step(key, state, action)[2] == reward, "wrappers may leave the params out"
+    without = env.step(key, state, action)[2]  # as wrappers call it
+    assert jnp.isclose(without, reward, rtol=1e-5)  # another program, which may round otherwise
 
 
 @pytest.fixture(scope="module")

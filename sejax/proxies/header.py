@@ -210,7 +210,7 @@ def read(
         holds a set or proxies of another kind.
     """
     path = find(source, option)
-    where = shortened(path, 80)
+    where = shortened(path, 60)
     try:
         size = path.stat().st_size
         if size > hub.MAX_BYTES:
