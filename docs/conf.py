@@ -64,7 +64,15 @@ autodoc_preserve_defaults = True
 maximum_signature_line_length = 88
 napoleon_numpy_docstring = False
 napoleon_custom_sections = [("Attributes", "params_style")]
-nitpick_ignore_regex = [("py:.*", r"(?!sejax\b).*")]  # other projects': no inventory is at hand
+nitpick_ignore_regex = [
+    ("py:.*", r"(?!sejax\b).*"),  # other projects': no inventory is at hand
+    # Type variables, and what only signatures name.
+    (
+        "py:class",
+        r"sejax\.(agents\.(base\.T|buffers\.State)|proxies\.configs\.Vector|envs\.environment\.(State|Params))",
+    ),
+    ("py:class", r"sejax\.(bilevel\.RunConfig|ops\.networks\.MLP)"),
+]
 
 # --- HTML ----------------------------------------------------------------------------------------
 

@@ -168,7 +168,8 @@ class Bilevel:
 class RunConfig(Protocol):
     """What `sejax.config` returns; `parts` are the arguments of `make_bilevel`."""
 
-    generations: int
+    @property
+    def generations(self) -> int: ...
 
     def parts(self) -> dict[str, Any]: ...
 
