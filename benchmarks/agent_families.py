@@ -9,8 +9,8 @@ hardly ever ends an episode. PPO learns when its rollout is full: it trains for 
 many steps, at least two, so that acting and learning have their usual shares.
 
 sejax trains the agents as the commands do, through `spread_over_devices` and with the agent's own
-number of lanes, but on one device. PyTorch trains `--torch-agents` of them one after the other, for
-as many steps each: what a step costs there does not depend on how many agents there are.
+number of agents in parallel, but on one device. PyTorch trains `--torch-agents` of them one after
+the other, for as many steps each: what a step costs there does not depend on how many there are.
 
 Both sides are kept to the same core and take turns, so that a disturbance meets both. Compilation
 is not counted, nor is a short training by PyTorch before the first. CPU time, unlike wall-clock,
@@ -23,11 +23,9 @@ import functools
 import importlib
 import os
 from dataclasses import dataclass, replace
-from statistics import median
 from typing import Any
 
 import common
-from rich.progress import track
 
 import sejax
 from sejax.options import registry
@@ -99,109 +97,64 @@ FAMILIES = {
 }
 
 
+# Name of an option -> value if --quick, value otherwise, what it counts.
+SIZES = {
+    "agents": (3, 40, "that sejax trains in each family"),
+    "torch_agents": (1, 3, "that PyTorch trains"),
+    "steps": (300, 2000, "of each agent"),
+    "pairs": (3, 3, "repetitions"),
+}
+
+
 def main() -> None:
     """Runs the benchmark, or one of its sides."""
     args = common.parse_args(__doc__, add_options)
-    set_defaults(args)
+    for name, (quick, full, _) in SIZES.items():
+        if getattr(args, name) is None:
+            setattr(args, name, quick if args.quick else full)
     if args.side:
         os.sched_setaffinity(0, {args.core})
         SIDES[args.side](args)
         return
+    names = args.families or list(FAMILIES)[: 3 if args.quick else None]
     machine = common.machine()
-    samples = measure_pairs(args)
-    result = summarise(samples)
-    show(result, args)
-    settings = {name: getattr(args, name) for name in SIZES} | {"core": args.core}
+    answers = measure_pairs(args, names)
+    rows = {name: common.compare_with_torch(mine) for name, mine in answers.items()}
+    share = common.share_of_core([*answers.values()])
+    common.show_comparison(f", {args.agents} agents", "agent, hyperparameters", rows, share)
+    settings = {name: getattr(args, name) for name in (*SIZES, "core")}
+    families = {name: row | {"steps": answers[name]["sejax"][0]["steps"]}
+                for name, row in rows.items()}  # fmt: skip
+    result = {"families": families, "share_of_core": share}
     common.finish("agent_families", args, {"machine": machine, "settings": settings, **result})
-
-
-# Name of an option -> value if --quick, value otherwise.
-SIZES = {"agents": (3, 40), "torch_agents": (1, 3), "steps": (300, 2000), "pairs": (3, 3)}
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Options of this benchmark."""
-    described = {
-        "agents": "that sejax trains in each family",
-        "torch_agents": "that PyTorch trains",
-        "steps": "of each agent",
-        "pairs": "repetitions",
-    }
-    for name, text in described.items():
-        quick, full = SIZES[name]
-        values = f"{quick} if --quick, else {full}" if quick != full else f"{full}"
-        parser.add_argument(f"--{name.replace('_', '-')}", type=int, help=f"{text} ({values})")
+    for name, (quick, full, text) in SIZES.items():
+        values = f"{text} ({quick} if --quick, else {full})"
+        parser.add_argument(common.option(name), type=int, help=values)
     parser.add_argument(
         "--families", nargs="+", choices=FAMILIES, metavar="FAMILY",
         help="rows of the table, such as 'td3, paper' (the first three if --quick, else all)",
     )  # fmt: skip
-    parser.add_argument("--core", type=int, default=common.available_cores()[-1])
+    common.add_core(parser)
 
 
-def set_defaults(args: argparse.Namespace) -> None:
-    """Fills in the sizes and families that were not given."""
-    for name, (quick, full) in SIZES.items():
-        if getattr(args, name) is None:
-            setattr(args, name, quick if args.quick else full)
-    args.families = args.families or list(FAMILIES)[: 3 if args.quick else None]
-
-
-def measure_pairs(args: argparse.Namespace) -> list[dict[str, Any]]:
-    """One sample for each family and pair: CPU seconds and steps of both sides."""
-    names = ("agents", "torch_agents", "steps", "core", "seed")
-    options = [x for name in names for x in (f"--{name.replace('_', '-')}", getattr(args, name))]
-    samples = []
-    with (
-        common.Side(__file__, "sejax", *options) as sejax_side,
-        common.Side(__file__, "torch", *options) as torch_side,
-    ):
-        for family in track(args.families, "Measuring", transient=True):
-            sides = [sejax_side, torch_side] if FAMILIES[family].reference else [sejax_side]
-            prepared = sejax_side.ask(family=family)
-            if torch_side in sides:
-                torch_side.ask(family=family, weights=prepared["weights"])
-            for pair in range(args.pairs):
-                seed = args.seed + pair
-                times = {side.name: side.ask(family=family, seed=seed) for side in sides}
-                samples.append({"family": family, **times})
-    return samples
-
-
-def summarise(samples: list[dict[str, Any]]) -> dict[str, Any]:
-    """Medians and ranges of both sides' times and of the ratios within the pairs."""
-    result: dict[str, Any] = {"families": {}}
-    for family in dict.fromkeys(sample["family"] for sample in samples):
-        chosen = [sample for sample in samples if sample["family"] == family]
-        times = {
-            side: [1e6 * sample[side]["cpu_s"] / sample[side]["steps"] for sample in chosen]
-            for side in SIDES
-            if side in chosen[0]
-        }
-        row = {f"{side}_us": common.spread(values) for side, values in times.items()}
-        if "torch" in times:
-            ratios = [b / a for a, b in zip(times["sejax"], times["torch"], strict=True)]
-            row["ratio"] = common.spread(ratios)
-        result["families"][family] = row | {"steps": chosen[0]["sejax"]["steps"]}
-    result["share_of_core"] = median(
-        sample[side]["cpu_s"] / sample[side]["wall_s"]
-        for sample in samples for side in SIDES if side in sample
-    )  # fmt: skip
-    return result
-
-
-def show(result: dict[str, Any], args: argparse.Namespace) -> None:
-    """Prints the table."""
-    rows = [
-        [family, *(common.show_spread(row[column]) if column in row else "-"
-                   for column in ("sejax_us", "torch_us", "ratio"))]
-        for family, row in result["families"].items()
-    ]  # fmt: skip
-    common.print_table(
-        f"CPU microseconds per agent step on one core, {args.agents} agents, median (min to max)",
-        ["agent, hyperparameters", "sejax", "PyTorch", "PyTorch / sejax"],
-        rows,
-    )
-    print(f"Share of the core that these processes got: {result['share_of_core']:.0%}")
+def measure_pairs(args: argparse.Namespace, names: list[str]) -> dict[str, common.Answers]:
+    """What both sides answer about each family."""
+    options = {x: getattr(args, x) for x in ("agents", "torch_agents", "steps", "core", "seed")}
+    answers = {}
+    with common.sides_of(__file__, common.PAIR, **options) as sides:
+        for name in names:
+            has_reference = FAMILIES[name].reference is not None
+            mine = sides if has_reference else {"sejax": sides["sejax"]}
+            weights = sides["sejax"].ask(family=name)["weights"]
+            if has_reference:
+                sides["torch"].ask(family=name, weights=weights)
+            requests = [{"family": name, "seed": args.seed + pair} for pair in range(args.pairs)]
+            answers[name] = common.in_turns(mine, requests, warm_up=False)
+    return answers
 
 
 def sejax_side(args: argparse.Namespace) -> None:

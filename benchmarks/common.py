@@ -2,18 +2,19 @@
 
 Each benchmark is a parent that only asks and prints, and *sides*: subprocesses of the same script
 (`--side NAME`) that set up their own threads and devices, compile, and then measure on request.
-Settings of one side never reach another, and a side starts once, however often it measures.
+Settings of one side never reach another, and a side starts once, however often it measures. Sides
+take turns, so that a disturbance of the machine meets all of them.
 """
 
 import argparse
+import contextlib
 import json
 import os
 import platform
-import resource
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cached_property
 from importlib.metadata import version
 from pathlib import Path
@@ -21,9 +22,12 @@ from statistics import median
 from typing import Any
 
 from rich.console import Console
+from rich.progress import track
 from rich.table import Table
 
 Handler = Callable[[dict[str, Any]], dict[str, Any]]
+Answers = dict[str, list[dict[str, Any]]]  # of each side, one for each time that it measured
+PAIR = ("sejax", "torch")  # the sides of a comparison with PyTorch
 
 
 def parse_args(
@@ -40,16 +44,23 @@ def parse_args(
     return parser.parse_args()
 
 
+def add_core(parser: argparse.ArgumentParser) -> None:
+    """The option of the core that all sides are kept to."""
+    parser.add_argument("--core", type=int, default=available_cores()[-1])
+
+
+# --- sides ---------------------------------------------------------------------------------------
+
+
 class Side:
     """A subprocess that answers requests, a JSON object on a line each way."""
 
-    def __init__(self, script: str, name: str, *options: object, env: dict[str, str] | None = None):
+    def __init__(self, script: str, name: str, *options: object):
         command = [sys.executable, script, "--side", name, *map(str, options)]
         self.name = name
         self._process = subprocess.Popen(
-            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
-            env=os.environ | (env or {}),
-        )  # fmt: skip
+            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        )
 
     @cached_property
     def ready(self) -> dict[str, Any]:
@@ -90,6 +101,39 @@ class Side:
         return json.loads(line)
 
 
+@contextlib.contextmanager
+def sides_of(script: str, names: Sequence[str], **options: object) -> Iterator[dict[str, Side]]:
+    """Sides of a script by their names, with these options of the command line."""
+    words = [word for name, value in options.items() for word in (option(name), value)]
+    with contextlib.ExitStack() as stack:
+        yield {name: stack.enter_context(Side(script, name, *words)) for name in names}
+
+
+def option(name: str) -> str:
+    """A name as an option of the command line."""
+    return f"--{name.replace('_', '-')}"
+
+
+def in_turns(
+    sides: Mapping[str, Side], requests: Sequence[dict[str, Any]], warm_up: bool = True
+) -> Answers:
+    """The sides' answers to each request; all sides answer one before the next is made.
+
+    Args:
+      sides: by their names.
+      requests: what they are asked.
+      warm_up: whether the first request is made once before, and not counted.
+    """
+    answers: Answers = {name: [] for name in sides}
+    first = requests[:1] if warm_up else []
+    for place, request in enumerate(track([*first, *requests], "Measuring", transient=True)):
+        for name, side in sides.items():
+            answer = side.ask(**request)
+            if place >= len(first):
+                answers[name].append(answer)
+    return answers
+
+
 def serve(ready: dict[str, Any], handle: Handler) -> None:
     """A side's main loop: says that it is ready, then answers until its input ends."""
     print(json.dumps(ready), flush=True)
@@ -109,9 +153,7 @@ def available_cores() -> list[int]:
     return sorted(os.sched_getaffinity(0))
 
 
-def peak_memory_mib() -> float:
-    """The most memory that this process has held so far."""
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+# --- results -------------------------------------------------------------------------------------
 
 
 def spread(values: Sequence[float]) -> dict[str, float]:
@@ -119,10 +161,50 @@ def spread(values: Sequence[float]) -> dict[str, float]:
     return {"median": median(values), "min": min(values), "max": max(values)}
 
 
-def show_spread(values: dict[str, float], digits: int = 1) -> str:
-    """`median (min to max)`."""
+def show_spread(values: dict[str, float] | None, digits: int = 1) -> str:
+    """`median (min to max)`, or `-` if nothing was measured."""
+    if values is None:
+        return "-"
     middle, low, high = (f"{values[k]:,.{digits}f}" for k in ("median", "min", "max"))
     return f"{middle} ({low} to {high})"
+
+
+def compare_with_torch(answers: Answers) -> dict[str, Any]:
+    """CPU microseconds of a step on each side of `PAIR` that is there, and the ratio in pairs.
+
+    Answers have `cpu_s`, `wall_s` and `steps`.
+    """
+    times = {
+        side: [1e6 * each["cpu_s"] / each["steps"] for each in mine]
+        for side, mine in answers.items()
+    }
+    row: dict[str, Any] = {f"{side}_us": spread(values) for side, values in times.items()}
+    if set(PAIR) <= times.keys():
+        ratios = [b / a for a, b in zip(*(times[side] for side in PAIR), strict=True)]
+        row |= {"ratio": spread(ratios), "ratios": [round(ratio, 2) for ratio in ratios]}
+    return row
+
+
+def share_of_core(every: Sequence[Answers]) -> float:
+    """The median share of a core that the sides got."""
+    return median(
+        each["cpu_s"] / each["wall_s"]
+        for answers in every for mine in answers.values() for each in mine
+    )  # fmt: skip
+
+
+def show_comparison(
+    title: str, what: str, rows: Mapping[str, dict[str, Any]], share: float
+) -> None:
+    """Prints a table of rows from `compare_with_torch`, by their names, and `share_of_core`."""
+    columns = ("sejax_us", "torch_us", "ratio")
+    print_table(
+        f"CPU microseconds per agent step on one core{title}, median (min to max)",
+        [what, "sejax", "PyTorch", "PyTorch / sejax"],
+        [[name, *(show_spread(row.get(column)) for column in columns)]
+         for name, row in rows.items()],
+    )  # fmt: skip
+    print(f"Share of the core that these processes got: {share:.0%}")
 
 
 def machine(packages: Sequence[str] = ("jax", "torch", "sejax")) -> dict[str, Any]:

@@ -22,12 +22,12 @@ starts the sides at the same time, which makes "start s" longer.
 """
 
 import argparse
+import contextlib
 import math
 from statistics import mean, median
 from typing import Any
 
 import common
-from rich.console import Console
 
 QUICK = ["es.population_size=2", "training.max_episodes=5"]
 ALL, ONE, TORCH = "sejax", "sejax-one-device", "torch"
@@ -64,24 +64,19 @@ def measure_sides(args: argparse.Namespace) -> dict[str, Any]:
     args.repeats = args.repeats or (2 if args.quick else 1)
     options = ["--cores", args.cores, "--seed", args.seed, *(["--quick"] if args.quick else [])]
     sides = {}
-    with Console().status("Starting and compiling"):
+    with contextlib.ExitStack() as stack:
         for name in SIDES if not args.quick else (ALL, TORCH):
-            sides[name] = common.Side(__file__, name, *options, *args.overrides)
+            side = common.Side(__file__, name, *options, *args.overrides)
+            sides[name] = stack.enter_context(side)
             if not args.quick:
-                assert sides[name].ready  # one after the other, for the start's own time
+                assert side.ready  # one after the other, for the start's own time
         starts = {name: side.ready["start_s"] for name, side in sides.items()}
-    weights = sides[ALL].ready["weights"]
-    samples: dict[str, list[dict[str, Any]]] = {name: [] for name in sides}
-    for _ in range(args.repeats):
-        for name, side in sides.items():
-            with Console().status(f"One generation: {TITLES[name]}"):
-                samples[name].append(side.ask(weights=weights))
-    for side in sides.values():
-        side.close()
+        request = {"weights": sides[ALL].ready["weights"]}
+        samples = common.in_turns(sides, [request] * args.repeats, warm_up=False)
     return compare(samples, starts)
 
 
-def compare(samples: dict[str, list[dict[str, Any]]], starts: dict[str, float]) -> dict[str, Any]:
+def compare(samples: common.Answers, starts: dict[str, float]) -> dict[str, Any]:
     """Each side's medians, and the ratios between the sides."""
     sides = {name: summarise(samples[name]) | {"start_s": starts[name]} for name in samples}
     ours, torch = sides[ALL], sides[TORCH]

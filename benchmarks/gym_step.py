@@ -24,10 +24,10 @@ SIDES = {
     "numpy": "sejax.gym.make, an SE of one step",
     "numpy-soft": "sejax.gym.make, the soft SE",
     "numpy-rn": "sejax.gym.make, cartpole-rn",
-    "numpy-batch": f"sejax.gym.make_vec, {NUM_ENVS} lanes, an SE of one step",
-    "numpy-batch-soft": f"sejax.gym.make_vec, {NUM_ENVS} lanes, the soft SE",
+    "numpy-batch": f"sejax.gym.make_vec, {NUM_ENVS} environments, an SE of one step",
+    "numpy-batch-soft": f"sejax.gym.make_vec, {NUM_ENVS} environments, the soft SE",
     "gymnax": "gymnax's wrapper, an SE of one step",
-    "gymnax-batch": f"gymnax's vector wrapper, {NUM_ENVS} lanes, an SE of one step",
+    "gymnax-batch": f"gymnax's vector wrapper, {NUM_ENVS} environments, an SE of one step",
     "CartPole-v1": "Gymnasium's CartPole-v1",
     "Acrobot-v1": "Gymnasium's Acrobot-v1",
 }
@@ -40,36 +40,24 @@ def main() -> None:
         return
     repeats = min(args.repeats, 3) if args.quick else args.repeats
     where = common.machine(("jax", "gymnasium", "gymnax", "numpy", "sejax"))
-    sides = {name: common.Side(__file__, name, "--core", args.core, "--seed", args.seed)
-             for name in SIDES}  # fmt: skip
-    times: dict[str, list[float]] = {name: [] for name in SIDES}
-    for repeat in range(repeats + 1):
-        for name, side in sides.items():
-            used = side.ask()["us"]
-            if repeat:  # the first one warms up
-                times[name].append(used)
-    for side in sides.values():
-        side.close()
-    result = {"us": {name: common.spread(times[name]) for name in SIDES}, "machine": where}
-    show(result)
-    common.finish("gym_step", args, result)
+    with common.sides_of(__file__, [*SIDES], core=args.core, seed=args.seed) as sides:
+        answers = common.in_turns(sides, [{}] * repeats)
+    us = {name: common.spread([each["us"] for each in mine]) for name, mine in answers.items()}
+    rows = [[SIDES[name], common.show_spread(values, 2)] for name, values in us.items()]
+    title = "CPU time of a step of one environment, median (min to max)"
+    common.print_table(title, ["side", "µs"], rows)
+    common.finish("gym_step", args, {"us": us, "machine": where})
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--repeats", type=int, default=15)
-    parser.add_argument("--core", type=int, default=common.available_cores()[-1])
-
-
-def show(result: dict[str, Any]) -> None:
-    rows = [[SIDES[name], common.show_spread(us, 2)] for name, us in result["us"].items()]
-    common.print_table("CPU time of a step of one environment, median (min to max)",
-                       ["side", "µs"], rows)  # fmt: skip
+    common.add_core(parser)
 
 
 def serve(args: argparse.Namespace) -> None:
     """A side."""
     os.sched_setaffinity(0, {args.core})
-    walk, num_steps = (walk_in_lanes if "batch" in args.side else walk_alone)(args.side, args.seed)
+    walk, num_steps = (walk_many if "batch" in args.side else walk_alone)(args.side, args.seed)
 
     def handle(_: dict[str, Any]) -> dict[str, Any]:
         return {"us": common.measure(walk)[1]["cpu_s"] / num_steps * 1e6}
@@ -95,8 +83,8 @@ def walk_alone(side: str, seed: int) -> tuple[Callable[[], None], int]:
     return walk, num_steps
 
 
-def walk_in_lanes(side: str, seed: int) -> tuple[Callable[[], None], int]:
-    """Likewise in lanes, which begin their episodes by themselves; steps of all lanes."""
+def walk_many(side: str, seed: int) -> tuple[Callable[[], None], int]:
+    """Likewise in many, which begin their episodes by themselves; steps of all of them."""
     envs: Any
     if side == "gymnax-batch":
         envs, num_steps = make_gymnax(NUM_ENVS), NUM_STEPS["jax batch"]

@@ -1,9 +1,10 @@
 """Which of brax's physics to use for HalfCheetah: what a step costs, and how like MuJoCo it is.
 
 The task of the paper runs on MuJoCo, which moves one body at a time on one core. Here every backend
-of brax is timed, as one cheetah and as 32 in lanes, and is given the same gaits as MuJoCo itself:
-sinusoidal torques of several frequencies and phases, and random ones, from rest. Their returns say
-whether what runs in MuJoCo runs there. MuJoCo's own model is Gymnasium's `half_cheetah.xml`.
+of brax is timed, as one cheetah and as 32 in parallel, and is given the same gaits as MuJoCo
+itself: sinusoidal torques of several frequencies and phases, and random ones, from rest. Their
+returns say whether what runs in MuJoCo runs there. MuJoCo's own model is Gymnasium's
+`half_cheetah.xml`.
 """
 
 import argparse
@@ -21,7 +22,7 @@ GAIT_STEPS = 200
 DT = 0.05  # seconds of a control step: five physics steps of 0.01
 MUJOCO_FRAMES = 5
 NUM_JOINTS = 6
-LANES = 32
+NUM_PARALLEL = 32
 
 
 def main() -> None:
@@ -36,11 +37,12 @@ def main() -> None:
     mujoco = {"step_us": mujoco_us, "lanes_us": None, "compile_s": None}
     rows = [{"physics": "MuJoCo", **mujoco, **compare(expected, expected)}]
     for backend in args.backends:
-        with common.Side(__file__, backend, "--gaits", args.gaits, "--seed", args.seed) as side:
-            measured = side.ask()
+        options = {"gaits": args.gaits, "seed": args.seed}
+        with common.sides_of(__file__, [backend], **options) as sides:
+            measured = sides[backend].ask()
         returns = np.array(measured.pop("returns"))
         rows.append({"physics": backend, **measured, **compare(returns, expected)})
-    columns = ["physics", "µs a step", f"in {LANES} lanes", "compile s", "mean return",
+    columns = ["physics", "µs a step", f"{NUM_PARALLEL} in parallel", "compile s", "mean return",
                "correlation", "mean difference"]  # fmt: skip
     cells = [
         [row["physics"], *(_number(row[key]) for key in ("step_us", "lanes_us", "compile_s")),
@@ -115,24 +117,24 @@ def serve_backend(args: argparse.Namespace) -> None:
 
     task = envs.make("halfcheetah", backend=args.side)
     actions = jnp.asarray(gaits(args.gaits, args.seed))
-    num_parallel = jnp.resize(actions, (LANES, *actions.shape[1:]))
-    state = at_rest_state(task.env)
+    many_actions = jnp.resize(actions, (NUM_PARALLEL, *actions.shape[1:]))
+    state, key = at_rest_state(task.env), jax.random.key(0)  # which has no effect
 
     def play(gait: Any) -> Any:
         def step(state: Any, torques: Any) -> Any:
-            _, state, reward, _, _ = task.env.step_env(None, state, torques, task.params)
+            _, state, reward, _, _ = task.env.step_env(key, state, torques, task.params)
             return state, reward
 
         return jax.lax.scan(step, state, gait)[1].sum()
 
     def handle(_: dict[str, Any]) -> dict[str, Any]:
         one, compiling = common.measure(lambda: jax.jit(play).lower(actions[0]).compile())
-        many = jax.jit(jax.vmap(play)).lower(num_parallel).compile()
+        many = jax.jit(jax.vmap(play)).lower(many_actions).compile()
         returns, used = common.measure(lambda: [float(one(gait)) for gait in actions])
-        _, in_lanes = common.measure(lambda: jax.block_until_ready(many(num_parallel)))
+        _, together = common.measure(lambda: jax.block_until_ready(many(many_actions)))
         return {
             "step_us": used["cpu_s"] / (args.gaits * GAIT_STEPS) * 1e6,
-            "lanes_us": in_lanes["cpu_s"] / (LANES * GAIT_STEPS) * 1e6,
+            "lanes_us": together["cpu_s"] / (NUM_PARALLEL * GAIT_STEPS) * 1e6,
             "compile_s": compiling["cpu_s"], "returns": returns,
         }  # fmt: skip
 

@@ -13,11 +13,9 @@ sides down (caches, clock rate). The ratio of a pair is what to quote: PyTorch's
 
 import argparse
 import os
-from statistics import median
 from typing import Any
 
 import common
-from rich.progress import track
 
 OVERRIDES = ["preset=paper", "training.stop_rule=never"]
 KINDS = {True: "with learning", False: "without learning"}
@@ -30,11 +28,14 @@ def main() -> None:
         os.sched_setaffinity(0, {args.core})
         SIDES[args.side](args)
         return
+    args.pairs = args.pairs or (5 if args.quick else 15)
     machine = common.machine()
-    samples = measure_pairs(args)
-    result = summarise(samples)
-    show(result)
+    answers = measure_pairs(args)
+    rows = {kind: common.compare_with_torch(mine) for kind, mine in answers.items()}
+    share = common.share_of_core([*answers.values()])
+    common.show_comparison("", "step", rows, share)
     settings = {"episodes": args.episodes, "pairs": args.pairs, "core": args.core}
+    result = {kind.replace(" ", "_"): row for kind, row in rows.items()} | {"share_of_core": share}
     common.finish("inner_step", args, {"machine": machine, "settings": settings, **result})
 
 
@@ -42,64 +43,26 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     """Options of this benchmark."""
     parser.add_argument("--episodes", type=int, default=10, help="in a training, of 200 steps each")
     parser.add_argument("--pairs", type=int, help="repetitions (5 if --quick, else 15)")
-    parser.add_argument("--core", type=int, default=common.available_cores()[-1])
+    common.add_core(parser)
 
 
-def measure_pairs(args: argparse.Namespace) -> list[dict[str, Any]]:
-    """One sample for each pair and kind of step: microseconds per step of both sides."""
-    pairs = args.pairs or (5 if args.quick else 15)
-    args.pairs = pairs
-    options = ("--episodes", args.episodes, "--core", args.core, "--seed", args.seed)
-    samples = []
-    with (
-        common.Side(__file__, "sejax", *options) as sejax_side,
-        common.Side(__file__, "torch", *options) as torch_side,
-    ):
-        weights = sejax_side.ready["weights"]
-        for pair in track(range(-1, pairs), "Measuring", transient=True):
-            for learning in KINDS:
-                request = {"learning": learning, "seed": args.seed + pair + 1, "weights": weights}
-                times = {side.name: side.ask(**request) for side in (sejax_side, torch_side)}
-                if pair >= 0:  # the one before warms up
-                    samples.append({"learning": learning, **times})
-    return samples
-
-
-def summarise(samples: list[dict[str, Any]]) -> dict[str, Any]:
-    """Medians and ranges of both sides' times and of the ratios within the pairs."""
-    result: dict[str, Any] = {}
-    for learning, kind in KINDS.items():
-        chosen = [sample for sample in samples if sample["learning"] == learning]
-        times = {
-            side: [1e6 * sample[side]["cpu_s"] / sample[side]["steps"] for sample in chosen]
-            for side in SIDES
+def measure_pairs(args: argparse.Namespace) -> dict[str, common.Answers]:
+    """What both sides answer about each kind of step; the two kinds take turns."""
+    options = {"episodes": args.episodes, "core": args.core, "seed": args.seed}
+    answers: dict[str, common.Answers] = {}
+    with common.sides_of(__file__, common.PAIR, **options) as sides:
+        weights = sides["sejax"].ready["weights"]
+        requests = [
+            {"learning": learning, "seed": args.seed + pair, "weights": weights}
+            for pair in range(args.pairs + 1)  # the first one warms up
+            for learning in KINDS
+        ]
+        every = common.in_turns(sides, requests, warm_up=False)
+    for place, kind in enumerate(KINDS.values()):
+        answers[kind] = {
+            name: mine[len(KINDS) + place :: len(KINDS)] for name, mine in every.items()
         }
-        ratios = [b / a for a, b in zip(times["sejax"], times["torch"], strict=True)]
-        result[kind.replace(" ", "_")] = {
-            "sejax_us": common.spread(times["sejax"]),
-            "torch_us": common.spread(times["torch"]),
-            "ratio": common.spread(ratios),
-            "ratios": [round(ratio, 2) for ratio in ratios],
-        }
-    result["share_of_core"] = median(
-        sample[side]["cpu_s"] / sample[side]["wall_s"] for sample in samples for side in SIDES
-    )
-    return result
-
-
-def show(result: dict[str, Any]) -> None:
-    """Prints the table."""
-    rows = [
-        [kind, *(common.show_spread(result[kind.replace(" ", "_")][column])
-                 for column in ("sejax_us", "torch_us", "ratio"))]
-        for kind in KINDS.values()
-    ]  # fmt: skip
-    common.print_table(
-        "CPU microseconds per agent step on one core, median (min to max)",
-        ["step", "sejax", "PyTorch", "PyTorch / sejax"],
-        rows,
-    )
-    print(f"Share of the core that these processes got: {result['share_of_core']:.0%}")
+    return answers
 
 
 def sejax_side(args: argparse.Namespace) -> None:

@@ -42,36 +42,29 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--tasks", nargs="+", default=list(TASKS), choices=TASKS)
     parser.add_argument("--task", help=argparse.SUPPRESS)
     parser.add_argument("--repeats", type=int, default=5)
-    parser.add_argument("--core", type=int, default=common.available_cores()[-1])
+    common.add_core(parser)
 
 
 def compare(task: str, names: list[str], args: argparse.Namespace) -> dict[str, Any]:
     """Microseconds of a step of each side, and how many times sejax's that is, in pairs."""
-    sides = {name: common.Side(__file__, name, "--task", task, "--core", args.core)
-             for name in names}  # fmt: skip
-    compiled = {name: side.ready["compile_s"] for name, side in sides.items()}
-    times: dict[str, list[float]] = {name: [] for name in names}
-    for repeat in range(args.repeats + 1):
-        for name, side in sides.items():
-            used = side.ask()["us"]
-            if repeat:  # the first one warms up
-                times[name].append(used)
-    for side in sides.values():
-        side.close()
-    ratios = {
-        name: [b / a for a, b in zip(times["mujoco"], times[name], strict=True)] for name in names
-    }
+    with common.sides_of(__file__, names, task=task, core=args.core) as sides:
+        compiled = {name: side.ready["compile_s"] for name, side in sides.items()}
+        answers = common.in_turns(sides, [{}] * args.repeats)
+    times = {name: [each["us"] for each in mine] for name, mine in answers.items()}
     return {
-        name: {"us": common.spread(times[name]), "ratio": common.spread(ratios[name]),
-               "compile_s": compiled[name]}
-        for name in names
-    }  # fmt: skip
+        name: {
+            "us": common.spread(mine),
+            "ratio": common.spread([b / a for a, b in zip(times["mujoco"], mine, strict=True)]),
+            "compile_s": compiled[name],
+        }
+        for name, mine in times.items()
+    }
 
 
 def compare_devices(args: argparse.Namespace) -> dict[str, Any]:
     """Seconds of the same walks on one device and on two, and the ratio within pairs."""
-    with common.Side(__file__, "devices", "--task", "halfcheetah") as side:
-        pairs = [side.ask() for _ in range(args.repeats + 1)][1:]
+    with common.sides_of(__file__, ["devices"], task="halfcheetah") as sides:
+        pairs = common.in_turns(sides, [{}] * args.repeats)["devices"]
     ratios = [pair["one"] / pair["two"] for pair in pairs]
     return {
         "one_s": common.spread([pair["one"] for pair in pairs]),
@@ -135,9 +128,7 @@ def serve_sejax(args: argparse.Namespace) -> None:
     options = {} if args.side == "mujoco" else {"backend": args.side}
     task, num_steps = envs.make(args.task, **options), NUM_STEPS[args.side]
     key = jax.random.key(args.seed)
-    walk, used = common.measure(
-        lambda: jax.jit(walk_of(task, num_steps)).lower(key).compile()
-    )  # fmt: skip
+    walk, used = common.measure(lambda: jax.jit(walk_of(task, num_steps)).lower(key).compile())
 
     def handle(_: dict[str, Any]) -> dict[str, Any]:
         _, used = common.measure(lambda: jax.block_until_ready(walk(key)))

@@ -57,13 +57,10 @@ def main() -> None:
         seeds = range(args.seed, args.seed + num_seeds)
         tables[name] = [curve_of(args, name, seed, generations) for seed in seeds]
         rows.append(summarise(name, tables[name], envs.make(args.env).solved_reward))
-    columns = list(rows[0])
-    common.print_table(f"{args.env}: time to a solved proxy", columns,
-                       [[str(row[c]) for c in columns] for row in rows])  # fmt: skip
+    title = f"{args.env}: time to a solved proxy"
+    common.print_table(title, [*rows[0]], [[*row.values()] for row in rows])
     if args.figure:
         draw(tables, envs.make(args.env).solved_reward, args.figure)
-    if args.markdown:
-        args.markdown.write_text(to_markdown(columns, rows))
     common.finish("time_to_solve", args, {"env": args.env, "settings": rows})
 
 
@@ -75,7 +72,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--curves", type=Path, metavar="CSV", help="curves of all finished seeds; "
                         "results/time_to_solve/ENV.csv")  # fmt: skip
     parser.add_argument("--figure", type=Path, help="draw the curves of all seeds there")
-    parser.add_argument("--markdown", type=Path, help="write the table there")
 
 
 def curve_of(args: argparse.Namespace, setting: str, seed: int, generations: int) -> pd.DataFrame:
@@ -143,11 +139,6 @@ def summarise(name: str, curves: list[pd.DataFrame], solved_reward: float) -> di
 
 def _spread(values: pd.Series, form: str) -> str:
     return f"{values.median():{form}} ({values.min():{form}} to {values.max():{form}})"
-
-
-def to_markdown(columns: list[str], rows: list[dict[str, Any]]) -> str:
-    lines = [columns, ["---"] * len(columns), *[[str(row[c]) for c in columns] for row in rows]]
-    return "".join(f"| {' | '.join(line)} |\n" for line in lines)
 
 
 def draw(tables: dict[str, list[pd.DataFrame]], solved_reward: float, path: Path) -> None:

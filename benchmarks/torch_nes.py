@@ -62,7 +62,7 @@ def evaluate(weights: Weights, settings: Settings, seed: int) -> Outcome:
     start = time.process_time()
     agent, training = settings.agent, settings.training
     result = train(SyntheticEnv(weights, settings.proxy), agent, training, seed)
-    returns = play_test_episodes(result.agent, agent, training.test_episodes, seed + 1)
+    returns = play_test_episodes(result.agent.state, agent, training.test_episodes, seed + 1)
     return Outcome(
         score=math.nan if result.nonfinite else float(returns.mean()),
         train_steps=result.train_steps,

@@ -340,37 +340,6 @@ class TrainResult:
     nonfinite: bool
 
 
-def train(env: SyntheticEnv, hp: DDQNConfig, training: TrainingConfig, seed: int) -> TrainResult:
-    """Trains one agent on the SE until the plateau rule fires or its steps or episodes are used up.
-
-    Raises:
-      ValueError: if the configurations ask for what is not built here.
-
-    Source: paper, Algorithm 1, TrainAgent.
-    """
-    if type(hp) is not DDQNConfig or training.stop_rule not in ("plateau", "never"):
-        raise ValueError("the reference is of agent=ddqn, training.stop_rule=plateau or never.")
-    torch.manual_seed(seed)
-    random.seed(seed)
-    rng = np.random.default_rng(seed)
-    agent = init_ddqn(hp)
-    max_steps = training.max_steps or training.max_episodes * MAX_STEPS
-    buffer = ReplayBuffer(min(hp.buffer_size, max_steps), hp.batch_size)
-    returns: list[float] = []
-    train_steps = 0
-    while True:
-        obs = torch.from_numpy(CartPole.reset(rng, 1)[0])
-        limit = min(MAX_STEPS, max_steps - train_steps)
-        episode = play_episode(env, agent, buffer, obs, len(returns), limit, hp)
-        train_steps += episode.steps
-        returns.append(episode.total)
-        is_over = should_stop(returns, training, hp.warmup_episodes)
-        if episode.nonfinite or train_steps >= max_steps or is_over:
-            break
-    nonfinite = episode.nonfinite or not agent.online.all_finite()
-    return TrainResult(agent=agent, train_steps=train_steps, returns=returns, nonfinite=nonfinite)
-
-
 class StepLearner(Protocol):
     """An agent as `train_for` needs it; it changes in place."""
 
@@ -385,12 +354,19 @@ class StepLearner(Protocol):
 
 
 def train_for(
-    env: SyntheticEnv, agent: StepLearner, reset: Callable[[], Tensor], num_steps: int
+    env: SyntheticEnv,
+    agent: StepLearner,
+    reset: Callable[[], Tensor],
+    num_steps: int,
+    is_over: Callable[[list[float]], bool] = lambda returns: False,
 ) -> TrainResult:
-    """Trains an agent on the SE for so many steps; episodes start from `reset()`."""
+    """Trains an agent on the SE for so many steps; episodes start from `reset()`.
+
+    It ends before if `is_over` says so of the returns of all episodes, after each of them.
+    """
     obs, total, episode_steps = reset(), 0.0, 0
     returns: list[float] = []
-    for train_steps in range(1, num_steps + 1):  # noqa: B007 (used below)
+    for train_steps in range(1, num_steps + 1):
         action = agent.act(obs)
         step = env.step(obs, action)
         total += step.reward
@@ -398,8 +374,10 @@ def train_for(
         ended = step.terminated or episode_steps == MAX_STEPS
         agent.observe(obs, action, step, ended)
         obs = step.obs
-        if ended:
+        if ended or train_steps == num_steps:
             returns.append(total)
+            if is_over(returns):
+                break
             obs, total, episode_steps = reset(), 0.0, 0
         if step.nonfinite:
             break
@@ -407,42 +385,51 @@ def train_for(
     return TrainResult(agent=agent, train_steps=train_steps, returns=returns, nonfinite=nonfinite)
 
 
-class Episode(NamedTuple):
-    """What came of one training episode."""
+def train(env: SyntheticEnv, hp: DDQNConfig, training: TrainingConfig, seed: int) -> TrainResult:
+    """Trains one agent on the SE until the plateau rule fires or its steps or episodes are used up.
 
-    steps: int
-    total: float
-    nonfinite: bool
+    Raises:
+      ValueError: if the configurations ask for what is not built here.
+
+    Source: paper, Algorithm 1, TrainAgent.
+    """
+    if type(hp) is not DDQNConfig or training.stop_rule not in ("plateau", "never"):
+        raise ValueError("the reference is of agent=ddqn, training.stop_rule=plateau or never.")
+    torch.manual_seed(seed)
+    random.seed(seed)
+    rng = np.random.default_rng(seed)
+    max_steps = training.max_steps or training.max_episodes * MAX_STEPS
+    return train_for(
+        env,
+        DDQNAgent(hp, max_steps),
+        lambda: torch.from_numpy(CartPole.reset(rng, 1)[0]),
+        max_steps,
+        lambda returns: should_stop(returns, training, hp.warmup_episodes),
+    )
 
 
-def play_episode(
-    env: SyntheticEnv,
-    agent: DDQNState,
-    buffer: ReplayBuffer,
-    obs: Tensor,
-    episode: int,
-    max_steps: int,
-    hp: DDQNConfig,
-) -> Episode:
-    """One training episode: each step acts, steps the SE, stores, and learns once."""
-    epsilon = epsilon_at(episode, hp)
-    total = 0.0
-    num_steps = 0
-    for _ in range(max_steps):
-        num_steps += 1
-        if random.random() < epsilon:
-            action = random.randrange(NUM_ACTIONS)
-        else:
-            action = greedy_action(agent, obs, hp.activation)
-        next_obs, reward, discount, terminated, nonfinite = env.step(obs, action)
-        buffer.store(obs, next_obs, action, reward, discount)
-        if episode >= hp.warmup_episodes:
-            ddqn_update(agent, buffer.sample(), hp)
-        obs = next_obs
-        total += reward
-        if terminated:
-            break
-    return Episode(num_steps, total, nonfinite)
+class DDQNAgent:
+    """What `train_for` takes: acts epsilon-greedily, and learns in each step after the warm-up."""
+
+    def __init__(self, config: DDQNConfig, max_steps: int):
+        self.state = init_ddqn(config)
+        self._config = config
+        self._buffer = ReplayBuffer(min(config.buffer_size, max_steps), config.batch_size)
+        self._episode = 0
+
+    def act(self, obs: Tensor) -> int:
+        if random.random() < epsilon_at(self._episode, self._config):
+            return random.randrange(NUM_ACTIONS)
+        return greedy_action(self.state, obs, self._config.activation)
+
+    def observe(self, obs: Tensor, action: int | Tensor, step: Step, ended: bool) -> None:
+        self._buffer.store(obs, step.obs, action, step.reward, step.discount)
+        if self._episode >= self._config.warmup_episodes:
+            ddqn_update(self.state, self._buffer.sample(), self._config)
+        self._episode += ended
+
+    def all_finite(self) -> bool:
+        return self.state.online.all_finite()
 
 
 def epsilon_at(episode: int, hp: DDQNConfig) -> float:

@@ -16,7 +16,6 @@ import random
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numpy as np
 import torch
 from torch import Tensor
 from torch_reference import (
@@ -72,14 +71,6 @@ def stack_critics(critics: Sequence[list[Tensor]]) -> list[Tensor]:
     weights = [weight.transpose(1, 2).contiguous() for weight in stacked[::2]]
     biases = [bias[:, None] for bias in stacked[1::2]]
     return [leaf for layer in zip(weights, biases, strict=True) for leaf in layer]
-
-
-def unstack_critics(params: list[Tensor]) -> list[list[Tensor]]:
-    """Inverse of `stack_critics`."""
-    return [
-        [leaf[i].T if k % 2 == 0 else leaf[i, 0] for k, leaf in enumerate(params)]
-        for i in range(len(params[0]))
-    ]
 
 
 def q_values(critics: list[Tensor], obs: Tensor, action: Tensor, activation: str) -> Tensor:
@@ -192,8 +183,3 @@ class TD3Agent:
 
     def all_finite(self) -> bool:
         return self.state.actor.all_finite() and self.state.critics.all_finite()
-
-
-def critics_to_numpy(state: TD3State) -> list[list[np.ndarray]]:
-    """The critics' parameters as `mlp` takes them, to compare updates with."""
-    return [[leaf.numpy() for leaf in critic] for critic in unstack_critics(state.critics.values)]

@@ -7,7 +7,6 @@ of the summed CPU times; each draw's ratio is in the table.
 """
 
 import argparse
-import functools
 import os
 import time
 from typing import Any
@@ -25,12 +24,13 @@ def main() -> None:
         serve(args)
         return
     draws = args.draws or (3 if args.quick else 16)
-    options = ("--steps", args.steps, "--core", args.core, "--seed", args.seed,
-               "--agent-size", args.agent_size or (32 if args.quick else 128),
-               "--agent-layers", 1 if args.quick else 2)  # fmt: skip
-    with common.Side(__file__, "sejax", *options) as side:
-        compile_s = side.ready["compile_s"]
-        samples = [side.ask(number=number) for number in range(draws)]
+    options = {name: getattr(args, name) for name in ("steps", "core", "seed")}
+    options["agent_size"] = args.agent_size or (32 if args.quick else 128)
+    options["agent_layers"] = 1 if args.quick else 2
+    with common.sides_of(__file__, ["sejax"], **options) as sides:
+        compile_s = sides["sejax"].ready["compile_s"]
+        requests = [{"number": number} for number in range(draws)]
+        samples = common.in_turns(sides, requests, warm_up=False)["sejax"]
     ratio = sum(s["varied_s"] for s in samples) / sum(s["alone_s"] for s in samples)
     show(samples, ratio, compile_s)
     common.finish("varied_hparams", args,
@@ -44,7 +44,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--agent-size", type=int, help="hidden and batch size that ranges surround "
                         "(32 if --quick, else 128)")  # fmt: skip
     parser.add_argument("--agent-layers", type=int, default=2, help="that ranges surround")
-    parser.add_argument("--core", type=int, default=common.available_cores()[-1])
+    common.add_core(parser)
 
 
 def serve(args: argparse.Namespace) -> None:
@@ -90,19 +90,13 @@ def serve(args: argparse.Namespace) -> None:
         agent = sejax.make_agent(dataclasses.replace(config.agent, **changes), task)
         alone = jax.jit(agent.fresh(make_run)).lower(key).compile()
         jax.block_until_ready((program(key, drawn), alone(key)))
-        runs = {"varied_s": (program, key, drawn), "alone_s": (alone, key)}
-        seconds = {}
-        for name, (run, *inputs) in runs.items():
-            _, times = common.measure(functools.partial(wait_for, run, *inputs))
-            seconds[name] = times["cpu_s"]
-        return {**plain, **seconds}
+
+        def cpu_s(run: Any, *inputs: Any) -> float:
+            return common.measure(lambda: jax.block_until_ready(run(*inputs)))[1]["cpu_s"]
+
+        return {**plain, "varied_s": cpu_s(program, key, drawn), "alone_s": cpu_s(alone, key)}
 
     common.serve({"compile_s": compile_s}, handle)
-
-
-def wait_for(program: Any, *inputs: Any) -> None:
-    """Runs a compiled program to its end."""
-    program(*inputs).block_until_ready()
 
 
 def show(samples: list[dict[str, Any]], ratio: float, compile_s: float) -> None:

@@ -19,6 +19,7 @@ import numpy as np
 import sejax
 
 AGENT = sejax.QLearningConfig()
+ES = sejax.NESConfig(population_size=16, num_incumbent_evals=16, noise_std=0.1, noise_std_decay=1)
 
 
 def learn_a_set(path: Path, size: int, generations: int) -> None:
@@ -27,7 +28,7 @@ def learn_a_set(path: Path, size: int, generations: int) -> None:
     proxy = sejax.SyntheticConfig(hidden_size=16, done="threshold").make(task)
     agent = sejax.make_agent(AGENT, task)
     learn = sejax.make_learner(
-        task=task, agent=agent, proxy=proxy, es=sejax.NESConfig(noise_std=0.1), devices=1,
+        task=task, agent=agent, proxy=proxy, es=ES, devices=1,
         training=sejax.TrainingConfig(max_steps=1000, stop_rule="never"), generations=generations,
     )  # fmt: skip
     results = jax.device_get(jax.jit(jax.vmap(learn))(jax.random.split(jax.random.key(0), size)))

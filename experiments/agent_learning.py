@@ -19,9 +19,10 @@ import sejax
 from experiments.common import curves, figures, tables
 from experiments.common.agents import Condition, train_groups
 from experiments.common.curves import CURVES, WINDOW
-from experiments.common.experiment import Experiment, Settings, count, each_of, setting
-from experiments.common.statistics import bootstrap_interval
-from sejax.options import registry
+from experiments.common.experiment import Experiment, Settings, count, setting
+from experiments.common.statistics import mean_interval
+from sejax.options import each_of, registry
+from sejax.options.plain import to_plain
 from sejax.training import TrainingConfig
 
 QUICK_STEPS = 2000
@@ -80,15 +81,15 @@ class PresetStudy(Study):
         return self._preset().agent
 
     def changes(self) -> dict[str, Any]:
-        papers = registry.to_plain(super().configuration())
-        ours = registry.to_plain(self.configuration())
+        papers = to_plain(super().configuration())
+        ours = to_plain(self.configuration())
         return {name: value for name, value in ours.items() if value != papers[name]}
 
     def training(self, quick: bool, test_episodes: int) -> TrainingConfig:
-        max_steps = min(self.max_steps, QUICK_STEPS) if quick else self.max_steps
+        limits = super().training(quick, test_episodes)
         return dataclasses.replace(
             self._preset().training,
-            max_steps=max_steps,
+            max_steps=limits.max_steps,
             stop_rule="never",
             tests_between=test_episodes,
         )
@@ -147,9 +148,9 @@ ENVS = tuple(dict.fromkeys(study.env for study in STUDIES))
 class AgentLearning(Settings):
     name = "agent_learning"
 
-    envs: tuple[str, ...] = setting(ENVS, each_of(ENVS), about="tasks whose agents are trained")
-    num_agents: int = count(10, "agents", quick=2, about="seeds of each agent")
-    test_episodes: int = count(1, "episodes", about="after each training episode")
+    envs: tuple[str, ...] = setting(ENVS, each_of(ENVS))  # tasks whose agents are trained
+    num_agents: int = count(10, quick=2)  # seeds of each agent
+    test_episodes: int = count(1)  # after each training episode
 
 
 def compute(settings: AgentLearning) -> pd.DataFrame:
@@ -174,14 +175,13 @@ def compute(settings: AgentLearning) -> pd.DataFrame:
 
 def summarise(rows: pd.DataFrame) -> pd.DataFrame:
     """One row for each study."""
-    summary = []
-    for number, mine in rows.groupby("study"):
-        study = STUDIES[int(number)]
+
+    def statistics(mine: pd.DataFrame) -> dict[str, Any]:
+        study = STUDIES[int(mine["study"].iloc[0])]
         threshold = sejax.envs.make(study.env).solved_reward
         to_solve = curves.all_steps_to_solve(mine, threshold)
         last = curves.last_returns(mine)
         row = {
-            "study": number,
             "env": study.env,
             "agent": study.agent,
             "num_agents": len(last),
@@ -192,10 +192,9 @@ def summarise(rows: pd.DataFrame) -> pd.DataFrame:
             "num_solved_at_the_end": int((last >= threshold).sum()),
             "median_steps_to_solve": np.median(to_solve),
         }
-        summary.append(
-            row | tables.mean_columns(last, "last", least=1) | tables.iqm_columns(last, "last")
-        )
-    return pd.DataFrame(summary)
+        return row | tables.mean_columns(last, "last") | tables.iqm_columns(last, "last")
+
+    return tables.summary_by(rows, ["study"], statistics)
 
 
 def _changes(row: Any) -> str:
@@ -216,7 +215,7 @@ COLUMNS: dict[str, Any] = {
     "median steps to solve": _median_steps,
     "steps, at most": "{max_steps:,}",
     "made": "{made_steps:,.0f}",
-    f"last {WINDOW} tests": "{last_mean:.1f} [{last_low:.1f}, {last_high:.1f}]",
+    f"last {WINDOW} tests": tables.mean_text("last", 1),
     "IQM": tables.iqm_text("last"),
     "others": lambda row: STUDIES[row.study].peers,
 }
@@ -228,11 +227,9 @@ def report(settings: AgentLearning, rows: pd.DataFrame) -> pd.DataFrame:
     note = (
         f"{settings.num_agents} seeds of each; after each training episode "
         f"{settings.test_episodes} greedy test episode. Solved: the mean of {WINDOW} tests in a "
-        f"row reaches the threshold at some time, at the end if that of the last {WINDOW} does. "
-        "Made: steps until the last episode that ended, on average; some are limited by their "
-        f"number of episodes. The last {WINDOW} tests: mean over seeds, bootstrap 95% interval. "
-        "CartPole here is v0, "
-        f"of 200 steps.{tables.iqm_note()}"
+        f"row reaches the threshold; at the end: that of the last {WINDOW}. Made: mean steps until "
+        f"the last episode that ended. The last {WINDOW} tests: mean over seeds. "
+        f"{tables.interval_note('seeds')} CartPole is v0, of 200 steps.{tables.iqm_note()}"
     )
     title = "Agents that learn the real tasks"
     return tables.publish(settings, title, tables.as_texts(summary, COLUMNS), summary, note)
@@ -264,7 +261,7 @@ def draw(settings: AgentLearning, rows: pd.DataFrame, points: int = 100) -> None
 
 def _intervals(values: np.ndarray) -> np.ndarray:
     """Ends of the means' intervals, `[2, points]`, of `[agent, points]`."""
-    return np.transpose([bootstrap_interval(each) for each in values.T])
+    return np.transpose([mean_interval(each) for each in values.T])
 
 
 EXPERIMENT = Experiment(settings=AgentLearning, compute=compute, report=report, about=__doc__)

@@ -3,10 +3,16 @@
 Source: paper, appendix "Qualitative Study of Reward Networks on the Cliff Walking Task" (figure
 "Learned Cliff Walking reward for different reward network types"); `docs/reference.md` 7.7.
 
+The paper describes its picture: the additive potential RNs pay little for entering the cliff and
+for going up from the edge, and much for going down to it; the additive non-potential ones pay for
+the shortest path; the exclusive non-potential ones only help around the start and the goal; the
+exclusive potential ones look random.
+
 Differs: moves out of the goal and the cliff, which end an episode and which no agent ever makes,
 are left out.
 """
 
+import itertools
 from dataclasses import dataclass
 from typing import Any
 
@@ -21,8 +27,9 @@ from experiments.common import reward_networks as rn
 from experiments.common.experiment import Experiment
 from experiments.common.reward_networks import RnSettings
 from experiments.common.tables import publish
-from sejax import options
+from sejax import ProxySet
 from sejax.envs.gridworld import CLIFF_WALKING as MAP
+from sejax.options import one_of
 
 CELLS = np.array([list(line) for line in MAP])  # [row, column]
 _COLORS = {"G": "#ffffff", "O": "#d9d9d9"}  # of cells without moves: goal and cliff
@@ -41,13 +48,11 @@ _CORNERS = {
 class RnHeatmap(RnSettings):
     name = "rn_heatmap"
 
-    objective: str = rn.objective_setting()
+    objective: str = rn.objective_setting()  # that RNs are learned by
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        options.one_of(("cliff_walking",))(
-            "env", self.env, "cliff_walking"
-        )  # the figure is its map
+        one_of(["cliff_walking"])("env", self.env, None)  # the figure is its map
 
 
 def compute(settings: RnHeatmap) -> pd.DataFrame:
@@ -62,16 +67,16 @@ def compute(settings: RnHeatmap) -> pd.DataFrame:
     return pd.concat(tables, ignore_index=True)
 
 
-def rewards_of_moves(rns: Any) -> np.ndarray:
+def rewards_of_moves(rns: ProxySet) -> np.ndarray:
     """What each RN pays for each move, `[rn, state, action]`; nan out of terminal states."""
     env, task = rns.env, rns.task
-    grid = task.env
+    grid, key = task.env, jax.random.key(0)  # nothing is random here
 
     def reward(weights: Any, index: Any, action: Any) -> Any:
         params = env.params(weights, rns.discount)
-        _, state = env.reset_env(None, params)
+        _, state = env.reset_env(key, params)
         state = state.replace(world=state.world.replace(index=index), obs=index)
-        _, _, reward, _, _ = env.step_env(None, state, action, params)
+        _, _, reward, _, _ = env.step_env(key, state, action, params)
         terminal = grid.is_terminated(state.world, task.params)
         return jnp.where(terminal, jnp.nan, reward)
 
@@ -92,8 +97,7 @@ def by_variant(settings: RnHeatmap, rows: pd.DataFrame) -> dict[str, np.ndarray]
 
 def kinds_of_moves() -> dict[str, np.ndarray]:
     """The moves that the paper speaks of, as masks `[state, action]`."""
-    rows, columns = 4, 12
-    row, column = np.divmod(np.arange(rows * columns), columns)
+    row, column = np.divmod(np.arange(CELLS.size), CELLS.shape[1])
     right, left, down, up = range(4)
     start, goal = (row == 3) & (column == 0), (column == 11) & (row == 2)
     above_cliff = (row == 2) & (column > 0) & (column < 11)
@@ -127,11 +131,12 @@ def mean_rewards(rewards: np.ndarray, ignore: bool) -> np.ndarray:
 def summarise(rewards: dict[str, np.ndarray]) -> pd.DataFrame:
     """Mean and std over RNs of the mean reward of each kind of move."""
     out = []
-    for variant, mine in rewards.items():
-        for kind, mask in kinds_of_moves().items():
-            of_rns = mine[:, mask].mean(axis=1)
-            row = {"variant": variant, "move": kind, "rns": len(mine)}
-            out.append(row | {"mean": of_rns.mean(), "std": of_rns.std()})
+    for (variant, mine), (kind, mask) in itertools.product(
+        rewards.items(), kinds_of_moves().items()
+    ):
+        of_rns = mine[:, mask].mean(axis=1)
+        row = {"variant": variant, "move": kind, "rns": len(mine)}
+        out.append(row | {"mean": of_rns.mean(), "std": of_rns.std()})
     return pd.DataFrame(out)
 
 
@@ -144,11 +149,7 @@ def report(settings: RnHeatmap, rows: pd.DataFrame) -> pd.DataFrame:
     table = table.loc[list(rewards), list(kinds_of_moves())].reset_index()
     note = (
         f"Mean and standard deviation over {settings.learned} RNs of each variant, learned by "
-        f"{settings.objective}. The edge is the row above the cliff. The paper describes its "
-        "picture: the additive potential RNs pay little for entering the cliff and for going up "
-        "from the edge, and much for going down to it; the additive non-potential ones pay for the "
-        "shortest path; the exclusive non-potential ones only help around the start and the goal; "
-        "the exclusive potential ones look random."
+        f"{settings.objective}. The edge is the row above the cliff."
     )
     title = "Rewards that RNs have learned for the moves on Cliff Walking"
     return publish(settings, title, table, summary, note)

@@ -5,7 +5,9 @@ Objectives"; `docs/reference.md` 7.3 and 7.4.
 
 As `rn_performance`, once for each objective. The authors' scripts picked the ten RNs with the
 *lowest* scores for two of the three objectives; both choices are shown here, `best` and `worst`, of
-half of the RNs at most each.
+half of the RNs at most each. The paper shows curves and gives no numbers. It concludes that the
+area does about as well as the threshold, and that the final return makes learning faster on
+CartPole but not on Cliff Walking.
 
 Differs: the area under the curve is divided by the training steps; the authors' is `auc_sum`, for
 which falling off the cliff at once is best.
@@ -19,12 +21,12 @@ from typing import Any
 import pandas as pd
 
 from experiments.common import reward_networks, rn_curves
-from experiments.common.experiment import Experiment, each_of, setting
+from experiments.common.experiment import Experiment, setting
 from experiments.common.rn_curves import CurveSettings
 from experiments.common.tables import publish
-from sejax.options import require, shortened
+from sejax.options import each_of, require
 
-PICKS = {"best": "highest", "worst": "lowest"}  # scores
+PICKS = ("best", "worst")  # by their scores
 QUICK_LEARNED = 4
 OBJECTIVE_NAMES = {
     "reward_threshold": "reward threshold",
@@ -39,14 +41,10 @@ DEFAULT_OBJECTIVES = ("reward_threshold", "auc", "max_reward")
 class RnObjectives(CurveSettings):
     name = "rn_objectives"
 
-    objectives: tuple[str, ...] = setting(
-        DEFAULT_OBJECTIVES, each_of(OBJECTIVE_NAMES), about=f"of {', '.join(OBJECTIVE_NAMES)}"
-    )
-    picks: tuple[str, ...] = setting(
-        tuple(PICKS),
-        each_of(PICKS),
-        about="RNs that train agents: best, worst (as the authors' scripts for two objectives)",
-    )
+    # Of reward_threshold, auc, max_reward, auc_sum.
+    objectives: tuple[str, ...] = setting(DEFAULT_OBJECTIVES, each_of(OBJECTIVE_NAMES))
+    # RNs that train agents: best, worst (as the authors' scripts for two objectives).
+    picks: tuple[str, ...] = setting(PICKS, each_of(PICKS))
 
     @classmethod
     def defaults(cls, given: Mapping[str, Any]) -> dict[str, Any]:
@@ -59,14 +57,13 @@ class RnObjectives(CurveSettings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if len(self.picks) > 1:
-            least, reason = 2 * self.rns, "the best and the worst are picked from them"
-            rule, fix = f"be at least {least}", f"learned={least} or picks=best"
-            require(
-                self.learned >= least,
-                "learned",
-                f"must {rule}, because {reason}; got {shortened(self.learned)}. Set {fix}.",
-            )
+        least = len(self.picks) * self.rns
+        require(
+            self.learned >= least,
+            "learned",
+            f"must be at least {least}, of which the best and the worst are picked; got "
+            f"{self.learned}. Set learned={least} or picks=best.",
+        )
 
 
 def compute(settings: RnObjectives) -> pd.DataFrame:
@@ -106,16 +103,11 @@ def report(settings: RnObjectives, rows: pd.DataFrame) -> pd.DataFrame:
         rn_curves.draw(settings, curves, 2.7, f"{pick}.png")
     table = pd.concat(tables, ignore_index=True)
     table = table[["objective", "RNs", *table.columns.drop(["objective", "RNs"])]]
-    ends = " and with the ".join(PICKS[pick] for pick in settings.picks)
     note = (
         f"{settings.learned} RNs of each variant were learned by each objective. Of these the "
-        f"{settings.rns} with the {ends} scores ({', '.join(settings.picks)}) train "
+        f"{settings.rns} with the highest (best) or lowest (worst) scores train "
         f"{settings.num_agents} agents each, for {rn_curves.common_note(settings, solved_reward)} "
-        "The area is by training steps, where the authors' code has the sum. The paper shows "
-        "curves and gives no numbers; those for the area and the final return are, by a slip in "
-        "the authors' scripts, of the worst ten. It concludes that the area does about as well as "
-        "the threshold, and that the final return makes learning faster on CartPole but not on "
-        "Cliff Walking."
+        "The area is by training steps, where the authors' code has the sum."
     )
     title = f"Objectives of reward networks on {settings.env}"
     return publish(settings, title, table, pd.concat(summaries), note)

@@ -7,7 +7,8 @@ rewards, and the rows for default hyperparameters, varied ones and unseen agents
 The RNs of each variant are learned first (`learned`), and are kept for all experiments. On each of
 the best `rns` of them `num_agents` agents are trained in each row, and as many on the real task
 alone and with an exploration bonus. Episodes of training and of greedy testing on the real task
-alternate, and nothing stops an agent early.
+alternate, and nothing stops an agent early. The paper shows curves and gives no numbers: on each
+task some variant learns faster than all agents without an RN, the additive ones most reliably.
 
 Differs: agents stop after the steps that the paper's figure shows, or its number of episodes.
 """
@@ -26,7 +27,7 @@ from experiments.common.tables import publish
 class RnPerformance(CurveSettings):
     name = "rn_performance"
 
-    objective: str = reward_networks.objective_setting()
+    objective: str = reward_networks.objective_setting()  # that RNs are learned by
 
 
 def compute(settings: RnPerformance) -> pd.DataFrame:
@@ -49,9 +50,7 @@ def report(settings: RnPerformance, curves: pd.DataFrame) -> pd.DataFrame:
     note = (
         f"The best {settings.rns} of {settings.learned} RNs of each variant, learned by "
         f"{settings.objective}, with {settings.num_agents} agents each, and as many groups on the "
-        f"real task{with_bonus}; {rn_curves.common_note(settings, solved_reward)} The paper shows "
-        "curves and gives no numbers: on each of these tasks some variant learns faster than all "
-        "agents without an RN, the additive ones most reliably."
+        f"real task{with_bonus}; {rn_curves.common_note(settings, solved_reward)}"
     )
     title = f"Agents trained with reward networks and tested on {settings.env}"
     return publish(settings, title, rn_curves.make_table(summary), summary, note)

@@ -28,9 +28,11 @@ import pandas as pd
 
 import sejax
 from experiments.common import figures
-from experiments.common.experiment import Experiment, Settings, count, each_of, setting
+from experiments.common.experiment import Experiment, Settings, count, setting
 from experiments.common.statistics import NUM_RESAMPLES
-from experiments.common.tables import as_texts, mean_columns, publish
+from experiments.common.tables import as_texts, mean_columns, mean_text, publish
+from sejax.bilevel import make_bilevel
+from sejax.options import each_of
 
 # docs/reference.md 6.2: default_config_gridworld.yaml as the published runs used it.
 SETTINGS = [
@@ -76,13 +78,11 @@ PAPER = {"all_better_1": "among the best", "all_better_2": "among the best"}
 class ScoreTransforms(Settings):
     name = "score_transforms"
 
-    runs: int = count(
-        220, "runs", quick=12, about="of each transform, with mirrored sampling and without"
-    )
-    generations: int = count(50, "generations", quick=10, about="of a run at most")
-    population: int = count(16, "candidates", least=2, quick=8, about="of a generation")
-    transforms: tuple[str, ...] = setting(tuple(LABELS), each_of(LABELS), about="to compare")
-    bins: int = count(9, "bins", quick=3, about="of step sizes")
+    runs: int = count(220, quick=12)  # of each transform, with mirrored sampling and without
+    generations: int = count(50, quick=10)  # of a run at most
+    population: int = count(16, least=2, quick=8)  # candidates of a generation
+    transforms: tuple[str, ...] = setting(tuple(LABELS), each_of(LABELS))  # to compare
+    bins: int = count(9, quick=3)  # of step sizes
 
 
 def compute(settings: ScoreTransforms) -> pd.DataFrame:
@@ -148,8 +148,6 @@ class Search(NamedTuple):
 
 def make_search(transform: str, mirrored: bool, population: int, devices: int | None) -> Search:
     """Builds Algorithm 1 for runs of a cell, which differ in their step sizes."""
-    from sejax.bilevel import make_bilevel
-
     own = [f"es.score_transform={transform}", f"es.mirrored={mirrored}"]
     own += [f"es.population_size={population}", "stop_when_solved=true"]
     config = dataclasses.replace(sejax.config([*SETTINGS, *own]), devices=devices)
@@ -206,8 +204,8 @@ def summarise(runs: pd.DataFrame, bins: int) -> pd.DataFrame:
                 "best_updates": best["updates"],
                 "solved": mine["solved"].mean(),
             }
-            | mean_columns(mine["updates"], "updates", least=1)
-            | mean_columns(behind, "behind", least=1)
+            | mean_columns(mine["updates"], "updates")
+            | mean_columns(behind, "behind")
         )
     return pd.DataFrame(rows).sort_values(["updates_mean", "transform"], ignore_index=True)
 
@@ -227,17 +225,15 @@ def share_of_best(runs: pd.DataFrame) -> dict[bool, float]:
 def make_table(summary: pd.DataFrame) -> pd.DataFrame:
     """The summary as texts, with the rank of the cell among those of the same sampling."""
     ranks = summary.groupby("mirrored")[["updates_mean", "best_updates"]].rank(method="min")
-    behind = "{behind_mean:.1f} [{behind_low:.1f}, {behind_high:.1f}]"
+    behind = mean_text("behind", 1)
     return as_texts(
         summary.join(ranks.add_suffix("_rank")),
         {
             "score transform": lambda row: LABELS[row.transform],
             "mirrored": lambda row: "yes" if row.mirrored else "no",
             "rank": "{updates_mean_rank:.0f}",
-            "updates, all step sizes": "{updates_mean:.1f} [{updates_low:.1f}, {updates_high:.1f}]",
-            "more than the best": lambda row: (
-                behind.format_map(row._asdict()) if row.behind_mean else ""
-            ),
+            "updates, all step sizes": mean_text("updates", 1),
+            "more than the best": lambda row: behind(row) if row.behind_mean else "",
             "solved": "{solved:.0%}",
             "best step sizes": "{best_from:.2g} to {best_to:.2g}",
             "updates there": "{best_updates:.1f}",
@@ -259,7 +255,7 @@ def report(settings: ScoreTransforms, rows: pd.DataFrame) -> pd.DataFrame:
     failing = rows.groupby("transform")["solved"].mean().min()
     note = (
         f"Means over {rows['run'].nunique()} runs with step sizes from {STEP_SIZES[0]} to "
-        f"{STEP_SIZES[1]:g}, bootstrap 95% interval; a run that {generations} generations did not "
+        f"{STEP_SIZES[1]:g}, Student's 95% interval; a run that {generations} generations did not "
         f'solve counts {generations}. "More than the best" of the same sampling is by pairs of '
         "runs, which have the same step size and seed; which is best was seen in these very runs, "
         f"and of runs drawn again it is in {stays}. Ranks are among those of the same "

@@ -2,8 +2,7 @@
 
 For each mixture some SEs are learned, and each of these trains fresh agents of all the kinds in
 `tested`: a table of what they were learned with and tested with. Kinds that took no part are
-marked; where a mixture lacks one of the kinds of the largest one, the two say what leaving it out
-costs.
+marked.
 
 Source: the question is that of the paper's section "Transferability of SEs"; several kinds of
 agents in one search, as in Liesen et al., "Discovering Minimal Reinforcement Learning Environments"
@@ -21,7 +20,7 @@ from experiments.common import figures, runs, tables
 from experiments.common.experiment import Experiment, setting
 from experiments.common.runs import MixtureRuns, kinds_in
 from experiments.common.shards import stack, unstack
-from sejax import envs
+from sejax import Task, envs
 from sejax.options import require
 
 SETS = (
@@ -33,33 +32,23 @@ SETS = (
     "ppo+td3_discrete",
     "ddqn+ppo+td3_discrete",
 )
+TESTED = ("ddqn", "dueling_ddqn", "ppo", "td3_discrete", "sac")
 LEFT_OUT = "°"  # after the return of a kind that took no part
-IQM_AND_SOLVED = f"IQM {tables.iqm_text('test_return')}; {{solved:.0%}}"
 
 
 @dataclass(frozen=True, kw_only=True)
 class SeFamilies(MixtureRuns):
     name = "se_families"
 
-    sets: tuple[str, ...] = setting(
-        SETS, quick=("ddqn", "ddqn+ppo"), about="agent mixtures that SEs are learned with"
-    )
-    tested: tuple[str, ...] = setting(
-        ("ddqn", "dueling_ddqn", "ppo", "td3_discrete", "sac"),
-        quick=("ddqn", "dueling_ddqn"),
-        about="kinds of agents that they are tested with",
-    )
+    # Agent mixtures that SEs are learned with.
+    sets: tuple[str, ...] = setting(SETS, quick=("ddqn", "ddqn+ppo"))
+    # Kinds of agents that they are tested with.
+    tested: tuple[str, ...] = setting(TESTED, quick=TESTED[:2])
 
     def __post_init__(self) -> None:
         super().__post_init__()
         for name, value in self.values("sets", "tested").items():
-            fix = f"{name}=[ddqn]"
-            require(
-                value,
-                name,
-                "must name a kind of agent, because agents learn or are tested; got none. Set "
-                f"{fix}.",
-            )
+            require(value, name, f"must name an agent; got none. Set {name}=[ddqn].")
 
 
 def compute(settings: SeFamilies) -> pd.DataFrame:
@@ -109,8 +98,8 @@ def make_table(summary: pd.DataFrame) -> pd.DataFrame:
 def cell(row: Any) -> str:
     """What a kind of agent reaches on the SEs of a mixture."""
     mark = "" if row.took_part else LEFT_OUT
-    mean = tables.mean_text("test_return", 1)(row)
-    return f"{mean}; {IQM_AND_SOLVED.format_map(row._asdict())}{mark}"
+    mean, iqm = tables.mean_text("test_return", 1)(row), tables.iqm_text("test_return")(row)
+    return f"{mean}; IQM {iqm}; {row.solved:.0%}{mark}"
 
 
 def shown(name: str) -> str:
@@ -118,71 +107,24 @@ def shown(name: str) -> str:
     return " + ".join(figures.AGENT_NAMES.get(x, x) for x in kinds_in(name))
 
 
-def left_out(summary: pd.DataFrame) -> pd.DataFrame:
-    """What each kind of the largest mixture reaches on that, and on the mixture of the others.
-
-    Returns:
-      Rows with `hparams`, `kind` and mean returns, `included` and `left_out`; none for mixtures
-      that were not learned.
-    """
-    sets = {frozenset(kinds_in(name)): name for name in summary["learned_with"].unique()}
-    largest = max(sets, key=len)
-    means = summary.set_index(["learned_with", "hparams", "kind"])["test_return_mean"]
-    rows = []
-    for (name, hparams, kind), mean in means.items():  # type: ignore[misc]
-        others = sets.get(largest - {kind})
-        if name == sets[largest] and kind in largest and others is not None:
-            without = means[others, hparams, kind]
-            row = {"hparams": hparams, "kind": kind, "included": mean, "left_out": without}
-            rows.append(row)
-    return pd.DataFrame(rows)
-
-
-def findings(summary: pd.DataFrame) -> str:
-    """Sentences on what was measured."""
-    texts = []
-    for hparams, mine in summary.groupby("hparams", sort=False):
-        means = mine.groupby("took_part")["test_return_mean"].mean()
-        shares = {True: "on SEs that were learned with it", False: "on others"}
-        apart = " and ".join(f"{means[x]:.1f} {where}" for x, where in shares.items() if x in means)
-        texts.append(f"With {hparams} hyperparameters a family's mean return is {apart}.")
-        sets = mine.groupby("learned_with", sort=False)
-        worst, cost = sets["test_return_mean"].min(), sets["cpu_s"].first()
-        best = worst.idxmax()
-        others = worst.drop(best)
-        if len(others):
-            texts.append(
-                f"The worst of the tested families reaches most, {worst[best]:.1f}, where SEs "
-                f"were learned with {shown(str(best))}, for {cost[best]:,.0f} CPU s a run "
-                f"({others.min():.1f} to {others.max():.1f} with other sets, for "
-                f"{cost.drop(best).min():,.0f} to {cost.drop(best).max():,.0f})."
-            )
-    for row in left_out(summary).itertuples():
-        texts.append(
-            f"{shown(row.kind)} ({row.hparams}) reaches {row.left_out:.1f} where it alone is "
-            f"left out, and {row.included:.1f} where it takes part."
-        )
-    return " ".join(texts)
-
-
 def report(settings: SeFamilies, rows: pd.DataFrame) -> pd.DataFrame:
     task = envs.make(settings.env)
     summary = summarise(unstack(rows, "curves"), unstack(rows, "agents"), task.solved_reward)
     draw(summary, task, settings.folder / "families.png")
     note = (
-        f"{settings.runs} NES runs with each set of families; of each the best SE trains "
-        f"{settings.num_agents} fresh agents of each family. Cells: mean return, with a bootstrap "
-        "95% interval for at least five SEs, which it draws (agents, where there is one SE); "
-        f"interquartile mean; share of the {summary['num_agents'].iloc[0]} agents that solve "
-        f"the task ({task.solved_reward:g}); {LEFT_OUT} a family that took no part in learning. "
-        "CPU s are those of the generations, "
-        f"without compilation. {findings(summary)}{tables.iqm_note('within each SE')}"
+        f"{settings.runs} NES runs with each mixture; the best SE of each trains "
+        f"{settings.num_agents} fresh agents of each kind. Cells: mean return; "
+        f"interquartile mean; share of the {summary['num_agents'].iloc[0]} agents that solve the "
+        f"task ({task.solved_reward:g}); {LEFT_OUT} a kind that took no part in learning. CPU s: "
+        "of the generations, without compilation. "
+        f"{tables.interval_note('SEs, agents where there is one SE')}"
+        f"{tables.iqm_note('within each SE')}"
     )
-    title = f"Agents tested on {task.name}, trained on SEs learned with other families of agents"
+    title = f"Agents tested on {task.name}, trained on SEs learned with other mixtures of agents"
     return tables.publish(settings, title, make_table(summary), summary, note)
 
 
-def draw(summary: pd.DataFrame, task: Any, path: Path) -> None:
+def draw(summary: pd.DataFrame, task: Task, path: Path) -> None:
     """Draws mean returns as a map for each kind of hyperparameters, and what each mixture cost."""
     hparams, sets, kinds = (list(summary[x].unique()) for x in ("hparams", "learned_with", "kind"))
     low = summary["test_return_mean"].min()

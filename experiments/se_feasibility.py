@@ -20,7 +20,7 @@ from experiments.common import figures, runs, tables
 from experiments.common.experiment import Experiment, count, setting
 from experiments.common.runs import RunSettings
 from sejax.cli.config import AGENT_HPARAMS
-from sejax.options import one_of, require, shortened
+from sejax.options import one_of, require
 
 NUM_RUNS = {"cartpole": 10}
 
@@ -52,11 +52,9 @@ PAPER = {
 class SeFeasibility(RunSettings):
     name = "se_feasibility"
 
-    runs: int = count(5, "runs", quick=3, about="independent NES runs; cartpole 10")
-    agent: str | None = setting(None, about="that the SEs are learned with; the task's choice")
-    agent_hparams: str = setting(
-        "default", one_of(AGENT_HPARAMS), about="its hyperparameters; varied: drawn for each agent"
-    )
+    runs: int = count(5, quick=3)  # independent NES runs; cartpole 10
+    agent: str | None = setting(None)  # that the SEs are learned with; the task's choice
+    agent_hparams: str = setting("default", one_of(AGENT_HPARAMS))  # varied: drawn for each agent
 
     @classmethod
     def defaults(cls, given: Mapping[str, Any]) -> dict[str, Any]:
@@ -80,34 +78,31 @@ def learning_config(settings: SeFeasibility) -> Any:
     words = [f"agent_hparams={settings.agent_hparams}"]
     words += [f"agent={settings.agent}"] if settings.agent else []
     config = settings.learn_config(words + (QUICK if settings.quick else []))
-    proxy, reason = config.name("proxy"), "rn_performance learns reward networks"
     require(
-        proxy != "rn",
+        config.name("proxy") != "rn",
         "run.proxy",
-        f"must be se, because {reason}; got {shortened(proxy)}. Set run.proxy=se.",
+        "must be an SE; got rn. Set run.proxy=se, or run experiments.rn_performance.",
     )
     return config
 
 
 def summarise(curves: pd.DataFrame, solved_reward: float) -> pd.DataFrame:
     """One row for each run: what it took to solve the task and how far it came."""
-    rows = []
-    for seed, curve in curves.groupby("seed"):
+
+    def statistics(curve: pd.DataFrame) -> dict[str, float]:
         to_solve = runs.generations_to_solve(curve, solved_reward)
         at_solving = curve[curve["generation"] + 1 == to_solve]
-        rows.append(
-            {
-                "seed": seed,
-                "generations": len(curve),
-                "generations_to_solve": to_solve,
-                "env_steps_to_solve": at_solving["env_steps_total"].max(),
-                "best_incumbent_mean": curve["incumbent_mean"].max(),
-                "last_incumbent_mean": curve["incumbent_mean"].iloc[-1],
-                "env_steps": curve["env_steps_total"].iloc[-1],
-                "wall_min": curve["wall_s"].iloc[-1] / 60,
-            }
-        )
-    return pd.DataFrame(rows)
+        return {
+            "generations": len(curve),
+            "generations_to_solve": to_solve,
+            "env_steps_to_solve": at_solving["env_steps_total"].max(),
+            "best_incumbent_mean": curve["incumbent_mean"].max(),
+            "last_incumbent_mean": curve["incumbent_mean"].iloc[-1],
+            "env_steps": curve["env_steps_total"].iloc[-1],
+            "wall_min": curve["wall_s"].iloc[-1] / 60,
+        }
+
+    return tables.summary_by(curves, ["seed"], statistics)
 
 
 def median_and_range(values: Any, limit: int) -> str:
@@ -132,9 +127,7 @@ def make_table(config: Any, summary: pd.DataFrame) -> pd.DataFrame:
     """The statistics of all runs, beside what the paper says of its own."""
     best, last = summary["best_incumbent_mean"], summary["last_incumbent_mean"]
     to_solve = summary["generations_to_solve"]
-    # With an interval for any number of runs, as they are as many as there are.
-    columns = tables.mean_columns(last, "last", least=1) | tables.iqm_columns(last, "last")
-    mean = "{last_mean:.1f} [{last_low:.1f}, {last_high:.1f}]"
+    row = pd.Series(tables.mean_columns(last, "last") | tables.iqm_columns(last, "last"))
     ours = {
         "runs": str(len(summary)),
         "generations run": f"{summary['generations'].max()}",
@@ -143,8 +136,8 @@ def make_table(config: Any, summary: pd.DataFrame) -> pd.DataFrame:
         "generations to solve": median_and_range(to_solve, config.generations),
         "real steps to solve, median": median_steps(summary),
         "best incumbent mean": f"{best.median():.1f} ({best.min():.1f} to {best.max():.1f})",
-        "last incumbent mean": mean.format_map(columns),
-        "last incumbent mean, IQM": tables.iqm_text("last").format_map(columns),
+        "last incumbent mean": tables.mean_text("last", 1)(row),
+        "last incumbent mean, IQM": tables.iqm_text("last")(row),
         "wall minutes of a run, mean": f"{summary['wall_min'].mean():.1f}",
     }
     paper = PAPER if config.name("env") in PAPER_TASKS else {}
@@ -160,13 +153,12 @@ def report(settings: SeFeasibility, rows: pd.DataFrame) -> pd.DataFrame:
     varied = " with varied hyperparameters" if config.agent_hparams == "varied" else ""
     note = (
         f"Preset {config.preset}. An incumbent mean is over "
-        f"{config.es.num_incumbent_evals or config.es.population_size} fresh "
-        f"agents with {config.training.test_episodes} test episodes each; a run counts as solved "
-        f"from the first generation in which it reaches {solved_reward:g}. Median and range over "
-        "runs; a run that did not solve the task counts as longer than all. The last incumbent "
-        "mean is that over runs, with a bootstrap 95% interval; the best is a maximum of noisy "
-        "means and hence too high: se_performance tests the stored SEs with other agents."
-        f"{tables.iqm_note(of='runs')}"
+        f"{config.es.num_incumbent_evals or config.es.population_size} fresh agents with "
+        f"{config.training.test_episodes} test episodes each; a run counts as solved from the "
+        f"first that reaches {solved_reward:g}. Median and range over runs; one that did not solve "
+        "the task took longer than all. The last incumbent mean: over runs. "
+        f"{tables.interval_note('runs')} The best is a maximum of noisy means and hence too high: "
+        f"se_performance tests the stored SEs with other agents.{tables.iqm_note(of='runs')}"
     )
     title = f"Learning SEs of {settings.env} for {config.name('agent')} agents{varied}"
     return tables.publish(settings, title, make_table(config, summary), summary, note)

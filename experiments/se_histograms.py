@@ -32,10 +32,12 @@ import sejax
 from experiments.common import agents as groups
 from experiments.common import figures
 from experiments.common.agents import SE_AGENTS, SOFT_SE, Condition, Measure
-from experiments.common.experiment import Experiment, Settings, count, each_of, setting
-from experiments.common.tables import as_texts, publish
+from experiments.common.experiment import Experiment, Settings, count, setting
+from experiments.common.tables import as_texts, publish, summary_by
+from sejax import ProxySet, Task
 from sejax.agents.buffers import Buffer, BufferMaker, write_row
-from sejax.options import registry
+from sejax.evaluation import make_recorder, make_tested_trainer
+from sejax.options import each_of, registry
 from sejax.training import TrainingConfig
 
 SOURCES = {
@@ -72,13 +74,11 @@ PAPER_RETURNS = {
 class SeHistograms(Settings):
     name = "se_histograms"
 
-    proxy: str = setting(SOFT_SE, about="SE: a run directory, a file or a shipped name")
-    agents: tuple[str, ...] = setting(
-        SE_AGENTS, each_of(SE_AGENTS), about="kinds of agents, a row each"
-    )
-    num_agents: int = count(10, "agents", quick=3, about="of each kind")
-    test_episodes: int = count(10, "episodes", about="of each agent")
-    max_rows: int = count(10_000, "transitions", about="of training, the last ones of an agent")
+    proxy: str = setting(SOFT_SE)  # SE: a run directory, a file or a shipped name
+    agents: tuple[str, ...] = setting(SE_AGENTS, each_of(SE_AGENTS))  # kinds of agents, a row each
+    num_agents: int = count(10, quick=3)  # of each kind
+    test_episodes: int = count(10)  # of each agent
+    max_rows: int = count(10_000)  # transitions of training, the last ones of an agent
 
     @property
     def rows_file(self) -> Path:
@@ -108,7 +108,7 @@ def compute(settings: SeHistograms) -> pd.DataFrame:
     return pd.concat(tables, ignore_index=True).drop(columns="group")
 
 
-def load(settings: SeHistograms) -> Any:
+def load(settings: SeHistograms) -> ProxySet:
     """The SE."""
     return sejax.load_set(settings.proxy, option="proxy", kind="se")[:1]
 
@@ -124,11 +124,9 @@ def transitions(max_rows: int) -> Measure:
 
 
 def make_recorded_run(
-    max_rows: int, agent: Any, env: Any, task: Any, training: TrainingConfig
+    max_rows: int, agent: Any, env: Any, task: Task, training: TrainingConfig
 ) -> Callable[..., Any]:
     """Builds `run(key, env_params, active)` that trains, tests and records one agent."""
-    from sejax.evaluation import make_recorder, make_tested_trainer
-
     capacity = min(max_rows, training.max_steps or max_rows)
     train = make_tested_trainer(agent, env, task, training, recorder=last_steps(capacity))
     test = make_recorder(agent, task, training.test_episodes)
@@ -212,7 +210,7 @@ def columns_of(rows: pd.DataFrame) -> list[str]:
     return [*[name for name in rows if name.startswith("state_")], "reward"]
 
 
-def names_of(task: Any, rows: pd.DataFrame) -> dict[str, str]:
+def names_of(task: Task, rows: pd.DataFrame) -> dict[str, str]:
     """What people call these columns."""
     usual = {name: name.replace("_", " ") for name in columns_of(rows)}
     return usual | dict(zip(usual, DIMENSIONS.get(task.name, ()), strict=False))
@@ -220,19 +218,22 @@ def names_of(task: Any, rows: pd.DataFrame) -> dict[str, str]:
 
 def summarise(rows: pd.DataFrame) -> pd.DataFrame:
     """Widths and distances of the distributions, a row for each kind of agent and dimension."""
-    out = []
-    for kind, mine in rows.groupby("kind", sort=False):
-        for column in columns_of(rows):
-            samples = {name: mine[mine["source"] == name][column] for name in SOURCES}
-            row = {"kind": kind, "dimension": column}
-            row |= {f"std_{name}": x.std(ddof=0) for name, x in samples.items()}
-            for a, b in (("response", "train"), ("response", "test"), ("train", "test")):
-                row[f"{a}_to_{b}"] = wasserstein_distance(samples[a], samples[b])
-            out.append(row)
-    return pd.DataFrame(out)
+    columns = columns_of(rows)
+    of_source = rows.melt(["kind", "source"], columns, var_name="dimension")
+
+    def statistics(mine: pd.DataFrame) -> dict[str, float]:
+        samples = {name: mine[mine["source"] == name]["value"] for name in SOURCES}
+        pairs = (("response", "train"), ("response", "test"), ("train", "test"))
+        return {f"std_{name}": x.std(ddof=0) for name, x in samples.items()} | {
+            f"{a}_to_{b}": wasserstein_distance(samples[a], samples[b]) for a, b in pairs
+        }
+
+    summary = summary_by(of_source, ["kind", "dimension"], statistics)
+    kinds = list(rows["kind"].unique())
+    return summary.sort_values("kind", key=lambda x: x.map(kinds.index), kind="stable")
 
 
-def make_table(task: Any, rows: pd.DataFrame, summary: pd.DataFrame) -> pd.DataFrame:
+def make_table(task: Task, rows: pd.DataFrame, summary: pd.DataFrame) -> pd.DataFrame:
     """The summary as texts; the return stands in each kind's first row."""
     names = names_of(task, rows)
 
@@ -290,7 +291,7 @@ def bin_edges(samples: dict[str, np.ndarray], num_bins: int = 80) -> np.ndarray:
     return np.linspace(low - room, high + room, num_bins + 1)
 
 
-def draw(task: Any, rows: pd.DataFrame, path: Path) -> None:
+def draw(task: Task, rows: pd.DataFrame, path: Path) -> None:
     """Draws a row for each kind of agent and a column for each state dimension and the reward.
 
     Source: paper, figure "Histograms of next state s' and reward r".

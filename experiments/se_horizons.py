@@ -18,15 +18,25 @@ import pandas as pd
 
 from experiments.common import figures, runs
 from experiments.common.agents import HPARAMS
-from experiments.common.experiment import Experiment, each_of, setting
+from experiments.common.experiment import Experiment, setting
 from experiments.common.runs import MixtureRuns
 from experiments.common.shards import stack, unstack
-from experiments.common.tables import as_texts, interval, mean_columns, publish
-from sejax import envs
-from sejax.options import positive
+from experiments.common.statistics import mean_interval
+from experiments.common.tables import (
+    as_texts,
+    brackets,
+    interval_note,
+    mean_columns,
+    mean_text,
+    publish,
+    summary_by,
+)
+from sejax import Task, envs
+from sejax.options import each_of, positive
 from sejax.proxies.configs import DONE_MODES, INITIAL_STATES
 
 COLORS = {"real": figures.REAL, "learned": figures.VARIED}
+TESTED = ("dueling_ddqn", "ppo", "td3_discrete")
 NO_END = "-"  # of SEs whose episodes are one step
 
 
@@ -57,30 +67,19 @@ BY = list(Kind._fields)
 class SeHorizons(MixtureRuns):
     name = "se_horizons"
 
-    horizons: tuple[int | None, ...] = setting(
-        (1, 2, 5, 20, None), quick=(1, None), about="steps of an SE's episodes; null: the task's"
-    )
-    starts: tuple[str, ...] = setting(
-        ("real", "learned"), each_of(INITIAL_STATES), about="initial states of the SEs"
-    )
-    ends: tuple[str, ...] = setting(
-        ("threshold",),
-        each_of(DONE_MODES),
-        about="how episodes of several steps end; the figure shows the first",
-    )
-    agents: tuple[str, ...] = setting(("ddqn",), about="agents that SEs are learned with")
-    tested: tuple[str, ...] = setting(
-        ("dueling_ddqn", "ppo", "td3_discrete"),
-        quick=("dueling_ddqn",),
-        about="kinds of agents that the best SE of each kind is tested with",
-    )
-
-    tested_hparams: tuple[str, ...] = setting(
-        ("default",), each_of(HPARAMS), about="their hyperparameters; the first are shown"
-    )
-    cpu_budget_s: float | None = setting(
-        60.0, positive("it is time"), quick=4.0, about="CPU seconds of a run, without compilation"
-    )
+    # Steps of an SE's episodes; null: the task's.
+    horizons: tuple[int | None, ...] = setting((1, 2, 5, 20, None), quick=(1, None))
+    # Initial states of the SEs.
+    starts: tuple[str, ...] = setting(("real", "learned"), each_of(INITIAL_STATES))
+    # How episodes of several steps end; the figure shows the first.
+    ends: tuple[str, ...] = setting(("threshold",), each_of(DONE_MODES))
+    agents: tuple[str, ...] = setting(("ddqn",))  # that SEs are learned with
+    # Kinds of agents that the best SE of each kind is tested with.
+    tested: tuple[str, ...] = setting(TESTED, quick=TESTED[:1])
+    # Their hyperparameters; the first are shown.
+    tested_hparams: tuple[str, ...] = setting(("default",), each_of(HPARAMS))
+    # CPU seconds of a run, without compilation.
+    cpu_budget_s: float | None = setting(60.0, positive("it is time"), quick=4.0)
 
     @property
     def kinds(self) -> list[Kind]:
@@ -119,44 +118,42 @@ def summarise_runs(
     A run that did not solve it took inf generations and CPU seconds; `stays_solved` is the share of
     the generations after the first solved one whose incumbent is solved, nan if there are none.
     """
-    rows = []
-    for values, whole in curves.groupby([*BY, "seed"], sort=False):
+
+    def statistics(whole: pd.DataFrame) -> dict[str, float]:
         curve = runs.within(whole, budget_s).reset_index(drop=True)
         to_solve = runs.generations_to_solve(curve, solved_reward)
         is_solved = np.isfinite(to_solve)
         later = curve["incumbent_mean"][curve["generation"] >= to_solve]
-        rows.append(
-            dict(zip([*BY, "seed"], values, strict=True))
-            | {
-                "generations": len(curve),
-                "best": curve["incumbent_mean"].max(),
-                "to_solve": to_solve,
-                "cpu_s_to_solve": curve["cpu_s"].cumsum()[to_solve - 1] if is_solved else np.inf,
-                "stays_solved": (later >= solved_reward).mean(),
-                "cpu_s": curve["cpu_s"].mean(),
-                "cpu_s_in_all": curve["cpu_s"].sum(),
-                "train_steps": curve["train_steps_mean"].mean(),
-                "env_steps": curve["env_steps_total"].iloc[-1],
-            }
-        )
-    return pd.DataFrame(rows)
+        return {
+            "generations": len(curve),
+            "best": curve["incumbent_mean"].max(),
+            "to_solve": to_solve,
+            "cpu_s_to_solve": curve["cpu_s"].cumsum()[to_solve - 1] if is_solved else np.inf,
+            "stays_solved": (later >= solved_reward).mean(),
+            "cpu_s": curve["cpu_s"].mean(),
+            "cpu_s_in_all": curve["cpu_s"].sum(),
+            "train_steps": curve["train_steps_mean"].mean(),
+            "env_steps": curve["env_steps_total"].iloc[-1],
+        }
+
+    return summary_by(curves, [*BY, "seed"], statistics)
 
 
 def summarise(each: pd.DataFrame, transfer: pd.DataFrame) -> pd.DataFrame:
     """A row for each kind of SE, with a column for the mean return of each tested kind of agent."""
-    rows = []
     means = ["stays_solved", "generations", "cpu_s", "train_steps", "env_steps"]
-    for values, mine in each.groupby(BY, sort=False):
-        solved = int(np.isfinite(mine["to_solve"]).sum())
-        rows.append(
-            {**dict(zip(BY, values, strict=True)), "runs": len(mine), "solved": solved}
-            | mean_columns(mine["best"], "best", least=1)
+
+    def statistics(mine: pd.DataFrame) -> dict[str, float]:
+        return (
+            {"runs": len(mine), "solved": int(np.isfinite(mine["to_solve"]).sum())}
+            | mean_columns(mine["best"], "best")
             | dict(mine[["to_solve", "cpu_s_to_solve"]].median())
             | dict(mine[means].mean())
         )
+
     transferred = transfer[transfer["hparams"] == transfer["hparams"].iloc[0]]
     returns = transferred.pivot(index=BY, columns="kind", values="test_return_mean")
-    return pd.DataFrame(rows).join(returns.add_prefix("on_"), on=BY)
+    return summary_by(each, BY, statistics).join(returns.add_prefix("on_"), on=BY)
 
 
 def make_table(summary: pd.DataFrame) -> pd.DataFrame:
@@ -165,7 +162,7 @@ def make_table(summary: pd.DataFrame) -> pd.DataFrame:
         "steps": "{horizon}",
         "starts": "{starts}",
         "end": "{end}",
-        "best incumbent": "{best_mean:.1f} [{best_low:.1f}, {best_high:.1f}]",
+        "best incumbent": mean_text("best", 1),
         "runs solved": "{solved} of {runs}",
         "generations to solve": lambda row: _finite(row.to_solve, 0),
         "CPU s to solve": lambda row: _finite(row.cpu_s_to_solve, 1),
@@ -181,48 +178,22 @@ def make_table(summary: pd.DataFrame) -> pd.DataFrame:
     return as_texts(summary, columns)
 
 
-def findings(each: pd.DataFrame, summary: pd.DataFrame, end: str) -> str:
-    """Sentences on what was measured; horizons and starts are compared where SEs end like this."""
-    texts = []
+def differences(each: pd.DataFrame, summary: pd.DataFrame, end: str) -> str:
+    """Best incumbents of two kinds of SE, one less the other, over pairs of equal seeds.
+
+    Compared are the shortest and the longest horizon of equal starts, and the starts of equal
+    horizons, of SEs that end like this.
+    """
+    bests, texts = each.set_index([*BY, "seed"])["best"], []
     shown = summary[summary["end"].isin([NO_END, end])]
-    for starts, mine in shown.groupby("starts", sort=False):
-        said = [
-            f"{row.horizon}: {row.best_mean:.1f}, {row.solved} of {row.runs}, "
-            f"{_finite(row.cpu_s_to_solve, 0)}"
-            for row in mine.itertuples()
-        ]
-        texts.append(
-            f"With {starts} starts (horizon: best incumbent, runs solved, median CPU s to "
-            f"solve): {'; '.join(said)}."
-        )
-        if len(mine) > 1:
-            texts.append(_compared(each, mine.iloc[0], mine.iloc[-1], "horizon"))
-    for _, mine in shown.groupby("horizon", sort=False):
-        if len(mine) > 1:
-            texts.append(_compared(each, mine.iloc[0], mine.iloc[-1], "starts"))
-    of_ends = summary[summary["end"] != NO_END].groupby("end", sort=False)
-    if of_ends.ngroups > 1:
-        means = of_ends.agg({"best_mean": "mean", "solved": "sum", "runs": "sum"})
-        said = [
-            f"{row.Index} {row.best_mean:.1f} ({row.solved} of {row.runs} runs solved)"
-            for row in means.itertuples()
-        ]
-        texts.append(f"Ends of several steps, over horizons and starts: {', '.join(said)}.")
-    return " ".join(texts)
-
-
-def _compared(each: pd.DataFrame, a: pd.Series, b: pd.Series, what: str) -> str:
-    """The difference between two kinds of SE that differ in this, over pairs of equal seeds."""
-    bests = each.set_index([*BY, "seed"])["best"]
-    differences = bests.loc[tuple(a[BY])] - bests.loc[tuple(b[BY])]
-    low, high = interval(differences, least=1)
-    tested = [name for name in a.index if name.startswith("on_")]
-    same = f"starts {a['starts']}" if what == "horizon" else f"horizon {a['horizon']}"
-    return (
-        f"With {same}, {what} {a[what]} less {what} {b[what]}: {differences.mean():+.1f} "
-        f"[{low:.1f}, {high:.1f}] in the best incumbent; the tested families reach "
-        f"{a[tested].mean():.1f} and {b[tested].mean():.1f}."
-    )
+    for same in ("starts", "horizon"):
+        for _, mine in shown.groupby(same, sort=False):
+            first, last = (Kind(*mine[BY].iloc[place]) for place in (0, -1))
+            if first != last:
+                less = bests.loc[first] - bests.loc[last]
+                ends = brackets(*mean_interval(less), 1)
+                texts.append(f"{first.name} less {last.name}: {less.mean():+.1f}{ends}")
+    return "; ".join(texts)
 
 
 def _finite(value: float, digits: int) -> str:
@@ -238,21 +209,20 @@ def report(settings: SeHorizons, rows: pd.DataFrame) -> pd.DataFrame:
     draw(task, each, summary, settings.ends[0], settings.folder / "horizons.png")
     note = (
         f"SEs learned with {' + '.join(settings.agents)}, {settings.runs} runs of "
-        f"{settings.cpu_budget_s:g} CPU s each (generations that began before these were spent; "
-        "compilation is not counted). Best incumbent: mean over runs with a bootstrap 95% interval "
-        "that draws runs; of each run it is a maximum of noisy means, one for each generation, and "
-        f"hence too high. Solved: an incumbent mean of {task.solved_reward:g}; generations and "
-        "CPU s until then are medians, - if half of the runs did not solve it; stay solved: share "
-        "of the later generations, over the runs that did. Real steps are those of the whole run. "
-        f"Tested: mean return of {settings.num_agents} fresh agents with "
-        f"{settings.tested_hparams[0]} hyperparameters on the SE with the best score of each "
-        f"kind. {findings(each, summary, settings.ends[0])}"
+        f"{settings.cpu_budget_s:g} CPU s each (generations that began before these were spent, "
+        f"without compilation). Best incumbent: mean over runs. {interval_note('runs')} Of each "
+        "run it is a maximum of noisy means and hence too high. Solved: an incumbent mean of "
+        f"{task.solved_reward:g}; generations and CPU s until then are medians, - if half of the "
+        "runs did not solve it; stay solved: share of the later generations. Real steps: of the "
+        f"whole run. Tested: mean return of {settings.num_agents} fresh agents with "
+        f"{settings.tested_hparams[0]} hyperparameters on the SE with the best score of each kind. "
+        f"Best incumbents in pairs of seeds: {differences(each, summary, settings.ends[0])}."
     )
     title = f"Horizons and starts of SEs of {task.name}, at equal cost"
     return publish(settings, title, make_table(summary), summary, note)
 
 
-def draw(task: Any, each: pd.DataFrame, summary: pd.DataFrame, end: str, path: Path) -> None:
+def draw(task: Task, each: pd.DataFrame, summary: pd.DataFrame, end: str, path: Path) -> None:
     """Draws returns against horizons of SEs that end like this, and CPU seconds to solve the task.
 
     A cross is a run that has not solved it, where its budget was spent.
@@ -269,7 +239,7 @@ def draw(task: Any, each: pd.DataFrame, summary: pd.DataFrame, end: str, path: P
             errors = np.abs(mine[["best_low", "best_high"]].to_numpy().T - best.to_numpy())
             line: Any = {"fmt": "o-", "ms": 5, "capsize": 3, "color": color}
             left.errorbar(places, best, yerr=errors, label=f"{starts} starts", **line)
-            means, label = mine[tested].mean(axis=1), f"{starts} starts, tested families"
+            means, label = mine[tested].mean(axis=1), f"{starts} starts, tested agents"
             left.plot(places, means, "D:", ms=4, color=color, mfc="none", label=label)
             own = each[each["end"].isin(ends) & (each["starts"] == starts)]
             solved = np.isfinite(own["cpu_s_to_solve"])

@@ -1,7 +1,7 @@
 """How well each single SE of a set trains agents: violins of the test returns, the best SE first.
 
 Source: paper, appendix "Evaluation of Individual SE Models" for CartPole and for Acrobot: 40 SEs,
-1000 agents with drawn hyperparameters on each, 10 test episodes.
+1000 agents with drawn hyperparameters on each, 10 test episodes. It shows violins, no numbers.
 
 Agents are trained as in se_performance; with its `out` folder, those that it trained on the same
 SEs are used again.
@@ -20,6 +20,7 @@ from experiments.common import agents as groups
 from experiments.common import figures, tables
 from experiments.common.agents import SeAgents, return_columns
 from experiments.common.experiment import Experiment, setting
+from sejax import ProxySet, Task
 from sejax.options import ConfigError
 
 
@@ -28,9 +29,7 @@ class SeModels(SeAgents):
     name = "se_models"
     files = "models_"
 
-    ses: str | None = setting(
-        None, quick="cartpole", about="file of SEs, from se_feasibility, or a shipped name"
-    )
+    ses: str | None = setting(None, quick="cartpole")  # file of SEs, or a shipped name
 
 
 def compute(settings: SeModels) -> pd.DataFrame:
@@ -45,12 +44,12 @@ def compute(settings: SeModels) -> pd.DataFrame:
     return pd.concat(parts, ignore_index=True)
 
 
-def load(settings: SeModels) -> Any:
+def load(settings: SeModels) -> ProxySet:
     """The SEs that are tested."""
     if settings.ses is None:
         raise ConfigError(
-            "ses must be given, because agents are trained on its SEs; got none. "
-            "Set ses=results/se_feasibility/cartpole/ses.safetensors."
+            "ses must be given; got none. Set ses=results/se_feasibility/cartpole/ses.safetensors.",
+            "ses",
         )
     return sejax.load_set(settings.ses, option="ses", kind="se")[: settings.num_ses]
 
@@ -98,8 +97,8 @@ def report(settings: SeModels, rows: pd.DataFrame) -> pd.DataFrame:
     draw(task, rows, settings.folder / "models.png")
     note = (
         f"Return: mean ± std over {rows['agent'].nunique()} agents with drawn hyperparameters and "
-        f"{len(return_columns(rows))} test episodes each. The paper has 1000 agents on each of 40 "
-        f"SEs and shows violins only, no numbers.{correlations_text(summary)}{tables.iqm_note()}"
+        f"{len(return_columns(rows))} test episodes each."
+        f"{correlations_text(summary)}{tables.iqm_note()}"
     )
     title = f"Single SEs of {task.name} (solved at {task.solved_reward:g})"
     return tables.publish(settings, title, tables.as_texts(summary, columns), summary, note)
@@ -120,7 +119,7 @@ def correlations_text(summary: pd.DataFrame) -> str:
     return f" Rank correlation of the SEs' mean returns: {', '.join(texts)}." if texts else ""
 
 
-def draw(task: Any, agents: pd.DataFrame, path: Path) -> None:
+def draw(task: Task, agents: pd.DataFrame, path: Path) -> None:
     """Draws a violin of the returns for each SE, the best first, in a row for each kind of agent.
 
     Source: paper, appendix "Evaluation of Individual SE Models".

@@ -30,7 +30,7 @@ from experiments.common import agents as groups
 from experiments.common import figures, tables
 from experiments.common.agents import Condition, SeAgents, return_columns, tuned_agent
 from experiments.common.experiment import Experiment, count, setting
-from sejax import envs
+from sejax import ProxySet, Task, envs
 from sejax.options import one_of, require, shortened
 from sejax.training import SOLVED_BY, TrainingConfig
 
@@ -75,23 +75,17 @@ PAPER_RETURNS = {
 class SePerformance(SeAgents):
     name = "se_performance"
 
-    varied: str | None = setting(None, about="file of SEs learned with drawn hyperparameters")
-    fixed: str | None = setting(None, about="file of SEs learned with one agent's; quick: cartpole")
-    env: str | None = setting(None, about="task, where no file is given; cartpole")
-    tuned: bool = setting(
-        True, quick=False, about="whether agents tuned for it train on the real task too"
-    )
+    varied: str | None = setting(None)  # file of SEs learned with drawn hyperparameters
+    fixed: str | None = setting(None)  # file of SEs learned with one agent's; quick: cartpole
+    env: str | None = setting(None)  # task, where no file is given; cartpole
+    tuned: bool = setting(True, quick=False)  # whether tuned agents train on the real task too
     real_groups: int | None = count(
-        None, "groups", about="groups of agents on the real task, which is slow; as many as SEs"
-    )
-    real_episodes: int | None = count(
-        None, "episodes", quick=100, about="on the real task; 1000 (discrete TD3 in Acrobot 500)"
-    )
-    solved_by: str = setting(
-        "train",
-        one_of(SOLVED_BY),
-        about="whose last returns end training on the real task; train, as in the paper's code",
-    )
+        None
+    )  # of agents on the real task, which is slow; as many as SEs
+    # On the real task; 1000 (discrete TD3 in Acrobot 500).
+    real_episodes: int | None = count(None, quick=100)
+    # Whose last returns end training on the real task; train, as in the paper's code.
+    solved_by: str = setting("train", one_of(SOLVED_BY))
 
 
 def compute(settings: SePerformance) -> pd.DataFrame:
@@ -113,7 +107,7 @@ def compute(settings: SePerformance) -> pd.DataFrame:
     return pd.concat(parts, ignore_index=True)
 
 
-def solved_ones(ses: Any) -> Any:
+def solved_ones(ses: ProxySet) -> Any:
     """The SEs whose score, a mean return, reached the task's threshold."""
     return ses[ses.scores >= ses.task.solved_reward]
 
@@ -127,12 +121,11 @@ def load_sets(settings: SePerformance) -> dict[str, Any]:
     for name, file in files.items():
         ses = sejax.load_set(file, option=name, kind="se")
         learned_with = "varied" if ses.config["agent_hparams"] == "varied" else "fixed"
-        rule, got = f"be SEs learned with {name} hyperparameters", f"{ses.path} with {learned_with}"
-        fix = f"{learned_with}={ses.path}"
         require(
             learned_with == name,
             name,
-            f"must {rule}, because it is what is compared; got {shortened(got)}. Set {fix}.",
+            f"must be SEs learned with {name} hyperparameters; got {shortened(ses.path)} with "
+            f"{learned_with} ones. Set {learned_with}={shortened(ses.path)}.",
         )
         solved = solved_ones(ses)
         sets[name] = (solved if len(solved) else ses)[: settings.num_ses]
@@ -143,17 +136,15 @@ def task_name(settings: SePerformance, sets: dict[str, Any]) -> str:
     """The one task of all sets."""
     asked = {settings.env} if settings.env else set()
     names = sorted({str(ses.task.name) for ses in sets.values()} | asked)
-    rule, fix = f"be {names[0] if names else ''} as the other files", "files of the same task"
     require(
         len(names) <= 1,
         "env",
-        f"must {rule}, because agents are tested on it; got {shortened(', '.join(names))}. Set "
-        f"{fix}.",
+        f"must be one task for all files; got {', '.join(names)}. Set files of the same task.",
     )
     return names[0] if names else "cartpole"
 
 
-def on_real(settings: SePerformance, task: Any, sets: dict[str, Any], kind: str) -> Condition:
+def on_real(settings: SePerformance, task: Task, sets: dict[str, Any], kind: str) -> Condition:
     """The real task for a number of groups of agents; training ends by the solved rule."""
     as_ses = max((len(ses) for ses in sets.values()), default=settings.num_ses)
     # docs/reference.md 7.1: discrete TD3 trains 500 episodes on Acrobot, all others 1000.
@@ -206,23 +197,21 @@ def with_best(agents: pd.DataFrame) -> pd.DataFrame:
 def summarise(agents: pd.DataFrame) -> pd.DataFrame:
     """Means, deviations and intervals for each kind of agent and setting.
 
-    Deviations are over agents; intervals of means come from drawing SEs (groups) again, since
-    agents of the same SE have much in common, or agents on the real task, where groups have
-    nothing in common; of fewer than five there is none (nan). Those of interquartile means come
-    from drawing agents within their SE.
+    Deviations are over agents; intervals of means are of the means of SEs (groups), since agents of
+    the same SE have much in common, or of agents on the real task, where groups have nothing in
+    common; of fewer than five there is none (nan). Those of interquartile means come from drawing
+    agents within their SE.
     """
-    rows = []
-    for (kind, name), mine in agents.groupby(["kind", "setting"], sort=False):
-        row = {"kind": kind, "setting": name, "num_ses": mine["group"].nunique()}
-        row |= {"num_agents": len(mine), "num_nonfinite": int(mine["nonfinite"].sum())}
+
+    def statistics(mine: pd.DataFrame) -> dict[str, float]:
+        ses = strata(mine, mine["setting"].iloc[0])
+        row = {"num_ses": mine["group"].nunique(), "num_agents": len(mine)}
+        row |= {"num_nonfinite": int(mine["nonfinite"].sum())}
         for column in ("train_steps", "train_episodes", "test_return"):
-            of_ses = mine.groupby("group")[column].mean()
-            row |= tables.mean_columns(
-                mine[column], column, mine[column] if name in ON_REAL else of_ses
-            )
-        row |= tables.iqm_columns(mine["test_return"], "test_return", strata(mine, str(name)))
-        rows.append(row)
-    return pd.DataFrame(rows)
+            row |= tables.mean_columns(mine[column], column, ses)
+        return row | tables.iqm_columns(mine["test_return"], "test_return", ses)
+
+    return tables.summary_by(agents, ["kind", "setting"], statistics)
 
 
 def strata(agents: pd.DataFrame, name: str) -> pd.Series | None:
@@ -255,16 +244,9 @@ def make_table(env_name: str, summary: pd.DataFrame) -> pd.DataFrame:
         "IQM": tables.iqm_text("test_return"),
         "paper's return": paper(PAPER_RETURNS),
     }
-    if not has_tuned(summary):
+    if "tuned" not in set(summary["setting"]):
         del columns["than tuned"]
     return tables.as_texts(summary, columns)
-
-
-AND_TUNED = ", and against agents there with fixed settings that were tuned for it"
-
-
-def has_tuned(rows: pd.DataFrame) -> bool:
-    return bool((rows["setting"] == "tuned").any())
 
 
 def report(settings: SePerformance, rows: pd.DataFrame) -> pd.DataFrame:
@@ -275,23 +257,19 @@ def report(settings: SePerformance, rows: pd.DataFrame) -> pd.DataFrame:
     draw_profiles(task, agents, settings.folder / "profiles.png")
     note = (
         f"Mean ± std over agents with drawn hyperparameters, {len(return_columns(rows))} test "
-        "episodes each; in brackets a bootstrap 95% interval, for at least five SEs: it draws SEs, "
-        'and agents on the real task. "Fewer" '
-        "are training steps saved against the real task, for which a group of agents takes the "
-        f"place of an SE{AND_TUNED if has_tuned(summary) else ''}. "
-        f"The best SEs of all sets, {NUM_BEST} at most, are chosen by half of "
-        "their agents and shown by the other half. SEs are those of a set that reached the "
-        "threshold, all where none did. The paper has 40 SEs with 10 agents each; where a field is "
-        "empty it gives no number here, but for DDQN in CartPole a mean return on SEs of 190.7, in "
-        "another section. "
-        f"Agents that met a number that is not finite: {int(rows['nonfinite'].sum())}."
-        f"{tables.iqm_note('within each SE')}"
+        f"episodes each. {tables.interval_note('SEs, over agents on the real task')} "
+        '"Fewer" are training steps saved against the real task. '
+        f"The best SEs of all sets, {NUM_BEST} at most, are chosen by half of their agents and "
+        "shown by the other half. SEs are those of a set that reached the threshold, all where "
+        "none did. The paper has 40 SEs with 10 agents each, and for DDQN in CartPole a mean "
+        "return on SEs of 190.7, in another section. Agents that met a number that is not finite: "
+        f"{int(rows['nonfinite'].sum())}.{tables.iqm_note('within each SE')}"
     )
     title = f"Agents trained on SEs and tested on {task.name} (solved at {task.solved_reward:g})"
     return tables.publish(settings, title, make_table(task.name, summary), summary, note)
 
 
-def draw(task: Any, agents: pd.DataFrame, path: Path) -> None:
+def draw(task: Task, agents: pd.DataFrame, path: Path) -> None:
     """Draws densities of the test returns above and bars of steps and episodes below.
 
     Source: paper, figures "Densities based on each 4000 cumulative test rewards".
@@ -321,7 +299,7 @@ def draw(task: Any, agents: pd.DataFrame, path: Path) -> None:
         figure.legend(handles, texts, ncols=columns, loc="outside upper center")
 
 
-def draw_profiles(task: Any, agents: pd.DataFrame, path: Path) -> None:
+def draw_profiles(task: Task, agents: pd.DataFrame, path: Path) -> None:
     """Draws performance profiles of the agents' mean test returns, a panel for each kind."""
     kinds = list(agents.groupby("kind", sort=False))
     low, high = agents["test_return"].min(), agents["test_return"].max()

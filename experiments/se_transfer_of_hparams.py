@@ -20,10 +20,11 @@ from scipy.stats import rankdata
 import sejax
 from experiments.common import agents, figures
 from experiments.common.agents import Condition, Group, Measure
-from experiments.common.experiment import Experiment, Settings, count, each_of, setting
-from experiments.common.statistics import NUM_RESAMPLES
-from experiments.common.tables import as_texts, publish
-from sejax.options import require
+from experiments.common.experiment import Experiment, Settings, count, setting
+from experiments.common.statistics import LEAST, NUM_RESAMPLES
+from experiments.common.tables import as_texts, publish, with_interval
+from sejax import ProxySet, Task
+from sejax.options import each_of, require
 from sejax.training import TrainingConfig
 
 BUDGETS = {"same": "as many steps", "long": "until the stop rule"}
@@ -34,31 +35,28 @@ QUICK_AGENT = {"hidden_size": 8, "batch_size": 16, "num_layers": 1, "warmup_epis
 class SeTransferOfHparams(Settings):
     name = "se_transfer_of_hparams"
 
-    env: str = setting("cartpole", about="task: cartpole, acrobot, ...")
+    env: str = setting("cartpole")  # task: cartpole, acrobot, ...
     ses: str | None = setting(
-        None, about="SE, or set of SEs of which the best is taken; the shipped one of the task"
-    )
-    agent: str = setting("ddqn", about="that is tuned, with draws around the preset's settings")
-    preset: str = setting("best", about="of the agent")
-    run: tuple[str, ...] = setting((), about="overrides of the agent, as run.agent.discount=0.9")
-    num_configs: int = count(64, "configurations", quick=16, about="that are drawn")
-    num_agents: int = count(4, "agents", least=2, about="seeds of each; half of them are judges")
-    test_episodes: int = count(10, "episodes", about="of each agent")
-    budgets: tuple[str, ...] = setting(
-        tuple(BUDGETS), each_of(BUDGETS), quick=("same",), about="on the real task: same, long"
-    )
-    max_steps: int | None = count(
-        None, "steps", quick=1000, about="of an agent on the SE; as it was learned"
-    )
-    real_episodes: int = count(1000, "episodes", about="of budget long, at most")
-    real_steps: int | None = count(100_000, "steps", about="of budget long, at most")
+        None
+    )  # SE, or a set of which the best is taken; the task's shipped one
+    agent: str = setting("ddqn")  # that is tuned, with draws around the preset's settings
+    preset: str = setting("best")  # of the agent
+    run: tuple[str, ...] = setting(())  # overrides of the agent, as run.agent.discount=0.9
+    num_configs: int = count(64, quick=16)  # that are drawn
+    num_agents: int = count(4, least=2)  # seeds of each; half of them are judges
+    test_episodes: int = count(10)  # of each agent
+    # On the real task: same, long.
+    budgets: tuple[str, ...] = setting(tuple(BUDGETS), each_of(BUDGETS), quick=("same",))
+    max_steps: int | None = count(None, quick=1000)  # of an agent on the SE; as it was learned
+    real_episodes: int = count(1000)  # of budget long, at most
+    real_steps: int | None = count(100_000)  # of budget long, at most
 
 
 @dataclass(frozen=True, kw_only=True)
 class Parts:
     """What is trained where."""
 
-    ses: Any  # `ProxySet` of one
+    ses: ProxySet  # `ProxySet` of one
     agent: Any  # configuration
     trainings: dict[str, TrainingConfig]  # by world: se, and the budgets on the real task
 
@@ -66,11 +64,11 @@ class Parts:
 def parts_of(settings: SeTransferOfHparams) -> Parts:
     """Reads the SE and configures agents and trainings."""
     ses = sejax.load_set(settings.ses or settings.env, option="ses", kind="se").ranked(1)
-    rule, reason, there = f"be of {settings.env}", "agents are tested on it", ses.task.name
+    there = ses.task.name
     require(
         there == settings.env,
         "ses",
-        f"must {rule}, because {reason}; got one of {there}. Set env={there}.",
+        f"must be of {settings.env}; got one of {there}. Set env={there}.",
     )
     words = [f"env={settings.env}", f"preset={settings.preset}", f"agent={settings.agent}"]
     if settings.quick:
@@ -82,11 +80,10 @@ def parts_of(settings: SeTransferOfHparams) -> Parts:
         max_steps=settings.max_steps or learned.max_steps,
         max_episodes=max(learned.max_episodes, settings.max_steps or 0),
     )
-    rule, reason = "be given with this SE", "its agents trained until a rule stopped them"
     require(
         on_se.max_steps is not None,
         "max_steps",
-        f"must {rule}, because {reason}; got null. Set max_steps=5000.",
+        "must be given with an SE whose agents a rule stopped; got null. Set max_steps=5000.",
     )
     real = TrainingConfig(
         stop_rule="never",
@@ -137,7 +134,7 @@ def compute(settings: SeTransferOfHparams) -> pd.DataFrame:
 
 
 def make_shared_draws(
-    agent: Any, env: Any, task: Any, training: TrainingConfig
+    agent: Any, env: Any, task: Task, training: TrainingConfig
 ) -> Callable[..., Any]:
     """Builds `run(key, (env_params, config_key), active) -> (Outcome, drawn values)`.
 
@@ -223,7 +220,7 @@ def with_intervals(
 ) -> dict[str, float]:
     """`quality` with the ends of bootstrap 95% intervals, `..._low` and `..._high`.
 
-    Configurations are drawn again.
+    Configurations are drawn again; of fewer than `LEAST` there is no interval (nan).
     """
     size = target.shape[1]
     draws = np.random.default_rng(0).integers(0, size, (num_resamples, size))
@@ -231,8 +228,11 @@ def with_intervals(
     for places in draws:
         own = target[:, places]
         drawn.append(quality(own if chooser is target else chooser[:, places], own))
-    low, high = (pd.DataFrame(drawn).quantile(end) for end in (0.025, 0.975))
-    return {**quality(chooser, target), **low.add_suffix("_low"), **high.add_suffix("_high")}
+    ends = pd.DataFrame(drawn).quantile([0.025, 0.975])
+    if size < LEAST:
+        ends[:] = np.nan
+    low, high = ends.iloc[0].add_suffix("_low"), ends.iloc[1].add_suffix("_high")
+    return {**quality(chooser, target), **low, **high}
 
 
 def summarise(rows: pd.DataFrame) -> pd.DataFrame:
@@ -250,43 +250,20 @@ def summarise(rows: pd.DataFrame) -> pd.DataFrame:
 
 def make_table(summary: pd.DataFrame) -> pd.DataFrame:
     """The summary as texts."""
-
-    def interval(name: str, digits: int) -> str:
-        return f"{{{name}:.{digits}f}} [{{{name}_low:.{digits}f}}, {{{name}_high:.{digits}f}}]"
-
     names = {"se": "the SE"} | {name: f"the real task, {text}" for name, text in BUDGETS.items()}
     return as_texts(
         summary,
         {
             "trained on the real task": lambda row: BUDGETS[row.target],
             "tuned on": lambda row: names[row.chosen_by],
-            "Spearman's rho": interval("rho", 2),
-            "return of the choice": interval("chosen", 1),
-            "regret": interval("regret", 1),
-            "regret of a random one": interval("regret_random", 1),
+            "Spearman's rho": with_interval("rho", "rho", 2),
+            "return of the choice": with_interval("chosen", "chosen", 1),
+            "regret": with_interval("regret", "regret", 1),
+            "regret of a random one": with_interval("regret_random", "regret_random", 1),
             "steps": "{train_steps:,.0f}",
             "CPU s": "{cpu_s:,.1f}",
         },
     )
-
-
-def findings(summary: pd.DataFrame) -> str:
-    """Sentences on what was measured."""
-    texts = []
-    for target, mine in summary.groupby("target", sort=False):
-        by = mine.set_index("chosen_by")
-        se, real = by.loc["se"], by.loc[target]
-        texts.append(
-            f"Trained on the real task {BUDGETS[str(target)]}, the configuration that is best on "
-            f"the SE loses {se.regret:.1f} [{se.regret_low:.1f}, {se.regret_high:.1f}] of return "
-            f"to the one chosen there, and a random one {se.regret_random:.1f} "
-            f"[{se.regret_random_low:.1f}, {se.regret_random_high:.1f}]; ranks agree with "
-            f"rho = {se.rho:.2f} [{se.rho_low:.2f}, {se.rho_high:.2f}], between two halves of the "
-            f"real agents with {real.rho:.2f} [{real.rho_low:.2f}, {real.rho_high:.2f}]. Tuning on "
-            f"the SE took {se.train_steps / real.train_steps:.2f} times the steps and "
-            f"{se.cpu_s / real.cpu_s:.2f} times the CPU seconds."
-        )
-    return " ".join(texts)
 
 
 def report(settings: SeTransferOfHparams, rows: pd.DataFrame) -> pd.DataFrame:
@@ -295,18 +272,17 @@ def report(settings: SeTransferOfHparams, rows: pd.DataFrame) -> pd.DataFrame:
     draw(task, rows, settings.folder / "hparams.png")
     note = (
         f"{rows['config'].nunique()} drawn configurations of {settings.agent}, each trained "
-        f"with {settings.num_agents} seeds in each world. On the real task one half of the seeds "
-        "judges what the other has chosen, and the other way round; regret is the judged return of "
-        "the choice by the same training on the real task, less that of the choice. Rho is that "
-        "of all seeds, or of the two halves where the real task chooses for itself. Intervals: "
-        "bootstrap 95%, drawing configurations. Steps and CPU seconds (without compilation) are "
-        f"those of the agents that choose: half of the real ones. {findings(summary)}"
+        f"with {settings.num_agents} seeds on the SE and on the real task. There one half of the "
+        "seeds judges what the other has chosen; regret is the judged return of the real task's "
+        "choice less that of this one. Rho is that of all seeds, or of the two halves where the "
+        "real task chooses for itself. Intervals: bootstrap 95%, drawing configurations. Steps and "
+        "CPU seconds (without compilation): of the agents that choose, half of the real ones."
     )
     title = f"Tuning {settings.agent} on an SE of {task.name} (solved at {task.solved_reward:g})"
     return publish(settings, title, make_table(summary), summary, note)
 
 
-def draw(task: Any, rows: pd.DataFrame, path: Any) -> None:
+def draw(task: Task, rows: pd.DataFrame, path: Any) -> None:
     """Draws the configurations' mean returns on the real task against those on the SE."""
     means = rows.groupby(["world", "config"])["test_return"].mean().unstack("world")
     targets = [name for name in BUDGETS if name in means]

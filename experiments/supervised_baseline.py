@@ -34,6 +34,7 @@ from experiments.common.agents import HPARAMS, SE_AGENTS, SOFT_SE, Condition, re
 from experiments.common.experiment import Experiment
 from experiments.common.shards import stack, unstack
 from experiments.common.supervised_models import SupervisedBaseline
+from sejax import ProxySet, Task
 from sejax.options import require, shortened
 
 BEST = 2  # models in the paper's second figure
@@ -66,40 +67,24 @@ def compute(settings: SupervisedBaseline) -> pd.DataFrame:
     return stack({"agents": pd.concat(parts), "fits": fits, "transitions": transitions})
 
 
-def load(settings: SupervisedBaseline) -> Any:
+def load(settings: SupervisedBaseline) -> ProxySet:
     """The SE, if agents can be trained on it, and the tests of its NES run recorded."""
     ses = sejax.load_set(settings.proxy, option="proxy", kind="se")[:1]
 
-    def require_se(holds: bool, rule: str, reason: str, got: str) -> None:
-        require(
-            holds,
-            "proxy",
-            f"must be an SE {rule}, because {reason}; got {shortened(got)}. Set proxy={SOFT_SE}.",
-        )
-
-    learned_with = ses.config["agent"] or {"name": "several agents"}
-    require_se(
-        ses.task.num_states is None and ses.task.num_actions is not None,
-        "with vector states and discrete actions",
-        "the agents are made for these",
-        f"one of {ses.task.name}",
-    )
-    require_se(
-        ses.env.config.horizon != 1,
-        "whose episodes have several steps",
-        "a supervised model predicts next states",
-        "a bandit",
-    )
-    require_se(
-        learned_with["name"] in SE_AGENTS and learned_with.get("action_repeat", 1) == 1,
-        f"learned with {', '.join(SE_AGENTS)}, without action repeat",
-        "the recorded NES runs have its agent, and their every step is a row",
-        f"one learned with {learned_with['name']}",
-    )
+    agent = ses.config["agent"] or {"name": "several agents"}
+    is_discrete = ses.task.num_states is None and ses.task.num_actions is not None
+    is_recorded = agent["name"] in SE_AGENTS and agent.get("action_repeat", 1) == 1
+    for holds, rule, got in (
+        (is_discrete, "with vector states and discrete actions", ses.task.name),
+        (ses.env.config.horizon != 1, "whose episodes have several steps", "a bandit"),
+        (is_recorded, f"learned with {', '.join(SE_AGENTS)}, no action repeat", agent["name"]),
+    ):
+        message = f"must be an SE {rule}; got one of {shortened(got)}. Set proxy={SOFT_SE}."
+        require(holds, "proxy", message)
     return ses
 
 
-def make_conditions(settings: Any, ses: Any, kind: str, hparams: str) -> dict[str, Condition]:
+def make_conditions(settings: Any, ses: ProxySet, kind: str, hparams: str) -> dict[str, Condition]:
     """The models of both variants and the SE, with as many agents on the SE as on all models."""
     sets = {
         name: sejax.load_set(supervised_models.model_file(settings, name), option="out")
@@ -141,23 +126,23 @@ def summarise(agents: pd.DataFrame, solved_reward: float) -> pd.DataFrame:
     Intervals come from drawing models again, as agents of one model have much in common. All groups
     of the SE share it: their intervals are those of drawing agents.
     """
-    rows = []
-    for (kind, hparams, name), mine in agents.groupby(["kind", "hparams", "world"]):
-        returns, model = mine["test_return"], None if name == "se" else mine["group"]
-        draws = returns if model is None else returns.groupby(model).mean()
-        rows.append(
-            {"kind": kind, "hparams": hparams, "world": name, "num_agents": len(mine)}
-            | tables.mean_columns(returns, "return", draws, least=1)
+
+    def statistics(mine: pd.DataFrame) -> dict[str, float]:
+        returns = mine["test_return"]
+        model = None if mine["world"].iloc[0] == "se" else mine["group"]
+        return (
+            {"num_agents": len(mine)}
+            | tables.mean_columns(returns, "return", model)
             | {"return_std": mine[return_columns(mine)].to_numpy().std()}
             | tables.iqm_columns(returns, "return", model)
             | {"solved": (returns >= solved_reward).mean()}
             | dict(mine[["train_steps", "train_episodes"]].mean())
             | {"num_nonfinite": int(mine["nonfinite"].sum())}
         )
-    order = [*SE_AGENTS, *HPARAMS, *LABELS]
-    return pd.DataFrame(rows).sort_values(
-        ["kind", "hparams", "world"], key=lambda names: names.map(order.index), ignore_index=True
-    )
+
+    by, order = ["kind", "hparams", "world"], [*SE_AGENTS, *HPARAMS, *LABELS]
+    summary = tables.summary_by(agents, by, statistics)
+    return summary.sort_values(by, key=lambda x: x.map(order.index), ignore_index=True)
 
 
 def make_table(summary: pd.DataFrame) -> pd.DataFrame:
@@ -187,17 +172,15 @@ def report(settings: SupervisedBaseline, rows: pd.DataFrame) -> pd.DataFrame:
     draw(task, agents, settings.folder / "supervised_baseline.png")
     last = fits[fits["epoch"] == fits["epoch"].max()].mean()
     note = (
-        f"Mean ± std over test episodes and a bootstrap 95% interval that draws models, for the SE "
-        f"agents; solved: agents with a mean return of {task.solved_reward:g} at least. "
+        f"Mean ± std over test episodes. {tables.interval_note('models, for the SE over agents')} "
+        f"Solved: agents with a mean return of {task.solved_reward:g} at least. "
         f"{len(data)} models, each fitted for {fits['epoch'].max() + 1:.0f} epochs to "
-        f"{data['transitions'].min():,.0f} transitions of one NES run, whose mean one is from "
-        f"an episode with a return of {data['episode_return'].mean():.1f}; "
-        f"{data['ends'].mean():.2%} of the transitions end an episode. Mean squared error "
-        f"{last['error']:.2g} of [s', r] (paper: 5e-07), "
-        f"{last['done_error']:.2g} of the end. As the authors: the network for the end "
-        "keeps its random weights. Fair: it is fitted too, and used. The best models are those of "
-        "the runs with the best episodes. Agents that met a number that is not finite: "
-        f"{diverged_text(agents)}.{tables.iqm_note('within each model')}"
+        f"{data['transitions'].min():,.0f} transitions of one NES run, from episodes with a mean "
+        f"return of {data['episode_return'].mean():.1f}; {data['ends'].mean():.2%} end an episode. "
+        f"Mean squared error {last['error']:.2g} of [s', r] (paper: 5e-07), "
+        f"{last['done_error']:.2g} of the end. The best models are those of the runs with the best "
+        f"episodes. Agents that met a number that is not finite: {diverged_text(agents)}."
+        f"{tables.iqm_note('within each model')}"
     )
     title = f"Agents trained on supervised models of {task.name} and on an SE"
     return tables.publish(settings, title, make_table(summary), summary, note)
@@ -215,7 +198,7 @@ def diverged_text(agents: pd.DataFrame) -> str:
     return ", ".join(texts) or "none"
 
 
-def draw(task: Any, agents: pd.DataFrame, path: Path) -> None:
+def draw(task: Task, agents: pd.DataFrame, path: Path) -> None:
     """Draws histograms of the test returns, a panel for each agent and choice of hyperparameters.
 
     Source: paper, figure "Comparing the cumulative test reward densities", top.

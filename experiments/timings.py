@@ -21,9 +21,11 @@ import pandas as pd
 
 import sejax
 from experiments.common import figures
-from experiments.common.experiment import Experiment, Settings, count, each_of, setting
+from experiments.common.experiment import Experiment, Settings, count, setting
 from experiments.common.tables import as_texts, publish
+from sejax.cli import session
 from sejax.cli.runtime import available_cores
+from sejax.options import each_of
 
 PAPER_CORES = 16
 
@@ -60,8 +62,8 @@ SETTINGS = {"paper": "the paper's", "best": "our default"}
 class Timings(Settings):
     name = "timings"
 
-    rows: tuple[str, ...] = setting(tuple(ROWS), each_of(ROWS), about="tasks and proxies")
-    generations: int = count(2, "iterations", about="outer iterations to time")
+    rows: tuple[str, ...] = setting(tuple(ROWS), each_of(ROWS))  # tasks and proxies
+    generations: int = count(2)  # outer iterations to time
 
 
 def compute(settings: Timings) -> pd.DataFrame:
@@ -93,12 +95,10 @@ def config_of(settings: Timings, row: Row, preset: str) -> Any:
 
 def time_generations(settings: Timings, row: Row, preset: str) -> pd.DataFrame:
     """Mean wall-clock of the first outer iterations, compiled before."""
-    from sejax.cli import session
-
     chunks = session.make_chunks(config_of(settings, row, preset))
     program = chunks.learner
     state = chunks.init(jax.random.key(settings.seed))
-    idle = jax.tree.map(lambda x: x.copy(), state.replace(finished=~state.finished))
+    idle = jax.tree.map(lambda x: x.copy(), dataclasses.replace(state, finished=~state.finished))
     jax.block_until_ready(chunks.advance(idle, 1))  # compiled, and run with nothing to do
     wall, cpu, steps = [], [], []
     for _ in range(settings.generations):

@@ -12,12 +12,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from sejax.agents.base import Agent
+from sejax.agents.base import Agent, AgentState, Hparams
 from sejax.agents.mixture import Mixture
 from sejax.envs.base import Task
 from sejax.envs.wrappers import repeat_actions
+from sejax.es.base import StrategyState
 from sejax.objectives import Outcome
 from sejax.ops.keys import step_keys
 from sejax.ops.loops import while_any_active
@@ -73,7 +74,7 @@ class _Episode:
     total: Array
     scored: Array  # return of the steps that count for the objective
     obs: Array
-    env_state: Any
+    env_state: PyTree
 
 
 class _Greedy:
@@ -95,7 +96,7 @@ class _Greedy:
         )
 
     def step(
-        self, key: Array, agent_state: Any, before: _Episode, eval_steps: Array | None = None
+        self, key: Array, agent_state: AgentState, before: _Episode, eval_steps: Array | None = None
     ) -> tuple[_Episode, Steps]:
         """The episode after a decision, and the decision; `key` is that of the whole episode.
 
@@ -139,12 +140,16 @@ def make_tester(agent: Agent, task: Task, num_episodes: int) -> Callable[..., Te
     """
     greedy = _Greedy(agent, task)
 
-    def step(nothing: Array, state: _Episode, consts: Any, masked: bool) -> tuple[Array, _Episode]:
+    def step(
+        nothing: Array, state: _Episode, consts: PyTree, masked: bool
+    ) -> tuple[Array, _Episode]:
         key, agent_state, eval_steps = consts
         after, _ = greedy.step(key, agent_state, state, eval_steps)
         return nothing, after
 
-    def episode(key: Array, agent_state: Any, active: Array | bool, eval_steps: Any) -> Tests:
+    def episode(
+        key: Array, agent_state: AgentState, active: Array | bool, eval_steps: Array | None
+    ) -> Tests:
         key_reset, key_steps = jax.random.split(key)
         state = greedy.begin(key_reset, active)
         consts = (key_steps, agent_state, eval_steps)
@@ -153,7 +158,7 @@ def make_tester(agent: Agent, task: Task, num_episodes: int) -> Callable[..., Te
 
     def test(
         key: Array,
-        agent_state: Any,
+        agent_state: AgentState,
         active: Array | bool = True,
         eval_steps: Array | None = None,
     ) -> Tests:
@@ -164,7 +169,9 @@ def make_tester(agent: Agent, task: Task, num_episodes: int) -> Callable[..., Te
     return test
 
 
-def make_recorder(agent: Agent, task: Task, num_episodes: int) -> Callable[[Array, Any], Steps]:
+def make_recorder(
+    agent: Agent, task: Task, num_episodes: int
+) -> Callable[[Array, AgentState], Steps]:
     """Builds `record(key, agent_state) -> Steps`, leaves `[num_episodes * max_steps, ...]`.
 
     The episodes are those of `make_tester` with the same key. A decision that an agent repeats is
@@ -172,7 +179,7 @@ def make_recorder(agent: Agent, task: Task, num_episodes: int) -> Callable[[Arra
     """
     greedy = _Greedy(agent, task)
 
-    def episode(key: Array, agent_state: Any) -> Steps:
+    def episode(key: Array, agent_state: AgentState) -> Steps:
         key_reset, key_steps = jax.random.split(key)
 
         def step(state: _Episode, _: None) -> tuple[_Episode, Steps]:
@@ -182,7 +189,7 @@ def make_recorder(agent: Agent, task: Task, num_episodes: int) -> Callable[[Arra
         start = greedy.begin(key_reset, True)
         return jax.lax.scan(step, start, length=-(-task.max_steps // agent.spec.action_repeat))[1]
 
-    def record(key: Array, agent_state: Any) -> Steps:
+    def record(key: Array, agent_state: AgentState) -> Steps:
         keys = jax.random.split(key, num_episodes)
         steps = jax.vmap(episode, in_axes=(0, None))(keys, agent_state)
         return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), steps)
@@ -237,8 +244,7 @@ def make_evaluator(
     require(
         isinstance(task, Task),
         "task",
-        "must be a sejax.Task, because agents are tested on it; got "
-        f"{type(task).__name__}. Set task=env.task of a proxy, or "
+        f"must be a sejax.Task; got {type(task).__name__}. Set task=env.task of a proxy, or "
         "sejax.envs.make(name).",
     )
     require_training_config(training)
@@ -249,7 +255,11 @@ def make_evaluator(
         train = make_tested_trainer(agent, env, task, training)
 
         def run(
-            key: Array, env_params: Any, active: Array | bool, eval_steps: Any, hparams: Any
+            key: Array,
+            env_params: PyTree,
+            active: Array | bool,
+            eval_steps: Array | None,
+            hparams: Hparams,
         ) -> Any:
             key_train, key_test = jax.random.split(key)
             result = train(key_train, env_params, hparams, active)
@@ -290,7 +300,7 @@ def make_tested_trainer(
     """
     test = make_tester(agent, task, max(1, training.num_tests_between))
 
-    def test_between(key: Array, agent_state: Any, active: Array) -> tuple[Array, Array]:
+    def test_between(key: Array, agent_state: AgentState, active: Array) -> tuple[Array, Array]:
         tests = test(key, agent_state, active)
         return tests.returns.mean(), tests.num_steps.sum()
 
@@ -336,7 +346,7 @@ def num_parallel_on_cpu(agent: Agent, training: TrainingConfig) -> int | None:
 def evaluate_agents(
     agent: Agent,
     env: Any,
-    env_params: Any,
+    env_params: PyTree,
     task: Task,
     training: TrainingConfig,
     keys: Array,
@@ -374,6 +384,20 @@ def make_candidate_evaluator(
     )
 
 
+@struct.dataclass
+class Candidates:
+    """What a generation evaluates."""
+
+    population: Float[Array, "pop dims"]  # as the strategy asks for it
+    incumbent: Float[Array, " dims"]
+    params: Float[Array, "evaluation dims"]  # first those of the population, then the incumbent's
+    keys: Array  # of the trainings, [evaluation]
+    active: Array  # whether anything is to be computed
+    eval_steps: Array | None  # length of the test episodes that are scored; None: the task's limit
+    key_tell: Array  # for `Strategy.tell`
+    es_state: StrategyState  # after `Strategy.ask`
+
+
 def make_population_evaluator(
     mixture: Mixture,
     proxy: ProxyEnv,
@@ -382,13 +406,13 @@ def make_population_evaluator(
     agent_of_evaluation: np.ndarray,
     devices: int | None = None,
     num_parallel: int | None = None,
-) -> Callable[..., Outcome]:
-    """Builds `evaluate(keys, params, active, eval_steps=None) -> Outcome`, leaves `[evaluation]`.
+) -> Callable[[Candidates], Outcome]:
+    """Builds `evaluate(candidates) -> Outcome`, leaves `[evaluation]`.
 
-    Trains one fresh agent on each candidate, `keys [evaluation]` and `params [evaluation, dims]`,
-    and tests it on the real task. Evaluations are grouped by agent when the program is built, so
-    that no training executes another agent's branch; each group is spread over the devices, and
-    on each of them batches of `num_parallel` follow one another.
+    Trains one fresh agent for each evaluation and tests it on the real task. Evaluations are
+    grouped by agent when the program is built, so that no training executes another agent's
+    branch; each group is spread over the devices, and on each of them batches of `num_parallel`
+    follow one another.
 
     Raises:
       ConfigError: if there are fewer than `devices` devices.
@@ -402,12 +426,11 @@ def make_population_evaluator(
         [num_parallel_on_cpu(agent, training) for agent in mixture.agents],
     )
 
-    def evaluate(
-        keys: Array, params: Array, active: Array, eval_steps: Array | None = None
-    ) -> Outcome:
-        def arguments(group: np.ndarray) -> tuple[Any, ...]:
-            shared = jax.tree.map(lambda x: jnp.repeat(x, group.size), (active, eval_steps))
-            return keys[group], params[group], *shared
+    def evaluate(candidates: Candidates) -> Outcome:
+        def arguments(group: np.ndarray) -> tuple[PyTree, ...]:
+            shared = candidates.active, candidates.eval_steps
+            shared = jax.tree.map(lambda x: jnp.repeat(x, group.size), shared)
+            return candidates.keys[group], candidates.params[group], *shared
 
         outcomes = evaluate_groups([arguments(group) for group in groups])
         if len(outcomes) == 1:

@@ -7,7 +7,7 @@ number. `Scoring` applies it to a generation: what the strategy compares, and wh
 import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import jax.numpy as jnp
 import numpy as np
@@ -15,6 +15,7 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
 from sejax.agents.mixture import Mixture
+from sejax.envs.base import Task
 from sejax.es.base import Evaluations, Strategy, finite_mean
 from sejax.options import Options, counts, not_negative, option, require
 
@@ -61,8 +62,8 @@ class Objective:
       scores_are_returns: whether scores are mean returns, which the task's threshold can be held
         against.
       eval_steps: `generation -> steps`, how much of the test episodes it scores, if not all: a
-        curriculum. Only the members are scored by it; what an incumbent is worth is said by whole
-        episodes.
+        curriculum. It scores the population alone; incumbents are
+        scored by whole episodes.
       meaning: of a score, for people.
     """
 
@@ -100,7 +101,7 @@ class MaxReward(Options):
     # Generation from which on the task's limit counts; before, the steps change linearly.
     curriculum_generations: int = option(50, counts("it is the length of a curriculum"))
 
-    def make(self, task: Any) -> Objective:
+    def make(self, task: Task) -> Objective:
         """The objective on a task."""
         if self.first_eval_steps is None:
             return Objective(score=lambda outcome: outcome.test_return, scores_are_returns=True)
@@ -132,7 +133,7 @@ class RewardThreshold(Options):
     # w_sol: training steps that a unit of missing return is worth
     unsolved_weight: float = option(100.0, not_negative("a shortfall must not be rewarded"))
 
-    def make(self, task: Any) -> Objective:
+    def make(self, task: Task) -> Objective:
         """The objective on a task.
 
         Raises:
@@ -141,8 +142,8 @@ class RewardThreshold(Options):
         require(
             task.is_solvable,
             "objective",
-            "must be one that needs no threshold in this task, because nobody says which return "
-            "solves it; got reward_threshold. Set env.solved_reward, or objective=max_reward.",
+            "must need no threshold where the task has none; got reward_threshold. Set "
+            "env.solved_reward, or objective=max_reward.",
         )
 
         def score(outcome: Outcome) -> Array:
@@ -167,7 +168,7 @@ class AUC(Options):
     group: ClassVar[str] = "objective"
     scores_are_returns: ClassVar[bool] = False
 
-    def make(self, task: Any) -> Objective:
+    def make(self, task: Task) -> Objective:
         """The objective on a task."""
         return Objective(
             score=lambda outcome: outcome.auc / jnp.maximum(outcome.train_steps, 1),
@@ -189,7 +190,7 @@ class AUCSum(Options):
     group: ClassVar[str] = "objective"
     scores_are_returns: ClassVar[bool] = False
 
-    def make(self, task: Any) -> Objective:
+    def make(self, task: Task) -> Objective:
         """The objective on a task."""
         return Objective(
             score=lambda outcome: outcome.auc,
@@ -220,95 +221,6 @@ class Scores:
     agent_means: Float[Array, " agent"]
     incumbent_mean: Float[Array, ""]
     diverged: Bool[Array, " all"]
-
-
-@dataclass(frozen=True, kw_only=True)
-class Scoring:
-    """How outcomes become scores, with one agent or a mixture, with or without a curriculum.
-
-    Attributes:
-      objective: the score of one outcome.
-      mixture: the agents.
-      evaluations: how often each candidate is evaluated.
-      agent_of_candidate: index of the agent that trains on each candidate, `[pop]`.
-      agent_of_evaluation: the same for each evaluation, `[evaluation]`.
-    """
-
-    objective: Objective
-    mixture: Mixture
-    evaluations: Evaluations
-    agent_of_candidate: np.ndarray
-    agent_of_evaluation: np.ndarray
-
-    @classmethod
-    def of(cls, objective: Objective, strategy: Strategy, mixture: Mixture) -> "Scoring":
-        """The scoring of a strategy's population.
-
-        Raises:
-          ConfigError: if the population is too small for the mixture, or the strategy compares
-            scores of several generations where their units differ.
-        """
-        one_unit = mixture.size == 1 and objective.eval_steps is None
-        require(
-            one_unit or not strategy.remembers_scores,
-            "es",
-            "must compare scores within a generation only, because with several agents or a "
-            "curriculum, scores of different generations are not comparable; got a strategy that "
-            "remembers scores. Set es=nes.",
-        )
-        asked = strategy.evaluations
-        evaluations = dataclasses.replace(
-            asked, num_incumbent_evals=mixture.num_evals(asked.num_incumbent_evals)
-        )
-        agent_of_candidate = mixture.agent_of_candidate(
-            strategy.population_size, strategy.antithetic
-        )
-        return cls(
-            objective=objective,
-            mixture=mixture,
-            evaluations=evaluations,
-            agent_of_candidate=agent_of_candidate,
-            agent_of_evaluation=evaluations.agents(agent_of_candidate, mixture.size),
-        )
-
-    def for_strategy(self, outcome: Outcome) -> tuple[Float[Array, " pop"], Float[Array, ""]]:
-        """Scores of the population and of the incumbent in one unit, for `Strategy.tell`."""
-        scores = self._scores(self.objective(outcome))
-        population = self.evaluations.population_scores(scores.population)
-        return self.mixture.comparable(population, self.agent_of_candidate, scores.agent_means)
-
-    def of_whole_tests(self, outcome: Outcome) -> Scores:
-        """The scores that people see; with a curriculum, those of whole test episodes."""
-        if self.objective.eval_steps is None:
-            return self._scores(self.objective(outcome))
-        return self._scores(self.objective.of_whole_tests(outcome))
-
-    def by_agent(self, statistic: Callable[[Array], Array], values: Array) -> Array:
-        """A statistic of the evaluations `[evaluation]` of each agent, `[agent]`."""
-        agents = self.agent_of_evaluation[: values.shape[0]]
-        return jnp.stack([statistic(values[agents == i]) for i in range(self.mixture.size)])
-
-    def _scores(self, scores: Float[Array, " evaluation"]) -> Scores:
-        population, incumbent = self.evaluations.split(scores)
-        num_population = population.shape[0]
-        of_population = self.agent_of_evaluation[:num_population]
-        of_incumbent = self.agent_of_evaluation[num_population:]
-        means = []
-        for i in range(self.mixture.size):
-            places = np.flatnonzero(of_incumbent == i)
-            repaired, mean = self.evaluations.incumbent_scores(
-                incumbent[places], population[of_population == i]
-            )
-            incumbent = incumbent.at[places].set(repaired)
-            means.append(mean)
-        agent_means = jnp.stack(means)
-        return Scores(
-            population=population,
-            incumbent=incumbent,
-            agent_means=agent_means,
-            incumbent_mean=self.mixture.aggregated(agent_means),
-            diverged=~jnp.isfinite(scores),
-        )
 
 
 @struct.dataclass
@@ -342,29 +254,116 @@ class GenerationInfo:
     active: Array  # False for a generation of a run that was over
 
 
-def generation_info(
-    scoring: Scoring, scores: Scores, outcome: Outcome, generation: Any, best: Any, active: Any
-) -> GenerationInfo:
-    """The statistics of `scores` and `outcome`."""
-    return GenerationInfo(
-        generation=generation,
-        incumbent_mean=scores.incumbent_mean,
-        incumbent_std=jnp.nanstd(scores.incumbent),
-        population_mean=finite_mean(scores.population),
-        population_max=jnp.nanmax(scores.population),
-        best_so_far=best,
-        train_steps_mean=outcome.train_steps.mean(),
-        train_steps_max=outcome.train_steps.max(),
-        train_episodes_mean=outcome.train_episodes.mean(),
-        num_nonfinite=scores.diverged.sum(),
-        by_agent=AgentInfo(
-            incumbent_mean=scores.agent_means,
-            population_mean=scoring.by_agent(finite_mean, scores.population),
-            train_steps_mean=scoring.by_agent(jnp.mean, outcome.train_steps),
-            num_nonfinite=scoring.by_agent(jnp.sum, scores.diverged),
-        ),
-        population_scores=scores.population,
-        train_steps=outcome.train_steps,
-        real_steps=outcome.real_steps,
-        active=active,
-    )
+@dataclass(frozen=True, kw_only=True)
+class Scoring:
+    """How outcomes become scores, with one agent or a mixture, with or without a curriculum.
+
+    Attributes:
+      objective: the score of one outcome.
+      mixture: the agents.
+      evaluations: how often each candidate is evaluated.
+      agent_of_candidate: index of the agent that trains on each candidate, `[pop]`.
+      agent_of_evaluation: the same for each evaluation, `[evaluation]`.
+    """
+
+    objective: Objective
+    mixture: Mixture
+    evaluations: Evaluations
+    agent_of_candidate: np.ndarray
+    agent_of_evaluation: np.ndarray
+
+    @classmethod
+    def of(cls, objective: Objective, strategy: Strategy, mixture: Mixture) -> "Scoring":
+        """The scoring of a strategy's population.
+
+        Raises:
+          ConfigError: if the population is too small for the mixture, or the strategy compares
+            scores of several generations where their units differ.
+        """
+        one_unit = mixture.size == 1 and objective.eval_steps is None
+        require(
+            one_unit or not strategy.remembers_scores,
+            "es",
+            "must compare scores within a generation with several agents or a curriculum; got one "
+            "that remembers scores. Set es=nes.",
+        )
+        asked = strategy.evaluations
+        evaluations = dataclasses.replace(
+            asked, num_incumbent_evals=mixture.num_evals(asked.num_incumbent_evals)
+        )
+        agent_of_candidate = mixture.agent_of_candidate(
+            strategy.population_size, strategy.antithetic
+        )
+        return cls(
+            objective=objective,
+            mixture=mixture,
+            evaluations=evaluations,
+            agent_of_candidate=agent_of_candidate,
+            agent_of_evaluation=evaluations.agents(agent_of_candidate, mixture.size),
+        )
+
+    def for_strategy(self, outcome: Outcome) -> tuple[Float[Array, " pop"], Float[Array, ""]]:
+        """Scores of the population and of the incumbent in one unit, for `Strategy.tell`."""
+        scores = self._scores(self.objective(outcome))
+        population = self.evaluations.population_scores(scores.population)
+        return self.mixture.comparable(population, self.agent_of_candidate, scores.agent_means)
+
+    def of_whole_tests(self, outcome: Outcome) -> Scores:
+        """The scores that people see; with a curriculum, those of whole test episodes."""
+        if self.objective.eval_steps is None:
+            return self._scores(self.objective(outcome))
+        return self._scores(self.objective.of_whole_tests(outcome))
+
+    def info(
+        self, scores: Scores, outcome: Outcome, generation: Array, best: Array, active: Array
+    ) -> GenerationInfo:
+        """The statistics of a generation."""
+        return GenerationInfo(
+            generation=generation,
+            incumbent_mean=scores.incumbent_mean,
+            incumbent_std=jnp.nanstd(scores.incumbent),
+            population_mean=finite_mean(scores.population),
+            population_max=jnp.nanmax(scores.population),
+            best_so_far=best,
+            train_steps_mean=outcome.train_steps.mean(),
+            train_steps_max=outcome.train_steps.max(),
+            train_episodes_mean=outcome.train_episodes.mean(),
+            num_nonfinite=scores.diverged.sum(),
+            by_agent=AgentInfo(
+                incumbent_mean=scores.agent_means,
+                population_mean=self.by_agent(finite_mean, scores.population),
+                train_steps_mean=self.by_agent(jnp.mean, outcome.train_steps),
+                num_nonfinite=self.by_agent(jnp.sum, scores.diverged),
+            ),
+            population_scores=scores.population,
+            train_steps=outcome.train_steps,
+            real_steps=outcome.real_steps,
+            active=active,
+        )
+
+    def by_agent(self, statistic: Callable[[Array], Array], values: Array) -> Array:
+        """A statistic of the evaluations `[evaluation]` of each agent, `[agent]`."""
+        agents = self.agent_of_evaluation[: values.shape[0]]
+        return jnp.stack([statistic(values[agents == i]) for i in range(self.mixture.size)])
+
+    def _scores(self, scores: Float[Array, " evaluation"]) -> Scores:
+        population, incumbent = self.evaluations.split(scores)
+        num_population = population.shape[0]
+        of_population = self.agent_of_evaluation[:num_population]
+        of_incumbent = self.agent_of_evaluation[num_population:]
+        means = []
+        for i in range(self.mixture.size):
+            places = np.flatnonzero(of_incumbent == i)
+            repaired, mean = self.evaluations.incumbent_scores(
+                incumbent[places], population[of_population == i]
+            )
+            incumbent = incumbent.at[places].set(repaired)
+            means.append(mean)
+        agent_means = jnp.stack(means)
+        return Scores(
+            population=population,
+            incumbent=incumbent,
+            agent_means=agent_means,
+            incumbent_mean=self.mixture.aggregated(agent_means),
+            diverged=~jnp.isfinite(scores),
+        )

@@ -26,14 +26,10 @@ def main(words: Sequence[str] | None = None) -> None:
     if {"--help", "-h"} & {*words}:
         print(USAGE)
         return
-    with commands.messages():
-        _main(words)
-
-
-def _main(words: Sequence[str]) -> None:
     outs = [word.removeprefix("out=") for word in words if word.startswith("out=")]
     folders = [Path(word) for word in words if not word.startswith("out=")]
-    print(report(folders, Path(outs[-1]) if outs else None))
+    with commands.messages():
+        print(report(folders, Path(outs[-1]) if outs else None))
 
 
 def report(folders: Sequence[Path], out: Path | None = None) -> Path:
@@ -53,23 +49,15 @@ def report(folders: Sequence[Path], out: Path | None = None) -> Path:
     from sejax.cli import report as pages
     from sejax.ops.files import require_writable, write_text
 
-    require(
-        folders,
-        "RUN_DIR",
-        "must be given, because the report is about it; got none. Set one or several: python -m "
-        "sejax.report runs/cartpole-se-ddqn-s0.",
-    )
+    require(folders, "RUN_DIR", "must be given; got none. Set it to the run_dir of a run.")
+    with registry.only_typed(()):  # nothing that a run directory names is imported
+        page = pages.page(pages.read(folders))
     if out is None:
         out = Path(folders[0] if len(folders) == 1 else ".", "report.html")
-    require(
-        not out.is_dir(),
-        "out",
-        f"must be a file, because the page is written there; got the folder {out}. Set "
-        f"out={out / 'report.html'}.",
-    )
+    fix = f"Set out={out / 'report.html'}."
+    require(not out.is_dir(), "out", f"must be a file; got the folder {out}. {fix}")
     require_writable("out", out.parent)
-    with registry.only_typed(()):  # nothing that a run directory names is imported
-        write_text(out, pages.page(pages.read(folders)))
+    write_text(out, page)
     return out
 
 

@@ -5,13 +5,16 @@ Running the same command on an existing run directory goes on where it stopped.
 
 import contextlib
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
-from sejax.cli import commands, runtime
+import yaml
+
+from sejax.cli import commands, compose, runtime
 from sejax.cli import config as configuration
 from sejax.cli.config import LearnConfig
+from sejax.cli.progress import RunProgress
+from sejax.cli.run_directory import open_for
 
 ABOUT = """Learn a small network that stands in for an RL task (proxy=se), or for its reward on the
 real dynamics (proxy=rn), from agents trained on nothing else.
@@ -21,7 +24,8 @@ real dynamics (proxy=rn), from agents trained on nothing else.
   python -m sejax.run env=gymnax/MountainCar-v0 agent=my_module:MyAgent
   python -m sejax.run seed=0,1,2 es.noise_std=0.03,0.06      a run for each combination
 
-The same command on the same run_dir goes on where it stopped.
+The same command on the same run_dir goes on where it stopped. --print-config prints the
+configuration of each run, and runs nothing.
 Then: python -m sejax.evaluate proxy=RUN_DIR
 """
 
@@ -33,61 +37,33 @@ def main(overrides: Sequence[str]) -> None:
       ConfigError: for overrides that cannot be, or a run directory that cannot be used.
       OSError: if a file cannot be written; everything saved before is whole.
     """
-    configs = []
-    for of_run in configuration.expand(overrides):
-        config = configuration.config(of_run)
-        given = config.run_dir
-        known = LearnConfig.in_run_dir if given is None else ("run_dir",)
-        own = configuration.name_in_sweep(overrides, of_run, known)
-        if own:  # or all runs of a sweep would have one folder
-            folder = f"{config.resolved_run_dir}_{own}" if given is None else f"{given}/{own}"
-            config = dataclasses.replace(config, run_dir=folder)
-        configs += runs_of(config)
-    learn_all(configs)
+    learn_all(configs_of(overrides))
 
 
 def help_text(overrides: Sequence[str]) -> str:
     """What `--help` prints."""
-    return f"{ABOUT}\n{configuration.help_text(LearnConfig, overrides)}"
+    return f"{ABOUT}\n{compose.help_text(LearnConfig, overrides)}"
 
 
-def learn(config: LearnConfig) -> list[float]:
-    """Learns a proxy for each of `num_seeds` seeds; see `learn_all`."""
-    return learn_all(runs_of(config))
+def config_text(overrides: Sequence[str]) -> str:
+    """What `--print-config` prints: the `config.yaml` of each run."""
+    plain = [configuration.plain(config) for config in configs_of(overrides)]
+    return yaml.safe_dump_all(plain, sort_keys=False)
 
 
-def learn_all(configs: Sequence[LearnConfig]) -> list[float]:
-    """Learns a proxy for each configuration, one after the other.
-
-    Each has a run directory of its own. Those that differ from the one before in the seed alone run
-    on its executable.
-
-    Returns:
-      The best incumbent score of each.
-
-    Raises:
-      ConfigError: if a run directory cannot be used.
-      OSError: if a file cannot be written; everything saved before is whole.
-    """
-    with contextlib.ExitStack() as stack:
-        before: dict[str, Any] = {}
-
-        def chunks_of(config: LearnConfig) -> Any:
-            program = dataclasses.replace(config, seed=0, run_dir=None)
-            if before.get("program") != program:
-                stack.close()
-                runtime.configure_jax()
-                made = config.machines.make(config, Path(config.resolved_run_dir), print)
-                before.update(program=program, chunks=stack.enter_context(made))
-            return before["chunks"]
-
-        several = len(configs) > 1
-        scores = [_learn(config, chunks_of, says_more=not several) for config in configs]
-    if several:
-        print("Best incumbent scores:")
-        for config, score in zip(configs, scores, strict=True):
-            print(f"{score:10.1f}  {config.resolved_run_dir}")
-    return scores
+def configs_of(overrides: Sequence[str]) -> list[LearnConfig]:
+    """The configuration of each run that the overrides describe, with folders of their own."""
+    configs = []
+    for of_run in compose.expand(overrides):
+        config = configuration.config(of_run)
+        given = config.run_dir
+        known = LearnConfig.in_run_dir if given is None else ("run_dir",)
+        swept = compose.name_in_sweep(overrides, of_run, known)
+        if swept:  # or all runs of a sweep would have one folder
+            folder = f"{config.resolved_run_dir}_{swept}" if given is None else f"{given}/{swept}"
+            config = dataclasses.replace(config, run_dir=folder)
+        configs += runs_of(config)
+    return configs
 
 
 def runs_of(config: LearnConfig) -> list[LearnConfig]:
@@ -105,43 +81,53 @@ def runs_of(config: LearnConfig) -> list[LearnConfig]:
     ]
 
 
-def _learn(config: LearnConfig, chunks_of: Callable[[LearnConfig], Any], says_more: bool) -> float:
-    """Learns a proxy in its run directory, with a live line of progress.
+def learn_all(configs: Sequence[LearnConfig]) -> list[float]:
+    """Learns a proxy for each configuration, one after the other, in a run directory each.
 
-    Ctrl-C leaves at once, with exit code 130: finished generations are saved.
-
-    Args:
-      config: the configuration.
-      chunks_of: gives its compiled generations.
-      says_more: whether it prints at the end where everything is, and what to do next.
+    Those that differ from the one before in the seed alone run on its executable. At the end it
+    prints where everything is and what to do next, or, of several runs, a line for each. Ctrl-C
+    leaves at once, with exit code 130: finished generations are saved.
 
     Returns:
-      The best incumbent score.
+      The best incumbent score of each.
+
+    Raises:
+      ConfigError: if a run directory cannot be used.
+      OSError: if a file cannot be written; everything saved before is whole.
     """
-    from sejax.cli.progress import RunProgress
+    scores = []
+    with contextlib.ExitStack() as machines:
+        compiled = None
+        for config in configs:
+            # Before the task is imported, so that a refusal is quick.
+            with open_for(config) as directory, RunProgress(config) as progress:
+                try:
+                    progress.status("importing jax and the task")
+                    from sejax.cli import session
 
-    # Before the task is imported: a refusal must be quick.
-    from sejax.cli.run_directory import open_for
-
-    with open_for(config) as directory, RunProgress(config) as progress:
-        try:
-            progress.status("importing jax and the task")
-            from sejax.cli import session
-
-            chunks = chunks_of(config)
-            ended = session.run(config, directory, chunks, progress)
-        except KeyboardInterrupt:
-            progress.stop()
-            print(
-                f"Interrupted. {directory.finished_generations} generations are saved in "
-                f"{directory.path}; the same command goes on from there."
-            )
-            commands.leave(commands.INTERRUPTED)
-        best = max(float(row["best_so_far"]) for row in directory.rows)
-        if says_more:
-            progress.finish(directory, chunks.learner, best, ended)
-    return best
+                    program = dataclasses.replace(config, seed=0, run_dir=None)
+                    if program != compiled:
+                        machines.close()
+                        runtime.configure_jax()
+                        made = config.machines.make(config, Path(config.resolved_run_dir), print)
+                        compiled, chunks = program, machines.enter_context(made)
+                    ended = session.run(config, directory, chunks, progress)
+                except KeyboardInterrupt:
+                    progress.stop()
+                    print(
+                        f"Interrupted. {directory.finished_generations} generations are saved in "
+                        f"{directory.path}; the same command goes on from there."
+                    )
+                    commands.leave(commands.INTERRUPTED)
+                scores.append(max(float(row["best_so_far"]) for row in directory.rows))
+                if len(configs) == 1:
+                    progress.finish(directory, chunks.learner, scores[-1], ended)
+    if len(configs) > 1:
+        print("Best incumbent scores:")
+        for config, score in zip(configs, scores, strict=True):
+            print(f"{score:10.1f}  {config.resolved_run_dir}")
+    return scores
 
 
 if __name__ == "__main__":
-    commands.start(main, help_text)
+    commands.start(main, help_text, config_text)

@@ -5,14 +5,9 @@ A trial is a run, whose generations are the budget; the same command goes on whe
 
 from collections.abc import Sequence
 from importlib.util import find_spec
-from typing import TYPE_CHECKING, Any
 
 from sejax.cli import commands, runtime
 from sejax.options import ConfigError
-
-if TYPE_CHECKING:  # they need the extra `search`
-    from sejax.cli.search_config import Search
-    from sejax.cli.trials import Runner
 
 
 def main(overrides: Sequence[str]) -> None:
@@ -23,24 +18,20 @@ def main(overrides: Sequence[str]) -> None:
       OSError: if a file cannot be written.
     """
     if find_spec("optuna") is None:
-        raise ConfigError(
-            "sejax.search needs Optuna, because it decides what is tried. Install it with "
-            "pip install 'sejax[search]'."
-        )
+        raise ConfigError("sejax.search needs Optuna. Install it with pip install 'sejax[search]'.")
     from sejax.cli import search_config, search_results, search_workers, study
+    from sejax.cli.trials import runner_of
+    from sejax.cli.workers import RayConfig
 
     search = search_config.read(overrides)
-    current = None
-    if not search.joins:  # all is checked before a study is made
-        current = search_config.require_fields(search, runner_of(search).config([]))
-    found, search = study.open_study(search, current)
     runner = runner_of(search)
-    search_config.require_fields(search, runner.config([]))  # of a study that is joined
+    current = search_config.require_fields(search, runner.config([]))
+    found = study.open_study(search, current)
     runtime.configure_jax()
     _say(f"Study {search.study} in {search.folder}: {', '.join(search.space)}.")
     try:
-        if search.machines.is_elsewhere:
-            search_workers.work(found, search, join, _say)
+        if isinstance(search.machines, RayConfig):
+            search_workers.work(found, search, search.machines, _say)
         else:
             study.work(found, search, runner, _say)
         search_results.write(found, search, runner.command)
@@ -51,7 +42,7 @@ def main(overrides: Sequence[str]) -> None:
             return
         settings = search_results.overrides_of(best[0], search)
         if search.num_verified:
-            settings = _verified(found, search, runner)
+            settings = search_results.verified(found, search, runner)
     except KeyboardInterrupt:
         _say(
             f"Interrupted. What has ended is saved in {search.folder}; the same command goes on "
@@ -61,40 +52,6 @@ def main(overrides: Sequence[str]) -> None:
     _say(f"\nThe best:\n  {search_results.command_line(settings, search, runner.command)}")
     _say(f"The same:\n  {search_results.preset_line(search, runner.command)}")
     _say(f"{search.folder} holds trials.csv, best.txt and preset.yaml.")
-
-
-def join(overrides: Sequence[str]) -> None:
-    """Works on a study that exists until it is over, as one more worker."""
-    from sejax.cli import search_config, study
-
-    found, search = study.open_study(search_config.read(overrides))
-    study.work(found, search, runner_of(search), lambda text: None)
-
-
-def runner_of(search: "Search") -> "Runner":
-    """What makes the trials of a search."""
-    from sejax.cli.trials import Learning, Tuning
-
-    if not search.is_of_agent:
-        return Learning(search)
-    from sejax.evaluate import proxy_study
-
-    return Tuning(search, proxy_study)
-
-
-def _verified(found: Any, search: "Search", runner: "Runner") -> list[str]:
-    """The overrides of the settings that were best when they were tried again."""
-    import filelock
-
-    from sejax.cli import search_results
-
-    with filelock.FileLock(search.folder / "verification.lock"):  # another worker may be at it
-        rows = search_results.verify(found, search, runner)
-    search_results.print_verified(rows, search)
-    best = found.get_trials(deepcopy=False)[int(rows["trial"].iloc[0])]
-    settings = search_results.overrides_of(best, search)
-    search_results.write_best(settings, search, runner.command)
-    return settings
 
 
 def _say(text: str) -> None:

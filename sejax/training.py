@@ -12,9 +12,9 @@ from typing import Any, ClassVar
 import jax
 import jax.numpy as jnp
 from flax import struct
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Int, PyTree
 
-from sejax.agents.base import Agent, AgentConfig, Spaces
+from sejax.agents.base import Agent, AgentConfig, AgentState, Hparams, Spaces
 from sejax.agents.buffers import Buffer, BufferMaker, Transition
 from sejax.envs.base import require_own_steps
 from sejax.envs.wrappers import repeat_actions
@@ -31,7 +31,7 @@ from sejax.options import (
     require,
     shortened,
 )
-from sejax.options.registry import from_plain
+from sejax.options.plain import from_plain
 from sejax.proxies.base import episode_limit, is_real, prepare
 from sejax.proxies.header import agents_of, is_registered
 from sejax.proxies.io import Proxy, ProxySet, stored_config
@@ -137,8 +137,8 @@ def training_of(proxy: Proxy | ProxySet, agent: AgentConfig | None = None) -> Tr
     require(
         isinstance(stored, Mapping),
         "training",
-        f"must be given for {proxy.path.name}, because the file does not tell how long agents "
-        "trained on it; got none. Set training=sejax.TrainingConfig(...).",
+        f"must be given for {shortened(proxy.path.name)}, which does not say how long its agents "
+        "trained; got none. Set training=sejax.TrainingConfig(...).",
     )
     training: TrainingConfig = from_plain(TrainingConfig, stored, "training")
     if agent is None:
@@ -160,8 +160,7 @@ def require_training_config(training: Any) -> None:
     require(
         isinstance(training, TrainingConfig),
         "training",
-        "must be a sejax.TrainingConfig, because it says how long agents train; got "
-        f"{type(training).__name__}. Set "
+        f"must be a sejax.TrainingConfig; got {type(training).__name__}. Set "
         "training=sejax.TrainingConfig(max_episodes=100).",
     )
 
@@ -184,9 +183,9 @@ def require_reachable(name: str, training: TrainingConfig, max_episode_steps: in
     require(
         training.max_episodes >= episodes,
         f"{name}.max_episodes",
-        f"must be at least {episodes}, because {name}.max_steps={training.max_steps} takes as many "
-        f"episodes of at most {max_episode_steps} steps; got {shortened(training.max_episodes)}. "
-        f"Set {name}.max_episodes={episodes}.",
+        f"must be at least {episodes} for {name}.max_steps={training.max_steps} in episodes of at "
+        f"most {max_episode_steps} steps; got {shortened(training.max_episodes)}. Set "
+        f"{name}.max_episodes={episodes}.",
     )
 
 
@@ -209,7 +208,7 @@ class TrainResult:
       recorded: what the recorder has kept of the training's steps, if there was one.
     """
 
-    agent_state: Any
+    agent_state: AgentState
     train_steps: Array
     episodes: Array
     returns: Float[Array, " max_episodes"]
@@ -217,7 +216,7 @@ class TrainResult:
     episode_ends: Int[Array, " max_episodes"]
     nonfinite: Array
     eval_steps: Array
-    recorded: Any
+    recorded: PyTree
 
 
 @struct.dataclass
@@ -234,19 +233,17 @@ class _Curve:
         """The episode's row is written if it has ended: an index out of range is dropped."""
         row = jnp.where(ended, episode, self.ends.shape[0])
 
-        def written(column: Array, value: Array) -> Array:
-            return column.at[row].set(value, mode="drop")
-
+        tests = self.test_returns
         return _Curve(
-            returns=written(self.returns, episode_return),
-            ends=written(self.ends, end),
-            test_returns=None if self.test_returns is None else written(self.test_returns, tested),
+            returns=self.returns.at[row].set(episode_return, mode="drop"),
+            ends=self.ends.at[row].set(end, mode="drop"),
+            test_returns=None if tests is None else tests.at[row].set(tested, mode="drop"),
         )
 
 
 @struct.dataclass
 class _LoopState:
-    """Carry of the step loop. What the agent remembers, and the curve, are carried beside it."""
+    """Carry of the step loop. Buffers and the curve are carried beside it."""
 
     active: Array
     step: Array  # decisions
@@ -254,8 +251,8 @@ class _LoopState:
     episode: Array
     episode_return: Array
     obs: Array
-    env_state: Any
-    agent_state: Any
+    env_state: PyTree
+    agent_state: AgentState
     recent: Array  # [2 * window]: the last returns that the stop rule judges, newest last
     nonfinite: Array
     eval_steps: Array
@@ -263,7 +260,7 @@ class _LoopState:
 
 
 # `(key, agent_state, active) -> (mean return, steps)`, on the real task.
-TestFn = Callable[[Array, Any, Array], tuple[Array, Array]]
+TestFn = Callable[[Array, AgentState, Array], tuple[Array, Array]]
 
 
 def make_trainer(
@@ -276,8 +273,8 @@ def make_trainer(
 ) -> Callable[..., TrainResult]:
     """Builds `train(key, env_params, hparams, active=True) -> TrainResult` for one agent.
 
-    The result is pure; `vmap` it over keys, parameters and hyperparameters. Under `vmap` the lanes
-    run in lockstep until the last one has stopped, without copies of replay buffers. With
+    The result is pure; `vmap` it over keys, parameters and hyperparameters. Under `vmap` a batch of
+    agents takes as many steps as its longest training, without copies of replay buffers. With
     `active=False` nothing is computed.
 
     Args:
@@ -324,14 +321,23 @@ def make_trainer(
     loop = _Loop(agent, env, training, solved_reward, test_fn, recorder)
 
     def train(
-        key: Array, env_params: Any, hparams: Any = agent.hparams, active: Array | bool = True
+        key: Array,
+        env_params: PyTree,
+        hparams: Hparams = agent.hparams,
+        active: Array | bool = True,
     ) -> TrainResult:
         env_params = loop.prepare(env_params, hparams)
         key_begin, key_steps = jax.random.split(key)
         state = loop.begin(key_begin, env_params, hparams, active)
-        remembered = tuple(buffer.init() for buffer in loop.buffers(state))
-        (remembered, curve), state = while_any_active(
-            loop.step, (remembered, loop.empty_curve()), state, (key_steps, env_params)
+        stored = tuple(buffer.init() for buffer in loop.buffers(state))
+        no_returns = jnp.full(training.max_episodes, jnp.nan)
+        curve = _Curve(
+            returns=no_returns,
+            ends=jnp.zeros(training.max_episodes, jnp.int32),
+            test_returns=None if loop.test_fn is None else no_returns,
+        )
+        (stored, curve), state = while_any_active(
+            loop.step, (stored, curve), state, (key_steps, env_params)
         )
         return TrainResult(
             agent_state=state.agent_state,
@@ -342,7 +348,7 @@ def make_trainer(
             episode_ends=curve.ends,
             nonfinite=state.nonfinite | ~_all_finite(state.agent_state),
             eval_steps=state.eval_steps,
-            recorded=remembered[1] if recorder is not None else None,
+            recorded=stored[1] if recorder is not None else None,
         )
 
     return train
@@ -350,34 +356,28 @@ def make_trainer(
 
 def _require_parts(agent: Any, env: Any, training: Any) -> None:
     """Checks that the arguments are what they are called, in their order."""
-    require(
-        isinstance(agent, Agent),
-        "agent",
-        "must be a sejax.Agent, because it acts and learns; got "
-        f"{type(agent).__name__}. Set agent=sejax.make_agent(config, task).",
-    )
+    kind = type(agent).__name__
+    fix = "Set agent=sejax.make_agent(config, task)."
+    require(isinstance(agent, Agent), "agent", f"must be a sejax.Agent; got {kind}. {fix}")
     require(
         hasattr(env, "step_env"),
         "env",
-        "must be a gymnax environment, because the agent trains there; got "
-        f"{type(env).__name__}. Set env to the first of the pair that sejax.load "
-        "returns, or to task.env.",
+        f"must be a gymnax environment; got {type(env).__name__}. Set env to the first of the pair "
+        "that sejax.load returns, or to task.env.",
     )
     require_own_steps(env)
     spaces = None if agent.spec.spaces is None else Spaces.of_env(env)
     require(
         agent.spec.spaces == spaces,
         "agent",
-        f"must be made for the environment's {spaces}, because it acts on what it was made for; "
-        f"got {shortened(agent.spec.spaces)}. Set agent=sejax.make_agent(config, task) with that "
-        "task.",
+        f"must be made for the environment's {spaces}; got one for {shortened(agent.spec.spaces)}. "
+        "Set agent=sejax.make_agent(config, task) with that task.",
     )
     require_training_config(training)
     require(
         not jax.config.jax_enable_x64,
         "jax_enable_x64",
-        "must be off, because sejax counts and computes in 32 bits; got true. Set "
-        "JAX_ENABLE_X64=0.",
+        "must be off: sejax computes in 32 bits; got true. Set JAX_ENABLE_X64=0.",
     )
 
 
@@ -388,15 +388,17 @@ def _make_solver(
     require(
         training.num_tests_between == 0 and recorder is None,
         "agent",
-        "must be one that learns where its training is looked at, because there is no learning "
-        "curve without one; got one that is solved for. Set agent=ddqn, or objective=max_reward "
-        "training.tests_between=0.",
+        "must learn where its training is looked at; got one that is solved for. Set agent=ddqn, "
+        "or objective=max_reward training.tests_between=0.",
     )
     assert agent.solve is not None
     solve = agent.solve
 
     def train(
-        key: Array, env_params: Any, hparams: Any = agent.hparams, active: Array | bool = True
+        key: Array,
+        env_params: PyTree,
+        hparams: Hparams = agent.hparams,
+        active: Array | bool = True,
     ) -> TrainResult:
         state = solve(env, env_params, hparams)
         return TrainResult(
@@ -441,7 +443,9 @@ class _Loop:
             env, params, agent.discount(hparams), limit_is_terminal
         )
 
-    def begin(self, key: Array, env_params: Any, hparams: Any, active: Array | bool) -> _LoopState:
+    def begin(
+        self, key: Array, env_params: PyTree, hparams: Hparams, active: Array | bool
+    ) -> _LoopState:
         key_agent, key_reset = jax.random.split(key)
         obs, env_state = self.env.reset_env(key_reset, env_params)
         agent_state = self.agent.init(key_agent, hparams)
@@ -460,14 +464,6 @@ class _Loop:
             tested=jnp.float32(0),
         )
 
-    def empty_curve(self) -> _Curve:
-        no_returns = jnp.full(self.training.max_episodes, jnp.nan)
-        return _Curve(
-            returns=no_returns,
-            ends=jnp.zeros(self.training.max_episodes, jnp.int32),
-            test_returns=None if self.test_fn is None else no_returns,
-        )
-
     def buffers(self, state: _LoopState) -> list[Buffer]:
         """What the agent keeps of its steps, and what the recorder does."""
 
@@ -480,10 +476,10 @@ class _Loop:
         return [make(shapes, self.buffer_steps) for make in self.buffer_makers]
 
     def step(
-        self, large: Any, state: _LoopState, consts: Any, masked: bool
-    ) -> tuple[Any, _LoopState]:
+        self, large: PyTree, state: _LoopState, consts: PyTree, masked: bool
+    ) -> tuple[PyTree, _LoopState]:
         """One agent step: act, step the world, store, learn, and close the episode if it ended."""
-        (remembered, curve), (key, env_params) = large, consts
+        (stored, curve), (key, env_params) = large, consts
         buffers = self.buffers(state)
         key_act, key_env, key_sample, key_update, *keys_end = step_keys(key, state.step, 6)
         action = self.agent.act(key_act, state.agent_state, state.obs, explore=True)
@@ -493,19 +489,20 @@ class _Loop:
         truncated = self.env.is_truncated(env_state, env_params)
         nonfinite = state.nonfinite | info.get("nonfinite", False)
         ended = terminated | truncated | nonfinite
-        transition = Transition(
-            state.obs, action, reward, self.discount(terminated, truncated, info), next_obs
-        )
+        # What a target bootstraps with, before gamma.
+        discount = jnp.float32(info.get("discount", jnp.where(terminated, 0.0, 1.0)))
+        discount = jnp.where(truncated, 0.0, discount) if self.limit_is_terminal else discount
+        transition = Transition(state.obs, action, reward, discount, next_obs)
         active = state.active if masked else True
         finished = ended & active  # an episode that counts
-        remembered = tuple(
+        stored = tuple(
             buffer.store(arrays, state.step, transition, ended, active)
-            for buffer, arrays in zip(buffers, remembered, strict=True)
+            for buffer, arrays in zip(buffers, stored, strict=True)
         )
 
-        def learn(agent_state: Any) -> Any:
+        def learn(agent_state: AgentState) -> Any:
             size = self.agent.batch_size(agent_state)
-            batch = buffers[0].batch(key_sample, remembered[0], state.step + 1, transition, size)
+            batch = buffers[0].batch(key_sample, stored[0], state.step + 1, transition, size)
             batch = buffers[0].mask(batch, active) if masked else batch
             return self.agent.update(key_update, agent_state, batch)
 
@@ -530,19 +527,15 @@ class _Loop:
         curve = curve.with_episode(
             before.episode, before.episode_return, train_steps, state.tested, finished
         )
-        return (remembered, curve), state
-
-    def discount(self, terminated: Array, truncated: Array, info: Any) -> Array:
-        """What a target bootstraps with, before gamma."""
-        discount = jnp.float32(info.get("discount", jnp.where(terminated, 0.0, 1.0)))
-        return jnp.where(truncated, 0.0, discount) if self.limit_is_terminal else discount
+        return (stored, curve), state
 
     def end_episode(
-        self, keys: list[Array], state: _LoopState, env_params: Any, finished: Array
+        self, keys: list[Array], state: _LoopState, env_params: PyTree, finished: Array
     ) -> _LoopState:
         """Records the episode, decides whether training goes on, and starts the next one.
 
-        In lanes this runs for all if it runs for one; `finished` spares the others the test.
+        Under `vmap` this runs for all agents if it runs for one; `finished` spares the others the
+        test.
         """
         key_reset, key_test = keys
         judged = state.episode_return
@@ -607,6 +600,6 @@ def is_solved(
     return recent[window:].sum() / jnp.clip(num_episodes, 1, window) >= solved_reward
 
 
-def _all_finite(tree: Any) -> Array:
+def _all_finite(tree: PyTree) -> Array:
     leaves = [x for x in jax.tree.leaves(tree) if jnp.issubdtype(x.dtype, jnp.floating)]
     return jnp.array([jnp.all(jnp.isfinite(x)) for x in leaves], bool).all()

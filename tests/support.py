@@ -1,5 +1,6 @@
 """What several test modules share: plain references, and a reader of compiled programs."""
 
+import functools
 import math
 import re
 
@@ -49,6 +50,38 @@ def numpy_forward(params, x, activation, num_layers, prelu_slope=0.25):
         if layer < num_layers:
             x = activate(x)
     return x
+
+
+def train_on(agent, batch, num_updates):
+    """The agent after so many updates on a batch; to be called in a jitted function."""
+
+    def step(state, key):
+        return agent.update(key, state, batch), None
+
+    state = agent.init(jax.random.key(0), agent.hparams)
+    return jax.lax.scan(step, state, jax.random.split(jax.random.key(1), num_updates))[0]
+
+
+@functools.cache
+def drawing(agent):
+    """The actions of 4000 keys, `(state, obs) -> (exploring, testing)`, jitted."""
+
+    @jax.jit
+    def draw(state, obs):
+        keys = jax.random.split(jax.random.key(1), 4000)
+        return [
+            jax.vmap(lambda key, e=explore: agent.act(key, state, obs, e))(keys)
+            for explore in (True, False)
+        ]
+
+    return draw
+
+
+def assert_shares(drawn, expected):
+    """Each index is drawn as often as expected, within five standard deviations."""
+    share = np.bincount(drawn, minlength=len(expected)) / drawn.size
+    deviation = np.sqrt(expected * (1 - expected) / drawn.size)
+    assert (np.abs(share - expected) <= 5 * deviation + 1e-7).all()
 
 
 # Ops that pass a buffer on or write into it in place.

@@ -197,6 +197,25 @@ def test_a_masked_batch_leaves_a_rollout_unlearned_and_others_as_they_are(case):
         assert_equal(masked, batch)
 
 
+@pytest.mark.parametrize("case", EXPLORING, ids="-".join)
+def test_an_exploring_agent_begins_episodes_and_acts_as_the_one_inside(case):
+    task, agent, _ = parts(case)
+    plain = parts((*case[:2], "none"))[1]
+    assert agent.buffer is plain.buffer and agent.env_action is plain.env_action
+    state, obs = started(case)[0], jnp.int32(0) if task.num_states else jnp.ones(task.obs_dim)
+
+    @functools.partial(jax.jit, static_argnums=0)
+    def begun_and_actions(agent, state):
+        begun, keys = agent.begin_episode(state, jnp.int32(5)), jax.random.split(jax.random.key(0))
+        acts = [jax.vmap(lambda key, e=e: agent.act(key, begun, obs, e)) for e in (True, False)]
+        return begun, [act(keys) for act in acts]
+
+    begun, actions = begun_and_actions(agent, state)
+    expected, expected_actions = begun_and_actions(plain, state.agent_state)
+    assert_equal(begun.agent_state, expected)
+    assert_equal(actions, expected_actions)
+
+
 @pytest.mark.parametrize("name", LEARNING)
 def test_an_agent_is_made_once_for_equal_configurations(name):
     task = envs.make(next(task for task in TASKS if fits(name, task)))
@@ -207,7 +226,7 @@ def test_an_agent_is_made_once_for_equal_configurations(name):
 # --- agents with a replay buffer -----------------------------------------------------------------
 
 
-@every_off_policy_agent
+@pytest.mark.parametrize("case", [*OFF_POLICY, *EXPLORING[:2]], ids="-".join)
 def test_columns_of_no_weight_change_nothing(case):
     state, batch = started(case)
     update, key = update_of(case), jax.random.key(0)

@@ -11,7 +11,6 @@ from support import large_ops_in_loops
 
 import sejax
 from sejax.bilevel import make_bilevel, make_learner
-from sejax.es.base import Evaluations
 from sejax.options import ConfigError, registry
 
 # 40 steps for each of 12 agents: short enough for rounding not to grow into other actions.
@@ -55,22 +54,22 @@ def run(generation, state, generations):
     return states, infos
 
 
-@pytest.fixture(scope="module")
-def one_device():
+def on_one_device(words):
     """Program on one device, its compiled generation, and a run of three generations per key."""
-    program = program_of("devices=1")
+    program = program_of("devices=1", words=words)
     generation, state = compiled(program, KEYS[0])
     runs = [run(generation, state, 3), run(generation, program.init(KEYS[1]), 3)]
     return program, generation, runs
+
+
+@pytest.fixture(scope="module")
+def one_device():
+    return on_one_device(TINY)
 
 
 @pytest.fixture(scope="module")
 def room():
-    """The same of tables."""
-    program = program_of("devices=1", words=ROOM)
-    generation, state = compiled(program, KEYS[0])
-    runs = [run(generation, state, 3), run(generation, program.init(KEYS[1]), 3)]
-    return program, generation, runs
+    return on_one_device(ROOM)
 
 
 def leaves(tree):
@@ -129,14 +128,10 @@ def test_infos_count_generations_and_steps(one_device):
         assert (info.real_steps >= 2 * 5).all()  # 2 tests of at least 5 steps each
 
 
-def test_generations_of_one_seed_differ_and_so_do_seeds(one_device):
-    _, _, ((states, infos), (others, _)) = one_device
+def test_no_two_trials_generations_or_seeds_have_a_key_in_common(one_device):
+    program, _, ((states, infos), (others, _)) = one_device
     assert (states[0].incumbent != others[0].incumbent).any()
     assert len({float(info.population_mean) for info in infos}) == 3
-
-
-def test_no_two_trials_generations_or_seeds_have_a_key_in_common(one_device):
-    program, _, ((states, _), (others, _)) = one_device
     asked = [program.ask(state).keys for state in (states[0], states[1], others[0])]
     data = np.concatenate([np.asarray(jax.random.key_data(keys)).reshape(-1, 2) for keys in asked])
     assert len(data) == 3 * program.strategy.num_evaluations
@@ -303,26 +298,10 @@ def test_an_incumbent_that_diverges_is_never_the_best(one_device):
     np.testing.assert_array_equal(after.best, states[0].best)
 
 
-def test_incumbent_agents_that_diverge_count_as_the_worst_of_the_generation():
-    nan, inf = np.nan, np.inf
-    trials = Evaluations(num_incumbent_evals=4)
-    scores = jnp.array([-9.0, nan, 3.0, 5.0, nan, 7.0, inf])  # the last four are the incumbent's
-    members, incumbent = trials.split(scores)
-    np.testing.assert_array_equal(members, [-9.0, nan, 3.0])
-    got, mean = trials.incumbent_scores(incumbent, members)
-    np.testing.assert_array_equal(got, [5.0, -9.0, 7.0, -9.0])
-    assert mean == (5 - 9 + 7 - 9) / 4
-    got, mean = trials.incumbent_scores(jnp.array([nan, nan]), jnp.array([198.0, 199.0]))
-    np.testing.assert_array_equal(got, [nan, nan])
-    assert np.isnan(mean)
-
-
 def test_more_devices_than_there_are_is_refused():
-    count = jax.device_count()
-    with pytest.raises(
-        ConfigError, match=rf"devices must be at most {count}, .* got {count + 1}\. Set devices="
-    ):
-        make_learner(tiny(f"devices={count + 1}"))
+    with pytest.raises(ConfigError) as error:
+        make_learner(tiny(f"devices={jax.device_count() + 1}"))
+    assert error.value.field == "devices"
 
 
 @pytest.mark.parametrize("part", ["task", "agent", "proxy", "es", "objective"])

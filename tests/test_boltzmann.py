@@ -95,7 +95,9 @@ def test_two_numbers_of_an_action_make_a_grid():
 def program_of(agent, **parts):
     return make_bilevel(**{
         "task": CARTPOLE, "agent": agent, "proxy": BANDIT, "devices": 1,
-        "es": sejax.NESConfig(population_size=16, noise_std=0.1, num_incumbent_evals=4),
+        "es": sejax.NESConfig(
+            population_size=16, noise_std=0.1, noise_std_decay=1.0, num_incumbent_evals=4
+        ),
         "training": sejax.TrainingConfig(max_steps=64, max_episodes=64, stop_rule="never"), **parts,
     })  # fmt: skip
 
@@ -123,18 +125,18 @@ def test_the_outer_loop_learns_a_bandit_without_a_step_of_training():
     assert np.isfinite(infos[0].by_agent.population_mean[0])
 
 
-def test_where_it_cannot_be_solved_for_it_says_so():
+def test_where_it_cannot_be_solved_for_it_is_refused():
     agent = sejax.make_agent(BoltzmannConfig(), CARTPOLE)
-    message = r"^agent must be one that learns, or the proxy an SE whose episodes are one step, .*"
-    with pytest.raises(ConfigError, match=message + r"proxy\.horizon=1\."):
+    with pytest.raises(ConfigError) as error:
         program = program_of(agent, proxy=SyntheticConfig(hidden_size=8))
         jax.eval_shape(program.generation, jax.eval_shape(program.init, jax.random.key(0)))
+    assert error.value.field == "agent"
     train = sejax.make_trainer(agent, CARTPOLE.env)
-    with pytest.raises(ConfigError, match=message):
+    with pytest.raises(ConfigError):
         jax.eval_shape(train, jax.random.key(0), CARTPOLE.params)
-    with pytest.raises(ConfigError, match=r"^agent must be one that learns where its training is"):
+    with pytest.raises(ConfigError):
         program_of(agent, objective=AUC())
-    with pytest.raises(ConfigError, match=r"more than 2 numbers, .* got boltzmann for 3 of them"):
+    with pytest.raises(ConfigError):
         BoltzmannConfig().make(
             type("Task", (), {"num_actions": None, "action_dim": 3, "max_action": 1.0})
         )

@@ -1,7 +1,5 @@
 """sejax.agents.exploration: the bonus by hand and by a plain loop, and in a training."""
 
-import functools
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,13 +8,13 @@ import pytest
 from sejax import envs
 from sejax.agents.buffers import Transition
 from sejax.agents.exploration import CountBasedConfig, with_count_bonus
-from sejax.agents.tabular import QLearningConfig, SARSAConfig, make_q_learning, make_sarsa
+from sejax.agents.tabular import QLearningConfig, SARSAConfig, make_tabular
 from sejax.evaluation import make_tester
 from sejax.training import TrainingConfig, make_trainer
 
 NUM_STATES, NUM_ACTIONS, BETA = 3, 2, 0.5
 KEY = jax.random.key(0)
-PLAIN = make_q_learning(
+PLAIN = make_tabular(
     QLearningConfig(learning_rate=0.5, discount=0.9, epsilon_init=0.8, epsilon_decay=0.5),
     NUM_STATES, NUM_ACTIONS,
 )  # fmt: skip
@@ -37,7 +35,7 @@ def step(obs, action, reward, discount=0.0, next_obs=0):
 @pytest.mark.parametrize("power", [1.0, 0.5])
 def test_the_bonus_falls_with_the_visits_of_a_pair_or_their_root(power):
     # With learning rate 1 and nothing to follow, a value is the last reward with its bonus.
-    plain = make_q_learning(QLearningConfig(learning_rate=1.0), NUM_STATES, NUM_ACTIONS)
+    plain = make_tabular(QLearningConfig(learning_rate=1.0), NUM_STATES, NUM_ACTIONS)
     agent = counting(plain, power=power)
     update = jax.jit(agent.update)
     state = agent.init(KEY, agent.hparams)
@@ -53,10 +51,9 @@ def test_the_bonus_falls_with_the_visits_of_a_pair_or_their_root(power):
     np.testing.assert_array_equal(state.counts, [[0, 0], [4, 1], [1, 0]])
 
 
-@pytest.mark.parametrize("make", [make_q_learning, make_sarsa])
-def test_the_agent_inside_learns_as_if_the_bonus_were_paid(make):
-    config = QLearningConfig if make is make_q_learning else SARSAConfig
-    plain = make(config(learning_rate=0.3, epsilon_init=0.6), NUM_STATES, NUM_ACTIONS)
+@pytest.mark.parametrize("config", [QLearningConfig, SARSAConfig])
+def test_the_agent_inside_learns_as_if_the_bonus_were_paid(config):
+    plain = make_tabular(config(learning_rate=0.3, epsilon_init=0.6), NUM_STATES, NUM_ACTIONS)
     agent = counting(plain)
     rng = np.random.default_rng(0)
     state, expected = agent.init(KEY, agent.hparams), plain.init(KEY, plain.hparams)
@@ -72,24 +69,6 @@ def test_the_agent_inside_learns_as_if_the_bonus_were_paid(make):
         expected = plain_update(key, expected, step(obs, action, paid, discount, next_obs))
     np.testing.assert_array_equal(state.counts, counts)
     np.testing.assert_allclose(state.agent_state.q_values, expected.q_values, rtol=1e-5, atol=1e-6)
-
-
-def test_it_acts_and_begins_episodes_as_the_agent_inside():
-    agent = counting()
-
-    @functools.partial(jax.jit, static_argnums=0)
-    def begin_and_act(agent, key):
-        state = agent.begin_episode(agent.init(key, agent.hparams), jnp.int32(1))
-        keys = jax.random.split(key, 50)
-        return state, [jax.vmap(lambda key, e=explore: agent.act(key, state, jnp.int32(2), e))(keys)
-                       for explore in (True, False)]  # fmt: skip
-
-    state, actions = begin_and_act(agent, KEY)
-    plain, expected_actions = begin_and_act(PLAIN, KEY)
-    assert state.agent_state.epsilon == plain.epsilon == np.float32(0.4)  # 0.8 * 0.5
-    for got, expected, number in zip(actions, expected_actions, (2, 1), strict=True):
-        np.testing.assert_array_equal(got, expected)
-        assert len(set(got.tolist())) == number
 
 
 def test_beta_and_the_numbers_inside_are_traced():
@@ -110,7 +89,7 @@ def test_beta_and_the_numbers_inside_are_traced():
 
 def test_in_a_training_each_learning_step_counts_and_returns_stay_without_the_bonus():
     task = envs.make("cliff_walking")
-    plain = make_q_learning(QLearningConfig(warmup_episodes=2), 48, 4)
+    plain = make_tabular(QLearningConfig(warmup_episodes=2), 48, 4)
     agent = counting(plain, 0.1, 48, 4)
     config = TrainingConfig(max_episodes=200, stop_rule="never")
     train, test = make_trainer(agent, task.env, config), make_tester(agent, task, 1)
@@ -132,18 +111,3 @@ def test_in_a_training_each_learning_step_counts_and_returns_stay_without_the_bo
     counts = np.asarray(result.agent_state.counts)
     np.testing.assert_array_equal(counts.sum(axis=(1, 2)), result.train_steps - lengths)
     assert (counts[:, 37:] == 0).all()  # nothing is done in the cliff or at the goal
-
-
-def test_without_a_bonus_a_training_is_the_plain_agents():
-    task = envs.make("gridworld_2x2")
-    plain = make_sarsa(SARSAConfig(epsilon_init=0.5, epsilon_min=0.5), 4, 4)
-    config = TrainingConfig(max_episodes=30, stop_rule="never")
-
-    def final(agent):
-        return jax.jit(make_trainer(agent, task.env, config))(KEY, task.params)
-
-    got, expected = final(counting(plain, 0.0, 4, 4)), final(plain)
-    np.testing.assert_array_equal(got.agent_state.agent_state.q_values,
-                                  expected.agent_state.q_values)  # fmt: skip
-    np.testing.assert_array_equal(got.returns, expected.returns)
-    assert got.train_steps == expected.train_steps == got.agent_state.counts.sum()

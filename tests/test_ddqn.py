@@ -7,11 +7,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from support import numpy_forward, shapes_of, unraveled
+from support import assert_shares, drawing, numpy_forward, shapes_of, train_on, unraveled
 
 from sejax.agents.buffers import Transition
 from sejax.agents.dqn import DDQNConfig, double_q_targets, make_ddqn
-from sejax.agents.policies import select_action
 from sejax.ops.networks import MLP
 from sejax.options import ACTIVATIONS
 
@@ -100,18 +99,6 @@ def test_targets_take_the_online_networks_action_and_the_target_networks_value()
     np.testing.assert_allclose(double_q_targets(online, target, reward, discount), [37.0, 9.0, 0.5])
 
 
-def test_dqns_targets_take_the_target_networks_best_value():
-    target = jnp.array([[10.0, 20.0], [40.0, 50.0]])
-    # 1 + 0.9 * 40 = 37 and -1 + 0.5 * 50 = 24.
-    got = double_q_targets(target, target, jnp.array([1.0, -1.0]), jnp.array([0.9, 0.5]))
-    np.testing.assert_allclose(got, [37.0, 24.0])
-
-
-def test_select_action_picks_each_columns_entry():
-    q_values = jnp.array([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]])
-    np.testing.assert_array_equal(select_action(q_values, jnp.array([1, 0, 1])), [4.0, 2.0, 6.0])
-
-
 # --- updates against torch -----------------------------------------------------------------------
 
 
@@ -124,20 +111,6 @@ def test_updates_equal_torchs_on_the_same_batches(case):
 def test_updates_with_the_fast_tanh_equal_torchs_with_the_exact_one():
     agent = make_ddqn(replace(CONFIG, activation="fast_tanh"), OBS_DIM, NUM_ACTIONS)
     assert_updates_equal_torchs(np.load(GOLDEN), "tanh", agent)
-
-
-def test_the_first_adam_step_moves_each_weight_by_the_learning_rate(state, update):
-    # Adam's first direction is g / (|g| + 1e-8): a sign, wherever the gradient is not tiny.
-    after = update(jax.random.key(0), state, random_batch(0))
-    moved = np.asarray(after.params) - np.asarray(state.params)
-    np.testing.assert_allclose(np.abs(moved), 0.01, rtol=1e-3)
-
-
-def test_the_target_network_starts_as_a_copy_and_follows_softly(state, update):
-    np.testing.assert_array_equal(state.target_params, state.params)
-    after = update(jax.random.key(0), state, random_batch(0))
-    expected = 0.1 * np.asarray(after.params) + 0.9 * np.asarray(state.target_params)
-    np.testing.assert_allclose(after.target_params, expected, rtol=1e-6)
 
 
 # --- when it learns ------------------------------------------------------------------------------
@@ -210,59 +183,15 @@ def test_epsilon_by_steps_falls_linearly_whatever_the_episodes(rarely):
 # --- exploration ---------------------------------------------------------------------------------
 
 
-@pytest.fixture(scope="module")
-def epsilon_in(agent, state):
-    """Epsilon in each of these episodes, with these hyperparameters."""
-    begin = jax.jit(agent.begin_episode)
-
-    def epsilons(episodes, **hparams):
-        numbers = {name: np.float32(x) for name, x in hparams.items()}
-        changed = state.replace(hparams=state.hparams._replace(**numbers))
-        return [float(begin(changed, np.int32(n)).epsilon) for n in episodes]
-
-    return epsilons
-
-
-def test_epsilon_decays_by_a_factor_each_episode_down_to_its_minimum(epsilon_in):
-    # 0.8, 0.4, 0.2, then max(0.1, 0.15) = 0.15.
-    got = epsilon_in(range(6), epsilon_init=0.8, epsilon_decay=0.5, epsilon_min=0.15)
-    np.testing.assert_allclose(got, [0.8, 0.4, 0.2, 0.15, 0.15, 0.15], rtol=1e-6)
-
-
-@pytest.fixture(scope="module")
-def draw_actions():
-    """Exploring actions of 4000 keys and the greedy one, by epsilon; three actions."""
-    agent = make_ddqn(CONFIG, OBS_DIM, num_actions=3)
-    obs = jnp.array([0.3, -0.2, 0.5])
-    net = MLP(3, CONFIG.hidden_size, CONFIG.num_layers, CONFIG.activation)
-    template = shapes_of(net.init, jax.random.key(0), obs)
-
-    @jax.jit
-    def draw(epsilon):
-        state = agent.init(jax.random.key(0), agent.hparams)
-        keys = jax.random.split(jax.random.key(1), 4000)
-        act = jax.vmap(agent.act, (0, None, None, None))
-        explorer = state.replace(epsilon=epsilon)
-        drawn, greedy = (act(keys, explorer, obs, explore) for explore in (True, False))
-        return drawn, greedy, state.params
-
-    params = unraveled(draw(np.float32(0))[2], template)["params"]
-    q_values = numpy_forward(params, np.asarray(obs), CONFIG.activation, CONFIG.num_layers)
-    return draw, int(np.argmax(q_values))
-
-
-@pytest.mark.parametrize("epsilon", [0.0, 0.3, 1.0])
-def test_actions_are_random_with_probability_epsilon_and_greedy_otherwise(draw_actions, epsilon):
-    draw, best = draw_actions
-    drawn, greedy, _ = draw(np.float32(epsilon))
-    assert drawn.dtype == jnp.int32
-    np.testing.assert_array_equal(greedy, best)
-    # Random actions are uniform, the greedy one included.
-    expected = np.full(3, epsilon / 3)
-    expected[best] += 1 - epsilon
-    share = np.bincount(drawn, minlength=3) / drawn.size
-    deviation = np.sqrt(expected * (1 - expected) / drawn.size)
-    assert (np.abs(share - expected) <= 5 * deviation + 1e-7).all()
+def test_actions_are_random_with_probability_epsilon_and_greedy_otherwise():
+    agent, obs = make_ddqn(CONFIG, OBS_DIM, num_actions=3), np.float32([0.3, -0.2, 0.5])
+    state = jax.jit(agent.init)(jax.random.key(0), agent.hparams).replace(epsilon=np.float32(0.3))
+    drawn, tested = drawing(agent)(state, obs)
+    template = shapes_of(CONFIG.network(3).init, jax.random.key(0), obs)
+    params = unraveled(state.params, template)["params"]
+    best = np.argmax(numpy_forward(params, obs, CONFIG.activation, CONFIG.num_layers))
+    assert (tested == best).all()
+    assert_shares(drawn, 0.1 + 0.7 * np.eye(3)[best])  # random ones are uniform
 
 
 # --- probe ---------------------------------------------------------------------------------------
@@ -273,10 +202,9 @@ def test_a_two_step_probe_learns_gamma_and_one():
     # follows, and Q(A) = 0 + gamma * Q(B) = gamma. The end looks like A: bootstrapping there
     # would be seen.
     gamma = 0.7
-    config = DDQNConfig(
-        hidden_size=8, num_layers=1, activation="tanh", learning_rate=0.02,
-        tau=0.1, discount=gamma,
-    )  # fmt: skip
+    config = replace(
+        CONFIG, hidden_size=8, num_layers=1, learning_rate=0.02, discount=gamma, activation="tanh"
+    )
     agent = make_ddqn(config, obs_dim=2, num_actions=2)
     a, b = [1.0, 0.0], [0.0, 1.0]
     batch = Transition(
@@ -286,16 +214,9 @@ def test_a_two_step_probe_learns_gamma_and_one():
         discount=np.float32([1.0, 1.0, 0.0, 0.0]),
         next_obs=np.float32([b, b, a, a]).T,
     )
-
-    def step(state, _):
-        return agent.update(jax.random.key(0), state, batch), None
-
-    @jax.jit
-    def learned(key):
-        return jax.lax.scan(step, agent.init(key, agent.hparams), length=600)[0].params
-
+    learned = jax.jit(lambda: train_on(agent, batch, 600).params)
     template = shapes_of(MLP(2, 8, 1, "tanh").init, jax.random.key(0), np.zeros(2))
-    params = unraveled(learned(jax.random.key(0)), template)["params"]
+    params = unraveled(learned(), template)["params"]
     for state, value in ((a, gamma), (b, 1.0)):
         q_values = numpy_forward(params, state, "tanh", 1)
         np.testing.assert_allclose(q_values, [value, value], atol=0.02)

@@ -9,10 +9,8 @@ import pytest
 from support import numpy_forward, random_like, shapes_of, unraveled
 from test_ddqn import BATCH, OBS_DIM, assert_updates_equal_torchs
 
-from sejax import envs
 from sejax.agents.dqn import DDQNConfig, DuelingDDQNConfig, make_ddqn
 from sejax.ops.networks import DuelingMLP
-from sejax.training import TrainingConfig, make_trainer
 
 NUM_ACTIONS = 2  # as in the batches of test_ddqn
 GOLDEN = Path(__file__).parent / "golden" / "dueling_updates.npz"
@@ -48,9 +46,9 @@ def dueling(activation="tanh", num_actions=3, stream_num_layers=2):
 # --- the network ---------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("activation", ACTIVATIONS)
-def test_forward_equals_a_numpy_loop(activation):
-    apply, variables = dueling(activation)
+@pytest.mark.parametrize(("activation", "stream_layers"), [("tanh", 2), ("prelu", 2), ("tanh", 0)])
+def test_forward_equals_a_numpy_loop(activation, stream_layers):
+    apply, variables = dueling(activation, stream_num_layers=stream_layers)
     params = variables["params"]
     slopes = {}
     if activation == "prelu":  # a slope for each part: a mix-up would be seen
@@ -66,22 +64,10 @@ def test_forward_equals_a_numpy_loop(activation):
             return numpy_forward(params[name], x, activation, num_layers, slopes.get(name))
 
         features = part("features", x, 1)
-        value, advantage = part("value", features, 2), part("advantage", features, 2)
+        value, advantage = (part(name, features, stream_layers) for name in ("value", "advantage"))
         expected = [value[0] + advantage[a] - sum(advantage) / 3 for a in range(3)]
         got = apply({"params": params}, np.float32(x))
         np.testing.assert_allclose(got, expected, rtol=1e-5, atol=1e-6)
-
-
-def test_streams_may_be_linear():
-    apply, variables = dueling(stream_num_layers=0)
-    params = variables["params"]
-    x = np.array([0.3, -1.0, 0.7])
-    features = numpy_forward(params["features"], x, "tanh", 1)
-    value, advantage = (
-        numpy_forward(params[k], features, "tanh", 0) for k in ("value", "advantage")
-    )
-    expected = value + advantage - advantage.mean()
-    np.testing.assert_allclose(apply(variables, np.float32(x)), expected, rtol=1e-5)
 
 
 # --- the agent -----------------------------------------------------------------------------------
@@ -91,19 +77,6 @@ def test_streams_may_be_linear():
 def test_updates_equal_torchs_on_the_same_batches(activation):
     agent = make_ddqn(config_with(activation), OBS_DIM, NUM_ACTIONS)
     assert_updates_equal_torchs(np.load(GOLDEN), activation, agent)  # made by torch_dueling.py
-
-
-@pytest.mark.slow
-def test_it_solves_cartpole():
-    task = envs.make("cartpole")
-    agent = make_ddqn(DuelingDDQNConfig(hidden_size=64, num_layers=1, feature_dim=64,
-                                        stream_hidden_size=64), task.obs_dim, 2)  # fmt: skip
-    training = TrainingConfig(max_episodes=1000, stop_rule="solved", solved_by="train")
-    train = make_trainer(agent, task.env, training, task.solved_reward)
-    result = jax.jit(train)(jax.random.key(0), task.params)
-    num_episodes = int(result.episodes)
-    assert num_episodes < 1000
-    assert result.returns[num_episodes - training.window : num_episodes].mean() >= 195
 
 
 def test_one_trains_alone_on_a_core():

@@ -20,7 +20,8 @@ from sejax.agents.tabular import QLearningConfig
 from sejax.cli import commands, progress
 from sejax.cli import config as configuration
 from sejax.cli.config import families_of
-from sejax.evaluate import evaluate, proxy_study, summarise
+from sejax.cli.worlds import proxy_setup
+from sejax.evaluate import evaluate, summarise
 from sejax.ops.checksummed import pack, unpack
 from sejax.options import ConfigError, registry
 from sejax.training import TrainingConfig, budget_for
@@ -111,7 +112,7 @@ def test_several_agents_are_in_one_table(room, tmp_path, capsys):
         of_sarsa.train_steps.mean()
     )
     printed = capsys.readouterr().out
-    assert "2 fresh agents of each family" in printed and printed.count("sarsa") == 4
+    assert "2 fresh agents of each kind" in printed and printed.count("sarsa") == 4
     assert is_drawn(tmp_path / "evaluation.png")
 
 
@@ -182,8 +183,8 @@ def test_initial_episodes_beyond_the_proxys_own_extend_its_step_budget(stored):
     waits = dataclasses.replace(then, warmup_episodes=3)
     assert budget_for(training, waits, [then], 1, 200).max_steps == 50 + 3
     # That is what an evaluation trains with.
-    study = proxy_study(evaluate_config(f"proxy={stored}", "agent.warmup_episodes=3"))
-    used = study.worlds["the proxy"][2]["ddqn"]
+    setup = proxy_setup(evaluate_config(f"proxy={stored}", "agent.warmup_episodes=3"))
+    used = setup.worlds["the proxy"][2]["ddqn"]
     assert used.max_steps == 650 and used.stop_rule == training.stop_rule
 
 
@@ -204,17 +205,17 @@ def test_each_of_several_agents_trains_as_long_as_it_must(tmp_path):
                                "agents.ppo.rollout_steps=null", words=[])  # fmt: skip
     budgets = {
         key: training.max_steps
-        for key, training in proxy_study(composed).worlds["the proxy"][2].items()
+        for key, training in proxy_setup(composed).worlds["the proxy"][2].items()
     }
     # Learned with 4000 steps, of which DDQN waits 2 * 200; here 10 episodes, as PPO collects.
     waits = {"ddqn": 10 * 200, "dueling_ddqn": 10 * 200, "ppo": 10 * 200 + 1}
     assert budgets == {key: 4000 + wait - 2 * 200 for key, wait in waits.items()}
-    as_learned = proxy_study(evaluate_config(f"proxy={path}", "agent_hparams=as_learned", words=[]))
+    as_learned = proxy_setup(evaluate_config(f"proxy={path}", "agent_hparams=as_learned", words=[]))
     assert as_learned.families == tuple(
         dataclasses.replace(x, field="agent", weight=1.0) for x in families_of(learned(*words)[0])
     )
     assert as_learned.worlds["the proxy"][2]["ppo"].max_steps == 4000
-    with pytest.raises(ConfigError, match=r"^agent must be given for proxy\.safetensors"):
+    with pytest.raises(ConfigError, match=r"^agent must be a registered"):
         sejax.load_proxy(path).learned_with("agent")
 
 
@@ -231,9 +232,9 @@ def test_each_of_several_agents_trains_as_long_as_it_must(tmp_path):
         (["seed=-1"], r"seed must lie in \[0, 2\*\*31\)"),
         (["num_agents=0"], "num_agents must be"),
         (["agent=2"], "agent must be one of"),
-        (["agents=[q_learning,sarsa]", "agents.sarsa.weight=2"], "agents.sarsa.weight must be"),
+        (["agents=[q_learning,sarsa]", "agents.sarsa.weight=2"], "agents.sarsa.weight is no field"),
         (["agents=[ddqn,ppo]", "agent_hparams=as_learned"],
-         r"agents must be left out with agent_hparams=as_learned.*got ddqn\+ppo"),
+         r"agents must be left out with agent_hparams=as_learned.*got agents=\[ddqn,ppo\]"),
     ],
 )  # fmt: skip
 def test_settings_that_cannot_be_or_have_no_effect_are_refused(given, message, stored):
@@ -275,8 +276,8 @@ def test_agents_of_an_rn_take_the_time_limit_as_they_learned_it(tmp_path):
     path = save(tmp_path / "proxy.safetensors", "env=pendulum", "proxy=rn")
     words = [f"proxy={path}", f"out_dir={tmp_path}"]
     for given, expected in (["agent_hparams=as_learned"], False), (["agent=td3"], True):
-        study = proxy_study(evaluate_config(*words, *given, words=[]))
-        for _, _, trainings in study.worlds.values():
+        setup = proxy_setup(evaluate_config(*words, *given, words=[]))
+        for _, _, trainings in setup.worlds.values():
             assert trainings["td3"].time_limit_is_terminal == expected
 
 
@@ -287,10 +288,10 @@ def test_an_se_that_does_not_say_how_long_agents_trained_needs_the_config(room, 
     sejax.save(bare, proxies.env, proxies[0].params.weights)
     words = [f"proxy={bare}", "num_agents=1", "baseline=false", f"out_dir={tmp_path}"]
     with pytest.raises(ConfigError, match=r"^training_from must be config for an SE whose file do"):
-        proxy_study(evaluate_config(*words, words=ROOM))
+        proxy_setup(evaluate_config(*words, words=ROOM))
     given = ["training_from=config", "training.max_steps=7", "training.stop_rule=never"]
-    study = proxy_study(evaluate_config(*words, *given, words=ROOM))
-    assert study.worlds["the proxy"][2]["q_learning"].max_steps == 7
+    setup = proxy_setup(evaluate_config(*words, *given, words=ROOM))
+    assert setup.worlds["the proxy"][2]["q_learning"].max_steps == 7
 
 
 def test_agents_like_those_of_the_run_bring_their_exploration(tmp_path, capsys):
@@ -301,10 +302,10 @@ def test_agents_like_those_of_the_run_bring_their_exploration(tmp_path, capsys):
     overrides = [f"proxy={path}", "agent_hparams=as_learned", "num_agents=2", "baseline=false",
                  "devices=1", "real_training.max_episodes=2"]  # fmt: skip
     composed = evaluate_config(*overrides, words=[])
-    study = proxy_study(composed)
-    assert study.families[0].agent == config.agent and study.exploration == config.exploration
+    setup = proxy_setup(composed)
+    assert setup.families[0].agent == config.agent and setup.exploration == config.exploration
     # Its dynamics are real.
-    assert study.worlds["the proxy"][2] == {"q_learning": composed.real_training}
+    assert setup.worlds["the proxy"][2] == {"q_learning": composed.real_training}
     evaluate(composed)
     assert "2 fresh q_learning agents" in capsys.readouterr().out
 
@@ -317,10 +318,10 @@ def test_a_proxy_knows_what_it_was_learned_with(room, tmp_path):
     assert sejax.training_of(proxies) == config.training
     bare = tmp_path / "bare.safetensors"
     sejax.save(bare, proxies.env, proxies[0].params.weights)
-    with pytest.raises(ConfigError, match=r"^agent must be given for bare\.safetensors"):
+    with pytest.raises(ConfigError, match=r"^agent must be a registered"):
         sejax.load_proxy(bare).learned_with("agent")
     sejax.save(bare, proxies.env, proxies[0].params.weights, {"agent": {"name": "my:Agent"}})
-    with pytest.raises(ConfigError, match=r"^agent must be given .*got my:Agent"):
+    with pytest.raises(ConfigError, match=r"^agent must be .*got my:Agent"):
         sejax.load_proxy(bare).learned_with("agent")
     assert "my" not in sys.modules
 
@@ -372,7 +373,7 @@ def test_a_missing_proxy_or_task_says_what_to_set():
         (["proxy=nope"], "proxy must be one of "),
         (["proxy=nope/proxy.safetensors"], "does not exist"),
         (["proxy=cartpole", "agents=[1,2]"], "agents must be one of"),
-        (["proxy=cartpole", "new=1"], "new must be a field"),
+        (["proxy=cartpole", "new=1"], "new is no field"),
         (["proxy=" + "d" * 10_000], "proxy must be "),
     ],
 )

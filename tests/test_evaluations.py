@@ -28,7 +28,8 @@ def test_every_candidate_trains_with_its_own_seed_unless_asked_otherwise(config)
 
 def test_common_random_numbers_give_each_evaluation_of_a_member_the_same_seeds():
     # 3 members, 2 signs, 2 evaluations: seeds 0 and 1 for each; the incumbents 0, 1, 2.
-    config = NESConfig(population_size=3, num_evals=2, common_random_numbers=True)
+    shared = {"num_evals": 2, "common_random_numbers": True}
+    config = NESConfig(population_size=3, num_incumbent_evals=3, **shared)
     strategy = config.make(6)
     seed_ids = strategy.evaluations.seed_ids(strategy.population_size)
     np.testing.assert_array_equal(seed_ids, [0, 1] * 6 + [0, 1, 2])

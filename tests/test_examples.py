@@ -195,20 +195,6 @@ def test_a_sac_update_is_one_that_was_derived_anew(examples):
         np.testing.assert_allclose(got, expected, rtol=1e-5, atol=1e-7)
 
 
-def test_sac_learns_on_proxies_within_nes(examples):
-    own_agent, own_task = examples("own_agent"), examples("own_task")
-    task = own_task.make_reacher()
-    agent = sejax.make_agent(own_agent.SAC(hidden_size=8, batch_size=8, warmup_episodes=1), task)
-    learn = sejax.make_learner(
-        task=task, agent=agent, proxy=sejax.SyntheticConfig(hidden_size=8),
-        es=sejax.NESConfig(population_size=2, num_incumbent_evals=1), generations=2, devices=1,
-        training=sejax.TrainingConfig(max_steps=40, stop_rule="never", test_episodes=2),
-    )  # fmt: skip
-    result = jax.jit(learn)(jax.random.key(0))
-    assert result.info.incumbent_mean.shape == (2,)
-    assert jnp.isfinite(result.info.incumbent_mean).all() and not result.info.num_nonfinite.any()
-
-
 def test_the_reacher_is_solved_by_moving_towards_the_target(examples):
     task = examples("own_task").make_reacher(size=5)
 

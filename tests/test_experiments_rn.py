@@ -13,7 +13,7 @@ from experiments import rn_heatmap, rn_objectives, rn_performance
 from experiments.common import reward_networks as rn
 from experiments.common import rn_curves, runs, shards
 from experiments.common.reward_networks import STUDIES
-from experiments.common.statistics import bootstrap_interval
+from experiments.common.statistics import mean_interval
 from experiments.rn_heatmap import RnHeatmap
 from experiments.rn_objectives import RnObjectives
 from experiments.rn_performance import RnPerformance
@@ -113,7 +113,7 @@ def test_rns_of_other_settings_are_refused_before_any_are_learned(options, monke
     variants = ("exclusive_potential", *settings.variants)  # the first is yet to be learned
     run = (*settings.run, "proxy.hidden_size=7")
     other = dataclasses.replace(settings, run=run, variants=variants)
-    with pytest.raises(ConfigError, match=r"rns_dir must be .* another proxy\.hidden_size"):
+    with pytest.raises(ConfigError, match=r"another proxy\.hidden_size"):
         rn_performance.EXPERIMENT.run(other)
 
 
@@ -149,15 +149,6 @@ def test_the_heat_map_shows_what_the_rns_pay(options):
     np.testing.assert_allclose(rewards[1, [36, 0], 3], potential, rtol=1e-5)
     stored = rn_heatmap.by_variant(settings, shards.read_rows(settings.rows_file))
     np.testing.assert_array_equal(stored["exclusive_non_potential"], rewards)
-
-
-def test_moves_are_those_of_the_map():
-    moves = {kind: mask.sum() for kind, mask in rn_heatmap.kinds_of_moves().items()}
-    assert moves == {
-        "into the cliff": 11, "from the start up": 1, "right along the cliff": 11,
-        "left along the cliff": 11, "down to the cliff's edge": 12, "up from the cliff's edge": 12,
-        "into the goal": 1,
-    }  # fmt: skip
 
 
 def test_ignored_rewards_do_not_stretch_the_colours():
@@ -214,31 +205,25 @@ def test_rows_of_other_settings_are_refused():
         [curves_of("real", 5), curves_of("icm", 2), curves_of("additive_potential", 5)]
     )
     rn_curves.require_rows(settings, rows)
-    for wrong, said in (({"rns": 4}, r"^rns must be 5, .*got 4\. Set rns=5, or from_rows=false"),
-                        ({"bonus_groups": 5}, r"^bonus_groups must be 2, .*got 5"),
-                        ({"rows": ("default", "tuned")}, r"^rows must be \[default\], .*tuned"),
-                        ({"num_agents": 10}, r"^num_agents must be 2, .*got 10")):  # fmt: skip
-        with pytest.raises(ConfigError, match=said):
-            rn_curves.require_rows(dataclasses.replace(settings, **wrong), rows)
+    for field, value in {"rns": 4, "bonus_groups": 5, "rows": ("default", "tuned"),
+                         "num_agents": 10}.items():  # fmt: skip
+        with pytest.raises(ConfigError) as refused:
+            rn_curves.require_rows(dataclasses.replace(settings, **{field: value}), rows)
+        assert refused.value.field == field
 
 
-def test_intervals_draw_rns_or_agents_and_need_five_of_them():
+def test_intervals_are_over_rns_or_agents_and_need_five_of_them():
     for world, independent in (
         ("additive_potential", 145 + 20 * np.arange(5)),  # the groups' means
         ("real", 140 + 10 * np.arange(10)),
     ):
         (row,) = rn_curves.summarise(curves_of(world, 5), -12.0, max_steps=300).itertuples()
-        assert (row.steps_low, row.steps_high) == bootstrap_interval(independent)
+        assert (row.steps_low, row.steps_high) == mean_interval(independent)
         assert row.return_low < row.return_mean < row.return_high
     few = rn_curves.summarise(curves_of("additive_potential", 4), -12.0, max_steps=300)
     assert few[["steps_low", "return_high"]].isna().all(axis=None)
     shown = rn_curves.make_table(few).iloc[0]
     assert shown["steps to solve"] == "175" and "[" not in shown["mean return over training"]
-
-
-def test_augmented_variants_are_named_in_pictures():
-    assert rn.label("exclusive_potential+augm") == r"$\gamma\Phi(s', v') - \Phi(s, v)$"
-    assert rn.label("exclusive_potential") == r"$\gamma\Phi(s') - \Phi(s)$"
 
 
 def test_settings_are_those_of_the_task():
@@ -276,20 +261,17 @@ def test_settings_are_those_of_the_task():
 
 # The tables of default hyperparameters, for agents that are trained on learned RNs. SARSA and TD3
 # are not here: see `STUDIES`.
+DDQN = {
+    "warmup_episodes": 1, "batch_size": 32, "learning_rate": 0.00025, "tau": 0.01,
+    "discount": 0.99, "epsilon_init": 1.0, "epsilon_min": 0.1, "epsilon_decay": 0.9,
+    "num_layers": 1, "hidden_size": 64, "activation": "relu", "buffer_size": 1_000_000,
+}  # fmt: skip
 AFTER_LEARNING = {
     ("cliff_walking", "agent"): {"learning_rate": 1.0, "discount": 0.8, "epsilon_init": 0.1,
                                  "epsilon_min": 0.1, "epsilon_decay": 0.0},
-    ("cartpole", "agent"): {
-        "warmup_episodes": 1, "batch_size": 32, "learning_rate": 0.00025, "tau": 0.01,
-        "discount": 0.99, "epsilon_init": 1.0, "epsilon_min": 0.1, "epsilon_decay": 0.9,
-        "num_layers": 1, "hidden_size": 64, "activation": "relu", "buffer_size": 1_000_000,
-    },
-    ("cartpole", "transfer_agent"): {
-        "warmup_episodes": 1, "batch_size": 32, "learning_rate": 0.00025, "tau": 0.01,
-        "discount": 0.99, "epsilon_init": 1.0, "epsilon_min": 0.1, "epsilon_decay": 0.9,
-        "num_layers": 1, "hidden_size": 64, "activation": "relu", "buffer_size": 1_000_000,
-        "feature_dim": 128, "stream_num_layers": 1, "stream_hidden_size": 128,
-    },
+    ("cartpole", "agent"): DDQN,
+    ("cartpole", "transfer_agent"): DDQN | {"feature_dim": 128, "stream_num_layers": 1,
+                                            "stream_hidden_size": 128},
     ("mountain_car_continuous", "transfer_agent"): {
         "epochs": 80, "learning_rate": 0.0003, "update_episodes": 10, "discount": 0.99,
         "action_repeat": 5, "value_weight": 1, "entropy_weight": 0.01, "clip_ratio": 0.2,

@@ -13,9 +13,7 @@ from test_experiments import TINY_AGENT, save_ses
 import sejax
 from experiments import score_transforms, se_histograms, supervised_baseline
 from experiments.common import supervised_models
-from experiments.common.statistics import bootstrap_interval
 from sejax.bilevel import make_bilevel
-from sejax.evaluation import make_recorder, make_tester
 from sejax.options import ConfigError
 from sejax.training import make_trainer
 
@@ -115,8 +113,6 @@ def test_the_best_bin_and_the_ranks_are_those_of_the_means():
         0.0,
         10.0,
     )  # by 5, 15, -1, 21
-    ends = bootstrap_interval([5, 15, -1, 21])
-    assert (second.behind_low, second.behind_high) == pytest.approx(ends)
     assert score_transforms.share_of_best(runs) == {True: pytest.approx(1 - (1 / 4) ** 4, abs=0.01)}
     cells = score_transforms.binned(runs, bins=3).set_index(["transform", "bin"])
     assert cells.loc[("rank", 0), "updates"] == 15 and cells.loc[("rank", 0), "runs"] == 2
@@ -152,24 +148,6 @@ def test_a_recorded_training_is_the_training(se_file, capacity):
         np.testing.assert_allclose(rewards.sum(), plain.returns[int(episode)], rtol=1e-4)
 
 
-def test_recorded_tests_are_the_tests(se_file):
-    task = sejax.load_set(se_file).task
-    agent = sejax.make_agent(sejax.DDQNConfig(**TINY_AGENT), task)
-    state = agent.init(jax.random.key(0), agent.hparams)
-    key = jax.random.key(4)
-    returns, lengths, _ = jax.jit(make_tester(agent, task, 3))(key, state)
-    steps = jax.jit(make_recorder(agent, task, 3))(key, state)
-    valid = np.asarray(steps.valid).reshape(3, -1)
-    np.testing.assert_array_equal(valid.sum(axis=1), lengths)
-    rewards = np.where(valid, np.asarray(steps.reward).reshape(3, -1), 0)
-    np.testing.assert_allclose(rewards.sum(axis=1), returns)
-    terminated = np.asarray(steps.terminated).reshape(3, -1)
-    assert all(row[length - 1] for row, length in zip(terminated, lengths, strict=True))
-    obs, next_obs = np.asarray(steps.obs), np.asarray(steps.next_obs)
-    within = valid[0, 1:]
-    np.testing.assert_array_equal(obs[1 : valid.shape[1]][within], next_obs[: within.size][within])
-
-
 def test_the_table_says_which_distribution_the_response_is_closer_to():
     states = {"train": [0.0, 0.2], "test": [3.0, 4.0], "response": [0.1, 0.5]}
     rows = pd.DataFrame([
@@ -194,17 +172,16 @@ def test_the_table_says_which_distribution_the_response_is_closer_to():
 def test_a_sample_is_uniform_over_all_that_was_added():
     counts = np.zeros(20)
     for seed in range(400):
-        sample = supervised_models.Sample(5, np.random.default_rng(seed))
+        rng, kept = np.random.default_rng(seed), None
         for start, stop in ((0, 3), (3, 4), (4, 20)):
-            sample.add(pd.DataFrame({"row": range(start, stop)}))
-        drawn = sample.table["row"]
+            rows = pd.DataFrame({"row": range(start, stop)})
+            kept = supervised_models.sampled(kept, rows, 5, rng)
+            assert len(kept) == min(stop, 5)
+        drawn = kept["row"]
         assert drawn.nunique() == 5
         counts[drawn] += 1
     error = np.sqrt(400 * 0.25 * 0.75)  # each row is drawn with probability 5 / 20
     assert np.abs(counts - 100).max() < 5 * error
-    small = supervised_models.Sample(5, np.random.default_rng(0))
-    small.add(pd.DataFrame({"row": [7, 8]}))
-    assert sorted(small.table["row"]) == [7, 8] and list(small.table) == ["row"]
 
 
 def random_data(num_rows):
@@ -250,7 +227,7 @@ def test_one_fit_serves_both_models_as_the_networks_share_nothing(se_file):
     assert (errors[-1] < errors[0]).all()
 
 
-def test_intervals_draw_models_and_the_best_ones_are_those_of_the_best_episodes():
+def test_models_are_summarised_and_the_best_ones_are_those_of_the_best_episodes():
     agents = pd.DataFrame({
         "kind": "ddqn", "hparams": "varied", "world": ["authors"] * 6 + ["se"] * 6,
         "group": [0, 0, 1, 1, 2, 2] * 2, "nonfinite": False, "train_steps": 10,
@@ -261,8 +238,9 @@ def test_intervals_draw_models_and_the_best_ones_are_those_of_the_best_episodes(
     agents = supervised_baseline.with_best(agents, [50.0, 10.0, 90.0])
     summary = supervised_baseline.summarise(agents, 195.0).set_index("world")
     assert summary.loc["authors", "return_mean"] == pytest.approx(14)
-    low, high = bootstrap_interval([2, 10, 30])
-    assert tuple(summary.loc["authors", ["return_low", "return_high"]]) == (low, high)
+    assert np.isnan(summary.loc["authors", "return_low"])  # of three models
+    low, high = summary.loc["se", ["return_low", "return_high"]]  # of six agents
+    assert low == high == 200
     assert summary.loc["authors_best", "return_mean"] == pytest.approx(16), "models 0 and 2"
     assert summary.loc["se", "solved"] == 1 and summary.loc["authors", "solved"] == 0
     table = supervised_baseline.make_table(summary.reset_index())
@@ -283,10 +261,10 @@ def test_a_recorded_run_is_the_bilevel_loop():
                            "agent.hidden_size=4", "agent.batch_size=4", "devices=1",
                            "es.population_size=2", "es.num_incumbent_evals=1",
                            "es.mirrored=false"])  # fmt: skip
-    recorded = supervised_models.make_recorded_run(config)
+    init, generation = supervised_models.make_recorded_run(config)
     program = make_bilevel(**config.parts())
     key = jax.random.key(7)
-    state, steps = recorded.generation(recorded.init(key))
+    state, steps = generation(init(key))
     expected, info = jax.jit(program.generation)(jax.jit(program.init)(key))
     np.testing.assert_allclose(state.es_state.mean, expected.es_state.mean, rtol=1e-4, atol=1e-6)
     # Those tests between episodes count as real steps, but are not recorded.
@@ -299,5 +277,6 @@ def test_ses_whose_tests_cannot_be_recorded_are_refused(overrides, tmp_path):
     words = ("preset=soft", "training.max_steps=9000", *overrides)
     path = save_ses(tmp_path / "se.safetensors", 1, *words)
     settings = supervised_baseline.SupervisedBaseline.of(quick=True, out=str(tmp_path), proxy=path)
-    with pytest.raises(ConfigError, match="without action repeat"):
+    with pytest.raises(ConfigError) as refused:
         supervised_baseline.EXPERIMENT.run(settings)
+    assert refused.value.field == "proxy"

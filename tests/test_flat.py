@@ -29,20 +29,6 @@ def test_a_vector_of_parameters_is_turned_back_into_them():
     assert jax.tree.structure(tree) == jax.tree.structure(TREE)
 
 
-def test_what_is_unflattened_is_shaped_as_init_would_shape_it_for_the_example():
-    def init(key, width, note="none"):
-        return {
-            "weights": jnp.ones((2, width.shape[0])),
-            "bias": jnp.ones(2),
-            "scale": jnp.ones(()),
-        }
-
-    tree = flat.unflattener(init, np.zeros(3))(np.arange(9.0, dtype=np.float32))
-    np.testing.assert_array_equal(tree["bias"], [0, 1])  # leaves in the order of their names
-    np.testing.assert_array_equal(tree["scale"], 2)
-    np.testing.assert_array_equal(tree["weights"], [[3, 4, 5], [6, 7, 8]])
-
-
 @pytest.mark.parametrize("rate", [0.1, 0.5])
 def test_adam_on_the_vector_is_optaxs_on_the_tree(rate):
     gradients = [random_like(TREE, seed) for seed in (1, 2, 3)]

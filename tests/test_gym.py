@@ -18,12 +18,12 @@ from support import random_like, shapes_of
 import sejax
 from sejax import envs
 from sejax.gym import GYMNASIUM_IDS, RealTask, SyntheticEnv, SyntheticWorld, make
-from sejax.gym.tasks import se_task
+from sejax.gym.networks import shapes_of as shapes_of_networks
 from sejax.ops.checksummed import pack, unpack
 from sejax.options import ConfigError, registry
 from sejax.proxies import MAX_ABS_VALUE
 from sejax.proxies.configs import SyntheticConfig
-from sejax.proxies.header import find, pretrained_names, read
+from sejax.proxies.header import find, pretrained_names
 
 KEY = jax.random.key(0)
 SMALL = {"hidden_size": 5}
@@ -36,11 +36,6 @@ def jax_se(task="cartpole", **config):
 
 def random_weights(env, seed=0, scale=0.5):
     return random_like(shapes_of(env.init_weights, KEY), seed, scale)
-
-
-def flat(weights):
-    return {f"{network}/{layer}/{name}": x for network, layers in weights.items()
-            for layer, leaves in layers.items() for name, x in leaves.items()}  # fmt: skip
 
 
 @pytest.fixture
@@ -58,13 +53,13 @@ def stored(tmp_path):
 def constant(state=0.25, reward=2.0, d=0.0, max_steps=200, **config):
     """A CartPole SE whose outputs are constants, whatever it sees; d is the done output."""
     config = SyntheticConfig(**SMALL | {"done": "threshold"} | config)
-    env = registry.make("proxy", config, envs.make("cartpole"))
-    weights = random_weights(env, scale=0.0)
+    shapes = shapes_of_networks(config.networks(obs_dim=4, action_dim=2))
+    weights = {name: np.zeros(shape, np.float32) for name, shape in shapes.items()}
     for head, value in {"state": state, "reward": reward, "done": d}.items():
-        if head in weights:
-            weights[head]["Dense_1"]["bias"][:] = value
+        if f"{head}/Dense_1/bias" in weights:
+            weights[f"{head}/Dense_1/bias"][:] = value
     task = RealTask.of_gymnasium("CartPole-v1", max_steps)
-    return SyntheticEnv(SyntheticWorld(flat(weights), config, task))
+    return SyntheticEnv(SyntheticWorld(weights, config, task))
 
 
 # --- the same as in JAX --------------------------------------------------------------------------
@@ -241,18 +236,20 @@ CHECKED = [("cartpole", {"done": "threshold"}), ("cartpole", BANDIT),
            ("pendulum", {"done": "bernoulli"}), ("gridworld_2x2", {"done": "sigmoid"})]  # fmt: skip
 
 
-@pytest.mark.parametrize("source", [
-    *CHECKED, *(name for name in pretrained_names() if not name.endswith("-rn")),
-], ids=str)  # fmt: skip
+def an_env(stored, source):
+    """Of the name of a shipped proxy, or of an SE's task and configuration."""
+    return make(source if isinstance(source, str) else stored(jax_se(source[0], **source[1])))
+
+
+@pytest.mark.parametrize("source", [*CHECKED, *pretrained_names()], ids=str)
 @pytest.mark.filterwarnings(
     "ignore:.*Box observation space m.*imum value is -?infinity:UserWarning",
     "ignore:.*recommend using a symmetric and normalized space:UserWarning",  # Pendulum's torque
+    "ignore:.*different from the unwrapped version:UserWarning",
+    "ignore:.*Not able to test alternative:UserWarning",
 )
 def test_gymnasiums_checker_passes(stored, source):
-    if isinstance(source, tuple):
-        task, config = source
-        source = stored(jax_se(task, **config))
-    check_env(make(source))
+    check_env(an_env(stored, source), skip_render_check=True)
 
 
 def test_spaces_are_the_tasks_without_bounds_of_the_observations(stored):
@@ -284,9 +281,9 @@ def test_a_seed_makes_episodes_again_and_starts_are_the_real_tasks(stored):
     assert not np.allclose(make(path).reset()[0], make(path).reset()[0])
 
 
-@pytest.mark.parametrize(("task", "config"), CHECKED, ids=str)
-def test_a_pickled_environment_goes_on_as_it_would_have(stored, task, config):
-    env = make(stored(jax_se(task, **config)))
+@pytest.mark.parametrize("source", [*CHECKED, "cartpole-rn"], ids=str)
+def test_a_pickled_environment_goes_on_as_it_would_have(stored, source):
+    env = an_env(stored, source)
     env.reset(seed=0)
     copy = pickle.loads(pickle.dumps(env))
     env.action_space.seed(0)
@@ -314,15 +311,6 @@ def test_a_task_may_be_called_what_gymnasium_would_not(stored, name):
     assert gymnasium.make(env.spec).reset(seed=0)[0].shape == (4,)
 
 
-def test_what_is_returned_is_the_callers(stored):
-    env = make(stored(jax_se()))
-    first, _ = env.reset(seed=0)
-    first[:] = np.nan
-    obs, *_ = env.step(0)
-    obs[:] = np.nan
-    assert np.isfinite(env.step(0)[0]).all()
-
-
 def test_a_step_needs_an_episode_and_an_action_of_the_space(stored):
     env = constant(d=1.0)
     with pytest.raises(gymnasium.error.ResetNeeded):
@@ -331,22 +319,13 @@ def test_a_step_needs_an_episode_and_an_action_of_the_space(stored):
     for action in (-1, 2, 0.5, None):
         with pytest.raises(gymnasium.error.InvalidAction, match=r"is none of Discrete\(2\)"):
             env.step(action)
-    assert env.step(np.int64(1))[2]
+    assert env.step(True)[2]  # and np.int64(1)
     with pytest.raises(gymnasium.error.ResetNeeded):
         env.step(0)
     env = make(stored(jax_se("pendulum")))
     env.reset(seed=0)
     with pytest.raises(gymnasium.error.InvalidAction, match=r"is none of Box"):
         env.step(0.5)
-
-
-def test_bools_are_actions_and_no_masks():
-    rewards: dict[int, set[float]] = {0: set(), 1: set()}
-    for action in (1, True, np.array(1), 0, False):
-        env = make("cartpole")
-        env.reset(seed=0)
-        rewards[int(action)].add(env.step(action)[1])
-    assert len(rewards[0]) == len(rewards[1]) == 1 and rewards[0] != rewards[1]
 
 
 def test_continuous_actions_are_clipped_to_the_bounds(stored):
@@ -370,14 +349,19 @@ def test_what_ships_is_registered_once_and_by_its_name():
 def test_it_runs_without_jax_and_in_forked_processes():
     program = """
 import sys
+import sejax
+sejax.pretrained()
+assert "gymnasium" not in sys.modules
 import sejax.gym
 from gymnasium.vector import AsyncVectorEnv
 env = sejax.gym.make("cartpole")
 env.reset(seed=0)
 env.step(1)
+sejax.gym.make("cartpole-rn").reset(seed=0)
 envs = AsyncVectorEnv([lambda: sejax.gym.make("cartpole")] * 2, context="fork")
 envs.reset(seed=0)
-print(envs.step([0, 1])[0].shape, sorted({"jax", "flax", "jaxtyping"} & set(sys.modules)))
+loaded = {"jax", "flax", "jaxtyping", "stable_baselines3", "torch"} & set(sys.modules)
+print(envs.step([0, 1])[0].shape, sorted(loaded))
 envs.close()
 """
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
@@ -401,14 +385,11 @@ def test_gymnasiums_tasks_have_the_spaces_of_sejaxs(name):
 
 
 @pytest.mark.parametrize(("given", "limit"), [({}, 200), ({"max_steps": 300}, 300)], ids=str)
-def test_a_task_of_gymnax_is_gymnasiums_of_that_id(tmp_path, given, limit):
-    jax_task = envs.make("gymnax/MountainCar-v0", **given)
-    path = tmp_path / "se.safetensors"
-    jax_env = SyntheticConfig(**SMALL).make(jax_task)
-    sejax.save(path, jax_env, random_weights(jax_env))
-    task = se_task(read(path)[1], None, needs_starts=True)
-    assert task.action_space == spaces.Discrete(3) and task.max_steps == limit
-    position, velocity = task.starts(np.random.default_rng(0))
+def test_a_task_of_gymnax_is_gymnasiums_of_that_id(stored, given, limit):
+    jax_env = SyntheticConfig(**SMALL).make(envs.make("gymnax/MountainCar-v0", **given))
+    env = make(stored(jax_env))
+    assert env.action_space == spaces.Discrete(3) and env.world.max_steps == limit
+    (position, velocity), _ = env.reset(seed=0)
     assert -0.6 <= position <= -0.4 and velocity == 0.0
 
 
@@ -459,7 +440,7 @@ def refused(call, *args, **kwargs):
     """The field that a refused call names."""
     with pytest.raises(ConfigError) as error:
         call(*args, **kwargs)
-    assert len(str(error.value)) < 500
+    assert len(str(error.value)) <= 300
     return error.value.field
 
 
@@ -483,8 +464,7 @@ def test_a_strangers_file_sets_no_options_that_the_task_does_not_have_here(tmp_p
     header["config"]["env"] |= given
     path = tmp_path / "strangers.safetensors"
     path.write_bytes(pack(tensors, "sejax", header))
-    with pytest.raises(ConfigError, match=rf"^env\.{next(iter(given))} must be"):
-        make(path)
+    assert refused(make, path) == f"env.{next(iter(given))}"
 
 
 @pytest.mark.parametrize("change", [

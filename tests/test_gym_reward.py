@@ -1,13 +1,10 @@
 """Reward networks around Gymnasium's environments: each reward, worked by hand."""
 
-import pickle
-
 import gymnasium
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from gymnasium.utils.env_checker import check_env
 from gymnasium.wrappers import (
     DtypeObservation,
     FlattenObservation,
@@ -74,7 +71,7 @@ def stored_rn(tmp_path, num_inputs, task="walk", discount=0.9, interface=WALK, *
         proxies=[{}],
     )  # fmt: skip
     path = tmp_path / "rn.safetensors"
-    path.write_bytes(stored.with_tensors(tensors))
+    path.write_bytes(header.packed(tensors, stored))
     if config.shaping.weighs_info:
         return path, tensors["info_weights"]
     layers = {layer: {k: tensors[f"potential/{layer}/{k}"] for k in ("kernel", "bias")}
@@ -233,26 +230,6 @@ def test_the_time_limit_is_the_tasks_and_there_once():
     assert [env.step(3)[3] for _ in range(50)] == [False] * 49 + [True]
 
 
-@pytest.mark.parametrize("name", [x for x in header.pretrained_names() if x.endswith("-rn")])
-@pytest.mark.filterwarnings("ignore:.*different from the unwrapped version:UserWarning",
-                            "ignore:.*m.*imum value is -?infinity:UserWarning",
-                            "ignore:.*Not able to test alternative:UserWarning")  # fmt: skip
-def test_gymnasiums_checker_passes(name):
-    check_env(make(name), skip_render_check=True)
-
-
-def test_a_pickled_one_goes_on_as_it_would_have():
-    env = make("cartpole-rn")
-    env.reset(seed=0)
-    env.step(1)
-    copy = pickle.loads(pickle.dumps(env))
-    for _ in range(3):
-        (obs, *rest), (same_obs, *same_rest) = env.step(0), copy.step(0)
-        np.testing.assert_array_equal(obs, same_obs)
-        assert rest == same_rest
-    np.testing.assert_array_equal(env.reset()[0], copy.reset()[0])
-
-
 def test_the_spec_of_a_wrapper_makes_the_wrapper_again(tmp_path):
     cartpole = envs.make("cartpole").interface
     path, _ = stored_rn(tmp_path, 4, interface=cartpole, variant="exclusive_potential")
@@ -265,15 +242,6 @@ def test_the_spec_of_a_wrapper_makes_the_wrapper_again(tmp_path):
     assert both[0].step(1)[1] == both[1].step(1)[1]
 
 
-def test_numbers_of_info_are_known_by_gymnasiums_names(tmp_path):
-    """v5's halfcheetah has another name for one than sejax's task."""
-    cheetah = ("x_position", "x_velocity", "reward_forward", "reward_ctrl")
-    for config, keys in (({"variant": "additive_weighted_info"}, cheetah),
-                         ({"augmented": True}, cheetah[:2])):  # fmt: skip
-        path, _ = stored_rn(tmp_path, 4, "halfcheetah", **config)
-        assert RewardNetwork(Walk(), path)._info_keys == keys
-
-
 # --- what cannot be ------------------------------------------------------------------------------
 
 
@@ -281,7 +249,7 @@ def refused(call, *args, **kwargs):
     """The field that a refused call names."""
     with pytest.raises(ConfigError) as error:
         call(*args, **kwargs)
-    assert len(str(error.value)) < 500
+    assert len(str(error.value)) <= 300
     return error.value.field
 
 

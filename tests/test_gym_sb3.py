@@ -5,7 +5,6 @@ They need the extra `sb3`, which `dev` has not (torch is 200 MB): `make test-exa
 
 import pickle
 import re
-import subprocess
 import sys
 from pathlib import Path
 
@@ -35,23 +34,8 @@ needs_sb3 = pytest.mark.skipif(PPO is None, reason="needs the extra sb3: make te
 def test_without_it_one_message_says_what_to_install(monkeypatch):
     for module in ("stable_baselines3", "stable_baselines3.common.vec_env"):
         monkeypatch.setitem(sys.modules, module, None)
-    with pytest.raises(ConfigError, match=r"^make_sb3 needs Stable-Baselines3, .*sejax\[sb3\]'\.$"):
+    with pytest.raises(ConfigError, match=r"pip install 'sejax\[sb3\]'"):
         sejax.gym.make_sb3("cartpole")
-
-
-def test_nothing_imports_it_unasked():
-    program = """
-import sys
-import sejax
-sejax.pretrained()
-print("gymnasium" in sys.modules)
-import sejax.gym
-sejax.gym.make_vec("cartpole", 2).reset(seed=0)
-sejax.gym.make("cartpole-rn").reset(seed=0)
-print(sorted({"jax", "flax", "stable_baselines3", "torch"} & set(sys.modules)))
-"""
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
-    assert done.stdout.split("\n") == ["False", "[]", ""], done.stdout + done.stderr
 
 
 @needs_sb3

@@ -82,7 +82,7 @@ def test_lanes_are_single_environments(name, mode):
     assert num_ended > num_envs
     assert_same(lanes.reset(), singles.reset())
     assert_same(lanes.reset(seed=[7, None, 9]), singles.reset(seed=[7, None, 9]))
-    assert lanes.np_random_seed == (7, 6, 9) and len(lanes.np_random) == num_envs
+    assert lanes.np_random_seed == [7, 6, 9] and len(lanes.np_random) == num_envs
 
 
 def test_a_pickled_one_goes_on_as_it_would_have():
@@ -124,13 +124,19 @@ def test_an_ended_lane_must_be_reset_where_nothing_does_it():
         envs.step([0, 1])
 
 
-def test_seeds_and_masks_are_one_for_each_lane():
+@pytest.mark.parametrize(
+    ("given", "field"),
+    [
+        ({"seed": [1, 2, 3]}, "seed"),
+        ({"options": {"reset_mask": np.array([True])}}, "options.reset_mask"),
+        ({"options": {"reset_mask": np.array([1, 0])}}, "options.reset_mask"),
+    ],
+)
+def test_seeds_and_masks_are_one_for_each_environment(given, field):
     envs = SyntheticVectorEnv(world_of(), 2)
-    with pytest.raises(ConfigError, match=r"^seed must have an entry for each"):
-        envs.reset(seed=[1, 2, 3])
-    for mask in (np.array([True]), np.array([1, 0])):
-        with pytest.raises(ConfigError, match=r"^options.reset_mask must be a bool"):
-            envs.reset(options={"reset_mask": mask})
+    with pytest.raises(ConfigError) as error:
+        envs.reset(**given)
+    assert error.value.field == field
 
 
 def test_gymnasium_makes_the_shipped_ones_by_their_names():
@@ -152,17 +158,20 @@ def test_a_reward_networks_lanes_are_gymnasiums():
     np.testing.assert_array_equal(envs.reset(seed=3)[0][1], single.reset(seed=4)[0])
     assert envs.step([1, 1])[1][1] == single.step(1)[1]
     assert envs.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
-    with pytest.raises(ConfigError, match=r"^num_envs must be"):
-        make_vec("cartpole", 0)
 
 
-@pytest.mark.parametrize("given, said", [
-    ({"num_envs": 2.5}, r"^num_envs must be"),
-    ({"num_envs": 2, "autoreset_mode": "samestep"}, r"^autoreset_mode must be one of SameStep, "),
-])  # fmt: skip
-def test_what_cannot_be_is_one_message(given, said):
-    with pytest.raises(ConfigError, match=said):
+@pytest.mark.parametrize(
+    ("given", "field"),
+    [
+        ({"num_envs": 0}, "num_envs"),
+        ({"num_envs": 2.5}, "num_envs"),
+        ({"num_envs": 2, "autoreset_mode": "samestep"}, "autoreset_mode"),
+    ],
+)
+def test_what_cannot_be_is_one_message(given, field):
+    with pytest.raises(ConfigError) as error:
         make_vec("cartpole", **given)
+    assert error.value.field == field
 
 
 def test_bools_are_actions_and_no_masks():

@@ -109,7 +109,7 @@ def test_limit_and_threshold_are_those_asked_for_or_known():
     assert {x: task_of(x).solved_reward for x in SOLVED_REWARD} == SOLVED_REWARD
     unknown = task_of("Catch-bsuite")
     assert unknown.solved_reward == math.inf and not unknown.is_solvable
-    with pytest.raises(ConfigError, match=r"^objective must be"):
+    with pytest.raises(ConfigError, match=r"^objective must"):
         sejax.RewardThreshold().make(unknown)
 
 
@@ -188,23 +188,23 @@ def test_environments_that_agents_can_take_as_they_are_are_left_alone():
 
 
 DICT, TUPLE = spaces.Dict({"x": spaces.Discrete(2)}), spaces.Tuple([spaces.Discrete(2)])
-ONE = (1,)
 
 
 @pytest.mark.parametrize(
-    ("action", "obs", "said"),
+    ("action", "obs"),
     [
-        (DICT, None, "have actions in a gymnax Box or Discrete space"),
-        (TUPLE, None, "have actions in a gymnax Box or Discrete space"),
-        (spaces.Discrete(2), DICT, "have observations in a gymnax Box or Discrete space"),
-        (spaces.Box(-jnp.inf, 1.0, ONE), None, "have bounded actions"),
-        (spaces.Box(-1.0, jnp.inf, ONE), None, "have bounded actions"),
-        (spaces.Box(1.0, 1.0, ONE), None, "have bounded actions"),
+        (DICT, None),
+        (TUPLE, None),
+        (spaces.Discrete(2), DICT),
+        (spaces.Box(-jnp.inf, 1.0, (1,)), None),
+        (spaces.Box(-1.0, jnp.inf, (1,)), None),
+        (spaces.Box(1.0, 1.0, (1,)), None),
     ],
 )
-def test_spaces_that_no_agent_could_use_are_refused(action, obs, said):
-    with pytest.raises(ConfigError, match=rf"^env must {said}.* in odd\."):
+def test_spaces_that_no_agent_could_use_are_refused(action, obs):
+    with pytest.raises(ConfigError) as error:
         odd_task(action, obs)
+    assert error.value.field == "env"
 
 
 # --- environments with a fault -------------------------------------------------------------------
@@ -215,12 +215,13 @@ class Plain:
 
     default_params = gymnax.EnvParams(max_steps_in_episode=3)
     is_truncated = Odd.is_truncated
+    obs, reward, terminated = np.zeros(2), 0.0, np.bool_(False)
 
     def reset_env(self, key, params):
-        return jnp.zeros(2), gymnax.EnvState(time=jnp.int32(0))
+        return jnp.array(self.obs), gymnax.EnvState(time=jnp.int32(0))
 
     def step_env(self, key, state, action, params):
-        return jnp.zeros(2), state, 0.0, jnp.bool_(False), {}
+        return jnp.array(self.obs), state, self.reward, jnp.array(self.terminated), {}
 
     def action_space(self, params):
         return spaces.Discrete(2)
@@ -229,88 +230,59 @@ class Plain:
         return spaces.Box(-1.0, 1.0, (2,))
 
 
-class NoLimit(Plain):
-    is_truncated = None
+def with_fault(**attributes):
+    return type("Faulty", (Plain,), attributes)()
 
 
-class Short(Plain):
-    def reset_env(self, key, params):
-        return jnp.zeros(3), gymnax.EnvState(time=0)
-
-    def step_env(self, key, state, action, params):
-        return jnp.zeros(3), state, 0.0, jnp.bool_(False), {}
+def drifts(self, key, state, action, params):
+    return jnp.zeros(2), state.replace(time=jnp.float32(1)), 0.0, jnp.bool_(False), {}
 
 
-class Four(Plain):
-    def step_env(self, key, state, action, params):
-        return jnp.zeros(2), state, 0.0, jnp.bool_(False)
-
-
-class NoSpace(Plain):
-    def action_space(self, params):
-        raise KeyError("actions")
-
-
-class Drifts(Plain):
-    def step_env(self, key, state, action, params):
-        return jnp.zeros(2), state.replace(time=jnp.float32(1)), 0.0, jnp.bool_(False), {}
-
-
-class Done(Plain):
-    def step_env(self, key, state, action, params):
-        return jnp.zeros(2), state, 0.0, jnp.float32(0), {}
-
-
-class Rewards(Plain):
-    def step_env(self, key, state, action, params):
-        return jnp.zeros(2), state, jnp.zeros(2), jnp.bool_(False), {}
+class Limit(NamedTuple):
+    max_steps_in_episode: int = 3
 
 
 @pytest.mark.parametrize(
-    ("env", "said"),
+    ("env", "options", "fault"),
     [
-        (NoLimit(), r"raised TypeError"),
-        (NoSpace(), r"raised KeyError: 'actions'"),
-        (Four(), r"five values.*raised ValueError: not enough values to unpack"),
-        (Short(), r"obs \(2,\).*obs is \(3,\)"),
-        (Drifts(), r"state\.time is \(\(\), 'int32'\) after reset_env and \(\(\), 'float32'\)"),
-        (Done(), r"terminated is \(\) float32"),
-        (Rewards(), r"reward is \(2,\)"),
-        (gymnax.make("CartPole-v1"), r"'tuple' object has no attribute 'default_params'"),
+        (with_fault(is_truncated=None), {}, "TypeError"),
+        (with_fault(action_space=lambda self, params: {}["actions"]), {}, "KeyError: 'actions'"),
+        (with_fault(step_env=lambda *args: (jnp.zeros(2), args[2], 0.0, False)), {}, "five values"),
+        (with_fault(obs=np.zeros(3)), {}, "obs"),
+        (with_fault(step_env=drifts), {}, "state.time"),
+        (with_fault(terminated=np.float32(0)), {}, "terminated"),
+        (with_fault(reward=np.zeros(2)), {}, "reward"),
+        (gymnax.make("CartPole-v1"), {}, "default_params"),
+        (Plain(), {"params": Limit(), "max_steps": 5}, "replace"),
+        (Plain(), {"params": gymnax.EnvState(time=0)}, "max_steps_in_episode"),
+        (StickyActionWrapper(cartpole.CartPole(), 1.0), {}, "step_env in place of reset and step"),
+        (Plain(), {"solved_reward": "high"}, "solved_reward"),
+        (Plain(), {"solved_reward": math.nan}, "solved_reward"),
+        (Plain(), {"max_steps": 0}, "max_steps"),
     ],
 )
-def test_a_fault_is_told_before_an_agent_trains(env, said):
+def test_a_fault_is_told_before_an_agent_trains(env, options, fault):
     assert Task(name="mine", env=Plain()).max_steps == 3
-    with pytest.raises(ConfigError, match=rf"^env must .*{said}"):
-        Task(name="mine", env=env)
+    with pytest.raises(ConfigError) as error:
+        Task(name="mine", env=env, **options)
+    assert error.value.field in ("env", "env.max_steps", "env.solved_reward")
+    assert fault in str(error.value) and len(str(error.value)) <= 300
 
 
-def test_limits_may_be_numbers_of_numpy_and_jax_but_must_be_replaceable():
-    class Limit(NamedTuple):
-        max_steps_in_episode: int = 3
-
+def test_limits_may_be_numbers_of_numpy_and_jax():
     assert Task(name="mine", env=Plain(), params=Limit(jnp.int32(4))).max_steps == 4
     assert type(Task(name="mine", env=Plain(), max_steps=np.int64(7)).max_steps) is int
-    for fields, said in [
-        ({"params": Limit(), "max_steps": 5}, "params must have a method replace"),
-        ({"params": gymnax.EnvState(time=0)}, "params must have max_steps_in_episode"),
-        ({"solved_reward": "high"}, r"env\.solved_reward must be a number"),
-        ({"solved_reward": math.nan}, r"env\.solved_reward must be a number"),
-    ]:
-        with pytest.raises(ConfigError, match=rf"^{said}"):
-            Task(name="mine", env=Plain(), **fields)
 
 
-def test_a_wrapper_whose_step_would_never_be_called_is_refused():
-    wrapped = StickyActionWrapper(cartpole.CartPole(), 1.0)
-    said = r"^env must change reset_env in place of reset and step_env in place of step; "
-    with pytest.raises(ConfigError, match=said):
-        Task(name="sticky", env=wrapped)
-    task = Task(name="plain", env=cartpole.CartPole())
-    with pytest.raises(ConfigError, match=said):
-        sejax.make_trainer(sejax.make_agent(sejax.DDQNConfig(), task), wrapped)
+def test_a_wrapper_whose_step_would_never_be_called_is_refused_as_a_proxy_too():
+    agent = sejax.make_agent(sejax.DDQNConfig(), Task(name="plain", env=cartpole.CartPole()))
+    with pytest.raises(ConfigError) as error:
+        sejax.make_trainer(agent, StickyActionWrapper(cartpole.CartPole(), 1.0))
+    assert error.value.field == "env"
 
-    class Half:  # changes what is called, and hands on the rest
+
+def test_a_wrapper_that_hands_on_what_it_does_not_change_is_taken():
+    class Half:
         def __init__(self, env):
             self.env = env
 

@@ -3,10 +3,12 @@
 import builtins
 import importlib.util
 
+import jax
 import numpy as np
 import pytest
 import yaml
 from fake_hub import oid, serving
+from safetensors.numpy import save
 
 import sejax
 from sejax.options import ConfigError
@@ -61,9 +63,15 @@ def test_an_address_names_repository_revision_and_file(address, parts):
     "hf://me/se/proxy.safetensors\n", "hf://datasets/me/se",
 ])  # fmt: skip
 def test_what_is_no_address_or_no_safetensors_file_is_refused(address):
+    refusal(hub.parse, address, "proxy", field="proxy")
+
+
+def refusal(call, *args, field):
+    """The message of a call that is refused because of this field."""
     with pytest.raises(ConfigError) as error:
-        hub.parse(address, "proxy")
-    assert error.value.field == "proxy" and len(str(error.value)) < 300
+        call(*args)
+    assert error.value.field == field and len(str(error.value)) <= 300
+    return str(error.value)
 
 
 def test_a_missing_extra_is_one_line_that_says_what_to_install(monkeypatch):
@@ -75,9 +83,8 @@ def test_a_missing_extra_is_one_line_that_says_what_to_install(monkeypatch):
         return importing(name, *args, **kwargs)
 
     monkeypatch.setattr(builtins, "__import__", without_the_hub)
-    for use in (lambda: sejax.load("hf://me/se"), lambda: sejax.push("cartpole", "me/se")):
-        with pytest.raises(ConfigError, match=r"pip install 'sejax\[hub\]'\.$"):
-            use()
+    assert "sejax[hub]" in refusal(sejax.load, "hf://me/se", field="source")
+    assert "sejax[hub]" in refusal(sejax.push, "cartpole", "me/se", field="repo")
 
 
 # --- what is pushed and loaded -------------------------------------------------------------------
@@ -90,30 +97,14 @@ def test_a_proxy_that_is_pushed_is_loaded_everywhere_as_it_was(the_hub):
     (files,) = the_hub.commits["me/my-cartpole"]
     assert sorted(files) == ["README.md", "proxy.safetensors"]
     assert files["proxy.safetensors"] == SHIPPED.read_bytes()
-    env, params = sejax.load(address)
-    shipped_env, shipped = sejax.load("cartpole")
-    assert env.config == shipped_env.config and env.task is shipped_env.task
-    assert_same_weights(params.weights, shipped.weights)
-    assert_same_weights(sejax.load_set(address)[0].params.weights, shipped.weights)
-    assert sejax.load_proxy(address).task.name == "cartpole"
+    proxy, shipped = sejax.load_proxy(address), sejax.load_proxy("cartpole")
+    assert proxy.env.config == shipped.env.config and proxy.task is shipped.task
+    assert proxy.fingerprint == shipped.fingerprint == sejax.load_set(address)[0].fingerprint
     assert header.read_config(address) == header.read_config("cartpole")
-
-
-@needs_the_extra
-def test_gymnasium_environments_come_from_there_without_jax(the_hub):
     pytest.importorskip("gymnasium")
-    env = sejax.gym.make(sejax.push("cartpole", "me/se"))
-    ours = sejax.gym.make("cartpole")
-    obs, _ = env.reset(seed=3)
-    np.testing.assert_array_equal(obs, ours.reset(seed=3)[0])
-    np.testing.assert_array_equal(env.step(1)[0], ours.step(1)[0])
-
-
-def assert_same_weights(a, b):
-    for network in b:
-        for layer in b[network]:
-            for name, x in b[network][layer].items():
-                np.testing.assert_array_equal(a[network][layer][name], x)
+    envs = [sejax.gym.make(source) for source in (address, "cartpole")]
+    np.testing.assert_array_equal(*(env.reset(seed=3)[0] for env in envs))
+    np.testing.assert_array_equal(*(env.step(1)[0] for env in envs))
 
 
 @needs_the_extra
@@ -158,11 +149,8 @@ def test_ones_own_task_is_to_be_given(the_hub, tmp_path):
     task = sejax.Task(name="mine", env=sejax.envs.make("cartpole").env, solved_reward=1.0,
                       max_steps=10)  # fmt: skip
     env = sejax.SyntheticConfig(hidden_size=2).make(task)
-    weights = {name: {layer: {key: np.zeros(x.shape, np.float32) for key, x in leaves.items()}
-                      for layer, leaves in layers.items()}
-               for name, layers in shapes_of(env).items()}  # fmt: skip
     path = tmp_path / "mine.safetensors"
-    sejax.save(path, env, weights)
+    sejax.save(path, env, env.init_weights(jax.random.key(0)))
     address = sejax.push(path, "me/mine")
     _, card = front_and_card(the_hub, "me/mine")
     assert 'sejax.load("hf://me/mine", task=...)' in card and "env=..." in card
@@ -170,18 +158,11 @@ def test_ones_own_task_is_to_be_given(the_hub, tmp_path):
     assert sejax.load(address, task=task)[0].task is task
 
 
-def shapes_of(env):
-    import jax
-
-    return jax.eval_shape(env.init_weights, jax.random.key(0))
-
-
 @needs_the_extra
 def test_a_set_is_not_pushed(the_hub, tmp_path):
     env, params = sejax.load("cartpole")
     sejax.save_set(tmp_path / "set.safetensors", env, [params.weights] * 2, [{}, {}])
-    with pytest.raises(ConfigError, match=r"^source must be a single proxy"):
-        sejax.push(tmp_path / "set.safetensors", "me/set")
+    refusal(sejax.push, tmp_path / "set.safetensors", "me/set", field="source")
     assert not the_hub.commits
 
 
@@ -204,27 +185,24 @@ def test_without_a_network_what_was_fetched_before_serves(the_hub, monkeypatch):
     sejax.load(address)
     monkeypatch.setattr(constants, "HF_HUB_OFFLINE", True)
     assert sejax.load_proxy(address).task.name == "cartpole"
-    with pytest.raises(ConfigError, match=r"the Hub cannot be reached, and no copy is here\. Conn"):
-        sejax.load("hf://me/other")
+    assert "no copy is here" in refusal(sejax.load, "hf://me/other", field="source")
 
 
 # --- what can go wrong ---------------------------------------------------------------------------
 
 
 @needs_the_extra
-@pytest.mark.parametrize(("address", "message"), [
-    ("hf://me/nothing", r"got hf://me/nothing: there is no such repository, or it is private\."),
-    ("hf://me/se@v9", r"no such revision\. Leave it out"),
-    ("hf://me/se/last.safetensors", r"no such file\. Name one: hf://USER/REPO/FILE"),
-    ("hf://me/hidden", r"there is no such repository, or it is private\. .* hf auth login\.$"),
-    ("hf://me/gated", r"its owner gives access on request\."),
-    ("hf://me/large/large.safetensors", r"at most 100,000,000 bytes, .*got 100,000,001 bytes"),
-    ("hf://me/pickle", r"which is damaged or of another format"),
-    ("hf://me/foreign", r"which is damaged or of another format"),
+@pytest.mark.parametrize(("address", "said"), [
+    ("hf://me/nothing", "no such repository, or it is private"),
+    ("hf://me/se@v9", "no such revision"),
+    ("hf://me/se/last.safetensors", "no such file. Name one: hf://USER/REPO/FILE"),
+    ("hf://me/hidden", "log in with hf auth login"),
+    ("hf://me/gated", "its owner gives access on request"),
+    ("hf://me/large/large.safetensors", "at most 100,000,000 bytes"),
+    ("hf://me/pickle", "damaged or of another format"),
+    ("hf://me/foreign", "damaged or of another format"),
 ])  # fmt: skip
-def test_each_failure_is_one_message(the_hub, tmp_path, address, message):
-    from safetensors.numpy import save
-
+def test_each_failure_is_one_message(the_hub, tmp_path, address, said):
     the_hub.commits = {
         "me/se": [{"proxy.safetensors": SHIPPED.read_bytes()}],
         "me/large": [{"large.safetensors": b""}],
@@ -233,35 +211,32 @@ def test_each_failure_is_one_message(the_hub, tmp_path, address, message):
     }
     the_hub.refused = {"me/hidden": (401, "RepoNotFound"), "me/gated": (403, "GatedRepo")}
     the_hub.claimed_sizes = {"large.safetensors": hub.MAX_BYTES + 1}
-    with pytest.raises(ConfigError, match=message):
-        sejax.load(address)
+    assert said in refusal(sejax.load, address, field="source")
     assert not list(tmp_path.rglob("large.safetensors")), "nothing of it is fetched"
 
 
 @needs_the_extra
 def test_who_may_not_write_is_told(the_hub, monkeypatch):
     monkeypatch.setenv("HF_TOKEN", "hf_other")
-    with pytest.raises(ConfigError, match=r"^repo must be within reach.* hf auth login"):
-        sejax.push("cartpole", "me/se")
+    assert "hf auth login" in refusal(sejax.push, "cartpole", "me/se", field="repo")
     monkeypatch.setattr("huggingface_hub.constants.ENDPOINT", "http://127.0.0.1:9")
-    with pytest.raises(ConfigError, match=r"^repo must be within reach.*ConnectError"):
-        sejax.push("cartpole", "me/se")
+    refusal(sejax.push, "cartpole", "me/se", field="repo")
 
 
-def test_a_repository_has_an_owner_and_a_name():
-    for repo in ("se", "me/se/x", "hf://me/se", "me/../se", "", None, 3):
-        with pytest.raises(ConfigError) as error:
-            sejax.push("cartpole", repo)
-        assert error.value.field == "repo"
+@pytest.mark.parametrize(
+    "repo", ["se", "me/se/x", "hf://me/se", "me/../se", "", None, 3, "me/" + "x" * 500]
+)
+def test_a_repository_has_an_owner_and_a_name(repo):
+    refusal(sejax.push, "cartpole", repo, field="repo")
 
 
 @needs_the_extra
 def test_the_command_evaluates_what_is_there_and_writes_in_the_working_folder(the_hub):
     from sejax.cli import config as configuration
-    from sejax.evaluate import proxy_study
+    from sejax.cli.worlds import proxy_setup
 
     sejax.push("cartpole", "me/se")
     config = configuration.evaluate_config([f"proxy=hf://me/se@{oid('me/se', 0)}"])
-    study = proxy_study(config)
+    study = proxy_setup(config)
     assert study.task.name == "cartpole"
-    assert str(study.out_dir) == f"runs/evaluate-me_se@{oid('me/se', 0)}"
+    assert str(study.out_dir) == f"runs/evaluate-me_se_{oid('me/se', 0)}"

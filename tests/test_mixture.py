@@ -337,8 +337,8 @@ def test_two_agents_are_one_program_with_a_training_loop_for_each():
     )
     bilevel = make_bilevel(
         task=task, agent=Mixture(agents=agents), proxy=SyntheticConfig(hidden_size=4),
-        es=NESConfig(population_size=23), training=dataclasses.replace(TRAINING, max_steps=40),
-        devices=2, num_parallel=1,
+        es=NESConfig(population_size=23, num_incumbent_evals=23), devices=2, num_parallel=1,
+        training=dataclasses.replace(TRAINING, max_steps=40),
     )  # fmt: skip
     lowered = jax.jit(bilevel.generation).lower(jax.eval_shape(bilevel.init, KEY))
     hlo = lowered.compile().as_text()

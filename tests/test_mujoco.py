@@ -1,7 +1,6 @@
 """MuJoCo behind XLA's foreign function interface, and the tasks on it beside Gymnasium's."""
 
 import functools
-import importlib.util
 import os
 import shutil
 import subprocess
@@ -59,32 +58,26 @@ SCALE = {"inverted_pendulum": 0.01}
 RENAMED = {"reward_forward": "reward_run"}  # the paper's name, of v3, for halfcheetah alone
 
 
-@pytest.fixture(scope="module")
-def in_gymnasium():
-    """`in_gymnasium(name, **options)`: Gymnasium's environment, without a step limit."""
-    if importlib.util.find_spec("imageio") is None:
-        pytest.skip("Gymnasium's MuJoCo environments need imageio: pip install 'gymnasium[mujoco]'")
-    return lambda name, **options: gymnasium.make(IDS[name], **options).unwrapped
+def in_gymnasium(name, **options):
+    """Gymnasium's environment, without a step limit."""
+    pytest.importorskip("imageio", reason="pip install 'gymnasium[mujoco]'")
+    return gymnasium.make(IDS[name], **options).unwrapped
 
 
-@pytest.fixture(scope="module")
-def walk():
-    """`walk(task)(key, actions)`: `(start, obs, steps)` with leaves `[step]` in `steps`; jitted."""
-    compiled = {}
+@functools.cache
+def walk_of(task):
+    """`walk(key, actions)`: `(start, obs, steps)` with leaves `[step]` in `steps`; jitted."""
 
-    def walk_of(task):
-        def walk(key, actions):
-            obs, state = task.env.reset_env(key, task.params)
+    def walk(key, actions):
+        obs, state = task.env.reset_env(key, task.params)
 
-            def step(state, action):
-                obs, state, *rest = task.env.step_env(None, state, action, task.params)
-                return state, (obs, state.physics, *rest)
+        def step(state, action):
+            obs, state, *rest = task.env.step_env(None, state, action, task.params)
+            return state, (obs, state.physics, *rest)
 
-            return state.physics, obs, jax.lax.scan(step, state, actions)[1]
+        return state.physics, obs, jax.lax.scan(step, state, actions)[1]
 
-        return compiled.setdefault(task, jax.jit(walk))
-
-    return walk_of
+    return jax.jit(walk)
 
 
 def draw_actions(task, num_steps, seed=0):
@@ -126,10 +119,10 @@ def play_in_gymnasium(env, qpos, qvel, actions):
 @pytest.mark.parametrize(
     ("name", "options"), [*((name, {}) for name in NAMES), *OPTIONS.items()], ids=str
 )
-def test_a_thousand_steps_equal_gymnasiums(name, options, walk, in_gymnasium):
+def test_a_thousand_steps_equal_gymnasiums(name, options):
     task, env = envs.make(name, **options), in_gymnasium(name, **options)
     actions = draw_actions(task, NUM_STEPS)
-    start, first, steps = jax.device_get(walk(task)(jax.random.key(1), actions))
+    start, first, steps = jax.device_get(walk_of(task)(jax.random.key(1), actions))
     obs, states, reward, terminated, info = steps
     expected_first, expected = play_in_gymnasium(env, *start_of(start, env.model), actions)
     np.testing.assert_allclose(first, expected_first, rtol=0, atol=1e-6)
@@ -149,7 +142,7 @@ def test_a_thousand_steps_equal_gymnasiums(name, options, walk, in_gymnasium):
 
 
 @pytest.mark.parametrize("name", ["hopper", "walker2d", "ant"])
-def test_who_is_healthy_is_as_in_gymnasium_on_both_sides_of_every_bound(name, in_gymnasium):
+def test_who_is_healthy_is_as_in_gymnasium_on_both_sides_of_every_bound(name):
     task, env, num = envs.make(name), in_gymnasium(name), 300
     rng = np.random.default_rng(0)
     qpos = np.float32(env.init_qpos + rng.uniform(-0.3, 0.3, (num, env.model.nq)))
@@ -166,7 +159,7 @@ def test_who_is_healthy_is_as_in_gymnasium_on_both_sides_of_every_bound(name, in
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_limits_thresholds_and_spaces_are_gymnasiums(name, in_gymnasium):
+def test_limits_thresholds_and_spaces_are_gymnasiums(name):
     task, spec, env = envs.make(name), gymnasium.spec(IDS[name]), in_gymnasium(name)
     assert task.max_steps == task.params.max_steps_in_episode == spec.max_episode_steps
     # The paper's threshold for HalfCheetah; Gymnasium has none for Walker2d.
@@ -179,7 +172,7 @@ def test_limits_thresholds_and_spaces_are_gymnasiums(name, in_gymnasium):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_resets_are_drawn_as_gymnasiums(name, in_gymnasium):
+def test_resets_are_drawn_as_gymnasiums(name):
     task, env, num = envs.make(name), in_gymnasium(name), 300
     keys = jax.random.split(jax.random.key(0), num)
     draw = jax.jit(jax.vmap(task.env.draw_start))  # what `reset_env` begins from, as tested above
@@ -196,30 +189,15 @@ def test_resets_are_drawn_as_gymnasiums(name, in_gymnasium):
             assert stats.ks_2samp(mine, reference).pvalue > 1e-4
 
 
-@pytest.mark.parametrize(
-    "options",
-    [
-        {"name": "hopper", "reset_noise_scale": -1.0},
-        {"name": "ant", "ctrl_cost_weight": float("inf")},
-        {"name": "halfcheetah", "backend": "mujocco"},
-        {"name": "reacher", "backend": "mjx"},
-    ],
-)
-def test_options_that_make_no_sense_are_refused(options):
-    with pytest.raises(ConfigError) as error:
-        envs.make(**options)
-    assert error.value.field == f"env.{list(options)[1]}"
-
-
 # --- pure, in every transformation ---------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
-def ant_walks(walk):
+def ant_walks():
     """`(walk, keys, actions, each)`: an ant's walks, and what they give one after another."""
     task = envs.make("ant")
     keys, actions = jax.random.split(jax.random.key(0), 6), draw_actions(task, 40)
-    one = walk(task)
+    one = walk_of(task)
     each = [jax.device_get(one(key, actions)) for key in keys]
     return one, keys, actions, jax.tree.map(lambda *x: np.stack(x), *each)
 
@@ -353,58 +331,61 @@ def test_wrong_shapes_are_refused_while_tracing():
         physics.step(state, jnp.zeros(4))
 
 
-@pytest.fixture
-def unbuilt(monkeypatch, tmp_path):
-    """As if the library had never been built or loaded."""
-    monkeypatch.setenv("SEJAX_CACHE_DIR", str(tmp_path))
-    monkeypatch.setattr(library, "_load", library._load.__wrapped__)
-    return tmp_path
+def no_compiler(patch):
+    patch.setenv("CXX", "no-such-compiler")
+    patch.setattr(library, "COMPILERS", ("none-either",))
 
 
+def failing_compiler(patch):
+    patch.setenv("CXX", "sh -c 'echo no standard library >&2; exit 1'")
+
+
+def unreadable_compiler(patch):
+    patch.setenv("CXX", "'g++")
+
+
+def unloadable_library(patch):
+    patch.setattr(library, "build", lambda path: path.write_text("nothing"))
+
+
+def no_mujoco(patch):
+    patch.setitem(sys.modules, "mujoco", None)
+
+
+def no_gymnasium(patch):
+    patch.setitem(sys.modules, "gymnasium", None)
+
+
+def no_cpu(patch):
+    patch.setattr(jax, "default_backend", lambda: "gpu")
+
+
+@pytest.mark.parametrize("config", [HalfCheetah(), Hopper()], ids=["halfcheetah", "hopper"])
 @pytest.mark.parametrize(
-    ("config", "fix"), [(HalfCheetah(), ", or set env.backend=mjx."), (Hopper(), "g++.")]
-)
-def test_without_a_compiler_one_message_says_what_can_be_done(config, fix, unbuilt, monkeypatch):
-    monkeypatch.setenv("CXX", "no-such-compiler")
-    monkeypatch.setattr(library, "COMPILERS", ("none-either",))
-    with pytest.raises(ConfigError, match=r"no C\+\+ compiler was.*\$CXX, none-either") as raised:
-        config.make()
-    assert str(raised.value).endswith(fix) and not list(unbuilt.iterdir())
-
-
-@pytest.mark.parametrize(
-    ("compiler", "said"),
+    ("without", "said"),
     [
-        ("sh -c 'echo no standard library >&2; exit 1'", r"sh failed with: no standard library\."),
-        ("'g++", r"CXX is no command, 'g\+\+ \(No closing quotation\)"),
+        (no_compiler, "$CXX, none-either"),
+        (failing_compiler, "no standard library"),
+        (unreadable_compiler, "CXX is no command, 'g++"),
+        (unloadable_library, "SEJAX_CACHE_DIR"),
+        (no_mujoco, "pip install 'sejax[mujoco]'"),
+        (no_gymnasium, "pip install 'sejax[mujoco]'"),
+        (no_cpu, "JAX_PLATFORMS=cpu"),
     ],
 )
-def test_a_compiler_that_fails_is_quoted_and_leaves_nothing(compiler, said, unbuilt, monkeypatch):
-    monkeypatch.setenv("CXX", compiler)
-    with pytest.raises(ConfigError, match=said):
-        HalfCheetah().make()
-    assert not list(unbuilt.iterdir())
-
-
-def test_a_library_that_cannot_be_loaded_is_one_message(unbuilt, monkeypatch):
-    monkeypatch.setattr(library, "build", lambda path: path.write_text("nothing"))
-    with pytest.raises(
-        ConfigError, match=r"env=hopper needs .*cannot be loaded \(OSError: .*TMPDIR"
-    ):
-        Hopper().make()
-
-
-@pytest.mark.parametrize("package", ["mujoco", "gymnasium"])
-def test_without_a_package_the_message_names_the_extra(package, monkeypatch):
-    monkeypatch.setitem(sys.modules, package, None)
-    with pytest.raises(ConfigError, match=r"'sejax\[mujoco\]', or set env\.backend=mjx"):
-        HalfCheetah().make()
-
-
-def test_other_devices_than_the_cpu_are_refused(monkeypatch):
-    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    with pytest.raises(ConfigError, match=r"must run on the CPU.*got gpu\. Set JAX_PLATFORMS=cpu"):
-        Hopper().make()
+def test_where_mujoco_cannot_run_one_message_says_what_can_be_done(
+    config, without, said, monkeypatch, tmp_path
+):
+    monkeypatch.setenv("SEJAX_CACHE_DIR", str(tmp_path))
+    monkeypatch.setattr(library, "_load", library._load.__wrapped__)  # as if never loaded
+    without(monkeypatch)
+    with pytest.raises(ConfigError) as error:
+        config.make()
+    message = str(error.value)
+    assert error.value.field == "env"
+    assert message.startswith(f"env={config.name} ") and said in message and len(message) <= 300
+    assert message.endswith(", or set env.backend=mjx.") == (config.name == "halfcheetah")
+    assert unloadable_library is without or not list(tmp_path.iterdir())
 
 
 # --- slow: builds and long runs ------------------------------------------------------------------
@@ -509,4 +490,4 @@ def test_sanitizers_find_nothing_in_walks_and_malformed_calls(tmp_path):
 
 @pytest.mark.slow
 def test_memory_does_not_grow_over_a_million_steps():
-    run_program("memory", "reacher", "200000")  # two lanes, three times
+    run_program("memory", "reacher", "200000")  # two walks, three times

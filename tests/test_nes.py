@@ -42,7 +42,8 @@ def whole_generations(strategy):
 @functools.cache
 def nes(**fields):
     """Strategy with jitted `ask` and `tell`, by config fields; population 3 unless told."""
-    strategy = NESConfig(**{"population_size": 3, **fields}).make(DIMS)
+    paper = {"num_incumbent_evals": None, "noise_std": 0.05, "noise_std_decay": 1.0}
+    strategy = NESConfig(**{"population_size": 3, **paper, **fields}).make(DIMS)
     return strategy, *map(jax.jit, whole_generations(strategy))
 
 
@@ -62,13 +63,6 @@ def told(scores, seed=1, **fields):
 # --- candidates ----------------------------------------------------------------------------------
 
 
-def test_mirrored_members_use_opposite_noise():
-    candidates, _, _ = asked()
-    plus, minus = candidates[:3] - MEAN, candidates[3:6] - MEAN
-    np.testing.assert_allclose(plus, -minus, atol=1e-7)
-    assert np.abs(plus).min() > 0
-
-
 def test_candidates_are_plus_then_minus_then_the_incumbents():
     candidates, _, _ = asked(num_evals=2)
     strategy, _, _ = nes(num_evals=2)
@@ -78,6 +72,7 @@ def test_candidates_are_plus_then_minus_then_the_incumbents():
     assert strategy.evaluations.num_incumbent_evals == 3
     np.testing.assert_array_equal(candidates[:12:2], candidates[1:12:2])
     np.testing.assert_allclose(candidates[:6] - MEAN, MEAN - candidates[6:12], atol=1e-7)
+    assert np.abs(candidates[:6] - MEAN).min() > 0
     np.testing.assert_array_equal(candidates[12:], np.tile(MEAN, (3, 1)))
     assert len(np.unique(candidates[:6:2], axis=0)) == 3
 
@@ -89,9 +84,9 @@ def test_without_mirroring_there_is_no_minus_half():
 
 
 def test_a_generation_of_the_paper_trains_48_agents():
-    strategy = NESConfig().make(DIMS)
+    strategy = NESConfig(population_size=16, num_incumbent_evals=None).make(DIMS)
     assert (strategy.num_evaluations, strategy.evaluations.num_incumbent_evals) == (48, 16)
-    fewer = NESConfig(num_incumbent_evals=5).make(DIMS)
+    fewer = NESConfig(population_size=16, num_incumbent_evals=5).make(DIMS)
     assert (fewer.num_evaluations, fewer.evaluations.num_incumbent_evals) == (37, 5)
 
 
@@ -161,6 +156,7 @@ def numpy_generation(mean, candidates, scores, config, noise_std, step_size):
 def test_generations_equal_a_numpy_loop(update_rule, aggregate_by):
     config = NESConfig(
         population_size=4, num_evals=3, eval_aggregate=aggregate_by, update_rule=update_rule,
+        num_incumbent_evals=None,
         noise_std=0.2, noise_std_decay=0.9, step_size=0.5, step_size_decay=0.8, weight_decay=0.1,
     )  # fmt: skip
     strategy = config.make(DIMS)
@@ -180,33 +176,6 @@ def test_generations_equal_a_numpy_loop(update_rule, aggregate_by):
         np.testing.assert_allclose(strategy.incumbent(state), mean, rtol=1e-4, atol=1e-5)
 
 
-def test_noise_and_step_shrink_by_their_factors_after_each_generation():
-    fields = {"noise_std_decay": 0.9, "step_size_decay": 0.5, "noise_std": 0.2, "step_size": 3.0}
-    strategy, ask, tell = nes(**fields)
-    state = strategy.init(jax.random.key(0), jnp.array(MEAN))
-    noises = []
-    for _ in range(3):
-        candidates, state = ask(jax.random.key(5), state)
-        noises.append(candidates[:3] - state.mean)
-        state = tell(jax.random.key(0), candidates, jnp.zeros(9), state)
-    # The same key draws the same normals, times sigma: 0.2, 0.18, 0.162.
-    np.testing.assert_allclose(noises[1], 0.9 * noises[0], rtol=1e-4, atol=1e-6)
-    np.testing.assert_allclose(noises[2], 0.81 * noises[0], rtol=1e-4, atol=1e-6)
-    np.testing.assert_allclose(state.step_size, 3.0 * 0.5**3, rtol=1e-6)
-
-
-def test_weight_decay_shrinks_the_mean_before_the_step():
-    scores = [0, 0, 0, 0, 0, 0, 1, 1, 1]  # no member beats the incumbent: no step
-    state, _ = told(scores, weight_decay=0.25)
-    np.testing.assert_allclose(state.mean, 0.75 * MEAN, rtol=1e-6)
-
-
-def test_the_proxy_stays_if_no_member_beats_the_incumbents_mean():
-    # Incumbents 1, 2, 6: mean 3; the best member has 3, which is not better.
-    state, _ = told([3, 0, 1, 2, 3, 0, 1, 2, 6])
-    np.testing.assert_array_equal(state.mean, MEAN)
-
-
 def test_diverged_scores_never_reach_the_mean():
     # Member 0 diverged with both signs; members 1 and 2 score 5 and 3 by their plus. The lowest
     # score of all is 1, which the incumbent's agent that diverged gets: mean (1 + 1 + 4) / 3 = 2,
@@ -216,11 +185,6 @@ def test_diverged_scores_never_reach_the_mean():
     noise = candidates[:3] - MEAN
     expected = MEAN + 0.75 * noise[1] + 0.25 * noise[2]
     np.testing.assert_allclose(state.mean, expected, rtol=1e-5, atol=1e-6)
-
-
-def test_a_generation_that_diverged_as_a_whole_leaves_the_proxy_as_it_was():
-    state, _ = told([NAN] * 9)
-    np.testing.assert_array_equal(state.mean, MEAN)
 
 
 def test_enormous_noise_that_diverged_leaves_no_trace():
@@ -247,8 +211,9 @@ def test_the_mean_step_on_a_linear_score_points_along_its_gradient(score_transfo
     gradient = np.array([3.0, -1.0, 0.5, 0.0, 2.0, -0.2])
     direction = gradient / np.linalg.norm(gradient)
     config = NESConfig(
-        population_size=8, noise_std=0.1, score_transform=score_transform, mirrored=mirrored
-    )
+        population_size=8, noise_std=0.1, score_transform=score_transform, mirrored=mirrored,
+        num_incumbent_evals=None,
+    )  # fmt: skip
     strategy = config.make(DIMS)
     ask, tell = whole_generations(strategy)
     start = strategy.init(jax.random.key(0), jnp.array(MEAN))
@@ -404,7 +369,8 @@ def test_every_algorithm_maximises_scores_though_some_trainings_diverge(name):
     ids=str,
 )
 def test_the_papers_nes_maximises_scores_though_some_trainings_diverge(fields):
-    scores = climb(NESConfig(population_size=16, **fields).make(DIMS), 40)
+    paper = {"population_size": 16, "num_incumbent_evals": None, "noise_std_decay": 1.0}
+    scores = climb(NESConfig(**paper, **fields).make(DIMS), 40)
     assert scores[0] < -1.1 and scores[-1] > -0.1
 
 

@@ -12,7 +12,7 @@ import pytest
 
 import sejax
 from sejax import options
-from sejax.agents.base import NoExploration, traced
+from sejax.agents.base import traced
 from sejax.agents.dqn import DDQNConfig, DQNConfig, DuelingDDQNConfig
 from sejax.agents.exploration import CountBasedConfig, ICMConfig
 from sejax.agents.ppo import PPOConfig
@@ -34,7 +34,7 @@ class Config(Options):
     size: int = option(4, options.counts("it is a size"))
     episodes: int = option(2, options.counts("it counts episodes", least=0))
     limit: int | None = option(None, options.counts("something must happen"))
-    window: int | None = option(8, options.or_none(options.counts("it is a length")))
+    window: int | None = option(8, options.counts("it is a length"))
     weight: float = option(0.5, options.not_negative("it is a weight"), traced=True)
     rate: float = option(0.1, options.positive("nothing would move", 10.0), varied="triple")
     share: float = option(0.9, options.fraction(), traced=True, varied="tenth_to_one")
@@ -77,8 +77,8 @@ def test_a_value_that_breaks_its_rule_is_refused(field, values):
         assert f"group.{field}=" in str(error.value)  # how to mend it
 
 
-def test_a_whole_message():
-    assert message(size=0) == (
+def test_two_whole_messages():
+    assert message(decay=2, share=2, size=0) == (  # of the first field that breaks its rule
         "group.size must be a whole number from 1 to 2147483647, because it is a size; got 0. "
         "Set group.size=4."
     )
@@ -104,11 +104,6 @@ def test_a_value_at_the_edge_of_its_rule_is_taken(fields):
         assert getattr(config, name) == value or value != value
 
 
-def test_the_first_field_that_breaks_its_rule_is_named():
-    assert message(decay=2, share=2, size=0).startswith("group.size must")
-    assert message(decay=2, share=2).startswith("group.share must")
-
-
 def test_a_dataclass_of_ones_own_can_be_checked_by_hand():
     @dataclasses.dataclass
     class Foreign:
@@ -131,11 +126,6 @@ def test_options_are_frozen_and_given_by_keyword():
 # --- what is traced, and what is varied ----------------------------------------------------------
 
 
-def test_traced_options_are_those_that_are_marked_in_the_order_of_the_fields():
-    assert list(traced_options(Config(weight=0.25)).items()) == [("weight", 0.25), ("share", 0.9)]
-    assert traced_options(NoExploration()) == {}
-
-
 def test_traced_hyperparameters_are_a_named_tuple_with_whatever_else_is_said():
     hparams = traced(Config(), hidden_size=None)
     assert hparams._asdict() == {"weight": 0.5, "share": 0.9, "hidden_size": None}
@@ -143,55 +133,38 @@ def test_traced_hyperparameters_are_a_named_tuple_with_whatever_else_is_said():
     assert type(hparams).__name__ == "ConfigHparams"
 
 
-DDQN = ("learning_rate", "tau", "discount", "epsilon_init", "epsilon_min",
-        "epsilon_decay", "exploration_steps")  # fmt: skip
+DDQN = ("learning_rate", "tau", "discount", "epsilon_init", "epsilon_min", "epsilon_decay",
+        "exploration_steps")  # fmt: skip
 TD3 = ("learning_rate", "tau", "discount", "action_noise_std", "target_noise_std",
        "target_noise_clip")  # fmt: skip
 SAC = ("learning_rate", "tau", "discount", "alpha", "init_alpha", "target_entropy",
        "target_entropy_fraction")  # fmt: skip
+PPO = ("learning_rate", "discount", "gae_lambda", "clip_ratio", "value_weight", "entropy_weight")
 TABULAR = ("learning_rate", "discount", "epsilon_init", "epsilon_min", "epsilon_decay")
+NETWORK = ("learning_rate", "hidden_size", "num_layers")
 
 
 @pytest.mark.parametrize(
-    ("config", "names"),
+    ("config", "traced", "varied"),
     [
-        (DDQNConfig, DDQN), (DuelingDDQNConfig, DDQN), (DQNConfig, DDQN), (TD3Config, TD3),
-        (SACConfig, SAC),
-        (DiscreteTD3Config, (*TD3, "temperature", "final_temperature")),
-        (PPOConfig, ("learning_rate", "discount", "gae_lambda", "clip_ratio", "value_weight",
-                     "entropy_weight")),
-        (QLearningConfig, TABULAR), (SARSAConfig, TABULAR),
-        (ICMConfig, ("learning_rate", "forward_weight", "reward_scale")), (CountBasedConfig, ()),
-    ],
-)  # fmt: skip
-def test_each_agents_numbers_are_traced_and_what_shapes_its_program_is_not(config, names):
-    assert tuple(traced_options(config())) == names
-
-
-NETWORK = {"learning_rate": "triple", "hidden_size": "triple", "num_layers": "one_more_or_less"}
-
-
-@pytest.mark.parametrize(
-    ("config", "marks"),
-    [
-        (DDQNConfig, NETWORK | {"batch_size": "triple"}),
-        (DuelingDDQNConfig, NETWORK | {"batch_size": "triple"}),
-        (DQNConfig, NETWORK | {"batch_size": "triple"}),
-        (SACConfig, NETWORK | {"batch_size": "triple"}),
-        (TD3Config, NETWORK | {"batch_size": "triple"}),
-        (DiscreteTD3Config, NETWORK | {"batch_size": "triple"}),
-        (PPOConfig, NETWORK),
-        (QLearningConfig, dict.fromkeys(("learning_rate", "discount"), "tenth_to_one")),
-        (SARSAConfig, dict.fromkeys(("learning_rate", "discount"), "tenth_to_one")),
-        (ICMConfig, {}),
+        (DDQNConfig, DDQN, (*NETWORK, "batch_size")),
+        (DuelingDDQNConfig, DDQN, (*NETWORK, "batch_size")),
+        (DQNConfig, DDQN, (*NETWORK, "batch_size")),
+        (TD3Config, TD3, (*NETWORK, "batch_size")),
+        (DiscreteTD3Config, (*TD3, "temperature", "final_temperature"), (*NETWORK, "batch_size")),
+        (SACConfig, SAC, (*NETWORK, "batch_size")),
+        (PPOConfig, PPO, NETWORK),
+        (QLearningConfig, TABULAR, ("learning_rate", "discount")),
+        (SARSAConfig, TABULAR, ("learning_rate", "discount")),
+        (ICMConfig, ("learning_rate", "forward_weight", "reward_scale"), ()),
+        (CountBasedConfig, (), ()),
     ],
 )
-def test_each_agent_says_which_of_its_options_are_varied_and_how(config, marks):
-    fields = [field.name for field in dataclasses.fields(config)]
-    varied = {name: options.marks(config, name).get("varied") for name in fields}
-    assert {name: how for name, how in varied.items() if how} == marks
-    if marks:
-        assert set(ranges_of(config())) == set(marks)
+def test_each_agent_says_which_options_are_traced_and_which_are_varied(config, traced, varied):
+    assert tuple(traced_options(config())) == traced
+    names = [field.name for field in dataclasses.fields(config)]
+    assert {x for x in names if options.marks(config, x).get("varied")} == set(varied)
+    assert not varied or set(ranges_of(config())) == set(varied)
 
 
 def test_a_mark_that_nobody_knows_is_a_mistake_of_the_class():

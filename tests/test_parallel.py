@@ -100,9 +100,9 @@ def test_two_devices_share_the_work():
 
 
 def test_more_devices_than_there_are_is_refused():
-    count = jax.device_count()
-    with pytest.raises(ConfigError, match=rf"^devices must be at most {count}, .*{count + 1}"):
-        spread_over_devices(work, count + 1)
+    with pytest.raises(ConfigError) as error:
+        spread_over_devices(work, jax.device_count() + 1)
+    assert error.value.field == "devices"
 
 
 def test_there_may_be_far_more_devices_than_elements():

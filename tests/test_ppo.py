@@ -10,17 +10,13 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
-from flax import struct
-from gymnax.environments import environment, spaces
 from jax.flatten_util import ravel_pytree
-from support import numpy_forward, raveled, shapes_of, unraveled
+from support import assert_shares, drawing, numpy_forward, raveled, shapes_of, unraveled
 
-import sejax
-from sejax import envs
 from sejax.agents import buffers
 from sejax.agents.base import traced
 from sejax.agents.buffers import Rollout, Transition
-from sejax.agents.policies import SOFTMAX, gaussian
+from sejax.agents.policies import gaussian, softmax
 from sejax.agents.ppo import (
     MIN_STD,
     PPOConfig,
@@ -31,10 +27,8 @@ from sejax.agents.ppo import (
     ppo_loss,
     shuffled,
 )
-from sejax.evaluation import make_tester
 from sejax.ops.networks import MLP
 from sejax.options import ConfigError
-from sejax.training import TrainingConfig, make_trainer
 
 OBS_DIM, NUM_ACTIONS, ACTION_DIM, MAX_ACTION, MAX_STEPS = 3, 4, 2, 2.0, 6
 STEPS = 13  # two episodes of full length, and one step
@@ -55,10 +49,11 @@ KINDS = tuple(CONFIGS)  # the last one's actions are discrete
 KEY = jax.random.key(0)
 
 
+@functools.cache
 def ppo(kind, config=None):
-    continuous = kind == "continuous"
-    return make_ppo(config or CONFIGS[kind], OBS_DIM, None if continuous else NUM_ACTIONS,
-                    ACTION_DIM if continuous else None, MAX_ACTION, MAX_STEPS)  # fmt: skip
+    is_continuous = kind == "continuous"
+    policy = gaussian(ACTION_DIM, MAX_ACTION) if is_continuous else softmax(NUM_ACTIONS)
+    return make_ppo(config or CONFIGS[kind], OBS_DIM, policy, MAX_STEPS)
 
 
 def networks(kind, config=CONFIG):
@@ -144,14 +139,6 @@ def assert_equal(a, b):
 
 
 # --- returns -------------------------------------------------------------------------------------
-
-
-def test_returns_by_hand():
-    # gamma = 0.5. The first episode ends at its third step, the second is cut after two:
-    # 4; 2 + 0.5 * 4 = 4; 1 + 0.5 * 4 = 3. Then 6, and 8 + 0.5 * 6 = 11.
-    reward, ended = jnp.array([1.0, 2.0, 4.0, 8.0, 6.0]), jnp.array([0.0, 0.0, 1.0, 0.0, 0.0])
-    got = jax.jit(discounted_returns)(reward, ended, 0.5)
-    np.testing.assert_allclose(got, [3.0, 4.0, 4.0, 11.0, 6.0])
 
 
 @pytest.mark.parametrize("ends", [(), ENDS, (STEPS - 1,), range(STEPS)])
@@ -300,13 +287,6 @@ def test_with_normalized_rewards_it_does_not_matter_in_what_they_are_paid():
     assert np.isfinite(update(KEY, state, Rollout(always, np.bool_(True))).params).all()
 
 
-def test_nothing_changes_until_the_rollout_is_full(kind, state, update):
-    assert_equal(update(KEY, state, rollout(kind, is_full=False)), state)
-    after = update(KEY, state, rollout(kind))
-    assert adam_steps(after) == CONFIG.epochs * CONFIGS[kind].num_minibatches
-    assert np.abs(np.asarray(after.params) - np.asarray(state.params)).max() > 0.01
-
-
 def test_lanes_learn_as_they_would_alone(kind, agent, state, update):
     # With their own parameters and learning rates; the second one's rollout is not full.
     rates = (0.05, 0.05, 0.01)
@@ -401,30 +381,14 @@ def test_a_rollout_is_as_long_as_the_authors(update_episodes, action_repeat):
 
 
 def test_a_minibatch_has_at_least_two_steps():
-    with pytest.raises(ConfigError, match=r"at most half of the rollout's 13.*got 7\. Set .*=6\."):
+    with pytest.raises(ConfigError) as error:
         ppo("gae", dataclasses.replace(GAE, num_minibatches=7))
+    assert error.value.field == "agent.num_minibatches"
 
 
 # --- policies ------------------------------------------------------------------------------------
 
 OBS = np.float32([0.3, -0.2, 0.5])
-
-
-@functools.cache
-def drawing(agent):
-    """Actions of 4000 keys, exploring and not."""
-
-    @jax.jit
-    def draw(state):
-        keys = jax.random.split(jax.random.key(2), 4000)
-        return [jax.vmap(lambda key, e=explore: agent.act(key, state, OBS, e))(keys)
-                for explore in (False, True)]  # fmt: skip
-
-    return draw
-
-
-def draw(agent, state, explore):
-    return drawing(agent)(state)[int(explore)]
 
 
 def actor_outputs(kind, state, scale=1.0):
@@ -440,29 +404,23 @@ def actor_outputs(kind, state, scale=1.0):
 def test_discrete_actions_follow_the_softmax_and_tests_its_mode():
     agent = ppo("discrete")
     outputs, state = actor_outputs("discrete", state_of(agent), scale=4.0)
-    actions = draw(agent, state, explore=True)
-    assert actions.dtype == jnp.int32
+    drawn, tested = drawing(agent)(state, OBS)
     expected = np.exp(outputs) / np.exp(outputs).sum()
     assert expected.max() > 1.5 * expected.min()
-    share = np.bincount(actions, minlength=NUM_ACTIONS) / actions.size
-    deviation = np.sqrt(expected * (1 - expected) / actions.size)
-    assert (np.abs(share - expected) <= 5 * deviation).all()
-    np.testing.assert_array_equal(draw(agent, state, explore=False), np.argmax(outputs))
-    assert agent.env_action(actions[0]) == actions[0]
+    assert_shares(drawn, expected)
+    np.testing.assert_array_equal(tested, np.argmax(outputs))
 
 
 def test_continuous_actions_are_normal_around_the_scaled_tanh_and_tests_take_the_mean():
     agent = ppo("continuous")
     outputs, state = actor_outputs("continuous", state_of(agent), scale=4.0)
     mean = MAX_ACTION * np.tanh(outputs)
-    actions = np.asarray(draw(agent, state, explore=True))
-    assert actions.dtype == np.float32
+    actions, tested = map(np.asarray, drawing(agent)(state, OBS))
     deviation = CONFIG.init_action_std / np.sqrt(len(actions))
     assert (np.abs(actions.mean(axis=0) - mean) <= 5 * deviation).all()
     assert (np.abs(actions.std(axis=0) - CONFIG.init_action_std) <= 5 * deviation).all()
     assert abs(np.corrcoef(actions.T)[0, 1]) <= 5 / np.sqrt(len(actions))
-    for action in draw(agent, state, explore=False)[:3]:
-        np.testing.assert_allclose(action, mean, rtol=1e-5)
+    np.testing.assert_allclose(tested, np.tile(mean, (4000, 1)), rtol=1e-5)
 
 
 def test_continuous_actions_are_clipped_for_the_world_only():
@@ -471,7 +429,7 @@ def test_continuous_actions_are_clipped_for_the_world_only():
     _, _, unravel = networks("continuous")
     params = {**unravel(state.params), "std": np.full(ACTION_DIM, 5.0, np.float32)}
     wide = state.replace(params=raveled(params))
-    actions = draw(agent, wide, explore=True)
+    actions, _ = drawing(agent)(wide, OBS)
     assert np.abs(actions).max() > 2 * MAX_ACTION  # remembered as drawn
     np.testing.assert_array_equal(
         agent.env_action(actions), np.clip(actions, -MAX_ACTION, MAX_ACTION)
@@ -481,13 +439,13 @@ def test_continuous_actions_are_clipped_for_the_world_only():
 def test_log_probabilities_and_entropies_by_hand():
     # Odds 1 : 3, hence probabilities 1/4 and 3/4; entropy -(ln(1/4) + 3 ln(3/4)) / 4.
     outputs = np.log(np.float32([[1.0, 1.0], [3.0, 3.0]]))
-    log_prob, entropy = jax.jit(SOFTMAX.evaluate)(outputs, np.zeros(0), np.array([0, 1]))
+    log_prob, entropy = jax.jit(softmax(2).evaluate)(outputs, np.zeros(0), np.array([0, 1]))
     np.testing.assert_allclose(np.exp(log_prob), [0.25, 0.75], rtol=1e-6)
     np.testing.assert_allclose(entropy, -(np.log(0.25) + 3 * np.log(0.75)) / 4, rtol=1e-6)
     # Means 0 and std 0.5, 2. The action (1, 2) is 2 and 1 deviations off:
     # density exp(-(4 + 1) / 2) / (2 pi * 0.5 * 2). Entropy ln(2 pi e * 0.5 * 2).
     std, action = np.float32([0.5, 2.0]), np.float32([[1.0], [2.0]])
-    evaluate = jax.jit(gaussian(MAX_ACTION).evaluate)
+    evaluate = jax.jit(gaussian(2, MAX_ACTION).evaluate)
     log_prob, entropy = evaluate(np.zeros((2, 1), np.float32), std, action)
     np.testing.assert_allclose(np.exp(log_prob), np.exp(-2.5) / (2 * np.pi), rtol=1e-6)
     np.testing.assert_allclose(entropy, [np.log(2 * np.pi) + 1], rtol=1e-6)
@@ -496,59 +454,17 @@ def test_log_probabilities_and_entropies_by_hand():
 # --- probes --------------------------------------------------------------------------------------
 
 
-def solve_bandit(agent, length, reward_fn, num_phases):
-    """What the agent does after learning phases on episodes of one step each.
-
-    500 actions as it explores, and the one that it holds to be best.
-    """
-    obs = np.zeros((length, 1), np.float32)
-
-    def acting(state, key, number):
-        act = jax.vmap(lambda key: agent.act(key, state, obs[0], True))
-        return act(jax.random.split(key, number))
-
-    def phase(state, key):
-        action = acting(state, key, length)
-        reward = reward_fn(agent.env_action(action))
-        steps = Transition(obs, action, reward, jnp.zeros(length), obs)
-        rows = pack(steps, jnp.ones(length))
-        return agent.update(key, state, Rollout(rows, jnp.bool_(True))), None
-
-    @jax.jit
-    def solve(key):
-        state = agent.init(key, agent.hparams)
-        state = jax.lax.scan(phase, state, jax.random.split(key, num_phases))[0]
-        return acting(state, jax.random.key(3), 500), agent.act(key, state, obs[0], False)
-
-    return solve(KEY)
-
-
-BANDIT = PPOConfig.paper(
-    hidden_size=4, num_layers=1, activation="tanh", learning_rate=0.03, update_episodes=64,
-    epochs=5,
+BANDIT = PPOConfig(
+    hidden_size=4, num_layers=1, learning_rate=0.03, epochs=5, rollout_steps=64, num_minibatches=2,
+    discount=0.8, normalize_rewards=False, gae_lambda=0.95, clip_ratio=0.2, value_weight=1.0,
+    max_grad_norm=None, adam_eps=1e-8,
 )  # fmt: skip
-
-
-def test_a_bandits_better_arm_is_found():
-    agent = make_ppo(BANDIT, 1, 3, None, 1.0, max_steps=1)
-    actions, best = solve_bandit(agent, 65, lambda action: jnp.where(action == 1, 1.0, 0.0), 30)
-    assert (np.asarray(actions) == 1).mean() > 0.95
-    assert best == 1
-
-
-def test_a_continuous_bandits_best_action_is_found_beyond_the_reach_of_a_tanh():
-    agent = make_ppo(BANDIT, 1, None, 1, 2.0, max_steps=1)
-    _, best = solve_bandit(agent, 65, lambda action: -jnp.sum((action - 1.5) ** 2, axis=-1), 40)
-    np.testing.assert_allclose(best, [1.5], atol=0.15)
 
 
 def test_the_critic_bootstraps_with_each_transitions_own_discount():
     # A reward of 1 in each step of episodes of four, with gamma = 0.8: V = 1 / (1 - 0.8 d), which
     # is 1 where episodes terminate with each step, 5 where they are truncated after four.
-    config = dataclasses.replace(
-        BANDIT, advantages="gae", rollout_steps=64, num_minibatches=2, discount=0.8
-    )
-    agent = make_ppo(config, 1, 2, None, 1.0, max_steps=4)
+    agent = make_ppo(BANDIT, obs_dim=1, policy=softmax(2), max_steps=4)
     obs, ones = np.ones((64, 1), np.float32), jnp.ones(64)
 
     @jax.jit
@@ -571,90 +487,3 @@ def test_the_critic_bootstraps_with_each_transitions_own_discount():
     np.testing.assert_allclose(value(0.0, np.ones(64, np.float32)), 1.0, rtol=0.02)
     np.testing.assert_allclose(value(1.0, fourth), 5.0, rtol=0.02)
     np.testing.assert_allclose(value(0.5, fourth), 1 / (1 - 0.4), rtol=0.02)
-
-
-@struct.dataclass
-class Context(environment.EnvState):
-    obs: jax.Array
-
-
-class ContextualBandit(environment.Environment):
-    """Episodes of one step: 1 for the action that is the sign of the first of three numbers."""
-
-    num_actions = 2
-    default_params = environment.EnvParams(max_steps_in_episode=1)
-
-    def reset_env(self, key, params):
-        obs = jax.random.normal(key, (3,))
-        return obs, Context(time=jnp.int32(0), obs=obs)
-
-    def step_env(self, key, state, action, params):
-        reward = jnp.float32(action == (state.obs[0] > 0))
-        return state.obs, state.replace(time=state.time + 1), reward, jnp.bool_(True), {}
-
-    def observation_space(self, params):
-        return spaces.Box(-10.0, 10.0, (3,))
-
-    def action_space(self, params):
-        return spaces.Discrete(2)
-
-
-def test_a_contextual_bandit_of_single_steps_is_learned_in_2000_of_them():
-    task = sejax.Task(name="bandit", env=ContextualBandit())
-    agent = sejax.make_agent(PPOConfig(hidden_size=16, num_layers=1), task)
-    training = TrainingConfig(max_episodes=2000, stop_rule="never")
-    train = make_trainer(agent, task.env, training)
-
-    @jax.jit
-    def accuracy(key):
-        contexts = jax.random.normal(jax.random.key(1), (1000, 3))
-        state = train(key, task.params).agent_state
-        actions = jax.vmap(lambda obs: agent.act(key, state, obs, False))(contexts)
-        return jnp.mean(actions == (contexts[:, 0] > 0))
-
-    assert accuracy(KEY) > 0.95
-
-
-# --- learning curves -----------------------------------------------------------------------------
-
-# An agent that has not learned has returns of about 20 and -1200.
-LEARNING = {
-    "cartpole": (
-        PPOConfig.paper(
-            activation="tanh", learning_rate=1e-3, update_episodes=4, epochs=20, discount=0.98
-        ),
-        TrainingConfig(max_episodes=1000, stop_rule="never", max_steps=80_000),
-        195.0,
-    ),
-    "pendulum": (
-        PPOConfig.paper(
-            activation="tanh", learning_rate=2e-3, update_episodes=10, epochs=30,
-            discount=0.9, init_action_std=1.0, entropy_weight=0.0,
-        ),
-        TrainingConfig(max_episodes=700, stop_rule="never"),
-        -600.0,
-    ),
-}  # fmt: skip
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", LEARNING)
-def test_the_agent_learns(name):
-    config, training, wanted = LEARNING[name]
-    task = envs.make(name)
-    action_dim = task.action_dim if task.num_actions is None else None
-    agent = make_ppo(
-        config, task.obs_dim, task.num_actions, action_dim, task.max_action, task.max_steps
-    )
-    train, test = make_trainer(agent, task.env, training), make_tester(agent, task, 20)
-
-    @jax.jit
-    def run(key):
-        key_train, key_test = jax.random.split(key)
-        result = train(key_train, task.params)
-        return result, test(key_test, result.agent_state)[0]
-
-    result, returns = run(KEY)
-    assert not result.nonfinite
-    print(name, "steps", result.train_steps, "test", returns.mean(), "+-", returns.std())
-    assert returns.mean() >= wanted

@@ -9,9 +9,8 @@ import sejax
 from experiments.common.reward_networks import STUDIES
 from sejax.agents.dqn import DDQNConfig
 from sejax.agents.ppo import PPOConfig
-from sejax.cli import config as configuration
+from sejax.cli import preset_files
 from sejax.options import ConfigError, registry
-from sejax.training import TrainingConfig
 
 composed_with = functools.cache(lambda *overrides: sejax.config(overrides))
 ENVS = ("cartpole", "acrobot")
@@ -48,20 +47,6 @@ FIXED = {
     "training.window": (10, 10),  # d
     "training.plateau_tolerance": (0.01, 0.01),  # C_diff
 }
-# Table "Default agent hyperparameters".
-DEFAULT_AGENT = {
-    "agent.warmup_episodes": 10,
-    "agent.batch_size": 128,
-    "agent.learning_rate": 0.001,
-    "agent.tau": 0.01,
-    "agent.discount": 0.99,
-    "agent.epsilon_decay": 0.9,
-    "agent.num_layers": 2,
-    "agent.hidden_size": 128,
-    "agent.activation": "relu",
-    "agent.buffer_size": 100_000,
-    "training.max_episodes": 1000,
-}
 
 
 def value_at(composed, path):
@@ -88,13 +73,6 @@ def test_the_papers_preset_follows_algorithm_1():
         assert composed.name("objective") == "max_reward"
 
 
-@pytest.mark.parametrize("path", DEFAULT_AGENT)
-def test_the_performance_preset_has_the_papers_default_agent(path):
-    for env in ENVS:
-        composed = composed_with(f"env={env}", "preset=paper_performance")
-        assert value_at(composed, path) == DEFAULT_AGENT[path]
-
-
 def test_the_performance_preset_is_how_those_ses_were_made():
     # The authors' configuration files: sigma 0.05, alpha 1, 128 LeakyReLU units, at most 50
     # generations, stopped when solved; epsilon from 1 to 0.01.
@@ -105,23 +83,19 @@ def test_the_performance_preset_is_how_those_ses_were_made():
         assert (composed.proxy.hidden_size, composed.proxy.activation) == (128, "leaky_relu")
         assert composed.generations == 50
         assert (composed.agent.epsilon_init, composed.agent.epsilon_min) == (1.0, 0.01)
+        assert composed.agent == DDQNConfig() and composed.training.max_episodes == 1000
+        assert composed.stop_when_solved
 
 
-def test_the_performance_preset_stops_when_solved():
-    assert composed_with("env=cartpole", "preset=paper_performance").stop_when_solved
-    assert composed_with("env=acrobot", "preset=paper_performance").stop_when_solved
-
-
-def test_the_dataclass_defaults_are_the_papers_default_agent():
-    for path, expected in DEFAULT_AGENT.items():
-        group, name = path.split(".")
-        schema = {"agent": DDQNConfig, "training": TrainingConfig}[group]
-        assert getattr(schema(), name) == expected
-
-
-# What docs/agents.md says of DQN; the authors' discrete TD3 (its block in their default
-# configuration); Haarnoja et al. (2018), table 1.
-OTHER_AGENTS = {
+# Table "Default agent hyperparameters"; what docs/agents.md says of DQN; the authors' discrete TD3
+# (its block in their default configuration); Haarnoja et al. (2018), table 1.
+PAPERS = {
+    "warmup_episodes": 10, "batch_size": 128, "learning_rate": 0.001, "tau": 0.01, "discount": 0.99,
+    "epsilon_decay": 0.9, "num_layers": 2, "hidden_size": 128, "activation": "relu",
+    "buffer_size": 100_000,
+}  # fmt: skip
+AGENTS = {
+    sejax.DDQNConfig: PAPERS,
     sejax.DQNConfig: {"double": False, "epsilon_min": 0.05, "exploration_steps": 1000},
     sejax.DiscreteTD3Config: {
         "learning_rate": 5e-4, "tau": 0.01, "policy_delay": 2, "batch_size": 128,
@@ -137,9 +111,9 @@ OTHER_AGENTS = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("config", OTHER_AGENTS, ids=lambda config: config.__name__)
-def test_other_agents_have_the_defaults_of_their_papers(config):
-    wanted = OTHER_AGENTS[config]
+@pytest.mark.parametrize("config", AGENTS, ids=lambda config: config.__name__)
+def test_agents_have_the_defaults_of_their_papers(config):
+    wanted = AGENTS[config]
     assert {name: getattr(config(), name) for name in wanted} == wanted
 
 
@@ -227,21 +201,21 @@ def test_ppo_on_ses_is_the_default(env):
 
 
 def test_what_is_tuned_is_known():
-    assert configuration.preset_names() == ["best", "paper", "paper_performance", "soft"]
-    assert configuration.tuned("rn") == [
+    assert preset_files.names() == ["best", "paper", "paper_performance", "soft"]
+    assert preset_files.tuned("rn") == [
         "cartpole", "cliff_walking", "halfcheetah", "mountain_car_continuous", "pendulum",
     ]  # fmt: skip
-    assert configuration.tuned("se", "paper") == ["acrobot", "cartpole"]
-    assert configuration.is_tuned("acrobot", "se") and not configuration.is_tuned("acrobot", "rn")
+    assert preset_files.tuned("se", "paper") == ["acrobot", "cartpole"]
+    assert preset_files.is_tuned("acrobot", "se") and not preset_files.is_tuned("acrobot", "rn")
 
 
 def test_every_file_is_of_a_task_and_proxy_and_has_settings_of_known_choices():
-    for path in configuration.PRESETS.glob("*.yaml"):
+    for path in preset_files.PRESETS.glob("*.yaml"):
         env, _, proxy = path.stem.rpartition("-")
         assert proxy in registry.names("proxy")
-        assert env in (configuration.GENERAL, *registry.names("env"))
-        for name, section in configuration.preset_sections(env, proxy).items():
-            assert name in configuration.preset_names()
+        assert env in (preset_files.GENERAL, *registry.names("env"))
+        for name, section in preset_files.sections_of(env, proxy).items():
+            assert name in preset_files.names()
             for group in ("agent", "es", "objective"):
                 assert set(section.get(f"with_{group}", {})) <= set(registry.names(group))
 
@@ -259,8 +233,11 @@ def test_a_section_has_the_settings_of_the_one_it_is_like_where_it_says_nothing(
 @pytest.mark.parametrize("proxy", ["se", "rn"])
 def test_a_task_without_a_file_has_general_settings(proxy):
     composed = composed_with("env=gymnax/MountainCar-v0", f"proxy={proxy}")
-    general = configuration.preset_sections("general", proxy)["best"]
-    assert composed.generations == general["generations"]
+    general = preset_files.sections_of("general", proxy)["best"]
+    if proxy == "se":  # whose settings are the defaults in Python
+        assert composed.es == sejax.NESConfig() and composed.generations == 100
+    else:
+        assert composed.proxy == sejax.RewardConfig() and composed.generations == 50
     for name, value in general["training"].items():
         assert getattr(composed.training, name) == value
     with pytest.raises(ConfigError, match=r"preset must be one .*cartpole.* Set preset=best"):

@@ -1,5 +1,6 @@
 """The proxies that ship: what is said of them, and that anybody's agents learn on them."""
 
+import dataclasses
 import math
 import re
 import shlex
@@ -15,9 +16,9 @@ from plain_agents import agent_for, learn, mean_return
 import sejax
 from sejax import envs
 from sejax.cli.config import evaluate_config
-from sejax.evaluate import proxy_study
+from sejax.cli.worlds import proxy_setup
 from sejax.gym import GYMNASIUM_IDS, make
-from sejax.proxies import zoo
+from sejax.proxies import header, zoo
 from sejax.proxies.header import PRETRAINED_DIR
 
 PROXIES = {proxy.name: proxy for proxy in sejax.pretrained()}
@@ -51,7 +52,7 @@ def test_each_has_a_card_that_says_what_it_teaches(name):
     for each in proxy.evaluations:
         assert f"{each.return_mean:.1f} ± {each.return_std:.1f}" in proxy.card
     (words,) = re.findall(r"`python -m sejax\.evaluate (.*)` trains agents", proxy.card)
-    study = proxy_study(evaluate_config(words.split()))
+    study = proxy_setup(evaluate_config(words.split()))
     best = max(proxy.on_proxy, key=lambda each: each.return_mean)
     assert best.agent in study.worlds["the proxy"][2], "the command trains what did best"
 
@@ -86,8 +87,31 @@ def test_the_page_is_what_the_tool_makes(monkeypatch):
     assert make_zoo.PAGE.read_text(encoding="utf-8") == make_zoo.page()
 
 
-def test_ranges_are_from_the_lowest_to_the_highest():
-    assert zoo.spread([], ".0f") == "" and zoo.spread([2.0, 1.0, 3.0], ".0f") == "1 to 3"
+def test_a_proxy_is_shipped_with_what_it_teaches(tmp_path, monkeypatch, capsys):
+    monkeypatch.syspath_prepend(TOOLS)
+    import ship_proxy
+
+    (each, *_) = PROXIES["cartpole"].evaluations
+    monkeypatch.setattr(ship_proxy, "evaluate", lambda *_: [dataclasses.asdict(each)])
+    monkeypatch.setattr(sys, "argv", ["ship_proxy.py", "cartpole", "mine", "--out", str(tmp_path)])
+    ship_proxy.main()
+    assert "# mine" in capsys.readouterr().out
+    shipped = zoo.describe(header.read(tmp_path / "mine.safetensors"))
+    assert shipped.evaluations == (each,) and shipped.scores == PROXIES["cartpole"].scores
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("hparams", "other"), ("world", "moon"), ("return_mean", []), ("agent", {})]
+)
+def test_an_evaluation_of_another_shape_is_refused(tmp_path, name, value):
+    proxy = sejax.load_proxy("cartpole")
+    evaluation = dataclasses.asdict(PROXIES["cartpole"].evaluations[0])
+    record = {"evaluations": [evaluation | {name: value}]}
+    path = tmp_path / "odd.safetensors"
+    sejax.save(path, proxy.env, proxy.params.weights, **record)
+    with pytest.raises(sejax.ConfigError) as error:
+        zoo.describe(header.read(path))
+    assert error.value.field == f"record.evaluations.{name}"
 
 
 # --- what they teach -----------------------------------------------------------------------------

@@ -4,7 +4,6 @@ import copy
 import dataclasses
 import errno
 import functools
-import json
 import math
 import sys
 
@@ -20,7 +19,6 @@ from sejax import envs
 from sejax.ops.checksummed import pack, unpack
 from sejax.options import ConfigError, registry
 from sejax.proxies import header
-from sejax.proxies.base import absent_task
 from sejax.proxies.configs import RewardConfig, SyntheticConfig
 
 CONFIG = {"preset": "best", "agent": {"name": "q_learning", "discount": 0.7}, "run_dir": "/home/me"}
@@ -64,7 +62,7 @@ def refusal(load, *args, **kwargs):
     with pytest.raises(ConfigError) as caught:
         load(*args, **kwargs)
     message = str(caught.value)
-    assert "\n" not in message and len(message) < 450
+    assert "\n" not in message and len(message) <= 300
     return caught.value
 
 
@@ -103,41 +101,56 @@ def test_a_loaded_proxy_steps_as_a_gymnax_environment():
     key, action = jax.random.key(1), jnp.int32(1)
     obs, _, reward, terminated, *_ = env.step(key, state, action, params)
     assert obs.shape == (4,) and reward.shape == () and terminated  # after its only step
-    assert env.step(key, state, action)[2] == reward, "wrappers may leave the params out"
+    without = env.step(key, state, action)[2]  # as wrappers call it
+    assert jnp.isclose(without, reward, rtol=1e-5)  # another program, which may round otherwise
 
 
-def test_a_set_that_is_saved_and_loaded_is_the_same(tmp_path, env, weights):
-    path = tmp_path / "set.safetensors"
-    records = [{"score": score, "generation": i, "seed": 5 + i}
-               for i, score in enumerate((0.5, 0.9, -0.1))]  # fmt: skip
+@pytest.fixture(scope="module")
+def a_set(tmp_path_factory, env, weights):
+    """A file of three proxies."""
+    path = tmp_path_factory.mktemp("sets") / "set.safetensors"
+    scores = (0.5, 0.9, 0.8)
+    records = [{"score": score, "generation": i, "seed": 5 + i} for i, score in enumerate(scores)]
     sejax.save_set(path, env, weights, records, CONFIG, 0.7)
-    proxies = sejax.load_set(path)
+    return path
+
+
+def test_a_set_that_is_saved_and_loaded_is_the_same(a_set, env, weights):
+    proxies = sejax.load_set(a_set, kind="rn")
     assert proxies.env is env and len(proxies) == 3 and proxies.task is env.task
-    assert proxies.records == tuple(records) and proxies.discount == 0.7
-    assert proxies.scores.tolist() == [0.5, 0.9, -0.1] and proxies.seeds.tolist() == [5, 6, 7]
-    for proxy, expected, record in zip(proxies, weights, records, strict=True):
+    assert proxies.discount == 0.7 and proxies.records[1]["generation"] == 1
+    assert proxies.scores.tolist() == [0.5, 0.9, 0.8] and proxies.seeds.tolist() == [5, 6, 7]
+    for proxy, expected, record in zip(proxies, weights, proxies.records, strict=True):
         assert_same_weights(proxy.params.weights, expected)
         assert proxy.record == record and proxy.params.discount == 0.7
-    assert refusal(sejax.load, path).field == "source"
+    assert refusal(sejax.load, a_set).field == "source"
+    assert refusal(sejax.load_set, a_set, option="--ses", kind="se").field == "--ses"
 
 
-def test_parts_of_a_set_are_chosen_by_score_and_place(tmp_path, env, weights):
-    path = tmp_path / "set.safetensors"
-    records = [{"score": score, "seed": i} for i, score in enumerate((0.5, 0.9, 0.8))]
-    sejax.save_set(path, env, weights, records, discount=0.7)
-    proxies = sejax.load_set(path)
-    assert proxies.ranked(2).seeds.tolist() == [1, 2]
-    assert proxies.ranked(2, worst=True).seeds.tolist() == [0, 2]
-    assert proxies[proxies.scores >= 0.8].seeds.tolist() == [1, 2]
-    assert proxies[:2].seeds.tolist() == [0, 1]
+def test_parts_of_a_set_are_chosen_by_score_and_place(a_set, weights):
+    proxies = sejax.load_set(a_set)
+    assert proxies.ranked(2).seeds.tolist() == [6, 7]
+    assert proxies.ranked(2, worst=True).seeds.tolist() == [5, 7]
+    assert proxies[proxies.scores >= 0.8].seeds.tolist() == [6, 7]
+    assert proxies[:2].seeds.tolist() == [5, 6]
     chosen = proxies[[2, 0]]
     assert_same_weights(chosen[0].params.weights, weights[2])
     assert chosen[0].fingerprint == proxies[2].fingerprint != proxies[0].fingerprint
 
 
-def test_a_kind_may_be_asked_for(path):
-    assert len(sejax.load_set(path, kind="rn")) == 1
-    assert refusal(sejax.load_set, path, option="--ses", kind="se").field == "--ses"
+def test_all_proxies_of_a_set_step_at_once(a_set):
+    proxies = sejax.load_set(a_set)
+    env, key = proxies.env, jax.random.key(0)
+
+    @jax.jit
+    def reward(weights):
+        params = env.params(weights, proxies.discount)
+        _, state = env.reset_env(key, params)
+        return env.step_env(key, state, jnp.int32(0), params)[2]
+
+    rewards = jax.vmap(reward)(proxies.weights)
+    np.testing.assert_allclose(rewards, [reward(x.params.weights) for x in proxies], rtol=1e-6)
+    assert len(set(rewards.tolist())) == 3
 
 
 def test_registering_with_gymnax_is_idempotent():
@@ -221,7 +234,8 @@ ODD_VALUES = {  # of entries of the metadata, by their place
     ("task",): [MISSING, None, [], "t" * 10_000],
     ("is_set",): [MISSING, None, "yes", 2],
     ("proxies",): [MISSING, None, [], [None], [3], {}, 3, [{"score": None}], [{"score": "x"}],
-                   [{"seed": None}], [{"seed": []}]],
+                   [{"seed": None}], [{"seed": []}], [{"scores": {"ddqn": []}}],
+                   [{"scores": 3}], [{"score": 10**400}]],
     ("discount",): [MISSING, None, "x", [], math.nan, -0.1, 1.5],
     ("interface",): [MISSING, None, []],
     ("interface", "max_steps"): [MISSING, 0, "9"],
@@ -229,7 +243,7 @@ ODD_VALUES = {  # of entries of the metadata, by their place
         MISSING, None, "n", {"n": 0}, {"n": 2.0}, {"n": 2**40}, {"low": [0], "high": []},
         {"low": [], "high": []}, {"low": [0]}, {"low": ["x"], "high": [1]},
         {"low": [1], "high": [0]}, {"low": [math.nan], "high": [1]},
-        {"low": [10**400], "high": [1]},
+        {"low": [10**400], "high": [1]}, {"low": [-1e300], "high": [1]},
     ],
 }  # fmt: skip
 
@@ -409,25 +423,6 @@ def test_a_task_given_must_be_that_of_the_proxy(path, tmp_path):
         assert refusal(sejax.load, se, task=other).field == "task"
 
 
-def test_a_task_made_by_hand_must_be_given(tmp_path, env, weights):
-    task = dataclasses.replace(env.task, name="by hand", origin=None)
-    mine = env.config.make(task)
-    sejax.save(tmp_path / "p.safetensors", mine, weights[0], discount=0.7)
-    assert refusal(sejax.load, tmp_path / "p.safetensors").field == "task"
-    assert sejax.load(tmp_path / "p.safetensors", task=task)[0].task is task
-
-
-@pytest.mark.parametrize("given, field", [
-    ({"task": "cartpole"}, "task"),
-    ({"proxy": "se"}, "proxy"),
-    ({"source": None}, "source"),
-    ({"source": 3}, "source"),
-    ({"source": "hf://" + "/" * 100}, "source"),
-])  # fmt: skip
-def test_arguments_of_another_type_are_refused(given, field):
-    assert refusal(sejax.load, **({"source": "cartpole"} | given)).field == field
-
-
 # --- without the task ----------------------------------------------------------------------------
 
 
@@ -491,20 +486,9 @@ def test_the_shipped_cheetah_needs_no_mujoco(monkeypatch):
     env, params = sejax.load("halfcheetah")
     _, obs, reward = rollout(env, params, jax.random.key(0), num_steps=1)
     assert obs.shape == (17,) and jnp.isfinite(reward)
-    assert env.task.interface == header.read("halfcheetah")[1].interface
+    assert env.task.interface == header.read("halfcheetah").header.interface
     with pytest.raises(ConfigError, match="needs MuJoCo"):
         sejax.load("halfcheetah-rn")
-
-
-@pytest.mark.parametrize("name", ["cartpole", "cliff_walking", "pendulum", "gymnax/Pong-misc"])
-def test_spaces_of_a_task_come_back_from_plain_values(name):
-    task = envs.make(name)
-    again = absent_task(name, json.loads(json.dumps(task.interface)), task.origin, "")
-    assert again.origin == task.origin
-    assert again.interface == task.interface
-    assert (again.obs_dim, again.action_dim) == (task.obs_dim, task.action_dim)
-    assert (again.num_states, again.num_actions) == (task.num_states, task.num_actions)
-    assert (again.max_action, again.max_steps) == (task.max_action, task.max_steps)
 
 
 # --- names ---------------------------------------------------------------------------------------
@@ -520,14 +504,14 @@ def test_a_folder_without_a_proxy_says_what_it_is(tmp_path):
     for load in (sejax.load, sejax.load_set):
         assert "it is no run" in str(refusal(load, tmp_path))
     (tmp_path / "config.yaml").write_text("{}")
-    assert "not finished a generation" in str(refusal(sejax.load, tmp_path))
+    assert "no generation" in str(refusal(sejax.load, tmp_path))
 
 
-@pytest.mark.parametrize(
-    "source",
-    ["n" * 10_000, "n" * 10_000 + ".safetensors", "/".join(["n"] * 5000), "a\0b", "\0", "x/../y",
-     "nope.safetensors", "nope/nope"],
-    ids=lambda source: repr(source[:20]),
-)  # fmt: skip
-def test_a_path_that_leads_nowhere_is_one_short_message(source):
-    assert refusal(sejax.load, source).field == "source"
+@pytest.mark.parametrize("name, given", [
+    ("task", "cartpole"), ("proxy", "se"), ("source", None), ("source", 3),
+    ("source", "hf://" + "/" * 100), ("source", "n" * 10_000),
+    ("source", "n" * 10_000 + ".safetensors"), ("source", "/".join(["n"] * 5000)),
+    ("source", "a\0b"), ("source", "x/../y"), ("source", "nope.safetensors"),
+], ids=lambda value: repr(value)[:20])  # fmt: skip
+def test_an_argument_that_cannot_be_is_one_short_message(name, given):
+    assert refusal(sejax.load, **{"source": "cartpole", name: given}).field == name

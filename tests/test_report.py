@@ -9,7 +9,7 @@ import yaml
 
 import sejax
 from sejax import report
-from sejax.cli import commands, next_steps
+from sejax.cli import commands
 from sejax.cli import config as configuration
 from sejax.cli import report as pages
 from sejax.cli.run_directory import columns_of
@@ -43,10 +43,12 @@ def write_run(path, *words, means=(10.0, 196.0, 150.0), ended=True, **changes):
 
 
 def evaluate(path, worlds=("the proxy", "the real task")):
-    rows = [f"{world},{i},{190 + i},{2000 * (place + 1)},20"
+    rows = [f"{world},{i},{190 + i},{2000 * (place + 1)},20,False,word"
             for place, world in enumerate(worlds) for i in range(3)]  # fmt: skip
     (path / "evaluation.csv").write_text(
-        "\n".join(["world,agent,test_return,train_steps,train_episodes", *rows, ""])
+        "\n".join(
+            ["world,agent,test_return,train_steps,train_episodes,nonfinite,activation", *rows, ""]
+        )
     )
 
 
@@ -91,14 +93,8 @@ def test_the_page_of_a_run_says_what_its_files_say(whole):
                  "0.2", "agent.learning_rate", "the real task", "191.0 ± 1.0"):  # fmt: skip
         assert any(text in x for x in page.texts), text
     assert f"python -m sejax.evaluate proxy={run} num_agents=20" in page.texts
-    again = f"python -m sejax.run env=cartpole proxy=se generations=6 seed=3 run_dir={run}"
+    again = f"python -m sejax.run preset={run}/config.yaml run_dir={run} generations=6"
     assert again in page.texts
-
-
-@pytest.fixture
-def no_words(monkeypatch):
-    """Leaves the command that goes on out of a page: to compose its words takes a second."""
-    monkeypatch.setattr(next_steps, "run_words", lambda stored: None)
 
 
 def test_the_page_needs_nothing_else_and_says_what_figures_show(whole):
@@ -123,7 +119,7 @@ def test_what_differs_between_runs_comes_first(tmp_path):
     assert not any(differs for _, _, differs in rows[1:])
 
 
-def test_what_comes_from_files_is_text(tmp_path, monkeypatch, no_words):
+def test_what_comes_from_files_is_text(tmp_path, monkeypatch):
     run = write_run(tmp_path / f"_{HOSTILE.replace('/', '')}", preset=HOSTILE)
     evaluate(run, worlds=(HOSTILE, f"_{HOSTILE}"))
     summary = json.loads((run / "run.json").read_text())
@@ -139,28 +135,14 @@ def test_what_comes_from_files_is_text(tmp_path, monkeypatch, no_words):
     assert [x.get("class") for x in page.of("tr")].count("differs") == 2  # preset and env.name
 
 
-def test_a_run_that_goes_on_is_told_as_such(tmp_path):
-    run = write_run(tmp_path / "run", ended=False)
-    with (run / "metrics.csv").open("a") as file:
-        file.write("3,0,11.5,2")  # a row that is being written
-    (read,) = pages.read([run])
-    assert read.generations == 3 and read.how_it_ended.startswith("not ended: 3 of 3")
+def test_a_run_that_goes_on_is_told_as_such_and_long_tables_are_thinned(tmp_path):
+    means = [float(i) for i in range(1000)]
+    (read,) = pages.read([write_run(tmp_path / "run", means=means, ended=False)])
+    assert read.title.startswith("not ended: 1000 of 3") and "solved at" not in read.facts
     assert read.environment == {} and read.solved_score is None
     assert "Go on, to generation 3" in dict(read.commands)
-
-
-def test_many_generations_are_thinned_to_the_last(tmp_path):
-    run = write_run(tmp_path / "run", means=[float(i) for i in range(1000)])
-    (read,) = pages.read([run])
     assert 50 <= len(read.thinned) <= pages.MOST_ROWS
     assert read.thinned[-1]["generation"] == "999"
-
-
-def test_the_words_of_a_run_compose_its_configuration():
-    words = ["agents=[ddqn,ppo]", "agents.ppo.weight=2", "es=snes", "run_dir='a b,c=é'"]
-    config = sejax.config(words)
-    found = next_steps.run_words(configuration.plain(config))
-    assert found is not None and sejax.config(found) == config
 
 
 def test_nothing_that_a_file_names_is_imported(tmp_path, monkeypatch):
@@ -171,22 +153,67 @@ def test_nothing_that_a_file_names_is_imported(tmp_path, monkeypatch):
     assert "env=mine_for_reports:make" in command
 
 
-def test_folders_that_are_no_runs_are_refused(tmp_path, capsys, no_words):
-    broken = write_run(tmp_path / "broken")
-    (broken / "run.json").write_text("[")
-    half = write_run(tmp_path / "half", agent="ddqn")
-    for words, said in [
-        ([], "RUN_DIR must be given"),
-        ([str(tmp_path)], "RUN_DIR must be the folder of a run"),
-        ([str(broken)], "JSONDecodeError"),
-        ([str(half)], "RUN_DIR must be the folder of a run"),
-        ([str(write_run(tmp_path / "run")), f"out={tmp_path}"], "out must be a file"),
-    ]:
+HEADER = ",".join(columns_of()) + "\n"
+GENERATION = "0,0,1,1,1,1,1,1,1,1,0,1,1\n"
+DAMAGE = [
+    *(("metrics.csv", text) for text in (
+        None, "", HEADER, "generation\n1\n", HEADER + GENERATION[:-1] + ",9\n",
+        *(HEADER + GENERATION.replace("0", each, 1) for each in ("nan", "inf", "9" * 400, "x")),
+        "\udcff",
+    )),
+    *(("config.yaml", text) for text in (
+        None, "", "- 1", "a: [", "a: " + "[" * 5000, "seed: &a [*a]", "? [1, 2]\n: 5",
+        "a: !!python/object/apply:os.system [id]", "generations: .inf", "agents: [1]",
+        "agent: ddqn",
+    )),
+    *(("run.json", text) for text in (
+        "[", "3", "null", "[" * 100_000, '{"solved_score": {}}', f'{{"cpu_s": {"9" * 500}}}',
+    )),
+    *(("evaluation.csv", text) for text in (
+        "test_return,train_steps,train_episodes\n1,2,3\n", "world,agent,test_return\nw,0,x\n",
+    )),
+]  # fmt: skip
+
+
+def test_odd_folders_are_refused_with_one_short_message(tmp_path, capsys):
+    """Findings F7: a folder without a run, a file, a path that is not there, and damaged runs."""
+
+    def said(*words):
         with pytest.raises(SystemExit) as ended:
-            report.main(words)
+            report.main([str(word) for word in words])
         error = capsys.readouterr().err
-        assert ended.value.code == commands.BAD_INPUT
-        assert said in error and len(error.strip().splitlines()) == 1
+        assert ended.value.code == commands.BAD_INPUT and error.count("\n") == 1
+        assert len(error) < 400 + len(str(tmp_path))
+        return error
+
+    run = write_run(tmp_path / "run")
+    (tmp_path / "file").write_text("")
+    for folder in (tmp_path, tmp_path / "file", tmp_path / "absent", "/proc/x", "a\0b", "d" * 9999):
+        assert said(folder).startswith("error: RUN_DIR must be")
+    assert said(run, tmp_path / "absent").startswith("error: RUN_DIR must be")
+    assert said().startswith("error: RUN_DIR must be")
+    assert said(run, f"out={tmp_path}").startswith("error: out must be")
+    for name, text in DAMAGE:
+        kept = (run / name).read_text() if (run / name).exists() else None
+        if text is None:
+            (run / name).unlink()
+        else:
+            start = kept if name == "config.yaml" and text[:1].isalpha() else ""
+            (run / name).write_text(f"{start}{text}", errors="surrogateescape")
+        assert said(run).startswith("error: RUN_DIR must be"), text[:50]
+        if kept is None:
+            (run / name).unlink()
+        else:
+            (run / name).write_text(kept)
+    assert not (run / "report.html").exists()
+
+
+def test_odd_values_that_can_be_shown_are_shown(tmp_path):
+    run = write_run(tmp_path / "run", seed=[1, {"a": None}])
+    (run / "run.json").write_text('{"generations": true, "machine": {"cpu": "\\ud800"}}')
+    (run / "evaluation.csv").write_text("world,agent,test_return,train_steps,train_episodes\n")
+    text = report.report([run]).read_text()
+    assert "\\ud800" in text and "not ended" in text
 
 
 def test_help_says_how_to_use_it(capsys):

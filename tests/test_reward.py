@@ -13,7 +13,6 @@ import sejax
 from sejax import bilevel, envs
 from sejax.agents import Agent, make_agent
 from sejax.agents.tabular import QLearningConfig
-from sejax.cli import config as configuration
 from sejax.evaluation import area_under_curve, make_evaluator
 from sejax.options import ConfigError, registry
 from sejax.proxies import MAX_ABS_VALUE
@@ -114,20 +113,6 @@ def test_everything_but_the_reward_is_the_real_tasks():
     assert terminated  # pushed to one side the pole falls
     late = state.replace(time=task.max_steps)
     assert env.is_truncated(late, params) and not env.is_truncated(state, params)
-
-
-def test_the_exclusive_ones_ignore_the_real_reward():
-    task = envs.make("cliff_walking")
-    costly = dataclasses.replace(task, params=task.params.replace(step_reward=-7.0))
-    for variant in VARIANTS:
-        config = RewardConfig(variant=variant, hidden_size=5)
-        rewards = []
-        for its_task in (task, costly):
-            env = RewardEnv(its_task, config)
-            (row,) = trajectory(env, env.init_weights(jax.random.key(0)), [3])
-            rewards.append(row[2])
-        difference = 6.0 if variant.startswith("additive") else 0.0
-        np.testing.assert_allclose(rewards[0] - rewards[1], difference, atol=1e-5)
 
 
 def test_potentials_telescope_along_any_trajectory():
@@ -253,10 +238,9 @@ def test_the_discount_is_the_agents():
 def test_an_agent_without_a_discount_is_told_where_one_is_needed():
     agent = Agent(init=None, act=None, update=None, buffer=None, hparams={"rate": 0.1})
     env = make_env("cliff_walking")
-    with pytest.raises(
-        ConfigError, match=r"^agent must say its discount, because additive_potential"
-    ):
+    with pytest.raises(ConfigError) as error:
         env.prepare(env.default_params, agent.discount(agent.hparams))
+    assert error.value.field == "agent"
     env = make_env("cliff_walking", "exclusive_non_potential")
     assert env.prepare(env.default_params, agent.discount(agent.hparams)).discount == 1
 
@@ -353,34 +337,18 @@ def test_the_area_counts_an_episode_that_the_budget_cut_off_with_the_test_after_
     assert area_under_curve(nothing, jnp.float32(-2.0)) == -2 * 17
 
 
-def test_a_loaded_potential_pays_with_the_discount_of_its_agent(tmp_path):
-    config = sejax.config([*LEARN, "proxy.variant=exclusive_potential", "agent.discount=0.7"])
-    parts = config.parts()
-    env, agent = parts["proxy"], parts["agent"]
-    weights = env.init_weights(jax.random.key(9))
-    discount = float(agent.discount(agent.hparams))
-    assert discount == 0.7
-    sejax.save(tmp_path / "rn.safetensors", env, weights, configuration.plain(config), discount)
-    for params in (sejax.load(tmp_path / "rn.safetensors")[1],
-                   sejax.load_set(tmp_path / "rn.safetensors")[0].params):  # fmt: skip
-        _, state = env.reset(jax.random.key(0), params)
-        _, _, reward, *_ = env.step(jax.random.key(1), state, 3, params)  # up, from 36 to 24
-        expected = 0.7 * phi(env, weights, 24) - phi(env, weights, 36)
-        np.testing.assert_allclose(reward, expected, rtol=1e-5)
-
-
 @pytest.mark.parametrize(
-    ("overrides", "said"),
+    ("overrides", "field"),
     [
-        (["env=pendulum", "proxy=rn", "preset=paper"], "cliff_walking"),
-        (["proxy=rn", "proxy.variant=additive"], "additive_potential"),
-        (["proxy=rn", "stop_when_solved=true"], "stop_when_solved=false"),
-        (["proxy=rn", "proxy.done=soft"], "proxy"),
+        (["env=pendulum", "proxy=rn", "preset=paper"], "preset"),
+        (["proxy=rn", "proxy.variant=additive"], "proxy.variant"),
+        (["proxy=rn", "proxy.done=soft"], "proxy.done"),
     ],
 )
-def test_what_makes_no_sense_is_refused(overrides, said):
-    with pytest.raises(ConfigError, match=said):
+def test_what_makes_no_sense_is_refused(overrides, field):
+    with pytest.raises(ConfigError) as error:
         sejax.config(overrides)
+    assert error.value.field == field
 
 
 def test_an_episode_ends_where_the_tasks_own_does():

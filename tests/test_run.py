@@ -19,6 +19,7 @@ from support import is_drawn
 
 import sejax
 from sejax import run
+from sejax.bilevel import Bilevel
 from sejax.cli import commands, run_directory, session
 from sejax.cli import config as configuration
 from sejax.cli.progress import RunProgress
@@ -123,12 +124,6 @@ def test_what_a_run_cost_adds_up_over_its_sessions(uninterrupted, tmp_path):
     assert whole["agents"] % 6 == 0 and whole["train_steps"] > first["train_steps"] > 0
 
 
-def test_a_finished_run_is_left_as_it_is(uninterrupted):
-    before = (uninterrupted / "metrics.csv").read_bytes()
-    learn(uninterrupted, "generations=6")
-    assert (uninterrupted / "metrics.csv").read_bytes() == before
-
-
 def test_seeds_run_one_after_the_other_on_one_executable(
     uninterrupted, tmp_path, monkeypatch, capsys
 ):
@@ -137,7 +132,7 @@ def test_seeds_run_one_after_the_other_on_one_executable(
         session.Chunks, "compile", lambda self, n: (compiled.append(n), compile_(self, n))
     )
     words = ["generations=6", "checkpoint_every=2", "num_seeds=2", f"run_dir={tmp_path}"]
-    best = run.learn(sejax.config([*TINY, *words]))
+    best = run.learn_all(run.configs_of([*TINY, *words]))
     assert compiled == [2]
     said = capsys.readouterr().out
     assert all(
@@ -156,12 +151,13 @@ def test_seeds_run_one_after_the_other_on_one_executable(
 def test_a_population_that_diverges_finishes_and_is_counted(tmp_path):
     shared = chunks()
 
-    def wild_init(key):
-        state = shared.learner.init(key)
-        noise_std = state.es_state.noise_std * 1e30
-        return state.replace(es_state=state.es_state.replace(noise_std=noise_std))
+    class Wild(Bilevel):
+        def init(self, key):
+            state = super().init(key)
+            noise_std = state.es_state.noise_std * 1e30
+            return state.replace(es_state=state.es_state.replace(noise_std=noise_std))
 
-    wild = session.Chunks(shared.learner._replace(init=wild_init))
+    wild = session.Chunks(Wild(**vars(shared.learner)))
     wild._compiled = shared._compiled
     config = sejax.config([*TINY, "generations=2", f"run_dir={tmp_path}"])
     with run_directory.open_for(config) as directory:
@@ -282,7 +278,8 @@ def test_other_families_in_the_same_directory_are_refused(two_families):
 
 
 def test_the_command_names_all_families_for_the_evaluation(two_families, capsys):
-    run.learn(sejax.config([*OWN, *FAMILIES, "generations=5", f"run_dir={two_families}"]))
+    words = [*OWN, *FAMILIES, "generations=5", f"run_dir={two_families}"]
+    run.learn_all([sejax.config(words)])
     said = capsys.readouterr().out
     assert f"sejax.evaluate proxy={two_families}" in said and "agents=[q_learning,sarsa]" in said
 
@@ -290,9 +287,7 @@ def test_the_command_names_all_families_for_the_evaluation(two_families, capsys)
 # --- damage --------------------------------------------------------------------------------------
 
 
-def test_a_damaged_checkpoint_is_refused_and_files_that_lack_are_made_again(
-    uninterrupted, tmp_path
-):
+def test_files_that_lack_or_are_damaged_are_made_again(uninterrupted, tmp_path):
     folder = Path(shutil.copytree(uninterrupted, tmp_path / "run"))
     for name in FILES - {"checkpoint.safetensors"}:
         (folder / name).unlink()
@@ -302,10 +297,6 @@ def test_a_damaged_checkpoint_is_refused_and_files_that_lack_are_made_again(
     assert rows(folder) == rows(uninterrupted)
     for name in ("proxy.safetensors", "proxy_last.safetensors"):
         assert (folder / name).read_bytes() == (uninterrupted / name).read_bytes()
-    checkpoint = folder / "checkpoint.safetensors"
-    checkpoint.write_bytes(checkpoint.read_bytes()[:-10])
-    with pytest.raises(ConfigError, match="must hold a whole checkpoint"):
-        learn(folder, "generations=6")
 
 
 def test_seconds_do_not_follow_the_machines_clock(uninterrupted, tmp_path, monkeypatch):
@@ -392,15 +383,15 @@ def test_an_interrupt_waits_until_files_are_written():
         signal.signal(signal.SIGINT, before)
 
 
-def test_bad_input_ends_a_process_with_one_message_and_status_2(tmp_path):
-    for word, message in [
-        ("env=cartpol", "Did you mean env=cartpole?"),
-        ("~env=[[1]]", "an override must read"),
-    ]:
-        ended = process(*RUN, word, f"run_dir={tmp_path}/run")
-        assert ended.returncode == 2
-        assert message in ended.stderr and len(ended.stderr.strip().splitlines()) == 1
-        assert not (tmp_path / "run").exists()
+def command(monkeypatch, *words):
+    """Runs the command in this process; returns its exit status."""
+    monkeypatch.setattr(sys, "argv", ["sejax.run", *words])
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    try:
+        commands.start(run.main, run.help_text, run.config_text)
+    except SystemExit as ended:
+        return ended.code
+    return 0
 
 
 @pytest.mark.parametrize(
@@ -410,23 +401,28 @@ def test_bad_input_ends_a_process_with_one_message_and_status_2(tmp_path):
         ("es.population_size=1", "es.population_size must be"),
         ("es.noise_sdt=1", "Did you mean es.noise_std?"),
         ("devices=x", "devices must be a whole number"),
+        ("~env=[[1]]", "an override must read"),
+        ("--resolve", "Options: --help, -h, --print-config."),
     ],
 )
 def test_bad_input_ends_with_one_message_and_status_2(
     override, message, tmp_path, monkeypatch, capsys
 ):
-    monkeypatch.setattr(sys, "argv", ["sejax.run", override, f"run_dir={tmp_path}/run"])
-    monkeypatch.setattr(sys, "path", list(sys.path))
-    with pytest.raises(SystemExit) as ended:
-        commands.start(run.main, run.help_text)
+    assert command(monkeypatch, override, f"run_dir={tmp_path}/run") == 2
     said = capsys.readouterr().err
-    assert ended.value.code == 2
     assert message in said and len(said.strip().splitlines()) == 1
     assert not (tmp_path / "run").exists()
 
 
+def test_print_config_prints_what_would_run_and_runs_nothing(tmp_path, monkeypatch, capsys):
+    words = [*TINY, f"run_dir={tmp_path}/run", "seed=1,2"]
+    assert command(monkeypatch, *words, "--print-config") == 0
+    printed = [configuration.learn_config(x) for x in yaml.safe_load_all(capsys.readouterr().out)]
+    assert printed == run.configs_of(words) and not (tmp_path / "run").exists()
+
+
 def test_the_command_says_how_it_ended_and_what_to_do_next(uninterrupted, capsys):
-    (best,) = run.learn(sejax.config([*TINY, "generations=6", f"run_dir={uninterrupted}"]))
+    (best,) = run.learn_all([sejax.config([*TINY, "generations=6", f"run_dir={uninterrupted}"])])
     said = capsys.readouterr().out
     scores = [float(row["incumbent_mean"]) for row in rows(uninterrupted)]
     assert best == pytest.approx(max(scores))

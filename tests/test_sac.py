@@ -3,13 +3,12 @@
 import functools
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from support import numpy_forward, shapes_of, unraveled
+from support import assert_shares, drawing, numpy_forward, shapes_of, train_on, unraveled
 
 from sejax.agents.buffers import Transition
 from sejax.agents.sac import (
@@ -19,7 +18,6 @@ from sejax.agents.sac import (
     make_learning_step,
     make_networks,
     make_sac,
-    make_sac_discrete,
     softmax_policy,
     squashed_gaussian,
 )
@@ -48,10 +46,7 @@ def policy_of(case):
 
 @functools.cache
 def agent_of(case):
-    is_discrete, config = CASES[case]
-    if is_discrete:
-        return make_sac_discrete(config, OBS_DIM, ACTION_DIM)
-    return make_sac(config, OBS_DIM, ACTION_DIM, MAX_ACTION)
+    return make_sac(CASES[case][1], OBS_DIM, policy_of(case))
 
 
 @functools.cache
@@ -232,22 +227,10 @@ def test_target_critics_start_as_copies_and_follow_softly():
 OBS = np.float32([0.3, -0.2, 0.5])
 
 
-@functools.cache
-def drawn_actions(case):
-    """Actions of 4000 keys: of warming up, of exploring after it, and of tests."""
-    agent = agent_of(case)
-
-    @jax.jit
-    def act(state):
-        keys = jax.random.split(jax.random.key(1), 4000)
-
-        def draw(episode, explore):
-            begun = agent.begin_episode(state, np.int32(episode))
-            return jax.vmap(lambda key: agent.act(key, begun, OBS, explore))(keys)
-
-        return draw(2, True), draw(3, True), draw(2, False)
-
-    return [np.asarray(x, np.float64) for x in act(state_of(case))]
+def drawn_actions(case, episode):
+    """Actions of 4000 keys, exploring and testing."""
+    state = agent_of(case).begin_episode(state_of(case), np.int32(episode))
+    return [np.asarray(x, np.float64) for x in drawing(agent_of(case))(state, OBS)]
 
 
 def actor_outputs(case):
@@ -257,30 +240,25 @@ def actor_outputs(case):
 
 def test_exploring_draws_from_the_policy_and_tests_take_its_mode():
     mean, log_std = np.split(actor_outputs("continuous"), 2)
-    _, drawn, tested = drawn_actions("continuous")
+    drawn, tested = drawn_actions("continuous", episode=3)
     u = np.arctanh(drawn)
     assert (np.abs(u.mean(0) - mean) < 5 * np.exp(log_std) / np.sqrt(4000)).all()
     np.testing.assert_allclose(u.std(0), np.exp(log_std), rtol=0.06)  # 5 / sqrt(2 * 4000)
     np.testing.assert_allclose(tested, np.tile(np.tanh(mean), (4000, 1)), rtol=1e-5)
     logits = actor_outputs("discrete")
-    share = np.exp(logits[1]) / np.exp(logits).sum()
-    _, drawn, tested = drawn_actions("discrete")
-    assert abs(drawn.mean() - share) < 5 * 0.5 / np.sqrt(4000)
+    drawn, tested = drawn_actions("discrete", episode=3)
+    assert_shares(np.int32(drawn), np.exp(logits) / np.exp(logits).sum())
     assert (tested == np.argmax(logits)).all()
 
 
 @KINDS
 def test_the_first_episodes_are_for_warming_up_uniformly(case):
-    drawn, _, _ = drawn_actions(case)
+    drawn, _ = drawn_actions(case, episode=2)
     bins = 2 if CASES[case][0] else 4
     edges = (0, 1) if CASES[case][0] else (-1, 1)
     for column in np.reshape(drawn, (4000, -1)).T:
         share = np.histogram(column, bins=bins, range=edges)[0] / 4000
         assert np.abs(share - 1 / bins).max() < 5 * np.sqrt(0.25 / 4000)
-    begin = agent_of(case).begin_episode
-    got = [bool(begin(state_of(case), jnp.int32(n)).is_warming_up) for n in range(5)]
-    assert got == [True, True, True, False, False]
-    assert (agent_of(case).spec.warmup_episodes, agent_of(case).spec.learns_from) == (3, 3)
 
 
 def test_the_world_takes_continuous_actions_in_its_own_units():
@@ -288,52 +266,7 @@ def test_the_world_takes_continuous_actions_in_its_own_units():
     np.testing.assert_array_equal(action, [1.0, -2.0])
 
 
-# --- the agent as a whole ------------------------------------------------------------------------
-
-
-def test_one_configuration_serves_both_kinds_of_actions():
-    assert set(SACConfig.actions) == {"discrete", "continuous"}
-    discrete = SimpleNamespace(name="task", obs_dim=OBS_DIM, num_actions=ACTION_DIM)
-    continuous = SimpleNamespace(
-        name="task",
-        obs_dim=OBS_DIM,
-        num_actions=None,
-        action_dim=ACTION_DIM,
-        max_action=MAX_ACTION,
-    )
-    config = SACConfig()
-    assert config.make(discrete) is make_sac_discrete(config, OBS_DIM, ACTION_DIM)
-    assert config.make(continuous) is make_sac(config, OBS_DIM, ACTION_DIM, MAX_ACTION)
-
-
 # --- probes --------------------------------------------------------------------------------------
-
-
-def train_on(agent, batch, num_updates):
-    """The agent after so many updates on a batch; to be called in a jitted function."""
-
-    def step(state, key):
-        return agent.update(key, state, batch), None
-
-    state = agent.init(jax.random.key(0), agent.hparams)
-    return jax.lax.scan(step, state, jax.random.split(jax.random.key(1), num_updates))[0]
-
-
-def test_on_a_one_step_bandit_the_policy_finds_the_best_action():
-    # Reward -(a - 0.6)^2 for actions in [-2, 2], whatever the observation; nothing follows.
-    config = SACConfig(hidden_size=16, num_layers=1, learning_rate=0.01, alpha=0.01)
-    agent = make_sac(config, obs_dim=1, action_dim=1, max_action=2.0)
-    action = np.linspace(-1, 1, 32, dtype=np.float32)[None]
-    zeros = np.zeros(32, np.float32)
-    batch = Transition(obs=zeros[None], action=action, reward=-((2 * action[0] - 0.6) ** 2),
-                       discount=zeros, next_obs=zeros[None])  # fmt: skip
-
-    @jax.jit
-    def trained_action(key):
-        state = train_on(agent, batch, 600)
-        return agent.env_action(agent.act(key, state, jnp.zeros(1), explore=False))
-
-    np.testing.assert_allclose(trained_action(jax.random.key(0)), [0.6], atol=0.2)
 
 
 def test_on_a_two_state_probe_values_and_policy_are_the_soft_optimal_ones():
@@ -345,8 +278,8 @@ def test_on_a_two_state_probe_values_and_policy_are_the_soft_optimal_ones():
     alpha, gamma = 0.5, 0.8
     config = SACConfig(hidden_size=16, num_layers=1, activation="tanh", learning_rate=0.02,
                        tau=0.1, discount=gamma, alpha=alpha)  # fmt: skip
-    agent = make_sac_discrete(config, obs_dim=2, num_actions=2)
-    networks = make_networks(config, 2, softmax_policy(2))
+    policy = softmax_policy(2)
+    agent, networks = make_sac(config, 2, policy), make_networks(config, 2, policy)
     a, b = [1.0, 0.0], [0.0, 1.0]
     batch = Transition(obs=np.float32([a, a, b, b]).T, action=np.int32([0, 1, 0, 1]),
                        reward=np.float32([0.5, 0.0, 1.0, 0.0]),

@@ -6,7 +6,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sejax.es.nes import NESConfig
 from sejax.es.score_transforms import TRANSFORMS
 
 NAN, INF = np.nan, np.inf
@@ -23,76 +22,63 @@ def transform(name, scores, incumbent):
     return np.asarray(all_of_them(np.array(scores, np.float32), np.float32(incumbent))[name])
 
 
-def test_the_eight_transforms_are_the_configured_ones():
-    assert tuple(TRANSFORMS) == (
-        "linear", "rank", "nes", "nes_unnormalized", "single_best", "single_better",
-        "all_better_1", "all_better_2",
-    )  # fmt: skip
-    for name in TRANSFORMS:
-        assert NESConfig(score_transform=name).score_transform == name
-
-
-@pytest.mark.parametrize(
-    ("name", "expected"),
-    [
-        # nan counts as the worst finite score, 1: (3-1)/2, 0/2, 0/2, (2-1)/2.
-        ("linear", [1, 0, 0, 0.5]),
-        # Members with a lower score: 3, 0, 1, 2; divided by 3 - 0.
-        ("rank", [1, 0, 1 / 3, 2 / 3]),
+# By name: the weights of each candidate. A score of nan counts as the worst finite one.
+WORKED = {
+    # Scores 3, nan, 1, 2 and an incumbent of 1.5.
+    "usual": (SCORES, 1.5, {
+        "linear": [1, 0, 0, 0.5],  # (3-1)/2, 0/2, 0/2, (2-1)/2
+        "rank": [1, 0, 1 / 3, 2 / 3],  # candidates with a lower score: 3, 0, 1, 2; over 3 - 0
         # n = 4. Ranks from the best: 1, 4, 3, 2. max(0, ln 3 - ln R) = 1.098612, 0, 0, 0.405465.
         # Their sum is 1.504077; shares 0.730423, 0, 0, 0.269577; less 1/4: 0.480423, -0.25,
         # -0.25, 0.019577; divided by 0.480423.
-        ("nes", [1, -0.520375, -0.520375, 0.040750]),
+        "nes": [1, -0.520375, -0.520375, 0.040750],
         # The same without the 1/4: 0.269577 / 0.730423 = 0.369070.
-        ("nes_unnormalized", [1, 0, 0, 0.369070]),
-        ("single_best", [1, 0, 0, 0]),
-        # 3 > 1.5, the incumbent.
-        ("single_better", [1, 0, 0, 0]),
-        # Advantages over 1.5: 1.5, 0, 0, 0.5; divided by the largest.
-        ("all_better_1", [1, 0, 0, 1 / 3]),
-        # The same divided by their sum, 2.
-        ("all_better_2", [0.75, 0, 0, 0.25]),
-    ],
-)
-def test_weights_worked_by_hand(name, expected):
-    np.testing.assert_allclose(transform(name, SCORES, 1.5), expected, rtol=1e-5, atol=1e-6)
-
-
-@pytest.mark.parametrize(
-    ("name", "expected"),
-    [
-        ("linear", [1, 0, 0, 0.5]),  # not asked
-        ("single_best", [1, 0, 0, 0]),  # not asked
-        ("single_better", [0, 0, 0, 0]),
-        ("all_better_1", [0, 0, 0, 0]),
-        ("all_better_2", [0, 0, 0, 0]),
-    ],
-)
-@pytest.mark.parametrize("incumbent", [3.0, 5.0])
-def test_the_better_transforms_weigh_nothing_if_none_beats_the_incumbent(name, expected, incumbent):
-    np.testing.assert_allclose(transform(name, SCORES, incumbent), expected, atol=1e-6)
-
-
-@pytest.mark.parametrize(
-    ("name", "expected"),
-    [
-        # Scores 2, 5, 5, 1: (K - 1) / 4.
-        ("linear", [0.25, 1, 1, 0]),
-        # Lower scores: 1, 2, 2, 0; divided by 2.
-        ("rank", [0.5, 1, 1, 0]),
+        "nes_unnormalized": [1, 0, 0, 0.369070],
+        "single_best": [1, 0, 0, 0],
+        "single_better": [1, 0, 0, 0],
+        "all_better_1": [1, 0, 0, 1 / 3],  # advantages 1.5, 0, 0, 0.5 over the largest
+        "all_better_2": [0.75, 0, 0, 0.25],  # over their sum
+    }),
+    "as good as the best": (SCORES, 3.0, {
+        "linear": [1, 0, 0, 0.5], "single_best": [1, 0, 0, 0],  # not asked
+        "single_better": 0, "all_better_1": 0, "all_better_2": 0,
+    }),
+    # Below the worst finite score, 1, by their range, 2: advantages over -1 are 4, 0, 2, 3.
+    "incumbent diverged": (SCORES, NAN, {
+        "single_better": [1, 0, 0, 0],
+        "all_better_1": [1, 0, 0.5, 0.75],
+        "all_better_2": [4 / 9, 0, 2 / 9, 3 / 9],
+    }),
+    "ties": ([2, 5, 5, 1], 1.0, {
+        "linear": [0.25, 1, 1, 0],  # (K - 1) / 4
+        "rank": [0.5, 1, 1, 0],  # lower scores: 1, 2, 2, 0; divided by 2
         # Ranks from the best, ties sharing the better: 3, 1, 1, 4. Shares 0, 1/2, 1/2, 0; less
         # 1/4: -0.25, 0.25, 0.25, -0.25; divided by 0.25.
-        ("nes", [-1, 1, 1, -1]),
-        ("nes_unnormalized", [0, 1, 1, 0]),
-        ("single_best", [0, 1, 1, 0]),
-        ("single_better", [0, 1, 1, 0]),
-        # Advantages over 1: 1, 4, 4, 0.
-        ("all_better_1", [0.25, 1, 1, 0]),
-        ("all_better_2", [1 / 9, 4 / 9, 4 / 9, 0]),
-    ],
-)
-def test_members_that_tie_weigh_the_same(name, expected):
-    np.testing.assert_allclose(transform(name, [2, 5, 5, 1], 1.0), expected, rtol=1e-5, atol=1e-6)
+        "nes": [-1, 1, 1, -1],
+        "nes_unnormalized": [0, 1, 1, 0],
+        "single_best": [0, 1, 1, 0],
+        "single_better": [0, 1, 1, 0],
+        "all_better_1": [0.25, 1, 1, 0],  # advantages over 1: 1, 4, 4, 0
+        "all_better_2": [1 / 9, 4 / 9, 4 / 9, 0],
+    }),
+    "all equal": ([7.0] * 4, 1.0, {
+        "single_best": 1, "single_better": 1, "all_better_1": 1, "all_better_2": 0.25,
+    }),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", WORKED)
+def test_weights_worked_by_hand(case):
+    scores, incumbent, weights = WORKED[case]
+    for name, expected in weights.items():
+        got = transform(name, scores, incumbent)
+        np.testing.assert_allclose(
+            got, np.broadcast_to(expected, 4), rtol=1e-5, atol=1e-6, err_msg=name
+        )
+
+
+def test_every_transform_is_worked_by_hand():
+    assert set(WORKED["usual"][2]) == set(TRANSFORMS)
 
 
 @pytest.mark.parametrize("name", ["linear", "rank", "nes", "nes_unnormalized"])
@@ -101,33 +87,12 @@ def test_equal_scores_weigh_nothing_where_a_difference_is_needed(name):
         np.testing.assert_array_equal(transform(name, [7.0] * size, 1.0), 0.0)
 
 
-@pytest.mark.parametrize(
-    ("name", "expected"),
-    [("single_best", 1), ("single_better", 1), ("all_better_1", 1), ("all_better_2", 0.25)],
-)
-def test_equal_scores_above_the_incumbent_share_the_weight(name, expected):
-    np.testing.assert_allclose(transform(name, [7.0] * 4, 1.0), expected)
-
-
 @pytest.mark.parametrize("name", TRANSFORMS)
 @pytest.mark.parametrize("incumbent", [1.0, NAN])
 def test_a_generation_that_diverged_as_a_whole_weighs_nothing(name, incumbent):
     for size in (2, 3, 16):
         for scores in ([NAN] * size, [NAN, INF] + [-INF] * (size - 2)):
             np.testing.assert_array_equal(transform(name, scores, incumbent), 0.0)
-
-
-@pytest.mark.parametrize(
-    ("name", "expected"),
-    [
-        ("single_better", [1, 0, 0, 0]),
-        # Below the worst finite score, 1, by their range, 2: advantages over -1 are 4, 0, 2, 3.
-        ("all_better_1", [1, 0, 0.5, 0.75]),
-        ("all_better_2", [4 / 9, 0, 2 / 9, 3 / 9]),
-    ],
-)
-def test_an_incumbent_without_a_finite_score_is_below_every_member(name, expected):
-    np.testing.assert_allclose(transform(name, SCORES, NAN), expected, rtol=1e-5, atol=1e-6)
 
 
 # --- laws ----------------------------------------------------------------------------------------

@@ -22,7 +22,6 @@ optuna = pytest.importorskip("optuna", reason="needs Optuna: pip install 'sejax[
 
 from optuna.trial import TrialState  # noqa: E402
 
-from sejax import search as command  # noqa: E402
 from sejax.cli import config as configuration  # noqa: E402
 from sejax.cli import search_config, search_results, study, trials  # noqa: E402
 from sejax.options import ConfigError  # noqa: E402
@@ -56,9 +55,9 @@ class Runner:
         pass
 
 
-def opened(path, *overrides):
+def opened(path, *overrides, current=None):
     search = search_config.read([SPACE, f"search_dir={path}", "sampler_seed=0", *overrides])
-    return study.open_study(search)
+    return study.open_study(search, current), search
 
 
 def states(found):
@@ -102,8 +101,7 @@ def test_a_search_that_is_stopped_goes_on_to_the_same_draws(tmp_path, sampler):
 
 
 def test_what_one_has_is_tried_first(tmp_path):
-    search = search_config.read([SPACE, f"search_dir={tmp_path}", *ONE, "trials=1"])
-    found, search = study.open_study(search, {"es.noise_std": 0.25})
+    found, search = opened(tmp_path, *ONE, "trials=1", current={"es.noise_std": 0.25})
     worked(found, search)
     assert found.trials[0].params == {"es.noise_std": 0.25}
 
@@ -180,24 +178,6 @@ def test_a_trial_that_is_interrupted_is_queued_again_and_goes_on_from_its_files(
     assert drawn[0] == drawn[1]
 
 
-def test_a_damaged_copy_of_a_lost_trials_folder_begins_anew(tmp_path):
-    class Damaged(Runner):
-        def run(self, config, folder, generations):
-            if (folder / "damaged").exists():
-                raise ConfigError("damaged")
-            if folder.name == "0000":
-                folder.mkdir(parents=True)
-                (folder / "damaged").touch()
-                raise KeyboardInterrupt
-            return super().run(config, folder, generations)
-
-    found, search = opened(tmp_path, "trials=1", *ONE)
-    with pytest.raises(KeyboardInterrupt):
-        worked(found, search, Damaged())
-    worked(found, search, Damaged())
-    assert states(found) == ["FAIL", "COMPLETE"]
-
-
 def test_a_trial_that_fails_each_time_is_given_up(tmp_path):
     class Failing(Runner):
         def meanwhile(self, name, generation):
@@ -252,33 +232,21 @@ def test_a_trial_that_two_workers_draw_is_computed_once(tmp_path):
     assert set(states(found)) == {"COMPLETE"}
 
 
-# --- joining -------------------------------------------------------------------------------------
+# --- the study -----------------------------------------------------------------------------------
 
 
-def test_a_study_is_joined_by_its_name_and_other_searches_are_refused(tmp_path):
+@pytest.mark.parametrize(
+    "other",
+    [["env=pendulum"], ["seeds=3"], ["es.step_size=interval(0.1, 1)"], ["es.noise_std=0.1,0.2"]],
+)
+def test_a_study_is_of_one_search(tmp_path, other):
     overrides = "env=acrobot", "study=mine", "seeds=2", "trials=1", *ONE
-    found, search = opened(tmp_path, *overrides)
-    worked(found, search)
-    url = f"storage=sqlite:///{tmp_path}/study.db"
-    joined, other = study.open_study(search_config.read(["study=mine", url]))
-    assert other.fixed == ("env=acrobot",) and other.config.seeds == 2
-    assert other.folder == tmp_path and len(joined.trials) == 1
-    for different in (["env=pendulum"], ["seeds=3"], ["es.step_size=interval(0.1, 1)"]):
-        with pytest.raises(ConfigError) as error:
-            opened(tmp_path, *overrides, *different)
-        assert error.value.field == "study"
-
-
-@pytest.mark.parametrize("where", [["search_dir=new"], ["storage=sqlite:///new/study.db"]])
-def test_a_study_that_is_not_there_is_refused_and_leaves_nothing(tmp_path, monkeypatch, where):
-    monkeypatch.chdir(tmp_path)
+    worked(*opened(tmp_path, *overrides))
+    again, _ = opened(tmp_path, *overrides, "trials=3", f"storage=sqlite:///{tmp_path}/study.db")
+    assert len(again.trials) == 1
     with pytest.raises(ConfigError) as error:
-        study.open_study(search_config.read(["study=nope", *where]))
-    assert error.value.field == "study" and not list(tmp_path.iterdir())
-    opened(tmp_path)
-    with pytest.raises(ConfigError) as error:
-        study.open_study(search_config.read(["study=nope", f"search_dir={tmp_path}"]))
-    assert error.value.field == "study" and "cartpole-se-ddqn" in str(error.value)
+        opened(tmp_path, *overrides, *other)
+    assert error.value.field == "study"
 
 
 @pytest.mark.parametrize(
@@ -321,7 +289,7 @@ def test_what_was_found_is_written(tmp_path, capsys):
     assert "0 of 25 trials were pruned" in capsys.readouterr().out
 
 
-def test_the_best_of_the_verified_come_first_and_what_is_not_finite_last(tmp_path, capsys):
+def test_the_best_of_the_verified_come_first_and_what_is_not_finite_last(tmp_path):
     found, search = opened(tmp_path, *ONE, "trials=3", "verify=3")
     runner, _ = worked(found, search)
     first, second, third = (x.number for x in search_results.ranked(found))
@@ -331,13 +299,12 @@ def test_the_best_of_the_verified_come_first_and_what_is_not_finite_last(tmp_pat
         "generations": 1.0,
     }
     runner.order = trials.Learning(search).order
-    rows = search_results.verify(found, search, runner)
+    best = search_results.verified(found, search, runner)
+    assert best == search_results.overrides_of(found.trials[third], search)
+    rows = pd.read_csv(tmp_path / "verification.csv")
     assert rows["trial"].tolist() == [third, second, first]
-    assert pd.read_csv(tmp_path / "verification.csv")["rank"].tolist() == [3, 2, 1]
-    search_results.print_verified(rows, search)
-    assert command._verified(found, search, runner) == search_results.overrides_of(
-        found.trials[third], search
-    )
+    assert rows["rank"].tolist() == [3, 2, 1]
+    assert (tmp_path / "best.txt").read_text().endswith(f"{best[0]}\n")
 
 
 # --- real trials ---------------------------------------------------------------------------------
@@ -366,10 +333,10 @@ def test_trials_are_runs_and_those_of_a_shape_share_one_program(tmp_path):
     runner.run(runner.config(["es.noise_std=0.1"]), tmp_path / "other", 3)
     assert len(runner._programs.shapes) == 1
 
-    from sejax.run import learn
+    from sejax.run import learn_all
 
     plain = [*GRID, *overrides, "generations=3", "checkpoint_every=1", f"run_dir={tmp_path}/run"]
-    learn(configuration.config([*plain, "seed=1"]))
+    learn_all([configuration.config([*plain, "seed=1"])])
     np.testing.assert_allclose(rows_of(tmp_path / "trial" / "seed1"), rows_of(tmp_path / "run"))
     values = runner.verify(overrides, tmp_path / "again")
     assert sorted(x.name for x in (tmp_path / "again").iterdir()) == [
@@ -388,10 +355,7 @@ class Tuning(trials.Tuning):
     """Trains nobody: an agent's return is 10 for each letter of its world, plus the generation."""
 
     def __init__(self, path, *overrides):
-        from sejax.evaluate import proxy_study
-
-        super().__init__(search_config.read([*ON_PROXY, f"search_dir={path}", *overrides]),
-                         proxy_study)  # fmt: skip
+        super().__init__(search_config.read([*ON_PROXY, f"search_dir={path}", *overrides]))
         self.made = []
 
     def _outcome(self, config, world, generation, num_agents):

@@ -1,7 +1,5 @@
 """The overrides of a search: what is searched, what is fixed, and what is refused."""
 
-import dataclasses
-
 import pytest
 
 pytest.importorskip("optuna", reason="needs Optuna: pip install 'sejax[search]'")
@@ -17,6 +15,7 @@ import sejax
 from sejax.cli import config as configuration
 from sejax.cli import search_config, spaces
 from sejax.options import ConfigError
+from sejax.options.plain import to_plain
 
 
 @pytest.mark.parametrize(
@@ -180,14 +179,24 @@ def test_a_search_without_anything_to_search_is_refused():
     assert error.value.field == "space"
 
 
-def test_a_stored_search_reads_back():
-    search = search_config.read(["env=acrobot", "seeds=2", "study=s", "es.noise_std=0.1,0.2"])
-    joining = search_config.read(["study=s", "trials=3"])
-    assert joining.joins and not search.joins
-    joined = joining.joined(search.stored())
-    assert joined == dataclasses.replace(
-        search, config=dataclasses.replace(search.config, trials=3)
+def test_a_worker_on_another_machine_has_the_same_search(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "own.yaml").write_text("es.noise_std: 0.1, 0.2\n")
+    (tmp_path / "p.yaml").write_text("es.population_size: 4\n")
+    search = search_config.read(
+        ["env=acrobot", "preset=p.yaml", "seeds=2", "space=own.yaml", "es.step_size=interval(0, 1)"]
     )
+    overrides = search.overrides()
+    monkeypatch.chdir("/")
+    worker = search_config.read(overrides)
+    assert worker.stored() == search.stored() and worker.study == search.study
+    assert worker.folder == tmp_path / "runs" / f"search-{search.study}"
+    assert worker.storage == f"sqlite:///{worker.folder}/study.db"
+
+
+def test_help_says_what_each_field_is():
+    said = search_config.help_text()
+    assert all(f"  {name}=" in said for name in to_plain(search_config.SearchConfig()))
 
 
 def test_without_optuna_the_extra_is_named(monkeypatch):

@@ -8,7 +8,6 @@ import sys
 
 import jax
 import numpy as np
-import optuna
 import pytest
 import yaml
 
@@ -102,25 +101,16 @@ NAMES = [f"{next(iter(x))}-{i}" for i, x in enumerate(FOREIGN)]
 
 
 @pytest.mark.parametrize("foreign", FOREIGN, ids=NAMES)
-def test_a_run_directory_is_compared_as_text(folder, refused, foreign):
+def test_what_a_run_stores_is_compared_and_shown_as_text(folder, refused, foreign):
     path = write_run(folder / "run", stored(**foreign))
     assert "run_dir must be new or hold" in refused(run_command, *TASK, f"run_dir={path}")
-
-
-@pytest.mark.parametrize("foreign", FOREIGN, ids=NAMES)
-def test_a_checkpoints_configuration_is_compared_as_text(folder, refused, foreign):
-    (folder / "run").mkdir()
+    report.main([str(path)])
+    assert (path / "report.html").stat().st_size > 1000
     rows = {"metrics": np.frombuffer(f"{','.join(columns_of())}\n".encode(), np.uint8)}
     manifest = {"format_version": 1, "config": stored(**foreign), "id": "0", "cpu_s": 1.0}
     data = checksummed.pack(rows, "sejax_run", manifest)
-    (folder / "run" / "checkpoint.safetensors").write_bytes(data)
-    assert "run_dir must be new or hold" in refused(run_command, *TASK, "run_dir=run")
-
-
-@pytest.mark.parametrize("foreign", FOREIGN, ids=NAMES)
-def test_a_report_shows_text(folder, foreign):
-    report.main([str(write_run(folder / "run", stored(**foreign)))])
-    assert (folder / "run" / "report.html").stat().st_size > 1000
+    (path / "checkpoint.safetensors").write_bytes(data)
+    assert "of the same configuration" in refused(run_command, *TASK, f"run_dir={path}")
 
 
 @pytest.mark.parametrize("text", [f"agent: {IMPORTED}", "agents.ddqn.name: subprocess:getoutput"])
@@ -164,57 +154,18 @@ def test_no_function_is_called_that_does_not_say_what_it_makes(folder, refused):
     assert "-> Task" in refused(run_command, *words)
 
 
-STUDIES = [
-    {"fixed": ["env=subprocess:getoutput", "env.cmd='touch PWNED'"]},
-    {"fixed": [f"env={IMPORTED}"]},
-    {"fixed": [f"agents=[ddqn,{IMPORTED}]"]},
-    {"fixed": ["hydra.searchpath=[pkg://strangers_module]"]},
-    {"fixed": [*TASK, "run_dir=victim"]},
-    {"fixed": ["preset=p.yaml"]},
-    {"fixed": TASK, "space": {"agent": f"choice(q_learning,{IMPORTED})"}},
-    {"fixed": TASK, "space": {"hydra.searchpath": "choice([pkg://strangers_module])"}},
-    {"fixed": TASK, "space": {"run_dir": "choice(victim)"}},
-    {"fixed": 3},
-    {"search": {"seeds": "strangers_module:make"}},
-]
+STUDIES = [3, {"env": IMPORTED}, {"agent": f"choice(q_learning,{IMPORTED})"}, {"run_dir": "victim"}]
 
 
-def write_study(folder, changes):
-    """A stranger's study, named `theirs`, in `theirs/study.db`; its URL."""
-    words = [*TASK, SPACE, "study=theirs", f"search_dir={folder / 'theirs'}"]
+@pytest.mark.filterwarnings("ignore::ResourceWarning")
+@pytest.mark.parametrize("stored", STUDIES, ids=range(len(STUDIES)))
+def test_a_study_is_compared_as_text(folder, refused, stored):
+    words = [*TASK, SPACE, f"search_dir={folder / 'theirs'}"]
     mine = settings.read(words)
-    made, _ = study.open_study(mine)
-    made.set_user_attr(study.STORED, mine.stored() | changes)
-    return f"sqlite:///{folder / 'theirs' / 'study.db'}"
-
-
-@pytest.mark.filterwarnings("ignore::ResourceWarning")
-@pytest.mark.parametrize("changes", STUDIES, ids=range(len(STUDIES)))
-def test_a_study_names_no_module_and_no_folder(folder, refused, changes):
-    (folder / "p.yaml").write_text(f"env: {IMPORTED}\n")
-    url = write_study(folder, changes)
-    refused(search_command, "study=theirs", f"storage={url}", "trials=1")
-    if changes.keys() == {"fixed"}:
-        refused(search_command, "study=theirs", f"storage={url}", "trials=1", *TASK, SPACE)
+    theirs = mine.stored() | stored if isinstance(stored, dict) else stored
+    study.open_study(mine).set_user_attr(study.STORED, theirs)
+    assert "study must be" in refused(search_command, *words)
     assert not (folder / "victim").exists()
-
-
-@pytest.mark.filterwarnings("ignore::ResourceWarning")
-def test_a_study_does_not_choose_where_a_worker_writes(folder):
-    victim = folder / "victim"
-    victim.mkdir()
-    url = write_study(folder, {"folder": str(victim)})
-    (folder / "elsewhere").mkdir()
-    for words in (["study=theirs", f"storage={url}"], [*TASK, SPACE, f"storage={url}",
-                                                      "study=theirs"]):  # fmt: skip
-        _, joined = study.open_study(settings.read(words))
-        assert joined.folder.resolve() == folder / "runs" / "search-theirs"
-    made = optuna.load_study(study_name="theirs", storage=url)
-    own = made.user_attrs[study.STORED]
-    hidden = {"search_dir": str(victim), "storage": f"sqlite:///{victim}/x.db"}
-    made.set_user_attr(study.STORED, own | {"search": own["search"] | hidden})
-    _, joined = study.open_study(settings.read(["study=theirs", f"storage={url}"]))
-    assert joined.storage == url and joined.folder != victim
 
 
 PROXIES = [x for x in FOREIGN if next(iter(x)) in ("env", "proxy", "agent")]
@@ -238,10 +189,11 @@ def test_a_proxys_file_names_no_module(folder, refused, foreign):
 
 
 @pytest.mark.parametrize("foreign", [*PROXIES, {"es": {"name": IMPORTED}}])
-def test_an_experiment_imports_nothing_that_a_set_names(folder, foreign, capsys):
+def test_an_experiment_imports_nothing_that_a_set_names(folder, foreign, capsys, monkeypatch):
     write_proxy(foreign)
     words = ["quick=true", "proxy=evil.safetensors", "out=out"]
+    monkeypatch.setattr(sys, "argv", ["supervised_baseline", *words])
     with pytest.raises(SystemExit) as ended:
-        supervised_baseline.EXPERIMENT.main(words)
+        supervised_baseline.EXPERIMENT.main()
     said = capsys.readouterr().err
     assert ended.value.code == commands.BAD_INPUT and said.count("\n") == 1

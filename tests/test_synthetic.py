@@ -33,7 +33,7 @@ def step():
         state = state.replace(vector=OBS)
         return jax.jit(lambda w: env.step_env(jax.random.key(1), state, 1, env.params(w)))
 
-    return {done: build(done) for done in ("soft", "threshold")}
+    return {done: build(done) for done in ("soft", "threshold", "bernoulli", "sigmoid")}
 
 
 def constant_weights(state, reward, done):
@@ -87,14 +87,12 @@ def test_predict_equals_three_separate_mlps_fed_the_one_hot_action_first(task):
         np.testing.assert_allclose(done, expected["done"][0], rtol=1e-5, atol=1e-6)
 
 
-def test_the_networks_share_a_shape_and_no_weights():
+def test_the_networks_differ_in_their_outputs_alone():
     env = make_env()
     weights = env.init_weights(jax.random.key(0))
     for head, outputs in {"state": 4, "reward": 1, "done": 1}.items():
         shapes = [weights[head][f"Dense_{i}"]["kernel"].shape for i in range(3)]
         assert shapes == [(5, 6), (5, 5), (outputs, 5)]  # 2 actions + 4 numbers of state
-    first = [np.asarray(weights[head]["Dense_0"]["kernel"]) for head in weights]
-    assert not np.allclose(first[0], first[1]) and not np.allclose(first[1], first[2])
 
 
 def test_the_papers_se_for_cartpole_has_2247_parameters():
@@ -140,7 +138,7 @@ def test_an_episode_terminates_where_the_done_output_exceeds_one_half(step, mode
     ],
     ids=str,
 )  # fmt: skip
-@pytest.mark.parametrize("mode", ["soft", "threshold"])
+@pytest.mark.parametrize("mode", ["soft", "threshold", "bernoulli", "sigmoid"])
 def test_an_absurd_or_nonfinite_output_ends_the_episode_where_it_was(step, mode, outputs):
     weights = constant_weights(**{"state": 1.0, "reward": 2.0, "done": 0.0, **outputs})
     obs, state, reward, terminated, info = step[mode](weights)
@@ -197,18 +195,6 @@ def test_an_agent_sees_a_drawn_end_as_it_sees_any_other(mode, done):
     np.testing.assert_allclose(obs, 0.7)  # the state after an end is the predicted one
     np.testing.assert_array_equal(reward, 1.5)
     assert not info["nonfinite"].any()
-
-
-@pytest.mark.parametrize("mode", ["bernoulli", "sigmoid"])
-def test_an_output_that_is_no_number_ends_an_episode_whatever_is_drawn(mode):
-    env = make_env(done=mode)
-    step = jax.jit(lambda key, w: env.step_env(key, state, 1, env.params(w))[2:])
-    _, state = env.reset_env(jax.random.key(0), env.default_params)
-    for outputs in ({"done": np.nan}, {"reward": 2 * MAX_ABS_VALUE}):
-        weights = constant_heads(env, **{"done": -5.0, **outputs})
-        reward, terminated, info = step(jax.random.key(1), weights)
-        assert terminated and reward == 0.0 and info["discount"] == 0.0
-        assert info["nonfinite"] == ("done" in outputs)
 
 
 # --- learned beginnings --------------------------------------------------------------------------
@@ -354,13 +340,6 @@ def test_a_bandit_has_a_reward_and_nothing_else(done):
     np.testing.assert_allclose(reward, expected[0], rtol=1e-5)
     assert terminated and info["discount"] == 0.0 and not info["nonfinite"]
     assert episode_limit(env) == 1
-
-
-def test_a_bandit_with_learned_starts_has_two_networks():
-    weights = make_env(horizon=1, initial_state="learned").init_weights(jax.random.key(0))
-    assert set(weights) == {"reward", "start"}
-    shapes = [weights["start"][f"Dense_{i}"]["kernel"].shape for i in range(2)]
-    assert shapes == [(32, 4), (4, 32)]
 
 
 @pytest.mark.parametrize(("fields", "at_fault"), [

@@ -6,18 +6,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from support import assert_shares, drawing
 
 from sejax import envs
 from sejax.agents.buffers import Transition
-from sejax.agents.policies import decayed_epsilon
-from sejax.agents.tabular import (
-    QLearningConfig,
-    SARSAConfig,
-    entry_of,
-    make_q_learning,
-    make_sarsa,
-    mask_of,
-)
+from sejax.agents.tabular import QLearningConfig, SARSAConfig, entry_of, make_tabular, mask_of
 from sejax.evaluation import make_tester
 from sejax.training import TrainingConfig, make_trainer
 
@@ -26,12 +19,12 @@ KEY = jax.random.key(0)
 NUMBERS = {"learning_rate": 0.5, "discount": 0.9, "epsilon_init": 0.4, "epsilon_min": 0.1}
 
 
-def q_learning(num_states=NUM_STATES, num_actions=NUM_ACTIONS, **numbers):
-    return make_q_learning(QLearningConfig(**{**NUMBERS, **numbers}), num_states, num_actions)
+@functools.cache
+def q_learning(num_states=NUM_STATES, num_actions=NUM_ACTIONS, config=QLearningConfig, **numbers):
+    return make_tabular(config(**{**NUMBERS, **numbers}), num_states, num_actions)
 
 
-def sarsa(num_states=NUM_STATES, num_actions=NUM_ACTIONS, **numbers):
-    return make_sarsa(SARSAConfig(**{**NUMBERS, **numbers}), num_states, num_actions)
+sarsa = functools.partial(q_learning, config=SARSAConfig)
 
 
 @functools.cache
@@ -114,23 +107,6 @@ def test_q_learning_bootstraps_with_the_best_action_also_among_negative_ones():
     np.testing.assert_allclose(state.q_values[0, 0], 1 + 0.9 * -2.0, rtol=1e-6)
 
 
-@pytest.mark.parametrize("make", [q_learning, sarsa])
-def test_a_transition_with_discount_zero_ignores_its_next_state(make):
-    agent = make(learning_rate=1.0)
-    state = started(agent, np.full((5, 3), 7.0))
-    after = update_of(agent)(KEY, state, step(3, 1, 2.0, 0.0, 4))
-    assert after.q_values[3, 1] == 2.0
-
-
-def test_a_greedy_sarsa_is_q_learning():
-    state = started(sarsa(), epsilon=0.0)
-    steps, keys = random_steps(40), jax.random.split(KEY, 40)
-    np.testing.assert_array_equal(
-        learn_all(sarsa(), state, steps, keys).q_values,
-        learn_all(q_learning(), state, steps, keys).q_values,
-    )
-
-
 # --- updates against plain loops -----------------------------------------------------------------
 
 
@@ -189,31 +165,7 @@ def test_an_infinite_entry_elsewhere_does_no_harm():
         np.testing.assert_array_equal(table_after, 0)
 
 
-# --- hyperparameters -----------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("make", [make_q_learning, make_sarsa])
-def test_the_defaults_are_the_papers_and_an_agent_is_made_once(make):
-    config = QLearningConfig() if make is make_q_learning else SARSAConfig()
-    agent = make(config, 48, 4)
-    assert agent is make(config, 48, 4)
-    assert agent.hparams._asdict() == {
-        "learning_rate": 1.0, "discount": 0.8,
-        "epsilon_init": 0.1, "epsilon_min": 0.1, "epsilon_decay": 0.0,
-    }  # fmt: skip
-    assert (agent.spec.warmup_episodes, agent.spec.learns_from) == (0, 0)
-
-
 # --- exploration ---------------------------------------------------------------------------------
-
-
-@jax.jit
-def epsilons(numbers, hparams):
-    """Those of five episodes, from the numbers and by the agent that has them."""
-    episodes, agent = jnp.arange(5), q_learning()
-    state = agent.init(KEY, hparams)
-    direct = jax.vmap(lambda episode: decayed_epsilon(*numbers, episode))(episodes)
-    return direct, jax.vmap(agent.begin_episode, (None, 0))(state, episodes).epsilon
 
 
 @pytest.mark.parametrize(
@@ -229,31 +181,14 @@ def epsilons(numbers, hparams):
 def test_epsilon_decays_by_a_factor_each_episode_down_to_its_minimum(numbers, expected):
     names = ("epsilon_init", "epsilon_min", "epsilon_decay")
     agent = q_learning(**dict(zip(names, numbers, strict=True)))
-    numbers = [np.float32(x) for x in numbers]
-    direct, begun = epsilons(numbers, agent.hparams)
-    np.testing.assert_allclose(direct, expected, rtol=1e-6)
-    np.testing.assert_allclose(begun, expected, rtol=1e-6)
+    state = fresh(agent)
+    got = [agent.begin_episode(state, jnp.int32(episode)).epsilon for episode in range(5)]
+    np.testing.assert_allclose(got, expected, rtol=1e-6)
 
 
-@functools.cache
-def drawing(make):
-    """Actions of 4000 keys in state 1, and the greedy one: `(table, epsilon) -> [4000], []`."""
-    agent = make()
-
-    @jax.jit
-    def draw(state):
-        keys = jax.random.split(jax.random.key(1), 4000)
-        drawn = jax.vmap(lambda key: agent.act(key, state, jnp.int32(1), True))(keys)
-        return drawn, agent.act(KEY, state, jnp.int32(1), explore=False)
-
-    return lambda table, epsilon: draw(started(agent, table, epsilon))
-
-
-def assert_shares(drawn, expected):
-    """The actions' shares, within five standard deviations."""
-    share = np.bincount(drawn, minlength=len(expected)) / drawn.size
-    deviation = np.sqrt(expected * (1 - expected) / drawn.size)
-    assert (np.abs(share - expected) <= 5 * deviation + 1e-7).all()
+def drawn_in_state_1(agent, table, epsilon):
+    """Actions of exploring and of testing, given this table of values."""
+    return drawing(agent)(started(agent, table, epsilon), np.int32(1))
 
 
 @pytest.mark.parametrize("make", [q_learning, sarsa])
@@ -261,7 +196,7 @@ def assert_shares(drawn, expected):
 def test_actions_are_random_with_probability_epsilon_and_greedy_otherwise(make, epsilon):
     table = np.zeros((5, 3))
     table[1] = [-1.0, -2.0, 3.0]
-    drawn, _ = drawing(make)(table, epsilon)
+    drawn, _ = drawn_in_state_1(make(), table, epsilon)
     assert drawn.dtype == jnp.int32
     # Random actions are uniform, the greedy one included.
     assert_shares(drawn, np.full(3, epsilon / 3) + (1 - epsilon) * np.array([0, 0, 1]))
@@ -274,23 +209,8 @@ def test_actions_are_random_with_probability_epsilon_and_greedy_otherwise(make, 
 def test_of_equal_actions_the_first_is_greedy(row, best):
     table = np.zeros((5, 3))
     table[1] = row
-    _, action = drawing(q_learning)(table, 1.0)
-    assert action == best and action.dtype == jnp.int32
-    drawn, _ = drawing(q_learning)(table, 0.0)
-    assert (np.asarray(drawn) == best).all()
-
-
-def test_sarsas_next_action_is_drawn_by_the_same_rule():
-    agent = sarsa(learning_rate=1.0, discount=1.0)
-    table = np.zeros((5, 3))
-    table[1] = [10.0, 30.0, 20.0]
-    state = started(agent, table, 0.6)
-    keys = jax.random.split(jax.random.key(2), 4000)
-    update = jax.jit(jax.vmap(agent.update, (0, None, None)))
-    value = np.asarray(update(keys, state, step(0, 2, 0.0, 1.0, 1)).q_values)[:, 0, 2]
-    assert set(value.tolist()) == {10.0, 20.0, 30.0}
-    action = np.array([0, 2, 1])[np.round(value / 10 - 1).astype(int)]
-    assert_shares(action, np.array([0.2, 0.6, 0.2]))
+    greedy, tested = drawn_in_state_1(q_learning(), table, 0.0)
+    assert (greedy == best).all() and (tested == best).all()
 
 
 # --- worlds with a known answer ------------------------------------------------------------------
@@ -348,7 +268,7 @@ def trained(agent, task, num_episodes, num_agents):
 def cliff_agents():
     """Q-learning with the paper's numbers."""
     task = envs.make("cliff_walking")
-    agent = make_q_learning(QLearningConfig(), task.num_states, task.num_actions)
+    agent = make_tabular(QLearningConfig(), task.num_states, task.num_actions)
     return trained(agent, task, num_episodes=300, num_agents=6)
 
 
@@ -384,7 +304,7 @@ def test_q_learning_of_a_room_ends_at_the_optimal_values():
 def test_sarsa_finds_the_shortest_way_when_it_explores_less_and_less():
     task = envs.make("cliff_walking")
     config = SARSAConfig(epsilon_init=0.01, epsilon_min=0.0, epsilon_decay=0.9)
-    agent = make_sarsa(config, task.num_states, task.num_actions)
+    agent = make_tabular(config, task.num_states, task.num_actions)
     _, returns = trained(agent, task, num_episodes=300, num_agents=6)
     assert (returns >= -14.0).all() and (returns == -12.0).sum() >= 4
 
@@ -406,21 +326,3 @@ def test_sarsa_values_its_own_exploration_and_q_learning_the_best_action(make, w
     values = np.asarray(values)[:, 0, 0]
     error = np.std(values) / np.sqrt(values.size)
     np.testing.assert_allclose(np.mean(values), 0.9 * worth, atol=5 * error + 1e-5)
-
-
-@pytest.mark.parametrize("make", [q_learning, sarsa])
-def test_lanes_equal_single_trainings(make):
-    task = envs.make("gridworld_2x2")
-    agent = make(4, 4)
-    training = TrainingConfig(max_episodes=12, stop_rule="solved", solved_by="train")
-    train = make_trainer(agent, task.env, training, task.solved_reward)
-    keys = jax.random.split(KEY, 4)
-    many = jax.jit(jax.vmap(lambda key: train(key, task.params)))(keys)
-    many = jax.tree.map(np.asarray, many)
-    assert len(set(np.asarray(many.train_steps).tolist())) > 1  # they stop at different times
-    alone = jax.jit(lambda key: train(key, task.params))
-    for i, key in enumerate(keys):
-        jax.tree.map(
-            lambda lane, single, i=i: np.testing.assert_allclose(lane[i], single, rtol=1e-6),
-            many, alone(key),
-        )  # fmt: skip

@@ -8,9 +8,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from support import numpy_forward, raveled, shapes_of, unraveled
+from support import drawing, numpy_forward, raveled, shapes_of, train_on, unraveled
 
-from sejax import envs
 from sejax.agents.buffers import Transition
 from sejax.agents.td3 import (
     DiscreteTD3Config,
@@ -23,13 +22,10 @@ from sejax.agents.td3 import (
     make_learning_step,
     make_networks,
     make_td3,
-    make_td3_discrete,
     smoothed_target_action,
     tanh_policy,
 )
-from sejax.evaluation import make_tester
 from sejax.ops.networks import MLP
-from sejax.training import TrainingConfig, make_trainer
 
 OBS_DIM, ACTION_DIM, BATCH, MAX_ACTION = 3, 2, 7, 2.0
 GOLDEN = Path(__file__).parent / "golden" / "td3_updates.npz"
@@ -66,9 +62,7 @@ def policy_of(config):
 
 @functools.cache
 def agent_of(config):
-    if is_discrete(config):
-        return make_td3_discrete(config, OBS_DIM, ACTION_DIM)
-    return make_td3(config, OBS_DIM, ACTION_DIM, MAX_ACTION)
+    return make_td3(config, OBS_DIM, policy_of(config))
 
 
 @functools.cache
@@ -119,14 +113,6 @@ def case_noise(config, seed):
     return LearningNoise(smoothing, *(np.float32(rng.gumbel(size=shape)) for _ in range(2)))
 
 
-def mlp_of(config, num_outputs):
-    return MLP(
-        num_outputs, config.hidden_size, config.num_layers, config.activation,
-        learn_prelu_slope=True, layer_norm=is_discrete(config) and config.layer_norm,
-        may_narrow=True,
-    )  # fmt: skip
-
-
 def initial_params(config):
     """Random parameters, all networks' different, so that it shows which is used where."""
     # A seed with which no gradient is as small as Adam's epsilon: rounding would decide its step.
@@ -150,7 +136,7 @@ def nested_params(config, params):
     """Flat parameters (as in `NAMES`) as dictionaries by layer; the critics' as lists of two."""
 
     def nest(flat, num_inputs, num_outputs):
-        init = mlp_of(config, num_outputs).init
+        init = config.mlp(num_outputs).init
         return unraveled(flat, shapes_of(init, jax.random.key(0), np.zeros(num_inputs)))["params"]
 
     nest_actor = functools.partial(nest, num_inputs=OBS_DIM, num_outputs=ACTION_DIM)
@@ -200,44 +186,11 @@ def test_noise_is_normal_and_gumbel_and_drawn_independently():
 
 
 @pytest.mark.parametrize("config", [CONFIG, DISCRETE], ids=["continuous", "discrete"])
-def test_the_actor_and_all_targets_move_in_every_second_step_the_critics_in_all(config):
-    states = [state_of(config)]
-    for name in ("actor", "critics"):  # targets start as copies
-        np.testing.assert_array_equal(
-            getattr(states[0], f"target_{name}"), getattr(states[0], name)
-        )
-    assert not np.allclose(states[0].critics[0], states[0].critics[1])
-    for number in range(1, 5):
-        noise = case_noise(config, number)
-        states.append(learn_of(config)(states[-1], case_batch(config, 0), noise))
-        before, after = states[-2:]
-        assert int(after.num_updates) == number
-        moved = {name: not np.array_equal(getattr(before, name), getattr(after, name))
-                 for name in NAMES}  # fmt: skip
-        is_policy_step = number % 2 == 0
-        assert moved == {name: name == "critics" or is_policy_step for name in NAMES}
-        if is_policy_step:
-            for name in ("actor", "critics"):
-                expected = 0.1 * getattr(after, name) + 0.9 * getattr(before, f"target_{name}")
-                np.testing.assert_allclose(
-                    getattr(after, f"target_{name}"), expected, rtol=1e-5, atol=1e-7
-                )
-
-
-def test_the_critics_losses_are_means_over_the_columns_and_added():
-    # With discount 0 the error of a column is Q - r, and the gradient for the bias of a critic's
-    # head is twice the mean error. Adam's first mean is a tenth of it.
-    state, batch = state_of(CONFIG), case_batch(CONFIG, 0, discount=np.zeros(BATCH))
-    after = learn_of(CONFIG)(state, batch, case_noise(CONFIG, 0))
-    _, critics, _, _ = nested_params(CONFIG, [getattr(state, name) for name in NAMES])
-    _, means, _, _ = nested_params(
-        CONFIG, [state.actor, after.critic_opt_state.mu, state.actor, state.critics]
-    )
-    inputs = np.concatenate([batch.obs, batch.action]).T[:-1]  # the last column does not count
-    for params, mean in zip(critics, means, strict=True):
-        q_values = np.array([numpy_forward(params, x, "relu", 2)[0] for x in inputs])
-        expected = 0.1 * 2 * np.mean(q_values - batch.reward[:-1])
-        np.testing.assert_allclose(mean["Dense_2"]["bias"], [expected], rtol=1e-4)
+def test_targets_start_as_copies_and_the_critics_apart(config):
+    state = state_of(config)
+    np.testing.assert_array_equal(state.target_actor, state.actor)
+    np.testing.assert_array_equal(state.target_critics, state.critics)
+    assert not np.allclose(*state.critics)
 
 
 # --- target policy, by hand ----------------------------------------------------------------------
@@ -298,17 +251,6 @@ def test_one_hot_samples_are_exact_and_have_the_relaxed_gradient():
     np.testing.assert_allclose(hard_gradient, gradient, rtol=1e-5, atol=1e-7)
 
 
-def test_samples_follow_the_softmax_of_the_logits():
-    probabilities, n = np.array([0.1, 0.2, 0.7]), 4000
-    policy = gumbel_softmax_policy(3, 1, one_hot=True)
-    state = state_of(DISCRETE)
-    logits = np.float32(np.tile(np.log(probabilities)[:, None] + 5.0, n))
-    sample = jax.jit(lambda key: policy.action(logits, policy.draw(key, (3, n)), state))
-    share = np.asarray(sample(jax.random.key(0))).mean(axis=1)
-    deviation = np.sqrt(probabilities * (1 - probabilities) / n)
-    assert (np.abs(share - probabilities) < 5 * deviation).all()
-
-
 def test_the_temperature_falls_linearly_to_its_end_and_stays():
     hparams = agent_of(DISCRETE).hparams._replace(temperature=2.0, final_temperature=0.25)
     temperature = jax.jit(lambda n: annealed_temperature(hparams, n, 4))
@@ -345,27 +287,12 @@ def acting_state_of(config):
     )))  # fmt: skip
 
 
-@functools.cache
-def acting(config, explore):
-    """Actions of 4000 keys, `(state, episode) -> [4000, action_dim]`."""
-    agent = agent_of(config)
-
-    @jax.jit
-    def act(state, episode):
-        state = agent.begin_episode(state, episode)
-        keys = jax.random.split(jax.random.key(1), 4000)
-        return jax.vmap(lambda key: agent.act(key, state, OBS, explore))(keys)
-
-    return act
-
-
-@functools.cache
 def drawn_actions(config, explore, warming_up=False, action_noise_std=0.01):
     """Actions of 4000 keys, `[4000, action_dim]`."""
-    state = acting_state_of(config)
+    state, agent = acting_state_of(config), agent_of(config)
     hparams = state.hparams._replace(action_noise_std=np.float32(action_noise_std))
-    episode = np.int32(2 if warming_up else 3)
-    return np.asarray(acting(config, explore)(state.replace(hparams=hparams), episode))
+    state = agent.begin_episode(state.replace(hparams=hparams), np.int32(2 if warming_up else 3))
+    return np.asarray(drawing(agent)(state, OBS)[0 if explore else 1])
 
 
 def test_warm_up_actions_are_uniform_in_the_range():
@@ -471,35 +398,6 @@ def test_layer_norm_comes_after_each_hidden_layer_but_the_first_and_is_shared():
 # --- probes --------------------------------------------------------------------------------------
 
 
-def train_on(agent, batch, num_updates):
-    """The agent after so many updates on a batch; to be called in a jitted function."""
-
-    def step(state, key):
-        return agent.update(key, state, batch), None
-
-    state = agent.init(jax.random.key(0), agent.hparams)
-    return jax.lax.scan(step, state, jax.random.split(jax.random.key(1), num_updates))[0]
-
-
-def test_on_a_one_step_bandit_the_policy_finds_the_best_action():
-    # Reward -(a - 0.3)^2 for actions in [-2, 2], whatever the observation; nothing follows.
-    config = TD3Config(hidden_size=16, num_layers=1, activation="tanh", learning_rate=0.01, tau=0.1)
-    agent = make_td3(config, obs_dim=1, action_dim=1, max_action=2.0)
-    action = np.linspace(-2, 2, 32, dtype=np.float32)[None]
-    zeros = np.zeros(32, np.float32)
-    batch = Transition(
-        obs=zeros[None], action=action, reward=-((action[0] - 0.3) ** 2), discount=zeros,
-        next_obs=zeros[None],
-    )  # fmt: skip
-
-    @jax.jit
-    def trained_action(key):
-        state = train_on(agent, batch, 700)
-        return agent.act(key, state, jnp.zeros(1), explore=False)
-
-    np.testing.assert_allclose(trained_action(jax.random.key(0)), [0.3], atol=0.1)
-
-
 @pytest.mark.parametrize("one_hot", [False, True], ids=["relaxed", "one_hot"])
 def test_on_a_two_state_probe_the_discrete_policy_waits_for_the_larger_reward(one_hot):
     # In A, action 0 ends the episode with 0.5 and action 1 leads to B with nothing. In B, action 0
@@ -510,7 +408,7 @@ def test_on_a_two_state_probe_the_discrete_policy_waits_for_the_larger_reward(on
         hidden_size=16, num_layers=2, learning_rate=0.003, tau=0.1, discount=0.8,
         target_noise_std=0.0, final_temperature=1.0, one_hot_actions=one_hot,
     )  # fmt: skip
-    agent = make_td3_discrete(config, obs_dim=2, num_actions=2)
+    agent = make_td3(config, 2, gumbel_softmax_policy(2, config.temperature_steps, one_hot))
     networks = make_networks(config, 2, 2)
     gumbel = np.float32(np.random.default_rng(0).gumbel(size=(2, 64)))
     taken, in_a = np.argmax(gumbel, axis=0), np.arange(64) % 2 == 0
@@ -535,38 +433,3 @@ def test_on_a_two_state_probe_the_discrete_policy_waits_for_the_larger_reward(on
     assert [int(action) for action in actions] == [1, 0]
     for got in q_values:
         np.testing.assert_allclose(got, [0.5, 0.8, 1.0, 0.0], atol=0.1)
-
-
-# --- real tasks ----------------------------------------------------------------------------------
-
-
-def mean_test_return(agent, task, training):
-    @jax.jit
-    def run(key):
-        key_train, key_test = jax.random.split(key)
-        result = make_trainer(agent, task.env, training, task.solved_reward)(key_train, task.params)
-        returns, *_ = make_tester(agent, task, 10)(key_test, result.agent_state)
-        return returns, result.train_steps
-
-    returns, train_steps = run(jax.random.key(0))
-    print(f"{task.name}: mean {returns.mean()}, worst {returns.min()}, {train_steps} steps")
-    return float(returns.mean())
-
-
-@pytest.mark.slow
-def test_td3_solves_pendulum_in_20000_steps():
-    task = envs.make("pendulum")
-    config = TD3Config(warmup_episodes=5, batch_size=128, learning_rate=1e-3)
-    agent = make_td3(config, task.obs_dim, task.action_dim, task.max_action)
-    training = TrainingConfig(
-        max_episodes=100, max_steps=20_000, stop_rule="never", time_limit_is_terminal=False
-    )
-    assert mean_test_return(agent, task, training) > -250
-
-
-@pytest.mark.slow
-def test_discrete_td3_solves_cartpole():
-    task = envs.make("cartpole")
-    agent = make_td3_discrete(DiscreteTD3Config(), task.obs_dim, task.num_actions)
-    training = TrainingConfig(max_steps=50_000, stop_rule="solved", solved_by="train")
-    assert mean_test_return(agent, task, training) >= task.solved_reward

@@ -11,6 +11,7 @@ from jax.flatten_util import ravel_pytree
 
 from sejax.agents import buffers
 from sejax.agents.buffers import Rollout, Transition
+from sejax.agents.policies import softmax
 from sejax.agents.ppo import PPOConfig, make_ppo
 from sejax.ops.networks import MLP
 from sejax.proxies.configs import SyntheticConfig
@@ -47,7 +48,7 @@ def torch_networks(params):
 
 
 def test_a_learning_phase_equals_sejaxs_on_the_same_rollout():
-    agent = make_ppo(CONFIG, OBS_DIM, NUM_ACTIONS, None, 1.0, STEPS)
+    agent = make_ppo(CONFIG, OBS_DIM, softmax(NUM_ACTIONS), STEPS)
     state = jax.jit(agent.init)(jax.random.key(1), agent.hparams)
     torch_state = torch_ppo.ppo_state(*torch_networks(state.params))
     rng = np.random.default_rng(0)

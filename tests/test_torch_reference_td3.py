@@ -65,9 +65,10 @@ def random_batch(rng):
 
 
 def test_updates_equal_sejaxs_on_the_same_batches_and_noise():
-    agent = make_td3(CONFIG, OBS_DIM, ACTION_DIM, MAX_ACTION)
+    policy = tanh_policy(ACTION_DIM, MAX_ACTION)
+    agent = make_td3(CONFIG, OBS_DIM, policy)
     networks = make_networks(CONFIG, OBS_DIM, ACTION_DIM)
-    learn = jax.jit(make_learning_step(CONFIG, networks, tanh_policy(ACTION_DIM, MAX_ACTION)))
+    learn = jax.jit(make_learning_step(CONFIG, networks, policy))
     state = jax.jit(agent.init)(jax.random.key(1), agent.hparams)
     torch_state = torch_td3.td3_state(*torch_networks(state.actor, state.critics))
     rng = np.random.default_rng(0)

@@ -19,7 +19,7 @@ from sejax.agents import AgentSpec
 from sejax.agents.buffers import Buffer, rollout_buffer
 from sejax.agents.dqn import DDQNConfig, make_ddqn
 from sejax.agents.tabular import QLearningConfig
-from sejax.evaluation import _Greedy, make_recorder, make_tester
+from sejax.evaluation import make_recorder, make_tester
 from sejax.options import ConfigError, registry
 from sejax.proxies.configs import SyntheticConfig
 from sejax.training import TrainingConfig, is_plateau, is_solved, make_trainer
@@ -123,20 +123,17 @@ def test_training_equals_a_plain_python_loop(trainers, variant, scripted):
     assert result.eval_steps == 0
 
 
-def test_a_plateau_stops_at_the_first_episode_that_the_rule_allows(trainers):
-    # All returns equal: flat at once, but the rule waits for episode index 2 + 2 (the fifth).
-    result = trainers["plateau"](KEY, script([3] * 12, [2] * 12))
-    assert result.episodes == 5 and result.train_steps == 10
-
-
-def test_growing_returns_never_are_a_plateau(trainers):
-    result = trainers["plateau"](KEY, script([2.0**n for n in range(12)], [1] * 12))
-    assert result.episodes == 12
-
-
-def test_a_solved_task_stops_only_after_the_initial_episodes(trainers):
-    result = trainers["solved"](KEY, script([3] * 12, [1] * 12))
-    assert result.episodes == 3
+@pytest.mark.parametrize(
+    ("variant", "returns", "episodes"),
+    [
+        # All returns equal: flat at once, but the rule waits for episode index 2 + 2 (the fifth).
+        ("plateau", [3.0] * 12, 5),
+        ("plateau", [2.0**n for n in range(12)], 12),  # growing returns are never flat
+        ("solved", [3.0] * 12, 3),  # after the initial episodes
+    ],
+)
+def test_a_rule_stops_at_the_first_episode_that_it_may(trainers, variant, returns, episodes):
+    assert trainers[variant](KEY, script(returns, [1] * 12)).episodes == episodes
 
 
 def test_tests_between_episodes_decide_and_are_recorded(trainers):
@@ -181,22 +178,15 @@ def test_a_step_budget_ends_training_within_an_episode(trainers):
     assert result.agent_state.num_updates == 17 - 8
 
 
-def test_episodes_run_for_max_episodes_at_the_step_limit(trainers):
-    result = trainers["never"](KEY, script([1] * 12, [99] * 12))
-    assert result.episodes == 12 and result.train_steps == 12 * MAX_STEPS
-
-
-def test_a_step_limit_above_the_default_still_trains_all_episodes(trainers):
-    params = script([1] * 12, [99] * 12, max_steps_in_episode=2 * MAX_STEPS)
-    result = trainers["never"](KEY, params)
-    assert result.episodes == 12 and result.train_steps == 12 * 2 * MAX_STEPS
+@pytest.mark.parametrize("limit", [MAX_STEPS, 2 * MAX_STEPS])  # the world's default, and above
+def test_all_episodes_are_trained_to_the_step_limit(trainers, limit):
+    result = trainers["never"](KEY, script([1] * 12, [99] * 12, max_steps_in_episode=limit))
+    assert result.episodes == 12 and result.train_steps == 12 * limit
 
 
 def test_tests_need_a_test_function():
     for name in ("tested", "watched"):
-        with pytest.raises(
-            ValueError, match=r"num_tests_between is 1\) need a test_fn; got None\."
-        ):
+        with pytest.raises(ValueError, match="test_fn"):
             make_trainer(scripted_agent(), ENV, VARIANTS[name])
 
 
@@ -659,12 +649,8 @@ def test_actions_are_repeated_beyond_the_tasks_limit_too():
     task = envs.Task(name="script", env=ENV, params=script([2.5] * 12, [99] * 12))
     agent = dataclasses.replace(scripted_agent(), spec=AgentSpec(action_repeat=3))
     state = agent.begin_episode(agent.init(KEY, 0.0), 0)
-    step = jax.jit(_Greedy(agent, task).step)
-    episode, made = _Greedy(agent, task).begin(KEY, True), []
-    while episode.active:
-        episode, _ = step(KEY, state, episode, jnp.int32(9))
-        made.append(int(episode.num_steps))
-    assert made == [3, 4, 7, 9]
+    tests = make_tester(agent, task, 1)(KEY, state, True, jnp.int32(9))
+    assert tests.num_steps == 9 and tests.returns == 2.5
 
 
 def test_recorded_tests_are_the_tests():
@@ -696,26 +682,28 @@ def test_a_length_that_the_episodes_cannot_reach_is_refused():
     agent = registry.make("agent", DDQNConfig(warmup_episodes=1), task)
     env = SyntheticConfig(initial_state="learned", horizon=1).make(task)
     asked = TrainingConfig(max_steps=4000, stop_rule="never")
-    with pytest.raises(ConfigError, match=r"^training\.max_episodes must be at least 4000, because "
-                       r"training\.max_steps=4000 takes .*of at most 1 steps; got 1000\. Set train"
-                       r"ing\.max_episodes=4000\.$"):  # fmt: skip
+    with pytest.raises(ConfigError, match=r"Set training\.max_episodes=4000\.$") as error:
         make_trainer(agent, env, asked)
+    assert error.value.field == "training.max_episodes"
     assert make_trainer(agent, env, dataclasses.replace(asked, max_episodes=4000))
     assert make_trainer(agent, env, dataclasses.replace(asked, stop_rule="plateau"))  # a bound
     assert make_trainer(agent, task.env, asked)  # whose params may allow any length
 
 
-@pytest.mark.parametrize("swapped, said", [
-    (lambda agent, task: (task.env, agent), r"^agent must be a sejax\.Agent, .*make_agent\("),
-    (lambda agent, task: (agent, (task.env, task.params)), r"^env must be a gymnax .*got tuple\."),
-    (lambda agent, task: (agent, task.env, {"max_steps": 3}), r"^training must be a sejax\.Train"),
+@pytest.mark.parametrize("swapped, field", [
+    (lambda agent, task: (task.env, agent), "agent"),
+    (lambda agent, task: (agent, (task.env, task.params)), "env"),
+    (lambda agent, task: (agent, task.env, {"max_steps": 3}), "training"),
 ])  # fmt: skip
-def test_arguments_of_other_kinds_are_one_message(swapped, said):
+def test_arguments_of_other_kinds_are_refused(swapped, field):
     task = envs.make("gridworld_2x2")
     agent = registry.make("agent", QLearningConfig(), task)
-    with pytest.raises(ConfigError, match=said):
+    with pytest.raises(ConfigError) as error:
         make_trainer(*swapped(agent, task))
-    with pytest.raises(ConfigError, match=r"^task must be a sejax\.Task, .*got GridWorld"):
+    assert error.value.field == field
+    with pytest.raises(ConfigError) as error:
         evaluation.make_evaluator(agent, task.env, task.env, TrainingConfig())
-    with jax.enable_x64(True), pytest.raises(ConfigError, match=r"^jax_enable_x64 must be off"):
+    assert error.value.field == "task"
+    with jax.enable_x64(True), pytest.raises(ConfigError) as error:
         make_trainer(agent, task.env)
+    assert error.value.field == "jax_enable_x64"

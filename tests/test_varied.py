@@ -2,7 +2,6 @@
 
 import dataclasses
 import functools
-import re
 from typing import NamedTuple
 
 import jax
@@ -13,7 +12,7 @@ from jax.flatten_util import ravel_pytree
 
 from sejax import envs
 from sejax.agents import make_agent
-from sejax.agents.base import Agent, AgentConfig, Draw, NoExploration, Varied, drawing_key
+from sejax.agents.base import Agent, AgentConfig, Draw, Varied, drawing_key
 from sejax.agents.buffers import Transition, block_size, no_buffer, sum_over_batch
 from sejax.agents.dqn import DDQNConfig, DuelingDDQNConfig, make_ddqn
 from sejax.agents.exploration import CountBasedConfig
@@ -66,31 +65,26 @@ def test_draws_fill_their_range_with_the_density_they_should_have(bounds):
 
 
 @pytest.mark.parametrize("num_layers", [1, 2, 3])
-def test_every_hidden_size_has_a_network_and_little_arithmetic_is_wasted(num_layers):
-    sizes = np.array(hidden_sizes(Range(42, 384, True, True), num_layers))
-    assert sizes[-1] == 384 and (np.diff(sizes) > 0).all()
-    drawn = np.arange(42, 385)
+@pytest.mark.parametrize("low, high", [(42, 384), (7, 72), (19, 171), (1, 9)])
+def test_every_hidden_size_has_a_network_and_little_arithmetic_is_wasted(num_layers, low, high):
+    sizes = np.array(hidden_sizes(Range(low, high, True, True), num_layers))
+    assert high <= sizes[-1] < high + 32 and sizes[-2:-1] < (high,)
+    assert low <= sizes[0] < low + 32 and (np.diff(sizes) > 0).all()
+    if high < 200:
+        return
+    drawn = np.arange(low, high + 1)
     rooms = np.array([sizes[sizes >= size].min() for size in drawn])
     # A layer between hidden ones costs the square of its size; sizes are drawn log-uniformly.
     power = 1 if num_layers == 1 else 2
     assert (rooms**power / drawn).sum() / (drawn.astype(float) ** (power - 1)).sum() < 1.2
 
 
-@pytest.mark.parametrize("bounds", [Range(7, 72, True, True), Range(19, 171, True, True),
-                                    Range(1, 9, True, True)])  # fmt: skip
-def test_the_smallest_and_the_largest_hidden_size_have_room(bounds):
-    for num_layers in (1, 2):
-        sizes = hidden_sizes(bounds, num_layers)
-        assert bounds.low <= sizes[0] < bounds.low + 32 and sizes[-2:-1] < (bounds.high,)
-        assert bounds.high <= sizes[-1] < bounds.high + 32
-
-
 # --- narrow networks -----------------------------------------------------------------------------
 
 
 def configured(kind, hidden_size, batch_size):
-    make = {"ddqn": DDQNConfig, "dueling": functools.partial(
-        DuelingDDQNConfig, feature_dim=4, stream_hidden_size=4)}[kind]  # fmt: skip
+    dueling = functools.partial(DuelingDDQNConfig, feature_dim=4, stream_hidden_size=4)
+    make = {"ddqn": DDQNConfig, "dueling": dueling}[kind]
     return make(
         hidden_size=hidden_size, batch_size=batch_size, num_layers=2, activation="prelu",
         learning_rate=0.01, tau=0.1,
@@ -112,7 +106,7 @@ def embed(small, large):
     return jax.tree.map(place, small, large)
 
 
-def random_batch(num_columns, seed=0):
+def random_batch(num_columns, seed):
     rng = np.random.default_rng(seed)
     return Transition(
         obs=np.float32(rng.normal(size=(OBS_DIM, num_columns))),
@@ -274,12 +268,6 @@ def test_the_agent_inside_an_exploring_one_is_varied():
     assert drawn.values["discount"] != variant.hparams.agent.discount
 
 
-def test_a_varied_agent_is_made_once():
-    task, config = envs.make("gridworld_2x2"), QLearningConfig()
-    assert make_agent(config, task, varied=True) is make_agent(config, task, NoExploration(), True)
-    assert make_agent(config, task, varied=True) is not make_agent(config, task)
-
-
 @dataclasses.dataclass(frozen=True)
 class ForeignConfig(AgentConfig):
     """Of an agent that knows nothing of sejax's options."""
@@ -302,16 +290,12 @@ def agent_that(name, **fields):
     )  # fmt: skip
 
 
-def test_an_agent_none_of_whose_options_is_varied_is_refused_with_the_whole_message():
+def test_an_agent_none_of_whose_options_is_varied_is_refused():
     task = envs.make("gridworld_2x2")
     assert isinstance(make_agent(ForeignConfig(), task), Agent)
-    message = (
-        "agent_hparams must be default with this agent, because none of its options says how it "
-        "is drawn (sejax.options.option(..., varied=...)); got ForeignConfig. "
-        "Set agent_hparams=default."
-    )
-    with pytest.raises(ConfigError, match=f"^{re.escape(message)}$"):
+    with pytest.raises(ConfigError) as error:
         make_agent(ForeignConfig(), task, varied=True)
+    assert error.value.field == "agent_hparams"
 
 
 # --- whole programs ------------------------------------------------------------------------------

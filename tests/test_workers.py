@@ -28,7 +28,7 @@ class Ray:
     """The three functions of Ray that a pool uses, and workers whose answers are planned.
 
     `fate(worker, turn)` says how many seconds what a worker does takes and how it ends: None for
-    an answer, or an exception. Turn 0 is the preparation.
+    an answer, or an exception. Turn 0 is the start.
     """
 
     def __init__(self, room=2, fate=lambda worker, turn: (1.0, None)):
@@ -69,13 +69,13 @@ class Worker:
         ray.started += 1
         self.ray, self.real = ray, real
         self.number, self.turns = ray.started, itertools.count()
-        self.prepare = self.evaluate = self
+        self.ready = self.evaluate = self
 
     def remote(self, share=None):
         seconds, error = self.ray.fate(self.number, next(self.turns))
         answer = share, self.number
         if self.real is not None:
-            answer = self.real.prepare() if share is None else self.real.evaluate(share)
+            answer = None if share is None else self.real.evaluate(share)
         reference = next(self.ray.references)
         self.ray.due[reference] = self.ray.now + seconds, error or answer
         return reference
@@ -100,15 +100,6 @@ def test_a_generation_is_divided_among_all_workers():
     assert ray.now == pytest.approx(3.0)  # the start and two shares each
 
 
-@pytest.mark.parametrize("error", [ValueError("bad instruction"), RuntimeError("killed")])
-def test_the_share_of_a_lost_worker_goes_to_another_and_it_is_replaced(error):
-    ray = Ray(fate=lambda *turn: (1.0, error if turn == (1, 2) else None))
-    pool = ray.pool()
-    assert evaluated(pool, 20).count(1) == 1
-    assert ray.killed == [1]
-    assert set(evaluated(pool, 20)) == {2, 3}
-
-
 def test_a_worker_that_hangs_is_given_up_and_its_share_sent_to_another():
     ray = Ray(fate=lambda *turn: (FOREVER if turn == (1, 2) else 1.0, None))
     evaluated(ray.pool(), 4)
@@ -119,7 +110,7 @@ def test_a_worker_that_hangs_is_given_up_and_its_share_sent_to_another():
 def test_a_training_that_takes_far_longer_than_all_before_ends_in_the_end():
     ray = Ray(room=1, fate=lambda worker, turn: (100.0 if turn == 2 or worker > 1 else 1.0, None))
     evaluated(ray.pool(), 2)
-    assert 1 <= len(ray.killed) < cluster.MOST_LOSSES
+    assert 1 <= len(ray.killed) < 5
 
 
 def test_the_first_share_may_take_long():
@@ -128,23 +119,17 @@ def test_the_first_share_may_take_long():
     assert not ray.killed
 
 
-def test_a_share_that_kills_every_worker_ends_the_run():
-    ray = Ray(fate=lambda worker, turn: (1.0, OSError("no space") if turn else None))
-    with pytest.raises(FailedError, match="no space"):
+@pytest.mark.parametrize("turn", [0, 1])
+def test_a_worker_that_fails_ends_the_run(turn):
+    told = OSError("ray::Worker.evaluate()\n  File worker.py\nOSError: no space\n")
+    ray = Ray(fate=lambda worker, now: (1.0, told if now == turn else None))
+    with pytest.raises(FailedError, match="failed: OSError: no space"):
         evaluated(ray.pool(), 2)
 
 
-def test_workers_that_never_start_end_the_run():
-    ray = Ray(fate=lambda worker, turn: (1.0, ImportError("no jax")))
-    with pytest.raises(FailedError, match="no jax"):
-        evaluated(ray.pool(), 2)
-
-
-def test_many_workers_may_go_with_their_node():
-    ray = Ray(room=40, fate=lambda worker, turn: (1.0, OSError("gone") if worker > 3 else None))
-    pool = ray.pool()
-    ray.room = 3
-    assert set(evaluated(pool, 50)) == {1, 2, 3}
+def test_a_worker_that_never_starts_is_replaced():
+    ray = Ray(room=1, fate=lambda *turn: (FOREVER if turn == (1, 0) else 1.0, None))
+    assert evaluated(ray.pool(), 2) == [2, 2] and ray.killed == [1]
 
 
 def test_machines_join_while_a_generation_runs():
@@ -179,11 +164,7 @@ def test_generations_are_whole_whatever_workers_do(seed):
     rng = random.Random(seed)
 
     def fate(worker, turn):
-        if rng.random() < 0.8:
-            return rng.choice([0.5, 1.0, 3.0]), None
-        if turn and rng.random() < 0.5:
-            return FOREVER, None
-        return 1.0, OSError("gone")
+        return rng.choice([0.5, 1.0, 3.0]) if rng.random() < 0.8 else FOREVER, None
 
     ray = Ray(room=rng.randint(1, 6), fate=fate)
     pool = ray.pool()
@@ -201,15 +182,20 @@ def numbers(tree):
     return [np.asarray(jax.random.key_data(x) if is_key(x) else x) for x in jax.tree.leaves(tree)]
 
 
+def remote_chunks(config, ray):
+    """The generations of a run on workers of a planned cluster."""
+    learner = make_bilevel(**config.parts() | {"devices": 1})
+    size = learner.mixture.size
+    arguments = configuration.plain(config), [5] * size, 0.0, workers.versions()
+    pool = ray.pool(lambda: workers.Worker(*arguments))
+    return RemoteChunks(learner, pool, [Batch(capacity=5, width=1)] * size)
+
+
 def require_equal_numbers(words, generations):
-    """Runs generations in one program and by workers, the first of which is soon lost."""
-    config = sejax.config(words)
-    program = make_bilevel(**config.parts() | {"devices": 1})
-    batches = [Batch(capacity=5, width=1)] * program.mixture.size
-    arguments = configuration.plain(config), [5] * program.mixture.size, 0.0, workers.versions()
-    ray = Ray(fate=lambda *turn: (1.0, OSError("gone") if turn == (1, 2) else None))
-    local = session.Chunks(program)
-    remote = RemoteChunks(program, ray.pool(lambda: workers.Worker(*arguments)), batches)
+    """Runs generations in one program and by workers, the first of which soon hangs."""
+    ray = Ray(fate=lambda *turn: (FOREVER if turn == (1, 2) else 1.0, None))
+    remote = remote_chunks(sejax.config(words), ray)
+    local = session.Chunks(remote.learner)
     key = jax.random.key(0)
     state, other = local.init(key), remote.init(key)
     for _ in range(generations):
@@ -244,7 +230,10 @@ def test_workers_give_the_numbers_of_one_process_to_the_last_bit():
 CASES = {
     "mixture": [*TINY[:1], "agents=[q_learning,sarsa]", *TINY[3:]],
     "batches": ["env=cartpole", "es.population_size=4"],
-    "curriculum": ["env=pendulum", "es.population_size=4", "training.max_episodes=3"],
+    "curriculum": [
+        *("env=pendulum", "es.population_size=4", "training.max_steps=200"),
+        *("training.max_episodes=200", "objective.first_eval_steps=50"),
+    ],
     "evosax": ["env=cliff_walking", "proxy=rn", "es=cma_es", "es.population_size=8"],
 }
 
@@ -272,7 +261,7 @@ def test_a_worker_with_other_versions_is_refused():
     config = sejax.config(TINY)
     expected = workers.versions() | {"jax": "0.1"}
     with pytest.raises(ConfigError, match=r"0\.1") as error:
-        workers.Worker(configuration.plain(config), [5], 0.0, expected).prepare()
+        workers.Worker(configuration.plain(config), [5], 0.0, expected)
     assert error.value.field == "machines"
 
 
@@ -306,11 +295,8 @@ def test_a_run_by_workers_has_the_files_of_one_process(tmp_path):
     found = []
     for name in ("local", "remote"):
         config = sejax.config([*TINY, "generations=2", f"run_dir={tmp_path / name}"])
-        program = make_bilevel(**config.parts() | {"devices": 1})
-        arguments = configuration.plain(config), [5], 0.0, workers.versions()
-        pool = Ray().pool(lambda arguments=arguments: workers.Worker(*arguments))
-        remote = RemoteChunks(program, pool, [Batch(capacity=5, width=1)])
-        chunks = session.Chunks(program) if name == "local" else remote
+        remote = remote_chunks(config, Ray())
+        chunks = session.Chunks(remote.learner) if name == "local" else remote
         with open_for(config) as directory:
             session.run(config, directory, chunks)
             found.append([row | {"wall_s": ""} for row in directory.rows])

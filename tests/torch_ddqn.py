@@ -7,7 +7,9 @@ Remake it with `python tests/torch_ddqn.py` where torch is installed.
 import jax
 import numpy as np
 import torch
+from jax.flatten_util import ravel_pytree
 from test_ddqn import CASES, GOLDEN, NUM_ACTIONS, OBS_DIM, q_network, random_batch
+from torch_td3 import TorchMLP
 
 from sejax.agents.buffers import Transition
 from sejax.agents.dqn import make_ddqn
@@ -20,44 +22,22 @@ class TorchDDQN:
 
     def __init__(self, params, target_params, config):
         self.config = config
-        self.online, self.slope = self._network(params)
-        self.target, self.target_slope = self._network(target_params)
-        parameters = [*self.online.parameters()] + ([self.slope] if self.slope is not None else [])
-        self.optimizer = torch.optim.Adam(parameters, lr=config.learning_rate)
+        self.online, self.target = self.network(params), self.network(target_params)
+        self.optimizer = torch.optim.Adam(self.online.parameters(), lr=config.learning_rate)
         self.num_updates = 0
 
-    def _network(self, params):
-        layers = []
-        for i in range(self.config.num_layers + 1):
-            kernel, bias = params[f"Dense_{i}"]["kernel"], params[f"Dense_{i}"]["bias"]
-            layer = torch.nn.Linear(kernel.shape[1], kernel.shape[0])
-            layer.weight.data = torch.tensor(np.array(kernel))
-            layer.bias.data = torch.tensor(np.array(bias))
-            layers.append(layer)
-        slope = params.get("prelu_slope")
-        slope = None if slope is None else torch.nn.Parameter(torch.tensor([float(slope)]))
-        return torch.nn.ModuleList(layers), slope
-
-    def q_values(self, layers, slope, x):
-        activate = {
-            "tanh": torch.tanh,
-            "relu": torch.relu,
-            "leaky_relu": torch.nn.functional.leaky_relu,
-            "prelu": lambda h: torch.nn.functional.prelu(h, slope),
-        }[self.config.activation]
-        for layer in layers[:-1]:
-            x = activate(layer(x))
-        return layers[-1](x)
+    def network(self, params):
+        return TorchMLP(params, self.config)
 
     def update(self, batch):
         tensors = Transition(*(torch.tensor(np.array(x)) for x in batch))
         obs, next_obs = tensors.obs.T, tensors.next_obs.T
-        q = self.q_values(self.online, self.slope, obs)
+        q = self.online(obs)
         q = q.gather(1, tensors.action.long()[:, None])[:, 0]
         with torch.no_grad():
-            values = self.q_values(self.target, self.target_slope, next_obs)
+            values = self.target(next_obs)
             if self.config.double:
-                best = self.q_values(self.online, self.slope, next_obs).argmax(1)
+                best = self.online(next_obs).argmax(1)
                 value = values.gather(1, best[:, None])[:, 0]
             else:
                 value = values.max(1).values
@@ -73,41 +53,32 @@ class TorchDDQN:
             return
         tau = self.config.tau
         with torch.no_grad():
-            pairs = [*zip(self.target.parameters(), self.online.parameters(), strict=True)]
-            if self.slope is not None:
-                pairs.append((self.target_slope, self.slope))
+            pairs = zip(self.target.parameters(), self.online.parameters(), strict=True)
             for slow, fast in pairs:
                 slow.copy_(tau * fast + (1 - tau) * slow)
 
-    def arrays(self, layers, slope):
-        out = {
-            f"Dense_{i}": {"kernel": m.weight.detach().numpy(), "bias": m.bias.detach().numpy()}
-            for i, m in enumerate(layers)
-        }
-        return out if slope is None else {**out, "prelu_slope": slope.detach().numpy()[0]}
+
+def golden(case, config, nested, make_reference=TorchDDQN):
+    """Parameters before, after one, and after five updates on the test's batches."""
+    agent = make_ddqn(config, OBS_DIM, NUM_ACTIONS)
+    params = agent.init(jax.random.key(1), agent.hparams).params
+    # Target and online network apart from the start, so that it shows which is used where.
+    target_params = params[::-1]
+    reference = make_reference(nested(params), nested(target_params), config)
+    arrays = {f"{case}/params/0": params, f"{case}/target_params/0": target_params}
+    for number in range(1, NUM_UPDATES + 1):
+        reference.update(random_batch(number))
+        if number in (1, NUM_UPDATES):
+            for name, net in (("params", reference.online), ("target_params", reference.target)):
+                arrays[f"{case}/{name}/{number}"] = ravel_pytree(net.nested())[0]
+    return {name: np.array(x) for name, x in arrays.items()}
 
 
 def main():
-    """Writes the parameters before, after one, and after five updates on the test's batches."""
     arrays = {}
     for case, config in CASES.items():
-        _, nested = q_network(config)
-        agent = make_ddqn(config, OBS_DIM, NUM_ACTIONS)
-        params = agent.init(jax.random.key(1), agent.hparams).params
-        # Target and online network apart from the start, so that it shows which is used where.
-        target_params = params[::-1]
-        reference = TorchDDQN(nested(params), nested(target_params), config)
-        arrays |= {f"{case}/params/0": params, f"{case}/target_params/0": target_params}
-        for number in range(1, NUM_UPDATES + 1):
-            reference.update(random_batch(number))
-            if number in (1, NUM_UPDATES):
-                for name, layers, slope in (
-                    ("params", reference.online, reference.slope),
-                    ("target_params", reference.target, reference.target_slope),
-                ):
-                    flat, _ = jax.flatten_util.ravel_pytree(reference.arrays(layers, slope))
-                    arrays[f"{case}/{name}/{number}"] = flat
-    np.savez(GOLDEN, **{name: np.asarray(x) for name, x in arrays.items()})
+        arrays |= golden(case, config, q_network(config)[1])
+    np.savez(GOLDEN, **arrays)
 
 
 if __name__ == "__main__":

@@ -4,15 +4,10 @@ The rest of the agent is that of `torch_ddqn.py`. Remake them with `python tests
 where torch is installed.
 """
 
-import jax
 import numpy as np
 import torch
-from jax.flatten_util import ravel_pytree
-from test_ddqn import OBS_DIM, random_batch
-from test_dueling import ACTIVATIONS, GOLDEN, NUM_ACTIONS, config_with, nested_params
-from torch_ddqn import NUM_UPDATES, TorchDDQN
-
-from sejax.agents.dqn import make_ddqn
+from test_dueling import ACTIVATIONS, GOLDEN, config_with, nested_params
+from torch_ddqn import TorchDDQN, golden
 
 PARTS = ("features", "value", "advantage")
 
@@ -47,7 +42,7 @@ class DuelingNet(torch.nn.Module):
         advantage = self.parts["advantage"](features)
         return self.parts["value"](features) + advantage - advantage.mean(1, keepdim=True)
 
-    def arrays(self):
+    def nested(self):
         """The parameters as the agent nests them."""
         out = {}
         for name, part in self.parts.items():
@@ -63,36 +58,18 @@ class DuelingNet(torch.nn.Module):
 
 
 class TorchDuelingDDQN(TorchDDQN):
-    """The agent of `torch_ddqn.py` with that network, which keeps its slopes itself."""
+    """The agent of `torch_ddqn.py` with that network."""
 
-    def _network(self, params):
-        return DuelingNet(params, self.config.activation), None
-
-    def q_values(self, network, slope, x):
-        return network(x)
+    def network(self, params):
+        return DuelingNet(params, self.config.activation)
 
 
 def main():
-    """Writes the parameters before, after one, and after five updates on the test's batches."""
     arrays = {}
     for activation in ACTIVATIONS:
         config = config_with(activation)
-        nested = nested_params(config)
-        agent = make_ddqn(config, OBS_DIM, NUM_ACTIONS)
-        params = agent.init(jax.random.key(1), agent.hparams).params
-        # Target and online network apart from the start, so that it shows which is used where.
-        target_params = params[::-1]
-        reference = TorchDuelingDDQN(nested(params), nested(target_params), config)
-        arrays |= {f"{activation}/params/0": params, f"{activation}/target_params/0": target_params}
-        for number in range(1, NUM_UPDATES + 1):
-            reference.update(random_batch(number))
-            if number in (1, NUM_UPDATES):
-                for name, net in (
-                    ("params", reference.online),
-                    ("target_params", reference.target),
-                ):
-                    arrays[f"{activation}/{name}/{number}"], _ = ravel_pytree(net.arrays())
-    np.savez(GOLDEN, **{name: np.asarray(x) for name, x in arrays.items()})
+        arrays |= golden(activation, config, nested_params(config), TorchDuelingDDQN)
+    np.savez(GOLDEN, **arrays)
 
 
 if __name__ == "__main__":

@@ -21,36 +21,7 @@ from test_sac import (
 )
 from torch.distributions import Categorical, Independent, Normal, TransformedDistribution
 from torch.distributions.transforms import TanhTransform
-
-
-class TorchMLP(torch.nn.Module):
-    def __init__(self, params, config):
-        super().__init__()
-        self.layers = torch.nn.ModuleList()
-        for i in range(config.num_layers + 1):
-            kernel, bias = params[f"Dense_{i}"]["kernel"], params[f"Dense_{i}"]["bias"]
-            layer = torch.nn.Linear(kernel.shape[1], kernel.shape[0])
-            layer.weight.data = torch.tensor(np.array(kernel))
-            layer.bias.data = torch.tensor(np.array(bias))
-            self.layers.append(layer)
-        kinds = {"tanh": torch.nn.Tanh, "relu": torch.nn.ReLU, "prelu": torch.nn.PReLU}
-        self.activate = kinds[config.activation]()
-        if config.activation == "prelu":
-            self.activate.weight.data = torch.tensor([float(params["prelu_slope"])])
-
-    def forward(self, x):
-        for layer in self.layers[:-1]:
-            x = self.activate(layer(x))
-        return self.layers[-1](x)
-
-    def nested(self):
-        out = {
-            f"Dense_{i}": {"kernel": m.weight.detach().numpy(), "bias": m.bias.detach().numpy()}
-            for i, m in enumerate(self.layers)
-        }
-        if isinstance(self.activate, torch.nn.PReLU):
-            out["prelu_slope"] = self.activate.weight.detach().numpy()[0]
-        return out
+from torch_td3 import TorchMLP
 
 
 class TorchSAC:

@@ -22,6 +22,21 @@ lists them with all that stands here. `python tools/make_zoo.py` makes this page
 
 *Return* and *steps* are from the lowest to the highest of the kinds of agents that were trained on
 the proxy and tested on the real task: the mean return there, and how long an agent trained.
+The second table of each tells what fresh agents reach that trained for the steps given and were
+then tested on the real task: mean and standard deviation of the agents' mean returns.
+
+Each is used in the same way, here `acrobot`:
+
+```python
+import sejax
+
+env = sejax.gym.make("acrobot")  # a gymnasium.Env of an SE, in NumPy: any agent, no JAX
+env, params = sejax.load("acrobot")  # a gymnax environment, in JAX
+```
+
+`python -m sejax.evaluate proxy=acrobot agent=sac` trains agents on it and tests them on the real
+task. HalfCheetah's need `pip install 'sejax[mujoco]'`. All are sejax's own, under Apache-2.0, and
+hold no data of others.
 
 """
 
@@ -30,9 +45,21 @@ def page() -> str:
     """The text of the page."""
     proxies = sejax.pretrained()
     rows = [proxy.row | {"name": f"[{proxy.name}](#{proxy.name})"} for proxy in proxies]
-    overview = table(list(rows[0]), [list(row.values()) for row in rows])
-    cards = [re.sub(r"^#", "##", proxy.card, flags=re.MULTILINE) for proxy in proxies]
-    return HEAD + "\n\n".join([overview, *cards]) + "\n"
+    return HEAD + "\n\n".join([table(rows), *map(section, proxies)]) + "\n"
+
+
+def section(proxy: sejax.PretrainedProxy) -> str:
+    """What a card says of this proxy alone: its facts, what it teaches and how it was learned."""
+    title, *sections = re.split(r"\n\n(?=## )", proxy.card)
+    name, _, facts = title.split("\n\n", 2)
+    kept = [f"#{name}", facts]
+    for text in sections:
+        heading, _, body = text.partition("\n\n")
+        if heading == "## What it teaches":
+            kept.append(body.partition("\n\n")[2])
+        elif heading == "## How it was learned":
+            kept.append(f"Learned by:\n\n{body}")
+    return "\n\n".join(kept)
 
 
 if __name__ == "__main__":

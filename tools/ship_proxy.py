@@ -24,7 +24,7 @@ import yaml
 
 import sejax
 from sejax.cli import config as configuration
-from sejax.options.registry import flatten
+from sejax.options.plain import flatten
 from sejax.proxies import header, zoo
 
 FREE_FIELDS = ("run_dir", "devices", "checkpoint_every")  # how to compute, not what
@@ -56,7 +56,7 @@ def main() -> None:
         ]
     target = args.out / f"{args.name}.safetensors"
     save(target, proxy, **more)
-    shipped = zoo.describe(target)
+    shipped = zoo.describe(header.read(target))
     print(f"{shipped.card}\n{zoo.Zoo([shipped])}\n\n{target}")
 
 
@@ -130,20 +130,19 @@ def evaluate(path: Path, hparams: str, args: argparse.Namespace) -> list[dict[st
     ]
     subprocess.run([sys.executable, "-m", "sejax.evaluate", *words], check=True)
     summary = json.loads((path.parent / "evaluation.json").read_text())
-    evaluations = [
-        zoo.Evaluation(
-            agent=agent,
-            hparams=hparams,
-            world=WORLDS[world],
-            num_agents=row["num_agents"],
-            return_mean=row["test_return_mean"],
-            return_std=row["test_return_std"],
-            train_steps=row["train_steps_mean"],
-        )
+    return [
+        {
+            "agent": agent,
+            "hparams": hparams,
+            "world": WORLDS[world],
+            "num_agents": row["num_agents"],
+            "return_mean": row["test_return_mean"],
+            "return_std": row["test_return_std"],
+            "train_steps": row["train_steps_mean"],
+        }
         for world, rows in summary.items()
         for agent, row in (rows if len(agents) > 1 else {agents[0]: rows}).items()
     ]
-    return [dataclasses.asdict(each) for each in evaluations]
 
 
 if __name__ == "__main__":

@@ -1,7 +1,6 @@
 """A table of a dataclass's fields, under its docstring: type, default, and what it is.
 
-What a field is stands beside it in the source, in a comment or as `about` in its metadata, and is
-written nowhere else.
+What a field is stands beside it in the source, in a comment, and is written nowhere else.
 """
 
 import ast
@@ -50,9 +49,8 @@ def rows(cls: type) -> Iterator[tuple[str, str, str, str]]:
     for field in dataclasses.fields(cls):
         if field.init and not field.name.startswith("_") and field not in shared:
             default = "" if field.default is dataclasses.MISSING else repr(field.default)
-            meaning = field.metadata.get("about") or comments.get(field.name, "")
             type_name = re.sub(r"(\w+\.)+(?=\w)", "", inspect.formatannotation(field.type))
-            yield field.name, type_name, default, meaning
+            yield field.name, type_name, default, comments.get(field.name, "")
 
 
 def add_table(app: Sphinx, what: str, name: str, cls: Any, options: Any, lines: list[str]) -> None:

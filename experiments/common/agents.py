@@ -16,11 +16,14 @@ import numpy as np
 import pandas as pd
 
 import sejax
-from experiments.common.experiment import Settings, count, each_of, setting
+from experiments.common.experiment import Settings, count, setting
+from sejax import ProxySet, Task
 from sejax.agents import NoExploration
 from sejax.cli.progress import Tally
+from sejax.evaluation import num_parallel_on_cpu
 from sejax.ops.parallel import spread_over_devices
-from sejax.options import registry
+from sejax.options import each_of, registry
+from sejax.options.plain import to_plain
 from sejax.training import TrainingConfig
 
 HPARAMS = ("varied", "default")
@@ -41,7 +44,7 @@ class Condition:
 
     name: str  # in the names of files
     env: Any  # gymnax environment; its groups differ in the `params`
-    task: Any  # the real one, that agents are tested on
+    task: Task  # the real one, that agents are tested on
     groups: tuple[Group, ...]
     agent: Any  # configuration of all
     training: TrainingConfig
@@ -51,13 +54,13 @@ class Condition:
     is_single: bool = False  # whether its one group takes its keys from the seed itself
 
     @classmethod
-    def real(cls, task: Any, names: Iterable[str], **rest: Any) -> Self:
+    def real(cls, task: Task, names: Iterable[str], **rest: Any) -> Self:
         """The real task for groups of these names."""
         groups = tuple(Group(name, task.params) for name in names)
         return cls(env=task.env, task=task, groups=groups, **rest)
 
     @classmethod
-    def of_set(cls, proxies: Any, names: Iterable[str], **rest: Any) -> Self:
+    def of_set(cls, proxies: ProxySet, names: Iterable[str], **rest: Any) -> Self:
         """The proxies of a `ProxySet`, one for each group; the first ones again for more groups."""
         ones = [(name, proxies[i % len(proxies)]) for i, name in enumerate(names)]
         groups = tuple(Group(name, one.params, one.fingerprint) for name, one in ones)
@@ -70,7 +73,7 @@ class Condition:
             "task": self.task.origin,
             "agent": registry.describe("agent", self.agent),
             "exploration": registry.describe("exploration", self.exploration),
-            "training": registry.to_plain(self.training),
+            "training": to_plain(self.training),
             "hparams": self.hparams,
             **self.settings,
         }
@@ -205,7 +208,7 @@ def make_program(
     exploration: Any,
     hparams: str,
     env: Any,
-    task: Any,
+    task: Task,
     training: TrainingConfig,
     devices: int | None,
 ) -> Callable[..., Any]:
@@ -214,8 +217,6 @@ def make_program(
     The leaves of `params` are `[group, ...]`; the agents of a group follow one another. Nothing is
     computed for an agent that is not active.
     """
-    from sejax.evaluation import num_parallel_on_cpu
-
     made = sejax.make_agent(agent, task, exploration, hparams == "varied")
     run = measure.make_run(made, env, task, training)
 
@@ -283,13 +284,11 @@ SOFT_SE = "results/soft_ses/cartpole.safetensors"  # with dynamics to look into,
 class SeAgents(Settings):
     """Settings about agents with drawn hyperparameters that are trained on the SEs of a set."""
 
-    agents: tuple[str, ...] = setting(SE_AGENTS, each_of(SE_AGENTS), about="kinds of agents")
-    num_agents: int = count(10, "agents", quick=4, about="for each SE")
-    num_ses: int = count(40, "SEs", quick=3, about="SEs of a set at most")
-    test_episodes: int = count(10, "episodes", about="of each agent")
-    max_steps: int | None = count(
-        None, "steps", quick=4000, about="training steps at most; as the SEs' configuration says"
-    )
+    agents: tuple[str, ...] = setting(SE_AGENTS, each_of(SE_AGENTS))  # kinds of agents
+    num_agents: int = count(10, quick=4)  # for each SE
+    num_ses: int = count(40, quick=3)  # SEs of a set at most
+    test_episodes: int = count(10)  # of each agent
+    max_steps: int | None = count(None, quick=4000)  # of training; as the SEs' configuration says
 
 
 def agent_config(settings: Settings, kind: str) -> Any:
@@ -298,7 +297,7 @@ def agent_config(settings: Settings, kind: str) -> Any:
 
 
 def training_as_learned(
-    proxies: Any, agent: Any, test_episodes: int, max_steps: int | None = None
+    proxies: ProxySet, agent: Any, test_episodes: int, max_steps: int | None = None
 ) -> TrainingConfig:
     """How long an agent trains on SEs: as those that these were learned with, or `max_steps`."""
     learned = sejax.training_of(proxies, agent)
@@ -307,7 +306,7 @@ def training_as_learned(
     return dataclasses.replace(learned, max_steps=most, test_episodes=test_episodes)
 
 
-def on_ses(settings: SeAgents, ses: Any, kind: str) -> Condition:
+def on_ses(settings: SeAgents, ses: ProxySet, kind: str) -> Condition:
     """The SEs of a set; agents train as long as those that the SEs were learned with."""
     agent = agent_config(settings, kind)
     training = training_as_learned(ses, agent, settings.test_episodes, settings.max_steps)

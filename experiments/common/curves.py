@@ -12,18 +12,20 @@ import numpy as np
 import pandas as pd
 
 from experiments.common.agents import Measure
+from sejax import Task
+from sejax.evaluation import make_tested_trainer
 from sejax.training import TrainingConfig
 
 WINDOW = 10  # test episodes that a point of a smoothed curve is the mean of
 
 
-def make_curve_run(agent: Any, env: Any, task: Any, training: TrainingConfig) -> Callable[..., Any]:
+def make_curve_run(
+    agent: Any, env: Any, task: Task, training: TrainingConfig
+) -> Callable[..., Any]:
     """Builds `run(key, env_params, active) -> (test returns, training steps)`, `[episode]` each.
 
     Entries after an agent's last episode are nan and 0. Only the limits of `training` end it.
     """
-    from sejax.evaluation import make_tested_trainer
-
     between = max(1, training.tests_between)
     training = dataclasses.replace(training, stop_rule="never", tests_between=between)
 

@@ -9,8 +9,7 @@ import dataclasses
 import functools
 import json
 import shlex
-import sys
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Self, get_origin, get_type_hints
@@ -21,34 +20,39 @@ from experiments.common.shards import Shards, read_rows, write_rows
 from sejax import options
 from sejax.cli import commands, runtime
 from sejax.ops.files import write_text
-from sejax.options import ConfigError, Options, Rule, as_text, counts, nearest, registry, shortened
+from sejax.options import (
+    ConfigError,
+    Options,
+    Rule,
+    as_text,
+    counts,
+    help_texts,
+    registry,
+    require,
+    shortened,
+)
+from sejax.options.plain import from_plain, parsed, to_plain
 
 RUN_PREFIX = "run."  # of an override for the NES runs: run.es.population_size=8
 NOT_SHOWN = {"work", "devices", "from_rows", "run"}  # fields that no result depends on, and `run`
 _SAME = object()
 
 
-def setting(default: Any, rule: Rule | None = None, *, about: str, quick: Any = _SAME) -> Any:
-    """A field of `Settings`.
+def setting(default: Any, rule: Rule | None = None, *, quick: Any = _SAME) -> Any:
+    """A field of `Settings`. The comment beside it is its help text.
 
     Args:
       default: its default; None where it may be left open.
       rule: what must hold, as in `sejax.options`.
-      about: its line in `--help`.
       quick: its default with `quick=true`.
     """
-    metadata = {"rule": rule, "about": about, "quick": default if quick is _SAME else quick}
+    metadata = {"rule": rule, "quick": default if quick is _SAME else quick}
     return dataclasses.field(default=default, metadata=metadata)
 
 
-def count(default: int | None, things: str, least: int = 1, **rest: Any) -> Any:
-    """A field that counts things."""
-    return setting(default, counts(f"it counts {things}", least), **rest)
-
-
-def each_of(known: Collection[str]) -> Rule:
-    """A list of these names."""
-    return options.each_of(known)
+def count(default: int | None, least: int = 1, *, quick: Any = _SAME) -> Any:
+    """A field that counts something, `least` of them at least."""
+    return setting(default, counts("nothing is computed otherwise", least), quick=quick)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,36 +66,39 @@ class Settings(Options):
     name: ClassVar[str]  # of the experiment's module
     files: ClassVar[str] = ""  # prefix of its files in `out`
 
-    quick: bool = setting(False, about="a small version, in minutes")
-    from_rows: bool = setting(False, about="make table and figures again from the stored rows")
-    out: str | None = setting(
-        None, about="folder of the results; results/NAME[/TASK], quick: runs/experiments/NAME-quick"
-    )
-    work: str | None = setting(
-        None, about="folder of what is not kept; runs/experiments/... for results/..., or out/work"
-    )
-    seed: int = setting(0, options.seed(), about="first seed")
-    devices: int | None = setting(None, counts("something must compute"), about="to use; all")
+    quick: bool = setting(False)  # a small version, in minutes
+    from_rows: bool = setting(False)  # make table and figures again from the stored rows
+    # Folder of the results; results/NAME[/TASK], quick: runs/experiments/NAME-quick.
+    out: str | None = setting(None)
+    # Folder of what is not kept; runs/experiments/... for results/..., or out/work.
+    work: str | None = setting(None)
+    seed: int = setting(0, options.seed())  # first seed
+    devices: int | None = count(None)  # to use; all
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        fields = vars(self)
+        for word in fields.get("run", ()):
+            name = word.partition("=")[0]
+            require(
+                name not in fields,
+                RUN_PREFIX + name,
+                f"must be given as {name}, as results are filed by it; got {shortened(word)}. "
+                f"Set {shortened(word)}.",
+            )
 
     @classmethod
     def of(cls, **given: Any) -> Self:
         """Settings from the given fields; a field that is None or left out has its default.
 
-        An override of the NES runs that is a field here, such as `run.env=acrobot`, sets the field.
-
         Raises:
           ConfigError: for an unknown field or a value that breaks its rule.
         """
         given = {name: value for name, value in given.items() if value is not None}
-        if "run" in given:
-            names = {field.name for field in dataclasses.fields(cls)}
-            words = given["run"] if not isinstance(given["run"], str) else [given["run"]]
-            own = [word for word in words if word.partition("=")[0] in names]
-            given |= parse(cls, own) | {"run": [word for word in words if word not in own]}
         for name, kind in get_type_hints(cls).items():
             if get_origin(kind) is tuple and isinstance(given.get(name), str):
                 given[name] = [given[name]]
-        return registry.from_plain(cls, cls.defaults(given) | given, "")
+        return from_plain(cls, cls.defaults(given) | given, "")
 
     @classmethod
     def defaults(cls, given: Mapping[str, Any]) -> dict[str, Any]:
@@ -138,7 +145,7 @@ class Settings(Options):
 
     def command(self) -> str:
         """The command that makes these results: the fields that differ from their defaults."""
-        mine = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+        mine = self.values(*(field.name for field in dataclasses.fields(self)))
         default = self.defaults(mine) | {"quick": False}
         hidden = NOT_SHOWN
         if self.folder.parts[:1] != ("results",) or self.folder == self._default_folder:
@@ -157,7 +164,7 @@ def work_beside(folder: Path, name: str) -> Path:
     return folder / name
 
 
-def parse(settings: type[Settings], words: Iterable[str]) -> dict[str, Any]:
+def parse(words: Iterable[str]) -> dict[str, Any]:
     """The fields that overrides `field=value` set; a list is `[a,b]`, and the last one counts.
 
     Overrides `run.FIELD=VALUE` become the list `run`, which configures the NES runs.
@@ -165,21 +172,16 @@ def parse(settings: type[Settings], words: Iterable[str]) -> dict[str, Any]:
     Raises:
       ConfigError: for anything else.
     """
-    fields = [field.name for field in dataclasses.fields(settings)]
     given: dict[str, Any] = {}
     runs = []
     for word in words:
         name, equals, text = word.partition("=")
-        if name.startswith(RUN_PREFIX) and "run" in fields:
+        if not equals:
+            raise ConfigError(f"An override must read FIELD=VALUE; got {shortened(word)}.")
+        if name.startswith(RUN_PREFIX):
             runs.append(word.removeprefix(RUN_PREFIX))
-        elif equals and name in fields:
-            given[name] = registry.parsed(text)
         else:
-            ranked = nearest(name.lstrip("-").replace("-", "_"), fields)
-            raise ConfigError(
-                f"{settings.name} reads overrides field=value; got {shortened(word, 60)}. "
-                f"Did you mean {ranked[0]}=...? See --help."
-            )
+            given[name] = parsed(text)
     if runs:
         given["run"] = [*(given.get("run") or []), *runs]
     return given
@@ -200,46 +202,36 @@ class Experiment:
         Raises:
           ConfigError: for settings or files that cannot work, or a folder of other settings.
         """
-        fields = registry.to_plain(settings).items()
+        fields = to_plain(settings).items()
         with registry.only_typed(f"{name}={value}" for name, value in fields):
-            return self._run(settings)
+            if not settings.from_rows:
+                write_rows(settings.rows_file, self.compute(settings))
+                made_with = json.dumps(settings.shards.made_with, indent=1)
+                write_text(settings.settings_file, f"{made_with}\n")
+            return self.report(settings, read_rows(settings.rows_file))
 
-    def _run(self, settings: Settings) -> pd.DataFrame:
-        if not settings.from_rows:
-            write_rows(settings.rows_file, self.compute(settings))
-            made_with = json.dumps(settings.shards.made_with, indent=1)
-            write_text(settings.settings_file, f"{made_with}\n")
-        return self.report(settings, read_rows(settings.rows_file))
-
-    def main(self, words: Sequence[str] | None = None) -> None:
+    def main(self) -> None:
         """The command; bad input ends it with one message."""
-        words = sys.argv[1:] if words is None else words
-        if {"--help", "-h"} & {*words}:
-            print(self.help())
-            return
-        try:
-            with registry.only_typed(words):
-                settings = self.settings.of(**parse(self.settings, words))
-        except ConfigError as error:
-            commands.fail(str(error), commands.BAD_INPUT)
-        runtime.configure_xla(settings.devices)
+        commands.start(self._run_command, lambda _: self.help())
+
+    def _run_command(self, words: Sequence[str]) -> None:
+        settings = self.settings.of(**parse(words))
         runtime.configure_jax()
         try:
-            with commands.messages():
-                self.run(settings)
+            self.run(settings)
         except KeyboardInterrupt:
             print(f"Interrupted. The same command goes on from {settings.work_folder}.")
             commands.leave(commands.INTERRUPTED)
 
     def help(self) -> str:
         """The text of `--help`: all fields with their defaults."""
-        full, quick = (self.settings.defaults({"quick": quick}) for quick in (False, True))
-        lines = []
-        for field in dataclasses.fields(self.settings):
-            default, other = as_text(full[field.name]), as_text(quick[field.name])
+        settings: Any = self.settings
+        full, quick = (settings.defaults({"quick": quick}) for quick in (False, True))
+        texts, lines = help_texts(settings), []
+        for name, value in full.items():
+            default, other = as_text(value), as_text(quick[name])
             differs = f" (quick: {other})" if default != other else ""
-            about = field.metadata["about"]
-            lines.append(f"  {f'{field.name}={default}':34}  {about}{differs}")
+            lines.append(f"  {f'{name}={default}':34}  {texts.get(name, '')}{differs}")
         if "run" in full:
             lines.append(f"  {RUN_PREFIX + 'FIELD=VALUE':34}  override of the NES runs")
         usage = f"python -m experiments.{self.settings.name} [FIELD=VALUE ...]"

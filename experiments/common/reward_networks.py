@@ -30,7 +30,8 @@ from experiments.common.shards import read_rows, write_rows
 from sejax import ICMConfig, options
 from sejax.cli import config as configuration
 from sejax.cli import run_directory
-from sejax.options import ConfigError, one_of, registry
+from sejax.options import ConfigError, listed, one_of, registry
+from sejax.options.plain import flatten
 
 # Paper, table "Overview of Reward Network variants".
 VARIANTS = (
@@ -189,14 +190,12 @@ def label(name: str) -> str:
 class RnSettings(RunSettings):
     """Settings about the task and the RNs that are learned; defaults are those of the study."""
 
-    env: str = setting("cliff_walking", one_of(STUDIES), about=f"task: {', '.join(STUDIES)}")
-    variants: tuple[str, ...] = setting(
-        VARIANTS, about=f"of the RNs: those, with {AUGMENTED}, {', '.join(WEIGHTED_INFO)}"
-    )
-    learned: int = count(10, "RNs", about="RNs to learn of each variant")
-    rns_dir: str | None = setting(
-        None, about="where RNs are kept; results/reward_networks, quick rns/ in `out`"
-    )
+    # Task: cliff_walking, cartpole, mountain_car_continuous, halfcheetah.
+    env: str = setting("cliff_walking", one_of(STUDIES))
+    # Of the RNs: those, with +augm, additive_weighted_info, exclusive_weighted_info.
+    variants: tuple[str, ...] = setting(VARIANTS)
+    learned: int = count(10)  # RNs to learn of each variant
+    rns_dir: str | None = setting(None)  # of RNs; results/reward_networks, quick: rns/ in `out`
 
     @classmethod
     def defaults(cls, given: Mapping[str, Any]) -> dict[str, Any]:
@@ -236,11 +235,7 @@ class RnSettings(RunSettings):
 
 def objective_setting() -> Any:
     """The setting of experiments that use the RNs of one objective."""
-    return setting(
-        "reward_threshold",
-        one_of(OBJECTIVES),
-        about=f"that RNs are learned by: {', '.join(OBJECTIVES)}",
-    )
+    return setting("reward_threshold", one_of(OBJECTIVES))
 
 
 def learn(settings: RnSettings, variant: str, objective: str) -> Any:
@@ -294,9 +289,9 @@ def stored(settings: RnSettings, variant: str, objective: str) -> Any:
         return None
     if differing:
         raise ConfigError(
-            f"rns_dir must be a new folder or hold RNs of the same settings, because they are "
-            f"learned once for all experiments; got {path} with another {', '.join(differing)}. "
-            f"Set rns_dir=DIR, or the settings that they were learned with."
+            f"rns_dir must be a new folder or hold RNs of the same settings; got {path} with "
+            f"another {listed(differing)}. Set rns_dir=DIR, or these settings.",
+            "rns_dir",
         )
     return there
 
@@ -304,7 +299,7 @@ def stored(settings: RnSettings, variant: str, objective: str) -> Any:
 def _what_counts(config: Any) -> dict[str, Any]:
     """The fields that a run's numbers depend on."""
     free = run_directory.FREE_FIELDS - {"generations"} | {"num_parallel", "num_seeds"}
-    flat = registry.flatten(configuration.plain(config))
+    flat = flatten(configuration.plain(config))
     return {name: value for name, value in flat.items() if name.partition(".")[0] not in free}
 
 

@@ -15,18 +15,20 @@ import pandas as pd
 
 from experiments.common import agents, curves, figures
 from experiments.common.agents import Condition
-from experiments.common.experiment import count, each_of, setting
+from experiments.common.experiment import count, setting
 from experiments.common.reward_networks import AUGMENTED, PAPER_ROWS, SHOWN, RnSettings, label
 from experiments.common.tables import (
     as_texts,
+    interval_note,
     iqm_columns,
     iqm_note,
     iqm_text,
     mean_columns,
     mean_text,
+    summary_by,
 )
-from sejax import options
-from sejax.options import registry, require, shortened
+from sejax import ProxySet
+from sejax.options import each_of, registry, require
 from sejax.training import TrainingConfig
 
 ROWS = {  # agents that are trained: the rows of the paper's figure, and one of ours
@@ -43,23 +45,18 @@ GRID_POINTS = 200
 class CurveSettings(RnSettings):
     """Settings about the agents."""
 
-    rows: tuple[str, ...] = setting(
-        PAPER_ROWS,
-        each_of(ROWS),
-        about="agents to train: default (the paper's hyperparameters; on continuous tasks those of "
-        "the quick agent that RNs are learned with), varied (drawn for each agent), transfer (one "
-        "that the RNs never saw), tuned (on the real task for few steps: DDQN on cartpole, PPO on "
-        "mountain_car_continuous)",
-    )
-    bonuses: tuple[str, ...] = setting(
-        (),
-        about="exploration bonuses on the real task to compare with: count_based on cliff_walking, "
-        "elsewhere icm; or none",
-    )
-    rns: int = count(10, "RNs", about="RNs of each variant that agents are trained on, the best")
-    bonus_groups: int = count(10, "groups", about="groups of agents with a bonus; as many as RNs")
-    num_agents: int = count(10, "agents", about="on each RN, in each row")
-    max_steps: int = count(5000, "steps", about="training steps; as the paper's figure")
+    # Agents to train: default (the paper's hyperparameters; on continuous tasks those of the quick
+    # agent that RNs are learned with), varied (drawn for each agent), transfer (one that the RNs
+    # never saw), tuned (on the real task for few steps: DDQN on cartpole, PPO on
+    # mountain_car_continuous).
+    rows: tuple[str, ...] = setting(PAPER_ROWS, each_of(ROWS))
+    # Exploration bonuses on the real task to compare with: count_based on cliff_walking, elsewhere
+    # icm; or none.
+    bonuses: tuple[str, ...] = setting(())
+    rns: int = count(10)  # RNs of each variant that agents are trained on, the best
+    bonus_groups: int = count(10)  # groups of agents with a bonus; as many as RNs
+    num_agents: int = count(10)  # on each RN, in each row
+    max_steps: int = count(5000)  # of training; as the paper's figure
 
     @classmethod
     def defaults(cls, given: Mapping[str, Any]) -> dict[str, Any]:
@@ -69,13 +66,12 @@ class CurveSettings(RnSettings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        options.each_of(self.study.rows)("rows", self.rows, None)
-        options.each_of((*self.study.bonuses, "none"))("bonuses", self.bonuses, None)
-        most, fix = f"be at most {self.learned}", f"learned={self.rns}"
+        each_of(self.study.rows)("rows", self.rows, None)
+        each_of((*self.study.bonuses, "none"))("bonuses", self.bonuses, None)
         require(
             self.rns <= self.learned,
             "rns",
-            f"must {most}, because so many are learned; got {shortened(self.rns)}. Set {fix}.",
+            f"must be at most learned={self.learned}; got {self.rns}. Set learned={self.rns}.",
         )
 
     def agent(self, row: str) -> Any:
@@ -109,7 +105,7 @@ def real_curves(settings: CurveSettings) -> Iterator[pd.DataFrame]:
             yield from curves_in(settings, name, settings.bonus_groups, make, exploration=bonus)
 
 
-def rn_curves(settings: CurveSettings, variant: str, rns: Any, prefix: str = "") -> Any:
+def rn_curves(settings: CurveSettings, variant: str, rns: ProxySet, prefix: str = "") -> Any:
     """Curves of all agents on the RNs of a set, of which each group of agents has one."""
     make = functools.partial(Condition.of_set, rns)
     return curves_in(settings, variant, len(rns), make, prefix)
@@ -150,11 +146,11 @@ def require_rows(settings: CurveSettings, rows: pd.DataFrame) -> None:
     """
 
     def same(name: str, there: Any, asked: Any) -> None:
-        reason, fix = f"{settings.rows_file} has these", f"{name}={there}, or from_rows=false"
         require(
             there == asked,
             name,
-            f"must be {there}, because {reason}; got {shortened(asked)}. Set {fix}.",
+            f"must be {there}, as in {settings.rows_file}; got {asked}. Set {name}={there}, or "
+            "from_rows=false.",
         )
 
     there = rows["row"].unique()
@@ -169,14 +165,15 @@ def require_rows(settings: CurveSettings, rows: pd.DataFrame) -> None:
 def summarise(rows: pd.DataFrame, solved_reward: float, max_steps: int) -> pd.DataFrame:
     """One row for each row of the figure and condition.
 
-    An agent that did not solve the task counts `max_steps`. Intervals come from drawing RNs again,
-    since agents of one RN have much in common, and agents where there are no RNs; of fewer than
+    An agent that did not solve the task counts `max_steps`. Intervals are of the means of the RNs,
+    since agents of one RN have much in common, and of agents where there are no RNs; of fewer than
     five there is none (nan).
     """
-    out = []
     grid = step_grid(max_steps)
     counted: dict[Any, Any] = {}  # steps and group of each agent, by row and condition
-    for (row, world), mine in rows.groupby(["row", "world"], sort=False):
+
+    def statistics(mine: pd.DataFrame) -> dict[str, float]:
+        row, world = mine[["row", "world"]].iloc[0]
         groups = mine.groupby("agent")["group"].first()
         to_solve = curves.all_steps_to_solve(mine, solved_reward)
         steps = to_solve.clip(upper=max_steps)
@@ -184,24 +181,21 @@ def summarise(rows: pd.DataFrame, solved_reward: float, max_steps: int) -> pd.Da
         mean_return = pd.Series(np.nanmean(held, axis=1), index=steps.index)
         labels = None if world in WITHOUT_RN else groups
         counted[row, world] = steps, groups
-        out.append(
-            {"row": row, "world": world, "groups": groups.nunique(), "agents": len(steps)}
+        return (
+            {"groups": groups.nunique(), "agents": len(steps)}
             | {"solved": np.isfinite(to_solve).mean()}
-            | mean_columns(steps, "steps", _draws(steps, labels))
-            | mean_columns(mean_return, "return", _draws(mean_return, labels))
+            | mean_columns(steps, "steps", labels)
+            | mean_columns(mean_return, "return", labels)
             | iqm_columns(mean_return, "return", labels)
             | {"last_return": curves.last_returns(mine).mean()}
         )
+
+    summary = summary_by(rows, ["row", "world"], statistics)
     shares = [
         share_of_bare(*mine, *counted[row, "real"]) if (row, "real") in counted else np.nan
         for (row, _), mine in counted.items()
     ]
-    return pd.DataFrame(out).assign(share_of_bare=shares)
-
-
-def _draws(values: pd.Series, labels: pd.Series | None) -> pd.Series:
-    """What an interval draws again: the means of the RNs, or agents where there are none."""
-    return values if labels is None else values.groupby(labels).mean()
+    return summary.assign(share_of_bare=shares)
 
 
 def share_of_bare(
@@ -243,19 +237,15 @@ def make_table(summary: pd.DataFrame) -> pd.DataFrame:
 
 def common_note(settings: CurveSettings, solved_reward: float) -> str:
     """What a reader must know of every table made of these curves."""
-    learned_with = (
-        " Default hyperparameters are those of the agent that the RNs were learned with, not the "
-        "paper's."
-    )
+    learned_with = " Default hyperparameters are those that the RNs were learned with."
     return (
         f"up to {settings.max_steps:,} training steps or {settings.study.max_episodes:,} episodes, "
         "one greedy test episode after each. Steps to solve: until the mean of "
         f"{curves.WINDOW} tests in a row reaches {solved_reward:g}; an agent that never "
-        f"does counts {settings.max_steps:,}. The share of the bare agent's is of as many groups, "
-        "of the same seeds. Where episodes end before the steps do, a curve and its mean go on as "
-        "the last test. In brackets bootstrap 95% intervals, for at least "
-        f"five RNs: they draw RNs, and agents on the real task.{iqm_note('within each RN')}"
-        f"{'' if settings.study.agent else learned_with}"
+        f"does counts {settings.max_steps:,}. The bare agent's are of as many groups, of the same "
+        "seeds. Curves that end early go on as the last test. "
+        f"{interval_note('RNs, over agents on the real task')}"
+        f"{iqm_note('within each RN')}{'' if settings.study.agent else learned_with}"
     )
 
 

@@ -18,14 +18,16 @@ import pandas as pd
 
 import sejax
 from experiments.common.agents import HPARAMS, Condition, groups_at_once, train_groups
-from experiments.common.experiment import Settings, count, each_of, setting
-from experiments.common.tables import iqm_columns, mean_columns
+from experiments.common.experiment import Settings, count, setting
+from experiments.common.tables import iqm_columns, mean_columns, summary_by
+from sejax import ProxySet
 from sejax.cli import config as configuration
 from sejax.cli import run_directory, session
-from sejax.cli.config import JOINT, key_of
+from sejax.cli.compose import key_of
+from sejax.cli.config import JOINT
 from sejax.cli.progress import Tally
 from sejax.ops.files import write_text
-from sejax.options import ConfigError, positive, registry, require, shortened
+from sejax.options import ConfigError, each_of, positive, registry, require
 
 UNLIMITED = 100_000  # generations of a run that its budget ends
 
@@ -34,10 +36,10 @@ UNLIMITED = 100_000  # generations of a run that its budget ends
 class RunSettings(Settings):
     """Settings about the NES runs."""
 
-    env: str = setting("cartpole", about="task: cartpole, acrobot, ...")
-    generations: int | None = count(None, "generations", about="outer iterations; the preset's")
-    preset: str = setting("best", about="of the NES runs: best, paper, for SEs paper_performance")
-    run: tuple[str, ...] = setting((), about="overrides of the NES runs, or as below")
+    env: str = setting("cartpole")  # task: cartpole, acrobot, ...
+    generations: int | None = count(None)  # outer iterations; the preset's
+    preset: str = setting("best")  # of the NES runs: best, paper, for SEs paper_performance
+    run: tuple[str, ...] = setting(())  # overrides of the NES runs, or as below
 
     def learn_config(self, overrides: Iterable[str]) -> Any:
         """The configuration of the NES runs with these overrides; those of `run` win."""
@@ -97,13 +99,11 @@ def _learn_one(
 
 def _require_no_more(config: Any, curve: pd.DataFrame) -> None:
     there = int(curve["generation"].max()) + 1 if len(curve) else 0
-    reason = f"a run in {config.run_dir} has so many, and its proxy is the best of all"
-    fix = f"generations={there}, or another folder"
     require(
         there <= config.generations,
         "generations",
-        f"must be at least {there}, because {reason}; got {shortened(config.generations)}. Set "
-        f"{fix}.",
+        f"must be at least {there}, as the run in {config.run_dir} has so many; got "
+        f"{config.generations}. Set generations={there}, or another folder.",
     )
 
 
@@ -185,7 +185,7 @@ def read_costs(path: Path, generations: int) -> np.ndarray:
         return np.array([])
     except ValueError as error:
         raise ConfigError(
-            f"work must hold whole files; {path} is damaged. Set work=DIR."
+            f"work must hold whole files; {path} is damaged. Set work=DIR.", "work"
         ) from error
 
 
@@ -212,19 +212,14 @@ QUICK_AGENT = {"hidden_size": 32, "batch_size": 32, "num_layers": 1, "warmup_epi
 class MixtureRuns(RunSettings):
     """Settings about SEs that are learned with some kinds of agents and tested with others."""
 
-    runs: int = count(5, "runs", quick=2, about="NES runs of each, of the same seeds everywhere")
-    tested: tuple[str, ...] = setting((), about="kinds of agents that SEs are tested with")
-    tested_hparams: tuple[str, ...] = setting(
-        HPARAMS,
-        each_of(HPARAMS),
-        quick=("default",),
-        about="their hyperparameters; varied: drawn for each",
-    )
-    num_agents: int = count(10, "agents", quick=4, about="of each kind on each SE")
-    test_episodes: int = count(10, "episodes", about="of each agent")
-    cpu_budget_s: float | None = setting(
-        None, positive("it is time"), about="CPU seconds of a run, without compilation"
-    )
+    runs: int = count(5, quick=2)  # NES runs of each, of the same seeds everywhere
+    tested: tuple[str, ...] = setting(())  # kinds of agents that SEs are tested with
+    # Their hyperparameters; varied: drawn for each.
+    tested_hparams: tuple[str, ...] = setting(HPARAMS, each_of(HPARAMS), quick=("default",))
+    num_agents: int = count(10, quick=4)  # of each kind on each SE
+    test_episodes: int = count(10)  # of each agent
+    # CPU seconds of a run, without compilation.
+    cpu_budget_s: float | None = setting(None, positive("it is time"))
 
     def config_with(self, kinds: Sequence[str], others: Iterable[str], words: Any = ()) -> Any:
         """The configuration of NES runs with these kinds of agents.
@@ -255,7 +250,7 @@ class MixtureRuns(RunSettings):
         collect(configs, path)
         return curves, sejax.load_set(path)
 
-    def evaluate(self, name: str, ses: Any, config: Any) -> pd.DataFrame:
+    def evaluate(self, name: str, ses: ProxySet, config: Any) -> pd.DataFrame:
         """Agents of one kind on each SE of a set, a row each.
 
         Args:
@@ -293,18 +288,17 @@ def summarise_tests(agents: pd.DataFrame, by: list[str], solved_reward: float) -
     The mean's interval draws SEs, of which there must be five, and agents where there is one SE;
     that of the interquartile mean draws agents within their SE.
     """
-    rows = []
-    for values, mine in agents.groupby(by, sort=False):
-        returns = mine["test_return"]
-        of_ses = returns.groupby(mine["seed"]).mean()
-        rows.append(
-            dict(zip(by, values, strict=True))
-            | {"num_ses": len(of_ses), "num_agents": len(mine)}
-            | mean_columns(returns, "test_return", of_ses if len(of_ses) > 1 else returns)
+
+    def statistics(mine: pd.DataFrame) -> dict[str, float]:
+        returns, num_ses = mine["test_return"], mine["seed"].nunique()
+        return (
+            {"num_ses": num_ses, "num_agents": len(mine)}
+            | mean_columns(returns, "test_return", mine["seed"] if num_ses > 1 else None)
             | iqm_columns(returns, "test_return", mine["seed"])
             | {"solved": (returns >= solved_reward).mean()}
         )
-    return pd.DataFrame(rows)
+
+    return summary_by(agents, by, statistics)
 
 
 def kinds_in(mixture: str) -> list[str]:

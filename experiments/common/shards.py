@@ -18,7 +18,7 @@ import pandas as pd
 
 from sejax.ops.files import atomic_path, write_text
 from sejax.options import ConfigError
-from sejax.options.registry import differences
+from sejax.options.plain import differences
 
 # Training steps grow along each curve: kept as differences, a table takes two thirds of the room.
 _GROWING, _DIFFERENCES = "steps", "steps_since_the_row_before"
@@ -85,8 +85,9 @@ class Shards:
         differing = differences(stored["settings"], settings, most=3)
         if differing:
             raise ConfigError(
-                f"work must be a new folder or that of the same experiment, because shards are "
-                f"used again; {path} differs in {differing}. Set work=DIR."
+                f"work must be a new folder or that of the same experiment; {path} differs in "
+                f"{differing}. Set work=DIR.",
+                "work",
             )
         return pd.read_csv(io.StringIO(text))
 
@@ -115,12 +116,14 @@ def read_rows(path: Path) -> pd.DataFrame:
         rows = pd.read_csv(path, low_memory=False)  # a column has one type throughout
     except FileNotFoundError as error:
         raise ConfigError(
-            f"from_rows needs stored rows; there is no {path}. Set from_rows=false, or out=DIR."
+            f"from_rows needs stored rows; there is no {path}. Set from_rows=false, or out=DIR.",
+            "from_rows",
         ) from error
     except (EOFError, lzma.LZMAError, ValueError) as error:  # pandas' errors are ValueErrors
         raise ConfigError(
             f"from_rows needs whole rows; {path} is damaged ({' '.join(str(error).split())[:80]}). "
-            "Restore the file, or set from_rows=false to make it again."
+            "Restore the file, or set from_rows=false to make it again.",
+            "from_rows",
         ) from error
     if _DIFFERENCES in rows:
         rows = rows.assign(**{_DIFFERENCES: rows[_DIFFERENCES].cumsum()})

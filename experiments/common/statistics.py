@@ -1,24 +1,61 @@
-"""Statistics of scores over runs and tasks, as the field reports them.
+"""Statistics of scores over runs and tasks, and their 95% intervals.
 
-Scores come in *strata*: an array of runs, `[run]`, for each task, or for each proxy that agents
-were trained on; strata may differ in length. A single array is a single stratum. Where strata are
-themselves samples (learned proxies that stand for others), give their means as a single one.
+Intervals of means are Student's, those of interquartile means Tukey and McLaughlin's, which is
+Student's for trimmed means. Percentile bootstraps of 5 to 10 values cover the truth in 80 to 90% of
+the cases in place of 95%; BCa ones are no better there. Of fewer than `LEAST` values there is no
+interval.
 
-Source: Agarwal et al., "Deep Reinforcement Learning at the Edge of the Statistical Precipice"
-(2021), sections 4.1 to 4.3; their library rliable, which takes matrices `[run, task]`.
+For runs that are drawn within *strata* (agents within the proxy that trained them), of which there
+are many, there is the stratified bootstrap. Strata are arrays `[run]` and may differ in length; a
+single array is a single stratum.
+
+Source: Tukey and McLaughlin, "Less vulnerable confidence and significance procedures for location
+based on a single sample" (1963); Agarwal et al., "Deep Reinforcement Learning at the Edge of the
+Statistical Precipice" (2021), sections 4.1 to 4.3, and their library rliable, which takes matrices
+`[run, task]`.
 """
 
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
+from scipy.stats import t as student
+from scipy.stats.mstats import winsorize
 
 LEVEL, NUM_RESAMPLES = 0.95, 2000
+LEAST = 5  # independent values of an interval: the range of two holds the median half of the time
+NONE = (float("nan"), float("nan"))  # of fewer
 
 
-def mean(scores: Any) -> Any:
-    """Mean over the last axis: `[..., run] -> [...]`."""
-    return np.mean(scores, axis=-1)
+def mean_interval(values: Any, level: float = LEVEL) -> tuple[float, float]:
+    """Student's confidence interval of the mean of independent values `[n]`; `NONE` if n < `LEAST`.
+
+    Average what belongs together before, such as the agents that one proxy trained.
+    """
+    values = np.asarray(values, float)
+    if values.size < LEAST:
+        return NONE
+    half = student.ppf((1 + level) / 2, values.size - 1) * values.std(ddof=1) / values.size**0.5
+    return float(values.mean() - half), float(values.mean() + half)
+
+
+def iqm_interval(values: Any, level: float = LEVEL) -> tuple[float, float]:
+    r"""Confidence interval of the interquartile mean of independent values `[n]`, likewise.
+
+    .. math:: IQM \pm t_{h - 1} s_w \sqrt{(n - 1) / (h (h - 1))}
+
+    where h of the n values are left by trimming, and :math:`s_w` is the deviation of all of them
+    after each trimmed one took the value of the nearest one that is left.
+    """
+    values = np.asarray(values, float)
+    size, kept = values.size, values.size - 2 * (values.size // 4)
+    if size < LEAST:
+        return NONE
+    deviation = np.asarray(winsorize(values, 0.25)).std(ddof=1)
+    half = student.ppf((1 + level) / 2, kept - 1) * deviation
+    half *= np.sqrt((size - 1) / (kept * (kept - 1)))
+    middle = interquartile_mean(values)
+    return float(middle - half), float(middle + half)
 
 
 def interquartile_mean(scores: Any) -> Any:
@@ -34,15 +71,14 @@ def interquartile_mean(scores: Any) -> Any:
 
 def bootstrap_interval(
     *strata: Any,
-    statistic: Callable[[Any], Any] = mean,
+    statistic: Callable[[Any], Any] = interquartile_mean,
     level: float = LEVEL,
     num_resamples: int = NUM_RESAMPLES,
     seed: int = 0,
 ) -> tuple[float, float]:
     """Percentile confidence interval of a statistic of all runs: the stratified bootstrap.
 
-    Runs are drawn again, with replacement, within each stratum. They must be independent: average
-    what belongs together before.
+    Runs are drawn again, with replacement, within each stratum. `NONE` for fewer than `LEAST` runs.
 
     Args:
       *strata: runs of each, `[run]`.
@@ -51,8 +87,10 @@ def bootstrap_interval(
       num_resamples: how often all runs are drawn.
       seed: of the draws.
     """
-    rng = np.random.default_rng(seed)
-    low, high = _ends(statistic(_resamples(rng, strata, num_resamples)), level)
+    resamples = _resamples(np.random.default_rng(seed), strata, num_resamples)
+    if resamples.shape[1] < LEAST:
+        return NONE
+    low, high = _ends(statistic(resamples), level)
     return float(low), float(high)
 
 
@@ -80,41 +118,6 @@ def performance_profile(
     resamples = _resamples(np.random.default_rng(seed), strata, num_resamples)
     low, high = _ends(np.array([fractions(runs) for runs in resamples]), level)
     return fractions(np.concatenate(strata)), low, high
-
-
-def probability_of_improvement(
-    strata: Sequence[Any],
-    others: Sequence[Any],
-    *,
-    level: float = LEVEL,
-    num_resamples: int = NUM_RESAMPLES,
-    seed: int = 0,
-) -> tuple[float, float, float]:
-    """Probability that a run beats one of the others, averaged over strata, and its interval.
-
-    A tie counts half: Mann and Whitney's statistic as a share of all pairs.
-
-    Args:
-      strata: runs of each, `[run]`.
-      others: those that they are compared with, of the same strata.
-      level, num_resamples, seed: as of `bootstrap_interval`.
-
-    Returns:
-      Probability, lower and upper end.
-    """
-    rng = np.random.default_rng(seed)
-    estimates, drawn = [], []
-    for runs, other_runs in zip(strata, others, strict=True):
-        estimates.append(_share_won(np.asarray(runs), np.asarray(other_runs)))
-        both = (_resamples(rng, [each], num_resamples) for each in (runs, other_runs))
-        drawn.append([_share_won(*pair) for pair in zip(*both, strict=True)])
-    low, high = _ends(np.mean(drawn, axis=0), level)
-    return float(np.mean(estimates)), float(low), float(high)
-
-
-def _share_won(runs: np.ndarray, others: np.ndarray) -> float:
-    """Share of the pairs of `[run]` and `[run]` in which the first is higher; a tie is a half."""
-    return float((1 + np.sign(runs[:, None] - others)).mean() / 2)
 
 
 def _resamples(rng: np.random.Generator, strata: Sequence[Any], count: int) -> np.ndarray:

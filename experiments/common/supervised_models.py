@@ -9,7 +9,7 @@ import functools
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -20,12 +20,16 @@ import pandas as pd
 import sejax
 from experiments.common import agents
 from experiments.common.agents import HPARAMS, SE_AGENTS, SOFT_SE
-from experiments.common.experiment import Settings, count, each_of, setting
+from experiments.common.experiment import Settings, count, setting
+from sejax import ProxySet
+from sejax.bilevel import make_bilevel
 from sejax.cli import config as configuration
+from sejax.evaluation import make_evaluator, num_parallel_on_cpu
 from sejax.ops.parallel import spread_over_devices
-from sejax.options import registry
+from sejax.options import each_of, registry
 
 LEARNING_RATE, BATCH_SIZE = 1e-4, 1024  # paper and docs/reference.md 7.5
+DRAWN = "_drawn"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,24 +38,20 @@ class SupervisedBaseline(Settings):
 
     name = "supervised_baseline"
 
-    proxy: str = setting(SOFT_SE, about="SE to compare with; run directory, file or shipped name")
-    models: int = count(5, "models", quick=2, about="NES runs, and a model for each")
-    generations: int = count(25, "generations", quick=3, about="of an NES run")
-    population: int = count(16, "candidates", least=2, quick=3, about="of a generation")
-    max_rows: int = count(100_000, "transitions", quick=3000, about="transitions for a model")
-    epochs: int = count(100, "epochs", quick=20, about="of a fit")
-    agents: tuple[str, ...] = setting(
-        ("ddqn",), each_of(SE_AGENTS), about=f"of {', '.join(SE_AGENTS)}"
-    )
-    hparams: tuple[str, ...] = setting(
-        HPARAMS, each_of(HPARAMS), about="of the agents; varied: drawn for each"
-    )
-    num_agents: int = count(20, "agents", quick=2, about="for each model")
-    test_episodes: int = count(10, "episodes", about="of each agent")
-    max_steps: int | None = count(None, "steps", about="of an agent on a model; as on the SE")
+    proxy: str = setting(SOFT_SE)  # SE to compare with; run directory, file or shipped name
+    models: int = count(5, quick=2)  # NES runs, and a model for each
+    generations: int = count(25, quick=3)  # of an NES run
+    population: int = count(16, least=2, quick=3)  # candidates of a generation
+    max_rows: int = count(100_000, quick=3000)  # transitions for a model
+    epochs: int = count(100, quick=20)  # of a fit
+    agents: tuple[str, ...] = setting(("ddqn",), each_of(SE_AGENTS))  # ddqn, dueling_ddqn, ...
+    hparams: tuple[str, ...] = setting(HPARAMS, each_of(HPARAMS))  # varied: drawn for each agent
+    num_agents: int = count(20, quick=2)  # for each model
+    test_episodes: int = count(10)  # of each agent
+    max_steps: int | None = count(None)  # of an agent on a model; as on the SE
 
 
-def learning_config(settings: SupervisedBaseline, ses: Any) -> Any:
+def learning_config(settings: SupervisedBaseline, ses: ProxySet) -> Any:
     """Settings of the NES runs that the transitions come from."""
     config = configuration.learn_config(ses.config)
     agent, training = config.agent, config.training
@@ -75,7 +75,7 @@ def learning_config(settings: SupervisedBaseline, ses: Any) -> Any:
     )
 
 
-def collect_all(settings: SupervisedBaseline, ses: Any) -> list[pd.DataFrame]:
+def collect_all(settings: SupervisedBaseline, ses: ProxySet) -> list[pd.DataFrame]:
     """The transitions of each NES run; every run is a shard."""
     config = learning_config(settings, ses)
     made_with = configuration.plain(config) | {"max_rows": settings.max_rows, "devices": None}
@@ -95,29 +95,24 @@ def collect_all(settings: SupervisedBaseline, ses: Any) -> list[pd.DataFrame]:
 
 def collect(config: Any, seed: int, max_rows: int) -> pd.DataFrame:
     """Runs NES and draws transitions, all equally likely, from its agents' real test episodes."""
-    run = make_recorded_run(config)
-    state = run.init(jax.random.key(seed))
-    sample = Sample(max_rows, np.random.default_rng(seed))
+    init, generation = make_recorded_run(config)
+    state, rng = init(jax.random.key(seed)), np.random.default_rng(seed)
+    kept = None
     for number in range(config.generations):
-        state, steps = run.generation(state)
-        sample.add(table_of(jax.device_get(steps), config.training.test_episodes, number))
-    return sample.table
-
-
-class RecordedRun(NamedTuple):
-    """An NES run whose agents' tests are recorded; compiled functions."""
-
-    init: Callable[[Any], Any]  # key -> LearnState
-    # state -> (state, Steps): a generation, and the steps of all tests, [evaluation, step, ...]
-    generation: Callable[[Any], Any]
+        state, steps = generation(state)
+        rows = table_of(jax.device_get(steps), config.training.test_episodes, number)
+        kept = sampled(kept, rows, max_rows, rng)
+    return pd.DataFrame() if kept is None else kept.drop(columns=DRAWN)
 
 
 @functools.cache
-def make_recorded_run(config: Any) -> RecordedRun:
-    """The NES run of a configuration, from any seed: compiled once for all of them."""
-    from sejax.bilevel import make_bilevel
-    from sejax.evaluation import make_evaluator, num_parallel_on_cpu
+def make_recorded_run(config: Any) -> tuple[Callable[[Any], Any], Callable[[Any], Any]]:
+    """The NES run of a configuration, whose agents' tests are recorded, compiled for any seed.
 
+    Returns:
+      `init(key) -> state`, and `generation(state) -> (state, Steps)`, which makes a generation; the
+      steps are those of all tests, `[evaluation, step, ...]`.
+    """
     bilevel = make_bilevel(**config.parts())
     proxy, training = bilevel.proxy, bilevel.training
     (agent,) = bilevel.mixture.agents
@@ -135,7 +130,7 @@ def make_recorded_run(config: Any) -> RecordedRun:
         state, _ = bilevel.tell(state, candidates, outcome)
         return state, steps
 
-    return RecordedRun(init=jax.jit(bilevel.init), generation=jax.jit(generation))
+    return jax.jit(bilevel.init), jax.jit(generation)
 
 
 def table_of(steps: Any, num_episodes: int, generation: int) -> pd.DataFrame:
@@ -160,24 +155,22 @@ def table_of(steps: Any, num_episodes: int, generation: int) -> pd.DataFrame:
     )
 
 
-class Sample:
-    """A uniform sample without replacement of all rows that were ever added."""
+def sampled(
+    kept: pd.DataFrame | None, rows: pd.DataFrame, size: int, rng: np.random.Generator
+) -> pd.DataFrame:
+    """A uniform sample without replacement of all rows so far, in random order.
 
-    def __init__(self, size: int, rng: np.random.Generator):
-        self.size = size
-        self._rng = rng
-        self._rows: pd.DataFrame | None = None
+    Every row draws a number, the column `DRAWN`, and those with the lowest numbers stay.
 
-    def add(self, rows: pd.DataFrame) -> None:
-        """Every row draws a number, and those with the lowest numbers stay."""
-        rows = rows.assign(_drawn=self._rng.uniform(size=len(rows)))
-        rows = rows if self._rows is None else pd.concat([self._rows, rows], ignore_index=True)
-        self._rows = rows.nsmallest(self.size, "_drawn").reset_index(drop=True)
-
-    @property
-    def table(self) -> pd.DataFrame:
-        """The sample, in random order."""
-        return pd.DataFrame() if self._rows is None else self._rows.drop(columns="_drawn")
+    Args:
+      kept: the sample of the rows before; None if there are none.
+      rows: new ones.
+      size: of the sample, at most.
+      rng: draws the numbers.
+    """
+    rows = rows.assign(**{DRAWN: rng.uniform(size=len(rows))})
+    rows = rows if kept is None else pd.concat([kept, rows], ignore_index=True)
+    return rows.nsmallest(size, DRAWN).reset_index(drop=True)
 
 
 def summary_of(data: list[pd.DataFrame]) -> pd.DataFrame:
@@ -200,7 +193,9 @@ def model_file(settings: SupervisedBaseline, variant: str) -> Path:
     return settings.folder / f"models-{variant}.safetensors"
 
 
-def fit_shard(settings: SupervisedBaseline, ses: Any, data: list[pd.DataFrame]) -> pd.DataFrame:
+def fit_shard(
+    settings: SupervisedBaseline, ses: ProxySet, data: list[pd.DataFrame]
+) -> pd.DataFrame:
     """Fits all models, stores both variants of them, and returns the errors of each epoch."""
     num_rows = min(len(rows) for rows in data)
     made_with = {
@@ -220,7 +215,7 @@ def fit_shard(settings: SupervisedBaseline, ses: Any, data: list[pd.DataFrame]) 
     return fits
 
 
-def fit_all(settings: Any, ses: Any, data: list[pd.DataFrame], num_rows: int) -> pd.DataFrame:
+def fit_all(settings: Any, ses: ProxySet, data: list[pd.DataFrame], num_rows: int) -> pd.DataFrame:
     """Fits a model to each run's transitions and writes the models; a row for each epoch."""
     arrays = [arrays_of(rows.iloc[:num_rows]) for rows in data]
     stacked = tuple(np.stack(parts) for parts in zip(*arrays, strict=True))
@@ -283,7 +278,7 @@ def make_fit(env: Any, num_rows: int, epochs: int) -> Callable[..., Any]:
     return fit
 
 
-def save_models(settings: Any, ses: Any, weights: Any, variant: str, done: str) -> None:
+def save_models(settings: Any, ses: ProxySet, weights: Any, variant: str, done: str) -> None:
     """Stores the models of a variant, as SEs with their use of the done output."""
     env = registry.make("proxy", dataclasses.replace(ses.env.config, done=done), ses.task)
     each = [jax.tree.map(lambda x, i=i: x[i], weights) for i in range(settings.models)]

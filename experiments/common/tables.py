@@ -1,6 +1,6 @@
 """Tables: means with intervals as columns, columns as texts, and writing a table."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -9,46 +9,60 @@ from rich.console import Console
 from rich.table import Table
 
 from experiments.common.experiment import Settings
-from experiments.common.statistics import bootstrap_interval, interquartile_mean
+from experiments.common.statistics import (
+    LEAST,
+    bootstrap_interval,
+    interquartile_mean,
+    iqm_interval,
+    mean_interval,
+)
 from sejax.ops.files import write_text
 
-LEAST_FOR_INTERVAL = 5  # independent values: two bracket the truth half of the time
 
-
-def interval(draws: Any, least: int = LEAST_FOR_INTERVAL) -> tuple[float, float]:
-    """95% bootstrap interval of the mean of what is drawn again; nan for fewer than `least`."""
-    return bootstrap_interval(draws) if len(draws) >= least else (np.nan, np.nan)
-
-
-def mean_columns(
-    values: Any, name: str, draws: Any = None, least: int = LEAST_FOR_INTERVAL
-) -> dict[str, float]:
-    """Mean, std and `interval` as columns `NAME_mean`, `NAME_std`, `NAME_low`, `NAME_high`.
+def mean_columns(values: pd.Series, name: str, groups: pd.Series | None = None) -> dict[str, float]:
+    """Mean, std and `mean_interval` as columns `NAME_mean`, `NAME_std`, `NAME_low`, `NAME_high`.
 
     Args:
       values: `[n]`.
       name: of the columns.
-      draws: what the interval draws again, such as the means of groups; the values if not given.
-      least: how many of them give an interval.
+      groups: labels of the values, such as the proxies of agents. Values of one group are not
+        independent: the interval is that of the groups' means.
     """
-    values = np.asarray(values, float)
-    low, high = interval(values if draws is None else draws, least)
-    columns = {"mean": values.mean(), "std": values.std(), "low": low, "high": high}
+    low, high = mean_interval(values if groups is None else values.groupby(groups).mean())
+    each = values.to_numpy(float)
+    columns = {"mean": each.mean(), "std": each.std(), "low": low, "high": high}
     return {f"{name}_{statistic}": value for statistic, value in columns.items()}
 
 
-def in_strata(values: pd.Series, labels: pd.Series | None) -> list[pd.Series]:
+def summary_by(
+    rows: pd.DataFrame, by: Sequence[str], statistics: Callable[[pd.DataFrame], Mapping[str, Any]]
+) -> pd.DataFrame:
+    """A row for each combination of values of the columns `by`, in the order of the rows.
+
+    Args:
+      rows: the table.
+      by: names of columns, which the summary has too.
+      statistics: further columns of a row, of the rows with its values.
+    """
+    groups = rows.groupby(list(by), sort=False)
+    return pd.DataFrame(
+        [dict(zip(by, values, strict=True)) | {**statistics(mine)} for values, mine in groups]
+    )
+
+
+def in_strata(values: pd.Series, groups: pd.Series | None) -> list[pd.Series]:
     """Values apart by their labels; all together where there are none."""
-    return [values] if labels is None else [mine for _, mine in values.groupby(labels)]
+    return [values] if groups is None else [mine for _, mine in values.groupby(groups)]
 
 
-def iqm_columns(values: pd.Series, name: str, strata: pd.Series | None = None) -> dict[str, float]:
+def iqm_columns(values: pd.Series, name: str, groups: pd.Series | None = None) -> dict[str, float]:
     """Interquartile mean and its interval as columns `NAME_iqm`, `NAME_iqm_low`, `NAME_iqm_high`.
 
-    The values are drawn again within their strata, which are labels of them.
+    Values with labels are drawn again within their groups; without, they are independent.
     """
-    ends = bootstrap_interval(*in_strata(values, strata), statistic=interquartile_mean)
-    columns = {"iqm": interquartile_mean(values), "iqm_low": ends[0], "iqm_high": ends[1]}
+    strata = in_strata(values, groups)
+    low, high = iqm_interval(values) if groups is None else bootstrap_interval(*strata)
+    columns = {"iqm": interquartile_mean(values), "iqm_low": low, "iqm_high": high}
     return {f"{name}_{statistic}": value for statistic, value in columns.items()}
 
 
@@ -57,28 +71,36 @@ def brackets(low: float, high: float, digits: int) -> str:
     return f" [{low:,.{digits}f}, {high:,.{digits}f}]" if np.isfinite(low) else ""
 
 
-def mean_text(name: str, digits: int, std: bool = False) -> Callable[[Any], str]:
-    """Makes `mean ± std [low, high]` of a row with the columns of `mean_columns`."""
+def with_interval(value: str, ends: str, digits: int, std: str = "") -> Callable[[Any], str]:
+    """Makes `value ± std [ends_low, ends_high]` of a row with columns of these names."""
 
     def text(row: Any) -> str:
-        mean, low, high = (getattr(row, f"{name}_{end}") for end in ("mean", "low", "high"))
-        spread = f" ± {getattr(row, f'{name}_std'):,.{digits}f}" if std else ""
-        return f"{mean:,.{digits}f}{spread}{brackets(low, high, digits)}"
+        spread = f" ± {getattr(row, std):,.{digits}f}" if std else ""
+        low, high = getattr(row, f"{ends}_low"), getattr(row, f"{ends}_high")
+        return f"{getattr(row, value):,.{digits}f}{spread}{brackets(low, high, digits)}"
 
     return text
 
 
-def iqm_text(name: str) -> str:
-    """The format of the columns of `iqm_columns` for `as_texts`."""
-    return f"{{{name}_iqm:,.1f}} [{{{name}_iqm_low:,.1f}}, {{{name}_iqm_high:,.1f}}]"
+def mean_text(name: str, digits: int, std: bool = False) -> Callable[[Any], str]:
+    """Makes a text of the columns of `mean_columns`."""
+    return with_interval(f"{name}_mean", name, digits, f"{name}_std" if std else "")
+
+
+def iqm_text(name: str) -> Callable[[Any], str]:
+    """Makes a text of the columns of `iqm_columns`."""
+    return with_interval(f"{name}_iqm", f"{name}_iqm", 1)
+
+
+def interval_note(of: str) -> str:
+    """What a reader must know of means' intervals, and what they take as independent."""
+    return f"In brackets Student's 95% interval over {of}, none for fewer than {LEAST}."
 
 
 def iqm_note(where: str = "", of: str = "agents") -> str:
-    """What a reader must know of such columns, and within what is drawn."""
-    return (
-        f" IQM: the interquartile mean over {of}, in brackets a stratified bootstrap 95% "
-        f"interval, which draws {' '.join(filter(None, (of, where)))}."
-    )
+    """The same of interquartile means."""
+    how = f", within SEs or RNs by a stratified bootstrap ({of} {where})" if where else ""
+    return f" IQM: the interquartile mean over {of}, with its 95% interval{how}."
 
 
 def as_texts(

@@ -84,9 +84,8 @@ def make_agent(
     require(
         isinstance(task, TaskSpec),
         "task",
-        "must be a sejax.Task, because an agent is made for its spaces; got "
-        f"{type(task).__name__}. Set task to env.task, or sejax.Task(name=..., "
-        "env=env).",
+        f"must be a sejax.Task; got {type(task).__name__}. Set task to env.task, or "
+        "sejax.Task(name=..., env=env).",
     )
     require_fit(config, exploration, task, task.name)
     is_key = registry.is_hashable(config) and registry.is_hashable(exploration)
@@ -126,39 +125,34 @@ def require_fit(
     Raises:
       ConfigError: if it cannot.
     """
-    for value, kind, example in (
-        (agent, AgentConfig, "DDQNConfig"),
-        (exploration, ExplorationConfig, "ICMConfig"),
-    ):
+    for value, kind in ((agent, AgentConfig), (exploration, ExplorationConfig)):
         require(
             isinstance(value, kind),
             kind.group,
-            f"must be a sejax.agents.{kind.__name__}, because it says what it fits and makes; got "
-            f"{shortened(value)}. Set {kind.group} to such as sejax.{example}().",
+            f"must be a sejax.agents.{kind.__name__}; got {shortened(value)}. Set {kind.group} to "
+            f"an instance of a subclass.",
         )
+    agent_name = registry.name_of("agent", agent)
     if not _fits(agent, spec):
         fitting = [name for name in names() if _fits(registry.find("agent", name), spec)]
         require(
             False,
             "agent",
-            f"must be one of {', '.join(fitting)} in {task_name}, because its states are "
-            f"{spec.states} and its actions {spec.actions}; got "
-            f"{shortened(registry.name_of('agent', agent))}. Set agent={fitting[0]}.",
+            f"must be one of {', '.join(fitting)} in {task_name}, with {spec.states} states and "
+            f"{spec.actions} actions; got {shortened(agent_name)}. Set agent={fitting[0]}.",
         )
+    exploration_name = shortened(registry.name_of("exploration", exploration))
     require(
         agent.learns_each_step or not exploration.needs_each_step,
         "exploration",
-        "must be none with this agent's train_every and gradient_steps, because its module learns "
-        "once at each step, and so must the agent; got "
-        f"{shortened(registry.name_of('exploration', exploration))}. Set exploration=none, or both "
-        "of these to 1.",
+        "must be none where the agent's train_every or gradient_steps is not 1; got "
+        f"{exploration_name}. Set exploration=none, or both of these to 1.",
     )
     require(
         exploration.states is None or agent.states in (None, exploration.states),
         "exploration",
-        f"must fit {registry.name_of('agent', agent)}, because it is made for agents with "
-        f"{exploration.states} states; got "
-        f"{shortened(registry.name_of('exploration', exploration))}. Set exploration=none.",
+        f"must be one for {agent.states} states with agent={shortened(agent_name)}; got "
+        f"{exploration_name}. Set exploration=none.",
     )
 
 

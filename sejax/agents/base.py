@@ -4,21 +4,20 @@ import collections
 import functools
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, ClassVar, NamedTuple, Protocol
+from typing import ClassVar, NamedTuple, Protocol, TypeAlias, TypeVar
 
 import jax
-from jaxtyping import Array, Int
+from jaxtyping import Array, Int, PyTree
 
 from sejax.agents.buffers import BufferMaker
 from sejax.envs.base import Task
-from sejax.envs.environment import spaces_of
+from sejax.envs.environment import Environment, spaces_of
 from sejax.envs.spec import Discrete, Space
 from sejax.options import Options, counts, option, traced_options
 
-# A pytree of what the agent needs; only the agent reads it.
-AgentState = Any
-# Traced hyperparameters of an agent: a pytree of floats, see `traced`.
-Hparams = Any
+AgentState: TypeAlias = PyTree  # what the agent needs; only the agent reads it
+T = TypeVar("T")
+Hparams: TypeAlias = PyTree  # traced hyperparameters of an agent, floats: see `traced`
 
 
 class ActFn(Protocol):
@@ -43,7 +42,7 @@ class Spaces(NamedTuple):
     action_dim: int
 
     @classmethod
-    def of_env(cls, env: Any) -> "Spaces":
+    def of_env(cls, env: Environment) -> "Spaces":
         """Those of an environment, or of a proxy."""
         return cls.of_spaces(*spaces_of(env))
 
@@ -103,7 +102,7 @@ class Agent:
 
     init: Callable[[Array, Hparams], AgentState]
     act: ActFn
-    update: Callable[[Array, AgentState, Any], AgentState]
+    update: Callable[[Array, AgentState, PyTree], AgentState]
     buffer: BufferMaker
     hparams: Hparams
     spec: AgentSpec = AgentSpec()
@@ -112,9 +111,9 @@ class Agent:
     discount: Callable[[Hparams], Array | float | None] = lambda hparams: None
     batch_size: Callable[[AgentState], Array | None] = lambda state: None
     varied: "Varied | None" = None
-    solve: Callable[[Any, Any, Hparams], AgentState] | None = None
+    solve: Callable[[Environment, PyTree, Hparams], AgentState] | None = None
 
-    def fresh(self, make_run: Callable[["Agent"], Callable[..., Any]]) -> Callable[..., Any]:
+    def fresh(self, make_run: Callable[["Agent"], Callable[..., T]]) -> Callable[..., T]:
         """Builds `run(key, *args)` for a fresh agent, whose hyperparameters may be drawn first.
 
         Args:
@@ -129,7 +128,7 @@ class Agent:
             return lambda key, *args: run_self(key, *args, self.hparams)
         draw, runs = self.varied.draw, [make_run(agent) for agent in self.varied.agents]
 
-        def run(key: Array, *args: Any) -> Any:
+        def run(key: Array, *args: PyTree) -> T:
             drawn = draw(drawing_key(key))
             return jax.lax.switch(drawn.variant, runs, key, *args, drawn.hparams)
 
@@ -222,10 +221,9 @@ class AgentOptions(AgentConfig):
     def steps_before_learning(self, max_episode_steps: int, task_max_steps: int) -> int:
         return self.warmup_episodes * max_episode_steps
 
-    def spec(self, **more: Any) -> AgentSpec:
-        """The spec of an agent that learns once it has warmed up, with further fields."""
-        warmup = self.warmup_episodes
-        return AgentSpec(**({"warmup_episodes": warmup, "learns_from": warmup} | more))
+    def spec(self) -> AgentSpec:
+        """The spec of an agent that learns once it has warmed up."""
+        return AgentSpec(warmup_episodes=self.warmup_episodes, learns_from=self.warmup_episodes)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -254,7 +252,7 @@ class NoExploration(ExplorationConfig):
         return agent
 
 
-def traced(config: Any, **more: Any) -> Any:
+def traced(config: Options, **more: float | None) -> Hparams:
     """A configuration's traced hyperparameters, a named tuple of floats.
 
     Args:
@@ -272,7 +270,7 @@ def traced(config: Any, **more: Any) -> Any:
 
 
 @functools.cache
-def _hparams_type(name: str, fields: tuple[str, ...]) -> Any:
+def _hparams_type(name: str, fields: tuple[str, ...]) -> Callable[..., Hparams]:
     return collections.namedtuple(name, fields)
 
 

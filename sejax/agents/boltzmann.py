@@ -14,17 +14,20 @@ Entropy" (2010); Haarnoja et al., "Reinforcement Learning with Deep Energy-Based
 theorem 1, of which a bandit is the case without a next state.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar, NoReturn
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
-from jaxtyping import Array, Float
+from gymnax.environments.environment import Environment
+from jaxtyping import Array, Float, PyTree
 
 from sejax.agents.base import Agent, AgentConfig, Hparams, traced
 from sejax.agents.buffers import no_buffer
+from sejax.envs.base import Task
 from sejax.options import counts, option, positive, require
 
 MOST_DIMS = 2  # of continuous actions: there are num_points to the power of these
@@ -46,7 +49,7 @@ class BoltzmannConfig(AgentConfig):
     # Values of each number of a continuous action, evenly spaced over its range.
     num_points: int = option(33, counts("a policy chooses", least=2))
 
-    def make(self, task: Any) -> Agent:
+    def make(self, task: Task) -> Agent:
         """The agent for a task's actions.
 
         Raises:
@@ -57,9 +60,8 @@ class BoltzmannConfig(AgentConfig):
         require(
             task.action_dim <= MOST_DIMS,
             "agent",
-            f"must be one that learns where actions have more than {MOST_DIMS} numbers, because "
-            "the Boltzmann policy tries every action of a grid; got boltzmann for "
-            f"{task.action_dim} of them. Set agent=sac.",
+            f"must be one that learns where actions have more than {MOST_DIMS} numbers; got "
+            f"boltzmann for {task.action_dim} of them. Set agent=sac.",
         )
         points = np.linspace(-task.max_action, task.max_action, self.num_points, dtype=np.float32)
         grid = np.meshgrid(*[points] * task.action_dim, indexing="ij")
@@ -69,7 +71,7 @@ class BoltzmannConfig(AgentConfig):
 class BoltzmannState(struct.PyTreeNode):
     """One agent: the rewards of its environment, and how it weighs them."""
 
-    reward: Any  # `(obs, action) -> []`, a pytree
+    reward: Callable[[Array, Array], Array]  # `(obs, action) -> []`, a pytree
     hparams: Hparams
 
 
@@ -88,13 +90,12 @@ def make_boltzmann(config: BoltzmannConfig, actions: Array) -> Agent:
       True
     """
 
-    def solve(env: Any, env_params: Any, hparams: Hparams) -> BoltzmannState:
+    def solve(env: Environment, env_params: PyTree, hparams: Hparams) -> BoltzmannState:
         require(
             getattr(env, "is_bandit", False),
             "agent",
-            "must be one that learns, or the proxy an SE whose episodes are one step, because the "
-            f"Boltzmann policy is known there alone; got boltzmann in {env.name}. Set agent=ddqn, "
-            "or proxy.horizon=1.",
+            "must be one that learns, or the proxy an SE whose episodes are one step; got "
+            f"boltzmann in {env.name}. Set agent=ddqn, or proxy.horizon=1.",
         )
         reward = jax.tree_util.Partial(env.bandit_reward, env_params.weights)
         return BoltzmannState(reward=reward, hparams=jax.tree.map(jnp.float32, hparams))
@@ -120,5 +121,5 @@ def log_weights(
     return jax.vmap(state.reward, (None, 0))(obs, actions) / state.hparams.temperature
 
 
-def _needs_no_training(*_: Any) -> Any:
+def _needs_no_training(*_: PyTree) -> NoReturn:
     raise NotImplementedError("the Boltzmann policy is solved for, not trained: Agent.solve")

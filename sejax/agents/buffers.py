@@ -5,17 +5,18 @@ A transition is one float32 row, so that storing is a single write and sampling 
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
 from jax.experimental.xla_metadata import set_xla_metadata
-from jaxtyping import Array, Bool, Float, Int, UInt32
+from jaxtyping import Array, Bool, Float, Int, PyTree, UInt32
 
 from sejax.ops import cpu
 from sejax.ops.keys import murmur, words
 
 Rows = Float[Array, "capacity width"]  # packed transitions, see `pack`
+State = TypeVar("State")  # of an agent
 
 # Columns of the reward and the discount in a packed transition.
 _REWARD, _DISCOUNT = -2, -1
@@ -70,6 +71,18 @@ class Rollout(NamedTuple):
         is_index = is_discrete and action_dim == 1
         return unpack(steps, None if is_index else action_dim)
 
+    def learn_if_full(self, learn: Callable[[State], State], state: State) -> State:
+        """`learn(state)` if the rollout is full; else the state, at next to no cost.
+
+        It is a loop of one trip or none: under `vmap` `lax.cond` would learn in every step and
+        throw it away, whereas this loop runs only when the rollout of some agent is full.
+        """
+
+        def phase(carry: tuple[Array, State]) -> tuple[Array, State]:
+            return jnp.bool_(False), learn(carry[1])
+
+        return jax.lax.while_loop(lambda carry: carry[0], phase, (self.is_full, state))[1]
+
     def with_bonus(self, bonus: Float[Array, " steps"]) -> "Rollout":
         """The same steps with a bonus added to each reward."""
         return self._replace(rows=self.rows.at[:, _REWARD - 1].add(bonus))  # before `ended`
@@ -91,10 +104,10 @@ class Buffer:
         away. By default the batch stays as it is, since most updates always take as long.
     """
 
-    init: Callable[[], Any]
-    store: Callable[[Any, Array, Transition, Array, Array | bool], Any]
-    batch: Callable[[Array, Any, Array, Transition, Array | None], Any]
-    mask: Callable[[Any, Array | bool], Any] = lambda batch, active: batch
+    init: Callable[[], PyTree]
+    store: Callable[[PyTree, Array, Transition, Array, Array | bool], PyTree]
+    batch: Callable[[Array, PyTree, Array, Transition, Array | None], PyTree]
+    mask: Callable[[PyTree, Array | bool], PyTree] = lambda batch, active: batch
 
 
 # `(example, max_steps) -> Buffer`: for transitions like `example`, of which there are at most
@@ -307,7 +320,7 @@ def block_size(width: int) -> int:
     return max(cpu.MIN_BLOCK, cpu.whole_vectors(-(-width // cpu.NUM_BLOCKS)))
 
 
-def sum_over_batch(fn: Callable[[Any], Array], batch: Any, batch_size: Array | None) -> Array:
+def sum_over_batch(fn: Callable[[PyTree], Array], batch: PyTree, batch_size: Array | None) -> Array:
     """Sum of `fn` over the columns of a batch, at the cost of those that are in use.
 
     Args:
@@ -331,7 +344,7 @@ def sum_over_batch(fn: Callable[[Any], Array], batch: Any, batch_size: Array | N
 
     batch = jax.tree.map(pad, batch)
 
-    def block(index: Array) -> Any:
+    def block(index: Array) -> Array:
         def cut(x: Array) -> Array:
             if not jnp.ndim(x):
                 return x
@@ -340,5 +353,6 @@ def sum_over_batch(fn: Callable[[Any], Array], batch: Any, batch_size: Array | N
         return fn(jax.tree.map(cut, batch))
 
     num_blocks = jnp.ceil(batch_size / size).astype(jnp.int32)
-    zero = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(block, num_blocks))
+    shape = jax.eval_shape(block, num_blocks)
+    zero = jnp.zeros(shape.shape, shape.dtype)
     return jax.lax.fori_loop(0, num_blocks, lambda i, total: total + block(i), zero)

@@ -5,7 +5,7 @@ control through deep reinforcement learning" (2015); the paper's hyperparameter 
 `docs/reference.md` 4.1 and 4.2.
 """
 
-import functools
+import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -15,12 +15,13 @@ import jax.numpy as jnp
 import optax
 from flax import linen as nn
 from flax import struct
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Int, PyTree
 
-from sejax.agents.base import Agent, Hparams
+from sejax.agents.base import Agent, AgentSpec, Hparams
 from sejax.agents.buffers import Transition
-from sejax.agents.off_policy import OffPolicyOptions, mean_over_batch, off_policy_agent
+from sejax.agents.off_policy import OffPolicyOptions, adam_step, off_policy_agent, soft_update
 from sejax.agents.policies import decayed_epsilon, epsilon_greedy, select_action
+from sejax.envs.base import Task
 from sejax.ops import cpu, flat
 from sejax.ops.networks import DuelingMLP, init_narrowed
 from sejax.options import MOST_LAYERS, counts, fraction, one_of, option
@@ -54,8 +55,12 @@ class DDQNConfig(OffPolicyOptions):
         is_small = self.num_layers == 1 and self.hidden_size * self.batch_size <= cpu.SMALL_PRODUCT
         return cpu.SMALL_NUM_PARALLEL if is_small else 1
 
-    def make(self, task: Any) -> Agent:
+    def spec(self) -> AgentSpec:
+        return dataclasses.replace(super().spec(), cpu_num_parallel=self.cpu_num_parallel)
+
+    def make(self, task: Task) -> Agent:
         """The agent for a task's observations and actions."""
+        assert task.num_actions is not None
         return make_ddqn(self, task.obs_dim, task.num_actions)
 
     def network(self, num_actions: int) -> nn.Module:
@@ -107,7 +112,6 @@ class DDQNState:
     hparams: Hparams  # traced options, and hidden_size and batch_size in use or None
 
 
-@functools.cache
 def make_ddqn(config: DDQNConfig, obs_dim: int, num_actions: int) -> Agent:
     """Builds the agent for observations `[obs_dim]` and actions `0..num_actions-1`.
 
@@ -121,7 +125,6 @@ def make_ddqn(config: DDQNConfig, obs_dim: int, num_actions: int) -> Agent:
     """
     network = config.network(num_actions)
     unflatten = flat.unflattener(network.init, jnp.zeros(obs_dim))
-    learn = make_learning_step(config, network, unflatten)
 
     def init(key: Array, hparams: Hparams) -> DDQNState:
         params = flat.flatten(init_narrowed(network, key, obs_dim, hparams.hidden_size))
@@ -143,12 +146,11 @@ def make_ddqn(config: DDQNConfig, obs_dim: int, num_actions: int) -> Agent:
 
     return off_policy_agent(
         config,
-        spec=config.spec(cpu_num_parallel=config.cpu_num_parallel),
         batches=config.gradient_steps,
         init=init,
         begin_episode=begin_episode,
         act=act,
-        update=make_update(config, learn),
+        update=make_update(config, make_learning_step(config, network, unflatten)),
     )
 
 
@@ -211,7 +213,7 @@ def split_batch(batch: Transition, num_parts: int) -> Transition:
 
 
 def make_learning_step(
-    config: DDQNConfig, network: nn.Module, unflatten: Callable[[Array], Any]
+    config: DDQNConfig, network: nn.Module, unflatten: Callable[[Array], PyTree]
 ) -> Callable[[DDQNState, Transition], DDQNState]:
     """Builds `learn(state, batch) -> state`: Adam on the loss of the error to double-Q targets.
 
@@ -219,33 +221,29 @@ def make_learning_step(
     """
     loss_fn = LOSSES[config.loss]
 
-    def sum_of_losses(params, target_params, discount, batch: Transition) -> Array:
-        q_values = network.apply(params, batch.obs)  # [actions, batch]
-        target_next_q: Any = network.apply(target_params, batch.next_obs)
-        targets = double_q_targets(
-            network.apply(params, batch.next_obs) if config.double else target_next_q,
-            target_next_q,
-            batch.reward,
-            discount * batch.discount,
-        )
-        error = select_action(q_values, batch.action) - jax.lax.stop_gradient(targets)
-        return jnp.sum(batch.weight * loss_fn(error))
-
     def learn(state: DDQNState, batch: Transition) -> DDQNState:
         hp = state.hparams
-        params, target_params = unflatten(state.params), unflatten(state.target_params)
 
-        def sum_of_gradients(batch: Transition) -> Array:
-            return flat.flatten(jax.grad(sum_of_losses)(params, target_params, hp.discount, batch))
+        tree, target_params = unflatten(state.params), unflatten(state.target_params)
 
-        gradient = mean_over_batch(sum_of_gradients, (batch,), hp.batch_size)
-        moved, opt_state = flat.adam_step(state.params, state.opt_state, gradient, hp.learning_rate)
+        def sum_of_losses(params: PyTree, batch: Transition) -> Array:
+            q_values: Any = network.apply(params, batch.obs)  # [actions, batch]
+            target_next_q: Any = network.apply(target_params, batch.next_obs)
+            next_q: Any = network.apply(params, batch.next_obs) if config.double else target_next_q
+            discount = hp.discount * batch.discount
+            targets = double_q_targets(next_q, target_next_q, batch.reward, discount)
+            error = select_action(q_values, batch.action) - jax.lax.stop_gradient(targets)
+            return jnp.sum(batch.weight * loss_fn(error))
+
+        params, opt_state = adam_step(
+            sum_of_losses, state.params, state.opt_state, (batch,), hp, tree
+        )
         tau = hp.tau
         if config.target_update_every > 1:
             tau = jnp.where(opt_state.count % config.target_update_every == 0, tau, 0.0)
         return state.replace(
-            params=moved,
-            target_params=tau * moved + (1 - tau) * state.target_params,
+            params=params,
+            target_params=soft_update(state.target_params, params, tau),
             opt_state=opt_state,
         )
 

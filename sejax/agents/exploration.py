@@ -11,7 +11,6 @@ Processes" (2008); paper, appendix, tables of ICM and of count-based Q-learning,
 """
 
 import dataclasses
-import functools
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
 
@@ -20,11 +19,12 @@ import jax.numpy as jnp
 import optax
 from flax import linen as nn
 from flax import struct
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Int, PyTree
 
 from sejax.agents.base import Agent, AgentState, ExplorationConfig, Hparams, traced
 from sejax.agents.buffers import Rollout, Transition
 from sejax.agents.tabular import entry_of, mask_of
+from sejax.envs.base import Task
 from sejax.ops import flat
 from sejax.ops.networks import MLP, Dense
 from sejax.options import MOST_LAYERS, counts, fraction, not_negative, option, positive
@@ -36,10 +36,10 @@ def _with_bonus(agent: Agent, **changes: Any) -> Agent:
     They are the state's `agent_state` and the hyperparameters' `agent`.
     """
 
-    def begin_episode(state: Any, episode: Array) -> Any:
+    def begin_episode(state: AgentState, episode: Array) -> AgentState:
         return state.replace(agent_state=agent.begin_episode(state.agent_state, episode))
 
-    def act(key: Array, state: Any, obs: Array, explore: bool) -> Array:
+    def act(key: Array, state: AgentState, obs: Array, explore: bool) -> Array:
         return agent.act(key, state.agent_state, obs, explore)
 
     return dataclasses.replace(
@@ -76,9 +76,10 @@ class ICMConfig(ExplorationConfig):
     num_layers: int = option(2, counts("the models need units", most=MOST_LAYERS))
     num_residual_blocks: int = option(4, counts("it counts", 0, MOST_LAYERS))
 
-    def make(self, agent: Agent, task: Any) -> Agent:
+    def make(self, agent: Agent, task: Task) -> Agent:
         """The agent with the bonus."""
-        return with_icm(agent, self, task.obs_dim, task.num_actions, task.action_dim)
+        is_discrete = task.num_actions is not None
+        return with_icm(agent, self, task.obs_dim, task.action_dim, is_discrete)
 
 
 class CuriousHparams(NamedTuple):
@@ -161,9 +162,8 @@ class ICM(nn.Module):
         )
 
 
-@functools.cache
 def with_icm(
-    agent: Agent, config: ICMConfig, obs_dim: int, num_actions: int | None, action_dim: int | None
+    agent: Agent, config: ICMConfig, obs_dim: int, action_width: int, is_discrete: bool
 ) -> Agent:
     """The same agent, learning from rewards with an intrinsic bonus.
 
@@ -177,10 +177,9 @@ def with_icm(
       agent: one that learns from batches of `Transition`s, or from a `Rollout`.
       config: the module's sizes and numbers.
       obs_dim: length of an observation.
-      num_actions: number of discrete actions, or None if they are continuous. Actions that are
-        indices enter the models as one-hot vectors; an agent's own vectors of that length, as those
-        of discrete TD3, enter as they are.
-      action_dim: length of a continuous action; not used where there is `num_actions`.
+      action_width: length of an action, or number of discrete actions.
+      is_discrete: whether actions are indices, which enter the models as one-hot vectors. An
+        agent's own vectors for discrete actions, as those of discrete TD3, enter as they are.
 
     Differs: two discrete actions are treated as any other number of them, with two logits and a
     softmax, where the authors' have the number 0 or 1 and one logit. Vectors of discrete actions
@@ -191,13 +190,11 @@ def with_icm(
     Example:
       >>> from sejax.agents.dqn import DDQNConfig, make_ddqn
       >>> plain = make_ddqn(DDQNConfig(), obs_dim=4, num_actions=2)
-      >>> agent = with_icm(plain, ICMConfig(), obs_dim=4, num_actions=2, action_dim=None)
+      >>> agent = with_icm(plain, ICMConfig(), obs_dim=4, action_width=2, is_discrete=True)
       >>> state = agent.init(jax.random.key(0), agent.hparams)
       >>> int(agent.act(jax.random.key(1), state, jnp.zeros(4), explore=False)) in (0, 1)
       True
     """
-    action_width = num_actions or action_dim
-    assert action_width is not None, "an action has a number of choices or a length"
     model = ICM(config, action_width)
     example = (jnp.zeros(obs_dim), jnp.zeros(action_width), jnp.zeros(obs_dim))
     unflatten = flat.unflattener(model.init, *example)
@@ -212,13 +209,13 @@ def with_icm(
             hparams=jax.tree.map(jnp.float32, hparams.icm),
         )
 
-    def outputs(params: Any, batch: Transition) -> ICMOutputs:
+    def outputs(params: PyTree, batch: Transition) -> ICMOutputs:
         action = as_vectors(batch.action, action_width)
         made: Any = model.apply(params, batch.obs, action, batch.next_obs)
         return made
 
     def train_models(state: CuriousState, batch: Transition) -> CuriousState:
-        def loss_fn(params: Any) -> Array:
+        def loss_fn(params: PyTree) -> Array:
             beta = state.hparams.forward_weight
             return icm_loss(outputs(params, batch), batch.action, beta, batch.weight)
 
@@ -240,21 +237,14 @@ def with_icm(
         return state.replace(agent_state=agent.update(key, state.agent_state, batch))
 
     def update_from_rollout(key: Array, state: CuriousState, rollout: Rollout) -> CuriousState:
-        """A loop of one or no turns is skipped under `vmap` too, where a `cond` takes both sides.
-
-        The agent's update is inside, as its rows with the bonus would otherwise be made each step.
-        """
-
-        def learn(carry: tuple[Array, CuriousState]) -> tuple[Array, CuriousState]:
-            _, state = carry
-            batch = rollout.transitions(obs_dim, num_actions is not None)
+        # The agent's update is inside: its rows with the bonus would else be made in each step.
+        def learn(state: CuriousState) -> CuriousState:
+            batch = rollout.transitions(obs_dim, is_discrete)
             augmented = rollout.with_bonus(bonus(state, batch))
             state = train_models(state, batch)
-            state = state.replace(agent_state=agent.update(key, state.agent_state, augmented))
-            return jnp.bool_(False), state
+            return state.replace(agent_state=agent.update(key, state.agent_state, augmented))
 
-        _, state = jax.lax.while_loop(lambda carry: carry[0], learn, (rollout.is_full, state))
-        return state
+        return rollout.learn_if_full(learn, state)
 
     return _with_bonus(
         agent,
@@ -332,8 +322,9 @@ class CountBasedConfig(ExplorationConfig):
     # p: 1 in the paper's text, 0.5 in the authors' code
     count_power: float = option(1.0, positive("the bonus would not fade"))
 
-    def make(self, agent: Agent, task: Any) -> Agent:
+    def make(self, agent: Agent, task: Task) -> Agent:
         """The agent with the bonus."""
+        assert task.num_states is not None and task.num_actions is not None
         return with_count_bonus(agent, self, task.num_states, task.num_actions)
 
 
@@ -352,7 +343,6 @@ class CountingState(struct.PyTreeNode):
     reward_scale: Array
 
 
-@functools.cache
 def with_count_bonus(
     agent: Agent, config: CountBasedConfig, num_states: int, num_actions: int
 ) -> Agent:
@@ -371,8 +361,8 @@ def with_count_bonus(
       num_actions: number of different actions.
 
     Example:
-      >>> from sejax.agents.tabular import QLearningConfig, make_q_learning
-      >>> plain = make_q_learning(QLearningConfig(), num_states=48, num_actions=4)
+      >>> from sejax.agents.tabular import QLearningConfig, make_tabular
+      >>> plain = make_tabular(QLearningConfig(), num_states=48, num_actions=4)
       >>> agent = with_count_bonus(plain, CountBasedConfig(), num_states=48, num_actions=4)
       >>> state = agent.init(jax.random.key(0), agent.hparams)
       >>> int(agent.act(jax.random.key(1), state, jnp.int32(36), explore=False))

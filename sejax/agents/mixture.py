@@ -71,21 +71,33 @@ class Mixture:
         require(
             size > 0 and len(self.names) == len(self.weights) == size,
             "agents",
-            "must hold an agent, and as many names and weights as agents, because each agent has "
-            f"one of both; got {size} agents, names={self.names} and weights={self.weights}. Set "
-            "names=() and weights=().",
+            "must hold an agent, and as many names and weights as agents; got "
+            f"{size} agents, names={shortened(self.names)} and weights={shortened(self.weights)}. "
+            "Set names=() and weights=().",
         )
         require(
             min(self.weights) >= 0 and max(self.weights) > 0,
             "agents",
-            "must have weights of at least 0, and one above, because the candidates are divided "
-            f"by them; got {shortened(self.weights)}. Set weights=().",
+            "must have weights of at least 0, and one above; got "
+            f"{shortened(self.weights)}. Set weights=().",
         )
 
     @classmethod
     def of(cls, agent: "Agent | Mixture") -> "Mixture":
-        """A mixture of one agent; a mixture stays as it is."""
-        return agent if isinstance(agent, Mixture) else cls(agents=(agent,))
+        """A mixture of one agent; a mixture stays as it is.
+
+        Raises:
+          ConfigError: for anything else.
+        """
+        if isinstance(agent, Mixture):
+            return agent
+        require(
+            isinstance(agent, Agent),
+            "agent",
+            f"must be a sejax.Agent or a sejax.Mixture; got {shortened(repr(agent))}. Pass an "
+            "object; sejax.config([...]) takes names.",
+        )
+        return cls(agents=(agent,))
 
     @property
     def size(self) -> int:
@@ -112,8 +124,8 @@ class Mixture:
         require(
             counts[shares > 0].all(),
             "es.population_size",
-            "must leave each agent of the mixture a candidate, because the proxy must be scored "
-            f"by all of them; got {num_places} perturbations for weights {self.weights}. Set "
+            f"must leave each agent a candidate; got {num_places} perturbations for weights "
+            f"{shortened(self.weights)}. Set "
             f"es.population_size={2 * max(num_places, self.size)}.",
         )
         return np.tile(dealt, 2 if antithetic else 1)

@@ -1,14 +1,22 @@
-"""What the agents with a replay buffer share: DDQN, TD3 and SAC."""
+"""The frame of the agents that learn from a replay buffer: DDQN, TD3 and SAC.
 
+It has their options, when they warm up, how a batch is drawn, and the step of Adam on its mean
+loss. The file of an agent has its networks, its loss and its targets.
+"""
+
+import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
+import jax
 import jax.numpy as jnp
-from jaxtyping import Array
+import optax
+from jaxtyping import Array, Float, PyTree
 
-from sejax.agents.base import Agent, AgentOptions, AgentSpec, traced
-from sejax.agents.buffers import num_columns, replay_buffer, sum_over_batch
+from sejax.agents.base import Agent, AgentOptions, AgentSpec, AgentState, Hparams, traced
+from sejax.agents.buffers import Transition, num_columns, replay_buffer, sum_over_batch
+from sejax.ops import flat
 from sejax.ops.networks import MLP
 from sejax.options import (
     ACTIVATIONS,
@@ -42,12 +50,11 @@ class OffPolicyOptions(AgentOptions):
         require(
             self.batch_size <= self.buffer_size,
             "agent.batch_size",
-            "must be at most agent.buffer_size, because batches are drawn from the buffer; got "
-            f"{self.batch_size} with agent.buffer_size={self.buffer_size}. Set "
+            f"must be at most agent.buffer_size={self.buffer_size}; got {self.batch_size}. Set "
             f"agent.batch_size={self.buffer_size}.",
         )
 
-    def mlp(self, num_outputs: int, **more: Any) -> MLP:
+    def mlp(self, num_outputs: int) -> MLP:
         """A network with these hidden layers."""
         return MLP(
             num_outputs,
@@ -55,54 +62,82 @@ class OffPolicyOptions(AgentOptions):
             self.num_layers,
             self.activation,
             learn_prelu_slope=True,
-            **more,
         )
 
 
-def off_policy_agent(
-    config: OffPolicyOptions, *, spec: AgentSpec, batches: int = 1, **functions: Any
-) -> Agent:
+@dataclass(frozen=True, kw_only=True)
+class ActorCriticOptions(OffPolicyOptions):
+    """Hyperparameters that TD3 and SAC share. Actions are uniformly random in the warm-up."""
+
+    actions: ClassVar[tuple[str, ...]] = ("continuous",)
+
+    batch_size: int = 256
+    learning_rate: float = 3e-4  # of the actor, the critics and the temperature
+    tau: float = 0.005
+    action_repeat: int = option(1, counts())  # environment steps for each decision
+
+    def spec(self) -> AgentSpec:
+        return dataclasses.replace(super().spec(), action_repeat=self.action_repeat)
+
+    def begin_episode(self, state: AgentState, episode: Array) -> AgentState:
+        """Says whether the agent acts at random, in its state's `is_warming_up`."""
+        return state.replace(is_warming_up=jnp.asarray(episode < self.warmup_episodes))
+
+
+def off_policy_agent(config: OffPolicyOptions, *, batches: int = 1, **functions: Any) -> Agent:
     """An agent that keeps its steps in a ring and learns from batches of them.
 
     Args:
       config: hyperparameters; the agent's state has the traced ones as `hparams`.
-      spec: of the agent.
       batches: how many batches `update` takes, side by side.
       **functions: `init`, `act`, `update` and others of `Agent`.
     """
 
-    def batch_size(state: Any) -> Array | None:
+    def batch_size(state: AgentState) -> Array | None:
         in_use = state.hparams.batch_size
         return None if in_use is None else in_use * batches
 
     return Agent(
         buffer=replay_buffer(config.batch_size * batches, config.buffer_size),
         hparams=traced(config, hidden_size=None, batch_size=None),
-        spec=spec,
+        spec=config.spec(),
         discount=lambda hparams: hparams.discount,
         batch_size=batch_size,
         **functions,
     )
 
 
-def warming_up(config: OffPolicyOptions) -> Callable[[Any, Array], Any]:
-    """Builds `begin_episode` of an agent that acts at random in its first episodes."""
-
-    def begin_episode(state: Any, episode: Array) -> Any:
-        return state.replace(is_warming_up=jnp.asarray(episode < config.warmup_episodes))
-
-    return begin_episode
-
-
-def mean_over_batch(
-    sum_fn: Callable[..., Array], columns: tuple[Any, ...], batch_size: Array | None
-) -> Array:
-    """A sum over a batch's columns as their mean, at the cost of those in use.
+def adam_step(
+    sum_of_losses: Callable[..., Array],
+    params: Float[Array, "*params"],
+    opt_state: optax.OptState,
+    columns: tuple[Transition, *tuple[PyTree, ...]],
+    hparams: Hparams,
+    tree: PyTree = None,
+) -> tuple[Float[Array, "*params"], optax.OptState]:
+    """One step of Adam on a batch's mean loss, at the cost of the columns in use.
 
     Args:
-      sum_fn: `(*columns) -> Array`, such as the gradient of a sum of losses.
-      columns: a batch of `Transition`s, and what else has its columns.
-      batch_size: columns in use, `[]`; None for all.
+      sum_of_losses: `(params, *columns) -> []`, the losses of the columns times their weights.
+      params: to move.
+      opt_state: of `flat.ADAM`.
+      columns: a batch, and what else has its columns, such as noise.
+      hparams: `learning_rate`, and `batch_size` in use or None.
+      tree: the same parameters as a pytree, if `sum_of_losses` takes them so.
     """
-    total = sum_over_batch(lambda columns: sum_fn(*columns), columns, batch_size)
-    return total / num_columns(columns[0])
+
+    def gradient(columns: PyTree) -> Array:
+        if tree is None:
+            return jax.grad(sum_of_losses)(params, *columns)
+        return flat.flatten(jax.grad(sum_of_losses)(tree, *columns))
+
+    total = sum_over_batch(gradient, columns, hparams.batch_size)
+    mean = total / num_columns(columns[0])
+    return flat.adam_step(params, opt_state, mean, hparams.learning_rate)
+
+
+def soft_update(
+    target: Float[Array, "*params"], online: Float[Array, "*params"], tau: Array
+) -> Float[Array, "*params"]:
+    """The parameters of a target network that follows the online one with weight `tau`."""
+    return tau * online + (1 - tau) * target

@@ -15,6 +15,8 @@ class Distribution(NamedTuple):
     """A distribution of actions, given the actor's outputs and the Gaussian's std.
 
     Attributes:
+      num_outputs: of the actor.
+      std_dim: length of the std; 0 for a softmax, whose actions are indices.
       sample: `(key, outputs, std) -> action`, for one observation.
       mode: `outputs -> action`, for one observation.
       evaluate: `(outputs, std, action) -> (log_prob, entropy)`, for `[outputs, batch]` and a batch
@@ -22,37 +24,35 @@ class Distribution(NamedTuple):
       env_action: `action -> action` as the environment takes it.
     """
 
+    num_outputs: int
+    std_dim: int
     sample: Callable[[Array, Array, Array], Array]
     mode: Callable[[Array], Array]
     evaluate: Callable[[Array, Array, Array], tuple[Array, Array]]
     env_action: Callable[[Array], Array]
 
 
-def _sample_softmax(key: Array, outputs: Float[Array, " actions"], std: Array) -> Int[Array, ""]:
-    return jax.random.categorical(key, outputs).astype(jnp.int32)
+def softmax(num_actions: int) -> Distribution:
+    """The actions `0..num_actions-1`, with logits as outputs."""
+
+    def evaluate(
+        outputs: Float[Array, "actions batch"], std: Array, action: Int[Array, " batch"]
+    ) -> tuple[Float[Array, " batch"], Float[Array, " batch"]]:
+        log_probs = jax.nn.log_softmax(outputs, axis=0)
+        entropy = -jnp.sum(jnp.exp(log_probs) * log_probs, axis=0)
+        return select_action(log_probs, action), entropy
+
+    return Distribution(
+        num_outputs=num_actions,
+        std_dim=0,
+        sample=lambda key, outputs, std: jax.random.categorical(key, outputs).astype(jnp.int32),
+        mode=lambda outputs: jnp.argmax(outputs).astype(jnp.int32),
+        evaluate=evaluate,
+        env_action=lambda action: action,
+    )
 
 
-def _softmax_mode(outputs: Float[Array, " actions"]) -> Int[Array, ""]:
-    return jnp.argmax(outputs).astype(jnp.int32)
-
-
-def _evaluate_softmax(
-    outputs: Float[Array, "actions batch"], std: Array, action: Int[Array, " batch"]
-) -> tuple[Float[Array, " batch"], Float[Array, " batch"]]:
-    log_probs = jax.nn.log_softmax(outputs, axis=0)
-    entropy = -jnp.sum(jnp.exp(log_probs) * log_probs, axis=0)
-    return select_action(log_probs, action), entropy
-
-
-SOFTMAX = Distribution(
-    sample=_sample_softmax,
-    mode=_softmax_mode,
-    evaluate=_evaluate_softmax,
-    env_action=lambda action: action,
-)
-
-
-def gaussian(max_action: float) -> Distribution:
+def gaussian(action_dim: int, max_action: float) -> Distribution:
     """Independent normal actions with mean `max_action * tanh(outputs)` and a given std.
 
     Differs: the authors' mean is `tanh(outputs)`, which cannot reach the whole range of a task
@@ -75,10 +75,14 @@ def gaussian(max_action: float) -> Distribution:
         log_prob = -0.5 * jnp.sum(standardized**2, axis=0) - log_scale
         return log_prob, jnp.broadcast_to(log_scale + 0.5 * std.size, log_prob.shape)
 
-    def env_action(action: Float[Array, " action_dim"]) -> Float[Array, " action_dim"]:
-        return jnp.clip(action, -max_action, max_action)
-
-    return Distribution(sample=sample, mode=mode, evaluate=evaluate, env_action=env_action)
+    return Distribution(
+        num_outputs=action_dim,
+        std_dim=action_dim,
+        sample=sample,
+        mode=mode,
+        evaluate=evaluate,
+        env_action=lambda action: jnp.clip(action, -max_action, max_action),
+    )
 
 
 # --- values of actions ---------------------------------------------------------------------------

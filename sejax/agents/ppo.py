@@ -9,7 +9,7 @@ Source: Schulman et al., "Proximal Policy Optimization Algorithms" (2017); Schul
 appendix, table of PPO; `docs/reference.md` 4.5.
 """
 
-import functools
+import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple, Self
@@ -18,11 +18,12 @@ import jax
 import jax.numpy as jnp
 import optax
 from flax import struct
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Int, PyTree
 
-from sejax.agents.base import Agent, AgentOptions, Hparams, traced
+from sejax.agents.base import Agent, AgentOptions, AgentSpec, Hparams, traced
 from sejax.agents.buffers import Rollout, Transition, rollout_buffer
-from sejax.agents.policies import SOFTMAX, Distribution, gaussian
+from sejax.agents.policies import Distribution, gaussian, softmax
+from sejax.envs.base import Task
 from sejax.ops import flat
 from sejax.ops.keys import murmur
 from sejax.ops.networks import MLP, init_narrowed
@@ -35,7 +36,6 @@ from sejax.options import (
     not_negative,
     one_of,
     option,
-    or_none,
     positive,
     require,
     shortened,
@@ -44,6 +44,7 @@ from sejax.options import (
 Steps = Float[Array, " steps"]  # of a rollout, or of a minibatch of it
 
 MIN_STD = 0.01  # of the Gaussian policy, in units of the action
+ADVANTAGES = ("monte_carlo", "gae")
 _MAX_LOG_RATIO = 20.0  # exp(20) is beyond any clip, and finite
 
 
@@ -64,11 +65,11 @@ class PPOConfig(AgentOptions):
     learning_rate: float = option(2e-3, positive(MOVES), traced=True, varied="triple")
     discount: float = option(0.99, fraction(), traced=True)
     # Decisions between two learning phases; null: as `update_episodes` says.
-    rollout_steps: int | None = option(128, or_none(counts()))
+    rollout_steps: int | None = option(128, counts())
     update_episodes: int = option(10, counts())  # of full length, between two learning phases
     epochs: int = option(10, counts())  # passes over the rollout in a learning phase
     num_minibatches: int = option(4, counts())  # Adam steps in an epoch, each on its part of it
-    advantages: str = option("gae", one_of(("monte_carlo", "gae")))
+    advantages: str = option("gae", one_of(ADVANTAGES))
     gae_lambda: float = option(0.9, fraction(), traced=True)  # of advantages=gae
     clip_ratio: float = option(0.1, positive(MOVES), traced=True)
     value_weight: float = option(0.5, not_negative(), traced=True)
@@ -76,7 +77,7 @@ class PPOConfig(AgentOptions):
     # Divides rewards by the running std of returns, with advantages=gae.
     normalize_rewards: bool = True
     # Norm that a longer gradient is scaled down to.
-    max_grad_norm: float | None = option(0.5, or_none(positive(MOVES)))
+    max_grad_norm: float | None = option(0.5, positive(MOVES))
     adam_eps: float = option(1e-5, positive("it keeps Adam from dividing by 0"))
     # Of the Gaussian policy; learned.
     init_action_std: float = option(0.5, positive(MOVES))
@@ -110,12 +111,13 @@ class PPOConfig(AgentOptions):
         }
         return cls(**(paper | changes))
 
-    def make(self, task: Any) -> Agent:
+    def make(self, task: Task) -> Agent:
         """The agent for a task's observations and actions."""
-        num_actions, action_dim = task.num_actions, task.action_dim
-        return make_ppo(
-            self, task.obs_dim, num_actions, action_dim, task.max_action, task.max_steps
-        )
+        if task.num_actions is None:
+            policy = gaussian(task.action_dim, task.max_action)
+        else:
+            policy = softmax(task.num_actions)
+        return make_ppo(self, task.obs_dim, policy, task.max_steps)
 
     def rollout_length(self, task_max_steps: int) -> int:
         """Decisions between two learning phases: `rollout_steps`, if that is set.
@@ -134,6 +136,9 @@ class PPOConfig(AgentOptions):
         """As of any agent; PPO learns once a rollout is full, whose length is by the task."""
         return self.rollout_length(task_max_steps) * self.action_repeat
 
+    def spec(self) -> AgentSpec:
+        return dataclasses.replace(super().spec(), learns_from=0, action_repeat=self.action_repeat)
+
     def optimizer(self) -> optax.GradientTransformation:
         """Adam's direction, of a gradient that may be shortened first."""
         adam = optax.scale_by_adam(eps=self.adam_eps)
@@ -151,16 +156,8 @@ class PPOState(struct.PyTreeNode):
     hparams: Hparams  # traced options, and hidden_size in use or None
 
 
-@functools.cache
-def make_ppo(
-    config: PPOConfig,
-    obs_dim: int,
-    num_actions: int | None,
-    action_dim: int | None,
-    max_action: float,
-    max_steps: int,
-) -> Agent:
-    """Builds the agent for observations `[obs_dim]`.
+def make_ppo(config: PPOConfig, obs_dim: int, policy: Distribution, max_steps: int) -> Agent:
+    """Builds the agent for observations `[obs_dim]` and a policy's actions.
 
     `update` learns once the rollout is full and costs next to nothing before, under `vmap` too.
 
@@ -172,35 +169,29 @@ def make_ppo(
     Args:
       config: hyperparameters.
       obs_dim: length of an observation.
-      num_actions: for actions `0..num_actions-1`; None if they are vectors.
-      action_dim: length of an action; not used if it is an index.
-      max_action: continuous actions reach the environment clipped to [-max_action, max_action]; the
-        rollout keeps them as drawn.
+      policy: the distribution of actions. The rollout keeps continuous ones as drawn; they reach
+        the environment clipped to its range.
       max_steps: the task's step limit for an episode, in environment steps.
 
     Raises:
       ConfigError: if a rollout has fewer than two steps for each minibatch.
 
     Example:
-      >>> agent = make_ppo(PPOConfig(), 4, num_actions=2, action_dim=None, max_action=1.0,
-      ...                  max_steps=200)
+      >>> agent = make_ppo(PPOConfig(), obs_dim=4, policy=softmax(2), max_steps=200)
       >>> state = agent.init(jax.random.key(0), agent.hparams)
       >>> int(agent.act(jax.random.key(1), state, jnp.zeros(4), explore=True)) in (0, 1)
       True
     """
-    is_discrete = num_actions is not None
-    policy = SOFTMAX if is_discrete else gaussian(max_action)
-    networks = make_networks(config, obs_dim, policy, num_actions, action_dim)
+    networks = make_networks(config, obs_dim, policy)
     length = config.rollout_length(max_steps)
     require(
         config.num_minibatches == 1 or 2 * config.num_minibatches <= length,
         "agent.num_minibatches",
-        f"must be at most half of the rollout's {length} steps, because advantages are compared "
-        f"within a minibatch; got {shortened(config.num_minibatches)}. Set "
-        f"agent.num_minibatches={max(1, length // 2)}.",
+        f"must be at most half of the rollout's {length} steps; got "
+        f"{shortened(config.num_minibatches)}. Set agent.num_minibatches={max(1, length // 2)}.",
     )
     optimizer = config.optimizer()
-    learn = make_learning_phase(config, networks, optimizer, obs_dim, is_discrete)
+    learn = make_learning_phase(config, networks, optimizer, obs_dim, policy.std_dim == 0)
 
     def init(key: Array, hparams: Hparams) -> PPOState:
         params = networks.init(key, hparams.hidden_size)
@@ -216,21 +207,13 @@ def make_ppo(
         return policy.sample(key, outputs, std) if explore else policy.mode(outputs)
 
     def update(key: Array, state: PPOState, rollout: Rollout) -> PPOState:
-        """Learns if the rollout is full.
-
-        A loop of one trip or none: under `vmap` `lax.cond` would learn in every step and throw it
-        away, whereas this loop runs only when the rollout of some agent is full.
-        """
-
-        def phase(carry: tuple[Array, PPOState]) -> tuple[Array, PPOState]:
-            _, state = carry
+        def phase(state: PPOState) -> PPOState:
             # XLA would move what does not depend on the carry out of the loop, into every step.
             inputs = (key, state.params, rollout.rows)
             own_key, params, rows = jax.lax.optimization_barrier(inputs)
-            state, full = state.replace(params=params), rollout._replace(rows=rows)
-            return jnp.bool_(False), learn(own_key, state, full)
+            return learn(own_key, state.replace(params=params), rollout._replace(rows=rows))
 
-        return jax.lax.while_loop(lambda carry: carry[0], phase, (rollout.is_full, state))[1]
+        return rollout.learn_if_full(phase, state)
 
     return Agent(
         init=init,
@@ -238,7 +221,7 @@ def make_ppo(
         update=update,
         buffer=rollout_buffer(length),
         hparams=traced(config, hidden_size=None),
-        spec=config.spec(learns_from=0, action_repeat=config.action_repeat),
+        spec=config.spec(),
         env_action=policy.env_action,
         discount=lambda hparams: hparams.discount,
     )
@@ -258,47 +241,40 @@ class Networks(NamedTuple):
     """
 
     init: Callable[[Array, Array | None], Array]
-    unflatten: Callable[[Array], Any]
-    actor: Callable[[Any, Array], tuple[Array, Array]]
-    critic: Callable[[Any, Array], Array]
-    evaluate: Callable[[Any, Array, Array], tuple[Array, Array, Array]]
+    unflatten: Callable[[Array], PyTree]
+    actor: Callable[[PyTree, Array], tuple[Array, Array]]
+    critic: Callable[[PyTree, Array], Array]
+    evaluate: Callable[[PyTree, Array, Array], tuple[Array, Array, Array]]
     least_params: Float[Array, " num_params"]
 
 
-def make_networks(
-    config: PPOConfig,
-    obs_dim: int,
-    policy: Distribution,
-    num_actions: int | None,
-    action_dim: int | None,
-) -> Networks:
+def make_networks(config: PPOConfig, obs_dim: int, policy: Distribution) -> Networks:
     """An actor `s -> outputs` and a critic `s -> V` of the same hidden layers, and the std."""
-    std_dim = 0 if num_actions else action_dim or 0  # a softmax has no std
     shape = (config.hidden_size, config.num_layers, config.activation)
     mlps = {
-        "actor": MLP(num_actions or std_dim, *shape, learn_prelu_slope=True),
+        "actor": MLP(policy.num_outputs, *shape, learn_prelu_slope=True),
         "critic": MLP(1, *shape, learn_prelu_slope=True),
     }
 
-    def init_tree(key: Array, hidden_size: Array | None = None) -> dict[str, Any]:
+    def init_tree(key: Array, hidden_size: Array | None = None) -> dict[str, PyTree]:
         keys = dict(zip(mlps, jax.random.split(key), strict=True))
         weights = {
             name: init_narrowed(mlp, keys[name], obs_dim, hidden_size) for name, mlp in mlps.items()
         }
-        return {**weights, "std": jnp.full(std_dim, config.init_action_std, jnp.float32)}
+        return {**weights, "std": jnp.full(policy.std_dim, config.init_action_std, jnp.float32)}
 
     def init(key: Array, hidden_size: Array | None) -> Array:
         return flat.flatten(init_tree(key, hidden_size))
 
-    def actor(tree: Any, obs: Array) -> tuple[Array, Array]:
+    def actor(tree: PyTree, obs: Array) -> tuple[Array, Array]:
         outputs: Any = mlps["actor"].apply(tree["actor"], obs)
         return outputs, tree["std"]
 
-    def critic(tree: Any, obs: Array) -> Array:
+    def critic(tree: PyTree, obs: Array) -> Array:
         value: Any = mlps["critic"].apply(tree["critic"], obs)
         return value[0]
 
-    def evaluate(tree: Any, obs: Array, action: Array) -> tuple[Array, Array, Array]:
+    def evaluate(tree: PyTree, obs: Array, action: Array) -> tuple[Array, Array, Array]:
         log_prob, entropy = policy.evaluate(*actor(tree, obs), action)
         return log_prob, entropy, critic(tree, obs)
 
@@ -310,7 +286,7 @@ def make_networks(
         actor=actor,
         critic=critic,
         evaluate=evaluate,
-        least_params=flat.flatten({**unbounded, "std": jnp.full(std_dim, MIN_STD)}),
+        least_params=flat.flatten({**unbounded, "std": jnp.full(policy.std_dim, MIN_STD)}),
     )
 
 
@@ -330,31 +306,20 @@ class Batch(NamedTuple):
     returns: Steps
 
 
-def monte_carlo(
+def prepared(
     config: PPOConfig, networks: Networks, state: PPOState, steps: Transition, ended: Steps
 ) -> tuple[Batch, Float[Array, "3"]]:
-    """A rollout with normalised returns, and the agent's sums over returns, as they are.
+    """A rollout by the parameters that made it, and the agent's sums over all returns so far.
 
-    The advantage is that over the value which the critic has in each Adam step.
-
-    Source: `docs/reference.md` 4.5.
-    """
-    old_log_prob, _, _ = networks.evaluate(
-        networks.unflatten(state.params), steps.obs, steps.action
-    )
-    returns = normalized(discounted_returns(steps.reward, ended, state.hparams.discount))
-    return Batch(steps.obs, steps.action, old_log_prob, None, returns), state.return_sums
-
-
-def gae(
-    config: PPOConfig, networks: Networks, state: PPOState, steps: Transition, ended: Steps
-) -> tuple[Batch, Float[Array, "3"]]:
-    """A rollout with generalised advantages, and the agent's sums over all returns so far.
-
-    Rewards are divided by the std of these returns with `config.normalize_rewards`.
+    With `advantages="monte_carlo"` returns are normalised, and the advantage is that over the value
+    which the critic has in each Adam step (`docs/reference.md` 4.5). With `"gae"` the advantages
+    are generalised ones, of rewards that `normalize_rewards` divides by the std of returns.
     """
     hp, tree, sums = state.hparams, networks.unflatten(state.params), state.return_sums
     old_log_prob, _, value = networks.evaluate(tree, steps.obs, steps.action)
+    if config.advantages == "monte_carlo":
+        returns = normalized(discounted_returns(steps.reward, ended, hp.discount))
+        return Batch(steps.obs, steps.action, old_log_prob, None, returns), sums
     decay, reward = hp.discount * steps.discount, steps.reward
     if config.normalize_rewards:
         sums = sums + power_sums(discounted_sums(reward, decay, ended))
@@ -362,10 +327,6 @@ def gae(
     next_value = networks.critic(tree, steps.next_obs)
     advantage = generalized_advantages(reward, decay, ended, value, next_value, hp.gae_lambda)
     return Batch(steps.obs, steps.action, old_log_prob, advantage, advantage + value), sums
-
-
-# How a rollout is prepared by the parameters that made it.
-ADVANTAGES = {"monte_carlo": monte_carlo, "gae": gae}
 
 
 def make_learning_phase(
@@ -380,9 +341,8 @@ def make_learning_phase(
     It passes `config.epochs` times over the rollout, each time in `config.num_minibatches` Adam
     steps. A rollout that these do not divide leaves some steps out of each pass.
     """
-    prepare = ADVANTAGES[config.advantages]
 
-    def loss_fn(tree: Any, batch: Batch, hp: Hparams) -> Array:
+    def loss_fn(tree: PyTree, batch: Batch, hp: Hparams) -> Array:
         log_prob, entropy, value = networks.evaluate(tree, batch.obs, batch.action)
         if batch.advantage is None:
             advantage = jax.lax.stop_gradient(batch.returns - value)
@@ -393,10 +353,12 @@ def make_learning_phase(
     def learn(key: Array, state: PPOState, rollout: Rollout) -> PPOState:
         hp = state.hparams
         steps = rollout.transitions(obs_dim, is_discrete)
-        batch, return_sums = prepare(config, networks, state, steps, rollout.ended)
+        batch, return_sums = prepared(config, networks, state, steps, rollout.ended)
         order = shuffled(key, config.epochs, config.num_minibatches, batch.returns.size)
 
-        def adam_step(number: Array, carry: tuple[Array, Any]) -> tuple[Array, Any]:
+        def adam_step(
+            number: Array, carry: tuple[Array, optax.OptState]
+        ) -> tuple[Array, optax.OptState]:
             params, opt_state = carry
             minibatch = batch
             if config.num_minibatches > 1:

@@ -11,55 +11,37 @@ import functools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, ClassVar, NamedTuple
+from typing import ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import optax
 from flax import struct
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, PyTree
 
 from sejax.agents.base import Agent, Hparams
 from sejax.agents.buffers import Transition
-from sejax.agents.off_policy import (
-    OffPolicyOptions,
-    mean_over_batch,
-    off_policy_agent,
-    warming_up,
-)
+from sejax.agents.off_policy import ActorCriticOptions, adam_step, off_policy_agent, soft_update
 from sejax.agents.policies import select_action
+from sejax.envs.base import Task
 from sejax.ops import flat
 from sejax.ops.networks import init_narrowed
-from sejax.options import (
-    counts,
-    finite,
-    fraction,
-    not_negative,
-    option,
-    positive,
-    require,
-    shortened,
-)
+from sejax.options import finite, fraction, not_negative, option, positive, require, shortened
 
 _MIN_LOG_STD, _MAX_LOG_STD = -20.0, 2.0  # of the Gaussian, as in the authors' code
 
 
 @dataclass(frozen=True, kw_only=True)
-class SACConfig(OffPolicyOptions):
+class SACConfig(ActorCriticOptions):
     """SAC's hyperparameters; the defaults are those of Haarnoja et al. (2018), table 1.
 
     Differs: the buffer holds 100,000 steps where the authors' holds a million. Christodoulou (2019)
-    has a target entropy of 0.98 of the largest, with which SAC does not learn CartPole. Actions are
-    uniformly random in the warm-up.
+    has a target entropy of 0.98 of the largest, with which SAC does not learn CartPole.
     """
 
     actions: ClassVar[tuple[str, ...]] = ("discrete", "continuous")
 
-    batch_size: int = 256
     hidden_size: int = 256
-    learning_rate: float = 3e-4  # of the actor, the critics and the temperature
-    tau: float = 0.005
-    action_repeat: int = option(1, counts())  # environment steps for each decision
     # Temperature: what a nat of entropy is worth, in reward units. None: learned, as the authors do
     # to meet a target entropy.
     alpha: float | None = option(None, not_negative("it weighs the entropy"), traced=True)
@@ -69,7 +51,7 @@ class SACConfig(OffPolicyOptions):
     # Of discrete actions, as a fraction of the largest, log |A|: see docs/agents.md.
     target_entropy_fraction: float = option(0.2, fraction(), traced=True)
 
-    def make(self, task: Any) -> Agent:
+    def make(self, task: Task) -> Agent:
         """The agent for a task's observations and actions.
 
         Raises:
@@ -77,16 +59,18 @@ class SACConfig(OffPolicyOptions):
         """
         kinds = ("target_entropy", "target_entropy_fraction")
         used, unused = kinds if task.num_actions is None else kinds[::-1]
-        default = type(self).__dataclass_fields__[unused].default
+        got, default = (getattr(each, unused) for each in (self, type(self)))
         require(
-            getattr(self, unused) == default,
+            got == default,
             f"agent.{unused}",
-            f"must stay {default} in {task.name}, because agent.{used} holds for its actions; got "
-            f"{shortened(getattr(self, unused))}. Set agent.{used} in its place.",
+            f"must stay {default} with {task.name}'s actions; got {shortened(got)}. Set "
+            f"agent.{used} in its place.",
         )
         if task.num_actions is None:
-            return make_sac(self, task.obs_dim, task.action_dim, task.max_action)
-        return make_sac_discrete(self, task.obs_dim, task.num_actions)
+            policy = gaussian_policy(task.action_dim, task.max_action)
+        else:
+            policy = softmax_policy(task.num_actions)
+        return make_sac(self, task.obs_dim, policy)
 
 
 class SACState(struct.PyTreeNode):
@@ -137,7 +121,7 @@ class Policy:
     num_outputs: int
     critic_inputs: int
     critic_outputs: int
-    target_entropy: Callable[[Any], Array]
+    target_entropy: Callable[[Hparams], Array]
     draw: Callable[[Array, int], LearningNoise]
     sample: Callable[[Array, Array, Array], Array]
     best: Callable[[Array], Array]
@@ -146,35 +130,15 @@ class Policy:
     env_action: Callable[[Array], Array]
 
 
-@functools.cache
-def make_sac(config: SACConfig, obs_dim: int, action_dim: int, max_action: float) -> Agent:
-    """Builds the agent for observations `[obs_dim]` and actions `[action_dim]`.
-
-    The buffer keeps actions in [-1, 1]; the environment takes `max_action` times as much.
+def make_sac(config: SACConfig, obs_dim: int, policy: Policy) -> Agent:
+    """Builds the agent for observations `[obs_dim]` and a policy's actions.
 
     Example:
-      >>> agent = make_sac(SACConfig(), obs_dim=3, action_dim=1, max_action=2.0)
-      >>> state = jax.jit(agent.init)(jax.random.key(0), agent.hparams)
-      >>> agent.act(jax.random.key(1), state, jnp.zeros(3), explore=True).shape
-      (1,)
-    """
-    return _make_agent(config, obs_dim, gaussian_policy(action_dim, max_action))
-
-
-@functools.cache
-def make_sac_discrete(config: SACConfig, obs_dim: int, num_actions: int) -> Agent:
-    """Builds the agent for observations `[obs_dim]` and actions `0..num_actions-1`.
-
-    Example:
-      >>> agent = make_sac_discrete(SACConfig(), obs_dim=4, num_actions=2)
+      >>> agent = make_sac(SACConfig(), obs_dim=4, policy=softmax_policy(2))
       >>> state = jax.jit(agent.init)(jax.random.key(0), agent.hparams)
       >>> int(agent.act(jax.random.key(1), state, jnp.zeros(4), explore=True)) in (0, 1)
       True
     """
-    return _make_agent(config, obs_dim, softmax_policy(num_actions))
-
-
-def _make_agent(config: SACConfig, obs_dim: int, policy: Policy) -> Agent:
     networks = make_networks(config, obs_dim, policy)
     learn = make_learning_step(networks, policy)
 
@@ -199,9 +163,8 @@ def _make_agent(config: SACConfig, obs_dim: int, policy: Policy) -> Agent:
 
     return off_policy_agent(
         config,
-        spec=config.spec(action_repeat=config.action_repeat),
         init=init,
-        begin_episode=warming_up(config),
+        begin_episode=config.begin_episode,
         act=act,
         update=update,
         env_action=policy.env_action,
@@ -214,8 +177,8 @@ def _make_agent(config: SACConfig, obs_dim: int, policy: Policy) -> Agent:
 class Params(NamedTuple):
     """Parameters of an agent; the leaves of `critics` are `[2, ...]`."""
 
-    actor: Any
-    critics: Any
+    actor: PyTree
+    critics: PyTree
     log_alpha: Array
 
 
@@ -231,12 +194,12 @@ class Networks(NamedTuple):
       critics: `(Params.critics, inputs) -> outputs`, `[2, critic_outputs, batch]`.
     """
 
-    init: Callable[[Array, Any], Array]
+    init: Callable[[Array, Hparams], Array]
     unflatten: Callable[[Array], Params]
     critics_of: Callable[[Array], Array]
-    unflatten_critics: Callable[[Array], Any]
+    unflatten_critics: Callable[[Array], PyTree]
     actor: Callable[[Params, Array], Array]
-    critics: Callable[[Any, Array], Array]
+    critics: Callable[[PyTree, Array], Array]
 
 
 def make_networks(config: SACConfig, obs_dim: int, policy: Policy) -> Networks:
@@ -244,34 +207,27 @@ def make_networks(config: SACConfig, obs_dim: int, policy: Policy) -> Networks:
 
     actor, critic = config.mlp(policy.num_outputs), config.mlp(policy.critic_outputs)
 
-    def init_critics(key: Array, hidden_size: Array | None = None) -> Any:
-        num_inputs = obs_dim + policy.critic_inputs
-        return jax.vmap(lambda key: init_narrowed(critic, key, num_inputs, hidden_size))(
-            jax.random.split(key)
-        )
-
-    def init_all(key: Array, hidden_size: Array | None = None) -> Params:
+    def init_params(key: Array, hidden_size: Array | None = None) -> Params:
         key_actor, key_critics = jax.random.split(key)
+        num_inputs = obs_dim + policy.critic_inputs
+        init_critics = jax.vmap(lambda key: init_narrowed(critic, key, num_inputs, hidden_size))
         return Params(
             actor=init_narrowed(actor, key_actor, obs_dim, hidden_size),
-            critics=init_critics(key_critics, hidden_size),
+            critics=init_critics(jax.random.split(key_critics)),
             log_alpha=jnp.zeros(()),
         )
 
     def init(key: Array, hparams: Hparams) -> Array:
-        params = init_all(key, hparams.hidden_size)
+        params = init_params(key, hparams.hidden_size)
         return flat.flatten(params._replace(log_alpha=jnp.log(jnp.float32(hparams.init_alpha))))
 
-    unflatten_critics = flat.unflattener(init_critics)
-    sizes = [
-        sum(math.prod(x.shape) for x in jax.tree.leaves(part))
-        for part in jax.eval_shape(init_all, jax.random.key(0))
-    ]
+    template = jax.eval_shape(init_params, jax.random.key(0))
+    start, size = (sum(x.size for x in jax.tree.leaves(part)) for part in template[:2])
     return Networks(
         init=init,
-        unflatten=flat.unflattener(init_all),
-        critics_of=lambda params: params[sizes[0] : sizes[0] + sizes[1]],
-        unflatten_critics=unflatten_critics,
+        unflatten=flat.inverse_of_flatten(template),
+        critics_of=lambda params: params[start : start + size],
+        unflatten_critics=flat.inverse_of_flatten(template.critics),
         actor=lambda params, obs: actor.apply(params.actor, obs),
         critics=jax.vmap(critic.apply, (0, None)),
     )
@@ -300,9 +256,9 @@ def make_learning_step(
     Source: Haarnoja et al. (2018), equations 5, 7 and 18; Christodoulou (2019), equations 10 to 12.
     """
 
-    def sum_of_losses(
-        params: Params, target_critics: Any, hp: Hparams, batch: Transition, noise: LearningNoise
-    ) -> Array:
+    def losses(
+        params: Params, target_critics: PyTree, hp: Hparams, batch: Transition, noise: LearningNoise
+    ) -> Float[Array, " batch"]:
         fixed = jax.lax.stop_gradient(params)
         online, online_fixed, target = (
             functools.partial(networks.critics, critics)
@@ -321,23 +277,24 @@ def make_learning_step(
         if hp.alpha is None:
             excess = jax.lax.stop_gradient(entropy) - policy.target_entropy(hp)
             losses = losses + params.log_alpha * excess
-        return jnp.sum(batch.weight * losses)
+        return losses
 
     def learn(state: SACState, batch: Transition, noise: LearningNoise) -> SACState:
         hp = state.hparams
-        params = networks.unflatten(state.params)
+        tree = networks.unflatten(state.params)
         target_critics = networks.unflatten_critics(state.target_critics)
 
-        def sum_of_gradients(batch: Transition, noise: LearningNoise) -> Array:
-            return flat.flatten(jax.grad(sum_of_losses)(params, target_critics, hp, batch, noise))
+        def sum_of_losses(params: Params, batch: Transition, noise: LearningNoise) -> Array:
+            return jnp.sum(batch.weight * losses(params, target_critics, hp, batch, noise))
 
-        gradient = mean_over_batch(sum_of_gradients, (batch, noise), hp.batch_size)
-        moved, opt_state = flat.adam_step(state.params, state.opt_state, gradient, hp.learning_rate)
-        tau = hp.tau
+        params, opt_state = adam_step(
+            sum_of_losses, state.params, state.opt_state, (batch, noise), hp, tree
+        )
+        critics = networks.critics_of(params)
         return state.replace(
-            params=moved,
+            params=params,
             opt_state=opt_state,
-            target_critics=tau * networks.critics_of(moved) + (1 - tau) * state.target_critics,
+            target_critics=soft_update(state.target_critics, critics, hp.tau),
         )
 
     return learn
@@ -372,6 +329,7 @@ def gaussian_policy(action_dim: int, max_action: float) -> Policy:
     def expected(
         critics: Critics, obs: Array, outputs: Array, noise: Array | None
     ) -> tuple[Array, Array]:
+        assert noise is not None
         action, log_p = squashed_gaussian(outputs, noise)
         return lesser(q_values(critics, obs, action)), -log_p
 
@@ -390,7 +348,7 @@ def gaussian_policy(action_dim: int, max_action: float) -> Policy:
 
 
 def squashed_gaussian(
-    outputs: Float[Array, "two_actions *batch"], noise: Any
+    outputs: Float[Array, "two_actions *batch"], noise: Float[Array, "actions *batch"]
 ) -> tuple[Float[Array, "actions *batch"], Float[Array, "*batch"]]:
     r"""Actions :math:`\tanh(\mu + \sigma \epsilon)` and the logarithms of their densities.
 

@@ -5,28 +5,34 @@ Using Connectionist Systems" (1994); paper, appendix, tables of Cliff Walking;
 `docs/reference.md` 4.6.
 """
 
-import functools
-from collections.abc import Callable
+import dataclasses
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Float, Int
 
-from sejax.agents.base import Agent, AgentOptions, Hparams, traced
+from sejax.agents.base import Agent, AgentOptions, AgentSpec, Hparams, traced
 from sejax.agents.buffers import Transition, no_buffer
 from sejax.agents.policies import decayed_epsilon, epsilon_greedy
+from sejax.envs.base import Task
 from sejax.options import MOVES, fraction, option, positive
-
-# `(key, q_row [num_actions], epsilon) -> []`: what the next state is worth to the target.
-NextValue = Callable[[Array, Array, Array], Array]
 
 
 @dataclass(frozen=True, kw_only=True)
 class QLearningConfig(AgentOptions):
-    """Tabular Q-learning (paper, appendix "Cliff Walking")."""
+    r"""Tabular Q-learning (paper, appendix "Cliff Walking").
+
+    .. math:: Q(s, a) \leftarrow Q(s, a) + \alpha (r + \gamma d \max_{a'} Q(s', a') - Q(s, a))
+
+    with the transition's own discount d, and from Q = 0 on. It learns from each step once, when it
+    has been made.
+
+    Differs: in an SE with `done="soft"` d is the learned 1 - done; the authors' tabular agents
+    bootstrap in full where done < 0.5 and not at all elsewhere, as `done="threshold"` does.
+    """
 
     states: ClassVar[str | None] = "discrete"
 
@@ -37,17 +43,38 @@ class QLearningConfig(AgentOptions):
     epsilon_min: float = option(0.1, fraction(), traced=True)
     epsilon_decay: float = option(0.0, fraction(), traced=True)
 
-    def make(self, task: Any) -> Agent:
+    def spec(self) -> AgentSpec:
+        return dataclasses.replace(super().spec(), cpu_num_parallel=None)
+
+    def make(self, task: Task) -> Agent:
         """The agent for a task's numbers of states and actions."""
-        return make_q_learning(self, task.num_states, task.num_actions)
+        assert task.num_states is not None and task.num_actions is not None
+        return make_tabular(self, task.num_states, task.num_actions)
+
+    def next_value(
+        self, key: Array, q_row: Float[Array, " num_actions"], epsilon: Array
+    ) -> Float[Array, ""]:
+        """What the next state is worth to the target, given its row of Q."""
+        return jnp.max(q_row)
 
 
 @dataclass(frozen=True, kw_only=True)
 class SARSAConfig(QLearningConfig):
-    """Tabular SARSA; the same hyperparameters."""
+    r"""Tabular SARSA; the same hyperparameters.
 
-    def make(self, task: Any) -> Agent:
-        return make_sarsa(self, task.num_states, task.num_actions)
+    .. math:: Q(s, a) \leftarrow Q(s, a) + \alpha (r + \gamma d \, Q(s', a') - Q(s, a))
+
+    As in the authors' code, a' is drawn by the learning step from the epsilon-greedy policy. It is
+    not the action executed next, which is drawn anew, and after this update.
+
+    Differs: in SEs as Q-learning.
+    """
+
+    def next_value(
+        self, key: Array, q_row: Float[Array, " num_actions"], epsilon: Array
+    ) -> Float[Array, ""]:
+        action = epsilon_greedy(key, q_row, epsilon)
+        return jnp.sum(jnp.where(jnp.arange(q_row.size) == action, q_row, 0.0))
 
 
 @struct.dataclass
@@ -59,60 +86,15 @@ class TabularState:
     hparams: Hparams  # traced options
 
 
-@functools.cache
-def make_q_learning(config: QLearningConfig, num_states: int, num_actions: int) -> Agent:
-    r"""Q-learning for observations `0..num_states-1` and actions `0..num_actions-1`.
-
-    .. math:: Q(s, a) \leftarrow Q(s, a) + \alpha (r + \gamma d \max_{a'} Q(s', a') - Q(s, a))
-
-    with the transition's own discount d, and from Q = 0 on. It learns from each step once, when it
-    has been made.
-
-    Differs: in an SE with `done="soft"` d is the learned 1 - done; the authors' tabular agents
-    bootstrap in full where done < 0.5 and not at all elsewhere, as `done="threshold"` does.
+def make_tabular(config: QLearningConfig, num_states: int, num_actions: int) -> Agent:
+    """Builds the agent for observations `0..num_states-1` and actions `0..num_actions-1`.
 
     Example:
-      >>> agent = make_q_learning(QLearningConfig(), num_states=48, num_actions=4)
+      >>> agent = make_tabular(SARSAConfig(), num_states=48, num_actions=4)
       >>> state = agent.init(jax.random.key(0), agent.hparams)
       >>> int(agent.act(jax.random.key(1), state, jnp.int32(36), explore=False))
       0
     """
-
-    def next_value(key: Array, q_row: Array, epsilon: Array) -> Array:
-        return jnp.max(q_row)
-
-    return _make_tabular(config, num_states, num_actions, next_value)
-
-
-@functools.cache
-def make_sarsa(config: SARSAConfig, num_states: int, num_actions: int) -> Agent:
-    r"""SARSA for observations `0..num_states-1` and actions `0..num_actions-1`.
-
-    .. math:: Q(s, a) \leftarrow Q(s, a) + \alpha (r + \gamma d \, Q(s', a') - Q(s, a))
-
-    As in the authors' code, a' is drawn by the learning step from the epsilon-greedy policy. It is
-    not the action executed next, which is drawn anew, and after this update.
-
-    Differs: in SEs as `make_q_learning`.
-
-    Example:
-      >>> agent = make_sarsa(SARSAConfig(), num_states=48, num_actions=4)
-      >>> state = agent.init(jax.random.key(0), agent.hparams)
-      >>> int(agent.act(jax.random.key(1), state, jnp.int32(36), explore=False))
-      0
-    """
-
-    def next_value(key: Array, q_row: Array, epsilon: Array) -> Array:
-        action = epsilon_greedy(key, q_row, epsilon)
-        return jnp.sum(jnp.where(jnp.arange(num_actions) == action, q_row, 0.0))
-
-    return _make_tabular(config, num_states, num_actions, next_value)
-
-
-def _make_tabular(
-    config: QLearningConfig, num_states: int, num_actions: int, next_value: NextValue
-) -> Agent:
-    """What both agents share: all but the value of the next state."""
 
     def init(key: Array, hparams: Hparams) -> TabularState:
         hparams = jax.tree.map(jnp.float32, hparams)
@@ -135,7 +117,7 @@ def _make_tabular(
 
     def update(key: Array, state: TabularState, transition: Transition) -> TabularState:
         hp, step = state.hparams, transition
-        value = next_value(key, row_of(state.q_values, step.next_obs), state.epsilon)
+        value = config.next_value(key, row_of(state.q_values, step.next_obs), state.epsilon)
         target = step.reward + hp.discount * step.discount * value
         is_visited = mask_of(step.obs, step.action, (num_states, num_actions))
         moved = state.q_values + hp.learning_rate * (target - state.q_values)
@@ -148,7 +130,7 @@ def _make_tabular(
         update=update,
         buffer=no_buffer(),
         hparams=traced(config),
-        spec=config.spec(cpu_num_parallel=None),
+        spec=config.spec(),
         discount=lambda hparams: hparams.discount,
     )
 

@@ -7,10 +7,9 @@ Jang et al., "Categorical Reparameterization with Gumbel-Softmax" (2017); the pa
 hyperparameter tables; `docs/reference.md` 4.3 and 4.4.
 """
 
-import functools
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, ClassVar, NamedTuple
+from typing import ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -20,35 +19,30 @@ from jaxtyping import Array, Bool, Float, Int
 
 from sejax.agents.base import Agent, Hparams
 from sejax.agents.buffers import Transition
-from sejax.agents.off_policy import (
-    OffPolicyOptions,
-    mean_over_batch,
-    off_policy_agent,
-    warming_up,
-)
+from sejax.agents.networks import flat_network
+from sejax.agents.off_policy import ActorCriticOptions, adam_step, off_policy_agent, soft_update
+from sejax.envs.base import Task
 from sejax.ops import flat
-from sejax.ops.networks import init_narrowed
+from sejax.ops.networks import MLP
 from sejax.options import MOVES, counts, fraction, not_negative, option, positive
 
 _MIN_TEMPERATURE = 1e-6
 
 
 @dataclass(frozen=True, kw_only=True)
-class TD3Config(OffPolicyOptions):
+class TD3Config(ActorCriticOptions):
     """TD3's hyperparameters (paper, appendix "MountainCarContinuous-v0 and HalfCheetah-v3").
 
     The defaults are the paper's for HalfCheetah; for MountainCarContinuous it has
-    `warmup_episodes=50 action_repeat=2`. Actions are uniformly random in the warm-up.
+    `warmup_episodes=50 action_repeat=2`.
+
+    Differs: the authors do not scale the target policy's noise by the largest action. That is the
+    same wherever it is 1, as in all of the paper's tasks. Tests are without exploration noise
+    unless `noisy_tests` is set.
     """
 
-    actions: ClassVar[tuple[str, ...]] = ("continuous",)
-
     warmup_episodes: int = 20
-    batch_size: int = 256
-    learning_rate: float = 3e-4  # of the actor and the critics
-    tau: float = 0.005
     policy_delay: int = option(2, counts())  # learning steps for each one of actor and targets
-    action_repeat: int = option(1, counts())  # environment steps for each decision
     # Exploration, in units of the largest action.
     action_noise_std: float = option(0.1, not_negative(), traced=True)
     # Smoothing of the target policy, likewise.
@@ -56,14 +50,21 @@ class TD3Config(OffPolicyOptions):
     target_noise_clip: float = option(0.5, not_negative(), traced=True)
     noisy_tests: bool = False  # exploration noise in tests too, as in the authors' code
 
-    def make(self, task: Any) -> Agent:
+    def make(self, task: Task) -> Agent:
         """The agent for a task's observations and actions."""
-        return make_td3(self, task.obs_dim, task.action_dim, task.max_action)
+        return make_td3(self, task.obs_dim, tanh_policy(task.action_dim, task.max_action))
 
 
 @dataclass(frozen=True, kw_only=True)
 class DiscreteTD3Config(TD3Config):
-    """TD3 for discrete actions: the policy is a Gumbel-Softmax (paper, default agent table)."""
+    """TD3 for discrete actions: the policy is a Gumbel-Softmax (paper, default agent table).
+
+    The buffer keeps actions as vectors `[num_actions]`: samples of the Gumbel-Softmax with
+    exploration noise. The environment takes the index of the largest entry.
+
+    Differs: the temperature reaches its end after `temperature_steps` learning steps, in the
+    authors' code after one less. Tests take the likeliest action unless `noisy_tests` is set.
+    """
 
     actions: ClassVar[tuple[str, ...]] = ("discrete",)
 
@@ -79,8 +80,15 @@ class DiscreteTD3Config(TD3Config):
     temperature_steps: int = option(2000, counts())  # ... reached linearly after so many updates
     one_hot_actions: bool = False  # straight-through one-hot actions in place of soft ones
 
-    def make(self, task: Any) -> Agent:
-        return make_td3_discrete(self, task.obs_dim, task.num_actions)
+    def make(self, task: Task) -> Agent:
+        assert task.num_actions is not None
+        policy = gumbel_softmax_policy(
+            task.num_actions, self.temperature_steps, self.one_hot_actions
+        )
+        return make_td3(self, task.obs_dim, policy)
+
+    def mlp(self, num_outputs: int) -> MLP:
+        return super().mlp(num_outputs).clone(layer_norm=self.layer_norm, may_narrow=True)
 
 
 class TD3State(struct.PyTreeNode):
@@ -136,49 +144,15 @@ class Policy:
     env_action: Callable[[Array], Array]
 
 
-@functools.cache
-def make_td3(config: TD3Config, obs_dim: int, action_dim: int, max_action: float) -> Agent:
-    """Builds the agent for observations `[obs_dim]` and actions `[action_dim]`.
-
-    Actions lie in [-max_action, max_action]; the stds of all noise are in units of `max_action`.
-
-    Differs: the authors do not scale the target policy's noise by the largest action. That is the
-    same wherever it is 1, as in all of the paper's tasks. Tests are without exploration noise
-    unless `config.noisy_tests` is set.
+def make_td3(config: TD3Config, obs_dim: int, policy: Policy) -> Agent:
+    """Builds the agent for observations `[obs_dim]` and a policy's actions.
 
     Example:
-      >>> agent = make_td3(TD3Config(), obs_dim=3, action_dim=1, max_action=2.0)
+      >>> agent = make_td3(TD3Config(), obs_dim=3, policy=tanh_policy(1, max_action=2.0))
       >>> state = jax.jit(agent.init)(jax.random.key(0), agent.hparams)
       >>> agent.act(jax.random.key(1), state, jnp.zeros(3), explore=True).shape
       (1,)
     """
-    policy = tanh_policy(action_dim, max_action)
-    return _make_agent(config, obs_dim, policy)
-
-
-@functools.cache
-def make_td3_discrete(config: DiscreteTD3Config, obs_dim: int, num_actions: int) -> Agent:
-    """Builds the agent for observations `[obs_dim]` and actions `0..num_actions-1`.
-
-    The buffer keeps actions as vectors `[num_actions]`: samples of the Gumbel-Softmax with
-    exploration noise. The environment takes the index of the largest entry.
-
-    Differs: the temperature reaches its end after `config.temperature_steps` learning steps, in the
-    authors' code after one less. Tests take the likeliest action unless `config.noisy_tests` is
-    set.
-
-    Example:
-      >>> agent = make_td3_discrete(DiscreteTD3Config(), obs_dim=4, num_actions=2)
-      >>> state = jax.jit(agent.init)(jax.random.key(0), agent.hparams)
-      >>> action = agent.act(jax.random.key(1), state, jnp.zeros(4), explore=True)
-      >>> action.shape, int(agent.env_action(action)) in (0, 1)
-      ((2,), True)
-    """
-    policy = gumbel_softmax_policy(num_actions, config.temperature_steps, config.one_hot_actions)
-    return _make_agent(config, obs_dim, policy)
-
-
-def _make_agent(config: TD3Config, obs_dim: int, policy: Policy) -> Agent:
     networks = make_networks(config, obs_dim, policy.action_dim)
     learn = make_learning_step(config, networks, policy)
 
@@ -213,9 +187,8 @@ def _make_agent(config: TD3Config, obs_dim: int, policy: Policy) -> Agent:
 
     return off_policy_agent(
         config,
-        spec=config.spec(action_repeat=config.action_repeat),
         init=init,
-        begin_episode=warming_up(config),
+        begin_episode=config.begin_episode,
         act=act,
         update=update,
         env_action=policy.env_action,
@@ -242,30 +215,19 @@ class Networks(NamedTuple):
 
 def make_networks(config: TD3Config, obs_dim: int, action_dim: int) -> Networks:
     """An actor `s -> [action_dim]` and critics `[s, a] -> Q` of the same hidden layers."""
-    layer_norm = isinstance(config, DiscreteTD3Config) and config.layer_norm
-
-    def network(num_inputs: int, num_outputs: int) -> tuple[Callable, Callable]:
-        mlp = config.mlp(num_outputs, layer_norm=layer_norm, may_narrow=True)
-        unflatten = flat.unflattener(mlp.init, jnp.zeros(num_inputs))
-
-        def init(key: Array, hidden_size: Array | None) -> Array:
-            return flat.flatten(init_narrowed(mlp, key, num_inputs, hidden_size))
-
-        return init, lambda params, x: mlp.apply(unflatten(params), x)
-
-    init_actor, actor = network(obs_dim, action_dim)
-    init_critic, critic = network(obs_dim + action_dim, 1)
+    actor = flat_network(config.mlp(action_dim), obs_dim)
+    critic = flat_network(config.mlp(1), obs_dim + action_dim)
 
     def init(key: Array, hidden_size: Array | None = None) -> tuple[Array, Array]:
         key_actor, key_critics = jax.random.split(key)
-        init_critics = jax.vmap(init_critic, (0, None))
+        init_critics = jax.vmap(critic.init, (0, None))
         critics = init_critics(jax.random.split(key_critics), hidden_size)
-        return init_actor(key_actor, hidden_size), critics
+        return actor.init(key_actor, hidden_size), critics
 
     return Networks(
         init=init,
-        actor=actor,
-        critic=lambda params, obs, action: critic(params, jnp.concatenate([obs, action]))[0],
+        actor=actor.apply,
+        critic=lambda params, obs, action: critic.apply(params, jnp.concatenate([obs, action]))[0],
     )
 
 
@@ -297,13 +259,8 @@ def make_learning_step(
             errors = both_q(critics, batch.obs, batch.action) - targets[None]
             return jnp.sum(batch.weight * jnp.sum(errors**2, axis=0))
 
-        gradient = mean_over_batch(
-            functools.partial(jax.grad(sum_of_losses), state.critics),
-            (batch, noise),
-            hp.batch_size,
-        )
-        critics, opt_state = flat.adam_step(
-            state.critics, state.critic_opt_state, gradient, hp.learning_rate
+        critics, opt_state = adam_step(
+            sum_of_losses, state.critics, state.critic_opt_state, (batch, noise), hp
         )
         return state.replace(critics=critics, critic_opt_state=opt_state)
 
@@ -314,18 +271,14 @@ def make_learning_step(
             action = policy.action(networks.actor(actor, batch.obs), noise.policy, state)
             return -jnp.sum(batch.weight * networks.critic(state.critics[0], batch.obs, action))
 
-        gradient = mean_over_batch(
-            functools.partial(jax.grad(sum_of_losses), state.actor), (batch, noise), hp.batch_size
+        actor, opt_state = adam_step(
+            sum_of_losses, state.actor, state.actor_opt_state, (batch, noise), hp
         )
-        actor, opt_state = flat.adam_step(
-            state.actor, state.actor_opt_state, gradient, hp.learning_rate
-        )
-        tau = hp.tau
         return state.replace(
             actor=actor,
             actor_opt_state=opt_state,
-            target_actor=tau * actor + (1 - tau) * state.target_actor,
-            target_critics=tau * state.critics + (1 - tau) * state.target_critics,
+            target_actor=soft_update(state.target_actor, actor, hp.tau),
+            target_critics=soft_update(state.target_critics, state.critics, hp.tau),
         )
 
     def learn(state: TD3State, batch: Transition, noise: LearningNoise) -> TD3State:

@@ -12,13 +12,13 @@ Source: paper, table "Agent hyperparameter ranges" and appendix "Varied Agent Hy
 import dataclasses
 import math
 from collections.abc import Callable
-from typing import Any, NamedTuple, get_type_hints
+from typing import NamedTuple, get_type_hints
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from sejax.agents.base import Agent, Draw, Varied, with_hparams
+from sejax.agents.base import Agent, AgentConfig, Draw, Varied, with_hparams
 from sejax.ops import cpu
 from sejax.options import marks, require
 
@@ -32,7 +32,7 @@ class Range(NamedTuple):
     integer: bool
 
 
-def ranges_of(config: Any) -> dict[str, Range]:
+def ranges_of(config: AgentConfig) -> dict[str, Range]:
     """The ranges around an agent's configuration, of the options that say how they are drawn.
 
     Those of `option(..., varied=how)`:
@@ -46,32 +46,25 @@ def ranges_of(config: Any) -> dict[str, Range]:
 
     Source: paper, table "Agent hyperparameter ranges"; tabular agents: `docs/reference.md` 4.9.
     """
-    hints = get_type_hints(type(config))
-    metadata = {field.name: marks(type(config), field.name) for field in dataclasses.fields(config)}
-    fields = [field for field in dataclasses.fields(config) if metadata[field.name].get("varied")]
+    cls, hints = type(config), get_type_hints(type(config))
+    names = [field.name for field in dataclasses.fields(config)]
+    how = {name: marks(cls, name)["varied"] for name in names if marks(cls, name).get("varied")}
     require(
-        fields,
+        how,
         "agent_hparams",
-        "must be default with this agent, because none of its options says how it is drawn "
-        f"(sejax.options.option(..., varied=...)); got {type(config).__name__}. Set "
-        "agent_hparams=default.",
+        f"must be default with {cls.__name__}, none of whose options has `varied` set; got varied. "
+        "Set agent_hparams=default.",
     )
-    # Traced ones first: which key draws what.
-    ordered = sorted(fields, key=lambda field: not metadata[field.name]["traced"])
-    return {
-        field.name: _range(
-            metadata[field.name]["varied"], getattr(config, field.name), hints[field.name] is int
-        )
-        for field in ordered
-    }
+    # Traced ones first: the order says which key draws what.
+    ordered = sorted(how, key=lambda name: not marks(cls, name)["traced"])
+    return {name: _range(how[name], getattr(config, name), hints[name] is int) for name in ordered}
 
 
-def _range(how: str, value: Any, integer: bool) -> Range:
+def _range(how: str, value: float, integer: bool) -> Range:
     match how:
-        case "triple" if integer:
-            return Range(max(1, value // 3), 3 * value, True, True)
         case "triple":
-            return Range(value / 3, 3 * value, True, False)
+            low = max(1, value // 3) if integer else value / 3
+            return Range(low, 3 * value, True, integer)
         case "one_more_or_less":
             return Range(max(1, value - 1), value + 1, False, True)
         case "tenth_to_one":
@@ -99,7 +92,7 @@ def hidden_sizes(bounds: Range, num_layers: int) -> tuple[int, ...]:
     return tuple(range(smallest, math.ceil(bounds.high) + step, step))
 
 
-def make_varied(config: Any, make: Callable[[Any], Agent]) -> Agent:
+def make_varied(config: AgentConfig, make: Callable[[AgentConfig], Agent]) -> Agent:
     """An agent whose options are drawn anew for each training; see `Agent.fresh`.
 
     Args:
@@ -125,7 +118,7 @@ def make_varied(config: Any, make: Callable[[Any], Agent]) -> Agent:
         ]
         room = {"batch_size": int(ranges["batch_size"].high)} if "batch_size" in ranges else {}
         variants = [
-            make(dataclasses.replace(config, num_layers=depth, hidden_size=size, **room))
+            make(dataclasses.replace(config, **room, **{"num_layers": depth, "hidden_size": size}))
             for depth, size in shapes
         ]
 

@@ -1,6 +1,7 @@
 """A Ray cluster's workers, which come and go.
 
-Ray knows the machines, starts processes there, notices when one is gone and carries the arrays.
+Ray knows the machines, starts processes there, starts them anew when they die, and carries the
+arrays.
 """
 
 import contextlib
@@ -14,17 +15,18 @@ from dataclasses import dataclass
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
-from sejax.options import ConfigError, FailedError, told
+from sejax.options import ConfigError, FailedError, shortened, told
 
 if TYPE_CHECKING:
     from sejax.cli.workers import RayConfig
 
+RESTARTS = 20  # by Ray, of a worker that dies
+RETRIES = -1  # by Ray, of a share; any number, as many fail at once until Ray knows a node is gone
 LOOK_S = 1.0  # between looks for machines that have come, and workers that hang
-FIRST_S = 3600.0  # a worker may take for its first answer, compilation included
-LEAST_S = 20.0  # a worker may always take
+FIRST_S = 3600.0  # a worker may take to start, compilation included, and for the first share
+LEAST_S = 20.0  # a share may always take
 LATE = 10.0  # times the longest share so far, after which a worker counts as hanging
 QUIET_S = 30.0  # without any worker that is ready, after which the user is told why
-MOST_LOSSES = 5  # of each worker, without an answer in between: that is no accident
 
 
 @contextlib.contextmanager
@@ -51,8 +53,9 @@ def connected(machines: "RayConfig") -> Iterator[ModuleType]:
             )
     except (ConnectionError, RuntimeError, ValueError) as error:
         raise ConfigError(
-            f"machines.address must be a cluster that can be reached, because trainings are sent "
-            f"there; {told(error)}. Start one with ray start --head, or set machines.address=local."
+            f"machines.address must be a cluster that can be reached; got {machines.address} "
+            f"({told(error)}). Start one with ray start --head, or set machines.address=local.",
+            "machines.address",
         ) from error
     try:
         yield ray
@@ -83,16 +86,35 @@ def num_workers(machines: "RayConfig") -> int:
     return int(room)
 
 
-class Pool:
-    """Workers that compute shares; lost ones are replaced, and new machines are used.
+def reason(error: Exception) -> str:
+    """The last line of an error, where Ray's errors have what the worker raised."""
+    return shortened(str(error).strip().splitlines()[-1].strip(), 160)
 
-    Ray restarts and retries by itself only where a worker was, and has room for it: on a cluster
-    whose node is lost a share would wait although other workers are idle. Here every worker is as
-    good as another: one that died and one that hangs are dropped, and their share goes to the next.
+
+@dataclass(frozen=True)
+class _Job:
+    """What a worker does: the share with this index, or None while it starts.
+
+    `num_late` is how often the share was late before.
+    """
+
+    worker: Any
+    share: int | None
+    since: float
+    num_late: int = 0
+
+
+class Pool:
+    """Workers that compute shares.
+
+    Ray starts a worker anew that dies, and sends it its share again. What Ray does not do is left:
+    it does not notice a worker that hangs, nor that a share waits for a machine that is gone while
+    others are idle, nor does it use machines that join. So a share that is late is taken from its
+    worker, which is ended, and goes to the next one that is free.
 
     Args:
       ray: the module; of it `wait`, `get` and `kill`.
-      start: starts a worker, an actor with `prepare` and `evaluate`, without waiting for it.
+      start: starts a worker, an actor with `ready` and `evaluate`, without waiting for it.
       num_workers: how many there should be now.
       say: tells the user.
       clock: seconds.
@@ -100,7 +122,7 @@ class Pool:
 
     def __init__(
         self,
-        ray: Any,
+        ray: ModuleType,
         start: Callable[[], Any],
         num_workers: Callable[[], int],
         say: Callable[[str], None] = lambda text: None,
@@ -111,10 +133,9 @@ class Pool:
         self._idle: list[Any] = []
         self._busy: dict[Any, _Job] = {}  # by what Ray returned for it
         self._longest_s = 0.0  # that a share took
-        self._losses, self._most = 0, 1  # since the last answer; workers that there were
         self._told_at = clock() + QUIET_S
         self._looked = -math.inf
-        self._hire()
+        self._grow()
 
     @property
     def size(self) -> int:
@@ -125,26 +146,26 @@ class Pool:
         """What workers return for each share, in the order of the shares.
 
         Raises:
-          FailedError: if workers are lost again and again, or the whole cluster is.
+          FailedError: if a worker fails, or the whole cluster is lost.
         """
         waiting, results = deque(range(len(shares))), dict[int, Any]()
+        num_late = [0] * len(shares)
         while len(results) < len(shares):
+            self._grow()
             while waiting and self._idle:
-                worker, index = self._idle.pop(), waiting.popleft()
-                job = _Job(worker, index, self._clock())
-                self._busy[worker.evaluate.remote(shares[index])] = job
+                worker, share = self._idle.pop(), waiting.popleft()
+                job = _Job(worker, share, self._clock(), num_late[share])
+                self._busy[worker.evaluate.remote(shares[share])] = job
             for job, answer in self._answers():
-                if isinstance(answer, Exception):
-                    self._drop(job, answer)
-                    if job.share is not None:
-                        waiting.appendleft(job.share)
-                    continue
                 self._idle.append(job.worker)
                 self._told_at = math.inf
                 if job.share is not None:
-                    results[job.share], self._losses = answer, 0
+                    results[job.share] = answer
                     self._longest_s = max(self._longest_s, self._clock() - job.since)
-        return [results[index] for index in range(len(shares))]
+            for share in self._end_late():
+                waiting.appendleft(share)
+                num_late[share] += 1
+        return [results[share] for share in range(len(shares))]
 
     def close(self) -> None:
         """Ends all workers."""
@@ -152,32 +173,15 @@ class Pool:
             self._ray.kill(worker)
         self._idle, self._busy = [], {}
 
-    def _answers(self) -> list[tuple["_Job", Any]]:
-        """Jobs that have ended within `LOOK_S`, each with its answer or an exception."""
-        self._hire()
-        if not self._busy:
-            time.sleep(LOOK_S)  # until a machine comes
-            return []
-        # With one reference Ray wakes up for the first answer; the others that came are taken too.
-        done, _ = self._ray.wait(list(self._busy), num_returns=1, timeout=LOOK_S)
-        if done:
-            done, _ = self._ray.wait(list(self._busy), num_returns=len(self._busy), timeout=0)
-        now = self._clock()
-        answers = [(self._busy.pop(reference), self._answer(reference)) for reference in done]
-        late = [ref for ref, job in self._busy.items() if now - job.since > self._limit_s(job)]
-        hanging = TimeoutError("it does not answer")
-        return answers + [(self._busy.pop(reference), hanging) for reference in late]
-
-    def _hire(self) -> None:
-        """Starts workers that are missing; at most once in `LOOK_S`."""
+    def _grow(self) -> None:
+        """Starts workers where machines have come; looks at most once in `LOOK_S`."""
         now = self._clock()
         if now - self._looked < LOOK_S:
             return
         self._looked = now
         for _ in range(self._num_workers() - self.size):
             worker = self._start()
-            self._busy[worker.prepare.remote()] = _Job(worker, None, now)
-        self._most = max(self._most, self.size)
+            self._busy[worker.ready.remote()] = _Job(worker, None, now)
         if now > self._told_at:
             self._told_at = math.inf
             self._say(
@@ -185,42 +189,32 @@ class Pool:
                 f"they need (see ray status)."
             )
 
-    def _answer(self, reference: Any) -> Any:
+    def _answers(self) -> list[tuple[_Job, Any]]:
+        """The next job that has ended, with its answer; none if there is none within `LOOK_S`."""
+        if not self._busy:
+            time.sleep(LOOK_S)  # until a machine comes
+            return []
+        done, _ = self._ray.wait(list(self._busy), num_returns=1, timeout=LOOK_S)
         try:
-            return self._ray.get(reference)
-        except Exception as error:  # that the worker raised, or of Ray if it has died
-            return error
+            return [(self._busy.pop(reference), self._ray.get(reference)) for reference in done]
+        except Exception as error:  # that the worker raised, or of Ray, if it died too often
+            raise FailedError(
+                f"A worker has failed: {reason(error)}. The generations before are saved; the same "
+                f"command with machines=local goes on here."
+            ) from error
 
-    def _limit_s(self, job: "_Job") -> float:
+    def _end_late(self) -> list[int]:
+        """Ends workers that hang; returns their shares."""
+        now, shares = self._clock(), []
+        for reference, job in list(self._busy.items()):
+            if now - job.since > self._limit_s(job):
+                self._ray.kill(job.worker)
+                del self._busy[reference]
+                shares += [] if job.share is None else [job.share]
+        return shares
+
+    def _limit_s(self, job: _Job) -> float:
+        """Seconds that a job may take; a share may be far longer than any before, and gets more."""
         if job.share is None or not self._longest_s:
             return FIRST_S
-        return max(LEAST_S, LATE * self._longest_s)
-
-    def _drop(self, job: "_Job", error: Exception) -> None:
-        """Ends a worker that failed or hangs.
-
-        Raises:
-          FailedError: if that has happened too often.
-        """
-        with contextlib.suppress(Exception):  # it may be gone
-            self._ray.kill(job.worker)
-        reason = told(error).splitlines()[-1].strip()
-        self._losses += 1
-        if self._losses >= MOST_LOSSES * self._most:  # a node may take many with it
-            raise FailedError(
-                f"{self._losses} workers were lost in a row, the last one so: {reason}. The "
-                f"generations before are saved; the same command with machines=local goes on here."
-            ) from error
-        if job.share is None:
-            self._say(f"A worker did not start: {reason}. Another one is started.")
-        if isinstance(error, TimeoutError):
-            self._longest_s *= 2  # its share may take longer than any before
-
-
-@dataclass(frozen=True)
-class _Job:
-    """What a worker does: the share with this index, or None while it gets ready."""
-
-    worker: Any
-    share: int | None
-    since: float
+        return max(LEAST_S, LATE * self._longest_s) * 2**job.num_late

@@ -13,10 +13,13 @@ from sejax.cli import runtime
 from sejax.options import ConfigError, FailedError, registry, shortened
 
 BAD_INPUT, FAILED, INTERRUPTED = 2, 1, 130
+HELP, PRINT_CONFIG = ("--help", "-h"), "--print-config"
 
 
 def start(
-    main: Callable[[Sequence[str]], object], help_text: Callable[[Sequence[str]], str]
+    main: Callable[[Sequence[str]], object],
+    help_text: Callable[[Sequence[str]], str],
+    config_text: Callable[[Sequence[str]], str] | None = None,
 ) -> None:
     """Runs a command on the words of the command line; errors become a message and an exit code.
 
@@ -25,17 +28,21 @@ def start(
     Args:
       main: the command, a function of its overrides.
       help_text: what `--help` prints beside these overrides.
+      config_text: what `--print-config` prints, if the command has this option.
     """
     words = sys.argv[1:]
     with messages(), registry.only_typed(words):
-        overrides = _prepared(words)
-        if {"--help", "-h"} & {*words}:
+        options = [*HELP, *([PRINT_CONFIG] if config_text else [])]
+        overrides = _prepared(words, options)
+        if {*HELP} & {*words}:
             print(help_text(overrides))
+        elif config_text and PRINT_CONFIG in words:
+            print(config_text(overrides), end="")
         else:
             main(overrides)
 
 
-def _prepared(words: Sequence[str]) -> list[str]:
+def _prepared(words: Sequence[str], known: Sequence[str]) -> list[str]:
     """Sets the process up, and returns the overrides among the words.
 
     Raises:
@@ -44,13 +51,12 @@ def _prepared(words: Sequence[str]) -> list[str]:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")  # terminals without Unicode
-    options = [word for word in words if word.startswith("-") and word not in ("--help", "-h")]
+    options = [word for word in words if word.startswith("-") and word not in known]
     if options:
-        raise ConfigError(
-            f"An override must read FIELD=VALUE; got {shortened(options[0])}. The only option "
-            f"is --help.",
-            "an override",
+        message = (
+            f"must read FIELD=VALUE; got {shortened(options[0])}. Options: {', '.join(known)}."
         )
+        raise ConfigError(f"An override {message}", "an override")
     if sys.path[0] != "":  # `python -m` has put the current folder there, if it still exists
         sys.path.insert(0, "")
     Path.cwd()
@@ -77,22 +83,16 @@ def messages() -> Iterator[None]:
         fail(str(error), BAD_INPUT)
     except BrokenPipeError:  # the reader has seen enough
         leave(0)
-    except OSError as error:
-        fail(
-            f"A file could not be written or read: {error}. All that was written before is "
-            f"whole; run the same command again to go on from there.",
-            FAILED,
-        )
     except FailedError as error:
         fail(str(error), FAILED)
+    except OSError as error:
+        message = f"A file could not be written or read: {error}. What was written before is whole"
+        fail(f"{message}; run the same command again to go on from there.", FAILED)
     except RuntimeError as error:
         if "RESOURCE_EXHAUSTED" not in str(error) and "Out of memory" not in str(error):
             raise
-        fail(
-            f"There is not enough memory: {str(error).splitlines()[0]} Smaller networks, "
-            f"buffers or populations need less.",
-            FAILED,
-        )
+        message = f"There is not enough memory: {str(error).splitlines()[0]}"
+        fail(f"{message} Smaller networks, buffers or populations need less.", FAILED)
 
 
 def fail(message: str, status: int) -> NoReturn:

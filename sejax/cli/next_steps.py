@@ -2,19 +2,17 @@
 
 import json
 import shlex
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from sejax.cli import config as configuration
-from sejax.options import ConfigError, as_text, registry
-from sejax.options.registry import flatten
+from sejax.options import as_text
 
 
 def evaluate_words(
-    proxy: Any, env_name: str, kind: str, agents: Sequence[str], has_real_steps: bool
+    proxy: Path | str, env_name: str, kind: str, agents: Sequence[str], has_real_steps: bool
 ) -> list[str]:
-    """What `sejax.evaluate` must be told.
+    """The overrides with which `sejax.evaluate` judges a proxy.
 
     Args:
       proxy: a run directory.
@@ -36,7 +34,9 @@ def evaluate_words(
     return [*words, "num_agents=20"]
 
 
-def of_stored(stored: dict[str, Any], path: Path, generations: int | None) -> list[tuple[str, str]]:
+def of_stored(
+    stored: Mapping[str, Any], path: Path, generations: int | None
+) -> list[tuple[str, str]]:
     """What can be done with a stored run, each with its command.
 
     Args:
@@ -44,28 +44,24 @@ def of_stored(stored: dict[str, Any], path: Path, generations: int | None) -> li
       path: the run directory.
       generations: that it may go on to; None if it is over.
     """
-    kind = str(stored["proxy"]["name"])
-    words = evaluate_words(
-        path, str(stored["env"]["name"]), kind, agent_names(stored), kind == "rn"
-    )
-    steps = [
-        (
-            "Train fresh agents on it, and on the real task beside them",
-            _command("sejax.evaluate", words),
-        )
-    ]
-    if not any(":" in name for name in (kind, str(stored["env"]["name"]))):
-        steps.append(
-            ("Use it as a gymnax environment", f"env, params = sejax.load({json.dumps(str(path))})")
-        )
-    changes = {"run_dir": str(path), "generations": generations}
-    again = run_words(stored | changes) if generations is not None else None
-    if again is not None:
-        steps.append((f"Go on, to generation {generations:,}", _command("sejax.run", again)))
+    env, kind = str(stored["env"]["name"]), str(stored["proxy"]["name"])
+    words = evaluate_words(path, env, kind, agent_names(stored), kind == "rn")
+    about = "Train fresh agents on it, and on the real task beside them"
+    steps = [(about, _command("sejax.evaluate", words))]
+    if ":" not in env + kind:
+        load = f"env, params = sejax.load({json.dumps(str(path))})"
+        steps.append(("Use it as a gymnax environment", load))
+    # What is not sejax's own must be typed: a file names no module.
+    chosen = [x["name"] for x in stored.values() if isinstance(x, Mapping) and "name" in x]
+    if generations is not None and not any(":" in str(x) for x in (*chosen, *agent_names(stored))):
+        folder = as_text(str(path))
+        words = [f"preset={as_text(str(path / 'config.yaml'))}", f"run_dir={folder}"]
+        again = _command("sejax.run", [*words, f"generations={generations}"])
+        steps.append((f"Go on, to generation {generations:,}", again))
     return steps
 
 
-def require_run(stored: dict[str, Any]) -> None:
+def require_run(stored: Mapping[str, Any]) -> None:
     """Checks that a stored configuration names what `of_stored` says.
 
     Raises:
@@ -77,49 +73,11 @@ def require_run(stored: dict[str, Any]) -> None:
     int(stored["generations"])
 
 
-def agent_names(stored: dict[str, Any]) -> list[str]:
+def agent_names(stored: Mapping[str, Any]) -> list[str]:
     """The agents of a stored run, by the names of their choices."""
     several = stored.get("agents") or {}
     families = [each for each in several.values() if isinstance(each, dict)]
     return [str(each["name"]) for each in families or [stored["agent"]]]
-
-
-def run_words(stored: dict[str, Any]) -> list[str] | None:
-    """The words after `python -m sejax.run` that compose a configuration; None if none are known.
-
-    That is so for what is not sejax's own: to know its fields, it would have to be imported.
-    """
-    several = agent_names(stored) if stored.get("agents") else []
-    groups = [x for x in configuration.LearnConfig.groups if x != "agent" or not several]
-    names = {group: str(stored.get(group, {}).get("name", "none")) for group in groups}
-    named = [*names.items(), *(("agent", name) for name in several)]
-    is_known = all(registry.is_registered(group, name) for group, name in named)
-    if (
-        not is_known or stored.get("preset") not in configuration.preset_names()
-    ):  # a run stores no file's name
-        return None
-    chosen = [f"{group}={names[group]}" for group in ("env", "proxy")]
-    chosen += [f"preset={stored['preset']}"] if stored.get("preset") != "best" else []
-    chosen += [f"agents=[{','.join(several)}]"] if several else []
-    try:
-        usual = configuration.plain(configuration.config(chosen))
-        others = [
-            f"{group}={name}"
-            for group, name in names.items()
-            if (usual[group] or {}).get("name") != name
-        ]
-        chosen += others
-        usual = flatten(configuration.plain(configuration.config(chosen)) if others else usual)
-        asked = flatten(stored)
-        words = chosen + [
-            f"{name}={as_text(value)}"
-            for name, value in asked.items()
-            if name in usual and usual[name] != value
-        ]
-        composed = flatten(configuration.plain(configuration.config(words)))
-    except (ConfigError, LookupError, TypeError, AttributeError):
-        return None
-    return words if all(composed.get(name) == value for name, value in asked.items()) else None
 
 
 def _command(module: str, words: Sequence[str]) -> str:

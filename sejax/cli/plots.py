@@ -1,26 +1,26 @@
 """Pictures of runs and evaluations."""
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import matplotlib as mpl
 
 mpl.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.figure import Figure
 
 from sejax.ops.files import atomic_path
-
-if TYPE_CHECKING:
-    import pandas as pd  # which takes 0.3 s to import
 
 INCUMBENT, POPULATION, SOLVED, STEPS = "#1f5fa8", "#d9822b", "#3c8d40", "#6b4c9a"
 AGENTS = ("#b8336a", "#2a9d8f", "#8d6a2f", "#7b5ea7", "#4d7c0f", "#0e7490", "#9f1239")
 
 
-def learning_curve(rows: Sequence[dict[str, Any]], solved_score: float | None, path: Path) -> None:
+def learning_curve(
+    rows: Sequence[Mapping[str, Any]], solved_score: float | None, path: Path
+) -> None:
     """Draws `learning_curve.png`: scores above, agents' training steps below.
 
     Args:
@@ -59,16 +59,16 @@ def learning_curve(rows: Sequence[dict[str, Any]], solved_score: float | None, p
 
 
 def evaluation(
-    tables: dict[tuple[str, str], "pd.DataFrame"], solved_reward: float, path: Path
+    tables: Mapping[tuple[str, str], Mapping[str, Any]], solved_reward: float | None, path: Path
 ) -> None:
     """Draws what agents trained in each world reached and what it took.
 
-    One column for each world, in it one for each family of agents, with a colour of its own.
+    A column for each world, in it one for each agent of several, each with its colour.
 
     Args:
-      tables: world and family to agents, with columns `test_return`, `train_steps` and
-        `train_episodes`.
-      solved_reward: the task's threshold.
+      tables: by world and agent, columns `test_return`, `train_steps` and `train_episodes`, each
+        with a number for each agent.
+      solved_reward: the task's threshold; None or infinite if there is none.
       path: the picture.
     """
     worlds, keys = (list(dict.fromkeys(names)) for names in zip(*tables, strict=True))
@@ -86,7 +86,7 @@ def evaluation(
         )
         for axis, (column, label) in zip(axes, panels, strict=True):
             for (world, key), table in tables.items():
-                index, values = places[world, key], table[column].to_numpy(float)
+                index, values = places[world, key], np.asarray(table[column], float)
                 color = (INCUMBENT, POPULATION)[worlds.index(world) % 2]
                 if len(keys) > 1:
                     color = AGENTS[keys.index(key) % len(AGENTS)]
@@ -113,11 +113,12 @@ def evaluation(
                 axis.set_ylim(bottom=0)
         if len(keys) > 1:
             axes[0].legend(frameon=False, fontsize=9)
-        axes[0].axhline(solved_reward, color=SOLVED, ls="--", lw=1.2)
+        if solved_reward is not None:
+            axes[0].axhline(solved_reward, color=SOLVED, ls="--", lw=1.2)
         _write(figure, path)
 
 
-def _write(figure: Any, path: Path) -> None:
+def _write(figure: Figure, path: Path) -> None:
     with atomic_path(path) as temporary:
         figure.savefig(temporary, dpi=150)
     plt.close(figure)

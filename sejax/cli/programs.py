@@ -9,19 +9,20 @@ constants, up to rounding.
 import copy
 import dataclasses
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Container
 from functools import partial
 from typing import Any
 
 import jax
+from jaxtyping import PyTree
 
 from sejax.agents.mixture import Mixture, MixtureConfig
 from sejax.bilevel import Bilevel, make_bilevel
 from sejax.cli import config as configuration
 from sejax.cli.config import LearnConfig, families_of
 from sejax.cli.session import Chunks
-from sejax.options import marks, traced_options
-from sejax.options.registry import to_plain
+from sejax.options import Options, marks, traced_options
+from sejax.options.plain import to_plain
 
 # Fields of a run that shape no program; a chunk's length and seeds are counted by themselves.
 _FREE = (
@@ -89,7 +90,7 @@ def shape_of(config: LearnConfig, numbers: dict[str, Any]) -> str:
     return json.dumps([plain, structure_of(numbers)], sort_keys=True, default=str)
 
 
-def structure_of(numbers: Any) -> list[Any]:
+def structure_of(numbers: PyTree) -> list[Any]:
     """What shapes a program of its arguments: which are left open (None), which are whole."""
     leaves, structure = jax.tree.flatten(numbers)
     return [str(structure), [type(leaf).__name__ for leaf in leaves]]
@@ -99,12 +100,12 @@ def _with_numbers(config: LearnConfig, num_dims: int, numbers: dict[str, Any]) -
     """The program of a configuration with other numbers, which may be traced."""
     parts = config.parts()
     if numbers["agents"]:
-        families = Mixture.of(parts["agent"])
+        mixture = Mixture.of(parts["agent"])
         learners = tuple(
             dataclasses.replace(agent, hparams=hparams)
-            for agent, hparams in zip(families.agents, numbers["agents"], strict=True)
+            for agent, hparams in zip(mixture.agents, numbers["agents"], strict=True)
         )
-        parts["agent"] = dataclasses.replace(families, agents=learners)
+        parts["agent"] = dataclasses.replace(mixture, agents=learners)
     if numbers["es"]:
         es = copy.copy(config.es)  # not checked again: a traced number is none
         for name, number in numbers["es"].items():
@@ -113,7 +114,7 @@ def _with_numbers(config: LearnConfig, num_dims: int, numbers: dict[str, Any]) -
     return make_bilevel(**parts)
 
 
-def static_of(config: Any) -> dict[str, Any]:
+def static_of(config: Options) -> dict[str, Any]:
     """A configuration's class, and its fields that are not traced, or left open."""
     traced = [
         f.name for f in dataclasses.fields(config) if marks(type(config), f.name).get("traced")
@@ -122,5 +123,5 @@ def static_of(config: Any) -> dict[str, Any]:
     return {"class": f"{type(config).__module__}:{type(config).__qualname__}", **fields}
 
 
-def _without(fields: dict[str, Any], names: Any) -> dict[str, Any]:
+def _without(fields: dict[str, Any], names: Container[str]) -> dict[str, Any]:
     return {k: v for k, v in fields.items() if k not in names}

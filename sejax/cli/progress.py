@@ -14,8 +14,7 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
-from sejax.cli import config as configuration
-from sejax.cli import next_steps
+from sejax.cli import next_steps, preset_files
 from sejax.cli.config import LearnConfig, families_of
 from sejax.cli.trackers import FinishedGeneration, Reporter
 from sejax.options import registry
@@ -89,7 +88,7 @@ class RunProgress(Reporter):
     def __enter__(self) -> "RunProgress":
         self._progress.start()
         pair = self._config.name("env"), self._config.name("proxy")
-        if not configuration.is_tuned(*pair):
+        if not preset_files.is_tuned(*pair):
             self.say(
                 f"There are no tuned settings for env={pair[0]} with proxy={pair[1]}: these are "
                 f"general ones, not tuned (docs/defaults.md)."
@@ -153,7 +152,7 @@ class RunProgress(Reporter):
             path, config.name("env"), config.name("proxy"), agents, learner.proxy.is_real
         )
         title = "learned" if ended == "finished" else ended
-        self._console.rule(f"{learner.task.name}: {title}", align="left")
+        self._console.rule(f"{learner.proxy.task.name}: {title}", align="left")
         self.say(
             f"{verdict}\n\n"
             f"  {path}/proxy.safetensors    the best proxy\n"

@@ -4,21 +4,23 @@ The page is one HTML file that holds its figures and loads nothing. What comes f
 in it: the template escapes all of it, and nothing that a file names is imported.
 """
 
+import csv
 import json
 import math
-from collections.abc import Sequence
+import statistics
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-import pandas as pd
 import yaml
+from jinja2 import Environment, FileSystemLoader
 
-from sejax.cli import next_steps
-from sejax.cli.run_directory import COLUMNS
-from sejax.options import ConfigError, told
-from sejax.options.registry import flatten
+from sejax.cli import next_steps, report_figures
+from sejax.cli.report_figures import Figure
+from sejax.options import ConfigError, shortened, told
+from sejax.options.plain import flatten
 
 MOST_ROWS = 60  # generations in a table
 COSTS = {
@@ -30,137 +32,49 @@ COSTS = {
 }
 MISSING = "-"
 
+Row = dict[str, Any]  # of a CSV file: numbers, and names as text
+
 
 @dataclass(frozen=True, kw_only=True)
 class Run:
-    """What a run directory holds.
+    """What a page says about a run.
 
     Attributes:
       path: the folder.
       name: what the page calls it.
-      stored: the configuration, plain values in nested mappings.
+      task: the real task.
+      title: how it ended.
+      facts: what there is to know at first sight.
+      config: the configuration by `group.field`.
+      environment: machine, devices and versions of the last session; empty before the run ended.
       rows: of `metrics.csv`.
-      ended: `run.json`; empty for a run that has not ended.
-      agents: `evaluation.csv`, if there is one.
+      solved_score: the incumbent mean that solves the task; None if no score does.
+      curve: how it learned.
+      evaluation: a row for each world and agent that an evaluation beside the run has tested.
+      agents: a figure of those; None without an evaluation.
+      commands: what can be done next, each with its command.
     """
 
     path: Path
     name: str
-    stored: dict[str, Any]
-    rows: pd.DataFrame
-    ended: dict[str, Any]
-    agents: pd.DataFrame | None
-
-    @cached_property
-    def config(self) -> dict[str, Any]:
-        """The configuration as `{"group.field": value}`."""
-        return flatten(self.stored)
-
-    @property
-    def task(self) -> str:
-        return str(self.config.get("env.name"))
-
-    @property
-    def generations(self) -> int:
-        """Generations that are finished."""
-        return int(self.rows["generation"].max()) + 1 if len(self.rows) else 0
-
-    @property
-    def has_ended(self) -> bool:
-        return self.ended.get("generations") == self.generations
-
-    @property
-    def solved_score(self) -> float | None:
-        """The incumbent mean that solves the task, if a score does and the run says so."""
-        score = self.ended.get("solved_score")
-        return float(score) if isinstance(score, int | float) else None
-
-    @property
-    def best_row(self) -> Any:
-        """The last row with the best incumbent, whose proxy is kept; None if none survived."""
-        scores = self.rows["incumbent_mean"].dropna()
-        return self.rows.loc[scores[scores == scores.max()].index[-1]] if len(scores) else None
-
-    @property
-    def how_it_ended(self) -> str:
-        asked = self.config.get("generations")
-        if not self.has_ended:
-            return f"not ended: {self.generations} of {asked} generations are there"
-        best, solved = self.best_row, self.solved_score
-        if solved is None or best is None:
-            return f"ended after {self.generations} of {asked} generations"
-        verdict = "solved" if best["incumbent_mean"] >= solved else "not solved"
-        return f"{verdict}, after {self.generations} of {asked} generations"
-
-    @property
-    def facts(self) -> dict[str, str]:
-        """What there is to know at first sight, by what it is called."""
-        best = self.best_row
-        facts = {
-            "task": self.task,
-            "proxy": str(self.config.get("proxy.name")).upper(),
-            "agent": ", ".join(next_steps.agent_names(self.stored)),
-            "ended": self.how_it_ended,
-            "seeds": number(self.rows["seed"].nunique()),
-            "best incumbent": MISSING,
-        }
-        if best is not None:
-            facts["best incumbent"] = spread(best["incumbent_mean"], best["incumbent_std"])
-            facts["in generation (from 0)"] = number(best["generation"])
-        if self.solved_score is not None:
-            facts["solved at"] = number(self.solved_score)
-        return facts | {
-            called: number(self.ended[name]) for name, called in COSTS.items() if name in self.ended
-        }
-
-    @property
-    def environment(self) -> dict[str, str]:
-        """Machine, devices and versions, as the run's last session had them."""
-        parts = {
-            **{k: v for k, v in _mapping(self.ended.get("machine")).items()},
-            "devices": self.ended.get("devices"),
-            **_mapping(self.ended.get("versions")),
-        }
-        return {name: text(value) for name, value in parts.items() if value is not None}
-
-    @property
-    def evaluation(self) -> list[dict[str, str]]:
-        """A row for each world and agent that an evaluation beside the run has tested."""
-        if self.agents is None:
-            return []
-        by = ["world", "agent"] if "number" in self.agents else ["world"]
-        return [
-            {
-                "trained on": str(key[0]),
-                **({"agent": str(key[1])} if len(by) > 1 else {}),
-                "agents": number(len(mine)),
-                "return": spread(mine["test_return"].mean(), mine["test_return"].std()),
-                "training steps": spread(mine["train_steps"].mean(), mine["train_steps"].std(), 0),
-                "training episodes": spread(
-                    mine["train_episodes"].mean(), mine["train_episodes"].std()
-                ),
-            }
-            for key, mine in self.agents.groupby(by, sort=False)
-        ]
+    task: str
+    title: str
+    facts: dict[str, str]
+    config: dict[str, str]
+    environment: dict[str, str]
+    rows: list[Row]
+    solved_score: float | None
+    curve: Figure
+    evaluation: list[dict[str, str]]
+    agents: Figure | None
+    commands: list[tuple[str, str]]
 
     @property
     def thinned(self) -> list[dict[str, str]]:
         """Rows for a table: evenly chosen where there are many, the last one among them."""
-        step = math.ceil(len(self.rows) / MOST_ROWS) or 1
-        chosen = self.rows.iloc[::-1].iloc[::step].iloc[::-1]
-        return [
-            {name: number(value) for name, value in row.items()}
-            for row in chosen.to_dict("records")
-        ]
-
-    @cached_property
-    def commands(self) -> list[tuple[str, str]]:
-        """What can be done next, each with its command; a run that ends when solved stays so."""
-        generations = int(self.stored["generations"])
-        more: int | None = 2 * generations if self.has_ended else generations
-        if self.has_ended and self.ended.get("ended") == "solved":
-            more = None
-        return next_steps.of_stored(self.stored, self.path, more)
+        step = -(-len(self.rows) // MOST_ROWS)
+        chosen = self.rows[::-1][::step][::-1]
+        return [{name: number(value) for name, value in row.items()} for row in chosen]
 
 
 # --- reading -------------------------------------------------------------------------------------
@@ -172,52 +86,112 @@ def read(paths: Sequence[Path]) -> list[Run]:
     Raises:
       ConfigError: for one that is none, or whose files cannot be read.
     """
-    names = [path.resolve().name for path in paths]
-    return [
-        _read(path, name if names.count(name) == 1 else str(path))
-        for path, name in zip(paths, names, strict=True)
-    ]
+    names = [path.name for path in paths]
+    runs = []
+    for place, (path, name) in enumerate(zip(paths, names, strict=True)):
+        try:
+            runs.append(_read(path, name if names.count(name) == 1 else str(path), place))
+        except Exception as error:  # files may be damaged in any way
+            raise ConfigError(
+                f"RUN_DIR must be the folder of a run with a finished generation; got "
+                f"{shortened(path)} ({told(error)}). Give the run_dir of a python -m sejax.run.",
+                "RUN_DIR",
+            ) from error
+    return runs
 
 
-def _read(path: Path, name: str) -> Run:
-    try:
-        stored = yaml.safe_load((path / "config.yaml").read_text(encoding="utf-8"))
-        rows = pd.read_csv(path / "metrics.csv")
-        ended = path / "run.json"
-        agents = path / "evaluation.csv"
-        next_steps.require_run(stored)
-        run = Run(
-            path=path,
-            name=name,
-            stored=dict(stored),
-            rows=_complete(rows, COLUMNS),
-            ended=dict(json.loads(ended.read_text(encoding="utf-8"))) if ended.exists() else {},
-            agents=_complete(pd.read_csv(agents), AGENT_COLUMNS) if agents.exists() else None,
-        )
-    except (
-        OSError,
-        ValueError,
-        TypeError,
-        LookupError,
-        AttributeError,
-        RecursionError,
-        yaml.YAMLError,
-    ) as error:
-        raise ConfigError(
-            f"RUN_DIR must be the folder of a run that has finished a generation, because the "
-            f"report is made of its files; got {path} ({told(error)}). Give the run_dir of a "
-            f"`python -m sejax.run`."
-        ) from error
-    return run
+def _read(path: Path, name: str, place: int) -> Run:
+    stored = yaml.safe_load((path / "config.yaml").read_text(encoding="utf-8"))
+    next_steps.require_run(stored)
+    summary = path / "run.json"
+    ended = dict(json.loads(summary.read_text(encoding="utf-8"))) if summary.exists() else {}
+    rows = _table(path / "metrics.csv")
+    if not rows:
+        raise ValueError("metrics.csv has no rows")
+    evaluated = path / "evaluation.csv"
+    agents = _table(evaluated, report_figures.MEASURES) if evaluated.exists() else []
+    solved_score = None if ended.get("solved_score") is None else float(ended["solved_score"])
+    finished, asked = int(rows[-1]["generation"]) + 1, int(stored["generations"])
+    is_over = ended.get("generations") == finished
+    better = [row for row in rows if math.isfinite(row["incumbent_mean"])]
+    best = max(better, key=lambda row: (row["incumbent_mean"], row["generation"]), default=None)
+    incumbent = MISSING if best is None else spread(best["incumbent_mean"], best["incumbent_std"])
+    title = _title(is_over, finished, asked, best, solved_score)
+    task = str(stored["env"]["name"])
+    facts = {
+        "task": task,
+        "proxy": str(stored["proxy"]["name"]).upper(),
+        "agent": ", ".join(next_steps.agent_names(stored)),
+        "ended": title,
+        "best incumbent": incumbent,
+    }
+    facts |= {} if best is None else {"in generation (from 0)": number(best["generation"])}
+    facts |= {} if solved_score is None else {"solved at": number(solved_score)}
+    facts |= {called: number(ended[cost]) for cost, called in COSTS.items() if cost in ended}
+    environment = {**_mapping(ended.get("machine")), "devices": ended.get("devices")}
+    environment |= _mapping(ended.get("versions"))
+    # A run that ends when solved stays so.
+    more = None if ended.get("ended") == "solved" else 2 * asked
+    groups = _by_world_and_agent(agents)
+    evaluation = [_summary(key, group) for key, group in groups.items()]
+    return Run(
+        path=path,
+        name=name,
+        task=task,
+        title=title,
+        facts=facts,
+        config={field: text(value) for field, value in flatten(stored).items()},
+        environment={k: text(v) for k, v in environment.items() if v is not None},
+        rows=rows,
+        solved_score=solved_score,
+        curve=report_figures.learning_curve(place, name, rows, solved_score, incumbent),
+        evaluation=evaluation,
+        agents=report_figures.evaluation(place, name, groups, solved_score, evaluation),
+        commands=next_steps.of_stored(stored, path, more if is_over else asked),
+    )
 
 
-AGENT_COLUMNS = ("test_return", "train_steps", "train_episodes")  # those that hold numbers
+def _title(
+    is_over: bool, finished: int, asked: int, best: Row | None, solved_score: float | None
+) -> str:
+    if not is_over:
+        return f"not ended: {finished} of {asked} generations are there"
+    if best is None or solved_score is None:
+        return f"ended after {finished} of {asked} generations"
+    verdict = "solved" if best["incumbent_mean"] >= solved_score else "not solved"
+    return f"{verdict}, after {finished} of {asked} generations"
 
 
-def _complete(table: pd.DataFrame, columns: Sequence[str]) -> pd.DataFrame:
-    """The table with numbers in these columns; a row that is being written is left out."""
-    table = table.dropna(subset=[columns[-1]])
-    return table.assign(**{name: table[name].astype(float) for name in columns})
+def _table(path: Path, columns: Sequence[str] = ()) -> list[Row]:
+    """The rows of a CSV file, with numbers in these columns, or in all."""
+    with path.open(newline="", encoding="utf-8") as file:
+        rows = list(csv.DictReader(file, strict=True))
+    return [row | {name: float(row[name]) for name in columns or row} for row in rows]
+
+
+def _by_world_and_agent(rows: list[Row]) -> dict[tuple[str, str], list[Row]]:
+    """Rows of `evaluation.csv`; of a single agent, `agent` is a number."""
+    groups: dict[tuple[str, str], list[Row]] = {}
+    for row in rows:
+        groups.setdefault((row["world"], row["agent"] if "number" in row else ""), []).append(row)
+    return groups
+
+
+def _summary(key: tuple[str, str], rows: list[Row]) -> dict[str, str]:
+    def summed(column: str, digits: int = 1) -> str:
+        values = [row[column] for row in rows]
+        std = statistics.stdev(values) if len(values) > 1 else math.nan
+        return spread(statistics.fmean(values), std, digits)
+
+    world, agent = key
+    return {
+        "trained on": world,
+        **({"agent": agent} if agent else {}),
+        "agents": number(len(rows)),
+        "return": summed("test_return"),
+        "training steps": summed("train_steps", 0),
+        "training episodes": summed("train_episodes"),
+    }
 
 
 # --- the page ------------------------------------------------------------------------------------
@@ -225,12 +199,6 @@ def _complete(table: pd.DataFrame, columns: Sequence[str]) -> pd.DataFrame:
 
 def page(runs: Sequence[Run]) -> str:
     """The HTML of a report on one run, or a comparison of several."""
-    from importlib.metadata import version
-
-    from jinja2 import Environment, FileSystemLoader
-
-    from sejax.cli import report_figures
-
     environment = Environment(
         loader=FileSystemLoader(Path(__file__).parent),
         autoescape=True,
@@ -238,18 +206,17 @@ def page(runs: Sequence[Run]) -> str:
         lstrip_blocks=True,
     )
     one = runs[0]
-    title = f"{one.name}: {one.how_it_ended}" if len(runs) == 1 else f"{len(runs)} runs compared"
-    return environment.get_template("report.html").render(
+    title = f"{one.name}: {one.title}" if len(runs) == 1 else f"{len(runs)} runs compared"
+    made = environment.get_template("report.html").render(
         title=title,
         runs=runs,
         facts=_side_by_side([run.facts for run in runs]),
-        curves=report_figures.curves(runs),
-        comparison=report_figures.comparison(runs),
-        evaluations=report_figures.evaluations(runs),
+        comparison=report_figures.comparison(runs) if len(runs) > 1 else None,
         settings=settings(runs),
         environments=_side_by_side([run.environment for run in runs]),
         version=version("sejax"),
     )
+    return made.encode(errors="backslashreplace").decode()  # JSON may hold half a character
 
 
 def settings(runs: Sequence[Run]) -> list[tuple[str, list[str], bool]]:
@@ -257,7 +224,7 @@ def settings(runs: Sequence[Run]) -> list[tuple[str, list[str], bool]]:
 
     Where a run is kept makes no difference.
     """
-    table = _side_by_side([{k: text(v) for k, v in run.config.items()} for run in runs])
+    table = _side_by_side([run.config for run in runs])
     differing = [
         (name, each, len(set(each)) > 1 and name != "run_dir") for name, each in table.items()
     ]
@@ -269,18 +236,15 @@ def _side_by_side(tables: Sequence[dict[str, str]]) -> dict[str, list[str]]:
     return {name: [table.get(name, MISSING) for table in tables] for name in names}
 
 
-def text(value: Any) -> str:
+def text(value: object) -> str:
     """A plain value as configurations have it."""
     if isinstance(value, list):
         return ", ".join(map(text, value))
-    return (
-        {None: "null", True: "true", False: "false"}[value]
-        if isinstance(value, bool | None)
-        else str(value)
-    )
+    words = {None: "null", True: "true", False: "false"}
+    return words[value] if isinstance(value, bool | None) else str(value)
 
 
-def number(value: Any) -> str:
+def number(value: object) -> str:
     """A number with three decimals at most."""
     if not isinstance(value, int | float) or not math.isfinite(value):
         return str(value)
@@ -292,5 +256,5 @@ def spread(mean: float, std: float, digits: int = 1) -> str:
     return f"{mean:,.{digits}f}" + (f" ± {std:,.{digits}f}" if math.isfinite(std) else "")
 
 
-def _mapping(value: Any) -> dict[str, Any]:
+def _mapping(value: object) -> Mapping[str, object]:
     return value if isinstance(value, dict) else {}

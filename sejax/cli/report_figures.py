@@ -2,17 +2,18 @@
 
 import re
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import matplotlib as mpl
 import matplotlib.pyplot as plt
-import numpy as np
-import pandas as pd
 from markupsafe import Markup
 
 from sejax.cli import plots
+
+if TYPE_CHECKING:  # which imports this
+    from sejax.cli.report import Run
 
 STYLE: Any = {
     "svg.fonttype": "none",
@@ -25,6 +26,9 @@ STYLE: Any = {
 }
 COLORS = (plots.INCUMBENT, plots.POPULATION, *plots.AGENTS)
 MARKERS = "osD^vP*X"
+MEASURES = ("test_return", "train_steps", "train_episodes")  # of an evaluation, in its figure
+
+Rows = Sequence[Mapping[str, Any]]
 
 
 class Figure(NamedTuple):
@@ -34,84 +38,75 @@ class Figure(NamedTuple):
     about: str  # for who does not see it
 
 
-def curves(runs: Sequence[Any]) -> list[Figure]:
-    """How each run learned."""
-    return [_learning_curve(run, f"curve{i}") for i, run in enumerate(runs)]
-
-
-def comparison(runs: Sequence[Any]) -> Figure | None:
-    """The incumbents of several runs, a panel for each task; None of a single run."""
-    if len(runs) == 1:
-        return None
-    tasks = list(dict.fromkeys(run.task for run in runs))
-    about = "; ".join(
-        f"{run.name} on {run.task}: best incumbent {run.facts['best incumbent']}" for run in runs
+def learning_curve(
+    place: int, name: str, rows: Rows, solved_score: float | None, best: str
+) -> Figure:
+    """How a run learned; `place` is its number on the page."""
+    return Figure(
+        _svg(lambda path: plots.learning_curve(rows, solved_score, path), f"curve{place}"),
+        f"Learning curve of {name}: scores of incumbent and population, and agents' training "
+        f"steps, over {len(rows)} generations; best incumbent {best}.",
     )
 
+
+def evaluation(
+    place: int,
+    name: str,
+    groups: Mapping[tuple[str, str], Rows],
+    solved_score: float | None,
+    summaries: Sequence[Mapping[str, str]],
+) -> Figure | None:
+    """What fresh agents reached on a run's proxy and beside it, where they were trained."""
+    if not groups:
+        return None
+    tables = {
+        (_label(world), _label(agent)): {name: [row[name] for row in rows] for name in MEASURES}
+        for (world, agent), rows in groups.items()
+    }
+    about = "; ".join(
+        f"trained on {row['trained on']} {row.get('agent', '')}: return {row['return']}, "
+        f"{row['training steps']} training steps"
+        for row in summaries
+    )
+    return Figure(
+        _svg(lambda path: plots.evaluation(tables, solved_score, path), f"evaluation{place}"),
+        f"Fresh agents of {name} on the real task. {about}.",
+    )
+
+
+def comparison(runs: "Sequence[Run]") -> Figure:
+    """The incumbents of several runs, a panel for each task."""
+    tasks = list(dict.fromkeys(run.task for run in runs))
+
     def draw(path: Path) -> None:
+        size = (6, 0.6 + 3.4 * len(tasks))
         figure, axes = plt.subplots(
-            len(tasks), 1, figsize=(6, 0.6 + 3.4 * len(tasks)), squeeze=False, layout="constrained"
+            len(tasks), 1, figsize=size, squeeze=False, layout="constrained"
         )
         for axis, task in zip(axes[:, 0], tasks, strict=True):
             for i, run in enumerate(runs):
                 if run.task == task:
-                    means = run.rows.groupby("generation")["incumbent_mean"].mean()
                     axis.plot(
-                        means.index,
-                        means,
+                        [row["generation"] for row in run.rows],
+                        [row["incumbent_mean"] for row in run.rows],
                         color=COLORS[i % len(COLORS)],
                         lw=1.8,
                         marker=MARKERS[i % len(MARKERS)],
                         ms=4,
-                        markevery=max(1, len(means) // 12),
+                        markevery=max(1, len(run.rows) // 12),
                         label=_label(run.name),
                     )
             for score in {x.solved_score for x in runs if x.task == task} - {None}:
-                axis.axhline(
-                    score, color=plots.SOLVED, ls="--", lw=1.2, label=f"solved ({score:g})"
-                )
+                label = f"solved ({score:g})"
+                axis.axhline(score, color=plots.SOLVED, ls="--", lw=1.2, label=label)
             axis.set(title=_label(task), xlabel="generation", ylabel="incumbent mean")
             axis.xaxis.get_major_locator().set_params(integer=True)
             axis.legend(frameon=False, fontsize=8)
         figure.savefig(path)
         plt.close(figure)
 
-    return Figure(_svg(draw, "comparison"), f"Incumbent means by generation. {about}.")
-
-
-def evaluations(runs: Sequence[Any]) -> list[Figure | None]:
-    """What fresh agents reached on each run's proxy and beside it, where they were trained."""
-    return [_evaluation(run, f"evaluation{i}") for i, run in enumerate(runs)]
-
-
-def _learning_curve(run: Any, prefix: str) -> Figure:
-    best = run.facts["best incumbent"]
-    svg = _svg(
-        lambda path: plots.learning_curve(run.rows.to_dict("records"), run.solved_score, path),
-        prefix,
-    )
-    return Figure(
-        svg,
-        f"Learning curve of {run.name}: scores of incumbent and population, and "
-        f"agents' training steps, over {run.generations} generations; best incumbent "
-        f"{best}.",
-    )
-
-
-def _evaluation(run: Any, prefix: str) -> Figure | None:
-    if run.agents is None:
-        return None
-    by = run.agents["agent"] if "number" in run.agents else pd.Series("", run.agents.index)
-    worlds = run.agents["world"].map(_label)
-    tables = {key: table for key, table in run.agents.groupby([worlds, by.map(_label)], sort=False)}
-    solved = np.nan if run.solved_score is None else run.solved_score
-    svg = _svg(lambda path: plots.evaluation(tables, solved, path), prefix)
-    about = "; ".join(
-        f"trained on {row['trained on']} {row.get('agent', '')}: return {row['return']}, "
-        f"{row['training steps']} training steps"
-        for row in run.evaluation
-    )
-    return Figure(svg, f"Fresh agents of {run.name} on the real task. {about}.")
+    each = (f"{x.name} on {x.task}: best incumbent {x.facts['best incumbent']}" for x in runs)
+    return Figure(_svg(draw, "comparison"), f"Incumbent means by generation. {'; '.join(each)}.")
 
 
 def _svg(draw: Callable[[Path], None], prefix: str) -> Markup:
@@ -135,6 +130,6 @@ def _svg(draw: Callable[[Path], None], prefix: str) -> Markup:
     return Markup(f'{head} aria-hidden="true" style="{limits}">{body}')
 
 
-def _label(name: object) -> str:
+def _label(name: str) -> str:
     """A name as matplotlib shows it: one that begins with an underscore it would leave out."""
-    return re.sub("^_", "\u2009_", str(name))
+    return re.sub("^_", "\u2009_", name)

@@ -14,7 +14,7 @@ import os
 import secrets
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
 import filelock
 import numpy as np
@@ -22,8 +22,16 @@ import yaml
 
 from sejax.ops import checksummed
 from sejax.ops.files import remove_leftovers, write_bytes, write_text
-from sejax.options import ConfigError
-from sejax.options.registry import differences
+from sejax.options import ConfigError, shortened
+from sejax.options.plain import differences
+
+if TYPE_CHECKING:  # which import jax
+    from jax import Array
+    from jax.tree_util import KeyPath
+    from jaxtyping import PyTree
+
+    from sejax.cli.config import LearnConfig
+    from sejax.objectives import GenerationInfo
 
 COLUMNS = (
     "generation",
@@ -47,12 +55,8 @@ AGENT_COLUMNS = ("incumbent_mean", "population_mean", "train_steps_mean", "num_n
 FREE_FIELDS = {"generations", "devices", "checkpoint_every", "run_dir", "tracker", "machines"}
 HINT = "Set run_dir=FOLDER."
 
-_CHECKPOINT, _METRICS, _CONFIG, _LOCK = (
-    "checkpoint.safetensors",
-    "metrics.csv",
-    "config.yaml",
-    "sejax.lock",
-)
+_CHECKPOINT, _LOCK = "checkpoint.safetensors", "sejax.lock"
+_METRICS, _CONFIG = "metrics.csv", "config.yaml"
 _KIND, _FORMAT_VERSION, _STATE, _ROWS = "sejax_run", 1, "state", "metrics"
 # Files whose temporaries a killed session leaves.
 _WRITTEN = (
@@ -66,6 +70,7 @@ _WRITTEN = (
 )
 # Files that only a run leaves; without its checkpoint they come from an older sejax, or it is lost.
 _SIGNS_OF_A_RUN = (_METRICS, "proxy.safetensors", "checkpoint")
+State = TypeVar("State")
 
 
 class RunDirectory:
@@ -154,7 +159,7 @@ class RunDirectory:
         """Steps on the real task up to the checkpoint."""
         return int(self.rows[-1]["env_steps_total"]) if self.rows else 0
 
-    def restore(self, like: Any) -> Any:
+    def restore(self, like: State) -> State | None:
         """The state of the checkpoint, and the files beside it remade; None for a new run.
 
         Args:
@@ -174,7 +179,9 @@ class RunDirectory:
         self._remake()
         return state
 
-    def save(self, state: Any, info: Any, wall_s: float, cpu_s: float) -> list[dict[str, str]]:
+    def save(
+        self, state: "PyTree[Array]", info: "GenerationInfo", wall_s: float, cpu_s: float
+    ) -> list[dict[str, str]]:
         """Writes the checkpoint after a block of generations, then the files remade from it.
 
         Args:
@@ -224,13 +231,11 @@ class RunDirectory:
             lock.acquire()
         except filelock.Timeout:
             self._refuse(
-                "be used by one process at a time",
-                "two would mix their files",
-                f"{self.path}, which another process uses",
+                f"must be used by one at a time; got {self.path}, which another process uses"
             )
         except (OSError, ValueError, NotImplementedError) as error:
-            reason = "the run's files go there"
-            self._refuse("be a folder that can be written", reason, f"{self.path} ({error})")
+            got = f"{shortened(self.path)} ({shortened(error)})"
+            self._refuse(f"must be a folder that can be written; got {got}")
         return lock
 
     def _open(self, completed: Callable[[dict[str, Any]], dict[str, Any]]) -> None:
@@ -248,9 +253,8 @@ class RunDirectory:
             differing = differences(completed(stored), self.config, FREE_FIELDS, most=3)
         if differing:
             self._refuse(
-                "be new or hold a run of the same configuration",
-                "a run goes on where it stopped",
-                f"{self.path}, which differs in {differing}",
+                f"must be new or hold a run of the same configuration; got {self.path}, which "
+                f"differs in {differing}"
             )
 
     def _read(self, tensors: dict[str, np.ndarray], manifest: dict[str, Any]) -> dict[str, Any]:
@@ -275,15 +279,15 @@ class RunDirectory:
             raise checksummed.DamagedError(f"it is none of this version ({error})") from error
         return stored
 
-    def _rows_of(self, info: Any, wall_s: float) -> list[dict[str, str]]:
+    def _rows_of(self, info: "GenerationInfo", wall_s: float) -> list[dict[str, str]]:
         """The rows of the active generations of a block."""
         real_steps = np.asarray(info.real_steps, np.int64).sum(axis=1).cumsum() + self.real_steps
-        own = {"seed", "env_steps_total", "wall_s"}
-        values = {name: np.asarray(getattr(info, name)) for name in COLUMNS if name not in own}
+        made = {"seed", "env_steps_total", "wall_s"}
+        values = {name: np.asarray(vars(info)[name]) for name in COLUMNS if name not in made}
         values["env_steps_total"] = real_steps
         for i, agent in enumerate(self._agents):
             for name in AGENT_COLUMNS:
-                values[f"{name}_{agent}"] = np.asarray(getattr(info.by_agent, name))[:, i]
+                values[f"{name}_{agent}"] = np.asarray(vars(info.by_agent)[name])[:, i]
         fixed = {"seed": str(self.config["seed"]), "wall_s": f"{wall_s:.3f}"}
         cells = [
             fixed | {name: _as_text(column[i]) for name, column in values.items()}
@@ -305,27 +309,24 @@ class RunDirectory:
         for name in _SIGNS_OF_A_RUN:
             if (self.path / name).exists():
                 self._refuse(
-                    f"be new or hold the {_CHECKPOINT} of its run",
-                    "other files there would be replaced",
-                    f"{self.path}, where an older sejax or a lost checkpoint left {name}",
+                    f"must be new or hold the {_CHECKPOINT} of its run; got {self.path}, whose "
+                    f"{name} would be replaced"
                 )
 
-    def _refuse_checkpoint(self, error: object) -> NoReturn:
-        path = self.path / _CHECKPOINT
-        self._refuse("hold a whole checkpoint", "the run goes on from it", f"{path}: {error}")
+    def _refuse_checkpoint(self, error: Exception) -> NoReturn:
+        self._refuse(f"must hold a whole checkpoint; got {self.path / _CHECKPOINT}: {error}")
 
-    def _refuse(self, rule: str, reason: str, got: object) -> NoReturn:
-        message = f"run_dir must {rule}, because {reason}; got {got}. {self._hint}"
-        raise ConfigError(message, "run_dir")
+    def _refuse(self, message: str) -> NoReturn:
+        raise ConfigError(f"run_dir {message}. {self._hint}", "run_dir")
 
 
-def open_for(config: Any, hint: str = HINT) -> RunDirectory:
+def open_for(config: "LearnConfig", hint: str = HINT) -> RunDirectory:
     """The folder of a run; made, or opened to go on.
 
     What it stores is compared as plain values: nothing that only the folder names is imported.
 
     Args:
-      config: a `LearnConfig`.
+      config: of the run.
       hint: last sentence of messages: how to choose another folder.
 
     Raises:
@@ -353,12 +354,12 @@ def _as_csv(rows: Iterable[Iterable[str]]) -> str:
     return "".join(",".join(row) + "\n" for row in rows)
 
 
-def _as_text(value: Any) -> str:
+def _as_text(value: np.generic) -> str:
     """Shortest text that reads back as the same float32, or the integer, however large."""
     return str(value) if value.dtype.kind in "iu" else f"{value:.9g}"
 
 
-def _as_tensors(state: Any) -> dict[str, np.ndarray]:
+def _as_tensors(state: "PyTree[Array]") -> dict[str, np.ndarray]:
     """The leaves of a pytree by their paths, as arrays that safetensors can store."""
     import jax
 
@@ -367,7 +368,7 @@ def _as_tensors(state: Any) -> dict[str, np.ndarray]:
     return {_name(path): array for (path, _), array in zip(flat, arrays, strict=True)}
 
 
-def _as_state(tensors: dict[str, np.ndarray], like: Any) -> Any:
+def _as_state(tensors: dict[str, np.ndarray], like: State) -> State:
     """The inverse of `_as_tensors`; leaves of their own memory, tied to no device.
 
     Args:
@@ -389,20 +390,21 @@ def _as_state(tensors: dict[str, np.ndarray], like: Any) -> Any:
                 f"version"
             )
     leaves = [_as_leaf(tensors[_name(path)], leaf) for path, leaf in flat]
-    return jax.tree.unflatten(tree, leaves)
+    state: State = jax.tree.unflatten(tree, leaves)
+    return state
 
 
-def _name(path: Any) -> str:
+def _name(path: "KeyPath") -> str:
     import jax
 
     return f"{_STATE}{jax.tree_util.keystr(path)}"
 
 
-def _describe(array: Any) -> str:
+def _describe(array: "np.ndarray | Array") -> str:
     return f"{array.dtype}{list(array.shape)}"
 
 
-def _bare(leaf: Any) -> Any:
+def _bare(leaf: "Array") -> "Array":
     """The data of a PRNG key, the bits of a dtype that only jax has, or the leaf itself."""
     import jax
 
@@ -411,7 +413,7 @@ def _bare(leaf: Any) -> Any:
     return leaf.view(f"uint{8 * leaf.dtype.itemsize}") if leaf.dtype.kind == "V" else leaf
 
 
-def _as_leaf(array: np.ndarray, like: Any) -> Any:
+def _as_leaf(array: np.ndarray, like: "Array") -> "Array":
     import jax
 
     if jax.dtypes.issubdtype(like.dtype, jax.dtypes.prng_key):

@@ -7,7 +7,6 @@ import os
 import platform
 import sys
 from pathlib import Path
-from typing import Any
 
 from sejax.ops import files
 
@@ -28,9 +27,8 @@ def _quota(cgroups: Path) -> float:
         quota, period = (cgroups / "cpu.max").read_text().split()
         return int(quota) / int(period)
     with contextlib.suppress(OSError, ValueError):
-        quota, period = (
-            (cgroups / "cpu" / f"cpu.cfs_{name}_us").read_text() for name in ("quota", "period")
-        )
+        old = cgroups / "cpu"
+        quota, period = ((old / f"cpu.cfs_{name}_us").read_text() for name in ("quota", "period"))
         return int(quota) / int(period) if int(quota) > 0 else math.inf
     return math.inf
 
@@ -114,13 +112,9 @@ def configure_jax() -> None:
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
 
 
-def machine() -> dict[str, Any]:
+def machine() -> dict[str, str | int]:
     """What kind of machine this is; not which."""
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-        models = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
-    except OSError:
-        models = []
+    models = [x.partition(":")[2].strip() for x in _cpu_lines() if x.startswith("model name")]
     return {
         "system": f"{platform.system()} {platform.release()}",
         "processor": models[0] if models else platform.processor() or platform.machine(),
@@ -130,10 +124,13 @@ def machine() -> dict[str, Any]:
 
 def cpu_fingerprint() -> str:
     """Short name of the host's kind of CPU: its architecture and a hash of model and features."""
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-        described = sorted({x for x in lines if x.startswith(("model name", "flags", "Features"))})
-    except OSError:
-        described = [platform.processor()]
+    kinds = ("model name", "flags", "Features")
+    described = sorted({x for x in _cpu_lines() if x.startswith(kinds)}) or [platform.processor()]
     digest = hashlib.sha256("\n".join(described).encode()).hexdigest()[:12]
     return f"{platform.machine()}-{digest}"
+
+
+def _cpu_lines() -> list[str]:
+    with contextlib.suppress(OSError):
+        return Path("/proc/cpuinfo").read_text().splitlines()
+    return []

@@ -2,13 +2,14 @@
 
 import dataclasses
 import functools
-from collections.abc import Mapping, Sequence
+import textwrap
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
+from sejax.cli import compose, spaces
 from sejax.cli import config as configuration
-from sejax.cli import spaces
 from sejax.cli.config import EvaluateConfig, LearnConfig
 from sejax.ops.files import as_file_name
 from sejax.options import (
@@ -16,6 +17,7 @@ from sejax.options import (
     Options,
     as_text,
     counts,
+    help_texts,
     nearest,
     one_of,
     option,
@@ -24,6 +26,10 @@ from sejax.options import (
     require,
     shortened,
 )
+from sejax.options.plain import flatten, from_plain, parsed, split, to_plain
+
+if TYPE_CHECKING:  # which nobody needs who searches on one machine
+    from sejax.cli.workers import LocalConfig, RayConfig
 
 SAMPLERS = ("tpe", "random")
 PRUNERS = ("hyperband", "median", "none")
@@ -42,6 +48,7 @@ TAKEN = {
 }
 # Fields that may differ between the workers of a study, and between its sessions.
 OWN = {"trials", "timeout", "storage", "search_dir", "sampler_seed", "verify", "fresh_seeds"}
+NAMES = {"study", "space"}  # which stand for what is compared
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,27 +61,32 @@ class SearchConfig(Options):
 
     group: ClassVar[str] = ""
 
-    trials: int = option(60, counts("there is nothing to compare otherwise"))  # that end
-    sampler: str = option("tpe", one_of(SAMPLERS))
-    # null: drawn, so that workers do not draw alike.
+    # trials that end, pruned or complete
+    trials: int = option(60, counts("there is nothing to compare otherwise"))
+    sampler: str = option("tpe", one_of(SAMPLERS))  # tpe or random
+    # null: drawn, so that workers do not draw alike
     sampler_seed: int | None = option(None, counts("it seeds a generator", least=0))
-    pruner: str = option("hyperband", one_of(PRUNERS))
-    min_generations: int = option(3, counts("a trial must show something"))  # before one is pruned
+    pruner: str = option("hyperband", one_of(PRUNERS))  # hyperband, median or none
+    # before a trial may be pruned
+    min_generations: int = option(3, counts("a trial must show something"))
+    # of a trial that is not pruned
     max_generations: int = option(27, counts("there is nothing to do otherwise"))
     seeds: int = option(1, counts("a trial needs a run"))  # runs of a trial
-    score: str = option("mean", one_of(SCORES))  # of a trial, over its seeds
-    # What a seed counts for. last: its last generation's score; best: its best so far; mean: the
-    # mean of all so far, which rewards learning early. null: last for a proxy, mean for an agent.
+    score: str = option("mean", one_of(SCORES))  # of a trial, over its seeds: mean or worst
+    # The score of a seed. last: of its last generation; best: its best so far; mean: the mean of
+    # all so far, which rewards learning early. null: last for a proxy, mean for an agent
     measure: str | None = option(None, one_of(MEASURES))
-    space: str | None = None  # a preset of ranges, or a file of your own
+    space: str | None = None  # a preset of ranges, or FILE.yaml
     study: str | None = None  # null: <env>-<proxy>-<agent>, or <agent>-on-<proxy>
     storage: str | None = None  # null: SQLite in search_dir; any URL that Optuna takes
     search_dir: str | None = None  # null: runs/search-<study>
-    timeout: float | None = option(None, positive("no trial would start"))  # s; none starts later
+    # s, after which no trial is begun
+    timeout: float | None = option(None, positive("no trial would start"))
     heartbeat: int = option(15, counts("workers must show that they live"))  # s
     # The best trials that are tried again, as the best score of many is the luckiest too: on the
-    # real task after a search on a proxy (null: 10), else with seeds that are new (null: 5).
+    # real task after a search on a proxy (null: 10), else with seeds that are new (null: 5)
     verify: int | None = option(None, counts("the best are tried again", least=0))
+    # new seeds of each that is tried again
     fresh_seeds: int = option(5, counts("the best are tried again with them"))
 
     def __post_init__(self) -> None:
@@ -82,9 +94,8 @@ class SearchConfig(Options):
         require(
             self.max_generations >= self.min_generations,
             "max_generations",
-            f"must be at least min_generations={self.min_generations}, because none is pruned "
-            f"before; got {shortened(self.max_generations)}. Set "
-            f"max_generations={9 * self.min_generations}.",
+            f"must be at least min_generations={self.min_generations}; got "
+            f"{self.max_generations}. Set max_generations={9 * self.min_generations}.",
         )
 
 
@@ -96,13 +107,13 @@ class Search:
       config: the search's own fields.
       fixed: overrides of all trials.
       space: dimensions by the field's name.
-      machines: where trials are run: a plugin's configuration.
+      machines: where trials are run.
     """
 
     config: SearchConfig
     fixed: tuple[str, ...]
     space: dict[str, spaces.Dimension]
-    machines: Any
+    machines: "LocalConfig | RayConfig"
 
     @property
     def is_of_agent(self) -> bool:
@@ -161,95 +172,46 @@ class Search:
         """URL of the database."""
         return self.config.storage or f"{SQLITE}{self.folder / 'study.db'}"
 
-    @property
-    def joins(self) -> bool:
-        """Whether the overrides only name a study that exists."""
-        given, default = registry.to_plain(self.config), registry.to_plain(SearchConfig())
-        changed = {k for k, v in given.items() if v != default[k]} - OWN - {"study"}
-        return self.config.study is not None and not (changed or self.fixed or self.space)
-
-    def stored(self) -> dict[str, Any]:
-        """What the workers of a study must have in common, as plain values."""
+    def stored(self) -> dict[str, object]:
+        """What all workers of a study have in common, by field."""
+        own = to_plain(self.config).items()
         return {
-            "search": _common(registry.to_plain(self.config)),
-            "fixed": list(self.fixed),
-            "space": {name: x.text for name, x in self.space.items()},
-            "folder": str(self.folder.resolve()),
+            **{name: value for name, value in own if name not in OWN | NAMES},
+            **dict(override.split("=", 1) for override in self.fixed),
+            **{name: dimension.text for name, dimension in self.space.items()},
         }
 
-    def joined(self, stored: Any) -> "Search":
-        """The search that a study stores, with this worker's own fields.
-
-        Its folder is that of the study's maker only where the worker's storage is a file in it, as
-        a study could name any folder otherwise.
+    def require_same(self, stored: object) -> None:
+        """Checks that a study is of this search; what it stores is compared and never read.
 
         Raises:
-          ConfigError: if the study holds what no search stores, overrides that would write or
-            import what the user has not typed, or another search than was asked for.
+          ConfigError: if it is of another one.
         """
-        stored = _checked(stored)
-        if not self.joins:
-            _require_same(self, stored)
-        search_dir, url = self.config.search_dir, self.config.storage or ""
-        beside = str(Path(url.removeprefix(SQLITE)).parent.resolve())
-        if search_dir is None and url.startswith(SQLITE) and stored["folder"] == beside:
-            search_dir = beside
-        return dataclasses.replace(
-            self,
-            config=dataclasses.replace(self.config, **stored["search"], search_dir=search_dir),
-            fixed=tuple(stored["fixed"]),
-            space={name: spaces.parse(name, text) for name, text in stored["space"].items()},
+        asked, found = self.stored(), stored if isinstance(stored, dict) else {}
+        differing = sorted(
+            str(name) for name in asked.keys() | found.keys() if asked.get(name) != found.get(name)
         )
-
-
-def _common(fields: Mapping[str, Any]) -> dict[str, Any]:
-    return {k: v for k, v in fields.items() if k not in {*OWN, "space", "study"}}
-
-
-def _checked(stored: Any) -> dict[str, Any]:
-    """What a study stores, with the fields that an older version did not have.
-
-    Raises:
-      ConfigError: as of `Search.joined`.
-    """
-    match stored:
-        case {"search": dict(own), "fixed": list(fixed), "space": dict(space), "folder": str()}:
-            pass
-        case _:
-            own, fixed, space = {}, [None], {}
-    overrides = [*fixed, *(f"{name}={text}" for name, text in space.items())]
-    for override in overrides:
-        name, _, text = str(override).partition("=")
-        is_known = isinstance(override, str) and configuration.NAME.fullmatch(name)
-        writes = name.partition(".")[0] in (*TAKEN, "machines")
-        reads = name == "preset" and configuration.ENDING in text
         require(
-            is_known and not (writes or reads) and not registry.untyped([override]),
+            not differing,
             "study",
-            "must hold choices and fields alone, without modules that you have not typed, because "
-            f"its overrides are read as if you had typed them; got {shortened(override)}. Set "
-            "study=NAME, another one, or repeat its overrides if you trust it.",
+            f"must be new or of the same search; got {shortened(self.study)}, which differs in "
+            f"{shortened(', '.join(differing))}. Set study=NAME, another one.",
         )
-    default = _common(registry.to_plain(SearchConfig()))
-    return stored | {"search": default | {k: v for k, v in own.items() if k in default}}
 
-
-def _require_same(search: Search, stored: Mapping[str, Any]) -> None:
-    asked = search.stored()
-    differing = sorted(
-        name
-        for part in ("search", "space")
-        for name in stored[part].keys() | asked[part].keys()
-        if stored[part].get(name) != asked[part].get(name)
-    )
-    differing += sorted(set(stored["fixed"]) ^ set(asked["fixed"]))
-    require(
-        not differing,
-        "study",
-        "must be new or of the same search, because its trials are compared with each other; got "
-        f"{search.study}, which differs in {', '.join(differing)[:80]}. Set study=NAME, or give "
-        "study and storage alone to join.",
-    )
+    def overrides(self) -> list[str]:
+        """The overrides of a worker that runs in any folder of any machine."""
+        own = to_plain(self.config) | {
+            "study": self.study,
+            "search_dir": str(self.folder.resolve()),
+            "storage": self.config.storage or f"{SQLITE}{self.folder.resolve() / 'study.db'}",
+            "space": None,  # which are there already
+            "sampler_seed": None,  # or workers would draw alike
+        }
+        return [
+            *self.fixed,
+            *(f"{name}={dimension.text}" for name, dimension in self.space.items()),
+            *(f"{name}={as_text(value)}" for name, value in own.items() if value is not None),
+        ]
 
 
 def read(overrides: Sequence[str]) -> Search:
@@ -266,36 +228,35 @@ def read(overrides: Sequence[str]) -> Search:
     values, fixed, space = {}, [], {}
     machines = {"name": "local"}
     choices = [  # a comma makes a sweep elsewhere
-        f"{name}=choice({text})" if len(registry.split(text)) > 1 else f"{name}{equals}{text}"
+        f"{name}=choice({text})" if len(split(text)) > 1 else f"{name}{equals}{text}"
         for name, equals, text in (override.partition("=") for override in overrides)
     ]
-    for name, given in configuration.read(choices).items():
+    for name, given in compose.read(choices).items():
         text = given if isinstance(given, str) else as_text(given)
-        override, value = f"{name}={text}", registry.parsed(text)
-        is_text = name in TEXTS and value is not None and not isinstance(value, str)
         require(
             name not in TAKEN,
             name,
             f"must be left out, because the search sets it for each trial; got {shortened(text)}. "
-            f"Set {TAKEN.get(name, f'{name}=VALUE')}.",
+            f"Set {TAKEN.get(name)}.",
         )
         if name in own:
-            values[name] = text if is_text else value
+            is_text = name in TEXTS and text != "null"
+            values[name] = text if is_text else parsed(text)
         elif name.partition(".")[0] == "machines":
-            machines[name.partition(".")[2] or "name"] = value
+            machines[name.partition(".")[2] or "name"] = parsed(text)
         elif spaces.is_range(text):
             space[name] = spaces.parse(name, text)
         else:
-            fixed.append(override)
-    config = registry.from_plain(SearchConfig, values, "")
+            fixed.append(f"{name}={text}")
+    config = from_plain(SearchConfig, values, "")
     where = registry.configure("machines", machines)
-    registry.require_package("machines", where, "trials are run there")
+    registry.require_package("machines", where)
     search = Search(config=config, fixed=tuple(fixed), space=space, machines=where)
     require(
         search.choice("proxy", "se") != "real",
         "proxy",
-        "must be learned, or be one to tune agents on, because trials on the real task cost what "
-        "a proxy saves; got real. Set proxy=cartpole, or env=cartpole proxy=se.",
+        "must be learned, or one to tune agents on; got real. Set proxy=cartpole, or "
+        "env=cartpole proxy=se.",
     )
     if config.space is None:
         return search
@@ -306,13 +267,13 @@ def read(overrides: Sequence[str]) -> Search:
     require(
         not foreign,
         "space",
-        "must name no module, because only what you type is imported; got "
-        f"{shortened(', '.join(foreign))}. Set agent='choice(...)' on the command line.",
+        f"must name no module that you have not typed; got {shortened(', '.join(foreign))}. Set "
+        "agent='choice(...)' on the command line.",
     )
     return dataclasses.replace(search, space={**offered, **space})
 
 
-def require_fields(search: Search, config: Any) -> dict[str, Any]:
+def require_fields(search: Search, config: LearnConfig | EvaluateConfig) -> dict[str, object]:
     """Checks that what is searched are fields of the command.
 
     Args:
@@ -328,18 +289,16 @@ def require_fields(search: Search, config: Any) -> dict[str, Any]:
     require(
         search.space,
         "space",
-        "must be given, or ranges of fields, because there is nothing to search otherwise; got "
-        "none. Set space=paper_se, or es.noise_std='tag(log, interval(0.01, 0.3))'.",
+        "must be given, or ranges of fields; got none. Set space=paper_se, or "
+        f"es.noise_std='{spaces.EXAMPLE}'.",
     )
-    groups = EvaluateConfig.groups if search.is_of_agent else LearnConfig.groups
-    values = registry.flatten(configuration.plain(config))
-    values |= {group: values.get(f"{group}.name") for group in groups}
+    values = flatten(configuration.plain(config))
+    values |= {group: values.get(f"{group}.name") for group in config.groups}
     for name in search.space:
         if name not in values:
-            close = nearest(name, values)[0]
             raise ConfigError(
                 f"{name} must be a field of the trials, because it is searched; got one that they "
-                f"do not have. Did you mean {close}?",
+                f"do not have. Did you mean {nearest(name, values)[0]}?",
                 name,
             )
     return {name: values[name] for name in search.space}
@@ -347,29 +306,23 @@ def require_fields(search: Search, config: Any) -> dict[str, Any]:
 
 def help_text() -> str:
     """What `--help` prints."""
-    values = {
-        "sampler": SAMPLERS,
-        "pruner": PRUNERS,
-        "score": SCORES,
-        "measure": MEASURES,
-        "space": (*spaces.names(), "FILE.yaml"),
-    }
+    texts = help_texts(SearchConfig)
     fields = "\n".join(
-        f"  {name}: {'null' if default is None else default}"
-        + (f"  ({', '.join(values[name])})" if name in values else "")
-        for name, default in registry.to_plain(SearchConfig()).items()
+        textwrap.fill(f"  {name}={as_text(value)}  # {texts[name]}", 98, subsequent_indent=" " * 6)
+        for name, value in to_plain(SearchConfig()).items()
     )
     return f"""Search hyperparameters with Optuna; a trial is a run, its generations the budget.
 With proxy=RUN_DIR, a file or a shipped name: those of an agent that is trained on that proxy.
 
-  python -m sejax.search env=cartpole es.noise_std='tag(log, interval(0.01, 0.3))'
+  python -m sejax.search env=cartpole es.noise_std='{spaces.EXAMPLE}'
   python -m sejax.search env=cartpole preset=paper space=paper_se trials=60
   python -m sejax.search proxy=cartpole agent=ppo space=agent
-  python -m sejax.search study=NAME storage=URL   # one more worker
 
-Fields:
+The same command goes on where it stopped, or is one more worker of the same study.
+
+Fields (space: {", ".join(spaces.names())} or FILE.yaml):
 {fields}
 
 All other overrides are those of python -m sejax.run (with a proxy: sejax.evaluate). Searched are
 choice(a,b), range(1,9,2), interval(0,1), int(interval(1,10)), tag(log, ...), and
-tag(log, inverse, ...) in 1 - x. The same command goes on where it stopped."""
+tag(log, inverse, ...) in 1 - x."""

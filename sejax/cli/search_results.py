@@ -6,13 +6,14 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import filelock
 import optuna
 import pandas as pd
 from optuna.trial import FrozenTrial, TrialState
 from rich.console import Console
 from rich.table import Table
 
-from sejax.cli.config import file_text
+from sejax.cli.preset_files import file_text
 from sejax.cli.search_config import Search
 from sejax.cli.study import ENDED
 from sejax.cli.trials import Runner
@@ -135,10 +136,7 @@ def print_table(study: optuna.Study, search: Search) -> None:
     console.print(shown)
     num_best = sum(trial.value == done[0].value for trial in done)
     if num_best > 1:
-        hint = " To reward learning early: measure=mean." if search.measure != "mean" else ""
-        if search.is_of_agent:
-            hint = " Agents that train for less on the proxy may differ: see docs/search.md."
-        console.print(f"{num_best} of {len(done)} share the best score.{hint}", soft_wrap=True)
+        console.print(f"{num_best} of {len(done)} share the best score: see docs/search.md.")
     begun = rows.dropna(subset=["generations"])  # those that were refused have none
     computed, most = begun["generations"].sum(), len(begun) * search.config.max_generations
     console.print(
@@ -151,32 +149,39 @@ def print_table(study: optuna.Study, search: Search) -> None:
         console.print(f"What mattered (PED-ANOVA): {listed}", soft_wrap=True)
 
 
-def verify(study: optuna.Study, search: Search, runner: Runner) -> pd.DataFrame:
+def verified(study: optuna.Study, search: Search, runner: Runner) -> list[str]:
     """Tries the best settings again, as the best score of many is the luckiest too.
 
+    Writes `verification.csv`, a row for each, and the best of them in the place of what `write`
+    took for the best.
+
     Returns:
-      A row for each in the order of what came of them, also in `verification.csv`.
+      The overrides of the settings that are the best now.
 
     Raises:
       ConfigError: if a folder is of other settings.
       OSError: if a file cannot be written.
     """
     rows: list[dict[str, Any]] = []
-    for rank, trial in enumerate(ranked(study)[: search.num_verified], 1):
-        overrides = overrides_of(trial, search)
-        name = f"{trial.number:04d}-{search.config.fresh_seeds}"
-        values = runner.verify(overrides, search.folder / "verified" / name)
-        settings = " ".join([*search.fixed, *overrides])
-        own = {"trial": trial.number, "rank": rank, "score": trial.value, "settings": settings}
-        rows.append({**values, **own})
-    rows.sort(key=runner.order)
-    found = pd.DataFrame(rows)
-    write_text(search.folder / "verification.csv", found.to_csv(index=False))
-    return found
+    with filelock.FileLock(search.folder / "verification.lock"):  # another worker may be at it
+        for rank, trial in enumerate(ranked(study)[: search.num_verified], 1):
+            overrides = overrides_of(trial, search)
+            name = f"{trial.number:04d}-{search.config.fresh_seeds}"
+            values = runner.verify(overrides, search.folder / "verified" / name)
+            settings = " ".join([*search.fixed, *overrides])
+            own = {"trial": trial.number, "rank": rank, "score": trial.value, "settings": settings}
+            rows.append({**values, **own})
+        rows.sort(key=runner.order)
+        found = pd.DataFrame(rows)
+        write_text(search.folder / "verification.csv", found.to_csv(index=False))
+    print_verified(found, search)
+    best = overrides_of(study.get_trials(deepcopy=False)[rows[0]["trial"]], search)
+    write_best(best, search, runner.command)
+    return best
 
 
 def print_verified(rows: pd.DataFrame, search: Search) -> None:
-    """Prints the rows of `verify`, and for agents how the orders on both tasks agree."""
+    """Prints the rows of `verification.csv`, and for agents how the orders on both tasks agree."""
     console, numbers = Console(highlight=False), rows.drop(columns="settings")
     what = "fresh agents" if search.is_of_agent else f"{search.config.fresh_seeds} other seeds"
     shown = Table(title=f"the best {len(rows)}, again with {what}")

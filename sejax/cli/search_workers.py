@@ -9,10 +9,13 @@ from typing import Any
 
 import optuna
 
-from sejax.cli import cluster, runtime
-from sejax.cli.search_config import SQLITE, Search
-from sejax.cli.study import ENDED, sentence
-from sejax.options import FailedError, registry, told
+from sejax.cli import cluster, runtime, search_config
+from sejax.cli.search_config import Search
+from sejax.cli.study import ENDED, open_study, sentence
+from sejax.cli.study import work as take_trials
+from sejax.cli.trials import runner_of
+from sejax.cli.workers import RayConfig
+from sejax.options import FailedError, registry
 
 RETRIES = 5  # of a worker that is lost
 LAST_S = 60.0  # for workers to notice that the study is over
@@ -21,7 +24,7 @@ LAST_S = 60.0  # for workers to notice that the study is over
 def work(
     study: optuna.Study,
     search: Search,
-    join: Callable[[Sequence[str]], None],
+    machines: RayConfig,
     say: Callable[[str], None],
 ) -> None:
     """Has the trials of a study made by workers on the cluster, until it is over.
@@ -29,7 +32,7 @@ def work(
     Args:
       study: the study.
       search: what is searched.
-      join: what a worker does, given the overrides that join the study.
+      machines: the cluster.
       say: tells the user.
 
     Raises:
@@ -37,12 +40,11 @@ def work(
       FailedError: if it is lost, or workers are lost again and again.
     """
     runtime.take_share_of_gpu(0)  # GPUs are the workers'
-    machines, gpus = search.machines, search.machines.gpus_per_worker
-    typed = [*search.fixed, *(x.text for x in search.space.values())]
+    gpus = machines.gpus_per_worker
     with cluster.connected(machines) as ray:
         start = ray.remote(num_cpus=1, num_gpus=gpus, max_retries=RETRIES)(_work)
         count = max(1, cluster.num_workers(machines))
-        running = [start.remote(join, _overrides(search), gpus, typed) for _ in range(count)]
+        running = [start.remote(search.overrides(), gpus) for _ in range(count)]
         known = {trial.number for trial in study.get_trials(deepcopy=False, states=ENDED)}
         done: list[Any] = []
         while not done:
@@ -56,34 +58,17 @@ def work(
             ray.get(done)
         except ray.exceptions.RayError as error:
             raise FailedError(
-                f"A worker has failed: {told(error).splitlines()[-1]}. What has ended is saved; "
+                f"A worker has failed: {cluster.reason(error)}. What has ended is saved; "
                 f"the same command goes on, with machines=local on this machine alone."
             ) from error
         ray.wait(running, num_returns=count, timeout=LAST_S)  # one that hangs is left behind
 
 
-def _overrides(search: Search) -> list[str]:
-    """The overrides by which a worker joins, and has what may differ between workers."""
-    folder = search.folder.resolve()
-    own = {
-        "study": search.study,
-        "search_dir": folder,
-        "storage": search.config.storage or f"{SQLITE}{folder / 'study.db'}",
-        "trials": search.config.trials,
-        "timeout": search.config.timeout,
-    }
-    return [f"{name}={value}" for name, value in own.items() if value is not None]
-
-
-def _work(
-    join: Callable[[Sequence[str]], None],
-    overrides: Sequence[str],
-    gpu_share: float,
-    typed: Sequence[str],
-) -> None:
-    """A worker; it may import what the overrides `typed` name."""
+def _work(overrides: Sequence[str], gpu: float) -> None:
+    """A worker, which has this part of a GPU."""
     runtime.configure_xla(1)
-    runtime.take_share_of_gpu(gpu_share)
+    runtime.take_share_of_gpu(gpu)
     runtime.configure_jax()
-    with registry.only_typed(typed):
-        join(overrides)
+    with registry.only_typed(overrides):
+        search = search_config.read(overrides)
+        take_trials(open_study(search), search, runner_of(search), lambda text: None)

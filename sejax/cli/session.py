@@ -12,22 +12,19 @@ from typing import Any
 
 import jax
 import numpy as np
+from jax import Array
 
-from sejax import __version__
-from sejax.bilevel import Bilevel, make_bilevel
-from sejax.cli import runtime
+from sejax.bilevel import Bilevel, LearnState, make_bilevel
+from sejax.cli import plots, runtime
 from sejax.cli.config import LearnConfig
 from sejax.cli.run_directory import RunDirectory
-from sejax.cli.trackers import (
-    FinishedGeneration,
-    GuardedTracker,
-    Reporter,
-    TrackedRun,
-)
+from sejax.cli.trackers import FinishedGeneration, GuardedTracker, Reporter, TrackedRun
+from sejax.objectives import GenerationInfo
 from sejax.ops.parallel import compiler_options
 from sejax.proxies.io import save
 
 DRAW_EVERY_S = 30.0
+PACKAGES = ("sejax", "jax", "jaxlib", "flax", "optax", "evosax", "gymnax", "numpy")
 
 
 class Chunks:
@@ -65,9 +62,10 @@ class Chunks:
         chunks.learner, chunks._arguments = learner, arguments
         return chunks
 
-    def init(self, key: jax.Array) -> Any:
+    def init(self, key: Array) -> LearnState:
         """The state before the first generation."""
-        return self._init(key, *self._arguments)
+        state: LearnState = self._init(key, *self._arguments)
+        return state
 
     def is_ready(self, length: int) -> bool:
         """Whether a chunk of this length has been compiled."""
@@ -76,7 +74,7 @@ class Chunks:
     def compile(self, length: int) -> None:
         """Compiles a chunk of this length."""
 
-        def chunk(state: Any, *arguments: Any) -> Any:
+        def chunk(state: LearnState, *arguments: Any) -> tuple[LearnState, GenerationInfo]:
             learner = self._make(*arguments)
             return jax.lax.scan(lambda state, _: learner.generation(state), state, length=length)
 
@@ -84,7 +82,7 @@ class Chunks:
         jitted = jax.jit(chunk, donate_argnums=0, compiler_options=compiler_options())
         self._compiled[length] = jitted.lower(state, *self._arguments).compile()
 
-    def advance(self, state: Any, length: int) -> tuple[Any, Any]:
+    def advance(self, state: LearnState, length: int) -> tuple[LearnState, GenerationInfo]:
         """Runs `length` generations; the buffers of the state are donated.
 
         Returns:
@@ -92,7 +90,8 @@ class Chunks:
         """
         if not self.is_ready(length):
             self.compile(length)
-        return self._compiled[length](state, *self._arguments)
+        state, info = self._compiled[length](state, *self._arguments)
+        return state, info
 
 
 def make_chunks(config: LearnConfig) -> Chunks:
@@ -122,8 +121,8 @@ def run(
       OSError: if a file cannot be written; everything saved before is whole.
     """
     report = report or Reporter()
-    clock = _Clock(directory, chunks)
-    proxies = _Proxies(config, directory, chunks.learner)
+    learner, clock = chunks.learner, _Clock(directory, chunks)
+    proxies = _Proxies(config, directory, learner)
     state = chunks.init(jax.random.key(config.seed))
     restored = directory.restore(state)
     if restored is not None:
@@ -131,14 +130,16 @@ def run(
         report.say(f"Going on at generation {directory.finished_generations} of {directory.path}.")
         proxies.save(jax.device_get(state))
     state = jax.tree.map(lambda x: x.copy(), state)  # own buffers, so that they can be donated
-
-    def is_over() -> bool:
-        return directory.finished_generations >= config.generations or bool(state.finished)
-
-    tracker = _tracker(config, directory, report)
+    tracked = TrackedRun(
+        folder=directory.path.resolve(),
+        id=directory.id,
+        generation=directory.finished_generations,
+        config=directory.config,
+    )
+    tracker = GuardedTracker(config.tracker, tracked, report.say)
     drawn = time.monotonic()
     with contextlib.closing(tracker):
-        while not is_over():
+        while directory.finished_generations < config.generations and not state.finished:
             left = config.generations - directory.finished_generations
             length = min(config.checkpoint_every, left)
             if not chunks.is_ready(length):
@@ -146,7 +147,9 @@ def run(
                 chunks.compile(length)
                 report.status("first generation")
             state, info = chunks.advance(state, length)
-            _wait(state)
+            pending: Any = state.generation
+            while not pending.is_ready():  # Ctrl-C is heard in Python alone
+                time.sleep(0.02)
             with interrupts_held():
                 saved, info = jax.device_get((state, info))
                 rows = directory.save(saved, info, clock.wall_s(), clock.cpu_s())
@@ -155,21 +158,25 @@ def run(
                     report.on_generation(generation)
                     tracker.on_generation(generation)
             if time.monotonic() - drawn > DRAW_EVERY_S:
-                draw(directory, chunks.learner)
+                draw(directory, learner)
                 drawn = time.monotonic()
-        draw(directory, chunks.learner)
-    ended = "solved" if bool(state.finished) else "finished"
+        draw(directory, learner)
+    ended = "solved" if state.finished else "finished"
+    agents = learner.strategy.num_evaluations  # of a generation
+    steps_of_agents = sum(float(row["train_steps_mean"]) for row in directory.rows)
     directory.write_summary(
         ended=ended,
         best_score=float(state.best_score),
         generations=directory.finished_generations,
-        solved_score=chunks.learner.solved_score,
+        solved_score=learner.solved_score,
         wall_s=round(clock.wall_s(), 1),
         cpu_s=round(clock.cpu_s(), 1),
-        **_cost(directory, chunks.learner.strategy.num_evaluations),
+        agents=directory.finished_generations * agents,
+        train_steps=round(steps_of_agents * agents),
+        real_steps=directory.real_steps,
         devices=[str(device) for device in jax.devices()],
         machine=runtime.machine(),
-        versions=_versions(),
+        versions={"python": platform.python_version()} | {x: version(x) for x in PACKAGES},
     )
     return ended
 
@@ -223,7 +230,7 @@ class _Proxies:
         self._discount = None if discount is None else float(discount)
         self._best: int | None = None  # the generation of the best proxy that is on the disk
 
-    def save(self, state: Any) -> None:
+    def save(self, state: LearnState) -> None:
         """Writes the best proxy, if it is new, and the last one.
 
         Raises:
@@ -236,7 +243,7 @@ class _Proxies:
         last = state.incumbent, state.incumbent_score, state.incumbent_scores
         self._save("proxy_last", *last, state.generation - 1)
 
-    def _save(self, name: str, flat: Any, score: Any, scores: Any, generation: Any) -> None:
+    def _save(self, name: str, flat: Array, score: Array, scores: Array, generation: Array) -> None:
         if not np.isfinite(flat).all():  # the mean has diverged; the file before it stays
             return
         names = self._learner.mixture.names
@@ -256,55 +263,18 @@ class _Proxies:
 
 def draw(directory: RunDirectory, learner: Bilevel) -> None:
     """Draws the learning curve of the rows so far."""
-    from sejax.cli import plots  # matplotlib and pandas take half a second to import
-
     if directory.rows:
         path = directory.path / "learning_curve.png"
         plots.learning_curve(directory.rows, learner.solved_score, path)
 
 
-def _tracker(config: LearnConfig, directory: RunDirectory, report: Reporter) -> GuardedTracker:
-    run = TrackedRun(
-        folder=directory.path.resolve(),
-        id=directory.id,
-        generation=directory.finished_generations,
-        config=directory.config,
-    )
-    return GuardedTracker(config.tracker, run, report.say)
-
-
-def _finished(rows: list[dict[str, str]], info: Any) -> Iterator[FinishedGeneration]:
+def _finished(rows: list[dict[str, str]], info: GenerationInfo) -> Iterator[FinishedGeneration]:
     """The generations of a chunk for the callbacks, of its rows and its info on the host."""
     for i, row in enumerate(rows):
-        scores = info.population_scores[i]
+        scores = np.asarray(info.population_scores[i])
         yield FinishedGeneration(
             generation=int(row["generation"]),
             values={k: float(v) for k, v in row.items() if k not in ("generation", "seed")},
             scores=scores[np.isfinite(scores)],
             train_steps=int(info.train_steps[i].sum(dtype=np.int64)),
         )
-
-
-def _cost(directory: RunDirectory, num_candidates: int) -> dict[str, int]:
-    """The cost of all generations in agents and steps."""
-    steps_of_agents = sum(float(row["train_steps_mean"]) for row in directory.rows)
-    return {
-        "agents": directory.finished_generations * num_candidates,
-        "train_steps": round(steps_of_agents * num_candidates),
-        "real_steps": directory.real_steps,
-    }
-
-
-def _wait(state: Any) -> None:
-    """Waits for the devices in Python, so that Ctrl-C is heard while they work."""
-    while not state.generation.is_ready():
-        time.sleep(0.02)
-
-
-def _versions() -> dict[str, str]:
-    packages = ("jax", "jaxlib", "flax", "optax", "evosax", "gymnax", "numpy")
-    return {
-        "python": platform.python_version(),
-        "sejax": __version__,
-        **{name: version(name) for name in packages},
-    }

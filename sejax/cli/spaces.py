@@ -23,10 +23,12 @@ import yaml
 from optuna.distributions import CategoricalDistribution, FloatDistribution, IntDistribution
 from optuna.trial import Trial
 
+from sejax.cli import compose
 from sejax.cli import config as configuration
-from sejax.options import ConfigError, is_number, nearest, require, shortened, told
-from sejax.options.registry import split
+from sejax.options import ConfigError, nearest, require, shortened, told
+from sejax.options.plain import split
 
+Distribution = CategoricalDistribution | FloatDistribution | IntDistribution
 FOLDER = Path(__file__).parent / "spaces"
 DIGITS = 6  # of a number: the override says exactly what was tried
 EXAMPLE = "tag(log, interval(0.01, 0.3))"
@@ -39,14 +41,14 @@ class Dimension:
 
     Attributes:
       name: of the field, such as `es.noise_std`.
-      text: the range or choice as it was given.
+      text: the range or choice, as an override has it.
       distribution: Optuna's.
       is_inverse: whether 1 - value is drawn in the place of the value.
     """
 
     name: str
     text: str
-    distribution: CategoricalDistribution | FloatDistribution | IntDistribution
+    distribution: Distribution
     is_inverse: bool = False
 
     @property
@@ -79,18 +81,20 @@ class Dimension:
                 trial.suggest_float(self.parameter, low, high, log=log)
         return self.override(trial.params)
 
-    def parameter_of(self, value: Any) -> Any:
+    def parameter_of(self, value: object) -> object:
         """The stored parameter that stands for a field's value; None if it is not drawn from."""
         drawn = self.distribution
         if isinstance(drawn, CategoricalDistribution):
             return next((x for x in drawn.choices if yaml.safe_load(str(x)) == value), None)
-        value = round(1 - value, 12) if self.is_inverse and is_number(value) else value
-        if not is_number(value) or not drawn.low <= value <= drawn.high:
+        if isinstance(value, bool) or not isinstance(value, int | float):
             return None
-        if isinstance(drawn, IntDistribution):
-            is_step = isinstance(value, int) and (value - drawn.low) % drawn.step == 0
-            return value if is_step else None
-        return float(value)
+        number = round(1 - value, 12) if self.is_inverse else value
+        if not drawn.low <= number <= drawn.high:
+            return None
+        if isinstance(drawn, FloatDistribution):
+            return float(number)
+        is_step = isinstance(number, int) and (number - drawn.low) % drawn.step == 0
+        return number if is_step else None
 
 
 def is_range(text: str) -> bool:
@@ -109,6 +113,7 @@ def parse(name: str, text: str) -> Dimension:
       IntDistribution(high=2, log=False, low=1, step=1)
     """
     call, tags = text.strip(), set()
+    text = call if _CALL.fullmatch(call) else f"choice({call})"
     if (tagged := _CALL.fullmatch(call)) and tagged[1] == "tag":
         *given, call = split(tagged[2])
         tags = set(given)
@@ -118,14 +123,14 @@ def parse(name: str, text: str) -> Dimension:
         distribution = _distribution(call, tags)
     except (ValueError, ZeroDivisionError) as error:  # also of Optuna
         raise ConfigError(
-            f"{name} must be a choice, a range or an interval, because it is searched; got "
-            f"{shortened(text)} ({told(error)}). Set {name}='{EXAMPLE}'.",
+            f"{name} must be a choice, a range or an interval; got {shortened(text)} "
+            f"({told(error)}). Set {name}='{EXAMPLE}'.",
             name,
         ) from error
     return Dimension(name=name, text=text, distribution=distribution, is_inverse="inverse" in tags)
 
 
-def _distribution(text: str, tags: set[str]) -> Any:
+def _distribution(text: str, tags: set[str]) -> Distribution:
     """Optuna's distribution of a range without tags.
 
     Raises:
@@ -190,19 +195,19 @@ def preset(name: str, agent: str, of_agent: bool) -> dict[str, Dimension]:
         and all(isinstance(x, dict) for x in of_agents.values())
         and (ranges or of_agents),
         "space",
-        "must map fields to ranges, and agents to such maps under with_agent, because they are "
-        f"searched; got {path} with other content. Set space=paper_se.",
+        "must map fields to ranges, and agents to such maps under with_agent; got other content in "
+        f"{path}. Set space=paper_se.",
     )
     for each in agent.split(configuration.JOINT):
         require(
             has_own or each in of_agents,
             "agent",
-            f"must be one of {', '.join(of_agents)} with space={name}, because it has no ranges "
-            f"for others; got {shortened(each)}. Set agent={next(iter(of_agents), 'ddqn')}.",
+            f"must be one of {', '.join(of_agents)} with space={name}; got {shortened(each)}. Set "
+            f"agent={next(iter(of_agents), 'ddqn')}.",
         )
         own = of_agents.get(each, {})
         if configuration.JOINT in agent:  # what a mixture shares has no place in an agent's ranges
-            prefix = f"agents.{configuration.key_of(each)}."
+            prefix = f"agents.{compose.key_of(each)}."
             own = {
                 field.replace("agent.", prefix, 1): text
                 for field, text in own.items()

@@ -1,8 +1,7 @@
 """The study of a search: its storage, and the loop in which a worker takes one trial after another.
 
-Workers of a study share its database alone. Each shows by heartbeats that it lives. A trial whose
-worker has not done so for some time counts as failed, and Optuna queues it again under a new
-number.
+Workers of a study share its database alone. Each shows by heartbeats that it lives. Optuna fails a
+trial whose worker has not done so for some time, and queues it again under a new number.
 """
 
 import contextlib
@@ -11,25 +10,24 @@ import math
 import shutil
 import time
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import filelock
 import numpy as np
 import optuna
-from optuna.exceptions import TrialPruned, UpdateFinishedTrialError
+from optuna.exceptions import ExperimentalWarning, TrialPruned, UpdateFinishedTrialError
 from optuna.storages import RDBStorage, RetryHeartbeatStaleTrialCallback
 from optuna.trial import FrozenTrial, Trial, TrialState
 
 from sejax.cli.search_config import REDUCTION_FACTOR, SQLITE, Search
 from sejax.cli.trials import Progress, Runner, worth
+from sejax.ops.files import require_writable
 from sejax.options import ConfigError, shortened, told
 
 STORED = "sejax"  # the study's attribute that holds what is searched
 RETRIES = 3  # of a trial whose worker was lost
 GRACE = 4  # heartbeats that may be missed
-ATTEMPTS = 5  # to open what another worker makes just now, with a second between them
 LONGEST_WAIT_S = 3600  # for another worker's write to SQLite
 ENDED = (TrialState.COMPLETE, TrialState.PRUNED)
 
@@ -37,51 +35,45 @@ ENDED = (TrialState.COMPLETE, TrialState.PRUNED)
 @contextlib.contextmanager
 def _quietly() -> Iterator[None]:
     """Without Optuna's warnings that heartbeats may change."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
+    with warnings.catch_warnings(action="ignore", category=ExperimentalWarning):
         yield
 
 
 @_quietly()
-def open_study(
-    search: Search, current: dict[str, Any] | None = None
-) -> tuple[optuna.Study, Search]:
-    """Makes the study, or joins one that is there.
+def open_study(search: Search, current: Mapping[str, object] | None = None) -> optuna.Study:
+    """Makes the study, or opens it if it is there.
 
     Args:
       search: what is searched.
       current: values of the searched fields that a new study tries first: they are to be beaten.
         Not tried if one of them is not among what is searched.
 
-    Returns:
-      The study, and what it searches: with `study=NAME` alone what the study's maker asked for.
-
     Raises:
       ConfigError: if the storage cannot be used, or the study is one of another search.
     """
     optuna.logging.set_verbosity(optuna.logging.ERROR)
     logging.getLogger("alembic").setLevel(logging.WARNING)
-    storage = _open_storage(search)
-    if search.joins:
-        study = _joined(search, storage)
-    else:
+    one_by_one: contextlib.AbstractContextManager[object] = contextlib.nullcontext()
+    if search.config.storage is None:  # or two workers would make the tables of a new file
+        require_writable("search_dir", search.folder)
+        one_by_one = filelock.FileLock(search.folder / "study.lock")
+    with one_by_one:
         study = optuna.create_study(
-            study_name=search.study, storage=storage, direction="maximize", load_if_exists=True
+            study_name=search.study,
+            storage=_storage(search),
+            pruner=_pruner(search),
+            direction="maximize",
+            load_if_exists=True,
         )
-    stored = study.user_attrs.get(STORED)
-    if stored is not None:
-        joined = search.joined(stored)
-        if joined.config.heartbeat != search.config.heartbeat:  # each worker has the same
-            study = optuna.load_study(study_name=search.study, storage=_open_storage(joined))
-        search = joined
-    else:
+        if STORED in study.user_attrs:
+            search.require_same(study.user_attrs[STORED])
+            return study
         study.set_user_attr(STORED, search.stored())
-        values = current or {}
-        first = {x.parameter: x.parameter_of(values.get(name)) for name, x in search.space.items()}
-        if values and None not in first.values():
-            study.enqueue_trial(first, skip_if_exists=True)
-    study.pruner = _pruner(search)
-    return study, search
+    values = current or {}
+    first = {x.parameter: x.parameter_of(values.get(name)) for name, x in search.space.items()}
+    if values and None not in first.values():
+        study.enqueue_trial(first, skip_if_exists=True)
+    return study
 
 
 @_quietly()
@@ -96,52 +88,52 @@ def work(
       KeyboardInterrupt: after queueing the trial at hand again, as after the following.
       ConfigError, OSError: of a trial that cannot be written.
     """
-    started, objective = time.monotonic(), _Objective(search, runner, say)
+    started, objective = time.monotonic(), _Objective(search, runner)
     timeout = math.inf if search.config.timeout is None else search.config.timeout
     while time.monotonic() - started < timeout:
         trials = study.get_trials(deepcopy=False)
         if sum(trial.state in ENDED for trial in trials) >= search.config.trials:
             return
         study.sampler = _sampler(search, trials)
-        objective.trial, objective.error = None, None
+        objective.number, objective.error = None, None
         try:
-            study.optimize(objective, n_trials=1)
+            study.optimize(
+                objective, n_trials=1, callbacks=[lambda _, trial: say(sentence(trial, search))]
+            )
         except optuna.exceptions.StorageInternalError as error:
             raise _unusable(search, error) from error
         except (Exception, KeyboardInterrupt):
-            own, number = objective.error, objective.trial
+            number, own = objective.number, objective.error
             if number is None:  # Optuna could not begin one
                 raise
-            if own is None or isinstance(own, (TrialPruned, UpdateFinishedTrialError)):
-                say(f"trial {number}: was taken for dead and is another worker's now")
-                continue
-            RetryHeartbeatStaleTrialCallback(RETRIES)(study, study.trials[number])
-            raise own from None
+            if own is not None:
+                RetryHeartbeatStaleTrialCallback(RETRIES)(study, study.trials[number])
+                raise own from None
+            say(f"trial {number}: was taken for dead and is another worker's now")
 
 
 class _Objective:
     """What Optuna calls for a trial.
 
     Attributes:
-      trial: number of the last one.
-      error: what it has raised.
+      number: of the last trial.
+      error: what it has raised, if it shall be tried again.
     """
 
-    def __init__(self, search: Search, runner: Runner, say: Callable[[str], None]):
-        self._search, self._runner, self._say = search, runner, say
-        self.trial: int | None = None
+    def __init__(self, search: Search, runner: Runner):
+        self._search, self._runner = search, runner
+        self.number: int | None = None
         self.error: BaseException | None = None
 
     def __call__(self, trial: Trial) -> float:
-        self.trial = trial.number
+        self.number = trial.number
         try:
             return self._score(trial)
+        except (TrialPruned, UpdateFinishedTrialError):
+            raise
         except BaseException as error:
             self.error = error
             raise
-        finally:
-            if self.error is None or isinstance(self.error, TrialPruned):
-                self._say(sentence(trial, self._search))
 
     def _score(self, trial: Trial) -> float:
         overrides = [dimension.suggest(trial) for dimension in self._search.space.values()]
@@ -154,30 +146,20 @@ class _Objective:
         folder.parent.mkdir(parents=True, exist_ok=True)
         # Two workers may draw the same trial from SQLite: the second waits, and finds it done.
         with filelock.FileLock(folder.with_suffix(".lock")):
-            return self._run(trial, config, folder)
-
-    def _run(self, trial: Trial, config: Any, folder: Path) -> float:
-        told_of, last = 0, self._search.config.max_generations
-        is_inherited = _take_over(folder, self._search, trial)
-        for rung in self._search.rungs:
-            try:
+            _take_over(folder, self._search, trial)
+            num_reported = 0
+            for rung in self._search.rungs:
                 progress = self._runner.run(config, folder, rung)
-            except ConfigError:
-                if not is_inherited:
-                    raise
-                shutil.rmtree(folder)  # damaged when its worker was lost
-                progress = self._runner.run(config, folder, rung)
-            is_inherited = False
-            for step in range(told_of + 1, rung + 1):
-                trial.report(self._worth(progress, step), step)
-            told_of = rung
-            if rung < last and trial.should_prune() and not progress.is_over:
-                self._keep(trial, progress, rung)
-                raise TrialPruned
-        trial.should_prune()  # so that the pruner knows of the last rung
-        self._keep(trial, progress, last)
-        score = self._worth(progress, last)
-        if not math.isfinite(score):
+                for step in range(num_reported + 1, rung + 1):
+                    trial.report(self._worth(progress, step), step)
+                num_reported = rung
+                # Asked at the last rung too, so that the pruner knows of it.
+                is_behind = trial.should_prune() and not progress.is_over
+                if is_behind and rung < self._search.config.max_generations:
+                    break
+            self._keep(trial, progress, rung)
+        score = self._worth(progress, rung)
+        if rung < self._search.config.max_generations or not math.isfinite(score):
             raise TrialPruned
         return score
 
@@ -200,7 +182,7 @@ def trial_folder(search: Search, number: int) -> Path:
     return search.folder / "trials" / f"{number:04d}"
 
 
-def sentence(trial: Trial | FrozenTrial, search: Search) -> str:
+def sentence(trial: FrozenTrial, search: Search) -> str:
     """What is said of a trial that has ended."""
     kept = trial.user_attrs
     if "refused" in kept:
@@ -214,7 +196,7 @@ def sentence(trial: Trial | FrozenTrial, search: Search) -> str:
     )
 
 
-def _take_over(folder: Path, search: Search, trial: Trial) -> bool:
+def _take_over(folder: Path, search: Search, trial: Trial) -> None:
     """Copies the folder of the trial that this one is queued in the place of, if it is here.
 
     A copy, as a process that was only slow may still write to the other one.
@@ -224,15 +206,12 @@ def _take_over(folder: Path, search: Search, trial: Trial) -> bool:
     found = [trial_folder(search, number) for number in reversed(history)]
     before = next((path for path in found if path.is_dir()), None)
     if before is None or folder.exists():
-        return False
+        return
     partial = folder.with_name(f"{folder.name}.partial")
     shutil.rmtree(partial, ignore_errors=True)
-    try:
+    with contextlib.suppress(shutil.Error):  # a file was replaced meanwhile: the trial begins anew
         shutil.copytree(before, partial, ignore=shutil.ignore_patterns("*.lock", ".*"))
-    except shutil.Error:  # a file was replaced meanwhile: the trial begins anew
-        return False
-    partial.rename(folder)
-    return True
+        partial.rename(folder)
 
 
 def _sampler(search: Search, trials: Sequence[FrozenTrial]) -> optuna.samplers.BaseSampler:
@@ -262,60 +241,24 @@ def _pruner(search: Search) -> optuna.pruners.BasePruner:
     return optuna.pruners.NopPruner()
 
 
-def _joined(search: Search, storage: RDBStorage) -> optuna.Study:
-    """A study that is named alone, once its maker has written what it searches.
-
-    Raises:
-      ConfigError: if it is not there.
-    """
-    for _ in range(ATTEMPTS):
-        names = optuna.get_all_study_names(storage)
-        if search.study not in names:
-            break
-        study = optuna.load_study(study_name=search.study, storage=storage)
-        if STORED in study.user_attrs:
-            return study
-        time.sleep(1.0)
-    raise _no_study(search, names)
-
-
-def _no_study(search: Search, names: Sequence[str]) -> ConfigError:
-    return ConfigError(
-        f"study must be one that is there, because nothing says what to search otherwise; got "
-        f"{shortened(search.study)}, and the storage has {', '.join(names)[:80] or 'none'}. Set "
-        f"study=NAME storage=URL, or say what to search: space=paper_se.",
-        "study",
-    )
-
-
-def _open_storage(search: Search) -> RDBStorage:
-    """The database of a search, made if it is not there and the search is no mere name.
+def _storage(search: Search) -> RDBStorage:
+    """The database of a search, made if it is not there.
 
     Raises:
       ConfigError: if it cannot be used.
     """
-    url, heartbeat = search.storage, search.config.heartbeat
-    is_file = url.startswith(SQLITE)
-    if search.joins and is_file and not Path(url.removeprefix(SQLITE)).exists():
-        raise _no_study(search, [])
-    options: dict[str, Any] = {"connect_args": {"timeout": LONGEST_WAIT_S}} if is_file else {}
-    for attempt in range(ATTEMPTS):
-        try:
-            if search.config.storage is None:
-                search.folder.mkdir(parents=True, exist_ok=True)
-            return RDBStorage(
-                url,
-                engine_kwargs={"pool_pre_ping": True, **options},
-                heartbeat_interval=heartbeat,
-                grace_period=GRACE * heartbeat,
-                heartbeat_stale_trial_callback=RetryHeartbeatStaleTrialCallback(RETRIES),
-            )
-        except Exception as error:  # of SQLAlchemy, of any driver, or that there is none
-            is_made = "already exists" in str(error)  # its tables, by another worker just now
-            if not is_made or attempt == ATTEMPTS - 1:
-                raise _unusable(search, error) from error
-            time.sleep(1.0)
-    raise AssertionError
+    is_file, heartbeat = search.storage.startswith(SQLITE), search.config.heartbeat
+    options = {"connect_args": {"timeout": LONGEST_WAIT_S}} if is_file else {}
+    try:
+        return RDBStorage(
+            search.storage,
+            engine_kwargs={"pool_pre_ping": True, **options},
+            heartbeat_interval=heartbeat,
+            grace_period=GRACE * heartbeat,
+            heartbeat_stale_trial_callback=RetryHeartbeatStaleTrialCallback(RETRIES),
+        )
+    except Exception as error:  # of SQLAlchemy, of any driver, or that there is none
+        raise _unusable(search, error) from error
 
 
 def _unusable(search: Search, error: Exception) -> ConfigError:
@@ -326,7 +269,7 @@ def _unusable(search: Search, error: Exception) -> ConfigError:
     if isinstance(cause, ImportError) and search.storage.startswith("postgresql:"):
         fix = "Install its driver with pip install 'psycopg[binary]'."
     return ConfigError(
-        f"{field} must hold a database that can be used, because the study is kept there; got "
+        f"{field} must hold a database that can be used; got "
         f"{shortened(search.storage.partition('://')[0])} ({told(cause)[:150]}). {fix}",
         field,
     )

@@ -14,7 +14,7 @@ import numpy as np
 import yaml
 
 from sejax.options import registry, told
-from sejax.options.registry import flatten
+from sejax.options.plain import flatten
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -4,6 +4,7 @@ Both go on from the trial's folder, so that a trial may be computed up to one ge
 up to another, by any process.
 """
 
+import contextlib
 import dataclasses
 import json
 import math
@@ -11,16 +12,31 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar
 
+import jax
+import jax.numpy as jnp
 import numpy as np
+from jax import Array
 
+from sejax.agents import make_agent
 from sejax.cli import config as configuration
+from sejax.cli import session
 from sejax.cli.config import EvaluateConfig, LearnConfig
 from sejax.cli.programs import Programs, kept, static_of, structure_of
+from sejax.cli.run_directory import open_for
 from sejax.cli.search_config import Search
+from sejax.cli.worlds import proxy_setup
+from sejax.evaluation import make_evaluator, num_parallel_on_cpu
+from sejax.objectives import Outcome
 from sejax.ops.files import write_text
-from sejax.options import ConfigError, registry, require, shortened
+from sejax.ops.parallel import compiler_options, spread_over_devices
+from sejax.options import require, shortened
+from sejax.options.plain import flatten, to_plain
+from sejax.proxies import header
+
+Config = TypeVar("Config", LearnConfig, EvaluateConfig)
+T = TypeVar("T", list[dict[str, Any]], dict[str, float])
 
 ROUNDS = "rounds.json"
 WORLDS = {"the proxy": "proxy", "the real task": "real"}  # and what columns call them
@@ -60,7 +76,7 @@ def worth(progress: Progress, step: int, search: Search) -> dict[str, float]:
     return {"mean": float(of_seeds.mean()), "worst": float(of_seeds.min())}
 
 
-class Runner(Protocol):
+class Runner(Protocol[Config]):
     """What makes a trial of settings.
 
     Attributes:
@@ -69,14 +85,14 @@ class Runner(Protocol):
 
     command: str
 
-    def config(self, overrides: Sequence[str]) -> Any:
+    def config(self, overrides: Sequence[str]) -> Config:
         """The configuration of a trial.
 
         Raises:
           ConfigError: if it is none that can run.
         """
 
-    def run(self, config: Any, folder: Path, generations: int) -> Progress:
+    def run(self, config: Config, folder: Path, generations: int) -> Progress:
         """Computes a trial up to a generation.
 
         Raises:
@@ -132,9 +148,6 @@ class Learning:
         generations: int,
     ) -> Progress:
         """Runs with seeds that are counted from the configuration's own."""
-        from sejax.cli import session
-        from sejax.cli.run_directory import open_for
-
         scores, cost, seconds, computed, ended = [], 0, 0.0, [], []
         for seed in seeds:
             one = dataclasses.replace(
@@ -170,7 +183,6 @@ class Tuning:
 
     Args:
       search: of an agent.
-      study_of: `sejax.evaluate.proxy_study`, which stands above this module.
 
     Raises:
       ConfigError: if the proxy is not to be found here, which is no fault of a trial's settings.
@@ -178,10 +190,8 @@ class Tuning:
 
     command = "sejax.evaluate"
 
-    def __init__(self, search: Search, study_of: Callable[[EvaluateConfig], Any]):
-        from sejax.proxies import header
-
-        self._search, self._study_of = search, study_of
+    def __init__(self, search: Search):
+        self._search = search
         self._default = configuration.evaluate_config(search.fixed)
         header.find(self._default.proxy, "proxy")
         self._compiled: dict[str, Any] = {}
@@ -192,21 +202,21 @@ class Tuning:
         require(
             config.agents is None,
             "agent",
-            "must be one, because its settings are searched; got several. Set agent=ppo.",
+            "must be one where its settings are searched; got several. Set agent=ppo.",
         )
         require(
             config.agent_hparams == "default",
             "agent_hparams",
-            "must be default, because the trial's settings are those that are tried; got "
-            f"{shortened(config.agent_hparams)}. Set agent_hparams=default.",
+            f"must be default where settings are searched; got {config.agent_hparams}. Set "
+            "agent_hparams=default.",
         )
-        self._study_of(config)  # which checks what is asked of the proxy
+        proxy_setup(config)  # which checks what is asked of the proxy
         return config
 
     def run(self, config: EvaluateConfig, folder: Path, generations: int) -> Progress:
         """See `Runner`."""
         settings = self._settings_of(config)
-        rounds: list[dict[str, Any]] = _stored(folder / ROUNDS, settings, [])[:generations]
+        rounds = _stored(folder / ROUNDS, settings, list[dict[str, Any]]())[:generations]
         while len(rounds) < generations:
             started = time.monotonic()
             outcome = self._outcome(config, "the proxy", len(rounds), self._search.config.seeds)
@@ -232,10 +242,10 @@ class Tuning:
         """
         config = self.config(overrides)
         path, settings = folder / "verified.json", self._settings_of(config)
-        values: dict[str, float] = _stored(path, settings, {})
+        values = _stored(path, settings, dict[str, float]())
         if values:
             return values
-        for world in self._study_of(config).worlds:
+        for world in proxy_setup(config).worlds:
             fresh, name = self._search.config.max_generations, WORLDS[world]
             outcome = self._outcome(config, world, fresh, config.num_agents)
             values[f"{name}_return"] = float(np.mean(outcome.test_return))
@@ -250,93 +260,88 @@ class Tuning:
         score = row[f"{where}_return"]
         if not math.isfinite(score):
             return math.inf, 0.0
-        solved = float(self._study_of(self._default).task.solved_reward)
+        solved = float(proxy_setup(self._default).task.solved_reward)
         return -min(score, solved), row[f"{where}_steps"]
 
-    def _settings_of(self, config: EvaluateConfig) -> dict[str, Any]:
-        """What a trial's rounds are of, by field, as it reads back from JSON."""
-        fields = registry.flatten(configuration.plain(dataclasses.replace(config, out_dir=None)))
-        read_back: dict[str, Any] = json.loads(
-            json.dumps({**fields, "seeds": self._search.config.seeds})
-        )
-        return read_back
+    def _settings_of(self, config: EvaluateConfig) -> str:
+        """What a trial's rounds are of."""
+        fields = flatten(configuration.plain(dataclasses.replace(config, out_dir=None)))
+        return json.dumps({**fields, "seeds": self._search.config.seeds})
 
-    def _outcome(self, config: EvaluateConfig, world: str, generation: int, num_agents: int) -> Any:
+    def _outcome(
+        self, config: EvaluateConfig, world: str, generation: int, num_agents: int
+    ) -> Outcome:
         """The outcome of fresh agents in a world of `sejax.evaluate`, leaves `[agent]`, NumPy."""
-        import jax
+        setup = proxy_setup(config)
+        (family,) = setup.families
+        agent = make_agent(family.agent, setup.task, setup.exploration)
+        env, env_params, trainings = setup.worlds[world]
+        training = trainings[family.key]
 
-        from sejax.agents import make_agent
+        def one(key: Array, hparams: Any) -> Outcome:
+            tried = dataclasses.replace(agent, hparams=hparams)
+            return make_evaluator(tried, env, setup.task, training)(key, env_params)
 
-        study = self._study_of(config)
-        (family,) = study.families
-        agent = make_agent(family.agent, study.task, study.exploration)
-        training = study.worlds[world][2][family.key]
+        def make() -> Callable[..., Outcome]:
+            width = num_parallel_on_cpu(agent, training)
+            spread = spread_over_devices(one, config.devices, config.num_parallel, width)
+            return jax.jit(
+                lambda keys, hparams: spread(
+                    keys, jax.tree.map(lambda x: jnp.broadcast_to(x, keys.shape), hparams)
+                ),
+                compiler_options=compiler_options(),
+            )
+
         key = json.dumps(
             [
                 world,
                 static_of(family.agent),
-                static_of(study.exploration),
-                registry.to_plain(training),
+                static_of(setup.exploration),
+                to_plain(training),
                 structure_of(agent.hparams),
                 num_agents,
             ]
         )
-        rounds = kept(
-            self._compiled, key, lambda: _make_rounds(agent, study, world, training, config)
-        )
+        rounds = kept(self._compiled, key, make)
         seed = jax.random.fold_in(jax.random.key(config.seed), generation)
-        return jax.device_get(rounds(jax.random.split(seed, num_agents), agent.hparams))
+        outcome: Outcome = jax.device_get(rounds(jax.random.split(seed, num_agents), agent.hparams))
+        return outcome
 
 
-def _make_rounds(agent: Any, study: Any, world: str, training: Any, config: Any) -> Any:
-    """`rounds(keys, hparams) -> Outcome`, compiled at its first call."""
-    import jax
-    import jax.numpy as jnp
-
-    from sejax.evaluation import make_evaluator, num_parallel_on_cpu
-    from sejax.ops.parallel import compiler_options, spread_over_devices
-
-    env, env_params, _ = study.worlds[world]
-
-    def one(key: Any, hparams: Any) -> Any:
-        tried = dataclasses.replace(agent, hparams=hparams)
-        return make_evaluator(tried, env, study.task, training)(key, env_params)
-
-    spread = spread_over_devices(
-        one, config.devices, config.num_parallel, num_parallel_on_cpu(agent, training)
-    )
-
-    def rounds(keys: Any, hparams: Any) -> Any:
-        return spread(keys, jax.tree.map(lambda x: jnp.broadcast_to(x, keys.shape), hparams))
-
-    return jax.jit(rounds, compiler_options=compiler_options())
+def runner_of(search: Search) -> Learning | Tuning:
+    """What makes the trials of a search."""
+    return Tuning(search) if search.is_of_agent else Learning(search)
 
 
 def _finite(scores: np.ndarray) -> np.ndarray:
     return np.where(np.isfinite(scores), scores, np.nan)
 
 
-def _store(path: Path, settings: dict[str, Any], values: Any) -> None:
+def _store(path: Path, settings: str, values: T) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     write_text(path, json.dumps({"settings": settings, "values": values}))
 
 
-def _stored(path: Path, settings: dict[str, Any], default: Any) -> Any:
+def _stored(path: Path, settings: str, default: T) -> T:
     """The values that a file holds of these settings; the default if it is not there.
 
     Raises:
       ConfigError: if it is damaged, or of other settings.
     """
-    try:
-        stored = json.loads(path.read_text(encoding="utf-8"))
-        if stored["settings"] == settings and isinstance(stored["values"], type(default)):
-            return stored["values"]
-    except FileNotFoundError:
+    if not path.exists():
         return default
-    except (ValueError, TypeError, KeyError):
-        pass
-    raise ConfigError(
-        f"search_dir must be of one study, because its trials go on from their files; got {path}, "
-        f"which is damaged or of other settings. {HINT}",
+    stored = None
+    with contextlib.suppress(ValueError):
+        stored = json.loads(path.read_text(encoding="utf-8"))
+    match stored:
+        case {"settings": found, "values": values}:
+            is_own = found == settings and isinstance(values, type(default))
+        case _:
+            is_own = False
+    require(
+        is_own,
         "search_dir",
+        f"must be of one study; got {shortened(path)}, which is damaged or of other settings. "
+        f"{HINT}",
     )
+    return values

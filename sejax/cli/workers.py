@@ -3,7 +3,7 @@
 The driver, this process, keeps the strategy, its state and all files. In each generation it sends
 candidates to the workers in shares, and outcomes come back. An outcome depends on its key and its
 candidate alone, so that the numbers are those of a single process whichever worker computes it. A
-worker has no state: a share whose worker is lost is sent to another one.
+worker has no state: any other one can compute its share again.
 
 Shares shrink towards the end of a generation (guided self-scheduling, Polychronopoulos and Kuck,
 1987), so that no worker waits long for the last one.
@@ -19,13 +19,17 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from sejax.cli.cluster import Pool, connected, num_workers
+from sejax.cli.cluster import RESTARTS, RETRIES, Pool, connected, num_workers
 from sejax.options import Options, counts, fraction, option, require
 
 if TYPE_CHECKING:  # jax must not be imported before a worker has chosen its devices
-    from sejax.bilevel import Bilevel, Candidates
+    from jax import Array
+
+    from sejax.bilevel import Bilevel, LearnState
+    from sejax.cli.config import LearnConfig
     from sejax.cli.session import Chunks
-    from sejax.objectives import Outcome
+    from sejax.evaluation import Candidates
+    from sejax.objectives import GenerationInfo, Outcome
 
 CAPACITY = 16  # most evaluations in a share on a CPU core, where batches follow one another
 
@@ -38,7 +42,7 @@ class LocalConfig(Options):
     is_elsewhere: ClassVar[bool] = False
 
     def make(
-        self, config: Any, folder: Path, say: Callable[[str], None]
+        self, config: "LearnConfig", folder: Path, say: Callable[[str], None]
     ) -> contextlib.AbstractContextManager["Chunks"]:
         """The compiled generations of a run."""
         from sejax.cli import session  # which imports jax
@@ -62,7 +66,7 @@ class RayConfig(Options):
     gpus_per_worker: float = option(0.0, fraction())
 
     def make(
-        self, config: Any, folder: Path, say: Callable[[str], None]
+        self, config: "LearnConfig", folder: Path, say: Callable[[str], None]
     ) -> contextlib.AbstractContextManager["RemoteChunks"]:
         """The generations of a run, computed by workers while the context is open.
 
@@ -74,7 +78,7 @@ class RayConfig(Options):
 
 @contextlib.contextmanager
 def _remote_chunks(
-    machines: RayConfig, config: Any, say: Callable[[str], None]
+    machines: RayConfig, config: "LearnConfig", say: Callable[[str], None]
 ) -> Iterator["RemoteChunks"]:
     from sejax.cli import config as configuration
     from sejax.cli import runtime
@@ -90,7 +94,12 @@ def _remote_chunks(
             k: v for k, v in configuration.plain(config).items() if k not in ("tracker", "machines")
         }
         arguments = plain, [batch.capacity for batch in batches], machines.gpus_per_worker
-        actor = ray.remote(num_cpus=1, num_gpus=machines.gpus_per_worker)(Worker)
+        actor = ray.remote(
+            num_cpus=1,
+            num_gpus=machines.gpus_per_worker,
+            max_restarts=RESTARTS,
+            max_task_retries=RETRIES,
+        )(Worker)
         pool = Pool(
             ray, lambda: actor.remote(*arguments, versions()), lambda: num_workers(machines), say
         )
@@ -111,7 +120,9 @@ class Batch:
     width: int
 
 
-def batches_of(config: Any, learner: "Bilevel", machines: RayConfig, num_first: int) -> list[Batch]:
+def batches_of(
+    config: "LearnConfig", learner: "Bilevel", machines: RayConfig, num_first: int
+) -> list[Batch]:
     """The batches of each agent.
 
     On a CPU they are the same for any number of workers, because sums over batches of other widths
@@ -142,10 +153,7 @@ def cut(places: np.ndarray, batch: Batch, num_workers: int) -> Iterator[np.ndarr
 
 def _places(learner: "Bilevel") -> list[np.ndarray]:
     """The indices of each agent's evaluations in a generation."""
-    from sejax.objectives import Scoring
-
-    scoring = Scoring.of(learner.objective, learner.strategy, learner.mixture)
-    agents = scoring.agent_of_evaluation
+    agents = learner.scoring.agent_of_evaluation
     return [np.flatnonzero(agents == i) for i in range(learner.mixture.size)]
 
 
@@ -180,11 +188,12 @@ class RemoteChunks:
         self._places = _places(learner)
         self._compiled: Any = None
 
-    def init(self, key: Any) -> Any:
+    def init(self, key: "Array") -> "LearnState":
         """The state before the first generation."""
         import jax
 
-        return jax.jit(self.learner.init)(key)
+        state: LearnState = jax.jit(self.learner.init)(key)
+        return state
 
     def is_ready(self, length: int) -> bool:
         """Whether this process's part is compiled, which it is for chunks of any length."""
@@ -201,11 +210,11 @@ class RemoteChunks:
 
         from sejax.ops.parallel import compiler_options
 
-        def generation(state: Any, outcome: "Outcome") -> tuple[Any, ...]:
+        def generation(state: "LearnState", outcome: "Outcome") -> tuple[Any, ...]:
             asked = self.learner.ask(state)
             return self.learner.tell(state, asked, outcome), _arguments(asked)
 
-        def evaluate(key: Any) -> "Outcome":
+        def evaluate(key: "Array") -> "Outcome":
             return self.learner.evaluate(self.learner.ask(self.learner.init(key)))
 
         key = jax.random.key(0)
@@ -215,7 +224,7 @@ class RemoteChunks:
         state = jax.eval_shape(self.learner.init, key)
         self._compiled = jitted.lower(state, self._no_outcome).compile()
 
-    def advance(self, state: Any, length: int) -> tuple[Any, Any]:
+    def advance(self, state: "LearnState", length: int) -> tuple["LearnState", "GenerationInfo"]:
         """Runs `length` generations.
 
         Returns:
@@ -278,6 +287,9 @@ class Worker:
       capacities: most evaluations in a share, for each agent.
       gpu_share: the part of a GPU that this process has; 0 for a CPU core.
       expected: versions of the driver's packages.
+
+    Raises:
+      ConfigError: if this machine has other versions of what decides the numbers.
     """
 
     def __init__(
@@ -287,37 +299,30 @@ class Worker:
         gpu_share: float,
         expected: dict[str, str],
     ):
-        self._config, self._capacities = config, capacities
-        self._gpu_share, self._expected = gpu_share, expected
-        self._programs: list[Any] = []
-
-    def prepare(self) -> None:
-        """Compiles.
-
-        Raises:
-          ConfigError: if this machine has other versions of what decides the numbers.
-        """
         from sejax.cli import runtime
 
         runtime.configure_xla(1)
-        runtime.take_share_of_gpu(self._gpu_share)
+        runtime.take_share_of_gpu(gpu_share)
         require(
-            versions() == self._expected,
+            versions() == expected,
             "machines",
-            "must have the same versions everywhere, because numbers differ otherwise; got "
-            f"{versions()} on {socket.gethostname()} and {self._expected} here. Set the same "
-            "versions up there.",
+            f"must have the same versions everywhere; got {versions()} on {socket.gethostname()} "
+            f"and {expected} here. Set the same versions up there.",
         )
         runtime.configure_jax()
         from sejax.bilevel import make_bilevel
         from sejax.cli import config as configuration
 
-        config = configuration.learn_config(self._config)
-        learner = make_bilevel(**config.parts() | {"devices": 1})
+        of_run = configuration.learn_config(config)
+        learner = make_bilevel(**of_run.parts() | {"devices": 1})
+        self._capacities = capacities
         self._programs = [
-            _compiled_share(learner, agent, capacity, config.num_parallel)
-            for agent, capacity in enumerate(self._capacities)
+            _compiled_share(learner, agent, capacity, of_run.num_parallel)
+            for agent, capacity in enumerate(capacities)
         ]
+
+    def ready(self) -> None:
+        """Answers as soon as everything is compiled."""
 
     def evaluate(self, share: Share) -> tuple["Outcome", float]:
         """The outcomes of a share, leaves `[n, ...]`, and the CPU seconds that they took."""
@@ -348,10 +353,10 @@ def _compiled_share(learner: "Bilevel", agent: int, capacity: int, num_parallel:
         num_parallel_on_cpu(own, training),
     )
 
-    def evaluate(key_data: Any, *arguments: Any) -> "Outcome":
+    def evaluate(key_data: "Array", *arguments: "Array | None") -> "Outcome":
         return spread(jax.random.wrap_key_data(key_data), *arguments)
 
-    def arguments(key: Any) -> tuple[Any, ...]:
+    def arguments(key: "Array") -> tuple[Any, ...]:
         asked = learner.ask(learner.init(key))
         return _at(_arguments(asked), np.zeros(capacity, int))
 

@@ -4,9 +4,7 @@ The tables `classic`, `gridworld` and `mujoco.tasks` say what each task is (a `T
 it; they import neither JAX nor gymnax. The dynamics are in `dynamics` and `mujoco`.
 """
 
-from typing import Any
-
-from sejax.envs.base import Task
+from sejax.envs.base import Task, TaskConfig
 from sejax.envs.spec import Box, Discrete, TaskSpec
 from sejax.options import registry
 
@@ -18,7 +16,7 @@ def names() -> list[str]:
     return registry.names("env")
 
 
-def make(name: str, **options: Any) -> Task:
+def make(name: str, **options: object) -> Task:
     """Builds a task once and returns the same object ever after.
 
     Args:
@@ -36,7 +34,7 @@ def make(name: str, **options: Any) -> Task:
     return make_from(registry.configure("env", {"name": name, **options}))
 
 
-def make_from(config: Any) -> Task:
+def make_from(config: TaskConfig) -> Task:
     """The task that a configuration describes, built once; it knows where it came from."""
     task = registry.make("env", config)
     if task.origin is None:  # set once, before anybody else has the task
@@ -44,7 +42,7 @@ def make_from(config: Any) -> Task:
     return task
 
 
-def spec_of(config: Any) -> TaskSpec:
+def spec_of(config: TaskConfig) -> TaskSpec:
     """The spec that a task's configuration states, or else the task itself."""
     stated = getattr(config, "spec", None)
     return stated if isinstance(stated, TaskSpec) else make_from(config)

@@ -1,14 +1,26 @@
 """A task: a real environment that agents are tested on, and its spec."""
 
 import contextlib
+import dataclasses
 import functools
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Protocol
 
 from sejax import options
 from sejax.envs.spec import Space, TaskSpec
+
+if TYPE_CHECKING:
+    from jaxtyping import Array, PyTree
+
+    from sejax.envs.environment import Environment, EnvParams
+
+
+class TaskConfig(Protocol):
+    """A dataclass whose fields are a task's options; its `spec`, if it has one, is the task's."""
+
+    def make(self) -> "Task": ...
 
 
 @dataclass(frozen=True, kw_only=True, eq=False, init=False)
@@ -46,9 +58,9 @@ class Task(TaskSpec):
     """
 
     name: str
-    env: Any
-    params: Any
-    origin: dict[str, Any] | None
+    env: "Environment"
+    params: "EnvParams"
+    origin: Mapping[str, object] | None
     observation: Space = field(init=False)  # of `env`, so that `dataclasses.replace` may change it
     action: Space = field(init=False)
 
@@ -56,23 +68,30 @@ class Task(TaskSpec):
         self,
         *,
         name: str,
-        env: Any,
-        params: Any = None,
+        env: "Environment",
+        params: "EnvParams | None" = None,
         solved_reward: float = math.inf,
         max_steps: int | None = None,
         info_keys: tuple[str, ...] = (),
         augmented_keys: tuple[str, ...] = (),
-        origin: dict[str, Any] | None = None,
+        origin: Mapping[str, object] | None = None,
     ):
         from sejax.envs.wrappers import as_vectors  # imports JAX
 
-        _require_threshold(solved_reward)
-        params = _params_of(env, params, name)
-        params, max_steps = _with_limit(params, max_steps)
-        with _says_what_it_must_be(name):
-            vectors, observation, action = as_vectors(env, params, name)
-        if not type(env).__module__.startswith(("sejax.", "gymnax.")):
-            _try(vectors, params, name)  # seconds for some, which have tests of their own
+        solved_reward = options.as_python(solved_reward)
+        is_nan = options.is_number(solved_reward) and math.isnan(solved_reward)
+        options.require(  # it may be traced
+            not is_nan and not isinstance(solved_reward, str | None),
+            "env.solved_reward",
+            f"must be a number; got {options.shortened(solved_reward)}. Set env.solved_reward=inf "
+            "if it is undefined.",
+        )
+        with _one_error(name):
+            params, max_steps = _with_limit(env, params, max_steps)
+            require_own_steps(env)
+            vectors, observation, action = as_vectors(env, params)
+            if not type(env).__module__.startswith(("sejax.", "gymnax.")):
+                _check_step(vectors, params, name)  # seconds for some, which have their own tests
         super().__init__(
             observation=observation,
             action=action,
@@ -85,7 +104,7 @@ class Task(TaskSpec):
         vars(self).update(name=name, env=vectors, params=params, origin=origin)
 
     @classmethod
-    def of(cls, spec: TaskSpec, *, name: str, env: Any) -> "Task":
+    def of(cls, spec: TaskSpec, *, name: str, env: "Environment") -> "Task":
         """The task of an environment that has the spec's spaces."""
         return cls(
             name=name,
@@ -97,7 +116,7 @@ class Task(TaskSpec):
         )
 
 
-def require_own_steps(env: Any) -> None:
+def require_own_steps(env: "Environment") -> None:
     """Checks that an environment is no wrapper of gymnax's kind.
 
     Such a one changes `step`, and its `step_env` is that of the environment in it: what it does
@@ -106,63 +125,30 @@ def require_own_steps(env: Any) -> None:
     Raises:
       ConfigError: for a class with `step` and no `step_env`, or `reset` and no `reset_env`.
     """
-    left_out = [
-        name
-        for name in ("reset", "step")
-        if hasattr(type(env), name) and not hasattr(type(env), f"{name}_env")
-    ]
+    methods = dir(type(env))
     options.require(
-        not left_out,
+        all(f"{name}_env" in methods for name in ("reset", "step") if name in methods),
         "env",
-        f"must change {' and '.join(f'{name}_env in place of {name}' for name in left_out)}; got "
-        f"{type(env).__name__}. Set env to a subclass of sejax.envs.wrappers.Wrapper.",
+        "must change reset_env and step_env in place of reset and step; got "
+        f"{type(env).__name__}. Derive it from sejax.envs.wrappers.Wrapper.",
     )
 
 
-def _require_threshold(solved_reward: Any) -> None:
-    is_nan = isinstance(solved_reward, float) and math.isnan(solved_reward)
-    options.require(
-        not is_nan and not isinstance(solved_reward, str | None),
-        "env.solved_reward",
-        f"must be a number, because returns are compared with it; got "
-        f"{options.shortened(solved_reward)}. Set env.solved_reward=inf if it is undefined.",
-    )
-
-
-def _params_of(env: Any, params: Any, name: str) -> Any:
-    """The params given, or the environment's; checks that both are what they are called."""
-    with _says_what_it_must_be(name):
-        default = env.default_params
-    require_own_steps(env)
-    params = default if params is None else params
-    options.require(
-        hasattr(params, "max_steps_in_episode"),
-        "params",
-        "must have max_steps_in_episode, because episodes are cut there; got "
-        f"{type(params).__name__}. Set params to a gymnax EnvParams.",
-    )
-    return params
-
-
-def _with_limit(params: Any, max_steps: int | None) -> tuple[Any, int]:
+def _with_limit(
+    env: "Environment", params: "EnvParams | None", max_steps: int | None
+) -> "tuple[EnvParams, int]":
     """Params that have the step limit, and the limit."""
-    limit = params.max_steps_in_episode if max_steps is None else max_steps
-    limit = options.as_python(limit)
-    options.counts("an episode has steps")("env.max_steps", limit, 200)
-    if max_steps is not None and params.max_steps_in_episode != limit:
-        options.require(
-            hasattr(params, "replace"),
-            "params",
-            f"must have a method replace, or max_steps_in_episode={limit}, because that is the "
-            f"task's max_steps; got {options.shortened(params)}. Set params to a gymnax EnvParams, "
-            "or max_steps=None.",
-        )
-        params = params.replace(max_steps_in_episode=limit)
+    default = env.default_params
+    params = default if params is None else params
+    limit = options.as_python(params.max_steps_in_episode if max_steps is None else max_steps)
+    options.counts()("env.max_steps", limit, 200)
+    if params.max_steps_in_episode != limit:
+        params = dataclasses.replace(params, max_steps_in_episode=limit)
     return params, int(limit)
 
 
 @contextlib.contextmanager
-def _says_what_it_must_be(name: str) -> Iterator[None]:
+def _one_error(name: str) -> Iterator[None]:
     """Turns whatever an environment raises within into a `ConfigError`."""
     try:
         yield
@@ -170,22 +156,22 @@ def _says_what_it_must_be(name: str) -> Iterator[None]:
         raise
     except Exception as error:
         raise options.ConfigError(
-            f"env must be a gymnax 1.x environment (step_env returns five values); {name} raised "
-            f"{options.told(error)}. Derive it from gymnax's Environment, or set env to the first "
-            f"result of gymnax.make."
+            f"env must be a gymnax 1.x environment with EnvParams; {name} raised "
+            f"{options.told(error)}. Derive it from gymnax's Environment, whose step_env returns "
+            "five values, or take it from gymnax.make(ID)[0].",
+            "env",
         ) from error
 
 
-def _try(env: Any, params: Any, name: str) -> None:
+def _check_step(env: "Environment", params: "EnvParams", name: str) -> None:
     """Traces a step, so that faults of an environment are met before an agent trains there.
 
     Raises:
-      ConfigError: if it cannot be made, or returns something else than five values whose shapes and
-        dtypes are those of the spaces and of `reset_env`.
+      ConfigError: if it returns other shapes or dtypes than the spaces and `reset_env` have.
     """
     import jax
 
-    def step(key: Any) -> Any:
+    def step(key: "Array") -> "PyTree":
         obs, state = env.reset_env(key, params)
         action = env.action_space(params).sample(key)
         next_obs, next_state, reward, terminated, _ = env.step_env(key, state, action, params)
@@ -193,30 +179,28 @@ def _try(env: Any, params: Any, name: str) -> None:
         begin, after = {"obs": obs, "state": state}, {"obs": next_obs, "state": next_state}
         return begin, after, reward, terminated
 
-    def kinds(tree: Any) -> dict[str, tuple[tuple[int, ...], str]]:
-        leaves = jax.tree_util.tree_leaves_with_path(tree)
+    def kinds(tree: "PyTree") -> dict[str, str]:
         name_of = functools.partial(jax.tree_util.keystr, simple=True, separator=".")
-        return {name_of(path): (x.shape, str(x.dtype)) for path, x in leaves}
+        leaves = jax.tree_util.tree_leaves_with_path(tree)
+        return {name_of(path): f"{x.dtype}{list(x.shape)}" for path, x in leaves}
 
-    with _says_what_it_must_be(name):
-        begin, after, reward, terminated = jax.eval_shape(step, jax.random.key(0))
-        shape = tuple(env.observation_space(params).shape)
+    begin, after, reward, terminated = jax.eval_shape(step, jax.random.key(0))
+    shape = tuple(env.observation_space(params).shape)
     began, went_on = kinds(begin), kinds(after)
     faults = [
         f"{key} is {began.get(key)} after reset_env and {went_on.get(key)} after step_env"
-        for key in {**began, **went_on}
+        for key in began | went_on
         if began.get(key) != went_on.get(key)
     ]
-    for what, is_right, x in (
-        ("obs", begin["obs"].shape == shape, begin["obs"]),
-        ("reward", reward.shape == (), reward),
-        ("terminated", terminated.shape == () and terminated.dtype == bool, terminated),
-    ):
-        if not is_right:
-            faults.append(f"{what} is {x.shape} {x.dtype}")
+    if begin["obs"].shape != shape:
+        faults.append(f"obs is {began['obs']} in a space of shape {list(shape)}")
+    if reward.shape != ():
+        faults.append(f"reward has shape {list(reward.shape)}, not []")
+    if terminated.shape != () or terminated.dtype != bool:
+        faults.append(f"terminated is {kinds(terminated)['']}, not bool[]")
     options.require(
         not faults,
         "env",
-        f"must keep its shapes: obs {shape}, reward a scalar, terminated a bool, because an "
-        f"episode is one loop; got {name}, where {'; '.join(faults)}. Set env to one that does.",
+        f"must keep its shapes; got {name}, where {options.shortened('; '.join(faults), 120)}. "
+        "Cast in reset_env and step_env what differs.",
     )

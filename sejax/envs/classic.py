@@ -33,8 +33,7 @@ class ClassicTask:
     def make(self) -> Task:
         from sejax.envs.dynamics import classic
 
-        env = getattr(classic, self.dynamics)((self.spec.observation, self.spec.action))
-        return Task.of(self.spec, name=self.name, env=env)
+        return Task.of(self.spec, name=self.name, env=getattr(classic, self.dynamics)(self.spec))
 
 
 class CartPole(ClassicTask):

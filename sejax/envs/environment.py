@@ -1,4 +1,4 @@
-"""The base class of our environments: a gymnax 1.x `Environment` that does not import gymnax.
+"""A gymnax 1.x `Environment` that does not import gymnax.
 
 Importing anything of gymnax imports all its environments, and with them seaborn and pandas, which
 takes 1.3 CPU s. The methods are gymnax's and the spaces that they return too, so that code which
@@ -7,16 +7,19 @@ imported when its spaces are asked for.
 """
 
 import functools
-from typing import Any
+from typing import TYPE_CHECKING, ClassVar, Generic, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
-from jaxtyping import Array
+from jaxtyping import Array, Bool
 
-from sejax.envs.spec import Box, Discrete, Space
-from sejax.options import ConfigError
+from sejax.envs.spec import Box, Discrete, Space, TaskSpec
+from sejax.options import ConfigError, shortened
+
+if TYPE_CHECKING:
+    from gymnax.environments.spaces import Space as GymnaxSpace
 
 
 @struct.dataclass
@@ -29,49 +32,83 @@ class EnvParams:
     max_steps_in_episode: int = 1
 
 
-class Environment:
+State = TypeVar("State", bound=EnvState)
+Params = TypeVar("Params", bound=EnvParams)
+Step = tuple[Array, State, Array, Array, dict[str, Array]]  # obs, state, reward, terminated, info
+
+
+class Environment(Generic[State, Params]):
     """An environment whose `step_env` and `reset_env` act on one element.
+
+    A subclass adds `start` and `observe` (or `reset_env`), `step_env` and `is_terminated`.
+
+    Args:
+      spec: its spaces, and the step limit of `default_params`.
 
     Attributes:
       spaces: of observations and actions; None in a wrapper, whose methods `observation_space` and
         `action_space` say.
     """
 
+    params_class: ClassVar[type[EnvParams]] = EnvParams
     spaces: tuple[Space, Space] | None = None
 
-    @property
-    def default_params(self) -> Any:
-        return EnvParams()
+    def __init__(self, spec: TaskSpec):
+        self.spaces = spec.observation, spec.action
+        self._default_params = self.params_class(max_steps_in_episode=spec.max_steps)
 
-    def reset_env(self, key: Any, params: Any) -> tuple[Any, Any]:
+    @property
+    def default_params(self) -> Params:
+        return self._default_params  # type: ignore[return-value]
+
+    def reset_env(self, key: Array, params: Params) -> tuple[Array, State]:
         """First observation and state of an episode."""
+        state = self.start(key)
+        return self.observe(state), state
+
+    def start(self, key: Array) -> State:
+        """First state of an episode."""
         raise NotImplementedError
 
-    def step_env(self, key: Any, state: Any, action: Any, params: Any) -> tuple[Any, ...]:
+    def step_env(self, key: Array, state: State, action: Array, params: Params) -> Step[State]:
         """`(obs, state, reward, terminated, info)` of one step; never resets."""
         raise NotImplementedError
 
-    def get_obs(self, state: Any, params: Any = None, key: Any = None) -> Any:
+    def observe(self, state: State) -> Array:
+        """The observation of a state."""
         raise NotImplementedError
 
-    def is_terminated(self, state: Any, params: Any) -> Any:
+    def is_terminated(self, state: State, params: Params) -> Bool[Array, ""]:
         raise NotImplementedError
 
-    def is_truncated(self, state: Any, params: Any) -> Any:
+    def is_truncated(self, state: State, params: Params) -> Bool[Array, ""]:
         """Whether the step limit is reached."""
-        return state.time >= params.max_steps_in_episode
+        return jnp.asarray(state.time >= params.max_steps_in_episode)
 
-    def discount(self, state: Any, params: Any) -> Array:
+    def get_obs(
+        self, state: State, params: Params | None = None, key: Array | None = None
+    ) -> Array:
+        """As `observe`, under gymnax's name."""
+        return self.observe(state)
+
+    def discount(self, state: State, params: Params) -> Array:
         """0 in a terminal state, else 1."""
         return jax.lax.select(self.is_terminated(state, params), 0.0, 1.0)
 
+    def after(self, state: State, reward: Array, params: Params) -> Step[State]:
+        """What a step returns that leads to this state."""
+        info = {"discount": self.discount(state, params)}
+        return self.observe(state), state, reward, self.is_terminated(state, params), info
+
     @functools.partial(jax.jit, static_argnames=("self",))
-    def reset(self, key: Array, params: Any = None) -> tuple[Any, Any]:
+    def reset(self, key: Array, params: Params | None = None) -> tuple[Array, State]:
         """As `reset_env`; for loops that are not sejax's."""
         return self.reset_env(key, self.default_params if params is None else params)
 
     @functools.partial(jax.jit, static_argnames=("self",))
-    def step(self, key: Array, state: Any, action: Any, params: Any = None) -> tuple[Any, ...]:
+    def step(
+        self, key: Array, state: State, action: Array, params: Params | None = None
+    ) -> tuple[Array, State, Array, Array, Array, dict[str, Array]]:
         """A step, and a reset where it ends the episode; for loops that are not sejax's.
 
         Returns:
@@ -90,15 +127,15 @@ class Environment:
         ends = {"terminated": terminated, "truncated": truncated, "final_observation": next_obs}
         return obs, state, reward, terminated, truncated, {**info, **ends}
 
-    def observation_space(self, params: Any = None) -> Any:
+    def observation_space(self, params: Params | None = None) -> "GymnaxSpace":
         """gymnax's `Box` or `Discrete`."""
         assert self.spaces is not None
-        return _of_gymnax(self.spaces[0])
+        return _as_gymnax(self.spaces[0])
 
-    def action_space(self, params: Any = None) -> Any:
+    def action_space(self, params: Params | None = None) -> "GymnaxSpace":
         """gymnax's `Box` or `Discrete`."""
         assert self.spaces is not None
-        return _of_gymnax(self.spaces[1])
+        return _as_gymnax(self.spaces[1])
 
     @property
     def num_actions(self) -> int:
@@ -111,8 +148,8 @@ class Environment:
         return type(self).__name__
 
 
-def spaces_of(env: Any) -> tuple[Space, Space]:
-    """Spaces of the observations and actions of any environment.
+def spaces_of(env: Environment, params: EnvParams | None = None) -> tuple[Space, Space]:
+    """Spaces of the observations and actions of any gymnax environment, boxes flattened.
 
     Raises:
       ConfigError: if one is neither a box nor discrete.
@@ -120,15 +157,12 @@ def spaces_of(env: Any) -> tuple[Space, Space]:
     if isinstance(env, Environment) and env.spaces is not None:
         return env.spaces
     with jax.ensure_compile_time_eval():  # gymnax computes some spaces
-        params = env.default_params
-        return (
-            space_of_gymnax(env.observation_space(params), "observations", type(env).__name__),
-            space_of_gymnax(env.action_space(params), "actions", type(env).__name__),
-        )
+        params = env.default_params if params is None else params
+        spaces = env.observation_space(params), env.action_space(params)
+        return _of_gymnax(spaces[0], "observations"), _of_gymnax(spaces[1], "actions")
 
 
-def _of_gymnax(space: Space) -> Any:
-    """A space as one of gymnax."""
+def _as_gymnax(space: Space) -> "GymnaxSpace":
     from gymnax.environments import spaces
 
     if isinstance(space, Discrete):
@@ -137,17 +171,7 @@ def _of_gymnax(space: Space) -> Any:
     return spaces.Box(low, high, low.shape, jnp.float32)
 
 
-def space_of_gymnax(space: Any, what: str, name: str) -> Space:
-    """A space of gymnax as ours, a box of any shape flattened.
-
-    Args:
-      space: of gymnax.
-      what: it is a space of, for the message.
-      name: of the environment, for the message.
-
-    Raises:
-      ConfigError: if it is neither a box nor discrete.
-    """
+def _of_gymnax(space: "GymnaxSpace", what: str) -> Space:
     from gymnax.environments import spaces
 
     if isinstance(space, spaces.Discrete):
@@ -156,7 +180,7 @@ def space_of_gymnax(space: Any, what: str, name: str) -> Space:
         bounds = (np.broadcast_to(np.float32(x), space.shape) for x in (space.low, space.high))
         return Box(*(tuple(bound.ravel().tolist()) for bound in bounds))
     raise ConfigError(
-        f"env must have {what} in a gymnax Box or Discrete space, because networks take vectors "
-        f"and tables take indices; got {space!r} in {name}. Make them one array in a subclass of "
-        f"sejax.envs.wrappers.Wrapper."
+        f"env must have {what} in a gymnax Box or Discrete space; got {shortened(repr(space))}. "
+        "Make them one array in a subclass of sejax.envs.wrappers.Wrapper.",
+        "env",
     )

@@ -41,7 +41,12 @@ class CliffWalking(Options):
     def make(self) -> Task:
         from sejax.envs.dynamics.gridworld import GridParams, GridWorld
 
-        params = GridParams(step_reward=-1.0, goal_reward=self.goal_reward, hole_reward=-100.0)
+        params = GridParams(
+            step_reward=-1.0,
+            goal_reward=self.goal_reward,
+            hole_reward=-100.0,
+            max_steps_in_episode=self.spec.max_steps,
+        )
         return Task.of(self.spec, name="cliff_walking", env=GridWorld(CLIFF_WALKING, params))
 
 

@@ -48,7 +48,8 @@ class GymnaxTask(Options):
         except Exception as error:  # such as a data set that cannot be fetched
             raise options.ConfigError(
                 f"env must be an environment that gymnax can make here; {gymnax_id} raised "
-                f"{options.told(error)}."
+                f"{options.told(error)}.",
+                "env",
             ) from error
         solved = self.solved_reward
         if solved is None:

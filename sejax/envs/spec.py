@@ -32,10 +32,6 @@ class Box:
     def symmetric(cls, *high: float) -> "Box":
         return cls(tuple(-x for x in high), high)
 
-    @classmethod
-    def unbounded(cls, size: int) -> "Box":
-        return cls.symmetric(*[math.inf] * size)
-
     @property
     def size(self) -> int:
         """Length of the vectors."""

@@ -2,11 +2,11 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar, TypeAlias
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, PyTree
 
 from sejax.options import MOST_MEMBERS, Options, counts, one_of, option
 
@@ -14,7 +14,7 @@ AGGREGATES = ("mean", "min")
 LARGEST = 1e6  # larger steps or noise lead to weights whose products are not finite
 _TIE = 1e-6  # of the incumbent's score, or of 1 where that is smaller
 
-StrategyState = Any  # a pytree that only the strategy reads
+StrategyState: TypeAlias = PyTree  # only the strategy reads it
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -5,14 +5,17 @@ This is the one place where a sign is turned: evosax minimises a fitness, scores
 
 import dataclasses
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Float
 
-from sejax.es.base import LARGEST, Evaluations, Strategy, StrategyOptions
+from sejax.es.base import LARGEST, Evaluations, Strategy, StrategyOptions, StrategyState
 from sejax.options import counts, one_of, option, positive, require, shortened, shrinks
+
+if TYPE_CHECKING:  # importing evosax takes a second
+    from evosax.algorithms.distribution_based.base import DistributionBasedAlgorithm, Params
 
 
 class Algorithm(NamedTuple):
@@ -65,8 +68,7 @@ class EvosaxConfig(StrategyOptions):
         require(
             self.population_size % 2 == 0,
             "es.population_size",
-            "must be even, because evosax's algorithms pair opposite perturbations; got "
-            f"{shortened(self.population_size)}. Set "
+            f"must be even; got {shortened(self.population_size)}. Set "
             f"es.population_size={self.population_size + 1}.",
         )
 
@@ -77,9 +79,8 @@ class EvosaxConfig(StrategyOptions):
         cls, antithetic, optimizer = ALGORITHMS[self.name]
         options: dict[str, Any] = {}
         if optimizer is not None:
-            options["optimizer"] = (
-                optax.sgd(1.0) if optimizer == "sgd" else optax.adam(self.step_size)
-            )
+            adam = optax.adam(self.step_size)
+            options["optimizer"] = adam if optimizer == "adam" else optax.sgd(1.0)
         if self.name == "open_es":
             # evosax asks for the next generation's std with the number of the one before.
             std, decay = self.noise_std, self.noise_std_decay
@@ -91,7 +92,7 @@ class EvosaxConfig(StrategyOptions):
         if self.name != "open_es":
             params = params.replace(std_init=self.noise_std)
 
-        def with_std(state: Any) -> Any:
+        def with_std(state: StrategyState) -> StrategyState:
             """The first state with our std where evosax has another, or another beside it."""
             if self.name == "open_es":
                 return state.replace(std=state.std / self.noise_std_decay)
@@ -110,8 +111,8 @@ class EvosaxConfig(StrategyOptions):
 
 
 def from_evosax(
-    algorithm: Any,
-    params: Any = None,
+    algorithm: "DistributionBasedAlgorithm",
+    params: "Params | None" = None,
     *,
     antithetic: bool = False,
     remembers_scores: bool = False,
@@ -137,8 +138,8 @@ def from_evosax(
     params = algorithm.default_params if params is None else params
 
     def tell(
-        key: Array, population: Array, scores: Array, incumbent_score: Array, state: Any
-    ) -> Any:
+        key: Array, population: Array, scores: Array, incumbent_score: Array, state: StrategyState
+    ) -> StrategyState:
         fitness = finite_fitness(-scores, jnp.inf if remembers_scores else 0.0)
         return algorithm.tell(key, population, fitness, state, params)[0]
 

@@ -19,16 +19,19 @@ UPDATE_RULES = ("authors", "paper")
 
 @dataclass(frozen=True, kw_only=True)
 class NESConfig(StrategyOptions):
-    """NES with mirrored sampling and evaluation of the incumbent (Algorithm 1)."""
+    """NES with mirrored sampling and evaluation of the incumbent (Algorithm 1).
 
+    The defaults are what was measured to work for SEs (docs/defaults.md); `preset=paper` has the
+    paper's.
+    """
+
+    population_size: int = 64  # n_p: perturbations of a generation
     # Agents on the incumbent; null: one for each perturbation, as in the paper.
-    num_incumbent_evals: int | None = option(
-        None, counts("the incumbent's score selects the proxy")
-    )
+    num_incumbent_evals: int | None = option(16, counts("the incumbent's score selects the proxy"))
     # sigma: std of the weight perturbation
-    noise_std: float = option(0.05, positive("candidates must differ", LARGEST), traced=True)
+    noise_std: float = option(0.06, positive("candidates must differ", LARGEST), traced=True)
     # factor on sigma after each generation
-    noise_std_decay: float = option(1.0, shrinks(), traced=True)
+    noise_std_decay: float = option(0.97, shrinks(), traced=True)
     # alpha
     step_size: float = option(1.0, positive("the proxy would not move", LARGEST), traced=True)
     # factor on alpha after each generation
@@ -119,8 +122,7 @@ def better_signs(
 ) -> tuple[Float[Array, " half"], Float[Array, "half dims"]]:
     """Score and noise of each perturbation's better sign; the plus signs are the first half."""
     plus, minus = scores.reshape(2, -1)
-    use_minus = jnp.where(jnp.isfinite(minus), minus, -jnp.inf) > jnp.where(
-        jnp.isfinite(plus), plus, -jnp.inf
-    )
+    rank_minus, rank_plus = (jnp.where(jnp.isfinite(x), x, -jnp.inf) for x in (minus, plus))
+    use_minus = rank_minus > rank_plus
     sign = jnp.where(use_minus, -1.0, 1.0)
     return jnp.where(use_minus, minus, plus), sign[:, None] * noise[: plus.shape[0]]

@@ -92,17 +92,14 @@ def all_better_2(scores: Scores, incumbent: Float[Array, ""]) -> Scores:
 
 
 TRANSFORMS: dict[str, ScoreTransform] = {
-    f.__name__: f
-    for f in (
-        linear,
-        rank,
-        nes,
-        nes_unnormalized,
-        single_best,
-        single_better,
-        all_better_1,
-        all_better_2,
-    )
+    "linear": linear,
+    "rank": rank,
+    "nes": nes,
+    "nes_unnormalized": nes_unnormalized,
+    "single_best": single_best,
+    "single_better": single_better,
+    "all_better_1": all_better_1,
+    "all_better_2": all_better_2,
 }
 
 

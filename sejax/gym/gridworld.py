@@ -9,6 +9,7 @@ from gymnasium.envs.registration import EnvSpec
 
 from sejax.envs import gridworld
 
+Info = dict[str, Any]  # of a reset or a step; and what a reset is told
 MAPS = {"cliff_walking": gridworld.CLIFF_WALKING, "gridworld_2x2": gridworld.ROOM_2X2}
 # Reward of a step into the floor, the goal and a hole.
 REWARDS = {"cliff_walking": (-1.0, 0.0, -100.0), "gridworld_2x2": (-0.01, 1.0, -1.0)}
@@ -38,7 +39,7 @@ class GridWorld(gymnasium.Env[int, int]):
       (2, -0.01, False, False, {})
     """
 
-    metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012 (as Gymnasium declares it)
+    metadata: Info = {"render_modes": []}  # noqa: RUF012 (as Gymnasium declares it)
 
     def __init__(self, name: str, goal_reward: float | None = None):
         self._rows = MAPS[name]
@@ -49,21 +50,16 @@ class GridWorld(gymnasium.Env[int, int]):
         self._index: int | None = None
         self.observation_space = spaces.Discrete(len("".join(self._rows)))
         self.action_space = spaces.Discrete(len(MOVES))
-        self.spec = EnvSpec(
-            id=name,
-            entry_point=f"{__name__}:GridWorld",
-            kwargs={"name": name, "goal_reward": goal_reward},
-        )
+        arguments = {"name": name, "goal_reward": goal_reward}
+        self.spec = EnvSpec(name, f"{__name__}:GridWorld", kwargs=arguments)
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[int, dict[str, Any]]:
+    def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[int, Info]:
         """Puts the agent on the map's S; `options` has no effect."""
         super().reset(seed=seed)
         self._index = self._start
         return self._index, {}
 
-    def step(self, action: int) -> tuple[int, float, bool, bool, dict[str, Any]]:
+    def step(self, action: int) -> tuple[int, float, bool, bool, Info]:
         """Moves by one cell.
 
         Raises:

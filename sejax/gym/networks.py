@@ -65,13 +65,11 @@ def joined(networks: Sequence[Layers]) -> Layers:
 
 
 def _block_diagonal(blocks: Sequence[np.ndarray]) -> np.ndarray:
-    rows, columns = (
-        np.cumsum([0, *sizes]) for sizes in zip(*(x.shape for x in blocks), strict=True)
-    )
-    whole = np.zeros((rows[-1], columns[-1]), np.float32)
-    for block, row, column in zip(blocks, rows, columns, strict=False):
-        whole[row : row + block.shape[0], column : column + block.shape[1]] = block
-    return whole
+    def at(i: int, j: int) -> np.ndarray:
+        return blocks[i] if i == j else np.zeros((len(blocks[i]), blocks[j].shape[1]), np.float32)
+
+    places = range(len(blocks))
+    return np.block([[at(i, j) for j in places] for i in places])
 
 
 def shapes_of(networks: Mapping[str, Sequence[int]]) -> Shapes:

@@ -14,7 +14,7 @@ from sejax.gym.synthetic import SyntheticEnv, SyntheticWorld
 from sejax.gym.tasks import RealTask, rn_env, se_task
 from sejax.gym.vector import SyntheticVectorEnv
 from sejax.options import ConfigError, as_python, counts, registry, require, shortened
-from sejax.proxies.header import Header, pretrained_names, read_single
+from sejax.proxies.header import Header, pretrained_names, read
 
 if TYPE_CHECKING:
     from stable_baselines3.common.vec_env import VecEnv
@@ -49,8 +49,8 @@ def make(
       'sejax/cartpole-rn'
     """
     header, world = _read(source, task, render_mode)
-    env: SyntheticEnv | RewardNetwork
     name = re.sub(r"[^\w.:-]+", "-", header.task) or "proxy"  # as Gymnasium's ids must be
+    env: SyntheticEnv | RewardNetwork
     if world is None:
         env, name = RewardNetwork(rn_env(header, task, render_mode), source), f"{name}-rn"
     else:
@@ -118,8 +118,8 @@ def make_sb3(source: Source, num_envs: int = 1, task: RealTask | str | None = No
         from sejax.gym.sb3 import SyntheticVecEnv
     except ImportError as error:
         raise ConfigError(
-            f"make_sb3 needs Stable-Baselines3, because it makes one of its VecEnvs; got {error}. "
-            f"Install it with pip install 'sejax[sb3]'."
+            f"make_sb3 needs Stable-Baselines3; got {error}. Install it with pip install "
+            "'sejax[sb3]'."
         ) from error
     _, world = _read(source, task)
     if world is None:
@@ -153,7 +153,7 @@ def _spec(name: str, **kwargs: Any) -> EnvSpec:
     )
 
 
-def _count(num_envs: Any) -> int:
+def _count(num_envs: float) -> int:
     num_envs = as_python(num_envs)
     counts("each is an episode at a time")("num_envs", num_envs, 8)
     return int(num_envs)
@@ -167,23 +167,21 @@ def _read(
     Raises:
       ConfigError: as `make`.
     """
-    weights, header = read_single(source, ("se", "rn"))
+    _, weights, header = read(source, kinds=("se", "rn"), single=True)
     if header.kind == "rn":
         return header, None
     require(
         render_mode in (None, "rgb_array"),
         "render_mode",
-        "must be None for an SE, because its states have no picture; got "
-        f"{shortened(render_mode)}. Set render_mode=None.",
+        f"must be None, as an SE's states have no picture; got {shortened(render_mode)}.",
     )
     config = registry.configure("proxy", header.config["proxy"])
     given = se_task(header, task, config.needs_task)
-    limit = header.interface["max_steps"]
+    limit = header.spec.max_steps
     require(
         config.max_steps(given.max_steps) == config.max_steps(limit),
         "task",
-        f"must have the max_steps that the SE was learned with, {limit}, because its episodes end "
-        f"there; got {shortened(given.max_steps)}. Set task=dataclasses.replace(task, "
-        f"max_steps={limit}).",
+        f"must have the step limit {limit} of the SE's task; got {shortened(given.max_steps)}. Set "
+        f"task=dataclasses.replace(task, max_steps={limit}).",
     )
     return header, SyntheticWorld(weights, config, given)

@@ -10,13 +10,16 @@ from gymnasium.envs.registration import EnvSpec
 from gymnasium.envs.toy_text.cliffwalking import CliffWalkingEnv
 from gymnasium.utils import RecordConstructorArgs
 from gymnasium.wrappers import DtypeObservation, FlattenObservation
+from numpy.typing import ArrayLike
 
+from sejax.envs.spec import Discrete
 from sejax.gym import networks
-from sejax.gym.tasks import GYMNASIUM_IDS, RealTask, num_categories, vector_size
+from sejax.gym.gridworld import Info
+from sejax.gym.tasks import GYMNASIUM_IDS, RealTask, space_of
 from sejax.options import ConfigError, as_python, fraction, registry, require, shortened
 from sejax.proxies import MAX_ABS_VALUE
 from sejax.proxies.configs import RewardConfig
-from sejax.proxies.header import check_tensors, read_single
+from sejax.proxies.header import check_tensors, read
 
 SAME_NUMBERS = (DtypeObservation, FlattenObservation)  # wrappers that change no number
 GYMNASIUM_NAMES = {"reward_run": "reward_forward"}  # entries of `info` that it calls otherwise
@@ -74,48 +77,38 @@ class RewardNetwork(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
             limit_is_terminal=limit_is_terminal,
         )
         super().__init__(env)
-        weights, header = read_single(source, ("rn",))
+        _, weights, header = read(source, kinds=("rn",), single=True)
         self.config: RewardConfig = registry.configure("proxy", header.config["proxy"])
         discount = as_python(discount)
         if discount is not None:
             fraction()("discount", discount, header.discount)
         self.discount = float(header.discount if discount is None else discount)
         self.limit_is_terminal = limit_is_terminal
-        require(
-            not isinstance(env.unwrapped, CliffWalkingEnv),
-            "env",
-            "must be sejax's Cliff Walking, because in Gymnasium's, falling off the cliff ends no "
-            f"episode and actions are numbered otherwise; got {shortened(env)}. Set "
-            f"env=sejax.gym.make({str(source)!r}), which is whole.",
-        )
         self._info_keys = self._keys(header.task, info_keys)
-        obs_dim = vector_size(env.observation_space, "env.observation_space")
-        self._num_states = num_categories(env.observation_space)
-        _require_task(env, RealTask.of_interface(header.interface), header.task)
+        obs_space = space_of(env.observation_space, "env.observation_space")
+        _require_task(env, RealTask.of_spec(header.spec), header.task)
         num_keys = len(self._info_keys)
         hidden = [self.config.hidden_size] * self.config.num_layers
         shapes: networks.Shapes = {"info_weights": (num_keys,)}
         if not self.config.shaping.weighs_info:
-            shapes = networks.shapes_of({"potential": [obs_dim + num_keys, *hidden, 1]})
+            shapes = networks.shapes_of({"potential": [obs_space.size + num_keys, *hidden, 1]})
         check_tensors("weights", weights, shapes, "those of the environment's task")
         self._weights = weights.get("info_weights")  # [info_keys]
         self._layers = networks.layers_of(weights, "potential")
-        self._table = None  # [num_states]: potentials, where states are counted
-        if self._num_states and self._layers:
-            self._table = self._apply(np.eye(obs_dim, dtype=np.float32)).tolist()
+        self._table: list[float] | None = None  # [num_states]: potentials of discrete states
+        if isinstance(obs_space, Discrete) and self._layers:
+            self._table = self._apply(np.eye(obs_space.n, dtype=np.float32)).tolist()
         self._potential = 0.0  # of the state that the agent is in
         self._made_as: EnvSpec | None = None
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Any, dict[str, Any]]:
+    def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Any, Info]:
         """Begins an episode of the environment."""
         obs, info = self.env.reset(seed=seed, options=options)
         nothing = np.zeros(len(self._info_keys), np.float32)  # v before the first step, as in JAX
         self._potential = self.potential(obs, nothing)
         return obs, info
 
-    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+    def step(self, action: ArrayLike) -> tuple[Any, float, bool, bool, Info]:
         """One step of the environment, with the RN's reward.
 
         Raises:
@@ -132,7 +125,7 @@ class RewardNetwork(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
         info = {**info, "discount": float(not terminated), "real_reward": real_reward}
         return obs, reward, terminated, truncated, info
 
-    def potential(self, obs: Any, told: Any = ()) -> float:
+    def potential(self, obs: Any, told: np.ndarray | tuple[()] = ()) -> float:
         """Phi of an observation, and of what `info` told of it if it sees that."""
         if self._table is not None:
             return self._table[obs]
@@ -162,15 +155,14 @@ class RewardNetwork(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
         outputs = networks.forward(self._layers, self.config.activation, inputs)
         return self.config.output_scale * outputs[..., 0]
 
-    def _told(self, info: dict[str, Any]) -> np.ndarray:
+    def _told(self, info: Info) -> np.ndarray:
         """The entries of a step's `info` that the RN weighs or sees, `[info_keys]`."""
         try:
             return np.array([info[key] for key in self._info_keys], np.float32)
         except KeyError as error:
             raise ConfigError(
-                f"env must tell {', '.join(self._info_keys)} in a step's info, because this RN "
-                f"needs it; got {', '.join(info) or 'none'}. Set "
-                f"sejax.gym.RewardNetwork(..., info_keys=[...]) to what it is called there.",
+                f"env must tell {', '.join(self._info_keys)} in a step's info; got "
+                f"{', '.join(info) or 'none'}. Set RewardNetwork(..., info_keys=[...]).",
                 "env",
             ) from error
 
@@ -187,45 +179,32 @@ class RewardNetwork(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs
         require(
             keys,
             "info_keys",
-            f"must be given for {task}, because this RN needs entries of a step's info that are "
-            "not known here; got none. Set sejax.gym.RewardNetwork(env, source, info_keys=[...]) "
-            f"to `sejax.Task.{name}`.",
+            f"must be given for {shortened(task)}, whose info is not known here; got none. Set "
+            f"info_keys to `sejax.Task.{name}`.",
         )
         return tuple(keys)
 
 
 def _require_task(env: gymnasium.Env[Any, Any], learned: RealTask, name: str) -> None:
     """Checks that an environment is of a task, as far as its spaces and wrappers tell."""
-    wanted, fix = learned.observation_space, f"env to an environment of {name}"
-    require(
-        _kind(env.observation_space) == _kind(wanted),
-        "env",
-        f"must have observations such as those of {name}, {wanted}, because the network sees them; "
-        f"got {shortened(env.observation_space)}. Set {fix}.",
-    )
     layers = list(_layers(env))
-    # Wrappers may make actions of one kind of another: some layer has the task's.
-    acts = {_kind(layer.action_space) for layer in layers}
-    require(
-        not acts.isdisjoint({_kind(learned.action_space), None}),
-        "env",
-        f"must have actions such as those of {name}, {learned.action_space}, because it is another "
-        f"task otherwise; got {shortened(env.action_space)}. Set {fix}.",
-    )
-    if _kind(layers[-1].observation_space) != _kind(wanted):
-        return  # a wrapper makes them what the network sees
+    own, wanted = env.observation_space, learned.observation_space
+    is_as_it_is = _kind(layers[-1].observation_space) == _kind(wanted)  # made so by no wrapper
     odd = [
         each
         for each in layers
         if isinstance(each, gymnasium.ObservationWrapper) and not isinstance(each, SAME_NUMBERS)
     ]
-    require(
-        not odd,
-        "env",
-        f"must have the observations of {name} as they are, because the network has seen no "
-        f"others; got {shortened(odd[0] if odd else env)}. Set gymnasium.wrappers that change "
-        "observations around RewardNetwork, not below it.",
+    # Wrappers may make actions of one kind of another: some layer has the task's.
+    acts = {_kind(layer.action_space) for layer in layers}
+    checks = (
+        (not isinstance(env.unwrapped, CliffWalkingEnv), "sejax's actions and falls", env),
+        (_kind(own) == _kind(wanted), f"the observations {wanted}", own),
+        (acts & {_kind(learned.action_space), None}, "its actions", env.action_space),
+        (not (is_as_it_is and odd), "observations that no wrapper below has changed", odd[:1]),
     )
+    for holds, must, got in checks:
+        require(holds, "env", f"must be of {shortened(name)}, with {must}; got {shortened(got)}.")
 
 
 def _layers(env: gymnasium.Env[Any, Any]) -> Iterator[gymnasium.Env[Any, Any]]:
@@ -236,7 +215,7 @@ def _layers(env: gymnasium.Env[Any, Any]) -> Iterator[gymnasium.Env[Any, Any]]:
         yield env
 
 
-def _kind(space: Any) -> tuple[str, Any] | None:
+def _kind(space: gymnasium.Space[Any]) -> tuple[str, int] | None:
     """What must be equal for two spaces to be of one task; None for one that is not known."""
     if isinstance(space, gymnasium.spaces.Discrete):
         return "discrete", int(space.n)

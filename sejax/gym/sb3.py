@@ -8,6 +8,7 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 from stable_baselines3.common.vec_env import VecEnv
 
+from sejax.gym.gridworld import Info
 from sejax.gym.synthetic import SyntheticEnv, SyntheticWorld
 from sejax.gym.vector import SyntheticVectorEnv
 
@@ -33,7 +34,7 @@ class SyntheticVecEnv(VecEnv):
     def __init__(self, world: SyntheticWorld, num_envs: int):
         self._env = SyntheticEnv(world)  # what each environment is
         self._envs = SyntheticVectorEnv(world, num_envs, AutoresetMode.DISABLED)
-        self._actions: np.ndarray | None = None
+        self._actions = np.zeros(0)  # which no space has
         super().__init__(num_envs, self._env.observation_space, self._env.action_space)
 
     def reset(self) -> np.ndarray:
@@ -46,11 +47,11 @@ class SyntheticVecEnv(VecEnv):
     def step_async(self, actions: np.ndarray) -> None:
         self._actions = actions
 
-    def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict[str, Any]]]:  # type: ignore[override]
+    def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[Info]]:  # type: ignore[override]
         """Observations, rewards and ends, `[num_envs, ...]`, and an info for each environment."""
         obs, rewards, terminated, truncated, told = self._envs.step(self._actions)
         dones, cut = terminated | truncated, truncated & ~terminated
-        infos: list[dict[str, Any]] = [
+        infos: list[Info] = [
             {"discount": discount, "TimeLimit.truncated": is_cut}
             for discount, is_cut in zip(told["discount"].tolist(), cut.tolist(), strict=True)
         ]

@@ -7,13 +7,18 @@ from typing import Any, NamedTuple
 import gymnasium
 import numpy as np
 from gymnasium import spaces
+from numpy.typing import ArrayLike
 
+from sejax.envs.spec import Box
 from sejax.gym import networks
-from sejax.gym.tasks import RealTask, num_categories, vector_size
+from sejax.gym.gridworld import Info
+from sejax.gym.tasks import RealTask
 from sejax.options import require
 from sejax.proxies import MAX_ABS_VALUE
 from sejax.proxies.configs import SyntheticConfig
 from sejax.proxies.header import check_tensors
+
+Numbers = np.ndarray | float
 
 
 class Step(NamedTuple):
@@ -54,15 +59,14 @@ class SyntheticWorld:
         self.max_steps = config.max_steps(task.max_steps)
         self.draws_ends = config.done in ("bernoulli", "sigmoid") and not config.is_bandit
         self.draws_noise = config.initial_state != "real"
-        self.obs_dim = vector_size(task.observation_space, "task.observation_space")
-        self._num_states = num_categories(task.observation_space)
-        self._num_actions = num_categories(task.action_space)
-        action_dim = vector_size(task.action_space, "task.action_space")
+        spec = task.spec
+        self.obs_dim = spec.obs_dim
+        self._num_states, self._num_actions = spec.num_states, spec.num_actions
         self.observation_space, self._units = task.observation_space, None
-        if isinstance(task.observation_space, spaces.Box):
-            self._units = config.units(task.observation_space)
+        if isinstance(spec.observation, Box):
+            self._units = config.units(spec.observation)
             self.observation_space = spaces.Box(-np.inf, np.inf, (self.obs_dim,), np.float32)
-        units = config.networks(self.obs_dim, action_dim)
+        units = config.networks(self.obs_dim, spec.action_dim)
         check_tensors("weights", weights, networks.shapes_of(units), "those of the proxy's task")
         self._start_layers = networks.layers_of(weights, "start")
         heads = [networks.layers_of(weights, name) for name in units if name != "start"]
@@ -71,10 +75,10 @@ class SyntheticWorld:
         require(
             self.draws_noise or self._starts,
             "task.starts",
-            "must be given for an SE whose initial states are the real task's, because episodes "
-            f"begin there; got {None}. Set RealTask(starts=...).",
+            "must be given for an SE whose initial states are the real task's; got None. Set "
+            "RealTask(starts=...).",
         )
-        self._one_hot = np.eye(action_dim, dtype=np.float32)
+        self._one_hot = np.eye(spec.action_dim, dtype=np.float32)
 
     def draw(self, rng: np.random.Generator, count: int) -> np.ndarray:
         """What the first states of `count` episodes are made of, `[count, obs_dim]` float32."""
@@ -116,7 +120,9 @@ class SyntheticWorld:
             return np.minimum(np.maximum(np.asarray(action, np.float32), low), high)
         raise gymnasium.error.InvalidAction(f"{action!r} is none of {space}")
 
-    def step(self, vector: np.ndarray, action: np.ndarray, time: Any, chance: Any = None) -> Step:
+    def step(
+        self, vector: np.ndarray, action: np.ndarray, time: Numbers, chance: Any = None
+    ) -> Step:
         """One step of each episode.
 
         Args:
@@ -197,16 +203,14 @@ class SyntheticEnv(gymnasium.Env[Any, Any]):
         self._vector: np.ndarray | None = None  # [obs_dim]: what the networks see and predict
         self._time = 0
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Any, dict[str, Any]]:
+    def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Any, Info]:
         """Begins an episode; `options` has no effect."""
         super().reset(seed=seed)
         self._time = 0
         self._vector = self.world.first(self.world.draw(self.np_random, 1)[0])
         return self._observe(self._vector), {}
 
-    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+    def step(self, action: ArrayLike) -> tuple[Any, float, bool, bool, Info]:
         """One step.
 
         Raises:

@@ -9,9 +9,11 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.wrappers import TimeLimit
 
+from sejax.envs.spec import Box, Discrete, Space, TaskSpec
 from sejax.gym.gridworld import MAPS, GridWorld
 from sejax.options import ConfigError, registry, require, shortened, told
-from sejax.proxies.header import Header
+from sejax.options.plain import to_plain
+from sejax.proxies.header import Header, is_same_space
 
 # The tasks that Gymnasium has too, with the same spaces, dynamics and initial states.
 GYMNASIUM_IDS = {
@@ -67,12 +69,12 @@ class RealTask:
         return cls.of_env(make_gymnasium(env_id, max_steps))
 
     @classmethod
-    def of_interface(cls, interface: Mapping[str, Any]) -> "RealTask":
-        """The task of a proxy's file (`TaskSpec.interface`), without `starts`."""
+    def of_spec(cls, spec: TaskSpec) -> "RealTask":
+        """The task of a proxy's file, without `starts`."""
         return cls(
-            observation_space=_space(interface["observation"]),
-            action_space=_space(interface["action"]),
-            max_steps=interface["max_steps"],
+            observation_space=_gymnasium_space(spec.observation),
+            action_space=_gymnasium_space(spec.action),
+            max_steps=spec.max_steps,
         )
 
     @classmethod
@@ -83,17 +85,25 @@ class RealTask:
           ConfigError: if it has no such limit.
         """
         limit = env.spec.max_episode_steps if env.spec else None
-        require(
-            limit,
-            "task",
-            "must have a step limit, because an episode of an SE may never end by itself; got "
-            f"{shortened(env)}. Set max_steps.",
-        )
+        require(limit, "task", f"must have a step limit; got {shortened(env)}. Set max_steps.")
         return cls(
             observation_space=env.observation_space,
             action_space=env.action_space,
             max_steps=int(limit or 0),
             starts=_EnvStarts(env),
+        )
+
+    @property
+    def spec(self) -> TaskSpec:
+        """Its spaces and its limit, as sejax has them.
+
+        Raises:
+          ConfigError: for a space whose elements networks cannot take.
+        """
+        return TaskSpec(
+            observation=space_of(self.observation_space, "task.observation_space"),
+            action=space_of(self.action_space, "task.action_space"),
+            max_steps=self.max_steps,
         )
 
 
@@ -126,11 +136,8 @@ def make_gymnasium(
             env_id, max_episode_steps=max_steps, disable_env_checker=True, **options
         )
     except (gymnasium.error.Error, ImportError) as error:
-        raise ConfigError(
-            f"task must be one that Gymnasium can make here, because initial states, actions and "
-            f"an RN's steps are those of the real task; {env_id} raised {told(error)}.",
-            "task",
-        ) from error
+        message = f"task must be one that Gymnasium can make here; {env_id} raised {told(error)}."
+        raise ConfigError(message, "task") from error
 
 
 def same_env(config: Mapping[str, Any], **options: Any) -> gymnasium.Env[Any, Any] | None:
@@ -149,7 +156,7 @@ def same_env(config: Mapping[str, Any], **options: Any) -> gymnasium.Env[Any, An
     # Gymnasium takes more options, such as the path of a model: what a file says is read by the
     # fields that the task has here.
     task = registry.configure("env", config)
-    fields = registry.to_plain(task)
+    fields = to_plain(task)
     if fields.pop("backend", "mujoco") not in GYMNASIUM_BACKENDS:
         return None
     max_steps = task.spec.max_steps
@@ -169,23 +176,22 @@ def se_task(header: Header, task: RealTask | str | None, needs_starts: bool) -> 
     Raises:
       ConfigError: if it must be given, or the one given has other actions than the file's.
     """
-    stored = RealTask.of_interface(header.interface)
+    learned = RealTask.of_spec(header.spec)
     if isinstance(task, str):
-        task = RealTask.of_gymnasium(task, stored.max_steps)
+        task = RealTask.of_gymnasium(task, learned.max_steps)
     if task is None:
-        return _task_with_starts(header) if needs_starts else stored
+        return _task_with_starts(header) if needs_starts else learned
     require(
         isinstance(task, RealTask),
         "task",
-        "must be a sejax.gym.RealTask, or an id of Gymnasium, because an SE takes its spaces from "
-        f"there; got {type(task).__name__}. Set task=sejax.gym.RealTask.of_env(env).",
+        f"must be a sejax.gym.RealTask or an id of Gymnasium; got {type(task).__name__}. Set "
+        "task=sejax.gym.RealTask.of_env(env).",
     )
     require(
-        is_close(task.action_space, stored.action_space),
+        is_same_space(task.spec.action, header.spec.action),
         "task",
-        f"must have the actions that the SE was learned with, {stored.action_space}, because "
-        f"others mean something else to its networks; got {shortened(task.action_space)}. Set task "
-        "to one with these, such as gymnasium.wrappers.RescaleAction makes.",
+        f"must have the actions of the SE's task, {shortened(learned.action_space)}; got "
+        f"{shortened(task.action_space)}. gymnasium.wrappers.RescaleAction makes such.",
     )
     return task
 
@@ -196,40 +202,39 @@ def _task_with_starts(header: Header) -> RealTask:
     env = same_env(config)
     if env is not None:
         return RealTask.of_env(env)
-    gymnax_id = header.task_kind.removeprefix(GYMNAX)
-    if gymnax_id != header.task_kind and gymnax_id in gymnasium.registry:
-        return RealTask.of_gymnasium(gymnax_id, registry.configure("env", config).max_steps)
+    _, is_gymnax, env_id = str(config.get("name")).partition(GYMNAX)
+    if is_gymnax and env_id in gymnasium.registry:
+        return RealTask.of_gymnasium(env_id, registry.configure("env", config).max_steps)
     raise _unknown_task(header, "sejax.gym.make(source, task=sejax.gym.RealTask(...))")
 
 
-def rn_env(header: Header, env_id: Any, render_mode: str | None) -> gymnasium.Env[Any, Any]:
+def rn_env(
+    header: Header, env_id: RealTask | str | None, render_mode: str | None
+) -> gymnasium.Env[Any, Any]:
     """The task of an RN: one that is given by its id, or the file's.
 
     Raises:
       ConfigError: for an id that is not a string, or if the task must be given.
     """
     fix = "sejax.gym.RewardNetwork(env, source)"
+    if env_id is None:
+        env = same_env(header.config["env"], render_mode=render_mode)
+        if env is None:
+            raise _unknown_task(header, fix)
+        return env
     require(
-        isinstance(env_id, str | None),
+        isinstance(env_id, str),
         "task",
-        "must be an id of Gymnasium for a reward network, because its dynamics are the real "
-        f"task's; got {shortened(shortened(env_id, 80))}. Set {fix}.",
+        f"must be an id of Gymnasium for a reward network; got {shortened(env_id)}. Set {fix}.",
     )
-    if env_id is not None:
-        return make_gymnasium(env_id, render_mode=render_mode)
-    env = same_env(header.config["env"], render_mode=render_mode)
-    if env is None:
-        raise _unknown_task(header, fix)
-    return env
+    return make_gymnasium(str(env_id), render_mode=render_mode)
 
 
 def _unknown_task(header: Header, fix: str) -> ConfigError:
     """Error for a task that only the caller can give."""
-    options = [f"{key}={x}" for key, x in header.config["env"].items() if key != "name"]
-    name = header.task_kind + (f" ({', '.join(options)})" if options else "")
     return ConfigError(
-        f"task must be given for {shortened(name, 80)}, because Gymnasium has no environment that "
-        f"is the same; got none. Set {fix}, or an id of Gymnasium.",
+        f"task must be given, because Gymnasium has none that is the same; got "
+        f"{shortened(header.config['env'])}. Set {fix}, or an id of Gymnasium.",
         "task",
     )
 
@@ -237,43 +242,23 @@ def _unknown_task(header: Header, fix: str) -> ConfigError:
 # --- spaces ---------------------------------------------------------------------------------------
 
 
-def _space(plain: Mapping[str, Any]) -> spaces.Space[Any]:
-    """A space of `sejax.envs.TaskSpec.interface`."""
-    if "n" in plain:
-        return spaces.Discrete(plain["n"])
-    low, high = (
-        np.array([end if x is None else x for x in plain[name]], np.float32)
-        for name, end in (("low", -np.inf), ("high", np.inf))
-    )
+def _gymnasium_space(space: Space) -> spaces.Space[Any]:
+    if isinstance(space, Discrete):
+        return spaces.Discrete(space.n)
+    low, high = (np.array(bound, np.float32) for bound in (space.low, space.high))
     return spaces.Box(low, high, dtype=np.float32)
 
 
-def is_close(space: spaces.Space[Any], other: spaces.Space[Any]) -> bool:
-    """Whether two spaces are the same, but for rounding and the dtype."""
-    if isinstance(space, spaces.Box) and isinstance(other, spaces.Box):
-        bounds = ((space.low, other.low), (space.high, other.high))
-        return space.shape == other.shape and all(np.allclose(*pair) for pair in bounds)
-    return num_categories(space) == num_categories(other)
-
-
-def num_categories(space: spaces.Space[Any]) -> int | None:
-    """Size of a `Discrete` space; None for a `Box`."""
-    return int(space.n) if isinstance(space, spaces.Discrete) else None
-
-
-def vector_size(space: spaces.Space[Any], name: str) -> int:
-    """Length of the vector that networks see; an index is one-hot to them.
+def space_of(space: spaces.Space[Any], name: str) -> Space:
+    """A space of Gymnasium as sejax has it.
 
     Raises:
-      ConfigError: for a space of another kind.
+      ConfigError: if its elements are neither vectors nor indices from 0 on.
     """
     if isinstance(space, spaces.Box) and len(space.shape) == 1:
-        return space.shape[0]
-    is_index = isinstance(space, spaces.Discrete) and space.start == 0
-    require(
-        is_index,
-        name,
-        "must be a Box of vectors or a Discrete from 0, because networks take vectors; got "
-        f"{shortened(space)}. Set {name} to that of `sejax.Task`.",
+        return Box(tuple(space.low.tolist()), tuple(space.high.tolist()))
+    if isinstance(space, spaces.Discrete) and space.start == 0:
+        return Discrete(int(space.n))
+    raise ConfigError(
+        f"{name} must be a Box of vectors or a Discrete from 0; got {shortened(space)}.", name
     )
-    return int(space.n)  # type: ignore[attr-defined]

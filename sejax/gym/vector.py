@@ -8,7 +8,9 @@ import numpy as np
 from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
+from numpy.typing import ArrayLike
 
+from sejax.gym.gridworld import Info
 from sejax.gym.synthetic import SyntheticWorld
 from sejax.options import one_of, require
 
@@ -38,10 +40,9 @@ class SyntheticVectorEnv(VectorEnv[Any, Any, np.ndarray]):
     ):
         self.world = world
         self.num_envs = num_envs
-        modes = [mode.value for mode in AutoresetMode]
-        mode: Any = getattr(autoreset_mode, "value", autoreset_mode)
-        one_of(modes)("autoreset_mode", mode, modes[0])
-        self.autoreset_mode = AutoresetMode(mode)
+        if not isinstance(autoreset_mode, AutoresetMode):
+            one_of([mode.value for mode in AutoresetMode])("autoreset_mode", autoreset_mode, None)
+        self.autoreset_mode = AutoresetMode(autoreset_mode)
         self.metadata = {"render_modes": [], "autoreset_mode": self.autoreset_mode}
         self.single_observation_space = world.observation_space
         self.single_action_space = world.action_space
@@ -50,29 +51,17 @@ class SyntheticVectorEnv(VectorEnv[Any, Any, np.ndarray]):
         self._vectors = np.zeros((num_envs, world.obs_dim), np.float32)
         self._times = np.zeros(num_envs, np.int64)
         self._ended = np.zeros(num_envs, np.bool_)
-        self._rngs: list[np.random.Generator | None] = [None] * num_envs
-        self._seeds: list[int | None] = [None] * num_envs
+        # Of each environment, as in Gymnasium's own; None before the first reset.
+        self._np_random: list[Any] = [None] * num_envs  # type: ignore[assignment]
+        self._np_random_seed: list[int | None] = [None] * num_envs  # type: ignore[assignment]
         # A generator gives the same numbers one by one and all at once, which is quicker.
         num_drawn = PREFETCHED if world.draws_noise and not world.draws_ends else 1
         self._drawn = np.zeros((num_envs, num_drawn, world.obs_dim), np.float32)
         self._num_used = np.full(num_envs, num_drawn)  # of those
 
-    @property  # type: ignore[misc]
-    def np_random(self) -> tuple[np.random.Generator | None, ...]:  # type: ignore[override]
-        """The generator of each environment; None before the first reset."""
-        return tuple(self._rngs)
-
-    @property
-    def np_random_seed(self) -> tuple[int | None, ...]:  # type: ignore[override]
-        """The seed of each environment; None before the first reset."""
-        return tuple(self._seeds)
-
     def reset(
-        self,
-        *,
-        seed: int | Sequence[int | None] | None = None,
-        options: dict[str, Any] | None = None,
-    ) -> tuple[np.ndarray, dict[str, Any]]:
+        self, *, seed: int | Sequence[int | None] | None = None, options: Info | None = None
+    ) -> tuple[np.ndarray, Info]:
         """Begins an episode in each environment.
 
         Args:
@@ -88,26 +77,24 @@ class SyntheticVectorEnv(VectorEnv[Any, Any, np.ndarray]):
         require(
             len(seeds) == self.num_envs,
             "seed",
-            "must have an entry for each environment, because each has a generator of its own; "
-            f"got {len(seeds)} for {self.num_envs}. Set seed=0.",
+            f"must be one number, or {self.num_envs}; got {len(seeds)}.",
         )
         require(
             mask.shape == (self.num_envs,) and mask.dtype == np.bool_,
             "options.reset_mask",
-            "must be a bool for each environment, because it says which begin anew; got "
-            f"{mask.dtype} {mask.shape} for {self.num_envs}. Set options={{'reset_mask': ended}}.",
+            f"must be [{self.num_envs}] of bool; got {mask.shape} of {mask.dtype}.",
         )
         indices = np.flatnonzero(mask)
         for i in indices:
-            if self._rngs[i] is None or seeds[i] is not None:
-                self._rngs[i], self._seeds[i] = seeding.np_random(seeds[i])
+            if self._np_random[i] is None or seeds[i] is not None:
+                self._np_random[i], self._np_random_seed[i] = seeding.np_random(seeds[i])
                 self._num_used[i] = self._drawn.shape[1]  # what it had drawn before is void
         self._begin(indices)
         return self.world.observe(self._vectors), {}
 
     def step(
-        self, actions: Any
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+        self, actions: ArrayLike
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, Info]:
         """One step of each environment.
 
         Raises:
@@ -115,7 +102,7 @@ class SyntheticVectorEnv(VectorEnv[Any, Any, np.ndarray]):
           gymnasium.error.InvalidAction: for actions that are none of the space's.
         """
         is_next_step = self.autoreset_mode is AutoresetMode.NEXT_STEP
-        if None in self._rngs or (self._ended.any() and not is_next_step):
+        if None in self._np_random or (self._ended.any() and not is_next_step):
             raise gymnasium.error.ResetNeeded("call reset() first: no episode is running")
         encoded = self.world.encode(actions, self.action_space)
         goes_on = ~self._ended
@@ -141,7 +128,7 @@ class SyntheticVectorEnv(VectorEnv[Any, Any, np.ndarray]):
             self._begin(np.flatnonzero(self._ended))
         return self.world.observe(self._vectors), rewards, terminated, truncated, infos
 
-    def _final(self, discounts: np.ndarray) -> dict[str, Any]:
+    def _final(self, discounts: np.ndarray) -> Info:
         """Infos of a step whose ended environments will begin anew at once."""
         ended = self._ended.copy()
         final_obs = np.full(self.num_envs, None, dtype=object)
@@ -162,9 +149,8 @@ class SyntheticVectorEnv(VectorEnv[Any, Any, np.ndarray]):
             return
         num_drawn = self._drawn.shape[1]
         for i in indices[self._num_used[indices] == num_drawn]:
-            rng = self._rngs[i]
-            assert rng is not None
-            self._drawn[i], self._num_used[i] = self.world.draw(rng, num_drawn), 0
+            self._drawn[i] = self.world.draw(self._np_random[i], num_drawn)
+            self._num_used[i] = 0
         self._vectors[indices] = self.world.first(self._drawn[indices, self._num_used[indices]])
         self._num_used[indices] += 1
         self._times[indices], self._ended[indices] = 0, False
@@ -173,7 +159,7 @@ class SyntheticVectorEnv(VectorEnv[Any, Any, np.ndarray]):
         """What decides over ends, `[indices]`, drawn with each environment's own generator."""
         if not self.world.draws_ends:
             return None
-        return np.array([self._rngs[i].random() for i in indices])  # type: ignore[union-attr]
+        return np.array([self._np_random[i].random() for i in indices])
 
     def _listed(self, seed: int | Sequence[int | None] | None) -> list[int | None]:
         if seed is None:

@@ -8,7 +8,7 @@ import tempfile
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
-from sejax.options import require, shortened
+from sejax.options import ConfigError, shortened
 
 
 def cache_folder() -> Path | None:
@@ -38,12 +38,10 @@ def require_writable(field: str, folder: Path) -> None:
         with tempfile.TemporaryFile(dir=folder):
             pass
     except (OSError, ValueError) as error:
-        rule = "be a folder that can be written"
-        require(
-            False,
-            field,
-            f"must {rule}, because files go there; got {shortened(error)}. Set {field}=FOLDER.",
-        )
+        got = shortened(error)
+        raise ConfigError(
+            f"{field} must be a folder that can be written; got {got}. Set {field}=FOLDER.", field
+        ) from error
 
 
 @contextlib.contextmanager

@@ -7,17 +7,19 @@ time: eight agents with buffers of 20,000 rows train 9 times as fast with the lo
 
 import functools
 from collections.abc import Callable
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jax.custom_batching import custom_vmap
 from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
+from jaxtyping import PyTree
 
-Body = Callable[..., tuple[Any, Any]]
+Body = Callable[..., tuple[PyTree, PyTree]]
 
 
-def while_any_active(body: Body, large: Any, small: Any, consts: Any) -> tuple[Any, Any]:
+def while_any_active(
+    body: Body, large: PyTree, small: PyTree, consts: PyTree
+) -> tuple[PyTree, PyTree]:
     """Runs `large, small = body(large, small, consts, masked)` while `small.active`.
 
     Plain form, equal for any nesting of `vmap` (`tests/test_loops.py`; `tests/test_program.py`
@@ -61,13 +63,13 @@ def while_any_active(body: Body, large: Any, small: Any, consts: Any) -> tuple[A
 
 
 def _while_any_active(
-    body: Body, depth: int, large: Any, small: Any, consts: Any
-) -> tuple[Any, Any]:
+    body: Body, depth: int, large: PyTree, small: PyTree, consts: PyTree
+) -> tuple[PyTree, PyTree]:
     """The loop under `depth` vmaps, which makes itself one deeper when it is vmapped."""
 
-    def masked_step(large: Any, small: Any, consts: Any) -> tuple[Any, Any]:
-        def step(large: Any, small: Any, consts: Any) -> tuple[Any, Any]:
-            return body(large, small, consts, depth > 0)
+    def masked_step(large: PyTree, small: PyTree, consts: PyTree) -> tuple[PyTree, PyTree]:
+        def step(*args: PyTree) -> tuple[PyTree, PyTree]:
+            return body(*args, depth > 0)
 
         for _ in range(depth):
             step = jax.vmap(step)
@@ -82,22 +84,25 @@ def _while_any_active(
     out_tree = jax.tree.structure(shapes)
 
     @custom_vmap
-    def loop(large: Any, small: Any, consts: Any, captured: Any) -> tuple[Any, Any]:
+    def loop(
+        large: PyTree, small: PyTree, consts: PyTree, captured: PyTree
+    ) -> tuple[PyTree, PyTree]:
         masked = jaxpr_as_fun(ClosedJaxpr(jaxpr.jaxpr, captured))
 
-        def step(carry: tuple[Any, Any]) -> tuple[Any, Any]:
+        def step(carry: tuple[PyTree, PyTree]) -> tuple[PyTree, PyTree]:
             return jax.tree.unflatten(out_tree, masked(*jax.tree.leaves((*carry, consts))))
 
         return jax.lax.while_loop(lambda carry: jnp.any(carry[1].active), step, (large, small))
 
     @loop.def_vmap
-    def _(axis_size: int, in_batched: Any, large: Any, small: Any, consts: Any, captured: Any):
-        def broadcast(batched: bool, x: Any) -> Any:
+    def _(axis_size: int, in_batched: list[PyTree], *args: PyTree) -> tuple[PyTree, PyTree]:
+        def broadcast(batched: bool, x: PyTree) -> PyTree:
             return x if batched else jnp.broadcast_to(x, (axis_size, *jnp.shape(x)))
 
         # The deeper loop captures for itself what is the same for all elements.
-        args = jax.tree.map(broadcast, in_batched[:3], [large, small, consts])
-        out = _while_any_active(body, depth + 1, *args)
+        out = _while_any_active(
+            body, depth + 1, *jax.tree.map(broadcast, in_batched[:3], list(args[:3]))
+        )
         return out, jax.tree.map(lambda _: True, out)
 
     return loop(large, small, consts, jaxpr.consts)

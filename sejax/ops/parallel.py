@@ -6,19 +6,19 @@ any number of devices (`tests/test_parallel.py`).
 
 import functools
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
+from jaxtyping import PyTree
 
-from sejax.options import require, shortened
+from sejax.options import require
 
 
 @functools.cache
-def compiler_options() -> dict[str, Any] | None:
+def compiler_options() -> dict[str, int] | None:
     """XLA's options for whole trainings; None for the defaults.
 
     On a CPU, vectors of 512 bits, where the CPU has them; the default is 256. On an AMD EPYC a
@@ -36,11 +36,11 @@ def compiler_options() -> dict[str, Any] | None:
 
 
 def spread_over_devices(
-    fn: Callable[..., Any],
+    fn: Callable[..., PyTree],
     num_devices: int | None = None,
     num_parallel: int | None = None,
     cpu_num_parallel: int | None = 1,
-) -> Callable[..., Any]:
+) -> Callable[..., PyTree]:
     """Maps `fn` over the leading axis of its arguments, on several devices.
 
     Args:
@@ -63,15 +63,22 @@ def spread_over_devices(
     return lambda *args: spread([args])[0]
 
 
-def copy_to_devices(tree: Any, num_devices: int | None = None) -> Any:
+def copy_to_devices(tree: PyTree, num_devices: int | None = None) -> PyTree:
     """The arrays of a pytree with a copy on each device, as results of spread functions have.
 
-    A jitted loop is compiled anew if its state comes back from devices on which it did not start.
+    A jitted loop is compiled anew if its state comes back from devices on which it did not start,
+    or strongly typed where it was weakly typed.
     """
+    tree = jax.tree.map(_strongly_typed, tree)
     mesh = _mesh(num_devices)
     if mesh.size == 1:
         return tree
     return jax.lax.with_sharding_constraint(tree, NamedSharding(mesh, PartitionSpec()))
+
+
+def _strongly_typed(x: Array) -> Array:
+    is_key = jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
+    return x if is_key else jax.lax.convert_element_type(x, x.dtype)
 
 
 def _mesh(num_devices: int | None) -> Mesh:
@@ -80,11 +87,11 @@ def _mesh(num_devices: int | None) -> Mesh:
 
 
 def spread_groups_over_devices(
-    fns: Sequence[Callable[..., Any]],
+    fns: Sequence[Callable[..., PyTree]],
     num_devices: int | None,
     num_parallel: int | None,
     cpu_num_parallel: Sequence[int | None],
-) -> Callable[[Sequence[tuple[Any, ...]]], list[Any]]:
+) -> Callable[[Sequence[tuple[PyTree, ...]]], list[PyTree]]:
     """As `spread_over_devices` for several functions with a group of elements each.
 
     A device goes from its share of one group to its share of the next without waiting for others.
@@ -102,14 +109,13 @@ def spread_groups_over_devices(
     require(
         num_devices is None or num_devices <= len(available),
         "devices",
-        f"must be at most {len(available)}, because that is how many there are; got "
-        f"{shortened(num_devices)}. Set devices=null.",
+        f"must be at most {len(available)}, all there are; got {num_devices}. Set devices=null.",
     )
     mesh = _mesh(num_devices)
     on_cpu = available[0].platform == "cpu"
     widths = [num_parallel or (width if on_cpu else None) for width in cpu_num_parallel]
 
-    def map_groups(groups: Sequence[tuple[Any, ...]]) -> list[Any]:
+    def map_groups(groups: Sequence[tuple[PyTree, ...]]) -> list[PyTree]:
         return [_map_in_batches(*each) for each in zip(fns, widths, groups, strict=True)]
 
     if mesh.size == 1:
@@ -117,23 +123,25 @@ def spread_groups_over_devices(
     axis = PartitionSpec("device")
     mapped = jax.shard_map(map_groups, mesh=mesh, in_specs=axis, out_specs=axis, check_vma=False)
 
-    def map_spread(groups: Sequence[tuple[Any, ...]]) -> list[Any]:
-        deal = functools.partial(_deal, num_devices=mesh.size)
-        dealt = [jax.tree.map(deal, args) for args in groups]
+    def map_spread(groups: Sequence[tuple[PyTree, ...]]) -> list[PyTree]:
+        dealt = [jax.tree.map(lambda x: _deal(x, mesh.size), args) for args in groups]
+        sizes = [_size(args) for args in groups]
         return [
-            jax.tree.map(functools.partial(_gather, num_devices=mesh.size, size=_size(args)), out)
-            for args, out in zip(groups, mapped(dealt), strict=True)
+            jax.tree.map(functools.partial(_gather, num_devices=mesh.size, size=size), out)
+            for size, out in zip(sizes, mapped(dealt), strict=True)
         ]
 
     return map_spread
 
 
-def _size(args: Any) -> int:
+def _size(args: PyTree) -> int:
     """Number of elements."""
     return jax.tree.leaves(args)[0].shape[0]
 
 
-def _map_in_batches(fn: Callable[..., Any], width: int | None, args: tuple[Any, ...]) -> Any:
+def _map_in_batches(
+    fn: Callable[..., PyTree], width: int | None, args: tuple[PyTree, ...]
+) -> PyTree:
     """Maps a function of one element on one device; `width` None puts all into one batch."""
     size = _size(args)
     width = width or size

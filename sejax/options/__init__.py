@@ -28,6 +28,8 @@ import io
 import numbers
 import textwrap
 import tokenize
+import types
+import typing
 from collections.abc import Callable, Collection, Iterable, Mapping
 from typing import Any, ClassVar
 
@@ -60,7 +62,7 @@ class FailedError(RuntimeError):
     """Computing that cannot go on. Commands print its message and exit with status 1."""
 
 
-def require(holds: Any, field: str, message: str) -> None:
+def require(holds: object, field: str, message: str) -> None:
     """Raises `ConfigError` unless `holds`.
 
     Args:
@@ -113,8 +115,8 @@ def option(
     """A dataclass field.
 
     Args:
-      default: its default; None where it may be left open, which passes any rule.
-      rule: what must hold.
+      default: its default.
+      rule: what must hold; None passes it where that is the default or `... | None` the type.
       traced: whether it is a number that the compiled program takes as an argument, so that a
         population may vary it without compiling anew. See `traced_options`.
       varied: how `agent_hparams=varied` draws it; see `sejax.agents.varied`.
@@ -133,7 +135,7 @@ class Options:
         check(self, self.group)
 
 
-def check(config: Any, group: str) -> None:
+def check(config: Options, group: str) -> None:
     """Checks all fields of a dataclass that have a rule.
 
     Numbers of NumPy and jax become Python's, and whole numbers floats where the default is one, so
@@ -150,11 +152,12 @@ def check(config: Any, group: str) -> None:
         if value is not given:
             object.__setattr__(config, field.name, value)
         rule = marks(type(config), field.name).get("rule")
-        if rule is not None and not (value is None and field.default is None):
+        may_be_none = field.default is None or types.NoneType in typing.get_args(field.type)
+        if rule is not None and not (value is None and may_be_none):
             rule(f"{group}.{field.name}" if group else field.name, value, field.default)
 
 
-def traced_options(config: Any) -> dict[str, Any]:
+def traced_options(config: Options) -> dict[str, Any]:
     """Values of the fields that are traced, in the order of the dataclass."""
     return {
         field.name: getattr(config, field.name)
@@ -205,25 +208,21 @@ def _comments(source: str) -> dict[str, str]:
     return found
 
 
-def is_number(value: Any) -> bool:
+def is_number(value: object) -> bool:
     """Whether it is an int or a float, which a bool is not here; see `as_python`."""
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 
 def as_python(value: Any) -> Any:
     """A number or bool of NumPy or jax as Python's; all else, traced ones too, as it is."""
-    is_one = getattr(value, "shape", None) == () and hasattr(value, "item")
-    if not is_one or isinstance(value, type):
+    if getattr(value, "shape", None) != () or not hasattr(value, "item"):
         return value
     try:
         number = value.item()
     except (TypeError, NotImplementedError):  # a traced one has no value yet, a key has none
         return value
-    return (
-        float(number)
-        if isinstance(number, numbers.Real) and not isinstance(number, bool | int | float)
-        else number
-    )
+    is_python = type(number) in (bool, int, float) or not isinstance(number, numbers.Real)
+    return number if is_python else float(number)  # such as a long double
 
 
 # --- rules ---------------------------------------------------------------------------------------
@@ -233,17 +232,13 @@ def rule(holds: Callable[[Any], bool], must: str, reason: str) -> Rule:
     """The rule that a predicate holds; see `require`."""
 
     def apply(name: str, value: Any, default: Any) -> None:
-        require(
-            holds(value),
-            name,
-            f"must {must}, because {reason}; got {shortened(value)}. Set "
-            f"{name}={as_text(default)}.",
-        )
+        got, fix = shortened(value), f"{name}={as_text(default)}"
+        require(holds(value), name, f"must {must}, because {reason}; got {got}. Set {fix}.")
 
     return apply
 
 
-def as_text(value: Any) -> str:
+def as_text(value: object) -> str:
     """A value as the command line takes it.
 
     Example:
@@ -253,9 +248,15 @@ def as_text(value: Any) -> str:
     if isinstance(value, list | tuple):
         return f"[{','.join(map(as_text, value))}]"
     if value is None or isinstance(value, bool):
-        return {None: "null", True: "true", False: "false"}[value]
+        return "null" if value is None else str(value).lower()
     text = str(value)
     return f"'{text}'" if any(character in text for character in ",[]'\" ") else text
+
+
+def between(low: float, high: float, reason: str, must: str = "") -> Rule:
+    """A number from `low` to `high`."""
+    must = must or f"lie between {low:g} and {high:g}"
+    return rule(lambda x: is_number(x) and low <= x <= high, must, reason)
 
 
 def counts(
@@ -273,45 +274,32 @@ def counts(
 
 def not_negative(reason: str = "it is a size") -> Rule:
     """A finite number from 0 on."""
-    return rule(lambda x: is_number(x) and 0 <= x <= MOST, f"lie between 0 and {MOST:g}", reason)
+    return between(0, MOST, reason)
 
 
 def finite(reason: str) -> Rule:
     """A finite number, of either sign."""
-    return rule(
-        lambda x: is_number(x) and abs(x) <= MOST, f"lie between {-MOST:g} and {MOST:g}", reason
-    )
+    return between(-MOST, MOST, reason)
 
 
 def positive(reason: str, at_most: float = MOST) -> Rule:
     """A finite number above 0 with which programs can compute in 32 bits."""
-    return rule(
-        lambda x: is_number(x) and LEAST <= x <= at_most,
-        f"lie between {LEAST:g} and {at_most:g}",
-        reason,
-    )
+    return between(LEAST, at_most, reason)
 
 
 def fraction() -> Rule:
     """A number in [0, 1]."""
-    return rule(lambda x: is_number(x) and 0 <= x <= 1, "lie in [0, 1]", "it is a fraction")
+    return between(0, 1, "it is a fraction")
 
 
 def shrinks() -> Rule:
     """A factor in (0, 1]."""
-    return rule(
-        lambda x: is_number(x) and LEAST <= x <= 1, "lie in (0, 1]", "it shrinks each generation"
-    )
+    return between(LEAST, 1, "it shrinks each generation", "lie in (0, 1]")
 
 
-def or_none(inner: Rule) -> Rule:
-    """None, or what another rule says; for an option that may be left open, but has a default."""
-
-    def either(name: str, value: Any, default: Any) -> None:
-        if value is not None:
-            inner(name, value, default)
-
-    return either
+def seed() -> Rule:
+    """A seed that `jax.random.key` takes as it is."""
+    return between(0, LARGEST, "it is a 32-bit number", "lie in [0, 2**31)")
 
 
 def one_of(known: Collection[str]) -> Rule:
@@ -332,10 +320,3 @@ def each_of(known: Collection[str]) -> Rule:
             one_of(known)(name, value, default)
 
     return apply
-
-
-def seed() -> Rule:
-    """A seed that `jax.random.key` takes as it is."""
-    return rule(
-        lambda x: is_number(x) and 0 <= x < 2**31, "lie in [0, 2**31)", "it is a 32-bit number"
-    )

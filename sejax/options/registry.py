@@ -21,9 +21,8 @@ A name is one that comes with sejax, one that an installed package offers as an 
 `module:attribute`, which imports the module. Within `only_typed`, as in every command, that is done
 only for a `module:attribute` that the user has typed: one that a file holds is refused.
 
-A configuration is written as plain values (`describe`) and read back (`configure`). A value is
-taken as its field's type means it (`1` for a float, a list for a tuple, the text of an override for
-a number) and never guessed: nothing in it is resolved, imported or executed.
+A configuration is written as plain values (`describe`) and read back (`configure`); what a value
+may be is in `sejax.options.plain`.
 """
 
 import contextlib
@@ -33,8 +32,8 @@ import importlib
 import importlib.metadata
 import importlib.util
 import inspect
+import operator
 import re
-import types
 import typing
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextvars import ContextVar
@@ -44,7 +43,6 @@ from typing import Any
 from sejax.options import (
     ConfigError,
     Options,
-    as_text,
     listed,
     nearest,
     require,
@@ -52,15 +50,7 @@ from sejax.options import (
     told,
     unknown_name,
 )
-
-# Fields that had another name in files of older versions.
-RENAMED = {
-    "init_episodes": "warmup_episodes",
-    "target_update_rate": "tau",
-    "lanes": "num_parallel",
-    "first_test_steps": "first_eval_steps",
-}
-_MISSING = dataclasses.MISSING
+from sejax.options.plain import MISSING, fields_of, from_plain, is_union, to_plain
 
 
 @dataclass(frozen=True)
@@ -229,6 +219,9 @@ def untyped(words: Iterable[str]) -> list[str]:
     return [] if typed is None else [path for path in paths_in(words) if path not in typed]
 
 
+# --- names ---------------------------------------------------------------------------------------
+
+
 def names(group: str) -> list[str]:
     """The registered names: those that come with sejax, then those of installed packages."""
     return [*GROUPS[group].built_in, *_offered(group)]
@@ -239,7 +232,7 @@ def is_registered(group: str, name: str) -> bool:
     return name in names(group) or _family(group, name) is not None
 
 
-def find(group: str, name: str) -> Any:
+def find(group: str, name: object) -> Any:
     """The dataclass that a name stands for.
 
     Args:
@@ -253,21 +246,24 @@ def find(group: str, name: str) -> Any:
     kind = GROUPS[group]
     if not isinstance(name, str):
         raise unknown_name(group, name, names(group))
-    if name in kind.built_in:
-        return _attribute(kind.built_in[name])
+    built_in = kind.built_in.get(name) or _family(group, name)
+    if built_in is not None:
+        return _attribute(built_in)
     if name in _offered(group):
-        return _as_dataclass(group, name, _load(group, _offered(group)[name]))
-    family = _family(group, name)
-    if family is not None:
-        return _attribute(family)
-    if ":" in name:
-        found = _import(group, name)
-        _require_maker(group, name, found)
-        return _as_dataclass(group, name, found)
-    raise unknown_name(group, name, names(group))
+        return _as_dataclass(group, name, _imported(group, _offered(group)[name]))
+    if ":" not in name:
+        raise unknown_name(group, name, names(group))
+    return _as_dataclass(group, name, _imported(group, name, _TYPED.get()))
 
 
-# --- plain values --------------------------------------------------------------------------------
+def name_of(group: str, config: object) -> str:
+    """The name by which `find` finds a configuration's class again."""
+    cls = type(config)
+    own = f"{cls.__module__}:{cls.__qualname__}"
+    if _is_one_of_many(cls):
+        return str(config.name)  # type: ignore[attr-defined]
+    built_in = (name for name, path in GROUPS[group].built_in.items() if path == own)
+    return _NAMES.get(cls) or next(built_in, own)
 
 
 def configure(group: str, values: Mapping[str, Any]) -> Any:
@@ -283,299 +279,23 @@ def configure(group: str, values: Mapping[str, Any]) -> Any:
     require(
         isinstance(values, Mapping) and "name" in values,
         group,
-        f"must be a choice with its fields, because one is made by name; got {shortened(values)}. "
-        f"Set {group}=NAME.",
+        f"must be a choice with its fields; got {shortened(values)}. Set {group}=NAME.",
     )
     cls = find(group, values["name"])
-    is_one_of_many = "name" in {field.name for field in dataclasses.fields(cls)}
-    fields = values if is_one_of_many else {k: v for k, v in values.items() if k != "name"}
+    fields = {k: v for k, v in values.items() if k != "name" or _is_one_of_many(cls)}
     return from_plain(cls, fields, group)
 
 
-def describe(group: str, config: Any) -> dict[str, Any]:
+def describe(group: str, config: object) -> dict[str, Any]:
     """Inverse of `configure`."""
     return {"name": name_of(group, config), **to_plain(config)}
 
 
 def defaults(group: str, name: str) -> dict[str, Any]:
     """What `describe` gives for a choice with its defaults; "???" for a field without one."""
-    plain_values: dict[str, Any] = {"name": name}
-    for field in dataclasses.fields(find(group, name)):
-        if field.init and field.name != "name":
-            plain_values[field.name] = "???" if _is_needed(field) else plain(_default(field))
-    return plain_values
-
-
-def name_of(group: str, config: Any) -> str:
-    """The name by which `find` finds a configuration's class again."""
-    if "name" in getattr(type(config), "__dataclass_fields__", {}):
-        return str(config.name)
-    cls = type(config)
-    own = f"{cls.__module__}:{cls.__qualname__}"
-    built_in = (name for name, path in GROUPS[group].built_in.items() if path == own)
-    return _NAMES.get(cls) or next(built_in, own)
-
-
-def to_plain(config: Any) -> dict[str, Any]:
-    """The fields of a dataclass as plain values: numbers, words, None, lists and dictionaries."""
-    fields = [field.name for field in dataclasses.fields(config) if field.init]
-    return {name: plain(getattr(config, name)) for name in fields}
-
-
-def plain(value: Any) -> Any:
-    """One value as `to_plain` has it."""
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return to_plain(value)
-    if isinstance(value, tuple | list):
-        return [plain(x) for x in value]
-    if isinstance(value, Mapping):
-        return {str(key): plain(x) for key, x in value.items()}
-    is_array = hasattr(value, "tolist") and not isinstance(value, type)  # NumPy's and jax's
-    return value.tolist() if is_array else value
-
-
-def from_plain(cls: Any, values: Mapping[str, Any], where: str) -> Any:
-    """Inverse of `to_plain`.
-
-    Args:
-      cls: a dataclass.
-      values: by the names of its fields, today's or those of `RENAMED`; those left out have their
-        defaults.
-      where: what messages call it, as `agent` in `agent.batch_size`; may be empty.
-
-    Raises:
-      ConfigError: for a field that is not there, is missing, or has a value of another type.
-    """
-    fields = {field.name: field for field in dataclasses.fields(cls) if field.init}
-    try:
-        hints = typing.get_type_hints(cls)
-    except NameError as error:
-        raise ConfigError(
-            f"{where or cls.__name__} must have fields of known types, because values are read by "
-            f"them; got {cls.__name__}, where {error}. Import it where the class is defined.",
-            where,
-        ) from error
-    read = {}
-    for stored, value in values.items():
-        name = stored if stored in fields else RENAMED.get(stored, stored)
-        if name not in fields:
-            raise unknown_field(_join(where, name), [_join(where, field) for field in fields])
-        full = _join(where, name)
-        read[name] = _converted(value, hints[name], full, _default(fields[name]))
-    for name in fields.keys() - read.keys():
-        full = _join(where, name)
-        is_there = not _is_needed(fields[name])
-        require(
-            is_there, full, f"must be given, because it has no default; got none. Set {full}=VALUE."
-        )
-    return cls(**read)
-
-
-def unknown_field(field: str, known: Collection[str]) -> ConfigError:
-    """Error for a field that is not there, with the nearest of those that are."""
-    field, last = shortened(field, 40), field.rpartition(".")[2]
-    ranked = [name for name in known if name.rpartition(".")[2] == last] or nearest(field, known)
-    fix = f"Did you mean {ranked[0]}? " if ranked else ""
-    return ConfigError(
-        f"{field} must be a field, because nothing else is read; got one that is not there. "
-        f"{fix}Fields: {listed(ranked)}.",
-        field,
-    )
-
-
-def flatten(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Nested settings as `{"group.field": value}`."""
-    flat: dict[str, Any] = {}
-    for key, value in values.items():
-        if isinstance(value, Mapping):
-            flat |= flatten(value, f"{prefix}{key}.")
-        else:
-            flat[f"{prefix}{key}"] = value
-    return flat
-
-
-def differences(
-    there: Mapping[str, Any], here: Mapping[str, Any], free: Collection[str] = (), most: int = 10
-) -> str:
-    """The fields in which two nested settings differ, for a message; empty if in none.
-
-    Args:
-      there: settings that were stored.
-      here: those that are asked for.
-      free: groups and fields of the first level that may differ.
-      most: fields that are named.
-
-    Example:
-      >>> differences({"es": {"noise_std": 0.1}, "seed": 0}, {"es": {"noise_std": 0.2}, "seed": 0})
-      'es.noise_std (0.1 there, 0.2 here)'
-    """
-    old, asked = flatten(there), flatten(here)
-    differing = [
-        f"{name} ({shortened(old.get(name), 60)} there, {shortened(asked.get(name), 60)} here)"
-        for name in sorted(old.keys() | asked.keys())
-        if name.partition(".")[0] not in free
-        # In the second way nan is nan.
-        and old.get(name) != asked.get(name)
-        and repr(old.get(name)) != repr(asked.get(name))
-    ]
-    more = f" and {len(differing) - most} more" if len(differing) > most else ""
-    return ", ".join(differing[:most]) + more
-
-
-def split(text: str, separator: str = ",") -> list[str]:
-    """The parts of a text between separators that are outside of brackets and quotes.
-
-    Example:
-      >>> split("0.1,[1,2],'a,b'")
-      ['0.1', '[1,2]', "'a,b'"]
-    """
-    parts, depth, quote = [""], 0, ""
-    for character in text:
-        if quote:
-            quote = "" if character == quote else quote
-        elif character in "'\"" and not parts[-1].strip():
-            quote = character
-        depth += (character in "[(" and not quote) - (character in "])" and not quote)
-        if character == separator and depth <= 0 and not quote:
-            parts.append("")
-        else:
-            parts[-1] += character
-    return [part.strip() for part in parts] if len(parts) > 1 else parts
-
-
-def unquoted(text: str) -> str:
-    """A text without the quotes around it."""
-    is_quoted = len(text) > 1 and text[0] == text[-1] and text[0] in "'\""
-    return text[1:-1] if is_quoted else text
-
-
-def parsed(text: str) -> Any:
-    """What the text of an override says by itself: null, true, a number, a list, or the text.
-
-    Example:
-      >>> parsed("[1e-3,2,true,ddqn]")
-      [0.001, 2, True, 'ddqn']
-    """
-    if text in _CONSTANTS:
-        return _CONSTANTS[text]
-    if text[:1] == "[" and text[-1:] == "]":
-        return [parsed(part) for part in split(text[1:-1])] if text[1:-1].strip() else []
-    for kind in (int, float):
-        try:
-            return kind(text)
-        except ValueError:
-            continue
-    return unquoted(text)
-
-
-_CONSTANTS = {"null": None, "true": True, "True": True, "false": False, "False": False}
-_TYPES = {bool: "true or false", int: "a whole number", float: "a number", str: "text"}
-_NO = object()  # what a value of another type is converted to
-
-
-def _converted(value: Any, hint: Any, name: str, default: Any) -> Any:
-    """A value as its field's type, or an error that says which that is."""
-    if hint is Any:
-        return parsed(value) if isinstance(value, str) else value
-    kinds = typing.get_args(hint) if _is_union(hint) else (hint,)
-    if type(None) in kinds and (value is None or value == "null"):
-        return None
-    kinds = tuple(kind for kind in kinds if kind is not type(None))
-    if type(value) in kinds and not isinstance(value, str):
-        return value
-    for kind in kinds[:-1]:
-        try:
-            return _as(kind, value, name, default)
-        except ConfigError:
-            continue
-    return _as(kinds[-1], value, name, default)
-
-
-def _as(kind: Any, value: Any, name: str, default: Any) -> Any:
-    origin, arguments = typing.get_origin(kind) or kind, typing.get_args(kind)
-    fix = f"{name}={'VALUE' if default is _MISSING else as_text(plain(default))}"
-    if origin is typing.Literal:
-        read = parsed(value) if isinstance(value, str) and value not in arguments else value
-        if read not in arguments:
-            raise unknown_name(name, value, map(str, arguments))
-        return read
-    if origin in (tuple, list):
-        items = parsed(value) if isinstance(value, str) else value
-        require(
-            isinstance(items, list | tuple),
-            name,
-            f"must be a list, because it is several; got {shortened(value)}. Set {fix}.",
-        )
-        if isinstance(value, str):  # each is read by its own type
-            items = split(value[1:-1]) if items else []
-        return origin(_elements(items, origin, arguments, name, default))
-    if isinstance(kind, type) and dataclasses.is_dataclass(kind):
-        if isinstance(value, kind):
-            return value
-        first = next(iter(dataclasses.fields(kind))).name
-        is_nested = isinstance(value, Mapping)
-        require(
-            is_nested,
-            name,
-            f"must have fields, because it is several; got {shortened(value)}. Set "
-            f"{name}.{first}=VALUE.",
-        )
-        return from_plain(kind, value, name)
-    if kind not in _TYPES:
-        return value
-    read = _scalar(value, kind)
-    require(
-        read is not _NO,
-        name,
-        f"must be {_TYPES[kind]}, because that is its type; got {shortened(repr(value))}. Set "
-        f"{fix}.",
-    )
-    return read
-
-
-def _elements(items: Any, origin: Any, kinds: tuple[Any, ...], name: str, default: Any) -> Any:
-    """The elements of a list or tuple, each as its type."""
-    if origin is tuple and kinds and kinds[-1] is not Ellipsis:
-        must, fix = f"have {len(kinds)} values", f"{name}={as_text(plain(default))}"
-        require(
-            len(items) == len(kinds),
-            name,
-            f"must {must}, because that is its type; got {shortened(items)}. Set {fix}.",
-        )
-    else:
-        kinds = (kinds[0] if kinds else Any,) * len(items)
-    return (_converted(x, kind, name, default) for x, kind in zip(items, kinds, strict=True))
-
-
-def _scalar(value: Any, kind: type) -> Any:
-    """A value as a bool, int, float or str; `_NO` if it is none."""
-    if kind is str:
-        is_name = type(value) in (int, float)  # a name of digits, as of a folder
-        return value if isinstance(value, str) else str(value) if is_name else _NO
-    if isinstance(value, str):
-        value = parsed(value)
-    if kind is float and type(value) is int and abs(value) < 2**1000:
-        return float(value)
-    if kind is int and type(value) is float and value.is_integer() and abs(value) < 2**53:
-        return int(value)
-    return value if type(value) is kind else _NO
-
-
-def _is_union(hint: Any) -> bool:
-    return typing.get_origin(hint) in (types.UnionType, typing.Union)
-
-
-def _is_needed(field: Any) -> bool:
-    return _default(field) is _MISSING
-
-
-def _default(field: Any) -> Any:
-    has_factory = field.default_factory is not _MISSING
-    return field.default_factory() if has_factory else field.default
-
-
-def _join(where: str, name: str) -> str:
-    return f"{where}.{shortened(name)}" if where else shortened(name)
+    fields = fields_of(find(group, name)).items()
+    plain = {field: "???" if value is MISSING else to_plain(value) for field, value in fields}
+    return plain | {"name": name}
 
 
 # --- objects -------------------------------------------------------------------------------------
@@ -590,15 +310,20 @@ def make(group: str, config: Any, *arguments: Any) -> Any:
     Raises:
       ConfigError: if it makes something of another kind, or cannot be made.
     """
-    if is_hashable(config):
-        return _made_once(group, config, *arguments)
-    key = (group, id(config), *arguments)
+    key = (group, config if is_hashable(config) else id(config), *arguments)
     if key not in _MADE:
-        _MADE[key] = config, _made(group, config, *arguments)  # with config, its id stays its own
+        made, kind = config.make(*arguments), _attribute(GROUPS[group].makes)
+        require(
+            isinstance(made, kind),
+            group,
+            f"must make a sejax.{kind.__name__}; got {type(made).__name__} from "
+            f"{shortened(name_of(group, config))}. Set {group} to a plugin that returns one.",
+        )
+        _MADE[key] = config, made  # with config, its id stays its own
     return _MADE[key][1]
 
 
-def is_hashable(config: Any) -> bool:
+def is_hashable(config: object) -> bool:
     """Whether a configuration serves as a key: a frozen dataclass of hashable values does."""
     try:
         hash(config)
@@ -607,64 +332,43 @@ def is_hashable(config: Any) -> bool:
     return True
 
 
-def _made(group: str, config: Any, *arguments: Any) -> Any:
-    made = config.make(*arguments)
-    kind = _attribute(GROUPS[group].makes)
-    require(
-        isinstance(made, kind),
-        group,
-        f"must make a sejax.{kind.__name__}, because that is what is used; got "
-        f"{type(made).__name__} from {name_of(group, config)}. Set {group} to a plugin that "
-        f"returns a sejax.{kind.__name__}.",
-    )
-    return made
-
-
-_made_once = functools.cache(_made)
-_MADE: dict[tuple[Any, ...], tuple[Any, Any]] = {}
-
-
-def require_package(group: str, config: Any, reason: str) -> None:
+def require_package(group: str, config: Any) -> None:
     """Checks that the package which a plugin names as its `package` is there; imports nothing.
 
     Raises:
       ConfigError: if it is not.
     """
-    package = getattr(config, "package", None)
-    if package is not None and importlib.util.find_spec(package) is None:
-        name, usual = name_of(group, config), next(iter(GROUPS[group].built_in))
-        raise ConfigError(
-            f"{group} must be one that is installed, because {reason}; got {name} without the "
-            f"package {package}. Install it with pip install 'sejax[{name}]', or set "
-            f"{group}={usual}.",
-            group,
-        )
+    package, name = getattr(config, "package", None), name_of(group, config)
+    require(
+        package is None or importlib.util.find_spec(package) is not None,
+        group,
+        f"must be one that is installed; got {name} without the package {package}. Install it with "
+        f"pip install 'sejax[{name}]', or set {group}={next(iter(GROUPS[group].built_in))}.",
+    )
 
 
+_MADE: dict[tuple[Any, ...], tuple[Any, Any]] = {}
 _NAMES: dict[type, str] = {}  # of classes that were found by another name than their own
 
 
+# --- plugins of others ---------------------------------------------------------------------------
+
+
 def _family(group: str, name: str) -> str | None:
-    matches = [p for start, p in GROUPS[group].families.items() if name.startswith(start)]
-    return matches[0] if matches else None
+    families = GROUPS[group].families.items()
+    return next((path for start, path in families if name.startswith(start)), None)
+
+
+def _is_one_of_many(cls: type) -> bool:
+    """Whether a class has a family of names, so that the name is one of its fields."""
+    return dataclasses.is_dataclass(cls) and "name" in {x.name for x in dataclasses.fields(cls)}
 
 
 @functools.cache
-def _offered(group: str) -> dict[str, Any]:
+def _offered(group: str) -> dict[str, str]:
     """Entry points of installed packages; a name of sejax's own cannot be taken over."""
     points = importlib.metadata.entry_points(group=GROUPS[group].entry_points)
-    return {point.name: point for point in points if point.name not in GROUPS[group].built_in}
-
-
-def _load(group: str, point: Any) -> Any:
-    try:
-        return point.load()
-    except Exception as error:
-        raise ConfigError(
-            f"{group} must be a plugin that can be imported; {point.name!r} of {point.value} "
-            f"raised {told(error)}. Mend or remove that package.",
-            group,
-        ) from error
+    return {x.name: x.value for x in points if x.name not in GROUPS[group].built_in}
 
 
 def _attribute(path: str) -> Any:
@@ -672,83 +376,41 @@ def _attribute(path: str) -> Any:
     return getattr(importlib.import_module(module), attribute)
 
 
-def _import(group: str, path: str) -> Any:
-    """Imports `module:attribute` that a user names."""
+def _imported(group: str, path: str, typed: Collection[str] | None = None) -> Any:
+    """What `module:attribute` names; it is imported if `typed` has it, or is None."""
     module, _, attribute = path.partition(":")
+    got = shortened(path, 60)
     require(
         all(part.isidentifier() for part in (*module.split("."), *attribute.split("."))),
         group,
-        "must be a name or module:attribute, because a module is imported by it; got "
-        f"{shortened(path)}. Set {group}=my_module:MyClass.",
+        f"must be a name or module:attribute; got {got}. Set {group}=my_module:MyClass.",
     )
-    typed = _TYPED.get()
     require(
         typed is None or path in typed,
         group,
-        "must be typed on the command line if it is of a module of your own, because what a file "
-        f"names is never imported; got {shortened(path)}. Set {group}={path}, if you trust that "
-        "module.",
+        "must be typed on the command line if it is of a module of your own: what a file names is "
+        f"never imported; got {got}. Set {group}={got}, if you trust it.",
     )
     try:
-        found: Any = importlib.import_module(module)
+        found = importlib.import_module(module)
     except Exception as error:
         raise ConfigError(
-            f"{group} must name a module that can be imported; {shortened(path)} raised "
-            f"{told(error)}. Run the command in the module's folder, or add that folder to "
-            f"PYTHONPATH.",
+            f"{group} must name a module that can be imported; {shortened(path, 40)} raised "
+            f"{told(error)}. Is its folder in PYTHONPATH?",
             group,
         ) from error
-    for part in attribute.split("."):
-        if not hasattr(found, part):
-            own = {
-                name
-                for name, value in vars(found).items()
-                if callable(value) and getattr(value, "__module__", None) == module
-            }
-            near = nearest(part, own)
-            fix = f" Did you mean {group}={module}:{near[0]}?" if near else ""
-            raise ConfigError(
-                f"{group} must name a class or function of {module}; got {shortened(part)}. "
-                f"There are: {listed(near)}.{fix}",
-                group,
-            )
-        found = getattr(found, part)
-    return found
-
-
-def _require_maker(group: str, name: str, found: Any) -> None:
-    """Checks that a function says that it makes what the group is of; nothing is called.
-
-    Any function of any module could else be called by a command's word.
-
-    Raises:
-      ConfigError: if its return annotation does not say so.
-    """
-    if not (inspect.isfunction(found) or isinstance(found, functools.partial)):
-        return  # a class says so by being a dataclass with `make`
-    function: Any = getattr(found, "func", found)  # of a partial, what it is one of
     try:
-        says = typing.get_type_hints(function).get("return")
-    except Exception:  # a name that only type checkers import
-        says = getattr(function, "__annotations__", {}).get("return")
-    kind = _attribute(GROUPS[group].makes)
-    said = [
-        typing.get_origin(x) or x
-        for x in (*(typing.get_args(says) if _is_union(says) else ()), says)
-    ]
-    makes = any(
-        issubclass(x, kind)
-        if isinstance(x, type)
-        else isinstance(x, str) and re.search(rf"\b{kind.__name__}\b", x)
-        for x in said
-    )
-    require(
-        makes,
-        group,
-        f"must be a function that says what it makes, -> {kind.__name__}, because not any function "
-        f"is called; got {shortened(name)} {f'-> {says}' if says else 'without'}. Set {group} to a "
-        f"dataclass with make, or annotate the function.",
-    )
+        return operator.attrgetter(attribute)(found)
+    except AttributeError as error:
+        known = vars(found).items()
+        own = [k for k, x in known if callable(x) and getattr(x, "__module__", None) == module]
+        near = nearest(attribute, own)
+        fix = f" Did you mean {group}={module}:{near[0]}?" if near else ""
+        raise ConfigError(
+            f"{group} must name a class or function of {shortened(module, 40)}; got "
+            f"{shortened(attribute, 40)}. There are: {listed(near, 60)}.{fix}",
+            group,
+        ) from error
 
 
 def _as_dataclass(group: str, name: str, found: Any) -> Any:
@@ -756,21 +418,20 @@ def _as_dataclass(group: str, name: str, found: Any) -> Any:
     arguments = GROUPS[group].arguments
     if isinstance(found, type) and dataclasses.is_dataclass(found) and hasattr(found, "make"):
         cls: Any = found
-    elif inspect.isfunction(found) or isinstance(found, functools.partial):
-        cls = _from_function(group, name, found)
     else:
-        raise ConfigError(
-            f"{group} must name a dataclass with make({', '.join(arguments)}), or a function of "
-            f"({', '.join((*arguments, 'option=default, ...'))}); {name} is {shortened(found)}. "
-            f"See docs/howto/own_pieces.md.",
+        require(
+            inspect.isfunction(found) or isinstance(found, functools.partial),
             group,
+            f"must name a dataclass with make({', '.join(arguments)}), or a function; got "
+            f"{shortened(name)}, which is {shortened(found)}. See docs/howto/own_pieces.md.",
         )
+        cls = _from_function(group, name, found)
     base = _attribute(GROUPS[group].base)
     require(
         issubclass(cls, base),
         group,
-        f"must be a subclass of {base.__module__}.{base.__name__}, because that says what it fits; "
-        f"got {shortened(name)}. Set class {cls.__name__}({base.__name__}).",
+        f"must be a subclass of {base.__module__}.{base.__name__}; got {shortened(name)}. Set "
+        f"class {cls.__name__}({base.__name__}).",
     )
     if f"{cls.__module__}:{cls.__qualname__}" != name:
         _NAMES[cls] = name
@@ -780,28 +441,34 @@ def _as_dataclass(group: str, name: str, found: Any) -> Any:
 @functools.cache
 def _from_function(group: str, name: str, function: Callable[..., Any]) -> type:
     """A dataclass whose fields are a function's parameters beyond those that `make` is given."""
+    written: Any = getattr(function, "func", function)  # of a partial, what it is one of
+    arguments, kind = GROUPS[group].arguments, _attribute(GROUPS[group].makes)
+    require(
+        _returns(written, kind),
+        group,
+        f"must be a function that says what it makes, as no other is called; got {shortened(name)} "
+        f"without -> {kind.__name__}. Annotate it, or set {group} to a dataclass with make.",
+    )
     parameters = list(inspect.signature(function).parameters.values())
-    arguments = GROUPS[group].arguments
-    options = parameters[len(arguments) :]
     is_open = any(p.kind in (p.VAR_POSITIONAL, p.VAR_KEYWORD) for p in parameters)
     require(
         len(parameters) >= len(arguments) and not is_open,
         group,
-        f"must take ({', '.join((*arguments, 'option=default, ...'))}), because each option is a "
-        f"field; got {name}{inspect.signature(function)}. Set {group} to such a function.",
+        f"must take ({', '.join((*arguments, 'option=default, ...'))}), each option a field; got "
+        f"{shortened(f'{name}{inspect.signature(function)}')}. Set {group} to such a function.",
     )
+    options = parameters[len(arguments) :]
+    lists = {p.name for p in options if isinstance(p.default, list)}
 
-    def make(self: Any, *given: Any) -> Any:
+    def make(self: object, *given: object) -> Any:
         values = {p.name: getattr(self, p.name) for p in options}
-        as_lists = [p.name for p in options if isinstance(p.default, list)]
-        return function(*given, **values | {name: list(values[name]) for name in as_lists})
+        return function(*given, **{k: list(v) if k in lists else v for k, v in values.items()})
 
-    written = getattr(function, "func", function)  # of a partial, what it is one of
     base = _attribute(GROUPS[group].base)
     cls = dataclasses.make_dataclass(
         written.__name__,
         [_as_field(parameter) for parameter in options],
-        bases=(Options if GROUPS[group].base == "builtins:object" else base,),
+        bases=(base if issubclass(base, Options) else Options,),
         namespace={"make": make, "__doc__": written.__doc__},
         frozen=True,
         kw_only=True,
@@ -810,17 +477,28 @@ def _from_function(group: str, name: str, function: Callable[..., Any]) -> type:
     return cls
 
 
+def _returns(function: Callable[..., Any], kind: type) -> bool:
+    """Whether a function's annotation says that it returns an object of a class."""
+    try:
+        says = typing.get_type_hints(function).get("return")
+    except Exception:  # a name that only type checkers import
+        says = inspect.get_annotations(function).get("return")
+    if isinstance(says, str):
+        return re.search(rf"\b{kind.__name__}\b", says) is not None
+    each = typing.get_args(says) if is_union(says) else (says,)
+    kinds = [typing.get_origin(x) or x for x in each]
+    return any(isinstance(x, type) and issubclass(x, kind) for x in kinds)
+
+
 def _as_field(parameter: inspect.Parameter) -> tuple[str, Any, Any]:
     """A parameter as name, type and field of a dataclass."""
-    unknown = parameter.annotation is inspect.Parameter.empty
-    kind = Any if unknown else parameter.annotation
-    default = parameter.default
+    default, empty = parameter.default, inspect.Parameter.empty
+    kind = Any if parameter.annotation is empty else parameter.annotation
+    if default is empty:
+        return parameter.name, kind, dataclasses.field()
     if default is None:  # which `length: float = None` may be too
         kind = typing.Optional[kind]  # noqa: UP045 (it may be a string)
-    if default is inspect.Parameter.empty:
-        return parameter.name, kind, dataclasses.field()
     if isinstance(default, list):  # a tuple is hashable, so that what it configures is built once
         default = tuple(default)
-        kinds = typing.get_args(kind)
-        kind = tuple[(kinds[0] if kinds else Any), ...]  # type: ignore[misc]
+        kind = tuple[(*typing.get_args(kind), Any)[0], ...]  # type: ignore[misc]
     return parameter.name, kind, dataclasses.field(default=default)

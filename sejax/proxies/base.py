@@ -13,13 +13,14 @@ from typing import Any, NoReturn
 
 import jax
 from flax import struct
-from jaxtyping import Array
+from jaxtyping import Array, PyTree
 
 from sejax.envs.base import Task
 from sejax.envs.environment import Environment, EnvParams
 from sejax.envs.spec import TaskSpec
 from sejax.options import ConfigError, require
 from sejax.proxies import ProxyConfig
+from sejax.proxies.header import Header
 
 
 @struct.dataclass
@@ -45,24 +46,23 @@ class ProxyEnv(Environment, ABC):
       ConfigError: for a configuration that does not derive from `ProxyConfig`.
     """
 
-    def __init__(self, task: Task, config: Any):
+    def __init__(self, task: Task, config: ProxyConfig):
+        name = type(config).__name__
         require(
             isinstance(config, ProxyConfig),
             "proxy",
-            "must be a dataclass that derives from sejax.ProxyConfig, because that declares what "
-            f"is asked of a proxy; got {type(config).__name__}. Set class "
-            f"{type(config).__name__}(sejax.ProxyConfig).",
+            f"must derive from sejax.ProxyConfig; got {name}. Set class {name}(sejax.ProxyConfig).",
         )
         self.spaces = task.observation, task.action
         self.task = task
-        self.config = config
+        self.config: Any = config  # of the class that made it, with its own fields
         self._default_params: Any = None
 
     @abstractmethod
     def init_weights(self, key: Array) -> Any:
         """Random weights, a nested dictionary of float32 arrays."""
 
-    def params(self, weights: Any, discount: Array | float = 1.0) -> Any:
+    def params(self, weights: PyTree, discount: Array | float = 1.0) -> Any:
         """`EnvParams` of the proxy with these weights.
 
         Args:
@@ -72,7 +72,10 @@ class ProxyEnv(Environment, ABC):
         return ProxyParams(weights=weights, max_steps_in_episode=self.max_steps)
 
     def prepare(
-        self, params: Any, discount: Array | float | None, limit_is_terminal: Array | bool = False
+        self,
+        params: PyTree,
+        discount: Array | float | None,
+        limit_is_terminal: Array | bool = False,
     ) -> Any:
         """The same params for the whole training of one agent.
 
@@ -98,7 +101,7 @@ class ProxyEnv(Environment, ABC):
         """Random weights, or those given to `with_default_params`."""
         return self._default_params or self.params(self.init_weights(jax.random.key(0)))
 
-    def with_default_params(self, params: Any) -> "ProxyEnv":
+    def with_default_params(self, params: PyTree) -> "ProxyEnv":
         """A copy for callers that rely on `default_params`, such as `gymnax.make`."""
         env = copy.copy(self)
         env._default_params = params
@@ -109,17 +112,19 @@ class ProxyEnv(Environment, ABC):
         return f"{type(self).__name__.removesuffix('Env')}-{self.task.name}"
 
 
-def is_real(env: Any) -> bool:
+def is_real(env: Environment) -> bool:
     """Whether steps in an environment are steps of a real task."""
     return not isinstance(env, ProxyEnv) or env.is_real
 
 
-def episode_limit(env: Any) -> int | None:
+def episode_limit(env: Environment) -> int | None:
     """Steps that an episode cannot exceed; None where only the params tell."""
     return env.max_steps if isinstance(env, ProxyEnv) else None
 
 
-def prepare(env: Any, params: Any, discount: Array | float | None, limit_is_terminal: bool) -> Any:
+def prepare(
+    env: Environment, params: PyTree, discount: Array | float | None, limit_is_terminal: bool
+) -> Any:
     """An environment's params for the whole training of one agent; see `ProxyEnv.prepare`."""
     if not isinstance(env, ProxyEnv):
         return params
@@ -137,17 +142,17 @@ class AbsentEnv(Environment):
     """
 
     def __init__(self, task_name: str, spec: TaskSpec, reason: str):
+        super().__init__(spec)
         self._task_name, self._reason = task_name, reason
-        self.spaces = spec.observation, spec.action
 
     def fail(self) -> NoReturn:
         """Raises the reason as a `ConfigError`."""
         raise ConfigError(self._reason, "task")
 
-    def reset_env(self, key: Any, params: Any) -> NoReturn:
+    def reset_env(self, key: Array, params: PyTree) -> NoReturn:
         self.fail()
 
-    def step_env(self, key: Any, state: Any, action: Any, params: Any) -> NoReturn:
+    def step_env(self, key: Array, state: PyTree, action: Array, params: PyTree) -> NoReturn:
         self.fail()
 
     @property
@@ -155,16 +160,15 @@ class AbsentEnv(Environment):
         return self._task_name
 
 
-def absent_task(name: str, interface: dict[str, Any], origin: dict[str, Any], reason: str) -> Task:
+def absent_task(header: Header, reason: str) -> Task:
     """A task of which no more is known than what a proxy's file says; built once.
 
     Args:
-      name: of the task.
-      interface: see `TaskSpec.interface`.
-      origin: see `Task`, for files that are written of it.
+      header: of the file.
       reason: why the task itself cannot be made.
     """
-    return _absent_task(name, json.dumps([interface, origin], sort_keys=True), reason)
+    known = json.dumps([header.interface, header.config["env"]], sort_keys=True)
+    return _absent_task(header.task, known, reason)
 
 
 @functools.cache

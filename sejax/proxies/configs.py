@@ -6,15 +6,16 @@ they load JAX.
 """
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, ClassVar, NamedTuple, TypeVar
 
 import numpy as np
 
 from sejax.envs.base import Task
-from sejax.envs.spec import TaskSpec
+from sejax.envs.spec import Box, TaskSpec
 from sejax.options import (
     ACTIVATIONS,
     MOST_LAYERS,
+    as_text,
     counts,
     one_of,
     option,
@@ -25,12 +26,16 @@ from sejax.options import (
 from sejax.proxies import MAX_ABS_VALUE, ProxyConfig
 
 if TYPE_CHECKING:
+    from jax import Array
+
     from sejax.proxies.base import ProxyEnv
 
 DONE_MODES = ("soft", "threshold", "bernoulli", "sigmoid")
 INITIAL_STATES = ("real", "learned", "noise")
 STATE_UNITS = ("raw", "bounds")
 START_HIDDEN_SIZE = 32  # of the network that makes initial states
+
+Vector = TypeVar("Vector", np.ndarray, "Array")
 
 
 class Units(NamedTuple):
@@ -44,11 +49,11 @@ class Units(NamedTuple):
     middle: np.ndarray
     one: np.ndarray
 
-    def encode(self, vector: Any) -> Any:
+    def encode(self, vector: Vector) -> Vector:
         """States `[*batch, obs_dim]` in these units; of NumPy or JAX."""
         return (vector - self.middle) / self.one
 
-    def decode(self, vector: Any) -> Any:
+    def decode(self, vector: Vector) -> Vector:
         """Inverse of `encode`."""
         return vector * self.one + self.middle
 
@@ -87,8 +92,8 @@ class SyntheticConfig(ProxyConfig):
         require(
             self.horizon != 1 or self.horizon_is_terminal,
             "proxy.horizon_is_terminal",
-            "must be true with proxy.horizon=1, because there is no next state to bootstrap with; "
-            "got false. Set proxy.horizon_is_terminal=true.",
+            "must be true with proxy.horizon=1, which has no next state; got false. Set "
+            "proxy.horizon_is_terminal=true.",
         )
 
     @property
@@ -131,22 +136,19 @@ class SyntheticConfig(ProxyConfig):
             networks["start"] = [obs_dim, START_HIDDEN_SIZE, obs_dim]
         return networks
 
-    def units(self, space: Any) -> Units | None:
-        """Units of states in a box, gymnax's or Gymnasium's; None for the task's own.
+    def units(self, space: Box) -> Units | None:
+        """Units of states in a box; None for the task's own.
 
         An entry without bounds keeps its own unit; some spaces write "none" as a huge number.
 
         Example:
-          >>> from gymnasium.spaces import Box
-          >>> space = Box(np.float32([-1.5, -np.inf]), np.float32([0.5, np.inf]))
+          >>> space = Box(low=(-1.5, -np.inf), high=(0.5, np.inf))
           >>> SyntheticConfig(state_units="bounds").units(space)
           Units(middle=array([-0.5,  0. ], dtype=float32), one=array([0.5, 1. ], dtype=float32))
         """
         if self.state_units == "raw":
             return None
-        low, high = (
-            np.broadcast_to(np.asarray(x, np.float32), space.shape) for x in (space.low, space.high)
-        )
+        low, high = (np.asarray(x, np.float32) for x in (space.low, space.high))
         bounded = (np.abs(low) < MAX_ABS_VALUE) & (np.abs(high) < MAX_ABS_VALUE)
         low, high = np.where(bounded, low, -2), np.where(bounded, high, 2)
         return Units(
@@ -194,7 +196,7 @@ class RewardConfig(ProxyConfig):
     default_objective: ClassVar[str] = "reward_threshold"
     has_real_dynamics: ClassVar[bool] = True
 
-    hidden_size: int = option(128, counts("a layer needs a unit"))
+    hidden_size: int = option(64, counts("a layer needs a unit"))
     num_layers: int = option(1, counts("there is a hidden layer", most=MOST_LAYERS))
     activation: str = option("prelu", one_of(ACTIVATIONS))
     variant: str = option("additive_potential", one_of(VARIANTS))
@@ -206,18 +208,14 @@ class RewardConfig(ProxyConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name, default in (
-            ("output_scale", 1),
-            ("augmented", False),
-            ("zero_at_terminal", False),
-        ):
+        defaults = {"output_scale": 1.0, "augmented": False, "zero_at_terminal": False}
+        for name, default in defaults.items():
             value = getattr(self, name)
             require(
                 value == default or not self.shaping.weighs_info,
                 f"proxy.{name}",
-                f"must be {str(default).lower()} with weighted info, because {self.variant} has no "
-                f"network; got {shortened(str(value).lower())}. Set "
-                f"proxy.{name}={str(default).lower()}.",
+                f"must be {as_text(default)}, as {self.variant} has no network; got "
+                f"{shortened(value)}. Set proxy.{name}={as_text(default)}.",
             )
 
     @property
@@ -244,8 +242,8 @@ class RewardConfig(ProxyConfig):
             require(
                 is_there or not is_needed,
                 f"proxy.{name}",
-                f"must do without {value} in {task_name}, because its steps tell nothing of the "
-                f"state beside the observation; got {shortened(value)}. Set proxy.{name}={fix}.",
+                f"must do without a step's info in {shortened(task_name)}, which tells nothing of "
+                f"the state; got {value}. Set proxy.{name}={fix}.",
             )
 
     def make(self, task: Task) -> "ProxyEnv":

@@ -10,17 +10,28 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from sejax.envs.spec import Box, Space, TaskSpec
 from sejax.ops.checksummed import DamagedError, pack, unpack
-from sejax.options import LARGEST, ConfigError, registry, require, shortened, unknown_name
+from sejax.options import (
+    LARGEST,
+    ConfigError,
+    is_number,
+    registry,
+    require,
+    shortened,
+    unknown_name,
+)
+from sejax.options.plain import from_plain
 from sejax.proxies import hub
 
 FORMAT_VERSION = 2
 PRETRAINED_DIR = Path(__file__).parents[1] / "pretrained"
 _KEY = "sejax"  # of the metadata's entry
+_LARGEST_FLOAT = float(np.finfo(np.float32).max)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,7 +48,7 @@ class Header:
       proxies: a record of each proxy, such as its score, generation and seed.
 
     Raises:
-      ValueError, LookupError or TypeError: for values that cannot be those of a file.
+      ValueError, LookupError, TypeError or ArithmeticError: for values that no file has.
     """
 
     format_version: int
@@ -56,37 +67,63 @@ class Header:
         if not self.proxies or not all(isinstance(record, Mapping) for record in self.proxies):
             raise ValueError("no records")
         for record in self.proxies:
-            for name in ("score", "generation", "seed"):
-                float(record.get(name, 0))
+            numbers = [record[name] for name in ("score", "generation", "seed") if name in record]
+            numbers += dict(record.get("scores", {})).values()
+            if not all(map(is_number, numbers)):
+                raise ValueError("a record without numbers")
+            np.array(numbers, float)  # OverflowError for one that is too large
         if not 0 <= self.discount <= 1:
             raise ValueError("a discount outside of [0, 1]")
-        _check_interface(self.interface)
+        spec = self.spec
+        if not (
+            _is_count(spec.max_steps) and _is_space(spec.observation) and _is_space(spec.action)
+        ):
+            raise ValueError("a space or step limit that no task has")
+
+    @property
+    def spec(self) -> TaskSpec:
+        """The task's spaces and step limit."""
+        return TaskSpec.of_interface(self.interface)
 
     @property
     def kind(self) -> str:
         """Name of the proxy's configuration: se, rn, or one of a package or module."""
         return str(self.config["proxy"].get("name"))
 
-    @property
-    def task_kind(self) -> str:
-        """Name of the task's configuration."""
-        return str(self.config["env"].get("name"))
 
-    @property
-    def agents(self) -> dict[str, Any]:
-        """Plain values of the agents that the proxies were learned with, by their keys."""
-        return agents_of(self.config)
+class Stored(NamedTuple):
+    """What a file holds.
 
-    def with_tensors(self, tensors: dict[str, np.ndarray]) -> bytes:
-        """The content of a file with this header.
+    Attributes:
+      path: the file.
+      tensors: by `network/layer/parameter`; kernels `[out, in]`, biases `[out]`.
+      header: its metadata.
+    """
 
-        Args:
-          tensors: float32 arrays by `network/layer/parameter`.
+    path: Path
+    tensors: dict[str, np.ndarray]
+    header: Header
 
-        Raises:
-          TypeError or ValueError: if the header's values are not plain.
-        """
-        return pack(tensors, _KEY, vars(self))
+
+def _is_count(number: object) -> bool:
+    return type(number) is int and 0 < number <= LARGEST
+
+
+def _is_space(space: Space) -> bool:
+    """Whether a space has entries, and bounds of single precision in their order."""
+    if not isinstance(space, Box):
+        return _is_count(space.n)
+    pairs = list(zip(space.low, space.high, strict=True))
+    are_floats = all(math.isinf(x) or abs(x) <= _LARGEST_FLOAT for pair in pairs for x in pair)
+    are_ordered = all(low <= high and low < math.inf and high > -math.inf for low, high in pairs)
+    return bool(pairs) and are_floats and are_ordered
+
+
+def is_same_space(one: Space, other: Space, with_bounds: bool = True) -> bool:
+    """Whether two spaces are the same but for rounding."""
+    if not (isinstance(one, Box) and isinstance(other, Box) and one.size == other.size):
+        return one == other
+    return not with_bounds or np.allclose([one.low, one.high], [other.low, other.high])
 
 
 def agents_of(config: Mapping[str, Any]) -> dict[str, Any]:
@@ -102,26 +139,9 @@ def agents_of(config: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def is_registered(group: str, stored: Any) -> bool:
+def is_registered(group: str, stored: object) -> bool:
     """Whether plain values name what sejax or an installed package has registered."""
     return isinstance(stored, Mapping) and registry.is_registered(group, str(stored.get("name")))
-
-
-def _check_interface(interface: Mapping[str, Any]) -> None:
-    """Raises an error for plain values that are not `Task.interface`."""
-    counts = [interface["max_steps"]]
-    for space in (interface["observation"], interface["action"]):
-        if "n" in space:
-            counts.append(space["n"])
-            continue
-        low, high = space["low"], space["high"]
-        are_numbers = all(x is None or math.isfinite(x) for x in (*low, *high))
-        if not (are_numbers and len(low) == len(high) > 0):
-            raise ValueError("a space of vectors without bounds")
-        if any(None not in pair and pair[0] > pair[1] for pair in zip(low, high, strict=True)):
-            raise ValueError("a space whose bounds are in the wrong order")
-    if not all(type(count) is int and 0 < count <= LARGEST for count in counts):
-        raise ValueError("a space or step limit that is not a whole number above 0")
 
 
 # --- where a file is ------------------------------------------------------------------------------
@@ -145,104 +165,77 @@ def find(source: str | Path, option: str = "source", also: Sequence[str] = ()) -
     """
     if hub.is_address(source):
         return hub.fetch(str(source), option)
-    text = shortened(source, 120)
+    text = shortened(source)
     try:
         path = Path(source)
-        is_dir, is_file = path.is_dir(), path.is_file()
+        is_run = path.is_dir()
+        file = path / hub.FILE if is_run else path
+        if file.is_file():
+            return file
     except (OSError, ValueError, TypeError) as error:
-        raise ConfigError(
-            f"{option} must be a path or a name; got {text} ({type(error).__name__}).", option
-        ) from None
-    if is_dir:
-        stored = path / hub.FILE
-        is_run = (path / "config.yaml").exists()
-        require(
-            stored.exists(),
-            option,
-            f"must be a run directory with a {hub.FILE}, because "
-            f"{'the run has not finished a generation yet' if is_run else 'it is no run'}; "
-            f"got {shortened(text)}. Set {option} to a run directory or a file.",
-        )
-        return stored
-    if is_file:
-        return path
-    if path.suffix or len(path.parts) != 1:
-        raise ConfigError(
-            f"{option} must be a run directory, a safetensors file, a shipped name or an address "
-            f"hf://USER/REPO; got {text}, which does not exist.",
-            option,
-        )
-    shipped = PRETRAINED_DIR / f"{source}.safetensors"
-    if shipped.is_file():
-        return shipped
-    raise unknown_name(option, shortened(source, 80), [*pretrained_names(), *also])
+        message = f"{option} must be a path or a name; got {text} ({type(error).__name__})."
+        raise ConfigError(message, option) from None
+    reason = "no generation has ended yet" if (path / "config.yaml").exists() else "it is no run"
+    require(
+        not is_run, option, f"must be a run directory with a {hub.FILE}; got {text} ({reason})."
+    )
+    require(
+        not path.suffix and len(path.parts) == 1,
+        option,
+        "must be a run directory, a safetensors file, a shipped name or hf://USER/REPO; got "
+        f"{text}, which does not exist.",
+    )
+    names = pretrained_names()
+    if str(source) not in names:
+        raise unknown_name(option, text, [*names, *also])
+    return PRETRAINED_DIR / f"{source}.safetensors"
 
 
 # --- reading and writing --------------------------------------------------------------------------
 
 
 def read(
-    source: str | Path, option: str = "source", kinds: Sequence[str] = ()
-) -> tuple[dict[str, np.ndarray], Header]:
+    source: str | Path, option: str = "source", kinds: Sequence[str] = (), single: bool = False
+) -> Stored:
     """Tensors and header of a file, whose checksum is verified.
 
     Args:
       source: as of `find`.
       option: name of the argument, for messages.
       kinds: kinds of proxies, one of which it must hold; empty for any.
+      single: whether it must hold one proxy.
 
     Raises:
       ConfigError: if there is no such file, it is damaged, too large or of another format, or it
-        holds proxies of another kind.
+        holds a set or proxies of another kind.
     """
     path = find(source, option)
+    where = shortened(path, 60)
     try:
         size = path.stat().st_size
         if size > hub.MAX_BYTES:
             raise DamagedError(f"it has {size:,} bytes, and the largest proxies have fewer")
-        tensors, stored = unpack(path.read_bytes(), _KEY)
-        header = registry.from_plain(Header, stored, "header")
+        tensors, plain = unpack(path.read_bytes(), _KEY)
+        header = from_plain(Header, plain, "header")
     except (OSError, LookupError, ValueError, TypeError, ArithmeticError) as error:
         raise ConfigError(
-            f"{option} must be a proxy's file as sejax writes it; got {shortened(path, 80)}, which "
-            f"is damaged or of another format ({shortened(error, 60)}). The run writes it again.",
+            f"{option} must be a proxy's file as sejax writes it; got {where}, which is damaged or "
+            f"of another format ({shortened(error, 60)}). The run writes it again.",
             option,
         ) from error
     require(
         not kinds or header.kind in kinds,
         option,
-        f"must be a proxy of the kind {shortened(' or '.join(map(str, kinds)), 40)}, because "
-        f"others are not read here; got proxy={shortened(header.kind, 40)} in "
-        f"{shortened(path, 80)}. Set {option} to such a proxy.",
+        f"must be a proxy of the kind {shortened(' or '.join(map(str, kinds)), 40)}; got "
+        f"proxy={shortened(header.kind, 40)} in {where}.",
     )
-    return tensors, header
-
-
-def read_single(
-    source: str | Path, kinds: Sequence[str] = ()
-) -> tuple[dict[str, np.ndarray], Header]:
-    """As `read`, of a file that must hold one proxy.
-
-    Raises:
-      ConfigError: as `read`, or if it holds a set.
-    """
-    tensors, header = read(source, kinds=kinds)
-    require_single(len(header.proxies), source)
-    return tensors, header
-
-
-def require_single(count: int, source: Any, option: str = "source") -> None:
-    """Checks that a file holds one proxy.
-
-    Raises:
-      ConfigError: if it holds a set.
-    """
+    count = len(header.proxies)
     require(
-        count == 1,
+        not single or count == 1,
         option,
-        f"must be a single proxy, because an agent trains in one environment; got a set of {count} "
-        f"in {shortened(source, 80)}. Set {option} to a run directory; sejax.load_set reads sets.",
+        f"must be a single proxy; got a set of {count} in {where}. sejax.load_set reads sets.",
     )
+    return Stored(path, tensors, header)
 
 
 def read_config(source: str | Path, option: str = "source") -> dict[str, Any]:
@@ -251,7 +244,16 @@ def read_config(source: str | Path, option: str = "source") -> dict[str, Any]:
     Raises:
       ConfigError: as `read`.
     """
-    return read(source, option)[1].config
+    return read(source, option).header.config
+
+
+def packed(tensors: dict[str, np.ndarray], header: Header) -> bytes:
+    """The content of a file.
+
+    Raises:
+      TypeError or ValueError: if the header's values are not plain.
+    """
+    return pack(tensors, _KEY, vars(header))
 
 
 def check_tensors(
@@ -272,16 +274,11 @@ def check_tensors(
       ConfigError: for other names, shapes or types, or numbers that are not finite.
     """
     there = {name: x.shape for name, x in tensors.items()}
-    odd = [
-        f"numbers that are not finite float32 in {name}"
-        for name, x in tensors.items()
-        if x.dtype != np.float32 or not np.isfinite(x).all()
-    ]
+    odd = [n for n, x in tensors.items() if x.dtype != np.float32 or not np.isfinite(x).all()]
+    got = f"others in {odd[0]}" if odd and there == shapes else f"the shapes {there}"
     require(
         there == shapes and not odd,
         field,
-        f"must hold finite float32 tensors of the shapes {shortened(shapes, 60)}, because the "
-        "proxy's configuration describes such networks; got "
-        f"{shortened(shortened(odd[0] if odd and there == shapes else there, 60))}. Set {field} to "
-        f"{fix}.",
+        f"must hold finite float32 tensors of the shapes {shortened(shapes, 60)}; got "
+        f"{shortened(got, 60)}. Set {field} to {fix}.",
     )

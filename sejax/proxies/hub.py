@@ -7,10 +7,11 @@ serves without a network.
 """
 
 import contextlib
+import functools
 import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from sejax.options import ConfigError, require, shortened, told
 
@@ -58,8 +59,8 @@ def parse(address: str, option: str = "source") -> Address:
     found = _ADDRESS.fullmatch(address) if len(address) < 500 else None
     if found is None:
         raise ConfigError(
-            f"{option} must be hf://USER/REPO or hf://USER/REPO@REVISION, either with "
-            f"/FILE.safetensors; got {shortened(address, 80)}. Set {option}=hf://USER/REPO.",
+            f"{option} must be hf://USER/REPO[@REVISION][/FILE.safetensors]; got "
+            f"{shortened(address)}.",
             option,
         )
     return Address(found["repo"], found["revision"], found["file"] or FILE)
@@ -80,30 +81,26 @@ def fetch(address: str, option: str = "source") -> Path:
     with _explained(option, address):
         from huggingface_hub import hf_hub_download
 
-        info = hf_hub_download(place.repo, place.file, revision=place.revision, dry_run=True)
-        size: int | None = info.file_size
+        download = functools.partial(
+            hf_hub_download, place.repo, place.file, revision=place.revision
+        )
+        size: int | None = download(dry_run=True).file_size
         require(
             size is not None and size <= MAX_BYTES,
             option,
-            f"must have at most {MAX_BYTES:,} bytes, because no proxy is larger; got "
-            f"{'an unknown number of' if size is None else f'{size:,}'} bytes at {address}. Set "
-            f"{option} to a proxy.",
+            f"must have at most {MAX_BYTES:,} bytes; got {size} bytes at {address}.",
         )
-        return Path(hf_hub_download(place.repo, place.file, revision=place.revision))
+        return Path(download())
 
 
-def require_repo(repo: Any) -> None:
+def require_repo(repo: object) -> None:
     """Checks the name of a repository.
 
     Raises:
       ConfigError: if it is not `USER/REPO`.
     """
-    require(
-        isinstance(repo, str) and re.fullmatch(_REPO, repo, re.ASCII),
-        "repo",
-        "must be USER/REPO, because that is how the Hub names repositories; got "
-        f"{shortened(shortened(repo, 80))}. Set repo='USER/REPO'.",
-    )
+    is_name = isinstance(repo, str) and re.fullmatch(_REPO, repo, re.ASCII)
+    require(is_name, "repo", f"must be USER/REPO on the Hub; got {shortened(repo)}.")
 
 
 def upload(repo: str, files: Mapping[str, bytes], message: str, private: bool) -> None:
@@ -127,47 +124,42 @@ def upload(repo: str, files: Mapping[str, bytes], message: str, private: bool) -
         api.create_commit(repo, additions, commit_message=message)
 
 
+# What to say of an error of `huggingface_hub`, or of the nearest of its base classes.
+_REASONS = {
+    "GatedRepoError": "its owner gives access on request. Ask there, then hf auth login",
+    "RepositoryNotFoundError": "there is no such repository, or it is private. Check its name, or "
+    "log in with hf auth login",
+    "RevisionNotFoundError": "the repository has no such revision. Leave it out for the newest",
+    "RemoteEntryNotFoundError": "the repository has no such file. Name one: "
+    "hf://USER/REPO/FILE.safetensors",
+    "LocalEntryNotFoundError": "the Hub cannot be reached, and no copy is here. Connect to the "
+    "network, or load a file",
+}
+
+
 @contextlib.contextmanager
 def _explained(option: str, place: str) -> Iterator[None]:
     """Turns whatever `huggingface_hub` raises into one message."""
+    place = shortened(place, 60)
     try:
         yield
     except ConfigError:
         raise
-    except ImportError as error:
-        raise ConfigError(
-            f"{option} needs huggingface_hub, because it is on the Hugging Face Hub; got {place} "
-            f"({error}). Install it with pip install 'sejax[hub]'.",
-            option,
-        ) from error
     except Exception as error:  # the HTTP library's too, which differs between its versions
-        raise ConfigError(
-            f"{option} must be within reach on the Hugging Face Hub; got {place}: "
-            f"{_reason(error)}.",
-            option,
-        ) from error
+        message = f"{option} must be within reach on the Hub; got {place}: {_reason(error)}."
+        raise ConfigError(message, option) from error
 
 
-def _reason(error: Any) -> str:
+def _reason(error: Exception) -> str:
     """What is wrong, and what to do about it."""
-    from huggingface_hub import errors
+    if isinstance(error, ImportError):
+        return f"{error}. Install it with pip install 'sejax[hub]'"
+    from huggingface_hub.errors import HfHubHTTPError
 
-    reasons = {  # the first that fits: a gated repository is also one that is not found
-        errors.GatedRepoError: "its owner gives access on request. Ask there, then hf auth login",
-        errors.RepositoryNotFoundError: "there is no such repository, or it is private. Check its "
-        "name, or log in with hf auth login",
-        errors.RevisionNotFoundError: "the repository has no such revision. Leave it out for the "
-        "newest",
-        errors.RemoteEntryNotFoundError: "the repository has no such file. Name one: "
-        "hf://USER/REPO/FILE.safetensors",
-        errors.LocalEntryNotFoundError: "the Hub cannot be reached, and no copy is here. Connect "
-        "to the network, or load a file",
-    }
-    for kind, reason in reasons.items():
-        if isinstance(error, kind):
-            return reason
-    response = getattr(error, "response", None)  # only errors of HTTP have one
-    status = response.status_code if response is not None else None
+    for kind in type(error).__mro__:
+        if kind.__name__ in _REASONS:
+            return _REASONS[kind.__name__]
+    status = error.response.status_code if isinstance(error, HfHubHTTPError) else None
     if status in (401, 403):
         return f"you may not do that (HTTP {status}). Log in with hf auth login and a write token"
-    return f"{told(error)}. Try again, or work with a local file"
+    return f"{shortened(told(error), 100)}. Try again, or work with a local file"

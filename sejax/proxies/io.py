@@ -10,28 +10,19 @@ from typing import Any, overload
 import jax
 import numpy as np
 from flax.traverse_util import flatten_dict, unflatten_dict
+from jaxtyping import PyTree
 
 from sejax import envs
 from sejax.envs.base import Task
 from sejax.ops.files import write_bytes
-from sejax.options import ConfigError, one_of, registry, require, shortened, told
-from sejax.proxies import ProxyConfig
+from sejax.options import ConfigError, as_python, one_of, registry, require, shortened, told
+from sejax.proxies import ProxyConfig, header
 from sejax.proxies.base import ProxyEnv, absent_task, require_present
-from sejax.proxies.header import (
-    FORMAT_VERSION,
-    Header,
-    agents_of,
-    check_tensors,
-    find,
-    is_registered,
-    pretrained_names,
-    read,
-    require_single,
-)
+from sejax.proxies.header import Header, Stored, agents_of, check_tensors, is_same_space
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Stored:
+class _Loaded:
     """What is common to a stored proxy and a set of them.
 
     Attributes:
@@ -84,20 +75,19 @@ class _Stored:
         stored = agents_of(self.config)
         return {key: self._configured("agent", values) for key, values in stored.items()}
 
-    def _configured(self, group: str, stored: Any) -> Any:
+    def _configured(self, group: str, stored: object) -> Any:
+        name = stored.get("name") if isinstance(stored, Mapping) else "none"
         require(
-            is_registered(group, stored),
+            header.is_registered(group, stored),
             group,
-            f"must be given for {shortened(self.path.name, 60)}, because the file names no "
-            f"registered {group}, and what a file names is never imported; got "
-            f"{shortened(stored.get('name'), 60) if isinstance(stored, Mapping) else 'none'}. "
-            f"Set {group} to one of your own.",
+            f"must be a registered one in {shortened(self.path.name, 60)}, because what a file "
+            f"names is never imported; got {shortened(name, 60)}. Set {group} to one of your own.",
         )
-        return registry.configure(group, stored)
+        return registry.configure(group, stored)  # type: ignore[arg-type]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Proxy(_Stored):
+class Proxy(_Loaded):
     """A stored proxy.
 
     Attributes:
@@ -121,7 +111,7 @@ class Proxy(_Stored):
 
 
 @dataclass(frozen=True, kw_only=True)
-class ProxySet(_Stored):
+class ProxySet(_Loaded):
     """Proxies that share a configuration, and hence every compiled program.
 
     `proxies[i]` is a `Proxy`; a slice, indices or a mask give a smaller set, as with NumPy.
@@ -189,10 +179,9 @@ def stored_config(proxy: Proxy | ProxySet) -> dict[str, Any]:
       ConfigError: for an argument of another type.
     """
     require(
-        isinstance(proxy, _Stored),
+        isinstance(proxy, _Loaded),
         "proxy",
-        "must be a stored one, because its file tells what it was learned with; got "
-        f"{type(proxy).__name__}. Set proxy=sejax.load_proxy(source).",
+        f"must be a stored one; got {type(proxy).__name__}. Set proxy=sejax.load_proxy(source).",
     )
     return proxy.config
 
@@ -203,7 +192,7 @@ def stored_config(proxy: Proxy | ProxySet) -> dict[str, Any]:
 def save(
     path: str | Path,
     env: ProxyEnv,
-    weights: Any,
+    weights: PyTree,
     config: Mapping[str, Any] | None = None,
     discount: float | None = None,
     **record: Any,
@@ -233,7 +222,7 @@ def save(
       >>> load_proxy(path).record
       {'score': 195.0}
     """
-    _write(path, env, _checked_tensors(env, weights), config, discount, [record], is_set=False)
+    _write(path, env, [weights], [record], config, discount, is_set=False)
 
 
 def save_set(
@@ -254,79 +243,85 @@ def save_set(
     require(
         are_lists and len(weights) == len(records) > 0,
         "records",
-        f"must be one for each proxy, because they say which is which; got "
+        "must be one for each proxy; got "
         f"{f'{len(records)} for {len(weights)}' if are_lists else 'others than lists'}. "
-        f"Set records=[{{}}] * len(weights).",
+        "Set records=[{}] * len(weights).",
     )
-    each = [_checked_tensors(env, one) for one in weights]
-    tensors = {name: np.stack([one[name] for one in each]) for name in each[0]}
-    _write(path, env, tensors, config, discount, records, is_set=True)
-
-
-def _checked_tensors(env: ProxyEnv, weights: Any) -> dict[str, np.ndarray]:
-    """The weights of one proxy by `network/layer/parameter`, float32."""
-    require(
-        isinstance(env, ProxyEnv),
-        "env",
-        "must be a sejax.ProxyEnv, because a file says how it is made again; got "
-        f"{type(env).__name__}. Set env to the first of the pair that sejax.load "
-        "returns.",
-    )
-    flat = _flatten(weights) if isinstance(weights, Mapping) else {"": np.zeros(0)}
-    tensors = {name: np.asarray(x, np.float32) for name, x in flat.items()}
-    check_tensors("weights", tensors, _shapes_of(env), "params.weights")
-    return tensors
+    _write(path, env, weights, records, config, discount, is_set=True)
 
 
 def _write(
     path: str | Path,
     env: ProxyEnv,
-    tensors: dict[str, np.ndarray],
+    weights: Sequence[Any],
+    records: Sequence[Mapping[str, Any]],
     config: Mapping[str, Any] | None,
     discount: float | None,
-    records: Sequence[Mapping[str, Any]],
     is_set: bool,
 ) -> None:
     require(
+        isinstance(env, ProxyEnv),
+        "env",
+        f"must be a sejax.ProxyEnv; got {type(env).__name__}. Set env, _ = sejax.load(source).",
+    )
+    require(
         discount is not None or not env.config.needs_discount,
         "discount",
-        "must be given for a potential-based reward network, because its reward is made with it; "
-        f"got {shortened(discount)}. Set discount=params.discount, that of the agent.",
+        "must be given for a potential-based reward network; got None. Set "
+        "discount=params.discount, that of the agent.",
     )
+    each = [_tensors_of(env, one) for one in weights]
+    tensors = {name: np.stack([one[name] for one in each]) for name in each[0]}
     known = {
         "env": env.task.origin or {"name": env.task.name},
         "proxy": registry.describe("proxy", env.config),
     }
     try:
-        header = Header(
-            format_version=FORMAT_VERSION,
+        stored = Header(
+            format_version=header.FORMAT_VERSION,
             task=env.task.name,
             interface=env.task.interface,
             config={**known, **(config or {}), "run_dir": None},  # no path of a machine
             discount=1.0 if discount is None else float(discount),
             is_set=is_set,
-            proxies=[{name: _plain(x) for name, x in record.items()} for record in records],
+            proxies=[{name: as_python(x) for name, x in record.items()} for record in records],
         )
-        data = header.with_tensors(tensors)
+        data = header.packed(tensors if is_set else each[0], stored)
     except (LookupError, ValueError, TypeError, AttributeError) as error:
         raise ConfigError(
-            f"config, discount and record must be plain values that sejax.load takes, because they "
-            f"are kept beside the weights; got {shortened(told(error), 60)}. Give numbers for "
-            f"score, generation and seed, and sejax.config(...).plain() for config.",
+            "config, discount and record must be plain values that sejax.load takes; got "
+            f"{shortened(told(error), 60)}. Set numbers for score, generation and seed, and "
+            "sejax.config(...).plain() for config.",
             "config",
         ) from error
     write_bytes(Path(path), data)
 
 
-def _plain(value: Any) -> Any:
-    """A number for an array of one, such as a result's score."""
-    return value.item() if hasattr(value, "dtype") and np.ndim(value) == 0 else value
+def _tensors_of(env: ProxyEnv, weights: PyTree) -> dict[str, np.ndarray]:
+    """The weights of one proxy by `network/layer/parameter`, float32."""
+    flat = _flatten(weights) if isinstance(weights, Mapping) else {}
+    tensors = {name: np.asarray(x, np.float32) for name, x in flat.items()}
+    check_tensors("weights", tensors, _shapes_of(env), "params.weights")
+    return tensors
+
+
+def _flatten(weights: PyTree) -> dict[str, Any]:
+    """Nested weights by `network/layer/parameter`."""
+    return flatten_dict(weights, sep="/")
+
+
+def _shapes_of(env: ProxyEnv) -> dict[str, tuple[int, ...]]:
+    """Shape of each of a proxy's weights."""
+    weights = jax.eval_shape(env.init_weights, jax.random.key(0))
+    return {name: x.shape for name, x in _flatten(weights).items()}
 
 
 # --- reading --------------------------------------------------------------------------------------
 
 
-def load(source: str | Path, task: Task | None = None, proxy: Any = None) -> tuple[ProxyEnv, Any]:
+def load(
+    source: str | Path, task: Task | None = None, proxy: ProxyConfig | None = None
+) -> tuple[ProxyEnv, Any]:
     """Loads a proxy as a gymnax environment and its params (the weights).
 
     The discount of a potential-based RN is that of the agent it was learned with. For another one
@@ -361,7 +356,10 @@ def load(source: str | Path, task: Task | None = None, proxy: Any = None) -> tup
 
 
 def load_proxy(
-    source: str | Path, task: Task | None = None, proxy: Any = None, option: str = "source"
+    source: str | Path,
+    task: Task | None = None,
+    proxy: ProxyConfig | None = None,
+    option: str = "source",
 ) -> Proxy:
     """As `load`, with the real task, the configuration and the record.
 
@@ -371,15 +369,13 @@ def load_proxy(
       proxy: as of `load`.
       option: name of `source` in messages.
     """
-    proxies = load_set(source, task, proxy, option)
-    require_single(len(proxies), proxies.path, option)
-    return proxies[0]
+    return _proxies_of(header.read(source, option, single=True), task, proxy, option)[0]
 
 
 def load_set(
     source: str | Path,
     task: Task | None = None,
-    proxy: Any = None,
+    proxy: ProxyConfig | None = None,
     option: str = "source",
     kind: str | None = None,
 ) -> ProxySet:
@@ -400,118 +396,92 @@ def load_set(
       >>> len(rns), rns[0].params.discount
       (1, 0.8)
     """
-    path = find(source, option)
-    tensors, header = read(path, option, () if kind is None else (kind,))
-    env = _env_of(path, header, task, proxy, option)
-    if not header.is_set:
+    stored = header.read(source, option, () if kind is None else (kind,))
+    return _proxies_of(stored, task, proxy, option)
+
+
+def _proxies_of(
+    stored: Stored, task: Task | None, proxy: ProxyConfig | None, option: str
+) -> ProxySet:
+    env = _env_of(stored, task, proxy, option)
+    found, tensors = stored.header, stored.tensors
+    if not found.is_set:
         tensors = {name: x[None] for name, x in tensors.items()}
-    shapes = {name: (len(header.proxies), *shape) for name, shape in _shapes_of(env).items()}
+    shapes = {name: (len(found.proxies), *shape) for name, shape in _shapes_of(env).items()}
     check_tensors(option, tensors, shapes, "a file that sejax has written")
     return ProxySet(
         env=env,
         weights=unflatten_dict(tensors, sep="/"),
-        records=tuple(header.proxies),
-        config=header.config,
-        discount=header.discount,
-        path=path,
+        records=tuple(found.proxies),
+        config=found.config,
+        discount=found.discount,
+        path=stored.path,
     )
 
 
-def _env_of(path: Path, header: Header, task: Any, proxy: Any, option: str) -> ProxyEnv:
-    """The environment that a file's metadata describes; task and configuration may be given."""
-    for name, given, kind, fix in (
-        ("task", task, Task, "task=sejax.envs.make(NAME)"),
-        ("proxy", proxy, ProxyConfig, "proxy=sejax.SyntheticConfig(...), or leave it out"),
-    ):
+def _env_of(stored: Stored, task: Task | None, proxy: ProxyConfig | None, option: str) -> ProxyEnv:
+    """The environment that a file's header describes; task and configuration may be given."""
+    for name, given, kind in (("task", task, Task), ("proxy", proxy, ProxyConfig)):
         require(
             given is None or isinstance(given, kind),
             name,
-            f"must be a sejax.{kind.__name__}, because a file's names are never imported; got "
-            f"{shortened(shortened(repr(given), 80))}. Set {fix}.",
+            f"must be a sejax.{kind.__name__}; got {shortened(repr(given))}. Leave it out for a "
+            f"registered {name}.",
         )
     if proxy is None:
-        proxy = _registered("proxy", "proxy", "proxy_kind", path, header, option)
-    is_given = task is not None
-    if not is_given:
+        proxy = _registered("proxy", "proxy", "proxy_kind", stored, option)
+    found, is_given = stored.header, task is not None
+    if task is None:
         try:
-            task = envs.make_from(_registered("env", "task", "env", path, header, option))
+            task = envs.make_from(_registered("env", "task", "env", stored, option))
         except ConfigError as error:
             if proxy.needs_task:
                 raise
-            task = absent_task(header.task, header.interface, header.config["env"], str(error))
+            task = absent_task(found, str(error))
     require(
-        header.task == task.name,
+        found.task == task.name,
         option,
-        f"must be a proxy of {task.name}, because that is the task given; got one of "
-        f"{shortened(header.task, 60)} in {shortened(path, 60)}. Set {option} to a proxy of "
-        f"{task.name}, or another task.",
+        f"must be a proxy of the task {task.name}; got one of {shortened(found.task, 40)} in "
+        f"{shortened(stored.path.name, 40)}. Set another task.",
     )
     if is_given:
-        _require_same(header.interface, task.interface, proxy, path)
+        _require_same(found, task, proxy, stored.path)
     return registry.make("proxy", proxy, task)
 
 
-def _registered(
-    group: str, argument: str, word: str, path: Path, header: Header, option: str
-) -> Any:
+def _registered(group: str, argument: str, word: str, stored: Stored, option: str) -> Any:
     """The configuration of a group, if its name is one that sejax or a package has registered."""
-    stored = header.config[group]
-    if is_registered(group, stored):
-        return registry.configure(group, stored)
-    name = shortened(stored.get("name"), 60)
-    named = name if ":" in name else f"MODULE:{name}"
-    raise ConfigError(
-        f"{option} must be a proxy of a registered {group} if no {argument} is given, because what "
-        f"a file names is never imported; got {name} in {shortened(path, 60)}. Give it: "
-        f"sejax.load(path, {argument}=...), or {word}={named} in a command.",
-        argument,
-    )
+    values = stored.header.config[group]
+    if not header.is_registered(group, values):
+        raise ConfigError(
+            f"{option} must be a proxy of a registered {group}, because what a file names is never "
+            f"imported; got {shortened(values.get('name'), 40)} in "
+            f"{shortened(stored.path.name, 40)}. Set {argument}=... of sejax.load, or "
+            f"{word}=MODULE:NAME in a command.",
+            argument,
+        )
+    return registry.configure(group, values)
 
 
-def _require_same(
-    learned: Mapping[str, Any], given: Mapping[str, Any], proxy: ProxyConfig, path: Path
-) -> None:
+def _require_same(learned: Header, task: Task, proxy: ProxyConfig, path: Path) -> None:
     """Checks that a task given is that of the proxy, as far as the proxy depends on it.
 
     An RN is for the same dynamics with another step limit too, and an SE in the task's raw units
     does not know the bounds of observations.
     """
+    spec = learned.spec
     same = {
-        "observation": _is_same_space(learned, given, "observation", proxy.sees_bounds),
-        "action": _is_same_space(learned, given, "action", with_bounds=True),
-        "max_steps": learned["max_steps"] == given["max_steps"] or proxy.has_real_dynamics,
+        "observation": is_same_space(spec.observation, task.observation, proxy.sees_bounds),
+        "action": is_same_space(spec.action, task.action),
+        "max_steps": spec.max_steps == task.max_steps or proxy.has_real_dynamics,
     }
     for name, is_same in same.items():
         require(
             is_same,
             "task",
-            f"must have the {name} {shortened(learned[name], 60)}, because {shortened(path, 60)} "
-            f"is of such a task; got {shortened(shortened(given[name], 60))}. Set task to a "
-            f"sejax.Task with that {name}.",
+            f"must have the {name} {shortened(learned.interface[name], 60)} of "
+            f"{shortened(path.name, 40)}; got {shortened(task.interface[name], 60)}.",
         )
-
-
-def _is_same_space(
-    learned: Mapping[str, Any], given: Mapping[str, Any], name: str, with_bounds: bool
-) -> bool:
-    """Whether a space of two `Task.interface` is the same up to rounding."""
-    one, other = (
-        np.array([space["n"]] if "n" in space else [space["low"], space["high"]], float)
-        for space in (learned[name], given[name])
-    )  # None is nan: no bound
-    matters = with_bounds or one.ndim == 1
-    return one.shape == other.shape and (not matters or np.allclose(one, other, equal_nan=True))
-
-
-def _flatten(weights: Any) -> dict[str, Any]:
-    """Nested weights by `network/layer/parameter`."""
-    return flatten_dict(weights, sep="/")
-
-
-def _shapes_of(env: ProxyEnv) -> dict[str, tuple[int, ...]]:
-    """Shape of each of a proxy's weights."""
-    weights = jax.eval_shape(env.init_weights, jax.random.key(0))
-    return {name: x.shape for name, x in _flatten(weights).items()}
 
 
 # --- gymnax ---------------------------------------------------------------------------------------
@@ -526,7 +496,7 @@ def register_gymnax() -> list[str]:
     import gymnax  # all of its environments, which takes a second
     from gymnax.registration import registered_envs
 
-    names = pretrained_names()
+    names = header.pretrained_names()
     for name in names:
         if f"sejax/{name}" not in registered_envs:
             gymnax.register(f"sejax/{name}", lambda name=name: load(name)[0])

@@ -5,12 +5,13 @@ Source: paper, section "Learning Reward Networks" (table "Overview of Reward Net
 """
 
 import dataclasses
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
 from flax import struct
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 from sejax.envs.base import Task
 from sejax.envs.environment import EnvParams, EnvState
@@ -92,7 +93,7 @@ class RewardEnv(ProxyEnv):
         num_inputs = self.task.obs_dim + len(self._augmented_keys)
         return {"potential": self._net.init(key, jnp.zeros(num_inputs))["params"]}
 
-    def params(self, weights: Any, discount: Array | float = 1.0) -> RewardParams:
+    def params(self, weights: PyTree, discount: Array | float = 1.0) -> RewardParams:
         return RewardParams(weights=weights, discount=discount, max_steps_in_episode=self.max_steps)
 
     def prepare(
@@ -112,7 +113,7 @@ class RewardEnv(ProxyEnv):
         require(
             discount is not None or not self.config.shaping.is_potential_based,
             "agent",
-            f"must say its discount, because {self.config.variant} pays with it; got none. Set "
+            f"must have a discount for {self.config.variant}; got none. Set "
             "Agent(discount=lambda hparams: ...).",
         )
         potentials = None
@@ -137,7 +138,7 @@ class RewardEnv(ProxyEnv):
         inputs = jnp.concatenate([obs, jnp.asarray(augmentation, jnp.float32)])
         return self._apply(params.weights, inputs)
 
-    def _apply(self, weights: Any, inputs: Float[Array, "in *batch"]) -> Float[Array, "*batch"]:
+    def _apply(self, weights: PyTree, inputs: Float[Array, "in *batch"]) -> Float[Array, "*batch"]:
         outputs: Any = self._net.apply({"params": weights["potential"]}, inputs)
         return self.config.output_scale * outputs[0]
 
@@ -146,8 +147,8 @@ class RewardEnv(ProxyEnv):
         params: RewardParams,
         state: RewardState,
         next_state: RewardState,
-        info: Any,
-        terminated: Any,
+        info: Mapping[str, Array],
+        terminated: Array | bool,
     ) -> Float[Array, ""]:
         """The learned part of a transition's reward.
 
@@ -175,7 +176,7 @@ class RewardEnv(ProxyEnv):
         return obs, RewardState(world=world, obs=obs, augmentation=nothing, time=jnp.int32(0))
 
     def step_env(
-        self, key: Array, state: RewardState, action: Any, params: RewardParams
+        self, key: Array, state: RewardState, action: Array, params: RewardParams
     ) -> tuple[Array, RewardState, Array, Array, dict[Any, Any]]:
         obs, world, real_reward, terminated, info = self.task.env.step_env(
             key, state.world, action, self.task.params
@@ -203,10 +204,10 @@ class RewardEnv(ProxyEnv):
         at_limit = state.time >= params.max_steps_in_episode
         return at_limit | self.task.env.is_truncated(state.world, self.task.params)
 
-    def get_obs(self, state: RewardState, params: Any = None, key: Any = None) -> Array:
+    def get_obs(self, state: RewardState, params: PyTree = None, key: Array | None = None) -> Array:
         return state.obs
 
 
-def _select(info: Any, keys: tuple[str, ...]) -> Float[Array, " keys"]:
+def _select(info: Mapping[str, Array], keys: tuple[str, ...]) -> Float[Array, " keys"]:
     """The numbers under these keys."""
     return jnp.array([info[key] for key in keys], jnp.float32)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import jax
 import jax.numpy as jnp
 from flax import struct
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, PyTree
 
 from sejax.envs.base import Task
 from sejax.envs.environment import EnvState
@@ -83,7 +83,7 @@ class SyntheticEnv(ProxyEnv):
         return weights
 
     def predict(
-        self, weights: Any, vector: Float[Array, " obs_dim"], action: Array
+        self, weights: PyTree, vector: Float[Array, " obs_dim"], action: Array
     ) -> tuple[Float[Array, " obs_dim"], Float[Array, ""], Float[Array, ""]]:
         """The networks' raw outputs: next state, reward and done output d."""
         out = self._outputs(weights, vector, action)
@@ -91,7 +91,7 @@ class SyntheticEnv(ProxyEnv):
         return state, out["reward"][0], out["done"][0]
 
     def _outputs(
-        self, weights: Any, vector: Float[Array, " obs_dim"], action: Array
+        self, weights: PyTree, vector: Float[Array, " obs_dim"], action: Array
     ) -> dict[str, Any]:
         """The output of each network, `[size]`, in the networks' own units."""
         if self.task.num_actions is not None:
@@ -117,7 +117,7 @@ class SyntheticEnv(ProxyEnv):
         return self.get_obs(state), state
 
     def step_env(
-        self, key: Array, state: SyntheticState, action: Any, params: ProxyParams
+        self, key: Array, state: SyntheticState, action: Array, params: ProxyParams
     ) -> tuple[Array, SyntheticState, Array, Array, dict[Any, Any]]:
         if self.task.num_actions is None:  # beyond its bounds the networks were never taught
             action = jnp.clip(action, -self.task.max_action, self.task.max_action)
@@ -151,7 +151,9 @@ class SyntheticEnv(ProxyEnv):
             return jnp.bool_(False)
         return super().is_truncated(state, params)
 
-    def get_obs(self, state: SyntheticState, params: Any = None, key: Any = None) -> Array:
+    def get_obs(
+        self, state: SyntheticState, params: PyTree = None, key: Array | None = None
+    ) -> Array:
         if self.task.num_states is not None:
             return jnp.argmax(state.vector).astype(jnp.int32)
         return state.vector
@@ -166,13 +168,13 @@ class BanditEnv(SyntheticEnv):
     is_bandit = True
 
     def predict(
-        self, weights: Any, vector: Float[Array, " obs_dim"], action: Array
+        self, weights: PyTree, vector: Float[Array, " obs_dim"], action: Array
     ) -> tuple[Float[Array, " obs_dim"], Float[Array, ""], Float[Array, ""]]:
         """The state as it is, the network's reward, and 1."""
         return vector, self._outputs(weights, vector, action)["reward"][0], jnp.float32(1)
 
     def bandit_reward(
-        self, weights: Any, obs: Float[Array, " obs_dim"], action: Array
+        self, weights: PyTree, obs: Float[Array, " obs_dim"], action: Array
     ) -> Float[Array, ""]:
         """The reward of an action, where states are what agents observe."""
         return self.predict(weights, obs, action)[1]

@@ -6,16 +6,18 @@ All of it reads a file's header without JAX. `tools/ship_proxy.py` writes the sh
 
 import itertools
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import yaml
 
 from sejax.options import registry
+from sejax.options.plain import from_plain
 from sejax.proxies import header, hub
 from sejax.proxies.configs import SyntheticConfig
 
+CARD = Path(__file__).with_name("card.md")
 SHIPPED_LICENSE = "Apache-2.0, like sejax, which made it; it contains no data of others."
 
 
@@ -34,8 +36,8 @@ class Evaluation:
     """
 
     agent: str
-    hparams: str
-    world: str
+    hparams: Literal["default", "varied", "as_learned"]
+    world: Literal["proxy", "real"]
     num_agents: int
     return_mean: float
     return_std: float
@@ -72,6 +74,7 @@ class PretrainedProxy:
       kind: se, rn, or the name of another configuration.
       task: name of the task that it stands in for.
       settings: the proxy's configuration, plain values.
+      size_kb: size of the file in units of 1,000 bytes.
       scores: mean score of the incumbent with each agent that it was learned with, in the
         generation that the proxy is of; for an SE a test return. Empty if it was not recorded.
       objective: name of the objective that the scores are of; "" if it was not recorded.
@@ -79,20 +82,19 @@ class PretrainedProxy:
       seed: seed of its run; None if it was not recorded.
       evaluations: results of fresh agents.
       learning: its run; None if it was not recorded.
-      size_kb: size of the file in units of 1,000 bytes.
     """
 
     name: str
     kind: str
     task: str
     settings: dict[str, Any]
-    scores: dict[str, float]
-    objective: str
-    generation: int | None
-    seed: int | None
-    evaluations: tuple[Evaluation, ...]
-    learning: Learning | None
     size_kb: float
+    scores: dict[str, float] = field(default_factory=dict)
+    objective: str = ""
+    generation: int | None = None
+    seed: int | None = None
+    evaluations: tuple[Evaluation, ...] = ()
+    learning: Learning | None = None
 
     @property
     def agents(self) -> tuple[str, ...]:
@@ -147,42 +149,41 @@ def pretrained() -> Zoo:
       >>> [proxy.name for proxy in pretrained() if proxy.kind == "se"][:2]
       ['acrobot', 'cartpole']
     """
-    names = header.pretrained_names()
-    return Zoo(describe(header.PRETRAINED_DIR / f"{name}.safetensors") for name in names)
+    files = (header.PRETRAINED_DIR / f"{name}.safetensors" for name in header.pretrained_names())
+    return Zoo(describe(header.read(file, single=True)) for file in files)
 
 
-def describe(path: Path, name: str | None = None) -> PretrainedProxy:
+def describe(stored: header.Stored, name: str | None = None) -> PretrainedProxy:
     """What a file of one proxy tells about it.
 
     Args:
-      path: the file.
+      stored: the file.
       name: name of the proxy; the file's if None.
 
     Raises:
-      ConfigError: if it is damaged, of another format, or a set.
+      ConfigError: for an evaluation or a learning of another shape.
     """
-    _, stored = header.read_single(path)
-    record = stored.proxies[0]
-    scores = record.get("scores")
-    if scores is None:
-        scores = dict.fromkeys(stored.agents, record["score"]) if "score" in record else {}
-    learning = record.get("learning")
-    return PretrainedProxy(
-        name=name or path.stem,
-        kind=stored.kind,
-        task=stored.task,
-        settings=stored.config["proxy"],
-        scores=scores,
-        objective=str((stored.config.get("objective") or {}).get("name", "")),
-        generation=record.get("generation"),
-        seed=record.get("seed"),
-        evaluations=tuple(
-            registry.from_plain(Evaluation, each, "evaluation")
-            for each in record.get("evaluations", ())
-        ),
-        learning=registry.from_plain(Learning, learning, "learning") if learning else None,
-        size_kb=path.stat().st_size / 1000,
+    path, _, told = stored
+    record, objective = told.proxies[0], told.config.get("objective")
+    names = ("scores", "generation", "seed", "evaluations", "learning")
+    known = {name: record[name] for name in names if record.get(name) is not None}
+    if "score" in record:
+        agents = header.agents_of(told.config)
+        known.setdefault("scores", dict.fromkeys(agents, float(record["score"])))
+    described: PretrainedProxy = from_plain(
+        PretrainedProxy,
+        {
+            "name": name or path.stem,
+            "kind": told.kind,
+            "task": told.task,
+            "settings": told.config["proxy"],
+            "objective": objective.get("name", "") if isinstance(objective, Mapping) else "",
+            "size_kb": path.stat().st_size / 1000,
+            **known,
+        },
+        "record",
     )
+    return described
 
 
 def spread(values: Sequence[float], spec: str) -> str:
@@ -224,7 +225,7 @@ _WORLDS = {"proxy": "this proxy", "real": "the real task"}
 
 
 def card_of(proxy: PretrainedProxy, source: str, needs: Sequence[str], license_text: str) -> str:
-    """A proxy's model card, in Markdown; it leaves out what is not known.
+    """A proxy's model card, `card.md` with its values; sections of what is not known are left out.
 
     Args:
       proxy: what its file tells.
@@ -233,38 +234,46 @@ def card_of(proxy: PretrainedProxy, source: str, needs: Sequence[str], license_t
         names are never imported.
       license_text: a sentence, or the license's name.
     """
-    about = _ABOUT.get(proxy.kind, _ABOUT_OTHER).format(task=proxy.task, kind=proxy.kind)
-    facts = table(["property", "value"], list(_facts(proxy).items()))
-    parts = [f"# {proxy.name}", about, facts]
-    if proxy.evaluations:
-        rows = [
-            (
-                each.agent,
-                _HPARAMS[each.hparams],
-                _WORLDS[each.world],
-                f"{each.return_mean:.1f} ± {each.return_std:.1f}",
-                f"{each.train_steps:,.0f}",
-                str(each.num_agents),
-            )
-            for each in proxy.evaluations
-        ]
-        columns = ["agent", "hyperparameters", "trained on", "return", "training steps", "agents"]
-        parts += [
-            "## What it teaches",
-            "Fresh agents, trained for the steps given and then tested on the real task (mean and "
-            "standard deviation of the agents' mean returns):",
-            table(columns, rows),
-        ]
-    if proxy.learning:
-        parts += ["## How it was learned", f"    {proxy.learning.command}"]
-    usage = _usage(proxy, source, needs)
-    return "\n\n".join([*parts, "## How to use it", usage, "## License", license_text])
+    options = {"task": "env", "proxy": "proxy_kind"}  # of commands, for arguments of `sejax.load`
+    call = f'("{source}"' + "".join(f", {name}=..." for name in needs) + ")"
+    gym = f"env = sejax.gym.make{call}  # a gymnasium.Env, in NumPy: any agent, no JAX\n"
+    values = {
+        "name": proxy.name,
+        "about": _ABOUT.get(proxy.kind, _ABOUT_OTHER).format(task=proxy.task, kind=proxy.kind),
+        "facts": table([{"property": key, "value": x} for key, x in _facts(proxy).items()]),
+        "evaluations": table([*map(_cells, proxy.evaluations)]) or None,
+        "command": proxy.learning.command if proxy.learning else None,
+        "install": "With `pip install 'sejax[hub]'`:\n\n" if hub.is_address(source) else "",
+        "gym": gym if proxy.kind == "se" else "",
+        "call": call,
+        "source": source,
+        "overrides": "".join(f" {options[name]}=..." for name in needs) + _words_of_best(proxy),
+        "license": license_text,
+    }
+    unknown = [f"{{{name}}}" for name, value in values.items() if value is None]
+    sections = CARD.read_text(encoding="utf-8").rstrip().split("\n\n## ")
+    told = [text for text in sections if not any(field in text for field in unknown)]
+    return "\n\n## ".join(told).format(**values)
 
 
-def table(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A table in Markdown."""
-    lines = [columns, ["---"] * len(columns), *rows]
+def table(rows: Sequence[Mapping[str, str]]) -> str:
+    """A table in Markdown, of rows by the names of their columns; empty without rows."""
+    if not rows:
+        return ""
+    lines = [rows[0].keys(), ["---"] * len(rows[0]), *(row.values() for row in rows)]
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+def _cells(each: Evaluation) -> dict[str, str]:
+    """An evaluation's row in a card."""
+    return {
+        "agent": each.agent,
+        "hyperparameters": _HPARAMS[each.hparams],
+        "trained on": _WORLDS[each.world],
+        "return": f"{each.return_mean:.1f} ± {each.return_std:.1f}",
+        "training steps": f"{each.train_steps:,.0f}",
+        "agents": str(each.num_agents),
+    }
 
 
 def _facts(proxy: PretrainedProxy) -> dict[str, str]:
@@ -293,21 +302,6 @@ def _facts(proxy: PretrainedProxy) -> dict[str, str]:
         only = " (all of them tests)" if proxy.kind == "se" else ""
         facts["steps on the real task"] = f"{learning.real_steps:,}{only}"
     return facts
-
-
-def _usage(proxy: PretrainedProxy, source: str, needs: Sequence[str]) -> str:
-    """Calls and the command that use a proxy."""
-    options = {"task": "env", "proxy": "proxy_kind"}  # of commands, for arguments of `sejax.load`
-    call = f'("{source}"' + "".join(f", {name}=..." for name in needs) + ")"
-    words = "".join(f" {options[name]}=..." for name in needs) + _words_of_best(proxy)
-    install = "With `pip install 'sejax[hub]'`:\n\n" if hub.is_address(source) else ""
-    gym = f"env = sejax.gym.make{call}  # a gymnasium.Env, in NumPy: any agent, no JAX\n"
-    return (
-        f"{install}```python\nimport sejax\n\n{gym if proxy.kind == 'se' else ''}"
-        f"env, params = sejax.load{call}  # a gymnax environment, in JAX\n```\n\n"
-        f"`python -m sejax.evaluate proxy={source}{words}` trains agents on it and tests them on "
-        f"the real task."
-    )
 
 
 def _words_of_best(proxy: PretrainedProxy) -> str:
@@ -356,17 +350,17 @@ def push(
       ConfigError: if there is no such proxy, it is a set, or the repository cannot be written.
     """
     hub.require_repo(repo)
-    path = header.find(source)
-    proxy = describe(path, name=repo.rpartition("/")[2])
-    config = header.read_config(path)
+    stored = header.read(source, single=True)
+    proxy = describe(stored, name=repo.rpartition("/")[2])
     needs = [
         argument
         for group, argument in (("env", "task"), ("proxy", "proxy"))
-        if not header.is_registered(group, config[group])
+        if not header.is_registered(group, stored.header.config[group])
     ]
     address = f"{hub.SCHEME}{repo}"
     card = _front_matter(proxy, license) + card_of(proxy, address, needs, license)
-    hub.upload(repo, {hub.FILE: path.read_bytes(), "README.md": card.encode()}, message, private)
+    files = {hub.FILE: stored.path.read_bytes(), "README.md": card.encode()}
+    hub.upload(repo, files, message, private)
     return address
 
 

@@ -1,43 +1,21 @@
 """Gymnasium's classic control tasks in JAX.
 
-gymnax 1.0 has the same dynamics; but for MountainCarContinuous, resets and steps compile to the
-same programs (`tests/test_envs.py`), so that numbers are equal to the last bit. Angles are in rad,
-velocities of the cars per step, and others per second.
+gymnax 1.0 has the same dynamics, to the last bit but for MountainCarContinuous
+(`tests/test_envs.py`); importing it takes 1.3 CPU s, which each command would spend. Angles are in
+rad, velocities of the cars per step, and others per second.
 
 Source: Gymnasium 1.3, `gymnasium.envs.classic_control`; gymnax 1.0,
 `gymnax.environments.classic_control`.
 """
 
-from typing import Any, ClassVar
+from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Bool, Float
 
-from sejax.envs.environment import Environment, EnvParams, EnvState
-from sejax.envs.spec import Space
-
-Step = tuple[Array, Any, Array, Array, dict[str, Array]]  # obs, state, reward, terminated, info
-
-
-class ClassicEnv(Environment):
-    """What the tasks have in common: a subclass adds `reset_env`, `step_env` and `get_obs`."""
-
-    params_class: ClassVar[type[EnvParams]]
-
-    def __init__(self, spaces: tuple[Space, Space]):
-        self.spaces = spaces
-
-    @property
-    def default_params(self) -> Any:
-        return self.params_class()
-
-    def after(self, state: Any, reward: Array, params: Any) -> Step:
-        """What a step returns that leads to this state."""
-        info = {"discount": self.discount(state, params)}
-        return self.get_obs(state), state, reward, self.is_terminated(state, params), info
-
+from sejax.envs.environment import Environment, EnvParams, EnvState, Step
 
 # --- CartPole ------------------------------------------------------------------------------------
 
@@ -63,19 +41,18 @@ class CartPoleParams(EnvParams):
     x_threshold: float = 2.4
 
 
-class CartPoleEnv(ClassicEnv):
+class CartPoleEnv(Environment[CartPoleState, CartPoleParams]):
     """A pole on a cart that is pushed left (action 0) or right (1)."""
 
     params_class = CartPoleParams
 
-    def reset_env(self, key: Array, params: CartPoleParams) -> tuple[Array, CartPoleState]:
-        start = jax.random.uniform(key, minval=-0.05, maxval=0.05, shape=(4,))
-        state = CartPoleState(
-            x=start[0], x_dot=start[1], theta=start[2], theta_dot=start[3], time=0
-        )
-        return self.get_obs(state), state
+    def start(self, key: Array) -> CartPoleState:
+        x, x_dot, theta, theta_dot = jax.random.uniform(key, (4,), minval=-0.05, maxval=0.05)
+        return CartPoleState(x=x, x_dot=x_dot, theta=theta, theta_dot=theta_dot, time=0)
 
-    def step_env(self, key: Any, state: CartPoleState, action: Any, params: CartPoleParams) -> Step:
+    def step_env(
+        self, key: Array, state: CartPoleState, action: Array, params: CartPoleParams
+    ) -> Step[CartPoleState]:
         was_terminal = self.is_terminated(state, params)
         force = params.force_mag * action - params.force_mag * (1 - action)
         cos, sin = jnp.cos(state.theta), jnp.sin(state.theta)
@@ -93,7 +70,7 @@ class CartPoleEnv(ClassicEnv):
         )
         return self.after(state, jnp.array(1.0 - was_terminal), params)
 
-    def get_obs(self, state: CartPoleState, params: Any = None, key: Any = None) -> Array:
+    def observe(self, state: CartPoleState) -> Array:
         return jnp.array([state.x, state.x_dot, state.theta, state.theta_dot])
 
     def is_terminated(self, state: CartPoleState, params: CartPoleParams) -> Bool[Array, ""]:
@@ -128,28 +105,30 @@ class AcrobotParams(EnvParams):
     torque_noise_max: float = 0.0
 
 
-class AcrobotEnv(ClassicEnv):
+class AcrobotEnv(Environment[AcrobotState, AcrobotParams]):
     """Two links of which the second joint is turned by a torque of -1, 0 or 1."""
 
     params_class = AcrobotParams
 
-    def reset_env(self, key: Array, params: AcrobotParams) -> tuple[Array, AcrobotState]:
-        start = jax.random.uniform(key, shape=(4,), minval=-0.1, maxval=0.1)
-        state = AcrobotState(
-            joint_angle1=start[0],
-            joint_angle2=start[1],
-            velocity_1=start[2],
-            velocity_2=start[3],
+    def start(self, key: Array) -> AcrobotState:
+        angle1, angle2, *velocities = jax.random.uniform(key, (4,), minval=-0.1, maxval=0.1)
+        return AcrobotState(
+            joint_angle1=angle1,
+            joint_angle2=angle2,
+            velocity_1=velocities[0],
+            velocity_2=velocities[1],
             time=jnp.int32(0),
         )
-        return self.get_obs(state), state
 
-    def step_env(self, key: Array, state: AcrobotState, action: Any, params: AcrobotParams) -> Step:
+    def step_env(
+        self, key: Array, state: AcrobotState, action: Array, params: AcrobotParams
+    ) -> Step[AcrobotState]:
         noise = params.torque_noise_max
         torque = params.available_torque[action]
         torque = torque + jax.random.uniform(key, shape=(), minval=-noise, maxval=noise)
-        angles, velocities = self._angles(state), (state.velocity_1, state.velocity_2)
-        after = _runge_kutta(jnp.array([*angles, *velocities, torque]), params)
+        angles = [state.joint_angle1, state.joint_angle2]
+        before = jnp.array([*angles, state.velocity_1, state.velocity_2, torque])
+        after = _runge_kutta(before, params)
         state = AcrobotState(
             joint_angle1=_wrap(after[0], -jnp.pi, jnp.pi),
             joint_angle2=_wrap(after[1], -jnp.pi, jnp.pi),
@@ -159,16 +138,14 @@ class AcrobotEnv(ClassicEnv):
         )
         return self.after(state, -1.0 * (1 - self.is_terminated(state, params)), params)
 
-    def get_obs(self, state: AcrobotState, params: Any = None, key: Any = None) -> Array:
-        angles = [f(angle) for angle in self._angles(state) for f in (jnp.cos, jnp.sin)]
-        return jnp.array([*angles, state.velocity_1, state.velocity_2])
+    def observe(self, state: AcrobotState) -> Array:
+        angles = [state.joint_angle1, state.joint_angle2]
+        sides = [f(angle) for angle in angles for f in (jnp.cos, jnp.sin)]
+        return jnp.array([*sides, state.velocity_1, state.velocity_2])
 
     def is_terminated(self, state: AcrobotState, params: AcrobotParams) -> Bool[Array, ""]:
-        angle1, angle2 = self._angles(state)
-        return -jnp.cos(angle1) - jnp.cos(angle2 + angle1) > 1.0
-
-    def _angles(self, state: AcrobotState) -> tuple[Array, Array]:
-        return state.joint_angle1, state.joint_angle2
+        angle = state.joint_angle1
+        return -jnp.cos(angle) - jnp.cos(state.joint_angle2 + angle) > 1.0
 
 
 def _runge_kutta(y: Float[Array, "5"], params: AcrobotParams) -> Float[Array, "5"]:
@@ -223,39 +200,47 @@ class CarState(EnvState):
     velocity: Array
 
 
-class CarEnv(ClassicEnv):
-    """What both cars have in common: an underpowered car in a valley, and a goal on a hill."""
-
-    def reset_env(self, key: Array, params: Any) -> tuple[Float[Array, "2"], CarState]:
-        position = jax.random.uniform(key, shape=(), minval=-0.6, maxval=-0.4)
-        state = CarState(position=position, velocity=jnp.array(0.0), time=0)
-        return self.get_obs(state), state
-
-    def get_obs(self, state: CarState, params: Any = None, key: Any = None) -> Array:
-        return jnp.array([state.position, state.velocity])
-
-    def is_terminated(self, state: CarState, params: Any) -> Bool[Array, ""]:
-        is_there = state.position >= params.goal_position
-        return is_there * (state.velocity >= params.goal_velocity)
-
-
 @struct.dataclass
-class MountainCarParams(EnvParams):
+class CarParams(EnvParams):
     min_position: float = -1.2
     max_position: float = 0.6
     max_speed: float = 0.07
     goal_position: float = 0.5
     goal_velocity: float = 0.0
-    force: float = 0.001
     gravity: float = 0.0025
 
 
-class MountainCarEnv(CarEnv):
+Params = TypeVar("Params", bound=CarParams)
+
+
+class CarEnv(Environment[CarState, Params]):
+    """What both cars have in common: an underpowered car in a valley, and a goal on a hill."""
+
+    def start(self, key: Array) -> CarState:
+        position = jax.random.uniform(key, minval=-0.6, maxval=-0.4)
+        return CarState(position=position, velocity=jnp.array(0.0), time=0)
+
+    def observe(self, state: CarState) -> Array:
+        return jnp.array([state.position, state.velocity])
+
+    def is_terminated(self, state: CarState, params: Params) -> Bool[Array, ""]:
+        is_there = state.position >= params.goal_position
+        return is_there * (state.velocity >= params.goal_velocity)
+
+
+@struct.dataclass
+class MountainCarParams(CarParams):
+    force: float = 0.001
+
+
+class MountainCarEnv(CarEnv[MountainCarParams]):
     """A car that is pushed left (0), not at all (1) or right (2)."""
 
     params_class = MountainCarParams
 
-    def step_env(self, key: Any, state: CarState, action: Any, params: MountainCarParams) -> Step:
+    def step_env(
+        self, key: Array, state: CarState, action: Array, params: MountainCarParams
+    ) -> Step[CarState]:
         velocity = (
             state.velocity
             + (action - 1) * params.force
@@ -270,19 +255,14 @@ class MountainCarEnv(CarEnv):
 
 
 @struct.dataclass
-class MountainCarContinuousParams(EnvParams):
+class MountainCarContinuousParams(CarParams):
+    goal_position: float = 0.45
     min_action: float = -1.0
     max_action: float = 1.0
-    min_position: float = -1.2
-    max_position: float = 0.6
-    max_speed: float = 0.07
-    goal_position: float = 0.45
-    goal_velocity: float = 0.0
     power: float = 0.0015
-    gravity: float = 0.0025
 
 
-class MountainCarContinuousEnv(CarEnv):
+class MountainCarContinuousEnv(CarEnv[MountainCarContinuousParams]):
     r"""A car with an engine that is costly to use.
 
     .. math::
@@ -299,8 +279,8 @@ class MountainCarContinuousEnv(CarEnv):
     params_class = MountainCarContinuousParams
 
     def step_env(
-        self, key: Any, state: CarState, action: Any, params: MountainCarContinuousParams
-    ) -> Step:
+        self, key: Array, state: CarState, action: Array, params: MountainCarContinuousParams
+    ) -> Step[CarState]:
         action = jnp.reshape(action, ())
         force = jnp.clip(action, params.min_action, params.max_action)
         acceleration = params.power * force - params.gravity * jnp.cos(3 * state.position)
@@ -333,18 +313,19 @@ class PendulumParams(EnvParams):
     l: float = 1.0  # noqa: E741 (Gymnasium's name)
 
 
-class PendulumEnv(ClassicEnv):
+class PendulumEnv(Environment[PendulumState, PendulumParams]):
     """A pendulum that is turned by a torque, `[1]` or `[]`; it never terminates."""
 
     params_class = PendulumParams
 
-    def reset_env(self, key: Array, params: PendulumParams) -> tuple[Array, PendulumState]:
+    def start(self, key: Array) -> PendulumState:
         high = jnp.array([jnp.pi, 1])
-        start = jax.random.uniform(key, shape=(2,), minval=-high, maxval=high)
-        state = PendulumState(theta=start[0], theta_dot=start[1], time=0)
-        return self.get_obs(state), state
+        theta, theta_dot = jax.random.uniform(key, (2,), minval=-high, maxval=high)
+        return PendulumState(theta=theta, theta_dot=theta_dot, time=0)
 
-    def step_env(self, key: Any, state: PendulumState, action: Any, params: PendulumParams) -> Step:
+    def step_env(
+        self, key: Array, state: PendulumState, action: Array, params: PendulumParams
+    ) -> Step[PendulumState]:
         torque = jnp.reshape(jnp.clip(action, -params.max_torque, params.max_torque), ())
         angle = (state.theta + jnp.pi) % (2 * jnp.pi) - jnp.pi
         reward = -(angle**2 + 0.1 * state.theta_dot**2 + 0.001 * torque**2)
@@ -361,7 +342,7 @@ class PendulumEnv(ClassicEnv):
         state = PendulumState(theta=theta, theta_dot=theta_dot, time=state.time + 1)
         return self.after(state, reward, params)
 
-    def get_obs(self, state: PendulumState, params: Any = None, key: Any = None) -> Array:
+    def observe(self, state: PendulumState) -> Array:
         return jnp.array([jnp.cos(state.theta), jnp.sin(state.theta), state.theta_dot])
 
     def is_terminated(self, state: PendulumState, params: PendulumParams) -> Bool[Array, ""]:

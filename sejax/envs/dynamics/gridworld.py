@@ -4,14 +4,13 @@ Source: `docs/reference.md` 6.1 and 6.2.
 """
 
 from collections.abc import Sequence
-from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
-from jaxtyping import Array, Int
+from jaxtyping import Array, Bool
 
-from sejax.envs.environment import Environment, EnvParams, EnvState
+from sejax.envs.environment import Environment, EnvParams, EnvState, Step
 from sejax.envs.spec import Discrete
 
 CELLS = "S GO#"  # start, floor, goal, hole, wall
@@ -35,7 +34,7 @@ class GridParams(EnvParams):
     max_steps_in_episode: int = 10
 
 
-class GridWorld(Environment):
+class GridWorld(Environment[GridState, GridParams]):
     """A deterministic world of cells.
 
     A move into a wall or off the map stays in place and is paid like the cell it stays in.
@@ -63,24 +62,19 @@ class GridWorld(Environment):
         _check(rows)
         cells = np.array([list(row) for row in rows])
         self.spaces = Discrete(cells.size), Discrete(len(MOVES))
-        self._params = params
+        self._default_params = params or GridParams()
         self._start = int(np.flatnonzero(cells == "S")[0])
         self._goal = (cells == "G").ravel()  # [num_states]
         self._hole = (cells == "O").ravel()  # [num_states]
         self._next = _next_indices(cells)  # [num_states, 4]
 
-    @property
-    def default_params(self) -> GridParams:
-        return self._params or GridParams()
-
-    def reset_env(self, key: Array | None, params: GridParams) -> tuple[Array, GridState]:
+    def start(self, key: Array) -> GridState:
         """Puts the agent on the map's S; the key has no effect."""
-        state = GridState(index=jnp.int32(self._start), time=0)
-        return state.index, state
+        return GridState(index=jnp.int32(self._start), time=0)
 
     def step_env(
-        self, key: Array | None, state: GridState, action: Any, params: GridParams
-    ) -> tuple[Int[Array, ""], GridState, Array, Array, dict[Any, Any]]:
+        self, key: Array, state: GridState, action: Array, params: GridParams
+    ) -> Step[GridState]:
         """Moves by one cell: action 0 RIGHT, 1 LEFT, 2 DOWN, 3 UP, `[]` int32."""
         index = jnp.asarray(self._next)[state.index, action]
         state = GridState(index=index, time=state.time + 1)
@@ -89,34 +83,24 @@ class GridWorld(Environment):
             params.goal_reward,
             jnp.where(jnp.asarray(self._hole)[index], params.hole_reward, params.step_reward),
         )
-        info = {"discount": self.discount(state, params)}
-        return index, state, reward, self.is_terminated(state, params), info
+        return self.after(state, reward, params)
 
-    def get_obs(self, state: GridState, params: Any = None, key: Any = None) -> Array:
+    def observe(self, state: GridState) -> Array:
         return state.index
 
-    def is_terminated(self, state: GridState, params: GridParams) -> Array:
+    def is_terminated(self, state: GridState, params: GridParams) -> Bool[Array, ""]:
         return jnp.asarray(self._goal | self._hole)[state.index]
 
 
 def _check(rows: Sequence[str]) -> None:
     characters = "".join(rows)
-    if len({len(row) for row in rows}) != 1:
-        raise ValueError(
-            "rows must have one length, because a grid is a rectangle; got lengths "
-            f"{[len(row) for row in rows]}. Fill short rows with spaces."
-        )
-    unknown = sorted(set(characters) - set(CELLS))
-    if unknown:
-        raise ValueError(
-            f"rows must consist of {list(CELLS)}, because nothing else has a meaning; "
-            f"got {unknown}. Use a space for floor."
-        )
-    if characters.count("S") != 1:
-        raise ValueError(
-            "rows must have one S, because each episode starts there; "
-            f"got {characters.count('S')}. Mark one cell with S."
-        )
+    for holds, must, got in (
+        (len({len(row) for row in rows}) == 1, "have one length", [len(row) for row in rows]),
+        ({*characters} <= {*CELLS}, f"consist of {list(CELLS)}", sorted({*characters} - {*CELLS})),
+        (characters.count("S") == 1, "have one S", characters.count("S")),
+    ):
+        if not holds:
+            raise ValueError(f"rows must {must}; got {got}")
 
 
 def _next_indices(cells: np.ndarray) -> np.ndarray:

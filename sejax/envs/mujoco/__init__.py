@@ -8,14 +8,14 @@ used, and the CPU. `brax` has other physics for halfcheetah.
 
 from typing import TYPE_CHECKING
 
-from sejax.options import ConfigError, require, shortened
+from sejax.options import ConfigError
 
 if TYPE_CHECKING:
     from sejax.envs.mujoco.environment import MujocoEnv
     from sejax.envs.mujoco.tasks import MujocoTask
 
 
-def make_env(config: "MujocoTask", otherwise: str = "") -> "MujocoEnv":
+def make_env(config: "MujocoTask", otherwise: str = "") -> "MujocoEnv[MujocoTask]":
     """The environment of a task.
 
     Args:
@@ -26,30 +26,28 @@ def make_env(config: "MujocoTask", otherwise: str = "") -> "MujocoEnv":
       ConfigError: without the extra `mujoco`, a C++ compiler that works or a CPU as jax's default
         device.
     """
+    field = f"env={config.name}"
     try:
         import gymnasium  # noqa: F401, whose models are read
         import mujoco  # noqa: F401
     except ImportError as error:
         raise ConfigError(
-            f"env={config.name} needs MuJoCo and Gymnasium, because its physics and its model are "
-            f"theirs; got {error}. Install them with pip install 'sejax[mujoco]'{otherwise}."
+            f"{field} needs MuJoCo and Gymnasium; {error}. Install them with pip install "
+            f"'sejax[mujoco]'{otherwise}.",
+            "env",
         ) from error
     import jax
 
     from sejax.envs.mujoco import library, models
 
-    require(
-        jax.default_backend() == "cpu",
-        f"env={config.name}",
-        "must run on the CPU, because MuJoCo's C library does; got "
-        f"{shortened(jax.default_backend())}. Set JAX_PLATFORMS=cpu{otherwise}.",
-    )
+    if (backend := jax.default_backend()) != "cpu":
+        fix = f"Set JAX_PLATFORMS=cpu{otherwise}."
+        raise ConfigError(f"{field} must run on the CPU; got {backend}. {fix}", "env")
     try:
         library.load()
     except library.BuildError as error:
         raise ConfigError(
-            f"env={config.name} needs the code between XLA and MuJoCo, which is compiled on first "
-            f"use; {error}{otherwise}."
+            f"{field} needs a library of its own; {error}{otherwise}.", "env"
         ) from error
-    env: MujocoEnv = getattr(models, config.model)(config)
+    env: MujocoEnv[MujocoTask] = getattr(models, config.model)(config)
     return env

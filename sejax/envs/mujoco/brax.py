@@ -1,14 +1,15 @@
 """HalfCheetah on brax."""
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import jax.numpy as jnp
+from brax.base import State as BraxState
 from brax.envs.base import State
 from brax.envs.half_cheetah import Halfcheetah
 from flax import struct
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
-from sejax.envs.environment import Environment, EnvParams, EnvState
+from sejax.envs.environment import Environment, EnvParams, EnvState, Step
 
 if TYPE_CHECKING:
     from sejax.envs.mujoco.tasks import HalfCheetah
@@ -20,16 +21,10 @@ LS_ITERATIONS = 10
 
 @struct.dataclass
 class CheetahState(EnvState):
-    physics: Any  # brax's pipeline state
-    time: Array | int
+    physics: BraxState
 
 
-@struct.dataclass
-class CheetahParams(EnvParams):
-    max_steps_in_episode: int = 1000
-
-
-class BraxHalfCheetahEnv(Environment):
+class BraxHalfCheetahEnv(Environment[CheetahState, EnvParams]):
     r"""A planar cheetah with six joints that is paid for running forward.
 
     .. math:: r = v_x - 0.1 \lVert a \rVert^2
@@ -45,37 +40,30 @@ class BraxHalfCheetahEnv(Environment):
     """
 
     def __init__(self, config: "HalfCheetah"):
+        super().__init__(config.spec)
         self.backend = config.backend
-        self.spaces = config.spec.observation, config.spec.action
         self._info_keys = config.spec.info_keys
         self._brax = Halfcheetah(backend=self.backend)
         if self.backend == "mjx":
             self._brax.sys = self._brax.sys.tree_replace({"opt.ls_iterations": LS_ITERATIONS})
 
-    @property
-    def default_params(self) -> CheetahParams:
-        return CheetahParams()
-
-    def reset_env(
-        self, key: Array, params: CheetahParams
-    ) -> tuple[Float[Array, "17"], CheetahState]:
+    def reset_env(self, key: Array, params: EnvParams) -> tuple[Float[Array, "17"], CheetahState]:
         state = self._brax.reset(key)
         return state.obs, CheetahState(physics=state.pipeline_state, time=jnp.int32(0))
 
     def step_env(
-        self, key: Array | None, state: CheetahState, action: Array, params: CheetahParams
-    ) -> tuple[Float[Array, "17"], CheetahState, Array, Array, dict[Any, Any]]:
+        self, key: Array, state: CheetahState, action: Array, params: EnvParams
+    ) -> Step[CheetahState]:
         """One control step of 0.05 s; the key has no effect."""
         nothing = jnp.float32(0)
-        before = State(
-            state.physics, None, nothing, nothing, dict.fromkeys(self._info_keys, nothing)
-        )
+        metrics = dict.fromkeys(self._info_keys, nothing)
+        before = State(state.physics, None, nothing, nothing, metrics)
         after = self._brax.step(before, action)
         info = {**after.metrics, "discount": jnp.float32(1)}
         state = CheetahState(physics=after.pipeline_state, time=state.time + 1)
         return after.obs, state, after.reward, jnp.bool_(False), info
 
-    def is_terminated(self, state: CheetahState, params: CheetahParams) -> Array:
+    def is_terminated(self, state: CheetahState, params: EnvParams) -> Bool[Array, ""]:
         return jnp.bool_(False)
 
     @property

@@ -58,15 +58,14 @@ def _load() -> ctypes.CDLL:
         build(built)
         with contextlib.suppress(OSError):
             if kept is not None:
-                with files.atomic_path(kept) as place:
-                    shutil.copyfile(built, place)
+                files.write_bytes(kept, built.read_bytes())
                 return _register(kept)
         try:
             return _register(built)
         except OSError as error:
             raise BuildError(
-                f"the library was built, and cannot be loaded ({told(error)}). Set "
-                "SEJAX_CACHE_DIR, or TMPDIR, to a folder that programs can be run from"
+                f"it cannot be loaded ({told(error)}). Set SEJAX_CACHE_DIR, or TMPDIR, to a folder "
+                "that programs can be run from"
             ) from error
 
 
@@ -114,10 +113,9 @@ def build(path: Path) -> None:
     try:
         subprocess.run(command, check=True, capture_output=True, text=True)
     except (OSError, subprocess.CalledProcessError) as error:
-        said = getattr(error, "stderr", None) or str(error)
+        said = error if isinstance(error, OSError) else error.stderr.strip()
         raise BuildError(
-            f"{command[0]} failed with: {shortened(said.strip(), 1000)}. Mend that, or set CXX to "
-            "another compiler"
+            f"{command[0]} failed with: {shortened(said, 120)}. Mend that, or set CXX"
         ) from error
 
 
@@ -136,9 +134,7 @@ def _given_compiler() -> list[str]:
     try:
         return shlex.split(command)
     except ValueError as error:
-        raise BuildError(
-            f"CXX is no command, {command} ({error}). Set CXX to a compiler"
-        ) from error
+        raise BuildError(f"CXX is no command, {command} ({error}). Set it to one") from error
 
 
 def _register(path: Path) -> ctypes.CDLL:

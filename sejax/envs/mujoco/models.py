@@ -3,20 +3,20 @@
 Source: Gymnasium 1.3, `gymnasium.envs.mujoco`, of each the version 5.
 """
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from sejax.envs.mujoco.environment import MujocoEnv, Rewards, control_cost, plane
+from sejax.envs.mujoco.environment import MujocoEnv, Scalars, control_cost, plane
 from sejax.envs.mujoco.physics import Report
 
 if TYPE_CHECKING:
-    from sejax.envs.mujoco.tasks import MujocoTask
+    from sejax.envs.mujoco import tasks
 
 
-class HalfCheetahEnv(MujocoEnv):
+class HalfCheetahEnv(MujocoEnv["tasks.HalfCheetah"]):
     r"""A planar cheetah with six joints that is paid for running forward and never terminates.
 
     .. math:: r = v_x - 0.1 \lVert a \rVert^2
@@ -30,22 +30,32 @@ class HalfCheetahEnv(MujocoEnv):
     gymnasium_id = "HalfCheetah-v5"
     file = "half_cheetah.xml"
     frame_skip = 5
+    normal_velocities = True
 
-    def draw_start(self, key: Array) -> tuple[Float[Array, "9"], Float[Array, "9"]]:
-        return self.noisy_start(key, 0.1, normal_velocities=True)
-
-    def observe(self, now: Report) -> Float[Array, "17"]:
+    def observe_report(self, now: Report) -> Float[Array, "17"]:
         return jnp.concatenate([now.qpos[1:], now.qvel])
 
-    def rewards(self, now: Report, action: Array, healthy: Array) -> Rewards:
-        run = self.velocity(now.qpos_change[0])
-        return {"reward_run": run, "reward_ctrl": control_cost(action, 0.1)}
+    def rewards(self, now: Report, action: Array, healthy: Array) -> Scalars:
+        return {"reward_run": self.x_velocity(now), "reward_ctrl": control_cost(action, 0.1)}
 
-    def tells(self, now: Report) -> dict[str, Float[Array, ""]]:
-        return {"x_position": now.qpos[0], "x_velocity": self.velocity(now.qpos_change[0])}
+    def more_info(self, now: Report) -> Scalars:
+        return {"x_position": now.qpos[0], "x_velocity": self.x_velocity(now)}
 
 
-class HopperEnv(MujocoEnv):
+Runner = TypeVar("Runner", bound="tasks.Runner")
+
+
+class RunnerEnv(MujocoEnv[Runner]):
+    """What the tasks have in common that pay for moving along x."""
+
+    def rewards(self, now: Report, action: Array, healthy: Array) -> Scalars:
+        return {
+            "reward_forward": self.config.forward_reward_weight * self.x_velocity(now),
+            "reward_ctrl": control_cost(action, self.config.ctrl_cost_weight),
+        }
+
+
+class HopperEnv(RunnerEnv["tasks.Hopper"]):
     r"""A planar leg with three joints that is paid for hopping forward and for not falling.
 
     .. math:: r = v_x + 1 - 0.001 \lVert a \rVert^2
@@ -59,10 +69,7 @@ class HopperEnv(MujocoEnv):
     file = "hopper.xml"
     frame_skip = 4
 
-    def draw_start(self, key: Array) -> tuple[Float[Array, " nq"], Float[Array, " nv"]]:
-        return self.noisy_start(key, self.config.reset_noise_scale)
-
-    def observe(self, now: Report) -> Float[Array, " obs_dim"]:
+    def observe_report(self, now: Report) -> Float[Array, " obs_dim"]:
         return jnp.concatenate([now.qpos[1:], jnp.clip(now.qvel, -10, 10)])
 
     def is_healthy(self, now: Report) -> Bool[Array, ""]:
@@ -70,18 +77,14 @@ class HopperEnv(MujocoEnv):
         others = jnp.concatenate([now.qpos[2:], now.qvel])
         return (height > 0.7) & (jnp.abs(angle) < 0.2) & jnp.all(jnp.abs(others) < 100)
 
-    def rewards(self, now: Report, action: Array, healthy: Array) -> Rewards:
-        config = self.config
-        return {
-            "reward_forward": config.forward_reward_weight * self.velocity(now.qpos_change[0]),
-            "reward_ctrl": control_cost(action, config.ctrl_cost_weight),
-            "reward_survive": healthy * config.healthy_reward,
-        }
+    def rewards(self, now: Report, action: Array, healthy: Array) -> Scalars:
+        survive = healthy * self.config.healthy_reward
+        return {**super().rewards(now, action, healthy), "reward_survive": survive}
 
-    def tells(self, now: Report) -> dict[str, Float[Array, ""]]:
+    def more_info(self, now: Report) -> Scalars:
         return {
             "x_position": now.qpos[0],
-            "x_velocity": self.velocity(now.qpos_change[0]),
+            "x_velocity": self.x_velocity(now),
             "z_distance_from_origin": now.qpos[1] - self._qpos0[1],
         }
 
@@ -103,7 +106,7 @@ class Walker2dEnv(HopperEnv):
         return (height > 0.8) & (height < 2.0) & (jnp.abs(angle) < 1.0)
 
 
-class SwimmerEnv(MujocoEnv):
+class SwimmerEnv(RunnerEnv["tasks.Swimmer"]):
     r"""Three links in a viscous plane that are paid for swimming along x and never terminate.
 
     .. math:: r = v_x - 10^{-4} \lVert a \rVert^2
@@ -116,24 +119,14 @@ class SwimmerEnv(MujocoEnv):
     file = "swimmer.xml"
     frame_skip = 4
 
-    def draw_start(self, key: Array) -> tuple[Float[Array, "5"], Float[Array, "5"]]:
-        return self.noisy_start(key, self.config.reset_noise_scale)
-
-    def observe(self, now: Report) -> Float[Array, "8"]:
+    def observe_report(self, now: Report) -> Float[Array, "8"]:
         return jnp.concatenate([now.qpos[2:], now.qvel])
 
-    def rewards(self, now: Report, action: Array, healthy: Array) -> Rewards:
-        config = self.config
-        return {
-            "reward_forward": config.forward_reward_weight * self.velocity(now.qpos_change[0]),
-            "reward_ctrl": control_cost(action, config.ctrl_cost_weight),
-        }
-
-    def tells(self, now: Report) -> dict[str, Float[Array, ""]]:
-        return plane(now.qpos[:2], self.velocity(now.qpos_change[:2]))
+    def more_info(self, now: Report) -> Scalars:
+        return plane(now.qpos[:2], now.qpos_change[:2] / self.physics.dt)
 
 
-class InvertedPendulumEnv(MujocoEnv):
+class InvertedPendulumEnv(MujocoEnv["tasks.InvertedPendulum"]):
     """A pole on a cart that is paid 1 for each step after which it stands.
 
     It has fallen, which terminates, at an angle beyond 0.2 rad. Observations are positions and
@@ -144,23 +137,20 @@ class InvertedPendulumEnv(MujocoEnv):
     file = "inverted_pendulum.xml"
     frame_skip = 2
 
-    def draw_start(self, key: Array) -> tuple[Float[Array, "2"], Float[Array, "2"]]:
-        return self.noisy_start(key, self.config.reset_noise_scale)
-
-    def observe(self, now: Report) -> Float[Array, "4"]:
+    def observe_report(self, now: Report) -> Float[Array, "4"]:
         return jnp.concatenate([now.qpos, now.qvel])
 
     def is_healthy(self, now: Report) -> Bool[Array, ""]:
-        return jnp.isfinite(self.observe(now)).all() & (jnp.abs(now.qpos[1]) <= 0.2)
+        return jnp.isfinite(self.observe_report(now)).all() & (jnp.abs(now.qpos[1]) <= 0.2)
 
-    def rewards(self, now: Report, action: Array, healthy: Array) -> Rewards:
+    def rewards(self, now: Report, action: Array, healthy: Array) -> Scalars:
         return {"reward_survive": healthy.astype(jnp.float32)}
 
 
 _TORSO = 1
 
 
-class AntEnv(MujocoEnv):
+class AntEnv(RunnerEnv["tasks.Ant"]):
     r"""A body on four legs with eight joints that is paid for walking along x and for its health.
 
     .. math:: r = v_x + 1 - 0.5 \lVert a \rVert^2 - 5 \cdot 10^{-4} \lVert F \rVert^2
@@ -175,11 +165,9 @@ class AntEnv(MujocoEnv):
     file = "ant.xml"
     frame_skip = 5
     with_forces = True
+    normal_velocities = True
 
-    def draw_start(self, key: Array) -> tuple[Float[Array, "15"], Float[Array, "14"]]:
-        return self.noisy_start(key, self.config.reset_noise_scale, normal_velocities=True)
-
-    def observe(self, now: Report) -> Float[Array, " obs_dim"]:
+    def observe_report(self, now: Report) -> Float[Array, " obs_dim"]:
         parts = [now.qpos[2:], now.qvel]
         if self.config.include_cfrc_ext_in_observation:
             parts.append(_forces(now)[1:].ravel())  # the world itself feels none
@@ -189,20 +177,22 @@ class AntEnv(MujocoEnv):
         finite = jnp.isfinite(now.qpos).all() & jnp.isfinite(now.qvel).all()
         return finite & (now.qpos[2] >= 0.2) & (now.qpos[2] <= 1.0)
 
-    def rewards(self, now: Report, action: Array, healthy: Array) -> Rewards:
+    def rewards(self, now: Report, action: Array, healthy: Array) -> Scalars:
         config = self.config
         return {
-            "reward_forward": config.forward_reward_weight * self._velocity(now)[0],
-            "reward_ctrl": control_cost(action, config.ctrl_cost_weight),
+            **super().rewards(now, action, healthy),
             "reward_contact": -config.contact_cost_weight * jnp.sum(_forces(now) ** 2),
             "reward_survive": healthy * config.healthy_reward,
         }
 
-    def tells(self, now: Report) -> dict[str, Float[Array, ""]]:
+    def more_info(self, now: Report) -> Scalars:
         return plane(now.qpos[:2], self._velocity(now))
 
+    def x_velocity(self, now: Report) -> Float[Array, ""]:
+        return self._velocity(now)[0]
+
     def _velocity(self, now: Report) -> Float[Array, "2"]:
-        return self.velocity(now.xpos_change[_TORSO, :2])
+        return now.xpos_change[_TORSO, :2] / self.physics.dt
 
 
 def _forces(now: Report) -> Float[Array, "nbody 6"]:
@@ -212,7 +202,7 @@ def _forces(now: Report) -> Float[Array, "nbody 6"]:
 _RADIUS = 0.2  # m, of the disc that the target is in
 
 
-class ReacherEnv(MujocoEnv):
+class ReacherEnv(MujocoEnv["tasks.Reacher"]):
     r"""An arm with two joints that is charged for the distance of its tip x from a target.
 
     .. math:: r = -\lVert x - x_{target} \rVert - \lVert a \rVert^2
@@ -225,7 +215,7 @@ class ReacherEnv(MujocoEnv):
     file = "reacher.xml"
     frame_skip = 2
 
-    def __init__(self, config: "MujocoTask"):
+    def __init__(self, config: "tasks.Reacher"):
         super().__init__(config)
         self._tip, self._target = (self.physics.model.body(x).id for x in ("fingertip", "target"))
 
@@ -239,12 +229,12 @@ class ReacherEnv(MujocoEnv):
         speed = jax.random.uniform(key_speed, (2,), minval=-0.005, maxval=0.005)
         return jnp.concatenate([arm, target]), jnp.concatenate([speed, jnp.zeros(2)])
 
-    def observe(self, now: Report) -> Float[Array, "10"]:
+    def observe_report(self, now: Report) -> Float[Array, "10"]:
         angles, target = now.qpos[:2], now.qpos[2:]
         parts = [jnp.cos(angles), jnp.sin(angles), target, now.qvel[:2], self._miss(now)[:2]]
         return jnp.concatenate(parts)
 
-    def rewards(self, now: Report, action: Array, healthy: Array) -> Rewards:
+    def rewards(self, now: Report, action: Array, healthy: Array) -> Scalars:
         config = self.config
         return {
             "reward_dist": -config.reward_dist_weight * jnp.linalg.norm(self._miss(now)),

@@ -5,7 +5,7 @@ import hashlib
 import importlib.util
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -98,7 +98,9 @@ class Physics:
         arguments = (state, (self.num_words,)), (ctrl, (self.model.nu,))
         return self._call("sejax_mujoco_step", *arguments, frame_skip=np.int64(self.frame_skip))
 
-    def _call(self, target: str, *arguments: Any, **attributes: Any) -> tuple[Array, Report]:
+    def _call(
+        self, target: str, *arguments: tuple[Array, tuple[int, ...]], **attributes: np.int64
+    ) -> tuple[Array, Report]:
         for array, shape in arguments:
             if array.shape != shape:
                 raise ValueError(f"{target} must get arrays of shape {shape}; got {array.shape}")
@@ -109,12 +111,8 @@ class Physics:
         )
         call = jax.ffi.ffi_call(target, results, vmap_method="broadcast_all")
         state, numbers = call(*(array for array, _ in arguments), model=self._id, **attributes)
-        parts = jnp.split(numbers, np.cumsum(sizes)[:-1])
-        shaped = {
-            name: x.reshape(shape)
-            for (name, shape), x in zip(self._shapes.items(), parts, strict=True)
-        }
-        return state, Report(**shaped)
+        parts = zip(self._shapes.items(), jnp.split(numbers, np.cumsum(sizes)[:-1]), strict=True)
+        return state, Report(**{name: x.reshape(shape) for (name, shape), x in parts})
 
 
 @functools.cache

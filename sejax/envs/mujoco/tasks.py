@@ -6,10 +6,11 @@ task is made.
 """
 
 import io
+import math
 import warnings
 from contextlib import redirect_stdout
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 from sejax.envs import mujoco
 from sejax.envs.base import Task
@@ -20,16 +21,17 @@ from sejax.options import ConfigError, Options, finite, not_negative, one_of, op
 # MuJoCo, at ten times its cost on a CPU (docs/halfcheetah.md).
 BACKENDS = ("mujoco", "mjx", "spring", "positional", "generalized")
 
+
 _ON_A_LINE = ("x_position", "x_velocity")
-_TOLD_OF_WALKERS = (
+_IN_A_PLANE = ("x_position", "y_position", "x_velocity", "y_velocity")
+_INFO_OF_WALKERS = (
     *_ON_A_LINE,
     "z_distance_from_origin",
     "reward_forward",
     "reward_ctrl",
     "reward_survive",
 )
-_IN_A_PLANE = ("x_position", "y_position", "x_velocity", "y_velocity")
-_TOLD_IN_A_PLANE = (
+_INFO_IN_A_PLANE = (
     "x_position",
     "y_position",
     "distance_from_origin",
@@ -40,11 +42,23 @@ _TOLD_IN_A_PLANE = (
 )
 
 
-def _spec(obs_dim: int, num_actions: int, max_action: float = 1.0, **rest: Any) -> TaskSpec:
+def _spec(
+    obs_dim: int,
+    action_dim: int,
+    *,
+    solved_reward: float,
+    max_action: float = 1.0,
+    max_steps: int = 1000,
+    info_keys: tuple[str, ...] = (),
+    augmented_keys: tuple[str, ...] = (),
+) -> TaskSpec:
     return TaskSpec(
-        observation=Box.unbounded(obs_dim),
-        action=Box.symmetric(*[max_action] * num_actions),
-        **{"max_steps": 1000, **rest},
+        observation=Box.symmetric(*[math.inf] * obs_dim),
+        action=Box.symmetric(*[max_action] * action_dim),
+        max_steps=max_steps,
+        solved_reward=solved_reward,
+        info_keys=info_keys,
+        augmented_keys=augmented_keys,
     )
 
 
@@ -56,12 +70,14 @@ class MujocoTask(Options):
       name: of the task.
       model: class of `sejax.envs.mujoco.models`.
       terminate_when_unhealthy: whether an unhealthy state ends the episode; an option of some.
+      reset_noise_scale: range or deviation of what is drawn at a reset; an option of some.
     """
 
     group: ClassVar[str] = "env"
     name: ClassVar[str]
     model: ClassVar[str]
     terminate_when_unhealthy = True
+    reset_noise_scale = 0.1
 
     @property
     def spec(self) -> TaskSpec:
@@ -82,8 +98,8 @@ class HalfCheetah(MujocoTask):
     name = "halfcheetah"
     model = "HalfCheetahEnv"
     spec = _spec(
-        obs_dim=17,
-        num_actions=6,
+        17,
+        6,
         solved_reward=3000.0,
         info_keys=(*_ON_A_LINE, "reward_run", "reward_ctrl"),
         augmented_keys=_ON_A_LINE,
@@ -92,7 +108,7 @@ class HalfCheetah(MujocoTask):
     backend: str = option(BACKENDS[0], one_of(BACKENDS))  # physics
 
     def make(self) -> Task:
-        if self.backend == "mujoco":
+        if self.backend == BACKENDS[0]:
             env = mujoco.make_env(self, ", or set env.backend=mjx")
             return Task.of(self.spec, name=self.name, env=env)
         try:
@@ -103,31 +119,33 @@ class HalfCheetah(MujocoTask):
                 brax_env = BraxHalfCheetahEnv(self)
         except ImportError as error:
             raise ConfigError(
-                f"env.backend={self.backend} needs brax, because its physics are brax's; it is not "
-                f"installed ({error}). Install it with pip install 'sejax[brax]'."
+                f"env.backend must be {BACKENDS[0]} without brax; got {self.backend} ({error}). "
+                "Install brax with pip install 'sejax[brax]'.",
+                "env.backend",
             ) from error
         return Task.of(self.spec, name=self.name, env=brax_env)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Hopper(MujocoTask):
+class Runner(MujocoTask):
+    """What the tasks have in common that pay for moving along x and charge for torque."""
+
+    forward_reward_weight: float = option(1.0, finite("it weighs a reward"))
+    ctrl_cost_weight: float = option(1e-3, not_negative("it weighs a cost"))
+    reset_noise_scale: float = option(0.1, not_negative("it is a range"))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Hopper(Runner):
     """A planar leg that is paid for hopping forward without falling."""
 
     name = "hopper"
     model = "HopperEnv"
-    spec = _spec(
-        obs_dim=11,
-        num_actions=3,
-        solved_reward=3800.0,
-        info_keys=_TOLD_OF_WALKERS,
-        augmented_keys=_ON_A_LINE,
-    )
+    spec = _spec(11, 3, solved_reward=3800.0, info_keys=_INFO_OF_WALKERS, augmented_keys=_ON_A_LINE)
 
-    forward_reward_weight: float = option(1.0, finite("it weighs a reward"))
-    ctrl_cost_weight: float = option(1e-3, not_negative("it weighs a cost"))
     healthy_reward: float = option(1.0, finite("it is a reward"))
     terminate_when_unhealthy: bool = True
-    reset_noise_scale: float = option(5e-3, not_negative("it is a range"))
+    reset_noise_scale: float = 5e-3
 
 
 class Walker2d(Hopper):
@@ -139,32 +157,18 @@ class Walker2d(Hopper):
 
     name = "walker2d"
     model = "Walker2dEnv"
-    spec = _spec(
-        obs_dim=17,
-        num_actions=6,
-        solved_reward=4000.0,
-        info_keys=_TOLD_OF_WALKERS,
-        augmented_keys=_ON_A_LINE,
-    )
+    spec = _spec(17, 6, solved_reward=4000.0, info_keys=_INFO_OF_WALKERS, augmented_keys=_ON_A_LINE)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Swimmer(MujocoTask):
+class Swimmer(Runner):
     """Three links in a viscous plane that are paid for swimming in one direction."""
 
     name = "swimmer"
     model = "SwimmerEnv"
-    spec = _spec(
-        obs_dim=8,
-        num_actions=2,
-        solved_reward=360.0,
-        info_keys=_TOLD_IN_A_PLANE,
-        augmented_keys=_IN_A_PLANE,
-    )
+    spec = _spec(8, 2, solved_reward=360.0, info_keys=_INFO_IN_A_PLANE, augmented_keys=_IN_A_PLANE)
 
-    forward_reward_weight: float = option(1.0, finite("it weighs a reward"))
-    ctrl_cost_weight: float = option(1e-4, not_negative("it weighs a cost"))
-    reset_noise_scale: float = option(0.1, not_negative("it is a range"))
+    ctrl_cost_weight: float = 1e-4
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -173,33 +177,31 @@ class InvertedPendulum(MujocoTask):
 
     name = "inverted_pendulum"
     model = "InvertedPendulumEnv"
-    spec = _spec(obs_dim=4, num_actions=1, max_action=3.0, solved_reward=950.0)
+    spec = _spec(4, 1, max_action=3.0, solved_reward=950.0)
 
     reset_noise_scale: float = option(0.01, not_negative("it is a range"))
 
 
 @dataclass(frozen=True, kw_only=True)
-class Ant(MujocoTask):
+class Ant(Runner):
     """A body on four legs that is paid for walking in one direction and for its health."""
 
     name = "ant"
     model = "AntEnv"
 
-    forward_reward_weight: float = option(1.0, finite("it weighs a reward"))
-    ctrl_cost_weight: float = option(0.5, not_negative("it weighs a cost"))
+    ctrl_cost_weight: float = 0.5
     contact_cost_weight: float = option(5e-4, not_negative("it weighs a cost"))
     healthy_reward: float = option(1.0, finite("it is a reward"))
     terminate_when_unhealthy: bool = True
     include_cfrc_ext_in_observation: bool = True  # external forces on each body
-    reset_noise_scale: float = option(0.1, not_negative("it is a range"))
 
     @property
     def spec(self) -> TaskSpec:
         return _spec(
-            obs_dim=105 if self.include_cfrc_ext_in_observation else 27,
-            num_actions=8,
+            105 if self.include_cfrc_ext_in_observation else 27,
+            8,
             solved_reward=6000.0,
-            info_keys=(*_TOLD_IN_A_PLANE, "reward_contact", "reward_survive"),
+            info_keys=(*_INFO_IN_A_PLANE, "reward_contact", "reward_survive"),
             augmented_keys=_IN_A_PLANE,
         )
 
@@ -210,13 +212,7 @@ class Reacher(MujocoTask):
 
     name = "reacher"
     model = "ReacherEnv"
-    spec = _spec(
-        obs_dim=10,
-        num_actions=2,
-        max_steps=50,
-        solved_reward=-3.75,
-        info_keys=("reward_dist", "reward_ctrl"),
-    )
+    spec = _spec(10, 2, max_steps=50, solved_reward=-3.75, info_keys=("reward_dist", "reward_ctrl"))
 
     reward_dist_weight: float = option(1.0, not_negative("it weighs a cost"))
     reward_control_weight: float = option(1.0, not_negative("it weighs a cost"))

@@ -1,0 +1,137 @@
+"""Preset files: the settings of tasks and proxies, and of files that a user writes.
+
+sejax's own are `presets/<env>-<proxy>.yaml`, with a section for each preset: values, `with_agent`,
+`with_es` and `with_objective` for those that only hold with one of these, and `like` for a section
+that it builds on. `general-<proxy>.yaml` serves tasks without a file of their own, and sections
+that say `like: general`. A user's file (`preset=FILE.yaml`) holds overrides.
+"""
+
+import functools
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from sejax.options import ConfigError, listed, require, shortened, told, unknown_name
+from sejax.options.plain import flatten, merge, parsed
+
+PRESETS = Path(__file__).parent / "presets"
+GENERAL = "general"  # the presets of tasks without a file of their own
+ENDING = ".yaml"  # of a preset file
+
+
+@functools.cache
+def _all_sections() -> dict[str, dict[str, dict[str, Any]]]:
+    """The sections of all files by the files' stems, each with what it builds on merged in."""
+    paths = sorted(PRESETS.glob(f"*{ENDING}"), key=lambda path: not path.stem.startswith(GENERAL))
+    files: dict[str, dict[str, dict[str, Any]]] = {}
+    for path in paths:  # the general ones first
+        sections = files[path.stem] = yaml.safe_load(path.read_text())
+        for name, section in sections.items():
+            like = section.pop("like", None)  # stands before it in the file
+            general = f"{GENERAL}-{path.stem.rpartition('-')[2]}"
+            base = files[general][name] if like == GENERAL else sections[like] if like else {}
+            sections[name] = merge(base, section)
+    return files
+
+
+def names() -> list[str]:
+    """All presets that some file has."""
+    return sorted({name for sections in _all_sections().values() for name in sections})
+
+
+def is_tuned(env: str, proxy: str) -> bool:
+    """Whether a task has a preset file of its own for a proxy."""
+    return f"{env}-{proxy}" in _all_sections()
+
+
+def tuned(proxy: str, preset: str = "best") -> list[str]:
+    """Tasks that have settings of their own for a proxy."""
+    stems = sorted(stem for stem, sections in _all_sections().items() if preset in sections)
+    pairs = [stem.rpartition("-") for stem in stems]
+    return [env for env, _, of in pairs if of == proxy and env != GENERAL]
+
+
+def sections_of(env: str, proxy: str) -> dict[str, dict[str, Any]]:
+    """The presets of a task and proxy, by their names."""
+    general = _all_sections().get(f"{GENERAL}-{proxy}", {"best": {}})
+    return _all_sections().get(f"{env}-{proxy}", general)
+
+
+def values_of(preset: str, chosen: Mapping[str, str], mixture: Mapping[str, str]) -> dict[str, Any]:
+    """The settings of a preset for these choices, nested plain values.
+
+    Args:
+      preset: its name.
+      chosen: the choice of each group.
+      mixture: names of a mixture's agents by their keys.
+
+    Raises:
+      ConfigError: for an unknown preset, or one that the task does not have.
+    """
+    if preset not in names():
+        raise unknown_name("preset", preset, names())
+    env, proxy = chosen["env"], chosen["proxy"]
+    sections = sections_of(env, proxy)
+    require(
+        preset in sections,
+        "preset",
+        f"must be one that env={shortened(env)} has with proxy={shortened(proxy)} "
+        f"({listed(list(sections))}); got {preset}, which {listed(tuned(proxy, preset), 60)} have. "
+        "Set preset=best.",
+    )
+    section = sections[preset]
+    values: dict[str, Any] = {k: v for k, v in section.items() if not k.startswith("with_")}
+    for group in ("es", "objective", "agent"):
+        values = merge(values, section.get(f"with_{group}", {}).get(chosen.get(group), {}))
+    with_agent = section.get("with_agent", {})
+    each = {key: with_agent.get(name, {}).get("agent", {}) for key, name in mixture.items()}
+    return {"preset": preset} | values | ({"agents": each} if each else {})
+
+
+def read_file(path: Path) -> dict[str, Any]:
+    """The values of a user's file, by their full names; `preset: paper` in it is its base.
+
+    A choice may stand beside its fields as `name`, so that a run's `config.yaml` is such a file.
+
+    Raises:
+      ConfigError: for a file that cannot be read, or that holds no fields.
+    """
+    try:
+        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+        values = flatten(content) if isinstance(content, dict) else {}
+    except (OSError, yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
+        raise ConfigError(
+            f"preset must be a name or a YAML file that can be read; got {shortened(path, 40)} "
+            f"({told(error)}). Set preset=best.",
+            "preset",
+        ) from error
+    require(
+        values,
+        "preset",
+        f"must be a file that maps fields to values; got {shortened(path)} with "
+        f"{shortened(content)}. Write `es.noise_std: 0.1` there, or set preset=best.",
+    )
+    base = str(values.get("preset", ""))
+    require(
+        not base.endswith(ENDING),
+        "preset",
+        f"must name no file in a file; got {shortened(base)}. Write preset: best.",
+    )
+    chosen = {x.removesuffix(".name"): values.pop(x) for x in [*values] if x.endswith(".name")}
+    mixture = [chosen.pop(x) for x in [*chosen] if x.startswith("agents.")]
+    values |= chosen | ({"agents": mixture} if mixture else {})
+    return {k: v for k, v in values.items() if v is not None or k not in ("agent", "agents")}
+
+
+def file_text(overrides: Iterable[str]) -> str:
+    """The preset file that holds overrides.
+
+    Example:
+      >>> print(file_text(["env=acrobot", "es.noise_std=0.1"]), end="")
+      env: acrobot
+      es.noise_std: 0.1
+    """
+    pairs = (override.partition("=") for override in overrides)
+    return str(yaml.safe_dump({name: parsed(text) for name, _, text in pairs}, sort_keys=False))

@@ -1,0 +1,171 @@
+"""Which agents an evaluation trains, where, and how long."""
+
+import dataclasses
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from sejax import agents, envs
+from sejax.agents.base import AgentConfig
+from sejax.cli import config as configuration
+from sejax.cli.compose import named
+from sejax.cli.config import AgentFamily, EvaluateConfig, families_of
+from sejax.ops.files import as_file_name
+from sejax.options import registry, require, shortened
+from sejax.proxies import header, hub
+from sejax.proxies.io import Proxy, load_proxy
+from sejax.training import TrainingConfig, require_reachable, training_of
+
+
+class World(NamedTuple):
+    """Where agents train, and how long each of them by its key."""
+
+    env: Any
+    params: Any
+    trainings: dict[str, TrainingConfig]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Setup:
+    """Which agents train where.
+
+    Attributes:
+      task: the real task, on which all are tested.
+      worlds: by name, the first one first in tables.
+      families: the agents.
+      exploration: of all of them.
+      out_dir: where the files go.
+    """
+
+    task: envs.Task
+    worlds: dict[str, World]
+    families: tuple[AgentFamily, ...]
+    exploration: Any
+    out_dir: Path
+
+    @property
+    def has_several(self) -> bool:
+        return len(self.families) > 1
+
+
+def real_setup(config: EvaluateConfig) -> Setup:
+    """Agents on the real task alone."""
+    require(config.env, "env", "must be given with proxy=real; got none. Set env=cartpole.")
+    task_config = registry.configure("env", {"name": config.env})
+    families = families_of(config)
+    for family in families:
+        with named(family.field):
+            spec = envs.spec_of(task_config)
+            agents.require_fit(family.agent, config.exploration, spec, str(config.env))
+    task = envs.make_from(task_config)
+    trainings = dict.fromkeys((family.key for family in families), config.real_training)
+    return Setup(
+        task=task,
+        worlds={"the real task": World(task.env, task.params, trainings)},
+        families=families,
+        exploration=config.exploration,
+        out_dir=Path(config.out_dir or Path("runs", f"evaluate-{as_file_name(task.name)}")),
+    )
+
+
+def proxy_setup(config: EvaluateConfig) -> Setup:
+    """Agents on a proxy, and on its real task beside them."""
+    proxy = _load(config)
+    env, task = proxy.env, proxy.task
+    require(
+        config.env in (None, task.name, proxy.config["env"].get("name")),
+        "env",
+        f"must be the proxy's own task; got {config.env} for a proxy of {task.name}. Set "
+        f"env={task.name}.",
+    )
+    families, exploration = families_of(config), config.exploration
+    if config.agent_hparams == "as_learned":
+        learned = proxy.learned_agents().items()
+        families = tuple(AgentFamily(key=key, field="agent", agent=agent) for key, agent in learned)
+        exploration = proxy.learned_with("exploration")
+    trainings = {}
+    for family in families:
+        agent = family.agent
+        with named(family.field):
+            agents.require_fit(agent, exploration, task, task.name)
+            group, training = _training_on(proxy, config, agent)
+            configuration.require_real_returns(group, training)
+            if not agent.is_solved_for:
+                require_reachable(group, training, env.max_steps)
+            if env.config.reaches_step_limit:
+                configuration.require_learning(
+                    group, training, agent, env.max_steps, task.max_steps
+                )
+        require(
+            not (config.baseline and agent.is_solved_for),
+            "baseline",
+            f"must be false with {family.field}={family.key}, which can only solve a one-step SE; "
+            "got true. Set baseline=false.",
+        )
+        trainings[family.key] = training
+    worlds = {"the proxy": World(env, proxy.params, trainings)}
+    if config.baseline:
+        real_trainings = dict.fromkeys(trainings, _real_training(config, proxy))
+        worlds["the real task"] = World(task.env, task.params, real_trainings)
+    beside = proxy.path.parent
+    if beside == header.PRETRAINED_DIR:
+        beside = Path("runs", f"evaluate-{proxy.path.stem}")
+    elif hub.is_address(config.proxy):
+        beside = Path("runs", f"evaluate-{as_file_name(config.proxy.removeprefix(hub.SCHEME))}")
+    return Setup(
+        task=task,
+        worlds=worlds,
+        families=families,
+        exploration=exploration,
+        out_dir=Path(config.out_dir or beside),
+    )
+
+
+def _load(config: EvaluateConfig) -> Proxy:
+    """The proxy; modules are imported if the command line names them, never because a file does."""
+    path = header.find(config.proxy, "proxy", also=("real",))
+    stored = header.read_config(path, "proxy")
+    task = proxy = None
+    if config.env is not None and not registry.is_registered("env", config.env):
+        fields = stored["env"] if stored["env"].get("name") == config.env else {}
+        task = envs.make_from(registry.configure("env", {**fields, "name": config.env}))
+    if config.proxy_kind is not None:
+        fields = {**stored["proxy"], "name": config.proxy_kind}
+        proxy = registry.configure("proxy", fields)
+    return load_proxy(path, task, proxy, "proxy")
+
+
+def _training_on(
+    proxy: Proxy, config: EvaluateConfig, agent: AgentConfig
+) -> tuple[str, TrainingConfig]:
+    """The group of fields that says how long agents train on the proxy, and how long that is."""
+    if config.training_from == "config":
+        return "training", config.training
+    if proxy.env.is_real:  # agents train and stop as on the real task
+        return "real_training", _real_training(config, proxy)
+    require(
+        "training" in proxy.config,
+        "training_from",
+        "must be config for an SE whose file does not say how long agents trained on it; got "
+        f"{shortened(config.training_from)}. Set training_from=config training.stop_rule=never "
+        "training.max_steps=2000 training.max_episodes=2000.",
+    )
+    test_episodes = config.real_training.test_episodes
+    training = dataclasses.replace(training_of(proxy, agent), test_episodes=test_episodes)
+    return "real_training", training
+
+
+def _real_training(config: EvaluateConfig, proxy: Proxy) -> TrainingConfig:
+    """How agents train on real dynamics; those of an RN's run take its limit as they did there."""
+    as_learned = config.agent_hparams == "as_learned" and "training" in proxy.config
+    if not (as_learned and proxy.env.is_real):
+        return config.real_training
+    is_terminal = training_of(proxy).time_limit_is_terminal
+    default = TrainingConfig().time_limit_is_terminal
+    require(
+        config.real_training.time_limit_is_terminal in (default, is_terminal),
+        "real_training.time_limit_is_terminal",
+        f"must be what the proxy's agents learned with; got {not default}. Leave it out, or set "
+        "agent_hparams=default.",
+    )
+    return dataclasses.replace(config.real_training, time_limit_is_terminal=is_terminal)
