@@ -27,10 +27,10 @@ import sejax
 from experiments.common import bandits, figures, tables
 from experiments.common.agents import HPARAMS, Condition, Group, groups_at_once, train_groups
 from experiments.common.bandits import Copied, PolicyBandit
-from experiments.common.experiment import Experiment, Settings, count, each_of, setting
+from experiments.common.experiment import Experiment, Settings, count, setting
 from experiments.common.shards import stack, unstack
 from sejax import envs
-from sejax.options import one_of, positive
+from sejax.options import each_of, one_of, positive
 
 SOURCES = ("by_hand", "agent", "episodes", "search", "evolved")
 DISCRETE = ("ddqn", "dueling_ddqn", "ppo", "sac", "td3_discrete")
@@ -53,20 +53,19 @@ STUDENT_STEPS = {"pendulum": 5_000, "halfcheetah": 10_000}  # 2,000 elsewhere
 class NullBaselines(Settings):
     name = "null_baselines"
 
-    env: str = setting("cartpole", one_of(tuple(TEACHERS)), about=f"task: {', '.join(TEACHERS)}")
-    sources: tuple[str, ...] = setting(SOURCES, each_of(SOURCES), about="what makes the proxies")
-    students: tuple[str, ...] = setting((), about="kinds of agents; those that fit the task")
-    hparams: tuple[str, ...] = setting(
-        HPARAMS, each_of(HPARAMS), quick=("default",), about="of the students; varied: drawn"
-    )
-    tables: int = count(10, "policies", quick=2, about="of each source and kind of teacher")
-    num_agents: int = count(5, "agents", quick=2, about="of each kind on each proxy")
-    num_evolved: int = count(20, "agents", quick=2, about="of each kind on the shipped SE")
-    steps: int | None = count(None, "steps", quick=500, about="of a student; 2,000 or more")
-    teacher_steps: int | None = count(None, "steps", quick=500, about="of a teacher; by the task")
-    search_steps: int = count(1_000_000, "steps", quick=5_000, about="of a search, at most")
-    num_states: int = count(1024, "states", about="of a table")
-    widen: float = setting(1.5, positive("it is a scale"), about="spread of a table's states")
+    env: str = setting("cartpole", one_of(tuple(TEACHERS)))
+    sources: tuple[str, ...] = setting(SOURCES, each_of(SOURCES))  # what makes the proxies
+    students: tuple[str, ...] = setting(())  # kinds of agents; all that fit the task
+    # Hyperparameters of the students; varied: drawn for each.
+    hparams: tuple[str, ...] = setting(HPARAMS, each_of(HPARAMS), quick=("default",))
+    policies: int = count(10, quick=2)  # of each source and kind of teacher
+    num_agents: int = count(5, quick=2)  # of each kind on each proxy
+    num_evolved: int = count(20, quick=2)  # agents of each kind on the shipped SE
+    steps: int | None = count(None, quick=500)  # of a student; 2,000, more on hard tasks
+    teacher_steps: int | None = count(None, quick=500)  # of a teacher; by the task
+    search_steps: int = count(1_000_000, quick=5_000)  # real steps of a search, at most
+    num_states: int = count(1024)  # of a table
+    widen: float = setting(1.5, positive("it is a scale"))  # spread of a table's states
 
     @property
     def task(self) -> envs.Task:
@@ -82,7 +81,7 @@ class NullBaselines(Settings):
 def makers(settings: NullBaselines, source: str) -> Iterator[tuple[str, Callable[[], Copied]]]:
     """The tables of a source: the name of each, and what makes it."""
     task, size, widen = settings.task, settings.num_states, settings.widen
-    seeds = range(settings.seed, settings.seed + settings.tables)
+    seeds = range(settings.seed, settings.seed + settings.policies)
     if source == "by_hand" and settings.env in bandits.BY_HAND:
         for seed in seeds:
             yield f"hand-{seed:02d}", functools.partial(bandits.copy_by_hand, task, seed, size)
@@ -134,7 +133,8 @@ def compute(settings: NullBaselines) -> pd.DataFrame:
     """Makes the proxies and trains students on them: `makers` and `students`."""
     task = settings.task
     bandit = PolicyBandit(task)
-    made, students = [], []
+    made: list[dict[str, Any]] = []
+    students = []
     for source in settings.sources:
         if source == "evolved":
             env, groups, num_agents = *shipped(settings, made), settings.num_evolved
@@ -195,23 +195,21 @@ def summarise(settings: NullBaselines, rows: pd.DataFrame) -> pd.DataFrame:
     costs = made.groupby(["source", "teacher"], sort=False)[
         ["real_steps", "cpu_s", "policy_return"]
     ]
-    found = []
-    for keys, mine in students.groupby(["source", "teacher", "kind", "hparams"], sort=False):
+    solved_reward = settings.task.solved_reward
+
+    def statistics(mine: pd.DataFrame) -> dict[str, float]:
         returns = mine["test_return"]
-        by_table = returns.groupby(mine["group"]).mean()
-        draws = by_table if len(by_table) > 1 else returns
-        found.append(
-            dict(zip(("source", "teacher", "kind", "hparams"), keys, strict=True))
-            | {"num_tables": len(by_table), "num_agents": len(mine)}
-            | tables.mean_columns(returns, "test_return", draws)
-            | {
-                "median": returns.median(),
-                "worst_tenth": returns[returns <= returns.quantile(0.1)].mean(),
-                "worst": returns.min(),
-                "solved": (returns >= settings.task.solved_reward).mean(),
-            }
-        )
-    return pd.DataFrame(found).join(costs.mean(), on=["source", "teacher"])
+        return tables.mean_columns(returns, "test_return", mine["group"]) | {
+            "median": returns.median(),
+            "worst_tenth": returns[returns <= returns.quantile(0.1)].mean(),
+            "worst": returns.min(),
+            "solved": (returns >= solved_reward).mean(),
+            "num_proxies": mine["group"].nunique(),
+            "num_agents": len(mine),
+        }
+
+    summary = tables.summary_by(students, ["source", "teacher", "kind", "hparams"], statistics)
+    return summary.join(costs.mean(), on=["source", "teacher"])
 
 
 NAMES = {

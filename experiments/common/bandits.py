@@ -111,7 +111,8 @@ class PolicyBandit(ProxyEnv):
             reward = jnp.float32(action == state.action)
         else:
             reward = -jnp.abs(action - state.action).mean()
-        return state.obs, state.replace(time=state.time + 1), reward, jnp.bool_(True), {}
+        after = BanditState(obs=state.obs, action=state.action, time=state.time + 1)
+        return state.obs, after, reward, jnp.bool_(True), {}
 
     def is_truncated(self, state: BanditState, params: ProxyParams) -> Array:
         """Never: the only step terminates the episode."""
@@ -274,7 +275,7 @@ def copy_of_search(task: Task, real_steps: int, seed: int, num_states: int, wide
         step = jnp.tensordot((plus - minus)[top], noise[top], 1) / (ARS_TOP * spread)
         weights = weights + ARS_STEP * step
         tests = tester(key_test, (weights, *scale))
-        used = sum(tests.num_steps.sum() for tests in both)
+        used = both[0].num_steps.sum() + both[1].num_steps.sum()
         return weights, tests, used
 
     weights = best = zeros
