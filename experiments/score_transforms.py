@@ -111,9 +111,9 @@ def compute_cell(settings: ScoreTransforms, transform: str, mirrored: bool) -> p
     state = search.init(keys, np.float32(step_sizes))
     for _ in range(settings.generations):
         state = search.advance(state)  # runs that have solved the task stay as they are
-        if state.finished.all():
+        if state.solved.all():
             break
-    solved = np.asarray(state.finished)
+    solved = np.asarray(state.solved)
     updates = np.where(solved, np.asarray(state.generation) - 1, settings.generations)
     return pd.DataFrame(
         {

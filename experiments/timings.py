@@ -98,7 +98,7 @@ def time_generations(settings: Timings, row: Row, preset: str) -> pd.DataFrame:
     chunks = session.make_chunks(config_of(settings, row, preset))
     program = chunks.learner
     state = chunks.init(jax.random.key(settings.seed))
-    idle = jax.tree.map(lambda x: x.copy(), dataclasses.replace(state, finished=~state.finished))
+    idle = jax.tree.map(lambda x: x.copy(), dataclasses.replace(state, solved=~state.solved))
     jax.block_until_ready(chunks.advance(idle, 1))  # compiled, and run with nothing to do
     wall, cpu, steps = [], [], []
     for _ in range(settings.generations):

@@ -49,7 +49,7 @@ class LearnState:
     best_score: Array
     best_scores: Float[Array, " agent"]
     best_generation: Array
-    finished: Array  # stop_when_solved: the run is over and its generations cost nothing
+    solved: Array  # with stop_when_solved: the run is over and its generations cost nothing
 
 
 @struct.dataclass
@@ -101,7 +101,7 @@ class Bilevel:
             best_score=jnp.float32(-jnp.inf),
             best_scores=unknown,
             best_generation=jnp.int32(-1),
-            finished=jnp.bool_(False),
+            solved=jnp.bool_(False),
         )
         return copy_to_devices(state, self.devices)
 
@@ -123,7 +123,7 @@ class Bilevel:
             incumbent=incumbent,
             params=evaluations.params(population, incumbent),
             keys=jax.vmap(jax.random.fold_in, (None, 0))(key_inner, seed_ids),
-            active=~state.finished,
+            active=~state.solved,
             eval_steps=None if eval_steps is None else eval_steps(state.generation),
             key_tell=key_tell,
             es_state=es_state,
@@ -157,10 +157,10 @@ class Bilevel:
             best_score=jnp.where(is_best, score, state.best_score),
             best_scores=jnp.where(is_best, by_agent, state.best_scores),
             best_generation=jnp.where(is_best, state.generation, state.best_generation),
-            finished=state.finished | solved,
+            solved=state.solved | solved,
         )
-        after = jax.tree.map(lambda old, new: jnp.where(state.finished, old, new), state, after)
-        active = ~state.finished
+        after = jax.tree.map(lambda old, new: jnp.where(state.solved, old, new), state, after)
+        active = ~state.solved
         return after, self.scoring.info(scores, outcome, state.generation, after.best_score, active)
 
 
@@ -240,7 +240,8 @@ def make_bilevel(
       task: the real task.
       agent: the agent that learns on the proxies, from `sejax.make_agent` or one of your own; or a
         mixture of agents (`sejax.Mixture`), among which the candidates are divided.
-      proxy, es, objective: by default an SE, the paper's NES, and the mean test return.
+      proxy, es, objective: by default an SE of whole episodes (`SyntheticConfig()`), NES
+        (`NESConfig()`), and the mean test return.
       training: how long each agent trains, and how it is tested.
       stop_when_solved: whether a run ends at its first incumbent mean that solves the task.
       devices: devices to spread the candidates over; None for all.

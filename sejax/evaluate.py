@@ -11,7 +11,7 @@ import yaml
 from sejax.agents import make_agent
 from sejax.cli import commands, compose, runtime
 from sejax.cli import config as configuration
-from sejax.cli.config import AgentFamily, EvaluateConfig
+from sejax.cli.config import EvaluateConfig, MixtureMember
 from sejax.cli.worlds import Setup, proxy_setup, real_setup
 from sejax.ops.files import require_writable, write_text
 
@@ -82,9 +82,9 @@ def evaluate(config: EvaluateConfig) -> float:
     out_dir = setup.out_dir
     require_writable("out_dir", out_dir)  # before agents train for nothing
     tables = {
-        (world, family.key): _train_and_test(config, setup, world, family)
+        (world, member.key): _train_and_test(config, setup, world, member)
         for world in setup.worlds
-        for family in setup.families
+        for member in setup.members
     }
     table = pd.concat([t.assign(world=world) for (world, _), t in tables.items()])
     summary = summarise(table, ["world", "agent"] if setup.has_several else ["world"])
@@ -97,11 +97,10 @@ def evaluate(config: EvaluateConfig) -> float:
 
 
 def _train_and_test(
-    config: EvaluateConfig, setup: Setup, world: str, family: AgentFamily
+    config: EvaluateConfig, setup: Setup, world: str, member: MixtureMember
 ) -> "pd.DataFrame":
-    """A row for each agent of a family."""
+    """A row for each agent of a member."""
     import jax
-    import numpy as np
     import pandas as pd
 
     from sejax.cli.progress import Tally
@@ -109,9 +108,9 @@ def _train_and_test(
 
     env, env_params, trainings = setup.worlds[world]
     varied = config.agent_hparams == "varied"
-    agent = make_agent(family.agent, setup.task, setup.exploration, varied)
+    agent = make_agent(member.agent, setup.task, setup.exploration, varied)
     keys = jax.random.split(jax.random.key(config.seed), config.num_agents)
-    who = f"{family.key} agents" if setup.has_several else "agents"
+    who = f"{member.key} agents" if setup.has_several else "agents"
     started = time.time()
     with Tally(config.num_agents, f"{who} on {world}") as tally:
         outcome = jax.device_get(
@@ -120,7 +119,7 @@ def _train_and_test(
                 env,
                 env_params,
                 setup.task,
-                trainings[family.key],
+                trainings[member.key],
                 keys,
                 config.num_parallel,
                 config.devices,
@@ -131,10 +130,8 @@ def _train_and_test(
     print(f"{world}: {config.num_agents} {who} in {time.time() - started:.1f} s", flush=True)
     numbers: dict[str, Any] = {"agent": range(config.num_agents)}
     if setup.has_several:
-        numbers = {"agent": family.key, "number": range(config.num_agents)}
+        numbers = {"agent": member.key, "number": range(config.num_agents)}
     of_agents = {name: x for name, x in vars(outcome).items() if x.ndim == 1}  # not of episodes
-    # The real task does not tell of numbers that are none.
-    of_agents["nonfinite"] = of_agents["nonfinite"] | ~np.isfinite(outcome.test_return)
     return pd.DataFrame({**numbers, "test_return": outcome.test_return, **of_agents, **drawn})
 
 
@@ -166,7 +163,7 @@ def _print_table(summary: "pd.DataFrame", setup: Setup, config: EvaluateConfig) 
     from sejax.cli.report import spread
 
     task = setup.task
-    who = "agents of each kind" if setup.has_several else f"{setup.families[0].key} agents"
+    who = "agents of each kind" if setup.has_several else f"{setup.members[0].key} agents"
     solved = f" (solved at {task.solved_reward:g})" if task.is_solvable else ""
     table = Table(title=f"{config.num_agents} fresh {who}, tested on {task.name}{solved}")
     labels = ["trained on", "agent"][: summary.index.nlevels]

@@ -6,7 +6,6 @@ Running the same command on an existing run directory goes on where it stopped.
 import contextlib
 import dataclasses
 from collections.abc import Sequence
-from pathlib import Path
 
 import yaml
 
@@ -109,7 +108,7 @@ def learn_all(configs: Sequence[LearnConfig]) -> list[float]:
                     if program != compiled:
                         machines.close()
                         runtime.configure_jax()
-                        made = config.machines.make(config, Path(config.resolved_run_dir), print)
+                        made = config.machines.make(config, print)
                         compiled, chunks = program, machines.enter_context(made)
                     ended = session.run(config, directory, chunks, progress)
                 except KeyboardInterrupt:

@@ -265,7 +265,7 @@ def test_a_run_that_has_solved_its_task_stays_as_it_is_at_no_cost(room):
     program = make_bilevel(**parts | {"task": task, "proxy": proxy})
     assert program.solved_score == task.solved_reward
     states, infos = run(*compiled(program, KEYS[0]), 3)
-    assert states[1].finished and infos[0].active
+    assert states[1].solved and infos[0].active
     assert_equal(states[1].best, alone[1].best)
     for state, info in zip(states[2:], infos[1:], strict=True):
         assert_equal(state, states[1])

@@ -144,8 +144,8 @@ def test_a_mixture_has_fields_for_each_agent():
     mixture = composed.agents
     assert composed.agent is None and composed.name("agent") == "ddqn+td3_discrete"
     assert (mixture.aggregate, mixture.compared_by) == ("min", "rank")
-    assert [(x.key, x.weight) for x in mixture.families] == [("ddqn", 1.0), ("td3_discrete", 2.0)]
-    assert mixture.families[0].agent.batch_size == 32
+    assert [(x.key, x.weight) for x in mixture.members] == [("ddqn", 1.0), ("td3_discrete", 2.0)]
+    assert mixture.members[0].agent.batch_size == 32
     assert str(composed.resolved_run_dir) == "runs/cartpole-se-ddqn+td3_discrete-s0"
     assert composed.parts()["agent"].weights == (1.0, 2.0)
 
@@ -153,13 +153,13 @@ def test_a_mixture_has_fields_for_each_agent():
 @pytest.mark.parametrize("preset", ["best", "paper"])
 def test_each_agent_of_a_mixture_has_the_settings_that_it_has_alone(preset):
     words = ("env=acrobot", f"preset={preset}", "training.max_steps=null")
-    for family in composed_with(*words, "agents=[td3_discrete,ddqn]").agents.families:
-        assert family.agent == composed_with(*words, f"agent={family.key}").agent
+    for member in composed_with(*words, "agents=[td3_discrete,ddqn]").agents.members:
+        assert member.agent == composed_with(*words, f"agent={member.key}").agent
 
 
 def test_evaluate_takes_a_mixture_and_the_agent_of_the_proxys_task():
     config = evaluate_config(["proxy=cartpole", "agents=[ddqn,ppo]", "agents.ppo.epochs=3"])
-    assert [x.key for x in config.agents.families] == ["ddqn", "ppo"]
+    assert [x.key for x in config.agents.members] == ["ddqn", "ppo"]
     assert evaluate_config(["proxy=pendulum"]).agent == sejax.TD3Config()
     assert evaluate_config(["proxy=cliff_walking-rn"]).agent == sejax.QLearningConfig()
     assert evaluate_config(["proxy=real", "env=acrobot"]).real_training.stop_rule == "solved"
@@ -203,7 +203,7 @@ def test_a_preset_file_stands_for_its_overrides(tmp_path):
     )
     assert composed.preset == "paper"
     file.write_text(preset_files.file_text(["agents=[ddqn,ppo]", "agents.ppo.weight=2"]))
-    assert sejax.config([f"preset={file}"]).agents.families[1].weight == 2
+    assert sejax.config([f"preset={file}"]).agents.members[1].weight == 2
 
 
 @pytest.mark.parametrize(

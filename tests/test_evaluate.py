@@ -19,7 +19,7 @@ from sejax.agents.ppo import PPOConfig
 from sejax.agents.tabular import QLearningConfig
 from sejax.cli import commands, progress
 from sejax.cli import config as configuration
-from sejax.cli.config import families_of
+from sejax.cli.config import members_of
 from sejax.cli.worlds import proxy_setup
 from sejax.evaluate import evaluate, summarise
 from sejax.ops.checksummed import pack, unpack
@@ -54,7 +54,7 @@ def learned(*words):
 
 def save(path, *words):
     config, env, weights = learned(*words)
-    discount = families_of(config)[0].agent.discount
+    discount = members_of(config)[0].agent.discount
     sejax.save(path, env, weights, configuration.plain(config), discount, score=1.0, seed=0)
     return path
 
@@ -211,8 +211,8 @@ def test_each_of_several_agents_trains_as_long_as_it_must(tmp_path):
     waits = {"ddqn": 10 * 200, "dueling_ddqn": 10 * 200, "ppo": 10 * 200 + 1}
     assert budgets == {key: 4000 + wait - 2 * 200 for key, wait in waits.items()}
     as_learned = proxy_setup(evaluate_config(f"proxy={path}", "agent_hparams=as_learned", words=[]))
-    assert as_learned.families == tuple(
-        dataclasses.replace(x, field="agent", weight=1.0) for x in families_of(learned(*words)[0])
+    assert as_learned.members == tuple(
+        dataclasses.replace(x, field="agent", weight=1.0) for x in members_of(learned(*words)[0])
     )
     assert as_learned.worlds["the proxy"][2]["ppo"].max_steps == 4000
     with pytest.raises(ConfigError, match=r"^agent must be a registered"):
@@ -303,7 +303,7 @@ def test_agents_like_those_of_the_run_bring_their_exploration(tmp_path, capsys):
                  "devices=1", "real_training.max_episodes=2"]  # fmt: skip
     composed = evaluate_config(*overrides, words=[])
     setup = proxy_setup(composed)
-    assert setup.families[0].agent == config.agent and setup.exploration == config.exploration
+    assert setup.members[0].agent == config.agent and setup.exploration == config.exploration
     # Its dynamics are real.
     assert setup.worlds["the proxy"][2] == {"q_learning": composed.real_training}
     evaluate(composed)

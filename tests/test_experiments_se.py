@@ -289,10 +289,10 @@ def config_with(names, others=(), **given):
 def test_words_on_a_family_reach_the_sets_that_have_it():
     run = ["agents.ppo.epochs=3", "es.noise_std=0.5"]
     both = config_with(["ddqn", "ppo"], ["ddqn", "ppo"], run=run)
-    assert [(x.key, x.weight) for x in both.agents.families] == [("ddqn", 1), ("ppo", 1)]
-    assert both.agents.families[1].agent.epochs == 3 and both.es.noise_std == 0.5
+    assert [(x.key, x.weight) for x in both.agents.members] == [("ddqn", 1), ("ppo", 1)]
+    assert both.agents.members[1].agent.epochs == 3 and both.es.noise_std == 0.5
     alone = config_with(["ddqn"], ["ddqn", "ppo"], run=run)
-    assert [x.key for x in alone.agents.families] == ["ddqn"] and alone.es.noise_std == 0.5
+    assert [x.key for x in alone.agents.members] == ["ddqn"] and alone.es.noise_std == 0.5
     with pytest.raises(ConfigError, match="agents"):
         config_with(["ddqn"], ["ddqn"], run=["agents.ppo.epochs=3"])
     assert config_with(["ddqn"], cpu_budget_s=5.0).generations == runs.UNLIMITED

@@ -45,13 +45,13 @@ class ScriptedSearch:
     def init(self, keys, sizes):
         np.testing.assert_allclose(sizes, score_transforms.draw_step_sizes(len(keys), 3), rtol=1e-6)
         none = np.zeros(len(keys), int)
-        return SimpleNamespace(generation=none, finished=none > 0, incumbent_score=none)
+        return SimpleNamespace(generation=none, solved=none > 0, incumbent_score=none)
 
     def advance(self, state):
         self.advanced += 1
-        made = np.where(state.finished, state.generation, state.generation + 1)
+        made = np.where(state.solved, state.generation, state.generation + 1)
         score = np.arange(len(made)) * 100
-        return SimpleNamespace(generation=made, finished=made > self.solved_at,
+        return SimpleNamespace(generation=made, solved=made > self.solved_at,
                                incumbent_score=score)  # fmt: skip
 
 

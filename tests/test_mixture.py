@@ -304,11 +304,11 @@ def test_a_run_stops_when_the_incumbents_score_solves_the_task(aggregate, score)
     # The mean of both agents is above the threshold, the second agent's is below it.
     incumbents = TASK.solved_reward + np.array([0.75, -0.25])
     after, info = told(incumbents, aggregate=aggregate)
-    assert bool(after.finished) == (aggregate == "mean")
+    assert bool(after.solved) == (aggregate == "mean")
     np.testing.assert_allclose(after.best_score, TASK.solved_reward + score, rtol=1e-6)
     np.testing.assert_allclose(info.by_agent.incumbent_mean, incumbents, rtol=1e-6)
     after, _ = told(incumbents + 1, stop_when_solved=False)
-    assert not after.finished and after.best_score > TASK.solved_reward
+    assert not after.solved and after.best_score > TASK.solved_reward
 
 
 def test_the_incumbents_agents_that_diverged_rank_last_within_their_agent():
@@ -320,7 +320,7 @@ def test_the_incumbents_agents_that_diverged_rank_last_within_their_agent():
 
 def test_an_incumbent_that_one_agent_never_survived_is_never_the_best():
     after, info = told([1e6, NAN])
-    assert (after.best_generation, after.best_score, after.finished) == (-1, -INF, False)
+    assert (after.best_generation, after.best_score, after.solved) == (-1, -INF, False)
     np.testing.assert_array_equal(after.incumbent_scores, [1e6, -INF])
     np.testing.assert_array_equal(info.by_agent.num_nonfinite, [0, 1])
 

@@ -20,7 +20,7 @@ from support import is_drawn
 import sejax
 from sejax import run
 from sejax.bilevel import Bilevel
-from sejax.cli import commands, run_directory, session
+from sejax.cli import commands, run_directory, runtime, session
 from sejax.cli import config as configuration
 from sejax.cli.progress import RunProgress
 from sejax.cli.run_directory import AGENT_COLUMNS, COLUMNS
@@ -101,9 +101,12 @@ def test_the_stored_proxy_is_the_one_of_the_best_generation(uninterrupted):
     assert last["generation"] == 5 and last["score"] == pytest.approx(scores[-1])
 
 
-def test_a_run_in_two_sessions_equals_one_in_one(uninterrupted, tmp_path):
-    learn(tmp_path, "generations=4")
-    assert "Going on at generation 4" in learn(tmp_path, "generations=6")
+def test_a_run_in_two_sessions_equals_one_in_one(uninterrupted, tmp_path, monkeypatch):
+    with monkeypatch.context() as context:
+        context.setattr(runtime, "versions", lambda: {"jax": "0.1"})
+        learn(tmp_path, "generations=4")
+    said = learn(tmp_path, "generations=6")
+    assert "Going on at generation 4" in said and "made with {'jax': '0.1'}" in said
     assert rows(tmp_path) == rows(uninterrupted)
     proxy = "proxy.safetensors"
     assert (tmp_path / proxy).read_bytes() == (uninterrupted / proxy).read_bytes()

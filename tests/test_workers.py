@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 import sejax
 from sejax.bilevel import make_bilevel
-from sejax.cli import cluster, session, workers
+from sejax.cli import cluster, runtime, session, workers
 from sejax.cli import config as configuration
 from sejax.cli.cluster import Pool
 from sejax.cli.workers import Batch, RemoteChunks, cut
@@ -186,7 +186,7 @@ def remote_chunks(config, ray):
     """The generations of a run on workers of a planned cluster."""
     learner = make_bilevel(**config.parts() | {"devices": 1})
     size = learner.mixture.size
-    arguments = configuration.plain(config), [5] * size, 0.0, workers.versions()
+    arguments = configuration.plain(config), [5] * size, 0.0, runtime.versions()
     pool = ray.pool(lambda: workers.Worker(*arguments))
     return RemoteChunks(learner, pool, [Batch(capacity=5, width=1)] * size)
 
@@ -224,7 +224,7 @@ TINY = [
 
 def test_workers_give_the_numbers_of_one_process_to_the_last_bit():
     state = require_equal_numbers(TINY, 4)
-    assert bool(state.finished)  # so that nothing was computed in some of them
+    assert bool(state.solved)  # so that nothing was computed in some of them
 
 
 CASES = {
@@ -259,7 +259,7 @@ def test_so_they_do_with_the_flags_of_a_command(case):
 
 def test_a_worker_with_other_versions_is_refused():
     config = sejax.config(TINY)
-    expected = workers.versions() | {"jax": "0.1"}
+    expected = runtime.versions() | {"jax": "0.1"}
     with pytest.raises(ConfigError, match=r"0\.1") as error:
         workers.Worker(configuration.plain(config), [5], 0.0, expected)
     assert error.value.field == "machines"

@@ -261,7 +261,7 @@ class MixtureRuns(RunSettings):
         Returns:
           Rows with the columns `kind`, `hparams`, and `seed` of the SE.
         """
-        (family,) = config.agents.families
+        (member,) = config.agents.members
         training = dataclasses.replace(config.training, test_episodes=self.test_episodes)
         seeds = {
             f"{name}-{seed:02d}-{ses[i].fingerprint}": seed for i, seed in enumerate(ses.seeds)
@@ -271,14 +271,14 @@ class MixtureRuns(RunSettings):
             condition = Condition.of_set(
                 ses,
                 seeds,
-                name=f"{family.key}-{hparams}",
-                agent=family.agent,
+                name=f"{member.key}-{hparams}",
+                agent=member.agent,
                 training=training,
                 hparams=hparams,
             )
             rows = train_groups(condition, self, self.num_agents, at_once=at_once)
             own = rows["group"].map(seeds)
-            tables.append(rows.assign(kind=family.key, hparams=hparams, seed=own))
+            tables.append(rows.assign(kind=member.key, hparams=hparams, seed=own))
         return pd.concat(tables, ignore_index=True)
 
 

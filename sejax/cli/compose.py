@@ -311,8 +311,8 @@ def help_text(schema: "type[CommandConfig]", overrides: Sequence[str]) -> str:
     values = flatten(composed.values)
     lines = ["Choices (group=choice):"]
     for group in schema.groups:
-        families = [f"{start}ID" for start in registry.GROUPS[group].families]
-        known = [*registry.names(group), *families, "module:attribute"]
+        prefixes = [f"{start}ID" for start in registry.GROUPS[group].prefixes]
+        known = [*registry.names(group), *prefixes, "module:attribute"]
         lines += [f"  {group}: {', '.join(known)}"]
     if schema.learns:
         lines += [f"  preset: {', '.join([*preset_files.names(), 'FILE.yaml'])}"]

@@ -45,7 +45,7 @@ Schema = TypeVar("Schema", bound="CommandConfig")
 
 
 @dataclass(frozen=True, kw_only=True)
-class AgentFamily(Options):
+class MixtureMember(Options):
     """One of the agents of a configuration.
 
     Attributes:
@@ -67,7 +67,7 @@ class AgentFamily(Options):
 class AgentsConfig(MixtureConfig):
     """A mixture of agents, sorted by their keys."""
 
-    families: tuple[AgentFamily, ...]
+    members: tuple[MixtureMember, ...]
 
 
 _SHARED = tuple(field.name for field in dataclasses.fields(MixtureConfig))
@@ -84,12 +84,12 @@ def _agents_from_plain(values: object) -> AgentsConfig | None:
         "agents",
         f"must be a list of agents; got {shortened(values)}. Set agents=[ddqn,ppo].",
     )
-    families = tuple(_family(key, by_key[key]) for key in sorted(by_key))
+    members = tuple(_member(key, by_key[key]) for key in sorted(by_key))
     shared = to_plain(from_plain(MixtureConfig, shared, "agents"))
-    return AgentsConfig(families=families, **shared)
+    return AgentsConfig(members=members, **shared)
 
 
-def _family(key: str, values: object) -> AgentFamily:
+def _member(key: str, values: object) -> MixtureMember:
     field = f"agents.{key}"
     require(
         key == key_of(key),
@@ -98,17 +98,17 @@ def _family(key: str, values: object) -> AgentFamily:
     )
     with named(field):
         fields = dict(values) if isinstance(values, Mapping) else {}
-        family = {"key": key, "field": field, "weight": fields.pop("weight", 1.0)}
+        member = {"key": key, "field": field, "weight": fields.pop("weight", 1.0)}
         agent = registry.configure("agent", fields)
-        return from_plain(AgentFamily, family | {"agent": agent}, "agent")
+        return from_plain(MixtureMember, member | {"agent": agent}, "agent")
 
 
-def families_of(config: "CommandConfig") -> tuple[AgentFamily, ...]:
+def members_of(config: "CommandConfig") -> tuple[MixtureMember, ...]:
     """The agents of a command's configuration: several, or the one."""
     if config.agents is not None:
-        return config.agents.families
+        return config.agents.members
     key = registry.name_of("agent", config.agent)
-    return (AgentFamily(key=key, field="agent", agent=config.agent),)
+    return (MixtureMember(key=key, field="agent", agent=config.agent),)
 
 
 # --- configurations ------------------------------------------------------------------------------
@@ -173,7 +173,9 @@ class LearnConfig(CommandConfig):
     num_seeds: int = option(1, counts("it counts runs"))
     # End a run at its first incumbent mean that reaches the solved threshold.
     stop_when_solved: bool = False
-    checkpoint_every: int = option(1, counts("it counts generations"))  # generations
+    checkpoint_every: int = option(
+        1, counts("it counts generations")
+    )  # generations between checkpoints
     run_dir: str | None = None  # null: runs/<env>-<proxy>-<agent>[_<exploration>][_varied]-s<seed>
 
     def __post_init__(self) -> None:
@@ -197,20 +199,20 @@ class LearnConfig(CommandConfig):
         spec, task_name = envs.spec_of(self.env), self.name("env")
         self.proxy.require_task(spec, task_name)
         max_steps = self.proxy.max_steps(spec.max_steps)
-        train = not all(x.agent.is_solved_for for x in families_of(self))
+        train = not all(x.agent.is_solved_for for x in members_of(self))
         if train and not self.proxy.has_real_dynamics:
             require_reachable("training", self.training, max_steps)
-        for family in families_of(self):
-            with named(family.field):
-                agents.require_fit(family.agent, self.exploration, spec, task_name)
+        for member in members_of(self):
+            with named(member.field):
+                agents.require_fit(member.agent, self.exploration, spec, task_name)
                 if self.proxy.reaches_step_limit:
                     limits = max_steps, spec.max_steps
-                    require_learning("training", self.training, family.agent, *limits)
+                    require_learning("training", self.training, member.agent, *limits)
 
     def name(self, group: str) -> str:
         """The name by which a group's choice was made; several agents are `ddqn+ppo`."""
         if group == "agent":
-            return JOINT.join(family.key for family in families_of(self))
+            return JOINT.join(member.key for member in members_of(self))
         return registry.name_of(group, getattr(self, group))
 
     def plain(self) -> dict[str, Any]:
@@ -238,7 +240,7 @@ class LearnConfig(CommandConfig):
 
     def _learners(self, task: envs.Task) -> Agent | Mixture:
         """The agent, or the mixture of agents, that trains on the proxies."""
-        varied, each = self.agent_hparams == "varied", families_of(self)
+        varied, each = self.agent_hparams == "varied", members_of(self)
         made = tuple(agents.make_agent(x.agent, task, self.exploration, varied) for x in each)
         if self.agents is None:
             return made[0]
@@ -330,7 +332,7 @@ def plain(config: CommandConfig) -> dict[str, Any]:
     if config.agents is not None:
         values["agents"] = {name: getattr(config.agents, name) for name in _SHARED} | {
             each.key: {"name": "", "weight": each.weight} | registry.describe("agent", each.agent)
-            for each in config.agents.families
+            for each in config.agents.members
         }
     return to_plain(values)  # type: ignore[no-any-return]
 
@@ -338,10 +340,10 @@ def plain(config: CommandConfig) -> dict[str, Any]:
 def completed(stored: Mapping[str, Any], config: LearnConfig) -> dict[str, Any]:
     """A stored run's values with the defaults of fields that an older version did not write.
 
-    New fields have a default that changes no number. Of `module:attribute` that is imported which
-    `config` has, nothing else.
+    New fields have a default that changes no number. Of `module:attribute` only what `config` has
+    is imported.
     """
-    own = [registry.name_of("agent", each.agent) for each in families_of(config)]
+    own = [registry.name_of("agent", each.agent) for each in members_of(config)]
     own += [config.name(group) for group in config.groups if group != "agent"]
     try:
         with registry.only_typed(own):

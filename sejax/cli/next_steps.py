@@ -76,8 +76,8 @@ def require_run(stored: Mapping[str, Any]) -> None:
 def agent_names(stored: Mapping[str, Any]) -> list[str]:
     """The agents of a stored run, by the names of their choices."""
     several = stored.get("agents") or {}
-    families = [each for each in several.values() if isinstance(each, dict)]
-    return [str(each["name"]) for each in families or [stored["agent"]]]
+    members = [each for each in several.values() if isinstance(each, dict)]
+    return [str(each["name"]) for each in members or [stored["agent"]]]
 
 
 def _command(module: str, words: Sequence[str]) -> str:

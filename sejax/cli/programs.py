@@ -19,7 +19,7 @@ from jaxtyping import PyTree
 from sejax.agents.mixture import Mixture, MixtureConfig
 from sejax.bilevel import Bilevel, make_bilevel
 from sejax.cli import config as configuration
-from sejax.cli.config import LearnConfig, families_of
+from sejax.cli.config import LearnConfig, members_of
 from sejax.cli.session import Chunks
 from sejax.options import Options, marks, traced_options
 from sejax.options.plain import to_plain
@@ -81,7 +81,7 @@ def shape_of(config: LearnConfig, numbers: dict[str, Any]) -> str:
     plain["es"] = _without(plain["es"], numbers["es"])
     if numbers["agents"]:
         learners = Mixture.of(config.parts()["agent"])
-        plain["agent"] = [static_of(family.agent) for family in families_of(config)]
+        plain["agent"] = [static_of(member.agent) for member in members_of(config)]
         shared = {
             f.name: getattr(learners.config, f.name) for f in dataclasses.fields(MixtureConfig)
         }

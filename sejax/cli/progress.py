@@ -15,7 +15,7 @@ from rich.progress import (
 )
 
 from sejax.cli import next_steps, preset_files
-from sejax.cli.config import LearnConfig, families_of
+from sejax.cli.config import LearnConfig, members_of
 from sejax.cli.trackers import FinishedGeneration, Reporter
 from sejax.options import registry
 
@@ -129,7 +129,7 @@ class RunProgress(Reporter):
 
     def _of_agents(self, values: Mapping[str, float]) -> str:
         """The incumbent's mean for each of several agents."""
-        keys = [family.key for family in families_of(self._config)]
+        keys = [member.key for member in members_of(self._config)]
         each = [f"{key} {values[f'incumbent_mean_{key}']:.1f}" for key in keys if len(keys) > 1]
         return f" ({', '.join(each)})" if each else ""
 
@@ -147,7 +147,7 @@ class RunProgress(Reporter):
                 f"{solved}: best incumbent mean {best:.1f}, solved at {learner.solved_score:g}"
             )
         path, config = directory.path, self._config
-        agents = [registry.name_of("agent", each.agent) for each in families_of(config)]
+        agents = [registry.name_of("agent", each.agent) for each in members_of(config)]
         words = next_steps.evaluate_words(
             path, config.name("env"), config.name("proxy"), agents, learner.proxy.is_real
         )

@@ -20,6 +20,7 @@ import filelock
 import numpy as np
 import yaml
 
+from sejax.cli import runtime
 from sejax.ops import checksummed
 from sejax.ops.files import remove_leftovers, write_bytes, write_text
 from sejax.options import ConfigError, shortened
@@ -84,6 +85,7 @@ class RunDirectory:
       rows: the rows of `metrics.csv`, each as text by column.
       id: 8 hexadecimal digits, drawn when the run began.
       cpu_s: CPU seconds of all sessions up to the checkpoint.
+      versions: of the packages that decide the numbers, as the checkpoint was written.
     """
 
     def __init__(
@@ -112,6 +114,7 @@ class RunDirectory:
         self.columns = columns_of(agents)
         self.rows: list[dict[str, str]] = []
         self.id, self.cpu_s = secrets.token_hex(4), 0.0
+        self.versions: object = runtime.versions()
         self._agents, self._hint = agents if len(agents) > 1 else (), hint
         self._csv = _as_csv([self.columns])
         self._state: dict[str, np.ndarray] | None = None
@@ -208,6 +211,7 @@ class RunDirectory:
             "config": self.config,
             "id": self.id,
             "cpu_s": cpu_s,
+            "versions": runtime.versions(),
         }
         is_first = not self.rows
         write_bytes(self.path / _CHECKPOINT, checksummed.pack(tensors, _KIND, manifest))
@@ -273,6 +277,7 @@ class RunDirectory:
             self.rows = [{name: row.get(name, "nan") for name in self.columns} for row in rows]
             self._csv = _as_csv([self.columns, *(row.values() for row in self.rows)])
             self.id, self.cpu_s = str(manifest["id"]), float(manifest["cpu_s"])
+            self.versions = manifest.get("versions", self.versions)
             self._state, stored = tensors, dict(manifest["config"])
             _ = self.wall_s, self.real_steps
         except (KeyError, TypeError, ValueError) as error:
@@ -334,7 +339,7 @@ def open_for(config: "LearnConfig", hint: str = HINT) -> RunDirectory:
     """
     from sejax.cli import config as configuration  # which imports jax
 
-    agents = [family.key for family in configuration.families_of(config)]
+    agents = [member.key for member in configuration.members_of(config)]
     return RunDirectory(
         config.resolved_run_dir,
         configuration.plain(config),

@@ -134,3 +134,10 @@ def _cpu_lines() -> list[str]:
     with contextlib.suppress(OSError):
         return Path("/proc/cpuinfo").read_text().splitlines()
     return []
+
+
+def versions() -> dict[str, str]:
+    """Of the packages that decide a run's numbers."""
+    from importlib.metadata import version
+
+    return {name: version(name) for name in ("sejax", "jax", "jaxlib")}

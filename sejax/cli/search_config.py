@@ -82,7 +82,9 @@ class SearchConfig(Options):
     search_dir: str | None = None  # null: runs/search-<study>
     # s, after which no trial is begun
     timeout: float | None = option(None, positive("no trial would start"))
-    heartbeat: int = option(15, counts("workers must show that they live"))  # s
+    heartbeat: int = option(
+        15, counts("workers must show that they live")
+    )  # seconds between signs of life of a worker
     # The best trials that are tried again, as the best score of many is the luckiest too: on the
     # real task after a search on a proxy (null: 10), else with seeds that are new (null: 5)
     verify: int | None = option(None, counts("the best are tried again", least=0))

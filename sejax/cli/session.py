@@ -128,6 +128,9 @@ def run(
     if restored is not None:
         state = restored
         report.say(f"Going on at generation {directory.finished_generations} of {directory.path}.")
+        here = runtime.versions()
+        if directory.versions != here:
+            report.say(f"It was made with {directory.versions}; here are {here}. Numbers may move.")
         proxies.save(jax.device_get(state))
     state = jax.tree.map(lambda x: x.copy(), state)  # own buffers, so that they can be donated
     tracked = TrackedRun(
@@ -139,7 +142,7 @@ def run(
     tracker = GuardedTracker(config.tracker, tracked, report.say)
     drawn = time.monotonic()
     with contextlib.closing(tracker):
-        while directory.finished_generations < config.generations and not state.finished:
+        while directory.finished_generations < config.generations and not state.solved:
             left = config.generations - directory.finished_generations
             length = min(config.checkpoint_every, left)
             if not chunks.is_ready(length):
@@ -161,7 +164,7 @@ def run(
                 draw(directory, learner)
                 drawn = time.monotonic()
         draw(directory, learner)
-    ended = "solved" if state.finished else "finished"
+    ended = "solved" if state.solved else "finished"
     agents = learner.strategy.num_evaluations  # of a generation
     steps_of_agents = sum(float(row["train_steps_mean"]) for row in directory.rows)
     directory.write_summary(

@@ -273,10 +273,10 @@ class Tuning:
     ) -> Outcome:
         """The outcome of fresh agents in a world of `sejax.evaluate`, leaves `[agent]`, NumPy."""
         setup = proxy_setup(config)
-        (family,) = setup.families
-        agent = make_agent(family.agent, setup.task, setup.exploration)
+        (member,) = setup.members
+        agent = make_agent(member.agent, setup.task, setup.exploration)
         env, env_params, trainings = setup.worlds[world]
-        training = trainings[family.key]
+        training = trainings[member.key]
 
         def one(key: Array, hparams: Any) -> Outcome:
             tried = dataclasses.replace(agent, hparams=hparams)
@@ -295,7 +295,7 @@ class Tuning:
         key = json.dumps(
             [
                 world,
-                static_of(family.agent),
+                static_of(member.agent),
                 static_of(setup.exploration),
                 to_plain(training),
                 structure_of(agent.hparams),

@@ -14,11 +14,11 @@ import socket
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
+from sejax.cli import runtime
 from sejax.cli.cluster import RESTARTS, RETRIES, Pool, connected, num_workers
 from sejax.options import Options, counts, fraction, option, require
 
@@ -42,7 +42,7 @@ class LocalConfig(Options):
     is_elsewhere: ClassVar[bool] = False
 
     def make(
-        self, config: "LearnConfig", folder: Path, say: Callable[[str], None]
+        self, config: "LearnConfig", say: Callable[[str], None]
     ) -> contextlib.AbstractContextManager["Chunks"]:
         """The compiled generations of a run."""
         from sejax.cli import session  # which imports jax
@@ -66,7 +66,7 @@ class RayConfig(Options):
     gpus_per_worker: float = option(0.0, fraction())
 
     def make(
-        self, config: "LearnConfig", folder: Path, say: Callable[[str], None]
+        self, config: "LearnConfig", say: Callable[[str], None]
     ) -> contextlib.AbstractContextManager["RemoteChunks"]:
         """The generations of a run, computed by workers while the context is open.
 
@@ -81,7 +81,6 @@ def _remote_chunks(
     machines: RayConfig, config: "LearnConfig", say: Callable[[str], None]
 ) -> Iterator["RemoteChunks"]:
     from sejax.cli import config as configuration
-    from sejax.cli import runtime
 
     runtime.take_share_of_gpu(0)  # GPUs are the workers'
     from sejax.bilevel import make_bilevel
@@ -101,7 +100,10 @@ def _remote_chunks(
             max_task_retries=RETRIES,
         )(Worker)
         pool = Pool(
-            ray, lambda: actor.remote(*arguments, versions()), lambda: num_workers(machines), say
+            ray,
+            lambda: actor.remote(*arguments, runtime.versions()),
+            lambda: num_workers(machines),
+            say,
         )
         with contextlib.closing(pool):
             yield RemoteChunks(learner, pool, batches)
@@ -299,14 +301,13 @@ class Worker:
         gpu_share: float,
         expected: dict[str, str],
     ):
-        from sejax.cli import runtime
-
         runtime.configure_xla(1)
         runtime.take_share_of_gpu(gpu_share)
+        versions = runtime.versions()
         require(
-            versions() == expected,
+            versions == expected,
             "machines",
-            f"must have the same versions everywhere; got {versions()} on {socket.gethostname()} "
+            f"must have the same versions everywhere; got {versions} on {socket.gethostname()} "
             f"and {expected} here. Set the same versions up there.",
         )
         runtime.configure_jax()
@@ -362,10 +363,3 @@ def _compiled_share(learner: "Bilevel", agent: int, capacity: int, num_parallel:
 
     shapes = jax.eval_shape(arguments, jax.random.key(0))
     return jax.jit(evaluate, compiler_options=compiler_options()).lower(*shapes).compile()
-
-
-def versions() -> dict[str, str]:
-    """Of the packages that decide a run's numbers."""
-    from importlib.metadata import version
-
-    return {name: version(name) for name in ("sejax", "jax", "jaxlib")}

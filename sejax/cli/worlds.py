@@ -9,7 +9,7 @@ from sejax import agents, envs
 from sejax.agents.base import AgentConfig
 from sejax.cli import config as configuration
 from sejax.cli.compose import named
-from sejax.cli.config import AgentFamily, EvaluateConfig, families_of
+from sejax.cli.config import EvaluateConfig, MixtureMember, members_of
 from sejax.ops.files import as_file_name
 from sejax.options import registry, require, shortened
 from sejax.proxies import header, hub
@@ -32,37 +32,37 @@ class Setup:
     Attributes:
       task: the real task, on which all are tested.
       worlds: by name, the first one first in tables.
-      families: the agents.
+      members: the agents.
       exploration: of all of them.
       out_dir: where the files go.
     """
 
     task: envs.Task
     worlds: dict[str, World]
-    families: tuple[AgentFamily, ...]
+    members: tuple[MixtureMember, ...]
     exploration: Any
     out_dir: Path
 
     @property
     def has_several(self) -> bool:
-        return len(self.families) > 1
+        return len(self.members) > 1
 
 
 def real_setup(config: EvaluateConfig) -> Setup:
     """Agents on the real task alone."""
     require(config.env, "env", "must be given with proxy=real; got none. Set env=cartpole.")
     task_config = registry.configure("env", {"name": config.env})
-    families = families_of(config)
-    for family in families:
-        with named(family.field):
+    members = members_of(config)
+    for member in members:
+        with named(member.field):
             spec = envs.spec_of(task_config)
-            agents.require_fit(family.agent, config.exploration, spec, str(config.env))
+            agents.require_fit(member.agent, config.exploration, spec, str(config.env))
     task = envs.make_from(task_config)
-    trainings = dict.fromkeys((family.key for family in families), config.real_training)
+    trainings = dict.fromkeys((member.key for member in members), config.real_training)
     return Setup(
         task=task,
         worlds={"the real task": World(task.env, task.params, trainings)},
-        families=families,
+        members=members,
         exploration=config.exploration,
         out_dir=Path(config.out_dir or Path("runs", f"evaluate-{as_file_name(task.name)}")),
     )
@@ -78,15 +78,17 @@ def proxy_setup(config: EvaluateConfig) -> Setup:
         f"must be the proxy's own task; got {config.env} for a proxy of {task.name}. Set "
         f"env={task.name}.",
     )
-    families, exploration = families_of(config), config.exploration
+    members, exploration = members_of(config), config.exploration
     if config.agent_hparams == "as_learned":
         learned = proxy.learned_agents().items()
-        families = tuple(AgentFamily(key=key, field="agent", agent=agent) for key, agent in learned)
+        members = tuple(
+            MixtureMember(key=key, field="agent", agent=agent) for key, agent in learned
+        )
         exploration = proxy.learned_with("exploration")
     trainings = {}
-    for family in families:
-        agent = family.agent
-        with named(family.field):
+    for member in members:
+        agent = member.agent
+        with named(member.field):
             agents.require_fit(agent, exploration, task, task.name)
             group, training = _training_on(proxy, config, agent)
             configuration.require_real_returns(group, training)
@@ -99,10 +101,10 @@ def proxy_setup(config: EvaluateConfig) -> Setup:
         require(
             not (config.baseline and agent.is_solved_for),
             "baseline",
-            f"must be false with {family.field}={family.key}, which can only solve a one-step SE; "
+            f"must be false with {member.field}={member.key}, which can only solve a one-step SE; "
             "got true. Set baseline=false.",
         )
-        trainings[family.key] = training
+        trainings[member.key] = training
     worlds = {"the proxy": World(env, proxy.params, trainings)}
     if config.baseline:
         real_trainings = dict.fromkeys(trainings, _real_training(config, proxy))
@@ -115,7 +117,7 @@ def proxy_setup(config: EvaluateConfig) -> Setup:
     return Setup(
         task=task,
         worlds=worlds,
-        families=families,
+        members=members,
         exploration=exploration,
         out_dir=Path(config.out_dir or beside),
     )

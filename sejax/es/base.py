@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float, PyTree
 from sejax.options import MOST_MEMBERS, Options, counts, one_of, option
 
 AGGREGATES = ("mean", "min")
-LARGEST = 1e6  # larger steps or noise lead to weights whose products are not finite
+MAX_SCALE = 1e6  # larger steps or noise lead to weights whose products are not finite
 _TIE = 1e-6  # of the incumbent's score, or of 1 where that is smaller
 
 StrategyState: TypeAlias = PyTree  # only the strategy reads it
@@ -129,7 +129,7 @@ class StrategyOptions(Options):
         16, counts("scores are compared within a generation", 2, MOST_MEMBERS)
     )
     num_evals: int = option(1, counts("a candidate needs a score"))  # agents on each candidate
-    eval_aggregate: str = option("mean", one_of(AGGREGATES))  # what their scores make
+    eval_aggregate: str = option("mean", one_of(AGGREGATES))  # how their scores become one
     common_random_numbers: bool = False  # the same inner seeds for all candidates of a generation
 
     def evaluations(self, num_incumbent_evals: int) -> Evaluations:

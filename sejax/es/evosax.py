@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Float
 
-from sejax.es.base import LARGEST, Evaluations, Strategy, StrategyOptions, StrategyState
+from sejax.es.base import MAX_SCALE, Evaluations, Strategy, StrategyOptions, StrategyState
 from sejax.options import counts, one_of, option, positive, require, shortened, shrinks
 
 if TYPE_CHECKING:  # importing evosax takes a second
@@ -57,11 +57,11 @@ class EvosaxConfig(StrategyOptions):
     # Agents trained on the distribution's mean.
     num_incumbent_evals: int = option(16, counts("the incumbent's score selects the proxy"))
     # Initial std of the search distribution.
-    noise_std: float = option(0.05, positive("candidates must differ", LARGEST))
+    noise_std: float = option(0.05, positive("candidates must differ", MAX_SCALE))
     # Factor for each generation, of open_es alone.
     noise_std_decay: float = option(1.0, shrinks())
     # Learning rate of Adam on the mean, of open_es and pgpe.
-    step_size: float = option(0.05, positive("the mean would not move", LARGEST))
+    step_size: float = option(0.05, positive("the mean would not move", MAX_SCALE))
 
     def __post_init__(self) -> None:
         super().__post_init__()

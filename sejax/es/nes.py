@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Float
 
-from sejax.es.base import LARGEST, Strategy, StrategyOptions
+from sejax.es.base import MAX_SCALE, Strategy, StrategyOptions
 from sejax.es.score_transforms import TRANSFORMS
 from sejax.options import counts, fraction, one_of, option, positive, shrinks
 
@@ -29,11 +29,11 @@ class NESConfig(StrategyOptions):
     # Agents on the incumbent; null: one for each perturbation, as in the paper.
     num_incumbent_evals: int | None = option(16, counts("the incumbent's score selects the proxy"))
     # sigma: std of the weight perturbation
-    noise_std: float = option(0.06, positive("candidates must differ", LARGEST), traced=True)
+    noise_std: float = option(0.06, positive("candidates must differ", MAX_SCALE), traced=True)
     # factor on sigma after each generation
     noise_std_decay: float = option(0.97, shrinks(), traced=True)
-    # alpha
-    step_size: float = option(1.0, positive("the proxy would not move", LARGEST), traced=True)
+    # alpha: step size of the update
+    step_size: float = option(1.0, positive("the proxy would not move", MAX_SCALE), traced=True)
     # factor on alpha after each generation
     step_size_decay: float = option(1.0, shrinks(), traced=True)
     mirrored: bool = True  # each perturbation is tried as +eps and -eps and keeps its better sign

@@ -14,7 +14,7 @@ group         entry points            `make(...)` gives
 `objective`   `sejax.objectives`      `(task)` a `sejax.Objective`
 `es`          `sejax.strategies`      `(num_dims)` a `sejax.Strategy`
 `tracker`     `sejax.trackers`        `(run)` a `sejax.cli.trackers.Tracker`
-`machines`    `sejax.cli`             `(config, folder, say)`: see `sejax.cli.workers`
+`machines`    `sejax.machines`        `(config, say)`: see `sejax.cli.workers`
 ============= ======================= ==============================================
 
 A name is one that comes with sejax, one that an installed package offers as an entry point, or
@@ -62,7 +62,7 @@ class Group:
       makes: `module:attribute` of the class of what `make` returns.
       arguments: what `make` is given, for messages and for functions in a dataclass's place.
       built_in: name to `module:attribute`.
-      families: beginning of a name to `module:attribute` of a dataclass with a field `name`.
+      prefixes: beginning of a name to `module:attribute` of a dataclass with a field `name`.
       base: `module:attribute` of the class that each plugin's dataclass is a subclass of.
     """
 
@@ -70,7 +70,7 @@ class Group:
     makes: str
     arguments: tuple[str, ...]
     built_in: dict[str, str]
-    families: dict[str, str] = dataclasses.field(default_factory=dict)
+    prefixes: dict[str, str] = dataclasses.field(default_factory=dict)
     base: str = "builtins:object"
 
 
@@ -170,9 +170,9 @@ GROUPS = {
         },
     ),
     "machines": Group(
-        "sejax.cli",
+        "sejax.machines",
         "contextlib:AbstractContextManager",
-        ("config", "folder", "say"),
+        ("config", "say"),
         {
             "local": "sejax.cli.workers:LocalConfig",
             "ray": "sejax.cli.workers:RayConfig",
@@ -229,7 +229,7 @@ def names(group: str) -> list[str]:
 
 def is_registered(group: str, name: str) -> bool:
     """Whether a name is known without importing a module that it names."""
-    return name in names(group) or _family(group, name) is not None
+    return name in names(group) or _by_prefix(group, name) is not None
 
 
 def find(group: str, name: object) -> Any:
@@ -246,7 +246,7 @@ def find(group: str, name: object) -> Any:
     kind = GROUPS[group]
     if not isinstance(name, str):
         raise unknown_name(group, name, names(group))
-    built_in = kind.built_in.get(name) or _family(group, name)
+    built_in = kind.built_in.get(name) or _by_prefix(group, name)
     if built_in is not None:
         return _attribute(built_in)
     if name in _offered(group):
@@ -354,9 +354,9 @@ _NAMES: dict[type, str] = {}  # of classes that were found by another name than 
 # --- plugins of others ---------------------------------------------------------------------------
 
 
-def _family(group: str, name: str) -> str | None:
-    families = GROUPS[group].families.items()
-    return next((path for start, path in families if name.startswith(start)), None)
+def _by_prefix(group: str, name: str) -> str | None:
+    prefixes = GROUPS[group].prefixes.items()
+    return next((path for start, path in prefixes if name.startswith(start)), None)
 
 
 def _is_one_of_many(cls: type) -> bool:
