@@ -47,6 +47,9 @@ CURVES = RNS | {"num_agents": 2, "max_steps": 150, "rows": "default"}
 # Settings with which an experiment takes seconds; `se` stands for the file of a random SE.
 TINY = {
     "agent_learning": {"envs": "cliff_walking"},
+    "null_baselines": {"sources": ["by_hand", "episodes", "evolved"], "students": "ddqn",
+                       "hparams": "default", "policies": 1, "num_agents": 2, "num_evolved": 2,
+                       "steps": 40, "teacher_steps": 60, "num_states": 16},
     "rn_heatmap": RNS,
     "rn_objectives": CURVES | {"objectives": ("reward_threshold", "auc")},
     "rn_performance": CURVES,
@@ -70,8 +73,8 @@ TINY = {
                             "test_episodes": 2},
     "timings": {"rows": "cliff_walking-rn", "generations": 1},
 }  # fmt: skip
-SLOW = {"rn_performance", "score_transforms", "se_families", "se_horizons", "se_performance",
-        "se_transfer_of_hparams", "supervised_baseline"}  # fmt: skip
+SLOW = {"null_baselines", "rn_performance", "score_transforms", "se_families", "se_horizons",
+        "se_performance", "se_transfer_of_hparams", "supervised_baseline"}  # fmt: skip
 
 
 def module_of(name):

@@ -1,0 +1,311 @@
+"""Bandits that copy a policy: the null baseline of one-step SEs.
+
+A one-step SE is a contextual bandit, and its reward is a policy. The cheapest such bandit is a
+table: states, and what some policy does in each. An agent is shown one of the states, acts, and is
+paid for acting as the table does. This module makes the policies (written by hand, trained for few
+real steps, or searched) and the environment; `experiments.null_baselines` tests agents on it.
+"""
+
+import time
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jaxtyping import Array, Float
+
+import sejax
+from sejax.envs.base import Task
+from sejax.envs.environment import EnvState
+from sejax.evaluation import make_recorder, make_tester
+from sejax.proxies.base import ProxyEnv, ProxyParams
+
+Policy = Callable[[Array], Array]  # an observation [obs_dim] to an action
+
+# Controllers in a line each, as a textbook has them; gains are first guesses and were not searched.
+# MountainCar and Acrobot push along a velocity; Pendulum swings up by energy, and balances at the
+# top.
+BY_HAND: dict[str, Policy] = {
+    "cartpole": lambda s: (0.1 * s[0] + 0.3 * s[1] + s[2] + 0.6 * s[3] > 0).astype(jnp.int32),
+    "acrobot": lambda s: jnp.where(s[5] > 0, 2, 0),
+    "mountain_car": lambda s: jnp.where(s[1] > 0, 2, 0),
+    "mountain_car_continuous": lambda s: jnp.sign(s[1:2]),
+    "pendulum": lambda s: jnp.clip(
+        jnp.where(
+            s[0] > 0.8,
+            -10 * s[1] - 2 * s[2],
+            s[2] * (15 * (1 - s[0]) - s[2] ** 2 / 2),
+        ),
+        -2,
+        2,
+    )[None],
+}
+BY_HAND["cartpole_v1"] = BY_HAND["cartpole"]
+
+
+class Copied(NamedTuple):
+    """A policy's actions in some states, and what it took to get them.
+
+    Attributes:
+      states: `[state, obs_dim]`, in the task's units.
+      actions: `[state]` int32, or `[state, action_dim]`.
+      real_steps: steps on the real task that making it took, tests included.
+      cpu_s: CPU seconds of that, without compilation.
+      policy_return: mean return of the policy itself on the real task, over `TEST_EPISODES`.
+    """
+
+    states: np.ndarray
+    actions: np.ndarray
+    real_steps: int
+    cpu_s: float
+    policy_return: float
+
+
+TEST_EPISODES = 10
+
+
+@struct.dataclass
+class BanditState(EnvState):
+    obs: Array  # [obs_dim]
+    action: Array  # what the policy does there
+    time: Array | int
+
+
+class PolicyBandit(ProxyEnv):
+    """An environment of one-step episodes that pays for acting as a table does.
+
+    The reward is 1 for the table's action and 0 for others; where actions are continuous, it is
+    minus the mean distance to the table's. The weights are `{"states": [state, obs_dim],
+    "actions": [state, ...]}`, so that one compiled program serves all tables of a size.
+    """
+
+    def __init__(self, task: Task):
+        config = sejax.SyntheticConfig(horizon=1, initial_state="noise", done="threshold")
+        super().__init__(task, config)
+
+    def init_weights(self, key: Array) -> dict[str, Array]:
+        """A table of one state of zeros, where the policy does nothing."""
+        action = jnp.zeros(1, jnp.int32) if self._is_discrete else jnp.zeros((1, self._action_dim))
+        return {"states": jnp.zeros((1, self.task.obs_dim)), "actions": action}
+
+    @property
+    def _is_discrete(self) -> bool:
+        return self.task.num_actions is not None
+
+    @property
+    def _action_dim(self) -> int:
+        return self.task.action_dim
+
+    def reset_env(self, key: Array, params: ProxyParams) -> tuple[Array, BanditState]:
+        states, actions = (jnp.asarray(params.weights[name]) for name in ("states", "actions"))
+        i = jax.random.randint(key, (), 0, states.shape[0])
+        state = BanditState(obs=states[i], action=actions[i], time=jnp.int32(0))
+        return state.obs, state
+
+    def step_env(
+        self, key: Array, state: BanditState, action: Array, params: ProxyParams
+    ) -> tuple[Array, BanditState, Float[Array, ""], Array, dict[Any, Any]]:
+        if self._is_discrete:
+            reward = jnp.float32(action == state.action)
+        else:
+            reward = -jnp.abs(action - state.action).mean()
+        after = BanditState(obs=state.obs, action=state.action, time=state.time + 1)
+        return state.obs, after, reward, jnp.bool_(True), {}
+
+    def is_truncated(self, state: BanditState, params: ProxyParams) -> Array:
+        """Never: the only step terminates the episode."""
+        return jnp.bool_(False)
+
+    def get_obs(self, state: BanditState, params: Any = None, key: Any = None) -> Array:
+        return state.obs
+
+
+# --- policies ------------------------------------------------------------------------------------
+
+
+def policy_agent(task: Task, policy: Callable[[Any, Array], Array]) -> sejax.Agent:
+    """An agent that does not learn: its state is what `policy(state, obs)` takes.
+
+    Its only use is to be tested and recorded as other agents are.
+    """
+    base = sejax.make_agent(sejax.config([f"env={task.name}"]).agent, task)
+    return sejax.Agent(
+        init=lambda key, hparams: (),
+        act=lambda key, state, obs, /, explore: policy(state, obs),
+        update=lambda key, state, batch: state,
+        buffer=base.buffer,
+        hparams=(),
+        spec=base.spec,
+    )
+
+
+def copy_by_hand(task: Task, seed: int, num_states: int) -> Copied:
+    """The controller of `BY_HAND` in states around those that it visits in one episode.
+
+    Raises:
+      KeyError: where there is none.
+    """
+    policy = BY_HAND[task.name]
+    agent = policy_agent(task, lambda _, obs: policy(obs))
+    return copy(task, agent, (), jax.random.key(seed), num_states, real_steps=0, cpu_s=0.0)
+
+
+def copy_of_agent(
+    task: Task, config: Any, real_steps: int, seed: int, num_states: int, widen: float
+) -> Copied:
+    """An agent that trained on the real task for a number of steps.
+
+    Args:
+      task: the real task.
+      config: of the agent.
+      real_steps: that it trains for.
+      seed: of the training.
+      num_states: of the table.
+      widen: see `copy`.
+    """
+    agent = sejax.make_agent(config, task)
+    training = sejax.TrainingConfig(
+        max_steps=real_steps,
+        max_episodes=real_steps,
+        stop_rule="never",
+        time_limit_is_terminal=False,
+    )
+    train = jax.jit(sejax.make_trainer(agent, task.env, training))
+    key_train, key_copy = jax.random.split(jax.random.key(seed))
+    compiled = train.lower(key_train, task.params).compile()
+    started = time.process_time()
+    result = jax.block_until_ready(compiled(key_train, task.params))
+    cpu_s = time.process_time() - started
+    return copy(
+        task, agent, result.agent_state, key_copy, num_states, real_steps, cpu_s, widen=widen
+    )
+
+
+def copy(
+    task: Task,
+    agent: sejax.Agent,
+    agent_state: Any,
+    key: Array,
+    num_states: int,
+    real_steps: int,
+    cpu_s: float,
+    widen: float = 1.5,
+) -> Copied:
+    """What an agent does in states around those that it visits in its test episodes.
+
+    Args:
+      task: the real task.
+      agent: whose greedy actions are copied.
+      agent_state: its state.
+      key: of the tests and the states.
+      num_states: of the table; half of them are visited ones.
+      real_steps: what making the agent took; the test episodes are added.
+      cpu_s: likewise.
+      widen: standard deviation of the Gaussian around the visited states, in units of theirs; 0 for
+        visited states alone.
+    """
+    key_test, key_rows, key_noise = jax.random.split(key, 3)
+    tests = make_tester(agent, task, TEST_EPISODES)(key_test, agent_state)
+    steps = make_recorder(agent, task, TEST_EPISODES)(key_test, agent_state)
+    visited = steps.obs[np.asarray(steps.valid)]
+    rows = jax.random.choice(key_rows, visited, (num_states,))
+    noise = jax.random.normal(key_noise, rows.shape) * visited.std(0)
+    is_wide = (jnp.arange(num_states) % 2 == 1)[:, None]
+    states = jnp.where(is_wide & (widen > 0), visited.mean(0) + widen * noise, rows)
+    act = jax.vmap(lambda obs: agent.act(jax.random.key(0), agent_state, obs, explore=False))
+    return Copied(
+        states=np.asarray(states),
+        actions=np.asarray(jax.jit(act)(states)),
+        real_steps=real_steps + int(tests.num_steps.sum()),
+        cpu_s=cpu_s,
+        policy_return=float(tests.returns.mean()),
+    )
+
+
+def copy_of_search(task: Task, real_steps: int, seed: int, num_states: int, widen: float) -> Copied:
+    """A linear policy found by augmented random search, on rollouts alone.
+
+    The search ends when the policy solves the task in `TEST_EPISODES` tests, or when the steps are
+    spent. Of all generations the one with the best tests is kept.
+
+    Args:
+      task: the real task.
+      real_steps: at most.
+      seed: of the search.
+      num_states: of the table.
+      widen: see `copy`.
+
+    Source: Mania et al., "Simple random search of static linear policies is competitive for
+    reinforcement learning" (2018), Algorithm 2, with the statistics of observations taken from
+    random episodes before the search.
+    """
+    key_random, key_search, key_copy = jax.random.split(jax.random.key(seed), 3)
+    outputs = task.num_actions or task.action_dim
+    agent = policy_agent(task, _linear_policy(task))
+    zeros = jnp.zeros((outputs, task.obs_dim + 1))
+
+    def random_episodes(key: Array) -> Any:
+        keys = jax.random.split(key, TEST_EPISODES)
+        weights = jax.vmap(lambda k: jax.random.normal(k, zeros.shape))(keys)
+        scale = (jnp.zeros(task.obs_dim), jnp.ones(task.obs_dim))
+        record = make_recorder(agent, task, 1)
+        return jax.vmap(lambda k, w: record(k, (w, *scale)))(keys, weights)
+
+    steps = jax.jit(random_episodes)(key_random)
+    visited = steps.obs[np.asarray(steps.valid)]
+    scale = (visited.mean(0), jnp.maximum(visited.std(0), 1e-6))
+    once, tester = make_tester(agent, task, 1), make_tester(agent, task, TEST_EPISODES)
+
+    @jax.jit
+    def generation(key: Array, weights: Array) -> tuple[Array, Any, Array]:
+        key_noise, key_once, key_test = jax.random.split(key, 3)
+        noise = jax.random.normal(key_noise, (ARS_DIRECTIONS, *zeros.shape))
+        keys = jax.random.split(key_once, ARS_DIRECTIONS)
+        both = [
+            jax.vmap(lambda k, e, s=sign: once(k, (weights + s * ARS_NOISE * e, *scale)))(
+                keys, noise
+            )
+            for sign in (1, -1)
+        ]
+        plus, minus = (tests.returns[:, 0] for tests in both)
+        top = jnp.argsort(-jnp.maximum(plus, minus))[:ARS_TOP]
+        spread = jnp.concatenate([plus[top], minus[top]]).std() + 1e-6
+        step = jnp.tensordot((plus - minus)[top], noise[top], 1) / (ARS_TOP * spread)
+        weights = weights + ARS_STEP * step
+        tests = tester(key_test, (weights, *scale))
+        used = both[0].num_steps.sum() + both[1].num_steps.sum()
+        return weights, tests, used
+
+    weights = best = zeros
+    compiled = generation.lower(key_search, weights).compile()
+    best_return, used, started = -np.inf, len(visited), time.process_time()
+    for i in range(MOST_GENERATIONS):
+        weights, tests, steps_used = compiled(jax.random.fold_in(key_search, i), weights)
+        used += int(steps_used) + int(tests.num_steps.sum())
+        if float(tests.returns.mean()) > best_return:
+            best, best_return = weights, float(tests.returns.mean())
+        is_solved = task.solved_reward is not None and best_return >= task.solved_reward
+        if is_solved or used >= real_steps:
+            break
+    cpu_s = time.process_time() - started
+    return copy(task, agent, (best, *scale), key_copy, num_states, used, cpu_s, widen=widen)
+
+
+# Mania et al. search these for each task; here they are the same for all.
+ARS_DIRECTIONS, ARS_TOP, ARS_NOISE, ARS_STEP = 16, 8, 0.3, 0.3
+MOST_GENERATIONS = 100_000
+
+
+def _linear_policy(task: Task) -> Callable[[Any, Array], Array]:
+    """The policy of `(weights [output, obs_dim + 1], mean [obs_dim], std [obs_dim])`."""
+
+    def policy(state: Any, obs: Array) -> Array:
+        weights, mean, std = state
+        out = weights @ jnp.append((obs - mean) / std, 1.0)
+        if task.num_actions is not None:
+            return jnp.argmax(out).astype(jnp.int32)
+        return task.max_action * jnp.tanh(out)
+
+    return policy

@@ -1,0 +1,292 @@
+"""What does as well as an evolved SE: bandits that copy a policy, and what each of them costs.
+
+A one-step SE is a contextual bandit, so that its reward is a policy. Here agents train on bandits
+that copy a policy, beside the SE that ships with sejax:
+
+- `by_hand`: a controller in one line, no step of the real task;
+- `agent`: an agent that trained on the real task for few steps;
+- `episodes`: ten test episodes of that agent, and no other state (behaviour cloning's data);
+- `search`: a linear policy found by augmented random search, with at most the steps of the SE;
+- `evolved`: the shipped SE.
+
+Each is tested with the same students, and the policy that is copied is tested itself. Costs stand
+beside returns: real steps (tests included) and CPU seconds of making the proxy.
+"""
+
+import functools
+import hashlib
+import itertools
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+import sejax
+from experiments.common import bandits, figures, tables
+from experiments.common.agents import HPARAMS, Condition, Group, groups_at_once, train_groups
+from experiments.common.bandits import Copied, PolicyBandit
+from experiments.common.experiment import Experiment, Settings, count, setting
+from experiments.common.shards import stack, unstack
+from sejax import envs
+from sejax.options import each_of, one_of, positive
+
+SOURCES = ("by_hand", "agent", "episodes", "search", "evolved")
+DISCRETE = ("ddqn", "dueling_ddqn", "ppo", "sac", "td3_discrete")
+CONTINUOUS = ("td3", "sac", "ppo")
+# Two kinds of teachers for each task, with real steps in which most of them learn it; from
+# docs/agents.md, whose seeds are others.
+TEACHERS: dict[str, dict[str, int]] = {
+    "cartpole": {"ppo": 5_000, "ddqn": 8_000},
+    "cartpole_v1": {"ppo": 10_000, "ddqn": 15_000},
+    "acrobot": {"ppo": 8_000, "ddqn": 10_000},
+    "mountain_car": {"ddqn": 40_000, "sac": 40_000},
+    "mountain_car_continuous": {"td3": 32_000, "ppo": 32_000},
+    "pendulum": {"td3": 8_000, "sac": 8_000},
+    "halfcheetah": {"td3": 50_000, "sac": 50_000},
+}
+STUDENT_STEPS = {"pendulum": 5_000, "halfcheetah": 10_000}  # 2,000 elsewhere
+
+
+@dataclass(frozen=True, kw_only=True)
+class NullBaselines(Settings):
+    name = "null_baselines"
+
+    env: str = setting("cartpole", one_of(tuple(TEACHERS)))
+    sources: tuple[str, ...] = setting(SOURCES, each_of(SOURCES))  # what makes the proxies
+    students: tuple[str, ...] = setting(())  # kinds of agents; all that fit the task
+    # Hyperparameters of the students; varied: drawn for each.
+    hparams: tuple[str, ...] = setting(HPARAMS, each_of(HPARAMS), quick=("default",))
+    policies: int = count(10, quick=2)  # of each source and kind of teacher
+    num_agents: int = count(5, quick=2)  # of each kind on each proxy
+    num_evolved: int = count(20, quick=2)  # agents of each kind on the shipped SE
+    steps: int | None = count(None, quick=500)  # of a student; 2,000, more on hard tasks
+    teacher_steps: int | None = count(None, quick=500)  # of a teacher; by the task
+    search_steps: int = count(1_000_000, quick=5_000)  # real steps of a search, at most
+    num_states: int = count(1024)  # of a table
+    widen: float = setting(1.5, positive("it is a scale"))  # spread of a table's states
+
+    @property
+    def task(self) -> envs.Task:
+        """The real task."""
+        return envs.make(self.env)
+
+    @property
+    def kinds(self) -> tuple[str, ...]:
+        """The kinds of students."""
+        return self.students or (CONTINUOUS if self.task.num_actions is None else DISCRETE)
+
+
+def makers(settings: NullBaselines, source: str) -> Iterator[tuple[str, Callable[[], Copied]]]:
+    """The tables of a source: the name of each, and what makes it."""
+    task, size, widen = settings.task, settings.num_states, settings.widen
+    seeds = range(settings.seed, settings.seed + settings.policies)
+    if source == "by_hand" and settings.env in bandits.BY_HAND:
+        for seed in seeds:
+            yield f"hand-{seed:02d}", functools.partial(bandits.copy_by_hand, task, seed, size)
+    elif source in ("agent", "episodes"):
+        wide = widen if source == "agent" else 0.0
+        for (kind, steps), seed in itertools.product(TEACHERS[settings.env].items(), seeds):
+            config = sejax.config([f"env={settings.env}", f"agent={kind}"]).agent
+            steps = settings.teacher_steps or steps
+            make = functools.partial(bandits.copy_of_agent, task, config, steps, seed, size, wide)
+            yield f"{kind}-{seed:02d}", make
+    elif source == "search":
+        for seed in seeds:
+            yield (
+                f"ars-{seed:02d}",
+                functools.partial(
+                    bandits.copy_of_search, task, settings.search_steps, seed, size, widen
+                ),
+            )
+
+
+def make_table(settings: NullBaselines, source: str, name: str, make: Callable[[], Copied]) -> Any:
+    """The rows of one table, a cached shard: states `s0...`, actions `a0...`, and its costs."""
+    names = ("seed", "num_states", "widen", "teacher_steps", "search_steps")
+    depends = settings.values(*names) | {"env": settings.env, "source": source, "name": name}
+
+    def compute() -> pd.DataFrame:
+        made = make()
+        actions = made.actions.reshape(len(made.actions), -1)
+        columns = {f"s{i}": x for i, x in enumerate(made.states.T)}
+        columns |= {f"a{i}": x for i, x in enumerate(actions.T)}
+        costs = made._asdict()
+        costs = {x: costs[x] for x in ("real_steps", "cpu_s", "policy_return")}
+        return pd.DataFrame(columns | costs)
+
+    return settings.shards.compute(f"table-{source}-{name}", depends, compute)
+
+
+def as_group(env: PolicyBandit, name: str, rows: pd.DataFrame) -> Group:
+    """The bandit that rows of `make_table` describe."""
+    states = rows.filter(regex=r"^s\d").to_numpy(np.float32)
+    actions = rows.filter(regex=r"^a\d").to_numpy(np.float32)
+    if env.task.num_actions is not None:
+        actions = actions[:, 0].astype(np.int32)
+    digest = hashlib.sha256(states.tobytes() + actions.tobytes()).hexdigest()[:12]
+    return Group(name, env.params({"states": states, "actions": actions}), digest)
+
+
+def compute(settings: NullBaselines) -> pd.DataFrame:
+    """Makes the proxies and trains students on them: `makers` and `students`."""
+    task = settings.task
+    bandit = PolicyBandit(task)
+    made: list[dict[str, Any]] = []
+    students = []
+    for source in settings.sources:
+        if source == "evolved":
+            env, groups, num_agents = *shipped(settings, made), settings.num_evolved
+        else:
+            env, groups, num_agents = bandit, [], settings.num_agents
+            for name, make in makers(settings, source):
+                rows = make_table(settings, source, name, make)
+                groups.append(as_group(bandit, name, rows))
+                costs = rows.iloc[0][["real_steps", "cpu_s", "policy_return"]]
+                made.append({"source": source, "group": name, **costs})
+        if groups:
+            students.append(train_students(settings, source, env, groups, num_agents))
+    return stack({"makers": pd.DataFrame(made), "students": pd.concat(students)})
+
+
+def shipped(settings: NullBaselines, made: list[dict[str, Any]]) -> tuple[Any, list[Group]]:
+    """The SE of the task that ships with sejax; its costs are added to `made`."""
+    known = {proxy.name: proxy for proxy in sejax.pretrained()}
+    if settings.env not in known:
+        return None, []
+    env, params = sejax.load(settings.env)
+    row = known[settings.env].row
+    costs = {"real_steps": row["real steps"], "cpu_s": row["CPU s"]}
+    numbers = {name: float(str(x).replace(",", "")) for name, x in costs.items()}
+    made.append({"source": "evolved", "group": "shipped", **numbers, "policy_return": np.nan})
+    return env, [Group("shipped", params)]
+
+
+def train_students(
+    settings: NullBaselines, source: str, env: Any, groups: list[Group], num_agents: int
+) -> pd.DataFrame:
+    """Agents of each kind on each proxy of a source, a row each."""
+    steps = settings.steps or STUDENT_STEPS.get(settings.env, 2_000)
+    training = sejax.TrainingConfig(max_steps=steps, max_episodes=steps, stop_rule="never")
+    found = []
+    for kind, hparams in itertools.product(settings.kinds, settings.hparams):
+        condition = Condition(
+            name=f"{source}-{kind}-{hparams}",
+            env=env,
+            task=settings.task,
+            groups=tuple(groups),
+            agent=sejax.config([f"env={settings.env}", f"agent={kind}"]).agent,
+            training=training,
+            hparams=hparams,
+            settings={"source": source},
+        )
+        at_once = min(len(groups), groups_at_once(settings.devices))
+        rows = train_groups(condition, settings, num_agents, at_once=at_once)
+        found.append(rows.assign(source=source, kind=kind, hparams=hparams))
+    return pd.concat(found, ignore_index=True)
+
+
+def summarise(settings: NullBaselines, rows: pd.DataFrame) -> pd.DataFrame:
+    """A row for each source, teacher, kind of student and of hyperparameters."""
+    made, students = unstack(rows, "makers"), unstack(rows, "students")
+    made["teacher"] = made["group"].str.partition("-")[0]
+    students = students.merge(made[["source", "group", "teacher"]], on=["source", "group"])
+    costs = made.groupby(["source", "teacher"], sort=False)[
+        ["real_steps", "cpu_s", "policy_return"]
+    ]
+    solved_reward = settings.task.solved_reward
+
+    def statistics(mine: pd.DataFrame) -> dict[str, float]:
+        returns = mine["test_return"]
+        return tables.mean_columns(returns, "test_return", mine["group"]) | {
+            "median": returns.median(),
+            "worst_tenth": returns[returns <= returns.quantile(0.1)].mean(),
+            "worst": returns.min(),
+            "solved": (returns >= solved_reward).mean(),
+            "num_proxies": mine["group"].nunique(),
+            "num_agents": len(mine),
+        }
+
+    summary = tables.summary_by(students, ["source", "teacher", "kind", "hparams"], statistics)
+    return summary.join(costs.mean(), on=["source", "teacher"])
+
+
+NAMES = {
+    "by_hand": "by hand",
+    "agent": "one agent",
+    "episodes": "ten episodes",
+    "search": "random search",
+    "evolved": "evolved SE (shipped)",
+}
+
+
+def report(settings: NullBaselines, rows: pd.DataFrame) -> pd.DataFrame:
+    summary = summarise(settings, rows)
+    draw(settings, summary)
+    shown = []
+    for (source, teacher, hparams), mine in summary.groupby(
+        ["source", "teacher", "hparams"], sort=False
+    ):
+        first = mine.iloc[0]
+        policy = first["policy_return"]
+        shown.append(
+            {
+                "proxy made of": NAMES[source]
+                + (
+                    f": {figures.AGENT_NAMES.get(teacher, teacher)}"
+                    if source in ("agent", "episodes")
+                    else ""
+                ),
+                "real steps": f"{first['real_steps']:,.0f}",
+                "CPU s": f"{first['cpu_s']:,.1f}",
+                "the policy itself": "" if np.isnan(policy) else f"{policy:,.1f}",
+                "students": hparams,
+                **{
+                    figures.AGENT_NAMES.get(row.kind, row.kind): cell(row)
+                    for row in mine.itertuples()
+                },
+            }
+        )
+    table = pd.DataFrame(shown)
+    steps = settings.steps or STUDENT_STEPS.get(settings.env, 2_000)
+    note = (
+        f"Cells: mean return of fresh agents after {steps:,} steps on the proxy (mean of the worst "
+        f"tenth; share that solves the task, {settings.task.solved_reward:g}). Students' "
+        "hyperparameters are their defaults, or drawn around them (varied). Real steps and CPU "
+        "seconds are those of making one proxy, tests included, without compilation. A policy by "
+        "hand took no step of the real task; its tests did."
+    )
+    title = f"What does as well as an SE on {settings.env}"
+    return tables.publish(settings, title, table, summary, note)
+
+
+def cell(row: Any) -> str:
+    """What one kind of student reaches."""
+    return f"{row.test_return_mean:,.1f} ({row.worst_tenth:,.1f}; {row.solved:.0%})"
+
+
+def draw(settings: NullBaselines, summary: pd.DataFrame) -> None:
+    """Students' mean returns against the real steps that a proxy cost."""
+    mine = summary[summary["hparams"] == settings.hparams[0]]
+    with figures.panels(settings.folder / "costs.png", 1, 1, (6.4, 3.6)) as (_, [[axes]]):
+        for i, ((source, teacher), points) in enumerate(
+            mine.groupby(["source", "teacher"], sort=False)
+        ):
+            name = NAMES[source] + (f": {teacher}" if source in ("agent", "episodes") else "")
+            axes.plot(
+                points["real_steps"].clip(lower=1),
+                points["test_return_mean"],
+                "osD^v<>"[i % 7],
+                color=f"C{i}",
+                label=name,
+            )
+        figures.threshold(axes, settings.task.solved_reward)
+        axes.set(xscale="log", xlabel="real steps to make the proxy", ylabel="students' return")
+        axes.legend(fontsize=7)
+
+
+EXPERIMENT = Experiment(settings=NullBaselines, compute=compute, report=report, about=__doc__)
+
+if __name__ == "__main__":
+    EXPERIMENT.main()

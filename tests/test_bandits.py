@@ -1,0 +1,65 @@
+"""Bandits that copy a policy: what they pay, and the policies that they copy."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from experiments.common import bandits
+from experiments.common.bandits import PolicyBandit
+from sejax import envs
+
+CARTPOLE, CAR = envs.make("cartpole"), envs.make("mountain_car_continuous")
+
+
+@pytest.mark.parametrize("task, actions, tried, paid", [
+    (CARTPOLE, np.int32([0, 1]), np.int32([1, 1]), [0.0, 1.0]),
+    (CAR, np.float32([[0.5], [-1.0]]), np.float32([[0.25], [1.0]]), [-0.25, -2.0]),
+])  # fmt: skip
+def test_a_bandit_pays_for_the_action_of_the_table(task, actions, tried, paid):
+    env = PolicyBandit(task)
+    states = np.arange(2 * task.obs_dim, dtype=np.float32).reshape(2, -1)
+    params = env.params({"states": states, "actions": actions})
+    met = set()
+    for seed in range(20):
+        obs, state = env.reset_env(jax.random.key(seed), params)
+        row = int(np.flatnonzero((states == np.asarray(obs)).all(1))[0])
+        after, _, reward, terminated, _ = env.step_env(jax.random.key(0), state, tried[row], params)
+        assert float(reward) == paid[row] and terminated and (after == obs).all()
+        met.add(row)
+    assert met == {0, 1}
+
+
+def test_the_controller_of_cartpole_balances_and_is_copied():
+    copied = bandits.copy_by_hand(CARTPOLE, seed=0, num_states=64)
+    assert copied.policy_return == 200.0 and copied.real_steps == 2000  # ten tests, nothing else
+    u = copied.states @ np.array([0.1, 0.3, 1.0, 0.6])
+    assert (copied.actions == (u > 0)).all() and 0 < copied.actions.mean() < 1
+
+
+@pytest.mark.parametrize("task, least", [(CARTPOLE, 195.0), (CAR, 90.0)], ids=lambda x: str(x)[:8])
+def test_a_random_search_solves_a_task_and_counts_its_steps(task, least):
+    copied = bandits.copy_of_search(task, real_steps=100_000, seed=0, num_states=8, widen=0.0)
+    assert copied.policy_return >= least
+    tests = 2 * bandits.TEST_EPISODES * 20  # the random episodes and the last tests, at least
+    assert tests < copied.real_steps < 110_000
+
+
+def test_a_search_ends_when_its_steps_are_spent():
+    task = envs.make("pendulum")  # whose episodes all have 200 steps
+    copied = bandits.copy_of_search(task, real_steps=1, seed=0, num_states=8, widen=0.0)
+    one_generation = 3 * bandits.TEST_EPISODES + 2 * bandits.ARS_DIRECTIONS
+    assert copied.real_steps == 200 * one_generation
+    assert copied.policy_return < task.solved_reward
+
+
+def test_a_copy_of_an_agent_has_its_greedy_actions_and_its_steps():
+    import sejax
+
+    config = sejax.config(["env=cartpole", "agent=ddqn"]).agent
+    copied = bandits.copy_of_agent(CARTPOLE, config, 300, seed=0, num_states=32, widen=1.5)
+    assert copied.states.shape == (32, 4) and set(np.unique(copied.actions)) <= {0, 1}
+    tested = copied.policy_return * bandits.TEST_EPISODES  # a step is a unit of return
+    assert copied.real_steps == 300 + tested
+    wide, visited = copied.states[1::2], copied.states[::2]
+    assert jnp.std(wide[:, 3]) > jnp.std(visited[:, 3])
