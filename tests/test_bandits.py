@@ -37,6 +37,7 @@ def test_the_controller_of_cartpole_balances_and_is_copied():
     assert (copied.actions == (u > 0)).all() and 0 < copied.actions.mean() < 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("task, least", [(CARTPOLE, 195.0), (CAR, 90.0)], ids=lambda x: str(x)[:8])
 def test_a_random_search_solves_a_task_and_counts_its_steps(task, least):
     copied = bandits.copy_of_search(task, real_steps=100_000, seed=0, num_states=8, widen=0.0)
