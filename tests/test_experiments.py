@@ -73,8 +73,9 @@ TINY = {
                             "test_episodes": 2},
     "timings": {"rows": "cliff_walking-rn", "generations": 1},
 }  # fmt: skip
-SLOW = {"null_baselines", "rn_heatmap", "rn_objectives", "rn_performance", "score_transforms", "se_families", "se_horizons",
-        "se_performance", "se_transfer_of_hparams", "supervised_baseline"}  # fmt: skip
+SLOW = {"null_baselines", "rn_heatmap", "rn_objectives", "rn_performance", "score_transforms",
+        "se_families", "se_horizons", "se_performance", "se_transfer_of_hparams",
+        "supervised_baseline"}  # fmt: skip
 
 
 def module_of(name):
