@@ -53,7 +53,7 @@ STUDENT_STEPS = {"pendulum": 5_000, "halfcheetah": 10_000}  # 2,000 elsewhere
 class NullBaselines(Settings):
     name = "null_baselines"
 
-    env: str = setting("cartpole", one_of(tuple(TEACHERS)))
+    env: str = setting("cartpole", one_of(tuple(TEACHERS)))  # the task
     sources: tuple[str, ...] = setting(SOURCES, each_of(SOURCES))  # what makes the proxies
     students: tuple[str, ...] = setting(())  # kinds of agents; all that fit the task
     # Hyperparameters of the students; varied: drawn for each.

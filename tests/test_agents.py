@@ -153,7 +153,9 @@ def test_the_default_hyperparameters_are_the_traced_options_of_the_configuration
     assert agent.spec.spaces is not None
 
 
-@every_agent
+@pytest.mark.parametrize(
+    "case", [*PLAIN, *(pytest.param(x, marks=pytest.mark.slow) for x in EXPLORING)], ids="-".join
+)
 def test_agents_of_other_hyperparameters_learn_in_one_program_as_each_would_alone(case):
     _, agent, start = parts(case)
     hparams = agent.hparams if case[2] == "none" else agent.hparams.agent

@@ -74,8 +74,8 @@ TINY = {
     "timings": {"rows": "cliff_walking-rn", "generations": 1},
 }  # fmt: skip
 SLOW = {"null_baselines", "rn_heatmap", "rn_objectives", "rn_performance", "score_transforms",
-        "se_families", "se_horizons", "se_performance", "se_transfer_of_hparams",
-        "supervised_baseline"}  # fmt: skip
+        "se_families", "se_feasibility", "se_horizons", "se_models", "se_performance",
+        "se_transfer_of_hparams", "supervised_baseline"}  # fmt: skip
 
 
 def module_of(name):

@@ -339,6 +339,7 @@ def test_a_fresh_agent_is_the_variant_that_was_drawn_with_what_was_drawn_for_it(
     assert (which, scaled) == (0, 3.0)
 
 
+@pytest.mark.slow
 def test_trainings_with_drawn_hyperparameters_equal_those_with_the_same_given():
     task = envs.make("cartpole")
     env = SyntheticConfig(hidden_size=4).make(task)
