@@ -7,7 +7,6 @@ serves without a network.
 """
 
 import contextlib
-import functools
 import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -81,16 +80,15 @@ def fetch(address: str, option: str = "source") -> Path:
     with _explained(option, address):
         from huggingface_hub import hf_hub_download
 
-        download = functools.partial(
-            hf_hub_download, place.repo, place.file, revision=place.revision
-        )
-        size: int | None = download(dry_run=True).file_size
+        repo, file, revision = place.repo, place.file, place.revision
+        found = hf_hub_download(repo, file, revision=revision, dry_run=True)
+        size: int | None = found.file_size
         require(
             size is not None and size <= MAX_BYTES,
             option,
             f"must have at most {MAX_BYTES:,} bytes; got {size} bytes at {address}.",
         )
-        return Path(download())
+        return Path(hf_hub_download(repo, file, revision=revision))
 
 
 def require_repo(repo: object) -> None:
