@@ -35,8 +35,8 @@ from sejax.options import each_of, one_of, positive
 SOURCES = ("by_hand", "agent", "episodes", "search", "evolved")
 DISCRETE = ("ddqn", "dueling_ddqn", "ppo", "sac", "td3_discrete")
 CONTINUOUS = ("td3", "sac", "ppo")
-# Two kinds of teachers for each task, with real steps in which most of them learn it; from
-# docs/agents.md, whose seeds are others.
+# Two kinds of teachers for each task, and their real steps: guesses after docs/agents.md, whose
+# seeds are others. How well a teacher has learned stands in the table.
 TEACHERS: dict[str, dict[str, int]] = {
     "cartpole": {"ppo": 5_000, "ddqn": 8_000},
     "cartpole_v1": {"ppo": 10_000, "ddqn": 15_000},
@@ -84,7 +84,10 @@ def makers(settings: NullBaselines, source: str) -> Iterator[tuple[str, Callable
     seeds = range(settings.seed, settings.seed + settings.policies)
     if source == "by_hand" and settings.env in bandits.BY_HAND:
         for seed in seeds:
-            yield f"hand-{seed:02d}", functools.partial(bandits.copy_by_hand, task, seed, size)
+            yield (
+                f"hand-{seed:02d}",
+                functools.partial(bandits.copy_by_hand, task, seed, size, widen),
+            )
     elif source in ("agent", "episodes"):
         wide = widen if source == "agent" else 0.0
         for (kind, steps), seed in itertools.product(TEACHERS[settings.env].items(), seeds):
@@ -232,12 +235,7 @@ def report(settings: NullBaselines, rows: pd.DataFrame) -> pd.DataFrame:
         policy = first["policy_return"]
         shown.append(
             {
-                "proxy made of": NAMES[source]
-                + (
-                    f": {figures.AGENT_NAMES.get(teacher, teacher)}"
-                    if source in ("agent", "episodes")
-                    else ""
-                ),
+                "proxy made of": label(source, teacher),
                 "real steps": f"{first['real_steps']:,.0f}",
                 "CPU s": f"{first['cpu_s']:,.1f}",
                 "the policy itself": "" if np.isnan(policy) else f"{policy:,.1f}",
@@ -261,6 +259,12 @@ def report(settings: NullBaselines, rows: pd.DataFrame) -> pd.DataFrame:
     return tables.publish(settings, title, table, summary, note)
 
 
+def label(source: str, teacher: str) -> str:
+    """A source as people write it, with its kind of teacher."""
+    is_taught = source in ("agent", "episodes")
+    return NAMES[source] + (f": {figures.AGENT_NAMES[teacher]}" if is_taught else "")
+
+
 def cell(row: Any) -> str:
     """What one kind of student reaches."""
     return f"{row.test_return_mean:,.1f} ({row.worst_tenth:,.1f}; {row.solved:.0%})"
@@ -273,13 +277,12 @@ def draw(settings: NullBaselines, summary: pd.DataFrame) -> None:
         for i, ((source, teacher), points) in enumerate(
             mine.groupby(["source", "teacher"], sort=False)
         ):
-            name = NAMES[source] + (f": {teacher}" if source in ("agent", "episodes") else "")
             axes.plot(
                 points["real_steps"].clip(lower=1),
                 points["test_return_mean"],
                 "osD^v<>"[i % 7],
                 color=f"C{i}",
-                label=name,
+                label=label(source, teacher),
             )
         figures.threshold(axes, settings.task.solved_reward)
         axes.set(xscale="log", xlabel="real steps to make the proxy", ylabel="students' return")

@@ -31,7 +31,7 @@ def test_a_bandit_pays_for_the_action_of_the_table(task, actions, tried, paid):
 
 
 def test_the_controller_of_cartpole_balances_and_is_copied():
-    copied = bandits.copy_by_hand(CARTPOLE, seed=0, num_states=64)
+    copied = bandits.copy_by_hand(CARTPOLE, seed=0, num_states=64, widen=1.5)
     assert copied.policy_return == 200.0 and copied.real_steps == 2000  # ten tests, nothing else
     u = copied.states @ np.array([0.1, 0.3, 1.0, 0.6])
     assert (copied.actions == (u > 0)).all() and 0 < copied.actions.mean() < 1

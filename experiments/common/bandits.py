@@ -6,6 +6,8 @@ paid for acting as the table does. This module makes the policies (written by ha
 real steps, or searched) and the environment; `experiments.null_baselines` tests agents on it.
 """
 
+import functools
+import itertools
 import time
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -87,16 +89,14 @@ class PolicyBandit(ProxyEnv):
 
     def init_weights(self, key: Array) -> dict[str, Array]:
         """A table of one state of zeros, where the policy does nothing."""
-        action = jnp.zeros(1, jnp.int32) if self._is_discrete else jnp.zeros((1, self._action_dim))
+        action = (
+            jnp.zeros(1, jnp.int32) if self._is_discrete else jnp.zeros((1, self.task.action_dim))
+        )
         return {"states": jnp.zeros((1, self.task.obs_dim)), "actions": action}
 
     @property
     def _is_discrete(self) -> bool:
         return self.task.num_actions is not None
-
-    @property
-    def _action_dim(self) -> int:
-        return self.task.action_dim
 
     def reset_env(self, key: Array, params: ProxyParams) -> tuple[Array, BanditState]:
         states, actions = (jnp.asarray(params.weights[name]) for name in ("states", "actions"))
@@ -141,15 +141,46 @@ def policy_agent(task: Task, policy: Callable[[Any, Array], Array]) -> sejax.Age
     )
 
 
-def copy_by_hand(task: Task, seed: int, num_states: int) -> Copied:
-    """The controller of `BY_HAND` in states around those that it visits in one episode.
+@functools.cache
+def _hand(task: Task) -> sejax.Agent:
+    policy = BY_HAND[task.name]
+    return policy_agent(task, lambda _, obs: policy(obs))
+
+
+def copy_by_hand(task: Task, seed: int, num_states: int, widen: float) -> Copied:
+    """The controller of `BY_HAND`, whose tests are its only real steps.
 
     Raises:
       KeyError: where there is none.
     """
-    policy = BY_HAND[task.name]
-    agent = policy_agent(task, lambda _, obs: policy(obs))
-    return copy(task, agent, (), jax.random.key(seed), num_states, real_steps=0, cpu_s=0.0)
+    key = jax.random.key(seed)
+    return copy(task, _hand(task), (), key, num_states, real_steps=0, cpu_s=0.0, widen=widen)
+
+
+@functools.cache
+def _trained(
+    task: Task, config: Any, real_steps: int, seed: int
+) -> tuple[sejax.Agent, Any, Array, float]:
+    """A teacher, its state, a key for its tests, and its CPU seconds."""
+    agent = sejax.make_agent(config, task)
+    key_train, key_copy = jax.random.split(jax.random.key(seed))
+    train = _trainer(task, agent, real_steps)
+    started = time.process_time()
+    result = jax.block_until_ready(train(key_train, task.params))
+    return agent, result.agent_state, key_copy, time.process_time() - started
+
+
+@functools.cache
+def _trainer(task: Task, agent: sejax.Agent, real_steps: int) -> Callable[..., Any]:
+    """A compiled training on the real task."""
+    training = sejax.TrainingConfig(
+        max_steps=real_steps,
+        max_episodes=real_steps,
+        stop_rule="never",
+        time_limit_is_terminal=False,
+    )
+    train = jax.jit(sejax.make_trainer(agent, task.env, training))
+    return train.lower(jax.random.key(0), task.params).compile()
 
 
 def copy_of_agent(
@@ -165,22 +196,23 @@ def copy_of_agent(
       num_states: of the table.
       widen: see `copy`.
     """
-    agent = sejax.make_agent(config, task)
-    training = sejax.TrainingConfig(
-        max_steps=real_steps,
-        max_episodes=real_steps,
-        stop_rule="never",
-        time_limit_is_terminal=False,
-    )
-    train = jax.jit(sejax.make_trainer(agent, task.env, training))
-    key_train, key_copy = jax.random.split(jax.random.key(seed))
-    compiled = train.lower(key_train, task.params).compile()
-    started = time.process_time()
-    result = jax.block_until_ready(compiled(key_train, task.params))
-    cpu_s = time.process_time() - started
-    return copy(
-        task, agent, result.agent_state, key_copy, num_states, real_steps, cpu_s, widen=widen
-    )
+    agent, state, key, cpu_s = _trained(task, config, real_steps, seed)
+    return copy(task, agent, state, key, num_states, real_steps, cpu_s, widen)
+
+
+@functools.cache
+def _tested(task: Task, agent: sejax.Agent) -> Callable[[Array, Any], Any]:
+    """Compiled tests, and the steps of the same episodes."""
+    test = make_tester(agent, task, TEST_EPISODES)
+    record = make_recorder(agent, task, TEST_EPISODES)
+    return jax.jit(lambda key, state: (test(key, state), record(key, state)))
+
+
+@functools.cache
+def _greedy(agent: sejax.Agent) -> Callable[[Any, Array], Array]:
+    """Compiled actions in many states."""
+    act = functools.partial(agent.act, explore=False)
+    return jax.jit(jax.vmap(lambda state, obs: act(jax.random.key(0), state, obs), (None, 0)))
 
 
 def copy(
@@ -191,7 +223,7 @@ def copy(
     num_states: int,
     real_steps: int,
     cpu_s: float,
-    widen: float = 1.5,
+    widen: float,
 ) -> Copied:
     """What an agent does in states around those that it visits in its test episodes.
 
@@ -207,17 +239,15 @@ def copy(
         visited states alone.
     """
     key_test, key_rows, key_noise = jax.random.split(key, 3)
-    tests = make_tester(agent, task, TEST_EPISODES)(key_test, agent_state)
-    steps = make_recorder(agent, task, TEST_EPISODES)(key_test, agent_state)
+    tests, steps = _tested(task, agent)(key_test, agent_state)
     visited = steps.obs[np.asarray(steps.valid)]
     rows = jax.random.choice(key_rows, visited, (num_states,))
     noise = jax.random.normal(key_noise, rows.shape) * visited.std(0)
     is_wide = (jnp.arange(num_states) % 2 == 1)[:, None]
     states = jnp.where(is_wide & (widen > 0), visited.mean(0) + widen * noise, rows)
-    act = jax.vmap(lambda obs: agent.act(jax.random.key(0), agent_state, obs, explore=False))
     return Copied(
         states=np.asarray(states),
-        actions=np.asarray(jax.jit(act)(states)),
+        actions=np.asarray(_greedy(agent)(agent_state, states)),
         real_steps=real_steps + int(tests.num_steps.sum()),
         cpu_s=cpu_s,
         policy_return=float(tests.returns.mean()),
@@ -242,60 +272,64 @@ def copy_of_search(task: Task, real_steps: int, seed: int, num_states: int, wide
     random episodes before the search.
     """
     key_random, key_search, key_copy = jax.random.split(jax.random.key(seed), 3)
-    outputs = task.num_actions or task.action_dim
-    agent = policy_agent(task, _linear_policy(task))
-    zeros = jnp.zeros((outputs, task.obs_dim + 1))
-
-    def random_episodes(key: Array) -> Any:
-        keys = jax.random.split(key, TEST_EPISODES)
-        weights = jax.vmap(lambda k: jax.random.normal(k, zeros.shape))(keys)
-        scale = (jnp.zeros(task.obs_dim), jnp.ones(task.obs_dim))
-        record = make_recorder(agent, task, 1)
-        return jax.vmap(lambda k, w: record(k, (w, *scale)))(keys, weights)
-
-    steps = jax.jit(random_episodes)(key_random)
+    agent, random_episodes, generation = _search(task)
+    steps = random_episodes(key_random)
     visited = steps.obs[np.asarray(steps.valid)]
     scale = (visited.mean(0), jnp.maximum(visited.std(0), 1e-6))
+    weights = best = jnp.zeros(_shape(task))
+    best_return, used, started = -np.inf, len(visited), time.process_time()
+    for i in itertools.count():
+        key = jax.random.fold_in(key_search, i)
+        weights, tests, steps_used = generation(key, weights, scale)
+        used += int(steps_used) + int(tests.num_steps.sum())
+        if float(tests.returns.mean()) > best_return:
+            best, best_return = weights, float(tests.returns.mean())
+        if best_return >= task.solved_reward or used >= real_steps:
+            break
+    cpu_s = time.process_time() - started
+    return copy(task, agent, (best, *scale), key_copy, num_states, used, cpu_s, widen)
+
+
+def _shape(task: Task) -> tuple[int, int]:
+    """Of a linear policy's weights; the last column is a bias."""
+    return task.num_actions or task.action_dim, task.obs_dim + 1
+
+
+@functools.cache
+def _search(task: Task) -> tuple[sejax.Agent, Callable[..., Any], Callable[..., Any]]:
+    """The linear policy as an agent, and compiled: random episodes, a generation of the search."""
+    agent = policy_agent(task, _linear_policy(task))
     once, tester = make_tester(agent, task, 1), make_tester(agent, task, TEST_EPISODES)
+    record = make_recorder(agent, task, 1)
 
     @jax.jit
-    def generation(key: Array, weights: Array) -> tuple[Array, Any, Array]:
+    def random_episodes(key: Array) -> Any:
+        keys = jax.random.split(key, TEST_EPISODES)
+        weights = jax.vmap(lambda k: jax.random.normal(k, _shape(task)))(keys)
+        scale = (jnp.zeros(task.obs_dim), jnp.ones(task.obs_dim))
+        return jax.vmap(lambda k, w: record(k, (w, *scale)))(keys, weights)
+
+    def generation(key: Array, weights: Array, scale: Any) -> tuple[Array, Any, Array]:
         key_noise, key_once, key_test = jax.random.split(key, 3)
-        noise = jax.random.normal(key_noise, (ARS_DIRECTIONS, *zeros.shape))
+        noise = jax.random.normal(key_noise, (ARS_DIRECTIONS, *weights.shape))
         keys = jax.random.split(key_once, ARS_DIRECTIONS)
-        both = [
-            jax.vmap(lambda k, e, s=sign: once(k, (weights + s * ARS_NOISE * e, *scale)))(
-                keys, noise
-            )
-            for sign in (1, -1)
-        ]
+        test_all = jax.vmap(lambda k, w: once(k, (w, *scale)))
+        both = [test_all(keys, weights + sign * ARS_NOISE * noise) for sign in (1, -1)]
         plus, minus = (tests.returns[:, 0] for tests in both)
         top = jnp.argsort(-jnp.maximum(plus, minus))[:ARS_TOP]
         spread = jnp.concatenate([plus[top], minus[top]]).std() + 1e-6
         step = jnp.tensordot((plus - minus)[top], noise[top], 1) / (ARS_TOP * spread)
         weights = weights + ARS_STEP * step
-        tests = tester(key_test, (weights, *scale))
         used = both[0].num_steps.sum() + both[1].num_steps.sum()
-        return weights, tests, used
+        return weights, tester(key_test, (weights, *scale)), used
 
-    weights = best = zeros
-    compiled = generation.lower(key_search, weights).compile()
-    best_return, used, started = -np.inf, len(visited), time.process_time()
-    for i in range(MOST_GENERATIONS):
-        weights, tests, steps_used = compiled(jax.random.fold_in(key_search, i), weights)
-        used += int(steps_used) + int(tests.num_steps.sum())
-        if float(tests.returns.mean()) > best_return:
-            best, best_return = weights, float(tests.returns.mean())
-        is_solved = task.solved_reward is not None and best_return >= task.solved_reward
-        if is_solved or used >= real_steps:
-            break
-    cpu_s = time.process_time() - started
-    return copy(task, agent, (best, *scale), key_copy, num_states, used, cpu_s, widen=widen)
+    state = jnp.zeros(task.obs_dim), jnp.ones(task.obs_dim)
+    shapes = jax.random.key(0), jnp.zeros(_shape(task)), state
+    return agent, random_episodes, jax.jit(generation).lower(*shapes).compile()
 
 
 # Mania et al. search these for each task; here they are the same for all.
 ARS_DIRECTIONS, ARS_TOP, ARS_NOISE, ARS_STEP = 16, 8, 0.3, 0.3
-MOST_GENERATIONS = 100_000
 
 
 def _linear_policy(task: Task) -> Callable[[Any, Array], Array]:
