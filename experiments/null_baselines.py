@@ -10,7 +10,8 @@ that copy a policy, beside the SE that ships with sejax:
 - `evolved`: the shipped SE.
 
 Each is tested with the same students, and the policy that is copied is tested itself. Costs stand
-beside returns: real steps (tests included) and CPU seconds of making the proxy.
+beside returns: real steps (tests included) and CPU seconds of making the proxy. Of the agents the
+best of each four is shown too, by its own tests, at the cost of four.
 """
 
 import functools
@@ -18,7 +19,7 @@ import hashlib
 import itertools
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -58,12 +59,15 @@ class NullBaselines(Settings):
     students: tuple[str, ...] = setting(())  # kinds of agents; all that fit the task
     # Hyperparameters of the students; varied: drawn for each.
     hparams: tuple[str, ...] = setting(HPARAMS, each_of(HPARAMS), quick=("default",))
-    policies: int = count(10, quick=2)  # of each source and kind of teacher
+    policies: int = count(12, quick=2)  # of each source and kind of teacher
     num_agents: int = count(5, quick=2)  # of each kind on each proxy
     num_evolved: int = count(20, quick=2)  # agents of each kind on the shipped SE
     steps: int | None = count(None, quick=500)  # of a student; 2,000, more on hard tasks
+    # Students with default hyperparameters also train for these shares of the steps.
+    shares: tuple[float, ...] = setting((0.125, 0.25, 0.5), quick=(0.5,))
     teacher_steps: int | None = count(None, quick=500)  # of a teacher; by the task
-    search_steps: int = count(1_000_000, quick=5_000)  # real steps of a search, at most
+    # Real steps of a search, at most; those of the shipped SE.
+    search_steps: int | None = count(None, quick=5_000)
     num_states: int = count(1024)  # of a table
     widen: float = setting(1.5, positive("it is a scale"))  # spread of a table's states
 
@@ -71,6 +75,18 @@ class NullBaselines(Settings):
     def task(self) -> envs.Task:
         """The real task."""
         return envs.make(self.env)
+
+    @property
+    def budgets(self) -> list[int]:
+        """Steps of students, the most at last."""
+        most = self.steps or STUDENT_STEPS.get(self.env, 2_000)
+        return [*sorted(max(1, int(most * share)) for share in self.shares), most]
+
+    @property
+    def most_search_steps(self) -> int:
+        """Real steps of a search: as many as the SE took that ships with sejax."""
+        made = [shipped.real_steps] if (shipped := shipped_se(self)) else []
+        return self.search_steps or int(*made or [1_000_000])
 
     @property
     def kinds(self) -> tuple[str, ...]:
@@ -100,15 +116,22 @@ def makers(settings: NullBaselines, source: str) -> Iterator[tuple[str, Callable
             yield (
                 f"ars-{seed:02d}",
                 functools.partial(
-                    bandits.copy_of_search, task, settings.search_steps, seed, size, widen
+                    bandits.copy_of_search,
+                    task,
+                    settings.most_search_steps,
+                    seed,
+                    size,
+                    widen,
                 ),
             )
 
 
 def make_table(settings: NullBaselines, source: str, name: str, make: Callable[[], Copied]) -> Any:
     """The rows of one table, a cached shard: states `s0...`, actions `a0...`, and its costs."""
-    names = ("seed", "num_states", "widen", "teacher_steps", "search_steps")
+    names = ("seed", "num_states", "widen", "teacher_steps")
     depends = settings.values(*names) | {"env": settings.env, "source": source, "name": name}
+    if source == "search":
+        depends["search_steps"] = settings.most_search_steps
 
     def compute() -> pd.DataFrame:
         made = make()
@@ -132,92 +155,133 @@ def as_group(env: PolicyBandit, name: str, rows: pd.DataFrame) -> Group:
     return Group(name, env.params({"states": states, "actions": actions}), digest)
 
 
+class Shipped(NamedTuple):
+    """The SE of a task that ships with sejax, and what it took to learn it."""
+
+    env: Any
+    params: Any
+    real_steps: float
+    cpu_s: float
+
+
+def shipped_se(settings: NullBaselines) -> Shipped | None:
+    """The task's; None where there is none."""
+    rows = {proxy.name: proxy.row for proxy in sejax.pretrained()}
+    if settings.env not in rows:
+        return None
+    costs = [float(str(rows[settings.env][x]).replace(",", "")) for x in ("real steps", "CPU s")]
+    return Shipped(*sejax.load(settings.env), *costs)
+
+
 def compute(settings: NullBaselines) -> pd.DataFrame:
     """Makes the proxies and trains students on them: `makers` and `students`."""
-    task = settings.task
-    bandit = PolicyBandit(task)
+    bandit = PolicyBandit(settings.task)
     made: list[dict[str, Any]] = []
     students = []
     for source in settings.sources:
-        if source == "evolved":
-            env, groups, num_agents = *shipped(settings, made), settings.num_evolved
-        else:
-            env, groups, num_agents = bandit, [], settings.num_agents
-            for name, make in makers(settings, source):
-                rows = make_table(settings, source, name, make)
-                groups.append(as_group(bandit, name, rows))
-                costs = rows.iloc[0][["real_steps", "cpu_s", "policy_return"]]
-                made.append({"source": source, "group": name, **costs})
+        env, groups, num_agents = bandit, [], settings.num_agents
+        for name, make in makers(settings, source):
+            rows = make_table(settings, source, name, make)
+            groups.append(as_group(bandit, name, rows))
+            costs = rows.iloc[0][["real_steps", "cpu_s", "policy_return"]]
+            made.append({"source": source, "group": name, **costs})
+        if source == "evolved" and (se := shipped_se(settings)):
+            env, groups, num_agents = se.env, [Group("shipped", se.params)], settings.num_evolved
+            costs = {"real_steps": se.real_steps, "cpu_s": se.cpu_s, "policy_return": np.nan}
+            made.append({"source": source, "group": "shipped", **costs})
         if groups:
             students.append(train_students(settings, source, env, groups, num_agents))
     return stack({"makers": pd.DataFrame(made), "students": pd.concat(students)})
 
 
-def shipped(settings: NullBaselines, made: list[dict[str, Any]]) -> tuple[Any, list[Group]]:
-    """The SE of the task that ships with sejax; its costs are added to `made`."""
-    known = {proxy.name: proxy for proxy in sejax.pretrained()}
-    if settings.env not in known:
-        return None, []
-    env, params = sejax.load(settings.env)
-    row = known[settings.env].row
-    costs = {"real_steps": row["real steps"], "cpu_s": row["CPU s"]}
-    numbers = {name: float(str(x).replace(",", "")) for name, x in costs.items()}
-    made.append({"source": "evolved", "group": "shipped", **numbers, "policy_return": np.nan})
-    return env, [Group("shipped", params)]
-
-
 def train_students(
     settings: NullBaselines, source: str, env: Any, groups: list[Group], num_agents: int
 ) -> pd.DataFrame:
-    """Agents of each kind on each proxy of a source, a row each."""
-    steps = settings.steps or STUDENT_STEPS.get(settings.env, 2_000)
-    training = sejax.TrainingConfig(max_steps=steps, max_episodes=steps, stop_rule="never")
+    """Agents of each kind on each proxy of a source, a row for each agent and number of steps."""
+    *fewer, most = settings.budgets
+    budgets = [("default", steps) for steps in fewer if "default" in settings.hparams]
+    budgets += [(hparams, most) for hparams in settings.hparams]
     found = []
-    for kind, hparams in itertools.product(settings.kinds, settings.hparams):
+    for kind, (hparams, steps) in itertools.product(settings.kinds, budgets):
         condition = Condition(
-            name=f"{source}-{kind}-{hparams}",
+            name=f"{source}-{kind}-{hparams}-{steps}",
             env=env,
             task=settings.task,
             groups=tuple(groups),
             agent=sejax.config([f"env={settings.env}", f"agent={kind}"]).agent,
-            training=training,
+            training=sejax.TrainingConfig(max_steps=steps, max_episodes=steps, stop_rule="never"),
             hparams=hparams,
             settings={"source": source},
         )
         at_once = min(len(groups), groups_at_once(settings.devices))
         rows = train_groups(condition, settings, num_agents, at_once=at_once)
-        found.append(rows.assign(source=source, kind=kind, hparams=hparams))
+        found.append(rows.assign(source=source, kind=kind, hparams=hparams, steps=steps))
     return pd.concat(found, ignore_index=True)
+
+
+def best_of_four(made: pd.DataFrame) -> pd.DataFrame:
+    """Of each four agents the one whose own tests were best, at the cost of all four.
+
+    Args:
+      made: a row for each proxy, of all sources.
+
+    Returns:
+      Further rows, of the source `best_of_four`.
+    """
+    found = []
+    for _, mine in made[made["source"] == "agent"].groupby("teacher", sort=False):
+        for first in range(0, len(mine) - 3, 4):
+            four = mine.iloc[first : first + 4]
+            best = four.loc[four["policy_return"].idxmax()]
+            costs = four[["real_steps", "cpu_s"]].sum()
+            found.append({**best, **costs, "source": "best_of_four"})
+    return pd.DataFrame(found, columns=made.columns)
+
+
+def steps_until_solved(students: pd.DataFrame, solved_reward: float) -> pd.Series:
+    """The fewest steps of each student that solve the task; inf if none does.
+
+    The students of all numbers of steps have the same seeds.
+    """
+    solves = students["steps"].where(students["test_return"] >= solved_reward, np.inf)
+    return solves.groupby([students["group"], students["agent"]]).min()
 
 
 def summarise(settings: NullBaselines, rows: pd.DataFrame) -> pd.DataFrame:
     """A row for each source, teacher, kind of student and of hyperparameters."""
     made, students = unstack(rows, "makers"), unstack(rows, "students")
     made["teacher"] = made["group"].str.partition("-")[0]
+    chosen = best_of_four(made)
+    best = students[(students["source"] == "agent") & students["group"].isin(chosen["group"])]
+    made = pd.concat([made, chosen], ignore_index=True)
+    students = pd.concat([students, best.assign(source="best_of_four")])
     students = students.merge(made[["source", "group", "teacher"]], on=["source", "group"])
-    costs = made.groupby(["source", "teacher"], sort=False)[
-        ["real_steps", "cpu_s", "policy_return"]
-    ]
-    solved_reward = settings.task.solved_reward
+    costs = made.groupby(["source", "teacher"])[["real_steps", "cpu_s", "policy_return"]].mean()
+    most, solved_reward = settings.budgets[-1], settings.task.solved_reward
 
     def statistics(mine: pd.DataFrame) -> dict[str, float]:
-        returns = mine["test_return"]
-        return tables.mean_columns(returns, "test_return", mine["group"]) | {
+        last = mine[mine["steps"] == most]
+        returns = last["test_return"]
+        steps = steps_until_solved(mine, solved_reward).median()
+        return tables.mean_columns(returns, "test_return", last["group"]) | {
             "median": returns.median(),
             "worst_tenth": returns[returns <= returns.quantile(0.1)].mean(),
             "worst": returns.min(),
             "solved": (returns >= solved_reward).mean(),
-            "num_proxies": mine["group"].nunique(),
-            "num_agents": len(mine),
+            "median_steps_until_solved": steps if settings.shares else np.nan,
+            "num_proxies": last["group"].nunique(),
+            "num_agents": len(last),
         }
 
-    summary = tables.summary_by(students, ["source", "teacher", "kind", "hparams"], statistics)
-    return summary.join(costs.mean(), on=["source", "teacher"])
+    students = students.sort_values("source", key=lambda x: x.map(list(NAMES).index), kind="stable")
+    by = ["source", "teacher", "kind", "hparams"]
+    return tables.summary_by(students, by, statistics).join(costs, on=["source", "teacher"])
 
 
 NAMES = {
     "by_hand": "by hand",
     "agent": "one agent",
+    "best_of_four": "best of four",
     "episodes": "ten episodes",
     "search": "random search",
     "evolved": "evolved SE (shipped)",
@@ -237,7 +301,7 @@ def report(settings: NullBaselines, rows: pd.DataFrame) -> pd.DataFrame:
             {
                 "proxy made of": label(source, teacher),
                 "real steps": f"{first['real_steps']:,.0f}",
-                "CPU s": f"{first['cpu_s']:,.1f}",
+                "CPU s": f"{first['cpu_s']:,.2f}",
                 "the policy itself": "" if np.isnan(policy) else f"{policy:,.1f}",
                 "students": hparams,
                 **{
@@ -247,13 +311,15 @@ def report(settings: NullBaselines, rows: pd.DataFrame) -> pd.DataFrame:
             }
         )
     table = pd.DataFrame(shown)
-    steps = settings.steps or STUDENT_STEPS.get(settings.env, 2_000)
+    budgets, most = settings.budgets, settings.budgets[-1]
     note = (
-        f"Cells: mean return of fresh agents after {steps:,} steps on the proxy (mean of the worst "
-        f"tenth; share that solves the task, {settings.task.solved_reward:g}). Students' "
-        "hyperparameters are their defaults, or drawn around them (varied). Real steps and CPU "
-        "seconds are those of making one proxy, tests included, without compilation. A policy by "
-        "hand took no step of the real task; its tests did."
+        f"Cells: mean return of fresh agents after {most:,} steps on the proxy (mean of the worst "
+        f"tenth; share that solves the task, {settings.task.solved_reward:g}; steps after which "
+        f"the median student has solved it, of {', '.join(f'{x:,}' for x in budgets)}). "
+        "Students' hyperparameters are their defaults, or drawn around them (varied). Real steps "
+        "and CPU seconds are those of making one proxy, tests included, without compilation; of "
+        "the best of four, of all four. A policy by hand took no step of the real task; its tests "
+        "did. `summary.csv` has medians, the worst agent, intervals over proxies and counts."
     )
     title = f"What does as well as an SE on {settings.env}"
     return tables.publish(settings, title, table, summary, note)
@@ -261,13 +327,15 @@ def report(settings: NullBaselines, rows: pd.DataFrame) -> pd.DataFrame:
 
 def label(source: str, teacher: str) -> str:
     """A source as people write it, with its kind of teacher."""
-    is_taught = source in ("agent", "episodes")
+    is_taught = source in ("agent", "best_of_four", "episodes")
     return NAMES[source] + (f": {figures.AGENT_NAMES[teacher]}" if is_taught else "")
 
 
 def cell(row: Any) -> str:
     """What one kind of student reaches."""
-    return f"{row.test_return_mean:,.1f} ({row.worst_tenth:,.1f}; {row.solved:.0%})"
+    steps = row.median_steps_until_solved
+    until = f"; {steps:,.0f}" if row.hparams == "default" and np.isfinite(steps) else ""
+    return f"{row.test_return_mean:,.1f} ({row.worst_tenth:,.1f}; {row.solved:.0%}{until})"
 
 
 def draw(settings: NullBaselines, summary: pd.DataFrame) -> None:
