@@ -1,4 +1,5 @@
 # make run: learn a CartPole synthetic environment until it is solved.  make test: the test suite.
+# make claims: checks the documents' numbers against the stored rows.
 # make docs: the site, in docs/_build/html.  make dist: the packages, in dist/.
 # All make .venv first if it is missing; python3.11 or newer with pip and venv, make and git are all
 # they need.
@@ -7,7 +8,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 
 .PHONY: run test test-slow test-examples test-trackers test-ray test-lowest test-latest lint typecheck \
-    docs linkcheck dist clean
+    claims docs linkcheck dist clean
 
 run: $(VENV)/.installed
 	$(BIN)/python -m sejax.run env=cartpole stop_when_solved=true
@@ -45,6 +46,9 @@ test-latest: PACKAGES := --editable '.[gym,hub,mujoco]'
 test-lowest test-latest: TESTS := networks ddqn synthetic nes proxy_files gym hub mujoco config registry run
 
 # --- the code, its site, its packages ---------------------------------------------------------------
+
+claims: $(VENV)/.installed
+	$(BIN)/python -m tools.claims
 
 lint: $(VENV)/.installed-dev
 	$(BIN)/ruff format --check .

@@ -1,0 +1,249 @@
+"""Checks the numbers of the documents against the stored rows that they come from.
+
+    python -m tools.claims          # make claims: fails for a number that is not what the rows give
+    python -m tools.claims write    # writes numbers and tables into the documents
+    python -m tools.claims list     # each claim, with its count and the commit of its rows
+
+`docs/claims.yaml` has an entry for each number, and says what an entry looks like.
+"""
+
+import re
+import string
+import subprocess
+import sys
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import yaml
+
+from experiments.common.shards import read_rows
+from sejax.ops.files import write_text
+from sejax.proxies import zoo
+
+ROOT = Path(__file__).parents[1]
+NUMBER = r"[-+]?\d[\d,]*(?:\.\d+)?%?"
+TABLE = re.compile(r"(<!-- table: (.+?) -->\n).*?(<!-- end -->)", re.DOTALL)
+# What no number is looked for in: generated tables, comments, code, mathematics, addresses.
+HIDDEN = re.compile(
+    r"<!--.*?-->|^ *(`{3,}).*?^ *\1|`[^`]*`|\$\$.*?\$\$|\$[^$\n]*\$|\]\([^)]*\)|https?://\S+",
+    re.DOTALL | re.MULTILINE,
+)
+# Numbers of headings and of years, and those in names.
+NAMES = re.compile(
+    r"^#+ [\d.]+|\b(?:Python|Apache|[Ff]igures?|[Tt]ables?|[Ss]ections?|[Ss]eeds?) \d[\d.]*"
+    r"|\((?:[^()]*, )?(?:19|20)\d\d\)|\bet al\.,? (?:19|20)\d\d",
+    re.MULTILINE,
+)
+UNCLAIMED = re.compile(rf"(?<![\w.-])(?<!\w[-/]){NUMBER}")
+FUNCTIONS = {"len": len, "min": min, "max": max, "sum": sum, "round": round, "abs": abs}
+
+
+class WrongError(ValueError):
+    """A claim or table that its rows do not give."""
+
+
+def frame_of(root: Path, rows: str) -> Any:
+    """Stored rows: a table, what a JSON file holds, or the evaluations of the shipped proxies."""
+    if rows == "pretrained":
+        return pd.DataFrame(
+            [
+                vars(proxy) | (vars(proxy.learning) if proxy.learning else {}) | vars(each)
+                for proxy in zoo.pretrained()
+                for each in proxy.evaluations
+            ]
+        )
+    path = root / rows
+    if not path.exists():
+        raise WrongError(f"there are no rows {rows}")
+    return yaml.safe_load(path.read_text()) if path.suffix == ".json" else read_rows(path)
+
+
+@dataclass(frozen=True)
+class Claims:
+    """The entries of `docs/claims.yaml`, and the documents of the project in a folder."""
+
+    root: Path
+    entries: Mapping[str, Any]
+
+    @classmethod
+    def read(cls, root: Path) -> "Claims":
+        return cls(root, yaml.safe_load((root / "docs/claims.yaml").read_text(encoding="utf-8")))
+
+    # --- what the rows give ----------------------------------------------------------------------
+
+    def selected(self, entry: Mapping[str, Any]) -> dict[str, Any]:
+        """The frames of an entry by name; one file is `rows`."""
+        names = entry["rows"] if isinstance(entry["rows"], dict) else {"rows": entry["rows"]}
+        frames = {name: frame_of(self.root, rows) for name, rows in names.items()}
+        if "where" in entry:
+            frames["rows"] = frames["rows"].query(entry["where"])
+        return frames
+
+    def values(self, entry: Mapping[str, Any]) -> dict[str, Any]:
+        """The names that an entry's text may have: values, and columns where the row is one."""
+        frames = self.selected(entry)
+        rows = frames.get("rows")
+        one = isinstance(rows, pd.DataFrame) and len(rows) == 1
+        names = {**(rows.to_dict("records")[0] if one else {}), **frames}
+        for name, expression in entry.get("values", {}).items():
+            names[name] = eval(str(expression), {"__builtins__": FUNCTIONS, "np": np} | names)
+        return names
+
+    def lines(self, name: str) -> list[str]:
+        """A table in Markdown: that of an experiment, or of an entry."""
+        if name.startswith("results/"):
+            text = (self.root / name).read_text(encoding="utf-8")
+            return [line for line in text.splitlines() if line.startswith("|")]
+        table = self.entries.get("tables", {})[name]
+        made = [table["head"], " | ".join("---" for _ in table["head"].split("|"))]
+        for line in table["lines"]:
+            if "values" in line or "rows" not in line:
+                each: Any = [self.values(line) if "rows" in line else {}]
+            else:
+                each = self.selected(line)["rows"].to_dict("records")
+            made += [without_nan(line["cells"].format_map(row)) for row in each]
+        return [re.sub(" +", " ", f"| {line} |") for line in made]
+
+    # --- what the documents say ------------------------------------------------------------------
+
+    def documents(self) -> dict[str, str]:
+        """The text of each document, by its path."""
+        paths = [*self.root.glob("*.md"), *(self.root / "docs").rglob("*.md")]
+        named = {str(path.relative_to(self.root)): path for path in sorted(paths)}
+        return {
+            name: path.read_text(encoding="utf-8")
+            for name, path in named.items()
+            if "_build" not in name and name not in self.entries.get("generated", ())
+        }
+
+    def with_tables(self, text: str) -> str:
+        """A document whose tables are what the rows give."""
+        return TABLE.sub(
+            lambda found: "\n".join([found[1], *self.lines(found[2]), "", found[3]]), text
+        )
+
+    def pattern(self, entry: Mapping[str, Any], names: Mapping[str, Any]) -> re.Pattern[str]:
+        """An entry's text with any numbers in place of its own, over any line breaks."""
+        parts = []
+        for literal, field, spec, _ in string.Formatter().parse(entry["text"]):
+            parts.append(r"\s+".join(map(re.escape, re.split(r"\s+", literal))))
+            if field is not None:
+                said = format_field(field, spec, names)
+                is_number = re.fullmatch(NUMBER, said)
+                parts.append(f"({NUMBER})" if is_number else f"({re.escape(said)})")
+        return re.compile("".join(parts))
+
+    def said(self, entry: Mapping[str, Any], names: Mapping[str, Any]) -> list[str]:
+        """The entry's numbers as the rows give them, in the order of its text."""
+        fields = string.Formatter().parse(entry["text"])
+        return [format_field(field, spec, names) for _, field, spec, _ in fields if field]
+
+    # --- the check -------------------------------------------------------------------------------
+
+    def check(self) -> Iterator[str]:
+        """What is wrong, a message each."""
+        documents, covering = self.documents(), []
+        for name, text in documents.items():
+            for found in TABLE.finditer(text):
+                try:
+                    if found[0] != self.with_tables(found[0]):
+                        yield f"{name}: the table {found[2]} is not what its rows give"
+                except (KeyError, OSError, WrongError) as error:
+                    yield f"{name}: the table {found[2]} cannot be made: {error!r}"
+        for key, entry in self.entries.get("claims", {}).items():
+            try:
+                names = self.values(entry)
+                pattern, said = self.pattern(entry, names), self.said(entry, names)
+                entry["count"].format_map(names)
+            except Exception as error:  # whatever an expression raises
+                yield f"{key}: {error!r}"
+                continue
+            covering.append(pattern)
+            where = [(name, x) for name, text in documents.items() for x in pattern.finditer(text)]
+            if not where:
+                yield f"{key}: no document has its text"
+            for name, found in where:
+                if list(found.groups()) != said:
+                    yield f"{name}: {key} says {list(found.groups())}, its rows give {said}"
+        for phrase in self.entries.get("stated", {}):
+            covering.append(re.compile(r"\s+".join(map(re.escape, phrase.split()))))
+            if not any(covering[-1].search(text) for text in documents.values()):
+                yield f"stated: no document has {phrase!r}"
+        for name in self.entries["documents"]:
+            yield from unclaimed(name, documents[name], covering)
+        for key, entry in self.entries.get("claims", {}).items():
+            literal = re.sub(r"\{.*?\}", " ", entry["text"])
+            yield from unclaimed(key, literal, covering[len(self.entries["claims"]) :])
+
+    def write(self) -> None:
+        """Puts what the rows give into all documents."""
+        for name, text in self.documents().items():
+            new = self.with_tables(text)
+            for entry in self.entries.get("claims", {}).values():
+                names = self.values(entry)
+                said = self.said(entry, names)
+                new = self.pattern(entry, names).sub(lambda x, said=said: replaced(x, said), new)
+            if new != text:
+                write_text(self.root / name, new)
+                print(f"{name} is written.")
+
+    def list(self) -> None:
+        """Prints each claim with its count, and the commit and date of its rows."""
+        for key, entry in self.entries.get("claims", {}).items():
+            names = self.values(entry)
+            rows = entry["rows"]
+            paths = list(rows.values()) if isinstance(rows, dict) else [rows]
+            paths = ["sejax/pretrained" if path == "pretrained" else path for path in paths]
+            git = ["git", "-C", str(self.root), "log", "-1", "--format=%h %cs", "--", *paths]
+            made = entry.get("made") or subprocess.run(git, capture_output=True, text=True).stdout
+            count = entry["count"].format_map(names)
+            print(f"{key}: {entry['text'].format_map(names)} ({count})")
+            print(f"    {', '.join(paths)}, {made.strip()}")
+
+
+def format_field(field: str, spec: str | None, names: Mapping[str, Any]) -> str:
+    """A placeholder's text."""
+    return f"{{{field}:{spec or ''}}}".format_map(names)
+
+
+def without_nan(text: str) -> str:
+    """Cells without the intervals that too few values leave unknown."""
+    return re.sub(r" \[nan, nan\]|\bnan%?", "", text)
+
+
+def replaced(found: re.Match[str], said: list[str]) -> str:
+    """The text that was found, with these groups."""
+    parts, start = [], found.start()
+    for group, text in enumerate(said, 1):
+        parts += [found.string[start : found.start(group)], text]
+        start = found.end(group)
+    return "".join([*parts, found.string[start : found.end()]])
+
+
+def unclaimed(name: str, text: str, covering: list[re.Pattern[str]]) -> Iterator[str]:
+    """The numbers of a text that are in no generated table, claim or stated phrase."""
+    for pattern in (*covering, TABLE, HIDDEN, NAMES):
+        text = pattern.sub(lambda x: re.sub(r"\S", " ", x[0]), text)
+    for found in UNCLAIMED.finditer(text):
+        line = text.count("\n", 0, found.start()) + 1
+        yield f"{name}:{line}: {found[0]} has no entry in docs/claims.yaml"
+
+
+def main() -> None:
+    """The command."""
+    claims = Claims.read(ROOT)
+    if "list" in sys.argv[1:]:
+        claims.list()
+    elif "write" in sys.argv[1:]:
+        claims.write()
+    wrong = list(claims.check())
+    print("\n".join([*wrong, f"docs/claims.yaml: {len(wrong)} wrong"]))
+    sys.exit(bool(wrong))
+
+
+if __name__ == "__main__":
+    main()
