@@ -88,7 +88,7 @@ def report(settings: RnObjectives, rows: pd.DataFrame) -> pd.DataFrame:
     for objective, pick in itertools.product(settings.objectives, settings.picks):
         mine = beside(settings, rows, objective, pick)
         rn_curves.require_rows(settings, mine)
-        summary = rn_curves.summarise(mine, solved_reward, settings.max_steps)
+        summary = rn_curves.summarise(mine, settings.max_steps)
         table = rn_curves.make_table(summary)
         has_rn = ~table["trained with"].isin(rn_curves.WITHOUT_RN)
         if not tables:

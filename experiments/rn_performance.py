@@ -31,7 +31,7 @@ class RnPerformance(CurveSettings):
 
 
 def compute(settings: RnPerformance) -> pd.DataFrame:
-    """Learns and trains what is missing; a row for each training episode of each agent."""
+    """Learns and trains what is missing; each agent's curve, as `curves.thinned` leaves it."""
     reward_networks.check_stored(settings, [settings.objective])
     tables = [*rn_curves.real_curves(settings)]
     for variant in settings.variants:
@@ -44,7 +44,7 @@ def report(settings: RnPerformance, curves: pd.DataFrame) -> pd.DataFrame:
     solved_reward = settings.task.solved_reward
     rn_curves.require_rows(settings, curves)
     rn_curves.draw(settings, {f"test return on {settings.env}": curves}, 3.1, "performance.png")
-    summary = rn_curves.summarise(curves, solved_reward, settings.max_steps)
+    summary = rn_curves.summarise(curves, settings.max_steps)
     bonuses = set(settings.bonuses) - {"none"}
     with_bonus = f" (with a bonus: {settings.bonus_groups})" if bonuses else ""
     note = (

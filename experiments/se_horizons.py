@@ -184,7 +184,7 @@ def differences(each: pd.DataFrame, summary: pd.DataFrame, end: str) -> str:
     Compared are the shortest and the longest horizon of equal starts, and the starts of equal
     horizons, of SEs that end like this.
     """
-    bests, texts = each.set_index([*BY, "seed"])["best"], []
+    bests, texts = each.set_index([*BY, "seed"])["best"].sort_index(), []
     shown = summary[summary["end"].isin([NO_END, end])]
     for same in ("starts", "horizon"):
         for _, mine in shown.groupby(same, sort=False):

@@ -1,9 +1,12 @@
 """The documents' numbers are those of the stored rows: `make claims`."""
 
+import shutil
+
+import pandas as pd
 import pytest
 import yaml
 
-from tools import claims
+from tools import claims, remake
 
 DOCUMENT = """# 1. A page of 2026 tests
 
@@ -20,6 +23,7 @@ steps, [paper](https://arxiv.org/abs/2202.02790), `seed=3`, over 16 workers (Fer
 """
 ENTRIES = {
     "documents": ["README.md"],
+    "without_rows": {},
     "claims": {
         "share": {
             "text": "DDQN takes {share:.0%} of the steps",
@@ -102,6 +106,19 @@ def test_numbers_and_tables_are_written(project, tmp_path):
     project(DOCUMENT.replace("41%", "0%").replace("1,025", "0"))
     claims.Claims.read(tmp_path).write()
     assert (tmp_path / "README.md").read_text() == DOCUMENT
+
+
+def test_a_changed_row_of_an_experiment_is_found(tmp_path):
+    name = "results/score_transforms"
+    shutil.copytree(claims.ROOT / name, tmp_path / name)
+    assert list(remake.check(tmp_path)) == []
+    path = tmp_path / name / "rows.csv.xz"
+    rows = pd.read_csv(path)
+    rows.loc[0, "updates"] += 1
+    rows.to_csv(path, index=False)
+    assert list(remake.check(tmp_path)) == [
+        f"{name}/{file} is not what its rows give" for file in ("table.md", "summary.csv")
+    ]
 
 
 def test_the_documents_of_this_project_pass():

@@ -432,6 +432,20 @@ def test_curves_hold_the_value_of_the_last_finished_episode():
     np.testing.assert_array_equal(values, [[np.nan, 1, 1, 2], [np.nan, np.nan, 5, 5]])
 
 
+def test_thinned_curves_hold_the_same_values_on_the_grid():
+    rising = curve(range(3, 303, 3), [*range(80), *[80] * 20])
+    two = pd.concat([rising, curve([400], [5], agent=1)])
+    grid = np.linspace(10, 300, 30)  # of its steps, 250 is the first at which 80 is held
+    kept = curves.thinned(two, grid, solved_reward=50.0)
+    assert kept.groupby("agent").size().tolist() == [25, 1]
+    values = (curves.on_grid(each, grid, window=1) for each in (two, kept))
+    np.testing.assert_array_equal(*values)
+    # The mean of the tests 46 to 55 is the first of 50 and more; agent 1 has too few tests.
+    each = kept.groupby("agent").first()
+    assert each["steps_to_solve"].tolist() == [3 * 56, np.inf]
+    assert each["last_return"].tolist() == [80, 5]
+
+
 def test_the_agents_of_reward_networks_train_as_there_but_to_the_end():
     study = agent_learning.PresetStudy("pendulum", "td3", 20_000, "")
     preset = sejax.config(["env=pendulum", "proxy=rn"])

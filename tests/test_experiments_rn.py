@@ -10,8 +10,8 @@ from test_experiments import CURVES, RNS, refuse_to_compute
 
 import sejax
 from experiments import rn_heatmap, rn_objectives, rn_performance
+from experiments.common import curves, rn_curves, runs, shards
 from experiments.common import reward_networks as rn
-from experiments.common import rn_curves, runs, shards
 from experiments.common.reward_networks import STUDIES
 from experiments.common.statistics import mean_interval
 from experiments.rn_heatmap import RnHeatmap
@@ -92,12 +92,12 @@ def test_a_set_grows_by_the_rns_that_it_lacks(options, monkeypatch, tmp_path):
     assert list(four.scores[:3]) == list(three.scores)
     assert [four[i].fingerprint for i in range(3)] == [three[i].fingerprint for i in range(3)]
     assert four[3].fingerprint not in [three[i].fingerprint for i in range(3)]
-    curves = shards.read_rows(rn.curves_file(four.path))
-    assert list(curves["seed"]) == [3, 4, 5, 6]
+    grown = shards.read_rows(rn.curves_file(four.path))
+    assert list(grown["seed"]) == [3, 4, 5, 6]
     three.path.write_bytes(before)  # as if killed before the set was written
     again = rn.learn(more, "additive_potential", "reward_threshold")
     assert list(again.seeds) == [3, 4, 5, 6]
-    assert shards.read_rows(rn.curves_file(four.path)).equals(curves)
+    assert shards.read_rows(rn.curves_file(four.path)).equals(grown)
     longer = pd.DataFrame({"generation": [0, 1], "seed": 3, "incumbent_mean": 0.0})
     monkeypatch.setattr(runs, "_learn_one", lambda *_: longer)
     config = rn.learning_config(more, "additive_potential", "reward_threshold")
@@ -164,9 +164,9 @@ def test_ignored_rewards_do_not_stretch_the_colours():
     np.testing.assert_allclose(nothing, [[np.nan, 0.0, 1.0]])
 
 
-def curves_of(world, num_groups):
+def curves_of(world, num_groups, solved_reward=-12.0):
     """Episodes of 10 steps; agent i of group g is good from its episode 5 + 2 g + i on."""
-    return pd.concat([
+    rows = pd.concat([
         pd.DataFrame({
             "row": "default", "world": world, "group": g, "agent": 2 * g + i,
             "steps": np.arange(10, 310, 10),
@@ -174,27 +174,27 @@ def curves_of(world, num_groups):
         })
         for g in range(num_groups) for i in range(2)
     ])  # fmt: skip
+    return curves.thinned(rows, rn_curves.step_grid(300), solved_reward)
 
 
 def test_the_summary_is_over_agents():
-    curves = curves_of("real", 2)
-    (row,) = rn_curves.summarise(curves, -12.0, max_steps=300).itertuples()
+    (row,) = rn_curves.summarise(curves_of("real", 2), max_steps=300).itertuples()
     # Ten tests in a row: solved at episodes 14, 15, 16 and 17.
     assert row.steps_mean == np.mean([140, 150, 160, 170]) and row.solved == 1.0
     assert row.last_return == -12.0 and -50 < row.return_mean < -12
-    never = rn_curves.summarise(curves, 0.0, max_steps=300).iloc[0]
+    never = rn_curves.summarise(curves_of("real", 2, 0.0), max_steps=300).iloc[0]
     assert never["steps_mean"] == 300 and never["solved"] == 0.0
 
 
 def test_shares_are_of_the_groups_of_the_same_seeds():
     # Steps to solve of group g: 140 + 20 g and 150 + 20 g.
-    curves = pd.concat([curves_of("real", 5), curves_of("icm", 2), curves_of("real_rn", 5)])
-    summary = rn_curves.summarise(curves, -12.0, max_steps=300).set_index("world")
+    worlds = pd.concat([curves_of("real", 5), curves_of("icm", 2), curves_of("real_rn", 5)])
+    summary = rn_curves.summarise(worlds, max_steps=300).set_index("world")
     assert summary["steps_mean"].tolist() == [185, 155, 185]
     assert summary["share_of_bare"].tolist() == [1, 1, 1]
     turned = pd.concat([curves_of("icm", 1), curves_of("real", 5)])  # in whatever order
-    assert rn_curves.summarise(turned, -12.0, max_steps=300)["share_of_bare"].tolist() == [1, 1]
-    alone = rn_curves.summarise(curves_of("icm", 2), -12.0, max_steps=300)
+    assert rn_curves.summarise(turned, max_steps=300)["share_of_bare"].tolist() == [1, 1]
+    alone = rn_curves.summarise(curves_of("icm", 2), max_steps=300)
     assert np.isnan(alone["share_of_bare"][0]) and not rn_curves.make_table(alone).iat[0, 4]
 
 
@@ -217,10 +217,10 @@ def test_intervals_are_over_rns_or_agents_and_need_five_of_them():
         ("additive_potential", 145 + 20 * np.arange(5)),  # the groups' means
         ("real", 140 + 10 * np.arange(10)),
     ):
-        (row,) = rn_curves.summarise(curves_of(world, 5), -12.0, max_steps=300).itertuples()
+        (row,) = rn_curves.summarise(curves_of(world, 5), max_steps=300).itertuples()
         assert (row.steps_low, row.steps_high) == mean_interval(independent)
         assert row.return_low < row.return_mean < row.return_high
-    few = rn_curves.summarise(curves_of("additive_potential", 4), -12.0, max_steps=300)
+    few = rn_curves.summarise(curves_of("additive_potential", 4), max_steps=300)
     assert few[["steps_low", "return_high"]].isna().all(axis=None)
     shown = rn_curves.make_table(few).iloc[0]
     assert shown["steps to solve"] == "175" and "[" not in shown["mean return over training"]

@@ -1,7 +1,7 @@
 """Checks the numbers of the documents against the stored rows that they come from.
 
     python -m tools.claims          # make claims: fails for a number that is not what the rows give
-    python -m tools.claims write    # writes numbers and tables into the documents
+    python -m tools.claims write    # makes the tables of results/ again, and writes the documents
     python -m tools.claims list     # each claim, with its count and the commit of its rows
 
 `docs/claims.yaml` has an entry for each number, and says what an entry looks like.
@@ -23,6 +23,7 @@ import yaml
 from experiments.common.shards import read_rows
 from sejax.ops.files import write_text
 from sejax.proxies import zoo
+from tools import remake
 
 ROOT = Path(__file__).parents[1]
 NUMBER = r"[-+]?\d[\d,]*(?:\.\d+)?%?"
@@ -146,6 +147,7 @@ class Claims:
 
     def check(self) -> Iterator[str]:
         """What is wrong, a message each."""
+        yield from remake.check(self.root, tuple(self.entries["without_rows"]))
         documents, covering = self.documents(), []
         for name, text in documents.items():
             for found in TABLE.finditer(text):
@@ -180,7 +182,8 @@ class Claims:
             yield from unclaimed(key, literal, covering[len(self.entries["claims"]) :])
 
     def write(self) -> None:
-        """Puts what the rows give into all documents."""
+        """Puts what the rows give into the tables of `results/` and all documents."""
+        remake.write(self.root, tuple(self.entries["without_rows"]))
         for name, text in self.documents().items():
             new = self.with_tables(text)
             for entry in self.entries.get("claims", {}).values():

@@ -59,7 +59,8 @@ def on_grid(curves: pd.DataFrame, grid: np.ndarray, window: int = WINDOW) -> np.
     rows = []
     for _, curve in curves.groupby("agent"):
         place = np.searchsorted(curve["steps"], grid, side="right") - 1
-        smoothed = curve["test_return"].rolling(window, min_periods=1).mean().to_numpy()
+        returns = curve["test_return"].astype(np.float32)  # as computed; stored in few digits
+        smoothed = returns.rolling(window, min_periods=1).mean().to_numpy()
         rows.append(np.where(place >= 0, smoothed[place], np.nan))
     return np.stack(rows)
 
@@ -80,6 +81,26 @@ def all_steps_to_solve(curves: pd.DataFrame, solved_reward: float) -> pd.Series:
 def last_returns(curves: pd.DataFrame, window: int = WINDOW) -> pd.Series:
     """Mean of each agent's last `window` test returns, by agent."""
     return curves.groupby("agent")["test_return"].apply(lambda x: x.tail(window).mean())
+
+
+def thinned(curves: pd.DataFrame, grid: np.ndarray, solved_reward: float) -> pd.DataFrame:
+    """What tables and figures need of curves: the rows with which they change at steps of a grid.
+
+    `on_grid` with a window of 1 gives the same of these. What needs all rows is in two more
+    columns, the same in all rows of an agent: `steps_to_solve` and `last_return`, the mean of its
+    last `WINDOW` test returns. Test returns have the precision that they were computed with.
+    """
+    tables = []
+    for _, curve in curves.groupby("agent", sort=False):
+        place = np.searchsorted(curve["steps"], grid, side="right") - 1
+        held = curve.iloc[np.unique(place.clip(min=0))]
+        tables.append(held[held["test_return"] != held["test_return"].shift()])
+    kept = pd.concat(tables, ignore_index=True)
+    return kept.assign(
+        test_return=kept["test_return"].astype(np.float32),
+        steps_to_solve=kept["agent"].map(all_steps_to_solve(curves, solved_reward)),
+        last_return=kept["agent"].map(last_returns(curves)),
+    )
 
 
 CURVES = Measure(

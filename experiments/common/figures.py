@@ -133,9 +133,14 @@ def panels(
     with plt.rc_context(STYLE):
         figure, axes = plt.subplots(lines, columns, **options)
         yield figure, axes
-        with atomic_path(path) as temporary:
-            figure.savefig(temporary, dpi=200)
-            with Image.open(temporary) as picture:  # in 256 colours: a third of the bytes
-                few = picture.convert("RGB").quantize(256, dither=Image.Dither.NONE)
-            few.save(temporary, format="png", optimize=True)
+        save(figure, path)
         plt.close(figure)
+
+
+def save(figure: Any, path: Path) -> None:
+    """Writes a figure as PNG in 256 colours: a third of the bytes."""
+    with atomic_path(path) as temporary:
+        figure.savefig(temporary, dpi=200)
+        with Image.open(temporary) as picture:
+            few = picture.convert("RGB").quantize(256, dither=Image.Dither.NONE)
+        few.save(temporary, format="png", optimize=True)

@@ -114,7 +114,7 @@ def rn_curves(settings: CurveSettings, variant: str, rns: ProxySet, prefix: str 
 def curves_in(
     settings: CurveSettings, name: str, groups: int, make: Any, prefix: str = "", **more: Any
 ) -> Iterator[pd.DataFrame]:
-    """Those of each row, with the columns `group`, `row` and `world`.
+    """Those of each row, `curves.thinned`, with the columns `group`, `row` and `world`.
 
     `make(group names, ...)` makes a condition; the prefix tells apart conditions of one name.
     """
@@ -130,7 +130,8 @@ def curves_in(
         rows = agents.train_groups(condition, settings, settings.num_agents, curves.CURVES)
         group = rows["group"].astype(int)
         number = rows["agent"] + group * settings.num_agents
-        yield rows.assign(agent=number, group=group, row=row, world=name)
+        rows = rows.assign(agent=number, group=group, row=row, world=name)
+        yield curves.thinned(rows, step_grid(settings.max_steps), settings.task.solved_reward)
 
 
 def by_row(settings: CurveSettings, rows: pd.DataFrame) -> pd.DataFrame:
@@ -162,7 +163,7 @@ def require_rows(settings: CurveSettings, rows: pd.DataFrame) -> None:
         same(name, groups, settings.values(name)[name])
 
 
-def summarise(rows: pd.DataFrame, solved_reward: float, max_steps: int) -> pd.DataFrame:
+def summarise(rows: pd.DataFrame, max_steps: int) -> pd.DataFrame:
     """One row for each row of the figure and condition.
 
     An agent that did not solve the task counts `max_steps`. Intervals are of the means of the RNs,
@@ -174,8 +175,8 @@ def summarise(rows: pd.DataFrame, solved_reward: float, max_steps: int) -> pd.Da
 
     def statistics(mine: pd.DataFrame) -> dict[str, float]:
         row, world = mine[["row", "world"]].iloc[0]
-        groups = mine.groupby("agent")["group"].first()
-        to_solve = curves.all_steps_to_solve(mine, solved_reward)
+        each = mine.groupby("agent").first()
+        groups, to_solve = each["group"], each["steps_to_solve"]
         steps = to_solve.clip(upper=max_steps)
         held = curves.on_grid(mine, grid, window=1)
         mean_return = pd.Series(np.nanmean(held, axis=1), index=steps.index)
@@ -187,7 +188,7 @@ def summarise(rows: pd.DataFrame, solved_reward: float, max_steps: int) -> pd.Da
             | mean_columns(steps, "steps", labels)
             | mean_columns(mean_return, "return", labels)
             | iqm_columns(mean_return, "return", labels)
-            | {"last_return": curves.last_returns(mine).mean()}
+            | {"last_return": each["last_return"].mean()}
         )
 
     summary = summary_by(rows, ["row", "world"], statistics)
