@@ -1,0 +1,341 @@
+"""Who needs the dynamics: what agents that look ahead less learn on each stored and shipped SE.
+
+An agent with a discount of 0 sees the reward of its next step alone. An SE that teaches it as well
+as a far-sighted one is a policy in disguise, however long its episodes are; one that teaches the
+far-sighted alone teaches through its dynamics.
+
+On each SE, DDQN (TD3 for continuous actions) trains with each discount, with equal seeds, as long
+and with the hyperparameters as it was learned with. R(d) is the return of agents with discount d on
+the real task. The unit of differences is the way from R of untrained agents to the solved return:
+
+- *dynamics*: R(0.99) - R(0) is more than `margin`;
+- *policy*: it is less, and R(0.99) is more than `margin` above R of untrained agents;
+- *teaches little*: R(0.99) is less than that;
+- *open*: the agents do not say.
+
+More and less are those of Student's 95% interval over the agents of an SE, in pairs of equal seeds.
+"""
+
+import dataclasses
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import pandas as pd
+
+import sejax
+from experiments.common import figures, tables
+from experiments.common.agents import (
+    OUTCOMES,
+    SOFT_SE,
+    Condition,
+    Group,
+    Measure,
+    groups_at_once,
+    train_groups,
+    training_as_learned,
+    tuned_agent,
+)
+from experiments.common.experiment import Experiment, Settings, count, setting
+from experiments.common.shards import stack, unstack
+from experiments.common.statistics import mean_interval
+from sejax import ProxySet, TrainingConfig, envs
+from sejax.agents.base import with_hparams
+from sejax.options import fraction, positive, registry, require
+from sejax.proxies import header
+
+STORED = (  # below results/
+    "soft_ses/*.safetensors",
+    "paper/*/*/proxy.safetensors",
+    "se_feasibility/*/ses.safetensors",
+    "se_horizons/*/*.safetensors",
+    "se_families/*/*.safetensors",
+)
+DISCOUNTS = (0.0, 0.5, 0.9, 0.99)
+UNTRAINED = "untrained"
+
+
+@dataclass(frozen=True, kw_only=True)
+class SeMyopia(Settings):
+    name = "se_myopia"
+
+    env: str = setting("cartpole")  # task of the SEs
+    # Files of SEs, run directories or shipped names; all that are shipped and in results/.
+    ses: tuple[str, ...] = setting((), quick=("cartpole", SOFT_SE))
+    num_ses: int = count(5, quick=1)  # the first SEs of each set
+    num_agents: int = count(20, quick=5)  # on each SE with each discount
+    test_episodes: int = count(10)  # of each agent
+    max_steps: int | None = count(None, quick=1000)  # of training; as the SE's configuration says
+    # Difference that counts as none, as a share of the way from untrained agents to solved.
+    margin: float = setting(0.1, positive("a difference is never measured as 0", 1))
+    discounts: tuple[float, ...] = setting(DISCOUNTS)  # the least and the greatest are compared
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for discount in self.discounts:
+            fraction()("discounts", discount, 0.99)
+        two = len(set(self.discounts)) > 1
+        must = "must hold two that differ, which are compared; got fewer. Set discounts=[0,0.99]."
+        require(two, "discounts", must)
+
+
+class Se(NamedTuple):
+    """An SE of a set."""
+
+    set: str
+    ses: ProxySet
+    place: int
+
+
+def find(settings: SeMyopia) -> Iterator[Se]:
+    """The SEs that are tested."""
+    files: list[str] = list(settings.ses)
+    if not files:
+        shipped = [proxy.name for proxy in sejax.pretrained() if proxy.kind == "se"]
+        files = [*shipped, *(str(x) for name in STORED for x in sorted(Path("results").glob(name)))]
+    for file in files:
+        if header.read_config(file, "ses")["env"]["name"] == settings.env:
+            ses = sejax.load_set(file, option="ses", kind="se")
+            for place in range(min(len(ses), settings.num_ses)):
+                yield Se(set_name(file), ses, place)
+
+
+def set_name(file: str) -> str:
+    """A file's name for people: of those that are one set, the folder that they are in."""
+    path = Path(file)
+    if path.suffix != ".safetensors":
+        return f"{file} (shipped)" if file in header.pretrained_names() else file
+    if path.name == "proxy.safetensors":  # of a run, one of several
+        path = path.parents[1]
+    elif path.name == "ses.safetensors":
+        path = path.parent
+    return str(path.with_suffix("")).removeprefix("results/")
+
+
+def make_run(agent: Any, env: Any, task: Any, training: TrainingConfig) -> Any:
+    """Builds `run(key, (discount, env_params), active) -> Outcome`, for all discounts."""
+
+    def run(key: Any, params: tuple[Any, Any], active: Any) -> Any:
+        discount, env_params = params
+        hparams = with_hparams(agent.hparams, {"discount": discount})
+        sighted = dataclasses.replace(agent, hparams=hparams)
+        return sejax.make_evaluator(sighted, env, task, training)(key, env_params, active)
+
+    return run
+
+
+MEASURE = Measure(make_run=make_run, to_table=OUTCOMES.to_table, log=OUTCOMES.log)
+
+
+def agent_on(settings: SeMyopia, ses: ProxySet) -> Any:
+    """DDQN, or TD3, as the set was learned with it; else as it is tuned for the task."""
+    kind = "td3" if ses.task.num_actions is None else "ddqn"
+    for values in header.agents_of(ses.config).values():
+        if values["name"] == kind:
+            return registry.configure("agent", values)
+    return tuned_agent(settings.env, kind)
+
+
+def compute(settings: SeMyopia) -> pd.DataFrame:
+    """Trains what is missing; a row for each SE, and one for each agent."""
+    found = list(find(settings))
+    require(found, "ses", f"must hold SEs of {settings.env}; there are none. Set env=acrobot.")
+    seen = set()  # some SEs are in several files
+    programs: dict[Any, tuple[ProxySet, dict[str, Any]]] = {}
+    for _, ses, place in found:
+        one = ses[place]
+        if one.fingerprint not in seen:
+            seen.add(one.fingerprint)
+            agent = agent_on(settings, ses)
+            training = training_as_learned(ses, agent, settings.test_episodes, settings.max_steps)
+            _, params = programs.setdefault((ses.env.config, agent, training), (ses, {}))
+            params[one.fingerprint] = one.params
+    agents = [untrained(settings, found[0].ses)]
+    for (_, agent, training), (ses, params) in programs.items():
+        for discount in settings.discounts:
+            condition = Condition(
+                name=f"{discount:g}",
+                env=ses.env,
+                task=ses.task,
+                groups=tuple(Group(x, (discount, each), x) for x, each in params.items()),
+                agent=agent,
+                training=training,
+                settings={"proxy": ses.config["proxy"], "discount": discount},
+            )
+            at_once = groups_at_once(settings.devices)
+            rows = train_groups(condition, settings, settings.num_agents, MEASURE, at_once)
+            agents.append(rows.assign(discount=discount))
+    return stack({"ses": pd.DataFrame(map(describe, found)), "agents": pd.concat(agents)})
+
+
+def describe(se: Se) -> dict[str, Any]:
+    """A row about an SE and its episodes."""
+    config = se.ses.env.config
+    return {
+        "set": se.set,
+        "group": se.ses[se.place].fingerprint,
+        "seed": se.ses.seeds[se.place],
+        "horizon": se.ses.env.max_steps,
+        "at_limit": "ends" if config.ends_at_horizon else "cut",
+        "done": "-" if config.is_bandit else config.done,
+        "initial_state": config.initial_state,
+    }
+
+
+def untrained(settings: SeMyopia, ses: ProxySet) -> pd.DataFrame:
+    """Agents that trained for one step, tested on the real task."""
+    condition = Condition.real(
+        ses.task,
+        [UNTRAINED],
+        name=UNTRAINED,
+        agent=agent_on(settings, ses),
+        training=TrainingConfig(
+            max_steps=1, max_episodes=1, stop_rule="never", test_episodes=settings.test_episodes
+        ),
+    )
+    return train_groups(condition, settings, settings.num_agents)
+
+
+def verdicts(
+    agents: pd.DataFrame, floor: float, solved_reward: float, margin: float
+) -> pd.DataFrame:
+    """A row for each SE: what it loses with the least discount, and what it is.
+
+    Args:
+      agents: rows with the columns `group`, `discount`, `agent` and `test_return`.
+      floor: mean return of untrained agents.
+      solved_reward: of the task.
+      margin: share of the way between them that counts as none.
+
+    Returns:
+      The columns `group`, `loss` (mean difference of returns) with the ends of its interval
+      `loss_low` and `loss_high`, and `verdict`.
+    """
+    none = margin * (solved_reward - floor)
+    found = []
+    for group, mine in agents.groupby("group", sort=False):
+        returns = mine.pivot(index="agent", columns="discount", values="test_return")
+        far, lost = returns.iloc[:, -1], returns.iloc[:, -1] - returns.iloc[:, 0]
+        low, high = mean_interval(lost)
+        gain_low, gain_high = mean_interval(far - floor)
+        if low > none:
+            verdict = "dynamics"
+        elif high < none < gain_low:
+            verdict = "policy"
+        else:
+            verdict = "teaches little" if gain_high < none else "open"
+        columns = {"loss": lost.mean(), "loss_low": low, "loss_high": high, "verdict": verdict}
+        found.append({"group": group, **columns})
+    return pd.DataFrame(found)
+
+
+def summarise(
+    ses: pd.DataFrame, agents: pd.DataFrame, solved_reward: float, margin: float
+) -> pd.DataFrame:
+    """A row for each set of SEs, with columns for each discount (`return_0_5_mean`)."""
+    is_untrained = agents["group"] == UNTRAINED
+    floor = agents[is_untrained]["test_return"].mean()
+    agents = agents[~is_untrained]
+    judged = verdicts(agents, floor, solved_reward, margin)
+    far = agents[agents["discount"] == agents["discount"].max()]
+
+    def statistics(mine: pd.DataFrame) -> dict[str, Any]:
+        verdict = judged[judged["group"].isin(mine["group"])]["verdict"].value_counts()
+        lasted = far[far["group"].isin(mine["group"])]
+        columns: dict[str, Any] = {
+            **mine.iloc[0][["horizon", "at_limit", "done", "initial_state"]],
+            "num_ses": len(mine),
+            "steps": lasted["train_steps"].sum() / lasted["train_episodes"].clip(lower=1).sum(),
+            "verdict": ", ".join(
+                name if len(mine) == 1 else f"{name} {count} of {len(mine)}"
+                for name, count in verdict.items()
+            ),
+            "untrained": floor,
+        }
+        own = agents[agents["group"].isin(mine["group"])]
+        for discount, at in own.groupby("discount"):
+            returns = at["test_return"]
+            name = column(discount)
+            columns |= tables.mean_columns(returns, name, at["group"] if len(mine) > 1 else None)
+            columns[f"{name}_worst"] = returns.nsmallest(-(-len(returns) // 10)).mean()
+        return columns
+
+    return tables.summary_by(ses, ["set"], statistics)
+
+
+def report(settings: SeMyopia, rows: pd.DataFrame) -> pd.DataFrame:
+    task = envs.make(settings.env)
+    ses, agents = unstack(rows, "ses"), unstack(rows, "agents")
+    summary = summarise(ses, agents, task.solved_reward, settings.margin)
+    discounts = sorted(agents["discount"].dropna().unique())
+    draw(settings, summary, discounts)
+    shown: dict[str, Any] = {
+        "SEs": "{set}",
+        "number": "{num_ses}",
+        "horizon": "{horizon:.0f} ({at_limit})",
+        "ends": "{done}",
+        "starts": "{initial_state}",
+        "steps of an episode": "{steps:.1f}",
+    }
+    for discount in discounts:
+        shown[f"discount {discount:g}"] = cell(column(discount))
+    shown["verdict"] = "{verdict}"
+    table = tables.as_texts(summary, shown)
+    kind = figures.AGENT_NAMES["td3" if task.num_actions is None else "ddqn"]
+    least, most = discounts[0], discounts[-1]
+    untrained = summary["untrained"].iloc[0]
+    none = settings.margin * (task.solved_reward - untrained)
+    note = (
+        f"{settings.num_agents} {kind} on each SE with each discount. Cells: mean return on "
+        f"{task.name} (mean of the worst tenth). "
+        f"{tables.interval_note('SEs, agents where there is one SE')} Steps of an episode: mean "
+        f"over the training of agents with discount {most:g}. Verdict on each SE, by Student's 95% "
+        f"interval of the difference of returns with discounts {most:g} and {least:g} over pairs "
+        f"of agents of equal seeds. Dynamics: above {none:.3g}, {settings.margin:.0%} of the way "
+        f"from untrained agents ({untrained:.1f}) to the solved return ({task.solved_reward:g}). "
+        f"Policy: below it. Teaches little: agents with discount {most:g} are less than that above "
+        "untrained ones. Open: the intervals hold both. Where episodes are one step, a discount "
+        "is of no effect."
+    )
+    title = f"Which SEs of {task.name} teach agents that look ahead less"
+    return tables.publish(settings, title, table, summary, note)
+
+
+def column(discount: float) -> str:
+    """Name of the columns about agents with this discount."""
+    return f"return_{discount:g}".replace(".", "_")
+
+
+def cell(name: str) -> Any:
+    """What agents with one discount reach."""
+    mean = tables.mean_text(name, 1)
+    return lambda row: f"{mean(row)} ({getattr(row, f'{name}_worst'):,.1f})"
+
+
+def draw(settings: SeMyopia, summary: pd.DataFrame, discounts: list[float]) -> None:
+    """Mean returns against discounts: a line for each set, with the verdict on most of its SEs."""
+    task = envs.make(settings.env)
+    with figures.panels(settings.folder / "myopia.png", 1, 1, (6.4, 3.8)) as (figure, [[axes]]):
+        for row in summary.to_dict("records"):
+            means = [row[f"{column(discount)}_mean"] for discount in discounts]
+            kind = next(x for x in KINDS if row["verdict"].startswith(x))
+            axes.plot(range(len(discounts)), means, "o-", ms=3, lw=1, color=KINDS[kind], alpha=0.7)
+        for kind, color in KINDS.items():
+            axes.plot([], [], "o-", ms=3, lw=1, color=color, label=kind)
+        figures.threshold(axes, task.solved_reward)
+        axes.set_xticks(range(len(discounts)), [f"{x:g}" for x in discounts])
+        axes.set(xlabel="discount of the agents", ylabel=f"mean return on {task.name}")
+        figures.legend_above(figure, axes)
+
+
+KINDS = {
+    "policy": figures.REAL,
+    "dynamics": figures.FIXED,
+    "open": figures.VARIED,
+    "teaches little": "#999999",
+}
+EXPERIMENT = Experiment(settings=SeMyopia, compute=compute, report=report, about=__doc__)
+
+if __name__ == "__main__":
+    EXPERIMENT.main()

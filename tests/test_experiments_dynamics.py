@@ -1,0 +1,109 @@
+"""The experiments on SEs that teach through their dynamics."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pandas as pd
+import pytest
+from scipy.stats import t as student
+from test_experiments import save_ses
+
+import sejax
+from experiments import se_myopia
+from experiments.common.agents import OUTCOMES
+
+# --- the myopia test ------------------------------------------------------------------------------
+
+
+def agent_rows(group, by_discount):
+    """Rows of agents on one SE, given their returns by discount."""
+    return pd.concat(
+        pd.DataFrame({"group": group, "discount": discount, "agent": range(len(returns)),
+                      "test_return": np.asarray(returns, float), "train_steps": 100,
+                      "train_episodes": 20})
+        for discount, returns in by_discount.items()
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("myopic", "far", "verdict"),
+    [
+        ([98, 99, 100, 101, 102], [100, 100, 100, 100, 100], "policy"),
+        ([0, 1, 2, 3, 4], [98, 99, 100, 101, 102], "dynamics"),
+        ([0, 1, 2, 3, 4], [3, 4, 2, 1, 0], "teaches little"),
+        ([0, 100, 0, 100, 0], [100, 100, 100, 100, 100], "open"),
+        ([0, 100, 0, 100, 0], [0, 100, 0, 100, 0], "open"),  # equal, but does it teach anything?
+        ([100, 100, 100, 100, 100], [0, 0, 0, 0, 0], "teaches little"),
+        ([0, 0, 0, 0], [100, 100, 100, 100], "open"),  # too few agents for an interval
+    ],
+)
+def test_a_verdict_is_read_off_intervals(myopic, far, verdict):
+    rows = agent_rows("a", {0.0: myopic, 0.5: [7] * len(far), 0.99: far})
+    (found,) = se_myopia.verdicts(rows, 0.0, 100.0, 0.1).to_dict("records")
+    assert found["verdict"] == verdict and found["group"] == "a"
+    lost = np.subtract(far, myopic)
+    assert found["loss"] == pytest.approx(lost.mean())
+    if len(lost) >= 5:
+        half = student.ppf(0.975, 4) * lost.std(ddof=1) / 5**0.5
+        ends = [lost.mean() - half, lost.mean() + half]
+        assert [found["loss_low"], found["loss_high"]] == pytest.approx(ends)
+
+
+def test_sets_are_summarised_over_their_ses_and_share_those_that_are_in_both():
+    same = {"horizon": 9, "at_limit": "cut", "done": "soft", "initial_state": "real"}
+    ses = pd.DataFrame([{"set": "one", "group": "a", **same}, {"set": "two", "group": "a", **same},
+                        {"set": "two", "group": "b", **same}])  # fmt: skip
+    agents = pd.concat([
+        agent_rows("a", {0.0: [100] * 10, 0.99: [100] * 10}),
+        agent_rows("b", {0.0: [0] * 10, 0.99: [100] * 9 + [20]}).assign(train_episodes=5),
+        agent_rows("untrained", {np.nan: [-1.0, 1.0]}),
+    ])  # fmt: skip
+    one, two = se_myopia.summarise(ses, agents, 100.0, 0.1).to_dict("records")
+    assert one["verdict"] == "policy" and one["num_ses"] == 1 and one["untrained"] == 0
+    assert two["verdict"] == "policy 1 of 2, dynamics 1 of 2" and two["num_ses"] == 2
+    assert (one["steps"], two["steps"]) == (5, 8), "2000 steps in 250 episodes"
+    assert one["return_0_mean"] == 100 and two["return_0_mean"] == 50
+    assert one["return_0_low"] == 100 and np.isnan(two["return_0_low"]), "two SEs are too few"
+    assert two["return_0_99_worst"] == 60, "of twenty agents the two worst, 20 and 100"
+
+
+def test_a_discount_that_is_traced_is_that_of_the_configuration():
+    task = sejax.envs.make("cartpole")
+    env = sejax.SyntheticConfig(hidden_size=4).make(task)
+    training = sejax.TrainingConfig(max_steps=40, max_episodes=40, stop_rule="never")
+    config = sejax.DDQNConfig(hidden_size=4, batch_size=4, num_layers=1, warmup_episodes=0)
+    key, params = jax.random.key(3), env.params(env.init_weights(jax.random.key(5)), 0.99)
+
+    def outcome(discount):
+        agent = sejax.make_agent(dataclasses.replace(config, discount=discount), task)
+        return sejax.make_evaluator(agent, env, task, training)(key, params)
+
+    run = jax.jit(se_myopia.make_run(sejax.make_agent(config, task), env, task, training))
+    for discount in (0.0, 0.9):
+        found = run(key, (jnp.float32(discount), params), True)
+        jax.tree.map(np.testing.assert_array_equal, found, outcome(discount))
+        assert len(OUTCOMES.to_table(jax.tree.map(lambda x: x[None], found), {})) == 1
+
+
+def test_ses_are_found_by_their_task_and_named_by_their_file(tmp_path):
+    files = [save_ses(tmp_path / "set" / "ses.safetensors", 3),
+             save_ses(tmp_path / "runs" / "seed0" / "proxy.safetensors", 1),
+             save_ses(tmp_path / "other.safetensors", 1, "env=acrobot"), "cartpole"]  # fmt: skip
+    found = list(se_myopia.find(se_myopia.SeMyopia.of(ses=files, num_ses=2)))
+    names = [str(tmp_path / "set")] * 2 + [str(tmp_path / "runs"), "cartpole (shipped)"]
+    assert [se.set for se in found] == names and [se.place for se in found] == [0, 1, 0, 0]
+    (other,) = se_myopia.find(se_myopia.SeMyopia.of(ses=files, env="acrobot"))
+    assert other.set == str(tmp_path / "other") and other.ses.task.name == "acrobot"
+
+
+@pytest.mark.parametrize(
+    ("given", "field"),
+    [({"discounts": [0.9]}, "discounts"), ({"discounts": [0, 1.5]}, "discounts"),
+     ({"env": "pendulum", "ses": "cartpole"}, "ses"), ({"margin": 0}, "margin")],
+)  # fmt: skip
+def test_settings_that_cannot_work_are_refused(given, field, tmp_path):
+    with pytest.raises(sejax.ConfigError) as refused:
+        se_myopia.EXPERIMENT.run(se_myopia.SeMyopia.of(out=str(tmp_path), **given))
+    assert refused.value.field == field
