@@ -17,7 +17,7 @@ More and less are those of Student's 95% interval over the agents of an SE, in p
 """
 
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -40,7 +40,7 @@ from experiments.common.agents import (
 from experiments.common.experiment import Experiment, Settings, count, setting
 from experiments.common.shards import stack, unstack
 from experiments.common.statistics import mean_interval
-from sejax import ProxySet, TrainingConfig, envs
+from sejax import ProxySet, Task, TrainingConfig, envs
 from sejax.agents.base import with_hparams
 from sejax.options import fraction, positive, registry, require
 from sejax.proxies import header
@@ -151,21 +151,19 @@ def compute(settings: SeMyopia) -> pd.DataFrame:
             training = training_as_learned(ses, agent, settings.test_episodes, settings.max_steps)
             _, params = programs.setdefault((ses.env.config, agent, training), (ses, {}))
             params[one.fingerprint] = one.params
-    agents = [untrained(settings, found[0].ses)]
+    first = found[0].ses
+    agents = [untrained(settings, first.task, agent_on(settings, first))]
     for (_, agent, training), (ses, params) in programs.items():
-        for discount in settings.discounts:
-            condition = Condition(
-                name=f"{discount:g}",
-                env=ses.env,
-                task=ses.task,
-                groups=tuple(Group(x, (discount, each), x) for x, each in params.items()),
-                agent=agent,
-                training=training,
-                settings={"proxy": ses.config["proxy"], "discount": discount},
-            )
-            at_once = groups_at_once(settings.devices)
-            rows = train_groups(condition, settings, settings.num_agents, MEASURE, at_once)
-            agents.append(rows.assign(discount=discount))
+        condition = Condition(
+            name="",
+            env=ses.env,
+            task=ses.task,
+            groups=tuple(Group(x, each, x) for x, each in params.items()),
+            agent=agent,
+            training=training,
+            settings={"proxy": ses.config["proxy"]},
+        )
+        agents.append(train_with_discounts(settings, condition, settings.discounts))
     return stack({"ses": pd.DataFrame(map(describe, found)), "agents": pd.concat(agents)})
 
 
@@ -183,13 +181,32 @@ def describe(se: Se) -> dict[str, Any]:
     }
 
 
-def untrained(settings: SeMyopia, ses: ProxySet) -> pd.DataFrame:
+def train_with_discounts(
+    settings: Any, condition: Condition, discounts: Sequence[float]
+) -> pd.DataFrame:
+    """Rows of the agents of a condition with each discount, in the column `discount`."""
+    tables = []
+    for discount in discounts:
+        pairs = [group._replace(params=(discount, group.params)) for group in condition.groups]
+        sighted = dataclasses.replace(
+            condition,
+            name=f"{condition.name}{discount:g}",
+            groups=tuple(pairs),
+            settings=condition.settings | {"discount": discount},
+        )
+        at_once = groups_at_once(settings.devices)
+        rows = train_groups(sighted, settings, settings.num_agents, MEASURE, at_once)
+        tables.append(rows.assign(discount=discount))
+    return pd.concat(tables, ignore_index=True)
+
+
+def untrained(settings: Any, task: Task, agent: Any) -> pd.DataFrame:
     """Agents that trained for one step, tested on the real task."""
     condition = Condition.real(
-        ses.task,
+        task,
         [UNTRAINED],
         name=UNTRAINED,
-        agent=agent_on(settings, ses),
+        agent=agent,
         training=TrainingConfig(
             max_steps=1, max_episodes=1, stop_rule="never", test_episodes=settings.test_episodes
         ),

@@ -65,6 +65,8 @@ TINY = {
                     "run": [*TINY_SE, *tiny_agents("ddqn", "dueling_ddqn")]},
     "se_models": {"ses": "se", "agents": "ddqn", "num_agents": 2, "test_episodes": 2},
     "se_myopia": {"ses": "se", "num_agents": 2, "test_episodes": 1},
+    "se_out_of_sample": {"fixed": "se", "agents": "ddqn", "num_ses": 1, "real_agents": 2,
+                         "more_steps": [40], "test_episodes": 1},
     "se_performance": {"fixed": "se", "agents": "ddqn", "num_agents": 2, "test_episodes": 2,
                        "real_episodes": 3},
     "se_transfer_of_hparams": {"ses": "se", "num_configs": 3, "num_agents": 2, "max_steps": 40,
@@ -75,8 +77,9 @@ TINY = {
     "timings": {"rows": "cliff_walking-rn", "generations": 1},
 }  # fmt: skip
 SLOW = {"null_baselines", "rn_heatmap", "rn_objectives", "rn_performance", "score_transforms",
-        "se_families", "se_feasibility", "se_horizons", "se_models", "se_myopia", "se_performance",
-        "se_transfer_of_hparams", "supervised_baseline"}  # fmt: skip
+        "se_families", "se_feasibility", "se_horizons", "se_models", "se_myopia",
+        "se_out_of_sample", "se_performance", "se_transfer_of_hparams",
+        "supervised_baseline"}  # fmt: skip
 
 
 def module_of(name):

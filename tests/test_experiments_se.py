@@ -18,6 +18,7 @@ from experiments import (
     se_feasibility,
     se_horizons,
     se_models,
+    se_out_of_sample,
     se_performance,
     se_transfer_of_hparams,
 )
@@ -276,6 +277,49 @@ def test_ses_learned_otherwise_or_of_another_task_are_refused(ses, tmp_path):
         with pytest.raises(ConfigError) as refused:
             run("se_performance", se_performance, tmp_path, **given)
         assert refused.value.field == field
+
+
+# --- out of sample --------------------------------------------------------------------------------
+
+
+def test_an_se_is_solved_where_its_fresh_agents_are_and_intervals_draw_ses():
+    returns = {"a": [200, 190], "b": [200, 180], "c": [195, 195], "d": [150, 0], "e": [200, 200]}
+    agents = pd.DataFrame([
+        {"kind": "ppo", "hparams": "default", "trained_on": name, "steps": 2000, "group": group,
+         "agent": i, "test_return": float(x)}
+        for name in ("fixed", "real") for group, pair in returns.items()
+        for i, x in enumerate(pair)
+    ])  # fmt: skip
+    summary = se_out_of_sample.summarise(agents, 195).set_index("trained_on")
+    ses, real = summary.loc["fixed"], summary.loc["real"]
+    assert (ses["groups_solved"], ses["num_groups"], ses["num_agents"]) == (3, 5, 10)  # a, c, e
+    assert ses["solved"] == 0.6 and ses["worst_tenth"] == ses["worst"] == 0
+    ends = ses["test_return_low"], ses["test_return_high"]
+    assert ends == pytest.approx(mean_interval([195, 190, 195, 75, 200]))
+    ends = real["test_return_low"], real["test_return_high"]
+    assert ends == pytest.approx(mean_interval(agents["test_return"][:10]))
+    table = se_out_of_sample.make_table(summary.reset_index())
+    assert table["interval over"].tolist() == ["5 SEs", "10 agents"]
+    assert table["SEs or tables solved"].tolist() == ["3 of 5", ""]
+
+
+def test_fresh_agents_train_on_all_ses_and_beside_them_as_long(ses):
+    settings = se_out_of_sample.SeOutOfSample.of(fixed=ses, real_agents=4, more_steps=[90])
+    assert settings.seed == 1000, "seeds that took no part in tuning"
+    sets = se_out_of_sample.load_sets(settings)
+    found = list(se_out_of_sample.conditions(settings, sets, "ddqn", "default"))
+    names = [condition.groups[0].name.partition("-")[0] for condition, _ in found]
+    assert names == ["fixed", "hand", "real", "real"]
+    assert [condition.training.max_steps for condition, _ in found] == [41, 41, 41, 90]
+    counts = [len(condition.groups) * num_agents for condition, num_agents in found]
+    assert counts == [3 * 10, 4, 4, 4], "unsolved SEs are not left out"
+    assert not found[-1][0].training.time_limit_is_terminal
+
+
+def test_ses_of_another_task_are_refused(ses):
+    settings = se_out_of_sample.SeOutOfSample.of(env="acrobot", fixed=ses)
+    with pytest.raises(ConfigError, match="env=cartpole"):
+        se_out_of_sample.load_sets(settings)
 
 
 # --- mixtures and horizons ------------------------------------------------------------------------

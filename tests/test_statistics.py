@@ -12,6 +12,7 @@ from experiments.common.statistics import (
     iqm_interval,
     mean_interval,
     performance_profile,
+    worst_tenth,
 )
 
 
@@ -108,6 +109,12 @@ def test_fewer_than_five_values_have_no_interval():
     four = [1.0, 2.0, 3.0, 4.0]
     for ends in (mean_interval(four), iqm_interval(four), bootstrap_interval(four[:2], four[2:])):
         assert np.isnan(ends).all()
+
+
+def test_the_worst_tenth_is_the_mean_of_the_lowest_values():
+    assert worst_tenth(np.random.default_rng(0).permutation(20)) == 0.5
+    assert worst_tenth([3.0, 1.0, 2.0]) == 1.0 and worst_tenth(range(11)) == 0.5
+    assert np.isnan(worst_tenth([np.nan, 1.0]))
 
 
 def test_equal_runs_have_no_uncertainty():

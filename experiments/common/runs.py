@@ -58,13 +58,19 @@ def configs_of(config: Any, num_runs: int, folder: Path) -> list[Any]:
     ]
 
 
-def learn(configs: list[Any], budget_s: float | None = None, option: str = "work") -> pd.DataFrame:
+def learn(
+    configs: list[Any],
+    budget_s: float | None = None,
+    option: str = "work",
+    chunks: session.Chunks | None = None,
+) -> pd.DataFrame:
     """Learns the proxies of several runs that differ in the seed, or what is left of them.
 
     Args:
       configs: of the runs; see `configs_of`.
       budget_s: CPU seconds after which a run begins no further generation.
       option: the setting that names the folder, for messages.
+      chunks: the compiled generations of these runs, if they were made before.
 
     Returns:
       The generations of all runs: the columns of `metrics.csv`, and their CPU seconds `cpu_s`.
@@ -72,7 +78,7 @@ def learn(configs: list[Any], budget_s: float | None = None, option: str = "work
     Raises:
       ConfigError: if a folder holds a run of other settings or of more generations, or is in use.
     """
-    chunks = session.make_chunks(configs[0])
+    chunks = chunks or session.make_chunks(configs[0])
     curves = []
     with Tally(len(configs), "NES runs") as tally:
         for config in configs:

@@ -69,6 +69,13 @@ def interquartile_mean(scores: Any) -> Any:
     return np.where(np.isnan(ordered[..., -1]), np.nan, middle)[()]
 
 
+def worst_tenth(values: Any) -> float:
+    """Mean of the lowest tenth of values `[n]`, of one at least; nan where one is nan."""
+    values = np.asarray(values, float)
+    lowest = np.sort(values)[: -(-values.size // 10)]
+    return float("nan") if np.isnan(values).any() else float(lowest.mean())
+
+
 def bootstrap_interval(
     *strata: Any,
     statistic: Callable[[Any], Any] = interquartile_mean,
