@@ -76,6 +76,23 @@ def test_the_command_of_each_se_composes_what_its_file_was_learned_with(name):
     assert config.training == sejax.training_of(stored)
 
 
+@pytest.mark.parametrize("name", sorted(set(PROXIES) - set(SES)))
+def test_each_rn_says_what_it_cost(name):
+    learning = PROXIES[name].learning
+    assert learning.real_steps > 1e6 and f"| {learning.real_steps:,} |" in PROXIES[name].card
+    assert sejax.config(shlex.split(learning.command)[3:]).generations == learning.generations
+
+
+def test_the_curves_beside_a_set_tell_what_its_proxies_cost(monkeypatch):
+    monkeypatch.syspath_prepend(TOOLS)
+    import ship_proxy
+
+    stored = "results/reward_networks/cartpole/reward_threshold/exclusive_potential.safetensors"
+    path, proxy = TOOLS.parent / stored, sejax.load_proxy("cartpole-rn")
+    learning = ship_proxy.learning_of(path, proxy)["learning"]
+    assert learning == dataclasses.asdict(PROXIES["cartpole-rn"].learning)
+
+
 def _fields(values):
     return {name: value for name, value in values.items() if name != "name"}
 

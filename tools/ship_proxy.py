@@ -5,8 +5,8 @@
     python tools/ship_proxy.py rns/additive_potential.safetensors#3 cartpole-rn --hparams as_learned
 
 Fresh agents of each kind train on it and are tested on the real task (`python -m sejax.evaluate`),
-with each choice of hyperparameters. The run directory tells what learning it cost; a bare file does
-not. Writes `sejax/pretrained/NAME.safetensors`; then `python tools/make_zoo.py` makes docs/zoo.md.
+with each choice of hyperparameters. The run directory tells what learning it cost; the curves beside
+a set of `experiments/` tell the real steps; a bare file tells nothing. Writes `sejax/pretrained/NAME.safetensors`; then `python tools/make_zoo.py` makes docs/zoo.md.
 """  # noqa: E501
 
 import argparse
@@ -20,6 +20,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
 import yaml
 
 import sejax
@@ -47,7 +48,7 @@ def main() -> None:
     args = parser.parse_intermixed_args()  # overrides may come after options
     path, _, place = args.run.partition("#")
     proxy = sejax.load_set(path, option="run")[int(place or 0)]
-    more = learning_of(Path(path))
+    more = learning_of(Path(path), proxy)
     with tempfile.TemporaryDirectory() as folder:
         alone = Path(folder) / f"{args.name}.safetensors"
         save(alone, proxy)
@@ -70,14 +71,24 @@ def save(path: Path, proxy: sejax.Proxy, **more: object) -> None:
 # --- how it was learned ---------------------------------------------------------------------------
 
 
-def learning_of(path: Path) -> dict[str, Any]:
-    """What a run directory tells of its run, as a part of the proxy's record."""
-    if not path.is_dir():
+def learning_of(path: Path, proxy: sejax.Proxy) -> dict[str, Any]:
+    """What is known of a proxy's run, as a part of its record."""
+    curves = path.with_suffix(".csv.xz")
+    if path.is_dir():
+        ended = json.loads((path / "run.json").read_text())  # not there before the run has ended
+        config = yaml.safe_load((path / "config.yaml").read_text())
+        costs = {name: ended[name] for name in COSTS}
+    elif curves.exists():
+        learned = configuration.learn_config(proxy.config)  # with the names of today
+        own = {"seed": proxy.record["seed"], "num_seeds": 1}
+        config = json.loads(json.dumps(configuration.plain(learned))) | own
+        rows = pd.read_csv(curves)
+        real_steps = rows[rows["seed"] == config["seed"]]["env_steps_total"]
+        costs = {"generations": len(real_steps), "real_steps": int(real_steps.max())}
+    else:
         return {}
-    ended = json.loads((path / "run.json").read_text())  # not there before the run has ended
-    config = yaml.safe_load((path / "config.yaml").read_text())
     command = f"python -m sejax.run {shlex.join(words_of(config))}"
-    learning = zoo.Learning(command=command, **{name: ended[name] for name in COSTS})
+    learning = zoo.Learning(command=command, **costs)
     return {"learning": dataclasses.asdict(learning)}
 
 

@@ -51,18 +51,18 @@ class Learning:
     Attributes:
       command: command that repeats it.
       generations: generations of the outer loop.
-      agents: number of agents that were trained.
-      train_steps: steps of their trainings, which for an SE are none of the real task.
       real_steps: steps on the real task, tests included.
-      cpu_s: CPU seconds, compilation included.
+      agents: number of agents that were trained; None if it was not recorded.
+      train_steps: steps of their trainings, which for an SE are none of the real task; likewise.
+      cpu_s: CPU seconds, compilation included; likewise.
     """
 
     command: str
     generations: int
-    agents: int
-    train_steps: int
     real_steps: int
-    cpu_s: float
+    agents: int | None = None
+    train_steps: int | None = None
+    cpu_s: float | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -123,7 +123,7 @@ class PretrainedProxy:
             "tested with": ", ".join(dict.fromkeys(each.agent for each in self.on_proxy)),
             "return": spread([each.return_mean for each in self.on_proxy], ".1f"),
             "steps": spread([each.train_steps for each in self.on_proxy], ",.0f"),
-            "CPU s": f"{learning.cpu_s:,.0f}" if learning else "",
+            "CPU s": f"{learning.cpu_s:,.0f}" if learning and learning.cpu_s else "",
             "real steps": f"{learning.real_steps:,}" if learning else "",
             "kB": f"{self.size_kb:.1f}",
         }
@@ -295,10 +295,14 @@ def _facts(proxy: PretrainedProxy) -> dict[str, str]:
         facts |= {} if number is None else {name: str(number)}
     if proxy.learning:
         learning = proxy.learning
-        facts["cost of the run"] = (
-            f"{learning.cpu_s:,.0f} CPU seconds, {learning.generations} generations, "
-            f"{learning.agents:,} agents, {learning.train_steps:,} training steps"
-        )
+        costs = {
+            "CPU seconds": learning.cpu_s,
+            "generations": learning.generations,
+            "agents": learning.agents,
+            "training steps": learning.train_steps,
+        }
+        known = (f"{x:,.0f} {unit}" for unit, x in costs.items() if x is not None)
+        facts["cost of the run"] = ", ".join(known)
         only = " (all of them tests)" if proxy.kind == "se" else ""
         facts["steps on the real task"] = f"{learning.real_steps:,}{only}"
     return facts
