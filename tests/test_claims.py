@@ -123,3 +123,8 @@ def test_a_changed_row_of_an_experiment_is_found(tmp_path):
 
 def test_the_documents_of_this_project_pass():
     assert list(claims.Claims.read(claims.ROOT).check()) == []
+
+
+def test_results_have_ten_megabytes_at_most():
+    files = [path for path in (claims.ROOT / "results").rglob("*") if path.is_file()]
+    assert sum(path.stat().st_size for path in files) <= 10e6

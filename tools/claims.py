@@ -11,7 +11,7 @@ import re
 import string
 import subprocess
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -36,7 +36,7 @@ HIDDEN = re.compile(
 # Numbers of headings and of years, and those in names.
 NAMES = re.compile(
     r"^#+ [\d.]+|\b(?:Python|Apache|[Ff]igures?|[Tt]ables?|[Ss]ections?|[Ss]eeds?) \d[\d.]*"
-    r"|\((?:[^()]*, )?(?:19|20)\d\d\)|\bet al\.,? (?:19|20)\d\d",
+    r"|\((?:[^()]*, )?(?:19|20)\d\d\)|\bet al\.,? (?:[A-Z]+ )?(?:19|20)\d\d",
     re.MULTILINE,
 )
 UNCLAIMED = re.compile(rf"(?<![\w.-])(?<!\w[-/]){NUMBER}")
@@ -171,15 +171,25 @@ class Claims:
             for name, found in where:
                 if list(found.groups()) != said:
                     yield f"{name}: {key} says {list(found.groups())}, its rows give {said}"
-        for phrase in self.entries.get("stated", {}):
-            covering.append(re.compile(r"\s+".join(map(re.escape, phrase.split()))))
-            if not any(covering[-1].search(text) for text in documents.values()):
+        stated = {
+            phrase: re.compile(r"\s+".join(map(re.escape, phrase.split())))
+            for phrase in self.entries.get("stated", {})
+        }
+        typed = self.typed()
+        for phrase, pattern in stated.items():
+            if not any(map(pattern.search, (*documents.values(), *typed.values()))):
                 yield f"stated: no document has {phrase!r}"
         for name in self.entries["documents"]:
-            yield from unclaimed(name, documents[name], covering)
-        for key, entry in self.entries.get("claims", {}).items():
-            literal = re.sub(r"\{.*?\}", " ", entry["text"])
-            yield from unclaimed(key, literal, covering[len(self.entries["claims"]) :])
+            yield from unclaimed(name, documents[name], [*covering, *stated.values()])
+        for name, text in typed.items():
+            yield from unclaimed(name, text, stated.values())
+
+    def typed(self) -> dict[str, str]:
+        """What the texts of claims and the cells of tables say beside their placeholders."""
+        texts = {key: entry["text"] for key, entry in self.entries.get("claims", {}).items()}
+        for key, table in self.entries.get("tables", {}).items():
+            texts[key] = "\n".join([table["head"], *(line["cells"] for line in table["lines"])])
+        return {key: re.sub(r"\{.*?\}", "_", text) for key, text in texts.items()}
 
     def write(self) -> None:
         """Puts what the rows give into the tables of `results/` and all documents."""
@@ -199,13 +209,17 @@ class Claims:
         for key, entry in self.entries.get("claims", {}).items():
             names = self.values(entry)
             rows = entry["rows"]
-            paths = list(rows.values()) if isinstance(rows, dict) else [rows]
-            paths = ["sejax/pretrained" if path == "pretrained" else path for path in paths]
-            git = ["git", "-C", str(self.root), "log", "-1", "--format=%h %cs", "--", *paths]
-            made = entry.get("made") or subprocess.run(git, capture_output=True, text=True).stdout
-            count = entry["count"].format_map(names)
-            print(f"{key}: {entry['text'].format_map(names)} ({count})")
-            print(f"    {', '.join(paths)}, {made.strip()}")
+            files = list(rows.values()) if isinstance(rows, dict) else [rows]
+            print(f"{key}: {entry['text'].format_map(names)} ({entry['count'].format_map(names)})")
+            for file in files:
+                print(f"    {file}, {entry.get('made') or self.made(file)}")
+
+    def made(self, rows: str) -> str:
+        """Commit and date at which rows were made: those of the settings beside them, if any."""
+        beside = (self.root / rows).with_name("settings.json")
+        path = beside if beside.exists() else {"pretrained": "sejax/pretrained"}.get(rows, rows)
+        git = ["git", "-C", str(self.root), "log", "-1", "--format=%h %cs", "--", str(path)]
+        return subprocess.run(git, capture_output=True, text=True).stdout.strip()
 
 
 def format_field(field: str, spec: str | None, names: Mapping[str, Any]) -> str:
@@ -227,7 +241,7 @@ def replaced(found: re.Match[str], said: list[str]) -> str:
     return "".join([*parts, found.string[start : found.end()]])
 
 
-def unclaimed(name: str, text: str, covering: list[re.Pattern[str]]) -> Iterator[str]:
+def unclaimed(name: str, text: str, covering: Iterable[re.Pattern[str]]) -> Iterator[str]:
     """The numbers of a text that are in no generated table, claim or stated phrase."""
     for pattern in (*covering, TABLE, HIDDEN, NAMES):
         text = pattern.sub(lambda x: re.sub(r"\S", " ", x[0]), text)
