@@ -97,6 +97,15 @@ def test_a_number_typed_into_a_claim_is_found(project):
     assert any("share:1: 41% has no entry" in x for x in project(claims={"share": share}))
 
 
+def test_a_number_typed_into_a_table_needs_a_source(project):
+    table = {"head": "paper | steps", "lines": [{"cells": "40 | 2,500"}]}
+    entries = {"tables": ENTRIES["tables"] | {"typed": table}}
+    wrong = [f"typed:2: {number} has no entry in docs/claims.yaml" for number in ("40", "2,500")]
+    assert project(**entries) == wrong
+    table["source"] = "paper, Table 2"
+    assert project(**entries) == []
+
+
 def test_a_phrase_that_no_document_has_is_found(project):
     stated = ENTRIES["stated"] | {"in 7 hours": "paper"}
     assert project(stated=stated) == ["stated: no document has 'in 7 hours'"]

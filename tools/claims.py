@@ -7,6 +7,7 @@
 `docs/claims.yaml` has an entry for each number, and says what an entry looks like.
 """
 
+import functools
 import re
 import string
 import subprocess
@@ -87,7 +88,7 @@ class Claims:
     def values(self, entry: Mapping[str, Any]) -> dict[str, Any]:
         """The names that an entry's text may have: values, and columns where the row is one."""
         frames = self.selected(entry)
-        rows = frames.get("rows")
+        rows: Any = frames.get("rows")
         one = isinstance(rows, pd.DataFrame) and len(rows) == 1
         names = {**(rows.to_dict("records")[0] if one else {}), **frames}
         for name, expression in entry.get("values", {}).items():
@@ -187,19 +188,20 @@ class Claims:
     def typed(self) -> dict[str, str]:
         """What the texts of claims and the cells of tables say beside their placeholders."""
         texts = {key: entry["text"] for key, entry in self.entries.get("claims", {}).items()}
-        for key, table in self.entries.get("tables", {}).items():
+        tables = self.entries.get("tables", {}).items()
+        for key, table in ((key, table) for key, table in tables if "source" not in table):
             texts[key] = "\n".join([table["head"], *(line["cells"] for line in table["lines"])])
         return {key: re.sub(r"\{.*?\}", "_", text) for key, text in texts.items()}
 
     def write(self) -> None:
         """Puts what the rows give into the tables of `results/` and all documents."""
         remake.write(self.root, tuple(self.entries["without_rows"]))
+        claims = [(entry, self.values(entry)) for entry in self.entries.get("claims", {}).values()]
         for name, text in self.documents().items():
             new = self.with_tables(text)
-            for entry in self.entries.get("claims", {}).values():
-                names = self.values(entry)
-                said = self.said(entry, names)
-                new = self.pattern(entry, names).sub(lambda x, said=said: replaced(x, said), new)
+            for entry, names in claims:
+                put = functools.partial(replaced, said=self.said(entry, names))
+                new = self.pattern(entry, names).sub(put, new)
             if new != text:
                 write_text(self.root / name, new)
                 print(f"{name} is written.")
