@@ -63,7 +63,7 @@ def compute(settings: RnHeatmap) -> pd.DataFrame:
         rewards = rewards_of_moves(rn.learn(settings, variant, settings.objective))
         places = zip(("rn", "state", "action"), np.indices(rewards.shape), strict=True)
         table = pd.DataFrame({name: place.ravel() for name, place in places})
-        tables.append(table.assign(variant=variant, reward=rewards.ravel().astype(float)))
+        tables.append(table.assign(variant=variant, reward=rewards.ravel()))
     return pd.concat(tables, ignore_index=True)
 
 

@@ -17,6 +17,7 @@ from sejax.evaluation import make_tested_trainer
 from sejax.training import TrainingConfig
 
 WINDOW = 10  # test episodes that a point of a smoothed curve is the mean of
+DECIMALS = 2  # of stored test returns
 
 
 def make_curve_run(
@@ -59,8 +60,7 @@ def on_grid(curves: pd.DataFrame, grid: np.ndarray, window: int = WINDOW) -> np.
     rows = []
     for _, curve in curves.groupby("agent"):
         place = np.searchsorted(curve["steps"], grid, side="right") - 1
-        returns = curve["test_return"].astype(np.float32)  # as computed; stored in few digits
-        smoothed = returns.rolling(window, min_periods=1).mean().to_numpy()
+        smoothed = curve["test_return"].rolling(window, min_periods=1).mean().to_numpy()
         rows.append(np.where(place >= 0, smoothed[place], np.nan))
     return np.stack(rows)
 
@@ -84,20 +84,25 @@ def last_returns(curves: pd.DataFrame, window: int = WINDOW) -> pd.Series:
 
 
 def thinned(curves: pd.DataFrame, grid: np.ndarray, solved_reward: float) -> pd.DataFrame:
-    """What tables and figures need of curves: the rows with which they change at steps of a grid.
+    """What tables and figures need of curves: what they are at the steps of a grid.
 
-    `on_grid` with a window of 1 gives the same of these. What needs all rows is in two more
-    columns, the same in all rows of an agent: `steps_to_solve` and `last_return`, the mean of its
-    last `WINDOW` test returns. Test returns have the precision that they were computed with.
+    A row says from which step of the grid on the curve has this value, and `on_grid` with a window
+    of 1 gives the same of these rows, but for what the second decimal of returns leaves out. What
+    needs all rows is in two more columns, the same in all rows of an agent: `steps_to_solve` and
+    `last_return`, the mean of its last `WINDOW` test returns.
     """
     tables = []
     for _, curve in curves.groupby("agent", sort=False):
         place = np.searchsorted(curve["steps"], grid, side="right") - 1
-        held = curve.iloc[np.unique(place.clip(min=0))]
+        known = place >= 0
+        held = curve.iloc[place[known]].assign(steps=grid[known])
+        held = held if known.any() else curve.head(1)  # beyond the grid
         tables.append(held[held["test_return"] != held["test_return"].shift()])
     kept = pd.concat(tables, ignore_index=True)
+    whole = kept["steps"].astype(int)
     return kept.assign(
-        test_return=kept["test_return"].astype(np.float32),
+        steps=whole if (whole == kept["steps"]).all() else kept["steps"],
+        test_return=kept["test_return"].round(DECIMALS),
         steps_to_solve=kept["agent"].map(all_steps_to_solve(curves, solved_reward)),
         last_return=kept["agent"].map(last_returns(curves)),
     )

@@ -29,6 +29,7 @@ AGENT_NAMES = {
     "q_learning": "Q-learning",
     "sarsa": "SARSA",
 }
+DPI = 120
 LEGEND_COLUMN = 1.4  # inches that a label with its line takes
 STYLE: Any = {
     "font.size": 10,
@@ -140,7 +141,7 @@ def panels(
 def save(figure: Any, path: Path) -> None:
     """Writes a figure as PNG in 256 colours: a third of the bytes."""
     with atomic_path(path) as temporary:
-        figure.savefig(temporary, dpi=200)
+        figure.savefig(temporary, dpi=DPI)
         with Image.open(temporary) as picture:
             few = picture.convert("RGB").quantize(256, dither=Image.Dither.NONE)
         few.save(temporary, format="png", optimize=True)

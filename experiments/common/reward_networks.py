@@ -167,6 +167,8 @@ STUDIES = {
         },
     ),
 }
+# Columns of the NES runs' curves: scores and costs.
+KEPT = ("generation", "seed", "incumbent_mean", "env_steps_total", "wall_s", "cpu_s")
 SHOWN = {  # colour of a condition, and the reward that agents get there
     "real": (figures.BEST, "real reward"),
     "icm": ("#7a7a7a", "real reward + ICM"),
@@ -254,7 +256,7 @@ def learn(settings: RnSettings, variant: str, objective: str) -> Any:
         if there:
             before = read_rows(curves_file(path))  # with those beyond, if stopped right here
             curve = pd.concat([before[before["seed"] < config.seed], curve], ignore_index=True)
-        write_rows(curves_file(path), curve)
+        write_rows(curves_file(path), curve[curve.columns.intersection(KEPT)])
         runs.collect(configs, path, there)
         there = sejax.load_set(path, option="rns_dir", kind="rn")
     return there[: settings.learned]
