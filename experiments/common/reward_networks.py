@@ -111,7 +111,7 @@ STUDIES = {
     "mountain_car_continuous": Study(
         agent=None,
         transfer_agent=sejax.PPOConfig.paper(action_repeat=5),
-        # docs/agents.md, "PPO in few steps"
+        # docs/agents.md, "PPO"
         tuned_agent=functools.partial(
             sejax.PPOConfig.paper,
             action_repeat=5,

@@ -52,8 +52,7 @@ _MAX_LOG_RATIO = 20.0  # exp(20) is beyond any clip, and finite
 class PPOConfig(AgentOptions):
     """PPO (clip) for discrete and continuous actions.
 
-    The defaults learn from few steps: they solve CartPole in some 4,000 (`docs/agents.md`). `paper`
-    has the paper's PPO.
+    The defaults learn from few steps (`docs/agents.md`). `paper` has the paper's PPO.
     """
 
     actions: ClassVar[tuple[str, ...]] = ("discrete", "continuous")
