@@ -54,6 +54,9 @@ TINY = {
     "rn_objectives": CURVES | {"objectives": ("reward_threshold", "auc")},
     "rn_performance": CURVES,
     "score_transforms": {"runs": 3, "generations": 2, "population": 2, "transforms": "rank"},
+    "se_dynamics": {"kinds": ["bandit", "threshold"], "students": "ddqn", "runs": 1,
+                    "generations": 2, "num_agents": 2, "test_episodes": 1,
+                    "run": [*TINY_SE, *tiny_agents("agent", group="")]},
     "se_families": {"sets": "ddqn", "tested": "ddqn", "runs": 1, "generations": 2, "num_agents": 2,
                     "test_episodes": 1, "run": [*TINY_SE, *tiny_agents("ddqn")]},
     "se_feasibility": {"runs": 2, "generations": 2,
@@ -77,7 +80,7 @@ TINY = {
     "timings": {"rows": "cliff_walking-rn", "generations": 1},
 }  # fmt: skip
 SLOW = {"null_baselines", "rn_heatmap", "rn_objectives", "rn_performance", "score_transforms",
-        "se_families", "se_feasibility", "se_horizons", "se_models", "se_myopia",
+        "se_dynamics", "se_families", "se_feasibility", "se_horizons", "se_models", "se_myopia",
         "se_out_of_sample", "se_performance", "se_transfer_of_hparams",
         "supervised_baseline"}  # fmt: skip
 
