@@ -4,8 +4,10 @@ Kinds of SEs that may teach through their dynamics are learned with the same age
 beside the bandit of `preset=best`. The best SE of each run then trains fresh agents of several
 kinds, and takes the myopia test (`se_myopia`): what agents with smaller discounts learn on it.
 
-All kinds have as many runs at any time: the next seed begins when all have finished the last one,
-and rows, table and figure are written again after each.
+All agents are sejax's. Those of others do not see the discount that soft ends are handed over as.
+
+The next seed begins when all kinds have finished the one before. Rows, table and figure are written
+again after each run.
 """
 
 import dataclasses
@@ -37,9 +39,13 @@ KINDS: dict[str, tuple[str, ...]] = {
     "bernoulli": (*WHOLE, "proxy.done=bernoulli"),
     "ten_steps": ("proxy.initial_state=real", "proxy.horizon=10", "proxy.done=threshold"),
 }
-# On Pendulum, preset=best has TD3 explore as in a bandit, where no action is dear.
+# On Pendulum, preset=best has agents explore as in a bandit: for a hundred episodes, of one step
+# each, where no action is dear.
 NOT_BANDIT = {
-    "pendulum": ("agent.warmup_episodes=1", "agent.action_noise_std=0.1", "agent.policy_delay=2")
+    ("pendulum", "td3"): (
+        *("agent.warmup_episodes=1", "agent.action_noise_std=0.1", "agent.policy_delay=2"),
+    ),
+    ("pendulum", "sac"): ("agent.warmup_episodes=1",),
 }
 NUM_RUNS = {"cartpole": 10, "acrobot": 10}
 DISCRETE = ("ddqn", "dueling_ddqn", "ppo", "sac", "td3_discrete")
@@ -55,7 +61,8 @@ class SeDynamics(RunSettings):
     kinds: tuple[str, ...] = setting(tuple(KINDS), each_of(tuple(KINDS)))  # of SEs
     runs: int = count(3, quick=2)  # NES runs of each kind; cartpole and acrobot 10
     max_steps: int = count(4000, quick=1000)  # of an agent, but on bandits
-    students: tuple[str, ...] = setting(())  # kinds of agents; all that fit the task
+    # Kinds of agents; all that fit the task.
+    students: tuple[str, ...] = setting((), each_of(tuple(dict.fromkeys(DISCRETE + CONTINUOUS))))
     num_agents: int = count(10, quick=5)  # of each kind and discount on each SE
     test_episodes: int = count(10)  # of each agent
     # Difference that counts as none, as in se_myopia.
@@ -71,14 +78,30 @@ class SeDynamics(RunSettings):
     @property
     def tested(self) -> tuple[str, ...]:
         """The kinds of students."""
-        is_continuous = envs.make(self.env).num_actions is None
-        return self.students or (CONTINUOUS if is_continuous else DISCRETE)
+        return self.students or self._fitting
+
+    @property
+    def _fitting(self) -> tuple[str, ...]:
+        return CONTINUOUS if envs.make(self.env).num_actions is None else DISCRETE
+
+    @property
+    def learner(self) -> str:
+        """The kind of agent that SEs are learned with."""
+        return self._fitting[0]
+
+    def agent_words(self, kind: str, agent: str) -> tuple[str, ...]:
+        """Overrides of a kind of agent on a kind of SE."""
+        return () if kind == "bandit" else NOT_BANDIT.get((self.env, agent), ())
+
+    def agent_of(self, kind: str, agent: str) -> Any:
+        """The configuration of a student on a kind of SE."""
+        words = self.agent_words(kind, agent)
+        return sejax.config([f"env={self.env}", f"agent={agent}", *words]).agent
 
     def config_of(self, kind: str) -> Any:
         """The configuration of the NES runs of a kind."""
-        words = list(KINDS[kind])
+        words = [*KINDS[kind], *self.agent_words(kind, self.learner)]
         if kind != "bandit":
-            words += NOT_BANDIT.get(self.env, ())
             steps = self.max_steps
             words += [f"training.max_steps={steps}", f"training.max_episodes={steps}"]
         return self.learn_config([*(QUICK if self.quick else ()), *words])
@@ -88,8 +111,11 @@ def compute(settings: SeDynamics) -> pd.DataFrame:
     """Learns and trains what is missing, and reports after each seed."""
     task = envs.make(settings.env)
     learners = {kind: settings.config_of(kind) for kind in settings.kinds}
+    students = {
+        kind: {x: settings.agent_of(kind, x) for x in settings.tested} for kind in settings.kinds
+    }
     chunks: dict[str, session.Chunks] = {}
-    tuned = tuned_agent(settings.env, settings.tested[0])
+    tuned = tuned_agent(settings.env, settings.learner)
     curves, agents = [], [se_myopia.untrained(settings, task, tuned)]
     rows = pd.DataFrame()
     for place in range(settings.runs):
@@ -101,11 +127,11 @@ def compute(settings: SeDynamics) -> pd.DataFrame:
             curve = runs.learn([mine], chunks=chunks[kind])
             own = {"kind": kind, "seed": mine.seed}
             curves.append(curve[list(CURVE)].assign(**own))
-            tests = test(settings, kind, mine, chunks[kind].learner.proxy)
+            tests = test(settings, kind, mine, chunks[kind].learner.proxy, students[kind])
             agents.append(tests.assign(**own))
-        rows = stack({"curves": pd.concat(curves), "agents": pd.concat(agents)})
-        write_rows(settings.rows_file, rows)
-        report(settings, rows)
+            rows = stack({"curves": pd.concat(curves), "agents": pd.concat(agents)})
+            write_rows(settings.rows_file, rows)
+            report(settings, rows)
     return rows
 
 
@@ -113,7 +139,9 @@ CURVE = ("generation", "incumbent_mean", "population_mean", "env_steps_total", "
 TESTS = ("group", "agent", "student", "discount", "test_return", "train_steps", "train_episodes")
 
 
-def test(settings: SeDynamics, kind: str, config: Any, env: Any) -> pd.DataFrame:
+def test(
+    settings: SeDynamics, kind: str, config: Any, env: Any, students: Mapping[str, Any]
+) -> pd.DataFrame:
     """Agents on the best SE of a run, a row each: those of each kind, and with each discount.
 
     Args:
@@ -121,6 +149,7 @@ def test(settings: SeDynamics, kind: str, config: Any, env: Any) -> pd.DataFrame
       kind: of the SE.
       config: of the run.
       env: the SE, which the runs of a kind share with all compiled programs.
+      students: configurations of agents, by their kind.
     """
     se = sejax.load_proxy(Path(config.run_dir))
     name = f"seed{config.seed}"
@@ -142,13 +171,14 @@ def test(settings: SeDynamics, kind: str, config: Any, env: Any) -> pd.DataFrame
         )
 
     found = []
-    for student in settings.tested:
-        tested = condition(f"{kind}-{student}", tuned_agent(settings.env, student))
+    for student, agent in students.items():
+        tested = condition(f"{kind}-{student}", agent)
         found.append(train_groups(tested, own, settings.num_agents).assign(student=student))
     (learner,) = se.learned_agents().values()
     sighted = condition(f"{kind}-discount-", learner)
     found.append(se_myopia.train_with_discounts(own, sighted, se_myopia.DISCOUNTS))
-    settings.shards.made_with.update(own.shards.made_with)
+    made_with = {f"{condition}-{name}": x for condition, x in own.shards.made_with.items()}
+    settings.shards.made_with.update(made_with)
     return pd.concat(found, ignore_index=True).reindex(columns=list(TESTS))
 
 
@@ -225,7 +255,7 @@ def report(settings: SeDynamics, rows: pd.DataFrame) -> pd.DataFrame:
         "CPU s a generation": "{cpu_s:.2f}",
         "SEs that solve": "{solved} of {runs}",
     }
-    for student in settings.tested:
+    for student in agents["student"].dropna().unique():
         columns[figures.AGENT_NAMES[student]] = tables.mean_text(f"on_{student}", 1)
     for discount in se_myopia.DISCOUNTS:
         columns[f"discount {discount:g}"] = tables.mean_text(se_myopia.column(discount), 1)
