@@ -1,8 +1,11 @@
 """Which SEs are environments in earnest, and what does that cost beside a bandit?
 
 Kinds of SEs that may teach through their dynamics are learned with the same agents and strategy,
-beside the bandit of `preset=best`. The best SE of each run then trains fresh agents of several
-kinds, and takes the myopia test (`se_myopia`): what agents with smaller discounts learn on it.
+beside the bandit of `preset=best`: with soft ends, which are handed over as a discount; with the
+same as probabilities (`bernoulli`); with ends at a threshold, which no episode of `shortest` has
+before a tenth of the task's step limit; and with ten steps an episode at most. The best SE of each
+run then trains fresh agents of several kinds, and takes the myopia test (`se_myopia`): what agents
+with smaller discounts learn on it.
 
 All agents are sejax's. Those of others do not see the discount that soft ends are handed over as.
 
@@ -31,12 +34,13 @@ from sejax.cli import session
 from sejax.options import each_of, positive
 
 WHOLE = ("proxy.initial_state=real", "proxy.horizon=null")
-# Overrides of the runs, by kind.
+# Overrides of the runs, by kind; `tenth` of the task's step limit.
 KINDS: dict[str, tuple[str, ...]] = {
     "bandit": (),
     "soft": (*WHOLE, "proxy.done=soft"),
     "threshold": (*WHOLE, "proxy.done=threshold"),
     "bernoulli": (*WHOLE, "proxy.done=bernoulli"),
+    "shortest": (*WHOLE, "proxy.done=threshold", "proxy.min_steps={tenth}"),
     "ten_steps": ("proxy.initial_state=real", "proxy.horizon=10", "proxy.done=threshold"),
 }
 # On Pendulum, preset=best has agents explore as in a bandit: for a hundred episodes, of one step
@@ -100,7 +104,9 @@ class SeDynamics(RunSettings):
 
     def config_of(self, kind: str) -> Any:
         """The configuration of the NES runs of a kind."""
-        words = [*KINDS[kind], *self.agent_words(kind, self.learner)]
+        tenth = envs.make(self.env).max_steps // 10
+        words = [word.format(tenth=tenth) for word in KINDS[kind]]
+        words += self.agent_words(kind, self.learner)
         if kind != "bandit":
             steps = self.max_steps
             words += [f"training.max_steps={steps}", f"training.max_episodes={steps}"]
@@ -154,6 +160,8 @@ def test(
     se = sejax.load_proxy(Path(config.run_dir))
     name = f"seed{config.seed}"
     group = Group(name, se.params, se.fingerprint)
+    # Without a least length, as in the shards of before there was one.
+    proxy = {k: x for k, x in se.config["proxy"].items() if (k, x) != ("min_steps", 1)}
     own = dataclasses.replace(settings, seed=config.seed)  # agents on other SEs have other seeds
 
     def condition(name: str, agent: Any) -> Condition:
@@ -167,7 +175,7 @@ def test(
             groups=(group,),
             agent=agent,
             training=training,
-            settings={"proxy": se.config["proxy"]},
+            settings={"proxy": proxy},
         )
 
     found = []

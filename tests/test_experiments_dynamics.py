@@ -162,6 +162,8 @@ def test_kinds_differ_in_their_proxy_and_agents_explore_as_their_episodes_ask():
     assert (soft.proxy.done, soft.proxy.horizon, soft.proxy.initial_state) == ("soft", None, "real")
     assert (soft.training.max_steps, bandit.training.max_steps) == (4000, 5000)
     assert soft.es == bandit.es
+    shortest = se_dynamics.SeDynamics.of(env="acrobot").config_of("shortest")
+    assert (shortest.proxy.min_steps, soft.proxy.min_steps) == (50, 1)
     assert settings.agent_of("bandit", "td3") == bandit.agent
     for kind in settings.kinds:
         config = settings.config_of(kind)
