@@ -133,8 +133,15 @@ def real_step(state, action):
     return obs, bool(terminated)
 
 
-def check_responses(settings, rows):
+def shard(settings, name):
+    """The table of a cached shard."""
+    text = (settings.shards.folder / f"{name}.csv").read_text()
+    return pd.read_csv(io.StringIO(text.partition("\n")[2]))
+
+
+def check_responses(settings, _):
     """What the SE says to a real state, which is the next one of the row before."""
+    rows = shard(settings, "ddqn-all")
     by_source = rows.groupby("source").size()
     assert by_source["train"] == 2 * 50 and by_source["test"] == by_source["response"]
     test, response = (rows[rows["source"] == name] for name in ("test", "response"))
@@ -153,8 +160,7 @@ def check_responses(settings, rows):
 
 def check_models(settings, _):
     """Each transition is a real step; the variants differ in the network for the end only."""
-    text = (settings.shards.folder / "transitions-0.csv").read_text()
-    rows = pd.read_csv(io.StringIO(text.partition("\n")[2]))
+    rows = shard(settings, "transitions-0")
     assert len(rows) == 30 and set(rows["generation"]) == {0, 1} and (rows["reward"] == 1).all()
     for _, row in rows.iterrows():
         obs, terminated = real_step(row[STATES].to_numpy(np.float32), row["action"])
