@@ -54,7 +54,7 @@ TINY = {
     "rn_objectives": CURVES | {"objectives": ("reward_threshold", "auc")},
     "rn_performance": CURVES,
     "score_transforms": {"runs": 3, "generations": 2, "population": 2, "transforms": "rank"},
-    "se_dynamics": {"kinds": ["bandit", "threshold"], "students": "ddqn", "runs": 1,
+    "se_dynamics": {"kinds": ["bandit", "against_myopic"], "students": "ddqn", "runs": 1,
                     "generations": 2, "num_agents": 2, "test_episodes": 1,
                     "run": [*TINY_SE, *tiny_agents("agent", group="")]},
     "se_families": {"sets": "ddqn", "tested": "ddqn", "runs": 1, "generations": 2, "num_agents": 2,
