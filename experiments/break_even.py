@@ -32,7 +32,6 @@ from experiments.common.agents import (
     OUTCOMES,
     Condition,
     Group,
-    groups_at_once,
     train_groups,
     training_as_learned,
     tuned_agent,
@@ -47,7 +46,12 @@ from sejax.proxies.header import pretrained_names
 NUM_GROUPS = 5  # of agents: the CPU seconds of a group are one value
 COUNTS = (100, 20)  # agents of each sort, pilots of each kind
 COUNTS_OF = {"halfcheetah": (20, 5)}
-DISCRETE, CONTINUOUS, TABLES = ("ddqn", "ppo", "sac"), ("td3", "sac", "ppo"), ("q_learning", "sarsa")
+# Kinds of tuned agents: for discrete and continuous actions, and of tables.
+DISCRETE, CONTINUOUS, TABLES = (
+    ("ddqn", "ppo", "sac"),
+    ("td3", "sac", "ppo"),
+    ("q_learning", "sarsa"),
+)
 MOST_STEPS = {  # of an agent on the real task or an RN; 100,000 elsewhere
     "cliff_walking": 5_000,
     "acrobot": 50_000,
@@ -219,8 +223,7 @@ class Study:
         num_groups = 1 if num_agents else NUM_GROUPS
         condition = self.condition(name, agent, on_proxy, training, num_groups, **more)
         each = num_agents or self.num_agents // num_groups
-        at_once = min(num_groups, groups_at_once(self.settings.devices))
-        return train_groups(condition, settings or self.settings, each, TIMED, at_once)
+        return train_groups(condition, settings or self.settings, each, TIMED)
 
     def condition(
         self,
@@ -351,8 +354,10 @@ def with_nulls(summary: pd.DataFrame, folder: str) -> pd.DataFrame:
         for source in NULLS:
             ones = mine[mine["source"] == source]
             good = ones[ones["test_return_mean"] >= row.target]
-            order = good.sort_values("real_steps") if len(good) else ones.sort_values(
-                "test_return_mean", ascending=False
+            order = (
+                good.sort_values("real_steps")
+                if len(good)
+                else ones.sort_values("test_return_mean", ascending=False)
             )
             best = dict.fromkeys(NULL_COLUMNS, np.nan) if ones.empty else order.iloc[0]
             own |= {f"{source}_{x}": best[x] for x in NULL_COLUMNS[-3:]}
@@ -410,7 +415,7 @@ def make_table(summary: pd.DataFrame) -> pd.DataFrame:
         summary,
         {
             "proxy": "{proxy}",
-            "real steps to learn it": lambda row: tables_number(row.learning_steps),
+            "real steps to learn it": lambda row: number(row.learning_steps),
             "students": agents("student"),
             "the same on the task": agents("same"),
             "tuned on the task": agents("tuned"),
@@ -424,7 +429,7 @@ def make_table(summary: pd.DataFrame) -> pd.DataFrame:
     )
 
 
-def tables_number(value: float) -> str:
+def number(value: float) -> str:
     """A count; empty if it is not known."""
     return "" if np.isnan(value) else f"{value:,.0f}"
 
@@ -477,24 +482,22 @@ def draw(settings: BreakEven, summary: pd.DataFrame, learned: pd.DataFrame) -> N
 
 
 def panel(axis: Any, row: Any, learned: pd.DataFrame) -> None:
-    """What one proxy costs, beside agents and NES."""
+    """What one proxy costs, beside tuned agents and NES runs; bands hold half of them."""
     grid = step_grid(row.most_steps)
     held = curves.on_grid(learned, grid, window=1)
-    label = "tuned agents on the task (mean, quartiles)"
-    figures.band(axis, grid, held, quartiles, figures.TUNED, label=label)
+    figures.band(axis, grid, held, quartiles, figures.TUNED, label="tuned agents")
     lowest = np.nanmean(held, axis=0).min()
     path = Path(RUNS.get(row.task, ""), "rows.csv.xz")
     if row.of == "se" and path.is_file():
         spent, scores = scores_of_runs(read_rows(path))
-        label = f"NES, incumbents of {path.parent.name}'s runs (in-sample)"
-        label = "incumbents of stored NES runs (in-sample; mean, quartiles)"
+        label = "NES incumbents (in-sample)"
         figures.band(axis, spent, scores, quartiles, figures.VARIED, label=label)
     how: dict[str, Any] = {"color": figures.FIXED, "ls": "", "ms": 7}
     cost = row.learning_steps
-    axis.plot(cost, row.student_return_mean, "o", label="students of the shipped proxy", **how)
+    axis.plot(cost, row.student_return_mean, "o", label="students of the proxy", **how)
     how["color"] = figures.BEST
     known = row.best_of_four_real_steps, row.best_of_four_test_return_mean
-    axis.plot(*known, "^", label="students of a bandit of the best of four agents", **how)
+    axis.plot(*known, "^", label="students of a bandit", **how)
     figures.threshold(axis, row.target)
     axis.set(xscale="log", xlabel="real steps", title=row.proxy)
     axis.set_ylim(bottom=lowest - 0.05 * (row.target - lowest))
