@@ -69,7 +69,7 @@ class NullBaselines(Settings):
     # Real steps of a search, at most; those of the shipped SE.
     search_steps: int | None = count(None, quick=5_000)
     num_states: int = count(1024)  # of a table
-    # States of a table. visited: half of them, and half drawn around these; noise: as those in which
+    # States of a table. visited: half of them, half drawn around these; noise: as those in which
     # episodes of the task's SEs begin. Those of `episodes` are visited ones.
     states: str = setting("visited", one_of(("visited", "noise")))
     widen: float = setting(1.5, positive("it is a scale"))  # spread of those around visited states
