@@ -69,7 +69,9 @@ class NullBaselines(Settings):
     # Real steps of a search, at most; those of the shipped SE.
     search_steps: int | None = count(None, quick=5_000)
     num_states: int = count(1024)  # of a table
-    widen: float = setting(1.5, positive("it is a scale"))  # spread of a table's states
+    # Spread of half of the states, in units of the visited ones; null: all states are noise, as
+    # those in which episodes of the task's SEs begin.
+    widen: float | None = setting(1.5, positive("it is a scale"))
 
     @property
     def task(self) -> envs.Task:
@@ -96,7 +98,7 @@ class NullBaselines(Settings):
 
 def makers(settings: NullBaselines, source: str) -> Iterator[tuple[str, Callable[[], Copied]]]:
     """The tables of a source: the name of each, and what makes it."""
-    task, size, widen = settings.task, settings.num_states, settings.widen
+    task, size, widen = settings.task, settings.num_states, settings.widen or np.inf
     seeds = range(settings.seed, settings.seed + settings.policies)
     if source == "by_hand" and settings.env in bandits.BY_HAND:
         for seed in seeds:
