@@ -1,8 +1,12 @@
 """Which SEs are environments in earnest, and what does that cost beside a bandit?
 
 Kinds of SEs that may teach through their dynamics are learned with the same agents and strategy,
-beside the bandit of `preset=best`. The best SE of each run then trains fresh agents of several
-kinds, and takes the myopia test (`se_myopia`): what agents with smaller discounts learn on it.
+beside the bandit of `preset=best`: with soft ends, which are handed over as a discount; with the
+same as probabilities (`bernoulli`); with ends at a threshold, which no episode of `shortest` has
+before a tenth of the task's step limit; with ends at a threshold, and a myopic agent (discount 0)
+that trains on half of the candidates and counts against the SE (`against_myopic`); and with ten
+steps an episode at most. The best SE of each run then trains fresh agents of several kinds, and
+takes the myopia test (`se_myopia`): what agents with smaller discounts learn on it.
 
 All agents are sejax's. Those of others do not see the discount that soft ends are handed over as.
 
@@ -11,7 +15,8 @@ again after each run.
 """
 
 import dataclasses
-from collections.abc import Mapping
+import re
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -31,14 +36,17 @@ from sejax.cli import session
 from sejax.options import each_of, positive
 
 WHOLE = ("proxy.initial_state=real", "proxy.horizon=null")
-# Overrides of the runs, by kind.
+# Overrides of the runs, by kind; `tenth` of the task's step limit.
 KINDS: dict[str, tuple[str, ...]] = {
     "bandit": (),
     "soft": (*WHOLE, "proxy.done=soft"),
     "threshold": (*WHOLE, "proxy.done=threshold"),
     "bernoulli": (*WHOLE, "proxy.done=bernoulli"),
+    "shortest": (*WHOLE, "proxy.done=threshold", "proxy.min_steps={tenth}"),
+    "against_myopic": (*WHOLE, "proxy.done=threshold"),
     "ten_steps": ("proxy.initial_state=real", "proxy.horizon=10", "proxy.done=threshold"),
 }
+MYOPIC = "myopic"  # agent of `against_myopic`: as the learning one, but for its discount and weight
 # On Pendulum, preset=best has agents explore as in a bandit: for a hundred episodes, of one step
 # each, where no action is dear.
 NOT_BANDIT = {
@@ -100,15 +108,33 @@ class SeDynamics(RunSettings):
 
     def config_of(self, kind: str) -> Any:
         """The configuration of the NES runs of a kind."""
-        words = [*KINDS[kind], *self.agent_words(kind, self.learner)]
+        tenth = envs.make(self.env).max_steps // 10
+        words = [word.format(tenth=tenth) for word in KINDS[kind]]
+        words += self.agent_words(kind, self.learner)
         if kind != "bandit":
             steps = self.max_steps
             words += [f"training.max_steps={steps}", f"training.max_episodes={steps}"]
-        return self.learn_config([*(QUICK if self.quick else ()), *words])
+        words = [*(QUICK if self.quick else ()), *words]
+        if kind != "against_myopic":
+            return self.learn_config(words)
+        both = (self.learner, MYOPIC)
+        words = [f"agents=[{','.join(both)}]", *for_each(both, words)]
+        own = {"name": self.learner, "discount": 0, "weight": -1}
+        words += [f"agents.{MYOPIC}.{field}={x}" for field, x in own.items()]
+        return dataclasses.replace(self, run=for_each(both, self.run)).learn_config(words)
+
+
+def for_each(agents: Sequence[str], words: Iterable[str]) -> tuple[str, ...]:
+    """Overrides in which those of an agent are those of each in a mixture."""
+    return tuple(
+        re.sub(r"^agent\.", f"agents.{agent}.", word)
+        for word in words
+        for agent in (agents if word.startswith("agent.") else agents[:1])
+    )
 
 
 def compute(settings: SeDynamics) -> pd.DataFrame:
-    """Learns and trains what is missing, and reports after each seed."""
+    """Learns and trains what is missing, and reports after each run."""
     task = envs.make(settings.env)
     learners = {kind: settings.config_of(kind) for kind in settings.kinds}
     students = {
@@ -125,6 +151,8 @@ def compute(settings: SeDynamics) -> pd.DataFrame:
             folder = settings.work_folder / "runs" / kind
             mine = runs.configs_of(config, settings.runs, folder)[place]
             curve = runs.learn([mine], chunks=chunks[kind])
+            if mine.agents is not None:  # the incumbent's mean is a difference then
+                curve["incumbent_mean"] = curve[f"incumbent_mean_{settings.learner}"]
             own = {"kind": kind, "seed": mine.seed}
             curves.append(curve[list(CURVE)].assign(**own))
             tests = test(settings, kind, mine, chunks[kind].learner.proxy, students[kind])
@@ -154,6 +182,8 @@ def test(
     se = sejax.load_proxy(Path(config.run_dir))
     name = f"seed{config.seed}"
     group = Group(name, se.params, se.fingerprint)
+    # Without a least length, as in the shards of before there was one.
+    proxy = {k: x for k, x in se.config["proxy"].items() if (k, x) != ("min_steps", 1)}
     own = dataclasses.replace(settings, seed=config.seed)  # agents on other SEs have other seeds
 
     def condition(name: str, agent: Any) -> Condition:
@@ -167,14 +197,14 @@ def test(
             groups=(group,),
             agent=agent,
             training=training,
-            settings={"proxy": se.config["proxy"]},
+            settings={"proxy": proxy},
         )
 
     found = []
     for student, agent in students.items():
         tested = condition(f"{kind}-{student}", agent)
         found.append(train_groups(tested, own, settings.num_agents).assign(student=student))
-    (learner,) = se.learned_agents().values()
+    (learner,) = (x for key, x in se.learned_agents().items() if key != MYOPIC)
     sighted = condition(f"{kind}-discount-", learner)
     found.append(se_myopia.train_with_discounts(own, sighted, se_myopia.DISCOUNTS))
     made_with = {f"{condition}-{name}": x for condition, x in own.shards.made_with.items()}
@@ -266,7 +296,8 @@ def report(settings: SeDynamics, rows: pd.DataFrame) -> pd.DataFrame:
     note = (
         f"NES runs of {settings.generations} generations for each kind; real steps and CPU s (of "
         "the generations, without compilation) until the first incumbent mean of at least "
-        f"{task.solved_reward:g}: medians over runs, - if half of them had none. The best SE of "
+        f"{task.solved_reward:g}: medians over runs, - if half of them had none. Of SEs that a "
+        "myopic agent counts against, the incumbent mean is that of the other one. The best SE of "
         f"each run trains {settings.num_agents} fresh agents of each kind with its default "
         "hyperparameters, and of the learning kind with each discount: mean return on "
         f"{task.name}. {tables.interval_note('SEs')} SEs that solve: those whose fresh agents "

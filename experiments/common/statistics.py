@@ -39,6 +39,23 @@ def mean_interval(values: Any, level: float = LEVEL) -> tuple[float, float]:
     return float(values.mean() - half), float(values.mean() + half)
 
 
+def difference_interval(first: Any, second: Any, level: float = LEVEL) -> tuple[float, float]:
+    """Welch's confidence interval of the difference of two means, of independent values `[n], [m]`.
+
+    `NONE` if either has fewer than `LEAST` values.
+    """
+    first, second = np.asarray(first, float), np.asarray(second, float)
+    if min(first.size, second.size) < LEAST:
+        return NONE
+    errors = np.array([x.var(ddof=1) / x.size for x in (first, second)])
+    middle, error = first.mean() - second.mean(), errors.sum()
+    if error == 0:
+        return float(middle), float(middle)
+    freedom = error**2 / (errors**2 / [first.size - 1, second.size - 1]).sum()
+    half = student.ppf((1 + level) / 2, freedom) * error**0.5
+    return float(middle - half), float(middle + half)
+
+
 def iqm_interval(values: Any, level: float = LEVEL) -> tuple[float, float]:
     r"""Confidence interval of the interquartile mean of independent values `[n]`, likewise.
 
