@@ -47,6 +47,8 @@ CURVES = RNS | {"num_agents": 2, "max_steps": 150, "rows": "default"}
 # Settings with which an experiment takes seconds; `se` stands for the file of a random SE.
 TINY = {
     "agent_learning": {"envs": "cliff_walking"},
+    "break_even": {"proxies": "cliff_walking-rn", "num_agents": 5, "num_pilots": 2,
+                   "max_steps": 300, "test_episodes": 1},
     "null_baselines": {"sources": ["by_hand", "episodes", "evolved"], "students": "ddqn",
                        "hparams": "default", "policies": 1, "num_agents": 2, "num_evolved": 2,
                        "steps": 40, "teacher_steps": 60, "num_states": 16},
@@ -79,9 +81,9 @@ TINY = {
                             "test_episodes": 2},
     "timings": {"rows": "cliff_walking-rn", "generations": 1},
 }  # fmt: skip
-SLOW = {"null_baselines", "rn_heatmap", "rn_objectives", "rn_performance", "score_transforms",
-        "se_dynamics", "se_families", "se_feasibility", "se_horizons", "se_models", "se_myopia",
-        "se_out_of_sample", "se_performance", "se_transfer_of_hparams",
+SLOW = {"break_even", "null_baselines", "rn_heatmap", "rn_objectives", "rn_performance",
+        "score_transforms", "se_dynamics", "se_families", "se_feasibility", "se_horizons",
+        "se_models", "se_myopia", "se_out_of_sample", "se_performance", "se_transfer_of_hparams",
         "supervised_baseline"}  # fmt: skip
 
 
