@@ -20,7 +20,7 @@ from experiments.common import curves, figures, tables
 from experiments.common.agents import Condition, train_groups
 from experiments.common.curves import CURVES, WINDOW
 from experiments.common.experiment import Experiment, Settings, count, setting
-from experiments.common.statistics import mean_interval
+from experiments.common.statistics import mean_interval, worst_tenth
 from sejax.options import each_of, registry
 from sejax.options.plain import to_plain
 from sejax.training import TrainingConfig
