@@ -1,15 +1,22 @@
 """Which SEs are environments in earnest, and what does that cost beside a bandit?
 
 Kinds of SEs that may teach through their dynamics are learned with the same agents and strategy,
-beside the bandit of `preset=best`. The best SE of each run then trains fresh agents of several
-kinds, and takes the myopia test (`se_myopia`): what agents with smaller discounts learn on it.
+beside the bandit of `preset=best`: with soft ends, which are handed over as a discount; with the
+same as probabilities (`bernoulli`); with ends at a threshold, which no episode of `shortest` has
+before a tenth of the task's step limit; with ends at a threshold, and a myopic agent (discount 0)
+that trains on half of the candidates and counts against the SE (`against_myopic`); and with ten
+steps an episode at most. The best SE of each run then trains fresh agents of several kinds, and
+takes the myopia test (`se_myopia`): what agents with smaller discounts learn on it.
 
-All kinds have as many runs at any time: the next seed begins when all have finished the last one,
-and rows, table and figure are written again after each.
+All agents are sejax's. Those of others do not see the discount that soft ends are handed over as.
+
+The next seed begins when all kinds have finished the one before. Rows, table and figure are written
+again after each run.
 """
 
 import dataclasses
-from collections.abc import Mapping
+import re
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -29,17 +36,24 @@ from sejax.cli import session
 from sejax.options import each_of, positive
 
 WHOLE = ("proxy.initial_state=real", "proxy.horizon=null")
-# Overrides of the runs, by kind.
+# Overrides of the runs, by kind; `tenth` of the task's step limit.
 KINDS: dict[str, tuple[str, ...]] = {
     "bandit": (),
     "soft": (*WHOLE, "proxy.done=soft"),
     "threshold": (*WHOLE, "proxy.done=threshold"),
     "bernoulli": (*WHOLE, "proxy.done=bernoulli"),
+    "shortest": (*WHOLE, "proxy.done=threshold", "proxy.min_steps={tenth}"),
+    "against_myopic": (*WHOLE, "proxy.done=threshold"),
     "ten_steps": ("proxy.initial_state=real", "proxy.horizon=10", "proxy.done=threshold"),
 }
-# On Pendulum, preset=best has TD3 explore as in a bandit, where no action is dear.
+MYOPIC = "myopic"  # agent of `against_myopic`: as the learning one, but for its discount and weight
+# On Pendulum, preset=best has agents explore as in a bandit: for a hundred episodes, of one step
+# each, where no action is dear.
 NOT_BANDIT = {
-    "pendulum": ("agent.warmup_episodes=1", "agent.action_noise_std=0.1", "agent.policy_delay=2")
+    ("pendulum", "td3"): (
+        *("agent.warmup_episodes=1", "agent.action_noise_std=0.1", "agent.policy_delay=2"),
+    ),
+    ("pendulum", "sac"): ("agent.warmup_episodes=1",),
 }
 NUM_RUNS = {"cartpole": 10, "acrobot": 10}
 DISCRETE = ("ddqn", "dueling_ddqn", "ppo", "sac", "td3_discrete")
@@ -55,7 +69,8 @@ class SeDynamics(RunSettings):
     kinds: tuple[str, ...] = setting(tuple(KINDS), each_of(tuple(KINDS)))  # of SEs
     runs: int = count(3, quick=2)  # NES runs of each kind; cartpole and acrobot 10
     max_steps: int = count(4000, quick=1000)  # of an agent, but on bandits
-    students: tuple[str, ...] = setting(())  # kinds of agents; all that fit the task
+    # Kinds of agents; all that fit the task.
+    students: tuple[str, ...] = setting((), each_of(tuple(dict.fromkeys(DISCRETE + CONTINUOUS))))
     num_agents: int = count(10, quick=5)  # of each kind and discount on each SE
     test_episodes: int = count(10)  # of each agent
     # Difference that counts as none, as in se_myopia.
@@ -71,25 +86,62 @@ class SeDynamics(RunSettings):
     @property
     def tested(self) -> tuple[str, ...]:
         """The kinds of students."""
-        is_continuous = envs.make(self.env).num_actions is None
-        return self.students or (CONTINUOUS if is_continuous else DISCRETE)
+        return self.students or self._fitting
+
+    @property
+    def _fitting(self) -> tuple[str, ...]:
+        return CONTINUOUS if envs.make(self.env).num_actions is None else DISCRETE
+
+    @property
+    def learner(self) -> str:
+        """The kind of agent that SEs are learned with."""
+        return self._fitting[0]
+
+    def agent_words(self, kind: str, agent: str) -> tuple[str, ...]:
+        """Overrides of a kind of agent on a kind of SE."""
+        return () if kind == "bandit" else NOT_BANDIT.get((self.env, agent), ())
+
+    def agent_of(self, kind: str, agent: str) -> Any:
+        """The configuration of a student on a kind of SE."""
+        words = self.agent_words(kind, agent)
+        return sejax.config([f"env={self.env}", f"agent={agent}", *words]).agent
 
     def config_of(self, kind: str) -> Any:
         """The configuration of the NES runs of a kind."""
-        words = list(KINDS[kind])
+        tenth = envs.make(self.env).max_steps // 10
+        words = [word.format(tenth=tenth) for word in KINDS[kind]]
+        words += self.agent_words(kind, self.learner)
         if kind != "bandit":
-            words += NOT_BANDIT.get(self.env, ())
             steps = self.max_steps
             words += [f"training.max_steps={steps}", f"training.max_episodes={steps}"]
-        return self.learn_config([*(QUICK if self.quick else ()), *words])
+        words = [*(QUICK if self.quick else ()), *words]
+        if kind != "against_myopic":
+            return self.learn_config(words)
+        both = (self.learner, MYOPIC)
+        words = [f"agents=[{','.join(both)}]", *for_each(both, words)]
+        own = {"name": self.learner, "discount": 0, "weight": -1}
+        words += [f"agents.{MYOPIC}.{field}={x}" for field, x in own.items()]
+        return dataclasses.replace(self, run=for_each(both, self.run)).learn_config(words)
+
+
+def for_each(agents: Sequence[str], words: Iterable[str]) -> tuple[str, ...]:
+    """Overrides in which those of an agent are those of each in a mixture."""
+    return tuple(
+        re.sub(r"^agent\.", f"agents.{agent}.", word)
+        for word in words
+        for agent in (agents if word.startswith("agent.") else agents[:1])
+    )
 
 
 def compute(settings: SeDynamics) -> pd.DataFrame:
-    """Learns and trains what is missing, and reports after each seed."""
+    """Learns and trains what is missing, and reports after each run."""
     task = envs.make(settings.env)
     learners = {kind: settings.config_of(kind) for kind in settings.kinds}
+    students = {
+        kind: {x: settings.agent_of(kind, x) for x in settings.tested} for kind in settings.kinds
+    }
     chunks: dict[str, session.Chunks] = {}
-    tuned = tuned_agent(settings.env, settings.tested[0])
+    tuned = tuned_agent(settings.env, settings.learner)
     curves, agents = [], [se_myopia.untrained(settings, task, tuned)]
     rows = pd.DataFrame()
     for place in range(settings.runs):
@@ -99,13 +151,15 @@ def compute(settings: SeDynamics) -> pd.DataFrame:
             folder = settings.work_folder / "runs" / kind
             mine = runs.configs_of(config, settings.runs, folder)[place]
             curve = runs.learn([mine], chunks=chunks[kind])
+            if mine.agents is not None:  # the incumbent's mean is a difference then
+                curve["incumbent_mean"] = curve[f"incumbent_mean_{settings.learner}"]
             own = {"kind": kind, "seed": mine.seed}
             curves.append(curve[list(CURVE)].assign(**own))
-            tests = test(settings, kind, mine, chunks[kind].learner.proxy)
+            tests = test(settings, kind, mine, chunks[kind].learner.proxy, students[kind])
             agents.append(tests.assign(**own))
-        rows = stack({"curves": pd.concat(curves), "agents": pd.concat(agents)})
-        write_rows(settings.rows_file, rows)
-        report(settings, rows)
+            rows = stack({"curves": pd.concat(curves), "agents": pd.concat(agents)})
+            write_rows(settings.rows_file, rows)
+            report(settings, rows)
     return rows
 
 
@@ -113,7 +167,9 @@ CURVE = ("generation", "incumbent_mean", "population_mean", "env_steps_total", "
 TESTS = ("group", "agent", "student", "discount", "test_return", "train_steps", "train_episodes")
 
 
-def test(settings: SeDynamics, kind: str, config: Any, env: Any) -> pd.DataFrame:
+def test(
+    settings: SeDynamics, kind: str, config: Any, env: Any, students: Mapping[str, Any]
+) -> pd.DataFrame:
     """Agents on the best SE of a run, a row each: those of each kind, and with each discount.
 
     Args:
@@ -121,10 +177,13 @@ def test(settings: SeDynamics, kind: str, config: Any, env: Any) -> pd.DataFrame
       kind: of the SE.
       config: of the run.
       env: the SE, which the runs of a kind share with all compiled programs.
+      students: configurations of agents, by their kind.
     """
     se = sejax.load_proxy(Path(config.run_dir))
     name = f"seed{config.seed}"
     group = Group(name, se.params, se.fingerprint)
+    # Without a least length, as in the shards of before there was one.
+    proxy = {k: x for k, x in se.config["proxy"].items() if (k, x) != ("min_steps", 1)}
     own = dataclasses.replace(settings, seed=config.seed)  # agents on other SEs have other seeds
 
     def condition(name: str, agent: Any) -> Condition:
@@ -138,17 +197,18 @@ def test(settings: SeDynamics, kind: str, config: Any, env: Any) -> pd.DataFrame
             groups=(group,),
             agent=agent,
             training=training,
-            settings={"proxy": se.config["proxy"]},
+            settings={"proxy": proxy},
         )
 
     found = []
-    for student in settings.tested:
-        tested = condition(f"{kind}-{student}", tuned_agent(settings.env, student))
+    for student, agent in students.items():
+        tested = condition(f"{kind}-{student}", agent)
         found.append(train_groups(tested, own, settings.num_agents).assign(student=student))
-    (learner,) = se.learned_agents().values()
+    (learner,) = (x for key, x in se.learned_agents().items() if key != MYOPIC)
     sighted = condition(f"{kind}-discount-", learner)
     found.append(se_myopia.train_with_discounts(own, sighted, se_myopia.DISCOUNTS))
-    settings.shards.made_with.update(own.shards.made_with)
+    made_with = {f"{condition}-{name}": x for condition, x in own.shards.made_with.items()}
+    settings.shards.made_with.update(made_with)
     return pd.concat(found, ignore_index=True).reindex(columns=list(TESTS))
 
 
@@ -225,7 +285,7 @@ def report(settings: SeDynamics, rows: pd.DataFrame) -> pd.DataFrame:
         "CPU s a generation": "{cpu_s:.2f}",
         "SEs that solve": "{solved} of {runs}",
     }
-    for student in settings.tested:
+    for student in agents["student"].dropna().unique():
         columns[figures.AGENT_NAMES[student]] = tables.mean_text(f"on_{student}", 1)
     for discount in se_myopia.DISCOUNTS:
         columns[f"discount {discount:g}"] = tables.mean_text(se_myopia.column(discount), 1)
@@ -236,7 +296,8 @@ def report(settings: SeDynamics, rows: pd.DataFrame) -> pd.DataFrame:
     note = (
         f"NES runs of {settings.generations} generations for each kind; real steps and CPU s (of "
         "the generations, without compilation) until the first incumbent mean of at least "
-        f"{task.solved_reward:g}: medians over runs, - if half of them had none. The best SE of "
+        f"{task.solved_reward:g}: medians over runs, - if half of them had none. Of SEs that a "
+        "myopic agent counts against, the incumbent mean is that of the other one. The best SE of "
         f"each run trains {settings.num_agents} fresh agents of each kind with its default "
         "hyperparameters, and of the learning kind with each discount: mean return on "
         f"{task.name}. {tables.interval_note('SEs')} SEs that solve: those whose fresh agents "

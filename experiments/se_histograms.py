@@ -13,10 +13,14 @@ Agents with default hyperparameters are trained on one SE and tested on the real
 
 If `response` is closer to `train` than to `test`, it is the SE that shifts the distributions and
 not what the agents do in it.
+
+Of the transitions, which are too many to keep, the rows have how often values were met in narrow
+bins, and the returns of the tests.
 """
 
 import functools
-from collections.abc import Callable
+import itertools
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -33,6 +37,7 @@ from experiments.common import agents as groups
 from experiments.common import figures
 from experiments.common.agents import SE_AGENTS, SOFT_SE, Condition, Measure
 from experiments.common.experiment import Experiment, Settings, count, setting
+from experiments.common.shards import stack, unstack
 from experiments.common.tables import as_texts, publish, summary_by
 from sejax import ProxySet, Task
 from sejax.agents.buffers import Buffer, BufferMaker, write_row
@@ -40,6 +45,7 @@ from sejax.evaluation import make_recorder, make_tested_trainer
 from sejax.options import each_of, registry
 from sejax.training import TrainingConfig
 
+NUM_BINS, NUM_DRAWN = 2000, 80  # of the rows, and of the figure
 SOURCES = {
     "train": (figures.REAL, "SE, in training"),
     "test": (figures.VARIED, "real task, in tests"),
@@ -80,14 +86,9 @@ class SeHistograms(Settings):
     test_episodes: int = count(10)  # of each agent
     max_rows: int = count(10_000)  # transitions of training, the last ones of an agent
 
-    @property
-    def rows_file(self) -> Path:
-        """Every transition: too many to keep."""
-        return self.work_folder / "rows.csv.xz"
-
 
 def compute(settings: SeHistograms) -> pd.DataFrame:
-    """Trains what is missing; a row for each transition."""
+    """Trains what is missing; a row for each bin, and one for each test."""
     ses, measure = load(settings), transitions(settings.max_rows)
     most = groups.QUICK_STEPS if settings.quick else None
     tables = []
@@ -105,7 +106,8 @@ def compute(settings: SeHistograms) -> pd.DataFrame:
         )
         rows = groups.train_groups(condition, settings, settings.num_agents, measure)
         tables.append(rows.assign(kind=kind))
-    return pd.concat(tables, ignore_index=True).drop(columns="group")
+    rows = pd.concat(tables, ignore_index=True)
+    return stack({"bins": binned(rows), "returns": test_returns(rows)})
 
 
 def load(settings: SeHistograms) -> ProxySet:
@@ -119,7 +121,9 @@ def transitions(max_rows: int) -> Measure:
     return Measure(
         make_run=functools.partial(make_recorded_run, max_rows),
         to_table=lambda recorded, drawn: rows_of(recorded),
-        log=lambda rows: f"mean return {test_returns(rows).mean():.1f}, {len(rows):,} transitions",
+        log=lambda rows: (
+            f"mean return {test_returns(rows)['reward'].mean():.1f}, {len(rows):,} transitions"
+        ),
     )
 
 
@@ -199,43 +203,68 @@ def rows_of(recorded: dict[str, dict[str, np.ndarray]]) -> pd.DataFrame:
     return pd.concat(tables, ignore_index=True)
 
 
-def test_returns(rows: pd.DataFrame) -> pd.Series:
-    """Return of each agent's test episodes, by agent and episode."""
+def binned(rows: pd.DataFrame) -> pd.DataFrame:
+    """How often values were met: a row for each kind of agent, dimension and bin, where any was.
+
+    A column for each source has the counts; the bin goes from `low + bin * width` on, a `width`.
+    """
+    tables = []
+    for (kind, mine), column in itertools.product(rows.groupby("kind", sort=False), shown(rows)):
+        edges = np.histogram_bin_edges(mine[column], NUM_BINS)
+        counts = {
+            source: np.histogram(mine[mine["source"] == source][column], edges)[0]
+            for source in SOURCES
+        }
+        where = {"kind": kind, "dimension": column, "low": edges[0], "width": edges[1] - edges[0]}
+        table = pd.DataFrame({"bin": range(NUM_BINS)} | counts).assign(**where)
+        tables.append(table[table[[*SOURCES]].any(axis=1)])
+    return pd.concat(tables, ignore_index=True)
+
+
+def centres(bins: pd.DataFrame) -> pd.Series:
+    """The values that bins stand for."""
+    return bins["low"] + (bins["bin"] + 0.5) * bins["width"]
+
+
+def test_returns(rows: pd.DataFrame) -> pd.DataFrame:
+    """A row for each test episode of each agent, its rewards summed."""
     tests = rows[rows["source"] == "test"]
-    return tests.groupby(["agent", "episode"])["reward"].sum()
+    by = [name for name in ("kind", "agent", "episode") if name in rows]
+    return tests.groupby(by, sort=False, as_index=False)["reward"].sum()
 
 
-def columns_of(rows: pd.DataFrame) -> list[str]:
+def shown(rows: pd.DataFrame) -> list[str]:
     """The columns that are shown: those of the next state, then the reward."""
     return [*[name for name in rows if name.startswith("state_")], "reward"]
 
 
 def names_of(task: Task, rows: pd.DataFrame) -> dict[str, str]:
-    """What people call these columns."""
-    usual = {name: name.replace("_", " ") for name in columns_of(rows)}
+    """What people call the dimensions."""
+    usual = {name: name.replace("_", " ") for name in rows["dimension"].unique()}
     return usual | dict(zip(usual, DIMENSIONS.get(task.name, ()), strict=False))
 
 
-def summarise(rows: pd.DataFrame) -> pd.DataFrame:
+def summarise(bins: pd.DataFrame) -> pd.DataFrame:
     """Widths and distances of the distributions, a row for each kind of agent and dimension."""
-    columns = columns_of(rows)
-    of_source = rows.melt(["kind", "source"], columns, var_name="dimension")
 
     def statistics(mine: pd.DataFrame) -> dict[str, float]:
-        samples = {name: mine[mine["source"] == name]["value"] for name in SOURCES}
+        places, width = mine["bin"].astype(int), mine["width"].iloc[0]
+        counts = mine[[*SOURCES]].astype(int)
         pairs = (("response", "train"), ("response", "test"), ("train", "test"))
-        return {f"std_{name}": x.std(ddof=0) for name, x in samples.items()} | {
-            f"{a}_to_{b}": wasserstein_distance(samples[a], samples[b]) for a, b in pairs
+        return {
+            f"std_{name}": width * np.cov(places, fweights=x, ddof=0) ** 0.5
+            for name, x in counts.items()
+        } | {
+            f"{a}_to_{b}": width * wasserstein_distance(places, places, counts[a], counts[b])
+            for a, b in pairs
         }
 
-    summary = summary_by(of_source, ["kind", "dimension"], statistics)
-    kinds = list(rows["kind"].unique())
-    return summary.sort_values("kind", key=lambda x: x.map(kinds.index), kind="stable")
+    return summary_by(bins, ["kind", "dimension"], statistics)
 
 
-def make_table(task: Task, rows: pd.DataFrame, summary: pd.DataFrame) -> pd.DataFrame:
+def make_table(task: Task, summary: pd.DataFrame, returns: pd.DataFrame) -> pd.DataFrame:
     """The summary as texts; the return stands in each kind's first row."""
-    names = names_of(task, rows)
+    names = names_of(task, summary)
 
     def first(text: Callable[[str], str]) -> Callable[[Any], str]:
         return lambda row: text(row.kind) if row.dimension == next(iter(names)) else ""
@@ -244,8 +273,8 @@ def make_table(task: Task, rows: pd.DataFrame, summary: pd.DataFrame) -> pd.Data
         return "train" if row.response_to_train < row.response_to_test else "test"
 
     def returned(kind: str) -> str:
-        returns = test_returns(rows[rows["kind"] == kind])
-        return f"{returns.mean():.2f} ± {returns.std():.2f}"
+        mine = returns[returns["kind"] == kind]["reward"]
+        return f"{mine.mean():.2f} ± {mine.std():.2f}"
 
     return as_texts(
         summary,
@@ -264,46 +293,50 @@ def make_table(task: Task, rows: pd.DataFrame, summary: pd.DataFrame) -> pd.Data
 
 def report(settings: SeHistograms, rows: pd.DataFrame) -> pd.DataFrame:
     task = load(settings).task
-    summary = summarise(rows)
-    draw(task, rows, settings.folder / "histograms.png")
+    bins, returns = unstack(rows, "bins"), unstack(rows, "returns")
+    summary = summarise(bins)
+    draw(task, bins, settings.folder / "histograms.png")
     closer = int((summary["response_to_train"] < summary["response_to_test"]).sum())
     note = (
-        f"{rows['agent'].nunique()} agents a row with {settings.test_episodes} test episodes each; "
-        "the return is mean ± std over test episodes. Train: the SE's transitions met in training; "
-        "test: the real task's in greedy tests; response: the SE's from the states and actions of "
-        "those tests. Distances are Wasserstein's, in the unit of the dimension. The response is "
-        f"closer to training than to the tests in {closer} of {len(summary)} distributions "
-        "(paper: it aligns better with training, so that the SE makes the shift and not its "
-        "agents)."
+        f"{returns['agent'].nunique()} agents a row with {settings.test_episodes} test episodes "
+        "each; the return is mean ± std over test episodes. Train: the SE's transitions met in "
+        "training; test: the real task's in greedy tests; response: the SE's from the states and "
+        "actions of those tests. Distances are Wasserstein's, in the unit of the dimension. The "
+        f"response is closer to training than to the tests in {closer} of {len(summary)} "
+        "distributions (paper: it aligns better with training, so that the SE makes the shift and "
+        "not its agents)."
     )
     title = f"Transitions of agents trained on an SE of {task.name}"
-    return publish(settings, title, make_table(task, rows, summary), summary, note)
+    return publish(settings, title, make_table(task, summary, returns), summary, note)
 
 
-def bin_edges(samples: dict[str, np.ndarray], num_bins: int = 80) -> np.ndarray:
-    """Bins `[num_bins + 1]` over what is common to look at: a thousandth at each end is left out.
+def bin_edges(mine: pd.DataFrame, samples: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Wider bins over what is common to look at: a thousandth at each end is left out.
 
     Of each sample, not of all: a narrow one would else be lost in one bin of a wide one.
     """
     quantiles = [np.quantile(x, (0.001, 0.999)) for x in samples.values() if x.size]
-    low, high = min(q[0] for q in quantiles), max(q[1] for q in quantiles)
-    room = 0.03 * (high - low) or 0.5
-    return np.linspace(low - room, high + room, num_bins + 1)
+    low, width = mine["low"].iloc[0], mine["width"].iloc[0]
+    first = int((min(q[0] for q in quantiles) - low) / width)
+    last = int((max(q[1] for q in quantiles) - low) / width) + 1
+    step = max(1, (last - first) // NUM_DRAWN)  # bins that one is drawn of
+    return low + width * np.arange(first - 2 * step, last + 3 * step, step)
 
 
-def draw(task: Task, rows: pd.DataFrame, path: Path) -> None:
+def draw(task: Task, bins: pd.DataFrame, path: Path) -> None:
     """Draws a row for each kind of agent and a column for each state dimension and the reward.
 
     Source: paper, figure "Histograms of next state s' and reward r".
     """
-    kinds, names = list(rows["kind"].unique()), names_of(task, rows)
+    kinds, names = list(bins["kind"].unique()), names_of(task, bins)
     size = 2.5 * len(names), 0.8 + 2.2 * len(kinds)
     with figures.panels(path, len(kinds), len(names), size, sharey="row") as (figure, axes):
         for line, kind in zip(axes, kinds, strict=True):
-            mine = rows[rows["kind"] == kind]
             for axis, (column, name) in zip(line, names.items(), strict=True):
-                samples = {s: mine[mine["source"] == s][column].to_numpy() for s in SOURCES}
-                edges = bin_edges(samples)
+                mine = bins[(bins["kind"] == kind) & (bins["dimension"] == column)]
+                values = centres(mine)
+                samples = {s: np.repeat(values, mine[s].astype(int)).to_numpy() for s in SOURCES}
+                edges = bin_edges(mine, samples)
                 for source, values in samples.items():
                     color, _ = SOURCES[source]
                     figures.histogram(axis, values, 0.3, 1.1, bins=edges, color=color)

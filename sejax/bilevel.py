@@ -82,7 +82,8 @@ class Bilevel:
     @property
     def solved_score(self) -> float | None:
         """Incumbent mean at which the task counts as solved; None if no score says so."""
-        task, are_returns = self.proxy.task, self.objective.scores_are_returns
+        task = self.proxy.task
+        are_returns = self.objective.scores_are_returns and not self.mixture.has_opponents
         return task.solved_reward if are_returns and task.is_solvable else None
 
     def init(self, key: Array) -> LearnState:
@@ -282,7 +283,7 @@ def make_bilevel(
     require(
         not stop_when_solved or bilevel.solved_score is not None,
         "stop_when_solved",
-        "must be false where no score of this objective and task says solved; got true.",
+        "must be false where no score of this objective, task and mixture says solved; got true.",
     )
     return bilevel
 

@@ -304,15 +304,30 @@ class Scoring:
 
     def for_strategy(self, outcome: Outcome) -> tuple[Float[Array, " pop"], Float[Array, ""]]:
         """Scores of the population and of the incumbent in one unit, for `Strategy.tell`."""
-        scores = self._scores(self.objective(outcome))
+        scores = self._scores(self.signed(self.objective(outcome)))
         population = self.evaluations.population_scores(scores.population)
         return self.mixture.comparable(population, self.agent_of_candidate, scores.agent_means)
 
     def of_whole_tests(self, outcome: Outcome) -> Scores:
         """The scores that people see; with a curriculum, those of whole test episodes."""
-        if self.objective.eval_steps is None:
-            return self._scores(self.objective(outcome))
-        return self._scores(self.objective.of_whole_tests(outcome))
+        is_whole = self.objective.eval_steps is None
+        score = self.objective if is_whole else self.objective.of_whole_tests
+        scores = self._scores(self.signed(score(outcome)))
+        if not self.mixture.has_opponents:
+            return scores
+        num_population = scores.population.shape[0]
+        each = self.signed(jnp.concatenate([scores.population, scores.incumbent]))
+        return scores.replace(
+            population=each[:num_population],
+            incumbent=each[num_population:],
+            agent_means=scores.agent_means * self.mixture.signs,
+        )
+
+    def signed(self, scores: Float[Array, " evaluation"]) -> Float[Array, " evaluation"]:
+        """Scores in which more is better, also of agents that count against a proxy."""
+        if not self.mixture.has_opponents:
+            return scores
+        return scores * self.mixture.signs[self.agent_of_evaluation]
 
     def info(
         self, scores: Scores, outcome: Outcome, generation: Array, best: Array, active: Array

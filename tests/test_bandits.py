@@ -64,3 +64,11 @@ def test_a_copy_of_an_agent_has_its_greedy_actions_and_its_steps():
     assert copied.real_steps == 300 + tested
     wide, visited = copied.states[1::2], copied.states[::2]
     assert jnp.std(wide[:, 3]) > jnp.std(visited[:, 3])
+
+
+def test_a_table_of_noise_has_the_units_of_the_task_and_the_actions_of_the_policy():
+    copied = bandits.copy_by_hand(CARTPOLE, seed=0, num_states=512, widen=np.inf)
+    assert np.allclose(copied.states.std(0), 1, atol=0.15)  # CartPole's SEs see its own units
+    assert (copied.actions == (copied.states @ np.array([0.1, 0.3, 1.0, 0.6]) > 0)).all()
+    car = bandits.copy_by_hand(envs.make("mountain_car"), seed=0, num_states=512, widen=np.inf)
+    assert np.allclose(car.states.std(0), [0.45, 0.035], rtol=0.15)  # half of each bound

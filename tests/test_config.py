@@ -116,6 +116,7 @@ def test_a_configuration_is_read_back_from_its_plain_values():
         [],
         ["env=pendulum", "agent=sac"],
         ["agents=[ddqn,ppo]", "agents.ppo.epochs=3"],
+        ["agents=[ddqn,myopic]", "agents.myopic.name=ddqn", "agents.myopic.discount=0"],
         ["env=cliff_walking", "proxy=rn"],
         ["es=snes", "env=gymnax/Catch-bsuite"],
     ):
@@ -148,6 +149,17 @@ def test_a_mixture_has_fields_for_each_agent():
     assert mixture.members[0].agent.batch_size == 32
     assert str(composed.resolved_run_dir) == "runs/cartpole-se-ddqn+td3_discrete-s0"
     assert composed.parts()["agent"].weights == (1.0, 2.0)
+
+
+def test_an_agent_of_a_mixture_may_have_a_name_of_its_own():
+    config = sejax.config(["agents=[ddqn,myopic]", "agents.myopic.name=ddqn",
+                           "agents.myopic.discount=0", "agents.myopic.weight=-1"])  # fmt: skip
+    sighted, myopic = config.agents.members
+    assert (myopic.key, myopic.agent.discount, myopic.weight) == ("myopic", 0.0, -1.0)
+    assert sighted.agent == sejax.config([]).agent, "with the settings of its preset"
+    assert dataclasses.replace(myopic.agent, discount=0.99) == sighted.agent
+    assert config.parts()["agent"].weights == (1.0, -1.0)
+    assert config.parts()["agent"].names == ("ddqn", "myopic")
 
 
 @pytest.mark.parametrize("preset", ["best", "paper"])
@@ -208,7 +220,12 @@ def test_a_preset_file_stands_for_its_overrides(tmp_path):
 
 @pytest.mark.parametrize(
     "overrides",
-    [[], ["agents=[ddqn,ppo]", "agents.ppo.weight=2", "es=snes"], ["env=gymnax/Catch-bsuite"]],
+    [
+        [],
+        ["agents=[ddqn,ppo]", "agents.ppo.weight=2", "es=snes"],
+        ["env=gymnax/Catch-bsuite"],
+        ["agents=[ddqn,myopic]", "agents.myopic.name=ddqn", "agents.myopic.weight=-1"],
+    ],
 )
 def test_a_runs_configuration_is_a_preset_file(tmp_path, overrides):
     config = sejax.config([*overrides, "run_dir='a b,c=é'", "seed=3"])
@@ -288,12 +305,15 @@ def test_two_whole_messages():
         ("agent=no_module_of:mine", "agent", "PYTHONPATH"),
         ("agents=[ddqn,td3_discret]", "agents", "td3_discrete"),
         ("agents=[ddqn,ddqn]", "agents", ""),
+        ("agents=[ddqn,myopic]", "agents", ""),
+        ("agents=[ddqn,myopic] agents.myopic.name=3", "agents", ""),
+        ("agents=[ddqn,ppo] agents.myopic.name=ddqn", "agents.myopic.name", ""),
         ("agents=[]", "agents", "agents=[ddqn,ppo]"),
         ("agents=3", "agents", ""),
         ("agents=[ddqn,ppo] agent.batch_size=3", "agent.batch_size", "agents.ddqn.batch_size=3"),
         ("agents=[ddqn,ppo] agent=sac", "agent", "agents=[ddqn,ppo,sac]"),
         ("agents=[ddqn,ppo] agents.ddqn.batchsize=3", "agents.ddqn.batchsize", "batch_size"),
-        ("agents=[ddqn,ppo] agents.ddqn.weight=-1", "agents.ddqn.weight", ""),
+        ("agents=[ddqn,ppo] agents.ddqn.weight=-2e6", "agents.ddqn.weight", ""),
         ("agents=[ddqn,ppo] agents.ddqn.batch_size=0", "agents.ddqn.batch_size", ""),
         ("agents.aggregate=min", "agents.aggregate", "agents=[ddqn,ppo]"),
         ("agents=[ddqn,td3]", "agents.td3", ""),

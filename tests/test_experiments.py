@@ -56,6 +56,9 @@ TINY = {
     "rn_objectives": CURVES | {"objectives": ("reward_threshold", "auc")},
     "rn_performance": CURVES,
     "score_transforms": {"runs": 3, "generations": 2, "population": 2, "transforms": "rank"},
+    "se_dynamics": {"kinds": ["bandit", "against_myopic"], "students": "ddqn", "runs": 1,
+                    "generations": 2, "num_agents": 2, "test_episodes": 1,
+                    "run": [*TINY_SE, *tiny_agents("agent", group="")]},
     "se_families": {"sets": "ddqn", "tested": "ddqn", "runs": 1, "generations": 2, "num_agents": 2,
                     "test_episodes": 1, "run": [*TINY_SE, *tiny_agents("ddqn")]},
     "se_feasibility": {"runs": 2, "generations": 2,
@@ -79,8 +82,8 @@ TINY = {
     "timings": {"rows": "cliff_walking-rn", "generations": 1},
 }  # fmt: skip
 SLOW = {"break_even", "null_baselines", "rn_heatmap", "rn_objectives", "rn_performance",
-        "score_transforms", "se_families", "se_feasibility", "se_horizons", "se_models",
-        "se_myopia", "se_out_of_sample", "se_performance", "se_transfer_of_hparams",
+        "score_transforms", "se_dynamics", "se_families", "se_feasibility", "se_horizons",
+        "se_models", "se_myopia", "se_out_of_sample", "se_performance", "se_transfer_of_hparams",
         "supervised_baseline"}  # fmt: skip
 
 
@@ -132,8 +135,15 @@ def real_step(state, action):
     return obs, bool(terminated)
 
 
-def check_responses(settings, rows):
+def shard(settings, name):
+    """The table of a cached shard."""
+    text = (settings.shards.folder / f"{name}.csv").read_text()
+    return pd.read_csv(io.StringIO(text.partition("\n")[2]))
+
+
+def check_responses(settings, _):
     """What the SE says to a real state, which is the next one of the row before."""
+    rows = shard(settings, "ddqn-all")
     by_source = rows.groupby("source").size()
     assert by_source["train"] == 2 * 50 and by_source["test"] == by_source["response"]
     test, response = (rows[rows["source"] == name] for name in ("test", "response"))
@@ -152,8 +162,7 @@ def check_responses(settings, rows):
 
 def check_models(settings, _):
     """Each transition is a real step; the variants differ in the network for the end only."""
-    text = (settings.shards.folder / "transitions-0.csv").read_text()
-    rows = pd.read_csv(io.StringIO(text.partition("\n")[2]))
+    rows = shard(settings, "transitions-0")
     assert len(rows) == 30 and set(rows["generation"]) == {0, 1} and (rows["reward"] == 1).all()
     for _, row in rows.iterrows():
         obs, terminated = real_step(row[STATES].to_numpy(np.float32), row["action"])

@@ -8,10 +8,11 @@ import numpy as np
 import pandas as pd
 import pytest
 from scipy.stats import t as student
+from support import refuse
 from test_experiments import save_ses
 
 import sejax
-from experiments import se_myopia
+from experiments import se_dynamics, se_myopia
 from experiments.common.agents import OUTCOMES
 
 # --- the myopia test ------------------------------------------------------------------------------
@@ -107,3 +108,89 @@ def test_settings_that_cannot_work_are_refused(given, field, tmp_path):
     with pytest.raises(sejax.ConfigError) as refused:
         se_myopia.EXPERIMENT.run(se_myopia.SeMyopia.of(out=str(tmp_path), **given))
     assert refused.value.field == field
+
+
+# --- kinds of SEs ---------------------------------------------------------------------------------
+
+
+def curve_rows(kind, seed, incumbents):
+    """The generations of a run, each of 10 real steps and 2 CPU seconds."""
+    steps = range(1, len(incumbents) + 1)
+    return pd.DataFrame({"kind": kind, "seed": seed, "generation": range(len(incumbents)),
+                         "incumbent_mean": np.asarray(incumbents, float), "population_mean": 0.0,
+                         "env_steps_total": [10 * x for x in steps], "cpu_s": 2.0})  # fmt: skip
+
+
+def test_a_run_costs_what_it_spent_until_its_first_incumbent_that_solves():
+    curves = pd.concat([curve_rows("bandit", 0, [3, 100, 50]), curve_rows("bandit", 1, [1, 2, 3])])
+    solved, unsolved = se_dynamics.summarise_runs(curves, 100.0).to_dict("records")
+    costs = ["generations_to_solve", "steps_to_solve", "cpu_s_to_solve"]
+    assert [solved[x] for x in costs] == [2, 20, 4]
+    assert [unsolved[x] for x in costs] == [np.inf] * 3
+    assert (unsolved["best"], unsolved["steps"], unsolved["cpu_s"]) == (3, 30, 2)
+
+
+def test_kinds_are_summarised_whatever_runs_are_finished():
+    """The second seed of the kind with dynamics is still to come."""
+    curves = pd.concat([curve_rows("bandit", 0, [100]), curve_rows("bandit", 1, [0, 0]),
+                        curve_rows("soft", 0, [0, 100, 100])])  # fmt: skip
+
+    def agents(kind, seed, myopic, far, fresh):
+        group = f"seed{seed}"
+        sighted = agent_rows(group, {0.0: [myopic] * 5, 0.99: [far] * 5})
+        students = agent_rows(group, {np.nan: [fresh] * 5}).assign(student="ddqn")
+        return pd.concat([sighted, students]).assign(kind=kind, seed=seed)
+
+    rows = pd.concat([agent_rows("untrained", {np.nan: [-1.0, 1.0]}),
+                      agents("bandit", 0, 100, 100, 80), agents("bandit", 1, 0, 0, 20),
+                      agents("soft", 0, 10, 100, 40)])  # fmt: skip
+    bandit, soft = se_dynamics.summarise(curves, rows, 100.0, 0.1).to_dict("records")
+    told = ("kind", "runs", "first_solved", "solved", "generations_to_solve", "untrained")
+    assert [bandit[x] for x in told] == ["bandit", 2, 1, 1, np.inf, 0]
+    assert [soft[x] for x in told] == ["soft", 1, 1, 1, 2, 0]
+    assert [bandit[x] for x in ("policy", "teaches little", "dynamics")] == [1, 1, 0]
+    assert [soft[x] for x in ("policy", "teaches little", "dynamics")] == [0, 0, 1]
+    means = [(x["on_ddqn_mean"], x["return_0_mean"], x["return_0_99_mean"]) for x in (bandit, soft)]
+    assert means == [(50, 50, 50), (40, 10, 100)]
+    assert bandit["episode_steps"] == 5, "100 steps in 20 episodes"
+
+
+def test_kinds_differ_in_their_proxy_and_agents_explore_as_their_episodes_ask():
+    settings = se_dynamics.SeDynamics.of(env="pendulum")
+    bandit, soft = settings.config_of("bandit"), settings.config_of("soft")
+    assert bandit == settings.learn_config([]) and bandit.proxy.is_bandit
+    assert (soft.proxy.done, soft.proxy.horizon, soft.proxy.initial_state) == ("soft", None, "real")
+    assert (soft.training.max_steps, bandit.training.max_steps) == (4000, 5000)
+    assert soft.es == bandit.es
+    myopic = settings.config_of("against_myopic")
+    assert dataclasses.replace(myopic, agents=None, agent=bandit.agent) == dataclasses.replace(
+        settings.config_of("threshold"), agent=bandit.agent
+    )
+    opponent, sighted = myopic.agents.members
+    assert (opponent.key, opponent.weight, opponent.agent.discount) == ("myopic", -1, 0)
+    assert sighted.agent == soft.agent == dataclasses.replace(opponent.agent, discount=0.99)
+    shortest = se_dynamics.SeDynamics.of(env="acrobot").config_of("shortest")
+    assert (shortest.proxy.min_steps, soft.proxy.min_steps) == (50, 1)
+    assert settings.agent_of("bandit", "td3") == bandit.agent
+    for kind in settings.kinds:
+        config = settings.config_of(kind)
+        assert settings.agent_of(kind, "td3") == config.agent or kind == "against_myopic"
+        for agent in settings.tested:
+            limits = config.proxy.max_steps(200), 200
+            waits = settings.agent_of(kind, agent).steps_before_learning(*limits)
+            assert waits < config.training.max_steps, (kind, agent)
+
+
+@pytest.mark.parametrize(
+    ("given", "field"),
+    [({"kinds": ["hard"]}, "kinds"), ({"students": ["dqnn"]}, "students"),
+     ({"students": ["ddqn", "td3"]}, "agent"), ({"margin": 0}, "margin"),
+     ({"max_steps": 100, "kinds": ["soft"]}, "training")],
+)  # fmt: skip
+def test_kinds_and_students_that_cannot_work_are_refused_before_any_run(
+    given, field, tmp_path, monkeypatch
+):
+    monkeypatch.setattr(se_dynamics.runs, "learn", refuse)
+    with pytest.raises(sejax.ConfigError) as refused:
+        se_dynamics.EXPERIMENT.run(se_dynamics.SeDynamics.of(out=str(tmp_path), **given))
+    assert refused.value.field.startswith(field)

@@ -155,11 +155,16 @@ def test_the_table_says_which_distribution_the_response_is_closer_to():
          "state_0": x}
         for source, values in states.items() for i, x in enumerate(values)
     ])  # fmt: skip
-    summary = se_histograms.summarise(rows)
+    bins = se_histograms.binned(rows)
+    width = 4.0 / se_histograms.NUM_BINS
+    assert bins[bins["dimension"] == "state_0"]["bin"].tolist() == [0, 50, 100, 250, 1500, 1999]
+    summary = se_histograms.summarise(bins)
     state = summary.iloc[0]
-    assert state["response_to_train"] == pytest.approx(0.2)
-    assert state["response_to_test"] == pytest.approx(3.2)
-    table = se_histograms.make_table(SimpleNamespace(name="other"), rows, summary)
+    assert state["response_to_train"] == pytest.approx(0.2, abs=width)
+    assert state["response_to_test"] == pytest.approx(3.2, abs=width)
+    assert state["std_train"] == pytest.approx(0.1, abs=width)
+    returns = se_histograms.test_returns(rows)
+    table = se_histograms.make_table(SimpleNamespace(name="other"), summary, returns)
     assert table["response is closer to"][0] == "train" and list(table["next"]) == [
         "state 0", "reward",
     ]  # fmt: skip

@@ -114,6 +114,8 @@ def assert_equal_steps(env, jax_env, params, num_steps=40):
         ("cartpole", BANDIT),
         ("gridworld_2x2", {"done": "soft", "horizon": 1}),
         ("pendulum", {"done": "threshold", "state_units": "bounds", "initial_state": "noise"}),
+        ("cartpole", {"done": "soft", "min_steps": 3}),
+        ("cartpole", {"done": "sigmoid", "min_steps": 4, "horizon": 6}),
     ],
     ids=str,
 )  # fmt: skip
@@ -201,6 +203,14 @@ def test_a_learned_horizon_terminates_or_truncates():
     assert episode(soft) == [(False, False, 1.5), (True, False, 0.0)]
 
 
+def test_an_episode_has_its_least_number_of_steps():
+    on = (False, False, 1.0)
+    for mode in ("threshold", "bernoulli"):
+        assert episode(constant(d=1.0, done=mode, min_steps=3)) == [on, on, (True, False, 0.0)]
+    soft = constant(done="soft", d=-0.5, min_steps=2, horizon=3, horizon_is_terminal=False)
+    assert episode(soft) == [on, (False, False, 1.5), (False, True, 1.5)]
+
+
 def test_an_episode_that_ends_at_its_limit_is_both_terminated_and_truncated():
     assert episode(constant(d=1.0, max_steps=1)) == [(True, True, 0.0)]  # as with TimeLimit
 
@@ -210,10 +220,10 @@ def test_an_episode_that_ends_at_its_limit_is_both_terminated_and_truncated():
     [{"state": np.inf}, {"reward": np.nan}, {"d": -np.inf}, {"state": 2e6}, {"reward": -2e6}],
     ids=str,
 )
-@pytest.mark.parametrize("mode", ["soft", "bernoulli"])
-def test_an_absurd_or_nonfinite_output_ends_the_episode_where_it_was(mode, outputs):
+@pytest.mark.parametrize(("mode", "min_steps"), [("soft", 1), ("soft", 2), ("bernoulli", 1)])
+def test_an_absurd_or_nonfinite_output_ends_the_episode_where_it_was(mode, min_steps, outputs):
     finite = {name: x if np.isfinite(x) else 0.0 for name, x in outputs.items()}
-    env = constant(**finite, done=mode)
+    env = constant(**finite, done=mode, min_steps=min_steps)
     _, last_bias = env.world._layers[-1]
     last_bias += [*[outputs.get("state", 0.0)] * 4, outputs.get("reward", 0), outputs.get("d", 0)]
     first, _ = env.reset(seed=0)

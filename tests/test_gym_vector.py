@@ -35,6 +35,7 @@ SES = {
     "drawn ends": {"done": "bernoulli", "initial_state": "learned"},
     "real starts and drawn ends": {"done": "sigmoid"},
     "soft": {"done": "soft"},
+    "of a least length": {"done": "soft", "min_steps": 2},
     "continuous actions": {"task": "pendulum", "state_units": "bounds"},
 }
 

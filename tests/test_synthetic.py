@@ -313,6 +313,34 @@ def test_a_done_output_ends_an_episode_before_its_horizon():
     assert terminated[0] and not truncated[0] and discount[0] == 0.0
 
 
+@pytest.mark.parametrize(
+    ("done", "d", "terminated", "discounts"),
+    [
+        # Steps 1 and 2 end nothing, whatever d says; step 3 is as it would be without min_steps=3.
+        ("threshold", 1.0, [False, False, True], [1, 1, 0]),
+        ("threshold", 0.0, [False, False, False], [1, 1, 1]),
+        ("bernoulli", 1.0, [False, False, True], [1, 1, 0]),
+        ("sigmoid", 50.0, [False, False, True], [1, 1, 0]),
+        ("soft", 0.25, [False, False, False], [1, 1, 0.75]),
+        ("soft", 1.5, [False, False, True], [1, 1, -0.5]),
+    ],
+)
+def test_no_done_output_ends_an_episode_before_its_least_number_of_steps(
+    done, d, terminated, discounts
+):
+    env = make_env(done=done, min_steps=3)
+    ended, truncated, discount = walk(env, constant_heads(env, done=d))
+    np.testing.assert_array_equal(ended, terminated)
+    np.testing.assert_allclose(discount, discounts)
+    assert not truncated.any()
+
+
+def test_an_absurd_output_ends_an_episode_before_its_least_number_of_steps():
+    env = make_env(done="soft", min_steps=3)
+    terminated, _, discount = walk(env, constant_heads(env, reward=np.nan), num_steps=1)
+    assert terminated[0] and discount[0] == 0
+
+
 def test_an_episode_begins_anew_after_its_horizon():
     env = make_env(done="threshold", horizon=2)
     params = env.params(constant_heads(env, state=0.7))
@@ -347,6 +375,8 @@ def test_a_bandit_has_a_reward_and_nothing_else(done):
     ({"initial_state": "any"}, "initial_state"),
     ({"horizon": 0}, "horizon"),
     ({"horizon": 1, "horizon_is_terminal": False}, "horizon_is_terminal"),
+    ({"min_steps": 0}, "min_steps"),
+    ({"horizon": 3, "min_steps": 4}, "min_steps"),
 ])  # fmt: skip
 def test_what_no_episode_can_be_is_refused(fields, at_fault):
     with pytest.raises(ConfigError) as error:

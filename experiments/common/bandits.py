@@ -236,15 +236,21 @@ def copy(
       real_steps: what making the agent took; the test episodes are added.
       cpu_s: likewise.
       widen: standard deviation of the Gaussian around the visited states, in units of theirs; 0 for
-        visited states alone.
+        visited states alone; inf for standard normal noise alone, in the units of the task's SEs,
+        which is where their episodes begin.
     """
     key_test, key_rows, key_noise = jax.random.split(key, 3)
     tests, steps = _tested(task, agent)(key_test, agent_state)
     visited = steps.obs[np.asarray(steps.valid)]
     rows = jax.random.choice(key_rows, visited, (num_states,))
-    noise = jax.random.normal(key_noise, rows.shape) * visited.std(0)
+    noise = jax.random.normal(key_noise, rows.shape)
     is_wide = (jnp.arange(num_states) % 2 == 1)[:, None]
-    states = jnp.where(is_wide & (widen > 0), visited.mean(0) + widen * noise, rows)
+    if np.isinf(widen):
+        states = in_task_units(task, noise)
+    else:
+        states = jnp.where(
+            is_wide & (widen > 0), visited.mean(0) + widen * (noise * visited.std(0)), rows
+        )
     return Copied(
         states=np.asarray(states),
         actions=np.asarray(_greedy(agent)(agent_state, states)),
@@ -252,6 +258,12 @@ def copy(
         cpu_s=cpu_s,
         policy_return=float(tests.returns.mean()),
     )
+
+
+def in_task_units(task: Task, noise: Array) -> Array:
+    """Noise `[state, obs_dim]` as the states in which episodes of the task's SEs begin."""
+    units = sejax.config([f"env={task.name}"]).proxy.units(task.observation)
+    return noise if units is None else units.decode(noise)
 
 
 def copy_of_search(task: Task, real_steps: int, seed: int, num_states: int, widen: float) -> Copied:

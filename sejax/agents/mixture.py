@@ -3,6 +3,10 @@
 A proxy that is learned with one agent teaches that agent; whether it teaches others is left to
 chance. Here the candidates of a generation are divided among several agents, so that a step of the
 outer loop helps all of them, at the same number of trainings.
+
+An agent of negative weight counts against the proxy: what is sought teaches the others and not it.
+With weights w and scores F of the agents, a step follows the gradient of the sum of w F, in which
+each agent's part is estimated from its share abs(w) of the candidates.
 """
 
 from dataclasses import dataclass
@@ -26,7 +30,8 @@ class MixtureConfig(Options):
 
     group: ClassVar[str] = "agents"
 
-    # The incumbent's score, given its mean with each agent: the mean of those, or the worst.
+    # The incumbent's score, given its mean with each agent: the mean of those, or the worst; less
+    # the means with agents of negative weight, times these as shares of the positive ones.
     aggregate: str = option("mean", one_of(AGGREGATES))
     # How scores of several agents become comparable. advantage: a candidate's score less the
     # incumbent's mean with the same agent; rank: its rank among that agent's candidates, less the
@@ -42,12 +47,11 @@ class Mixture:
       agents: from `sejax.make_agent`, or your own.
       names: of the agents, for tables; their numbers if not given.
       weights: shares of the candidates that each agent trains on; equal if not given. An agent of
-        weight 0 trains on the incumbent alone.
+        weight 0 trains on the incumbent alone; the scores of one of negative weight are negated.
       config: how the agents' scores are combined.
 
     Raises:
-      ConfigError: for no agents, other numbers of names and weights, negative weights, or none
-        above 0.
+      ConfigError: for no agents, other numbers of names and weights, or no weight above 0.
 
     Example:
       >>> import sejax
@@ -76,10 +80,9 @@ class Mixture:
             "Set names=() and weights=().",
         )
         require(
-            min(self.weights) >= 0 and max(self.weights) > 0,
+            max(self.weights) > 0,
             "agents",
-            "must have weights of at least 0, and one above; got "
-            f"{shortened(self.weights)}. Set weights=().",
+            f"must have a weight above 0; got {shortened(self.weights)}. Set weights=().",
         )
 
     @classmethod
@@ -103,6 +106,16 @@ class Mixture:
     def size(self) -> int:
         return len(self.agents)
 
+    @property
+    def signs(self) -> np.ndarray:
+        """-1 for an agent whose scores count against a proxy, else 1, `[agent]` float32."""
+        return np.where(np.array(self.weights) < 0, -1, 1).astype(np.float32)
+
+    @property
+    def has_opponents(self) -> bool:
+        """Whether the scores of an agent count against a proxy; the mixture's are no returns."""
+        return min(self.weights) < 0
+
     def agent_of_candidate(self, population_size: int, antithetic: bool = False) -> np.ndarray:
         """Index of the agent that trains on each candidate, `[pop]`.
 
@@ -114,7 +127,8 @@ class Mixture:
           ConfigError: if an agent with a weight gets no candidate.
         """
         num_places = population_size // 2 if antithetic else population_size
-        shares = np.array(self.weights) / sum(self.weights)
+        weights = np.abs(self.weights)
+        shares = weights / sum(weights)
         counts = np.zeros(self.size)
         dealt = []
         for place in range(num_places):
@@ -135,8 +149,13 @@ class Mixture:
         return -(-num_incumbent_evals // self.size) * self.size
 
     def aggregated(self, means: Float[Array, " agent"]) -> Float[Array, ""]:
-        """The incumbent's score, given its mean with each agent; nan if one is."""
-        return means.mean() if self.config.aggregate == "mean" else means.min()
+        """The incumbent's score, given its mean with each agent, in its sign; nan if one is."""
+        aggregate = jnp.mean if self.config.aggregate == "mean" else jnp.min
+        if not self.has_opponents:
+            return aggregate(means)
+        weights = np.array(self.weights)
+        shares = np.maximum(-weights, 0) / np.maximum(weights, 0).sum()
+        return aggregate(means[weights >= 0]) + (shares * means).sum()
 
     def comparable(
         self,
@@ -149,7 +168,8 @@ class Mixture:
         Those of a single agent stay as they are.
 
         Args:
-          scores: of the candidates; not finite where training diverged, and then they stay so.
+          scores: of the candidates, in their agents' signs; not finite where training diverged, and
+            then they stay so.
           agent_of_candidate: index of the agent that trained on each.
           incumbent_means: nan for an agent that no evaluation of the incumbent survived with; its
             candidates are then compared with their own mean.

@@ -192,7 +192,10 @@ def named(field: str) -> Iterator[None]:
 
 
 def _mixture(given: Mapping[str, Any]) -> dict[str, str]:
-    """The names of a mixture's agents by their keys; empty without `agents=[...]`."""
+    """The names of a mixture's agents by their keys; empty without `agents=[...]`.
+
+    A key is the agent's name, or any word with `agents.KEY.name`.
+    """
     asked = given.get("agents")
     names = parsed(asked) if isinstance(asked, str) else asked
     if names is None:
@@ -202,8 +205,9 @@ def _mixture(given: Mapping[str, Any]) -> dict[str, str]:
     for name in names:
         if not isinstance(name, str):
             raise unknown_name("agents", name, registry.names("agent"))
-    mixture = {key_of(name): name for name in names}
-    several = shortened(",".join(mixture.values()))
+    keys = {key_of(name): name for name in names}
+    mixture = {key: str(given.get(f"agents.{key}.name", name)) for key, name in keys.items()}
+    several = shortened(",".join(dict.fromkeys(names)))
     require(
         len(mixture) == len(names),
         "agents",
@@ -262,6 +266,7 @@ def _fields(
     if schema.learns:
         share = 1.0, "share of the candidates that train it"
         found |= {f"agents.{key}.weight": share for key in mixture}
+    found |= {f"agents.{key}.name": (name, "kind of agent") for key, name in mixture.items()}
     return found
 
 

@@ -52,7 +52,8 @@ class MixtureMember(Options):
       key: its name in tables and metrics.
       field: its name in overrides and messages.
       agent: its configuration.
-      weight: its share of a generation's candidates; with 0 it only judges incumbents.
+      weight: its share of a generation's candidates; with 0 it only judges incumbents, and below 0
+        its scores count against a proxy.
     """
 
     group: ClassVar[str] = "agent"
@@ -60,7 +61,7 @@ class MixtureMember(Options):
     key: str
     field: str
     agent: AgentConfig
-    weight: float = option(1.0, between(0, 1e6, "it is a share of the candidates"))
+    weight: float = option(1.0, between(-1e6, 1e6, "it is a share of the candidates"))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -120,8 +120,9 @@ def read_file(path: Path) -> dict[str, Any]:
         f"must name no file in a file; got {shortened(base)}. Write preset: best.",
     )
     chosen = {x.removesuffix(".name"): values.pop(x) for x in [*values] if x.endswith(".name")}
-    mixture = [chosen.pop(x) for x in [*chosen] if x.startswith("agents.")]
-    values |= chosen | ({"agents": mixture} if mixture else {})
+    mixture = [x.removeprefix("agents.") for x in chosen if x.startswith("agents.")]
+    names = {f"agents.{key}.name": chosen.pop(f"agents.{key}") for key in mixture}
+    values |= chosen | names | ({"agents": mixture} if mixture else {})
     return {k: v for k, v in values.items() if v is not None or k not in ("agent", "agents")}
 
 

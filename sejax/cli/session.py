@@ -228,7 +228,8 @@ class _Proxies:
         # What was learned does not depend on the tracker, nor on where it was computed.
         plain = directory.config.items()
         self._plain = {k: v for k, v in plain if k not in ("tracker", "machines")}
-        agent = learner.mixture.agents[0]
+        mixture = learner.mixture
+        agent = mixture.agents[int(np.argmax(mixture.signs))]  # the first that it shall teach
         discount = agent.discount(agent.hparams)
         self._discount = None if discount is None else float(discount)
         self._best: int | None = None  # the generation of the best proxy that is on the disk

@@ -142,8 +142,9 @@ class SyntheticWorld:
         if outputs.ndim == 1:  # one at a time, Python's numbers are quicker than NumPy's
             reward, done = reward.item(), done.item()
         at_limit = time >= self.max_steps
-        terminated = self._ends(done, chance) | absurd
-        discount = 1 - (done if self.config.done == "soft" else terminated)
+        may_end = (time >= self.config.min_steps) | absurd
+        terminated = self._ends(done, chance) & may_end | absurd
+        discount = 1 - (done * may_end if self.config.done == "soft" else terminated)
         truncated = at_limit
         if self.config.ends_at_horizon:
             terminated, truncated = terminated | at_limit, at_limit & False
@@ -181,13 +182,13 @@ class SyntheticEnv(gymnasium.Env[Any, Any]):
     Observations are float32 vectors without bounds, since a learned world need not stay where the
     real one does; or, for tasks of discrete states, the index of the state vector's largest entry.
 
-    An episode is *terminated* where the done output d says so (`config.done`), where a learned
-    horizon ends it (`config.horizon`, unless it merely cuts), or where an output is not finite or
-    beyond 1e6, which also costs the step its reward and leaves the state where it was. It is
-    *truncated* at the task's step limit, here and not by a wrapper. `info["discount"]` is what the
-    agents that an SE was learned with bootstrap with: 0 where the episode has terminated and 1
-    elsewhere, save in an SE with `done=soft`, where it is 1 - d. Such an SE teaches through that
-    number, which Gymnasium's agents do not see.
+    An episode is *terminated* where the done output d says so (`config.done`), at the step
+    `config.min_steps` at the earliest; where a learned horizon ends it (`config.horizon`, unless it
+    merely cuts); or where an output is not finite or beyond 1e6, which also costs the step its
+    reward and leaves the state where it was. It is *truncated* at the task's step limit, here and
+    not by a wrapper. `info["discount"]` is what the agents that an SE was learned with bootstrap
+    with: 0 where the episode has terminated and 1 elsewhere, save in an SE with `done=soft`, where
+    it is 1 - d. Such an SE teaches through that number, which Gymnasium's agents do not see.
 
     Args:
       world: of the SE.

@@ -73,6 +73,9 @@ class SyntheticConfig(ProxyConfig):
     # (the authors'); threshold: at d > 0.5; bernoulli: with probability clip(d, 0, 1); sigmoid:
     # with probability sigmoid(d). Agents see all ends but the first.
     done: str = option("soft", one_of(DONE_MODES))
+    # First step of an episode that d may end it at; before it, targets bootstrap with 1. An SE of
+    # episodes of a step or two is a bandit, whatever its networks could do.
+    min_steps: int = option(1, counts("an episode has steps"))
     # real: the task's initial states; learned: standard normal noise plus a network's output for
     # it; noise: noise alone, in the units of `state_units`.
     initial_state: str = option("real", one_of(INITIAL_STATES))
@@ -89,6 +92,12 @@ class SyntheticConfig(ProxyConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        require(
+            self.min_steps <= (self.horizon or self.min_steps),
+            "proxy.min_steps",
+            f"must be at most the horizon; got {self.min_steps} with a horizon of {self.horizon}. "
+            f"Set proxy.min_steps={self.horizon}, or proxy.horizon=null.",
+        )
         require(
             self.horizon != 1 or self.horizon_is_terminal,
             "proxy.horizon_is_terminal",

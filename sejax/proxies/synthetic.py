@@ -30,7 +30,7 @@ class SyntheticState(EnvState):
 
 
 class SyntheticEnv(ProxyEnv):
-    """A task whose dynamics, reward and termination are networks; a gymnax 1.x `Environment`.
+    r"""A task whose dynamics, reward and termination are networks; a gymnax 1.x `Environment`.
 
     Each network maps the action (one-hot if discrete) and the state to the next state, the reward
     or the done output d. Where states are discrete, the networks' state is a vector with an entry
@@ -43,7 +43,11 @@ class SyntheticEnv(ProxyEnv):
       output for it, so that the initial states of a fresh SE surround the origin.
     - `done`: how d terminates an episode. `info["discount"]` is what a target bootstraps with: with
       "soft" 1 - d itself (a learned discount, not confined to [0, 1], which agents outside of sejax
-      do not see), else 1 - terminated.
+      do not see), else 1 - terminated. "bernoulli" is that discount, clipped to [0, 1], as any
+      agent sees it: an end of probability 1 - clip(1 - d, 0, 1) = clip(d, 0, 1), so that targets
+      are the same on average. Rewards cannot take its place: what a target loses by it is
+      :math:`\gamma d V(s')`, of the agent's own values.
+    - `min_steps`: the first step that d may end an episode at.
     - `horizon`: steps of an episode. The last one terminates it if `horizon_is_terminal`. At the
       task's own limit, with no horizon, the episode is truncated.
 
@@ -125,12 +129,17 @@ class SyntheticEnv(ProxyEnv):
         size = jnp.maximum(jnp.max(jnp.abs(vector)), jnp.maximum(jnp.abs(reward), jnp.abs(done)))
         is_sane = size < MAX_ABS_VALUE  # False for nan
         state = SyntheticState(vector=jnp.where(is_sane, vector, state.vector), time=state.time + 1)
-        ends = self.ends(key, done) | ~is_sane
+        ends, discount = self.ends(key, done), 1.0 - done
+        if self.config.min_steps > 1:
+            may_end = state.time >= self.config.min_steps
+            ends, discount = ends & may_end, jnp.where(may_end, discount, 1.0)
+        ends |= ~is_sane
         at_horizon = jnp.bool_(False)
         if self.config.ends_at_horizon:
             at_horizon = state.time >= params.max_steps_in_episode
         terminated = ends | at_horizon
-        discount = 1.0 - done if self.config.done == "soft" else 1.0 - ends
+        if self.config.done != "soft":
+            discount = 1.0 - ends
         info = {
             "discount": jnp.where(is_sane & ~at_horizon, discount, 0.0),
             "nonfinite": ~jnp.isfinite(size),

@@ -285,7 +285,8 @@ def _facts(proxy: PretrainedProxy) -> dict[str, str]:
         facts["initial states"] = _STARTS[config.initial_state]
         facts["episodes"] = "one step: a contextual bandit" if config.is_bandit else limit
         if not config.is_bandit:
-            facts["an episode ends"] = _ENDS[config.done]
+            later = f", from step {config.min_steps} on" if config.min_steps > 1 else ""
+            facts["an episode ends"] = _ENDS[config.done] + later
     if proxy.scores:
         meaning = _SCORES.get(proxy.objective)
         facts["agents"] = ", ".join(proxy.agents)
