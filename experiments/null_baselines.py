@@ -69,14 +69,20 @@ class NullBaselines(Settings):
     # Real steps of a search, at most; those of the shipped SE.
     search_steps: int | None = count(None, quick=5_000)
     num_states: int = count(1024)  # of a table
-    # Spread of half of the states, in units of the visited ones; null: all states are noise, as
-    # those in which episodes of the task's SEs begin.
-    widen: float | None = setting(1.5, positive("it is a scale"))
+    # States of a table. visited: half of them, half drawn around these; noise: as those in which
+    # episodes of the task's SEs begin. Those of `episodes` are visited ones.
+    states: str = setting("visited", one_of(("visited", "noise")))
+    widen: float = setting(1.5, positive("it is a scale"))  # spread of those around visited states
 
     @property
     def task(self) -> envs.Task:
         """The real task."""
         return envs.make(self.env)
+
+    @property
+    def spread(self) -> float:
+        """Of a table's states around visited ones, for `bandits.copy`."""
+        return np.inf if self.states == "noise" else self.widen
 
     @property
     def budgets(self) -> list[int]:
@@ -98,7 +104,7 @@ class NullBaselines(Settings):
 
 def makers(settings: NullBaselines, source: str) -> Iterator[tuple[str, Callable[[], Copied]]]:
     """The tables of a source: the name of each, and what makes it."""
-    task, size, widen = settings.task, settings.num_states, settings.widen or np.inf
+    task, size, widen = settings.task, settings.num_states, settings.spread
     seeds = range(settings.seed, settings.seed + settings.policies)
     if source == "by_hand" and settings.env in bandits.BY_HAND:
         for seed in seeds:
@@ -132,6 +138,8 @@ def make_table(settings: NullBaselines, source: str, name: str, make: Callable[[
     """The rows of one table, a cached shard: states `s0...`, actions `a0...`, and its costs."""
     names = ("seed", "num_states", "widen", "teacher_steps")
     depends = settings.values(*names) | {"env": settings.env, "source": source, "name": name}
+    if settings.states != "visited":
+        depends["states"] = settings.states
     if source == "search":
         depends["search_steps"] = settings.most_search_steps
 
