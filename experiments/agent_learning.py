@@ -20,7 +20,7 @@ from experiments.common import curves, figures, tables
 from experiments.common.agents import Condition, train_groups
 from experiments.common.curves import CURVES, WINDOW
 from experiments.common.experiment import Experiment, Settings, count, setting
-from experiments.common.statistics import mean_interval
+from experiments.common.statistics import mean_interval, worst_tenth
 from sejax.options import each_of, registry
 from sejax.options.plain import to_plain
 from sejax.training import TrainingConfig
@@ -192,7 +192,7 @@ def summarise(rows: pd.DataFrame) -> pd.DataFrame:
             "num_solved_at_the_end": int((last >= threshold).sum()),
             "median_steps_to_solve": np.median(to_solve),
         }
-        return row | tables.mean_columns(last, "last") | tables.iqm_columns(last, "last")
+        return row | tables.mean_columns(last, "last") | {"last_worst_tenth": worst_tenth(last)}
 
     return tables.summary_by(rows, ["study"], statistics)
 
@@ -216,7 +216,7 @@ COLUMNS: dict[str, Any] = {
     "steps, at most": "{max_steps:,}",
     "made": "{made_steps:,.0f}",
     f"last {WINDOW} tests": tables.mean_text("last", 1),
-    "IQM": tables.iqm_text("last"),
+    "worst tenth": "{last_worst_tenth:.1f}",
     "others": lambda row: STUDIES[row.study].peers,
 }
 
@@ -229,7 +229,7 @@ def report(settings: AgentLearning, rows: pd.DataFrame) -> pd.DataFrame:
         f"{settings.test_episodes} greedy test episode. Solved: the mean of {WINDOW} tests in a "
         f"row reaches the threshold; at the end: that of the last {WINDOW}. Made: mean steps until "
         f"the last episode that ended. The last {WINDOW} tests: mean over seeds. "
-        f"{tables.interval_note('seeds')} CartPole is v0, of 200 steps.{tables.iqm_note()}"
+        f"{tables.interval_note('seeds')} CartPole is v0, of 200 steps.{tables.WORST_NOTE}"
     )
     title = "Agents that learn the real tasks"
     return tables.publish(settings, title, tables.as_texts(summary, COLUMNS), summary, note)

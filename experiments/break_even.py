@@ -175,8 +175,8 @@ class Study:
         yield self.labelled(same, "same", self.kind)
 
         pilots = {}
-        swapped = {"seed": self.settings.pilot_seed, "pilot_seed": self.settings.seed}
-        settings = dataclasses.replace(self.settings, **swapped)
+        seed, pilot_seed = self.settings.seed, self.settings.pilot_seed
+        settings = dataclasses.replace(self.settings, seed=pilot_seed, pilot_seed=seed)
         for kind in kinds_for(self.task):
             agent = tuned_agent(self.task.name, kind)
             training = self.until_solved()
@@ -348,7 +348,8 @@ def with_nulls(summary: pd.DataFrame, folder: str) -> pd.DataFrame:
     """
     found = []
     for row in summary.itertuples():
-        path, own = Path(folder, str(row.task), "summary.csv"), {}
+        path = Path(folder, str(row.task), "summary.csv")
+        own: dict[str, Any] = {}
         stored = pd.read_csv(path) if path.exists() else pd.DataFrame(columns=NULL_COLUMNS)
         mine = stored[(stored["kind"] == row.student_agent) & (stored["hparams"] == "default")]
         for source in NULLS:
@@ -395,7 +396,7 @@ def make_table(summary: pd.DataFrame) -> pd.DataFrame:
             mine = {x: getattr(row, f"{role}_{x}", np.nan) for x in SHOWN}
             if pd.isna(mine["agent"]):
                 return ""
-            kind = figures.AGENT_NAMES.get(mine["agent"], mine["agent"])
+            kind = figures.AGENT_NAMES[str(mine["agent"])]
             share = "" if role == "student" and row.of == "se" else f", {mine['reached']:.0%}"
             return (
                 f"{kind}: {mine['steps_mean']:,.0f}{share}; {mine['return_mean']:,.1f} "

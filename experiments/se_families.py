@@ -98,8 +98,8 @@ def make_table(summary: pd.DataFrame) -> pd.DataFrame:
 def cell(row: Any) -> str:
     """What a kind of agent reaches on the SEs of a mixture."""
     mark = "" if row.took_part else LEFT_OUT
-    mean, iqm = tables.mean_text("test_return", 1)(row), tables.iqm_text("test_return")(row)
-    return f"{mean}; IQM {iqm}; {row.solved:.0%}{mark}"
+    mean = tables.mean_text("test_return", 1)(row)
+    return f"{mean}; worst tenth {row.test_return_worst_tenth:.1f}; {row.solved:.0%}{mark}"
 
 
 def shown(name: str) -> str:
@@ -114,11 +114,10 @@ def report(settings: SeFamilies, rows: pd.DataFrame) -> pd.DataFrame:
     note = (
         f"{settings.runs} NES runs with each mixture; the best SE of each trains "
         f"{settings.num_agents} fresh agents of each kind. Cells: mean return; "
-        f"interquartile mean; share of the {summary['num_agents'].iloc[0]} agents that solve the "
-        f"task ({task.solved_reward:g}); {LEFT_OUT} a kind that took no part in learning. CPU s: "
-        "of the generations, without compilation. "
+        f"mean of the worst tenth; share of the {summary['num_agents'].iloc[0]} agents that solve "
+        f"the task ({task.solved_reward:g}); {LEFT_OUT} a kind that took no part in learning. CPU "
+        "s: of the generations, without compilation. "
         f"{tables.interval_note('SEs, agents where there is one SE')}"
-        f"{tables.iqm_note('within each SE')}"
     )
     title = f"Agents tested on {task.name}, trained on SEs learned with other mixtures of agents"
     return tables.publish(settings, title, make_table(summary), summary, note)

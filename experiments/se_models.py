@@ -20,6 +20,7 @@ from experiments.common import agents as groups
 from experiments.common import figures, tables
 from experiments.common.agents import SeAgents, return_columns
 from experiments.common.experiment import Experiment, setting
+from experiments.common.statistics import worst_tenth
 from sejax import ProxySet, Task
 from sejax.options import ConfigError
 
@@ -60,10 +61,9 @@ def summarise(agents: pd.DataFrame, solved_reward: float) -> pd.DataFrame:
     summary = grouped["test_return"].agg(
         return_mean="mean",
         return_std=lambda x: x.std(ddof=0),
+        return_worst_tenth=worst_tenth,
         solved=lambda x: (x >= solved_reward).mean(),
     )
-    iqms = [tables.iqm_columns(returns, "return") for _, returns in grouped["test_return"]]
-    summary = summary.assign(**pd.DataFrame(iqms, index=summary.index))
     summary["train_steps"] = grouped["train_steps"].mean()
     kinds = list(dict.fromkeys(agents["kind"]))
     rank = summary.reset_index().assign(order=lambda t: t["kind"].map(kinds.index))
@@ -89,7 +89,7 @@ def report(settings: SeModels, rows: pd.DataFrame) -> pd.DataFrame:
         "run's seed": lambda row: ses.seeds[row.se],
         "score when learned": lambda row: f"{ses.scores[row.se]:.1f}",
         "return": "{return_mean:.1f} ± {return_std:.1f}",
-        "IQM": tables.iqm_text("return"),
+        "worst tenth": "{return_worst_tenth:.1f}",
         "agents that solve the task": "{solved:.0%}",
         "training steps": "{train_steps:,.0f}",
     }
@@ -98,7 +98,7 @@ def report(settings: SeModels, rows: pd.DataFrame) -> pd.DataFrame:
     note = (
         f"Return: mean ± std over {rows['agent'].nunique()} agents with drawn hyperparameters and "
         f"{len(return_columns(rows))} test episodes each."
-        f"{correlations_text(summary)}{tables.iqm_note()}"
+        f"{correlations_text(summary)}{tables.WORST_NOTE}"
     )
     title = f"Single SEs of {task.name} (solved at {task.solved_reward:g})"
     return tables.publish(settings, title, tables.as_texts(summary, columns), summary, note)

@@ -30,6 +30,7 @@ from experiments.common import agents as groups
 from experiments.common import figures, tables
 from experiments.common.agents import Condition, SeAgents, return_columns, tuned_agent
 from experiments.common.experiment import Experiment, count, setting
+from experiments.common.statistics import worst_tenth
 from sejax import ProxySet, Task, envs
 from sejax.options import one_of, require, shortened
 from sejax.training import SOLVED_BY, TrainingConfig
@@ -194,13 +195,12 @@ def with_best(agents: pd.DataFrame) -> pd.DataFrame:
     return pd.concat([agents, best.assign(setting="best")], ignore_index=True)
 
 
-def summarise(agents: pd.DataFrame) -> pd.DataFrame:
+def summarise(agents: pd.DataFrame, solved_reward: float) -> pd.DataFrame:
     """Means, deviations and intervals for each kind of agent and setting.
 
     Deviations are over agents; intervals of means are of the means of SEs (groups), since agents of
     the same SE have much in common, or of agents on the real task, where groups have nothing in
-    common; of fewer than five there is none (nan). Those of interquartile means come from drawing
-    agents within their SE.
+    common; of fewer than five there is none (nan).
     """
 
     def statistics(mine: pd.DataFrame) -> dict[str, float]:
@@ -209,7 +209,9 @@ def summarise(agents: pd.DataFrame) -> pd.DataFrame:
         row |= {"num_nonfinite": int(mine["nonfinite"].sum())}
         for column in ("train_steps", "train_episodes", "test_return"):
             row |= tables.mean_columns(mine[column], column, ses)
-        return row | tables.iqm_columns(mine["test_return"], "test_return", ses)
+        returns = mine["test_return"]
+        row |= {"solved": (returns >= solved_reward).mean()}
+        return row | {"test_return_worst_tenth": worst_tenth(returns)}
 
     return tables.summary_by(agents, ["kind", "setting"], statistics)
 
@@ -241,7 +243,8 @@ def make_table(env_name: str, summary: pd.DataFrame) -> pd.DataFrame:
         "than tuned": lambda row: fewer(row, "tuned"),
         "episodes": tables.mean_text("train_episodes", 1, std=True),
         "return": tables.mean_text("test_return", 1, std=True),
-        "IQM": tables.iqm_text("test_return"),
+        "worst tenth": "{test_return_worst_tenth:.1f}",
+        "solved": "{solved:.0%}",
         "paper's return": paper(PAPER_RETURNS),
     }
     if "tuned" not in set(summary["setting"]):
@@ -252,7 +255,7 @@ def make_table(env_name: str, summary: pd.DataFrame) -> pd.DataFrame:
 def report(settings: SePerformance, rows: pd.DataFrame) -> pd.DataFrame:
     task = envs.make(task_name(settings, load_sets(settings)))
     agents = with_best(rows)
-    summary = summarise(agents)
+    summary = summarise(agents, task.solved_reward)
     draw(task, agents, settings.folder / "performance.png")
     draw_profiles(task, agents, settings.folder / "profiles.png")
     note = (
@@ -263,10 +266,14 @@ def report(settings: SePerformance, rows: pd.DataFrame) -> pd.DataFrame:
         "shown by the other half. SEs are those of a set that reached the threshold, all where "
         "none did. The paper has 40 SEs with 10 agents each, and for DDQN in CartPole a mean "
         "return on SEs of 190.7, in another section. Agents that met a number that is not finite: "
-        f"{int(rows['nonfinite'].sum())}.{tables.iqm_note('within each SE')}"
+        f"{int(rows['nonfinite'].sum())}.{tables.WORST_NOTE}"
     )
     title = f"Agents trained on SEs and tested on {task.name} (solved at {task.solved_reward:g})"
-    return tables.publish(settings, title, make_table(task.name, summary), summary, note)
+    most = f"restricted to {settings.real_episodes or 1000:,} episodes"
+    table = make_table(task.name, summary).rename(
+        columns={"training steps": f"training steps, {most}"}
+    )
+    return tables.publish(settings, title, table, summary, note)
 
 
 def draw(task: Task, agents: pd.DataFrame, path: Path) -> None:
@@ -308,7 +315,8 @@ def draw_profiles(task: Task, agents: pd.DataFrame, path: Path) -> None:
         for axis, (kind, of_kind) in zip(axes[0], kinds, strict=True):
             for name, mine in of_kind.groupby("setting", sort=False):
                 color, label = SHOWN[str(name)]
-                runs = tables.in_strata(mine["test_return"], strata(mine, str(name)))
+                labels = mine.index if name in ON_REAL else mine["group"]
+                runs = [each for _, each in mine["test_return"].groupby(labels)]
                 figures.profile(axis, runs, low, high, color, f"train: {label}")
             axis.axvline(task.solved_reward, color=figures.SOLVED, ls="--", lw=1.1)
             title, label = figures.AGENT_NAMES.get(str(kind), kind), "return of an agent on"

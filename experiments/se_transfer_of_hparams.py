@@ -21,7 +21,7 @@ import sejax
 from experiments.common import agents, figures
 from experiments.common.agents import Condition, Group, Measure
 from experiments.common.experiment import Experiment, Settings, count, setting
-from experiments.common.statistics import LEAST, NUM_RESAMPLES
+from experiments.common.statistics import NUM_RESAMPLES, bca_interval
 from experiments.common.tables import as_texts, publish, with_interval
 from sejax import ProxySet, Task
 from sejax.options import each_of, require
@@ -218,21 +218,23 @@ def rank_correlation(a: np.ndarray, b: np.ndarray) -> float:
 def with_intervals(
     chooser: np.ndarray, target: np.ndarray, num_resamples: int = NUM_RESAMPLES
 ) -> dict[str, float]:
-    """`quality` with the ends of bootstrap 95% intervals, `..._low` and `..._high`.
+    """`quality` with the ends of BCa 95% intervals over configurations, `..._low` and `..._high`.
 
-    Configurations are drawn again; of fewer than `LEAST` there is no interval (nan).
+    Of fewer than five configurations there is no interval (nan).
     """
-    size = target.shape[1]
-    draws = np.random.default_rng(0).integers(0, size, (num_resamples, size))
-    drawn = []
-    for places in draws:
+
+    def of(places: np.ndarray) -> dict[str, float]:
         own = target[:, places]
-        drawn.append(quality(own if chooser is target else chooser[:, places], own))
-    ends = pd.DataFrame(drawn).quantile([0.025, 0.975])
-    if size < LEAST:
-        ends[:] = np.nan
-    low, high = ends.iloc[0].add_suffix("_low"), ends.iloc[1].add_suffix("_high")
-    return {**quality(chooser, target), **low, **high}
+        return quality(own if chooser is target else chooser[:, places], own)
+
+    each = np.arange(target.shape[1])
+    draws = np.random.default_rng(0).integers(0, each.size, (num_resamples, each.size))
+    drawn = pd.DataFrame([of(places) for places in draws])
+    left_out = pd.DataFrame([of(np.delete(each, i)) for i in each])
+    found = quality(chooser, target)
+    ends = {name: bca_interval(x, drawn[name], left_out[name]) for name, x in found.items()}
+    lows = {f"{name}_low": low for name, (low, _) in ends.items()}
+    return found | lows | {f"{name}_high": high for name, (_, high) in ends.items()}
 
 
 def summarise(rows: pd.DataFrame) -> pd.DataFrame:
@@ -275,8 +277,8 @@ def report(settings: SeTransferOfHparams, rows: pd.DataFrame) -> pd.DataFrame:
         f"with {settings.num_agents} seeds on the SE and on the real task. There one half of the "
         "seeds judges what the other has chosen; regret is the judged return of the real task's "
         "choice less that of this one. Rho is that of all seeds, or of the two halves where the "
-        "real task chooses for itself. Intervals: bootstrap 95%, drawing configurations. Steps and "
-        "CPU seconds (without compilation): of the agents that choose, half of the real ones."
+        "real task chooses for itself. Intervals: BCa bootstrap 95%, over configurations. Steps "
+        "and CPU seconds (without compilation): of the agents that choose, half of the real ones."
     )
     title = f"Tuning {settings.agent} on an SE of {task.name} (solved at {task.solved_reward:g})"
     return publish(settings, title, make_table(summary), summary, note)

@@ -33,6 +33,7 @@ from experiments.common import figures, supervised_models, tables
 from experiments.common.agents import HPARAMS, SE_AGENTS, SOFT_SE, Condition, return_columns
 from experiments.common.experiment import Experiment
 from experiments.common.shards import stack, unstack
+from experiments.common.statistics import worst_tenth
 from experiments.common.supervised_models import SupervisedBaseline
 from sejax import ProxySet, Task
 from sejax.options import require, shortened
@@ -134,7 +135,7 @@ def summarise(agents: pd.DataFrame, solved_reward: float) -> pd.DataFrame:
             {"num_agents": len(mine)}
             | tables.mean_columns(returns, "return", model)
             | {"return_std": mine[return_columns(mine)].to_numpy().std()}
-            | tables.iqm_columns(returns, "return", model)
+            | {"return_worst_tenth": worst_tenth(returns)}
             | {"solved": (returns >= solved_reward).mean()}
             | dict(mine[["train_steps", "train_episodes"]].mean())
             | {"num_nonfinite": int(mine["nonfinite"].sum())}
@@ -155,7 +156,7 @@ def make_table(summary: pd.DataFrame) -> pd.DataFrame:
             "trained on": lambda row: LABELS[row.world],
             "agents": "{num_agents}",
             "return": tables.mean_text("return", 1, std=True),
-            "IQM": tables.iqm_text("return"),
+            "worst tenth": "{return_worst_tenth:.1f}",
             "paper's": lambda row: PAPER.get((row.world, row.kind, row.hparams), ""),
             "solved": "{solved:.0%}",
             "training steps": "{train_steps:,.0f}",
@@ -180,7 +181,7 @@ def report(settings: SupervisedBaseline, rows: pd.DataFrame) -> pd.DataFrame:
         f"Mean squared error {last['error']:.2g} of [s', r] (paper: 5e-07), "
         f"{last['done_error']:.2g} of the end. The best models are those of the runs with the best "
         f"episodes. Agents that met a number that is not finite: {diverged_text(agents)}."
-        f"{tables.iqm_note('within each model')}"
+        f"{tables.WORST_NOTE}"
     )
     title = f"Agents trained on supervised models of {task.name} and on an SE"
     return tables.publish(settings, title, make_table(summary), summary, note)

@@ -83,8 +83,7 @@ TINY = {
 }  # fmt: skip
 SLOW = {"break_even", "null_baselines", "rn_heatmap", "rn_objectives", "rn_performance",
         "score_transforms", "se_dynamics", "se_families", "se_feasibility", "se_horizons",
-        "se_models", "se_myopia",
-        "se_out_of_sample", "se_performance", "se_transfer_of_hparams",
+        "se_models", "se_myopia", "se_out_of_sample", "se_performance", "se_transfer_of_hparams",
         "supervised_baseline"}  # fmt: skip
 
 

@@ -24,9 +24,6 @@ from experiments import (
 )
 from experiments.common import agents, figures, runs, shards
 from experiments.common.statistics import (
-    bootstrap_interval,
-    interquartile_mean,
-    iqm_interval,
     mean_interval,
 )
 from sejax import envs
@@ -138,20 +135,16 @@ def made_up_agents(num_ses=4, num_agents=6):
 def test_intervals_are_over_ses_and_not_agents_but_on_the_real_task():
     agents = made_up_agents(num_ses=5)
     values = agents["test_return"].to_numpy().reshape(5, 6)
-    for setting, independent, of_iqm in (
-        ("varied", values.mean(axis=1), bootstrap_interval(*values)),
-        ("real", values.ravel(), iqm_interval(values.ravel())),
-    ):
-        row = se_performance.summarise(agents.assign(setting=setting)).iloc[0]
+    for setting, independent in (("varied", values.mean(axis=1)), ("real", values.ravel())):
+        row = se_performance.summarise(agents.assign(setting=setting), 25.0).iloc[0]
         assert row["test_return_mean"] == pytest.approx(values.mean())
         assert row["test_return_std"] == pytest.approx(np.std(values))
         assert (row["num_ses"], row["num_agents"]) == (5, 30)
         ends = mean_interval(independent)
         assert (row["test_return_low"], row["test_return_high"]) == pytest.approx(ends)
-        assert row["test_return_iqm"] == interquartile_mean(values.ravel())
-        ends = row["test_return_iqm_low"], row["test_return_iqm_high"]
-        assert ends == pytest.approx(of_iqm)
-    few = se_performance.summarise(made_up_agents(num_ses=4))
+        assert row["test_return_worst_tenth"] == np.sort(values.ravel())[:3].mean()
+        assert row["solved"] == 0.4  # two SEs of five
+    few = se_performance.summarise(made_up_agents(num_ses=4), 25.0)
     assert np.isnan(few["test_return_low"][0]) and np.isnan(few["train_steps_high"][0])
     assert "[" not in se_performance.make_table("cartpole", few)["return"][0]
 
@@ -172,7 +165,7 @@ def test_a_tuned_agent_is_a_baseline_of_its_own():
         made_up_agents().assign(kind="ddqn", setting=name, train_steps=value)
         for name, value in steps.items()
     )
-    table = se_performance.make_table("cartpole", se_performance.summarise(agents))
+    table = se_performance.make_table("cartpole", se_performance.summarise(agents, 195))
     assert table["fewer"].tolist() == ["", "60%", "90%"]
     assert table["than tuned"].tolist() == ["", "", "75%"]
 
@@ -366,14 +359,14 @@ def test_the_matrix_has_means_costs_and_marks_families_that_took_no_part():
     row = summary.iloc[0]  # returns 94, 96, 104, 106
     assert (row["test_return_mean"], row["solved"], row["num_ses"]) == (100, 0.75, 2)
     assert np.isnan(row["test_return_low"])  # of two SEs
-    assert row["test_return_iqm"] == 100  # of 96 and 104
+    assert row["test_return_worst_tenth"] == 94
     assert summary["took_part"].tolist() == [True, False, True, True]
     assert summary["cpu_s"].tolist() == [3, 3, 7.5, 7.5]
     assert summary["solved_runs"].tolist() == [0.5] * 4 and summary["env_steps"].eq(300).all()
     table = se_families.make_table(summary)
     assert table["learned with"].tolist() == ["DDQN", "DDQN + PPO"]
     assert [text.endswith(se_families.LEFT_OUT) for text in table["PPO"]] == [True, False]
-    assert table["DDQN"][0] == "100.0; IQM 100.0; 75%"
+    assert table["DDQN"][0] == "100.0; worst tenth 94.0; 75%"
     with_ends = summary.assign(test_return_low=95.0, test_return_high=105.0)
     assert se_families.make_table(with_ends)["DDQN"][0].startswith("100.0 [95.0, 105.0]; IQM 100.0")
 

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import gymnasium
 import numpy as np
+import pandas as pd
 import pytest
 from plain_agents import agent_for, learn, mean_return
 
@@ -102,6 +103,30 @@ def test_the_page_is_what_the_tool_makes(monkeypatch):
     import make_zoo
 
     assert make_zoo.PAGE.read_text(encoding="utf-8") == make_zoo.page()
+
+
+def test_the_page_tells_of_each_se_how_it_teaches(monkeypatch, tmp_path):
+    """If it was tested, with the weights that are shipped: those of a bandit are a policy's."""
+    monkeypatch.syspath_prepend(TOOLS)
+    import make_zoo
+
+    cells = {name: make_zoo.row(PROXIES[name], make_zoo.verdicts())["teaches by"]
+             for name in PROXIES}  # fmt: skip
+    for name, proxy in PROXIES.items():
+        if proxy.kind == "rn":
+            assert cells[name] == ""
+        elif proxy.settings["horizon"] == 1:
+            assert cells[name] in ("policy", "")
+    folder = tmp_path / "results" / "se_myopia" / "cartpole"
+    folder.mkdir(parents=True)
+    monkeypatch.setattr(make_zoo, "ROOT", tmp_path)
+    summary = pd.DataFrame({"set": ["cartpole (shipped)"], "verdict": ["dynamics"]})
+    summary.to_csv(folder / "summary.csv", index=False)
+    tested = {sejax.load_proxy("cartpole").fingerprint: {"cartpole": "dynamics"}, "another": {}}
+    for fingerprint, expected in tested.items():
+        rows = pd.DataFrame({"set": ["cartpole (shipped)", None], "group": [fingerprint, "x"]})
+        rows.to_csv(folder / "rows.csv.xz", index=False)
+        assert make_zoo.verdicts() == expected
 
 
 def test_a_proxy_is_shipped_with_what_it_teaches(tmp_path, monkeypatch, capsys):

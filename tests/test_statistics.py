@@ -1,89 +1,30 @@
-"""experiments.common.statistics: against rliable, scipy, and what can be worked out by hand."""
-
-import itertools
+"""experiments.common.statistics: against scipy, by simulation, and what is worked out by hand."""
 
 import numpy as np
+import pandas as pd
 import pytest
 import scipy.stats
 
 from experiments.common.statistics import (
-    bootstrap_interval,
-    interquartile_mean,
-    iqm_interval,
+    bca_interval,
+    difference_interval,
     mean_interval,
     performance_profile,
     worst_tenth,
 )
+from experiments.common.tables import mean_columns
 
 
-def mean(scores):
-    return np.mean(scores, axis=-1)
-
-
-# `[task, run]`.
-SCORES = np.array([
-    [0.1, 0.4, 0.7, 0.2, 1.6, 0.9, 0.3],
-    [2.0, 2.5, 0.5, 3.5, 2.2, 1.1, 2.9],
-    [-3.0, -1.0, -2.5, 0.5, -0.5, 4.0, -1.5],
-])  # fmt: skip
-THRESHOLDS = [-3, -1, 0, 0.5, 1, 2.5]
-# What rliable 1.2.0 (numpy 2.4, arch 8.0) gives for their transposes, with
-# `np.random.seed(0)` before each: `get_interval_estimates` with `metrics.aggregate_iqm`,
-# `aggregate_mean` and `create_performance_profile` (20,000 resamples each). Another seed moves the
-# ends by up to 0.01.
-RLIABLE = {
-    "iqm": (0.75454545, 0.28181818, 1.33636364),
-    "mean": (0.70952381, 0.15714286, 1.33821429),
-    "profile": (
-        [0.95238095, 0.80952381, 0.76190476, 0.47619048, 0.38095238, 0.14285714],
-        [0.85714286, 0.71428571, 0.66666667, 0.28571429, 0.23809524, 0.0],
-        [1.0, 0.95238095, 0.85714286, 0.66666667, 0.52380952, 0.28571429],
-    ),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize(("name", "statistic"), [("iqm", interquartile_mean), ("mean", mean)])
-def test_intervals_are_those_of_rliable(name, statistic):
-    estimate, *ends = RLIABLE[name]
-    assert statistic(SCORES.ravel()) == pytest.approx(estimate)
-    ours = bootstrap_interval(*SCORES, statistic=statistic, num_resamples=20_000)
-    assert ours == pytest.approx(ends, abs=0.02)
-
-
-def test_performance_profiles_are_those_of_rliable():
-    ours = performance_profile(*SCORES, thresholds=THRESHOLDS, num_resamples=20_000)
-    for got, expected in zip(ours, RLIABLE["profile"], strict=True):
-        np.testing.assert_allclose(got, expected, atol=1e-8)
-
-
-@pytest.mark.parametrize(
-    ("last", "expected"), [(0, 0.0), (1, 0.5), (2, 1.0), (3, 1.5), (7, 3.5), (8, 4.0)]
-)
-def test_the_interquartile_mean_of_numbers_in_a_row_is_their_middle(last, expected):
-    assert interquartile_mean(np.random.default_rng(0).permutation(last + 1)) == expected
-
-
-def test_the_interquartile_mean_forgets_outliers_and_takes_the_last_axis():
-    assert interquartile_mean([-1e9, 1.0, 3.0, 1e9]) == 2.0
-    assert interquartile_mean([0, 10, 20, 30, 40, 50, 60, 1e9]) == 35.0
-    rows = np.random.default_rng(1).exponential(size=(4, 3, 11))
-    expected = scipy.stats.trim_mean(rows, 0.25, axis=-1)
-    np.testing.assert_allclose(interquartile_mean(rows), expected, rtol=1e-12)
-    assert np.isnan(interquartile_mean([[0, np.nan, 1, 2, 3], [1, 1, 1, 1, 1]])).tolist() == [1, 0]
-
-
-def test_runs_are_drawn_within_their_strata():
-    """Two strata of three runs: the 27 * 27 equally likely means, worked out."""
-    strata = [0.0, 1.0, 3.0], [100.0, 141.0, 110.0]
-    means = [np.mean(a + b) for a in itertools.product(strata[0], repeat=3)
-             for b in itertools.product(strata[1], repeat=3)]  # fmt: skip
-    for level in (0.5, 0.8, 0.95):
-        ends = np.quantile(means, [(1 - level) / 2, (1 + level) / 2], method="inverted_cdf")
-        got = bootstrap_interval(*strata, statistic=mean, level=level, num_resamples=9999)
-        assert got == pytest.approx(ends)
-    # As one stratum, where runs of one task could stand for those of the other, it is far wider.
-    low, high = bootstrap_interval(np.concatenate(strata), statistic=mean)
-    assert low < 40 and high > 80
+def test_a_profile_is_of_all_runs_and_its_interval_of_the_groups():
+    """Five groups; above 1 are shares of 1, 1/2, 1/2, 0 and 1/2: t of 4 is 2.7764, std 0.3536."""
+    groups = [2.0, 3.0], [1.0, 2.0], [0.0, 5.0], [1.0, 1.0], [9.0, 0.5]
+    shares, low, high = performance_profile(groups, [1, -1, 9])
+    np.testing.assert_allclose(shares, [0.5, 1, 0])
+    np.testing.assert_allclose([low[0], high[0]], [0.5 - 0.43900, 0.5 + 0.43900], atol=1e-4)
+    np.testing.assert_array_equal([low[1:], high[1:]], [[1, 0]] * 2)
+    assert np.isnan(performance_profile(groups[:4], [1])[1]).all(), "of four groups none"
+    _, low, high = performance_profile([[0.0], [0.0], [0.0], [0.0], [2.0]], [1])
+    assert low == 0 and high < 1, "within what a share can be"
 
 
 @pytest.mark.parametrize("size", [5, 6, 10, 33])
@@ -91,23 +32,72 @@ def test_intervals_are_those_of_scipys_t_tests(size):
     values = np.random.default_rng(size).exponential(size=size)
     expected = scipy.stats.ttest_1samp(values, 0).confidence_interval()
     assert mean_interval(values) == pytest.approx(tuple(expected))
-    against_zero = scipy.stats.ttest_ind(values, np.zeros(8), trim=0.25, equal_var=False)
-    assert iqm_interval(values) == pytest.approx(tuple(against_zero.confidence_interval()))
+    others = np.random.default_rng(0).normal(size=7)
+    welch = scipy.stats.ttest_ind(values, others, equal_var=False).confidence_interval()
+    assert difference_interval(values, others) == pytest.approx(tuple(welch))
 
 
-@pytest.mark.parametrize("interval", [mean_interval, iqm_interval])
+def draws(size, num_agents, seed=0):
+    """Returns of agents `[study, SE, agent]`: SEs differ as agents of one do; mean 0."""
+    rng = np.random.default_rng(seed)
+    return rng.normal(size=(2000, size, 1)) + rng.normal(size=(2000, size, num_agents))
+
+
 @pytest.mark.parametrize("size", [5, 8, 10])
-def test_intervals_of_few_values_cover_the_truth_as_often_as_they_say(interval, size):
-    """Percentile bootstraps of as few cover the mean of normal values in 82 to 90% of the cases."""
-    values = np.random.default_rng(0).normal(size=(2000, size))
-    ends = np.array([interval(each) for each in values])
-    covered = np.mean((ends[:, 0] <= 0) & (ends[:, 1] >= 0))
-    assert abs(covered - 0.95) < 0.02  # its standard error: 0.005
+def test_intervals_cover_the_truth_as_often_as_they_say(size):
+    """Those over the agents of few SEs, as if these were independent, cover it far less often."""
+
+    def covered(interval, *values):
+        ends = np.array([interval(*each) for each in zip(*values, strict=True)])
+        return np.mean((ends[:, 0] <= 0) & (ends[:, 1] >= 0))
+
+    returns = draws(size, num_agents=6)
+    means = returns.mean(axis=2)
+    for share in (
+        covered(mean_interval, means),
+        covered(difference_interval, means, 3 * draws(10, 6, seed=1).mean(axis=2)),
+    ):
+        assert abs(share - 0.95) < 0.02  # its standard error: 0.005
+    assert covered(mean_interval, returns.reshape(2000, -1)) < 0.8
+    columns = [
+        mean_columns(pd.Series(each.ravel()), "x", pd.Series(np.repeat(range(size), 6)))
+        for each in returns[:200]
+    ]
+    lows = [mean_interval(each)[0] for each in means[:200]]
+    np.testing.assert_allclose([column["x_low"] for column in columns], lows)
+
+
+def test_bca_intervals_are_scipys_and_cover_a_rank_correlation():
+    def rho(x, y):
+        """Of rows without ties, `[..., n]`."""
+        size = x.shape[-1]
+        away = scipy.stats.rankdata(x, axis=-1) - scipy.stats.rankdata(y, axis=-1)
+        return 1 - 6 * (away**2).sum(axis=-1) / (size**3 - size)
+
+    rng = np.random.default_rng(0)
+    x = rng.exponential(size=30)
+    left_out = [np.delete(x, i).mean() for i in range(30)]
+    theirs = scipy.stats.bootstrap((x,), np.mean, method="BCa", n_resamples=999)
+    ends = bca_interval(x.mean(), theirs.bootstrap_distribution, left_out)
+    assert ends == pytest.approx(tuple(theirs.confidence_interval))
+
+    truth, hits = 6 / np.pi * np.arcsin(0.6 / 2), []  # of normal values with a correlation of 0.6
+    for _ in range(300):
+        x, y = rng.multivariate_normal([0, 0], [[1, 0.6], [0.6, 1]], 40).T
+        places = rng.integers(0, 40, (400, 40))
+        tiny = 1e-9 * rng.normal(size=(2, 400, 40))  # parts ties
+        drawn = rho(x[places] + tiny[0], y[places] + tiny[1])
+        others = np.array([np.delete(np.arange(40), i) for i in range(40)])
+        low, high = bca_interval(rho(x, y), drawn, rho(x[others], y[others]))
+        hits.append(low <= truth <= high)
+    assert 0.90 < np.mean(hits) < 0.99  # its standard error: 0.013
+    assert np.isnan(bca_interval(0.5, [0.4, 0.6], [0.4, 0.5, 0.6, 0.7])).all()
+    assert bca_interval(1.0, [1.0] * 9, [1.0] * 6) == (1, 1)
 
 
 def test_fewer_than_five_values_have_no_interval():
     four = [1.0, 2.0, 3.0, 4.0]
-    for ends in (mean_interval(four), iqm_interval(four), bootstrap_interval(four[:2], four[2:])):
+    for ends in (mean_interval(four), difference_interval(four, [1.0] * 9)):
         assert np.isnan(ends).all()
 
 
@@ -118,7 +108,7 @@ def test_the_worst_tenth_is_the_mean_of_the_lowest_values():
 
 
 def test_equal_runs_have_no_uncertainty():
-    assert mean_interval([3.0] * 5) == iqm_interval([3.0] * 5) == (3.0, 3.0)
-    assert bootstrap_interval([3.0] * 5, [3.0]) == (3.0, 3.0)
-    profile = performance_profile([3.0] * 5, thresholds=[2.9, 3.0])
+    assert mean_interval([3.0] * 5) == (3.0, 3.0)
+    assert difference_interval([3.0] * 5, [1.0] * 6) == (2.0, 2.0)
+    profile = performance_profile([[3.0]] * 5, [2.9, 3.0])
     np.testing.assert_array_equal(profile, [[1, 0]] * 3)  # above is more than

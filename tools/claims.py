@@ -100,7 +100,9 @@ class Claims:
         if name.startswith("results/"):
             text = (self.root / name).read_text(encoding="utf-8")
             return [line for line in text.splitlines() if line.startswith("|")]
-        table = self.entries.get("tables", {})[name]
+        if name not in self.entries.get("tables", {}):
+            raise WrongError("it has no entry")
+        table = self.entries["tables"][name]
         made = [table["head"], " | ".join("---" for _ in table["head"].split("|"))]
         for line in table["lines"]:
             if "values" in line or "rows" not in line:
@@ -156,7 +158,7 @@ class Claims:
                     if found[0] != self.with_tables(found[0]):
                         yield f"{name}: the table {found[2]} is not what its rows give"
                 except (KeyError, OSError, WrongError) as error:
-                    yield f"{name}: the table {found[2]} cannot be made: {error!r}"
+                    yield f"{name}: the table {found[2]} cannot be made: {error}"
         for key, entry in self.entries.get("claims", {}).items():
             try:
                 names = self.values(entry)

@@ -4,13 +4,18 @@ python tools/make_zoo.py
 """
 
 import re
+from collections.abc import Mapping
 from pathlib import Path
+
+import pandas as pd
 
 import sejax
 from sejax.ops.files import write_text
 from sejax.proxies.zoo import table
 
-PAGE = Path(__file__).parents[1] / "docs" / "zoo.md"
+ROOT = Path(__file__).parents[1]
+PAGE = ROOT / "docs" / "zoo.md"
+TESTED = "results/se_myopia/*"
 
 HEAD = """\
 # The zoo
@@ -22,6 +27,9 @@ lists them with all that stands here. `python tools/make_zoo.py` makes this page
 
 *Return* and *steps* are from the lowest to the highest of the kinds of agents that were trained on
 the proxy and tested on the real task: the mean return there, and how long an agent trained.
+*Teaches by* is the verdict on an SE of [the myopia test](results.md#the-myopia-test): `policy` if
+agents that look at the next reward alone learn as well, `dynamics` if only far-sighted ones learn.
+
 The second table of each tells what fresh agents reach that trained for the steps given and were
 then tested on the real task: mean and standard deviation of the agents' mean returns.
 
@@ -44,8 +52,32 @@ hold no data of others.
 def page() -> str:
     """The text of the page."""
     proxies = sejax.pretrained()
-    rows = [proxy.row | {"name": f"[{proxy.name}](#{proxy.name})"} for proxy in proxies]
+    rows = [row(proxy, verdicts()) for proxy in proxies]
     return HEAD + "\n\n".join([table(rows), *map(section, proxies)]) + "\n"
+
+
+def verdicts() -> dict[str, str]:
+    """What the myopia test says of each shipped SE that it was made on, by its name.
+
+    Not of a proxy that was learned anew since.
+    """
+    names = {f"{proxy.name} (shipped)": proxy.name for proxy in sejax.pretrained()}
+    found = {}
+    for folder in ROOT.glob(TESTED):
+        rows = pd.read_csv(folder / "rows.csv.xz", low_memory=False)
+        tested = rows[rows["set"].isin(names)]
+        verdicts = pd.read_csv(folder / "summary.csv").set_index("set")["verdict"]
+        for key, fingerprint in zip(tested["set"], tested["group"], strict=True):
+            if sejax.load_proxy(names[key]).fingerprint == fingerprint:
+                found[names[key]] = verdicts[key]
+    return found
+
+
+def row(proxy: sejax.PretrainedProxy, verdicts: Mapping[str, str]) -> dict[str, str]:
+    """A proxy's row of the table."""
+    name, kind, *others = proxy.row.items()
+    linked = {"name": f"[{proxy.name}](#{proxy.name})"}
+    return dict([name, kind, ("teaches by", verdicts.get(proxy.name, "")), *others]) | linked
 
 
 def section(proxy: sejax.PretrainedProxy) -> str:

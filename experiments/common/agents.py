@@ -17,7 +17,7 @@ import pandas as pd
 
 import sejax
 from experiments.common.experiment import Settings, count, setting
-from sejax import ProxySet, Task
+from sejax import Proxy, ProxySet, Task
 from sejax.agents import NoExploration
 from sejax.cli.progress import Tally
 from sejax.evaluation import num_parallel_on_cpu
@@ -297,7 +297,7 @@ def agent_config(settings: Settings, kind: str) -> Any:
 
 
 def training_as_learned(
-    proxies: ProxySet, agent: Any, test_episodes: int, max_steps: int | None = None
+    proxies: Proxy | ProxySet, agent: Any, test_episodes: int, max_steps: int | None = None
 ) -> TrainingConfig:
     """How long an agent trains on SEs: as those that these were learned with, or `max_steps`."""
     learned = sejax.training_of(proxies, agent)

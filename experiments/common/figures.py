@@ -97,11 +97,11 @@ def band(axis: Any, grid: Any, values: Any, ends: Any, color: str, **line: Any) 
 
 
 def profile(
-    axis: Any, strata: Sequence[Any], low: float, high: float, color: str, label: str
+    axis: Any, groups: Sequence[Any], low: float, high: float, color: str, label: str
 ) -> None:
     """Draws the share of runs with more than each score in [low, high], and its 95% interval."""
     grid = np.linspace(low, high, 200)
-    shares, *ends = performance_profile(*strata, thresholds=grid)
+    shares, *ends = performance_profile(groups, grid)
     axis.plot(grid, shares, color=color, lw=1.8, label=label)
     axis.fill_between(grid, *ends, color=color, alpha=0.2, lw=0)
     axis.set(xlim=(low, high), ylim=(0, 1.02))

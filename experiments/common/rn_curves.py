@@ -17,12 +17,11 @@ from experiments.common import agents, curves, figures
 from experiments.common.agents import Condition
 from experiments.common.experiment import count, setting
 from experiments.common.reward_networks import AUGMENTED, PAPER_ROWS, SHOWN, RnSettings, label
+from experiments.common.statistics import worst_tenth
 from experiments.common.tables import (
+    WORST_NOTE,
     as_texts,
     interval_note,
-    iqm_columns,
-    iqm_note,
-    iqm_text,
     mean_columns,
     mean_text,
     summary_by,
@@ -187,7 +186,8 @@ def summarise(rows: pd.DataFrame, max_steps: int) -> pd.DataFrame:
             | {"solved": np.isfinite(to_solve).mean()}
             | mean_columns(steps, "steps", labels)
             | mean_columns(mean_return, "return", labels)
-            | iqm_columns(mean_return, "return", labels)
+            | {"return_worst_tenth": worst_tenth(mean_return)}
+            | {"steps_restricted_to": max_steps}
             | {"last_return": each["last_return"].mean()}
         )
 
@@ -220,17 +220,18 @@ def make_table(summary: pd.DataFrame) -> pd.DataFrame:
     def share(row: Any) -> str:
         return f"{row.share_of_bare:.0%}" if np.isfinite(row.share_of_bare) else ""
 
+    most = summary["steps_restricted_to"].iloc[0]
     return as_texts(
         summary,
         {
             "agents": lambda row: ROWS[row.row],
             "trained with": "{world}",
             "groups, agents": "{groups}, {agents}",
-            "steps to solve": mean_text("steps", 0),
+            f"steps to solve, restricted to {most:,}": mean_text("steps", 0),
             "of the bare agent's": share,
             "solved": "{solved:.0%}",
             "mean return over training": mean_text("return", 1),
-            "IQM": iqm_text("return"),
+            "worst tenth": "{return_worst_tenth:.1f}",
             "last tests": "{last_return:.1f}",
         },
     )
@@ -241,12 +242,12 @@ def common_note(settings: CurveSettings, solved_reward: float) -> str:
     learned_with = " Default hyperparameters are those that the RNs were learned with."
     return (
         f"up to {settings.max_steps:,} training steps or {settings.study.max_episodes:,} episodes, "
-        "one greedy test episode after each. Steps to solve: until the mean of "
+        "one greedy test episode after each. Steps to solve: restricted mean, until the mean of "
         f"{curves.WINDOW} tests in a row reaches {solved_reward:g}; an agent that never "
         f"does counts {settings.max_steps:,}. The bare agent's are of as many groups, of the same "
         "seeds. Curves that end early go on as the last test. "
         f"{interval_note('RNs, over agents on the real task')}"
-        f"{iqm_note('within each RN')}{'' if settings.study.agent else learned_with}"
+        f"{WORST_NOTE}{'' if settings.study.agent else learned_with}"
     )
 
 

@@ -19,7 +19,8 @@ import pandas as pd
 import sejax
 from experiments.common.agents import HPARAMS, Condition, groups_at_once, train_groups
 from experiments.common.experiment import Settings, count, setting
-from experiments.common.tables import iqm_columns, mean_columns, summary_by
+from experiments.common.statistics import worst_tenth
+from experiments.common.tables import mean_columns, summary_by
 from sejax import ProxySet
 from sejax.cli import config as configuration
 from sejax.cli import run_directory, session
@@ -291,8 +292,7 @@ class MixtureRuns(RunSettings):
 def summarise_tests(agents: pd.DataFrame, by: list[str], solved_reward: float) -> pd.DataFrame:
     """Statistics of the returns (`test_return_...`) for each value of the columns `by`.
 
-    The mean's interval draws SEs, of which there must be five, and agents where there is one SE;
-    that of the interquartile mean draws agents within their SE.
+    The mean's interval is over SEs, of which there must be five, and agents where there is one SE.
     """
 
     def statistics(mine: pd.DataFrame) -> dict[str, float]:
@@ -300,7 +300,7 @@ def summarise_tests(agents: pd.DataFrame, by: list[str], solved_reward: float) -
         return (
             {"num_ses": num_ses, "num_agents": len(mine)}
             | mean_columns(returns, "test_return", mine["seed"] if num_ses > 1 else None)
-            | iqm_columns(returns, "test_return", mine["seed"])
+            | {"test_return_worst_tenth": worst_tenth(returns)}
             | {"solved": (returns >= solved_reward).mean()}
         )
 

@@ -1,26 +1,20 @@
-"""Statistics of scores over runs and tasks, and their 95% intervals.
+"""Statistics of scores over runs, and their 95% intervals.
 
-Intervals of means are Student's, those of interquartile means Tukey and McLaughlin's, which is
-Student's for trimmed means. Percentile bootstraps of 5 to 10 values cover the truth in 80 to 90% of
-the cases in place of 95%; BCa ones are no better there. Of fewer than `LEAST` values there is no
-interval.
+Intervals of means are Student's, of what was sampled: of the means of SEs or RNs where agents
+belong to them, as agents of one have much in common, else of agents. Percentile bootstraps of 5 to
+10 values cover the truth in 80 to 90% of the cases in place of 95%. Of fewer than `LEAST` values
+there is no interval. What is no mean, such as a rank correlation, has a BCa bootstrap interval.
 
-For runs that are drawn within *strata* (agents within the proxy that trained them), of which there
-are many, there is the stratified bootstrap. Strata are arrays `[run]` and may differ in length; a
-single array is a single stratum.
-
-Source: Tukey and McLaughlin, "Less vulnerable confidence and significance procedures for location
-based on a single sample" (1963); Agarwal et al., "Deep Reinforcement Learning at the Edge of the
-Statistical Precipice" (2021), sections 4.1 to 4.3, and their library rliable, which takes matrices
-`[run, task]`.
+Where returns have a ceiling, a mean beside the mean of the worst tenth tells agents apart that an
+interquartile mean does not.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from scipy.stats import norm
 from scipy.stats import t as student
-from scipy.stats.mstats import winsorize
 
 LEVEL, NUM_RESAMPLES = 0.95, 2000
 LEAST = 5  # independent values of an interval: the range of two holds the median half of the time
@@ -56,36 +50,6 @@ def difference_interval(first: Any, second: Any, level: float = LEVEL) -> tuple[
     return float(middle - half), float(middle + half)
 
 
-def iqm_interval(values: Any, level: float = LEVEL) -> tuple[float, float]:
-    r"""Confidence interval of the interquartile mean of independent values `[n]`, likewise.
-
-    .. math:: IQM \pm t_{h - 1} s_w \sqrt{(n - 1) / (h (h - 1))}
-
-    where h of the n values are left by trimming, and :math:`s_w` is the deviation of all of them
-    after each trimmed one took the value of the nearest one that is left.
-    """
-    values = np.asarray(values, float)
-    size, kept = values.size, values.size - 2 * (values.size // 4)
-    if size < LEAST:
-        return NONE
-    deviation = np.asarray(winsorize(values, 0.25)).std(ddof=1)
-    half = student.ppf((1 + level) / 2, kept - 1) * deviation
-    half *= np.sqrt((size - 1) / (kept * (kept - 1)))
-    middle = interquartile_mean(values)
-    return float(middle - half), float(middle + half)
-
-
-def interquartile_mean(scores: Any) -> Any:
-    """Mean over the last axis without its lowest and highest quarter: `[..., run] -> [...]`.
-
-    Of n runs, floor(n / 4) are left out on each side; nan where one is nan.
-    """
-    ordered = np.sort(np.asarray(scores, float), axis=-1)  # with nan last
-    cut = ordered.shape[-1] // 4
-    middle = ordered[..., cut : ordered.shape[-1] - cut].mean(axis=-1)
-    return np.where(np.isnan(ordered[..., -1]), np.nan, middle)[()]
-
-
 def worst_tenth(values: Any) -> float:
     """Mean of the lowest tenth of values `[n]`, of one at least; nan where one is nan."""
     values = np.asarray(values, float)
@@ -93,65 +57,53 @@ def worst_tenth(values: Any) -> float:
     return float("nan") if np.isnan(values).any() else float(lowest.mean())
 
 
-def bootstrap_interval(
-    *strata: Any,
-    statistic: Callable[[Any], Any] = interquartile_mean,
-    level: float = LEVEL,
-    num_resamples: int = NUM_RESAMPLES,
-    seed: int = 0,
-) -> tuple[float, float]:
-    """Percentile confidence interval of a statistic of all runs: the stratified bootstrap.
-
-    Runs are drawn again, with replacement, within each stratum. `NONE` for fewer than `LEAST` runs.
-
-    Args:
-      *strata: runs of each, `[run]`.
-      statistic: `[resample, run] -> [resample]`, of the runs of all strata.
-      level: of confidence.
-      num_resamples: how often all runs are drawn.
-      seed: of the draws.
-    """
-    resamples = _resamples(np.random.default_rng(seed), strata, num_resamples)
-    if resamples.shape[1] < LEAST:
-        return NONE
-    low, high = _ends(statistic(resamples), level)
-    return float(low), float(high)
-
-
 def performance_profile(
-    *strata: Any,
-    thresholds: Any,
-    level: float = LEVEL,
-    num_resamples: int = NUM_RESAMPLES,
-    seed: int = 0,
+    groups: Sequence[Any], thresholds: Any
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Fraction of runs with a score above each threshold, and its interval at each.
 
+    The interval is that of `mean_interval`, of the groups' fractions, within [0, 1].
+
     Args:
-      *strata: runs of each, `[run]`.
+      groups: runs of each, `[run]`; a group is what is independent, such as the agents of one SE.
       thresholds: `[threshold]`.
-      level, num_resamples, seed: as of `bootstrap_interval`.
 
     Returns:
       Fractions, lower and upper ends, `[threshold]` each.
+
+    Source: Agarwal et al. (2021), section 4.2, whose intervals are of a stratified bootstrap.
     """
 
-    def fractions(runs: np.ndarray) -> np.ndarray:
-        return (runs > np.reshape(thresholds, (-1, 1))).mean(axis=-1)
+    def fractions(runs: Any) -> np.ndarray:
+        return (np.asarray(runs, float) > np.reshape(thresholds, (-1, 1))).mean(axis=-1)
 
-    resamples = _resamples(np.random.default_rng(seed), strata, num_resamples)
-    low, high = _ends(np.array([fractions(runs) for runs in resamples]), level)
-    return fractions(np.concatenate(strata)), low, high
-
-
-def _resamples(rng: np.random.Generator, strata: Sequence[Any], count: int) -> np.ndarray:
-    """All runs, drawn again within their strata: `[resample, run]`."""
-    arrays = [np.asarray(runs, float) for runs in strata]
-    return np.concatenate(
-        [runs[rng.integers(0, runs.size, (count, runs.size))] for runs in arrays], axis=1
-    )
+    each = np.array([fractions(runs) for runs in groups])
+    low, high = np.array([mean_interval(column) for column in each.T]).clip(0, 1).T
+    return fractions(np.concatenate([*groups])), low, high
 
 
-def _ends(values: np.ndarray, level: float) -> np.ndarray:
-    """Percentiles `[2, ...]` of values `[resample, ...]` between which a share `level` lies."""
-    return np.quantile(values, [(1 - level) / 2, (1 + level) / 2], axis=0)
+def bca_interval(
+    estimate: float, drawn: Any, left_out: Any, level: float = LEVEL
+) -> tuple[float, float]:
+    """Bias-corrected and accelerated bootstrap interval, for what has no Student's interval.
+
+    Args:
+      estimate: of all values.
+      drawn: estimates of values that were drawn again, `[resample]`; nan is left out.
+      left_out: estimates without one value each, `[n]`; `NONE` for fewer than `LEAST`.
+      level: of confidence.
+
+    Source: Efron, "Better bootstrap confidence intervals" (1987).
+    """
+    drawn, left_out = (x[~np.isnan(x)] for x in (np.asarray(drawn), np.asarray(left_out)))
+    if left_out.size < LEAST or drawn.size == 0 or np.isnan(estimate):
+        return NONE
+    share = ((drawn < estimate).mean() + (drawn <= estimate).mean()) / 2
+    least = 0.5 / drawn.size
+    bias = norm.ppf(np.clip(share, least, 1 - least))
+    away = left_out.mean() - left_out
+    spread = 6 * (away**2).sum() ** 1.5
+    acceleration = (away**3).sum() / spread if spread else 0.0
+    ends = bias + norm.ppf([(1 - level) / 2, (1 + level) / 2])
+    low, high = np.quantile(drawn, norm.cdf(bias + ends / (1 - acceleration * ends)))
+    return float(low), float(high)

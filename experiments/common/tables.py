@@ -11,9 +11,6 @@ from rich.table import Table
 from experiments.common.experiment import Settings
 from experiments.common.statistics import (
     LEAST,
-    bootstrap_interval,
-    interquartile_mean,
-    iqm_interval,
     mean_interval,
 )
 from sejax.ops.files import write_text
@@ -50,20 +47,7 @@ def summary_by(
     )
 
 
-def in_strata(values: pd.Series, groups: pd.Series | None) -> list[pd.Series]:
-    """Values apart by their labels; all together where there are none."""
-    return [values] if groups is None else [mine for _, mine in values.groupby(groups)]
-
-
-def iqm_columns(values: pd.Series, name: str, groups: pd.Series | None = None) -> dict[str, float]:
-    """Interquartile mean and its interval as columns `NAME_iqm`, `NAME_iqm_low`, `NAME_iqm_high`.
-
-    Values with labels are drawn again within their groups; without, they are independent.
-    """
-    strata = in_strata(values, groups)
-    low, high = iqm_interval(values) if groups is None else bootstrap_interval(*strata)
-    columns = {"iqm": interquartile_mean(values), "iqm_low": low, "iqm_high": high}
-    return {f"{name}_{statistic}": value for statistic, value in columns.items()}
+WORST_NOTE = " Worst tenth: the mean of the lowest tenth of what the mean is over."
 
 
 def brackets(low: float, high: float, digits: int) -> str:
@@ -87,20 +71,9 @@ def mean_text(name: str, digits: int, std: bool = False) -> Callable[[Any], str]
     return with_interval(f"{name}_mean", name, digits, f"{name}_std" if std else "")
 
 
-def iqm_text(name: str) -> Callable[[Any], str]:
-    """Makes a text of the columns of `iqm_columns`."""
-    return with_interval(f"{name}_iqm", f"{name}_iqm", 1)
-
-
 def interval_note(of: str) -> str:
     """What a reader must know of means' intervals, and what they take as independent."""
     return f"In brackets Student's 95% interval over {of}, none for fewer than {LEAST}."
-
-
-def iqm_note(where: str = "", of: str = "agents") -> str:
-    """The same of interquartile means."""
-    how = f", within SEs or RNs by a stratified bootstrap ({of} {where})" if where else ""
-    return f" IQM: the interquartile mean over {of}, with its 95% interval{how}."
 
 
 def as_texts(
