@@ -317,7 +317,8 @@ class Scoring:
             return scores
         num_population = scores.population.shape[0]
         each = self.signed(jnp.concatenate([scores.population, scores.incumbent]))
-        return scores.replace(
+        return dataclasses.replace(
+            scores,
             population=each[:num_population],
             incumbent=each[num_population:],
             agent_means=scores.agent_means * self.mixture.signs,
