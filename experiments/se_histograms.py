@@ -335,7 +335,7 @@ def draw(task: Task, bins: pd.DataFrame, path: Path) -> None:
             for axis, (column, name) in zip(line, names.items(), strict=True):
                 mine = bins[(bins["kind"] == kind) & (bins["dimension"] == column)]
                 values = centres(mine)
-                samples = {s: np.repeat(values, mine[s].astype(int)).to_numpy() for s in SOURCES}
+                samples = {s: values.repeat(mine[s].astype(int)).to_numpy() for s in SOURCES}
                 edges = bin_edges(mine, samples)
                 for source, values in samples.items():
                     color, _ = SOURCES[source]

@@ -58,6 +58,9 @@ def frame_of(root: Path, rows: str) -> Any:
                 for each in proxy.evaluations
             ]
         )
+    if "*" in rows:
+        found = sorted(root.glob(rows))
+        return pd.concat([read_rows(path).assign(folder=path.parent.name) for path in found])
     path = root / rows
     if not path.exists():
         raise WrongError(f"there are no rows {rows}")

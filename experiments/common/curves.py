@@ -58,10 +58,12 @@ def on_grid(curves: pd.DataFrame, grid: np.ndarray, window: int = WINDOW) -> np.
     The value at a step of the grid is that of the last finished episode; nan before the first.
     """
     rows = []
-    for _, curve in curves.groupby("agent"):
-        place = np.searchsorted(curve["steps"], grid, side="right") - 1
-        smoothed = curve["test_return"].rolling(window, min_periods=1).mean().to_numpy()
-        rows.append(np.where(place >= 0, smoothed[place], np.nan))
+    for _, curve in curves.groupby("agent")[["steps", "test_return"]]:
+        values = curve["test_return"]
+        if window > 1:
+            values = values.rolling(window, min_periods=1).mean()
+        place = np.searchsorted(curve["steps"].to_numpy(), grid, side="right") - 1
+        rows.append(np.where(place >= 0, values.to_numpy()[place], np.nan))
     return np.stack(rows)
 
 
