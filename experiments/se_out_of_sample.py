@@ -60,10 +60,9 @@ class SeOutOfSample(Settings):
     name = "se_out_of_sample"
 
     env: str = setting("cartpole", one_of(tuple(FILES)))  # the task
-    # Files of SEs learned with one agent (fixed) and with drawn hyperparameters (varied); those of
-    # se_feasibility where neither is given.
+    # File of SEs learned with one agent; where no file is given, those of se_feasibility.
     fixed: str | None = setting(None)
-    varied: str | None = setting(None)
+    varied: str | None = setting(None)  # file of SEs learned with drawn hyperparameters
     agents: tuple[str, ...] = setting(KINDS, each_of(KINDS), quick=("ddqn", "ppo"))  # kinds
     # Hyperparameters of the agents; varied: drawn for each.
     hparams: tuple[str, ...] = setting(HPARAMS, each_of(HPARAMS), quick=("default",))
