@@ -70,6 +70,7 @@ def test_sets_are_summarised_over_their_ses_and_share_those_that_are_in_both():
     assert two["return_0_99_worst"] == 60, "of twenty agents the two worst, 20 and 100"
 
 
+@pytest.mark.slow
 def test_a_discount_that_is_traced_is_that_of_the_configuration():
     task = sejax.envs.make("cartpole")
     env = sejax.SyntheticConfig(hidden_size=4).make(task)
