@@ -260,7 +260,7 @@ def draw(settings: SeOutOfSample, rows: pd.DataFrame) -> None:
         names = [name for name in SHOWN if name in {*rows["trained_on"], "real_more"}]
         handles = [figures.plt.Line2D([], [], color=SHOWN[name][0], lw=3) for name in names]
         labels = [SHOWN[name][1] for name in names]
-        columns = len(names) if len(kinds) > 2 else 2
+        columns = min(len(names), max(len(kinds), 2))
         figure.legend(handles, labels, ncols=columns, loc="outside upper center")
 
 
@@ -269,7 +269,7 @@ def colored(rows: pd.DataFrame, returns: list[str]) -> list[tuple[str, Any]]:
     found = []
     for name, mine in rows.groupby("trained_on", sort=False):
         least, most = mine["steps"].min(), mine["steps"].max()
-        named = {str(name): least} | ({"real_more": most} if name == "real" else {})
+        named = {str(name): least} | ({"real_more": most} if most > least else {})
         for label, steps in named.items():
             values = mine.loc[mine["steps"] == steps, returns].to_numpy(float).ravel()
             found.append((SHOWN[label][0], values))
