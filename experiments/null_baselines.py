@@ -26,7 +26,14 @@ import pandas as pd
 
 import sejax
 from experiments.common import bandits, figures, tables
-from experiments.common.agents import HPARAMS, Condition, Group, groups_at_once, train_groups
+from experiments.common.agents import (
+    HPARAMS,
+    Condition,
+    Group,
+    groups_at_once,
+    kinds_of_students,
+    train_groups,
+)
 from experiments.common.bandits import Copied, PolicyBandit
 from experiments.common.experiment import Experiment, Settings, count, setting
 from experiments.common.shards import stack, unstack
@@ -34,10 +41,8 @@ from sejax import envs
 from sejax.options import each_of, one_of, positive
 
 SOURCES = ("by_hand", "agent", "episodes", "search", "evolved")
-DISCRETE = ("ddqn", "dueling_ddqn", "ppo", "sac", "td3_discrete")
-CONTINUOUS = ("td3", "sac", "ppo")
-# Two kinds of teachers for each task, and their real steps: guesses after docs/agents.md, whose
-# seeds are others. How well a teacher has learned stands in the table.
+# Two kinds of teachers for each task, and their real steps: guesses, made on other
+# seeds. How well a teacher has learned stands in the table.
 TEACHERS: dict[str, dict[str, int]] = {
     "cartpole": {"ppo": 5_000, "ddqn": 8_000},
     "cartpole_v1": {"ppo": 10_000, "ddqn": 15_000},
@@ -99,7 +104,7 @@ class NullBaselines(Settings):
     @property
     def kinds(self) -> tuple[str, ...]:
         """The kinds of students."""
-        return self.students or (CONTINUOUS if self.task.num_actions is None else DISCRETE)
+        return self.students or kinds_of_students(self.task)
 
 
 def makers(settings: NullBaselines, source: str) -> Iterator[tuple[str, Callable[[], Copied]]]:

@@ -19,7 +19,7 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pandas as pd
@@ -27,7 +27,15 @@ import pandas as pd
 import sejax
 from experiments import se_myopia
 from experiments.common import figures, runs, tables
-from experiments.common.agents import Condition, Group, train_groups, tuned_agent
+from experiments.common.agents import (
+    CONTINUOUS,
+    DISCRETE,
+    Condition,
+    Group,
+    kinds_of_students,
+    train_groups,
+    tuned_agent,
+)
 from experiments.common.experiment import Experiment, count, setting
 from experiments.common.runs import RunSettings
 from experiments.common.shards import stack, unstack, write_rows
@@ -51,19 +59,19 @@ MYOPIC = "myopic"  # agent of `against_myopic`: as the learning one, but for its
 # each, where no action is dear.
 NOT_BANDIT = {
     ("pendulum", "td3"): (
-        *("agent.warmup_episodes=1", "agent.action_noise_std=0.1", "agent.policy_delay=2"),
+        "agent.warmup_episodes=1",
+        "agent.action_noise_std=0.1",
+        "agent.policy_delay=2",
     ),
     ("pendulum", "sac"): ("agent.warmup_episodes=1",),
 }
-NUM_RUNS = {"cartpole": 10, "acrobot": 10}
-DISCRETE = ("ddqn", "dueling_ddqn", "ppo", "sac", "td3_discrete")
-CONTINUOUS = ("td3", "sac", "ppo")
 QUICK = (*runs.QUICK, "agent.hidden_size=32", "agent.batch_size=32")
 
 
 @dataclass(frozen=True, kw_only=True)
 class SeDynamics(RunSettings):
     name = "se_dynamics"
+    num_runs: ClassVar[Mapping[str, int]] = {"cartpole": 10, "acrobot": 10}
 
     generations: int | None = count(40, quick=3)  # outer iterations
     kinds: tuple[str, ...] = setting(tuple(KINDS), each_of(tuple(KINDS)))  # of SEs
@@ -76,13 +84,6 @@ class SeDynamics(RunSettings):
     # Difference that counts as none, as in se_myopia.
     margin: float = setting(0.1, positive("a difference is never measured as 0", 1))
 
-    @classmethod
-    def defaults(cls, given: Mapping[str, Any]) -> dict[str, Any]:
-        default = super().defaults(given)
-        if not given.get("quick"):
-            default["runs"] = NUM_RUNS.get(given.get("env", default["env"]), default["runs"])
-        return default
-
     @property
     def tested(self) -> tuple[str, ...]:
         """The kinds of students."""
@@ -90,7 +91,7 @@ class SeDynamics(RunSettings):
 
     @property
     def _fitting(self) -> tuple[str, ...]:
-        return CONTINUOUS if envs.make(self.env).num_actions is None else DISCRETE
+        return kinds_of_students(envs.make(self.env))
 
     @property
     def learner(self) -> str:

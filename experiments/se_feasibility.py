@@ -10,7 +10,7 @@ into `ses.safetensors`, which the other experiments read (`ses`, `varied`, `fixe
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pandas as pd
@@ -22,8 +22,6 @@ from experiments.common.runs import RunSettings
 from experiments.common.statistics import worst_tenth
 from sejax.cli.config import AGENT_HPARAMS
 from sejax.options import one_of, require
-
-NUM_RUNS = {"cartpole": 10}
 
 # A small proxy and agents that learn enough to be seen moving.
 QUICK = [
@@ -52,17 +50,11 @@ PAPER = {
 @dataclass(frozen=True, kw_only=True)
 class SeFeasibility(RunSettings):
     name = "se_feasibility"
+    num_runs: ClassVar[Mapping[str, int]] = {"cartpole": 10}
 
     runs: int = count(5, quick=3)  # independent NES runs; cartpole 10
     agent: str | None = setting(None)  # that the SEs are learned with; the task's choice
     agent_hparams: str = setting("default", one_of(AGENT_HPARAMS))  # varied: drawn for each agent
-
-    @classmethod
-    def defaults(cls, given: Mapping[str, Any]) -> dict[str, Any]:
-        default = super().defaults(given)
-        if not given.get("quick"):
-            default["runs"] = NUM_RUNS.get(given.get("env", default["env"]), default["runs"])
-        return default
 
 
 def compute(settings: SeFeasibility) -> pd.DataFrame:

@@ -20,6 +20,7 @@ import pandas as pd
 import sejax
 from experiments.common import bandits, figures, tables
 from experiments.common.agents import (
+    DISCRETE,
     HPARAMS,
     Condition,
     Group,
@@ -34,7 +35,6 @@ from experiments.common.statistics import worst_tenth
 from sejax import ProxySet, Task, TrainingConfig, envs
 from sejax.options import each_of, one_of, require, seed
 
-KINDS = ("ddqn", "dueling_ddqn", "ppo", "sac", "td3_discrete")
 FOLDER = "results/se_feasibility"
 FILES = {  # of SEs learned with one agent (fixed) and with drawn hyperparameters (varied)
     "cartpole": {
@@ -63,7 +63,7 @@ class SeOutOfSample(Settings):
     # File of SEs learned with one agent; where no file is given, those of se_feasibility.
     fixed: str | None = setting(None)
     varied: str | None = setting(None)  # file of SEs learned with drawn hyperparameters
-    agents: tuple[str, ...] = setting(KINDS, each_of(KINDS), quick=("ddqn", "ppo"))  # kinds
+    agents: tuple[str, ...] = setting(DISCRETE, each_of(DISCRETE), quick=("ddqn", "ppo"))  # kinds
     # Hyperparameters of the agents; varied: drawn for each.
     hparams: tuple[str, ...] = setting(HPARAMS, each_of(HPARAMS), quick=("default",))
     num_ses: int = count(40, quick=5)  # SEs of a set at most

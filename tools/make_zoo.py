@@ -52,7 +52,8 @@ hold no data of others.
 def page() -> str:
     """The text of the page."""
     proxies = sejax.pretrained()
-    rows = [row(proxy, verdicts()) for proxy in proxies]
+    tested = verdicts()
+    rows = [row(proxy, tested) for proxy in proxies]
     return HEAD + "\n\n".join([table(rows), *map(section, proxies)]) + "\n"
 
 

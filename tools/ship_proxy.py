@@ -6,7 +6,8 @@
 
 Fresh agents of each kind train on it and are tested on the real task (`python -m sejax.evaluate`),
 with each choice of hyperparameters. The run directory tells what learning it cost; the curves beside
-a set of `experiments/` tell the real steps; a bare file tells nothing. Writes `sejax/pretrained/NAME.safetensors`; then `python tools/make_zoo.py` makes docs/zoo.md.
+a set of `experiments/` tell the real steps; a bare file tells nothing. Writes
+`sejax/pretrained/NAME.safetensors`; then `python tools/make_zoo.py` makes docs/zoo.md.
 """  # noqa: E501
 
 import argparse

@@ -27,6 +27,9 @@ from sejax.options.plain import to_plain
 from sejax.training import TrainingConfig
 
 HPARAMS = ("varied", "default")
+# Kinds of students, where actions are discrete and where they are continuous.
+DISCRETE = ("ddqn", "dueling_ddqn", "ppo", "sac", "td3_discrete")
+CONTINUOUS = ("td3", "sac", "ppo")
 GROUPS_AT_ONCE = 5  # groups of agents in one program, but for one CPU device
 
 
@@ -269,6 +272,11 @@ def return_columns(agents: pd.DataFrame) -> list[str]:
 def tuned_agent(env: str, kind: str) -> Any:
     """The agent of that kind with what was found on real tasks for few steps (docs/agents.md)."""
     return sejax.config([f"env={env}", f"agent={kind}"]).agent
+
+
+def kinds_of_students(task: Task) -> tuple[str, ...]:
+    """The kinds of agents that fit a task's actions; the first is the one that SEs are for."""
+    return CONTINUOUS if task.num_actions is None else DISCRETE
 
 
 # --- agents on SEs -------------------------------------------------------------------------------

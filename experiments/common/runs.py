@@ -7,10 +7,10 @@ of its own: one that was stopped goes on, and a finished one is kept.
 import contextlib
 import dataclasses
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import numpy as np
@@ -35,12 +35,22 @@ UNLIMITED = 100_000  # generations of a run that its budget ends
 
 @dataclass(frozen=True, kw_only=True)
 class RunSettings(Settings):
-    """Settings about the NES runs."""
+    """Settings about the NES runs; `num_runs` has the default of a field `runs` by task."""
+
+    num_runs: ClassVar[Mapping[str, int]] = {}
 
     env: str = setting("cartpole")  # task: cartpole, acrobot, ...
     generations: int | None = count(None)  # outer iterations; the preset's
     preset: str = setting("best")  # of the NES runs: best, paper, for SEs paper_performance
     run: tuple[str, ...] = setting(())  # overrides of the NES runs, or as below
+
+    @classmethod
+    def defaults(cls, given: Mapping[str, Any]) -> dict[str, Any]:
+        default = super().defaults(given)
+        task = given.get("env", default["env"])
+        if not given.get("quick") and task in cls.num_runs:
+            default["runs"] = cls.num_runs[task]
+        return default
 
     def learn_config(self, overrides: Iterable[str]) -> Any:
         """The configuration of the NES runs with these overrides; those of `run` win."""
