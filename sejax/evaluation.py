@@ -6,7 +6,7 @@ Agents".
 
 import dataclasses
 from collections.abc import Callable, Sequence
-from typing import Any, Literal, NamedTuple, cast, overload
+from typing import Any, Literal, NamedTuple, overload
 
 import jax
 import jax.numpy as jnp
@@ -50,13 +50,6 @@ class Steps(NamedTuple):
     valid: Bool[Array, " step"]
 
 
-class Place(NamedTuple):
-    """An environment that an agent can be tested in, as a task is."""
-
-    env: Any
-    params: Any
-
-
 class Tests(NamedTuple):
     """Results of greedy episodes.
 
@@ -87,12 +80,12 @@ class _Episode:
 class _Greedy:
     """One greedy episode of an agent on a task: its beginning, and each step."""
 
-    def __init__(self, agent: Agent, task: Task | Place):
-        self.agent, self.params = agent, cast(Any, task.params)
-        self.env = repeat_actions(task.env, agent.spec.action_repeat)
+    def __init__(self, agent: Agent, env: Any, params: Any = None):
+        self.agent, self.params = agent, params
+        self.env = repeat_actions(env, agent.spec.action_repeat)
 
-    def begin(self, key: Array, active: Array | bool) -> _Episode:
-        obs, env_state = self.env.reset_env(key, self.params)
+    def begin(self, key: Array, active: Array | bool, params: Any = None) -> _Episode:
+        obs, env_state = self.env.reset_env(key, self.params if params is None else params)
         return _Episode(
             active=jnp.asarray(active),
             num_steps=jnp.int32(0),
@@ -103,22 +96,29 @@ class _Greedy:
         )
 
     def step(
-        self, key: Array, agent_state: AgentState, before: _Episode, eval_steps: Array | None = None
+        self,
+        key: Array,
+        agent_state: AgentState,
+        before: _Episode,
+        eval_steps: Array | None = None,
+        own_params: Any = None,
     ) -> tuple[_Episode, Steps]:
         """The episode after a decision, and the decision; `key` is that of the whole episode.
 
-        With `eval_steps` the episode may last that long, beyond the task's limit too.
+        With `eval_steps` the episode may last that long, beyond the task's limit too. `own_params`
+        are the environment's in this episode, if not those of all.
         """
+        params = self.params if own_params is None else own_params
         key_act, key_env = step_keys(key, before.num_steps, 2)
         action = self.agent.act(key_act, agent_state, before.obs, explore=False)
         action = self.agent.env_action(action)
-        params = longest = self.params
+        longest = params
         is_within: Any = True  # the task's limit, where a repeated action ends too
         if eval_steps is not None:
-            limit = self.params.max_steps_in_episode
+            limit = params.max_steps_in_episode
             is_within, most = before.num_steps < limit, jnp.maximum(limit, eval_steps)
-            longest = self.params.replace(max_steps_in_episode=most)
-            params = self.params.replace(max_steps_in_episode=jnp.where(is_within, limit, most))
+            longest = params.replace(max_steps_in_episode=most)
+            params = params.replace(max_steps_in_episode=jnp.where(is_within, limit, most))
         obs, env_state, reward, terminated, info = self.env.step_env(
             key_env, before.env_state, action, params
         )
@@ -139,30 +139,13 @@ class _Greedy:
         return after, made
 
 
-def make_tester(agent: Agent, task: Task | Place, num_episodes: int) -> Callable[..., Tests]:
+def make_tester(agent: Agent, task: Task, num_episodes: int) -> Callable[..., Tests]:
     """Builds `test(key, agent_state, active=True, eval_steps=None) -> Tests`.
 
-    Episodes on the real task, or in another place, without exploration, each from a fresh initial
-    state. With
+    Episodes on the real task without exploration, each from a fresh initial state. With
     `active=False` nothing is played and all results are 0.
     """
-    greedy = _Greedy(agent, task)
-
-    def step(
-        nothing: Array, state: _Episode, consts: PyTree, masked: bool
-    ) -> tuple[Array, _Episode]:
-        key, agent_state, eval_steps = consts
-        after, _ = greedy.step(key, agent_state, state, eval_steps)
-        return nothing, after
-
-    def episode(
-        key: Array, agent_state: AgentState, active: Array | bool, eval_steps: Array | None
-    ) -> Tests:
-        key_reset, key_steps = jax.random.split(key)
-        state = greedy.begin(key_reset, active)
-        consts = (key_steps, agent_state, eval_steps)
-        _, state = while_any_active(step, jnp.zeros(0), state, consts)
-        return Tests(state.total, state.num_steps, state.scored)
+    play = _make_player(_Greedy(agent, task.env, task.params), num_episodes)
 
     def test(
         key: Array,
@@ -170,11 +153,50 @@ def make_tester(agent: Agent, task: Task | Place, num_episodes: int) -> Callable
         active: Array | bool = True,
         eval_steps: Array | None = None,
     ) -> Tests:
-        keys = jax.random.split(key, num_episodes)
-        in_axes = (0, None, None, None)
-        return jax.vmap(episode, in_axes)(keys, agent_state, active, eval_steps)
+        return play(key, agent_state, active, eval_steps, None)
 
     return test
+
+
+def make_proxy_tester(agent: Agent, proxy: Any, num_episodes: int) -> Callable[..., Tests]:
+    """Builds `test(key, agent_state, env_params, active=True) -> Tests`: episodes on a proxy.
+
+    As of `make_tester`, but on the proxy with these weights.
+    """
+    play = _make_player(_Greedy(agent, proxy), num_episodes)
+    return lambda key, agent_state, env_params, active=True: play(
+        key, agent_state, active, None, env_params
+    )
+
+
+def _make_player(greedy: _Greedy, num_episodes: int) -> Callable[..., Tests]:
+    """Builds `play(key, agent_state, active, eval_steps, params) -> Tests`."""
+
+    def step(
+        nothing: Array, state: _Episode, consts: PyTree, masked: bool
+    ) -> tuple[Array, _Episode]:
+        key, agent_state, eval_steps, params = consts
+        after, _ = greedy.step(key, agent_state, state, eval_steps, params)
+        return nothing, after
+
+    def episode(
+        key: Array,
+        agent_state: AgentState,
+        active: Array | bool,
+        eval_steps: Array | None,
+        params: PyTree,
+    ) -> Tests:
+        key_reset, key_steps = jax.random.split(key)
+        state = greedy.begin(key_reset, active, params)
+        consts = (key_steps, agent_state, eval_steps, params)
+        _, state = while_any_active(step, jnp.zeros(0), state, consts)
+        return Tests(state.total, state.num_steps, state.scored)
+
+    def play(key: Array, *arguments: PyTree) -> Tests:
+        keys = jax.random.split(key, num_episodes)
+        return jax.vmap(episode, in_axes=(0, None, None, None, None))(keys, *arguments)
+
+    return play
 
 
 def make_recorder(
@@ -185,7 +207,7 @@ def make_recorder(
     The episodes are those of `make_tester` with the same key. A decision that an agent repeats is
     one step here.
     """
-    greedy = _Greedy(agent, task)
+    greedy = _Greedy(agent, task.env, task.params)
 
     def episode(key: Array, agent_state: AgentState) -> Steps:
         key_reset, key_steps = jax.random.split(key)

@@ -17,17 +17,19 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, PyTree
 
 from sejax import landscapes
+from sejax.agents import make_agent
 from sejax.agents.base import Agent, AgentConfig, Hparams, with_hparams
 from sejax.agents.mixture import Mixture
 from sejax.envs.base import Task
-from sejax.evaluation import Place, make_tester, num_parallel_on_cpu
+from sejax.evaluation import make_proxy_tester, num_parallel_on_cpu
 from sejax.landscapes import Landscape
 from sejax.objectives import Agreement, Evaluator, Objective, Outcome
-from sejax.ops.parallel import map_in_batches, on_cpu
+from sejax.ops.parallel import compiler_options, map_in_batches, on_cpu, spread_over_devices
 from sejax.options import Options, between, counts, marks, one_of, option, require, shortened
 from sejax.options.plain import to_plain
 from sejax.proxies.base import ProxyEnv
-from sejax.training import TrainingConfig, make_trainer
+from sejax.proxies.io import ProxySet
+from sejax.training import TrainingConfig, make_trainer, training_of
 
 AGREEMENTS = ("spearman", "top")
 MEASURES = ("both", "greedy", "training")
@@ -41,6 +43,8 @@ class Ranking(Options):
     scores_are_returns: ClassVar[bool] = False
 
     landscape: str | None = None  # CSV file of `python -m sejax.landscape`
+    # Of a training of the landscape; null: as its file says, which is then kept with the proxy.
+    steps: int | None = option(None, counts("an agent must train"))
     # What an agent reaches on an SE: the return of greedy episodes, that of its training episodes,
     # or both, whose agreements are averaged.
     measure: str = option("both", one_of(MEASURES))
@@ -56,6 +60,12 @@ class Ranking(Options):
     num_seeds: int = option(1, counts("an agent must train"))
     num_judging_seeds: int = option(4, counts("an agent must train"))
     num_tests: int = option(32, counts("an agent must be tested"))  # greedy episodes on the SE
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.landscape is not None and self.steps is None:
+            found = landscapes.read(self.landscape, f"{self.group}.landscape")
+            object.__setattr__(self, "steps", next(iter(found.values())).steps)
 
     def make(self, task: Task) -> Objective:
         """The objective on a task.
@@ -97,6 +107,12 @@ class Ranking(Options):
                 each.task == task,
                 field,
                 f"must be of {task}; got one of {shortened(each.task)}. Set env={each.task}.",
+            )
+            require(
+                each.steps == self.steps,
+                f"{self.group}.steps",
+                f"must be {each.steps}, of the landscape; got {self.steps}. Set "
+                f"{self.group}.steps=null.",
             )
             num_judging = self.num_judging(each)
             require(
@@ -231,14 +247,14 @@ def make_measure(
 ) -> Callable[..., Reached]:
     """Builds `measure(key, env_params, hparams, active=True) -> Reached` of one agent on an SE."""
     train = make_trainer(agent, proxy, training)
+    test = make_proxy_tester(agent, proxy, num_tests)
 
     def measure(
         key: Array, env_params: PyTree, hparams: Hparams, active: Array | bool = True
     ) -> Reached:
         key_train, key_test = jax.random.split(key)
         result = train(key_train, env_params, hparams, active)
-        test = make_tester(agent, Place(proxy, env_params), num_tests)
-        greedy = test(key_test, result.agent_state, active).returns.mean()
+        greedy = test(key_test, result.agent_state, env_params, active).returns.mean()
         mean = jnp.nansum(result.returns) / jnp.maximum(1, result.episodes)
         survived = ~result.nonfinite & jnp.isfinite(greedy) & jnp.isfinite(mean)
         return Reached(
@@ -275,12 +291,17 @@ def configurations_of(
 ) -> Configurations:
     """A landscape's configurations in a training of `steps` steps on an SE."""
     factor = (steps or landscape.steps) / landscape.steps
-    counted = {name for name in landscape.values if marks(cls, name).get("counts_steps")}
-    values = {
-        name: jnp.float32(np.maximum(1, np.round(x * factor)) if name in counted else x)
-        for name, x in landscape.values.items()
-    }
+    values = scaled_values(cls, landscape.values, factor)
     return Configurations(agent, values, jnp.float32(landscape.mean_returns))
+
+
+def scaled_values(cls: type, values: Mapping[str, np.ndarray], factor: float) -> dict[str, Array]:
+    """Values of options, `[config]` each, in a training that is `factor` times as long."""
+    counted = {name for name in values if marks(cls, name).get("counts_steps")}
+    return {
+        name: jnp.float32(np.maximum(1, np.round(x * factor)) if name in counted else x)
+        for name, x in values.items()
+    }
 
 
 def reach(
@@ -310,6 +331,89 @@ def reach(
 
     reached = map_in_batches(one, num_parallel, (keys.reshape(-1), places))
     return jax.tree.map(lambda x: x.reshape(num_configs, num_seeds), reached)
+
+
+# --- tuning on an SE -----------------------------------------------------------------------------
+
+
+def reached_on(
+    ses: ProxySet,
+    agent: AgentConfig,
+    values: Mapping[str, np.ndarray],
+    *,
+    training: TrainingConfig | None = None,
+    num_seeds: int = 4,
+    num_tests: int = 32,
+    seed: int = 0,
+    devices: int | None = None,
+) -> Reached:
+    """What configurations reach on SEs that were learned with `objective=ranking`.
+
+    `mean_rank` of the result orders them.
+
+    Args:
+      ses: from `sejax.load_set`.
+      agent: with room for all configurations, as it trains on the SE.
+      values: by option, what each configuration sets on the real task, `[config]`. Options that
+        count steps are scaled to a training on the SE.
+      training: on the SE; by default as the SEs were learned with.
+      num_seeds: trainings of each configuration on each SE.
+      num_tests: greedy episodes after each.
+      seed: of all of them.
+      devices: None for all.
+
+    Returns:
+      Leaves `[se, config, seed]`.
+
+    Raises:
+      ConfigError: for SEs that were not learned so.
+    """
+    stored = ses.config.get("objective", {})
+    require(
+        stored.get("name") == "ranking" and stored.get("steps"),
+        "proxy",
+        f"must be learned with objective=ranking; got {shortened(ses.path)}. Learn one with "
+        "preset=ranking objective.landscape=FILE.csv.",
+    )
+    training = training or training_of(ses)
+    factor = (training.max_steps or stored["steps"]) / stored["steps"]
+    made = make_agent(agent, ses.task)
+    own = scaled_values(type(agent), values, factor)
+    measure = make_measure(made, ses.env, training, num_tests)
+    shape = (len(ses), len(next(iter(values.values()))), num_seeds)
+
+    def one(key: Array, weights: PyTree, values: dict[str, Array]) -> Reached:
+        return measure(key, ses.env.params(weights, ses.discount), hparams_of(made, values))
+
+    def all_of(weights: PyTree, own: dict[str, Array]) -> Reached:
+        se, config, _ = (x.reshape(-1) for x in np.indices(shape))
+        # The same keys on all SEs: their differences are those of the SEs.
+        keys = jnp.broadcast_to(jax.random.split(jax.random.key(seed), shape[1:]), shape)
+        spread = spread_over_devices(one, devices, None, num_parallel_on_cpu(made, training))
+        of_each = jax.tree.map(lambda x: x[se], weights), jax.tree.map(lambda x: x[config], own)
+        reached = spread(keys.reshape(-1), *of_each)
+        return jax.tree.map(lambda x: x.reshape(shape), reached)
+
+    compiled = jax.jit(all_of, compiler_options=compiler_options())
+    found: Reached = jax.device_get(compiled(ses.weights, own))
+    return found
+
+
+def mean_rank(reached: Reached, measure: str = "both") -> np.ndarray:
+    """Mean over SEs and measures of the ranks of configurations in [0, 1], `[config]`.
+
+    Args:
+      reached: leaves `[se, config, seed]`.
+      measure: as of `Ranking`.
+    """
+    kinds = measures_of(measure)
+    means = jnp.concatenate([jnp.asarray(getattr(reached, kind)).mean(axis=-1) for kind in kinds])
+    return np.asarray(jax.vmap(ranks)(means).mean(axis=0))
+
+
+def measures_of(measure: str) -> tuple[str, ...]:
+    """The fields of `Reached` that a measure looks at."""
+    return ("greedy", "training") if measure == "both" else (measure,)
 
 
 # --- agreement -----------------------------------------------------------------------------------
@@ -384,7 +488,7 @@ def make_evaluators(
         judging.append(each.take(places[first:]))
         measures.append(make_measure(agent, proxy, training, options.num_tests))
         widths.append(num_parallel_on_cpu(agent, training) if on_cpu() else None)
-    kinds = ("greedy", "training") if options.measure == "both" else (options.measure,)
+    kinds = measures_of(options.measure)
 
     def agree(
         key: Array,
@@ -460,4 +564,4 @@ def config_class(agent: str) -> type:
     return cls
 
 
-__all__ = ["Ranking", "agreement", "hparams_of", "make_measure", "ranks"]
+__all__ = ["Ranking", "Reached", "agreement", "mean_rank", "ranks", "reached_on"]

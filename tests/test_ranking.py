@@ -45,11 +45,16 @@ def table(num_configs=8, num_seeds=2, agent="ddqn", seed=0):
     return rows.assign(nonfinite=0, **{"return": rng.uniform(9, 200, len(rows))})
 
 
-@pytest.fixture
-def file(tmp_path):
-    path = tmp_path / "landscape.csv"
+def file_of(folder):
+    """The file of a landscape."""
+    path = folder / "landscape.csv"
     landscapes.write(path, CARD, table())
     return path
+
+
+@pytest.fixture
+def file(tmp_path):
+    return file_of(tmp_path)
 
 
 # --- ranks ---------------------------------------------------------------------------------------
@@ -161,6 +166,33 @@ def test_all_candidates_of_a_generation_train_the_same_configurations(learned, f
     outcome = jax.jit(learner.evaluate)(same)
     assert len(set(outcome.agreement.learned_from.tolist())) == 1
     assert outcome.train_steps.tolist()[0] == 2 * 3 * 60
+
+
+def test_what_configurations_reach_on_ses_is_what_each_agent_reaches(learned, tmp_path):
+    """Two SEs, three configurations, two seeds against agents that train one after the other."""
+    learner, _, asked, _, found = learned
+    weights = [learner.unravel(x) for x in asked.population[:2]]
+    config = sejax.config([*RUN, f"objective.landscape={file_of(tmp_path)}"])
+    path = tmp_path / "tuner.safetensors"
+    sejax.save_set(path, learner.proxy, weights, [{}, {}], config.plain())
+    ses = sejax.load_set(path)
+    values = {name: x[:3] for name, x in found.values.items()}
+    values["exploration_steps"] = np.array([50, 100, 1000])  # of 1,000 steps; 60 on the SE
+    reached = ranking.reached_on(ses, config.agent, values, num_seeds=2, num_tests=2, devices=1)
+    assert reached.greedy.shape == (2, 3, 2)
+    agent = sejax.make_agent(config.agent, ses.task)
+    measure = jax.jit(ranking.make_measure(agent, ses.env, config.training, 2))
+    keys = jax.random.split(jax.random.key(0), (3, 2))
+    for place in ((0, 0, 1), (1, 2, 0)):
+        se, i, seed = place
+        own = {name: x[i] for name, x in values.items()}
+        own["exploration_steps"] = [3, 6, 60][i]
+        alone = measure(keys[i, seed], ses[se].params, ranking.hparams_of(agent, own))
+        np.testing.assert_allclose(reached.greedy[place], alone.greedy, rtol=1e-5)
+        np.testing.assert_allclose(reached.training[place], alone.training, rtol=1e-5)
+    means = reached.greedy.mean(axis=-1)
+    expected = np.mean([ranks(jnp.asarray(x)) for x in means], axis=0)
+    np.testing.assert_allclose(ranking.mean_rank(reached, "greedy"), expected, atol=1e-6)
 
 
 # --- landscapes ----------------------------------------------------------------------------------
@@ -313,4 +345,4 @@ def test_a_run_learns_by_ranking_and_says_so(file, tmp_path, capsys):
     main([*RUN, f"objective.landscape={file}", "generations=2", f"run_dir={tmp_path / 'run'}"])
     assert "agreement of ranks" in capsys.readouterr().out
     stored = configuration.learn_config(sejax.load_proxy(tmp_path / "run").config)
-    assert stored.name("objective") == "ranking"
+    assert stored.name("objective") == "ranking" and stored.objective.steps == 1000
