@@ -5,8 +5,8 @@ Agents".
 """
 
 import dataclasses
-from collections.abc import Callable
-from typing import Any, Literal, NamedTuple, overload
+from collections.abc import Callable, Sequence
+from typing import Any, Literal, NamedTuple, cast, overload
 
 import jax
 import jax.numpy as jnp
@@ -19,7 +19,7 @@ from sejax.agents.mixture import Mixture
 from sejax.envs.base import Task
 from sejax.envs.wrappers import repeat_actions
 from sejax.es.base import StrategyState
-from sejax.objectives import Outcome
+from sejax.objectives import Evaluator, Objective, Outcome
 from sejax.ops.keys import step_keys
 from sejax.ops.loops import while_any_active
 from sejax.ops.parallel import (
@@ -48,6 +48,13 @@ class Steps(NamedTuple):
     reward: Float[Array, " step"]
     terminated: Bool[Array, " step"]
     valid: Bool[Array, " step"]
+
+
+class Place(NamedTuple):
+    """An environment that an agent can be tested in, as a task is."""
+
+    env: Any
+    params: Any
 
 
 class Tests(NamedTuple):
@@ -80,8 +87,8 @@ class _Episode:
 class _Greedy:
     """One greedy episode of an agent on a task: its beginning, and each step."""
 
-    def __init__(self, agent: Agent, task: Task):
-        self.agent, self.params = agent, task.params
+    def __init__(self, agent: Agent, task: Task | Place):
+        self.agent, self.params = agent, cast(Any, task.params)
         self.env = repeat_actions(task.env, agent.spec.action_repeat)
 
     def begin(self, key: Array, active: Array | bool) -> _Episode:
@@ -132,10 +139,11 @@ class _Greedy:
         return after, made
 
 
-def make_tester(agent: Agent, task: Task, num_episodes: int) -> Callable[..., Tests]:
+def make_tester(agent: Agent, task: Task | Place, num_episodes: int) -> Callable[..., Tests]:
     """Builds `test(key, agent_state, active=True, eval_steps=None) -> Tests`.
 
-    Episodes on the real task without exploration, each from a fresh initial state. With
+    Episodes on the real task, or in another place, without exploration, each from a fresh initial
+    state. With
     `active=False` nothing is played and all results are 0.
     """
     greedy = _Greedy(agent, task)
@@ -374,13 +382,21 @@ def evaluate_agents(
     return jax.jit(program, compiler_options=compiler_options())(keys)
 
 
-def make_candidate_evaluator(
-    agent: Agent, proxy: ProxyEnv, training: TrainingConfig, unravel: Callable[[Array], Any]
-) -> Callable[..., Outcome]:
-    """Builds `evaluate(key, params [dims], active, eval_steps) -> Outcome` for one candidate."""
-    evaluate = make_evaluator(agent, proxy, proxy.task, training)
-    return lambda key, params, active, eval_steps: evaluate(
-        key, proxy.params(unravel(params)), active, eval_steps
+def evaluators_of(
+    objective: Objective, mixture: Mixture, proxy: ProxyEnv, training: TrainingConfig
+) -> tuple[Evaluator, ...]:
+    """How candidates are evaluated: by the objective's own evaluators, or one for each agent.
+
+    An agent's trains it on the candidate and tests it on the real task.
+    """
+    if objective.evaluators is not None:
+        return objective.evaluators(mixture, proxy, training)
+    return tuple(
+        Evaluator(
+            run=make_evaluator(agent, proxy, proxy.task, training),
+            cpu_num_parallel=num_parallel_on_cpu(agent, training),
+        )
+        for agent in mixture.agents
     )
 
 
@@ -399,31 +415,35 @@ class Candidates:
 
 
 def make_population_evaluator(
-    mixture: Mixture,
-    proxy: ProxyEnv,
-    training: TrainingConfig,
-    unravel: Callable[[Array], Any],
-    agent_of_evaluation: np.ndarray,
+    evaluators: Sequence[Evaluator],
+    params_of: Callable[[Float[Array, " dims"]], PyTree],
+    evaluator_of_evaluation: np.ndarray,
     devices: int | None = None,
     num_parallel: int | None = None,
 ) -> Callable[[Candidates], Outcome]:
     """Builds `evaluate(candidates) -> Outcome`, leaves `[evaluation]`.
 
-    Trains one fresh agent for each evaluation and tests it on the real task. Evaluations are
-    grouped by agent when the program is built, so that no training executes another agent's
-    branch; each group is spread over the devices, and on each of them batches of `num_parallel`
-    follow one another.
+    Evaluations are grouped by evaluator when the program is built, so that no training executes
+    another agent's branch; each group is spread over the devices, and on each of them batches of
+    `num_parallel` follow one another.
+
+    Args:
+      evaluators: how one candidate is evaluated.
+      params_of: a candidate to the proxy's `EnvParams`.
+      evaluator_of_evaluation: index of the evaluator, `[evaluation]`.
+      devices: None for all.
+      num_parallel: None for what suits each evaluator.
 
     Raises:
       ConfigError: if there are fewer than `devices` devices.
     """
-    groups = [np.flatnonzero(agent_of_evaluation == i) for i in range(mixture.size)]
+    groups = [np.flatnonzero(evaluator_of_evaluation == i) for i in range(len(evaluators))]
     order = np.argsort(np.concatenate(groups))
     evaluate_groups = spread_groups_over_devices(
-        [make_candidate_evaluator(agent, proxy, training, unravel) for agent in mixture.agents],
+        [of_vectors(each, params_of) for each in evaluators],
         devices,
         num_parallel,
-        [num_parallel_on_cpu(agent, training) for agent in mixture.agents],
+        [each.cpu_num_parallel for each in evaluators],
     )
 
     def evaluate(candidates: Candidates) -> Outcome:
@@ -438,3 +458,12 @@ def make_population_evaluator(
         return jax.tree.map(lambda *parts: jnp.concatenate(parts)[order], *outcomes)
 
     return evaluate
+
+
+def of_vectors(
+    evaluator: Evaluator, params_of: Callable[[Float[Array, " dims"]], PyTree]
+) -> Callable[..., Outcome]:
+    """`evaluator.run` for a candidate as a flat vector: `(key, vector, active, eval_steps)`."""
+    return lambda key, vector, active, eval_steps: evaluator.run(
+        key, params_of(vector), active, eval_steps
+    )

@@ -18,6 +18,8 @@ from sejax.agents.mixture import Mixture
 from sejax.envs.base import Task
 from sejax.es.base import Evaluations, Strategy, finite_mean
 from sejax.options import Options, counts, not_negative, option, require
+from sejax.proxies.base import ProxyEnv
+from sejax.training import TrainingConfig
 
 
 @struct.dataclass
@@ -34,6 +36,8 @@ class Outcome:
         counts with the test return.
       nonfinite: whether a number that is not finite was met in training; the score is then nan.
       real_steps: steps on the real task: tests, and training where its dynamics are real.
+      agreement: of ranks with a landscape (`sejax.ranking`), of the configurations that are learned
+        from and of those that judge; None with other objectives.
     """
 
     test_returns: Float[Array, "*agent episode"]
@@ -43,11 +47,33 @@ class Outcome:
     auc: Float[Array, "*agent"]
     nonfinite: Bool[Array, "*agent"]
     real_steps: Int[Array, "*agent"]
+    agreement: "Agreement | None" = None
 
     @property
     def test_return(self) -> Float[Array, "*agent"]:
         """Mean over the test episodes."""
         return self.test_returns.mean(axis=-1)
+
+
+@struct.dataclass
+class Agreement:
+    """Agreement of ranks in [-1, 1], `[*agent]` float32."""
+
+    learned_from: Array
+    judging: Array
+
+
+@dataclass(frozen=True, kw_only=True)
+class Evaluator:
+    """How a candidate is evaluated.
+
+    Attributes:
+      run: `(key, env_params, active, eval_steps) -> Outcome`, of one candidate.
+      cpu_num_parallel: candidates in one vmapped batch on a CPU core; None for all.
+    """
+
+    run: Callable[..., Outcome]
+    cpu_num_parallel: int | None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,8 +88,12 @@ class Objective:
       scores_are_returns: whether scores are mean returns, which the task's threshold can be held
         against.
       eval_steps: `generation -> steps`, how much of the test episodes it scores, if not all: a
-        curriculum. It scores the population alone; incumbents are
-        scored by whole episodes.
+        curriculum.
+      judge: `outcome -> [agent]`, by which people see an incumbent and the best one is kept, if not
+        by `score`.
+      evaluators: `(mixture, proxy, training)` to two evaluators, of the population and of the
+        incumbent, each of a candidate with all agents; None where one agent of the mixture trains
+        on a candidate and is tested on the real task.
       meaning: of a score, for people.
     """
 
@@ -71,15 +101,19 @@ class Objective:
     needs_tests: bool = False
     scores_are_returns: bool = False
     eval_steps: Callable[[Array], Array] | None = None
+    judge: Callable[[Outcome], Float[Array, "*agent"]] | None = None
+    evaluators: (
+        Callable[[Mixture, ProxyEnv, TrainingConfig], tuple[Evaluator, Evaluator]] | None
+    ) = None
     meaning: str = ""
 
     def __call__(self, outcome: Outcome) -> Float[Array, "*agent"]:
         """Scores; nan for trainings that diverged."""
         return jnp.where(outcome.nonfinite, jnp.nan, self.score(outcome))
 
-    def of_whole_tests(self, outcome: Outcome) -> Float[Array, "*agent"]:
-        """Mean returns of whole test episodes, whatever of them is scored; nan likewise."""
-        return jnp.where(outcome.nonfinite, jnp.nan, outcome.test_return)
+    def judged(self, outcome: Outcome) -> Float[Array, "*agent"]:
+        """The scores that people see; nan likewise."""
+        return jnp.where(outcome.nonfinite, jnp.nan, (self.judge or self.score)(outcome))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -115,6 +149,7 @@ class MaxReward(Options):
             score=lambda outcome: outcome.scored_returns.mean(axis=-1),
             scores_are_returns=True,
             eval_steps=eval_steps,
+            judge=lambda outcome: outcome.test_return,
         )
 
 
@@ -264,6 +299,8 @@ class Scoring:
       evaluations: how often each candidate is evaluated.
       agent_of_candidate: index of the agent that trains on each candidate, `[pop]`.
       agent_of_evaluation: the same for each evaluation, `[evaluation]`.
+      evaluator_of_evaluation: index of the evaluator likewise: one for each agent, or with
+        `Objective.evaluators` that of the population, then that of the incumbent.
     """
 
     objective: Objective
@@ -271,6 +308,7 @@ class Scoring:
     evaluations: Evaluations
     agent_of_candidate: np.ndarray
     agent_of_evaluation: np.ndarray
+    evaluator_of_evaluation: np.ndarray
 
     @classmethod
     def of(cls, objective: Objective, strategy: Strategy, mixture: Mixture) -> "Scoring":
@@ -294,12 +332,19 @@ class Scoring:
         agent_of_candidate = mixture.agent_of_candidate(
             strategy.population_size, strategy.antithetic
         )
+        agent_of_evaluation = evaluations.agents(agent_of_candidate, mixture.size)
+        of_incumbent = np.arange(agent_of_evaluation.size) >= (
+            agent_of_evaluation.size - evaluations.num_incumbent_evals
+        )
         return cls(
             objective=objective,
             mixture=mixture,
             evaluations=evaluations,
             agent_of_candidate=agent_of_candidate,
-            agent_of_evaluation=evaluations.agents(agent_of_candidate, mixture.size),
+            agent_of_evaluation=agent_of_evaluation,
+            evaluator_of_evaluation=(
+                of_incumbent.astype(int) if objective.evaluators else agent_of_evaluation
+            ),
         )
 
     def for_strategy(self, outcome: Outcome) -> tuple[Float[Array, " pop"], Float[Array, ""]]:
@@ -308,11 +353,9 @@ class Scoring:
         population = self.evaluations.population_scores(scores.population)
         return self.mixture.comparable(population, self.agent_of_candidate, scores.agent_means)
 
-    def of_whole_tests(self, outcome: Outcome) -> Scores:
+    def judged(self, outcome: Outcome) -> Scores:
         """The scores that people see; with a curriculum, those of whole test episodes."""
-        is_whole = self.objective.eval_steps is None
-        score = self.objective if is_whole else self.objective.of_whole_tests
-        scores = self._scores(self.signed(score(outcome)))
+        scores = self._scores(self.signed(self.objective.judged(outcome)))
         if not self.mixture.has_opponents:
             return scores
         num_population = scores.population.shape[0]

@@ -211,7 +211,7 @@ def test_an_incumbent_is_worth_what_it_teaches_less_what_it_shall_not(aggregate,
     es = NESConfig(population_size=4, num_incumbent_evals=len(weights))
     scoring = scoring_of(weights, es, aggregate=aggregate)
     means = [200.0, 10.0, 140.0][: len(weights)]
-    scores = scoring.of_whole_tests(outcome_of([7.0] * 8 + means))
+    scores = scoring.judged(outcome_of([7.0] * 8 + means))
     np.testing.assert_allclose(scores.incumbent_mean, score, rtol=1e-6)
     # People see returns.
     np.testing.assert_array_equal(scores.agent_means, means)
@@ -230,7 +230,7 @@ def test_scores_of_an_opponent_are_negated_and_its_divergence_is_no_gain():
     # Of the opponent: 40 and the highest, 50: 45. It taught the opponent 50 and 20 at most.
     np.testing.assert_allclose(compared, [100 - 100, -(50 - 45), NAN, -(20 - 45)])
     assert incumbent == 0
-    scores = scoring.of_whole_tests(outcome_of(returns))
+    scores = scoring.judged(outcome_of(returns))
     np.testing.assert_allclose(scores.agent_means, [100, 45])
     np.testing.assert_allclose(scores.incumbent_mean, 100 - 45)
     np.testing.assert_array_equal(scores.population, returns[:8])

@@ -126,6 +126,10 @@ COMMANDS = {
         ["env=mountain_car_continuous", "proxy=rn"],
     ],
     "agent": [["proxy=cartpole", "agent=ppo"], ["proxy=cartpole", "agent=ddqn"]],
+    "wide": [
+        *(["proxy=cartpole", f"agent={x}"] for x in ("ddqn", "ppo", "sac", "td3_discrete")),
+        ["proxy=pendulum", "agent=td3"],
+    ],
 }
 
 

@@ -185,7 +185,7 @@ def numbers(tree):
 def remote_chunks(config, ray):
     """The generations of a run on workers of a planned cluster."""
     learner = make_bilevel(**config.parts() | {"devices": 1})
-    size = learner.mixture.size
+    size = len(learner.evaluators)
     arguments = configuration.plain(config), [5] * size, 0.0, runtime.versions()
     pool = ray.pool(lambda: workers.Worker(*arguments))
     return RemoteChunks(learner, pool, [Batch(capacity=5, width=1)] * size)

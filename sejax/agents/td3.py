@@ -77,7 +77,8 @@ class DiscreteTD3Config(TD3Config):
     # Of the Gumbel-Softmax at the start.
     temperature: float = option(1.0, positive(MOVES), traced=True)
     final_temperature: float = option(0.05, fraction(), traced=True)  # as a fraction of it, ...
-    temperature_steps: int = option(2000, counts())  # ... reached linearly after so many updates
+    # ... reached linearly after so many updates
+    temperature_steps: int = option(2000, counts(), counts_steps=True)
     one_hot_actions: bool = False  # straight-through one-hot actions in place of soft ones
 
     def make(self, task: Task) -> Agent:

@@ -242,7 +242,9 @@ def _choices(
         with contextlib.suppress(ConfigError):  # what is wrong is said when the task is made
             chosen["agent"] = agents.default_for(schema.spec_for(given))
     if schema.learns and "objective" not in given:
-        chosen["objective"] = registry.find("proxy", chosen["proxy"]).default_objective
+        preset, names = given.get("preset", "best"), (chosen["env"], chosen["proxy"])
+        default = registry.find("proxy", chosen["proxy"]).default_objective
+        chosen["objective"] = preset_files.objective_of(preset, *names) or default
     return chosen
 
 

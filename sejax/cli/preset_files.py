@@ -54,9 +54,15 @@ def tuned(proxy: str, preset: str = "best") -> list[str]:
 
 
 def sections_of(env: str, proxy: str) -> dict[str, dict[str, Any]]:
-    """The presets of a task and proxy, by their names."""
+    """The presets of a task and proxy, by their names: its own, and what all tasks have."""
     general = _all_sections().get(f"{GENERAL}-{proxy}", {"best": {}})
-    return _all_sections().get(f"{env}-{proxy}", general)
+    return general | _all_sections().get(f"{env}-{proxy}", {})
+
+
+def objective_of(preset: str, env: str, proxy: str) -> str | None:
+    """The objective that a preset is for; None if it is for any."""
+    found: str | None = sections_of(env, proxy).get(preset, {}).get("objective", {}).get("name")
+    return found
 
 
 def values_of(preset: str, chosen: Mapping[str, str], mixture: Mapping[str, str]) -> dict[str, Any]:
@@ -82,7 +88,10 @@ def values_of(preset: str, chosen: Mapping[str, str], mixture: Mapping[str, str]
         "Set preset=best.",
     )
     section = sections[preset]
-    values: dict[str, Any] = {k: v for k, v in section.items() if not k.startswith("with_")}
+    of_choices = ("objective",)  # which `objective_of` has told
+    values: dict[str, Any] = {
+        k: v for k, v in section.items() if not k.startswith("with_") and k not in of_choices
+    }
     for group in ("es", "objective", "agent"):
         values = merge(values, section.get(f"with_{group}", {}).get(chosen.get(group), {}))
     with_agent = section.get("with_agent", {})

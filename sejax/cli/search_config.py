@@ -27,6 +27,7 @@ from sejax.options import (
     shortened,
 )
 from sejax.options.plain import flatten, from_plain, parsed, split, to_plain
+from sejax.proxies import header
 
 if TYPE_CHECKING:  # which nobody needs who searches on one machine
     from sejax.cli.workers import LocalConfig, RayConfig
@@ -263,7 +264,7 @@ def read(overrides: Sequence[str]) -> Search:
     if config.space is None:
         return search
     given = {override.partition("=")[0] for override in fixed} | set(space)
-    preset = spaces.preset(config.space, search.agent, search.is_of_agent)
+    preset = spaces.preset(config.space, search.agent, search.is_of_agent, _steps(search))
     offered = {name: x for name, x in preset.items() if name not in given}
     foreign = registry.untyped(x.text for x in offered.values())
     require(
@@ -273,6 +274,15 @@ def read(overrides: Sequence[str]) -> Search:
         "agent='choice(...)' on the command line.",
     )
     return dataclasses.replace(search, space={**offered, **space})
+
+
+def _steps(search: Search) -> int | None:
+    """Steps of a training on the proxy; None if a rule says when it ends."""
+    if not search.is_of_agent:
+        return configuration.config(search.fixed).training.max_steps
+    stored = header.read_config(header.find(search.choice("proxy", ""), "proxy"), "proxy")
+    steps: int | None = stored.get("training", {}).get("max_steps")
+    return steps
 
 
 def require_fields(search: Search, config: LearnConfig | EvaluateConfig) -> dict[str, object]:

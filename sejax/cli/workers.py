@@ -29,7 +29,7 @@ if TYPE_CHECKING:  # jax must not be imported before a worker has chosen its dev
     from sejax.cli.config import LearnConfig
     from sejax.cli.session import Chunks
     from sejax.evaluation import Candidates
-    from sejax.objectives import GenerationInfo, Outcome
+    from sejax.objectives import Evaluator, GenerationInfo, Outcome
 
 CAPACITY = 16  # most evaluations in a share on a CPU core, where batches follow one another
 
@@ -111,7 +111,7 @@ def _remote_chunks(
 
 @dataclass(frozen=True)
 class Batch:
-    """How the evaluations of one agent of a mixture are computed.
+    """How the evaluations of one evaluator are computed.
 
     Attributes:
       capacity: most evaluations in a share.
@@ -125,20 +125,18 @@ class Batch:
 def batches_of(
     config: "LearnConfig", learner: "Bilevel", machines: RayConfig, num_first: int
 ) -> list[Batch]:
-    """The batches of each agent.
+    """The batches of each evaluator: one for each agent of a mixture, or as an objective has them.
 
     On a CPU they are the same for any number of workers, because sums over batches of other widths
     round otherwise. A worker with a GPU computes its part of a generation at once.
     """
-    from sejax.evaluation import num_parallel_on_cpu
-
     batches = []
-    for agent, places in zip(learner.mixture.agents, _places(learner), strict=True):
+    for evaluator, places in zip(learner.evaluators, _places(learner), strict=True):
         if machines.gpus_per_worker:
             capacity, width = -(-len(places) // num_first), config.num_parallel
         else:
             capacity = CAPACITY
-            width = config.num_parallel or num_parallel_on_cpu(agent, learner.training)
+            width = config.num_parallel or evaluator.cpu_num_parallel
         width = width or capacity
         batches.append(Batch(width * -(-capacity // width), width))
     return batches
@@ -154,22 +152,22 @@ def cut(places: np.ndarray, batch: Batch, num_workers: int) -> Iterator[np.ndarr
 
 
 def _places(learner: "Bilevel") -> list[np.ndarray]:
-    """The indices of each agent's evaluations in a generation."""
-    agents = learner.scoring.agent_of_evaluation
-    return [np.flatnonzero(agents == i) for i in range(learner.mixture.size)]
+    """The indices of each evaluator's evaluations in a generation."""
+    evaluators = learner.scoring.evaluator_of_evaluation
+    return [np.flatnonzero(evaluators == i) for i in range(len(learner.evaluators))]
 
 
 @dataclass(frozen=True)
 class Share:
-    """Evaluations of one agent of the mixture.
+    """Evaluations of one evaluator.
 
     Attributes:
-      agent: its index.
+      evaluator: its index.
       arguments: data of their keys `[n, ...]`, candidates `[n, dims]`, whether anything is computed
         `[n]`, and the length of the test episodes that are scored, `[n]` or None.
     """
 
-    agent: int
+    evaluator: int
     arguments: tuple[Any, ...]
 
 
@@ -253,10 +251,10 @@ class RemoteChunks:
         import jax
 
         places, shares = [], []
-        for agent, (own, batch) in enumerate(zip(self._places, self._batches, strict=True)):
+        for evaluator, (own, batch) in enumerate(zip(self._places, self._batches, strict=True)):
             for some in cut(own, batch, max(1, self._pool.size)):
                 places.append(some)
-                shares.append(Share(agent, _at(arguments, some)))
+                shares.append(Share(evaluator, _at(arguments, some)))
         outcomes, cpu_s = zip(*self._pool.map(shares), strict=True)
         self.cpu_s += sum(cpu_s)
         order = np.argsort(np.concatenate(places))
@@ -286,7 +284,7 @@ class Worker:
 
     Args:
       config: of the run, plain.
-      capacities: most evaluations in a share, for each agent.
+      capacities: most evaluations in a share, for each evaluator.
       gpu_share: the part of a GPU that this process has; 0 for a CPU core.
       expected: versions of the driver's packages.
 
@@ -318,8 +316,8 @@ class Worker:
         learner = make_bilevel(**of_run.parts() | {"devices": 1})
         self._capacities = capacities
         self._programs = [
-            _compiled_share(learner, agent, capacity, of_run.num_parallel)
-            for agent, capacity in enumerate(capacities)
+            _compiled_share(learner, evaluator, capacity, of_run.num_parallel)
+            for evaluator, capacity in zip(learner.evaluators, capacities, strict=True)
         ]
 
     def ready(self) -> None:
@@ -330,28 +328,26 @@ class Worker:
         import jax
 
         started = time.process_time()
-        n, capacity = len(share.arguments[0]), self._capacities[share.agent]
+        n, capacity = len(share.arguments[0]), self._capacities[share.evaluator]
         # Filled up with copies, for which nothing is computed.
         places, is_own = np.minimum(np.arange(capacity), n - 1), np.arange(capacity) < n
         keys, params, active, eval_steps = _at(share.arguments, places)
-        outcome = self._programs[share.agent](keys, params, active & is_own, eval_steps)
+        outcome = self._programs[share.evaluator](keys, params, active & is_own, eval_steps)
         outcome = jax.tree.map(lambda x: x[:n], jax.device_get(outcome))
         return outcome, time.process_time() - started
 
 
-def _compiled_share(learner: "Bilevel", agent: int, capacity: int, num_parallel: int | None) -> Any:
-    """The program that trains and tests an agent on up to `capacity` candidates."""
+def _compiled_share(
+    learner: "Bilevel", evaluator: "Evaluator", capacity: int, num_parallel: int | None
+) -> Any:
+    """The program that evaluates up to `capacity` candidates."""
     import jax
 
-    from sejax.evaluation import make_candidate_evaluator, num_parallel_on_cpu
+    from sejax.evaluation import of_vectors
     from sejax.ops.parallel import compiler_options, spread_over_devices
 
-    own, training = learner.mixture.agents[agent], learner.training
     spread = spread_over_devices(
-        make_candidate_evaluator(own, learner.proxy, training, learner.unravel),
-        1,
-        num_parallel,
-        num_parallel_on_cpu(own, training),
+        of_vectors(evaluator, learner.params_of), 1, num_parallel, evaluator.cpu_num_parallel
     )
 
     def evaluate(key_data: "Array", *arguments: "Array | None") -> "Outcome":

@@ -112,11 +112,10 @@ def spread_groups_over_devices(
         f"must be at most {len(available)}, all there are; got {num_devices}. Set devices=null.",
     )
     mesh = _mesh(num_devices)
-    on_cpu = available[0].platform == "cpu"
-    widths = [num_parallel or (width if on_cpu else None) for width in cpu_num_parallel]
+    widths = [num_parallel or (width if on_cpu() else None) for width in cpu_num_parallel]
 
     def map_groups(groups: Sequence[tuple[PyTree, ...]]) -> list[PyTree]:
-        return [_map_in_batches(*each) for each in zip(fns, widths, groups, strict=True)]
+        return [map_in_batches(*each) for each in zip(fns, widths, groups, strict=True)]
 
     if mesh.size == 1:
         return map_groups
@@ -134,12 +133,17 @@ def spread_groups_over_devices(
     return map_spread
 
 
+def on_cpu() -> bool:
+    """Whether trainings are computed on CPU cores."""
+    return jax.devices()[0].platform == "cpu"
+
+
 def _size(args: PyTree) -> int:
     """Number of elements."""
     return jax.tree.leaves(args)[0].shape[0]
 
 
-def _map_in_batches(
+def map_in_batches(
     fn: Callable[..., PyTree], width: int | None, args: tuple[PyTree, ...]
 ) -> PyTree:
     """Maps a function of one element on one device; `width` None puts all into one batch."""

@@ -147,6 +147,7 @@ GROUPS = {
             "reward_threshold": "sejax.objectives:RewardThreshold",
             "auc": "sejax.objectives:AUC",
             "auc_sum": "sejax.objectives:AUCSum",
+            "ranking": "sejax.ranking:Ranking",
         },
     ),
     "es": Group(
