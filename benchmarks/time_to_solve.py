@@ -1,15 +1,15 @@
-"""How long `python -m sejax.run` takes to find a proxy that solves the task, over many seeds.
+"""How long `python -m sejax.run` takes until an incumbent reaches the threshold, over many seeds.
 
 Each seed is a run of the command itself, one after another on all cores, in a directory of its
 own under `--runs`: an interrupted benchmark goes on where it stopped. The curves of finished seeds
-are kept in `--curves`, and no seed is run again that it has with as many generations. A run counts
-as solved at the first generation whose incumbent mean (fresh agents, none of which trained before)
-reaches the task's threshold, and goes on to the end, to show whether the incumbent stays solved.
+are kept in `--curves`, and no seed is run again that it has with as many generations. A run's first
+passage is the first generation whose incumbent mean reaches the task's threshold, after which fresh
+agents can still fall short of it. The run goes on, to show whether the incumbent stays there.
 
-Reported for each setting: in how many seeds it solved, and the generations, wall-clock minutes
-(compilation and all files included, Python's start and imports not), CPU minutes and real
-environment steps to that point, of those that solved it; then the share of later generations in
-which the incumbent was still solved.
+Reported for each setting: in how many seeds there was a first passage, and the generations,
+wall-clock minutes (compilation and all files included, Python's start and imports not), CPU minutes
+and real environment steps until it, of those seeds; then the share of later generations in which
+the incumbent was there.
 """
 
 import argparse
@@ -57,7 +57,7 @@ def main() -> None:
         seeds = range(args.seed, args.seed + num_seeds)
         tables[name] = [curve_of(args, name, seed, generations) for seed in seeds]
         rows.append(summarise(name, tables[name], envs.make(args.env).solved_reward))
-    title = f"{args.env}: time to a solved proxy"
+    title = f"{args.env}: time until the first incumbent at the threshold"
     common.print_table(title, [*rows[0]], [[*row.values()] for row in rows])
     if args.figure:
         draw(tables, envs.make(args.env).solved_reward, args.figure)
@@ -101,12 +101,12 @@ def run_seed(args: argparse.Namespace, setting: str, seed: int, generations: int
 
 
 def summarise(name: str, curves: list[pd.DataFrame], solved_reward: float) -> dict[str, Any]:
-    """One row of the table; medians and ranges over the seeds that solved the task."""
+    """One row of the table; medians and ranges over the seeds with a first passage."""
     reached = []
     for curve in curves:
-        is_solved = curve["incumbent_mean"].to_numpy() >= solved_reward
-        if is_solved.any():
-            first = int(np.argmax(is_solved))
+        is_there = curve["incumbent_mean"].to_numpy() >= solved_reward
+        if is_there.any():
+            first = int(np.argmax(is_there))
             row = curve.iloc[first]
             reached.append(
                 {
@@ -114,7 +114,7 @@ def summarise(name: str, curves: list[pd.DataFrame], solved_reward: float) -> di
                     "wall minutes": row["wall_s"] / 60,
                     "CPU minutes": row["cpu_s"] / 60,
                     "real steps": row["env_steps_total"],
-                    "solved afterwards": is_solved[first + 1 :].mean()
+                    "there afterwards": is_there[first + 1 :].mean()
                     if first + 1 < len(curve)
                     else np.nan,
                 }
@@ -125,14 +125,14 @@ def summarise(name: str, curves: list[pd.DataFrame], solved_reward: float) -> di
     row = {
         "preset": name,
         "generations run": len(curves[0]),
-        "solved": f"{len(reached)} of {len(curves)}",
+        "first passage": f"{len(reached)} of {len(curves)}",
         "best incumbent": f"{best:.1f}",
         "last five incumbents": f"{last.mean():.1f}",
         "CPU seconds of a generation": f"{cpu_s:.0f}",
     }
     table = pd.DataFrame(reached)
     for column, form in (("generations", ",.0f"), ("wall minutes", ".1f"), ("CPU minutes", ".1f"),
-                         ("real steps", ",.0f"), ("solved afterwards", ".0%")):  # fmt: skip
+                         ("real steps", ",.0f"), ("there afterwards", ".0%")):  # fmt: skip
         row[column] = _spread(table[column], form) if reached else "-"
     return row
 

@@ -237,6 +237,11 @@ def make_table(env_name: str, summary: pd.DataFrame) -> pd.DataFrame:
         "agent": "{kind}",
         "trained on": lambda row: SHOWN[row.setting][1],
         "SEs, agents": "{num_ses}, {num_agents}",
+        "interval over": lambda row: (
+            tables.drawn_text(row.num_agents, "agents")
+            if row.setting in ON_REAL
+            else tables.drawn_text(row.num_ses, "SEs")
+        ),
         "training steps": tables.mean_text("train_steps", 0, std=True),
         "paper's": paper(PAPER_STEPS),
         "fewer": lambda row: fewer(row, "real"),
@@ -260,7 +265,7 @@ def report(settings: SePerformance, rows: pd.DataFrame) -> pd.DataFrame:
     draw_profiles(task, agents, settings.folder / "profiles.png")
     note = (
         f"Mean ± std over agents with drawn hyperparameters, {len(return_columns(rows))} test "
-        f"episodes each. {tables.interval_note('SEs, over agents on the real task')} "
+        f"episodes each. {tables.interval_note('what its column names')} "
         '"Fewer" are training steps saved against the real task. '
         f"The best SEs of all sets, {NUM_BEST} at most, are chosen by half of their agents and "
         "shown by the other half. SEs are those of a set that reached the threshold, all where "

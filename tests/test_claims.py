@@ -1,5 +1,6 @@
 """The documents' numbers are those of the stored rows: `make claims`."""
 
+import re
 import shutil
 
 import pandas as pd
@@ -132,6 +133,23 @@ def test_a_changed_row_of_an_experiment_is_found(tmp_path):
 
 def test_the_documents_of_this_project_pass():
     assert list(claims.Claims.read(claims.ROOT).check()) == []
+
+
+@pytest.mark.parametrize("which", [0, -1])
+def test_another_digit_in_any_page_of_this_project_is_found(which, monkeypatch):
+    project = claims.Claims.read(claims.ROOT)
+    pages = project.documents()
+    for name in project.entries["documents"]:
+        text = pages[name]
+        for pattern in (claims.HIDDEN, claims.NAMES):
+            text = pattern.sub(lambda x: " " * len(x[0]), text)
+        number = list(claims.UNCLAIMED.finditer(text))[which]
+        changed = re.sub(r"\d", lambda x: str((int(x[0]) + 1) % 10), number[0])
+        pages[name] = pages[name][: number.start()] + changed + pages[name][number.end() :]
+    monkeypatch.setattr(claims.Claims, "documents", lambda self: pages)
+    monkeypatch.setattr(remake, "check", lambda *skipped: iter(()))
+    found = "\n".join(project.check())
+    assert [name for name in project.entries["documents"] if f"{name}:" not in found] == []
 
 
 def test_results_have_ten_megabytes_at_most():

@@ -195,7 +195,24 @@ def test_shares_are_of_the_groups_of_the_same_seeds():
     turned = pd.concat([curves_of("icm", 1), curves_of("real", 5)])  # in whatever order
     assert rn_curves.summarise(turned, max_steps=300)["share_of_bare"].tolist() == [1, 1]
     alone = rn_curves.summarise(curves_of("icm", 2), max_steps=300)
-    assert np.isnan(alone["share_of_bare"][0]) and not rn_curves.make_table(alone).iat[0, 4]
+    (cells,) = rn_curves.make_table(alone).to_dict("records")
+    assert np.isnan(alone["share_of_bare"][0]) and cells["of the bare agent's"] == ""
+
+
+def test_a_table_names_what_its_intervals_draw():
+    worlds = [curves_of("real", 5), curves_of("icm", 2), curves_of("additive_potential", 5),
+              curves_of("exclusive_potential", 4)]  # fmt: skip
+    summary = rn_curves.summarise(pd.concat(worlds), max_steps=300)
+    table = rn_curves.make_table(summary).set_index("trained with")
+    assert table["interval over"].to_dict() == {
+        "real": "10 agents",
+        "icm": "",
+        "additive_potential": "5 RNs",
+        "exclusive_potential": "",
+    }
+    assert (table["interval over"] != "").tolist() == [
+        "[" in cell for cell in table["mean return over training"]
+    ]
 
 
 def test_rows_of_other_settings_are_refused():

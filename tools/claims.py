@@ -21,6 +21,7 @@ import numpy as np
 import pandas as pd
 import yaml
 
+import sejax
 from experiments.common.shards import read_rows
 from sejax.ops.files import write_text
 from sejax.proxies import zoo
@@ -49,7 +50,9 @@ class WrongError(ValueError):
 
 
 def frame_of(root: Path, rows: str) -> Any:
-    """Stored rows: a table, what a JSON file holds, or the evaluations of the shipped proxies."""
+    """Stored rows: a table, what a JSON file holds, shipped proxies' evaluations, or settings."""
+    if rows.startswith("settings "):
+        return sejax.config(rows.split()[1:])
     if rows == "pretrained":
         return pd.DataFrame(
             [

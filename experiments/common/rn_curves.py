@@ -21,6 +21,7 @@ from experiments.common.statistics import worst_tenth
 from experiments.common.tables import (
     WORST_NOTE,
     as_texts,
+    drawn_text,
     interval_note,
     mean_columns,
     mean_text,
@@ -227,6 +228,11 @@ def make_table(summary: pd.DataFrame) -> pd.DataFrame:
             "agents": lambda row: ROWS[row.row],
             "trained with": "{world}",
             "groups, agents": "{groups}, {agents}",
+            "interval over": lambda row: (
+                drawn_text(row.agents, "agents")
+                if row.world in WITHOUT_RN
+                else drawn_text(row.groups, "RNs")
+            ),
             f"steps to solve, restricted to {most:,}": mean_text("steps", 0),
             "of the bare agent's": share,
             "solved": "{solved:.0%}",
@@ -246,7 +252,7 @@ def common_note(settings: CurveSettings, solved_reward: float) -> str:
         f"{curves.WINDOW} tests in a row reaches {solved_reward:g}; an agent that never "
         f"does counts {settings.max_steps:,}. The bare agent's are of as many groups, of the same "
         "seeds. Curves that end early go on as the last test. "
-        f"{interval_note('RNs, over agents on the real task')}"
+        f"{interval_note('what its column names')}"
         f"{WORST_NOTE}{'' if settings.study.agent else learned_with}"
     )
 

@@ -129,8 +129,8 @@ def _log(curve: pd.DataFrame, solved_score: float | None) -> str:
     if solved_score is None:
         return best
     solved = generations_to_solve(curve, solved_score)
-    how = f"solved in generation {solved:.0f}" if np.isfinite(solved) else "not solved"
-    return f"{best}, {how} of {len(curve)}"
+    first = f"{solved:.0f}" if np.isfinite(solved) else "none"
+    return f"{best}, first passage of the threshold in generation {first} of {len(curve)}"
 
 
 def collect(configs: list[Any], path: Path, before: Any = None) -> None:

@@ -76,6 +76,11 @@ def interval_note(of: str) -> str:
     return f"In brackets Student's 95% interval over {of}, none for fewer than {LEAST}."
 
 
+def drawn_text(number: int, what: str) -> str:
+    """What an interval draws, as a cell of a column `interval over`; empty if there is none."""
+    return f"{number} {what}" if number >= LEAST else ""
+
+
 def as_texts(
     summary: pd.DataFrame, columns: Mapping[str, str | Callable[[Any], Any]]
 ) -> pd.DataFrame:
