@@ -14,6 +14,7 @@ from sejax import landscape as command
 from sejax import landscapes, ranking
 from sejax.bilevel import make_bilevel
 from sejax.cli import config as configuration
+from sejax.cli import kinds
 from sejax.options import ConfigError
 from sejax.ranking import agreement, ranks
 
@@ -268,7 +269,7 @@ WORDS = ["env=cartpole", "agent=ddqn", "configs=3", "seeds=2", "steps=60", "devi
 
 
 def test_a_stopped_command_goes_on_to_the_same_rows(tmp_path, monkeypatch):
-    monkeypatch.setattr(command, "CHUNK", 4)
+    monkeypatch.setattr(kinds, "CHUNK", 4)
     whole, stopped = tmp_path / "whole.csv", tmp_path / "stopped.csv"
     command.main([*WORDS, f"file={whole}"])
     card, rows = landscapes.read_table(whole)
@@ -295,7 +296,7 @@ def test_a_landscapes_row_is_an_agent_with_those_options(tmp_path):
     values = {name: x[1] for name, x in kind.values.items()}
     assert values["learning_rate"] == row["agent.learning_rate"]
     training = sejax.TrainingConfig(stop_rule="never", max_steps=60, max_episodes=60)
-    _, keys = command._program(own, kind)
+    _, keys = kinds.program_of(kind, own.steps, own.test_episodes)
     hparams = ranking.hparams_of(agent, values)
     evaluate = sejax.make_evaluator(
         dataclasses.replace(agent, hparams=hparams), task.env, task, training
