@@ -131,7 +131,9 @@ def _train_and_test(
     numbers: dict[str, Any] = {"agent": range(config.num_agents)}
     if setup.has_several:
         numbers = {"agent": member.key, "number": range(config.num_agents)}
-    of_agents = {name: x for name, x in vars(outcome).items() if x.ndim == 1}  # not of episodes
+    of_agents = {  # not of episodes, and no agreement of ranks
+        name: x for name, x in vars(outcome).items() if x is not None and x.ndim == 1
+    }
     return pd.DataFrame({**numbers, "test_return": outcome.test_return, **of_agents, **drawn})
 
 

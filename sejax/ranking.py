@@ -33,6 +33,7 @@ from sejax.training import TrainingConfig, make_trainer, training_of
 
 AGREEMENTS = ("spearman", "top")
 MEASURES = ("both", "greedy", "training")
+CHUNK = 128  # most configurations of one call of a program, so that memory stays small
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -346,6 +347,7 @@ def reached_on(
     num_tests: int = 32,
     seed: int = 0,
     devices: int | None = None,
+    num_parallel: int | None = None,
 ) -> Reached:
     """What configurations reach on SEs that were learned with `objective=ranking`.
 
@@ -361,6 +363,7 @@ def reached_on(
       num_tests: greedy episodes after each.
       seed: of all of them.
       devices: None for all.
+      num_parallel: trainings in one vmapped batch; None for what suits the agent and the device.
 
     Returns:
       Leaves `[se, config, seed]`.
@@ -380,22 +383,30 @@ def reached_on(
     made = make_agent(agent, ses.task)
     own = scaled_values(type(agent), values, factor)
     measure = make_measure(made, ses.env, training, num_tests)
-    shape = (len(ses), len(next(iter(values.values()))), num_seeds)
+    size = len(next(iter(values.values())))
+    num_chunks = -(-size // CHUNK)
+    shape = (len(ses), -(-size // num_chunks), num_seeds)
+    # The same keys on all SEs: their differences are those of the SEs.
+    keys = jax.random.split(jax.random.key(seed), (size, num_seeds))
 
     def one(key: Array, weights: PyTree, values: dict[str, Array]) -> Reached:
         return measure(key, ses.env.params(weights, ses.discount), hparams_of(made, values))
 
-    def all_of(weights: PyTree, own: dict[str, Array]) -> Reached:
+    def all_of(keys: Array, weights: PyTree, own: dict[str, Array]) -> Reached:
         se, config, _ = (x.reshape(-1) for x in np.indices(shape))
-        # The same keys on all SEs: their differences are those of the SEs.
-        keys = jnp.broadcast_to(jax.random.split(jax.random.key(seed), shape[1:]), shape)
-        spread = spread_over_devices(one, devices, None, num_parallel_on_cpu(made, training))
+        width = num_parallel_on_cpu(made, training)
+        spread = spread_over_devices(one, devices, num_parallel, width)
         of_each = jax.tree.map(lambda x: x[se], weights), jax.tree.map(lambda x: x[config], own)
-        reached = spread(keys.reshape(-1), *of_each)
+        reached = spread(jnp.broadcast_to(keys, shape).reshape(-1), *of_each)
         return jax.tree.map(lambda x: x.reshape(shape), reached)
 
     compiled = jax.jit(all_of, compiler_options=compiler_options())
-    found: Reached = jax.device_get(compiled(ses.weights, own))
+    parts = []
+    for start in range(0, size, shape[1]):
+        places = np.arange(start, start + shape[1]) % size
+        some = {name: x[places] for name, x in own.items()}
+        parts.append(jax.device_get(compiled(keys[places], ses.weights, some)))
+    found: Reached = jax.tree.map(lambda *x: np.concatenate(x, axis=1)[:, :size], *parts)
     return found
 
 

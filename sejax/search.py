@@ -5,9 +5,13 @@ A trial is a run, whose generations are the budget; the same command goes on whe
 
 from collections.abc import Sequence
 from importlib.util import find_spec
+from typing import TYPE_CHECKING
 
 from sejax.cli import commands, runtime
 from sejax.options import ConfigError
+
+if TYPE_CHECKING:
+    from sejax.cli.search_config import Search
 
 
 def main(overrides: Sequence[str]) -> None:
@@ -19,39 +23,61 @@ def main(overrides: Sequence[str]) -> None:
     """
     if find_spec("optuna") is None:
         raise ConfigError("sejax.search needs Optuna. Install it with pip install 'sejax[search]'.")
-    from sejax.cli import search_config, search_results, search_workers, study
-    from sejax.cli.trials import runner_of
-    from sejax.cli.workers import RayConfig
+    from sejax.cli import search_config, search_results
 
     search = search_config.read(overrides)
-    runner = runner_of(search)
-    current = search_config.require_fields(search, runner.config([]))
-    found = study.open_study(search, current)
-    runtime.configure_jax()
-    _say(f"Study {search.study} in {search.folder}: {', '.join(search.space)}.")
     try:
-        if isinstance(search.machines, RayConfig):
-            search_workers.work(found, search, search.machines, _say)
+        if search.tuner is not None:
+            from sejax.cli import tuning
+
+            runtime.configure_jax()
+            command = tuning.COMMAND
+            search, settings = tuning.tune(search, _say)
         else:
-            study.work(found, search, runner, _say)
-        search_results.write(found, search, runner.command)
-        search_results.print_table(found, search)
-        best = search_results.ranked(found)
-        if not best:
-            _say("No trial was completed.")
-            return
-        settings = search_results.overrides_of(best[0], search)
-        if search.num_verified:
-            settings = search_results.verified(found, search, runner)
+            command, settings = _study(search)
     except KeyboardInterrupt:
         _say(
             f"Interrupted. What has ended is saved in {search.folder}; the same command goes on "
             f"from there."
         )
         commands.leave(commands.INTERRUPTED)
-    _say(f"\nThe best:\n  {search_results.command_line(settings, search, runner.command)}")
-    _say(f"The same:\n  {search_results.preset_line(search, runner.command)}")
+    if not settings:
+        _say("No trial was completed.")
+        return
+    _say(f"\nThe best:\n  {search_results.command_line(settings, search, command)}")
+    _say(f"The same:\n  {search_results.preset_line(search, command)}")
     _say(f"{search.folder} holds trials.csv, best.txt and preset.yaml.")
+
+
+def _study(search: "Search") -> tuple[str, list[str]]:
+    """Works on the study of a search.
+
+    Returns:
+      The command that repeats the best trial, and the overrides of its settings; none if no trial
+      was completed.
+    """
+    from sejax.cli import search_config, search_results, search_workers, study
+    from sejax.cli.trials import runner_of
+    from sejax.cli.workers import RayConfig
+
+    runner = runner_of(search)
+    current = search_config.require_fields(search, runner.config([]))
+    found = study.open_study(search, current)
+    runtime.configure_jax()
+    _say(f"Study {search.study} in {search.folder}: {', '.join(search.space)}.")
+    if isinstance(search.machines, RayConfig):
+        search_workers.work(found, search, search.machines, _say)
+    else:
+        study.work(found, search, runner, _say)
+    search_results.write(found, search, runner.command)
+    search_results.print_table(found, search)
+    best = search_results.ranked(found)
+    if not best:
+        return runner.command, []
+    settings = search_results.overrides_of(best[0], search)
+    if search.num_verified:
+        settings = search_results.verified(found, search, runner)
+    return runner.command, settings
 
 
 def _say(text: str) -> None:

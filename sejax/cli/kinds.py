@@ -16,7 +16,7 @@ import numpy as np
 
 from sejax.cli import config as configuration
 from sejax.cli.config import LearnConfig
-from sejax.options import as_text, marks, require, shortened
+from sejax.options import as_text, is_number, marks, require, shortened
 from sejax.options.plain import to_plain
 
 if TYPE_CHECKING:  # which take long to import, or need Optuna
@@ -84,13 +84,14 @@ def kind_of(
     words = [*base, f"agent={name}"]
     plain = configuration.config(words)
     cls = type(plain.agent)
-    for field in space:
+    for field, dimension in space.items():
         option = field.removeprefix(PREFIX)
+        is_argument = option in SIZES or marks(cls, option).get("traced")
         require(
-            field.startswith(PREFIX) and (option in SIZES or marks(cls, option).get("traced")),
+            field.startswith(PREFIX) and is_argument and is_number(dimension.at(0.0)),
             field,
             "must be a number of the agent that compiled programs take as an argument, or its "
-            f"hidden_size or batch_size; got {shortened(space[field].text)}. Leave it out.",
+            f"hidden_size or batch_size; got {shortened(dimension.text)}. Leave it out.",
         )
     stream = name if stream is None else stream
     rng = np.random.default_rng([plain.seed if seed is None else seed, zlib.crc32(stream.encode())])

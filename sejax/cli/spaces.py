@@ -29,7 +29,7 @@ from optuna.trial import Trial
 from sejax.cli import compose
 from sejax.cli import config as configuration
 from sejax.options import ConfigError, nearest, require, shortened, told
-from sejax.options.plain import split
+from sejax.options.plain import parsed, split
 
 Distribution = CategoricalDistribution | FloatDistribution | IntDistribution
 FOLDER = Path(__file__).parent / "spaces"
@@ -88,9 +88,8 @@ class Dimension:
         """The value at a quantile in [0, 1) of what the field is drawn from uniformly."""
         drawn = self.distribution
         if isinstance(drawn, CategoricalDistribution):
-            return drawn.choices[int(quantile * len(drawn.choices))]
-        is_whole, half = isinstance(drawn, IntDistribution), drawn.step / 2 if drawn.step else 0.0
-        low, high = drawn.low - half, drawn.high + half
+            return parsed(str(drawn.choices[int(quantile * len(drawn.choices))]))
+        is_whole, (low, high) = isinstance(drawn, IntDistribution), self._ends()
         if drawn.log:
             number = math.exp(math.log(low) + quantile * math.log(high / low))
         else:
@@ -100,6 +99,29 @@ class Dimension:
             number = min(drawn.low + drawn.step * steps, drawn.high)
         value = self.value({self.parameter: number})
         return int(value) if is_whole else float(value)
+
+    def quantile_of(self, value: float) -> float:
+        """The quantile at which a value lies; inverse of `at`, but for rounding.
+
+        Raises:
+          ValueError: for a value that is none of a choice.
+        """
+        drawn = self.distribution
+        if isinstance(drawn, CategoricalDistribution):
+            choices = [parsed(str(x)) for x in drawn.choices]
+            return (choices.index(value) + 0.5) / len(choices)
+        low, high = self._ends()
+        number = 1 - value if self.is_inverse else value
+        if drawn.log:
+            return math.log(number / low) / math.log(high / low)
+        return (number - low) / (high - low)
+
+    def _ends(self) -> tuple[float, float]:
+        """Of the numbers that are drawn uniformly, before they are made whole."""
+        drawn = self.distribution
+        assert not isinstance(drawn, CategoricalDistribution)
+        half = drawn.step / 2 if drawn.step else 0.0
+        return drawn.low - half, drawn.high + half
 
     def parameter_of(self, value: object) -> object:
         """The stored parameter that stands for a field's value; None if it is not drawn from."""

@@ -1,9 +1,10 @@
 """Which agents an evaluation trains, where, and how long."""
 
 import dataclasses
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 from sejax import agents, envs
 from sejax.agents.base import AgentConfig
@@ -13,8 +14,10 @@ from sejax.cli.config import EvaluateConfig, MixtureMember, members_of
 from sejax.ops.files import as_file_name
 from sejax.options import registry, require, shortened
 from sejax.proxies import header, hub
-from sejax.proxies.io import Proxy, load_proxy
+from sejax.proxies.io import Proxy, ProxySet, load_proxy
 from sejax.training import TrainingConfig, require_reachable, training_of
+
+Loaded = TypeVar("Loaded", Proxy, ProxySet)
 
 
 class World(NamedTuple):
@@ -70,14 +73,8 @@ def real_setup(config: EvaluateConfig) -> Setup:
 
 def proxy_setup(config: EvaluateConfig) -> Setup:
     """Agents on a proxy, and on its real task beside them."""
-    proxy = _load(config)
+    proxy = load(config, load_proxy)
     env, task = proxy.env, proxy.task
-    require(
-        config.env in (None, task.name, proxy.config["env"].get("name")),
-        "env",
-        f"must be the proxy's own task; got {config.env} for a proxy of {task.name}. Set "
-        f"env={task.name}.",
-    )
     members, exploration = members_of(config), config.exploration
     if config.agent_hparams == "as_learned":
         learned = proxy.learned_agents().items()
@@ -123,8 +120,17 @@ def proxy_setup(config: EvaluateConfig) -> Setup:
     )
 
 
-def _load(config: EvaluateConfig) -> Proxy:
-    """The proxy; modules are imported if the command line names them, never because a file does."""
+def load(config: EvaluateConfig, using: Callable[..., Loaded]) -> Loaded:
+    """The proxy, or the set; modules are imported if the command line names them, never because a
+    file does.
+
+    Args:
+      config: that names it.
+      using: `load_proxy` or `load_set`.
+
+    Raises:
+      ConfigError: if it cannot be loaded, or `env` is not its task.
+    """
     path = header.find(config.proxy, "proxy", also=("real",))
     stored = header.read_config(path, "proxy")
     task = proxy = None
@@ -134,7 +140,14 @@ def _load(config: EvaluateConfig) -> Proxy:
     if config.proxy_kind is not None:
         fields = {**stored["proxy"], "name": config.proxy_kind}
         proxy = registry.configure("proxy", fields)
-    return load_proxy(path, task, proxy, "proxy")
+    loaded = using(path, task, proxy, "proxy")
+    name = loaded.task.name
+    require(
+        config.env in (None, name, loaded.config["env"].get("name")),
+        "env",
+        f"must be the proxy's own task; got {config.env} for a proxy of {name}. Set env={name}.",
+    )
+    return loaded
 
 
 def _training_on(
