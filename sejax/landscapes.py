@@ -197,10 +197,16 @@ def from_arlbench(folder: Path | str, file: Path | str, steps: int | None = None
                 "steps",
                 f"must be one of {listed([f'{x:.0f}' for x in curve['steps']])}; got {at:g}.",
             )
-            own = {f"{PREFIX}{names[x]}": float(row[c]) for c, x in drawn.items() if x in names}
+            own: dict[str, object] = {
+                f"{PREFIX}{names[x]}": float(row[c]) for c, x in drawn.items() if x in names
+            }
             value = float(returns.iloc[0])
             bad = int(not math.isfinite(value))
-            place = {"agent": agent, "config": int(row["run_id"]), "seed": int(seed.name)}
+            place: dict[str, object] = {
+                "agent": agent,
+                "config": int(row["run_id"]),
+                "seed": int(seed.name),
+            }
             tables.append({**place, **own, "nonfinite": bad, "return": value, "steps": int(at)})
     require(tables, "folder", f"must have a folder for each seed; got {shortened(folder)}.")
     table = pd.DataFrame(tables)
