@@ -48,6 +48,8 @@ class LandscapeConfig(Options):
 
     configs: int = option(64, counts("configurations are compared", least=2))  # of each agent
     seeds: int = option(8, counts("an agent must train"))  # trainings of each configuration
+    # Number of the first training of each: others are independent of it.
+    first_seed: int = option(0, counts("it is a number", least=0))
     steps: int = option(10_000, counts("an agent must train"))  # of each training
     test_episodes: int = option(10, counts("it counts episodes"))  # greedy ones after it
     space: str = "wide"  # a preset of ranges, or FILE.yaml
@@ -158,6 +160,7 @@ def card_of(own: LandscapeConfig, kinds: Sequence[Kind]) -> dict[str, Any]:
         "test_episodes": own.test_episodes,
         "configs": own.configs,
         "seeds": own.seeds,
+        "first_seed": own.first_seed,
         "seed": first.seed,
         "agents": {kind.name: to_plain(kind.config.agent) for kind in kinds},
         "space": {kind.name: {field: x.text for field, x in kind.space.items()} for kind in kinds},
@@ -177,7 +180,8 @@ def measure(
     if len(done):
         mine = done[done["agent"] == kind.name]
         have = set(zip(mine["config"], mine["seed"], strict=True))
-    places = [(c, s) for c in range(own.configs) for s in range(own.seeds) if (c, s) not in have]
+    seeds = range(own.first_seed, own.first_seed + own.seeds)
+    places = [(c, s) for c in range(own.configs) for s in seeds if (c, s) not in have]
     for rows in train(kind, places, own.steps, own.test_episodes):
         done = pd.concat([done, rows], ignore_index=True) if len(done) else rows
         landscapes.write(path, card, _sorted(done, list(card["agents"])))

@@ -7,6 +7,7 @@ configuration sets (`agent.learning_rate`, ...), the mean `return` of the tests,
 if the training diverged. `python -m sejax.landscape` measures them.
 """
 
+import csv
 import io
 import math
 from collections.abc import Mapping
@@ -124,13 +125,110 @@ def write(path: Path, card: Mapping[str, Any], table: pd.DataFrame) -> None:
     write_text(path, commented + table.to_csv(index=False))
 
 
+# --- ARLBench -------------------------------------------------------------------------------------
+
+# ARLBench's names of what sejax's agents take as arguments of a compiled program.
+ARLBENCH = {
+    "ppo": {
+        "learning_rate": "learning_rate",
+        "gae_lambda": "gae_lambda",
+        "clip_eps": "clip_ratio",
+        "ent_coef": "entropy_weight",
+        "vf_coef": "value_weight",
+    },
+    "sac": {"learning_rate": "learning_rate", "tau": "tau"},
+    "dqn": {"learning_rate": "learning_rate", "epsilon": "epsilon_min"},
+}
+ARLBENCH_TASKS = {
+    "CartPole-v1": "cartpole_v1",
+    "Acrobot-v1": "acrobot",
+    "MountainCar-v0": "mountain_car",
+    "MountainCarContinuous-v0": "mountain_car_continuous",
+    "Pendulum-v1": "pendulum",
+    "HalfCheetah-v4": "halfcheetah",
+    "Hopper-v4": "hopper",
+    "Ant-v4": "ant",
+}
+_PREFIX = "hp_config."  # of its columns
+
+
+def from_arlbench(folder: Path | str, file: Path | str, steps: int | None = None) -> list[str]:
+    """Writes a landscape that ARLBench measured as a file of sejax's.
+
+    What its agents have and sejax's do not take as an argument is left out: configurations then
+    differ in more than the file says.
+
+    Args:
+      folder: of one of its landscapes, such as `results/sobol/ppo_Hopper-v4` of a commit that has
+        them (a44d4c64 of github.com/automl/arlbench), with a folder for each seed.
+      file: that is written.
+      steps: of the checkpoint whose returns count; None for the last.
+
+    Returns:
+      Its hyperparameters that are left out.
+
+    Raises:
+      ConfigError: for a folder that holds no such landscape, or no such checkpoint.
+
+    Source: Becktepe et al., "ARLBench: Flexible and Efficient Benchmarking for Hyperparameter
+    Optimization in Reinforcement Learning" (2024).
+    """
+    folder = Path(folder)
+    agent, _, task = folder.name.partition("_")
+    require(
+        agent in ARLBENCH and task in ARLBENCH_TASKS,
+        "folder",
+        f"must be AGENT_TASK of {listed(list(ARLBENCH))} and {listed(list(ARLBENCH_TASKS))}; got "
+        f"{shortened(folder.name)}.",
+    )
+    names, tables, other = ARLBENCH[agent], [], set()
+    seeds = sorted((x for x in folder.iterdir() if x.name.isdigit()), key=lambda x: int(x.name))
+    for seed in seeds:
+        with (seed / "runhistory.csv").open(encoding="utf-8") as history:
+            rows = list(csv.DictReader(history))  # some have cells that no column is named for
+        drawn = {x: x.removeprefix(_PREFIX) for x in rows[0] if str(x).startswith(_PREFIX)}
+        other |= {name for name in drawn.values() if name not in names}
+        for row in rows:
+            curve = pd.read_csv(seed / row["run_id"] / "evaluation.csv")
+            at = curve["steps"].iloc[-1] if steps is None else steps
+            returns = curve.loc[curve["steps"] == at, "returns"]
+            require(
+                len(returns) == 1,
+                "steps",
+                f"must be one of {listed([f'{x:.0f}' for x in curve['steps']])}; got {at:g}.",
+            )
+            own: dict[str, object] = {
+                f"{PREFIX}{names[x]}": float(row[c]) for c, x in drawn.items() if x in names
+            }
+            value = float(returns.iloc[0])
+            bad = int(not math.isfinite(value))
+            place: dict[str, object] = {
+                "agent": agent,
+                "config": int(row["run_id"]),
+                "seed": int(seed.name),
+            }
+            tables.append({**place, **own, "nonfinite": bad, "return": value, "steps": int(at)})
+    require(tables, "folder", f"must have a folder for each seed; got {shortened(folder)}.")
+    table = pd.DataFrame(tables)
+    card = {
+        "task": ARLBENCH_TASKS[task],
+        "steps": int(table["steps"].max()),
+        "test_episodes": None,  # not told
+        "agents": {agent: {}},
+        "source": "ARLBench (BSD-3), results/sobol",
+        "left_out": sorted(other),
+    }
+    write(Path(file), card, table.drop(columns="steps"))
+    return sorted(other)
+
+
 def _landscape(
     card: Mapping[str, Any], agent: str, rows: pd.DataFrame, field: str, path: Path
 ) -> Landscape:
     where = f"{shortened(path, 60)} with {shortened(agent, 20)}"
     again = "Run the command that measured it again."
-    grid = rows.pivot_table(index="config", columns="seed", values="return", aggfunc="first")
-    diverged = rows.pivot_table(index="config", columns="seed", values="nonfinite", aggfunc="first")
+    by_place = rows.drop_duplicates(KEYS).set_index(["config", "seed"])
+    grid, diverged = by_place["return"].unstack(), by_place["nonfinite"].unstack()
     values = {
         name.removeprefix(PREFIX): rows.groupby("config")[name].first().to_numpy()
         for name in rows.columns

@@ -410,7 +410,7 @@ def reached_on(
     return found
 
 
-def mean_rank(reached: Reached, measure: str = "both") -> np.ndarray:
+def mean_rank(reached: Reached, measure: str = "greedy") -> np.ndarray:
     """Mean over SEs and measures of the ranks of configurations in [0, 1], `[config]`.
 
     Args:

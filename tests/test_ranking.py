@@ -1,6 +1,7 @@
 """Landscapes, and SEs that rank as they do."""
 
 import dataclasses
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -347,3 +348,37 @@ def test_a_run_learns_by_ranking_and_says_so(file, tmp_path, capsys):
     assert "agreement of ranks" in capsys.readouterr().out
     stored = configuration.learn_config(sejax.load_proxy(tmp_path / "run").config)
     assert stored.name("objective") == "ranking" and stored.objective.steps == 1000
+
+
+# --- ARLBench ------------------------------------------------------------------------------------
+
+# Three configurations and two seeds of results/sobol/ppo_Hopper-v4 at a44d4c64 of
+# github.com/automl/arlbench; BSD-3, copyright its authors.
+EXCERPT = Path(__file__).parent / "arlbench" / "ppo_Hopper-v4"
+
+
+def test_arlbenchs_landscapes_are_read(tmp_path):
+    left_out = landscapes.from_arlbench(EXCERPT, tmp_path / "x.csv")
+    assert left_out == [
+        "max_grad_norm", "minibatch_size", "normalize_advantage", "vf_clip_eps",
+    ]  # fmt: skip
+    found = landscapes.read(tmp_path / "x.csv")["ppo"]
+    assert (found.task, found.steps, found.returns.shape) == ("hopper", 1_000_000, (3, 2))
+    # As in its files: configuration 2 of seed 1, and configuration 0.
+    np.testing.assert_allclose(found.returns[2, 1], 182.50848)
+    np.testing.assert_allclose(found.values["clip_ratio"][0], 0.2744067519636624)
+    early = landscapes.from_arlbench(EXCERPT, tmp_path / "early.csv", steps=100_000)
+    assert early == left_out
+    np.testing.assert_allclose(
+        landscapes.read(tmp_path / "early.csv")["ppo"].returns[2, 1], 184.36667
+    )
+
+
+def test_other_folders_and_checkpoints_are_refused(tmp_path):
+    with pytest.raises(ConfigError, match="folder must be AGENT_TASK"):
+        landscapes.from_arlbench(tmp_path, tmp_path / "x.csv")
+    with pytest.raises(ConfigError, match="steps must be one of 100000"):
+        landscapes.from_arlbench(EXCERPT, tmp_path / "x.csv", steps=5)
+    (tmp_path / "ppo_Hopper-v4").mkdir()
+    with pytest.raises(ConfigError, match="folder must have a folder for each seed"):
+        landscapes.from_arlbench(tmp_path / "ppo_Hopper-v4", tmp_path / "x.csv")

@@ -1,0 +1,390 @@
+"""Is a proxy good for tuning: SEs that are learned to rank configurations of agents.
+
+Configurations of one kind of agent are drawn in wide ranges and trained on the real task, once.
+SEs are learned so that what these configurations reach on them ranks them alike
+(`objective=ranking`); a tuner is a few of those SEs, whose ranks are averaged. Other
+configurations, of this kind and of others, which took no part in learning, stopping or choosing,
+are then ranked by each tuner, and beside it by short trainings on the real task, by regressors on
+the configurations that the SEs were learned from, and by chance.
+"""
+
+import dataclasses
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from scipy.stats import rankdata, spearmanr
+
+import sejax
+from experiments.common import figures, runs, tables
+from experiments.common.agents import DISCRETE, kinds_of_students
+from experiments.common.experiment import Experiment, Settings, count, setting
+from experiments.common.shards import stack, unstack
+from experiments.common.statistics import NUM_RESAMPLES, bca_interval, mean_interval
+from sejax import envs, landscape, landscapes
+from sejax.cli import session
+from sejax.options import each_of
+
+QUICK = (
+    *("es.population_size=4", "proxy.hidden_size=8", "training.max_steps=200"),
+    *("training.max_episodes=200", "objective.num_tests=4"),
+)
+LEARN, HELD = 0, 2000  # seeds of the draws of configurations
+TOP = 5  # configurations that are chosen where several are
+TASK_WORDS = "the real task, {steps:,} steps x {seeds}"
+
+
+@dataclass(frozen=True, kw_only=True)
+class SeTuners(Settings):
+    name = "se_tuners"
+
+    env: str = setting("cartpole")  # task
+    agent: str | None = setting(None)  # that SEs are learned with; the task's first
+    # Kinds of agents whose configurations are ranked; all that fit the task.
+    ranked: tuple[str, ...] = setting((), each_of(tuple(DISCRETE)))
+    run: tuple[str, ...] = setting(())  # overrides of the NES runs
+    num_configs: int = count(64, quick=8)  # of each kind, to learn from and to rank
+    num_seeds: int = count(8, least=2, quick=2)  # real trainings of each
+    steps: int = count(10_000, quick=300)  # of a real training
+    num_tuners: int = count(5, quick=2)
+    members: int = count(3, quick=2)  # SEs of a tuner
+    generations: int | None = count(None, quick=2)  # of the NES runs
+    tuning_seeds: int = count(4, quick=2)  # trainings of a configuration on each SE
+    # Steps of short real trainings, by their seeds.
+    short_steps: tuple[int, ...] = setting((500, 1500, 2000), quick=(100,))
+
+    @property
+    def learner(self) -> str:
+        """The kind of agent that SEs are learned with."""
+        return self.agent or kinds_of_students(envs.make(self.env))[0]
+
+    @property
+    def kinds(self) -> tuple[str, ...]:
+        """The kinds of agents that are ranked, the learning one first."""
+        kinds = self.ranked or kinds_of_students(envs.make(self.env))
+        return tuple(dict.fromkeys((self.learner, *kinds)))
+
+
+# --- computing -----------------------------------------------------------------------------------
+
+
+def measured(settings: SeTuners, kind: str, seed: int, steps: int, first_seed: int) -> pd.DataFrame:
+    """A landscape of one kind, a row for each training; see `python -m sejax.landscape`."""
+    path = settings.work_folder / f"{kind}-{seed}-{steps}.csv"
+    seeds = settings.num_seeds if steps == settings.steps else settings.tuning_seeds
+    words = {
+        "env": settings.env,
+        "agent": kind,
+        "configs": settings.num_configs,
+        "seeds": seeds,
+        "first_seed": first_seed,
+        "steps": steps,
+        "seed": settings.seed + seed,
+        "file": path,
+        "devices": settings.devices or "null",
+    }
+    landscape.main([f"{name}={value}" for name, value in words.items()])
+    rows = landscapes.read_table(path, "work")[1].drop(columns="agent")
+    use = "learn" if seed == LEARN else "held"
+    return rows.assign(kind=kind, use=use, steps=steps)
+
+
+def compute(settings: SeTuners) -> pd.DataFrame:
+    """Measures, learns and ranks what is missing."""
+    real = [measured(settings, settings.learner, LEARN, settings.steps, 0)]
+    for kind in settings.kinds:
+        real.append(measured(settings, kind, HELD, settings.steps, 0))
+        for steps in settings.short_steps:  # of other agents than those that judge
+            real.append(measured(settings, kind, HELD, steps, 100))
+    config = learn_config(settings)
+    number = settings.num_tuners * settings.members
+    configs = runs.configs_of(config, number, settings.work_folder / "runs")
+    chunks = session.make_chunks(configs[0])
+    curves = runs.learn(configs, chunks=chunks)
+    evaluations = chunks.learner.strategy.num_evaluations
+    curves["train_steps_sum"] = curves["train_steps_mean"] * evaluations
+    path = settings.folder / "tuners.safetensors"
+    runs.collect(configs, path)
+    reached = [reached_by(settings, kind, sejax.load_set(path)) for kind in settings.kinds]
+    return stack({"real": pd.concat(real), "curves": curves, "reached": pd.concat(reached)})
+
+
+def learn_config(settings: SeTuners) -> Any:
+    """The configuration of the NES runs."""
+    path = settings.work_folder / f"{settings.learner}-{LEARN}-{settings.steps}.csv"
+    words = [
+        *(f"env={settings.env}", "preset=ranking", f"agent={settings.learner}"),
+        f"objective.landscape={path}",
+        *(QUICK if settings.quick else ()),
+        *([] if settings.generations is None else [f"generations={settings.generations}"]),
+    ]
+    steps = next((x.partition("=")[2] for x in words if x.startswith("training.max_steps=")), None)
+    if steps is not None:
+        agent = agent_config(settings, settings.learner, int(steps))
+        counted = ("exploration_steps", "temperature_steps")
+        words += [f"agent.{x}={getattr(agent, x)}" for x in counted if hasattr(agent, x)]
+    config = sejax.config([*words, *settings.run])
+    return dataclasses.replace(config, devices=settings.devices, seed=settings.seed)
+
+
+def agent_config(settings: SeTuners, kind: str, max_steps: int) -> Any:
+    """An agent with room for all configurations, as it trains on an SE."""
+    from sejax.ranking import scaled
+
+    words = [f"env={settings.env}", "preset=ranking", "objective=max_reward", f"agent={kind}"]
+    config = sejax.config(words)
+    agent, factor = config.agent, max_steps / (config.training.max_steps or max_steps)
+    plain = {field.name: getattr(agent, field.name) for field in dataclasses.fields(agent)}
+    changed = {name: scaled(type(agent), name, x, factor) for name, x in plain.items()}
+    return dataclasses.replace(agent, **changed)
+
+
+def reached_by(settings: SeTuners, kind: str, ses: sejax.ProxySet) -> pd.DataFrame:
+    """What the held-out configurations of one kind reach on each SE, a row each."""
+    from sejax import ranking
+
+    path = settings.work_folder / f"{kind}-{HELD}-{settings.steps}.csv"
+    found = landscapes.read(path, "work")[kind]
+    max_steps = sejax.training_of(ses).max_steps
+    assert max_steps is not None
+    agent = agent_config(settings, kind, max_steps)
+
+    def rows() -> pd.DataFrame:
+        reached = ranking.reached_on(
+            ses,
+            agent,
+            found.values,
+            num_seeds=settings.tuning_seeds,
+            seed=settings.seed,
+            devices=settings.devices,
+        )
+        se, config = np.indices(reached.greedy.shape[:2]).reshape(2, -1)
+        means = {x: getattr(reached, x).mean(axis=-1).ravel() for x in ("greedy", "training")}
+        steps = reached.train_steps.sum(axis=-1).ravel()
+        return pd.DataFrame({"se": se, "config": config, **means, "train_steps": steps})
+
+    made_with = {
+        "weights": [ses[i].fingerprint for i in range(len(ses))],
+        "seeds": settings.tuning_seeds,
+        "configs": settings.num_configs,
+        "steps": settings.steps,
+    }
+    return settings.shards.compute(f"reached-{kind}", made_with, rows).assign(kind=kind)
+
+
+# --- ranking -------------------------------------------------------------------------------------
+
+
+def returns_of(real: pd.DataFrame, use: str, kind: str, steps: int) -> pd.DataFrame:
+    """Returns on the real task, a row for each configuration and a column for each seed."""
+    mine = real[(real["use"] == use) & (real["kind"] == kind) & (real["steps"] == steps)]
+    lowest = mine["return"].min()
+    return mine.pivot(index="config", columns="seed", values="return").fillna(lowest)
+
+
+def features_of(real: pd.DataFrame, kind: str, steps: int) -> tuple[np.ndarray, np.ndarray]:
+    """What configurations set, to learn from and held out, `[config, option]` each.
+
+    As ranks within all of them, so that options on all scales are uniform.
+    """
+    mine = real[(real["kind"] == kind) & (real["steps"] == steps)]
+    names = [x for x in mine if x.startswith(landscapes.PREFIX) and mine[x].notna().all()]
+    each = mine.groupby(["use", "config"], sort=False)[names].first()
+    ranks = each.rank(pct=True)
+    return ranks.loc["learn"].to_numpy(), ranks.loc["held"].to_numpy()
+
+
+def regressed(
+    kind: str, features: np.ndarray, returns: np.ndarray, asked: np.ndarray
+) -> np.ndarray:
+    """What a regressor expects of configurations, `[config]`: `forest` or `gaussian_process`."""
+    from sklearn.ensemble import RandomForestRegressor
+    from sklearn.exceptions import ConvergenceWarning
+    from sklearn.gaussian_process import GaussianProcessRegressor
+    from sklearn.gaussian_process.kernels import ConstantKernel, Matern, WhiteKernel
+
+    if kind == "forest":
+        model = RandomForestRegressor(n_estimators=500, min_samples_leaf=2, random_state=0)
+    else:
+        kernel = ConstantKernel() * Matern(np.ones(features.shape[1]), nu=2.5) + WhiteKernel()
+        model = GaussianProcessRegressor(
+            kernel, normalize_y=True, n_restarts_optimizer=3, random_state=0
+        )
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ConvergenceWarning)  # a length that says: of no effect
+        expected: np.ndarray = model.fit(features, returns).predict(asked)
+    return expected
+
+
+def quality(chooser: np.ndarray, target: np.ndarray) -> dict[str, float]:
+    """How good an order of configurations is for the real task.
+
+    Args:
+      chooser: `[config]`, more is better.
+      target: returns on the real task, `[config]`.
+
+    Returns:
+      `rho`, Spearman's correlation; `regret`, the highest return less that of the first;
+      `regret_top`, the same of the mean of the first `TOP`. Of equally good ones the mean counts.
+    """
+    order = pd.Series(target).groupby(-rankdata(chooser, method="min")).transform("mean")
+    # Equal ones stand together: each is worth their mean.
+    sorted_worth = order.to_numpy()[np.argsort(-chooser, kind="stable")]
+    first = sorted_worth[0]
+    return {
+        "rho": float(spearmanr(chooser, target).statistic) if np.ptp(chooser) else 0.0,
+        "regret": float(target.max() - first),
+        "regret_top": float(target.max() - sorted_worth[:TOP].mean()),
+    }
+
+
+def with_interval(chooser: np.ndarray, target: np.ndarray) -> dict[str, float]:
+    """`quality` with the ends of a BCa interval of rho over configurations."""
+    each = np.arange(target.size)
+    draws = np.random.default_rng(0).integers(0, each.size, (NUM_RESAMPLES, each.size))
+
+    def rho(places: np.ndarray) -> float:
+        return quality(chooser[places], target[places])["rho"]
+
+    found = quality(chooser, target)
+    drawn = pd.Series([rho(x) for x in draws])
+    left_out = pd.Series([rho(np.delete(each, i)) for i in each])
+    low, high = bca_interval(found["rho"], drawn, left_out)
+    return found | {"rho_low": low, "rho_high": high}
+
+
+def over_tuners(choosers: list[np.ndarray], target: np.ndarray) -> dict[str, float]:
+    """The mean of `quality` over tuners, with Student's interval of rho over them."""
+    each = pd.DataFrame([quality(x, target) for x in choosers])
+    low, high = mean_interval(each["rho"])
+    worst = float(each["rho"].min())
+    return {**each.mean(), "rho_low": low, "rho_high": high, "rho_worst": worst}
+
+
+def mean_ranks(reached: pd.DataFrame, ses: list[int]) -> np.ndarray:
+    """Mean over some SEs of the ranks of greedy returns, `[config]`."""
+    mine = reached[reached["se"].isin(ses)]
+    ranks = mine.groupby("se")["greedy"].rank()
+    means: np.ndarray = ranks.groupby(mine["config"]).mean().to_numpy()
+    return means
+
+
+def summarise(settings: SeTuners, rows: pd.DataFrame) -> pd.DataFrame:
+    """A row for each kind of agent and each way to order its configurations."""
+    real, reached = unstack(rows, "real"), unstack(rows, "reached")
+    curves = unstack(rows, "curves")
+    members, number = settings.members, settings.num_tuners
+    learning_cpu_s = curves["cpu_s"].sum() / (number * members)
+    learned = real[real["use"] == "learn"]
+    landscape_cost = {"once_steps": learned["real_steps"].sum()}
+    # CPU seconds of a training step on an SE, with its share of the tests.
+    step_cpu_s = curves["cpu_s"].sum() / curves["train_steps_sum"].sum()
+    found = []
+
+    def add(kind: str, how: str, values: dict[str, float], **costs: float) -> None:
+        found.append({"kind": kind, "ranked_by": how, **values, **costs})
+
+    for kind in settings.kinds:
+        judges = returns_of(real, "held", kind, settings.steps)
+        target = judges.mean(axis=1).to_numpy()
+        mine = reached[reached["kind"] == kind]
+        each = mine["train_steps"].sum() / mine[["se", "config"]].drop_duplicates().shape[0]
+        groups = np.arange(number * members).reshape(number, members).tolist()
+        singles = [mean_ranks(mine, [se]) for se in range(number * members)]
+        tuners = [mean_ranks(mine, ses) for ses in groups]
+        add(kind, "one SE", over_tuners(singles, target), steps=each, cpu_s=each * step_cpu_s,
+            **landscape_cost, learning_cpu_s=learning_cpu_s)  # fmt: skip
+        add(kind, f"a tuner of {members} SEs", over_tuners(tuners, target), steps=members * each,
+            cpu_s=members * each * step_cpu_s,
+            **landscape_cost, learning_cpu_s=members * learning_cpu_s)  # fmt: skip
+        for steps in settings.short_steps:
+            short = returns_of(real, "held", kind, steps)
+            is_short = (real["kind"] == kind) & (real["use"] == "held") & (real["steps"] == steps)
+            cpu_s = real[is_short]["cpu_s"].mean()
+            for num in dict.fromkeys((1, short.shape[1])):
+                how = TASK_WORDS.format(steps=steps, seeds=num)
+                values = with_interval(short.iloc[:, :num].mean(axis=1).to_numpy(), target)
+                add(kind, how, values, real_steps=steps * num, cpu_s=cpu_s * num)
+        if kind == settings.learner:
+            asked = features_of(real, kind, settings.steps)
+            known = returns_of(real, "learn", kind, settings.steps).mean(axis=1).to_numpy()
+            for name in ("forest", "gaussian_process"):
+                expected = regressed(name, asked[0], known, asked[1])
+                add(kind, name.replace("_", " "), with_interval(expected, target), **landscape_cost)
+                both = [rankdata(x) + rankdata(expected) for x in tuners]
+                add(kind, f"{name.replace('_', ' ')} and a tuner, mean rank",
+                    over_tuners(both, target), **landscape_cost,
+                    learning_cpu_s=members * learning_cpu_s)  # fmt: skip
+        halves = [judges.iloc[:, i::2].mean(axis=1).to_numpy() for i in (0, 1)]
+        add(kind, "half of the judging agents", with_interval(*halves),
+            real_steps=settings.steps * (judges.shape[1] // 2))  # fmt: skip
+        add(kind, "chance", {"rho": 0.0, "regret": float(target.max() - target.mean()),
+            "regret_top": float(target.max() - target.mean())})  # fmt: skip
+    return pd.DataFrame(found)
+
+
+# --- the report ----------------------------------------------------------------------------------
+
+
+def report(settings: SeTuners, rows: pd.DataFrame) -> pd.DataFrame:
+    summary = summarise(settings, rows)
+    draw(settings, rows, settings.folder / "ranks.png")
+    columns: dict[str, Any] = {
+        "agent": lambda row: figures.AGENT_NAMES[row.kind],
+        "ranked by": "{ranked_by}",
+        "rho": lambda row: f"{row.rho:.2f}{tables.brackets(row.rho_low, row.rho_high, 2)}",
+        "worst tuner": lambda row: _number(row.rho_worst, 2),
+        "regret": "{regret:.1f}",
+        f"regret, {TOP} best": "{regret_top:.1f}",
+        "SE steps a configuration": lambda row: _number(row.steps),
+        "real steps a configuration": lambda row: _number(row.real_steps),
+        "CPU s a configuration": lambda row: _number(row.cpu_s, 3),
+        "real steps once": lambda row: _number(row.once_steps),
+        "CPU s of learning": lambda row: _number(row.learning_cpu_s),
+    }
+    note = (
+        f"{settings.num_configs} configurations of each kind that took no part in learning, each "
+        f"judged by the mean return of {settings.num_seeds} agents after {settings.steps:,} real "
+        f"steps. SEs are learned from {settings.num_configs} others of "
+        f"{figures.AGENT_NAMES[settings.learner]}, a quarter of which judges incumbents. On an SE "
+        f"{settings.tuning_seeds} agents of a configuration train and are tested on it. Rho: "
+        "Spearman's correlation with the judging returns; in brackets 95%, of tuners Student's "
+        "over these, else BCa over configurations. Regret: the highest judging return less that of "
+        f"the first, or of the first {TOP} on average. Real steps once: of the configurations that "
+        "are learned from, tests included."
+    )
+    task = envs.make(settings.env)
+    title = f"Configurations of agents ranked on SEs of {task.name}"
+    return tables.publish(settings, title, tables.as_texts(summary, columns), summary, note)
+
+
+def _number(value: float, digits: int = 0) -> str:
+    return f"{value:,.{digits}f}" if np.isfinite(value) else ""
+
+
+def draw(settings: SeTuners, rows: pd.DataFrame, path: Path) -> None:
+    """Draws the real return of each configuration against its rank by the first tuner."""
+    real, reached = unstack(rows, "real"), unstack(rows, "reached")
+    kinds = settings.kinds
+    with figures.panels(path, 1, len(kinds), (0.6 + 2.6 * len(kinds), 3.0), sharey=True) as (
+        _,
+        axes,
+    ):
+        for axis, kind in zip(axes[0], kinds, strict=True):
+            target = returns_of(real, "held", kind, settings.steps).mean(axis=1)
+            chooser = mean_ranks(reached[reached["kind"] == kind], list(range(settings.members)))
+            ranks = rankdata(chooser)
+            rho = spearmanr(chooser, target).statistic
+            axis.plot(ranks, target, "o", ms=4, color=figures.REAL, alpha=0.7)
+            axis.set_title(f"{figures.AGENT_NAMES[kind]}, rho {rho:.2f}", fontsize=9)
+            axis.set_xlabel("rank by a tuner")
+        axes[0, 0].set_ylabel("return on the real task")
+
+
+EXPERIMENT = Experiment(settings=SeTuners, compute=compute, report=report, about=__doc__)
+
+if __name__ == "__main__":
+    EXPERIMENT.main()
