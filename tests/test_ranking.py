@@ -170,8 +170,11 @@ def test_all_candidates_of_a_generation_train_the_same_configurations(learned, f
     assert outcome.train_steps.tolist()[0] == 2 * 3 * 60
 
 
-def test_what_configurations_reach_on_ses_is_what_each_agent_reaches(learned, tmp_path):
+def test_what_configurations_reach_on_ses_is_what_each_agent_reaches(
+    learned, tmp_path, monkeypatch
+):
     """Two SEs, three configurations, two seeds against agents that train one after the other."""
+    monkeypatch.setattr(ranking, "CHUNK", 2)  # the second call is filled up
     learner, _, asked, _, found = learned
     weights = [learner.unravel(x) for x in asked.population[:2]]
     config = sejax.config([*RUN, f"objective.landscape={file_of(tmp_path)}"])

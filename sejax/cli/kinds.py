@@ -91,7 +91,7 @@ def kind_of(
             field.startswith(PREFIX) and is_argument and is_number(dimension.at(0.0)),
             field,
             "must be a number of the agent that compiled programs take as an argument, or its "
-            f"hidden_size or batch_size; got {shortened(dimension.text)}. Leave it out.",
+            f"hidden_size or batch_size; got {shortened(dimension.text)}. Leave it out, or fix it.",
         )
     stream = name if stream is None else stream
     rng = np.random.default_rng([plain.seed if seed is None else seed, zlib.crc32(stream.encode())])

@@ -284,12 +284,12 @@ def read(overrides: Sequence[str]) -> Search:
             fixed.append(f"{name}={text}")
     config = from_plain(SearchConfig, values, "")
     where = registry.configure("machines", machines)
-    registry.require_package("machines", where)
     search = Search(config=config, fixed=tuple(fixed), space=space, machines=where)
     if search.tuner is not None:
         _require_on_tuner(search.tuner, found)
         config = from_plain(SearchConfig, ON_TUNER | values, "")
         search = dataclasses.replace(search, config=config)
+    registry.require_package("machines", where)
     require(
         config.landscape is None or search.tuner is not None,
         "landscape",
