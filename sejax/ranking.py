@@ -545,8 +545,8 @@ def _outcome(agreement: Agreement, reached: Sequence[Reached]) -> Outcome:
     """An outcome without tests on the real task; it is not finite if all trainings diverged."""
     survived: Bool[Array, ""] = jnp.stack([jnp.isfinite(x.greedy).any() for x in reached]).any()
     return Outcome(
-        test_returns=jnp.zeros(0),
-        scored_returns=jnp.zeros(0),
+        test_returns=jnp.full(1, jnp.nan),
+        scored_returns=jnp.full(1, jnp.nan),
         train_steps=sum((x.train_steps.sum() for x in reached), jnp.int32(0)),
         train_episodes=sum((x.train_episodes.sum() for x in reached), jnp.int32(0)),
         auc=jnp.float32(0),

@@ -149,12 +149,12 @@ def test_the_first_generation_goes_on_with_the_best_of_fresh_proxies(learned):
 
 
 def test_all_candidates_of_a_generation_train_the_same_configurations(learned, file):
-    """A minibatch, two agents: the incumbent in all places is worth the same in all."""
+    """A minibatch, two agents and devices: one candidate in all places is worth the same in all."""
     path = file.with_name("two.csv")
     agents = dict.fromkeys(("ddqn", "dqn"), CARD["agents"]["ddqn"])
     rows = pd.concat([table(), table(agent="dqn", seed=1)])
     landscapes.write(path, CARD | {"agents": agents}, rows)
-    own = [word for word in RUN if not word.startswith("agent.")]
+    own = [word for word in RUN if not word.startswith(("agent.", "devices="))] + ["devices=2"]
     each = [
         f"agents.{name}.{field}"
         for name in agents
