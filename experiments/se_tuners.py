@@ -108,8 +108,14 @@ def compute(settings: SeTuners) -> pd.DataFrame:
     curves["train_steps_sum"] = curves["train_steps_mean"] * evaluations
     path = settings.folder / "tuners.safetensors"
     runs.collect(configs, path)
-    reached = [reached_by(settings, kind, sejax.load_set(path)) for kind in settings.kinds]
-    return stack({"real": pd.concat(real), "curves": curves, "reached": pd.concat(reached)})
+    tuners = sejax.load_set(path)
+    reached = [reached_by(settings, kind, tuners, "reached") for kind in settings.kinds]
+    found = {"real": pd.concat(real), "curves": curves, "reached": pd.concat(reached)}
+    if settings.env in {x.name for x in sejax.pretrained()}:  # a proxy that was not made for it
+        se = sejax.load_set(settings.env)
+        shipped = [reached_by(settings, kind, se, "shipped") for kind in settings.kinds]
+        found["shipped"] = pd.concat(shipped)
+    return stack(found)
 
 
 def learn_config(settings: SeTuners) -> Any:
@@ -142,8 +148,11 @@ def agent_config(settings: SeTuners, kind: str, max_steps: int) -> Any:
     return dataclasses.replace(agent, **changed)
 
 
-def reached_by(settings: SeTuners, kind: str, ses: sejax.ProxySet) -> pd.DataFrame:
-    """What the held-out configurations of one kind reach on each SE, a row each."""
+def reached_by(settings: SeTuners, kind: str, ses: sejax.ProxySet, name: str) -> pd.DataFrame:
+    """What the held-out configurations of one kind reach on each SE, a row each.
+
+    They train as on the tuners, and on a shipped SE as it was learned.
+    """
     from sejax import ranking
 
     path = settings.work_folder / f"{kind}-{HELD}-{settings.steps}.csv"
@@ -157,6 +166,7 @@ def reached_by(settings: SeTuners, kind: str, ses: sejax.ProxySet) -> pd.DataFra
             ses,
             agent,
             found.values,
+            steps=settings.steps,
             num_seeds=settings.tuning_seeds,
             seed=settings.seed,
             devices=settings.devices,
@@ -172,7 +182,7 @@ def reached_by(settings: SeTuners, kind: str, ses: sejax.ProxySet) -> pd.DataFra
         "configs": settings.num_configs,
         "steps": settings.steps,
     }
-    return settings.shards.compute(f"reached-{kind}", made_with, rows).assign(kind=kind)
+    return settings.shards.compute(f"{name}-{kind}", made_with, rows).assign(kind=kind)
 
 
 # --- ranking -------------------------------------------------------------------------------------
@@ -334,6 +344,11 @@ def summarise(settings: SeTuners, rows: pd.DataFrame) -> pd.DataFrame:
             **landscape_cost, learning_cpu_s=members * learning_cpu_s)  # fmt: skip
         held = real[(real["kind"] == kind) & (real["use"] == "held")]
         cpu_of = held.groupby("steps")["cpu_s"].mean()
+        if "shipped" in set(rows["table"]):
+            shipped = unstack(rows, "shipped").query("kind == @kind")
+            each = shipped["train_steps"].mean()
+            add(kind, "the shipped SE", with_interval(mean_ranks(shipped, [0]), target),
+                steps=each, cpu_s=each * step_cpu_s)  # fmt: skip
         for steps in settings.short_steps:
             short = returns_of(real, "held", kind, steps)
             cpu_s = cpu_of[steps]

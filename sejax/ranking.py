@@ -341,6 +341,7 @@ def reached_on(
     agent: AgentConfig,
     values: Mapping[str, np.ndarray],
     *,
+    steps: int | None = None,
     training: TrainingConfig | None = None,
     num_seeds: int = 4,
     num_tests: int = 32,
@@ -356,6 +357,7 @@ def reached_on(
       agent: with room for all configurations, as it trains on the SE.
       values: by option, what each configuration sets on the real task, `[config]`. Options that
         count steps are scaled to a training on the SE.
+      steps: of a training on the real task; by default those of the SEs' landscape.
       training: on the SE; by default as the SEs were learned with.
       num_seeds: trainings of each configuration on each SE.
       num_tests: greedy episodes after each.
@@ -366,17 +368,19 @@ def reached_on(
       Leaves `[se, config, seed]`.
 
     Raises:
-      ConfigError: for SEs that were not learned so.
+      ConfigError: for SEs that were not learned so, unless `steps` is given.
     """
     stored = ses.config.get("objective", {})
+    steps = steps or (stored.get("steps") if stored.get("name") == "ranking" else None)
     require(
-        stored.get("name") == "ranking" and stored.get("steps"),
+        steps,
         "proxy",
         f"must be learned with objective=ranking; got {shortened(ses.path)}. Learn one with "
         "preset=ranking objective.landscape=FILE.csv.",
     )
+    assert steps is not None
     training = training or training_of(ses)
-    factor = (training.max_steps or stored["steps"]) / stored["steps"]
+    factor = (training.max_steps or steps) / steps
     made = make_agent(agent, ses.task)
     own = scaled_values(type(agent), values, factor)
     measure = make_measure(made, ses.env, training, num_tests)
