@@ -41,6 +41,8 @@ class Ranking(Options):
 
     group: ClassVar[str] = "objective"
     scores_are_returns: ClassVar[bool] = False
+    scores_all_agents: ClassVar[bool] = True  # as one, with a candidate
+    decimals: ClassVar[int] = 3  # of a score, for people
 
     landscape: str | None = None  # CSV file of `python -m sejax.landscape`
     # Of a training of the landscape; null: as its file says, which is then kept with the proxy.
