@@ -34,7 +34,7 @@ QUICK = (
 )
 LEARN, HELD = 0, 2000  # seeds of the draws of configurations
 TOP = 5  # configurations that are chosen where several are
-TASK_WORDS = "the real task, {steps:,} steps x {seeds}"
+TASK_WORDS = "the real task, {steps:,} steps, seeds: {seeds}"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,7 +49,7 @@ class SeTuners(Settings):
     num_configs: int = count(64, quick=8)  # of each kind, to learn from and to rank
     num_seeds: int = count(8, least=2, quick=2)  # real trainings of each
     steps: int = count(10_000, quick=300)  # of a real training
-    num_tuners: int = count(5, quick=2)
+    num_tuners: int = count(5, quick=2)  # of as many SEs each
     members: int = count(3, quick=2)  # SEs of a tuner
     generations: int | None = count(None, quick=2)  # of the NES runs
     tuning_seeds: int = count(4, quick=2)  # trainings of a configuration on each SE
@@ -108,8 +108,14 @@ def compute(settings: SeTuners) -> pd.DataFrame:
     curves["train_steps_sum"] = curves["train_steps_mean"] * evaluations
     path = settings.folder / "tuners.safetensors"
     runs.collect(configs, path)
-    reached = [reached_by(settings, kind, sejax.load_set(path)) for kind in settings.kinds]
-    return stack({"real": pd.concat(real), "curves": curves, "reached": pd.concat(reached)})
+    tuners = sejax.load_set(path)
+    reached = [reached_by(settings, kind, tuners, "reached") for kind in settings.kinds]
+    found = {"real": pd.concat(real), "curves": curves, "reached": pd.concat(reached)}
+    if settings.env in {x.name for x in sejax.pretrained()}:  # a proxy that was not made for it
+        se = sejax.load_set(settings.env)
+        shipped = [reached_by(settings, kind, se, "shipped") for kind in settings.kinds]
+        found["shipped"] = pd.concat(shipped)
+    return stack(found)
 
 
 def learn_config(settings: SeTuners) -> Any:
@@ -142,8 +148,11 @@ def agent_config(settings: SeTuners, kind: str, max_steps: int) -> Any:
     return dataclasses.replace(agent, **changed)
 
 
-def reached_by(settings: SeTuners, kind: str, ses: sejax.ProxySet) -> pd.DataFrame:
-    """What the held-out configurations of one kind reach on each SE, a row each."""
+def reached_by(settings: SeTuners, kind: str, ses: sejax.ProxySet, name: str) -> pd.DataFrame:
+    """What the held-out configurations of one kind reach on each SE, a row each.
+
+    They train as on the tuners, and on a shipped SE as it was learned.
+    """
     from sejax import ranking
 
     path = settings.work_folder / f"{kind}-{HELD}-{settings.steps}.csv"
@@ -157,6 +166,7 @@ def reached_by(settings: SeTuners, kind: str, ses: sejax.ProxySet) -> pd.DataFra
             ses,
             agent,
             found.values,
+            steps=settings.steps,
             num_seeds=settings.tuning_seeds,
             seed=settings.seed,
             devices=settings.devices,
@@ -172,7 +182,7 @@ def reached_by(settings: SeTuners, kind: str, ses: sejax.ProxySet) -> pd.DataFra
         "configs": settings.num_configs,
         "steps": settings.steps,
     }
-    return settings.shards.compute(f"reached-{kind}", made_with, rows).assign(kind=kind)
+    return settings.shards.compute(f"{name}-{kind}", made_with, rows).assign(kind=kind)
 
 
 # --- ranking -------------------------------------------------------------------------------------
@@ -264,6 +274,38 @@ def over_tuners(choosers: list[np.ndarray], target: np.ndarray) -> dict[str, flo
     return {**each.mean(), "rho_low": low, "rho_high": high, "rho_worst": worst}
 
 
+def halved(returns: dict[int, np.ndarray], judges: np.ndarray) -> dict[str, float]:
+    """A choice by successive halving on the real task, the mean over what each judge would choose.
+
+    All configurations train for the fewest steps, a third of them for the next number, and so on;
+    the best of the last ones is chosen after the judges' steps.
+
+    Args:
+      returns: by the steps of a short training, `[config, seed]`, ascending.
+      judges: returns after full trainings, `[config, seed]`; a seed chooses, the others judge.
+
+    Returns:
+      `regret` and `regret_top` of the choice, as of `quality`; `trained_...`, the share of the
+      configurations that trained for so many steps.
+
+    Source: Li et al., "Hyperband" (2017); its bracket that halves most, with eta = 3.
+    """
+    number, regrets = len(judges), []
+    best = judges.mean(axis=1).max()
+    trained = {}
+    for seed in range(judges.shape[1]):
+        alive = np.arange(number)
+        for steps, short in returns.items():
+            trained[steps] = len(alive) / number
+            order = np.argsort(-short[alive, seed % short.shape[1]], kind="stable")
+            alive = alive[order[: max(1, len(alive) // 3)]]
+        chosen = alive[np.argmax(judges[alive, seed])]
+        regrets.append(best - np.delete(judges[chosen], seed).mean())
+    shares = {f"trained_{steps}": share for steps, share in trained.items()}
+    mean = float(np.mean(regrets))
+    return {"regret": mean, "regret_top": mean, **shares, "trained_last": len(alive) / number}
+
+
 def mean_ranks(reached: pd.DataFrame, ses: list[int]) -> np.ndarray:
     """Mean over some SEs of the ranks of greedy returns, `[config]`."""
     mine = reached[reached["se"].isin(ses)]
@@ -300,10 +342,16 @@ def summarise(settings: SeTuners, rows: pd.DataFrame) -> pd.DataFrame:
         add(kind, f"a tuner of {members} SEs", over_tuners(tuners, target), steps=members * each,
             cpu_s=members * each * step_cpu_s,
             **landscape_cost, learning_cpu_s=members * learning_cpu_s)  # fmt: skip
+        held = real[(real["kind"] == kind) & (real["use"] == "held")]
+        cpu_of = held.groupby("steps")["cpu_s"].mean()
+        if "shipped" in set(rows["table"]):
+            shipped = unstack(rows, "shipped").query("kind == @kind")
+            each = shipped["train_steps"].mean()
+            add(kind, "the shipped SE", with_interval(mean_ranks(shipped, [0]), target),
+                steps=each, cpu_s=each * step_cpu_s)  # fmt: skip
         for steps in settings.short_steps:
             short = returns_of(real, "held", kind, steps)
-            is_short = (real["kind"] == kind) & (real["use"] == "held") & (real["steps"] == steps)
-            cpu_s = real[is_short]["cpu_s"].mean()
+            cpu_s = cpu_of[steps]
             for num in dict.fromkeys((1, short.shape[1])):
                 how = TASK_WORDS.format(steps=steps, seeds=num)
                 values = with_interval(short.iloc[:, :num].mean(axis=1).to_numpy(), target)
@@ -318,6 +366,14 @@ def summarise(settings: SeTuners, rows: pd.DataFrame) -> pd.DataFrame:
                 add(kind, f"{name.replace('_', ' ')} and a tuner, mean rank",
                     over_tuners(both, target), **landscape_cost,
                     learning_cpu_s=members * learning_cpu_s)  # fmt: skip
+        rungs = sorted(settings.short_steps)[:2]
+        short_returns = {x: returns_of(real, "held", kind, x).to_numpy() for x in rungs}
+        found_by = halved(short_returns, judges.to_numpy())
+        shares = {x: found_by.pop(f"trained_{x}") for x in rungs}
+        shares[settings.steps] = found_by.pop("trained_last")
+        add(kind, "successive halving", {"rho": np.nan, **found_by},
+            real_steps=sum(x * share for x, share in shares.items()),
+            cpu_s=sum(cpu_of[x] * share for x, share in shares.items()))  # fmt: skip
         halves = [judges.iloc[:, i::2].mean(axis=1).to_numpy() for i in (0, 1)]
         add(kind, "half of the judging agents", with_interval(*halves),
             real_steps=settings.steps * (judges.shape[1] // 2))  # fmt: skip
@@ -335,7 +391,7 @@ def report(settings: SeTuners, rows: pd.DataFrame) -> pd.DataFrame:
     columns: dict[str, Any] = {
         "agent": lambda row: figures.AGENT_NAMES[row.kind],
         "ranked by": "{ranked_by}",
-        "rho": lambda row: f"{row.rho:.2f}{tables.brackets(row.rho_low, row.rho_high, 2)}",
+        "rho": lambda row: f"{_number(row.rho, 2)}{tables.brackets(row.rho_low, row.rho_high, 2)}",
         "worst tuner": lambda row: _number(row.rho_worst, 2),
         "regret": "{regret:.1f}",
         f"regret, {TOP} best": "{regret_top:.1f}",
@@ -353,8 +409,10 @@ def report(settings: SeTuners, rows: pd.DataFrame) -> pd.DataFrame:
         f"{settings.tuning_seeds} agents of a configuration train and are tested on it. Rho: "
         "Spearman's correlation with the judging returns; in brackets 95%, of tuners Student's "
         "over these, else BCa over configurations. Regret: the highest judging return less that of "
-        f"the first, or of the first {TOP} on average. Real steps once: of the configurations that "
-        "are learned from, tests included."
+        f"the first, or of the first {TOP} on average. Successive halving chooses one by "
+        f"{' and '.join(f'{x:,}' for x in sorted(settings.short_steps)[:2])} steps and full "
+        "trainings, of a third of the configurations each. Real steps once: of the configurations "
+        "that are learned from, tests included."
     )
     task = envs.make(settings.env)
     title = f"Configurations of agents ranked on SEs of {task.name}"

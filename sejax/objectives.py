@@ -27,7 +27,8 @@ class Outcome:
     """What came of one agent. Leaves are `[]` but for the first, and `[agent, ...]` for many.
 
     Attributes:
-      test_returns: return of each test episode on the real task, in reward units.
+      test_returns: return of each test episode on the real task, in reward units; a single nan
+        where there was no test.
       scored_returns: the same for the steps of each that the objective has asked for.
       train_steps: steps in the training world.
       train_episodes: episodes there.

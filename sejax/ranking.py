@@ -42,6 +42,8 @@ class Ranking(Options):
 
     group: ClassVar[str] = "objective"
     scores_are_returns: ClassVar[bool] = False
+    scores_all_agents: ClassVar[bool] = True  # as one, with a candidate
+    decimals: ClassVar[int] = 3  # of a score, for people
 
     landscape: str | None = None  # CSV file of `python -m sejax.landscape`
     # Of a training of the landscape; null: as its file says, which is then kept with the proxy.
@@ -342,6 +344,7 @@ def reached_on(
     agent: AgentConfig,
     values: Mapping[str, np.ndarray],
     *,
+    steps: int | None = None,
     training: TrainingConfig | None = None,
     num_seeds: int = 4,
     num_tests: int = 32,
@@ -358,6 +361,7 @@ def reached_on(
       agent: with room for all configurations, as it trains on the SE.
       values: by option, what each configuration sets on the real task, `[config]`. Options that
         count steps are scaled to a training on the SE.
+      steps: of a training on the real task; by default those of the SEs' landscape.
       training: on the SE; by default as the SEs were learned with.
       num_seeds: trainings of each configuration on each SE.
       num_tests: greedy episodes after each.
@@ -369,17 +373,19 @@ def reached_on(
       Leaves `[se, config, seed]`.
 
     Raises:
-      ConfigError: for SEs that were not learned so.
+      ConfigError: for SEs that were not learned so, unless `steps` is given.
     """
     stored = ses.config.get("objective", {})
+    steps = steps or (stored.get("steps") if stored.get("name") == "ranking" else None)
     require(
-        stored.get("name") == "ranking" and stored.get("steps"),
+        steps,
         "proxy",
         f"must be learned with objective=ranking; got {shortened(ses.path)}. Learn one with "
         "preset=ranking objective.landscape=FILE.csv.",
     )
+    assert steps is not None
     training = training or training_of(ses)
-    factor = (training.max_steps or stored["steps"]) / stored["steps"]
+    factor = (training.max_steps or steps) / steps
     made = make_agent(agent, ses.task)
     own = scaled_values(type(agent), values, factor)
     measure = make_measure(made, ses.env, training, num_tests)
@@ -556,8 +562,8 @@ def _outcome(agreement: Agreement, reached: Sequence[Reached]) -> Outcome:
     """An outcome without tests on the real task; it is not finite if all trainings diverged."""
     survived: Bool[Array, ""] = jnp.stack([jnp.isfinite(x.greedy).any() for x in reached]).any()
     return Outcome(
-        test_returns=jnp.zeros(0),
-        scored_returns=jnp.zeros(0),
+        test_returns=jnp.full(1, jnp.nan),
+        scored_returns=jnp.full(1, jnp.nan),
         train_steps=sum((x.train_steps.sum() for x in reached), jnp.int32(0)),
         train_episodes=sum((x.train_episodes.sum() for x in reached), jnp.int32(0)),
         auc=jnp.float32(0),

@@ -76,6 +76,9 @@ TINY = {
                        "real_episodes": 3},
     "se_transfer_of_hparams": {"ses": "se", "num_configs": 3, "num_agents": 2, "max_steps": 40,
                                "test_episodes": 1},
+    "se_tuners": {"ranked": "ddqn", "num_configs": 4, "num_seeds": 2, "steps": 60, "num_tuners": 1,
+                  "members": 1, "tuning_seeds": 2, "short_steps": [40], "generations": 2,
+                  "run": ["objective.judging=0.5"]},
     "supervised_baseline": {"proxy": "se", "hparams": "default", "models": 3, "generations": 2,
                             "population": 2, "max_rows": 30, "epochs": 2, "num_agents": 2,
                             "test_episodes": 2},
@@ -84,7 +87,7 @@ TINY = {
 SLOW = {"break_even", "null_baselines", "rn_heatmap", "rn_objectives", "rn_performance",
         "score_transforms", "se_dynamics", "se_families", "se_feasibility", "se_horizons",
         "se_models", "se_myopia", "se_out_of_sample", "se_performance", "se_transfer_of_hparams",
-        "supervised_baseline"}  # fmt: skip
+        "se_tuners", "supervised_baseline"}  # fmt: skip
 
 
 def module_of(name):

@@ -54,6 +54,17 @@ def file_of(folder):
     return path
 
 
+def two_agents(path):
+    """Overrides of a run with two agents, and their landscape in a file."""
+    agents = dict.fromkeys(("ddqn", "dqn"), CARD["agents"]["ddqn"])
+    rows = pd.concat([table(), table(agent="dqn", seed=1)])
+    landscapes.write(path, CARD | {"agents": agents}, rows)
+    own = [word for word in RUN if not word.startswith(("agent.", "devices="))]
+    fields = ("hidden_size=8", "batch_size=4", "exploration_steps=6")
+    each = [f"agents.{name}.{field}" for name in agents for field in fields]
+    return [*own, *each, "agents=[ddqn,dqn]", f"objective.landscape={path}"]
+
+
 @pytest.fixture
 def file(tmp_path):
     return file_of(tmp_path)
@@ -150,19 +161,9 @@ def test_the_first_generation_goes_on_with_the_best_of_fresh_proxies(learned):
 
 
 def test_all_candidates_of_a_generation_train_the_same_configurations(learned, file):
-    """A minibatch, two agents: the incumbent in all places is worth the same in all."""
-    path = file.with_name("two.csv")
-    agents = dict.fromkeys(("ddqn", "dqn"), CARD["agents"]["ddqn"])
-    rows = pd.concat([table(), table(agent="dqn", seed=1)])
-    landscapes.write(path, CARD | {"agents": agents}, rows)
-    own = [word for word in RUN if not word.startswith("agent.")]
-    each = [
-        f"agents.{name}.{field}"
-        for name in agents
-        for field in ("hidden_size=8", "batch_size=4", "exploration_steps=6")
-    ]
-    words = [f"objective.landscape={path}", "objective.num_configs=3", "agents=[ddqn,dqn]"]
-    learner = make_bilevel(**sejax.config([*own, *each, *words]).parts())
+    """A minibatch, two agents and devices: one candidate in all places is worth the same in all."""
+    words = [*two_agents(file.with_name("two.csv")), "objective.num_configs=3", "devices=2"]
+    learner = make_bilevel(**sejax.config(words).parts())
     asked = learner.ask(learner.init(jax.random.key(0)))
     same = asked.replace(params=jnp.broadcast_to(asked.incumbent, asked.params.shape))
     outcome = jax.jit(learner.evaluate)(same)
@@ -345,12 +346,17 @@ def test_spaces_that_are_no_one_program_are_refused(words, message):
 
 
 def test_a_run_learns_by_ranking_and_says_so(file, tmp_path, capsys):
+    """With two agents: of them all a candidate has one score."""
     from sejax.run import main
 
-    main([*RUN, f"objective.landscape={file}", "generations=2", f"run_dir={tmp_path / 'run'}"])
-    assert "agreement of ranks" in capsys.readouterr().out
+    words = two_agents(file.with_name("two.csv"))
+    main([*words, "generations=2", f"run_dir={tmp_path / 'run'}"])
+    said = capsys.readouterr().out
+    assert "agreement of ranks" in said and "sejax.search proxy=" in said
     stored = configuration.learn_config(sejax.load_proxy(tmp_path / "run").config)
     assert stored.name("objective") == "ranking" and stored.objective.steps == 1000
+    rows = pd.read_csv(tmp_path / "run/metrics.csv")
+    assert not [name for name in rows if name.startswith("incumbent_mean_")]
 
 
 # --- ARLBench ------------------------------------------------------------------------------------

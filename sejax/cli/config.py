@@ -221,6 +221,13 @@ class LearnConfig(CommandConfig):
             return JOINT.join(member.key for member in members_of(self))
         return registry.name_of(group, getattr(self, group))
 
+    @property
+    def scored_agents(self) -> tuple[str, ...]:
+        """The agents that have scores of their own; none where an objective scores all as one."""
+        if getattr(self.objective, "scores_all_agents", False):
+            return ()
+        return tuple(member.key for member in members_of(self))
+
     def plain(self) -> dict[str, Any]:
         """Nested plain values, as in `config.yaml`; what `sejax.save` keeps with a proxy."""
         return plain(self)

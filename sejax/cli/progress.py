@@ -1,7 +1,8 @@
 """Live lines of progress on a terminal, and the last words of `sejax.run`."""
 
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
@@ -15,7 +16,7 @@ from rich.progress import (
 )
 
 from sejax.cli import next_steps, preset_files
-from sejax.cli.config import LearnConfig, members_of
+from sejax.cli.config import JOINT, LearnConfig, members_of
 from sejax.cli.trackers import FinishedGeneration, Reporter
 from sejax.options import registry
 
@@ -116,8 +117,9 @@ class RunProgress(Reporter):
         steps_per_s = self._steps / max(time.monotonic() - self._started, 1e-9)
         values = info.values
         text = (
-            f"incumbent {values['incumbent_mean']:.1f} ± {values['incumbent_std']:.1f}"
-            f"{self._of_agents(values)}, best {values['best_so_far']:.1f}, "
+            f"incumbent {self._score(values['incumbent_mean'])} ± "
+            f"{self._score(values['incumbent_std'])}{self._of_agents(values)}, "
+            f"best {self._score(values['best_so_far'])}, "
             f"{values['train_steps_mean']:,.0f} steps an agent, {steps_per_s:,.0f} steps/s"
         )
         if values["num_nonfinite"]:
@@ -127,10 +129,15 @@ class RunProgress(Reporter):
         if not self._live:
             self.say(f"generation {done}/{self._config.generations}: {text}")
 
+    def _score(self, score: float) -> str:
+        return f"{score:.{getattr(self._config.objective, 'decimals', 1)}f}"
+
     def _of_agents(self, values: Mapping[str, float]) -> str:
         """The incumbent's mean for each of several agents."""
-        keys = [member.key for member in members_of(self._config)]
-        each = [f"{key} {values[f'incumbent_mean_{key}']:.1f}" for key in keys if len(keys) > 1]
+        keys = self._config.scored_agents
+        each = [
+            f"{key} {self._score(values[f'incumbent_mean_{key}'])}" for key in keys if len(keys) > 1
+        ]
         return f" ({', '.join(each)})" if each else ""
 
     def finish(
@@ -138,7 +145,7 @@ class RunProgress(Reporter):
     ) -> None:
         """Says how it ended, where everything is, and what to do next."""
         self.stop()
-        verdict = f"best incumbent score {best:.1f}"
+        verdict = f"best incumbent score {self._score(best)}"
         if learner.objective.meaning:
             verdict += f": {learner.objective.meaning}"
         if learner.solved_score is not None:
@@ -158,10 +165,22 @@ class RunProgress(Reporter):
             f"  {path}/proxy.safetensors    the best proxy\n"
             f"  {path}/learning_curve.png   how it was learned\n"
             f"  {path}/metrics.csv          a row for each generation\n\n"
-            f"Train fresh agents on it, and on the real task beside them:\n"
-            f"  python -m sejax.evaluate {' '.join(words)}\n"
+            f"{self._use(path, words)}\n"
             f"Use it as a gymnax environment:\n"
             f'  env, params = sejax.load("{path}"{self._own_arguments()})'
+        )
+
+    def _use(self, path: Path, words: Sequence[str]) -> str:
+        """What the proxy is for, and its command."""
+        if self._config.name("objective") == "ranking":
+            agent = self._config.name("agent").partition(JOINT)[0]
+            return (
+                "Rank configurations of an agent on it, and try the best on the real task:\n"
+                f"  python -m sejax.search proxy={path} agent={agent}"
+            )
+        return (
+            "Train fresh agents on it, and on the real task beside them:\n"
+            f"  python -m sejax.evaluate {' '.join(words)}"
         )
 
     def _own_arguments(self) -> str:

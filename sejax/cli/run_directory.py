@@ -339,11 +339,10 @@ def open_for(config: "LearnConfig", hint: str = HINT) -> RunDirectory:
     """
     from sejax.cli import config as configuration  # which imports jax
 
-    agents = [member.key for member in configuration.members_of(config)]
     return RunDirectory(
         config.resolved_run_dir,
         configuration.plain(config),
-        agents,
+        config.scored_agents,
         hint,
         completed=lambda stored: configuration.completed(stored, config),
     )
