@@ -119,6 +119,17 @@ def test_agents_that_took_no_part_are_those_of_the_preset(tuner, tmp_path):
     assert setup.agent.temperature_steps == 30 and setup.agent.activation == "tanh"
 
 
+def test_each_agent_of_a_mixture_is_as_it_was_learned_with(tuner, tmp_path):
+    words = [word for word in LEARNED if not word.startswith("agent.")]
+    words += ["agents=[ddqn,sac]", "agents.sac.activation=prelu", "agents.ddqn.activation=relu"]
+    ses, path = sejax.load_set(tuner), tmp_path / "both.safetensors"
+    stored = sejax.config(words).plain() | {"objective": ses.config["objective"]}
+    sejax.save(path, ses.env, ses[0].params.weights, stored)
+    for name, activation in (("sac", "prelu"), ("ddqn", "relu")):
+        search = search_config.read([f"proxy={path}", f"agent={name}", "trials=2"])
+        assert tuning.setup_of(search).agent.activation == activation
+
+
 def test_draws_depend_on_the_sampler_seed_and_on_no_landscapes(tuner, tmp_path):
     drawn = [
         tuning.setup_of(search_config.read(words_of(tuner, tmp_path, *own))).kind.values

@@ -113,8 +113,8 @@ def setup_of(search: Search) -> Setup:
         *_words("env", ses.config["env"], config.env),
         *(f"{x}={as_text(getattr(config, x))}" for x in ("devices", "num_parallel")),
     ]
-    learned = agents_of(ses.config).get(name)
-    if learned is not None:  # which is ranked as it was learned with
+    learned = agents_of(ses.config).get(name, {})
+    if learned.get("name") == name:  # which is ranked as it was learned with
         base += _words("agent", registry.describe("agent", registry.configure("agent", learned)))
         limits = {x: getattr(training, x) for x in ("stop_rule", "max_steps", "max_episodes")}
         base += [f"training.{x}={as_text(value)}" for x, value in limits.items()]
