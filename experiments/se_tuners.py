@@ -196,11 +196,14 @@ def returns_of(real: pd.DataFrame, use: str, kind: str, steps: int) -> pd.DataFr
 
 
 def features_of(real: pd.DataFrame, kind: str, steps: int) -> tuple[np.ndarray, np.ndarray]:
-    """What configurations set, to learn from and held out, `[config, option]` each.
+    """What configurations set, to learn from and held out of one kind, `[config, option]` each.
 
-    As ranks within all of them, so that options on all scales are uniform.
+    Of options that both have, as ranks within all of them, so that all scales are uniform.
     """
-    mine = real[(real["kind"] == kind) & (real["steps"] == steps)]
+    is_full = real["steps"] == steps
+    learn = real[is_full & (real["use"] == "learn")]
+    held = real[is_full & (real["use"] == "held") & (real["kind"] == kind)]
+    mine = pd.concat([learn, held])
     names = [x for x in mine if x.startswith(landscapes.PREFIX) and mine[x].notna().all()]
     each = mine.groupby(["use", "config"], sort=False)[names].first()
     ranks = each.rank(pct=True)
@@ -356,16 +359,14 @@ def summarise(settings: SeTuners, rows: pd.DataFrame) -> pd.DataFrame:
                 how = TASK_WORDS.format(steps=steps, seeds=num)
                 values = with_interval(short.iloc[:, :num].mean(axis=1).to_numpy(), target)
                 add(kind, how, values, real_steps=steps * num, cpu_s=cpu_s * num)
-        if kind == settings.learner:
-            asked = features_of(real, kind, settings.steps)
-            known = returns_of(real, "learn", kind, settings.steps).mean(axis=1).to_numpy()
-            for name in ("forest", "gaussian_process"):
-                expected = regressed(name, asked[0], known, asked[1])
-                add(kind, name.replace("_", " "), with_interval(expected, target), **landscape_cost)
-                both = [rankdata(x) + rankdata(expected) for x in tuners]
-                add(kind, f"{name.replace('_', ' ')} and a tuner, mean rank",
-                    over_tuners(both, target), **landscape_cost,
-                    learning_cpu_s=members * learning_cpu_s)  # fmt: skip
+        asked = features_of(real, kind, settings.steps)
+        known = returns_of(real, "learn", settings.learner, settings.steps).mean(axis=1).to_numpy()
+        for name in ("forest", "gaussian_process"):
+            expected, how = regressed(name, asked[0], known, asked[1]), name.replace("_", " ")
+            add(kind, how, with_interval(expected, target), **landscape_cost)
+            both = [rankdata(x) + rankdata(expected) for x in tuners]
+            add(kind, f"{how} and a tuner, mean rank", over_tuners(both, target),
+                **landscape_cost, learning_cpu_s=members * learning_cpu_s)  # fmt: skip
         rungs = sorted(settings.short_steps)[:2]
         short_returns = {x: returns_of(real, "held", kind, x).to_numpy() for x in rungs}
         found_by = halved(short_returns, judges.to_numpy())
@@ -409,7 +410,8 @@ def report(settings: SeTuners, rows: pd.DataFrame) -> pd.DataFrame:
         f"{settings.tuning_seeds} agents of a configuration train and are tested on it. Rho: "
         "Spearman's correlation with the judging returns; in brackets 95%, of tuners Student's "
         "over these, else BCa over configurations. Regret: the highest judging return less that of "
-        f"the first, or of the first {TOP} on average. Successive halving chooses one by "
+        f"the first, or of the first {TOP} on average. Regressors see the options that an agent "
+        f"shares with {figures.AGENT_NAMES[settings.learner]}. Successive halving chooses one by "
         f"{' and '.join(f'{x:,}' for x in sorted(settings.short_steps)[:2])} steps and full "
         "trainings, of a third of the configurations each. Real steps once: of the configurations "
         "that are learned from, tests included."
