@@ -9,7 +9,6 @@ the configurations that the SEs were learned from, and by chance.
 """
 
 import dataclasses
-import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -26,6 +25,7 @@ from experiments.common.shards import stack, unstack
 from experiments.common.statistics import NUM_RESAMPLES, bca_interval, mean_interval
 from sejax import envs, landscape, landscapes
 from sejax.cli import session
+from sejax.ops import gaussian_process
 from sejax.options import each_of
 
 QUICK = (
@@ -214,21 +214,12 @@ def regressed(
     kind: str, features: np.ndarray, returns: np.ndarray, asked: np.ndarray
 ) -> np.ndarray:
     """What a regressor expects of configurations, `[config]`: `forest` or `gaussian_process`."""
+    if kind == "gaussian_process":
+        return gaussian_process.predict(features, returns, asked)
     from sklearn.ensemble import RandomForestRegressor
-    from sklearn.exceptions import ConvergenceWarning
-    from sklearn.gaussian_process import GaussianProcessRegressor
-    from sklearn.gaussian_process.kernels import ConstantKernel, Matern, WhiteKernel
 
-    if kind == "forest":
-        model = RandomForestRegressor(n_estimators=500, min_samples_leaf=2, random_state=0)
-    else:
-        kernel = ConstantKernel() * Matern(np.ones(features.shape[1]), nu=2.5) + WhiteKernel()
-        model = GaussianProcessRegressor(
-            kernel, normalize_y=True, n_restarts_optimizer=3, random_state=0
-        )
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", ConvergenceWarning)  # a length that says: of no effect
-        expected: np.ndarray = model.fit(features, returns).predict(asked)
+    model = RandomForestRegressor(n_estimators=500, min_samples_leaf=2, random_state=0)
+    expected: np.ndarray = model.fit(features, returns).predict(asked)
     return expected
 
 
