@@ -37,6 +37,7 @@ from experiments.common.agents import (
 from experiments.common.bandits import Copied, PolicyBandit
 from experiments.common.experiment import Experiment, Settings, count, setting
 from experiments.common.shards import stack, unstack
+from experiments.common.statistics import worst_tenth
 from sejax import envs
 from sejax.options import each_of, one_of, positive
 
@@ -280,7 +281,7 @@ def summarise(settings: NullBaselines, rows: pd.DataFrame) -> pd.DataFrame:
         steps = steps_until_solved(mine, solved_reward).median()
         return tables.mean_columns(returns, "test_return", last["group"]) | {
             "median": returns.median(),
-            "worst_tenth": returns[returns <= returns.quantile(0.1)].mean(),
+            "worst_tenth": worst_tenth(returns),
             "worst": returns.min(),
             "solved": (returns >= solved_reward).mean(),
             "median_steps_until_solved": steps if settings.shares else np.nan,

@@ -3,10 +3,13 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pandas as pd
 import pytest
 
+from experiments import null_baselines
 from experiments.common import bandits
 from experiments.common.bandits import PolicyBandit
+from experiments.common.shards import stack
 from sejax import envs
 
 CARTPOLE, CAR = envs.make("cartpole"), envs.make("mountain_car_continuous")
@@ -72,3 +75,14 @@ def test_a_table_of_noise_has_the_units_of_the_task_and_the_actions_of_the_polic
     assert (copied.actions == (copied.states @ np.array([0.1, 0.3, 1.0, 0.6]) > 0)).all()
     car = bandits.copy_by_hand(envs.make("mountain_car"), seed=0, num_states=512, widen=np.inf)
     assert np.allclose(car.states.std(0), [0.45, 0.035], rtol=0.15)  # half of each bound
+
+
+def test_the_worst_tenth_is_a_tenth_where_most_students_are_at_the_ceiling():
+    """Two of twenty, though nineteen have the return of the tenth quantile."""
+    made = {"source": ["by_hand"], "group": "hand-00", "real_steps": 2000.0, "cpu_s": 0.0,
+            "policy_return": 200.0}  # fmt: skip
+    students = {"source": "by_hand", "group": "hand-00", "kind": "ddqn", "hparams": "default",
+                "agent": range(20), "steps": 2000, "test_return": [100] + [200] * 19}  # fmt: skip
+    rows = stack({"makers": pd.DataFrame(made), "students": pd.DataFrame(students)})
+    (row,) = null_baselines.summarise(null_baselines.NullBaselines(), rows).itertuples()
+    assert row.worst_tenth == 150 and row.test_return_mean == 195 and row.worst == 100

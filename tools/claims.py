@@ -23,6 +23,7 @@ import yaml
 
 import sejax
 from experiments.common.shards import read_rows
+from experiments.common.statistics import difference_interval, mean_interval
 from sejax.ops.files import write_text
 from sejax.proxies import zoo
 from tools import remake
@@ -43,6 +44,7 @@ NAMES = re.compile(
 )
 UNCLAIMED = re.compile(rf"(?<![\w.-])(?<!\w[-/]){NUMBER}")
 FUNCTIONS = {"len": len, "min": min, "max": max, "sum": sum, "round": round, "abs": abs}
+FUNCTIONS |= {each.__name__: each for each in (mean_interval, difference_interval)}
 
 
 class WrongError(ValueError):

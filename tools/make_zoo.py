@@ -30,6 +30,11 @@ the proxy and tested on the real task: the mean return there, and how long an ag
 *Teaches by* is the verdict on an SE of [the myopia test](results.md#the-myopia-test): `policy` if
 agents that look at the next reward alone learn as well, `dynamics` if only far-sighted ones learn.
 
+Costs are those of the one run that ships, often the best of several: `cartpole` of five,
+`cartpole-rn` of ten, `cliff_walking-rn` of fifty, `mountain_car_continuous-rn` of five, by their
+scores or, for `cartpole`, by the returns of discrete TD3. What `cartpole_v1` and `pendulum` were
+chosen from is not stored.
+
 The second table of each tells what fresh agents reach that trained for the steps given and were
 then tested on the real task: mean and standard deviation of the agents' mean returns.
 
