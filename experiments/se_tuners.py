@@ -9,7 +9,6 @@ the configurations that the SEs were learned from, and by chance.
 """
 
 import dataclasses
-import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -26,6 +25,7 @@ from experiments.common.shards import stack, unstack
 from experiments.common.statistics import NUM_RESAMPLES, bca_interval, mean_interval
 from sejax import envs, landscape, landscapes
 from sejax.cli import session
+from sejax.ops import gaussian_process
 from sejax.options import each_of
 
 QUICK = (
@@ -196,11 +196,14 @@ def returns_of(real: pd.DataFrame, use: str, kind: str, steps: int) -> pd.DataFr
 
 
 def features_of(real: pd.DataFrame, kind: str, steps: int) -> tuple[np.ndarray, np.ndarray]:
-    """What configurations set, to learn from and held out, `[config, option]` each.
+    """What configurations set, to learn from and held out of one kind, `[config, option]` each.
 
-    As ranks within all of them, so that options on all scales are uniform.
+    Of options that both have, as ranks within all of them, so that all scales are uniform.
     """
-    mine = real[(real["kind"] == kind) & (real["steps"] == steps)]
+    is_full = real["steps"] == steps
+    learn = real[is_full & (real["use"] == "learn")]
+    held = real[is_full & (real["use"] == "held") & (real["kind"] == kind)]
+    mine = pd.concat([learn, held])
     names = [x for x in mine if x.startswith(landscapes.PREFIX) and mine[x].notna().all()]
     each = mine.groupby(["use", "config"], sort=False)[names].first()
     ranks = each.rank(pct=True)
@@ -211,21 +214,12 @@ def regressed(
     kind: str, features: np.ndarray, returns: np.ndarray, asked: np.ndarray
 ) -> np.ndarray:
     """What a regressor expects of configurations, `[config]`: `forest` or `gaussian_process`."""
+    if kind == "gaussian_process":
+        return gaussian_process.predict(features, returns, asked)
     from sklearn.ensemble import RandomForestRegressor
-    from sklearn.exceptions import ConvergenceWarning
-    from sklearn.gaussian_process import GaussianProcessRegressor
-    from sklearn.gaussian_process.kernels import ConstantKernel, Matern, WhiteKernel
 
-    if kind == "forest":
-        model = RandomForestRegressor(n_estimators=500, min_samples_leaf=2, random_state=0)
-    else:
-        kernel = ConstantKernel() * Matern(np.ones(features.shape[1]), nu=2.5) + WhiteKernel()
-        model = GaussianProcessRegressor(
-            kernel, normalize_y=True, n_restarts_optimizer=3, random_state=0
-        )
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", ConvergenceWarning)  # a length that says: of no effect
-        expected: np.ndarray = model.fit(features, returns).predict(asked)
+    model = RandomForestRegressor(n_estimators=500, min_samples_leaf=2, random_state=0)
+    expected: np.ndarray = model.fit(features, returns).predict(asked)
     return expected
 
 
@@ -356,16 +350,14 @@ def summarise(settings: SeTuners, rows: pd.DataFrame) -> pd.DataFrame:
                 how = TASK_WORDS.format(steps=steps, seeds=num)
                 values = with_interval(short.iloc[:, :num].mean(axis=1).to_numpy(), target)
                 add(kind, how, values, real_steps=steps * num, cpu_s=cpu_s * num)
-        if kind == settings.learner:
-            asked = features_of(real, kind, settings.steps)
-            known = returns_of(real, "learn", kind, settings.steps).mean(axis=1).to_numpy()
-            for name in ("forest", "gaussian_process"):
-                expected = regressed(name, asked[0], known, asked[1])
-                add(kind, name.replace("_", " "), with_interval(expected, target), **landscape_cost)
-                both = [rankdata(x) + rankdata(expected) for x in tuners]
-                add(kind, f"{name.replace('_', ' ')} and a tuner, mean rank",
-                    over_tuners(both, target), **landscape_cost,
-                    learning_cpu_s=members * learning_cpu_s)  # fmt: skip
+        asked = features_of(real, kind, settings.steps)
+        known = returns_of(real, "learn", settings.learner, settings.steps).mean(axis=1).to_numpy()
+        for name in ("forest", "gaussian_process"):
+            expected, how = regressed(name, asked[0], known, asked[1]), name.replace("_", " ")
+            add(kind, how, with_interval(expected, target), **landscape_cost)
+            both = [rankdata(x) + rankdata(expected) for x in tuners]
+            add(kind, f"{how} and a tuner, mean rank", over_tuners(both, target),
+                **landscape_cost, learning_cpu_s=members * learning_cpu_s)  # fmt: skip
         rungs = sorted(settings.short_steps)[:2]
         short_returns = {x: returns_of(real, "held", kind, x).to_numpy() for x in rungs}
         found_by = halved(short_returns, judges.to_numpy())
@@ -409,7 +401,8 @@ def report(settings: SeTuners, rows: pd.DataFrame) -> pd.DataFrame:
         f"{settings.tuning_seeds} agents of a configuration train and are tested on it. Rho: "
         "Spearman's correlation with the judging returns; in brackets 95%, of tuners Student's "
         "over these, else BCa over configurations. Regret: the highest judging return less that of "
-        f"the first, or of the first {TOP} on average. Successive halving chooses one by "
+        f"the first, or of the first {TOP} on average. Regressors see the options that an agent "
+        f"shares with {figures.AGENT_NAMES[settings.learner]}. Successive halving chooses one by "
         f"{' and '.join(f'{x:,}' for x in sorted(settings.short_steps)[:2])} steps and full "
         "trainings, of a third of the configurations each. Real steps once: of the configurations "
         "that are learned from, tests included."

@@ -42,6 +42,7 @@ _EXPORTS = {
     "ProxyParams": "sejax.proxies.base",
     "ProxySet": "sejax.proxies.io",
     "QLearningConfig": "sejax.agents.tabular",
+    "Ranking": "sejax.ranking",
     "RewardConfig": "sejax.proxies.configs",
     "RewardThreshold": "sejax.objectives",
     "SACConfig": "sejax.agents.sac",
@@ -108,6 +109,7 @@ if TYPE_CHECKING:  # what a type checker and an editor see
         save_set,
     )
     from sejax.proxies.zoo import PretrainedProxy, pretrained, push
+    from sejax.ranking import Ranking
     from sejax.training import TrainingConfig, TrainResult, make_trainer, training_of
 
 __all__ = [
@@ -138,6 +140,7 @@ __all__ = [
     "ProxyParams",
     "ProxySet",
     "QLearningConfig",
+    "Ranking",
     "RewardConfig",
     "RewardThreshold",
     "SACConfig",

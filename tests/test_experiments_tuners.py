@@ -51,14 +51,17 @@ def test_a_tuner_averages_the_ranks_of_its_ses():
     assert np.isnan(found["rho_low"])  # of three
 
 
-def test_features_are_ranks_among_all_configurations():
+def test_features_are_ranks_of_what_both_agents_have():
     rows = pd.DataFrame({
-        "kind": "ddqn", "use": ["learn", "learn", "held", "held"], "config": [0, 1, 0, 1],
-        "steps": 10, "agent.learning_rate": [1e-4, 1e-1, 1e-3, 1e-2], "agent.other": np.nan,
+        "kind": ["ddqn", "ddqn", "ppo", "ppo", "ddqn"], "use": ["learn"] * 2 + ["held"] * 3,
+        "config": [0, 1, 0, 1, 0], "steps": 10,
+        "agent.learning_rate": [1e-4, 1e-1, 1e-3, 1e-2, 5e-2],
+        "agent.tau": [0.1, 0.2, np.nan, np.nan, 0.3],
     })  # fmt: skip
-    learn, held = se_tuners.features_of(rows, "ddqn", 10)
+    learn, held = se_tuners.features_of(rows, "ppo", 10)
     np.testing.assert_allclose(learn, [[0.25], [1.0]])
     np.testing.assert_allclose(held, [[0.5], [0.75]])
+    assert se_tuners.features_of(rows, "ddqn", 10)[1].shape == (1, 2)
 
 
 @pytest.mark.parametrize("kind", ["forest", "gaussian_process"])

@@ -259,18 +259,6 @@ def test_landscapes_that_do_not_fit_are_refused(tuner, tmp_path, card, own, mess
         tuned(tuner, tmp_path, f"landscape={path}", *own)
 
 
-def test_a_gaussian_process_is_that_of_the_book():
-    """Two points at distance 1 in length scales: K = [[2.5, c], [c, 2.5]], c = 2 exp(-1/2)."""
-    c, theta = 2 * np.exp(-0.5), np.array([0.5, 2.0, 0.5])
-    x, y = np.array([[0.0], [0.5]]), np.array([1.0, 0.0])
-    got = gaussian_process.posterior_mean(x, y, np.array([[0.0]]), theta)
-    determinant = 2.5**2 - c**2
-    np.testing.assert_allclose(got, [(2 * 2.5 - c * c) / determinant])
-    # -y K^-1 y / 2 - log det K / 2
-    expected = -0.5 * 2.5 / determinant - 0.5 * np.log(determinant)
-    np.testing.assert_allclose(gaussian_process.log_likelihood(x, y, theta), expected)
-
-
 def test_a_gaussian_process_finds_the_feature_that_matters():
     rng = np.random.default_rng(0)
     x, x_new = rng.random((40, 3)), rng.random((100, 3))

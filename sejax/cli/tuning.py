@@ -8,6 +8,7 @@ import dataclasses
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from importlib.util import find_spec
 from typing import Any
 
 import filelock
@@ -105,6 +106,12 @@ def setup_of(search: Search) -> Setup:
         search.space,
         "space",
         "must have fields that are not fixed; got none. Leave out one of the agent's overrides.",
+    )
+    require(
+        own.landscape is None or find_spec("sklearn") is not None,
+        "landscape",
+        f"must be left out without scikit-learn; got {shortened(own.landscape)}. Install it with "
+        "pip install 'sejax[search]'.",
     )
     require(own.trials > 1, "trials", "must be at least 2 to be ranked; got 1. Set trials=1000.")
     given = [word for word in search.fixed if word.startswith(PREFIX)]
