@@ -74,8 +74,6 @@ TINY = {
                          "more_steps": [40], "test_episodes": 1},
     "se_performance": {"fixed": "se", "agents": "ddqn", "num_agents": 2, "test_episodes": 2,
                        "real_episodes": 3},
-    "se_transfer_of_hparams": {"ses": "se", "num_configs": 3, "num_agents": 2, "max_steps": 40,
-                               "test_episodes": 1},
     "se_tuners": {"ranked": "ddqn", "num_configs": 4, "num_seeds": 2, "steps": 60, "num_tuners": 1,
                   "members": 1, "tuning_seeds": 2, "short_steps": [40], "generations": 2,
                   "run": ["objective.judging=0.5"]},
@@ -86,7 +84,7 @@ TINY = {
 }  # fmt: skip
 SLOW = {"break_even", "null_baselines", "rn_heatmap", "rn_objectives", "rn_performance",
         "score_transforms", "se_dynamics", "se_families", "se_feasibility", "se_horizons",
-        "se_models", "se_myopia", "se_out_of_sample", "se_performance", "se_transfer_of_hparams",
+        "se_models", "se_myopia", "se_out_of_sample", "se_performance",
         "se_tuners", "supervised_baseline"}  # fmt: skip
 
 
@@ -349,7 +347,7 @@ def test_words_that_cannot_work_are_refused(word, field):
         ("rn_heatmap", {"env": "cartpole"}, "env"),
         ("score_transforms", {"population": 1}, "population"),
         ("se_families", {"sets": []}, "sets"),
-        ("se_transfer_of_hparams", {"num_agents": 1}, "num_agents"),
+        ("se_tuners", {"num_seeds": 1}, "num_seeds"),
         ("timings", {"rows": "pendulum-rn"}, "rows"),
     ],
 )

@@ -20,7 +20,6 @@ from experiments import (
     se_models,
     se_out_of_sample,
     se_performance,
-    se_transfer_of_hparams,
 )
 from experiments.common import agents, figures, runs, shards
 from experiments.common.statistics import (
@@ -444,79 +443,3 @@ def test_runs_are_compared_within_equal_cpu_seconds():
     assert table["stay solved"].tolist() == ["0%", "-"]
     text = se_horizons.differences(each, summary, "threshold")
     assert text == "1-real less limit-real-threshold: +94.0"
-
-
-# --- tuning ---------------------------------------------------------------------------------------
-
-
-def tuning_rows():
-    """Three configurations with two agents each; on the SE the last is best, in truth the first."""
-    returns = {"se": [[10, 10], [20, 20], [30, 30]], "same": [[90, 80], [50, 100], [40, 30]]}
-    return pd.DataFrame([
-        {"world": world, "config": config, "agent": agent, "test_return": float(x),
-         "train_steps": 100, "cpu_s": 0.5}
-        for world, configs in returns.items() for config, agents in enumerate(configs)
-        for agent, x in enumerate(agents)
-    ])  # fmt: skip
-
-
-def test_one_half_of_the_real_agents_judges_what_the_other_chose():
-    rows = tuning_rows()
-    se, same = (se_transfer_of_hparams.returns_by_half(rows, x) for x in ("se", "same"))
-    np.testing.assert_array_equal(se, [[10, 20, 30]] * 2)
-    np.testing.assert_array_equal(same, [[90, 50, 40], [80, 100, 30]])
-    # Even agents choose the first, worth 80 to the odd ones; these the second, worth 50 to those.
-    # The SE chooses the last, worth 30 and 40; a random one is worth 65. Ranks of the means 85, 75
-    # and 35 are those of the SE turned round; the halves rank 3 2 1 and 2 3 1.
-    own = se_transfer_of_hparams.quality(same, same)
-    assert own == pytest.approx({"rho": 0.5, "chosen": 65, "regret": 0, "regret_random": 0})
-    by_se = se_transfer_of_hparams.quality(se, same)
-    assert by_se == pytest.approx({"rho": -1, "chosen": 35, "regret": 30, "regret_random": 0})
-
-    summary = se_transfer_of_hparams.summarise(rows)
-    assert summary["chosen_by"].tolist() == ["se", "same"]
-    assert summary["train_steps"].tolist() == [600, 300]
-    assert summary["cpu_s"].tolist() == [3, 1.5]
-    assert summary[["regret_low", "rho_high"]].isna().all(axis=None)  # of three configurations
-    again = pd.concat([rows, rows.assign(config=rows["config"] + 3)])
-    more = se_transfer_of_hparams.summarise(again)
-    assert more["regret_high"][0] >= 30 >= more["regret_low"][0]
-    assert (more["regret_low"][1], more["regret_high"][1]) == (0, 0)
-
-
-def test_agents_of_a_configuration_share_what_is_drawn():
-    """Stands in for training: an agent's "return" is its learning rate, and a number of its own."""
-    config = sejax.DDQNConfig(hidden_size=2, num_layers=1)
-    agent = sejax.make_agent(config, envs.make("cartpole"), varied=True)
-    hparams = {"learning_rate": 0.0}
-
-    def evaluator(agent, env, task, training):
-        hparams["learning_rate"] = agent.hparams.learning_rate
-        return lambda key, env_params, active: (
-            agent.hparams.learning_rate, jax.random.uniform(key)
-        )  # fmt: skip
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sejax, "make_evaluator", evaluator)
-        run = se_transfer_of_hparams.make_shared_draws(agent, None, None, None)
-        places = [np.asarray(jax.random.key_data(jax.random.key(i))) for i in (0, 1)]
-        made = {(i, seed): run(jax.random.key(seed), (None, places[i]), True)
-                for i in (0, 1) for seed in (0, 1)}  # fmt: skip
-    rates = {place: float(result[0]) for place, (result, _) in made.items()}
-    assert rates[0, 0] == rates[0, 1] != rates[1, 0] == rates[1, 1]
-    assert rates[0, 0] == float(made[0, 0][1]["learning_rate"])
-    assert rates[0, 0] == float(agent.drawn_values(jax.random.key(0))["learning_rate"])
-    assert made[0, 0][0][1] != made[0, 1][0][1]
-
-
-def test_a_tuned_agent_trains_on_the_real_task_as_long_as_on_the_se():
-    of = se_transfer_of_hparams.SeTransferOfHparams.of
-    parts = se_transfer_of_hparams.parts_of(of(run=["agent.batch_size=7"]))
-    assert parts.agent.batch_size == 7 and len(parts.ses) == 1
-    trainings = parts.trainings
-    assert list(trainings) == ["se", "same", "long"]
-    assert trainings["same"].max_steps == trainings["se"].max_steps == 2000
-    assert trainings["same"].stop_rule == "never" and trainings["long"].stop_rule == "solved"
-    assert dataclasses.asdict(trainings["long"])["max_steps"] == 100_000
-    with pytest.raises(ConfigError, match="env=cartpole"):
-        se_transfer_of_hparams.parts_of(of(env="acrobot", ses="cartpole"))
