@@ -245,17 +245,23 @@ def quality(chooser: np.ndarray, target: np.ndarray) -> dict[str, float]:
     }
 
 
+def rank_correlations(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Spearman's correlation of each row, `[row]`; 0 where one is constant."""
+    x, y = (rankdata(each, axis=1) for each in (x, y))
+    x, y = (each - each.mean(axis=1, keepdims=True) for each in (x, y))
+    norm = np.sqrt((x**2).sum(axis=1) * (y**2).sum(axis=1))
+    return np.divide((x * y).sum(axis=1), norm, out=np.zeros(len(x)), where=norm > 0)
+
+
 def with_interval(chooser: np.ndarray, target: np.ndarray) -> dict[str, float]:
     """`quality` with the ends of a BCa interval of rho over configurations."""
     each = np.arange(target.size)
     draws = np.random.default_rng(0).integers(0, each.size, (NUM_RESAMPLES, each.size))
 
-    def rho(places: np.ndarray) -> float:
-        return quality(chooser[places], target[places])["rho"]
-
     found = quality(chooser, target)
-    drawn = pd.Series([rho(x) for x in draws])
-    left_out = pd.Series([rho(np.delete(each, i)) for i in each])
+    drawn = pd.Series(rank_correlations(chooser[draws], target[draws]))
+    others = np.array([np.delete(each, i) for i in each])
+    left_out = pd.Series(rank_correlations(chooser[others], target[others]))
     low, high = bca_interval(found["rho"], drawn, left_out)
     return found | {"rho_low": low, "rho_high": high}
 

@@ -17,6 +17,15 @@ def test_quality_is_scipys_rho_and_the_loss_of_the_choice():
     assert found["regret_top"] == 50 - np.mean([30, 40, 50, 20, 10])
 
 
+def test_rank_correlations_are_scipys():
+    rng = np.random.default_rng(0)
+    x, y = rng.integers(0, 5, (6, 9)), rng.normal(size=(6, 9))
+    found = se_tuners.rank_correlations(x, y)
+    expected = [spearmanr(*each).statistic for each in zip(x, y, strict=True)]
+    np.testing.assert_allclose(found, expected)
+    assert se_tuners.rank_correlations(np.ones((1, 3)), y[:1, :3]) == 0
+
+
 def test_of_equally_good_choices_the_mean_counts():
     target = np.array([10.0, 50, 30])
     found = se_tuners.quality(np.array([1.0, 1, 0]), target)
