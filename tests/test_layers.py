@@ -11,14 +11,14 @@ ROOT = Path(__file__).parents[1] / "sejax"
 # looked up when somebody asks for what they stand for: they do not count.
 LAYERS = [
     {"search"},
-    {"run", "evaluate", "report"},
+    {"run", "evaluate", "landscape", "report"},
     {"cli"},
-    {"bilevel"},
+    {"bilevel", "ranking"},
     {"evaluation"},
     {"training", "objectives", "gym"},
     {"proxies"},
     {"agents"},
-    {"envs", "es"},
+    {"envs", "es", "landscapes"},
     {"ops"},
     {"options"},
     {""},

@@ -298,8 +298,8 @@ def test_the_area_under_the_curve_is_of_trainings_that_go_on_when_solved(objecti
     config = sejax.config([*LEARN, f"objective={objective}"])
     assert config.training.stop_rule == "solved"
     asked = []
-    monkeypatch.setattr(bilevel, "make_population_evaluator",
-                        lambda agent, proxy, training, *_: asked.append(training))  # fmt: skip
+    monkeypatch.setattr(bilevel, "evaluators_of", lambda *parts: asked.append(parts[-1]))
+    monkeypatch.setattr(bilevel, "make_population_evaluator", lambda *_: None)
     bilevel.make_bilevel(**config.parts())
     changes = {"stop_rule": "never", "tests_between": 1}
     assert asked == [dataclasses.replace(config.training, **changes)]
