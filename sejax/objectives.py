@@ -7,7 +7,7 @@ number. `Scoring` applies it to a generation: what the strategy compares, and wh
 import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import jax.numpy as jnp
 import numpy as np
@@ -19,7 +19,9 @@ from sejax.envs.base import Task
 from sejax.es.base import Evaluations, Strategy, finite_mean
 from sejax.options import Options, counts, not_negative, option, require
 from sejax.proxies.base import ProxyEnv
-from sejax.training import TrainingConfig
+
+if TYPE_CHECKING:  # which lies above
+    from sejax.training import TrainingConfig
 
 
 @struct.dataclass
@@ -104,7 +106,7 @@ class Objective:
     eval_steps: Callable[[Array], Array] | None = None
     judge: Callable[[Outcome], Float[Array, "*agent"]] | None = None
     evaluators: (
-        Callable[[Mixture, ProxyEnv, TrainingConfig], tuple[Evaluator, Evaluator]] | None
+        Callable[[Mixture, ProxyEnv, "TrainingConfig"], tuple[Evaluator, Evaluator]] | None
     ) = None
     meaning: str = ""
 
