@@ -239,7 +239,7 @@ def quality(chooser: np.ndarray, target: np.ndarray) -> dict[str, float]:
     sorted_worth = order.to_numpy()[np.argsort(-chooser, kind="stable")]
     first = sorted_worth[0]
     return {
-        "rho": float(spearmanr(chooser, target).statistic) if np.ptp(chooser) else 0.0,
+        "rho": float(rank_correlations(chooser[None], target[None])[0]),
         "regret": float(target.max() - first),
         "regret_top": float(target.max() - sorted_worth[:TOP].mean()),
     }

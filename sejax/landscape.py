@@ -104,7 +104,7 @@ def read(overrides: Sequence[str]) -> tuple[LandscapeConfig, list[Kind]]:
     from sejax.cli import spaces
 
     names = [field.name for field in dataclasses.fields(LandscapeConfig)]
-    values, ranges, rest, asked = {}, {}, [], ["ddqn"]
+    values, ranges, rest = {}, {}, []
     given = dict(override.partition("=")[::2] for override in overrides)
     for name, text in given.items():
         if name in names:
@@ -127,7 +127,14 @@ def read(overrides: Sequence[str]) -> tuple[LandscapeConfig, list[Kind]]:
         f"must come with one agent; got {','.join(asked)}. Measure each in a file of its own.",
     )
     found = [
-        kind_of(name, base, _space(own, name, base, ranges), configs=own.configs, steps=own.steps)
+        kind_of(
+            name,
+            base,
+            _space(own, name, base, ranges),
+            configs=own.configs,
+            steps=own.steps,
+            exact=foreign,
+        )
         for name in asked
     ]
     return own, found

@@ -61,17 +61,6 @@ class Landscape:
         means: np.ndarray = self.returns.mean(axis=1)
         return means
 
-    def take(self, places: np.ndarray | slice) -> "Landscape":
-        """The landscape of some configurations."""
-        return Landscape(
-            task=self.task,
-            agent=self.agent,
-            options=self.options,
-            steps=self.steps,
-            values={name: x[places] for name, x in self.values.items()},
-            returns=self.returns[places],
-        )
-
 
 def read(path: Path | str, field: str = FIELD) -> dict[str, Landscape]:
     """The landscapes of a file by their agents.
@@ -83,7 +72,7 @@ def read(path: Path | str, field: str = FIELD) -> dict[str, Landscape]:
     """
     card, table = read_table(path, field)
     return {
-        str(agent): _landscape(card, str(agent), rows, f"{field}", Path(path))
+        str(agent): _landscape(card, str(agent), rows, field, Path(path))
         for agent, rows in table.groupby("agent", sort=False)
     }
 
@@ -169,6 +158,7 @@ def from_arlbench(folder: Path | str, file: Path | str, steps: int | None = None
 
     Raises:
       ConfigError: for a folder that holds no such landscape, or no such checkpoint.
+      OSError: if a file of the folder cannot be read.
 
     Source: Becktepe et al., "ARLBench: Flexible and Efficient Benchmarking for Hyperparameter
     Optimization in Reinforcement Learning" (2024).
@@ -176,10 +166,10 @@ def from_arlbench(folder: Path | str, file: Path | str, steps: int | None = None
     folder = Path(folder)
     agent, _, task = folder.name.partition("_")
     require(
-        agent in ARLBENCH and task in ARLBENCH_TASKS,
+        agent in ARLBENCH and task in ARLBENCH_TASKS and folder.is_dir(),
         "folder",
-        f"must be AGENT_TASK of {listed(list(ARLBENCH))} and {listed(list(ARLBENCH_TASKS))}; got "
-        f"{shortened(folder.name)}.",
+        f"must be a folder AGENT_TASK of {listed(list(ARLBENCH))} and "
+        f"{listed(list(ARLBENCH_TASKS))}; got {shortened(folder.name)}.",
     )
     names, tables, other = ARLBENCH[agent], [], set()
     seeds = sorted((x for x in folder.iterdir() if x.name.isdigit()), key=lambda x: int(x.name))

@@ -92,8 +92,8 @@ class Objective:
         against.
       eval_steps: `generation -> steps`, how much of the test episodes it scores, if not all: a
         curriculum.
-      judge: `outcome -> [agent]`, by which people see an incumbent and the best one is kept, if not
-        by `score`.
+      judge: `outcome -> [agent]`, by which people see an incumbent and the best one is kept. None
+        for `score`, or with `eval_steps` for the mean return of whole test episodes.
       evaluators: `(mixture, proxy, training)` to two evaluators, of the population and of the
         incumbent, each of a candidate with all agents; None where one agent of the mixture trains
         on a candidate and is tested on the real task.
@@ -116,7 +116,10 @@ class Objective:
 
     def judged(self, outcome: Outcome) -> Float[Array, "*agent"]:
         """The scores that people see; nan likewise."""
-        return jnp.where(outcome.nonfinite, jnp.nan, (self.judge or self.score)(outcome))
+        judge = self.judge or self.score
+        if self.judge is None and self.eval_steps is not None:
+            judge = lambda outcome: outcome.test_return  # noqa: E731
+        return jnp.where(outcome.nonfinite, jnp.nan, judge(outcome))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -152,7 +155,6 @@ class MaxReward(Options):
             score=lambda outcome: outcome.scored_returns.mean(axis=-1),
             scores_are_returns=True,
             eval_steps=eval_steps,
-            judge=lambda outcome: outcome.test_return,
         )
 
 

@@ -25,7 +25,17 @@ from sejax.evaluation import make_proxy_tester, num_parallel_on_cpu
 from sejax.landscapes import Landscape
 from sejax.objectives import Agreement, Evaluator, Objective, Outcome
 from sejax.ops.parallel import compiler_options, map_in_batches, on_cpu, spread_over_devices
-from sejax.options import Options, between, counts, marks, one_of, option, require, shortened
+from sejax.options import (
+    Options,
+    between,
+    counts,
+    marks,
+    one_of,
+    option,
+    registry,
+    require,
+    shortened,
+)
 from sejax.options.plain import to_plain
 from sejax.proxies.base import ProxyEnv
 from sejax.proxies.io import ProxySet
@@ -33,6 +43,7 @@ from sejax.training import TrainingConfig, make_trainer, training_of
 
 AGREEMENTS = ("spearman", "top")
 MEASURES = ("both", "greedy", "training")
+SIZES = ("hidden_size", "batch_size")  # options that an agent has room for, beside traced ones
 CHUNK = 128  # most configurations of one call of a program, so that memory stays small
 
 
@@ -195,7 +206,7 @@ def require_same_options(config: AgentConfig, landscape: Landscape, steps: int) 
             f"agent.{name}={expected}.",
         )
     for name, values in landscape.values.items():
-        is_size = name in ("hidden_size", "batch_size") and name in own
+        is_size = name in SIZES and name in own
         require(
             is_size or marks(cls, name).get("traced"),
             "objective.landscape",
@@ -483,11 +494,13 @@ def make_evaluators(
     All candidates of a generation train the same configurations with the same keys if
     `es.common_random_numbers` is set. The incumbent's agents train those and then the judging ones.
     """
+    # A mixture has its agents in an order of its own; a single one may have no name.
+    names = mixture.names if mixture.size > 1 else tuple(found)
     require(
-        mixture.size == len(found),
+        set(names) == set(found),
         "agent",
-        f"must be {', '.join(found)}, of the landscape; got {mixture.size} agents. Pass those in "
-        "this order.",
+        f"must be {', '.join(found)}, of the landscape; got {', '.join(names)}. Pass "
+        "sejax.Mixture(agents=..., names=...) with these names.",
     )
     require(
         not proxy.is_real,
@@ -496,10 +509,9 @@ def make_evaluators(
         "Set proxy=se.",
     )
     learning, judging, measures, widths = [], [], [], []
-    for landscape, agent in zip(found.values(), mixture.agents, strict=True):
-        each = configurations_of(
-            landscape, agent, config_class(landscape.agent), training.max_steps
-        )
+    for name, agent in zip(names, mixture.agents, strict=True):
+        landscape, cls = found[name], registry.find("agent", name)
+        each = configurations_of(landscape, agent, cls, training.max_steps)
         places, first = np.arange(landscape.size), landscape.size - options.num_judging(landscape)
         learning.append(each.take(places[:first]))
         judging.append(each.take(places[first:]))
@@ -571,14 +583,6 @@ def _outcome(agreement: Agreement, reached: Sequence[Reached]) -> Outcome:
         real_steps=jnp.int32(0),
         agreement=agreement,
     )
-
-
-def config_class(agent: str) -> type:
-    """The class of an agent's options by its name."""
-    from sejax.options import registry
-
-    cls: type = registry.find("agent", agent)
-    return cls
 
 
 __all__ = ["Ranking", "Reached", "agreement", "mean_rank", "ranks", "reached_on"]

@@ -49,6 +49,8 @@ def test_a_curriculum_scores_other_lengths_until_it_is_over():
     np.testing.assert_array_equal(objective(ended), [20.0, 400.0, np.nan])
     np.testing.assert_array_equal(objective.judged(ended), [10.0, 200.0, np.nan])
     assert MaxReward().make(task()).eval_steps is None
+    own = Objective(score=lambda outcome: outcome.scored_returns.mean(axis=-1), eval_steps=len)
+    np.testing.assert_array_equal(own.judged(ended), [10.0, 200.0, np.nan])  # one of your own too
 
 
 def test_reward_threshold_charges_steps_and_the_shortfall():

@@ -56,8 +56,8 @@ def file_of(folder):
 
 def two_agents(path):
     """Overrides of a run with two agents, and their landscape in a file."""
-    agents = dict.fromkeys(("ddqn", "dqn"), CARD["agents"]["ddqn"])
-    rows = pd.concat([table(), table(agent="dqn", seed=1)])
+    agents = dict.fromkeys(("dqn", "ddqn"), CARD["agents"]["ddqn"])  # not as a mixture sorts them
+    rows = pd.concat([table(agent="dqn", seed=1), table()])
     landscapes.write(path, CARD | {"agents": agents}, rows)
     own = [word for word in RUN if not word.startswith(("agent.", "devices="))]
     fields = ("hidden_size=8", "batch_size=4", "exploration_steps=6")
@@ -201,6 +201,20 @@ def test_what_configurations_reach_on_ses_is_what_each_agent_reaches(
     np.testing.assert_allclose(ranking.mean_rank(reached, "greedy"), expected, atol=1e-6)
 
 
+def test_each_agent_trains_its_own_configurations(file, monkeypatch):
+    """Whatever order the file and the mixture have them in."""
+    config = sejax.config(two_agents(file.with_name("two.csv")))
+    found, asked = config.objective.landscapes("cartpole"), []
+    assert list(found) == ["dqn", "ddqn"]
+    monkeypatch.setattr(ranking, "configurations_of", lambda x, agent, cls, steps: (
+        asked.append((x.agent, agent)) or ranking.Configurations(agent, {}, jnp.zeros(x.size))
+    ))  # fmt: skip
+    make_bilevel(**config.parts())
+    of_names = {member.key: sejax.make_agent(member.agent, config.task())
+                for member in config.agents.members}  # fmt: skip
+    assert asked == list(of_names.items())
+
+
 # --- landscapes ----------------------------------------------------------------------------------
 
 
@@ -310,6 +324,12 @@ def test_a_landscapes_row_is_an_agent_with_those_options(tmp_path):
     np.testing.assert_allclose(got.test_return, row["return"], rtol=1e-5)
 
 
+def test_an_option_that_is_fixed_stays_as_it_is():
+    words = ["env=cartpole", "agent=ddqn", "steps=10000", "agent.exploration_steps=50"]
+    (kind,) = command.read(words)[1]
+    assert kind.config.agent.exploration_steps == 50 and "exploration_steps" not in kind.values
+
+
 def test_draws_do_not_depend_on_other_agents_and_cover_the_space():
     words = ["env=cartpole", "configs=200", "steps=10000"]
     (alone,) = command.read([*words, "agent=ddqn"])[1]
@@ -384,7 +404,7 @@ def test_arlbenchs_landscapes_are_read(tmp_path):
 
 
 def test_other_folders_and_checkpoints_are_refused(tmp_path):
-    with pytest.raises(ConfigError, match="folder must be AGENT_TASK"):
+    with pytest.raises(ConfigError, match="folder must be a folder AGENT_TASK"):
         landscapes.from_arlbench(tmp_path, tmp_path / "x.csv")
     with pytest.raises(ConfigError, match="steps must be one of 100000"):
         landscapes.from_arlbench(EXCERPT, tmp_path / "x.csv", steps=5)

@@ -16,6 +16,7 @@ import numpy as np
 
 from sejax.cli import config as configuration
 from sejax.cli.config import LearnConfig
+from sejax.landscapes import PREFIX
 from sejax.options import as_text, is_number, marks, require, shortened
 from sejax.options.plain import to_plain
 
@@ -26,8 +27,6 @@ if TYPE_CHECKING:  # which take long to import, or need Optuna
     from sejax.cli.spaces import Dimension
 
 CHUNK = 64  # most trainings of one call of the program
-SIZES = ("hidden_size", "batch_size")  # for which there is room
-PREFIX = "agent."
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,7 +78,7 @@ def kind_of(
       ConfigError: for overrides that cannot be, ranges of what a compiled program does not take as
         an argument, and values that an agent does not take.
     """
-    from sejax.ranking import scaled
+    from sejax.ranking import SIZES, scaled
 
     words = [*base, f"agent={name}"]
     plain = configuration.config(words)

@@ -20,10 +20,10 @@ from sejax.agents.base import AgentConfig
 from sejax.cli import config as configuration
 from sejax.cli import runtime, search_results
 from sejax.cli.config import REAL_TRAINING, EvaluateConfig
-from sejax.cli.kinds import PREFIX, Kind, kind_of, stored, train
+from sejax.cli.kinds import Kind, kind_of, stored, train
 from sejax.cli.search_config import Search
 from sejax.cli.worlds import load
-from sejax.landscapes import Landscape
+from sejax.landscapes import PREFIX, Landscape
 from sejax.ops import gaussian_process
 from sejax.ops.files import require_writable, write_text
 from sejax.options import as_text, listed, registry, require, shortened
