@@ -336,6 +336,13 @@ def test_spaces_that_are_no_one_program_are_refused(words, message):
         command.read([*[x for x in WORDS if x.partition("=")[0] not in named], *words])
 
 
+def test_a_run_with_two_agents_has_one_score(file):
+    config = sejax.config(two_agents(file.with_name("two.csv")))
+    assert config.scored_agents == ()  # and so no columns of each
+    assert make_bilevel(**config.parts()).scoring.mixture.size == 1
+
+
+@pytest.mark.slow
 def test_a_run_learns_by_ranking_and_says_so(file, tmp_path, capsys):
     """With two agents: of them all a candidate has one score."""
     from sejax.run import main
