@@ -117,6 +117,7 @@ def test_rns_of_other_settings_are_refused_before_any_are_learned(options, monke
         rn_performance.EXPERIMENT.run(other)
 
 
+@pytest.mark.slow
 def test_objectives_are_compared_with_the_best_and_the_worst(options):
     settings = options(RnObjectives, objectives=("reward_threshold", "auc"))
     table = rn_objectives.EXPERIMENT.run(settings)
