@@ -19,7 +19,7 @@ from scipy.stats import rankdata, spearmanr
 
 import sejax
 from experiments.common import figures, runs, tables
-from experiments.common.agents import DISCRETE, kinds_of_students
+from experiments.common.agents import CONTINUOUS, DISCRETE, kinds_of_students
 from experiments.common.experiment import Experiment, Settings, count, setting
 from experiments.common.shards import stack, unstack
 from experiments.common.statistics import NUM_RESAMPLES, bca_interval, mean_interval
@@ -44,7 +44,7 @@ class SeTuners(Settings):
     env: str = setting("cartpole")  # task
     agent: str | None = setting(None)  # that SEs are learned with; the task's first
     # Kinds of agents whose configurations are ranked; all that fit the task.
-    ranked: tuple[str, ...] = setting((), each_of(tuple(DISCRETE)))
+    ranked: tuple[str, ...] = setting((), each_of(tuple(dict.fromkeys(DISCRETE + CONTINUOUS))))
     run: tuple[str, ...] = setting(())  # overrides of the NES runs
     num_configs: int = count(64, quick=8)  # of each kind, to learn from and to rank
     num_seeds: int = count(8, least=2, quick=2)  # real trainings of each

@@ -53,6 +53,7 @@ _EXPORTS = {
     "Task": "sejax.envs.base",
     "TrainResult": "sejax.training",
     "TrainingConfig": "sejax.training",
+    "Tuner": "sejax.proxies.tuners",
     "config": "sejax.cli.config",
     "configure_xla": "sejax.cli.runtime",
     "evaluate_agents": "sejax.evaluation",
@@ -64,6 +65,7 @@ _EXPORTS = {
     "make_learner": "sejax.bilevel",
     "make_trainer": "sejax.training",
     "pretrained": "sejax.proxies.zoo",
+    "pretrained_tuners": "sejax.proxies.tuners",
     "push": "sejax.proxies.zoo",
     "register_gymnax": "sejax.proxies.io",
     "save": "sejax.proxies.io",
@@ -108,6 +110,7 @@ if TYPE_CHECKING:  # what a type checker and an editor see
         save,
         save_set,
     )
+    from sejax.proxies.tuners import Tuner, pretrained_tuners
     from sejax.proxies.zoo import PretrainedProxy, pretrained, push
     from sejax.ranking import Ranking
     from sejax.training import TrainingConfig, TrainResult, make_trainer, training_of
@@ -151,6 +154,7 @@ __all__ = [
     "Task",
     "TrainResult",
     "TrainingConfig",
+    "Tuner",
     "agents",
     "config",
     "configure_xla",
@@ -167,6 +171,7 @@ __all__ = [
     "make_trainer",
     "options",
     "pretrained",
+    "pretrained_tuners",
     "proxies",
     "push",
     "register_gymnax",

@@ -142,9 +142,12 @@ for proxy in sejax.pretrained():
         print(proxy.name, env.task.name == proxy.task)
     except sejax.ConfigError as error:
         print(proxy.name, "sejax[mujoco]" in str(error))
+for tuner in sejax.pretrained_tuners():
+    print(tuner.name, len(sejax.load_set(tuner.name)) == tuner.ses)
 """
     lines = dict(line.split() for line in run("-c", program).splitlines())
-    assert lines == {proxy.name: "True" for proxy in sejax.pretrained()}
+    shipped = [*sejax.pretrained(), *sejax.pretrained_tuners()]
+    assert lines == {each.name: "True" for each in shipped}
 
 
 def test_what_needs_an_extra_says_which(run):
@@ -183,3 +186,15 @@ def test_a_users_script_runs_and_mypy_finds_nothing_in_it(run, python, tmp_path)
             "--cache-dir", tmp_path / "cache", "script.py"]  # fmt: skip
     done = subprocess.run(mypy, cwd=tmp_path, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout
+
+
+# --- with the extra search -----------------------------------------------------------------------
+
+
+def test_a_shipped_tuner_tunes(run, python):
+    install(python, f"{one('*.whl')}[search]")
+    words = ["proxy=cartpole-tuner", "agent=sac", "trials=6", "verify=1", "fresh_seeds=1",
+             "devices=1", "search_dir=tuned"]  # fmt: skip
+    assert "python -m sejax.evaluate proxy=real env=cartpole agent=sac" in run(
+        "-m", "sejax.search", *words
+    )

@@ -95,6 +95,15 @@ def test_a_proxy_needs_no_configuration_and_no_record(tmp_path, env, weights):
     assert refusal(proxy.learned_with, "training").field == "group"
 
 
+def test_no_path_of_the_machine_is_kept(path, env, weights):
+    objective = {"name": "ranking", "landscape": "/home/me/x.csv", "steps": 7}
+    config = {"run_dir": "/home/me/run", "objective": objective}
+    sejax.save(path, env, weights[0], config, 0.9)
+    config = sejax.load_proxy(path).config
+    assert config["run_dir"] is None
+    assert config["objective"] == {"name": "ranking", "landscape": None, "steps": 7}
+
+
 def test_a_loaded_proxy_steps_as_a_gymnax_environment():
     env, params = sejax.load("cartpole")
     obs, state = env.reset(jax.random.key(0), params)

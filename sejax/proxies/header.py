@@ -30,6 +30,7 @@ from sejax.proxies import hub
 
 FORMAT_VERSION = 2
 PRETRAINED_DIR = Path(__file__).parents[1] / "pretrained"
+TUNERS_DIR = PRETRAINED_DIR / "tuners"
 _KEY = "sejax"  # of the metadata's entry
 _LARGEST_FLOAT = float(np.finfo(np.float32).max)
 
@@ -148,8 +149,13 @@ def is_registered(group: str, stored: object) -> bool:
 
 
 def pretrained_names() -> list[str]:
-    """Names of the proxies that ship with the package."""
+    """Names of the proxies that ship with the package, each of which agents train on."""
     return sorted(path.stem for path in PRETRAINED_DIR.glob("*.safetensors"))
+
+
+def tuner_names() -> list[str]:
+    """Names of the tuners that ship with the package: sets of SEs that rank configurations."""
+    return sorted(path.stem for path in TUNERS_DIR.glob("*.safetensors"))
 
 
 def find(source: str | Path, option: str = "source", also: Sequence[str] = ()) -> Path:
@@ -185,10 +191,10 @@ def find(source: str | Path, option: str = "source", also: Sequence[str] = ()) -
         "must be a run directory, a safetensors file, a shipped name or hf://USER/REPO; got "
         f"{text}, which does not exist.",
     )
-    names = pretrained_names()
-    if str(source) not in names:
-        raise unknown_name(option, text, [*names, *also])
-    return PRETRAINED_DIR / f"{source}.safetensors"
+    name, proxies, tuners = str(source), pretrained_names(), tuner_names()
+    if name not in proxies + tuners:
+        raise unknown_name(option, text, [*proxies, *tuners, *also])
+    return (PRETRAINED_DIR if name in proxies else TUNERS_DIR) / f"{name}.safetensors"
 
 
 # --- reading and writing --------------------------------------------------------------------------
