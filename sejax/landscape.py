@@ -1,34 +1,24 @@
 """`python -m sejax.landscape`: measure what configurations of agents reach on a real task."""
 
-import dataclasses
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from importlib.util import find_spec
+import contextlib
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sejax.cli import commands, runtime
+from sejax.cli import commands, kinds, runtime
 from sejax.cli import config as configuration
-from sejax.cli.kinds import Kind, kind_of, stored, train
+from sejax.cli.kinds import Kind, stored
+from sejax.cli.landscape_config import LandscapeConfig, read
 from sejax.ops.files import as_file_name
-from sejax.options import (
-    ConfigError,
-    Options,
-    as_text,
-    counts,
-    help_texts,
-    option,
-    registry,
-    require,
-)
-from sejax.options.plain import fields_of, from_plain, parsed, split, to_plain
+from sejax.options import ConfigError, as_text, help_texts, registry, require
+from sejax.options.plain import fields_of, to_plain
 
-if TYPE_CHECKING:  # which take long to import, or need Optuna
+if TYPE_CHECKING:  # which take long to import
     import pandas as pd
 
-    from sejax.cli.spaces import Dimension
+    from sejax.cli.landscape_workers import Train
 
 ABOUT = """Measure what configurations of agents reach on a real task, in one CSV file.
 
@@ -36,24 +26,9 @@ ABOUT = """Measure what configurations of agents reach on a real task, in one CS
   python -m sejax.landscape env=pendulum agent=[sac,ppo] file=pendulum.csv
 
 Configurations are drawn from `space`, or from ranges as of sejax.search; other fields are those of
-sejax.run with preset=ranking. The same command goes on where it stopped.
+sejax.run with preset=ranking. The same command goes on where it stopped. On a Ray cluster:
+machines=ray.
 """
-
-
-@dataclass(frozen=True, kw_only=True)
-class LandscapeConfig(Options):
-    """The fields of `python -m sejax.landscape`; all others are those of `sejax.run`."""
-
-    group: ClassVar[str] = ""
-
-    configs: int = option(64, counts("configurations are compared", least=2))  # of each agent
-    seeds: int = option(8, counts("an agent must train"))  # trainings of each configuration
-    # Number of the first training of each: others are independent of it.
-    first_seed: int = option(0, counts("it is a number", least=0))
-    steps: int = option(10_000, counts("an agent must train"))  # of each training
-    test_episodes: int = option(10, counts("it counts episodes"))  # greedy ones after it
-    space: str = "wide"  # a preset of ranges, or FILE.yaml
-    file: str | None = None  # null: runs/landscape-<env>-<agents>.csv
 
 
 def main(overrides: Sequence[str]) -> None:
@@ -67,16 +42,17 @@ def main(overrides: Sequence[str]) -> None:
 
     from sejax import landscapes
 
-    own, kinds = read(overrides)
-    path = Path(own.file or Path("runs", f"landscape-{_name(kinds)}.csv"))
+    own, agents = read(overrides)
+    path = Path(own.file or Path("runs", f"landscape-{_name(agents)}.csv"))
     path.parent.mkdir(parents=True, exist_ok=True)
-    card = card_of(own, kinds)
+    card = card_of(own, agents)
     try:
         with filelock.FileLock(path.with_name(f"{path.name}.lock"), timeout=0):
             done = stored(path, card, "file", "Set file=FILE.csv, another one.")
             runtime.configure_jax()
-            for kind in kinds:
-                done = measure(own, kind, path, card, done)
+            with trainer_of(agents[0].config.machines, overrides) as train:
+                for kind in agents:
+                    done = measure(own, kind, path, card, done, train)
     except filelock.Timeout as error:
         raise ConfigError(
             f"file must be written by one command at a time; got {path}. Set file=FILE.csv.", "file"
@@ -93,73 +69,14 @@ def main(overrides: Sequence[str]) -> None:
     print(f"{path} holds every training.")
 
 
-def read(overrides: Sequence[str]) -> tuple[LandscapeConfig, list[Kind]]:
-    """The command's fields, and the kinds of agents with their configurations.
-
-    Raises:
-      ConfigError: for overrides that cannot be.
-    """
-    if find_spec("optuna") is None:
-        raise ConfigError("spaces need Optuna. Install it with pip install 'sejax[search]'.")
-    from sejax.cli import spaces
-
-    names = [field.name for field in dataclasses.fields(LandscapeConfig)]
-    values, ranges, rest = {}, {}, []
-    given = dict(override.partition("=")[::2] for override in overrides)
-    for name, text in given.items():
-        if name in names:
-            values[name] = text if name in ("space", "file") and text != "null" else parsed(text)
-        elif spaces.is_range(text):
-            ranges[name] = text
-        elif name not in ("agent", "agents"):
-            rest.append(f"{name}={text}")
-    own = from_plain(LandscapeConfig, values, "")
-    base = ["preset=ranking", "objective=max_reward", *rest]
-    chosen = given.get("agents", given.get("agent"))
-    if chosen is None:
-        asked = [configuration.config(base).name("agent")]
-    else:
-        asked = split(chosen.strip("[]"))
-    foreign = [name for name in given if name.startswith("agent.")]
-    require(
-        len(asked) == 1 or not foreign,
-        foreign[0] if foreign else "agent",
-        f"must come with one agent; got {','.join(asked)}. Measure each in a file of its own.",
-    )
-    found = [
-        kind_of(
-            name,
-            base,
-            _space(own, name, base, ranges),
-            configs=own.configs,
-            steps=own.steps,
-            exact=foreign,
-        )
-        for name in asked
-    ]
-    return own, found
+def _name(agents: Sequence[Kind]) -> str:
+    names = configuration.JOINT.join(kind.name for kind in agents)
+    return as_file_name(f"{agents[0].config.name('env')}-{names}")
 
 
-def _space(
-    own: LandscapeConfig, name: str, base: Sequence[str], ranges: Mapping[str, str]
-) -> dict[str, "Dimension"]:
-    """What the configurations of an agent set: the preset's fields that are not fixed, and own."""
-    from sejax.cli import spaces
-
-    fixed = {word.partition("=")[0] for word in base}
-    offered = spaces.preset(own.space, name, True, own.steps)
-    space = {field: x for field, x in offered.items() if field not in fixed}
-    return space | {field: spaces.parse(field, text, own.steps) for field, text in ranges.items()}
-
-
-def _name(kinds: Sequence[Kind]) -> str:
-    agents = configuration.JOINT.join(kind.name for kind in kinds)
-    return as_file_name(f"{kinds[0].config.name('env')}-{agents}")
-
-
-def card_of(own: LandscapeConfig, kinds: Sequence[Kind]) -> dict[str, Any]:
+def card_of(own: LandscapeConfig, agents: Sequence[Kind]) -> dict[str, Any]:
     """What a file says of its landscape."""
-    first = kinds[0].config
+    first = agents[0].config
     return {
         "task": first.task().name,
         "env": registry.describe("env", first.env),
@@ -169,14 +86,38 @@ def card_of(own: LandscapeConfig, kinds: Sequence[Kind]) -> dict[str, Any]:
         "seeds": own.seeds,
         "first_seed": own.first_seed,
         "seed": first.seed,
-        "agents": {kind.name: to_plain(kind.config.agent) for kind in kinds},
-        "space": {kind.name: {field: x.text for field, x in kind.space.items()} for kind in kinds},
+        "agents": {kind.name: to_plain(kind.config.agent) for kind in agents},
+        "space": {kind.name: {field: x.text for field, x in kind.space.items()} for kind in agents},
         "versions": runtime.versions(),
     }
 
 
+def trainer_of(
+    machines: Any, overrides: Sequence[str]
+) -> contextlib.AbstractContextManager["Train"]:
+    """What trains agents, as `sejax.cli.kinds.train` does here, while the context is open.
+
+    Raises:
+      ConfigError: for machines that are neither here nor on a Ray cluster.
+    """
+    if not getattr(machines, "is_elsewhere", False):
+        return contextlib.nullcontext(kinds.train)
+    from sejax.cli import landscape_workers
+    from sejax.cli.workers import RayConfig
+
+    name = registry.name_of("machines", machines)
+    message = f"must be local or ray for a landscape; got {name}. Set machines=ray."
+    require(isinstance(machines, RayConfig), "machines", message)
+    return landscape_workers.connected(machines, overrides)
+
+
 def measure(
-    own: LandscapeConfig, kind: Kind, path: Path, card: dict[str, Any], done: "pd.DataFrame"
+    own: LandscapeConfig,
+    kind: Kind,
+    path: Path,
+    card: dict[str, Any],
+    done: "pd.DataFrame",
+    train: "Train",
 ) -> "pd.DataFrame":
     """Trains what is missing of one kind of agent, and writes the file after each chunk."""
     import pandas as pd

@@ -15,7 +15,7 @@ from sejax import landscape as command
 from sejax import landscapes, ranking
 from sejax.bilevel import make_bilevel
 from sejax.cli import config as configuration
-from sejax.cli import kinds
+from sejax.cli import kinds, landscape_config
 from sejax.options import ConfigError
 from sejax.ranking import agreement, ranks
 
@@ -277,7 +277,7 @@ def test_a_landscapes_row_is_an_agent_with_those_options(tmp_path):
     path = tmp_path / "x.csv"
     command.main([*WORDS, f"file={path}"])
     card, rows = landscapes.read_table(path)
-    own, (kind,) = command.read(WORDS)
+    own, (kind,) = landscape_config.read(WORDS)
     task = kind.config.task()
     row = rows.iloc[2]
     options = dict(card["agents"]["ddqn"])
@@ -298,14 +298,14 @@ def test_a_landscapes_row_is_an_agent_with_those_options(tmp_path):
 
 def test_an_option_that_is_fixed_stays_as_it_is():
     words = ["env=cartpole", "agent=ddqn", "steps=10000", "agent.exploration_steps=50"]
-    (kind,) = command.read(words)[1]
+    (kind,) = landscape_config.read(words)[1]
     assert kind.config.agent.exploration_steps == 50 and "exploration_steps" not in kind.values
 
 
 def test_draws_do_not_depend_on_other_agents_and_cover_the_space():
     words = ["env=cartpole", "configs=200", "steps=10000"]
-    (alone,) = command.read([*words, "agent=ddqn"])[1]
-    both = command.read([*words, "agent=[sac,ddqn]"])[1]
+    (alone,) = landscape_config.read([*words, "agent=ddqn"])[1]
+    both = landscape_config.read([*words, "agent=[sac,ddqn]"])[1]
     for name, x in alone.values.items():
         np.testing.assert_array_equal(x, both[1].values[name])
     rate, steps = alone.values["learning_rate"], alone.values["exploration_steps"]
@@ -334,7 +334,7 @@ def test_draws_do_not_depend_on_other_agents_and_cover_the_space():
 def test_spaces_that_are_no_one_program_are_refused(words, message):
     named = {word.partition("=")[0] for word in words}
     with pytest.raises(ConfigError, match=message):
-        command.read([*[x for x in WORDS if x.partition("=")[0] not in named], *words])
+        landscape_config.read([*[x for x in WORDS if x.partition("=")[0] not in named], *words])
 
 
 def test_a_run_with_two_agents_has_one_score(file):

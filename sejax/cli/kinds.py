@@ -5,6 +5,7 @@ the largest of them.
 """
 
 import dataclasses
+import functools
 import time
 import zlib
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
@@ -123,41 +124,63 @@ def _largest(dimension: "Dimension") -> int:
 
 # --- trainings on the real task ------------------------------------------------------------------
 
+Place = tuple[int, int]  # configuration and seed of a training
+
+
+def chunks_of(places: Sequence[Place], size: int) -> list[Sequence[Place]]:
+    """At most `size` trainings each."""
+    return [places[start : start + size] for start in range(0, len(places), size)]
+
 
 def train(
-    kind: Kind, places: Sequence[tuple[int, int]], steps: int, test_episodes: int
+    kind: Kind, places: Sequence[Place], steps: int, test_episodes: int
 ) -> Iterator["pd.DataFrame"]:
     """Trains agents on the real task; yields rows of a landscape, those of a chunk at a time.
 
     Args:
       kind: of agent.
-      places: configuration and seed of each training.
+      places: of the trainings.
       steps: of each.
       test_episodes: greedy ones after it.
     """
+    if places:
+        trained = make_chunk_trainer(kind, steps, test_episodes, min(CHUNK, len(places)))
+        yield from map(trained, chunks_of(places, CHUNK))
+
+
+def make_chunk_trainer(
+    kind: Kind, steps: int, test_episodes: int, size: int
+) -> Callable[[Sequence[Place]], "pd.DataFrame"]:
+    """Builds what trains at most `size` agents in one call of a program: rows of a landscape."""
     import jax
     import pandas as pd
 
-    if not places:
-        return
     program, keys = program_of(kind, steps, test_episodes)
-    compiled, size = None, min(CHUNK, len(places))
-    for start in range(0, len(places), size):
-        some = places[start : start + size]
-        filled = np.array([some[i % len(some)] for i in range(size)])
-        values = {name: np.float32(x[filled[:, 0]]) for name, x in kind.values.items()}
-        compiled = compiled or program.lower(keys(filled), values).compile()
+
+    def of_places(filled: np.ndarray) -> tuple[jax.Array, dict[str, np.ndarray]]:
+        values = {name: x[filled[:, 0]].astype(np.float32) for name, x in kind.values.items()}
+        return keys(filled), values
+
+    @functools.cache
+    def compiled() -> Any:
+        return program.lower(*of_places(np.zeros((size, 2), int))).compile()
+
+    def train_chunk(places: Sequence[Place]) -> pd.DataFrame:
+        compute = compiled()
+        filled = np.array([places[i % len(places)] for i in range(size)])
         started = time.process_time()
-        found = jax.device_get(compiled(keys(filled), values))
-        cpu_s = (time.process_time() - started) / len(some)
-        rows = pd.DataFrame(some, columns=["config", "seed"])
+        found = jax.device_get(compute(*of_places(filled)))
+        cpu_s = (time.process_time() - started) / len(places)
+        rows = pd.DataFrame(places, columns=["config", "seed"])
         rows.insert(0, "agent", kind.name)
         for name, x in kind.values.items():
             rows[f"{PREFIX}{name}"] = x[rows["config"]]
         for name, x in found.items():
-            rows[name] = x[: len(some)]
+            rows[name] = x[: len(places)]
         rows["cpu_s"] = round(cpu_s, 4)
-        yield rows
+        return rows
+
+    return train_chunk
 
 
 def program_of(
