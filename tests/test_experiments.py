@@ -198,7 +198,7 @@ def test_an_experiment_runs_and_resumes_and_remakes_its_report(
     table = page.run(settings)
     files = {path.name for path in tmp_path.iterdir()}
     prefix = settings.files
-    assert {f"{prefix}table.md", f"{prefix}summary.csv", f"{prefix}settings.json"} <= files
+    assert {f"{prefix}table.md", f"{prefix}summary.csv", f"{prefix}settings.json.xz"} <= files
     assert settings.rows_file.exists()
     figures = list(tmp_path.glob("*.png"))
     assert figures and all(map(is_drawn, figures))

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import lzma
 
 import numpy as np
 import pandas as pd
@@ -40,7 +41,7 @@ def options(rns_dir, tmp_path):
 
 def weights_of(settings, prefix):
     """Fingerprints of the RNs that a condition used, as its settings say."""
-    made_with = json.loads(settings.settings_file.read_text())
+    made_with = json.loads(lzma.decompress(settings.settings_file.read_bytes()))
     return set(made_with[prefix]["weights"].values())
 
 

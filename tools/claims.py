@@ -228,8 +228,8 @@ class Claims:
 
     def made(self, rows: str) -> str:
         """Commit and date at which rows were made: those of the settings beside them, if any."""
-        beside = (self.root / rows).with_name("settings.json")
-        path = beside if beside.exists() else {"pretrained": "sejax/pretrained"}.get(rows, rows)
+        beside = [*(self.root / rows).parent.glob("settings.json*")]
+        path = beside[0] if beside else {"pretrained": "sejax/pretrained"}.get(rows, rows)
         git = ["git", "-C", str(self.root), "log", "-1", "--format=%h %cs", "--", str(path)]
         return subprocess.run(git, capture_output=True, text=True).stdout.strip()
 

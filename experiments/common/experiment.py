@@ -8,6 +8,7 @@ overrides `field=value`, and everything is checked before anything that takes lo
 import dataclasses
 import functools
 import json
+import lzma
 import shlex
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -19,7 +20,7 @@ import pandas as pd
 from experiments.common.shards import Shards, read_rows, write_rows
 from sejax import options
 from sejax.cli import commands, runtime
-from sejax.ops.files import write_text
+from sejax.ops.files import write_bytes
 from sejax.options import (
     ConfigError,
     Options,
@@ -137,7 +138,7 @@ class Settings(Options):
     @property
     def settings_file(self) -> Path:
         """What the rows were computed with."""
-        return self.folder / f"{self.files}settings.json"
+        return self.folder / f"{self.files}settings.json.xz"
 
     def values(self, *names: str) -> dict[str, Any]:
         """These fields."""
@@ -207,7 +208,7 @@ class Experiment:
             if not settings.from_rows:
                 write_rows(settings.rows_file, self.compute(settings))
                 made_with = json.dumps(settings.shards.made_with, indent=1)
-                write_text(settings.settings_file, f"{made_with}\n")
+                write_bytes(settings.settings_file, lzma.compress(f"{made_with}\n".encode()))
             return self.report(settings, read_rows(settings.rows_file))
 
     def main(self) -> None:

@@ -50,7 +50,9 @@ def connected(machines: RayConfig, overrides: Sequence[str]) -> Iterator["Train"
         def train(
             kind: Kind, places: Sequence[Place], steps: int, test_episodes: int
         ) -> Iterator["pd.DataFrame"]:
-            size = max(1, min(CHUNK, -(-len(places) // (EACH * num_workers))))
+            if not places:
+                return
+            size = min(CHUNK, -(-len(places) // (EACH * num_workers)))
             arguments = list(overrides), kind.name, size, machines.gpus_per_worker
             pool = ActorPool([start.remote(*arguments) for _ in range(num_workers)])
             yield from pool.map_unordered(
