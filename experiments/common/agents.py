@@ -204,7 +204,8 @@ def train(
     ]
 
 
-@functools.cache
+# A compiled program takes hundreds of the 65,530 memory mappings that Linux grants a process.
+@functools.lru_cache(maxsize=80)
 def make_program(
     measure: Measure,
     agent: Any,
