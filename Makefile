@@ -47,7 +47,7 @@ test-lowest test-latest: TESTS := networks ddqn synthetic nes proxy_files gym hu
 
 # --- the code, its site, its packages ---------------------------------------------------------------
 
-claims: $(VENV)/.installed
+claims: $(VENV)/.installed-dev
 	$(BIN)/python -m tools.claims
 
 lint: $(VENV)/.installed-dev
