@@ -33,6 +33,7 @@ from experiments.common.agents import (
     groups_at_once,
     kinds_of_students,
     train_groups,
+    tuned_agent,
 )
 from experiments.common.bandits import Copied, PolicyBandit
 from experiments.common.experiment import Experiment, Settings, count, setting
@@ -52,14 +53,6 @@ TEACHERS: dict[str, dict[str, int]] = {
     "mountain_car_continuous": {"td3": 32_000, "ppo": 32_000},
     "pendulum": {"td3": 8_000, "sac": 8_000},
     "halfcheetah": {"td3": 50_000, "sac": 50_000},
-}
-# Overrides of teachers that are otherwise made for one-step SEs: those of real tasks.
-TEACHER_WORDS = {
-    ("mountain_car_continuous", "td3"): ("proxy=rn",),
-    ("mountain_car_continuous", "ppo"): ("proxy=rn",),
-    ("halfcheetah", "td3"): ("proxy=rn",),
-    ("pendulum", "td3"): ("proxy=rn",),
-    ("pendulum", "sac"): ("agent.warmup_episodes=1",),
 }
 STUDENT_STEPS = {"pendulum": 5_000, "halfcheetah": 10_000}  # 2,000 elsewhere
 
@@ -129,8 +122,7 @@ def makers(settings: NullBaselines, source: str) -> Iterator[tuple[str, Callable
     elif source in ("agent", "episodes"):
         wide = widen if source == "agent" else 0.0
         for (kind, steps), seed in itertools.product(TEACHERS[settings.env].items(), seeds):
-            words = TEACHER_WORDS.get((settings.env, kind), ())
-            config = sejax.config([f"env={settings.env}", f"agent={kind}", *words]).agent
+            config = tuned_agent(settings.env, kind)
             steps = settings.teacher_steps or steps
             make = functools.partial(bandits.copy_of_agent, task, config, steps, seed, size, wide)
             yield f"{kind}-{seed:02d}", make
@@ -155,9 +147,6 @@ def make_table(settings: NullBaselines, source: str, name: str, make: Callable[[
     depends = settings.values(*names) | {"env": settings.env, "source": source, "name": name}
     if settings.states != "visited":
         depends["states"] = settings.states
-    words = TEACHER_WORDS.get((settings.env, name.partition("-")[0]), ())
-    if source in ("agent", "episodes") and words:
-        depends["words"] = words
     if source == "search":
         depends["search_steps"] = settings.most_search_steps
 

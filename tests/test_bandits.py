@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 
 from experiments import null_baselines
-from experiments.common import bandits
+from experiments.common import agents, bandits
 from experiments.common.bandits import PolicyBandit
 from experiments.common.shards import stack
 from sejax import envs
@@ -86,3 +86,11 @@ def test_the_worst_tenth_is_a_tenth_where_most_students_are_at_the_ceiling():
     rows = stack({"makers": pd.DataFrame(made), "students": pd.DataFrame(students)})
     (row,) = null_baselines.summarise(null_baselines.NullBaselines(), rows).itertuples()
     assert row.worst_tenth == 150 and row.test_return_mean == 195 and row.worst == 100
+
+
+@pytest.mark.parametrize("env", null_baselines.TEACHERS)
+def test_teachers_have_most_of_their_steps_to_learn(env):
+    """Agents that are made for one-step SEs explore for a hundred episodes, whole ones on a task."""
+    task = envs.make(env)
+    for kind, steps in null_baselines.TEACHERS[env].items():
+        assert agents.tuned_agent(env, kind).warmup_episodes * task.max_steps < 0.7 * steps

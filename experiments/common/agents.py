@@ -270,9 +270,20 @@ def return_columns(agents: pd.DataFrame) -> list[str]:
     return [name for name in agents if name.startswith("return_")]
 
 
+# Overrides where the preset's agent is made for one-step SEs, and explores as in a bandit.
+ON_REAL_TASKS = {
+    ("mountain_car_continuous", "td3"): ("proxy=rn",),
+    ("mountain_car_continuous", "ppo"): ("proxy=rn",),
+    ("halfcheetah", "td3"): ("proxy=rn",),
+    ("pendulum", "td3"): ("proxy=rn",),
+    ("pendulum", "sac"): ("agent.warmup_episodes=1",),
+}
+
+
 def tuned_agent(env: str, kind: str) -> Any:
     """The agent of that kind with what was found on real tasks for few steps (docs/agents.md)."""
-    return sejax.config([f"env={env}", f"agent={kind}"]).agent
+    words = ON_REAL_TASKS.get((env, kind), ())
+    return sejax.config([f"env={env}", f"agent={kind}", *words]).agent
 
 
 def kinds_of_students(task: Task) -> tuple[str, ...]:
