@@ -90,7 +90,7 @@ def test_the_worst_tenth_is_a_tenth_where_most_students_are_at_the_ceiling():
 
 @pytest.mark.parametrize("env", null_baselines.TEACHERS)
 def test_teachers_have_most_of_their_steps_to_learn(env):
-    """Agents that are made for one-step SEs explore for a hundred episodes, whole ones on a task."""
+    """Agents made for one-step SEs explore for a hundred episodes, which are whole on a task."""
     task = envs.make(env)
     for kind, steps in null_baselines.TEACHERS[env].items():
         assert agents.tuned_agent(env, kind).warmup_episodes * task.max_steps < 0.7 * steps
