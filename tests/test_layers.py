@@ -11,9 +11,9 @@ ROOT = Path(__file__).parents[1] / "sejax"
 # looked up when somebody asks for what they stand for: they do not count.
 LAYERS = [
     {"search"},
-    {"run", "evaluate", "landscape", "report"},
+    {"run", "evaluate", "landscape", "distill", "report"},
     {"cli"},
-    {"bilevel", "ranking"},
+    {"bilevel", "ranking", "distillation"},
     {"evaluation"},
     {"training", "objectives", "gym"},
     {"proxies"},

@@ -201,7 +201,9 @@ def test_ppo_on_ses_is_the_default(env):
 
 
 def test_what_is_tuned_is_known():
-    assert preset_files.names() == ["best", "paper", "paper_performance", "ranking", "soft"]
+    assert preset_files.names() == [
+        *("best", "distilled", "paper", "paper_performance", "ranking", "soft"),
+    ]
     assert preset_files.tuned("rn") == [
         "cartpole", "cliff_walking", "halfcheetah", "mountain_car_continuous", "pendulum",
     ]  # fmt: skip

@@ -19,6 +19,7 @@ from flax import struct
 from jaxtyping import Array, Float
 
 import sejax
+from sejax.distillation.policy_search import policy_agent
 from sejax.envs.base import Task
 from sejax.envs.environment import EnvState
 from sejax.evaluation import make_recorder, make_tester
@@ -123,22 +124,6 @@ class PolicyBandit(ProxyEnv):
 
 
 # --- policies ------------------------------------------------------------------------------------
-
-
-def policy_agent(task: Task, policy: Callable[[Any, Array], Array]) -> sejax.Agent:
-    """An agent that does not learn: its state is what `policy(state, obs)` takes.
-
-    Its only use is to be tested and recorded as other agents are.
-    """
-    base = sejax.make_agent(sejax.config([f"env={task.name}"]).agent, task)
-    return sejax.Agent(
-        init=lambda key, hparams: (),
-        act=lambda key, state, obs, /, explore: policy(state, obs),
-        update=lambda key, state, batch: state,
-        buffer=base.buffer,
-        hparams=(),
-        spec=base.spec,
-    )
 
 
 @functools.cache

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 DONE_MODES = ("soft", "threshold", "bernoulli", "sigmoid")
 INITIAL_STATES = ("real", "learned", "noise")
 STATE_UNITS = ("raw", "bounds")
-START_HIDDEN_SIZE = 32  # of the network that makes initial states
+START_HIDDEN_SIZE = 32  # units of the network that makes initial states
 
 Vector = TypeVar("Vector", np.ndarray, "Array")
 
@@ -86,6 +86,7 @@ class SyntheticConfig(ProxyConfig):
     # Steps of an episode; null: the task's limit. 1: a contextual bandit, which has neither a
     # next-state nor a done network.
     horizon: int | None = option(None, counts("an episode has steps"))
+    start_hidden_size: int = option(START_HIDDEN_SIZE, counts("a layer needs a unit"))
     # Whether the horizon terminates an episode, so that nothing is bootstrapped there, or truncates
     # it, as the task's limit does.
     horizon_is_terminal: bool = True
@@ -142,7 +143,7 @@ class SyntheticConfig(ProxyConfig):
         hidden = [self.hidden_size] * self.num_layers
         networks = {head: [action_dim + obs_dim, *hidden, outputs[head]] for head in heads}
         if self.initial_state == "learned":
-            networks["start"] = [obs_dim, START_HIDDEN_SIZE, obs_dim]
+            networks["start"] = [obs_dim, self.start_hidden_size, obs_dim]
         return networks
 
     def units(self, space: Box) -> Units | None:

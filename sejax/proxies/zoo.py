@@ -82,6 +82,7 @@ class PretrainedProxy:
       seed: seed of its run; None if it was not recorded.
       evaluations: results of fresh agents.
       learning: its run; None if it was not recorded.
+      policy_return: return of the policy that it was made of; None if it was learned with agents.
     """
 
     name: str
@@ -95,6 +96,12 @@ class PretrainedProxy:
     seed: int | None = None
     evaluations: tuple[Evaluation, ...] = ()
     learning: Learning | None = None
+    policy_return: float | None = None
+
+    @property
+    def is_distilled(self) -> bool:
+        """Whether it was made of a policy, and no agent was trained to learn it."""
+        return self.policy_return is not None
 
     @property
     def agents(self) -> tuple[str, ...]:
@@ -119,7 +126,7 @@ class PretrainedProxy:
             "name": self.name,
             "kind": self.kind,
             "task": self.task,
-            "learned with": ", ".join(self.agents),
+            "learned with": "a policy" if self.is_distilled else ", ".join(self.agents),
             "tested with": ", ".join(dict.fromkeys(each.agent for each in self.on_proxy)),
             "return": spread([each.return_mean for each in self.on_proxy], ".1f"),
             "steps": spread([each.train_steps for each in self.on_proxy], ",.0f"),
@@ -165,7 +172,7 @@ def describe(stored: header.Stored, name: str | None = None) -> PretrainedProxy:
     """
     path, _, told = stored
     record, objective = told.proxies[0], told.config.get("objective")
-    names = ("scores", "generation", "seed", "evaluations", "learning")
+    names = ("scores", "generation", "seed", "evaluations", "learning", "policy_return")
     known = {name: record[name] for name in names if record.get(name) is not None}
     if "score" in record:
         agents = header.agents_of(told.config)
@@ -287,6 +294,11 @@ def _facts(proxy: PretrainedProxy) -> dict[str, str]:
         if not config.is_bandit:
             later = f", from step {config.min_steps} on" if config.min_steps > 1 else ""
             facts["an episode ends"] = _ENDS[config.done] + later
+    if proxy.policy_return is not None:
+        facts["distilled"] = (
+            f"from a policy that reaches {proxy.policy_return:.1f} itself: its reward is that "
+            "policy, and no agent was trained to learn it"
+        )
     if proxy.scores:
         meaning = _SCORES.get(proxy.objective)
         facts["agents"] = ", ".join(proxy.agents)
@@ -304,7 +316,7 @@ def _facts(proxy: PretrainedProxy) -> dict[str, str]:
         }
         known = (f"{x:,.0f} {unit}" for unit, x in costs.items() if x is not None)
         facts["cost of the run"] = ", ".join(known)
-        only = " (all of them tests)" if proxy.kind == "se" else ""
+        only = " (all of them tests)" if proxy.kind == "se" and not proxy.is_distilled else ""
         facts["steps on the real task"] = f"{learning.real_steps:,}{only}"
     return facts
 

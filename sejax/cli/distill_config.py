@@ -1,0 +1,103 @@
+"""The configuration of `python -m sejax.distill`: its own fields, and those of its students."""
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar
+
+from sejax import envs
+from sejax.cli import config as configuration
+from sejax.cli.config import LearnConfig
+from sejax.distillation.policy_copy import CopyConfig
+from sejax.distillation.policy_search import SearchConfig
+from sejax.ops.files import as_file_name
+from sejax.options import Options, counts, option, positive, require
+from sejax.options.plain import from_plain, merge
+
+# Students of a task's kind of actions where none are named, and how long they train.
+STUDENTS = {"continuous": "[td3,sac]", "discrete": "[ddqn,ppo]"}
+STEPS = {"continuous": 10_000, "discrete": 2_000}
+
+
+@dataclass(frozen=True, kw_only=True)
+class DistillConfig(Options):
+    """The fields of `python -m sejax.distill`; all others are those of `sejax.run`."""
+
+    group: ClassVar[str] = ""
+
+    # null: one is searched. An agent that trains on the task; ppo:FILE.zip, of Stable-Baselines3;
+    # FILE.npz with kernel_0, bias_0 and so on; or module:function.
+    policy: str | None = None
+    policy_steps: int = option(20_000, counts("an agent must train"))  # of an agent, on the task
+    # Of a policy that is not of the exact form.
+    copy: CopyConfig = dataclasses.field(default_factory=CopyConfig)
+    # Of a linear policy.
+    search: SearchConfig = dataclasses.field(default_factory=SearchConfig)
+    slope: float = option(1.0, positive("a reward must tell actions apart"))  # of the SE's reward
+    # Deviation of the SE's initial states, in units of those that the policy visits.
+    widen: float = option(1.0, positive("it is a scale"))
+    # Policies that are taught: the best tested one of each of so many equal parts of the search.
+    num_snapshots: int = option(6, counts("something must be taught"))
+    # Students of each kind on the SE of each policy, which choose one of them.
+    num_students: int = option(4, counts("an SE is chosen by what it teaches"))
+    # Others of each kind, on the chosen SE.
+    num_tested: int = option(10, counts("a card says what an SE teaches"))
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        tested = self.search.generations // self.search.test_every
+        require(
+            self.policy is not None or self.num_snapshots <= tested,
+            "num_snapshots",
+            f"must be at most {tested}, as many policies as the search tests; got "
+            f"{self.num_snapshots}. Set search.test_every=1.",
+        )
+
+
+def read(overrides: Sequence[str]) -> tuple[DistillConfig, LearnConfig]:
+    """The command's fields, and a configuration of task, students and trainings.
+
+    Raises:
+      ConfigError: for overrides that cannot be.
+    """
+    names = {field.name for field in dataclasses.fields(DistillConfig)}
+    values: dict[str, object] = {}
+    rest = []
+    for override in overrides:
+        name, _, text = override.partition("=")
+        first, _, last = name.partition(".")
+        if first in names:
+            values = merge(values, {first: {last: text}} if last else {first: text})
+        else:
+            rest.append(override)
+    given = {override.partition("=")[0] for override in rest}
+    task = [x for x in rest if x.partition("=")[0].partition(".")[0] == "env"]
+    spec = envs.spec_of(configuration.config(task).env)
+    defaults = {"preset": "distilled"}
+    if not given & {"agent", "agents"}:
+        defaults["agents"] = STUDENTS[spec.actions]
+    if not given & {"training.max_steps", "training.max_episodes"}:
+        defaults |= dict.fromkeys(
+            ("training.max_steps", "training.max_episodes"), str(STEPS[spec.actions])
+        )
+    words = [f"{name}={text}" for name, text in defaults.items() if name not in given]
+    config = configuration.config([*words, *rest])
+    require(
+        config.training.is_fixed_length,
+        "training.stop_rule",
+        f"must be never, with training.max_steps; got {config.training.stop_rule}. Set "
+        "training.stop_rule=never.",
+    )
+    own = from_plain(DistillConfig, values, "")  # after the task, whose faults come first
+    if own.search.alive_bonus is None:
+        bonus = getattr(config.env, "healthy_reward", 0.0)
+        search = dataclasses.replace(own.search, alive_bonus=bonus)
+        own = dataclasses.replace(own, search=search)
+    return own, config
+
+
+def folder_of(config: LearnConfig) -> Path:
+    """The command's folder: `run_dir`, or one named by task and seed."""
+    name = as_file_name(f"distill-{config.name('env')}-s{config.seed}")
+    return Path(config.run_dir or f"runs/{name}")

@@ -1,0 +1,291 @@
+"""What `python -m sejax.distill` does: find policies, teach them, and write the best SE."""
+
+import dataclasses
+import json
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import pandas as pd
+
+from sejax.agents import make_agent
+from sejax.cli import config as configuration
+from sejax.cli import policies
+from sejax.cli.config import LearnConfig, members_of
+from sejax.cli.distill_config import DistillConfig
+from sejax.distillation import teaching
+from sejax.distillation.policy_copy import copy_policy, visit
+from sejax.distillation.policy_search import Policy, make_search
+from sejax.distillation.teaching import Lesson
+from sejax.ops import checksummed
+from sejax.ops.files import write_bytes, write_text
+from sejax.options import ConfigError, as_text
+from sejax.options.plain import differences, flatten, to_plain
+from sejax.proxies import header, zoo
+from sejax.proxies.io import save
+
+CHECKPOINT, KIND = "search.safetensors", "sejax_search"
+CHOOSE, TEST = "choose", "test"  # what students are for
+Costs = dict[str, Any]  # real_steps and cpu_s
+
+
+def distill(own: DistillConfig, config: LearnConfig, folder: Path, words: str = "") -> Path:
+    """Finds policies, teaches them, and writes the SE that teaches best.
+
+    Args:
+      own: how policies are found, and how many students there are.
+      config: task, students and their trainings, and seed.
+      folder: where files are written, and the search goes on.
+      words: the command's overrides, for the card.
+
+    Returns:
+      The SE's file.
+
+    Raises:
+      ConfigError: for a folder of another search, or a policy that cannot be.
+      OSError: if a file cannot be written.
+    """
+    find = search if own.policy is None else copied
+    lessons, costs = find(own, config, folder)
+    env, weights = teaching.make_ses(config.task(), lessons, own.slope, own.widen)
+    chosen_by = students(own, config, lessons, CHOOSE)
+    grades = teaching.grades(chosen_by)
+    _print_grades(chosen_by, grades)
+    best = [each.generation for each in lessons].index(int(grades.idxmax()))
+    rows = pd.concat([chosen_by, students(own, config, [lessons[best]], TEST)])
+    write_text(folder / "students.csv", rows.to_csv(index=False))
+    costs["cpu_s"] += rows["cpu_s"].sum()
+    costs["real_steps"] += int(rows["real_steps"].sum())
+    path = folder / "proxy.safetensors"
+    _save(path, env, weights[best], own, config, lessons[best], rows, costs, words)
+    return path
+
+
+# --- the search -----------------------------------------------------------------------------------
+
+
+def search(own: DistillConfig, config: LearnConfig, folder: Path) -> tuple[list[Lesson], Costs]:
+    """The policies that are to be taught, and what finding them cost.
+
+    Each block of generations up to a test is kept before the next begins.
+    """
+    task, options = config.task(), own.search
+    made = make_search(options, task, config.devices)
+    asked = {"search": to_plain(options), "env": configuration.plain(config)["env"]}
+    asked |= {"seed": config.seed}
+    tested, rows = _restored(folder, asked, made.init())
+    key_search, key_test = jax.random.split(jax.random.key(config.seed))
+    policy = tested[-1] if tested else made.init()
+    run = jax.jit(made.generation)
+    test, record = jax.jit(made.test), jax.jit(made.record)
+    for first in range(len(rows) * options.test_every, options.generations, options.test_every):
+        started, num_steps, returns = time.process_time(), 0, []
+        last = min(first + options.test_every, options.generations)
+        for number in range(first, last):
+            policy, tried = run(jax.random.fold_in(key_search, number), policy, number)
+            num_steps += int(tried.num_steps)
+            returns.append(float(tried.returns.mean()))
+        tests = test(jax.random.fold_in(key_test, last), policy)
+        row = {
+            "generation": last,
+            "population_mean": float(np.mean(returns)),
+            "test_mean": float(tests.returns.mean()),
+            "test_std": float(tests.returns.std()),
+            "real_steps": num_steps + int(tests.num_steps.sum()),
+            "cpu_s": time.process_time() - started,
+        }
+        tested, rows = [*tested, policy], [*rows, row]
+        _keep(folder, asked, tested, rows)
+        steps = sum(each["real_steps"] for each in rows)
+        print(
+            f"generation {last}/{options.generations}: policy {row['test_mean']:.1f} ± "
+            f"{row['test_std']:.1f}, {steps:,} real steps",
+            flush=True,
+        )
+    curve = pd.DataFrame(rows)
+    write_text(folder / "search.csv", curve.to_csv(index=False))
+    lessons = []
+    started, recorded = time.process_time(), 0
+    for part in np.array_split(np.arange(len(curve)), own.num_snapshots):
+        best = part[int(curve["test_mean"].iloc[part].argmax())]
+        row, policy = curve.iloc[best], tested[best]
+        seen = record(jax.random.fold_in(key_test, int(row["generation"])), policy)
+        states = np.asarray(seen.obs)[np.asarray(seen.valid)]
+        recorded += len(states)
+        layers = policy.layers(task.max_action)
+        lessons.append(Lesson(int(row["generation"]), layers, states, float(row["test_mean"])))
+    cpu_s = curve["cpu_s"].sum() + time.process_time() - started
+    return lessons, {"cpu_s": cpu_s, "real_steps": int(curve["real_steps"].sum()) + recorded}
+
+
+def copied(own: DistillConfig, config: LearnConfig, folder: Path) -> tuple[list[Lesson], Costs]:
+    """The given policy, or its copy, as the only one that is taught; see `search`."""
+    task = config.task()
+    assert own.policy is not None
+    described = flatten({"env": configuration.plain(config)["env"]})
+    words = [f"{name.removesuffix('.name')}={as_text(x)}" for name, x in described.items()]
+    given = policies.policy_of(own.policy, task, words, own.policy_steps, config.seed)
+    started, key = time.process_time(), jax.random.key(config.seed)
+    if given.layers is None:
+        made = copy_policy(own.copy, task, given.act, key)
+        lesson = Lesson(0, made.layers, made.states, made.policy_return)
+        real_steps = made.real_steps
+        print(f"policy {made.policy_return:.1f}, its copy {made.copy_return:.1f}", flush=True)
+    else:
+        seen = visit(task, given.act, key, own.copy.episodes)
+        lesson = Lesson(0, given.layers, seen.states, float(seen.returns.mean()))
+        real_steps = len(seen.states)
+        print(f"policy {lesson.policy_return:.1f}", flush=True)
+    cpu_s = given.cpu_s + time.process_time() - started
+    return [lesson], {"cpu_s": cpu_s, "real_steps": given.real_steps + real_steps}
+
+
+def _keep(
+    folder: Path, asked: dict[str, Any], tested: list[Policy], rows: list[dict[str, Any]]
+) -> None:
+    tensors = {
+        name: np.stack([np.asarray(getattr(policy, name)) for policy in tested])
+        for name in tested[0]._fields
+    }
+    write_bytes(
+        folder / CHECKPOINT, checksummed.pack(tensors, KIND, {"asked": asked, "rows": rows})
+    )
+
+
+def _restored(
+    folder: Path, asked: dict[str, Any], policy: Policy
+) -> tuple[list[Policy], list[dict[str, Any]]]:
+    """The policies that were tested, and the rows of `search.csv`; none in a new folder.
+
+    Raises:
+      ConfigError: for a damaged file, or one of another search.
+    """
+    path = folder / CHECKPOINT
+    if not path.exists():
+        return [], []
+    try:
+        tensors, manifest = checksummed.read(path, KIND)
+    except checksummed.DamagedError as error:
+        raise ConfigError(
+            f"run_dir must hold a search as it was written; got {path}, which is damaged "
+            f"({error}). Set run_dir=FOLDER, another one.",
+            "run_dir",
+        ) from error
+    differing = differences(manifest["asked"], json.loads(json.dumps(asked)))
+    if differing:
+        raise ConfigError(
+            f"run_dir must hold the same search; got {folder}, with {differing}. Set "
+            "run_dir=FOLDER, another one.",
+            "run_dir",
+        )
+    rows = manifest["rows"]
+    tested = [type(policy)(**{name: x[i] for name, x in tensors.items()}) for i in range(len(rows))]
+    return tested, rows
+
+
+# --- students -------------------------------------------------------------------------------------
+
+
+def students(
+    own: DistillConfig, config: LearnConfig, lessons: Sequence[Lesson], use: str
+) -> pd.DataFrame:
+    """A row for each student on the SE of each lesson; see `sejax.distillation.teaching`.
+
+    Those that choose an SE (`CHOOSE`) are others than those that test it (`TEST`).
+    """
+    task, found = config.task(), []
+    env, weights = teaching.make_ses(task, lessons, own.slope, own.widen)
+    key = jax.random.fold_in(jax.random.key(config.seed), 1 if use == CHOOSE else 2)
+    keys = jax.random.split(key, own.num_students if use == CHOOSE else own.num_tested)
+    for member in members_of(config):
+        agent = make_agent(member.agent, task, config.exploration)
+        started = time.process_time()
+        taught = teaching.teach(env, weights, agent, config.training, keys, config.devices)
+        rows = teaching.as_rows(taught, lessons, member.key, use)
+        found.append(rows.assign(cpu_s=(time.process_time() - started) / len(rows)))
+        returns = rows["test_return"]
+        print(
+            f"{len(rows)} {member.key} students reach {returns.mean():.1f}, the worst "
+            f"{returns.min():.1f}",
+            flush=True,
+        )
+    return pd.concat(found, ignore_index=True)
+
+
+def _print_grades(rows: pd.DataFrame, grades: pd.Series) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    kinds = list(dict.fromkeys(rows["agent"]))
+    table = Table(title="What the SE of each policy teaches: mean and worst student")
+    for column in ("generation", "policy", *kinds, "grade"):
+        table.add_column(column, justify="right")
+    for generation, mine in rows.groupby("generation"):
+        cells = [f"{generation}", f"{mine['policy_return'].iloc[0]:.1f}"]
+        for kind in kinds:
+            returns = mine[mine["agent"] == kind]["test_return"]
+            cells.append(f"{returns.mean():.1f}, {returns.min():.1f}")
+        table.add_row(*cells, f"{grades[generation]:.1f}")
+    Console(highlight=False).print(table)
+
+
+# --- the file -------------------------------------------------------------------------------------
+
+
+def _save(
+    path: Path,
+    env: Any,
+    weights: Any,
+    own: DistillConfig,
+    config: LearnConfig,
+    lesson: Lesson,
+    rows: pd.DataFrame,
+    costs: dict[str, Any],
+    words: str,
+) -> None:
+    """Writes the SE with its record, and its card."""
+    tested = rows[rows["use"] == TEST]
+    evaluations = [
+        zoo.Evaluation(
+            agent=kind,
+            hparams="as_learned",
+            world="proxy",
+            num_agents=len(mine),
+            return_mean=float(mine["test_return"].mean()),
+            return_std=float(mine["test_return"].std(ddof=0)),
+            train_steps=float(mine["train_steps"].mean()),
+        )
+        for kind, mine in tested.groupby("agent", sort=False)
+    ]
+    learning = zoo.Learning(
+        command=f"python -m sejax.distill {words}".rstrip(),
+        generations=own.search.generations,
+        real_steps=costs["real_steps"],
+        agents=len(rows),
+        train_steps=int(rows["train_steps"].sum()),
+        cpu_s=round(float(costs["cpu_s"]), 1),
+    )
+    plain = configuration.plain(config)
+    others = {name: plain[name] for name in plain if name not in ("env", "proxy")}
+    save(
+        path,
+        env,
+        weights,
+        others,
+        generation=lesson.generation,
+        seed=config.seed,
+        policy_return=lesson.policy_return,
+        evaluations=[dataclasses.asdict(each) for each in evaluations],
+        learning=dataclasses.asdict(learning),
+    )
+    card = zoo.describe(header.read(path, single=True)).card
+    write_text(path.with_name("card.md"), f"{card}\n")
+    for each in evaluations:
+        print(f"{each.agent}: {each.return_mean:.1f} ± {each.return_std:.1f}, fresh students")
+    print(
+        f"{path} holds the SE of generation {lesson.generation}: {learning.real_steps:,} real "
+        f"steps, {learning.cpu_s:,.0f} CPU s."
+    )

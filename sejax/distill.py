@@ -1,0 +1,64 @@
+"""`python -m sejax.distill`: an SE made of a policy, chosen by the agents that it teaches."""
+
+import shlex
+from collections.abc import Sequence
+
+from sejax.cli import commands, runtime
+from sejax.cli.distill_config import DistillConfig, folder_of, read
+from sejax.ops.files import require_writable
+from sejax.options import ConfigError, as_text, help_texts
+from sejax.options.plain import fields_of, flatten, to_plain
+
+ABOUT = """Make an SE of a policy, and choose it by what it teaches.
+
+  python -m sejax.distill env=hopper
+  python -m sejax.distill env=halfcheetah agents=[td3,sac,ppo] search.generations=200
+  python -m sejax.distill env=pendulum policy=sac:model.zip
+
+A linear policy is found by augmented random search. The best policies of parts of the search become
+SEs; students train on each, and the SE that teaches best is kept. With `policy` that one is copied.
+Other fields are those of sejax.run with preset=distilled. Writes proxy.safetensors, card.md,
+search.csv and students.csv into run_dir; the same command goes on where it stopped.
+"""
+
+
+def main(overrides: Sequence[str]) -> None:
+    """Distils as the overrides say.
+
+    Raises:
+      ConfigError: for overrides that cannot be, or a folder of another search.
+      OSError: if a file cannot be written.
+    """
+    import filelock
+
+    from sejax.cli import distilling
+
+    own, config = read(overrides)
+    runtime.configure_jax()
+    folder = folder_of(config)
+    require_writable("run_dir", folder)
+    try:
+        with filelock.FileLock(folder / "sejax.lock", timeout=0):
+            distilling.distill(own, config, folder, shlex.join(overrides))
+    except filelock.Timeout as error:
+        raise ConfigError(
+            f"run_dir must be written by one command at a time; got {folder}. Set run_dir=FOLDER.",
+            "run_dir",
+        ) from error
+    except KeyboardInterrupt:
+        print(f"Interrupted. The same command goes on from {folder}.")
+        commands.leave(commands.INTERRUPTED)
+
+
+def help_text(overrides: Sequence[str]) -> str:
+    """What `--help` prints."""
+    texts = help_texts(DistillConfig)
+    lines = [
+        f"  {name}={as_text(default)}  # {texts.get(name, '')}"
+        for name, default in flatten(to_plain(fields_of(DistillConfig))).items()
+    ]
+    return "\n".join([ABOUT, "Its own fields, with their defaults:", *lines])
+
+
+if __name__ == "__main__":
+    commands.start(main, help_text)

@@ -1,0 +1,133 @@
+"""`python -m sejax.distill`: the command, its files, resuming, and policies that it is given."""
+
+import shutil
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import sejax
+from sejax.cli import distilling
+from sejax.cli.distill_config import read
+from sejax.distill import help_text, main
+from sejax.ops import checksummed
+from sejax.options import ConfigError
+from sejax.proxies import header, zoo
+
+QUICK = (
+    *("env=cartpole", "devices=1", "search.num_directions=4", "search.num_top=2"),
+    *("search.generations=4", "search.test_every=1", "search.num_tests=2", "num_snapshots=2"),
+    *("num_students=2", "num_tested=2", "training.max_steps=60", "training.max_episodes=60"),
+    *("training.test_episodes=2", "agent=ddqn"),
+)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    path = tmp_path_factory.mktemp("distilled") / "run"
+    main([*QUICK, f"run_dir={path}"])
+    return path
+
+
+def test_it_writes_an_se_that_says_what_it_is(folder):
+    shown = zoo.describe(header.read(folder))
+    curve, rows = pd.read_csv(folder / "search.csv"), pd.read_csv(folder / "students.csv")
+    assert curve["generation"].tolist() == [1, 2, 3, 4]
+    assert rows.groupby(["use", "agent"]).size().to_dict() == {
+        ("choose", "ddqn"): 4,
+        ("test", "ddqn"): 2,
+    }
+    assert shown.is_distilled and shown.row["learned with"] == "a policy"
+    assert "no agent was trained to learn it" in (folder / "card.md").read_text()
+    tested = rows[rows["use"] == "test"].groupby("agent")["test_return"].mean()
+    assert {x.agent: x.return_mean for x in shown.evaluations} == pytest.approx(tested.to_dict())
+    # Searches, the recorded episodes, and all tests of students.
+    least = curve["real_steps"].sum() + rows["real_steps"].sum()
+    assert least < shown.learning.real_steps <= least + 2 * 2 * 200
+    assert shown.learning.train_steps == 6 * 60
+    assert shown.policy_return == pytest.approx(
+        curve.set_index("generation")["test_mean"][shown.generation]
+    )
+
+
+def test_the_se_that_teaches_best_is_kept(folder):
+    rows = pd.read_csv(folder / "students.csv")
+    chosen = rows[rows["use"] == "choose"].groupby(["generation", "agent"])["test_return"]
+    marks = ((chosen.mean() + chosen.min()) / 2).groupby("generation").mean()
+    assert sejax.load_proxy(folder).record["generation"] == marks.idxmax()
+    assert set(rows[rows["use"] == "test"]["generation"]) == {marks.idxmax()}
+
+
+def test_a_killed_search_goes_on_to_the_same_se(folder, tmp_path):
+    tensors, manifest = checksummed.read(folder / distilling.CHECKPOINT, distilling.KIND)
+    half = {name: x[:2] for name, x in tensors.items()}
+    manifest["rows"] = manifest["rows"][:2]
+    kept = checksummed.pack(half, distilling.KIND, manifest)
+    (tmp_path / distilling.CHECKPOINT).write_bytes(kept)
+    main([*QUICK, f"run_dir={tmp_path}"])
+    names = ["use", "generation", "agent", "student", "test_return"]
+    one, two = (pd.read_csv(x / "students.csv")[names] for x in (folder, tmp_path))
+    pd.testing.assert_frame_equal(one, two)
+    assert sejax.load_proxy(folder).fingerprint == sejax.load_proxy(tmp_path).fingerprint
+
+
+def test_another_search_does_not_go_on(folder, tmp_path):
+    path = shutil.copytree(folder, tmp_path / "copy")
+    with pytest.raises(ConfigError, match=r"search.step_size \(0.02 there, 0.5 here\)"):
+        main([*QUICK, f"run_dir={path}", "search.step_size=0.5"])
+    with (path / distilling.CHECKPOINT).open("r+b") as file:
+        file.truncate(200)
+    with pytest.raises(ConfigError, match="damaged"):
+        main([*QUICK, f"run_dir={path}"])
+
+
+def act(obs):
+    """A policy that a test distils by its name."""
+    return (obs[:, 2] + 0.6 * obs[:, 3] > 0).astype(int)
+
+
+def test_policies_come_from_files_functions_and_agents(tmp_path, capsys):
+    layers = {"kernel_0": np.array([[0, 0, 0, 0], [0, 0.3, 1, 0.6]]), "bias_0": np.zeros(2)}
+    np.savez(tmp_path / "linear.npz", **layers)
+    words = [*QUICK, "copy.episodes=2", f"run_dir={tmp_path}/run"]
+    main([*words, f"policy={tmp_path}/linear.npz"])
+    assert "policy 200.0\n" in capsys.readouterr().out
+    assert sejax.load_proxy(tmp_path / "run").record["policy_return"] == 200.0
+    quick = ("copy.rounds=1", "copy.steps=20", "copy.hidden_size=4")
+    main([*words, *quick, f"policy={__name__}:act"])
+    assert "its copy" in capsys.readouterr().out
+    main([*words, *quick, "policy=ddqn", "policy_steps=128"])
+    real_steps = zoo.describe(header.read(tmp_path / "run")).learning.real_steps
+    assert real_steps > 128
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["num_snapshots=5"], "num_snapshots must be at most 4"),
+        (["search.num_top=5"], "search.num_top must be at most search.num_directions"),
+        (["search.generationz=5"], "Did you mean search.generations"),
+        (["training.stop_rule=plateau"], "training.stop_rule must be never"),
+        (["policy=nothing"], "policy must be an agent, a file or a function"),
+        (["policy=nothing.npz"], "policy must be a file of kernel_0"),
+        (["policy=nothing:act"], "policy must be a function that can be imported"),
+        (["policy=dqn:nothing.zip"], "policy must name an algorithm and a file"),
+        (["agent=nothing"], "agent must be one of"),
+    ],
+)
+def test_what_cannot_be_is_refused(words, message, tmp_path):
+    with pytest.raises(ConfigError, match=message):
+        main([*QUICK, f"run_dir={tmp_path}", *words])
+
+
+def test_the_bonus_for_health_is_left_out_of_searches():
+    assert read(["env=hopper"])[0].search.alive_bonus == 1.0
+    assert read(["env=hopper", "search.alive_bonus=0"])[0].search.alive_bonus == 0.0
+    assert read(["env=halfcheetah"])[0].search.alive_bonus == 0.0
+    assert read(["env=halfcheetah"])[1].training.max_steps == 10_000
+
+
+def test_help_names_every_field():
+    text = help_text([])
+    for name in ("search.policy_error=0.1", "copy.hidden_size=32", "num_tested=10", "policy=null"):
+        assert f"  {name}  # " in text

@@ -1,0 +1,127 @@
+"""sejax.proxies.exact: SEs whose best policy is a given one."""
+
+import itertools
+
+import jax
+import numpy as np
+import pytest
+
+import sejax
+from sejax.envs.base import Task
+from sejax.envs.spec import Box, Discrete, TaskSpec
+from sejax.options import ConfigError
+from sejax.proxies.base import AbsentEnv
+from sejax.proxies.exact import gaussian, make_exact
+
+RNG = np.random.default_rng(0)
+OBS_DIM = 3
+
+
+def task_with(action):
+    """A task of which only the spaces count."""
+    spec = TaskSpec(observation=Box.symmetric(*[9.0] * OBS_DIM), action=action, max_steps=7)
+    return Task.of(spec, name="spaces", env=AbsentEnv("spaces", spec, "it has no dynamics"))
+
+
+TASKS = {"continuous": task_with(Box.symmetric(0.5, 0.5)), "discrete": task_with(Discrete(3))}
+STATES = RNG.normal(size=(50, OBS_DIM)) * [1.0, 3.0, 0.1] + [0.0, -2.0, 5.0]
+
+
+def layers_of(*sizes):
+    return [
+        (RNG.normal(size=(n_out, n_in)), RNG.normal(size=n_out))
+        for n_in, n_out in itertools.pairwise(sizes)
+    ]
+
+
+def plain_outputs(layers, obs):
+    """The policy, unit by unit."""
+    values = list(obs)
+    for i, (kernel, bias) in enumerate(layers):
+        values = [
+            sum(w * v for w, v in zip(row, values, strict=True)) + b
+            for row, b in zip(kernel, bias, strict=True)
+        ]
+        if i < len(layers) - 1:
+            values = [max(0.0, v) for v in values]
+    return np.array(values)
+
+
+def rewards(env, weights, states, actions):
+    each = jax.vmap(jax.vmap(env.bandit_reward, (None, None, 0)), (None, 0, None))
+    return np.asarray(each(weights, states.astype(np.float32), actions))
+
+
+@pytest.mark.parametrize("hidden", [(), (5,), (4, 6)])
+def test_a_continuous_action_costs_its_distance_to_the_policys(hidden):
+    layers = layers_of(OBS_DIM, *hidden, 2)
+    env, weights = make_exact(TASKS["continuous"], layers, STATES, slope=2.0)
+    actions = RNG.uniform(-0.5, 0.5, (9, 2)).astype(np.float32)
+    wanted = [
+        [-2.0 * np.abs(a - np.clip(plain_outputs(layers, s), -0.5, 0.5)).sum() for a in actions]
+        for s in STATES
+    ]
+    np.testing.assert_allclose(rewards(env, weights, STATES, actions), wanted, atol=2e-4)
+
+
+@pytest.mark.parametrize("hidden", [(), (5,)])
+def test_a_discrete_action_costs_for_each_better_one(hidden):
+    layers = layers_of(OBS_DIM, *hidden, 3)
+    env, weights = make_exact(TASKS["discrete"], layers, STATES)
+    outputs = np.array([plain_outputs(layers, s) for s in STATES])
+    apart = outputs[:, None, :] - outputs[:, :, None]  # [state, chosen, better]
+    margin = np.quantile(np.abs(apart[:, ~np.eye(3, dtype=bool)]), 0.1)
+    wanted = -np.clip(apart / margin, 0, 1).sum(axis=2)
+    got = rewards(env, weights, STATES, np.arange(3))
+    np.testing.assert_allclose(got, wanted, atol=2e-3)
+    assert (got.argmax(axis=1) == outputs.argmax(axis=1)).all()
+
+
+def test_episodes_begin_like_the_states_that_were_visited():
+    env, weights = make_exact(TASKS["continuous"], layers_of(OBS_DIM, 2), STATES, widen=1.5)
+    params = env.params(weights)
+    keys = jax.random.split(jax.random.key(0), 40_000)
+    starts = np.asarray(jax.jit(jax.vmap(lambda key: env.reset_env(key, params)[0]))(keys))
+    std = STATES.std(axis=0)
+    np.testing.assert_allclose((starts.mean(axis=0) - STATES.mean(axis=0)) / std, 0, atol=0.04)
+    scale = np.outer(std, std)
+    np.testing.assert_allclose(np.cov(starts.T) / scale, 2.25 * np.cov(STATES.T) / scale, atol=0.1)
+
+
+def test_a_number_that_never_varies_is_kept():
+    states = np.stack([np.full(9, 4.0), np.linspace(0, 1, 9)], axis=1)
+    (kernel, bias), (last, shift) = gaussian(states)
+    noise = RNG.normal(size=(2, 1000))
+    moved = noise + last @ np.maximum(kernel @ noise + bias[:, None], 0) + shift[:, None]
+    assert np.abs(moved[0] - 4.0).max() < 1e-3
+    assert 0.25 < moved[1].std() < 0.45
+
+
+def test_it_is_stored_and_plays_in_numpy_alike(tmp_path):
+    task = sejax.envs.make("pendulum")
+    env, weights = make_exact(task, layers_of(3, 4, 1), STATES)
+    sejax.save(tmp_path / "se.safetensors", env, weights)
+    alike = sejax.gym.make(str(tmp_path / "se.safetensors"))
+    obs, _ = alike.reset(seed=1)
+    action = np.array([0.7], np.float32)
+    _, reward, terminated, *_ = alike.step(action)
+    assert terminated
+    np.testing.assert_allclose(reward, env.bandit_reward(weights, obs, action), rtol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("task", "layers", "states", "field"),
+    [
+        ("cliff_walking", layers_of(48, 4), STATES, "env"),
+        ("pendulum", layers_of(4, 1), STATES, "policy"),
+        ("pendulum", layers_of(3, 2), STATES, "policy"),
+        ("pendulum", [], STATES, "policy"),
+        ("pendulum", [(np.full((1, 3), np.nan), np.zeros(1))], STATES, "policy"),
+        ("pendulum", layers_of(3, 1), STATES[:, :2], "states"),
+        ("pendulum", layers_of(3, 1), STATES[:1], "states"),
+    ],
+)
+def test_what_does_not_fit_is_refused(task, layers, states, field):
+    with pytest.raises(ConfigError) as caught:
+        make_exact(sejax.envs.make(task), layers, states)
+    assert caught.value.field == field

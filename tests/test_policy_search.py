@@ -1,0 +1,175 @@
+"""sejax.distillation: the search of linear policies, copies of policies, and what SEs teach."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pandas as pd
+import pytest
+
+from sejax import envs
+from sejax.distillation.policy_copy import CopyConfig, acting, copy_policy, visit
+from sejax.distillation.policy_search import (
+    Policy,
+    SearchConfig,
+    linear_act,
+    make_search,
+    step_size,
+    with_moments,
+)
+from sejax.distillation.teaching import grades
+from sejax.options import ConfigError
+from sejax.proxies.exact import evaluate
+
+CARTPOLE, PENDULUM = envs.make("cartpole"), envs.make("pendulum")
+SMALL = SearchConfig(num_directions=6, num_top=3, generations=10, num_tests=4)
+RNG = np.random.default_rng(1)
+
+
+@pytest.fixture(scope="module")
+def tried():
+    """A generation from a policy that is not zero, on one device and on two."""
+    found = []
+    for devices in (1, 2):
+        search = make_search(SMALL, CARTPOLE, devices)
+        before = search.init()._replace(weights=jnp.asarray(RNG_WEIGHTS))
+        found.append((before, *jax.jit(search.generation)(jax.random.key(5), before, 2)))
+    return found
+
+
+RNG_WEIGHTS = RNG.normal(size=(2, 5)).astype(np.float32) * 0.1
+
+
+def test_a_generation_moves_along_the_best_directions(tried):
+    before, after, generation = tried[0]
+    directions = np.asarray(
+        jax.random.normal(jax.random.split(jax.random.key(5), 3)[0], (6, 2, 5)), float
+    )
+    returns = np.asarray(generation.returns, float)
+    best = sorted(range(6), key=lambda i: -max(returns[i], returns[6 + i]))[:3]
+    used = [returns[i] for i in best] + [returns[6 + i] for i in best]
+    step = sum((returns[i] - returns[6 + i]) * directions[i] for i in best)
+    wanted = np.asarray(before.weights) + 0.02 * step / (3 * np.std(used))
+    np.testing.assert_allclose(after.weights, wanted, rtol=1e-4, atol=1e-6)
+    # In CartPole a step pays 1: all steps of the directions, and one episode of the policy.
+    assert int(generation.num_steps) == int(returns.sum()) + int(after.num_seen)
+
+
+def test_devices_do_not_matter(tried):
+    (_, one, _), (_, two, _) = tried
+    assert jax.tree.all(jax.tree.map(lambda x, y: bool((x == y).all()), one, two))
+
+
+def test_moments_are_those_of_all_that_was_seen():
+    policy = make_search(SMALL, PENDULUM).init()
+    rows = RNG.normal(size=(3, 40, 3)).astype(np.float32) * [1, 5, 0.2] + [3, 0, -1]
+    valid = RNG.uniform(size=(3, 40)) < [[0.7], [0.5], [0.0]]
+    for obs, each in zip(rows, valid, strict=True):
+        policy = with_moments(policy, jnp.asarray(obs, jnp.float32), jnp.asarray(each))
+    seen = np.concatenate([obs[each] for obs, each in zip(rows, valid, strict=True)])
+    assert int(policy.num_seen) == len(seen)
+    np.testing.assert_allclose(policy.mean, seen.mean(0), rtol=1e-4)
+    np.testing.assert_allclose(policy.std, seen.std(0), rtol=1e-4)
+
+
+@pytest.mark.parametrize("task", [CARTPOLE, PENDULUM], ids=lambda task: task.name)
+def test_layers_do_what_the_policy_does(task):
+    d, m = task.obs_dim, task.action_dim
+    policy = Policy(
+        jnp.asarray(RNG.normal(size=(m, d + 1)), jnp.float32),
+        jnp.float32(10),
+        jnp.asarray(RNG.normal(size=d), jnp.float32),
+        jnp.asarray(RNG.uniform(1, 9, d), jnp.float32),
+    )
+    obs = RNG.normal(size=(30, d)).astype(np.float32)
+    wanted = jax.vmap(lambda x: linear_act(task, policy, x))(obs)
+    got = acting(task, policy.layers(task.max_action))(obs)
+    np.testing.assert_allclose(got, wanted, atol=1e-4)
+
+
+def test_the_step_size_declines_in_the_second_half():
+    config = SearchConfig(generations=100, step_size=0.5)
+    sizes = [float(step_size(config, i)) for i in (0, 49, 75, 99)]
+    np.testing.assert_allclose(sizes, [0.5, 0.5, 0.25, 0.05], rtol=1e-6)
+
+
+def test_a_search_solves_cartpole_and_takes_bonuses_out():
+    search = make_search(dataclasses.replace(SMALL, num_directions=16), CARTPOLE)
+    generation, policy = jax.jit(search.generation), search.init()
+    for i in range(6):
+        policy, _ = generation(jax.random.fold_in(jax.random.key(0), i), policy, i)
+    assert float(jax.jit(search.test)(jax.random.key(1), policy).returns.mean()) > 150
+    # Without the reward for standing nothing is learned: every direction is as good.
+    flat = make_search(dataclasses.replace(SMALL, alive_bonus=1.0), CARTPOLE)
+    policy, _ = jax.jit(flat.generation)(jax.random.key(0), flat.init(), 0)
+    assert not np.asarray(policy.weights).any()
+
+
+def test_first_generations_may_be_short():
+    short = dataclasses.replace(SMALL, short_steps=7, short_generations=2)
+    generation = jax.jit(make_search(short, PENDULUM).generation)
+    steps = [generation(jax.random.key(0), make_search(short, PENDULUM).init(), i)[1].num_steps
+             for i in (1, 2)]  # fmt: skip
+    assert [int(x) for x in steps] == [12 * 7 + 200, 13 * 200]
+
+
+@pytest.mark.parametrize("change", [{"num_top": 7}, {"noise_std": 0.0}, {"policy_error": -1.0}])
+def test_settings_that_cannot_be_are_refused(change):
+    with pytest.raises(ConfigError, match="search"):
+        dataclasses.replace(SMALL, **change)
+    with pytest.raises(ConfigError, match="vectors"):
+        make_search(SMALL, envs.make("cliff_walking"))
+
+
+# --- copies --------------------------------------------------------------------------------------
+
+
+def test_a_copy_does_what_the_policy_does():
+    kernel, bias = np.array([[2.0, -4.0, -1.0]]), np.array([0.3])
+
+    def policy(obs):
+        return np.clip(np.maximum(obs @ kernel.T + bias, -0.5), -2, 2)
+
+    config = CopyConfig(hidden_size=8, rounds=2, episodes=3, steps=1500)
+    found = copy_policy(config, PENDULUM, policy, jax.random.key(0))
+    assert [x.shape for x, _ in found.layers] == [(8, 3), (1, 8)]
+    error = np.clip(evaluate(found.layers, found.states), -2, 2) - policy(found.states)
+    assert np.sqrt((error**2).mean()) < 0.1
+    assert found.real_steps == 3 * 3 * 200
+    assert found.copy_return == pytest.approx(found.policy_return, abs=250)
+
+
+def test_a_linear_copy_of_discrete_actions():
+    kernel = np.array([[0.0, 0.0, 0.0, 0.0], [0.1, 0.3, 1.0, 0.6]])
+
+    def policy(obs):
+        return (obs @ kernel.T).argmax(axis=1)
+
+    config = CopyConfig(hidden_size=0, rounds=2, episodes=4, steps=1500, policy_error=0.3)
+    found = copy_policy(config, CARTPOLE, policy, jax.random.key(0))
+    alike = acting(CARTPOLE, found.layers)(found.states) == policy(found.states)
+    assert alike.mean() > 0.8  # many states lie close to where the action changes
+    assert found.policy_return == found.copy_return == 200.0
+
+
+def test_visits_are_whole_episodes():
+    seen = visit(CARTPOLE, lambda obs: np.zeros(len(obs), int), jax.random.key(0), 5)
+    assert seen.returns.sum() == len(seen.states)  # a step pays 1
+    assert (seen.returns < 15).all()  # pushed to one side all the time
+
+
+# --- what SEs teach ------------------------------------------------------------------------------
+
+
+def test_grades_weigh_the_worst_student_and_count_those_that_diverged():
+    rows = pd.DataFrame(
+        {
+            "generation": [1, 1, 1, 1, 2, 2, 2, 2],
+            "agent": ["td3", "td3", "sac", "sac"] * 2,
+            "test_return": [10.0, 20.0, 5.0, 5.0, 30.0, np.nan, 8.0, 0.0],
+        }
+    )
+    found = grades(rows)
+    assert found[1] == pytest.approx(((15 + 10) / 2 + 5) / 2)
+    assert found[2] == pytest.approx(((15 + 0) / 2 + (4 + 0) / 2) / 2)  # nan counts as 0
