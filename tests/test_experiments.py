@@ -56,6 +56,8 @@ TINY = {
     "rn_objectives": CURVES | {"objectives": ("reward_threshold", "auc")},
     "rn_performance": CURVES,
     "score_transforms": {"runs": 3, "generations": 2, "population": 2, "transforms": "rank"},
+    "se_distilled": {"env": "cartpole", "students": "ddqn", "quick": True,
+                     "run": ["training.max_steps=60", "training.max_episodes=60"]},
     "se_dynamics": {"kinds": ["bandit", "against_myopic"], "students": "ddqn", "runs": 1,
                     "generations": 2, "num_agents": 2, "test_episodes": 1,
                     "run": [*TINY_SE, *tiny_agents("agent", group="")]},
@@ -83,7 +85,7 @@ TINY = {
     "timings": {"rows": "cliff_walking-rn", "generations": 1},
 }  # fmt: skip
 SLOW = {"break_even", "null_baselines", "rn_heatmap", "rn_objectives", "rn_performance",
-        "score_transforms", "se_dynamics", "se_families", "se_feasibility", "se_horizons",
+        "score_transforms", "se_distilled", "se_dynamics", "se_families", "se_feasibility", "se_horizons",
         "se_models", "se_myopia", "se_out_of_sample", "se_performance",
         "se_tuners", "supervised_baseline"}  # fmt: skip
 
