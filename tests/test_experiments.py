@@ -85,8 +85,8 @@ TINY = {
     "timings": {"rows": "cliff_walking-rn", "generations": 1},
 }  # fmt: skip
 SLOW = {"break_even", "null_baselines", "rn_heatmap", "rn_objectives", "rn_performance",
-        "score_transforms", "se_distilled", "se_dynamics", "se_families", "se_feasibility", "se_horizons",
-        "se_models", "se_myopia", "se_out_of_sample", "se_performance",
+        "score_transforms", "se_distilled", "se_dynamics", "se_families", "se_feasibility",
+        "se_horizons", "se_models", "se_myopia", "se_out_of_sample", "se_performance",
         "se_tuners", "supervised_baseline"}  # fmt: skip
 
 
