@@ -26,10 +26,9 @@ class DistillConfig(Options):
 
     group: ClassVar[str] = ""
 
-    # null: one is searched. An agent that trains on the task; ppo:FILE.zip, of Stable-Baselines3;
-    # FILE.npz with kernel_0, bias_0 and so on; or module:function.
+    # null: one is searched. ppo:FILE.zip, of Stable-Baselines3; FILE.npz with kernel_0, bias_0 and
+    # so on; or module:function.
     policy: str | None = None
-    policy_steps: int = option(20_000, counts("an agent must train"))  # of an agent, on the task
     # Of a policy that is not of the exact form.
     copy: CopyConfig = dataclasses.field(default_factory=CopyConfig)
     # Of a linear policy.

@@ -1,23 +1,17 @@
-"""Policies that `python -m sejax.distill` is given: agents, files, and functions."""
+"""Policies that `python -m sejax.distill` is given: files and functions."""
 
-import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
-from sejax.agents import make_agent
-from sejax.cli import config as configuration
 from sejax.distillation.policy_copy import Actor, acting
 from sejax.envs.base import Task
-from sejax.options import ConfigError, registry, require, shortened, told
+from sejax.options import ConfigError, require, shortened, told
 from sejax.proxies.exact import Layer
-from sejax.training import TrainingConfig, make_trainer
 
-FIX = "Set policy=sac, ppo:FILE.zip (Stable-Baselines3), FILE.npz or module:function."
+FIX = "Set policy=ppo:FILE.zip (Stable-Baselines3), FILE.npz or module:function."
 
 
 class Given(NamedTuple):
@@ -26,27 +20,20 @@ class Given(NamedTuple):
     Attributes:
       act: what it does.
       layers: the same, if it is of the exact form already; None if it must be copied.
-      real_steps: that making it took here.
-      cpu_s: likewise.
     """
 
     act: Actor
     layers: Sequence[Layer] | None = None
-    real_steps: int = 0
-    cpu_s: float = 0.0
 
 
-def policy_of(text: str, task: Task, env_words: Sequence[str], steps: int, seed: int) -> Given:
+def policy_of(text: str, task: Task) -> Given:
     """The policy that an override names.
 
     Args:
-      text: the name of an agent, which trains on the task itself; `ALGORITHM:FILE.zip`, a model of
-        Stable-Baselines3; `FILE.npz` with `kernel_0` `[out, in]`, `bias_0` and so on, affine maps
-        with ReLUs between; or `module:function`, of observations `[state, obs_dim]` to actions.
+      text: `ALGORITHM:FILE.zip`, a model of Stable-Baselines3; `FILE.npz` with `kernel_0`
+        `[out, in]`, `bias_0` and so on, affine maps with ReLUs between; or `module:function`, of
+        observations `[state, obs_dim]` to actions.
       task: the real task.
-      env_words: overrides that make it.
-      steps: of an agent's training.
-      seed: likewise.
 
     Raises:
       ConfigError: for anything else.
@@ -56,31 +43,8 @@ def policy_of(text: str, task: Task, env_words: Sequence[str], steps: int, seed:
     if text.endswith(".npz"):
         layers = _of_file(text)
         return Given(acting(task, layers), layers)
-    if ":" in text:
-        return Given(_of_function(text))
-    if text in registry.names("agent"):
-        return _of_agent(text, task, env_words, steps, seed)
-    raise ConfigError(f"policy must be an agent, a file or a function; got {text}. {FIX}", "policy")
-
-
-def _of_agent(name: str, task: Task, env_words: Sequence[str], steps: int, seed: int) -> Given:
-    config = configuration.config([*env_words, f"agent={name}"])
-    agent = make_agent(config.agent, task)
-    training = TrainingConfig(
-        max_steps=steps, max_episodes=steps, stop_rule="never", time_limit_is_terminal=False
-    )
-    train = jax.jit(make_trainer(agent, task.env, training))
-    started = time.process_time()
-    state = jax.block_until_ready(train(jax.random.key(seed), task.params)).agent_state
-
-    @jax.jit
-    def act(obs: Any) -> Any:
-        key = jax.random.key(0)  # greedy: without effect
-        actions = jax.vmap(lambda one: agent.act(key, state, one, explore=False))(obs)
-        return jax.vmap(agent.env_action)(actions)
-
-    cpu_s = time.process_time() - started
-    return Given(lambda obs: np.asarray(act(jnp.asarray(obs))), None, steps, cpu_s)
+    require(":" in text, "policy", f"must be a file or a function; got {shortened(text)}. {FIX}")
+    return Given(_of_function(text))
 
 
 def _of_sb3(text: str, task: Task) -> Actor:
