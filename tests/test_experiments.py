@@ -76,6 +76,8 @@ TINY = {
                          "more_steps": [40], "test_episodes": 1},
     "se_performance": {"fixed": "se", "agents": "ddqn", "num_agents": 2, "test_episodes": 2,
                        "real_episodes": 3},
+    "se_teachability": {"env": "cartpole", "students": "ddqn", "quick": True,
+                        "run": ["training.max_steps=60", "training.max_episodes=60"]},
     "se_tuners": {"ranked": "ddqn", "num_configs": 4, "num_seeds": 2, "steps": 60, "num_tuners": 1,
                   "members": 1, "tuning_seeds": 2, "short_steps": [40], "generations": 2,
                   "run": ["objective.judging=0.5"]},
@@ -87,7 +89,7 @@ TINY = {
 SLOW = {"break_even", "null_baselines", "rn_heatmap", "rn_objectives", "rn_performance",
         "score_transforms", "se_distilled", "se_dynamics", "se_families", "se_feasibility",
         "se_horizons", "se_models", "se_myopia", "se_out_of_sample", "se_performance",
-        "se_tuners", "supervised_baseline"}  # fmt: skip
+        "se_teachability", "se_tuners", "supervised_baseline"}  # fmt: skip
 
 
 def module_of(name):

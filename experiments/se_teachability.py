@@ -1,0 +1,267 @@
+"""What makes a policy teachable: students on SEs of many policies, beside what predicts them.
+
+A policy that earns more may be a worse teacher. Searches with several sizes of the emulated error
+give policies of many kinds; of each one SE is made, on which fresh students of several kinds train.
+Beside them stands what can be known of a policy without a student: its return, its return with a
+random linear error in each episode, as of a student that learned it roughly, and how often its
+actions lie at their bounds. On the SE that teaches best, other forms are compared: the reward's
+slope, the spread of the initial states, the number of steps.
+"""
+
+import dataclasses
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+import pandas as pd
+from scipy.stats import spearmanr
+
+import sejax
+from experiments.common import figures, tables
+from experiments.common.agents import CONTINUOUS, DISCRETE
+from experiments.common.experiment import Experiment, Settings, count, setting
+from experiments.common.shards import stack, unstack
+from sejax import envs
+from sejax.cli import distilling
+from sejax.cli.config import LearnConfig, members_of
+from sejax.cli.distill_config import DistillConfig, read
+from sejax.distillation import teaching
+from sejax.distillation.policy_copy import erring, visit
+from sejax.distillation.teaching import Lesson
+from sejax.options import each_of
+from sejax.options.plain import to_plain
+from sejax.proxies.exact import evaluate
+
+QUICK = (
+    *("search.generations=4", "search.test_every=1", "search.num_directions=4"),
+    *("search.num_top=2", "num_snapshots=2", "training.max_steps=200"),
+    "training.max_episodes=200",
+)
+
+
+class Form(NamedTuple):
+    """How an SE is made of a policy, and how long students train on it."""
+
+    slope: float = 1.0  # of the reward
+    widen: float = 1.0  # spread of the initial states, in units of the visited ones'
+    share: float = 1.0  # of the steps of a student
+
+
+FORMS = {
+    "as it is": Form(),
+    "slope 0.2": Form(slope=0.2),
+    "slope 5": Form(slope=5.0),
+    "starts 0.5 as wide": Form(widen=0.5),
+    "starts 1.5 times as wide": Form(widen=1.5),
+    "starts 3 times as wide": Form(widen=3.0),
+    "a quarter of the steps": Form(share=0.25),
+    "half of the steps": Form(share=0.5),
+    "twice the steps": Form(share=2.0),
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class SeTeachability(Settings):
+    name = "se_teachability"
+
+    env: str = setting("halfcheetah")  # task
+    # Kinds of students; all that the task's preset has.
+    students: tuple[str, ...] = setting((), each_of(tuple(dict.fromkeys(DISCRETE + CONTINUOUS))))
+    # Emulated errors of the searches.
+    searched_with: tuple[float, ...] = setting((0.0, 0.1, 0.3), quick=(0.1,))
+    num_seeds: int = count(2, quick=1)  # searches with each
+    num_students: int = count(4, quick=2)  # of each kind on each SE
+    num_formed: int = count(8, quick=2)  # of each kind on each form of the best SE
+    # Errors that a policy is tested with.
+    errors: tuple[float, ...] = setting((0.0, 0.1, 0.2, 0.3), quick=(0.0, 0.3))
+    num_episodes: int = count(16, quick=2)  # of each such test
+    run: tuple[str, ...] = setting(())  # overrides of sejax.distill
+
+    @property
+    def kinds(self) -> tuple[str, ...]:
+        """Kinds of students."""
+        discrete = envs.make(self.env).num_actions is not None
+        return self.students or (DISCRETE if discrete else CONTINUOUS)
+
+    def searches(self) -> Iterator[tuple[str, DistillConfig, LearnConfig]]:
+        """Each search: its name, and what the command reads for it."""
+        for error in self.searched_with:
+            for seed in range(self.seed, self.seed + self.num_seeds):
+                words = [
+                    *(f"env={self.env}", f"agents=[{','.join(self.kinds)}]", f"seed={seed}"),
+                    *(f"search.policy_error={error}", f"num_students={self.num_students}"),
+                    *(QUICK if self.quick else ()),
+                ]
+                own, config = read([*words, *self.run])
+                name = f"error{error:g}-seed{seed}"
+                yield name, own, dataclasses.replace(config, devices=self.devices)
+
+
+# --- computing -----------------------------------------------------------------------------------
+
+
+def compute(settings: SeTeachability) -> pd.DataFrame:
+    """Searches, tests and teaches what is missing."""
+    policies, students, taught = [], [], {}
+    for name, own, config in settings.searches():
+        folder = settings.work_folder / name
+        folder.mkdir(parents=True, exist_ok=True)
+        lessons, _ = distilling.search(own, config, folder)
+        made_with = {"own": to_plain(own), "kinds": list(settings.kinds)}
+        made_with["training"] = to_plain(config.training)
+        tests = settings.values("errors", "num_episodes")
+
+        def tested(lessons: Any = lessons, config: Any = config) -> pd.DataFrame:
+            return pd.DataFrame([_tested(settings, config, lesson) for lesson in lessons])
+
+        def learned(own: Any = own, config: Any = config, lessons: Any = lessons) -> pd.DataFrame:
+            return distilling.students(own, config, lessons, distilling.CHOOSE)
+
+        columns = {"search": name, "searched_with": own.search.policy_error}
+        rows = settings.shards.compute(f"policies-{name}", made_with | tests, tested)
+        policies.append(rows.assign(**columns))
+        rows = settings.shards.compute(f"students-{name}", made_with, learned)
+        students.append(rows.assign(**columns))
+        grades = teaching.grades(rows)
+        best = {lesson.generation: lesson for lesson in lessons}[int(grades.idxmax())]
+        taught[float(grades.max())] = (name, own, config, best)
+    formed = _formed(settings, *taught[max(taught)])
+    parts = {"policies": pd.concat(policies), "students": pd.concat(students), "forms": formed}
+    return stack(parts)
+
+
+def _tested(settings: SeTeachability, config: LearnConfig, lesson: Lesson) -> dict[str, float]:
+    """What can be known of a policy without a student."""
+    task, key = config.task(), jax.random.key(config.seed + 1)
+    scale = lesson.states.mean(0), np.maximum(lesson.states.std(0), 1e-2)
+    found: dict[str, float] = {"generation": lesson.generation}
+    for error in settings.errors:
+        act = erring(task, lesson.layers, scale, error, key, settings.num_episodes)
+        seen = visit(task, act, key, settings.num_episodes)
+        found[f"return_{error:g}"] = float(seen.returns.mean())
+    outputs = evaluate(lesson.layers, lesson.states)
+    is_continuous = task.num_actions is None
+    found["saturated"] = float((np.abs(outputs) > task.max_action).mean()) if is_continuous else 0.0
+    return found
+
+
+def _formed(
+    settings: SeTeachability, name: str, own: DistillConfig, config: LearnConfig, lesson: Lesson
+) -> pd.DataFrame:
+    """Students on the forms of one policy's SE, a row each."""
+    task, found = config.task(), []
+    keys = jax.random.split(jax.random.key(config.seed + 2), settings.num_formed)
+    most = config.training.max_steps
+    assert most is not None
+    for label, form in FORMS.items():
+        env, weights = teaching.make_ses(task, [lesson], form.slope, form.widen)
+        steps = int(most * form.share)
+        training = dataclasses.replace(config.training, max_steps=steps, max_episodes=steps)
+        made_with = {"search": to_plain(own), "form": form._asdict(), "kinds": settings.kinds}
+        made_with |= {"training": to_plain(training), "num": len(keys), "of": lesson.generation}
+
+        def learned(env: Any = env, weights: Any = weights, training: Any = training) -> Any:
+            rows = []
+            for member in members_of(config):
+                agent = sejax.make_agent(member.agent, task)
+                outcome = teaching.teach(env, weights, agent, training, keys, config.devices)
+                rows.append(teaching.as_rows(outcome, [lesson], member.key, "form"))
+            return pd.concat(rows, ignore_index=True)
+
+        file = f"form-{name}-{label.replace(' ', '_')}"
+        found.append(settings.shards.compute(file, made_with, learned).assign(form=label))
+    return pd.concat(found)
+
+
+# --- the report ----------------------------------------------------------------------------------
+
+
+def by_policy(rows: pd.DataFrame) -> pd.DataFrame:
+    """A row for each policy and kind of student, with what is known of the policy."""
+    policies, students = unstack(rows, "policies"), unstack(rows, "students")
+    each = students.assign(
+        test_return=students["test_return"].fillna(students["test_return"].min())
+    )
+    grouped = each.groupby(["search", "generation", "agent"])["test_return"]
+    taught = grouped.agg(["mean", "min"]).reset_index()
+    return taught.merge(policies, on=["search", "generation"])
+
+
+def summarise(settings: SeTeachability, rows: pd.DataFrame) -> pd.DataFrame:
+    """How well each number of a policy ranks policies as their students do, by kind."""
+    each = by_policy(rows)
+    found = []
+    for kind, mine in each.groupby("agent", sort=False):
+        known = {f"return_{x:g}": f"return with an error of {x:g}" for x in settings.errors}
+        known["saturated"] = "share of actions at their bounds"
+        for column, label in known.items():
+            varies = mine[column].nunique() > 1 and mine["mean"].nunique() > 1
+            rho = {x: spearmanr(mine[column], mine[x])[0] if varies else np.nan
+                   for x in ("mean", "min")}  # fmt: skip
+            found.append(
+                {"kind": kind, "known": label, "policies": len(mine),
+                 "rho_mean": rho["mean"], "rho_worst": rho["min"]}
+            )  # fmt: skip
+    return pd.DataFrame(found)
+
+
+def report(settings: SeTeachability, rows: pd.DataFrame) -> pd.DataFrame:
+    summary = summarise(settings, rows)
+    draw(settings, rows, settings.folder / "teachability.png")
+    forms = unstack(rows, "forms")
+    each = forms.groupby(["form", "agent"], sort=False)["test_return"].agg(["mean", "min"])
+    shown = []
+    for label, mine in each.groupby("form", sort=False):
+        cells = {"the best SE": str(label)}
+        for (_, kind), row in mine.iterrows():  # type: ignore[misc]
+            cells[figures.AGENT_NAMES[kind]] = f"{row['mean']:,.0f}, worst {row['min']:,.0f}"
+        shown.append(cells)
+    texts = pd.DataFrame(shown)
+    lines = ["| known of a policy | " + " | ".join(summary["kind"].unique()) + " |"]
+    lines.append("| --- " * (1 + summary["kind"].nunique()) + "|")
+    for known, mine in summary.groupby("known", sort=False):
+        rhos = " | ".join(f"{x:.2f}" for x in mine["rho_mean"])
+        lines.append(f"| {known} | {rhos} |")
+    note = (
+        "Spearman's correlation of what is known of a policy with the mean return of the students "
+        f"on its SE, over {summary['policies'].max()} policies of "
+        f"{len(list(settings.searches()))} searches:\n\n"
+        + "\n".join(lines)
+        + f"\n\nOn each SE {settings.num_students} students of each kind trained; on each form of "
+        f"the SE that taught best, {settings.num_formed}. An error is a random linear map of the "
+        "observation in each episode; its size is the root mean square in units of the action's "
+        "bound."
+    )
+    title = f"What makes policies of {settings.env} teachable"
+    return tables.publish(settings, title, texts, summary, note)
+
+
+def draw(settings: SeTeachability, rows: pd.DataFrame, path: Path) -> None:
+    """Draws students' returns against the policy's own, and against that with the largest error."""
+    each, kinds = by_policy(rows), settings.kinds
+    columns = [f"return_{settings.errors[0]:g}", f"return_{max(settings.errors):g}"]
+    labels = ["return of the policy", f"with an error of {max(settings.errors):g}"]
+    size = (0.6 + 2.5 * len(kinds), 4.8)
+    with figures.panels(path, 2, len(kinds), size, sharey=True) as (_, axes):
+        for axis_row, column, label in zip(axes, columns, labels, strict=True):
+            for axis, kind in zip(axis_row, kinds, strict=True):
+                mine = each[each["agent"] == kind]
+                ends = [mine[column].min(), mine[column].max()]
+                axis.plot(ends, ends, color="0.75", lw=1)
+                for error, some in mine.groupby("searched_with"):
+                    axis.plot(some[column], some["mean"], "o", ms=4, alpha=0.7,
+                              label=f"searched with {error:g}")  # fmt: skip
+                axis.set_title(figures.AGENT_NAMES[kind], fontsize=10)
+                axis.set_xlabel(label)
+        for axis_row in axes:
+            axis_row[0].set_ylabel("students' mean return")
+        axes[0][0].legend(fontsize=7)
+
+
+EXPERIMENT = Experiment(settings=SeTeachability, compute=compute, report=report, about=__doc__)
+
+if __name__ == "__main__":
+    EXPERIMENT.main()
