@@ -4,7 +4,8 @@
 the way, and keeps the one that teaches its students best. No agent is trained to learn it: such an
 SE is its policy in disguise, and the baseline that evolved SEs must beat. Here the whole command
 runs with several seeds, and fresh students of each kind, which took no part in choosing, say what
-the chosen SE teaches. All costs are counted, discarded policies and their students included.
+the chosen SE teaches. Costs are those of the whole run, discarded policies and their students
+included.
 """
 
 import dataclasses

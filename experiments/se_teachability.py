@@ -136,10 +136,9 @@ def compute(settings: SeTeachability) -> pd.DataFrame:
 def _tested(settings: SeTeachability, config: LearnConfig, lesson: Lesson) -> dict[str, float]:
     """What can be known of a policy without a student."""
     task, key = config.task(), jax.random.key(config.seed + 1)
-    scale = lesson.states.mean(0), np.maximum(lesson.states.std(0), 1e-2)
     found: dict[str, float] = {"generation": lesson.generation}
     for error in settings.errors:
-        act = erring(task, lesson.layers, scale, error, key, settings.num_episodes)
+        act = erring(task, lesson.layers, lesson.states, error, key, settings.num_episodes)
         seen = visit(task, act, key, settings.num_episodes)
         found[f"return_{error:g}"] = float(seen.returns.mean())
     outputs = evaluate(lesson.layers, lesson.states)

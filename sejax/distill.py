@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from sejax.cli import commands, runtime
 from sejax.cli.distill_config import DistillConfig, folder_of, read
 from sejax.ops.files import require_writable
-from sejax.options import ConfigError, as_text, help_texts
+from sejax.options import ConfigError, as_text, help_texts, require
 from sejax.options.plain import fields_of, flatten, to_plain
 
 ABOUT = """Make an SE of a policy, and choose it by what it teaches.
@@ -16,9 +16,9 @@ ABOUT = """Make an SE of a policy, and choose it by what it teaches.
   python -m sejax.distill env=pendulum policy=sac:model.zip
 
 A linear policy is found by augmented random search. The best policies of parts of the search become
-SEs; students train on each, and the SE that teaches best is kept. With `policy` that one is copied.
+SEs; students train on each, and the SE that teaches best is kept. With `policy`, that one is used.
 Other fields are those of sejax.run with preset=distilled. Writes proxy.safetensors, card.md,
-search.csv and students.csv into run_dir; the same command goes on where it stopped.
+search.csv and students.csv into run_dir; the same command goes on with a search that was stopped.
 """
 
 
@@ -36,6 +36,12 @@ def main(overrides: Sequence[str]) -> None:
     own, config = read(overrides)
     runtime.configure_jax()
     folder = folder_of(config)
+    require(
+        not (folder / "checkpoint.safetensors").exists(),
+        "run_dir",
+        f"must not be a run of sejax.run, whose proxy would be lost; got {folder}. Set "
+        "run_dir=FOLDER.",
+    )
     require_writable("run_dir", folder)
     try:
         with filelock.FileLock(folder / "sejax.lock", timeout=0):

@@ -86,6 +86,32 @@ def act(obs):
     return (obs[:, 2] + 0.6 * obs[:, 3] > 0).astype(int)
 
 
+def of_another_shape(obs):
+    return np.zeros((len(obs), 2))
+
+
+def out_of_range(obs):
+    return np.full(len(obs), 7)
+
+
+def fails(obs):
+    return 1 // 0
+
+
+def test_a_run_of_another_command_is_not_overwritten(tmp_path):
+    (tmp_path / "checkpoint.safetensors").touch()
+    with pytest.raises(ConfigError, match=r"run_dir must not be a run of sejax.run"):
+        main([*QUICK, f"run_dir={tmp_path}"])
+
+
+def test_files_of_other_things_are_refused(tmp_path):
+    np.savez(tmp_path / "other.npz", weights=np.zeros(3))
+    np.savez(tmp_path / "turned.npz", kernel_0=np.zeros((4, 2)), bias_0=np.zeros(2))
+    for name in ("other", "turned"):
+        with pytest.raises(ConfigError, match="policy must"):
+            main([*QUICK, f"run_dir={tmp_path}/run", f"policy={tmp_path}/{name}.npz"])
+
+
 def test_policies_come_from_files_and_functions(tmp_path, capsys):
     layers = {"kernel_0": np.array([[0, 0, 0, 0], [0, 0.3, 1, 0.6]]), "bias_0": np.zeros(2)}
     np.savez(tmp_path / "linear.npz", **layers)
@@ -110,6 +136,12 @@ def test_policies_come_from_files_and_functions(tmp_path, capsys):
         (["policy=nothing:act"], "policy must be a function that can be imported"),
         (["policy=dqn:nothing.zip"], "policy must name an algorithm and a file"),
         (["agent=nothing"], "agent must be one of"),
+        (["generations=5"], "generations must be left out .* Set search.generations=N"),
+        (["proxy.hidden_size=5"], "proxy.hidden_size must be left out"),
+        (["env=cliff_walking"], "must"),
+        ([f"policy={__name__}:of_another_shape"], r"policy must give whole numbers from 0 to 1"),
+        ([f"policy={__name__}:out_of_range"], r"policy must give whole numbers from 0 to 1"),
+        ([f"policy={__name__}:fails"], "policy must act in cartpole; it raised ZeroDivisionError"),
     ],
 )
 def test_what_cannot_be_is_refused(words, message, tmp_path):

@@ -9,7 +9,7 @@ import pandas as pd
 import pytest
 
 from sejax import envs
-from sejax.distillation.policy_copy import CopyConfig, acting, copy_policy, visit
+from sejax.distillation.policy_copy import CopyConfig, acting, copy_policy, erring, visit
 from sejax.distillation.policy_search import (
     Policy,
     SearchConfig,
@@ -151,6 +151,19 @@ def test_a_linear_copy_of_discrete_actions():
     alike = acting(CARTPOLE, found.layers)(found.states) == policy(found.states)
     assert alike.mean() > 0.8  # many states lie close to where the action changes
     assert found.policy_return == found.copy_return == 200.0
+
+
+def test_errors_have_their_size_and_do_not_depend_on_who_has_ended():
+    states = RNG.normal(size=(500, 4)) * [1, 2, 0.1, 1]
+    layers = [(RNG.normal(size=(2, 4)), np.zeros(2))]
+    key, asked = jax.random.key(3), RNG.normal(size=(64, 4)) * 0.1
+    one = erring(CARTPOLE, layers, states, 0.3, key, 64)(asked)
+    asked[1:] *= 1e4  # as of episodes that go on after their end
+    assert erring(CARTPOLE, layers, states, 0.3, key, 64)(asked)[0] == one[0]
+    flat = [(np.zeros((1, 3)), np.zeros(1))]
+    seen = RNG.normal(size=(4000, 3))
+    act = erring(PENDULUM, flat, seen, 0.1, key, 4000)
+    assert 0.17 < np.sqrt((act(seen) ** 2).mean()) < 0.25  # of a bound of 2, with the bias's part
 
 
 def test_visits_are_whole_episodes():

@@ -17,6 +17,18 @@ from sejax.options.plain import from_plain, merge
 
 # Students of a task's kind of actions where none are named, and how long they train.
 STUDENTS = {"continuous": "[td3,sac]", "discrete": "[ddqn,ppo]"}
+# Of the fields of sejax.run; the others would have no effect.
+TAKEN = (
+    "env",
+    "agent",
+    "agents",
+    "exploration",
+    "training",
+    "preset",
+    "seed",
+    "devices",
+    "run_dir",
+)
 STEPS = {"continuous": 10_000, "discrete": 2_000}
 
 
@@ -45,7 +57,7 @@ class DistillConfig(Options):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        tested = self.search.generations // self.search.test_every
+        tested = -(-self.search.generations // self.search.test_every)
         require(
             self.policy is not None or self.num_snapshots <= tested,
             "num_snapshots",
@@ -71,12 +83,19 @@ def read(overrides: Sequence[str]) -> tuple[DistillConfig, LearnConfig]:
         else:
             rest.append(override)
     given = {override.partition("=")[0] for override in rest}
+    for name in sorted(given):
+        known = name.partition(".")[0] in TAKEN
+        fix = "Set search.generations=N." if name == "generations" else "Leave it out."
+        require(known, name, f"must be left out of sejax.distill, where it has no effect. {fix}")
     task = [x for x in rest if x.partition("=")[0].partition(".")[0] == "env"]
     spec = envs.spec_of(configuration.config(task).env)
     defaults = {"preset": "distilled"}
     if not given & {"agent", "agents"}:
         defaults["agents"] = STUDENTS[spec.actions]
-    if not given & {"training.max_steps", "training.max_episodes"}:
+    if "training.max_steps" in given:  # of one step each
+        text = next(x for x in rest if x.startswith("training.max_steps=")).partition("=")[2]
+        defaults["training.max_episodes"] = text
+    elif "training.max_episodes" not in given:
         defaults |= dict.fromkeys(
             ("training.max_steps", "training.max_episodes"), str(STEPS[spec.actions])
         )

@@ -203,7 +203,7 @@ def students(
         taught = teaching.teach(env, weights, agent, config.training, keys, config.devices)
         rows = teaching.as_rows(taught, lessons, member.key, use)
         found.append(rows.assign(cpu_s=(time.process_time() - started) / len(rows)))
-        returns = rows["test_return"]
+        returns = teaching.counted(rows["test_return"])
         print(
             f"{len(rows)} {member.key} students reach {returns.mean():.1f}, the worst "
             f"{returns.min():.1f}",
@@ -251,15 +251,15 @@ def _save(
             hparams="as_learned",
             world="proxy",
             num_agents=len(mine),
-            return_mean=float(mine["test_return"].mean()),
-            return_std=float(mine["test_return"].std(ddof=0)),
+            return_mean=float(teaching.counted(mine["test_return"]).mean()),
+            return_std=float(teaching.counted(mine["test_return"]).std(ddof=0)),
             train_steps=float(mine["train_steps"].mean()),
         )
         for kind, mine in tested.groupby("agent", sort=False)
     ]
     learning = zoo.Learning(
         command=f"python -m sejax.distill {words}".rstrip(),
-        generations=own.search.generations,
+        generations=own.search.generations if own.policy is None else 0,
         real_steps=costs["real_steps"],
         agents=len(rows),
         train_steps=int(rows["train_steps"].sum()),

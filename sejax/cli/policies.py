@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
+from zipfile import BadZipFile
 
 import numpy as np
 
@@ -39,12 +40,43 @@ def policy_of(text: str, task: Task) -> Given:
       ConfigError: for anything else.
     """
     if text.endswith(".zip"):
-        return Given(_of_sb3(text, task))
+        return Given(checked(_of_sb3(text, task), task))
     if text.endswith(".npz"):
         layers = _of_file(text)
-        return Given(acting(task, layers), layers)
+        return Given(checked(acting(task, layers), task), layers)
     require(":" in text, "policy", f"must be a file or a function; got {shortened(text)}. {FIX}")
-    return Given(_of_function(text))
+    return Given(checked(_of_function(text), task))
+
+
+def checked(act: Actor, task: Task) -> Actor:
+    """The policy, whose actions are looked at.
+
+    Raises:
+      ConfigError: where it is called, if it fails, or its actions are none of the task.
+    """
+    count = task.num_actions
+
+    def wrapped(obs: np.ndarray) -> np.ndarray:
+        shape = (len(obs),) if count is not None else (len(obs), task.action_dim)
+        try:
+            actions = np.asarray(act(obs), float)
+        except Exception as error:
+            raise ConfigError(
+                f"policy must act in {task.name}; it raised {told(error)}.", "policy"
+            ) from error
+        holds = actions.shape == shape and np.isfinite(actions).all()
+        if holds and count is not None:
+            holds = bool(((actions >= 0) & (actions < count) & (actions % 1 == 0)).all())
+        kind = "finite numbers" if count is None else f"whole numbers from 0 to {count - 1}"
+        require(
+            holds,
+            "policy",
+            f"must give {kind} of the shape {list(shape)}; got {list(actions.shape)}, such as "
+            f"{shortened(actions.ravel()[:3], 40)}. Set another policy.",
+        )
+        return actions.astype(np.int32) if count is not None else actions
+
+    return wrapped
 
 
 def _of_sb3(text: str, task: Task) -> Actor:
@@ -79,7 +111,12 @@ def _of_file(text: str) -> list[Layer]:
         stored = np.load(text, allow_pickle=False)
         count = sum(name.startswith("kernel_") for name in stored.files)
         layers = [(stored[f"kernel_{i}"], stored[f"bias_{i}"]) for i in range(count)]
-    except (OSError, ValueError, KeyError) as error:
+        require(
+            count > 0, "policy", f"must hold kernel_0, bias_0 and so on; got {stored.files}. {FIX}"
+        )
+    except ConfigError:
+        raise
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, BadZipFile) as error:
         raise ConfigError(
             f"policy must be a file of kernel_0, bias_0 and so on; got {shortened(text)} "
             f"({told(error)}). {FIX}",

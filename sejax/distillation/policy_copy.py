@@ -113,11 +113,11 @@ def copy_policy(config: CopyConfig, task: Task, policy: Actor, key: Array) -> Co
     first: Visit | None = None
     for _ in range(config.rounds):
         key, key_visit, key_error, key_fit = jax.random.split(key, 4)
-        if found is None:
+        if found is None or first is None:
             seen = first = visit(task, policy, key_visit, config.episodes)
             scale = seen.states.mean(0), np.maximum(seen.states.std(0), 1e-2)
         else:
-            act = erring(task, found, scale, config.policy_error, key_error, config.episodes)
+            act = erring(task, found, first.states, config.policy_error, key_error, config.episodes)
             seen = visit(task, act, key_visit, config.episodes)
         steps += len(seen.states)
         states.append(seen.states)
@@ -149,20 +149,33 @@ def acting(task: Task, layers: Sequence[Layer]) -> Actor:
 def erring(
     task: Task,
     layers: Sequence[Layer],
-    scale: tuple[np.ndarray, np.ndarray],
+    states: np.ndarray,
     size: float,
     key: Array,
     episodes: int,
 ) -> Actor:
-    """A policy with a random linear error of the observation, another one in each episode."""
+    """A policy with a random linear error of the observation, another one in each episode.
+
+    Args:
+      task: the real task.
+      layers: the policy.
+      states: that it visits; an error is linear in observations of their mean 0 and variance 1.
+      size: of the error, in units of the action's bound; of discrete actions in units of the
+        deviation of the policy's outputs in these states.
+      key: of the errors.
+      episodes: that are played side by side.
+    """
+    mean, std = states.mean(0), np.maximum(states.std(0), 1e-2)
+    unit = task.max_action
+    if task.num_actions is not None:
+        unit = float(evaluate(layers, states).std()) + 1e-9
     shape = episodes, task.action_dim, task.obs_dim + 1
     error = np.array(jax.random.normal(key, shape)) * task.obs_dim**-0.5
     error[..., -1] *= 0.5 * task.obs_dim**0.5
 
     def act(obs: np.ndarray) -> np.ndarray:
         outputs = evaluate(layers, obs)
-        unit = task.max_action if task.num_actions is None else outputs.std() + 1e-9
-        whitened = np.concatenate([(obs - scale[0]) / scale[1], np.ones((len(obs), 1))], axis=1)
+        whitened = np.concatenate([(obs - mean) / std, np.ones((len(obs), 1))], axis=1)
         outputs = outputs + size * unit * np.einsum("eij,ej->ei", error, whitened)
         if task.num_actions is not None:
             return np.argmax(outputs, axis=-1)

@@ -19,6 +19,7 @@ from sejax.envs.base import Task
 from sejax.evaluation import make_evaluator, num_parallel_on_cpu
 from sejax.objectives import Outcome
 from sejax.ops.parallel import compiler_options, spread_over_devices
+from sejax.options import FailedError
 from sejax.proxies.base import ProxyEnv
 from sejax.proxies.exact import Layer, make_exact
 from sejax.training import TrainingConfig
@@ -110,11 +111,22 @@ def as_rows(taught: Outcome, lessons: Sequence[Lesson], kind: str, use: str) -> 
     )
 
 
+def counted(returns: pd.Series) -> pd.Series:
+    """Returns in which a student that diverged is as bad as the worst of all.
+
+    Raises:
+      FailedError: if all diverged.
+    """
+    if returns.isna().all():
+        raise FailedError("No student learned: all met numbers that are not finite.")
+    return returns.fillna(returns.min())
+
+
 def grades(rows: pd.DataFrame) -> pd.Series:
     """How well each SE teaches, by generation: the mean over kinds of (mean + worst student) / 2.
 
     A student that diverged is as bad as the worst of all.
     """
-    returns = rows["test_return"].fillna(rows["test_return"].min())
+    returns = counted(rows["test_return"])
     by_kind = returns.groupby([rows["generation"], rows["agent"]]).agg(["mean", "min"])
     return by_kind.mean(axis=1).groupby("generation").mean()
