@@ -5,6 +5,8 @@ from collections.abc import Sequence
 
 from sejax.cli import commands, runtime
 from sejax.cli.distill_config import DistillConfig, folder_of, read
+from sejax.distillation.policy_copy import CopyConfig
+from sejax.distillation.policy_search import SearchConfig
 from sejax.ops.files import require_writable
 from sejax.options import ConfigError, as_text, help_texts, require
 from sejax.options.plain import fields_of, flatten, to_plain
@@ -58,9 +60,11 @@ def main(overrides: Sequence[str]) -> None:
 
 def help_text(overrides: Sequence[str]) -> str:
     """What `--help` prints."""
-    texts = help_texts(DistillConfig)
+    texts = dict(help_texts(DistillConfig))
+    for part in (CopyConfig, SearchConfig):
+        texts |= {f"{part.group}.{name}": x for name, x in help_texts(part).items()}
     lines = [
-        f"  {name}={as_text(default)}  # {texts.get(name, '')}"
+        f"  {name}={as_text(default)}" + (f"  # {texts[name]}" if name in texts else "")
         for name, default in flatten(to_plain(fields_of(DistillConfig))).items()
     ]
     return "\n".join([ABOUT, "Its own fields, with their defaults:", *lines])

@@ -159,4 +159,7 @@ def test_the_bonus_for_health_is_left_out_of_searches():
 def test_help_names_every_field():
     text = help_text([])
     for name in ("search.policy_error=0.1", "copy.hidden_size=32", "num_tested=10", "policy=null"):
-        assert f"  {name}  # " in text
+        assert f"  {name}" in text
+    own = text.partition("their defaults:")[2].strip().splitlines()
+    texts = [line.partition("#")[2].strip() for line in own]
+    assert len(own) > 20 and sum(map(bool, texts)) > 15  # names that explain themselves have none
