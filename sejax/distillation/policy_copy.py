@@ -137,13 +137,14 @@ def copy_policy(config: CopyConfig, task: Task, policy: Actor, key: Array) -> Co
 def acting(task: Task, layers: Sequence[Layer]) -> Actor:
     """What a policy of affine maps and ReLUs does."""
 
-    def act(obs: np.ndarray) -> np.ndarray:
-        outputs = evaluate(layers, obs)
-        if task.num_actions is not None:
-            return np.argmax(outputs, axis=-1)
-        return np.clip(outputs, -task.max_action, task.max_action)
+    return lambda obs: actions_of(task, evaluate(layers, obs))
 
-    return act
+
+def actions_of(task: Task, outputs: np.ndarray) -> np.ndarray:
+    """Actions of a policy's outputs `[state, action_dim]`: the best, or the outputs clipped."""
+    if task.num_actions is not None:
+        return np.argmax(outputs, axis=-1)
+    return np.clip(outputs, -task.max_action, task.max_action)
 
 
 def erring(
@@ -176,10 +177,8 @@ def erring(
     def act(obs: np.ndarray) -> np.ndarray:
         outputs = evaluate(layers, obs)
         whitened = np.concatenate([(obs - mean) / std, np.ones((len(obs), 1))], axis=1)
-        outputs = outputs + size * unit * np.einsum("eij,ej->ei", error, whitened)
-        if task.num_actions is not None:
-            return np.argmax(outputs, axis=-1)
-        return np.clip(outputs, -task.max_action, task.max_action)
+        wrong = size * unit * np.einsum("eij,ej->ei", error, whitened)
+        return actions_of(task, outputs + wrong)
 
     return act
 

@@ -110,14 +110,12 @@ class Search:
     """The functions of a search; each is pure.
 
     Attributes:
-      agent: whose states are policies; it does not learn.
       init: `() -> Policy`, one that does nothing.
       generation: `(key, policy, number) -> (Policy, Generation)`.
       test: `(key, policy) -> Tests`, episodes without the emulated error.
       record: `(key, policy) -> Steps`, every step of the same episodes.
     """
 
-    agent: Agent
     init: Callable[[], Policy]
     generation: Callable[[Array, Policy, Array | int], tuple[Policy, Generation]]
     test: Callable[[Array, Policy], Any]
@@ -223,7 +221,6 @@ def make_search(config: SearchConfig, task: Task, devices: int | None = None) ->
         return policy, Generation(returns, num_steps.sum() + seen.valid.sum())
 
     return Search(
-        agent=agent,
         init=init,
         generation=generation,
         test=make_tester(agent, task, config.num_tests),
