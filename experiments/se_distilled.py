@@ -9,6 +9,7 @@ included.
 """
 
 import dataclasses
+import shlex
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,16 +23,16 @@ from experiments.common.agents import CONTINUOUS, DISCRETE
 from experiments.common.experiment import Experiment, Settings, count, setting
 from experiments.common.shards import stack, unstack
 from sejax import envs
+from sejax.cli import config as configuration
 from sejax.cli import distilling
-from sejax.cli.config import LearnConfig
-from sejax.cli.distill_config import DistillConfig, read
+from sejax.cli.distill_config import read
 from sejax.options import each_of
 from sejax.options.plain import to_plain
 
 QUICK = (
     *("search.generations=4", "search.test_every=1", "search.num_directions=4"),
     *("search.num_top=2", "num_snapshots=2", "num_students=2", "training.max_steps=200"),
-    "training.max_episodes=200",
+    *("training.max_episodes=200", "search.num_starts=2", "search.start_generations=2"),
 )
 
 
@@ -52,14 +53,12 @@ class SeDistilled(Settings):
         discrete = envs.make(self.env).num_actions is not None
         return self.students or (DISCRETE if discrete else CONTINUOUS)
 
-    def configs(self, seed: int) -> tuple[DistillConfig, LearnConfig]:
-        """What the command reads for a seed."""
-        words = [
+    def words(self, seed: int) -> list[str]:
+        """The command's overrides for a seed."""
+        return [
             *(f"env={self.env}", f"agents=[{','.join(self.kinds)}]", f"seed={seed}"),
-            *(f"num_tested={self.num_tested}", *(QUICK if self.quick else ())),
+            *(f"num_tested={self.num_tested}", *(QUICK if self.quick else ()), *self.run),
         ]
-        own, config = read([*words, *self.run])
-        return own, dataclasses.replace(config, devices=self.devices)
 
 
 def compute(settings: SeDistilled) -> pd.DataFrame:
@@ -74,20 +73,19 @@ def compute(settings: SeDistilled) -> pd.DataFrame:
 
 def one_run(settings: SeDistilled, seed: int) -> pd.DataFrame:
     """Rows of the command with one seed, a cached shard."""
-    own, config = settings.configs(seed)
+    own, config = read(settings.words(seed))
+    config = dataclasses.replace(config, devices=settings.devices)
     folder = settings.work_folder / f"seed{seed}"
 
     def run() -> pd.DataFrame:
         folder.mkdir(parents=True, exist_ok=True)
         started = time.process_time()
-        distilling.distill(own, config, folder)
+        distilling.distill(own, config, folder, shlex.join(settings.words(seed)))
         print(f"seed {seed}: {time.process_time() - started:.0f} CPU s", flush=True)
         names = ("search", "students")
         return stack({name: pd.read_csv(folder / f"{name}.csv") for name in names})
 
-    made_with = {"own": to_plain(own), "config": {"env": settings.env, "seed": seed}}
-    made_with["students"] = list(settings.kinds)
-    made_with["training"] = to_plain(config.training)
+    made_with = {"own": to_plain(own), "config": configuration.plain(config) | {"devices": None}}
     return settings.shards.compute(f"seed{seed}", made_with, run)
 
 

@@ -38,7 +38,7 @@ from sejax.proxies.exact import evaluate
 QUICK = (
     *("search.generations=4", "search.test_every=1", "search.num_directions=4"),
     *("search.num_top=2", "num_snapshots=2", "training.max_steps=200"),
-    "training.max_episodes=200",
+    *("training.max_episodes=200", "search.num_starts=2", "search.start_generations=2"),
 )
 
 

@@ -17,6 +17,7 @@ from sejax.proxies import header, zoo
 QUICK = (
     *("env=cartpole", "devices=1", "search.num_directions=4", "search.num_top=2"),
     *("search.generations=4", "search.test_every=1", "search.num_tests=2", "num_snapshots=2"),
+    *("search.num_starts=2", "search.start_generations=2"),
     *("num_students=2", "num_tested=2", "training.max_steps=60", "training.max_episodes=60"),
     *("training.test_episodes=2", "agent=ddqn"),
 )
@@ -32,7 +33,9 @@ def folder(tmp_path_factory):
 def test_it_writes_an_se_that_says_what_it_is(folder):
     shown = zoo.describe(header.read(folder))
     curve, rows = pd.read_csv(folder / "search.csv"), pd.read_csv(folder / "students.csv")
-    assert curve["generation"].tolist() == [1, 2, 3, 4]
+    assert curve["generation"].tolist() == [1, 2, 1, 2, 3, 4]
+    best = int(curve["start"][curve["test_mean"].iloc[:4].idxmax()])
+    assert curve["start"].tolist() == [0, 0, 1, 1, best, best]
     assert rows.groupby(["use", "agent"]).size().to_dict() == {
         ("choose", "ddqn"): 4,
         ("test", "ddqn"): 2,
@@ -45,9 +48,7 @@ def test_it_writes_an_se_that_says_what_it_is(folder):
     least = curve["real_steps"].sum() + rows["real_steps"].sum()
     assert least < shown.learning.real_steps <= least + 2 * 2 * 200
     assert shown.learning.train_steps == 6 * 60
-    assert shown.policy_return == pytest.approx(
-        curve.set_index("generation")["test_mean"][shown.generation]
-    )
+    assert rows["policy_return"][rows["use"] == "test"].unique() == [shown.policy_return]
 
 
 def test_the_se_that_teaches_best_is_kept(folder):
@@ -58,12 +59,13 @@ def test_the_se_that_teaches_best_is_kept(folder):
     assert set(rows[rows["use"] == "test"]["generation"]) == {marks.idxmax()}
 
 
-def test_a_killed_search_goes_on_to_the_same_se(folder, tmp_path):
+@pytest.mark.parametrize("kept", [1, 2, 3, 5])  # tests, of both starts and of the one that went on
+def test_a_killed_search_goes_on_to_the_same_se(folder, tmp_path, kept):
     tensors, manifest = checksummed.read(folder / distilling.CHECKPOINT, distilling.KIND)
-    half = {name: x[:2] for name, x in tensors.items()}
-    manifest["rows"] = manifest["rows"][:2]
-    kept = checksummed.pack(half, distilling.KIND, manifest)
-    (tmp_path / distilling.CHECKPOINT).write_bytes(kept)
+    half = {name: x[:kept] for name, x in tensors.items()}
+    manifest["rows"] = manifest["rows"][:kept]
+    packed = checksummed.pack(half, distilling.KIND, manifest)
+    (tmp_path / distilling.CHECKPOINT).write_bytes(packed)
     main([*QUICK, f"run_dir={tmp_path}"])
     names = ["use", "generation", "agent", "student", "test_return"]
     one, two = (pd.read_csv(x / "students.csv")[names] for x in (folder, tmp_path))
@@ -71,10 +73,14 @@ def test_a_killed_search_goes_on_to_the_same_se(folder, tmp_path):
     assert sejax.load_proxy(folder).fingerprint == sejax.load_proxy(tmp_path).fingerprint
 
 
-def test_another_search_does_not_go_on(folder, tmp_path):
+def test_a_folder_of_another_command_is_left_alone(folder, tmp_path):
     path = shutil.copytree(folder, tmp_path / "copy")
     with pytest.raises(ConfigError, match=r"search.step_size \(0.02 there, 0.5 here\)"):
         main([*QUICK, f"run_dir={path}", "search.step_size=0.5"])
+    with pytest.raises(ConfigError, match=r"policy \(None there"):
+        main([*QUICK, f"run_dir={path}", f"policy={__name__}:act"])
+    with pytest.raises(ConfigError, match=r"with agent"):
+        main([*QUICK, f"run_dir={path}", "agent=dqn"])
     with (path / distilling.CHECKPOINT).open("r+b") as file:
         file.truncate(200)
     with pytest.raises(ConfigError, match="damaged"):
@@ -115,12 +121,12 @@ def test_files_of_other_things_are_refused(tmp_path):
 def test_policies_come_from_files_and_functions(tmp_path, capsys):
     layers = {"kernel_0": np.array([[0, 0, 0, 0], [0, 0.3, 1, 0.6]]), "bias_0": np.zeros(2)}
     np.savez(tmp_path / "linear.npz", **layers)
-    words = [*QUICK, "copy.episodes=2", f"run_dir={tmp_path}/run"]
-    main([*words, f"policy={tmp_path}/linear.npz"])
+    words = [*QUICK, "copy.episodes=2"]
+    main([*words, f"policy={tmp_path}/linear.npz", f"run_dir={tmp_path}/run"])
     assert "policy 200.0\n" in capsys.readouterr().out
     assert sejax.load_proxy(tmp_path / "run").record["policy_return"] == 200.0
     quick = ("copy.rounds=1", "copy.steps=20", "copy.hidden_size=4")
-    main([*words, *quick, f"policy={__name__}:act"])
+    main([*words, *quick, f"policy={__name__}:act", f"run_dir={tmp_path}/other"])
     assert "its copy" in capsys.readouterr().out
 
 

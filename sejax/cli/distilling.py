@@ -5,11 +5,13 @@ import json
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 import pandas as pd
+import yaml
+from jaxtyping import Array
 
 from sejax.agents import make_agent
 from sejax.cli import config as configuration
@@ -18,15 +20,16 @@ from sejax.cli.config import LearnConfig, members_of
 from sejax.cli.distill_config import DistillConfig
 from sejax.distillation import teaching
 from sejax.distillation.policy_copy import copy_policy, visit
-from sejax.distillation.policy_search import Policy, make_search
+from sejax.distillation.policy_search import Policy, SearchConfig, make_search
 from sejax.distillation.teaching import Lesson
 from sejax.ops import checksummed
 from sejax.ops.files import write_bytes, write_text
-from sejax.options import ConfigError
+from sejax.options import ConfigError, require
 from sejax.options.plain import differences, to_plain
 from sejax.proxies import header, zoo
 from sejax.proxies.io import save
 
+ASKED = "distill.yaml"
 CHECKPOINT, KIND = "search.safetensors", "sejax_search"
 CHOOSE, TEST = "choose", "test"  # what students are for
 Costs = dict[str, Any]  # real_steps and cpu_s
@@ -51,10 +54,12 @@ def distill(own: DistillConfig, config: LearnConfig, folder: Path, words: str = 
     find = search if own.policy is None else copied
     lessons, costs = find(own, config, folder)
     env, weights = teaching.make_ses(config.task(), lessons, own.slope, own.widen)
-    chosen_by = students(own, config, lessons, CHOOSE)
-    grades = teaching.grades(chosen_by)
-    _print_grades(chosen_by, grades)
-    best = [each.generation for each in lessons].index(int(grades.idxmax()))
+    best, chosen_by = 0, pd.DataFrame()
+    if len(lessons) > 1:
+        chosen_by = students(own, config, lessons, CHOOSE)
+        grades = teaching.grades(chosen_by)
+        _print_grades(chosen_by, grades)
+        best = [each.generation for each in lessons].index(int(grades.idxmax()))
     rows = pd.concat([chosen_by, students(own, config, [lessons[best]], TEST)])
     write_text(folder / "students.csv", rows.to_csv(index=False))
     costs["cpu_s"] += rows["cpu_s"].sum()
@@ -62,6 +67,12 @@ def distill(own: DistillConfig, config: LearnConfig, folder: Path, words: str = 
     path = folder / "proxy.safetensors"
     _save(path, env, weights[best], own, config, lessons[best], rows, costs, words)
     return path
+
+
+def keys_of(config: LearnConfig) -> dict[str, Array]:
+    """A key for each use of random numbers."""
+    uses = ("search", "test", "record", CHOOSE, TEST)
+    return dict(zip(uses, jax.random.split(jax.random.key(config.seed), len(uses)), strict=True))
 
 
 # --- the search -----------------------------------------------------------------------------------
@@ -72,24 +83,27 @@ def search(own: DistillConfig, config: LearnConfig, folder: Path) -> tuple[list[
 
     Each block of generations up to a test is kept before the next begins.
     """
+    _require_same(own, config, folder)
     task, options = config.task(), own.search
     made = make_search(options, task, config.devices)
-    asked = {"search": to_plain(options), "env": configuration.plain(config)["env"]}
-    asked |= {"seed": config.seed}
-    tested, rows = _restored(folder, asked, made.init())
-    key_search, key_test = jax.random.split(jax.random.key(config.seed))
-    policy = tested[-1] if tested else made.init()
+    tested, rows = _restored(folder, made.init())
+    keys = keys_of(config)
     run = jax.jit(made.generation)
     test, record = jax.jit(made.test), jax.jit(made.record)
-    for first in range(len(rows) * options.test_every, options.generations, options.test_every):
+    while (block := _next_block(options, rows)) is not None:
         started, num_steps, returns = time.process_time(), 0, []
-        last = min(first + options.test_every, options.generations)
-        for number in range(first, last):
+        last = min(block.first + options.test_every, options.generations)
+        policy = made.init() if block.goes_on_from is None else tested[block.goes_on_from]
+        key_search, key_test = (
+            jax.random.fold_in(keys[use], block.start) for use in ("search", "test")
+        )
+        for number in range(block.first, last):
             policy, tried = run(jax.random.fold_in(key_search, number), policy, number)
             num_steps += int(tried.num_steps)
             returns.append(float(tried.returns.mean()))
         tests = test(jax.random.fold_in(key_test, last), policy)
         row = {
+            "start": block.start,
             "generation": last,
             "population_mean": float(np.mean(returns)),
             "test_mean": float(tests.returns.mean()),
@@ -98,10 +112,11 @@ def search(own: DistillConfig, config: LearnConfig, folder: Path) -> tuple[list[
             "cpu_s": time.process_time() - started,
         }
         tested, rows = [*tested, policy], [*rows, row]
-        _keep(folder, asked, tested, rows)
+        _keep(folder, tested, rows)
         steps = sum(each["real_steps"] for each in rows)
         print(
-            f"generation {last}/{options.generations}: policy {row['test_mean']:.1f} ± "
+            f"start {block.start + 1}/{options.num_starts}, generation "
+            f"{last}/{options.generations}: policy {row['test_mean']:.1f} ± "
             f"{row['test_std']:.1f}, {steps:,} real steps",
             flush=True,
         )
@@ -109,16 +124,55 @@ def search(own: DistillConfig, config: LearnConfig, folder: Path) -> tuple[list[
     write_text(folder / "search.csv", curve.to_csv(index=False))
     lessons = []
     started, recorded = time.process_time(), 0
-    for part in np.array_split(np.arange(len(curve)), own.num_snapshots):
-        best = part[int(curve["test_mean"].iloc[part].argmax())]
-        row, policy = curve.iloc[best], tested[best]
-        seen = record(jax.random.fold_in(key_test, int(row["generation"])), policy)
-        states = np.asarray(seen.obs)[np.asarray(seen.valid)]
+    went_on = curve[curve["start"] == _best_start(rows)]
+    for part in np.array_split(np.arange(len(went_on)), own.num_snapshots):
+        number = int(went_on.iloc[part]["test_mean"].idxmax())
+        policy, generation = tested[number], int(curve["generation"][number])
+        # Episodes of their own: the tests had a part in choosing.
+        seen = record(jax.random.fold_in(keys["record"], generation), policy)
+        valid = np.asarray(seen.valid)
+        states, total = np.asarray(seen.obs)[valid], float(np.asarray(seen.reward)[valid].sum())
         recorded += len(states)
         layers = policy.layers(task.max_action)
-        lessons.append(Lesson(int(row["generation"]), layers, states, float(row["test_mean"])))
+        lessons.append(Lesson(generation, layers, states, total / options.num_tests))
     cpu_s = curve["cpu_s"].sum() + time.process_time() - started
     return lessons, {"cpu_s": cpu_s, "real_steps": int(curve["real_steps"].sum()) + recorded}
+
+
+class Block(NamedTuple):
+    """Generations up to a test.
+
+    Attributes:
+      start: the search that they are of.
+      first: its first generation.
+      goes_on_from: the number of the tested policy that it goes on from; None for a new one.
+    """
+
+    start: int
+    first: int
+    goes_on_from: int | None
+
+
+def _next_block(options: SearchConfig, rows: list[dict[str, Any]]) -> Block | None:
+    """What follows the blocks of `rows`: all starts one after another, then the best of them."""
+    tried = min(options.start_generations, options.generations)
+    num_blocks = -(-tried // options.test_every)
+    if len(rows) < options.num_starts * num_blocks:
+        start, number = divmod(len(rows), num_blocks)
+    else:
+        start = _best_start(rows)
+        number = len(rows) - (options.num_starts - 1) * num_blocks
+    first = number * options.test_every
+    if first >= options.generations:
+        return None
+    own = [i for i, row in enumerate(rows) if row["start"] == start]
+    return Block(start, first, own[-1] if own else None)
+
+
+def _best_start(rows: list[dict[str, Any]]) -> int:
+    """The start with the policy that was tested best."""
+    best = max(rows, key=lambda row: np.nan_to_num(row["test_mean"], nan=-np.inf))
+    return int(best["start"])
 
 
 def copied(own: DistillConfig, config: LearnConfig, folder: Path) -> tuple[list[Lesson], Costs]:
@@ -126,7 +180,8 @@ def copied(own: DistillConfig, config: LearnConfig, folder: Path) -> tuple[list[
     task = config.task()
     assert own.policy is not None
     given = policies.policy_of(own.policy, task)
-    started, key = time.process_time(), jax.random.key(config.seed)
+    _require_same(own, config, folder)
+    started, key = time.process_time(), keys_of(config)["record"]
     if given.layers is None:
         made = copy_policy(own.copy, task, given.act, key)
         lesson = Lesson(0, made.layers, made.states, made.policy_return)
@@ -140,25 +195,38 @@ def copied(own: DistillConfig, config: LearnConfig, folder: Path) -> tuple[list[
     return [lesson], {"cpu_s": time.process_time() - started, "real_steps": real_steps}
 
 
-def _keep(
-    folder: Path, asked: dict[str, Any], tested: list[Policy], rows: list[dict[str, Any]]
-) -> None:
+def _require_same(own: DistillConfig, config: LearnConfig, folder: Path) -> None:
+    """Writes what was asked for, or checks that it is what the folder was made with."""
+    others = {"run_dir", "devices"}  # they change no number
+    asked = to_plain(own) | {
+        name: value for name, value in configuration.plain(config).items() if name not in others
+    }
+    path = folder / ASKED
+    if not path.exists():
+        write_text(path, yaml.safe_dump(asked, sort_keys=False))
+        return
+    differing = differences(yaml.safe_load(path.read_text()), json.loads(json.dumps(asked)))
+    require(
+        not differing,
+        "run_dir",
+        f"must hold what the same command made; got {folder}, with {differing}. Set "
+        "run_dir=FOLDER, another one.",
+    )
+
+
+def _keep(folder: Path, tested: list[Policy], rows: list[dict[str, Any]]) -> None:
     tensors = {
         name: np.stack([np.asarray(getattr(policy, name)) for policy in tested])
         for name in tested[0]._fields
     }
-    write_bytes(
-        folder / CHECKPOINT, checksummed.pack(tensors, KIND, {"asked": asked, "rows": rows})
-    )
+    write_bytes(folder / CHECKPOINT, checksummed.pack(tensors, KIND, {"rows": rows}))
 
 
-def _restored(
-    folder: Path, asked: dict[str, Any], policy: Policy
-) -> tuple[list[Policy], list[dict[str, Any]]]:
+def _restored(folder: Path, policy: Policy) -> tuple[list[Policy], list[dict[str, Any]]]:
     """The policies that were tested, and the rows of `search.csv`; none in a new folder.
 
     Raises:
-      ConfigError: for a damaged file, or one of another search.
+      ConfigError: for a damaged file.
     """
     path = folder / CHECKPOINT
     if not path.exists():
@@ -171,13 +239,6 @@ def _restored(
             f"({error}). Set run_dir=FOLDER, another one.",
             "run_dir",
         ) from error
-    differing = differences(manifest["asked"], json.loads(json.dumps(asked)))
-    if differing:
-        raise ConfigError(
-            f"run_dir must hold the same search; got {folder}, with {differing}. Set "
-            "run_dir=FOLDER, another one.",
-            "run_dir",
-        )
     rows = manifest["rows"]
     tested = [type(policy)(**{name: x[i] for name, x in tensors.items()}) for i in range(len(rows))]
     return tested, rows
@@ -195,8 +256,9 @@ def students(
     """
     task, found = config.task(), []
     env, weights = teaching.make_ses(task, lessons, own.slope, own.widen)
-    key = jax.random.fold_in(jax.random.key(config.seed), 1 if use == CHOOSE else 2)
-    keys = jax.random.split(key, own.num_students if use == CHOOSE else own.num_tested)
+    keys = jax.random.split(
+        keys_of(config)[use], own.num_students if use == CHOOSE else own.num_tested
+    )
     for member in members_of(config):
         agent = make_agent(member.agent, task, config.exploration)
         started = time.process_time()

@@ -19,6 +19,7 @@ import numpy as np
 import optax
 from jaxtyping import Array, Float
 
+from sejax.distillation.policy_search import random_map
 from sejax.envs.base import Task
 from sejax.options import Options, counts, not_negative, option, positive
 from sejax.proxies.exact import Layer, evaluate
@@ -171,8 +172,7 @@ def erring(
     if task.num_actions is not None:
         unit = float(evaluate(layers, states).std()) + 1e-9
     shape = episodes, task.action_dim, task.obs_dim + 1
-    error = np.array(jax.random.normal(key, shape)) * task.obs_dim**-0.5
-    error[..., -1] *= 0.5 * task.obs_dim**0.5
+    error = np.asarray(random_map(key, shape))
 
     def act(obs: np.ndarray) -> np.ndarray:
         outputs = evaluate(layers, obs)

@@ -37,6 +37,10 @@ class SearchConfig(Options):
     group: ClassVar[str] = "search"
 
     generations: int = option(100, counts("something must be searched"))
+    # Searches that begin, each for so many generations (up to a test); the one whose policy was
+    # tested best goes on. A search may stop at a poor gait, which shows early.
+    num_starts: int = option(3, counts("a search begins"))
+    start_generations: int = option(40, counts("a start must be tried"))
     num_directions: int = option(32, counts("something must be tried"))  # N, two episodes each
     num_top: int = option(16, counts("something must be learned from"))  # b: directions that count
     noise_std: float = option(0.03, positive("directions must differ"))  # nu
@@ -180,20 +184,19 @@ def make_search(config: SearchConfig, task: Task, devices: int | None = None) ->
         zeros = jnp.zeros(task.obs_dim)
         return Policy(jnp.zeros(shape), jnp.float32(0), zeros, zeros)
 
-    def episode(key: Array, policy: Policy, limit: Array) -> tuple[Array, Array]:
+    def episode(key: Array, policy: Policy, size: Array, limit: Array) -> tuple[Array, Array]:
         """The return of an episode with an error of its own, and its steps."""
         key_error, key_play = jax.random.split(key)
-        policy = policy._replace(weights=policy.weights + error(key_error, policy.weights))
+        error = size * random_map(key_error, shape)
+        policy = policy._replace(weights=policy.weights + error)
         tests = play(key_play, policy, task.params.replace(max_steps_in_episode=limit))
         return tests.returns[0], tests.num_steps[0]
 
-    def error(key: Array, weights: Array) -> Array:
-        """A random linear map; its outputs have about the asked root mean square."""
-        scale = jnp.full(shape, task.obs_dim**-0.5).at[:, -1].set(0.5)
-        size: Array | float = config.policy_error
+    def error_size(policy: Policy) -> Array:
+        size = jnp.float32(config.policy_error)
         if task.num_actions is not None:  # only the outputs' relative size counts
-            size = size * jnp.sqrt(jnp.mean(weights**2) * task.obs_dim)
-        return size * scale * jax.random.normal(key, shape)
+            size = size * jnp.sqrt(jnp.mean(policy.weights**2) * task.obs_dim)
+        return jnp.broadcast_to(size, 2 * config.num_directions)
 
     width = 1 if task.num_actions is None else None
     spread = spread_over_devices(episode, devices, cpu_num_parallel=width)
@@ -210,7 +213,9 @@ def make_search(config: SearchConfig, task: Task, devices: int | None = None) ->
             is_short = number < config.short_generations
             limit = jnp.where(is_short, min(config.short_steps, task.max_steps), limit)
         limits = jnp.broadcast_to(limit, len(weights))
-        returns, num_steps = spread(keys, tried._replace(weights=weights), limits)
+        returns, num_steps = spread(
+            keys, tried._replace(weights=weights), error_size(policy), limits
+        )
         plus, minus = jnp.split(_finite(returns - bonus * num_steps), 2)
         _, top = jax.lax.top_k(jnp.maximum(plus, minus), config.num_top)
         deviation = jnp.concatenate([plus[top], minus[top]]).std() + 1e-6
@@ -226,6 +231,16 @@ def make_search(config: SearchConfig, task: Task, devices: int | None = None) ->
         test=make_tester(agent, task, config.num_tests),
         record=make_recorder(agent, task, config.num_tests),
     )
+
+
+def random_map(key: Array, shape: tuple[int, ...]) -> Float[Array, "... inputs"]:
+    """A random linear map of whitened observations, the last column a bias.
+
+    Its outputs have a root mean square of 1 over maps and observations, a fifth of their variance
+    by the bias.
+    """
+    scale = jnp.full(shape[-1], (0.8 / (shape[-1] - 1)) ** 0.5).at[-1].set(0.2**0.5)
+    return scale * jax.random.normal(key, shape)
 
 
 def step_size(config: SearchConfig, number: Array | int) -> Array:
