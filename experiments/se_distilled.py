@@ -135,14 +135,14 @@ def report(settings: SeDistilled, rows: pd.DataFrame) -> pd.DataFrame:
             name = figures.AGENT_NAMES[str(row.kind)]
             cells[name] = f"{row.mean:,.1f} ± {row.std:,.1f}, worst {row.worst:,.1f}"
         shown.append(cells)
-    own, config = settings.configs(settings.seed)
+    own, config = read(settings.words(settings.seed))
+    search = own.search
     note = (
-        f"Each row is a run of `python -m sejax.distill`: {own.search.generations} generations of "
-        f"augmented random search of a linear policy; students train on SEs of "
+        f"Each row is a run of `python -m sejax.distill`: augmented random search of a linear "
+        f"policy; {search.num_starts} searches begin with {search.start_generations} generations "
+        f"each, the best goes on to generation {search.generations}; students train on SEs of "
         f"{own.num_snapshots} policies, and one SE is kept. Real steps and CPU seconds are those "
-        f"of the whole run: search, all students, their tests, but for "
-        f"{own.num_snapshots * own.search.num_tests} episodes that give the initial states. A "
-        "kind's column: mean, standard "
+        "of the whole run: all searches, students and tests. A kind's column: mean, standard "
         f"deviation and worst of {settings.num_tested} students that took no part in choosing, "
         f"each after {config.training.max_steps:,} steps on the SE, by the mean of "
         f"{config.training.test_episodes} episodes on the real task."

@@ -120,23 +120,23 @@ def search(own: DistillConfig, config: LearnConfig, folder: Path) -> tuple[list[
             f"{row['test_std']:.1f}, {steps:,} real steps",
             flush=True,
         )
-    curve = pd.DataFrame(rows)
-    write_text(folder / "search.csv", curve.to_csv(index=False))
-    lessons = []
-    started, recorded = time.process_time(), 0
+    curve, lessons = pd.DataFrame(rows), []
     went_on = curve[curve["start"] == _best_start(rows)]
     for part in np.array_split(np.arange(len(went_on)), own.num_snapshots):
+        started = time.process_time()
         number = int(went_on.iloc[part]["test_mean"].idxmax())
         policy, generation = tested[number], int(curve["generation"][number])
         # Episodes of their own: the tests had a part in choosing.
         seen = record(jax.random.fold_in(keys["record"], generation), policy)
         valid = np.asarray(seen.valid)
         states, total = np.asarray(seen.obs)[valid], float(np.asarray(seen.reward)[valid].sum())
-        recorded += len(states)
         layers = policy.layers(task.max_action)
+        curve.loc[number, "real_steps"] += len(states)
+        curve.loc[number, "cpu_s"] += time.process_time() - started
         lessons.append(Lesson(generation, layers, states, total / options.num_tests))
-    cpu_s = curve["cpu_s"].sum() + time.process_time() - started
-    return lessons, {"cpu_s": cpu_s, "real_steps": int(curve["real_steps"].sum()) + recorded}
+    write_text(folder / "search.csv", curve.to_csv(index=False))
+    costs = {"cpu_s": float(curve["cpu_s"].sum()), "real_steps": int(curve["real_steps"].sum())}
+    return lessons, costs
 
 
 class Block(NamedTuple):
