@@ -156,7 +156,7 @@ def _formed(
     most = config.training.max_steps
     assert most is not None
     for label, form in FORMS.items():
-        env, weights = teaching.make_ses(task, [lesson], form.slope, form.widen)
+        env, weights = teaching.make_ses(task, [lesson], slope=form.slope, widen=form.widen)
         steps = int(most * form.share)
         training = dataclasses.replace(config.training, max_steps=steps, max_episodes=steps)
         made_with = {"search": to_plain(own), "form": form._asdict(), "kinds": settings.kinds}

@@ -25,11 +25,20 @@ from sejax.es.base import Strategy, StrategyState
 from sejax.es.nes import NESConfig
 from sejax.evaluation import (
     Candidates,
+    best_policy,
     evaluators_of,
     make_population_evaluator,
     tested_throughout,
 )
-from sejax.objectives import Evaluator, GenerationInfo, MaxReward, Objective, Outcome, Scoring
+from sejax.objectives import (
+    CLOSED_FORM,
+    Evaluator,
+    GenerationInfo,
+    MaxReward,
+    Objective,
+    Outcome,
+    Scoring,
+)
 from sejax.ops import flat
 from sejax.ops.parallel import copy_to_devices
 from sejax.options import counts, registry, require, shortened
@@ -289,6 +298,9 @@ def make_bilevel(
     mixture = Mixture.of(agent)
     training = training or TrainingConfig()
     training = tested_throughout(training) if objective.needs_tests else training
+    if objective.closed_form:
+        policy = best_policy(proxy, objective.temperature)
+        mixture = mixture.joined_by(CLOSED_FORM, policy, objective.closed_form)
     evaluators = evaluators_of(objective, mixture, proxy, training)
     if objective.evaluators is not None:  # which leaves no share of the candidates to an agent
         mixture = Mixture.of(mixture.agents[0])

@@ -17,11 +17,14 @@ from jaxtyping import Array, Bool, Float, Int
 from sejax.agents.mixture import Mixture
 from sejax.envs.base import Task
 from sejax.es.base import Evaluations, Strategy, finite_mean
-from sejax.options import Options, counts, not_negative, option, require
+from sejax.options import Options, counts, fraction, not_negative, option, require
 from sejax.proxies.base import ProxyEnv
 
 if TYPE_CHECKING:  # which lies above
     from sejax.training import TrainingConfig
+
+
+CLOSED_FORM = "closed_form"  # the name of an SE's best policy among the agents that score it
 
 
 @struct.dataclass
@@ -97,6 +100,9 @@ class Objective:
       evaluators: `(mixture, proxy, training)` to two evaluators, of the population and of the
         incumbent, each of a candidate with all agents; None where one agent of the mixture trains
         on a candidate and is tested on the real task.
+      closed_form: share of the candidates that are scored by the test return of their best policy,
+        which is known, in place of an agent's; with 1 no agent trains.
+      temperature: what a nat of entropy is worth to that policy, in rewards of the proxy.
       meaning: of a score, for people.
     """
 
@@ -108,6 +114,8 @@ class Objective:
     evaluators: (
         Callable[[Mixture, ProxyEnv, "TrainingConfig"], tuple[Evaluator, Evaluator]] | None
     ) = None
+    closed_form: float = 0.0
+    temperature: float = 0.0
     meaning: str = ""
 
     def __call__(self, outcome: Outcome) -> Float[Array, "*agent"]:
@@ -140,20 +148,32 @@ class MaxReward(Options):
     first_eval_steps: int | None = option(None, counts("there is nothing to score otherwise"))
     # Generation from which on the task's limit counts; before, the steps change linearly.
     curriculum_generations: int = option(50, counts("it is the length of a curriculum"))
+    # Share of the candidates that no agent trains on: an SE with proxy.horizon=1 whose best policy
+    # is known (discrete actions, or a proxy.reward_form) is scored by that policy's return.
+    closed_form: float = option(0.0, fraction())
+    # What a nat of entropy is worth to that policy, in the SE's rewards; 0: it plays the best
+    # action. Above 0 it plays at random between actions that the SE hardly tells apart.
+    temperature: float = option(0.0, not_negative())
 
     def make(self, task: Task) -> Objective:
         """The objective on a task."""
+        objective = Objective(
+            score=lambda outcome: outcome.test_return,
+            scores_are_returns=True,
+            closed_form=self.closed_form,
+            temperature=self.temperature,
+        )
         if self.first_eval_steps is None:
-            return Objective(score=lambda outcome: outcome.test_return, scores_are_returns=True)
+            return objective
         first, last = self.first_eval_steps, task.max_steps
 
         def eval_steps(generation: Array) -> Array:
             done = jnp.minimum(generation / self.curriculum_generations, 1.0)
             return jnp.round(first + done * (last - first)).astype(jnp.int32)
 
-        return Objective(
+        return dataclasses.replace(
+            objective,
             score=lambda outcome: outcome.scored_returns.mean(axis=-1),
-            scores_are_returns=True,
             eval_steps=eval_steps,
         )
 

@@ -316,8 +316,6 @@ def make_trainer(
             f"tests after each episode (training.num_tests_between is "
             f"{training.num_tests_between}) need a test_fn; got None."
         )
-    if agent.solve is not None:
-        return _make_solver(agent, env, training, recorder)
     loop = _Loop(agent, env, training, solved_reward, test_fn, recorder)
 
     def train(
@@ -379,41 +377,6 @@ def _require_parts(agent: Any, env: Any, training: Any) -> None:
         "jax_enable_x64",
         "must be off: sejax computes in 32 bits; got true. Set JAX_ENABLE_X64=0.",
     )
-
-
-def _make_solver(
-    agent: Agent, env: Any, training: TrainingConfig, recorder: BufferMaker | None
-) -> Callable[..., TrainResult]:
-    """The `train` of an agent that knows its world's optimum: no steps, and an empty curve."""
-    require(
-        training.num_tests_between == 0 and recorder is None,
-        "agent",
-        "must learn where its training is looked at; got one that is solved for. Set agent=ddqn, "
-        "or objective=max_reward training.tests_between=0.",
-    )
-    assert agent.solve is not None
-    solve = agent.solve
-
-    def train(
-        key: Array,
-        env_params: PyTree,
-        hparams: Hparams = agent.hparams,
-        active: Array | bool = True,
-    ) -> TrainResult:
-        state = solve(env, env_params, hparams)
-        return TrainResult(
-            agent_state=state,
-            train_steps=jnp.int32(0),
-            episodes=jnp.int32(0),
-            returns=jnp.full(training.max_episodes, jnp.nan),
-            test_returns=None,
-            episode_ends=jnp.zeros(training.max_episodes, jnp.int32),
-            nonfinite=~_all_finite(state),
-            eval_steps=jnp.int32(0),
-            recorded=None,
-        )
-
-    return train
 
 
 class _Loop:

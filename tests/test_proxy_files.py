@@ -181,8 +181,7 @@ def test_shipped_proxies_load(name):
         assert proxy.learned_with(group) is not None
     assert sejax.training_of(proxy).max_episodes > 0
     agents = proxy.learned_agents()
-    # Of the first agent; the Boltzmann policy, which looks no further than a step, has none.
-    assert proxy.discount == getattr(agents[next(iter(agents))], "discount", 1.0)
+    assert proxy.discount == agents[next(iter(agents))].discount  # of the first agent
     assert {"score", "generation", "seed", "evaluations"} <= proxy.record.keys()
 
 

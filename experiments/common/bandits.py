@@ -19,7 +19,7 @@ from flax import struct
 from jaxtyping import Array, Float
 
 import sejax
-from sejax.distillation.policy_search import policy_agent
+from sejax.agents.fixed import make_fixed
 from sejax.envs.base import Task
 from sejax.envs.environment import EnvState
 from sejax.evaluation import make_recorder, make_tester
@@ -129,7 +129,7 @@ class PolicyBandit(ProxyEnv):
 @functools.cache
 def _hand(task: Task) -> sejax.Agent:
     policy = BY_HAND[task.name]
-    return policy_agent(task, lambda _, obs: policy(obs))
+    return make_fixed(task, lambda key, state, obs: policy(obs))
 
 
 def copy_by_hand(task: Task, seed: int, num_states: int, widen: float) -> Copied:
@@ -295,7 +295,8 @@ def _shape(task: Task) -> tuple[int, int]:
 @functools.cache
 def _search(task: Task) -> tuple[sejax.Agent, Callable[..., Any], Callable[..., Any]]:
     """The linear policy as an agent, and compiled: random episodes, a generation of the search."""
-    agent = policy_agent(task, _linear_policy(task))
+    policy = _linear_policy(task)
+    agent = make_fixed(task, lambda key, state, obs: policy(state, obs))
     once, tester = make_tester(agent, task, 1), make_tester(agent, task, TEST_EPISODES)
     record = make_recorder(agent, task, 1)
 

@@ -96,8 +96,6 @@ class Agent:
         none.
       batch_size: `state -> []`, columns of a batch in use where hyperparameters vary; None for all.
       varied: how hyperparameters are drawn for each training; None if they are not.
-      solve: `(env, env_params, hparams) -> state`, the trained agent, where an environment's
-        optimum is known; then nothing is trained. None for agents that learn.
     """
 
     init: Callable[[Array, Hparams], AgentState]
@@ -111,7 +109,6 @@ class Agent:
     discount: Callable[[Hparams], Array | float | None] = lambda hparams: None
     batch_size: Callable[[AgentState], Array | None] = lambda state: None
     varied: "Varied | None" = None
-    solve: Callable[[Environment, PyTree, Hparams], AgentState] | None = None
 
     def fresh(self, make_run: Callable[["Agent"], Callable[..., T]]) -> Callable[..., T]:
         """Builds `run(key, *args)` for a fresh agent, whose hyperparameters may be drawn first.
@@ -180,14 +177,11 @@ class AgentConfig(Options):
     Attributes:
       states: the observations that it fits, "vector" or "discrete"; None for both.
       actions: the actions that it fits, of "discrete" and "continuous".
-      is_solved_for: whether its agents have `Agent.solve`, so that they cannot train on a real
-        task.
     """
 
     group: ClassVar[str] = "agent"
     states: ClassVar[str | None] = None
     actions: ClassVar[tuple[str, ...]] = ("discrete", "continuous")
-    is_solved_for: ClassVar[bool] = False
 
     @property
     def learns_each_step(self) -> bool:

@@ -9,6 +9,7 @@ With weights w and scores F of the agents, a step follows the gradient of the su
 each agent's part is estimated from its share abs(w) of the candidates.
 """
 
+import dataclasses
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -101,6 +102,24 @@ class Mixture:
             "object; sejax.config([...]) takes names.",
         )
         return cls(agents=(agent,))
+
+    def joined_by(self, name: str, agent: Agent, share: float) -> "Mixture":
+        """The mixture with one more at its end, which gets a share of the candidates.
+
+        Args:
+          name: of the one that joins.
+          agent: that one.
+          share: in (0, 1]; with 1 it is alone.
+        """
+        if share == 1:
+            return dataclasses.replace(self, agents=(agent,), names=(name,), weights=(1.0,))
+        weight = share / (1 - share) * float(np.abs(self.weights).sum())
+        return dataclasses.replace(
+            self,
+            agents=(*self.agents, agent),
+            names=(*self.names, name),
+            weights=(*self.weights, weight),
+        )
 
     @property
     def size(self) -> int:

@@ -16,6 +16,7 @@ from sejax.agents.base import Agent, AgentConfig, ExplorationConfig
 from sejax.agents.mixture import Mixture, MixtureConfig
 from sejax.cli.compose import DEFAULTS, compose, key_of, named
 from sejax.envs.spec import TaskSpec
+from sejax.objectives import CLOSED_FORM
 from sejax.ops.files import as_file_name
 from sejax.options import (
     ConfigError,
@@ -30,6 +31,7 @@ from sejax.options import (
     shortened,
 )
 from sejax.options.plain import from_plain, to_plain
+from sejax.proxies import require_best_action
 from sejax.training import TrainingConfig, require_reachable
 
 AGENT_HPARAMS = ("default", "varied")
@@ -202,13 +204,15 @@ class LearnConfig(CommandConfig):
         spec, task_name = envs.spec_of(self.env), self.name("env")
         self.proxy.require_task(spec, task_name)
         max_steps = self.proxy.max_steps(spec.max_steps)
-        train = not all(x.agent.is_solved_for for x in members_of(self))
-        if train and not self.proxy.has_real_dynamics:
+        closed_form = getattr(self.objective, "closed_form", 0.0)
+        if closed_form:
+            require_best_action(self.proxy, spec, task_name)
+        if closed_form < 1 and not self.proxy.has_real_dynamics:
             require_reachable("training", self.training, max_steps)
         for member in members_of(self):
             with named(member.field):
                 agents.require_fit(member.agent, self.exploration, spec, task_name)
-                if self.proxy.reaches_step_limit:
+                if self.proxy.reaches_step_limit and closed_form < 1:
                     limits = max_steps, spec.max_steps
                     require_learning("training", self.training, member.agent, *limits)
         if hasattr(self.objective, "require_agents"):
@@ -226,7 +230,9 @@ class LearnConfig(CommandConfig):
         """The agents that have scores of their own; none where an objective scores all as one."""
         if getattr(self.objective, "scores_all_agents", False):
             return ()
-        return tuple(member.key for member in members_of(self))
+        closed_form = getattr(self.objective, "closed_form", 0.0)
+        trained = members_of(self) if closed_form < 1 else ()
+        return (*(each.key for each in trained), *([CLOSED_FORM] if closed_form else ()))
 
     def plain(self) -> dict[str, Any]:
         """Nested plain values, as in `config.yaml`; what `sejax.save` keeps with a proxy."""
@@ -256,10 +262,11 @@ class LearnConfig(CommandConfig):
         """The agent, or the mixture of agents, that trains on the proxies."""
         varied, each = self.agent_hparams == "varied", members_of(self)
         made = tuple(agents.make_agent(x.agent, task, self.exploration, varied) for x in each)
-        if self.agents is None:
+        if self.agents is None and not getattr(self.objective, "closed_form", 0.0):
             return made[0]
         names, weights = tuple(x.key for x in each), tuple(x.weight for x in each)
-        return Mixture(agents=made, names=names, weights=weights, config=self.agents)
+        shared = self.agents or MixtureConfig()
+        return Mixture(agents=made, names=names, weights=weights, config=shared)
 
     @property
     def resolved_run_dir(self) -> Path:

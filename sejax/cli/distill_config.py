@@ -4,7 +4,7 @@ import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar
 
 from sejax import envs
 from sejax.cli import config as configuration
@@ -12,7 +12,7 @@ from sejax.cli.config import LearnConfig
 from sejax.distillation.policy_copy import CopyConfig
 from sejax.distillation.policy_search import SearchConfig
 from sejax.ops.files import as_file_name
-from sejax.options import Options, counts, option, positive, require
+from sejax.options import Options, counts, one_of, option, positive, require
 from sejax.options.plain import from_plain, merge
 
 # Students of a task's kind of actions where none are named, and how long they train.
@@ -45,6 +45,9 @@ class DistillConfig(Options):
     copy: CopyConfig = dataclasses.field(default_factory=CopyConfig)
     # Of a linear policy.
     search: SearchConfig = dataclasses.field(default_factory=SearchConfig)
+    # Of the SE's reward where actions are continuous: minus the distance to the policy's, or its
+    # square.
+    reward_form: str = option("distance", one_of(("distance", "quadratic")))
     slope: float = option(1.0, positive("a reward must tell actions apart"))  # of the SE's reward
     # Deviation of the SE's initial states, in units of those that the policy visits.
     widen: float = option(1.0, positive("it is a scale"))
@@ -64,6 +67,11 @@ class DistillConfig(Options):
             f"must be at most {tested}, as many policies as the search tests; got "
             f"{self.num_snapshots}. Set search.test_every=1.",
         )
+
+    @property
+    def of_ses(self) -> dict[str, Any]:
+        """Options of `sejax.proxies.exact.make_exact`."""
+        return {"form": self.reward_form, "slope": self.slope, "widen": self.widen}
 
 
 def read(overrides: Sequence[str]) -> tuple[DistillConfig, LearnConfig]:

@@ -53,7 +53,7 @@ def distill(own: DistillConfig, config: LearnConfig, folder: Path, words: str = 
     """
     find = search if own.policy is None else copied
     lessons, costs = find(own, config, folder)
-    env, weights = teaching.make_ses(config.task(), lessons, own.slope, own.widen)
+    env, weights = teaching.make_ses(config.task(), lessons, **own.of_ses)
     best, chosen_by = 0, pd.DataFrame()
     if len(lessons) > 1:
         chosen_by = students(own, config, lessons, CHOOSE)
@@ -255,7 +255,7 @@ def students(
     Those that choose an SE (`CHOOSE`) are others than those that test it (`TEST`).
     """
     task, found = config.task(), []
-    env, weights = teaching.make_ses(task, lessons, own.slope, own.widen)
+    env, weights = teaching.make_ses(task, lessons, **own.of_ses)
     keys = jax.random.split(
         keys_of(config)[use], own.num_students if use == CHOOSE else own.num_tested
     )

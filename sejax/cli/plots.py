@@ -53,7 +53,7 @@ def learning_curve(
         bottom.set_ylabel("training steps\nof an agent")
         bottom.set_xlabel("NES generation")
         steps = [x for name, x in data.items() if name.startswith("train_steps_mean")]
-        bottom.set_ylim(0, 1.1 * np.nanmax(steps))
+        bottom.set_ylim(0, max(1.1 * np.nanmax(steps), 1.0))
         bottom.xaxis.get_major_locator().set_params(integer=True)
         _write(figure, path)
 

@@ -19,7 +19,7 @@ from sejax.cli import plots, runtime
 from sejax.cli.config import LearnConfig
 from sejax.cli.run_directory import RunDirectory
 from sejax.cli.trackers import FinishedGeneration, GuardedTracker, Reporter, TrackedRun
-from sejax.objectives import GenerationInfo
+from sejax.objectives import CLOSED_FORM, GenerationInfo
 from sejax.ops.parallel import compiler_options
 from sejax.proxies.io import save
 
@@ -261,7 +261,7 @@ class _Proxies:
             score=float(score),
             generation=int(generation),
             seed=self._seed,
-            **({"scores": by_agent} if len(names) > 1 else {}),
+            **({"scores": by_agent} if len(names) > 1 or CLOSED_FORM in names else {}),
         )
 
 

@@ -89,18 +89,11 @@ def proxy_setup(config: EvaluateConfig) -> Setup:
             agents.require_fit(agent, exploration, task, task.name)
             group, training = _training_on(proxy, config, agent)
             configuration.require_real_returns(group, training)
-            if not agent.is_solved_for:
-                require_reachable(group, training, env.max_steps)
+            require_reachable(group, training, env.max_steps)
             if env.config.reaches_step_limit:
                 configuration.require_learning(
                     group, training, agent, env.max_steps, task.max_steps
                 )
-        require(
-            not (config.baseline and agent.is_solved_for),
-            "baseline",
-            f"must be false with {member.field}={member.key}, which can only solve a one-step SE; "
-            "got true. Set baseline=false.",
-        )
         trainings[member.key] = training
     worlds = {"the proxy": World(env, proxy.params, trainings)}
     if config.baseline:

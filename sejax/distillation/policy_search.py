@@ -10,7 +10,6 @@ Source: Mania et al., "Simple random search of static linear policies is competi
 reinforcement learning" (2018), Algorithm 2 (V2-t). The emulated error is ours.
 """
 
-import functools
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
@@ -20,8 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from sejax.agents.base import Agent, AgentSpec, Spaces
-from sejax.agents.buffers import no_buffer
+from sejax.agents.fixed import make_fixed
 from sejax.envs.base import Task
 from sejax.evaluation import make_proxy_tester, make_recorder, make_tester
 from sejax.ops.parallel import spread_over_devices
@@ -126,22 +124,6 @@ class Search:
     record: Callable[[Array, Policy], Any]
 
 
-def policy_agent(task: Task, act: Callable[[Any, Array], Array]) -> Agent:
-    """An agent that does not learn: its state is what `act(state, obs)` takes.
-
-    Its use is to be tested and recorded as other agents are. `sejax.evaluation` does both.
-    """
-    spaces = Spaces(task.num_states, task.obs_dim, task.num_actions, task.action_dim)
-    return Agent(
-        init=lambda key, hparams: (),
-        act=lambda key, state, obs, /, explore: act(state, obs),
-        update=lambda key, state, batch: state,
-        buffer=no_buffer(),
-        hparams=(),
-        spec=AgentSpec(spaces=spaces),
-    )
-
-
 def linear_act(task: Task, policy: Policy, obs: Float[Array, " obs_dim"]) -> Array:
     """What a linear policy does."""
     outputs = policy.weights @ jnp.append((obs - policy.mean) / policy.std, 1.0)
@@ -174,7 +156,7 @@ def make_search(config: SearchConfig, task: Task, devices: int | None = None) ->
         "env",
         f"must have vectors as observations; got {task.name}. Set env=cartpole.",
     )
-    agent = policy_agent(task, functools.partial(linear_act, task))
+    agent = make_fixed(task, lambda key, policy, obs: linear_act(task, policy, obs))
     shape = task.action_dim, task.obs_dim + 1
     play = make_proxy_tester(agent, task.env, 1)
     record_one = make_recorder(agent, task, 1)

@@ -42,12 +42,13 @@ class Lesson(NamedTuple):
 
 
 def make_ses(
-    task: Task, lessons: Sequence[Lesson], slope: float = 1.0, widen: float = 1.0
+    task: Task, lessons: Sequence[Lesson], **options: Any
 ) -> tuple[ProxyEnv, list[dict[str, Any]]]:
-    """An SE of each lesson: the environment that they share, and the weights of each."""
-    made = [
-        make_exact(task, each.layers, each.states, slope=slope, widen=widen) for each in lessons
-    ]
+    """An SE of each lesson: the environment that they share, and the weights of each.
+
+    `options` are those of `sejax.proxies.exact.make_exact`.
+    """
+    made = [make_exact(task, each.layers, each.states, **options) for each in lessons]
     return made[0][0], [weights for _, weights in made]
 
 

@@ -158,8 +158,14 @@ class SyntheticWorld:
     def _predict(self, action: np.ndarray, vector: np.ndarray) -> np.ndarray:
         """Next state, reward and done output d; in a bandit the state stays, and d is 1."""
         seen = vector if self._units is None else self._units.encode(vector)
-        inputs = np.concatenate([action, seen], axis=-1)
+        known = self.config.reward_form != "network"
+        inputs = seen if known else np.concatenate([action, seen], axis=-1)
         outputs = networks.forward(self._layers, self.config.activation, inputs)
+        if known:
+            bound = self.action_space.high  # type: ignore[attr-defined]
+            apart = action - bound * np.clip(outputs, -1, 1)
+            cost = np.abs(apart) if self.config.reward_form == "distance" else apart**2
+            outputs = -self.config.reward_slope * cost.sum(axis=-1, keepdims=True)
         if self.config.is_bandit:
             whole = np.empty((*vector.shape[:-1], self.obs_dim + 2), np.float32)
             whole[..., :-2], whole[..., -2:-1], whole[..., -1] = vector, outputs, 1

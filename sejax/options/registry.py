@@ -113,7 +113,6 @@ GROUPS = {
             "sac": "sejax.agents.sac:SACConfig",
             "q_learning": "sejax.agents.tabular:QLearningConfig",
             "sarsa": "sejax.agents.tabular:SARSAConfig",
-            "boltzmann": "sejax.agents.boltzmann:BoltzmannConfig",
         },
         base="sejax.agents.base:AgentConfig",
     ),

@@ -33,6 +33,7 @@ if TYPE_CHECKING:
 DONE_MODES = ("soft", "threshold", "bernoulli", "sigmoid")
 INITIAL_STATES = ("real", "learned", "noise")
 STATE_UNITS = ("raw", "bounds")
+REWARD_FORMS = ("network", "distance", "quadratic")
 START_HIDDEN_SIZE = 32  # units of the network that makes initial states
 
 Vector = TypeVar("Vector", np.ndarray, "Array")
@@ -86,6 +87,12 @@ class SyntheticConfig(ProxyConfig):
     # Steps of an episode; null: the task's limit. 1: a contextual bandit, which has neither a
     # next-state nor a done network.
     horizon: int | None = option(None, counts("an episode has steps"))
+    # What the reward network of a bandit makes. network: the reward of an action; distance,
+    # quadratic: the best of continuous actions, in units of their bound, from which the reward is
+    # minus the sum of the distances, or of their squares, so that the best policy is known.
+    reward_form: str = option("network", one_of(REWARD_FORMS))
+    # What such a reward takes for each unit of it.
+    reward_slope: float = option(1.0, positive("a reward must tell actions apart"))
     start_hidden_size: int = option(START_HIDDEN_SIZE, counts("a layer needs a unit"))
     # Whether the horizon terminates an episode, so that nothing is bootstrapped there, or truncates
     # it, as the task's limit does.
@@ -104,6 +111,12 @@ class SyntheticConfig(ProxyConfig):
             "proxy.horizon_is_terminal",
             "must be true with proxy.horizon=1, which has no next state; got false. Set "
             "proxy.horizon_is_terminal=true.",
+        )
+        require(
+            self.is_bandit or self.reward_form == "network",
+            "proxy.reward_form",
+            f"must be network where episodes have several steps; got {self.reward_form}. Set "
+            "proxy.horizon=1.",
         )
 
     @property
@@ -124,6 +137,22 @@ class SyntheticConfig(ProxyConfig):
     def sees_bounds(self) -> bool:
         return self.state_units == "bounds"
 
+    def knows_best_action(self, spec: TaskSpec) -> bool:
+        return self.is_bandit and (spec.num_actions is not None or self.reward_form != "network")
+
+    def require_task(self, spec: TaskSpec, task_name: str) -> None:
+        """Checks that the reward's form is one for the task's actions.
+
+        Raises:
+          ConfigError: if it is not.
+        """
+        require(
+            self.reward_form == "network" or spec.num_actions is None,
+            "proxy.reward_form",
+            f"must be network for discrete actions, as of {shortened(task_name)}; got "
+            f"{self.reward_form}. Set proxy.reward_form=network.",
+        )
+
     @property
     def reaches_step_limit(self) -> bool:
         return self.is_bandit or (self.done == "soft" and self.horizon is None)
@@ -142,6 +171,8 @@ class SyntheticConfig(ProxyConfig):
         heads = ("reward",) if self.is_bandit else tuple(outputs)
         hidden = [self.hidden_size] * self.num_layers
         networks = {head: [action_dim + obs_dim, *hidden, outputs[head]] for head in heads}
+        if self.reward_form != "network":
+            networks["reward"] = [obs_dim, *hidden, action_dim]
         if self.initial_state == "learned":
             networks["start"] = [obs_dim, self.start_hidden_size, obs_dim]
         return networks
@@ -166,7 +197,12 @@ class SyntheticConfig(ProxyConfig):
         )
 
     def make(self, task: Task) -> "ProxyEnv":
-        """The SE of a task."""
+        """The SE of a task.
+
+        Raises:
+          ConfigError: for a form of the reward that is not one for the task's actions.
+        """
+        self.require_task(task, task.name)
         from sejax.proxies.synthetic import BanditEnv, SyntheticEnv  # imports JAX
 
         return (BanditEnv if self.is_bandit else SyntheticEnv)(task, self)

@@ -1,14 +1,14 @@
 r"""One-step SEs whose best policy is known: written down, with nothing fitted.
 
 The reward of a one-step SE says which action is best in a state, so that it can be built from a
-policy. Where actions are continuous, the reward is minus the distance to the policy's action,
-clipped to the bounds; where they are discrete, each action that the policy likes better costs:
+policy. Where actions are continuous, the reward is minus the distance to the policy's action, or
+its square (`proxy.reward_form`); where they are discrete, each action that the policy likes better
+costs, in a network of ReLUs that is no approximation:
 
 .. math:: r(s, a) = -c \sum_i |a_i - \mathrm{clip}(u_i(s))| \qquad
    r(s, a) = -c \sum_j \mathrm{clip}((u_j(s) - u_a(s)) / m, 0, 1)
 
-Both are networks of ReLUs without any approximation. Episodes begin in a Gaussian with the mean and
-covariance of states that the policy visited.
+Episodes begin in a Gaussian with the mean and covariance of states that the policy visited.
 
 Such an SE is its policy in disguise: no agent was trained to learn it, and what it costs is what
 the policy cost (`sejax.distillation`).
@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from sejax.envs.base import Task
-from sejax.options import require
+from sejax.options import positive, require
 from sejax.proxies.base import ProxyEnv
 from sejax.proxies.configs import START_HIDDEN_SIZE, SyntheticConfig
 
@@ -37,6 +37,7 @@ def make_exact(
     layers: Sequence[Layer],
     states: np.ndarray,
     *,
+    form: str = "distance",
     slope: float = 1.0,
     widen: float = 1.0,
 ) -> tuple[ProxyEnv, dict[str, Any]]:
@@ -48,7 +49,8 @@ def make_exact(
         are its output `[action_dim]`, clipped to the task's bounds; of discrete ones the one with
         the largest output `[num_actions]` is best.
       states: observations that the policy visited, `[state, obs_dim]`, in the task's units.
-      slope: c, what a unit of distance costs, or an action that is not the best.
+      form: of the reward where actions are continuous, `distance` or `quadratic`.
+      slope: c, what a unit of it costs, or an action that is not the best.
       widen: deviation of the initial states, in units of the visited ones'.
 
     Returns:
@@ -70,8 +72,12 @@ def make_exact(
     task_states = np.asarray(states, float)
     layers = [(np.asarray(kernel, float), np.asarray(bias, float)) for kernel, bias in layers]
     _require_fit(task, layers, task_states)
+    positive("a reward must tell actions apart")("slope", slope, 1.0)
+    positive("it is a scale")("widen", widen, 1.0)
+    known: dict[str, Any] = {}
     if task.num_actions is None:
-        reward = _distance(layers, task.action_dim, task.max_action, slope)
+        reward = _as_network(layers, task.max_action)
+        known = {"reward_form": form, "reward_slope": slope}
     else:
         reward = _preference(layers, task_states, slope)
     config = SyntheticConfig(
@@ -82,6 +88,7 @@ def make_exact(
         done="threshold",
         initial_state="learned",
         horizon=1,
+        **known,
     )
     weights = {
         "reward": as_weights(reward, config.hidden_size),
@@ -119,34 +126,28 @@ def _require_fit(task: Task, layers: Sequence[Layer], states: np.ndarray) -> Non
     )
 
 
-def _distance(layers: Sequence[Layer], size: int, bound: float, slope: float) -> list[Layer]:
-    """Minus the distance of an action `[size]` within +-`bound` to the policy's clipped one.
-
-    relu(u + bound) - relu(u - bound) is clip(u) + bound, and |x| is relu(x) + relu(-x).
-    """
-    *hidden, (kernel, bias) = _with_action(layers, size, bound)
-    eye = np.eye(size)
-    action, output = kernel[:size], kernel[size:]
-    clipped = (
-        np.concatenate([action, output, output]),
-        np.concatenate([bias[:size], bias[size:] + bound, bias[size:] - bound]),
-    )
-    apart = np.block([[eye, -eye, eye], [-eye, eye, -eye]]), np.zeros(2 * size)
-    return [*hidden, clipped, apart, (np.full((1, 2 * size), -slope), np.zeros(1))]
+def _as_network(layers: Sequence[Layer], bound: float) -> list[Layer]:
+    """The policy in units of the bound, with a hidden layer at least: x is relu(x) - relu(-x)."""
+    *hidden, (kernel, bias) = layers
+    if not hidden:
+        size = len(kernel)
+        hidden = [(np.concatenate([kernel, -kernel]), np.zeros(2 * size))]
+        kernel = np.concatenate([np.eye(size), -np.eye(size)], axis=1)
+    return [*hidden, (kernel / bound, bias / bound)]
 
 
 def _preference(layers: Sequence[Layer], states: np.ndarray, slope: float) -> list[Layer]:
     """Minus what an action, one-hot, costs for each that the policy likes better.
 
-    An action that is better by the margin m, or more, costs 1; m is the tenth of such differences
-    in the given states that are smallest, so that nearly every wrong action costs as much.
+    An action that is better by the margin m, or more, costs 1; a tenth of such differences in
+    the given states are smaller than m, so that nearly every wrong action costs as much.
     """
     size = len(layers[-1][1])
     outputs = evaluate(layers, states)
     better, chosen = (np.array(x) for x in zip(*_pairs(size), strict=True))
     differences = np.abs(outputs[:, better] - outputs[:, chosen])
     margin = max(float(np.quantile(differences, 0.1)), 1e-6 * float(np.abs(outputs).max()), 1e-9)
-    *hidden, (kernel, bias) = _with_action(layers, size, 0.0)
+    *hidden, (kernel, bias) = _with_action(layers, size)
     action, output, own = kernel[:size], kernel[size:] / margin, bias[size:] / margin
     apart, shift = output[better] - output[chosen], own[better] - own[chosen]
     # relu(x) - relu(x - 1) is clip(x, 0, 1).
@@ -164,16 +165,16 @@ def _pairs(size: int) -> list[tuple[int, int]]:
     return [(j, k) for j in range(size) for k in range(size) if j != k]
 
 
-def _with_action(layers: Sequence[Layer], size: int, shift: float) -> list[Layer]:
-    """The policy's layers, which hand on the action `[size]` plus `shift`, at least 0, beside.
+def _with_action(layers: Sequence[Layer], size: int) -> list[Layer]:
+    """The policy's layers, which hand on the action `[size]`, one-hot, beside.
 
     The network's input is the action before the observation, and so are the outputs of each layer.
     """
     found = []
-    for i, (kernel, bias) in enumerate(layers):
+    for kernel, bias in layers:
         beside = np.zeros((size, kernel.shape[1])), np.zeros((len(bias), size))
         wide = np.block([[np.eye(size), beside[0]], [beside[1], kernel]])
-        found.append((wide, np.concatenate([np.full(size, shift if i == 0 else 0.0), bias])))
+        found.append((wide, np.concatenate([np.zeros(size), bias])))
     return found
 
 

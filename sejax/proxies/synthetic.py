@@ -75,10 +75,10 @@ class SyntheticEnv(ProxyEnv):
 
     def init_weights(self, key: Array) -> dict[str, Any]:
         """Random weights of each network: "state", "reward", "done", and "start" if learned."""
-        example = jnp.zeros(self.task.action_dim + self.task.obs_dim)
+        units = self.config.networks(self.task.obs_dim, self.task.action_dim)
         *keys, key_start = jax.random.split(key, len(self._nets) + 1)
         weights: dict[str, Any] = {
-            head: net.init(k, example)["params"]
+            head: net.init(k, jnp.zeros(units[head][0]))["params"]
             for k, (head, net) in zip(keys, self._nets.items(), strict=True)
         }
         if self._start is not None:
@@ -100,9 +100,12 @@ class SyntheticEnv(ProxyEnv):
         """The output of each network, `[size]`, in the networks' own units."""
         if self.task.num_actions is not None:
             action = jax.nn.one_hot(action, self.task.num_actions)
-        seen = vector if self._units is None else self._units.encode(vector)
-        x = jnp.concatenate([action, seen])
+        x = jnp.concatenate([action, self._seen(vector)])
         return {head: net.apply({"params": weights[head]}, x) for head, net in self._nets.items()}
+
+    def _seen(self, vector: Float[Array, " obs_dim"]) -> Float[Array, " obs_dim"]:
+        """A state in the networks' own units."""
+        return vector if self._units is None else self._units.encode(vector)
 
     def reset_env(self, key: Array, params: ProxyParams) -> tuple[Array, SyntheticState]:
         if self.config.initial_state == "real":
@@ -169,9 +172,20 @@ class SyntheticEnv(ProxyEnv):
 
 
 class BanditEnv(SyntheticEnv):
-    """An SE with `horizon=1`, a contextual bandit: its one network makes the reward.
+    r"""An SE with `horizon=1`, a contextual bandit: its one network makes the reward.
 
-    Its only step terminates the episode and leaves the state as it is.
+    Its only step terminates the episode and leaves the state as it is. With `reward_form` distance
+    or quadratic the network's output u(s), in units of the bound b, is the best action:
+
+    .. math:: r(s, a) = -c \sum_i |a_i - \mathrm{clip}(b u_i(s), \pm b)|^p, \quad p \in \{1, 2\}
+
+    What every agent strives for is then known without training one, as it is where actions are
+    discrete: the best action; or, where entropy is worth a temperature :math:`\tau`, the policy
+    :math:`\pi(a \mid s) \propto \exp(r(s, a) / \tau)`.
+
+    Source: forms of the reward: ours; the policy: Ziebart, "Modeling Purposeful Adaptive Behavior
+    with the Principle of Maximum Causal Entropy" (2010); Haarnoja et al., "Reinforcement Learning
+    with Deep Energy-Based Policies" (2017), theorem 1, for a bandit.
     """
 
     is_bandit = True
@@ -180,10 +194,60 @@ class BanditEnv(SyntheticEnv):
         self, weights: PyTree, vector: Float[Array, " obs_dim"], action: Array
     ) -> tuple[Float[Array, " obs_dim"], Float[Array, ""], Float[Array, ""]]:
         """The state as it is, the network's reward, and 1."""
-        return vector, self._outputs(weights, vector, action)["reward"][0], jnp.float32(1)
+        if self.config.reward_form == "network":
+            return vector, self._outputs(weights, vector, action)["reward"][0], jnp.float32(1)
+        apart = action - self._best_action(weights, vector)
+        cost = jnp.abs(apart) if self.config.reward_form == "distance" else apart**2
+        return vector, -self.config.reward_slope * cost.sum(), jnp.float32(1)
+
+    def _best_action(
+        self, weights: PyTree, vector: Float[Array, " obs_dim"]
+    ) -> Float[Array, " action_dim"]:
+        """What the network of a reward of known form makes: the best action of a state."""
+        output: Any = self._nets["reward"].apply({"params": weights["reward"]}, self._seen(vector))
+        return self.task.max_action * jnp.clip(output, -1.0, 1.0)
 
     def bandit_reward(
         self, weights: PyTree, obs: Float[Array, " obs_dim"], action: Array
     ) -> Float[Array, ""]:
         """The reward of an action, where states are what agents observe."""
         return self.predict(weights, obs, action)[1]
+
+    def best_action(self, weights: PyTree, obs: Array) -> Array:
+        """The action of the highest reward; see `ProxyConfig.knows_best_action`."""
+        if self.task.num_actions is None:
+            return self._best_action(weights, obs)
+        return jnp.argmax(self._rewards(weights, obs)).astype(jnp.int32)
+
+    def soft_action(
+        self, key: Array, weights: PyTree, obs: Array, temperature: Array | float
+    ) -> Array:
+        """An action drawn in proportion to exp(reward / temperature).
+
+        Args:
+          key: of the draw.
+          weights: of the SE.
+          obs: what an agent observes.
+          temperature: what a nat of entropy is worth, above 0.
+        """
+        if self.task.num_actions is not None:
+            return jax.random.categorical(key, self._rewards(weights, obs) / temperature)
+        best, bound = self._best_action(weights, obs), self.task.max_action
+        scale = temperature / self.config.reward_slope
+        if self.config.reward_form == "quadratic":  # a normal distribution within the bounds
+            std = jnp.sqrt(scale / 2)
+            low, high = (-bound - best) / std, (bound - best) / std
+            return best + std * jax.random.truncated_normal(key, low, high)
+        # Laplace's within the bounds: a side by its mass, and a distance on that side.
+        key_side, key_distance = jax.random.split(key)
+        below, above = (1 - jnp.exp((sign * best - bound) / scale) for sign in (-1, 1))
+        is_above = jax.random.uniform(key_side, best.shape) * (below + above) < above
+        mass = jnp.where(is_above, above, below) * jax.random.uniform(key_distance, best.shape)
+        return best - jnp.where(is_above, 1, -1) * scale * jnp.log1p(-mass)
+
+    def _rewards(self, weights: PyTree, obs: Array) -> Float[Array, " num_actions"]:
+        """The rewards of discrete actions."""
+        if self.task.num_states is not None:
+            obs = jax.nn.one_hot(obs, self.task.num_states)
+        actions = jnp.arange(self.task.num_actions)
+        return jax.vmap(self.bandit_reward, (None, None, 0))(weights, obs, actions)

@@ -327,10 +327,7 @@ def _words_of_best(proxy: PretrainedProxy) -> str:
     if best is None:
         return ""
     if best.hparams == "as_learned":
-        known = [name for name in proxy.agents if registry.is_registered("agent", name)]
-        # An agent that is solved for on an SE cannot train on the real task beside it.
-        is_alone = any(registry.find("agent", name).is_solved_for for name in known)
-        return " agent_hparams=as_learned" + (" baseline=false" if is_alone else "")
+        return " agent_hparams=as_learned"
     varied = " agent_hparams=varied" if best.hparams == "varied" else ""
     return f" agent={best.agent}{varied}"
 
