@@ -23,11 +23,9 @@ from experiments.common.agents import CONTINUOUS, DISCRETE
 from experiments.common.experiment import Experiment, Settings, count, setting
 from experiments.common.shards import stack, unstack
 from sejax import envs
-from sejax.cli import config as configuration
 from sejax.cli import distilling
 from sejax.cli.distill_config import read
 from sejax.options import each_of
-from sejax.options.plain import to_plain
 
 QUICK = (
     *("search.generations=4", "search.test_every=1", "search.num_directions=4"),
@@ -85,8 +83,7 @@ def one_run(settings: SeDistilled, seed: int) -> pd.DataFrame:
         names = ("search", "students")
         return stack({name: pd.read_csv(folder / f"{name}.csv") for name in names})
 
-    made_with = {"own": to_plain(own), "config": configuration.plain(config) | {"devices": None}}
-    return settings.shards.compute(f"seed{seed}", made_with, run)
+    return settings.shards.compute(f"seed{seed}", distilling.asked(own, config), run)
 
 
 def summarise(rows: pd.DataFrame) -> pd.DataFrame:

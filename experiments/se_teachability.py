@@ -5,7 +5,7 @@ give policies of many kinds; of each one SE is made, on which fresh students of 
 Beside them stands what can be known of a policy without a student: its return, its return with a
 random linear error in each episode, as of a student that learned it roughly, and how often its
 actions lie at their bounds. On the SE that teaches best, other forms are compared: the reward's
-slope, the spread of the initial states, the number of steps.
+form and slope, the initial states, the number of steps.
 """
 
 import dataclasses
@@ -15,8 +15,10 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pandas as pd
+from jaxtyping import Array
 from scipy.stats import spearmanr
 
 import sejax
@@ -25,15 +27,20 @@ from experiments.common.agents import CONTINUOUS, DISCRETE
 from experiments.common.experiment import Experiment, Settings, count, setting
 from experiments.common.shards import stack, unstack
 from sejax import envs
+from sejax.cli import config as configuration
 from sejax.cli import distilling
 from sejax.cli.config import LearnConfig, members_of
 from sejax.cli.distill_config import DistillConfig, read
 from sejax.distillation import teaching
 from sejax.distillation.policy_copy import erring, visit
 from sejax.distillation.teaching import Lesson
+from sejax.envs.base import Task
 from sejax.options import each_of
 from sejax.options.plain import to_plain
+from sejax.proxies.base import ProxyParams
+from sejax.proxies.configs import SyntheticConfig
 from sejax.proxies.exact import evaluate
+from sejax.proxies.synthetic import BanditEnv, SyntheticState
 
 QUICK = (
     *("search.generations=4", "search.test_every=1", "search.num_directions=4"),
@@ -48,10 +55,15 @@ class Form(NamedTuple):
     slope: float = 1.0  # of the reward
     widen: float = 1.0  # spread of the initial states, in units of the visited ones'
     share: float = 1.0  # of the steps of a student
+    reward: str = "distance"  # of continuous actions
+    starts: str = "gaussian"  # or visited: those states; or uncorrelated: their numbers shuffled
 
 
 FORMS = {
     "as it is": Form(),
+    "quadratic reward": Form(reward="quadratic"),
+    "starts that were visited": Form(starts="visited"),
+    "uncorrelated starts": Form(starts="uncorrelated"),
     "slope 0.2": Form(slope=0.2),
     "slope 5": Form(slope=5.0),
     "starts 0.5 as wide": Form(widen=0.5),
@@ -100,6 +112,18 @@ class SeTeachability(Settings):
                 yield name, own, dataclasses.replace(config, devices=self.devices)
 
 
+class VisitedStarts(BanditEnv):
+    """A one-step SE whose episodes begin in given states, `[state, obs_dim]`."""
+
+    def __init__(self, task: Task, config: SyntheticConfig, states: np.ndarray):
+        super().__init__(task, config)
+        self._states = jnp.asarray(states, jnp.float32)
+
+    def reset_env(self, key: Array, params: ProxyParams) -> tuple[Array, SyntheticState]:
+        state = SyntheticState(vector=jax.random.choice(key, self._states), time=jnp.int32(0))
+        return self.get_obs(state), state
+
+
 # --- computing -----------------------------------------------------------------------------------
 
 
@@ -110,8 +134,10 @@ def compute(settings: SeTeachability) -> pd.DataFrame:
         folder = settings.work_folder / name
         folder.mkdir(parents=True, exist_ok=True)
         lessons, _ = distilling.search(own, config, folder)
-        made_with = {"own": to_plain(own), "kinds": list(settings.kinds)}
-        made_with["training"] = to_plain(config.training)
+        made_with = {
+            "own": to_plain(own),
+            "config": configuration.plain(config) | {"devices": None},
+        }
         tests = settings.values("errors", "num_episodes")
 
         def tested(lessons: Any = lessons, config: Any = config) -> pd.DataFrame:
@@ -135,7 +161,7 @@ def compute(settings: SeTeachability) -> pd.DataFrame:
 
 def _tested(settings: SeTeachability, config: LearnConfig, lesson: Lesson) -> dict[str, float]:
     """What can be known of a policy without a student."""
-    task, key = config.task(), jax.random.key(config.seed + 1)
+    task, key = config.task(), jax.random.fold_in(distilling.keys_of(config)["record"], 0)
     found: dict[str, float] = {"generation": lesson.generation}
     for error in settings.errors:
         act = erring(task, lesson.layers, lesson.states, error, key, settings.num_episodes)
@@ -152,20 +178,34 @@ def _formed(
 ) -> pd.DataFrame:
     """Students on the forms of one policy's SE, a row each."""
     task, found = config.task(), []
-    keys = jax.random.split(jax.random.key(config.seed + 2), settings.num_formed)
+    key = jax.random.fold_in(distilling.keys_of(config)[distilling.TEST], 1)
+    keys = jax.random.split(key, settings.num_formed)
     most = config.training.max_steps
     assert most is not None
+    rng = np.random.default_rng(config.seed)
     for label, form in FORMS.items():
-        env, weights = teaching.make_ses(task, [lesson], slope=form.slope, widen=form.widen)
+        if form.reward != "distance" and task.num_actions is not None:
+            continue
+        shown = lesson
+        if form.starts == "uncorrelated":
+            shown = lesson._replace(states=rng.permuted(lesson.states, axis=0))
+        env, weights = teaching.make_ses(
+            task, [shown], form=form.reward, slope=form.slope, widen=form.widen
+        )
+        if form.starts == "visited":
+            env = VisitedStarts(task, env.config, lesson.states)
         steps = int(most * form.share)
         training = dataclasses.replace(config.training, max_steps=steps, max_episodes=steps)
-        made_with = {"search": to_plain(own), "form": form._asdict(), "kinds": settings.kinds}
-        made_with |= {"training": to_plain(training), "num": len(keys), "of": lesson.generation}
+        made_with = {
+            "own": to_plain(own),
+            "config": configuration.plain(config) | {"devices": None},
+        }
+        made_with |= {"form": form._asdict(), "num": len(keys), "of": lesson.generation}
 
         def learned(env: Any = env, weights: Any = weights, training: Any = training) -> Any:
             rows = []
             for member in members_of(config):
-                agent = sejax.make_agent(member.agent, task)
+                agent = sejax.make_agent(member.agent, task, config.exploration)
                 outcome = teaching.teach(env, weights, agent, training, keys, config.devices)
                 rows.append(teaching.as_rows(outcome, [lesson], member.key, "form"))
             return pd.concat(rows, ignore_index=True)

@@ -195,17 +195,20 @@ def copied(own: DistillConfig, config: LearnConfig, folder: Path) -> tuple[list[
     return [lesson], {"cpu_s": time.process_time() - started, "real_steps": real_steps}
 
 
+def asked(own: DistillConfig, config: LearnConfig) -> dict[str, Any]:
+    """What the numbers depend on, as plain values."""
+    others = {"run_dir", "devices"}
+    plain = configuration.plain(config)
+    return to_plain(own) | {name: plain[name] for name in plain if name not in others}
+
+
 def _require_same(own: DistillConfig, config: LearnConfig, folder: Path) -> None:
     """Writes what was asked for, or checks that it is what the folder was made with."""
-    others = {"run_dir", "devices"}  # they change no number
-    asked = to_plain(own) | {
-        name: value for name, value in configuration.plain(config).items() if name not in others
-    }
-    path = folder / ASKED
+    path, wanted = folder / ASKED, asked(own, config)
     if not path.exists():
-        write_text(path, yaml.safe_dump(asked, sort_keys=False))
+        write_text(path, yaml.safe_dump(wanted, sort_keys=False))
         return
-    differing = differences(yaml.safe_load(path.read_text()), json.loads(json.dumps(asked)))
+    differing = differences(yaml.safe_load(path.read_text()), json.loads(json.dumps(wanted)))
     require(
         not differing,
         "run_dir",
