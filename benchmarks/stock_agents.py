@@ -13,6 +13,10 @@ of real agents are kept in `--real`, and none is made again.
 It needs Stable-Baselines3 beside sejax, `pip install 'sejax[bench]'`:
 
     python benchmarks/stock_agents.py cartpole cartpole --steps 1000,2500 --real-steps 50000
+
+An agent in capitals has the library's own defaults in place of RL Zoo's, here on the SE alone:
+
+    python benchmarks/stock_agents.py halfcheetah halfcheetah-distilled --agents SAC,PPO --alone
 """
 
 import argparse
@@ -49,6 +53,9 @@ TASKS = {  # id in Gymnasium, and the step limit
     "mountain_car_continuous": ("MountainCarContinuous-v0", 999),
     "pendulum": ("Pendulum-v1", 200),
     "halfcheetah": ("HalfCheetah-v5", 1000),
+    "hopper": ("Hopper-v5", 1000),
+    "swimmer": ("Swimmer-v5", 1000),
+    "walker2d": ("Walker2d-v5", 1000),
 }
 ALGORITHMS = {"ppo": sb3.PPO, "a2c": sb3.A2C, "dqn": sb3.DQN, "sac": sb3.SAC, "td3": sb3.TD3}
 REAL = "the real task"
@@ -173,12 +180,13 @@ def main() -> None:
     real = pd.read_csv(real_path) if real_path.exists() else pd.DataFrame(columns=COLUMNS)
     each = list(itertools.product(agents, range(args.seed, args.seed + args.seeds)))
     taught = run_all([in_budget(args, args.source, *one) for one in each], args.jobs)
-    trainings = [in_budget(args, REAL, *one) for one in each]
+    trainings = [] if args.alone else [in_budget(args, REAL, *one) for one in each]
     if args.real_steps:
         trainings += [as_the_zoo(args, *one) for one in each]
     new = run_all([training for training in trainings if not is_known(real, training)], args.jobs)
     real = pd.concat([real, new] if len(real) else [new]).drop_duplicates(COLUMNS[:7], keep="last")
-    for table, file in ((taught, path), (real, real_path)):
+    tables = [(taught, path)] if args.alone else [(taught, path), (real, real_path)]
+    for table, file in tables:
         write_text(file, table.sort_values(COLUMNS[:7]).to_csv(index=False))
     rows = list(summarise(args, agents, taught, real))
     common.print_table(
@@ -192,12 +200,14 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("task", choices=TASKS)
     parser.add_argument("source", help="an SE: a shipped name, a safetensors file, a run directory")
     parser.add_argument("--agents", type=agents_of, metavar="A,B", help=", ".join(ALGORITHMS) + "; "
-                        "with other settings than the zoo's: 'sac learning_rate=1e-3'")  # fmt: skip
+                        "in capitals with the library's defaults; with other "
+                        "settings: 'sac learning_rate=1e-3'")  # fmt: skip
     parser.add_argument("--steps", type=numbers_of, default=[1000, 2500, 6000], metavar="N,N")
     parser.add_argument("--seeds", type=int, default=5, help="agents of each kind")
     parser.add_argument("--episodes", type=int, default=20, help="of each test")
     parser.add_argument("--real-steps", type=int, default=0, help="train real agents with the "
                         "zoo's schedules for as many steps as well")  # fmt: skip
+    parser.add_argument("--alone", action="store_true", help="no agents on the real task")
     parser.add_argument("--real-every", type=int, default=1000, help="steps between their tests")
     parser.add_argument("--jobs", type=int, default=1, help="processes, of one thread each")
     parser.add_argument("--csv", type=Path, help="results/stock_agents/TASK-SOURCE.csv")
@@ -213,8 +223,8 @@ def agents_of(text: str) -> list[str]:
 
 
 def kind_of(agent: str) -> str:
-    """One of `ALGORITHMS`, of a name that may have settings behind it."""
-    return (agent.split() or [""])[0]
+    """One of `ALGORITHMS`, of a name that may have settings behind it, or be in capitals."""
+    return (agent.split() or [""])[0].lower()
 
 
 def numbers_of(text: str) -> list[int]:
@@ -261,7 +271,8 @@ def run(training: Training) -> list[tuple[Any, ...]]:
     torch.set_num_threads(1)
     env_id, _ = TASKS[training.task]
     kind = kind_of(training.agent)
-    zoo = ZOO[kind, env_id]
+    is_default = training.agent.startswith(kind.upper())
+    zoo = Zoo(training.total_steps) if is_default else ZOO[kind, env_id]
     changes = (word.split("=", 1) for word in training.agent.split()[1:])
     hparams = zoo.hparams | {name: ast.literal_eval(value) for name, value in changes}
     envs: Any = make_vec_env(lambda: make_world(training), zoo.num_envs, seed=training.seed)
