@@ -52,6 +52,19 @@ def test_elements_that_stop_at_different_times_equal_single_loops(shape):
         assert_counted(log[index], state.number[index], limit)
 
 
+@pytest.mark.parametrize("shape", [(4,), (2, 2)])
+def test_blocks_of_steps_that_gpus_run_change_nothing(monkeypatch, shape):
+    ran = []
+
+    def on_a_gpu(carry, *, cpu, default):
+        ran.append(default)
+        return default(carry)
+
+    monkeypatch.setattr(jax.lax, "platform_dependent", on_a_gpu)
+    test_elements_that_stop_at_different_times_equal_single_loops(shape)
+    assert ran
+
+
 def test_arguments_that_all_elements_share_need_no_axis():
     loop = jax.jit(jax.vmap(count_to, in_axes=(None, 0)))
     log, state = jax.tree.map(np.asarray, loop(3, np.array([True, False, True])))

@@ -16,6 +16,10 @@ from jaxtyping import PyTree
 
 Body = Callable[..., tuple[PyTree, PyTree]]
 
+# On a GPU the host waits for a loop's predicate, which it asks for once in so many steps. What a
+# batch that has ended meanwhile does changes nothing.
+STEPS_PER_CHECK = 16
+
 
 def while_any_active(
     body: Body, large: PyTree, small: PyTree, consts: PyTree
@@ -92,7 +96,15 @@ def _while_any_active(
         def step(carry: tuple[PyTree, PyTree]) -> tuple[PyTree, PyTree]:
             return jax.tree.unflatten(out_tree, masked(*jax.tree.leaves((*carry, consts))))
 
-        return jax.lax.while_loop(lambda carry: jnp.any(carry[1].active), step, (large, small))
+        def block(carry: tuple[PyTree, PyTree]) -> tuple[PyTree, PyTree]:
+            return jax.lax.fori_loop(0, STEPS_PER_CHECK, lambda _, each: step(each), carry)
+
+        def advance(carry: tuple[PyTree, PyTree]) -> tuple[PyTree, PyTree]:
+            if depth == 0:  # a step of a loop that has ended is not masked
+                return step(carry)
+            return jax.lax.platform_dependent(carry, cpu=step, default=block)
+
+        return jax.lax.while_loop(lambda carry: jnp.any(carry[1].active), advance, (large, small))
 
     @loop.def_vmap
     def _(axis_size: int, in_batched: list[PyTree], *args: PyTree) -> tuple[PyTree, PyTree]:
