@@ -7,7 +7,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: run test test-slow test-examples test-trackers test-ray test-lowest test-latest lint typecheck \
+.PHONY: run test test-slow test-suites test-examples test-trackers test-ray test-lowest test-latest lint typecheck \
     claims docs linkcheck dist clean
 
 run: $(VENV)/.installed
@@ -21,10 +21,14 @@ test-slow: $(VENV)/.installed-dev
 
 # --- with packages that the suite leaves out, each in an environment of its own in build/ -----------
 
-test-examples test-trackers test-ray test-lowest test-latest:
+test-suites test-examples test-trackers test-ray test-lowest test-latest:
 	$(PYTHON) -m venv --clear build/$@
 	build/$@/bin/python -m pip install --quiet $(PACKAGES) pytest pytest-xdist chex hypothesis
 	build/$@/bin/python -m pytest $(OPTIONS) -n 2 --dist loadfile $(TESTS:%=tests/test_%.py)
+
+# Environments of other JAX suites, through stoa.
+test-suites: PACKAGES := --constraint constraints.txt --editable '.[stoa]' navix jumanji pgx xminigrid
+test-suites: TESTS := stoa
 
 # Stable-Baselines3, sbx, rejax, and the PyTorch code that benchmarks compare with. On Linux, PyPI's
 # torch brings CUDA along; PIP_EXTRA_INDEX_URL may name an index that has it without.

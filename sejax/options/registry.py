@@ -97,7 +97,7 @@ GROUPS = {
             "ant": "sejax.envs.mujoco.tasks:Ant",
             "reacher": "sejax.envs.mujoco.tasks:Reacher",
         },
-        {"gymnax/": "sejax.envs.gymnax:GymnaxTask"},
+        {"gymnax/": "sejax.envs.gymnax:GymnaxTask", "stoa/": "sejax.envs.stoa:StoaTask"},
     ),
     "agent": Group(
         "sejax.agents",

@@ -1,0 +1,152 @@
+"""Environments of other JAX suites, by suite and id: `env=stoa/navix/Navix-Empty-5x5-v0`.
+
+[stoa](https://github.com/EdanToledo/Stoa) gives the suites one interface, in which an episode says
+whether it was terminated or truncated and no step resets; here it becomes sejax's. Observations of
+several arrays become one vector, in the order of their names. A suite is installed beside sejax's
+extra `stoa`. Two players, or several actions at once, do not fit an agent of sejax.
+"""
+
+import importlib
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+
+from sejax import options
+from sejax.envs.base import Task
+from sejax.envs.spec import Box, Discrete, TaskSpec
+from sejax.options import Options, counts, option, require
+
+if TYPE_CHECKING:
+    from sejax.envs.environment import Environment
+
+PREFIX = "stoa/"
+LIMITS = ("max_steps", "time_limit", "episode_length")  # as suites call it
+
+
+class Suite(NamedTuple):
+    """Where a suite makes its environments, and which of stoa's classes takes them.
+
+    Attributes:
+      module, maker: a function of the id.
+      adapter: in `stoa.env_adapters`, a module and a class.
+    """
+
+    module: str
+    maker: str
+    adapter: tuple[str, str]
+
+
+SUITES = {
+    "brax": Suite("brax.envs", "get_environment", ("brax", "BraxToStoa")),
+    "jumanji": Suite("jumanji", "make", ("jumanji", "JumanjiToStoa")),
+    "navix": Suite("navix", "make", ("navix", "NavixToStoa")),
+    "pgx": Suite("pgx", "make", ("pgx", "PGXToStoa")),
+    "playground": Suite(
+        "mujoco_playground.registry", "load", ("playground", "MuJoCoPlaygroundToStoa")
+    ),
+    "xminigrid": Suite("xminigrid", "make", ("xminigrid", "XMiniGridToStoa")),
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class StoaTask(Options):
+    """An environment of a suite that stoa has an adapter for.
+
+    Raises:
+      ConfigError: when it is made, for a suite that is not known or not installed, or an id that it
+        cannot make.
+    """
+
+    group: ClassVar[str] = "env"
+
+    name: str = f"{PREFIX}navix/Navix-Empty-5x5-v0"
+    solved_reward: float | None = None  # mean return that counts as solved; null: undefined
+    # null: the environment's own, or 1,000 where it has none.
+    max_steps: int | None = option(None, counts("an episode has steps"))
+
+    def make(self) -> Task:
+        suite, _, name = self.name.removeprefix(PREFIX).partition("/")
+        if suite not in SUITES or not name:
+            raise options.unknown_name("env", self.name, [f"{PREFIX}{x}/ID" for x in SUITES])
+        module, maker, (adapter, of) = SUITES[suite]
+        try:
+            made = getattr(importlib.import_module(module), maker)(name)
+            adapted = getattr(importlib.import_module(f"stoa.env_adapters.{adapter}"), of)
+            args = made if isinstance(made, tuple) else (made,)  # with its params
+            env = adapted(*args)
+        except Exception as error:  # of a package that is missing, or of the suite
+            raise options.ConfigError(
+                f"env must be an environment that {suite} can make here; {name} raised "
+                f"{options.told(error)}. Set pip install 'sejax[stoa]' {suite}.",
+                "env",
+            ) from error
+        return Task(
+            name=self.name,
+            env=_environment(env, self.max_steps or _limit(args)),
+            solved_reward=math.inf if self.solved_reward is None else self.solved_reward,
+        )
+
+
+def _limit(made: tuple[Any, ...]) -> int:
+    """The environment's own step limit, of what its suite has made."""
+    stated = (getattr(x, name, None) for x in made for name in LIMITS)
+    return next((int(x) for x in stated if isinstance(x, int)), 1000)
+
+
+def _environment(env: Any, max_steps: int) -> "Environment[Any, Any]":
+    """A stoa environment in sejax's own interface."""
+    import jax
+    import jax.numpy as jnp
+    import numpy as np
+    from flax import struct
+    from jaxtyping import Array
+
+    from sejax.envs.environment import Environment, EnvState
+
+    @struct.dataclass
+    class StoaState(EnvState):
+        inner: Any
+        truncated: Array
+
+    def observed(step: Any) -> Array:
+        leaves = jax.tree.leaves(step.observation)
+        return jnp.concatenate([jnp.ravel(x).astype(jnp.float32) for x in leaves])
+
+    class StoaEnv(Environment[Any, Any]):
+        def reset_env(self, key: Array, params: Any) -> tuple[Array, StoaState]:
+            inner, step = env.reset(key)
+            state = StoaState(time=jnp.int32(0), inner=inner, truncated=jnp.bool_(False))
+            return observed(step), state
+
+        def step_env(self, key: Array, state: Any, action: Array, params: Any) -> Any:
+            inner, step = env.step(state.inner, action)
+            after = StoaState(time=state.time + 1, inner=inner, truncated=step.truncated())
+            info = {"discount": jnp.float32(step.discount)}
+            return observed(step), after, jnp.float32(step.reward), step.terminated(), info
+
+        def is_truncated(self, state: Any, params: Any) -> Array:
+            return jnp.asarray(state.truncated | (state.time >= params.max_steps_in_episode))
+
+    space = env.action_space()
+    _, first = jax.eval_shape(env.reset, jax.random.key(0))
+    size = sum(x.size for x in jax.tree.leaves(first.observation))
+    if hasattr(space, "num_values"):
+        require(
+            np.ndim(space.num_values) == 0,
+            "env",
+            f"must have one action at a time; got {space.num_values}. Set another one.",
+        )
+        action: Any = Discrete(int(space.num_values))
+    else:
+        bounds = (np.broadcast_to(x, space.shape).ravel() for x in (space.minimum, space.maximum))
+        low, high = (tuple(map(float, x)) for x in bounds)
+        action = Box(low, high)
+    observation = Box.symmetric(*[math.inf] * size)
+
+    def first_reward(key: Array) -> Array:
+        return env.step(env.reset(key)[0], jnp.zeros(space.shape, space.dtype))[1].reward
+
+    players = jax.eval_shape(first_reward, jax.random.key(0)).size
+    must = f"must have one player; got {players} of them. Set another one."
+    require(players == 1, "env", must)
+    return StoaEnv(TaskSpec(observation=observation, action=action, max_steps=max_steps))
