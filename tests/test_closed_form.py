@@ -183,7 +183,7 @@ def test_the_command_names_it_in_its_files(tmp_path):
     ("words", "message"),
     [
         (["env=cartpole", "preset=soft"], r"objective.closed_form must be 0 .* proxy.horizon=1,"),
-        (["env=pendulum", "proxy.horizon=1"], r"Set proxy.horizon=1 proxy.reward_form=distance,"),
+        (["env=pendulum", "proxy.reward_form=network"], r"proxy.reward_form=distance,"),
         (["env=cartpole", "proxy=rn", "objective=max_reward"], "objective.closed_form must be 0"),
         (["env=cartpole", "objective.closed_form=2"], "objective.closed_form must lie between"),
         (["env=cartpole", "proxy.reward_form=distance", "proxy.horizon=1"],

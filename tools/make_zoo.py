@@ -30,10 +30,15 @@ the proxy and tested on the real task: the mean return there, and how long an ag
 *Teaches by* is the verdict on an SE of [the myopia test](results.md#the-myopia-test): `policy` if
 agents that look at the next reward alone learn as well, `dynamics` if only far-sighted ones learn.
 
+Those called *distilled* were not evolved: each is [made of a searched policy](distill.md), which
+is all that it teaches, and stands beside the evolved SE of its task. Of three such runs, with three
+seeds, the one that ships taught those students best by which a run chooses its SE; what it is said
+to teach was measured on others.
+
 Costs are those of the one run that ships, often the best of several: `cartpole` of five,
 `cartpole-rn` of ten, `cliff_walking-rn` of fifty, `mountain_car_continuous-rn` of five, by their
-scores or, for `cartpole`, by the returns of discrete TD3. What `cartpole_v1` and `pendulum` were
-chosen from is not stored.
+scores or, for `cartpole`, by the returns of discrete TD3. What `cartpole_v1` was chosen from is not
+stored. `pendulum` is the second of two settings that were tried, one run each.
 
 The second table of each tells what fresh agents reach that trained for the steps given and were
 then tested on the real task: mean and standard deviation of the agents' mean returns.
@@ -93,7 +98,8 @@ def row(proxy: sejax.PretrainedProxy, verdicts: Mapping[str, str]) -> dict[str, 
     """A proxy's row of the table."""
     name, kind, *others = proxy.row.items()
     linked = {"name": f"[{proxy.name}](#{proxy.name})"}
-    return dict([name, kind, ("teaches by", verdicts.get(proxy.name, "")), *others]) | linked
+    teaches_by = "policy" if proxy.is_distilled else verdicts.get(proxy.name, "")
+    return dict([name, kind, ("teaches by", teaches_by), *others]) | linked
 
 
 def section(proxy: sejax.PretrainedProxy) -> str:

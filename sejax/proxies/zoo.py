@@ -226,6 +226,7 @@ _ENDS = {
     "sigmoid": "with the probability that the done output's sigmoid is",
     "soft": 'where the done output exceeds 1/2; agents must bootstrap with `info["discount"]`',
 }
+_COSTS = {"distance": "distance to", "quadratic": "squared distance to"}
 _SCORES = {"reward_threshold": "minus the training steps until solved, and a penalty if unsolved"}
 _HPARAMS = {"default": "default", "varied": "drawn for each", "as_learned": "as it was learned"}
 _WORLDS = {"proxy": "this proxy", "real": "the real task"}
@@ -291,6 +292,9 @@ def _facts(proxy: PretrainedProxy) -> dict[str, str]:
         limit = f"at most {config.horizon} steps" if config.horizon else "the real task's limit"
         facts["initial states"] = _STARTS[config.initial_state]
         facts["episodes"] = "one step: a contextual bandit" if config.is_bandit else limit
+        if config.reward_form != "network":
+            cost = _COSTS[config.reward_form]
+            facts["reward"] = f"minus the {cost} an action that a network makes"
         if not config.is_bandit:
             later = f", from step {config.min_steps} on" if config.min_steps > 1 else ""
             facts["an episode ends"] = _ENDS[config.done] + later
