@@ -192,7 +192,7 @@ def test_the_best_preset_has_a_quick_ppo_for_mountain_car_continuous():
         assert dataclasses.replace(quick, **freed) == study.transfer_agent
 
 
-@pytest.mark.parametrize("env", ["cartpole", "pendulum", "mountain_car_continuous"])
+@pytest.mark.parametrize("env", ["cartpole", "mountain_car", "mountain_car_continuous"])
 def test_ppo_on_ses_is_the_default(env):
     assert composed_with(f"env={env}", "agent=ppo").agent == PPOConfig()
 

@@ -154,7 +154,7 @@ def pretrained() -> Zoo:
 
     Example:
       >>> [proxy.name for proxy in pretrained() if proxy.kind == "se"][:2]
-      ['acrobot', 'cartpole']
+      ['acrobot', 'acrobot-distilled']
     """
     files = (header.PRETRAINED_DIR / f"{name}.safetensors" for name in header.pretrained_names())
     return Zoo(describe(header.read(file, single=True)) for file in files)
