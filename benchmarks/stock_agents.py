@@ -16,7 +16,7 @@ It needs Stable-Baselines3 beside sejax, `pip install 'sejax[bench]'`:
 
 An agent in capitals has the library's own defaults in place of RL Zoo's, here on the SE alone:
 
-    python benchmarks/stock_agents.py halfcheetah halfcheetah-distilled --agents SAC,PPO --alone
+    python benchmarks/stock_agents.py hopper hopper-distilled --agents SAC,PPO --alone
 """
 
 import argparse
@@ -171,6 +171,13 @@ def main() -> None:
     args = common.parse_args(__doc__, add_options)
     if args.quick:
         args.agents, args.steps, args.seeds, args.episodes = ["ppo"], [500], 2, 5
+    if args.alone and args.real_steps:
+        raise SystemExit("error: --alone must stand without --real-steps.")
+    of_zoo = [agent for agent, of in ZOO if of == TASKS[args.task][0]]
+    unknown = [x for x in args.agents or [] if x == x.lower() and kind_of(x) not in of_zoo]
+    if unknown or not (args.agents or of_zoo):
+        raise SystemExit(f"error: --agents must be in capitals for {args.task}, as RL Zoo's "
+                         "settings of it are not here.")  # fmt: skip
     # A look leaves the results that are kept alone.
     folder = Path("runs/stock_agents" if args.quick else "results/stock_agents")
     env_id, _ = TASKS[args.task]

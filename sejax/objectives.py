@@ -155,6 +155,15 @@ class MaxReward(Options):
     # action. Above 0 it plays at random between actions that the SE hardly tells apart.
     temperature: float = option(0.0, not_negative())
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require(
+            self.closed_form > 0 or self.temperature == 0,
+            "objective.temperature",
+            f"must be 0 with objective.closed_form=0, where no policy is known; got "
+            f"{self.temperature:g}. Set objective.closed_form=0.5.",
+        )
+
     def make(self, task: Task) -> Objective:
         """The objective on a task."""
         objective = Objective(

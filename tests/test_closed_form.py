@@ -190,6 +190,10 @@ def test_the_command_names_it_in_its_files(tmp_path):
          "proxy.reward_form must be network for discrete actions"),
         (["env=pendulum", "proxy.reward_form=distance", "proxy.horizon=null"],
          "proxy.reward_form must be network where episodes have several steps"),
+        (["env=cartpole", "objective.temperature=0.1", "objective.closed_form=0"],
+         "objective.temperature must be 0 with objective.closed_form=0"),
+        (["env=cartpole", "proxy.reward_slope=2"],
+         "proxy.reward_slope must be 1 with proxy.reward_form=network"),
     ],
 )  # fmt: skip
 def test_where_the_best_policy_is_not_known_it_is_refused(words, message):

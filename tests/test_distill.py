@@ -85,6 +85,10 @@ def test_a_folder_of_another_command_is_left_alone(folder, tmp_path):
         file.truncate(200)
     with pytest.raises(ConfigError, match="damaged"):
         main([*QUICK, f"run_dir={path}"])
+    for text in ("", "a: ["):
+        (path / distilling.ASKED).write_text(text)
+        with pytest.raises(ConfigError, match=r"must hold distill.yaml as it was written"):
+            main([*QUICK, f"run_dir={path}"])
 
 
 def act(obs):
@@ -133,6 +137,7 @@ def test_policies_come_from_files_and_functions(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
+        (["reward_form=quadratic"], "reward_form must be left out where actions are discrete"),
         (["num_snapshots=5"], "num_snapshots must be at most 4"),
         (["search.num_top=5"], "search.num_top must be at most search.num_directions"),
         (["search.generationz=5"], "Did you mean search.generations"),

@@ -99,3 +99,8 @@ def test_pilots_have_other_seeds_and_costs_are_those_of_the_card():
     known = {name: proxy_users.costs_of(name) for name in break_even.BreakEven.of().proxies}
     for card in sejax.pretrained():
         assert known[card.name]["learning_steps"] == card.learning.real_steps > 0
+
+
+def test_the_kind_of_agents_is_the_first_that_the_proxy_was_learned_with():
+    study = proxy_users.Study(proxy_users.BreakEven.of(quick=True), sejax.load_proxy("cartpole"))
+    assert study.kind == "ddqn"

@@ -117,9 +117,7 @@ class Study:
         self.num_agents, self.num_pilots = settings.counts(self.task)
         self.target = float(self.task.solved_reward)
         self.kind, self.agent = next(
-            (registry.name_of("agent", agent), agent)
-            for agent in proxy.learned_agents().values()
-            if not agent.is_solved_for
+            (registry.name_of("agent", agent), agent) for agent in proxy.learned_agents().values()
         )
 
     def agents(self) -> Iterator[pd.DataFrame]:

@@ -116,6 +116,11 @@ def read(overrides: Sequence[str]) -> tuple[DistillConfig, LearnConfig]:
         "training.stop_rule=never.",
     )
     own = from_plain(DistillConfig, values, "")  # after the task, whose faults come first
+    require(
+        spec.actions == "continuous" or own.reward_form == "distance",
+        "reward_form",
+        f"must be left out where actions are discrete; got {own.reward_form}. Leave it out.",
+    )
     if own.search.alive_bonus is None:
         bonus = getattr(config.env, "healthy_reward", 0.0)
         search = dataclasses.replace(own.search, alive_bonus=bonus)

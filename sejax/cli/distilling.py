@@ -124,7 +124,7 @@ def search(own: DistillConfig, config: LearnConfig, folder: Path) -> tuple[list[
     went_on = curve[curve["start"] == _best_start(rows)]
     for part in np.array_split(np.arange(len(went_on)), own.num_snapshots):
         started = time.process_time()
-        number = int(went_on.iloc[part]["test_mean"].idxmax())
+        number = int(went_on.iloc[part]["test_mean"].fillna(-np.inf).idxmax())
         policy, generation = tested[number], int(curve["generation"][number])
         # Episodes of their own: the tests had a part in choosing.
         seen = record(jax.random.fold_in(keys["record"], generation), policy)
@@ -208,7 +208,17 @@ def _require_same(own: DistillConfig, config: LearnConfig, folder: Path) -> None
     if not path.exists():
         write_text(path, yaml.safe_dump(wanted, sort_keys=False))
         return
-    differing = differences(yaml.safe_load(path.read_text()), json.loads(json.dumps(wanted)))
+    try:
+        stored = yaml.safe_load(path.read_text())
+    except (OSError, ValueError, yaml.YAMLError):
+        stored = None
+    require(
+        isinstance(stored, dict),
+        "run_dir",
+        f"must hold {ASKED} as it was written; got {folder}, where it is damaged. Set "
+        "run_dir=FOLDER, another one.",
+    )
+    differing = differences(stored, json.loads(json.dumps(wanted)))
     require(
         not differing,
         "run_dir",
@@ -243,6 +253,11 @@ def _restored(folder: Path, policy: Policy) -> tuple[list[Policy], list[dict[str
             "run_dir",
         ) from error
     rows = manifest["rows"]
+    require(
+        all("start" in row for row in rows),
+        "run_dir",
+        f"must hold a search of this version; got {folder}. Set run_dir=FOLDER, another one.",
+    )
     tested = [type(policy)(**{name: x[i] for name, x in tensors.items()}) for i in range(len(rows))]
     return tested, rows
 

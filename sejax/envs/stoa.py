@@ -2,7 +2,8 @@
 
 [stoa](https://github.com/EdanToledo/Stoa) gives the suites one interface, in which an episode says
 whether it was terminated or truncated and no step resets; here it becomes sejax's. Observations of
-several arrays become one vector, in the order of their names. A suite is installed beside sejax's
+several arrays become one vector, in the order of their fields (of a dictionary, its names), and
+continuous actions lie in [-1, 1]. A suite is installed beside sejax's
 extra `stoa`. Two players, or several actions at once, do not fit an agent of sejax.
 """
 
@@ -74,10 +75,12 @@ class StoaTask(Options):
             adapted = getattr(importlib.import_module(f"stoa.env_adapters.{adapter}"), of)
             args = made if isinstance(made, tuple) else (made,)  # with its params
             env = adapted(*args)
-        except Exception as error:  # of a package that is missing, or of the suite
+        except Exception as error:
+            is_missing = isinstance(error, ImportError)
+            fix = f"Install pip install 'sejax[stoa]' {suite}." if is_missing else "Set another id."
             raise options.ConfigError(
                 f"env must be an environment that {suite} can make here; {name} raised "
-                f"{options.told(error)}. Set pip install 'sejax[stoa]' {suite}.",
+                f"{options.told(error)}. {fix}",
                 "env",
             ) from error
         return Task(
@@ -119,10 +122,13 @@ def _environment(env: Any, max_steps: int) -> "Environment[Any, Any]":
             return observed(step), state
 
         def step_env(self, key: Array, state: Any, action: Array, params: Any) -> Any:
-            inner, step = env.step(state.inner, action)
-            after = StoaState(time=state.time + 1, inner=inner, truncated=step.truncated())
+            inner, step = env.step(state.inner, as_theirs(action))
+            # jumanji's last steps all come as terminated; the discount tells which are not.
+            terminated = step.last() & (step.discount == 0)
+            truncated = step.last() & ~terminated
+            after = StoaState(time=state.time + 1, inner=inner, truncated=truncated)
             info = {"discount": jnp.float32(step.discount)}
-            return observed(step), after, jnp.float32(step.reward), step.terminated(), info
+            return observed(step), after, jnp.float32(step.reward), terminated, info
 
         def is_truncated(self, state: Any, params: Any) -> Array:
             return jnp.asarray(state.truncated | (state.time >= params.max_steps_in_episode))
@@ -137,10 +143,18 @@ def _environment(env: Any, max_steps: int) -> "Environment[Any, Any]":
             f"must have one action at a time; got {space.num_values}. Set another one.",
         )
         action: Any = Discrete(int(space.num_values))
+        as_theirs = lambda action: action  # noqa: E731
     else:
-        bounds = (np.broadcast_to(x, space.shape).ravel() for x in (space.minimum, space.maximum))
-        low, high = (tuple(map(float, x)) for x in bounds)
-        action = Box(low, high)
+        low, high = (
+            np.broadcast_to(x, space.shape).astype("f4") for x in (space.minimum, space.maximum)
+        )
+        require(
+            np.isfinite([low, high]).all() and (low < high).all(),
+            "env",
+            f"must have bounded actions; got {space.minimum} to {space.maximum}. Set another one.",
+        )
+        action = Box.symmetric(*[1.0] * low.size)  # as agents act, of any bounds
+        as_theirs = lambda action: low + (action.reshape(low.shape) + 1) / 2 * (high - low)  # noqa: E731
     observation = Box.symmetric(*[math.inf] * size)
 
     def first_reward(key: Array) -> Array:

@@ -82,7 +82,8 @@ def require_best_action(config: ProxyConfig, spec: TaskSpec, task_name: str) -> 
     Raises:
       ConfigError: if it is not.
     """
-    fix = "proxy.horizon=1" + ("" if spec.num_actions else " proxy.reward_form=distance")
+    kind = "proxy.horizon=1" if hasattr(config, "horizon") else "proxy=se proxy.horizon=1"
+    fix = kind + ("" if spec.num_actions else " proxy.reward_form=distance")
     require(
         config.knows_best_action(spec),
         "objective.closed_form",

@@ -116,7 +116,13 @@ class SyntheticConfig(ProxyConfig):
             self.is_bandit or self.reward_form == "network",
             "proxy.reward_form",
             f"must be network where episodes have several steps; got {self.reward_form}. Set "
-            "proxy.horizon=1.",
+            "proxy.reward_form=network, or proxy.horizon=1.",
+        )
+        require(
+            self.reward_form != "network" or self.reward_slope == 1,
+            "proxy.reward_slope",
+            f"must be 1 with proxy.reward_form=network; got {self.reward_slope:g}. Set "
+            "proxy.reward_form=distance.",
         )
 
     @property
