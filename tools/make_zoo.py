@@ -31,8 +31,8 @@ the proxy and tested on the real task: the mean return there, and how long an ag
 agents that look at the next reward alone learn as well, `dynamics` if only far-sighted ones learn.
 
 Those called *distilled* were not evolved: each is [made of a searched policy](distill.md), which
-is all that it teaches, and stands beside the evolved SE of its task. Of three such runs, with three
-seeds, the one that ships taught those students best by which a run chooses its SE; what it is said
+is all that it teaches, and stands beside the evolved SE of its task. Of three such runs (one of
+`walker2d-distilled`), with three seeds, the one that ships taught those students best by which a run chooses its SE; what it is said
 to teach was measured on others.
 
 Costs are those of the one run that ships, often the best of several: `cartpole` of five,
@@ -53,7 +53,7 @@ env, params = sejax.load("acrobot")  # a gymnax environment, in JAX
 ```
 
 `python -m sejax.evaluate proxy=acrobot agent=sac` trains agents on it and tests them on the real
-task. HalfCheetah's need `pip install 'sejax[mujoco]'`. All are sejax's own, under Apache-2.0, and
+task. Those of MuJoCo's tasks need `pip install 'sejax[mujoco]'`. All are sejax's own, under Apache-2.0, and
 hold no data of others.
 
 """
