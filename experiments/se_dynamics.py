@@ -43,7 +43,9 @@ from sejax import Task, envs
 from sejax.cli import session
 from sejax.options import each_of, positive
 
-WHOLE = ("proxy.initial_state=real", "proxy.horizon=null")
+# On Pendulum, preset=best has a reward whose best action is known, and no trainings for a share.
+TRAINED = ("proxy.reward_form=network", "objective.closed_form=0", "objective.temperature=0")
+WHOLE = ("proxy.initial_state=real", "proxy.horizon=null", *TRAINED)
 # Overrides of the runs, by kind; `tenth` of the task's step limit.
 KINDS: dict[str, tuple[str, ...]] = {
     "bandit": (),
@@ -52,7 +54,9 @@ KINDS: dict[str, tuple[str, ...]] = {
     "bernoulli": (*WHOLE, "proxy.done=bernoulli"),
     "shortest": (*WHOLE, "proxy.done=threshold", "proxy.min_steps={tenth}"),
     "against_myopic": (*WHOLE, "proxy.done=threshold"),
-    "ten_steps": ("proxy.initial_state=real", "proxy.horizon=10", "proxy.done=threshold"),
+    "ten_steps": (
+        *("proxy.initial_state=real", "proxy.horizon=10", "proxy.done=threshold", *TRAINED),
+    ),
 }
 MYOPIC = "myopic"  # agent of `against_myopic`: as the learning one, but for its discount and weight
 # On Pendulum, preset=best has agents explore as in a bandit: for a hundred episodes, of one step
