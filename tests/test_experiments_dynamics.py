@@ -161,7 +161,7 @@ def test_kinds_differ_in_their_proxy_and_agents_explore_as_their_episodes_ask():
     bandit, soft = settings.config_of("bandit"), settings.config_of("soft")
     assert bandit == settings.learn_config([]) and bandit.proxy.is_bandit
     assert (soft.proxy.done, soft.proxy.horizon, soft.proxy.initial_state) == ("soft", None, "real")
-    assert (soft.training.max_steps, bandit.training.max_steps) == (4000, 5000)
+    assert (soft.training.max_steps, bandit.training.max_steps) == (4000, 10000)
     assert soft.es == bandit.es
     myopic = settings.config_of("against_myopic")
     assert dataclasses.replace(myopic, agents=None, agent=bandit.agent) == dataclasses.replace(

@@ -31,9 +31,9 @@ the proxy and tested on the real task: the mean return there, and how long an ag
 agents that look at the next reward alone learn as well, `dynamics` if only far-sighted ones learn.
 
 Those called *distilled* were not evolved: each is [made of a searched policy](distill.md), which
-is all that it teaches, and stands beside the evolved SE of its task. Of three such runs (one of
-`walker2d-distilled`), with three seeds, the one that ships taught those students best by which a run chooses its SE; what it is said
-to teach was measured on others.
+is all that it teaches, and stands beside the evolved SE of its task. Of three such runs with three
+seeds (two of `swimmer-distilled`, one of `walker2d-distilled`) the one that ships taught those
+students best by which a run chooses its SE; what it is said to teach was measured on others.
 
 Costs are those of the one run that ships, often the best of several: `cartpole` of five,
 `cartpole-rn` of ten, `cliff_walking-rn` of fifty, `mountain_car_continuous-rn` of five, by their
@@ -53,8 +53,8 @@ env, params = sejax.load("acrobot")  # a gymnax environment, in JAX
 ```
 
 `python -m sejax.evaluate proxy=acrobot agent=sac` trains agents on it and tests them on the real
-task. Those of MuJoCo's tasks need `pip install 'sejax[mujoco]'`. All are sejax's own, under Apache-2.0, and
-hold no data of others.
+task. Those of MuJoCo's tasks need `pip install 'sejax[mujoco]'`. All are sejax's own, under
+Apache-2.0, and hold no data of others.
 
 """
 
