@@ -204,15 +204,14 @@ class LearnConfig(CommandConfig):
         spec, task_name = envs.spec_of(self.env), self.name("env")
         self.proxy.require_task(spec, task_name)
         max_steps = self.proxy.max_steps(spec.max_steps)
-        closed_form = getattr(self.objective, "closed_form", 0.0)
-        if closed_form:
+        if self.closed_form:
             require_best_action(self.proxy, spec, task_name)
-        if closed_form < 1 and not self.proxy.has_real_dynamics:
+        if self.closed_form < 1 and not self.proxy.has_real_dynamics:
             require_reachable("training", self.training, max_steps)
         for member in members_of(self):
             with named(member.field):
                 agents.require_fit(member.agent, self.exploration, spec, task_name)
-                if self.proxy.reaches_step_limit and closed_form < 1:
+                if self.proxy.reaches_step_limit and self.closed_form < 1:
                     limits = max_steps, spec.max_steps
                     require_learning("training", self.training, member.agent, *limits)
         if hasattr(self.objective, "require_agents"):
@@ -226,13 +225,17 @@ class LearnConfig(CommandConfig):
         return registry.name_of(group, getattr(self, group))
 
     @property
+    def closed_form(self) -> float:
+        """The share of the candidates that no agent trains on; 0 with objectives of your own."""
+        return float(getattr(self.objective, "closed_form", 0.0))
+
+    @property
     def scored_agents(self) -> tuple[str, ...]:
         """The agents that have scores of their own; none where an objective scores all as one."""
         if getattr(self.objective, "scores_all_agents", False):
             return ()
-        closed_form = getattr(self.objective, "closed_form", 0.0)
-        trained = members_of(self) if closed_form < 1 else ()
-        return (*(each.key for each in trained), *([CLOSED_FORM] if closed_form else ()))
+        trained = members_of(self) if self.closed_form < 1 else ()
+        return (*(each.key for each in trained), *([CLOSED_FORM] if self.closed_form else ()))
 
     def plain(self) -> dict[str, Any]:
         """Nested plain values, as in `config.yaml`; what `sejax.save` keeps with a proxy."""
@@ -262,7 +265,7 @@ class LearnConfig(CommandConfig):
         """The agent, or the mixture of agents, that trains on the proxies."""
         varied, each = self.agent_hparams == "varied", members_of(self)
         made = tuple(agents.make_agent(x.agent, task, self.exploration, varied) for x in each)
-        if self.agents is None and not getattr(self.objective, "closed_form", 0.0):
+        if self.agents is None and not self.closed_form:
             return made[0]
         names, weights = tuple(x.key for x in each), tuple(x.weight for x in each)
         shared = self.agents or MixtureConfig()

@@ -77,7 +77,8 @@ class StoaTask(Options):
             env = adapted(*args)
         except Exception as error:
             is_missing = isinstance(error, ImportError)
-            fix = f"Install pip install 'sejax[stoa]' {suite}." if is_missing else "Set another id."
+            install = f"Install it with pip install 'sejax[stoa]' {suite}."
+            fix = install if is_missing else "Set another id."
             raise options.ConfigError(
                 f"env must be an environment that {suite} can make here; {name} raised "
                 f"{options.told(error)}. {fix}",
