@@ -23,6 +23,7 @@ import tempfile
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -136,7 +137,7 @@ def checks(device: Any, cpu: Any) -> dict[str, Any]:
                 text = compiled.as_text()
     one, two = (jax.tree.leaves(jax.device_get(learned[x].weights)) for x in (device, cpu))
     apart = max(float(np.abs(x - y).max()) for x, y in zip(one, two, strict=True))
-    return {"largest_difference_of_weights": apart} | facts_of(text)
+    return {"largest_difference_of_weights": apart} | facts_of(text or "")
 
 
 def facts_of(text: str) -> dict[str, Any]:
@@ -214,15 +215,15 @@ def figures(args: argparse.Namespace) -> Iterator[tuple[str, Make, int]]:
     """What is measured: its name, what makes its program, and the number of agents."""
     for name in agents_of(args):
         for width in WIDTHS[:1] if args.quick else WIDTHS:
-            yield f"{name} trains", (lambda n=name, w=width: throughput(n, w, args)), width
+            yield f"{name} trains", partial(throughput, name, width, args), width
     if args.quick:
         return
     for size in (144, 4096):
-        yield "a generation of CartPole", (lambda s=size: generation(s)), size
+        yield "a generation of CartPole", partial(generation, size), size
     many = 10_000
-    yield "agents on the shipped SE of CartPole", (lambda: throughput("PPO", many, args)), many
+    yield "agents on the shipped SE of CartPole", partial(throughput, "PPO", many, args), many
     for width in (16, 256):
-        yield "steps of HalfCheetah on brax", (lambda w=width: cheetah(w)), width
+        yield "steps of HalfCheetah on brax", partial(cheetah, width), width
 
 
 def training_of(name: str, num: int, steps: int) -> tuple[Callable[..., Any], Any, Any]:
