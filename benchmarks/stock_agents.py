@@ -151,7 +151,8 @@ class Training(NamedTuple):
     Attributes:
       world: an SE, as `sejax.gym.make` takes it, or `REAL`.
       task: one of `TASKS`.
-      agent: one of `ALGORITHMS`, and changes of the zoo's settings: `sac learning_rate=1e-3`.
+      agent: one of `ALGORITHMS`, and changes of the zoo's settings: `sac learning_rate=1e-3`,
+        `PPO num_envs=8`.
       seed: of the agent and of its world.
       total_steps: what schedules span.
       num_episodes: of each test.
@@ -282,7 +283,8 @@ def run(training: Training) -> list[tuple[Any, ...]]:
     zoo = Zoo(training.total_steps) if is_default else ZOO[kind, env_id]
     changes = (word.split("=", 1) for word in training.agent.split()[1:])
     hparams = zoo.hparams | {name: ast.literal_eval(value) for name, value in changes}
-    envs: Any = make_vec_env(lambda: make_world(training), zoo.num_envs, seed=training.seed)
+    num_envs = hparams.pop("num_envs", zoo.num_envs)
+    envs: Any = make_vec_env(lambda: make_world(training), num_envs, seed=training.seed)
     if zoo.normalize:
         envs = VecNormalize(envs, gamma=hparams.get("gamma", 0.99))
     if zoo.noise:
