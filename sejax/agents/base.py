@@ -7,13 +7,15 @@ from dataclasses import dataclass
 from typing import ClassVar, NamedTuple, Protocol, TypeAlias, TypeVar
 
 import jax
+from flax import linen as nn
 from jaxtyping import Array, Int, PyTree
 
 from sejax.agents.buffers import BufferMaker
 from sejax.envs.base import Task
 from sejax.envs.environment import Environment, spaces_of
 from sejax.envs.spec import Discrete, Space
-from sejax.options import Options, counts, option, traced_options
+from sejax.ops.networks import OnImages
+from sejax.options import Options, counts, one_of, option, require, traced_options
 
 AgentState: TypeAlias = PyTree  # what the agent needs; only the agent reads it
 T = TypeVar("T")
@@ -218,6 +220,34 @@ class AgentOptions(AgentConfig):
     def spec(self) -> AgentSpec:
         """The spec of an agent that learns once it has warmed up."""
         return AgentSpec(warmup_episodes=self.warmup_episodes, learns_from=self.warmup_episodes)
+
+
+@dataclass(frozen=True, kw_only=True)
+class TorsoOptions(AgentOptions):
+    """What agents share that can see images."""
+
+    torso: str | None = option(None, one_of(("conv",)))  # what comes before the hidden layers
+    num_filters: int = option(16, counts())  # of torso=conv, each of 3 x 3 pixels
+
+    def with_torso(self, network: nn.Module, image: tuple[int, ...]) -> nn.Module:
+        """The network behind the torso.
+
+        Args:
+          network: of the hidden layers and the outputs.
+          image: rows, columns and channels of the observations; empty if they are no images.
+
+        Raises:
+          ConfigError: for a torso for images where there are none.
+        """
+        if self.torso is None:
+            return network
+        require(
+            len(image) == 3 and min(image[:2]) >= 3,
+            "agent.torso",
+            f"must be null for observations that are not images; got {self.torso}. Set "
+            "agent.torso=null.",
+        )
+        return OnImages(image, self.num_filters, network)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -17,7 +17,7 @@ from flax import linen as nn
 from flax import struct
 from jaxtyping import Array, Float, Int, PyTree
 
-from sejax.agents.base import Agent, AgentSpec, Hparams
+from sejax.agents.base import Agent, AgentSpec, Hparams, TorsoOptions
 from sejax.agents.buffers import Transition
 from sejax.agents.off_policy import OffPolicyOptions, adam_step, off_policy_agent, soft_update
 from sejax.agents.policies import decayed_epsilon, epsilon_greedy, select_action
@@ -30,7 +30,7 @@ LOSSES = {"squared": jnp.square, "huber": optax.losses.huber_loss}
 
 
 @dataclass(frozen=True, kw_only=True)
-class DDQNConfig(OffPolicyOptions):
+class DDQNConfig(OffPolicyOptions, TorsoOptions):
     """DDQN's hyperparameters; the defaults are the paper's "default agent hyperparameters"."""
 
     epsilon_init: float = option(1.0, fraction(), traced=True)  # share of random actions
@@ -63,7 +63,7 @@ class DDQNConfig(OffPolicyOptions):
     def make(self, task: Task) -> Agent:
         """The agent for a task's observations and actions."""
         assert task.num_actions is not None
-        return make_ddqn(self, task.obs_dim, task.num_actions)
+        return make_ddqn(self, task.obs_dim, task.num_actions, task.image)
 
     def network(self, num_actions: int) -> nn.Module:
         """Maps observations `[obs_dim, *batch]` to Q values `[num_actions, *batch]`."""
@@ -114,10 +114,13 @@ class DDQNState:
     hparams: Hparams  # traced options, and hidden_size and batch_size in use or None
 
 
-def make_ddqn(config: DDQNConfig, obs_dim: int, num_actions: int) -> Agent:
+def make_ddqn(
+    config: DDQNConfig, obs_dim: int, num_actions: int, image: tuple[int, ...] = ()
+) -> Agent:
     """Builds the agent for observations `[obs_dim]` and actions `0..num_actions-1`.
 
-    A `DuelingDDQNConfig` makes its network a dueling one.
+    A `DuelingDDQNConfig` makes its network a dueling one. `image` are rows, columns and channels of
+    observations that are images, for a config with a torso.
 
     Example:
       >>> agent = make_ddqn(DDQNConfig(), obs_dim=4, num_actions=2)
@@ -125,7 +128,7 @@ def make_ddqn(config: DDQNConfig, obs_dim: int, num_actions: int) -> Agent:
       >>> int(agent.act(jax.random.key(1), state, jnp.zeros(4), explore=False)) in (0, 1)
       True
     """
-    network = config.network(num_actions)
+    network = config.with_torso(config.network(num_actions), image)
     unflatten = flat.unflattener(network.init, jnp.zeros(obs_dim))
 
     def init(key: Array, hparams: Hparams) -> DDQNState:

@@ -20,7 +20,7 @@ import optax
 from flax import struct
 from jaxtyping import Array, Float, Int, PyTree
 
-from sejax.agents.base import Agent, AgentOptions, AgentSpec, Hparams, traced
+from sejax.agents.base import Agent, AgentSpec, Hparams, TorsoOptions, traced
 from sejax.agents.buffers import Rollout, Transition, rollout_buffer
 from sejax.agents.policies import Distribution, gaussian, softmax
 from sejax.envs.base import Task
@@ -49,7 +49,7 @@ _MAX_LOG_RATIO = 20.0  # exp(20) is beyond any clip, and finite
 
 
 @dataclass(frozen=True, kw_only=True)
-class PPOConfig(AgentOptions):
+class PPOConfig(TorsoOptions):
     """PPO (clip) for discrete and continuous actions.
 
     The defaults learn from few steps (`docs/agents.md`). `paper` has the paper's PPO.
@@ -116,7 +116,7 @@ class PPOConfig(AgentOptions):
             policy = gaussian(task.action_dim, task.max_action)
         else:
             policy = softmax(task.num_actions)
-        return make_ppo(self, task.obs_dim, policy, task.max_steps)
+        return make_ppo(self, task.obs_dim, policy, task.max_steps, task.image)
 
     def rollout_length(self, task_max_steps: int) -> int:
         """Decisions between two learning phases: `rollout_steps`, if that is set.
@@ -155,7 +155,13 @@ class PPOState(struct.PyTreeNode):
     hparams: Hparams  # traced options, and hidden_size in use or None
 
 
-def make_ppo(config: PPOConfig, obs_dim: int, policy: Distribution, max_steps: int) -> Agent:
+def make_ppo(
+    config: PPOConfig,
+    obs_dim: int,
+    policy: Distribution,
+    max_steps: int,
+    image: tuple[int, ...] = (),
+) -> Agent:
     """Builds the agent for observations `[obs_dim]` and a policy's actions.
 
     `update` learns once the rollout is full and costs next to nothing before, under `vmap` too.
@@ -171,6 +177,7 @@ def make_ppo(config: PPOConfig, obs_dim: int, policy: Distribution, max_steps: i
       policy: the distribution of actions. The rollout keeps continuous ones as drawn; they reach
         the environment clipped to its range.
       max_steps: the task's step limit for an episode, in environment steps.
+      image: rows, columns and channels of observations that are images, for a torso.
 
     Raises:
       ConfigError: if a rollout has fewer than two steps for each minibatch.
@@ -181,7 +188,7 @@ def make_ppo(config: PPOConfig, obs_dim: int, policy: Distribution, max_steps: i
       >>> int(agent.act(jax.random.key(1), state, jnp.zeros(4), explore=True)) in (0, 1)
       True
     """
-    networks = make_networks(config, obs_dim, policy)
+    networks = make_networks(config, obs_dim, policy, image)
     length = config.rollout_length(max_steps)
     require(
         config.num_minibatches == 1 or 2 * config.num_minibatches <= length,
@@ -247,12 +254,14 @@ class Networks(NamedTuple):
     least_params: Float[Array, " num_params"]
 
 
-def make_networks(config: PPOConfig, obs_dim: int, policy: Distribution) -> Networks:
+def make_networks(
+    config: PPOConfig, obs_dim: int, policy: Distribution, image: tuple[int, ...] = ()
+) -> Networks:
     """An actor `s -> outputs` and a critic `s -> V` of the same hidden layers, and the std."""
     shape = (config.hidden_size, config.num_layers, config.activation)
     mlps = {
-        "actor": MLP(policy.num_outputs, *shape, learn_prelu_slope=True),
-        "critic": MLP(1, *shape, learn_prelu_slope=True),
+        name: config.with_torso(MLP(size, *shape, learn_prelu_slope=True), image)
+        for name, size in (("actor", policy.num_outputs), ("critic", 1))
     }
 
     def init_tree(key: Array, hidden_size: Array | None = None) -> dict[str, PyTree]:

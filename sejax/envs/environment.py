@@ -178,7 +178,8 @@ def _of_gymnax(space: "GymnaxSpace", what: str) -> Space:
         return Discrete(int(space.n))
     if isinstance(space, spaces.Box):
         bounds = (np.broadcast_to(np.float32(x), space.shape) for x in (space.low, space.high))
-        return Box(*(tuple(bound.ravel().tolist()) for bound in bounds))
+        low, high = (tuple(bound.ravel().tolist()) for bound in bounds)
+        return Box(low, high, tuple(space.shape) if len(space.shape) == 3 else ())
     raise ConfigError(
         f"env must have {what} in a gymnax Box or Discrete space; got {shortened(repr(space))}. "
         "Make them one array in a subclass of sejax.envs.wrappers.Wrapper.",

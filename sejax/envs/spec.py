@@ -23,10 +23,16 @@ class Discrete:
 
 @dataclass(frozen=True)
 class Box:
-    """Vectors between two bounds, which may be infinite."""
+    """Vectors between two bounds, which may be infinite.
+
+    Attributes:
+      low, high: the bounds.
+      image: rows, columns and channels, if the vectors are images, row by row; else empty.
+    """
 
     low: tuple[float, ...]
     high: tuple[float, ...]
+    image: tuple[int, ...] = ()
 
     @classmethod
     def symmetric(cls, *high: float) -> "Box":
@@ -121,6 +127,11 @@ class TaskSpec:
     def num_actions(self) -> int | None:
         """Number of discrete actions; None for continuous ones."""
         return self.action.n if isinstance(self.action, Discrete) else None
+
+    @property
+    def image(self) -> tuple[int, ...]:
+        """Rows, columns and channels of observations that are images; else empty."""
+        return self.observation.image if isinstance(self.observation, Box) else ()
 
     @property
     def action_dim(self) -> int:
