@@ -52,6 +52,8 @@ TINY = {
     "null_baselines": {"sources": ["by_hand", "episodes", "evolved"], "students": "ddqn",
                        "hparams": "default", "policies": 1, "num_agents": 2, "num_evolved": 2,
                        "steps": 40, "teacher_steps": 60, "num_states": 16},
+    "minatar": {"games": "Breakout", "num_agents": 1, "ppo_steps": 1100, "dqn_steps": 400,
+                "num_parts": 2},
     "rn_heatmap": RNS,
     "rn_objectives": CURVES | {"objectives": ("reward_threshold", "auc")},
     "rn_performance": CURVES,
@@ -86,7 +88,7 @@ TINY = {
                             "test_episodes": 2},
     "timings": {"rows": "cliff_walking-rn", "generations": 1},
 }  # fmt: skip
-SLOW = {"break_even", "null_baselines", "rn_heatmap", "rn_objectives", "rn_performance",
+SLOW = {"break_even", "minatar", "null_baselines", "rn_heatmap", "rn_objectives", "rn_performance",
         "score_transforms", "se_distilled", "se_dynamics", "se_families", "se_feasibility",
         "se_horizons", "se_models", "se_myopia", "se_out_of_sample", "se_performance",
         "se_teachability", "se_tuners", "supervised_baseline"}  # fmt: skip
