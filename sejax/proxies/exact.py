@@ -40,6 +40,7 @@ def make_exact(
     form: str = "distance",
     slope: float = 1.0,
     widen: float = 1.0,
+    independent_starts: bool = False,
 ) -> tuple[ProxyEnv, dict[str, Any]]:
     """A one-step SE whose best policy is a given one.
 
@@ -52,6 +53,7 @@ def make_exact(
       form: of the reward where actions are continuous, `distance` or `quadratic`.
       slope: c, what a unit of it costs, or an action that is not the best.
       widen: deviation of the initial states, in units of the visited ones'.
+      independent_starts: whether their numbers are drawn without the visited states' covariance.
 
     Returns:
       The SE, and its weights; `sejax.save` writes them.
@@ -92,7 +94,9 @@ def make_exact(
     )
     weights = {
         "reward": as_weights(reward, config.hidden_size),
-        "start": as_weights(gaussian(task_states, widen), config.start_hidden_size),
+        "start": as_weights(
+            gaussian(task_states, widen, independent_starts), config.start_hidden_size
+        ),
     }
     return config.make(task), weights
 
@@ -178,14 +182,16 @@ def _with_action(layers: Sequence[Layer], size: int) -> list[Layer]:
     return found
 
 
-def gaussian(states: np.ndarray, widen: float = 1.0) -> list[Layer]:
+def gaussian(states: np.ndarray, widen: float = 1.0, independent: bool = False) -> list[Layer]:
     """Layers that turn standard normal noise n into a move, so that n and it have the moments.
 
     The mean and covariance of n + move are those of the states, the deviations times `widen`.
-    relu(n + c) - c is n but for noise below -c.
+    relu(n + c) - c is n but for noise below -c. Numbers that are `independent` have no covariance.
     """
     mean, size = states.mean(axis=0), states.shape[1]
     spread = widen**2 * np.cov(states, rowvar=False).reshape(size, size)
+    if independent:
+        spread = np.diag(np.diag(spread))
     # A number that does not vary keeps a deviation that is far below rounding.
     root = np.linalg.cholesky(spread + 1e-10 * np.eye(size) * max(1.0, np.abs(spread).max()))
     kernel = root - np.eye(size)
