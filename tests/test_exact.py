@@ -77,15 +77,21 @@ def test_a_discrete_action_costs_for_each_better_one(hidden):
     assert (got.argmax(axis=1) == outputs.argmax(axis=1)).all()
 
 
-def test_episodes_begin_like_the_states_that_were_visited():
-    env, weights = make_exact(TASKS["continuous"], layers_of(OBS_DIM, 2), STATES, widen=1.5)
+@pytest.mark.parametrize("independent", [False, True])
+def test_episodes_begin_like_the_states_that_were_visited(independent):
+    states = STATES @ [[1.0, 2.0, 0.0], [0.0, 1.0, 0.02], [0.0, 0.0, 1.0]]  # correlated
+    env, weights = make_exact(TASKS["continuous"], layers_of(OBS_DIM, 2), states, widen=1.5,
+                              independent_starts=independent)  # fmt: skip
     params = env.params(weights)
     keys = jax.random.split(jax.random.key(0), 40_000)
     starts = np.asarray(jax.jit(jax.vmap(lambda key: env.reset_env(key, params)[0]))(keys))
-    std = STATES.std(axis=0)
-    np.testing.assert_allclose((starts.mean(axis=0) - STATES.mean(axis=0)) / std, 0, atol=0.04)
+    std = states.std(axis=0)
+    np.testing.assert_allclose((starts.mean(axis=0) - states.mean(axis=0)) / std, 0, atol=0.04)
     scale = np.outer(std, std)
-    np.testing.assert_allclose(np.cov(starts.T) / scale, 2.25 * np.cov(STATES.T) / scale, atol=0.1)
+    wanted = np.cov(states.T)
+    assert np.abs(wanted / scale - np.diag(np.diag(wanted / scale))).max() > 0.5
+    wanted = np.diag(np.diag(wanted)) if independent else wanted
+    np.testing.assert_allclose(np.cov(starts.T) / scale, 2.25 * wanted / scale, atol=0.1)
 
 
 def test_a_number_that_never_varies_is_kept():
