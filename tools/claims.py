@@ -33,7 +33,8 @@ NUMBER = r"[-+]?\d[\d,]*(?:\.\d+)?%?"
 TABLE = re.compile(r"(<!-- table: (.+?) -->\n).*?(<!-- end -->)", re.DOTALL)
 # What no number is looked for in: generated tables, comments, code, mathematics, addresses.
 HIDDEN = re.compile(
-    r"<!--.*?-->|^ *(`{3,}).*?^ *\1|`[^`]*`|\$\$.*?\$\$|\$[^$\n]*\$|\]\([^)]*\)|https?://\S+",
+    r"<!--.*?-->|^ *(`{3,}).*?^ *\1|`[^`]*`|\$\$.*?\$\$|\$[^$\n]*\$|\]\([^)]*\)|https?://\S+"
+    r"|^:[^\n]*",  # directives and their options
     re.DOTALL | re.MULTILINE,
 )
 # Numbers of headings and of years, and those in names.
