@@ -45,8 +45,9 @@ AGENTS = {
 class Minatar(Settings):
     name = "minatar"
 
+    # Of gymnax's games of MinAtar.
     games: tuple[str, ...] = setting(tuple(GAMES), each_of(GAMES), quick=("Breakout",))
-    agents: tuple[str, ...] = setting(tuple(AGENTS), each_of(AGENTS))
+    agents: tuple[str, ...] = setting(tuple(AGENTS), each_of(AGENTS))  # kinds of agents
     num_agents: int = count(3, quick=1)  # seeds of each agent on each game
     ppo_steps: int = count(1_000_000, quick=3000)  # of a training of PPO
     dqn_steps: int = count(300_000, quick=3000)  # of DQN

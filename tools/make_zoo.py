@@ -32,7 +32,8 @@ agents that look at the next reward alone learn as well, `dynamics` if only far-
 
 Those called *distilled* were not evolved: each is [made of a searched policy](distill.md), which
 is all that it teaches, and stands beside the evolved SE of its task. Of three such runs with three
-seeds the one that ships taught those students best by which a run chooses its SE; what it is said to teach was measured on others.
+seeds the one that ships taught those students best by which a run chooses its SE; what it is said
+to teach was measured on others.
 
 Costs are those of the one run that ships, often the best of several: `cartpole` of five,
 `cartpole-rn` of ten, `cliff_walking-rn` of fifty, `mountain_car_continuous-rn` of five, by their
