@@ -3,8 +3,8 @@
 A policy that earns more may be a worse teacher. Searches with several sizes of the emulated error
 give policies of many kinds; of each one SE is made, on which fresh students of several kinds train.
 Beside them stands what can be known of a policy without a student: its return, its return with a
-random linear error in each episode, as of a student that learned it roughly, and how often its
-actions lie at their bounds. On the SE that teaches best, other forms are compared: the reward's
+random linear error in each episode, as of a student that learned it roughly, its return with noise
+on each action, and how often its actions lie at their bounds. On the SE that teaches best, other forms are compared: the reward's
 form and slope, the initial states, the number of steps.
 """
 
@@ -32,7 +32,7 @@ from sejax.cli import distilling
 from sejax.cli.config import LearnConfig, members_of
 from sejax.cli.distill_config import DistillConfig, read
 from sejax.distillation import teaching
-from sejax.distillation.policy_copy import erring, visit
+from sejax.distillation.policy_copy import Actor, acting, erring, visit
 from sejax.distillation.teaching import Lesson
 from sejax.envs.base import Task
 from sejax.options import each_of
@@ -89,6 +89,9 @@ class SeTeachability(Settings):
     num_formed: int = count(8, quick=2)  # of each kind on each form of the best SE
     # Errors that a policy is tested with.
     errors: tuple[float, ...] = setting((0.0, 0.1, 0.2, 0.3), quick=(0.0, 0.3))
+    # Noise on each action that a policy is tested with: Gaussian, in units of the action's bound; of
+    # discrete actions the probability of a random one.
+    noises: tuple[float, ...] = setting((0.1, 0.2, 0.4), quick=(0.2,))
     num_episodes: int = count(16, quick=2)  # of each such test
     run: tuple[str, ...] = setting(())  # overrides of sejax.distill
 
@@ -138,7 +141,7 @@ def compute(settings: SeTeachability) -> pd.DataFrame:
             "own": to_plain(own),
             "config": configuration.plain(config) | {"devices": None},
         }
-        tests = settings.values("errors", "num_episodes")
+        tests = settings.values("errors", "noises", "num_episodes")
 
         def tested(lessons: Any = lessons, config: Any = config) -> pd.DataFrame:
             return pd.DataFrame([_tested(settings, config, lesson) for lesson in lessons])
@@ -167,10 +170,36 @@ def _tested(settings: SeTeachability, config: LearnConfig, lesson: Lesson) -> di
         act = erring(task, lesson.layers, lesson.states, error, key, settings.num_episodes)
         seen = visit(task, act, key, settings.num_episodes)
         found[f"return_{error:g}"] = float(seen.returns.mean())
+    for noise in settings.noises:
+        act = noisy(task, acting(task, lesson.layers), noise, config.seed)
+        seen = visit(task, act, key, settings.num_episodes)
+        found[f"noise_{noise:g}"] = float(seen.returns.mean())
     outputs = evaluate(lesson.layers, lesson.states)
     is_continuous = task.num_actions is None
     found["saturated"] = float((np.abs(outputs) > task.max_action).mean()) if is_continuous else 0.0
     return found
+
+
+def noisy(task: Task, act: Actor, size: float, seed: int) -> Actor:
+    """A policy with noise on each action: Gaussian, or now and then a random action.
+
+    Args:
+      task: the real task.
+      act: the policy.
+      size: standard deviation in units of the action's bound; of discrete actions, how often.
+      seed: of the noise.
+    """
+    rng = np.random.default_rng(seed)
+
+    def noisy_act(obs: np.ndarray) -> np.ndarray:
+        actions = act(obs)
+        if task.num_actions is not None:
+            others = rng.integers(task.num_actions, size=actions.shape)
+            return np.where(rng.random(actions.shape) < size, others, actions)
+        wrong = size * task.max_action * rng.standard_normal(actions.shape)
+        return np.clip(actions + wrong, -task.max_action, task.max_action)
+
+    return noisy_act
 
 
 def _formed(
@@ -235,6 +264,7 @@ def summarise(settings: SeTeachability, rows: pd.DataFrame) -> pd.DataFrame:
     found = []
     for kind, mine in each.groupby("agent", sort=False):
         known = {f"return_{x:g}": f"return with an error of {x:g}" for x in settings.errors}
+        known |= {f"noise_{x:g}": f"return with action noise of {x:g}" for x in settings.noises}
         known["saturated"] = "share of actions at their bounds"
         for column, label in known.items():
             varies = mine[column].nunique() > 1 and mine["mean"].nunique() > 1
@@ -272,7 +302,8 @@ def report(settings: SeTeachability, rows: pd.DataFrame) -> pd.DataFrame:
         + f"\n\nOn each SE {settings.num_students} students of each kind trained; on each form of "
         f"the SE that taught best, {settings.num_formed}. An error is a random linear map of the "
         "observation in each episode; its size is the root mean square in units of the action's "
-        "bound."
+        "bound. Action noise is Gaussian in that unit; of discrete actions, the probability of a "
+        "random one."
     )
     title = f"What makes policies of {settings.env} teachable"
     return tables.publish(settings, title, texts, summary, note)
