@@ -4,8 +4,8 @@ A policy that earns more may be a worse teacher. Searches with several sizes of 
 give policies of many kinds; of each one SE is made, on which fresh students of several kinds train.
 Beside them stands what can be known of a policy without a student: its return, its return with a
 random linear error in each episode, as of a student that learned it roughly, its return with noise
-on each action, and how often its actions lie at their bounds. On the SE that teaches best, other forms are compared: the reward's
-form and slope, the initial states, the number of steps.
+on each action, and how often its actions lie at their bounds. On the SE that teaches best, other
+forms are compared: the reward's form and slope, the initial states, the number of steps.
 """
 
 import dataclasses
@@ -89,8 +89,8 @@ class SeTeachability(Settings):
     num_formed: int = count(8, quick=2)  # of each kind on each form of the best SE
     # Errors that a policy is tested with.
     errors: tuple[float, ...] = setting((0.0, 0.1, 0.2, 0.3), quick=(0.0, 0.3))
-    # Noise on each action that a policy is tested with: Gaussian, in units of the action's bound; of
-    # discrete actions the probability of a random one.
+    # Noise on each action that a policy is tested with: Gaussian, in units of the action's bound;
+    # of discrete actions the probability of a random one.
     noises: tuple[float, ...] = setting((0.1, 0.2, 0.4), quick=(0.2,))
     num_episodes: int = count(16, quick=2)  # of each such test
     run: tuple[str, ...] = setting(())  # overrides of sejax.distill
@@ -289,17 +289,19 @@ def report(settings: SeTeachability, rows: pd.DataFrame) -> pd.DataFrame:
             cells[figures.AGENT_NAMES[kind]] = f"{row['mean']:,.0f}, worst {row['min']:,.0f}"
         shown.append(cells)
     texts = pd.DataFrame(shown)
-    lines = ["| known of a policy | " + " | ".join(summary["kind"].unique()) + " |"]
-    lines.append("| --- " * (1 + summary["kind"].nunique()) + "|")
+    kinds = [figures.AGENT_NAMES[kind] for kind in summary["kind"].unique()]
+    lines = ["| known of a policy | " + " | ".join(kinds) + " |"]
+    lines.append("| --- " * (1 + len(kinds)) + "|")
     for known, mine in summary.groupby("known", sort=False):
-        rhos = " | ".join(f"{x:.2f}" for x in mine["rho_mean"])
+        rhos = " | ".join("alike" if np.isnan(x) else f"{x:.2f}" for x in mine["rho_mean"])
         lines.append(f"| {known} | {rhos} |")
     note = (
         "Spearman's correlation of what is known of a policy with the mean return of the students "
         f"on its SE, over {summary['policies'].max()} policies of "
         f"{len(list(settings.searches()))} searches:\n\n"
         + "\n".join(lines)
-        + f"\n\nOn each SE {settings.num_students} students of each kind trained; on each form of "
+        + "\n\n*alike*: all policies, or all their students, earned the same. "
+        f"On each SE {settings.num_students} students of each kind trained; on each form of "
         f"the SE that taught best, {settings.num_formed}. An error is a random linear map of the "
         "observation in each episode; its size is the root mean square in units of the action's "
         "bound. Action noise is Gaussian in that unit; of discrete actions, the probability of a "
