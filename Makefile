@@ -33,7 +33,7 @@ test-suites: TESTS := stoa
 # Stable-Baselines3, sbx, rejax, and the PyTorch code that benchmarks compare with. On Linux, PyPI's
 # torch brings CUDA along; PIP_EXTRA_INDEX_URL may name an index that has it without.
 test-examples: PACKAGES := --constraint constraints.txt --editable '.[examples,mujoco]'
-test-examples: TESTS := examples gym_sb3 torch_reference torch_reference_ppo torch_reference_td3 torch_nes
+test-examples: TESTS := examples gym_sb3 torch_reference torch_reference_ppo torch_reference_td3 torch_nes torch_vectorised
 
 # The newest trackers: trackio and constraints.txt have no pillow in common.
 test-trackers: PACKAGES := --editable '.[tensorboard,trackio,wandb]'

@@ -2,11 +2,12 @@
 
 Checks first: how far apart a tiny run is on both, whether the compiled program of a
 generation stays on the device and copies no large array, and how many kernels a step launches at
-least. Then figures: agent steps a second with more and more agents in one batch, generations of
-CartPole of 144 and of 4,096 candidates, ten thousand agents on the shipped SE, HalfCheetah on brax.
-No figure begins after `--minutes`, and the table says which are left out.
+least. Then figures: agent steps a second with more and more agents in one batch, the paper's DDQN
+beside vectorised PyTorch, generations of CartPole of 144 and of 4,096 candidates, ten thousand
+agents on the shipped SE, HalfCheetah on brax. No figure begins after `--minutes`, or if it would
+last longer by the one before; the table says which are left out.
 
-    pip install 'sejax[brax]' && python benchmarks/gpu.py --json gpu.json
+    pip install 'sejax[brax]' torch && python benchmarks/gpu.py --json gpu.json
 
 Without a GPU it measures the first device that there is. Seconds are wall-clock of the second call,
 compilation apart. Kernels are counted without a GPU, in the program that is lowered for CUDA: of
@@ -49,15 +50,16 @@ ALONE = (
 
 
 class World(NamedTuple):
-    """What agents of a kind train on: the words of its run, and a shipped SE."""
+    """What agents of a kind train on: the words of its run, and a shipped SE; else a fresh one."""
 
     words: tuple[str, ...]
-    proxy: str
+    proxy: str | None = None
 
 
+OF_THE_PAPER = "the paper's DDQN"
 AGENTS = {
     "quick DDQN": World(("env=cartpole", "agent=ddqn"), "cartpole"),
-    "the paper's DDQN": World(("env=cartpole", "agent=ddqn", "preset=paper"), "cartpole"),
+    OF_THE_PAPER: World(("env=cartpole", "agent=ddqn", "preset=paper")),
     "PPO": World(("env=cartpole", "agent=ppo"), "cartpole"),
     "TD3": World(("env=mountain_car_continuous", "agent=td3"), "mountain_car_continuous"),
 }
@@ -79,10 +81,10 @@ def main() -> None:
         "kernels": {name: kernels(name, args) for name in agents_of(args)},
     }  # fmt: skip
     show_checks(result)
-    rows = [
-        {"what": what, "agents": size, "on": device.platform, **clock.measure(make, device)}
-        for what, make, size in figures(args)
-    ]
+    rows = []
+    for what, make, size in figures(args, device):
+        found = clock.measure(what, make, size)
+        rows.append({"what": what, "agents": size, "on": device.platform, **found})
     result["figures"] = rows + (of_cpu(args) if has_card else [])
     show_figures(result)
     common.finish("gpu", args, result)
@@ -208,28 +210,89 @@ def name_of(op: Any) -> str:
 
 # --- figures -------------------------------------------------------------------------------------
 
-Make = Callable[[], tuple[Callable[..., Any], tuple[Any, ...]]]  # `(fn, arguments)`; fn gives steps
+
+class Program(NamedTuple):
+    """What is measured.
+
+    Attributes:
+      run: computes once, and returns the steps that it took.
+      facts: of the program, such as the bytes that it holds.
+    """
+
+    run: Callable[[], int]
+    facts: dict[str, float]
 
 
-def figures(args: argparse.Namespace) -> Iterator[tuple[str, Make, int]]:
+Make = Callable[[], Program]
+
+
+def figures(args: argparse.Namespace, device: Any) -> Iterator[tuple[str, Make, int]]:
     """What is measured: its name, what makes its program, and the number of agents."""
+    widths = WIDTHS[:1] if args.quick else WIDTHS
+    steps = 64 if args.quick else STEPS
+    on_device = partial(compiled, device)
     for name in agents_of(args):
-        for width in WIDTHS[:1] if args.quick else WIDTHS:
-            yield f"{name} trains", partial(throughput, name, width, args), width
+        for width in widths:
+            yield f"{name} trains", on_device(partial(throughput, name, width, steps)), width
+    for width in widths:
+        yield f"{OF_THE_PAPER} in PyTorch", partial(in_torch, device, width, steps), width
     if args.quick:
         return
     for size in (144, 4096):
-        yield "a generation of CartPole", partial(generation, size), size
+        yield "a generation of CartPole", on_device(partial(generation, size)), size
     many = 10_000
-    yield "agents on the shipped SE of CartPole", partial(throughput, "PPO", many, args), many
+    on_se = partial(throughput, "PPO", many, steps)
+    yield "agents on the shipped SE of CartPole", on_device(on_se), many
     for width in (16, 256):
-        yield "steps of HalfCheetah on brax", partial(cheetah, width), width
+        yield "steps of HalfCheetah on brax", on_device(partial(cheetah, width)), width
+
+
+def compiled(device: Any, parts: Callable[[], tuple[Callable[..., Any], tuple[Any, ...]]]) -> Make:
+    """A program of JAX for a device; `parts` gives the function and its arguments."""
+
+    def make() -> Program:
+        with jax.default_device(device):
+            fn, arguments = parts()
+            program = jax.jit(fn).lower(*arguments).compile()
+        used = program.memory_analysis()
+        sizes = (getattr(used, f"{x}_size_in_bytes", 0) for x in ("argument", "output", "temp"))
+        return Program(lambda: int(program(*arguments)), {"bytes": sum(sizes)})
+
+    return make
+
+
+def in_torch(device: Any, num: int, steps: int) -> Program:
+    """The paper's DDQN in vectorised PyTorch, on an SE as sejax's agents of that name have.
+
+    Raises:
+      RuntimeError: without PyTorch, or if it does not know the device.
+    """
+    try:
+        import torch
+        from torch_reference import SyntheticEnv
+        from torch_vectorised import train
+    except ImportError as error:
+        raise RuntimeError("needs PyTorch: pip install torch") from error
+    where = "cuda" if device.platform == "gpu" else device.platform
+    torch.zeros((), device=where)  # else said now
+    run = configuration.config(AGENTS[OF_THE_PAPER].words)
+    _, params = fresh_se(run)
+    env = SyntheticEnv(jax.device_get(params.weights), run.proxy, where)
+    return Program(partial(train, env, members_of(run)[0].agent, num, steps, where), {})
+
+
+def fresh_se(run: Any) -> tuple[Any, Any]:
+    """The SE of a run before it has learned, and its params."""
+    env = run.parts()["proxy"]
+    return env, env.params(env.init_weights(jax.random.key(0)))
 
 
 def training_of(name: str, num: int, steps: int) -> tuple[Callable[..., Any], Any, Any]:
     """The training of one agent for so many steps, keys for `num` of them, and the SE's params."""
-    env, params = sejax.load(AGENTS[name].proxy)
-    (member,) = members_of(configuration.config(AGENTS[name].words))
+    world = AGENTS[name]
+    run = configuration.config(world.words)
+    env, params = sejax.load(world.proxy) if world.proxy else fresh_se(run)
+    (member,) = members_of(run)
     config = dataclasses.replace(member.agent, **early(member.agent))
     agent = sejax.make_agent(config, env.task)
     training = TrainingConfig(max_steps=steps, max_episodes=steps, stop_rule="never")
@@ -241,8 +304,8 @@ def early(config: Any) -> dict[str, Any]:
     return {"warmup_episodes": 1} if hasattr(config, "warmup_episodes") else {}
 
 
-def throughput(name: str, num: int, args: argparse.Namespace) -> Any:
-    train, keys, params = training_of(name, num, 64 if args.quick else STEPS)
+def throughput(name: str, num: int, steps: int) -> Any:
+    train, keys, params = training_of(name, num, steps)
     fn = jax.vmap(train, (0, None))
     return (lambda keys, params: fn(keys, params).train_steps.sum()), (keys, params)
 
@@ -281,30 +344,28 @@ class Clock:
 
     def __init__(self, seconds: float):
         self.left = seconds
+        self._last: dict[str, tuple[int, float]] = {}  # agents and seconds of what was measured
 
-    def measure(self, make: Make, device: Any) -> dict[str, Any]:
-        """Compiles, runs twice, and times the second run; nothing once the time is over."""
-        started = time.perf_counter()
-        if self.left <= 0:
+    def measure(self, what: str, make: Make, agents: int) -> dict[str, Any]:
+        """Makes the program, runs it twice, and times the second run."""
+        size, seconds = self._last.get(what, (agents, 0.0))
+        if self.left <= 2 * seconds * agents / size:
             return {"left_out": "no time left"}
+        started = time.perf_counter()
         try:
-            with jax.default_device(device):
-                fn, arguments = make()
-                compiled = jax.jit(fn).lower(*arguments).compile()
-                compile_s = time.perf_counter() - started
-                steps = int(compiled(*arguments))
-                again = time.perf_counter()
-                jax.block_until_ready(compiled(*arguments))
-                wall_s = time.perf_counter() - again
+            program = make()
+            compile_s = time.perf_counter() - started
+            steps = program.run()
+            again = time.perf_counter()
+            program.run()
+            wall_s = time.perf_counter() - again
         except (RuntimeError, sejax.ConfigError) as error:  # out of memory, or an extra is missing
             return {"left_out": str(error).partition("\n")[0][:120]}
         finally:
             self.left -= time.perf_counter() - started
-        used = compiled.memory_analysis()
-        parts = ("argument", "output", "temp")
-        size = sum(getattr(used, f"{part}_size_in_bytes", 0) for part in parts)
+        self._last[what] = agents, wall_s
         return {"steps": steps, "wall_s": wall_s, "compile_s": compile_s,
-                "steps_per_s": steps / wall_s, "bytes": size}  # fmt: skip
+                "steps_per_s": steps / wall_s, **program.facts}  # fmt: skip
 
 
 # --- what is printed -----------------------------------------------------------------------------
@@ -327,7 +388,7 @@ def show_figures(result: dict[str, Any]) -> None:
             continue
         rows.append([
             *start, f"{row['steps_per_s']:,.0f}", f"{row['wall_s']:.2f}", f"{row['compile_s']:.1f}",
-            f"{row['bytes'] / 1e6:,.1f}",
+            f"{row['bytes'] / 1e6:,.1f}" if "bytes" in row else "",
         ])  # fmt: skip
     columns = ["what", "agents", "on", "steps/s", "s", "compile s", "MB"]
     common.print_table(f"{result['card']} ({result['platform']})", columns, rows)

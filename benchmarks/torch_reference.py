@@ -156,9 +156,12 @@ class SyntheticEnv:
     """The SE: its three networks run as one whose layers hold theirs side by side.
 
     Actions are indices, made one-hot here, or vectors.
+
+    Attributes:
+      soft: whether `done` is a number between going on and an end.
     """
 
-    def __init__(self, weights: Weights, config: SyntheticConfig):
+    def __init__(self, weights: Weights, config: SyntheticConfig, device: str = "cpu"):
         heads = [params_from_flax(weights[head]) for head in HEADS]
         self._params = []
         for i in range(config.num_layers + 1):
@@ -167,22 +170,28 @@ class SyntheticEnv:
             self._params.append(torch.cat([head[2 * i + 1] for head in heads]))
         self._params.append(torch.full((1,), PRELU_SLOPE))
         self._activation = config.activation
-        self._soft = config.done == "soft"
+        self.soft = config.done == "soft"
         self._obs_dim = len(heads[0][-1])
-        self._one_hot = torch.eye(self._params[0].shape[1] - self._obs_dim)
+        self._one_hot = torch.eye(self._params[0].shape[1] - self._obs_dim, device=device)
+        self._params = [x.to(device) for x in self._params]
+
+    def outputs(self, obs: Tensor, action: int | Tensor) -> Tensor:
+        """What the networks give, next state, reward and done: of one observation, or of rows."""
+        is_index = isinstance(action, int) or not action.is_floating_point()
+        vector = self._one_hot[action] if is_index else action
+        return mlp(self._params, torch.cat([vector, obs], dim=-1), self._activation)
 
     @torch.no_grad()
     def step(self, obs: Tensor, action: int | Tensor) -> Step:
         """One step from an observation with an action's index or vector."""
-        vector = self._one_hot[action] if isinstance(action, int) else action
-        out = mlp(self._params, torch.cat([vector, obs]), self._activation)
+        out = self.outputs(obs, action)
         values = out.tolist()
         size = max(map(abs, values)) if all(map(math.isfinite, values)) else math.nan
         if not size < ABSURD:
             return Step(obs, 0.0, 0.0, True, math.isnan(size))
         *_, reward, done = values
         terminated = done > 0.5
-        discount = 1 - done if self._soft else 1.0 - terminated
+        discount = 1 - done if self.soft else 1.0 - terminated
         return Step(out[: self._obs_dim], reward, discount, terminated, False)
 
 

@@ -12,7 +12,7 @@ touches no flag.
 import importlib
 from typing import TYPE_CHECKING, Any
 
-__version__ = "0.2.0"
+__version__ = "1.0.0"
 
 _EXPORTS = {
     "AUC": "sejax.objectives",

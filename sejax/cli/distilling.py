@@ -209,7 +209,7 @@ def _require_same(own: DistillConfig, config: LearnConfig, folder: Path) -> None
         write_text(path, yaml.safe_dump(wanted, sort_keys=False))
         return
     try:
-        stored = yaml.safe_load(path.read_text())
+        stored = yaml.safe_load(path.read_text(encoding="utf-8"))
     except (OSError, ValueError, yaml.YAMLError):
         stored = None
     require(

@@ -27,7 +27,7 @@ def _all_sections() -> dict[str, dict[str, dict[str, Any]]]:
     paths = sorted(PRESETS.glob(f"*{ENDING}"), key=lambda path: not path.stem.startswith(GENERAL))
     files: dict[str, dict[str, dict[str, Any]]] = {}
     for path in paths:  # the general ones first
-        sections = files[path.stem] = yaml.safe_load(path.read_text())
+        sections = files[path.stem] = yaml.safe_load(path.read_text(encoding="utf-8"))
         for name, section in sections.items():
             like = section.pop("like", None)  # stands before it in the file
             general = f"{GENERAL}-{path.stem.rpartition('-')[2]}"

@@ -72,7 +72,7 @@ def _load() -> ctypes.CDLL:
 def file_name() -> str:
     """What the library is called: there is one for each version of all that it is made of."""
     parts = (
-        SOURCE.read_text(),
+        SOURCE.read_text(encoding="utf-8"),
         " ".join(FLAGS),
         version("mujoco"),
         version("jaxlib"),
