@@ -27,7 +27,7 @@ test-suites test-examples test-trackers test-ray test-lowest test-latest:
 	build/$@/bin/python -m pytest $(OPTIONS) -n 2 --dist loadfile $(TESTS:%=tests/test_%.py)
 
 # Environments of other JAX suites, through stoa.
-test-suites: PACKAGES := --constraint constraints.txt --editable '.[stoa]' navix jumanji pgx xminigrid
+test-suites: PACKAGES := --constraint constraints.txt --editable '.[stoa]' brax craftax jumanji navix pgx playground xminigrid
 test-suites: TESTS := stoa
 
 # Stable-Baselines3, sbx, rejax, and the PyTorch code that benchmarks compare with. On Linux, PyPI's

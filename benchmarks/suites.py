@@ -1,7 +1,8 @@
 """Agent steps a CPU second in environments of other JAX suites, through `env=stoa/SUITE/ID`.
 
 PPO agents side by side, as `sejax.make_trainer` trains them; the second call is timed. Suites that
-are not installed are left out: `pip install 'sejax[stoa]' navix jumanji pgx xminigrid`.
+are not installed are left out: `pip install 'sejax[stoa]' brax craftax jumanji navix pgx playground
+xminigrid`.
 
     python benchmarks/suites.py
     python benchmarks/suites.py navix/Navix-DoorKey-5x5-v0 brax/inverted_pendulum
@@ -20,6 +21,7 @@ NAMES = (
     *("navix/Navix-Empty-5x5-v0", "navix/Navix-DoorKey-5x5-v0", "xminigrid/MiniGrid-Empty-5x5"),
     *("jumanji/Maze-v0", "jumanji/Game2048-v1", "jumanji/Snake-v1", "pgx/2048"),
     *("pgx/minatar-breakout", "pgx/minatar-asterix", "brax/inverted_pendulum"),
+    *("playground/CartpoleBalance", "craftax/Craftax-Classic-Symbolic-v1"),
 )
 
 

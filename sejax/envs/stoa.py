@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from sejax.envs.environment import Environment
 
 PREFIX = "stoa/"
-LIMITS = ("max_steps", "time_limit", "episode_length")  # as suites call it
+LIMITS = ("max_steps", "max_timesteps", "time_limit", "episode_length")  # as suites call it
 
 
 class Suite(NamedTuple):
@@ -39,11 +39,12 @@ class Suite(NamedTuple):
 
 SUITES = {
     "brax": Suite("brax.envs", "get_environment", ("brax", "BraxToStoa")),
+    "craftax": Suite("sejax.envs.stoa", "make_craftax", ("gymnax", "GymnaxToStoa")),
     "jumanji": Suite("jumanji", "make", ("jumanji", "JumanjiToStoa")),
     "navix": Suite("navix", "make", ("navix", "NavixToStoa")),
     "pgx": Suite("pgx", "make", ("pgx", "PGXToStoa")),
     "playground": Suite(
-        "mujoco_playground.registry", "load", ("playground", "MuJoCoPlaygroundToStoa")
+        "sejax.envs.stoa", "make_playground", ("playground", "MuJoCoPlaygroundToStoa")
     ),
     "xminigrid": Suite("xminigrid", "make", ("xminigrid", "XMiniGridToStoa")),
 }
@@ -91,9 +92,32 @@ class StoaTask(Options):
         )
 
 
+def make_craftax(name: str) -> Any:
+    """An environment of craftax, which has gymnax's interface and a copy of its spaces."""
+    from craftax.craftax_env import make_craftax_env_from_name
+    from gymnax.environments import spaces
+
+    env = make_craftax_env_from_name(name, auto_reset=False)
+    space = spaces.Discrete(env.action_space(env.default_params).n)
+    env.action_space = lambda params=None: space
+    return env
+
+
+def make_playground(name: str) -> Any:
+    """An environment of MuJoCo Playground on JAX: its default, Warp, wants a GPU of NVIDIA."""
+    from mujoco_playground import registry
+
+    return registry.load(name, config_overrides={"impl": "jax"})
+
+
 def _limit(made: tuple[Any, ...]) -> int:
     """The environment's own step limit, of what its suite has made."""
-    stated = (getattr(x, name, None) for x in made for name in LIMITS)
+    stated = (
+        getattr(x, name, None)
+        for each in made
+        for x in (each, getattr(each, "default_params", None), getattr(each, "_config", None))
+        for name in LIMITS
+    )
     return next((int(x) for x in stated if isinstance(x, int)), 1000)
 
 
