@@ -4,8 +4,8 @@ Checks first: how far apart a tiny run is on both, whether the compiled program 
 generation stays on the device and copies no large array, and how many kernels a step launches at
 least. Then figures: agent steps a second with more and more agents in one batch, the paper's DDQN
 beside vectorised PyTorch, generations of CartPole of 144 and of 4,096 candidates, ten thousand
-agents on the shipped SE, HalfCheetah on brax. No figure begins after `--minutes`, or if it would
-last longer by the one before; the table says which are left out.
+agents on the shipped SE, HalfCheetah on brax. No figure begins after `--minutes`, or if the one
+before tells that it would not end in time; the table says which are left out.
 
     pip install 'sejax[brax]' torch && python benchmarks/gpu.py --json gpu.json
 
@@ -274,7 +274,10 @@ def in_torch(device: Any, num: int, steps: int) -> Program:
     except ImportError as error:
         raise RuntimeError("needs PyTorch: pip install torch") from error
     where = "cuda" if device.platform == "gpu" else device.platform
-    torch.zeros((), device=where)  # else said now
+    try:
+        torch.zeros((), device=where)
+    except (AssertionError, RuntimeError) as error:  # such as: not compiled with CUDA enabled
+        raise RuntimeError(str(error)) from error
     run = configuration.config(AGENTS[OF_THE_PAPER].words)
     _, params = fresh_se(run)
     env = SyntheticEnv(jax.device_get(params.weights), run.proxy, where)
@@ -301,7 +304,7 @@ def training_of(name: str, num: int, steps: int) -> tuple[Callable[..., Any], An
 
 def early(config: Any) -> dict[str, Any]:
     """Learning from the first steps on, so that a short training is like a long one."""
-    return {"warmup_episodes": 1} if hasattr(config, "warmup_episodes") else {}
+    return {"warmup_episodes": 0} if hasattr(config, "warmup_episodes") else {}
 
 
 def throughput(name: str, num: int, steps: int) -> Any:

@@ -124,7 +124,8 @@ def report(settings: Minatar, rows: pd.DataFrame) -> pd.DataFrame:
     draw(rows, settings.folder / "learning_curves.png")
     summary = summarise(rows)
     note = (
-        "Returns of training episodes, with exploration; mean over agents. gymnax's returns are "
+        "Returns of training episodes, with exploration, in the last tenth of the steps, of which "
+        "each part weighs alike; mean over agents. gymnax's returns are "
         "those of its README. Pictures: shaded from the worst to the best agent."
     )
     title = "Agents with a convolution on MinAtar"

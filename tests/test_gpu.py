@@ -29,7 +29,9 @@ def test_the_command_measures_and_writes_its_result(tmp_path):
     assert result["checks"] == {
         "largest_difference_of_weights": 0.0, "visits_of_the_host": 0, "copies_of_large_arrays": 0
     }  # fmt: skip
-    (row,) = result["figures"]
+    row, in_torch = result["figures"]
+    assert in_torch["what"] == "the paper's DDQN in PyTorch"
+    assert in_torch.get("steps", 16 * 64) == 16 * 64
     assert row["agents"] == 16 and row["steps"] == 16 * 64 and row["steps_per_s"] > 0
     assert 10 < result["kernels"]["quick DDQN"]["a_step"] < 100
     assert "Kernels of an agent step" in done.stdout
@@ -59,10 +61,15 @@ def test_facts_of_a_program_are_visits_and_large_copies(gpu):
 
 
 def test_what_takes_too_long_or_fails_is_left_out(gpu):
-    device = jax.devices("cpu")[0]
-    assert gpu.Clock(0).measure(lambda: 1 // 0, device) == {"left_out": "no time left"}
+    no_time = {"left_out": "no time left"}
+    assert gpu.Clock(0).measure("x", lambda: 1 // 0, 1) == no_time
 
     def too_large():
         raise RuntimeError("out of memory\nand more")
 
-    assert gpu.Clock(9).measure(too_large, device) == {"left_out": "out of memory"}
+    assert gpu.Clock(9).measure("x", too_large, 1) == {"left_out": "out of memory"}
+    clock, quick = gpu.Clock(9), gpu.Program(lambda: 7, {"bytes": 3})
+    assert clock.measure("x", lambda: quick, 1).items() >= {"steps": 7, "bytes": 3}.items()
+    clock._last["x"] = 1, 5.0  # seconds of one agent: two would take some ten, and it runs twice
+    assert clock.measure("x", lambda: quick, 2) == no_time
+    assert clock.measure("y", lambda: quick, 2)["steps"] == 7

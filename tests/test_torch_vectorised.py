@@ -41,15 +41,38 @@ def test_updates_and_values_are_those_of_agents_alone():
         torch.testing.assert_close(many.values(obs)[i], q_values)
 
 
-def test_the_se_gives_rows_what_it_gives_one():
+@pytest.mark.parametrize("done", ["soft", "threshold"])
+def test_a_step_of_many_is_that_of_each(done):
+    torch.manual_seed(1)
     weights = {name: reference.params_to_flax(reference.init_mlp([6, 5, size], "leaky_relu"))
                for name, size in reference.HEADS.items()}  # fmt: skip
-    config = SyntheticConfig(hidden_size=5, num_layers=1, activation="leaky_relu", done="soft")
+    weights["done"]["Dense_1"]["bias"] += 0.5  # some end, some do not
+    config = SyntheticConfig(hidden_size=5, num_layers=1, activation="leaky_relu", done=done)
     env = reference.SyntheticEnv(weights, config)
-    obs, action = torch.randn(7, 4), torch.randint(2, (7,))
-    rows = env.outputs(obs, action)
-    for i in range(7):
+    obs, action = torch.randn(20, 4), torch.randint(2, (20,))
+    obs[3], obs[4, 0] = 1e9, float("nan")  # absurd
+    many = vectorised.take(env, obs, action)
+    rows = vectorised.packed(obs, action, many)
+    assert 2 < many.terminated.sum() < 20 and many.terminated[3] and many.terminated[4]
+    for i in range(20):
         step = env.step(obs[i], int(action[i]))
-        torch.testing.assert_close(rows[i, :4], step.obs)
-        assert float(rows[i, 4]) == pytest.approx(step.reward, abs=1e-6)
+        torch.testing.assert_close(many.next_obs[i], step.obs, equal_nan=True)
+        found = [float(x[i]) for x in (many.reward, many.discount, many.terminated)]
+        wanted = [step.reward, step.discount, step.terminated]
+        assert found == pytest.approx(wanted, abs=1e-6)
+        assert rows[i, 8:10].tolist() == pytest.approx([int(action[i]), step.reward], abs=1e-6)
+    assert len({round(float(x), 4) for x in many.discount}) > (5 if done == "soft" else 1)
     assert vectorised.train(env, CONFIG, 5, 30, "cpu") == 150
+    with pytest.raises(ValueError, match="only these hyperparameters are built"):
+        vectorised.train(env, DDQNConfig(double=False), 5, 30, "cpu")
+
+
+def test_a_batch_has_each_agents_own_rows():
+    stored = torch.arange(4 * 3 * 11.0).reshape(4, 3, 11)
+    batches = vectorised.drawn(stored, 2, 50)
+    for agent in range(3):
+        first = batches.obs[agent, :, 0]
+        assert set(first.tolist()) == {float(stored[i, agent, 0]) for i in range(2)}
+        torch.testing.assert_close(batches.next_obs[agent, :, 0], first + 4)
+        assert batches.action[agent, :, 0].tolist() == (first + 8).long().tolist()
+        torch.testing.assert_close(batches.discount[agent, :, 0], first + 10)

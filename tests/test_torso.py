@@ -63,6 +63,7 @@ def task():
 def test_gymnax_images_keep_their_shape():
     task = sejax.envs.make("gymnax/Breakout-MinAtar")
     assert task.image == (10, 10, 4) and task.obs_dim == 400
+    assert TaskSpec.of_interface(task.interface).image == task.image  # as a file keeps it
     assert sejax.envs.make("cartpole").image == ()
     assert sejax.envs.make("cliff_walking").image == ()
 
@@ -84,6 +85,8 @@ def test_an_agent_tells_patterns_apart(task, agent):
 def test_a_torso_needs_images(agent):
     with pytest.raises(sejax.ConfigError, match=r"agent\.torso must be null .* got conv\."):
         sejax.make_agent(AGENTS[agent], sejax.envs.make("cartpole"))
+    with pytest.raises(sejax.ConfigError, match=r"agent\.num_filters must be left out .* got 4\."):
+        type(AGENTS[agent])(num_filters=4)
 
 
 def test_units_behind_a_torso_can_be_switched_off(task):

@@ -229,6 +229,14 @@ class TorsoOptions(AgentOptions):
     torso: str | None = option(None, one_of(("conv",)))  # what comes before the hidden layers
     num_filters: int = option(16, counts())  # of torso=conv, each of 3 x 3 pixels
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require(
+            self.torso is not None or self.num_filters == type(self).num_filters,
+            "agent.num_filters",
+            f"must be left out without a torso; got {self.num_filters}. Set agent.torso=conv.",
+        )
+
     def with_torso(self, network: nn.Module, image: tuple[int, ...]) -> nn.Module:
         """The network behind the torso.
 
@@ -244,8 +252,8 @@ class TorsoOptions(AgentOptions):
         require(
             len(image) == 3 and min(image[:2]) >= 3,
             "agent.torso",
-            f"must be null for observations that are not images; got {self.torso}. Set "
-            "agent.torso=null.",
+            "must be null unless observations are images of rows, columns and channels, at least 3 "
+            f"x 3 pixels; got {self.torso}. Set agent.torso=null.",
         )
         return OnImages(image, self.num_filters, network)
 

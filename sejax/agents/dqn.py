@@ -54,7 +54,8 @@ class DDQNConfig(OffPolicyOptions, TorsoOptions):
     @property
     def cpu_num_parallel(self) -> int:
         """The fastest `vmap` width on one CPU core."""
-        is_small = self.num_layers == 1 and self.hidden_size * self.batch_size <= cpu.SMALL_PRODUCT
+        product = self.hidden_size * self.batch_size
+        is_small = self.torso is None and self.num_layers == 1 and product <= cpu.SMALL_PRODUCT
         return cpu.SMALL_NUM_PARALLEL if is_small else 1
 
     def spec(self) -> AgentSpec:

@@ -257,7 +257,10 @@ class Networks(NamedTuple):
 def make_networks(
     config: PPOConfig, obs_dim: int, policy: Distribution, image: tuple[int, ...] = ()
 ) -> Networks:
-    """An actor `s -> outputs` and a critic `s -> V` of the same hidden layers, and the std."""
+    """An actor `s -> outputs` and a critic `s -> V` of the same hidden layers, and the std.
+
+    `image` is that of `make_ppo`.
+    """
     shape = (config.hidden_size, config.num_layers, config.activation)
     mlps = {
         name: config.with_torso(MLP(size, *shape, learn_prelu_slope=True), image)

@@ -51,7 +51,8 @@ class DistillConfig(Options):
     slope: float = option(1.0, positive("a reward must tell actions apart"))  # of the SE's reward
     # Deviation of the SE's initial states, in units of those that the policy visits.
     widen: float = option(1.0, positive("it is a scale"))
-    # Whether the numbers of an initial state are drawn without the visited states' covariance.
+    # Whether the numbers of an initial state are independent; else they have the visited states'
+    # covariance.
     independent_starts: bool = False
     # Policies that are taught: the best tested one of each of so many equal parts of the search.
     num_snapshots: int = option(6, counts("something must be taught"))

@@ -90,7 +90,8 @@ class TaskSpec:
         """What agents see, as plain values that a proxy's file keeps.
 
         `observation` and `action` are `{"n": categories}` or the bounds of a vector, `{"low": [x],
-        "high": [x]}` with None where there is none; `max_steps` is the step limit.
+        "high": [x]}` with None where there is none, and the shape `image` of images; `max_steps` is
+        the step limit.
         """
         return {
             "observation": _plain(self.observation),
@@ -151,10 +152,11 @@ def _plain(space: Space) -> dict[str, Any]:
     if isinstance(space, Discrete):
         return {"n": space.n}
     bounds = {"low": space.low, "high": space.high}
-    return {
+    plain: dict[str, Any] = {
         name: [float(np.float32(x)) if math.isfinite(x) else None for x in bound]
         for name, bound in bounds.items()
     }
+    return plain | ({"image": list(space.image)} if space.image else {})
 
 
 def _space_of(plain: Mapping[str, Any]) -> Space:
@@ -165,4 +167,4 @@ def _space_of(plain: Mapping[str, Any]) -> Space:
         tuple(end if x is None else float(x) for x in plain[name])
         for name, end in (("low", -math.inf), ("high", math.inf))
     )
-    return Box(low, high)
+    return Box(low, high, tuple(plain.get("image", ())))

@@ -53,7 +53,8 @@ def make_exact(
       form: of the reward where actions are continuous, `distance` or `quadratic`.
       slope: c, what a unit of it costs, or an action that is not the best.
       widen: deviation of the initial states, in units of the visited ones'.
-      independent_starts: whether their numbers are drawn without the visited states' covariance.
+      independent_starts: whether their numbers are independent; else they have the covariance of
+        the visited states.
 
     Returns:
       The SE, and its weights; `sejax.save` writes them.

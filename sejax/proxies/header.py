@@ -111,9 +111,15 @@ def _is_count(number: object) -> bool:
 
 
 def _is_space(space: Space) -> bool:
-    """Whether a space has entries, and bounds of single precision in their order."""
+    """Whether a space has entries, bounds of single precision in their order, and a fit shape."""
     if not isinstance(space, Box):
         return _is_count(space.n)
+    if space.image and not (
+        len(space.image) == 3
+        and all(map(_is_count, space.image))
+        and math.prod(space.image) == space.size
+    ):
+        return False
     pairs = list(zip(space.low, space.high, strict=True))
     are_floats = all(math.isinf(x) or abs(x) <= _LARGEST_FLOAT for pair in pairs for x in pair)
     are_ordered = all(low <= high and low < math.inf and high > -math.inf for low, high in pairs)
