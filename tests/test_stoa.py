@@ -107,14 +107,16 @@ def test_agents_train_there(name):
     assert not result.nonfinite.any()
 
 
-def test_a_reward_network_is_learned_there(tmp_path):
-    pytest.importorskip("navix")
+@pytest.mark.filterwarnings("default")
+@pytest.mark.parametrize("name", [*IDS[:-1], "pgx/2048"])
+def test_a_reward_network_is_learned_there(name, tmp_path):
+    needs(name.partition("/")[0])
     main([
-        *("env=stoa/navix/Navix-Empty-5x5-v0", "env.solved_reward=0.9", "proxy=rn", "agent=ppo"),
+        *(f"env=stoa/{name}", "env.solved_reward=0.9", "proxy=rn", "agent=ppo"),
         *("generations=2", "es.population_size=2", "training.max_episodes=3", "devices=1"),
         *("agent.rollout_steps=32", "training.test_episodes=1", f"run_dir={tmp_path}"),
     ])  # fmt: skip
-    assert sejax.load_proxy(tmp_path).task.name == "stoa/navix/Navix-Empty-5x5-v0"
+    assert sejax.load_proxy(tmp_path).task.name == f"stoa/{name}"
 
 
 @pytest.mark.parametrize(
