@@ -11,7 +11,7 @@ BIN := $(VENV)/bin
     claims docs linkcheck dist clean
 
 run: $(VENV)/.installed
-	$(BIN)/python -m sejax.run env=cartpole stop_when_solved=true
+	$(BIN)/python -m sejax.run env=cartpole stop_when_solved=true run_dir=runs/first
 
 test: $(VENV)/.installed-dev
 	$(BIN)/python -m pytest -n 2 --dist loadfile
