@@ -312,20 +312,21 @@ def report(settings: SeTeachability, rows: pd.DataFrame) -> pd.DataFrame:
 
 
 def draw(settings: SeTeachability, rows: pd.DataFrame, path: Path) -> None:
-    """Draws students' returns against the policy's own, and against that with the largest error."""
+    """Draws students' returns against the policy's own, and that with most error or noise."""
     each, kinds = by_policy(rows), settings.kinds
-    columns = [f"return_{settings.errors[0]:g}", f"return_{max(settings.errors):g}"]
-    labels = ["return of the policy", f"with an error of {max(settings.errors):g}"]
-    size = (0.6 + 2.5 * len(kinds), 4.8)
-    with figures.panels(path, 2, len(kinds), size, sharey=True) as (_, axes):
+    error, noise = max(settings.errors), max(settings.noises)
+    columns = [f"return_{settings.errors[0]:g}", f"return_{error:g}", f"noise_{noise:g}"]
+    labels = ["return of the policy", f"with an error of {error:g}", f"with noise of {noise:g}"]
+    size = (0.6 + 2.5 * len(kinds), 2.4 * len(columns))
+    with figures.panels(path, len(columns), len(kinds), size, sharey=True) as (_, axes):
         for axis_row, column, label in zip(axes, columns, labels, strict=True):
             for axis, kind in zip(axis_row, kinds, strict=True):
                 mine = each[each["agent"] == kind]
                 ends = [mine[column].min(), mine[column].max()]
                 axis.plot(ends, ends, color="0.75", lw=1)
-                for error, some in mine.groupby("searched_with"):
+                for searched_with, some in mine.groupby("searched_with"):
                     axis.plot(some[column], some["mean"], "o", ms=4, alpha=0.7,
-                              label=f"searched with {error:g}")  # fmt: skip
+                              label=f"searched with {searched_with:g}")  # fmt: skip
                 axis.set_title(figures.AGENT_NAMES[kind], fontsize=10)
                 axis.set_xlabel(label)
         for axis_row in axes:

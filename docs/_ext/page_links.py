@@ -1,9 +1,11 @@
-"""Links from docstrings, which name pages by their files, to the pages of the site."""
+"""Links from docstrings, which name pages by their files, and from sources back to the pages."""
 
 import re
 from typing import Any
 
 from sphinx.application import Sphinx
+
+SOURCES = "_modules/"
 
 
 def link_pages(app: Sphinx, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:
@@ -11,6 +13,25 @@ def link_pages(app: Sphinx, what: str, name: str, obj: Any, options: Any, lines:
     lines[:] = [re.sub(r"`?(docs/(\w+)\.md)`?", r":doc:`\1 </docs/\2>`", line) for line in lines]
 
 
+def link_back(app: Sphinx, page: str, template: str, context: Any, doctree: Any) -> None:
+    """Names an object by its own module where a page documents it by that.
+
+    Sphinx names all objects of a module as the first one that is documented, which may be an alias.
+    """
+    if not page.startswith(SOURCES):
+        return
+    module = page.removeprefix(SOURCES).replace("/", ".")
+    known = app.env.domaindata["py"]["objects"]
+
+    def own(match: re.Match[str]) -> str:
+        name = f"{module}.{match[2]}"
+        return f'{match[1]}#{name}"' if name in known else match[0]
+
+    back = r'(<a class="viewcode-back" href="[^"#]*)#sejax\.([^"]*)"'
+    context["body"] = re.sub(back, own, context["body"])
+
+
 def setup(app: Sphinx) -> dict[str, bool]:
     app.connect("autodoc-process-docstring", link_pages)
+    app.connect("html-page-context", link_back)
     return {"parallel_read_safe": True, "parallel_write_safe": True}
