@@ -46,7 +46,8 @@ class SeTuners(Settings):
     # Kinds of agents whose configurations are ranked; all that fit the task.
     ranked: tuple[str, ...] = setting((), each_of(tuple(dict.fromkeys(DISCRETE + CONTINUOUS))))
     run: tuple[str, ...] = setting(())  # overrides of the NES runs
-    num_configs: int = count(64, quick=8)  # of each kind, to learn from and to rank
+    learn_configs: int = count(256, quick=8)  # to learn from
+    num_configs: int = count(64, quick=8)  # of each kind, to rank
     num_seeds: int = count(8, least=2, quick=2)  # real trainings of each
     steps: int = count(10_000, quick=300)  # of a real training
     num_tuners: int = count(5, quick=2)  # of as many SEs each
@@ -78,7 +79,7 @@ def measured(settings: SeTuners, kind: str, seed: int, steps: int, first_seed: i
     words = {
         "env": settings.env,
         "agent": kind,
-        "configs": settings.num_configs,
+        "configs": settings.learn_configs if seed == LEARN else settings.num_configs,
         "seeds": seeds,
         "first_seed": first_seed,
         "steps": steps,
@@ -402,7 +403,7 @@ def report(settings: SeTuners, rows: pd.DataFrame) -> pd.DataFrame:
     note = (
         f"{settings.num_configs} configurations of each kind that took no part in learning, each "
         f"judged by the mean return of {settings.num_seeds} agents after {settings.steps:,} real "
-        f"steps. SEs are learned from {settings.num_configs} others of "
+        f"steps. SEs are learned from {settings.learn_configs} others of "
         f"{figures.AGENT_NAMES[settings.learner]}, a quarter of which judges incumbents. On an SE "
         f"{settings.tuning_seeds} agents of a configuration train and are tested on it. Rho: "
         "Spearman's correlation with the judging returns; in brackets 95%, of tuners Student's "

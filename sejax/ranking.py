@@ -68,7 +68,7 @@ class Ranking(Options):
     # Share of each agent's configurations, the last ones, that judge incumbents; no candidate is
     # learned from them.
     judging: float = option(0.25, between(0.05, 0.9, "some must learn and some must judge"))
-    # Configurations that a generation draws anew to learn from; null: all.
+    # Configurations that a generation draws anew to learn from, of each agent; all if that is fewer.
     num_configs: int | None = option(None, counts("ranks compare several", least=2))
     # Trainings of a configuration on an SE, whose mean is ranked: of learning and of judging.
     num_seeds: int = option(1, counts("an agent must train"))
@@ -540,13 +540,13 @@ def make_evaluators(
         return jnp.stack(agreements).mean(), reached
 
     def drawn(key: Array) -> list[Configurations]:
-        if options.num_configs is None:
-            return learning
-        places = [
-            jax.random.permutation(jax.random.fold_in(key, i), len(x.returns))
-            for i, x in enumerate(learning)
-        ]
-        return [x.take(p[: options.num_configs]) for x, p in zip(learning, places, strict=True)]
+        most, found = options.num_configs, []
+        for i, each in enumerate(learning):
+            size = len(each.returns)
+            is_part = most is not None and most < size
+            places = jax.random.permutation(jax.random.fold_in(key, i), size)[:most]
+            found.append(each.take(places) if is_part else each)
+        return found
 
     def make_run(judges: bool) -> Callable[..., Outcome]:
         def run(key: Array, env_params: PyTree, active: Array | bool, _: Any = None) -> Outcome:
