@@ -146,8 +146,10 @@ def compute(settings: SeTeachability) -> pd.DataFrame:
         def tested(lessons: Any = lessons, config: Any = config) -> pd.DataFrame:
             return pd.DataFrame([_tested(settings, config, lesson) for lesson in lessons])
 
-        def learned(own: Any = own, config: Any = config, lessons: Any = lessons) -> pd.DataFrame:
-            return distilling.students(own, config, lessons, distilling.CHOOSE)
+        def learned(
+            own: Any = own, config: Any = config, lessons: Any = lessons, folder: Path = folder
+        ) -> pd.DataFrame:
+            return distilling.students(own, config, lessons, distilling.CHOOSE, folder)
 
         columns = {"search": name, "searched_with": own.search.policy_error}
         rows = settings.shards.compute(f"policies-{name}", made_with | tests, tested)

@@ -73,6 +73,30 @@ def test_a_killed_search_goes_on_to_the_same_se(folder, tmp_path, kept):
     assert sejax.load_proxy(folder).fingerprint == sejax.load_proxy(tmp_path).fingerprint
 
 
+def test_students_that_have_trained_do_not_train_again(folder, tmp_path, monkeypatch):
+    path, teach, calls = shutil.copytree(folder, tmp_path / "copy"), distilling.teaching.teach, []
+    shutil.rmtree(path / "students")
+    for name in ("students.csv", "proxy.safetensors"):
+        (path / name).unlink()
+
+    def killed(*args):
+        if len(calls) == 1:
+            raise KeyboardInterrupt
+        calls.append(args)
+        return teach(*args)
+
+    monkeypatch.setattr(distilling.teaching, "teach", killed)
+    own, config = read([*QUICK, f"run_dir={path}"])
+    with pytest.raises(KeyboardInterrupt):
+        distilling.distill(own, config, path)
+    monkeypatch.setattr(distilling.teaching, "teach", lambda *x: calls.append(x) or teach(*x))
+    distilling.distill(own, config, path)
+    names = ["use", "generation", "agent", "student", "test_return"]
+    one, two = (pd.read_csv(x / "students.csv")[names] for x in (folder, path))
+    pd.testing.assert_frame_equal(one, two)
+    assert len(calls) == len(one.groupby(["use", "agent"]))  # each kind once
+
+
 def test_a_folder_of_another_command_is_left_alone(folder, tmp_path):
     path = shutil.copytree(folder, tmp_path / "copy")
     with pytest.raises(ConfigError, match=r"search.step_size \(0.02 there, 0.5 here\)"):

@@ -56,11 +56,11 @@ def distill(own: DistillConfig, config: LearnConfig, folder: Path, words: str = 
     env, weights = teaching.make_ses(config.task(), lessons, **own.of_ses)
     best, chosen_by = 0, pd.DataFrame()
     if len(lessons) > 1:
-        chosen_by = students(own, config, lessons, CHOOSE)
+        chosen_by = students(own, config, lessons, CHOOSE, folder)
         grades = teaching.grades(chosen_by)
         _print_grades(chosen_by, grades)
         best = [each.generation for each in lessons].index(int(grades.idxmax()))
-    rows = pd.concat([chosen_by, students(own, config, [lessons[best]], TEST)])
+    rows = pd.concat([chosen_by, students(own, config, [lessons[best]], TEST, folder)])
     write_text(folder / "students.csv", rows.to_csv(index=False))
     costs["cpu_s"] += rows["cpu_s"].sum()
     costs["real_steps"] += int(rows["real_steps"].sum())
@@ -266,11 +266,16 @@ def _restored(folder: Path, policy: Policy) -> tuple[list[Policy], list[dict[str
 
 
 def students(
-    own: DistillConfig, config: LearnConfig, lessons: Sequence[Lesson], use: str
+    own: DistillConfig,
+    config: LearnConfig,
+    lessons: Sequence[Lesson],
+    use: str,
+    folder: Path,
 ) -> pd.DataFrame:
     """A row for each student on the SE of each lesson; see `sejax.distillation.teaching`.
 
-    Those that choose an SE (`CHOOSE`) are others than those that test it (`TEST`).
+    Those that choose an SE (`CHOOSE`) are others than those that test it (`TEST`). The rows of each
+    kind are kept in the folder before the next kind trains.
     """
     task, found = config.task(), []
     env, weights = teaching.make_ses(task, lessons, **own.of_ses)
@@ -278,11 +283,16 @@ def students(
         keys_of(config)[use], own.num_students if use == CHOOSE else own.num_tested
     )
     for member in members_of(config):
-        agent = make_agent(member.agent, task, config.exploration)
-        started = time.process_time()
-        taught = teaching.teach(env, weights, agent, config.training, keys, config.devices)
-        rows = teaching.as_rows(taught, lessons, member.key, use)
-        found.append(rows.assign(cpu_s=(time.process_time() - started) / len(rows)))
+        path = folder / "students" / f"{use}-{member.key}.csv"
+        if not path.exists():
+            agent = make_agent(member.agent, task, config.exploration)
+            started = time.process_time()
+            taught = teaching.teach(env, weights, agent, config.training, keys, config.devices)
+            new = teaching.as_rows(taught, lessons, member.key, use)
+            new = new.assign(cpu_s=(time.process_time() - started) / len(new))
+            write_text(path, new.to_csv(index=False))
+        rows = pd.read_csv(path)  # also new ones, so that both are the same
+        found.append(rows)
         returns = teaching.counted(rows["test_return"])
         print(
             f"{len(rows)} {member.key} students reach {returns.mean():.1f}, the worst "
