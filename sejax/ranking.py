@@ -68,9 +68,9 @@ class Ranking(Options):
     # Share of each agent's configurations, the last ones, that judge incumbents; no candidate is
     # learned from them.
     judging: float = option(0.25, between(0.05, 0.9, "some must learn and some must judge"))
-    # Configurations of each agent that a generation draws anew to learn from; all if these are
-    # fewer.
-    num_configs: int | None = option(None, counts("ranks compare several", least=2))
+    # Configurations of each agent that a generation draws anew to learn from; all with null, and if
+    # these are fewer.
+    num_configs: int | None = option(48, counts("ranks compare several", least=2))
     # Trainings of a configuration on an SE, whose mean is ranked: of learning and of judging.
     num_seeds: int = option(1, counts("an agent must train"))
     num_judging_seeds: int = option(4, counts("an agent must train"))
