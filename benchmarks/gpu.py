@@ -9,7 +9,8 @@ before tells that it would not end in time; the table says which are left out.
 
     pip install 'sejax[brax]' torch && python benchmarks/gpu.py --json gpu.json
 
-Without a GPU it measures the first device that there is. Seconds are wall-clock of the second call,
+Measure on an idle machine: PyTorch's threads wait for each other. Without a GPU it measures the
+first device that there is. Seconds are wall-clock of the second call,
 compilation apart. Kernels are counted without a GPU, in the program that is lowered for CUDA: of
 the operations in the body of the training loop, those that XLA cannot fuse into their neighbours.
 """

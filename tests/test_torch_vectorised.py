@@ -58,7 +58,7 @@ def test_a_step_of_many_is_that_of_each(done):
         step = env.step(obs[i], int(action[i]))
         torch.testing.assert_close(many.next_obs[i], step.obs, equal_nan=True)
         found = [float(x[i]) for x in (many.reward, many.discount, many.terminated)]
-        wanted = [step.reward, step.discount, step.terminated]
+        wanted = [step.reward, step.discount, float(step.terminated)]
         assert found == pytest.approx(wanted, abs=1e-6)
         assert rows[i, 8:10].tolist() == pytest.approx([int(action[i]), step.reward], abs=1e-6)
     assert len({round(float(x), 4) for x in many.discount}) > (5 if done == "soft" else 1)
