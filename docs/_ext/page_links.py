@@ -14,7 +14,7 @@ def link_pages(app: Sphinx, what: str, name: str, obj: Any, options: Any, lines:
 
 
 def link_back(app: Sphinx, page: str, template: str, context: Any, doctree: Any) -> None:
-    """Names an object by its own module where a page documents it by that.
+    """Links an object by the anchor that its page has.
 
     Sphinx names all objects of a module as the first one that is documented, which may be an alias.
     """
@@ -25,7 +25,7 @@ def link_back(app: Sphinx, page: str, template: str, context: Any, doctree: Any)
 
     def own(match: re.Match[str]) -> str:
         name = f"{module}.{match[2]}"
-        return f'{match[1]}#{name}"' if name in known else match[0]
+        return f'{match[1]}#{known[name].node_id}"' if name in known else match[0]
 
     back = r'(<a class="viewcode-back" href="[^"#]*)#sejax\.([^"]*)"'
     context["body"] = re.sub(back, own, context["body"])
