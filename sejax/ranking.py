@@ -541,13 +541,14 @@ def make_evaluators(
         return jnp.stack(agreements).mean(), reached
 
     def drawn(key: Array) -> list[Configurations]:
-        most, found = options.num_configs, []
-        for i, each in enumerate(learning):
-            size = len(each.returns)
-            is_part = most is not None and most < size
-            places = jax.random.permutation(jax.random.fold_in(key, i), size)[:most]
-            found.append(each.take(places) if is_part else each)
-        return found
+        def part(i: int, each: Configurations) -> Configurations:
+            most, size = options.num_configs, len(each.returns)
+            if most is None or most >= size:
+                return each
+            places = jax.random.permutation(jax.random.fold_in(key, i), size)
+            return each.take(places[:most])
+
+        return [part(i, each) for i, each in enumerate(learning)]
 
     def make_run(judges: bool) -> Callable[..., Outcome]:
         def run(key: Array, env_params: PyTree, active: Array | bool, _: Any = None) -> Outcome:

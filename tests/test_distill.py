@@ -97,6 +97,19 @@ def test_students_that_have_trained_do_not_train_again(folder, tmp_path, monkeyp
     assert len(calls) == len(one.groupby(["use", "agent"]))  # each kind once
 
 
+def test_a_policy_whose_file_has_changed_gets_students_of_its_own(tmp_path):
+    path, kernel = tmp_path / "policy.npz", np.zeros((2, 4), np.float32)
+    words = [*QUICK, f"policy={path}", f"run_dir={tmp_path / 'run'}"]
+    for sign in (1.0, -1.0):
+        kernel[1] = sign * np.array([0, 0, 1.0, 0.6])
+        np.savez(path, kernel_0=kernel, bias_0=np.zeros(2, np.float32))
+        main(words)
+        rows = pd.read_csv(tmp_path / "run" / "students.csv")
+        shown = zoo.describe(header.read(tmp_path / "run"))
+        assert rows["policy_return"].unique() == pytest.approx([shown.policy_return])
+    assert len(list((tmp_path / "run" / "students").iterdir())) == 2
+
+
 def test_a_folder_of_another_command_is_left_alone(folder, tmp_path):
     path = shutil.copytree(folder, tmp_path / "copy")
     with pytest.raises(ConfigError, match=r"search.step_size \(0.02 there, 0.5 here\)"):

@@ -27,7 +27,7 @@ from sejax.ops.files import write_bytes, write_text
 from sejax.options import ConfigError, require
 from sejax.options.plain import differences, to_plain
 from sejax.proxies import header, zoo
-from sejax.proxies.io import save
+from sejax.proxies.io import fingerprint, save
 
 ASKED = "distill.yaml"
 CHECKPOINT, KIND = "search.safetensors", "sejax_search"
@@ -275,15 +275,17 @@ def students(
     """A row for each student on the SE of each lesson; see `sejax.distillation.teaching`.
 
     Those that choose an SE (`CHOOSE`) are others than those that test it (`TEST`). The rows of each
-    kind are kept in the folder before the next kind trains.
+    kind, on SEs of these weights, are kept in the folder before the next kind trains.
     """
     task, found = config.task(), []
     env, weights = teaching.make_ses(task, lessons, **own.of_ses)
     keys = jax.random.split(
         keys_of(config)[use], own.num_students if use == CHOOSE else own.num_tested
     )
+    # The file that `policy` names may have changed.
+    taught_by = fingerprint({str(i): each for i, each in enumerate(weights)})
     for member in members_of(config):
-        path = folder / "students" / f"{use}-{member.key}.csv"
+        path = folder / "students" / f"{use}-{member.key}-{taught_by}.csv"
         if not path.exists():
             agent = make_agent(member.agent, task, config.exploration)
             started = time.process_time()

@@ -105,9 +105,14 @@ class Proxy(_Loaded):
     @property
     def fingerprint(self) -> str:
         """Eight hexadecimal digits that tell its weights from others."""
-        flat = _flatten(self.params.weights)
-        content = b"".join(np.ascontiguousarray(flat[name]).tobytes() for name in sorted(flat))
-        return hashlib.sha256(content).hexdigest()[:8]
+        return fingerprint(self.params.weights)
+
+
+def fingerprint(weights: Any) -> str:
+    """Eight hexadecimal digits that tell nested weights from others."""
+    flat = _flatten(weights)
+    content = b"".join(np.ascontiguousarray(flat[name]).tobytes() for name in sorted(flat))
+    return hashlib.sha256(content).hexdigest()[:8]
 
 
 @dataclass(frozen=True, kw_only=True)
