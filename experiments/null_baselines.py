@@ -54,6 +54,7 @@ TEACHERS: dict[str, dict[str, int]] = {
     "pendulum": {"td3": 8_000, "sac": 8_000},
     "halfcheetah": {"td3": 50_000, "sac": 50_000},
 }
+COSTS = ("real_steps", "cpu_s", "policy_return")  # of a proxy, and what its policy reaches
 STUDENT_STEPS = {"pendulum": 5_000, "halfcheetah": 10_000}  # 2,000 elsewhere
 
 
@@ -156,7 +157,7 @@ def make_table(settings: NullBaselines, source: str, name: str, make: Callable[[
         columns = {f"s{i}": x for i, x in enumerate(made.states.T)}
         columns |= {f"a{i}": x for i, x in enumerate(actions.T)}
         costs = made._asdict()
-        costs = {x: costs[x] for x in ("real_steps", "cpu_s", "policy_return")}
+        costs = {x: costs[x] for x in COSTS}
         return pd.DataFrame(columns | costs)
 
     return settings.shards.compute(f"table-{source}-{name}", depends, compute)
@@ -200,7 +201,7 @@ def compute(settings: NullBaselines) -> pd.DataFrame:
         for name, make in makers(settings, source):
             rows = make_table(settings, source, name, make)
             groups.append(as_group(bandit, name, rows))
-            costs = rows.iloc[0][["real_steps", "cpu_s", "policy_return"]]
+            costs = rows.iloc[0][list(COSTS)]
             made.append({"source": source, "group": name, **costs})
         if source == "evolved" and (se := shipped_se(settings)):
             env, groups, num_agents = se.env, [Group("shipped", se.params)], settings.num_evolved
@@ -267,13 +268,14 @@ def steps_until_solved(students: pd.DataFrame, solved_reward: float) -> pd.Serie
 def summarise(settings: NullBaselines, rows: pd.DataFrame) -> pd.DataFrame:
     """A row for each source, teacher, kind of student and of hyperparameters."""
     made, students = unstack(rows, "makers"), unstack(rows, "students")
+    made = made.reindex(columns=["source", "group", *COSTS])  # of SEs alone no policy's return
     made["teacher"] = made["group"].str.partition("-")[0]
     chosen = best_of_four(made)
     best = students[(students["source"] == "agent") & students["group"].isin(chosen["group"])]
     made = pd.concat([made, chosen], ignore_index=True)
     students = pd.concat([students, best.assign(source="best_of_four")])
     students = students.merge(made[["source", "group", "teacher"]], on=["source", "group"])
-    costs = made.groupby(["source", "teacher"])[["real_steps", "cpu_s", "policy_return"]].mean()
+    costs = made.groupby(["source", "teacher"])[list(COSTS)].mean()
     most, solved_reward = settings.budgets[-1], settings.task.solved_reward
 
     def statistics(mine: pd.DataFrame) -> dict[str, float]:
@@ -301,7 +303,7 @@ NAMES = {
     "best_of_four": "best of four",
     "episodes": "ten episodes",
     "search": "random search",
-    "evolved": "evolved SE (shipped)",
+    "evolved": "evolved SE",
 }
 
 
@@ -344,6 +346,8 @@ def report(settings: NullBaselines, rows: pd.DataFrame) -> pd.DataFrame:
 
 def label(source: str, teacher: str) -> str:
     """A source as people write it, with its kind of teacher."""
+    if source == "evolved":
+        return f"{NAMES[source]} ({teacher})"
     is_taught = source in ("agent", "best_of_four", "episodes")
     return NAMES[source] + (f": {figures.AGENT_NAMES[teacher]}" if is_taught else "")
 

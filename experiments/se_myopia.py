@@ -47,7 +47,6 @@ from sejax.proxies import header
 
 STORED = (  # below results/
     "soft_ses/*.safetensors",
-    "paper/*/*/proxy.safetensors",
     "se_feasibility/*/ses.safetensors",
     "se_horizons/*/*.safetensors",
     "se_families/*/*.safetensors",
