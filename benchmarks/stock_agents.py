@@ -373,14 +373,17 @@ def summarise(
         )  # fmt: skip
         here = mine[mine.steps == steps]
         there = theirs[(theirs.steps == steps) & (theirs.total_steps == max(args.steps))]
+        beside = {
+            "real task": round(there.mean_return.mean(), 1),
+            "real steps to be as good": as_good(theirs, here.mean_return.mean(), len(seeds)),
+        }
         yield {
             "agent": agent,
             "steps": steps,
             "SE": round(here.mean_return.mean(), 1),
             "each seed": ", ".join(f"{x:.1f}" for x in here.sort_values("seed").mean_return),
             "CPU s": round(here.cpu_s.mean(), 1),
-            "real task": round(there.mean_return.mean(), 1),
-            "real steps to be as good": as_good(theirs, here.mean_return.mean(), len(seeds)),
+            **({} if args.alone else beside),
         }
 
 

@@ -9,6 +9,7 @@ the configurations that the SEs were learned from, and by chance.
 """
 
 import dataclasses
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -254,17 +255,39 @@ def rank_correlations(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     return np.divide((x * y).sum(axis=1), norm, out=np.zeros(len(x)), where=norm > 0)
 
 
+def over_configs(
+    statistic: Callable[[np.ndarray], np.ndarray], number: int
+) -> tuple[float, float, float]:
+    """A statistic of all configurations, with its BCa interval over them.
+
+    Args:
+      statistic: of configurations by their numbers, `[draw, config]` -> `[draw]`.
+      number: of configurations.
+    """
+    each = np.arange(number)
+    draws = np.random.default_rng(0).integers(0, number, (NUM_RESAMPLES, number))
+    others = np.array([np.delete(each, i) for i in each])
+    estimate = float(statistic(each[None])[0])
+    drawn, left_out = (pd.Series(statistic(x)) for x in (draws, others))
+    return estimate, *bca_interval(estimate, drawn, left_out)
+
+
 def with_interval(chooser: np.ndarray, target: np.ndarray) -> dict[str, float]:
     """`quality` with the ends of a BCa interval of rho over configurations."""
-    each = np.arange(target.size)
-    draws = np.random.default_rng(0).integers(0, each.size, (NUM_RESAMPLES, each.size))
+    rho, low, high = over_configs(lambda i: rank_correlations(chooser[i], target[i]), target.size)
+    return quality(chooser, target) | {"rho": rho, "rho_low": low, "rho_high": high}
 
-    found = quality(chooser, target)
-    drawn = pd.Series(rank_correlations(chooser[draws], target[draws]))
-    others = np.array([np.delete(each, i) for i in each])
-    left_out = pd.Series(rank_correlations(chooser[others], target[others]))
-    low, high = bca_interval(found["rho"], drawn, left_out)
-    return found | {"rho_low": low, "rho_high": high}
+
+def ahead(choosers: list[np.ndarray], other: np.ndarray, target: np.ndarray) -> dict[str, float]:
+    """By how much the mean rho of choosers is above that of another, in pairs of configurations."""
+
+    def difference(i: np.ndarray) -> np.ndarray:
+        ours = np.mean([rank_correlations(x[i], target[i]) for x in choosers], axis=0)
+        found: np.ndarray = ours - rank_correlations(other[i], target[i])
+        return found
+
+    rho, low, high = over_configs(difference, target.size)
+    return {"rho": rho, "rho_low": low, "rho_high": high}
 
 
 def over_tuners(choosers: list[np.ndarray], target: np.ndarray) -> dict[str, float]:
@@ -347,21 +370,29 @@ def summarise(settings: SeTuners, rows: pd.DataFrame) -> pd.DataFrame:
         cpu_of = held.groupby("steps")["cpu_s"].mean()
         if "shipped" in set(rows["table"]):
             shipped = unstack(rows, "shipped").query("kind == @kind")
-            each = shipped["train_steps"].mean()
+            taken = shipped["train_steps"].mean()
             add(kind, "the shipped SE", with_interval(mean_ranks(shipped, [0]), target),
-                steps=each, cpu_s=each * step_cpu_s)  # fmt: skip
+                steps=taken, cpu_s=taken * step_cpu_s)  # fmt: skip
+        tested: dict[int, np.ndarray] = {}  # on the task, by the steps of a configuration
         for steps in settings.short_steps:
             short = returns_of(real, "held", kind, steps)
             cpu_s = cpu_of[steps]
             for num in dict.fromkeys((1, short.shape[1])):
+                chooser = short.iloc[:, :num].mean(axis=1).to_numpy()
+                tested[steps * num] = chooser
                 how = TASK_WORDS.format(steps=steps, seeds=num)
-                values = with_interval(short.iloc[:, :num].mean(axis=1).to_numpy(), target)
-                add(kind, how, values, real_steps=steps * num, cpu_s=cpu_s * num)
+                add(kind, how, with_interval(chooser, target), real_steps=steps * num,
+                    cpu_s=cpu_s * num)  # fmt: skip
+        equal = max((x for x in tested if x <= members * each), default=min(tested))
+        how = f"a tuner of {members} SEs, less the real task after {equal:,} steps"
+        add(kind, how, ahead(tuners, tested[equal], target))
         asked = features_of(real, kind, settings.steps)
         known = returns_of(real, "learn", settings.learner, settings.steps).mean(axis=1).to_numpy()
         for name in ("forest", "gaussian_process"):
             expected, how = regressed(name, asked[0], known, asked[1]), name.replace("_", " ")
             add(kind, how, with_interval(expected, target), **landscape_cost)
+            less = f"a tuner of {members} SEs, less the {how}"
+            add(kind, less, ahead(tuners, expected, target))
             both = [rankdata(x) + rankdata(expected) for x in tuners]
             add(kind, f"{how} and a tuner, mean rank", over_tuners(both, target),
                 **landscape_cost, learning_cpu_s=members * learning_cpu_s)  # fmt: skip
@@ -392,8 +423,8 @@ def report(settings: SeTuners, rows: pd.DataFrame) -> pd.DataFrame:
         "ranked by": "{ranked_by}",
         "rho": lambda row: f"{_number(row.rho, 2)}{tables.brackets(row.rho_low, row.rho_high, 2)}",
         "worst tuner": lambda row: _number(row.rho_worst, 2),
-        "regret": "{regret:.1f}",
-        f"regret, {TOP} best": "{regret_top:.1f}",
+        "regret": lambda row: _number(row.regret, 1),
+        f"regret, {TOP} best": lambda row: _number(row.regret_top, 1),
         "SE steps a configuration": lambda row: _number(row.steps),
         "real steps a configuration": lambda row: _number(row.real_steps),
         "CPU s a configuration": lambda row: _number(row.cpu_s, 3),
@@ -407,7 +438,8 @@ def report(settings: SeTuners, rows: pd.DataFrame) -> pd.DataFrame:
         f"{figures.AGENT_NAMES[settings.learner]}, a quarter of which judges incumbents. On an SE "
         f"{settings.tuning_seeds} agents of a configuration train and are tested on it. Rho: "
         "Spearman's correlation with the judging returns; in brackets 95%, of tuners Student's "
-        "over these, else BCa over configurations. Regret: the highest judging return less that of "
+        "over these, else BCa over configurations; less: the mean rho of tuners less another, BCa "
+        "over configurations. Regret: the highest judging return less that of "
         f"the first, or of the first {TOP} on average. Regressors see the options that an agent "
         f"shares with {figures.AGENT_NAMES[settings.learner]}. Successive halving chooses one by "
         f"{' and '.join(f'{x:,}' for x in sorted(settings.short_steps)[:2])} steps and full "

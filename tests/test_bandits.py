@@ -88,6 +88,15 @@ def test_the_worst_tenth_is_a_tenth_where_most_students_are_at_the_ceiling():
     assert row.worst_tenth == 150 and row.test_return_mean == 195 and row.worst == 100
 
 
+def test_an_se_is_summed_up_without_bandits():
+    made = {"source": ["evolved"], "group": ["shipped"], "real_steps": [7], "cpu_s": [1.0]}
+    students = {"source": "evolved", "group": "shipped", "kind": "ddqn", "hparams": "default",
+                "agent": range(5), "steps": 2000, "test_return": [150] * 5}  # fmt: skip
+    rows = stack({"makers": pd.DataFrame(made), "students": pd.DataFrame(students)})
+    (row,) = null_baselines.summarise(null_baselines.NullBaselines(), rows).itertuples()
+    assert (row.test_return_mean, row.real_steps) == (150, 7) and np.isnan(row.policy_return)
+
+
 @pytest.mark.parametrize("env", null_baselines.TEACHERS)
 def test_teachers_have_most_of_their_steps_to_learn(env):
     """Agents made for one-step SEs explore for a hundred episodes, which are whole on a task."""

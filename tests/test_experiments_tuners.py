@@ -80,3 +80,16 @@ def test_regressors_find_a_smooth_function(kind):
     of = lambda x: np.sin(3 * x[:, 0]) - x[:, 1]  # noqa: E731
     found = se_tuners.regressed(kind, x, of(x), asked)
     assert spearmanr(found, of(asked)).statistic > 0.9
+
+
+def test_tuners_are_compared_with_others_on_the_same_configurations():
+    rng = np.random.default_rng(0)
+    target = rng.normal(size=12)
+    tuners = [target + rng.normal(size=12) for _ in range(3)]
+    other = target + 2 * rng.normal(size=12)
+    found = se_tuners.ahead(tuners, other, target)
+    ours = np.mean([spearmanr(x, target).statistic for x in tuners])
+    assert found["rho"] == pytest.approx(ours - spearmanr(other, target).statistic)
+    assert found["rho_low"] < found["rho"] < found["rho_high"]
+    same = se_tuners.ahead([other, other], other, target)
+    assert same == {"rho": 0, "rho_low": 0, "rho_high": 0}
