@@ -47,7 +47,7 @@ class SeTuners(Settings):
     # Kinds of agents whose configurations are ranked; all that fit the task.
     ranked: tuple[str, ...] = setting((), each_of(tuple(dict.fromkeys(DISCRETE + CONTINUOUS))))
     run: tuple[str, ...] = setting(())  # overrides of the NES runs
-    learn_configs: int = count(64, quick=8)  # to learn from
+    learn_configs: int = count(256, quick=8)  # to learn from
     num_configs: int = count(64, quick=8)  # of each kind, to rank
     num_seeds: int = count(8, least=2, quick=2)  # real trainings of each
     steps: int = count(10_000, quick=300)  # of a real training

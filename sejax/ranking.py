@@ -59,9 +59,9 @@ class Ranking(Options):
     landscape: str | None = None  # CSV file of `python -m sejax.landscape`
     # Of a training of the landscape; null: as its file says, which is then kept with the proxy.
     steps: int | None = option(None, counts("an agent must train"))
-    # What an agent reaches on an SE: the return of greedy episodes, that of its training episodes,
-    # or both, whose agreements are averaged.
-    measure: str = option("both", one_of(MEASURES))
+    # What an agent reaches on an SE: the return of greedy episodes, by which configurations are
+    # ranked later, that of training episodes, or both, whose agreements are averaged.
+    measure: str = option("greedy", one_of(MEASURES))
     # spearman: Pearson's correlation of ranks; top: of the squares of ranks, so that the best
     # configurations weigh more.
     agreement: str = option("spearman", one_of(AGREEMENTS))

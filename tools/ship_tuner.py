@@ -93,12 +93,12 @@ def tuner_of(
         "ses": len(places),
         "train_steps": sejax.training_of(ses).max_steps,
         "agent": settings.learner,
-        "configs": settings.num_configs,
+        "configs": settings.learn_configs,
         "seeds": settings.num_seeds,
         "steps": settings.steps,
         "real_steps": int(learned["real_steps"].sum()),
         "landscape": f"python -m sejax.landscape env={settings.env} agent={settings.learner} "
-        f"configs={settings.num_configs} seeds={settings.num_seeds} steps={settings.steps} "
+        f"configs={settings.learn_configs} seeds={settings.num_seeds} steps={settings.steps} "
         f"seed={settings.seed + LEARN} file=landscape.csv",
         "command": f"python -m sejax.run {shlex.join(words)}",
         "cpu_s": float(learned["cpu_s"].sum() + mine["cpu_s"].sum()),
