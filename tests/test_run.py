@@ -404,6 +404,7 @@ def command(monkeypatch, *words):
         ("es.population_size=1", "es.population_size must be"),
         ("es.noise_sdt=1", "Did you mean es.noise_std?"),
         ("devices=x", "devices must be a whole number"),
+        ("generations.x=1", "must be a whole number, without fields; got generations.x"),
         ("~env=[[1]]", "an override must read"),
         ("--resolve", "Options: --help, -h, --print-config."),
     ],

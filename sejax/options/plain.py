@@ -154,6 +154,9 @@ def _as(kind: Any, value: Any, name: str, default: Any) -> Any:
         return from_plain(kind, value, name)
     if kind not in _KINDS:
         return value
+    if isinstance(value, Mapping) and value:
+        own = f"{name}.{next(iter(value))}"
+        require(False, name, f"must be {_KINDS[kind]}, without fields; got {own}. Leave {own} out.")
     scalar = _scalar(value, kind)
     needs(scalar is not _NO, f"be {_KINDS[kind]}")
     return scalar
