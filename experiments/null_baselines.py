@@ -336,9 +336,10 @@ def report(settings: NullBaselines, rows: pd.DataFrame) -> pd.DataFrame:
         f"tenth; share that solves the task, {settings.task.solved_reward:g}; steps after which "
         f"the median student has solved it, of {', '.join(f'{x:,}' for x in budgets)}). "
         "Students' hyperparameters are their defaults, or drawn around them (varied). Real steps "
-        "and CPU seconds are those of making one proxy, tests included, without compilation; of "
-        "the best of four, of all four. A policy by hand took no step of the real task; its tests "
-        "did. `summary.csv` has medians, the worst agent, intervals over proxies and counts."
+        "are those of making one proxy, tests included; CPU seconds of bandits leave out tests and "
+        "compilation. Costs of the best of four are those of all four. A policy by hand took no "
+        "step of the real task; its tests did. `summary.csv` has medians, the worst agent, "
+        "intervals over proxies and counts."
     )
     title = f"What does as well as an SE on {settings.env}"
     return tables.publish(settings, title, table, summary, note)

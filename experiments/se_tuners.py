@@ -9,7 +9,7 @@ the configurations that the SEs were learned from, and by chance.
 """
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -330,6 +330,14 @@ def halved(returns: dict[int, np.ndarray], judges: np.ndarray) -> dict[str, floa
     return {"regret": mean, "regret_top": mean, **shares, "trained_last": len(alive) / number}
 
 
+def equal_steps(tested: Collection[int], steps: float) -> int:
+    """Of the steps of tests on the task the most that are not above others, else the fewest.
+
+    An agent may end an SE's last episode a step late, which is no difference.
+    """
+    return max((x for x in tested if x <= 1.01 * steps), default=min(tested))
+
+
 def mean_ranks(reached: pd.DataFrame, ses: list[int]) -> np.ndarray:
     """Mean over some SEs of the ranks of greedy returns, `[config]`."""
     mine = reached[reached["se"].isin(ses)]
@@ -379,11 +387,11 @@ def summarise(settings: SeTuners, rows: pd.DataFrame) -> pd.DataFrame:
             cpu_s = cpu_of[steps]
             for num in dict.fromkeys((1, short.shape[1])):
                 chooser = short.iloc[:, :num].mean(axis=1).to_numpy()
-                tested[steps * num] = chooser
+                tested.setdefault(steps * num, chooser)
                 how = TASK_WORDS.format(steps=steps, seeds=num)
                 add(kind, how, with_interval(chooser, target), real_steps=steps * num,
                     cpu_s=cpu_s * num)  # fmt: skip
-        equal = max((x for x in tested if x <= members * each), default=min(tested))
+        equal = equal_steps(tested, members * each)
         how = f"a tuner of {members} SEs, less the real task after {equal:,} steps"
         add(kind, how, ahead(tuners, tested[equal], target))
         asked = features_of(real, kind, settings.steps)

@@ -22,7 +22,7 @@ if TYPE_CHECKING:  # which take long to import
 
 ABOUT = """Measure what configurations of agents reach on a real task, in one CSV file.
 
-  python -m sejax.landscape env=cartpole agent=ddqn configs=64 seeds=8 steps=10000
+  python -m sejax.landscape env=cartpole agent=ddqn configs=256 seeds=8 steps=10000
   python -m sejax.landscape env=pendulum agent=[sac,ppo] file=pendulum.csv
 
 Configurations are drawn from `space`, or from ranges as of sejax.search; other fields are those of

@@ -93,3 +93,9 @@ def test_tuners_are_compared_with_others_on_the_same_configurations():
     assert found["rho_low"] < found["rho"] < found["rho_high"]
     same = se_tuners.ahead([other, other], other, target)
     assert same == {"rho": 0, "rho_low": 0, "rho_high": 0}
+
+
+def test_a_tuner_is_compared_with_as_many_steps_of_the_task():
+    tested = [500, 2000, 6000, 8000]
+    assert se_tuners.equal_steps(tested, 5999) == 6000
+    assert se_tuners.equal_steps(tested, 4000) == 2000 and se_tuners.equal_steps(tested, 9) == 500

@@ -15,6 +15,7 @@ import pytest
 from plain_agents import agent_for, learn, mean_return
 
 import sejax
+from experiments.common.shards import read_rows, unstack
 from sejax import envs
 from sejax.cli.config import evaluate_config
 from sejax.cli.distill_config import read
@@ -203,6 +204,10 @@ def test_the_tuner_that_ships_is_what_its_study_stores(monkeypatch, tmp_path, ca
     made = sejax.load_set(tmp_path / "cartpole-tuner.safetensors")
     shipped = sejax.load_set("cartpole-tuner")
     assert [x.fingerprint for x in made] == [x.fingerprint for x in shipped]
+    real = unstack(read_rows(study / "rows.csv.xz"), "real")
+    learned = real[real["use"] == "learn"]
+    assert tuner.configs == learned["config"].nunique()
+    assert tuner.real_steps == learned["real_steps"].sum()
     ses = sejax.load_set(study / "tuners.safetensors")
     means = ses.scores.reshape(-1, 3).mean(axis=1)
     assert ship_tuner.best(ses.scores, 3)[0] == 3 * means.argmax()
