@@ -274,8 +274,8 @@ def over_configs(
 
 def with_interval(chooser: np.ndarray, target: np.ndarray) -> dict[str, float]:
     """`quality` with the ends of a BCa interval of rho over configurations."""
-    rho, low, high = over_configs(lambda i: rank_correlations(chooser[i], target[i]), target.size)
-    return quality(chooser, target) | {"rho": rho, "rho_low": low, "rho_high": high}
+    _, low, high = over_configs(lambda i: rank_correlations(chooser[i], target[i]), target.size)
+    return quality(chooser, target) | {"rho_low": low, "rho_high": high}
 
 
 def ahead(choosers: list[np.ndarray], other: np.ndarray, target: np.ndarray) -> dict[str, float]:
