@@ -37,9 +37,9 @@ HIDDEN = re.compile(
     r"|^:[^\n]*",  # directives and their options
     re.DOTALL | re.MULTILINE,
 )
-# Numbers of headings and of years, and those in names.
+# Numbers of headings, of lists and of years, and those in names.
 NAMES = re.compile(
-    r"^#+ [\d.]+|\b(?:Python|Apache|[Ff]igures?|[Tt]ables?|[Ss]ections?|[Ss]eeds?) \d[\d.]*"
+    r"^#+ [\d.]+|^\d+\. |\b(?:Python|Apache|[Ff]igures?|[Tt]ables?|[Ss]ections?|[Ss]eeds?) \d[\d.]*"
     r"|\((?:[^()]*, )?(?:19|20)\d\d\)|\bet al\.,? (?:[A-Z]+ )?(?:19|20)\d\d",
     re.MULTILINE,
 )
