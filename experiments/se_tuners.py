@@ -48,6 +48,11 @@ class SeTuners(Settings):
     ranked: tuple[str, ...] = setting((), each_of(tuple(dict.fromkeys(DISCRETE + CONTINUOUS))))
     run: tuple[str, ...] = setting(())  # overrides of the NES runs
     learn_configs: int = count(256, quick=8)  # to learn from
+    # Ranges of theirs beside those of space=wide: SEs that see no rate that is too high rank high
+    # ones too well.
+    learn_ranges: tuple[str, ...] = setting(
+        ("agent.learning_rate=tag(log, interval(0.0001, 1))",)
+    )
     num_configs: int = count(64, quick=8)  # of each kind, to rank
     num_seeds: int = count(8, least=2, quick=2)  # real trainings of each
     steps: int = count(10_000, quick=300)  # of a real training
@@ -77,6 +82,7 @@ def measured(settings: SeTuners, kind: str, seed: int, steps: int, first_seed: i
     """A landscape of one kind, a row for each training; see `python -m sejax.landscape`."""
     path = settings.work_folder / f"{kind}-{seed}-{steps}.csv"
     seeds = settings.num_seeds if steps == settings.steps else settings.tuning_seeds
+    ranges = settings.learn_ranges if seed == LEARN else ()
     words = {
         "env": settings.env,
         "agent": kind,
@@ -88,7 +94,7 @@ def measured(settings: SeTuners, kind: str, seed: int, steps: int, first_seed: i
         "file": path,
         "devices": settings.devices or "null",
     }
-    landscape.main([f"{name}={value}" for name, value in words.items()])
+    landscape.main([*(f"{name}={value}" for name, value in words.items()), *ranges])
     rows = landscapes.read_table(path, "work")[1].drop(columns="agent")
     use = "learn" if seed == LEARN else "held"
     return rows.assign(kind=kind, use=use, steps=steps)
