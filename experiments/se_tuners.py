@@ -50,17 +50,17 @@ class SeTuners(Settings):
     learn_configs: int = count(256, quick=8)  # to learn from
     # Ranges of theirs beside those of space=wide: SEs that see no rate that is too high rank high
     # ones too well.
-    learn_ranges: tuple[str, ...] = setting(
-        ("agent.learning_rate=tag(log, interval(0.0001, 1))",)
-    )
+    learn_ranges: tuple[str, ...] = setting(("agent.learning_rate=tag(log, interval(0.0001, 1))",))
     num_configs: int = count(64, quick=8)  # of each kind, to rank
     num_seeds: int = count(8, least=2, quick=2)  # real trainings of each
     steps: int = count(10_000, quick=300)  # of a real training
     num_tuners: int = count(5, quick=2)  # of as many SEs each
     members: int = count(3, quick=2)  # SEs of a tuner
     generations: int | None = count(None, quick=2)  # of the NES runs
-    tuning_seeds: int = count(4, quick=2)  # trainings of a configuration on each SE
-    # Steps of short real trainings, by their seeds.
+    tuning_seeds: int = count(2)  # trainings of a configuration on each SE
+    transfer: int = count(2)  # times as long trainings of other kinds, and as few of them
+    short_seeds: int = count(4, quick=2)  # of short real trainings
+    # Steps of short real trainings.
     short_steps: tuple[int, ...] = setting((500, 1500, 2000), quick=(100,))
 
     @property
@@ -81,7 +81,7 @@ class SeTuners(Settings):
 def measured(settings: SeTuners, kind: str, seed: int, steps: int, first_seed: int) -> pd.DataFrame:
     """A landscape of one kind, a row for each training; see `python -m sejax.landscape`."""
     path = settings.work_folder / f"{kind}-{seed}-{steps}.csv"
-    seeds = settings.num_seeds if steps == settings.steps else settings.tuning_seeds
+    seeds = settings.num_seeds if steps == settings.steps else settings.short_seeds
     ranges = settings.learn_ranges if seed == LEARN else ()
     words = {
         "env": settings.env,
@@ -165,9 +165,12 @@ def reached_by(settings: SeTuners, kind: str, ses: sejax.ProxySet, name: str) ->
 
     path = settings.work_folder / f"{kind}-{HELD}-{settings.steps}.csv"
     found = landscapes.read(path, "work")[kind]
-    max_steps = sejax.training_of(ses).max_steps
-    assert max_steps is not None
-    agent = agent_config(settings, kind, max_steps)
+    own = training = sejax.training_of(ses)
+    if name == "reached":
+        training = ranking.training_on(ses, kind, settings.transfer)
+    assert own.max_steps is not None and training.max_steps is not None
+    agent = agent_config(settings, kind, training.max_steps)
+    num_seeds = max(1, settings.tuning_seeds * own.max_steps // training.max_steps)
 
     def rows() -> pd.DataFrame:
         reached = ranking.reached_on(
@@ -175,7 +178,8 @@ def reached_by(settings: SeTuners, kind: str, ses: sejax.ProxySet, name: str) ->
             agent,
             found.values,
             steps=settings.steps,
-            num_seeds=settings.tuning_seeds,
+            training=training,
+            num_seeds=num_seeds,
             seed=settings.seed,
             devices=settings.devices,
         )
@@ -186,7 +190,8 @@ def reached_by(settings: SeTuners, kind: str, ses: sejax.ProxySet, name: str) ->
 
     made_with = {
         "weights": [ses[i].fingerprint for i in range(len(ses))],
-        "seeds": settings.tuning_seeds,
+        "seeds": num_seeds,
+        "train_steps": training.max_steps,
         "configs": settings.num_configs,
         "steps": settings.steps,
     }
@@ -391,7 +396,7 @@ def summarise(settings: SeTuners, rows: pd.DataFrame) -> pd.DataFrame:
         for steps in settings.short_steps:
             short = returns_of(real, "held", kind, steps)
             cpu_s = cpu_of[steps]
-            for num in dict.fromkeys((1, short.shape[1])):
+            for num in dict.fromkeys((1, -(-short.shape[1] // 2), short.shape[1])):
                 chooser = short.iloc[:, :num].mean(axis=1).to_numpy()
                 tested.setdefault(steps * num, chooser)
                 how = TASK_WORDS.format(steps=steps, seeds=num)
@@ -445,12 +450,17 @@ def report(settings: SeTuners, rows: pd.DataFrame) -> pd.DataFrame:
         "real steps once": lambda row: _number(row.once_steps),
         "CPU s of learning": lambda row: _number(row.learning_cpu_s),
     }
+    others = ""
+    if settings.transfer > 1:
+        fewer = max(1, settings.tuning_seeds // settings.transfer)
+        others = f", of other kinds {fewer} after {settings.transfer} times as many steps"
     note = (
         f"{settings.num_configs} configurations of each kind that took no part in learning, each "
         f"judged by the mean return of {settings.num_seeds} agents after {settings.steps:,} real "
         f"steps. SEs are learned from {settings.learn_configs} others of "
         f"{figures.AGENT_NAMES[settings.learner]}, a quarter of which judges incumbents. On an SE "
-        f"{settings.tuning_seeds} agents of a configuration train and are tested on it. Rho: "
+        f"{settings.tuning_seeds} agents of a configuration train and are tested on it"
+        f"{others}. Rho: "
         "Spearman's correlation with the judging returns; in brackets 95%, of tuners Student's "
         "over these, else BCa over configurations; less: the mean rho of tuners less another, BCa "
         "over configurations. Regret: the highest judging return less that of "

@@ -6,6 +6,7 @@ by the agreement of ranks: agents with each configuration train on it, and no re
 Source: the use is the paper's ("cheap-to-run environments for AutoML"); the objective is ours.
 """
 
+import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
@@ -38,12 +39,14 @@ from sejax.options import (
 )
 from sejax.options.plain import to_plain
 from sejax.proxies.base import ProxyEnv
+from sejax.proxies.header import agents_of
 from sejax.proxies.io import ProxySet
 from sejax.training import TrainingConfig, make_trainer, training_of
 
 AGREEMENTS = ("spearman", "top")
 MEASURES = ("both", "greedy", "training")
 SIZES = ("hidden_size", "batch_size")  # options that an agent has room for, beside traced ones
+TRANSFER = 2  # times as long trainings of kinds of agents that no SE was learned with
 CHUNK = 128  # most configurations of one call of a program, so that memory stays small
 
 
@@ -351,6 +354,30 @@ def reach(
 # --- tuning on an SE -----------------------------------------------------------------------------
 
 
+def training_on(ses: ProxySet, kind: str, transfer: int = TRANSFER) -> TrainingConfig:
+    """How agents of a kind train on SEs that rank.
+
+    SEs make the agents that they are learned with learn fast; others learn less from as many steps
+    (docs/tuners.md).
+
+    Args:
+      ses: from `sejax.load_set`.
+      kind: name of the kind, such as `sac`.
+      transfer: times as long trainings, if none of the SEs' agents is of this kind.
+
+    Raises:
+      ConfigError: for SEs that are not stored.
+    """
+    training = training_of(ses)
+    learned = {values.get("name", name) for name, values in agents_of(ses.config).items()}
+    times = 1 if kind in learned else transfer
+    return dataclasses.replace(
+        training,
+        max_steps=None if training.max_steps is None else times * training.max_steps,
+        max_episodes=times * training.max_episodes,
+    )
+
+
 def reached_on(
     ses: ProxySet,
     agent: AgentConfig,
@@ -370,11 +397,12 @@ def reached_on(
 
     Args:
       ses: from `sejax.load_set`.
-      agent: with room for all configurations, as it trains on the SE.
+      agent: with room for all configurations, as it trains on the SE: options that count steps are
+        those of `training`.
       values: by option, what each configuration sets on the real task, `[config]`. Options that
         count steps are scaled to a training on the SE.
       steps: of a training on the real task; by default those of the SEs' landscape.
-      training: on the SE; by default as the SEs were learned with.
+      training: on the SE, such as `training_on`; by default as the SEs were learned with.
       num_seeds: trainings of each configuration on each SE.
       num_tests: greedy episodes after each.
       seed: of all of them.

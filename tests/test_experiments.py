@@ -81,7 +81,7 @@ TINY = {
     "se_teachability": {"env": "cartpole", "students": "ddqn", "quick": True,
                         "run": ["training.max_steps=60", "training.max_episodes=60"]},
     "se_tuners": {"ranked": "ddqn", "learn_configs": 4, "num_configs": 4, "num_seeds": 2,
-                  "steps": 60, "num_tuners": 1, "members": 1, "tuning_seeds": 2,
+                  "steps": 60, "num_tuners": 1, "members": 1, "tuning_seeds": 2, "short_seeds": 2,
                   "short_steps": [40], "generations": 2, "run": ["objective.judging=0.5"]},
     "supervised_baseline": {"proxy": "se", "hparams": "default", "models": 3, "generations": 2,
                             "population": 2, "max_rows": 30, "epochs": 2, "num_agents": 2,

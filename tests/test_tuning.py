@@ -1,5 +1,6 @@
 """Searches on SEs that rank: what is drawn, how it is ordered, what is tried on the real task."""
 
+import dataclasses
 import shlex
 
 import jax
@@ -93,7 +94,7 @@ def tuned(tuner, folder, *own):
 
 def test_a_tuner_has_defaults_of_its_own(tuner):
     search = search_config.read([f"proxy={tuner}", "agent=sac"])
-    assert (search.config.trials, search.config.seeds, search.num_verified) == (1000, 4, 10)
+    assert (search.config.trials, search.config.seeds, search.num_verified) == (1000, 2, 10)
     assert search.study == "sac-on-tuner" and "agent.target_entropy_fraction" in search.space
     assert search_config.read(["proxy=cartpole", "agent=sac"]).space == {}
 
@@ -114,9 +115,21 @@ def test_agents_have_room_and_fixed_options_stay(tuner, tmp_path):
 def test_agents_that_took_no_part_are_those_of_the_preset(tuner, tmp_path):
     words = [f"proxy={tuner}", "agent=td3_discrete", "trials=2", f"search_dir={tmp_path}"]
     setup = tuning.setup_of(search_config.read(words))
-    # preset=ranking has temperature_steps=500, all of its trainings.
+    # preset=ranking has temperature_steps=500, all of its trainings; of others twice as long.
     assert setup.kind.config.agent.temperature_steps == STEPS
-    assert setup.agent.temperature_steps == 30 and setup.agent.activation == "tanh"
+    assert setup.agent.temperature_steps == 60 and setup.agent.activation == "tanh"
+
+
+def test_agents_that_took_no_part_train_twice_as_long(tuner):
+    ses = sejax.load_set(tuner)
+    learned = sejax.training_of(ses)
+    assert ranking.training_on(ses, "ddqn") == learned
+    other = ranking.training_on(ses, "sac")
+    assert (other.max_steps, other.max_episodes) == (60, 2 * learned.max_episodes)
+    assert (
+        dataclasses.replace(other, max_steps=learned.max_steps, max_episodes=learned.max_episodes)
+        == learned
+    )
 
 
 def test_each_agent_of_a_mixture_is_as_it_was_learned_with(tuner, tmp_path):

@@ -30,7 +30,7 @@ from sejax.options import as_text, listed, registry, require, shortened
 from sejax.options.plain import flatten, to_plain
 from sejax.proxies.header import agents_of
 from sejax.proxies.io import ProxySet, load_set
-from sejax.ranking import mean_rank, reached_on, require_same_options, scaled
+from sejax.ranking import mean_rank, reached_on, require_same_options, scaled, training_on
 from sejax.training import training_of
 
 COMMAND = "sejax.evaluate"  # that repeats the best configuration, on the real task
@@ -155,7 +155,7 @@ def _words(group: str, values: Any, name: str | None = None) -> list[str]:
 
 def _on_ses(kind: Kind, ses: ProxySet, steps: int) -> AgentConfig:
     """The agent as it trains on SEs: options that count steps are as large a part of those."""
-    agent, training = kind.config.agent, training_of(ses)
+    agent, training = kind.config.agent, training_on(ses, kind.name)
     factor = (training.max_steps or steps) / steps
     values = {x: scaled(type(agent), x, value, factor) for x, value in to_plain(agent).items()}
     short: AgentConfig = registry.configure("agent", {**values, "name": kind.name})
@@ -208,6 +208,7 @@ def ranked(setup: Setup, say: Callable[[str], None]) -> pd.DataFrame:
         setup.ses,
         setup.agent,
         values,
+        training=training_on(setup.ses, setup.kind.name),
         num_seeds=search.config.seeds,
         seed=setup.config.seed,
         devices=setup.config.devices,
