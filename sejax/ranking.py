@@ -41,12 +41,12 @@ from sejax.options.plain import to_plain
 from sejax.proxies.base import ProxyEnv
 from sejax.proxies.header import agents_of
 from sejax.proxies.io import ProxySet
+from sejax.proxies.tuners import TRANSFER
 from sejax.training import TrainingConfig, make_trainer, training_of
 
 AGREEMENTS = ("spearman", "top")
 MEASURES = ("both", "greedy", "training")
 SIZES = ("hidden_size", "batch_size")  # options that an agent has room for, beside traced ones
-TRANSFER = 2  # times as long trainings of kinds of agents that no SE was learned with
 CHUNK = 128  # most configurations of one call of a program, so that memory stays small
 
 

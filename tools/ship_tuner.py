@@ -87,6 +87,11 @@ def tuner_of(
         *("objective.landscape=landscape.csv", *settings.run),
         *(f"seed={ses.seeds[places[0]]}", f"num_seeds={len(places)}"),
     ]
+    measured = [
+        *(f"env={settings.env}", f"agent={settings.learner}", f"configs={settings.learn_configs}"),
+        *(f"seeds={settings.num_seeds}", f"steps={settings.steps}"),
+        *(f"seed={settings.seed + LEARN}", "file=landscape.csv", *settings.learn_ranges),
+    ]
     values: dict[str, Any] = {
         "name": "",
         "task": ses.task.name,
@@ -97,9 +102,7 @@ def tuner_of(
         "seeds": settings.num_seeds,
         "steps": settings.steps,
         "real_steps": int(learned["real_steps"].sum()),
-        "landscape": f"python -m sejax.landscape env={settings.env} agent={settings.learner} "
-        f"configs={settings.learn_configs} seeds={settings.num_seeds} steps={settings.steps} "
-        f"seed={settings.seed + LEARN} file=landscape.csv",
+        "landscape": f"python -m sejax.landscape {shlex.join(measured)}",
         "command": f"python -m sejax.run {shlex.join(words)}",
         "cpu_s": float(learned["cpu_s"].sum() + mine["cpu_s"].sum()),
         "chosen": f"of {settings.num_tuners} tuners, by the agreement with what judges",

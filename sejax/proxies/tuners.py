@@ -10,6 +10,8 @@ from sejax.options.plain import from_plain
 from sejax.proxies import header
 from sejax.proxies.zoo import table
 
+TRANSFER = 2  # times as long trainings of kinds of agents that no SE was learned with
+
 
 @dataclass(frozen=True, kw_only=True)
 class Ranked:
@@ -81,7 +83,8 @@ class Tuner:
         facts = {
             "task": self.task,
             "SEs": str(self.ses),
-            "a training on one": f"{self.train_steps:,} steps",
+            "a training on one": f"{self.train_steps:,} steps of {self.agent}, "
+            f"{TRANSFER * self.train_steps:,} of other agents",
             "learned from": f"{self.configs} configurations of {self.agent}, each trained with "
             f"{self.seeds} seeds for {self.steps:,} steps",
             "steps on the real task": f"{self.real_steps:,}, once",
