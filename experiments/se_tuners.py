@@ -57,7 +57,7 @@ class SeTuners(Settings):
     num_tuners: int = count(5, quick=2)  # of as many SEs each
     members: int = count(3, quick=2)  # SEs of a tuner
     generations: int | None = count(None, quick=2)  # of the NES runs
-    tuning_seeds: int = count(2)  # trainings of a configuration on each SE
+    tuning_seeds: int = count(4, quick=2)  # trainings of a configuration on each SE
     transfer: int = count(2)  # times as long trainings of other kinds, and as few of them
     short_seeds: int = count(4, quick=2)  # of short real trainings
     # Steps of short real trainings.

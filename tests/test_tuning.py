@@ -94,7 +94,7 @@ def tuned(tuner, folder, *own):
 
 def test_a_tuner_has_defaults_of_its_own(tuner):
     search = search_config.read([f"proxy={tuner}", "agent=sac"])
-    assert (search.config.trials, search.config.seeds, search.num_verified) == (1000, 2, 10)
+    assert (search.config.trials, search.config.seeds, search.num_verified) == (1000, 4, 10)
     assert search.study == "sac-on-tuner" and "agent.target_entropy_fraction" in search.space
     assert search_config.read(["proxy=cartpole", "agent=sac"]).space == {}
 

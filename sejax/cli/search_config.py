@@ -57,7 +57,7 @@ TAKEN = {
 OWN = {"trials", "timeout", "storage", "search_dir", "sampler_seed", "verify", "fresh_seeds"}
 NAMES = {"study", "space"}  # which stand for what is compared
 # On an SE that ranks: defaults, and all fields that have a meaning there, beside the agent's.
-ON_TUNER = {"space": "wide", "trials": 1000, "seeds": 2, "sampler_seed": 0}
+ON_TUNER = {"space": "wide", "trials": 1000, "seeds": 4, "sampler_seed": 0}
 TAKEN_ON_TUNER = {
     *(*ON_TUNER, "landscape", "study", "search_dir", "verify", "fresh_seeds"),
     *("proxy", "proxy_kind", "env", "agent", "seed", "devices", "num_parallel"),
