@@ -369,8 +369,9 @@ def training_on(ses: ProxySet, kind: str, transfer: int = TRANSFER) -> TrainingC
       ConfigError: for SEs that are not stored.
     """
     training = training_of(ses)
-    learned = {values.get("name", name) for name, values in agents_of(ses.config).items()}
-    times = 1 if kind in learned else transfer
+    learned = agents_of(ses.config).values()
+    took_part = any(isinstance(x, Mapping) and x.get("name") == kind for x in learned)
+    times = 1 if took_part else transfer
     return dataclasses.replace(
         training,
         max_steps=None if training.max_steps is None else times * training.max_steps,
