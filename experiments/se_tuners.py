@@ -33,7 +33,8 @@ QUICK = (
     *("es.population_size=4", "proxy.hidden_size=8", "training.max_steps=200"),
     *("training.max_episodes=200", "objective.num_tests=4"),
 )
-LEARN, HELD = 0, 2000  # seeds of the draws of configurations
+LEARN, REGRESSED, HELD = 0, 1000, 2000  # seeds of the draws of configurations
+USES = {LEARN: "learn", REGRESSED: "regressed", HELD: "held"}
 TOP = 5  # configurations that are chosen where several are
 TASK_WORDS = "the real task, {steps:,} steps, seeds: {seeds}"
 
@@ -86,7 +87,7 @@ def measured(settings: SeTuners, kind: str, seed: int, steps: int, first_seed: i
     words = {
         "env": settings.env,
         "agent": kind,
-        "configs": settings.learn_configs if seed == LEARN else settings.num_configs,
+        "configs": settings.learn_configs if seed != HELD else settings.num_configs,
         "seeds": seeds,
         "first_seed": first_seed,
         "steps": steps,
@@ -96,13 +97,14 @@ def measured(settings: SeTuners, kind: str, seed: int, steps: int, first_seed: i
     }
     landscape.main([*(f"{name}={value}" for name, value in words.items()), *ranges])
     rows = landscapes.read_table(path, "work")[1].drop(columns="agent")
-    use = "learn" if seed == LEARN else "held"
-    return rows.assign(kind=kind, use=use, steps=steps)
+    return rows.assign(kind=kind, use=USES[seed], steps=steps)
 
 
 def compute(settings: SeTuners) -> pd.DataFrame:
     """Measures, learns and ranks what is missing."""
     real = [measured(settings, settings.learner, LEARN, settings.steps, 0)]
+    if settings.learn_ranges:  # regressors know best what lies in the ranges that are ranked
+        real.append(measured(settings, settings.learner, REGRESSED, settings.steps, 0))
     for kind in settings.kinds:
         real.append(measured(settings, kind, HELD, settings.steps, 0))
         for steps in settings.short_steps:  # of other agents than those that judge
@@ -209,18 +211,23 @@ def returns_of(real: pd.DataFrame, use: str, kind: str, steps: int) -> pd.DataFr
 
 
 def features_of(real: pd.DataFrame, kind: str, steps: int) -> tuple[np.ndarray, np.ndarray]:
-    """What configurations set, to learn from and held out of one kind, `[config, option]` each.
+    """What configurations set, for regression and held out of one kind, `[config, option]` each.
 
     Of options that both have, as ranks within all of them, so that all scales are uniform.
     """
     is_full = real["steps"] == steps
-    learn = real[is_full & (real["use"] == "learn")]
+    learn = real[is_full & (real["use"] == regressed_from(real))]
     held = real[is_full & (real["use"] == "held") & (real["kind"] == kind)]
     mine = pd.concat([learn, held])
     names = [x for x in mine if x.startswith(landscapes.PREFIX) and mine[x].notna().all()]
     each = mine.groupby(["use", "config"], sort=False)[names].first()
     ranks = each.rank(pct=True)
-    return ranks.loc["learn"].to_numpy(), ranks.loc["held"].to_numpy()
+    return ranks.loc[regressed_from(real)].to_numpy(), ranks.loc["held"].to_numpy()
+
+
+def regressed_from(real: pd.DataFrame) -> str:
+    """The use of the configurations that regressors learn from."""
+    return "regressed" if (real["use"] == "regressed").any() else "learn"
 
 
 def regressed(
@@ -363,8 +370,10 @@ def summarise(settings: SeTuners, rows: pd.DataFrame) -> pd.DataFrame:
     curves = unstack(rows, "curves")
     members, number = settings.members, settings.num_tuners
     learning_cpu_s = curves["cpu_s"].sum() / (number * members)
-    learned = real[real["use"] == "learn"]
-    landscape_cost = {"once_steps": learned["real_steps"].sum()}
+    once = real[real["steps"] == settings.steps].groupby("use")["real_steps"].sum()
+    landscape_cost = {"once_steps": once["learn"]}
+    regression_cost = {"once_steps": once[regressed_from(real)]}
+    both_cost = {"once_steps": once[list({"learn", regressed_from(real)})].sum()}
     # CPU seconds of a training step on an SE, with its share of the tests.
     step_cpu_s = curves["cpu_s"].sum() / curves["train_steps_sum"].sum()
     found = []
@@ -406,15 +415,16 @@ def summarise(settings: SeTuners, rows: pd.DataFrame) -> pd.DataFrame:
         how = f"a tuner of {members} SEs, less the real task after {equal:,} steps"
         add(kind, how, ahead(tuners, tested[equal], target))
         asked = features_of(real, kind, settings.steps)
-        known = returns_of(real, "learn", settings.learner, settings.steps).mean(axis=1).to_numpy()
+        known = returns_of(real, regressed_from(real), settings.learner, settings.steps)
         for name in ("forest", "gaussian_process"):
-            expected, how = regressed(name, asked[0], known, asked[1]), name.replace("_", " ")
-            add(kind, how, with_interval(expected, target), **landscape_cost)
+            expected = regressed(name, asked[0], known.mean(axis=1).to_numpy(), asked[1])
+            how = name.replace("_", " ")
+            add(kind, how, with_interval(expected, target), **regression_cost)
             less = f"a tuner of {members} SEs, less the {how}"
             add(kind, less, ahead(tuners, expected, target))
             both = [rankdata(x) + rankdata(expected) for x in tuners]
             add(kind, f"{how} and a tuner, mean rank", over_tuners(both, target),
-                **landscape_cost, learning_cpu_s=members * learning_cpu_s)  # fmt: skip
+                **both_cost, learning_cpu_s=members * learning_cpu_s)  # fmt: skip
         rungs = sorted(settings.short_steps)[:2]
         short_returns = {x: returns_of(real, "held", kind, x).to_numpy() for x in rungs}
         found_by = halved(short_returns, judges.to_numpy())
@@ -450,7 +460,9 @@ def report(settings: SeTuners, rows: pd.DataFrame) -> pd.DataFrame:
         "real steps once": lambda row: _number(row.once_steps),
         "CPU s of learning": lambda row: _number(row.learning_cpu_s),
     }
-    others = ""
+    regressors = others = ""
+    if settings.learn_ranges:
+        regressors = ", of as many other configurations, in the ranges of those that are ranked"
     if settings.transfer > 1:
         fewer = max(1, settings.tuning_seeds // settings.transfer)
         others = f", of other kinds {fewer} after {settings.transfer} times as many steps"
@@ -465,7 +477,8 @@ def report(settings: SeTuners, rows: pd.DataFrame) -> pd.DataFrame:
         "over these, else BCa over configurations; less: the mean rho of tuners less another, BCa "
         "over configurations. Regret: the highest judging return less that of "
         f"the first, or of the first {TOP} on average. Regressors see the options that an agent "
-        f"shares with {figures.AGENT_NAMES[settings.learner]}. Successive halving chooses one by "
+        f"shares with {figures.AGENT_NAMES[settings.learner]}{regressors}. "
+        "Successive halving chooses one by "
         f"{' and '.join(f'{x:,}' for x in sorted(settings.short_steps)[:2])} steps and full "
         "trainings, of a third of the configurations each. Real steps once: of the configurations "
         "that are learned from, tests included."
