@@ -23,8 +23,8 @@ class Ranked:
       rho: Spearman's correlation with their returns on the real task.
       rho_low: lower end of its 95% interval (BCa, over configurations).
       rho_high: upper end.
-      rho_process: rho of a Gaussian process on the configurations that the tuner was learned from,
-        over the options that both kinds share; no training needs it.
+      rho_process: rho of a Gaussian process on as many configurations of the tuner's own kind, in
+        the ranges of those that are ranked, over the options that both kinds share.
       regret: the highest return less that of the tuner's first, in the task's unit.
       regret_process: that of the Gaussian process's first.
       regret_chance: that of a random one on average.
@@ -109,8 +109,9 @@ class Tuner:
             "an agent reach what ranks them as the real task does.\n\n"
             f"{table(rows)}\n\n## What it ranks\n\nConfigurations that took no part in learning or "
             "choosing. Rho: Spearman's correlation with their returns on the real task; regret: "
-            "the highest of these less that of the first. The Gaussian process sees what the tuner "
-            f"was learned from, and trains nobody.\n\n{table(found)}\n\n## How it was learned\n\n"
+            "the highest of these less that of the first. The Gaussian process learns from as many "
+            f"others of {self.agent}, in the ranges that are ranked, and trains nobody.\n\n"
+            f"{table(found)}\n\n## How it was learned\n\n"
             f"    {self.landscape}\n    {self.command}\n\n## How to use it\n\n"
             f"    python -m sejax.search proxy={self.name} agent={self.agent}\n"
         )
