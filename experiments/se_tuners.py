@@ -5,7 +5,7 @@ SEs are learned so that what these configurations reach on them ranks them alike
 (`objective=ranking`); a tuner is a few of those SEs, whose ranks are averaged. Other
 configurations, of this kind and of others, which took no part in learning, stopping or choosing,
 are then ranked by each tuner, and beside it by short trainings on the real task, by regressors on
-the configurations that the SEs were learned from, and by chance.
+as many measured configurations, and by chance.
 """
 
 import dataclasses
@@ -28,6 +28,7 @@ from sejax import envs, landscape, landscapes
 from sejax.cli import session
 from sejax.ops import gaussian_process
 from sejax.options import each_of
+from sejax.proxies.tuners import TRANSFER
 
 QUICK = (
     *("es.population_size=4", "proxy.hidden_size=8", "training.max_steps=200"),
@@ -49,8 +50,7 @@ class SeTuners(Settings):
     ranked: tuple[str, ...] = setting((), each_of(tuple(dict.fromkeys(DISCRETE + CONTINUOUS))))
     run: tuple[str, ...] = setting(())  # overrides of the NES runs
     learn_configs: int = count(256, quick=8)  # to learn from
-    # Ranges of theirs beside those of space=wide: SEs that see no rate that is too high rank high
-    # ones too well.
+    # Ranges of theirs in place of those of space=wide, so that SEs see rates that are too high.
     learn_ranges: tuple[str, ...] = setting(("agent.learning_rate=tag(log, interval(0.0001, 1))",))
     num_configs: int = count(64, quick=8)  # of each kind, to rank
     num_seeds: int = count(8, least=2, quick=2)  # real trainings of each
@@ -59,7 +59,7 @@ class SeTuners(Settings):
     members: int = count(3, quick=2)  # SEs of a tuner
     generations: int | None = count(None, quick=2)  # of the NES runs
     tuning_seeds: int = count(4, quick=2)  # trainings of a configuration on each SE
-    transfer: int = count(2)  # times as long trainings of other kinds, and as few of them
+    transfer: int = count(TRANSFER)  # times as long trainings of other kinds, and as few of them
     short_seeds: int = count(4, quick=2)  # of short real trainings
     # Steps of short real trainings.
     short_steps: tuple[int, ...] = setting((500, 1500, 2000), quick=(100,))

@@ -357,8 +357,7 @@ def reach(
 def training_on(ses: ProxySet, kind: str, transfer: int = TRANSFER) -> TrainingConfig:
     """How agents of a kind train on SEs that rank.
 
-    SEs make the agents that they are learned with learn fast; others learn less from as many steps
-    (docs/tuners.md).
+    The number of steps suits the kinds that the SEs were learned with; others have more.
 
     Args:
       ses: from `sejax.load_set`.
@@ -367,6 +366,8 @@ def training_on(ses: ProxySet, kind: str, transfer: int = TRANSFER) -> TrainingC
 
     Raises:
       ConfigError: for SEs that are not stored.
+
+    Source: ours; docs/tuners.md has what was measured.
     """
     training = training_of(ses)
     learned = agents_of(ses.config).values()
