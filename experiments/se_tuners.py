@@ -11,6 +11,7 @@ as many measured configurations, and by chance.
 import dataclasses
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -38,6 +39,8 @@ LEARN, REGRESSED, HELD = 0, 1000, 2000  # seeds of the draws of configurations
 USES = {LEARN: "learn", REGRESSED: "regressed", HELD: "held"}
 TOP = 5  # configurations that are chosen where several are
 TASK_WORDS = "the real task, {steps:,} steps, seeds: {seeds}"
+# Landscapes of regressors: the tuners' own, and one in the ranges that are ranked.
+REGRESSED_FROM = {"learn": " on the tuners' landscape", "regressed": " on ranked ranges"}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -210,24 +213,21 @@ def returns_of(real: pd.DataFrame, use: str, kind: str, steps: int) -> pd.DataFr
     return mine.pivot(index="config", columns="seed", values="return").fillna(lowest)
 
 
-def features_of(real: pd.DataFrame, kind: str, steps: int) -> tuple[np.ndarray, np.ndarray]:
+def features_of(
+    real: pd.DataFrame, use: str, kind: str, steps: int
+) -> tuple[np.ndarray, np.ndarray]:
     """What configurations set, for regression and held out of one kind, `[config, option]` each.
 
     Of options that both have, as ranks within all of them, so that all scales are uniform.
     """
     is_full = real["steps"] == steps
-    learn = real[is_full & (real["use"] == regressed_from(real))]
+    learn = real[is_full & (real["use"] == use)]
     held = real[is_full & (real["use"] == "held") & (real["kind"] == kind)]
     mine = pd.concat([learn, held])
     names = [x for x in mine if x.startswith(landscapes.PREFIX) and mine[x].notna().all()]
     each = mine.groupby(["use", "config"], sort=False)[names].first()
     ranks = each.rank(pct=True)
-    return ranks.loc[regressed_from(real)].to_numpy(), ranks.loc["held"].to_numpy()
-
-
-def regressed_from(real: pd.DataFrame) -> str:
-    """The use of the configurations that regressors learn from."""
-    return "regressed" if (real["use"] == "regressed").any() else "learn"
+    return ranks.loc[use].to_numpy(), ranks.loc["held"].to_numpy()
 
 
 def regressed(
@@ -290,19 +290,33 @@ def over_configs(
     return estimate, *bca_interval(estimate, drawn, left_out)
 
 
-def with_interval(chooser: np.ndarray, target: np.ndarray) -> dict[str, float]:
-    """`quality` with the ends of a BCa interval of rho over configurations."""
-    _, low, high = over_configs(lambda i: rank_correlations(chooser[i], target[i]), target.size)
-    return quality(chooser, target) | {"rho_low": low, "rho_high": high}
+def choices(short: pd.DataFrame, number: int) -> list[np.ndarray]:
+    """Mean returns of all choices of so many seeds, `[config]` each."""
+    each = combinations(range(short.shape[1]), number)
+    return [short.iloc[:, list(seeds)].mean(axis=1).to_numpy() for seeds in each]
 
 
-def ahead(choosers: list[np.ndarray], other: np.ndarray, target: np.ndarray) -> dict[str, float]:
-    """By how much the mean rho of choosers is above that of another, in pairs of configurations."""
+def mean_rho(choosers: list[np.ndarray], target: np.ndarray, drawn: np.ndarray) -> np.ndarray:
+    """Mean rho of choosers, for configurations that were drawn, `[draw, config]` -> `[draw]`."""
+    rhos = [rank_correlations(chooser[drawn], target[drawn]) for chooser in choosers]
+    mean: np.ndarray = np.mean(rhos, axis=0)
+    return mean
 
-    def difference(i: np.ndarray) -> np.ndarray:
-        ours = np.mean([rank_correlations(x[i], target[i]) for x in choosers], axis=0)
-        found: np.ndarray = ours - rank_correlations(other[i], target[i])
-        return found
+
+def with_interval(choosers: list[np.ndarray], target: np.ndarray) -> dict[str, float]:
+    """The mean of `quality` over choosers, with a BCa interval of rho over configurations."""
+    _, low, high = over_configs(lambda drawn: mean_rho(choosers, target, drawn), target.size)
+    mean = pd.DataFrame([quality(chooser, target) for chooser in choosers]).mean()
+    return {**mean, "rho_low": low, "rho_high": high}
+
+
+def ahead(
+    choosers: list[np.ndarray], others: list[np.ndarray], target: np.ndarray
+) -> dict[str, float]:
+    """By how much the mean rho of choosers is above that of others, in pairs of configurations."""
+
+    def difference(drawn: np.ndarray) -> np.ndarray:
+        return mean_rho(choosers, target, drawn) - mean_rho(others, target, drawn)
 
     rho, low, high = over_configs(difference, target.size)
     return {"rho": rho, "rho_low": low, "rho_high": high}
@@ -372,8 +386,6 @@ def summarise(settings: SeTuners, rows: pd.DataFrame) -> pd.DataFrame:
     learning_cpu_s = curves["cpu_s"].sum() / (number * members)
     once = real[real["steps"] == settings.steps].groupby("use")["real_steps"].sum()
     landscape_cost = {"once_steps": once["learn"]}
-    regression_cost = {"once_steps": once[regressed_from(real)]}
-    both_cost = {"once_steps": once[list({"learn", regressed_from(real)})].sum()}
     # CPU seconds of a training step on an SE, with its share of the tests.
     step_cpu_s = curves["cpu_s"].sum() / curves["train_steps_sum"].sum()
     found = []
@@ -399,32 +411,37 @@ def summarise(settings: SeTuners, rows: pd.DataFrame) -> pd.DataFrame:
         if "shipped" in set(rows["table"]):
             shipped = unstack(rows, "shipped").query("kind == @kind")
             taken = shipped["train_steps"].mean()
-            add(kind, "the shipped SE", with_interval(mean_ranks(shipped, [0]), target),
+            add(kind, "the shipped SE", with_interval([mean_ranks(shipped, [0])], target),
                 steps=taken, cpu_s=taken * step_cpu_s)  # fmt: skip
-        tested: dict[int, np.ndarray] = {}  # on the task, by the steps of a configuration
+        tested: dict[tuple[int, int], list[np.ndarray]] = {}  # on the task, by steps and seeds
         for steps in settings.short_steps:
             short = returns_of(real, "held", kind, steps)
-            cpu_s = cpu_of[steps]
-            for num in dict.fromkeys((1, -(-short.shape[1] // 2), short.shape[1])):
-                chooser = short.iloc[:, :num].mean(axis=1).to_numpy()
-                tested.setdefault(steps * num, chooser)
+            for num in range(1, short.shape[1] + 1):
+                tested[steps, num] = choices(short, num)
                 how = TASK_WORDS.format(steps=steps, seeds=num)
-                add(kind, how, with_interval(chooser, target), real_steps=steps * num,
-                    cpu_s=cpu_s * num)  # fmt: skip
-        equal = equal_steps(tested, members * each)
-        how = f"a tuner of {members} SEs, less the real task after {equal:,} steps"
-        add(kind, how, ahead(tuners, tested[equal], target))
-        asked = features_of(real, kind, settings.steps)
-        known = returns_of(real, regressed_from(real), settings.learner, settings.steps)
-        for name in ("forest", "gaussian_process"):
-            expected = regressed(name, asked[0], known.mean(axis=1).to_numpy(), asked[1])
-            how = name.replace("_", " ")
-            add(kind, how, with_interval(expected, target), **regression_cost)
-            less = f"a tuner of {members} SEs, less the {how}"
-            add(kind, less, ahead(tuners, expected, target))
-            both = [rankdata(x) + rankdata(expected) for x in tuners]
-            add(kind, f"{how} and a tuner, mean rank", over_tuners(both, target),
-                **both_cost, learning_cpu_s=members * learning_cpu_s)  # fmt: skip
+                add(kind, how, with_interval(tested[steps, num], target), real_steps=steps * num,
+                    cpu_s=cpu_of[steps] * num)  # fmt: skip
+        equal = equal_steps({steps * num for steps, num in tested}, members * each)
+        for (steps, num), choosers in tested.items():
+            if steps * num == equal:
+                how = f"a tuner of {members} SEs, less {TASK_WORDS.format(steps=steps, seeds=num)}"
+                add(kind, how, ahead(tuners, choosers, target))
+        for use, where in REGRESSED_FROM.items():
+            if use not in once:
+                continue
+            asked = features_of(real, use, kind, settings.steps)
+            known = returns_of(real, use, settings.learner, settings.steps)
+            costs = {"once_steps": once[use]}
+            both_costs = {"once_steps": once[list({"learn", use})].sum()}
+            for name in ("forest", "gaussian_process"):
+                expected = regressed(name, asked[0], known.mean(axis=1).to_numpy(), asked[1])
+                how = name.replace("_", " ") + where
+                add(kind, how, with_interval([expected], target), **costs)
+                less = f"a tuner of {members} SEs, less the {how}"
+                add(kind, less, ahead(tuners, [expected], target))
+                both = [rankdata(x) + rankdata(expected) for x in tuners]
+                add(kind, f"{how}, and a tuner, mean rank", over_tuners(both, target),
+                    **both_costs, learning_cpu_s=members * learning_cpu_s)  # fmt: skip
         rungs = sorted(settings.short_steps)[:2]
         short_returns = {x: returns_of(real, "held", kind, x).to_numpy() for x in rungs}
         found_by = halved(short_returns, judges.to_numpy())
@@ -434,7 +451,7 @@ def summarise(settings: SeTuners, rows: pd.DataFrame) -> pd.DataFrame:
             real_steps=sum(x * share for x, share in shares.items()),
             cpu_s=sum(cpu_of[x] * share for x, share in shares.items()))  # fmt: skip
         halves = [judges.iloc[:, i::2].mean(axis=1).to_numpy() for i in (0, 1)]
-        add(kind, "half of the judging agents", with_interval(*halves),
+        add(kind, "half of the judging agents", with_interval(halves[:1], halves[1]),
             real_steps=settings.steps * (judges.shape[1] // 2))  # fmt: skip
         add(kind, "chance", {"rho": 0.0, "regret": float(target.max() - target.mean()),
             "regret_top": float(target.max() - target.mean())})  # fmt: skip
@@ -462,7 +479,10 @@ def report(settings: SeTuners, rows: pd.DataFrame) -> pd.DataFrame:
     }
     regressors = others = ""
     if settings.learn_ranges:
-        regressors = ", of as many other configurations, in the ranges of those that are ranked"
+        regressors = (
+            ", of the configurations that SEs are learned from, or of as many others in the "
+            "ranges of those that are ranked"
+        )
     if settings.transfer > 1:
         fewer = max(1, settings.tuning_seeds // settings.transfer)
         others = f", of other kinds {fewer} after {settings.transfer} times as many steps"
@@ -475,7 +495,8 @@ def report(settings: SeTuners, rows: pd.DataFrame) -> pd.DataFrame:
         f"{others}. Rho: "
         "Spearman's correlation with the judging returns; in brackets 95%, of tuners Student's "
         "over these, else BCa over configurations; less: the mean rho of tuners less another, BCa "
-        "over configurations. Regret: the highest judging return less that of "
+        "over configurations. Of several seeds on the task: the mean over all choices of so many "
+        f"of {settings.short_seeds}. Regret: the highest judging return less that of "
         f"the first, or of the first {TOP} on average. Regressors see the options that an agent "
         f"shares with {figures.AGENT_NAMES[settings.learner]}{regressors}. "
         "Successive halving chooses one by "

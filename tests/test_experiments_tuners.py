@@ -67,12 +67,12 @@ def test_features_are_ranks_of_what_both_agents_have():
         "agent.learning_rate": [1e-4, 1e-1, 1e-3, 1e-2, 5e-2],
         "agent.tau": [0.1, 0.2, np.nan, np.nan, 0.3],
     })  # fmt: skip
-    learn, held = se_tuners.features_of(rows, "ppo", 10)
+    learn, held = se_tuners.features_of(rows, "learn", "ppo", 10)
     np.testing.assert_allclose(learn, [[0.25], [1.0]])
     np.testing.assert_allclose(held, [[0.5], [0.75]])
-    assert se_tuners.features_of(rows, "ddqn", 10)[1].shape == (1, 2)
+    assert se_tuners.features_of(rows, "learn", "ddqn", 10)[1].shape == (1, 2)
     own = rows.assign(use=["learn", "regressed", "held", "held", "held"])
-    learn, _ = se_tuners.features_of(own, "ppo", 10)  # of what was measured for regressors alone
+    learn, _ = se_tuners.features_of(own, "regressed", "ppo", 10)  # of what was measured for regressors alone
     np.testing.assert_allclose(learn, [[1.0]])
 
 
@@ -90,12 +90,21 @@ def test_tuners_are_compared_with_others_on_the_same_configurations():
     target = rng.normal(size=12)
     tuners = [target + rng.normal(size=12) for _ in range(3)]
     other = target + 2 * rng.normal(size=12)
-    found = se_tuners.ahead(tuners, other, target)
+    found = se_tuners.ahead(tuners, [other], target)
     ours = np.mean([spearmanr(x, target).statistic for x in tuners])
     assert found["rho"] == pytest.approx(ours - spearmanr(other, target).statistic)
     assert found["rho_low"] < found["rho"] < found["rho_high"]
-    same = se_tuners.ahead([other, other], other, target)
+    same = se_tuners.ahead([other, other], [other], target)
     assert same == {"rho": 0, "rho_low": 0, "rho_high": 0}
+
+
+def test_trainings_on_the_task_count_for_all_choices_of_their_seeds():
+    short = pd.DataFrame([[1.0, 2.0, 6.0], [4.0, 4.0, 1.0]])
+    found = se_tuners.choices(short, 2)
+    np.testing.assert_allclose(found, [[1.5, 4.0], [3.5, 2.5], [4.0, 2.5]])
+    target = np.array([0.0, 1.0])  # the first choice is right, the two others are wrong
+    assert se_tuners.with_interval(found, target)["rho"] == pytest.approx(-1 / 3)
+    np.testing.assert_allclose(se_tuners.mean_rho(found, target, np.array([[0, 1]])), [-1 / 3])
 
 
 def test_a_tuner_is_compared_with_as_many_steps_of_the_task():

@@ -70,8 +70,9 @@ def tuner_of(
     for kind in settings.kinds:
         target = se_tuners.returns_of(real, "held", kind, settings.steps).mean(axis=1).to_numpy()
         order = se_tuners.mean_ranks(reached[reached["kind"] == kind], places)
-        own = se_tuners.with_interval(order, target)
-        process = summary.loc[kind, "gaussian process"]
+        own = se_tuners.with_interval([order], target)
+        use = max(set(real["use"]) & set(se_tuners.REGRESSED_FROM))  # the ranked ranges', if there
+        process = summary.loc[kind, f"gaussian process{se_tuners.REGRESSED_FROM[use]}"]
         ranked.append(
             {
                 "agent": kind,
