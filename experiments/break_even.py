@@ -265,7 +265,7 @@ def panel(axis: Any, row: Any, learned: pd.DataFrame) -> None:
     figures.band(axis, grid, held, quartiles, figures.TUNED, label="tuned agents")
     lowest = pd.DataFrame(held).mean().min()  # where any of them has a return
     path = Path(RUNS.get(row.task, ""), "rows.csv.xz")
-    if row.of == "se" and path.is_file():
+    if row.proxy == row.task and path.is_file():  # an evolved SE has its task's name
         spent, scores = scores_of_runs(read_rows(path))
         label = "NES incumbents (in-sample)"
         figures.band(axis, spent, scores, quartiles, figures.VARIED, label=label)
