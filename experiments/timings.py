@@ -5,8 +5,8 @@ Networks" (table "Approximate timings for one NES outer loop").
 
 The first outer iterations of a run are timed, once compiled, with our default and, where that has
 other agents, with the paper's settings too; not on HalfCheetah, where an iteration of these takes
-an hour. Most of their agents are far from solving the task and train for as long as they may. How long
-later ones take differs by run.
+an hour. Most of their agents are far from solving the task and train for as long as they may.
+How long later ones take differs by run.
 """
 
 import dataclasses

@@ -39,8 +39,8 @@ Costs are those of the one run that ships, often the best of several: `cartpole`
 `cartpole-rn` of ten, `cliff_walking-rn` of fifty, `mountain_car_continuous-rn` of five, by their
 scores or, for `cartpole`, by the returns of discrete TD3. What `cartpole_v1`,
 `acrobot`, `mountain_car` and `mountain_car_continuous` were chosen from is not stored.
-`halfcheetah` is the first of three runs; `halfcheetah-rn` is the one run of its variant. `pendulum` is the second of two settings that were tried,
-one run each.
+`halfcheetah` is the first of three runs; `halfcheetah-rn` is the one run of its variant.
+`pendulum` is the second of two settings that were tried, one run each.
 
 The second table of each tells what fresh agents reach that trained for the steps given and were
 then tested on the real task: mean and standard deviation of the agents' mean returns.
