@@ -72,9 +72,8 @@ def test_features_are_ranks_of_what_both_agents_have():
     np.testing.assert_allclose(held, [[0.5], [0.75]])
     assert se_tuners.features_of(rows, "learn", "ddqn", 10)[1].shape == (1, 2)
     own = rows.assign(use=["learn", "regressed", "held", "held", "held"])
-    learn, _ = se_tuners.features_of(
-        own, "regressed", "ppo", 10
-    )  # of what was measured for regressors alone
+    # Of what was measured for regressors alone.
+    learn, _ = se_tuners.features_of(own, "regressed", "ppo", 10)
     np.testing.assert_allclose(learn, [[1.0]])
 
 

@@ -19,7 +19,7 @@ import pandas as pd
 import sejax
 from experiments import se_tuners
 from experiments.common.shards import read_rows, unstack
-from experiments.se_tuners import LEARN, SeTuners
+from experiments.se_tuners import LEARN, REGRESSED_FROM, SeTuners
 from sejax.proxies import header, tuners
 
 
@@ -71,8 +71,8 @@ def tuner_of(
         target = se_tuners.returns_of(real, "held", kind, settings.steps).mean(axis=1).to_numpy()
         order = se_tuners.mean_ranks(reached[reached["kind"] == kind], places)
         own = se_tuners.with_interval([order], target)
-        use = max(set(real["use"]) & set(se_tuners.REGRESSED_FROM))  # the ranked ranges', if there
-        process = summary.loc[kind, f"gaussian process{se_tuners.REGRESSED_FROM[use]}"]
+        landscape = REGRESSED_FROM["regressed" if settings.learn_ranges else "learn"]
+        process = summary.loc[kind, f"gaussian process{landscape}"]
         ranked.append(
             {
                 "agent": kind,
