@@ -106,7 +106,8 @@ def test_the_page_runs_and_its_torch_networks_are_the_se():
     assert len(blocks) > 5
     for block in blocks:
         names = {}
-        exec(compile(block.replace("2_500", "256"), PAGE.name, "exec"), names)
+        short = re.sub(r"learn\([\d_]+\)", "learn(256)", block)
+        exec(compile(short, PAGE.name, "exec"), names)
         if "load_file" in block:
             world = sejax.gym.make("cartpole").world
             noise, actions = names["noise"].numpy(), names["actions"].numpy().argmax(axis=1)
