@@ -267,7 +267,11 @@ def quality(chooser: np.ndarray, target: np.ndarray) -> dict[str, float]:
 
 def rank_correlations(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """Spearman's correlation of each row, `[row]`; 0 where one is constant."""
-    x, y = (rankdata(each, axis=1) for each in (x, y))
+    return correlations(rankdata(x, axis=1), rankdata(y, axis=1))
+
+
+def correlations(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Pearson's correlation of each row, `[row]`; 0 where one is constant."""
     x, y = (each - each.mean(axis=1, keepdims=True) for each in (x, y))
     norm = np.sqrt((x**2).sum(axis=1) * (y**2).sum(axis=1))
     return np.divide((x * y).sum(axis=1), norm, out=np.zeros(len(x)), where=norm > 0)
@@ -298,7 +302,8 @@ def choices(short: pd.DataFrame, number: int) -> list[np.ndarray]:
 
 def mean_rho(choosers: list[np.ndarray], target: np.ndarray, drawn: np.ndarray) -> np.ndarray:
     """Mean rho of choosers, for configurations that were drawn, `[draw, config]` -> `[draw]`."""
-    rhos = [rank_correlations(chooser[drawn], target[drawn]) for chooser in choosers]
+    judged = rankdata(target[drawn], axis=1)
+    rhos = [correlations(rankdata(x[drawn], axis=1), judged) for x in choosers]
     mean: np.ndarray = np.mean(rhos, axis=0)
     return mean
 

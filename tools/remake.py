@@ -1,16 +1,19 @@
 """Makes the tables of `results/` again from the stored rows.
 
 Each `table.md` begins with its command, which does so with `from_rows=true`. Figures are left out,
-so that all take less than a minute.
+so that all take less than a minute on two cores.
 """
 
 import contextlib
 import importlib
 import io
+import itertools
+import multiprocessing
 import os
 import shlex
 import shutil
 from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from unittest import mock
@@ -36,21 +39,32 @@ def remake(root: Path, skipped: Sequence[str] = ()) -> Iterator[tuple[Path, str]
         there = Path(folder, "results")
         ignore = shutil.ignore_patterns(*MADE)
         shutil.copytree(root / "results", there, copy_function=os.symlink, ignore=ignore)
-        for table in sorted((root / "results").rglob("*table.md")):
-            if str(table.relative_to(root)) in skipped:
-                continue
-            with contextlib.chdir(folder):
-                report(table.read_text(encoding="utf-8").splitlines()[2].strip("`"))
-            for path in (table, table.with_name(table.name.replace("table.md", "summary.csv"))):
-                yield path, (there / path.relative_to(root / "results")).read_text("utf-8")
+        tables = [
+            path
+            for path in sorted((root / "results").rglob("*table.md"))
+            if str(path.relative_to(root)) not in skipped
+        ]
+        num_processes = min(len(tables), os.cpu_count() or 1) or 1
+        context = multiprocessing.get_context("spawn")  # JAX has threads, which a fork loses
+        with ProcessPoolExecutor(num_processes, context) as pool:
+            made = pool.map(report, tables, itertools.repeat(folder))
+            for table, _ in zip(tables, made, strict=True):
+                summary = table.with_name(table.name.replace("table.md", "summary.csv"))
+                for path in (table, summary):
+                    yield path, (there / path.relative_to(root / "results")).read_text("utf-8")
 
 
-def report(command: str) -> None:
-    """Runs a command `python -m experiments.NAME ...` on the stored rows, without figures."""
+def report(table: Path, folder: str) -> None:
+    """Runs the command of a table on the stored rows in a folder, without figures."""
+    command = table.read_text(encoding="utf-8").splitlines()[2].strip("`")
     _, _, module, *words = shlex.split(command)
     made = importlib.import_module(module).EXPERIMENT
     settings = made.settings.of(**experiment.parse([*words, "from_rows=true"]))
-    with contextlib.redirect_stdout(io.StringIO()), mock.patch.object(figures, "save"):
+    with (
+        contextlib.chdir(folder),
+        contextlib.redirect_stdout(io.StringIO()),
+        mock.patch.object(figures, "save"),
+    ):
         made.run(settings)
 
 
