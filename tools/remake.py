@@ -58,14 +58,13 @@ def report(table: Path, folder: str) -> None:
     """Runs the command of a table on the stored rows in a folder, without figures."""
     command = table.read_text(encoding="utf-8").splitlines()[2].strip("`")
     _, _, module, *words = shlex.split(command)
-    made = importlib.import_module(module).EXPERIMENT
-    settings = made.settings.of(**experiment.parse([*words, "from_rows=true"]))
     with (
         contextlib.chdir(folder),
         contextlib.redirect_stdout(io.StringIO()),
         mock.patch.object(figures, "save"),
     ):
-        made.run(settings)
+        made = importlib.import_module(module).EXPERIMENT
+        made.run(made.settings.of(**experiment.parse([*words, "from_rows=true"])))
 
 
 def is_same(path: Path, text: str) -> bool:
