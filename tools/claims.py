@@ -228,11 +228,18 @@ class Claims:
                 print(f"    {file}, {entry.get('made') or self.made(file)}")
 
     def made(self, rows: str) -> str:
-        """Commit and date at which rows were made: those of the settings beside them, if any."""
-        beside = [*(self.root / rows).parent.glob("settings.json*")]
-        path = beside[0] if beside else {"pretrained": "sejax/pretrained"}.get(rows, rows)
-        git = ["git", "-C", str(self.root), "log", "-1", "--format=%h %cs", "--", str(path)]
-        return subprocess.run(git, capture_output=True, text=True).stdout.strip()
+        """Commit and date at which rows were made: the older of those of rows and of settings.
+
+        Rows are written again when columns move, settings when their format does.
+        """
+        paths = [{"pretrained": "sejax/pretrained"}.get(rows, rows)]
+        paths += [str(path) for path in (self.root / rows).parent.glob("settings.json*")]
+        git = ["git", "-C", str(self.root), "log", "-1", "--format=%ct %h %cs", "--"]
+        found = [
+            subprocess.run([*git, path], capture_output=True, text=True).stdout.strip()
+            for path in paths
+        ]
+        return min(filter(None, found), default="").partition(" ")[2]
 
 
 def format_field(field: str, spec: str | None, names: Mapping[str, Any]) -> str:
