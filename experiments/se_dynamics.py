@@ -3,10 +3,9 @@
 Kinds of SEs that may teach through their dynamics are learned with the same agents and strategy,
 beside the bandit of `preset=best`: with soft ends, which are handed over as a discount; with the
 same as probabilities (`bernoulli`); with ends at a threshold, which no episode of `shortest` has
-before a tenth of the task's step limit; with ends at a threshold, and a myopic agent (discount 0)
-that trains on half of the candidates and counts against the SE (`against_myopic`); and with ten
-steps an episode at most. The best SE of each run then trains fresh agents of several kinds, and
-takes the myopia test (`se_myopia`): what agents with smaller discounts learn on it.
+before a tenth of the task's step limit; and with ten steps an episode at most. The best SE of each
+run then trains fresh agents of several kinds, and takes the myopia test (`se_myopia`): what agents
+with smaller discounts learn on it.
 
 All agents are sejax's. Those of others do not see the discount that soft ends are handed over as.
 
@@ -15,8 +14,7 @@ again after each run.
 """
 
 import dataclasses
-import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
@@ -43,9 +41,8 @@ from sejax import Task, envs
 from sejax.cli import session
 from sejax.options import each_of, positive
 
-# On Pendulum, preset=best has a reward whose best action is known, and no trainings for a share.
-TRAINED = ("proxy.reward_form=network", "objective.closed_form=0", "objective.temperature=0")
-WHOLE = ("proxy.initial_state=real", "proxy.horizon=null", *TRAINED)
+# On Pendulum, preset=best has a reward whose best action is known.
+WHOLE = ("proxy.initial_state=real", "proxy.horizon=null", "proxy.reward_form=network")
 # Overrides of the runs, by kind; `tenth` of the task's step limit.
 KINDS: dict[str, tuple[str, ...]] = {
     "bandit": (),
@@ -53,12 +50,8 @@ KINDS: dict[str, tuple[str, ...]] = {
     "threshold": (*WHOLE, "proxy.done=threshold"),
     "bernoulli": (*WHOLE, "proxy.done=bernoulli"),
     "shortest": (*WHOLE, "proxy.done=threshold", "proxy.min_steps={tenth}"),
-    "against_myopic": (*WHOLE, "proxy.done=threshold"),
-    "ten_steps": (
-        *("proxy.initial_state=real", "proxy.horizon=10", "proxy.done=threshold", *TRAINED),
-    ),
+    "ten_steps": (*WHOLE, "proxy.horizon=10", "proxy.done=threshold"),
 }
-MYOPIC = "myopic"  # agent of `against_myopic`: as the learning one, but for its discount and weight
 # On Pendulum, preset=best has agents explore as in a bandit: for a hundred episodes, of one step
 # each, where no action is dear.
 NOT_BANDIT = {
@@ -119,23 +112,7 @@ class SeDynamics(RunSettings):
         if kind != "bandit":
             steps = self.max_steps
             words += [f"training.max_steps={steps}", f"training.max_episodes={steps}"]
-        words = [*(QUICK if self.quick else ()), *words]
-        if kind != "against_myopic":
-            return self.learn_config(words)
-        both = (self.learner, MYOPIC)
-        words = [f"agents=[{','.join(both)}]", *for_each(both, words)]
-        own = {"name": self.learner, "discount": 0, "weight": -1}
-        words += [f"agents.{MYOPIC}.{field}={x}" for field, x in own.items()]
-        return dataclasses.replace(self, run=for_each(both, self.run)).learn_config(words)
-
-
-def for_each(agents: Sequence[str], words: Iterable[str]) -> tuple[str, ...]:
-    """Overrides in which those of an agent are those of each in a mixture."""
-    return tuple(
-        re.sub(r"^agent\.", f"agents.{agent}.", word)
-        for word in words
-        for agent in (agents if word.startswith("agent.") else agents[:1])
-    )
+        return self.learn_config([*(QUICK if self.quick else ()), *words])
 
 
 def compute(settings: SeDynamics) -> pd.DataFrame:
@@ -156,8 +133,6 @@ def compute(settings: SeDynamics) -> pd.DataFrame:
             folder = settings.work_folder / "runs" / kind
             mine = runs.configs_of(config, settings.runs, folder)[place]
             curve = runs.learn([mine], chunks=chunks[kind])
-            if mine.agents is not None:  # the incumbent's mean is a difference then
-                curve["incumbent_mean"] = curve[f"incumbent_mean_{settings.learner}"]
             own = {"kind": kind, "seed": mine.seed}
             curves.append(curve[list(CURVE)].assign(**own))
             tests = test(settings, kind, mine, chunks[kind].learner.proxy, students[kind])
@@ -209,7 +184,7 @@ def test(
     for student, agent in students.items():
         tested = condition(f"{kind}-{student}", agent)
         found.append(train_groups(tested, own, settings.num_agents).assign(student=student))
-    (learner,) = (x for key, x in se.learned_agents().items() if key != MYOPIC)
+    (learner,) = se.learned_agents().values()
     sighted = condition(f"{kind}-discount-", learner)
     found.append(se_myopia.train_with_discounts(own, sighted, se_myopia.DISCOUNTS))
     made_with = {f"{condition}-{name}": x for condition, x in own.shards.made_with.items()}
@@ -301,8 +276,7 @@ def report(settings: SeDynamics, rows: pd.DataFrame) -> pd.DataFrame:
     note = (
         f"NES runs of {settings.generations} generations for each kind; real steps and CPU s (of "
         "the generations, without compilation) until the first incumbent mean of at least "
-        f"{task.solved_reward:g}: medians over runs, - if half of them had none. Of SEs that a "
-        "myopic agent counts against, the incumbent mean is that of the other one. The best SE of "
+        f"{task.solved_reward:g}: medians over runs, - if half of them had none. The best SE of "
         f"each run trains {settings.num_agents} fresh agents of each kind with its default "
         "hyperparameters, and of the learning kind with each discount: mean return on "
         f"{task.name}. {tables.interval_note('SEs')} SEs that solve: those whose fresh agents "

@@ -25,13 +25,11 @@ from sejax.es.base import Strategy, StrategyState
 from sejax.es.nes import NESConfig
 from sejax.evaluation import (
     Candidates,
-    best_policy,
     evaluators_of,
     make_population_evaluator,
     tested_throughout,
 )
 from sejax.objectives import (
-    CLOSED_FORM,
     Evaluator,
     GenerationInfo,
     MaxReward,
@@ -100,8 +98,8 @@ class Bilevel:
     def solved_score(self) -> float | None:
         """Incumbent mean at which the task counts as solved; None if no score says so."""
         task = self.proxy.task
-        are_returns = self.objective.scores_are_returns and not self.mixture.has_opponents
-        return task.solved_reward if are_returns and task.is_solvable else None
+        is_return = self.objective.scores_are_returns
+        return task.solved_reward if is_return and task.is_solvable else None
 
     def init(self, key: Array) -> LearnState:
         """The state before the first generation, with random weights of the proxy."""
@@ -298,9 +296,6 @@ def make_bilevel(
     mixture = Mixture.of(agent)
     training = training or TrainingConfig()
     training = tested_throughout(training) if objective.needs_tests else training
-    if objective.closed_form:
-        policy = best_policy(proxy, objective.temperature)
-        mixture = mixture.joined_by(CLOSED_FORM, policy, objective.closed_form)
     evaluators = evaluators_of(objective, mixture, proxy, training)
     if objective.evaluators is not None:  # which leaves no share of the candidates to an agent
         mixture = Mixture.of(mixture.agents[0])

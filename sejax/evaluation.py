@@ -15,7 +15,6 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from sejax.agents.base import Agent, AgentState, Hparams
-from sejax.agents.fixed import make_fixed
 from sejax.agents.mixture import Mixture
 from sejax.envs.base import Task
 from sejax.envs.wrappers import repeat_actions
@@ -29,7 +28,6 @@ from sejax.ops.parallel import (
     spread_over_devices,
 )
 from sejax.options import require
-from sejax.proxies import require_best_action
 from sejax.proxies.base import ProxyEnv, is_real
 from sejax.training import (
     TrainingConfig,
@@ -411,77 +409,17 @@ def evaluators_of(
 ) -> tuple[Evaluator, ...]:
     """How candidates are evaluated: by the objective's own evaluators, or one for each agent.
 
-    An agent's trains it on the candidate and tests it on the real task. The last of a mixture that
-    `best_policy` has joined is tested as it is.
+    An agent's trains it on the candidate and tests it on the real task.
     """
     if objective.evaluators is not None:
         return objective.evaluators(mixture, proxy, training)
-    trained = mixture.agents[:-1] if objective.closed_form else mixture.agents
-    found = [
+    return tuple(
         Evaluator(
             run=make_evaluator(agent, proxy, proxy.task, training),
             cpu_num_parallel=num_parallel_on_cpu(agent, training),
         )
-        for agent in trained
-    ]
-    if objective.closed_form:
-        run = make_untrained_evaluator(mixture.agents[-1], proxy.task, training)
-        found.append(Evaluator(run=run, cpu_num_parallel=1))
-    return tuple(found)
-
-
-def best_policy(proxy: ProxyEnv, temperature: float = 0.0) -> Agent:
-    """What every agent strives for in an SE whose best policy is known, without training one.
-
-    Args:
-      proxy: such an SE.
-      temperature: as of `BanditEnv.soft_action`; 0 for the best action.
-
-    Returns:
-      A policy in the form of an agent; its state is the proxy's `EnvParams`.
-
-    Raises:
-      ConfigError: for any other proxy.
-    """
-    require_best_action(proxy.config, proxy.task, proxy.task.name)
-    env: Any = proxy
-
-    def act(key: Array, params: PyTree, obs: Array) -> Array:
-        if temperature == 0:
-            return env.best_action(params.weights, obs)
-        return env.soft_action(key, params.weights, obs, temperature)
-
-    return make_fixed(proxy.task, act)
-
-
-def make_untrained_evaluator(
-    policy: Agent, task: Task, training: TrainingConfig
-) -> Callable[..., Outcome]:
-    """Builds `evaluate(key, env_params, active=True, eval_steps=None) -> Outcome` of `best_policy`.
-
-    It plays the tests of `make_evaluator`, and nothing else.
-    """
-    test = make_tester(policy, task, training.test_episodes)
-
-    def evaluate(
-        key: Array,
-        env_params: PyTree,
-        active: Array | bool = True,
-        eval_steps: Array | None = None,
-    ) -> Outcome:
-        _, key_test = jax.random.split(key)
-        tests = test(key_test, env_params, active, eval_steps)
-        return Outcome(
-            test_returns=tests.returns,
-            scored_returns=tests.scored,
-            train_steps=jnp.int32(0),
-            train_episodes=jnp.int32(0),
-            auc=jnp.float32(0),
-            nonfinite=~jnp.isfinite(tests.returns).all(),
-            real_steps=tests.num_steps.sum(),
-        )
-
-    return evaluate
+        for agent in mixture.agents
+    )
 
 
 @struct.dataclass

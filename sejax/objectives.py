@@ -17,14 +17,11 @@ from jaxtyping import Array, Bool, Float, Int
 from sejax.agents.mixture import Mixture
 from sejax.envs.base import Task
 from sejax.es.base import Evaluations, Strategy, finite_mean
-from sejax.options import Options, counts, fraction, not_negative, option, require
+from sejax.options import Options, counts, not_negative, option, require
 from sejax.proxies.base import ProxyEnv
 
 if TYPE_CHECKING:  # which lies above
     from sejax.training import TrainingConfig
-
-
-CLOSED_FORM = "closed_form"  # the name of an SE's best policy among the agents that score it
 
 
 @struct.dataclass
@@ -100,9 +97,6 @@ class Objective:
       evaluators: `(mixture, proxy, training)` to two evaluators, of the population and of the
         incumbent, each of a candidate with all agents; None where one agent of the mixture trains
         on a candidate and is tested on the real task.
-      closed_form: share of the candidates that are scored by the test return of their best policy,
-        which is known, in place of an agent's; with 1 no agent trains.
-      temperature: what a nat of entropy is worth to that policy, in rewards of the proxy.
       meaning: of a score, for people.
     """
 
@@ -114,8 +108,6 @@ class Objective:
     evaluators: (
         Callable[[Mixture, ProxyEnv, "TrainingConfig"], tuple[Evaluator, Evaluator]] | None
     ) = None
-    closed_form: float = 0.0
-    temperature: float = 0.0
     meaning: str = ""
 
     def __call__(self, outcome: Outcome) -> Float[Array, "*agent"]:
@@ -148,29 +140,12 @@ class MaxReward(Options):
     first_eval_steps: int | None = option(None, counts("there is nothing to score otherwise"))
     # Generation from which on the task's limit counts; before, the steps change linearly.
     curriculum_generations: int = option(50, counts("it is the length of a curriculum"))
-    # Share of the candidates that no agent trains on: an SE with proxy.horizon=1 whose best policy
-    # is known (discrete actions, or a proxy.reward_form) is scored by that policy's return.
-    closed_form: float = option(0.0, fraction())
-    # What a nat of entropy is worth to that policy, in the SE's rewards; 0: it plays the best
-    # action. Above 0 it plays at random between actions that the SE hardly tells apart.
-    temperature: float = option(0.0, not_negative())
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        require(
-            self.closed_form > 0 or self.temperature == 0,
-            "objective.temperature",
-            f"must be 0 with objective.closed_form=0, where no policy is known; got "
-            f"{self.temperature:g}. Set objective.closed_form=0.5.",
-        )
 
     def make(self, task: Task) -> Objective:
         """The objective on a task."""
         objective = Objective(
             score=lambda outcome: outcome.test_return,
             scores_are_returns=True,
-            closed_form=self.closed_form,
-            temperature=self.temperature,
         )
         if self.first_eval_steps is None:
             return objective
@@ -383,29 +358,13 @@ class Scoring:
 
     def for_strategy(self, outcome: Outcome) -> tuple[Float[Array, " pop"], Float[Array, ""]]:
         """Scores of the population and of the incumbent in one unit, for `Strategy.tell`."""
-        scores = self._scores(self.signed(self.objective(outcome)))
+        scores = self._scores(self.objective(outcome))
         population = self.evaluations.population_scores(scores.population)
         return self.mixture.comparable(population, self.agent_of_candidate, scores.agent_means)
 
     def judged(self, outcome: Outcome) -> Scores:
         """The scores that people see; with a curriculum, those of whole test episodes."""
-        scores = self._scores(self.signed(self.objective.judged(outcome)))
-        if not self.mixture.has_opponents:
-            return scores
-        num_population = scores.population.shape[0]
-        each = self.signed(jnp.concatenate([scores.population, scores.incumbent]))
-        return dataclasses.replace(
-            scores,
-            population=each[:num_population],
-            incumbent=each[num_population:],
-            agent_means=scores.agent_means * self.mixture.signs,
-        )
-
-    def signed(self, scores: Float[Array, " evaluation"]) -> Float[Array, " evaluation"]:
-        """Scores in which more is better, also of agents that count against a proxy."""
-        if not self.mixture.has_opponents:
-            return scores
-        return scores * self.mixture.signs[self.agent_of_evaluation]
+        return self._scores(self.objective.judged(outcome))
 
     def info(
         self, scores: Scores, outcome: Outcome, generation: Array, best: Array, active: Array

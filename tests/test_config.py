@@ -155,12 +155,12 @@ def test_a_mixture_has_fields_for_each_agent():
 
 def test_an_agent_of_a_mixture_may_have_a_name_of_its_own():
     config = sejax.config(["agents=[ddqn,myopic]", "agents.myopic.name=ddqn",
-                           "agents.myopic.discount=0", "agents.myopic.weight=-1"])  # fmt: skip
+                           "agents.myopic.discount=0", "agents.myopic.weight=2"])  # fmt: skip
     sighted, myopic = config.agents.members
-    assert (myopic.key, myopic.agent.discount, myopic.weight) == ("myopic", 0.0, -1.0)
+    assert (myopic.key, myopic.agent.discount, myopic.weight) == ("myopic", 0.0, 2.0)
     assert sighted.agent == sejax.config([]).agent, "with the settings of its preset"
     assert dataclasses.replace(myopic.agent, discount=0.99) == sighted.agent
-    assert config.parts()["agent"].weights == (1.0, -1.0)
+    assert config.parts()["agent"].weights == (1.0, 2.0)
     assert config.parts()["agent"].names == ("ddqn", "myopic")
 
 
@@ -226,7 +226,7 @@ def test_a_preset_file_stands_for_its_overrides(tmp_path):
         [],
         ["agents=[ddqn,ppo]", "agents.ppo.weight=2", "es=snes"],
         ["env=gymnax/Catch-bsuite"],
-        ["agents=[ddqn,myopic]", "agents.myopic.name=ddqn", "agents.myopic.weight=-1"],
+        ["agents=[ddqn,myopic]", "agents.myopic.name=ddqn", "agents.myopic.weight=3"],
     ],
 )
 def test_a_runs_configuration_is_a_preset_file(tmp_path, overrides):
@@ -315,7 +315,7 @@ def test_two_whole_messages():
         ("agents=[ddqn,ppo] agent.batch_size=3", "agent.batch_size", "agents.ddqn.batch_size=3"),
         ("agents=[ddqn,ppo] agent=sac", "agent", "agents=[ddqn,ppo,sac]"),
         ("agents=[ddqn,ppo] agents.ddqn.batchsize=3", "agents.ddqn.batchsize", "batch_size"),
-        ("agents=[ddqn,ppo] agents.ddqn.weight=-2e6", "agents.ddqn.weight", ""),
+        ("agents=[ddqn,ppo] agents.ddqn.weight=-1", "agents.ddqn.weight", ""),
         ("agents=[ddqn,ppo] agents.ddqn.batch_size=0", "agents.ddqn.batch_size", ""),
         ("agents.aggregate=min", "agents.aggregate", "agents=[ddqn,ppo]"),
         ("agents=[ddqn,td3]", "agents.td3", ""),

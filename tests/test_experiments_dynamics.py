@@ -163,19 +163,12 @@ def test_kinds_differ_in_their_proxy_and_agents_explore_as_their_episodes_ask():
     assert (soft.proxy.done, soft.proxy.horizon, soft.proxy.initial_state) == ("soft", None, "real")
     assert (soft.training.max_steps, bandit.training.max_steps) == (4000, 10000)
     assert soft.es == bandit.es
-    myopic = settings.config_of("against_myopic")
-    assert dataclasses.replace(myopic, agents=None, agent=bandit.agent) == dataclasses.replace(
-        settings.config_of("threshold"), agent=bandit.agent
-    )
-    opponent, sighted = myopic.agents.members
-    assert (opponent.key, opponent.weight, opponent.agent.discount) == ("myopic", -1, 0)
-    assert sighted.agent == soft.agent == dataclasses.replace(opponent.agent, discount=0.99)
     shortest = se_dynamics.SeDynamics.of(env="acrobot").config_of("shortest")
     assert (shortest.proxy.min_steps, soft.proxy.min_steps) == (50, 1)
     assert settings.agent_of("bandit", "td3") == bandit.agent
     for kind in settings.kinds:
         config = settings.config_of(kind)
-        assert settings.agent_of(kind, "td3") == config.agent or kind == "against_myopic"
+        assert settings.agent_of(kind, "td3") == config.agent
         for agent in settings.tested:
             limits = config.proxy.max_steps(200), 200
             waits = settings.agent_of(kind, agent).steps_before_learning(*limits)

@@ -3,13 +3,8 @@
 A proxy that is learned with one agent teaches that agent; whether it teaches others is left to
 chance. Here the candidates of a generation are divided among several agents, so that a step of the
 outer loop helps all of them, at the same number of trainings.
-
-An agent of negative weight counts against the proxy: what is sought teaches the others and not it.
-With weights w and scores F of the agents, a step follows the gradient of the sum of w F, in which
-each agent's part is estimated from its share abs(w) of the candidates.
 """
 
-import dataclasses
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -31,8 +26,7 @@ class MixtureConfig(Options):
 
     group: ClassVar[str] = "agents"
 
-    # The incumbent's score, given its mean with each agent: the mean of those, or the worst; less
-    # the means with agents of negative weight, times these as shares of the positive ones.
+    # The incumbent's score, given its mean with each agent: the mean of those, or the worst.
     aggregate: str = option("mean", one_of(AGGREGATES))
     # How scores of several agents become comparable. advantage: a candidate's score less the
     # incumbent's mean with the same agent; rank: its rank among that agent's candidates, less the
@@ -48,11 +42,11 @@ class Mixture:
       agents: from `sejax.make_agent`, or your own.
       names: of the agents, for tables; their numbers if not given.
       weights: shares of the candidates that each agent trains on; equal if not given. An agent of
-        weight 0 trains on the incumbent alone; the scores of one of negative weight are negated.
+        weight 0 trains on the incumbent alone.
       config: how the agents' scores are combined.
 
     Raises:
-      ConfigError: for no agents, other numbers of names and weights, or no weight above 0.
+      ConfigError: for no agents, other numbers of names and weights, a weight below 0, or all 0.
 
     Example:
       >>> import sejax
@@ -81,9 +75,10 @@ class Mixture:
             "Set names=() and weights=().",
         )
         require(
-            max(self.weights) > 0,
+            min(self.weights) >= 0 and max(self.weights) > 0,
             "agents",
-            f"must have a weight above 0; got {shortened(self.weights)}. Set weights=().",
+            "must have a weight above 0, and none below; got "
+            f"{shortened(self.weights)}. Set weights=().",
         )
 
     @classmethod
@@ -103,37 +98,9 @@ class Mixture:
         )
         return cls(agents=(agent,))
 
-    def joined_by(self, name: str, agent: Agent, share: float) -> "Mixture":
-        """The mixture with one more at its end, which gets a share of the candidates.
-
-        Args:
-          name: of the one that joins.
-          agent: that one.
-          share: in (0, 1]; with 1 it is alone.
-        """
-        if share == 1:
-            return dataclasses.replace(self, agents=(agent,), names=(name,), weights=(1.0,))
-        weight = share / (1 - share) * float(np.abs(self.weights).sum())
-        return dataclasses.replace(
-            self,
-            agents=(*self.agents, agent),
-            names=(*self.names, name),
-            weights=(*self.weights, weight),
-        )
-
     @property
     def size(self) -> int:
         return len(self.agents)
-
-    @property
-    def signs(self) -> np.ndarray:
-        """-1 for an agent whose scores count against a proxy, else 1, `[agent]` float32."""
-        return np.where(np.array(self.weights) < 0, -1, 1).astype(np.float32)
-
-    @property
-    def has_opponents(self) -> bool:
-        """Whether the scores of an agent count against a proxy; the mixture's are no returns."""
-        return min(self.weights) < 0
 
     def agent_of_candidate(self, population_size: int, antithetic: bool = False) -> np.ndarray:
         """Index of the agent that trains on each candidate, `[pop]`.
@@ -146,8 +113,7 @@ class Mixture:
           ConfigError: if an agent with a weight gets no candidate.
         """
         num_places = population_size // 2 if antithetic else population_size
-        weights = np.abs(self.weights)
-        shares = weights / sum(weights)
+        shares = np.array(self.weights) / sum(self.weights)
         counts = np.zeros(self.size)
         dealt = []
         for place in range(num_places):
@@ -168,13 +134,9 @@ class Mixture:
         return -(-num_incumbent_evals // self.size) * self.size
 
     def aggregated(self, means: Float[Array, " agent"]) -> Float[Array, ""]:
-        """The incumbent's score, given its mean with each agent, in its sign; nan if one is."""
+        """The incumbent's score, given its mean with each agent; nan if one is."""
         aggregate = jnp.mean if self.config.aggregate == "mean" else jnp.min
-        if not self.has_opponents:
-            return aggregate(means)
-        weights = np.array(self.weights)
-        shares = np.maximum(-weights, 0) / np.maximum(weights, 0).sum()
-        return aggregate(means[weights >= 0]) + (shares * means).sum()
+        return aggregate(means)
 
     def comparable(
         self,
@@ -187,8 +149,7 @@ class Mixture:
         Those of a single agent stay as they are.
 
         Args:
-          scores: of the candidates, in their agents' signs; not finite where training diverged, and
-            then they stay so.
+          scores: of the candidates; not finite where training diverged, and then they stay so.
           agent_of_candidate: index of the agent that trained on each.
           incumbent_means: nan for an agent that no evaluation of the incumbent survived with; its
             candidates are then compared with their own mean.

@@ -16,7 +16,6 @@ from sejax.agents.base import Agent, AgentConfig, ExplorationConfig
 from sejax.agents.mixture import Mixture, MixtureConfig
 from sejax.cli.compose import DEFAULTS, compose, key_of, named
 from sejax.envs.spec import TaskSpec
-from sejax.objectives import CLOSED_FORM
 from sejax.ops.files import as_file_name
 from sejax.options import (
     ConfigError,
@@ -31,7 +30,6 @@ from sejax.options import (
     shortened,
 )
 from sejax.options.plain import from_plain, to_plain
-from sejax.proxies import require_best_action
 from sejax.training import TrainingConfig, require_reachable
 
 AGENT_HPARAMS = ("default", "varied")
@@ -54,8 +52,7 @@ class MixtureMember(Options):
       key: its name in tables and metrics.
       field: its name in overrides and messages.
       agent: its configuration.
-      weight: its share of a generation's candidates; with 0 it only judges incumbents, and below 0
-        its scores count against a proxy.
+      weight: its share of a generation's candidates; with 0 it only judges incumbents.
     """
 
     group: ClassVar[str] = "agent"
@@ -63,7 +60,7 @@ class MixtureMember(Options):
     key: str
     field: str
     agent: AgentConfig
-    weight: float = option(1.0, between(-1e6, 1e6, "it is a share of the candidates"))
+    weight: float = option(1.0, between(0, 1e6, "it is a share of the candidates"))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -204,14 +201,12 @@ class LearnConfig(CommandConfig):
         spec, task_name = envs.spec_of(self.env), self.name("env")
         self.proxy.require_task(spec, task_name)
         max_steps = self.proxy.max_steps(spec.max_steps)
-        if self.closed_form:
-            require_best_action(self.proxy, spec, task_name)
-        if self.closed_form < 1 and not self.proxy.has_real_dynamics:
+        if not self.proxy.has_real_dynamics:
             require_reachable("training", self.training, max_steps)
         for member in members_of(self):
             with named(member.field):
                 agents.require_fit(member.agent, self.exploration, spec, task_name)
-                if self.proxy.reaches_step_limit and self.closed_form < 1:
+                if self.proxy.reaches_step_limit:
                     limits = max_steps, spec.max_steps
                     require_learning("training", self.training, member.agent, *limits)
         if hasattr(self.objective, "require_agents"):
@@ -225,17 +220,11 @@ class LearnConfig(CommandConfig):
         return registry.name_of(group, getattr(self, group))
 
     @property
-    def closed_form(self) -> float:
-        """The share of the candidates that no agent trains on; 0 with objectives of your own."""
-        return float(getattr(self.objective, "closed_form", 0.0))
-
-    @property
     def scored_agents(self) -> tuple[str, ...]:
         """The agents that have scores of their own; none where an objective scores all as one."""
         if getattr(self.objective, "scores_all_agents", False):
             return ()
-        trained = members_of(self) if self.closed_form < 1 else ()
-        return (*(each.key for each in trained), *([CLOSED_FORM] if self.closed_form else ()))
+        return tuple(member.key for member in members_of(self))
 
     def plain(self) -> dict[str, Any]:
         """Nested plain values, as in `config.yaml`; what `sejax.save` keeps with a proxy."""
@@ -265,7 +254,7 @@ class LearnConfig(CommandConfig):
         """The agent, or the mixture of agents, that trains on the proxies."""
         varied, each = self.agent_hparams == "varied", members_of(self)
         made = tuple(agents.make_agent(x.agent, task, self.exploration, varied) for x in each)
-        if self.agents is None and not self.closed_form:
+        if self.agents is None:
             return made[0]
         names, weights = tuple(x.key for x in each), tuple(x.weight for x in each)
         shared = self.agents or MixtureConfig()

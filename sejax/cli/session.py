@@ -19,7 +19,7 @@ from sejax.cli import plots, runtime
 from sejax.cli.config import LearnConfig
 from sejax.cli.run_directory import RunDirectory
 from sejax.cli.trackers import FinishedGeneration, GuardedTracker, Reporter, TrackedRun
-from sejax.objectives import CLOSED_FORM, GenerationInfo
+from sejax.objectives import GenerationInfo
 from sejax.ops.parallel import compiler_options
 from sejax.proxies.io import save
 
@@ -228,8 +228,7 @@ class _Proxies:
         # What was learned does not depend on the tracker, nor on where it was computed.
         plain = directory.config.items()
         self._plain = {k: v for k, v in plain if k not in ("tracker", "machines")}
-        mixture = learner.mixture
-        agent = mixture.agents[int(np.argmax(mixture.signs))]  # the first that it shall teach
+        agent = learner.mixture.agents[0]
         discount = agent.discount(agent.hparams)
         self._discount = None if discount is None else float(discount)
         self._best: int | None = None  # the generation of the best proxy that is on the disk
@@ -261,7 +260,7 @@ class _Proxies:
             score=float(score),
             generation=int(generation),
             seed=self._seed,
-            **({"scores": by_agent} if len(names) > 1 or CLOSED_FORM in names else {}),
+            **({"scores": by_agent} if len(names) > 1 else {}),
         )
 
 

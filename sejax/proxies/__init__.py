@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 from sejax.envs.base import Task
 from sejax.envs.spec import TaskSpec
-from sejax.options import Options, require, shortened
+from sejax.options import Options
 
 if TYPE_CHECKING:
     from sejax.proxies.base import ProxyEnv
@@ -60,10 +60,6 @@ class ProxyConfig(Options, ABC):
         """Maximum number of steps of an episode, given the real task's."""
         return task_max_steps
 
-    def knows_best_action(self, spec: TaskSpec) -> bool:
-        """Whether a proxy of this kind has `best_action` for a task: its optimum is known."""
-        return False
-
     def require_task(self, spec: TaskSpec, task_name: str) -> None:
         """Checks that a proxy of this kind is possible for a task.
 
@@ -74,19 +70,3 @@ class ProxyConfig(Options, ABC):
     @abstractmethod
     def make(self, task: Task) -> "ProxyEnv":
         """The proxy of a task."""
-
-
-def require_best_action(config: ProxyConfig, spec: TaskSpec, task_name: str) -> None:
-    """Checks that the best policy of a proxy is known, as `objective.closed_form` needs it.
-
-    Raises:
-      ConfigError: if it is not.
-    """
-    kind = "proxy.horizon=1" if hasattr(config, "horizon") else "proxy=se proxy.horizon=1"
-    fix = kind + ("" if spec.num_actions else " proxy.reward_form=distance")
-    require(
-        config.knows_best_action(spec),
-        "objective.closed_form",
-        f"must be 0 but for SEs of one step whose best action is known; got another one, of "
-        f"{shortened(task_name)}. Set {fix}, or objective.closed_form=0.",
-    )

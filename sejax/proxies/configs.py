@@ -143,9 +143,6 @@ class SyntheticConfig(ProxyConfig):
     def sees_bounds(self) -> bool:
         return self.state_units == "bounds"
 
-    def knows_best_action(self, spec: TaskSpec) -> bool:
-        return self.is_bandit and (spec.num_actions is not None or self.reward_form != "network")
-
     def require_task(self, spec: TaskSpec, task_name: str) -> None:
         """Checks that the reward's form is one for the task's actions.
 

@@ -179,13 +179,7 @@ class BanditEnv(SyntheticEnv):
 
     .. math:: r(s, a) = -c \sum_i |a_i - \mathrm{clip}(b u_i(s), \pm b)|^p, \quad p \in \{1, 2\}
 
-    What every agent strives for is then known without training one, as it is where actions are
-    discrete: the best action; or, where entropy is worth a temperature :math:`\tau`, the policy
-    :math:`\pi(a \mid s) \propto \exp(r(s, a) / \tau)`.
-
-    Source: forms of the reward: ours; the policy: Ziebart, "Modeling Purposeful Adaptive Behavior
-    with the Principle of Maximum Causal Entropy" (2010); Haarnoja et al., "Reinforcement Learning
-    with Deep Energy-Based Policies" (2017), theorem 1, for a bandit.
+    Source: forms of the reward: ours.
     """
 
     is_bandit = True
@@ -212,42 +206,3 @@ class BanditEnv(SyntheticEnv):
     ) -> Float[Array, ""]:
         """The reward of an action, where states are what agents observe."""
         return self.predict(weights, obs, action)[1]
-
-    def best_action(self, weights: PyTree, obs: Array) -> Array:
-        """The action of the highest reward; see `ProxyConfig.knows_best_action`."""
-        if self.task.num_actions is None:
-            return self._best_action(weights, obs)
-        return jnp.argmax(self._rewards(weights, obs)).astype(jnp.int32)
-
-    def soft_action(
-        self, key: Array, weights: PyTree, obs: Array, temperature: Array | float
-    ) -> Array:
-        """An action drawn in proportion to exp(reward / temperature).
-
-        Args:
-          key: of the draw.
-          weights: of the SE.
-          obs: what an agent observes.
-          temperature: what a nat of entropy is worth, above 0.
-        """
-        if self.task.num_actions is not None:
-            return jax.random.categorical(key, self._rewards(weights, obs) / temperature)
-        best, bound = self._best_action(weights, obs), self.task.max_action
-        scale = temperature / self.config.reward_slope
-        if self.config.reward_form == "quadratic":  # a normal distribution within the bounds
-            std = jnp.sqrt(scale / 2)
-            low, high = (-bound - best) / std, (bound - best) / std
-            return best + std * jax.random.truncated_normal(key, low, high)
-        # Laplace's within the bounds: a side by its mass, and a distance on that side.
-        key_side, key_distance = jax.random.split(key)
-        below, above = (1 - jnp.exp((sign * best - bound) / scale) for sign in (-1, 1))
-        is_above = jax.random.uniform(key_side, best.shape) * (below + above) < above
-        mass = jnp.where(is_above, above, below) * jax.random.uniform(key_distance, best.shape)
-        return best - jnp.where(is_above, 1, -1) * scale * jnp.log1p(-mass)
-
-    def _rewards(self, weights: PyTree, obs: Array) -> Float[Array, " num_actions"]:
-        """The rewards of discrete actions."""
-        if self.task.num_states is not None:
-            obs = jax.nn.one_hot(obs, self.task.num_states)
-        actions = jnp.arange(self.task.num_actions)
-        return jax.vmap(self.bandit_reward, (None, None, 0))(weights, obs, actions)

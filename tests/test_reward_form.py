@@ -1,0 +1,76 @@
+"""SEs of one step whose reward has a known form: what it is, how it is stored, what is refused."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import sejax
+from sejax import envs
+from sejax.cli import config as configuration
+from sejax.options import ConfigError
+from sejax.proxies.configs import SyntheticConfig
+
+FORMS = {
+    form: SyntheticConfig(
+        hidden_size=8, horizon=1, initial_state="noise", state_units="bounds", reward_form=form,
+        reward_slope=0.7,
+    )
+    for form in ("distance", "quadratic")
+}  # fmt: skip
+OBS = jnp.array([0.6, 0.8, -2.0])
+
+
+def made(config):
+    env = config.make(envs.make("pendulum"))
+    return env, env.init_weights(jax.random.key(3))
+
+
+def step_reward(env, weights, obs, action):
+    """As an agent would meet it."""
+    params = env.params(weights)
+    _, state = env.reset_env(jax.random.key(0), params)
+    state = state.replace(vector=jnp.asarray(obs))
+    return float(env.step_env(jax.random.key(0), state, jnp.asarray(action), params)[2])
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_the_reward_is_what_the_form_says(form):
+    env, weights = made(FORMS[form])
+    # The network by hand: leaky ReLUs of the state in units of half the way to the bounds.
+    seen = np.asarray(OBS) / np.array([0.5, 0.5, 4.0])
+    first, last = weights["reward"]["Dense_0"], weights["reward"]["Dense_1"]
+    hidden = np.asarray(first["kernel"]) @ seen + np.asarray(first["bias"])
+    hidden = np.where(hidden > 0, hidden, 0.01 * hidden)
+    output = np.asarray(last["kernel"]) @ hidden + np.asarray(last["bias"])
+    best = 2.0 * np.clip(output, -1, 1)
+    for action in (-2.0, 0.3, 5.0):  # the last is clipped to 2
+        apart = abs(min(action, 2.0) - best[0])
+        wanted = -0.7 * (apart if form == "distance" else apart**2)
+        assert step_reward(env, weights, OBS, [action]) == pytest.approx(wanted, rel=1e-4)
+
+
+def test_it_is_stored_and_plays_in_numpy_alike(tmp_path):
+    for form, config in FORMS.items():
+        env, weights = made(config)
+        sejax.save(tmp_path / f"{form}.safetensors", env, weights)
+        alike = sejax.gym.make(str(tmp_path / f"{form}.safetensors"))
+        obs, _ = alike.reset(seed=1)
+        action = np.array([-1.3], np.float32)
+        _, reward, terminated, *_ = alike.step(action)
+        assert terminated
+        np.testing.assert_allclose(reward, env.bandit_reward(weights, obs, action), rtol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("words", "field"),
+    [
+        (["env=cartpole", "proxy.reward_form=distance", "proxy.horizon=1"], "proxy.reward_form"),
+        (["env=pendulum", "proxy.reward_form=distance", "proxy.horizon=null"], "proxy.reward_form"),
+        (["env=cartpole", "proxy.reward_slope=2"], "proxy.reward_slope"),
+    ],
+)
+def test_a_form_that_cannot_be_is_refused(words, field):
+    with pytest.raises(ConfigError) as error:
+        configuration.config(words)
+    assert error.value.field == field
