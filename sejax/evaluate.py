@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import math
 import time
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
@@ -158,11 +159,14 @@ def _as_json(summary: "pd.DataFrame") -> str:
     return json.dumps(nested, indent=2)
 
 
+def spread(mean: float, std: float, digits: int) -> str:
+    """Mean and deviation as text; one agent has no deviation."""
+    return f"{mean:,.{digits}f}" + (f" ± {std:,.{digits}f}" if math.isfinite(std) else "")
+
+
 def _print_table(summary: "pd.DataFrame", setup: Setup, config: EvaluateConfig) -> None:
     from rich.console import Console
     from rich.table import Table
-
-    from sejax.cli.report import spread
 
     task = setup.task
     who = "agents of each kind" if setup.has_several else f"{setup.members[0].key} agents"

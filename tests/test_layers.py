@@ -11,7 +11,7 @@ ROOT = Path(__file__).parents[1] / "sejax"
 # looked up when somebody asks for what they stand for: they do not count.
 LAYERS = [
     {"search"},
-    {"run", "evaluate", "landscape", "distill", "report"},
+    {"run", "evaluate", "landscape", "distill"},
     {"cli"},
     {"bilevel", "ranking", "distillation"},
     {"evaluation"},

@@ -13,7 +13,7 @@ import yaml
 
 import sejax
 from experiments import supervised_baseline
-from sejax import evaluate, report, run, search
+from sejax import evaluate, run, search
 from sejax.cli import commands, study
 from sejax.cli import config as configuration
 from sejax.cli import search_config as settings
@@ -104,20 +104,11 @@ NAMES = [f"{next(iter(x))}-{i}" for i, x in enumerate(FOREIGN)]
 def test_what_a_run_stores_is_compared_and_shown_as_text(folder, refused, foreign):
     path = write_run(folder / "run", stored(**foreign))
     assert "run_dir must be new or hold" in refused(run_command, *TASK, f"run_dir={path}")
-    report.main([str(path)])
-    assert (path / "report.html").stat().st_size > 1000
     rows = {"metrics": np.frombuffer(f"{','.join(columns_of())}\n".encode(), np.uint8)}
     manifest = {"format_version": 1, "config": stored(**foreign), "id": "0", "cpu_s": 1.0}
     data = checksummed.pack(rows, "sejax_run", manifest)
     (path / "checkpoint.safetensors").write_bytes(data)
     assert "of the same configuration" in refused(run_command, *TASK, f"run_dir={path}")
-
-
-@pytest.mark.parametrize("text", [f"agent: {IMPORTED}", "agents.ddqn.name: subprocess:getoutput"])
-def test_a_report_reads_no_preset_file(folder, text):
-    (folder / "p.yaml").write_text(f"{text}\n")
-    report.main([str(write_run(folder / "run", stored(preset="p.yaml")))])
-    assert (folder / "run" / "report.html").exists()
 
 
 PRESETS = [
