@@ -42,8 +42,6 @@ class Outcome:
         counts with the test return.
       nonfinite: whether a number that is not finite was met in training; the score is then nan.
       real_steps: steps on the real task: tests, and training where its dynamics are real.
-      agreement: of ranks with a landscape (`sejax.ranking`), of the configurations that are learned
-        from and of those that judge; None with other objectives.
     """
 
     test_returns: Float[Array, "*agent episode"]
@@ -53,20 +51,11 @@ class Outcome:
     auc: Float[Array, "*agent"]
     nonfinite: Bool[Array, "*agent"]
     real_steps: Int[Array, "*agent"]
-    agreement: "Agreement | None" = None
 
     @property
     def test_return(self) -> Float[Array, "*agent"]:
         """Mean over the test episodes."""
         return self.test_returns.mean(axis=-1)
-
-
-@struct.dataclass
-class Agreement:
-    """Agreement of ranks in [-1, 1], `[*agent]` float32."""
-
-    learned_from: Array
-    judging: Array
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -94,9 +83,7 @@ class Objective:
       scores_are_returns: whether scores are mean returns, which the task's threshold can be held
         against.
       eval_steps: `generation -> steps`, how much of the test episodes it scores, if not all: a
-        curriculum.
-      judge: `outcome -> [agent]`, by which people see an incumbent and the best one is kept. None
-        for `score`, or with `eval_steps` for the mean return of whole test episodes.
+        curriculum. People see the mean return of whole test episodes then, in place of scores.
       evaluators: `(mixture, proxy, training)` to two evaluators, of the population and of the
         incumbent, each of a candidate with all agents; None where one agent of the mixture trains
         on a candidate and is tested on the real task.
@@ -110,7 +97,6 @@ class Objective:
     needs_tests: bool = False
     scores_are_returns: bool = False
     eval_steps: Callable[[Array], Array] | None = None
-    judge: Callable[[Outcome], Float[Array, "*agent"]] | None = None
     evaluators: (
         Callable[[Mixture, ProxyEnv, "TrainingConfig"], tuple[Evaluator, Evaluator]] | None
     ) = None
@@ -124,10 +110,8 @@ class Objective:
 
     def judged(self, outcome: Outcome) -> Float[Array, "*agent"]:
         """The scores that people see; nan likewise."""
-        judge = self.judge or self.score
-        if self.judge is None and self.eval_steps is not None:
-            judge = lambda outcome: outcome.test_return  # noqa: E731
-        return jnp.where(outcome.nonfinite, jnp.nan, judge(outcome))
+        scores = self.score(outcome) if self.eval_steps is None else outcome.test_return
+        return jnp.where(outcome.nonfinite, jnp.nan, scores)
 
 
 @dataclass(frozen=True, kw_only=True)
