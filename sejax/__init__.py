@@ -42,7 +42,6 @@ _EXPORTS = {
     "ProxyParams": "sejax.proxies.base",
     "ProxySet": "sejax.proxies.io",
     "QLearningConfig": "sejax.agents.tabular",
-    "Ranking": "sejax.ranking",
     "RewardConfig": "sejax.proxies.configs",
     "RewardThreshold": "sejax.objectives",
     "SACConfig": "sejax.agents.sac",
@@ -53,7 +52,6 @@ _EXPORTS = {
     "Task": "sejax.envs.base",
     "TrainResult": "sejax.training",
     "TrainingConfig": "sejax.training",
-    "Tuner": "sejax.proxies.tuners",
     "config": "sejax.cli.config",
     "configure_xla": "sejax.cli.runtime",
     "evaluate_agents": "sejax.evaluation",
@@ -65,7 +63,6 @@ _EXPORTS = {
     "make_learner": "sejax.bilevel",
     "make_trainer": "sejax.training",
     "pretrained": "sejax.proxies.zoo",
-    "pretrained_tuners": "sejax.proxies.tuners",
     "push": "sejax.proxies.zoo",
     "register_gymnax": "sejax.proxies.io",
     "save": "sejax.proxies.io",
@@ -110,9 +107,7 @@ if TYPE_CHECKING:  # what a type checker and an editor see
         save,
         save_set,
     )
-    from sejax.proxies.tuners import Tuner, pretrained_tuners
     from sejax.proxies.zoo import PretrainedProxy, pretrained, push
-    from sejax.ranking import Ranking
     from sejax.training import TrainingConfig, TrainResult, make_trainer, training_of
 
 __all__ = [
@@ -143,7 +138,6 @@ __all__ = [
     "ProxyParams",
     "ProxySet",
     "QLearningConfig",
-    "Ranking",
     "RewardConfig",
     "RewardThreshold",
     "SACConfig",
@@ -154,7 +148,6 @@ __all__ = [
     "Task",
     "TrainResult",
     "TrainingConfig",
-    "Tuner",
     "agents",
     "config",
     "configure_xla",
@@ -171,7 +164,6 @@ __all__ = [
     "make_trainer",
     "options",
     "pretrained",
-    "pretrained_tuners",
     "proxies",
     "push",
     "register_gymnax",

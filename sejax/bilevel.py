@@ -25,18 +25,12 @@ from sejax.es.base import Strategy, StrategyState
 from sejax.es.nes import NESConfig
 from sejax.evaluation import (
     Candidates,
+    Evaluator,
     evaluators_of,
     make_population_evaluator,
     tested_throughout,
 )
-from sejax.objectives import (
-    Evaluator,
-    GenerationInfo,
-    MaxReward,
-    Objective,
-    Outcome,
-    Scoring,
-)
+from sejax.objectives import GenerationInfo, MaxReward, Objective, Outcome, Scoring
 from sejax.ops import flat
 from sejax.ops.parallel import copy_to_devices
 from sejax.options import counts, registry, require, shortened
@@ -91,7 +85,6 @@ class Bilevel:
     params_of: Callable[[Array], PyTree]  # the same to its `EnvParams`
     num_dims: int
     stop_when_solved: bool
-    random_generations: int
     devices: int | None
 
     @property
@@ -126,19 +119,11 @@ class Bilevel:
         candidates = self.ask(state)
         return self.tell(state, candidates, self.evaluate(candidates))
 
-    def fresh(self, key: Array) -> Float[Array, "pop dims"]:
-        """A population of random weights."""
-        keys = jax.random.split(key, self.strategy.population_size)
-        return jax.vmap(lambda key: flat.flatten(self.proxy.init_weights(key)))(keys)
-
     def ask(self, state: LearnState) -> Candidates:
         """The population around the incumbent, and a key for each evaluation."""
         key = jax.random.fold_in(state.key, state.generation)
         key_ask, key_inner, key_tell = jax.random.split(key, 3)
         population, es_state = self.strategy.ask(key_ask, state.es_state)
-        if self.random_generations:
-            is_random = state.generation < self.random_generations
-            population = jnp.where(is_random, self.fresh(key_ask), population)
         incumbent = self.strategy.incumbent(es_state)
         evaluations, eval_steps = self.strategy.evaluations, self.objective.eval_steps
         seed_ids = jnp.asarray(evaluations.seed_ids(self.strategy.population_size))
@@ -167,12 +152,6 @@ class Bilevel:
         es_state = self.strategy.tell(
             candidates.key_tell, candidates.population, *compared, candidates.es_state
         )
-        if self.random_generations:
-            restarted = self.strategy.init(candidates.key_tell, _best_of(candidates, *compared))
-            is_random = state.generation < self.random_generations
-            es_state = jax.tree.map(
-                lambda old, new: jnp.where(is_random, old, new), restarted, es_state
-            )
         scores = self.scoring.judged(outcome)
         score, by_agent = _or_lowest(scores.incumbent_mean), _or_lowest(scores.agent_means)
         is_best = (score >= state.best_score) & jnp.isfinite(score)
@@ -262,7 +241,6 @@ def make_bilevel(
     objective: Any = None,
     training: TrainingConfig | None = None,
     stop_when_solved: bool = False,
-    random_generations: int = 0,
     devices: int | None = None,
     num_parallel: int | None = None,
 ) -> Bilevel:
@@ -276,8 +254,6 @@ def make_bilevel(
         (`NESConfig()`), and the mean test return.
       training: how long each agent trains, and how it is tested.
       stop_when_solved: whether a run ends at its first incumbent mean that solves the task.
-      random_generations: first generations whose candidates are fresh proxies; the strategy starts
-        anew from the best.
       devices: devices to spread the candidates over; None for all.
       num_parallel: agents that train in one vmapped batch on a device; None for what suits both.
 
@@ -296,9 +272,7 @@ def make_bilevel(
     mixture = Mixture.of(agent)
     training = training or TrainingConfig()
     training = tested_throughout(training) if objective.needs_tests else training
-    evaluators = evaluators_of(objective, mixture, proxy, training)
-    if objective.evaluators is not None:  # which leaves no share of the candidates to an agent
-        mixture = Mixture.of(mixture.agents[0])
+    evaluators = evaluators_of(mixture, proxy, training)
     scoring = Scoring.of(objective, strategy, mixture)
 
     def params_of(vector: Array) -> PyTree:
@@ -313,13 +287,12 @@ def make_bilevel(
         scoring=scoring,
         evaluators=evaluators,
         evaluate=make_population_evaluator(
-            evaluators, params_of, scoring.evaluator_of_evaluation, devices, num_parallel
+            evaluators, params_of, scoring.agent_of_evaluation, devices, num_parallel
         ),
         unravel=unravel,
         params_of=params_of,
         num_dims=num_dims,
         stop_when_solved=stop_when_solved,
-        random_generations=random_generations,
         devices=devices,
     )
     require(
@@ -338,16 +311,6 @@ def _made(group: str, kind: type[T], part: Any, *arguments: Any) -> T:
     must = f"must be a sejax.{kind.__name__}; got {shortened(repr(part))}. {fix}"
     require(isinstance(part, kind), group, must)
     return part
-
-
-def _best_of(
-    candidates: Candidates, scores: Float[Array, " pop"], incumbent_score: Array
-) -> Float[Array, " dims"]:
-    """The candidate with the highest score, or the incumbent if none has a higher one than it."""
-    scores = _or_lowest(scores)
-    best = candidates.population[jnp.argmax(scores)]
-    is_better = scores.max() > _or_lowest(incumbent_score)
-    return jnp.where(is_better, best, candidates.incumbent)
 
 
 def _or_lowest(scores: Array) -> Array:

@@ -6,6 +6,7 @@ Agents".
 
 import dataclasses
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple, overload
 
 import jax
@@ -19,7 +20,7 @@ from sejax.agents.mixture import Mixture
 from sejax.envs.base import Task
 from sejax.envs.wrappers import repeat_actions
 from sejax.es.base import StrategyState
-from sejax.objectives import Evaluator, Objective, Outcome
+from sejax.objectives import Outcome
 from sejax.ops.keys import step_keys
 from sejax.ops.loops import while_any_active
 from sejax.ops.parallel import (
@@ -404,15 +405,23 @@ def evaluate_agents(
     return jax.jit(program, compiler_options=compiler_options())(keys)
 
 
-def evaluators_of(
-    objective: Objective, mixture: Mixture, proxy: ProxyEnv, training: TrainingConfig
-) -> tuple[Evaluator, ...]:
-    """How candidates are evaluated: by the objective's own evaluators, or one for each agent.
+@dataclass(frozen=True, kw_only=True)
+class Evaluator:
+    """How a candidate is evaluated.
 
-    An agent's trains it on the candidate and tests it on the real task.
+    Attributes:
+      run: `(key, env_params, active, eval_steps) -> Outcome`, of one candidate.
+      cpu_num_parallel: candidates in one vmapped batch on a CPU core; None for all.
     """
-    if objective.evaluators is not None:
-        return objective.evaluators(mixture, proxy, training)
+
+    run: Callable[..., Outcome]
+    cpu_num_parallel: int | None
+
+
+def evaluators_of(
+    mixture: Mixture, proxy: ProxyEnv, training: TrainingConfig
+) -> tuple[Evaluator, ...]:
+    """How each agent evaluates a candidate: it trains there, and is tested on the real task."""
     return tuple(
         Evaluator(
             run=make_evaluator(agent, proxy, proxy.task, training),
@@ -439,7 +448,7 @@ class Candidates:
 def make_population_evaluator(
     evaluators: Sequence[Evaluator],
     params_of: Callable[[Float[Array, " dims"]], PyTree],
-    evaluator_of_evaluation: np.ndarray,
+    agent_of_evaluation: np.ndarray,
     devices: int | None = None,
     num_parallel: int | None = None,
 ) -> Callable[[Candidates], Outcome]:
@@ -452,14 +461,14 @@ def make_population_evaluator(
     Args:
       evaluators: how one candidate is evaluated.
       params_of: a candidate to the proxy's `EnvParams`.
-      evaluator_of_evaluation: index of the evaluator, `[evaluation]`.
+      agent_of_evaluation: index of the evaluator, `[evaluation]`.
       devices: None for all.
       num_parallel: None for what suits each evaluator.
 
     Raises:
       ConfigError: if there are fewer than `devices` devices.
     """
-    groups = [np.flatnonzero(evaluator_of_evaluation == i) for i in range(len(evaluators))]
+    groups = [np.flatnonzero(agent_of_evaluation == i) for i in range(len(evaluators))]
     order = np.argsort(np.concatenate(groups))
     evaluate_groups = spread_groups_over_devices(
         [of_vectors(each, params_of) for each in evaluators],

@@ -7,7 +7,7 @@ number. `Scoring` applies it to a generation: what the strategy compares, and wh
 import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import jax.numpy as jnp
 import numpy as np
@@ -18,10 +18,6 @@ from sejax.agents.mixture import Mixture
 from sejax.envs.base import Task
 from sejax.es.base import Evaluations, Strategy, finite_mean
 from sejax.options import Options, counts, not_negative, option, require
-from sejax.proxies.base import ProxyEnv
-
-if TYPE_CHECKING:  # which lies above
-    from sejax.training import TrainingConfig
 
 
 @struct.dataclass
@@ -39,8 +35,6 @@ class Outcome:
         counts with the test return.
       nonfinite: whether a number that is not finite was met in training; the score is then nan.
       real_steps: steps on the real task: tests, and training where its dynamics are real.
-      agreement: of ranks with a landscape (`sejax.ranking`), of the configurations that are learned
-        from and of those that judge; None with other objectives.
     """
 
     test_returns: Float[Array, "*agent episode"]
@@ -50,33 +44,11 @@ class Outcome:
     auc: Float[Array, "*agent"]
     nonfinite: Bool[Array, "*agent"]
     real_steps: Int[Array, "*agent"]
-    agreement: "Agreement | None" = None
 
     @property
     def test_return(self) -> Float[Array, "*agent"]:
         """Mean over the test episodes."""
         return self.test_returns.mean(axis=-1)
-
-
-@struct.dataclass
-class Agreement:
-    """Agreement of ranks in [-1, 1], `[*agent]` float32."""
-
-    learned_from: Array
-    judging: Array
-
-
-@dataclass(frozen=True, kw_only=True)
-class Evaluator:
-    """How a candidate is evaluated.
-
-    Attributes:
-      run: `(key, env_params, active, eval_steps) -> Outcome`, of one candidate.
-      cpu_num_parallel: candidates in one vmapped batch on a CPU core; None for all.
-    """
-
-    run: Callable[..., Outcome]
-    cpu_num_parallel: int | None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -91,12 +63,7 @@ class Objective:
       scores_are_returns: whether scores are mean returns, which the task's threshold can be held
         against.
       eval_steps: `generation -> steps`, how much of the test episodes it scores, if not all: a
-        curriculum.
-      judge: `outcome -> [agent]`, by which people see an incumbent and the best one is kept. None
-        for `score`, or with `eval_steps` for the mean return of whole test episodes.
-      evaluators: `(mixture, proxy, training)` to two evaluators, of the population and of the
-        incumbent, each of a candidate with all agents; None where one agent of the mixture trains
-        on a candidate and is tested on the real task.
+        curriculum. People see the mean return of whole test episodes then, in place of scores.
       meaning: of a score, for people.
     """
 
@@ -104,10 +71,6 @@ class Objective:
     needs_tests: bool = False
     scores_are_returns: bool = False
     eval_steps: Callable[[Array], Array] | None = None
-    judge: Callable[[Outcome], Float[Array, "*agent"]] | None = None
-    evaluators: (
-        Callable[[Mixture, ProxyEnv, "TrainingConfig"], tuple[Evaluator, Evaluator]] | None
-    ) = None
     meaning: str = ""
 
     def __call__(self, outcome: Outcome) -> Float[Array, "*agent"]:
@@ -116,10 +79,8 @@ class Objective:
 
     def judged(self, outcome: Outcome) -> Float[Array, "*agent"]:
         """The scores that people see; nan likewise."""
-        judge = self.judge or self.score
-        if self.judge is None and self.eval_steps is not None:
-            judge = lambda outcome: outcome.test_return  # noqa: E731
-        return jnp.where(outcome.nonfinite, jnp.nan, judge(outcome))
+        scores = self.score(outcome) if self.eval_steps is None else outcome.test_return
+        return jnp.where(outcome.nonfinite, jnp.nan, scores)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -308,8 +269,6 @@ class Scoring:
       evaluations: how often each candidate is evaluated.
       agent_of_candidate: index of the agent that trains on each candidate, `[pop]`.
       agent_of_evaluation: the same for each evaluation, `[evaluation]`.
-      evaluator_of_evaluation: index of the evaluator likewise: one for each agent, or with
-        `Objective.evaluators` that of the population, then that of the incumbent.
     """
 
     objective: Objective
@@ -317,7 +276,6 @@ class Scoring:
     evaluations: Evaluations
     agent_of_candidate: np.ndarray
     agent_of_evaluation: np.ndarray
-    evaluator_of_evaluation: np.ndarray
 
     @classmethod
     def of(cls, objective: Objective, strategy: Strategy, mixture: Mixture) -> "Scoring":
@@ -341,19 +299,12 @@ class Scoring:
         agent_of_candidate = mixture.agent_of_candidate(
             strategy.population_size, strategy.antithetic
         )
-        agent_of_evaluation = evaluations.agents(agent_of_candidate, mixture.size)
-        of_incumbent = np.arange(agent_of_evaluation.size) >= (
-            agent_of_evaluation.size - evaluations.num_incumbent_evals
-        )
         return cls(
             objective=objective,
             mixture=mixture,
             evaluations=evaluations,
             agent_of_candidate=agent_of_candidate,
-            agent_of_evaluation=agent_of_evaluation,
-            evaluator_of_evaluation=(
-                of_incumbent.astype(int) if objective.evaluators else agent_of_evaluation
-            ),
+            agent_of_evaluation=evaluations.agents(agent_of_candidate, mixture.size),
         )
 
     def for_strategy(self, outcome: Outcome) -> tuple[Float[Array, " pop"], Float[Array, ""]]:

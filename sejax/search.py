@@ -27,14 +27,7 @@ def main(overrides: Sequence[str]) -> None:
 
     search = search_config.read(overrides)
     try:
-        if search.tuner is not None:
-            from sejax.cli import tuning
-
-            runtime.configure_jax()
-            command = tuning.COMMAND
-            search, settings = tuning.tune(search, _say)
-        else:
-            command, settings = _study(search)
+        command, settings = _study(search)
     except KeyboardInterrupt:
         _say(
             f"Interrupted. What has ended is saved in {search.folder}; the same command goes on "

@@ -55,8 +55,6 @@ def test_every_task_composes_with_every_preset(env, preset):
 @pytest.mark.parametrize("group", ["es", "objective", "exploration", "tracker"])
 def test_every_choice_of_a_group_composes(group):
     for name in registry.GROUPS[group].built_in:
-        if name == "ranking":  # which needs a landscape: tests/test_ranking.py
-            continue
         env = ["env=cliff_walking"] if name == "count_based" else []
         if registry.GROUPS[group].entry_points != "sejax.trackers" or name in ("none",):
             assert sejax.config([*env, f"{group}={name}"]).name(group) == name

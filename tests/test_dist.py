@@ -142,12 +142,9 @@ for proxy in sejax.pretrained():
         print(proxy.name, env.task.name == proxy.task)
     except sejax.ConfigError as error:
         print(proxy.name, "sejax[mujoco]" in str(error))
-for tuner in sejax.pretrained_tuners():
-    print(tuner.name, len(sejax.load_set(tuner.name)) == tuner.ses)
 """
     lines = dict(line.split() for line in run("-c", program).splitlines())
-    shipped = [*sejax.pretrained(), *sejax.pretrained_tuners()]
-    assert lines == {each.name: "True" for each in shipped}
+    assert lines == {proxy.name: "True" for proxy in sejax.pretrained()}
 
 
 def test_what_needs_an_extra_says_which(run):
@@ -191,10 +188,10 @@ def test_a_users_script_runs_and_mypy_finds_nothing_in_it(run, python, tmp_path)
 # --- with the extra search -----------------------------------------------------------------------
 
 
-def test_a_shipped_tuner_tunes(run, python):
+def test_a_search_runs(run, python):
     install(python, f"{one('*.whl')}[search]")
-    words = ["proxy=cartpole-tuner", "agent=sac", "trials=6", "verify=1", "fresh_seeds=1",
-             "devices=1", "search_dir=tuned"]  # fmt: skip
-    assert "python -m sejax.evaluate proxy=real env=cartpole agent=sac" in run(
-        "-m", "sejax.search", *words
-    )
+    words = ["env=gridworld_2x2", "es.noise_std=interval(0.1, 1)", "es.population_size=2",
+             "trials=2", "min_generations=1", "max_generations=1", "verify=1", "fresh_seeds=1",
+             "devices=1", "search_dir=found"]  # fmt: skip
+    best = "python -m sejax.run env=gridworld_2x2 es.population_size=2 devices=1 es.noise_std="
+    assert best in run("-m", "sejax.search", *words)

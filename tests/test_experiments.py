@@ -80,9 +80,6 @@ TINY = {
                        "real_episodes": 3},
     "se_teachability": {"env": "cartpole", "students": "ddqn", "quick": True,
                         "run": ["training.max_steps=60", "training.max_episodes=60"]},
-    "se_tuners": {"ranked": "ddqn", "learn_configs": 4, "num_configs": 4, "num_seeds": 2,
-                  "steps": 60, "num_tuners": 1, "members": 1, "tuning_seeds": 2, "short_seeds": 2,
-                  "short_steps": [40], "generations": 2, "run": ["objective.judging=0.5"]},
     "supervised_baseline": {"proxy": "se", "hparams": "default", "models": 3, "generations": 2,
                             "population": 2, "max_rows": 30, "epochs": 2, "num_agents": 2,
                             "test_episodes": 2},
@@ -91,7 +88,7 @@ TINY = {
 SLOW = {"break_even", "minatar", "null_baselines", "rn_heatmap", "rn_objectives", "rn_performance",
         "score_transforms", "se_distilled", "se_dynamics", "se_families", "se_feasibility",
         "se_horizons", "se_models", "se_myopia", "se_out_of_sample", "se_performance",
-        "se_teachability", "se_tuners", "supervised_baseline"}  # fmt: skip
+        "se_teachability", "supervised_baseline"}  # fmt: skip
 
 
 def module_of(name):
@@ -353,7 +350,6 @@ def test_words_that_cannot_work_are_refused(word, field):
         ("rn_heatmap", {"env": "cartpole"}, "env"),
         ("score_transforms", {"population": 1}, "population"),
         ("se_families", {"sets": []}, "sets"),
-        ("se_tuners", {"num_seeds": 1}, "num_seeds"),
         ("timings", {"rows": "pendulum-rn"}, "rows"),
     ],
 )

@@ -11,14 +11,14 @@ ROOT = Path(__file__).parents[1] / "sejax"
 # looked up when somebody asks for what they stand for: they do not count.
 LAYERS = [
     {"search"},
-    {"run", "evaluate", "landscape", "distill"},
+    {"run", "evaluate", "distill"},
     {"cli"},
-    {"bilevel", "ranking", "distillation"},
+    {"bilevel", "distillation"},
     {"evaluation"},
     {"training", "objectives", "gym"},
     {"proxies"},
     {"agents"},
-    {"envs", "es", "landscapes"},
+    {"envs", "es"},
     {"ops"},
     {"options"},
     {""},

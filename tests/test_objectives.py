@@ -67,7 +67,7 @@ def test_auc_is_the_mean_under_the_curve_or_the_area(config, scores):
     np.testing.assert_array_equal(got, scores)
 
 
-@pytest.mark.parametrize("name", [x for x in registry.names("objective") if x != "ranking"])
+@pytest.mark.parametrize("name", registry.names("objective"))
 def test_a_training_that_diverged_has_no_score(name):
     objective = registry.make("objective", registry.configure("objective", {"name": name}), task())
     got = objective(outcome([200.0, 200.0], [10, 10], [True, False]))

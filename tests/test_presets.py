@@ -201,9 +201,7 @@ def test_ppo_on_ses_is_the_default(env):
 
 
 def test_what_is_tuned_is_known():
-    assert preset_files.names() == [
-        *("best", "distilled", "paper", "paper_performance", "ranking", "soft"),
-    ]
+    assert preset_files.names() == ["best", "distilled", "paper", "paper_performance", "soft"]
     assert preset_files.tuned("rn") == [
         "cartpole", "cliff_walking", "halfcheetah", "mountain_car_continuous", "pendulum",
     ]  # fmt: skip

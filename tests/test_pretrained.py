@@ -15,7 +15,6 @@ import pytest
 from plain_agents import agent_for, learn, mean_return
 
 import sejax
-from experiments.common.shards import read_rows, unstack
 from sejax import envs
 from sejax.cli.config import evaluate_config
 from sejax.cli.distill_config import read
@@ -169,48 +168,6 @@ def test_an_evaluation_of_another_shape_is_refused(tmp_path, name, value):
     with pytest.raises(sejax.ConfigError) as error:
         zoo.describe(header.read(path))
     assert error.value.field == f"record.evaluations.{name}"
-
-
-# --- tuners --------------------------------------------------------------------------------------
-
-
-def test_a_tuner_says_how_it_ranks_and_what_it_cost():
-    for tuner in sejax.pretrained_tuners():
-        ses = sejax.load_set(tuner.name)
-        assert (len(ses), ses.task.name) == (tuner.ses, tuner.task)
-        assert ses.config["objective"]["steps"] == tuner.steps
-        assert shlex.split(tuner.command)[3:6] == [
-            f"env={tuner.task}", "preset=ranking", f"agent={tuner.agent}"
-        ]  # fmt: skip
-        for ranked in tuner.ranked:
-            assert -1 <= ranked.rho_low < ranked.rho < ranked.rho_high <= 1
-            assert f"{ranked.rho:.2f} [{ranked.rho_low:.2f}, {ranked.rho_high:.2f}]" in tuner.card
-        for said in (tuner.landscape, tuner.command, f"{tuner.real_steps:,}"):
-            assert said in tuner.card
-    with pytest.raises(sejax.ConfigError, match="must be a single proxy; got a set of 3"):
-        sejax.gym.make("cartpole-tuner")
-
-
-def test_the_tuner_that_ships_is_what_its_study_stores(monkeypatch, tmp_path, capsys):
-    """It was chosen by what judges: the held-out configurations have no say."""
-    from tools import ship_tuner
-
-    study = TOOLS.parent / "results/se_tuners/cartpole"
-    argv = ["ship_tuner.py", str(study), "cartpole-tuner", "--out", str(tmp_path)]
-    monkeypatch.setattr(sys, "argv", argv)
-    ship_tuner.main()
-    (tuner,) = sejax.pretrained_tuners()
-    assert tuner.card in capsys.readouterr().out
-    made = sejax.load_set(tmp_path / "cartpole-tuner.safetensors")
-    shipped = sejax.load_set("cartpole-tuner")
-    assert [x.fingerprint for x in made] == [x.fingerprint for x in shipped]
-    real = unstack(read_rows(study / "rows.csv.xz"), "real")
-    learned = real[real["use"] == "learn"]
-    assert tuner.configs == learned["config"].nunique()
-    assert tuner.real_steps == learned["real_steps"].sum()
-    ses = sejax.load_set(study / "tuners.safetensors")
-    means = ses.scores.reshape(-1, 3).mean(axis=1)
-    assert ship_tuner.best(ses.scores, 3)[0] == 3 * means.argmax()
 
 
 # --- what they teach -----------------------------------------------------------------------------

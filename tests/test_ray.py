@@ -346,31 +346,6 @@ def test_a_search_has_its_trials_made_by_workers(cluster, tmp_path):
     assert len(rows) - 1 >= 4
 
 
-def test_a_landscape_has_the_rows_of_one_process(cluster, tmp_path):
-    pytest.importorskip("optuna")
-
-    def rows_of(machines):
-        words = [
-            *("env=cartpole", "agent=[ddqn,ppo]", "configs=3", "seeds=2", "steps=40"),
-            *(f"file={machines}.csv", f"machines={machines}", "test_episodes=1"),
-        ]
-        done = subprocess.run(
-            [sys.executable, "-m", "sejax.landscape", *words],
-            cwd=tmp_path,
-            env=cluster.environment,
-            capture_output=True,
-            text=True,
-            timeout=300,
-        )
-        assert done.returncode == 0, done.stderr
-        lines = (tmp_path / f"{machines}.csv").read_text().splitlines()
-        rows = csv.DictReader(x for x in lines if not x.startswith("#"))
-        return [{name: x for name, x in row.items() if name != "cpu_s"} for row in rows]
-
-    assert len(rows_of("local")) == 12
-    assert rows_of("ray") == rows_of("local")
-
-
 def test_a_stopped_worker_of_a_killed_driver_makes_room(cluster, wanted, tmp_path):
     with Driver(tmp_path, "machines=ray", environment=cluster.environment) as driver:
         wait_for(driver.generations)

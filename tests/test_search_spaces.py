@@ -70,26 +70,6 @@ def test_a_current_value_has_its_place_in_a_range_or_none(text, value, parameter
 @pytest.mark.parametrize(
     "text",
     [
-        "interval(1, 3)",
-        "tag(log, interval(0.01, 0.3))",
-        "tag(log, inverse, interval(0.9, 0.999))",
-        "tag(log, int(interval(4, 32)))",
-        "range(16, 65, 16)",
-        "choice(1e-3, 2, 8)",
-    ],
-)
-def test_a_value_lies_at_the_quantile_that_it_is_drawn_from(text):
-    dimension = spaces.parse("agent.x", text)
-    for quantile in (0.0, 0.25, 0.5, 0.99):
-        value = dimension.at(quantile)
-        found = dimension.quantile_of(value)
-        assert dimension.at(found) == pytest.approx(value) and 0 <= found <= 1
-    assert dimension.quantile_of(dimension.at(0.1)) < dimension.quantile_of(dimension.at(0.9))
-
-
-@pytest.mark.parametrize(
-    "text",
-    [
         "interval(1)",
         "interval(0, inf)",
         "interval(2, 1)",
@@ -146,10 +126,6 @@ COMMANDS = {
         ["env=mountain_car_continuous", "proxy=rn"],
     ],
     "agent": [["proxy=cartpole", "agent=ppo"], ["proxy=cartpole", "agent=ddqn"]],
-    "wide": [
-        *(["proxy=cartpole", f"agent={x}"] for x in ("ddqn", "ppo", "sac", "td3_discrete")),
-        ["proxy=pendulum", "agent=td3"],
-    ],
 }
 
 

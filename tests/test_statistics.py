@@ -6,7 +6,6 @@ import pytest
 import scipy.stats
 
 from experiments.common.statistics import (
-    bca_interval,
     difference_interval,
     mean_interval,
     performance_profile,
@@ -65,34 +64,6 @@ def test_intervals_cover_the_truth_as_often_as_they_say(size):
     ]
     lows = [mean_interval(each)[0] for each in means[:200]]
     np.testing.assert_allclose([column["x_low"] for column in columns], lows)
-
-
-def test_bca_intervals_are_scipys_and_cover_a_rank_correlation():
-    def rho(x, y):
-        """Of rows without ties, `[..., n]`."""
-        size = x.shape[-1]
-        away = scipy.stats.rankdata(x, axis=-1) - scipy.stats.rankdata(y, axis=-1)
-        return 1 - 6 * (away**2).sum(axis=-1) / (size**3 - size)
-
-    rng = np.random.default_rng(0)
-    x = rng.exponential(size=30)
-    left_out = [np.delete(x, i).mean() for i in range(30)]
-    theirs = scipy.stats.bootstrap((x,), np.mean, method="BCa", n_resamples=999)
-    ends = bca_interval(x.mean(), theirs.bootstrap_distribution, left_out)
-    assert ends == pytest.approx(tuple(theirs.confidence_interval))
-
-    truth, hits = 6 / np.pi * np.arcsin(0.6 / 2), []  # of normal values with a correlation of 0.6
-    for _ in range(300):
-        x, y = rng.multivariate_normal([0, 0], [[1, 0.6], [0.6, 1]], 40).T
-        places = rng.integers(0, 40, (400, 40))
-        tiny = 1e-9 * rng.normal(size=(2, 400, 40))  # parts ties
-        drawn = rho(x[places] + tiny[0], y[places] + tiny[1])
-        others = np.array([np.delete(np.arange(40), i) for i in range(40)])
-        low, high = bca_interval(rho(x, y), drawn, rho(x[others], y[others]))
-        hits.append(low <= truth <= high)
-    assert 0.90 < np.mean(hits) < 0.99  # its standard error: 0.013
-    assert np.isnan(bca_interval(0.5, [0.4, 0.6], [0.4, 0.5, 0.6, 0.7])).all()
-    assert bca_interval(1.0, [1.0] * 9, [1.0] * 6) == (1, 1)
 
 
 def test_fewer_than_five_values_have_no_interval():

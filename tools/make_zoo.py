@@ -61,22 +61,12 @@ Apache-2.0, and hold no data of others.
 """
 
 
-TUNERS = """\
-## Tuners
-
-Sets of SEs that [rank configurations of agents](tuners.md), for `sejax.search` and
-`sejax.load_set`. `sejax.pretrained_tuners()` lists them; `python -m tools.ship_tuner --help` says
-where they come from."""
-
-
 def page() -> str:
     """The text of the page."""
     proxies = sejax.pretrained()
     tested = verdicts()
     rows = [row(proxy, tested) for proxy in proxies]
-    tuners = sejax.pretrained_tuners()
-    cards = [re.sub("^#", "###", tuner.card, flags=re.MULTILINE) for tuner in tuners]
-    return HEAD + "\n\n".join([table(rows), *map(section, proxies), TUNERS, *cards])
+    return HEAD + "\n\n".join([table(rows), *map(section, proxies)])
 
 
 def verdicts() -> dict[str, str]:
@@ -120,6 +110,4 @@ def section(proxy: sejax.PretrainedProxy) -> str:
 
 if __name__ == "__main__":
     write_text(PAGE, page())
-    print(
-        f"{PAGE} has {len(sejax.pretrained())} proxies and {len(sejax.pretrained_tuners())} tuners."
-    )
+    print(f"{PAGE} has {len(sejax.pretrained())} proxies.")

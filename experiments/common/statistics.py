@@ -3,7 +3,7 @@
 Intervals of means are Student's, of what was sampled: of the means of SEs or RNs where agents
 belong to them, as agents of one have much in common, else of agents. Percentile bootstraps of 5 to
 10 values cover the truth in 80 to 90% of the cases in place of 95%. Of fewer than `LEAST` values
-there is no interval. What is no mean, such as a rank correlation, has a BCa bootstrap interval.
+there is no interval.
 
 Where returns have a ceiling, a mean beside the mean of the worst tenth tells agents apart that an
 interquartile mean does not.
@@ -13,7 +13,6 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from scipy.stats import norm
 from scipy.stats import t as student
 
 LEVEL, NUM_RESAMPLES = 0.95, 2000
@@ -80,30 +79,3 @@ def performance_profile(
     each = np.array([fractions(runs) for runs in groups])
     low, high = np.array([mean_interval(column) for column in each.T]).clip(0, 1).T
     return fractions(np.concatenate([*groups])), low, high
-
-
-def bca_interval(
-    estimate: float, drawn: Any, left_out: Any, level: float = LEVEL
-) -> tuple[float, float]:
-    """Bias-corrected and accelerated bootstrap interval, for what has no Student's interval.
-
-    Args:
-      estimate: of all values.
-      drawn: estimates of values that were drawn again, `[resample]`; nan is left out.
-      left_out: estimates without one value each, `[n]`; `NONE` for fewer than `LEAST`.
-      level: of confidence.
-
-    Source: Efron, "Better bootstrap confidence intervals" (1987).
-    """
-    drawn, left_out = (x[~np.isnan(x)] for x in (np.asarray(drawn), np.asarray(left_out)))
-    if left_out.size < LEAST or drawn.size == 0 or np.isnan(estimate):
-        return NONE
-    share = ((drawn < estimate).mean() + (drawn <= estimate).mean()) / 2
-    least = 0.5 / drawn.size
-    bias = norm.ppf(np.clip(share, least, 1 - least))
-    away = left_out.mean() - left_out
-    spread = 6 * (away**2).sum() ** 1.5
-    acceleration = (away**3).sum() / spread if spread else 0.0
-    ends = bias + norm.ppf([(1 - level) / 2, (1 + level) / 2])
-    low, high = np.quantile(drawn, norm.cdf(bias + ends / (1 - acceleration * ends)))
-    return float(low), float(high)

@@ -38,9 +38,7 @@ class DDQNConfig(OffPolicyOptions, TorsoOptions):
     epsilon_decay: float = option(0.9, fraction(), traced=True)  # factor for each episode
     # If given, epsilon falls linearly in so many steps from when the agent first learns, whatever
     # the episodes: for environments whose episodes have one or two steps.
-    exploration_steps: int | None = option(
-        None, counts("it counts steps"), traced=True, counts_steps=True
-    )
+    exploration_steps: int | None = option(None, counts("it counts steps"), traced=True)
     double: bool = True  # the online network chooses a target's action; else the target network
     loss: str = option("squared", one_of(LOSSES))  # of the error; huber: its gradient is clipped
     target_update_every: int = option(1, counts())  # learning steps for each update of the target

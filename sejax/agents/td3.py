@@ -78,7 +78,7 @@ class DiscreteTD3Config(TD3Config):
     temperature: float = option(1.0, positive(MOVES), traced=True)
     final_temperature: float = option(0.05, fraction(), traced=True)  # as a fraction of it, ...
     # ... reached linearly after so many updates
-    temperature_steps: int = option(2000, counts(), counts_steps=True)
+    temperature_steps: int = option(2000, counts())
     one_hot_actions: bool = False  # straight-through one-hot actions in place of soft ones
 
     def make(self, task: Task) -> Agent:

@@ -169,8 +169,6 @@ class LearnConfig(CommandConfig):
     agent_hparams: str = option("default", one_of(AGENT_HPARAMS))
     # n_o: steps of the outer loop.
     generations: int = option(100, counts("there is nothing to do otherwise", most=1_000_000))
-    # First generations whose candidates are fresh proxies, of which the best is gone on with.
-    random_generations: int = option(0, counts("it counts generations", least=0))
     # Independent runs, with seeds seed, seed + 1, ...
     num_seeds: int = option(1, counts("it counts runs"))
     # End a run at its first incumbent mean that reaches the solved threshold.
@@ -209,9 +207,6 @@ class LearnConfig(CommandConfig):
                 if self.proxy.reaches_step_limit:
                     limits = max_steps, spec.max_steps
                     require_learning("training", self.training, member.agent, *limits)
-        if hasattr(self.objective, "require_agents"):
-            own = {registry.name_of("agent", x.agent): x.agent for x in members_of(self)}
-            self.objective.require_agents(own, task_name, self.training)
 
     def name(self, group: str) -> str:
         """The name by which a group's choice was made; several agents are `ddqn+ppo`."""
@@ -221,9 +216,7 @@ class LearnConfig(CommandConfig):
 
     @property
     def scored_agents(self) -> tuple[str, ...]:
-        """The agents that have scores of their own; none where an objective scores all as one."""
-        if getattr(self.objective, "scores_all_agents", False):
-            return ()
+        """The agents that have scores of their own."""
         return tuple(member.key for member in members_of(self))
 
     def plain(self) -> dict[str, Any]:
@@ -245,7 +238,6 @@ class LearnConfig(CommandConfig):
             "objective": registry.make("objective", self.objective, task),
             "training": self.training,
             "stop_when_solved": self.stop_when_solved,
-            "random_generations": self.random_generations,
             "devices": self.devices,
             "num_parallel": self.num_parallel,
         }

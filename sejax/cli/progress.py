@@ -1,8 +1,7 @@
 """Live lines of progress on a terminal, and the last words of `sejax.run`."""
 
 import time
-from collections.abc import Mapping, Sequence
-from pathlib import Path
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
@@ -16,7 +15,7 @@ from rich.progress import (
 )
 
 from sejax.cli import next_steps, preset_files
-from sejax.cli.config import JOINT, LearnConfig, members_of
+from sejax.cli.config import LearnConfig, members_of
 from sejax.cli.trackers import FinishedGeneration, Reporter
 from sejax.options import registry
 
@@ -130,7 +129,7 @@ class RunProgress(Reporter):
             self.say(f"generation {done}/{self._config.generations}: {text}")
 
     def _score(self, score: float) -> str:
-        return f"{score:.{getattr(self._config.objective, 'decimals', 1)}f}"
+        return f"{score:.1f}"
 
     def _of_agents(self, values: Mapping[str, float]) -> str:
         """The incumbent's mean for each of several agents."""
@@ -165,22 +164,10 @@ class RunProgress(Reporter):
             f"  {path}/proxy.safetensors    the best proxy\n"
             f"  {path}/learning_curve.png   how it was learned\n"
             f"  {path}/metrics.csv          a row for each generation\n\n"
-            f"{self._use(path, words)}\n"
+            "Train fresh agents on it, and on the real task beside them:\n"
+            f"  python -m sejax.evaluate {' '.join(words)}\n"
             f"Use it as a gymnax environment:\n"
             f'  env, params = sejax.load("{path}"{self._own_arguments()})'
-        )
-
-    def _use(self, path: Path, words: Sequence[str]) -> str:
-        """What the proxy is for, and its command."""
-        if self._config.name("objective") == "ranking":
-            agent = self._config.name("agent").partition(JOINT)[0]
-            return (
-                "Rank configurations of an agent on it, and try the best on the real task:\n"
-                f"  python -m sejax.search proxy={path} agent={agent}"
-            )
-        return (
-            "Train fresh agents on it, and on the real task beside them:\n"
-            f"  python -m sejax.evaluate {' '.join(words)}"
         )
 
     def _own_arguments(self) -> str:

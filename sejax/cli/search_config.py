@@ -3,10 +3,10 @@
 import dataclasses
 import functools
 import textwrap
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 from sejax.cli import compose, spaces
 from sejax.cli import config as configuration
@@ -27,7 +27,7 @@ from sejax.options import (
     shortened,
 )
 from sejax.options.plain import flatten, from_plain, parsed, split, to_plain
-from sejax.proxies import header, hub
+from sejax.proxies import hub
 
 if TYPE_CHECKING:  # which nobody needs who searches on one machine
     from sejax.cli.workers import LocalConfig, RayConfig
@@ -38,13 +38,7 @@ SCORES = ("mean", "worst")
 MEASURES = ("last", "best", "mean")
 REDUCTION_FACTOR = 3  # eta of Hyperband
 SQLITE = "sqlite:///"  # of a URL, before a file's path
-TEXTS = (
-    "study",
-    "storage",
-    "search_dir",
-    "space",
-    "landscape",
-)  # whatever YAML takes them for: 2024-01-01
+TEXTS = ("study", "storage", "search_dir", "space")  # whatever YAML takes them for: 2024-01-01
 # Fields of the command that are the search's, and which of its own to set in their place.
 TAKEN = {
     "generations": "max_generations=27",
@@ -56,12 +50,6 @@ TAKEN = {
 # Fields that may differ between the workers of a study, and between its sessions.
 OWN = {"trials", "timeout", "storage", "search_dir", "sampler_seed", "verify", "fresh_seeds"}
 NAMES = {"study", "space"}  # which stand for what is compared
-# On an SE that ranks: defaults, and all fields that have a meaning there, beside the agent's.
-ON_TUNER = {"space": "wide", "trials": 1000, "seeds": 4, "sampler_seed": 0}
-TAKEN_ON_TUNER = {
-    *(*ON_TUNER, "landscape", "study", "search_dir", "verify", "fresh_seeds"),
-    *("proxy", "proxy_kind", "env", "agent", "seed", "devices", "num_parallel"),
-}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,26 +62,22 @@ class SearchConfig(Options):
 
     group: ClassVar[str] = ""
 
-    # trials that end, pruned or complete; on an SE that ranks 1000, its configurations
+    # trials that end, pruned or complete
     trials: int = option(60, counts("there is nothing to compare otherwise"))
     sampler: str = option("tpe", one_of(SAMPLERS))  # tpe or random
-    # null: drawn, so that workers do not draw alike; 0 on an SE that ranks
+    # null: drawn, so that workers do not draw alike
     sampler_seed: int | None = option(None, counts("it seeds a generator", least=0))
     pruner: str = option("hyperband", one_of(PRUNERS))  # hyperband, median or none
     # before a trial may be pruned
     min_generations: int = option(3, counts("a trial must show something"))
     # of a trial that is not pruned
     max_generations: int = option(27, counts("there is nothing to do otherwise"))
-    # runs of a trial; on an SE that ranks 4, trainings of each configuration on each SE
-    seeds: int = option(1, counts("a trial needs a run"))
+    seeds: int = option(1, counts("a trial needs a run"))  # runs of a trial
     score: str = option("mean", one_of(SCORES))  # of a trial, over its seeds: mean or worst
     # The score of a seed. last: of its last generation; best: its best so far; mean: the mean of
     # all so far, which rewards learning early. null: last for a proxy, mean for an agent
     measure: str | None = option(None, one_of(MEASURES))
-    space: str | None = None  # a preset of ranges, or FILE.yaml; on an SE that ranks wide
-    # On an SE that ranks: CSV of sejax.landscape with configurations of this agent, to which a
-    # Gaussian process is fitted that takes their ranks as a feature, and orders the others
-    landscape: str | None = None
+    space: str | None = None  # a preset of ranges, or FILE.yaml
     study: str | None = None  # null: <env>-<proxy>-<agent>, or <agent>-on-<proxy>
     storage: str | None = None  # null: SQLite in search_dir; any URL that Optuna takes
     search_dir: str | None = None  # null: runs/search-<study>
@@ -140,19 +124,6 @@ class Search:
         name = self.choice("proxy", "se")
         is_kind = name in registry.names("proxy") or ":" in name
         return hub.is_address(name) or not is_kind
-
-    @functools.cached_property
-    def tuner(self) -> Mapping[str, Any] | None:
-        """The objective of the stored SE that agents are tuned on, if it ranks configurations.
-
-        Raises:
-          ConfigError: if the proxy is not to be found.
-        """
-        if not self.is_of_agent or self.choice("proxy", "") == "real":
-            return None
-        stored = header.read_config(self.choice("proxy", ""), "proxy").get("objective")
-        is_ranking = isinstance(stored, Mapping) and stored.get("name") == "ranking"
-        return stored if is_ranking else None
 
     @property
     def num_verified(self) -> int:
@@ -264,8 +235,7 @@ def read(overrides: Sequence[str]) -> Search:
         f"{name}=choice({text})" if len(split(text)) > 1 else f"{name}{equals}{text}"
         for name, equals, text in (override.partition("=") for override in overrides)
     ]
-    found = compose.read(choices)
-    for name, given in found.items():
+    for name, given in compose.read(choices).items():
         text = given if isinstance(given, str) else as_text(given)
         require(
             name not in TAKEN,
@@ -285,18 +255,7 @@ def read(overrides: Sequence[str]) -> Search:
     config = from_plain(SearchConfig, values, "")
     where = registry.configure("machines", machines)
     search = Search(config=config, fixed=tuple(fixed), space=space, machines=where)
-    if search.tuner is not None:
-        _require_on_tuner(search.tuner, found)
-        config = from_plain(SearchConfig, ON_TUNER | values, "")
-        search = dataclasses.replace(search, config=config)
     registry.require_package("machines", where)
-    require(
-        config.landscape is None or search.tuner is not None,
-        "landscape",
-        "must come with an SE that was learned with objective=ranking; got "
-        f"{shortened(config.landscape)} with proxy={shortened(search.choice('proxy', 'se'))}. Set "
-        "landscape=null.",
-    )
     require(
         search.choice("proxy", "se") != "real",
         "proxy",
@@ -306,7 +265,7 @@ def read(overrides: Sequence[str]) -> Search:
     if config.space is None:
         return search
     given = {override.partition("=")[0] for override in fixed} | set(space)
-    preset = spaces.preset(config.space, search.agent, search.is_of_agent, _steps(search))
+    preset = spaces.preset(config.space, search.agent, search.is_of_agent)
     offered = {name: x for name, x in preset.items() if name not in given}
     foreign = registry.untyped(x.text for x in offered.values())
     require(
@@ -316,38 +275,6 @@ def read(overrides: Sequence[str]) -> Search:
         "agent='choice(...)' on the command line.",
     )
     return dataclasses.replace(search, space={**offered, **space})
-
-
-def _require_on_tuner(tuner: Mapping[str, Any], given: Mapping[str, object]) -> None:
-    """Checks that only fields are given that have a meaning on an SE that ranks.
-
-    Raises:
-      ConfigError: for the first that has none, or a tuner that does not say its steps.
-    """
-    for name, value in given.items():
-        require(
-            name in TAKEN_ON_TUNER or name.startswith("agent."),
-            name,
-            "must be left out on an SE that ranks, where all configurations of one agent train "
-            f"at once; got {shortened(as_text(value))}. docs/search.md lists what may be set.",
-        )
-    require(
-        isinstance(tuner.get("steps"), int),
-        "proxy",
-        "must say how long agents of its landscape trained; got one without objective.steps. "
-        "Learn it again with preset=ranking objective.landscape=FILE.csv.",
-    )
-
-
-def _steps(search: Search) -> int | None:
-    """Steps of a training on the proxy; None if a rule says when it ends."""
-    if search.tuner is not None:  # ranges are those of the real task
-        return int(search.tuner["steps"])
-    if not search.is_of_agent:
-        return configuration.config(search.fixed).training.max_steps
-    stored = header.read_config(header.find(search.choice("proxy", ""), "proxy"), "proxy")
-    steps: int | None = stored.get("training", {}).get("max_steps")
-    return steps
 
 
 def require_fields(search: Search, config: LearnConfig | EvaluateConfig) -> dict[str, object]:
@@ -394,7 +321,6 @@ With proxy=RUN_DIR, a file or a shipped name: those of an agent that is trained 
   python -m sejax.search env=cartpole es.noise_std='{spaces.EXAMPLE}'
   python -m sejax.search env=cartpole preset=paper space=paper_se trials=60
   python -m sejax.search proxy=cartpole agent=ppo space=agent
-  python -m sejax.search proxy=TUNER agent=sac   (an SE that was learned with objective=ranking)
 
 The same command goes on where it stopped, or is one more worker of the same study.
 

@@ -8,14 +8,11 @@
 `tag(log, interval(0.01, 0.3))`                   uniform in the logarithm; also of whole numbers
 `tag(log, inverse, interval(0.9, 0.999))`         uniform in the logarithm of the distance from 1,
                                                   which the paper's tables call "True (inv.)"
-`share(0.02, 1)`                                  whole numbers, uniform in the logarithm, between
-                                                  these parts of the steps of a training
 ================================================= =================================================
 
 A YAML file of a space maps fields to these, and under `with_agent` agents to ranges of their own.
 """
 
-import math
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -29,13 +26,13 @@ from optuna.trial import Trial
 from sejax.cli import compose
 from sejax.cli import config as configuration
 from sejax.options import ConfigError, nearest, require, shortened, told
-from sejax.options.plain import parsed, split
+from sejax.options.plain import split
 
 Distribution = CategoricalDistribution | FloatDistribution | IntDistribution
 FOLDER = Path(__file__).parent / "spaces"
 DIGITS = 6  # of a number: the override says exactly what was tried
 EXAMPLE = "tag(log, interval(0.01, 0.3))"
-_CALL = re.compile(r"(choice|range|interval|int|tag|share)\((.*)\)", re.DOTALL)
+_CALL = re.compile(r"(choice|range|interval|int|tag)\((.*)\)", re.DOTALL)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,45 +81,6 @@ class Dimension:
                 trial.suggest_float(self.parameter, low, high, log=log)
         return self.override(trial.params)
 
-    def at(self, quantile: float) -> Any:
-        """The value at a quantile in [0, 1) of what the field is drawn from uniformly."""
-        drawn = self.distribution
-        if isinstance(drawn, CategoricalDistribution):
-            return parsed(str(drawn.choices[int(quantile * len(drawn.choices))]))
-        is_whole, (low, high) = isinstance(drawn, IntDistribution), self._ends()
-        if drawn.log:
-            number = math.exp(math.log(low) + quantile * math.log(high / low))
-        else:
-            number = low + quantile * (high - low)
-        if isinstance(drawn, IntDistribution):
-            steps = round((number - drawn.low) / drawn.step)
-            number = min(drawn.low + drawn.step * steps, drawn.high)
-        value = self.value({self.parameter: number})
-        return int(value) if is_whole else float(value)
-
-    def quantile_of(self, value: float) -> float:
-        """The quantile at which a value lies; inverse of `at`, but for rounding.
-
-        Raises:
-          ValueError: for a value that is none of a choice.
-        """
-        drawn = self.distribution
-        if isinstance(drawn, CategoricalDistribution):
-            choices = [parsed(str(x)) for x in drawn.choices]
-            return (choices.index(value) + 0.5) / len(choices)
-        low, high = self._ends()
-        number = 1 - value if self.is_inverse else value
-        if drawn.log:
-            return math.log(number / low) / math.log(high / low)
-        return (number - low) / (high - low)
-
-    def _ends(self) -> tuple[float, float]:
-        """Of the numbers that are drawn uniformly, before they are made whole."""
-        drawn = self.distribution
-        assert not isinstance(drawn, CategoricalDistribution)
-        half = drawn.step / 2 if drawn.step else 0.0
-        return drawn.low - half, drawn.high + half
-
     def parameter_of(self, value: object) -> object:
         """The stored parameter that stands for a field's value; None if it is not drawn from."""
         drawn = self.distribution
@@ -144,8 +102,8 @@ def is_range(text: str) -> bool:
     return _CALL.fullmatch(text) is not None or len(split(text)) > 1
 
 
-def parse(name: str, text: str, steps: int | None = None) -> Dimension:
-    """A field's range or choice; `steps` of a training, of which it may be a share.
+def parse(name: str, text: str) -> Dimension:
+    """A field's range or choice.
 
     Raises:
       ConfigError: if it cannot be searched.
@@ -154,8 +112,7 @@ def parse(name: str, text: str, steps: int | None = None) -> Dimension:
       >>> parse("agent.num_layers", "int(interval(1, 2))").distribution
       IntDistribution(high=2, log=False, low=1, step=1)
     """
-    text = _without_share(name, text.strip(), steps)
-    call, tags = text, set()
+    call, tags = text.strip(), set()
     text = call if _CALL.fullmatch(call) else f"choice({call})"
     if (tagged := _CALL.fullmatch(call)) and tagged[1] == "tag":
         *given, call = split(tagged[2])
@@ -171,27 +128,6 @@ def parse(name: str, text: str, steps: int | None = None) -> Dimension:
             name,
         ) from error
     return Dimension(name=name, text=text, distribution=distribution, is_inverse="inverse" in tags)
-
-
-def _without_share(name: str, text: str, steps: int | None) -> str:
-    """A share of the steps as a range of whole numbers."""
-    call = _CALL.fullmatch(text)
-    if call is None or call[1] != "share":
-        return text
-    require(
-        steps is not None,
-        name,
-        f"must have steps to be a share of; got {text}. Set training.max_steps=2000.",
-    )
-    try:
-        low, high = (max(1, round(float(x) * (steps or 1))) for x in split(call[2]))
-    except (ValueError, OverflowError) as error:
-        raise ConfigError(
-            f"{name} must be a share between two numbers; got {shortened(text)} ({told(error)}). "
-            f"Set {name}='share(0.02, 1)'.",
-            name,
-        ) from error
-    return f"tag(log, int(interval({low}, {high})))"
 
 
 def _distribution(text: str, tags: set[str]) -> Distribution:
@@ -230,14 +166,13 @@ def names() -> list[str]:
     return sorted(file.stem for file in FOLDER.glob("*.yaml"))
 
 
-def preset(name: str, agent: str, of_agent: bool, steps: int | None = None) -> dict[str, Dimension]:
+def preset(name: str, agent: str, of_agent: bool) -> dict[str, Dimension]:
     """The dimensions of a preset, or of a file of your own.
 
     Args:
       name: of the preset, or a path that ends in .yaml.
       agent: the chosen agent; each of a mixture has its own ranges (`ddqn+ppo`).
       of_agent: whether agents are tuned on a proxy, so that the agent's own fields alone count.
-      steps: of a training, of which ranges may be shares.
 
     Raises:
       ConfigError: if it is not there, or has nothing for the agent.
@@ -280,4 +215,4 @@ def preset(name: str, agent: str, of_agent: bool, steps: int | None = None) -> d
             }
         ranges |= own
     chosen = {k: v for k, v in ranges.items() if not of_agent or k.startswith("agent.")}
-    return {field: parse(field, str(text), steps) for field, text in chosen.items()}
+    return {field: parse(field, str(text)) for field, text in chosen.items()}

@@ -28,8 +28,8 @@ if TYPE_CHECKING:  # jax must not be imported before a worker has chosen its dev
     from sejax.bilevel import Bilevel, LearnState
     from sejax.cli.config import LearnConfig
     from sejax.cli.session import Chunks
-    from sejax.evaluation import Candidates
-    from sejax.objectives import Evaluator, GenerationInfo, Outcome
+    from sejax.evaluation import Candidates, Evaluator
+    from sejax.objectives import GenerationInfo, Outcome
 
 CAPACITY = 16  # most evaluations in a share on a CPU core, where batches follow one another
 
@@ -153,7 +153,7 @@ def cut(places: np.ndarray, batch: Batch, num_workers: int) -> Iterator[np.ndarr
 
 def _places(learner: "Bilevel") -> list[np.ndarray]:
     """The indices of each evaluator's evaluations in a generation."""
-    evaluators = learner.scoring.evaluator_of_evaluation
+    evaluators = learner.scoring.agent_of_evaluation
     return [np.flatnonzero(evaluators == i) for i in range(len(learner.evaluators))]
 
 

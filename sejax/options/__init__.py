@@ -115,7 +115,6 @@ def option(
     *,
     traced: bool = False,
     varied: str | None = None,
-    counts_steps: bool = False,
 ) -> Any:
     """A dataclass field.
 
@@ -125,9 +124,8 @@ def option(
       traced: whether it is a number that the compiled program takes as an argument, so that a
         population may vary it without compiling anew. See `traced_options`.
       varied: how `agent_hparams=varied` draws it; see `sejax.agents.varied`.
-      counts_steps: whether it counts steps of a training, and must grow with its length.
     """
-    metadata = {"rule": rule, "traced": traced, "varied": varied, "counts_steps": counts_steps}
+    metadata = {"rule": rule, "traced": traced, "varied": varied}
     return dataclasses.field(default=default, metadata=metadata)
 
 

@@ -146,7 +146,6 @@ GROUPS = {
             "reward_threshold": "sejax.objectives:RewardThreshold",
             "auc": "sejax.objectives:AUC",
             "auc_sum": "sejax.objectives:AUCSum",
-            "ranking": "sejax.ranking:Ranking",
         },
     ),
     "es": Group(

@@ -30,7 +30,6 @@ from sejax.proxies import hub
 
 FORMAT_VERSION = 2
 PRETRAINED_DIR = Path(__file__).parents[1] / "pretrained"
-TUNERS_DIR = PRETRAINED_DIR / "tuners"
 _KEY = "sejax"  # of the metadata's entry
 _LARGEST_FLOAT = float(np.finfo(np.float32).max)
 
@@ -159,11 +158,6 @@ def pretrained_names() -> list[str]:
     return sorted(path.stem for path in PRETRAINED_DIR.glob("*.safetensors"))
 
 
-def tuner_names() -> list[str]:
-    """Names of the tuners that ship with the package: sets of SEs that rank configurations."""
-    return sorted(path.stem for path in TUNERS_DIR.glob("*.safetensors"))
-
-
 def find(source: str | Path, option: str = "source", also: Sequence[str] = ()) -> Path:
     """The file that a run directory, a path, a shipped name or an address on the Hub stands for.
 
@@ -197,10 +191,10 @@ def find(source: str | Path, option: str = "source", also: Sequence[str] = ()) -
         "must be a run directory, a safetensors file, a shipped name or hf://USER/REPO; got "
         f"{text}, which does not exist.",
     )
-    name, proxies, tuners = str(source), pretrained_names(), tuner_names()
-    if name not in proxies + tuners:
-        raise unknown_name(option, text, [*proxies, *tuners, *also])
-    return (PRETRAINED_DIR if name in proxies else TUNERS_DIR) / f"{name}.safetensors"
+    name, shipped = str(source), pretrained_names()
+    if name not in shipped:
+        raise unknown_name(option, text, [*shipped, *also])
+    return PRETRAINED_DIR / f"{name}.safetensors"
 
 
 # --- reading and writing --------------------------------------------------------------------------

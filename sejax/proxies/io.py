@@ -286,7 +286,8 @@ def _write(
             format_version=header.FORMAT_VERSION,
             task=env.task.name,
             interface=env.task.interface,
-            config={**known, **_without_paths(config or {})},
+            # Without the path of the machine that a run was on.
+            config={**known, **(config or {}), "run_dir": None},
             discount=1.0 if discount is None else float(discount),
             is_set=is_set,
             proxies=[{name: as_python(x) for name, x in record.items()} for record in records],
@@ -300,14 +301,6 @@ def _write(
             "config",
         ) from error
     write_bytes(Path(path), data)
-
-
-def _without_paths(config: Mapping[str, Any]) -> dict[str, Any]:
-    """A configuration without the paths of the machine that a run was on."""
-    objective = config.get("objective")
-    if isinstance(objective, Mapping) and "landscape" in objective:
-        config = {**config, "objective": {**objective, "landscape": None}}
-    return {**config, "run_dir": None}
 
 
 def _tensors_of(env: ProxyEnv, weights: PyTree) -> dict[str, np.ndarray]:
