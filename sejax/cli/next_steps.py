@@ -6,7 +6,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from sejax.options import as_text
+from sejax.options import as_text, registry
+from sejax.options.plain import flatten
 
 
 def evaluate_words(
@@ -52,8 +53,8 @@ def of_stored(
         load = f"env, params = sejax.load({json.dumps(str(path))})"
         steps.append(("Use it as a gymnax environment", load))
     # What is not sejax's own must be typed: a file names no module.
-    chosen = [x["name"] for x in stored.values() if isinstance(x, Mapping) and "name" in x]
-    if generations is not None and not any(":" in str(x) for x in (*chosen, *agent_names(stored))):
+    own = registry.paths_in(f"={value}" for value in flatten(stored).values())
+    if generations is not None and not own:
         folder = as_text(str(path))
         words = [f"preset={as_text(str(path / 'config.yaml'))}", f"run_dir={folder}"]
         again = _command("sejax.run", [*words, f"generations={generations}"])
