@@ -116,7 +116,9 @@ def _read(path: Path, name: str, place: int) -> Run:
     better = [row for row in rows if math.isfinite(row["incumbent_mean"])]
     best = max(better, key=lambda row: (row["incumbent_mean"], row["generation"]), default=None)
     incumbent = MISSING if best is None else spread(best["incumbent_mean"], best["incumbent_std"])
+    diverged = is_over and ended.get("ended") == "diverged"
     title = _title(is_over, finished, asked, best, solved_score)
+    title = "all agents diverged" if diverged else title
     task = str(stored["env"]["name"])
     facts = {
         "task": task,
@@ -147,7 +149,7 @@ def _read(path: Path, name: str, place: int) -> Run:
         curve=report_figures.learning_curve(place, name, rows, solved_score, incumbent),
         evaluation=evaluation,
         agents=report_figures.evaluation(place, name, groups, solved_score, evaluation),
-        commands=next_steps.of_stored(stored, path, more if is_over else asked),
+        commands=[] if diverged else next_steps.of_stored(stored, path, more if is_over else asked),
     )
 
 
