@@ -14,6 +14,7 @@ from sejax.cli import config as configuration
 from sejax.cli.config import LearnConfig
 from sejax.cli.progress import RunProgress
 from sejax.cli.run_directory import open_for
+from sejax.options import FailedError
 
 ABOUT = """Learn a small network that stands in for an RL task (proxy=se), or for its reward on the
 real dynamics (proxy=rn), from agents trained on nothing else.
@@ -92,9 +93,10 @@ def learn_all(configs: Sequence[LearnConfig]) -> list[float]:
 
     Raises:
       ConfigError: if a run directory cannot be used.
+      FailedError: after the last run, if all agents of one diverged.
       OSError: if a file cannot be written; everything saved before is whole.
     """
-    scores = []
+    scores, diverged = [], []
     with contextlib.ExitStack() as machines:
         compiled = None
         for config in configs:
@@ -119,12 +121,20 @@ def learn_all(configs: Sequence[LearnConfig]) -> list[float]:
                     )
                     commands.leave(commands.INTERRUPTED)
                 scores.append(max(float(row["best_so_far"]) for row in directory.rows))
-                if len(configs) == 1:
+                if ended == "diverged":
+                    diverged.append(directory.path)
+                elif len(configs) == 1:
                     progress.finish(directory, chunks.learner, scores[-1], ended)
     if len(configs) > 1:
         print("Best incumbent scores:")
         for config, score in zip(configs, scores, strict=True):
             print(f"{score:10.1f}  {config.resolved_run_dir}")
+    if diverged:
+        raise FailedError(
+            f"All agents of {', '.join(map(str, diverged))} diverged: nothing was learned. Does "
+            "the task return NaN? If it does not, set a smaller agent.learning_rate. Delete the "
+            "folder, or set another run_dir, to begin anew."
+        )
     return scores
 
 

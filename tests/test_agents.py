@@ -330,6 +330,16 @@ def test_an_agent_that_cannot_work_is_refused(make, field):
     assert error.value.field == field
 
 
+@pytest.mark.parametrize(
+    ("agent", "written"),
+    [("ppo", "PPOConfig()"), ("PPO", "PPOConfig()"), (sejax.DDQNConfig, "DDQNConfig()")],
+)
+def test_a_name_or_a_class_is_answered_with_an_object(agent, written):
+    with pytest.raises(ConfigError) as error:
+        sejax.make_agent(agent, CARTPOLE)
+    assert error.value.field == "agent" and f"Set agent={written}." in str(error.value)
+
+
 def test_an_agent_may_fit_every_task():
     @dataclasses.dataclass(frozen=True)
     class Fixed(AgentConfig):

@@ -1,13 +1,17 @@
 """How the commands start: odd words, folders and terminals."""
 
+import functools
 import io
 import os
+import runpy
 import subprocess
 import sys
+import warnings
 
 import jax
 import pytest
 
+from sejax import __main__ as program
 from sejax.cli import commands, runtime
 from sejax.options import FailedError
 
@@ -62,3 +66,91 @@ def test_a_current_folder_that_is_gone_is_one_message(tmp_path):
     assert done.returncode == commands.FAILED
     assert done.stderr.startswith("error: ") and done.stderr.count("\n") == 1
     assert "Traceback" not in done.stderr
+
+
+# --- what people type ----------------------------------------------------------------------------
+
+
+def ended(monkeypatch, capsys, main, *words):
+    """The exit status and the lines of a command in this process."""
+    monkeypatch.setattr(sys, "argv", ["sejax", *words])
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    try:
+        main()
+        status = 0
+    except SystemExit as left:
+        status = left.code
+    said = capsys.readouterr()
+    return status, (said.out + said.err).splitlines()
+
+
+@pytest.mark.parametrize(
+    ("words", "meant"),
+    [
+        (["--env", "cartpole"], "Write env=cartpole, without dashes."),
+        (["--env=cartpole", "seed=1"], "Write env=cartpole, without dashes."),
+        (["-agent"], "Write agent=VALUE, without dashes."),
+        (["--seed", "env=cartpole"], "Write seed=VALUE, without dashes."),
+    ],
+)
+def test_an_option_with_dashes_is_answered_with_an_override(monkeypatch, capsys, words, meant):
+    def main():
+        commands.start(print, str)
+
+    status, (said,) = ended(monkeypatch, capsys, main, *words)
+    assert status == commands.BAD_INPUT
+    assert said.startswith("error: an override must read FIELD=VALUE;") and meant in said
+
+
+@pytest.mark.parametrize("words", [[], ["--help"]])
+def test_without_a_word_the_commands_are_listed_a_line_each(monkeypatch, capsys, words):
+    status, lines = ended(monkeypatch, capsys, program.main, *words)
+    assert status == 0 and len(lines) == len(program.COMMANDS) + 2
+    for name in program.COMMANDS:
+        assert any(line.startswith(f"  {name} ") for line in lines)
+
+
+@pytest.mark.parametrize(
+    ("word", "meant"), [("train", "sejax run."), ("env=cartpole", "sejax run env=cartpole.")]
+)
+def test_an_unknown_command_lists_the_known_ones(monkeypatch, capsys, word, meant):
+    status, lines = ended(monkeypatch, capsys, program.main, word)
+    assert status == commands.BAD_INPUT
+    assert lines[0] == f"error: There is no command {word}. Write {meant}"
+    assert len(lines) == len(program.COMMANDS) + 3
+
+
+@pytest.mark.parametrize("name", program.COMMANDS)
+def test_a_command_by_its_word_is_the_module_of_that_name(monkeypatch, capsys, name):
+    by_word = ended(monkeypatch, capsys, program.main, name, "--help")
+
+    def by_module():
+        runpy.run_module(f"sejax.{name}", run_name="__main__", alter_sys=True)
+
+    with warnings.catch_warnings(action="ignore"):  # that it has been imported before
+        assert ended(monkeypatch, capsys, by_module, "--help") == by_word
+    assert by_word[0] == 0 and len(by_word[1]) > 5
+
+
+def test_an_error_in_code_of_ones_own_ends_with_its_place(monkeypatch, capsys, tmp_path):
+    (tmp_path / "my_code.py").write_text("def fails(x):\n    return 1 / x\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.chdir(tmp_path)
+    import my_code
+
+    def main():
+        with commands.messages():
+            my_code.fails(0)
+
+    status, lines = ended(monkeypatch, capsys, main)
+    assert status == commands.FAILED and lines[0].startswith("Traceback")
+    said = "ZeroDivisionError: division by zero (my_code.py:2: return 1 / x)"
+    assert lines[-1] == f"error: code of your own raised {said}"
+
+
+def test_an_error_of_sejaxs_own_is_raised_as_it_is(monkeypatch, capsys):
+    def main():
+        commands.start(functools.partial(int, "x"), str)
+
+    with pytest.raises(TypeError):
+        ended(monkeypatch, capsys, main)

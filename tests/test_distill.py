@@ -181,7 +181,7 @@ def test_policies_come_from_files_and_functions(tmp_path, capsys):
         (["training.stop_rule=plateau"], "training.stop_rule must be never"),
         (["policy=sac"], "policy must be a file or a function"),
         (["policy=nothing.npz"], "policy must be a file of kernel_0"),
-        (["policy=nothing:act"], "policy must be a function that can be imported"),
+        (["policy=nothing:act"], "policy must name a module that can be imported"),
         (["policy=dqn:nothing.zip"], "policy must name an algorithm and a file"),
         (["agent=nothing"], "agent must be one of"),
         (["generations=5"], "generations must be left out .* Set search.generations=N"),

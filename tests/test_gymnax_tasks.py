@@ -1,6 +1,7 @@
 """Any environment of gymnax as a task: vectors in, vectors out, limits kept, faults told."""
 
 import math
+from pathlib import Path
 from typing import NamedTuple
 
 import gymnax
@@ -267,7 +268,11 @@ class Limit(NamedTuple):
     [
         (with_fault(is_truncated=None), {}, "TypeError"),
         (with_fault(action_space=lambda self, params: {}["actions"]), {}, "KeyError: 'actions'"),
-        (with_fault(step_env=lambda *args: (jnp.zeros(2), args[2], 0.0, False)), {}, "five values"),
+        (
+            with_fault(step_env=lambda *args: (jnp.zeros(2), args[2], 0.0, False)),
+            {},
+            "returns obs, state, reward, terminated and info",
+        ),
         (with_fault(obs=np.zeros(3)), {}, "obs"),
         (with_fault(step_env=drifts), {}, "state.time"),
         (with_fault(terminated=np.float32(0)), {}, "terminated"),
@@ -287,6 +292,25 @@ def test_a_fault_is_told_before_an_agent_trains(env, options, fault):
         Task(name="mine", env=env, **options)
     assert error.value.field in ("env", "env.max_steps", "env.solved_reward")
     assert fault in str(error.value) and len(str(error.value)) <= 300
+
+
+def branches(self, key, state, action, params):
+    reward = 1.0 if action > 0 else 0.0
+    return jnp.zeros(2), state, reward, jnp.bool_(False), {}
+
+
+def reads(self, key, state, action, params):
+    return jnp.zeros(2), state, float(action), jnp.bool_(False), {}
+
+
+@pytest.mark.parametrize("step_env", [branches, reads])
+def test_a_fault_in_code_of_ones_own_is_told_with_its_place(step_env):
+    with pytest.raises(ConfigError) as error:
+        Task(name="mine", env=with_fault(step_env=step_env))
+    said, line = str(error.value), step_env.__code__.co_firstlineno + 1
+    source = Path(__file__).read_text().splitlines()[line - 1].strip()
+    assert error.value.field == "env" and "use jnp.where" in said
+    assert f"test_gymnax_tasks.py:{line}: {source[:60]}" in said and "Derive it" not in said
 
 
 def test_limits_may_be_numbers_of_numpy_and_jax():

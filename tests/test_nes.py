@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import sejax
+from sejax.bilevel import make_bilevel
 from sejax.es.base import Evaluations
 from sejax.es.evosax import ALGORITHMS, EvosaxConfig, finite_fitness, from_evosax
 from sejax.es.nes import NESConfig
@@ -311,7 +312,7 @@ def another_of_evosax(num_dims):
 def test_a_strategy_that_remembers_scores_wants_them_in_one_unit():
     config = sejax.config(["env=gridworld_2x2"])
     parts = config.parts()
-    es = another_of_evosax(sejax.bilevel.make_bilevel(**parts).num_dims)
+    es = another_of_evosax(make_bilevel(**parts).num_dims)
     assert sejax.make_learner(**{**parts, "es": es})
     for more in (["agents=[q_learning,sarsa]"], ["objective.first_eval_steps=2"]):
         parts = sejax.config(["env=gridworld_2x2", *more]).parts()

@@ -18,7 +18,7 @@ import yaml
 from support import is_drawn
 
 import sejax
-from sejax import run
+from sejax import report, run
 from sejax.bilevel import Bilevel
 from sejax.cli import commands, run_directory, runtime, session
 from sejax.cli import config as configuration
@@ -432,3 +432,47 @@ def test_the_command_says_how_it_ended_and_what_to_do_next(uninterrupted, capsys
     assert best == pytest.approx(max(scores))
     assert f"best incumbent mean {best:.1f}, solved at 0.8" in said
     assert f"python -m sejax.evaluate proxy={uninterrupted} agent=q_learning" in said
+    assert "\ngridworld_2x2: " + ("solved" if best >= 0.8 else "learned") in f"\n{said}"
+
+
+BROKEN = """
+import math
+import sejax
+from sejax.envs.dynamics.gridworld import GridParams, GridWorld
+
+def make(reward: float = math.nan):
+    params = GridParams(step_reward=reward, goal_reward=reward)
+    return sejax.Task(name="room", env=GridWorld(["S ", " G"]), params=params, solved_reward=3.0)
+"""
+
+
+def test_a_run_whose_agents_all_diverge_stops_and_recommends_nothing(tmp_path, monkeypatch, capsys):
+    (tmp_path / "my_broken.py").write_text(BROKEN)
+    monkeypatch.chdir(tmp_path)
+    words = [*TINY, "env=my_broken:make", "run_dir=run"]
+    for _ in range(2):  # typed again it says the same, and computes nothing
+        assert command(monkeypatch, *words) == commands.FAILED
+        said = capsys.readouterr()
+        assert "All agents of run diverged" in said.err and "Does the task return NaN?" in said.err
+        assert "sejax.evaluate" not in said.out and "sejax.load" not in said.out
+        assert [row["num_nonfinite"] for row in rows(tmp_path / "run")] == ["6"]
+        assert not [*(tmp_path / "run").glob("proxy*")]
+        assert json.loads((tmp_path / "run" / "run.json").read_text())["ended"] == "diverged"
+    report.main(["run"])
+    page = (tmp_path / "run" / "report.html").read_text()
+    assert "all agents diverged" in page and "sejax.evaluate" not in page
+    sweep = [*TINY, "env=my_broken:make", "env.reward=nan,1.0", "generations=1", "run_dir=sweep"]
+    assert command(monkeypatch, *sweep) == commands.FAILED
+    assert "All agents of sweep/env.reward_nan diverged" in capsys.readouterr().err
+    assert (tmp_path / "sweep" / "env.reward_1.0" / "proxy.safetensors").exists()
+
+
+def test_what_is_said_of_a_task_of_ones_own_can_be_typed(tmp_path, monkeypatch, capsys):
+    (tmp_path / "my_room.py").write_text(BROKEN)
+    monkeypatch.chdir(tmp_path)
+    words = [*TINY, "env=my_room:make", "env.reward=1", "generations=1", "run_dir=run"]
+    assert command(monkeypatch, *words) == 0
+    (line,) = re.findall(r"env, params = (.*)", capsys.readouterr().out)
+    assert line == "sejax.load(\"run\", task=sejax.envs.make(name='my_room:make', reward=1.0))"
+    env, _ = eval(line, {"sejax": sejax})
+    assert env.task.name == "room"

@@ -1,12 +1,15 @@
 """sejax.es.score_transforms: each of the eight on numbers worked by hand, and their laws."""
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sejax.es.score_transforms import TRANSFORMS
+from sejax.es.nes import NESConfig
+from sejax.es.score_transforms import TRANSFORMS, transform_of
+from sejax.options import ConfigError
 
 NAN, INF = np.nan, np.inf
 SCORES = [3.0, NAN, 1.0, 2.0]
@@ -150,3 +153,54 @@ def test_rounding_of_the_incumbents_mean_is_no_advantage(name, score):
         assert not transform(name, [score] * 4, incumbent).any()
     better = score + np.float32(1e-4) * np.abs(score)
     np.testing.assert_array_equal(transform(name, [score, better, score], score), [0, 1, 0])
+
+
+# --- of one's own --------------------------------------------------------------------------------
+
+
+def squared(scores):
+    return scores**2
+
+
+def test_a_function_of_ones_own_sees_the_worst_finite_score_for_a_diverged_one():
+    own = jax.jit(transform_of(squared, 4))
+    np.testing.assert_allclose(own(np.float32([3, NAN, 1, 2]), 0.0), [9, 1, 1, 4])
+    np.testing.assert_array_equal(own(np.full(4, NAN, np.float32), 0.0), np.zeros(4))
+    unbounded = jax.jit(transform_of(lambda scores: 1 / (scores + 2), 2))
+    np.testing.assert_array_equal(unbounded(np.float32([-2, 2]), 0.0), [0, 0.25])
+
+
+def test_a_function_of_ones_own_may_be_typed_or_given(tmp_path, monkeypatch):
+    (tmp_path / "my_transforms.py").write_text("def linear(scores):\n    return scores\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    scores = np.float32([3, -1])
+    for choice in ("my_transforms:linear", lambda scores: scores):
+        config = NESConfig(score_transform=choice, population_size=2)
+        assert hash(config) == hash(NESConfig(score_transform=choice, population_size=2))
+        np.testing.assert_array_equal(transform_of(choice, 2)(scores, 0.0), scores)
+        made = jax.jit(lambda: config.make(3).init(jax.random.key(0), jnp.zeros(3)).mean)  # noqa: B023
+        assert made().shape == (3,)  # made while something else is traced
+
+
+@pytest.mark.parametrize(
+    ("own", "said"),
+    [
+        (lambda scores: scores[:1], "shape [1]"),
+        (lambda scores: scores.mean(), "shape []"),
+        (lambda scores: (scores - scores.mean()) / scores.std(), "for the scores [0.0, 0.0"),
+        (lambda scores: scores if scores[0] > 0 else -scores, "or jax.numpy (tests/"),
+        (lambda scores, incumbent: scores, "TypeError"),
+    ],
+)
+def test_a_function_that_gives_no_weights_is_refused(own, said):
+    with pytest.raises(ConfigError) as error:
+        NESConfig(score_transform=own).make(3)
+    assert error.value.field == "es.score_transform"
+    assert said in str(error.value) and "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("choice", ["linaer", 3, None, ["rank"], "a b:c", "rank.py:f"])
+def test_what_is_neither_a_name_nor_a_function_is_refused(choice):
+    with pytest.raises(ConfigError) as error:
+        NESConfig(score_transform=choice)
+    assert error.value.field == "es.score_transform"

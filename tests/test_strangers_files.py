@@ -140,9 +140,19 @@ def test_what_is_typed_beside_a_preset_file_is_imported(folder):
     assert (folder / "typed").exists()
 
 
-def test_no_function_is_called_that_does_not_say_what_it_makes(folder, refused):
-    words = [f"env={SHELL['name']}", f"env.cmd='{SHELL['cmd']}'"]
-    assert "-> Task" in refused(run_command, *words)
+TRANSFORM = "strangers_module:make"
+
+
+def test_a_score_transform_that_a_file_names_is_not_imported(folder, refused):
+    words = [*TASK, f"es.score_transform={TRANSFORM}"]
+    config = configuration.plain(sejax.config(words))
+    assert config["es"]["score_transform"] == TRANSFORM  # typed, and imported when it is made
+    (folder / "p.yaml").write_text(f"es.score_transform: {TRANSFORM}\n")
+    said = refused(run_command, *TASK, "preset=p.yaml")
+    assert "es.score_transform must be typed" in said
+    report.main([str(write_run(folder / "run", config))])
+    write_proxy({"es": config["es"]})
+    assert sejax.load_proxy("evil.safetensors").env.task.name == "cartpole"
 
 
 STUDIES = [3, {"env": IMPORTED}, {"agent": f"choice(q_learning,{IMPORTED})"}, {"run_dir": "victim"}]

@@ -27,7 +27,7 @@ from sejax.agents.buffers import (
 )
 from sejax.envs.base import Task
 from sejax.envs.spec import TaskSpec
-from sejax.options import registry, require, shortened
+from sejax.options import nearest, registry, require, shortened
 
 __all__ = [
     "Agent",
@@ -129,8 +129,8 @@ def require_fit(
         require(
             isinstance(value, kind),
             kind.group,
-            f"must be a sejax.agents.{kind.__name__}; got {shortened(value)}. Set {kind.group} to "
-            f"an instance of a subclass.",
+            f"must be a sejax.agents.{kind.__name__}; got {shortened(repr(value))}. Set "
+            f"{kind.group}={_object_of(kind.group, value)}.",
         )
     agent_name = registry.name_of("agent", agent)
     if not _fits(agent, spec):
@@ -154,6 +154,13 @@ def require_fit(
         f"must be one for {agent.states} states with agent={shortened(agent_name)}; got "
         f"{exploration_name}. Set exploration=none.",
     )
+
+
+def _object_of(group: str, value: object) -> str:
+    """What to write for a class, or for the name of one."""
+    name = nearest(value, registry.names(group))[0]
+    cls = value if isinstance(value, type) else registry.find(group, name)
+    return f"{cls.__name__}()"
 
 
 def default_for(spec: TaskSpec) -> str:

@@ -5,12 +5,21 @@ import io
 import os
 import re
 import sys
+import traceback
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import NoReturn
 
-from sejax.cli import runtime
-from sejax.options import ConfigError, FailedError, registry, shortened
+from sejax.cli import compose, runtime
+from sejax.options import (
+    ConfigError,
+    FailedError,
+    place_of,
+    registry,
+    require,
+    shortened,
+    told,
+)
 
 BAD_INPUT, FAILED, INTERRUPTED = 2, 1, 130
 HELP, PRINT_CONFIG = ("--help", "-h"), "--print-config"
@@ -51,12 +60,13 @@ def _prepared(words: Sequence[str], known: Sequence[str]) -> list[str]:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")  # terminals without Unicode
-    options = [word for word in words if word.startswith("-") and word not in known]
-    if options:
-        message = (
-            f"must read FIELD=VALUE; got {shortened(options[0])}. Options: {', '.join(known)}."
+    for i, word in enumerate(words):
+        require(
+            not word.startswith("-") or word in known,
+            "an override",
+            f"must read FIELD=VALUE; got {shortened(word)}. Write {compose.meant(words[i:])}, "
+            f"without dashes. Options: {', '.join(known)}.",
         )
-        raise ConfigError(f"An override {message}", "an override")
     if sys.path[0] != "":  # `python -m` has put the current folder there, if it still exists
         sys.path.insert(0, "")
     Path.cwd()
@@ -88,11 +98,14 @@ def messages() -> Iterator[None]:
     except OSError as error:
         message = f"A file could not be written or read: {error}. What was written before is whole"
         fail(f"{message}; run the same command again to go on from there.", FAILED)
-    except RuntimeError as error:
-        if "RESOURCE_EXHAUSTED" not in str(error) and "Out of memory" not in str(error):
+    except Exception as error:
+        if "RESOURCE_EXHAUSTED" in str(error) or "Out of memory" in str(error):
+            message = f"There is not enough memory: {str(error).splitlines()[0]}"
+            fail(f"{message} Smaller networks, buffers or populations need less.", FAILED)
+        if not place_of(error):
             raise
-        message = f"There is not enough memory: {str(error).splitlines()[0]}"
-        fail(f"{message} Smaller networks, buffers or populations need less.", FAILED)
+        traceback.print_exc()
+        fail(f"code of your own raised {told(error)}", FAILED)
 
 
 def fail(message: str, status: int) -> NoReturn:

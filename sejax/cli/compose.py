@@ -119,13 +119,18 @@ def read(overrides: Sequence[str]) -> dict[str, Any]:
       ConfigError: for what is no override, or several values, and for a file that cannot be read.
     """
     given: dict[str, Any] = {}
-    for override in overrides:
+    for i, override in enumerate(overrides):
         name, equals, text = override.partition("=")
-        got = shortened(override)
         require(
             equals and NAME.fullmatch(name),
             "an override",
-            f"must read FIELD=VALUE; got {got}. Set env={got} or proxy={got}, if that is meant.",
+            f"must read FIELD=VALUE; got {shortened(override)}. Write {meant(overrides[i:])}.",
+        )
+        require(
+            not text.startswith("[") or text.endswith("]"),
+            name,
+            f"must close its bracket, with no space in it; got {shortened(text)}. Set "
+            f"{name}={shortened(text.rstrip(','))}].",
         )
         values = split(text)
         require(
@@ -138,6 +143,18 @@ def read(overrides: Sequence[str]) -> dict[str, Any]:
     if str(given.get("preset", "")).endswith(preset_files.ENDING):
         given = preset_files.read_file(Path(given.pop("preset"))) | given
     return given
+
+
+def meant(words: Sequence[str]) -> str:
+    """What may be meant by words of which the first is no FIELD=VALUE."""
+    name, *values = [*filter(None, (word.strip("-=") for word in words[:3])), "VALUE"]
+    if "=" in name:  # after dashes
+        return shortened(name)
+    value = "VALUE" if "=" in values[0] else values[0]
+    is_field = words[0].startswith("-") or name in registry.GROUPS or value != "VALUE"
+    if is_field and NAME.fullmatch(name) and not registry.is_registered("env", name):
+        return f"{shortened(name)}={shortened(value)}"
+    return f"env={shortened(name)} or proxy={shortened(name)}, if that is meant"
 
 
 def expand(overrides: Sequence[str]) -> list[list[str]]:

@@ -20,6 +20,7 @@ from sejax.ops.files import as_file_name
 from sejax.options import (
     ConfigError,
     Options,
+    as_text,
     between,
     counts,
     one_of,
@@ -29,7 +30,7 @@ from sejax.options import (
     seed,
     shortened,
 )
-from sejax.options.plain import from_plain, to_plain
+from sejax.options.plain import flatten, from_plain, to_plain
 from sejax.training import TrainingConfig, require_reachable
 
 AGENT_HPARAMS = ("default", "varied")
@@ -348,8 +349,7 @@ def completed(stored: Mapping[str, Any], config: LearnConfig) -> dict[str, Any]:
     New fields have a default that changes no number. Of `module:attribute` only what `config` has
     is imported.
     """
-    own = [registry.name_of("agent", each.agent) for each in members_of(config)]
-    own += [config.name(group) for group in config.groups if group != "agent"]
+    own = map(as_text, flatten(plain(config)).values())
     try:
         with registry.only_typed(own):
             return plain(learn_config(stored))

@@ -9,7 +9,7 @@ import numpy as np
 
 from sejax.distillation.policy_copy import Actor, acting
 from sejax.envs.base import Task
-from sejax.options import ConfigError, require, shortened, told
+from sejax.options import ConfigError, registry, require, shortened, told
 from sejax.proxies.exact import Layer
 
 FIX = "Set policy=ppo:FILE.zip (Stable-Baselines3), FILE.npz or module:function."
@@ -126,17 +126,8 @@ def _of_file(text: str) -> list[Layer]:
 
 
 def _of_function(text: str) -> Actor:
-    import importlib
-
-    module, _, name = text.partition(":")
-    try:
-        found = getattr(importlib.import_module(module), name)
-    except (ImportError, AttributeError) as error:
-        raise ConfigError(
-            f"policy must be a function that can be imported; got {shortened(text)} "
-            f"({told(error)}). {FIX}",
-            "policy",
-        ) from error
+    registry.require_typed("policy", text)
+    found = registry.imported("policy", text)
     require(
         callable(found),
         "policy",

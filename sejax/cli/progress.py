@@ -144,11 +144,12 @@ class RunProgress(Reporter):
     ) -> None:
         """Says how it ended, where everything is, and what to do next."""
         self.stop()
-        verdict = f"best incumbent score {self._score(best)}"
+        title, verdict = "learned", f"best incumbent score {self._score(best)}"
         if learner.objective.meaning:
             verdict += f": {learner.objective.meaning}"
         if learner.solved_score is not None:
             solved = "solved" if best >= learner.solved_score else "not solved"
+            title = "solved" if solved == "solved" else title
             verdict = (
                 f"{solved}: best incumbent mean {best:.1f}, solved at {learner.solved_score:g}"
             )
@@ -157,7 +158,6 @@ class RunProgress(Reporter):
         words = next_steps.evaluate_words(
             path, config.name("env"), config.name("proxy"), agents, learner.proxy.is_real
         )
-        title = "learned" if ended == "finished" else ended
         self._console.rule(f"{learner.proxy.task.name}: {title}", align="left")
         self.say(
             f"{verdict}\n\n"
@@ -171,6 +171,8 @@ class RunProgress(Reporter):
         )
 
     def _own_arguments(self) -> str:
-        """What `sejax.load` must be given beside the proxy."""
-        task = ", task=my_task" if ":" in self._config.name("env") else ""
-        return task + (", proxy=my_proxy_config" if ":" in self._config.name("proxy") else "")
+        """What `sejax.load` must be given beside the proxy: what no file's name is imported for."""
+        env, proxy = registry.describe("env", self._config.env), self._config.name("proxy")
+        fields = ", ".join(f"{name}={value!r}" for name, value in env.items())
+        task = f", task=sejax.envs.make({fields})" if ":" in env["name"] else ""
+        return task + (f', proxy=sejax.config(["proxy={proxy}"]).proxy' if ":" in proxy else "")

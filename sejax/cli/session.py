@@ -114,7 +114,8 @@ def run(
       report: hears how it goes on.
 
     Returns:
-      How it ended: finished or solved.
+      How it ended: finished, solved, or diverged: a run of whose agents none has ended with finite
+      numbers stops, and has no proxy.
 
     Raises:
       ConfigError: if the folder's state is that of another version.
@@ -143,6 +144,8 @@ def run(
     drawn = time.monotonic()
     with contextlib.closing(tracker):
         while directory.finished_generations < config.generations and not state.solved:
+            if _all_diverged(directory, learner):
+                break
             left = config.generations - directory.finished_generations
             length = min(config.checkpoint_every, left)
             if not chunks.is_ready(length):
@@ -164,7 +167,8 @@ def run(
                 draw(directory, learner)
                 drawn = time.monotonic()
         draw(directory, learner)
-    ended = "solved" if state.solved else "finished"
+    diverged = _all_diverged(directory, learner)
+    ended = "solved" if state.solved else "diverged" if diverged else "finished"
     agents = learner.strategy.num_evaluations  # of a generation
     steps_of_agents = sum(float(row["train_steps_mean"]) for row in directory.rows)
     directory.write_summary(
@@ -182,6 +186,13 @@ def run(
         versions={"python": platform.python_version()} | {x: version(x) for x in PACKAGES},
     )
     return ended
+
+
+def _all_diverged(directory: RunDirectory, learner: Bilevel) -> bool:
+    """Whether there are generations, and every agent of each met a number that is not finite."""
+    agents = learner.strategy.num_evaluations
+    rows = directory.rows
+    return bool(rows) and all(float(row["num_nonfinite"]) == agents for row in rows)
 
 
 @contextlib.contextmanager
@@ -224,7 +235,7 @@ class _Proxies:
     """The proxy files of a run."""
 
     def __init__(self, config: LearnConfig, directory: RunDirectory, learner: Bilevel):
-        self._folder, self._learner, self._seed = directory.path, learner, config.seed
+        self._directory, self._learner, self._seed = directory, learner, config.seed
         # What was learned does not depend on the tracker, nor on where it was computed.
         plain = directory.config.items()
         self._plain = {k: v for k, v in plain if k not in ("tracker", "machines")}
@@ -234,11 +245,13 @@ class _Proxies:
         self._best: int | None = None  # the generation of the best proxy that is on the disk
 
     def save(self, state: LearnState) -> None:
-        """Writes the best proxy, if it is new, and the last one.
+        """Writes the best proxy, if it is new, and the last one; none if all agents diverged.
 
         Raises:
           OSError: if a file cannot be written.
         """
+        if _all_diverged(self._directory, self._learner):
+            return
         if self._best != state.best_generation:
             best = state.best, state.best_score, state.best_scores, state.best_generation
             self._save("proxy", *best)
@@ -252,7 +265,7 @@ class _Proxies:
         names = self._learner.mixture.names
         by_agent = dict(zip(names, map(float, scores), strict=True))
         save(
-            self._folder / f"{name}.safetensors",
+            self._directory.path / f"{name}.safetensors",
             self._learner.proxy,
             self._learner.unravel(flat),
             self._plain,

@@ -155,10 +155,13 @@ def _one_error(name: str) -> Iterator[None]:
     except options.ConfigError:
         raise
     except Exception as error:
+        fix = (
+            " Derive it from gymnax's Environment, whose step_env returns obs, state, reward, "
+            "terminated and info, or take it from gymnax.make(ID)[0]."
+        )
         raise options.ConfigError(
             f"env must be a gymnax 1.x environment with EnvParams; {name} raised "
-            f"{options.told(error)}. Derive it from gymnax's Environment, whose step_env returns "
-            "five values, or take it from gymnax.make(ID)[0].",
+            f"{options.told(error)}.{'' if options.place_of(error) else fix}",
             "env",
         ) from error
 

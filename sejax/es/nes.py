@@ -11,7 +11,7 @@ from flax import struct
 from jaxtyping import Array, Float
 
 from sejax.es.base import MAX_SCALE, Strategy, StrategyOptions
-from sejax.es.score_transforms import TRANSFORMS
+from sejax.es.score_transforms import OwnTransform, require_transform, transform_of
 from sejax.options import counts, fraction, one_of, option, positive, shrinks
 
 UPDATE_RULES = ("authors", "paper")
@@ -37,7 +37,8 @@ class NESConfig(StrategyOptions):
     # factor on alpha after each generation
     step_size_decay: float = option(1.0, shrinks(), traced=True)
     mirrored: bool = True  # each perturbation is tried as +eps and -eps and keeps its better sign
-    score_transform: str = option("all_better_2", one_of(TRANSFORMS))
+    # A name, or my_module:my_function of scores `[pop]` that gives weights `[pop]`.
+    score_transform: str | OwnTransform = option("all_better_2", require_transform)  # noqa: RUF009
     # authors: psi += alpha sum F eps; paper: that divided by n_p sigma
     update_rule: str = option("authors", one_of(UPDATE_RULES))
     # psi shrinks by this before each update
@@ -76,7 +77,7 @@ def make_nes(config: NESConfig, num_dims: int) -> Strategy:
       (8, 3)
     """
     num_noises = config.population_size
-    transform = TRANSFORMS[config.score_transform]
+    transform = transform_of(config.score_transform, num_noises)
 
     def init(key: Array, mean: Float[Array, " dims"]) -> NESState:
         return NESState(

@@ -1,4 +1,4 @@
-r"""The eight score transforms: from the candidates' scores K_i to their weights F_i.
+r"""Score transforms: from the candidates' scores K_i to their weights F_i; eight, or your own.
 
 Scores are to be maximised. A score that is not finite ranks below every finite one and gets the
 weight of the worst. If no candidate is better than another (or than the incumbent, where the
@@ -10,13 +10,18 @@ Source: paper, appendix "NES Score Transformation". `K_psi` is the incumbent's m
 
 from collections.abc import Callable
 
+import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from sejax.es.base import is_tie
+from sejax.options import ConfigError, registry, require, told, unknown_name
 
+FIELD = "es.score_transform"
 Scores = Float[Array, " pop"]
 ScoreTransform = Callable[[Scores, Float[Array, ""]], Scores]
+OwnTransform = Callable[[Scores], Scores]
 
 
 def linear(scores: Scores, incumbent: Float[Array, ""]) -> Scores:
@@ -101,6 +106,56 @@ TRANSFORMS: dict[str, ScoreTransform] = {
     "all_better_1": all_better_1,
     "all_better_2": all_better_2,
 }
+
+
+def require_transform(field: str, choice: object, default: object = None) -> None:
+    """Checks that it is a name, a `module:attribute` that may be imported, or a function.
+
+    Raises:
+      ConfigError: for anything else. Nothing is imported.
+    """
+    if isinstance(choice, str) and ":" in choice:
+        registry.require_typed(field, choice)
+    elif not callable(choice) and choice not in [*TRANSFORMS]:
+        raise unknown_name(field, choice, TRANSFORMS)
+
+
+def transform_of(choice: str | OwnTransform, pop: int) -> ScoreTransform:
+    """The transform that a configuration chooses.
+
+    Args:
+      choice: a name of `TRANSFORMS`; or a function of one's own, itself or as `module:attribute`.
+        It maps scores `[pop]` to weights `[pop]`. For a score that is not finite it is given the
+        worst finite one; a weight that is not finite is 0.
+      pop: the number of scores.
+
+    Raises:
+      ConfigError: if a function cannot be imported or traced, or gives weights of another shape, or
+        some that are not finite for the scores 0, 1, 2, ... or for equal ones.
+    """
+    if isinstance(choice, str) and choice in TRANSFORMS:
+        return TRANSFORMS[choice]
+    own = registry.imported(FIELD, choice) if isinstance(choice, str) else choice
+    for scores in (np.arange(pop, dtype=np.float32), np.zeros(pop, np.float32)):
+        try:
+            with jax.ensure_compile_time_eval():
+                weights = np.asarray(jax.jit(own)(scores), float)
+        except Exception as error:
+            must = f"{FIELD} must be a function of scores [pop] that jax can trace"
+            raise ConfigError(f"{must}; {choice} raised {told(error)}.", FIELD) from error
+        require(
+            weights.shape == (pop,) and np.isfinite(weights).all(),
+            FIELD,
+            f"must give a finite weight for each of {pop} scores; got {weights.tolist()!s:.60} of "
+            f"shape {list(weights.shape)} for the scores {scores.tolist()!s:.40}. Mend {choice}, "
+            f"or set {FIELD}=rank.",
+        )
+
+    def transform(scores: Scores, incumbent: Float[Array, ""]) -> Scores:
+        weights = jnp.asarray(own(_floor_nonfinite(scores)), jnp.float32)
+        return jnp.where(jnp.isfinite(weights) & jnp.isfinite(scores).any(), weights, 0.0)
+
+    return transform
 
 
 def _advantage(scores: Scores, incumbent: Float[Array, ""]) -> Scores:

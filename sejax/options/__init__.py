@@ -26,11 +26,15 @@ import functools
 import inspect
 import io
 import numbers
+import os
+import sysconfig
 import textwrap
 import tokenize
+import traceback
 import types
 import typing
 from collections.abc import Callable, Collection, Iterable, Mapping
+from pathlib import Path
 from typing import Any, ClassVar
 
 ACTIVATIONS = ("tanh", "fast_tanh", "relu", "leaky_relu", "prelu")  # of `sejax.ops.networks`
@@ -87,7 +91,12 @@ def unknown_name(field: str, got: object, known: Iterable[str]) -> ConfigError:
 def nearest(got: object, known: Iterable[str]) -> list[str]:
     """The known names, the most similar first."""
     start = str(got)[:200]  # comparing takes time that grows with the square of the length
-    return sorted(known, key=lambda name: -difflib.SequenceMatcher(None, start, name).ratio())
+
+    def similarity(name: str) -> float:  # where the case differs, the letters count
+        pairs = (start, name), (start.lower(), name.lower())
+        return sum(difflib.SequenceMatcher(None, *pair).ratio() for pair in pairs)
+
+    return sorted(known, key=similarity, reverse=True)
 
 
 def listed(names: Collection[str], most: int = 120) -> str:
@@ -102,8 +111,34 @@ def shortened(value: object, length: int = 80) -> str:
 
 
 def told(error: BaseException) -> str:
-    """Kind and message of an error of other code, on one line."""
-    return f"{type(error).__name__}: {shortened(' '.join(str(error).split()), 120)}"
+    """An error of other code on one line: its kind, its message, its place in a user's file."""
+    place, text = place_of(error), shortened(" ".join(str(error).split()), 120)
+    kinds = [cls.__name__ for cls in type(error).__mro__]
+    # jax's errors of a value that is not known while tracing; their texts tell of jax's inside.
+    if any(kind.startswith(("ConcretizationType", "NonConcrete", "Tracer")) for kind in kinds):
+        text = "Python code needs the value of a traced array; use jnp.where, or jax.numpy"
+    return f"{kinds[0]}: {text}{f' ({place})' if place else ''}"
+
+
+def place_of(error: BaseException) -> str:
+    """File, line and source of the innermost frame in a user's own file; empty without one.
+
+    Python's library, installed packages and sejax are not the user's own.
+    """
+    frames = traceback.extract_tb(error.__traceback__)
+    own = [frame for frame in frames if not frame.filename.startswith(("<", *_LIBRARIES))]
+    if not own:
+        return ""
+    path = Path(own[-1].filename)
+    with contextlib.suppress(OSError, ValueError):  # it is elsewhere
+        path = path.relative_to(Path.cwd())
+    return f"{path}:{own[-1].lineno}: {shortened(own[-1].line, 60)}"
+
+
+_LIBRARIES = (
+    *(f"{sysconfig.get_path(x)}{os.sep}" for x in ("stdlib", "platstdlib", "purelib", "platlib")),
+    f"{Path(__file__).parents[1]}{os.sep}",
+)
 
 
 # --- fields --------------------------------------------------------------------------------------

@@ -35,7 +35,7 @@ import inspect
 import operator
 import re
 import typing
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextvars import ContextVar
 from dataclasses import dataclass
 from typing import Any
@@ -45,12 +45,13 @@ from sejax.options import (
     Options,
     listed,
     nearest,
+    place_of,
     require,
     shortened,
     told,
     unknown_name,
 )
-from sejax.options.plain import MISSING, fields_of, from_plain, is_union, to_plain
+from sejax.options.plain import MISSING, fields_of, from_plain, to_plain
 
 
 @dataclass(frozen=True)
@@ -249,10 +250,13 @@ def find(group: str, name: object) -> Any:
     if built_in is not None:
         return _attribute(built_in)
     if name in _offered(group):
-        return _as_dataclass(group, name, _imported(group, _offered(group)[name]))
+        return _as_dataclass(group, name, imported(group, _offered(group)[name]))
     if ":" not in name:
-        raise unknown_name(group, name, names(group))
-    return _as_dataclass(group, name, _imported(group, name, _TYPED.get()))
+        is_path = "." in name and name.replace(".", "_").isidentifier()
+        meant = [":".join(name.rsplit(".", 1))] if is_path else []
+        raise unknown_name(group, name, [*names(group), *meant])
+    require_typed(group, name)
+    return _as_dataclass(group, name, imported(group, name))
 
 
 def name_of(group: str, config: object) -> str:
@@ -375,47 +379,69 @@ def _attribute(path: str) -> Any:
     return getattr(importlib.import_module(module), attribute)
 
 
-def _imported(group: str, path: str, typed: Collection[str] | None = None) -> Any:
-    """What `module:attribute` names; it is imported if `typed` has it, or is None."""
+def require_typed(field: str, path: str) -> None:
+    """Checks that `module:attribute` may be imported; imports nothing.
+
+    Raises:
+      ConfigError: for text of another form, or one that the user has not typed (`only_typed`).
+    """
     module, _, attribute = path.partition(":")
-    got = shortened(path, 60)
+    got, typed = shortened(path, 60), _TYPED.get()
+    parts = [*module.split("."), *attribute.split(".")]
+    own = module.removesuffix(".py").replace("/", ".").strip(".")
+    fix = f"{own}:{attribute}" if own.replace(".", "_").isidentifier() else "my_module:MyClass"
     require(
-        all(part.isidentifier() for part in (*module.split("."), *attribute.split("."))),
-        group,
-        f"must be a name or module:attribute; got {got}. Set {group}=my_module:MyClass.",
+        all(map(str.isidentifier, parts)) and not module.endswith(".py"),
+        field,
+        f"must be a name or module:attribute; got {got}. Set {field}={shortened(fix, 60)}.",
     )
     require(
         typed is None or path in typed,
-        group,
+        field,
         "must be typed on the command line if it is of a module of your own: what a file names is "
-        f"never imported; got {got}. Set {group}={got}, if you trust it.",
+        f"never imported; got {got}. Set {field}={got}, if you trust it.",
     )
+
+
+def imported(field: str, path: str) -> Any:
+    """What `module:attribute` names; `require_typed` has been asked before.
+
+    Raises:
+      ConfigError: if the module cannot be imported, or has nothing of this name.
+    """
+    module, _, attribute = path.partition(":")
     try:
         found = importlib.import_module(module)
     except Exception as error:
+        fix = "" if place_of(error) else " Is its folder in PYTHONPATH?"
         raise ConfigError(
-            f"{group} must name a module that can be imported; {shortened(path, 40)} raised "
-            f"{told(error)}. Is its folder in PYTHONPATH?",
-            group,
+            f"{field} must name a module that can be imported; {shortened(path, 40)} raised "
+            f"{told(error)}.{fix}",
+            field,
         ) from error
     try:
         return operator.attrgetter(attribute)(found)
     except AttributeError as error:
-        known = vars(found).items()
-        own = [k for k, x in known if callable(x) and getattr(x, "__module__", None) == module]
+        known = [(k, x) for k, x in vars(found).items() if inspect.isfunction(x) or _makes(x)]
+        own = [k for k, x in known if x.__module__ == module]
         near = nearest(attribute, own)
-        fix = f" Did you mean {group}={module}:{near[0]}?" if near else ""
+        fix = f" Did you mean {field}={module}:{near[0]}?" if near else ""
         raise ConfigError(
-            f"{group} must name a class or function of {shortened(module, 40)}; got "
+            f"{field} must name a class or function of {shortened(module, 40)}; got "
             f"{shortened(attribute, 40)}. There are: {listed(near, 60)}.{fix}",
-            group,
+            field,
         ) from error
+
+
+def _makes(found: object) -> bool:
+    """Whether it is a dataclass with `make`."""
+    return isinstance(found, type) and dataclasses.is_dataclass(found) and hasattr(found, "make")
 
 
 def _as_dataclass(group: str, name: str, found: Any) -> Any:
     """The dataclass that a plugin is, or that a function stands for."""
     arguments = GROUPS[group].arguments
-    if isinstance(found, type) and dataclasses.is_dataclass(found) and hasattr(found, "make"):
+    if _makes(found):
         cls: Any = found
     else:
         require(
@@ -441,13 +467,7 @@ def _as_dataclass(group: str, name: str, found: Any) -> Any:
 def _from_function(group: str, name: str, function: Callable[..., Any]) -> type:
     """A dataclass whose fields are a function's parameters beyond those that `make` is given."""
     written: Any = getattr(function, "func", function)  # of a partial, what it is one of
-    arguments, kind = GROUPS[group].arguments, _attribute(GROUPS[group].makes)
-    require(
-        _returns(written, kind),
-        group,
-        f"must be a function that says what it makes, as no other is called; got {shortened(name)} "
-        f"without -> {kind.__name__}. Annotate it, or set {group} to a dataclass with make.",
-    )
+    arguments = GROUPS[group].arguments
     parameters = list(inspect.signature(function).parameters.values())
     is_open = any(p.kind in (p.VAR_POSITIONAL, p.VAR_KEYWORD) for p in parameters)
     require(
@@ -474,19 +494,6 @@ def _from_function(group: str, name: str, function: Callable[..., Any]) -> type:
     )
     cls.__module__ = written.__module__
     return cls
-
-
-def _returns(function: Callable[..., Any], kind: type) -> bool:
-    """Whether a function's annotation says that it returns an object of a class."""
-    try:
-        says = typing.get_type_hints(function).get("return")
-    except Exception:  # a name that only type checkers import
-        says = inspect.get_annotations(function).get("return")
-    if isinstance(says, str):
-        return re.search(rf"\b{kind.__name__}\b", says) is not None
-    each = typing.get_args(says) if is_union(says) else (says,)
-    kinds = [typing.get_origin(x) or x for x in each]
-    return any(isinstance(x, type) and issubclass(x, kind) for x in kinds)
 
 
 def _as_field(parameter: inspect.Parameter) -> tuple[str, Any, Any]:
