@@ -42,16 +42,19 @@ SOLVED_BY = ("test", "train")
 
 @dataclass(frozen=True, kw_only=True)
 class TrainingConfig(Options):
-    """How long an agent trains, and how it is tested."""
+    """How long an agent trains, and how it is tested.
+
+    The defaults are for one-step SEs. On a real task set `stop_rule="solved", max_steps=None`.
+    """
 
     group: ClassVar[str] = "training"
 
-    max_episodes: int = option(1000, counts("it counts episodes"))  # n_e: of a training at most
+    max_episodes: int = option(2000, counts("it counts episodes"))  # n_e: of a training at most
     # The stop rule waits for so many training steps.
     min_steps: int = option(0, counts("it counts steps", least=0))
     # Training ends after so many steps, whatever the rule says.
-    max_steps: int | None = option(None, counts("an agent must train"))
-    stop_rule: str = option("plateau", one_of(STOP_RULES))  # plateau (SEs), solved (real tasks)
+    max_steps: int | None = option(2000, counts("an agent must train"))
+    stop_rule: str = option("never", one_of(STOP_RULES))  # plateau (SEs), solved (real tasks)
     # d: episodes in each of the two means that the plateau rule compares
     window: int = option(10, counts("it counts episodes"))
     # C_diff: relative change between them that counts as flat

@@ -57,7 +57,6 @@ class PPOConfig(TorsoOptions):
 
     actions: ClassVar[tuple[str, ...]] = ("discrete", "continuous")
 
-    warmup_episodes: int = 1  # PPO learns from the start; this only holds back the stop rule
     hidden_size: int = option(64, counts(), varied="triple")
     num_layers: int = option(2, counts(most=MOST_LAYERS), varied="one_more_or_less")
     activation: str = option("tanh", one_of(ACTIVATIONS))

@@ -38,7 +38,7 @@ AGENT_HPARAMS = ("default", "varied")
 EVALUATION_HPARAMS = (*AGENT_HPARAMS, "as_learned")
 TRAINING_FROM = ("proxy", "config")
 TRAINING = TrainingConfig()  # on proxies
-REAL_TRAINING = TrainingConfig(stop_rule="solved")
+REAL_TRAINING = TrainingConfig(stop_rule="solved", max_steps=None, max_episodes=1000)
 JOINT = "+"  # between the agents of a mixture, in names
 Schema = TypeVar("Schema", bound="CommandConfig")
 
