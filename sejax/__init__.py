@@ -54,6 +54,7 @@ _EXPORTS = {
     "TrainResult": "sejax.training",
     "TrainingConfig": "sejax.training",
     "Tuner": "sejax.proxies.tuners",
+    "agent_of": "sejax.proxies.io",
     "config": "sejax.cli.config",
     "configure_xla": "sejax.cli.runtime",
     "evaluate_agents": "sejax.evaluation",
@@ -103,6 +104,7 @@ if TYPE_CHECKING:  # what a type checker and an editor see
     from sejax.proxies.io import (
         Proxy,
         ProxySet,
+        agent_of,
         load,
         load_proxy,
         load_set,
@@ -155,6 +157,7 @@ __all__ = [
     "TrainResult",
     "TrainingConfig",
     "Tuner",
+    "agent_of",
     "agents",
     "config",
     "configure_xla",

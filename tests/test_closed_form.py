@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from support import paper_se
 
 import sejax
 from sejax import envs
@@ -19,7 +20,7 @@ from sejax.run import main
 CARTPOLE, PENDULUM = envs.make("cartpole"), envs.make("pendulum")
 CHOICE = SyntheticConfig(hidden_size=8, horizon=1, initial_state="learned", done="threshold")
 FORMS = {
-    form: SyntheticConfig(
+    form: paper_se(
         hidden_size=8, horizon=1, initial_state="noise", state_units="bounds", reward_form=form,
         reward_slope=0.7,
     )
@@ -90,7 +91,7 @@ def test_of_discrete_actions_the_best_is_known_and_soft_ones_are_a_softmax():
 
 def test_discrete_states_are_indices_for_the_policy():
     task = envs.make("cliff_walking")
-    env, weights = made(SyntheticConfig(hidden_size=8, horizon=1, initial_state="learned"), task)
+    env, weights = made(paper_se(hidden_size=8, horizon=1, initial_state="learned"), task)
     params = env.params(weights)
     _, state = env.reset_env(jax.random.key(0), params)
     state = state.replace(vector=jax.nn.one_hot(7, 48))
@@ -204,4 +205,4 @@ def test_where_the_best_policy_is_not_known_it_is_refused(words, message):
 
 def test_the_parts_refuse_it_too():
     with pytest.raises(ConfigError, match=r"objective.closed_form must be 0"):
-        program_of(DDQN, proxy=SyntheticConfig(hidden_size=8), closed_form=1.0)
+        program_of(DDQN, proxy=paper_se(hidden_size=8), closed_form=1.0)

@@ -6,15 +6,16 @@ import jax
 import jax.numpy as jnp
 import pytest
 from scripted import MAX_EPISODES, MAX_STEPS, ScriptedEnv, script, scripted_agent
+from support import paper_se, paper_training
 
 import sejax
 from sejax import envs, evaluation
 from sejax.options import registry
-from sejax.proxies.configs import RewardConfig, SyntheticConfig
+from sejax.proxies.configs import RewardConfig
 from sejax.training import TrainingConfig
 
 ENV = ScriptedEnv()
-TRAINING = TrainingConfig(max_episodes=MAX_EPISODES, stop_rule="never", test_episodes=3)
+TRAINING = paper_training(max_episodes=MAX_EPISODES, stop_rule="never", test_episodes=3)
 
 
 def test_tests_between_are_as_many_as_asked_and_the_area_is_over_all_steps():
@@ -62,13 +63,13 @@ def test_an_outcome_counts_training_and_tests():
 
 
 @pytest.mark.parametrize(("env", "agent", "exploration", "varied", "proxy"), [
-    ("pendulum", "td3", "none", False, SyntheticConfig(hidden_size=2)),
+    ("pendulum", "td3", "none", False, paper_se(hidden_size=2)),
     ("pendulum", "td3", "icm", False, RewardConfig(hidden_size=2)),
-    ("pendulum", "sac", "icm", False, SyntheticConfig(hidden_size=2)),
-    ("pendulum", "ppo", "icm", False, SyntheticConfig(hidden_size=2)),
-    ("cartpole", "td3_discrete", "none", False, SyntheticConfig(hidden_size=2)),
+    ("pendulum", "sac", "icm", False, paper_se(hidden_size=2)),
+    ("pendulum", "ppo", "icm", False, paper_se(hidden_size=2)),
+    ("cartpole", "td3_discrete", "none", False, paper_se(hidden_size=2)),
     ("cartpole", "ddqn", "icm", False, RewardConfig(hidden_size=2)),
-    pytest.param("pendulum", "sac", "icm", True, SyntheticConfig(hidden_size=2),
+    pytest.param("pendulum", "sac", "icm", True, paper_se(hidden_size=2),
                  marks=pytest.mark.slow),  # which is traced for every size that may be drawn
     pytest.param("cartpole", "ddqn", "icm", True, RewardConfig(hidden_size=2),
                  marks=pytest.mark.slow),

@@ -7,7 +7,6 @@ import pytest
 
 import sejax
 from experiments.common.reward_networks import STUDIES
-from sejax.agents.dqn import DDQNConfig
 from sejax.agents.ppo import PPOConfig
 from sejax.cli import preset_files
 from sejax.options import ConfigError, registry

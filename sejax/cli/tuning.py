@@ -21,7 +21,7 @@ from sejax.cli import config as configuration
 from sejax.cli import runtime, search_results
 from sejax.cli.config import REAL_TRAINING, EvaluateConfig
 from sejax.cli.kinds import Kind, kind_of, stored, train
-from sejax.cli.search_config import Search
+from sejax.cli.search_config import DEFAULT, Search
 from sejax.cli.worlds import load
 from sejax.landscapes import PREFIX, Landscape
 from sejax.ops import gaussian_process
@@ -99,7 +99,7 @@ def setup_of(search: Search) -> Setup:
       ConfigError: as `tune`.
     """
     own, tuner = search.config, search.tuner or {}
-    config = configuration.evaluate_config(search.fixed)
+    config = configuration.evaluate_config([DEFAULT, *search.fixed])
     ses, steps = load(config, load_set), int(tuner["steps"])
     training, name = training_of(ses), registry.name_of("agent", config.agent)
     require(
