@@ -22,6 +22,7 @@ from sejax.envs.base import Task
 from sejax.envs.wrappers import repeat_actions
 from sejax.es.base import StrategyState
 from sejax.objectives import Evaluator, Objective, Outcome
+from sejax.ops import cpu
 from sejax.ops.keys import step_keys
 from sejax.ops.loops import while_any_active
 from sejax.ops.parallel import (
@@ -267,8 +268,7 @@ def make_evaluator(
     Example:
       >>> import sejax
       >>> env, params = sejax.load("cartpole")
-      >>> agent = sejax.make_agent(sejax.DDQNConfig(warmup_episodes=1), env.task)
-      >>> training = sejax.TrainingConfig(max_steps=2000, max_episodes=2000, stop_rule="never")
+      >>> agent, training = sejax.agent_of(env), sejax.training_of(env)
       >>> evaluate = make_evaluator(agent, env, env.task, training)
       >>> outcome = jax.eval_shape(evaluate, jax.random.key(0), params)
       >>> outcome.test_returns.shape
@@ -424,6 +424,8 @@ def _evaluation_program(
             return outcome
 
         width = num_parallel_on_cpu(agent, training)
+        if width is not None:
+            width = min(width, cpu.width_of(keys.shape[0]))
         spread: Outcome = spread_over_devices(one, devices, num_parallel, width)(keys)
         return spread
 

@@ -345,7 +345,8 @@ def test_where_no_agent_is_named_it_is_the_tasks_own(room, tmp_path):
     sejax.save(tmp_path / "theirs.safetensors", env, env.init_weights(jax.random.key(0)))
     own = "agent_hparams=default"
     for proxy, kind in ((room, "q_learning"), (f"pendulum {own}", "td3"),
-                        (f"acrobot {own}", "ddqn"), (tmp_path / "theirs.safetensors", "td3"), ("nope", "ddqn"),
+                        (f"acrobot {own}", "ddqn"),
+                        (tmp_path / "theirs.safetensors", "td3"), ("nope", "ddqn"),
                         ("real env=gridworld_2x2", "q_learning"), ("real", "ddqn")):  # fmt: skip
         config = evaluate_config(*f"proxy={proxy}".split(), words=[])
         assert registry.name_of("agent", config.agent) == kind
