@@ -135,6 +135,7 @@ class PPOConfig(TorsoOptions):
         return self.rollout_length(task_max_steps) * self.action_repeat
 
     def spec(self) -> AgentSpec:
+        # It learns from the start; `warmup_episodes` only holds back the stop rule.
         return dataclasses.replace(super().spec(), learns_from=0, action_repeat=self.action_repeat)
 
     def optimizer(self) -> optax.GradientTransformation:

@@ -39,7 +39,7 @@ def _read_sections(path: Path, bases: Mapping[str, Any]) -> dict[str, dict[str, 
     sections: dict[str, dict[str, Any]] = {}
     for name, section in yaml.safe_load(path.read_text(encoding="utf-8")).items():
         like = section.pop("like", None)
-        base = (bases | sections)[like] if like else {}
+        base = {**bases, **sections}[like] if like else {}
         sections[name] = merge(base, section)
     return sections
 
