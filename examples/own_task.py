@@ -83,7 +83,8 @@ def main() -> None:
         tau=0.005,
     ), task)  # fmt: skip
     learn = sejax.make_learner(
-        task=task, agent=agent, proxy=sejax.SyntheticConfig(hidden_size=32, initial_state="real", horizon=None),
+        task=task, agent=agent,
+        proxy=sejax.SyntheticConfig(hidden_size=32, initial_state="real", horizon=None),
         es=sejax.NESConfig(population_size=args.population, noise_std=0.1, noise_std_decay=1.0,
                            num_incumbent_evals=args.population),
         training=sejax.TrainingConfig(max_steps=args.steps, stop_rule="never"),
